@@ -1,0 +1,94 @@
+# Every target makes what it needs: Python >= 3.11, make and a package index are enough.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+FLOORS := .venv-floors
+
+NOTEBOOK := examples/neural_dae_pendulum_drag.ipynb
+
+# $(call make-venv,DIR,CANDIDATES): a virtual environment from the first interpreter that is new enough.
+define make-venv
+	@for p in $(2); do \
+	    "$$p" -c 'import sys, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || continue; \
+	    echo "$$("$$p" --version) makes $(1)"; \
+	    exec "$$p" -m venv $(1); \
+	done; \
+	echo "Python >= 3.11 (with venv) is needed; name one: make PYTHON=/path/to/python" >&2; exit 1
+endef
+
+pip = $(1)/bin/python -m pip --disable-pip-version-check
+
+.PHONY: help demo test test-all test-floors lint types docs wheel check bench notebook clean
+
+help:
+	@echo "demo         train the pendulum's drag network (examples/)"
+	@echo "test         quick tests;  test-all: the slow ones too;  test-floors: on the oldest dependencies"
+	@echo "check        lint, types, test, docs, wheel: all that must pass"
+	@echo "bench        benchmarks;  notebook: execute the example notebook in place;  clean: remove products"
+
+$(BIN)/python:
+	$(call make-venv,$(VENV),"$(PYTHON)" python3.13 python3.12 python3.11 python3.14)
+
+$(VENV)/.stamp-demo: pyproject.toml | $(BIN)/python
+	$(call pip,$(VENV)) install -q -e '.[plot]'
+	@touch $@
+
+$(VENV)/.stamp-dev: pyproject.toml | $(BIN)/python
+	$(call pip,$(VENV)) install -q -e '.[dev]'
+	@touch $@ $(VENV)/.stamp-demo
+
+demo: $(VENV)/.stamp-demo
+	$(BIN)/python examples/neural_dae_pendulum_drag.py
+
+test: $(VENV)/.stamp-dev
+	$(BIN)/python -m pytest
+
+test-all: $(VENV)/.stamp-dev
+	$(BIN)/python -m pytest -m "slow or not slow"
+
+lint: $(VENV)/.stamp-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(VENV)/.stamp-dev
+	$(BIN)/pyright
+
+docs: $(VENV)/.stamp-dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+# The wheel alone, in an environment without the development tools, seen from outside the repository.
+wheel: $(VENV)/.stamp-dev
+	rm -rf dist
+	$(BIN)/python -m build --wheel --outdir dist . >/dev/null
+	@set -e; dir=$$(mktemp -d); trap 'rm -rf "$$dir"' EXIT; \
+	$(BIN)/python -m venv "$$dir/venv"; \
+	"$$dir/venv/bin/python" -m pip --disable-pip-version-check install -q dist/*.whl; \
+	cp .ci/check_wheel.py dist/*.whl "$$dir"; \
+	cd "$$dir"; venv/bin/python check_wheel.py ./*.whl
+
+check: lint types test docs wheel
+
+# The lowest versions that pyproject.toml admits, on the oldest Python where there is a choice.
+$(FLOORS)/.stamp: pyproject.toml
+	rm -rf $(FLOORS)
+	$(call make-venv,$(FLOORS),python3.11 "$(PYTHON)" python3.12 python3.13)
+	$(call pip,$(FLOORS)) install -q uv
+	$(FLOORS)/bin/uv pip install -q --python $(FLOORS)/bin/python --resolution lowest-direct -e '.[plot,test]'
+	@touch $@
+
+test-floors: $(FLOORS)/.stamp
+	@$(FLOORS)/bin/python -c 'import jax, diffrax, equinox, optimistix, lineax, optax, sympy, scipy, jaxtyping'
+	@$(FLOORS)/bin/uv pip freeze -q --python $(FLOORS)/bin/python --exclude-editable
+	$(FLOORS)/bin/python -m pytest
+
+bench: $(VENV)/.stamp-dev
+	@set -e; for f in benchmarks/[!_]*.py; do echo "== $$f"; $(BIN)/python "$$f"; done
+
+notebook: $(VENV)/.stamp-dev
+	$(BIN)/jupyter-execute --inplace $(NOTEBOOK)
+
+clean:
+	rm -rf build dist site .pytest_cache .ruff_cache .hypothesis examples/output $(FLOORS)
+	find . -path './.venv*' -prune -o -type d \( -name __pycache__ -o -name .ipynb_checkpoints \) -print \
+	    | xargs rm -rf

@@ -1,0 +1,20 @@
+"""Differentiable acausal modeling: components and equations in, one Equinox module out."""
+
+from .acausal_compiler import AcausalCompiler as AcausalCompiler
+from .errors import InitializationError as InitializationError
+from .errors import ModelError as ModelError
+from .errors import SimulationError as SimulationError
+from .errors import StructuralError as StructuralError
+from .lowering.system import AcausalSystem as AcausalSystem
+from .modeling import AcausalDiagram as AcausalDiagram
+from .modeling import Component as Component
+from .modeling import Domain as Domain
+from .modeling import Electrical as Electrical
+from .modeling import EqnEnv as EqnEnv
+from .modeling import NeuralDAEBlock as NeuralDAEBlock
+from .modeling import Translational as Translational
+from .modeling import der as der
+from .simulate import simulate as simulate
+from .solution import Solution as Solution
+
+__version__ = "0.1.0"

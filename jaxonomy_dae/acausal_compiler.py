@@ -1,0 +1,244 @@
+"""The compiler: all passes in order."""
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from .compiler.diagnose import check_structure
+from .compiler.eliminate_aliases import eliminate_aliases
+from .compiler.extend import Extended, extend
+from .compiler.flatten import flatten
+from .compiler.numeric import Networks, consistent_point, start_values
+from .compiler.order_blocks import order_blocks
+from .compiler.reduce_index import reduce_index
+from .compiler.select_states import StateSelection, select_states
+from .compiler.structure import incidence
+from .compiler.tables import ZERO, AliasTable, FlatModel, describe_equation
+from .errors import ModelError, StructuralError, nearest
+from .lowering.lower import SystemPlan, lower, quantity_scale
+from .lowering.parameters import ParameterNames, Parameters
+from .lowering.report import SystemReport
+from .lowering.system import AcausalSystem
+from .modeling.diagram import AcausalDiagram
+from .modeling.environment import EqnEnv
+from .modeling.neural import as_weights
+
+Mode = Literal["auto", "dummy_derivatives", "projection"]
+
+
+class AcausalCompiler:
+    """Compiles a diagram: `system = AcausalCompiler(ev, diagram)()`.
+
+    **Arguments:**
+
+    - `ev`: the environment the components were made with.
+    - `diagram`: the model.
+    - `state_selection`: `"dummy_derivatives"` integrates a minimal set of states; `"projection"` integrates all candidates
+        and projects onto the hidden constraints; `"auto"` takes dummy derivatives where the constraints' Jacobian is
+        constant, projection elsewhere.
+    - `prefer_states`: names of variables that should be states, the most important first.
+
+    **Raises** (when called):
+
+    - `ModelError`: the model is not well formed.
+    - `StructuralError`: equations and unknowns do not fit together.
+
+    `compiler.report` says what was done, after the call.
+    """
+
+    def __init__(
+        self,
+        ev: EqnEnv,
+        diagram: AcausalDiagram,
+        *,
+        state_selection: Mode = "auto",
+        prefer_states: Sequence[str] = (),
+    ):
+        if not isinstance(ev, EqnEnv) or not isinstance(diagram, AcausalDiagram):
+            raise ModelError("AcausalCompiler(ev, diagram) needs an EqnEnv and an AcausalDiagram")
+        if state_selection not in ("auto", "dummy_derivatives", "projection"):
+            raise ModelError(
+                f"state_selection is 'auto', 'dummy_derivatives' or 'projection'; got {state_selection!r}"
+            )
+        if isinstance(prefer_states, str):
+            raise ModelError(f"prefer_states is a list of names; write prefer_states=[{prefer_states!r}]")
+        self.ev = ev
+        self.diagram = diagram
+        self.state_selection = state_selection
+        self.prefer_states = tuple(prefer_states)
+        self._report: SystemReport | None = None
+
+    @property
+    def report(self) -> SystemReport:
+        """What the last call did."""
+        if self._report is None:
+            raise ModelError("nothing has been compiled yet: call the compiler first")
+        return self._report
+
+    def __call__(self) -> AcausalSystem:
+        flat = flatten(self.diagram)
+        plan = compile_flat(flat, self.state_selection, self.prefer_states)
+        self._report = SystemReport(plan)
+        table = ParameterNames(flat.parameters.names, flat.parameters.units, flat.parameters.bounds, plan.digest)
+        parameters = Parameters(jnp.asarray(flat.parameters.values, dtype=jnp.zeros(()).dtype), None, (), table)
+        neural = {name: _own(network) for name, network in flat.networks.items()}
+        return AcausalSystem(parameters, neural, plan)
+
+
+def _own(network: Any) -> Any:
+    """A network whose inexact leaves are JAX arrays."""
+    return as_weights(network) if not isinstance(network, eqx.Module) else network
+
+
+def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> SystemPlan:
+    """Runs the passes on a flattened model."""
+    groups, alias = eliminate_aliases(flat)
+    used = np.zeros(len(flat.variables), bool)
+    for group in groups:
+        used[group.variable[group.variable != ZERO]] = True
+    is_input = flat.variables.is_input
+    roots = np.arange(len(flat.variables)) == alias.root
+    column = np.full(len(flat.variables), -1, np.int64)
+    unknown = np.flatnonzero(roots & ~is_input)
+    column[unknown] = np.arange(len(unknown))
+    signature = incidence(groups, column, len(unknown))
+    check_structure(flat, groups, alias, signature, unknown)
+    offsets = reduce_index(signature)
+    inputs = np.flatnonzero(roots & is_input & used)
+    column[inputs] = len(unknown) + np.arange(len(inputs))
+    extended = extend(groups, offsets, column, is_input, len(unknown))
+    names = name_quantities(flat, alias, extended)
+    preferred = _preferred(flat, alias, extended, prefer_states)
+    merit = _merit(flat, alias, extended, preferred)
+
+    def point():
+        return _initial_point(flat, alias, extended)
+
+    selection = select_states(
+        groups,
+        extended,
+        mode,
+        lambda q: merit[q],
+        quantity_scale(flat, alias, extended),
+        point,
+        lambda q: names[q],
+        lambda e: describe_equation(groups, e),
+    )
+    known = np.zeros(extended.quantities.n, bool)
+    known[selection.states] = True
+    known[extended.quantities.n_unknown :] = True
+    blocks = order_blocks(extended, known, selection.constraints)
+    if isinstance(blocks, np.ndarray):
+        left = "; ".join(describe_equation(groups, int(extended.base[e])) for e in blocks[:5])
+        raise StructuralError(
+            f"after index reduction these equations determine no variable of their own: {left}. They follow from the "
+            "other equations, or contradict them: remove one."
+        )
+    _check_row_targets(flat, alias, extended, selection, names, mode)
+    return lower(flat, alias, groups, extended, selection, blocks, mode, names, selection.states)
+
+
+def name_quantities(flat: FlatModel, alias: AliasTable, extended: Extended) -> list[str]:
+    """A user's name for every quantity: of a variable that equals it, best without a minus sign and no port."""
+    quantities = extended.quantities
+    names: list[str] = [""] * quantities.n
+    best: list[tuple] = [(2,)] * quantities.n
+    for v, name in enumerate(flat.variables.names):
+        root = int(alias.root[v])
+        if root == ZERO or quantities.column[root] < 0:
+            continue
+        j = quantities.column[root]
+        if alias.order[v] > quantities.highest[j]:
+            continue
+        q = int(quantities.first[j] + alias.order[v])
+        internal = ":" in name
+        rank = (int(alias.sign[v] < 0), int(internal), int(flat.variables.is_port[v]), int(v != root), v)
+        if rank < best[q]:
+            best[q], names[q] = rank, ("-" if alias.sign[v] < 0 else "") + name
+    for q in range(quantities.n):
+        if not names[q]:
+            names[q] = f"der({names[q - 1]})"
+    return names
+
+
+def _preferred(flat: FlatModel, alias: AliasTable, extended: Extended, names: Sequence[str]) -> dict[int, int]:
+    """How strongly each quantity was asked for as a state."""
+    index = {n: k for k, n in enumerate(flat.variables.names)}
+    quantities = extended.quantities
+    out = {}
+    for k, name in enumerate(names):
+        if name not in index:
+            raise ModelError(f"prefer_states: '{name}' is no variable: " + nearest(name, index))
+        v = index[name]
+        root = int(alias.root[v])
+        if root != ZERO and quantities.column[root] >= 0:
+            q = int(quantities.first[quantities.column[root]] + alias.order[v])
+            out.setdefault(q, len(names) - k)
+    return out
+
+
+def _merit(flat: FlatModel, alias: AliasTable, extended: Extended, preferred: dict[int, int]) -> list[tuple]:
+    """How much each quantity should be a state: asked for, fixed at the start, given a start."""
+    quantities = extended.quantities
+    fixed = np.zeros(quantities.n, int)
+    started = np.zeros(quantities.n, int)
+    for v, start in enumerate(flat.variables.start):
+        root = int(alias.root[v])
+        if start is None or root == ZERO or quantities.column[root] < 0:
+            continue
+        j = quantities.column[root]
+        if alias.order[v] <= quantities.highest[j]:
+            q = quantities.first[j] + alias.order[v]
+            started[q] = 1
+            fixed[q] |= int(flat.variables.fixed[v])
+    return [(preferred.get(q, 0), int(fixed[q]), int(started[q])) for q in range(quantities.n)]
+
+
+def _initial_point(flat: FlatModel, alias: AliasTable, extended: Extended):
+    """All quantities near the declared starts, consistent where possible; parameters; networks."""
+    quantities = extended.quantities
+    values = flat.parameters.values
+    networks = Networks(tuple(flat.networks.values()))
+    value_of = start_values(flat.variables.start, values)
+    guess = np.zeros(quantities.n)
+    pins: dict[int, float] = {}
+    for v, start in enumerate(flat.variables.start):
+        root = int(alias.root[v])
+        if start is None or root == ZERO or quantities.column[root] < 0:
+            continue
+        j = quantities.column[root]
+        if alias.order[v] > quantities.highest[j]:
+            continue
+        q = int(quantities.first[j] + alias.order[v])
+        guess[q] = alias.sign[v] * value_of(v)
+        if flat.variables.fixed[v]:
+            pins[q] = guess[q]
+    point, _ = consistent_point(extended, guess, list(pins.items()), values, 0.0, networks)
+    return point, values, networks
+
+
+def _check_row_targets(
+    flat: FlatModel, alias: AliasTable, extended: Extended, selection: StateSelection, names: list[str], mode: str
+):
+    quantities = extended.quantities
+    states = set(selection.states.tolist())
+    listed = ", ".join(repr(names[q]) for q in selection.states[:12])
+    for row in flat.rows:
+        if mode != "dummy_derivatives":
+            raise ModelError(
+                f"neural block '{row.opaque.name}': inject='row' adds to rows of a minimal set of states, so it needs "
+                f"state_selection='dummy_derivatives'; this compiler has '{mode}'. For a real force, use inject='equation'."
+            )
+        for v in row.targets:
+            root = int(alias.root[v])
+            q = -1 if root == ZERO else int(quantities.first[quantities.column[root]] + alias.order[v])
+            if q not in states:
+                name = flat.variables.names[v]
+                raise ModelError(
+                    f"neural block '{row.opaque.name}': its target '{name}' is no state, so it has no row to "
+                    f"add to. The states are {listed}. To make it one, compile with prefer_states=['{name}']; or "
+                    "use inject='equation', which needs no state."
+                )

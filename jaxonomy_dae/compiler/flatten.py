@@ -1,0 +1,450 @@
+"""Flatten: components and connections become integer tables.
+
+Given a diagram, returns a `FlatModel`: one id for each variable and parameter, one group of rows for each equation
+template. Components of equal shape (same declarations, literally the same equations) are treated together, so the
+symbolic work does not grow with the number of instances.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import sympy
+
+from ..errors import ModelError, nearest
+from ..modeling.component import Component
+from ..modeling.diagram import AcausalDiagram
+from ..modeling.ports import Port
+from ..modeling.symbols import ParameterSymbol, TimeSymbol, VariableSymbol
+from .tables import EquationGroup, FlatModel, ParameterTable, RowInjection, Start, VariableTable
+from .templates import (
+    AnyTemplate,
+    LinearTemplate,
+    OpaqueFunction,
+    OpaqueTemplate,
+    Template,
+    canonical,
+    linear_coefficients,
+)
+
+
+@dataclasses.dataclass
+class _Rows:
+    """A group under construction."""
+
+    template: AnyTemplate
+    variable: list[np.ndarray] = dataclasses.field(default_factory=list)
+    order: list[np.ndarray] = dataclasses.field(default_factory=list)
+    parameter: list[np.ndarray] = dataclasses.field(default_factory=list)
+    coefficient: list[np.ndarray] = dataclasses.field(default_factory=list)
+    origin: list[str] = dataclasses.field(default_factory=list)
+
+
+class GroupBuilder:
+    """Collects equation rows by template."""
+
+    def __init__(self):
+        self._rows: dict[str, _Rows] = {}
+
+    def add(self, template: AnyTemplate, variable, order, parameter, coefficient, origin: Sequence[str]):
+        """Adds n instances: arrays of shape (n, slots), (n, slots), (n, parameters), (n, coefficients)."""
+        rows = self._rows.setdefault(template.key, _Rows(template))
+        n = len(origin)
+        rows.variable.append(np.asarray(variable, np.int64).reshape(n, -1))
+        rows.order.append(np.asarray(order, np.int64).reshape(n, -1))
+        rows.parameter.append(np.asarray(parameter, np.int64).reshape(n, template.n_parameters))
+        rows.coefficient.append(np.asarray(coefficient, np.float64).reshape(n, template.n_coefficients))
+        rows.origin.extend(origin)
+
+    def add_linear(self, terms: Sequence[tuple[int, int, float]], origin: str):
+        """Adds Σ coefficient·variable^(order) = 0."""
+        variable, order, coefficient = zip(*terms, strict=True)
+        self.add(LinearTemplate(len(terms)), [variable], [order], np.zeros((1, 0)), [coefficient], [origin])
+
+    def groups(self) -> tuple[EquationGroup, ...]:
+        out = []
+        for rows in self._rows.values():
+            variable = np.concatenate(rows.variable)
+            out.append(
+                EquationGroup(
+                    rows.template,
+                    variable,
+                    np.concatenate(rows.order),
+                    np.ones_like(variable),
+                    np.concatenate(rows.parameter),
+                    np.concatenate(rows.coefficient),
+                    rows.origin,
+                )
+            )
+        return tuple(out)
+
+
+class _Model:
+    """Ids of everything in a diagram, in the order it was added."""
+
+    def __init__(self, diagram: AcausalDiagram):
+        self.components: list[Component] = []
+        stack = list(reversed(diagram.components.values()))
+        while stack:
+            component = stack.pop()
+            self.components.append(component)
+            stack.extend(reversed(component.children.values()))
+        if not self.components:
+            raise ModelError("the diagram has no components: add some with diagram.add(...)")
+        self.index = {id(c): k for k, c in enumerate(self.components)}
+        paths: dict[int, str] = {}
+        for c in self.components:
+            paths[id(c)] = c.name if c.parent is None else f"{paths[id(c.parent)]}.{c.name}"
+        self.paths = [paths[id(c)] for c in self.components]
+        n_variables = [len(c.variables) for c in self.components]
+        n_parameters = [len(c.parameters) for c in self.components]
+        self.first_variable = np.concatenate([[0], np.cumsum(n_variables)]).astype(np.int64)
+        self.first_parameter = np.concatenate([[0], np.cumsum(n_parameters)]).astype(np.int64)
+        # One position table for each distinct list of names.
+        self._positions: dict[tuple[str, ...], dict[str, int]] = {}
+        self.variable_positions = [self._position(tuple(c.variables)) for c in self.components]
+        self.parameter_positions = [self._position(tuple(c.parameters)) for c in self.components]
+
+    def _position(self, names: tuple[str, ...]) -> dict[str, int]:
+        return self._positions.setdefault(names, {n: k for k, n in enumerate(names)})
+
+    def _resolve(self, k: int, path: str, table: str) -> int | None:
+        """The id behind a path as component k sees it."""
+        positions = self.variable_positions if table == "variables" else self.parameter_positions
+        first = self.first_variable if table == "variables" else self.first_parameter
+        if path in positions[k]:
+            return int(first[k]) + positions[k][path]
+        component = self.components[k]
+        while "." in path:
+            head, path = path.split(".", 1)
+            if head not in component.children:
+                return None
+            component = component.children[head]
+            j = self.index[id(component)]
+            if path in positions[j]:
+                return int(first[j]) + positions[j][path]
+        return None
+
+    def variable(self, k: int, path: str) -> int:
+        found = self._resolve(k, path, "variables")
+        if found is None:
+            component = self.components[k]
+            inside = [*component.variables, *(f"{c.name}.{v}" for c in component.children.values() for v in c.variables)]
+            raise ModelError(
+                f"component '{self.paths[k]}': the symbol '{path}' in its equations is no variable of it or of a child "
+                "component: " + nearest(path, inside)
+            )
+        return found
+
+    def parameter(self, k: int, path: str) -> int:
+        found = self._resolve(k, path, "parameters")
+        if found is None:
+            component = self.components[k]
+            raise ModelError(
+                f"component '{self.paths[k]}': the symbol '{path}' in its equations is no parameter of it or of a "
+                "child component: " + nearest(path, component.parameters)
+            )
+        return found
+
+    def port_variable(self, port: Port, name: str) -> int:
+        k = self.index.get(id(port.component))
+        if k is None:
+            raise ModelError(f"{port!r} is connected, but its component is not part of the diagram: add it")
+        return int(self.first_variable[k]) + self.variable_positions[k][f"{port.name}.{name}"]
+
+
+def flatten(diagram: AcausalDiagram) -> FlatModel:
+    """Flattens a diagram.
+
+    **Raises:**
+
+    - `ModelError` for symbols no component declares, ports of components that are not in the diagram, and targets or
+        inputs of neural blocks that do not exist.
+    """
+    model = _Model(diagram)
+    builder = GroupBuilder()
+    networks: dict[str, Any] = {}
+    _add_components(model, builder)
+    _add_learned_terms(model, builder, networks)
+    _add_connections(model, diagram, builder)
+    variables = _variable_table(model)
+    parameters = _parameter_table(model)
+    groups = builder.groups()
+    variables, groups, rows = _add_blocks(model, diagram, variables, groups, networks)
+    return FlatModel(variables, parameters, groups, networks, rows)
+
+
+def _add_components(model: _Model, builder: GroupBuilder):
+    by_shape: dict[tuple, list[int]] = {}
+    for k, c in enumerate(model.components):
+        if c.equations:
+            by_shape.setdefault((tuple(c.equations), tuple(c.variables), tuple(c.parameters)), []).append(k)
+    for (equations, local_variables, local_parameters), members in by_shape.items():
+        position = {name: k for k, name in enumerate((*local_variables, *local_parameters))}
+        for residual in equations:
+            # Slots follow the order of declaration, never names, so names change nothing but names.
+            def rank(s):
+                # Symbols of children come after one's own, in the order the children's ids give.
+                if s.path in position:
+                    return (0, position[s.path], getattr(s, "order", 0))
+                resolve = model.variable if isinstance(s, VariableSymbol) else model.parameter
+                return (1, resolve(members[0], s.path), getattr(s, "order", 0))
+
+            symbols = residual.free_symbols
+            for s in symbols:
+                if not isinstance(s, VariableSymbol | ParameterSymbol | TimeSymbol):
+                    raise ModelError(
+                        f"component '{model.paths[members[0]]}': the symbol '{s}' was declared by no component; declare "
+                        "it with self.variable(...) or self.parameter(...) and use the symbol that returns"
+                    )
+            variables = sorted((s for s in symbols if isinstance(s, VariableSymbol)), key=rank)
+            parameters = sorted((s for s in symbols if isinstance(s, ParameterSymbol)), key=rank)
+            coefficients = linear_coefficients(residual, variables)
+            ids = _ids(model, members, [v.path for v in variables], "variable")
+            parameter_ids = _ids(model, members, [p.path for p in parameters], "parameter")
+            order = np.tile([v.order for v in variables], (len(members), 1))
+            text = f"0 = {residual}"
+            origin = [f"{model.paths[k]}: {text}" for k in members]
+            if coefficients is None:
+                template: AnyTemplate = canonical(residual, variables, parameters)
+                builder.add(template, ids, order, parameter_ids, np.zeros((len(members), 0)), origin)
+            else:
+                template = LinearTemplate(len(variables))
+                rows = np.tile(coefficients, (len(members), 1))
+                builder.add(template, ids, order, np.zeros((len(members), 0)), rows, origin)
+
+
+def _ids(model: _Model, members: list[int], paths: list[str], kind: str) -> np.ndarray:
+    """Ids of `paths` in each member component, shape (members, paths)."""
+    out = np.empty((len(members), len(paths)), np.int64)
+    for j, path in enumerate(paths):
+        positions = (model.variable_positions if kind == "variable" else model.parameter_positions)[members[0]]
+        if path in positions:
+            first = model.first_variable if kind == "variable" else model.first_parameter
+            out[:, j] = first[members] + positions[path]
+        else:
+            resolve = model.variable if kind == "variable" else model.parameter
+            out[:, j] = [resolve(k, path) for k in members]
+    return out
+
+
+def _add_learned_terms(model: _Model, builder: GroupBuilder, networks: dict[str, Any]):
+    for k, component in enumerate(model.components):
+        for term in component.learned_terms:
+            name = f"{model.paths[k]}.{term.name}"
+            times = frozenset(j for j, s in enumerate(term.inputs) if isinstance(s, TimeSymbol))
+            opaque = OpaqueFunction(len(networks), name, None, len(term.inputs), times)
+            networks[name] = term.network
+            inputs = [(model.variable(k, s.path), s.order) for s in term.inputs if isinstance(s, VariableSymbol)]
+            for j, output in enumerate(term.outputs):
+                _add_opaque(builder, opaque, j, (model.variable(k, output.path), 0), inputs)
+
+
+def _add_opaque(builder: GroupBuilder, opaque: OpaqueFunction, output: int, y: tuple[int, int], inputs):
+    pairs = [y, *inputs]
+    builder.add(
+        OpaqueTemplate(opaque, output),
+        [[v for v, _ in pairs]],
+        [[o for _, o in pairs]],
+        np.zeros((1, 0)),
+        np.zeros((1, 0)),
+        [f"{opaque.name}: output {output} of the network"],
+    )
+
+
+def _add_connections(model: _Model, diagram: AcausalDiagram, builder: GroupBuilder):
+    """Across variables of joined ports are equal, their through variables sum to zero; loose ports carry none.
+
+    A port has two faces: the outer one joins in the connections of the component's parent, the inner one in those of
+    the component itself, where its through variables count negative.
+    """
+    parent: dict[tuple[int, int], tuple[int, int]] = {}  # faces (port id, 0 outer | 1 inner)
+    ports: dict[int, Port] = {}
+    for component in model.components:
+        for port in component.ports.values():
+            ports[id(port)] = port
+            parent[id(port), 0] = (id(port), 0)
+    rank = {key: k for k, key in enumerate(ports)}
+
+    def find(face):
+        while parent[face] != face:
+            parent[face] = parent[parent[face]]
+            face = parent[face]
+        return face
+
+    def join(connections, owner: Component | None):
+        for ends in connections:
+            faces = []
+            for port in ends:
+                if id(port) not in ports:
+                    raise ModelError(f"{port!r} is connected, but its component is not part of the diagram: add it")
+                if owner is not None and port.component is not owner and port.component.parent is not owner:
+                    raise ModelError(
+                        f"component '{owner.path}' connects {port!r}: it can connect its own ports and its children's"
+                    )
+                inner = int(owner is not None and port.component is owner)
+                faces.append((id(port), inner))
+                parent.setdefault(faces[-1], faces[-1])
+            for face in faces[1:]:
+                a, b = find(faces[0]), find(face)
+                if a != b:
+                    parent[max(a, b, key=lambda f: (rank[f[0]], f[1]))] = min(
+                        a, b, key=lambda f: (rank[f[0]], f[1])
+                    )
+
+    join(diagram.connections, None)
+    for component in model.components:
+        join(component.connections, component)
+    sets: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for face in sorted(parent, key=lambda f: (rank[f[0]], f[1])):
+        sets.setdefault(find(face), []).append(face)
+    for faces in sets.values():
+        members = [ports[p] for p, _ in faces]
+        where = ", ".join(f"{model.paths[model.index[id(p.component)]]}.{p.name}" for p in members[:4])
+        where += ", …" if len(members) > 4 else ""
+        kind = "connection of" if len(faces) > 1 else "unconnected port"
+        domain = members[0].domain
+        for name, _ in domain.across:
+            first = model.port_variable(members[0], name)
+            for port in members[1:]:
+                other = model.port_variable(port, name)
+                builder.add_linear([(first, 0, 1.0), (other, 0, -1.0)], f"{kind} {where}: equal {name}")
+        for name, _ in domain.through:
+            terms = [
+                (model.port_variable(port, name), 0, -1.0 if inner else 1.0)
+                for port, (_, inner) in zip(members, faces, strict=True)
+            ]
+            builder.add_linear(terms, f"{kind} {where}: {name} sums to zero")
+
+
+def _variable_table(model: _Model) -> VariableTable:
+    names: list[str] = []
+    start: list[Start | None] = []
+    unit: list[str] = []
+    default: list[float | None] = []
+    is_input, is_port, fixed, nominal = [], [], [], []
+    expressions: dict[sympy.Expr, tuple[Template, list[str]]] = {}
+    for k, component in enumerate(model.components):
+        path = model.paths[k]
+        for variable in component.variables.values():
+            names.append(f"{path}.{variable.name}")
+            is_input.append(variable.kind == "input")
+            is_port.append(variable.kind == "port")
+            fixed.append(variable.fixed)
+            nominal.append(variable.nominal)
+            unit.append(variable.unit)
+            default.append(variable.default)
+            if variable.start is None:
+                start.append(None)
+                continue
+            if variable.start not in expressions:
+                symbols = sorted(variable.start.free_symbols, key=lambda s: model.parameter(k, s.path))  # type: ignore
+                expressions[variable.start] = (canonical(variable.start, (), symbols), [s.path for s in symbols])  # type: ignore
+            template, paths = expressions[variable.start]
+            start.append(Start(template, tuple(model.parameter(k, p) for p in paths)))
+    return VariableTable(
+        names,
+        np.array(is_input, bool),
+        np.array(is_port, bool),
+        start,
+        np.array(fixed, bool),
+        np.array(nominal, float),
+        unit,
+        default,
+    )
+
+
+def _parameter_table(model: _Model) -> ParameterTable:
+    names, values, units, bounds = [], [], [], []
+    for k, component in enumerate(model.components):
+        for parameter in component.parameters.values():
+            names.append(f"{model.paths[k]}.{parameter.name}")
+            values.append(parameter.value)
+            units.append(parameter.unit)
+            bounds.append(parameter.bounds)
+    return ParameterTable(names, np.array(values, float), units, np.array(bounds, float).reshape(-1, 2))
+
+
+def _add_blocks(model: _Model, diagram: AcausalDiagram, variables: VariableTable, groups, networks):
+    """Adds the learned corrections.
+
+    `equation`: for a target v with corrections w₁, w₂, …, every equation that mentions dv/dt reads instead a new
+    variable u, and dv/dt = u + w₁ + w₂ + … is added. `row`: kept for lowering.
+    """
+    rows: list[RowInjection] = []
+    corrections: dict[int, list[int]] = {}
+    builder = GroupBuilder()
+    names = list(variables.names)
+    known = {name: k for k, name in enumerate(names)}
+
+    def find(reference, block, what: str) -> int:
+        component, name = reference
+        if component is not None:
+            if id(component) not in model.index:
+                raise ModelError(
+                    f"neural block '{block.name}': its {what} '{component.path}.{name}' belongs to a component that is not "
+                    "part of the diagram: add it"
+                )
+            name = f"{component.path}.{name}"
+        if name not in known:
+            raise ModelError(f"neural block '{block.name}': its {what} '{name}' is no variable: " + nearest(name, known))
+        return known[name]
+
+    differentiated = np.zeros(len(names), bool)
+    for group in groups:
+        differentiated[group.variable[group.order > 0]] = True
+    for block in diagram.blocks.values():
+        targets = tuple(find(t, block, "target") for t in block.targets)
+        times = frozenset(k for k, (c, n) in enumerate(block.inputs) if c is None and n == "time")
+        inputs = tuple(find(r, block, "input") for k, r in enumerate(block.inputs) if k not in times)
+        theta = block.theta is not None
+        opaque = OpaqueFunction(
+            len(networks), block.name, block.network if theta else None, len(block.inputs), times
+        )
+        networks[block.name] = block.theta if theta else block.network
+        for v in targets:
+            if not differentiated[v]:
+                raise ModelError(
+                    f"neural block '{block.name}': its target '{names[v]}' is differentiated in no equation, so there is no "
+                    "derivative to correct; targets can be "
+                    + ", ".join(repr(names[k]) for k in np.flatnonzero(differentiated)[:8])
+                )
+        if block.inject == "row":
+            rows.append(RowInjection(opaque, targets, inputs))
+            continue
+        for j, v in enumerate(targets):
+            w = len(names)
+            names.append(f"{block.name}[{j}]")
+            corrections.setdefault(v, []).append(w)
+            _add_opaque(builder, opaque, j, (w, 0), [(i, 0) for i in inputs])
+    if corrections:
+        target_index = np.full(len(names) + len(corrections), -1)
+        for v, ws in corrections.items():
+            u = len(names)
+            target_index[v] = u
+            names.append(f"{names[v]}:physics")
+            builder.add_linear(
+                [(v, 1, 1.0), (u, 0, -1.0), *((w, 0, -1.0) for w in ws)], f"corrected derivative of {names[v]}"
+            )
+        redirected = []
+        for group in groups:
+            new = target_index[group.variable]
+            hit = (new >= 0) & (group.order > 0)
+            variable = np.where(hit, new, group.variable)
+            order = np.where(hit, group.order - 1, group.order)
+            redirected.append(dataclasses.replace(group, variable=variable, order=order))
+        groups = (*redirected, *builder.groups())
+    extra = len(names) - len(variables)
+    if extra:
+        variables = VariableTable(
+            names,
+            np.concatenate([variables.is_input, np.zeros(extra, bool)]),
+            np.concatenate([variables.is_port, np.zeros(extra, bool)]),
+            [*variables.start, *[None] * extra],
+            np.concatenate([variables.fixed, np.zeros(extra, bool)]),
+            np.concatenate([variables.nominal, np.ones(extra)]),
+            [*variables.unit, *[""] * extra],
+            [*variables.default, *[None] * extra],
+        )
+    return variables, groups, tuple(rows)

@@ -1,0 +1,96 @@
+"""Block lower triangular order (BLT): which equations determine which unknowns, and in which order.
+
+Given the extended equations and the known quantities, matches equations with unknowns and orders the strongly connected
+components (Duff & Reid 1978, Tarjan 1972). Each block is solved for its unknowns once the blocks of lower level are.
+"""
+
+import dataclasses
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components, maximum_bipartite_matching
+
+from .extend import Extended
+from .structure import pattern
+
+
+@dataclasses.dataclass(frozen=True)
+class Blocks:
+    """The blocks, in an order in which they can be solved.
+
+    Block b holds equations[pointer[b]:pointer[b+1]] and the unknowns at the same places; equal levels do not depend on
+    each other.
+    """
+
+    pointer: np.ndarray
+    equations: np.ndarray
+    unknowns: np.ndarray
+    level: np.ndarray
+
+    def __len__(self):
+        return len(self.level)
+
+
+def order_blocks(extended: Extended, known: np.ndarray, removed: np.ndarray) -> Blocks | np.ndarray:
+    """Orders the equations that are not in `removed` for the quantities that are not `known`.
+
+    Returns the blocks; or, if no perfect matching exists, the extended equations that were left unmatched.
+    """
+    unknown_id = np.full(extended.quantities.n, -1, np.int64)
+    unknowns = np.flatnonzero(~known[: extended.quantities.n_unknown])
+    unknown_id[unknowns] = np.arange(len(unknowns))
+    kept = np.ones(extended.n_equations, bool)
+    kept[removed] = False
+    equations = np.flatnonzero(kept)
+    wanted = unknown_id >= 0
+    pointer, columns = extended.incidence(wanted)
+    lengths = np.diff(pointer)
+    entry_rows = np.repeat(np.arange(extended.n_equations), lengths)
+    inside = kept[entry_rows]
+    row_id = np.cumsum(kept) - 1
+    rows, columns = row_id[entry_rows[inside]], unknown_id[columns[inside]]
+    n = len(equations)
+    pointer = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))]).astype(np.int64)
+    graph = pattern(pointer, columns, len(unknowns))
+    matched = maximum_bipartite_matching(graph, perm_type="column").astype(np.int64)
+    if (matched < 0).any() or n != len(unknowns):
+        return equations[matched < 0]
+
+    # Equation i depends on the equation that is matched with each of its other unknowns.
+    equation_of = np.empty(n, np.int64)
+    equation_of[matched] = np.arange(n)
+    source = equation_of[columns]
+    dependency = sp.coo_array((np.ones(len(rows), np.int8), (rows, source)), shape=(n, n)).tocsr()
+    n_blocks, label = connected_components(dependency, directed=True, connection="strong")
+    level = _levels(label[rows], label[source], n_blocks)
+    # Deterministic order: by level, then by the block's first equation.
+    first_equation = np.full(n_blocks, n, np.int64)
+    np.minimum.at(first_equation, label, np.arange(n))
+    block_order = np.lexsort((first_equation, level))
+    rank = np.empty(n_blocks, np.int64)
+    rank[block_order] = np.arange(n_blocks)
+    sorting = np.lexsort((np.arange(n), rank[label]))
+    sizes = np.bincount(rank[label], minlength=n_blocks)
+    pointer = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+    return Blocks(pointer, equations[sorting], unknowns[matched[sorting]], level[block_order])
+
+
+def _levels(block: np.ndarray, needs: np.ndarray, n_blocks: int) -> np.ndarray:
+    """The length of the longest chain of blocks below each block."""
+    outside = block != needs
+    pairs = np.unique(np.stack([needs[outside], block[outside]], axis=1), axis=0)
+    waiting = np.bincount(pairs[:, 1], minlength=n_blocks)
+    start = np.concatenate([[0], np.cumsum(np.bincount(pairs[:, 0], minlength=n_blocks))]).tolist()
+    followers = pairs[:, 1].tolist()
+    level = [0] * n_blocks
+    waiting_list = waiting.tolist()
+    ready = np.flatnonzero(waiting == 0).tolist()
+    while ready:
+        b = ready.pop()
+        for k in range(start[b], start[b + 1]):
+            f = followers[k]
+            level[f] = max(level[f], level[b] + 1)
+            waiting_list[f] -= 1
+            if waiting_list[f] == 0:
+                ready.append(f)
+    return np.array(level, np.int64)

@@ -1,0 +1,229 @@
+"""State selection: which quantities are integrated, and which equations become constraints to project onto.
+
+Candidates are all derivatives below the highest ones. The hidden constraints are the equations that index reduction
+differentiated, below their last derivative. They fall into independent parts (connected components). In a part whose
+Jacobian with respect to the candidates is constant, or where the user forces it, dummy derivatives (Mattsson &
+Söderlind 1993) leave a minimal set of states, chosen by numerical pivots. In every other part all candidates are
+states and the hidden constraints are kept for projection: no choice of fewer states would be regular everywhere.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
+
+from ..errors import StructuralError
+from .extend import Extended
+from .numeric import Networks, group_values
+from .tables import ZERO, EquationGroup, equation_offsets
+
+POOR_PIVOT = 0.1  # a preferred pivot may be this much smaller than the best one
+SINGULAR_PIVOT = 1e-9
+
+
+@dataclasses.dataclass(frozen=True)
+class StateSelection:
+    """The states, the constraints to project onto, and what was decided where."""
+
+    states: np.ndarray  # quantities
+    constraints: np.ndarray  # extended equations
+    dummies: np.ndarray  # candidate quantities that are no states
+    projected: np.ndarray  # equations as written whose hidden constraints are projected onto
+    notes: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Entries:
+    """Entries of the constraint Jacobian: ∂F_row/∂(variable column), at the matching orders."""
+
+    row: np.ndarray
+    column: np.ndarray
+    constant: np.ndarray
+    group: np.ndarray
+    instance: np.ndarray
+    slot: np.ndarray
+
+
+def _entries(groups: tuple[EquationGroup, ...], extended: Extended) -> _Entries:
+    quantities = extended.quantities
+    c = np.bincount(extended.base) - 1
+    first = equation_offsets(groups)
+    out: list[list[np.ndarray]] = [[] for _ in range(6)]
+    for g, group in enumerate(groups):
+        count = c[first[g] : first[g + 1]]
+        if not len(group) or group.variable.shape[1] == 0 or not (count > 0).any():
+            continue
+        used = (group.variable != ZERO) & (count > 0)[:, None]
+        column = np.where(used, quantities.column[group.variable], 0)
+        used &= column < quantities.n_unknown_columns
+        highest = quantities.highest[np.where(used, column, 0)]
+        used &= (group.order + count[:, None] == highest) & (highest > 0)
+        instance, slot = np.nonzero(used)
+        if not len(instance):
+            continue
+        constant = np.array([group.template.coefficient_is_constant(k) for k in range(group.variable.shape[1])])
+        values = (first[g] + instance, column[instance, slot], constant[slot], np.full(len(slot), g), instance, slot)
+        for collected, value in zip(out, values, strict=True):
+            collected.append(value)
+    joined = [np.concatenate(v) if v else np.zeros(0, np.int64) for v in out]
+    return _Entries(joined[0], joined[1], joined[2].astype(bool), *joined[3:])
+
+
+def select_states(
+    groups: tuple[EquationGroup, ...],
+    extended: Extended,
+    mode: str,
+    merit: Callable[[int], tuple],
+    scale: np.ndarray,
+    point: Callable[[], tuple[np.ndarray, np.ndarray, Networks]],
+    name: Callable[[int], str],
+    equation_name: Callable[[int], str],
+) -> StateSelection:
+    """Selects states.
+
+    **Arguments:**
+
+    - `mode`: "auto", "dummy_derivatives" or "projection".
+    - `merit`: how much a quantity should be a state; larger tuples are kept, ties go to the first quantity.
+    - `scale`: the typical size of every quantity.
+    - `point`: called only if numbers are needed: all quantities near the initial point, parameters, networks.
+    - `name`, `equation_name`: of a quantity and of an equation, for messages.
+
+    **Raises:**
+
+    - `StructuralError` if hidden constraints depend on each other at the initial point.
+    """
+    quantities = extended.quantities
+    unknown = quantities.n_unknown
+    order, owner = quantities.order[:unknown], quantities.owner[:unknown]
+    candidate = order < quantities.highest[owner]
+    c = np.bincount(extended.base) - 1
+    constrained = np.flatnonzero(c > 0)
+    entries = _entries(groups, extended)
+    notes: list[str] = []
+    is_dummy = np.zeros(unknown, bool)
+    projected = np.zeros(len(c), bool)
+
+    if len(constrained):
+        shape = (len(c), quantities.n_unknown_columns)
+        parts = _parts(entries, constrained, shape)
+        numbers = None
+        for rows, members in parts:
+            constant = entries.constant[members].all()
+            if mode == "projection" or (mode == "auto" and not constant):
+                projected[rows] = True
+                continue
+            if numbers is None:
+                numbers = _evaluate(groups, extended, entries, point)
+            columns = np.unique(entries.column[members])
+            dense = np.zeros((len(rows), len(columns)))
+            np.add.at(
+                dense,
+                (np.searchsorted(rows, entries.row[members]), np.searchsorted(columns, entries.column[members])),
+                numbers[members],
+            )
+            chosen, more = _dummy_derivatives(
+                dense, c[rows], columns, quantities, merit, scale, name, [equation_name(r) for r in rows]
+            )
+            is_dummy[chosen] = True
+            notes.extend(more)
+
+    states = np.flatnonzero(candidate & ~is_dummy)
+    below_last = extended.level < c[extended.base]
+    constraints = np.flatnonzero(below_last & projected[extended.base])
+    return StateSelection(
+        states, constraints, np.flatnonzero(is_dummy), np.flatnonzero(projected), tuple(notes)
+    )
+
+
+def _parts(entries: _Entries, constrained: np.ndarray, shape: tuple[int, int]):
+    """Independent sets of constrained equations, as (equations, indices of their entries), in order."""
+    n_rows, n_columns = shape
+    graph = sp.coo_array(
+        (np.ones(len(entries.row)), (entries.row, n_rows + entries.column)), shape=(n_rows + n_columns,) * 2
+    )
+    _, label = connected_components(graph, directed=False)
+    by_label: dict[int, list[int]] = {}
+    for r in constrained.tolist():
+        by_label.setdefault(int(label[r]), []).append(r)
+    members: dict[int, list[int]] = {key: [] for key in by_label}
+    for k, r in enumerate(entries.row.tolist()):
+        members[int(label[r])].append(k)
+    return [(np.array(rows), np.array(members[key], np.int64)) for key, rows in by_label.items()]
+
+
+def _evaluate(groups, extended: Extended, entries: _Entries, point) -> np.ndarray:
+    """The numbers of all entries; those that depend on the point are taken at the initial point."""
+    values, parameters, networks = point()
+    by_base = {}
+    first = equation_offsets(groups)
+    for group in extended.groups:
+        if group.level == 0:
+            g = int(np.searchsorted(first, group.base[0], side="right") - 1)
+            by_base[g] = group
+    numbers = np.empty(len(entries.row))
+    for g in np.unique(entries.group):
+        here = entries.group == g
+        partials = group_values(by_base[int(g)], values, parameters, 0.0, networks, partials=True)
+        numbers[here] = partials[entries.instance[here], entries.slot[here]]
+    return numbers
+
+
+def _dummy_derivatives(dense, c, columns, quantities, merit, scale, name, equations):
+    """Mattsson & Söderlind's selection, level by level: the candidate quantities that become dummies."""
+    notes: list[str] = []
+    chosen: list[int] = []
+    available = np.arange(len(columns))
+    for level in range(1, int(c.max()) + 1):
+        rows = np.flatnonzero(c >= level)
+        available = available[quantities.highest[columns[available]] >= level]
+        # If the (d − level + 1)-th derivative is a dummy, the quantity below it is no state.
+        below = quantities.first[columns[available]] + quantities.highest[columns[available]] - level
+        matrix = dense[np.ix_(rows, available)] * scale[below]
+        picked = _pivots(matrix, [(merit(int(q)), -int(q)) for q in below])
+        if picked is None:
+            raise StructuralError(
+                "the constraints "
+                + "; ".join(equations[r] for r in rows[:6])
+                + " do not determine as many variables as there are constraints at the initial point: one of them follows "
+                "from the others, or the start values are at a singular position. Remove the redundant constraint, or "
+                'change the start values, or use state_selection="projection".'
+            )
+        by_merit = sorted(range(len(below)), key=lambda k: (merit(int(below[k])), -int(below[k])))
+        wanted = set(by_merit[: len(picked)])
+        for k in picked:
+            if k not in wanted and merit(int(below[k]))[0] > 0:
+                notes.append(
+                    f"{name(int(below[k]))} was preferred as a state, but without it the constraints would be "
+                    "near-singular at the initial point"
+                )
+        chosen.extend(int(below[k]) for k in picked)
+        available = available[picked]
+    return chosen, notes
+
+
+def _pivots(matrix: np.ndarray, keys: list[tuple]) -> list[int] | None:
+    """As many columns as rows, nonsingular together: the least wanted as states whose pivots are not poor."""
+    work = matrix / np.maximum(np.abs(matrix).max(axis=1, keepdims=True, initial=0.0), 1e-300)
+    free_rows = list(range(work.shape[0]))
+    free_columns = list(range(work.shape[1]))
+    picked: list[int] = []
+    while free_rows:
+        if not free_columns:
+            return None
+        sub = np.abs(work[np.ix_(free_rows, free_columns)])
+        best_of_column = sub.max(axis=0)
+        best = best_of_column.max()
+        if not best > SINGULAR_PIVOT:
+            return None
+        good = [k for k in range(len(free_columns)) if best_of_column[k] >= POOR_PIVOT * best]
+        k = min(good, key=lambda k: keys[free_columns[k]])
+        column = free_columns.pop(k)
+        row = free_rows.pop(int(np.argmax(sub[:, k])))
+        picked.append(column)
+        if free_rows:
+            factors = work[free_rows, column] / work[row, column]
+            work[free_rows] -= np.outer(factors, work[row])
+    return sorted(picked)

@@ -1,0 +1,126 @@
+"""The tables passes read and write: integers and templates, no user symbols.
+
+A variable is an integer; a *quantity* is one of its derivatives, order 0 included. An equation is a template and rows
+of integers. After alias elimination a slot also has a sign, and variable −1 stands for the constant zero.
+"""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from .templates import AnyTemplate, OpaqueFunction, Template
+
+ZERO = -1
+
+
+@dataclasses.dataclass(frozen=True)
+class VariableTable:
+    """What the user declared of each variable, by id."""
+
+    names: list[str]
+    is_input: np.ndarray
+    is_port: np.ndarray
+    start: list["Start | None"]
+    fixed: np.ndarray
+    nominal: np.ndarray
+    unit: list[str]
+    default: list[float | None]
+
+    def __len__(self):
+        return len(self.names)
+
+
+@dataclasses.dataclass(frozen=True)
+class Start:
+    """A start value: an expression in parameters, as a template without slots, and the parameters it reads."""
+
+    template: Template
+    parameters: tuple[int, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class ParameterTable:
+    """What the user declared of each parameter, by id."""
+
+    names: list[str]
+    values: np.ndarray
+    units: list[str]
+    bounds: np.ndarray
+
+    def __len__(self):
+        return len(self.names)
+
+
+@dataclasses.dataclass(frozen=True)
+class EquationGroup:
+    """All instances of one template: instance i's slot k is sign[i, k]·(variable[i, k])^(order[i, k])."""
+
+    template: AnyTemplate
+    variable: np.ndarray
+    order: np.ndarray
+    sign: np.ndarray
+    parameter: np.ndarray
+    coefficient: np.ndarray
+    origin: list[str]
+
+    def __len__(self):
+        return self.variable.shape[0]
+
+    def take(self, rows) -> "EquationGroup":
+        rows = np.asarray(rows, dtype=np.int64)
+        return EquationGroup(
+            self.template,
+            self.variable[rows],
+            self.order[rows],
+            self.sign[rows],
+            self.parameter[rows],
+            self.coefficient[rows],
+            [self.origin[r] for r in rows],
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class RowInjection:
+    """A learned correction that is added to the finished right-hand side."""
+
+    opaque: OpaqueFunction
+    targets: tuple[int, ...]
+    inputs: tuple[int, ...]  # variables, time left out
+
+
+@dataclasses.dataclass(frozen=True)
+class FlatModel:
+    """A flattened model."""
+
+    variables: VariableTable
+    parameters: ParameterTable
+    groups: tuple[EquationGroup, ...]
+    networks: dict[str, Any]
+    rows: tuple[RowInjection, ...]
+
+    @property
+    def n_equations(self) -> int:
+        return sum(len(g) for g in self.groups)
+
+
+@dataclasses.dataclass(frozen=True)
+class AliasTable:
+    """Each variable as sign·(root)^(order): root ZERO with sign 0 for a variable that is identically zero."""
+
+    root: np.ndarray
+    order: np.ndarray
+    sign: np.ndarray
+    eliminated: list[tuple[str, int]]  # the equations the aliases came from, and the variable each one replaced
+
+
+def equation_offsets(groups: tuple[EquationGroup, ...]) -> np.ndarray:
+    """First equation id of each group, and the total."""
+    return np.concatenate([[0], np.cumsum([len(g) for g in groups])]).astype(np.int64)
+
+
+def describe_equation(groups: tuple[EquationGroup, ...], equation: int) -> str:
+    """Where an equation comes from, in user names."""
+    offsets = equation_offsets(groups)
+    g = int(np.searchsorted(offsets, equation, side="right") - 1)
+    return groups[g].origin[equation - int(offsets[g])]

@@ -1,0 +1,32 @@
+"""The package's errors. Every message speaks in user names and says what to do."""
+
+import difflib
+from collections.abc import Iterable
+
+
+class ModelError(ValueError):
+    """The model as written is not well formed: a name, a port, a value, a shape."""
+
+
+class StructuralError(ModelError):
+    """The equations and the unknowns do not fit together, whatever their values."""
+
+
+class InitializationError(RuntimeError):
+    """No consistent initial point was found."""
+
+
+class SimulationError(RuntimeError):
+    """The integration stopped before its end."""
+
+
+def nearest(name: str, known: Iterable[str], count: int = 3) -> str:
+    """A clause that suggests known names near `name` (or lists a few of them)."""
+    known = list(known)
+    close = difflib.get_close_matches(name, known, n=count, cutoff=0.5)
+    if close:
+        return "did you mean " + " or ".join(repr(c) for c in close) + "?"
+    if not known:
+        return "there are none."
+    shown = ", ".join(repr(k) for k in known[:8])
+    return f"known names: {shown}{', …' if len(known) > 8 else '.'}"

@@ -1,0 +1,1 @@
+"""Components by physical domain."""

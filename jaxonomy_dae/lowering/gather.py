@@ -1,0 +1,84 @@
+"""Static gathers: how values that lie in several arrays come together as one.
+
+Where every quantity lies is known when the system is compiled: in which chunk, at which offset. A gather is therefore
+planned once, as the cheapest of a scalar read, a (strided) slice, a take, or a take from a concatenation.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+Chunk = Any  # an array of shape (n,), a scalar, or a tuple of scalars
+
+
+def take(array: Any, index: np.ndarray) -> Any:
+    """array[index] for a static index, as a slice where the index is an arithmetic progression."""
+    n = len(index)
+    if isinstance(array, tuple):
+        if n == len(array) and np.array_equal(index, np.arange(n)):
+            return jnp.stack(array)
+        return jnp.stack([array[k] for k in index])
+    if n == array.shape[0] and index[0] == 0 and np.array_equal(index, np.arange(n)):
+        return array
+    if n > 1:
+        step = int(index[1] - index[0])
+        if step > 0 and np.array_equal(index, index[0] + step * np.arange(n)):
+            return jax.lax.slice(array, (int(index[0]),), (int(index[-1]) + 1,), (step,))
+    if n == 1:
+        return jax.lax.slice(array, (int(index[0]),), (int(index[0]) + 1,))
+    return array[index]
+
+
+@dataclasses.dataclass(frozen=True)
+class Gather:
+    """n values with signs. `chunk` −1 in all places is the constant zero."""
+
+    chunk: np.ndarray
+    offset: np.ndarray
+    sign: np.ndarray
+
+    def read(self, chunks: list[Chunk], dtype) -> Any:
+        """The values: a scalar if n is 1 (or a Python 0.0 where all are zero), else an array of shape (n,)."""
+        n = len(self.chunk)
+        if (self.chunk < 0).all():
+            return 0.0
+        if n == 1:
+            value = _entry(chunks[self.chunk[0]], int(self.offset[0]))
+            return value if self.sign[0] > 0 else -value
+        if (self.chunk == self.chunk[0]).all():
+            source = chunks[self.chunk[0]]
+            value = source if _is_scalar(source) else take(source, self.offset)
+        else:
+            value = self._from_several(chunks, dtype)
+        if (self.sign > 0).all():
+            return value
+        if (self.sign < 0).all():
+            return -value
+        return value * jnp.asarray(self.sign, dtype)
+
+    def _from_several(self, chunks: list[Chunk], dtype) -> Any:
+        used = np.unique(self.chunk)
+        parts, start, position = [], np.zeros(int(used.max()) + 2, np.int64), 0
+        for c in used:
+            part = jnp.zeros(1, dtype) if c < 0 else _as_vector(chunks[c])
+            start[c] = position
+            parts.append(part)
+            position += part.shape[0]
+        return take(jnp.concatenate(parts), start[self.chunk] + np.maximum(self.offset, 0))
+
+
+def _is_scalar(chunk: Chunk) -> bool:
+    return not isinstance(chunk, tuple) and jnp.ndim(chunk) == 0
+
+
+def _as_vector(chunk: Chunk) -> Any:
+    if isinstance(chunk, tuple):
+        return jnp.stack(chunk)
+    return jnp.reshape(chunk, (-1,))
+
+
+def _entry(chunk: Chunk, offset: int) -> Any:
+    return chunk if _is_scalar(chunk) else chunk[offset]

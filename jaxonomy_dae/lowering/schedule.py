@@ -1,0 +1,159 @@
+"""The schedule: blocks of one shape and level become one step.
+
+Given the extended system and its BLT order, returns steps in the order of their evaluation. A step solves `n` blocks of
+the same shape at once: the same templates, slots filled in the same pattern. Most blocks are a single equation solved
+for its unknown.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from ..compiler.extend import Extended, ExtendedGroup
+from ..compiler.order_blocks import Blocks
+from ..compiler.tables import ZERO
+from ..compiler.tear import Tearing, tear
+from ..compiler.templates import AnyTemplate
+
+
+@dataclasses.dataclass(frozen=True)
+class SlotSource:
+    """Where a slot's value comes from, over the step's n blocks: a local unknown, or quantities known before."""
+
+    local: int  # −1: from outside
+    quantity: np.ndarray
+    sign: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class StepEquation:
+    """One equation of a step."""
+
+    template: AnyTemplate
+    slots: tuple[SlotSource, ...]
+    parameter: np.ndarray  # (n, parameters)
+    coefficient: np.ndarray  # (n, coefficients)
+    equation: np.ndarray  # extended equations (n,)
+
+
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """n blocks of one shape. `unknown[u]` are the quantities of the local unknown u, shape (n,)."""
+
+    level: int
+    equations: tuple[StepEquation, ...]
+    unknown: tuple[np.ndarray, ...]
+    tearing: Tearing
+    linear: bool
+
+    @property
+    def n(self) -> int:
+        return len(self.unknown[0])
+
+    @property
+    def carried(self) -> bool:
+        """Whether the tearing variables are part of the state array, to be refined by Newton's method."""
+        return not self.linear
+
+    def needs(self) -> np.ndarray:
+        """The quantities that must be known before."""
+        outside = [s.quantity for e in self.equations for s in e.slots if s.local < 0]
+        return np.unique(np.concatenate(outside)) if outside else np.zeros(0, np.int64)
+
+
+def build_schedule(extended: Extended, blocks: Blocks) -> tuple[Step, ...]:
+    """Groups the blocks into steps."""
+    group_of = np.empty(extended.n_equations, np.int64)
+    row_of = np.empty(extended.n_equations, np.int64)
+    for g, group in enumerate(extended.groups):
+        group_of[group.equation] = g
+        row_of[group.equation] = np.arange(len(group))
+
+    sizes = np.diff(blocks.pointer)
+    block_of_place = np.repeat(np.arange(len(blocks)), sizes)
+    keyed: list[tuple[tuple, Step]] = []
+    single = sizes[block_of_place] == 1
+    places = np.flatnonzero(single)
+    for g, group in enumerate(extended.groups):
+        here = places[group_of[blocks.equations[places]] == g]
+        if len(here):
+            keyed.extend(_single_steps(group, g, row_of, blocks, here, block_of_place))
+    shapes: dict[tuple, list[int]] = {}
+    details: dict[int, tuple] = {}
+    for b in np.flatnonzero(sizes > 1).tolist():
+        detail = _block_detail(extended, blocks, b, group_of, row_of)
+        details[b] = detail
+        shapes.setdefault((int(blocks.level[b]), detail[2]), []).append(b)
+    for (level, _), members in shapes.items():
+        step = _block_step(extended, level, [details[b] for b in members], group_of, row_of)
+        keyed.append(((level, 1, int(details[members[0]][0][0])), step))
+    keyed.sort(key=lambda pair: pair[0])
+    return tuple(step for _, step in keyed)
+
+
+def _single_steps(group: ExtendedGroup, g: int, row_of, blocks: Blocks, places, block_of_place):
+    rows = row_of[blocks.equations[places]]
+    unknown = blocks.unknowns[places]
+    level = blocks.level[block_of_place[places]]
+    hit = group.quantity[rows] == unknown[:, None]
+    shapes: dict[tuple, list[int]] = {}
+    for k, (lv, pattern) in enumerate(zip(level.tolist(), map(bytes, hit), strict=True)):
+        shapes.setdefault((lv, pattern), []).append(k)
+    for (lv, _), members in shapes.items():
+        r = rows[members]
+        positions = np.flatnonzero(hit[members[0]])
+        equation = _equation(group, r, {int(p): 0 for p in positions})
+        template = group.template
+        linear = template.is_affine_in([int(p) for p in positions])
+        torn = Tearing(((0, 0),), (), ()) if linear else Tearing((), (0,), (0,))
+        yield (lv, 0, int(equation.equation[0])), Step(lv, (equation,), (unknown[members],), torn, linear)
+
+
+def _equation(group: ExtendedGroup, rows: np.ndarray, local: dict[int, int]) -> StepEquation:
+    slots = tuple(
+        SlotSource(local.get(k, -1), group.quantity[rows, k], group.sign[rows, k])
+        for k in range(group.quantity.shape[1])
+    )
+    return StepEquation(group.template, slots, group.parameter[rows], group.coefficient[rows], group.equation[rows])
+
+
+def _block_detail(extended: Extended, blocks: Blocks, b: int, group_of, row_of):
+    """(equations, unknowns, shape) of a block, equations by template and unknowns by number."""
+    inside = slice(int(blocks.pointer[b]), int(blocks.pointer[b + 1]))
+    equations = sorted(blocks.equations[inside].tolist(), key=lambda e: (int(group_of[e]), e))
+    unknowns = sorted(blocks.unknowns[inside].tolist())
+    local = {q: u for u, q in enumerate(unknowns)}
+    shape = tuple(
+        (int(group_of[e]), tuple(local.get(q, -1) for q in extended.groups[group_of[e]].quantity[row_of[e]].tolist()))
+        for e in equations
+    )
+    return equations, unknowns, shape
+
+
+def _block_step(extended: Extended, level: int, details: list[tuple], group_of, row_of) -> Step:
+    shape = details[0][2]
+    equations = []
+    for k, (g, slots) in enumerate(shape):
+        rows = row_of[np.array([d[0][k] for d in details])]
+        equations.append(_equation(extended.groups[g], rows, {s: u for s, u in enumerate(slots) if u >= 0}))
+    n_unknowns = len(details[0][1])
+    unknown = tuple(np.array([d[1][u] for d in details]) for u in range(n_unknowns))
+    linear = True
+    contains, solvable = [], []
+    for (_, slots), equation in zip(shape, equations, strict=True):
+        template = equation.template
+        positions = [k for k, u in enumerate(slots) if u >= 0]
+        linear &= template.is_affine_in(positions)
+        contains.append(frozenset(u for u in slots if u >= 0))
+        safe = set()
+        for u in contains[-1]:
+            where = [k for k in positions if slots[k] == u]
+            if len(where) == 1 and template.coefficient_never_vanishes(where[0]):
+                safe.add(u)
+        solvable.append(frozenset(safe))
+    return Step(level, tuple(equations), unknown, tear(contains, solvable), linear)
+
+
+def known_zero(source: SlotSource) -> bool:
+    """Whether the slot is the constant zero in all blocks."""
+    return source.local < 0 and bool((source.quantity == ZERO).all())

@@ -1,0 +1,172 @@
+"""The compiled model."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..errors import ModelError, nearest
+from .dynamics import Point
+from .lower import SystemPlan
+from .parameters import Parameters
+
+
+class AcausalSystem(eqx.Module):
+    """A compiled model, an `equinox.Module` whose leaves are its parameters and the weights of its networks.
+
+    - `parameters`: a flat array with names, `system.parameters["pend.m"]`.
+    - `neural`: the networks by name, `system.neural["drag"]`.
+    - `states`, `algebraics`, `variables`: names.
+    """
+
+    parameters: Parameters
+    neural: dict[str, Any]
+    plan: SystemPlan = eqx.field(static=True)
+
+    # --- names -------------------------------------------------------------------------------------------------
+
+    @property
+    def states(self) -> list[str]:
+        """The names of the differential states, in the order of the state array."""
+        return [self.plan.quantity_name[q] for q in self.plan.states]
+
+    @property
+    def carried(self) -> list[str]:
+        """Tearing variables of nonlinear blocks: they follow the states in the state array, as algebraic unknowns."""
+        return [self.plan.quantity_name[q] for q in self.plan.carried]
+
+    @property
+    def variables(self) -> list[str]:
+        """All variables of the model, eliminated ones included."""
+        return self.plan.visible_variables
+
+    @property
+    def algebraics(self) -> list[str]:
+        """The variables that are no states, nor equal to one."""
+        chosen = set(self.plan.states.tolist())
+        inputs = set(self.plan.inputs.names)
+        names = self.plan.variable_index
+        return [n for n in self.variables if n not in inputs and self.plan.quantity_of(names[n])[0] not in chosen]
+
+    @property
+    def inputs(self) -> list[str]:
+        """The names of the inputs."""
+        return list(self.plan.inputs.names)
+
+    @property
+    def report(self):
+        """What the compiler did, to be printed."""
+        from .report import SystemReport
+
+        return SystemReport(self.plan)
+
+    # --- changing ----------------------------------------------------------------------------------------------
+
+    def with_parameters(self, values: Mapping[str, Any]) -> "AcausalSystem":
+        """A system with new parameter values (numbers or tracers); nothing is compiled again.
+
+        **Raises:**
+
+        - `ModelError` for unknown names, values that are not finite or out of bounds.
+        """
+        return eqx.tree_at(lambda s: s.parameters, self, self.parameters.replaced(values))
+
+    def partition(self, *names: str) -> tuple["AcausalSystem", "AcausalSystem"]:
+        """Separates what is trained: `(trainable, frozen)`, to be joined again by `equinox.combine`.
+
+        `names` are networks (`"drag"`) and parameters (`"pend.m"`).
+
+        **Raises:**
+
+        - `ModelError` for a name that is neither.
+        """
+        chosen_networks = {n for n in names if n in self.neural}
+        chosen_parameters = tuple(n for n in dict.fromkeys(names) if n not in self.neural)
+        for name in chosen_parameters:
+            if name not in self.parameters.names:
+                raise ModelError(
+                    f"'{name}' is neither a network nor a parameter: "
+                    + nearest(name, [*self.neural, *self.parameters.names])
+                )
+        system = eqx.tree_at(lambda s: s.parameters, self, self.parameters.freed(chosen_parameters))
+        wanted = jax.tree.map(lambda _: False, system)
+        if chosen_parameters:
+            wanted = eqx.tree_at(lambda s: s.parameters.free, wanted, True)
+        if chosen_networks:
+            flags = {
+                n: jax.tree.map(eqx.is_inexact_array, w) if n in chosen_networks else wanted.neural[n]
+                for n, w in system.neural.items()
+            }
+            wanted = eqx.tree_at(lambda s: s.neural, wanted, flags)
+        return eqx.partition(system, wanted)
+
+    def merged(self) -> "AcausalSystem":
+        """The same system with nothing set apart by `partition`."""
+        return eqx.tree_at(lambda s: s.parameters, self, self.parameters.merged())
+
+    # --- computing ---------------------------------------------------------------------------------------------
+
+    def _point(self, t: Any, args: Any) -> Point:
+        networks = tuple(self.neural[n] for n in self.plan.network_names)
+        return Point(self.plan, self.parameters.array, networks, t, args)
+
+    def vector_field(self, t: Any, x: Float[Array, " n"], args: Any = None) -> Float[Array, " n"]:
+        """d(state)/dt for `diffrax.ODETerm(system.vector_field)`; `args` is the dictionary of inputs, or None."""
+        return self._point(t, args).vector_field(x)
+
+    def project(self, t: Any, x: Float[Array, " n"], args: Any = None, iterations: int = 1) -> Float[Array, " n"]:
+        """The state moved onto the hidden constraints (nothing to do if there are none)."""
+        return self._point(t, args).project(x, iterations)
+
+    @property
+    def is_constrained(self) -> bool:
+        """Whether a state must satisfy hidden constraints, or carries unknowns of nonlinear blocks."""
+        return bool(self.plan.n_constraints or len(self.plan.carried))
+
+    def constraint_residual(self, t: Any, x: Float[Array, " n"], args: Any = None) -> Float[Array, " m"]:
+        """The residuals of all hidden constraints at a state."""
+        point = self._point(t, args)
+        state = point.split(x)
+        parts = [point.constraint_vector(state)]
+        if len(self.plan.carried):
+            parts.append(point.carried_vector(point.t, state))
+        return jnp.concatenate(parts)
+
+    def observe(self, names: str | Sequence[str], t: Any, x: Float[Array, " n"], args: Any = None) -> Any:
+        """The values of variables at a state: a scalar for one name, shape `(len(names),)` for several.
+
+        **Raises:**
+
+        - `ModelError` for an unknown name.
+        """
+        single = isinstance(names, str)
+        quantity, sign = self.plan.resolve([names] if single else list(names))
+        values = self._point(t, args).quantities(x, quantity, sign)
+        return values[0] if single else values
+
+    def initialize(
+        self, t0: Any = 0.0, inputs: Mapping[str, Any] | None = None, initial: Mapping[str, Any] | None = None
+    ) -> Float[Array, " n"]:
+        """A consistent state at `t0`: all equations, hidden ones included, and the fixed starts hold.
+
+        **Arguments:**
+
+        - `t0`: the initial time.
+        - `inputs`: as in `simulate`.
+        - `initial`: values of variables at `t0`; they outrank the starts declared in components.
+
+        **Returns:**
+
+        The state, shape `(len(states) + len(carried),)`: differentiable with respect to parameters and values given.
+
+        **Raises:**
+
+        - `InitializationError` if fixed starts contradict the equations, or no consistent point was found.
+        """
+        from .initialize import check, initialize
+
+        x, residual = initialize(self, t0, inputs, initial)
+        return check(self, x, residual, initial)

@@ -1,0 +1,10 @@
+"""What a user writes: environment, symbols, ports, components, diagrams, learned terms."""
+
+from .component import Component as Component
+from .diagram import AcausalDiagram as AcausalDiagram
+from .environment import EqnEnv as EqnEnv
+from .neural import NeuralDAEBlock as NeuralDAEBlock
+from .ports import Domain as Domain
+from .ports import Electrical as Electrical
+from .ports import Translational as Translational
+from .symbols import der as der

@@ -1,0 +1,388 @@
+"""The base class of everything a user models with."""
+
+import dataclasses
+import math
+import numbers
+from collections.abc import Sequence
+from typing import Any, Self
+
+import numpy as np
+import sympy
+
+from ..errors import ModelError, nearest
+from .environment import EqnEnv
+from .ports import Domain, Port
+from .symbols import ParameterSymbol, TimeSymbol, VariableSymbol
+
+
+@dataclasses.dataclass(frozen=True)
+class Parameter:
+    """A declared parameter: its local name, value, unit and bounds."""
+
+    name: str
+    value: Any
+    unit: str
+    bounds: tuple[float, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Variable:
+    """A declared variable: `kind` is 'variable', 'input', 'output', 'learned' or 'port'."""
+
+    name: str
+    kind: str
+    start: Any
+    fixed: bool
+    nominal: float
+    unit: str
+    default: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Learned:
+    """A network in the equations: outputs = network(inputs), all named by local variables."""
+
+    name: str
+    network: Any
+    inputs: tuple[VariableSymbol | TimeSymbol, ...]
+    outputs: tuple[VariableSymbol, ...]
+
+
+class _Sealing(type):
+    """Closes a component when its construction ends: from then on its symbols are seen from the outside."""
+
+    def __call__(cls, *args, **kwargs):
+        component = super().__call__(*args, **kwargs)
+        component._sealed = True
+        return component
+
+
+class Component(metaclass=_Sealing):
+    """The base class of all components: subclass it, and declare physics in `__init__`.
+
+    ```python
+    class Tank(Component):
+        def __init__(self, ev, name, area=1.0, outlet=0.1, initial_level=1.0):
+            super().__init__(ev, name)
+            A = self.parameter("area", area, unit="m2")
+            k = self.parameter("outlet", outlet)
+            h0 = self.parameter("initial_level", initial_level, unit="m")
+            h = self.variable("level", start=h0, fixed=True, unit="m")
+            self.add_equations(Eq(A * der(h), -k * sqrt(h)))
+    ```
+
+    **Arguments:**
+
+    - `ev`: the model's `EqnEnv`.
+    - `name`: the component's name, without dots; the model's names are `"name.variable"`.
+
+    A variable of a child component is written as an attribute of the child, `self.r1.v`, or as `self.r1["v"]`.
+    """
+
+    def __init__(self, ev: EqnEnv, name: str):
+        if not isinstance(ev, EqnEnv):
+            raise ModelError(f"the first argument of a component is an EqnEnv; got {type(ev).__name__}")
+        if not isinstance(name, str) or not name or "." in name or any(c.isspace() for c in name):
+            raise ModelError(f"a component's name is a non-empty string without dots or spaces; got {name!r}")
+        self.ev = ev
+        self.name = name
+        self.parent: Component | None = None
+        self.parameters: dict[str, Parameter] = {}
+        self.variables: dict[str, Variable] = {}
+        self.ports: dict[str, Port] = {}
+        self.children: dict[str, Component] = {}
+        self.equations: list[sympy.Expr] = []
+        self.learned_terms: list[Learned] = []
+        self.connections: list[tuple[Port, ...]] = []
+        self._sealed = False
+
+    # --- names -------------------------------------------------------------------------------------------------
+
+    @property
+    def path(self) -> str:
+        """The component's full name: `parent.child`."""
+        return self.name if self.parent is None else f"{self.parent.path}.{self.name}"
+
+    def _outside_path(self) -> str:
+        """The path of this component as seen from the nearest ancestor that is still being written."""
+        if not self._sealed:
+            return ""
+        above = "" if self.parent is None else self.parent._outside_path()
+        return f"{above}{self.name}."
+
+    def symbol(self, name: str) -> sympy.Symbol:
+        """The symbol of a declared variable or parameter, as the component now being written sees it."""
+        if name in self.variables:
+            return VariableSymbol(self._outside_path() + name)
+        if name in self.parameters:
+            return ParameterSymbol(self._outside_path() + name)
+        raise ModelError(
+            f"component '{self.path}' has no variable or parameter '{name}': "
+            + nearest(name, [*self.variables, *self.parameters])
+        )
+
+    __getitem__ = symbol
+
+    def __getattr__(self, name: str) -> Any:
+        # Reached only for names that are no plain attributes: declared symbols, ports, children.
+        if not name.startswith("_"):
+            for table in ("ports", "children"):
+                if name in self.__dict__.get(table, ()):
+                    return self.__dict__[table][name]
+            declared = [*self.__dict__.get("variables", ()), *self.__dict__.get("parameters", ())]
+            if name in declared:
+                return self.symbol(name)
+        raise AttributeError(f"{type(self).__name__} has no attribute '{name}'")
+
+    def __setattr__(self, name: str, value: Any):
+        # `self.v = self.variable("v")` is allowed and stores nothing: a stored symbol would keep the inside's name.
+        if isinstance(value, VariableSymbol | ParameterSymbol):
+            if name == value.name and (name in self.variables or name in self.parameters):
+                return
+            raise ModelError(
+                f"component '{self.name}': cannot store the symbol '{value}' as attribute '{name}', because its name "
+                f"changes when the component is seen from outside. Use a local Python variable; outside, the symbol is "
+                f"`component[\"{value}\"]`."
+            )
+        super().__setattr__(name, value)
+
+    def _claim(self, name: str, what: str):
+        if self._sealed:
+            raise ModelError(
+                f"component '{self.path}' is complete: declare its {what} '{name}' inside __init__ of its class"
+            )
+        if not isinstance(name, str) or not name or "." in name:
+            raise ModelError(f"component '{self.name}': a {what}'s name is a string without dots; got {name!r}")
+        for table, kind in (
+            (self.parameters, "parameter"),
+            (self.variables, "variable"),
+            (self.ports, "port"),
+            (self.children, "child component"),
+        ):
+            if name in table:
+                raise ModelError(
+                    f"component '{self.name}' uses the name '{name}' twice: it is a {kind} already; rename the {what}"
+                )
+        if any(term.name == name for term in self.learned_terms):
+            raise ModelError(f"component '{self.name}' uses the name '{name}' twice: it is a learned term already")
+
+    # --- declarations ------------------------------------------------------------------------------------------
+
+    def parameter(
+        self, name: str, value: Any, unit: str = "", bounds: tuple[float, float] = (-math.inf, math.inf)
+    ) -> ParameterSymbol:
+        """Declares a parameter: a number that is constant in time and can be set, trained and differentiated.
+
+        **Arguments:**
+
+        - `name`: its local name.
+        - `value`: a finite number (a Python or NumPy scalar).
+        - `unit`: shown in reports and plots.
+        - `bounds`: the closed interval of admissible values.
+
+        **Raises:**
+
+        - `ModelError` if the value is no finite number inside the bounds.
+        """
+        self._claim(name, "parameter")
+        where = f"{self.name}.{name}"
+        try:
+            number = float(value)
+        except (TypeError, ValueError):
+            raise ModelError(
+                f"parameter '{where}' must be a number; got {type(value).__name__}. To vary or differentiate it, "
+                f"compile once and use `system.with_parameters({{'{where}': value}})`"
+            ) from None
+        if not math.isfinite(number):
+            raise ModelError(f"parameter '{where}' must be finite; got {number}")
+        low, high = bounds
+        if not low <= number <= high:
+            raise ModelError(f"parameter '{where}' must lie in [{low}, {high}]; got {number}")
+        self.parameters[name] = Parameter(name, number, unit, (float(low), float(high)))
+        return ParameterSymbol(name)
+
+    def _declare(self, name: str, kind: str, start=None, fixed=False, nominal=1.0, unit="", default=None):
+        if not (isinstance(nominal, numbers.Real) and math.isfinite(nominal) and nominal > 0):
+            raise ModelError(f"the nominal value of '{self.name}.{name}' must be a positive number; got {nominal}")
+        if fixed and start is None:
+            raise ModelError(f"'{self.name}.{name}' is fixed at the start but has no start value: give `start=`")
+        if start is not None:
+            start = sympy.sympify(start)
+            if isinstance(start, sympy.Number) and not start.is_finite:
+                raise ModelError(f"the start value of '{self.name}.{name}' must be finite; got {start}")
+            wrong = [s for s in start.free_symbols if not isinstance(s, ParameterSymbol)]
+            if wrong:
+                raise ModelError(
+                    f"the start value of '{self.name}.{name}' may use parameters only; it uses '{wrong[0]}'"
+                )
+        self.variables[name] = Variable(name, kind, start, bool(fixed), float(nominal), unit, default)
+        return VariableSymbol(name)
+
+    def variable(
+        self, name: str, start: Any = None, fixed: bool = False, nominal: float = 1.0, unit: str = ""
+    ) -> VariableSymbol:
+        """Declares a variable, an unknown function of time.
+
+        **Arguments:**
+
+        - `name`: its local name.
+        - `start`: a number or an expression in parameters: its value at the initial time.
+        - `fixed`: whether `start` must hold; otherwise it guides the search for a consistent initial point.
+        - `nominal`: a positive number, its typical size in its unit; scales tolerances and projections.
+        - `unit`: shown in reports and plots.
+        """
+        self._claim(name, "variable")
+        return self._declare(name, "variable", start, fixed, nominal, unit)
+
+    def input(self, name: str, default: float | None = None, unit: str = "") -> VariableSymbol:
+        """Declares an input: a function of time given to `simulate(inputs={"component.name": ...})`.
+
+        With a `default` it may be left out, and is then that constant.
+        """
+        self._claim(name, "input")
+        return self._declare(name, "input", unit=unit, default=None if default is None else float(default))
+
+    def output(self, name: str, expr: Any, unit: str = "") -> VariableSymbol:
+        """Declares a variable that equals `expr`, to be read in the solution."""
+        self._claim(name, "output")
+        symbol = self._declare(name, "output", unit=unit)
+        self.add_equations(sympy.Eq(symbol, expr, evaluate=False))
+        return symbol
+
+    def port(self, name: str, domain: Domain) -> Port:
+        """Declares a port of the given domain; returns it, with its variables as attributes."""
+        self._claim(name, "port")
+        if not isinstance(domain, Domain):
+            raise ModelError(f"port '{self.name}.{name}' needs a Domain such as Electrical; got {domain!r}")
+        port = Port(self, name, domain)
+        self.ports[name] = port
+        for variable, unit in (*domain.across, *domain.through):
+            self._declare(f"{name}.{variable}", "port", unit=unit)
+        return port
+
+    def learned(
+        self, name: str, network: Any, inputs: Sequence[Any], outputs: int | None = None
+    ) -> tuple[VariableSymbol, ...]:
+        """Puts a network into the equations: its outputs are variables, one symbol each.
+
+        **Arguments:**
+
+        - `name`: of the network; its weights are `system.neural["component.name"]`, its outputs the variables
+            `component.name` (one output) or `component.name[0]`, `component.name[1]`, …
+        - `network`: a callable pytree, `network(u) -> (outputs,)`, such as an `equinox.nn.MLP`.
+        - `inputs`: symbols of variables (or `ev.t`); `u` has shape `(len(inputs),)`, in this order.
+        - `outputs`: how many outputs; found by tracing the network when left out.
+
+        **Returns:**
+
+        A tuple of symbols. They may stand in any equation, algebraic ones included; where index reduction
+        differentiates them, the network is differentiated with `jax.jvp`.
+
+        **Raises:**
+
+        - `ModelError` if the network does not take `(len(inputs),)` or does not return a vector.
+        """
+        self._claim(name, "learned term")
+        from .neural import count_outputs
+
+        if not callable(network):
+            raise ModelError(f"learned term '{self.name}.{name}': the network must be callable; got {network!r}")
+        symbols = []
+        for entry in inputs:
+            entry = sympy.sympify(entry)
+            if not isinstance(entry, VariableSymbol | TimeSymbol):
+                raise ModelError(
+                    f"learned term '{self.name}.{name}': inputs are symbols of variables or ev.t; got '{entry}'"
+                )
+            symbols.append(entry)
+        found = count_outputs(network, len(symbols), f"learned term '{self.name}.{name}'")
+        if outputs is not None and outputs != found:
+            raise ModelError(
+                f"learned term '{self.name}.{name}': expected {outputs} outputs, but the network returns {found}"
+            )
+        names = [name] if found == 1 else [f"{name}[{k}]" for k in range(found)]
+        declared = tuple(self._declare(n, "learned") for n in names)
+        self.learned_terms.append(Learned(name, network, tuple(symbols), declared))
+        return declared
+
+    def add_equations(self, *equations: Any) -> None:
+        """Adds equations: SymPy `Eq`s, or expressions that are zero.
+
+        **Raises:**
+
+        - `ModelError` if an equation is trivially true or false, or has a symbol the component does not know.
+        """
+        if self._sealed:
+            raise ModelError(f"component '{self.path}' is complete: add its equations inside __init__ of its class")
+        for equation in equations:
+            if isinstance(equation, sympy.Eq):
+                residual = equation.lhs - equation.rhs
+            elif isinstance(equation, bool | sympy.logic.boolalg.BooleanAtom):
+                raise ModelError(
+                    f"component '{self.name}': an equation is always {equation}; does it say what you mean? "
+                    "(`a == b` compares; write `Eq(a, b)`)"
+                )
+            else:
+                residual = sympy.sympify(equation)
+            if not isinstance(residual, sympy.Expr):
+                raise ModelError(f"component '{self.name}': {equation!r} is no equation")
+            if not any(isinstance(s, VariableSymbol) for s in residual.free_symbols):
+                raise ModelError(f"component '{self.name}': the equation {equation} contains no variable")
+            self.equations.append(residual)
+
+    # --- hierarchy ---------------------------------------------------------------------------------------------
+
+    def add(self, child: "Component") -> Any:
+        """Adds a child component and returns it; its names become `"self.child.variable"`."""
+        if not isinstance(child, Component):
+            raise ModelError(f"component '{self.name}': only components can be added; got {type(child).__name__}")
+        if child.parent is not None:
+            raise ModelError(f"component '{child.name}' already belongs to '{child.parent.path}'")
+        self._claim(child.name, "child component")
+        child.parent = self
+        self.children[child.name] = child
+        return child
+
+    def connect(self, *ends: Any) -> Self:
+        """Connects ports of this component and of its children: `connect(a.p, b.n, …)` or `connect(a, "p", b, "n")`."""
+        self.connections.append(resolve_ports(ends, f"component '{self.name}'"))
+        return self
+
+    def __repr__(self):
+        return f"{type(self).__name__}({self.path!r})"
+
+
+def resolve_ports(ends: Sequence[Any], where: str) -> tuple[Port, ...]:
+    """Reads the arguments of a `connect` call: ports, or pairs (component, port name), of one domain."""
+    ports: list[Port] = []
+    rest = list(ends)
+    while rest:
+        end = rest.pop(0)
+        if isinstance(end, Component):
+            if not rest or not isinstance(rest[0], str):
+                raise ModelError(f"{where}: connect(component, \"port\", …) needs a port name after '{end.path}'")
+            name = rest.pop(0)
+            if name not in end.ports:
+                raise ModelError(f"component '{end.path}' has no port '{name}': " + nearest(name, end.ports))
+            end = end.ports[name]
+        if not isinstance(end, Port):
+            raise ModelError(f"{where}: connect takes ports, or a component and a port name; got {end!r}")
+        ports.append(end)
+    if len(ports) < 2:
+        raise ModelError(f"{where}: connect needs at least two ports; got {len(ports)}")
+    for port in ports[1:]:
+        if port.domain != ports[0].domain:
+            raise ModelError(
+                f"{where}: cannot connect {port!r} to {ports[0]!r}: a connection joins ports of one domain"
+            )
+    if len({id(p) for p in ports}) < len(ports):
+        raise ModelError(f"{where}: a port is connected to itself: {', '.join(map(repr, ports))}")
+    return tuple(ports)
+
+
+def number_of(value: Any, what: str) -> float:
+    """A finite float, or a `ModelError` that says what was expected."""
+    array = np.asarray(value)
+    if array.shape != () or not np.issubdtype(array.dtype, np.number) or not np.isfinite(array):
+        raise ModelError(f"{what} must be a finite number; got {value!r}")
+    return float(array)

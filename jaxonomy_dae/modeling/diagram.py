@@ -1,0 +1,80 @@
+"""A model: components, the connections between them, and learned corrections."""
+
+from typing import Any, Self
+
+from ..errors import ModelError
+from .component import Component, resolve_ports
+from .neural import NeuralDAEBlock
+from .ports import Port
+
+
+class AcausalDiagram:
+    """The top level of a model.
+
+    ```python
+    diagram = AcausalDiagram()
+    diagram.add(source, resistor, ground)
+    diagram.connect(source.p, resistor.p)
+    diagram.connect(resistor, "n", ground, "p")
+    ```
+
+    A connected component is added by itself; `add` is needed for those without connections only.
+    """
+
+    def __init__(self, name: str | None = None):
+        self.name = name
+        self.components: dict[str, Component] = {}
+        self.connections: list[tuple[Port, ...]] = []
+        self.blocks: dict[str, NeuralDAEBlock] = {}
+
+    def add(self, *components: Component) -> Self:
+        """Adds components to the model.
+
+        **Raises:**
+
+        - `ModelError` if a name is used twice, or a component belongs to another one already.
+        """
+        for component in components:
+            if not isinstance(component, Component):
+                raise ModelError(f"only components can be added to a diagram; got {type(component).__name__}")
+            if component.parent is not None:
+                raise ModelError(f"component '{component.path}' is part of '{component.parent.path}': add that one")
+            known = self.components.get(component.name)
+            if known is component:
+                continue
+            if known is not None:
+                raise ModelError(f"two components are named '{component.name}': rename one of them")
+            if component.name in self.blocks:
+                raise ModelError(f"'{component.name}' names a neural block already: rename the component")
+            self.components[component.name] = component
+        return self
+
+    def connect(self, *ends: Any) -> Self:
+        """Connects ports: `connect(a.p, b.n, …)`, or `connect(a, "p", b, "n")`.
+
+        **Raises:**
+
+        - `ModelError` if a port does not exist or the ports are of different domains.
+        """
+        ports = resolve_ports(ends, "diagram")
+        for port in ports:
+            top = port.component
+            while top.parent is not None:
+                top = top.parent
+            self.add(top)
+        self.connections.append(ports)
+        return self
+
+    def add_neural_correction_block(self, block: NeuralDAEBlock) -> Self:
+        """Adds a learned correction; several may be added, also on the same target, and their effects sum.
+
+        **Raises:**
+
+        - `ModelError` if the name is used already.
+        """
+        if not isinstance(block, NeuralDAEBlock):
+            raise ModelError(f"expected a NeuralDAEBlock; got {type(block).__name__}")
+        if block.name in self.blocks or block.name in self.components:
+            raise ModelError(f"the name '{block.name}' is used twice: rename the neural block")
+        self.blocks[block.name] = block
+        return self

@@ -1,0 +1,26 @@
+"""What all components of one model share."""
+
+from .symbols import TIME, TimeSymbol
+
+
+class EqnEnv:
+    """The environment of a model's equations.
+
+    **Arguments:**
+
+    - `constants`: named numbers every component of the model can read, such as `gravity=9.81`, as
+        `ev.constants["gravity"]`. They are plain numbers: what is to be trained or varied should be a parameter.
+
+    `ev.t` is the symbol of time; it may stand in any equation.
+    """
+
+    t: TimeSymbol
+    constants: dict[str, float]
+
+    def __init__(self, **constants: float):
+        self.t = TIME
+        self.constants = dict(constants)
+
+    def __repr__(self):
+        inside = ", ".join(f"{k}={v}" for k, v in self.constants.items())
+        return f"EqnEnv({inside})"

@@ -1,0 +1,105 @@
+"""Learned corrections of a model's equations."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from ..errors import ModelError
+from .component import Component
+
+
+def as_weights(theta: Any) -> Any:
+    """Weights as arrays: Python and NumPy numbers become JAX arrays, everything else stays."""
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf) if eqx.is_inexact_array_like(leaf) else leaf, theta)
+
+
+def count_outputs(network: Callable, inputs: int, where: str, theta: Any = None) -> int:
+    """The number of outputs of `network(u)` or `network(t, u, theta)`, found without computing anything."""
+    dtypes = [leaf.dtype for leaf in jax.tree.leaves((network, theta)) if eqx.is_inexact_array(leaf)]
+    dtype = dtypes[0] if dtypes else jnp.zeros(()).dtype
+    u = jax.ShapeDtypeStruct((inputs,), dtype)
+    try:
+        if theta is None:
+            out = eqx.filter_eval_shape(network, u)
+        else:
+            out = eqx.filter_eval_shape(network, jax.ShapeDtypeStruct((), dtype), u, theta)
+    except Exception as error:
+        signature = f"network(u) with u of shape ({inputs},)"
+        if theta is not None:
+            signature = f"network(t, u, theta) with u of shape ({inputs},)"
+        raise ModelError(f"{where}: calling {signature} failed: {error}") from error
+    if not (hasattr(out, "shape") and len(out.shape) == 1):
+        found = getattr(out, "shape", type(out).__name__)
+        raise ModelError(f"{where}: the network must return a vector of shape (outputs,); got shape {found}")
+    return out.shape[0]
+
+
+class NeuralDAEBlock:
+    """A learned correction on the time derivatives of target variables.
+
+    **Arguments:**
+
+    - `network`: an Equinox module (any callable pytree) `network(u) -> (n_targets,)`; or, with `theta`, a function
+        `network(t, u, theta) -> (n_targets,)`.
+    - `theta`: the weights of a plain function, any pytree of arrays (a flat vector, usually).
+    - `targets`: pairs `(component, "variable")` or full names `"component.variable"`, one for each output.
+    - `inputs`: what `u` gathers, in this order; pairs, names, or `"time"`. Default: the targets.
+    - `name`: `system.neural[name]` holds the module, or `theta`.
+    - `inject`: `"equation"` makes the target's derivative *physics + correction* inside the model's equations, so that
+        hidden constraints and multipliers respond. `"row"` adds the correction to the finished right-hand side of the
+        target's row instead, and the constraints never see it; the target must then be a state, and the
+        system compiled with `state_selection="dummy_derivatives"`.
+
+    **Raises:**
+
+    - `ModelError` if targets or inputs are malformed, or the network's output does not have one entry a target.
+    """
+
+    def __init__(
+        self,
+        network: Callable,
+        theta: Any = None,
+        *,
+        targets: Sequence[Any],
+        inputs: Sequence[Any] | None = None,
+        name: str,
+        inject: Literal["equation", "row"] = "equation",
+    ):
+        where = f"neural block '{name}'"
+        if not isinstance(name, str) or not name or "." in name:
+            raise ModelError(f"a neural block's name is a non-empty string without dots; got {name!r}")
+        if not callable(network):
+            raise ModelError(f"{where}: the network must be callable; got {network!r}")
+        if inject not in ("equation", "row"):
+            raise ModelError(f"{where}: inject is 'equation' or 'row'; got {inject!r}")
+        if isinstance(targets, str) or not targets:
+            raise ModelError(f"{where}: targets is a non-empty list of (component, \"variable\"); got {targets!r}")
+        self.name = name
+        self.network = network
+        self.theta = None if theta is None else as_weights(theta)
+        self.inject = inject
+        self.targets = tuple(_reference(t, where) for t in targets)
+        self.inputs = self.targets if inputs is None else tuple(_reference(i, where) for i in inputs)
+        found = count_outputs(network, len(self.inputs), where, self.theta)
+        if found != len(self.targets):
+            raise ModelError(
+                f"{where}: expected one output for each of its {len(self.targets)} targets, shape "
+                f"({len(self.targets)},), but the network returns shape ({found},)"
+            )
+
+    def __repr__(self):
+        return f"NeuralDAEBlock({self.name!r}, inject={self.inject!r})"
+
+
+def _reference(entry: Any, where: str) -> tuple[Component | None, str]:
+    """A reference to a variable: (component, local name), or (None, full name)."""
+    if isinstance(entry, str):
+        return None, entry
+    if isinstance(entry, tuple | list) and len(entry) == 2:
+        component, name = entry
+        if isinstance(component, Component) and isinstance(name, str):
+            return component, name
+    raise ModelError(f"{where}: expected (component, \"variable\") or \"component.variable\"; got {entry!r}")

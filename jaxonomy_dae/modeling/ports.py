@@ -1,0 +1,47 @@
+"""Ports: where components meet.
+
+A domain names the quantities that are equal at a junction (across) and those that sum to zero (through), counted
+positive into the component.
+"""
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .component import Component
+
+
+@dataclasses.dataclass(frozen=True)
+class Domain:
+    """A physical domain: its across variables and its through variables, with units."""
+
+    name: str
+    across: tuple[tuple[str, str], ...]
+    through: tuple[tuple[str, str], ...]
+
+
+Electrical = Domain("Electrical", across=(("v", "V"),), through=(("i", "A"),))
+Translational = Domain("Translational", across=(("x", "m"),), through=(("f", "N"),))
+
+
+class Port:
+    """A port of a component; its variables are attributes: `self.p.v`, `self.p.i`."""
+
+    def __init__(self, component: "Component", name: str, domain: Domain):
+        self.component = component
+        self.name = name
+        self.domain = domain
+
+    def __getattr__(self, name: str):
+        if name.startswith("__"):
+            raise AttributeError(name)
+        domain = self.domain
+        known = [n for n, _ in (*domain.across, *domain.through)]
+        if name not in known:
+            raise AttributeError(
+                f"the {domain.name} port '{self.component.name}.{self.name}' has no '{name}': it has {', '.join(known)}"
+            )
+        return self.component.symbol(f"{self.name}.{name}")
+
+    def __repr__(self):
+        return f"{self.component.path}.{self.name}: {self.domain.name} port"

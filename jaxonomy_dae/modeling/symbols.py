@@ -1,0 +1,91 @@
+"""Symbols of a component's equations.
+
+A symbol is named by its path *relative to the component that uses it* (`v`, `p.i`, and `child.v` in a parent),
+so all instances of a component class share literally the same SymPy expressions. Which variable of the model a
+symbol means is decided when the diagram is flattened, by integers.
+"""
+
+from typing import Any
+
+import sympy
+
+from ..errors import ModelError
+
+
+class VariableSymbol(sympy.Symbol):
+    """A variable, or its `order`-th time derivative, seen from one component."""
+
+    __slots__ = ("order", "path")
+    path: str
+    order: int
+
+    def __new__(cls, path: str, order: int = 0):
+        name = "der(" * order + path + ")" * order
+        symbol = super().__new__(cls, name, real=True)
+        symbol.path = path
+        symbol.order = order
+        return symbol
+
+    def __getnewargs_ex__(self):
+        return (self.path, self.order), {}
+
+
+class ParameterSymbol(sympy.Symbol):
+    """A parameter seen from one component."""
+
+    __slots__ = ("path",)
+    path: str
+
+    def __new__(cls, path: str):
+        symbol = super().__new__(cls, path, real=True)
+        symbol.path = path
+        return symbol
+
+    def __getnewargs_ex__(self):
+        return (self.path,), {}
+
+
+class TimeSymbol(sympy.Symbol):
+    """The independent variable."""
+
+    __slots__ = ()
+
+    def __new__(cls):
+        return super().__new__(cls, "time", real=True)
+
+    def __getnewargs_ex__(self):
+        return (), {}
+
+
+TIME = TimeSymbol()
+
+
+def der(expression: Any) -> Any:
+    """The time derivative of a variable, or of an expression in variables, parameters and time.
+
+    **Arguments:**
+
+    - `expression`: a symbol returned by `Component.variable`, or any SymPy expression of such symbols. Calls
+        nest: `der(der(x))` is the second derivative.
+
+    **Returns:**
+
+    A SymPy expression that can stand in any equation. Parameters do not change in time, so their derivative is zero.
+
+    **Raises:**
+
+    - `ModelError` if the expression has a symbol that no component declared.
+    """
+    expression = sympy.sympify(expression)
+    if isinstance(expression, VariableSymbol):
+        return VariableSymbol(expression.path, expression.order + 1)
+    total = sympy.diff(expression, TIME)
+    for symbol in sorted(expression.free_symbols, key=lambda s: s.sort_key()):
+        if isinstance(symbol, VariableSymbol):
+            total += sympy.diff(expression, symbol) * VariableSymbol(symbol.path, symbol.order + 1)
+        elif not isinstance(symbol, ParameterSymbol | TimeSymbol):
+            raise ModelError(
+                f"der({expression}): the symbol '{symbol}' was declared by no component. "
+                "Use the symbols that `self.variable(...)` and `self.parameter(...)` return."
+            )
+    return total

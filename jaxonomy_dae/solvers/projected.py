@@ -1,0 +1,76 @@
+"""Projection after every step, for any Diffrax solver."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+from diffrax import AbstractSolver
+from diffrax import AbstractWrappedSolver as _Wrapped
+
+Projection = Callable[[Any, Any, Any], Any]
+
+
+class Projected(_Wrapped):
+    """Wraps a Diffrax solver: after every step, y₁ is moved onto a manifold.
+
+    The standard projection method (Hairer, Lubich & Wanner 2006, Geometric Numerical Integration, Algorithm IV.4.2): the
+    step, its error estimate and its dense output are those of the wrapped solver, and the projection changes y₁ by no
+    more than the step's error, so the order is kept. Between the ends of steps, the dense output lies on the manifold to
+    its own accuracy; `jaxonomy_dae.simulate` projects saved values too.
+
+    **Arguments:**
+
+    - `solver`: any Diffrax solver.
+    - `projection`: a function `(t, y, args) -> y` such as `system.project`; `simulate` fills it in if left out.
+    """
+
+    solver: AbstractSolver
+    projection: Projection | None = None
+
+    def __check_init__(self):
+        if isinstance(self.solver, Projected):
+            raise ValueError("the solver is wrapped in Projected already")
+
+    @property
+    def term_structure(self):
+        return self.solver.term_structure
+
+    @property
+    def interpolation_cls(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.solver.interpolation_cls
+
+    @property
+    def term_compatible_contr_kwargs(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.solver.term_compatible_contr_kwargs
+
+    def order(self, terms):
+        return self.solver.order(terms)
+
+    def strong_order(self, terms):
+        return self.solver.strong_order(terms)
+
+    def error_order(self, terms):
+        return self.solver.error_order(terms)
+
+    def init(self, terms, t0, t1, y0, args):
+        return self.solver.init(terms, t0, t1, y0, args)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        if self.projection is None:
+            raise ValueError("Projected needs a projection outside simulate(): Projected(solver, system.project)")
+        y1, y_error, dense_info, solver_state, result = self.solver.step(
+            terms, t0, t1, y0, args, solver_state, made_jump
+        )
+        return self.projection(t1, y1, args), y_error, dense_info, solver_state, result
+
+    def func(self, terms, t0, y0, args):
+        return self.solver.func(terms, t0, y0, args)
+
+
+def with_projection(solver: AbstractSolver, projection: Projection) -> Projected:
+    """The solver wrapped, or its own wrapper filled in."""
+    if isinstance(solver, _Wrapped) and isinstance(getattr(solver, "projection", None), Callable):
+        return solver  # type: ignore[return-value]
+    if type(solver) is Projected:
+        return eqx.tree_at(lambda s: s.projection, solver, projection, is_leaf=lambda v: v is None)
+    return Projected(solver, projection)
