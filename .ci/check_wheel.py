@@ -1,4 +1,4 @@
-"""Given a wheel's path, run where that wheel is installed: it holds the package alone, and importing it is inert."""
+"""Given a wheel, run where it is installed: it holds the package alone, and importing it is inert."""
 
 import importlib.metadata
 import importlib.util

@@ -60,9 +60,7 @@ class AcausalCompiler:
         if not isinstance(ev, EqnEnv) or not isinstance(diagram, AcausalDiagram):
             raise ModelError("AcausalCompiler(ev, diagram) needs an EqnEnv and an AcausalDiagram")
         if state_selection not in ("auto", "dummy_derivatives", "projection"):
-            raise ModelError(
-                f"state_selection is 'auto', 'dummy_derivatives' or 'projection'; got {state_selection!r}"
-            )
+            raise ModelError(f"state_selection is 'auto', 'dummy_derivatives' or 'projection'; got {state_selection!r}")
         if isinstance(prefer_states, str):
             raise ModelError(f"prefer_states is a list of names; write prefer_states=[{prefer_states!r}]")
         self.ev = ev

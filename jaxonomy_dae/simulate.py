@@ -77,7 +77,7 @@ def simulate(
         )
     options = (
         solver if solver is not None else diffrax.Tsit5(),
-        adjoint if adjoint is not None else diffrax.RecursiveCheckpointAdjoint(),
+        adjoint if adjoint is not None else default_adjoint(system.plan.n_state),
         stepsize_controller,
         max_steps,
         progress,
@@ -106,6 +106,16 @@ def simulate(
     if throw and not bool(diffrax.is_okay(result)):
         raise SimulationError(_explain(solution, float(t1), max_steps, rtol, atol))
     return solution
+
+
+def default_adjoint(n_state: int) -> diffrax.RecursiveCheckpointAdjoint:
+    """Reverse mode with as many checkpoints as are cheap.
+
+    Every step copies all checkpoints, and XLA on CPU does so twice as fast while each copied array has at most 64
+    entries. With c checkpoints, (c + 2)(c + 1)/2 steps are recomputed but once (Griewank & Walther 2000), so few are
+    enough.
+    """
+    return diffrax.RecursiveCheckpointAdjoint(checkpoints=64 // n_state if 1 <= n_state <= 6 else 32)
 
 
 @eqx.filter_jit
@@ -209,9 +219,7 @@ def _check_arguments(system, t0, t1, ts, inputs, initial, adjoint, solver, max_s
             raise ModelError(f"input '{name}' has no default: give it with inputs={{'{name}': function_of_time}}")
     for name, value in (initial or {}).items():
         if name in system.parameters.names:
-            raise ModelError(
-                f"initial: '{name}' is a parameter; use system.with_parameters({{'{name}': value}})"
-            )
+            raise ModelError(f"initial: '{name}' is a parameter; use system.with_parameters({{'{name}': value}})")
         quantity = system.plan.resolve([name])[0][0]
         if quantity < 0:
             raise ModelError(f"initial: '{name}' is identically zero in this model")
@@ -242,7 +250,9 @@ def _check_interval(t0, t1, ts):
     backwards = np.flatnonzero(np.diff(saved) < 0)
     if len(backwards):
         k = int(backwards[0])
-        raise ModelError(f"ts must be sorted; ts[{k}]={saved[k]} is followed by ts[{k + 1}]={saved[k + 1]}: use jnp.sort(ts)")
+        raise ModelError(
+            f"ts must be sorted; ts[{k}]={saved[k]} is followed by ts[{k + 1}]={saved[k + 1]}: use jnp.sort(ts)"
+        )
     slack = 1e-6 if np.asarray(ts).dtype == np.float32 else 1e-12
     low = -math.inf if a is None else float(a) - slack * (1 + abs(float(a)))
     high = math.inf if b is None else float(b) + slack * (1 + abs(float(b)))
@@ -266,7 +276,9 @@ def _check_tolerances(rtol, atol, dtype):
             if dtype == jnp.float32
             else ""
         )
-        raise ModelError(f"rtol={float(number):g} cannot be reached in {dtype} (eps {eps:.1e}).{switch} use rtol ≥ {10 * eps:.0e}.")
+        raise ModelError(
+            f"rtol={float(number):g} cannot be reached in {dtype} (eps {eps:.1e}).{switch} use rtol ≥ {10 * eps:.0e}."
+        )
 
 
 def _check_parameters(system: AcausalSystem):
@@ -294,4 +306,3 @@ def _explain(solution: Solution, t1: float, max_steps: int, rtol: float, atol: f
     else:
         reason = f"the integration failed: {solution.result}"
     return f"{reason}. The last saved time is {reached:g} of {t1:g}."
-

@@ -35,9 +35,8 @@ def check_structure(
         return
     n, m = flat.n_equations, len(flat.variables) - int(flat.variables.is_input.sum())
     difference = n - m
-    count = (
-        f"{n} equations for {m} unknowns, "
-        + (f"{difference} too many" if difference > 0 else f"{-difference} too few" if difference < 0 else "as many, but")
+    count = f"{n} equations for {m} unknowns, " + (
+        f"{difference} too many" if difference > 0 else f"{-difference} too few" if difference < 0 else "as many, but"
     )
     lines = [f"the model is structurally singular: {count}."]
     if len(extra):
@@ -53,7 +52,9 @@ def check_structure(
         texts = [flat.variables.names[v] for v in _display(flat, alias, unknown[columns])]
         lines.append("Under-determined, nothing determines all of these variables:")
         lines.extend(_listed(texts))
-        lines.append("Add the missing equation, a connection of their ports, a ground or a fixed position; or make one an input.")
+        lines.append(
+            "Add the missing equation, a connection of their ports, a ground or a fixed position; or make one an input."
+        )
     raise StructuralError("\n".join(lines))
 
 
@@ -101,5 +102,3 @@ def _display(flat: FlatModel, alias: AliasTable, roots: np.ndarray) -> list[int]
         plain = members[~flat.variables.is_port[members]]
         out.append(int(plain[0]) if len(plain) else root)
     return out
-
-

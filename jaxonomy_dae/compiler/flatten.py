@@ -130,7 +130,10 @@ class _Model:
         found = self._resolve(k, path, "variables")
         if found is None:
             component = self.components[k]
-            inside = [*component.variables, *(f"{c.name}.{v}" for c in component.children.values() for v in c.variables)]
+            inside = [
+                *component.variables,
+                *(f"{c.name}.{v}" for c in component.children.values() for v in c.variables),
+            ]
             raise ModelError(
                 f"component '{self.paths[k]}': the symbol '{path}' in its equations is no variable of it or of a child "
                 "component: " + nearest(path, inside)
@@ -289,9 +292,7 @@ def _add_connections(model: _Model, diagram: AcausalDiagram, builder: GroupBuild
             for face in faces[1:]:
                 a, b = find(faces[0]), find(face)
                 if a != b:
-                    parent[max(a, b, key=lambda f: (rank[f[0]], f[1]))] = min(
-                        a, b, key=lambda f: (rank[f[0]], f[1])
-                    )
+                    parent[max(a, b, key=lambda f: (rank[f[0]], f[1]))] = min(a, b, key=lambda f: (rank[f[0]], f[1]))
 
     join(diagram.connections, None)
     for component in model.components:
@@ -388,7 +389,9 @@ def _add_blocks(model: _Model, diagram: AcausalDiagram, variables: VariableTable
                 )
             name = f"{component.path}.{name}"
         if name not in known:
-            raise ModelError(f"neural block '{block.name}': its {what} '{name}' is no variable: " + nearest(name, known))
+            raise ModelError(
+                f"neural block '{block.name}': its {what} '{name}' is no variable: " + nearest(name, known)
+            )
         return known[name]
 
     differentiated = np.zeros(len(names), bool)
@@ -399,9 +402,7 @@ def _add_blocks(model: _Model, diagram: AcausalDiagram, variables: VariableTable
         times = frozenset(k for k, (c, n) in enumerate(block.inputs) if c is None and n == "time")
         inputs = tuple(find(r, block, "input") for k, r in enumerate(block.inputs) if k not in times)
         theta = block.theta is not None
-        opaque = OpaqueFunction(
-            len(networks), block.name, block.network if theta else None, len(block.inputs), times
-        )
+        opaque = OpaqueFunction(len(networks), block.name, block.network if theta else None, len(block.inputs), times)
         networks[block.name] = block.theta if theta else block.network
         for v in targets:
             if not differentiated[v]:

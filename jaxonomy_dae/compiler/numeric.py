@@ -102,7 +102,9 @@ def consistent_point(
     n = extended.quantities.n_unknown
     pins = np.array([q for q, _ in fixed], np.int64)
     targets = np.array([x for _, x in fixed])
-    pin_rows = sp.coo_array((np.ones(len(pins)), (np.arange(len(pins)), pins)), shape=(len(pins), extended.quantities.n))
+    pin_rows = sp.coo_array(
+        (np.ones(len(pins)), (np.arange(len(pins)), pins)), shape=(len(pins), extended.quantities.n)
+    )
     values = guess.copy()
 
     def evaluate(values):

@@ -133,9 +133,7 @@ def select_states(
     states = np.flatnonzero(candidate & ~is_dummy)
     below_last = extended.level < c[extended.base]
     constraints = np.flatnonzero(below_last & projected[extended.base])
-    return StateSelection(
-        states, constraints, np.flatnonzero(is_dummy), np.flatnonzero(projected), tuple(notes)
-    )
+    return StateSelection(states, constraints, np.flatnonzero(is_dummy), np.flatnonzero(projected), tuple(notes))
 
 
 def _parts(entries: _Entries, constrained: np.ndarray, shape: tuple[int, int]):

@@ -49,7 +49,9 @@ def tear(contains: Sequence[frozenset[int]], solvable: Sequence[frozenset[int]])
             continue
 
         def gain(u: int) -> tuple[int, int, int]:
-            opened = sum(1 for e in open_equations if u in left[e] and len(left[e]) == 2 and left[e] - {u} <= solvable[e])
+            opened = sum(
+                1 for e in open_equations if u in left[e] and len(left[e]) == 2 and left[e] - {u} <= solvable[e]
+            )
             return opened, sum(1 for e in open_equations if u in left[e]), -u
 
         u = max(sorted(unknown), key=gain)

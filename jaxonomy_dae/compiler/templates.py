@@ -106,8 +106,10 @@ class Template:
         partial = self.partials[position]
         if not self.coefficient_is_constant(position):
             return False
-        return partial.is_Number or partial.is_Symbol or all(
-            f.is_Number or f.is_Symbol or (f.is_Pow and f.base.is_Symbol) for f in partial.as_ordered_factors()
+        return (
+            partial.is_Number
+            or partial.is_Symbol
+            or all(f.is_Number or f.is_Symbol or (f.is_Pow and f.base.is_Symbol) for f in partial.as_ordered_factors())
         )
 
     def _kernel(self, key: Any, expressions: Callable[[], Sequence[sympy.Expr]], backend: str) -> Kernel:

@@ -91,7 +91,10 @@ class Point:
         for row in plan.rows:
             u = [jnp.asarray(evaluation.read(g), self.dtype) for g in row.inputs]
             slopes = self._corrected(slopes, row, u)
-        if len(plan.carried):
+        if plan.carried_rates is not None:
+            rates = [jnp.asarray(evaluation.read(g), self.dtype) for g in plan.carried_rates]
+            slopes = [*slopes, *rates] if isinstance(slopes, list) else jnp.concatenate([slopes, jnp.stack(rates)])
+        elif len(plan.carried):
             slopes = self._with_carried(state, slopes)
         return self.join(slopes)
 
@@ -191,7 +194,9 @@ class Point:
             rest = state[n:]
 
             def h(*x):
-                return [v[k] if jnp.ndim(v) else v for v in self.constraints((*x, *rest)) for k in range(max(1, v.size))]
+                return [
+                    v[k] if jnp.ndim(v) else v for v in self.constraints((*x, *rest)) for k in range(max(1, v.size))
+                ]
 
             value, pull = jax.vjp(h, *state[:n])
             one, zero = jnp.ones((), self.dtype), jnp.zeros((), self.dtype)

@@ -6,6 +6,7 @@ local unknowns.
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -192,15 +193,28 @@ class Evaluation:
 
         if not tearing.tearing:
             return follow([])
-        if step.carried:
-            z = [self._filled(self.read(g), shape) for g in planned.guess]
-            if refine == 0:
-                self.residuals.extend(residuals(z))
-            for _ in range(refine):
-                z = newton(residuals, z)
-        else:
-            z = newton(residuals, [jnp.zeros(shape, self.dtype) for _ in tearing.tearing])
+        if not step.carried:
+            return self._affine(follow, residuals, len(tearing.tearing), shape)
+        z = [self._filled(self.read(g), shape) for g in planned.guess]
+        if refine == 0:
+            self.residuals.extend(residuals(z))
+        for _ in range(refine):
+            z = newton(residuals, z)
         return follow(z)
+
+    def _affine(self, follow, residuals, m: int, shape: tuple[int, ...]) -> list[Any]:
+        """The local unknowns of a linear block: affine in its tearing variables, as the residuals are."""
+        zero = [jnp.zeros(shape, self.dtype)] * m
+        if m > UNROLLED:
+            return follow(newton(residuals, zero))
+        (r, base), push = jax.linearize(lambda z: (residuals(z), follow(z)), zero)
+        one = jnp.ones(shape, self.dtype)
+        columns = [push([one if j == k else zero[0] for j in range(m)]) for k in range(m)]
+        z = solve([[column[0][e] for column in columns] for e in range(m)], [-v for v in r])
+        return [
+            functools.reduce(lambda total, pair: total + pair[0] * pair[1][1][u], zip(z, columns, strict=True), value)
+            for u, value in enumerate(base)
+        ]
 
     def _filled(self, value: Any, shape: tuple[int, ...]) -> Any:
         return jnp.broadcast_to(jnp.asarray(value, self.dtype), shape)
@@ -211,9 +225,7 @@ def newton(residuals, z: list[Any]) -> list[Any]:
     m = len(z)
     if m <= UNROLLED:
         value, push = jax.linearize(residuals, z)
-        columns = [
-            push([jnp.ones_like(a) if j == k else jnp.zeros_like(a) for j, a in enumerate(z)]) for k in range(m)
-        ]
+        columns = [push([jnp.ones_like(a) if j == k else jnp.zeros_like(a) for j, a in enumerate(z)]) for k in range(m)]
         step = solve([[column[r] for column in columns] for r in range(m)], value)
         return [a - b for a, b in zip(z, step, strict=True)]
     stacked = jnp.stack(z)

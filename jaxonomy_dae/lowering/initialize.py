@@ -56,7 +56,9 @@ def choose_rows(plan: SystemPlan, values: np.ndarray, networks: tuple, names: tu
     """Chooses the rows for the overrides `names` (with their quantities and signs)."""
     variables = plan.flat.variables
     overrides = [
-        Row(name, int(q), int(s), None, k) for k, (name, q, s) in enumerate(zip(names, *resolved, strict=True)) if q != ZERO
+        Row(name, int(q), int(s), None, k)
+        for k, (name, q, s) in enumerate(zip(names, *resolved, strict=True))
+        if q != ZERO
     ]
     overridden = {r.quantity for r in overrides}
     started: dict[int, Row] = {}

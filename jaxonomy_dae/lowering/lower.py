@@ -67,6 +67,7 @@ class SystemPlan:
     inputs: InputTable
     derivative: Program
     next_derivative: Gather
+    carried_rates: tuple[Gather, ...] | None  # where the model itself has the derivatives of all `carried`
     everything: Program
     carried_residuals: Program
     constraint_program: Program
@@ -77,9 +78,7 @@ class SystemPlan:
     functions: tuple[Any, ...]
 
     def __eq__(self, other):
-        return (
-            isinstance(other, SystemPlan) and self.digest == other.digest and self.functions == other.functions
-        )
+        return isinstance(other, SystemPlan) and self.digest == other.digest and self.functions == other.functions
 
     def __hash__(self):
         return hash(self.digest)
@@ -171,7 +170,8 @@ def lower(
     constraint_program = program(_needed(steps, constraint_slots, n))
     planned_constraints = tuple(
         ConstraintGroup(
-            g, tuple(constraint_program.layout.gather(g.quantity[:, k], g.sign[:, k]) for k in range(g.quantity.shape[1]))
+            g,
+            tuple(constraint_program.layout.gather(g.quantity[:, k], g.sign[:, k]) for k in range(g.quantity.shape[1])),
         )
         for g in constraint_groups
     )
@@ -179,7 +179,8 @@ def lower(
     everything = program(steps)
     row_inputs = _row_input_quantities(flat, alias, extended)
     following = state_order + 1
-    derivative = program(_needed(steps, np.concatenate([following, *(q for q, _ in row_inputs)]), n))
+    rates = carried + 1 if _rates_hold(flat, alias, extended, carried_residuals, carried) else carried[:0]
+    derivative = program(_needed(steps, np.concatenate([following, rates, *(q for q, _ in row_inputs)]), n))
     rows = tuple(
         _plan_row(row, inputs, flat, alias, extended, state_order, derivative.layout)
         for row, inputs in zip(flat.rows, row_inputs, strict=True)
@@ -219,6 +220,7 @@ def lower(
         inputs,
         derivative,
         derivative.layout.gather(following) if len(following) else Gather(*(np.zeros(0, np.int64),) * 3),
+        tuple(derivative.layout.gather(q) for q in rates) if len(rates) else None,
         everything,
         carried_residuals,
         constraint_program,
@@ -228,6 +230,19 @@ def lower(
         tuple(flat.networks),
         functions,
     )
+
+
+def _rates_hold(
+    flat: FlatModel, alias: AliasTable, extended: Extended, residuals: Program, carried: np.ndarray
+) -> bool:
+    """Whether the derivatives of all carried unknowns are quantities of the model, untouched by row injection."""
+    quantities = extended.quantities
+    if not len(carried) or not (quantities.order[carried] < quantities.highest[quantities.owner[carried]]).all():
+        return False
+    read = np.concatenate([planned.step.needs() for planned in residuals.steps])
+    targets = [v for row in flat.rows for v in row.targets]
+    injected = quantities.first[quantities.column[alias.root[targets]]] + alias.order[targets] if targets else []
+    return not np.isin(injected, read).any()
 
 
 def quantity_scale(flat: FlatModel, alias: AliasTable, extended: Extended) -> np.ndarray:

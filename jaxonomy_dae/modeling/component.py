@@ -4,7 +4,7 @@ import dataclasses
 import math
 import numbers
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import sympy
@@ -142,7 +142,7 @@ class Component(metaclass=_Sealing):
             raise ModelError(
                 f"component '{self.name}': cannot store the symbol '{value}' as attribute '{name}', because its name "
                 f"changes when the component is seen from outside. Use a local Python variable; outside, the symbol is "
-                f"`component[\"{value}\"]`."
+                f'`component["{value}"]`.'
             )
         super().__setattr__(name, value)
 
@@ -343,7 +343,7 @@ class Component(metaclass=_Sealing):
         self.children[child.name] = child
         return child
 
-    def connect(self, *ends: Any) -> Self:
+    def connect(self, *ends: Any) -> "Component":
         """Connects ports of this component and of its children: `connect(a.p, b.n, …)` or `connect(a, "p", b, "n")`."""
         self.connections.append(resolve_ports(ends, f"component '{self.name}'"))
         return self

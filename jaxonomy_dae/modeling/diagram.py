@@ -1,6 +1,6 @@
 """A model: components, the connections between them, and learned corrections."""
 
-from typing import Any, Self
+from typing import Any
 
 from ..errors import ModelError
 from .component import Component, resolve_ports
@@ -27,7 +27,7 @@ class AcausalDiagram:
         self.connections: list[tuple[Port, ...]] = []
         self.blocks: dict[str, NeuralDAEBlock] = {}
 
-    def add(self, *components: Component) -> Self:
+    def add(self, *components: Component) -> "AcausalDiagram":
         """Adds components to the model.
 
         **Raises:**
@@ -49,7 +49,7 @@ class AcausalDiagram:
             self.components[component.name] = component
         return self
 
-    def connect(self, *ends: Any) -> Self:
+    def connect(self, *ends: Any) -> "AcausalDiagram":
         """Connects ports: `connect(a.p, b.n, …)`, or `connect(a, "p", b, "n")`.
 
         **Raises:**
@@ -65,7 +65,7 @@ class AcausalDiagram:
         self.connections.append(ports)
         return self
 
-    def add_neural_correction_block(self, block: NeuralDAEBlock) -> Self:
+    def add_neural_correction_block(self, block: NeuralDAEBlock) -> "AcausalDiagram":
         """Adds a learned correction; several may be added, also on the same target, and their effects sum.
 
         **Raises:**

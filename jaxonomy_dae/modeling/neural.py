@@ -76,7 +76,7 @@ class NeuralDAEBlock:
         if inject not in ("equation", "row"):
             raise ModelError(f"{where}: inject is 'equation' or 'row'; got {inject!r}")
         if isinstance(targets, str) or not targets:
-            raise ModelError(f"{where}: targets is a non-empty list of (component, \"variable\"); got {targets!r}")
+            raise ModelError(f'{where}: targets is a non-empty list of (component, "variable"); got {targets!r}')
         self.name = name
         self.network = network
         self.theta = None if theta is None else as_weights(theta)
@@ -102,4 +102,4 @@ def _reference(entry: Any, where: str) -> tuple[Component | None, str]:
         component, name = entry
         if isinstance(component, Component) and isinstance(name, str):
             return component, name
-    raise ModelError(f"{where}: expected (component, \"variable\") or \"component.variable\"; got {entry!r}")
+    raise ModelError(f'{where}: expected (component, "variable") or "component.variable"; got {entry!r}')

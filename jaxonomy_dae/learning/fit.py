@@ -1,0 +1,195 @@
+"""Training: gradient descent with Optax, and nonlinear least squares with Optimistix."""
+
+import dataclasses
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any, Generic, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import optimistix as optx
+from tqdm.auto import tqdm
+
+from ..errors import ModelError
+from ..lowering.system import AcausalSystem
+
+Model = TypeVar("Model", bound=eqx.Module)
+
+
+@dataclasses.dataclass(frozen=True)
+class Fit(Generic[Model]):
+    """The outcome of a training run.
+
+    - `model`: the best iterate, of the same structure as the model given.
+    - `history`: the losses, `history[k]` after k updates; shape `(steps + 1,)`, or shorter if stopped early.
+    - `best_step`, `best_loss`: where the best iterate was found.
+    - `message`: why the run ended.
+    """
+
+    model: Model
+    history: np.ndarray
+    best_step: int
+    best_loss: float
+    message: str
+
+
+def split(model: Any, train: Any) -> tuple[Any, Any]:
+    """(trainable, frozen) parts of a model; `train` as in `fit`."""
+    if isinstance(model, AcausalSystem):
+        if train is None:
+            train = tuple(model.neural)
+            if not train:
+                raise ModelError("this system has no networks: say what to train, train=['component.parameter', …]")
+        if isinstance(train, str):
+            train = (train,)
+        return model.partition(*train)
+    return eqx.partition(model, eqx.is_inexact_array if train is None else train)
+
+
+def _merged(model: Any) -> Any:
+    return model.merged() if isinstance(model, AcausalSystem) else model
+
+
+def fit(
+    model: Model,
+    loss: Callable[..., Any],
+    optimizer: optax.GradientTransformation,
+    steps: int,
+    *,
+    train: Sequence[str] | Any = None,
+    args: tuple = (),
+    progress: bool = True,
+) -> Fit[Model]:
+    """Minimises a loss by gradient steps; keeps the best iterate.
+
+    **Arguments:**
+
+    - `model`: an `AcausalSystem`, or any Equinox module.
+    - `loss`: `loss(model, *args)`, a scalar; it is compiled once, with its gradient and the update.
+    - `optimizer`: such as `optax.adam(0.02)`.
+    - `steps`: how many updates.
+    - `train`: for a system, names of networks and parameters (default: all its networks); for another module, a filter
+        as in `equinox.partition` (default: all its inexact arrays).
+    - `args`: further arguments of the loss, such as data.
+    - `progress`: shows a bar with the loss.
+
+    **Returns:**
+
+    A `Fit`. If the loss or its gradient is not finite, the run stops with a `RuntimeWarning`, and the best iterate so
+    far is returned.
+
+    **Raises:**
+
+    - `ModelError` if the loss is no scalar, is not finite at the start, or nothing is to be trained.
+    """
+    if not isinstance(steps, int) or steps < 0:
+        raise ModelError(f"steps must be a number of updates ≥ 0; got {steps!r}")
+    trainable, frozen = split(model, train)
+    if not jax.tree.leaves(trainable):
+        raise ModelError("nothing is to be trained: `train` selects no arrays of the model")
+
+    @eqx.filter_jit
+    def step(trainable, frozen, state, args):
+        def objective(trainable):
+            value = loss(_merged(eqx.combine(trainable, frozen)), *args)
+            if jnp.shape(value) != ():
+                raise ModelError(f"the loss must return a scalar; got shape {jnp.shape(value)}")
+            return value
+
+        value, gradient = eqx.filter_value_and_grad(objective)(trainable)
+        finite = jnp.array([jnp.isfinite(g).all() for g in jax.tree.leaves(gradient)]).all()
+        with jax.numpy_dtype_promotion("standard"):  # Optax raises floats to integer powers
+            updates, state = optimizer.update(gradient, state, trainable)
+        return value, finite, eqx.apply_updates(trainable, updates), state
+
+    with jax.numpy_dtype_promotion("standard"):
+        state = optimizer.init(eqx.filter(trainable, eqx.is_inexact_array))
+    history: list[float] = []
+    best, best_step, message = trainable, 0, f"all {steps} steps were taken"
+    with tqdm(total=steps, disable=not progress, desc="fit", unit="step") as bar:
+        for k in range(steps + 1):
+            value, finite, following, following_state = step(trainable, frozen, state, args)
+            number = float(value)
+            if not (math.isfinite(number) and bool(finite)):
+                what = (
+                    f"the loss is {number}" if not math.isfinite(number) else "the gradient of the loss is not finite"
+                )
+                if k == 0:
+                    raise ModelError(
+                        f"{what} at the start: simulate the model once with throw=True to see why, and check the data"
+                    )
+                message = (
+                    f"stopped after {k} updates: {what}. The best iterate, after {best_step} updates, is returned; a smaller "
+                    "learning rate or optax.clip_by_global_norm may help"
+                )
+                if math.isfinite(number):
+                    history.append(number)
+                warnings.warn(message, RuntimeWarning, stacklevel=2)
+                break
+            history.append(number)
+            if number < history[best_step]:
+                best, best_step = trainable, k
+            if k < steps:
+                trainable, state = following, following_state
+                bar.update()
+                bar.set_postfix(loss=f"{number:.3e}", best=f"{history[best_step]:.3e}")
+    fitted = _merged(eqx.combine(best, frozen))
+    return Fit(fitted, np.array(history), best_step, history[best_step], message)
+
+
+def fit_least_squares(
+    model: Model,
+    residuals: Callable[..., Any],
+    *,
+    train: Sequence[str] | Any = None,
+    args: tuple = (),
+    steps: int = 60,
+    rtol: float = 1e-8,
+    atol: float = 1e-12,
+) -> Fit[Model]:
+    """Minimises ½ Σ residuals² by Levenberg–Marquardt steps.
+
+    Where data are many and weights are few this is worth far more than gradient steps. The Jacobian is found by forward
+    mode, so the simulation inside needs `adjoint=diffrax.ForwardMode()`.
+
+    **Arguments:**
+
+    - `model`, `train`, `args`: as in `fit`.
+    - `residuals`: `residuals(model, *args)`, an array of any shape.
+    - `steps`: how many steps at most.
+    - `rtol`, `atol`: when to stop, relative to the weights and to the sum of squares.
+
+    **Returns:**
+
+    A `Fit` whose `history` has the first and the last value of ½ Σ residuals².
+    """
+    trainable, frozen = split(model, train)
+    if not jax.tree.leaves(trainable):
+        raise ModelError("nothing is to be trained: `train` selects no arrays of the model")
+
+    def function(trainable, extra):
+        frozen, args = extra
+        return jnp.ravel(residuals(_merged(eqx.combine(trainable, frozen)), *args))
+
+    @eqx.filter_jit
+    def run(trainable, frozen, args):
+        solver = optx.LevenbergMarquardt(rtol=rtol, atol=atol)
+        found = optx.least_squares(function, solver, trainable, (frozen, args), max_steps=steps, throw=False)
+        cost = [0.5 * jnp.sum(function(w, (frozen, args)) ** 2) for w in (trainable, found.value)]
+        return found.value, found.stats["num_steps"], cost
+
+    found, taken, cost = run(trainable, frozen, args)
+    first, last = (float(c) for c in cost)
+    if not math.isfinite(first):
+        raise ModelError("the residuals are not finite at the start: simulate the model once to see why")
+    if not last <= first:
+        warnings.warn(
+            "least squares found no better point; the model is returned unchanged", RuntimeWarning, stacklevel=2
+        )
+        return Fit(model, np.array([first]), 0, first, "no better point was found")
+    fitted = _merged(eqx.combine(found, frozen))
+    return Fit(fitted, np.array([first, last]), int(taken), last, f"{int(taken)} steps were taken")
