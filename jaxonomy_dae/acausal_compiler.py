@@ -36,9 +36,9 @@ class AcausalCompiler:
 
     - `ev`: the environment the components were made with.
     - `diagram`: the model.
-    - `state_selection`: `"dummy_derivatives"` integrates a minimal set of states; `"projection"` integrates all candidates
-        and projects onto the hidden constraints; `"auto"` takes dummy derivatives where the constraints' Jacobian is
-        constant, projection elsewhere.
+    - `state_selection`: `"dummy_derivatives"` integrates a minimal set of states; `"projection"` integrates all
+        candidates and projects onto the hidden constraints; `"auto"` takes dummy derivatives where the constraints'
+        Jacobian is constant, projection elsewhere.
     - `prefer_states`: names of variables that should be states, the most important first.
 
     **Raises** (when called):
@@ -228,7 +228,8 @@ def _check_row_targets(
         if mode != "dummy_derivatives":
             raise ModelError(
                 f"neural block '{row.opaque.name}': inject='row' adds to rows of a minimal set of states, so it needs "
-                f"state_selection='dummy_derivatives'; this compiler has '{mode}'. For a real force, use inject='equation'."
+                f"state_selection='dummy_derivatives'; this compiler has '{mode}'. For a real force, use "
+                "inject='equation'."
             )
         for v in row.targets:
             root = int(alias.root[v])

@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from .errors import ModelError, SimulationError, nearest
 from .lowering.initialize import check, initialize
@@ -43,8 +44,8 @@ def simulate(
     - `system`: from an `AcausalCompiler`.
     - `t0`, `t1`: the interval, `t0 < t1`.
     - `ts`: when to save, shape `(n,)`, increasing, inside the interval; None saves every step taken.
-    - `solver`: any Diffrax solver for ordinary differential equations; default `Tsit5`. Systems with hidden constraints are
-        projected onto them after every step and at every saved time.
+    - `solver`: any Diffrax solver for ordinary differential equations; default `Tsit5`. Systems with hidden constraints
+        are projected onto them after every step and at every saved time.
     - `rtol`, `atol`: tolerances of the local error.
     - `inputs`: functions of time (callable pytrees such as Diffrax interpolations, or plain functions) or constants, by
         the inputs' names.
@@ -59,8 +60,8 @@ def simulate(
 
     A `Solution`: `solution["pend.x"]` has shape `(n,)`.
 
-    Called with plain arrays, it is compiled once for each structure, set of options and shapes. Inside `jax.jit`, `grad`
-    or `vmap` it is traced like any function.
+    Called with plain arrays, it is compiled once for each structure, set of options and shapes. Inside `jax.jit`,
+    `grad` or `vmap` it is traced like any function.
 
     **Raises:**
 
@@ -147,7 +148,7 @@ def _integrate(x0, system: AcausalSystem, t0, t1, ts, inputs, initial, options):
         throw=False,
         progress_meter=diffrax.TqdmProgressMeter() if progress else diffrax.NoProgressMeter(),
     )
-    saved, x = solved.ts, solved.ys
+    saved, x = jnp.asarray(solved.ts), jnp.asarray(solved.ys)
     if system.is_constrained:
         filled = jnp.isfinite(x).all(axis=-1)
         safe = jnp.where(filled[:, None], x, x0)
@@ -185,7 +186,7 @@ def _first_step(system, t0, t1, x0, inputs, order, controller):
 
 
 def _is_traced(tree: Any) -> bool:
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
 # --- arguments ---------------------------------------------------------------------------------------------------
@@ -198,8 +199,8 @@ def _check_arguments(system, t0, t1, ts, inputs, initial, adjoint, solver, max_s
         raise ModelError(f"solver must be a Diffrax solver such as diffrax.Tsit5(); got {solver!r}")
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ModelError(
-            "adjoint=BacksolveAdjoint() is wrong for constrained systems: it integrates the state backwards without its "
-            "constraints and leaves the algebraic variables out. Use the default RecursiveCheckpointAdjoint(), or "
+            "adjoint=BacksolveAdjoint() is wrong for constrained systems: it integrates the state backwards without "
+            "its constraints and leaves the algebraic variables out. Use the default RecursiveCheckpointAdjoint(), or "
             "ForwardMode() for few parameters"
         )
     if not isinstance(max_steps, int) or max_steps < 1:
@@ -211,8 +212,8 @@ def _check_arguments(system, t0, t1, ts, inputs, initial, adjoint, solver, max_s
             raise ModelError(f"'{name}' is no input of this system: " + nearest(name, known))
         if not callable(value) and jnp.shape(value) != ():
             raise ModelError(
-                f"input '{name}' must be a function of time or a constant; got shape {jnp.shape(value)}. For samples use "
-                "diffrax.LinearInterpolation(ts, ys).evaluate"
+                f"input '{name}' must be a function of time or a constant; got shape {jnp.shape(value)}. For samples "
+                "use diffrax.LinearInterpolation(ts, ys).evaluate"
             )
     for name, default in zip(known, system.plan.inputs.defaults, strict=True):
         if default is None and name not in (inputs or {}):
@@ -228,7 +229,7 @@ def _check_arguments(system, t0, t1, ts, inputs, initial, adjoint, solver, max_s
 
 
 def _concrete(value: Any) -> np.ndarray | None:
-    return None if isinstance(value, jax.core.Tracer) else np.asarray(value, float)
+    return None if isinstance(value, Tracer) else np.asarray(value, float)
 
 
 def _check_interval(t0, t1, ts):
@@ -272,7 +273,8 @@ def _check_tolerances(rtol, atol, dtype):
     number = _concrete(rtol)
     if number is not None and float(number) < 10 * eps:
         switch = (
-            ' Switch to double precision with jax.config.update("jax_enable_x64", True) before the model is compiled, or'
+            ' Switch to double precision with jax.config.update("jax_enable_x64", True) before the model is '
+            "compiled, or"
             if dtype == jnp.float32
             else ""
         )

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from .lowering.system import AcausalSystem
@@ -46,7 +47,7 @@ class Solution(eqx.Module):
             column = self.states[:, int(place[0])]
             return column if sign[0] > 0 else -column
         leaves = jax.tree.leaves((self.system, self.ts, self.states, self.inputs))
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        if any(isinstance(leaf, Tracer) for leaf in leaves):
             return _observe(self.system, self.ts, self.states, self.inputs, quantity, sign)
         return _observe_all(self.system, self.ts, self.states, self.inputs, quantity[0], sign[0])
 

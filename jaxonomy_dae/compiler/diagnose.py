@@ -4,6 +4,8 @@ The Dulmage–Mendelsohn decomposition of the incidence names the smallest parts
 same variables, and variables that share too few equations.
 """
 
+from typing import Any
+
 import numpy as np
 import scipy.sparse as sp
 
@@ -45,7 +47,8 @@ def check_structure(
         lines.append("Over-determined, these equations compete for too few variables:")
         lines.extend(_listed(texts))
         lines.append(
-            "Remove one of them, or connect less: for instance two sources, two fixed positions or two grounds on one node."
+            "Remove one of them, or connect less: for instance two sources, two fixed positions or two grounds on one "
+            "node."
         )
     if len(missing):
         columns = _under_determined(incidence, matched, missing)
@@ -64,7 +67,7 @@ def _listed(texts: list[str]) -> list[str]:
     return [f"  {t}" for t in texts[:SHOWN]] + more
 
 
-def _reach(step: sp.csr_array, start: np.ndarray) -> np.ndarray:
+def _reach(step: Any, start: np.ndarray) -> np.ndarray:
     """All nodes reachable from `start`, in order."""
     seen = np.zeros(step.shape[0], bool)
     frontier = start

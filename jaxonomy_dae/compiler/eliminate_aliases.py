@@ -27,9 +27,16 @@ class _Classes:
         has_start = np.array([s is not None for s in v.start], bool)
         # The better root: an input, then what is differentiated, fixed, started, no port variable; then the first.
         self.merit = list(
-            zip(v.is_input.tolist(), differentiated.tolist(), v.fixed.tolist(), has_start.tolist(), (~v.is_port).tolist(),
-                [-k for k in range(n)], strict=True)
-        )  # fmt: skip
+            zip(
+                v.is_input.tolist(),
+                differentiated.tolist(),
+                v.fixed.tolist(),
+                has_start.tolist(),
+                (~v.is_port).tolist(),
+                [-k for k in range(n)],
+                strict=True,
+            )
+        )
         self.is_input = v.is_input.tolist()
 
     def find(self, v: int) -> tuple[int, int, int]:

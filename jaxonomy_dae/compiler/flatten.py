@@ -187,7 +187,7 @@ def _add_components(model: _Model, builder: GroupBuilder):
         position = {name: k for k, name in enumerate((*local_variables, *local_parameters))}
         for residual in equations:
             # Slots follow the order of declaration, never names, so names change nothing but names.
-            def rank(s):
+            def rank(s, position=position, members=members):
                 # Symbols of children come after one's own, in the order the children's ids give.
                 if s.path in position:
                     return (0, position[s.path], getattr(s, "order", 0))
@@ -198,8 +198,8 @@ def _add_components(model: _Model, builder: GroupBuilder):
             for s in symbols:
                 if not isinstance(s, VariableSymbol | ParameterSymbol | TimeSymbol):
                     raise ModelError(
-                        f"component '{model.paths[members[0]]}': the symbol '{s}' was declared by no component; declare "
-                        "it with self.variable(...) or self.parameter(...) and use the symbol that returns"
+                        f"component '{model.paths[members[0]]}': the symbol '{s}' was declared by no component; "
+                        "declare it with self.variable(...) or self.parameter(...) and use the symbol that returns"
                     )
             variables = sorted((s for s in symbols if isinstance(s, VariableSymbol)), key=rank)
             parameters = sorted((s for s in symbols if isinstance(s, ParameterSymbol)), key=rank)
@@ -384,8 +384,8 @@ def _add_blocks(model: _Model, diagram: AcausalDiagram, variables: VariableTable
         if component is not None:
             if id(component) not in model.index:
                 raise ModelError(
-                    f"neural block '{block.name}': its {what} '{component.path}.{name}' belongs to a component that is not "
-                    "part of the diagram: add it"
+                    f"neural block '{block.name}': its {what} '{component.path}.{name}' belongs to a component that "
+                    "is not part of the diagram: add it"
                 )
             name = f"{component.path}.{name}"
         if name not in known:
@@ -407,8 +407,8 @@ def _add_blocks(model: _Model, diagram: AcausalDiagram, variables: VariableTable
         for v in targets:
             if not differentiated[v]:
                 raise ModelError(
-                    f"neural block '{block.name}': its target '{names[v]}' is differentiated in no equation, so there is no "
-                    "derivative to correct; targets can be "
+                    f"neural block '{block.name}': its target '{names[v]}' is differentiated in no equation, so there "
+                    "is no derivative to correct; targets can be "
                     + ", ".join(repr(names[k]) for k in np.flatnonzero(differentiated)[:8])
                 )
         if block.inject == "row":

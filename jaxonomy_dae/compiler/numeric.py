@@ -135,7 +135,7 @@ def consistent_point(
     return values, float(np.abs(r).max(initial=0.0))
 
 
-def _least_norm(matrix: sp.csr_array, right: np.ndarray) -> np.ndarray:
+def _least_norm(matrix: Any, right: np.ndarray) -> np.ndarray:
     if matrix.shape[1] <= 1500:
         return np.linalg.lstsq(matrix.toarray(), right, rcond=1e-12)[0]
     return sp.linalg.lsmr(matrix, right, atol=1e-12, btol=1e-12, maxiter=10 * matrix.shape[1])[0]

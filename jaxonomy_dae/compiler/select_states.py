@@ -185,9 +185,9 @@ def _dummy_derivatives(dense, c, columns, quantities, merit, scale, name, equati
             raise StructuralError(
                 "the constraints "
                 + "; ".join(equations[r] for r in rows[:6])
-                + " do not determine as many variables as there are constraints at the initial point: one of them follows "
-                "from the others, or the start values are at a singular position. Remove the redundant constraint, or "
-                'change the start values, or use state_selection="projection".'
+                + " do not determine as many variables as there are constraints at the initial point: one of them "
+                "follows from the others, or the start values are at a singular position. Remove the redundant "
+                'constraint, or change the start values, or use state_selection="projection".'
             )
         by_merit = sorted(range(len(below)), key=lambda k: (merit(int(below[k])), -int(below[k])))
         wanted = set(by_merit[: len(picked)])

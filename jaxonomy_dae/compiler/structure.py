@@ -1,6 +1,7 @@
 """Incidence: which equation contains which variable, up to which derivative."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -61,7 +62,9 @@ def incidence(groups: tuple[EquationGroup, ...], column: np.ndarray, n_columns: 
     return Incidence(pointer, columns, orders, n_columns)
 
 
-def pattern(pointer: np.ndarray, columns: np.ndarray, n_columns: int) -> sp.csr_array:
+def pattern(pointer: np.ndarray, columns: np.ndarray, n_columns: int) -> Any:
     """A boolean sparse matrix, for scipy.sparse.csgraph."""
     data = np.ones(len(columns), np.int8)
-    return sp.csr_array((data, columns.astype(np.int32), pointer.astype(np.int32)), shape=(len(pointer) - 1, n_columns))
+    shape = (len(pointer) - 1, n_columns)
+    matrix: Any = (data, columns.astype(np.int32), pointer.astype(np.int32))
+    return sp.csr_array(matrix, shape=shape)

@@ -34,7 +34,7 @@ def _parameter_symbol(k: int) -> sympy.Symbol:
 _NUMPY = {"numpy": np, "jax": jnp}
 
 
-def _float_constants(expression: sympy.Expr) -> sympy.Expr:
+def _float_constants(expression: Any) -> Any:
     """Exact constants that are no integers become floats, so that kernels keep the dtype of their arguments."""
     constants = [e for e in expression.atoms(sympy.Rational, sympy.NumberSymbol) if not e.is_Integer]
     return expression.xreplace({c: sympy.Float(c, 17) for c in constants})
@@ -75,7 +75,7 @@ class Template:
 
     @functools.cached_property
     def _partial_slots(self) -> tuple[frozenset[int], ...]:
-        position = {_slot_symbol(s): k for k, s in enumerate(self.slots)}
+        position: dict[Any, int] = {_slot_symbol(s): k for k, s in enumerate(self.slots)}
         return tuple(frozenset(position[f] for f in p.free_symbols if f in position) for p in self.partials)
 
     @functools.cached_property
@@ -103,7 +103,7 @@ class Template:
 
     def coefficient_never_vanishes(self, position: int) -> bool:
         """Whether ∂(residual)/∂(slot) is a nonzero number or a product of parameters, safe to divide by."""
-        partial = self.partials[position]
+        partial: Any = self.partials[position]
         if not self.coefficient_is_constant(position):
             return False
         return (
@@ -135,12 +135,6 @@ class Template:
         slots = list(slots)
         slots[position] = 0.0
         return self._kernel(("solve", position), solved, backend)(*slots, *parameters, t)[0]
-
-    def text(self, names: Sequence[str], parameters: Sequence[str]) -> str:
-        """The equation in user names."""
-        replaced = {_slot_symbol(s): sympy.Symbol(n) for s, n in zip(self.slots, names, strict=True)}
-        replaced |= {_parameter_symbol(k): sympy.Symbol(n) for k, n in enumerate(parameters)}
-        return f"0 = {self.expression.xreplace(replaced)}"
 
 
 class LinearTemplate:
@@ -186,10 +180,6 @@ class LinearTemplate:
                 total = term if total is None else total + term
         return 0.0 if total is None else total
 
-    def text(self, names, parameters, coefficients=()) -> str:
-        terms = [sympy.nsimplify(c) * sympy.Symbol(n) for c, n in zip(coefficients, names, strict=True)]
-        return f"0 = {sympy.Add(*terms)}"
-
 
 def _scaled(c, s):
     if np.ndim(c) == 0:
@@ -229,7 +219,7 @@ class OpaqueFunction:
         return out.astype(u.dtype)
 
     def derivatives(self, weights, order: int, t, inputs: list[list]):
-        """The `order`-th time derivative of the outputs; inputs[k] lists the k-th derivatives of the non-time inputs."""
+        """The `order`-th time derivative of the outputs; inputs[k] lists the non-time inputs' k-th derivatives."""
 
         def level(k: int):
             if k == 0:
@@ -297,10 +287,6 @@ class OpaqueTemplate:
         values = jnp.stack([jnp.asarray(s, jnp.asarray(t).dtype) for s in slots])
         return tuple(jax.jacfwd(lambda v: self.residual(list(v), (), (), t, networks))(values))
 
-    def text(self, names, parameters) -> str:
-        inside = ", ".join(names[1 : 1 + self._n])
-        return f"0 = {names[0]} - {self.opaque.name}({inside})" + "'" * self._q
-
 
 AnyTemplate = Template | LinearTemplate | OpaqueTemplate
 
@@ -325,7 +311,7 @@ def linear_coefficients(residual: sympy.Expr, variables: Sequence[VariableSymbol
     """The coefficients of a residual that is a linear form in its variables with numeric coefficients, else None."""
     if any(isinstance(s, ParameterSymbol | TimeSymbol) for s in residual.free_symbols):
         return None
-    found = dict.fromkeys(variables, 0.0)
+    found: dict[Any, float] = dict.fromkeys(variables, 0.0)
     for term in sympy.Add.make_args(residual):
         factor, rest = term.as_coeff_Mul()
         if rest not in found or not factor.is_finite:

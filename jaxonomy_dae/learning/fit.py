@@ -123,8 +123,8 @@ def fit(
                         f"{what} at the start: simulate the model once with throw=True to see why, and check the data"
                     )
                 message = (
-                    f"stopped after {k} updates: {what}. The best iterate, after {best_step} updates, is returned; a smaller "
-                    "learning rate or optax.clip_by_global_norm may help"
+                    f"stopped after {k} updates: {what}. The best iterate, after {best_step} updates, is returned; a "
+                    "smaller learning rate or optax.clip_by_global_norm may help"
                 )
                 if math.isfinite(number):
                     history.append(number)

@@ -5,9 +5,8 @@ Conventions: potential `v` in volt, current `i` in ampere counted positive into 
 """
 
 import sympy
-from sympy import Eq
 
-from ..modeling import Component, Electrical, EqnEnv, der
+from ..modeling import Component, Electrical, Eq, EqnEnv, der
 
 
 class _TwoPin(Component):

@@ -1,8 +1,8 @@
 """Planar mechanics in Cartesian coordinates."""
 
-from sympy import Eq, cos, sin
+from sympy import cos, sin
 
-from ..modeling import Component, EqnEnv, der
+from ..modeling import Component, Eq, EqnEnv, der
 
 
 class PlanarPendulum(Component):

@@ -4,9 +4,7 @@ Conventions: absolute position `x` in metre, force `f` in newton counted positiv
 mass obeys M·dv/dt = flange.f.
 """
 
-from sympy import Eq
-
-from ..modeling import Component, EqnEnv, Translational, der
+from ..modeling import Component, Eq, EqnEnv, Translational, der
 
 
 class Mass(Component):

@@ -23,7 +23,7 @@ READ_REFINEMENTS = 4
 
 
 def input_values(plan: SystemPlan, given: Any, t: Any, dtype) -> tuple:
-    """The values of all input quantities at time t: inputs are functions of time or constants, differentiated by jvp."""
+    """The values of all input quantities at time t: functions of time or constants, differentiated by jvp."""
     given = given or {}
 
     def value(k: int) -> Callable:

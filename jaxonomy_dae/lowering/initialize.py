@@ -1,10 +1,10 @@
 """Consistent initialization.
 
-The unknowns are the state array's entries. The rows are: hidden constraints, residuals of nonlinear blocks, values given
-by the caller, fixed starts, and as many guesses as it takes to determine the rest; which guesses are kept is decided once,
-numerically, when the rows are chosen. The rows may be redundant, as long as they agree: they are solved in the
-least-squares sense (Levenberg–Marquardt), and the last Gauss–Newton step carries the derivative, which by the implicit
-function theorem is exact where the rows hold.
+The unknowns are the state array's entries. The rows are: hidden constraints, residuals of nonlinear blocks, values
+given by the caller, fixed starts, and as many guesses as it takes to determine the rest; which guesses are kept is
+decided once, numerically, when the rows are chosen. The rows may be redundant, as long as they agree: they are solved
+in the least-squares sense (Levenberg–Marquardt), and the last Gauss–Newton step carries the derivative, which by the
+implicit function theorem is exact where the rows hold.
 """
 
 import dataclasses
@@ -17,12 +17,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from jax.core import Tracer
 
 from ..compiler.numeric import Networks, consistent_point, residual_and_jacobian, start_values
 from ..compiler.tables import ZERO, Start, describe_equation
 from ..errors import InitializationError
 from .dynamics import Point
-from .gather import Gather
+from .gather import Gather, take
 from .lower import SystemPlan
 
 NUMERIC_LIMIT = 3000  # quantities up to which guesses are chosen by rank
@@ -61,17 +62,19 @@ def choose_rows(plan: SystemPlan, values: np.ndarray, networks: tuple, names: tu
         if q != ZERO
     ]
     overridden = {r.quantity for r in overrides}
+    value_of = start_values(variables.start, values)
     started: dict[int, Row] = {}
     fixed: list[Row] = []
     for v, start in enumerate(variables.start):
         if start is None:
             continue
         quantity, sign = plan.quantity_of(v)
+        if quantity == ZERO and not (variables.fixed[v] and value_of(v) != 0.0):
+            continue  # zero as it should be; any other fixed start contradicts the equations, and is kept to say so
         row = Row(variables.names[v], quantity, sign, start)
         if variables.fixed[v] and quantity not in overridden:
             fixed.append(row)
-        if quantity not in started or (variables.fixed[v] and row in fixed):
-            started.setdefault(quantity, row)
+        started.setdefault(quantity, row)
     started |= {r.quantity: r for r in fixed}
     started |= {r.quantity: r for r in overrides}
     entries = [int(q) for q in (*plan.states, *plan.carried)]
@@ -79,9 +82,8 @@ def choose_rows(plan: SystemPlan, values: np.ndarray, networks: tuple, names: tu
     inside = set(plan.states.tolist())
     rows = [*overrides, *fixed]
     if not plan.n_constraints and not len(plan.carried) and all(r.quantity in inside for r in rows):
-        promoted = tuple(
-            plan.quantity_name[q] for q, g in zip(entries, guess, strict=True) if g is None or g not in rows
-        )
+        held = {r.quantity for r in rows}
+        promoted = tuple(plan.quantity_name[q] for q in entries if q not in held)
         return InitialRows(guess, tuple(rows), True, (), promoted, ())
     return _by_rank(plan, values, networks, overrides, fixed, started, guess)
 
@@ -166,11 +168,8 @@ def initialize(system, t0: Any, inputs: Mapping[str, Any] | None, initial: Mappi
     given = [initial[n] for n in names] if initial else []
     point: Point = system._point(t0, inputs)
     parameters = point.parameters
-    values = [_row_value(row, given, parameters) for row in rows.kept]
-    first = [_row_value(row, given, parameters) if row else jnp.zeros((), point.dtype) for row in rows.guess]
-    first = [v if row is None or row.sign >= 0 else -v for row, v in zip(rows.guess, first, strict=True)]
-    x0 = jnp.stack(first) if first else jnp.zeros((0,), point.dtype)
-    target = jnp.stack(values) if values else jnp.zeros((0,), point.dtype)
+    x0 = _values(rows.guess, given, parameters) * jnp.asarray(_signs(rows.guess), point.dtype)
+    target = _values(rows.kept, given, parameters)
     place = {int(q): k for k, q in enumerate((*plan.states, *plan.carried))}
     quantity = np.array([r.quantity for r in rows.kept], np.int64)
     sign = np.array([r.sign for r in rows.kept], np.int64)
@@ -222,14 +221,37 @@ def frozen_inputs(inputs: Any) -> Any:
     return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, inputs)
 
 
-def _row_value(row: Row, given: list, parameters: Any) -> Any:
-    if row.given >= 0:
-        return jnp.asarray(given[row.given], parameters.dtype)
-    if row.start is None:
-        return jnp.zeros((), parameters.dtype)
-    chosen = [parameters[k] for k in row.start.parameters]
-    value = row.start.template.residual([], chosen, [], jnp.zeros((), parameters.dtype), None)
-    return jnp.asarray(value, parameters.dtype)
+def _signs(rows: tuple[Row | None, ...]) -> np.ndarray:
+    return np.array([1 if row is None or row.sign >= 0 else -1 for row in rows], np.int64)
+
+
+def _values(rows: tuple[Row | None, ...], given: list, parameters: Any) -> Any:
+    """The values of start rows, shape (rows,): one vectorised kernel for each distinct start expression."""
+    members: dict[str, list[int]] = {}
+    for k, row in enumerate(rows):
+        key = "zero" if row is None or (row.start is None and row.given < 0) else "given"
+        if row is not None and row.start is not None and row.given < 0:
+            key = row.start.template.key
+        members.setdefault(key, []).append(k)
+    parts = []
+    for key, places in members.items():
+        if key == "zero":
+            parts.append(jnp.zeros((len(places),), parameters.dtype))
+            continue
+        chosen = [rows[k] for k in places]
+        if key == "given":
+            parts.append(jnp.stack([jnp.asarray(given[row.given], parameters.dtype) for row in chosen if row]))
+            continue
+        starts = [row.start for row in chosen if row and row.start]
+        columns = np.array([start.parameters for start in starts], np.int64).T
+        values = [take(parameters, column) for column in columns]
+        time = jnp.zeros((), parameters.dtype)
+        value = starts[0].template.residual([], values, [], time, None)
+        parts.append(jnp.broadcast_to(jnp.asarray(value, parameters.dtype), (len(places),)))
+    if not parts:
+        return jnp.zeros((0,), parameters.dtype)
+    back = np.argsort(np.concatenate(list(members.values())), kind="stable")
+    return take(jnp.concatenate(parts), back)
 
 
 def tolerance(dtype, x: Any) -> Any:
@@ -253,10 +275,9 @@ def row_names(plan: SystemPlan, rows: InitialRows) -> list[str]:
 
 def check(system, x: Any, residual: Any, initial: Mapping[str, Any] | None) -> Any:
     """Raises an `InitializationError` that names the worst rows if the initial point is not consistent."""
-    plan: SystemPlan = system.plan
     limit = tolerance(x.dtype, x)
     bad = ~(jnp.max(jnp.abs(residual), initial=0.0) <= limit) | ~jnp.all(jnp.isfinite(x))
-    if isinstance(bad, jax.core.Tracer):
+    if isinstance(bad, Tracer):
         return eqx.error_if(
             x,
             bad,

@@ -220,7 +220,7 @@ def lower(
         inputs,
         derivative,
         derivative.layout.gather(following) if len(following) else Gather(*(np.zeros(0, np.int64),) * 3),
-        tuple(derivative.layout.gather(q) for q in rates) if len(rates) else None,
+        tuple(derivative.layout.gather(np.array([q])) for q in rates) if len(rates) else None,
         everything,
         carried_residuals,
         constraint_program,
@@ -311,7 +311,7 @@ def _plan_row(row: RowInjection, inputs, flat, alias, extended, states, layout: 
         q = int(quantities.first[quantities.column[alias.root[v]]] + alias.order[v])
         rows.append(position[q])
         signs.append(int(alias.sign[v]))
-    gathers = tuple(layout.gather(q, s) for q, s in zip(*inputs, strict=True))
+    gathers = tuple(layout.gather(np.array([q]), np.array([s])) for q, s in zip(*inputs, strict=True))
     return PlannedRow(row.opaque, tuple(rows), gathers, tuple(signs))
 
 

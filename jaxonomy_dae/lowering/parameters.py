@@ -5,9 +5,9 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..errors import ModelError, nearest
@@ -99,7 +99,7 @@ class Parameters(eqx.Module):
                     f"parameter '{name}' is a scalar; got shape {jnp.shape(value)}. For a batch, use "
                     f"jax.vmap(lambda v: ... system.with_parameters({{'{name}': v}}) ...)"
                 )
-            if not isinstance(value, jax.core.Tracer):
+            if not isinstance(value, Tracer):
                 number = float(value)
                 low, high = self.table.bounds[k]
                 if not np.isfinite(number):

@@ -7,4 +7,5 @@ from .neural import NeuralDAEBlock as NeuralDAEBlock
 from .ports import Domain as Domain
 from .ports import Electrical as Electrical
 from .ports import Translational as Translational
+from .symbols import Eq as Eq
 from .symbols import der as der

@@ -1,12 +1,12 @@
 """The base class of everything a user models with."""
 
 import dataclasses
+import functools
 import math
 import numbers
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import sympy
 
 from ..errors import ModelError, nearest
@@ -315,20 +315,10 @@ class Component(metaclass=_Sealing):
         if self._sealed:
             raise ModelError(f"component '{self.path}' is complete: add its equations inside __init__ of its class")
         for equation in equations:
-            if isinstance(equation, sympy.Eq):
-                residual = equation.lhs - equation.rhs
-            elif isinstance(equation, bool | sympy.logic.boolalg.BooleanAtom):
-                raise ModelError(
-                    f"component '{self.name}': an equation is always {equation}; does it say what you mean? "
-                    "(`a == b` compares; write `Eq(a, b)`)"
-                )
-            else:
-                residual = sympy.sympify(equation)
-            if not isinstance(residual, sympy.Expr):
-                raise ModelError(f"component '{self.name}': {equation!r} is no equation")
-            if not any(isinstance(s, VariableSymbol) for s in residual.free_symbols):
-                raise ModelError(f"component '{self.name}': the equation {equation} contains no variable")
-            self.equations.append(residual)
+            try:
+                self.equations.append(_residual(equation))
+            except ModelError as error:
+                raise ModelError(f"component '{self.name}': {error}") from None
 
     # --- hierarchy ---------------------------------------------------------------------------------------------
 
@@ -350,6 +340,24 @@ class Component(metaclass=_Sealing):
 
     def __repr__(self):
         return f"{type(self).__name__}({self.path!r})"
+
+
+@functools.lru_cache(maxsize=4096)
+def _residual(equation: Any) -> sympy.Expr:
+    """What must be zero for an equation to hold."""
+    if isinstance(equation, sympy.Eq):
+        residual = equation.lhs - equation.rhs  # pyright: ignore[reportOperatorIssue]
+    elif isinstance(equation, bool | sympy.logic.boolalg.BooleanAtom):
+        raise ModelError(
+            f"an equation is always {equation}; does it say what you mean? (`a == b` compares; write `Eq(a, b)`)"
+        )
+    else:
+        residual = sympy.sympify(equation)
+    if not isinstance(residual, sympy.Expr):
+        raise ModelError(f"{equation!r} is no equation")
+    if not any(isinstance(s, VariableSymbol) for s in residual.free_symbols):
+        raise ModelError(f"the equation {equation} contains no variable")
+    return residual
 
 
 def resolve_ports(ends: Sequence[Any], where: str) -> tuple[Port, ...]:
@@ -378,11 +386,3 @@ def resolve_ports(ends: Sequence[Any], where: str) -> tuple[Port, ...]:
     if len({id(p) for p in ports}) < len(ports):
         raise ModelError(f"{where}: a port is connected to itself: {', '.join(map(repr, ports))}")
     return tuple(ports)
-
-
-def number_of(value: Any, what: str) -> float:
-    """A finite float, or a `ModelError` that says what was expected."""
-    array = np.asarray(value)
-    if array.shape != () or not np.issubdtype(array.dtype, np.number) or not np.isfinite(array):
-        raise ModelError(f"{what} must be a finite number; got {value!r}")
-    return float(array)

@@ -5,6 +5,7 @@ so all instances of a component class share literally the same SymPy expressions
 symbol means is decided when the diagram is flattened, by integers.
 """
 
+import functools
 from typing import Any
 
 import sympy
@@ -19,6 +20,7 @@ class VariableSymbol(sympy.Symbol):
     path: str
     order: int
 
+    @functools.lru_cache(maxsize=65536)  # noqa: B019 (large models ask for the same few symbols again and again)
     def __new__(cls, path: str, order: int = 0):
         name = "der(" * order + path + ")" * order
         symbol = super().__new__(cls, name, real=True)
@@ -36,6 +38,7 @@ class ParameterSymbol(sympy.Symbol):
     __slots__ = ("path",)
     path: str
 
+    @functools.lru_cache(maxsize=65536)  # noqa: B019
     def __new__(cls, path: str):
         symbol = super().__new__(cls, path, real=True)
         symbol.path = path
@@ -58,6 +61,9 @@ class TimeSymbol(sympy.Symbol):
 
 
 TIME = TimeSymbol()
+
+# SymPy's Eq, remembering what it returned: the components of a large model write the same few equations.
+Eq = functools.lru_cache(maxsize=4096)(sympy.Eq)
 
 
 def der(expression: Any) -> Any:

@@ -13,10 +13,10 @@ Projection = Callable[[Any, Any, Any], Any]
 class Projected(_Wrapped):
     """Wraps a Diffrax solver: after every step, y₁ is moved onto a manifold.
 
-    The standard projection method (Hairer, Lubich & Wanner 2006, Geometric Numerical Integration, Algorithm IV.4.2): the
-    step, its error estimate and its dense output are those of the wrapped solver, and the projection changes y₁ by no
-    more than the step's error, so the order is kept. Between the ends of steps, the dense output lies on the manifold to
-    its own accuracy; `jaxonomy_dae.simulate` projects saved values too.
+    The standard projection method (Hairer, Lubich & Wanner 2006, Geometric Numerical Integration, Algorithm IV.4.2):
+    the step, its error estimate and its dense output are those of the wrapped solver, and the projection changes y₁ by
+    no more than the step's error, so the order is kept. Between the ends of steps, the dense output lies on the
+    manifold to its own accuracy; `jaxonomy_dae.simulate` projects saved values too.
 
     **Arguments:**
 

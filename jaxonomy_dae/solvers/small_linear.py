@@ -11,8 +11,8 @@ UNROLLED = 6
 def solve(matrix: Sequence[Sequence[Any]], right: Sequence[Any], *, positive: bool = False) -> list[Any]:
     """Solves A·x = b where the entries of A and b are scalars or arrays of one shape (a batch).
 
-    The elimination is written out, with partial pivoting by selection: no call of LAPACK, no branch, and every entry may
-    be batched. It pays up to about `UNROLLED` unknowns. A symmetric positive definite matrix (`positive`) needs no
+    The elimination is written out, with partial pivoting by selection: no call of LAPACK, no branch, and every entry
+    may be batched. It pays up to about `UNROLLED` unknowns. A symmetric positive definite matrix (`positive`) needs no
     pivoting.
     """
     n = len(right)
