@@ -16,6 +16,7 @@ from .lowering.initialize import check, initialize
 from .lowering.system import AcausalSystem
 from .solution import Solution
 from .solvers.projected import with_projection
+from .solvers.tsit5 import Tsit5
 
 SAVED_ITERATIONS = 3
 
@@ -44,8 +45,8 @@ def simulate(
     - `system`: from an `AcausalCompiler`.
     - `t0`, `t1`: the interval, `t0 < t1`.
     - `ts`: when to save, shape `(n,)`, increasing, inside the interval; None saves every step taken.
-    - `solver`: any Diffrax solver for ordinary differential equations; default `Tsit5`. Systems with hidden constraints
-        are projected onto them after every step and at every saved time.
+    - `solver`: any Diffrax solver for ordinary differential equations; default `solvers.Tsit5`. Systems with hidden
+        constraints are projected onto them after every step and at every saved time.
     - `rtol`, `atol`: tolerances of the local error.
     - `inputs`: functions of time (callable pytrees such as Diffrax interpolations, or plain functions) or constants, by
         the inputs' names.
@@ -77,7 +78,7 @@ def simulate(
             "stepsize_controller=ConstantStepSize() needs a step: use diffrax.StepTo(ts=jnp.linspace(t0, t1, n))"
         )
     options = (
-        solver if solver is not None else diffrax.Tsit5(),
+        solver if solver is not None else Tsit5(),
         adjoint if adjoint is not None else default_adjoint(system.plan.n_state),
         stepsize_controller,
         max_steps,

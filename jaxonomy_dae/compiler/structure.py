@@ -66,5 +66,6 @@ def pattern(pointer: np.ndarray, columns: np.ndarray, n_columns: int) -> Any:
     """A boolean sparse matrix, for scipy.sparse.csgraph."""
     data = np.ones(len(columns), np.int8)
     shape = (len(pointer) - 1, n_columns)
-    matrix: Any = (data, columns.astype(np.int32), pointer.astype(np.int32))
-    return sp.csr_array(matrix, shape=shape)
+    arrays: Any = (data, columns.astype(np.int32), pointer.astype(np.int32))
+    shape: Any = (len(pointer) - 1, n_columns)
+    return sp.csr_array(arrays, shape=shape)

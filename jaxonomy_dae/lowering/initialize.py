@@ -207,7 +207,12 @@ def initialize(system, t0: Any, inputs: Mapping[str, Any] | None, initial: Mappi
         solution = optx.least_squares(lambda y, _: fixed(y), solver, x, max_steps=MAX_STEPS, throw=False)
         return solution.value
 
-    near = jax.lax.cond(jnp.max(jnp.abs(fixed(start)), initial=0.0) <= close, lambda x: x, search, start)
+    def far(carry):
+        x, searched = carry
+        return ~searched & ~(jnp.max(jnp.abs(fixed(x)), initial=0.0) <= close)
+
+    # A loop that runs at most once, not a `cond`: under vmap it is skipped if all members start consistent.
+    near, _ = jax.lax.while_loop(far, lambda c: (search(c[0]), jnp.array(True)), (start, jnp.array(False)))
     near = frozen(near)
     jacobian = frozen(jax.jacfwd(fixed)(near))
     remaining = residual(near, parameters, inputs, target)
