@@ -84,8 +84,9 @@ def simulate(
         max_steps,
         progress,
     )
-    inputs = dict(inputs or {})
-    initial = dict(initial or {})
+    # Numbers become arrays, so that a new value is no new program.
+    inputs = {name: v if callable(v) else jnp.asarray(v, dtype) for name, v in (inputs or {}).items()}
+    initial = {name: jnp.asarray(v, dtype) for name, v in sorted((initial or {}).items())}
     t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
     ts = None if ts is None else jnp.asarray(ts, dtype)
     arguments = (system, t0, t1, ts, inputs, initial, options)

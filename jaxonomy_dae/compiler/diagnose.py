@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..errors import StructuralError
-from .reduce_index import maximum_matching
+from .match import maximum_matching
 from .structure import Incidence
 from .tables import AliasTable, EquationGroup, FlatModel, describe_equation
 
@@ -28,7 +28,7 @@ def check_structure(
 
     `unknown` lists the variable behind each column of the incidence.
     """
-    matched = maximum_matching(incidence)
+    matched = maximum_matching(incidence.pointer, incidence.variable, incidence.n_variables)
     extra = np.flatnonzero(matched < 0)
     taken = np.zeros(incidence.n_variables, bool)
     taken[matched[matched >= 0]] = True

@@ -8,10 +8,10 @@ import dataclasses
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.sparse.csgraph import connected_components, maximum_bipartite_matching
+from scipy.sparse.csgraph import connected_components
 
 from .extend import Extended
-from .structure import pattern
+from .match import maximum_matching
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,8 +51,7 @@ def order_blocks(extended: Extended, known: np.ndarray, removed: np.ndarray) -> 
     rows, columns = row_id[entry_rows[inside]], unknown_id[columns[inside]]
     n = len(equations)
     pointer = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))]).astype(np.int64)
-    graph = pattern(pointer, columns, len(unknowns))
-    matched = maximum_bipartite_matching(graph, perm_type="column").astype(np.int64)
+    matched = maximum_matching(pointer, columns, len(unknowns))
     if (matched < 0).any() or n != len(unknowns):
         return equations[matched < 0]
 

@@ -11,9 +11,9 @@ No differentiated equation is ever built here: the pass works on integers alone.
 import dataclasses
 
 import numpy as np
-from scipy.sparse.csgraph import maximum_bipartite_matching
 
-from .structure import Incidence, pattern
+from .match import maximum_matching
+from .structure import Incidence
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,12 +35,6 @@ class Offsets:
         return int(self.variable.sum() - self.equation.sum())
 
 
-def maximum_matching(incidence: Incidence) -> np.ndarray:
-    """A maximum matching of equations with variables whatever the order; −1 for unmatched equations."""
-    graph = pattern(incidence.pointer, incidence.variable, incidence.n_variables)
-    return maximum_bipartite_matching(graph, perm_type="column").astype(np.int64)
-
-
 def reduce_index(incidence: Incidence) -> Offsets:
     """Pantelides' algorithm.
 
@@ -57,7 +51,7 @@ def reduce_index(incidence: Incidence) -> Offsets:
     active = sigma == d[columns]
     rows = incidence.rows[active]
     start = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n_equations))])
-    match_equation = maximum_bipartite_matching(pattern(start, columns[active], n), perm_type="column").astype(np.int64)
+    match_equation = maximum_matching(start, columns[active], n)
     match_variable = np.full(n, -1, np.int64)
     matched = np.flatnonzero(match_equation >= 0)
     match_variable[match_equation[matched]] = matched

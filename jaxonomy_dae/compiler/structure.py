@@ -1,10 +1,8 @@
 """Incidence: which equation contains which variable, up to which derivative."""
 
 import dataclasses
-from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 
 from .tables import ZERO, EquationGroup
 
@@ -60,12 +58,3 @@ def incidence(groups: tuple[EquationGroup, ...], column: np.ndarray, n_columns: 
     joined = [np.concatenate(a) if a else np.zeros(0, np.int64) for a in (rows, columns, orders)]
     pointer, columns, orders = compress(*joined, first)
     return Incidence(pointer, columns, orders, n_columns)
-
-
-def pattern(pointer: np.ndarray, columns: np.ndarray, n_columns: int) -> Any:
-    """A boolean sparse matrix, for scipy.sparse.csgraph."""
-    data = np.ones(len(columns), np.int8)
-    shape = (len(pointer) - 1, n_columns)
-    arrays: Any = (data, columns.astype(np.int32), pointer.astype(np.int32))
-    shape: Any = (len(pointer) - 1, n_columns)
-    return sp.csr_array(arrays, shape=shape)

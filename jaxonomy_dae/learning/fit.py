@@ -91,6 +91,8 @@ def fit(
     trainable, frozen = split(model, train)
     if not jax.tree.leaves(trainable):
         raise ModelError("nothing is to be trained: `train` selects no arrays of the model")
+    # Updates make weakly typed leaves strong, which would compile the step again.
+    trainable = jax.tree.map(lambda w: jnp.asarray(w, w.dtype) if eqx.is_array(w) else w, trainable)
 
     @eqx.filter_jit
     def step(trainable, frozen, state, args):
@@ -122,12 +124,14 @@ def fit(
                     raise ModelError(
                         f"{what} at the start: simulate the model once with throw=True to see why, and check the data"
                     )
+                if math.isfinite(number):
+                    history.append(number)
+                    if number < history[best_step]:
+                        best, best_step = trainable, k
                 message = (
                     f"stopped after {k} updates: {what}. The best iterate, after {best_step} updates, is returned; a "
                     "smaller learning rate or optax.clip_by_global_norm may help"
                 )
-                if math.isfinite(number):
-                    history.append(number)
                 warnings.warn(message, RuntimeWarning, stacklevel=2)
                 break
             history.append(number)

@@ -58,6 +58,17 @@ class Damper(Component):
         self.add_equations(Eq(s, b.x - a.x), Eq(v, der(s)), Eq(f, d * v), Eq(b.f, f), Eq(a.f + b.f, 0))
 
 
+class Rod(Component):
+    """A rigid massless rod: flange_b.x − flange_a.x = length (metre); `f` is the force that pulls its ends together."""
+
+    def __init__(self, ev: EqnEnv, name: str, length: float = 0.0):
+        super().__init__(ev, name)
+        distance = self.parameter("length", length, unit="m")
+        a, b = self.port("flange_a", Translational), self.port("flange_b", Translational)
+        f = self.variable("f", unit="N")
+        self.add_equations(Eq(b.x - a.x, distance), Eq(b.f, f), Eq(a.f + b.f, 0))
+
+
 class FixedPosition(Component):
     """A flange held at the parameter `position` (metre)."""
 

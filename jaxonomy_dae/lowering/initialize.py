@@ -82,9 +82,14 @@ def choose_rows(plan: SystemPlan, values: np.ndarray, networks: tuple, names: tu
     inside = set(plan.states.tolist())
     rows = [*overrides, *fixed]
     if not plan.n_constraints and not len(plan.carried) and all(r.quantity in inside for r in rows):
-        held = {r.quantity for r in rows}
+        held: set[int] = set()
+        again = []  # starts of variables that equal one with a start of its own
+        for r in rows:
+            if r.quantity in held:
+                again.append(r.name)
+            held.add(r.quantity)
         promoted = tuple(plan.quantity_name[q] for q in entries if q not in held)
-        return InitialRows(guess, tuple(rows), True, (), promoted, ())
+        return InitialRows(guess, tuple(rows), True, tuple(again), promoted, ())
     return _by_rank(plan, values, networks, overrides, fixed, started, guess)
 
 

@@ -110,6 +110,9 @@ class AcausalSystem(eqx.Module):
     # --- computing ---------------------------------------------------------------------------------------------
 
     def _point(self, t: Any, args: Any) -> Point:
+        for name, default in zip(self.plan.inputs.names, self.plan.inputs.defaults, strict=True):
+            if default is None and name not in (args or {}):
+                raise ModelError(f"input '{name}' has no default: give it as {{'{name}': function_of_time}}")
         networks = tuple(self.neural[n] for n in self.plan.network_names)
         return Point(self.plan, self.parameters.array, networks, t, args)
 

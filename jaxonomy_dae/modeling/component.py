@@ -163,6 +163,11 @@ class Component(metaclass=_Sealing):
                 raise ModelError(
                     f"component '{self.name}' uses the name '{name}' twice: it is a {kind} already; rename the {what}"
                 )
+        if what in ("port", "child component") and hasattr(Component, name):
+            raise ModelError(
+                f"component '{self.name}': a {what} cannot be named '{name}', because every component has an "
+                "attribute of that name; rename it"
+            )
         if any(term.name == name for term in self.learned_terms):
             raise ModelError(f"component '{self.name}' uses the name '{name}' twice: it is a learned term already")
 

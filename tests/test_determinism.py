@@ -1,0 +1,148 @@
+"""The same model gives the same system: whatever the hash seed, whatever the names."""
+
+import json
+import os
+import pathlib
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from problems import compiled, drag_on, mlp, oscillator, pendulum, rc_circuit
+
+from jaxonomy_dae import EqnEnv
+from jaxonomy_dae.library.electrical import Capacitor, Ground, Inductor, Resistor, VoltageSource
+
+ROOT = pathlib.Path(__file__).parents[1]
+
+
+def ladder(names=None, stages=3):
+    """A filter with an inductor and, from the second stage on, two parallel capacitors in each stage."""
+    plain = ["source", "ground", *(f"{kind}{k}" for k in range(stages) for kind in ("l", "r", "c", "d"))]
+    name = dict(zip(plain, names or plain, strict=True))
+    ev = EqnEnv()
+    source, ground = VoltageSource(ev, name["source"], 2.0), Ground(ev, name["ground"])
+    parts, connect, above = [source, ground], [(source.n, ground.p)], source.p
+    for k in range(stages):
+        coil = Inductor(ev, name[f"l{k}"], 0.1 + k)
+        r, c, d = Resistor(ev, name[f"r{k}"], 1.0 + k), Capacitor(ev, name[f"c{k}"], 0.5), Capacitor(ev, name[f"d{k}"])
+        parts += [coil, r, c, d]
+        connect += [(above, coil.p), (coil.n, r.p), (r.n, c.p, d.p), (c.n, d.n, ground.p)]
+        above = r.n
+    return compiled(*parts, connect=connect)
+
+
+def systems():
+    """One system for each kind of lowering."""
+    yield "pendulum", pendulum(drag_on("vx", "vy", network=mlp(2, 2)))
+    yield "minimal", pendulum(drag_on("vx"), compiler={"state_selection": "dummy_derivatives"})
+    yield "row", pendulum(drag_on("vx", inject="row"), compiler={
+        "state_selection": "dummy_derivatives", "prefer_states": ["pend.vx"]})  # fmt: skip
+    yield "ladder", ladder()
+    yield "oscillator", oscillator()
+
+
+def everything(system) -> dict:
+    """All that must not change: order, names, report, digest, and numbers to the last bit."""
+    x = 0.3 + 0.1 * jnp.arange(system.plan.n_state, dtype=float)
+    slope = jax.jit(lambda x: system.vector_field(0.25, x))(x)
+    start = jax.jit(system.initialize)()
+    return {
+        "states": system.states,
+        "carried": system.carried,
+        "algebraics": system.algebraics,
+        "variables": system.variables,
+        "parameters": system.parameters.names,
+        "report": str(system.report),
+        "digest": system.plan.digest,
+        "slope": [v.hex() for v in np.asarray(slope).tolist()],
+        "start": [v.hex() for v in np.asarray(start).tolist()],
+    }
+
+
+# --- hash seeds --------------------------------------------------------------------------------------------------
+
+PROGRAM = """
+import json, jax
+jax.config.update("jax_enable_x64", True)
+from test_determinism import everything, systems
+print(json.dumps({name: everything(system) for name, system in systems()}))
+"""
+
+
+def start_with_seed(seed):
+    path = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
+    environment = os.environ | {"PYTHONHASHSEED": str(seed), "PYTHONPATH": path}
+    return subprocess.Popen(
+        [sys.executable, "-c", PROGRAM], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+@pytest.mark.parametrize(
+    "seeds", [pytest.param((0, 1), id="two"), pytest.param((0, 1, 2, 3, 4), id="five", marks=pytest.mark.slow)]
+)
+def test_the_hash_seed_changes_nothing(seeds):
+    processes = [start_with_seed(seed) for seed in seeds]
+    outputs = [process.communicate(timeout=300) for process in processes]
+    for process, (_, errors) in zip(processes, outputs, strict=True):
+        assert process.returncode == 0, errors
+    results = [json.loads(out) for out, _ in outputs]
+    assert set(results[0]) == {name for name, _ in systems()}
+    for other in results[1:]:
+        for name, expected in results[0].items():
+            assert other[name] == expected, name
+
+
+def test_compiling_twice_gives_equal_systems():
+    for (_, first), (_, second) in zip(systems(), systems(), strict=True):
+        assert first.plan == second.plan and hash(first.plan) == hash(second.plan)
+        assert str(first.report) == str(second.report)
+
+
+# --- names -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "name", ["a", "Z9", "_", "vx", "lambda", "E", "sin", "I", "pi", "time", "der", "q-1", "Größe", "x[0]", "0"]
+)
+@pytest.mark.parametrize("mode", ["auto", "dummy_derivatives"])
+def test_a_components_name_changes_nothing(name, mode):
+    options = {"compiler": {"state_selection": mode}}
+    expected, renamed = pendulum(drag_on("vx"), **options), pendulum(drag_on("vx"), name=name, **options)
+
+    def as_pend(text):
+        return text.replace("pend", name)
+
+    assert str(renamed.report) == as_pend(str(expected.report))
+    for attribute in ("states", "carried", "algebraics", "variables", "inputs"):
+        assert getattr(renamed, attribute) == [as_pend(n) for n in getattr(expected, attribute)]
+    assert renamed.parameters.names == [as_pend(n) for n in expected.parameters.names]
+    x = 0.3 + 0.1 * jnp.arange(expected.plan.n_state, dtype=float)
+    field = jax.jit(lambda s, x: s.vector_field(0.0, x), static_argnums=())
+    if name in ("a", "lambda"):  # a compilation each
+        np.testing.assert_array_equal(field(renamed, x), field(expected, x))
+
+
+def test_names_order_nothing():
+    """Names in the opposite alphabetical order: every list keeps its order."""
+    expected = ladder()
+    plain = ["source", "ground", *(f"{kind}{k}" for k in range(3) for kind in ("l", "r", "c", "d"))]
+    other = [f"n{99 - k}n" for k in range(len(plain))]
+    renamed = ladder(other)
+
+    def renamed_back(text):
+        for new, old in zip(other, plain, strict=True):
+            text = text.replace(new, old)
+        return text
+
+    assert renamed_back(str(renamed.report)) == str(expected.report)
+    assert [renamed_back(n) for n in renamed.states] == expected.states
+    assert [renamed_back(n) for n in renamed.variables] == expected.variables
+    assert [renamed_back(n) for n in renamed.plan.quantity_name] == expected.plan.quantity_name
+
+
+def test_equal_circuits_of_different_values_have_one_structure():
+    assert rc_circuit(R=1.0).plan == rc_circuit(R=2.0).plan
+    assert rc_circuit().plan != ladder(stages=1).plan

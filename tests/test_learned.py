@@ -1,0 +1,251 @@
+"""Learned terms: corrections of derivatives, networks in algebraic equations, networks that constraints reach.
+
+The networks here are known laws, written as functions, so that the solutions have closed forms.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from problems import compiled, drag_on, mlp, pendulum
+from sympy import Eq
+
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, Electrical, EqnEnv, NeuralDAEBlock, der, simulate
+from jaxonomy_dae.library.electrical import Capacitor, Ground
+
+TS = jnp.linspace(0.0, 2.0, 9)
+T = np.asarray(TS)
+SOLVE = dict(rtol=1e-9, atol=1e-11)
+CLOSE = dict(rtol=0, atol=1e-7)  # a hundred times the tolerance of the solves
+
+
+class Free(Component):
+    """dx/dt = 0, dy/dt = 0: all motion comes from corrections."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        x, y = self.variable("x", start=1.0, fixed=True), self.variable("y", start=2.0, fixed=True)
+        self.add_equations(Eq(der(x), 0), Eq(der(y), 0))
+
+
+def corrected(*blocks, **options):
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    component = Free(ev, "c")
+    diagram.add(component)
+    for k, block in enumerate(blocks):
+        given = {"name": f"block{k}", "targets": [(component, "x")]} | block
+        diagram.add_neural_correction_block(NeuralDAEBlock(given.pop("network"), given.pop("theta", None), **given))
+    return AcausalCompiler(ev, diagram, **options)()
+
+
+def slopes(system, t=0.0, **at):
+    """The vector field by name, at a point given by name."""
+    x = jnp.array([at[n.removeprefix("c.")] for n in system.states])
+    return {n.removeprefix("c."): float(v) for n, v in zip(system.states, system.vector_field(t, x), strict=True)}
+
+
+# --- corrections -------------------------------------------------------------------------------------------------
+
+
+def test_several_blocks_on_one_target_add_up():
+    system = corrected({"network": lambda u: -u}, {"network": lambda u: -0.5 * u}, {"network": lambda u: 0 * u + 3.0})
+    assert list(system.neural) == ["block0", "block1", "block2"]
+    solution = simulate(system, 2.0, ts=TS, **SOLVE)
+    np.testing.assert_allclose(solution["c.x"], 2.0 - np.exp(-1.5 * T), **CLOSE)
+    np.testing.assert_allclose(solution["block1[0]"], -0.5 * (2.0 - np.exp(-1.5 * T)), **CLOSE)
+    np.testing.assert_allclose(solution["c.y"], 2.0, **CLOSE)
+
+
+@pytest.mark.parametrize("inject", ["equation", "row"])
+def test_module_and_function_with_weights_are_the_same(inject):
+    options = {"state_selection": "dummy_derivatives"}
+    module = mlp(2, 2)
+    targets = {"targets": ["c.x", "c.y"], "inject": inject}
+    a = corrected({"network": module, "name": "law", **targets}, **options)
+    weights, static = eqx.partition(module, eqx.is_array)
+    b = corrected(
+        {"network": lambda t, u, theta: eqx.combine(theta, static)(u), "theta": weights, "name": "law", **targets},
+        **options,
+    )
+    assert jax.tree.leaves(a.neural["law"]) == jax.tree.leaves(b.neural["law"]) or eqx.tree_equal(
+        eqx.filter(a.neural["law"], eqx.is_array), b.neural["law"]
+    )
+    expected = module(jnp.array([0.3, -0.8]))
+    for system in (a, b):
+        found = slopes(system, x=0.3, y=-0.8)
+        np.testing.assert_allclose([found["x"], found["y"]], expected, rtol=1e-14)  # rounding
+
+
+def test_a_flat_theta_of_numbers_becomes_an_array():
+    system = corrected({"network": lambda t, u, theta: -theta[0] * u, "theta": np.array([2.0])})
+    assert isinstance(system.neural["block0"], jax.Array)
+    assert slopes(system, x=3.0, y=0.0) == {"x": -6.0, "y": 0.0}
+
+
+@pytest.mark.parametrize("inject", ["equation", "row"])
+def test_inputs_in_the_order_given_with_time_among_them(inject):
+    block = {
+        "network": lambda u: jnp.array([u[0] + 10 * u[1] + 100 * u[2]]),
+        "inputs": ["c.y", "time", "c.x"],
+        "inject": inject,
+    }
+    system = corrected(block, state_selection="dummy_derivatives")
+    assert slopes(system, t=0.5, x=0.25, y=2.0) == {"x": 2.0 + 5.0 + 25.0, "y": 0.0}
+
+
+def test_time_reaches_a_function_with_weights():
+    system = corrected({"network": lambda t, u, theta: theta * jnp.sin(t) + 0 * u, "theta": jnp.array(2.0)})
+    solution = simulate(system, 2.0, ts=TS, **SOLVE)
+    np.testing.assert_allclose(solution["c.x"], 3.0 - 2.0 * np.cos(T), **CLOSE)
+
+
+def test_the_order_of_targets_is_the_order_of_outputs():
+    system = corrected({"network": lambda u: jnp.array([1.0, 2.0]) + 0 * u, "targets": ["c.y", "c.x"]})
+    assert slopes(system, x=0.0, y=0.0) == {"x": 2.0, "y": 1.0}
+
+
+# --- in algebraic equations --------------------------------------------------------------------------------------
+
+
+class LearnedResistor(Component):
+    """Between two pins: v = network(i), or i = network(v)."""
+
+    def __init__(self, ev, name, network, gives):
+        super().__init__(ev, name)
+        p, n = self.port("p", Electrical), self.port("n", Electrical)
+        v, i = self.variable("v"), self.variable("i")
+        self.add_equations(Eq(v, p.v - n.v), Eq(i, p.i), Eq(p.i + n.i, 0))
+        (law,) = self.learned("law", network, inputs=[i if gives == "v" else v])
+        self.add_equations(Eq(v if gives == "v" else i, law))
+
+
+def discharge(network, gives, v0=1.0, C=0.5):
+    ev = EqnEnv()
+    c, r, g = Capacitor(ev, "c", C, initial_voltage=v0), LearnedResistor(ev, "r", network, gives), Ground(ev, "g")
+    return compiled(c, r, g, connect=[(c.p, r.p), (c.n, r.n, g.p)])
+
+
+def diode_discharge(t, a=0.4, C=0.5, v0=1.0):
+    """C·dv/dt = −a·(exp(v) − 1) in closed form."""
+    return -np.log(1 - (1 - np.exp(-v0)) * np.exp(-a * t / C))
+
+
+@pytest.mark.parametrize(
+    "network, gives",
+    [
+        pytest.param(lambda v: 0.4 * jnp.expm1(v), "i", id="explicit"),
+        # The current is found from v = law(i): a nonlinear block around the network.
+        pytest.param(lambda i: jnp.log1p(i / 0.4), "v", id="implicit"),
+    ],
+)
+def test_a_resistor_with_a_learned_law(network, gives):
+    system = discharge(network, gives)
+    solution = simulate(system, 2.0, ts=TS, **SOLVE)
+    v = diode_discharge(T)
+    np.testing.assert_allclose(solution["c.v"], v, **CLOSE)
+    np.testing.assert_allclose(solution["r.i"], 0.4 * np.expm1(v), **CLOSE)
+    np.testing.assert_allclose(solution["r.law"], solution["r.v" if gives == "v" else "r.i"], **CLOSE)
+
+
+def test_gradients_reach_the_weights_inside_an_algebraic_equation():
+    """dv/dt of a discharge through i = k·v has the derivative −v/C with respect to k."""
+
+    class Conductance(eqx.Module):
+        k: jax.Array
+
+        def __call__(self, v):
+            return self.k * v
+
+    system = discharge(Conductance(jnp.array(0.7)), "i")
+
+    def slope(s):
+        return s.vector_field(0.0, jnp.array([1.3]))[0]
+
+    gradient = eqx.filter_grad(slope)(system)
+    assert float(gradient.neural["r.law"].k) == pytest.approx(-1.3 / 0.5, rel=1e-12)
+
+
+# --- in constraints ----------------------------------------------------------------------------------------------
+
+
+class Cam(Component):
+    """A follower at y = network(x) on a cam that moves harmonically; the force that moves it is m·d²y/dt².
+
+    The constraint y − network(x) = 0 is differentiated twice, the network with it.
+    """
+
+    def __init__(self, ev, name, network):
+        super().__init__(ev, name)
+        m = self.parameter("m", 2.0)
+        x, u = self.variable("x", start=0.8, fixed=True), self.variable("u", start=0.0, fixed=True)
+        y, v, f = self.variable("y"), self.variable("v"), self.variable("f")
+        (profile,) = self.learned("profile", network, inputs=[x])
+        self.add_equations(Eq(der(x), u), Eq(der(u), -x))
+        self.add_equations(Eq(der(y), v), Eq(m * der(v), f), Eq(y, profile))
+
+
+@pytest.mark.parametrize("mode", ["auto", "dummy_derivatives"])
+def test_constraints_differentiate_networks_exactly(mode):
+    system = compiled(Cam(EqnEnv(), "cam", jnp.tanh), state_selection=mode)
+    x, u = 0.8 * np.cos(T), -0.8 * np.sin(T)
+    y = np.tanh(x)
+    slope = 1 - y**2
+    solution = simulate(system, 2.0, ts=TS, **SOLVE)
+    np.testing.assert_allclose(solution["cam.x"], x, **CLOSE)
+    np.testing.assert_allclose(solution["cam.y"], y, **CLOSE)
+    np.testing.assert_allclose(solution["cam.v"], slope * u, **CLOSE)
+    np.testing.assert_allclose(solution["cam.f"], 2.0 * (-2 * y * slope * u**2 - slope * x), **CLOSE)
+
+
+class Bead(Component):
+    """A bead on the wire y = network(x), no friction: m·r'' = λ·(−N'(x), 1) + (0, −m·g), N' by a second network."""
+
+    def __init__(self, ev, name, network, slope):
+        super().__init__(ev, name)
+        m, g = self.parameter("m", 1.5), self.parameter("g", 9.81)
+        x, y = self.variable("x", start=0.6, fixed=True), self.variable("y")
+        vx, vy, lam = self.variable("vx", start=0.0, fixed=True), self.variable("vy"), self.variable("lam")
+        (height,) = self.learned("height", network, inputs=[x])
+        (rise,) = self.learned("rise", slope, inputs=[x])
+        self.add_equations(
+            Eq(der(x), vx), Eq(der(y), vy), Eq(m * der(vx), -lam * rise), Eq(m * der(vy), lam - m * g), Eq(y, height)
+        )
+
+
+def test_a_bead_on_a_learned_wire_keeps_its_energy():
+    system = compiled(Bead(EqnEnv(), "b", lambda x: x**2, lambda x: 2 * x))
+    solution = simulate(system, 2.0, ts=TS, **SOLVE)
+    x, y, vx, vy = (np.asarray(solution[f"b.{n}"]) for n in ("x", "y", "vx", "vy"))
+    assert np.ptp(x) > 1.0  # it swings from side to side
+    np.testing.assert_allclose(y, x**2, **CLOSE)
+    np.testing.assert_allclose(vy, 2 * x * vx, **CLOSE)
+    np.testing.assert_allclose(0.5 * (vx**2 + vy**2) + 9.81 * y, 9.81 * 0.36, rtol=0, atol=1e-6)  # summed over steps
+    # At the start, at rest: x'' = −2x·g/(1 + 4x²), λ = m(g + y''), y'' = 2x·x''.
+    a = -2 * 0.6 * 9.81 / (1 + 4 * 0.36)
+    assert float(solution["b.lam"][0]) == pytest.approx(1.5 * (9.81 + 1.2 * a), abs=1e-7)
+
+
+def test_the_structure_does_not_depend_on_the_weights():
+    reports = {str(pendulum(drag_on("vx", "vy", network=mlp(2, 2, seed=k))).report) for k in range(3)}
+    zero = jax.tree.map(lambda leaf: 0 * leaf if eqx.is_array(leaf) else leaf, mlp(2, 2))
+    reports.add(str(pendulum(drag_on("vx", "vy", network=zero)).report))
+    assert len(reports) == 1
+
+
+def test_row_injection_leaves_the_constraint_alone():
+    """What tells it from a force: λ is as if the correction were 0, and the other rows are untouched."""
+    options = {"state_selection": "dummy_derivatives", "prefer_states": ("pend.vx", "pend.x")}
+    plain = pendulum(compiler=options)
+    row = pendulum(drag_on("vx", network=lambda u: 0 * u + 5.0, inject="row"), compiler=options)
+
+    @eqx.filter_jit
+    def start(system):
+        x = system.initialize()
+        return x, system.vector_field(0.0, x), system.observe("pend.lam", 0.0, x)
+
+    (x, slope, lam), (x_row, slope_row, lam_row) = start(plain), start(row)
+    assert (row.states, row.carried) == (["pend.x", "pend.vx"], ["pend.y"]) == (plain.states, plain.carried)
+    np.testing.assert_allclose(x_row, x, rtol=1e-12)  # rounding, here and below
+    np.testing.assert_allclose((slope_row - slope)[:2], [0.0, 5.0], atol=1e-12)
+    assert float(lam_row) == pytest.approx(float(lam), rel=1e-12)

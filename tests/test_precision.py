@@ -1,0 +1,94 @@
+"""Single precision, and what importing the package does (nothing). In processes of their own: JAX's settings are global."""
+
+import os
+import pathlib
+import subprocess
+import sys
+
+import pytest
+
+ROOT = pathlib.Path(__file__).parents[1]
+
+
+def run(program: str, **environment) -> str:
+    """Runs a program in a new Python, without this process's settings; returns what it printed."""
+    kept = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
+    path = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", program],
+        env=kept | {"PYTHONPATH": path} | environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+IMPORT = """
+import os, sys, threading
+import jax, diffrax, equinox, optimistix, lineax, optax, sympy, scipy, tqdm.auto
+settings = {k: getattr(jax.config, k) for k in jax.config.values}
+environment, threads, streams = dict(os.environ), threading.active_count(), (sys.stdout, sys.stderr)
+limit, hooks = sys.getrecursionlimit(), (sys.excepthook, len(sys.meta_path))
+import jaxonomy_dae
+import jaxonomy_dae.learning, jaxonomy_dae.solvers
+import jaxonomy_dae.library.electrical, jaxonomy_dae.library.planar, jaxonomy_dae.library.translational
+assert not jax.config.jax_enable_x64
+assert settings == {k: getattr(jax.config, k) for k in jax.config.values}
+assert environment == dict(os.environ)
+assert (threads, streams) == (threading.active_count(), (sys.stdout, sys.stderr))
+assert (limit, hooks) == (sys.getrecursionlimit(), (sys.excepthook, len(sys.meta_path)))
+heavy = {"matplotlib", "pandas", "jaxonomy", "klujax", "splineax", "torch", "IPython"}
+assert not heavy & set(sys.modules), heavy & set(sys.modules)
+from jax._src import xla_bridge
+assert not xla_bridge._backends, "importing has started a device"
+print(jaxonomy_dae.__file__)
+"""
+
+
+def test_importing_changes_nothing():
+    assert run(IMPORT).strip().startswith(str(ROOT))
+
+
+SINGLE = """
+import jax, jax.numpy as jnp, numpy as np
+from problems import angle_solution, mlp, pendulum, drag_on, oscillator, damped_oscillation
+from jaxonomy_dae import ModelError, simulate
+
+system = pendulum(drag_on("vx"))
+assert system.parameters.array.dtype == jnp.float32
+try:
+    simulate(system, 1.0)
+except ModelError as error:
+    print(error)
+
+ts = jnp.array([0.5, 1.0, 1.5])
+solution = simulate(system, 1.5, ts=ts, rtol=1e-4, atol=1e-6)
+assert solution.states.dtype == solution["pend.lam"].dtype == jnp.float32
+expected = angle_solution(-1.2, 0.0, ts, force=lambda vx, vy: (-0.5 * vx * abs(vx), 0.0))
+# Ten times the tolerance, at speeds up to 1.
+for name in ("x", "y", "vx", "vy"):
+    np.testing.assert_allclose(solution[f"pend.{name}"], getattr(expected, name), rtol=0, atol=1e-3)
+np.testing.assert_allclose(solution["pend.lam"], expected.lam, rtol=1e-3)
+# Projected, as far as single precision goes (eps 1.2e-7).
+assert float(jnp.max(jnp.abs(solution.constraint_residual()))) < 1e-6
+
+solution = simulate(oscillator(), 1.5, ts=ts, rtol=1e-4, atol=1e-6)
+np.testing.assert_allclose(solution["mass.x"], damped_oscillation(np.asarray(ts))[0], rtol=0, atol=1e-3)
+print("done")
+"""
+
+
+@pytest.fixture(scope="module")
+def single():
+    return run(SINGLE)
+
+
+def test_single_precision_works_with_loose_tolerances(single):
+    assert single.strip().endswith("done")
+
+
+def test_single_precision_explains_why_the_default_tolerances_fail(single):
+    for part in ("rtol=1e-06", "float32", "jax_enable_x64", "rtol ≥ 1e-06"):
+        assert part in single

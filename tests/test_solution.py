@@ -1,0 +1,194 @@
+"""What `simulate` returns: saved times, names, residuals, failures, figures."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from problems import angle_solution, compiled, damped_oscillation, oscillator, pendulum
+from sympy import Eq
+
+from jaxonomy_dae import AcausalSystem, Component, EqnEnv, ModelError, SimulationError, Solution, der, simulate
+
+TS = jnp.array([0.0, 0.4, 1.1])
+
+
+@pytest.fixture(scope="module")
+def system():
+    return oscillator()
+
+
+@pytest.fixture(scope="module")
+def solution(system):
+    return simulate(system, 1.1, ts=TS, rtol=1e-9, atol=1e-11)
+
+
+# --- names -------------------------------------------------------------------------------------------------------
+
+
+def test_variables_by_name(solution):
+    x, v = damped_oscillation(np.asarray(TS))
+    assert isinstance(solution, Solution) and isinstance(solution.system, AcausalSystem)
+    for name, expected in {
+        "mass.x": x,  # a state
+        "mass.v": v,
+        "der(mass.x)": v,
+        "der(mass.v)": (-0.6 * v - 5.0 * x) / 2.0,
+        "der(der(mass.x))": (-0.6 * v - 5.0 * x) / 2.0,
+        "mass.flange.x": x,  # equal to a state
+        "spring.f": 5.0 * x,  # solved for
+        "spring.flange_a.f": -5.0 * x,  # eliminated, with a sign
+        "wall.flange.x": 0.0 * x,  # a parameter
+    }.items():
+        assert solution[name].shape == (3,)
+        np.testing.assert_allclose(solution[name], expected, rtol=0, atol=1e-7, err_msg=name)  # 100 × tolerance
+    np.testing.assert_array_equal(solution["time"], TS)
+    np.testing.assert_array_equal(solution.ts, TS)
+    assert "mass.x" in solution and "time" in solution and "mass.y" not in solution
+
+
+def test_unknown_names(solution):
+    with pytest.raises(ModelError, match=r"'mass\.xx' is no variable: did you mean 'mass\.x'"):
+        solution["mass.xx"]
+    with pytest.raises(ModelError, match=r"'der\(der\(der\(mass\.x\)\)\)' occurs nowhere.*only 'mass\.x'"):
+        solution["der(der(der(mass.x)))"]
+
+
+def test_to_dict_has_everything(solution, system):
+    everything = solution.to_dict()
+    assert list(everything) == ["time", *system.variables]
+    np.testing.assert_array_equal(everything["spring.f"], solution["spring.f"])
+
+
+def test_a_solution_is_a_pytree(solution):
+    doubled = jax.tree.map(lambda leaf: 2 * leaf if isinstance(leaf, jax.Array) else leaf, solution)
+    np.testing.assert_array_equal(doubled.ts, 2 * TS)
+    assert "3 times" in repr(solution)
+
+
+def test_solutions_may_leave_jit(system):
+    @jax.jit
+    def run(x0):
+        solution = simulate(system, 1.1, ts=TS, initial={"mass.x": x0})
+        return solution["mass.x"], solution["spring.f"], solution["der(mass.v)"]
+
+    x, f, a = run(0.2)
+    np.testing.assert_allclose(f, 5.0 * x, rtol=1e-12)
+    np.testing.assert_allclose(x, damped_oscillation(np.asarray(TS), x0=0.2)[0], rtol=0, atol=1e-4)  # 100 × 1e-6
+    np.testing.assert_allclose(a, (-0.6 * np.gradient(x, TS) - 5 * x) / 2, rtol=1)  # only that it is the acceleration
+
+
+def test_stats_and_result(solution):
+    assert solution.result == diffrax.RESULTS.successful
+    assert solution.stats["num_steps"] == solution.stats["num_accepted_steps"] + solution.stats["num_rejected_steps"]
+    assert all(isinstance(v, int) for v in solution.stats.values())
+
+
+# --- saved times -------------------------------------------------------------------------------------------------
+
+
+def test_without_times_every_step_is_saved(system):
+    solution = simulate(system, 1.1, rtol=1e-9, atol=1e-11)
+    t = np.asarray(solution.ts)
+    assert t[0] == 0.0 and t[-1] == 1.1 and (np.diff(t) > 0).all()
+    assert len(t) == solution.stats["num_accepted_steps"] + 1 > 5
+    np.testing.assert_allclose(solution["mass.x"], damped_oscillation(t)[0], rtol=0, atol=1e-7)
+    assert solution["spring.f"].shape == t.shape
+
+
+def test_another_start_time(system):
+    """The model does not know the time, so only the interval's length matters."""
+    solution = simulate(system, 4.1, t0=3.0, ts=TS + 3.0, rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(solution["mass.x"], damped_oscillation(np.asarray(TS))[0], rtol=0, atol=1e-7)
+
+
+def test_constraint_residuals():
+    plain = pendulum()
+    solution = simulate(plain, 1.1, ts=TS, rtol=1e-9, atol=1e-11)
+    residual = solution.constraint_residual()
+    assert residual.shape == (3, 2)
+    assert np.max(np.abs(residual)) < 1e-13  # rounding
+    # Written out: x² + y² − L² and its derivative, at a point off the circle.
+    off = jnp.array([{"pend.x": 0.9, "pend.y": -0.7, "pend.vx": 0.36, "pend.vy": 0.45}[n] for n in plain.states])
+    found = sorted(np.asarray(plain.constraint_residual(0.0, off)))
+    np.testing.assert_allclose(found, sorted([0.81 + 0.49 - 1.0, 2 * (0.9 * 0.36 - 0.7 * 0.45)]), rtol=1e-12)
+    projected = plain.project(0.0, off, iterations=5)
+    assert np.max(np.abs(plain.constraint_residual(0.0, projected))) < 1e-14
+    x, y = np.asarray(projected)[[plain.states.index("pend.x"), plain.states.index("pend.y")]]
+    # The velocity is nearly tangential, so the nearest point lies in the radius' direction, up to 0.14²/2.
+    np.testing.assert_allclose([x, y], np.array([0.9, -0.7]) / np.hypot(0.9, 0.7), atol=0.01)
+
+
+def test_an_unconstrained_system_has_no_residuals(solution):
+    assert solution.constraint_residual().shape == (3, 0)
+
+
+# --- failures ----------------------------------------------------------------------------------------------------
+
+
+class Blowup(Component):
+    """dx/dt = x², from 1: x = 1/(1 − t), infinite at t = 1."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        x = self.variable("x", start=1.0, fixed=True)
+        self.add_equations(Eq(der(x), x**2))
+        self.output("half", x / 2)
+
+
+@pytest.fixture(scope="module")
+def blowup():
+    return compiled(Blowup(EqnEnv(), "c"))
+
+
+def test_failure_without_throw_keeps_what_was_reached(blowup):
+    ts = jnp.array([0.3, 0.6, 0.9, 1.2, 1.5])
+    solution = simulate(blowup, 1.5, ts=ts, max_steps=200, throw=False)
+    assert solution.result != diffrax.RESULTS.successful
+    x = np.asarray(solution["c.x"])
+    np.testing.assert_allclose(x[:3], 1 / (1 - np.asarray(ts[:3])), rtol=1e-4)  # a hundred times the tolerance
+    assert not np.isfinite(x[3:]).any() and not np.isfinite(np.asarray(solution["c.half"])[3:]).any()
+    np.testing.assert_allclose(np.asarray(solution["c.half"])[:3], x[:3] / 2, rtol=1e-12)
+
+
+def test_failure_raises_in_plain_words(blowup):
+    with pytest.raises(SimulationError, match=r"max_steps=200.*Raise max_steps.*rtol=1e-06.*last saved time is 0\.9"):
+        simulate(blowup, 1.5, ts=jnp.array([0.3, 0.6, 0.9, 1.2, 1.5]), max_steps=200)
+
+
+def test_every_step_saved_up_to_a_failure(blowup):
+    solution = simulate(blowup, 1.5, max_steps=50, throw=False)
+    t = np.asarray(solution.ts)
+    assert np.isfinite(t).all() and 0.5 < t[-1] < 1.0 and len(solution["c.x"]) == len(t)
+    np.testing.assert_allclose(solution["c.x"], 1 / (1 - t), rtol=1e-3)
+
+
+def test_failure_inside_jit_raises(blowup):
+    with pytest.raises(Exception, match="maximum number of solver steps"):
+        jax.block_until_ready(
+            jax.jit(lambda: simulate(blowup, 1.5, ts=jnp.array([0.5, 1.5]), max_steps=50)["c.x"])()
+        )  # fmt: skip
+
+
+def test_failed_rows_of_a_constrained_system():
+    ts = jnp.linspace(0.0, 5.0, 11)
+    solution = simulate(pendulum(), 5.0, ts=ts, max_steps=30, throw=False)
+    x = np.asarray(solution["pend.x"])
+    done = np.isfinite(x)
+    assert 1 < done.sum() < 11 and not done[done.sum() :].any()
+    np.testing.assert_allclose(x[done], angle_solution(-1.2, 0.0, ts[done]).x, rtol=0, atol=1e-4)
+
+
+# --- figures -----------------------------------------------------------------------------------------------------
+
+
+def test_plot(solution):
+    plt = pytest.importorskip("matplotlib.pyplot")
+    axes = solution.plot()
+    assert [line.get_label() for line in axes.lines] == ["mass.x [m]", "mass.v [m/s]"]
+    np.testing.assert_array_equal(axes.lines[0].get_ydata(), solution["mass.x"])
+    assert axes.get_xlabel() == "time [s]"
+    _, given = plt.subplots()
+    assert solution.plot("spring.f", ax=given) is given
+    assert given.get_ylabel() == "spring.f [N]"
+    plt.close("all")
