@@ -55,6 +55,6 @@ def incidence(groups: tuple[EquationGroup, ...], column: np.ndarray, n_columns: 
         columns.append(column[variable[used]])
         orders.append(group.order.ravel()[used])
         first += n
-    joined = [np.concatenate(a) if a else np.zeros(0, np.int64) for a in (rows, columns, orders)]
-    pointer, columns, orders = compress(*joined, first)
-    return Incidence(pointer, columns, orders, n_columns)
+    row, variable, order = (np.concatenate(a) if a else np.zeros(0, np.int64) for a in (rows, columns, orders))
+    pointer, variable, order = compress(row, variable, order, first)
+    return Incidence(pointer, variable, order, n_columns)
