@@ -1,5 +1,6 @@
 """The compiler: all passes in order."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -13,7 +14,7 @@ from .compiler.extend import Extended, extend
 from .compiler.flatten import flatten
 from .compiler.numeric import Networks, consistent_point, start_values
 from .compiler.order_blocks import order_blocks
-from .compiler.reduce_index import reduce_index
+from .compiler.resolve_cancellation import reduce_with_cancellation
 from .compiler.select_states import StateSelection, select_states
 from .compiler.structure import incidence
 from .compiler.tables import ZERO, AliasTable, FlatModel, describe_equation
@@ -104,7 +105,7 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Sy
     column[unknown] = np.arange(len(unknown))
     signature = incidence(groups, column, len(unknown))
     check_structure(flat, groups, alias, signature, unknown)
-    offsets = reduce_index(signature)
+    groups, _, offsets, notes = reduce_with_cancellation(groups, column, len(unknown), flat.parameters.values)
     inputs = np.flatnonzero(roots & is_input & used)
     column[inputs] = len(unknown) + np.arange(len(inputs))
     extended = extend(groups, offsets, column, is_input, len(unknown))
@@ -125,6 +126,7 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Sy
         lambda q: names[q],
         lambda e: describe_equation(groups, e),
     )
+    selection = dataclasses.replace(selection, notes=(*notes, *selection.notes))
     known = np.zeros(extended.quantities.n, bool)
     known[selection.states] = True
     known[extended.quantities.n_unknown :] = True

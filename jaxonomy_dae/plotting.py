@@ -7,7 +7,10 @@ import numpy as np
 from .errors import ModelError
 
 if TYPE_CHECKING:
+    from .lowering.system import AcausalSystem
     from .solution import Solution
+
+NAMED = 40  # up to this many unknowns, rows and columns are labelled
 
 
 def _pyplot() -> Any:
@@ -48,3 +51,59 @@ def plot_solution(solution: "Solution", *names: str, ax: Any = None) -> Any:
     if len(names) > 1:
         ax.legend()
     return ax
+
+
+def structure(system: "AcausalSystem", ax: Any = None) -> Any:
+    """Draws the incidence matrix in block lower triangular order, and returns the axes.
+
+    Rows are equations, columns the unknowns they are solved for; a dot says that the equation contains the unknown.
+    Simultaneous blocks are framed, their tearing variables red.
+    """
+    plt = _pyplot()
+    plan = system.plan
+    blocks, extended = plan.blocks, plan.extended
+    n = len(blocks.unknowns)
+    if not n:
+        raise ModelError("nothing to draw: the system has no equations to solve")
+    wanted = np.zeros(extended.quantities.n, bool)
+    wanted[blocks.unknowns] = True
+    pointer, quantity = extended.incidence(wanted)
+    row_of = np.full(extended.n_equations, -1)
+    row_of[blocks.equations] = np.arange(n)
+    column_of = np.full(extended.quantities.n, -1)
+    column_of[blocks.unknowns] = np.arange(n)
+    row = row_of[np.repeat(np.arange(extended.n_equations), np.diff(pointer))]
+    column = column_of[quantity][row >= 0]
+    row = row[row >= 0]
+    torn = [column_of[step.unknown[u]] for step in plan.steps for u in step.tearing.tearing]
+    is_torn = np.isin(column, np.concatenate(torn)) if torn else np.zeros(len(column), bool)
+    if ax is None:
+        size = float(np.clip(0.22 * n + 2.0, 3.5, 9.0))
+        _, ax = plt.subplots(figsize=(size, size), layout="constrained")
+    dot = float(np.clip(2000.0 / n**2, 0.5, 40.0))
+    ax.scatter(column[~is_torn], row[~is_torn], s=dot, color="C0", linewidths=0)
+    ax.scatter(column[is_torn], row[is_torn], s=dot, color="C3", linewidths=0)
+    for k in range(len(blocks)):
+        first, last = int(blocks.pointer[k]), int(blocks.pointer[k + 1])
+        if last - first > 1:
+            corner, side = (first - 0.5, first - 0.5), last - first
+            ax.add_patch(plt.Rectangle(corner, side, side, fill=False, color="0.4", linewidth=0.8))
+    ax.set_xlim(-0.5, n - 0.5)
+    ax.set_ylim(n - 0.5, -0.5)
+    ax.set_aspect("equal")
+    if n <= NAMED:
+        ax.set_xticks(range(n), [plan.quantity_name[q] for q in blocks.unknowns], rotation=90, fontsize=7)
+        ax.set_yticks(range(n), [_equation_label(plan, int(e)) for e in blocks.equations], fontsize=7)
+        ax.grid(True, alpha=0.2)
+    else:
+        ax.set_xlabel(f"{n} unknowns")
+        ax.set_ylabel(f"{n} equations")
+    return ax
+
+
+def _equation_label(plan: Any, equation: int) -> str:
+    from .compiler.tables import describe_equation
+
+    text = describe_equation(plan.groups, int(plan.extended.base[equation])).replace("0 = ", "")
+    text = text if len(text) <= 40 else text[:39] + "…"
+    return text + "\u2032" * int(plan.extended.level[equation])

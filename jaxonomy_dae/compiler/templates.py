@@ -64,7 +64,8 @@ class Template:
     opaque: "OpaqueFunction | None" = None
 
     @property
-    def _arguments(self) -> list[sympy.Symbol]:
+    def arguments(self) -> list[sympy.Symbol]:
+        """The symbols of the slots, of the parameters, and of time."""
         parameters = [_parameter_symbol(k) for k in range(self.n_parameters)]
         return [*map(_slot_symbol, self.slots), *parameters, TIME]
 
@@ -114,7 +115,7 @@ class Template:
 
     def _kernel(self, key: Any, expressions: Callable[[], Sequence[sympy.Expr]], backend: str) -> Kernel:
         if (key, backend) not in self._kernels:
-            self._kernels[key, backend] = _compile(self._arguments, expressions(), backend)
+            self._kernels[key, backend] = _compile(self.arguments, expressions(), backend)
         return self._kernels[key, backend]
 
     def residual(self, slots, parameters, coefficients, t, networks, backend="jax") -> Any:

@@ -1,6 +1,7 @@
 """The report of a compilation, in user names."""
 
 import functools
+import html
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from ..compiler.tables import describe_equation
 from .lower import SystemPlan
 
 SHOWN = 12
+HTML_SHOWN = 200
 
 
 class SystemReport:
@@ -40,13 +42,19 @@ class SystemReport:
 
     @property
     def index(self) -> int:
-        """The structural index."""
-        return self._offsets.structural_index
+        """The structural index; where highest derivatives cancel, that of the equations in which they do not."""
+        extended = self._plan.extended
+        counts = np.bincount(extended.base, minlength=1) - 1
+        quantities = extended.quantities
+        algebraic = (quantities.highest[: quantities.n_unknown_columns] == 0).any()
+        return max(self._offsets.structural_index, int(counts.max(initial=0)) + int(algebraic))
 
     @property
     def degrees_of_freedom(self) -> int:
         """How many initial values can be chosen."""
-        return self._offsets.degrees_of_freedom
+        extended = self._plan.extended
+        quantities = extended.quantities
+        return int(quantities.highest[: quantities.n_unknown_columns].sum() - extended.level.astype(bool).sum())
 
     @property
     def differentiated(self) -> list[tuple[str, int]]:
@@ -99,8 +107,29 @@ class SystemReport:
         return out
 
     def __str__(self):
+        head, sections = self._contents()
+        lines = list(head)
+        for title, entries in sections:
+            more = [f"    … and {len(entries) - SHOWN} more"] if len(entries) > SHOWN else []
+            lines += [f"{title}:", *(f"    {e}" for e in entries[:SHOWN]), *more]
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        """The same for a notebook: sections that fold."""
+        head, sections = self._contents()
+        out = [f"<p>{'<br>'.join(html.escape(line) for line in head)}</p>"]
+        for title, entries in sections:
+            items = "".join(f"<li><code>{html.escape(e)}</code></li>" for e in entries[:HTML_SHOWN])
+            more = f"<li>… and {len(entries) - HTML_SHOWN} more</li>" if len(entries) > HTML_SHOWN else ""
+            opened = " open" if len(entries) <= SHOWN else ""
+            out.append(f"<details{opened}><summary>{html.escape(title)}</summary><ul>{items}{more}</ul></details>")
+        return "".join(out)
+
+    def _contents(self) -> tuple[list[str], list[tuple[str, list[str]]]]:
         plan = self._plan
-        lines = [
+        head = [
             f"{self.n_equations} equations, {self.n_unknowns} unknowns, {len(plan.flat.parameters)} parameters"
             + (f", {len(plan.inputs.names)} inputs" if plan.inputs.names else "")
             + (f", {len(plan.network_names)} networks" if plan.network_names else ""),
@@ -108,27 +137,19 @@ class SystemReport:
             f"{len({g.template.key for g in plan.groups})} shapes remain",
             f"structural index {self.index}, {self.degrees_of_freedom} degrees of freedom",
         ]
-        lines += _section("differentiated", [f"{n}× {text}" for text, n in self.differentiated])
-        lines += [f"state selection {self.state_selection}"]
-        lines += _section(f"{len(self.states)} states", [_some(self.states)])
-        if self.carried:
-            lines += _section("algebraic unknowns in the state array", [_some(self.carried)])
-        lines += _section(f"{len(self.algebraics)} algebraic variables", [_some(self.algebraics)])
-        lines += _section("hidden constraints, projected onto", self.constraints)
-        lines += _section("simultaneous blocks", self.blocks)
-        lines += _section("notes", self.notes)
-        return "\n".join(lines)
-
-    __repr__ = __str__
+        head.append(f"state selection {self.state_selection}")
+        sections = [
+            ("differentiated", [f"{n}× {text}" for text, n in self.differentiated]),
+            (f"{len(self.states)} states", [_some(self.states)]),
+            ("algebraic unknowns in the state array", [_some(self.carried)]),
+            (f"{len(self.algebraics)} algebraic variables", [_some(self.algebraics)]),
+            ("hidden constraints, projected onto", self.constraints),
+            ("simultaneous blocks", self.blocks),
+            ("notes", self.notes),
+        ]
+        kept = [(title, [e for e in entries if e]) for title, entries in sections]
+        return head, [(title, entries) for title, entries in kept if entries]
 
 
 def _some(names: list[str]) -> str:
     return ", ".join(names[:SHOWN]) + (f", … ({len(names)} in all)" if len(names) > SHOWN else "")
-
-
-def _section(title: str, entries: list[str]) -> list[str]:
-    entries = [e for e in entries if e]
-    if not entries:
-        return []
-    more = [f"    … and {len(entries) - SHOWN} more"] if len(entries) > SHOWN else []
-    return [f"{title}:", *(f"    {e}" for e in entries[:SHOWN]), *more]

@@ -1,0 +1,211 @@
+"""Cancellation that structure cannot see.
+
+Index reduction trusts the incidence: where the highest derivatives of several equations cancel in a linear combination,
+it stops too early (two equations with C·(y₁′ − y₂′) and C·(y₂′ − y₁′) are one differential and one algebraic equation).
+Where the coefficients are constants or parameters, the combination is found exactly: a left null vector w of a diagonal
+block of the system Jacobian, in rational functions of the parameters. The equation Σ wᵢ Fᵢ^(cᵢ − c_min), in which the
+highest derivatives are gone, replaces one of lowest cᵢ, and index reduction starts again: the linear combination method
+of Tan, Nedialkov & Pryce (2017).
+"""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+import sympy
+from scipy.sparse.csgraph import connected_components
+
+from ..errors import StructuralError
+from .reduce_index import Offsets, reduce_index
+from .structure import Incidence, incidence
+from .tables import ZERO, EquationGroup, describe_equation, equation_offsets
+from .templates import LinearTemplate, Template, template_of
+
+LARGEST_BLOCK = 60
+ROUNDS = 20
+
+
+@dataclasses.dataclass(frozen=True)
+class _Equation:
+    """One equation with its symbols: quantities are (variable, order), parameters ids."""
+
+    expression: Any
+    origin: str
+
+
+def _quantity(variable: int, order: int) -> sympy.Symbol:
+    return sympy.Symbol(f"v{variable}_{order}", real=True)
+
+
+def _parameter(k: int) -> sympy.Symbol:
+    # Positive: no parameter that divides is zero, and roots of squares simplify.
+    return sympy.Symbol(f"q{k}", positive=True)
+
+
+def reduce_with_cancellation(
+    groups: tuple[EquationGroup, ...], column: np.ndarray, n_unknown: int, values: np.ndarray
+) -> tuple[tuple[EquationGroup, ...], Incidence, Offsets, tuple[str, ...]]:
+    """Index reduction, repeated until no diagonal block with constant coefficients is singular.
+
+    Returns the equations, changed where something cancelled, their incidence and offsets, and notes.
+
+    **Raises:**
+
+    - `StructuralError` if a block is singular for the given parameter values alone, or equations depend on each other.
+    """
+    notes: list[str] = []
+    for _ in range(ROUNDS):
+        signature = incidence(groups, column, n_unknown)
+        offsets = reduce_index(signature)
+        found = _singular_block(groups, signature, offsets, column, values)
+        if found is None:
+            return groups, signature, offsets, tuple(notes)
+        groups, note = _replace(groups, offsets, column, *found)
+        notes.append(note)
+    raise StructuralError("index reduction found ever new cancellations: some equations depend on each other")
+
+
+def _singular_block(groups, signature: Incidence, offsets: Offsets, column, values):
+    """(equations, columns) of the first diagonal block of several equations with constant entries that is singular."""
+    rows = signature.rows
+    active = signature.order + offsets.equation[rows] == offsets.variable[signature.variable]
+    owner = np.empty(signature.n_variables, np.int64)
+    owner[offsets.matched_variable] = np.arange(signature.n_equations)
+    n = signature.n_equations
+    follow = (rows[active], owner[signature.variable[active]])
+    count, label = connected_components(
+        sp.coo_array((np.ones(len(follow[0])), follow), shape=(n, n)), directed=True, connection="strong"
+    )
+    sizes = np.bincount(label, minlength=count)
+    first = equation_offsets(groups)
+    order = np.argsort(label, kind="stable")
+    start = np.concatenate([[0], np.cumsum(sizes)])
+    for b in np.flatnonzero((sizes > 1) & (sizes <= LARGEST_BLOCK)).tolist():
+        equations = np.sort(order[start[b] : start[b + 1]])
+        columns = offsets.matched_variable[equations]
+        dense = _constant_entries(groups, first, equations, columns, offsets, column, values)
+        if dense is None:
+            continue
+        scaled = dense / np.maximum(np.abs(dense).max(axis=1, keepdims=True), 1e-300)
+        singular = np.linalg.svd(scaled, compute_uv=False)
+        if singular[-1] < 1e-12 * max(singular[0], 1.0):
+            return equations, columns
+    return None
+
+
+def _constant_entries(groups, first, equations, columns, offsets: Offsets, column, values) -> np.ndarray | None:
+    """∂Fᵢ/∂(highest derivative of column j), or None if an entry is no constant."""
+    place = {int(c): k for k, c in enumerate(columns)}
+    dense = np.zeros((len(equations), len(columns)))
+    for k, e in enumerate(equations.tolist()):
+        g = int(np.searchsorted(first, e, side="right") - 1)
+        group, i = groups[g], e - int(first[g])
+        hit = []
+        for slot in range(group.variable.shape[1]):
+            v = int(group.variable[i, slot])
+            j = place.get(int(column[v]), -1) if v != ZERO and column[v] >= 0 else -1
+            if j >= 0 and group.order[i, slot] + offsets.equation[e] == offsets.variable[columns[j]]:
+                if not group.template.coefficient_is_constant(slot):
+                    return None
+                hit.append((slot, j))
+        slots = [0.0] * len(group.template.slots)
+        chosen = list(values[group.parameter[i]])
+        if group.template.opaque is not None:
+            partial = [1.0] * len(slots)  # only y's coefficient is constant
+        else:
+            partial = group.template.partial_values(
+                slots, chosen, list(group.coefficient[i]), 0.0, None, backend="numpy"
+            )
+        for slot, j in hit:
+            dense[k, j] += group.sign[i, slot] * float(partial[slot])
+    return dense
+
+
+def _symbolic(groups, e: int, times: int) -> _Equation:
+    """An equation, differentiated `times` times, in quantities and parameters."""
+    first = equation_offsets(groups)
+    g = int(np.searchsorted(first, e, side="right") - 1)
+    group, i = groups[g], e - int(first[g])
+    template = group.template
+    for _ in range(times):
+        template = template.derivative
+    values = []
+    for base, q in template.slots:
+        v = int(group.variable[i, base])
+        values.append(
+            sympy.S.Zero if v == ZERO else int(group.sign[i, base]) * _quantity(v, int(group.order[i, base]) + q)
+        )
+    if isinstance(template, LinearTemplate):
+        terms = [sympy.nsimplify(c) * s for c, s in zip(group.coefficient[i].tolist(), values, strict=True)]
+        return _Equation(sympy.Add(*terms), group.origin[i])
+    assert isinstance(template, Template)
+    symbols = template.arguments
+    replaced = dict(zip(symbols, [*values, *(_parameter(int(k)) for k in group.parameter[i])], strict=False))
+    return _Equation(template.expression.xreplace(replaced), group.origin[i])
+
+
+def _replace(groups, offsets: Offsets, column, equations, columns):
+    c = offsets.equation[equations]
+    lowest = int(c.min())
+    try:
+        written = [_symbolic(groups, int(e), int(k) - lowest) for e, k in zip(equations, c, strict=True)]
+    except AssertionError:
+        raise StructuralError(
+            "a block with learned terms is singular: "
+            + "; ".join(describe_equation(groups, int(e)) for e in equations[:4])
+        ) from None
+    variable_of = {int(column[v]): v for v in np.flatnonzero(column >= 0).tolist()}
+    top = [_quantity(variable_of[int(j)], int(offsets.variable[j]) - lowest) for j in columns]
+    matrix = sympy.Matrix([[sympy.diff(w.expression, t) for t in top] for w in written])
+    null = matrix.T.nullspace(simplify=True)
+    if not null:
+        raise StructuralError(
+            "these equations are singular for the given parameter values, though not in general: "
+            + "; ".join(w.origin for w in written[:4])
+            + ". Change the parameters, or state the constraint they imply as an equation of its own."
+        )
+    weights = list(null[0])
+    combined = sympy.Add(*(w * equation.expression for w, equation in zip(weights, written, strict=True)))
+    for symbol in sorted(combined.free_symbols, key=str):
+        if str(symbol).startswith("v") and sympy.simplify(sympy.diff(combined, symbol)) == 0:
+            combined = combined.subs(symbol, 0)
+    combined = sympy.nsimplify(combined) if combined.is_number else combined
+    used = [k for k, w in enumerate(weights) if w != 0]
+    origin = "combination of " + "; ".join(written[k].origin for k in used[:4])
+    if not any(str(s).startswith("v") for s in combined.free_symbols):
+        raise StructuralError(f"these equations depend on each other, or contradict: {origin}. Remove one of them.")
+    replaced = next(int(equations[k]) for k in used if c[k] == lowest)
+    new = _group(combined, origin)
+    first = equation_offsets(groups)
+    g = int(np.searchsorted(first, replaced, side="right") - 1)
+    rest = [k for k in range(len(groups[g])) if k != replaced - int(first[g])]
+    kept = (*groups[:g], groups[g].take(rest), *groups[g + 1 :], new)
+    return tuple(k for k in kept if len(k)), f"highest derivatives cancel in a {origin}"
+
+
+def _group(expression: Any, origin: str) -> EquationGroup:
+    """A group of one equation from its symbolic form."""
+    quantities = sorted(
+        tuple(map(int, str(s)[1:].split("_"))) for s in expression.free_symbols if str(s).startswith("v")
+    )
+    parameters = sorted(int(str(s)[1:]) for s in expression.free_symbols if str(s).startswith("q"))
+    slots = tuple((k, 0) for k in range(len(quantities)))
+    placeholder = Template(sympy.S.Zero, slots, len(parameters))
+    replaced = dict(
+        zip(
+            [*(_quantity(*q) for q in quantities), *(_parameter(p) for p in parameters)],
+            placeholder.arguments,
+            strict=False,
+        )
+    )
+    template = template_of(expression.xreplace(replaced), slots, len(parameters))
+    return EquationGroup(
+        template,
+        np.array([[v for v, _ in quantities]], np.int64),
+        np.array([[o for _, o in quantities]], np.int64),
+        np.ones((1, len(quantities)), np.int64),
+        np.array([parameters], np.int64).reshape(1, -1),
+        np.zeros((1, 0)),
+        [origin],
+    )
