@@ -124,7 +124,7 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Sy
         quantity_scale(flat, alias, extended),
         point,
         lambda q: names[q],
-        lambda e: describe_equation(groups, e),
+        lambda e: describe_equation(groups, int(e)),
     )
     selection = dataclasses.replace(selection, notes=(*notes, *selection.notes))
     known = np.zeros(extended.quantities.n, bool)

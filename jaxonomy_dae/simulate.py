@@ -15,7 +15,7 @@ from .errors import ModelError, SimulationError, nearest
 from .lowering.initialize import check, initialize
 from .lowering.system import AcausalSystem
 from .solution import Solution
-from .solvers.projected import with_projection
+from .solvers.projected import for_forward_mode, with_projection
 from .solvers.tsit5 import Tsit5
 
 SAVED_ITERATIONS = 3
@@ -88,16 +88,21 @@ def simulate(
     inputs = {name: v if callable(v) else jnp.asarray(v, dtype) for name, v in (inputs or {}).items()}
     initial = {name: jnp.asarray(v, dtype) for name, v in sorted((initial or {}).items())}
     t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
-    ts = None if ts is None else jnp.asarray(ts, dtype)
+    if ts is not None:
+        ts = jnp.asarray(ts, dtype)
+        if not _is_traced((t0, t1, ts)):
+            ts = jnp.clip(ts, t0, t1)  # `_check_interval` lets rounding pass, Diffrax does not
     arguments = (system, t0, t1, ts, inputs, initial, options)
-    if _is_traced(arguments):
+    outcome = None if _is_traced(arguments) else _compiled(arguments)
+    # An input's function may close over a traced value, which shows in the outcome only.
+    if outcome is None or _is_traced(outcome):
         x0, residual = initialize(system, t0, inputs, initial)
         x0 = check(system, x0, residual, initial) if throw else x0
         saved, x, stats, result = _integrate(x0, *arguments)
         if throw:
             x = result.error_if(x, ~diffrax.is_okay(result))
         return Solution(saved, x, system, inputs, stats, result)
-    (x0, residual), (saved, x, stats, result) = _compiled(arguments)
+    (x0, residual), (saved, x, stats, result) = outcome
     if throw:
         _check_parameters(system)
         check(system, x0, residual, initial)
@@ -107,7 +112,7 @@ def simulate(
         saved, x = saved[:taken], x[:taken]
     solution = Solution(saved, x, system, inputs, stats, result)
     if throw and not bool(diffrax.is_okay(result)):
-        raise SimulationError(_explain(solution, float(t1), max_steps, rtol, atol))
+        raise SimulationError(_explain(solution, x0, float(t0), float(t1), max_steps, rtol, atol))
     return solution
 
 
@@ -132,6 +137,7 @@ def _integrate(x0, system: AcausalSystem, t0, t1, ts, inputs, initial, options):
     solver, adjoint, controller, max_steps, progress = options
     if system.is_constrained:
         solver = with_projection(solver, system.project)
+        solver = for_forward_mode(solver) if isinstance(adjoint, diffrax.ForwardMode) else solver
     term = diffrax.ODETerm(system.vector_field)
     dt0 = _first_step(system, t0, t1, x0, inputs, solver.order(term), controller)
     saveat = diffrax.SaveAt(t0=True, steps=True) if ts is None else diffrax.SaveAt(ts=ts)
@@ -184,7 +190,8 @@ def _first_step(system, t0, t1, x0, inputs, order, controller):
     power = 1.0 / ((order or 1) + 1)
     h1 = jnp.where(largest <= 1e-15, jnp.maximum(1e-6, h0 * 1e-3), (0.01 / jnp.maximum(largest, 1e-15)) ** power)
     h = jnp.minimum(jnp.minimum(100 * h0, h1), t1 - t0)
-    return jnp.where(jnp.isfinite(h) & (h > 0), h, 1e-6 * (t1 - t0))
+    h = jnp.where(jnp.isfinite(h) & (h > 0), h, 1e-6 * (t1 - t0))
+    return jax.lax.stop_gradient(h)  # inputs may close over what is differentiated
 
 
 def _is_traced(tree: Any) -> bool:
@@ -212,9 +219,9 @@ def _check_arguments(system, t0, t1, ts, inputs, initial, adjoint, solver, max_s
     for name, value in (inputs or {}).items():
         if name not in known:
             raise ModelError(f"'{name}' is no input of this system: " + nearest(name, known))
-        if not callable(value) and jnp.shape(value) != ():
+        if not callable(value) and np.shape(value) != ():
             raise ModelError(
-                f"input '{name}' must be a function of time or a constant; got shape {jnp.shape(value)}. For samples "
+                f"input '{name}' must be a function of time or a constant; got shape {np.shape(value)}. For samples "
                 "use diffrax.LinearInterpolation(ts, ys).evaluate"
             )
     for name, default in zip(known, system.plan.inputs.defaults, strict=True):
@@ -226,8 +233,8 @@ def _check_arguments(system, t0, t1, ts, inputs, initial, adjoint, solver, max_s
         quantity = system.plan.resolve([name])[0][0]
         if quantity < 0:
             raise ModelError(f"initial: '{name}' is identically zero in this model")
-        if jnp.shape(value) != ():
-            raise ModelError(f"initial: '{name}' needs a scalar; got shape {jnp.shape(value)}")
+        if np.shape(value) != ():
+            raise ModelError(f"initial: '{name}' needs a scalar; got shape {np.shape(value)}")
 
 
 def _concrete(value: Any) -> np.ndarray | None:
@@ -243,8 +250,8 @@ def _check_interval(t0, t1, ts):
         raise ModelError(f"the interval needs t0 < t1; got t0={float(a)}, t1={float(b)}")
     if ts is None:
         return
-    if jnp.ndim(ts) != 1 or not jnp.shape(ts)[0]:
-        raise ModelError(f"ts must have shape (n,), n ≥ 1; got {jnp.shape(ts)}")
+    if np.ndim(ts) != 1 or not np.shape(ts)[0]:
+        raise ModelError(f"ts must have shape (n,), n ≥ 1; got {np.shape(ts)}")
     saved = _concrete(ts)
     if saved is None:
         return
@@ -297,8 +304,15 @@ def _check_parameters(system: AcausalSystem):
                 raise ModelError(f"a weight of network '{name}' is not finite: go back to an earlier iterate")
 
 
-def _explain(solution: Solution, t1: float, max_steps: int, rtol: float, atol: float) -> str:
-    x = np.asarray(solution.states)
+def _explain(solution: Solution, x0: Any, t0: float, t1: float, max_steps: int, rtol: float, atol: float) -> str:
+    system, x = solution.system, np.asarray(solution.states)
+    slope = np.asarray(system.vector_field(t0, x0, solution.inputs))
+    if not np.isfinite(slope).all():
+        name = [*system.states, *system.carried][int(np.flatnonzero(~np.isfinite(slope))[0])]
+        return (
+            f"the derivative of '{name}' is not finite at the start, t={t0:g}: the equations divide by zero there, or "
+            "take the root or logarithm of what has none. Start elsewhere, with initial={...} or new parameters."
+        )
     filled = np.isfinite(x).all(axis=1)
     reached = float(np.asarray(solution.ts)[filled][-1]) if filled.any() else math.nan
     taken = solution.stats.get("num_steps", 0)
@@ -309,4 +323,5 @@ def _explain(solution: Solution, t1: float, max_steps: int, rtol: float, atol: f
         )
     else:
         reason = f"the integration failed: {solution.result}"
-    return f"{reason}. The last saved time is {reached:g} of {t1:g}."
+    last = f"The last saved time is {reached:g} of {t1:g}" if filled.any() else f"Nothing was saved before t={t1:g}"
+    return f"{reason}. {last}."

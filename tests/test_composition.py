@@ -148,6 +148,27 @@ def test_vmap_over_release_angles_at_the_charts_singular_points(plain):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7)
 
 
+def test_inputs_may_close_over_what_is_transformed():
+    """dx/dt = u − x from 0 with u = a·t: x(1) = a/e, whichever way `a` comes."""
+    system = compiled(Driven(EqnEnv(), "c"))
+
+    def last(a):
+        return simulate(system, 1.0, ts=jnp.array([1.0]), inputs={"c.u": lambda t: a * t})["c.x"][0]
+
+    expected = np.exp(-1)
+    for value in (last(2.0) / 2, jax.jit(last)(2.0) / 2, jax.grad(last)(2.0), jax.vmap(last)(jnp.array([2.0]))[0] / 2):
+        assert float(value) == pytest.approx(expected, abs=1e-6)  # the default tolerance
+
+
+class Driven(Component):
+    """dx/dt = u − x."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        x = self.variable("x", start=0.0, fixed=True)
+        self.add_equations(Eq(der(x), self.input("u") - x))
+
+
 def test_jvp(rc):
     def voltage(r):
         system = rc.with_parameters({"r.R": r})

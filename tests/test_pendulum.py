@@ -118,7 +118,7 @@ def test_period_two_does_not_drift(plain):
 
 def test_structure(plain):
     report = plain.report
-    # The pendulum's structural index 3 and two degrees of freedom: Pantelides (1988), shared/testset/pendulum_cash.json.
+    # Pantelides (1988); shared/testset/pendulum_cash.json: structural index 3, two degrees of freedom.
     assert (report.index, report.degrees_of_freedom) == (3, 2)
     assert sorted(n for _, n in report.differentiated) == [1, 1, 2]
     assert len(report.constraints) == 2

@@ -1,4 +1,4 @@
-"""Single precision, and what importing the package does (nothing). In processes of their own: JAX's settings are global."""
+"""Single precision, and what importing does (nothing): in processes of their own, as JAX's settings are global."""
 
 import os
 import pathlib
@@ -28,14 +28,14 @@ def run(program: str, **environment) -> str:
 IMPORT = """
 import os, sys, threading
 import jax, diffrax, equinox, optimistix, lineax, optax, sympy, scipy, tqdm.auto
-settings = {k: getattr(jax.config, k) for k in jax.config.values}
+settings = dict(jax.config.values)
 environment, threads, streams = dict(os.environ), threading.active_count(), (sys.stdout, sys.stderr)
 limit, hooks = sys.getrecursionlimit(), (sys.excepthook, len(sys.meta_path))
 import jaxonomy_dae
 import jaxonomy_dae.learning, jaxonomy_dae.solvers
 import jaxonomy_dae.library.electrical, jaxonomy_dae.library.planar, jaxonomy_dae.library.translational
 assert not jax.config.jax_enable_x64
-assert settings == {k: getattr(jax.config, k) for k in jax.config.values}
+assert len(settings) > 100 and settings == dict(jax.config.values)
 assert environment == dict(os.environ)
 assert (threads, streams) == (threading.active_count(), (sys.stdout, sys.stderr))
 assert (limit, hooks) == (sys.getrecursionlimit(), (sys.excepthook, len(sys.meta_path)))

@@ -102,6 +102,14 @@ def test_another_start_time(system):
     np.testing.assert_allclose(solution["mass.x"], damped_oscillation(np.asarray(TS))[0], rtol=0, atol=1e-7)
 
 
+def test_rounding_in_times_is_forgiven(system):
+    """0.1 + 0.1 + 0.1 is a little more than 0.3."""
+    ts = np.arange(4) * 0.1
+    assert ts[-1] > 0.3
+    solution = simulate(system, 0.3, ts=ts.tolist(), rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(solution["mass.x"], damped_oscillation(ts)[0], rtol=0, atol=1e-7)
+
+
 def test_constraint_residuals():
     plain = pendulum()
     solution = simulate(plain, 1.1, ts=TS, rtol=1e-9, atol=1e-11)

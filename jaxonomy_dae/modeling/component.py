@@ -320,10 +320,14 @@ class Component(metaclass=_Sealing):
         if self._sealed:
             raise ModelError(f"component '{self.path}' is complete: add its equations inside __init__ of its class")
         for equation in equations:
+            if not isinstance(equation, sympy.Basic | bool | int | float):
+                raise ModelError(f"component '{self.name}': {equation!r} is no equation")
             try:
                 self.equations.append(_residual(equation))
             except ModelError as error:
                 raise ModelError(f"component '{self.name}': {error}") from None
+            except TypeError:  # not even hashable, such as a matrix
+                raise ModelError(f"component '{self.name}': {equation!r} is no equation") from None
 
     # --- hierarchy ---------------------------------------------------------------------------------------------
 

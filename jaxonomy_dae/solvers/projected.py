@@ -43,6 +43,11 @@ class Projected(_Wrapped):
     def term_compatible_contr_kwargs(self):  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.solver.term_compatible_contr_kwargs
 
+    @property
+    def scan_kind(self) -> str:
+        """How the wrapped solver loops over its stages; Diffrax asks for it under `ForwardMode`."""
+        return getattr(self.solver, "scan_kind", None) or "default"
+
     def order(self, terms):
         return self.solver.order(terms)
 
@@ -74,3 +79,12 @@ def with_projection(solver: AbstractSolver, projection: Projection) -> Projected
     if type(solver) is Projected:
         return eqx.tree_at(lambda s: s.projection, solver, projection, is_leaf=lambda v: v is None)
     return Projected(solver, projection)
+
+
+def for_forward_mode(solver: AbstractSolver) -> AbstractSolver:
+    """The solver with a stage loop that forward mode can differentiate, as Diffrax sets it for unwrapped solvers."""
+    inner = solver.solver if isinstance(solver, Projected) and type(solver) is Projected else solver
+    if getattr(inner, "scan_kind", "none") is not None:
+        return solver
+    changed = eqx.tree_at(lambda s: s.scan_kind, inner, "lax", is_leaf=lambda v: v is None)
+    return changed if inner is solver else Projected(changed, solver.projection)  # type: ignore[attr-defined]

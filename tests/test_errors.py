@@ -1,0 +1,454 @@
+"""Wrong models and wrong calls: each message names the part concerned and says what to do.
+
+Every case is a function that raises, the error's type, and a pattern of names and advice. What only shows when a
+simulation runs is in test_solution.py and test_initialization.py; single precision is in test_precision.py.
+"""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import sympy
+from problems import compiled, drag_on, mlp, pendulum, quadratic, rc_circuit
+from sympy import Eq
+from test_precision import run
+
+from jaxonomy_dae import (
+    AcausalCompiler,
+    AcausalDiagram,
+    Component,
+    EqnEnv,
+    ModelError,
+    NeuralDAEBlock,
+    SimulationError,
+    StructuralError,
+    der,
+    simulate,
+)
+from jaxonomy_dae.library.electrical import Ground, Resistor, VoltageSource
+from jaxonomy_dae.library.planar import PlanarPendulum
+from jaxonomy_dae.library.translational import FixedPosition, Mass, Spring
+
+EV = EqnEnv()
+
+
+def component(write, name="c"):
+    """A component whose class body is the function `write(self, ev)`."""
+
+    class Written(Component):
+        def __init__(self, ev, name):
+            super().__init__(ev, name)
+            write(self, ev)
+
+    return Written(EV, name)
+
+
+def decay(self, ev, *more):
+    x = self.variable("x", start=1.0, fixed=True)
+    self.add_equations(Eq(der(x), -x), *more)
+    return x
+
+
+def raises(error, message, call):
+    with pytest.raises(error, match=message) as caught:
+        call()
+    assert caught.type is error or issubclass(caught.type, error)
+
+
+def case(message, call, error=ModelError):
+    return pytest.param(message, call, error, id=message[:40])
+
+
+# --- writing a component -----------------------------------------------------------------------------------------
+
+
+def declares_twice(self, ev):
+    self.parameter("R", 1.0)
+    self.variable("R")
+
+
+def learned_twice(self, ev):
+    x = self.variable("x")
+    self.learned("law", mlp(1, 2), inputs=[x])
+    self.variable("law")
+
+
+def stores_a_symbol(self, ev):
+    self.position = self.variable("x")
+
+
+def declares_afterwards():
+    component(decay).variable("y")
+
+
+def adds_equations_afterwards():
+    c = component(decay)
+    c.add_equations(Eq(c.x, 1))
+
+
+@pytest.mark.parametrize(
+    "message, call, error",
+    [
+        case(r"'c' uses the name 'R' twice: it is a parameter already; rename the variable",
+             lambda: component(declares_twice)),
+        case(r"'c' uses the name 'law' twice: it is a learned term already", lambda: component(learned_twice)),
+        case(r"cannot store the symbol 'x' as attribute 'position'.*component\[\"x\"\]",
+             lambda: component(stores_a_symbol)),
+        case(r"'c' is complete: declare its variable 'y' inside __init__", declares_afterwards),
+        case(r"'c' is complete: add its equations inside __init__", adds_equations_afterwards),
+        case(r"name is a non-empty string without dots or spaces; got 'a\.b'", lambda: Ground(EV, "a.b")),
+        case(r"variable's name is a string without dots; got 'a\.b'",
+             lambda: component(lambda self, ev: self.variable("a.b"))),
+        case(r"parameter 'r\.R' must be finite; got nan", lambda: Resistor(EV, "r", np.nan)),
+        case(r"parameter 'c\.k' must lie in \[0.*1.*\]; got 2",
+             lambda: component(lambda self, ev: self.parameter("k", 2.0, bounds=(0.0, 1.0)))),
+        case(r"'c\.x' is fixed at the start but has no start value: give `start=`",
+             lambda: component(lambda self, ev: self.variable("x", fixed=True))),
+        case(r"start value of 'c\.x' must be finite", lambda: component(lambda s, ev: s.variable("x", start=np.inf))),
+        case(r"start value of 'c\.y' may use parameters only; it uses 'x'",
+             lambda: component(lambda s, ev: s.variable("y", start=2 * s.variable("x")))),
+        case(r"nominal value of 'c\.x' must be a positive number; got -1\.0",
+             lambda: component(lambda s, ev: s.variable("x", nominal=-1.0))),
+        case(r"an equation is always True.*Eq\(a, b\)",
+             lambda: component(lambda s, ev: s.add_equations(Eq(s.variable("x"), s.x)))),
+        case(r"an equation is always False", lambda: component(lambda s, ev: s.add_equations(s.variable("x") == 2))),
+        case(r"contains no variable", lambda: component(lambda s, ev: s.add_equations(s.parameter("k", 1.0) - 1))),
+        case(r"no variable or parameter 'z'", lambda: component(decay)["z"]),
+        case(r"no attribute 'z'", lambda: component(decay).z, AttributeError),
+        case(r"Electrical port 'r\.p' has no 'x': it has v, i", lambda: Resistor(EV, "r").p.x, AttributeError),
+        case(r"der\(.*\): the symbol 'k' was declared by no component.*self\.parameter",
+             lambda: der(sympy.Symbol("k") * component(decay).x)),
+        case(r"learned term 'c\.law': the network must be callable; got 3",
+             lambda: component(lambda s, ev: s.learned("law", 3, inputs=[s.variable("x")]))),
+        case(r"learned term 'c\.law': inputs are symbols of variables or ev\.t; got 'x\*\*2'",
+             lambda: component(lambda s, ev: s.learned("law", mlp(1, 1), inputs=[s.variable("x") ** 2]))),
+        case(r"learned term 'c\.law': calling network\(u\) with u of shape \(2,\) failed",
+             lambda: component(lambda s, ev: s.learned("law", mlp(1, 1), inputs=[s.variable("x"), ev.t]))),
+        case(r"learned term 'c\.law': expected 3 outputs, but the network returns 2",
+             lambda: component(lambda s, ev: s.learned("law", mlp(1, 2), inputs=[s.variable("x")], outputs=3))),
+        case(r"must return a vector of shape \(outputs,\); got shape \(\)",
+             lambda: component(lambda s, ev: s.learned("law", jnp.sum, inputs=[s.variable("x")]))),
+    ],
+)  # fmt: skip
+def test_writing_a_component(message, call, error):
+    raises(error, message, call)
+
+
+# --- wrong types -------------------------------------------------------------------------------------------------
+
+# conftest.py has the signatures' types checked before these messages can be raised, so they are tested without it.
+WRONG_TYPES = [
+    (r"first argument of a component is an EqnEnv; got str", lambda: Ground("ground", "g")),
+    (r"parameter 'r\.R' must be a number; got list.*with_parameters\(\{'r\.R'", lambda: Resistor(EV, "r", [1.0])),
+    (r"port 'c\.p' needs a Domain such as Electrical; got 'electrical'",
+     lambda: component(lambda s, ev: s.port("p", "electrical"))),
+    (r"is no equation", lambda: component(lambda s, ev: s.add_equations(sympy.Matrix([s.variable("x")])))),
+    (r"only components can be added to a diagram; got str", lambda: AcausalDiagram().add("r")),
+    (r"needs an EqnEnv and an AcausalDiagram", lambda: AcausalCompiler(AcausalDiagram(), EV)),
+    (r"'auto', 'dummy_derivatives' or 'projection'; got 'best'",
+     lambda: AcausalCompiler(EV, AcausalDiagram(), state_selection="best")),
+    (r"inject is 'equation' or 'row'; got 'force'", lambda: pendulum(drag_on("vx", inject="force"))),
+    (r"must be callable", lambda: NeuralDAEBlock(jnp.ones(3), targets=["pend.vx"], name="drag")),
+    (r"needs an AcausalSystem.*got AcausalDiagram", lambda: simulate(AcausalDiagram(), 1.0)),
+    (r"solver must be a Diffrax solver.*got 'tsit5'", lambda: simulate(rc_circuit(), 1.0, solver="tsit5")),
+]  # fmt: skip
+
+
+def check_wrong_types():
+    for message, call in WRONG_TYPES:
+        raises(ModelError, message, call)
+
+
+def test_wrong_types():
+    assert run("import test_errors; test_errors.check_wrong_types(); print('done')").strip() == "done"
+
+
+# --- writing a diagram -------------------------------------------------------------------------------------------
+
+
+def added_elsewhere():
+    child = Resistor(EV, "r")
+    component(lambda self, ev: self.add(child), "parent")
+    AcausalDiagram().add(child)
+
+
+def a_child_twice():
+    child = Resistor(EV, "r")
+    component(lambda self, ev: self.add(child), "one")
+    component(lambda self, ev: self.add(child), "two")
+
+
+def block_named_as_component():
+    bob = PlanarPendulum(EV, "pend")
+    block = NeuralDAEBlock(quadratic, targets=[(bob, "vx")], name="pend")
+    AcausalDiagram().add(bob).add_neural_correction_block(block)
+
+
+def connects_a_grandchild():
+    inner = component(lambda self, ev: self.add(Resistor(ev, "r")), "inner")
+
+    def outer(self, ev):
+        self.add(inner)
+        self.connect(inner.r.p, inner.r.n)
+
+    compiled(component(outer, "outer"))
+
+
+def connects_what_is_not_there():
+    outside = Resistor(EV, "outside")
+
+    def inside(self, ev):
+        r = self.add(Resistor(ev, "r"))
+        self.connect(r.p, outside.p)
+
+    compiled(component(inside))
+
+
+@pytest.mark.parametrize(
+    "message, call, error",
+    [
+        case(r"two components are named 'r': rename one",
+             lambda: AcausalDiagram().add(Resistor(EV, "r"), Ground(EV, "r"))),
+        case(r"name 'pend' is used twice: rename the neural block", block_named_as_component),
+        case(r"'parent\.r' is part of 'parent': add that one", added_elsewhere),
+        case(r"'r' already belongs to 'one'", a_child_twice),
+        case(r"'r' has no port 'q'", lambda: AcausalDiagram().connect(Resistor(EV, "r"), "q", Ground(EV, "g"), "p")),
+        case(r"'m' has no port 'flang': did you mean 'flange'",
+             lambda: AcausalDiagram().connect(Mass(EV, "m"), "flang", Spring(EV, "s"), "flange_a")),
+        case(r"cannot connect m\.flange: Translational port to r\.p: Electrical port.*one domain",
+             lambda: AcausalDiagram().connect(Resistor(EV, "r").p, Mass(EV, "m").flange)),
+        case(r"at least two ports; got 1", lambda: AcausalDiagram().connect(Resistor(EV, "r").p)),
+        case(r"needs a port name after 'g'", lambda: AcausalDiagram().connect(Resistor(EV, "r").p, Ground(EV, "g"))),
+        case(r"takes ports, or a component and a port name; got 'p'", lambda: AcausalDiagram().connect("p", "n")),
+        case(r"'outer' connects outer\.inner\.r\.p.*its own ports and its children's", connects_a_grandchild),
+        case(r"outside\.p.*not part of the diagram: add it", connects_what_is_not_there),
+        case(r"no components: add some", lambda: AcausalCompiler(EV, AcausalDiagram())()),
+        case(r"prefer_states=\['pend\.x'\]", lambda: AcausalCompiler(EV, AcausalDiagram(), prefer_states="pend.x")),
+        case(r"prefer_states: 'pend\.z' is no variable: did you mean",
+             lambda: pendulum(compiler={"prefer_states": ["pend.z"]})),
+        case(r"nothing has been compiled yet", lambda: AcausalCompiler(EV, AcausalDiagram()).report),
+    ],
+)  # fmt: skip
+def test_writing_a_diagram(message, call, error):
+    raises(error, message, call)
+
+
+# --- equations and unknowns --------------------------------------------------------------------------------------
+
+
+def undeclared(self, ev):
+    decay(self, ev, Eq(self.variable("y"), sympy.Symbol("k")))
+
+
+def of_another(self, ev):
+    decay(self, ev, Eq(self.variable("y"), Resistor(ev, "elsewhere").v))
+
+
+def one_too_many(self, ev):
+    x = decay(self, ev)
+    y = self.variable("y")
+    self.add_equations(Eq(y, 2 * x), Eq(y**2, 3 + x))
+
+
+def one_too_few(self, ev):
+    x = decay(self, ev)
+    y, z = self.variable("y"), self.variable("z")
+    self.add_equations(Eq(y + z, 2 * x))
+
+
+def as_many_but_wrong(self, ev):
+    x, y, z = (self.variable(n) for n in "xyz")
+    self.add_equations(Eq(der(x), -x), Eq(x**2, 1 + x), Eq(y * z, x))
+
+
+def says_the_same_twice(self, ev):
+    x, y = self.variable("x", start=1, fixed=True), self.variable("y", start=1)
+    self.add_equations(Eq(der(x), -x), Eq(der(y), x), Eq(x + y, 2))
+    u, v = self.variable("u", start=0, fixed=True), self.variable("v", start=0, fixed=True)
+    self.add_equations(Eq(der(u), v), Eq(der(v), -u))
+
+
+def no_ground():
+    s, r = VoltageSource(EV, "s"), Resistor(EV, "r")
+    compiled(s, r, connect=[(s.p, r.p), (s.n, r.n)])
+
+
+def two_sources_in_parallel():
+    a, b, r, g = VoltageSource(EV, "a", 1.0), VoltageSource(EV, "b", 2.0), Resistor(EV, "r"), Ground(EV, "g")
+    compiled(a, b, r, g, connect=[(a.p, b.p, r.p), (a.n, b.n, r.n, g.p)])
+
+
+def two_walls_on_one_flange():
+    a, b = FixedPosition(EV, "a", 0.0), FixedPosition(EV, "b", 1.0)
+    compiled(a, b, connect=[(a.flange, b.flange)])
+
+
+@pytest.mark.parametrize(
+    "message, call, error",
+    [
+        case(r"'c': the symbol 'k' was declared by no component.*self\.parameter",
+             lambda: compiled(component(undeclared))),
+        case(r"'c': the symbol 'elsewhere\.v' in its equations is no variable of it",
+             lambda: compiled(component(of_another))),
+        case(r"(?s)3 equations for 2 unknowns, 1 too many.*Over-determined.*y\*\*2.*Remove one",
+             lambda: compiled(component(one_too_many)), StructuralError),
+        case(r"(?s)2 equations for 3 unknowns, 1 too few.*Under-determined.*c\.[yz].*Add the missing equation",
+             lambda: compiled(component(one_too_few)), StructuralError),
+        case(r"(?s)3 equations for 3 unknowns.*compete.*x\*\*2.*determines all of these.*c\.[yz]",
+             lambda: compiled(component(as_many_but_wrong)), StructuralError),
+        case(r"(?s)Under-determined.*s\.p\.v|r\.p\.v.*a ground", no_ground, StructuralError),
+        case(r"(?s)Over-determined.*[ab]: .*two sources", two_sources_in_parallel, StructuralError),
+        case(r"(?s)Over-determined.*[ab]: .*two fixed positions", two_walls_on_one_flange, StructuralError),
+    ],
+)  # fmt: skip
+def test_equations_and_unknowns(message, call, error):
+    raises(error, message, call)
+
+
+def test_the_over_determined_part_is_named_and_nothing_else():
+    def write(self, ev):
+        one_too_many(self, ev)
+        innocent = self.variable("innocent", start=0.0, fixed=True)
+        self.add_equations(Eq(der(innocent), 1 - innocent))
+
+    with pytest.raises(StructuralError) as caught:
+        compiled(component(write))
+    assert "innocent" not in str(caught.value)
+
+
+# --- neural blocks -----------------------------------------------------------------------------------------------
+
+MINIMAL = {"state_selection": "dummy_derivatives", "prefer_states": ["pend.vx", "pend.x"]}
+
+
+@pytest.mark.parametrize(
+    "message, call, error",
+    [
+        case(r"neural block 'drag': its target 'pend\.vz' is no variable: did you mean 'pend\.v[xy]'",
+             lambda: pendulum(drag_on("vz"))),
+        case(r"neural block 'drag': its input 'pend\.speed' is no variable",
+             lambda: pendulum(drag_on("vx", inputs=["pend.speed"]))),
+        case(r"its target 'pend\.lam' is differentiated in no equation.*'pend\.vx', 'pend\.vy'",
+             lambda: pendulum(drag_on("lam"))),
+        case(r"its target 'pend\.vy' is no state.*The states are 'pend\..*prefer_states=\['pend\.vy'\].*'equation'",
+             lambda: pendulum(drag_on("vy", inject="row"), compiler=MINIMAL)),
+        case(r"inject='row'.*needs state_selection='dummy_derivatives'; this compiler has 'auto'",
+             lambda: pendulum(drag_on("vx", inject="row"))),
+        case(r"its target 'other\.vx' belongs to a component that is not part of the diagram",
+             lambda: pendulum(lambda bob: NeuralDAEBlock(quadratic, targets=[(PlanarPendulum(EV, "other"), "vx")],
+                                                         name="drag"))),
+        case(r"expected one output for each of its 2 targets, shape \(2,\), but the network returns shape \(3,\)",
+             lambda: pendulum(drag_on("vx", "vy", network=mlp(2, 3)))),
+        case(r"calling network\(u\) with u of shape \(1,\) failed", lambda: pendulum(drag_on("vx", network=mlp(2, 1)))),
+        case(r"calling network\(t, u, theta\) with u of shape \(1,\) failed",
+             lambda: pendulum(drag_on("vx", network=lambda t, u, theta: theta["w"] * u, theta=jnp.ones(3)))),
+        case(r"must return a vector of shape \(outputs,\); got shape \(\)",
+             lambda: pendulum(drag_on("vx", network=lambda u: u[0]))),
+        case(r"targets is a non-empty list.*got \[\]", lambda: NeuralDAEBlock(quadratic, targets=[], name="drag")),
+        case(r"targets is a non-empty list.*got 'pend\.vx'",
+             lambda: NeuralDAEBlock(quadratic, targets="pend.vx", name="drag")),
+        case(r"expected \(component, \"variable\"\).*got \('pend', 'vx'\)",
+             lambda: NeuralDAEBlock(quadratic, targets=[("pend", "vx")], name="drag")),
+        case(r"string without dots; got 'a\.b'", lambda: NeuralDAEBlock(quadratic, targets=["pend.vx"], name="a.b")),
+    ],
+)  # fmt: skip
+def test_neural_blocks(message, call, error):
+    raises(error, message, call)
+
+
+# --- using a system ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def rc():
+    return rc_circuit()
+
+
+def use(message, call, error=ModelError):
+    return case(message, call, error)
+
+
+@pytest.mark.parametrize(
+    "message, call, error",
+    [
+        use(r"'r\.r' is no parameter: did you mean 'r\.R'", lambda s: s.with_parameters({"r.r": 1.0})),
+        use(r"'r\.r' is no parameter: did you mean 'r\.R'", lambda s: s.parameters["r.r"]),
+        use(r"parameter 'r\.R' must be finite; got inf", lambda s: s.with_parameters({"r.R": np.inf})),
+        use(r"parameter 'r\.R' is a scalar; got shape \(3,\).*jax\.vmap",
+            lambda s: s.with_parameters({"r.R": jnp.ones(3)})),
+        use(r"'c\.vv' is no variable: did you mean 'c\.v'", lambda s: s.observe("c.vv", 0.0, jnp.zeros(1))),
+        use(r"'net' is neither a network nor a parameter: known names: 'source\.V'", lambda s: s.partition("net")),
+        use(r"initial: 'r\.R' is a parameter; use system\.with_parameters\(\{'r\.R': value\}\)",
+            lambda s: simulate(s, 1.0, initial={"r.R": 1.0})),
+        use(r"'c\.u' is no variable: did you mean", lambda s: simulate(s, 1.0, initial={"c.u": 1.0})),
+        use(r"initial: 'c\.v' needs a scalar; got shape \(2,\)",
+            lambda s: simulate(s, 1.0, initial={"c.v": jnp.ones(2)})),
+        use(r"initial: 'ground\.p\.v' is identically zero", lambda s: simulate(s, 1.0, initial={"ground.p.v": 1.0})),
+        use(r"'r\.u' is no input of this system: there are none", lambda s: simulate(s, 1.0, inputs={"r.u": 1.0})),
+        use(r"BacksolveAdjoint\(\) is wrong for constrained systems.*RecursiveCheckpointAdjoint",
+            lambda s: simulate(s, 1.0, adjoint=diffrax.BacksolveAdjoint())),
+        use(r"ConstantStepSize\(\) needs a step: use diffrax\.StepTo\(ts=",
+            lambda s: simulate(s, 1.0, stepsize_controller=diffrax.ConstantStepSize())),
+        use(r"max_steps must be a positive integer; got 0", lambda s: simulate(s, 1.0, max_steps=0)),
+        use(r"ts must be sorted; ts\[1\]=0\.5 is followed by ts\[2\]=0\.2: use jnp\.sort",
+            lambda s: simulate(s, 1.0, ts=jnp.array([0.1, 0.5, 0.2]))),
+        use(r"ts must lie between t0=0\.0 and t1=1\.0; 1\.5 does not", lambda s: simulate(s, 1.0, ts=[0.5, 1.5])),
+        use(r"ts must lie between t0=0\.0 and t1=1\.0; -0\.5 does not", lambda s: simulate(s, 1.0, ts=[-0.5, 0.5])),
+        use(r"ts must have shape \(n,\), n ≥ 1; got \(0,\)", lambda s: simulate(s, 1.0, ts=jnp.zeros(0))),
+        use(r"ts must be finite", lambda s: simulate(s, 1.0, ts=[0.5, np.nan])),
+        use(r"needs t0 < t1; got t0=0\.0, t1=-1\.0", lambda s: simulate(s, -1.0)),
+        use(r"t1 must be a finite number; got nan", lambda s: simulate(s, np.nan)),
+        use(r"rtol=1e-16 cannot be reached in float64.*rtol ≥ 2e-15", lambda s: simulate(s, 1.0, rtol=1e-16)),
+        use(r"atol must be a number ≥ 0; got -1", lambda s: simulate(s, 1.0, atol=-1.0)),
+    ],
+)  # fmt: skip
+def test_using_a_system(rc, message, call, error):
+    raises(error, message, lambda: call(rc))
+
+
+def test_inputs():
+    system = compiled(component(lambda self, ev: decay(self, ev, Eq(self.variable("y"), self.input("u")))))
+    with pytest.raises(ModelError, match=r"input 'c\.u' has no default: give it with inputs=\{'c\.u': function"):
+        simulate(system, 1.0)
+    with pytest.raises(ModelError, match=r"'c\.v' is no input of this system: did you mean 'c\.u'"):
+        simulate(system, 1.0, inputs={"c.v": 1.0})
+    with pytest.raises(ModelError, match=r"input 'c\.u' must be a function of time or a constant.*LinearInterpolation"):
+        simulate(system, 1.0, inputs={"c.u": jnp.ones(3)})
+    for call in (system.initialize, lambda: system.vector_field(0.0, jnp.ones(1))):
+        with pytest.raises(ModelError, match=r"input 'c\.u' has no default: give it"):
+            call()
+
+
+def test_bounds_hold_later_too():
+    def write(self, ev):
+        decay(self, ev, Eq(self.variable("y"), self.parameter("k", 0.5, bounds=(0.0, 1.0))))
+
+    system = compiled(component(write))
+    with pytest.raises(ModelError, match=r"'c\.k' must lie in \[0\.0, 1\.0\]; got 2"):
+        system.with_parameters({"c.k": 2.0})
+
+
+def test_non_finite_parameters_and_weights_are_named(rc):
+    broken = eqx.tree_at(lambda s: s.parameters.values, rc, rc.parameters.values.at[1].set(jnp.nan))
+    with pytest.raises(ModelError, match=r"parameter 'r\.R' is not finite: nan"):
+        simulate(broken, 2.0, ts=jnp.array([2.0]))
+
+    def write(self, ev):
+        (law,) = self.learned("law", mlp(1, 1), inputs=[self.variable("x", start=1.0, fixed=True)])
+        self.add_equations(Eq(der(self.x), law))
+
+    system = compiled(component(write))
+    broken = jax.tree.map(lambda leaf: leaf * np.nan if eqx.is_inexact_array(leaf) and leaf.ndim else leaf, system)
+    with pytest.raises(ModelError, match=r"a weight of network 'c\.law' is not finite.*earlier iterate"):
+        simulate(broken, 2.0, ts=jnp.array([2.0]))
+
+
+def test_a_start_at_a_singular_point():
+    def write(self, ev):
+        x = self.variable("x", start=0.0, fixed=True)
+        self.add_equations(Eq(der(x), -1 / x))
+
+    with pytest.raises(SimulationError, match=r"derivative of 'c\.x' is not finite at the start.*initial="):
+        simulate(compiled(component(write)), 1.0, ts=jnp.array([1.0]))
