@@ -1,0 +1,355 @@
+"""Index reduction, matching and exact cancellation, on the literature's own examples and on random structures."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+import sympy
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.sparse.csgraph import maximum_bipartite_matching
+
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, StructuralError, der, simulate
+from jaxonomy_dae.compiler.match import maximum_matching
+from jaxonomy_dae.compiler.reduce_index import reduce_index
+from jaxonomy_dae.compiler.structure import Incidence
+from jaxonomy_dae.library.electrical import Capacitor, Ground, Inductor, Resistor, VoltageSource
+from jaxonomy_dae.library.translational import FixedPosition, Mass, Rod
+
+EV = EqnEnv()
+# The transistor amplifier of the Bari test set (Mazzia & Magherini 2008, II-14): parameters, starts, end values.
+AMPLIFIER = json.loads((Path(__file__).parent / "data" / "transamp.json").read_text())
+
+
+def compiled(*components, **options):
+    diagram = AcausalDiagram()
+    diagram.add(*components)
+    return AcausalCompiler(EV, diagram, **options)()
+
+
+def written(equations, starts=None, name="m"):
+    """A component with the variables that `equations(v)` asks for by name."""
+    starts = starts or {}
+
+    class Written(Component):
+        def __init__(self):
+            super().__init__(EV, name)
+
+            class Variables(dict):
+                def __missing__(variables, key):  # noqa: N805
+                    start = starts.get(key)
+                    variables[key] = self.variable(key, start=start, fixed=start is not None)
+                    return variables[key]
+
+            self.add_equations(*equations(Variables()))
+
+    return Written()
+
+
+def counts(system):
+    """Differentiations by equation text, without the component's name."""
+    return {text.split(": ", 1)[1]: n for text, n in system.report.differentiated}
+
+
+# --- the literature --------------------------------------------------------------------------------------------
+
+
+def test_pantelides_pendulum():
+    # Pantelides (1988), example: x'' = xT, y'' = yT − g, x² + y² = L² in first-order form: the constraint twice, the
+    # two definitions of velocities once.
+    def equations(v):
+        x, y, w, z, tension = v["x"], v["y"], v["w"], v["z"], v["T"]
+        return (
+            der(x) - w,
+            der(y) - z,
+            der(w) - tension * x,
+            der(z) - tension * y + 1,
+            x**2 + y**2 - 1,
+        )
+
+    system = compiled(written(equations, {"x": 0.6, "w": 0.0}))
+    assert sorted(counts(system).values()) == [1, 1, 2]
+    assert counts(system)["0 = x**2 + y**2 - 1"] == 2
+    assert system.report.index == 3 and system.report.degrees_of_freedom == 2
+
+
+def test_mattsson_soederlind_linear_example():
+    # Mattsson & Söderlind (1993), the linear example of section 2: x₁ + x₂ + u₁ = 0, x₁ + x₂ + x₃ + u₂ = 0,
+    # x₁ + x₃' + x₄ + u₃ = 0, 2x₁'' + x₂'' + x₃'' + x₄' + u₄ = 0. Pantelides' algorithm differentiates the equations
+    # (2, 2, 1, 0) times, and two degrees of freedom are left.
+    def equations(v):
+        x1, x2, x3, x4, t = v["x1"], v["x2"], v["x3"], v["x4"], EV.t
+        return (
+            x1 + x2 + sympy.sin(t),
+            x1 + x2 + x3 + sympy.cos(t),
+            x1 + der(x3) + x4 + t,
+            2 * der(der(x1)) + der(der(x2)) + der(der(x3)) + der(x4) + 1,
+        )
+
+    system = compiled(written(equations))
+    found = counts(system)
+    assert [n for text, n in found.items() if "cos" in text] == [2]
+    assert [n for text, n in found.items() if "sin" in text] == [2]
+    assert [n for text, n in found.items() if "der(x3) + x1" in text or "x1 + x4 + der(x3)" in text] == [1]
+    assert len(found) == 3
+    assert system.report.degrees_of_freedom == 2 and len(system.states) == 2
+
+
+def test_exothermic_reactor_with_prescribed_temperature():
+    # The exothermic reactor (Pantelides 1988; Unger, Kröner & Marquardt 1995): concentration C and temperature T with
+    # reaction rate R, cooled so that C or T follows a given path; the cooling temperature Tc is the unknown. A path on
+    # T is differentiated once: index 2. One on C is differentiated twice, its balance and the rate law once: index 3.
+    def path_on(which):
+        def equations(v):
+            c, temperature, rate, cooling = v["C"], v["T"], v["R"], v["Tc"]
+            path = c - (0.5 + 0.1 * sympy.exp(-EV.t)) if which == "C" else temperature - (1.0 + 0.1 * sympy.sin(EV.t))
+            return (
+                der(c) - (1 - c) + rate,
+                der(temperature) - (1 - temperature) - 2 * rate + 3 * (temperature - cooling),
+                rate - 4 * sympy.exp(-2 / temperature) * c,
+                path,
+            )
+
+        return equations
+
+    on_c = compiled(written(path_on("C"), {"T": None}))
+    assert on_c.report.index == 3 and on_c.report.degrees_of_freedom == 0
+    assert sorted(counts(on_c).values()) == [1, 1, 2]
+    on_t = compiled(written(path_on("T"), {"C": 0.9}))
+    assert on_t.report.index == 2 and on_t.report.degrees_of_freedom == 1
+    assert list(counts(on_t).values()) == [1]
+
+
+def test_two_inertias_on_a_gear():
+    # A rigid gear phi1 = n·phi2 between two inertias: index 3, the gear's equation twice, two degrees of freedom.
+    def equations(v):
+        phi1, phi2, w1, w2, tau = v["phi1"], v["phi2"], v["w1"], v["w2"], v["tau"]
+        return (der(phi1) - w1, der(phi2) - w2, 2 * der(w1) + tau - 1, 3 * der(w2) - 10 * tau, phi1 - 10 * phi2)
+
+    system = compiled(written(equations, {"phi1": 0.0, "w1": 0.0}))
+    assert system.report.index == 3 and system.report.degrees_of_freedom == 2 and len(system.states) == 2
+    assert counts(system)["0 = phi1 - 10*phi2"] == 2
+    # Closed form: the reflected inertia 2 + 3/100, driven by 1: phi1 = t²/(2·2.03).
+    solution = simulate(system, 2.0, ts=np.array([2.0]), rtol=1e-9)
+    assert float(solution["m.phi1"][0]) == pytest.approx(4.0 / (2 * 2.03), rel=1e-8)
+
+
+def test_slider_crank_closes_its_loop():
+    # Crank of radius 1/2, rod of length 1: x = cos(p) + cos(q)/2, 0 = sin(p) + sin(q)/2, as position constraints of
+    # (q, x, p): index 3, one degree of freedom in position.
+    def equations(v):
+        q, x, p, lam, mu = v["q"], v["x"], v["p"], v["lam"], v["mu"]
+        return (
+            der(der(q)) + lam * sympy.sin(q) / 2 + mu * sympy.cos(q) / 2,
+            der(der(x)) + lam,
+            2 * der(der(p)) + lam * sympy.sin(p) + mu * sympy.cos(p),
+            x - sympy.cos(p) - sympy.cos(q) / 2,
+            sympy.sin(p) + sympy.sin(q) / 2,
+        )
+
+    system = compiled(written(equations, {"q": 1.0}))
+    assert system.report.index == 3 and system.report.degrees_of_freedom == 2
+    assert sorted(counts(system).values()) == [2, 2]
+
+
+def circuit(*parts):
+    """A circuit from (component, node of p, node of n); node 0 is ground."""
+    diagram, nodes = AcausalDiagram(), {}
+    for component, p, n in parts:
+        for port, node in ((component.p, p), (component.n, n)):
+            if node in nodes:
+                diagram.connect(nodes[node], port)
+            nodes.setdefault(node, port)
+    ground = Ground(EV, "ground")
+    diagram.connect(nodes[0], ground.p)
+    return AcausalCompiler(EV, diagram)()
+
+
+def test_two_capacitors_in_parallel():
+    c1, c2 = Capacitor(EV, "c1", C=1.0, initial_voltage=1.0), Capacitor(EV, "c2", C=3.0)
+    system = circuit((c1, 1, 0), (c2, 1, 0), (Resistor(EV, "r", R=0.5), 1, 0))
+    assert system.report.index == 2 and system.report.degrees_of_freedom == 1 and len(system.states) == 1
+    solution = simulate(system, 1.0, ts=np.array([1.0]), rtol=1e-9)
+    assert float(solution["c2.v"][0]) == pytest.approx(np.exp(-1.0 / (0.5 * 4.0)), rel=1e-8)  # exp(−t/(R·(C1 + C2)))
+
+
+def test_capacitor_loop_with_a_source():
+    source = VoltageSource(EV, "source", v=2.0)
+    c1, c2 = Capacitor(EV, "c1", C=1.0), Capacitor(EV, "c2", C=3.0, initial_voltage=0.5)
+    system = circuit((source, 1, 0), (c1, 1, 2), (c2, 2, 0), (Resistor(EV, "r", R=1.0), 2, 0))
+    assert system.report.index == 2 and system.report.degrees_of_freedom == 1
+    solution = simulate(system, 2.0, ts=np.array([2.0]), rtol=1e-9)
+    # v1 + v2 = 2, so (C1 + C2) v2' = −v2/R.
+    assert float(solution["c2.v"][0]) == pytest.approx(0.5 * np.exp(-2.0 / 4.0), rel=1e-8)
+    assert float(solution["c1.v"][0]) == pytest.approx(2.0 - 0.5 * np.exp(-2.0 / 4.0), rel=1e-8)
+
+
+def test_inductor_cut_set():
+    l1, l2 = Inductor(EV, "l1", L=1.0, initial_current=1.0), Inductor(EV, "l2", L=2.0)
+    system = circuit((Resistor(EV, "r", R=3.0), 1, 0), (l1, 1, 2), (l2, 2, 0))
+    assert system.report.index == 2 and system.report.degrees_of_freedom == 1
+    solution = simulate(system, 1.0, ts=np.array([1.0]), rtol=1e-9)
+    assert float(solution["l2.i"][0]) == pytest.approx(np.exp(-1.0), rel=1e-8)  # exp(−R t/(L1 + L2))
+
+
+def test_rigid_rod_between_masses():
+    m1, m2 = Mass(EV, "m1", M=1.0, initial_position=0.0, initial_velocity=2.0), Mass(EV, "m2", M=3.0)
+    diagram = AcausalDiagram().connect(m1.flange, (rod := Rod(EV, "rod", length=1.5)).flange_a)
+    diagram.connect(rod.flange_b, m2.flange)
+    system = AcausalCompiler(EV, diagram)()
+    assert system.report.index == 3 and system.states == ["m1.x", "m1.v"]
+    solution = simulate(system, 1.0, ts=np.array([1.0]), rtol=1e-9)
+    assert float(solution["m2.x"][0]) == pytest.approx(3.5, rel=1e-10)
+
+
+# --- cancellation that structure cannot see --------------------------------------------------------------------
+
+
+class Amplifier(Component):
+    """The transistor amplifier, equations as published."""
+
+    def __init__(self, name):
+        super().__init__(EV, name)
+        p = {k: self.parameter(k, v) for k, v in AMPLIFIER["parameters"].items()}
+        starts = AMPLIFIER["y0"]
+        y = [None] + [self.variable(f"y{i + 1}", start=starts[i], fixed=True) for i in range(8)]
+
+        def g(x):
+            return p["beta"] * (sympy.exp(x / p["UF"]) - 1)
+
+        ue = sympy.sin(200 * sympy.pi * EV.t) / 10
+        d = [None] + [der(v) for v in y[1:]]
+        self.add_equations(
+            p["C1"] * (d[2] - d[1]) - (y[1] - ue) / p["R0"],
+            p["C1"] * (d[1] - d[2])
+            - (-p["Ub"] / p["R2"] + y[2] * (1 / p["R1"] + 1 / p["R2"]) + (1 - p["alpha"]) * g(y[2] - y[3])),
+            -p["C2"] * d[3] - (y[3] / p["R3"] - g(y[2] - y[3])),
+            p["C3"] * (d[5] - d[4]) - ((y[4] - p["Ub"]) / p["R4"] + p["alpha"] * g(y[2] - y[3])),
+            p["C3"] * (d[4] - d[5])
+            - (-p["Ub"] / p["R6"] + y[5] * (1 / p["R5"] + 1 / p["R6"]) + (1 - p["alpha"]) * g(y[5] - y[6])),
+            -p["C4"] * d[6] - (y[6] / p["R7"] - g(y[5] - y[6])),
+            p["C5"] * (d[8] - d[7]) - ((y[7] - p["Ub"]) / p["R8"] + p["alpha"] * g(y[5] - y[6])),
+            p["C5"] * (d[7] - d[8]) - y[8] / p["R9"],
+        )
+
+
+def test_transistor_amplifier_has_five_degrees_of_freedom():
+    # Structural index 0, true index 1, five degrees of freedom (Mazzia & Magherini 2008; rank of M is 5).
+    system = compiled(Amplifier("amp"))
+    assert system.report.degrees_of_freedom == 5
+    assert len(system.report.notes) == 3 and all("cancel" in note for note in system.report.notes)
+
+
+@pytest.mark.slow
+def test_transistor_amplifier_end_values():
+    system = compiled(Amplifier("amp"))
+    solution = simulate(system, 0.2, ts=np.array([0.2]), rtol=1e-8, atol=1e-10, max_steps=100_000)
+    found = np.array([float(solution[f"amp.y{i + 1}"][0]) for i in range(8)])
+    # Published end values, 11.8 digits confirmed; the local tolerance 1e-8 over 4,000 steps leaves 50 × of it.
+    np.testing.assert_allclose(found, AMPLIFIER["y_end"], atol=50 * 1e-8, rtol=0)
+
+
+def test_dependent_equations_are_named():
+    def equations(v):
+        x, y = v["x"], v["y"]
+        return der(x) + der(y) - 1, 2 * der(x) + 2 * der(y) - 2
+
+    with pytest.raises(StructuralError, match="depend on each other"):
+        compiled(written(equations))
+
+
+# --- random structures -----------------------------------------------------------------------------------------
+
+
+@st.composite
+def patterns(draw):
+    n, m = draw(st.integers(1, 9)), draw(st.integers(1, 9))
+    entries = draw(st.lists(st.booleans(), min_size=n * m, max_size=n * m))
+    return sp.csr_array(np.array(entries, np.int8).reshape(n, m))
+
+
+@given(patterns())
+def test_matching_is_maximum(pattern):
+    found = maximum_matching(pattern.indptr.astype(np.int64), pattern.indices.astype(np.int64), pattern.shape[1])
+    taken = found[found >= 0]
+    assert len(set(taken.tolist())) == len(taken)
+    assert all(pattern[r, c] for r, c in enumerate(found) if c >= 0)
+    assert len(taken) == (maximum_bipartite_matching(pattern, perm_type="column") >= 0).sum()
+
+
+@given(st.integers(2, 7), st.randoms(use_true_random=False))
+def test_offsets_are_pryces(n, random):
+    # A perfect matching on the diagonal, more entries at random, orders at random: dⱼ ≥ σᵢⱼ + cᵢ everywhere, equality
+    # on the matching, and some c is zero (Pryce 2001).
+    order = np.full((n, n), -1)
+    for i in range(n):
+        order[i, i] = random.randint(0, 2)
+        for j in range(n):
+            if random.random() < 0.3:
+                order[i, j] = random.randint(0, 2)
+    rows, columns = np.nonzero(order >= 0)
+    pointer = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))])
+    offsets = reduce_index(Incidence(pointer, columns, order[rows, columns], n))
+    c, d = offsets.equation, offsets.variable
+    assert (d[columns] >= order[rows, columns] + c[rows]).all()
+    matched = offsets.matched_variable
+    assert sorted(matched.tolist()) == list(range(n))
+    assert (d[matched] == order[np.arange(n), matched] + c).all()
+    assert c.min() == 0
+    # Σd − Σc is the value of a maximum-weight transversal.
+    weights = np.where(order >= 0, order.astype(float), -1e6)
+    from scipy.optimize import linear_sum_assignment
+
+    best = linear_sum_assignment(weights, maximize=True)
+    assert d.sum() - c.sum() == weights[best].sum()
+
+
+# --- size ------------------------------------------------------------------------------------------------------
+
+
+def ladder(n):
+    diagram = AcausalDiagram()
+    source, ground = VoltageSource(EV, "source"), Ground(EV, "ground")
+    diagram.connect(source.n, ground.p)
+    before = source.p
+    for k in range(n):
+        r, c = Resistor(EV, f"r{k}"), Capacitor(EV, f"c{k}", initial_voltage=0.0)
+        diagram.connect(before, r.p).connect(r.n, c.p).connect(c.n, ground.p)
+        before = r.n
+    return AcausalCompiler(EV, diagram)()
+
+
+@pytest.mark.parametrize("sizes", [(100, 400), pytest.param((100, 10_000), marks=pytest.mark.slow)])
+def test_the_program_does_not_grow_with_the_model(sizes):
+    import jax
+
+    lengths = []
+    for n in sizes:
+        system = ladder(n)
+        x = np.zeros(n)
+        lengths.append(len(jax.make_jaxpr(lambda x, system=system: system.vector_field(0.0, x))(x).eqns))
+    assert lengths[0] == lengths[1]
+
+
+def test_ladder_against_scipy():
+    import scipy.integrate
+
+    n = 50
+    main = np.full(n, -2.0)
+    main[-1] = -1.0
+    a = np.diag(main) + np.diag(np.ones(n - 1), 1) + np.diag(np.ones(n - 1), -1)
+    b = np.eye(n)[0]
+    reference = scipy.integrate.solve_ivp(
+        lambda t, v: a @ v + b, (0, 10), np.zeros(n), method="DOP853", rtol=1e-12, atol=1e-14
+    ).y[:, -1]
+    solution = simulate(ladder(n), 10.0, ts=np.array([10.0]), rtol=1e-8, atol=1e-10)
+    found = np.array([float(solution[f"c{k}.v"][0]) for k in range(n)])
+    np.testing.assert_allclose(found, reference, atol=1e-6)  # 100 × the local tolerance
+
+
+def test_unused_wall_is_fine():
+    wall, mass = FixedPosition(EV, "wall", position=1.0), Mass(EV, "m", initial_position=0.0, initial_velocity=1.0)
+    system = compiled(wall, mass)
+    assert system.states == ["m.x", "m.v"]
