@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import optimistix as optx
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from ..errors import ModelError
 from ..lowering.system import AcausalSystem
@@ -25,12 +25,14 @@ class Fit(Generic[Model]):
     """The outcome of a training run.
 
     - `model`: the best iterate, of the same structure as the model given.
+    - `last`: the last iterate.
     - `history`: the losses, `history[k]` after k updates; shape `(steps + 1,)`, or shorter if stopped early.
     - `best_step`, `best_loss`: where the best iterate was found.
     - `message`: why the run ended.
     """
 
     model: Model
+    last: Model
     history: np.ndarray
     best_step: int
     best_loss: float
@@ -141,8 +143,8 @@ def fit(
                 trainable, state = following, following_state
                 bar.update()
                 bar.set_postfix(loss=f"{number:.3e}", best=f"{history[best_step]:.3e}")
-    fitted = _merged(eqx.combine(best, frozen))
-    return Fit(fitted, np.array(history), best_step, history[best_step], message)
+    fitted, last = (_merged(eqx.combine(weights, frozen)) for weights in (best, trainable))
+    return Fit(fitted, last, np.array(history), best_step, history[best_step], message)
 
 
 def fit_least_squares(
@@ -158,7 +160,8 @@ def fit_least_squares(
     """Minimises ½ Σ residuals² by Levenberg–Marquardt steps.
 
     Where data are many and weights are few this is worth far more than gradient steps. The Jacobian is found by forward
-    mode, so the simulation inside needs `adjoint=diffrax.ForwardMode()`.
+    mode, so the simulation inside needs `adjoint=diffrax.ForwardMode()`. Give it `throw=False` and a moderate `max_steps`
+    too: a trial step may lead where the model cannot be integrated, and is then rejected rather than raised.
 
     **Arguments:**
 
@@ -194,6 +197,6 @@ def fit_least_squares(
         warnings.warn(
             "least squares found no better point; the model is returned unchanged", RuntimeWarning, stacklevel=2
         )
-        return Fit(model, np.array([first]), 0, first, "no better point was found")
+        return Fit(model, model, np.array([first]), 0, first, "no better point was found")
     fitted = _merged(eqx.combine(found, frozen))
-    return Fit(fitted, np.array([first, last]), int(taken), last, f"{int(taken)} steps were taken")
+    return Fit(fitted, fitted, np.array([first, last]), int(taken), last, f"{int(taken)} steps were taken")
