@@ -160,8 +160,8 @@ def fit_least_squares(
     """Minimises ½ Σ residuals² by Levenberg–Marquardt steps.
 
     Where data are many and weights are few this is worth far more than gradient steps. The Jacobian is found by forward
-    mode, so the simulation inside needs `adjoint=diffrax.ForwardMode()`. Give it `throw=False` and a moderate `max_steps`
-    too: a trial step may lead where the model cannot be integrated, and is then rejected rather than raised.
+    mode, so the simulation inside needs `adjoint=diffrax.ForwardMode()`. Give it `throw=False` and a moderate
+    `max_steps` too: a trial step may lead where the model cannot be integrated, and is then rejected, not raised.
 
     **Arguments:**
 
