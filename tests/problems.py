@@ -71,17 +71,13 @@ def pendulum(*blocks: Any, name: str = "pend", compiler: dict[str, Any] | None =
 
     `blocks` are functions from the component to a `NeuralDAEBlock`.
     """
-    ev, diagram = EqnEnv(), AcausalDiagram()
-    bob = PlanarPendulum(ev, name, **({"initial_theta": RELEASE} | parameters))
-    diagram.add(bob)
-    for block in blocks:
-        diagram.add_neural_correction_block(block(bob))
-    return AcausalCompiler(ev, diagram, **(compiler or {}))()
+    bob = PlanarPendulum(EqnEnv(), name, **({"initial_theta": RELEASE} | parameters))
+    return compiled(bob, blocks=[block(bob) for block in blocks], **(compiler or {}))
 
 
 def drag_on(*targets: str, network: Callable = quadratic, name: str = "drag", **options) -> Callable:
-    """A correction of a pendulum's velocities, for `pendulum`."""
-    return lambda bob: NeuralDAEBlock(network, targets=[(bob, t) for t in targets], name=name, **options)
+    """A correction of a component's variables, for `pendulum` and `oscillator`."""
+    return lambda component: NeuralDAEBlock(network, targets=[(component, t) for t in targets], name=name, **options)
 
 
 def mlp(inputs: int, outputs: int, *, width: int = 4, seed: int = 0) -> eqx.nn.MLP:
@@ -156,12 +152,16 @@ PERIOD_TWO_GRAVITY = 4 * scipy.special.ellipk(0.5) ** 2
 # --- circuits ----------------------------------------------------------------------------------------------------
 
 
-def compiled(*components: Component, connect: Sequence[Sequence[Any]] = (), **options) -> AcausalSystem:
-    """Components and connections, compiled."""
+def compiled(
+    *components: Component, connect: Sequence[Sequence[Any]] = (), blocks: Sequence[NeuralDAEBlock] = (), **options
+) -> AcausalSystem:
+    """Components, connections and learned corrections, compiled."""
     diagram = AcausalDiagram()
     diagram.add(*components)
     for ends in connect:
         diagram.connect(*ends)
+    for block in blocks:
+        diagram.add_neural_correction_block(block)
     return AcausalCompiler(components[0].ev, diagram, **options)()
 
 
@@ -183,14 +183,18 @@ def rc_voltage(t, R=2.0, C=0.5, V=3.0, v0=0.0):
 # --- oscillators -------------------------------------------------------------------------------------------------
 
 
-def oscillator(M=2.0, D=0.6, K=5.0, x0=0.7, v0=-0.4) -> AcausalSystem:
-    """A mass between a spring and a damper, both fixed to a wall."""
+def oscillator(
+    *blocks: Callable, M=2.0, D=0.6, K=5.0, x0=0.7, v0=-0.4, compiler: dict[str, Any] | None = None
+) -> AcausalSystem:
+    """A mass between a spring and a damper, both fixed to a wall; `blocks` correct the mass."""
     ev = EqnEnv()
     mass = Mass(ev, "mass", M, initial_position=x0, initial_velocity=v0)
     spring, damper, wall = Spring(ev, "spring", K), Damper(ev, "damper", D), FixedPosition(ev, "wall")
     return compiled(
         wall, spring, damper, mass,
         connect=[(wall.flange, spring.flange_a, damper.flange_a), (mass.flange, spring.flange_b, damper.flange_b)],
+        blocks=[block(mass) for block in blocks],
+        **(compiler or {}),
     )  # fmt: skip
 
 

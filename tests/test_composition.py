@@ -155,9 +155,9 @@ def test_inputs_may_close_over_what_is_transformed():
     def last(a):
         return simulate(system, 1.0, ts=jnp.array([1.0]), inputs={"c.u": lambda t: a * t})["c.x"][0]
 
-    expected = np.exp(-1)
-    for value in (last(2.0) / 2, jax.jit(last)(2.0) / 2, jax.grad(last)(2.0), jax.vmap(last)(jnp.array([2.0]))[0] / 2):
-        assert float(value) == pytest.approx(expected, abs=1e-6)  # the default tolerance
+    # The first error estimates are exactly zero: no gradient may flow through the size of the first step.
+    assert float(jax.jit(jax.grad(last))(2.0)) == pytest.approx(np.exp(-1), abs=1e-6)  # the default tolerance
+    np.testing.assert_allclose(jax.vmap(last)(jnp.array([2.0, 3.0])), np.array([2, 3]) * np.exp(-1), rtol=0, atol=3e-6)
 
 
 class Driven(Component):
@@ -238,6 +238,7 @@ def test_projected_solvers(plain, solver):
     assert solution.stats["num_steps"] < 200  # Kvaerno5's default iteration needs over 800 (FACTS)
 
 
+@pytest.mark.slow
 def test_projection_may_be_given_by_hand(plain):
     solver = Projected(diffrax.Tsit5(), plain.project)
     solved = diffrax.diffeqsolve(

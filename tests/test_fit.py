@@ -164,6 +164,7 @@ def test_least_squares_recovers_parameters():
     assert jax.tree.structure(result.model) == jax.tree.structure(system)
 
 
+@pytest.mark.slow
 def test_least_squares_recovers_a_law():
     """dx/dt = −k·xⁿ, from x(0) = 1: x = (1 + (n − 1)·k·t)^(1/(1 − n))."""
     system = compiled(Decay(EqnEnv(), "c", Power(jnp.array(0.3), jnp.array(1.2))))

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from problems import compiled, drag_on, mlp, pendulum
+from problems import compiled, drag_on, mlp, oscillator, pendulum
 from sympy import Eq
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, Electrical, EqnEnv, NeuralDAEBlock, der, simulate
@@ -105,6 +105,39 @@ def test_the_order_of_targets_is_the_order_of_outputs():
     assert slopes(system, x=0.0, y=0.0) == {"x": 2.0, "y": 1.0}
 
 
+class Nested(Component):
+    """A component around another."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        self.add(Free(ev, "inner"))
+
+
+@pytest.mark.parametrize("by_name", [False, True])
+def test_targets_inside_other_components(by_name):
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    outer = Nested(ev, "outer")
+    diagram.add(outer)
+    target = "outer.inner.y" if by_name else (outer.inner, "y")
+    diagram.add_neural_correction_block(NeuralDAEBlock(lambda u: 3 * u, targets=[target], name="b"))
+    system = AcausalCompiler(ev, diagram)()
+    slope = dict(zip(system.states, system.vector_field(0.0, jnp.array([2.0, 2.0])), strict=True))
+    assert float(slope["outer.inner.x"]) == 0.0 and float(slope["outer.inner.y"]) == 6.0
+
+
+@pytest.mark.parametrize("mode", ["auto", "dummy_derivatives"])
+def test_a_corrected_position_moves_what_is_attached(mode):
+    """x' = v + N is the velocity that the damper sees: M·v' = −K·x − D·(v + N)."""
+    system = oscillator(
+        drag_on("x", network=lambda u: 0.5 * u), compiler={"state_selection": mode}, M=2.0, D=0.6, K=5.0
+    )  # fmt: skip
+    at = {"mass.x": 0.4, "mass.v": -0.3}
+    x = jnp.array([at[n] for n in system.states])
+    slope = dict(zip(system.states, system.vector_field(0.0, x), strict=True))
+    assert float(slope["mass.x"]) == pytest.approx(-0.3 + 0.2, rel=1e-12)
+    assert float(slope["mass.v"]) == pytest.approx((-5.0 * 0.4 - 0.6 * (-0.3 + 0.2)) / 2.0, rel=1e-12)
+
+
 # --- in algebraic equations --------------------------------------------------------------------------------------
 
 
@@ -185,7 +218,7 @@ class Cam(Component):
         self.add_equations(Eq(der(y), v), Eq(m * der(v), f), Eq(y, profile))
 
 
-@pytest.mark.parametrize("mode", ["auto", "dummy_derivatives"])
+@pytest.mark.parametrize("mode", ["auto", pytest.param("dummy_derivatives", marks=pytest.mark.slow)])
 def test_constraints_differentiate_networks_exactly(mode):
     system = compiled(Cam(EqnEnv(), "cam", jnp.tanh), state_selection=mode)
     x, u = 0.8 * np.cos(T), -0.8 * np.sin(T)
@@ -213,6 +246,7 @@ class Bead(Component):
         )
 
 
+@pytest.mark.slow
 def test_a_bead_on_a_learned_wire_keeps_its_energy():
     system = compiled(Bead(EqnEnv(), "b", lambda x: x**2, lambda x: 2 * x))
     solution = simulate(system, 2.0, ts=TS, **SOLVE)

@@ -122,3 +122,24 @@ def test_structure(plain):
     assert (report.index, report.degrees_of_freedom) == (3, 2)
     assert sorted(n for _, n in report.differentiated) == [1, 1, 2]
     assert len(report.constraints) == 2
+
+
+def minimal(theta, *prefer):
+    """The states and the notes of a pendulum with two states, released at an angle."""
+    options = {"state_selection": "dummy_derivatives", "prefer_states": prefer}
+    report = pendulum(initial_theta=theta, compiler=options).report
+    return {name.removeprefix("pend.") for name in report.states}, " ".join(report.notes)
+
+
+def test_preferred_states_are_taken_where_they_are_regular():
+    assert minimal(RELEASE, "pend.x", "pend.vx") == ({"x", "vx"}, "")
+    assert minimal(RELEASE, "pend.y", "pend.vy") == ({"y", "vy"}, "")
+
+
+@pytest.mark.parametrize("theta, good, bad", [(-np.pi / 2, "x", "y"), (0.0, "y", "x")])
+def test_a_singular_choice_of_states_is_vetoed(theta, good, bad):
+    """At its lowest point a pendulum's height is no state (FACTS, 4): numbers decide, not structure alone."""
+    assert minimal(theta) == ({good, f"v{good}"}, "")
+    states, notes = minimal(theta, f"pend.{bad}", f"pend.v{bad}")
+    assert states == {good, f"v{good}"}
+    assert f"pend.v{bad} was preferred" in notes and "near-singular" in notes
