@@ -136,7 +136,7 @@ def _compiled(arguments):
 def _integrate(x0, system: AcausalSystem, t0, t1, ts, inputs, initial, options):
     solver, adjoint, controller, max_steps, progress = options
     if system.is_constrained:
-        solver = with_projection(solver, system.project)
+        solver = with_projection(solver, system.project, strict=bool(system.carried))
         solver = for_forward_mode(solver) if isinstance(adjoint, diffrax.ForwardMode) else solver
     term = diffrax.ODETerm(system.vector_field)
     dt0 = _first_step(system, t0, t1, x0, inputs, solver.order(term), controller)
@@ -323,5 +323,10 @@ def _explain(solution: Solution, x0: Any, t0: float, t1: float, max_steps: int, 
         )
     else:
         reason = f"the integration failed: {solution.result}"
+    if system.plan.mode == "dummy_derivatives" and system.carried:
+        reason += (
+            f"; or the states {', '.join(system.states[:4])} have become a singular choice, which "
+            'state_selection="auto" avoids'
+        )
     last = f"The last saved time is {reached:g} of {t1:g}" if filled.any() else f"Nothing was saved before t={t1:g}"
     return f"{reason}. {last}."

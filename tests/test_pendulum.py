@@ -18,7 +18,8 @@ from problems import (
     pendulum,
 )
 
-from jaxonomy_dae import simulate
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, SimulationError, simulate
+from jaxonomy_dae.library.planar import PlanarPendulum
 
 TIGHT = dict(rtol=1e-11, atol=1e-12)
 
@@ -143,3 +144,22 @@ def test_a_singular_choice_of_states_is_vetoed(theta, good, bad):
     states, notes = minimal(theta, f"pend.{bad}", f"pend.v{bad}")
     assert states == {good, f"v{good}"}
     assert f"pend.v{bad} was preferred" in notes and "near-singular" in notes
+
+
+def test_a_forced_singular_chart_fails_loudly():
+    # With (y, vy) as states x = ±√(L² − y²) cannot be followed through the lowest point, which a release from rest
+    # reaches after a quarter of the period 4·K(sin²(A/2))·√(L/g), amplitude A = π/2 − 1.2.
+    import scipy.special
+
+    ev = EqnEnv()
+    diagram = AcausalDiagram().add(PlanarPendulum(ev, "pend", initial_theta=-1.2))
+    options = dict(state_selection="dummy_derivatives", prefer_states=["pend.vy", "pend.y"])
+    system = AcausalCompiler(ev, diagram, **options)()
+    assert system.states == ["pend.y", "pend.vy"]
+    quarter = scipy.special.ellipk(np.sin((np.pi / 2 - 1.2) / 2) ** 2) / np.sqrt(9.81)
+    times = np.linspace(0.0, 2.0, 401)
+    with pytest.raises(SimulationError, match="singular choice"):
+        simulate(system, 2.0, ts=times, rtol=1e-7, atol=1e-9, max_steps=2000)
+    solution = simulate(system, 2.0, ts=times, rtol=1e-7, atol=1e-9, max_steps=2000, throw=False)
+    reached = times[np.isfinite(np.asarray(solution["pend.y"]))]
+    assert quarter - 0.01 < reached[-1] <= quarter

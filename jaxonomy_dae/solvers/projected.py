@@ -4,6 +4,8 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 from diffrax import AbstractSolver
 from diffrax import AbstractWrappedSolver as _Wrapped
 
@@ -22,10 +24,13 @@ class Projected(_Wrapped):
 
     - `solver`: any Diffrax solver.
     - `projection`: a function `(t, y, args) -> y` such as `system.project`; `simulate` fills it in if left out.
+    - `strict`: whether the distance moved counts as an error of the step. A step that has slipped to another branch of
+        an implicit function is then rejected, however well its own error estimate looks.
     """
 
     solver: AbstractSolver
     projection: Projection | None = None
+    strict: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
         if isinstance(self.solver, Projected):
@@ -66,19 +71,23 @@ class Projected(_Wrapped):
         y1, y_error, dense_info, solver_state, result = self.solver.step(
             terms, t0, t1, y0, args, solver_state, made_jump
         )
-        return self.projection(t1, y1, args), y_error, dense_info, solver_state, result
+        projected = self.projection(t1, y1, args)
+        if self.strict and y_error is not None:
+            moved = jax.tree.map(lambda a, b: jnp.abs(a - b), projected, y1)
+            y_error = jax.tree.map(lambda e, m: jnp.abs(e) + m, y_error, moved)
+        return projected, y_error, dense_info, solver_state, result
 
     def func(self, terms, t0, y0, args):
         return self.solver.func(terms, t0, y0, args)
 
 
-def with_projection(solver: AbstractSolver, projection: Projection) -> Projected:
+def with_projection(solver: AbstractSolver, projection: Projection, strict: bool) -> Projected:
     """The solver wrapped, or its own wrapper filled in."""
     if isinstance(solver, _Wrapped) and isinstance(getattr(solver, "projection", None), Callable):
         return solver  # type: ignore[return-value]
     if type(solver) is Projected:
         return eqx.tree_at(lambda s: s.projection, solver, projection, is_leaf=lambda v: v is None)
-    return Projected(solver, projection)
+    return Projected(solver, projection, strict)
 
 
 def for_forward_mode(solver: AbstractSolver) -> AbstractSolver:
@@ -87,4 +96,4 @@ def for_forward_mode(solver: AbstractSolver) -> AbstractSolver:
     if getattr(inner, "scan_kind", "none") is not None:
         return solver
     changed = eqx.tree_at(lambda s: s.scan_kind, inner, "lax", is_leaf=lambda v: v is None)
-    return changed if inner is solver else Projected(changed, solver.projection)  # type: ignore[attr-defined]
+    return changed if inner is solver else Projected(changed, solver.projection, solver.strict)  # type: ignore[attr-defined]
