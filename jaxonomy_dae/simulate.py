@@ -15,7 +15,7 @@ from .errors import ModelError, SimulationError, nearest
 from .lowering.initialize import check, initialize
 from .lowering.system import AcausalSystem
 from .solution import Solution
-from .solvers.projected import for_forward_mode, with_projection
+from .solvers.projected import with_projection
 from .solvers.tsit5 import Tsit5
 
 SAVED_ITERATIONS = 3
@@ -137,7 +137,6 @@ def _integrate(x0, system: AcausalSystem, t0, t1, ts, inputs, initial, options):
     solver, adjoint, controller, max_steps, progress = options
     if system.is_constrained:
         solver = with_projection(solver, system.project, strict=bool(system.carried))
-        solver = for_forward_mode(solver) if isinstance(adjoint, diffrax.ForwardMode) else solver
     term = diffrax.ODETerm(system.vector_field)
     dt0 = _first_step(system, t0, t1, x0, inputs, solver.order(term), controller)
     saveat = diffrax.SaveAt(t0=True, steps=True) if ts is None else diffrax.SaveAt(ts=ts)
@@ -204,6 +203,11 @@ def _is_traced(tree: Any) -> bool:
 def _check_arguments(system, t0, t1, ts, inputs, initial, adjoint, solver, max_steps):
     if not isinstance(system, AcausalSystem):
         raise ModelError(f"simulate needs an AcausalSystem (call the AcausalCompiler); got {type(system).__name__}")
+    if system.parameters.values.ndim != 1:
+        raise ModelError(
+            f"the system is a batch, its parameters have shape {system.parameters.values.shape}: simulate each with "
+            "equinox.filter_vmap(lambda s: simulate(s, ...))(system)"
+        )
     if solver is not None and not isinstance(solver, diffrax.AbstractSolver):
         raise ModelError(f"solver must be a Diffrax solver such as diffrax.Tsit5(); got {solver!r}")
     if isinstance(adjoint, diffrax.BacksolveAdjoint):

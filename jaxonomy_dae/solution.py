@@ -1,6 +1,6 @@
 """Solutions: every variable by name."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import equinox as eqx
@@ -22,6 +22,8 @@ class Solution(eqx.Module):
     - `system`, `inputs`: what was simulated.
     - `stats`: steps taken, accepted, rejected.
     - `result`: Diffrax's result code. Where the integration stopped early, later rows are infinite.
+
+    A solution that `equinox.filter_vmap` returns is a batch: shapes get its axis in front.
     """
 
     ts: Float[Array, " n"]
@@ -40,6 +42,8 @@ class Solution(eqx.Module):
         """
         if name == "time":
             return self.ts
+        if self.states.ndim > 2:
+            return _each(self, lambda one: one[name])
         plan = self.system.plan
         quantity, sign = plan.resolve([name])
         place = np.flatnonzero(np.concatenate([plan.states, plan.carried]) == quantity[0])
@@ -59,6 +63,8 @@ class Solution(eqx.Module):
 
     def constraint_residual(self) -> Float[Array, "n m"]:
         """The residuals of all hidden constraints at the saved times, shape `(n, constraints)`."""
+        if self.states.ndim > 2:
+            return _each(self, Solution.constraint_residual)
         return _constraint_residual(self.system, self.ts, self.states, self.inputs)
 
     def to_dict(self) -> dict[str, Any]:
@@ -72,7 +78,12 @@ class Solution(eqx.Module):
         return plot_solution(self, *names, ax=ax)
 
     def __repr__(self):
-        return f"Solution({self.ts.shape[0]} times, {len(self.system.variables)} variables)"
+        return f"Solution({self.ts.shape[-1]} times, {len(self.system.variables)} variables)"
+
+
+def _each(batch: Solution, read: Callable[[Solution], Any]) -> Any:
+    """Reads every solution of a batch."""
+    return eqx.filter_vmap(read)(batch)
 
 
 def _observe(system: AcausalSystem, ts, states, inputs, quantity: np.ndarray, sign: np.ndarray):

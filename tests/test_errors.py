@@ -140,6 +140,8 @@ def test_writing_a_component(message, call, error):
 
 # conftest.py has the signatures' types checked before these messages can be raised, so they are tested without it.
 WRONG_TYPES = [
+    (r"the system is a batch, its parameters have shape \(3, 4\).*equinox\.filter_vmap",
+     lambda: simulate(jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), rc_circuit()), 1.0)),
     (r"first argument of a component is an EqnEnv; got str", lambda: Ground("ground", "g")),
     (r"parameter 'r\.R' must be a number; got list.*with_parameters\(\{'r\.R'", lambda: Resistor(EV, "r", [1.0])),
     (r"port 'c\.p' needs a Domain such as Electrical; got 'electrical'",

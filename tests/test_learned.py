@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from problems import compiled, drag_on, mlp, oscillator, pendulum
+import scipy.integrate
+from problems import GRAVITY, RELEASE, compiled, drag_on, mlp, oscillator, pendulum
 from sympy import Eq
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, Electrical, EqnEnv, NeuralDAEBlock, der, simulate
@@ -197,6 +198,38 @@ def test_gradients_reach_the_weights_inside_an_algebraic_equation():
 
     gradient = eqx.filter_grad(slope)(system)
     assert float(gradient.neural["r.law"].k) == pytest.approx(-1.3 / 0.5, rel=1e-12)
+
+
+def test_a_correction_that_depends_on_the_tension():
+    """Friction of the link, N = −0.3·lam on vx: the multiplier depends on the force and the force on the multiplier."""
+    system = pendulum(drag_on("vx", network=lambda u: -0.3 * u, inputs=["pend.lam"]))
+    ts = [0.5, 1.0]
+    solution = simulate(system, 1.0, ts=ts, **SOLVE)
+
+    def tension(theta, omega):  # 2·lam = ω² − g·sin θ + cos θ·N, solved for lam
+        return (omega**2 - GRAVITY * np.sin(theta)) / (2 + 0.3 * np.cos(theta))
+
+    def field(t, state):
+        theta, omega = state
+        return omega, -GRAVITY * np.cos(theta) + 0.3 * tension(theta, omega) * np.sin(theta)
+
+    angle = scipy.integrate.solve_ivp(field, (0.0, 1.0), (RELEASE, 0.0), "DOP853", ts, rtol=1e-12, atol=1e-12).y
+    np.testing.assert_allclose(solution["pend.x"], np.cos(angle[0]), **CLOSE)
+    np.testing.assert_allclose(solution["pend.lam"], tension(*angle), rtol=0, atol=1e-6)  # as in test_pendulum.py
+
+
+def test_networks_keep_their_precision():
+    """Weights drawn in single precision stay so, in a model that runs in double."""
+    single = jax.tree.map(lambda leaf: leaf.astype(jnp.float32) if eqx.is_array(leaf) else leaf, mlp(1, 1))
+    system = corrected({"network": single})
+
+    def slope(system):
+        return jnp.sum(system.vector_field(0.0, jnp.array([0.3, 0.0])))
+
+    value, gradient = eqx.filter_value_and_grad(slope)(system)
+    assert float(value) == pytest.approx(float(mlp(1, 1)(jnp.array([0.3]))[0]), abs=1e-6)  # single precision
+    assert value.dtype == jnp.float64
+    assert {leaf.dtype for leaf in jax.tree.leaves(gradient.neural)} == {jnp.dtype("float32")}
 
 
 # --- in constraints ----------------------------------------------------------------------------------------------

@@ -48,10 +48,22 @@ class Projected(_Wrapped):
     def term_compatible_contr_kwargs(self):  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.solver.term_compatible_contr_kwargs
 
+    # Diffrax reads and replaces these on a solver that counts as a Runge–Kutta or an implicit one, wrapped or not.
+
     @property
-    def scan_kind(self) -> str:
-        """How the wrapped solver loops over its stages; Diffrax asks for it under `ForwardMode`."""
-        return getattr(self.solver, "scan_kind", None) or "default"
+    def scan_kind(self):
+        """How the wrapped solver loops over its stages."""
+        return self.solver.scan_kind  # pyright: ignore[reportAttributeAccessIssue]
+
+    @property
+    def root_finder(self):
+        """How the wrapped solver finds roots."""
+        return self.solver.root_finder  # pyright: ignore[reportAttributeAccessIssue]
+
+    @property
+    def root_find_max_steps(self):
+        """How long the wrapped solver looks for roots."""
+        return self.solver.root_find_max_steps  # pyright: ignore[reportAttributeAccessIssue]
 
     def order(self, terms):
         return self.solver.order(terms)
@@ -88,12 +100,3 @@ def with_projection(solver: AbstractSolver, projection: Projection, strict: bool
     if type(solver) is Projected:
         return eqx.tree_at(lambda s: s.projection, solver, projection, is_leaf=lambda v: v is None)
     return Projected(solver, projection, strict)
-
-
-def for_forward_mode(solver: AbstractSolver) -> AbstractSolver:
-    """The solver with a stage loop that forward mode can differentiate, as Diffrax sets it for unwrapped solvers."""
-    inner = solver.solver if isinstance(solver, Projected) and type(solver) is Projected else solver
-    if getattr(inner, "scan_kind", "none") is not None:
-        return solver
-    changed = eqx.tree_at(lambda s: s.scan_kind, inner, "lax", is_leaf=lambda v: v is None)
-    return changed if inner is solver else Projected(changed, solver.projection, solver.strict)  # type: ignore[attr-defined]
