@@ -61,7 +61,7 @@ class Solution(eqx.Module):
     def __iter__(self) -> Iterator[str]:
         return iter(self.system.variables)
 
-    def constraint_residual(self) -> Float[Array, "n m"]:
+    def constraint_residual(self) -> Float[Array, "*batch n m"]:
         """The residuals of all hidden constraints at the saved times, shape `(n, constraints)`."""
         if self.states.ndim > 2:
             return _each(self, Solution.constraint_residual)

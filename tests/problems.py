@@ -4,6 +4,10 @@ References are closed forms, published numbers, or SciPy's solution of a simpler
 jaxonomy_dae; the models are written with it, the expectations are not.
 """
 
+import os
+import pathlib
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -20,6 +24,7 @@ from jaxonomy_dae.library.electrical import Capacitor, Ground, Resistor, Voltage
 from jaxonomy_dae.library.planar import PlanarPendulum
 from jaxonomy_dae.library.translational import Damper, FixedPosition, Mass, Spring
 
+ROOT = pathlib.Path(__file__).parents[1]
 GRAVITY = 9.81  # m/s²
 RELEASE = -1.2  # rad from the +x axis: the tutorial's
 HORIZONS = (0.5, 1.0, 1.5)  # s: the tutorial's
@@ -205,3 +210,21 @@ def damped_oscillation(t, M=2.0, D=0.6, K=5.0, x0=0.7, v0=-0.4):
     c, s, e = np.cos(w * t), np.sin(w * t), np.exp(-a * t)
     b = (v0 + a * x0) / w
     return e * (x0 * c + b * s), e * ((-a * x0 + w * b) * c + (-a * b - w * x0) * s)
+
+
+# --- other processes ---------------------------------------------------------------------------------------------
+
+
+def environment(**changed: str) -> dict[str, str]:
+    """The environment for a new Python that finds the package and this module, without JAX's settings."""
+    kept = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
+    return kept | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])} | changed
+
+
+def run(program: str) -> str:
+    """Runs a program in a new Python, without this process's settings; returns what it printed."""
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", program], env=environment(), capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout

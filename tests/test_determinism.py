@@ -1,8 +1,6 @@
 """The same model gives the same system: whatever the hash seed, whatever the names."""
 
 import json
-import os
-import pathlib
 import subprocess
 import sys
 
@@ -10,16 +8,14 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from problems import compiled, drag_on, oscillator, pendulum, rc_circuit
+from problems import compiled, drag_on, environment, oscillator, pendulum, rc_circuit
 
 from jaxonomy_dae import EqnEnv
 from jaxonomy_dae.library.electrical import Capacitor, Ground, Inductor, Resistor, VoltageSource
 
-ROOT = pathlib.Path(__file__).parents[1]
-
 
 def ladder(names=None, stages=3):
-    """A filter with an inductor and, from the second stage on, two parallel capacitors in each stage."""
+    """A filter of stages with an inductor, a resistor and two parallel capacitors each."""
     plain = ["source", "ground", *(f"{kind}{k}" for k in range(stages) for kind in ("l", "r", "c", "d"))]
     name = dict(zip(plain, names or plain, strict=True))
     ev = EqnEnv()
@@ -75,10 +71,12 @@ print(json.dumps({name: everything(system) for name, system in systems()}))
 
 
 def start_with_seed(seed):
-    path = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
-    environment = os.environ | {"PYTHONHASHSEED": str(seed), "PYTHONPATH": path}
     return subprocess.Popen(
-        [sys.executable, "-c", PROGRAM], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-c", PROGRAM],
+        env=environment(PYTHONHASHSEED=str(seed)),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
 
 

@@ -11,9 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import sympy
-from problems import compiled, drag_on, mlp, pendulum, quadratic, rc_circuit
+from problems import compiled, drag_on, mlp, pendulum, quadratic, rc_circuit, run
 from sympy import Eq
-from test_precision import run
 
 from jaxonomy_dae import (
     AcausalCompiler,

@@ -163,3 +163,20 @@ def test_a_forced_singular_chart_fails_loudly():
     solution = simulate(system, 2.0, ts=times, rtol=1e-7, atol=1e-9, max_steps=2000, throw=False)
     reached = times[np.isfinite(np.asarray(solution["pend.y"]))]
     assert quarter - 0.01 < reached[-1] <= quarter
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("states", [("x", "vx"), ("y", "vy")])
+def test_a_forced_singular_chart_is_right_as_far_as_it_goes(states):
+    names = [f"pend.{s}" for s in states]
+    compiler = {"state_selection": "dummy_derivatives", "prefer_states": names}
+    system = pendulum(initial_theta=np.pi / 6, compiler=compiler)
+    assert system.states == names
+    ts = np.linspace(0.0, 3.0, 61)
+    solution = simulate(system, 3.0, ts=ts, rtol=1e-8, atol=1e-10, max_steps=2000, throw=False)
+    found = np.stack([solution["pend.x"], solution["pend.y"]])
+    done = np.isfinite(found).all(axis=0)
+    assert 5 < done.sum() < 61
+    angle = elliptic_angle(np.pi / 6, ts[done])
+    # As for full swings above; the last steps before the singular point are the hardest.
+    np.testing.assert_allclose(found[:, done], np.stack([np.cos(angle), np.sin(angle)]), rtol=0, atol=1e-4)

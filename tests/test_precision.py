@@ -1,29 +1,7 @@
 """Single precision, and what importing does (nothing): in processes of their own, as JAX's settings are global."""
 
-import os
-import pathlib
-import subprocess
-import sys
-
 import pytest
-
-ROOT = pathlib.Path(__file__).parents[1]
-
-
-def run(program: str, **environment) -> str:
-    """Runs a program in a new Python, without this process's settings; returns what it printed."""
-    kept = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
-    path = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", program],
-        env=kept | {"PYTHONPATH": path} | environment,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
+from problems import ROOT, run
 
 IMPORT = """
 import os, sys, threading
