@@ -95,9 +95,6 @@ def _own(network: Any) -> Any:
 def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> SystemPlan:
     """Runs the passes on a flattened model."""
     groups, alias = eliminate_aliases(flat)
-    used = np.zeros(len(flat.variables), bool)
-    for group in groups:
-        used[group.variable[group.variable != ZERO]] = True
     is_input = flat.variables.is_input
     roots = np.arange(len(flat.variables)) == alias.root
     column = np.full(len(flat.variables), -1, np.int64)
@@ -105,10 +102,15 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Sy
     column[unknown] = np.arange(len(unknown))
     signature = incidence(groups, column, len(unknown))
     check_structure(flat, groups, alias, signature, unknown)
-    groups, _, offsets, notes = reduce_with_cancellation(groups, column, len(unknown), flat.parameters.values)
-    inputs = np.flatnonzero(roots & is_input & used)
+    named = np.flatnonzero(alias.root != ZERO)
+    least = np.zeros(len(flat.variables), np.int64)  # the highest derivative of each root that a variable is equal to
+    np.maximum.at(least, alias.root[named], alias.order[named])
+    groups, _, offsets, notes = reduce_with_cancellation(
+        groups, column, len(unknown), least[unknown], flat.parameters.values
+    )
+    inputs = np.flatnonzero(roots & is_input)
     column[inputs] = len(unknown) + np.arange(len(inputs))
-    extended = extend(groups, offsets, column, is_input, len(unknown))
+    extended = extend(groups, offsets, column, is_input, least, len(unknown))
     names = name_quantities(flat, alias, extended)
     preferred = _preferred(flat, alias, extended, prefer_states)
     merit = _merit(flat, alias, extended, preferred)

@@ -17,7 +17,7 @@ TS = jnp.array([0.5, 1.0, 2.0])
 
 
 def kvaerno5():
-    """Kvaerno5 whose Newton iteration does not give up after two steps (FACTS, Writing a Diffrax solver)."""
+    """Kvaerno5 whose Newton iteration does not give up after two steps."""
     return diffrax.Kvaerno5(root_finder=diffrax.with_stepsize_controller_tols(optx.Chord)())
 
 
@@ -238,7 +238,7 @@ def test_projected_solvers(plain, solver):
     reference = angle_solution(-1.2, 0.0, solution.ts)
     np.testing.assert_allclose(solution["pend.x"], reference.x, rtol=0, atol=1e-7)  # a hundred times the tolerance
     assert np.max(np.abs(solution.constraint_residual())) < 1e-12
-    assert solution.stats["num_steps"] < 200  # Kvaerno5's default iteration needs over 800 (FACTS)
+    assert solution.stats["num_steps"] < 200  # Kvaerno5's default iteration needs over 800
 
 
 @pytest.mark.slow

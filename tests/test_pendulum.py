@@ -119,7 +119,7 @@ def test_period_two_does_not_drift(plain):
 
 def test_structure(plain):
     report = plain.report
-    # Pantelides (1988); shared/testset/pendulum_cash.json: structural index 3, two degrees of freedom.
+    # Pantelides (1988); J. Cash's driver: structural index 3, two degrees of freedom.
     assert (report.index, report.degrees_of_freedom) == (3, 2)
     assert sorted(n for _, n in report.differentiated) == [1, 1, 2]
     assert len(report.constraints) == 2
@@ -139,7 +139,7 @@ def test_preferred_states_are_taken_where_they_are_regular():
 
 @pytest.mark.parametrize("theta, good, bad", [(-np.pi / 2, "x", "y"), (0.0, "y", "x")])
 def test_a_singular_choice_of_states_is_vetoed(theta, good, bad):
-    """At its lowest point a pendulum's height is no state (FACTS, 4): numbers decide, not structure alone."""
+    """At its lowest point a pendulum's height is no state: numbers decide, not structure alone."""
     assert minimal(theta) == ({good, f"v{good}"}, "")
     states, notes = minimal(theta, f"pend.{bad}", f"pend.v{bad}")
     assert states == {good, f"v{good}"}

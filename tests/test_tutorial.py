@@ -37,7 +37,7 @@ def truth():
 
 
 def test_truth_is_the_tutorials(truth):
-    # FACTS prints eight decimals of a solve at these tolerances; 2e-6 is the tutorial's five digits with its rounding.
+    # Eight decimals of a hand-written solve at these tolerances; 2e-6 is the tutorial's five digits with its rounding.
     np.testing.assert_allclose(truth, ROW, rtol=0, atol=2e-6)
 
 
@@ -71,7 +71,7 @@ def training(truth):
 
 
 def test_initial_loss_and_gradient_are_the_tutorials(training):
-    # 1e-4 relative throughout: the tutorial's BDF at rtol 1e-7 against Tsit5 at 1e-7 differ by some 1e-5 (FACTS, 3).
+    # 1e-4 relative throughout: the tutorial's BDF at rtol 1e-7 against Tsit5 at 1e-7 differ by some 1e-5.
     losses, gradient = training
     assert losses[0] == pytest.approx(INITIAL_LOSS, rel=1e-4)
     assert float(jnp.linalg.norm(gradient.neural["drag"])) == pytest.approx(INITIAL_GRADIENT_NORM, rel=1e-4)

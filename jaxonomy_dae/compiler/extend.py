@@ -88,15 +88,22 @@ class Extended:
 
 
 def extend(
-    groups: tuple[EquationGroup, ...], offsets: Offsets, column: np.ndarray, is_input: np.ndarray, n_unknown: int
+    groups: tuple[EquationGroup, ...],
+    offsets: Offsets,
+    column: np.ndarray,
+    is_input: np.ndarray,
+    least: np.ndarray,
+    n_unknown: int,
 ) -> Extended:
-    """Builds the extended system; column[v] numbers root variables, unknowns first, then inputs."""
+    """Builds the extended system; column[v] numbers root variables, unknowns first, then inputs, least[v] is the lowest
+    order that root variable v must have."""
     n_columns = int(column.max(initial=-1)) + 1
     variable = np.full(n_columns, -1, np.int64)
     present = np.flatnonzero(column >= 0)
     variable[column[present]] = present
     highest = np.zeros(n_columns, np.int64)
     highest[:n_unknown] = offsets.variable
+    highest[n_unknown:] = least[variable[n_unknown:]]
     first_equation = 0
     for group in groups:
         c = offsets.equation[first_equation : first_equation + len(group)]

@@ -35,17 +35,20 @@ class Offsets:
         return int(self.variable.sum() - self.equation.sum())
 
 
-def reduce_index(incidence: Incidence) -> Offsets:
+def reduce_index(incidence: Incidence, least: np.ndarray | None = None) -> Offsets:
     """Pantelides' algorithm.
 
-    The incidence must have a perfect matching (otherwise the algorithm would not end); `explain_structure` checks that
-    before.
+    `least` gives orders that the variables must reach in any case, because eliminated variables equal these
+    derivatives. The incidence must have a perfect matching (otherwise the algorithm would not end); `check_structure`
+    makes sure of that before.
     """
     n_equations, n = incidence.n_equations, incidence.n_variables
     pointer, columns, sigma = incidence.pointer, incidence.variable, incidence.order
     c = np.zeros(n_equations, np.int64)
     d = np.zeros(n, np.int64)
     np.maximum.at(d, columns, sigma)
+    if least is not None:
+        d = np.maximum(d, least)
 
     # A maximum matching along the highest derivatives first; only what it leaves out needs the careful search.
     active = sigma == d[columns]

@@ -44,7 +44,7 @@ def _parameter(k: int) -> sympy.Symbol:
 
 
 def reduce_with_cancellation(
-    groups: tuple[EquationGroup, ...], column: np.ndarray, n_unknown: int, values: np.ndarray
+    groups: tuple[EquationGroup, ...], column: np.ndarray, n_unknown: int, least: np.ndarray, values: np.ndarray
 ) -> tuple[tuple[EquationGroup, ...], Incidence, Offsets, tuple[str, ...]]:
     """Index reduction, repeated until no diagonal block with constant coefficients is singular.
 
@@ -57,7 +57,7 @@ def reduce_with_cancellation(
     notes: list[str] = []
     for _ in range(ROUNDS):
         signature = incidence(groups, column, n_unknown)
-        offsets = reduce_index(signature)
+        offsets = reduce_index(signature, least)
         found = _singular_block(groups, signature, offsets, column, values)
         if found is None:
             return groups, signature, offsets, tuple(notes)
