@@ -30,7 +30,7 @@ RELEASE = -1.2  # rad from the +x axis: the tutorial's
 HORIZONS = (0.5, 1.0, 1.5)  # s: the tutorial's
 DRAG = 0.5  # 1/m, drag per mass
 
-# --- the reference tutorial (its printed figures, and checks of them with hand-written Diffrax) -----------------------------------------------------
+# --- the reference tutorial: its printed figures, and checks of them with hand-written Diffrax ------------------
 
 # (vx, x) at the three horizons, m = L = 1, correction −0.5·vx·|vx| on vx alone. `ROW` is what the tutorial computes
 # (its five printed digits agree); `EQUATION` is the true force. From a hand-written Diffrax model, checked there
@@ -145,12 +145,12 @@ def elliptic_angle(theta0: float, ts: np.ndarray, g: float = GRAVITY, L: float =
 
 # Cash's pendulum, g = L = m = 1, released at (1, 0) with velocity (0, 1); (x, y, x', y', λ) at t = 1, where
 # λ = 2·lam. From J. Cash's driver pendul3.f (github fons/JavaOdeInt). 18 digits are printed, 9 of them are right:
-# a 30-digit Taylor series confirmed that (J. Cash's MEBDFDAE drivers).
+# a 30-digit Taylor series confirmed that.
 CASH = np.array([0.867348640604551746, 0.497701050476373918, -0.0337480180329866458, 0.0588130114660715686,
                  -0.493103151528274442])  # fmt: skip
 
-# Released from the horizontal, this gravity makes the period exactly 2: g = 4·K(1/2)² (
-# pendulum_period2.json; github modelon-community/Assimulo, examples/mech_system_pendulum.py).
+# Released from the horizontal, this gravity makes the period exactly 2: g = 4·K(1/2)²
+# (github modelon-community/Assimulo, examples/mech_system_pendulum.py).
 PERIOD_TWO_GRAVITY = 4 * scipy.special.ellipk(0.5) ** 2
 
 
