@@ -1,4 +1,8 @@
 """Diffrax solvers for constrained and differential-algebraic systems."""
 
+from .bdf import BDF as BDF
+from .dae_term import DAETerm as DAETerm
 from .projected import Projected as Projected
+from .rodas5p import Rodas5P as Rodas5P
+from .step_control import StepControl as StepControl
 from .tsit5 import Tsit5 as Tsit5

@@ -1,0 +1,245 @@
+"""BDF: variable order, variable step, fixed leading coefficient."""
+
+from typing import Any, ClassVar
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+
+from .bdf_coefficients import Coefficients, coefficients, interpolate
+from .dae_term import FlatProblem
+from .index_one import consistent_slope
+from .linear_algebra import LinearAlgebra, choose
+from .newton import Tolerances, implicit_step
+from .projected import Projection
+from .step_control import encoded
+
+ROWS = 6  # differences of orders 0 … 5
+
+
+class BDFInterpolation(diffrax.AbstractLocalInterpolation):
+    """The polynomial that the method itself integrates, of the step's order."""
+
+    t0: Any
+    t1: Any
+    y0: Any
+    phi: Any
+    psi: Any
+    order: Any
+
+    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> Any:
+        """The solution at t0, or its increment from t0 to t1."""
+        if t1 is not None:
+            return jax.tree.map(jnp.subtract, self.evaluate(t1), self.evaluate(t0))
+        weight = interpolate(t0 - self.t1, self.psi, self.order)
+        return jax.tree.map(lambda phi: jnp.tensordot(weight.astype(phi.dtype), phi, axes=1), self.phi)
+
+
+class _State(eqx.Module):
+    """What a step needs of those before it; names as in Brenan, Campbell & Petzold (1996)."""
+
+    phi: Any  # scaled divided differences, shape (ROWS, n)
+    psi: Any  # sums of past step sizes, shape (ROWS,)
+    order: Any  # of the step to come
+    last_order: Any
+    steady: Any  # steps taken with the same size and order
+    last_step: Any
+    planned: Any  # the next step's size, as proposed
+    starting: Any  # whether order and size still double and rise
+    factor: Any
+    factor_cj: Any  # the coefficient the factorisation was made with
+    last_cj: Any
+    contraction: Any  # ρ/(1−ρ) of the last Newton iterations
+    counts: Any  # Jacobians (and factorisations), Newton iterations
+
+
+class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
+    """Backward differentiation formulas of order 1 to 5 for M dy/dt = F(t, y), index 1, and stiff ordinary equations.
+
+    Variable step, fixed leading coefficient: the formulas, the error estimates and the choice of order are those of
+    Brenan, Campbell & Petzold (1996), Numerical Solution of Initial-Value Problems in Differential-Algebraic Equations,
+    chapter 5, with the step-size rules of SUNDIALS IDA (Hindmarsh et al. 2005, ACM TOMS 31:363). The corrector is a
+    modified Newton iteration whose factorisation is kept over steps, renewed where the leading coefficient has changed
+    too much or the iteration fails, and then tried again inside the step.
+
+    Gradients are those of the implicit equations, linearised afresh at their solution: how Newton got there, with which
+    Jacobian, does not show.
+
+    **Arguments:**
+
+    - `max_order`: 1 to 5.
+    - `fixed_order`: stay at `max_order` once it is reached; for convergence studies.
+    - `linear`: the linear algebra; None chooses by size.
+    - `algebraic_errors`: whether unknowns that never occur differentiated count in the error test.
+    - `rtol`, `atol`, `norm`: given where the step-size controller has none; else left out.
+    - `projection`: `(t, y, args) -> y`, onto hidden constraints: applied inside the step, before the history is
+        updated. `simulate` fills it in.
+
+    Takes a `DAETerm` or a `diffrax.ODETerm`; wants `StepControl(rtol, atol, steered=True)` and works with
+    `diffrax.PIDController(rtol, atol)`.
+    """
+
+    max_order: int = eqx.field(static=True, default=5)
+    fixed_order: bool = eqx.field(static=True, default=False)
+    linear: LinearAlgebra | None = None
+    algebraic_errors: bool = eqx.field(static=True, default=True)
+    projection: Projection | None = None
+    root_finder: Any = Tolerances()
+    root_find_max_steps: int = eqx.field(static=True, default=4)
+
+    term_structure: ClassVar = diffrax.AbstractTerm
+    interpolation_cls: ClassVar = BDFInterpolation
+
+    def __check_init__(self):
+        if self.max_order not in range(1, 6):
+            raise ValueError(
+                f"max_order must be 1 to 5 (BDF formulas of order 6 are hardly stable); got {self.max_order}"
+            )
+
+    def order(self, terms):
+        return self.max_order
+
+    def error_order(self, terms):
+        return 1  # how the error estimate answers to the step size: it carries the next size, see `encoded`
+
+    def func(self, terms, t0, y0, args):
+        """dy/dt of the solution through a consistent point."""
+        problem = FlatProblem(terms, y0, args)
+        return problem.unravel(consistent_slope(problem, self.linear, t0, problem.flat))
+
+    def init(self, terms, t0, t1, y0, args):
+        problem = FlatProblem(terms, y0, args)
+        y = problem.flat
+        linear = choose(self.linear, y.shape[0], problem.pattern)
+        slope = consistent_slope(problem, self.linear, t0, y)
+        return self._fresh(y, slope, t1 - t0, linear.empty(y.shape[0], y.dtype), jnp.zeros((2,), jnp.int32))
+
+    def _fresh(self, y, slope, h, factor, counts) -> _State:
+        """The history of order 1 with one derivative known."""
+        h = jnp.asarray(h)
+        one, zero = jnp.array(1, jnp.int32), jnp.array(0, jnp.int32)
+        phi = jnp.zeros((ROWS, y.shape[0]), y.dtype).at[0].set(y).at[1].set(h.astype(y.dtype) * slope)
+        still = jax.lax.stop_gradient(h)
+        return _State(
+            phi, h * jnp.arange(1, ROWS + 1, dtype=h.dtype), one, zero, zero, jnp.zeros_like(still), still,
+            jnp.array(True), factor, jnp.zeros_like(still), jnp.zeros_like(still), jnp.full((), 20.0, h.dtype), counts,
+        )  # fmt: skip
+
+    def step(self, terms, t0, t1, y0, args, solver_state: _State, made_jump):
+        """One step, with error estimate and dense output."""
+        problem = FlatProblem(terms, y0, args)
+        y = problem.flat
+        linear = choose(self.linear, y.shape[0], problem.pattern)
+        h = t1 - t0
+        state = solver_state
+        if made_jump is not False:
+
+            def restart():
+                slope = consistent_slope(problem, self.linear, t0, y)
+                return self._fresh(y, slope, h, state.factor, state.counts)
+
+            state = jax.lax.cond(made_jump, restart, lambda: state)
+        rtol, atol, norm = self.root_finder.values(y.dtype)
+        weight = jax.lax.stop_gradient(1 / (atol + rtol * jnp.abs(y)))
+
+        # After rejections the step is shorter than it was planned to be, and the next orders count for less.
+        ratio = jax.lax.stop_gradient(h) / state.planned
+        retried = ratio < 0.95
+        order = jnp.where(retried & (ratio < 0.07) & (not self.fixed_order), 1, state.order)
+        starting = state.starting & ~retried
+        c: Coefficients = coefficients(h, state.psi, order)
+        phi = c.beta.astype(y.dtype)[:, None] * state.phi
+        predicted = jnp.tensordot(c.upto.astype(y.dtype), phi, axes=1)
+        slope = jnp.tensordot(c.gamma.astype(y.dtype), phi, axes=1)
+        cj = c.leading
+        solved = implicit_step(
+            problem, linear, t1, predicted, slope, cj,
+            weight=weight, norm=norm, max_iterations=self.root_find_max_steps,
+            factor=state.factor, factor_cj=state.factor_cj, last_cj=state.last_cj, contraction=state.contraction,
+        )  # fmt: skip
+        y1 = solved.y
+        if self.projection is not None:
+            moved = ravel_like(self.projection(t1, problem.unravel(y1), args))
+            y1 = jnp.where(solved.converged, moved, y1)
+        e = y1 - predicted
+
+        # Error estimates at this order and its neighbours, after Brenan, Campbell & Petzold, eq. 5.2.31 ff.
+        still = jax.lax.stop_gradient
+        differential = jnp.asarray(problem.mass.differential, y.dtype)
+        counted = weight if self.algebraic_errors else weight * differential
+        phi_, e_ = still(phi), still(e)
+        k = order
+
+        def size(v):
+            return norm(v * counted)
+
+        def row(j):
+            return phi_[jnp.clip(j, 0, ROWS - 1)]
+
+        def sigma(j):
+            return c.sigma[jnp.clip(j, 0, ROWS - 1)].astype(y.dtype)
+
+        e_norm = size(e_)
+        lower = row(k) + e_
+        lowest = lower + row(k - 1)
+        err = sigma(k) * e_norm
+        err_1 = sigma(k - 1) * size(lower)
+        err_2 = sigma(k - 2) * size(lowest)
+        kf = k.astype(y.dtype)
+        total, total_1, total_2 = (kf + 1) * err, kf * err_1, (kf - 1) * err_2
+        fall = jnp.where(k > 2, jnp.maximum(total_1, total_2) <= total, (k == 2) & (total_1 <= 0.5 * total))
+        accepted = solved.converged & (c.test.astype(y.dtype) * e_norm < 1.0)
+
+        same = jnp.abs(still(h) - state.last_step) <= 1e-6 * state.last_step
+        steady = jnp.where(same & (k == state.last_order), state.steady, 0)
+        steady = jnp.minimum(steady + 1, state.last_order + 2)
+        starting = starting & ~fall & (k < self.max_order)
+        err_up = size(e_ - row(k + 1)) / (kf + 2)
+        total_up = (kf + 2) * err_up
+        stay = (k == self.max_order) | (k + 1 >= steady) | (k - state.last_order == 1)
+        best_below = (k > 1) & (total_1 <= jnp.minimum(total, total_up))
+        up = ~stay & ~fall & ~best_below & jnp.where(k == 1, total_up < 0.5 * total, total_up < total)
+        down = fall | (~stay & best_below)
+        change = jnp.where(up, 1, jnp.where(down, -1, 0))
+        estimate = jnp.where(up, err_up, jnp.where(down, err_1, err))
+        first = state.last_order == 0
+        if self.fixed_order:
+            change = jnp.where(k < self.max_order, jnp.where(first, 0, 1), 0)
+            estimate = err
+        next_order = jnp.where(starting, jnp.where(first, k, k + 1), k + change).astype(jnp.int32)
+        next_order = jnp.clip(next_order, 1, self.max_order)
+        wish = (2 * estimate + 1e-4) ** (-1 / (next_order.astype(y.dtype) + 1))
+        factor = jnp.where(wish >= 2, 2.0, jnp.where(wish <= 1, jnp.clip(wish, 0.5, 0.9), 1.0))
+        factor = jnp.where(starting, jnp.where(first, 1.0, 2.0), factor)
+        again = 0.9 * (2 * err + 1e-4) ** (-1 / (kf + 1))
+        again = jnp.where(solved.converged & ~retried, jnp.clip(again, 0.25, 0.9), 0.25)
+        factor = jnp.where(accepted, factor, jnp.where(jnp.isfinite(again), again, 0.25))
+
+        updated = _advance(phi, e, k, self.max_order)
+        h_ = still(h)
+        new_state = _State(
+            updated, c.psi, next_order, k, steady.astype(jnp.int32), h_, h_ * factor.astype(h_.dtype), starting,
+            solved.factor, solved.factor_cj, still(cj), solved.contraction,
+            state.counts + jnp.stack([solved.factorisations, solved.iterations]),
+        )  # fmt: skip
+        value = jnp.where(jnp.isfinite(y1), y1, y)
+        scale = atol + jnp.maximum(jnp.abs(y), jnp.abs(value)) * rtol
+        y_error = encoded(factor, accepted) * still(jnp.broadcast_to(scale, y.shape))
+        dense = dict(y0=y0, phi=jax.vmap(problem.unravel)(updated), psi=c.psi, order=k)
+        return problem.unravel(y1), problem.unravel(y_error), dense, new_state, diffrax.RESULTS.successful
+
+
+def ravel_like(y: Any) -> Any:
+    """A solution as one vector."""
+    return ravel_pytree(y)[0]
+
+
+def _advance(phi: Any, e: Any, order: Any, max_order: int) -> Any:
+    """The differences after a step: φ*_k + e, and below it sums; e itself is kept where order k + 1 would read it."""
+    rows = jnp.arange(ROWS)[:, None]
+    inside = jnp.where(rows <= order, phi, 0) + jnp.where(rows == order, 1, 0) * e
+    sums = jnp.cumsum(inside[::-1], axis=0)[::-1]
+    out = jnp.where(rows <= order, sums, phi)
+    return jnp.where((rows == order + 1) & (order < max_order), e, out)

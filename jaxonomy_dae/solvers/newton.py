@@ -1,0 +1,154 @@
+"""The modified Newton iteration of an implicit step, and its derivative."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from diffrax._root_finder import use_stepsize_tol
+
+from .dae_term import FlatProblem
+from .linear_algebra import LinearAlgebra
+
+CONVERGED = 0.33  # of the local error's tolerance (Brenan, Campbell & Petzold 1996, section 5.2.2)
+DIVERGED = 0.9  # contraction rate above which an iteration is given up
+STALE = 0.25  # relative change of the leading coefficient that a factorisation survives
+
+
+class Tolerances(eqx.Module):
+    """Tolerances of the iteration: those of the step-size controller, unless given."""
+
+    rtol: Any = use_stepsize_tol
+    atol: Any = use_stepsize_tol
+    norm: Any = use_stepsize_tol
+
+    def values(self, dtype: Any) -> tuple[Any, Any, Callable[[Any], Any]]:
+        """(rtol, atol flat, norm)."""
+        if self.rtol is use_stepsize_tol:
+            raise ValueError(
+                "BDF needs tolerances: call it by diffrax.diffeqsolve, or BDF(root_finder=Tolerances(...))"
+            )
+        leaves = [jnp.ravel(jnp.asarray(leaf, dtype)) for leaf in jax.tree.leaves(self.atol)]
+        atol = leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves)
+        return jnp.asarray(self.rtol, dtype), atol[0] if atol.shape[0] == 1 else atol, self.norm
+
+
+class Solved(NamedTuple):
+    """The outcome of `implicit_step`."""
+
+    y: Any
+    converged: Any
+    factor: Any
+    factor_cj: Any
+    contraction: Any
+    factorisations: Any
+    iterations: Any
+
+
+def implicit_step(
+    problem: FlatProblem,
+    linear: LinearAlgebra,
+    t: Any,
+    predicted: Any,
+    slope: Any,
+    cj: Any,
+    *,
+    weight: Any,
+    norm: Callable[[Any], Any],
+    max_iterations: int,
+    factor: Any,
+    factor_cj: Any,
+    last_cj: Any,
+    contraction: Any,
+) -> Solved:
+    """Solves M (slope + c_j (y − predicted)) = F(t, y).
+
+    The factorisation at hand serves if its leading coefficient is near; where the iteration then fails, it is made anew
+    at the prediction and tried once more. The derivative of y is that of the equation, whatever factorisation was used.
+    """
+    right = eqx.filter_closure_convert(problem.right, t, predicted)
+    dtype = predicted.dtype
+
+    @eqx.filter_custom_jvp
+    def root(right, t, predicted, slope, cj, history):
+        factor, factor_cj, last_cj, contraction, weight = history
+        mass, y_cj = problem.mass, cj.astype(dtype)
+
+        def residual(y):
+            return mass.times(slope + y_cj * (y - predicted)) - right(t, y)
+
+        def fresh():
+            _, jacobian = linear.jacobian(lambda y: right(t, y), predicted)
+            return linear.factor(linear.combine(mass, y_cj, jacobian)), cj
+
+        ratio = cj / jnp.where(factor_cj == 0, 1, factor_cj)
+        near = (1 - STALE) / (1 + STALE)
+        stale = (factor_cj == 0) | (ratio < near) | (ratio > 1 / near)
+
+        def attempt(carry):
+            renew, _, factor, factor_cj, contraction, made, iterations = carry
+            factor, factor_cj = jax.lax.cond(renew, fresh, lambda: (factor, factor_cj))
+            changed = renew | (cj != last_cj)
+            contraction = jnp.where(renew, 20.0, jnp.where(changed, 100.0, contraction))
+            scale = (2 / (1 + cj / factor_cj)).astype(dtype)
+
+            def iterate(inner):
+                y, m, first, contraction, _, _ = inner
+                change = -scale * linear.apply(factor, None, residual(y))
+                size = norm(change * weight)
+                first = jnp.where(m == 0, size, first)
+                rate = jnp.where(m == 0, 0.0, (size / jnp.where(first == 0, 1, first)) ** (1 / jnp.maximum(m, 1)))
+                failed = ~jnp.isfinite(size) | (rate > DIVERGED)
+                contraction = jnp.where(m == 0, contraction, jnp.where(failed, contraction, rate / (1 - rate)))
+                small = jnp.where(m == 0, size <= 1e-4 * CONVERGED, False)
+                done = (small | (contraction * size <= CONVERGED)) & ~failed
+                return y + change, m + 1, first, contraction, done, failed
+
+            def going(inner):
+                _, m, _, _, done, failed = inner
+                return ~done & ~failed & (m < max_iterations)
+
+            zero = jnp.zeros((), dtype)
+            start = (predicted, jnp.array(0), zero, contraction.astype(dtype), jnp.array(False), jnp.array(False))
+            y, m, _, contraction, done, _ = jax.lax.while_loop(going, iterate, start)
+            contraction = contraction.astype(cj.dtype)
+            out = y, factor, factor_cj, contraction, made + renew, iterations + m
+            return done, out
+
+        def body(carry):
+            renew, _, (_, factor, factor_cj, contraction, made, iterations), _ = carry
+            done, out = attempt((renew, None, factor, factor_cj, contraction, made, iterations))
+            return jnp.array(True), done, out, renew
+
+        def unfinished(carry):
+            _, done, _, was_fresh = carry
+            return ~done & ~was_fresh
+
+        zero = jnp.array(0, jnp.int32)
+        start = (stale, jnp.array(False), (predicted, factor, factor_cj, contraction, zero, zero), jnp.array(False))
+        _, done, (y, *rest), _ = jax.lax.while_loop(unfinished, body, start)
+        y = jnp.where(done & jnp.isfinite(y).all(), y, predicted)
+        return y, (done, *rest)
+
+    @root.def_jvp
+    def _(primals, tangents):
+        right, t, predicted, slope, cj, history = primals
+        y, rest = root(right, t, predicted, slope, cj, history)
+
+        def at(right, t, predicted, slope, cj):
+            return problem.mass.times(slope + cj.astype(dtype) * (y - predicted)) - right(t, y)
+
+        moved = (*tangents[:5],)
+        _, change = eqx.filter_jvp(at, (right, t, predicted, slope, cj), moved)
+        _, jacobian = linear.jacobian(lambda v: right(t, v), y)
+        matrix = linear.combine(problem.mass, cj.astype(dtype), jacobian)
+        tangent = linear.solve(linear.factor(matrix), matrix, -change)
+        still = jax.tree.map(lambda v: None, rest)
+        return (y, rest), (tangent, still)
+
+    still = jax.lax.stop_gradient
+    y, rest = root(right, t, predicted, slope, cj, still((factor, factor_cj, last_cj, contraction, weight)))
+    done, factor, factor_cj, contraction, made, iterations = still(rest)
+    return Solved(y, done, factor, factor_cj, contraction, made.astype(jnp.int32), iterations.astype(jnp.int32))

@@ -1,0 +1,113 @@
+"""Step sizes: the first one, what follows a step, and the end when nothing helps."""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+
+SAFETY = 0.9
+# A solver that chooses its own step sizes writes them into its error estimate, whose norm e a controller reads back:
+# e = SAFETY/φ for a growth or a rejection by the factor φ (what the ordinary formula for order 1 makes of it too), and
+# e = SAFETY + (1 − SAFETY)·φ for a step that is kept though the next shall be smaller.
+
+
+def encoded(factor: Any, keep: Any) -> Any:
+    """The norm of an error estimate that asks for a step size changed by a factor."""
+    smaller = keep & (factor < 1)
+    return jnp.where(smaller, SAFETY + (1 - SAFETY) * factor, SAFETY / factor)
+
+
+def decoded(norm: Any) -> Any:
+    """The factor that `encoded` stands for."""
+    shrunk = (norm - SAFETY) / (1 - SAFETY)
+    factor = jnp.where((norm > SAFETY * (1 + 1e-5)) & (norm < 1), shrunk, SAFETY / norm)
+    return jnp.where(jnp.abs(factor - 1) < 1e-5, 1.0, factor)
+
+
+class StepControl(diffrax.AbstractAdaptiveStepSizeController):
+    """Step sizes for `BDF` and `Rodas5P`, from tolerances of the local error.
+
+    Differs from `diffrax.PIDController` in three points. The first step (`dt0=None`) comes from the slopes of the
+    equations themselves, in their own time scale. A step size that falls below the spacing of floating-point numbers
+    ends the integration with `RESULTS.dt_min_reached`. A solver that is `steered`, as `BDF` is, chooses step sizes
+    itself and may shorten the next step after one it kept.
+
+    **Arguments:**
+
+    - `rtol`, `atol`: of the local error; `atol` may be an array that looks like y.
+    - `norm`: of scaled errors; root mean square by default.
+    - `steered`: for `BDF`.
+    - `dtmax`: the longest step.
+    """
+
+    rtol: Any
+    atol: Any
+    norm: Callable[[Any], Any] = optx.rms_norm
+    steered: bool = eqx.field(static=True, default=False)
+    dtmax: Any = None
+
+    def wrap(self, direction):
+        return self
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        """The end of the first step, and the state of the controller: whether the last step was rejected."""
+        if dt0 is None:
+            dt0 = self._first(terms, t0, t1, y0, args, func, 1 if self.steered else int(error_order or 1))
+        if self.dtmax is not None:
+            dt0 = jnp.minimum(dt0, self.dtmax)
+        return t0 + dt0, jnp.array(False)
+
+    def _first(self, terms, t0, t1, y0, args, func, order):
+        """h with c = h^(p+1)·|y'|·r^p in units of the tolerance, where r = |y''|/|y'| is the problem's own rate."""
+        frozen = jax.tree.map(lambda v: jax.lax.stop_gradient(v) if eqx.is_array(v) else v, (terms, y0, args))
+        terms, y0, args = frozen
+        t0, t1 = jax.lax.stop_gradient((t0, t1))
+        interval = t1 - t0
+
+        def size(v):
+            return self.norm(jax.tree.map(lambda a, y: a / (self.atol + jnp.abs(y) * self.rtol), v, y0))
+
+        tiny = jnp.finfo(interval.dtype).tiny
+        slope = func(terms, t0, y0, args)
+        d0, d1 = size(y0), size(slope)
+        h0 = jnp.minimum(1e-3 * interval, 0.01 * d0 / jnp.maximum(d1, tiny))
+        h0 = jnp.where(h0 > 0, h0, 1e-6 * interval)
+        ahead = func(terms, t0 + h0, jax.tree.map(lambda y, s: y + (h0 * s).astype(y.dtype), y0, slope), args)
+        d2 = size(jax.tree.map(jnp.subtract, ahead, slope)) / h0
+        d1 = jnp.maximum(d1, d2 * h0)
+        rate = jnp.maximum(d2 / jnp.maximum(d1, tiny), 1 / interval)
+        target = 0.25 if order == 1 else 0.01
+        h = (target / jnp.maximum(d1 * rate**order, tiny)) ** (1 / (order + 1))
+        h = jnp.where(jnp.isfinite(h) & (h > 0), h, 1e-6 * interval)
+        return jax.lax.stop_gradient(jnp.minimum(h, 0.1 * interval).astype(interval.dtype))
+
+    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
+        """Whether the step is kept, and the next one."""
+        rejected = controller_state
+
+        def scaled(a, b, e):
+            b = jnp.where(jnp.isfinite(b).all(), b, a)
+            return e / (self.atol + jnp.maximum(jnp.abs(a), jnp.abs(b)) * self.rtol)
+
+        norm = jax.lax.stop_gradient(self.norm(jax.tree.map(scaled, y0, y1_candidate, y_error)))
+        norm = jnp.where(jnp.isfinite(norm), norm, jnp.inf)
+        keep = norm < 1
+        if self.steered:
+            factor = jnp.where(jnp.isfinite(norm), decoded(norm), 0.25)
+        else:
+            factor = SAFETY * norm ** (-1 / error_order)
+            most = jnp.where(rejected, 1.0, 8.0)  # no growth at once after a rejection
+            factor = jnp.clip(factor, 0.2, jnp.where(keep, most, SAFETY))
+        dt = (t1 - t0) * factor.astype(t1.dtype)
+        if self.dtmax is not None:
+            dt = jnp.minimum(dt, self.dtmax)
+        start = jnp.where(keep, t1, t0)
+        least = 4 * jnp.finfo(t1.dtype).eps * jnp.abs(start)
+        failed = ~keep & ((dt <= least) | (dt == 0))
+        result = diffrax.RESULTS.where(failed, diffrax.RESULTS.dt_min_reached, diffrax.RESULTS.successful)
+        dt = jax.lax.stop_gradient(dt)
+        return keep, start, start + dt, False, ~keep, result
