@@ -94,9 +94,7 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
 
     def __check_init__(self):
         if self.max_order not in range(1, 6):
-            raise ValueError(
-                f"max_order must be 1 to 5 (BDF formulas of order 6 are hardly stable); got {self.max_order}"
-            )
+            raise ValueError(f"max_order must be 1, 2, 3, 4 or 5; got {self.max_order}")
 
     def order(self, terms):
         return self.max_order
@@ -132,7 +130,7 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         problem = FlatProblem(terms, y0, args)
         y = problem.flat
         linear = choose(self.linear, y.shape[0], problem.pattern)
-        h = t1 - t0
+        h = jnp.asarray(t1 - t0)
         state = solver_state
         if made_jump is not False:
 

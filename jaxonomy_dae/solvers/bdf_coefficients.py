@@ -1,7 +1,7 @@
 """The coefficients of a variable-step BDF formula with fixed leading coefficient.
 
-Brenan, Campbell & Petzold (1996), Numerical Solution of Initial-Value Problems in Differential-Algebraic Equations, section
-5.2. All arrays have one entry for each difference, orders 0 to 5; those above the order in use are masked.
+Brenan, Campbell & Petzold (1996), Numerical Solution of Initial-Value Problems in Differential-Algebraic Equations,
+section 5.2. All arrays have one entry for each difference, orders 0 to 5; those above the order in use are masked.
 """
 
 from typing import Any, NamedTuple

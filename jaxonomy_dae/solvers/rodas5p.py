@@ -3,7 +3,6 @@
 from typing import Any, ClassVar
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -115,7 +114,7 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
         mass, y = problem.mass, problem.flat
         dtype = y.dtype
         linear = choose(self.linear, y.shape[0], problem.pattern)
-        h_time = t1 - t0
+        h_time = jnp.asarray(t1 - t0)
         h = h_time.astype(dtype)
         # A step of length zero occurs where a batch waits for its slowest member.
         inverse = 1 / jnp.where(h == 0, jnp.asarray(1, dtype), h)

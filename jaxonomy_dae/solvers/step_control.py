@@ -88,6 +88,7 @@ class StepControl(diffrax.AbstractAdaptiveStepSizeController):
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
         """Whether the step is kept, and the next one."""
         rejected = controller_state
+        t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
 
         def scaled(a, b, e):
             b = jnp.where(jnp.isfinite(b).all(), b, a)
