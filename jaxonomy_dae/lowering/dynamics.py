@@ -78,10 +78,32 @@ class Point:
     def vector_field(self, x: Any) -> Any:
         """d(state)/dt, shape (n_state,)."""
         plan = self.plan
-        n = len(plan.states)
         state = self.split(x)
         if len(plan.carried):
             state = self.refined(state, FIELD_REFINEMENTS)
+        slopes, evaluation = self._slopes(state)
+        if plan.carried_rates is not None:
+            rates = [jnp.asarray(evaluation.read(g), self.dtype) for g in plan.carried_rates]
+            slopes = [*slopes, *rates] if isinstance(slopes, list) else jnp.concatenate([slopes, jnp.stack(rates)])
+        elif len(plan.carried):
+            slopes = self._with_carried(state, slopes)
+        return self.join(slopes)
+
+    def semi_explicit(self, x: Any) -> Any:
+        """dx/dt of the states, then the residuals of nonlinear blocks, at the state as it is: shape (n_state,)."""
+        state = self.split(x)
+        slopes, _ = self._slopes(state)
+        if not len(self.plan.carried):
+            return self.join(slopes)
+        residuals = self._carried(self.t, state)
+        if isinstance(slopes, list) and all(jnp.ndim(r) == 0 for r in residuals):
+            return self.join([*slopes, *residuals])
+        return jnp.concatenate([self.join(slopes), *(jnp.reshape(r, (-1,)) for r in residuals)])
+
+    def _slopes(self, state: Any) -> tuple[Any, Evaluation]:
+        """dx/dt of the differential states, and all that was computed on the way."""
+        plan = self.plan
+        n = len(plan.states)
         evaluation = self.run(plan.derivative, state, refine=0)
         if isinstance(state, tuple):
             slopes: Any = [evaluation.read(_only(plan.next_derivative, k)) for k in range(n)]
@@ -91,12 +113,7 @@ class Point:
         for row in plan.rows:
             u = [jnp.asarray(evaluation.read(g), self.dtype) for g in row.inputs]
             slopes = self._corrected(slopes, row, u)
-        if plan.carried_rates is not None:
-            rates = [jnp.asarray(evaluation.read(g), self.dtype) for g in plan.carried_rates]
-            slopes = [*slopes, *rates] if isinstance(slopes, list) else jnp.concatenate([slopes, jnp.stack(rates)])
-        elif len(plan.carried):
-            slopes = self._with_carried(state, slopes)
-        return self.join(slopes)
+        return slopes, evaluation
 
     def _corrected(self, slopes: Any, row: PlannedRow, u: list[Any]) -> Any:
         entries = iter(u)

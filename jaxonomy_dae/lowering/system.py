@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..errors import ModelError, nearest
@@ -123,6 +124,16 @@ class AcausalSystem(eqx.Module):
         # Reverse mode recomputes a small field rather than storing what it needs of every stage: a few fused kernels
         # instead of a store for each intermediate value, a quarter of the time of a gradient.
         return eqx.filter_checkpoint(lambda s, t, x, args: s._point(t, args).vector_field(x))(self, t, x, args)
+
+    def semi_explicit(self, t: Any, x: Float[Array, " n"], args: Any = None) -> Float[Array, " n"]:
+        """The right-hand side of M d(state)/dt = F(t, state): slopes of the differential states, then the residuals of
+        nonlinear blocks, whose rows of `mass` are zero."""
+        return self._point(t, args).semi_explicit(x)
+
+    @property
+    def mass(self) -> np.ndarray:
+        """The diagonal of M in M d(state)/dt = `semi_explicit`: one for states, zero for algebraic unknowns."""
+        return np.concatenate([np.ones(len(self.plan.states)), np.zeros(len(self.plan.carried))])
 
     def project(self, t: Any, x: Float[Array, " n"], args: Any = None, iterations: int = 1) -> Float[Array, " n"]:
         """The state moved onto the hidden constraints (nothing to do if there are none)."""

@@ -1,0 +1,128 @@
+"""What is wrong with a start, and why an integration stopped: found once, said by name."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .dae_term import FlatProblem
+from .index_one import algebraic_part, consistent_slope, index_matrix
+
+LARGE = 300  # unknowns up to which matrices are looked at
+SHOWN = 4
+
+
+class StartCheck(eqx.Module):
+    """What `explain_start` reads: the residual of the algebraic equations, the step that would mend it in units of the
+    tolerance, and the matrix that is regular if the index is 1 (or None)."""
+
+    right: Any
+    residual: Any
+    shift: Any
+    matrix: Any
+
+    def error_if(self, ys: Any) -> Any:
+        """For traced starts: an error while running."""
+        ys = eqx.error_if(ys, ~jnp.all(jnp.isfinite(self.right)), "the equations are not finite at the start")
+        bad = ~(jnp.max(jnp.abs(self.shift), initial=0.0) <= 1)
+        return eqx.error_if(ys, bad, "inconsistent start: see jaxonomy_dae.solvers.consistent_start")
+
+
+def start_check(problem: FlatProblem, t: Any, rtol: Any, atol: Any) -> StartCheck:
+    """Evaluates the equations at the start."""
+    problem_y = jax.lax.stop_gradient(problem.flat)
+    if not problem.mass.is_singular:
+        empty = jnp.zeros((0,), problem_y.dtype)
+        return StartCheck(problem.right(t, problem_y), empty, empty, None)
+    chosen, right, _, matrix = index_matrix(problem, None, t, problem_y)
+    residual = algebraic_part(problem, right)
+    weight = rtol * jnp.abs(problem_y) + _flat(atol, problem_y)
+    shift = chosen.apply(chosen.factor(matrix), matrix, residual) / weight
+    looked_at = matrix if isinstance(matrix, jax.Array) and matrix.shape[0] <= LARGE else None
+    return jax.lax.stop_gradient(StartCheck(right, residual, shift, looked_at))
+
+
+def _flat(atol: Any, like: Any) -> Any:
+    parts = [jnp.ravel(jnp.asarray(leaf, like.dtype)) for leaf in jax.tree.leaves(atol)]
+    joined = jnp.concatenate(parts)
+    return joined if joined.shape == like.shape else joined[0]
+
+
+def explain_start(check: StartCheck, names: Sequence[str]) -> str:
+    """What is wrong with a start, or nothing."""
+    right = np.asarray(check.right)
+    if not np.isfinite(right).all():
+        rows = np.flatnonzero(~np.isfinite(right))[:SHOWN]
+        return (
+            f"the equations are not finite at the start: row {', '.join(map(str, rows))} of F is {right[rows[0]]}. "
+            "Start elsewhere"
+        )
+    if check.matrix is not None:
+        found = null_names(np.asarray(check.matrix), names)
+        if found:
+            return (
+                f"the index is above 1, or the equations are singular at the start: they do not determine {found}. "
+                "Differentiate the constraints, or write the model as a Component: jaxonomy_dae.AcausalCompiler "
+                "reduces the index"
+            )
+    shift = np.abs(np.asarray(check.shift))
+    if shift.size and not shift.max(initial=0.0) <= 1:
+        residual = np.abs(np.asarray(check.residual))
+        rows = [k for k in np.argsort(-residual)[:SHOWN] if residual[k] > 0]
+        moved = [k for k in np.argsort(-np.where(np.isfinite(shift), shift, np.inf))[:SHOWN] if not shift[k] <= 1]
+        return (
+            "inconsistent start, the algebraic equations do not hold: "
+            + ", ".join(f"row {k} of F is off by {residual[k]:.3g}" for k in rows)
+            + f". To mend it {', '.join(names[k] for k in moved)} must move: "
+            "y0 = jaxonomy_dae.solvers.consistent_start(term, y0), or system.initialize() for a compiled model"
+        )
+    return ""
+
+
+def null_names(matrix: np.ndarray, names: Sequence[str]) -> str:
+    """The unknowns that a singular matrix leaves undetermined, by name; nothing if it is regular."""
+    if not np.isfinite(matrix).all():
+        return ""
+    rows = np.abs(matrix).max(axis=1)
+    columns = np.abs(matrix / np.where(rows == 0, 1, rows)[:, None]).max(axis=0)
+    scaled = matrix / np.where(rows == 0, 1, rows)[:, None] / np.where(columns == 0, 1, columns)[None, :]
+    _, s, v = np.linalg.svd(scaled)
+    if s.size and s[-1] > 1e-14 * len(s) * s[0]:
+        return ""
+    null = np.abs(v[-1])
+    return ", ".join(f"'{names[k]}'" for k in np.argsort(-null)[:SHOWN] if null[k] > 1e-3)
+
+
+def explain_failure(
+    term: Any, args: Any, t: Any, y: Any, solution: Any, names: Sequence[str], max_steps: int, rtol: Any, atol: Any
+) -> str:
+    """Why an integration stopped at the last accepted point (t, y), and the unknowns worst there."""
+    problem = FlatProblem(term, y, args)
+    flat, time = problem.flat, jnp.asarray(t)
+    many = solution.result == diffrax.RESULTS.max_steps_reached
+    reason = f"max_steps={max_steps} was reached" if many else "no step was short enough to be accepted"
+    head = f"the integration stopped at t={float(t):g}: {reason}. "
+    right = np.asarray(problem.right(time, flat))
+    if not np.isfinite(right).all():
+        return head + f"The equations are not finite there: row {np.flatnonzero(~np.isfinite(right))[0]} of F. "
+    if flat.shape[0] <= LARGE:
+        found = null_names(np.asarray(index_matrix(problem, None, time, flat)[3]), names)
+        if found:
+            return head + (
+                f"Newton's matrix is singular there: the equations do not determine {found} (a bifurcation, or an "
+                "index above 1)."
+            )
+    weight = np.asarray(rtol * jnp.abs(flat) + _flat(atol, flat))
+    slope = np.abs(np.asarray(consistent_slope(problem, None, time, flat))) / weight
+    worst = [k for k in np.argsort(-np.where(np.isfinite(slope), slope, np.inf))[:SHOWN] if not slope[k] == 0]
+    fastest = ", ".join(f"'{names[k]}' = {float(flat[k]):.6g}" for k in worst)
+    mend = (
+        "Raise max_steps, loosen the tolerances, or look for a jump or a pole: jump_ts= names times of jumps"
+        if many
+        else "Look for a pole, a jump (jump_ts= names their times) or a root or logarithm without a value just beyond"
+    )
+    return head + f"Changing fastest there: {fastest}. {mend}."

@@ -1,0 +1,240 @@
+"""`solve_dae`: a differential-algebraic equation of the user's own, solved and checked."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from ..errors import InitializationError, ModelError, SimulationError
+from .bdf import BDF
+from .dae_term import DAETerm, FlatProblem
+from .diagnosis import StartCheck, explain_failure, explain_start, start_check
+from .projected import Projected
+from .rodas5p import Rodas5P
+from .step_control import StepControl
+
+SMALL = 30  # up to this many unknowns a factorisation costs less than the steps that a multistep method saves
+
+
+def solve_dae(
+    term: Any,
+    t1: Any,
+    y0: Any,
+    *,
+    t0: Any = 0.0,
+    ts: Any = None,
+    solver: diffrax.AbstractSolver | None = None,
+    rtol: float = 1e-6,
+    atol: Any = 1e-8,
+    args: Any = None,
+    adjoint: diffrax.AbstractAdjoint | None = None,
+    stepsize_controller: diffrax.AbstractStepSizeController | None = None,
+    jump_ts: Any = None,
+    max_steps: int = 16384,
+    names: Sequence[str] | None = None,
+    throw: bool = True,
+) -> diffrax.Solution:
+    """Solves M dy/dt = F(t, y, args), or dx/dt = f, 0 = g, from a consistent start.
+
+    **Arguments:**
+
+    - `term`: a `DAETerm` (or a `diffrax.ODETerm`).
+    - `t0`, `t1`: the interval.
+    - `y0`: the start, consistent: `consistent_start` makes it so. The pair `(x, z)` for `DAETerm(f, g)`.
+    - `ts`: when to save; None saves the end alone.
+    - `solver`: default `Rodas5P` up to 30 unknowns, `BDF` beyond.
+    - `rtol`, `atol`: of the local error; `atol` may look like y.
+    - `args`: handed to the functions; gradients flow to it.
+    - `adjoint`, `stepsize_controller`, `max_steps`: of Diffrax.
+    - `jump_ts`: times at which F jumps: steps end there and the method starts anew.
+    - `names`: of the unknowns, in order, for error messages.
+    - `throw`: whether to raise if the start is inconsistent or the integration fails; otherwise see `solution.result`.
+
+    **Returns:**
+
+    A `diffrax.Solution`; `stats` counts steps, and Jacobians (each factorised once).
+
+    **Raises:**
+
+    - `ModelError` for functions and matrices of the wrong shape and tolerances out of reach;
+    - `InitializationError` for an inconsistent start, or an index above 1;
+    - `SimulationError` if the integration fails, with the time and the worst unknowns by name.
+    """
+    y0 = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.result_type(leaf, jnp.float32)), y0)
+    dtype = jnp.result_type(*jax.tree.leaves(y0))
+    check_tolerances(rtol, atol, dtype)
+    n = sum(leaf.size for leaf in jax.tree.leaves(y0))
+    if names is not None and len(names) != n:
+        raise ModelError(f"names must name every unknown: {n} of them; got {len(names)}")
+    if solver is None:
+        solver = default_solver(n)
+    if stepsize_controller is None:
+        stepsize_controller = step_control(solver, rtol, atol, jump_ts)
+    if isinstance(adjoint, diffrax.BacksolveAdjoint):
+        raise ModelError(BACKSOLVE)
+    t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
+    ts = None if ts is None else jnp.asarray(ts, dtype)
+    options = (solver, adjoint or diffrax.RecursiveCheckpointAdjoint(), stepsize_controller, max_steps)
+    arguments = (term, t0, t1, y0, ts, args, (rtol, atol), options)
+    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments))
+    check, solution, last = (_solve if traced else _compiled)(*arguments)
+    known = list(names) if names is not None else [f"y[{k}]" for k in range(n)]
+    outcome = (check, solution.result)
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(outcome)):
+        if throw:
+            ys = check.error_if(solution.ys)
+            solution = eqx.tree_at(lambda s: s.ys, solution, solution.result.error_if(ys, solution.result != OK))
+        return solution
+    if throw:
+        message = explain_start(check, known)
+        if message:
+            raise InitializationError(message)
+        if solution.result != OK:
+            raise SimulationError(explain_failure(term, args, *last, solution, known, max_steps, rtol, atol))
+    return solution
+
+
+OK = diffrax.RESULTS.successful
+BACKSOLVE = (
+    "adjoint=BacksolveAdjoint() is wrong for differential-algebraic equations: integrated backwards, the state leaves "
+    "its constraints. Use the default, or diffrax.ForwardMode() for few parameters"
+)
+
+
+def default_solver(n: int) -> diffrax.AbstractSolver:
+    """The solver for n stiff or algebraic unknowns."""
+    return Rodas5P() if n <= SMALL else BDF()
+
+
+def is_multistep(solver: Any) -> bool:
+    """Whether the solver chooses step sizes itself."""
+    return isinstance(solver.solver if isinstance(solver, Projected) else solver, BDF)
+
+
+def step_control(solver: Any, rtol: Any, atol: Any, jump_ts: Any = None) -> diffrax.AbstractStepSizeController:
+    """The step-size controller for one of our solvers."""
+    control: Any = StepControl(rtol, atol, steered=is_multistep(solver))
+    return control if jump_ts is None else diffrax.ClipStepSizeController(control, jump_ts=jnp.asarray(jump_ts))
+
+
+def check_tolerances(rtol: Any, atol: Any, dtype: Any):
+    """Refuses tolerances that are no numbers or that the precision cannot reach."""
+    for name, value in (("rtol", rtol), ("atol", atol)):
+        for leaf in jax.tree.leaves(value):
+            if isinstance(leaf, Tracer):
+                continue
+            number = np.asarray(leaf, float)
+            if not (np.isfinite(number).all() and (number >= 0).all()):
+                raise ModelError(f"{name} must be a number ≥ 0; got {value}")
+    if isinstance(rtol, Tracer):
+        return
+    eps = float(jnp.finfo(dtype).eps)
+    if float(rtol) < 10 * eps:
+        switch = (
+            ' Switch to double precision with jax.config.update("jax_enable_x64", True) before the model is '
+            "compiled, or"
+            if dtype == jnp.float32
+            else ""
+        )
+        raise ModelError(
+            f"rtol={float(rtol):g} cannot be reached in {dtype} (eps {eps:.1e}).{switch} use rtol ≥ {10 * eps:.0e}."
+        )
+
+
+def _solve(term, t0, t1, y0, ts, args, tolerances, options):
+    solver, adjoint, controller, max_steps = options
+    check: StartCheck = start_check(FlatProblem(term, y0, args), t0, *tolerances)
+    subs = {
+        "out": diffrax.SubSaveAt(t1=True) if ts is None else diffrax.SubSaveAt(ts=ts),
+        "last": diffrax.SubSaveAt(t1=True),
+    }
+    counted = isinstance(solver, BDF)
+    solution = diffrax.diffeqsolve(
+        term,
+        solver,
+        t0,
+        t1,
+        None,
+        y0,
+        args,
+        saveat=diffrax.SaveAt(subs=subs, solver_state=counted),
+        stepsize_controller=controller,
+        adjoint=adjoint,
+        max_steps=max_steps,
+        throw=False,
+    )
+    stats = dict(solution.stats)
+    if counted:
+        jacobians, iterations = jax.lax.stop_gradient(solution.solver_state.counts)  # pyright: ignore
+        stats |= {"num_jacobians": jacobians, "num_newton_iterations": iterations}
+    elif isinstance(solver, Rodas5P):
+        stats |= {"num_jacobians": stats["num_steps"]}
+    times: Any = solution.ts
+    values: Any = solution.ys
+    last = (times["last"][0], jax.tree.map(lambda v: v[0], values["last"]))
+    out = eqx.tree_at(
+        lambda s: (s.ts, s.ys, s.stats, s.solver_state),
+        solution,
+        (times["out"], values["out"], stats, None),
+        is_leaf=lambda v: v is None,
+    )
+    return check, out, last
+
+
+_compiled = eqx.filter_jit(_solve)
+
+
+def consistent_start(
+    term: DAETerm, y0: Any, *, t0: Any = 0.0, args: Any = None, max_steps: int = 50, names: Sequence[str] | None = None
+) -> Any:
+    """A consistent start near y0: what occurs differentiated stays (M y does), the algebraic unknowns are solved for.
+
+    **Raises:**
+
+    - `InitializationError` if Newton's method does not converge, with the unknowns that still move.
+
+    Differentiable with respect to `args` and y0.
+    """
+    y0 = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.result_type(leaf, jnp.float32)), y0)
+    from .index_one import consistent_shift
+
+    problem = FlatProblem(term, y0, args)
+    t = jnp.asarray(t0, problem.flat.dtype)
+    eps = float(jnp.finfo(problem.flat.dtype).eps)
+    frozen = jax.lax.stop_gradient
+    still = FlatProblem(*jax.tree.map(lambda v: frozen(v) if eqx.is_array(v) else v, (term, y0, args)))
+
+    def shift(y):
+        return consistent_shift(still, None, frozen(t), y)
+
+    def going(carry):
+        _, size, count = carry
+        return (size > 10 * eps) & (count < max_steps)
+
+    def body(carry):
+        y, _, count = carry
+        d = shift(y)
+        return y + d, jnp.max(jnp.abs(d) / (1 + jnp.abs(y)), initial=0.0), count + 1
+
+    start = (still.flat, jnp.asarray(jnp.inf, problem.flat.dtype), 0)
+    y, size, _ = jax.lax.while_loop(going, body, start)
+    y = problem.flat + frozen(y - still.flat)
+    y = y + consistent_shift(problem, None, t, y)  # one exact step carries the derivative
+    failed = ~(size <= math.sqrt(eps))
+    if isinstance(failed, Tracer):
+        y = eqx.error_if(y, failed, "no consistent start: Newton's method did not converge")
+    elif bool(failed):
+        moving = np.abs(np.asarray(shift(y)))
+        known = list(names) if names is not None else [f"y[{k}]" for k in range(moving.shape[0])]
+        worst = [known[k] for k in np.argsort(-np.where(np.isfinite(moving), moving, np.inf))[:4]]
+        raise InitializationError(
+            f"no consistent start was found near y0; still moving: {', '.join(worst)}. Give a better y0, and check "
+            "that the algebraic equations determine the algebraic unknowns (index 1)"
+        )
+    return problem.unravel(y)
