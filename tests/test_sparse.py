@@ -1,0 +1,189 @@
+"""Sparse solves and Jacobians against dense ones.
+
+The solves are backward stable, so errors are about 1e-16 times the condition number, which is below 1e3 here: 1e-11 is
+far from noise, and from any mistake.
+"""
+
+import importlib.util
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+from problems import run
+
+from jaxonomy_dae.solvers import sparse
+from jaxonomy_dae.solvers.sparse import MissingSparseSolver, SparsePattern, solve_sparse, sparse_jacobian
+
+installed = pytest.mark.skipif(importlib.util.find_spec("klujax") is None, reason='needs the extra "sparse"')
+TIGHT = dict(rtol=1e-11, atol=1e-11)
+
+
+def random_matrix(n: int = 40, seed: int = 0):
+    """A diagonally dominant matrix with random places, some of which occur twice, its values, and a right side."""
+    rng = np.random.default_rng(seed)
+    rows = np.concatenate([np.arange(n), rng.integers(0, n, 2 * n), [0]])
+    cols = np.concatenate([np.arange(n), rng.integers(0, n, 2 * n), [0]])
+    values = np.concatenate([rng.uniform(8, 10, n), rng.uniform(-1, 1, 2 * n), [0.5]])
+    return SparsePattern(rows, cols, n), jnp.asarray(values), jnp.asarray(rng.normal(size=n))
+
+
+# --- patterns ----------------------------------------------------------------------------------------------------
+
+
+def test_patterns_are_compared_by_content():
+    pattern, values, _ = random_matrix()
+    same, other = random_matrix()[0], random_matrix(seed=1)[0]
+    assert pattern == same and hash(pattern) == hash(same) and pattern != other
+    single, inverse = pattern.coalesced
+    assert single.coalesced is None and len(single) < len(pattern)
+    summed = jnp.zeros(len(single)).at[inverse].add(values)
+    np.testing.assert_allclose(single.dense(summed), pattern.dense(values))
+    for rows, cols, message in (([0, 3], [0, 0], "rows must lie"), ([0], [-1], "cols must lie"), ([0], [0, 1], "one")):
+        with pytest.raises(ValueError, match=message):
+            SparsePattern(np.array(rows), np.array(cols), 3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_columns_of_one_color_share_no_row(seed):
+    pattern = random_matrix(60, seed)[0]
+    filled = np.asarray(pattern.dense(jnp.ones(len(pattern)))) != 0
+    for color in range(pattern.n_colors):
+        assert filled[:, pattern.colors == color].sum(axis=1).max() <= 1
+
+
+def test_banded_patterns_take_as_many_colors_as_the_band_is_wide():
+    n = 20_000
+    k = np.arange(n)
+    pattern = SparsePattern(np.concatenate([k, k[1:], k[:-1]]), np.concatenate([k, k[:-1], k[1:]]), n)
+    assert pattern.n_colors == 3
+
+
+# --- Jacobians ---------------------------------------------------------------------------------------------------
+
+
+def test_jacobian_is_the_dense_one():
+    pattern, values, b = random_matrix()
+
+    def fun(y):
+        return jnp.sin(pattern.multiply(values, y)) + y**3
+
+    found = sparse_jacobian(fun, pattern.coalesced[0])
+    assert pattern.n_colors < 20  # of 40 columns
+    dense = pattern.coalesced[0].dense
+    np.testing.assert_allclose(dense(found(b)), jax.jacfwd(fun)(b), rtol=1e-14, atol=1e-14)
+    # Its derivative, too: the second derivatives along a direction.
+    second = jax.jvp(lambda y: dense(found(y)), (b,), (b,))[1]
+    np.testing.assert_allclose(second, jax.jvp(jax.jacfwd(fun), (b,), (b,))[1], rtol=1e-13, atol=1e-13)
+
+
+def test_jacobian_of_a_dense_pattern():
+    rows, cols = np.indices((7, 5)).reshape(2, -1)
+    pattern = SparsePattern(rows, cols, 5, 7)
+    matrix = jnp.asarray(np.random.default_rng(0).normal(size=(7, 5)))
+    found = sparse_jacobian(lambda y: matrix @ y, pattern)(jnp.ones(5))
+    np.testing.assert_allclose(pattern.dense(found), matrix, rtol=1e-15)
+
+
+# --- solves ------------------------------------------------------------------------------------------------------
+
+
+@installed
+@pytest.mark.parametrize("transpose", [False, True])
+def test_solution_is_the_dense_one(transpose):
+    pattern, values, b = random_matrix()
+
+    def dense(values, b):
+        matrix = pattern.dense(values)
+        return jnp.linalg.solve(matrix.T if transpose else matrix, b)
+
+    def found(values, b):
+        return solve_sparse(pattern, jnp.asarray(values), jnp.asarray(b), transpose)
+
+    for transform in (lambda f: f, jax.jit):
+        np.testing.assert_allclose(transform(found)(values, b), dense(values, b), **TIGHT)
+    batch = jnp.stack([values, 1.3 * values, values + 0.1]), jnp.stack([b, -b, b**2])
+    for axes in ((0, 0), (0, None), (None, 0)):
+        arguments = [array if axis == 0 else array[0] for array, axis in zip(batch, axes, strict=True)]
+        compare = [jax.vmap(f, axes)(*arguments) for f in (found, dense)]
+        np.testing.assert_allclose(*compare, **TIGHT)
+    check_grads(found, (values, b), order=2, modes=["fwd", "rev"])
+    jacobians = [jax.jit(jax.jacrev(f, argnums=(0, 1)))(values, b) for f in (found, dense)]
+    for one, other in zip(*jacobians, strict=True):
+        np.testing.assert_allclose(one, other, **TIGHT)
+    batched = [jax.vmap(jax.grad(lambda v, r, f=f: jnp.sum(f(v, r) ** 2)))(*batch) for f in (found, dense)]
+    np.testing.assert_allclose(*batched, **TIGHT)
+
+
+@installed
+def test_solve_within_a_loop():
+    pattern, values, b = random_matrix()
+    matrix = pattern.dense(values)
+
+    @jax.jit
+    def iterated(values, b):
+        return jax.lax.fori_loop(0, 3, lambda k, x: solve_sparse(pattern, values, x), b)
+
+    expected = jnp.linalg.solve(matrix @ matrix @ matrix, b)
+    np.testing.assert_allclose(iterated(values, b), expected, **TIGHT)
+    slope = jax.grad(lambda v: jnp.sum(iterated(v, b)))(values)
+    reference = jax.grad(lambda v: jnp.sum(jnp.linalg.solve(jnp.linalg.matrix_power(pattern.dense(v), 3), b)))(values)
+    np.testing.assert_allclose(slope, reference, **TIGHT)
+
+
+@installed
+def test_not_a_number_passes_through():
+    pattern, values, b = random_matrix()
+    assert jnp.isnan(solve_sparse(pattern, values.at[0].set(jnp.nan), b)).any()
+
+
+def test_host_solve():
+    """What accelerators use: SciPy from a callback."""
+    pattern, values, b = random_matrix()
+    single, inverse = pattern.coalesced
+    values = jnp.zeros(len(single)).at[inverse].add(values)
+    solve = jax.jit(lambda v, b: sparse._on_host(single.rows, single.cols, v, b))
+    np.testing.assert_allclose(solve(values, b), jnp.linalg.solve(single.dense(values), b), **TIGHT)
+    many = jax.vmap(solve, (None, 0))(values, jnp.stack([b, 2 * b]))
+    np.testing.assert_allclose(many[1], 2 * many[0], **TIGHT)
+    assert jnp.isnan(solve(jnp.zeros_like(values), b)).all()
+
+
+# --- the package behind it ---------------------------------------------------------------------------------------
+
+
+def test_missing_package_names_the_extra(monkeypatch):
+    def missing(name):
+        raise ImportError(name)
+
+    monkeypatch.setattr(sparse.importlib, "import_module", missing)
+    sparse.klu.cache_clear()
+    pattern, values, b = random_matrix()
+    with pytest.raises(MissingSparseSolver, match=r'pip install "jaxonomy_dae\[sparse\]"'):
+        solve_sparse(pattern, values, b)
+    sparse.klu.cache_clear()
+
+
+@installed
+def test_settings_are_left_alone():
+    printed = run(
+        "import jax\n"
+        "import sys\n"
+        "from jaxonomy_dae.solvers import sparse\n"
+        "assert 'klujax' not in sys.modules\n"
+        "before = jax.config.values\n"
+        "sparse.klu()\n"
+        "assert 'klujax' in sys.modules and jax.config.values == before\n"
+        "try:\n"
+        "    sparse.solve_sparse(sparse.SparsePattern([0], [0], 1), jax.numpy.ones(1), jax.numpy.ones(1))\n"
+        "except ValueError as error:\n"
+        "    print(error)\n"
+    )
+    assert "jax_enable_x64" in printed
+
+
+def test_square_matrices_only(monkeypatch):
+    monkeypatch.setattr(sparse, "klu", lambda: None)
+    with pytest.raises(ValueError, match="2 × 1"):
+        solve_sparse(SparsePattern(np.array([1]), np.array([0]), 1, 2), jnp.ones(1), jnp.ones(2))
