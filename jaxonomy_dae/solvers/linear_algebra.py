@@ -5,6 +5,7 @@ A step factorises W = a·M − ∂F/∂y once and solves with it often. `factor`
 factorisation.
 """
 
+import functools
 from typing import Any
 
 import equinox as eqx
@@ -12,8 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..errors import ModelError
 from .dae_term import Mass
 from .small_linear import solve as solve_unrolled
+from .sparse import SparsePattern, compressed, solve_sparse
 
 UNROLLED_INVERSE = 4  # up to this many unknowns the inverse is written out
 EXPLICIT_INVERSE = 32  # up to this many it is kept: a solve is one small product, a tenth of LAPACK's calls
@@ -91,9 +94,68 @@ def _substitute(lu: Any, b: Any) -> Any:
     return jax.lax.linalg.triangular_solve(lu, y, left_side=True, lower=False)
 
 
-LinearAlgebra = Dense
+class Sparse(eqx.Module):
+    """Sparse matrices of one pattern, as values in the order of the pattern: needs the extra `sparse`.
+
+    Only values are kept between steps: KLU factorises anew at each solve, which costs about as much as reading a stored
+    factorisation would.
+    """
+
+    pattern: SparsePattern = eqx.field(static=True)
+
+    def jacobian(self, function: Any, y: Any) -> tuple[Any, Any]:
+        """(F(y), the values of ∂F/∂y, from one derivative for each colour of its columns)."""
+        value, push = jax.linearize(function, y)
+        return value, compressed(push, self.pattern, y.dtype)
+
+    def combine(self, mass: Mass, a: Any, jacobian: Any) -> Any:
+        """a·M − ∂F/∂y."""
+        m = jnp.asarray(_diagonal(mass), jacobian.dtype)
+        return jnp.concatenate([-jacobian, a * m])
+
+    def index_matrix(self, mass: Mass, jacobian: Any) -> Any:
+        """M − P·∂F/∂y with P the projector onto the algebraic equations: regular if and only if the index is 1."""
+        p = jnp.asarray(mass.algebraic, jacobian.dtype)
+        return jnp.concatenate([-p[self.pattern.rows] * jacobian, jnp.asarray(_diagonal(mass), jacobian.dtype)])
+
+    def factor(self, matrix: Any) -> Any:
+        """The values themselves."""
+        return matrix
+
+    def empty(self, n: int, dtype: Any) -> Any:
+        """Something that looks like what `factor` returns."""
+        return jnp.zeros((len(self.pattern) + n,), dtype)
+
+    def apply(self, factor: Any, matrix: Any, b: Any) -> Any:
+        """W⁻¹ b, without derivatives."""
+        return self.solve(jax.lax.stop_gradient(factor), None, b) if matrix is None else self.solve(factor, matrix, b)
+
+    def solve(self, factor: Any, matrix: Any, b: Any) -> Any:
+        """W⁻¹ b, differentiable."""
+        return solve_sparse(_with_diagonal(self.pattern), factor if matrix is None else matrix, b)
+
+
+@functools.lru_cache(maxsize=64)
+def _with_diagonal(pattern: SparsePattern) -> SparsePattern:
+    place = np.arange(pattern.n)
+    return SparsePattern(np.concatenate([pattern.rows, place]), np.concatenate([pattern.cols, place]), pattern.n)
+
+
+def _diagonal(mass: Mass) -> np.ndarray:
+    if not mass.is_diagonal:
+        raise ModelError("sparse steps need a diagonal mass matrix: give its diagonal, shape (n,)")
+    return mass.array
+
+
+LinearAlgebra = Dense | Sparse
+SPARSE_FROM = 128  # unknowns from which a sparse factorisation is taken, where the pattern is sparse enough
+SPARSE_DENSITY = 0.15
 
 
 def choose(given: LinearAlgebra | None, n: int, pattern: Any) -> LinearAlgebra:
-    """The linear algebra for n unknowns."""
-    return given if given is not None else Dense()
+    """The linear algebra for n unknowns: dense for few, and where no pattern is known or it is nearly full."""
+    if given is not None:
+        return given
+    if pattern is None or n < SPARSE_FROM or pattern.density > SPARSE_DENSITY:
+        return Dense()
+    return Sparse(pattern)
