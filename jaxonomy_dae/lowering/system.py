@@ -175,5 +175,4 @@ class AcausalSystem(eqx.Module):
         """
         from .initialize import check, initialize
 
-        x, residual = initialize(self, t0, inputs, initial)
-        return check(self, x, residual, initial)
+        return check(self, initialize(self, t0, inputs, initial), t0, inputs, initial)
