@@ -97,8 +97,8 @@ def simulate(
     # An input's function may close over a traced value, which shows in the outcome only.
     if outcome is None or _is_traced(outcome):
         found = initialize(system, t0, inputs, initial)
-        x0 = check(system, found, t0, inputs, initial) if throw else found.x
-        saved, x, stats, result = _integrate(x0, *arguments)
+        found = check(system, found, t0, inputs, initial) if throw else found
+        saved, x, stats, result = _integrate(found.x, *arguments)
         result = _with_start(found, result)
         if throw:
             x = result.error_if(x, ~diffrax.is_okay(result))

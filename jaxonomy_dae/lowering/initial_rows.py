@@ -84,7 +84,8 @@ def initial_rows(plan: SystemPlan, names: tuple[str, ...], solve_for: tuple[int,
 
     - `InitializationError` if parameters are solved for and the values given do not determine them, or do so twice.
     """
-    overrides, fixed, started = _declared(plan, names)
+    overrides, fixed, declared = _declared(plan, names)
+    started = declared | {r.quantity: r for r in overrides}
     entries = [int(q) for q in (*plan.states, *plan.carried)]
     guess = tuple(started.get(q) for q in entries)
     inside = set(plan.states.tolist())
@@ -100,7 +101,7 @@ def initial_rows(plan: SystemPlan, names: tuple[str, ...], solve_for: tuple[int,
         promoted = tuple(plan.quantity_name[q] for q in entries if q not in held)
         independent = tuple(k not in again for k in range(len(rows)))
         return InitialRows(guess, tuple(rows), independent, True, tuple(again), promoted, ())
-    opened = _opened(plan, overrides, fixed, started, solve_for)
+    opened = _opened(plan, fixed, declared, solve_for)
     if opened is None:
         if solve_for:
             raise InitializationError(
@@ -135,11 +136,10 @@ def _declared(plan: SystemPlan, names: tuple[str, ...]) -> tuple[list[Row], list
             fixed.append(row)
         started.setdefault(quantity, row)
     started |= {r.quantity: r for r in reversed(fixed)}
-    started |= {r.quantity: r for r in overrides}
     return overrides, fixed, started
 
 
-def _opened(plan: SystemPlan, overrides, fixed, started, solve_for) -> _Open | None:
+def _opened(plan: SystemPlan, fixed, started, solve_for) -> _Open | None:
     """The equations' Jacobian, rows scaled, at a point near the initial one; None if it is too large, or not finite."""
     extended = plan.extended
     n = extended.quantities.n_unknown
@@ -247,8 +247,8 @@ def supports(plan: SystemPlan, names: tuple[str, ...], solve_for: tuple[int, ...
     rows = initial_rows(plan, names, solve_for)
     if rows.direct:
         return {k: (next(r for r in rows.kept if r.quantity == rows.kept[k].quantity),) for k in rows.redundant}
-    overrides, fixed, started = _declared(plan, names)
-    opened = _opened(plan, overrides, fixed, started, solve_for) if rows.redundant else None
+    _, fixed, declared = _declared(plan, names)
+    opened = _opened(plan, fixed, declared, solve_for) if rows.redundant else None
     if opened is None or opened.n > NUMERIC_LIMIT // 3:
         return {k: () for k in rows.redundant}
     base = [r for r, alone in zip(rows.kept, rows.independent or (), strict=True) if alone]

@@ -2,7 +2,8 @@
 
 Each rung starts at the given point, and only if the one before failed:
 
-1. Newton's method with a line search (Gauss–Newton where there are more equations than unknowns; Deuflhard 2004, ch. 3);
+1. Newton's method with a line search (Gauss–Newton where there are more equations than unknowns;
+   Deuflhard 2004, ch. 3);
 2. Levenberg–Marquardt, the damping changed as by Nielsen (1999): starts where the Jacobian is singular;
 3. Newton homotopy, F(x) = (1 − s)·F(x0) followed from s = 0 to 1 in arc length (Keller 1977; Allgower & Georg 1990),
    to the one side and then to the other: past the local minima of |F|, where descent methods stop.
@@ -188,7 +189,8 @@ def find_root(
         follow = where(landed, _POLISH, where(lands | (correcting & landing), _LAND, _TRACK))
 
         # What comes next
-        failed = ~stop & (where(descending, newton_fails, where(marquardt, marquardt_fails, homotopy_fails)) | (fresh & ~finite))
+        fails = where(descending, newton_fails, where(marquardt, marquardt_fails, homotopy_fails))
+        failed = ~stop & (fails | (fresh & ~finite))
         rounded = failed & holds & ~tracking & ~fresh
         by = where(phase == _POLISH, 3, 1 + phase)
         above = where(phase == _NEWTON, _MARQUARDT, _FAILED)

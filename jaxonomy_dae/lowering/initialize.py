@@ -177,9 +177,10 @@ def _values(rows: tuple[Row | None, ...], given: list, parameters: Any) -> Any:
     return take(jnp.concatenate(parts), back)
 
 
-def tolerance(dtype, x: Any) -> Any:
+def tolerance(dtype: Any, x: Any) -> Any:
     """The largest residual of an initial point that counts as rounding."""
-    return float(jnp.finfo(dtype).eps) ** 0.6 * (1.0 + jnp.max(jnp.abs(x), initial=0.0))
+    largest = np.max(np.abs(x), initial=0.0) if isinstance(x, np.ndarray) else jnp.max(jnp.abs(x), initial=0.0)
+    return float(jnp.finfo(dtype).eps) ** 0.6 * (1.0 + largest)
 
 
 def is_consistent(found: InitialPoint) -> Any:
@@ -189,21 +190,56 @@ def is_consistent(found: InitialPoint) -> Any:
     return holds & jnp.all(jnp.isfinite(unknown))
 
 
-def check(system, found: InitialPoint, t0: Any, inputs: Any, initial: Any, solve_for: tuple[str, ...] = ()) -> Any:
-    """The state; raises an `InitializationError` that says what does not hold if the point is not consistent, or is
-    one at which a block of equations is singular."""
-    good = is_consistent(found)
-    if isinstance(good, Tracer):
-        return eqx.error_if(
+def find_initial(
+    system: Any,
+    t0: Any,
+    inputs: Mapping[str, Any] | None,
+    initial: Mapping[str, Any] | None,
+    solve_for: tuple[str, ...] = (),
+) -> InitialPoint:
+    """`initialize`, compiled once for each structure where nothing is traced."""
+    dtype = system.parameters.values.dtype
+    inputs = {name: v if callable(v) else jnp.asarray(v, dtype) for name, v in (inputs or {}).items()}
+    initial = {name: jnp.asarray(v, dtype) for name, v in sorted((initial or {}).items())}
+    arguments = (system, jnp.asarray(t0, dtype), inputs, initial, solve_for)
+    if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments)):
+        found = _compiled(*arguments)
+        # An input's function may close over a traced value, which shows in the outcome only.
+        if not isinstance(found.x, Tracer):
+            return found
+    return initialize(*arguments)
+
+
+_compiled = eqx.filter_jit(initialize)
+
+
+def check(
+    system: Any, found: InitialPoint, t0: Any, inputs: Any, initial: Any, solve_for: tuple[str, ...] = ()
+) -> InitialPoint:
+    """The same point; raises an `InitializationError` if it is not consistent, if a block of equations is singular
+    there, or if a parameter solved for is out of its bounds."""
+    from .initialization_report import InitializationReport  # which reads what is defined here
+
+    low, high = system.parameters.table.bounds[[system.parameters.table.index(n) for n in solve_for]].reshape(-1, 2).T
+    slack = tolerance(found.x.dtype, found.solved)
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((found, system, t0))):
+        x = eqx.error_if(
             found.x,
-            ~good,
+            ~is_consistent(found),
             "no consistent initial point: fixed starts contradict the equations, or the search failed. "
             "system.initialization_report() outside jit gives the names",
         )
-    from .initialization_report import InitializationReport
-
-    report = InitializationReport(system, found, t0, inputs, initial, solve_for)
-    problem = report.problem
+        outside = ~((found.solved >= low - slack) & (found.solved <= high + slack))
+        solved = eqx.error_if(found.solved, outside, f"a parameter of {list(solve_for)} is out of its bounds")
+        return found._replace(x=x, solved=solved if solve_for else found.solved)
+    problem = InitializationReport(system, found, t0, inputs, initial, solve_for).problem
     if problem is not None:
         raise InitializationError(problem)
-    return found.x
+    for name, value, a, b in zip(solve_for, np.asarray(found.solved), low, high, strict=True):
+        if not a - float(slack) <= value <= b + float(slack):
+            raise InitializationError(
+                f"solve_for: the values given need {name} = {value:.6g}, which is out of its bounds [{a:g}, {b:g}]. "
+                "Give other values in initial={...}, or start the search elsewhere with "
+                f"system.with_parameters({{'{name}': guess}})"
+            )
+    return found
