@@ -12,7 +12,7 @@ import numpy as np
 from jax.core import Tracer
 
 from .errors import ModelError, SimulationError, nearest
-from .lowering.initialize import check, initialize
+from .lowering.initialize import check, initialize, is_consistent
 from .lowering.system import AcausalSystem
 from .solution import Solution
 from .solvers.projected import with_projection
@@ -96,23 +96,24 @@ def simulate(
     outcome = None if _is_traced(arguments) else _compiled(arguments)
     # An input's function may close over a traced value, which shows in the outcome only.
     if outcome is None or _is_traced(outcome):
-        x0, residual = initialize(system, t0, inputs, initial)
-        x0 = check(system, x0, residual, initial) if throw else x0
-        saved, x, stats, result = _integrate(x0, *arguments)
+        found = initialize(system, t0, inputs, initial)
+        found = check(system, found, t0, inputs, initial) if throw else found
+        saved, x, stats, result = _integrate(found.x, *arguments)
+        result = _with_start(found, result)
         if throw:
             x = result.error_if(x, ~diffrax.is_okay(result))
         return Solution(saved, x, system, inputs, stats, result)
-    (x0, residual), (saved, x, stats, result) = outcome
+    found, (saved, x, stats, result) = outcome
     if throw:
         _check_parameters(system)
-        check(system, x0, residual, initial)
+        check(system, found, t0, inputs, initial)
     stats = {name: int(value) for name, value in stats.items() if jnp.ndim(value) == 0}
     if ts is None:
         taken = int(np.isfinite(np.asarray(saved)).sum())
         saved, x = saved[:taken], x[:taken]
     solution = Solution(saved, x, system, inputs, stats, result)
     if throw and not bool(diffrax.is_okay(result)):
-        raise SimulationError(_explain(solution, x0, float(t0), float(t1), max_steps, rtol, atol))
+        raise SimulationError(_explain(solution, found.x, float(t0), float(t1), max_steps, rtol, atol))
     return solution
 
 
@@ -129,8 +130,15 @@ def default_adjoint(n_state: int) -> diffrax.RecursiveCheckpointAdjoint:
 @eqx.filter_jit
 def _compiled(arguments):
     system, t0, _, _, inputs, initial, _ = arguments
-    x0, residual = initialize(system, t0, inputs, initial)
-    return (x0, residual), _integrate(x0, *arguments)
+    found = initialize(system, t0, inputs, initial)._replace(jacobian=None)
+    saved, x, stats, result = _integrate(found.x, *arguments)
+    return found, (saved, x, stats, _with_start(found, result))
+
+
+def _with_start(found, result):
+    """The result of an integration, a failure if it began at an inconsistent point."""
+    failure = diffrax.RESULTS.nonlinear_divergence
+    return diffrax.RESULTS.where(is_consistent(found), result, failure)
 
 
 def _integrate(x0, system: AcausalSystem, t0, t1, ts, inputs, initial, options):

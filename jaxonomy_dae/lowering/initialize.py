@@ -1,229 +1,142 @@
 """Consistent initialization.
 
-The unknowns are the state array's entries. The rows are: hidden constraints, residuals of nonlinear blocks, values
-given by the caller, fixed starts, and as many guesses as it takes to determine the rest; which guesses are kept is
-decided once, numerically, when the rows are chosen. The rows may be redundant, as long as they agree: they are solved
-in the least-squares sense (Levenberg–Marquardt), and the last Gauss–Newton step carries the derivative, which by the
-implicit function theorem is exact where the rows hold.
+The unknowns are the state array's entries, and parameters that are solved for. The rows are: hidden constraints,
+residuals of nonlinear blocks, values given by the caller, fixed starts, and the guesses that `initial_rows` keeps. The
+rows may be redundant, as long as they agree. A ladder of methods finds the point, kept out of differentiation; one last
+Gauss–Newton step carries the derivative, which by the implicit function theorem is exact where the rows hold.
 """
 
-import dataclasses
-import functools
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jax.core import Tracer
 
-from ..compiler.numeric import Networks, consistent_point, residual_and_jacobian, start_values
-from ..compiler.tables import ZERO, Start, describe_equation
 from ..errors import InitializationError
 from .dynamics import Point
 from .gather import Gather, take
+from .initial_rows import InitialRows, Row, initial_rows
+from .initialization_methods import FAILED, find_root
 from .lower import SystemPlan
 
-NUMERIC_LIMIT = 3000  # quantities up to which guesses are chosen by rank
-MAX_STEPS = 256
+
+class InitialPoint(NamedTuple):
+    """What the search found: `x` of shape (n_state,), `solved` the parameters solved for, the residual of every row
+    and the value it should have had (zero for equations), an index into `METHODS`, the number of evaluations, and the
+    Jacobian of the rows with respect to (x, solved)."""
+
+    x: Any
+    solved: Any
+    residual: Any
+    target: Any
+    method: Any
+    evaluations: Any
+    jacobian: Any
 
 
-@dataclasses.dataclass(frozen=True)
-class Row:
-    """One start that must hold: sign·quantity equals a start expression or the caller's value `given`."""
-
-    name: str
-    quantity: int
-    sign: int
-    start: Start | None
-    given: int = -1
-
-
-@dataclasses.dataclass(frozen=True)
-class InitialRows:
-    """What determines the initial point."""
-
-    guess: tuple[Row | None, ...]  # for each entry of the state array, where its first value comes from
-    kept: tuple[Row, ...]
-    direct: bool  # every kept row is a state and nothing else constrains the states
-    redundant: tuple[str, ...]
-    promoted: tuple[str, ...]
-    dropped: tuple[str, ...]
-
-
-def choose_rows(plan: SystemPlan, values: np.ndarray, networks: tuple, names: tuple[str, ...], resolved) -> InitialRows:
-    """Chooses the rows for the overrides `names` (with their quantities and signs)."""
-    variables = plan.flat.variables
-    overrides = [
-        Row(name, int(q), int(s), None, k)
-        for k, (name, q, s) in enumerate(zip(names, *resolved, strict=True))
-        if q != ZERO
-    ]
-    overridden = {r.quantity for r in overrides}
-    value_of = start_values(variables.start, values)
-    started: dict[int, Row] = {}
-    fixed: list[Row] = []
-    for v, start in enumerate(variables.start):
-        if start is None:
-            continue
-        quantity, sign = plan.quantity_of(v)
-        if quantity == ZERO and not (variables.fixed[v] and value_of(v) != 0.0):
-            continue  # zero as it should be; any other fixed start contradicts the equations, and is kept to say so
-        row = Row(variables.names[v], quantity, sign, start)
-        if variables.fixed[v] and quantity not in overridden:
-            fixed.append(row)
-        started.setdefault(quantity, row)
-    started |= {r.quantity: r for r in fixed}
-    started |= {r.quantity: r for r in overrides}
-    entries = [int(q) for q in (*plan.states, *plan.carried)]
-    guess = tuple(started.get(q) for q in entries)
-    inside = set(plan.states.tolist())
-    rows = [*overrides, *fixed]
-    if not plan.n_constraints and not len(plan.carried) and all(r.quantity in inside for r in rows):
-        held: set[int] = set()
-        again = []  # starts of variables that equal one with a start of its own
-        for r in rows:
-            if r.quantity in held:
-                again.append(r.name)
-            held.add(r.quantity)
-        promoted = tuple(plan.quantity_name[q] for q in entries if q not in held)
-        return InitialRows(guess, tuple(rows), True, tuple(again), promoted, ())
-    return _by_rank(plan, values, networks, overrides, fixed, started, guess)
-
-
-def _by_rank(plan: SystemPlan, values, networks, overrides, fixed, started, guess) -> InitialRows:
-    extended = plan.extended
-    n = extended.quantities.n_unknown
-    if n > NUMERIC_LIMIT:
-        return InitialRows(guess, (*overrides, *fixed), False, (), (), ())
-    value_of = start_values([r.start for r in started.values()], values)
-    point = np.zeros(extended.quantities.n)
-    for k, (q, row) in enumerate(started.items()):
-        if row.start is not None and q != ZERO:
-            point[q] = row.sign * value_of(k)
-    pins = [(r.quantity, r.sign * _number(r, values)) for r in fixed if r.quantity != ZERO]
-    weights = Networks(networks)
-    point, _ = consistent_point(extended, point, pins, values, 0.0, weights)
-    _, jacobian = residual_and_jacobian(extended, point, values, 0.0, weights)
-    dense = jacobian.toarray()[:, :n]
-    if not np.isfinite(dense).all():
-        return InitialRows(guess, (*overrides, *fixed), False, (), (), ())
-    dense = dense / np.maximum(np.abs(dense).max(axis=1, keepdims=True), 1e-300)
-    _, singular, vt = np.linalg.svd(dense, full_matrices=True)
-    rank = int((singular > 1e-10 * max(singular.max(initial=0.0), 1.0)).sum())
-    free = vt[rank:].T  # directions the equations leave open, (n, freedom)
-
-    def pin(q: int) -> bool:
-        """Whether fixing q closes a direction; closes it."""
-        nonlocal free
-        row = free[q]
-        size = np.linalg.norm(row)
-        if free.shape[1] == 0 or size < 1e-7:
-            return False
-        rest = np.linalg.svd(row[None, :] / size, full_matrices=True)[2][1:]
-        free = free @ rest.T
-        return True
-
-    kept, redundant, dropped = [], [], []
-    for row in overrides:
-        kept.append(row)
-        if not (row.quantity != ZERO and pin(row.quantity)):
-            redundant.append(row.name)
-    for row in fixed:
-        if row.quantity != ZERO and pin(row.quantity):
-            kept.append(row)
-        elif overrides:
-            dropped.append(row.name)  # what the caller gave outranks it
-        else:
-            kept.append(row)
-            redundant.append(row.name)
-    promoted = []
-    entries = [int(q) for q in (*plan.states, *plan.carried)]
-    while free.shape[1]:
-        sizes = np.linalg.norm(free[entries], axis=1)
-        best = sizes.max(initial=0.0)
-        if best < 1e-7:
-            break
-        declared = [k for k in range(len(entries)) if sizes[k] >= 0.1 * best and guess[k] is not None]
-        k = declared[0] if declared else int(np.argmax(sizes))
-        q = entries[k]
-        pin(q)
-        kept.append(guess[k] or Row(plan.quantity_name[q], q, 1, None))
-        promoted.append(plan.quantity_name[q])
-    return InitialRows(guess, tuple(kept), False, tuple(redundant), tuple(promoted), tuple(dropped))
-
-
-def _number(row: Row, values: np.ndarray) -> float:
-    return start_values([row.start], values)(0)
-
-
-@functools.lru_cache(maxsize=256)
-def _rows(plan: SystemPlan, names: tuple[str, ...]) -> InitialRows:
-    networks = tuple(plan.flat.networks.values())
-    return choose_rows(plan, plan.flat.parameters.values, networks, names, plan.resolve(names))
-
-
-def initialize(system, t0: Any, inputs: Mapping[str, Any] | None, initial: Mapping[str, Any] | None):
-    """(state, residuals of all rows): a pure function, to be used inside jit."""
+def initialize(
+    system,
+    t0: Any,
+    inputs: Mapping[str, Any] | None,
+    initial: Mapping[str, Any] | None,
+    solve_for: tuple[str, ...] = (),
+) -> InitialPoint:
+    """A pure function, to be used inside jit. Nothing is raised but for wrong names or counts: see `check`."""
     plan: SystemPlan = system.plan
     names = tuple(initial or ())
-    rows = _rows(plan, names)
+    unknown = np.array([system.parameters.table.index(n) for n in solve_for], np.int64)
+    rows = initial_rows(plan, names, tuple(unknown.tolist()))
     given = [initial[n] for n in names] if initial else []
     point: Point = system._point(t0, inputs)
     parameters = point.parameters
+    n = plan.n_state
     x0 = _values(rows.guess, given, parameters) * jnp.asarray(_signs(rows.guess), point.dtype)
     target = _values(rows.kept, given, parameters)
+    starts = _reader(plan, rows.kept)
+    if rows.direct:
+        nothing = jnp.zeros((), jnp.int32)
+        return InitialPoint(x0, x0[:0], starts(point, x0) - target, target, nothing, nothing, None)
+
+    def residual(w, parameters, inputs, target):
+        if len(unknown):
+            parameters = parameters.at[unknown].set(w[n:])
+            target = _values(rows.kept, given, parameters)
+        here = Point(plan, parameters, point.networks, t0, inputs)
+        state = here.split(w[:n])
+        parts = [here.constraint_vector(state)]
+        if len(plan.carried):
+            parts.append(here.carried_vector(here.t, state))
+        parts.append(starts(here, w[:n]) - target)
+        return jnp.concatenate(parts)
+
+    frozen = jax.lax.stop_gradient
+    settings = frozen((parameters, frozen_inputs(inputs), target))
+    start = frozen(jnp.append(x0, parameters[unknown]) if len(unknown) else x0)
+    scale = np.append(plan.nominal, np.ones(len(unknown)))
+    core = independent_rows(plan, rows, len(start))
+    eps = float(jnp.finfo(point.dtype).eps)
+    close = min(1e3 * eps, 0.1 * eps**0.6)
+    found = frozen(
+        find_root(
+            lambda w: residual(w, *settings),
+            start,
+            scale,
+            core,
+            lambda w: close * (1.0 + jnp.max(jnp.abs(w), initial=0.0)),
+            lambda w: tolerance(point.dtype, w),
+        )
+    )
+    remaining = residual(found.x, parameters, inputs, target)
+    # Where nothing was found, there is nothing to differentiate, and the others of a batch must not notice.
+    good = found.method < FAILED
+    w = found.x - _least_squares(
+        jnp.where(good, found.jacobian, jnp.eye(*found.jacobian.shape, dtype=point.dtype)),
+        jnp.where(good, remaining, jnp.zeros_like(remaining)),
+    )
+    full = jnp.concatenate([jnp.zeros((remaining.shape[0] - target.shape[0],), point.dtype), target])
+    return InitialPoint(w[:n], w[n:], remaining, full, found.method, found.evaluations, found.jacobian)
+
+
+def _least_squares(matrix: Any, right: Any) -> Any:
+    """The least-squares solution of A·x = b; the one of least norm where A has fewer rows than columns."""
+    m, n = matrix.shape
+    if m >= n:
+        q, r = jnp.linalg.qr(matrix)
+        return jax.scipy.linalg.solve_triangular(r, q.T @ right)
+    q, r = jnp.linalg.qr(matrix.T)
+    return q @ jax.scipy.linalg.solve_triangular(r, right, trans=1)
+
+
+def independent_rows(plan: SystemPlan, rows: InitialRows, n: int) -> np.ndarray | None:
+    """As many rows as unknowns, none of which follows from others; None if they are not known."""
+    if rows.independent is None:
+        return None
+    equations = plan.n_constraints + len(plan.carried)
+    core = np.append(np.ones(equations, bool), rows.independent).nonzero()[0]
+    return core if len(core) == n else None
+
+
+def _reader(plan: SystemPlan, kept: tuple[Row, ...]):
+    """The values of the rows' variables as a function of the point and the state array."""
+    quantity = np.array([r.quantity for r in kept], np.int64)
+    sign = np.array([r.sign for r in kept], np.int64)
     place = {int(q): k for k, q in enumerate((*plan.states, *plan.carried))}
-    quantity = np.array([r.quantity for r in rows.kept], np.int64)
-    sign = np.array([r.sign for r in rows.kept], np.int64)
     in_state = all(int(q) in place for q in quantity)
 
     def starts(here: Point, x):
         if not len(quantity):
             return jnp.zeros((0,), here.dtype)
         if in_state:
-            return x[np.array([place[int(q)] for q in quantity])] * jnp.asarray(sign, here.dtype)
+            where = np.array([place[int(q)] for q in quantity])
+            return take(x, where) * jnp.asarray(np.where(sign < 0, -1, 1), here.dtype)
         evaluation = here.run(plan.everything, here.split(x), refine=0)
         gather: Gather = plan.everything.layout.gather(quantity, sign)
         return jnp.broadcast_to(jnp.asarray(evaluation.read(gather), here.dtype), (len(quantity),))
 
-    if rows.direct:
-        return x0, starts(point, x0) - target
-
-    def residual(x, parameters, inputs, target):
-        here = Point(plan, parameters, point.networks, t0, inputs)
-        state = here.split(x)
-        parts = [here.constraint_vector(state)]
-        if len(plan.carried):
-            parts.append(here.carried_vector(here.t, state))
-        parts.append(starts(here, x) - target)
-        return jnp.concatenate(parts)
-
-    frozen = jax.lax.stop_gradient
-    fixed = lambda x: residual(x, frozen(parameters), frozen_inputs(inputs), frozen(target))  # noqa: E731
-    start = frozen(x0)
-    eps = float(jnp.finfo(point.dtype).eps)
-    close = 1e3 * eps * (1.0 + jnp.max(jnp.abs(start), initial=0.0))
-
-    def search(x):
-        solver = optx.LevenbergMarquardt(rtol=1e2 * eps, atol=1e2 * eps)
-        solution = optx.least_squares(lambda y, _: fixed(y), solver, x, max_steps=MAX_STEPS, throw=False)
-        return solution.value
-
-    def far(carry):
-        x, searched = carry
-        return ~searched & ~(jnp.max(jnp.abs(fixed(x)), initial=0.0) <= close)
-
-    # A loop that runs at most once, not a `cond`: under vmap it is skipped if all members start consistent.
-    near, _ = jax.lax.while_loop(far, lambda c: (search(c[0]), jnp.array(True)), (start, jnp.array(False)))
-    near = frozen(near)
-    jacobian = frozen(jax.jacfwd(fixed)(near))
-    remaining = residual(near, parameters, inputs, target)
-    q, r = jnp.linalg.qr(jacobian)
-    x = near - jax.scipy.linalg.solve_triangular(r, q.T @ remaining)
-    return x, residual(x, parameters, inputs, target)
+    return starts
 
 
 def frozen_inputs(inputs: Any) -> Any:
@@ -264,61 +177,69 @@ def _values(rows: tuple[Row | None, ...], given: list, parameters: Any) -> Any:
     return take(jnp.concatenate(parts), back)
 
 
-def tolerance(dtype, x: Any) -> Any:
+def tolerance(dtype: Any, x: Any) -> Any:
     """The largest residual of an initial point that counts as rounding."""
-    return float(jnp.finfo(dtype).eps) ** 0.6 * (1.0 + jnp.max(jnp.abs(x), initial=0.0))
+    largest = np.max(np.abs(x), initial=0.0) if isinstance(x, np.ndarray) else jnp.max(jnp.abs(x), initial=0.0)
+    return float(jnp.finfo(dtype).eps) ** 0.6 * (1.0 + largest)
 
 
-def row_names(plan: SystemPlan, rows: InitialRows) -> list[str]:
-    """What each residual of `initialize` says, in user names."""
-    out = []
-    if rows.direct:
-        return [f"start of {r.name}" for r in rows.kept]
-    for planned in plan.constraints:
-        for base, level in zip(planned.group.base, [planned.group.level] * len(planned.group), strict=True):
-            text = describe_equation(plan.groups, int(base))
-            out.append(text + (f" (differentiated {level}×)" if level else ""))
-    out.extend(f"block of {plan.quantity_name[q]}" for q in plan.carried)
-    out.extend(f"start of {r.name}" for r in rows.kept)
-    return out
+def is_consistent(found: InitialPoint) -> Any:
+    """Whether all rows hold, to rounding."""
+    unknown = jnp.append(found.x, found.solved)
+    holds = jnp.max(jnp.abs(found.residual), initial=0.0) <= tolerance(found.x.dtype, unknown)
+    return holds & jnp.all(jnp.isfinite(unknown))
 
 
-def check(system, x: Any, residual: Any, initial: Mapping[str, Any] | None) -> Any:
-    """Raises an `InitializationError` that names the worst rows if the initial point is not consistent."""
-    limit = tolerance(x.dtype, x)
-    bad = ~(jnp.max(jnp.abs(residual), initial=0.0) <= limit) | ~jnp.all(jnp.isfinite(x))
-    if isinstance(bad, Tracer):
-        return eqx.error_if(
-            x,
-            bad,
-            "no consistent initial point: fixed starts contradict the equations, or the search failed. Call "
-            "system.initialize() outside jit for the names",
+def find_initial(
+    system: Any,
+    t0: Any,
+    inputs: Mapping[str, Any] | None,
+    initial: Mapping[str, Any] | None,
+    solve_for: tuple[str, ...] = (),
+) -> InitialPoint:
+    """`initialize`, compiled once for each structure where nothing is traced."""
+    dtype = system.parameters.values.dtype
+    inputs = {name: v if callable(v) else jnp.asarray(v, dtype) for name, v in (inputs or {}).items()}
+    initial = {name: jnp.asarray(v, dtype) for name, v in sorted((initial or {}).items())}
+    arguments = (system, jnp.asarray(t0, dtype), inputs, initial, solve_for)
+    if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments)):
+        found = _compiled(*arguments)
+        # An input's function may close over a traced value, which shows in the outcome only.
+        if not isinstance(found.x, Tracer):
+            return found
+    return initialize(*arguments)
+
+
+_compiled = eqx.filter_jit(initialize)
+
+
+def check(
+    system: Any, found: InitialPoint, t0: Any, inputs: Any, initial: Any, solve_for: tuple[str, ...] = ()
+) -> InitialPoint:
+    """The same point; raises an `InitializationError` if it is not consistent, if a block of equations is singular
+    there, or if a parameter solved for is out of its bounds."""
+    from .initialization_report import InitializationReport  # which reads what is defined here
+
+    low, high = system.parameters.table.bounds[[system.parameters.table.index(n) for n in solve_for]].reshape(-1, 2).T
+    slack = tolerance(found.x.dtype, found.solved)
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((found, system, t0))):
+        x = eqx.error_if(
+            found.x,
+            ~is_consistent(found),
+            "no consistent initial point: fixed starts contradict the equations, or the search failed. "
+            "system.initialization_report() outside jit gives the names",
         )
-    if bool(bad):
-        raise InitializationError(explain(system, x, residual, initial))
-    return x
-
-
-def explain(system, x: Any, residual: Any, initial: Mapping[str, Any] | None) -> str:
-    """The message for an inconsistent initial point."""
-    plan: SystemPlan = system.plan
-    rows = _rows(plan, tuple(initial or ()))
-    names = row_names(plan, rows)
-    size = np.abs(np.asarray(residual))
-    if not np.isfinite(size).all() or not np.isfinite(np.asarray(x)).all():
-        wrong = [n for n, s in zip(names, size, strict=True) if not np.isfinite(s)][:4]
-        return (
-            "no consistent initial point: the equations are not finite at the start values"
-            + (f" ({'; '.join(wrong)})" if wrong else "")
-            + ". Give start values at a regular point with `initial={...}` or in the components."
-        )
-    worst = [k for k in np.argsort(-size)[:5] if size[k] > 0]
-    lines = [f"  {names[k]}: off by {size[k]:.3g}" for k in worst]
-    redundant = [r for r in rows.redundant]
-    hint = (
-        f"The starts of {', '.join(repr(r) for r in redundant[:4])} follow from the others: free them "
-        "(fixed=False) or give values that agree."
-        if redundant
-        else "Check the starts named above, or give better guesses with `initial={...}`."
-    )
-    return "no consistent initial point was found; what does not hold:\n" + "\n".join(lines) + "\n" + hint
+        outside = ~((found.solved >= low - slack) & (found.solved <= high + slack))
+        solved = eqx.error_if(found.solved, outside, f"a parameter of {list(solve_for)} is out of its bounds")
+        return found._replace(x=x, solved=solved if solve_for else found.solved)
+    problem = InitializationReport(system, found, t0, inputs, initial, solve_for).problem
+    if problem is not None:
+        raise InitializationError(problem)
+    for name, value, a, b in zip(solve_for, np.asarray(found.solved), low, high, strict=True):
+        if not a - float(slack) <= value <= b + float(slack):
+            raise InitializationError(
+                f"solve_for: the values given need {name} = {value:.6g}, which is out of its bounds [{a:g}, {b:g}]. "
+                "Give other values in initial={...}, or start the search elsewhere with "
+                f"system.with_parameters({{'{name}': guess}})"
+            )
+    return found

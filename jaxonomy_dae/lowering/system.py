@@ -1,12 +1,13 @@
 """The compiled model."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, overload
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..errors import ModelError, nearest
@@ -165,26 +166,98 @@ class AcausalSystem(eqx.Module):
         values = self._point(t, args).quantities(x, quantity, sign)
         return values[0] if single else values
 
+    @overload
     def initialize(
         self, t0: Any = 0.0, inputs: Mapping[str, Any] | None = None, initial: Mapping[str, Any] | None = None
-    ) -> Float[Array, " n"]:
+    ) -> Array: ...
+
+    @overload
+    def initialize(
+        self,
+        t0: Any = 0.0,
+        inputs: Mapping[str, Any] | None = None,
+        initial: Mapping[str, Any] | None = None,
+        *,
+        solve_for: Sequence[str],
+    ) -> tuple[Array, "AcausalSystem"]: ...
+
+    def initialize(
+        self,
+        t0: Any = 0.0,
+        inputs: Mapping[str, Any] | None = None,
+        initial: Mapping[str, Any] | None = None,
+        *,
+        solve_for: Sequence[str] | None = None,
+    ) -> Any:
         """A consistent state at `t0`: all equations, hidden ones included, and the fixed starts hold.
 
         **Arguments:**
 
         - `t0`: the initial time.
         - `inputs`: as in `simulate`.
-        - `initial`: values of variables at `t0`; they outrank the starts declared in components.
+        - `initial`: values of variables at `t0`; they outrank the starts declared in components. `"der(m.v)"` is the
+            derivative of a variable that the model differentiates.
+        - `solve_for`: parameters that are unknown: as many more values as there are names must be given in `initial`
+            or be fixed in components. The search starts at their present values. A rest length for which a mass is in
+            equilibrium at 0.3 m: `initial={"m.x": 0.3, "m.v": 0.0, "der(m.v)": 0.0}, solve_for=["spring.length"]`.
 
         **Returns:**
 
         The state, shape `(len(states) + len(carried),)`: differentiable with respect to parameters and values given.
+        With `solve_for`, the pair of the state and a system that holds the parameters found; go on with that system
+        and the same `initial`, as in `simulate(found, t1, initial=...)`.
 
         **Raises:**
 
-        - `InitializationError` if fixed starts contradict the equations, or no consistent point was found.
+        - `InitializationError` if fixed starts contradict the equations, if no consistent point was found, if a block
+            of equations is singular there, if the values given are too few or too many for `solve_for`, or if a
+            parameter found is out of its bounds. Inside jit, what depends on values is an Equinox run-time error.
         """
-        from .initialize import check, initialize
+        from .initialize import check, find_initial
 
-        x, residual = initialize(self, t0, inputs, initial)
-        return check(self, x, residual, initial)
+        names = self._names_to_solve_for(solve_for)
+        found = find_initial(self, t0, inputs, initial, names)
+        found = check(self, found, t0, inputs, initial, names)
+        if solve_for is None:
+            return found.x
+        table = self.parameters.table
+        index = np.array([table.index(n) for n in names], np.int64)
+        low, high = (jnp.asarray(b, found.x.dtype) for b in table.bounds[index].reshape(-1, 2).T)
+        # Rounding must not leave the bounds, nor the clip the gradient.
+        solved = found.solved + jax.lax.stop_gradient(jnp.clip(found.solved, low, high) - found.solved)
+        values = self.parameters.array.at[index].set(solved)
+        return found.x, eqx.tree_at(lambda s: s.parameters, self, Parameters(values, None, (), table))
+
+    def initialization_report(
+        self,
+        t0: Any = 0.0,
+        inputs: Mapping[str, Any] | None = None,
+        initial: Mapping[str, Any] | None = None,
+        *,
+        solve_for: Sequence[str] = (),
+    ):
+        """What `initialize` does with the same arguments, to be printed: which starts hold, which were guesses and how
+        far each moved, which are redundant or contradict each other, what does not hold, which method succeeded.
+
+        **Raises:**
+
+        - `ModelError` inside jit, where there are no numbers to report.
+        """
+        from .initialization_report import InitializationReport
+        from .initialize import find_initial
+
+        names = self._names_to_solve_for(solve_for)
+        found = find_initial(self, t0, inputs, initial, names)
+        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((found, self, t0))):
+            raise ModelError("initialization_report needs numbers: call it outside jit, grad and vmap")
+        return InitializationReport(self, found, t0, inputs, initial, names)
+
+    def _names_to_solve_for(self, solve_for: Sequence[str] | None) -> tuple[str, ...]:
+        if isinstance(solve_for, str):
+            raise ModelError(f"solve_for is a list of parameters' names; write solve_for=[{solve_for!r}]")
+        names = tuple(dict.fromkeys(solve_for or ()))
+        for name in names:
+            if name not in self.parameters.names and name in self.plan.variable_index:
+                raise ModelError(f"solve_for: '{name}' is a variable and found anyway; name parameters")
+            self.parameters.table.index(name)
+        return names
