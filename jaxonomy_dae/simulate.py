@@ -11,12 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from .errors import ModelError, SimulationError, nearest
+from .errors import ModelError, SimulationError
 from .lowering.initialize import check, initialize, is_consistent
+from .lowering.solver_choice import solver_choice
 from .lowering.system import AcausalSystem
+from .simulate_arguments import check_arguments, check_parameters
 from .solution import Solution
+from .solvers import BDF, DAETerm, Projected, Rodas5P, Tsit5
+from .solvers.diagnosis import explain_failure
 from .solvers.projected import with_projection
-from .solvers.tsit5 import Tsit5
+from .solvers.solve import check_tolerances, step_control
 
 SAVED_ITERATIONS = 3
 
@@ -34,6 +38,7 @@ def simulate(
     initial: Mapping[str, Any] | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
+    jump_ts: Any = None,
     max_steps: int = 16384,
     progress: bool = False,
     throw: bool = True,
@@ -45,14 +50,16 @@ def simulate(
     - `system`: from an `AcausalCompiler`.
     - `t0`, `t1`: the interval, `t0 < t1`.
     - `ts`: when to save, shape `(n,)`, increasing, inside the interval; None saves every step taken.
-    - `solver`: any Diffrax solver for ordinary differential equations; default `solvers.Tsit5`. Systems with hidden
-        constraints are projected onto them after every step and at every saved time.
-    - `rtol`, `atol`: tolerances of the local error.
+    - `solver`: any Diffrax solver for ordinary differential equations, or `solvers.BDF`, `solvers.Rodas5P` for stiff
+        systems and those with nonlinear blocks. None chooses, and `solution.stats` says what and why. Systems with
+        hidden constraints are projected onto them after every step and at every saved time.
+    - `rtol`, `atol`: tolerances of the local error; `atol` is multiplied by the states' nominal values.
     - `inputs`: functions of time (callable pytrees such as Diffrax interpolations, or plain functions) or constants, by
         the inputs' names.
     - `initial`: values at `t0` by variables' names, which outrank the starts declared in components.
     - `adjoint`: of Diffrax; `diffrax.ForwardMode()` for forward-mode differentiation (`jax.jvp`, `jax.jacfwd`).
-    - `stepsize_controller`: instead of the proportional–integral controller made from the tolerances.
+    - `stepsize_controller`: instead of the controller made from the tolerances.
+    - `jump_ts`: times at which inputs jump, shape `(n,)`: steps end there and the method starts anew.
     - `max_steps`: bounds the steps taken; with `ts=None` as many rows are reserved.
     - `progress`: shows a progress bar.
     - `throw`: whether to raise if the integration fails; otherwise see `solution.result`.
@@ -68,17 +75,24 @@ def simulate(
 
     - `ModelError` for arguments that cannot work; `InitializationError`; `SimulationError`.
     """
-    _check_arguments(system, t0, t1, ts, inputs, initial, adjoint, solver, max_steps)
+    check_arguments(system, t0, t1, ts, inputs, initial, adjoint, solver, max_steps)
     dtype = system.parameters.values.dtype
+    chosen, reason = solver_choice(system.plan)
+    if solver is None:
+        solver = {"Tsit5": Tsit5, "Rodas5P": Rodas5P, "BDF": BDF}[chosen]()
+    else:
+        chosen, reason = type(solver).__name__, "as asked for"
     if stepsize_controller is None:
-        _check_tolerances(rtol, atol, dtype)
-        stepsize_controller = diffrax.PIDController(rtol=rtol, atol=atol)
+        check_tolerances(rtol, atol, dtype)
+        stepsize_controller = _step_sizes(system, solver, jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype))
     if isinstance(stepsize_controller, diffrax.ConstantStepSize):
         raise ModelError(
             "stepsize_controller=ConstantStepSize() needs a step: use diffrax.StepTo(ts=jnp.linspace(t0, t1, n))"
         )
+    if jump_ts is not None:
+        stepsize_controller = diffrax.ClipStepSizeController(stepsize_controller, jump_ts=jnp.asarray(jump_ts, dtype))
     options = (
-        solver if solver is not None else Tsit5(),
+        solver,
         adjoint if adjoint is not None else default_adjoint(system.plan.n_state),
         stepsize_controller,
         max_steps,
@@ -98,23 +112,50 @@ def simulate(
     if outcome is None or _is_traced(outcome):
         found = initialize(system, t0, inputs, initial)
         found = check(system, found, t0, inputs, initial) if throw else found
-        saved, x, stats, result = _integrate(found.x, *arguments)
+        saved, x, _, stats, result = _integrate(found.x, *arguments)
         result = _with_start(found, result)
         if throw:
             x = result.error_if(x, ~diffrax.is_okay(result))
-        return Solution(saved, x, system, inputs, stats, result)
-    found, (saved, x, stats, result) = outcome
+        return Solution(saved, x, system, inputs, stats, result, chosen, reason)
+    found, (saved, x, last, stats, result) = outcome
     if throw:
-        _check_parameters(system)
+        check_parameters(system)
         check(system, found, t0, inputs, initial)
     stats = {name: int(value) for name, value in stats.items() if jnp.ndim(value) == 0}
     if ts is None:
         taken = int(np.isfinite(np.asarray(saved)).sum())
         saved, x = saved[:taken], x[:taken]
-    solution = Solution(saved, x, system, inputs, stats, result)
+    solution = Solution(saved, x, system, inputs, stats, result, chosen, reason)
     if throw and not bool(diffrax.is_okay(result)):
+        names = [*system.states, *system.carried]
+        if _is_implicit(solver):
+            problem = _term(system, solver), inputs, *last
+            raise SimulationError(explain_failure(*problem, solution, names, max_steps, rtol, atol))
         raise SimulationError(_explain(solution, found.x, float(t0), float(t1), max_steps, rtol, atol))
     return solution
+
+
+def _is_implicit(solver: Any) -> bool:
+    """Whether the solver takes differential-algebraic equations."""
+    return isinstance(solver.solver if isinstance(solver, Projected) else solver, BDF | Rodas5P)
+
+
+def _step_sizes(system: AcausalSystem, solver: Any, rtol: Any, atol: Any) -> diffrax.AbstractStepSizeController:
+    """The controller for tolerances: absolute ones in units of the nominal values."""
+    nominal = system.plan.nominal
+    if len(nominal) and (nominal != 1).any():
+        atol = atol * jnp.asarray(nominal, atol.dtype)
+    if _is_implicit(solver):
+        return step_control(solver, rtol, atol)
+    return diffrax.PIDController(rtol=rtol, atol=atol)
+
+
+def _term(system: AcausalSystem, solver: Any) -> diffrax.AbstractTerm:
+    if not _is_implicit(solver):
+        return diffrax.ODETerm(system.vector_field)
+    if not len(system.plan.carried):
+        return DAETerm(system.vector_field, mass=system.mass)
+    return DAETerm(system.semi_explicit, mass=system.mass)
 
 
 def default_adjoint(n_state: int) -> diffrax.RecursiveCheckpointAdjoint:
@@ -131,8 +172,8 @@ def default_adjoint(n_state: int) -> diffrax.RecursiveCheckpointAdjoint:
 def _compiled(arguments):
     system, t0, _, _, inputs, initial, _ = arguments
     found = initialize(system, t0, inputs, initial)._replace(jacobian=None)
-    saved, x, stats, result = _integrate(found.x, *arguments)
-    return found, (saved, x, stats, _with_start(found, result))
+    saved, x, last, stats, result = _integrate(found.x, *arguments)
+    return found, (saved, x, last, stats, _with_start(found, result))
 
 
 def _with_start(found, result):
@@ -143,12 +184,20 @@ def _with_start(found, result):
 
 def _integrate(x0, system: AcausalSystem, t0, t1, ts, inputs, initial, options):
     solver, adjoint, controller, max_steps, progress = options
-    if system.is_constrained:
+    term = _term(system, solver)
+    implicit = _is_implicit(solver)
+    if system.is_constrained and not implicit:
         solver = with_projection(solver, system.project, strict=bool(system.carried))
-    term = diffrax.ODETerm(system.vector_field)
-    dt0 = _first_step(system, t0, t1, x0, inputs, solver.order(term), controller)
-    saveat = diffrax.SaveAt(t0=True, steps=True) if ts is None else diffrax.SaveAt(ts=ts)
-    solved = diffrax.diffeqsolve(
+    elif system.plan.n_constraints and isinstance(solver, BDF):
+        solver = solver if solver.projection is not None else _with_field(solver, "projection", system.project)
+    elif system.plan.n_constraints:
+        solver = with_projection(solver, system.project, strict=False)
+    own_start = implicit and not isinstance(controller, diffrax.StepTo)
+    dt0 = None if own_start else _first_step(system, t0, t1, x0, inputs, solver.order(term), controller)
+    main = diffrax.SubSaveAt(t0=True, steps=True) if ts is None else diffrax.SubSaveAt(ts=ts)
+    subs = {"out": main, "last": diffrax.SubSaveAt(t1=True)} if implicit else {"out": main}
+    counted = isinstance(solver, BDF)
+    solved: Any = diffrax.diffeqsolve(
         term,
         solver,
         t0,
@@ -156,21 +205,31 @@ def _integrate(x0, system: AcausalSystem, t0, t1, ts, inputs, initial, options):
         dt0,
         x0,
         args=inputs,
-        saveat=saveat,
+        saveat=diffrax.SaveAt(subs=subs, solver_state=counted),
         stepsize_controller=controller,
         adjoint=adjoint,
         max_steps=max_steps,
         throw=False,
         progress_meter=diffrax.TqdmProgressMeter() if progress else diffrax.NoProgressMeter(),
     )
-    saved, x = jnp.asarray(solved.ts), jnp.asarray(solved.ys)
+    stats = dict(solved.stats)
+    if counted:
+        stats["num_jacobians"], stats["num_newton_iterations"] = jax.lax.stop_gradient(solved.solver_state.counts)
+    elif implicit:
+        stats["num_jacobians"] = stats["num_steps"]
+    saved, x = jnp.asarray(solved.ts["out"]), jnp.asarray(solved.ys["out"])
+    last = jax.tree.map(lambda v: v[0], (solved.ts["last"], solved.ys["last"])) if implicit else None
     if system.is_constrained:
         filled = jnp.isfinite(x).all(axis=-1)
         safe = jnp.where(filled[:, None], x, x0)
         times = jnp.where(filled, saved, t0)
         projected = jax.vmap(lambda t, y: system.project(t, y, inputs, iterations=SAVED_ITERATIONS))(times, safe)
         x = jnp.where(filled[:, None], projected, x)
-    return saved, x, solved.stats, solved.result
+    return saved, x, last, stats, solved.result
+
+
+def _with_field(module: Any, name: str, value: Any) -> Any:
+    return eqx.tree_at(lambda m: getattr(m, name), module, value, is_leaf=lambda v: v is None)
 
 
 def _first_step(system, t0, t1, x0, inputs, order, controller):
@@ -203,117 +262,6 @@ def _first_step(system, t0, t1, x0, inputs, order, controller):
 
 def _is_traced(tree: Any) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
-
-
-# --- arguments ---------------------------------------------------------------------------------------------------
-
-
-def _check_arguments(system, t0, t1, ts, inputs, initial, adjoint, solver, max_steps):
-    if not isinstance(system, AcausalSystem):
-        raise ModelError(f"simulate needs an AcausalSystem (call the AcausalCompiler); got {type(system).__name__}")
-    if system.parameters.values.ndim != 1:
-        raise ModelError(
-            f"the system is a batch, its parameters have shape {system.parameters.values.shape}: simulate each with "
-            "equinox.filter_vmap(lambda s: simulate(s, ...))(system)"
-        )
-    if solver is not None and not isinstance(solver, diffrax.AbstractSolver):
-        raise ModelError(f"solver must be a Diffrax solver such as diffrax.Tsit5(); got {solver!r}")
-    if isinstance(adjoint, diffrax.BacksolveAdjoint):
-        raise ModelError(
-            "adjoint=BacksolveAdjoint() is wrong for constrained systems: it integrates the state backwards without "
-            "its constraints and leaves the algebraic variables out. Use the default RecursiveCheckpointAdjoint(), or "
-            "ForwardMode() for few parameters"
-        )
-    if not isinstance(max_steps, int) or max_steps < 1:
-        raise ModelError(f"max_steps must be a positive integer; got {max_steps!r}")
-    _check_interval(t0, t1, ts)
-    known = system.inputs
-    for name, value in (inputs or {}).items():
-        if name not in known:
-            raise ModelError(f"'{name}' is no input of this system: " + nearest(name, known))
-        if not callable(value) and np.shape(value) != ():
-            raise ModelError(
-                f"input '{name}' must be a function of time or a constant; got shape {np.shape(value)}. For samples "
-                "use diffrax.LinearInterpolation(ts, ys).evaluate"
-            )
-    for name, default in zip(known, system.plan.inputs.defaults, strict=True):
-        if default is None and name not in (inputs or {}):
-            raise ModelError(f"input '{name}' has no default: give it with inputs={{'{name}': function_of_time}}")
-    for name, value in (initial or {}).items():
-        if name in system.parameters.names:
-            raise ModelError(f"initial: '{name}' is a parameter; use system.with_parameters({{'{name}': value}})")
-        quantity = system.plan.resolve([name])[0][0]
-        if quantity < 0:
-            raise ModelError(f"initial: '{name}' is identically zero in this model")
-        if np.shape(value) != ():
-            raise ModelError(f"initial: '{name}' needs a scalar; got shape {np.shape(value)}")
-
-
-def _concrete(value: Any) -> np.ndarray | None:
-    return None if isinstance(value, Tracer) else np.asarray(value, float)
-
-
-def _check_interval(t0, t1, ts):
-    a, b = _concrete(t0), _concrete(t1)
-    for name, value in (("t0", a), ("t1", b)):
-        if value is not None and (value.shape != () or not math.isfinite(value)):
-            raise ModelError(f"{name} must be a finite number; got {value}")
-    if a is not None and b is not None and not a < b:
-        raise ModelError(f"the interval needs t0 < t1; got t0={float(a)}, t1={float(b)}")
-    if ts is None:
-        return
-    if np.ndim(ts) != 1 or not np.shape(ts)[0]:
-        raise ModelError(f"ts must have shape (n,), n ≥ 1; got {np.shape(ts)}")
-    saved = _concrete(ts)
-    if saved is None:
-        return
-    if not np.isfinite(saved).all():
-        raise ModelError("ts must be finite")
-    backwards = np.flatnonzero(np.diff(saved) < 0)
-    if len(backwards):
-        k = int(backwards[0])
-        raise ModelError(
-            f"ts must be sorted; ts[{k}]={saved[k]} is followed by ts[{k + 1}]={saved[k + 1]}: use jnp.sort(ts)"
-        )
-    slack = 1e-6 if np.asarray(ts).dtype == np.float32 else 1e-12
-    low = -math.inf if a is None else float(a) - slack * (1 + abs(float(a)))
-    high = math.inf if b is None else float(b) + slack * (1 + abs(float(b)))
-    outside = saved[(saved < low) | (saved > high)]
-    if len(outside):
-        raise ModelError(
-            f"ts must lie between t0={t0} and t1={t1}; {outside[0]} does not. Extend the interval or drop it"
-        )
-
-
-def _check_tolerances(rtol, atol, dtype):
-    for name, value in (("rtol", rtol), ("atol", atol)):
-        number = _concrete(value)
-        if number is not None and not (number.shape == () and math.isfinite(number) and number >= 0):
-            raise ModelError(f"{name} must be a number ≥ 0; got {value}")
-    eps = float(jnp.finfo(dtype).eps)
-    number = _concrete(rtol)
-    if number is not None and float(number) < 10 * eps:
-        switch = (
-            ' Switch to double precision with jax.config.update("jax_enable_x64", True) before the model is '
-            "compiled, or"
-            if dtype == jnp.float32
-            else ""
-        )
-        raise ModelError(
-            f"rtol={float(number):g} cannot be reached in {dtype} (eps {eps:.1e}).{switch} use rtol ≥ {10 * eps:.0e}."
-        )
-
-
-def _check_parameters(system: AcausalSystem):
-    values = np.asarray(system.parameters.array)
-    bad = np.flatnonzero(~np.isfinite(values))
-    if len(bad):
-        name = system.parameters.names[bad[0]]
-        raise ModelError(f"parameter '{name}' is not finite: {values[bad[0]]}. Set it with with_parameters")
-    for name, network in system.neural.items():
-        for leaf in jax.tree.leaves(eqx.filter(network, eqx.is_inexact_array)):
-            if not np.isfinite(np.asarray(leaf)).all():
-                raise ModelError(f"a weight of network '{name}' is not finite: go back to an earlier iterate")
 
 
 def _explain(solution: Solution, x0: Any, t0: float, t1: float, max_steps: int, rtol: float, atol: float) -> str:

@@ -20,7 +20,8 @@ class Solution(eqx.Module):
     - `states`: the state array at these times, shape `(n, len(system.states) + len(system.carried))`, on the hidden
         constraints.
     - `system`, `inputs`: what was simulated.
-    - `stats`: steps taken, accepted, rejected.
+    - `counts`: steps taken, accepted, rejected, and Jacobians of implicit solvers; `stats` adds the solver's name and
+        why it was chosen.
     - `result`: Diffrax's result code. Where the integration stopped early, later rows are infinite.
 
     A solution that `equinox.filter_vmap` returns is a batch: shapes get its axis in front.
@@ -30,8 +31,10 @@ class Solution(eqx.Module):
     states: Float[Array, "n x"]
     system: AcausalSystem
     inputs: dict[str, Any]
-    stats: dict[str, Any]
+    counts: dict[str, Any]
     result: Any
+    solver: str = eqx.field(static=True, default="")
+    reason: str = eqx.field(static=True, default="")
 
     def __getitem__(self, name: str) -> Any:
         """The values of a variable; `"time"` and `"der(...)"` of what the model differentiates are accepted.
@@ -54,6 +57,11 @@ class Solution(eqx.Module):
         if any(isinstance(leaf, Tracer) for leaf in leaves):
             return _observe(self.system, self.ts, self.states, self.inputs, quantity, sign)
         return _observe_all(self.system, self.ts, self.states, self.inputs, quantity[0], sign[0])
+
+    @property
+    def stats(self) -> dict[str, Any]:
+        """What the integration took: numbers of steps, the solver and the reason for it."""
+        return {**self.counts, "solver": self.solver, "reason": self.reason}
 
     def __contains__(self, name: str) -> bool:
         return name == "time" or name in self.system.plan.variable_index

@@ -279,7 +279,7 @@ def _check_count(plan: SystemPlan, opened: _Open, directions: _Directions, redun
         more = "a value" if len(given) == 1 else f"{len(given)} values"
         raise InitializationError(
             f"solve_for: {more} too many for {len(wanted)} unknown parameter{'s' * (len(wanted) > 1)} "
-            f"({_some(wanted)}): {_some([r.name for r in given])} follow{'s' * (len(given) == 1)} from the other values "
+            f"({_some(wanted)}): {_some([r.name for r in given])} follow{'s' * (len(given) == 1)} from the others "
             f"given. Leave {'it' if len(given) == 1 else 'them'} out{others}."
         )
     left = np.linalg.norm(directions.free[opened.n :], axis=1)

@@ -9,6 +9,7 @@ from ..compiler.reduce_index import Offsets, reduce_index
 from ..compiler.structure import incidence
 from ..compiler.tables import describe_equation
 from .lower import SystemPlan
+from .solver_choice import solver_choice
 
 SHOWN = 12
 HTML_SHOWN = 200
@@ -138,6 +139,7 @@ class SystemReport:
             f"structural index {self.index}, {self.degrees_of_freedom} degrees of freedom",
         ]
         head.append(f"state selection {self.state_selection}")
+        head.append("simulate(solver=None) takes {}: {}".format(*solver_choice(plan)))
         sections = [
             ("differentiated", [f"{n}× {text}" for text, n in self.differentiated]),
             (f"{len(self.states)} states", [_some(self.states)]),

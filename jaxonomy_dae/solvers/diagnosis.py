@@ -77,7 +77,7 @@ def explain_start(check: StartCheck, names: Sequence[str]) -> str:
         return (
             "inconsistent start, the algebraic equations do not hold: "
             + ", ".join(f"row {k} of F is off by {residual[k]:.3g}" for k in rows)
-            + f". To mend it {', '.join(names[k] for k in moved)} must move: "
+            + f". To mend it {', '.join(str(names[k]) for k in moved)} must move: "
             "y0 = jaxonomy_dae.solvers.consistent_start(term, y0), or system.initialize() for a compiled model"
         )
     return ""
