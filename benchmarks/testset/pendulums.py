@@ -145,11 +145,14 @@ def caraxis() -> Problem:
     variables = (*AXIS, *("v_" + n for n in AXIS), "lam1", "lam2")
     names = tuple(f"caraxis.{n}" for n in variables)
     y0 = facts["initial"]["y0"]
+    p = SimpleNamespace(**facts["parameters"])
+    # In units of the spring's oscillation: lengths L, speeds L·sqrt(1/k), multipliers by the springs' unit stiffness.
+    scale = [p.L] * 4 + [p.L / np.sqrt(p.eps**2 * p.M / 2)] * 4 + [1.0] * 2
     return Problem(
         name="caraxis",
         build=alone(CarAxis),
         reference=named("caraxis", variables, facts["reference"]["y"]),
-        scale=dict(zip(names, [1.0] * 8 + [1e-2] * 2, strict=True)),
+        scale=dict(zip(names, scale, strict=True)),
         digits=9.2,
         origin="published",
         t1=facts["time"]["t_end"],

@@ -40,7 +40,7 @@ class Problem:
         right to `published_digits`.
     - `scale`: the size below which a component's error counts as absolute. The error of a result is
         |found − reference| / max(|reference|, scale).
-    - `atol`: the absolute tolerance that goes with a relative tolerance of 1: solve with `atol = rtol·problem.atol`.
+    - `atol`, `least_atol`: solve with an absolute tolerance of max(rtol·atol, least_atol); see `tolerances`.
     - `t0`: where integration starts, `t1` where it ends. `breaks`: times in between where the equations jump.
     - `index_one`: index-1 equations M·dy/dt = F(t, y); `given` says whether these are the published equations, so that
         a solver may be measured on them, or a reduction by hand.
@@ -57,6 +57,7 @@ class Problem:
     index_one: Callable[[], IndexOne]
     given: bool
     atol: float = 1.0
+    least_atol: float = 0.0
     t0: float = 0.0
     breaks: tuple[float, ...] = ()
     stiff: bool = False
@@ -67,6 +68,10 @@ class Problem:
     def compile(self) -> AcausalSystem:
         ev, diagram = self.build()
         return AcausalCompiler(ev, diagram)()
+
+    def tolerances(self, rtol: float) -> dict[str, float]:
+        """`rtol=` and `atol=` for a solver."""
+        return {"rtol": rtol, "atol": max(rtol * self.atol, self.least_atol)}
 
     def errors(self, found: Mapping[str, Any]) -> dict[str, float]:
         """|found − reference| / max(|reference|, scale) for every reference; `found` are values at `t1`."""
