@@ -28,8 +28,8 @@ def simulate(
     t0: Any = 0.0,
     ts: Any = None,
     solver: diffrax.AbstractSolver | None = None,
-    rtol: float = 1e-6,
-    atol: float = 1e-8,
+    rtol: Any = 1e-6,
+    atol: Any = 1e-8,
     inputs: Mapping[str, Any] | None = None,
     initial: Mapping[str, Any] | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
@@ -47,7 +47,7 @@ def simulate(
     - `ts`: when to save, shape `(n,)`, increasing, inside the interval; None saves every step taken.
     - `solver`: any Diffrax solver for ordinary differential equations; default `solvers.Tsit5`. Systems with hidden
         constraints are projected onto them after every step and at every saved time.
-    - `rtol`, `atol`: tolerances of the local error.
+    - `rtol`, `atol`: tolerances of the local error; as arrays, they can change without compiling anew.
     - `inputs`: functions of time (callable pytrees such as Diffrax interpolations, or plain functions) or constants, by
         the inputs' names.
     - `initial`: values at `t0` by variables' names, which outrank the starts declared in components.
@@ -308,7 +308,7 @@ def _check_parameters(system: AcausalSystem):
                 raise ModelError(f"a weight of network '{name}' is not finite: go back to an earlier iterate")
 
 
-def _explain(solution: Solution, x0: Any, t0: float, t1: float, max_steps: int, rtol: float, atol: float) -> str:
+def _explain(solution: Solution, x0: Any, t0: float, t1: float, max_steps: int, rtol: Any, atol: Any) -> str:
     system, x = solution.system, np.asarray(solution.states)
     slope = np.asarray(system.vector_field(t0, x0, solution.inputs))
     if not np.isfinite(slope).all():

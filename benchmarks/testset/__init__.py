@@ -4,6 +4,9 @@
 the physics is here, written from its own equations with its original index.
 """
 
+import functools
+from dataclasses import replace
+
 from .chemistry import chemakzo, robertson
 from .circuits import msl_cauer, transamp
 from .drive_train import msl_rotational_first
@@ -15,7 +18,7 @@ from .problem import Problem as Problem
 from .problem import Table as Table
 
 PROBLEMS: dict[str, Problem] = {
-    problem.name: problem
+    problem.name: replace(problem, index_one=functools.cache(problem.index_one))
     for problem in (
         robertson(),
         chemakzo(),

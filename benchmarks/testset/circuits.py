@@ -128,12 +128,8 @@ def _cauer_matrices() -> tuple[np.ndarray, np.ndarray]:
     """(A, b) of d/dt(vC1, vC3, vC5, iL1, iL2) = A·x + b·V, the capacitor loops eliminated by hand."""
     p = SimpleNamespace(**load("msl_cauer")["parameters"])
     # vC2 = v1 − v3 and vC4 = v3 − v5, so that charges are a full capacitance matrix times (v1, v3, v5).
-    charge = np.array(
-        [[p.c1 + p.c2, -p.c2, 0.0], [-p.c2, p.c2 + p.c3 + p.c4, -p.c4], [0.0, -p.c4, p.c4 + p.c5]]
-    )
-    current = np.array(
-        [[-1 / p.R1, 0.0, 0.0, -1.0, 0.0], [0.0, 0.0, 0.0, 1.0, -1.0], [0.0, 0.0, -1 / p.R2, 0.0, 1.0]]
-    )
+    charge = np.array([[p.c1 + p.c2, -p.c2, 0.0], [-p.c2, p.c2 + p.c3 + p.c4, -p.c4], [0.0, -p.c4, p.c4 + p.c5]])
+    current = np.array([[-1 / p.R1, 0.0, 0.0, -1.0, 0.0], [0.0, 0.0, 0.0, 1.0, -1.0], [0.0, 0.0, -1 / p.R2, 0.0, 1.0]])
     voltage = np.array([[1.0, -1.0, 0.0, 0.0, 0.0], [0.0, 1.0, -1.0, 0.0, 0.0]])
     a = np.vstack([np.linalg.solve(charge, current), voltage / np.array([[p.l1], [p.l2]])])
     b = np.concatenate([np.linalg.solve(charge, [1 / p.R1, 0.0, 0.0]), [0.0, 0.0]])

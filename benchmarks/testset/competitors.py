@@ -4,7 +4,6 @@ Each function takes a `Problem` and tolerances, and returns an `Outcome` or rais
 residual in Python, so its steps compare, its times do not; CasADi's IDAS runs compiled residuals and exact Jacobians.
 """
 
-import functools
 from collections.abc import Callable
 
 import numpy as np
@@ -19,13 +18,6 @@ MAX_STEPS = 1_000_000
 
 class NotApplicable(Exception):
     """The solver cannot take this problem; says why."""
-
-
-@functools.cache
-def equations(problem_name: str) -> IndexOne:
-    from . import PROBLEMS
-
-    return PROBLEMS[problem_name].index_one()
 
 
 def _slopes(one: IndexOne, t: float) -> np.ndarray:
@@ -47,7 +39,7 @@ def ida(problem: Problem, rtol: float, atol: float, repeat: Callable[[float], in
         from sksundae.ida import IDA
     except ImportError:
         raise NotApplicable("scikit-sundae is not installed (pip install 'jaxonomy_dae[bench]')") from None
-    one = equations(problem.name)
+    one = problem.index_one()
     mass = one.matrix()
 
     def residual(t, y, yp, res):
@@ -75,7 +67,7 @@ def ida(problem: Problem, rtol: float, atol: float, repeat: Callable[[float], in
 
 
 def _semi_explicit(one: IndexOne) -> tuple[int, np.ndarray, np.ndarray]:
-    """(n, A, B) with y = B·(x, z), A·M·B = diag(1ₙ, 0), so that (x', 0) = A·F(t, B·(x, z)): from M's singular values."""
+    """(n, A, B) with y = B·(x, z) and A·M·B = diag(1ₙ, 0), so that (x', 0) = A·F(t, y): from M's singular values."""
     if one.mass.ndim == 1 and np.array_equal(one.mass, np.arange(len(one.mass)) < int((one.mass != 0).sum())):
         return one.split(), np.eye(len(one.mass)), np.eye(len(one.mass))
     left, singular, right = np.linalg.svd(one.matrix())
@@ -96,7 +88,7 @@ def casadi_idas(
         import casadi
     except ImportError:
         raise NotApplicable("CasADi is not installed (pip install 'jaxonomy_dae[bench]')") from None
-    one = equations(problem.name)
+    one = problem.index_one()
     n, a, b = _semi_explicit(one)
     unknowns, t = casadi.SX.sym("y", len(one.y0)), casadi.SX.sym("t")
     plain = np.array_equal(b, np.eye(len(b)))
@@ -141,7 +133,7 @@ def casadi_idas(
 
 def scipy_radau(problem: Problem, rtol: float, atol: float, repeat: Callable[[float], int]) -> Outcome:
     """SciPy's Radau on the ODE that is left when algebraic unknowns are eliminated in closed form."""
-    one = equations(problem.name)
+    one = problem.index_one()
     if not one.linear:
         raise NotApplicable("its algebraic equations are nonlinear: no ODE in closed form")
 

@@ -44,9 +44,7 @@ class Plate(Component):
     def __init__(self, ev: EqnEnv, name: str = "plate", m: int = 10):
         super().__init__(ev, name)
         inside, start = _interior(m), _start(m)
-        u = [
-            self.variable(f"u{k // m}_{k % m}", start=float(start[k]), fixed=bool(inside[k])) for k in range(m * m)
-        ]
+        u = [self.variable(f"u{k // m}_{k % m}", start=float(start[k]), fixed=bool(inside[k])) for k in range(m * m)]
         rate = sympy.Integer((m - 1) ** 2)
         for k in range(m * m):
             if inside[k]:
@@ -83,7 +81,10 @@ def _right_side(m: int):
 
 
 def sundials_heat2d(m: int = 10) -> Problem:
-    """Linear, m² unknowns, the stiffer the finer. The published table has 1 to 4 digits; the exact discrete solution is known."""
+    """Linear, m² unknowns, the stiffer the finer.
+
+    The published table has 1 to 4 digits; the exact discrete solution is known.
+    """
     facts = load("sundials_heat2d")
     end = facts["time"]["t_end"]
     names = [f"plate.u{k // m}_{k % m}" for k in range(m * m)]
@@ -92,9 +93,7 @@ def sundials_heat2d(m: int = 10) -> Problem:
 
     def index_one():
         right_side, order = _right_side(m)
-        return IndexOne(
-            right_side, inside[order].astype(float), _start(m)[order], {}, tuple(names[k] for k in order)
-        )
+        return IndexOne(right_side, inside[order].astype(float), _start(m)[order], {}, tuple(names[k] for k in order))
 
     peak = names[np.argmax(_start(m))]
     ts, top = np.array(facts["reference"]["table"]).T

@@ -21,9 +21,9 @@ def _slider_crank(t, coordinates, velocities, p):
     s1, c1, s2, c2 = sympy.sin(q), sympy.cos(q), sympy.sin(r), sympy.cos(r)
     s21, c21 = s2 * c1 - c2 * s1, c2 * c1 + s2 * s1
     length = sympy.sqrt(x**2 - x * (c2 + p.a * c1) + (1 + p.a**2) / 4 + p.a * c21 / 2)
-    speed = (
-        2 * x * xd - xd * (c2 + p.a * c1) + x * (s2 * rd + p.a * s1 * qd) - p.a * s21 * (rd - qd) / 2
-    ) / (2 * length)
+    speed = (2 * x * xd - xd * (c2 + p.a * c1) + x * (s2 * rd + p.a * s1 * qd) - p.a * s21 * (rd - qd) / 2) / (
+        2 * length
+    )
     pull = (p.k * (length - p.l0) + p.c * speed) / length
     force = sympy.Matrix(
         [
@@ -75,15 +75,11 @@ def sundials_slcrank() -> Problem:
         digits=10.0,
         origin="recomputed: " + facts["recomputed"]["method"],
         t1=facts["time"]["t_end"],
-        index_one=lambda: mechanical(
-            _slider_crank, facts["parameters"], y0[:3], y0[3:6], names, accelerations=False
-        ),
+        index_one=lambda: mechanical(_slider_crank, facts["parameters"], y0[:3], y0[3:6], names, accelerations=False),
         given=False,
         published=named("sundials_slcrank", CRANK, facts["reference"]["y"]),
         published_digits=4.5,
-        table=Table(
-            np.array(track["t"]), dict(zip(names[:3], np.array(track["y1_y2_y3"]).T, strict=True)), digits=4.2
-        ),
+        table=Table(np.array(track["t"]), dict(zip(names[:3], np.array(track["y1_y2_y3"]).T, strict=True)), digits=4.2),
     )
 
 
@@ -105,9 +101,7 @@ def _squeezer(t, q, v, p):
     m[2, 2] = p.m3 * (p.sa**2 + p.sb**2) + p.I3
     m[3, 3] = p.m4 * near**2 + p.I4
     m[3, 4] = m[4, 3] = p.m4 * (near**2 + p.zt * near * sin(q4)) + p.I4
-    m[4, 4] = (
-        p.m4 * (p.zt**2 + 2 * p.zt * near * sin(q4) + near**2) + p.m5 * (p.ta**2 + p.tb**2) + p.I4 + p.I5
-    )
+    m[4, 4] = p.m4 * (p.zt**2 + 2 * p.zt * near * sin(q4) + near**2) + p.m5 * (p.ta**2 + p.tb**2) + p.I4 + p.I5
     m[5, 5] = p.m6 * far**2 + p.I6
     m[5, 6] = m[6, 5] = p.m6 * (far**2 - p.u * far * sin(q6)) + p.I6
     m[6, 6] = p.m6 * (far**2 - 2 * p.u * far * sin(q6) + p.u**2) + p.m7 * (p.ua**2 + p.ub**2) + p.I6 + p.I7
@@ -158,9 +152,7 @@ class SqueezingMechanism(Component):
             self.variable("v_" + n, start=y0[7 + k], fixed=n == "Theta", nominal=1e3, unit="rad/s")
             for k, n in enumerate(ANGLES)
         ]
-        w = [
-            self.variable("w_" + n, start=y0[14 + k], nominal=1e5, unit="rad/s2") for k, n in enumerate(ANGLES)
-        ]
+        w = [self.variable("w_" + n, start=y0[14 + k], nominal=1e5, unit="rad/s2") for k, n in enumerate(ANGLES)]
         lam = [self.variable(f"lam{k + 1}", start=y0[21 + k], nominal=1e2) for k in range(6)]
         mass, force, constraint = _squeezer(ev.t, q, v, p)
         self.add_equations(

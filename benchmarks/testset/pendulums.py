@@ -62,9 +62,7 @@ def _pendulum(name: str, reference: list[float], digits: float, origin: str, **p
         digits=digits,
         origin=origin,
         t1=facts["time"]["t_end"],
-        index_one=lambda: mechanical(
-            _kinetics, facts["parameters"], start[:2], start[2:4], names, accelerations=False
-        ),
+        index_one=lambda: mechanical(_kinetics, facts["parameters"], start[:2], start[2:4], names, accelerations=False),
         given=False,
         **published,
     )
