@@ -12,6 +12,7 @@ from .modeling import Domain as Domain
 from .modeling import Electrical as Electrical
 from .modeling import EqnEnv as EqnEnv
 from .modeling import NeuralDAEBlock as NeuralDAEBlock
+from .modeling import Rotational as Rotational
 from .modeling import Thermal as Thermal
 from .modeling import Translational as Translational
 from .modeling import der as der

@@ -32,8 +32,8 @@ def simulate(
     t0: Any = 0.0,
     ts: Any = None,
     solver: diffrax.AbstractSolver | None = None,
-    rtol: float = 1e-6,
-    atol: float = 1e-8,
+    rtol: Any = 1e-6,
+    atol: Any = 1e-8,
     inputs: Mapping[str, Any] | None = None,
     initial: Mapping[str, Any] | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
@@ -90,7 +90,8 @@ def simulate(
             "stepsize_controller=ConstantStepSize() needs a step: use diffrax.StepTo(ts=jnp.linspace(t0, t1, n))"
         )
     if jump_ts is not None:
-        stepsize_controller = diffrax.ClipStepSizeController(stepsize_controller, jump_ts=jnp.asarray(jump_ts, dtype))
+        adaptive: Any = stepsize_controller
+        stepsize_controller = diffrax.ClipStepSizeController(adaptive, jump_ts=jnp.asarray(jump_ts, dtype))
     options = (
         solver,
         adjoint if adjoint is not None else default_adjoint(system.plan.n_state),
@@ -117,6 +118,7 @@ def simulate(
         if throw:
             x = result.error_if(x, ~diffrax.is_okay(result))
         return Solution(saved, x, system, inputs, stats, result, chosen, reason)
+    last: Any
     found, (saved, x, last, stats, result) = outcome
     if throw:
         check_parameters(system)
@@ -129,8 +131,9 @@ def simulate(
     if throw and not bool(diffrax.is_okay(result)):
         names = [*system.states, *system.carried]
         if _is_implicit(solver):
-            problem = _term(system, solver), inputs, *last
-            raise SimulationError(explain_failure(*problem, solution, names, max_steps, rtol, atol))
+            t, y = last
+            term = _term(system, solver)
+            raise SimulationError(explain_failure(term, inputs, t, y, solution, names, max_steps, rtol, atol))
         raise SimulationError(_explain(solution, found.x, float(t0), float(t1), max_steps, rtol, atol))
     return solution
 
@@ -264,7 +267,7 @@ def _is_traced(tree: Any) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
-def _explain(solution: Solution, x0: Any, t0: float, t1: float, max_steps: int, rtol: float, atol: float) -> str:
+def _explain(solution: Solution, x0: Any, t0: float, t1: float, max_steps: int, rtol: Any, atol: Any) -> str:
     system, x = solution.system, np.asarray(solution.states)
     slope = np.asarray(system.vector_field(t0, x0, solution.inputs))
     if not np.isfinite(slope).all():

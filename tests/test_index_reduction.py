@@ -1,8 +1,5 @@
 """Index reduction, matching and exact cancellation, on the literature's own examples and on random structures."""
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -10,6 +7,7 @@ import sympy
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.sparse.csgraph import maximum_bipartite_matching
+from testset import PROBLEMS
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, StructuralError, der, simulate
 from jaxonomy_dae.compiler.match import maximum_matching
@@ -19,8 +17,6 @@ from jaxonomy_dae.library.electrical import Capacitor, Ground, Inductor, Resisto
 from jaxonomy_dae.library.translational import FixedPosition, Mass, Rod
 
 EV = EqnEnv()
-# The transistor amplifier of the Bari test set (Mazzia & Magherini 2008, II-14): parameters, starts, end values.
-AMPLIFIER = json.loads((Path(__file__).parent / "data" / "transamp.json").read_text())
 
 
 def compiled(*components, **options):
@@ -207,48 +203,11 @@ def test_rigid_rod_between_masses():
 # --- cancellation that structure cannot see --------------------------------------------------------------------
 
 
-class Amplifier(Component):
-    """The transistor amplifier, equations as published."""
-
-    def __init__(self, name):
-        super().__init__(EV, name)
-        p = {k: self.parameter(k, v) for k, v in AMPLIFIER["parameters"].items()}
-        starts = AMPLIFIER["y0"]
-        y = [None] + [self.variable(f"y{i + 1}", start=starts[i], fixed=True) for i in range(8)]
-
-        def g(x):
-            return p["beta"] * (sympy.exp(x / p["UF"]) - 1)
-
-        ue = sympy.sin(200 * sympy.pi * EV.t) / 10
-        d = [None] + [der(v) for v in y[1:]]
-        self.add_equations(
-            p["C1"] * (d[2] - d[1]) - (y[1] - ue) / p["R0"],
-            p["C1"] * (d[1] - d[2])
-            - (-p["Ub"] / p["R2"] + y[2] * (1 / p["R1"] + 1 / p["R2"]) + (1 - p["alpha"]) * g(y[2] - y[3])),
-            -p["C2"] * d[3] - (y[3] / p["R3"] - g(y[2] - y[3])),
-            p["C3"] * (d[5] - d[4]) - ((y[4] - p["Ub"]) / p["R4"] + p["alpha"] * g(y[2] - y[3])),
-            p["C3"] * (d[4] - d[5])
-            - (-p["Ub"] / p["R6"] + y[5] * (1 / p["R5"] + 1 / p["R6"]) + (1 - p["alpha"]) * g(y[5] - y[6])),
-            -p["C4"] * d[6] - (y[6] / p["R7"] - g(y[5] - y[6])),
-            p["C5"] * (d[8] - d[7]) - ((y[7] - p["Ub"]) / p["R8"] + p["alpha"] * g(y[5] - y[6])),
-            p["C5"] * (d[7] - d[8]) - y[8] / p["R9"],
-        )
-
-
 def test_transistor_amplifier_has_five_degrees_of_freedom():
     # Structural index 0, true index 1, five degrees of freedom (Mazzia & Magherini 2008; rank of M is 5).
-    system = compiled(Amplifier("amp"))
+    system = PROBLEMS["transamp"].compile()
     assert system.report.degrees_of_freedom == 5
     assert len(system.report.notes) == 3 and all("cancel" in note for note in system.report.notes)
-
-
-@pytest.mark.slow
-def test_transistor_amplifier_end_values():
-    system = compiled(Amplifier("amp"))
-    solution = simulate(system, 0.2, ts=np.array([0.2]), rtol=1e-8, atol=1e-10, max_steps=100_000)
-    found = np.array([float(solution[f"amp.y{i + 1}"][0]) for i in range(8)])
-    # Published end values, 11.8 digits confirmed; the local tolerance 1e-8 over 4,000 steps leaves 50 × of it.
-    np.testing.assert_allclose(found, AMPLIFIER["y_end"], atol=50 * 1e-8, rtol=0)
 
 
 def test_dependent_equations_are_named():

@@ -6,6 +6,7 @@ from .environment import EqnEnv as EqnEnv
 from .neural import NeuralDAEBlock as NeuralDAEBlock
 from .ports import Domain as Domain
 from .ports import Electrical as Electrical
+from .ports import Rotational as Rotational
 from .ports import Thermal as Thermal
 from .ports import Translational as Translational
 from .symbols import Eq as Eq
