@@ -30,7 +30,7 @@ def solve_dae(
     t0: Any = 0.0,
     ts: Any = None,
     solver: diffrax.AbstractSolver | None = None,
-    rtol: float = 1e-6,
+    rtol: Any = 1e-6,
     atol: Any = 1e-8,
     args: Any = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
