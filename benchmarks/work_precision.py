@@ -1,6 +1,6 @@
 """Work and precision on eleven published DAE problems, beside SUNDIALS IDA, CasADi's IDAS and SciPy's Radau.
 
-    python benchmarks/work_precision.py                                   # everything: an hour
+    python benchmarks/work_precision.py                                   # everything: long
     python benchmarks/work_precision.py -p robertson andrews -s bdf idas  # some problems and solvers
     python benchmarks/work_precision.py -t 1e-4 1e-6                      # some tolerances
 

@@ -236,7 +236,7 @@ def ravel_like(y: Any) -> Any:
 
 def _advance(phi: Any, e: Any, order: Any, max_order: int) -> Any:
     """The differences after a step: φ*_k + e, and below it sums; e itself is kept where order k + 1 would read it."""
-    rows = jnp.arange(ROWS)[:, None]
+    rows = jnp.arange(ROWS, dtype=order.dtype)[:, None]
     inside = jnp.where(rows <= order, phi, 0) + jnp.where(rows == order, 1, 0) * e
     sums = jnp.cumsum(inside[::-1], axis=0)[::-1]
     out = jnp.where(rows <= order, sums, phi)

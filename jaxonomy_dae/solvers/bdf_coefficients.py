@@ -25,7 +25,7 @@ class Coefficients(NamedTuple):
 def coefficients(h: Any, psi: Any, order: Any) -> Coefficients:
     """The coefficients for a step of size h after steps with the sums `psi`."""
     rows = psi.shape[0]
-    index = jnp.arange(rows)
+    index = jnp.arange(rows, dtype=order.dtype)
     inside = index <= order
     one = jnp.ones((1,), psi.dtype)
     new = jnp.concatenate([h[None], psi[:-1] + h])
@@ -47,4 +47,4 @@ def interpolate(after: Any, psi: Any, order: Any) -> Any:
     shifted = jnp.concatenate([jnp.zeros((1,), psi.dtype), psi[: rows - 2]])
     factors = (after + shifted) / psi[: rows - 1]
     weight = jnp.concatenate([jnp.ones((1,), psi.dtype), jnp.cumprod(factors)])
-    return jnp.where(jnp.arange(rows) <= order, weight, 0)
+    return jnp.where(jnp.arange(rows, dtype=order.dtype) <= order, weight, 0)

@@ -98,7 +98,9 @@ def implicit_step(
                 change = -scale * linear.apply(factor, None, residual(y))
                 size = norm(change * weight)
                 first = jnp.where(m == 0, size, first)
-                rate = jnp.where(m == 0, 0.0, (size / jnp.where(first == 0, 1, first)) ** (1 / jnp.maximum(m, 1)))
+                rate = jnp.where(
+                    m == 0, 0.0, (size / jnp.where(first == 0, 1, first)) ** (1 / jnp.maximum(m, 1).astype(dtype))
+                )
                 failed = ~jnp.isfinite(size) | (rate > DIVERGED)
                 contraction = jnp.where(m == 0, contraction, jnp.where(failed, contraction, rate / (1 - rate)))
                 small = jnp.where(m == 0, size <= 1e-4 * CONVERGED, False)
@@ -110,10 +112,17 @@ def implicit_step(
                 return ~done & ~failed & (m < max_iterations)
 
             zero = jnp.zeros((), dtype)
-            start = (predicted, jnp.array(0), zero, contraction.astype(dtype), jnp.array(False), jnp.array(False))
+            start = (
+                predicted,
+                jnp.array(0, jnp.int32),
+                zero,
+                contraction.astype(dtype),
+                jnp.array(False),
+                jnp.array(False),
+            )
             y, m, _, contraction, done, _ = jax.lax.while_loop(going, iterate, start)
             contraction = contraction.astype(cj.dtype)
-            out = y, factor, factor_cj, contraction, made + renew, iterations + m
+            out = y, factor, factor_cj, contraction, made + renew.astype(jnp.int32), iterations + m
             return done, out
 
         def body(carry):

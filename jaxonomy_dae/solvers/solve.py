@@ -66,7 +66,7 @@ def solve_dae(
     - `InitializationError` for an inconsistent start, or an index above 1;
     - `SimulationError` if the integration fails, with the time and the worst unknowns by name.
     """
-    y0 = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.result_type(leaf, jnp.float32)), y0)
+    y0 = jax.tree.map(_inexact, y0)
     dtype = jnp.result_type(*jax.tree.leaves(y0))
     check_tolerances(rtol, atol, dtype)
     n = sum(leaf.size for leaf in jax.tree.leaves(y0))
@@ -98,6 +98,12 @@ def solve_dae(
         if solution.result != OK:
             raise SimulationError(explain_failure(term, args, *last, solution, known, max_steps, rtol, atol))
     return solution
+
+
+def _inexact(leaf: Any) -> Any:
+    """An array of floating-point numbers; integers become the default kind."""
+    array = jnp.asarray(leaf)
+    return array if jnp.issubdtype(array.dtype, jnp.inexact) else array.astype(jnp.zeros(()).dtype)
 
 
 OK = diffrax.RESULTS.successful
@@ -201,7 +207,7 @@ def consistent_start(
 
     Differentiable with respect to `args` and y0.
     """
-    y0 = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.result_type(leaf, jnp.float32)), y0)
+    y0 = jax.tree.map(_inexact, y0)
     from .index_one import consistent_shift
 
     problem = FlatProblem(term, y0, args)
