@@ -111,7 +111,8 @@ def find_root(
     def evaluate(state: _Machine) -> _Machine:
         x = state.points[0, :n]
         jacobian, value = jax.jacfwd(lambda y: (function(y),) * 2, has_aux=True)(x)
-        jacobian = jacobian * unit[:n]
+        # What a function of the user's closes over may be differentiated elsewhere: not in here.
+        value, jacobian = jax.lax.stop_gradient((value, jacobian * unit[:n]))
         worst = jnp.max(jnp.abs(value), initial=0.0)
         return advance(state, value, jacobian, worst <= close(x), worst <= enough(x))
 

@@ -73,7 +73,7 @@ def initialize(
         return jnp.concatenate(parts)
 
     frozen = jax.lax.stop_gradient
-    settings = frozen((parameters, frozen_inputs(inputs), target))
+    settings = (frozen(parameters), frozen_inputs(inputs), frozen(target))
     start = frozen(jnp.append(x0, parameters[unknown]) if len(unknown) else x0)
     scale = np.append(plan.nominal, np.ones(len(unknown)))
     core = independent_rows(plan, rows, len(start))

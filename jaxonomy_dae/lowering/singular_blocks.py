@@ -266,7 +266,7 @@ def _estimate(matrix: np.ndarray) -> float:
 
 
 def _finding(plan: SystemPlan, values: _Values, step: Step, b: int, condition, singular, left, right) -> BlockFinding:
-    names = [plan.quantity_name[int(u[b])] for u in step.unknown]
+    names = [plan.quantity_name[int(u[b])].removeprefix("-") for u in step.unknown]
     texts = [equation_text(plan, int(e.equation[b])) for e in step.equations]
     chosen = np.flatnonzero(np.abs(right).max(axis=1, initial=0.0) > 1e-3)
     dependent = np.flatnonzero(np.abs(left).max(axis=1, initial=0.0) > 1e-3)
@@ -282,14 +282,14 @@ def _causes(plan: SystemPlan, values: _Values, step: Step, b: int, left, right) 
     null vectors u and v."""
     before = values.jacobian(step)[b]
 
-    def matters(after: np.ndarray) -> bool:
+    def matters(after: np.ndarray, anyhow: bool = False) -> bool:
         change = after - before
         if not np.isfinite(change).all():
             return True
         scale = np.abs(change).max(initial=0.0)
         if scale == 0.0:
             return False
-        return left.shape[1] == 0 or bool(np.abs(left.T @ (change / scale) @ right).max(initial=0.0) > 1e-9)
+        return anyhow or not left.shape[1] or bool(np.abs(left.T @ (change / scale) @ right).max() > 1e-9)
 
     found: list[tuple[str, float]] = []
     for p in sorted({int(p) for e in step.equations for p in e.parameter[b]}):
@@ -302,14 +302,20 @@ def _causes(plan: SystemPlan, values: _Values, step: Step, b: int, left, right) 
     if zero:
         return tuple(zero)
     moved: list[tuple[str, float]] = []
+    touched: list[tuple[str, float]] = []  # where it is of the second order
     sources = {int(e.slots[s].quantity[b]) for e in step.equations for s in _slots_of_partials(e)} - {ZERO}
     for q in sorted(sources):
         kept = values.quantities[q]
         values.quantities[q] = kept + 1e-3 * max(1.0, abs(kept))
-        if matters(values.jacobian(step)[b]):
-            moved.append((plan.quantity_name[q], float(kept)))
+        after = values.jacobian(step)[b]
         values.quantities[q] = kept
-    return tuple([c for c in moved if c[1] == 0.0] or found or moved)
+        name = plan.quantity_name[q]
+        named = (name.removeprefix("-"), float(-kept if name.startswith("-") else kept) + 0.0)
+        if matters(after):
+            moved.append(named)
+        elif kept == 0.0 and matters(after, anyhow=True):
+            touched.append(named)
+    return tuple([c for c in moved if c[1] == 0.0] or found or moved or touched)
 
 
 def _constraints(plan: SystemPlan, values: _Values) -> Iterator[BlockFinding]:
@@ -347,7 +353,7 @@ def _constraints(plan: SystemPlan, values: _Values) -> Iterator[BlockFinding]:
     states = np.flatnonzero(np.abs(matrix[dependent]).max(axis=0, initial=0.0) > 0)
     if not len(states):
         states = np.array(sorted({k for r in dependent for k in plan.constraint_pattern[r]}), np.int64)
-    names = tuple(plan.quantity_name[int(plan.states[k])] for k in states)
+    names = tuple(plan.quantity_name[int(plan.states[k])].removeprefix("-") for k in states)
     singular = condition >= 1 / (4 * m * np.finfo(float).eps)
     at = tuple((name, float(values.quantities[plan.states[k]])) for name, k in zip(names, states, strict=True))
     yield BlockFinding(float(condition), singular, m, names, tuple(texts[e] for e in dependent), at, False)
