@@ -10,6 +10,7 @@ from sympy import Eq, atan
 
 from jaxonomy_dae import Component, EqnEnv, InitializationError, der, simulate
 from jaxonomy_dae.lowering.initialization_methods import METHODS, find_root
+from jaxonomy_dae.lowering.initialize import find_initial, is_consistent
 
 # x³ − 2x + 2 = 0 has one real root, by Cardano's formula; |F| has a local minimum at √(2/3), where F = 2 − (4/3)√(2/3).
 CARDANO = -np.cbrt(1 + np.sqrt(19 / 27)) - np.cbrt(1 - np.sqrt(19 / 27))
@@ -142,18 +143,34 @@ def test_one_member_that_fails_does_not_disturb_the_others():
     system = compiled(Law(EqnEnv(), "c", lambda z: z**2 + 1, p=2.0, z=3.0))
     p = jnp.array([2.0, 0.5, 5.0])
 
-    def run(p):
-        solution = simulate(system.with_parameters({"c.p": p}), 0.1, ts=jnp.array([0.1]), throw=False)
-        return solution["c.z"][0], solution.result
+    def start(p):
+        changed = system.with_parameters({"c.p": p})
+        found = find_initial(changed, 0.0, None, None)
+        return changed.observe("c.z", 0.0, found.x), is_consistent(found)
 
     def total(p):
-        z, result = jax.vmap(run)(p)
-        return z[0] + z[2], (z, diffrax.is_okay(result))
+        z, good = jax.vmap(start)(p)
+        return z[0] + z[2], (z, good)
 
-    # z² = p·x − 1 and dx/dt = −z: z falls by p/2 per time, from √(p − 1).
-    (_, (z, okay)), slope = jax.jit(jax.value_and_grad(total, has_aux=True))(p)
-    np.testing.assert_allclose(z[jnp.array([0, 2])], [1.0 - 0.1, 2.0 - 0.25], rtol=1e-6)
-    assert okay.tolist() == [True, False, True]
-    np.testing.assert_allclose(slope, [1 / 2 - 0.05, 0.0, 1 / 4 - 0.05], rtol=1e-5, atol=1e-12)
+    (_, (z, good)), slope = jax.jit(jax.value_and_grad(total, has_aux=True))(p)
+    np.testing.assert_allclose(z[jnp.array([0, 2])], [1.0, 2.0], rtol=1e-12)  # √(p − 1)
+    assert good.tolist() == [True, False, True]
+    np.testing.assert_allclose(slope, [1 / 2, 0.0, 1 / 4], rtol=1e-12, atol=1e-12)
     with pytest.raises(InitializationError, match=r"worst first:\n  c: .*c\.z.*: off by 0\.5"):
         system.with_parameters({"c.p": 0.5}).initialize()
+
+
+@pytest.mark.slow
+def test_a_run_from_an_inconsistent_start_is_no_success():
+    system = compiled(Law(EqnEnv(), "c", lambda z: z**2 + 1, p=2.0, z=3.0))
+
+    @jax.jit
+    @jax.vmap
+    def run(p):
+        solution = simulate(system.with_parameters({"c.p": p}), 0.1, ts=jnp.array([0.1]), throw=False)
+        return solution["c.z"][0], diffrax.is_okay(solution.result)
+
+    z, okay = run(jnp.array([2.0, 0.5, 5.0]))
+    # z² = p·x − 1 and dx/dt = −z: z falls by p/2 per time, from √(p − 1).
+    np.testing.assert_allclose(z[jnp.array([0, 2])], [1.0 - 0.1, 2.0 - 0.25], rtol=1e-6)
+    assert okay.tolist() == [True, False, True]

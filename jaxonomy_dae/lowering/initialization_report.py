@@ -148,7 +148,8 @@ class InitializationReport:
         size = np.abs(self._residual)
         order = np.argsort(np.where(np.isfinite(size), -size, -np.inf), kind="stable")
         described = self._described()
-        return [Residual(*described[k], float(self._residual[k])) for k in order if not size[k] <= self._limit]
+        chosen = [int(k) for k in order if not size[k] <= self._limit]
+        return [Residual(described[k][0], described[k][1], float(self._residual[k])) for k in chosen]
 
     def _described(self) -> list[tuple[str, tuple[str, ...]]]:
         """The text and the variables of every row, as `initialize` orders them."""

@@ -24,6 +24,8 @@ from .schedule import Step, StepEquation
 
 DENSE_LIMIT = 200  # unknowns up to which a block gets a singular value decomposition
 ILL_CONDITIONED = 1e12
+TINY = 1e-300
+PASSES = 5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -220,9 +222,11 @@ def examine_blocks(
     yield from _constraints(plan, values)
 
 
-def _equilibrated(matrix: np.ndarray) -> np.ndarray:
+def _equilibrated(matrix: np.ndarray, passes: int) -> np.ndarray:
     """Matrices (n, rows, columns) with rows and columns scaled to a largest entry near 1 (Ruiz 2001)."""
-    for _ in range(5):
+    matrix = matrix / (np.abs(matrix).max(axis=2, keepdims=True, initial=0.0) + TINY)
+    matrix = matrix / (np.abs(matrix).max(axis=1, keepdims=True, initial=0.0) + TINY)
+    for _ in range(passes):
         rows, columns = np.abs(matrix).max(axis=2, initial=0.0), np.abs(matrix).max(axis=1, initial=0.0)
         rows, columns = np.sqrt(np.where(rows > 0, rows, 1.0)), np.sqrt(np.where(columns > 0, columns, 1.0))
         matrix = matrix / rows[:, :, None] / columns[:, None, :]
@@ -235,14 +239,17 @@ def _conditions(matrices: np.ndarray):
     if k == 1:
         # A single coefficient has no scale but zero.
         return np.where(matrices[:, 0, 0] == 0, np.inf, 1.0), lambda b: np.ones((1, 1)), lambda b: np.ones((1, 1))
-    finite = np.isfinite(matrices).all(axis=(1, 2))
+    finite = np.atleast_1d(np.isfinite(matrices).all(axis=(1, 2)))
     # What is not finite has another cause than rank, and is reported as such.
-    scaled = _equilibrated(np.where(finite[:, None, None], matrices, np.eye(k)))
+    matrices = np.where(finite[:, None, None], matrices, np.eye(k))
     if k > DENSE_LIMIT:
-        return np.array([_estimate(a) for a in scaled]), lambda b: np.zeros((k, 0)), lambda b: np.zeros((k, 0))
-    singular = np.linalg.svd(scaled, compute_uv=False)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        condition = np.where(singular[:, -1] > 0, singular[:, 0] / singular[:, -1], np.inf)
+        condition = np.array([_estimate(a) for a in _equilibrated(matrices, PASSES)])
+        return condition, lambda b: np.zeros((k, 0)), lambda b: np.zeros((k, 0))
+    scaled = _equilibrated(matrices, 0)
+    condition = _ratio(np.linalg.svd(scaled, compute_uv=False))
+    if not (condition < ILL_CONDITIONED).all():  # perhaps for want of better scaling
+        scaled = _equilibrated(matrices, PASSES)
+        condition = _ratio(np.linalg.svd(scaled, compute_uv=False))
 
     def null(b: int, transposed: bool) -> np.ndarray:
         u, s, vt = np.linalg.svd(scaled[b])
@@ -252,17 +259,22 @@ def _conditions(matrices: np.ndarray):
     return condition, lambda b: null(b, True), lambda b: null(b, False)
 
 
+def _ratio(singular: np.ndarray) -> np.ndarray:
+    """Condition numbers from singular values, shape (n, k)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(singular[:, -1] > 0, singular[:, 0] / singular[:, -1], np.inf)
+
+
 def _estimate(matrix: np.ndarray) -> float:
     """A lower bound of a large block's condition number, by a sparse factorization (Hager 1984)."""
+    linalg: Any = scipy.sparse.linalg
     sparse = sp.csc_array(matrix)
     try:
-        factors = scipy.sparse.linalg.splu(sparse)
+        factors = linalg.splu(sparse)
     except RuntimeError:
         return np.inf
-    inverse = scipy.sparse.linalg.LinearOperator(
-        matrix.shape, matvec=factors.solve, rmatvec=lambda v: factors.solve(v, trans="T")
-    )
-    return float(scipy.sparse.linalg.onenormest(sparse) * scipy.sparse.linalg.onenormest(inverse, t=1))
+    inverse = linalg.LinearOperator(matrix.shape, matvec=factors.solve, rmatvec=lambda v: factors.solve(v, trans="T"))
+    return float(linalg.onenormest(sparse) * linalg.onenormest(inverse, t=1))
 
 
 def _finding(plan: SystemPlan, values: _Values, step: Step, b: int, condition, singular, left, right) -> BlockFinding:
@@ -344,7 +356,7 @@ def _constraints(plan: SystemPlan, values: _Values) -> Iterator[BlockFinding]:
         row += len(group)
     if not np.isfinite(matrix).all():
         return
-    u, s, _ = np.linalg.svd(_equilibrated(matrix[None])[0])
+    u, s, _ = np.linalg.svd(_equilibrated(matrix[None], PASSES if m > 1 else 0)[0])
     s = np.append(s, np.zeros(max(0, m - len(s))))[:m]
     condition = np.inf if s[-1] == 0 else s[0] / s[-1]
     if condition < ILL_CONDITIONED:
