@@ -23,7 +23,7 @@ def climb(function, start, core="all"):
     chosen = np.arange(start.shape[0]) if core == "all" and m >= start.shape[0] else None
     close = lambda x: 2e-13 * (1 + jnp.max(jnp.abs(x)))  # noqa: E731
     enough = lambda x: 4e-10 * (1 + jnp.max(jnp.abs(x)))  # noqa: E731
-    found = jax.jit(lambda x: find_root(function, x, np.ones(len(start)), chosen, close, enough))(start)
+    found = jax.jit(lambda x: find_root(function, m, x, np.ones(len(start)), chosen, close, enough))(start)
     return np.asarray(found.x), METHODS[int(found.method)], float(jnp.abs(function(found.x)).max())
 
 
@@ -88,7 +88,7 @@ def test_members_of_a_batch_are_on_their_own_rungs():
     @jax.vmap
     def roots(start):
         function = lambda x: x**3 - 2 * x + 2  # noqa: E731
-        found = find_root(function, start, np.ones(1), np.arange(1), lambda x: 1e-13, lambda x: 1e-10)
+        found = find_root(function, 1, start, np.ones(1), np.arange(1), lambda x: 1e-13, lambda x: 1e-10)
         return found.x, found.method
 
     x, method = roots(starts)

@@ -71,6 +71,7 @@ class _Scalars(NamedTuple):
 
 def find_root(
     function: Callable[[Any], Any],
+    m: int,
     start: Any,
     scale: np.ndarray,
     core: np.ndarray | None,
@@ -81,7 +82,7 @@ def find_root(
 
     **Arguments:**
 
-    - `function`: F, from shape (n,) to (m,).
+    - `function`: F, from shape (n,) to `(m,)`.
     - `start`: where every rung starts, shape (n,).
     - `scale`: the typical size of each unknown.
     - `core`: n rows of F that are independent and determine x, for the homotopy; None leaves that rung out.
@@ -89,10 +90,9 @@ def find_root(
         zero where rounding prevents more.
     """
     dtype, n = start.dtype, start.shape[0]
-    m = jax.eval_shape(function, start).shape[0]
     eps = float(jnp.finfo(dtype).eps)
     where, one = jnp.where, jnp.ones((), dtype)
-    unit = jnp.append(jnp.maximum(jnp.asarray(scale, dtype), jnp.abs(start)), one)
+    unit = jnp.asarray(np.append(scale, 1.0), dtype)
     origin = jnp.append(start, 0 * one)
     along = np.append(np.zeros(n), 1.0)  # the direction of s
     # The first border: no direction of its own, so that it is regular where the Jacobian at the start is not.
@@ -102,10 +102,10 @@ def find_root(
     floor = 0.0 if m >= n else 1e2 * eps  # with fewer equations than unknowns, steps of least norm
 
     def packed(*scalars) -> Any:
-        place = jax.lax.iota(jnp.int32, len(scalars))
+        place = np.arange(len(scalars))  # selects, unlike a stack, become one kernel
         out = jnp.zeros((len(scalars),), dtype)
         for k, s in enumerate(scalars):
-            out = where(place == k, jnp.asarray(s, dtype), out)
+            out = where(jnp.asarray(place == k), jnp.asarray(s, dtype), out)
         return out
 
     def evaluate(state: _Machine) -> _Machine:
@@ -154,7 +154,7 @@ def find_root(
         stacked = jnp.concatenate([
             jnp.concatenate([matrix, curve[:, None], -short[:, None], jnp.zeros((m, 1), dtype)], axis=1),
             jnp.concatenate([border, jnp.asarray([0.0, 1.0], dtype)])[None, :],
-            shift * jnp.eye(n + 1, n + 3, dtype=dtype),
+            shift * jnp.asarray(np.eye(n + 1, n + 3), dtype),
         ])  # fmt: skip
         r = jnp.linalg.qr(stacked, mode="raw")[0].T[: n + 1]  # below the diagonal lie the reflections, not read
         solved = jax.scipy.linalg.solve_triangular(r[:, : n + 1], r[:, n + 1 :])
@@ -227,7 +227,9 @@ def find_root(
 
     begin = _Scalars(_NEWTON, FAILED, True, 0, 0, 1.0, 1.0, 0.0, 0.0, False, 1.0, 0)
     points = jnp.stack([origin, origin, origin, along])
-    state = _Machine(packed(*begin), points, jnp.ones((3, m), dtype), jnp.zeros((m, n), dtype))
+    state = _Machine(
+        jnp.asarray([float(v) for v in begin], dtype), points, jnp.ones((3, m), dtype), jnp.zeros((m, n), dtype)
+    )
     state = jax.lax.while_loop(lambda s: s.scalars[0] < _DONE, evaluate, state)
     s = _Scalars(*state.scalars)
     found = where(s.phase == _DONE, state.points[1], state.points[2])[:n]

@@ -82,6 +82,7 @@ def initialize(
     found = frozen(
         find_root(
             lambda w: residual(w, *settings),
+            plan.n_constraints + len(plan.carried) + len(rows.kept),
             start,
             scale,
             core,
@@ -93,7 +94,7 @@ def initialize(
     # Where nothing was found, there is nothing to differentiate, and the others of a batch must not notice.
     good = found.method < FAILED
     w = found.x - _least_squares(
-        jnp.where(good, found.jacobian, jnp.eye(*found.jacobian.shape, dtype=point.dtype)),
+        jnp.where(good, found.jacobian, jnp.asarray(np.eye(*found.jacobian.shape), point.dtype)),
         jnp.where(good, remaining, jnp.zeros_like(remaining)),
     )
     full = jnp.concatenate([jnp.zeros((remaining.shape[0] - target.shape[0],), point.dtype), target])
