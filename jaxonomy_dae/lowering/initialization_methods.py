@@ -225,7 +225,7 @@ def find_root(
         ])  # fmt: skip
         return _Machine(scalars, points, jnp.stack([value, first, w]), jacobian)
 
-    begin = _Scalars(_NEWTON, FAILED, True, 0, 0, 1.0, 1.0, 0.0, 0.0, False, 1.0, 0)
+    begin = _Scalars(_NEWTON, FAILED, 1.0, 0, 0, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0)
     points = jnp.stack([origin, origin, origin, along])
     state = _Machine(
         jnp.asarray([float(v) for v in begin], dtype), points, jnp.ones((3, m), dtype), jnp.zeros((m, n), dtype)
