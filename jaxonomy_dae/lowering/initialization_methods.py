@@ -92,7 +92,7 @@ def find_root(
     dtype, n = start.dtype, start.shape[0]
     eps = float(jnp.finfo(dtype).eps)
     where, one = jnp.where, jnp.ones((), dtype)
-    unit = jnp.asarray(np.append(scale, 1.0), dtype)
+    unit = jnp.append(jnp.maximum(jnp.asarray(scale, dtype), jnp.abs(start)), one)
     origin = jnp.append(start, 0 * one)
     along = np.append(np.zeros(n), 1.0)  # the direction of s
     # The first border: no direction of its own, so that it is regular where the Jacobian at the start is not.
