@@ -181,7 +181,7 @@ def _compiled(arguments):
 
 def _with_start(found, result):
     """The result of an integration, a failure if it began at an inconsistent point."""
-    failure = diffrax.RESULTS.nonlinear_divergence
+    failure: Any = diffrax.RESULTS.nonlinear_divergence
     return diffrax.RESULTS.where(is_consistent(found), result, failure)
 
 

@@ -67,12 +67,13 @@ class _Open:
             out[row.quantity] = 1.0
         if row.start is not None and row.given < 0 and set(row.start.parameters) & set(self.solve_for):
             start = row.start
-            values = [jnp.asarray(self.values[k]) for k in start.parameters]
             with jax.ensure_compile_time_eval():
-                slope = jax.grad(lambda v: jnp.asarray(start.template.residual([], v, [], jnp.zeros(()), None)))(values)
+                values = [jnp.asarray(self.values[k]) for k in start.parameters]
+                slopes = jax.grad(lambda v: jnp.asarray(start.template.residual([], v, [], jnp.zeros(()), None)))
+                slope = [float(s) for s in slopes(values)]
             for k, parameter in enumerate(start.parameters):
                 if parameter in self.solve_for:
-                    out[self.n + self.solve_for.index(parameter)] -= row.sign * float(slope[k])
+                    out[self.n + self.solve_for.index(parameter)] -= row.sign * slope[k]
         return out
 
 
@@ -279,8 +280,8 @@ def _check_count(plan: SystemPlan, opened: _Open, directions: _Directions, redun
         more = "a value" if len(given) == 1 else f"{len(given)} values"
         raise InitializationError(
             f"solve_for: {more} too many for {len(wanted)} unknown parameter{'s' * (len(wanted) > 1)} "
-            f"({_some(wanted)}): {_some([r.name for r in given])} follow{'s' * (len(given) == 1)} from the others "
-            f"given. Leave {'it' if len(given) == 1 else 'them'} out{others}."
+            f"({_some(wanted)}): {_some([r.name for r in given])} follow{'s' * (len(given) == 1)} from the others. "
+            f"Leave {'it' if len(given) == 1 else 'them'} out{others}."
         )
     left = np.linalg.norm(directions.free[opened.n :], axis=1)
     undetermined = [w for w, size in zip(wanted, left, strict=True) if size >= OPEN]

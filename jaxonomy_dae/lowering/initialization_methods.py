@@ -71,6 +71,7 @@ class _Scalars(NamedTuple):
 
 def find_root(
     function: Callable[[Any], Any],
+    m: int,
     start: Any,
     scale: np.ndarray,
     core: np.ndarray | None,
@@ -81,7 +82,7 @@ def find_root(
 
     **Arguments:**
 
-    - `function`: F, from shape (n,) to (m,).
+    - `function`: F, from shape (n,) to `(m,)`.
     - `start`: where every rung starts, shape (n,).
     - `scale`: the typical size of each unknown.
     - `core`: n rows of F that are independent and determine x, for the homotopy; None leaves that rung out.
@@ -89,7 +90,6 @@ def find_root(
         zero where rounding prevents more.
     """
     dtype, n = start.dtype, start.shape[0]
-    m = jax.eval_shape(function, start).shape[0]
     eps = float(jnp.finfo(dtype).eps)
     where, one = jnp.where, jnp.ones((), dtype)
     unit = jnp.append(jnp.maximum(jnp.asarray(scale, dtype), jnp.abs(start)), one)
@@ -102,16 +102,17 @@ def find_root(
     floor = 0.0 if m >= n else 1e2 * eps  # with fewer equations than unknowns, steps of least norm
 
     def packed(*scalars) -> Any:
-        place = jax.lax.iota(jnp.int32, len(scalars))
+        place = np.arange(len(scalars))  # selects, unlike a stack, become one kernel
         out = jnp.zeros((len(scalars),), dtype)
         for k, s in enumerate(scalars):
-            out = where(place == k, jnp.asarray(s, dtype), out)
+            out = where(jnp.asarray(place == k), jnp.asarray(s, dtype), out)
         return out
 
     def evaluate(state: _Machine) -> _Machine:
         x = state.points[0, :n]
         jacobian, value = jax.jacfwd(lambda y: (function(y),) * 2, has_aux=True)(x)
-        jacobian = jacobian * unit[:n]
+        # What a function of the user's closes over may be differentiated elsewhere: not in here.
+        value, jacobian = jax.lax.stop_gradient((value, jacobian * unit[:n]))
         worst = jnp.max(jnp.abs(value), initial=0.0)
         return advance(state, value, jacobian, worst <= close(x), worst <= enough(x))
 
@@ -153,7 +154,7 @@ def find_root(
         stacked = jnp.concatenate([
             jnp.concatenate([matrix, curve[:, None], -short[:, None], jnp.zeros((m, 1), dtype)], axis=1),
             jnp.concatenate([border, jnp.asarray([0.0, 1.0], dtype)])[None, :],
-            shift * jnp.eye(n + 1, n + 3, dtype=dtype),
+            shift * jnp.asarray(np.eye(n + 1, n + 3), dtype),
         ])  # fmt: skip
         r = jnp.linalg.qr(stacked, mode="raw")[0].T[: n + 1]  # below the diagonal lie the reflections, not read
         solved = jax.scipy.linalg.solve_triangular(r[:, : n + 1], r[:, n + 1 :])
@@ -224,9 +225,11 @@ def find_root(
         ])  # fmt: skip
         return _Machine(scalars, points, jnp.stack([value, first, w]), jacobian)
 
-    begin = _Scalars(_NEWTON, FAILED, True, 0, 0, 1.0, 1.0, 0.0, 0.0, False, 1.0, 0)
+    begin = _Scalars(_NEWTON, FAILED, 1.0, 0, 0, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0)
     points = jnp.stack([origin, origin, origin, along])
-    state = _Machine(packed(*begin), points, jnp.ones((3, m), dtype), jnp.zeros((m, n), dtype))
+    state = _Machine(
+        jnp.asarray([float(v) for v in begin], dtype), points, jnp.ones((3, m), dtype), jnp.zeros((m, n), dtype)
+    )
     state = jax.lax.while_loop(lambda s: s.scalars[0] < _DONE, evaluate, state)
     s = _Scalars(*state.scalars)
     found = where(s.phase == _DONE, state.points[1], state.points[2])[:n]

@@ -113,7 +113,9 @@ class InitializationReport:
             if row is not None and row.given < 0 and row.start is not None:
                 values = list(parameters[list(row.start.parameters)])
                 guess = row.sign * float(row.start.template.residual([], values, [], 0.0, None, backend="numpy"))
-            out.append(Guess(plan.quantity_name[int(q)], guess, float(self._x[k])))
+            name = plan.quantity_name[int(q)]
+            sign = -1.0 if name.startswith("-") else 1.0
+            out.append(Guess(name.removeprefix("-"), sign * guess + 0.0, sign * float(self._x[k]) + 0.0))
         return out
 
     @functools.cached_property
@@ -146,12 +148,15 @@ class InitializationReport:
         size = np.abs(self._residual)
         order = np.argsort(np.where(np.isfinite(size), -size, -np.inf), kind="stable")
         described = self._described()
-        return [Residual(*described[k], float(self._residual[k])) for k in order if not size[k] <= self._limit]
+        chosen = [int(k) for k in order if not size[k] <= self._limit]
+        return [Residual(described[k][0], described[k][1], float(self._residual[k])) for k in chosen]
 
     def _described(self) -> list[tuple[str, tuple[str, ...]]]:
         """The text and the variables of every row, as `initialize` orders them."""
         plan = self._plan
-        starts = [(f"start {r.name} = {v:.6g}", (r.name,)) for r, v in zip(self._rows.kept, self._target, strict=True)]
+        starts = [
+            (f"start of {r.name}, {v:.6g}", (r.name,)) for r, v in zip(self._rows.kept, self._target, strict=True)
+        ]
         if self._rows.direct:
             return starts
         out = []
@@ -168,7 +173,7 @@ class InitializationReport:
         return out + starts
 
     def _names(self, quantities: np.ndarray) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(self._plan.quantity_name[int(q)] for q in quantities if q != ZERO))
+        return tuple(dict.fromkeys(self._plan.quantity_name[int(q)].removeprefix("-") for q in quantities if q != ZERO))
 
     # --- blocks ------------------------------------------------------------------------------------------------
 
@@ -240,7 +245,7 @@ class InitializationReport:
             )
         lines = ["no consistent initial point was found; what does not hold, worst first:"]
         for r in self.residuals[:WORST]:
-            variables = "" if r.text.startswith("start ") else f", in {_some(r.variables)}"
+            variables = "" if r.text.startswith("start of ") else f", in {_some(r.variables)}"
             lines.append(f"  {r.text}{variables}: off by {abs(r.value):.3g}")
         if len(self.residuals) > WORST:
             lines.append(f"  … and {len(self.residuals) - WORST} more")
@@ -257,16 +262,17 @@ class InitializationReport:
         causes = ", ".join(f"{n} = {v:.6g}" for n, v in block.causes[:6])
         at = f" with {causes}" if causes else ""
         if block.causes_are_parameters:
-            mend = f"Change {_some([n for n, _ in block.causes])}"
+            names = [n for n, _ in block.causes]
+            mend = f"Give {names[0]} another value" if len(names) == 1 else f"Give one of {_some(names)} another value"
         else:
-            mend = "Start elsewhere, with `initial={...}`"
+            mend = "Start elsewhere, with `initial={...}` or other parameters"
         lines = [
             f"the equations are singular at the initial point{at}: they do not determine {_some(block.variables)}",
             *(f"  {text}" for text in block.equations[:SHOWN]),
         ]
         if len(block.equations) > SHOWN:
             lines.append(f"  … and {len(block.equations) - SHOWN} more")
-        lines.append(f"{mend}; or, if this is meant, remove what becomes superfluous from the model.")
+        lines.append(f"{mend}, or remove from the model what has become superfluous.")
         return "\n".join(lines)
 
     def __str__(self):

@@ -73,7 +73,7 @@ def initialize(
         return jnp.concatenate(parts)
 
     frozen = jax.lax.stop_gradient
-    settings = frozen((parameters, frozen_inputs(inputs), target))
+    settings = (frozen(parameters), frozen_inputs(inputs), frozen(target))
     start = frozen(jnp.append(x0, parameters[unknown]) if len(unknown) else x0)
     scale = np.append(plan.nominal, np.ones(len(unknown)))
     core = independent_rows(plan, rows, len(start))
@@ -82,6 +82,7 @@ def initialize(
     found = frozen(
         find_root(
             lambda w: residual(w, *settings),
+            plan.n_constraints + len(plan.carried) + len(rows.kept),
             start,
             scale,
             core,
@@ -93,7 +94,7 @@ def initialize(
     # Where nothing was found, there is nothing to differentiate, and the others of a batch must not notice.
     good = found.method < FAILED
     w = found.x - _least_squares(
-        jnp.where(good, found.jacobian, jnp.eye(*found.jacobian.shape, dtype=point.dtype)),
+        jnp.where(good, found.jacobian, jnp.asarray(np.eye(*found.jacobian.shape), point.dtype)),
         jnp.where(good, remaining, jnp.zeros_like(remaining)),
     )
     full = jnp.concatenate([jnp.zeros((remaining.shape[0] - target.shape[0],), point.dtype), target])
@@ -220,8 +221,8 @@ def check(
     there, or if a parameter solved for is out of its bounds."""
     from .initialization_report import InitializationReport  # which reads what is defined here
 
-    low, high = system.parameters.table.bounds[[system.parameters.table.index(n) for n in solve_for]].reshape(-1, 2).T
-    slack = tolerance(found.x.dtype, found.solved)
+    table = system.parameters.table
+    low, high = table.bounds[np.array([table.index(n) for n in solve_for], np.int64)].T
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((found, system, t0))):
         x = eqx.error_if(
             found.x,
@@ -229,14 +230,19 @@ def check(
             "no consistent initial point: fixed starts contradict the equations, or the search failed. "
             "system.initialization_report() outside jit gives the names",
         )
+        if not solve_for:
+            return found._replace(x=x)
+        slack = tolerance(found.x.dtype, found.solved)
         outside = ~((found.solved >= low - slack) & (found.solved <= high + slack))
         solved = eqx.error_if(found.solved, outside, f"a parameter of {list(solve_for)} is out of its bounds")
-        return found._replace(x=x, solved=solved if solve_for else found.solved)
+        return found._replace(x=x, solved=solved)
     problem = InitializationReport(system, found, t0, inputs, initial, solve_for).problem
     if problem is not None:
         raise InitializationError(problem)
-    for name, value, a, b in zip(solve_for, np.asarray(found.solved), low, high, strict=True):
-        if not a - float(slack) <= value <= b + float(slack):
+    solved = np.asarray(found.solved)
+    slack = float(tolerance(found.x.dtype, solved))
+    for name, value, a, b in zip(solve_for, solved, low, high, strict=True):
+        if not a - slack <= value <= b + slack:
             raise InitializationError(
                 f"solve_for: the values given need {name} = {value:.6g}, which is out of its bounds [{a:g}, {b:g}]. "
                 "Give other values in initial={...}, or start the search elsewhere with "

@@ -24,6 +24,8 @@ from .schedule import Step, StepEquation
 
 DENSE_LIMIT = 200  # unknowns up to which a block gets a singular value decomposition
 ILL_CONDITIONED = 1e12
+TINY = 1e-300
+PASSES = 5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -220,9 +222,11 @@ def examine_blocks(
     yield from _constraints(plan, values)
 
 
-def _equilibrated(matrix: np.ndarray) -> np.ndarray:
+def _equilibrated(matrix: np.ndarray, passes: int) -> np.ndarray:
     """Matrices (n, rows, columns) with rows and columns scaled to a largest entry near 1 (Ruiz 2001)."""
-    for _ in range(5):
+    matrix = matrix / (np.abs(matrix).max(axis=2, keepdims=True, initial=0.0) + TINY)
+    matrix = matrix / (np.abs(matrix).max(axis=1, keepdims=True, initial=0.0) + TINY)
+    for _ in range(passes):
         rows, columns = np.abs(matrix).max(axis=2, initial=0.0), np.abs(matrix).max(axis=1, initial=0.0)
         rows, columns = np.sqrt(np.where(rows > 0, rows, 1.0)), np.sqrt(np.where(columns > 0, columns, 1.0))
         matrix = matrix / rows[:, :, None] / columns[:, None, :]
@@ -235,14 +239,17 @@ def _conditions(matrices: np.ndarray):
     if k == 1:
         # A single coefficient has no scale but zero.
         return np.where(matrices[:, 0, 0] == 0, np.inf, 1.0), lambda b: np.ones((1, 1)), lambda b: np.ones((1, 1))
-    finite = np.isfinite(matrices).all(axis=(1, 2))
+    finite = np.atleast_1d(np.isfinite(matrices).all(axis=(1, 2)))
     # What is not finite has another cause than rank, and is reported as such.
-    scaled = _equilibrated(np.where(finite[:, None, None], matrices, np.eye(k)))
+    matrices = np.where(finite[:, None, None], matrices, np.eye(k))
     if k > DENSE_LIMIT:
-        return np.array([_estimate(a) for a in scaled]), lambda b: np.zeros((k, 0)), lambda b: np.zeros((k, 0))
-    singular = np.linalg.svd(scaled, compute_uv=False)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        condition = np.where(singular[:, -1] > 0, singular[:, 0] / singular[:, -1], np.inf)
+        condition = np.array([_estimate(a) for a in _equilibrated(matrices, PASSES)])
+        return condition, lambda b: np.zeros((k, 0)), lambda b: np.zeros((k, 0))
+    scaled = _equilibrated(matrices, 0)
+    condition = _ratio(np.linalg.svd(scaled, compute_uv=False))
+    if not (condition < ILL_CONDITIONED).all():  # perhaps for want of better scaling
+        scaled = _equilibrated(matrices, PASSES)
+        condition = _ratio(np.linalg.svd(scaled, compute_uv=False))
 
     def null(b: int, transposed: bool) -> np.ndarray:
         u, s, vt = np.linalg.svd(scaled[b])
@@ -252,21 +259,26 @@ def _conditions(matrices: np.ndarray):
     return condition, lambda b: null(b, True), lambda b: null(b, False)
 
 
+def _ratio(singular: np.ndarray) -> np.ndarray:
+    """Condition numbers from singular values, shape (n, k)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(singular[:, -1] > 0, singular[:, 0] / singular[:, -1], np.inf)
+
+
 def _estimate(matrix: np.ndarray) -> float:
     """A lower bound of a large block's condition number, by a sparse factorization (Hager 1984)."""
+    linalg: Any = scipy.sparse.linalg
     sparse = sp.csc_array(matrix)
     try:
-        factors = scipy.sparse.linalg.splu(sparse)
+        factors = linalg.splu(sparse)
     except RuntimeError:
         return np.inf
-    inverse = scipy.sparse.linalg.LinearOperator(
-        matrix.shape, matvec=factors.solve, rmatvec=lambda v: factors.solve(v, trans="T")
-    )
-    return float(scipy.sparse.linalg.onenormest(sparse) * scipy.sparse.linalg.onenormest(inverse, t=1))
+    inverse = linalg.LinearOperator(matrix.shape, matvec=factors.solve, rmatvec=lambda v: factors.solve(v, trans="T"))
+    return float(linalg.onenormest(sparse) * linalg.onenormest(inverse, t=1))
 
 
 def _finding(plan: SystemPlan, values: _Values, step: Step, b: int, condition, singular, left, right) -> BlockFinding:
-    names = [plan.quantity_name[int(u[b])] for u in step.unknown]
+    names = [plan.quantity_name[int(u[b])].removeprefix("-") for u in step.unknown]
     texts = [equation_text(plan, int(e.equation[b])) for e in step.equations]
     chosen = np.flatnonzero(np.abs(right).max(axis=1, initial=0.0) > 1e-3)
     dependent = np.flatnonzero(np.abs(left).max(axis=1, initial=0.0) > 1e-3)
@@ -282,14 +294,14 @@ def _causes(plan: SystemPlan, values: _Values, step: Step, b: int, left, right) 
     null vectors u and v."""
     before = values.jacobian(step)[b]
 
-    def matters(after: np.ndarray) -> bool:
+    def matters(after: np.ndarray, anyhow: bool = False) -> bool:
         change = after - before
         if not np.isfinite(change).all():
             return True
         scale = np.abs(change).max(initial=0.0)
         if scale == 0.0:
             return False
-        return left.shape[1] == 0 or bool(np.abs(left.T @ (change / scale) @ right).max(initial=0.0) > 1e-9)
+        return anyhow or not left.shape[1] or bool(np.abs(left.T @ (change / scale) @ right).max() > 1e-9)
 
     found: list[tuple[str, float]] = []
     for p in sorted({int(p) for e in step.equations for p in e.parameter[b]}):
@@ -302,14 +314,20 @@ def _causes(plan: SystemPlan, values: _Values, step: Step, b: int, left, right) 
     if zero:
         return tuple(zero)
     moved: list[tuple[str, float]] = []
+    touched: list[tuple[str, float]] = []  # where it is of the second order
     sources = {int(e.slots[s].quantity[b]) for e in step.equations for s in _slots_of_partials(e)} - {ZERO}
     for q in sorted(sources):
         kept = values.quantities[q]
         values.quantities[q] = kept + 1e-3 * max(1.0, abs(kept))
-        if matters(values.jacobian(step)[b]):
-            moved.append((plan.quantity_name[q], float(kept)))
+        after = values.jacobian(step)[b]
         values.quantities[q] = kept
-    return tuple([c for c in moved if c[1] == 0.0] or found or moved)
+        name = plan.quantity_name[q]
+        named = (name.removeprefix("-"), float(-kept if name.startswith("-") else kept) + 0.0)
+        if matters(after):
+            moved.append(named)
+        elif kept == 0.0 and matters(after, anyhow=True):
+            touched.append(named)
+    return tuple([c for c in moved if c[1] == 0.0] or found or moved or touched)
 
 
 def _constraints(plan: SystemPlan, values: _Values) -> Iterator[BlockFinding]:
@@ -338,7 +356,7 @@ def _constraints(plan: SystemPlan, values: _Values) -> Iterator[BlockFinding]:
         row += len(group)
     if not np.isfinite(matrix).all():
         return
-    u, s, _ = np.linalg.svd(_equilibrated(matrix[None])[0])
+    u, s, _ = np.linalg.svd(_equilibrated(matrix[None], PASSES if m > 1 else 0)[0])
     s = np.append(s, np.zeros(max(0, m - len(s))))[:m]
     condition = np.inf if s[-1] == 0 else s[0] / s[-1]
     if condition < ILL_CONDITIONED:
@@ -347,7 +365,7 @@ def _constraints(plan: SystemPlan, values: _Values) -> Iterator[BlockFinding]:
     states = np.flatnonzero(np.abs(matrix[dependent]).max(axis=0, initial=0.0) > 0)
     if not len(states):
         states = np.array(sorted({k for r in dependent for k in plan.constraint_pattern[r]}), np.int64)
-    names = tuple(plan.quantity_name[int(plan.states[k])] for k in states)
+    names = tuple(plan.quantity_name[int(plan.states[k])].removeprefix("-") for k in states)
     singular = condition >= 1 / (4 * m * np.finfo(float).eps)
     at = tuple((name, float(values.quantities[plan.states[k]])) for name, k in zip(names, states, strict=True))
     yield BlockFinding(float(condition), singular, m, names, tuple(texts[e] for e in dependent), at, False)

@@ -1,0 +1,176 @@
+"""The ladder of methods: each rung is reached by a problem that defeats the one before, and finds a known root."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from problems import compiled
+from sympy import Eq, atan
+
+from jaxonomy_dae import Component, EqnEnv, InitializationError, der, simulate
+from jaxonomy_dae.lowering.initialization_methods import METHODS, find_root
+from jaxonomy_dae.lowering.initialize import find_initial, is_consistent
+
+# x³ − 2x + 2 = 0 has one real root, by Cardano's formula; |F| has a local minimum at √(2/3), where F = 2 − (4/3)√(2/3).
+CARDANO = -np.cbrt(1 + np.sqrt(19 / 27)) - np.cbrt(1 - np.sqrt(19 / 27))
+
+
+def climb(function, start, core="all"):
+    """(root, method, residual) found from a start."""
+    start = jnp.asarray(start, float)
+    m = jax.eval_shape(function, start).shape[0]
+    chosen = np.arange(start.shape[0]) if core == "all" and m >= start.shape[0] else None
+    close = lambda x: 2e-13 * (1 + jnp.max(jnp.abs(x)))  # noqa: E731
+    enough = lambda x: 4e-10 * (1 + jnp.max(jnp.abs(x)))  # noqa: E731
+    found = jax.jit(lambda x: find_root(function, m, x, np.ones(len(start)), chosen, close, enough))(start)
+    return np.asarray(found.x), METHODS[int(found.method)], float(jnp.abs(function(found.x)).max())
+
+
+def freudenstein_roth(x):
+    """Freudenstein & Roth (1963): root (5, 4); descent from (0.5, −2) ends in a local minimum at (11.41…, −0.8968…)."""
+    a = -13 + x[0] + ((5 - x[1]) * x[1] - 2) * x[1]
+    b = -29 + x[0] + ((x[1] + 1) * x[1] - 14) * x[1]
+    return jnp.stack([a, b])
+
+
+PROBLEMS = {
+    "a consistent start": (lambda x: x - 3.0, [3.0], "the start was consistent", [3.0]),
+    "affine": (lambda x: 2 * x - 3.0, [0.0], "Newton", [1.5]),
+    # The full step from 10 goes to −138 and diverges from there.
+    "arctan, line search": (jnp.arctan, [10.0], "Newton", [0.0]),
+    "arctan, far away": (jnp.arctan, [1000.0], "Newton", [0.0]),
+    # x0² + x1² = 5 and x1 = x0 + 1: (1, 2) and (−2, −1). At x0 = −x1 the Jacobian is singular.
+    "a singular start": (
+        lambda x: jnp.stack([x[0] ** 2 + x[1] ** 2 - 5, x[0] - x[1] + 1]),
+        [0.5, -0.5],
+        "Levenberg–Marquardt",
+        None,
+    ),
+    "a stationary start": (lambda x: x**2 - 4.0, [0.0], "homotopy", None),  # the gradient of |F|² is zero: ±2
+    "a local minimum": (lambda x: x**3 - 2 * x + 2, [2.0], "homotopy", [CARDANO]),
+    "from the fold itself": (lambda x: x**3 - 3 * x + 4, [1.0], "homotopy", None),  # F' = 0 there
+    "the other side": (lambda x: x * jnp.exp(-x) + 1, [3.0], "homotopy", [-0.5671432904097838]),  # −Ω
+    "two unknowns": (freudenstein_roth, [0.5, -2.0], "homotopy", [5.0, 4.0]),
+    # Redundant rows that agree at the root alone.
+    "redundant": (lambda x: jnp.stack([x[0] - 2, x[0] ** 3 + x[0] - 10]), [0.0], "Newton", [2.0]),
+}
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_the_rung(name):
+    function, start, method, root = PROBLEMS[name]
+    x, used, residual = climb(function, start)
+    assert used == method
+    assert residual <= 1e-12 * (1 + np.abs(x).max())  # where the ladder stops
+    if root is not None:
+        np.testing.assert_allclose(x, root, rtol=1e-12, atol=1e-12)
+
+
+def test_without_a_root_the_best_point_is_returned():
+    x, used, residual = climb(lambda x: x**2 + 1, [2.0])
+    assert used == METHODS[-1]
+    assert residual == pytest.approx(1.0, abs=1e-6)  # the least of x² + 1; |x| ≤ 1e-3 there
+    # Two rows that contradict each other: the least-squares compromise.
+    x, used, _ = climb(lambda x: jnp.stack([x[0] - 1, x[0] - 2]), [0.0], core=None)
+    assert used == METHODS[-1] and x[0] == pytest.approx(1.5, abs=1e-5)
+
+
+def test_a_start_that_is_not_finite_is_given_up_at_once():
+    x, used, residual = climb(jnp.log, [-1.0])
+    assert used == METHODS[-1] and x[0] == -1.0 and np.isnan(residual)
+
+
+def test_members_of_a_batch_are_on_their_own_rungs():
+    starts = jnp.array([[CARDANO], [-1.5], [2.0], [jnp.nan]])
+
+    @jax.jit
+    @jax.vmap
+    def roots(start):
+        function = lambda x: x**3 - 2 * x + 2  # noqa: E731
+        found = find_root(function, 1, start, np.ones(1), np.arange(1), lambda x: 1e-13, lambda x: 1e-10)
+        return found.x, found.method
+
+    x, method = roots(starts)
+    assert [METHODS[int(k)] for k in method] == ["the start was consistent", "Newton", "homotopy", "none"]
+    np.testing.assert_allclose(x[:3, 0], CARDANO, rtol=1e-12)
+
+
+class Law(Component):
+    """dx/dt = −z, where f(z) = p·x determines z."""
+
+    def __init__(self, ev, name, law, p=0.0, z=2.0):
+        super().__init__(ev, name)
+        p = self.parameter("p", p)
+        x = self.variable("x", start=1.0, fixed=True)
+        z = self.variable("z", start=self.parameter("guess", z))
+        self.add_equations(Eq(der(x), -z), Eq(law(z), p * x))
+
+
+def cubic(z):
+    return z**3 - 2 * z + 2
+
+
+@pytest.mark.parametrize(
+    "law, guess, method, root",
+    [(atan, 10.0, "Newton", 0.0), (cubic, 2.0, "homotopy", CARDANO)],
+)
+def test_a_models_own_equation(law, guess, method, root):
+    system = compiled(Law(EqnEnv(), "c", law, z=guess))
+    assert system.initialization_report().method == method
+    assert float(system.observe("c.z", 0.0, system.initialize())) == pytest.approx(root, abs=1e-12)
+
+
+def test_gradients_are_exact_whichever_rung_found_the_point():
+    system = compiled(Law(EqnEnv(), "c", cubic))
+
+    @jax.jit
+    @jax.value_and_grad
+    def z(p):
+        changed = system.with_parameters({"c.p": p})
+        return changed.observe("c.z", 0.0, changed.initialize())
+
+    value, slope = z(0.0)
+    # dz/dp = x/(3z² − 2), x = 1, by the implicit function theorem.
+    assert float(value) == pytest.approx(CARDANO, rel=1e-12)
+    assert float(slope) == pytest.approx(1 / (3 * CARDANO**2 - 2), rel=1e-12)
+    numeric = (float(z(1e-5)[0]) - float(z(-1e-5)[0])) / 2e-5
+    assert float(slope) == pytest.approx(numeric, rel=1e-8)
+
+
+def test_one_member_that_fails_does_not_disturb_the_others():
+    """z² = p − 1 at x = 1 has no solution for p < 1."""
+    system = compiled(Law(EqnEnv(), "c", lambda z: z**2 + 1, p=2.0, z=3.0))
+    p = jnp.array([2.0, 0.5, 5.0])
+
+    def start(p):
+        changed = system.with_parameters({"c.p": p})
+        found = find_initial(changed, 0.0, None, None)
+        return changed.observe("c.z", 0.0, found.x), is_consistent(found)
+
+    def total(p):
+        z, good = jax.vmap(start)(p)
+        return z[0] + z[2], (z, good)
+
+    (_, (z, good)), slope = jax.jit(jax.value_and_grad(total, has_aux=True))(p)
+    np.testing.assert_allclose(z[jnp.array([0, 2])], [1.0, 2.0], rtol=1e-12)  # √(p − 1)
+    assert good.tolist() == [True, False, True]
+    np.testing.assert_allclose(slope, [1 / 2, 0.0, 1 / 4], rtol=1e-12, atol=1e-12)
+    with pytest.raises(InitializationError, match=r"first:\n  c: 0 = -p\*x \+ z\*\*2 \+ 1, in c\.x, c\.z: off by"):
+        system.with_parameters({"c.p": 0.5}).initialize()
+
+
+@pytest.mark.slow
+def test_a_run_from_an_inconsistent_start_is_no_success():
+    system = compiled(Law(EqnEnv(), "c", lambda z: z**2 + 1, p=2.0, z=3.0))
+
+    @jax.jit
+    @jax.vmap
+    def run(p):
+        solution = simulate(system.with_parameters({"c.p": p}), 0.1, ts=jnp.array([0.1]), throw=False)
+        return solution["c.z"][0], diffrax.is_okay(solution.result)
+
+    z, okay = run(jnp.array([2.0, 0.5, 5.0]))
+    # z² = p·x − 1 and dx/dt = −z: z falls by p/2 per time, from √(p − 1).
+    np.testing.assert_allclose(z[jnp.array([0, 2])], [1.0 - 0.1, 2.0 - 0.25], rtol=1e-6)
+    assert okay.tolist() == [True, False, True]
