@@ -324,6 +324,7 @@ def _add_connections(model: _Model, diagram: AcausalDiagram, builder: GroupBuild
         [f"{model.paths[model.index[id(p.component)]]}.{p.name}" for p in ports.values()],
         [p.domain.name for p in ports.values()],
         np.array([key in loose for key in ports], bool),
+        np.array([(key, 1) in parent for key in ports], bool),
     )
 
 

@@ -25,7 +25,7 @@ from scipy.sparse.csgraph import connected_components
 
 from .tables import ZERO, AliasTable, EquationGroup, FlatModel, describe_equation, written_by
 from .templates import LinearTemplate, Template
-from .wording import listed, words
+from .wording import DomainWords, listed, words
 
 FINDINGS = 4  # of each kind
 LARGEST = 400  # equations among which the smallest dependent set is sought
@@ -94,7 +94,7 @@ def recognise(flat: FlatModel, groups: tuple[EquationGroup, ...], alias: AliasTa
     for rows in [*([r] for r in twice[:FINDINGS]), *cycles[:FINDINGS]]:
         rows, variables = say.behind(rows)
         kind = say.kind(variables)
-        if kind == "mixed" or not len(variables):
+        if kind == "mixed" or not len(variables) or not say.components(rows):
             equations.append((rows, variables))
         elif kind == "across" or not set(say.components(rows)) <= afloat:
             texts.append(say.once_too_often(rows, variables, kind))
@@ -149,7 +149,9 @@ def _loops(entries: _Entries, determined_by: np.ndarray) -> list[list[int]]:
     order = np.argsort(pairs.row, kind="stable")
     a, b = order[0::2], order[1::2]
     size = np.abs(pairs.coefficient)
-    good = (pairs.order[a] == 0) & (pairs.order[b] == 0) & (size[a] == size[b]) & (pairs.variable[a] != pairs.variable[b])
+    good = (
+        (pairs.order[a] == 0) & (pairs.order[b] == 0) & (size[a] == size[b]) & (pairs.variable[a] != pairs.variable[b])
+    )
     a, b = a[good], b[good]
     if not len(a):
         return []
@@ -287,14 +289,16 @@ def _islands(flat: FlatModel, groups, alias: AliasTable, members: np.ndarray) ->
         columns.append(group.variable[i, k])
         moved.append(~_invariant(group, weight))
         first += len(group)
+    rows, columns = (np.concatenate(a) if a else np.zeros(0, np.int64) for a in (rows, columns))
     nodes = np.flatnonzero(shift)
     place = np.full(n, -1)
     place[nodes] = np.arange(len(nodes))
-    row, column, total = np.concatenate(rows), place[np.concatenate(columns)], first + len(nodes)
-    graph = sp.coo_array((np.ones(len(row)), (row, first + column)), shape=(total, total))
+    total = first + len(nodes)
+    graph = sp.coo_array((np.ones(len(rows)), (rows, first + place[columns])), shape=(total, total))
     parts, part = connected_components(graph, directed=False)
     fixed = np.zeros(parts, bool)
-    fixed[part[:first][np.concatenate(moved)]] = True
+    if moved:
+        fixed[part[:first][np.concatenate(moved)]] = True
     fixed[part[first:][held[nodes]]] = True
     afloat = np.unique(part[first:][~fixed[part[first:]]])
     if not len(afloat):
@@ -380,7 +384,9 @@ class _Speech:
         at_ports = variables[table.port[variables] >= 0]
         domains = {self.flat.ports.domains[p] for p in table.port[at_ports].tolist()}
         kinds = set(table.is_across[at_ports].tolist())
-        if len(domains) != 1 or len(kinds) != 1 or len(set(table.port[at_ports].tolist())) < 2:
+        if len(domains) != 1 or len(kinds) != 1:
+            return "mixed"
+        if len(at_ports) < 2 and not self.flat.ports.is_loose[table.port[at_ports]].any():
             return "mixed"
         return "across" if True in kinds else "through"
 
@@ -398,31 +404,44 @@ class _Speech:
             self.flat.ports.domains[table.port[at_ports[0]]],
             *([table.names[at_ports[0]].rsplit(".", 1)[1]] * 2),
         )
-        if len(names) == 1 and len(rows) > 1:
-            owner = names[0]
-            between = [self.flat.ports.names[p] for p in np.unique(table.port[at_ports])]
-            mine = [p for p in between if p.rpartition(".")[0] == owner]
-            if kind == "across":
-                return (
-                    f"the ports {listed(mine)} of '{owner}' are connected with each other, but '{owner}' fixes the "
-                    f"{word.across} between them. Remove the connection, or put {word.bridge} into it."
-                )
-        single = all(self.flat.ports.count(n) == 1 for n in names)
-        both = "both fix" if len(names) == 2 else "together fix"
-        if kind == "across" and single:
+        if kind == "through":
+            return self._flows(rows, np.unique(table.port[at_ports]), word)
+        if len(names) == 1:
+            own = [self.flat.ports.names[p] for p in np.unique(table.port[at_ports])]
+            own = [p for p in own if p.rpartition(".")[0] == names[0]]
+            return (
+                f"the ports {listed(own)} of '{names[0]}' are connected with each other, but '{names[0]}' fixes the "
+                f"{word.between} between them. Remove the connection, or put {word.bridge} into it."
+            )
+        if all(self.flat.ports.count(n) == 1 for n in names):
             every = "both fix" if len(names) == 2 else "each fix"
             return (
                 f"{listed(names)} {every} the {word.across} of one node. Keep one of them, or put {word.bridge} "
                 "between them."
             )
-        if kind == "across":
-            return (
-                f"{listed(names)} form a loop, and each of them fixes a {word.across}: one too many. Remove one of them, "
-                f"or put {word.bridge} into the loop."
-            )
         return (
-            f"{listed(names)} {both} one {word.through}. Remove one of them, or connect {word.bridge} in parallel with "
-            "one of them."
+            f"{listed(names)} form a loop, and each of them fixes a {word.between}: one too many. Remove one of them, "
+            f"or put {word.bridge} into the loop."
+        )
+
+    def _flows(self, rows, at_ports, word: DomainWords) -> str:
+        """That a flow is fixed twice: by sources in series, at a node, or by a source and a loose port."""
+        alone = [r for r in rows.tolist() if self.start[r + 1] - self.start[r] == 1]
+        names = self.components(alone) or self.components(rows)
+        loose = [self.flat.ports.names[p] for p in at_ports.tolist() if self.flat.ports.is_loose[p]]
+        if loose:
+            return (
+                f"nothing is connected to {listed(loose)}, so no {word.through} flows there, but {listed(names)} "
+                f"{'fixes' if len(names) == 1 else 'fix'} it. Connect {listed(loose)}."
+            )
+        if len(names) == 1:
+            return (
+                f"'{names[0]}' fixes a {word.through} that has no way back. Connect {word.bridge} in parallel with it."
+            )
+        series = "are in series and both fix the" if len(names) == 2 else "meet, and each of them fixes its"
+        return (
+            f"{listed(names)} {series} {word.through}: one too many. Remove one of them, or connect {word.bridge} in "
+            "parallel with one of them."
         )
 
     def sources(self, rows, groups, alias: AliasTable) -> str:

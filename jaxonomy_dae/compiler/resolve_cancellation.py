@@ -17,13 +17,17 @@ import sympy
 from scipy.sparse.csgraph import connected_components
 
 from ..errors import StructuralError
+from .match import maximum_matching
 from .reduce_index import Offsets, reduce_index
 from .structure import Incidence, incidence
-from .tables import ZERO, EquationGroup, describe_equation, equation_offsets
+from .tables import ZERO, EquationGroup, describe_equation, equation_offsets, written_by
 from .templates import LinearTemplate, Template, template_of
+from .wording import itemised
 
 LARGEST_BLOCK = 60
 ROUNDS = 20
+COMBINED = "combination of "
+SOURCES = 4  # equations named
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,15 +59,25 @@ def reduce_with_cancellation(
     - `StructuralError` if a block is singular for the given parameter values alone, or equations depend on each other.
     """
     notes: list[str] = []
+    signature = incidence(groups, column, n_unknown)
     for _ in range(ROUNDS):
-        signature = incidence(groups, column, n_unknown)
         offsets = reduce_index(signature, least)
         found = _singular_block(groups, signature, offsets, column, values)
         if found is None:
             return groups, signature, offsets, tuple(notes)
+        combined = [describe_equation(groups, int(e)) for e in found[0]]
         groups, note = _replace(groups, offsets, column, *found)
         notes.append(note)
-    raise StructuralError("index reduction found ever new cancellations: some equations depend on each other")
+        signature = incidence(groups, column, n_unknown)
+        if (maximum_matching(signature.pointer, signature.variable, n_unknown) < 0).any():
+            raise StructuralError(_dependent(combined))
+    raise StructuralError(_dependent(combined))
+
+
+def _dependent(origins: list[str]) -> str:
+    """The message for equations that depend on each other, or contradict."""
+    lines = ["these equations depend on each other, or contradict. Remove or change one of:"]
+    return "\n".join(lines + itemised([(written_by(o) or "", o) for o in origins]))
 
 
 def _singular_block(groups, signature: Incidence, offsets: Offsets, column, values):
@@ -151,19 +165,30 @@ def _replace(groups, offsets: Offsets, column, equations, columns):
     try:
         written = [_symbolic(groups, int(e), int(k) - lowest) for e, k in zip(equations, c, strict=True)]
     except AssertionError:
+        origins = [describe_equation(groups, int(e)) for e in equations]
         raise StructuralError(
-            "a block with learned terms is singular: "
-            + "; ".join(describe_equation(groups, int(e)) for e in equations[:4])
+            "\n".join(
+                [
+                    "highest derivatives cancel in these equations, and a learned term in them hides the constraint "
+                    "that follows. State it as an equation of its own instead of one of:",
+                    *itemised([(written_by(o) or "", o) for o in origins]),
+                ]
+            )
         ) from None
     variable_of = {int(column[v]): v for v in np.flatnonzero(column >= 0).tolist()}
     top = [_quantity(variable_of[int(j)], int(offsets.variable[j]) - lowest) for j in columns]
     matrix = sympy.Matrix([[sympy.diff(w.expression, t) for t in top] for w in written])
     null = matrix.T.nullspace(simplify=True)
     if not null:
+        lines = itemised([(written_by(w.origin) or "", w.origin) for w in written])
         raise StructuralError(
-            "these equations are singular for the given parameter values, though not in general: "
-            + "; ".join(w.origin for w in written[:4])
-            + ". Change the parameters, or state the constraint they imply as an equation of its own."
+            "\n".join(
+                [
+                    "these equations are singular for the given parameter values, though not in general. Change the "
+                    "parameters, or state the constraint that follows as an equation of its own:",
+                    *lines,
+                ]
+            )
         )
     weights = list(null[0])
     combined = sympy.Add(*(w * equation.expression for w, equation in zip(weights, written, strict=True)))
@@ -172,9 +197,10 @@ def _replace(groups, offsets: Offsets, column, equations, columns):
             combined = combined.subs(symbol, 0)
     combined = sympy.nsimplify(combined) if combined.is_number else combined
     used = [k for k, w in enumerate(weights) if w != 0]
-    origin = "combination of " + "; ".join(written[k].origin for k in used[:4])
+    sources = list(dict.fromkeys(p for k in used for p in written[k].origin.removeprefix(COMBINED).split("; ")))
+    origin = COMBINED + "; ".join([*sources[:SOURCES], *(["…"] if len(sources) > SOURCES else [])])
     if not any(str(s).startswith("v") for s in combined.free_symbols):
-        raise StructuralError(f"these equations depend on each other, or contradict: {origin}. Remove one of them.")
+        raise StructuralError(_dependent([written[k].origin for k in used]))
     replaced = next(int(equations[k]) for k in used if c[k] == lowest)
     new = _group(combined, origin)
     first = equation_offsets(groups)

@@ -38,11 +38,12 @@ class VariableTable:
 
 @dataclasses.dataclass(frozen=True)
 class PortTable:
-    """The ports of the model, by id: full names, domains, and whether nothing is connected to them."""
+    """The ports of the model, by id: full names, domains, and whether they are connected from outside and inside."""
 
     names: list[str]
     domains: list[str]
     is_loose: np.ndarray
+    has_inside: np.ndarray
 
     @functools.cached_property
     def _counts(self) -> collections.Counter[str]:

@@ -1,5 +1,6 @@
 """Words for messages: lists of names, and what a user of each physical domain calls things."""
 
+import collections
 import dataclasses
 from collections.abc import Iterable, Sequence
 
@@ -11,6 +12,7 @@ class DomainWords:
     """How errors speak of one domain: its across and through quantities, what carries a level, what mends a loop."""
 
     across: str
+    between: str  # what a difference of two across quantities is called
     through: str
     floating: str  # a sentence with {names}
     mend: str
@@ -19,6 +21,7 @@ class DomainWords:
 
 WORDS = {
     "Electrical": DomainWords(
+        "potential",
         "voltage",
         "current",
         "the circuit of {names} has no ground, so nothing determines its potentials",
@@ -27,6 +30,7 @@ WORDS = {
     ),
     "Translational": DomainWords(
         "position",
+        "distance",
         "force",
         "nothing holds {names}: no mass and no fixed position is connected",
         "Connect a Mass or a FixedPosition",
@@ -34,6 +38,7 @@ WORDS = {
     ),
     "Thermal": DomainWords(
         "temperature",
+        "temperature difference",
         "heat flow",
         "nothing determines the temperatures of {names}: no heat capacitor and no fixed temperature is connected",
         "Connect a HeatCapacitor or a FixedTemperature",
@@ -48,6 +53,7 @@ def words(domain: str, across: str = "potential", through: str = "flow") -> Doma
         return WORDS[domain]
     return DomainWords(
         across,
+        f"difference of '{across}'",
         through,
         f"nothing determines the level of '{across}' at the {domain} ports of {{names}}: only its differences matter",
         f"Connect a component that fixes '{across}'",
@@ -70,9 +76,9 @@ def counted(n: int, what: str) -> str:
 
 def itemised(items: Sequence[tuple[str, str]], shown: int = SHOWN) -> list[str]:
     """Indented lines of (component, equation), those of one component together; long lists are cut."""
-    items = list(dict.fromkeys(items))
-    lines = [f"  {text}" for _, text in items[:shown]]
-    rest = items[shown:]
+    count = collections.Counter(items)
+    lines = [f"  {item[1]}" + (f"  (written {n} times)" if n > 1 else "") for item, n in list(count.items())[:shown]]
+    rest = list(count)[shown:]
     if rest:
         owners = list(dict.fromkeys(owner for owner, _ in rest if owner))
         lines.append(f"  … and {len(rest)} more" + (f", of {listed(owners, 4)}" if owners else ""))
