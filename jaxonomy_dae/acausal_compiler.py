@@ -15,10 +15,10 @@ from .compiler.extend import Extended, extend
 from .compiler.flatten import flatten
 from .compiler.numeric import Networks, consistent_point, start_values
 from .compiler.order_blocks import order_blocks
-from .compiler.resolve_cancellation import reduce_with_cancellation
+from .compiler.resolve_cancellation import reduce_with_cancellation, zero_pivots
 from .compiler.select_states import StateSelection, select_states
 from .compiler.structure import incidence
-from .compiler.tables import ZERO, AliasTable, FlatModel, describe_equation, written_by
+from .compiler.tables import ZERO, AliasTable, EquationGroup, FlatModel, describe_equation, equation_offsets, written_by
 from .compiler.wording import itemised, listed
 from .errors import ModelError, StructuralError, nearest
 from .lowering.lower import SystemPlan, lower, quantity_scale
@@ -108,9 +108,12 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Sy
     named = np.flatnonzero(alias.root != ZERO)
     least = np.zeros(len(flat.variables), np.int64)  # the highest derivative of each root that a variable is equal to
     np.maximum.at(least, alias.root[named], alias.order[named])
-    groups, _, offsets, notes = reduce_with_cancellation(
+    groups, signature, offsets, notes = reduce_with_cancellation(
         groups, column, len(unknown), least[unknown], flat.parameters.values
     )
+    zero = zero_pivots(groups, signature, offsets, column, flat.parameters.values)
+    if len(zero):
+        raise StructuralError(_zero_pivot(flat, groups, int(zero[0])))
     inputs = np.flatnonzero(roots & is_input)
     column[inputs] = len(unknown) + np.arange(len(inputs))
     extended = extend(groups, offsets, column, is_input, least, len(unknown))
@@ -150,6 +153,17 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Sy
         )
     _check_row_targets(flat, alias, extended, selection, names, mode)
     return lower(flat, alias, groups, extended, selection, blocks, mode, names, selection.states)
+
+
+def _zero_pivot(flat: FlatModel, groups: tuple[EquationGroup, ...], equation: int) -> str:
+    first = equation_offsets(groups)
+    g = int(np.searchsorted(first, equation, side="right") - 1)
+    parameters = groups[g].parameter[equation - int(first[g])].tolist()
+    values = [f"{flat.parameters.names[p]} = {flat.parameters.values[p]:g}" for p in dict.fromkeys(parameters)]
+    return (
+        f"the equation {describe_equation(groups, equation)} determines nothing for {', '.join(values)}: the "
+        "coefficient of what it should determine is zero. Give other values, or leave the component out."
+    )
 
 
 def _loose_ports(flat: FlatModel) -> tuple[str, ...]:

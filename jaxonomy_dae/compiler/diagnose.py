@@ -192,7 +192,7 @@ def _too_few(flat: FlatModel, n_equations: int, names: list[str], concerned: np.
         text = f"only {counted(n_equations, 'equation')} for {counted(len(names), 'unknown')}, {listed(names)}"
     if hollow:
         inside = listed(dict.fromkeys(p.rpartition(".")[0] for p in hollow))
-        return f"{text}: inside {inside} nothing uses {listed(hollow)}; connect it there, or write its equations."
+        return f"inside {inside} nothing uses {listed(hollow)}: connect it there, or write its equations."
     if near:
         return f"{text}: {'is' if len(near) == 1 else 'are'} {listed(near)} meant to be connected?"
     if len(names) == 1:

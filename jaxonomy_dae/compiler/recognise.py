@@ -91,7 +91,7 @@ def recognise(flat: FlatModel, groups: tuple[EquationGroup, ...], alias: AliasTa
     floating, afloat = _floating(flat, groups, alias)
     cycles = _loops(entries, determined_by)
     texts, equations = list(floating), []
-    for rows in [*([r] for r in twice[:FINDINGS]), *cycles[:FINDINGS]]:
+    for rows in [*([r] for r in sorted(twice)[:FINDINGS]), *cycles[:FINDINGS]]:
         rows, variables = say.behind(rows)
         kind = say.kind(variables)
         if kind == "mixed" or not len(variables) or not say.components(rows):
