@@ -1,7 +1,6 @@
 """Random diagrams, most of them broken: compiling either works or says, in names of the model, what is wrong.
 
-A recipe is plain data drawn from a `random.Random`, so that Hypothesis can shrink it and another process can draw the
-same again.
+A recipe is plain data drawn from a `random.Random`, so that another process can draw the same again.
 """
 
 import random
@@ -294,16 +293,17 @@ def check_verdict(recipe):
     return "regular" if system else "singular"
 
 
-generators = st.randoms(use_true_random=False)
+# Hypothesis' own `randoms` prefer small numbers, and nearly every model would be malformed.
+generators = st.integers(0, 2**32 - 1).map(random.Random)
 
 
-@hypothesis.settings(max_examples=60)
+@hypothesis.settings(max_examples=40)
 @hypothesis.given(generators)
 def test_broken_models_say_what_is_wrong(rng):
     check(draw_recipe(rng))
 
 
-@hypothesis.settings(max_examples=60)
+@hypothesis.settings(max_examples=40)
 @hypothesis.given(generators)
 def test_models_are_refused_exactly_if_they_are_singular(rng):
     check_verdict(draw_recipe(rng))
@@ -320,7 +320,7 @@ def test_many_broken_models(rng):
 
 def test_the_recipes_reach_what_they_are_for():
     """Most kinds of outcome occur among the first recipes, so that the tests above test something."""
-    seen = {check_verdict(draw_recipe(random.Random(seed))) for seed in range(60)}
+    seen = {check_verdict(draw_recipe(random.Random(seed))) for seed in range(30)}
     assert {"regular", "singular", "malformed"} <= seen
 
 
