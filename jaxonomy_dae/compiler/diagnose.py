@@ -33,7 +33,7 @@ def check_structure(
     """
     found = recognise(flat, groups, alias)
     if found.texts:
-        raise StructuralError(_joined(found.texts))
+        raise StructuralError(_joined(found.texts, found.more))
     matched = maximum_matching(pattern.pointer, pattern.variable, pattern.n_variables)
     taken = np.zeros(pattern.n_variables, bool)
     taken[matched[matched >= 0]] = True
@@ -66,7 +66,7 @@ def check_structure(
         _too_few(flat, len(rows), _names(flat, alias, unknown, columns), np.isin(alias.root, unknown[columns]))
         for rows, columns in under
     ]
-    raise StructuralError(_joined(texts))
+    raise StructuralError(_joined(texts, found.more))
 
 
 def dulmage_mendelsohn(pattern: Incidence, matched: np.ndarray):
@@ -128,10 +128,11 @@ def _components(rows, columns, has_row: np.ndarray, has_column: np.ndarray) -> l
 # --- what to say -------------------------------------------------------------------------------------------------
 
 
-def _joined(texts: list[str]) -> str:
-    if len(texts) == 1:
+def _joined(texts: list[str], unseen: int = 0) -> str:
+    unseen += max(len(texts) - PARTS, 0)
+    if len(texts) == 1 and not unseen:
         return texts[0]
-    more = [f"- … and {len(texts) - PARTS} more faults of this kind."] if len(texts) > PARTS else []
+    more = [f"- … and {unseen} more."] if unseen else []
     return "\n".join(["the equations do not fit together:", *(f"- {t}" for t in texts[:PARTS]), *more])
 
 

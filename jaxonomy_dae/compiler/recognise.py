@@ -37,6 +37,7 @@ class Findings:
 
     texts: list[str]
     equations: list[tuple[np.ndarray, np.ndarray]]  # equations as written, and the fewer variables they contain
+    more: int  # how many equations too many were found beside those
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,7 +104,7 @@ def recognise(flat: FlatModel, groups: tuple[EquationGroup, ...], alias: AliasTa
             sources = say.sources(rows, groups, alias)
             if sources:
                 texts.append(sources)
-    return Findings(list(dict.fromkeys(texts)), equations)
+    return Findings(list(dict.fromkeys(texts)), equations, max(len(twice) - FINDINGS, 0))
 
 
 # --- known variables ---------------------------------------------------------------------------------------------
