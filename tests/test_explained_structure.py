@@ -277,7 +277,7 @@ CASES = {
     ),
     "a port that may be meant to be connected": (
         loose,
-        "only 1 equation for 2 unknowns, 'c.gain' and 'c.p.v': is 'c.p' meant to be connected?",
+        "only 1 equation for 2 unknowns, 'c.p.v' and 'c.gain': is 'c.p' meant to be connected?",
     ),
     "numerically dependent equations": (
         lambda: law(
