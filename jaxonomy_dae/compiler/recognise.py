@@ -23,12 +23,13 @@ import scipy.sparse as sp
 import sympy
 from scipy.sparse.csgraph import connected_components
 
-from .tables import ZERO, AliasTable, EquationGroup, FlatModel, describe_equation, written_by
+from .entries import Entries, entries_of
+from .explain import Explainer
+from .tables import ZERO, AliasTable, EquationGroup, FlatModel, written_by
 from .templates import LinearTemplate, Template
-from .wording import DomainWords, listed, words
+from .wording import listed, words
 
 FINDINGS = 4  # of each kind
-LARGEST = 400  # equations among which the smallest dependent set is sought
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,62 +41,18 @@ class Findings:
     more: int  # how many equations too many were found beside those
 
 
-@dataclasses.dataclass(frozen=True)
-class _Entries:
-    """The entries (equation, variable, order) of all groups; `coefficient` is NaN unless it is a number."""
-
-    row: np.ndarray
-    variable: np.ndarray
-    order: np.ndarray
-    coefficient: np.ndarray
-    n_rows: int
-
-    def take(self, which: np.ndarray) -> "_Entries":
-        return _Entries(
-            self.row[which], self.variable[which], self.order[which], self.coefficient[which], self.n_rows
-        )  # fmt: skip
-
-
-def _numbers(group: EquationGroup) -> np.ndarray:
-    """∂(residual)/∂(slot's variable), shape (n, slots), NaN where it is no number."""
-    template = group.template
-    n, k = group.variable.shape
-    if isinstance(template, LinearTemplate):
-        return group.coefficient * group.sign
-    if isinstance(template, Template):
-        values = [float(p) if p.is_Number else np.nan for p in template.partials]  # pyright: ignore
-        return np.broadcast_to(values, (n, k)) * group.sign if k else np.zeros((n, 0))
-    return np.broadcast_to([1.0, *[np.nan] * (k - 1)], (n, k)) * group.sign
-
-
-def _entries(groups: tuple[EquationGroup, ...], unknown: np.ndarray) -> _Entries:
-    rows, variables, orders, coefficients = [], [], [], []
-    first = 0
-    for group in groups:
-        n, k = group.variable.shape
-        used = group.variable != ZERO
-        used &= unknown[group.variable]
-        rows.append(np.broadcast_to(np.arange(first, first + n)[:, None], (n, k))[used])
-        variables.append(group.variable[used])
-        orders.append(group.order[used])
-        coefficients.append(_numbers(group)[used])
-        first += n
-    row, variable, order = (np.concatenate(a) if a else np.zeros(0, np.int64) for a in (rows, variables, orders))
-    return _Entries(row, variable, order, np.concatenate(coefficients) if coefficients else np.zeros(0), first)
-
-
 def recognise(flat: FlatModel, groups: tuple[EquationGroup, ...], alias: AliasTable) -> Findings:
     """What is certainly wrong with a model; `groups` and `alias` are those after alias elimination."""
-    entries = _entries(flat.groups, ~flat.variables.is_input)
+    entries = entries_of(flat.groups, ~flat.variables.is_input)
     determined_by, twice = _known(entries, len(flat.variables))
-    say = _Speech(flat, entries, determined_by)
+    say = Explainer(flat, entries, determined_by)
     floating, afloat = _floating(flat, groups, alias)
     cycles = _loops(entries, determined_by)
     texts, equations = list(floating), []
     for rows in [*([r] for r in sorted(twice)[:FINDINGS]), *cycles[:FINDINGS]]:
         rows, variables = say.behind(rows)
-        kind = say.kind(variables)
-        if kind == "mixed" or not len(variables) or not say.components(rows):
+        kind = say.kind(rows, variables)
+        if kind == "mixed":
             equations.append((rows, variables))
         elif kind == "across" or not set(say.components(rows)) <= afloat:
             texts.append(say.once_too_often(rows, variables, kind))
@@ -110,7 +67,7 @@ def recognise(flat: FlatModel, groups: tuple[EquationGroup, ...], alias: AliasTa
 # --- known variables ---------------------------------------------------------------------------------------------
 
 
-def _known(entries: _Entries, n_variables: int) -> tuple[np.ndarray, list[int]]:
+def _known(entries: Entries, n_variables: int) -> tuple[np.ndarray, list[int]]:
     """For each variable, the equation that determines it alone (−1: none); and equations all of whose are known."""
     count = np.bincount(entries.row, minlength=entries.n_rows)
     total = np.bincount(entries.row, np.arange(len(entries.row), dtype=float), entries.n_rows)
@@ -142,7 +99,7 @@ def _known(entries: _Entries, n_variables: int) -> tuple[np.ndarray, list[int]]:
 # --- loops -------------------------------------------------------------------------------------------------------
 
 
-def _loops(entries: _Entries, determined_by: np.ndarray) -> list[list[int]]:
+def _loops(entries: Entries, determined_by: np.ndarray) -> list[list[int]]:
     """Circles of equations a ± b = known in which one follows from the others up to a constant."""
     open_ = entries.take(determined_by[entries.variable] < 0)
     count = np.bincount(open_.row, minlength=entries.n_rows)
@@ -221,7 +178,7 @@ def _cuts(flat: FlatModel, groups, alias: AliasTable, known: np.ndarray) -> list
     is_known = np.zeros(len(flat.variables), bool)  # of roots
     plain = known & (alias.root != ZERO) & (alias.order == 0)
     is_known[alias.root[plain]] = True
-    entries = _entries(groups, ~flat.variables.is_input & ~is_known)
+    entries = entries_of(groups, ~flat.variables.is_input & ~is_known)
     connection = np.zeros(entries.n_rows, bool)
     first = 0
     for group in groups:
@@ -333,138 +290,3 @@ def _invariant(group: EquationGroup, weight: np.ndarray) -> np.ndarray:
             fits.append(all(sympy.Add(*terms) == 0 for terms in sums.values()))
         out[rest] = np.array(fits)[which.ravel()]
     return out
-
-
-# --- what to say -------------------------------------------------------------------------------------------------
-
-
-class _Speech:
-    """Sentences about equations of the flattened model."""
-
-    def __init__(self, flat: FlatModel, entries: _Entries, determined_by: np.ndarray):
-        self.flat = flat
-        self.entries = entries
-        self.determined_by = determined_by
-        self.start = np.searchsorted(entries.row, np.arange(entries.n_rows + 1))
-
-    def behind(self, rows: list[int]) -> tuple[np.ndarray, np.ndarray]:
-        """The equations, with those that determine their known variables; and all variables in them."""
-        seen, todo, variables = set(rows), list(rows), set()
-        while todo:
-            row = todo.pop()
-            for v in self.entries.variable[self.start[row] : self.start[row + 1]].tolist():
-                variables.add(v)
-                by = int(self.determined_by[v])
-                if by >= 0 and by not in seen:
-                    seen.add(by)
-                    todo.append(by)
-        return self._smallest(np.array(sorted(seen), np.int64), np.array(sorted(variables), np.int64))
-
-    def _smallest(self, rows: np.ndarray, variables: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Those equations that depend on each other: the support of the left null vector, other entries drawn."""
-        if not 1 < len(rows) <= LARGEST:
-            return rows, variables
-        matrix = np.zeros((len(rows), len(variables)))
-        random = np.random.default_rng(0)
-        for i, row in enumerate(rows.tolist()):
-            inside = slice(self.start[row], self.start[row + 1])
-            here = self.entries.coefficient[inside]
-            drawn = np.where(np.isnan(here), random.uniform(0.5, 2.0, len(here)), here)
-            np.add.at(matrix[i], np.searchsorted(variables, self.entries.variable[inside]), drawn)
-        u, singular, _ = np.linalg.svd(matrix, full_matrices=True)
-        rank = int((singular > 1e-10).sum())
-        if rank != len(rows) - 1:
-            return rows, variables
-        rows = rows[np.abs(u[:, -1]) > 1e-8]
-        kept = [self.entries.variable[self.start[r] : self.start[r + 1]] for r in rows.tolist()]
-        return rows, np.unique(np.concatenate(kept)) if kept else variables[:0]
-
-    def kind(self, variables: np.ndarray) -> str:
-        """'across' or 'through' if the ports among the variables are of that kind alone, else 'mixed'."""
-        table = self.flat.variables
-        at_ports = variables[table.port[variables] >= 0]
-        domains = {self.flat.ports.domains[p] for p in table.port[at_ports].tolist()}
-        kinds = set(table.is_across[at_ports].tolist())
-        if len(domains) != 1 or len(kinds) != 1:
-            return "mixed"
-        if len(at_ports) < 2 and not self.flat.ports.is_loose[table.port[at_ports]].any():
-            return "mixed"
-        return "across" if True in kinds else "through"
-
-    def components(self, rows) -> list[str]:
-        """The components that wrote these equations, in the order of the model."""
-        found = {written_by(describe_equation(self.flat.groups, int(r))) for r in rows}
-        return [c for c in self.flat.components if c in found]  # connections and networks are none
-
-    def once_too_often(self, rows, variables, kind: str) -> str:
-        """That components determine the same thing twice."""
-        table = self.flat.variables
-        at_ports = variables[table.port[variables] >= 0]
-        names = self.components(rows)
-        word = words(
-            self.flat.ports.domains[table.port[at_ports[0]]],
-            *([table.names[at_ports[0]].rsplit(".", 1)[1]] * 2),
-        )
-        if kind == "through":
-            return self._flows(rows, np.unique(table.port[at_ports]), word)
-        if len(names) == 1:
-            own = [self.flat.ports.names[p] for p in np.unique(table.port[at_ports])]
-            own = [p for p in own if p.rpartition(".")[0] == names[0]]
-            return (
-                f"the ports {listed(own)} of '{names[0]}' are connected with each other, but '{names[0]}' fixes the "
-                f"{word.between} between them. Remove the connection, or put {word.bridge} into it."
-            )
-        if all(self.flat.ports.count(n) == 1 for n in names):
-            every = "both fix" if len(names) == 2 else "each fix"
-            return (
-                f"{listed(names)} {every} the {word.across} of one node. Keep one of them, or put {word.bridge} "
-                "between them."
-            )
-        return (
-            f"{listed(names)} form a loop, and each of them fixes a {word.between}: one too many. Remove one of them, "
-            f"or put {word.bridge} into the loop."
-        )
-
-    def _flows(self, rows, at_ports, word: DomainWords) -> str:
-        """That a flow is fixed twice: by sources in series, at a node, or by a source and a loose port."""
-        alone = [r for r in rows.tolist() if self.start[r + 1] - self.start[r] == 1]
-        names = self.components(alone) or self.components(rows)
-        loose = [self.flat.ports.names[p] for p in at_ports.tolist() if self.flat.ports.is_loose[p]]
-        if loose:
-            return (
-                f"nothing is connected to {listed(loose)}, so no {word.through} flows there, but {listed(names)} "
-                f"{'fixes' if len(names) == 1 else 'fix'} it. Connect {listed(loose)}."
-            )
-        if len(names) == 1:
-            return (
-                f"'{names[0]}' fixes a {word.through} that has no way back. Connect {word.bridge} in parallel with it."
-            )
-        series = "are in series and both fix the" if len(names) == 2 else "meet, and each of them fixes its"
-        return (
-            f"{listed(names)} {series} {word.through}: one too many. Remove one of them, or connect {word.bridge} in "
-            "parallel with one of them."
-        )
-
-    def sources(self, rows, groups, alias: AliasTable) -> str:
-        """That the flows between two parts of the model are all fixed; empty if none is."""
-        flat = self.flat
-        known = set()
-        roots: dict[int, int] = {}
-        for v in np.flatnonzero((self.determined_by >= 0) & (alias.order == 0)).tolist():
-            roots.setdefault(int(alias.root[v]), v)
-        for row in rows.tolist():
-            offsets = np.concatenate([[0], np.cumsum([len(g) for g in groups])])
-            g = int(np.searchsorted(offsets, row, side="right") - 1)
-            for v in groups[g].variable[row - int(offsets[g])].tolist():
-                if v != ZERO and v in roots:
-                    known.add(int(self.determined_by[roots[v]]))
-        behind, variables = self.behind(sorted(known))
-        names = self.components(behind)
-        if not names:
-            return ""
-        at_ports = [int(flat.variables.port[v]) for v in variables if flat.variables.port[v] >= 0]
-        word = words(flat.ports.domains[at_ports[0]] if at_ports else "")
-        return (
-            f"{listed(names)} fix every {word.through} between two parts of the model: one too many. Remove one of "
-            f"them, or connect {word.bridge} in parallel with one of them."
-        )
