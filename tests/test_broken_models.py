@@ -346,7 +346,7 @@ def test_names_change_nothing(rng):
 
 
 @pytest.mark.slow
-@hypothesis.settings(max_examples=25, suppress_health_check=list(hypothesis.HealthCheck))
+@hypothesis.settings(max_examples=12, suppress_health_check=list(hypothesis.HealthCheck))
 @hypothesis.given(generators)
 def test_accepted_models_start_or_say_why_not(rng):
     recipe = draw_recipe(rng)
