@@ -91,6 +91,14 @@ def loose():
     return compiled(component(write))
 
 
+def a_start_of_an_input():
+    def write(self, ev):
+        x, y, u = self.variable("x", start=1.0, fixed=True), self.variable("y"), self.input("u")
+        self.add_equations(Eq(x, u), Eq(der(y), x))
+
+    return compiled(component(write))
+
+
 def inputs_only():
     def write(self, ev):
         x, u = self.variable("x"), self.input("u")
@@ -314,6 +322,10 @@ CASES = {
         "the fixed starts of 'c.x', 'c.y' and 'c.z' contradict the equation c: 0 = -x - y + z. Free one of them "
         "(fixed=False), or give values that agree.",
     ),
+    "a start of an input": (
+        a_start_of_an_input,
+        "the start of 'c.x' is fixed, but its value comes from the input 'c.u'. Free the start (fixed=False).",
+    ),
     "a start of what is zero": (
         lambda: law("x y", lambda c: Eq(c.x, 0), lambda c: Eq(der(c.y), c.x), x=1.0),
         "the start of 'c.x' is fixed at 1, but the equations say that it is always zero. Free the start (fixed=False).",
@@ -435,6 +447,8 @@ def test_parts_of_a_hundred_thousand_equations():
          ["2 starts are fixed for 1 degree of freedom, those of 'a.v' and 'b.v': they must agree, or free 1 of them"]),
         (lambda: law("x y", lambda c: Eq(c.x, -c.y), lambda c: Eq(der(c.x), -c.x), x=1.0, y=-1.0),
          ["'c.x' and 'c.y' are one quantity, and both starts are fixed: they agree, so one of them is enough"]),
+        (lambda: law("x y", lambda c: Eq(c.x**2, 4), lambda c: Eq(der(c.y), c.x), x=2.0),
+         ["the start of 'c.x' is fixed, but follows from the equations: they must agree, or free it"]),
         (lambda: compiled(PlanarPendulum(EqnEnv(), "p")),
          ["4 starts are fixed for 2 degrees of freedom, those of 'p.x', 'p.y', 'p.vx' and 'p.vy': they must agree, or "
           "free 2 of them"]),

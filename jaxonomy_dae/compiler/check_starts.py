@@ -27,7 +27,8 @@ def check_equal_starts(flat: FlatModel, groups: tuple[EquationGroup, ...], alias
 
     **Raises:**
 
-    - `StructuralError` if starts that are plain numbers contradict each other.
+    - `StructuralError` if starts that are plain numbers contradict each other, or a start is fixed of what an input
+        gives.
     """
     table = flat.variables
     fixed = np.flatnonzero(table.fixed).tolist()
@@ -47,6 +48,11 @@ def check_equal_starts(flat: FlatModel, groups: tuple[EquationGroup, ...], alias
                     "the start (fixed=False)."
                 )
             continue
+        if table.is_input[key[0]]:
+            raise StructuralError(
+                f"the start of '{name}' is fixed, but its value comes from the input '{table.names[key[0]]}'. Free the "
+                "start (fixed=False)."
+            )
         if number is not None and key in numbers and not _equal(numbers[key][1], sign * number):
             w, other = numbers[key]
             relation = "are equal" if alias.sign[w] == sign else "are equal but for the sign"
@@ -129,7 +135,11 @@ def dependent_starts(flat: FlatModel, alias: AliasTable, extended: Extended) -> 
     for equations, inside in over:
         names = [flat.variables.names[pins[int(pinned[k - n])]] for k in equations if k >= n]
         surplus = len(equations) - len(inside)
-        if names:
+        if len(names) == 1:
+            notes.append(
+                f"the start of '{names[0]}' is fixed, but follows from the equations: they must agree, or free it"
+            )
+        elif names:
             free = counted(max(len(names) - surplus, 0), "degree") + " of freedom"
             notes.append(
                 f"{len(names)} starts are fixed for {free}, those of {listed(names)}: they must agree, or free "
