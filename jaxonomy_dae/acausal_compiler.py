@@ -8,16 +8,18 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from .compiler.check_starts import check_equal_starts, dependent_starts
 from .compiler.diagnose import check_structure
 from .compiler.eliminate_aliases import eliminate_aliases
 from .compiler.extend import Extended, extend
 from .compiler.flatten import flatten
 from .compiler.numeric import Networks, consistent_point, start_values
 from .compiler.order_blocks import order_blocks
-from .compiler.resolve_cancellation import reduce_with_cancellation
+from .compiler.resolve_cancellation import reduce_with_cancellation, zero_pivots
 from .compiler.select_states import StateSelection, select_states
 from .compiler.structure import incidence
-from .compiler.tables import ZERO, AliasTable, FlatModel, describe_equation
+from .compiler.tables import ZERO, AliasTable, EquationGroup, FlatModel, describe_equation, equation_offsets, written_by
+from .compiler.wording import itemised, listed
 from .errors import ModelError, StructuralError, nearest
 from .lowering.lower import SystemPlan, lower, quantity_scale
 from .lowering.parameters import ParameterNames, Parameters
@@ -102,15 +104,20 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Sy
     column[unknown] = np.arange(len(unknown))
     signature = incidence(groups, column, len(unknown))
     check_structure(flat, groups, alias, signature, unknown)
+    started = check_equal_starts(flat, groups, alias)
     named = np.flatnonzero(alias.root != ZERO)
     least = np.zeros(len(flat.variables), np.int64)  # the highest derivative of each root that a variable is equal to
     np.maximum.at(least, alias.root[named], alias.order[named])
-    groups, _, offsets, notes = reduce_with_cancellation(
+    groups, signature, offsets, notes = reduce_with_cancellation(
         groups, column, len(unknown), least[unknown], flat.parameters.values
     )
+    zero = zero_pivots(groups, signature, offsets, column, flat.parameters.values)
+    if len(zero):
+        raise StructuralError(_zero_pivot(flat, groups, int(zero[0])))
     inputs = np.flatnonzero(roots & is_input)
     column[inputs] = len(unknown) + np.arange(len(inputs))
     extended = extend(groups, offsets, column, is_input, least, len(unknown))
+    starts = (*started, *dependent_starts(flat, alias, extended))
     names = name_quantities(flat, alias, extended)
     preferred = _preferred(flat, alias, extended, prefer_states)
     merit = _merit(flat, alias, extended, preferred)
@@ -128,19 +135,40 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Sy
         lambda q: names[q],
         lambda e: describe_equation(groups, int(e)),
     )
-    selection = dataclasses.replace(selection, notes=(*notes, *selection.notes))
+    selection = dataclasses.replace(selection, notes=(*_loose_ports(flat), *starts, *notes, *selection.notes))
     known = np.zeros(extended.quantities.n, bool)
     known[selection.states] = True
     known[extended.quantities.n_unknown :] = True
     blocks = order_blocks(extended, known, selection.constraints)
     if isinstance(blocks, np.ndarray):
-        left = "; ".join(describe_equation(groups, int(extended.base[e])) for e in blocks[:5])
+        left = [describe_equation(groups, int(extended.base[e])) for e in blocks]
         raise StructuralError(
-            f"after index reduction these equations determine no variable of their own: {left}. They follow from the "
-            "other equations, or contradict them: remove one."
+            "\n".join(
+                [
+                    "after index reduction nothing is left for these equations to determine: they follow from the "
+                    "others, or contradict them. Remove or change one of:",
+                    *itemised([(written_by(t) or "", t) for t in left]),
+                ]
+            )
         )
     _check_row_targets(flat, alias, extended, selection, names, mode)
     return lower(flat, alias, groups, extended, selection, blocks, mode, names, selection.states)
+
+
+def _zero_pivot(flat: FlatModel, groups: tuple[EquationGroup, ...], equation: int) -> str:
+    first = equation_offsets(groups)
+    g = int(np.searchsorted(first, equation, side="right") - 1)
+    parameters = groups[g].parameter[equation - int(first[g])].tolist()
+    values = [f"{flat.parameters.names[p]} = {flat.parameters.values[p]:g}" for p in dict.fromkeys(parameters)]
+    return (
+        f"the equation {describe_equation(groups, equation)} determines nothing for {', '.join(values)}: the "
+        "coefficient of what it should determine is zero. Give other values, or leave the component out."
+    )
+
+
+def _loose_ports(flat: FlatModel) -> tuple[str, ...]:
+    loose = [name for name, is_loose in zip(flat.ports.names, flat.ports.is_loose.tolist(), strict=True) if is_loose]
+    return (f"nothing is connected to {listed(loose, 12)}: nothing flows there",) if loose else ()
 
 
 def name_quantities(flat: FlatModel, alias: AliasTable, extended: Extended) -> list[str]:

@@ -1,6 +1,7 @@
 """The same model gives the same system: whatever the hash seed, whatever the names."""
 
 import json
+import random
 import subprocess
 import sys
 
@@ -9,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from problems import compiled, drag_on, environment, oscillator, pendulum, rc_circuit
+from test_broken_models import draw_recipe, names_of, outcome
+from test_explained_structure import CASES
 
 from jaxonomy_dae import EqnEnv
 from jaxonomy_dae.library.electrical import Capacitor, Ground, Inductor, Resistor, VoltageSource
@@ -60,13 +63,25 @@ def everything(system) -> dict:
     }
 
 
+def broken() -> list[str]:
+    """What becomes of random models, most of them broken: the error's text, or the report and the digest."""
+    out = []
+    for seed in range(40):
+        recipe = draw_recipe(random.Random(seed))
+        system, text = outcome(recipe, names_of(recipe))
+        out.append(f"{system.report}\n{system.plan.digest}" if system else text)
+    return out
+
+
 # --- hash seeds --------------------------------------------------------------------------------------------------
 
 PROGRAM = """
 import json, jax
 jax.config.update("jax_enable_x64", True)
-from test_determinism import everything, systems
-print(json.dumps({name: everything(system) for name, system in systems()}))
+from test_determinism import broken, everything, systems
+from test_explained_structure import texts
+found = {name: everything(system) for name, system in systems()}
+print(json.dumps(found | {"texts": texts(), "broken": broken()}))
 """
 
 
@@ -89,7 +104,9 @@ def test_the_hash_seed_changes_nothing(seeds):
     for process, (_, errors) in zip(processes, outputs, strict=True):
         assert process.returncode == 0, errors
     results = [json.loads(out) for out, _ in outputs]
-    assert set(results[0]) == {name for name, _ in systems()}
+    assert set(results[0]) == {name for name, _ in systems()} | {"texts", "broken"}
+    assert results[0]["texts"] == {name: text for name, (_, text) in CASES.items()}
+    assert results[0]["broken"] == broken()
     for other in results[1:]:
         for name, expected in results[0].items():
             assert other[name] == expected, name

@@ -26,9 +26,9 @@ from jaxonomy_dae import (
     der,
     simulate,
 )
-from jaxonomy_dae.library.electrical import Ground, Resistor, VoltageSource
+from jaxonomy_dae.library.electrical import Ground, Resistor
 from jaxonomy_dae.library.planar import PlanarPendulum
-from jaxonomy_dae.library.translational import FixedPosition, Mass, Spring
+from jaxonomy_dae.library.translational import Mass, Spring
 
 EV = EqnEnv()
 
@@ -220,7 +220,7 @@ def connects_what_is_not_there():
              lambda: AcausalDiagram().connect(Mass(EV, "m"), "flang", Spring(EV, "s"), "flange_a")),
         case(r"cannot connect m\.flange: Translational port to r\.p: Electrical port.*one domain",
              lambda: AcausalDiagram().connect(Resistor(EV, "r").p, Mass(EV, "m").flange)),
-        case(r"at least two ports; got 1", lambda: AcausalDiagram().connect(Resistor(EV, "r").p)),
+        case(r"at least two ports; got .r\.p. only", lambda: AcausalDiagram().connect(Resistor(EV, "r").p)),
         case(r"needs a port name after 'g'", lambda: AcausalDiagram().connect(Resistor(EV, "r").p, Ground(EV, "g"))),
         case(r"takes ports, or a component and a port name; got 'p'", lambda: AcausalDiagram().connect("p", "n")),
         case(r"'outer' connects outer\.inner\.r\.p.*its own ports and its children's", connects_a_grandchild),
@@ -253,39 +253,6 @@ def one_too_many(self, ev):
     self.add_equations(Eq(y, 2 * x), Eq(y**2, 3 + x))
 
 
-def one_too_few(self, ev):
-    x = decay(self, ev)
-    y, z = self.variable("y"), self.variable("z")
-    self.add_equations(Eq(y + z, 2 * x))
-
-
-def as_many_but_wrong(self, ev):
-    x, y, z = (self.variable(n) for n in "xyz")
-    self.add_equations(Eq(der(x), -x), Eq(x**2, 1 + x), Eq(y * z, x))
-
-
-def says_the_same_twice(self, ev):
-    x, y = self.variable("x", start=1, fixed=True), self.variable("y", start=1)
-    self.add_equations(Eq(der(x), -x), Eq(der(y), x), Eq(x + y, 2))
-    u, v = self.variable("u", start=0, fixed=True), self.variable("v", start=0, fixed=True)
-    self.add_equations(Eq(der(u), v), Eq(der(v), -u))
-
-
-def no_ground():
-    s, r = VoltageSource(EV, "s"), Resistor(EV, "r")
-    compiled(s, r, connect=[(s.p, r.p), (s.n, r.n)])
-
-
-def two_sources_in_parallel():
-    a, b, r, g = VoltageSource(EV, "a", 1.0), VoltageSource(EV, "b", 2.0), Resistor(EV, "r"), Ground(EV, "g")
-    compiled(a, b, r, g, connect=[(a.p, b.p, r.p), (a.n, b.n, r.n, g.p)])
-
-
-def two_walls_on_one_flange():
-    a, b = FixedPosition(EV, "a", 0.0), FixedPosition(EV, "b", 1.0)
-    compiled(a, b, connect=[(a.flange, b.flange)])
-
-
 @pytest.mark.parametrize(
     "message, call, error",
     [
@@ -293,15 +260,6 @@ def two_walls_on_one_flange():
              lambda: compiled(component(undeclared))),
         case(r"'c': the symbol 'elsewhere\.v' in its equations is no variable of it",
              lambda: compiled(component(of_another))),
-        case(r"(?s)3 equations for 2 unknowns, 1 too many.*Over-determined.*y\*\*2.*Remove one",
-             lambda: compiled(component(one_too_many)), StructuralError),
-        case(r"(?s)2 equations for 3 unknowns, 1 too few.*Under-determined.*c\.[yz].*Add the missing equation",
-             lambda: compiled(component(one_too_few)), StructuralError),
-        case(r"(?s)3 equations for 3 unknowns.*compete.*x\*\*2.*determines all of these.*c\.[yz]",
-             lambda: compiled(component(as_many_but_wrong)), StructuralError),
-        case(r"(?s)Under-determined.*s\.p\.v|r\.p\.v.*a ground", no_ground, StructuralError),
-        case(r"(?s)Over-determined.*[ab]: .*two sources", two_sources_in_parallel, StructuralError),
-        case(r"(?s)Over-determined.*[ab]: .*two fixed positions", two_walls_on_one_flange, StructuralError),
     ],
 )  # fmt: skip
 def test_equations_and_unknowns(message, call, error):

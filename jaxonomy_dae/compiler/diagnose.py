@@ -1,107 +1,210 @@
 """Structural diagnosis: which part of a model has too many equations, and which too few.
 
-The Dulmage–Mendelsohn decomposition of the incidence names the smallest parts concerned: equations that compete for the
-same variables, and variables that share too few equations.
+What has a name is said by that name (`recognise`). For anything else, the Dulmage–Mendelsohn decomposition of the
+incidence isolates the parts concerned: equations that compete for the same variables, and variables that share too few
+equations.
 """
-
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
 
 from ..errors import StructuralError
 from .match import maximum_matching
-from .structure import Incidence
-from .tables import AliasTable, EquationGroup, FlatModel, describe_equation
+from .recognise import recognise
+from .structure import Incidence, incidence
+from .tables import AliasTable, EquationGroup, FlatModel, describe_equation, written_by
+from .wording import counted, itemised, listed
 
-SHOWN = 6
+PARTS = 4
 
 
 def check_structure(
     flat: FlatModel,
     groups: tuple[EquationGroup, ...],
     alias: AliasTable,
-    incidence: Incidence,
+    pattern: Incidence,
     unknown: np.ndarray,
 ) -> None:
-    """Raises a `StructuralError` in user names unless every equation can be matched with an unknown of its own.
+    """Raises a `StructuralError` in user names if the model is certainly singular.
 
-    `unknown` lists the variable behind each column of the incidence.
+    `groups` and `alias` are those after alias elimination; `unknown` lists the variable behind each column of the
+    incidence `pattern`. After the check, every equation can be matched with an unknown of its own.
     """
-    matched = maximum_matching(incidence.pointer, incidence.variable, incidence.n_variables)
-    extra = np.flatnonzero(matched < 0)
-    taken = np.zeros(incidence.n_variables, bool)
+    found = recognise(flat, groups, alias)
+    if found.texts:
+        raise StructuralError(_joined(found.texts, found.more))
+    matched = maximum_matching(pattern.pointer, pattern.variable, pattern.n_variables)
+    taken = np.zeros(pattern.n_variables, bool)
     taken[matched[matched >= 0]] = True
-    missing = np.flatnonzero(~taken)
-    if not len(extra) and not len(missing):
+    if (matched >= 0).all() and taken.all() and not found.equations:
         return
-    n, m = flat.n_equations, len(flat.variables) - int(flat.variables.is_input.sum())
-    difference = n - m
-    count = f"{n} equations for {m} unknowns, " + (
-        f"{difference} too many" if difference > 0 else f"{-difference} too few" if difference < 0 else "as many, but"
-    )
-    lines = [f"the model is structurally singular: {count}."]
-    if len(extra):
-        equations = _over_determined(incidence, matched, extra)
-        texts = [describe_equation(groups, int(e)) for e in equations]
-        lines.append("Over-determined, these equations compete for too few variables:")
-        lines.extend(_listed(texts))
-        lines.append(
-            "Remove one of them, or connect less: for instance two sources, two fixed positions or two grounds on one "
-            "node."
-        )
-    if len(missing):
-        columns = _under_determined(incidence, matched, missing)
-        texts = [flat.variables.names[v] for v in _display(flat, alias, unknown[columns])]
-        lines.append("Under-determined, nothing determines all of these variables:")
-        lines.extend(_listed(texts))
-        lines.append(
-            "Add the missing equation, a connection of their ports, a ground or a fixed position; or make one an input."
-        )
-    raise StructuralError("\n".join(lines))
+    over, under = dulmage_mendelsohn(pattern, matched)
+    if found.equations:
+        texts = []
+        for rows, variables in found.equations:
+            if not len(variables):
+                text = describe_equation(flat.groups, int(rows[0]))
+                texts.append(
+                    f"this equation contains no unknown: {text}. Remove it, or declare its input as a variable."
+                )
+                continue
+            names = [flat.variables.names[v] for v in variables if not flat.variables.is_port[v]]
+            names = names or [flat.variables.names[v] for v in variables]
+            texts.append(_too_many([describe_equation(flat.groups, int(r)) for r in rows], len(variables), names))
+    else:
+        texts = [
+            _too_many(
+                [describe_equation(groups, int(r)) for r in rows], len(columns), _names(flat, alias, unknown, columns)
+            )
+            for rows, columns in over
+            if len(columns)
+        ]
+        empty = [describe_equation(groups, int(rows[0])) for rows, columns in over if not len(columns)]
+        texts += _repeated(flat, empty) if empty else []
+    texts += [
+        _too_few(flat, len(rows), _names(flat, alias, unknown, columns), np.isin(alias.root, unknown[columns]))
+        for rows, columns in under
+    ]
+    raise StructuralError(_joined(texts, found.more))
 
 
-def _listed(texts: list[str]) -> list[str]:
-    texts = list(dict.fromkeys(texts))
-    more = [f"  … and {len(texts) - SHOWN} more"] if len(texts) > SHOWN else []
-    return [f"  {t}" for t in texts[:SHOWN]] + more
+def dulmage_mendelsohn(pattern: Incidence, matched: np.ndarray):
+    """The over- and under-determined parts of an incidence (Dulmage & Mendelsohn 1958), split where they fall apart.
 
+    **Arguments:**
 
-def _reach(step: Any, start: np.ndarray) -> np.ndarray:
-    """All nodes reachable from `start`, in order."""
-    seen = np.zeros(step.shape[0], bool)
-    frontier = start
-    while len(frontier):
-        seen[frontier] = True
-        following = np.unique(step[frontier].indices)
-        frontier = following[~seen[following]]
-    return np.flatnonzero(seen)
+    - `matched`: the column of every equation in some maximum matching, −1 for none. The parts do not depend on it.
 
+    **Returns:**
 
-def _over_determined(incidence: Incidence, matched: np.ndarray, extra: np.ndarray) -> np.ndarray:
-    owner = np.full(incidence.n_variables, -1, np.int64)
+    Two lists of (equations, columns): parts with more equations than columns, and parts with fewer; in order.
+    """
+    n, m = pattern.n_equations, pattern.n_variables
+    rows, columns = pattern.rows, pattern.variable
+    owner = np.full(m, -1, np.int64)
     owner[matched[matched >= 0]] = np.flatnonzero(matched >= 0)
-    following = owner[incidence.variable]
-    used = following >= 0
-    n = incidence.n_equations
-    step = sp.coo_array((np.ones(int(used.sum())), (incidence.rows[used], following[used])), shape=(n, n)).tocsr()
-    return _reach(step, extra)
+    # From an equation too many, along its variables to the equations that hold them.
+    held = owner[columns] >= 0
+    too_many = _reach(rows[held], owner[columns[held]], np.flatnonzero(matched < 0), n)
+    # From a variable too many, along its equations to the variables these hold.
+    holds = matched[rows] >= 0
+    unsettled = _reach(columns[holds], matched[rows[holds]], np.flatnonzero(owner < 0), m)
+    in_over = too_many[rows]
+    over_columns = np.zeros(m, bool)
+    over_columns[columns[in_over]] = True
+    in_under = unsettled[columns]
+    under_rows = np.zeros(n, bool)
+    under_rows[rows[in_under]] = True
+    over = _components(rows[in_over], columns[in_over], too_many, over_columns)
+    under = _components(rows[in_under], columns[in_under], under_rows, unsettled)
+    return over, under
 
 
-def _under_determined(incidence: Incidence, matched: np.ndarray, missing: np.ndarray) -> np.ndarray:
-    rows = incidence.rows
-    own = matched[rows]
-    used = own >= 0
-    n = incidence.n_variables
-    step = sp.coo_array((np.ones(int(used.sum())), (incidence.variable[used], own[used])), shape=(n, n)).tocsr()
-    return _reach(step, missing)
+def _reach(tail: np.ndarray, head: np.ndarray, start: np.ndarray, n: int) -> np.ndarray:
+    """Which of n nodes can be reached from `start` along the arcs: a search from one node put before them all."""
+    arcs = (np.concatenate([tail, np.full(len(start), n)]), np.concatenate([head, start]))
+    graph = sp.coo_array((np.ones(len(arcs[0])), arcs), shape=(n + 1, n + 1)).tocsr()
+    reached = sp.csgraph.breadth_first_order(graph, n, return_predecessors=False)
+    out = np.zeros(n + 1, bool)
+    out[reached] = True
+    return out[:n]
 
 
-def _display(flat: FlatModel, alias: AliasTable, roots: np.ndarray) -> list[int]:
-    """For each root variable, the variable that names it best: no port, if there is one."""
-    out = []
-    for root in roots.tolist():
-        members = np.flatnonzero(alias.root == root)
-        plain = members[~flat.variables.is_port[members]]
-        out.append(int(plain[0]) if len(plain) else root)
-    return out
+def _components(rows, columns, has_row: np.ndarray, has_column: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The connected parts of a set of equations and columns, those of the first equations or columns first."""
+    n, m = len(has_row), len(has_column)
+    graph = sp.coo_array((np.ones(len(rows)), (rows, n + columns)), shape=(n + m, n + m))
+    _, label = connected_components(graph, directed=False)
+    used = np.flatnonzero(np.concatenate([has_row, has_column]))
+    labels, first = np.unique(label[used], return_index=True)
+    order = np.argsort(label[used], kind="stable")
+    members = np.split(used[order], np.searchsorted(label[used][order], labels)[1:]) if len(used) else []
+    return [
+        (members[k][members[k] < n], members[k][members[k] >= n] - n) for k in np.argsort(first, kind="stable").tolist()
+    ]
+
+
+# --- what to say -------------------------------------------------------------------------------------------------
+
+
+def _joined(texts: list[str], unseen: int = 0) -> str:
+    unseen += max(len(texts) - PARTS, 0)
+    if len(texts) == 1 and not unseen:
+        return texts[0]
+    more = [f"- … and {unseen} more."] if unseen else []
+    return "\n".join(["the equations do not fit together:", *(f"- {t}" for t in texts[:PARTS]), *more])
+
+
+def _too_many(equations: list[str], n_unknowns: int, names: list[str]) -> str:
+    n = len(equations)
+    if n > n_unknowns:
+        lines = [
+            f"{counted(n, 'equation')} determine only {counted(n_unknowns, 'unknown')}, {listed(names)}. "
+            f"Remove {counted(n - n_unknowns, 'equation') if n - n_unknowns > 1 else 'one'} of:"
+        ]
+    else:
+        lines = ["one of these equations repeats or contradicts the others. Remove or change one of:"]
+    own = [e for e in equations if written_by(e) is not None]
+    others = [e for e in equations if written_by(e) is None]
+    return "\n".join(lines + itemised([(written_by(e) or "", e) for e in (*own, *others)]))
+
+
+def _repeated(flat: FlatModel, empty: list[str]) -> list[str]:
+    """What to say of equations in which alias elimination has left no variable."""
+    column = np.cumsum(~flat.variables.is_input) - 1
+    column[flat.variables.is_input] = -1
+    unknown = np.flatnonzero(~flat.variables.is_input)
+    whole = incidence(flat.groups, column, len(unknown))
+    over, _ = dulmage_mendelsohn(whole, maximum_matching(whole.pointer, whole.variable, whole.n_variables))
+    texts = []
+    for rows, columns in over:
+        equations = [describe_equation(flat.groups, int(r)) for r in rows]
+        if not set(empty).isdisjoint(equations):
+            empty = [e for e in empty if e not in equations]
+            names = [flat.variables.names[v] for v in unknown[columns] if not flat.variables.is_port[v]]
+            texts.append(
+                _too_many(equations, len(columns), names or [flat.variables.names[v] for v in unknown[columns]])
+            )
+    return texts + [f"this equation only repeats what others say: {e}. Remove it." for e in empty]
+
+
+def _unused_inside(flat: FlatModel) -> np.ndarray:
+    """Ports that no equation and no connection inside their component mentions."""
+    unused = ~flat.ports.has_inside
+    for group in flat.groups:
+        if len(group) and group.variable.shape[1]:
+            port = flat.variables.port[group.variable[[written_by(o) is not None for o in group.origin]]]
+            unused[port[port >= 0]] = False
+    return unused
+
+
+def _too_few(flat: FlatModel, n_equations: int, names: list[str], concerned: np.ndarray) -> str:
+    missing = len(names) - n_equations
+    unused = _unused_inside(flat)
+    port = flat.variables.port[concerned & (flat.variables.port >= 0)]
+    hollow = [flat.ports.names[p] for p in np.unique(port[unused[port]]).tolist()]
+    owners = {name.rpartition(".")[0] for name in names}
+    loose = [p for p, is_loose in zip(flat.ports.names, flat.ports.is_loose.tolist(), strict=True) if is_loose]
+    near = [p for p in loose if p.rpartition(".")[0] in owners]
+    if n_equations == 0:
+        text = f"nothing determines {listed(names, joint='or')}"
+    else:
+        text = f"only {counted(n_equations, 'equation')} for {counted(len(names), 'unknown')}, {listed(names)}"
+    if hollow:
+        inside = listed(dict.fromkeys(p.rpartition(".")[0] for p in hollow))
+        return f"inside {inside} nothing uses {listed(hollow)}: connect it there, or write its equations."
+    if near:
+        return f"{text}: {'is' if len(near) == 1 else 'are'} {listed(near)} meant to be connected?"
+    if len(names) == 1:
+        return f"{text}: add an equation for it, declare it as an input, or leave it out."
+    what = "an equation" if missing == 1 else f"{missing} equations"
+    return f"{text}: add {what}, or declare {'one' if missing == 1 else missing} of them as an input."
+
+
+def _names(flat: FlatModel, alias: AliasTable, unknown: np.ndarray, columns: np.ndarray) -> list[str]:
+    """For each column, the variable that names it best: no port, if there is one."""
+    variables = flat.variables
+    order = np.lexsort((np.arange(len(variables)), variables.is_port, alias.order, alias.root))
+    first = order[np.searchsorted(alias.root[order], unknown[columns])]
+    return [variables.names[v] for v in first.tolist()]

@@ -17,7 +17,7 @@ from ..modeling.component import Component
 from ..modeling.diagram import AcausalDiagram
 from ..modeling.ports import Port
 from ..modeling.symbols import ParameterSymbol, TimeSymbol, VariableSymbol
-from .tables import EquationGroup, FlatModel, ParameterTable, RowInjection, Start, VariableTable
+from .tables import EquationGroup, FlatModel, ParameterTable, PortTable, RowInjection, Start, VariableTable
 from .templates import (
     AnyTemplate,
     LinearTemplate,
@@ -170,12 +170,12 @@ def flatten(diagram: AcausalDiagram) -> FlatModel:
     networks: dict[str, Any] = {}
     _add_components(model, builder)
     _add_learned_terms(model, builder, networks)
-    _add_connections(model, diagram, builder)
+    ports = _add_connections(model, diagram, builder)
     variables = _variable_table(model)
     parameters = _parameter_table(model)
     groups = builder.groups()
     variables, groups, rows = _add_blocks(model, diagram, variables, groups, networks)
-    return FlatModel(variables, parameters, groups, networks, rows)
+    return FlatModel(variables, parameters, groups, networks, rows, model.paths, ports)
 
 
 def _add_components(model: _Model, builder: GroupBuilder):
@@ -256,7 +256,7 @@ def _add_opaque(builder: GroupBuilder, opaque: OpaqueFunction, output: int, y: t
     )
 
 
-def _add_connections(model: _Model, diagram: AcausalDiagram, builder: GroupBuilder):
+def _add_connections(model: _Model, diagram: AcausalDiagram, builder: GroupBuilder) -> PortTable:
     """Across variables of joined ports are equal, their through variables sum to zero; loose ports carry none.
 
     A port has two faces: the outer one joins in the connections of the component's parent, the inner one in those of
@@ -300,8 +300,11 @@ def _add_connections(model: _Model, diagram: AcausalDiagram, builder: GroupBuild
     sets: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for face in sorted(parent, key=lambda f: (rank[f[0]], f[1])):
         sets.setdefault(find(face), []).append(face)
+    loose: set[int] = set()
     for faces in sets.values():
         members = [ports[p] for p, _ in faces]
+        if len(faces) == 1 and faces[0][1] == 0:
+            loose.add(faces[0][0])
         where = ", ".join(f"{model.paths[model.index[id(p.component)]]}.{p.name}" for p in members[:4])
         where += ", …" if len(members) > 4 else ""
         kind = "connection of" if len(faces) > 1 else "unconnected port"
@@ -317,6 +320,12 @@ def _add_connections(model: _Model, diagram: AcausalDiagram, builder: GroupBuild
                 for port, (_, inner) in zip(members, faces, strict=True)
             ]
             builder.add_linear(terms, f"{kind} {where}: {name} sums to zero")
+    return PortTable(
+        [f"{model.paths[model.index[id(p.component)]]}.{p.name}" for p in ports.values()],
+        [p.domain.name for p in ports.values()],
+        np.array([key in loose for key in ports], bool),
+        np.array([(key, 1) in parent for key in ports], bool),
+    )
 
 
 def _variable_table(model: _Model) -> VariableTable:
@@ -324,10 +333,16 @@ def _variable_table(model: _Model) -> VariableTable:
     start: list[Start | None] = []
     unit: list[str] = []
     default: list[float | None] = []
-    is_input, is_port, fixed, nominal = [], [], [], []
+    is_input, is_port, fixed, nominal, owner, port, is_across = [], [], [], [], [], [], []
+    n_ports = 0
     expressions: dict[sympy.Expr, tuple[Template, list[str]]] = {}
     for k, component in enumerate(model.components):
         path = model.paths[k]
+        place: dict[str, tuple[int, bool]] = {}
+        for p in component.ports.values():
+            for table, across in ((p.domain.across, True), (p.domain.through, False)):
+                place |= {f"{p.name}.{name}": (n_ports, across) for name, _ in table}
+            n_ports += 1
         for variable in component.variables.values():
             names.append(f"{path}.{variable.name}")
             is_input.append(variable.kind == "input")
@@ -336,6 +351,9 @@ def _variable_table(model: _Model) -> VariableTable:
             nominal.append(variable.nominal)
             unit.append(variable.unit)
             default.append(variable.default)
+            owner.append(k)
+            port.append(place.get(variable.name, (-1, False))[0])
+            is_across.append(place.get(variable.name, (-1, False))[1])
             if variable.start is None:
                 start.append(None)
                 continue
@@ -353,6 +371,9 @@ def _variable_table(model: _Model) -> VariableTable:
         np.array(nominal, float),
         unit,
         default,
+        np.array(owner, np.int64),
+        np.array(port, np.int64),
+        np.array(is_across, bool),
     )
 
 
@@ -447,5 +468,8 @@ def _add_blocks(model: _Model, diagram: AcausalDiagram, variables: VariableTable
             np.concatenate([variables.nominal, np.ones(extra)]),
             [*variables.unit, *[""] * extra],
             [*variables.default, *[None] * extra],
+            np.concatenate([variables.owner, np.full(extra, -1)]),
+            np.concatenate([variables.port, np.full(extra, -1)]),
+            np.concatenate([variables.is_across, np.zeros(extra, bool)]),
         )
     return variables, groups, tuple(rows)

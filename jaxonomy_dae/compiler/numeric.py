@@ -86,6 +86,7 @@ def residual_and_jacobian(extended: Extended, values, parameters, t: float, netw
     return residual, sp.coo_array(data, shape=shape).tocsr()
 
 
+@np.errstate(all="ignore")  # numbers that overflow end the search
 def consistent_point(
     extended: Extended,
     guess: np.ndarray,
@@ -119,7 +120,10 @@ def consistent_point(
         full = sp.vstack([jacobian, pin_rows]).tocsr()[:, :n]
         if not np.isfinite(full.data).all():
             break
-        step = _least_norm(full, -r)
+        try:
+            step = _least_norm(full, -r)
+        except np.linalg.LinAlgError:
+            break
         scale, accepted = 1.0, False
         while scale > 1e-4:
             trial = values.copy()

@@ -12,6 +12,7 @@ import dataclasses
 
 import numpy as np
 
+from ..errors import StructuralError
 from .match import maximum_matching
 from .structure import Incidence
 
@@ -39,8 +40,12 @@ def reduce_index(incidence: Incidence, least: np.ndarray | None = None) -> Offse
     """Pantelides' algorithm.
 
     `least` gives orders that the variables must reach in any case, because eliminated variables equal these
-    derivatives. The incidence must have a perfect matching (otherwise the algorithm would not end); `check_structure`
-    makes sure of that before.
+    derivatives. The incidence must have a perfect matching, otherwise the algorithm would not end; `check_structure`
+    makes sure of that before, in user names.
+
+    **Raises:**
+
+    - `StructuralError` if there is no perfect matching.
     """
     n_equations, n = incidence.n_equations, incidence.n_variables
     pointer, columns, sigma = incidence.pointer, incidence.variable, incidence.order
@@ -59,6 +64,10 @@ def reduce_index(incidence: Incidence, least: np.ndarray | None = None) -> Offse
     matched = np.flatnonzero(match_equation >= 0)
     match_variable[match_equation[matched]] = matched
 
+    if len(matched) < n_equations or n_equations != n:
+        whole = maximum_matching(pointer, columns, n)
+        if n_equations != n or (whole < 0).any():
+            raise StructuralError(f"{n_equations} equations cannot be matched with {n} unknowns")
     pointer_list, column_list, sigma_list = pointer.tolist(), columns.tolist(), sigma.tolist()
     c_list, d_list = c.tolist(), d.tolist()
     of_variable, of_equation = match_variable.tolist(), match_equation.tolist()

@@ -4,7 +4,9 @@ A variable is an integer; a *quantity* is one of its derivatives, order 0 includ
 of integers. After alias elimination a slot also has a sign, and variable −1 stands for the constant zero.
 """
 
+import collections
 import dataclasses
+import functools
 from typing import Any
 
 import numpy as np
@@ -26,9 +28,30 @@ class VariableTable:
     nominal: np.ndarray
     unit: list[str]
     default: list[float | None]
+    owner: np.ndarray  # the component, −1 for variables of neural blocks
+    port: np.ndarray  # the port it belongs to, −1 if none
+    is_across: np.ndarray
 
     def __len__(self):
         return len(self.names)
+
+
+@dataclasses.dataclass(frozen=True)
+class PortTable:
+    """The ports of the model, by id: full names, domains, and whether they are connected from outside and inside."""
+
+    names: list[str]
+    domains: list[str]
+    is_loose: np.ndarray
+    has_inside: np.ndarray
+
+    @functools.cached_property
+    def _counts(self) -> collections.Counter[str]:
+        return collections.Counter(name.rpartition(".")[0] for name in self.names)
+
+    def count(self, component: str) -> int:
+        """How many ports a component has."""
+        return self._counts[component]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,6 +121,8 @@ class FlatModel:
     groups: tuple[EquationGroup, ...]
     networks: dict[str, Any]
     rows: tuple[RowInjection, ...]
+    components: list[str]  # full names, by id
+    ports: PortTable
 
     @property
     def n_equations(self) -> int:
@@ -117,6 +142,12 @@ class AliasTable:
 def equation_offsets(groups: tuple[EquationGroup, ...]) -> np.ndarray:
     """First equation id of each group, and the total."""
     return np.concatenate([[0], np.cumsum([len(g) for g in groups])]).astype(np.int64)
+
+
+def written_by(origin: str) -> str | None:
+    """The component or network an equation's text begins with ("r.p: …"); None for connections and combinations."""
+    head, colon, _ = origin.partition(": ")
+    return head if colon and " " not in head else None
 
 
 def describe_equation(groups: tuple[EquationGroup, ...], equation: int) -> str:

@@ -30,6 +30,16 @@ class VoltageSource(_TwoPin):
         self.add_equations(Eq(voltage, source))
 
 
+class CurrentSource(_TwoPin):
+    """An ideal source: the current from `p` to `n` through it is the parameter `I` (ampere), whatever the voltage."""
+
+    def __init__(self, ev: EqnEnv, name: str, i: float = 1.0):
+        super().__init__(ev, name)
+        source = self.parameter("I", i, unit="A")
+        _, current = self._two_pins()
+        self.add_equations(Eq(current, source))
+
+
 class Resistor(_TwoPin):
     """v = R·i, `R` in ohm."""
 

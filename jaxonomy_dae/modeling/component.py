@@ -386,12 +386,18 @@ def resolve_ports(ends: Sequence[Any], where: str) -> tuple[Port, ...]:
             raise ModelError(f"{where}: connect takes ports, or a component and a port name; got {end!r}")
         ports.append(end)
     if len(ports) < 2:
-        raise ModelError(f"{where}: connect needs at least two ports; got {len(ports)}")
+        got = f"'{ports[0].component.path}.{ports[0].name}' only" if ports else "none"
+        raise ModelError(f"{where}: connect needs at least two ports; got {got}")
     for port in ports[1:]:
         if port.domain != ports[0].domain:
             raise ModelError(
                 f"{where}: cannot connect {port!r} to {ports[0]!r}: a connection joins ports of one domain"
             )
-    if len({id(p) for p in ports}) < len(ports):
-        raise ModelError(f"{where}: a port is connected to itself: {', '.join(map(repr, ports))}")
+    seen: set[int] = set()
+    for port in ports:
+        if id(port) in seen:
+            raise ModelError(
+                f"{where}: '{port.component.path}.{port.name}' is connected to itself: name each port once"
+            )
+        seen.add(id(port))
     return tuple(ports)

@@ -43,7 +43,10 @@ class AcausalDiagram:
             if known is component:
                 continue
             if known is not None:
-                raise ModelError(f"two components are named '{component.name}': rename one of them")
+                raise ModelError(
+                    f"two components are named '{component.name}': rename one of them, or make a new diagram if this "
+                    "is the same model again"
+                )
             if component.name in self.blocks:
                 raise ModelError(f"'{component.name}' names a neural block already: rename the component")
             self.components[component.name] = component

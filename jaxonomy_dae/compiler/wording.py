@@ -1,0 +1,85 @@
+"""Words for messages: lists of names, and what a user of each physical domain calls things."""
+
+import collections
+import dataclasses
+from collections.abc import Iterable, Sequence
+
+SHOWN = 6
+
+
+@dataclasses.dataclass(frozen=True)
+class DomainWords:
+    """How errors speak of one domain: its across and through quantities, what carries a level, what mends a loop."""
+
+    across: str
+    between: str  # what a difference of two across quantities is called
+    through: str
+    floating: str  # a sentence with {names}
+    mend: str
+    bridge: str
+
+
+WORDS = {
+    "Electrical": DomainWords(
+        "potential",
+        "voltage",
+        "current",
+        "the circuit of {names} has no ground, so nothing determines its potentials",
+        "Connect a Ground to one of its nodes",
+        "a resistor",
+    ),
+    "Translational": DomainWords(
+        "position",
+        "distance",
+        "force",
+        "nothing holds {names}: no mass and no fixed position is connected",
+        "Connect a Mass or a FixedPosition",
+        "a spring",
+    ),
+    "Thermal": DomainWords(
+        "temperature",
+        "temperature difference",
+        "heat flow",
+        "nothing determines the temperatures of {names}: no heat capacitor and no fixed temperature is connected",
+        "Connect a HeatCapacitor or a FixedTemperature",
+        "a thermal conductor",
+    ),
+}
+
+
+def words(domain: str, across: str = "potential", through: str = "flow") -> DomainWords:
+    """The words of a domain; for a user's own domain, the names of its variables."""
+    if domain in WORDS:
+        return WORDS[domain]
+    return DomainWords(
+        across,
+        f"difference of '{across}'",
+        through,
+        f"nothing determines the level of '{across}' at the {domain} ports of {{names}}: only its differences matter",
+        f"Connect a component that fixes '{across}'",
+        "a component",
+    )
+
+
+def listed(names: Iterable[str], shown: int = SHOWN, joint: str = "and") -> str:
+    """'a', 'b' and 'c'; long lists are cut, and the rest counted."""
+    names = [f"'{n}'" for n in dict.fromkeys(names)]
+    if len(names) > shown + 1:
+        return f"{', '.join(names[:shown])} {joint} {len(names) - shown} more"
+    return f" {joint} ".join([", ".join(names[:-1]), names[-1]]) if len(names) > 1 else "".join(names)
+
+
+def counted(n: int, what: str) -> str:
+    """1 equation, 2 equations."""
+    return f"{n} {what}{'' if n == 1 else 's'}"
+
+
+def itemised(items: Sequence[tuple[str, str]], shown: int = SHOWN) -> list[str]:
+    """Indented lines of (component, equation), those of one component together; long lists are cut."""
+    count = collections.Counter(items)
+    lines = [f"  {item[1]}" + (f"  (written {n} times)" if n > 1 else "") for item, n in list(count.items())[:shown]]
+    rest = list(count)[shown:]
+    if rest:
+        owners = list(dict.fromkeys(owner for owner, _ in rest if owner))
+        lines.append(f"  … and {len(rest)} more" + (f", of {listed(owners, 4)}" if owners else ""))
+    return lines
