@@ -1,6 +1,7 @@
 """Lowering: the compiler's tables become the static plan of an `AcausalSystem`."""
 
 import dataclasses
+import functools
 import hashlib
 from collections.abc import Sequence
 from typing import Any
@@ -13,6 +14,8 @@ from ..compiler.select_states import StateSelection
 from ..compiler.tables import ZERO, AliasTable, EquationGroup, FlatModel, RowInjection
 from ..compiler.templates import OpaqueFunction
 from ..errors import ModelError, nearest
+from ..solvers.sparse import SparsePattern
+from . import pattern
 from .evaluate import Layout, Program, plan
 from .gather import Gather
 from .schedule import Step, build_schedule
@@ -34,6 +37,7 @@ class PlannedRow:
     rows: tuple[int, ...]
     inputs: tuple[Gather, ...]
     sign: tuple[int, ...]
+    quantities: np.ndarray  # of the inputs
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,6 +94,23 @@ class SystemPlan:
     @property
     def n_constraints(self) -> int:
         return len(self.selection.constraints)
+
+    @functools.cached_property
+    def jacobian_pattern(self) -> SparsePattern | None:
+        """Where ∂(vector field)/∂(state) can be nonzero at a consistent state, shape (n_state, n_state); None if it has
+        too many places to list."""
+        return pattern.field_pattern(self)
+
+    def dae_pattern(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """(rows, columns) where the Jacobian of [f(t, x, z); g(t, x, z)] with respect to the state array [x, z] can be
+        nonzero: the states' derivatives with z read from the array, not refined, then the residuals of the nonlinear
+        blocks. Sorted by row, each place once; None if there are too many to list."""
+        found = self._dae_pattern
+        return None if found is None else (found.rows, found.cols)
+
+    @functools.cached_property
+    def _dae_pattern(self) -> SparsePattern | None:
+        return pattern.dae_pattern(self)
 
     def quantity_of(self, variable: int) -> tuple[int, int]:
         """(quantity, sign) of a variable; quantity ZERO if it is identically zero."""
@@ -166,7 +187,7 @@ def lower(
     keep = {id(s) for s in (*upstream, *nonlinear)}
     carried_residuals = program([s for s in steps if id(s) in keep])
 
-    constraint_groups, constraint_slots, pattern = _constraints(extended, selection, state_order)
+    constraint_groups, constraint_slots, constraint_pattern = _constraints(extended, selection, state_order)
     constraint_program = program(_needed(steps, constraint_slots, n))
     planned_constraints = tuple(
         ConstraintGroup(
@@ -225,7 +246,7 @@ def lower(
         carried_residuals,
         constraint_program,
         planned_constraints,
-        pattern,
+        constraint_pattern,
         rows,
         tuple(flat.networks),
         functions,
@@ -312,7 +333,7 @@ def _plan_row(row: RowInjection, inputs, flat, alias, extended, states, layout: 
         rows.append(position[q])
         signs.append(int(alias.sign[v]))
     gathers = tuple(layout.gather(np.array([q]), np.array([s])) for q, s in zip(*inputs, strict=True))
-    return PlannedRow(row.opaque, tuple(rows), gathers, tuple(signs))
+    return PlannedRow(row.opaque, tuple(rows), gathers, tuple(signs), inputs[0])
 
 
 def _digest(flat: FlatModel, mode: str, selection: StateSelection, states: np.ndarray, extended: Extended) -> str:

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..errors import ModelError, nearest
-from .dynamics import SCALARS, Point
+from ..solvers.sparse import SparseMatrix, SparsePattern, sparse_jacobian
+from .dynamics import READ_REFINEMENTS, SCALARS, Point
 from .lower import SystemPlan
 from .parameters import Parameters
 
@@ -123,6 +124,35 @@ class AcausalSystem(eqx.Module):
         # Reverse mode recomputes a small field rather than storing what it needs of every stage: a few fused kernels
         # instead of a store for each intermediate value, a quarter of the time of a gradient.
         return eqx.filter_checkpoint(lambda s, t, x, args: s._point(t, args).vector_field(x))(self, t, x, args)
+
+    @property
+    def jacobian_pattern(self) -> SparsePattern | None:
+        """Where the Jacobian of the vector field can have entries: `.rows` and `.cols`, sorted by row. None if it is so
+        large and dense that its places are not worth listing."""
+        return self.plan.jacobian_pattern
+
+    def jacobian(self, t: Any, x: Float[Array, " n"], args: Any = None) -> SparseMatrix:
+        """∂(vector field)/∂(state) at a consistent state, sparse: `.values` at the places of `.pattern`, `.dense()`,
+        `.solve(b)`, `matrix @ vector`.
+
+        It takes as many directional derivatives as the pattern has colours: three for a chain, however long.
+
+        **Raises:**
+
+        - `ModelError` if it is large and dense.
+        """
+        pattern = self.jacobian_pattern
+        if pattern is None:
+            raise ModelError(
+                f"the Jacobian of these {self.plan.n_state} states is dense, too large to list its entries: use "
+                "jax.jvp(system.vector_field, …) for its products with vectors"
+            )
+        point = self._point(t, args)
+        if len(self.plan.carried):
+            x = jax.lax.stop_gradient(point.join(point.refined(point.split(x), READ_REFINEMENTS))) + (
+                x - jax.lax.stop_gradient(x)
+            )
+        return SparseMatrix(sparse_jacobian(point.vector_field, pattern)(x), pattern)
 
     def project(self, t: Any, x: Float[Array, " n"], args: Any = None, iterations: int = 1) -> Float[Array, " n"]:
         """The state moved onto the hidden constraints (nothing to do if there are none)."""

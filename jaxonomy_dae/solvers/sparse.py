@@ -19,6 +19,7 @@ import importlib
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -124,6 +125,28 @@ class SparsePattern:
         """A·x, or Aᵀ·x."""
         rows, cols, size = (self.cols, self.rows, self.n) if transpose else (self.rows, self.cols, self.n_rows)
         return jnp.zeros(size, x.dtype).at[rows].add(values * x[cols])
+
+
+class SparseMatrix(eqx.Module):
+    """A matrix by its pattern and the values of its entries."""
+
+    values: Float[Array, " nnz"]
+    pattern: SparsePattern = eqx.field(static=True)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.pattern.shape
+
+    def dense(self) -> Float[Array, "n_rows n"]:
+        """The matrix as an array."""
+        return self.pattern.dense(self.values)
+
+    def __matmul__(self, x: Float[Array, " n"]) -> Float[Array, " n_rows"]:
+        return self.pattern.multiply(self.values, x)
+
+    def solve(self, b: Float[Array, " n"], transpose: bool = False) -> Float[Array, " n"]:
+        """x with A·x = b, or Aᵀ·x = b: see `solve_sparse`."""
+        return solve_sparse(self.pattern, self.values, b, transpose)
 
 
 class MissingSparseSolver(ImportError):
