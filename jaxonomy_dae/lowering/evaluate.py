@@ -5,6 +5,7 @@ tuple of scalars for small systems), chunk 1 the inputs' quantities; every step 
 local unknowns.
 """
 
+import copy
 import dataclasses
 import functools
 from collections.abc import Sequence
@@ -16,10 +17,14 @@ import numpy as np
 
 from ..compiler.numeric import Networks
 from ..compiler.tables import ZERO
+from ..errors import ModelError
+from ..solvers import sparse
 from ..solvers.small_linear import UNROLLED, solve
+from ..solvers.sparse import SparsePattern, solve_sparse
 from .gather import Chunk, Gather, take
-from .schedule import Step, StepEquation
+from .schedule import AnyStep, SparseStep, Step, StepEquation
 
+DENSE = 1000  # simultaneous equations that dense elimination may solve if there is no sparse solver: about 20 ms
 LONG_SUM = 16  # linear equations with more terms are one gather and one sum
 
 
@@ -57,26 +62,45 @@ class PlannedStep:
 
 
 @dataclasses.dataclass(frozen=True)
+class PlannedSparse:
+    """A sparse step: its equations read its own unknowns as a chunk that follows all others. `entries` lists, for each
+    equation, (slot, instances, signs) of the slots that are unknowns; in this order their partial derivatives are the
+    values of the matrix at the places of `pattern`."""
+
+    step: SparseStep
+    equations: tuple[_PlannedEquation, ...]
+    entries: tuple[tuple[tuple[int, np.ndarray, Any], ...], ...]
+    pattern: SparsePattern
+    guess: Gather | None
+
+
+@dataclasses.dataclass(frozen=True)
 class Program:
     """Planned steps and the layout of all they compute."""
 
-    steps: tuple[PlannedStep, ...]
+    steps: tuple[PlannedStep | PlannedSparse, ...]
     layout: Layout
 
 
 def plan(
-    steps: Sequence[Step], states: np.ndarray, inputs: np.ndarray, n_quantities: int, carried: np.ndarray
+    steps: Sequence[AnyStep], states: np.ndarray, inputs: np.ndarray, n_quantities: int, carried: np.ndarray
 ) -> Program:
     """Plans the evaluation of `steps`; the state array holds `states`, then `carried`."""
     chunk = np.full(n_quantities, -2, np.int64)
     offset = np.zeros(n_quantities, np.int64)
     chunk[states], offset[states] = 0, np.arange(len(states))
     chunk[inputs], offset[inputs] = 1, np.arange(len(inputs))
-    place = {int(q): len(states) + k for k, q in enumerate(carried)}
+    place = np.zeros(n_quantities, np.int64)
+    place[carried] = len(states) + np.arange(len(carried))
     next_chunk = 2
     planned = []
     for step in steps:
         layout = Layout(chunk, offset)
+        if isinstance(step, SparseStep):
+            chunk[step.unknown[0]], offset[step.unknown[0]] = next_chunk, np.arange(step.n)
+            next_chunk += 1
+            planned.append(_plan_sparse(step, layout, place))
+            continue
         equations = []
         for equation in step.equations:
             sources, signs = [], []
@@ -87,13 +111,39 @@ def plan(
         guess = []
         if step.carried:
             for u in step.tearing.tearing:
-                where = np.array([place[int(q)] for q in step.unknown[u]])
-                guess.append(Gather(np.zeros(step.n, np.int64), where, np.ones(step.n, np.int64)))
+                guess.append(_from_state(place[step.unknown[u]]))
         planned.append(PlannedStep(step, tuple(equations), tuple(guess)))
         for quantities in step.unknown:
             chunk[quantities], offset[quantities] = next_chunk, np.arange(step.n)
             next_chunk += 1
     return Program(tuple(planned), Layout(chunk, offset))
+
+
+def _plan_sparse(step: SparseStep, layout: Layout, place: np.ndarray) -> PlannedSparse:
+    """Plans a sparse step; `layout` has its unknowns already."""
+    local = np.full(len(place) + 1, -1, np.int64)  # the last entry is the constant zero
+    local[step.unknown[0]] = np.arange(step.n)
+    equations, entries, rows, cols = [], [], [], []
+    first = 0
+    for equation in step.equations:
+        sources = tuple(layout.gather(slot.quantity, slot.sign) for slot in equation.slots)
+        equations.append(_PlannedEquation(equation, sources, (1,) * len(sources)))
+        here = []
+        for k, slot in enumerate(equation.slots):
+            instances = np.flatnonzero(local[slot.quantity] >= 0)
+            if len(instances):
+                here.append((k, instances, _uniform(slot.sign[instances])))
+                rows.append(first + instances)
+                cols.append(local[slot.quantity[instances]])
+        entries.append(tuple(here))
+        first += len(equation.equation)
+    pattern = SparsePattern(np.concatenate(rows), np.concatenate(cols), step.n)
+    guess = _from_state(place[step.unknown[0]]) if step.carried else None
+    return PlannedSparse(step, tuple(equations), tuple(entries), pattern, guess)
+
+
+def _from_state(place: np.ndarray) -> Gather:
+    return Gather(np.zeros(len(place), np.int64), place, np.ones(len(place), np.int64))
 
 
 def _uniform(sign: np.ndarray) -> Any:
@@ -114,7 +164,10 @@ class Evaluation:
     def run(self, program: Program, refine: int):
         """Evaluates all steps; the tearing variables of carried steps get `refine` Newton corrections."""
         for planned in program.steps:
-            self.chunks.extend(self._step(planned, refine))
+            if isinstance(planned, PlannedSparse):
+                self.chunks.append(self._sparse_step(planned, refine))
+            else:
+                self.chunks.extend(self._step(planned, refine))
         return self
 
     def read(self, gather: Gather) -> Any:
@@ -202,6 +255,48 @@ class Evaluation:
             z = newton(residuals, z)
         return follow(z)
 
+    def _sparse_step(self, planned: PlannedSparse, refine: int) -> Any:
+        """The unknowns of large blocks, shape (n,)."""
+
+        def solved(u: Any) -> Any:
+            """One Newton step, exact if the equations are affine."""
+            residual, values = self._whole(planned, u, partials=True)
+            return u - solve_block(planned.pattern, values, residual)
+
+        if planned.guess is None:
+            return solved(jnp.zeros(planned.step.n, self.dtype))
+        u = self.read(planned.guess)
+        if refine == 0:
+            self.residuals.append(self._whole(planned, u, partials=False)[0])
+        for _ in range(refine):
+            u = solved(u)
+        return u
+
+    def _whole(self, planned: PlannedSparse, u: Any, partials: bool) -> tuple[Any, Any]:
+        """The residuals of a sparse step's equations at its unknowns u, and the values of their matrix."""
+        there = copy.copy(self)
+        there.chunks = [*self.chunks, u]
+        residuals, values = [], []
+        for equation, entries in zip(planned.equations, planned.entries, strict=True):
+            template = equation.equation.template
+            shape = (len(equation.equation.equation),)
+            slots, *rest = there._arguments(equation, [])
+
+            def residual(*slots, template=template, rest=rest, shape=shape):
+                return self._filled(template.residual(list(slots), *rest), shape)
+
+            residuals.append(residual(*slots))
+            if not partials:
+                continue
+            if template.opaque is not None:
+                slots = [self._filled(s, shape) for s in slots]
+                slopes = [_slope(residual, slots, k) for k in range(len(slots))]
+            else:
+                slopes = template.partial_values(slots, *rest)
+            for k, instances, sign in entries:
+                values.append(_signed(sign, take(self._filled(slopes[k], shape), instances), self.dtype))
+        return jnp.concatenate(residuals), jnp.concatenate(values) if partials else None
+
     def _affine(self, follow, residuals, m: int, shape: tuple[int, ...]) -> list[Any]:
         """The local unknowns of a linear block: affine in its tearing variables, as the residuals are."""
         zero = [jnp.zeros(shape, self.dtype)] * m
@@ -218,6 +313,33 @@ class Evaluation:
 
     def _filled(self, value: Any, shape: tuple[int, ...]) -> Any:
         return jnp.broadcast_to(jnp.asarray(value, self.dtype), shape)
+
+
+def _slope(function, slots: list[Any], k: int) -> Any:
+    """∂f/∂slot k of a function that acts on every instance alone."""
+    return jax.jvp(lambda s: function(*slots[:k], s, *slots[k + 1 :]), (slots[k],), (jnp.ones_like(slots[k]),))[1]
+
+
+def solve_block(pattern: SparsePattern, values: Any, right: Any) -> Any:
+    """A·x = b by KLU; by dense elimination where KLU is not available and A is not too large for that.
+
+    **Raises:** `ModelError` where neither is possible.
+    """
+    if jax.config.jax_enable_x64 and sparse.available():
+        return solve_sparse(pattern, values, right)
+    check_solvable(pattern.n)
+    if pattern.n > DENSE:
+        raise ModelError(
+            f"the model has {pattern.n} simultaneous equations; sparse solves compute in float64: call "
+            "jax.config.update('jax_enable_x64', True) at the start"
+        )
+    return jnp.linalg.solve(pattern.dense(values), right)
+
+
+def check_solvable(n: int):
+    """**Raises:** `ModelError` if n simultaneous equations need a package that is not installed."""
+    if n > DENSE and not sparse.available():
+        raise ModelError(f"the model has {n} simultaneous equations, which need a sparse solver: {sparse.EXTRA}")
 
 
 def newton(residuals, z: list[Any]) -> list[Any]:

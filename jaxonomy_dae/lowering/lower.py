@@ -16,9 +16,9 @@ from ..compiler.templates import OpaqueFunction
 from ..errors import ModelError, nearest
 from ..solvers.sparse import SparsePattern
 from . import pattern
-from .evaluate import Layout, Program, plan
+from .evaluate import Layout, Program, check_solvable, plan
 from .gather import Gather
-from .schedule import Step, build_schedule
+from .schedule import TORN, AnyStep, SparseStep, build_schedule
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,7 +59,7 @@ class SystemPlan:
     groups: tuple[EquationGroup, ...]
     extended: Extended
     selection: StateSelection
-    steps: tuple[Step, ...]
+    steps: tuple[AnyStep, ...]
     blocks: Blocks
     mode: str
 
@@ -71,7 +71,7 @@ class SystemPlan:
     inputs: InputTable
     derivative: Program
     next_derivative: Gather
-    carried_rates: tuple[Gather, ...] | None  # where the model itself has the derivatives of all `carried`
+    carried_rates: Gather | None  # where the model itself has the derivatives of all `carried`
     everything: Program
     carried_residuals: Program
     constraint_program: Program
@@ -107,6 +107,15 @@ class SystemPlan:
         blocks. Sorted by row, each place once; None if there are too many to list."""
         found = self._dae_pattern
         return None if found is None else (found.rows, found.cols)
+
+    @functools.cached_property
+    def carried_pattern(self) -> SparsePattern | None:
+        """Where ∂g/∂z can be nonzero, if there are so many algebraic unknowns z that it matters."""
+        if len(self.carried) <= TORN or self._dae_pattern is None:
+            return None
+        n, found = len(self.states), self._dae_pattern
+        inside = (found.rows >= n) & (found.cols >= n)
+        return SparsePattern(found.rows[inside] - n, found.cols[inside] - n, len(self.carried))
 
     @functools.cached_property
     def _dae_pattern(self) -> SparsePattern | None:
@@ -146,7 +155,7 @@ class SystemPlan:
         return np.array(quantity, np.int64), np.array(sign, np.int64)
 
 
-def _needed(steps: Sequence[Step], targets: np.ndarray, n: int) -> tuple[Step, ...]:
+def _needed(steps: Sequence[AnyStep], targets: np.ndarray, n: int) -> tuple[AnyStep, ...]:
     """The steps on which the target quantities depend, in order."""
     wanted = np.zeros(n, bool)
     wanted[targets[targets != ZERO]] = True
@@ -174,11 +183,14 @@ def lower(
     quantities = extended.quantities
     n = quantities.n
     steps = build_schedule(extended, blocks)
-    carried = [step.unknown[u] for step in steps if step.carried for u in step.tearing.tearing]
+    for step in steps:
+        if isinstance(step, SparseStep):
+            check_solvable(step.n)
+    carried = [quantities for step in steps for quantities in step.guessed]
     carried = np.concatenate(carried) if carried else np.zeros(0, np.int64)
     input_quantities = np.arange(quantities.n_unknown, n)
 
-    def program(chosen: Sequence[Step]) -> Program:
+    def program(chosen: Sequence[AnyStep]) -> Program:
         return plan(chosen, state_order, input_quantities, n, carried)
 
     nonlinear = [s for s in steps if s.carried]
@@ -241,7 +253,7 @@ def lower(
         inputs,
         derivative,
         derivative.layout.gather(following) if len(following) else Gather(*(np.zeros(0, np.int64),) * 3),
-        tuple(derivative.layout.gather(np.array([q])) for q in rates) if len(rates) else None,
+        derivative.layout.gather(rates) if len(rates) else None,
         everything,
         carried_residuals,
         constraint_program,

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..solvers.sparse import SparsePattern
-from .schedule import Step
+from .schedule import AnyStep, SparseStep
 
 if TYPE_CHECKING:
     from .lower import SystemPlan
@@ -89,8 +89,10 @@ class Dependencies:
         """The rows of quantities."""
         return self.union(np.arange(len(quantity)), quantity, len(quantity))
 
-    def add(self, step: Step):
+    def add(self, step: AnyStep):
         """The rows of what a step computes."""
+        if isinstance(step, SparseStep):
+            return self._add_sparse(step)
         n = step.n
         sources = [s.quantity for e in step.equations for s in e.slots if s.local < 0]
         quantity = np.concatenate(sources) if sources else np.zeros(0, np.int64)
@@ -98,13 +100,33 @@ class Dependencies:
         if not step.carried or self.refined:
             self._store(self.union(owner, quantity, n), step.unknown)
             return
-        guessed = [step.unknown[u] for u in step.tearing.tearing]
+        guessed = step.torn
         places = [self.place[quantities] for quantities in guessed]
         rows = self.union(owner, quantity, n, places)
         self._store(rows, step.unknown)
         self.residuals.extend([rows] * len(guessed))
         for quantities, place in zip(guessed, places, strict=True):
             self.segment[quantities], self.row[quantities] = 0, place
+
+    def _add_sparse(self, step: SparseStep):
+        sources = [s.quantity for e in step.equations for s in e.slots]
+        quantity = np.concatenate(sources)
+        if not step.carried or self.refined:
+            owners = [block for e, block in zip(step.equations, step.equation_block, strict=True) for _ in e.slots]
+            own = np.zeros(len(self.segment), bool)
+            own[step.unknown[0]] = True
+            outside = ~own[quantity]
+            rows = self.union(np.concatenate(owners)[outside], quantity[outside], int(step.block.max()) + 1)
+            self._store(rows, [])
+            self.segment[step.unknown[0]], self.row[step.unknown[0]] = len(self.segments) - 1, step.block
+            return
+        self.segment[step.unknown[0]], self.row[step.unknown[0]] = 0, self.place[step.unknown[0]]
+        first, owners = 0, []
+        for equation in step.equations:
+            n = len(equation.equation)
+            owners.append(np.tile(first + np.arange(n), len(equation.slots)))
+            first += n
+        self.residuals.append(self.union(np.concatenate(owners), quantity, step.n))
 
 
 def entries(rows: Sequence[Rows]) -> tuple[np.ndarray, np.ndarray]:

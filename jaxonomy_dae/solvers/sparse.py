@@ -170,6 +170,15 @@ def klu() -> Any:
         jax.config.update("jax_platform_name", platform)
 
 
+def available() -> bool:
+    """Whether the package for sparse solves is installed."""
+    try:
+        klu()
+    except MissingSparseSolver:
+        return False
+    return True
+
+
 def solve_sparse(
     pattern: SparsePattern, values: Float[Array, " nnz"], b: Float[Array, " n"], transpose: bool = False
 ) -> Float[Array, " n"]:
