@@ -22,9 +22,11 @@ from ..solvers import sparse
 from ..solvers.small_linear import UNROLLED, solve
 from ..solvers.sparse import SparsePattern, solve_sparse
 from .gather import Chunk, Gather, take
+from .repeat import Repeat, find_repeats
 from .schedule import AnyStep, SparseStep, Step, StepEquation
 
 DENSE = 1000  # simultaneous equations that dense elimination may solve if there is no sparse solver: about 20 ms
+UNROLLED_REPETITIONS = 4  # of a loop, written out in each of its iterations
 LONG_SUM = 16  # linear equations with more terms are one gather and one sum
 
 
@@ -75,10 +77,26 @@ class PlannedSparse:
 
 
 @dataclasses.dataclass(frozen=True)
+class PlannedRepeat:
+    """A loop over the repetitions of a few steps.
+
+    Within it, chunk 0 are the values carried over from the repetitions before, chunk 1 what each repetition reads from
+    outside; the steps' unknowns follow. Parameters are numbered through as the steps list them.
+    """
+
+    count: int
+    body: tuple[PlannedStep, ...]
+    first: Gather | None  # what the first repetition carries
+    following: Gather | None  # and each hands on, read within the loop
+    outside: Gather | None  # (count · number,)
+    parameters: np.ndarray  # (count, number)
+
+
+@dataclasses.dataclass(frozen=True)
 class Program:
     """Planned steps and the layout of all they compute."""
 
-    steps: tuple[PlannedStep | PlannedSparse, ...]
+    steps: tuple[PlannedStep | PlannedSparse | PlannedRepeat, ...]
     layout: Layout
 
 
@@ -94,29 +112,87 @@ def plan(
     place[carried] = len(states) + np.arange(len(carried))
     next_chunk = 2
     planned = []
-    for step in steps:
+    for step in find_repeats(steps, n_quantities):
         layout = Layout(chunk, offset)
-        if isinstance(step, SparseStep):
-            chunk[step.unknown[0]], offset[step.unknown[0]] = next_chunk, np.arange(step.n)
-            next_chunk += 1
+        if isinstance(step, Repeat):
+            planned.append(_plan_repeat(step, layout))
+            unknown = [quantities.ravel() for each in step.unknown for quantities in each]
+        elif isinstance(step, SparseStep):
+            unknown = step.unknown
+            chunk[unknown[0]], offset[unknown[0]] = next_chunk, np.arange(step.n)
             planned.append(_plan_sparse(step, layout, place))
-            continue
-        equations = []
-        for equation in step.equations:
-            sources, signs = [], []
-            for slot in equation.slots:
-                sources.append(-1 - slot.local if slot.local >= 0 else layout.gather(slot.quantity, slot.sign))
-                signs.append(_uniform(slot.sign))
-            equations.append(_PlannedEquation(equation, tuple(sources), tuple(signs)))
-        guess = []
-        if step.carried:
-            for u in step.tearing.tearing:
-                guess.append(_from_state(place[step.unknown[u]]))
-        planned.append(PlannedStep(step, tuple(equations), tuple(guess)))
-        for quantities in step.unknown:
-            chunk[quantities], offset[quantities] = next_chunk, np.arange(step.n)
+        else:
+            unknown = step.unknown
+            equations = tuple(_plan_equation(e, layout) for e in step.equations)
+            guess = tuple(_from_state(place[quantities]) for quantities in step.guessed)
+            planned.append(PlannedStep(step, equations, guess))
+        for quantities in unknown:
+            chunk[quantities], offset[quantities] = next_chunk, np.arange(len(quantities))
             next_chunk += 1
     return Program(tuple(planned), Layout(chunk, offset))
+
+
+def _plan_equation(equation: StepEquation, layout: Layout) -> _PlannedEquation:
+    sources = [-1 - s.local if s.local >= 0 else layout.gather(s.quantity, s.sign) for s in equation.slots]
+    return _PlannedEquation(equation, tuple(sources), tuple(_uniform(s.sign) for s in equation.slots))
+
+
+def _plan_repeat(repeat: Repeat, layout: Layout) -> PlannedRepeat:
+    """Plans a loop; `layout` is that of what lies before it."""
+    chunk_of = {}  # of (step of the body, unknown), within the loop
+    for p, step in enumerate(repeat.body):
+        for u in range(len(step.unknown)):
+            chunk_of[p, u] = 2 + len(chunk_of)
+    # A register holds a value of `back` repetitions ago; it is filled from the register of one less.
+    registers: dict[tuple[int, int, int, int], int] = {}
+    first: list[int] = []
+    for read in np.flatnonzero(repeat.back > 0).tolist():
+        for back in range(1, int(repeat.back[read]) + 1):
+            key = (back, *repeat.source[read].tolist())
+            if key not in registers:
+                registers[key] = len(registers)
+                first.append(int(repeat.reads[repeat.back[read] - back, read]))
+    handed = [
+        (chunk_of[p, u], instance) if back == 1 else (0, registers[back - 1, p, u, instance])
+        for back, p, u, instance in registers
+    ]
+    outside = np.flatnonzero((repeat.back < 0) & (repeat.reads[0] != ZERO))
+    chunk = np.full(len(repeat.back), -1, np.int64)
+    offset = np.zeros(len(repeat.back), np.int64)
+    chunk[outside], offset[outside] = 1, np.arange(len(outside))
+    for read in np.flatnonzero(repeat.back >= 0).tolist():
+        back, (p, u, instance) = int(repeat.back[read]), repeat.source[read].tolist()
+        chunk[read] = 0 if back else chunk_of[p, u]
+        offset[read] = registers[back, p, u, instance] if back else instance
+
+    body, read, parameter = [], 0, 0
+    for step in repeat.body:
+        equations = []
+        for equation in step.equations:
+            sources: list[Gather | int] = []
+            for slot in equation.slots:
+                if slot.local >= 0:
+                    sources.append(-1 - slot.local)
+                    continue
+                here = slice(read, read + step.n)
+                sources.append(Gather(chunk[here], offset[here], np.where(slot.sign == 0, 1, slot.sign)))
+                read += step.n
+            size = equation.parameter.size
+            numbers = parameter + np.arange(size).reshape(equation.parameter.shape)
+            parameter += size
+            renumbered = dataclasses.replace(equation, parameter=numbers)
+            equations.append(
+                _PlannedEquation(renumbered, tuple(sources), tuple(_uniform(s.sign) for s in equation.slots))
+            )
+        body.append(PlannedStep(step, tuple(equations), ()))
+    return PlannedRepeat(
+        repeat.count,
+        tuple(body),
+        layout.gather(np.array(first)) if first else None,
+        Gather(*np.array(handed).T, np.ones(len(handed), np.int64)) if first else None,
+        layout.gather(repeat.reads[:, outside].ravel()) if len(outside) else None,
+        repeat.parameters,
+    )
 
 
 def _plan_sparse(step: SparseStep, layout: Layout, place: np.ndarray) -> PlannedSparse:
@@ -164,7 +240,9 @@ class Evaluation:
     def run(self, program: Program, refine: int):
         """Evaluates all steps; the tearing variables of carried steps get `refine` Newton corrections."""
         for planned in program.steps:
-            if isinstance(planned, PlannedSparse):
+            if isinstance(planned, PlannedRepeat):
+                self.chunks.extend(self._repeat(planned))
+            elif isinstance(planned, PlannedSparse):
                 self.chunks.append(self._sparse_step(planned, refine))
             else:
                 self.chunks.extend(self._step(planned, refine))
@@ -254,6 +332,29 @@ class Evaluation:
         for _ in range(refine):
             z = newton(residuals, z)
         return follow(z)
+
+    def _repeat(self, planned: PlannedRepeat) -> list[Any]:
+        """The unknowns of all repetitions, each of shape (count · n,)."""
+
+        def read(gather: Gather | None) -> Any:
+            if gather is None:
+                return jnp.zeros(0, self.dtype)
+            return self._filled(self.read(gather), (len(gather.chunk),))
+
+        def repetition(carried, given):
+            outside, parameters = given
+            inner = Evaluation(carried, outside, parameters, self.t, Networks(self.networks.weights))
+            for step in planned.body:
+                inner.chunks.extend(inner._step(step, refine=0))
+            if planned.following is not None:
+                carried = self._filled(inner.read(planned.following), carried.shape)
+            return carried, tuple(inner.chunks[2:])
+
+        count = planned.count
+        parameters = self.parameters[planned.parameters.ravel()].reshape(planned.parameters.shape)
+        given = jnp.reshape(read(planned.outside), (count, -1)), parameters
+        _, chunks = jax.lax.scan(repetition, read(planned.first), given, unroll=UNROLLED_REPETITIONS)
+        return [jnp.reshape(c, (-1,)) for c in chunks]
 
     def _sparse_step(self, planned: PlannedSparse, refine: int) -> Any:
         """The unknowns of large blocks, shape (n,)."""

@@ -197,7 +197,8 @@ def lower(
     residual_needs = np.concatenate([np.zeros(0, np.int64), *(s.needs() for s in nonlinear)])
     upstream = _needed(steps, residual_needs, n)
     keep = {id(s) for s in (*upstream, *nonlinear)}
-    carried_residuals = program([s for s in steps if id(s) in keep])
+    for_residuals = [s for s in steps if id(s) in keep]
+    carried_residuals = program(for_residuals)
 
     constraint_groups, constraint_slots, constraint_pattern = _constraints(extended, selection, state_order)
     constraint_program = program(_needed(steps, constraint_slots, n))
@@ -212,7 +213,7 @@ def lower(
     everything = program(steps)
     row_inputs = _row_input_quantities(flat, alias, extended)
     following = state_order + 1
-    rates = carried + 1 if _rates_hold(flat, alias, extended, carried_residuals, carried) else carried[:0]
+    rates = carried + 1 if _rates_hold(flat, alias, extended, for_residuals, carried) else carried[:0]
     derivative = program(_needed(steps, np.concatenate([following, rates, *(q for q, _ in row_inputs)]), n))
     rows = tuple(
         _plan_row(row, inputs, flat, alias, extended, state_order, derivative.layout)
@@ -266,13 +267,13 @@ def lower(
 
 
 def _rates_hold(
-    flat: FlatModel, alias: AliasTable, extended: Extended, residuals: Program, carried: np.ndarray
+    flat: FlatModel, alias: AliasTable, extended: Extended, residuals: Sequence[AnyStep], carried: np.ndarray
 ) -> bool:
     """Whether the derivatives of all carried unknowns are quantities of the model, untouched by row injection."""
     quantities = extended.quantities
     if not len(carried) or not (quantities.order[carried] < quantities.highest[quantities.owner[carried]]).all():
         return False
-    read = np.concatenate([planned.step.needs() for planned in residuals.steps])
+    read = np.concatenate([step.needs() for step in residuals])
     targets = [v for row in flat.rows for v in row.targets]
     injected = quantities.first[quantities.column[alias.root[targets]]] + alias.order[targets] if targets else []
     return not np.isin(injected, read).any()
