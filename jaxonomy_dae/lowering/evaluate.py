@@ -22,6 +22,7 @@ from ..solvers import sparse
 from ..solvers.small_linear import UNROLLED, solve
 from ..solvers.sparse import SparsePattern, solve_sparse
 from .gather import Chunk, Gather, take
+from .merge import merge_thin
 from .repeat import Repeat, find_repeats
 from .schedule import AnyStep, SparseStep, Step, StepEquation
 
@@ -112,7 +113,7 @@ def plan(
     place[carried] = len(states) + np.arange(len(carried))
     next_chunk = 2
     planned = []
-    for step in find_repeats(steps, n_quantities):
+    for step in merge_thin(find_repeats(steps, n_quantities), n_quantities, DENSE):
         layout = Layout(chunk, offset)
         if isinstance(step, Repeat):
             planned.append(_plan_repeat(step, layout))
