@@ -12,7 +12,7 @@ from problems import compiled
 
 from jaxonomy_dae import Component, EqnEnv, der
 from jaxonomy_dae.lowering import merge
-from jaxonomy_dae.lowering.evaluate import PlannedRepeat, PlannedSparse
+from jaxonomy_dae.lowering.program import PlannedRepeat, PlannedSparse
 
 TIGHT = dict(rtol=1e-12, atol=1e-13)
 

@@ -14,9 +14,10 @@ import numpy as np
 from ..compiler.numeric import Networks
 from ..solvers.small_linear import UNROLLED, solve
 from ..solvers.sparse import sparse_jacobian
-from .evaluate import Evaluation, Program, newton, solve_block
+from .evaluate import Evaluation, newton, solve_block
 from .gather import Gather, take
 from .lower import ConstraintGroup, PlannedRow, SystemPlan
+from .program import Program
 
 SCALARS = 32  # up to this many states, tracing is done on scalars
 FIELD_REFINEMENTS = 1

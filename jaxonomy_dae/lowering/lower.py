@@ -16,8 +16,9 @@ from ..compiler.templates import OpaqueFunction
 from ..errors import ModelError, nearest
 from ..solvers.sparse import SparsePattern
 from . import pattern
-from .evaluate import Layout, Program, check_solvable, plan
+from .evaluate import check_solvable
 from .gather import Gather
+from .program import Layout, Program, plan
 from .schedule import TORN, AnyStep, SparseStep, build_schedule
 
 

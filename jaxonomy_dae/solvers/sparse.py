@@ -92,7 +92,7 @@ class SparsePattern:
         lengths = np.bincount(self.rows, minlength=self.n_rows).astype(np.int64)
         if int((lengths**2).sum()) > COLORING_WORK or lengths.max(initial=0) * 2 > self.n:
             return np.arange(self.n)
-        by_column = sp.coo_array((np.ones(len(self), np.int8), (self.rows, self.cols)), shape=self.shape).tocsc()
+        by_column: Any = sp.coo_array((np.ones(len(self), np.int8), (self.rows, self.cols)), shape=self.shape).tocsc()
         pointer, entries = by_column.indptr.tolist(), by_column.indices.tolist()
         taken: list[set[int]] = [set() for _ in range(self.n_rows)]  # colours of the columns seen in each row
         colors = np.zeros(self.n, np.int64)
@@ -153,13 +153,18 @@ class MissingSparseSolver(ImportError):
     """The package for sparse solves is not installed."""
 
 
+def is_double() -> bool:
+    """Whether JAX is in 64-bit mode."""
+    return jnp.zeros(()).dtype == jnp.float64
+
+
 @functools.cache
 def klu() -> Any:
     """The module `klujax`, imported without its effects on JAX's settings.
 
     **Raises:** `MissingSparseSolver`, which names the extra to install.
     """
-    x64 = jax.config.jax_enable_x64
+    x64 = is_double()
     platform = jax.config.read("jax_platform_name")
     try:
         return importlib.import_module("klujax")
@@ -196,7 +201,7 @@ def solve_sparse(
     klu()
     if pattern.n_rows != pattern.n:
         raise ValueError(f"a matrix to be solved with must be square; this one is {pattern.n_rows} × {pattern.n}")
-    if not jax.config.jax_enable_x64:
+    if not is_double():
         raise ValueError(
             "sparse solves compute in float64: call jax.config.update('jax_enable_x64', True) at the start"
         )
