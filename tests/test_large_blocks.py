@@ -185,12 +185,12 @@ def test_gradients_of_a_nonlinear_grid(monkeypatch):
     grid = Grid(3, cubic=0.5)
     system = whole_whatever_size(monkeypatch, grid)
     assert system.carried and whole(system)
-    x0 = system.initialize()
+    x0 = jax.jit(lambda: system.initialize())()
 
     def slopes(G, k=5):
+        """Read at the old state: the unknowns are refined from there."""
         changed = system.with_parameters({f"r{k}.G": G})
-        x = changed.project(0.0, x0, iterations=6)
-        return changed.vector_field(0.0, x)[:3]
+        return changed.observe([f"c{k}.i" for k in range(3)], 0.0, x0)
 
     def reference(G, k=5):
         other = Grid(3, cubic=0.5)
@@ -198,7 +198,7 @@ def test_gradients_of_a_nonlinear_grid(monkeypatch):
         return other.reference()
 
     at, h = float(grid.G[5]), 1e-4
-    np.testing.assert_allclose(slopes(at), grid.reference(), rtol=1e-8)
+    np.testing.assert_allclose(jax.jit(slopes)(at), grid.reference(), rtol=1e-8)
     forward, reverse = jax.jit(jax.jacfwd(slopes))(at), jax.jit(jax.jacrev(slopes))(at)
     np.testing.assert_allclose(forward, reverse, rtol=1e-10)
     differences = (reference(at + h) - reference(at - h)) / (2 * h)
