@@ -1,10 +1,12 @@
-"""How compiling scales: an RC ladder, a thermal grid, and a chain of masses with rigid rods.
+"""How compiling scales: an RC ladder, a thermal grid, a chain of masses with rigid rods, a grid of resistors with a few
+capacitors (one linear block), and a cascade of filters (a chain of assignments).
 
 For each size: building the model, compiling it, XLA's part and the first solve, the steady solve, peak memory; then the
 growth exponent of the compile time, fitted over the larger sizes. Each size runs in a process of its own. The ladder's
-end voltage is compared with a SciPy solution of the same network.
+end voltage is compared with a SciPy solution of the same network, the grid's first currents with a sparse nodal
+analysis in SciPy, the cascade's first slopes with the recursion they are.
 
-    python benchmarks/ladder.py            # n = 10 … 20,000, grid 100 × 100, chain of 300
+    python benchmarks/ladder.py            # n = 10 … 20,000, grid 100 × 100, chain of 300, resistors 60 × 60, cascades
     python benchmarks/ladder.py 10 100     # other sizes of the ladder
 """
 
@@ -18,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 SIZES = (10, 100, 1000, 4000, 9000, 20000)
+OTHERS = [("grid", 100), ("chain", 300), ("resistors", 60), ("cascade", 100), ("cascade", 1000), ("cascade", 10000)]
 RTOL = 1e-6
 END = 10.0
 
@@ -75,6 +78,99 @@ def chain(n: int):
     return ev, diagram
 
 
+def resistors(n: int):
+    """n × n nodes, neighbours joined by resistors, 1 V at one corner, ground at the other, capacitors at 4 nodes."""
+    from jaxonomy_dae import AcausalDiagram, EqnEnv
+    from jaxonomy_dae.library.electrical import Capacitor, Ground, Resistor, VoltageSource
+
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    source, ground = VoltageSource(ev, "source"), Ground(ev, "ground")
+    pins = [[] for _ in range(n * n)]
+    for k, (a, b, R) in enumerate(zip(*edges(n), strict=True)):
+        r = Resistor(ev, f"r{k}", float(R))
+        pins[a].append(r.p)
+        pins[b].append(r.n)
+    pins[0].append(source.p)
+    pins[-1].append(ground.p)
+    for k, node in enumerate(stored(n)):
+        c = Capacitor(ev, f"c{k}", initial_voltage=0.1 * k)
+        pins[node].append(c.p)
+        pins[-1].append(c.n)
+    pins[-1].append(source.n)
+    for node in pins:
+        diagram.connect(*node)
+    return ev, diagram
+
+
+def edges(n: int):
+    """(from, to, resistance) of the grid's resistors."""
+    number = np.arange(n * n).reshape(n, n)
+    a = np.concatenate([number[1:].ravel(), number[:, 1:].ravel()])
+    b = np.concatenate([number[:-1].ravel(), number[:, :-1].ravel()])
+    return a, b, 1.0 + 0.5 * np.sin(np.arange(len(a)))
+
+
+def stored(n: int) -> list[int]:
+    """The nodes with capacitors."""
+    return [k * n + k for k in (n // 5, 2 * n // 5, 3 * n // 5, 4 * n // 5)]
+
+
+def currents(n: int) -> np.ndarray:
+    """The capacitors' first currents, by nodal analysis."""
+    import scipy.sparse as sp
+
+    a, b, R = edges(n)
+    k = np.arange(len(a))
+    difference = sp.coo_array(
+        (np.repeat([1.0, -1.0], len(a)), (np.tile(k, 2), np.concatenate([a, b]))), shape=(len(a), n * n)
+    ).tocsc()
+    matrix = (difference.T @ sp.diags_array(1 / R) @ difference).tocsc()
+    known = np.array([0, *stored(n), n * n - 1])
+    free = np.setdiff1d(np.arange(n * n), known)
+    v = np.zeros(n * n)
+    v[known] = [1.0, 0.0, 0.1, 0.2, 0.3, 0.0]
+    start = time.perf_counter()
+    v[free] = -sp.linalg.spsolve(matrix[:, free][free], matrix[:, known][free] @ v[known])
+    print(f"SciPy's solve of the nodes' voltages: {1e3 * (time.perf_counter() - start):.1f} ms", file=sys.stderr)
+    return -(matrix @ v)[stored(n)]
+
+
+def cascade(n: int):
+    """n filters in series, der(x) = u − x, whose input u reaches their output y = a·u + b·x at once."""
+    from jaxonomy_dae import AcausalDiagram, Component, EqnEnv, der
+
+    class Filter(Component):
+        def __init__(self, ev, name):
+            super().__init__(ev, name)
+            a, b = self.parameter("a", 0.9), self.parameter("b", 0.2)
+            u, y, x = self.variable("u"), self.variable("y"), self.variable("x", start=0.1, fixed=True)
+            self.add_equations(der(x) - (u - x), y - a * u - b * x)
+
+    class Cascade(Component):
+        def __init__(self, ev, name):
+            super().__init__(ev, name)
+            parts = [self.add(Filter(ev, f"f{k}")) for k in range(n)]
+            self.add_equations(parts[0].u - 1)
+            for before, after in zip(parts, parts[1:], strict=False):
+                self.add_equations(after.u - before.y)
+
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    diagram.add(Cascade(ev, "cascade"))
+    return ev, diagram
+
+
+def recursion(n: int) -> np.ndarray:
+    """The cascade's first slopes."""
+    u, out = 1.0, []
+    for _ in range(n):
+        out.append(u - 0.1)
+        u = 0.9 * u + 0.2 * 0.1
+    return np.array(out)
+
+
+MODELS = {"ladder": ladder, "grid": grid, "chain": chain, "resistors": resistors, "cascade": cascade}
+
+
 def reference(n: int) -> np.ndarray:
     """The ladder's capacitor voltages at the end, by SciPy's Radau with a sparse Jacobian."""
     import scipy.integrate
@@ -108,7 +204,7 @@ def measure(kind: str, n: int) -> dict:
         out[name] = time.perf_counter() - begin
         return value
 
-    ev, diagram = lap("build", lambda: {"ladder": ladder, "grid": grid, "chain": chain}[kind](n))
+    ev, diagram = lap("build", lambda: MODELS[kind](n))
     system = lap("compile", AcausalCompiler(ev, diagram))
     end = END if kind == "ladder" else 1.0
 
@@ -126,21 +222,27 @@ def measure(kind: str, n: int) -> dict:
     if kind == "ladder":
         voltages = np.array([solution[f"c{k}.v"][0] for k in {0, n // 2, n - 1}])
         out["error"] = float(np.max(np.abs(voltages - reference(n)[list({0, n // 2, n - 1})])))
+    if kind == "resistors":
+        found = system.observe([f"c{k}.i" for k in range(4)], 0.0, system.initialize())
+        out["error"] = float(np.max(np.abs(found - currents(n))))
+    if kind == "cascade":
+        found = np.sort(system.vector_field(0.0, system.initialize()))
+        out["error"] = float(np.max(np.abs(found - np.sort(recursion(n)))))
     return out
 
 
 def main(sizes):
-    head = f"{'model':>14s}{'equations':>11s}{'index':>6s}{'build':>8s}{'compile':>9s}{'XLA+first':>11s}{'total':>8s}"
+    head = f"{'model':>15s}{'equations':>11s}{'index':>6s}{'build':>8s}{'compile':>9s}{'XLA+first':>11s}{'total':>8s}"
     print(head + f"{'steady':>11s}{'steps':>7s}{'memory':>10s}{'error':>10s}")
     rows = []
-    for kind, n in [("ladder", n) for n in sizes] + [("grid", 100), ("chain", 300)]:
+    for kind, n in [("ladder", n) for n in sizes] + OTHERS:
         command = [sys.executable, str(Path(__file__)), "--one", kind, str(n)]
         row = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
         total = row["build"] + row["compile"] + row["first"]
         error = f"{row['error']:10.1e}" if "error" in row else ""
         name = f"{kind} {n}"
         print(
-            f"{name:>14s}{row['equations']:11d}{row['index']:6d}{row['build']:7.2f}s{row['compile']:8.2f}s"
+            f"{name:>15s}{row['equations']:11d}{row['index']:6d}{row['build']:7.2f}s{row['compile']:8.2f}s"
             f"{row['first']:10.2f}s{total:7.2f}s{1e3 * row['steady']:9.2f}ms{row['steps']:7d}"
             f"{row['memory']:8.0f}MB{error}",
             flush=True,

@@ -75,7 +75,7 @@ def structure(system: "AcausalSystem", ax: Any = None) -> Any:
     row = row_of[np.repeat(np.arange(extended.n_equations), np.diff(pointer))]
     column = column_of[quantity][row >= 0]
     row = row[row >= 0]
-    torn = [column_of[step.unknown[u]] for step in plan.steps for u in step.tearing.tearing]
+    torn = [column_of[quantities] for step in plan.steps for quantities in step.torn]
     is_torn = np.isin(column, np.concatenate(torn)) if torn else np.zeros(len(column), bool)
     if ax is None:
         size = float(np.clip(0.22 * n + 2.0, 3.5, 9.0))

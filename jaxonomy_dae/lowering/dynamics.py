@@ -13,9 +13,11 @@ import numpy as np
 
 from ..compiler.numeric import Networks
 from ..solvers.small_linear import UNROLLED, solve
-from .evaluate import Evaluation, Program, newton
-from .gather import take
+from ..solvers.sparse import sparse_jacobian
+from .evaluate import Evaluation, newton, solve_block
+from .gather import Gather, take
 from .lower import ConstraintGroup, PlannedRow, SystemPlan
+from .program import Program
 
 SCALARS = 32  # up to this many states, tracing is done on scalars
 FIELD_REFINEMENTS = 1
@@ -83,8 +85,7 @@ class Point:
             state = self.refined(state, FIELD_REFINEMENTS)
         slopes, evaluation = self._slopes(state)
         if plan.carried_rates is not None:
-            rates = [jnp.asarray(evaluation.read(g), self.dtype) for g in plan.carried_rates]
-            slopes = [*slopes, *rates] if isinstance(slopes, list) else jnp.concatenate([slopes, jnp.stack(rates)])
+            slopes = self._appended(slopes, evaluation, plan.carried_rates)
         elif len(plan.carried):
             slopes = self._with_carried(state, slopes)
         return self.join(slopes)
@@ -144,8 +145,14 @@ class Point:
             return [*slopes, *rates]
         g = self.carried_vector
         value = jax.jvp(g, (self.t, state), (jnp.ones_like(self.t), jnp.append(slopes, jnp.zeros(m, self.dtype))))[1]
-        matrix = jax.jacfwd(lambda z: g(self.t, jnp.concatenate([state[:n], z])))(state[n:])
-        return jnp.concatenate([slopes, -jnp.linalg.solve(matrix, value)])
+
+        def of_z(z):
+            return g(self.t, jnp.concatenate([state[:n], z]))
+
+        if plan.carried_pattern is not None:
+            matrix = sparse_jacobian(of_z, plan.carried_pattern)(state[n:])
+            return jnp.concatenate([slopes, -solve_block(plan.carried_pattern, matrix, value)])
+        return jnp.concatenate([slopes, -jnp.linalg.solve(jax.jacfwd(of_z)(state[n:]), value)])
 
     def _carried(self, t: Any, state: Any) -> list[Any]:
         """The residuals of nonlinear blocks at the tearing variables in the state."""
@@ -158,14 +165,17 @@ class Point:
         """The state after Newton corrections of the tearing variables of nonlinear blocks, block by block."""
         plan = self.plan
         evaluation = self.run(plan.carried_residuals, state, refine=count)
-        z = [evaluation.read(plan_z) for plan_z in self._carried_gathers()]
-        if isinstance(state, tuple):
-            return (*state[: len(plan.states)], *z)
-        return jnp.concatenate([state[: len(plan.states)], jnp.stack([jnp.asarray(v, self.dtype) for v in z])])
+        gather = plan.carried_residuals.layout.gather(plan.carried)
+        return self._appended(state[: len(plan.states)], evaluation, gather)
 
-    def _carried_gathers(self):
-        layout = self.plan.carried_residuals.layout
-        return [layout.gather(np.array([q])) for q in self.plan.carried]
+    def _appended(self, first: Any, evaluation: Evaluation, gather: Gather) -> Any:
+        """What was computed, appended to scalars (a list or a tuple) or to an array."""
+        n = len(gather.chunk)
+        if isinstance(first, list | tuple):
+            return type(first)(
+                [*first, *(jnp.asarray(evaluation.read(_only(gather, k)), self.dtype) for k in range(n))]
+            )
+        return jnp.concatenate([first, jnp.broadcast_to(jnp.asarray(evaluation.read(gather), self.dtype), (n,))])
 
     # --- constraints -------------------------------------------------------------------------------------------
 

@@ -1,13 +1,10 @@
 """Evaluation: steps become gathers, vectorised kernels and chunks of results.
 
-The traced program grows with the number of steps, not of the equations in them. Chunk 0 is the state (an array, or a
-tuple of scalars for small systems), chunk 1 the inputs' quantities; every step appends one chunk for each of its
-local unknowns.
+The traced program grows with the number of steps, not of the equations in them.
 """
 
-import dataclasses
+import copy
 import functools
-from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -15,89 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..compiler.numeric import Networks
-from ..compiler.tables import ZERO
+from ..errors import ModelError
+from ..solvers import sparse
 from ..solvers.small_linear import UNROLLED, solve
+from ..solvers.sparse import SparsePattern, solve_sparse
 from .gather import Chunk, Gather, take
-from .schedule import Step, StepEquation
+from .program import DENSE, PlannedEquation, PlannedRepeat, PlannedSparse, PlannedStep, Program
 
+UNROLLED_REPETITIONS = 4  # of a loop, written out in each of its iterations
 LONG_SUM = 16  # linear equations with more terms are one gather and one sum
-
-
-@dataclasses.dataclass(frozen=True)
-class Layout:
-    """Where every quantity lies: chunk −1 is the constant zero, −2 not computed."""
-
-    chunk: np.ndarray
-    offset: np.ndarray
-
-    def gather(self, quantity: np.ndarray, sign: np.ndarray | None = None) -> Gather:
-        quantity = np.atleast_1d(quantity)
-        zero = quantity == ZERO
-        sign = np.ones(len(quantity), np.int64) if sign is None else np.where(sign == 0, 1, np.atleast_1d(sign))
-        chunk = np.where(zero, -1, self.chunk[quantity])
-        if (chunk == -2).any():
-            raise AssertionError("a quantity is read before it is computed")
-        return Gather(chunk, np.where(zero, 0, self.offset[quantity]), sign)
-
-
-@dataclasses.dataclass(frozen=True)
-class _PlannedEquation:
-    equation: StepEquation
-    sources: tuple[Gather | int, ...]  # a gather, or −1 − u for the local unknown u
-    signs: tuple[Any, ...]  # of local slots
-
-
-@dataclasses.dataclass(frozen=True)
-class PlannedStep:
-    """A step with its gathers planned; `guess` reads its tearing variables from the state if they are carried."""
-
-    step: Step
-    equations: tuple[_PlannedEquation, ...]
-    guess: tuple[Gather, ...]
-
-
-@dataclasses.dataclass(frozen=True)
-class Program:
-    """Planned steps and the layout of all they compute."""
-
-    steps: tuple[PlannedStep, ...]
-    layout: Layout
-
-
-def plan(
-    steps: Sequence[Step], states: np.ndarray, inputs: np.ndarray, n_quantities: int, carried: np.ndarray
-) -> Program:
-    """Plans the evaluation of `steps`; the state array holds `states`, then `carried`."""
-    chunk = np.full(n_quantities, -2, np.int64)
-    offset = np.zeros(n_quantities, np.int64)
-    chunk[states], offset[states] = 0, np.arange(len(states))
-    chunk[inputs], offset[inputs] = 1, np.arange(len(inputs))
-    place = {int(q): len(states) + k for k, q in enumerate(carried)}
-    next_chunk = 2
-    planned = []
-    for step in steps:
-        layout = Layout(chunk, offset)
-        equations = []
-        for equation in step.equations:
-            sources, signs = [], []
-            for slot in equation.slots:
-                sources.append(-1 - slot.local if slot.local >= 0 else layout.gather(slot.quantity, slot.sign))
-                signs.append(_uniform(slot.sign))
-            equations.append(_PlannedEquation(equation, tuple(sources), tuple(signs)))
-        guess = []
-        if step.carried:
-            for u in step.tearing.tearing:
-                where = np.array([place[int(q)] for q in step.unknown[u]])
-                guess.append(Gather(np.zeros(step.n, np.int64), where, np.ones(step.n, np.int64)))
-        planned.append(PlannedStep(step, tuple(equations), tuple(guess)))
-        for quantities in step.unknown:
-            chunk[quantities], offset[quantities] = next_chunk, np.arange(step.n)
-            next_chunk += 1
-    return Program(tuple(planned), Layout(chunk, offset))
-
-
-def _uniform(sign: np.ndarray) -> Any:
-    return int(sign[0]) if (sign == sign[0]).all() else sign
 
 
 class Evaluation:
@@ -114,14 +37,19 @@ class Evaluation:
     def run(self, program: Program, refine: int):
         """Evaluates all steps; the tearing variables of carried steps get `refine` Newton corrections."""
         for planned in program.steps:
-            self.chunks.extend(self._step(planned, refine))
+            if isinstance(planned, PlannedRepeat):
+                self.chunks.extend(self._repeat(planned))
+            elif isinstance(planned, PlannedSparse):
+                self.chunks.append(self._sparse_step(planned, refine))
+            else:
+                self.chunks.extend(self._step(planned, refine))
         return self
 
     def read(self, gather: Gather) -> Any:
         """Gathered values: a scalar, or an array."""
         return gather.read(self.chunks, self.dtype)
 
-    def _arguments(self, planned: _PlannedEquation, local: list[Any]):
+    def _arguments(self, planned: PlannedEquation, local: list[Any]):
         slots = []
         for source, sign in zip(planned.sources, planned.signs, strict=True):
             if isinstance(source, Gather):
@@ -141,10 +69,10 @@ class Evaluation:
             coefficients = [float(c[0]) if (c == c[0]).all() else c for c in equation.coefficient.T]
         return slots, parameters, coefficients, self.t, self.networks
 
-    def _residual(self, planned: _PlannedEquation, local: list[Any]) -> Any:
+    def _residual(self, planned: PlannedEquation, local: list[Any]) -> Any:
         return planned.equation.template.residual(*self._arguments(planned, local))
 
-    def _solved(self, planned: _PlannedEquation, unknown: int, local: list[Any]) -> Any:
+    def _solved(self, planned: PlannedEquation, unknown: int, local: list[Any]) -> Any:
         """The local unknown for which the equation, affine in it, holds."""
         equation = planned.equation
         positions = [k for k, s in enumerate(equation.slots) if s.local == unknown]
@@ -161,7 +89,7 @@ class Evaluation:
         slope = sum(_signed(planned.signs[k], partials[k], self.dtype) for k in positions)
         return -rest / slope
 
-    def _solved_long_sum(self, planned: _PlannedEquation, position: int) -> Any:
+    def _solved_long_sum(self, planned: PlannedEquation, position: int) -> Any:
         equation = planned.equation
         n = equation.coefficient.shape[0]
         others = [k for k in range(len(equation.slots)) if k != position]
@@ -202,6 +130,72 @@ class Evaluation:
             z = newton(residuals, z)
         return follow(z)
 
+    def _repeat(self, planned: PlannedRepeat) -> list[Any]:
+        """The unknowns of all repetitions, each of shape (count · n,)."""
+
+        def read(gather: Gather | None) -> Any:
+            if gather is None:
+                return jnp.zeros(0, self.dtype)
+            return self._filled(self.read(gather), (len(gather.chunk),))
+
+        def repetition(carried, given):
+            outside, parameters = given
+            inner = Evaluation(carried, outside, parameters, self.t, Networks(self.networks.weights))
+            for step in planned.body:
+                inner.chunks.extend(inner._step(step, refine=0))
+            if planned.following is not None:
+                carried = self._filled(inner.read(planned.following), carried.shape)
+            return carried, tuple(inner.chunks[2:])
+
+        count = planned.count
+        parameters = self.parameters[planned.parameters.ravel()].reshape(planned.parameters.shape)
+        given = jnp.reshape(read(planned.outside), (count, -1)), parameters
+        _, chunks = jax.lax.scan(repetition, read(planned.first), given, unroll=UNROLLED_REPETITIONS)
+        return [jnp.reshape(c, (-1,)) for c in chunks]
+
+    def _sparse_step(self, planned: PlannedSparse, refine: int) -> Any:
+        """The unknowns of large blocks, shape (n,)."""
+
+        def solved(u: Any) -> Any:
+            """One Newton step, exact if the equations are affine."""
+            residual, values = self._whole(planned, u, partials=True)
+            return u - solve_block(planned.pattern, values, residual)
+
+        if planned.guess is None:
+            return solved(jnp.zeros(planned.step.n, self.dtype))
+        u = self.read(planned.guess)
+        if refine == 0:
+            self.residuals.append(self._whole(planned, u, partials=False)[0])
+        for _ in range(refine):
+            u = solved(u)
+        return u
+
+    def _whole(self, planned: PlannedSparse, u: Any, partials: bool) -> tuple[Any, Any]:
+        """The residuals of a sparse step's equations at its unknowns u, and the values of their matrix."""
+        there = copy.copy(self)
+        there.chunks = [*self.chunks, u]
+        residuals, values = [], []
+        for equation, entries in zip(planned.equations, planned.entries, strict=True):
+            template = equation.equation.template
+            shape = (len(equation.equation.equation),)
+            arguments: Any = there._arguments(equation, [])
+            slots, rest = arguments[0], arguments[1:]
+
+            def residual(*slots, template=template, rest=rest, shape=shape):
+                return self._filled(template.residual(list(slots), *rest), shape)
+
+            residuals.append(residual(*slots))
+            if not partials:
+                continue
+            if template.opaque is not None:
+                slots = [self._filled(s, shape) for s in slots]
+                slopes = [_slope(residual, slots, k) for k in range(len(slots))]
+            else:
+                slopes = template.partial_values(slots, *rest)
+            for k, instances, sign in entries:
+                values.append(_signed(sign, take(self._filled(slopes[k], shape), instances), self.dtype))
+        return jnp.concatenate(residuals), jnp.concatenate(values) if partials else None
+
     def _affine(self, follow, residuals, m: int, shape: tuple[int, ...]) -> list[Any]:
         """The local unknowns of a linear block: affine in its tearing variables, as the residuals are."""
         zero = [jnp.zeros(shape, self.dtype)] * m
@@ -218,6 +212,33 @@ class Evaluation:
 
     def _filled(self, value: Any, shape: tuple[int, ...]) -> Any:
         return jnp.broadcast_to(jnp.asarray(value, self.dtype), shape)
+
+
+def _slope(function, slots: list[Any], k: int) -> Any:
+    """∂f/∂slot k of a function that acts on every instance alone."""
+    return jax.jvp(lambda s: function(*slots[:k], s, *slots[k + 1 :]), (slots[k],), (jnp.ones_like(slots[k]),))[1]
+
+
+def solve_block(pattern: SparsePattern, values: Any, right: Any) -> Any:
+    """A·x = b by KLU; by dense elimination where KLU is not available and A is not too large for that.
+
+    **Raises:** `ModelError` where neither is possible.
+    """
+    if sparse.is_double() and sparse.available():
+        return solve_sparse(pattern, values, right)
+    check_solvable(pattern.n)
+    if pattern.n > DENSE:
+        raise ModelError(
+            f"the model has {pattern.n} simultaneous equations; sparse solves compute in float64: call "
+            "jax.config.update('jax_enable_x64', True) at the start"
+        )
+    return jnp.linalg.solve(pattern.dense(values), right)
+
+
+def check_solvable(n: int):
+    """**Raises:** `ModelError` if n simultaneous equations need a package that is not installed."""
+    if n > DENSE and not sparse.available():
+        raise ModelError(f"the model has {n} simultaneous equations, which need a sparse solver: {sparse.EXTRA}")
 
 
 def newton(residuals, z: list[Any]) -> list[Any]:

@@ -1,6 +1,7 @@
 """Lowering: the compiler's tables become the static plan of an `AcausalSystem`."""
 
 import dataclasses
+import functools
 import hashlib
 from collections.abc import Sequence
 from typing import Any
@@ -13,9 +14,12 @@ from ..compiler.select_states import StateSelection
 from ..compiler.tables import ZERO, AliasTable, EquationGroup, FlatModel, RowInjection
 from ..compiler.templates import OpaqueFunction
 from ..errors import ModelError, nearest
-from .evaluate import Layout, Program, plan
+from ..solvers.sparse import SparsePattern
+from . import pattern
+from .evaluate import check_solvable
 from .gather import Gather
-from .schedule import Step, build_schedule
+from .program import Layout, Program, plan
+from .schedule import TORN, AnyStep, SparseStep, build_schedule
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +38,7 @@ class PlannedRow:
     rows: tuple[int, ...]
     inputs: tuple[Gather, ...]
     sign: tuple[int, ...]
+    quantities: np.ndarray  # of the inputs
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +60,7 @@ class SystemPlan:
     groups: tuple[EquationGroup, ...]
     extended: Extended
     selection: StateSelection
-    steps: tuple[Step, ...]
+    steps: tuple[AnyStep, ...]
     blocks: Blocks
     mode: str
 
@@ -67,7 +72,7 @@ class SystemPlan:
     inputs: InputTable
     derivative: Program
     next_derivative: Gather
-    carried_rates: tuple[Gather, ...] | None  # where the model itself has the derivatives of all `carried`
+    carried_rates: Gather | None  # where the model itself has the derivatives of all `carried`
     everything: Program
     carried_residuals: Program
     constraint_program: Program
@@ -90,6 +95,32 @@ class SystemPlan:
     @property
     def n_constraints(self) -> int:
         return len(self.selection.constraints)
+
+    @functools.cached_property
+    def jacobian_pattern(self) -> SparsePattern | None:
+        """Where ∂(vector field)/∂(state) can be nonzero at a consistent state, shape (n_state, n_state); None if it has
+        too many places to list."""
+        return pattern.field_pattern(self)
+
+    def dae_pattern(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """(rows, columns) where the Jacobian of [f(t, x, z); g(t, x, z)] with respect to the state array [x, z] can be
+        nonzero: the states' derivatives with z read from the array, not refined, then the residuals of the nonlinear
+        blocks. Sorted by row, each place once; None if there are too many to list."""
+        found = self._dae_pattern
+        return None if found is None else (found.rows, found.cols)
+
+    @functools.cached_property
+    def carried_pattern(self) -> SparsePattern | None:
+        """Where ∂g/∂z can be nonzero, if there are so many algebraic unknowns z that it matters."""
+        if len(self.carried) <= TORN or self._dae_pattern is None:
+            return None
+        n, found = len(self.states), self._dae_pattern
+        inside = (found.rows >= n) & (found.cols >= n)
+        return SparsePattern(found.rows[inside] - n, found.cols[inside] - n, len(self.carried))
+
+    @functools.cached_property
+    def _dae_pattern(self) -> SparsePattern | None:
+        return pattern.dae_pattern(self)
 
     def quantity_of(self, variable: int) -> tuple[int, int]:
         """(quantity, sign) of a variable; quantity ZERO if it is identically zero."""
@@ -125,7 +156,7 @@ class SystemPlan:
         return np.array(quantity, np.int64), np.array(sign, np.int64)
 
 
-def _needed(steps: Sequence[Step], targets: np.ndarray, n: int) -> tuple[Step, ...]:
+def _needed(steps: Sequence[AnyStep], targets: np.ndarray, n: int) -> tuple[AnyStep, ...]:
     """The steps on which the target quantities depend, in order."""
     wanted = np.zeros(n, bool)
     wanted[targets[targets != ZERO]] = True
@@ -153,20 +184,24 @@ def lower(
     quantities = extended.quantities
     n = quantities.n
     steps = build_schedule(extended, blocks)
-    carried = [step.unknown[u] for step in steps if step.carried for u in step.tearing.tearing]
+    for step in steps:
+        if isinstance(step, SparseStep):
+            check_solvable(step.n)
+    carried = [quantities for step in steps for quantities in step.guessed]
     carried = np.concatenate(carried) if carried else np.zeros(0, np.int64)
     input_quantities = np.arange(quantities.n_unknown, n)
 
-    def program(chosen: Sequence[Step]) -> Program:
+    def program(chosen: Sequence[AnyStep]) -> Program:
         return plan(chosen, state_order, input_quantities, n, carried)
 
     nonlinear = [s for s in steps if s.carried]
     residual_needs = np.concatenate([np.zeros(0, np.int64), *(s.needs() for s in nonlinear)])
     upstream = _needed(steps, residual_needs, n)
     keep = {id(s) for s in (*upstream, *nonlinear)}
-    carried_residuals = program([s for s in steps if id(s) in keep])
+    for_residuals = [s for s in steps if id(s) in keep]
+    carried_residuals = program(for_residuals)
 
-    constraint_groups, constraint_slots, pattern = _constraints(extended, selection, state_order)
+    constraint_groups, constraint_slots, constraint_pattern = _constraints(extended, selection, state_order)
     constraint_program = program(_needed(steps, constraint_slots, n))
     planned_constraints = tuple(
         ConstraintGroup(
@@ -179,7 +214,7 @@ def lower(
     everything = program(steps)
     row_inputs = _row_input_quantities(flat, alias, extended)
     following = state_order + 1
-    rates = carried + 1 if _rates_hold(flat, alias, extended, carried_residuals, carried) else carried[:0]
+    rates = carried + 1 if _rates_hold(flat, alias, extended, for_residuals, carried) else carried[:0]
     derivative = program(_needed(steps, np.concatenate([following, rates, *(q for q, _ in row_inputs)]), n))
     rows = tuple(
         _plan_row(row, inputs, flat, alias, extended, state_order, derivative.layout)
@@ -220,12 +255,12 @@ def lower(
         inputs,
         derivative,
         derivative.layout.gather(following) if len(following) else Gather(*(np.zeros(0, np.int64),) * 3),
-        tuple(derivative.layout.gather(np.array([q])) for q in rates) if len(rates) else None,
+        derivative.layout.gather(rates) if len(rates) else None,
         everything,
         carried_residuals,
         constraint_program,
         planned_constraints,
-        pattern,
+        constraint_pattern,
         rows,
         tuple(flat.networks),
         functions,
@@ -233,13 +268,13 @@ def lower(
 
 
 def _rates_hold(
-    flat: FlatModel, alias: AliasTable, extended: Extended, residuals: Program, carried: np.ndarray
+    flat: FlatModel, alias: AliasTable, extended: Extended, residuals: Sequence[AnyStep], carried: np.ndarray
 ) -> bool:
     """Whether the derivatives of all carried unknowns are quantities of the model, untouched by row injection."""
     quantities = extended.quantities
     if not len(carried) or not (quantities.order[carried] < quantities.highest[quantities.owner[carried]]).all():
         return False
-    read = np.concatenate([planned.step.needs() for planned in residuals.steps])
+    read = np.concatenate([step.needs() for step in residuals])
     targets = [v for row in flat.rows for v in row.targets]
     injected = quantities.first[quantities.column[alias.root[targets]]] + alias.order[targets] if targets else []
     return not np.isin(injected, read).any()
@@ -312,7 +347,7 @@ def _plan_row(row: RowInjection, inputs, flat, alias, extended, states, layout: 
         rows.append(position[q])
         signs.append(int(alias.sign[v]))
     gathers = tuple(layout.gather(np.array([q]), np.array([s])) for q, s in zip(*inputs, strict=True))
-    return PlannedRow(row.opaque, tuple(rows), gathers, tuple(signs))
+    return PlannedRow(row.opaque, tuple(rows), gathers, tuple(signs), inputs[0])
 
 
 def _digest(flat: FlatModel, mode: str, selection: StateSelection, states: np.ndarray, extended: Extended) -> str:

@@ -10,6 +10,7 @@ from ..compiler.structure import incidence
 from ..compiler.tables import describe_equation
 from .lower import SystemPlan
 from .solver_choice import solver_choice
+from .schedule import SparseStep
 
 SHOWN = 12
 HTML_SHOWN = 200
@@ -98,6 +99,12 @@ class SystemReport:
         plan = self._plan
         out = []
         for step in plan.steps:
+            if isinstance(step, SparseStep):
+                kind = "linear" if step.linear else "nonlinear"
+                for block in range(int(step.block.max()) + 1):
+                    names = [plan.quantity_name[q] for q in step.unknown[0][step.block == block]]
+                    out.append(f"{kind} block of {len(names)}: {_some(names)}; solved whole, sparse")
+                continue
             if len(step.unknown) == 1 and step.linear:
                 continue
             names = [plan.quantity_name[u[0]] for u in step.unknown]

@@ -11,7 +11,8 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..errors import ModelError, nearest
-from .dynamics import SCALARS, Point
+from ..solvers.sparse import SparseMatrix, SparsePattern, sparse_jacobian
+from .dynamics import READ_REFINEMENTS, SCALARS, Point
 from .lower import SystemPlan
 from .parameters import Parameters
 
@@ -135,6 +136,35 @@ class AcausalSystem(eqx.Module):
     def mass(self) -> np.ndarray:
         """The diagonal of M in M d(state)/dt = `semi_explicit`: one for states, zero for algebraic unknowns."""
         return np.concatenate([np.ones(len(self.plan.states)), np.zeros(len(self.plan.carried))])
+
+    @property
+    def jacobian_pattern(self) -> SparsePattern | None:
+        """Where the Jacobian of the vector field can have entries: `.rows` and `.cols`, sorted by row. None if it is so
+        large and dense that its places are not worth listing."""
+        return self.plan.jacobian_pattern
+
+    def jacobian(self, t: Any, x: Float[Array, " n"], args: Any = None) -> SparseMatrix:
+        """∂(vector field)/∂(state) at a consistent state, sparse: `.values` at the places of `.pattern`, `.dense()`,
+        `.solve(b)`, `matrix @ vector`.
+
+        It takes as many directional derivatives as the pattern has colours: three for a chain, however long.
+
+        **Raises:**
+
+        - `ModelError` if it is large and dense.
+        """
+        pattern = self.jacobian_pattern
+        if pattern is None:
+            raise ModelError(
+                f"the Jacobian of these {self.plan.n_state} states is dense, too large to list its entries: use "
+                "jax.jvp(system.vector_field, …) for its products with vectors"
+            )
+        point = self._point(t, args)
+        if len(self.plan.carried):
+            x = jax.lax.stop_gradient(point.join(point.refined(point.split(x), READ_REFINEMENTS))) + (
+                x - jax.lax.stop_gradient(x)
+            )
+        return SparseMatrix(sparse_jacobian(point.vector_field, pattern)(x), pattern)
 
     def project(self, t: Any, x: Float[Array, " n"], args: Any = None, iterations: int = 1) -> Float[Array, " n"]:
         """The state moved onto the hidden constraints (nothing to do if there are none)."""

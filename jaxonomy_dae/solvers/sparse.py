@@ -19,6 +19,7 @@ import importlib
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -91,7 +92,7 @@ class SparsePattern:
         lengths = np.bincount(self.rows, minlength=self.n_rows).astype(np.int64)
         if int((lengths**2).sum()) > COLORING_WORK or lengths.max(initial=0) * 2 > self.n:
             return np.arange(self.n)
-        by_column = sp.coo_array((np.ones(len(self), np.int8), (self.rows, self.cols)), shape=self.shape).tocsc()
+        by_column: Any = sp.coo_array((np.ones(len(self), np.int8), (self.rows, self.cols)), shape=self.shape).tocsc()
         pointer, entries = by_column.indptr.tolist(), by_column.indices.tolist()
         taken: list[set[int]] = [set() for _ in range(self.n_rows)]  # colours of the columns seen in each row
         colors = np.zeros(self.n, np.int64)
@@ -126,8 +127,35 @@ class SparsePattern:
         return jnp.zeros(size, x.dtype).at[rows].add(values * x[cols])
 
 
+class SparseMatrix(eqx.Module):
+    """A matrix by its pattern and the values of its entries."""
+
+    values: Float[Array, " nnz"]
+    pattern: SparsePattern = eqx.field(static=True)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.pattern.shape
+
+    def dense(self) -> Float[Array, "n_rows n"]:
+        """The matrix as an array."""
+        return self.pattern.dense(self.values)
+
+    def __matmul__(self, x: Float[Array, " n"]) -> Float[Array, " n_rows"]:
+        return self.pattern.multiply(self.values, x)
+
+    def solve(self, b: Float[Array, " n"], transpose: bool = False) -> Float[Array, " n"]:
+        """x with A·x = b, or Aᵀ·x = b: see `solve_sparse`."""
+        return solve_sparse(self.pattern, self.values, b, transpose)
+
+
 class MissingSparseSolver(ImportError):
     """The package for sparse solves is not installed."""
+
+
+def is_double() -> bool:
+    """Whether JAX is in 64-bit mode."""
+    return jnp.zeros(()).dtype == jnp.float64
 
 
 @functools.cache
@@ -136,7 +164,7 @@ def klu() -> Any:
 
     **Raises:** `MissingSparseSolver`, which names the extra to install.
     """
-    x64 = jax.config.jax_enable_x64
+    x64 = is_double()
     platform = jax.config.read("jax_platform_name")
     try:
         return importlib.import_module("klujax")
@@ -145,6 +173,15 @@ def klu() -> Any:
     finally:
         jax.config.update("jax_enable_x64", x64)
         jax.config.update("jax_platform_name", platform)
+
+
+def available() -> bool:
+    """Whether the package for sparse solves is installed."""
+    try:
+        klu()
+    except MissingSparseSolver:
+        return False
+    return True
 
 
 def solve_sparse(
@@ -164,7 +201,7 @@ def solve_sparse(
     klu()
     if pattern.n_rows != pattern.n:
         raise ValueError(f"a matrix to be solved with must be square; this one is {pattern.n_rows} × {pattern.n}")
-    if not jax.config.jax_enable_x64:
+    if not is_double():
         raise ValueError(
             "sparse solves compute in float64: call jax.config.update('jax_enable_x64', True) at the start"
         )

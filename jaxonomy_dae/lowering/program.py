@@ -1,0 +1,218 @@
+"""Programs: steps with all their gathers planned.
+
+Chunk 0 is the state (an array, or a tuple of scalars for small systems), chunk 1 the inputs' quantities; every step
+appends one chunk for each of its local unknowns, a sparse step one for all, a loop one for each unknown of its body.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ..compiler.tables import ZERO
+from ..solvers.sparse import SparsePattern
+from .gather import Gather
+from .merge import merge_thin
+from .repeat import Repeat, find_repeats
+from .schedule import AnyStep, SparseStep, Step, StepEquation
+
+DENSE = 1000  # simultaneous equations that dense elimination may solve if there is no sparse solver: about 20 ms
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """Where every quantity lies: chunk −1 is the constant zero, −2 not computed."""
+
+    chunk: np.ndarray
+    offset: np.ndarray
+
+    def gather(self, quantity: np.ndarray, sign: np.ndarray | None = None) -> Gather:
+        quantity = np.atleast_1d(quantity)
+        zero = quantity == ZERO
+        sign = np.ones(len(quantity), np.int64) if sign is None else np.where(sign == 0, 1, np.atleast_1d(sign))
+        chunk = np.where(zero, -1, self.chunk[quantity])
+        if (chunk == -2).any():
+            raise AssertionError("a quantity is read before it is computed")
+        return Gather(chunk, np.where(zero, 0, self.offset[quantity]), sign)
+
+
+@dataclasses.dataclass(frozen=True)
+class PlannedEquation:
+    equation: StepEquation
+    sources: tuple[Gather | int, ...]  # a gather, or −1 − u for the local unknown u
+    signs: tuple[Any, ...]  # of local slots
+
+
+@dataclasses.dataclass(frozen=True)
+class PlannedStep:
+    """A step with its gathers planned; `guess` reads its tearing variables from the state if they are carried."""
+
+    step: Step
+    equations: tuple[PlannedEquation, ...]
+    guess: tuple[Gather, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class PlannedSparse:
+    """A sparse step: its equations read its own unknowns as a chunk that follows all others. `entries` lists, for each
+    equation, (slot, instances, signs) of the slots that are unknowns; in this order their partial derivatives are the
+    values of the matrix at the places of `pattern`."""
+
+    step: SparseStep
+    equations: tuple[PlannedEquation, ...]
+    entries: tuple[tuple[tuple[int, np.ndarray, Any], ...], ...]
+    pattern: SparsePattern
+    guess: Gather | None
+
+
+@dataclasses.dataclass(frozen=True)
+class PlannedRepeat:
+    """A loop over the repetitions of a few steps.
+
+    Within it, chunk 0 are the values carried over from the repetitions before, chunk 1 what each repetition reads from
+    outside; the steps' unknowns follow. Parameters are numbered through as the steps list them.
+    """
+
+    count: int
+    body: tuple[PlannedStep, ...]
+    first: Gather | None  # what the first repetition carries
+    following: Gather | None  # and each hands on, read within the loop
+    outside: Gather | None  # (count · number,)
+    parameters: np.ndarray  # (count, number)
+
+
+@dataclasses.dataclass(frozen=True)
+class Program:
+    """Planned steps and the layout of all they compute."""
+
+    steps: tuple[PlannedStep | PlannedSparse | PlannedRepeat, ...]
+    layout: Layout
+
+
+def plan(
+    steps: Sequence[AnyStep], states: np.ndarray, inputs: np.ndarray, n_quantities: int, carried: np.ndarray
+) -> Program:
+    """Plans the evaluation of `steps`; the state array holds `states`, then `carried`."""
+    chunk = np.full(n_quantities, -2, np.int64)
+    offset = np.zeros(n_quantities, np.int64)
+    chunk[states], offset[states] = 0, np.arange(len(states))
+    chunk[inputs], offset[inputs] = 1, np.arange(len(inputs))
+    place = np.zeros(n_quantities, np.int64)
+    place[carried] = len(states) + np.arange(len(carried))
+    next_chunk = 2
+    planned = []
+    for step in merge_thin(find_repeats(steps, n_quantities), n_quantities, DENSE):
+        layout = Layout(chunk, offset)
+        if isinstance(step, Repeat):
+            planned.append(_plan_repeat(step, layout))
+            unknown = [quantities.ravel() for each in step.unknown for quantities in each]
+        elif isinstance(step, SparseStep):
+            unknown = step.unknown
+            chunk[unknown[0]], offset[unknown[0]] = next_chunk, np.arange(step.n)
+            planned.append(_plan_sparse(step, layout, place))
+        else:
+            unknown = step.unknown
+            equations = tuple(_plan_equation(e, layout) for e in step.equations)
+            guess = tuple(_from_state(place[quantities]) for quantities in step.guessed)
+            planned.append(PlannedStep(step, equations, guess))
+        for quantities in unknown:
+            chunk[quantities], offset[quantities] = next_chunk, np.arange(len(quantities))
+            next_chunk += 1
+    return Program(tuple(planned), Layout(chunk, offset))
+
+
+def _plan_equation(equation: StepEquation, layout: Layout) -> PlannedEquation:
+    sources = [-1 - s.local if s.local >= 0 else layout.gather(s.quantity, s.sign) for s in equation.slots]
+    return PlannedEquation(equation, tuple(sources), tuple(_uniform(s.sign) for s in equation.slots))
+
+
+def _plan_repeat(repeat: Repeat, layout: Layout) -> PlannedRepeat:
+    """Plans a loop; `layout` is that of what lies before it."""
+    chunk_of = {}  # of (step of the body, unknown), within the loop
+    for p, step in enumerate(repeat.body):
+        for u in range(len(step.unknown)):
+            chunk_of[p, u] = 2 + len(chunk_of)
+    # A register holds a value of `back` repetitions ago; it is filled from the register of one less.
+    registers: dict[tuple[int, int, int, int], int] = {}
+    first: list[int] = []
+    for read in np.flatnonzero(repeat.back > 0).tolist():
+        for back in range(1, int(repeat.back[read]) + 1):
+            key = (back, *repeat.source[read].tolist())
+            if key not in registers:
+                registers[key] = len(registers)
+                first.append(int(repeat.reads[repeat.back[read] - back, read]))
+    handed = [
+        (chunk_of[p, u], instance) if back == 1 else (0, registers[back - 1, p, u, instance])
+        for back, p, u, instance in registers
+    ]
+    outside = np.flatnonzero((repeat.back < 0) & (repeat.reads[0] != ZERO))
+    chunk = np.full(len(repeat.back), -1, np.int64)
+    offset = np.zeros(len(repeat.back), np.int64)
+    chunk[outside], offset[outside] = 1, np.arange(len(outside))
+    for read in np.flatnonzero(repeat.back >= 0).tolist():
+        back, (p, u, instance) = int(repeat.back[read]), repeat.source[read].tolist()
+        chunk[read] = 0 if back else chunk_of[p, u]
+        offset[read] = registers[back, p, u, instance] if back else instance
+
+    body, read, parameter = [], 0, 0
+    for step in repeat.body:
+        equations = []
+        for equation in step.equations:
+            sources: list[Gather | int] = []
+            for slot in equation.slots:
+                if slot.local >= 0:
+                    sources.append(-1 - slot.local)
+                    continue
+                here = slice(read, read + step.n)
+                sources.append(Gather(chunk[here], offset[here], np.where(slot.sign == 0, 1, slot.sign)))
+                read += step.n
+            size = equation.parameter.size
+            numbers = parameter + np.arange(size).reshape(equation.parameter.shape)
+            parameter += size
+            renumbered = dataclasses.replace(equation, parameter=numbers)
+            equations.append(
+                PlannedEquation(renumbered, tuple(sources), tuple(_uniform(s.sign) for s in equation.slots))
+            )
+        body.append(PlannedStep(step, tuple(equations), ()))
+    return PlannedRepeat(
+        repeat.count,
+        tuple(body),
+        layout.gather(np.array(first)) if first else None,
+        Gather(np.array([c for c, _ in handed]), np.array([k for _, k in handed]), np.ones(len(handed), np.int64))
+        if first
+        else None,
+        layout.gather(repeat.reads[:, outside].ravel()) if len(outside) else None,
+        repeat.parameters,
+    )
+
+
+def _plan_sparse(step: SparseStep, layout: Layout, place: np.ndarray) -> PlannedSparse:
+    """Plans a sparse step; `layout` has its unknowns already."""
+    local = np.full(len(place) + 1, -1, np.int64)  # the last entry is the constant zero
+    local[step.unknown[0]] = np.arange(step.n)
+    equations, entries, rows, cols = [], [], [], []
+    first = 0
+    for equation in step.equations:
+        sources = tuple(layout.gather(slot.quantity, slot.sign) for slot in equation.slots)
+        equations.append(PlannedEquation(equation, sources, (1,) * len(sources)))
+        here = []
+        for k, slot in enumerate(equation.slots):
+            instances = np.flatnonzero(local[slot.quantity] >= 0)
+            if len(instances):
+                here.append((k, instances, _uniform(slot.sign[instances])))
+                rows.append(first + instances)
+                cols.append(local[slot.quantity[instances]])
+        entries.append(tuple(here))
+        first += len(equation.equation)
+    pattern = SparsePattern(np.concatenate(rows), np.concatenate(cols), step.n)
+    guess = _from_state(place[step.unknown[0]]) if step.carried else None
+    return PlannedSparse(step, tuple(equations), tuple(entries), pattern, guess)
+
+
+def _from_state(place: np.ndarray) -> Gather:
+    return Gather(np.zeros(len(place), np.int64), place, np.ones(len(place), np.int64))
+
+
+def _uniform(sign: np.ndarray) -> Any:
+    return int(sign[0]) if (sign == sign[0]).all() else sign

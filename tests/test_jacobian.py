@@ -1,0 +1,118 @@
+"""The system's Jacobian and its pattern, from the structure, against dense automatic differentiation."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from problems import compiled, drag_on, mlp, oscillator, pendulum, rc_circuit
+from test_chains import cascade
+from test_large_blocks import Grid
+
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, ModelError, der
+from jaxonomy_dae.library.electrical import Capacitor, Ground, Resistor, VoltageSource
+from jaxonomy_dae.lowering import pattern
+
+
+class Implicit(Component):
+    """Two algebraic unknowns given implicitly, one by the other, and a state that follows them."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        x, y = self.variable("x", start=0.5, fixed=True), self.variable("y", start=0.2, fixed=True)
+        z, w = self.variable("z", start=0.5), self.variable("w", start=0.3)
+        self.add_equations(der(x) + z, der(y) + w + 2 * y, z + 0.1 * z**3 - x, w + 0.2 * w**5 - z * y)
+
+
+def network_on_a_row():
+    return pendulum(
+        drag_on("vx", network=mlp(1, 1), inject="row"),
+        compiler={"state_selection": "dummy_derivatives", "prefer_states": ["pend.x", "pend.vx"]},
+    )
+
+
+MODELS = {
+    "circuit": rc_circuit,
+    "oscillator": oscillator,
+    "pendulum": pendulum,
+    "pendulum, minimal": lambda: pendulum(compiler={"state_selection": "dummy_derivatives"}),
+    "network": lambda: pendulum(drag_on("vx", "vy", network=mlp(2, 2))),
+    "network on a row": network_on_a_row,
+    "implicit": lambda: compiled(Implicit(EqnEnv(), "c")),
+    "cascade": lambda: cascade(12),
+    "grid": lambda: Grid(6).system(),
+    "nonlinear grid": lambda: Grid(7, cubic=0.5).system(),
+}
+
+
+def covers(found, dense: np.ndarray):
+    """Whether all entries of a matrix that are not zero are in the pattern."""
+    inside = np.zeros(dense.shape, bool)
+    inside[found] = True
+    return not np.any(dense[~inside])
+
+
+@pytest.mark.parametrize(
+    "model", [pytest.param(m, marks=pytest.mark.slow) if m == "nonlinear grid" else m for m in MODELS]
+)
+def test_jacobian_is_the_dense_one(model):
+    system = MODELS[model]()
+    x = system.initialize()
+    dense = np.asarray(jax.jit(jax.jacfwd(lambda x: system.vector_field(0.2, x)))(x))
+    # A Newton correction at a solution passes derivatives with respect to its start that are rounding errors.
+    dense = np.where(np.abs(dense) < 1e-9, 0.0, dense)
+    found = system.jacobian_pattern
+    assert found.shape == (len(x), len(x)) and covers((found.rows, found.cols), dense)
+    np.testing.assert_allclose(jax.jit(lambda x: system.jacobian(0.2, x).dense())(x), dense, rtol=1e-9, atol=1e-8)
+
+
+@pytest.mark.parametrize("model", ["pendulum, minimal", "implicit", "nonlinear grid"])
+def test_pattern_of_the_semi_explicit_form(model):
+    """F = [f(t, x, z); g(t, x, z)], at any z, not only a solution."""
+    system = MODELS[model]()
+    n, plan = len(system.states), system.plan
+    state = jnp.asarray(np.random.default_rng(0).uniform(0.4, 1.2, plan.n_state))
+
+    def residual(state):
+        point = system._point(0.2, None)
+        state = point.split(state)
+        f = point.run(plan.derivative, state, refine=0).read(plan.next_derivative)
+        return jnp.concatenate([jnp.broadcast_to(f, (n,)), point.carried_vector(point.t, state)])
+
+    assert len(system.carried)
+    dense = np.asarray(jax.jit(jax.jacfwd(residual))(state))
+    rows, columns = plan.dae_pattern()
+    assert covers((rows, columns), dense)
+    assert len(set(zip(rows.tolist(), columns.tolist(), strict=True))) == len(rows)
+    if model == "nonlinear grid":  # no row has more entries than a node has neighbours, with their currents
+        assert len(rows) < 6 * plan.n_state
+
+
+@pytest.mark.parametrize("n", [300, pytest.param(20_000, marks=pytest.mark.slow)])
+def test_ladder_is_tridiagonal(n):
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    source, ground = VoltageSource(ev, "source"), Ground(ev, "ground")
+    diagram.connect(source.n, ground.p)
+    before = source.p
+    for k in range(n):
+        r, c = Resistor(ev, f"r{k}"), Capacitor(ev, f"c{k}", initial_voltage=0.0)
+        diagram.connect(before, r.p).connect(r.n, c.p).connect(c.n, ground.p)
+        before = r.n
+    system = AcausalCompiler(ev, diagram)()
+    found = system.jacobian_pattern
+    k = np.arange(n)
+    expected = np.concatenate([k * n + k, k[1:] * n + k[:-1], k[:-1] * n + k[1:]])
+    np.testing.assert_array_equal(np.sort(found.rows.astype(np.int64) * n + found.cols), np.sort(expected))
+    assert found.n_colors == 3
+    # With all resistances and capacitances 1: −2 on the diagonal (−1 at the end), 1 beside it.
+    jacobian = system.jacobian(0.0, jnp.ones(n))
+    dense = np.where(found.rows == found.cols, np.where(found.rows == n - 1, -1.0, -2.0), 1.0)
+    np.testing.assert_allclose(jacobian.values, dense, rtol=1e-12)
+    np.testing.assert_allclose(jacobian @ jnp.ones(n), np.eye(1, n)[0] * -1.0, atol=1e-12)
+
+
+def test_large_and_dense_is_said(monkeypatch):
+    monkeypatch.setattr(pattern, "LIMIT", 50)
+    system = cascade(12)
+    assert system.jacobian_pattern is None and system.plan.dae_pattern() is None
+    with pytest.raises(ModelError, match="dense"):
+        system.jacobian(0.0, jnp.zeros(12))
