@@ -13,6 +13,7 @@ from .initial_rows import Row, initial_rows, supports
 from .initialization_methods import FAILED, METHODS
 from .initialize import InitialPoint, tolerance
 from .lower import SystemPlan
+from .schedule import SparseStep
 from .singular_blocks import ILL_CONDITIONED, BlockFinding, equation_text, examine_blocks
 
 SHOWN = 12
@@ -165,9 +166,9 @@ class InitializationReport:
                 out.append((equation_text(plan, int(e)), self._names(q)))
         for step in plan.steps:
             if step.carried:
-                for e in step.tearing.residuals:
-                    equation = step.equations[e]
-                    for b in range(step.n):
+                whole = isinstance(step, SparseStep)
+                for equation in step.equations if whole else [step.equations[e] for e in step.tearing.residuals]:
+                    for b in range(len(equation.equation)):
                         slots = np.array([s.quantity[b] for s in equation.slots])
                         out.append((equation_text(plan, int(equation.equation[b])), self._names(slots)))
         return out + starts

@@ -9,8 +9,8 @@ from ..compiler.reduce_index import Offsets, reduce_index
 from ..compiler.structure import incidence
 from ..compiler.tables import describe_equation
 from .lower import SystemPlan
-from .solver_choice import solver_choice
 from .schedule import SparseStep
+from .solver_choice import solver_choice
 
 SHOWN = 12
 HTML_SHOWN = 200

@@ -20,7 +20,7 @@ from ..compiler.numeric import Networks, _opaque_values
 from ..compiler.tables import ZERO, describe_equation
 from ..compiler.templates import LinearTemplate, OpaqueTemplate
 from .lower import SystemPlan
-from .schedule import Step, StepEquation
+from .schedule import SparseStep, Step, StepEquation
 
 DENSE_LIMIT = 200  # unknowns up to which a block gets a singular value decomposition
 ILL_CONDITIONED = 1e12
@@ -55,6 +55,10 @@ def _plan_check(plan: SystemPlan) -> _Check:
     examined, wanted = set(), np.zeros(plan.extended.quantities.n, bool)
     solved: set[int] = set()
     for k, step in enumerate(plan.steps):
+        if isinstance(step, SparseStep):
+            examined.add(k)
+            wanted[step.needs()[step.needs() != ZERO]] = True
+            continue
         if len(step.unknown) == 1 and all(_never_vanishes(e) for e in step.equations):
             continue
         examined.add(k)
@@ -206,6 +210,13 @@ def examine_blocks(
     values = _Values(plan, parameters, networks, t, x, inputs)
     eps = np.finfo(float).eps
     for k, step in enumerate(plan.steps):
+        if isinstance(step, SparseStep):
+            finding = _sparse_finding(plan, values, step)
+            if finding is not None:
+                yield finding
+                if finding.singular:
+                    return
+            continue
         if step.carried and (k in check.solved or k in check.examined):
             values.follow(step)
         if k in check.examined:
@@ -275,6 +286,46 @@ def _estimate(matrix: np.ndarray) -> float:
         return np.inf
     inverse = linalg.LinearOperator(matrix.shape, matvec=factors.solve, rmatvec=lambda v: factors.solve(v, trans="T"))
     return float(linalg.onenormest(sparse) * linalg.onenormest(inverse, t=1))
+
+
+def _sparse_finding(plan: SystemPlan, values: _Values, step: SparseStep) -> BlockFinding | None:
+    """What is wrong with a sparse block, whose unknowns are solved for on the way if it is linear."""
+    n = step.n
+    place = {int(q): k for k, q in enumerate(step.unknown[0])}
+    rows, columns, entries, texts = [], [], [], []
+    if not step.carried:
+        values.quantities[step.unknown[0]] = 0.0
+    for equation in step.equations:
+        first = len(texts)
+        texts += [int(e) for e in equation.equation]
+        partials = values.partials(equation)
+        for k, slot in enumerate(equation.slots):
+            for i, q in enumerate(slot.quantity.tolist()):
+                if q in place:
+                    rows.append(first + i)
+                    columns.append(place[q])
+                    entries.append(partials[i, k])
+    matrix = sp.csc_array((np.array(entries, float), (rows, columns)), shape=(n, n))
+    if not np.isfinite(matrix.data).all():
+        return None  # what is not finite has another cause than rank
+    largest = sp.diags_array(1 / (abs(matrix).max(axis=1).toarray().ravel() + TINY))
+    scaled = sp.csc_array(largest @ matrix)
+    linalg: Any = scipy.sparse.linalg
+    try:
+        factors = linalg.splu(scaled)
+        inverse = linalg.LinearOperator((n, n), matvec=factors.solve, rmatvec=lambda v: factors.solve(v, trans="T"))
+        condition = float(linalg.onenormest(scaled) * linalg.onenormest(inverse, t=1))
+    except RuntimeError:
+        factors, condition = None, np.inf
+    if factors is not None and not step.carried:
+        residual = np.concatenate([values.residual(e) for e in step.equations])
+        values.quantities[step.unknown[0]] = factors.solve(-(largest @ residual))
+    if condition < ILL_CONDITIONED:
+        return None
+    names = tuple(plan.quantity_name[int(q)].removeprefix("-") for q in step.unknown[0])
+    equations = tuple(dict.fromkeys(equation_text(plan, e) for e in texts))
+    singular = not condition < 1 / (4 * n * np.finfo(float).eps)
+    return BlockFinding(condition, singular, n, names, equations, (), False)
 
 
 def _finding(plan: SystemPlan, values: _Values, step: Step, b: int, condition, singular, left, right) -> BlockFinding:
