@@ -1,5 +1,6 @@
 """`simulate`: a compiled system integrated by Diffrax."""
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -191,9 +192,11 @@ def _integrate(x0, system: AcausalSystem, t0, t1, ts, inputs, initial, options):
     implicit = _is_implicit(solver)
     if system.is_constrained and not implicit:
         solver = with_projection(solver, system.project, strict=bool(system.carried))
-    elif system.plan.n_constraints and isinstance(solver, BDF):
+    if isinstance(solver, BDF) and solver.algebraic_errors is None:
+        solver = dataclasses.replace(solver, algebraic_errors=False)
+    if system.plan.n_constraints and isinstance(solver, BDF):
         solver = solver if solver.projection is not None else _with_field(solver, "projection", system.project)
-    elif system.plan.n_constraints:
+    elif system.plan.n_constraints and implicit:
         solver = with_projection(solver, system.project, strict=False)
     own_start = implicit and not isinstance(controller, diffrax.StepTo)
     dt0 = None if own_start else _first_step(system, t0, t1, x0, inputs, solver.order(term), controller)
