@@ -20,6 +20,7 @@ from .simulate_arguments import check_arguments, check_parameters
 from .solution import Solution
 from .solvers import BDF, DAETerm, Projected, Rodas5P, Tsit5
 from .solvers.diagnosis import explain_failure
+from .solvers.linear_algebra import SPARSE_FROM
 from .solvers.projected import with_projection
 from .solvers.solve import check_tolerances, step_control
 
@@ -157,9 +158,9 @@ def _step_sizes(system: AcausalSystem, solver: Any, rtol: Any, atol: Any) -> dif
 def _term(system: AcausalSystem, solver: Any) -> diffrax.AbstractTerm:
     if not _is_implicit(solver):
         return diffrax.ODETerm(system.vector_field)
-    if not len(system.plan.carried):
-        return DAETerm(system.vector_field, mass=system.mass)
-    return DAETerm(system.semi_explicit, mass=system.mass)
+    plan = system.plan
+    field = system.semi_explicit if len(plan.carried) else system.vector_field
+    return DAETerm(field, mass=system.mass, pattern=plan.dae_pattern if plan.n_state >= SPARSE_FROM else None)
 
 
 def default_adjoint(n_state: int) -> diffrax.RecursiveCheckpointAdjoint:
