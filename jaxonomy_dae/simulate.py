@@ -135,7 +135,8 @@ def simulate(
         if _is_implicit(solver):
             t, y = last
             term = _term(system, solver)
-            raise SimulationError(explain_failure(term, inputs, t, y, solution, names, max_steps, rtol, atol))
+            text = explain_failure(term, inputs, t, y, solution, names, max_steps, rtol, atol)
+            raise SimulationError(f"{text} {_chart_hint(system)}".rstrip())
         raise SimulationError(_explain(solution, found.x, float(t0), float(t1), max_steps, rtol, atol))
     return solution
 
@@ -290,10 +291,15 @@ def _explain(solution: Solution, x0: Any, t0: float, t1: float, max_steps: int, 
         )
     else:
         reason = f"the integration failed: {solution.result}"
-    if system.plan.mode == "dummy_derivatives" and system.carried:
-        reason += (
-            f"; or the states {', '.join(system.states[:4])} have become a singular choice, which "
-            'state_selection="auto" avoids'
-        )
+    hint = _chart_hint(system)
     last = f"The last saved time is {reached:g} of {t1:g}" if filled.any() else f"Nothing was saved before t={t1:g}"
-    return f"{reason}. {last}."
+    return f"{reason}. {hint} {last}.".replace("  ", " ")
+
+
+def _chart_hint(system: AcausalSystem) -> str:
+    if system.plan.mode != "dummy_derivatives" or not system.carried:
+        return ""
+    return (
+        f"Perhaps the states {', '.join(system.states[:4])} have become a singular choice, which "
+        'state_selection="auto" avoids.'
+    )

@@ -83,7 +83,8 @@ def test_solutions_may_leave_jit(system):
 def test_stats_and_result(solution):
     assert solution.result == diffrax.RESULTS.successful
     assert solution.stats["num_steps"] == solution.stats["num_accepted_steps"] + solution.stats["num_rejected_steps"]
-    assert all(isinstance(v, int) for v in solution.stats.values())
+    assert all(isinstance(v, int) for v in solution.counts.values())
+    assert solution.stats["solver"] == "Tsit5" and solution.stats["reason"].startswith("explicit")
 
 
 # --- saved times -------------------------------------------------------------------------------------------------

@@ -135,6 +135,8 @@ def dependent_starts(flat: FlatModel, alias: AliasTable, extended: Extended) -> 
     for equations, inside in over:
         names = [flat.variables.names[pins[int(pinned[k - n])]] for k in equations if k >= n]
         surplus = len(equations) - len(inside)
+        if len(names) > 1 and len({name.rpartition(".")[0] for name in names}) == 1:
+            continue  # one component's own affair: its author fixed what its author made agree
         if len(names) == 1:
             notes.append(
                 f"the start of '{names[0]}' is fixed, but follows from the equations: they must agree, or free it"

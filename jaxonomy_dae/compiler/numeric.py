@@ -47,7 +47,7 @@ def group_values(group: ExtendedGroup, values, parameters, t: float, networks: N
     n = len(group)
     with np.errstate(all="ignore"):
         if group.template.opaque is not None:
-            return _opaque_values(group, slots, t, networks, partials)
+            return opaque_values(group, slots, t, networks, partials)
         if partials:
             out = group.template.partial_values(slots, p, c, t, networks, backend="numpy")
             return np.stack([np.broadcast_to(np.asarray(x, float), (n,)) for x in out], axis=-1) * group.sign
@@ -55,7 +55,7 @@ def group_values(group: ExtendedGroup, values, parameters, t: float, networks: N
         return np.broadcast_to(np.asarray(out, float), (n,))
 
 
-def _opaque_values(group: ExtendedGroup, slots, t, networks: Networks, partials: bool) -> np.ndarray:
+def opaque_values(group: Any, slots, t, networks: Networks, partials: bool) -> np.ndarray:
     def residual(column, time):
         return group.template.residual(list(column), (), (), time, Networks(networks.weights))
 

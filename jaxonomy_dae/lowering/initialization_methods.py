@@ -128,7 +128,11 @@ def find_root(
 
         # Is the trial point accepted?
         largest = jnp.max(jnp.abs(jacobian), axis=1, initial=0.0)
-        w = where(begins, 1 / where((largest > 1e-8) & (largest < 1e300), largest, one), state.rows[2])
+        w = where(
+            begins,
+            1 / where((largest > 1e-8) & (largest < 0.1 * float(jnp.finfo(largest.dtype).max)), largest, one),
+            state.rows[2],
+        )
         first = where(begins, value, state.rows[1])
         square = jnp.sum((w * value) ** 2 + 0 * largest)
         finite = jnp.isfinite(square)

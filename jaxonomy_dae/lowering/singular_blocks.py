@@ -16,7 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg
 
-from ..compiler.numeric import Networks, _opaque_values
+from ..compiler.numeric import Networks, opaque_values
 from ..compiler.tables import ZERO, describe_equation
 from ..compiler.templates import LinearTemplate, OpaqueTemplate
 from .lower import SystemPlan
@@ -153,7 +153,7 @@ class _Values:
 
         group = Group(equation.template, np.stack([s.sign for s in equation.slots], axis=-1))
         slots = [np.broadcast_to(s, (equation.parameter.shape[0],)) for s in slots]
-        return _opaque_values(group, slots, self.t, self.networks, partials)  # type: ignore[arg-type]
+        return opaque_values(group, slots, self.t, self.networks, partials)
 
     def jacobian(self, step: Step, parameters: np.ndarray | None = None) -> np.ndarray:
         """Of a step's n blocks, shape (n, k, k)."""
@@ -324,10 +324,52 @@ def _sparse_finding(plan: SystemPlan, values: _Values, step: SparseStep) -> Bloc
         values.quantities[step.unknown[0]] = factors.solve(-(largest @ residual))
     if condition < ILL_CONDITIONED:
         return None
-    names = tuple(plan.quantity_name[int(q)].removeprefix("-") for q in step.unknown[0])
-    equations = tuple(dict.fromkeys(equation_text(plan, e) for e in texts))
+    left, right = _null_vectors(scaled)
+    left = largest @ left
+    chosen = np.flatnonzero(np.abs(right) > 1e-3 * np.abs(right).max())
+    dependent = np.flatnonzero(np.abs(left) > 1e-3 * np.abs(left).max())
+    names = tuple(plan.quantity_name[int(step.unknown[0][k])].removeprefix("-") for k in chosen)
+    equations = tuple(dict.fromkeys(equation_text(plan, texts[k]) for k in dependent))
     singular = not condition < 1 / (4 * n * np.finfo(float).eps)
-    return BlockFinding(condition, singular, n, names, equations, (), False)
+    causes = _sparse_causes(plan, values, step, place, left, right) if singular else ()
+    return BlockFinding(condition, singular, n, names, equations, causes, bool(causes))
+
+
+def _null_vectors(matrix: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Left and right null vectors of a sparse matrix that is singular, or nearly so, by inverse iteration."""
+    n = matrix.shape[0]
+    linalg: Any = scipy.sparse.linalg
+    shift = 1e-10 * sp.diags_array(1 + np.arange(n) / n)  # regular, whatever the kernel
+    factors = linalg.splu(sp.csc_array(matrix + shift))
+    left = right = np.ones(n) + np.arange(n) / n
+    for _ in range(4):
+        right = factors.solve(right)
+        left = factors.solve(left, trans="T")
+        right, left = right / np.abs(right).max(), left / np.abs(left).max()
+    return left, right
+
+
+def _sparse_causes(
+    plan: SystemPlan, values: _Values, step: SparseStep, place: dict[int, int], left: np.ndarray, right: np.ndarray
+) -> tuple[tuple[str, float], ...]:
+    """The parameters p a change of which makes the block regular: uᵀ·∂J/∂p·v ≠ 0 for the null vectors u and v."""
+    effect = np.zeros(len(values.parameters))
+    first = 0
+    for equation in step.equations:
+        u = left[first : first + len(equation.equation)]
+        first += len(u)
+        columns = [np.array([place.get(int(q), -1) for q in slot.quantity]) for slot in equation.slots]
+        v = np.stack([np.where(c >= 0, right[c], 0.0) for c in columns], axis=-1)
+        before = values.partials(equation)
+        for j in range(equation.parameter.shape[1]):
+            p = equation.parameter[:, j]
+            moved = values.parameters.copy()
+            moved[p] += 1e-3 * np.maximum(1.0, np.abs(moved[p]))
+            change = values.partials(equation, moved) - before
+            np.add.at(effect, p, u * (change * v).sum(axis=1))
+    size = np.abs(np.where(np.isfinite(effect), effect, np.inf))
+    found = np.flatnonzero(size > 1e-6 * size.max(initial=0.0))[:DENSE_LIMIT]
+    return tuple((plan.flat.parameters.names[p], float(values.parameters[p])) for p in found)
 
 
 def _finding(plan: SystemPlan, values: _Values, step: Step, b: int, condition, singular, left, right) -> BlockFinding:
