@@ -94,3 +94,13 @@ def written(table: Any, index: Any, row: Any) -> Any:
 def read(table: Any, index: Any) -> Any:
     """A row of the table."""
     return jax.tree.map(lambda a: lax.dynamic_index_in_dim(a, index, 0, keepdims=False), table)
+
+
+def apart(true: Any, function: Any, carry: Any, *args: Any) -> Any:
+    """`function(carry, *args)`, which looks like the carry, as a computation of its own.
+
+    XLA on CPU runs a computation in plain order if none of its arrays is larger than 512 bytes, and as a graph of tasks
+    otherwise, which costs small operations several times over. So they stay apart from tables. `true` must not be
+    known to be so when this is compiled.
+    """
+    return lax.cond(true, function, lambda carry, *args: carry, carry, *args)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from .hoisted import Program, any_member, going, read, rows, unless_waiting, written
+from .hoisted import Program, any_member, apart, going, read, rows, unless_waiting, written
 from .reverse_step import ReverseStep
 from .step_times import StepTimes
 
@@ -60,11 +60,14 @@ class _Recorder:
     def run(self, carry, buffers, count, first):
         """At most `count` attempted steps: (carry, buffers, record, rows filled)."""
 
+        def body(state, buffers, active, first):
+            return self.program.body(self.numbers["body"], state, buffers, active, first)
+
         def advance(loop):
             carry, buffers, k, record, filled = loop
             state, last, moves = carry
             active = going(state, self.numbers, self.program)
-            new, buffers = self.program.body(self.numbers["body"], state, buffers, active, first)
+            new, buffers = apart(k < count, lambda c: body(*c, active, first), (state, buffers))
             accepted = active & (new.num_accepted_steps > state.num_accepted_steps)
             filled = jnp.where(k % self.program.chunk == 0, 0, filled)
             record = written(record, filled, self._row(carry, accepted))
@@ -124,7 +127,7 @@ def _(residuals, cotangents, perturbed, numbers, program):
 
         def one(inner):
             k, carry = inner
-            return k - 1, reverse.step(carry, read(record, k - 1))
+            return k - 1, apart(k > 0, reverse.step, carry, read(record, k - 1))
 
         _, carry = lax.while_loop(lambda inner: inner[0] > 0, one, (filled, carry))
         record, filled = lax.cond(q > 0, again, lambda _: (record, filled), q - 1)
