@@ -1,5 +1,6 @@
 """The loop over the steps of a solve that records them, and its derivative by going back over the record."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from .hoisted import Program, any_member, apart, going, read, rows, unless_waiting, written
+from .parcels import Parcels
 from .reverse_step import ReverseStep
 from .step_times import StepTimes
 
@@ -34,52 +36,64 @@ def solve(numbers: dict[str, Any], program: Program) -> tuple[Any, Any]:
 class _Recorder:
     """Attempts steps, and keeps what those since the last multiple of `chunk` started from, as far as accepted.
 
-    A carry is `(state, end of the last accepted step, derivatives of the times)`. Rows count the same for all members
-    of a batch, and each says which members accepted it; a row that none did is written over.
+    Loops carry `(row, rest)`, both packed: what a row of the record holds, and the rest of Diffrax's state. Rows count
+    the same for all members of a batch, and each says which members accepted it; a row that none did is written over.
     """
 
     def __init__(self, numbers: dict[str, Any], program: Program, times: StepTimes):
         self.numbers, self.program, self.times = numbers, program, times
+        state = numbers["state"]
+        carry = self._taken_apart(state, jnp.full_like(state.tprev, -jnp.inf), times.start())
+        self.row, self.rest = (Parcels(part) for part in carry)
+        self.start = self.pack(carry)
 
-    def start(self):
-        state = self.numbers["state"]
-        return state, jnp.full_like(state.tprev, -jnp.inf), self.times.start()
+    def _taken_apart(self, state, last, moves):
+        names = ("y", "solver_state", "tprev", "tnext") + (("made_jump",) if self.program.jumps else ())
+        row = {name: getattr(state, name) for name in names} | dict(last=last, moves=moves[:2])
+        return row, (dataclasses.replace(state, **dict.fromkeys(names)), moves[2:])
 
-    def going(self, carry):
-        return any_member(going(carry[0], self.numbers, self.program))
+    def pack(self, carry):
+        return self.row.pack(carry[0]), self.rest.pack(carry[1])
+
+    def unpack(self, packed):
+        """(state, end of the last accepted step, derivatives of the times)."""
+        row, (state, moves) = self.row.unpack(packed[0]), self.rest.unpack(packed[1])
+        last, first_moves = row.pop("last"), row.pop("moves")
+        return dataclasses.replace(state, **row), last, (*first_moves, *moves)
+
+    def going(self, packed):
+        return any_member(going(self.unpack(packed)[0], self.numbers, self.program))
 
     def empty(self):
-        return rows(self._row(self.start(), jnp.array(False)), self.program.chunk)
+        return rows((self.start[0], jnp.array(False)), self.program.chunk)
 
-    def _row(self, carry, accepted):
-        state, last, moves = carry
-        row = dict(y=state.y, solver_state=state.solver_state, tprev=state.tprev, tnext=state.tnext)
-        jump = state.made_jump if self.program.jumps else None
-        return row | dict(made_jump=jump, last=last, moves=moves[:2], accepted=accepted)
-
-    def run(self, carry, buffers, count, first):
+    def run(self, packed, buffers, count, first):
         """At most `count` attempted steps: (carry, buffers, record, rows filled)."""
 
-        def body(state, buffers, active, first):
-            return self.program.body(self.numbers["body"], state, buffers, active, first)
-
-        def advance(loop):
-            carry, buffers, k, record, filled = loop
+        def attempt(loop):
+            packed, buffers, _ = loop
+            carry = self.unpack(packed)
             state, last, moves = carry
             active = going(state, self.numbers, self.program)
-            new, buffers = apart(k < count, lambda c: body(*c, active, first), (state, buffers))
+            new, buffers = self.program.body(self.numbers["body"], state, buffers, active, first)
             accepted = active & (new.num_accepted_steps > state.num_accepted_steps)
-            filled = jnp.where(k % self.program.chunk == 0, 0, filled)
-            record = written(record, filled, self._row(carry, accepted))
             after = new, jnp.where(accepted, state.tnext, last), self.times.after(state, moves)
-            carry = unless_waiting(active, after, carry)
-            return carry, buffers, k + 1, record, filled + any_member(accepted).astype(filled.dtype)
+            after = unless_waiting(active, after, carry)
+            return self.pack(self._taken_apart(*after)), buffers, accepted
+
+        def advance(loop):
+            packed, buffers, k, record, filled = loop
+            before = packed[0]
+            packed, buffers, accepted = apart(k < count, attempt, (packed, buffers, jnp.array(False)))
+            filled = jnp.where(k % self.program.chunk == 0, 0, filled)
+            record = written(record, filled, (before, accepted))
+            return packed, buffers, k + 1, record, filled + any_member(accepted).astype(filled.dtype)
 
         zero = jnp.array(0, jnp.int32)
-        loop = (carry, buffers, zero, self.empty(), zero)
+        loop = (packed, buffers, zero, self.empty(), zero)
         loop = lax.while_loop(lambda loop: (loop[2] < count) & self.going(loop[0]), advance, loop)
-        carry, buffers, _, record, filled = loop
-        return carry, buffers, record, filled
+        packed, buffers, _, record, filled = loop
+        return packed, buffers, record, filled
 
 
 @solve.def_fwd
@@ -99,11 +113,12 @@ def _(perturbed, numbers, program):
         carry, buffers, record, filled = recorder.run(carry, buffers, program.chunk, jnp.array(True))
         return carry, buffers, chunks + 1, stride, kept, record, filled
 
-    start = recorder.start()
+    start = recorder.start
     one, zero = jnp.array(1, jnp.int32), jnp.array(0, jnp.int32)
     loop = (start, numbers["buffers"], zero, one, rows(start, points + 1), recorder.empty(), zero)
     loop = lax.while_loop(lambda loop: recorder.going(loop[0]), advance, loop)
-    (state, _, moves), buffers, chunks, stride, kept, record, filled = loop
+    carry, buffers, chunks, stride, kept, record, filled = loop
+    state, _, moves = recorder.unpack(carry)
     return (state, buffers), (state, moves, chunks, stride, kept, record, filled)
 
 
@@ -115,6 +130,8 @@ def _(residuals, cotangents, perturbed, numbers, program):
     reverse = ReverseStep(cotangents, perturbed, numbers, program, times)
     chunks, stride, filled = (eqxi.unvmap_max(v) for v in (chunks, stride, filled))
     blank = jax.tree.map(jnp.zeros_like, numbers["buffers"])  # saved nowhere: dead code
+    start = reverse.start(state, moves)
+    parcels = Parcels(start)
 
     def again(q):
         point = q // stride
@@ -122,17 +139,21 @@ def _(residuals, cotangents, perturbed, numbers, program):
         _, _, record, filled = recorder.run(read(kept, point), blank, count, jnp.array(False))
         return record, filled
 
+    def backwards(packed, row):
+        row, accepted = row
+        return parcels.pack(reverse.step(parcels.unpack(packed), recorder.row.unpack(row), accepted))
+
     def advance(loop):
-        q, record, filled, carry = loop
+        q, record, filled, packed = loop
 
         def one(inner):
-            k, carry = inner
-            return k - 1, apart(k > 0, reverse.step, carry, read(record, k - 1))
+            k, packed = inner
+            return k - 1, apart(k > 0, backwards, packed, read(record, k - 1))
 
-        _, carry = lax.while_loop(lambda inner: inner[0] > 0, one, (filled, carry))
+        _, packed = lax.while_loop(lambda inner: inner[0] > 0, one, (filled, packed))
         record, filled = lax.cond(q > 0, again, lambda _: (record, filled), q - 1)
-        return q - 1, record, filled, carry
+        return q - 1, record, filled, packed
 
-    loop = (chunks - 1, record, filled, reverse.start(state, moves))
-    *_, carry = lax.while_loop(lambda loop: loop[0] >= 0, advance, loop)
-    return reverse.finish(carry)
+    loop = (chunks - 1, record, filled, parcels.pack(start))
+    *_, packed = lax.while_loop(lambda loop: loop[0] >= 0, advance, loop)
+    return reverse.finish(parcels.unpack(packed))

@@ -58,10 +58,9 @@ class ReverseStep:
             after=(state.tprev, moves[0] if self.timed else ()),
         )
 
-    def step(self, carry: dict[str, Any], row: dict[str, Any]) -> dict[str, Any]:
+    def step(self, carry: dict[str, Any], row: dict[str, Any], kept: Any) -> dict[str, Any]:
         """Over one row of the record."""
         before = dict(carry)
-        kept = row["accepted"]
         moving, still = eqx.partition(row["solver_state"], eqx.is_inexact_array)
         ends = (row["tprev"], row["tnext"])
         dense_wanted = bool(self.save_ts)
@@ -85,7 +84,7 @@ class ReverseStep:
             carry = self._saved_step(carry, i, kept, y1)
         dense_ct, ends_ct = _zeros(dense), _zeros(ends)
         for i in self.save_ts:
-            carry, dense_ct, ends_ct = self._saved_times(carry, i, row, dense, rest[0], dense_ct, ends_ct)
+            carry, dense_ct, ends_ct = self._saved_times(carry, i, row, kept, dense, rest[0], dense_ct, ends_ct)
         out = pull((carry["y"], carry["solver_state"], dense_ct))
         carry = carry | dict(
             y=out[0],
@@ -119,12 +118,12 @@ class ReverseStep:
             carry["seeds"] = carry["seeds"] + (by_t + jnp.where(here, t_ct, 0)) * move
         return carry
 
-    def _saved_times(self, carry, i, row, dense, fixed, dense_ct, ends_ct):
+    def _saved_times(self, carry, i, row, kept, dense, fixed, dense_ct, ends_ct):
         """What was saved at times within the step, the last one first."""
         ts, (consts, others) = self.numbers["ts"][i], self.consts["save_ts"][i]
 
         def inside(index):
-            return row["accepted"] & (index > 0) & (ts[jnp.maximum(index - 1, 0)] > row["last"])
+            return kept & (index > 0) & (ts[jnp.maximum(index - 1, 0)] > row["last"])
 
         def one(loop):
             index, at, dense_ct, ends_ct, consts_ct, ts_ct = loop
