@@ -16,6 +16,7 @@ from .lowering.initialize import check, initialize
 from .lowering.system import AcausalSystem
 from .solution import Solution
 from .solvers.projected import with_projection
+from .solvers.stored_adjoint import StoredAdjoint
 from .solvers.tsit5 import Tsit5
 
 SAVED_ITERATIONS = 3
@@ -51,7 +52,7 @@ def simulate(
     - `inputs`: functions of time (callable pytrees such as Diffrax interpolations, or plain functions) or constants, by
         the inputs' names.
     - `initial`: values at `t0` by variables' names, which outrank the starts declared in components.
-    - `adjoint`: of Diffrax; `diffrax.ForwardMode()` for forward-mode differentiation (`jax.jvp`, `jax.jacfwd`).
+    - `adjoint`: how to differentiate; default `solvers.StoredAdjoint()`. `diffrax.ForwardMode()` for forward-mode differentiation (`jax.jvp`, `jax.jacfwd`).
     - `stepsize_controller`: instead of the proportional–integral controller made from the tolerances.
     - `max_steps`: bounds the steps taken; with `ts=None` as many rows are reserved.
     - `progress`: shows a progress bar.
@@ -79,7 +80,7 @@ def simulate(
         )
     options = (
         solver if solver is not None else Tsit5(),
-        adjoint if adjoint is not None else default_adjoint(system.plan.n_state),
+        adjoint if adjoint is not None else StoredAdjoint(),
         stepsize_controller,
         max_steps,
         progress,
@@ -114,16 +115,6 @@ def simulate(
     if throw and not bool(diffrax.is_okay(result)):
         raise SimulationError(_explain(solution, x0, float(t0), float(t1), max_steps, rtol, atol))
     return solution
-
-
-def default_adjoint(n_state: int) -> diffrax.RecursiveCheckpointAdjoint:
-    """Reverse mode with as many checkpoints as are cheap.
-
-    Every step copies all checkpoints, and XLA on CPU does so twice as fast while each copied array has at most 64
-    entries. With c checkpoints, (c + 2)(c + 1)/2 steps are recomputed but once (Griewank & Walther 2000), so few are
-    enough.
-    """
-    return diffrax.RecursiveCheckpointAdjoint(checkpoints=64 // n_state if 1 <= n_state <= 6 else 32)
 
 
 @eqx.filter_jit
@@ -213,7 +204,7 @@ def _check_arguments(system, t0, t1, ts, inputs, initial, adjoint, solver, max_s
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ModelError(
             "adjoint=BacksolveAdjoint() is wrong for constrained systems: it integrates the state backwards without "
-            "its constraints and leaves the algebraic variables out. Use the default RecursiveCheckpointAdjoint(), or "
+            "its constraints and leaves the algebraic variables out. Use the default, or RecursiveCheckpointAdjoint(), or "
             "ForwardMode() for few parameters"
         )
     if not isinstance(max_steps, int) or max_steps < 1:
