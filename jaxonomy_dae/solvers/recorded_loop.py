@@ -67,8 +67,8 @@ class _Recorder:
     def empty(self):
         return rows((self.start[0], jnp.array(False)), self.program.chunk)
 
-    def run(self, packed, buffers, count, first):
-        """At most `count` attempted steps: (carry, buffers, record, rows filled)."""
+    def run(self, packed, buffers, record, count, first):
+        """At most `count` attempted steps: (carry, buffers, record, rows filled). The record is written over."""
 
         def attempt(loop):
             packed, buffers, _ = loop
@@ -90,7 +90,7 @@ class _Recorder:
             return packed, buffers, k + 1, record, filled + any_member(accepted).astype(filled.dtype)
 
         zero = jnp.array(0, jnp.int32)
-        loop = (packed, buffers, zero, self.empty(), zero)
+        loop = (packed, buffers, zero, record, zero)
         loop = lax.while_loop(lambda loop: (loop[2] < count) & self.going(loop[0]), advance, loop)
         packed, buffers, _, record, filled = loop
         return packed, buffers, record, filled
@@ -102,7 +102,7 @@ def _(perturbed, numbers, program):
     points = program.points
 
     def advance(loop):
-        carry, buffers, chunks, stride, kept, _, _ = loop
+        carry, buffers, chunks, stride, kept, record, _ = loop
 
         def thin():
             return jax.tree.map(lambda a: a.at[: points // 2].set(a[:points:2]), kept), 2 * stride
@@ -110,7 +110,7 @@ def _(perturbed, numbers, program):
         kept, stride = lax.cond(chunks == points * stride, thin, lambda: (kept, stride))
         row = jnp.where(chunks % stride == 0, chunks // stride, points)  # the last row is for what is not kept
         kept = written(kept, row, carry)
-        carry, buffers, record, filled = recorder.run(carry, buffers, program.chunk, jnp.array(True))
+        carry, buffers, record, filled = recorder.run(carry, buffers, record, program.chunk, jnp.array(True))
         return carry, buffers, chunks + 1, stride, kept, record, filled
 
     start = recorder.start
@@ -133,10 +133,10 @@ def _(residuals, cotangents, perturbed, numbers, program):
     start = reverse.start(state, moves)
     parcels = Parcels(start)
 
-    def again(q):
+    def again(q, record, _):
         point = q // stride
         count = (q - point * stride + 1) * program.chunk
-        _, _, record, filled = recorder.run(read(kept, point), blank, count, jnp.array(False))
+        _, _, record, filled = recorder.run(read(kept, point), blank, record, count, jnp.array(False))
         return record, filled
 
     def backwards(packed, row):
@@ -151,7 +151,7 @@ def _(residuals, cotangents, perturbed, numbers, program):
             return k - 1, apart(k > 0, backwards, packed, read(record, k - 1))
 
         _, packed = lax.while_loop(lambda inner: inner[0] > 0, one, (filled, packed))
-        record, filled = lax.cond(q > 0, again, lambda _: (record, filled), q - 1)
+        record, filled = lax.cond(q > 0, again, lambda _, *same: same, q - 1, record, filled)
         return q - 1, record, filled, packed
 
     loop = (chunks - 1, record, filled, parcels.pack(start))
