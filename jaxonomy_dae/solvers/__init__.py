@@ -5,4 +5,5 @@ from .dae_term import DAETerm as DAETerm
 from .projected import Projected as Projected
 from .rodas5p import Rodas5P as Rodas5P
 from .step_control import StepControl as StepControl
+from .stored_adjoint import StoredAdjoint as StoredAdjoint
 from .tsit5 import Tsit5 as Tsit5

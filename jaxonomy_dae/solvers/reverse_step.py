@@ -113,7 +113,7 @@ class ReverseStep:
         by_t, by_y, by_consts = _where(here, pull(ct))
         carry = carry | dict(y=jax.tree.map(jnp.add, carry["y"], by_y))
         carry["save_steps"] = _added(carry["save_steps"], i, by_consts)
-        carry["row"] = _replaced(carry["row"], i, carry["row"][i] - here)
+        carry["row"] = _replaced(carry["row"], i, carry["row"][i] - here.astype(carry["row"][i].dtype))
         if self.timed:
             carry["seeds"] = carry["seeds"] + (by_t + jnp.where(here, t_ct, 0)) * move
         return carry

@@ -62,6 +62,7 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
         functions, numbers = _functions(**{**given, "init_state": init_state})
         state = dataclasses.replace(
             init_state,
+            made_jump=jnp.asarray(init_state.made_jump) if functions["jumps"] else False,
             controller_state=(init_state.controller_state, jnp.array(True)),
             progress_meter_state=(init_state.progress_meter_state, jnp.array(True)),
         )
