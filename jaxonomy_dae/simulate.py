@@ -52,7 +52,8 @@ def simulate(
     - `inputs`: functions of time (callable pytrees such as Diffrax interpolations, or plain functions) or constants, by
         the inputs' names.
     - `initial`: values at `t0` by variables' names, which outrank the starts declared in components.
-    - `adjoint`: how to differentiate; default `solvers.StoredAdjoint()`. `diffrax.ForwardMode()` for forward-mode differentiation (`jax.jvp`, `jax.jacfwd`).
+    - `adjoint`: how to differentiate; default `solvers.StoredAdjoint()`. `diffrax.ForwardMode()` for forward-mode
+        differentiation (`jax.jvp`, `jax.jacfwd`).
     - `stepsize_controller`: instead of the proportional–integral controller made from the tolerances.
     - `max_steps`: bounds the steps taken; with `ts=None` as many rows are reserved.
     - `progress`: shows a progress bar.
@@ -204,8 +205,8 @@ def _check_arguments(system, t0, t1, ts, inputs, initial, adjoint, solver, max_s
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ModelError(
             "adjoint=BacksolveAdjoint() is wrong for constrained systems: it integrates the state backwards without "
-            "its constraints and leaves the algebraic variables out. Use the default, or RecursiveCheckpointAdjoint(), or "
-            "ForwardMode() for few parameters"
+            "its constraints and leaves the algebraic variables out. Use the default StoredAdjoint(), "
+            "RecursiveCheckpointAdjoint(), or ForwardMode() for few parameters"
         )
     if not isinstance(max_steps, int) or max_steps < 1:
         raise ModelError(f"max_steps must be a positive integer; got {max_steps!r}")

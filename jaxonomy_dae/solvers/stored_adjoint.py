@@ -6,6 +6,7 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 from diffrax._heuristics import is_sde
@@ -32,8 +33,8 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
     `diffrax.ClipStepSizeController` and `diffrax.StepTo` are complete.
 
     Solves with events, dense output or Brownian motion, and those whose state is so large that a record would take more
-    than 32 MB, are handed to `diffrax.RecursiveCheckpointAdjoint`. Forward mode needs `diffrax.ForwardMode()`;
-    `jax.jacfwd` of a gradient works.
+    than 32 MB, are handed to `diffrax.RecursiveCheckpointAdjoint`. As with that, forward mode is refused, second
+    derivatives included: it needs `diffrax.ForwardMode()`.
     """
 
     def loop(
@@ -46,7 +47,10 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
             t0=t0, t1=t1, dt0=dt0, max_steps=max_steps, init_state=init_state, progress_meter=progress_meter,
         )  # fmt: skip
         chunk, points = _table(max_steps)
-        size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(_arrays(init_state.solver_state)))
+        size = sum(
+            leaf.size * leaf.dtype.itemsize
+            for leaf in jax.tree.leaves(_arrays((init_state.y, init_state.solver_state)))
+        )
         if event is not None or saveat.dense or is_sde(terms) or size * (chunk + points) > LARGEST_RECORD:
             passed = dict(passed_solver_state=passed_solver_state, passed_controller_state=passed_controller_state)
             return diffrax.RecursiveCheckpointAdjoint().loop(**given, throw=throw, **passed)
@@ -116,14 +120,14 @@ def _table(max_steps: int | None) -> tuple[int, int]:
 
 
 def _inner_loop(cond_fun, body_fun, start, *, max_steps, buffers, checkpoints):
-    """Saving at times within a step. Without `vmap` this is `lax.while_loop`; Equinox's knows what to do with it."""
-    import equinox.internal as eqxi
-
+    """Saving at times within a step."""
     del checkpoints
     return eqxi.while_loop(cond_fun, body_fun, start, max_steps=max_steps, buffers=buffers, kind="lax")
 
 
-def _functions(*, args, terms, solver, stepsize_controller, saveat, t1, init_state, **_):
+def _functions(
+    *, args, terms, solver, stepsize_controller, saveat, t1, init_state, **_
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """The functions of `Program` but for its body, and the arrays they close over."""
     s = init_state
     controller, others = eqx.partition(stepsize_controller, eqx.is_inexact_array)
