@@ -18,7 +18,7 @@ from .lowering.solver_choice import solver_choice
 from .lowering.system import AcausalSystem
 from .simulate_arguments import check_arguments, check_parameters
 from .solution import Solution
-from .solvers import BDF, DAETerm, Projected, Rodas5P, Tsit5
+from .solvers import BDF, DAETerm, Projected, Rodas5P, StoredAdjoint, Tsit5
 from .solvers.diagnosis import explain_failure
 from .solvers.linear_algebra import SPARSE_FROM
 from .solvers.projected import with_projection
@@ -59,7 +59,8 @@ def simulate(
     - `inputs`: functions of time (callable pytrees such as Diffrax interpolations, or plain functions) or constants, by
         the inputs' names.
     - `initial`: values at `t0` by variables' names, which outrank the starts declared in components.
-    - `adjoint`: of Diffrax; `diffrax.ForwardMode()` for forward-mode differentiation (`jax.jvp`, `jax.jacfwd`).
+    - `adjoint`: how to differentiate; default `solvers.StoredAdjoint()`. `diffrax.ForwardMode()` for forward-mode
+        differentiation (`jax.jvp`, `jax.jacfwd`).
     - `stepsize_controller`: instead of the controller made from the tolerances.
     - `jump_ts`: times at which inputs jump, shape `(n,)`: steps end there and the method starts anew.
     - `max_steps`: bounds the steps taken; with `ts=None` as many rows are reserved.
@@ -96,7 +97,7 @@ def simulate(
         stepsize_controller = diffrax.ClipStepSizeController(adaptive, jump_ts=jnp.asarray(jump_ts, dtype))
     options = (
         solver,
-        adjoint if adjoint is not None else default_adjoint(system.plan.n_state),
+        adjoint if adjoint is not None else StoredAdjoint(),
         stepsize_controller,
         max_steps,
         progress,
@@ -162,16 +163,6 @@ def _term(system: AcausalSystem, solver: Any) -> diffrax.AbstractTerm:
     plan = system.plan
     field = system.semi_explicit if len(plan.carried) else system.vector_field
     return DAETerm(field, mass=system.mass, pattern=plan.dae_pattern if plan.n_state >= SPARSE_FROM else None)
-
-
-def default_adjoint(n_state: int) -> diffrax.RecursiveCheckpointAdjoint:
-    """Reverse mode with as many checkpoints as are cheap.
-
-    Every step copies all checkpoints, and XLA on CPU does so twice as fast while each copied array has at most 64
-    entries. With c checkpoints, (c + 2)(c + 1)/2 steps are recomputed but once (Griewank & Walther 2000), so few are
-    enough.
-    """
-    return diffrax.RecursiveCheckpointAdjoint(checkpoints=64 // n_state if 1 <= n_state <= 6 else 32)
 
 
 @eqx.filter_jit

@@ -27,8 +27,8 @@ def check_arguments(system, t0, t1, ts, inputs, initial, adjoint, solver, max_st
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ModelError(
             "adjoint=BacksolveAdjoint() is wrong for constrained systems: it integrates the state backwards without "
-            "its constraints and leaves the algebraic variables out. Use the default RecursiveCheckpointAdjoint(), or "
-            "ForwardMode() for few parameters"
+            "its constraints and leaves the algebraic variables out. Use the default StoredAdjoint(), "
+            "RecursiveCheckpointAdjoint(), or ForwardMode() for few parameters"
         )
     if not isinstance(max_steps, int) or max_steps < 1:
         raise ModelError(f"max_steps must be a positive integer; got {max_steps!r}")

@@ -7,4 +7,5 @@ from .rodas5p import Rodas5P as Rodas5P
 from .solve import consistent_start as consistent_start
 from .solve import solve_dae as solve_dae
 from .step_control import StepControl as StepControl
+from .stored_adjoint import StoredAdjoint as StoredAdjoint
 from .tsit5 import Tsit5 as Tsit5

@@ -18,6 +18,7 @@ from .diagnosis import StartCheck, explain_failure, explain_start, start_check
 from .projected import Projected
 from .rodas5p import Rodas5P
 from .step_control import StepControl
+from .stored_adjoint import StoredAdjoint
 
 SMALL = 30  # up to this many unknowns a factorisation costs less than the steps that a multistep method saves
 
@@ -51,7 +52,8 @@ def solve_dae(
     - `solver`: default `Rodas5P` up to 30 unknowns, `BDF` beyond.
     - `rtol`, `atol`: of the local error; `atol` may look like y.
     - `args`: handed to the functions; gradients flow to it.
-    - `adjoint`, `stepsize_controller`, `max_steps`: of Diffrax.
+    - `adjoint`: how to differentiate; default `StoredAdjoint()`.
+    - `stepsize_controller`, `max_steps`: of Diffrax.
     - `jump_ts`: times at which F jumps: steps end there and the method starts anew.
     - `names`: of the unknowns, in order, for error messages.
     - `throw`: whether to raise if the start is inconsistent or the integration fails; otherwise see `solution.result`.
@@ -80,7 +82,7 @@ def solve_dae(
         raise ModelError(BACKSOLVE)
     t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
     ts = None if ts is None else jnp.asarray(ts, dtype)
-    options = (solver, adjoint or diffrax.RecursiveCheckpointAdjoint(), stepsize_controller, max_steps)
+    options = (solver, adjoint or StoredAdjoint(), stepsize_controller, max_steps)
     arguments = (term, t0, t1, y0, ts, args, (rtol, atol), options)
     traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments))
     check, solution, last = (_solve if traced else _compiled)(*arguments)

@@ -1,0 +1,106 @@
+"""A solve as functions that close over no array, and the arrays they need: what a derivative by hand starts from."""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+
+class Program(eqx.Module):
+    """The functions of a solve, without the arrays they close over."""
+
+    step: Any  # (tprev, tnext, y, solver_state, made_jump) -> what the solver's `step` returns
+    adapt: Any  # (controller, tprev, tnext, y, y1, y_error, controller_state) -> what its `adapt_step_size` returns
+    body: Any  # (state, buffers, active, first) -> (state, buffers): one attempted step, bookkeeping included
+    save_steps: tuple[Any, ...]  # for each part of `SaveAt`: (t, y) -> what it saves of a step, or None
+    save_ts: tuple[Any, ...]  # for each part: (t, tprev, tnext, dense_info) -> what it saves at a time, or None
+    every: tuple[int, ...] = eqx.field(static=True)  # for each part: it saves every so many steps, 0 for none
+    jumps: bool = eqx.field(static=True)  # whether `made_jump` is ever set
+    max_steps: int | None = eqx.field(static=True)
+    chunk: int = eqx.field(static=True)  # attempted steps between two points where the solve can be taken up again
+    points: int = eqx.field(static=True)  # how many such points are kept
+
+
+class Shut(eqx.Module):
+    """A function that closes over nothing; called with what it closed over, `(consts, *args)`."""
+
+    closure: Any
+
+    def __call__(self, consts: Any, *args: Any) -> Any:
+        return eqx.tree_at(lambda c: c.consts, self.closure, consts, is_leaf=lambda leaf: leaf is None)(*args)
+
+    @property
+    def out_struct(self) -> Any:
+        """What it returns: shapes and dtypes, and values where they are static."""
+        return self.closure.out_struct
+
+
+def hoist(function: Any, *args: Any) -> tuple[Shut, list[Any]]:
+    """(the function without the arrays it closes over, those arrays)."""
+    closure = eqx.filter_closure_convert(lambda *args: function(*args), *args)
+    return Shut(eqx.tree_at(lambda c: c.consts, closure, None)), list(closure.consts)  # pyright: ignore
+
+
+@jax.custom_batching.custom_vmap
+def unless_waiting(active, new, old):
+    """`new`; in a batch, whose members wait for the slowest one, `old` where a member is not active any more."""
+    del active, old
+    return new
+
+
+@unless_waiting.def_vmap
+def _(size, batched, active, new, old):
+    def spread(leaf, is_batched):
+        return leaf if is_batched else jnp.broadcast_to(leaf, (size, *jnp.shape(leaf)))
+
+    def choose(a, b):
+        return jnp.where(active.reshape(active.shape + (1,) * (a.ndim - active.ndim)), a, b)
+
+    new, old = jax.tree.map(spread, new, batched[1]), jax.tree.map(spread, old, batched[2])
+    out = jax.tree.map(choose, new, old) if batched[0] else unless_waiting(active, new, old)
+    return out, jax.tree.map(lambda _: True, out)
+
+
+def going(state: Any, numbers: dict[str, Any], program: Program) -> Any:
+    """Whether a solve takes another step."""
+    on = (state.tprev < numbers["t1"]) & diffrax.is_successful(state.result)
+    return on if program.max_steps is None else on & (state.num_steps < program.max_steps)
+
+
+def any_member(flag: Any) -> Any:
+    """Whether a flag is set for any member of the batch."""
+    return eqxi.unvmap_any(flag)
+
+
+def inexact(tree: Any) -> Any:
+    """The leaves that can have derivatives."""
+    return eqx.filter(tree, eqx.is_inexact_array)
+
+
+def rows(tree: Any, count: int) -> Any:
+    """Room for several of the like."""
+    return jax.tree.map(lambda leaf: jnp.zeros((count, *jnp.shape(leaf)), jnp.result_type(leaf)), tree)
+
+
+def written(table: Any, index: Any, row: Any) -> Any:
+    """The table with a row set."""
+    return jax.tree.map(lambda a, b: lax.dynamic_update_index_in_dim(a, b, index, 0), table, row)
+
+
+def read(table: Any, index: Any) -> Any:
+    """A row of the table."""
+    return jax.tree.map(lambda a: lax.dynamic_index_in_dim(a, index, 0, keepdims=False), table)
+
+
+def apart(true: Any, function: Any, carry: Any, *args: Any) -> Any:
+    """`function(carry, *args)`, which looks like the carry, as a computation of its own.
+
+    XLA on CPU runs a computation in plain order if none of its arrays is larger than 512 bytes, and as a graph of tasks
+    otherwise, which costs small operations several times over. So they stay apart from tables. `true` must not be
+    known to be so when this is compiled.
+    """
+    return lax.cond(true, function, lambda carry, *args: carry, carry, *args)

@@ -1,0 +1,305 @@
+"""Gradients by `StoredAdjoint`: those of Diffrax's own adjoints, and closed forms.
+
+Both differentiate the same steps, so they agree to rounding: 1e-10 relative to the largest component leaves room for
+its growth over some hundred steps.
+"""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+from jaxonomy_dae.solvers import BDF, Rodas5P, StepControl, StoredAdjoint, Tsit5
+
+STORED, RECURSIVE = StoredAdjoint(), diffrax.RecursiveCheckpointAdjoint()
+ARGS = (jnp.array([1.5, 1.0]), jnp.array([[0.1, -0.2], [0.3, 0.2]]))
+Y0 = jnp.array([1.0, 0.5])
+PID = diffrax.PIDController(rtol=1e-6, atol=1e-8)
+TS = jnp.array([0.0, 0.7, 0.71, 0.72, 2.0, 3.9])
+
+
+def field(t, y, args):
+    """A driven predator–prey model with a bounded learned term."""
+    (a, b), w = args
+    growth = jnp.stack([a * y[0] - y[0] * y[1], y[0] * y[1] - b * y[1]])
+    return growth + 0.1 * jnp.tanh(w @ y) + 0.1 * jnp.cos(3 * t)
+
+
+def solve(args, y0, adjoint, t0=0.0, t1=4.0, dt0=0.05, solver=None, saveat=None, controller=PID, term=None, **kwargs):
+    kwargs = {"max_steps": 4096, "throw": True} | kwargs
+    return diffrax.diffeqsolve(
+        diffrax.ODETerm(field) if term is None else term,
+        Tsit5() if solver is None else solver,
+        t0, t1, dt0, y0, args,
+        saveat=diffrax.SaveAt(t1=True) if saveat is None else saveat,
+        stepsize_controller=controller, adjoint=adjoint, **kwargs,
+    )  # fmt: skip
+
+
+def total(solution):
+    """A weighted sum of everything saved, rows never filled excepted."""
+    leaves = jax.tree.leaves((solution.ys, solution.ts))
+    finite = [jnp.where(jnp.isfinite(leaf), leaf, 0) for leaf in leaves]
+    return sum(jnp.sum(leaf * jnp.cos(jnp.arange(leaf.size, dtype=leaf.dtype)).reshape(leaf.shape)) for leaf in finite)
+
+
+def agree(a, b, tolerance=1e-10):
+    a, b = jax.tree.leaves(a), jax.tree.leaves(b)
+    assert len(a) == len(b)
+    for one, other in zip(a, b, strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=tolerance * max(float(jnp.abs(other).max()), 1e-3))
+
+
+def both(loss, *at, argnums=0):
+    """The loss and its gradient by both adjoints, which must agree."""
+    mine = jax.jit(jax.value_and_grad(lambda *v: loss(*v, STORED), argnums))(*at)
+    other = jax.jit(jax.value_and_grad(lambda *v: loss(*v, RECURSIVE), argnums))(*at)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(other))
+    agree(mine, other)
+    return mine
+
+
+SAVED = {
+    "t1": diffrax.SaveAt(t1=True),
+    "ts": diffrax.SaveAt(ts=TS),  # the start, several within a step, none in most steps
+    "steps": diffrax.SaveAt(t0=True, steps=True),
+    "parts": diffrax.SaveAt(
+        subs=[
+            diffrax.SubSaveAt(ts=TS, steps=2, t1=True, fn=lambda t, y, args: {"a": args[0][0] * y[0] ** 2, "b": t * y}),
+            diffrax.SubSaveAt(t0=True, ts=TS[2:]),
+        ]
+    ),
+}
+
+
+@pytest.mark.parametrize("saved", [pytest.param(s, marks=[] if s == "ts" else pytest.mark.slow) for s in SAVED])
+def test_what_is_saved(saved):
+    both(lambda args, y0, adjoint: total(solve(args, y0, adjoint, saveat=SAVED[saved])), ARGS, Y0, argnums=(0, 1))
+
+
+STIFF = {
+    "kvaerno5": (diffrax.Kvaerno5(), diffrax.PIDController(rtol=1e-5, atol=1e-7)),
+    "rodas5p": (Rodas5P(), StepControl(rtol=1e-6, atol=1e-8)),
+    "bdf": (BDF(), StepControl(rtol=1e-6, atol=1e-8, steered=True)),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", STIFF)
+def test_implicit_solvers(name):
+    solver, controller = STIFF[name]
+
+    def loss(args, y0, adjoint):
+        return total(solve(args, y0, adjoint, solver=solver, controller=controller, saveat=diffrax.SaveAt(ts=TS)))
+
+    with jax.numpy_dtype_promotion("standard" if name == "bdf" else "strict"):
+        both(loss, ARGS, Y0, argnums=(0, 1))
+
+
+@pytest.mark.parametrize("t1, max_steps", [(20.0, 4096), pytest.param(170.0, None, marks=pytest.mark.slow)])
+def test_more_steps_than_rows(t1, max_steps):
+    """Pieces are run again, and with 64 rows and 32 points, points are thinned out beyond 2048 steps."""
+    term = diffrax.ODETerm(lambda t, y, args: args * jnp.stack([y[1], -y[0]]))
+    controller = diffrax.StepTo(jnp.linspace(0.0, t1, 301 if max_steps else 2501))
+
+    def final(args, adjoint):
+        solved = solve(args, Y0, adjoint, t1=t1, dt0=None, controller=controller, term=term, max_steps=max_steps)
+        return solved.ys[0] @ jnp.array([1.0, 2.0])
+
+    value, slope = jax.jit(jax.value_and_grad(lambda args: final(args, STORED)))(jnp.array(1.0))
+    exact = jnp.array([jnp.cos(t1) + 0.5 * jnp.sin(t1), 0.5 * jnp.cos(t1) - jnp.sin(t1)]) @ jnp.array([1.0, 2.0])
+    turned = t1 * jnp.array([0.5 * jnp.cos(t1) - jnp.sin(t1), -jnp.cos(t1) - 0.5 * jnp.sin(t1)]) @ jnp.array([1.0, 2.0])
+    # Steps of 0.07 with an error constant of about 1e-4 at order 5: 1e-4·0.07^5·t1 = 3e-8 of the angle, times t1.
+    np.testing.assert_allclose(value, exact, atol=1e-7)
+    np.testing.assert_allclose(slope, turned, atol=1e-7 * t1)
+    forward = jax.jit(jax.jacfwd(lambda args: final(args, diffrax.ForwardMode())))(jnp.array(1.0))
+    agree(slope, forward)
+
+
+def test_batches():
+    """Members that take different numbers of steps, some more than the record has rows, others few."""
+    scale = jnp.array([0.05, 1.0, 40.0])
+    term = diffrax.ODETerm(lambda t, y, args: args * jnp.stack([y[1], -jnp.sin(y[0])]))
+
+    def loss(scale, y0, adjoint):
+        return total(solve(scale, y0, adjoint, term=term, saveat=diffrax.SaveAt(ts=TS)))
+
+    gradient = jax.grad(lambda scale, y0: loss(scale, y0, STORED), argnums=(0, 1))
+    y0 = jnp.stack([Y0, 1.1 * Y0, 0.5 * Y0])
+    batch = jax.jit(jax.vmap(gradient))(scale, y0)
+    each = [jax.jit(gradient)(s, y) for s, y in zip(scale, y0, strict=True)]
+    # Fused differently, the error estimates differ by rounding, and so do step sizes: by 1e-16/rtol relatively, and
+    # the result by that part of its own error, over the 170 radians of the fastest member.
+    agree(batch, jax.tree.map(lambda *leaves: jnp.stack(leaves), *each), 1e-7)
+
+
+@pytest.mark.slow
+def test_nested_and_outer_batches():
+    """vmap of vmap, and the gradient of a vmap with what is shared between its members."""
+    scale = jnp.array([0.05, 1.0, 4.0])
+    term = diffrax.ODETerm(lambda t, y, args: args * jnp.stack([y[1], -jnp.sin(y[0])]))
+
+    def loss(scale, y0, adjoint):
+        return total(solve(scale, y0, adjoint, term=term, saveat=diffrax.SaveAt(ts=TS)))
+
+    gradient = jax.grad(lambda scale, y0: loss(scale, y0, STORED), argnums=(0, 1))
+    y0 = jnp.stack([Y0, 1.1 * Y0, 0.5 * Y0])
+    batch = jax.jit(jax.vmap(gradient))(scale, y0)
+    nested = jax.jit(jax.vmap(jax.vmap(gradient)))(scale[None], y0[None])
+    agree(nested, jax.tree.map(lambda leaf: leaf[None], batch), 1e-7)
+    shared = jax.jit(jax.grad(lambda y0: jax.vmap(lambda s: loss(s, y0, STORED))(scale).sum()))(Y0)
+    parts = jax.jit(jax.vmap(jax.grad(lambda y0, s: loss(s, y0, STORED)), (None, 0)))(Y0, scale)
+    agree(shared, parts.sum(axis=0), 1e-7)
+
+
+@pytest.mark.slow
+def test_times():
+    """The start, the end, the first step and the times saved at."""
+
+    def loss(t0, t1, dt0, ts, adjoint):
+        saveat = diffrax.SaveAt(subs=[diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(steps=1, t1=True)])
+        return total(solve(ARGS, Y0, adjoint, t0=t0, t1=t1, dt0=dt0, saveat=saveat))
+
+    at = jnp.array(0.0), jnp.array(4.0), jnp.array(0.4), TS[1:]
+    _, slopes = both(loss, *at, argnums=(0, 1, 2, 3))
+    assert all(np.abs(leaf).min() > 1e-8 for leaf in slopes)
+
+
+def test_end_in_closed_form():
+    """y(t1) of y' = a·y·t: dy/dt1 = a·t1·y and dy/dt0 = −a·t0·y, to the solver's accuracy."""
+    term = diffrax.ODETerm(lambda t, y, a: a * y * t)
+    controller = diffrax.PIDController(rtol=1e-10, atol=1e-10)
+
+    def final(t0, t1):
+        return solve(-0.5, jnp.array([2.0]), STORED, t0=t0, t1=t1, term=term, controller=controller).ys[0, 0]
+
+    value, (by_start, by_end) = jax.jit(jax.value_and_grad(final, (0, 1)))(jnp.array(0.5), jnp.array(2.0))
+    y = 2 * np.exp(-0.25 * (2.0**2 - 0.5**2))
+    np.testing.assert_allclose([value, by_start, by_end], [y, 0.25 * y, -y], rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_jumps():
+    """A discontinuity at a time that is differentiated, which the controller steps to."""
+
+    def loss(jump, args, adjoint):
+        controller = diffrax.ClipStepSizeController(PID, jump_ts=jump[None])
+        term = diffrax.ODETerm(lambda t, y, a: -a * y + jnp.where(t < jump, 0.0, 1.0))
+        saveat = diffrax.SaveAt(ts=TS, steps=True)
+        return total(solve(args, Y0, adjoint, controller=controller, term=term, saveat=saveat))
+
+    both(loss, jnp.array(1.3), jnp.array(0.7), argnums=(0, 1))
+
+
+def test_rejected_steps_do_no_harm():
+    """A first step far too long takes the root of a negative number: y' = −√y, y(1) = (1 − 1/2)² for y(0) = 1."""
+    term = diffrax.ODETerm(lambda t, y, a: -a * jnp.sqrt(y))
+
+    def final(a, adjoint):
+        solved = solve(a, jnp.array([1.0]), adjoint, t1=1.0, dt0=20.0, term=term, controller=strict)
+        return solved.ys[0, 0], solved.stats["num_rejected_steps"]
+
+    strict = diffrax.ClipStepSizeController(diffrax.PIDController(rtol=1e-9, atol=1e-9))
+    a = jnp.array(1.9)  # within [0, 1] y stays positive, 0.0025 at the end, but stages of long steps do not
+
+    def slope(adjoint):
+        return jax.jit(jax.value_and_grad(lambda a: final(a, adjoint), has_aux=True))(a)
+
+    (value, rejected), by_a = slope(STORED)
+    assert int(rejected) > 0
+    np.testing.assert_allclose(value, (1 - a / 2) ** 2, rtol=1e-6)
+    np.testing.assert_allclose(by_a, -(1 - a / 2), rtol=1e-6)
+    _, other = slope(RECURSIVE)
+    assert np.isnan(other)  # why rejected steps are left out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("saved", ["ts", "steps"])
+def test_failed_solves(saved):
+    """Rows that were never reached are infinite and have no part in the gradient."""
+
+    def loss(args, adjoint):
+        return total(solve(args, Y0, adjoint, saveat=SAVED[saved], max_steps=9, throw=False))
+
+    both(loss, ARGS)
+
+
+@pytest.mark.slow
+def test_single_precision():
+    args, y0 = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), (ARGS, Y0))
+    controller = diffrax.PIDController(rtol=1e-3, atol=1e-4)
+
+    def loss(args, adjoint):
+        saveat = diffrax.SaveAt(ts=TS.astype(jnp.float32))
+        return total(solve(args, y0, adjoint, t0=jnp.float32(0), t1=jnp.float32(4), dt0=jnp.float32(0.05),
+                           saveat=saveat, controller=controller))  # fmt: skip
+
+    mine = jax.jit(jax.grad(lambda args: loss(args, STORED)))(args)
+    other = jax.jit(jax.grad(lambda args: loss(args, RECURSIVE)))(args)
+    assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(mine))
+    agree(mine, other, 2e-5)  # some hundred roundings of 1e-7
+
+
+def test_closures():
+    """What is differentiated may be hidden in functions, also in one that `SaveAt` calls."""
+
+    def loss(a, adjoint):
+        term = diffrax.ODETerm(lambda t, y, args: -a * y + args(t))
+        saveat = diffrax.SaveAt(ts=TS, fn=lambda t, y, args: a * y * args(t))
+        return total(solve(lambda t: jnp.sin(a * t), Y0, adjoint, term=term, saveat=saveat))
+
+    both(loss, jnp.array(0.8))
+
+
+@pytest.mark.slow
+def test_networks():
+    """Modules with functions and static parts in `args`; arrays that are no floats are left alone."""
+    network = eqx.nn.MLP(2, 2, 4, 1, jnp.tanh, key=jax.random.key(1))
+    table = jnp.array([1, 0])
+    term = diffrax.ODETerm(lambda t, y, args: args[0](y)[args[1]] - y)
+
+    def loss(adjoint):
+        return eqx.filter_jit(eqx.filter_grad(lambda n: total(solve((n, table), Y0, adjoint, term=term))))(network)
+
+    agree(loss(STORED), loss(RECURSIVE))
+
+
+@pytest.mark.slow
+def test_final_solver_state():
+    """A solve in two parts, the second one from where the solver stood, is differentiated through its state."""
+
+    def loss(args, adjoint):
+        saveat = diffrax.SaveAt(t1=True, solver_state=True)
+        first = solve(args, Y0, adjoint, t1=2.0, saveat=saveat)
+        return total(solve(args, first.ys[0], adjoint, t0=2.0, solver_state=first.solver_state))
+
+    both(loss, ARGS)
+
+
+@pytest.mark.slow
+def test_events_are_handed_on():
+    """y' = a, until y = 1: the time is 1/a."""
+    term = diffrax.ODETerm(lambda t, y, a: a * jnp.ones_like(y))
+    event = diffrax.Event(lambda t, y, args, **kwargs: y[0] - 1, optx.Newton(1e-10, 1e-10))
+
+    def end(a):
+        return solve(a, jnp.array([0.0]), STORED, term=term, event=event).ts[0]
+
+    np.testing.assert_allclose(jax.jit(jax.value_and_grad(end))(jnp.array(2.0)), (0.5, -0.25), rtol=1e-10)
+
+
+def test_forward_mode_is_refused():
+    with pytest.raises(TypeError, match="custom_vjp"):
+        jax.jvp(lambda y0: solve(ARGS, y0, STORED).ys, (Y0,), (Y0,))
+
+
+def test_nothing_recorded_without_differentiation():
+    """The result is that of Diffrax's own loop, bit for bit."""
+    saveat = SAVED["parts"]
+    mine = jax.jit(lambda: solve(ARGS, Y0, STORED, saveat=saveat))()
+    other = jax.jit(lambda: solve(ARGS, Y0, diffrax.ForwardMode(), saveat=saveat))()
+    assert {k: int(v) for k, v in mine.stats.items()} == {k: int(v) for k, v in other.stats.items()}
+    agree((mine.ts[0][:10], mine.ys[0]["a"][:10]), (other.ts[0][:10], other.ys[0]["a"][:10]), 1e-14)
