@@ -109,8 +109,8 @@ def batches(count):
             every = max(1, count // 20)
             loop = [float(one(jax.tree.map(lambda v, k=k: v[k], scaled))) for k in range(0, count, every)]
             apart = np.abs(np.asarray(batch(scaled))[::every] / np.array(loop) - 1).max()
-            print(f"{name:>16} {type(solver).__name__:>8} {t * 1e3:8.3f} ms {b * 1e3:8.3f} ms {b / t:7.2f} {apart:13.1e}",
-                  flush=True)  # fmt: skip
+            print(f"{name:>16} {type(solver).__name__:>8} {t * 1e3:8.3f} ms {b * 1e3:8.3f} ms {b / t:7.2f} "
+                  f"{apart:13.1e}", flush=True)  # fmt: skip
 
 
 if __name__ == "__main__":
