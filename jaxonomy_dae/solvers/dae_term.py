@@ -133,8 +133,6 @@ class DAETerm(diffrax.AbstractTerm):
             out = self.field(t, y, args)
             _check_like("F", out, y)
             return ravel_pytree(out)[0]
-        if not (isinstance(y, tuple) and len(y) == 2):
-            raise ModelError(f"the solution of DAETerm(f, g) is a pair (x, z); got {jax.tree.structure(y)}")
         x, z = y
         f, g = self.field(t, x, z, args), self.constraint(t, x, z, args)
         _check_like("f", f, x)
@@ -149,6 +147,8 @@ class DAETerm(diffrax.AbstractTerm):
     def mass_of(self, y: Any) -> Mass:
         """M for a solution that looks like y."""
         if self.mass is None:
+            if not (isinstance(y, tuple) and len(y) == 2):
+                raise ModelError(f"the solution of DAETerm(f, g) is a pair (x, z); got {jax.tree.structure(y)}")
             return _split_mass(*(ravel_pytree(part)[0].shape[0] for part in y))
         n = ravel_pytree(y)[0].shape[0]
         if self.mass.array.shape[0] != n:
