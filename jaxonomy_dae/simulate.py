@@ -1,5 +1,6 @@
 """`simulate`: a compiled system integrated by Diffrax."""
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -19,6 +20,7 @@ from .simulate_arguments import check_arguments, check_parameters
 from .solution import Solution
 from .solvers import BDF, DAETerm, Projected, Rodas5P, Tsit5
 from .solvers.diagnosis import explain_failure
+from .solvers.linear_algebra import SPARSE_FROM
 from .solvers.projected import with_projection
 from .solvers.solve import check_tolerances, step_control
 
@@ -156,9 +158,9 @@ def _step_sizes(system: AcausalSystem, solver: Any, rtol: Any, atol: Any) -> dif
 def _term(system: AcausalSystem, solver: Any) -> diffrax.AbstractTerm:
     if not _is_implicit(solver):
         return diffrax.ODETerm(system.vector_field)
-    if not len(system.plan.carried):
-        return DAETerm(system.vector_field, mass=system.mass)
-    return DAETerm(system.semi_explicit, mass=system.mass)
+    plan = system.plan
+    field = system.semi_explicit if len(plan.carried) else system.vector_field
+    return DAETerm(field, mass=system.mass, pattern=plan.dae_pattern if plan.n_state >= SPARSE_FROM else None)
 
 
 def default_adjoint(n_state: int) -> diffrax.RecursiveCheckpointAdjoint:
@@ -191,9 +193,11 @@ def _integrate(x0, system: AcausalSystem, t0, t1, ts, inputs, initial, options):
     implicit = _is_implicit(solver)
     if system.is_constrained and not implicit:
         solver = with_projection(solver, system.project, strict=bool(system.carried))
-    elif system.plan.n_constraints and isinstance(solver, BDF):
+    if isinstance(solver, BDF) and solver.algebraic_errors is None:
+        solver = dataclasses.replace(solver, algebraic_errors=False)
+    if system.plan.n_constraints and isinstance(solver, BDF):
         solver = solver if solver.projection is not None else _with_field(solver, "projection", system.project)
-    elif system.plan.n_constraints:
+    elif system.plan.n_constraints and implicit:
         solver = with_projection(solver, system.project, strict=False)
     own_start = implicit and not isinstance(controller, diffrax.StepTo)
     dt0 = None if own_start else _first_step(system, t0, t1, x0, inputs, solver.order(term), controller)

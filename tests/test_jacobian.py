@@ -80,7 +80,7 @@ def test_pattern_of_the_semi_explicit_form(model):
 
     assert len(system.carried)
     dense = np.asarray(jax.jit(jax.jacfwd(residual))(state))
-    rows, columns = plan.dae_pattern()
+    rows, columns = plan.dae_pattern.rows, plan.dae_pattern.cols
     assert covers((rows, columns), dense)
     assert len(set(zip(rows.tolist(), columns.tolist(), strict=True))) == len(rows)
     if model == "nonlinear grid":  # no row has more entries than a node has neighbours, with their currents
@@ -113,6 +113,6 @@ def test_ladder_is_tridiagonal(n):
 def test_large_and_dense_is_said(monkeypatch):
     monkeypatch.setattr(pattern, "LIMIT", 50)
     system = cascade(12)
-    assert system.jacobian_pattern is None and system.plan.dae_pattern() is None
+    assert system.jacobian_pattern is None and system.plan.dae_pattern is None
     with pytest.raises(ModelError, match="dense"):
         system.jacobian(0.0, jnp.zeros(12))

@@ -102,25 +102,21 @@ class SystemPlan:
         too many places to list."""
         return pattern.field_pattern(self)
 
-    def dae_pattern(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """(rows, columns) where the Jacobian of [f(t, x, z); g(t, x, z)] with respect to the state array [x, z] can be
-        nonzero: the states' derivatives with z read from the array, not refined, then the residuals of the nonlinear
-        blocks. Sorted by row, each place once; None if there are too many to list."""
-        found = self._dae_pattern
-        return None if found is None else (found.rows, found.cols)
+    @functools.cached_property
+    def dae_pattern(self) -> SparsePattern | None:
+        """Where the Jacobian of [f(t, x, z); g(t, x, z)] with respect to the state array [x, z] can be nonzero: the
+        states' derivatives with z read from the array, not refined, then the residuals of the nonlinear blocks. Sorted
+        by row, each place once; None if there are too many to list."""
+        return pattern.dae_pattern(self)
 
     @functools.cached_property
     def carried_pattern(self) -> SparsePattern | None:
         """Where ∂g/∂z can be nonzero, if there are so many algebraic unknowns z that it matters."""
-        if len(self.carried) <= TORN or self._dae_pattern is None:
+        if len(self.carried) <= TORN or self.dae_pattern is None:
             return None
-        n, found = len(self.states), self._dae_pattern
+        n, found = len(self.states), self.dae_pattern
         inside = (found.rows >= n) & (found.cols >= n)
         return SparsePattern(found.rows[inside] - n, found.cols[inside] - n, len(self.carried))
-
-    @functools.cached_property
-    def _dae_pattern(self) -> SparsePattern | None:
-        return pattern.dae_pattern(self)
 
     def quantity_of(self, variable: int) -> tuple[int, int]:
         """(quantity, sign) of a variable; quantity ZERO if it is identically zero."""

@@ -311,12 +311,14 @@ def _sparse_finding(plan: SystemPlan, values: _Values, step: SparseStep) -> Bloc
     largest = sp.diags_array(1 / (abs(matrix).max(axis=1).toarray().ravel() + TINY))
     scaled = sp.csc_array(largest @ matrix)
     linalg: Any = scipy.sparse.linalg
+    factors: Any = None
+    condition = np.inf
     try:
         factors = linalg.splu(scaled)
         inverse = linalg.LinearOperator((n, n), matvec=factors.solve, rmatvec=lambda v: factors.solve(v, trans="T"))
         condition = float(linalg.onenormest(scaled) * linalg.onenormest(inverse, t=1))
-    except RuntimeError:
-        factors, condition = None, np.inf
+    except RuntimeError:  # exactly singular
+        pass
     if factors is not None and not step.carried:
         residual = np.concatenate([values.residual(e) for e in step.equations])
         values.quantities[step.unknown[0]] = factors.solve(-(largest @ residual))

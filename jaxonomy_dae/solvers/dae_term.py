@@ -71,8 +71,17 @@ class Mass:
 
     @functools.cached_property
     def differential(self) -> np.ndarray:
-        """Which unknowns occur differentiated."""
-        return self.array != 0 if self.is_diagonal else (self.array != 0).any(axis=0)
+        """The part of y that is differentiated: its places, shape (n,), or the projector onto the range of Mᵀ."""
+        if self.is_diagonal:
+            return (self.array != 0).astype(float)
+        _, s, vt = np.linalg.svd(self.array)
+        kept = vt[s > s.max(initial=0.0) * 1e-12]
+        return kept.T @ kept
+
+    def differential_part(self, v: Any) -> Any:
+        """v without what is algebraic."""
+        p = jnp.asarray(self.differential, v.dtype)
+        return p * v if self.is_diagonal else p @ v
 
 
 class DAETerm(diffrax.AbstractTerm):

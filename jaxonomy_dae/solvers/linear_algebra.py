@@ -16,7 +16,7 @@ import numpy as np
 from ..errors import ModelError
 from .dae_term import Mass
 from .small_linear import solve as solve_unrolled
-from .sparse import SparsePattern, compressed, solve_sparse
+from .sparse import SparsePattern, available, compressed, solve_sparse
 
 UNROLLED_INVERSE = 4  # up to this many unknowns the inverse is written out
 EXPLICIT_INVERSE = 32  # up to this many it is kept: a solve is one small product, a tenth of LAPACK's calls
@@ -150,6 +150,7 @@ def _diagonal(mass: Mass) -> np.ndarray:
 LinearAlgebra = Dense | Sparse
 SPARSE_FROM = 128  # unknowns from which a sparse factorisation is taken, where the pattern is sparse enough
 SPARSE_DENSITY = 0.15
+DENSE_UPTO = 1000  # unknowns for which dense algebra will do if the extra is missing
 
 
 def choose(given: LinearAlgebra | None, n: int, pattern: Any) -> LinearAlgebra:
@@ -157,5 +158,7 @@ def choose(given: LinearAlgebra | None, n: int, pattern: Any) -> LinearAlgebra:
     if given is not None:
         return given
     if pattern is None or n < SPARSE_FROM or pattern.density > SPARSE_DENSITY:
+        return Dense()
+    if n <= DENSE_UPTO and not available():
         return Dense()
     return Sparse(pattern)
