@@ -14,9 +14,10 @@ from jax.core import Tracer
 from ..errors import InitializationError, ModelError, SimulationError
 from .bdf import BDF
 from .dae_term import DAETerm, FlatProblem
-from .diagnosis import StartCheck, explain_failure, explain_start, start_check
+from .diagnosis import SHOWN, StartCheck, explain_failure, explain_start, start_check
 from .projected import Projected
 from .rodas5p import Rodas5P
+from .solve_arguments import check_times, tolerance_of
 from .step_control import StepControl
 
 SMALL = 30  # up to this many unknowns a factorisation costs less than the steps that a multistep method saves
@@ -68,7 +69,9 @@ def solve_dae(
     """
     y0 = jax.tree.map(_inexact, y0)
     dtype = jnp.result_type(*jax.tree.leaves(y0))
+    check_times(t0, t1, ts)
     check_tolerances(rtol, atol, dtype)
+    atol = tolerance_of(atol, y0)
     n = sum(leaf.size for leaf in jax.tree.leaves(y0))
     if names is not None and len(names) != n:
         raise ModelError(f"names must name every unknown: {n} of them; got {len(names)}")
@@ -184,10 +187,12 @@ def _solve(term, t0, t1, y0, ts, args, tolerances, options):
     times: Any = solution.ts
     values: Any = solution.ys
     last = (times["last"][0], jax.tree.map(lambda v: v[0], values["last"]))
+    failure: Any = diffrax.RESULTS.nonlinear_divergence
+    result = diffrax.RESULTS.where(check.is_fine, solution.result, failure)
     out = eqx.tree_at(
-        lambda s: (s.ts, s.ys, s.stats, s.solver_state),
+        lambda s: (s.ts, s.ys, s.stats, s.solver_state, s.result),
         solution,
-        (times["out"], values["out"], stats, None),
+        (times["out"], values["out"], stats, None, result),
         is_leaf=lambda v: v is None,
     )
     return check, out, last
@@ -238,7 +243,8 @@ def consistent_start(
     elif bool(failed):
         moving = np.abs(np.asarray(shift(y)))
         known = list(names) if names is not None else [f"y[{k}]" for k in range(moving.shape[0])]
-        worst = [known[k] for k in np.argsort(-np.where(np.isfinite(moving), moving, np.inf))[:4]]
+        order = np.argsort(-np.where(np.isfinite(moving), moving, np.inf))[:SHOWN]
+        worst = [f"'{known[k]}'" for k in order if moving[k] != 0]
         raise InitializationError(
             f"no consistent start was found near y0; still moving: {', '.join(worst)}. Give a better y0, and check "
             "that the algebraic equations determine the algebraic unknowns (index 1)"
