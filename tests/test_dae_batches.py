@@ -64,8 +64,9 @@ def test_a_batch_is_the_loop(name, solver, n):
         assert np.array_equal(steps, alone_steps)
     else:
         # BDF's modified Newton iteration stops or goes on, and a step keeps its size or doubles it, by comparing noisy
-        # numbers: parameters changed by 1e-16 take other steps too. What is common is the accuracy, rtol = 1e-6.
-        assert difference.max() < 5e-6
+        # numbers: parameters changed by 1e-16 take other steps too. What is common is the accuracy, 50·rtol as for
+        # all published problems.
+        assert difference.max() < 50e-6
         assert np.median(np.asarray(steps) / alone_steps) == pytest.approx(1, abs=0.1)
 
 

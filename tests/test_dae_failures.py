@@ -1,4 +1,4 @@
-"""What users are told when a differential-algebraic equation cannot be solved, and what a batch gets instead of an error.
+"""What users are told when a differential-algebraic equation cannot be solved, and what is returned instead.
 
 Singularities have closed forms: their times are known. A solver stops short of one by at most the error it was allowed;
 1e-4 is a hundred times the tolerance of 1e-6.
@@ -185,8 +185,8 @@ def test_an_inconsistent_start_is_mended():
     with pytest.raises(InitializationError) as caught:
         solve_dae(TERM, 1.0, WRONG, names=PQR)
     assert str(caught.value) == (
-        "inconsistent start, the algebraic equations do not hold: row 2 of F is off by 0.4, row 1 of F is off by 0.375. "
-        "To mend it 'r', 'q' must move: y0 = jaxonomy_dae.solvers.consistent_start(term, y0), or system.initialize() "
+        "inconsistent start, the algebraic equations do not hold: row 2 of F is off by 0.4, row 1 of F is off by "
+        "0.375. To mend it 'r', 'q' must move: y0 = jaxonomy_dae.solvers.consistent_start(term, y0), or system.initialize() "
         "for a compiled model"
     )
     assert solve_dae(TERM, 1.0, WRONG, throw=False).result == diffrax.RESULTS.nonlinear_divergence
@@ -264,8 +264,8 @@ BAD = {
     ),
     "neither": (
         lambda: DAETerm(minus),
-        "a DAETerm needs g(t, x, z, args), or the mass matrix: DAETerm(f, g) or DAETerm(F, mass=M). For dy/dt = F alone "
-        "use diffrax.ODETerm(F)",
+        "a DAETerm needs g(t, x, z, args), or the mass matrix: DAETerm(f, g) or DAETerm(F, mass=M). For dy/dt = F "
+        "alone use diffrax.ODETerm(F)",
     ),
     "mass not square": (lambda: DAETerm(minus, mass=np.ones((2, 3))), SHAPE + "(2, 3)"),
     "mass of rank 3": (lambda: DAETerm(minus, mass=np.ones((2, 2, 2))), SHAPE + "(2, 2, 2)"),

@@ -2,7 +2,7 @@
 
 What an adjoint differentiates is the solver's own arithmetic: reverse and forward mode agree to rounding, 1e-8 of the
 gradient's size allowing for its amplification over some hundred stiff steps. Differences of solutions at a tolerance of
-1e-11 are exact to about 1e-6 (steps of 1e-4 relative: the truncation is the third derivative's); the gradient itself has
+1e-11 are exact to about 1e-6 (steps of 1e-4 relative: the truncation is the third derivative's); the gradient has
 the error of a solution at its own tolerance of 1e-8: 1e-5 is asked of both together.
 """
 
@@ -53,8 +53,8 @@ def end(name, solver, adjoint):
             args[p] = args[p] * (1 + change[k])
         start = consistent_start(term, jnp.asarray(one.y0), args=args)
         return solve_dae(
-            term, case.t1, start, solver=solver, rtol=rtol, atol=jnp.maximum(rtol * case.atol, 1e-15), args=args, adjoint=adjoint,
-            max_steps=4000,
+            term, case.t1, start, solver=solver, rtol=rtol, atol=jnp.maximum(rtol * case.atol, 1e-15), args=args,
+            adjoint=adjoint, max_steps=4000,
         ).ys[0]  # fmt: skip
 
     return solution

@@ -200,6 +200,7 @@ class FlatProblem:
         self.term = terms.term if wrapped else terms
         self.direction = terms.direction if wrapped else 1
         self.args = args
+        self.terms = terms
         self.flat, self.unravel = ravel_pytree(y)
         self.like = y
         if isinstance(self.term, DAETerm):
@@ -208,6 +209,11 @@ class FlatProblem:
         else:
             self.mass = _identity_mass(self.flat.shape[0])
             self.pattern = None
+
+    def frozen(self) -> "FlatProblem":
+        """The same without derivatives."""
+        parts = self.terms, self.like, self.args
+        return FlatProblem(*jax.tree.map(lambda v: jax.lax.stop_gradient(v) if eqx.is_array(v) else v, parts))
 
     def right(self, t: Any, flat: Any) -> Any:
         """F, shape (n,)."""

@@ -120,8 +120,8 @@ def explain_failure(
     right = np.asarray(problem.right(time, flat))
     if not np.isfinite(right).all():
         return head + (
-            f"The equations are not finite there: {_row(problem, right, names)}. Look for a division by zero, or a root "
-            "or logarithm without a value"
+            f"The equations are not finite there: {_row(problem, right, names)}. Look for a division by zero, or a "
+            "root or logarithm without a value"
         )
     if flat.shape[0] <= LARGE:
         found = null_names(np.asarray(index_matrix(problem, None, time, flat)[3]), names)
@@ -137,7 +137,7 @@ def explain_failure(
     mend = (
         "Raise max_steps, loosen the tolerances, or look for a jump or a pole: jump_ts= names times of jumps"
         if many
-        else "Look for a pole, a turning point, a jump (jump_ts= names their times), or a root or logarithm without a value "
-        "just beyond"
+        else "Look for a pole, a turning point, a jump (jump_ts= names their times), or a root or logarithm without a "
+        "value just beyond"
     )
     return head + f"Changing fastest there: {fastest}. {mend}."

@@ -15,6 +15,7 @@ from ..errors import InitializationError, ModelError, SimulationError
 from .bdf import BDF
 from .dae_term import DAETerm, FlatProblem
 from .diagnosis import SHOWN, StartCheck, explain_failure, explain_start, start_check
+from .index_one import consistent_point, consistent_shift
 from .projected import Projected
 from .rodas5p import Rodas5P
 from .solve_arguments import check_times, tolerance_of
@@ -213,35 +214,15 @@ def consistent_start(
     Differentiable with respect to `args` and y0.
     """
     y0 = jax.tree.map(_inexact, y0)
-    from .index_one import consistent_shift
-
     problem = FlatProblem(term, y0, args)
     t = jnp.asarray(t0, problem.flat.dtype)
-    eps = float(jnp.finfo(problem.flat.dtype).eps)
-    frozen = jax.lax.stop_gradient
-    still = FlatProblem(*jax.tree.map(lambda v: frozen(v) if eqx.is_array(v) else v, (term, y0, args)))
-
-    def shift(y):
-        return consistent_shift(still, None, frozen(t), y)
-
-    def going(carry):
-        _, size, count = carry
-        return (size > 10 * eps) & (count < max_steps)
-
-    def body(carry):
-        y, _, count = carry
-        d = shift(y)
-        return y + d, jnp.max(jnp.abs(d) / (1 + jnp.abs(y)), initial=0.0), count + 1
-
-    start = (still.flat, jnp.asarray(jnp.inf, problem.flat.dtype), 0)
-    y, size, _ = jax.lax.while_loop(going, body, start)
-    y = problem.flat + frozen(y - still.flat)
-    y = y + consistent_shift(problem, None, t, y)  # one exact step carries the derivative
+    y, size = consistent_point(problem, None, t, problem.flat, max_steps)
+    eps = float(jnp.finfo(y.dtype).eps)
     failed = ~(size <= math.sqrt(eps))
     if isinstance(failed, Tracer):
         y = eqx.error_if(y, failed, "no consistent start: Newton's method did not converge")
     elif bool(failed):
-        moving = np.abs(np.asarray(shift(y)))
+        moving = np.abs(np.asarray(consistent_shift(problem, None, t, y, problem.flat)))
         known = list(names) if names is not None else [f"y[{k}]" for k in range(moving.shape[0])]
         order = np.argsort(-np.where(np.isfinite(moving), moving, np.inf))[:SHOWN]
         worst = [f"'{known[k]}'" for k in order if moving[k] != 0]

@@ -24,7 +24,9 @@ def check_times(t0: Any, t1: Any, ts: Any):
         return
     saved, a, b = np.asarray(ts, float), float(t0), float(t1)
     if not ((saved >= min(a, b)) & (saved <= max(a, b))).all():
-        raise ModelError(f"ts must lie between t0={a:g} and t1={b:g}; they reach from {saved.min():g} to {saved.max():g}")
+        raise ModelError(
+            f"ts must lie between t0={a:g} and t1={b:g}; they reach from {saved.min():g} to {saved.max():g}"
+        )
     if (np.diff(saved) * (1 if a <= b else -1) < 0).any():
         raise ModelError("ts must be sorted in the direction of integration")
 
