@@ -186,8 +186,8 @@ def test_an_inconsistent_start_is_mended():
         solve_dae(TERM, 1.0, WRONG, names=PQR)
     assert str(caught.value) == (
         "inconsistent start, the algebraic equations do not hold: row 2 of F is off by 0.4, row 1 of F is off by "
-        "0.375. To mend it 'r', 'q' must move: y0 = jaxonomy_dae.solvers.consistent_start(term, y0), or system.initialize() "
-        "for a compiled model"
+        "0.375. To mend it 'r', 'q' must move: y0 = jaxonomy_dae.solvers.consistent_start(term, y0), or "
+        "system.initialize() for a compiled model"
     )
     assert solve_dae(TERM, 1.0, WRONG, throw=False).result == diffrax.RESULTS.nonlinear_divergence
     mended = consistent_start(TERM, WRONG)

@@ -109,8 +109,8 @@ def slopes(problem, order, *, direction=1):
     """Observed orders (in between, at the end) as the steps are halved, twice or three times.
 
     All runs have as many steps, so that one program serves them: those with longer steps go on beyond the end. BDF
-    begins with order 1, and at order 5 is not zero-stable under fast growth: its steps begin tiny, so that the start adds no
-    error, and grow slowly; a halved grid has two steps where the other has one.
+    begins with order 1, and at order 5 is not zero-stable under fast growth: its steps begin tiny, so that the start
+    adds no error, and grow slowly; a halved grid has two steps where the other has one.
     """
     if order == "rodas5p":
         grids = [np.full(round(END / h) + 1, h) for h in (0.2, 0.1, 0.05, 0.025)]
