@@ -10,7 +10,7 @@ from jax.flatten_util import ravel_pytree
 
 from .bdf_coefficients import Coefficients, coefficients, interpolate
 from .dae_term import FlatProblem
-from .index_one import consistent_slope
+from .index_one import consistent_point, consistent_slope
 from .linear_algebra import LinearAlgebra, choose
 from .newton import Tolerances, implicit_step
 from .projected import Projection
@@ -139,10 +139,11 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         if made_jump is not False:
 
             def restart():
-                slope = consistent_slope(problem, self.linear, t0, y)
-                return self._fresh(y, slope, h, state.factor, state.counts)
+                moved, _ = consistent_point(problem, self.linear, t0, y)  # algebraic unknowns jump too
+                slope = consistent_slope(problem, self.linear, t0, moved)
+                return moved, self._fresh(moved, slope, h, state.factor, state.counts)
 
-            state = jax.lax.cond(made_jump, restart, lambda: state)
+            y, state = jax.lax.cond(made_jump, restart, lambda: (y, state))
         rtol, atol, norm = self.root_finder.values(y.dtype)
         weight = jax.lax.stop_gradient(CAUTION / (atol + rtol * jnp.abs(y)))
 
@@ -228,7 +229,8 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         value = jnp.where(jnp.isfinite(y1), y1, y)
         scale = atol + jnp.maximum(jnp.abs(y), jnp.abs(value)) * rtol
         y_error = encoded(factor, accepted) * still(jnp.broadcast_to(scale, y.shape))
-        dense = dict(y0=y0, phi=jax.vmap(problem.unravel)(updated), psi=c.psi, order=k)
+        # Diffrax fills unused rows with infinity, which integers do not have.
+        dense = dict(y0=y0, phi=jax.vmap(problem.unravel)(updated), psi=c.psi, order=k.astype(c.psi.dtype))
         return problem.unravel(y1), problem.unravel(y_error), dense, new_state, diffrax.RESULTS.successful
 
 

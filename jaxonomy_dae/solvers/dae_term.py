@@ -142,8 +142,6 @@ class DAETerm(diffrax.AbstractTerm):
             out = self.field(t, y, args)
             _check_like("F", out, y)
             return ravel_pytree(out)[0]
-        if not (isinstance(y, tuple) and len(y) == 2):
-            raise ModelError(f"the solution of DAETerm(f, g) is a pair (x, z); got {jax.tree.structure(y)}")
         x, z = y
         f, g = self.field(t, x, z, args), self.constraint(t, x, z, args)
         _check_like("f", f, x)
@@ -158,6 +156,8 @@ class DAETerm(diffrax.AbstractTerm):
     def mass_of(self, y: Any) -> Mass:
         """M for a solution that looks like y."""
         if self.mass is None:
+            if not (isinstance(y, tuple) and len(y) == 2):
+                raise ModelError(f"the solution of DAETerm(f, g) is a pair (x, z); got {jax.tree.structure(y)}")
             return _split_mass(*(ravel_pytree(part)[0].shape[0] for part in y))
         n = ravel_pytree(y)[0].shape[0]
         if self.mass.array.shape[0] != n:
@@ -200,6 +200,7 @@ class FlatProblem:
         self.term = terms.term if wrapped else terms
         self.direction = terms.direction if wrapped else 1
         self.args = args
+        self.terms = terms
         self.flat, self.unravel = ravel_pytree(y)
         self.like = y
         if isinstance(self.term, DAETerm):
@@ -208,6 +209,11 @@ class FlatProblem:
         else:
             self.mass = _identity_mass(self.flat.shape[0])
             self.pattern = None
+
+    def frozen(self) -> "FlatProblem":
+        """The same without derivatives."""
+        parts = self.terms, self.like, self.args
+        return FlatProblem(*jax.tree.map(lambda v: jax.lax.stop_gradient(v) if eqx.is_array(v) else v, parts))
 
     def right(self, t: Any, flat: Any) -> Any:
         """F, shape (n,)."""

@@ -25,11 +25,15 @@ class StartCheck(eqx.Module):
     shift: Any
     matrix: Any
 
+    @property
+    def is_fine(self) -> Any:
+        """Whether the equations are finite at the start and the algebraic ones hold."""
+        return jnp.all(jnp.isfinite(self.right)) & (jnp.max(jnp.abs(self.shift), initial=0.0) <= 1)
+
     def error_if(self, ys: Any) -> Any:
         """For traced starts: an error while running."""
         ys = eqx.error_if(ys, ~jnp.all(jnp.isfinite(self.right)), "the equations are not finite at the start")
-        bad = ~(jnp.max(jnp.abs(self.shift), initial=0.0) <= 1)
-        return eqx.error_if(ys, bad, "inconsistent start: see jaxonomy_dae.solvers.consistent_start")
+        return eqx.error_if(ys, ~self.is_fine, "inconsistent start: see jaxonomy_dae.solvers.consistent_start")
 
 
 def start_check(problem: FlatProblem, t: Any, rtol: Any, atol: Any) -> StartCheck:
@@ -77,10 +81,17 @@ def explain_start(check: StartCheck, names: Sequence[str]) -> str:
         return (
             "inconsistent start, the algebraic equations do not hold: "
             + ", ".join(f"row {k} of F is off by {residual[k]:.3g}" for k in rows)
-            + f". To mend it {', '.join(str(names[k]) for k in moved)} must move: "
+            + f". To mend it {', '.join(repr(str(names[k])) for k in moved)} must move: "
             "y0 = jaxonomy_dae.solvers.consistent_start(term, y0), or system.initialize() for a compiled model"
         )
     return ""
+
+
+def _row(problem: FlatProblem, right: np.ndarray, names: Sequence[str]) -> str:
+    """The first row that is not finite, by the unknown whose derivative it gives, if it gives one."""
+    k = int(np.flatnonzero(~np.isfinite(right))[0])
+    own = problem.mass.is_diagonal and problem.mass.array[k] != 0
+    return f"row {k} of F, the derivative of '{names[k]}'" if own else f"row {k} of F"
 
 
 def null_names(matrix: np.ndarray, names: Sequence[str]) -> str:
@@ -108,7 +119,10 @@ def explain_failure(
     head = f"the integration stopped at t={float(t):g}: {reason}. "
     right = np.asarray(problem.right(time, flat))
     if not np.isfinite(right).all():
-        return head + f"The equations are not finite there: row {np.flatnonzero(~np.isfinite(right))[0]} of F. "
+        return head + (
+            f"The equations are not finite there: {_row(problem, right, names)}. Look for a division by zero, or a "
+            "root or logarithm without a value"
+        )
     if flat.shape[0] <= LARGE:
         found = null_names(np.asarray(index_matrix(problem, None, time, flat)[3]), names)
         if found:
@@ -123,6 +137,7 @@ def explain_failure(
     mend = (
         "Raise max_steps, loosen the tolerances, or look for a jump or a pole: jump_ts= names times of jumps"
         if many
-        else "Look for a pole, a jump (jump_ts= names their times) or a root or logarithm without a value just beyond"
+        else "Look for a pole, a turning point, a jump (jump_ts= names their times), or a root or logarithm without a "
+        "value just beyond"
     )
     return head + f"Changing fastest there: {fastest}. {mend}."

@@ -28,10 +28,41 @@ def consistent_slope(problem: FlatProblem, linear: LinearAlgebra | None, t: Any,
     return chosen.solve(chosen.factor(matrix), matrix, b)
 
 
-def consistent_shift(problem: FlatProblem, linear: LinearAlgebra | None, t: Any, y: Any) -> Any:
-    """A Newton step onto the algebraic equations that leaves M y alone: zero at a consistent point."""
+def consistent_shift(problem: FlatProblem, linear: LinearAlgebra | None, t: Any, y: Any, start: Any) -> Any:
+    """A Newton step onto the algebraic equations that leaves M y as it was at the start: zero at a consistent point.
+
+    Large steps there and back would leave rounding errors in M y, so every step mends it.
+    """
     chosen, right, _, matrix = index_matrix(problem, linear, t, y)
-    return chosen.solve(chosen.factor(matrix), matrix, algebraic_part(problem, right))
+    b = algebraic_part(problem, right) + problem.mass.times(start - y)
+    return chosen.solve(chosen.factor(matrix), matrix, b)
+
+
+def consistent_point(
+    problem: FlatProblem, linear: LinearAlgebra | None, t: Any, y: Any, max_steps: int = 50
+) -> tuple[Any, Any]:
+    """Newton's method onto the algebraic equations from y, M y left alone: the point, and the size of the last step.
+
+    Differentiable by one exact step at the end.
+    """
+    if not problem.mass.is_singular:
+        return y, jnp.zeros((), y.dtype)
+    frozen = jax.lax.stop_gradient
+    still, t_still, y_still = problem.frozen(), frozen(t), frozen(y)
+    eps = jnp.finfo(y.dtype).eps
+
+    def going(carry):
+        _, size, count = carry
+        return (size > 10 * eps) & (count < max_steps)
+
+    def body(carry):
+        v, _, count = carry
+        d = consistent_shift(still, linear, t_still, v, y_still)
+        return v + d, jnp.max(jnp.abs(d) / (1 + jnp.abs(v)), initial=0.0), count + 1
+
+    found, size, _ = jax.lax.while_loop(going, body, (y_still, jnp.asarray(jnp.inf, y.dtype), 0))
+    found = y + frozen(found - y_still)
+    return found + consistent_shift(problem, linear, t, found, y), size
 
 
 def algebraic_part(problem: FlatProblem, v: Any) -> Any:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .dae_term import FlatProblem
-from .index_one import consistent_slope
+from .index_one import consistent_point, consistent_slope
 from .linear_algebra import LinearAlgebra, choose
 
 # Steinebach (2023), "Construction of Rosenbrock–Wanner method Rodas5P and numerical benchmarks within the Julia
@@ -114,6 +114,8 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
         mass, y = problem.mass, problem.flat
         dtype = y.dtype
         linear = choose(self.linear, y.shape[0], problem.pattern)
+        if made_jump is not False:  # algebraic unknowns jump too
+            y = jax.lax.cond(made_jump, lambda: consistent_point(problem, self.linear, t0, y)[0], lambda: y)
         h_time = jnp.asarray(t1 - t0)
         h = h_time.astype(dtype)
         # A step of length zero occurs where a batch waits for its slowest member.
@@ -127,7 +129,7 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
         for i in range(8):
             if i:
                 point = y + _combine(A[i], stages) if i <= 5 else point + stages[-1]
-                right = problem.right(t0 + NODES[i] * h_time, point)
+                right = problem.right(t0 + float(NODES[i]) * h_time, point)
             b = right
             if i:
                 b = b + mass.times(inverse * _combine(C[i], stages))
@@ -136,7 +138,7 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
             stages.append(linear.solve(factor, matrix, b))
         y1 = point + stages[-1]
         k = jnp.stack([_combine(row, stages) for row in H])
-        dense = dict(y0=y0, y1=problem.unravel(y1), k=jax.vmap(problem.unravel)(k))
+        dense = dict(y0=problem.unravel(y), y1=problem.unravel(y1), k=jax.vmap(problem.unravel)(k))
         return problem.unravel(y1), problem.unravel(stages[-1]), dense, None, diffrax.RESULTS.successful
 
 

@@ -14,9 +14,11 @@ from jax.core import Tracer
 from ..errors import InitializationError, ModelError, SimulationError
 from .bdf import BDF
 from .dae_term import DAETerm, FlatProblem
-from .diagnosis import StartCheck, explain_failure, explain_start, start_check
+from .diagnosis import SHOWN, StartCheck, explain_failure, explain_start, start_check
+from .index_one import consistent_point, consistent_shift
 from .projected import Projected
 from .rodas5p import Rodas5P
+from .solve_arguments import check_times, tolerance_of
 from .step_control import StepControl
 from .stored_adjoint import StoredAdjoint
 
@@ -70,7 +72,9 @@ def solve_dae(
     """
     y0 = jax.tree.map(_inexact, y0)
     dtype = jnp.result_type(*jax.tree.leaves(y0))
+    check_times(t0, t1, ts)
     check_tolerances(rtol, atol, dtype)
+    atol = tolerance_of(atol, y0)
     n = sum(leaf.size for leaf in jax.tree.leaves(y0))
     if names is not None and len(names) != n:
         raise ModelError(f"names must name every unknown: {n} of them; got {len(names)}")
@@ -186,10 +190,12 @@ def _solve(term, t0, t1, y0, ts, args, tolerances, options):
     times: Any = solution.ts
     values: Any = solution.ys
     last = (times["last"][0], jax.tree.map(lambda v: v[0], values["last"]))
+    failure: Any = diffrax.RESULTS.nonlinear_divergence
+    result = diffrax.RESULTS.where(check.is_fine, solution.result, failure)
     out = eqx.tree_at(
-        lambda s: (s.ts, s.ys, s.stats, s.solver_state),
+        lambda s: (s.ts, s.ys, s.stats, s.solver_state, s.result),
         solution,
-        (times["out"], values["out"], stats, None),
+        (times["out"], values["out"], stats, None, result),
         is_leaf=lambda v: v is None,
     )
     return check, out, last
@@ -210,37 +216,18 @@ def consistent_start(
     Differentiable with respect to `args` and y0.
     """
     y0 = jax.tree.map(_inexact, y0)
-    from .index_one import consistent_shift
-
     problem = FlatProblem(term, y0, args)
     t = jnp.asarray(t0, problem.flat.dtype)
-    eps = float(jnp.finfo(problem.flat.dtype).eps)
-    frozen = jax.lax.stop_gradient
-    still = FlatProblem(*jax.tree.map(lambda v: frozen(v) if eqx.is_array(v) else v, (term, y0, args)))
-
-    def shift(y):
-        return consistent_shift(still, None, frozen(t), y)
-
-    def going(carry):
-        _, size, count = carry
-        return (size > 10 * eps) & (count < max_steps)
-
-    def body(carry):
-        y, _, count = carry
-        d = shift(y)
-        return y + d, jnp.max(jnp.abs(d) / (1 + jnp.abs(y)), initial=0.0), count + 1
-
-    start = (still.flat, jnp.asarray(jnp.inf, problem.flat.dtype), 0)
-    y, size, _ = jax.lax.while_loop(going, body, start)
-    y = problem.flat + frozen(y - still.flat)
-    y = y + consistent_shift(problem, None, t, y)  # one exact step carries the derivative
+    y, size = consistent_point(problem, None, t, problem.flat, max_steps)
+    eps = float(jnp.finfo(y.dtype).eps)
     failed = ~(size <= math.sqrt(eps))
     if isinstance(failed, Tracer):
         y = eqx.error_if(y, failed, "no consistent start: Newton's method did not converge")
     elif bool(failed):
-        moving = np.abs(np.asarray(shift(y)))
+        moving = np.abs(np.asarray(consistent_shift(problem, None, t, y, problem.flat)))
         known = list(names) if names is not None else [f"y[{k}]" for k in range(moving.shape[0])]
-        worst = [known[k] for k in np.argsort(-np.where(np.isfinite(moving), moving, np.inf))[:4]]
+        order = np.argsort(-np.where(np.isfinite(moving), moving, np.inf))[:SHOWN]
+        worst = [f"'{known[k]}'" for k in order if moving[k] != 0]
         raise InitializationError(
             f"no consistent start was found near y0; still moving: {', '.join(worst)}. Give a better y0, and check "
             "that the algebraic equations determine the algebraic unknowns (index 1)"

@@ -28,6 +28,13 @@ def decoded(norm: Any) -> Any:
     return jnp.where(jnp.abs(factor - 1) < 1e-5, 1.0, factor)
 
 
+def tolerance_like(atol: Any, y: Any) -> Any:
+    """An absolute tolerance for every leaf of y: one number for all, or what looks like y."""
+    if jax.tree.structure(atol) == jax.tree.structure(y):
+        return atol
+    return jax.tree.map(lambda _: atol, y)
+
+
 class StepControl(diffrax.AbstractAdaptiveStepSizeController):
     """Step sizes for `BDF` and `Rodas5P`, from tolerances of the local error.
 
@@ -67,9 +74,10 @@ class StepControl(diffrax.AbstractAdaptiveStepSizeController):
         terms, y0, args = frozen
         t0, t1 = jax.lax.stop_gradient((t0, t1))
         interval = t1 - t0
+        atol = tolerance_like(self.atol, y0)
 
         def size(v):
-            return self.norm(jax.tree.map(lambda a, y: a / (self.atol + jnp.abs(y) * self.rtol), v, y0))
+            return self.norm(jax.tree.map(lambda a, y, atol: a / (atol + jnp.abs(y) * self.rtol), v, y0, atol))
 
         tiny = jnp.finfo(interval.dtype).tiny
         slope = func(terms, t0, y0, args)
@@ -90,11 +98,12 @@ class StepControl(diffrax.AbstractAdaptiveStepSizeController):
         rejected = controller_state
         t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
 
-        def scaled(a, b, e):
+        def scaled(a, b, e, atol):
             b = jnp.where(jnp.isfinite(b).all(), b, a)
-            return e / (self.atol + jnp.maximum(jnp.abs(a), jnp.abs(b)) * self.rtol)
+            return e / (atol + jnp.maximum(jnp.abs(a), jnp.abs(b)) * self.rtol)
 
-        norm = jax.lax.stop_gradient(self.norm(jax.tree.map(scaled, y0, y1_candidate, y_error)))
+        atol = tolerance_like(self.atol, y0)
+        norm = jax.lax.stop_gradient(self.norm(jax.tree.map(scaled, y0, y1_candidate, y_error, atol)))
         norm = jnp.where(jnp.isfinite(norm), norm, jnp.inf)
         keep = norm < 1
         if self.steered:

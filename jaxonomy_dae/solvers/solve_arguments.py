@@ -1,0 +1,44 @@
+"""What `solve_dae` accepts: checked before anything is compiled."""
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from ..errors import ModelError
+
+
+def check_times(t0: Any, t1: Any, ts: Any):
+    """Refuses an interval that is none, and times to save that are not in it, in order."""
+    for name, value in (("t0", t0), ("t1", t1)):
+        if not isinstance(value, Tracer) and not (np.shape(value) == () and math.isfinite(value)):
+            raise ModelError(f"{name} must be a finite number; got {value}")
+    if ts is None:
+        return
+    if np.ndim(ts) != 1 or not np.shape(ts)[0]:
+        raise ModelError(f"ts must have shape (n,), n ≥ 1; got {np.shape(ts)}")
+    if any(isinstance(value, Tracer) for value in (t0, t1, ts)):
+        return
+    saved, a, b = np.asarray(ts, float), float(t0), float(t1)
+    if not ((saved >= min(a, b)) & (saved <= max(a, b))).all():
+        raise ModelError(
+            f"ts must lie between t0={a:g} and t1={b:g}; they reach from {saved.min():g} to {saved.max():g}"
+        )
+    if (np.diff(saved) * (1 if a <= b else -1) < 0).any():
+        raise ModelError("ts must be sorted in the direction of integration")
+
+
+def tolerance_of(atol: Any, y: Any) -> Any:
+    """An absolute tolerance as one number, or with the structure and shapes of y."""
+    leaves = jax.tree.leaves(atol)
+    if len(leaves) == 1 and np.shape(leaves[0]) == ():
+        return leaves[0]
+    shapes = [np.shape(leaf) for leaf in jax.tree.leaves(y)]
+    found = [np.shape(leaf) for leaf in leaves]
+    fits = all(given in ((), shape) for given, shape in zip(found, shapes, strict=False))
+    if jax.tree.structure(atol) != jax.tree.structure(y) or not fits:
+        raise ModelError(f"atol must be one number or look like y: expected shapes {shapes}, found {found}")
+    return jax.tree.map(lambda a, v: jnp.broadcast_to(jnp.asarray(a, v.dtype), v.shape), atol, y)

@@ -1,0 +1,125 @@
+"""Batches by `vmap`: each member as if alone, and one that fails leaves the others alone."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from testset import PROBLEMS
+
+from jaxonomy_dae.solvers import BDF, DAETerm, Rodas5P, consistent_start, solve_dae
+
+SOLVERS = {"bdf": BDF(), "rodas5p": Rodas5P()}
+slow = pytest.mark.slow
+# Relative spread of the parameters that vary; atol in units of rtol.
+CASES = {"robertson": (40.0, ("p1", "p2", "p3"), 1e-5), "transamp": (0.004, ("Ub", "R0", "R5", "beta"), 1.0)}
+PROBLEM_SCALE = {"robertson": 0.0, "transamp": 1.0}  # below which a component counts as small
+
+
+def member(name, solver, rtol=1e-6):
+    """(factors of the parameters) to (values at the end, steps)."""
+    one = PROBLEMS[name].index_one()
+    t1, parameters, atol = CASES[name]
+    term = DAETerm(one.F, mass=one.mass)
+
+    def solve(factors):
+        args = one.args()
+        for k, p in enumerate(parameters):
+            args[p] = args[p] * factors[k]
+        start = consistent_start(term, jnp.asarray(one.y0), args=args)
+        found = solve_dae(
+            term, t1, start, solver=SOLVERS[solver], args=args, rtol=rtol, atol=rtol * atol, throw=False, max_steps=4000
+        )
+        return found.ys[0], found.stats["num_steps"], found.result
+
+    return solve
+
+
+@pytest.mark.parametrize(
+    "name, solver, n",
+    [
+        ("robertson", "bdf", 20),
+        pytest.param("robertson", "rodas5p", 20, marks=slow),
+        pytest.param("transamp", "bdf", 20, marks=slow),
+        ("transamp", "rodas5p", 20),
+        pytest.param("robertson", "bdf", 1000, marks=slow),
+        pytest.param("robertson", "rodas5p", 1000, marks=slow),
+        pytest.param("transamp", "rodas5p", 1000, marks=slow),
+        pytest.param("transamp", "bdf", 1000, marks=slow),
+    ],
+)
+def test_a_batch_is_the_loop(name, solver, n):
+    factors = jnp.asarray(np.random.default_rng(0).uniform(0.8, 1.25, (n, len(CASES[name][1]))))
+    solve = member(name, solver)
+    batch, steps, result = eqx.filter_jit(eqx.filter_vmap(solve))(factors)
+    assert (result == diffrax.RESULTS.successful).all()
+    alone = eqx.filter_jit(solve)
+    looped = [alone(row) for row in factors]
+    expected, alone_steps = np.array([v[0] for v in looped]), np.array([v[1] for v in looped])
+    difference = np.abs(batch - expected) / np.maximum(np.abs(expected).max(axis=0), PROBLEM_SCALE[name])
+    if solver == "rodas5p":
+        # The same formulas in another order: rounding, amplified by stiffness.
+        assert difference.max() < 1e-9
+        assert np.array_equal(steps, alone_steps)
+    else:
+        # BDF's modified Newton iteration stops or goes on, and a step keeps its size or doubles it, by comparing noisy
+        # numbers: parameters changed by 1e-16 take other steps too. What is common is the accuracy, 50·rtol as for
+        # all published problems.
+        assert difference.max() < 50e-6
+        assert np.median(np.asarray(steps) / alone_steps) == pytest.approx(1, abs=0.1)
+
+
+# --- failing members ------------------------------------------------------------------------------------------------
+
+ONE = jnp.ones(1)
+TS = jnp.linspace(0.0, 2.0, 9)
+# x' and g with a parameter a; a start; which a fail at t = 1; the solution x for those that do not.
+FAILING = {
+    # z² = x, x' = a: Newton's matrix is singular where x = 0, at t = 1 for a = −1.
+    "singular matrix": (
+        DAETerm(lambda t, x, z, a: a * ONE, lambda t, x, z, a: z**2 - x),
+        np.array([0.5, -1.0, 0.1]),
+        lambda t, a: 1 + a * t,
+    ),
+    # x' = a·x²: a pole at t = 1 for a = 1.
+    "pole": (
+        DAETerm(lambda t, x, z, a: a * z**2, lambda t, x, z, a: z - x),
+        np.array([-0.5, 1.0, 0.1]),
+        lambda t, a: 1 / (1 - a * t),
+    ),
+    # The equations are not finite after t = 1 for a = 1.
+    "not a number": (
+        DAETerm(lambda t, x, z, a: -x, lambda t, x, z, a: z - x * jnp.where((a > 0.9) & (t > 1), jnp.nan, 1.0)),
+        np.array([-0.5, 1.0, 0.1]),
+        lambda t, a: np.exp(-t),
+    ),
+}
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize(
+    "failure", [name if name == "singular matrix" else pytest.param(name, marks=slow) for name in FAILING]
+)
+def test_one_that_fails_leaves_the_others_alone(failure, solver):
+    term, values, exact = FAILING[failure]
+
+    @eqx.filter_jit
+    @eqx.filter_vmap
+    def batch(a):
+        return solve_dae(
+            term, 2.0, (ONE, ONE), ts=TS, args=a, solver=SOLVERS[solver], throw=False, rtol=1e-8, atol=1e-10
+        )
+
+    found = batch(jnp.asarray(values))
+    okay = np.asarray(jax.vmap(diffrax.is_okay)(found.result))
+    assert okay.tolist() == [True, False, True]
+    ts, x, z = np.asarray(TS), np.asarray(found.ys[0])[:, :, 0], np.asarray(found.ys[1])[:, :, 0]
+    # A hundred times rtol; near its end the failing member's error grows without bound, so before t = 0.8 only.
+    for k in (0, 2):
+        np.testing.assert_allclose(x[k], exact(ts, values[k]), rtol=1e-6)
+        assert np.isfinite(z[k]).all()
+    before, after = ts < 0.8, ts > 1.1
+    np.testing.assert_allclose(x[1, before], exact(ts[before], values[1]), rtol=1e-6)
+    assert np.isfinite(z[1, before]).all()
+    assert np.isinf(x[1, after]).all() and np.isinf(z[1, after]).all()
