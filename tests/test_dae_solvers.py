@@ -1,6 +1,8 @@
 """What `BDF` and `Rodas5P` promise besides their order: constraints kept for long, published values over eleven
 decades, jumps, units, counters, dense output, single precision, one program for all tolerances."""
 
+from typing import Any
+
 import diffrax
 import equinox as eqx
 import jax
@@ -145,7 +147,7 @@ class Decay(Component):
 @ALSO_BDF
 def test_nominal_values_scale_tolerances(solver):
     unit = 2.0**20  # a power of two: no rounding differs
-    options = dict(solver=solver, atol=1e-5, rtol=1e-6)
+    options: dict[str, Any] = dict(solver=solver, atol=1e-5, rtol=1e-6)
 
     def steps(unit, nominal=1.0):
         system = compiled(Decay(EqnEnv(), unit, nominal))
