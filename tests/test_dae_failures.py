@@ -48,10 +48,7 @@ ENDS = {name: (DAETerm(f, g), *rest) for name, (f, g, *rest) in ENDS.items()}
 @pytest.mark.parametrize(
     "end", [end if end == "turning point" else pytest.param(end, marks=pytest.mark.slow) for end in ENDS]
 )
-def test_an_end_of_the_solution_is_reported(end, solver, request):
-    if end == "root" and isinstance(solver, Rodas5P):
-        reason = "no error estimate sees z between the ends of steps: off by 2e-3 at rtol 1e-6 where x' is constant"
-        request.applymarker(pytest.mark.xfail(reason=reason, strict=True))
+def test_an_end_of_the_solution_is_reported(end, solver):
     term, y0, time, exact = ENDS[end]
     with pytest.raises(SimulationError) as caught:
         solve_dae(term, 2.0, y0, ts=TS, solver=solver, names=NAMES)

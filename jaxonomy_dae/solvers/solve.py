@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.flatten_util import ravel_pytree
 
 from ..errors import InitializationError, ModelError, SimulationError
 from .bdf import BDF
@@ -22,6 +23,7 @@ from .solve_arguments import check_times, tolerance_of
 from .step_control import StepControl
 from .stored_adjoint import StoredAdjoint
 
+SAVED_ITERATIONS = 4
 SMALL = 30  # up to this many unknowns a factorisation costs less than the steps that a multistep method saves
 
 
@@ -190,15 +192,33 @@ def _solve(term, t0, t1, y0, ts, args, tolerances, options):
     times: Any = solution.ts
     values: Any = solution.ys
     last = (times["last"][0], jax.tree.map(lambda v: v[0], values["last"]))
+    saved = values["out"] if ts is None else _on_constraints(term, args, times["out"], values["out"], y0)
     failure: Any = diffrax.RESULTS.nonlinear_divergence
     result = diffrax.RESULTS.where(check.is_fine, solution.result, failure)
     out = eqx.tree_at(
         lambda s: (s.ts, s.ys, s.stats, s.solver_state, s.result),
         solution,
-        (times["out"], values["out"], stats, None, result),
+        (times["out"], saved, stats, None, result),
         is_leaf=lambda v: v is None,
     )
     return check, out, last
+
+
+def _on_constraints(term: Any, args: Any, ts: Any, ys: Any, y0: Any) -> Any:
+    """Saved values with their algebraic unknowns solved for: dense output interpolates those, and no error estimate
+    covers how fast they vary within a step."""
+
+    def one(t, y):
+        problem = FlatProblem(term, y, args)
+        if not problem.mass.is_singular:
+            return y
+        filled = jnp.all(jnp.isfinite(problem.flat))
+        safe = jnp.where(filled, problem.flat, ravel_pytree(y0)[0])
+        moved, _ = consistent_point(problem, None, jnp.where(filled, t, 0), safe, SAVED_ITERATIONS)
+        kept = filled & jnp.all(jnp.isfinite(moved))
+        return problem.unravel(jnp.where(kept, moved, problem.flat))
+
+    return jax.vmap(one)(ts, ys)
 
 
 _compiled = eqx.filter_jit(_solve)
