@@ -49,6 +49,8 @@ class Solution(eqx.Module):
             return _each(self, lambda one: one[name])
         plan = self.system.plan
         quantity, sign = plan.resolve([name])
+        if quantity[0] < 0:  # identically zero
+            return jnp.zeros(self.ts.shape, self.states.dtype)
         place = np.flatnonzero(np.concatenate([plan.states, plan.carried]) == quantity[0])
         if len(place):
             column = self.states[:, int(place[0])]

@@ -225,3 +225,15 @@ def test_plot(solution):
     assert solution.plot("spring.f", ax=given) is given
     assert given.get_ylabel() == "spring.f [N]"
     plt.close("all")
+
+
+def test_a_model_of_zeros_is_observed():
+    class Zeros(Component):
+        def __init__(self, ev, name):
+            super().__init__(ev, name)
+            x, y = self.variable("x"), self.variable("y")
+            self.add_equations(Eq(x, 0), Eq(y, -x))
+
+    system = compiled(Zeros(EqnEnv(), "c"))
+    np.testing.assert_array_equal(system.observe(["c.x", "c.y"], 0.0, system.initialize()), 0.0)
+    np.testing.assert_array_equal(simulate(system, 1.0, ts=jnp.array([0.5, 1.0]))["c.y"], [0.0, 0.0])

@@ -31,10 +31,11 @@ class Layout:
         quantity = np.atleast_1d(quantity)
         zero = quantity == ZERO
         sign = np.ones(len(quantity), np.int64) if sign is None else np.where(sign == 0, 1, np.atleast_1d(sign))
-        chunk = np.where(zero, -1, self.chunk[quantity])
+        chunk, offset = np.full(len(quantity), -1, np.int64), np.zeros(len(quantity), np.int64)
+        chunk[~zero], offset[~zero] = self.chunk[quantity[~zero]], self.offset[quantity[~zero]]
         if (chunk == -2).any():
             raise AssertionError("a quantity is read before it is computed")
-        return Gather(chunk, np.where(zero, 0, self.offset[quantity]), sign)
+        return Gather(chunk, offset, sign)
 
 
 @dataclasses.dataclass(frozen=True)
