@@ -224,6 +224,6 @@ def test_backsolve_is_refused():
         simulate(pendulum(), 1.0, solver=BDF(), adjoint=diffrax.BacksolveAdjoint())
     assert str(caught.value) == (
         "adjoint=BacksolveAdjoint() is wrong for constrained systems: it integrates the state backwards without its "
-        "constraints and leaves the algebraic variables out. Use the default RecursiveCheckpointAdjoint(), or "
-        "ForwardMode() for few parameters"
+        "constraints and leaves the algebraic variables out. Use the default StoredAdjoint(), "
+        "RecursiveCheckpointAdjoint(), or ForwardMode() for few parameters"
     )
