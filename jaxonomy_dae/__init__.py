@@ -1,11 +1,9 @@
 """Differentiable acausal modeling: components and equations in, one Equinox module out."""
 
-from .acausal_compiler import AcausalCompiler as AcausalCompiler
 from .errors import InitializationError as InitializationError
 from .errors import ModelError as ModelError
 from .errors import SimulationError as SimulationError
 from .errors import StructuralError as StructuralError
-from .lowering.system import AcausalSystem as AcausalSystem
 from .modeling import AcausalDiagram as AcausalDiagram
 from .modeling import Component as Component
 from .modeling import Domain as Domain
@@ -16,7 +14,9 @@ from .modeling import Rotational as Rotational
 from .modeling import Thermal as Thermal
 from .modeling import Translational as Translational
 from .modeling import der as der
-from .simulate import simulate as simulate
-from .solution import Solution as Solution
+from .simulation.simulate import simulate as simulate
+from .simulation.solution import Solution as Solution
+from .system.acausal_compiler import AcausalCompiler as AcausalCompiler
+from .system.system import AcausalSystem as AcausalSystem
 
 __version__ = "0.1.0"

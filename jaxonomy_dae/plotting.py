@@ -7,8 +7,8 @@ import numpy as np
 from .errors import ModelError
 
 if TYPE_CHECKING:
-    from .lowering.system import AcausalSystem
-    from .solution import Solution
+    from .simulation.solution import Solution
+    from .system.system import AcausalSystem
 
 NAMED = 40  # up to this many unknowns, rows and columns are labelled
 
@@ -102,7 +102,7 @@ def structure(system: "AcausalSystem", ax: Any = None) -> Any:
 
 
 def _equation_label(plan: Any, equation: int) -> str:
-    from .compiler.tables import describe_equation
+    from .model.tables import describe_equation
 
     text = describe_equation(plan.groups, int(plan.extended.base[equation])).replace("0 = ", "")
     text = text if len(text) <= 40 else text[:39] + "…"

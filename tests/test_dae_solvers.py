@@ -14,9 +14,9 @@ from testset import PROBLEMS
 from testset.problem import load
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der, simulate
+from jaxonomy_dae.linear.algebra import Dense, Sparse
+from jaxonomy_dae.linear.sparse import SparsePattern
 from jaxonomy_dae.solvers import BDF, DAETerm, Projected, Rodas5P, StepControl, solve_dae
-from jaxonomy_dae.solvers.linear_algebra import Dense, Sparse
-from jaxonomy_dae.solvers.sparse import SparsePattern
 
 SOLVERS = pytest.mark.parametrize("solver", [BDF(), Rodas5P()], ids=["bdf", "rodas5p"])
 ALSO_RODAS5P = pytest.mark.parametrize(

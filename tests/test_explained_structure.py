@@ -12,14 +12,14 @@ from problems import compiled
 from sympy import Eq, exp, sin
 
 from jaxonomy_dae import AcausalDiagram, Component, EqnEnv, ModelError, StructuralError, der
-from jaxonomy_dae.compiler.diagnose import dulmage_mendelsohn
-from jaxonomy_dae.compiler.match import maximum_matching
-from jaxonomy_dae.compiler.structure import Incidence, compress
 from jaxonomy_dae.library.electrical import Capacitor, CurrentSource, Ground, Inductor, Resistor, VoltageSource
 from jaxonomy_dae.library.planar import PlanarPendulum
 from jaxonomy_dae.library.thermal import FixedTemperature, HeatCapacitor, ThermalConductor
 from jaxonomy_dae.library.translational import Damper, FixedPosition, Mass, Rod, Spring
 from jaxonomy_dae.modeling import Domain, Electrical
+from jaxonomy_dae.structure.dulmage_mendelsohn import dulmage_mendelsohn
+from jaxonomy_dae.structure.incidence import Incidence, compress
+from jaxonomy_dae.structure.matching import maximum_matching
 
 KINDS = {
     cls.__name__: cls

@@ -10,11 +10,11 @@ from scipy.sparse.csgraph import maximum_bipartite_matching
 from testset import PROBLEMS
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, StructuralError, der, simulate
-from jaxonomy_dae.compiler.match import maximum_matching
-from jaxonomy_dae.compiler.reduce_index import reduce_index
-from jaxonomy_dae.compiler.structure import Incidence
 from jaxonomy_dae.library.electrical import Capacitor, Ground, Inductor, Resistor, VoltageSource
 from jaxonomy_dae.library.translational import FixedPosition, Mass, Rod
+from jaxonomy_dae.structure.incidence import Incidence
+from jaxonomy_dae.structure.matching import maximum_matching
+from jaxonomy_dae.structure.pantelides import reduce_index
 
 EV = EqnEnv()
 

@@ -9,8 +9,8 @@ from problems import compiled
 from sympy import Eq, atan
 
 from jaxonomy_dae import Component, EqnEnv, InitializationError, der, simulate
-from jaxonomy_dae.lowering.initialization_methods import METHODS, find_root
-from jaxonomy_dae.lowering.initialize import find_initial, is_consistent
+from jaxonomy_dae.initialization.initialize import find_initial, is_consistent
+from jaxonomy_dae.initialization.ladder import METHODS, find_root
 
 # x³ − 2x + 2 = 0 has one real root, by Cardano's formula; |F| has a local minimum at √(2/3), where F = 2 − (4/3)√(2/3).
 CARDANO = -np.cbrt(1 + np.sqrt(19 / 27)) - np.cbrt(1 - np.sqrt(19 / 27))

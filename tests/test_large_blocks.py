@@ -11,10 +11,10 @@ from problems import compiled
 
 from jaxonomy_dae import Component, EqnEnv, ModelError, simulate
 from jaxonomy_dae.library.electrical import Capacitor, Ground, Resistor, VoltageSource
+from jaxonomy_dae.linear import sparse
 from jaxonomy_dae.lowering import schedule
 from jaxonomy_dae.lowering.schedule import SparseStep
 from jaxonomy_dae.modeling import Electrical
-from jaxonomy_dae.solvers import sparse
 
 needs_klu = pytest.mark.skipif(importlib.util.find_spec("klujax") is None, reason='needs the extra "sparse"')
 

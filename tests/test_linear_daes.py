@@ -20,9 +20,10 @@ from problems import compiled
 from sympy import Eq
 
 from jaxonomy_dae import AcausalDiagram, Component, EqnEnv, der, simulate
-from jaxonomy_dae.acausal_compiler import compile_flat
 from jaxonomy_dae.compiler.flatten import flatten
-from jaxonomy_dae.lowering.report import SystemReport
+from jaxonomy_dae.compiler.pipeline import compile_flat
+from jaxonomy_dae.lowering.lower import lower
+from jaxonomy_dae.system.report import SystemReport
 
 T = sympy.Symbol("t")
 
@@ -155,7 +156,7 @@ MIXED = Pencil(
 def plan_of(component: Component):
     """The plan, without anything compiled by XLA."""
     diagram = AcausalDiagram().add(component)
-    return compile_flat(flatten(diagram), "auto", ())
+    return lower(compile_flat(flatten(diagram), "auto", ()))
 
 
 # --- structure ---------------------------------------------------------------------------------------------------

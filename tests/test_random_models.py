@@ -15,7 +15,7 @@ from problems import compiled
 from jaxonomy_dae import EqnEnv, simulate
 from jaxonomy_dae.library.electrical import Capacitor, Ground, Resistor, VoltageSource
 from jaxonomy_dae.library.translational import Damper, FixedPosition, Mass, Spring
-from jaxonomy_dae.solvers.small_linear import solve
+from jaxonomy_dae.linear.written_out import solve
 
 values = st.floats(0.2, 5.0)
 

@@ -13,8 +13,8 @@ import pytest
 from jax.test_util import check_grads
 from problems import run
 
-from jaxonomy_dae.solvers import sparse
-from jaxonomy_dae.solvers.sparse import MissingSparseSolver, SparsePattern, solve_sparse, sparse_jacobian
+from jaxonomy_dae.linear import sparse
+from jaxonomy_dae.linear.sparse import MissingSparseSolver, SparsePattern, solve_sparse, sparse_jacobian
 
 installed = pytest.mark.skipif(importlib.util.find_spec("klujax") is None, reason='needs the extra "sparse"')
 TIGHT = dict(rtol=1e-11, atol=1e-11)
@@ -170,7 +170,7 @@ def test_settings_are_left_alone():
     printed = run(
         "import jax\n"
         "import sys\n"
-        "from jaxonomy_dae.solvers import sparse\n"
+        "from jaxonomy_dae.linear import sparse\n"
         "assert 'klujax' not in sys.modules\n"
         "before = jax.config.values\n"
         "sparse.klu()\n"

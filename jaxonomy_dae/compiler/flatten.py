@@ -13,12 +13,8 @@ import numpy as np
 import sympy
 
 from ..errors import ModelError, nearest
-from ..modeling.component import Component
-from ..modeling.diagram import AcausalDiagram
-from ..modeling.ports import Port
-from ..modeling.symbols import ParameterSymbol, TimeSymbol, VariableSymbol
-from .tables import EquationGroup, FlatModel, ParameterTable, PortTable, RowInjection, Start, VariableTable
-from .templates import (
+from ..model.tables import EquationGroup, FlatModel, ParameterTable, PortTable, RowInjection, Start, VariableTable
+from ..model.templates import (
     AnyTemplate,
     LinearTemplate,
     OpaqueFunction,
@@ -27,6 +23,10 @@ from .templates import (
     canonical,
     linear_coefficients,
 )
+from ..modeling.component import Component
+from ..modeling.diagram import AcausalDiagram
+from ..modeling.ports import Port
+from ..modeling.symbols import ParameterSymbol, TimeSymbol, VariableSymbol
 
 
 @dataclasses.dataclass

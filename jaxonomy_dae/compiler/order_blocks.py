@@ -10,8 +10,8 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
-from .extend import Extended
-from .match import maximum_matching
+from ..model.extended import Extended
+from ..structure.matching import maximum_matching
 
 
 @dataclasses.dataclass(frozen=True)

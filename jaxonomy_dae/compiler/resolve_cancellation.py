@@ -16,13 +16,14 @@ import scipy.sparse as sp
 import sympy
 from scipy.sparse.csgraph import connected_components
 
+from ..diagnosis.wording import itemised
 from ..errors import StructuralError
-from .match import maximum_matching
-from .reduce_index import Offsets, reduce_index
-from .structure import Incidence, incidence
-from .tables import ZERO, EquationGroup, describe_equation, equation_offsets, written_by
-from .templates import LinearTemplate, Template, template_of
-from .wording import itemised
+from ..model.incidence import incidence
+from ..model.tables import ZERO, EquationGroup, describe_equation, equation_offsets, written_by
+from ..model.templates import LinearTemplate, Template, template_of
+from ..structure.incidence import Incidence
+from ..structure.matching import maximum_matching
+from ..structure.pantelides import Offsets, reduce_index
 
 LARGEST_BLOCK = 60
 ROUNDS = 20

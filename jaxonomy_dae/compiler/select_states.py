@@ -15,9 +15,9 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
 from ..errors import StructuralError
-from .extend import Extended
-from .numeric import Networks, group_values
-from .tables import ZERO, EquationGroup, equation_offsets
+from ..model.evaluate_numpy import Networks, group_values
+from ..model.extended import Extended
+from ..model.tables import ZERO, EquationGroup, equation_offsets
 
 POOR_PIVOT = 0.1  # a preferred pivot may be this much smaller than the best one
 SINGULAR_PIVOT = 1e-9

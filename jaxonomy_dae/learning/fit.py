@@ -15,7 +15,7 @@ import optimistix as optx
 from tqdm import tqdm
 
 from ..errors import ModelError
-from ..lowering.system import AcausalSystem
+from ..system.system import AcausalSystem
 
 Model = TypeVar("Model", bound=eqx.Module)
 

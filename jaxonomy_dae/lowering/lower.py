@@ -1,155 +1,21 @@
 """Lowering: the compiler's tables become the static plan of an `AcausalSystem`."""
 
-import dataclasses
-import functools
 import hashlib
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from ..compiler.extend import Extended, ExtendedGroup
-from ..compiler.order_blocks import Blocks
+from ..compiler.pipeline import CompiledModel
 from ..compiler.select_states import StateSelection
-from ..compiler.tables import ZERO, AliasTable, EquationGroup, FlatModel, RowInjection
-from ..compiler.templates import OpaqueFunction
-from ..errors import ModelError, nearest
-from ..solvers.sparse import SparsePattern
-from . import pattern
-from .evaluate import check_solvable
+from ..linear.sparse import check_solvable
+from ..model.extended import Extended, ExtendedGroup
+from ..model.quantities import quantity_scale
+from ..model.tables import ZERO, AliasTable, FlatModel, RowInjection
 from .gather import Gather
+from .plan import ConstraintGroup, InputTable, PlannedRow, SystemPlan
 from .program import Layout, Program, plan
-from .schedule import TORN, AnyStep, SparseStep, build_schedule
-
-
-@dataclasses.dataclass(frozen=True)
-class ConstraintGroup:
-    """Residuals of one template to project onto, read from a program's results."""
-
-    group: ExtendedGroup
-    slots: tuple[Gather, ...]
-
-
-@dataclasses.dataclass(frozen=True)
-class PlannedRow:
-    """A correction added to finished rows of the right-hand side."""
-
-    opaque: OpaqueFunction
-    rows: tuple[int, ...]
-    inputs: tuple[Gather, ...]
-    sign: tuple[int, ...]
-    quantities: np.ndarray  # of the inputs
-
-
-@dataclasses.dataclass(frozen=True)
-class InputTable:
-    """Which inputs the model has; quantities are listed as (input, order)."""
-
-    names: list[str]
-    defaults: list[float | None]
-    quantities: list[tuple[int, int]]
-
-
-@dataclasses.dataclass(frozen=True)
-class SystemPlan:
-    """All that is static about a compiled system; compared and hashed by its digest."""
-
-    digest: str
-    flat: FlatModel
-    alias: AliasTable
-    groups: tuple[EquationGroup, ...]
-    extended: Extended
-    selection: StateSelection
-    steps: tuple[AnyStep, ...]
-    blocks: Blocks
-    mode: str
-
-    variable_index: dict[str, int]
-    quantity_name: list[str]
-    states: np.ndarray  # quantities in the state array …
-    carried: np.ndarray  # … followed by the tearing variables of nonlinear blocks
-    nominal: np.ndarray  # of the state array
-    inputs: InputTable
-    derivative: Program
-    next_derivative: Gather
-    carried_rates: Gather | None  # where the model itself has the derivatives of all `carried`
-    everything: Program
-    carried_residuals: Program
-    constraint_program: Program
-    constraints: tuple[ConstraintGroup, ...]
-    constraint_pattern: tuple[frozenset[int], ...] | None
-    rows: tuple[PlannedRow, ...]
-    network_names: tuple[str, ...]
-    functions: tuple[Any, ...]
-
-    def __eq__(self, other):
-        return isinstance(other, SystemPlan) and self.digest == other.digest and self.functions == other.functions
-
-    def __hash__(self):
-        return hash(self.digest)
-
-    @property
-    def n_state(self) -> int:
-        return len(self.states) + len(self.carried)
-
-    @property
-    def n_constraints(self) -> int:
-        return len(self.selection.constraints)
-
-    @functools.cached_property
-    def jacobian_pattern(self) -> SparsePattern | None:
-        """Where ∂(vector field)/∂(state) can be nonzero at a consistent state, shape (n_state, n_state); None if it has
-        too many places to list."""
-        return pattern.field_pattern(self)
-
-    @functools.cached_property
-    def dae_pattern(self) -> SparsePattern | None:
-        """Where the Jacobian of [f(t, x, z); g(t, x, z)] with respect to the state array [x, z] can be nonzero: the
-        states' derivatives with z read from the array, not refined, then the residuals of the nonlinear blocks. Sorted
-        by row, each place once; None if there are too many to list."""
-        return pattern.dae_pattern(self)
-
-    @functools.cached_property
-    def carried_pattern(self) -> SparsePattern | None:
-        """Where ∂g/∂z can be nonzero, if there are so many algebraic unknowns z that it matters."""
-        if len(self.carried) <= TORN or self.dae_pattern is None:
-            return None
-        n, found = len(self.states), self.dae_pattern
-        inside = (found.rows >= n) & (found.cols >= n)
-        return SparsePattern(found.rows[inside] - n, found.cols[inside] - n, len(self.carried))
-
-    def quantity_of(self, variable: int) -> tuple[int, int]:
-        """(quantity, sign) of a variable; quantity ZERO if it is identically zero."""
-        root = int(self.alias.root[variable])
-        if root == ZERO:
-            return ZERO, 0
-        quantities = self.extended.quantities
-        return int(quantities.first[quantities.column[root]] + self.alias.order[variable]), int(
-            self.alias.sign[variable]
-        )
-
-    @property
-    def visible_variables(self) -> list[str]:
-        """The names a user may read: all but those made for corrected derivatives."""
-        return [n for n in self.flat.variables.names if ":" not in n]
-
-    def resolve(self, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-        """(quantities, signs) of variables by name; `"der(name)"` is accepted where the model has that derivative."""
-        quantity, sign = [], []
-        for name in names:
-            order, inner = 0, name
-            while inner.startswith("der(") and inner.endswith(")"):
-                order, inner = order + 1, inner[4:-1]
-            if inner not in self.variable_index:
-                raise ModelError(f"'{name}' is no variable: " + nearest(inner, self.visible_variables))
-            q, s = self.quantity_of(self.variable_index[inner])
-            if q != ZERO and order:
-                quantities = self.extended.quantities
-                if quantities.order[q] + order > quantities.highest[quantities.owner[q]]:
-                    raise ModelError(f"'{name}' occurs nowhere in the model: only '{inner}' does")
-            quantity.append(q if q == ZERO else q + order)
-            sign.append(s)
-        return np.array(quantity, np.int64), np.array(sign, np.int64)
+from .schedule import AnyStep, SparseStep, build_schedule
 
 
 def _needed(steps: Sequence[AnyStep], targets: np.ndarray, n: int) -> tuple[AnyStep, ...]:
@@ -165,18 +31,11 @@ def _needed(steps: Sequence[AnyStep], targets: np.ndarray, n: int) -> tuple[AnyS
     return tuple(reversed(kept))
 
 
-def lower(
-    flat: FlatModel,
-    alias: AliasTable,
-    groups: tuple[EquationGroup, ...],
-    extended: Extended,
-    selection: StateSelection,
-    blocks: Blocks,
-    mode: str,
-    quantity_name: list[str],
-    state_order: np.ndarray,
-) -> SystemPlan:
-    """Builds the plan; `state_order` lists the selected states as they will lie in the state array."""
+def lower(model: CompiledModel) -> SystemPlan:
+    """Builds the plan."""
+    flat, alias, groups, extended = model.flat, model.alias, model.groups, model.extended
+    selection, blocks, mode, quantity_name = model.selection, model.blocks, model.mode, list(model.quantity_name)
+    state_order = selection.states  # as they lie in the state array
     quantities = extended.quantities
     n = quantities.n
     steps = build_schedule(extended, blocks)
@@ -274,19 +133,6 @@ def _rates_hold(
     targets = [v for row in flat.rows for v in row.targets]
     injected = quantities.first[quantities.column[alias.root[targets]]] + alias.order[targets] if targets else []
     return not np.isin(injected, read).any()
-
-
-def quantity_scale(flat: FlatModel, alias: AliasTable, extended: Extended) -> np.ndarray:
-    """The nominal value of every quantity: the largest that a variable which equals it declares, else 1."""
-    quantities = extended.quantities
-    scale = np.zeros(quantities.n)
-    known = alias.root != ZERO
-    known[known] = quantities.column[alias.root[known]] >= 0
-    v = np.flatnonzero(known)
-    q = quantities.first[quantities.column[alias.root[v]]] + alias.order[v]
-    inside = alias.order[v] <= quantities.highest[quantities.column[alias.root[v]]]
-    np.maximum.at(scale, q[inside], flat.variables.nominal[v[inside]])
-    return np.where(scale == 0, 1.0, scale)
 
 
 def _constraints(extended: Extended, selection: StateSelection, states: np.ndarray):

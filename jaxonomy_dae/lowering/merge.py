@@ -10,8 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..solvers import sparse
-from .repeat import Repeat
+from ..linear import sparse
+from .loops import Repeat
 from .schedule import AnyStep, SlotSource, SparseStep, Step, StepEquation
 
 MANY = 150  # thin steps in a row that are worth merging: written out they cost XLA seconds

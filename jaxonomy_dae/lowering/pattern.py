@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..solvers.sparse import SparsePattern
+from ..linear.sparse import SparsePattern
 from .schedule import AnyStep, SparseStep
 
 if TYPE_CHECKING:
-    from .lower import SystemPlan
+    from .plan import SystemPlan
 
 LIMIT = 30_000_000  # entries of rows, above which the pattern counts as dense
 

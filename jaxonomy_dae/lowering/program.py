@@ -10,14 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from ..compiler.tables import ZERO
-from ..solvers.sparse import SparsePattern
+from ..linear.sparse import DENSE, SparsePattern
+from ..model.tables import ZERO
 from .gather import Gather
+from .loops import Repeat, find_repeats
 from .merge import merge_thin
-from .repeat import Repeat, find_repeats
 from .schedule import AnyStep, SparseStep, Step, StepEquation
-
-DENSE = 1000  # simultaneous equations that dense elimination may solve if there is no sparse solver: about 20 ms
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,10 +10,10 @@ import dataclasses
 
 import numpy as np
 
-from ..compiler.extend import Extended, ExtendedGroup
 from ..compiler.order_blocks import Blocks
-from ..compiler.tear import Tearing, tear
-from ..compiler.templates import AnyTemplate
+from ..model.extended import Extended, ExtendedGroup
+from ..model.templates import AnyTemplate
+from ..structure.tearing import Tearing, tear
 
 # A block stays whole, its matrix sparse, if it has more tearing variables than TORN: dense elimination then takes more
 # than KLU (30 unknowns: 0.2 ms and 0.09 ms; 200: 0.8 and 0.12). Or if it is longer than WRITTEN_OUT, because XLA needs

@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
+from ..linear.algebra import LinearAlgebra, choose
 from .bdf_coefficients import Coefficients, coefficients, interpolate
 from .dae_term import FlatProblem
 from .index_one import consistent_point, consistent_slope
-from .linear_algebra import LinearAlgebra, choose
 from .newton import Tolerances, implicit_step
 from .projected import Projection
 from .step_control import encoded

@@ -5,8 +5,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from ..linear.algebra import LinearAlgebra, choose
 from .dae_term import FlatProblem
-from .linear_algebra import LinearAlgebra, choose
 
 
 def index_matrix(problem: FlatProblem, linear: LinearAlgebra | None, t: Any, y: Any) -> tuple[Any, Any, Any, Any]:

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from diffrax._root_finder import use_stepsize_tol
 
+from ..linear.algebra import LinearAlgebra
 from .dae_term import FlatProblem
-from .linear_algebra import LinearAlgebra
 
 CONVERGED = 0.1  # of the local error's tolerance (Brenan, Campbell & Petzold 1996, section 5.2.2)
 DIVERGED = 0.9  # contraction rate above which an iteration is given up

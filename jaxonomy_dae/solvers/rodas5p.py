@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..linear.algebra import LinearAlgebra, choose
 from .dae_term import FlatProblem
 from .index_one import consistent_point, consistent_slope
-from .linear_algebra import LinearAlgebra, choose
 
 # Steinebach (2023), "Construction of Rosenbrock–Wanner method Rodas5P and numerical benchmarks within the Julia
 # Differential Equations package", BIT Numerical Mathematics 63:27, in the form without products by the Jacobian

@@ -12,16 +12,16 @@ import numpy as np
 from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 
+from ..adjoint.stored_adjoint import StoredAdjoint
 from ..errors import InitializationError, ModelError, SimulationError
 from .bdf import BDF
 from .dae_term import DAETerm, FlatProblem
-from .diagnosis import SHOWN, StartCheck, explain_failure, explain_start, start_check
+from .failures import SHOWN, StartCheck, explain_failure, explain_start, start_check
 from .index_one import consistent_point, consistent_shift
 from .projected import Projected
 from .rodas5p import Rodas5P
 from .solve_arguments import check_times, tolerance_of
 from .step_control import StepControl
-from .stored_adjoint import StoredAdjoint
 
 SAVED_ITERATIONS = 4
 SMALL = 30  # up to this many unknowns a factorisation costs less than the steps that a multistep method saves

@@ -1,0 +1,159 @@
+"""The loop over the steps of a solve that records them, and its derivative by going back over the record."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from .closure_conversion import Program, any_member, apart, going, read, rows, unless_waiting, written
+from .packing import Parcels
+from .reverse_step import ReverseStep
+from .step_times import StepTimes
+
+
+@eqx.filter_custom_vjp
+def solve(numbers: dict[str, Any], program: Program) -> tuple[Any, Any]:
+    """Steps until the end: the final `(state, buffers)`.
+
+    `numbers` holds every array that the solve depends on: `state` and `buffers` to start from, `t1`, the `controller`'s
+    own, the times `ts` of each part of `SaveAt`, and by the names of `program`'s functions what these close over.
+    """
+
+    def advance(carry):
+        state, buffers = carry
+        active = going(state, numbers, program)
+        new, buffers = program.body(numbers["body"], state, buffers, active, jnp.array(True))
+        return unless_waiting(active, new, state), buffers
+
+    start = numbers["state"], numbers["buffers"]
+    return lax.while_loop(lambda carry: any_member(going(carry[0], numbers, program)), advance, start)
+
+
+class _Recorder:
+    """Attempts steps, and keeps what those since the last multiple of `chunk` started from, as far as accepted.
+
+    Loops carry `(row, rest)`, both packed: what a row of the record holds, and the rest of Diffrax's state. Rows count
+    the same for all members of a batch, and each says which members accepted it; a row that none did is written over.
+    """
+
+    def __init__(self, numbers: dict[str, Any], program: Program, times: StepTimes):
+        self.numbers, self.program, self.times = numbers, program, times
+        state = numbers["state"]
+        carry = self._taken_apart(state, jnp.full_like(state.tprev, -jnp.inf), times.start())
+        self.row, self.rest = (Parcels(part) for part in carry)
+        self.start = self.pack(carry)
+
+    def _taken_apart(self, state, last, moves):
+        names = ("y", "solver_state", "tprev", "tnext") + (("made_jump",) if self.program.jumps else ())
+        row = {name: getattr(state, name) for name in names} | dict(last=last, moves=moves[:2])
+        return row, (dataclasses.replace(state, **dict.fromkeys(names)), moves[2:])
+
+    def pack(self, carry):
+        return self.row.pack(carry[0]), self.rest.pack(carry[1])
+
+    def unpack(self, packed):
+        """(state, end of the last accepted step, derivatives of the times)."""
+        row, (state, moves) = self.row.unpack(packed[0]), self.rest.unpack(packed[1])
+        last, first_moves = row.pop("last"), row.pop("moves")
+        return dataclasses.replace(state, **row), last, (*first_moves, *moves)
+
+    def going(self, packed):
+        return any_member(going(self.unpack(packed)[0], self.numbers, self.program))
+
+    def empty(self):
+        return rows((self.start[0], jnp.array(False)), self.program.chunk)
+
+    def run(self, packed, buffers, record, count, first):
+        """At most `count` attempted steps: (carry, buffers, record, rows filled). The record is written over."""
+
+        def attempt(loop):
+            packed, buffers, _ = loop
+            carry = self.unpack(packed)
+            state, last, moves = carry
+            active = going(state, self.numbers, self.program)
+            new, buffers = self.program.body(self.numbers["body"], state, buffers, active, first)
+            accepted = active & (new.num_accepted_steps > state.num_accepted_steps)
+            after = new, jnp.where(accepted, state.tnext, last), self.times.after(state, moves)
+            after = unless_waiting(active, after, carry)
+            return self.pack(self._taken_apart(*after)), buffers, accepted
+
+        def advance(loop):
+            packed, buffers, k, record, filled = loop
+            before = packed[0]
+            packed, buffers, accepted = apart(k < count, attempt, (packed, buffers, jnp.array(False)))
+            filled = jnp.where(k % self.program.chunk == 0, 0, filled)
+            record = written(record, filled, (before, accepted))
+            return packed, buffers, k + 1, record, filled + any_member(accepted).astype(filled.dtype)
+
+        zero = jnp.array(0, jnp.int32)
+        loop = (packed, buffers, zero, record, zero)
+        loop = lax.while_loop(lambda loop: (loop[2] < count) & self.going(loop[0]), advance, loop)
+        packed, buffers, _, record, filled = loop
+        return packed, buffers, record, filled
+
+
+@solve.def_fwd
+def _(perturbed, numbers, program):
+    recorder = _Recorder(numbers, program, StepTimes(perturbed, numbers, program))
+    points = program.points
+
+    def advance(loop):
+        carry, buffers, chunks, stride, kept, record, _ = loop
+
+        def thin():
+            return jax.tree.map(lambda a: a.at[: points // 2].set(a[:points:2]), kept), 2 * stride
+
+        kept, stride = lax.cond(chunks == points * stride, thin, lambda: (kept, stride))
+        row = jnp.where(chunks % stride == 0, chunks // stride, points)  # the last row is for what is not kept
+        kept = written(kept, row, carry)
+        carry, buffers, record, filled = recorder.run(carry, buffers, record, program.chunk, jnp.array(True))
+        return carry, buffers, chunks + 1, stride, kept, record, filled
+
+    start = recorder.start
+    one, zero = jnp.array(1, jnp.int32), jnp.array(0, jnp.int32)
+    loop = (start, numbers["buffers"], zero, one, rows(start, points + 1), recorder.empty(), zero)
+    loop = lax.while_loop(lambda loop: recorder.going(loop[0]), advance, loop)
+    carry, buffers, chunks, stride, kept, record, filled = loop
+    state, _, moves = recorder.unpack(carry)
+    return (state, buffers), (state, moves, chunks, stride, kept, record, filled)
+
+
+@solve.def_bwd
+def _(residuals, cotangents, perturbed, numbers, program):
+    state, moves, chunks, stride, kept, record, filled = residuals
+    times = StepTimes(perturbed, numbers, program)
+    recorder = _Recorder(numbers, program, times)
+    reverse = ReverseStep(cotangents, perturbed, numbers, program, times)
+    chunks, stride, filled = (eqxi.unvmap_max(v) for v in (chunks, stride, filled))
+    blank = jax.tree.map(jnp.zeros_like, numbers["buffers"])  # saved nowhere: dead code
+    start = reverse.start(state, moves)
+    parcels = Parcels(start)
+
+    def again(q, record, _):
+        point = q // stride
+        count = (q - point * stride + 1) * program.chunk
+        _, _, record, filled = recorder.run(read(kept, point), blank, record, count, jnp.array(False))
+        return record, filled
+
+    def backwards(packed, row):
+        row, accepted = row
+        return parcels.pack(reverse.step(parcels.unpack(packed), recorder.row.unpack(row), accepted))
+
+    def advance(loop):
+        q, record, filled, packed = loop
+
+        def one(inner):
+            k, packed = inner
+            return k - 1, apart(k > 0, backwards, packed, read(record, k - 1))
+
+        _, packed = lax.while_loop(lambda inner: inner[0] > 0, one, (filled, packed))
+        record, filled = lax.cond(q > 0, again, lambda _, *same: same, q - 1, record, filled)
+        return q - 1, record, filled, packed
+
+    loop = (chunks - 1, record, filled, parcels.pack(start))
+    *_, packed = lax.while_loop(lambda loop: loop[0] >= 0, advance, loop)
+    return reverse.finish(parcels.unpack(packed))

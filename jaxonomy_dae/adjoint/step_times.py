@@ -1,0 +1,84 @@
+"""How the ends of steps move with the times that a solve was given."""
+
+from typing import Any
+
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+from diffrax._integrate import _clip_to_end
+
+from .closure_conversion import Program, inexact
+
+
+class StepTimes:
+    """Derivatives of tprev and tnext, taken along in the forward direction.
+
+    A step-size controller multiplies the last step by a factor, and factors count as constants, so the ends of steps
+    depend on no state. What is left are a few numbers, here called seeds: the start, the first step, the end, and the
+    controller's own times, as far as they are differentiated. Mostly there are none.
+    """
+
+    def __init__(self, perturbed: dict[str, Any], numbers: dict[str, Any], program: Program):
+        self.numbers, self.program = numbers, program
+        clock = _clock(numbers)
+        self.leaves, self.structure = jax.tree.flatten(inexact(clock))
+        pairs = zip(jax.tree.leaves(_clock(perturbed)), jax.tree.leaves(clock), strict=True)
+        self.wanted = [flag for flag, leaf in pairs if eqx.is_inexact_array(leaf)]
+        self.count = sum(leaf.size for flag, leaf in zip(self.wanted, self.leaves, strict=True) if flag)
+
+    def seeds(self) -> Any:
+        """Derivatives of ((tprev, tnext, controller's state), (t1, controller)) at the start, shapes (seeds, ...)."""
+        out, row = [], 0
+        for wanted, leaf in zip(self.wanted, self.leaves, strict=True):
+            hot = jnp.zeros((self.count, leaf.size), leaf.dtype)
+            if wanted:
+                hot = hot.at[row : row + leaf.size].set(jnp.eye(leaf.size, dtype=leaf.dtype))
+                row += leaf.size
+            out.append(hot.reshape(self.count, *leaf.shape))
+        return jax.tree.unflatten(self.structure, out)
+
+    def split(self, total: Any) -> Any:
+        """The seeds' cotangents where they belong, None elsewhere."""
+        out, row = [], 0
+        for wanted, leaf in zip(self.wanted, self.leaves, strict=True):
+            out.append(total[row : row + leaf.size].reshape(leaf.shape).astype(leaf.dtype) if wanted else None)
+            row += leaf.size if wanted else 0
+        return jax.tree.unflatten(self.structure, out)
+
+    def start(self) -> Any:
+        """The derivatives of (tprev, tnext, controller's state) at the start."""
+        return self.seeds()[0] if self.count else ()
+
+    def after(self, state: Any, moves: Any) -> Any:
+        """The same after the step that a state is about to attempt."""
+        if not self.count:
+            return ()
+        program, numbers = self.program, self.numbers
+        jump = state.made_jump if program.jumps else False
+        y1, error, *_ = program.step(numbers["step"], state.tprev, state.tnext, state.y, state.solver_state, jump)
+        error = jax.tree.map(lambda e: jnp.where(jnp.isnan(e), jnp.inf, e), error)
+        fixed = eqx.filter(state.controller_state[0], eqx.is_inexact_array, inverse=True)
+        floor = numbers["t1"]
+        for _ in range(100):
+            floor = eqxi.prevbefore(floor)
+
+        def clock(moving, given):
+            tprev, tnext, controlled = moving
+            t1, controller = given
+            keep, tprev, tnext, _, after, _ = program.adapt(
+                numbers["adapt"], controller, tprev, tnext, state.y, y1, error, eqx.combine(controlled, fixed)
+            )
+            tprev = jnp.minimum(tprev, t1)
+            return tprev, _clip_to_end(tprev, tnext, t1, floor, keep), inexact(after)
+
+        at = inexact(_clock(numbers | {"state": state}))
+        given = self.seeds()[1]
+        return jax.vmap(lambda a, b: jax.jvp(clock, at, (a, b))[1])(moves, given)
+
+
+def _clock(tree: dict[str, Any]) -> Any:
+    """What the ends of steps depend on."""
+    state = tree["state"]
+    moving = state.tprev, state.tnext, state.controller_state[0]
+    return moving, (tree["t1"], tree["controller"])

@@ -1,0 +1,239 @@
+"""Reverse-mode differentiation of a solve from a record of its steps."""
+
+import dataclasses
+import math
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+from diffrax._heuristics import is_sde
+from jax import lax
+
+from .closure_conversion import Program, hoist, unless_waiting
+from .recorded_loop import solve
+from .reverse_step import state_saves
+
+LARGEST_RECORD = 2**25  # bytes; above, storing steps is no longer what is cheap
+
+
+class StoredAdjoint(diffrax.AbstractAdjoint):
+    """Differentiates the numerical solution itself, step by step backwards, from a record of the accepted steps.
+
+    Gradients are those of `diffrax.RecursiveCheckpointAdjoint`, to rounding, at a small multiple of the cost of the
+    solve. What a step started from is recorded during the solve, in a table of a few dozen rows. Where a solve takes
+    more steps than rows, it is run once more in pieces, from points kept on the way (checkpointing with two levels,
+    Griewank & Walther 2008, Evaluating Derivatives, chapter 12). Memory does not grow with `max_steps` to speak of, and
+    without differentiation nothing is recorded.
+
+    Rejected steps take no part, so what is not finite in them does no harm. Step sizes count as constant, but for what
+    they take from the times given: derivatives with respect to `t0`, `t1`, `dt0`, `SaveAt(ts=...)` and the times of
+    `diffrax.ClipStepSizeController` and `diffrax.StepTo` are complete.
+
+    Solves with events, dense output or Brownian motion, and those whose state is so large that a record would take more
+    than 32 MB, are handed to `diffrax.RecursiveCheckpointAdjoint`. As with that, forward mode is refused, second
+    derivatives included: it needs `diffrax.ForwardMode()`.
+    """
+
+    def loop(
+        self, *, args, terms, solver, stepsize_controller, event, saveat, t0, t1, dt0, max_steps, throw, init_state,
+        passed_solver_state, passed_controller_state, progress_meter,
+    ):  # fmt: skip
+        """The loop over the steps, called by `diffrax.diffeqsolve`."""
+        given = dict(
+            args=args, terms=terms, solver=solver, stepsize_controller=stepsize_controller, event=event, saveat=saveat,
+            t0=t0, t1=t1, dt0=dt0, max_steps=max_steps, init_state=init_state, progress_meter=progress_meter,
+        )  # fmt: skip
+        chunk, points = _table(max_steps)
+        size = sum(
+            leaf.size * leaf.dtype.itemsize
+            for leaf in jax.tree.leaves(_arrays((init_state.y, init_state.solver_state)))
+        )
+        if event is not None or saveat.dense or is_sde(terms) or size * (chunk + points) > LARGEST_RECORD:
+            passed = dict(passed_solver_state=passed_solver_state, passed_controller_state=passed_controller_state)
+            return diffrax.RecursiveCheckpointAdjoint().loop(**given, throw=throw, **passed)
+
+        # Diffrax's own loop, with functions in place of solver and controller that close over nothing.
+        init_state = dataclasses.replace(
+            init_state,
+            **{
+                name: _arrays(getattr(init_state, name))
+                for name in ("y", "tprev", "tnext", "solver_state", "controller_state")
+            },
+        )
+        functions, numbers = _functions(**{**given, "init_state": init_state})
+        state = dataclasses.replace(
+            init_state,
+            made_jump=jnp.asarray(init_state.made_jump) if functions["jumps"] else False,
+            controller_state=(init_state.controller_state, jnp.array(True)),
+            progress_meter_state=(init_state.progress_meter_state, jnp.array(True)),
+        )
+
+        def outer(cond_fun, body_fun, start, *, max_steps, buffers):
+            del cond_fun, buffers
+            start = _arrays(start)
+            buffers = tuple((save.ts, save.ys) for save in state_saves(start))
+
+            def body(state, buffers, active, first):
+                state = dataclasses.replace(
+                    state,
+                    controller_state=(state.controller_state[0], active),
+                    progress_meter_state=(state.progress_meter_state[0], first),
+                )
+                out = _arrays(body_fun(_with_buffers(state, buffers)))
+                return _without_buffers(out), tuple((save.ts, save.ys) for save in state_saves(out))
+
+            start = _without_buffers(start)
+            flag = jnp.array(True)
+            shut, consts = hoist(body, start, buffers, flag, flag)
+            program = Program(
+                **functions, body=shut, max_steps=max_steps, chunk=chunk, points=points,
+            )  # fmt: skip
+            final, buffers = solve(numbers | dict(state=start, buffers=buffers, body=consts), program)
+            return _with_buffers(final, buffers)
+
+        final_state, stats = self._loop(
+            **given
+            | dict(
+                solver=_Solver(functions["step"], numbers["step"], solver, terms),
+                stepsize_controller=_Controller(functions["adapt"], numbers["adapt"], numbers["controller"]),
+                progress_meter=_Meter(progress_meter),
+                init_state=state,
+            ),
+            inner_while_loop=_inner_loop,
+            outer_while_loop=outer,
+        )
+        final_state = dataclasses.replace(
+            final_state,
+            controller_state=final_state.controller_state[0],
+            progress_meter_state=final_state.progress_meter_state[0],
+        )
+        return final_state, stats
+
+
+def _table(max_steps: int | None) -> tuple[int, int]:
+    """(rows of the record, points kept): with steps for eight times their product, pieces are run again 4.5 times."""
+    chunk = 64 if max_steps is None else max(64, math.isqrt(max_steps // 4))
+    return chunk, chunk // 2 // 2 * 2
+
+
+def _inner_loop(cond_fun, body_fun, start, *, max_steps, buffers, checkpoints):
+    """Saving at times within a step."""
+    del checkpoints
+    return eqxi.while_loop(cond_fun, body_fun, start, max_steps=max_steps, buffers=buffers, kind="lax")
+
+
+def _functions(
+    *, args, terms, solver, stepsize_controller, saveat, t1, init_state, **_
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The functions of `Program` but for its body, and the arrays they close over."""
+    s = init_state
+    controller, others = eqx.partition(stepsize_controller, eqx.is_inexact_array)
+    order = solver.error_order(terms)
+
+    def take_step(tprev, tnext, y, solver_state, made_jump):
+        y1, y_error, dense, state, result = solver.step(terms, tprev, tnext, y, args, solver_state, made_jump)
+        return y1, y_error, dense, _arrays(state), result
+
+    def adapt(controller, tprev, tnext, y, y1, y_error, state):
+        both = eqx.combine(controller, others)
+        return both.adapt_step_size(tprev, tnext, y, y1, args, y_error, order, state)
+
+    def hoist_both(made_jump):
+        step = hoist(take_step, s.tprev, s.tnext, s.y, s.solver_state, made_jump)
+        y1, y_error, *_ = step[0].out_struct
+        return step, hoist(adapt, controller, s.tprev, s.tnext, s.y, y1, y_error, s.controller_state)
+
+    made_jump = s.made_jump
+    step, adapted = hoist_both(made_jump)
+    if made_jump is False and adapted[0].out_struct[3] is not False:
+        made_jump = jnp.array(False)
+        step, adapted = hoist_both(made_jump)
+    y1, _, dense, *_ = step[0].out_struct
+    parts = jax.tree.leaves(saveat.subs, is_leaf=lambda node: isinstance(node, diffrax.SubSaveAt))
+    none = None, []
+
+    def save_ts(part):
+        def saved(t, tprev, tnext, dense):
+            return part.fn(t, solver.interpolation_cls(t0=tprev, t1=tnext, **dense).evaluate(t), args)
+
+        return none if part.ts is None else hoist(saved, s.tprev, s.tprev, s.tnext, dense)
+
+    def save_step(part):
+        return hoist(lambda t, y: part.fn(t, y, args), s.tprev, y1) if part.steps else none
+
+    at_ts, at_steps = [save_ts(part) for part in parts], [save_step(part) for part in parts]
+    functions = dict(
+        step=step[0], adapt=adapted[0], jumps=made_jump is not False, every=tuple(int(part.steps) for part in parts),
+        save_ts=tuple(f for f, _ in at_ts), save_steps=tuple(f for f, _ in at_steps),
+    )  # fmt: skip
+    numbers = dict(
+        step=step[1], adapt=adapted[1], controller=controller, t1=jnp.asarray(t1),
+        ts=tuple(part.ts for part in parts),
+        save_ts=tuple(c for _, c in at_ts), save_steps=tuple(c for _, c in at_steps),
+    )  # fmt: skip
+    return functions, numbers
+
+
+class _Solver:
+    """What Diffrax's loop asks of a solver."""
+
+    def __init__(self, step, consts, solver, terms):
+        self.hoisted, self.consts, self.interpolation_cls = step, consts, solver.interpolation_cls
+        self.order = solver.error_order(terms)
+
+    def error_order(self, terms):
+        return self.order
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        return self.hoisted(self.consts, t0, t1, y0, solver_state, made_jump)
+
+
+class _Controller:
+    """What Diffrax's loop asks of a controller, but no step is accepted where a member of a batch waits."""
+
+    def __init__(self, adapt, consts, controller):
+        self.hoisted, self.consts, self.controller = adapt, consts, controller
+
+    def adapt_step_size(self, t0, t1, y0, y1, args, y_error, order, state):
+        state, active = state
+        keep, *rest, state, result = self.hoisted(self.consts, self.controller, t0, t1, y0, y1, y_error, state)
+        return unless_waiting(active, jnp.asarray(keep), jnp.array(False)), *rest, (state, active), result
+
+
+class _Meter:
+    """A progress meter that does not run when pieces are run again."""
+
+    def __init__(self, meter):
+        self.meter = meter
+
+    def step(self, state, progress):
+        state, first = state
+        if not isinstance(self.meter, diffrax.NoProgressMeter):
+            state = lax.cond(first, lambda: self.meter.step(state, progress), lambda: state)
+        return state, first
+
+
+def _arrays(tree):
+    def one(leaf):
+        leaf = jnp.asarray(leaf)
+        return lax.convert_element_type(leaf, leaf.dtype)  # no weak types: those would change in the loop
+
+    return jax.tree.map(one, tree)
+
+
+def _without_buffers(state):
+    return _with_buffers(state, tuple((None, None) for _ in state_saves(state)))
+
+
+def _with_buffers(state, buffers):
+    if not buffers:
+        return state
+    return eqx.tree_at(
+        lambda s: [leaf for save in state_saves(s) for leaf in (save.ts, save.ys)],
+        state,
+        [leaf for pair in buffers for leaf in pair],
+        is_leaf=lambda leaf: leaf is None,
+    )

@@ -1,0 +1,194 @@
+"""The compiler: all passes in order."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..diagnosis.starts import check_equal_starts, dependent_starts
+from ..diagnosis.structure import check_structure
+from ..diagnosis.wording import itemised, listed
+from ..errors import ModelError, StructuralError, nearest
+from ..model.consistent_point import consistent_point
+from ..model.evaluate_numpy import Networks, start_values
+from ..model.extended import Extended
+from ..model.incidence import incidence
+from ..model.quantities import name_quantities, quantity_scale
+from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, describe_equation, equation_offsets, written_by
+from .differentiate_equations import differentiate_equations
+from .eliminate_aliases import eliminate_aliases
+from .order_blocks import Blocks, order_blocks
+from .resolve_cancellation import reduce_with_cancellation, zero_pivots
+from .select_states import StateSelection, select_states
+
+
+@dataclasses.dataclass(frozen=True)
+class CompiledModel:
+    """What the passes found, in the order they found it."""
+
+    flat: FlatModel
+    alias: AliasTable
+    groups: tuple[EquationGroup, ...]  # after alias elimination and the resolution of cancellations
+    extended: Extended
+    selection: StateSelection
+    blocks: Blocks
+    mode: str
+    quantity_name: tuple[str, ...]
+
+
+def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> CompiledModel:
+    """Runs the passes on a flattened model."""
+    groups, alias = eliminate_aliases(flat)
+    is_input = flat.variables.is_input
+    roots = np.arange(len(flat.variables)) == alias.root
+    column = np.full(len(flat.variables), -1, np.int64)
+    unknown = np.flatnonzero(roots & ~is_input)
+    column[unknown] = np.arange(len(unknown))
+    signature = incidence(groups, column, len(unknown))
+    check_structure(flat, groups, alias, signature, unknown)
+    started = check_equal_starts(flat, groups, alias)
+    named = np.flatnonzero(alias.root != ZERO)
+    least = np.zeros(len(flat.variables), np.int64)  # the highest derivative of each root that a variable is equal to
+    np.maximum.at(least, alias.root[named], alias.order[named])
+    groups, signature, offsets, notes = reduce_with_cancellation(
+        groups, column, len(unknown), least[unknown], flat.parameters.values
+    )
+    zero = zero_pivots(groups, signature, offsets, column, flat.parameters.values)
+    if len(zero):
+        raise StructuralError(_zero_pivot(flat, groups, int(zero[0])))
+    inputs = np.flatnonzero(roots & is_input)
+    column[inputs] = len(unknown) + np.arange(len(inputs))
+    extended = differentiate_equations(groups, offsets, column, is_input, least, len(unknown))
+    starts = (*started, *dependent_starts(flat, alias, extended))
+    names = name_quantities(flat, alias, extended)
+    preferred = _preferred(flat, alias, extended, prefer_states)
+    merit = _merit(flat, alias, extended, preferred)
+
+    def point():
+        return _initial_point(flat, alias, extended)
+
+    selection = select_states(
+        groups,
+        extended,
+        mode,
+        lambda q: merit[q],
+        quantity_scale(flat, alias, extended),
+        point,
+        lambda q: names[q],
+        lambda e: describe_equation(groups, int(e)),
+    )
+    selection = dataclasses.replace(selection, notes=(*_loose_ports(flat), *starts, *notes, *selection.notes))
+    known = np.zeros(extended.quantities.n, bool)
+    known[selection.states] = True
+    known[extended.quantities.n_unknown :] = True
+    blocks = order_blocks(extended, known, selection.constraints)
+    if isinstance(blocks, np.ndarray):
+        left = [describe_equation(groups, int(extended.base[e])) for e in blocks]
+        raise StructuralError(
+            "\n".join(
+                [
+                    "after index reduction nothing is left for these equations to determine: they follow from the "
+                    "others, or contradict them. Remove or change one of:",
+                    *itemised([(written_by(t) or "", t) for t in left]),
+                ]
+            )
+        )
+    _check_row_targets(flat, alias, extended, selection, names, mode)
+    return CompiledModel(flat, alias, groups, extended, selection, blocks, mode, tuple(names))
+
+
+def _zero_pivot(flat: FlatModel, groups: tuple[EquationGroup, ...], equation: int) -> str:
+    first = equation_offsets(groups)
+    g = int(np.searchsorted(first, equation, side="right") - 1)
+    parameters = groups[g].parameter[equation - int(first[g])].tolist()
+    values = [f"{flat.parameters.names[p]} = {flat.parameters.values[p]:g}" for p in dict.fromkeys(parameters)]
+    return (
+        f"the equation {describe_equation(groups, equation)} determines nothing for {', '.join(values)}: the "
+        "coefficient of what it should determine is zero. Give other values, or leave the component out."
+    )
+
+
+def _loose_ports(flat: FlatModel) -> tuple[str, ...]:
+    loose = [name for name, is_loose in zip(flat.ports.names, flat.ports.is_loose.tolist(), strict=True) if is_loose]
+    return (f"nothing is connected to {listed(loose, 12)}: nothing flows there",) if loose else ()
+
+
+def _preferred(flat: FlatModel, alias: AliasTable, extended: Extended, names: Sequence[str]) -> dict[int, int]:
+    """How strongly each quantity was asked for as a state."""
+    index = {n: k for k, n in enumerate(flat.variables.names)}
+    quantities = extended.quantities
+    out = {}
+    for k, name in enumerate(names):
+        if name not in index:
+            raise ModelError(f"prefer_states: '{name}' is no variable: " + nearest(name, index))
+        v = index[name]
+        root = int(alias.root[v])
+        if root != ZERO and quantities.column[root] >= 0:
+            q = int(quantities.first[quantities.column[root]] + alias.order[v])
+            out.setdefault(q, len(names) - k)
+    return out
+
+
+def _merit(flat: FlatModel, alias: AliasTable, extended: Extended, preferred: dict[int, int]) -> list[tuple]:
+    """How much each quantity should be a state: asked for, fixed at the start, given a start."""
+    quantities = extended.quantities
+    fixed = np.zeros(quantities.n, int)
+    started = np.zeros(quantities.n, int)
+    for v, start in enumerate(flat.variables.start):
+        root = int(alias.root[v])
+        if start is None or root == ZERO or quantities.column[root] < 0:
+            continue
+        j = quantities.column[root]
+        if alias.order[v] <= quantities.highest[j]:
+            q = quantities.first[j] + alias.order[v]
+            started[q] = 1
+            fixed[q] |= int(flat.variables.fixed[v])
+    return [(preferred.get(q, 0), int(fixed[q]), int(started[q])) for q in range(quantities.n)]
+
+
+def _initial_point(flat: FlatModel, alias: AliasTable, extended: Extended):
+    """All quantities near the declared starts, consistent where possible; parameters; networks."""
+    quantities = extended.quantities
+    values = flat.parameters.values
+    networks = Networks(tuple(flat.networks.values()))
+    value_of = start_values(flat.variables.start, values)
+    guess = np.zeros(quantities.n)
+    pins: dict[int, float] = {}
+    for v, start in enumerate(flat.variables.start):
+        root = int(alias.root[v])
+        if start is None or root == ZERO or quantities.column[root] < 0:
+            continue
+        j = quantities.column[root]
+        if alias.order[v] > quantities.highest[j]:
+            continue
+        q = int(quantities.first[j] + alias.order[v])
+        guess[q] = alias.sign[v] * value_of(v)
+        if flat.variables.fixed[v]:
+            pins[q] = guess[q]
+    point, _ = consistent_point(extended, guess, list(pins.items()), values, 0.0, networks)
+    return point, values, networks
+
+
+def _check_row_targets(
+    flat: FlatModel, alias: AliasTable, extended: Extended, selection: StateSelection, names: list[str], mode: str
+):
+    quantities = extended.quantities
+    states = set(selection.states.tolist())
+    listed = ", ".join(repr(names[q]) for q in selection.states[:12])
+    for row in flat.rows:
+        if mode != "dummy_derivatives":
+            raise ModelError(
+                f"neural block '{row.opaque.name}': inject='row' adds to rows of a minimal set of states, so it needs "
+                f"state_selection='dummy_derivatives'; this compiler has '{mode}'. For a real force, use "
+                "inject='equation'."
+            )
+        for v in row.targets:
+            root = int(alias.root[v])
+            q = -1 if root == ZERO else int(quantities.first[quantities.column[root]] + alias.order[v])
+            if q not in states:
+                name = flat.variables.names[v]
+                raise ModelError(
+                    f"neural block '{row.opaque.name}': its target '{name}' is no state, so it has no row to "
+                    f"add to. The states are {listed}. To make it one, compile with prefer_states=['{name}']; or "
+                    "use inject='equation', which needs no state."
+                )

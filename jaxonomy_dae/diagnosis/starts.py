@@ -1,0 +1,150 @@
+"""Fixed starts that repeat or contradict each other.
+
+A fixed start is an equation that holds at the initial time. Too many of them are no fault as long as they agree, and
+whether they do usually depends on parameters, so that initialization decides. What certainly contradicts (plain
+numbers) is an error here; what must agree is noted in the report.
+"""
+
+import numpy as np
+
+from ..errors import StructuralError
+from ..model.evaluate_numpy import start_values
+from ..model.extended import Extended
+from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel
+from ..model.templates import LinearTemplate
+from ..structure.dulmage_mendelsohn import dulmage_mendelsohn
+from ..structure.incidence import Incidence, compress
+from ..structure.matching import maximum_matching
+from .wording import counted, listed
+
+CLOSE = 1e-9  # numbers that differ by less, relative to their size, are meant to be equal
+
+
+def check_equal_starts(flat: FlatModel, groups: tuple[EquationGroup, ...], alias: AliasTable) -> tuple[str, ...]:
+    """Compares the fixed starts of variables that are one quantity, and of those in linear equations with numbers.
+
+    Returns notes on starts that must agree.
+
+    **Raises:**
+
+    - `StructuralError` if starts that are plain numbers contradict each other, or a start is fixed of what an input
+        gives.
+    """
+    table = flat.variables
+    fixed = np.flatnonzero(table.fixed).tolist()
+    value_of = start_values(table.start, flat.parameters.values)
+    notes: list[str] = []
+    first: dict[tuple[int, int], int] = {}
+    numbers: dict[tuple[int, int], tuple[int, float]] = {}
+    for v in fixed:
+        name, start = table.names[v], table.start[v]
+        assert start is not None
+        number = None if start.parameters else value_of(v)
+        key, sign = (int(alias.root[v]), int(alias.order[v])), int(alias.sign[v])
+        if key[0] == ZERO:
+            if number:
+                raise StructuralError(
+                    f"the start of '{name}' is fixed at {number:g}, but the equations say that it is always zero. Free "
+                    "the start (fixed=False)."
+                )
+            continue
+        if table.is_input[key[0]]:
+            raise StructuralError(
+                f"the start of '{name}' is fixed, but its value comes from the input '{table.names[key[0]]}'. Free the "
+                "start (fixed=False)."
+            )
+        if number is not None and key in numbers and not _equal(numbers[key][1], sign * number):
+            w, other = numbers[key]
+            relation = "are equal" if alias.sign[w] == sign else "are equal but for the sign"
+            raise StructuralError(
+                f"'{table.names[w]}' and '{name}' {relation}, but their starts are fixed at "
+                f"{other * alias.sign[w]:g} and {number:g}. Free one of them (fixed=False)."
+            )
+        if number is not None:
+            numbers.setdefault(key, (v, sign * number))
+        if key in first:
+            w = first[key]
+            same = sign == alias.sign[w] and table.start[w] == start
+            settled = same or (key in numbers and numbers[key][0] == w and number is not None)
+            notes.append(
+                f"'{table.names[w]}' and '{name}' are one quantity, and both starts are fixed: "
+                + ("they agree, so one of them is enough" if settled else "they must agree; one of them is enough")
+            )
+        first.setdefault(key, v)
+    _check_linear(flat, groups, numbers)
+    return tuple(notes)
+
+
+def _equal(a: float, b: float) -> bool:
+    return abs(a - b) <= CLOSE * max(abs(a), abs(b))
+
+
+def _check_linear(flat: FlatModel, groups, numbers: dict[tuple[int, int], tuple[int, float]]):
+    """Equations with numeric coefficients, all of whose quantities start at fixed numbers."""
+    if len(numbers) < 2:
+        return
+    highest = 1 + max(order for _, order in numbers)
+    value = np.full((len(flat.variables), highest), np.nan)
+    for (root, order), (_, number) in numbers.items():
+        value[root, order] = number
+    for group in groups:
+        if not isinstance(group.template, LinearTemplate) or not group.variable.shape[1]:
+            continue
+        inside = group.order < highest
+        here = np.where(inside, value[group.variable, np.where(inside, group.order, 0)], np.nan)
+        terms = group.coefficient * here
+        wrong = np.abs(terms.sum(axis=1)) > CLOSE * np.abs(terms).max(axis=1)  # False for NaN
+        if wrong.any():
+            k = int(np.argmax(wrong))
+            pairs = zip(group.variable[k].tolist(), group.order[k].tolist(), strict=True)
+            names = [flat.variables.names[numbers[q][0]] for q in pairs]
+            raise StructuralError(
+                f"the fixed starts of {listed(names)} contradict the equation {group.origin[k]}. Free one of them "
+                "(fixed=False), or give values that agree."
+            )
+
+
+def dependent_starts(flat: FlatModel, alias: AliasTable, extended: Extended) -> tuple[str, ...]:
+    """Notes on fixed starts that outnumber what they can choose: they must agree.
+
+    The fixed starts join the extended system as equations; they depend on each other where its Dulmage–Mendelsohn
+    decomposition is over-determined.
+    """
+    quantities = extended.quantities
+    pins: dict[int, int] = {}
+    for v in np.flatnonzero(flat.variables.fixed).tolist():
+        root = int(alias.root[v])
+        if root != ZERO and 0 <= quantities.column[root] < quantities.n_unknown_columns:
+            column = quantities.column[root]
+            if alias.order[v] <= quantities.highest[column]:
+                pins.setdefault(int(quantities.first[column] + alias.order[v]), v)
+    pinned = np.array(list(pins), np.int64)
+    owner = quantities.owner[pinned]
+    if not len(pins) or (not extended.level.any() and (quantities.order[pinned] < quantities.highest[owner]).all()):
+        return ()  # every fixed quantity is free to choose
+    n, m = extended.n_equations, quantities.n_unknown
+    wanted = np.zeros(quantities.n, bool)
+    wanted[:m] = True
+    pointer, columns = extended.incidence(wanted)
+    rows = np.concatenate([np.repeat(np.arange(n), np.diff(pointer)), n + np.arange(len(pinned))])
+    columns = np.concatenate([columns, pinned])
+    pattern = Incidence(*compress(rows, columns, np.zeros_like(rows), n + len(pinned)), m)
+    matched = maximum_matching(pattern.pointer, pattern.variable, m)
+    over, _ = dulmage_mendelsohn(pattern, matched)
+    notes = []
+    for equations, inside in over:
+        names = [flat.variables.names[pins[int(pinned[k - n])]] for k in equations if k >= n]
+        surplus = len(equations) - len(inside)
+        if len(names) > 1 and len({name.rpartition(".")[0] for name in names}) == 1:
+            continue  # one component's own affair: its author fixed what its author made agree
+        if len(names) == 1:
+            notes.append(
+                f"the start of '{names[0]}' is fixed, but follows from the equations: they must agree, or free it"
+            )
+        elif names:
+            free = counted(max(len(names) - surplus, 0), "degree") + " of freedom"
+            notes.append(
+                f"{len(names)} starts are fixed for {free}, those of {listed(names)}: they must agree, or free "
+                f"{surplus} of them"
+            )
+    return tuple(notes)

@@ -1,0 +1,154 @@
+"""Structural diagnosis: which part of a model has too many equations, and which too few.
+
+What has a name is said by that name (`recognise`). For anything else, the Dulmage–Mendelsohn decomposition of the
+incidence isolates the parts concerned: equations that compete for the same variables, and variables that share too few
+equations.
+"""
+
+import numpy as np
+
+from ..errors import StructuralError
+from ..model.incidence import incidence
+from ..model.tables import AliasTable, EquationGroup, FlatModel, describe_equation, written_by
+from ..structure.dulmage_mendelsohn import dulmage_mendelsohn
+from ..structure.incidence import Incidence
+from ..structure.matching import maximum_matching
+from .recognise import recognise
+from .wording import counted, itemised, listed
+
+PARTS = 4
+
+
+def check_structure(
+    flat: FlatModel,
+    groups: tuple[EquationGroup, ...],
+    alias: AliasTable,
+    pattern: Incidence,
+    unknown: np.ndarray,
+) -> None:
+    """Raises a `StructuralError` in user names if the model is certainly singular.
+
+    `groups` and `alias` are those after alias elimination; `unknown` lists the variable behind each column of the
+    incidence `pattern`. After the check, every equation can be matched with an unknown of its own.
+    """
+    found = recognise(flat, groups, alias)
+    if found.texts:
+        raise StructuralError(_joined(found.texts, found.more))
+    matched = maximum_matching(pattern.pointer, pattern.variable, pattern.n_variables)
+    taken = np.zeros(pattern.n_variables, bool)
+    taken[matched[matched >= 0]] = True
+    if (matched >= 0).all() and taken.all() and not found.equations:
+        return
+    over, under = dulmage_mendelsohn(pattern, matched)
+    if found.equations:
+        texts = []
+        for rows, variables in found.equations:
+            if not len(variables):
+                text = describe_equation(flat.groups, int(rows[0]))
+                texts.append(
+                    f"this equation contains no unknown: {text}. Remove it, or declare its input as a variable."
+                )
+                continue
+            names = [flat.variables.names[v] for v in variables if not flat.variables.is_port[v]]
+            names = names or [flat.variables.names[v] for v in variables]
+            texts.append(_too_many([describe_equation(flat.groups, int(r)) for r in rows], len(variables), names))
+    else:
+        texts = [
+            _too_many(
+                [describe_equation(groups, int(r)) for r in rows], len(columns), _names(flat, alias, unknown, columns)
+            )
+            for rows, columns in over
+            if len(columns)
+        ]
+        empty = [describe_equation(groups, int(rows[0])) for rows, columns in over if not len(columns)]
+        texts += _repeated(flat, empty) if empty else []
+    texts += [
+        _too_few(flat, len(rows), _names(flat, alias, unknown, columns), np.isin(alias.root, unknown[columns]))
+        for rows, columns in under
+    ]
+    raise StructuralError(_joined(texts, found.more))
+
+
+# --- what to say -------------------------------------------------------------------------------------------------
+
+
+def _joined(texts: list[str], unseen: int = 0) -> str:
+    unseen += max(len(texts) - PARTS, 0)
+    if len(texts) == 1 and not unseen:
+        return texts[0]
+    more = [f"- … and {unseen} more."] if unseen else []
+    return "\n".join(["the equations do not fit together:", *(f"- {t}" for t in texts[:PARTS]), *more])
+
+
+def _too_many(equations: list[str], n_unknowns: int, names: list[str]) -> str:
+    n = len(equations)
+    if n > n_unknowns:
+        lines = [
+            f"{counted(n, 'equation')} determine only {counted(n_unknowns, 'unknown')}, {listed(names)}. "
+            f"Remove {counted(n - n_unknowns, 'equation') if n - n_unknowns > 1 else 'one'} of:"
+        ]
+    else:
+        lines = ["one of these equations repeats or contradicts the others. Remove or change one of:"]
+    own = [e for e in equations if written_by(e) is not None]
+    others = [e for e in equations if written_by(e) is None]
+    return "\n".join(lines + itemised([(written_by(e) or "", e) for e in (*own, *others)]))
+
+
+def _repeated(flat: FlatModel, empty: list[str]) -> list[str]:
+    """What to say of equations in which alias elimination has left no variable."""
+    column = np.cumsum(~flat.variables.is_input) - 1
+    column[flat.variables.is_input] = -1
+    unknown = np.flatnonzero(~flat.variables.is_input)
+    whole = incidence(flat.groups, column, len(unknown))
+    over, _ = dulmage_mendelsohn(whole, maximum_matching(whole.pointer, whole.variable, whole.n_variables))
+    texts = []
+    for rows, columns in over:
+        equations = [describe_equation(flat.groups, int(r)) for r in rows]
+        if not set(empty).isdisjoint(equations):
+            empty = [e for e in empty if e not in equations]
+            names = [flat.variables.names[v] for v in unknown[columns] if not flat.variables.is_port[v]]
+            texts.append(
+                _too_many(equations, len(columns), names or [flat.variables.names[v] for v in unknown[columns]])
+            )
+    return texts + [f"this equation only repeats what others say: {e}. Remove it." for e in empty]
+
+
+def _unused_inside(flat: FlatModel) -> np.ndarray:
+    """Ports that no equation and no connection inside their component mentions."""
+    unused = ~flat.ports.has_inside
+    for group in flat.groups:
+        if len(group) and group.variable.shape[1]:
+            port = flat.variables.port[group.variable[[written_by(o) is not None for o in group.origin]]]
+            unused[port[port >= 0]] = False
+    return unused
+
+
+def _too_few(flat: FlatModel, n_equations: int, names: list[str], concerned: np.ndarray) -> str:
+    missing = len(names) - n_equations
+    unused = _unused_inside(flat)
+    port = flat.variables.port[concerned & (flat.variables.port >= 0)]
+    hollow = [flat.ports.names[p] for p in np.unique(port[unused[port]]).tolist()]
+    owners = {name.rpartition(".")[0] for name in names}
+    loose = [p for p, is_loose in zip(flat.ports.names, flat.ports.is_loose.tolist(), strict=True) if is_loose]
+    near = [p for p in loose if p.rpartition(".")[0] in owners]
+    if n_equations == 0:
+        text = f"nothing determines {listed(names, joint='or')}"
+    else:
+        text = f"only {counted(n_equations, 'equation')} for {counted(len(names), 'unknown')}, {listed(names)}"
+    if hollow:
+        inside = listed(dict.fromkeys(p.rpartition(".")[0] for p in hollow))
+        return f"inside {inside} nothing uses {listed(hollow)}: connect it there, or write its equations."
+    if near:
+        return f"{text}: {'is' if len(near) == 1 else 'are'} {listed(near)} meant to be connected?"
+    if len(names) == 1:
+        return f"{text}: add an equation for it, declare it as an input, or leave it out."
+    what = "an equation" if missing == 1 else f"{missing} equations"
+    return f"{text}: add {what}, or declare {'one' if missing == 1 else missing} of them as an input."
+
+
+def _names(flat: FlatModel, alias: AliasTable, unknown: np.ndarray, columns: np.ndarray) -> list[str]:
+    """For each column, the variable that names it best: no port, if there is one."""
+    variables = flat.variables
+    order = np.lexsort((np.arange(len(variables)), variables.is_port, alias.order, alias.root))
+    first = order[np.searchsorted(alias.root[order], unknown[columns])]
+    return [variables.names[v] for v in first.tolist()]

@@ -1,0 +1,357 @@
+"""What initialization did, in user names: for `system.initialization_report()`, and for the text of its errors."""
+
+import functools
+import html
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from ..diagnosis.singular_blocks import ILL_CONDITIONED, BlockFinding, equation_text, examine_blocks
+from ..lowering.plan import SystemPlan
+from ..lowering.schedule import SparseStep
+from ..model.tables import ZERO
+from ..system.system_at import input_values
+from .initialize import InitialPoint, tolerance
+from .ladder import FAILED, METHODS
+from .rows import Row, initial_rows, supports
+
+SHOWN = 12
+HTML_SHOWN = 200
+WORST = 5
+CONDITION_LIMIT = 500  # unknowns up to which the condition of the initial equations is computed
+
+
+class Guess(NamedTuple):
+    """A state that nothing fixes: where the search began, and the value found."""
+
+    name: str
+    guess: float
+    value: float
+
+    @property
+    def moved(self) -> float:
+        return self.value - self.guess
+
+
+class Redundant(NamedTuple):
+    """A start that the equations and other starts determine: pairs of name and value."""
+
+    name: str
+    value: float
+    follows_from: tuple[tuple[str, float], ...]
+    agrees: bool
+
+
+class Residual(NamedTuple):
+    """What does not hold: an equation or a start, the variables in it, and by how much."""
+
+    text: str
+    variables: tuple[str, ...]
+    value: float
+
+
+class InitializationReport:
+    """What initialization did; `print(report)` shows it.
+
+    - `consistent`: whether a point was found at which everything holds.
+    - `method`: the rung of the ladder that found it, `evaluations` how many residuals it took.
+    - `fixed`: starts that hold, as pairs of name and value: values given come first, then declared ones.
+    - `guesses`: states that nothing fixes, and how far each moved.
+    - `redundant`: starts that follow from others, and whether they agree.
+    - `outranked`: names of fixed starts that gave way to values of the caller's.
+    - `solved`: parameters solved for, as pairs of name and value.
+    - `residuals`: what does not hold, worst first; empty if the point is consistent.
+    - `blocks`: blocks of equations that are singular at the point, or ill-conditioned.
+    - `notes`.
+    """
+
+    def __init__(
+        self, system: Any, found: InitialPoint, t0: Any, inputs: Any, initial: Any, solve_for: tuple[str, ...] = ()
+    ):
+        self._system, self._found, self._inputs = system, found, inputs
+        self._plan: SystemPlan = system.plan
+        table = system.parameters.table
+        self._key = (self._plan, tuple(sorted(initial or ())), tuple(table.index(n) for n in solve_for))
+        self._rows = initial_rows(*self._key)
+        self.time = float(t0)
+        self.method = METHODS[int(found.method)]
+        self.evaluations = int(found.evaluations)
+        self.outranked = list(self._rows.dropped)
+        self.solved = [(n, float(v)) for n, v in zip(solve_for, np.asarray(found.solved), strict=True)]
+        self._residual = np.asarray(found.residual, float)
+        self._target = np.asarray(found.target, float)[len(self._residual) - len(self._rows.kept) :]
+        self._x = np.asarray(found.x, float)
+        self._limit = float(tolerance(found.x.dtype, np.append(self._x, np.asarray(found.solved, float))))
+        unknown = np.append(self._x, np.asarray(found.solved, float))
+        self.consistent = bool(np.abs(self._residual).max(initial=0.0) <= self._limit and np.isfinite(unknown).all())
+
+    # --- starts ------------------------------------------------------------------------------------------------
+
+    @property
+    def _promoted(self) -> int:
+        """How many of the rows kept, the last ones, are guesses."""
+        return 0 if self._rows.direct else len(self._rows.promoted)
+
+    @functools.cached_property
+    def fixed(self) -> list[tuple[str, float]]:
+        kept = self._rows.kept[: len(self._rows.kept) - self._promoted]
+        redundant = set(self._rows.redundant)
+        return [(r.name, float(self._target[k])) for k, r in enumerate(kept) if k not in redundant]
+
+    @functools.cached_property
+    def guesses(self) -> list[Guess]:
+        plan, rows = self._plan, self._rows
+        n = len(rows.kept) - self._promoted
+        held = {r.quantity for r in rows.kept[:n]}
+        parameters = np.asarray(self._system.parameters.array, float)
+        out = []
+        for k, q in enumerate((*plan.states, *plan.carried)):
+            if int(q) in held:
+                continue
+            row = rows.guess[k]
+            guess = 0.0
+            if row is not None and row.given < 0 and row.start is not None:
+                values = list(parameters[list(row.start.parameters)])
+                guess = row.sign * float(row.start.template.residual([], values, [], 0.0, None, backend="numpy"))
+            name = plan.quantity_name[int(q)]
+            sign = -1.0 if name.startswith("-") else 1.0
+            out.append(Guess(name.removeprefix("-"), sign * guess + 0.0, sign * float(self._x[k]) + 0.0))
+        return out
+
+    @functools.cached_property
+    def redundant(self) -> list[Redundant]:
+        rows = self._rows
+        if not rows.redundant:
+            return []
+        place = {id(r): k for k, r in enumerate(rows.kept)}
+        position = {(r.name, r.given): k for k, r in enumerate(rows.kept)}
+
+        def value(row: Row) -> tuple[str, float]:
+            k = place.get(id(row), position[row.name, row.given])
+            return row.name, float(self._target[k])
+
+        out = []
+        first = len(self._residual) - len(rows.kept)
+        for k, others in supports(*self._key).items():
+            involved = [k, *(position[o.name, o.given] for o in others)]
+            off = np.abs(self._residual[[first + j for j in involved]]).max()
+            name, number = value(rows.kept[k])
+            out.append(Redundant(name, number, tuple(value(o) for o in others), bool(off <= self._limit)))
+        return out
+
+    # --- residuals ---------------------------------------------------------------------------------------------
+
+    @functools.cached_property
+    def residuals(self) -> list[Residual]:
+        if self.consistent:
+            return []
+        size = np.abs(self._residual)
+        order = np.argsort(np.where(np.isfinite(size), -size, -np.inf), kind="stable")
+        described = self._described()
+        chosen = [int(k) for k in order if not size[k] <= self._limit]
+        return [Residual(described[k][0], described[k][1], float(self._residual[k])) for k in chosen]
+
+    def _described(self) -> list[tuple[str, tuple[str, ...]]]:
+        """The text and the variables of every row, as `initialize` orders them."""
+        plan = self._plan
+        starts = [
+            (f"start of {r.name}, {v:.6g}", (r.name,)) for r, v in zip(self._rows.kept, self._target, strict=True)
+        ]
+        if self._rows.direct:
+            return starts
+        out = []
+        for planned in plan.constraints:
+            for e, q in zip(planned.group.equation, planned.group.quantity, strict=True):
+                out.append((equation_text(plan, int(e)), self._names(q)))
+        for step in plan.steps:
+            if step.carried:
+                whole = isinstance(step, SparseStep)
+                for equation in step.equations if whole else [step.equations[e] for e in step.tearing.residuals]:
+                    for b in range(len(equation.equation)):
+                        slots = np.array([s.quantity[b] for s in equation.slots])
+                        out.append((equation_text(plan, int(equation.equation[b])), self._names(slots)))
+        return out + starts
+
+    def _names(self, quantities: np.ndarray) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(self._plan.quantity_name[int(q)].removeprefix("-") for q in quantities if q != ZERO))
+
+    # --- blocks ------------------------------------------------------------------------------------------------
+
+    @functools.cached_property
+    def blocks(self) -> list[BlockFinding]:
+        return list(self._examine()) if self.consistent else []
+
+    def _examine(self):
+        system, plan = self._system, self._plan
+        parameters = system.parameters.array
+        if self.solved:
+            index = np.array([system.parameters.table.index(n) for n, _ in self.solved])
+            parameters = parameters.at[index].set(self._found.solved)
+        networks = tuple(system.neural[n] for n in plan.network_names)
+
+        def inputs():
+            return np.array([float(v) for v in input_values(plan, self._inputs, self.time, parameters.dtype)])
+
+        with jax.ensure_compile_time_eval():
+            yield from examine_blocks(plan, np.asarray(parameters, float), networks, self.time, self._x, inputs)
+
+    @functools.cached_property
+    def _condition(self) -> float | None:
+        """The condition number of the initial equations, rows and columns scaled."""
+        jacobian = self._found.jacobian
+        if jacobian is None or not self.consistent or not 0 < max(jacobian.shape) <= CONDITION_LIMIT:
+            return None
+        matrix = np.asarray(jacobian, float)
+        for axis in (1, 0, 1):
+            matrix = matrix / np.maximum(np.abs(matrix).max(axis=axis, keepdims=True), 1e-300)
+        s = np.linalg.svd(matrix, compute_uv=False)
+        return float(s[0] / s[-1]) if s[-1] > 0 else np.inf
+
+    @functools.cached_property
+    def notes(self) -> list[str]:
+        out = []
+        for block in self.blocks:
+            if not block.singular:
+                out.append(
+                    f"the block of {_some(block.variables)} is ill-conditioned, {block.condition:.1e}: about "
+                    f"{int(np.log10(block.condition))} digits of its solution are lost"
+                )
+        if self._condition is not None and self._condition > ILL_CONDITIONED:
+            out.append(
+                f"the initial equations are ill-conditioned, {self._condition:.1e}: the starts hardly determine the "
+                "point, and its gradients are not reliable"
+            )
+        return out
+
+    # --- text --------------------------------------------------------------------------------------------------
+
+    @property
+    def problem(self) -> str | None:
+        """The text of the `InitializationError` this amounts to, or None if the model can start here."""
+        if not self.consistent:
+            return self._inconsistent()
+        for block in self._examine():
+            if block.singular:
+                return self._singular(block)
+        return None
+
+    def _inconsistent(self) -> str:
+        if not np.isfinite(self._residual).all() or not np.isfinite(self._x).all():
+            wrong = [r.text for r in self.residuals if not np.isfinite(r.value)][:4]
+            return (
+                "no consistent initial point: the equations are not finite at the start values"
+                + (f" ({'; '.join(wrong)})" if wrong else "")
+                + ". Give start values at a regular point with `initial={...}` or in the components."
+            )
+        lines = ["no consistent initial point was found; what does not hold, worst first:"]
+        for r in self.residuals[:WORST]:
+            variables = "" if r.text.startswith("start of ") else f", in {_some(r.variables)}"
+            lines.append(f"  {r.text}{variables}: off by {abs(r.value):.3g}")
+        if len(self.residuals) > WORST:
+            lines.append(f"  … and {len(self.residuals) - WORST} more")
+        contradictions = [r for r in self.redundant if not r.agrees]
+        lines += [_contradiction(r) for r in contradictions[:4]]
+        if not contradictions:
+            lines.append(
+                f"Newton's method, Levenberg–Marquardt and homotopy did not find a solution in {self.evaluations} "
+                "evaluations. Check the starts named above, or give better guesses with `initial={...}`."
+            )
+        return "\n".join(lines)
+
+    def _singular(self, block: BlockFinding) -> str:
+        causes = ", ".join(f"{n} = {v:.6g}" for n, v in block.causes[:6])
+        at = f" with {causes}" if causes else ""
+        if block.causes_are_parameters:
+            names = [n for n, _ in block.causes]
+            mend = f"Give {names[0]} another value" if len(names) == 1 else f"Give one of {_some(names)} another value"
+        else:
+            mend = "Start elsewhere, with `initial={...}` or other parameters"
+        lines = [
+            f"the equations are singular at the initial point{at}: they do not determine {_some(block.variables)}",
+            *(f"  {text}" for text in block.equations[:SHOWN]),
+        ]
+        if len(block.equations) > SHOWN:
+            lines.append(f"  … and {len(block.equations) - SHOWN} more")
+        lines.append(f"{mend}, or remove from the model what has become superfluous.")
+        return "\n".join(lines)
+
+    def __str__(self):
+        head, sections = self._contents()
+        lines = list(head)
+        for title, entries in sections:
+            more = [f"    … and {len(entries) - SHOWN} more"] if len(entries) > SHOWN else []
+            lines += [f"{title}:", *(f"    {e}" for e in entries[:SHOWN]), *more]
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        """The same for a notebook: sections that fold."""
+        head, sections = self._contents()
+        out = [f"<p>{'<br>'.join(html.escape(line) for line in head)}</p>"]
+        for title, entries in sections:
+            items = "".join(f"<li><code>{html.escape(e)}</code></li>" for e in entries[:HTML_SHOWN])
+            more = f"<li>… and {len(entries) - HTML_SHOWN} more</li>" if len(entries) > HTML_SHOWN else ""
+            opened = " open" if len(entries) <= SHOWN else ""
+            out.append(f"<details{opened}><summary>{html.escape(title)}</summary><ul>{items}{more}</ul></details>")
+        return "".join(out)
+
+    def _contents(self) -> tuple[list[str], list[tuple[str, list[str]]]]:
+        singular = [b for b in self.blocks if b.singular]
+        state = "a consistent" if self.consistent else "no consistent"
+        head = [f"{state} initial point at t = {self.time:g}" + (", singular" if singular else "")]
+        if self._rows.direct:
+            head.append("the starts are the states; nothing had to be solved")
+        elif self.method == METHODS[0]:
+            head.append("the starts fulfil all equations; nothing had to be solved")
+        elif self.method == METHODS[FAILED]:
+            head.append(f"no method succeeded, {self.evaluations} evaluations")
+        else:
+            head.append(f"found by {self.method}, {self.evaluations} evaluations")
+        sections = [
+            ("solved for", [f"{n} = {v:.6g}" for n, v in self.solved]),
+            ("fixed", [f"{n} = {v:.6g}" for n, v in self.fixed]),
+            ("redundant, as they follow from others", [_redundancy(r) for r in self.redundant if r.agrees]),
+            ("contradicting", [_contradiction(r) for r in self.redundant if not r.agrees]),
+            ("fixed in the model, but outranked by values given", self.outranked),
+            ("guesses", [_guess(g, self._limit) for g in self.guesses]),
+            ("does not hold, worst first", [f"{r.text}: off by {abs(r.value):.3g}" for r in self.residuals]),
+            ("singular", [self._singular(b).replace("\n", " ") for b in singular]),
+            ("notes", self.notes),
+        ]
+        return head, [(title, list(entries)) for title, entries in sections if entries]
+
+
+def _guess(g: Guess, limit: float) -> str:
+    if abs(g.moved) <= limit:
+        return f"{g.name} = {g.value:.6g}, kept"
+    return f"{g.name} = {g.value:.6g}, moved by {g.moved:.3g} from {g.guess:.6g}"
+
+
+def _redundancy(r: Redundant) -> str:
+    others = ", ".join(f"{n} = {v:.6g}" for n, v in r.follows_from)
+    return f"{r.name} = {r.value:.6g}" + (f", from {others}" if others else ", from the equations")
+
+
+def _contradiction(r: Redundant) -> str:
+    if not r.follows_from:
+        return (
+            f"{r.name} is fixed at {r.value:.6g}, but the equations alone determine it: free it (fixed=False), or give "
+            "a value that agrees."
+        )
+    names = [r.name, *(n for n, _ in r.follows_from)]
+    values = [r.value, *(v for _, v in r.follows_from)]
+    return (
+        f"{_joined(names)} are fixed at {_joined([f'{v:.6g}' for v in values])}, which contradict each other: free one "
+        "start (fixed=False), or give values that agree."
+    )
+
+
+def _joined(names: list[str]) -> str:
+    return ", ".join(names[:-1]) + " and " + names[-1]
+
+
+def _some(names: Any) -> str:
+    names = list(names)
+    return ", ".join(names[:SHOWN]) + (f", … ({len(names)} in all)" if len(names) > SHOWN else "")

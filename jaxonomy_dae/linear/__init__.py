@@ -1,0 +1,1 @@
+"""Linear operators and solvers: written out, dense, sparse."""

@@ -1,0 +1,164 @@
+"""The linear algebra of implicit steps: one interface, chosen by size.
+
+A step factorises W = a·M − ∂F/∂y once and solves with it often. `factor` gives what the solves need, as arrays;
+`solve` is differentiable with respect to W and the right-hand side by the implicit rule, and never through the
+factorisation.
+"""
+
+import functools
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..errors import ModelError
+from .mass import Mass
+from .sparse import SparsePattern, available, compressed, solve_sparse
+from .written_out import solve as solve_unrolled
+
+UNROLLED_INVERSE = 4  # up to this many unknowns the inverse is written out
+EXPLICIT_INVERSE = 32  # up to this many it is kept: a solve is one small product, a tenth of LAPACK's calls
+
+
+class Dense(eqx.Module):
+    """Dense matrices: an explicit inverse for few unknowns, LU with partial pivoting for more.
+
+    The forward error of a solve by the inverse is of the size of that by LU (Higham 2002, Accuracy and Stability of
+    Numerical Algorithms, 14.1).
+    """
+
+    def jacobian(self, function: Any, y: Any) -> tuple[Any, Any]:
+        """(F(y), ∂F/∂y, shape (n, n))."""
+        value, push = jax.linearize(function, y)
+        return value, jax.vmap(push, out_axes=-1)(jnp.eye(y.shape[0], dtype=y.dtype))
+
+    def combine(self, mass: Mass, a: Any, jacobian: Any) -> Any:
+        """a·M − ∂F/∂y."""
+        m = mass.array if not mass.is_diagonal else np.diag(mass.array)
+        return a * jnp.asarray(m, jacobian.dtype) - jacobian
+
+    def index_matrix(self, mass: Mass, jacobian: Any) -> Any:
+        """M − P·∂F/∂y with P the projector onto the algebraic equations: regular if and only if the index is 1."""
+        p = jnp.asarray(mass.algebraic, jacobian.dtype)
+        m = jnp.asarray(mass.array, jacobian.dtype)
+        if mass.is_diagonal:
+            return jnp.diag(m) - p[:, None] * jacobian
+        return m - p @ jacobian
+
+    def factor(self, matrix: Any) -> Any:
+        """What solves need."""
+        n = matrix.shape[0]
+        if n <= UNROLLED_INVERSE:
+            rows = [[matrix[i, j] for j in range(n)] for i in range(n)]
+            return jnp.stack(solve_unrolled(rows, list(jnp.eye(n, dtype=matrix.dtype))))
+        lu, _, order = jax.lax.linalg.lu(matrix)
+        if n > EXPLICIT_INVERSE:
+            return lu, order
+        return _substitute(lu, jnp.eye(n, dtype=matrix.dtype)[order])
+
+    def empty(self, n: int, dtype: Any) -> Any:
+        """Something that looks like a factorisation."""
+        square = jnp.zeros((n, n), dtype)
+        return (square, jnp.zeros((n,), jnp.int32)) if n > EXPLICIT_INVERSE else square
+
+    def apply(self, factor: Any, matrix: Any, b: Any) -> Any:
+        """W⁻¹ b, without derivatives."""
+        if isinstance(factor, tuple):
+            lu, order = factor
+            return _substitute(lu, b[order][:, None])[:, 0]
+        return factor @ b
+
+    def solve(self, factor: Any, matrix: Any, b: Any) -> Any:
+        """W⁻¹ b, differentiable."""
+        factor = jax.lax.stop_gradient(factor)
+
+        def transposed(_, c):
+            if isinstance(factor, tuple):
+                lu, order = factor
+                y = jax.lax.linalg.triangular_solve(lu, c[:, None], left_side=True, lower=False, transpose_a=True)
+                y = jax.lax.linalg.triangular_solve(
+                    lu, y, left_side=True, lower=True, transpose_a=True, unit_diagonal=True
+                )
+                return jnp.zeros_like(c).at[order].set(y[:, 0])
+            return factor.T @ c
+
+        return jax.lax.custom_linear_solve(
+            lambda x: matrix @ x, b, lambda _, c: self.apply(factor, None, c), transposed
+        )
+
+
+def _substitute(lu: Any, b: Any) -> Any:
+    y = jax.lax.linalg.triangular_solve(lu, b, left_side=True, lower=True, unit_diagonal=True)
+    return jax.lax.linalg.triangular_solve(lu, y, left_side=True, lower=False)
+
+
+class Sparse(eqx.Module):
+    """Sparse matrices of one pattern, as values in the order of the pattern: needs the extra `sparse`.
+
+    Only values are kept between steps: KLU factorises anew at each solve, which costs about as much as reading a stored
+    factorisation would.
+    """
+
+    pattern: SparsePattern = eqx.field(static=True)
+
+    def jacobian(self, function: Any, y: Any) -> tuple[Any, Any]:
+        """(F(y), the values of ∂F/∂y, from one derivative for each colour of its columns)."""
+        value, push = jax.linearize(function, y)
+        return value, compressed(push, self.pattern, y.dtype)
+
+    def combine(self, mass: Mass, a: Any, jacobian: Any) -> Any:
+        """a·M − ∂F/∂y."""
+        m = jnp.asarray(_diagonal(mass), jacobian.dtype)
+        return jnp.concatenate([-jacobian, a * m])
+
+    def index_matrix(self, mass: Mass, jacobian: Any) -> Any:
+        """M − P·∂F/∂y with P the projector onto the algebraic equations: regular if and only if the index is 1."""
+        p = jnp.asarray(mass.algebraic, jacobian.dtype)
+        return jnp.concatenate([-p[self.pattern.rows] * jacobian, jnp.asarray(_diagonal(mass), jacobian.dtype)])
+
+    def factor(self, matrix: Any) -> Any:
+        """The values themselves."""
+        return matrix
+
+    def empty(self, n: int, dtype: Any) -> Any:
+        """Something that looks like what `factor` returns."""
+        return jnp.zeros((len(self.pattern) + n,), dtype)
+
+    def apply(self, factor: Any, matrix: Any, b: Any) -> Any:
+        """W⁻¹ b, without derivatives."""
+        return self.solve(jax.lax.stop_gradient(factor), None, b) if matrix is None else self.solve(factor, matrix, b)
+
+    def solve(self, factor: Any, matrix: Any, b: Any) -> Any:
+        """W⁻¹ b, differentiable."""
+        return solve_sparse(_with_diagonal(self.pattern), factor if matrix is None else matrix, b)
+
+
+@functools.lru_cache(maxsize=64)
+def _with_diagonal(pattern: SparsePattern) -> SparsePattern:
+    place = np.arange(pattern.n)
+    return SparsePattern(np.concatenate([pattern.rows, place]), np.concatenate([pattern.cols, place]), pattern.n)
+
+
+def _diagonal(mass: Mass) -> np.ndarray:
+    if not mass.is_diagonal:
+        raise ModelError("sparse steps need a diagonal mass matrix: give its diagonal, shape (n,)")
+    return mass.array
+
+
+LinearAlgebra = Dense | Sparse
+SPARSE_FROM = 128  # unknowns from which a sparse factorisation is taken, where the pattern is sparse enough
+SPARSE_DENSITY = 0.15
+DENSE_UPTO = 1000  # unknowns for which dense algebra will do if the extra is missing
+
+
+def choose(given: LinearAlgebra | None, n: int, pattern: Any) -> LinearAlgebra:
+    """The linear algebra for n unknowns: dense for few, and where no pattern is known or it is nearly full."""
+    if given is not None:
+        return given
+    if pattern is None or n < SPARSE_FROM or pattern.density > SPARSE_DENSITY:
+        return Dense()
+    if n <= DENSE_UPTO and not available():
+        return Dense()
+    return Sparse(pattern)

@@ -1,0 +1,138 @@
+"""Repetitions in the schedule: a chain of assignments has as many levels as links, and its steps repeat.
+
+Given the steps in order, finds runs in which the same few steps follow each other many times and read the same places
+relative to themselves, or what was known before the run. Such a run is lowered to one loop (`jax.lax.scan`) over its
+repetitions, so that the traced program does not grow with the length of the chain.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..model.tables import ZERO
+from .schedule import AnyStep, Step
+
+LEAST = 8  # repetitions
+LONGEST = 64  # steps that repeat
+BACK = 4  # repetitions that may be looked back
+TRIAL = 32  # repetitions looked at before a whole run is
+
+
+@dataclasses.dataclass(frozen=True)
+class Repeat:
+    """A run of `count` repetitions of the steps in `body` (as they are in the first).
+
+    A read is a place in the concatenation of all outside slots of the body, by step, equation, slot and instance.
+    """
+
+    body: tuple[Step, ...]
+    count: int
+    reads: np.ndarray  # (count, reads): quantities
+    back: np.ndarray  # (reads,): how many repetitions back the quantity was computed; −1: known before the run
+    source: np.ndarray  # (reads, 3): by which step of the body, as which unknown, in which instance
+    parameters: np.ndarray  # (count, parameters)
+    unknown: tuple[tuple[np.ndarray, ...], ...]  # of every step of the body, its unknowns, each (count, n)
+
+
+def find_repeats(steps: Sequence[AnyStep], n_quantities: int) -> list[AnyStep | Repeat]:
+    """The steps, with runs of repetitions in place of their steps."""
+    n = len(steps)
+    if n < 2 * LEAST:
+        return list(steps)
+    names: dict[tuple, int] = {}
+    shape = np.array([names.setdefault(_shape(step, k), len(names)) for k, step in enumerate(steps)])
+    if n - len(names) < LEAST:
+        return list(steps)
+    source = np.full((n_quantities + 1, 3), -1, np.int64)  # the last entry is the constant zero
+    for k, step in enumerate(steps):
+        for u, quantities in enumerate(step.unknown):
+            source[quantities] = np.stack(np.broadcast_arrays(k, u, np.arange(len(quantities))), axis=1)
+    runs = [_run_lengths(shape[:-p] == shape[p:]) for p in range(1, min(LONGEST, n // LEAST) + 1)]
+    out: list[AnyStep | Repeat] = []
+    k = 0
+    while k < n:
+        found = None
+        for period, run in enumerate(runs, start=1):
+            count = 1 + int(run[k]) // period if k < len(run) else 1
+            if count >= LEAST:
+                found = _repeat(steps, k, period, min(count, TRIAL), source)
+                if found is not None and count > TRIAL:
+                    found = _repeat(steps, k, period, count, source)
+                if found is not None:
+                    break
+        out.append(steps[k] if found is None else found)
+        k += 1 if found is None else found.count * len(found.body)
+    return out
+
+
+def _shape(step: AnyStep, number: int) -> tuple:
+    """What must be equal for two steps to be repetitions of each other."""
+    if not isinstance(step, Step) or step.carried:
+        return (number,)
+    return (
+        step.n,
+        step.tearing,
+        tuple(
+            (
+                e.template.key,
+                tuple(s.local for s in e.slots),
+                tuple(s.sign.tobytes() + (s.quantity == ZERO).tobytes() for s in e.slots),
+                e.coefficient.tobytes(),
+            )
+            for e in step.equations
+        ),
+    )
+
+
+def _run_lengths(true: np.ndarray) -> np.ndarray:
+    """How many entries from each on are true without a break."""
+    n = len(true)
+    last = np.where(true, n, np.arange(n))
+    return np.minimum.accumulate(last[::-1])[::-1] - np.arange(n)
+
+
+def _reads(step: Step) -> np.ndarray:
+    outside = [s.quantity for e in step.equations for s in e.slots if s.local < 0]
+    return np.concatenate(outside) if outside else np.zeros(0, np.int64)
+
+
+def _repeat(steps: Sequence[AnyStep], start: int, period: int, count: int, source: np.ndarray) -> Repeat | None:
+    """The longest run that begins at `start`, of at most `count` repetitions; None if there are too few."""
+    own = steps[start : start + period * count]
+    chosen: list[Step] = [s for s in own if isinstance(s, Step)]
+    reads = np.stack([np.concatenate([_reads(s) for s in chosen[k * period : (k + 1) * period]]) for k in range(count)])
+    if not reads.shape[1]:
+        return None
+    where = source[reads]  # (count, reads, 3)
+    back = -((where[0, :, 0] - start) // period)
+    follows = np.ones(reads.shape, bool)
+    follows[1:] = (where[1:, :, 0] - where[:-1, :, 0] == period) & (where[1:, :, 1:] == where[:-1, :, 1:]).all(axis=2)
+    follows = np.logical_and.accumulate(follows, axis=0) & (where[0, :, 0] >= 0) & (back <= BACK)
+    known = np.logical_and.accumulate(where[:, :, 0] < start, axis=0)
+    holds = (follows | known).all(axis=1)
+    count = count if holds.all() else int(np.argmin(holds))
+    if count < LEAST:
+        return None
+    chosen = chosen[: count * period]
+    inside = follows[count - 1]
+    place = np.stack([(where[0, :, 0] - start) % period, where[0, :, 1], where[0, :, 2]], axis=1)
+    return Repeat(
+        tuple(chosen[:period]),
+        count,
+        reads[:count],
+        np.where(inside, back, -1),
+        place,
+        np.stack(
+            [
+                np.concatenate(
+                    [e.parameter.ravel() for s in chosen[k * period : (k + 1) * period] for e in s.equations]
+                )
+                for k in range(count)
+            ]
+        ),
+        tuple(
+            tuple(np.stack([s.unknown[u] for s in chosen[p::period]]) for u in range(len(chosen[p].unknown)))
+            for p in range(period)
+        ),
+    )

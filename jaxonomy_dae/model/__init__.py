@@ -1,0 +1,1 @@
+"""The flat model: templates, tables, quantities."""

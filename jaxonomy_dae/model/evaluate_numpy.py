@@ -1,0 +1,97 @@
+"""Numbers at compile time: residuals and Jacobians of the extended system in NumPy, and a consistent point.
+
+Only the choice of states needs numbers before the model runs. They are computed in float64 whatever the precision the
+model will run in, from the same templates the lowered system uses.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse as sp
+
+from .extended import Extended, ExtendedGroup
+from .tables import ZERO
+from .templates import OpaqueFunction
+
+
+class Networks:
+    """The weights of learned terms, and each network's value, computed once for equal arguments."""
+
+    def __init__(self, weights: tuple[Any, ...]):
+        self.weights = weights
+        self._seen: dict[tuple, tuple[Any, Any]] = {}
+
+    def evaluate(self, opaque: OpaqueFunction, order: int, t, inputs: list[list]) -> Any:
+        """The outputs' `order`-th time derivative, shape (outputs,) or (outputs, instances)."""
+        key = (opaque.index, order, id(t), *(id(x) for level in inputs for x in level))
+        if key not in self._seen:
+            value = opaque.derivatives(self.weights[opaque.index], order, t, inputs)
+            self._seen[key] = (value, (t, inputs))  # the arguments are kept, so that their ids stay taken
+        return self._seen[key][0]
+
+
+def slot_values(group: ExtendedGroup, values: np.ndarray) -> list[np.ndarray]:
+    """The values of each slot over the group's instances."""
+    padded = np.append(values, 0.0)  # ZERO is −1: the last entry
+    return list((group.sign * padded[group.quantity]).T)
+
+
+def group_values(group: ExtendedGroup, values, parameters, t: float, networks: Networks, partials: bool):
+    """The residuals (n,) of a group, or its partial derivatives (n, slots)."""
+    slots = slot_values(group, values)
+    p = list(parameters[group.parameter].T)
+    c = list(group.coefficient.T)
+    n = len(group)
+    with np.errstate(all="ignore"):
+        if group.template.opaque is not None:
+            return opaque_values(group, slots, t, networks, partials)
+        if partials:
+            out = group.template.partial_values(slots, p, c, t, networks, backend="numpy")
+            return np.stack([np.broadcast_to(np.asarray(x, float), (n,)) for x in out], axis=-1) * group.sign
+        out = group.template.residual(slots, p, c, t, networks, backend="numpy")
+        return np.broadcast_to(np.asarray(out, float), (n,))
+
+
+def opaque_values(group: Any, slots, t, networks: Networks, partials: bool) -> np.ndarray:
+    def residual(column, time):
+        return group.template.residual(list(column), (), (), time, Networks(networks.weights))
+
+    with jax.ensure_compile_time_eval():  # these are constants, also while a user's function is being traced
+        values = jnp.asarray(np.stack(slots))
+        function = jax.jit(jax.vmap(jax.jacfwd(residual) if partials else residual, in_axes=(1, None)))
+        out = np.asarray(function(values, jnp.asarray(t, values.dtype)), float)
+    return out * group.sign if partials else out
+
+
+def residual_and_jacobian(extended: Extended, values, parameters, t: float, networks: Networks):
+    """All residuals, and the sparse Jacobian with respect to all quantities."""
+    residual = np.empty(extended.n_equations)
+    rows, columns, entries = [], [], []
+    for group in extended.groups:
+        residual[group.equation] = group_values(group, values, parameters, t, networks, partials=False)
+        if group.quantity.shape[1] == 0:
+            continue
+        partial = group_values(group, values, parameters, t, networks, partials=True)
+        used = group.quantity != ZERO
+        rows.append(np.broadcast_to(group.equation[:, None], used.shape)[used])
+        columns.append(group.quantity[used])
+        entries.append(partial[used])
+    shape = (extended.n_equations, extended.quantities.n)
+    if not rows:
+        return residual, sp.csr_array(shape)
+    data = (np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns)))
+    return residual, sp.coo_array(data, shape=shape).tocsr()
+
+
+def start_values(starts, parameters: np.ndarray) -> Callable[[int], float]:
+    """The value of a variable's start expression, as a function of the variable's id."""
+
+    def value(variable: int) -> float:
+        start = starts[variable]
+        chosen = list(parameters[list(start.parameters)])
+        return float(start.template.residual([], chosen, [], 0.0, None, backend="numpy"))
+
+    return value

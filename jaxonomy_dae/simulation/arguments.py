@@ -1,0 +1,104 @@
+"""What `simulate` accepts: every argument is checked before anything is compiled."""
+
+import math
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import numpy as np
+from jax.core import Tracer
+
+from ..errors import ModelError, nearest
+from ..system.system import AcausalSystem
+
+
+def check_arguments(system, t0, t1, ts, inputs, initial, adjoint, solver, max_steps):
+    """Raises a `ModelError` that says which argument cannot work, and what would."""
+    if not isinstance(system, AcausalSystem):
+        raise ModelError(f"simulate needs an AcausalSystem (call the AcausalCompiler); got {type(system).__name__}")
+    if system.parameters.values.ndim != 1:
+        raise ModelError(
+            f"the system is a batch, its parameters have shape {system.parameters.values.shape}: simulate each with "
+            "equinox.filter_vmap(lambda s: simulate(s, ...))(system)"
+        )
+    if solver is not None and not isinstance(solver, diffrax.AbstractSolver):
+        raise ModelError(f"solver must be a Diffrax solver such as diffrax.Tsit5(); got {solver!r}")
+    if isinstance(adjoint, diffrax.BacksolveAdjoint):
+        raise ModelError(
+            "adjoint=BacksolveAdjoint() is wrong for constrained systems: it integrates the state backwards without "
+            "its constraints and leaves the algebraic variables out. Use the default StoredAdjoint(), "
+            "RecursiveCheckpointAdjoint(), or ForwardMode() for few parameters"
+        )
+    if not isinstance(max_steps, int) or max_steps < 1:
+        raise ModelError(f"max_steps must be a positive integer; got {max_steps!r}")
+    _check_interval(t0, t1, ts)
+    known = system.inputs
+    for name, value in (inputs or {}).items():
+        if name not in known:
+            raise ModelError(f"'{name}' is no input of this system: " + nearest(name, known))
+        if not callable(value) and np.shape(value) != ():
+            raise ModelError(
+                f"input '{name}' must be a function of time or a constant; got shape {np.shape(value)}. For samples "
+                "use diffrax.LinearInterpolation(ts, ys).evaluate"
+            )
+    for name, default in zip(known, system.plan.inputs.defaults, strict=True):
+        if default is None and name not in (inputs or {}):
+            raise ModelError(f"input '{name}' has no default: give it with inputs={{'{name}': function_of_time}}")
+    for name, value in (initial or {}).items():
+        if name in system.parameters.names:
+            raise ModelError(f"initial: '{name}' is a parameter; use system.with_parameters({{'{name}': value}})")
+        quantity = system.plan.resolve([name])[0][0]
+        if quantity < 0:
+            raise ModelError(f"initial: '{name}' is identically zero in this model")
+        if np.shape(value) != ():
+            raise ModelError(f"initial: '{name}' needs a scalar; got shape {np.shape(value)}")
+
+
+def _concrete(value: Any) -> np.ndarray | None:
+    return None if isinstance(value, Tracer) else np.asarray(value, float)
+
+
+def _check_interval(t0, t1, ts):
+    a, b = _concrete(t0), _concrete(t1)
+    for name, value in (("t0", a), ("t1", b)):
+        if value is not None and (value.shape != () or not math.isfinite(value)):
+            raise ModelError(f"{name} must be a finite number; got {value}")
+    if a is not None and b is not None and not a < b:
+        raise ModelError(f"the interval needs t0 < t1; got t0={float(a)}, t1={float(b)}")
+    if ts is None:
+        return
+    if np.ndim(ts) != 1 or not np.shape(ts)[0]:
+        raise ModelError(f"ts must have shape (n,), n ≥ 1; got {np.shape(ts)}")
+    saved = _concrete(ts)
+    if saved is None:
+        return
+    if not np.isfinite(saved).all():
+        raise ModelError("ts must be finite")
+    backwards = np.flatnonzero(np.diff(saved) < 0)
+    if len(backwards):
+        k = int(backwards[0])
+        raise ModelError(
+            f"ts must be sorted; ts[{k}]={saved[k]} is followed by ts[{k + 1}]={saved[k + 1]}: use jnp.sort(ts)"
+        )
+    slack = 1e-6 if np.asarray(ts).dtype == np.float32 else 1e-12
+    low = -math.inf if a is None else float(a) - slack * (1 + abs(float(a)))
+    high = math.inf if b is None else float(b) + slack * (1 + abs(float(b)))
+    outside = saved[(saved < low) | (saved > high)]
+    if len(outside):
+        raise ModelError(
+            f"ts must lie between t0={t0} and t1={t1}; {outside[0]} does not. Extend the interval or drop it"
+        )
+
+
+def check_parameters(system: AcausalSystem):
+    """Raises a `ModelError` that names a parameter or network that is not finite."""
+    values = np.asarray(system.parameters.array)
+    bad = np.flatnonzero(~np.isfinite(values))
+    if len(bad):
+        name = system.parameters.names[bad[0]]
+        raise ModelError(f"parameter '{name}' is not finite: {values[bad[0]]}. Set it with with_parameters")
+    for name, network in system.neural.items():
+        for leaf in jax.tree.leaves(eqx.filter(network, eqx.is_inexact_array)):
+            if not np.isfinite(np.asarray(leaf)).all():
+                raise ModelError(f"a weight of network '{name}' is not finite: go back to an earlier iterate")

@@ -1,0 +1,1 @@
+"""Integers and graphs: incidence, matching, Pantelides, tearing."""

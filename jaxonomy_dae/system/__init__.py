@@ -1,0 +1,1 @@
+"""The compiled model: parameters, evaluation at a point, report."""

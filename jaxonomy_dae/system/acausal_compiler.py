@@ -1,0 +1,82 @@
+"""`AcausalCompiler`: from a diagram to a system."""
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from ..compiler.flatten import flatten
+from ..compiler.pipeline import compile_flat
+from ..errors import ModelError
+from ..lowering.lower import lower
+from ..modeling.diagram import AcausalDiagram
+from ..modeling.environment import EqnEnv
+from ..modeling.neural import as_weights
+from .parameters import ParameterNames, Parameters
+from .report import SystemReport
+from .system import AcausalSystem
+
+Mode = Literal["auto", "dummy_derivatives", "projection"]
+
+
+class AcausalCompiler:
+    """Compiles a diagram: `system = AcausalCompiler(ev, diagram)()`.
+
+    **Arguments:**
+
+    - `ev`: the environment the components were made with.
+    - `diagram`: the model.
+    - `state_selection`: `"dummy_derivatives"` integrates a minimal set of states; `"projection"` integrates all
+        candidates and projects onto the hidden constraints; `"auto"` takes dummy derivatives where the constraints'
+        Jacobian is constant, projection elsewhere.
+    - `prefer_states`: names of variables that should be states, the most important first.
+
+    **Raises** (when called):
+
+    - `ModelError`: the model is not well formed.
+    - `StructuralError`: equations and unknowns do not fit together.
+
+    `compiler.report` says what was done, after the call.
+    """
+
+    def __init__(
+        self,
+        ev: EqnEnv,
+        diagram: AcausalDiagram,
+        *,
+        state_selection: Mode = "auto",
+        prefer_states: Sequence[str] = (),
+    ):
+        if not isinstance(ev, EqnEnv) or not isinstance(diagram, AcausalDiagram):
+            raise ModelError("AcausalCompiler(ev, diagram) needs an EqnEnv and an AcausalDiagram")
+        if state_selection not in ("auto", "dummy_derivatives", "projection"):
+            raise ModelError(f"state_selection is 'auto', 'dummy_derivatives' or 'projection'; got {state_selection!r}")
+        if isinstance(prefer_states, str):
+            raise ModelError(f"prefer_states is a list of names; write prefer_states=[{prefer_states!r}]")
+        self.ev = ev
+        self.diagram = diagram
+        self.state_selection = state_selection
+        self.prefer_states = tuple(prefer_states)
+        self._report: SystemReport | None = None
+
+    @property
+    def report(self) -> SystemReport:
+        """What the last call did."""
+        if self._report is None:
+            raise ModelError("nothing has been compiled yet: call the compiler first")
+        return self._report
+
+    def __call__(self) -> AcausalSystem:
+        flat = flatten(self.diagram)
+        plan = lower(compile_flat(flat, self.state_selection, self.prefer_states))
+        self._report = SystemReport(plan)
+        table = ParameterNames(flat.parameters.names, flat.parameters.units, flat.parameters.bounds, plan.digest)
+        parameters = Parameters(jnp.asarray(flat.parameters.values, dtype=jnp.zeros(()).dtype), None, (), table)
+        neural = {name: _own(network) for name, network in flat.networks.items()}
+        return AcausalSystem(parameters, neural, plan)
+
+
+def _own(network: Any) -> Any:
+    """A network whose inexact leaves are JAX arrays."""
+    return as_weights(network) if not isinstance(network, eqx.Module) else network

@@ -1,0 +1,164 @@
+"""The report of a compilation, in user names."""
+
+import functools
+import html
+
+import numpy as np
+
+from ..lowering.plan import SystemPlan
+from ..lowering.schedule import SparseStep
+from ..model.incidence import incidence
+from ..model.tables import describe_equation
+from ..structure.pantelides import Offsets, reduce_index
+from .solver_choice import solver_choice
+
+SHOWN = 12
+HTML_SHOWN = 200
+
+
+class SystemReport:
+    """What the compiler did; `print(report)` shows it.
+
+    Attributes count and name: `n_equations`, `n_unknowns`, `n_aliases`, `index` (structural, of the model as written),
+    `differentiated` (pairs of an equation's text and how often), `states`, `algebraics`, `carried`, `constraints`,
+    `blocks` (of more than one equation, or nonlinear), `notes`.
+    """
+
+    def __init__(self, plan: SystemPlan):
+        self._plan = plan
+        flat = plan.flat
+        self.n_equations = flat.n_equations
+        self.n_unknowns = len(flat.variables) - int(flat.variables.is_input.sum())
+        self.n_aliases = len(plan.alias.eliminated)
+        self.state_selection = plan.mode
+        self.notes = list(plan.selection.notes)
+
+    @functools.cached_property
+    def _offsets(self) -> Offsets:
+        """Index reduction of the model as written, before alias elimination: the numbers the literature gives."""
+        flat = self._plan.flat
+        column = np.full(len(flat.variables), -1, np.int64)
+        unknown = np.flatnonzero(~flat.variables.is_input)
+        column[unknown] = np.arange(len(unknown))
+        return reduce_index(incidence(flat.groups, column, len(unknown)))
+
+    @property
+    def index(self) -> int:
+        """The structural index; where highest derivatives cancel, that of the equations in which they do not."""
+        extended = self._plan.extended
+        counts = np.bincount(extended.base, minlength=1) - 1
+        quantities = extended.quantities
+        algebraic = (quantities.highest[: quantities.n_unknown_columns] == 0).any()
+        return max(self._offsets.structural_index, int(counts.max(initial=0)) + int(algebraic))
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """How many initial values can be chosen."""
+        extended = self._plan.extended
+        quantities = extended.quantities
+        return int(quantities.highest[: quantities.n_unknown_columns].sum() - extended.level.astype(bool).sum())
+
+    @property
+    def differentiated(self) -> list[tuple[str, int]]:
+        """(equation, number of differentiations) where that is not zero."""
+        counts = self._offsets.equation
+        groups = self._plan.flat.groups
+        return [(describe_equation(groups, int(e)), int(counts[e])) for e in np.flatnonzero(counts)]
+
+    @property
+    def states(self) -> list[str]:
+        """The differential states."""
+        return [self._plan.quantity_name[q] for q in self._plan.states]
+
+    @property
+    def carried(self) -> list[str]:
+        """Tearing variables of nonlinear blocks, kept in the state array."""
+        return [self._plan.quantity_name[q] for q in self._plan.carried]
+
+    @property
+    def algebraics(self) -> list[str]:
+        """The unknowns that are solved for, derivatives left out."""
+        plan = self._plan
+        names = [plan.quantity_name[q] for q in plan.blocks.unknowns]
+        return [n for n in names if not n.startswith("der(") and ":" not in n]
+
+    @property
+    def constraints(self) -> list[str]:
+        """The hidden constraints the state is projected onto."""
+        plan = self._plan
+        out = []
+        for e in plan.selection.constraints:
+            level = int(plan.extended.level[e])
+            text = describe_equation(plan.groups, int(plan.extended.base[e]))
+            out.append(text + (f", differentiated {level}×" if level else ""))
+        return out
+
+    @property
+    def blocks(self) -> list[str]:
+        """The simultaneous blocks, alike ones counted together."""
+        plan = self._plan
+        out = []
+        for step in plan.steps:
+            if isinstance(step, SparseStep):
+                kind = "linear" if step.linear else "nonlinear"
+                for block in range(int(step.block.max()) + 1):
+                    names = [plan.quantity_name[q] for q in step.unknown[0][step.block == block]]
+                    out.append(f"{kind} block of {len(names)}: {_some(names)}; solved whole, sparse")
+                continue
+            if len(step.unknown) == 1 and step.linear:
+                continue
+            names = [plan.quantity_name[u[0]] for u in step.unknown]
+            torn = [names[u] for u in step.tearing.tearing]
+            kind = "linear" if step.linear else "nonlinear"
+            times = f"{step.n} × " if step.n > 1 else ""
+            out.append(f"{times}{kind} block of {len(names)}: {_some(names)}; torn at {_some(torn)}")
+        return out
+
+    def __str__(self):
+        head, sections = self._contents()
+        lines = list(head)
+        for title, entries in sections:
+            more = [f"    … and {len(entries) - SHOWN} more"] if len(entries) > SHOWN else []
+            lines += [f"{title}:", *(f"    {e}" for e in entries[:SHOWN]), *more]
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        """The same for a notebook: sections that fold."""
+        head, sections = self._contents()
+        out = [f"<p>{'<br>'.join(html.escape(line) for line in head)}</p>"]
+        for title, entries in sections:
+            items = "".join(f"<li><code>{html.escape(e)}</code></li>" for e in entries[:HTML_SHOWN])
+            more = f"<li>… and {len(entries) - HTML_SHOWN} more</li>" if len(entries) > HTML_SHOWN else ""
+            opened = " open" if len(entries) <= SHOWN else ""
+            out.append(f"<details{opened}><summary>{html.escape(title)}</summary><ul>{items}{more}</ul></details>")
+        return "".join(out)
+
+    def _contents(self) -> tuple[list[str], list[tuple[str, list[str]]]]:
+        plan = self._plan
+        head = [
+            f"{self.n_equations} equations, {self.n_unknowns} unknowns, {len(plan.flat.parameters)} parameters"
+            + (f", {len(plan.inputs.names)} inputs" if plan.inputs.names else "")
+            + (f", {len(plan.network_names)} networks" if plan.network_names else ""),
+            f"{self.n_aliases} aliases eliminated, {sum(len(g) for g in plan.groups)} equations of "
+            f"{len({g.template.key for g in plan.groups})} shapes remain",
+            f"structural index {self.index}, {self.degrees_of_freedom} degrees of freedom",
+        ]
+        head.append(f"state selection {self.state_selection}")
+        head.append("simulate(solver=None) takes {}: {}".format(*solver_choice(plan)))
+        sections = [
+            ("differentiated", [f"{n}× {text}" for text, n in self.differentiated]),
+            (f"{len(self.states)} states", [_some(self.states)]),
+            ("algebraic unknowns in the state array", [_some(self.carried)]),
+            (f"{len(self.algebraics)} algebraic variables", [_some(self.algebraics)]),
+            ("hidden constraints, projected onto", self.constraints),
+            ("simultaneous blocks", self.blocks),
+            ("notes", self.notes),
+        ]
+        kept = [(title, [e for e in entries if e]) for title, entries in sections]
+        return head, [(title, entries) for title, entries in kept if entries]
+
+
+def _some(names: list[str]) -> str:
+    return ", ".join(names[:SHOWN]) + (f", … ({len(names)} in all)" if len(names) > SHOWN else "")

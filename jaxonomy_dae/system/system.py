@@ -1,0 +1,293 @@
+"""The compiled model."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, overload
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from ..errors import ModelError, nearest
+from ..linear.sparse import SparseMatrix, SparsePattern, sparse_jacobian
+from ..lowering.plan import SystemPlan
+from .parameters import Parameters
+from .system_at import READ_REFINEMENTS, SCALARS, Point
+
+
+class AcausalSystem(eqx.Module):
+    """A compiled model, an `equinox.Module` whose leaves are its parameters and the weights of its networks.
+
+    - `parameters`: a flat array with names, `system.parameters["pend.m"]`.
+    - `neural`: the networks by name, `system.neural["drag"]`.
+    - `states`, `algebraics`, `variables`: names.
+    """
+
+    parameters: Parameters
+    neural: dict[str, Any]
+    plan: SystemPlan = eqx.field(static=True)
+
+    # --- names -------------------------------------------------------------------------------------------------
+
+    @property
+    def states(self) -> list[str]:
+        """The names of the differential states, in the order of the state array."""
+        return [self.plan.quantity_name[q] for q in self.plan.states]
+
+    @property
+    def carried(self) -> list[str]:
+        """Tearing variables of nonlinear blocks: they follow the states in the state array, as algebraic unknowns."""
+        return [self.plan.quantity_name[q] for q in self.plan.carried]
+
+    @property
+    def variables(self) -> list[str]:
+        """All variables of the model, eliminated ones included."""
+        return self.plan.visible_variables
+
+    @property
+    def algebraics(self) -> list[str]:
+        """The variables that are no states, nor equal to one."""
+        chosen = set(self.plan.states.tolist())
+        inputs = set(self.plan.inputs.names)
+        names = self.plan.variable_index
+        return [n for n in self.variables if n not in inputs and self.plan.quantity_of(names[n])[0] not in chosen]
+
+    @property
+    def inputs(self) -> list[str]:
+        """The names of the inputs."""
+        return list(self.plan.inputs.names)
+
+    @property
+    def report(self):
+        """What the compiler did, to be printed."""
+        from .report import SystemReport
+
+        return SystemReport(self.plan)
+
+    # --- changing ----------------------------------------------------------------------------------------------
+
+    def with_parameters(self, values: Mapping[str, Any]) -> "AcausalSystem":
+        """A system with new parameter values (numbers or tracers); nothing is compiled again.
+
+        **Raises:**
+
+        - `ModelError` for unknown names, values that are not finite or out of bounds.
+        """
+        return eqx.tree_at(lambda s: s.parameters, self, self.parameters.replaced(values))
+
+    def partition(self, *names: str) -> tuple["AcausalSystem", "AcausalSystem"]:
+        """Separates what is trained: `(trainable, frozen)`, to be joined again by `equinox.combine`.
+
+        `names` are networks (`"drag"`) and parameters (`"pend.m"`).
+
+        **Raises:**
+
+        - `ModelError` for a name that is neither.
+        """
+        chosen_networks = {n for n in names if n in self.neural}
+        chosen_parameters = tuple(n for n in dict.fromkeys(names) if n not in self.neural)
+        for name in chosen_parameters:
+            if name not in self.parameters.names:
+                raise ModelError(
+                    f"'{name}' is neither a network nor a parameter: "
+                    + nearest(name, [*self.neural, *self.parameters.names])
+                )
+        system = eqx.tree_at(lambda s: s.parameters, self, self.parameters.freed(chosen_parameters))
+        wanted = jax.tree.map(lambda _: False, system)
+        if chosen_parameters:
+            wanted = eqx.tree_at(lambda s: s.parameters.free, wanted, True)
+        if chosen_networks:
+            flags = {
+                n: jax.tree.map(eqx.is_inexact_array, w) if n in chosen_networks else wanted.neural[n]
+                for n, w in system.neural.items()
+            }
+            wanted = eqx.tree_at(lambda s: s.neural, wanted, flags)
+        return eqx.partition(system, wanted)
+
+    def merged(self) -> "AcausalSystem":
+        """The same system with nothing set apart by `partition`."""
+        return eqx.tree_at(lambda s: s.parameters, self, self.parameters.merged())
+
+    # --- computing ---------------------------------------------------------------------------------------------
+
+    def _point(self, t: Any, args: Any) -> Point:
+        for name, default in zip(self.plan.inputs.names, self.plan.inputs.defaults, strict=True):
+            if default is None and name not in (args or {}):
+                raise ModelError(f"input '{name}' has no default: give it as {{'{name}': function_of_time}}")
+        networks = tuple(self.neural[n] for n in self.plan.network_names)
+        return Point(self.plan, self.parameters.array, networks, t, args)
+
+    def vector_field(self, t: Any, x: Float[Array, " n"], args: Any = None) -> Float[Array, " n"]:
+        """d(state)/dt for `diffrax.ODETerm(system.vector_field)`; `args` is the dictionary of inputs, or None."""
+        if self.plan.n_state > SCALARS:
+            return self._point(t, args).vector_field(x)
+        # Reverse mode recomputes a small field rather than storing what it needs of every stage: a few fused kernels
+        # instead of a store for each intermediate value, a quarter of the time of a gradient.
+        return eqx.filter_checkpoint(lambda s, t, x, args: s._point(t, args).vector_field(x))(self, t, x, args)
+
+    def semi_explicit(self, t: Any, x: Float[Array, " n"], args: Any = None) -> Float[Array, " n"]:
+        """The right-hand side of M d(state)/dt = F(t, state): slopes of the differential states, then the residuals of
+        nonlinear blocks, whose rows of `mass` are zero."""
+        return self._point(t, args).semi_explicit(x)
+
+    @property
+    def mass(self) -> np.ndarray:
+        """The diagonal of M in M d(state)/dt = `semi_explicit`: one for states, zero for algebraic unknowns."""
+        return np.concatenate([np.ones(len(self.plan.states)), np.zeros(len(self.plan.carried))])
+
+    @property
+    def jacobian_pattern(self) -> SparsePattern | None:
+        """Where the Jacobian of the vector field can have entries: `.rows` and `.cols`, sorted by row. None if it is so
+        large and dense that its places are not worth listing."""
+        return self.plan.jacobian_pattern
+
+    def jacobian(self, t: Any, x: Float[Array, " n"], args: Any = None) -> SparseMatrix:
+        """∂(vector field)/∂(state) at a consistent state, sparse: `.values` at the places of `.pattern`, `.dense()`,
+        `.solve(b)`, `matrix @ vector`.
+
+        It takes as many directional derivatives as the pattern has colours: three for a chain, however long.
+
+        **Raises:**
+
+        - `ModelError` if it is large and dense.
+        """
+        pattern = self.jacobian_pattern
+        if pattern is None:
+            raise ModelError(
+                f"the Jacobian of these {self.plan.n_state} states is dense, too large to list its entries: use "
+                "jax.jvp(system.vector_field, …) for its products with vectors"
+            )
+        point = self._point(t, args)
+        if len(self.plan.carried):
+            x = jax.lax.stop_gradient(point.join(point.refined(point.split(x), READ_REFINEMENTS))) + (
+                x - jax.lax.stop_gradient(x)
+            )
+        return SparseMatrix(sparse_jacobian(point.vector_field, pattern)(x), pattern)
+
+    def project(self, t: Any, x: Float[Array, " n"], args: Any = None, iterations: int = 1) -> Float[Array, " n"]:
+        """The state moved onto the hidden constraints (nothing to do if there are none)."""
+        return self._point(t, args).project(x, iterations)
+
+    @property
+    def is_constrained(self) -> bool:
+        """Whether a state must satisfy hidden constraints, or carries unknowns of nonlinear blocks."""
+        return bool(self.plan.n_constraints or len(self.plan.carried))
+
+    def constraint_residual(self, t: Any, x: Float[Array, " n"], args: Any = None) -> Float[Array, " m"]:
+        """The residuals of all hidden constraints at a state."""
+        point = self._point(t, args)
+        state = point.split(x)
+        parts = [point.constraint_vector(state)]
+        if len(self.plan.carried):
+            parts.append(point.carried_vector(point.t, state))
+        return jnp.concatenate(parts)
+
+    def observe(self, names: str | Sequence[str], t: Any, x: Float[Array, " n"], args: Any = None) -> Any:
+        """The values of variables at a state: a scalar for one name, shape `(len(names),)` for several.
+
+        **Raises:**
+
+        - `ModelError` for an unknown name.
+        """
+        single = isinstance(names, str)
+        quantity, sign = self.plan.resolve([names] if single else list(names))
+        values = self._point(t, args).quantities(x, quantity, sign)
+        return values[0] if single else values
+
+    @overload
+    def initialize(
+        self, t0: Any = 0.0, inputs: Mapping[str, Any] | None = None, initial: Mapping[str, Any] | None = None
+    ) -> Array: ...
+
+    @overload
+    def initialize(
+        self,
+        t0: Any = 0.0,
+        inputs: Mapping[str, Any] | None = None,
+        initial: Mapping[str, Any] | None = None,
+        *,
+        solve_for: Sequence[str],
+    ) -> tuple[Array, "AcausalSystem"]: ...
+
+    def initialize(
+        self,
+        t0: Any = 0.0,
+        inputs: Mapping[str, Any] | None = None,
+        initial: Mapping[str, Any] | None = None,
+        *,
+        solve_for: Sequence[str] | None = None,
+    ) -> Any:
+        """A consistent state at `t0`: all equations, hidden ones included, and the fixed starts hold.
+
+        **Arguments:**
+
+        - `t0`: the initial time.
+        - `inputs`: as in `simulate`.
+        - `initial`: values of variables at `t0`; they outrank the starts declared in components. `"der(m.v)"` is the
+            derivative of a variable that the model differentiates.
+        - `solve_for`: parameters that are unknown: as many more values as there are names must be given in `initial`
+            or be fixed in components. The search starts at their present values. A rest length for which a mass is in
+            equilibrium at 0.3 m: `initial={"m.x": 0.3, "m.v": 0.0, "der(m.v)": 0.0}, solve_for=["spring.length"]`.
+
+        **Returns:**
+
+        The state, shape `(len(states) + len(carried),)`: differentiable with respect to parameters and values given.
+        With `solve_for`, the pair of the state and a system that holds the parameters found; go on with that system
+        and the same `initial`, as in `simulate(found, t1, initial=...)`.
+
+        **Raises:**
+
+        - `InitializationError` if fixed starts contradict the equations, if no consistent point was found, if a block
+            of equations is singular there, if the values given are too few or too many for `solve_for`, or if a
+            parameter found is out of its bounds. Inside jit, what depends on values is an Equinox run-time error.
+        """
+        from ..initialization.initialize import check, find_initial
+
+        names = self._names_to_solve_for(solve_for)
+        found = find_initial(self, t0, inputs, initial, names)
+        found = check(self, found, t0, inputs, initial, names)
+        if solve_for is None:
+            return found.x
+        table = self.parameters.table
+        index = np.array([table.index(n) for n in names], np.int64)
+        low, high = (jnp.asarray(b, found.x.dtype) for b in table.bounds[index].reshape(-1, 2).T)
+        # Rounding must not leave the bounds, nor the clip the gradient.
+        solved = found.solved + jax.lax.stop_gradient(jnp.clip(found.solved, low, high) - found.solved)
+        values = self.parameters.array.at[index].set(solved)
+        return found.x, eqx.tree_at(lambda s: s.parameters, self, Parameters(values, None, (), table))
+
+    def initialization_report(
+        self,
+        t0: Any = 0.0,
+        inputs: Mapping[str, Any] | None = None,
+        initial: Mapping[str, Any] | None = None,
+        *,
+        solve_for: Sequence[str] = (),
+    ):
+        """What `initialize` does with the same arguments, to be printed: which starts hold, which were guesses and how
+        far each moved, which are redundant or contradict each other, what does not hold, which method succeeded.
+
+        **Raises:**
+
+        - `ModelError` inside jit, where there are no numbers to report.
+        """
+        from ..initialization.initialize import find_initial
+        from ..initialization.report import InitializationReport
+
+        names = self._names_to_solve_for(solve_for)
+        found = find_initial(self, t0, inputs, initial, names)
+        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((found, self, t0))):
+            raise ModelError("initialization_report needs numbers: call it outside jit, grad and vmap")
+        return InitializationReport(self, found, t0, inputs, initial, names)
+
+    def _names_to_solve_for(self, solve_for: Sequence[str] | None) -> tuple[str, ...]:
+        if isinstance(solve_for, str):
+            raise ModelError(f"solve_for is a list of parameters' names; write solve_for=[{solve_for!r}]")
+        names = tuple(dict.fromkeys(solve_for or ()))
+        for name in names:
+            if name not in self.parameters.names and name in self.plan.variable_index:
+                raise ModelError(f"solve_for: '{name}' is a variable and found anyway; name parameters")
+            self.parameters.table.index(name)
+        return names

@@ -1,0 +1,273 @@
+"""What a compiled system computes at a point: its vector field, constraints, projection and every variable.
+
+All functions take the static plan, the flat parameters, the networks, time, the state array and input values. Small
+systems are traced on scalars, which XLA fuses into a few kernels; large ones on arrays.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..linear.sparse import solve_block, sparse_jacobian
+from ..linear.written_out import UNROLLED, solve
+from ..lowering.gather import Gather, take
+from ..lowering.plan import ConstraintGroup, PlannedRow, SystemPlan
+from ..lowering.program import Program
+from ..model.evaluate_numpy import Networks
+from .evaluate import Evaluation, newton
+
+SCALARS = 32  # up to this many states, tracing is done on scalars
+FIELD_REFINEMENTS = 1
+READ_REFINEMENTS = 4
+
+
+def input_values(plan: SystemPlan, given: Any, t: Any, dtype) -> tuple:
+    """The values of all input quantities at time t: functions of time or constants, differentiated by jvp."""
+    given = given or {}
+
+    def value(k: int) -> Callable:
+        name = plan.inputs.names[k]
+        source = given.get(name, plan.inputs.defaults[k])
+        if callable(source):
+            return lambda s: jnp.asarray(source(s), dtype)
+        return lambda s: jnp.asarray(source, dtype)
+
+    def derivative(function: Callable, order: int) -> Callable:
+        for _ in range(order):
+            function = _time_derivative(function)
+        return function
+
+    return tuple(derivative(value(k), order)(t) for k, order in plan.inputs.quantities)
+
+
+def _time_derivative(function: Callable) -> Callable:
+    return lambda s: jax.jvp(function, (s,), (jnp.ones_like(s),))[1]
+
+
+class Point:
+    """A system at one time and state, ready to be evaluated."""
+
+    def __init__(self, plan: SystemPlan, parameters: Any, networks: tuple, t: Any, inputs: Any):
+        self.plan = plan
+        self.parameters = parameters
+        self.dtype = parameters.dtype
+        self.networks = networks
+        self.inputs = inputs
+        self.t = jnp.asarray(t, self.dtype)
+
+    def split(self, x: Any) -> Any:
+        """The state as a tuple of scalars if it is small."""
+        return tuple(x[k] for k in range(x.shape[0])) if self.plan.n_state <= SCALARS else x
+
+    @staticmethod
+    def join(x: Any) -> Any:
+        """The state as an array."""
+        if isinstance(x, tuple | list):
+            return jnp.stack(x) if len(x) else jnp.zeros((0,))
+        return x
+
+    def run(self, program: Program, state: Any, refine: int, t: Any = None) -> Evaluation:
+        """Evaluates a program."""
+        t = self.t if t is None else t
+        inputs = input_values(self.plan, self.inputs, t, self.dtype)
+        return Evaluation(state, inputs, self.parameters, t, Networks(self.networks)).run(program, refine)
+
+    # --- vector field ------------------------------------------------------------------------------------------
+
+    def vector_field(self, x: Any) -> Any:
+        """d(state)/dt, shape (n_state,)."""
+        plan = self.plan
+        state = self.split(x)
+        if len(plan.carried):
+            state = self.refined(state, FIELD_REFINEMENTS)
+        slopes, evaluation = self._slopes(state)
+        if plan.carried_rates is not None:
+            slopes = self._appended(slopes, evaluation, plan.carried_rates)
+        elif len(plan.carried):
+            slopes = self._with_carried(state, slopes)
+        return self.join(slopes)
+
+    def semi_explicit(self, x: Any) -> Any:
+        """dx/dt of the states, then the residuals of nonlinear blocks, at the state as it is: shape (n_state,)."""
+        state = self.split(x)
+        slopes, _ = self._slopes(state)
+        if not len(self.plan.carried):
+            return self.join(slopes)
+        residuals = self._carried(self.t, state)
+        if isinstance(slopes, list) and all(jnp.ndim(r) == 0 for r in residuals):
+            return self.join([*slopes, *residuals])
+        return jnp.concatenate([self.join(slopes), *(jnp.reshape(r, (-1,)) for r in residuals)])
+
+    def _slopes(self, state: Any) -> tuple[Any, Evaluation]:
+        """dx/dt of the differential states, and all that was computed on the way."""
+        plan = self.plan
+        n = len(plan.states)
+        evaluation = self.run(plan.derivative, state, refine=0)
+        if isinstance(state, tuple):
+            slopes: Any = [evaluation.read(_only(plan.next_derivative, k)) for k in range(n)]
+            slopes = [jnp.asarray(s, self.dtype) for s in slopes]
+        else:
+            slopes = jnp.broadcast_to(evaluation.read(plan.next_derivative), (n,)).astype(self.dtype)
+        for row in plan.rows:
+            u = [jnp.asarray(evaluation.read(g), self.dtype) for g in row.inputs]
+            slopes = self._corrected(slopes, row, u)
+        return slopes, evaluation
+
+    def _corrected(self, slopes: Any, row: PlannedRow, u: list[Any]) -> Any:
+        entries = iter(u)
+        full = [self.t if k in row.opaque.time_positions else next(entries) for k in range(row.opaque.n_inputs)]
+        out = row.opaque(self.networks[row.opaque.index], self.t, jnp.stack(full))
+        for k, (target, sign) in enumerate(zip(row.rows, row.sign, strict=True)):
+            if isinstance(slopes, list):
+                slopes[target] = slopes[target] + sign * out[k]
+            else:
+                slopes = slopes.at[target].add(sign * out[k])
+        return slopes
+
+    def _with_carried(self, state: Any, slopes: Any) -> Any:
+        """Appends dz/dt = −(∂g/∂z)⁻¹ (∂g/∂t + ∂g/∂x dx/dt) for the tearing variables z of nonlinear blocks."""
+        plan = self.plan
+        n, m = len(plan.states), len(plan.carried)
+
+        if isinstance(state, tuple):
+            x, z = list(state[:n]), list(state[n:])
+
+            def along(rates: list[Any]) -> list[Any]:
+                def g(t, x, z):
+                    return self._carried(t, (*x, *z))
+
+                return jax.jvp(g, (self.t, x, z), (jnp.ones_like(self.t), slopes, rates))[1]
+
+            rates = newton(along, [jnp.zeros_like(a) for a in z])
+            return [*slopes, *rates]
+        g = self.carried_vector
+        value = jax.jvp(g, (self.t, state), (jnp.ones_like(self.t), jnp.append(slopes, jnp.zeros(m, self.dtype))))[1]
+
+        def of_z(z):
+            return g(self.t, jnp.concatenate([state[:n], z]))
+
+        if plan.carried_pattern is not None:
+            matrix = sparse_jacobian(of_z, plan.carried_pattern)(state[n:])
+            return jnp.concatenate([slopes, -solve_block(plan.carried_pattern, matrix, value)])
+        return jnp.concatenate([slopes, -jnp.linalg.solve(jax.jacfwd(of_z)(state[n:]), value)])
+
+    def _carried(self, t: Any, state: Any) -> list[Any]:
+        """The residuals of nonlinear blocks at the tearing variables in the state."""
+        return self.run(self.plan.carried_residuals, state, refine=0, t=t).residuals
+
+    def carried_vector(self, t: Any, state: Any) -> Any:
+        return jnp.concatenate([jnp.reshape(r, (-1,)) for r in self._carried(t, state)])
+
+    def refined(self, state: Any, count: int) -> Any:
+        """The state after Newton corrections of the tearing variables of nonlinear blocks, block by block."""
+        plan = self.plan
+        evaluation = self.run(plan.carried_residuals, state, refine=count)
+        gather = plan.carried_residuals.layout.gather(plan.carried)
+        return self._appended(state[: len(plan.states)], evaluation, gather)
+
+    def _appended(self, first: Any, evaluation: Evaluation, gather: Gather) -> Any:
+        """What was computed, appended to scalars (a list or a tuple) or to an array."""
+        n = len(gather.chunk)
+        if isinstance(first, list | tuple):
+            return type(first)(
+                [*first, *(jnp.asarray(evaluation.read(_only(gather, k)), self.dtype) for k in range(n))]
+            )
+        return jnp.concatenate([first, jnp.broadcast_to(jnp.asarray(evaluation.read(gather), self.dtype), (n,))])
+
+    # --- constraints -------------------------------------------------------------------------------------------
+
+    def constraints(self, state: Any) -> list[Any]:
+        """The hidden constraints' residuals, one array for each template: scalars, or shape (instances,)."""
+        evaluation = self.run(self.plan.constraint_program, state, refine=0)
+        return [self._constraint(evaluation, group) for group in self.plan.constraints]
+
+    def _constraint(self, evaluation: Evaluation, planned: ConstraintGroup) -> Any:
+        group = planned.group
+        slots = [evaluation.read(g) for g in planned.slots]
+        n = len(group)
+        if n == 1:
+            parameters = [self.parameters[int(k)] for k in group.parameter[0]]
+            coefficients: list[Any] = [float(c) for c in group.coefficient[0]]
+        else:
+            parameters = [take(self.parameters, column) for column in group.parameter.T]
+            coefficients = list(group.coefficient.T)
+        value = group.template.residual(slots, parameters, coefficients, self.t, evaluation.networks)
+        return jnp.broadcast_to(jnp.asarray(value, self.dtype), () if n == 1 else (n,))
+
+    def constraint_vector(self, state: Any) -> Any:
+        """All hidden constraints' residuals, shape (n_constraints,)."""
+        values = [jnp.reshape(v, (-1,)) for v in self.constraints(state)]
+        return jnp.concatenate(values) if values else jnp.zeros((0,), self.dtype)
+
+    def project(self, x: Any, iterations: int) -> Any:
+        """The state moved onto the hidden constraints by Gauss–Newton steps of least (nominal-weighted) norm, and the
+        tearing variables of nonlinear blocks refined."""
+        plan = self.plan
+        state = self.split(x)
+        for _ in range(iterations if plan.n_constraints else 0):
+            state = self._least_norm_step(state)
+        if len(plan.carried):
+            state = self.refined(state, iterations)
+        return self.join(state)
+
+    def _least_norm_step(self, state: Any) -> Any:
+        plan = self.plan
+        n = len(plan.states)
+        weight = plan.nominal**2
+        if isinstance(state, tuple) and plan.n_constraints <= UNROLLED:
+            rest = state[n:]
+
+            def h(*x):
+                return [
+                    v[k] if jnp.ndim(v) else v for v in self.constraints((*x, *rest)) for k in range(max(1, v.size))
+                ]
+
+            value, pull = jax.vjp(h, *state[:n])
+            one, zero = jnp.ones((), self.dtype), jnp.zeros((), self.dtype)
+            m = len(value)
+            rows = [pull([one if j == k else zero for j in range(m)]) for k in range(m)]
+            pattern = plan.constraint_pattern or (frozenset(range(n)),) * m
+            gram = [
+                [_sum([float(weight[c]) * rows[a][c] * rows[b][c] for c in sorted(pattern[a] & pattern[b])], zero)
+                 for b in range(m)]
+                for a in range(m)
+            ]  # fmt: skip
+            multiplier = solve(gram, value, positive=True)
+            moved = [
+                s - float(weight[c]) * _sum([rows[a][c] * multiplier[a] for a in range(m) if c in pattern[a]], zero)
+                for c, s in enumerate(state[:n])
+            ]
+            return (*moved, *rest)
+        array = self.join(state)
+        x, rest = array[:n], array[n:]
+
+        def vector(x):
+            return self.constraint_vector(self.split(jnp.concatenate([x, rest])))
+
+        value, pull = jax.vjp(vector, x)
+        jacobian = jax.vmap(lambda e: pull(e)[0])(jnp.eye(value.shape[0], dtype=self.dtype))
+        w = jnp.asarray(weight[:n], self.dtype)
+        multiplier = jnp.linalg.solve((jacobian * w) @ jacobian.T, value)
+        return self.split(jnp.concatenate([x - w * (jacobian.T @ multiplier), rest]))
+
+    # --- reading -----------------------------------------------------------------------------------------------
+
+    def quantities(self, x: Any, quantity: np.ndarray, sign: np.ndarray) -> Any:
+        """The values of quantities with signs, shape (len(quantity),)."""
+        evaluation = self.run(self.plan.everything, self.split(x), refine=READ_REFINEMENTS)
+        gather = self.plan.everything.layout.gather(quantity, sign)
+        return jnp.broadcast_to(jnp.asarray(evaluation.read(gather), self.dtype), (len(quantity),))
+
+
+def _sum(terms: list[Any], zero: Any) -> Any:
+    total = None
+    for term in terms:
+        total = term if total is None else total + term
+    return zero if total is None else total
+
+
+def _only(gather, k: int):
+    return type(gather)(gather.chunk[k : k + 1], gather.offset[k : k + 1], gather.sign[k : k + 1])
