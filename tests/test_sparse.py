@@ -6,6 +6,7 @@ far from noise, and from any mistake.
 
 import importlib.util
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,8 +14,10 @@ import pytest
 from jax.test_util import check_grads
 from problems import run
 
+from jaxonomy_dae import SimulationError
 from jaxonomy_dae.linear import sparse
 from jaxonomy_dae.linear.sparse import MissingSparseSolver, SparsePattern, solve_sparse, sparse_jacobian
+from jaxonomy_dae.solvers import DAETerm, Rodas5P, solve_dae
 
 installed = pytest.mark.skipif(importlib.util.find_spec("klujax") is None, reason='needs the extra "sparse"')
 TIGHT = dict(rtol=1e-11, atol=1e-11)
@@ -136,6 +139,52 @@ def test_solve_within_a_loop():
 def test_not_a_number_passes_through():
     pattern, values, b = random_matrix()
     assert jnp.isnan(solve_sparse(pattern, values.at[0].set(jnp.nan), b)).any()
+
+
+def cells(n: int, g):
+    """x' = −1, 0 = g(x, z) for n cells, as a sparse DAETerm: its unknowns are (x, z)."""
+    k = np.arange(n)
+    rows, cols = np.concatenate([n + k, n + k]), np.concatenate([k, n + k])
+
+    def right(t, y, args):
+        x, z = y[:n], y[n:]
+        return jnp.concatenate([-jnp.ones_like(x), g(x, z)])
+
+    return DAETerm(right, mass=np.repeat([1.0, 0.0], n), pattern=SparsePattern(rows, cols, 2 * n))
+
+
+@installed
+def test_a_failure_among_128_to_300_unknowns_is_explained():
+    with pytest.raises(SimulationError, match=r"stopped at t=(1|0\.99)"):
+        solve_dae(cells(70, lambda x, z: z**2 - x), 2.0, jnp.ones(140), solver=Rodas5P())
+
+
+@installed
+def test_a_pivot_of_zero_fails_its_own_member_alone():
+    """max(z, 0) = x: from t = 1 on the column of z is zero."""
+    term = cells(70, lambda x, z: jnp.maximum(z, 0) - x)
+
+    def at(t1):
+        solution = solve_dae(term, t1, jnp.ones(140), ts=jnp.array([0.4]), solver=Rodas5P(), throw=False)
+        return solution.ys[0, 0], diffrax.is_successful(solution.result)
+
+    x, fine = jax.vmap(at)(jnp.array([0.5, 2.0]))
+    np.testing.assert_allclose(x, 0.6, rtol=1e-9)
+    assert fine.tolist() == [True, False]
+
+
+@installed
+@pytest.mark.parametrize("deficiency", [1, 2, 3])
+def test_pivots_that_cancel_to_zero(deficiency):
+    """Integer matrices of deficient rank: no solve with the nudge aborts, and none looks like a solution."""
+    rng = np.random.default_rng(deficiency)
+    k, l = np.indices((6, 6)).reshape(2, -1)
+    pattern = SparsePattern(k, l, 6)
+    solve = jax.jit(lambda values, b: solve_sparse(pattern, values, b, nudged=True))
+    for _ in range(50):
+        low = rng.integers(-2, 3, (6, 6 - deficiency)) @ rng.integers(-2, 3, (6 - deficiency, 6))
+        x = solve(jnp.asarray(low[k, l], float), jnp.asarray(rng.normal(size=6)))
+        assert not np.isfinite(x).all() or np.abs(x).max() > 1e8
 
 
 def test_host_solve():

@@ -124,6 +124,7 @@ def _(perturbed, numbers, program):
 
 @solve.def_bwd
 def _(residuals, cotangents, perturbed, numbers, program):
+    residuals, numbers = jax.tree.map(jnp.asarray, (residuals, numbers))  # JAX hands constants over as its literals
     state, moves, chunks, stride, kept, record, filled = residuals
     times = StepTimes(perturbed, numbers, program)
     recorder = _Recorder(numbers, program, times)

@@ -47,6 +47,10 @@ class Dense(eqx.Module):
             return jnp.diag(m) - p[:, None] * jacobian
         return m - p @ jacobian
 
+    def materialise(self, matrix: Any) -> Any:
+        """The matrix as an array, shape (n, n)."""
+        return matrix
+
     def factor(self, matrix: Any) -> Any:
         """What solves need."""
         n = matrix.shape[0]
@@ -118,6 +122,10 @@ class Sparse(eqx.Module):
         p = jnp.asarray(mass.algebraic, jacobian.dtype)
         return jnp.concatenate([-p[self.pattern.rows] * jacobian, jnp.asarray(_diagonal(mass), jacobian.dtype)])
 
+    def materialise(self, matrix: Any) -> Any:
+        """The matrix as an array, shape (n, n)."""
+        return _with_diagonal(self.pattern).dense(matrix)
+
     def factor(self, matrix: Any) -> Any:
         """The values themselves."""
         return matrix
@@ -132,7 +140,7 @@ class Sparse(eqx.Module):
 
     def solve(self, factor: Any, matrix: Any, b: Any) -> Any:
         """W⁻¹ b, differentiable."""
-        return solve_sparse(_with_diagonal(self.pattern), factor if matrix is None else matrix, b)
+        return solve_sparse(_with_diagonal(self.pattern), factor if matrix is None else matrix, b, nudged=True)
 
 
 @functools.lru_cache(maxsize=64)

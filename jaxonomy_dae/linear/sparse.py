@@ -188,7 +188,12 @@ def available() -> bool:
 
 
 def solve_sparse(
-    pattern: SparsePattern, values: Float[Array, " nnz"], b: Float[Array, " n"], transpose: bool = False
+    pattern: SparsePattern,
+    values: Float[Array, " nnz"],
+    b: Float[Array, " n"],
+    transpose: bool = False,
+    *,
+    nudged: bool = False,
 ) -> Float[Array, " n"]:
     """x with A·x = b (or Aᵀ·x = b), A square and regular, its entries `values` at the places of `pattern`.
 
@@ -199,7 +204,8 @@ def solve_sparse(
 
     - `MissingSparseSolver` if `klujax` is not installed.
     - `ValueError` without 64-bit mode: KLU computes in float64.
-    - When run: JAX's run-time error "singular matrix" if a pivot is exactly zero.
+    - When run: JAX's run-time error "singular matrix" if entries cancel to a pivot of exactly zero; `nudged` avoids it
+        by changing every entry by a few units in its last place. Entries that vanish give what is not finite.
     """
     klu()
     if pattern.n_rows != pattern.n:
@@ -218,20 +224,38 @@ def solve_sparse(
         return pattern.multiply(values, x, transpose)
 
     def solve(_, right):
-        return _factorized(pattern, values, right, transpose)
+        return _factorized(pattern, values, right, transpose, nudged)
 
     def transpose_solve(_, right):
-        return _factorized(pattern, values, right, not transpose)
+        return _factorized(pattern, values, right, not transpose, nudged)
 
     return jax.lax.custom_linear_solve(matvec, b, solve, transpose_solve)
 
 
-def _factorized(pattern: SparsePattern, values: Any, b: Any, transpose: bool) -> Any:
+ULPS = 16  # changes of entries, in units of their rounding
+ZERO = 1e-200  # takes the place of a zero
+
+
+def _regularised(pattern: SparsePattern, values: Float[Array, " nnz"], nudged: bool) -> Float[Array, " nnz"]:
+    """The values with zeros replaced by what is tiny and, if `nudged`, changed by some units in their last place.
+
+    KLU gives up at a pivot that is exactly zero, and klujax then aborts the whole program, all members of a batch
+    included. After this such a pivot is tiny, and the solution overflows or is huge, as any caller can see. Zeros
+    replaced are enough where entries vanish; against those that cancel to zero the nudge helps, at a backward error of
+    `ULPS` roundings, which a Newton iteration does not feel.
+    """
+    shift = np.random.default_rng(0).uniform(-1, 1, len(pattern))
+    if nudged:
+        values = values * (1 + jnp.asarray(ULPS * np.finfo(np.float64).eps * shift))
+    return jnp.where(values == 0, jnp.asarray(ZERO * (2 + shift)), values)
+
+
+def _factorized(pattern: SparsePattern, values: Any, b: Any, transpose: bool, nudged: bool) -> Any:
     rows, cols = (pattern.cols, pattern.rows) if transpose else (pattern.rows, pattern.cols)
     double = values.astype(jnp.float64), b.astype(jnp.float64)
     x = jax.lax.platform_dependent(
         *double,
-        cpu=lambda values, b: klu().solve(jnp.asarray(rows), jnp.asarray(cols), values, b),
+        cpu=lambda values, b: klu().solve(jnp.asarray(rows), jnp.asarray(cols), _regularised(pattern, values, nudged), b),
         default=lambda values, b: _on_host(rows, cols, values, b),
     )
     return x.astype(b.dtype)

@@ -46,7 +46,7 @@ def start_check(problem: FlatProblem, t: Any, rtol: Any, atol: Any) -> StartChec
     residual = algebraic_part(problem, right)
     weight = rtol * jnp.abs(problem_y) + _flat(atol, problem_y)
     shift = chosen.apply(chosen.factor(matrix), matrix, residual) / weight
-    looked_at = matrix if isinstance(matrix, jax.Array) and matrix.shape[0] <= LARGE else None
+    looked_at = chosen.materialise(matrix) if problem_y.shape[0] <= LARGE else None
     return jax.lax.stop_gradient(StartCheck(right, residual, shift, looked_at))
 
 
@@ -124,7 +124,8 @@ def explain_failure(
             "root or logarithm without a value"
         )
     if flat.shape[0] <= LARGE:
-        found = null_names(np.asarray(index_matrix(problem, None, time, flat)[3]), names)
+        chosen, _, _, matrix = index_matrix(problem, None, time, flat)
+        found = null_names(np.asarray(chosen.materialise(matrix)), names)
         if found:
             return head + (
                 f"Newton's matrix is singular there: the equations do not determine {found} (a bifurcation, or an "
