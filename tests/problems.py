@@ -18,8 +18,18 @@ import numpy as np
 import scipy.integrate
 import scipy.special
 from jax.flatten_util import ravel_pytree
+from sympy import Eq
 
-from jaxonomy_dae import AcausalCompiler, AcausalDiagram, AcausalSystem, Component, EqnEnv, NeuralDAEBlock
+from jaxonomy_dae import (
+    AcausalCompiler,
+    AcausalDiagram,
+    AcausalSystem,
+    Component,
+    EqnEnv,
+    NeuralDAEBlock,
+    Translational,
+    der,
+)
 from jaxonomy_dae.library.electrical import Capacitor, Ground, Resistor, VoltageSource
 from jaxonomy_dae.library.planar import PlanarPendulum
 from jaxonomy_dae.library.translational import Damper, FixedPosition, Mass, Spring
@@ -170,6 +180,20 @@ def compiled(
     return AcausalCompiler(components[0].ev, diagram, **options)()
 
 
+class FreeMass(Component):
+    """The library's `Mass`, except that its mass may be any number."""
+
+    def __init__(self, ev: EqnEnv, name: str, M: float = 1.0, initial_position=None, initial_velocity=None):
+        super().__init__(ev, name)
+        m = self.parameter("M", M, unit="kg")
+        x0 = self.parameter("initial_position", initial_position or 0.0)
+        v0 = self.parameter("initial_velocity", initial_velocity or 0.0)
+        flange = self.port("flange", Translational)
+        x = self.variable("x", start=x0, fixed=initial_position is not None)
+        v = self.variable("v", start=v0, fixed=initial_velocity is not None)
+        self.add_equations(Eq(x, flange.x), Eq(der(x), v), Eq(m * der(v), flange.f))
+
+
 def rc_circuit(R: float = 2.0, C: float = 0.5, V: float = 3.0, v0: float = 0.0) -> AcausalSystem:
     """A capacitor charged through a resistor."""
     ev = EqnEnv()
@@ -189,11 +213,11 @@ def rc_voltage(t, R=2.0, C=0.5, V=3.0, v0=0.0):
 
 
 def oscillator(
-    *blocks: Callable, M=2.0, D=0.6, K=5.0, x0=0.7, v0=-0.4, compiler: dict[str, Any] | None = None
+    *blocks: Callable, M=2.0, D=0.6, K=5.0, x0=0.7, v0=-0.4, kind=Mass, compiler: dict[str, Any] | None = None
 ) -> AcausalSystem:
     """A mass between a spring and a damper, both fixed to a wall; `blocks` correct the mass."""
     ev = EqnEnv()
-    mass = Mass(ev, "mass", M, initial_position=x0, initial_velocity=v0)
+    mass = kind(ev, "mass", M, initial_position=x0, initial_velocity=v0)
     spring, damper, wall = Spring(ev, "spring", K), Damper(ev, "damper", D), FixedPosition(ev, "wall")
     return compiled(
         wall, spring, damper, mass,

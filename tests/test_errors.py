@@ -4,6 +4,9 @@ Every case is a function that raises, the error's type, and a pattern of names a
 simulation runs is in test_solution.py and test_initialization.py; single precision is in test_precision.py.
 """
 
+import math
+import re
+
 import diffrax
 import equinox as eqx
 import jax
@@ -87,6 +90,16 @@ def adds_equations_afterwards():
     c.add_equations(Eq(c.x, 1))
 
 
+class Forgetful(Component):
+    def __init__(self, ev, name):
+        self.variable("x")
+
+
+class Empty(Component):
+    def __init__(self, ev, name):
+        pass
+
+
 @pytest.mark.parametrize(
     "message, call, error",
     [
@@ -98,7 +111,7 @@ def adds_equations_afterwards():
         case(r"'c' is complete: declare its variable 'y' inside __init__", declares_afterwards),
         case(r"'c' is complete: add its equations inside __init__", adds_equations_afterwards),
         case(r"name is a non-empty string without dots or spaces; got 'a\.b'", lambda: Ground(EV, "a.b")),
-        case(r"variable's name is a string without dots; got 'a\.b'",
+        case(r"variable's name is a non-empty string without dots or spaces; got 'a\.b'",
              lambda: component(lambda self, ev: self.variable("a.b"))),
         case(r"parameter 'r\.R' must be finite; got nan", lambda: Resistor(EV, "r", np.nan)),
         case(r"parameter 'c\.k' must lie in \[0.*1.*\]; got 2",
@@ -129,6 +142,36 @@ def adds_equations_afterwards():
              lambda: component(lambda s, ev: s.learned("law", mlp(1, 2), inputs=[s.variable("x")], outputs=3))),
         case(r"must return a vector of shape \(outputs,\); got shape \(\)",
              lambda: component(lambda s, ev: s.learned("law", jnp.sum, inputs=[s.variable("x")]))),
+        case(r"parameter 'c\.k' must be a real number; got the string '2': write 2 without quotes",
+             lambda: component(lambda s, ev: s.parameter("k", "2"))),
+        case(r"parameter 'c\.k' must be a real number; got the complex number 2j",
+             lambda: component(lambda s, ev: s.parameter("k", 2j))),
+        case(r"parameter 'm\.M' must lie in \(0, inf\); got -1", lambda: Mass(EV, "m", -1.0)),
+        case(r"parameter 's\.K' must lie in \[0, inf\); got -2", lambda: Spring(EV, "s", -2.0)),
+        case(r"parameter 'c\.k': the bounds \[2, 1\] hold no number",
+             lambda: component(lambda s, ev: s.parameter("k", 1.5, bounds=(2.0, 1.0)))),
+        case(r"start value of 'c\.x' must be a real number; got the string '1'",
+             lambda: component(lambda s, ev: s.variable("x", start="1"))),
+        case(r"default of input 'c\.u' must be finite; got nan",
+             lambda: component(lambda s, ev: s.input("u", default=np.nan))),
+        case(r"complex coefficient", lambda: component(lambda s, ev: s.add_equations(sympy.I * s.variable("x") - 1))),
+        *(
+            case(rf"a variable's name cannot (contain|begin with) .* got '{re.escape(name)}'",
+                 lambda name=name: component(lambda s, ev: s.variable(name)))
+            for name in ("der(x)", "x:physics", "r[0]", "-x", "a/b")
+        ),
+        case(r"a component's name cannot contain '\('", lambda: Ground(EV, "der(g)")),
+        case(r"`diff` by ev\.t does not see that variables change.*der\(x\)",
+             lambda: component(lambda s, ev: s.variable("x").diff(ev.t))),
+        case(r"write der\(x\)", lambda: component(lambda s, ev: sympy.diff(s.variable("x") ** 2 * ev.t, ev.t))),
+        case(r"cannot compare them with if.*Piecewise",
+             lambda: component(lambda s, ev: 1 if s.variable("x") > 0 else 2)),
+        case(r"cannot compare.*Max or Min", lambda: component(lambda s, ev: max(s.variable("x"), 0))),
+        case(r"SymPy's functions", lambda: component(lambda s, ev: math.sin(s.variable("x")))),
+        case(r"SymPy's functions", lambda: component(lambda s, ev: np.sin(s.variable("x")))),
+        case(r"SymPy's functions", lambda: component(lambda s, ev: jnp.sin(s.variable("x")))),
+        case(r"Forgetful: its __init__ must begin with super\(\)\.__init__", lambda: Forgetful(EV, "c")),
+        case(r"Empty: its __init__ must begin with super\(\)\.__init__", lambda: Empty(EV, "c")),
     ],
 )  # fmt: skip
 def test_writing_a_component(message, call, error):
@@ -145,7 +188,7 @@ WRONG_TYPES = [
     (r"parameter 'r\.R' must be a number; got list.*with_parameters\(\{'r\.R'", lambda: Resistor(EV, "r", [1.0])),
     (r"port 'c\.p' needs a Domain such as Electrical; got 'electrical'",
      lambda: component(lambda s, ev: s.port("p", "electrical"))),
-    (r"is no equation", lambda: component(lambda s, ev: s.add_equations(sympy.Matrix([s.variable("x")])))),
+    (r"is not an equation", lambda: component(lambda s, ev: s.add_equations(sympy.Matrix([s.variable("x")])))),
     (r"only components can be added to a diagram; got str", lambda: AcausalDiagram().add("r")),
     (r"needs an EqnEnv and an AcausalDiagram", lambda: AcausalCompiler(AcausalDiagram(), EV)),
     (r"'auto', 'dummy_derivatives' or 'projection'; got 'best'",
@@ -187,6 +230,18 @@ def block_named_as_component():
     AcausalDiagram().add(bob).add_neural_correction_block(block)
 
 
+def two_environments():
+    AcausalDiagram().add(Resistor(EV, "r"), Ground(EqnEnv(), "g"))
+
+
+def a_child_of_another_environment():
+    component(lambda self, ev: self.add(Resistor(EqnEnv(), "r")))
+
+
+def a_foreign_environment():
+    AcausalCompiler(EqnEnv(), AcausalDiagram().add(Ground(EV, "g")))
+
+
 def connects_a_grandchild():
     inner = component(lambda self, ev: self.add(Resistor(ev, "r")), "inner")
 
@@ -225,6 +280,9 @@ def connects_what_is_not_there():
         case(r"takes ports, or a component and a port name; got 'p'", lambda: AcausalDiagram().connect("p", "n")),
         case(r"'outer' connects outer\.inner\.r\.p.*its own ports and its children's", connects_a_grandchild),
         case(r"outside\.p.*not part of the diagram: add it", connects_what_is_not_there),
+        case(r"components 'r' and 'g' were made with two EqnEnvs", two_environments),
+        case(r"its child 'r' was made with another EqnEnv; give it self\.ev", a_child_of_another_environment),
+        case(r"'g' was made with another EqnEnv than the compiler", a_foreign_environment),
         case(r"no components: add some", lambda: AcausalCompiler(EV, AcausalDiagram())()),
         case(r"prefer_states=\['pend\.x'\]", lambda: AcausalCompiler(EV, AcausalDiagram(), prefer_states="pend.x")),
         case(r"prefer_states: 'pend\.z' is no variable: did you mean",
@@ -332,10 +390,13 @@ def use(message, call, error=ModelError):
 @pytest.mark.parametrize(
     "message, call, error",
     [
-        use(r"'r\.r' is no parameter: did you mean 'r\.R'", lambda s: s.with_parameters({"r.r": 1.0})),
-        use(r"'r\.r' is no parameter: did you mean 'r\.R'", lambda s: s.parameters["r.r"]),
+        use(r"'r\.r' is not a parameter: did you mean 'r\.R'", lambda s: s.with_parameters({"r.r": 1.0})),
+        use(r"'r\.r' is not a parameter: did you mean 'r\.R'", lambda s: s.parameters["r.r"]),
         use(r"parameter 'r\.R' must be finite; got inf", lambda s: s.with_parameters({"r.R": np.inf})),
-        use(r"parameter 'r\.R' is a scalar; got shape \(3,\).*jax\.vmap",
+        use(r"parameter 'r\.R' must be a real number; got the string", lambda s: s.with_parameters({"r.R": "2"})),
+        use(r"parameter 'r\.R' must be a real number; got a complex", lambda s: s.with_parameters({"r.R": 1j})),
+        use(r"parameter 'c\.C' must lie in \(0, inf\); got 0", lambda s: s.with_parameters({"c.C": 0.0})),
+        use(r"parameter 'r\.R' is a scalar; got shape \(3,\).*filter_vmap",
             lambda s: s.with_parameters({"r.R": jnp.ones(3)})),
         use(r"'c\.vv' is no variable: did you mean 'c\.v'", lambda s: s.observe("c.vv", 0.0, jnp.zeros(1))),
         use(r"'net' is neither a network nor a parameter: known names: 'source\.V'", lambda s: s.partition("net")),
@@ -385,7 +446,7 @@ def test_bounds_hold_later_too():
         decay(self, ev, Eq(self.variable("y"), self.parameter("k", 0.5, bounds=(0.0, 1.0))))
 
     system = compiled(component(write))
-    with pytest.raises(ModelError, match=r"'c\.k' must lie in \[0\.0, 1\.0\]; got 2"):
+    with pytest.raises(ModelError, match=r"'c\.k' must lie in \[0, 1\]; got 2"):
         system.with_parameters({"c.k": 2.0})
 
 

@@ -8,7 +8,7 @@ import random
 
 import numpy as np
 import pytest
-from problems import compiled
+from problems import FreeMass, compiled
 from sympy import Eq, exp, sin
 
 from jaxonomy_dae import AcausalDiagram, Component, EqnEnv, ModelError, StructuralError, der
@@ -25,7 +25,7 @@ KINDS = {
     cls.__name__: cls
     for cls in (
         Capacitor, CurrentSource, Ground, Inductor, Resistor, VoltageSource, FixedTemperature, HeatCapacitor,
-        ThermalConductor, Damper, FixedPosition, Mass, Rod, Spring,
+        ThermalConductor, Damper, FixedPosition, Mass, FreeMass, Rod, Spring,
     )
 }  # fmt: skip
 
@@ -299,12 +299,12 @@ CASES = {
         "  c: 0 = x + y + z - sin(x)",
     ),
     "a mass of zero": (
-        lambda: model({"m": "Mass"}, m={"M": 0.0}),
+        lambda: model({"m": "FreeMass"}, m={"M": 0.0}),
         "the equation m: 0 = M*der(v) - flange.f determines nothing for m.M = 0: the coefficient of what it should "
         "determine is zero. Give other values, or leave the component out.",
     ),
     "masses that cancel": (
-        lambda: model({"a": "Mass", "b": "Mass"}, "a.flange b.flange", a={"M": 1.0}, b={"M": -1.0}),
+        lambda: model({"a": "Mass", "b": "FreeMass"}, "a.flange b.flange", a={"M": 1.0}, b={"M": -1.0}),
         "these equations are singular for the given parameter values, though not in general. Change the parameters, or "
         "state the constraint that follows as an equation of its own:\n"
         "  a: 0 = M*der(v) - flange.f\n"

@@ -1,5 +1,7 @@
 """Training: the best iterate is kept, nothing is compiled twice, and what goes wrong is said."""
 
+import math
+
 import diffrax
 import equinox as eqx
 import jax
@@ -10,8 +12,9 @@ import pytest
 from problems import compiled, rc_circuit, rc_voltage
 from sympy import Eq
 
-from jaxonomy_dae import Component, EqnEnv, ModelError, der, simulate
+from jaxonomy_dae import Component, EqnEnv, Interval, ModelError, der, simulate
 from jaxonomy_dae.learning import fit, fit_least_squares
+from jaxonomy_dae.solvers import StoredAdjoint
 
 TS = jnp.array([0.5, 1.0, 2.0])
 
@@ -184,6 +187,72 @@ def test_least_squares_on_a_plain_module():
     assert float(result.model.x) == pytest.approx(1.0) and abs(float(result.model.y)) == pytest.approx(2.0)
 
 
+# --- bounds ------------------------------------------------------------------------------------------------------
+
+
+class Line(Component):
+    """der(x) = −k: what is observed is the parameter itself."""
+
+    def __init__(self, ev, name, k, bounds):
+        super().__init__(ev, name)
+        rate = self.parameter("k", k, bounds=bounds)
+        x = self.variable("x", start=1.0, fixed=True)
+        self.add_equations(Eq(der(x), -rate))
+
+
+def rate(system):
+    return -system.observe("der(c.x)", 0.0, jnp.ones(1))
+
+
+# (bounds, start, target, nearest admissible value)
+BOUNDED = [
+    ((0.0, 2.0), 1.0, 0.7, 0.7),
+    ((0.0, 2.0), 1.0, 3.0, 2.0),
+    ((0.0, 2.0), 2.0, 0.5, 0.5),
+    ((0.0, math.inf), 1.0, -0.5, 0.0),
+    ((0.0, math.inf), 0.0, 0.5, 0.5),
+    ((-math.inf, 3.0), 1.0, 4.0, 3.0),
+    ((-math.inf, math.inf), 1.0, -4.0, -4.0),
+    (Interval(0.0, math.inf, open_low=True), 1.0, 5.0, 5.0),
+    (Interval(-math.inf, 0.0, open_high=True), -2.0, -1e-3, -1e-3),
+    (Interval(0.0, 2.0, open_low=True, open_high=True), 1.0, 1.9, 1.9),
+]
+
+
+@pytest.mark.parametrize("bounds, start, target, expected", BOUNDED)
+def test_fits_end_inside_bounds(bounds, start, target, expected):
+    system = compiled(Line(EqnEnv(), "c", start, bounds))
+    squares = fit_least_squares(system, lambda s: jnp.stack([rate(s) - target, rate(s) - target]), train="c.k")
+    assert float(squares.model.parameters["c.k"]) == pytest.approx(expected, abs=1e-6)
+    # A step of half the gradient of (k − target)² is the whole way; 1.5 times as much overshoots.
+    steps = fit(system, lambda s: (rate(s) - target) ** 2, optax.sgd(0.75), 30, train="c.k", progress=False)
+    assert float(steps.model.parameters["c.k"]) == pytest.approx(expected, abs=1e-6)
+    for result in (squares, steps):
+        result.model.with_parameters({"c.k": result.model.parameters["c.k"]})  # raises outside the bounds
+
+
+def test_an_open_end_is_approached_and_never_reached():
+    system = compiled(Line(EqnEnv(), "c", 1.0, Interval(0.0, math.inf, open_low=True)))
+    steps = fit(system, lambda s: (rate(s) + 1) ** 2, optax.sgd(0.5), 5, train="c.k", progress=False)
+    # Each step would go to −1, and goes nine tenths of the way to 0.
+    assert float(steps.model.parameters["c.k"]) == pytest.approx(1e-5, rel=1e-9)
+    squares = fit_least_squares(system, lambda s: jnp.stack([rate(s) + 1]), train="c.k")
+    assert 0 < float(squares.model.parameters["c.k"]) < 0.2
+
+
+def test_least_squares_chooses_forward_mode():
+    system = rc_circuit(R=3.0, C=0.5)
+    data = jnp.asarray(rc_voltage(TS, R=1.2))
+
+    def residuals(system, data, **options):
+        return simulate(system, 2.0, ts=TS, rtol=1e-8, atol=1e-10, **options)["c.v"] - data
+
+    result = fit_least_squares(system, residuals, train="r.R", args=(data,))
+    assert float(result.model.parameters["r.R"]) == pytest.approx(1.2, rel=1e-6)
+    with pytest.raises(ModelError, match="cannot be differentiated forwards.*ForwardMode"):
+        fit_least_squares(system, lambda s, d: residuals(s, d, adjoint=StoredAdjoint()), train="r.R", args=(data,))
+
+
 # --- wrong use ---------------------------------------------------------------------------------------------------
 
 
@@ -205,6 +274,17 @@ def test_least_squares_on_a_plain_module():
             r"the loss is nan at the start.*simulate the model once",
         ),
         (lambda: fit(Bowl(1.0, 2.0), lambda m: m.x, optax.sgd(1.0), 1, progress=False), r"nothing is to be trained"),
+        (
+            lambda: fit(
+                bowl(),
+                lambda m, d: m.x * d["t"][0],
+                optax.sgd(1.0),
+                1,
+                args=({"t": jnp.array([np.nan])},),
+                progress=False,
+            ),
+            r"the data are not finite: args\[0\]\['t'\]",
+        ),
         (
             lambda: fit_least_squares(bowl(x=np.nan), lambda m: jnp.stack([m.x])),
             r"not finite at the start: simulate the model once",

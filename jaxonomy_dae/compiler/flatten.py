@@ -385,7 +385,7 @@ def _parameter_table(model: _Model) -> ParameterTable:
             values.append(parameter.value)
             units.append(parameter.unit)
             bounds.append(parameter.bounds)
-    return ParameterTable(names, np.array(values, float), units, np.array(bounds, float).reshape(-1, 2))
+    return ParameterTable(names, np.array(values, float), units, bounds)
 
 
 def _add_blocks(model: _Model, diagram: AcausalDiagram, variables: VariableTable, groups, networks):

@@ -14,8 +14,11 @@ import optax
 import optimistix as optx
 from tqdm import tqdm
 
+from ..adjoint.default import forward_mode
 from ..errors import ModelError
+from ..modeling.interval import Interval
 from ..system.system import AcausalSystem
+from .bounds import Unbounded, project
 
 Model = TypeVar("Model", bound=eqx.Module)
 
@@ -56,6 +59,24 @@ def _merged(model: Any) -> Any:
     return model.merged() if isinstance(model, AcausalSystem) else model
 
 
+def _bounds(trainable: Any) -> tuple[Interval, ...]:
+    """The bounds of the parameters that are trained, in the order of `parameters.free`."""
+    if not isinstance(trainable, AcausalSystem) or trainable.parameters.free is None:
+        return ()
+    parameters = trainable.parameters
+    return tuple(parameters.table.intervals[k] for k in parameters.free_index)
+
+
+def _with_free(trainable: Any, values: Any) -> Any:
+    return eqx.tree_at(lambda s: s.parameters.free, trainable, values)
+
+
+def _check_data(args: tuple) -> None:
+    for path, leaf in jax.tree_util.tree_leaves_with_path(args):
+        if eqx.is_inexact_array_like(leaf) and not np.isfinite(np.asarray(leaf)).all():
+            raise ModelError(f"the data are not finite: args{jax.tree_util.keystr(path)} has NaN or infinite entries")
+
+
 def fit(
     model: Model,
     loss: Callable[..., Any],
@@ -67,6 +88,9 @@ def fit(
     progress: bool = True,
 ) -> Fit[Model]:
     """Minimises a loss by gradient steps; keeps the best iterate.
+
+    Declared bounds of parameters hold in every iterate: a step is projected onto a closed end, and towards an open end
+    goes nine tenths of the way at most.
 
     **Arguments:**
 
@@ -86,13 +110,16 @@ def fit(
 
     **Raises:**
 
-    - `ModelError` if the loss is no scalar, is not finite at the start, or nothing is to be trained.
+    - `ModelError` if the loss is not a scalar or not finite at the start, if arrays in `args` are not finite, or if
+        nothing is to be trained.
     """
     if not isinstance(steps, int) or steps < 0:
         raise ModelError(f"steps must be a number of updates ≥ 0; got {steps!r}")
     trainable, frozen = split(model, train)
     if not jax.tree.leaves(trainable):
         raise ModelError("nothing is to be trained: `train` selects no arrays of the model")
+    _check_data(args)
+    bounds = _bounds(trainable)
     # Updates make weakly typed leaves strong, which would compile the step again.
     trainable = jax.tree.map(lambda w: jnp.asarray(w, w.dtype) if eqx.is_array(w) else w, trainable)
 
@@ -108,7 +135,11 @@ def fit(
         finite = jnp.array([jnp.isfinite(g).all() for g in jax.tree.leaves(gradient)]).all()
         with jax.numpy_dtype_promotion("standard"):  # Optax raises floats to integer powers
             updates, state = optimizer.update(gradient, state, trainable)
-        return value, finite, eqx.apply_updates(trainable, updates), state
+        following = eqx.apply_updates(trainable, updates)
+        if bounds:
+            old, new = trainable.parameters.free, following.parameters.free
+            following = _with_free(following, project(new, old, bounds))
+        return value, finite, following, state
 
     with jax.numpy_dtype_promotion("standard"):
         state = optimizer.init(eqx.filter(trainable, eqx.is_inexact_array))
@@ -160,8 +191,12 @@ def fit_least_squares(
     """Minimises ½ Σ residuals² by Levenberg–Marquardt steps.
 
     Where data are many and weights are few this is worth far more than gradient steps. The Jacobian is found by forward
-    mode, so the simulation inside needs `adjoint=diffrax.ForwardMode()`. Give it `throw=False` and a moderate
-    `max_steps` too: a trial step may lead where the model cannot be integrated, and is then rejected, not raised.
+    mode, so `simulate` and `solve_dae` take `adjoint=diffrax.ForwardMode()` inside unless they are given another one.
+    Give them `throw=False` and a moderate `max_steps`: a trial step may lead where the model cannot be integrated, and
+    is then rejected, not raised.
+
+    Declared bounds of parameters hold in every trial: the steps are taken in unbounded coordinates, close to the
+    parameters themselves well inside the bounds. An open end is approached, never reached.
 
     **Arguments:**
 
@@ -173,23 +208,51 @@ def fit_least_squares(
     **Returns:**
 
     A `Fit` whose `history` has the first and the last value of ½ Σ residuals².
+
+    **Raises:**
+
+    - `ModelError` if the residuals or arrays in `args` are not finite at the start, if they cannot be differentiated
+        forwards, or if nothing is to be trained.
     """
     trainable, frozen = split(model, train)
     if not jax.tree.leaves(trainable):
         raise ModelError("nothing is to be trained: `train` selects no arrays of the model")
 
+    _check_data(args)
+    bounds = _bounds(trainable)
+    coordinates = Unbounded(trainable.parameters.free, bounds) if bounds else None
+
     def function(trainable, extra):
         frozen, args = extra
         return jnp.ravel(residuals(_merged(eqx.combine(trainable, frozen)), *args))
 
-    @eqx.filter_jit
-    def run(trainable, frozen, args):
-        solver = optx.LevenbergMarquardt(rtol=rtol, atol=atol)
-        found = optx.least_squares(function, solver, trainable, (frozen, args), max_steps=steps, throw=False)
-        cost = [0.5 * jnp.sum(function(w, (frozen, args)) ** 2) for w in (trainable, found.value)]
-        return found.value, found.stats["num_steps"], cost
+    def inside(weights):
+        return weights if coordinates is None else _with_free(weights, coordinates.values(weights.parameters.free))
 
-    found, taken, cost = run(trainable, frozen, args)
+    @eqx.filter_jit
+    def run(trainable, start, frozen, args):
+        solver = optx.LevenbergMarquardt(rtol=rtol, atol=atol)
+        if coordinates is not None:
+            # Curved coordinates spoil the prediction: by default, only steps predicted to 1 % lengthen the next.
+            solver = eqx.tree_at(lambda s: s.search.high_cutoff, solver, 0.5)
+        found = optx.least_squares(
+            lambda z, extra: function(inside(z), extra), solver, start, (frozen, args), max_steps=steps, throw=False
+        )
+        value = inside(found.value)
+        cost = [0.5 * jnp.sum(function(w, (frozen, args)) ** 2) for w in (trainable, value)]
+        return value, found.stats["num_steps"], cost
+
+    start = trainable if coordinates is None else _with_free(trainable, coordinates.start)
+    try:
+        with forward_mode():
+            found, taken, cost = run(trainable, start, frozen, args)
+    except TypeError as error:
+        if "forward-mode" not in str(error):
+            raise
+        raise ModelError(
+            "the residuals cannot be differentiated forwards: a simulation inside was given another adjoint, or was "
+            "traced before. Leave `adjoint` out, or give adjoint=diffrax.ForwardMode()"
+        ) from error
     first, last = (float(c) for c in cost)
     if not math.isfinite(first):
         raise ModelError("the residuals are not finite at the start: simulate the model once to see why")

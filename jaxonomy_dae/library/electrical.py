@@ -6,7 +6,7 @@ Conventions: potential `v` in volt, current `i` in ampere counted positive into 
 
 import sympy
 
-from ..modeling import Component, Electrical, Eq, EqnEnv, der
+from ..modeling import POSITIVE, Component, Electrical, Eq, EqnEnv, der
 
 
 class _TwoPin(Component):
@@ -41,7 +41,7 @@ class CurrentSource(_TwoPin):
 
 
 class Resistor(_TwoPin):
-    """v = R·i, `R` in ohm."""
+    """v = R·i, `R` in ohm; a negative one feeds energy in."""
 
     def __init__(self, ev: EqnEnv, name: str, R: float = 1.0):
         super().__init__(ev, name)
@@ -51,22 +51,22 @@ class Resistor(_TwoPin):
 
 
 class Capacitor(_TwoPin):
-    """C·dv/dt = i, `C` in farad. A given `initial_voltage` (volt) holds at the start; otherwise 0 is a guess."""
+    """C·dv/dt = i, `C` > 0 in farad. A given `initial_voltage` (volt) holds at the start; otherwise 0 is a guess."""
 
     def __init__(self, ev: EqnEnv, name: str, C: float = 1.0, initial_voltage: float | None = None):
         super().__init__(ev, name)
-        c = self.parameter("C", C, unit="F")
+        c = self.parameter("C", C, unit="F", bounds=POSITIVE)
         v0 = self.parameter("initial_voltage", initial_voltage or 0.0, unit="V")
         voltage, current = self._two_pins(v=dict(start=v0, fixed=initial_voltage is not None))
         self.add_equations(Eq(c * der(voltage), current))
 
 
 class Inductor(_TwoPin):
-    """L·di/dt = v, `L` in henry. A given `initial_current` (ampere) holds at the start; otherwise 0 is a guess."""
+    """L·di/dt = v, `L` > 0 in henry. A given `initial_current` (ampere) holds at the start; otherwise 0 is a guess."""
 
     def __init__(self, ev: EqnEnv, name: str, L: float = 1.0, initial_current: float | None = None):
         super().__init__(ev, name)
-        inductance = self.parameter("L", L, unit="H")
+        inductance = self.parameter("L", L, unit="H", bounds=POSITIVE)
         i0 = self.parameter("initial_current", initial_current or 0.0, unit="A")
         voltage, current = self._two_pins(i=dict(start=i0, fixed=initial_current is not None))
         self.add_equations(Eq(inductance * der(current), voltage))

@@ -2,7 +2,7 @@
 
 from sympy import cos, sin
 
-from ..modeling import Component, Eq, EqnEnv, der
+from ..modeling import POSITIVE, Component, Eq, EqnEnv, der
 
 
 class PlanarPendulum(Component):
@@ -16,7 +16,7 @@ class PlanarPendulum(Component):
 
     **Arguments:**
 
-    - `m`: mass (kilogram). `L`: length (metre). `g_x`, `g_y`: gravity's components (metre per second squared).
+    - `m` > 0: mass (kilogram). `L` > 0: length (metre). `g_x`, `g_y`: gravity's components (metre per second squared).
     - `initial_theta`: angle at the start from the +x axis, counter-clockwise (radian).
     - `initial_omega`: angular velocity at the start (radian per second).
     """
@@ -33,8 +33,8 @@ class PlanarPendulum(Component):
         initial_omega: float = 0.0,
     ):
         super().__init__(ev, name)
-        mass = self.parameter("m", m, unit="kg")
-        length = self.parameter("L", L, unit="m")
+        mass = self.parameter("m", m, unit="kg", bounds=POSITIVE)
+        length = self.parameter("L", L, unit="m", bounds=POSITIVE)
         gx = self.parameter("g_x", g_x, unit="m/s2")
         gy = self.parameter("g_y", g_y, unit="m/s2")
         theta = self.parameter("initial_theta", initial_theta, unit="rad")

@@ -6,11 +6,11 @@ flange, so an inertia obeys J·dw/dt = flange_a.tau + flange_b.tau.
 
 import sympy
 
-from ..modeling import Component, Eq, EqnEnv, Rotational, der
+from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Rotational, der
 
 
 class Inertia(Component):
-    """A rotating inertia with a shaft on both sides: J·dw/dt = flange_a.tau + flange_b.tau, `J` in kg·m².
+    """A rotating inertia with a shaft on both sides: J·dw/dt = flange_a.tau + flange_b.tau, `J` > 0 in kg·m².
 
     A given `initial_angle` (radian) or `initial_speed` (radian per second) holds at the start; otherwise 0 is a guess.
     The acceleration `a` is a variable too.
@@ -25,7 +25,7 @@ class Inertia(Component):
         initial_speed: float | None = None,
     ):
         super().__init__(ev, name)
-        inertia = self.parameter("J", J, unit="kg*m2")
+        inertia = self.parameter("J", J, unit="kg*m2", bounds=POSITIVE)
         phi0 = self.parameter("initial_angle", initial_angle or 0.0, unit="rad")
         w0 = self.parameter("initial_speed", initial_speed or 0.0, unit="rad/s")
         a, b = self.port("flange_a", Rotational), self.port("flange_b", Rotational)
@@ -53,22 +53,22 @@ class _Compliant(Component):
 
 
 class Spring(_Compliant):
-    """A linear spring: tau = c·(phi_rel − phi_rel0), `c` in N·m/rad, `phi_rel0` in radian."""
+    """A linear spring: tau = c·(phi_rel − phi_rel0), `c` ≥ 0 in N·m/rad, `phi_rel0` in radian."""
 
     def __init__(self, ev: EqnEnv, name: str, c: float = 1.0, phi_rel0: float = 0.0):
         super().__init__(ev, name)
-        stiffness = self.parameter("c", c, unit="N*m/rad")
+        stiffness = self.parameter("c", c, unit="N*m/rad", bounds=NONNEGATIVE)
         rest = self.parameter("phi_rel0", phi_rel0, unit="rad")
         phi, tau = self._two_flanges()
         self.add_equations(Eq(tau, stiffness * (phi - rest)))
 
 
 class Damper(_Compliant):
-    """A linear damper: tau = d·w_rel with w_rel = der(phi_rel), `d` in N·m·s/rad."""
+    """A linear damper: tau = d·w_rel with w_rel = der(phi_rel), `d` ≥ 0 in N·m·s/rad."""
 
     def __init__(self, ev: EqnEnv, name: str, d: float = 1.0):
         super().__init__(ev, name)
-        damping = self.parameter("d", d, unit="N*m*s/rad")
+        damping = self.parameter("d", d, unit="N*m*s/rad", bounds=NONNEGATIVE)
         phi, tau = self._two_flanges()
         w = self.variable("w_rel", unit="rad/s")
         self.add_equations(Eq(w, der(phi)), Eq(tau, damping * w))

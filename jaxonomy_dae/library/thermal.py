@@ -3,18 +3,18 @@
 Conventions: temperature `T` in kelvin, heat flow `Q_flow` in watt counted positive into the component at a port.
 """
 
-from ..modeling import Component, Eq, EqnEnv, Thermal, der
+from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Thermal, der
 
 
 class HeatCapacitor(Component):
-    """C·dT/dt = heat.Q_flow, `C` in joule per kelvin.
+    """C·dT/dt = heat.Q_flow, `C` > 0 in joule per kelvin.
 
     A given `initial_temperature` (kelvin) holds at the start; otherwise 293.15 is a guess.
     """
 
     def __init__(self, ev: EqnEnv, name: str, C: float = 1.0, initial_temperature: float | None = None):
         super().__init__(ev, name)
-        capacity = self.parameter("C", C, unit="J/K")
+        capacity = self.parameter("C", C, unit="J/K", bounds=POSITIVE)
         start = 293.15 if initial_temperature is None else initial_temperature
         t0 = self.parameter("initial_temperature", start, unit="K")
         heat = self.port("heat", Thermal)
@@ -23,11 +23,11 @@ class HeatCapacitor(Component):
 
 
 class ThermalConductor(Component):
-    """Q_flow = G·(port_a.T − port_b.T), `G` in watt per kelvin; `Q_flow` flows from `port_a` to `port_b`."""
+    """Q_flow = G·(port_a.T − port_b.T), `G` ≥ 0 in watt per kelvin; `Q_flow` flows from `port_a` to `port_b`."""
 
     def __init__(self, ev: EqnEnv, name: str, G: float = 1.0):
         super().__init__(ev, name)
-        conductance = self.parameter("G", G, unit="W/K")
+        conductance = self.parameter("G", G, unit="W/K", bounds=NONNEGATIVE)
         a, b = self.port("port_a", Thermal), self.port("port_b", Thermal)
         difference = self.variable("dT", unit="K")
         flow = self.variable("Q_flow", unit="W")

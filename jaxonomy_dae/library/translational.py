@@ -4,11 +4,11 @@ Conventions: absolute position `x` in metre, force `f` in newton counted positiv
 mass obeys M·dv/dt = flange.f.
 """
 
-from ..modeling import Component, Eq, EqnEnv, Translational, der
+from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Translational, der
 
 
 class Mass(Component):
-    """A sliding mass: M·dv/dt = flange.f, `M` in kilogram.
+    """A sliding mass: M·dv/dt = flange.f, `M` > 0 in kilogram.
 
     A given `initial_position` (metre) or `initial_velocity` (metre per second) holds at the start; otherwise 0 is a
     guess.
@@ -23,7 +23,7 @@ class Mass(Component):
         initial_velocity: float | None = None,
     ):
         super().__init__(ev, name)
-        m = self.parameter("M", M, unit="kg")
+        m = self.parameter("M", M, unit="kg", bounds=POSITIVE)
         x0 = self.parameter("initial_position", initial_position or 0.0, unit="m")
         v0 = self.parameter("initial_velocity", initial_velocity or 0.0, unit="m/s")
         flange = self.port("flange", Translational)
@@ -33,11 +33,12 @@ class Mass(Component):
 
 
 class Spring(Component):
-    """A linear spring: f = K·(flange_b.x − flange_a.x − length), `K` in newton per metre, pulling its ends together."""
+    """A linear spring that pulls its ends together: f = K·(flange_b.x − flange_a.x − length), `K` ≥ 0 in newton per
+    metre."""
 
     def __init__(self, ev: EqnEnv, name: str, K: float = 1.0, length: float = 0.0):
         super().__init__(ev, name)
-        k = self.parameter("K", K, unit="N/m")
+        k = self.parameter("K", K, unit="N/m", bounds=NONNEGATIVE)
         rest = self.parameter("length", length, unit="m")
         a, b = self.port("flange_a", Translational), self.port("flange_b", Translational)
         s = self.variable("s", unit="m")
@@ -46,11 +47,11 @@ class Spring(Component):
 
 
 class Damper(Component):
-    """A linear damper: f = D·(flange_b.v − flange_a.v), `D` in newton second per metre."""
+    """A linear damper: f = D·(flange_b.v − flange_a.v), `D` ≥ 0 in newton second per metre."""
 
     def __init__(self, ev: EqnEnv, name: str, D: float = 1.0):
         super().__init__(ev, name)
-        d = self.parameter("D", D, unit="N*s/m")
+        d = self.parameter("D", D, unit="N*s/m", bounds=NONNEGATIVE)
         a, b = self.port("flange_a", Translational), self.port("flange_b", Translational)
         s = self.variable("s", unit="m")
         v = self.variable("v", unit="m/s")

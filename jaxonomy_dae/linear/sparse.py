@@ -255,7 +255,9 @@ def _factorized(pattern: SparsePattern, values: Any, b: Any, transpose: bool, nu
     double = values.astype(jnp.float64), b.astype(jnp.float64)
     x = jax.lax.platform_dependent(
         *double,
-        cpu=lambda values, b: klu().solve(jnp.asarray(rows), jnp.asarray(cols), _regularised(pattern, values, nudged), b),
+        cpu=lambda values, b: klu().solve(
+            jnp.asarray(rows), jnp.asarray(cols), _regularised(pattern, values, nudged), b
+        ),
         default=lambda values, b: _on_host(rows, cols, values, b),
     )
     return x.astype(b.dtype)

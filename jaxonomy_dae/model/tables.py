@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ..modeling.interval import Interval
 from .templates import AnyTemplate, OpaqueFunction, Template
 
 ZERO = -1
@@ -69,7 +70,7 @@ class ParameterTable:
     names: list[str]
     values: np.ndarray
     units: list[str]
-    bounds: np.ndarray
+    bounds: list[Interval]
 
     def __len__(self):
         return len(self.names)

@@ -3,6 +3,9 @@
 from .component import Component as Component
 from .diagram import AcausalDiagram as AcausalDiagram
 from .environment import EqnEnv as EqnEnv
+from .interval import NONNEGATIVE as NONNEGATIVE
+from .interval import POSITIVE as POSITIVE
+from .interval import Interval as Interval
 from .neural import NeuralDAEBlock as NeuralDAEBlock
 from .ports import Domain as Domain
 from .ports import Electrical as Electrical

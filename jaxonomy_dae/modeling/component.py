@@ -1,7 +1,5 @@
 """The base class of everything a user models with."""
 
-import dataclasses
-import functools
 import math
 import numbers
 from collections.abc import Sequence
@@ -10,54 +8,19 @@ from typing import Any
 import sympy
 
 from ..errors import ModelError, nearest
+from .connections import resolve_ports
+from .construction import Construction
+from .declarations import Learned, Parameter, Variable
 from .environment import EqnEnv
+from .equations import residual_of
+from .interval import Interval, as_interval
+from .names import check_name
 from .ports import Domain, Port
+from .real_number import real_number
 from .symbols import ParameterSymbol, TimeSymbol, VariableSymbol
 
 
-@dataclasses.dataclass(frozen=True)
-class Parameter:
-    """A declared parameter: its local name, value, unit and bounds."""
-
-    name: str
-    value: Any
-    unit: str
-    bounds: tuple[float, float]
-
-
-@dataclasses.dataclass(frozen=True)
-class Variable:
-    """A declared variable: `kind` is 'variable', 'input', 'output', 'learned' or 'port'."""
-
-    name: str
-    kind: str
-    start: Any
-    fixed: bool
-    nominal: float
-    unit: str
-    default: float | None = None
-
-
-@dataclasses.dataclass(frozen=True)
-class Learned:
-    """A network in the equations: outputs = network(inputs), all named by local variables."""
-
-    name: str
-    network: Any
-    inputs: tuple[VariableSymbol | TimeSymbol, ...]
-    outputs: tuple[VariableSymbol, ...]
-
-
-class _Sealing(type):
-    """Closes a component when its construction ends: from then on its symbols are seen from the outside."""
-
-    def __call__(cls, *args, **kwargs):
-        component = super().__call__(*args, **kwargs)
-        component._sealed = True
-        return component
-
-
-class Component(metaclass=_Sealing):
+class Component(metaclass=Construction):
     """The base class of all components: subclass it, and declare physics in `__init__`.
 
     ```python
@@ -82,8 +45,7 @@ class Component(metaclass=_Sealing):
     def __init__(self, ev: EqnEnv, name: str):
         if not isinstance(ev, EqnEnv):
             raise ModelError(f"the first argument of a component is an EqnEnv; got {type(ev).__name__}")
-        if not isinstance(name, str) or not name or "." in name or any(c.isspace() for c in name):
-            raise ModelError(f"a component's name is a non-empty string without dots or spaces; got {name!r}")
+        check_name(name, "component")
         self.ev = ev
         self.name = name
         self.parent: Component | None = None
@@ -124,7 +86,9 @@ class Component(metaclass=_Sealing):
     __getitem__ = symbol
 
     def __getattr__(self, name: str) -> Any:
-        # Reached only for names that are no plain attributes: declared symbols, ports, children.
+        # Reached only for names that are not plain attributes: declared symbols, ports, children.
+        if name in _BASE_ATTRIBUTES and name not in self.__dict__:
+            raise ModelError(f"{type(self).__name__}: its __init__ must begin with super().__init__(ev, name)")
         if not name.startswith("_"):
             for table in ("ports", "children"):
                 if name in self.__dict__.get(table, ()):
@@ -151,8 +115,7 @@ class Component(metaclass=_Sealing):
             raise ModelError(
                 f"component '{self.path}' is complete: declare its {what} '{name}' inside __init__ of its class"
             )
-        if not isinstance(name, str) or not name or "." in name:
-            raise ModelError(f"component '{self.name}': a {what}'s name is a string without dots; got {name!r}")
+        check_name(name, what, f"component '{self.name}': ")
         for table, kind in (
             (self.parameters, "parameter"),
             (self.variables, "variable"),
@@ -174,7 +137,11 @@ class Component(metaclass=_Sealing):
     # --- declarations ------------------------------------------------------------------------------------------
 
     def parameter(
-        self, name: str, value: Any, unit: str = "", bounds: tuple[float, float] = (-math.inf, math.inf)
+        self,
+        name: str,
+        value: Any,
+        unit: str = "",
+        bounds: "Interval | tuple[float, float]" = (-math.inf, math.inf),
     ) -> ParameterSymbol:
         """Declares a parameter: a number that is constant in time and can be set, trained and differentiated.
 
@@ -183,43 +150,40 @@ class Component(metaclass=_Sealing):
         - `name`: its local name.
         - `value`: a finite number (a Python or NumPy scalar).
         - `unit`: shown in reports and plots.
-        - `bounds`: the closed interval of admissible values.
+        - `bounds`: the admissible values: a pair (low, high) of a closed interval, or an `Interval`, whose ends may be
+            open. Whatever sets the parameter keeps them: declaration, `with_parameters`, `fit`, `initialize`.
 
         **Raises:**
 
-        - `ModelError` if the value is no finite number inside the bounds.
+        - `ModelError` if the value is not a finite number inside the bounds.
         """
         self._claim(name, "parameter")
-        where = f"{self.name}.{name}"
-        try:
-            number = float(value)
-        except (TypeError, ValueError):
-            raise ModelError(
-                f"parameter '{where}' must be a number; got {type(value).__name__}. To vary or differentiate it, "
-                f"compile once and use `system.with_parameters({{'{where}': value}})`"
-            ) from None
-        if not math.isfinite(number):
-            raise ModelError(f"parameter '{where}' must be finite; got {number}")
-        low, high = bounds
-        if not low <= number <= high:
-            raise ModelError(f"parameter '{where}' must lie in [{low}, {high}]; got {number}")
-        self.parameters[name] = Parameter(name, number, unit, (float(low), float(high)))
+        where = f"parameter '{self.name}.{name}'"
+        interval = as_interval(bounds, where)
+        number = real_number(
+            value,
+            where,
+            ". To vary or differentiate it, compile once and use "
+            f"`system.with_parameters({{'{self.name}.{name}': value}})`",
+        )
+        if number not in interval:
+            raise ModelError(f"{where} must lie in {interval}; got {number:g}")
+        self.parameters[name] = Parameter(name, number, unit, interval)
         return ParameterSymbol(name)
 
     def _declare(self, name: str, kind: str, start=None, fixed=False, nominal=1.0, unit="", default=None):
+        where = f"'{self.name}.{name}'"
         if not (isinstance(nominal, numbers.Real) and math.isfinite(nominal) and nominal > 0):
-            raise ModelError(f"the nominal value of '{self.name}.{name}' must be a positive number; got {nominal}")
+            raise ModelError(f"the nominal value of {where} must be a positive number; got {nominal}")
         if fixed and start is None:
-            raise ModelError(f"'{self.name}.{name}' is fixed at the start but has no start value: give `start=`")
+            raise ModelError(f"{where} is fixed at the start but has no start value: give `start=`")
         if start is not None:
+            if not isinstance(start, sympy.Expr) or start.is_number:
+                start = real_number(start, f"the start value of {where}")
             start = sympy.sympify(start)
-            if isinstance(start, sympy.Number) and not start.is_finite:
-                raise ModelError(f"the start value of '{self.name}.{name}' must be finite; got {start}")
             wrong = [s for s in start.free_symbols if not isinstance(s, ParameterSymbol)]
             if wrong:
-                raise ModelError(
-                    f"the start value of '{self.name}.{name}' may use parameters only; it uses '{wrong[0]}'"
-                )
+                raise ModelError(f"the start value of {where} may use parameters only; it uses '{wrong[0]}'")
         self.variables[name] = Variable(name, kind, start, bool(fixed), float(nominal), unit, default)
         return VariableSymbol(name)
 
@@ -245,7 +209,9 @@ class Component(metaclass=_Sealing):
         With a `default` it may be left out, and is then that constant.
         """
         self._claim(name, "input")
-        return self._declare(name, "input", unit=unit, default=None if default is None else float(default))
+        if default is not None:
+            default = real_number(default, f"the default of input '{self.name}.{name}'")
+        return self._declare(name, "input", unit=unit, default=default)
 
     def output(self, name: str, expr: Any, unit: str = "") -> VariableSymbol:
         """Declares a variable that equals `expr`, to be read in the solution."""
@@ -321,13 +287,13 @@ class Component(metaclass=_Sealing):
             raise ModelError(f"component '{self.path}' is complete: add its equations inside __init__ of its class")
         for equation in equations:
             if not isinstance(equation, sympy.Basic | bool | int | float):
-                raise ModelError(f"component '{self.name}': {equation!r} is no equation")
+                raise ModelError(f"component '{self.name}': {equation!r} is not an equation")
             try:
-                self.equations.append(_residual(equation))
+                self.equations.append(residual_of(equation))
             except ModelError as error:
                 raise ModelError(f"component '{self.name}': {error}") from None
             except TypeError:  # not even hashable, such as a matrix
-                raise ModelError(f"component '{self.name}': {equation!r} is no equation") from None
+                raise ModelError(f"component '{self.name}': {equation!r} is not an equation") from None
 
     # --- hierarchy ---------------------------------------------------------------------------------------------
 
@@ -337,6 +303,10 @@ class Component(metaclass=_Sealing):
             raise ModelError(f"component '{self.name}': only components can be added; got {type(child).__name__}")
         if child.parent is not None:
             raise ModelError(f"component '{child.name}' already belongs to '{child.parent.path}'")
+        if child.ev is not self.ev:
+            raise ModelError(
+                f"component '{self.name}': its child '{child.name}' was made with another EqnEnv; give it self.ev"
+            )
         self._claim(child.name, "child component")
         child.parent = self
         self.children[child.name] = child
@@ -351,53 +321,6 @@ class Component(metaclass=_Sealing):
         return f"{type(self).__name__}({self.path!r})"
 
 
-@functools.lru_cache(maxsize=4096)
-def _residual(equation: Any) -> sympy.Expr:
-    """What must be zero for an equation to hold."""
-    if isinstance(equation, sympy.Eq):
-        residual = equation.lhs - equation.rhs  # pyright: ignore[reportOperatorIssue]
-    elif isinstance(equation, bool | sympy.logic.boolalg.BooleanAtom):
-        raise ModelError(
-            f"an equation is always {equation}; does it say what you mean? (`a == b` compares; write `Eq(a, b)`)"
-        )
-    else:
-        residual = sympy.sympify(equation)
-    if not isinstance(residual, sympy.Expr):
-        raise ModelError(f"{equation!r} is no equation")
-    if not any(isinstance(s, VariableSymbol) for s in residual.free_symbols):
-        raise ModelError(f"the equation {equation} contains no variable")
-    return residual
-
-
-def resolve_ports(ends: Sequence[Any], where: str) -> tuple[Port, ...]:
-    """Reads the arguments of a `connect` call: ports, or pairs (component, port name), of one domain."""
-    ports: list[Port] = []
-    rest = list(ends)
-    while rest:
-        end = rest.pop(0)
-        if isinstance(end, Component):
-            if not rest or not isinstance(rest[0], str):
-                raise ModelError(f"{where}: connect(component, \"port\", …) needs a port name after '{end.path}'")
-            name = rest.pop(0)
-            if name not in end.ports:
-                raise ModelError(f"component '{end.path}' has no port '{name}': " + nearest(name, end.ports))
-            end = end.ports[name]
-        if not isinstance(end, Port):
-            raise ModelError(f"{where}: connect takes ports, or a component and a port name; got {end!r}")
-        ports.append(end)
-    if len(ports) < 2:
-        got = f"'{ports[0].component.path}.{ports[0].name}' only" if ports else "none"
-        raise ModelError(f"{where}: connect needs at least two ports; got {got}")
-    for port in ports[1:]:
-        if port.domain != ports[0].domain:
-            raise ModelError(
-                f"{where}: cannot connect {port!r} to {ports[0]!r}: a connection joins ports of one domain"
-            )
-    seen: set[int] = set()
-    for port in ports:
-        if id(port) in seen:
-            raise ModelError(
-                f"{where}: '{port.component.path}.{port.name}' is connected to itself: name each port once"
-            )
-        seen.add(id(port))
-    return tuple(ports)
+_BASE_ATTRIBUTES = (
+    "ev name parent parameters variables ports children equations learned_terms connections _sealed".split()
+)

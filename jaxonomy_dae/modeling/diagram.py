@@ -3,7 +3,8 @@
 from typing import Any
 
 from ..errors import ModelError
-from .component import Component, resolve_ports
+from .component import Component
+from .connections import resolve_ports
 from .neural import NeuralDAEBlock
 from .ports import Port
 
@@ -39,6 +40,12 @@ class AcausalDiagram:
                 raise ModelError(f"only components can be added to a diagram; got {type(component).__name__}")
             if component.parent is not None:
                 raise ModelError(f"component '{component.path}' is part of '{component.parent.path}': add that one")
+            other = next(iter(self.components.values()), component)
+            if component.ev is not other.ev:
+                raise ModelError(
+                    f"components '{other.name}' and '{component.name}' were made with two EqnEnvs: make all components "
+                    "of a diagram with the same one"
+                )
             known = self.components.get(component.name)
             if known is component:
                 continue

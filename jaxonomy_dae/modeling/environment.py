@@ -1,6 +1,6 @@
 """What all components of one model share."""
 
-from .symbols import TIME, TimeSymbol
+from .symbols import ENVIRONMENT_TIME, TimeSymbol
 
 
 class EqnEnv:
@@ -18,7 +18,7 @@ class EqnEnv:
     constants: dict[str, float]
 
     def __init__(self, **constants: float):
-        self.t = TIME
+        self.t = ENVIRONMENT_TIME
         self.constants = dict(constants)
 
     def __repr__(self):

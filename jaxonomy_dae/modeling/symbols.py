@@ -60,7 +60,18 @@ class TimeSymbol(sympy.Symbol):
         return (), {}
 
 
-TIME = TimeSymbol()
+class EnvironmentTime(TimeSymbol):
+    """Time as users write it, `ev.t`. SymPy would differentiate by it as if variables were constants."""
+
+    __slots__ = ()
+
+    @property
+    def _diff_wrt(self):
+        raise ModelError("`diff` by ev.t does not see that variables change in time: write der(x), der(x * y), …")
+
+
+TIME = TimeSymbol()  # in templates, where a derivative by it is a partial derivative
+ENVIRONMENT_TIME = EnvironmentTime()
 
 # SymPy's Eq, remembering what it returned: the components of a large model write the same few equations.
 Eq = functools.lru_cache(maxsize=4096)(sympy.Eq)
@@ -85,7 +96,8 @@ def der(expression: Any) -> Any:
     expression = sympy.sympify(expression)
     if isinstance(expression, VariableSymbol):
         return VariableSymbol(expression.path, expression.order + 1)
-    total = sympy.diff(expression, TIME)
+    partial = sympy.diff(expression.xreplace({ENVIRONMENT_TIME: TIME}), TIME)
+    total = partial.xreplace({TIME: ENVIRONMENT_TIME})
     for symbol in sorted(expression.free_symbols, key=lambda s: s.sort_key()):
         if isinstance(symbol, VariableSymbol):
             total += sympy.diff(expression, symbol) * VariableSymbol(symbol.path, symbol.order + 1)

@@ -12,10 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from ..adjoint.default import default_adjoint
 from ..errors import ModelError, SimulationError
 from ..initialization.initialize import check, initialize, is_consistent
 from ..linear.algebra import SPARSE_FROM
-from ..solvers import BDF, DAETerm, Projected, Rodas5P, StoredAdjoint, Tsit5
+from ..solvers import BDF, DAETerm, Projected, Rodas5P, Tsit5
 from ..solvers.failures import explain_failure
 from ..solvers.projected import with_projection
 from ..solvers.solve import check_tolerances, step_control
@@ -97,7 +98,7 @@ def simulate(
         stepsize_controller = diffrax.ClipStepSizeController(adaptive, jump_ts=jnp.asarray(jump_ts, dtype))
     options = (
         solver,
-        adjoint if adjoint is not None else StoredAdjoint(),
+        adjoint if adjoint is not None else default_adjoint(),
         stepsize_controller,
         max_steps,
         progress,

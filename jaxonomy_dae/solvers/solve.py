@@ -12,7 +12,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 
-from ..adjoint.stored_adjoint import StoredAdjoint
+from ..adjoint.default import default_adjoint
 from ..errors import InitializationError, ModelError, SimulationError
 from .bdf import BDF
 from .dae_term import DAETerm, FlatProblem
@@ -88,7 +88,7 @@ def solve_dae(
         raise ModelError(BACKSOLVE)
     t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
     ts = None if ts is None else jnp.asarray(ts, dtype)
-    options = (solver, adjoint or StoredAdjoint(), stepsize_controller, max_steps)
+    options = (solver, adjoint or default_adjoint(), stepsize_controller, max_steps)
     arguments = (term, t0, t1, y0, ts, args, (rtol, atol), options)
     traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments))
     check, solution, last = (_solve if traced else _compiled)(*arguments)

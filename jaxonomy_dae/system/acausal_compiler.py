@@ -50,6 +50,12 @@ class AcausalCompiler:
     ):
         if not isinstance(ev, EqnEnv) or not isinstance(diagram, AcausalDiagram):
             raise ModelError("AcausalCompiler(ev, diagram) needs an EqnEnv and an AcausalDiagram")
+        for component in diagram.components.values():
+            if component.ev is not ev:
+                raise ModelError(
+                    f"component '{component.name}' was made with another EqnEnv than the compiler was given: pass the "
+                    "one that all components share"
+                )
         if state_selection not in ("auto", "dummy_derivatives", "projection"):
             raise ModelError(f"state_selection is 'auto', 'dummy_derivatives' or 'projection'; got {state_selection!r}")
         if isinstance(prefer_states, str):

@@ -1,6 +1,7 @@
 """Parameters: one flat array with names."""
 
 import dataclasses
+import functools
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -11,6 +12,10 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..errors import ModelError, nearest
+from ..modeling.interval import Interval, closed_ends
+from ..modeling.real_number import real_number
+
+SHOWN = 12
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,36 +24,45 @@ class ParameterNames:
 
     names: list[str] = dataclasses.field(compare=False, hash=False)
     units: list[str] = dataclasses.field(compare=False, hash=False)
-    bounds: np.ndarray = dataclasses.field(compare=False, hash=False)
+    intervals: list[Interval] = dataclasses.field(compare=False, hash=False)
     digest: str = ""
 
+    @functools.cached_property
+    def _index(self) -> dict[str, int]:
+        return {n: k for k, n in enumerate(self.names)}
+
     def index(self, name: str) -> int:
-        if not hasattr(self, "_index"):
-            object.__setattr__(self, "_index", {n: k for k, n in enumerate(self.names)})
-        found = self._index.get(name)  # type: ignore[attr-defined]
+        found = self._index.get(name)
         if found is None:
-            raise ModelError(f"'{name}' is no parameter: " + nearest(name, self.names))
+            raise ModelError(f"'{name}' is not a parameter: " + nearest(name, self.names))
         return found
+
+    @functools.cached_property
+    def bounds(self) -> Float[np.ndarray, "n 2"]:
+        """The least and the greatest admissible value of each parameter."""
+        return closed_ends(self.intervals)
 
 
 class Parameters(eqx.Module):
     """All parameters of a system: `parameters["pend.m"]`; `parameters.array` has shape `(len(parameters),)`.
 
     `free` holds the values of parameters that `AcausalSystem.partition` took apart to be trained; they override the
-    entries of `values` at `free_index`.
+    entries of `values` at `free_index`. In a batch of systems, shapes get its axes in front.
     """
 
-    values: Float[Array, " n"]
-    free: Float[Array, " k"] | None
+    values: Float[Array, "*batch n"]
+    free: Float[Array, "*batch k"] | None
     free_index: tuple[int, ...] = eqx.field(static=True)
     table: ParameterNames = eqx.field(static=True)
 
     @property
-    def array(self) -> Float[Array, " n"]:
+    def array(self) -> Float[Array, "*batch n"]:
         """All values, in the order of `names`."""
         if self.free is None or not self.free_index:
             return self.values
-        return self.values.at[np.array(self.free_index)].set(self.free)
+        batch = jnp.broadcast_shapes(self.values.shape[:-1], self.free.shape[:-1])
+        values = jnp.broadcast_to(self.values, (*batch, self.values.shape[-1]))
+        return values.at[..., np.array(self.free_index)].set(self.free)
 
     @property
     def names(self) -> list[str]:
@@ -57,9 +71,15 @@ class Parameters(eqx.Module):
 
     def __getitem__(self, name: str) -> Any:
         k = self.table.index(name)
-        if self.free is not None and k in self.free_index:
-            return self.free[self.free_index.index(k)]
-        return self.values[k]
+        if k in self.free_index:
+            part, place = self.free, self.free_index.index(k)
+        else:
+            part, place = self.values, k
+        if part is None:
+            raise ModelError(
+                f"parameter '{name}' is in the other part of a partitioned system: join both with equinox.combine"
+            )
+        return part[..., place]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.table.names)
@@ -70,7 +90,7 @@ class Parameters(eqx.Module):
     def items(self) -> list[tuple[str, Any]]:
         """Pairs of name and value."""
         array = self.array
-        return [(name, array[k]) for k, name in enumerate(self.table.names)]
+        return [(name, array[..., k]) for k, name in enumerate(self.table.names)]
 
     def merged(self) -> "Parameters":
         """The same values with nothing set apart."""
@@ -82,33 +102,68 @@ class Parameters(eqx.Module):
         if not index:
             return self.merged()
         array = self.array
-        return Parameters(array, array[np.array(index)], index, self.table)
+        return Parameters(array, array[..., np.array(index)], index, self.table)
 
     def replaced(self, new: Mapping[str, Any]) -> "Parameters":
-        """The same table with new values, which may be tracers.
+        """The same table with new values, which may be tracers; a batch takes one value for all or one for each.
 
         **Raises:**
 
-        - `ModelError` for an unknown name, a value that is no scalar, is not finite, or is out of the bounds.
+        - `ModelError` for an unknown name, a value of the wrong shape, that is not a finite real number, or is out of
+            the bounds.
         """
         array = self.array
+        batch = array.shape[:-1]
         for name, value in new.items():
             k = self.table.index(name)
-            if jnp.shape(value) != ():
-                raise ModelError(
-                    f"parameter '{name}' is a scalar; got shape {jnp.shape(value)}. For a batch, use "
-                    f"jax.vmap(lambda v: ... system.with_parameters({{'{name}': v}}) ...)"
-                )
-            if not isinstance(value, Tracer):
-                number = float(value)
-                low, high = self.table.bounds[k]
-                if not np.isfinite(number):
-                    raise ModelError(f"parameter '{name}' must be finite; got {number}")
-                if not low <= number <= high:
-                    raise ModelError(f"parameter '{name}' must lie in [{low}, {high}]; got {number}")
-            array = array.at[k].set(jnp.asarray(value, array.dtype))
+            array = array.at[..., k].set(jnp.asarray(self._checked(k, value, batch), array.dtype))
         return Parameters(array, None, (), self.table)
 
+    def _checked(self, k: int, value: Any, batch: tuple[int, ...]) -> Any:
+        name = self.table.names[k]
+        where = f"parameter '{name}'"
+        if isinstance(value, str):
+            return real_number(value, where)  # which raises
+        shape = jnp.shape(value)
+        if batch and shape not in ((), batch):
+            raise ModelError(f"{where} needs a scalar or, in this batch of systems, shape {batch}; got shape {shape}")
+        if not batch and shape:
+            raise ModelError(
+                f"{where} is a scalar; got shape {shape}. For a batch of systems, use "
+                f"equinox.filter_vmap(lambda v: system.with_parameters({{'{name}': v}}))(values)"
+            )
+        if jnp.issubdtype(jnp.result_type(value), jnp.complexfloating):
+            raise ModelError(f"{where} must be a real number; got a complex one: {value}")
+        if isinstance(value, Tracer):
+            return value
+        for number in np.ravel(np.asarray(value)):
+            if real_number(number, where) not in self.table.intervals[k]:
+                raise ModelError(f"{where} must lie in {self.table.intervals[k]}; got {float(number):g}")
+        return value
+
     def __repr__(self):
-        shown = ", ".join(f"{n}={v}" for n, v in self.items()[:12])
-        return f"Parameters({shown}{', …' if len(self) > 12 else ''})"
+        if not _is_array(self.values):  # the trained part of a partitioned system, or a mask
+            if self.free is None or not _is_array(self.free):
+                return f"Parameters({len(self)} names, no values)"
+            shown = [f"{self.table.names[k]}={_text(self.free[..., j])}" for j, k in enumerate(self.free_index)]
+            return f"Parameters({_some(shown)}; the others are in the frozen part)"
+        apart = {} if _is_array(self.free) else dict.fromkeys(self.free_index, "set apart")
+        array = self.array
+        shown = [f"{name}={apart.get(k) or _text(array[..., k])}" for k, name in enumerate(self.table.names[:SHOWN])]
+        batch = f"batch of shape {array.shape[:-1]}: " if array.ndim > 1 else ""
+        return f"Parameters({batch}{_some(shown, len(self))})"
+
+
+def _is_array(leaf: Any) -> bool:
+    return eqx.is_array(leaf)
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, Tracer):
+        return str(value)
+    return f"{float(value):g}" if np.ndim(value) == 0 else np.array2string(np.asarray(value), threshold=6, precision=6)
+
+
+def _some(shown: list[str], count: int | None = None) -> str:
+    more = ", …" if (count or len(shown)) > SHOWN else ""
+    return ", ".join(shown[:SHOWN]) + more

@@ -1,0 +1,26 @@
+"""Which adjoint a simulation takes that was not given one."""
+
+import contextlib
+import contextvars
+from collections.abc import Iterator
+
+import diffrax
+
+from .stored_adjoint import StoredAdjoint
+
+_forward: contextvars.ContextVar[bool] = contextvars.ContextVar("forward_mode", default=False)
+
+
+@contextlib.contextmanager
+def forward_mode() -> Iterator[None]:
+    """Inside, what is traced will be differentiated forwards, so the default adjoint is `diffrax.ForwardMode`."""
+    token = _forward.set(True)
+    try:
+        yield
+    finally:
+        _forward.reset(token)
+
+
+def default_adjoint() -> diffrax.AbstractAdjoint:
+    """The adjoint to be taken where none is given."""
+    return diffrax.ForwardMode() if _forward.get() else StoredAdjoint()

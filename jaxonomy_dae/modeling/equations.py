@@ -1,0 +1,29 @@
+"""Equations as residuals."""
+
+import functools
+from typing import Any
+
+import sympy
+
+from ..errors import ModelError
+from .symbols import ENVIRONMENT_TIME, TIME, VariableSymbol
+
+
+@functools.lru_cache(maxsize=4096)
+def residual_of(equation: Any) -> sympy.Expr:
+    """What must be zero for an equation to hold."""
+    if isinstance(equation, sympy.Eq):
+        residual = equation.lhs - equation.rhs  # pyright: ignore[reportOperatorIssue]
+    elif isinstance(equation, bool | sympy.logic.boolalg.BooleanAtom):
+        raise ModelError(
+            f"an equation is always {equation}; does it say what you mean? (`a == b` compares; write `Eq(a, b)`)"
+        )
+    else:
+        residual = sympy.sympify(equation)
+    if not isinstance(residual, sympy.Expr):
+        raise ModelError(f"{equation!r} is not an equation")
+    if residual.has(sympy.I):
+        raise ModelError(f"the equation {equation} has a complex coefficient: write its real and imaginary part as two")
+    if not any(isinstance(s, VariableSymbol) for s in residual.free_symbols):
+        raise ModelError(f"the equation {equation} contains no variable")
+    return residual.xreplace({ENVIRONMENT_TIME: TIME})  # pyright: ignore[reportReturnType]

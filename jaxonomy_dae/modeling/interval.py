@@ -1,0 +1,67 @@
+"""Intervals of admissible parameter values."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from ..errors import ModelError
+
+
+@dataclasses.dataclass(frozen=True)
+class Interval:
+    """The values from `low` to `high`; an end that is `open` is not admissible itself, an infinite end never is.
+
+    `Interval(0.0, math.inf, open_low=True)` holds the positive numbers. Training approaches an open end without
+    reaching it, and may stay on a closed one.
+    """
+
+    low: float = -math.inf
+    high: float = math.inf
+    open_low: bool = False
+    open_high: bool = False
+
+    def __contains__(self, value: float) -> bool:
+        above = self.low < value if self.open_low else self.low <= value
+        below = value < self.high if self.open_high else value <= self.high
+        return math.isfinite(value) and above and below
+
+    def __str__(self):
+        left = "(" if self.open_low or math.isinf(self.low) else "["
+        right = ")" if self.open_high or math.isinf(self.high) else "]"
+        return f"{left}{self.low:g}, {self.high:g}{right}"
+
+
+POSITIVE = Interval(0.0, math.inf, open_low=True)
+NONNEGATIVE = Interval(0.0, math.inf)
+
+
+def as_interval(bounds: Any, where: str) -> Interval:
+    """The interval that `bounds`, an `Interval` or a pair (low, high) of a closed one, declares."""
+    if isinstance(bounds, Interval):
+        found = bounds
+    else:
+        try:
+            low, high = (float(end) for end in bounds)
+        except (TypeError, ValueError):
+            raise ModelError(f"{where}: bounds are a pair (low, high) or an Interval; got {bounds!r}") from None
+        found = Interval(low, high)
+    empty = not found.low <= found.high or (found.low == found.high and (found.open_low or found.open_high))
+    if empty:  # comparisons with NaN are false
+        raise ModelError(f"{where}: the bounds {found} hold no number")
+    return found
+
+
+def closed_ends(intervals: Sequence[Interval]) -> Float[np.ndarray, "n 2"]:
+    """The least and the greatest number of each interval."""
+    ends = [
+        (
+            math.nextafter(i.low, math.inf) if i.open_low else i.low,
+            math.nextafter(i.high, -math.inf) if i.open_high else i.high,
+        )
+        for i in intervals
+    ]
+    return np.array(ends, np.float64).reshape(-1, 2)
