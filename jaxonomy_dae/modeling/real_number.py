@@ -17,10 +17,11 @@ def real_number(value: Any, where: str, hint: str = "") -> float:
     - `ModelError` for strings, complex numbers, arrays of several numbers, tracers, and what is not finite.
     """
     given: Any = value
-    text = f"; got the string {value!r}: write {value} without quotes" if isinstance(value, str) else ""
-    if not text and (_is_complex(value) or isinstance(value, numbers.Complex) and not isinstance(value, numbers.Real)):
-        given: Any = value
-    text = f"; got the complex number {value}: write its real and imaginary part as two parameters"
+    text = ""
+    if isinstance(value, str):
+        text = f"; got the string {value!r}: write {value} without quotes"
+    elif _is_complex(value) or (isinstance(value, numbers.Complex) and not isinstance(value, numbers.Real)):
+        text = f"; got the complex number {value}: write its real and imaginary part as two parameters"
     if text:
         raise ModelError(f"{where} must be a real number{text}")
     try:
