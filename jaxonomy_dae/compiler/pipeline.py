@@ -13,7 +13,7 @@ from ..model.consistent_point import consistent_point
 from ..model.evaluate_numpy import Networks, start_values
 from ..model.extended import Extended
 from ..model.incidence import incidence
-from ..model.quantities import name_quantities, quantity_scale
+from ..model.quantities import QuantityMap, map_quantities, name_quantities, quantity_scale
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, describe_equation, equation_offsets, written_by
 from .differentiate_equations import differentiate_equations
 from .eliminate_aliases import eliminate_aliases
@@ -30,6 +30,7 @@ class CompiledModel:
     alias: AliasTable
     groups: tuple[EquationGroup, ...]  # after alias elimination and the resolution of cancellations
     extended: Extended
+    variables: QuantityMap
     selection: StateSelection
     blocks: Blocks
     mode: str
@@ -59,20 +60,21 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Co
     inputs = np.flatnonzero(roots & is_input)
     column[inputs] = len(unknown) + np.arange(len(inputs))
     extended = differentiate_equations(groups, offsets, column, is_input, least, len(unknown))
-    starts = (*started, *dependent_starts(flat, alias, extended))
-    names = name_quantities(flat, alias, extended)
-    preferred = _preferred(flat, alias, extended, prefer_states)
-    merit = _merit(flat, alias, extended, preferred)
+    variables = map_quantities(alias, extended.quantities)
+    starts = (*started, *dependent_starts(flat, variables, extended))
+    names = name_quantities(flat, variables, extended.quantities)
+    preferred = _preferred(flat, variables, prefer_states)
+    merit = _merit(flat, variables, extended, preferred)
 
     def point():
-        return _initial_point(flat, alias, extended)
+        return _initial_point(flat, variables, extended)
 
     selection = select_states(
         groups,
         extended,
         mode,
         lambda q: merit[q],
-        quantity_scale(flat, alias, extended),
+        quantity_scale(flat, variables, extended),
         point,
         lambda q: names[q],
         lambda e: describe_equation(groups, int(e)),
@@ -93,8 +95,8 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Co
                 ]
             )
         )
-    _check_row_targets(flat, alias, extended, selection, names, mode)
-    return CompiledModel(flat, alias, groups, extended, selection, blocks, mode, tuple(names))
+    _check_row_targets(flat, variables, selection, names, mode)
+    return CompiledModel(flat, alias, groups, extended, variables, selection, blocks, mode, tuple(names))
 
 
 def _zero_pivot(flat: FlatModel, groups: tuple[EquationGroup, ...], equation: int) -> str:
@@ -113,40 +115,33 @@ def _loose_ports(flat: FlatModel) -> tuple[str, ...]:
     return (f"nothing is connected to {listed(loose, 12)}: nothing flows there",) if loose else ()
 
 
-def _preferred(flat: FlatModel, alias: AliasTable, extended: Extended, names: Sequence[str]) -> dict[int, int]:
+def _preferred(flat: FlatModel, variables: QuantityMap, names: Sequence[str]) -> dict[int, int]:
     """How strongly each quantity was asked for as a state."""
     index = {n: k for k, n in enumerate(flat.variables.names)}
-    quantities = extended.quantities
     out = {}
     for k, name in enumerate(names):
         if name not in index:
             raise ModelError(f"prefer_states: '{name}' is no variable: " + nearest(name, index))
-        v = index[name]
-        root = int(alias.root[v])
-        if root != ZERO and quantities.column[root] >= 0:
-            q = int(quantities.first[quantities.column[root]] + alias.order[v])
+        q, _ = variables[index[name]]
+        if q >= 0:
             out.setdefault(q, len(names) - k)
     return out
 
 
-def _merit(flat: FlatModel, alias: AliasTable, extended: Extended, preferred: dict[int, int]) -> list[tuple]:
+def _merit(flat: FlatModel, variables: QuantityMap, extended: Extended, preferred: dict[int, int]) -> list[tuple]:
     """How much each quantity should be a state: asked for, fixed at the start, given a start."""
     quantities = extended.quantities
     fixed = np.zeros(quantities.n, int)
     started = np.zeros(quantities.n, int)
     for v, start in enumerate(flat.variables.start):
-        root = int(alias.root[v])
-        if start is None or root == ZERO or quantities.column[root] < 0:
-            continue
-        j = quantities.column[root]
-        if alias.order[v] <= quantities.highest[j]:
-            q = quantities.first[j] + alias.order[v]
+        q, _ = variables[v]
+        if start is not None and q >= 0:
             started[q] = 1
             fixed[q] |= int(flat.variables.fixed[v])
     return [(preferred.get(q, 0), int(fixed[q]), int(started[q])) for q in range(quantities.n)]
 
 
-def _initial_point(flat: FlatModel, alias: AliasTable, extended: Extended):
+def _initial_point(flat: FlatModel, variables: QuantityMap, extended: Extended):
     """All quantities near the declared starts, consistent where possible; parameters; networks."""
     quantities = extended.quantities
     values = flat.parameters.values
@@ -155,24 +150,17 @@ def _initial_point(flat: FlatModel, alias: AliasTable, extended: Extended):
     guess = np.zeros(quantities.n)
     pins: dict[int, float] = {}
     for v, start in enumerate(flat.variables.start):
-        root = int(alias.root[v])
-        if start is None or root == ZERO or quantities.column[root] < 0:
+        q, sign = variables[v]
+        if start is None or q < 0:
             continue
-        j = quantities.column[root]
-        if alias.order[v] > quantities.highest[j]:
-            continue
-        q = int(quantities.first[j] + alias.order[v])
-        guess[q] = alias.sign[v] * value_of(v)
+        guess[q] = sign * value_of(v)
         if flat.variables.fixed[v]:
             pins[q] = guess[q]
     point, _ = consistent_point(extended, guess, list(pins.items()), values, 0.0, networks)
     return point, values, networks
 
 
-def _check_row_targets(
-    flat: FlatModel, alias: AliasTable, extended: Extended, selection: StateSelection, names: list[str], mode: str
-):
-    quantities = extended.quantities
+def _check_row_targets(flat: FlatModel, variables: QuantityMap, selection: StateSelection, names: list[str], mode: str):
     states = set(selection.states.tolist())
     listed = ", ".join(repr(names[q]) for q in selection.states[:12])
     for row in flat.rows:
@@ -183,9 +171,7 @@ def _check_row_targets(
                 "inject='equation'."
             )
         for v in row.targets:
-            root = int(alias.root[v])
-            q = -1 if root == ZERO else int(quantities.first[quantities.column[root]] + alias.order[v])
-            if q not in states:
+            if variables[v][0] not in states:
                 name = flat.variables.names[v]
                 raise ModelError(
                     f"neural block '{row.opaque.name}': its target '{name}' is no state, so it has no row to "

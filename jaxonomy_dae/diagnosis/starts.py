@@ -10,6 +10,7 @@ import numpy as np
 from ..errors import StructuralError
 from ..model.evaluate_numpy import start_values
 from ..model.extended import Extended
+from ..model.quantities import QuantityMap
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel
 from ..model.templates import LinearTemplate
 from ..structure.dulmage_mendelsohn import dulmage_mendelsohn
@@ -104,7 +105,7 @@ def _check_linear(flat: FlatModel, groups, numbers: dict[tuple[int, int], tuple[
             )
 
 
-def dependent_starts(flat: FlatModel, alias: AliasTable, extended: Extended) -> tuple[str, ...]:
+def dependent_starts(flat: FlatModel, variables: QuantityMap, extended: Extended) -> tuple[str, ...]:
     """Notes on fixed starts that outnumber what they can choose: they must agree.
 
     The fixed starts join the extended system as equations; they depend on each other where its Dulmage–Mendelsohn
@@ -113,11 +114,9 @@ def dependent_starts(flat: FlatModel, alias: AliasTable, extended: Extended) -> 
     quantities = extended.quantities
     pins: dict[int, int] = {}
     for v in np.flatnonzero(flat.variables.fixed).tolist():
-        root = int(alias.root[v])
-        if root != ZERO and 0 <= quantities.column[root] < quantities.n_unknown_columns:
-            column = quantities.column[root]
-            if alias.order[v] <= quantities.highest[column]:
-                pins.setdefault(int(quantities.first[column] + alias.order[v]), v)
+        q, _ = variables[v]
+        if 0 <= q < quantities.n_unknown:
+            pins.setdefault(q, v)
     pinned = np.array(list(pins), np.int64)
     owner = quantities.owner[pinned]
     if not len(pins) or (not extended.level.any() and (quantities.order[pinned] < quantities.highest[owner]).all()):

@@ -10,8 +10,8 @@ from ..compiler.pipeline import CompiledModel
 from ..compiler.select_states import StateSelection
 from ..linear.sparse import check_solvable
 from ..model.extended import Extended, ExtendedGroup
-from ..model.quantities import quantity_scale
-from ..model.tables import ZERO, AliasTable, FlatModel, RowInjection
+from ..model.quantities import QuantityMap, quantity_scale
+from ..model.tables import ZERO, FlatModel, RowInjection
 from .gather import Gather
 from .plan import ConstraintGroup, InputTable, PlannedRow, SystemPlan
 from .program import Layout, Program, plan
@@ -33,7 +33,7 @@ def _needed(steps: Sequence[AnyStep], targets: np.ndarray, n: int) -> tuple[AnyS
 
 def lower(model: CompiledModel) -> SystemPlan:
     """Builds the plan."""
-    flat, alias, groups, extended = model.flat, model.alias, model.groups, model.extended
+    flat, variable_map, groups, extended = model.flat, model.variables, model.groups, model.extended
     selection, blocks, mode, quantity_name = model.selection, model.blocks, model.mode, list(model.quantity_name)
     state_order = selection.states  # as they lie in the state array
     quantities = extended.quantities
@@ -67,12 +67,12 @@ def lower(model: CompiledModel) -> SystemPlan:
     )
 
     everything = program(steps)
-    row_inputs = _row_input_quantities(flat, alias, extended)
+    row_inputs = [_of(variable_map, row.inputs) for row in flat.rows]
     following = state_order + 1
-    rates = carried + 1 if _rates_hold(flat, alias, extended, for_residuals, carried) else carried[:0]
+    rates = carried + 1 if _rates_hold(flat, variable_map, extended, for_residuals, carried) else carried[:0]
     derivative = program(_needed(steps, np.concatenate([following, rates, *(q for q, _ in row_inputs)]), n))
     rows = tuple(
-        _plan_row(row, inputs, flat, alias, extended, state_order, derivative.layout)
+        _plan_row(row, inputs, variable_map, state_order, derivative.layout)
         for row, inputs in zip(flat.rows, row_inputs, strict=True)
     )
 
@@ -95,7 +95,8 @@ def lower(model: CompiledModel) -> SystemPlan:
     return SystemPlan(
         _digest(flat, mode, selection, state_order, extended),
         flat,
-        alias,
+        model.alias,
+        variable_map,
         groups,
         extended,
         selection,
@@ -106,7 +107,7 @@ def lower(model: CompiledModel) -> SystemPlan:
         quantity_name,
         state_order,
         carried,
-        quantity_scale(flat, alias, extended)[in_state],
+        quantity_scale(flat, variable_map, extended)[in_state],
         inputs,
         derivative,
         derivative.layout.gather(following) if len(following) else Gather(*(np.zeros(0, np.int64),) * 3),
@@ -123,15 +124,14 @@ def lower(model: CompiledModel) -> SystemPlan:
 
 
 def _rates_hold(
-    flat: FlatModel, alias: AliasTable, extended: Extended, residuals: Sequence[AnyStep], carried: np.ndarray
+    flat: FlatModel, variables: QuantityMap, extended: Extended, residuals: Sequence[AnyStep], carried: np.ndarray
 ) -> bool:
     """Whether the derivatives of all carried unknowns are quantities of the model, untouched by row injection."""
     quantities = extended.quantities
     if not len(carried) or not (quantities.order[carried] < quantities.highest[quantities.owner[carried]]).all():
         return False
     read = np.concatenate([step.needs() for step in residuals])
-    targets = [v for row in flat.rows for v in row.targets]
-    injected = quantities.first[quantities.column[alias.root[targets]]] + alias.order[targets] if targets else []
+    injected = variables.quantity[[v for row in flat.rows for v in row.targets]] if flat.rows else []
     return not np.isin(injected, read).any()
 
 
@@ -169,27 +169,18 @@ def _constraints(extended: Extended, selection: StateSelection, states: np.ndarr
     return groups, joined, None if pattern is None else tuple(pattern)
 
 
-def _row_input_quantities(flat: FlatModel, alias: AliasTable, extended: Extended):
-    quantities = extended.quantities
-    out = []
-    for row in flat.rows:
-        v = np.array(row.inputs, np.int64)
-        root = alias.root[v]
-        column = np.where(root == ZERO, 0, quantities.column[root])
-        out.append((np.where(root == ZERO, ZERO, quantities.first[column] + alias.order[v]), alias.sign[v]))
-    return out
+def _of(variables: QuantityMap, chosen: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """(quantities, signs) of the chosen variables."""
+    v = np.array(chosen, np.int64)
+    return variables.quantity[v], variables.sign[v]
 
 
-def _plan_row(row: RowInjection, inputs, flat, alias, extended, states, layout: Layout) -> PlannedRow:
-    quantities = extended.quantities
+def _plan_row(row: RowInjection, inputs, variables: QuantityMap, states, layout: Layout) -> PlannedRow:
     position = {int(q): k for k, q in enumerate(states)}
-    rows, signs = [], []
-    for v in row.targets:
-        q = int(quantities.first[quantities.column[alias.root[v]]] + alias.order[v])
-        rows.append(position[q])
-        signs.append(int(alias.sign[v]))
+    targets, signs = _of(variables, row.targets)
     gathers = tuple(layout.gather(np.array([q]), np.array([s])) for q, s in zip(*inputs, strict=True))
-    return PlannedRow(row.opaque, tuple(rows), gathers, tuple(signs), inputs[0])
+    rows = tuple(position[q] for q in targets.tolist())
+    return PlannedRow(row.opaque, rows, gathers, tuple(signs.tolist()), inputs[0])
 
 
 def _digest(flat: FlatModel, mode: str, selection: StateSelection, states: np.ndarray, extended: Extended) -> str:

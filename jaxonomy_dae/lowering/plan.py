@@ -12,6 +12,7 @@ from ..compiler.select_states import StateSelection
 from ..errors import ModelError, nearest
 from ..linear.sparse import SparsePattern
 from ..model.extended import Extended, ExtendedGroup
+from ..model.quantities import QuantityMap
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel
 from ..model.templates import OpaqueFunction
 from . import pattern
@@ -55,6 +56,7 @@ class SystemPlan:
     digest: str
     flat: FlatModel
     alias: AliasTable
+    variable_map: QuantityMap
     groups: tuple[EquationGroup, ...]
     extended: Extended
     selection: StateSelection
@@ -118,13 +120,7 @@ class SystemPlan:
 
     def quantity_of(self, variable: int) -> tuple[int, int]:
         """(quantity, sign) of a variable; quantity ZERO if it is identically zero."""
-        root = int(self.alias.root[variable])
-        if root == ZERO:
-            return ZERO, 0
-        quantities = self.extended.quantities
-        return int(quantities.first[quantities.column[root]] + self.alias.order[variable]), int(
-            self.alias.sign[variable]
-        )
+        return self.variable_map[variable]
 
     @property
     def visible_variables(self) -> list[str]:

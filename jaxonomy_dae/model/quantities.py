@@ -1,42 +1,56 @@
-"""Names and sizes of quantities."""
+"""Which quantity each variable is, and what quantities are called."""
+
+import dataclasses
 
 import numpy as np
+from jaxtyping import Int
 
-from .extended import Extended
+from .extended import Extended, Quantities
 from .tables import ZERO, AliasTable, FlatModel
 
+ABSENT = -2  # the quantity of a variable that the equations left no quantity for
 
-def name_quantities(flat: FlatModel, alias: AliasTable, extended: Extended) -> list[str]:
-    """A user's name for every quantity: of a variable that equals it, best without a minus sign and no port."""
-    quantities = extended.quantities
+
+@dataclasses.dataclass(frozen=True)
+class QuantityMap:
+    """Every variable of the model as sign·quantity; quantity ZERO (sign 0) if it is identically zero."""
+
+    quantity: Int[np.ndarray, " variables"]
+    sign: Int[np.ndarray, " variables"]
+
+    def __getitem__(self, variable: int) -> tuple[int, int]:
+        return int(self.quantity[variable]), int(self.sign[variable])
+
+
+def map_quantities(alias: AliasTable, quantities: Quantities) -> QuantityMap:
+    """Looks the alias of every variable up among the quantities."""
+    column = np.where(alias.root == ZERO, -1, quantities.column[alias.root])
+    reached = (column >= 0) & (alias.order <= np.append(quantities.highest, -1)[column])
+    quantity = np.where(reached, quantities.first[column] + alias.order, ABSENT)
+    return QuantityMap(np.where(alias.root == ZERO, ZERO, quantity), alias.sign)
+
+
+def name_quantities(flat: FlatModel, variables: QuantityMap, quantities: Quantities) -> list[str]:
+    """A user's name for every quantity: of a variable that equals it, best not of a port; a quantity that equals no
+    variable is the derivative of one."""
     names: list[str] = [""] * quantities.n
     best: list[tuple] = [(2,)] * quantities.n
-    for v, name in enumerate(flat.variables.names):
-        root = int(alias.root[v])
-        if root == ZERO or quantities.column[root] < 0:
-            continue
-        j = quantities.column[root]
-        if alias.order[v] > quantities.highest[j]:
-            continue
-        q = int(quantities.first[j] + alias.order[v])
-        internal = ":" in name
-        rank = (int(alias.sign[v] < 0), int(internal), int(flat.variables.is_port[v]), int(v != root), v)
+    owner, order = quantities.owner, quantities.order
+    for v in np.flatnonzero((variables.quantity >= 0) & (variables.sign > 0)).tolist():
+        q, name = int(variables.quantity[v]), flat.variables.names[v]
+        is_root = order[q] == 0 and quantities.variable[owner[q]] == v
+        rank = (int(":" in name), int(flat.variables.is_port[v]), int(not is_root), v)
         if rank < best[q]:
-            best[q], names[q] = rank, ("-" if alias.sign[v] < 0 else "") + name
+            best[q], names[q] = rank, name
     for q in range(quantities.n):
         if not names[q]:
             names[q] = f"der({names[q - 1]})"
     return names
 
 
-def quantity_scale(flat: FlatModel, alias: AliasTable, extended: Extended) -> np.ndarray:
+def quantity_scale(flat: FlatModel, variables: QuantityMap, extended: Extended) -> np.ndarray:
     """The nominal value of every quantity: the largest that a variable which equals it declares, else 1."""
-    quantities = extended.quantities
-    scale = np.zeros(quantities.n)
-    known = alias.root != ZERO
-    known[known] = quantities.column[alias.root[known]] >= 0
-    v = np.flatnonzero(known)
-    q = quantities.first[quantities.column[alias.root[v]]] + alias.order[v]
-    inside = alias.order[v] <= quantities.highest[quantities.column[alias.root[v]]]
-    np.maximum.at(scale, q[inside], flat.variables.nominal[v[inside]])
+    scale = np.zeros(extended.quantities.n)
+    v = np.flatnonzero(variables.quantity >= 0)
+    np.maximum.at(scale, variables.quantity[v], flat.variables.nominal[v])
     return np.where(scale == 0, 1.0, scale)

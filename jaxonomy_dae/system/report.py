@@ -79,8 +79,11 @@ class SystemReport:
     def algebraics(self) -> list[str]:
         """The unknowns that are solved for, derivatives left out."""
         plan = self._plan
-        names = [plan.quantity_name[q] for q in plan.blocks.unknowns]
-        return [n for n in names if not n.startswith("der(") and ":" not in n]
+        named: dict[int, str] = {}
+        for name in plan.visible_variables:
+            named.setdefault(plan.variable_map[plan.variable_index[name]][0], name)
+        names = [(plan.quantity_name[q], named.get(q)) for q in plan.blocks.unknowns.tolist()]
+        return [other if name.startswith("der(") else name for name, other in names if other is not None]
 
     @property
     def constraints(self) -> list[str]:
