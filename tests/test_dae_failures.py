@@ -113,7 +113,7 @@ def test_a_model_reports_its_turning_point(folded, solver):
     x, z = np.asarray(found["cell.x"])[before], np.asarray(found["cell.z"])[before]
     np.testing.assert_allclose(x, 2 - np.asarray(ts)[before], atol=1e-9)
     np.testing.assert_allclose(z**3 - 3 * z, x, atol=1e-9)
-    assert np.isinf(np.asarray(found.states)[np.asarray(ts) > 4.1]).all()
+    assert np.isnan(np.asarray(found.states)[np.asarray(ts) > 4.1]).all()
 
 
 @ALSO_RODAS5P
@@ -122,9 +122,7 @@ def test_a_model_reports_too_few_steps(folded, solver):
         simulate(folded, 3.0, solver=solver, max_steps=5)
     message = str(caught.value)
     assert "max_steps=5 was reached. Changing fastest there: 'cell.x' = " in message
-    assert message.endswith(
-        "Raise max_steps, loosen the tolerances, or look for a jump or a pole: jump_ts= names times of jumps."
-    )
+    assert "Raise max_steps, loosen rtol=1e-06 and atol, or look for a jump or a pole: jump_ts= names" in message
     found = simulate(folded, 3.0, solver=solver, max_steps=5, throw=False)
     assert found.result == diffrax.RESULTS.max_steps_reached
     assert np.isfinite(np.asarray(found.states)).all() and 1 < len(found.ts) <= 6
@@ -153,8 +151,9 @@ def test_a_model_that_is_not_finite_at_its_start():
     with pytest.raises(SimulationError) as caught:
         simulate(system, 1.0)
     assert str(caught.value) == (
-        "the integration stopped at t=0: no step was short enough to be accepted. The equations are not finite there: "
-        "row 0 of F, the derivative of 'cell.x'. Look for a division by zero, or a root or logarithm without a value"
+        "the integration stopped at t=0: no step was short enough to be accepted. The equations are not finite: "
+        "the derivative of 'cell.x' (row 0 of F) is nan at the start. Start elsewhere, or look for a division by zero, "
+        "or a root or logarithm without a value."
     )
     found = simulate(system, 1.0, ts=TS[:4], throw=False)
     assert found.result != diffrax.RESULTS.successful
@@ -307,7 +306,7 @@ BAD = {
     "single precision": (
         lambda: solve_dae(TERM, 1.0, SINGLE, rtol=1e-8),
         'rtol=1e-08 cannot be reached in float32 (eps 1.2e-07). Switch to double precision with jax.config.update("jax_'
-        'enable_x64", True) before the model is compiled, or use rtol ≥ 1e-06.',
+        'enable_x64", True) before the model is compiled, or use rtol ≥ 2e-06.',
     ),
     "no end": (lambda: solve_dae(TERM, np.nan, GOOD), "t1 must be a finite number; got nan"),
     "times outside": (

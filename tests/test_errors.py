@@ -406,7 +406,7 @@ def use(message, call, error=ModelError):
         use(r"initial: 'c\.v' needs a scalar; got shape \(2,\)",
             lambda s: simulate(s, 1.0, initial={"c.v": jnp.ones(2)})),
         use(r"initial: 'ground\.p\.v' is identically zero", lambda s: simulate(s, 1.0, initial={"ground.p.v": 1.0})),
-        use(r"'r\.u' is no input of this system: there are none", lambda s: simulate(s, 1.0, inputs={"r.u": 1.0})),
+        use(r"'r\.u' is not an input of this system: there are none", lambda s: simulate(s, 1.0, inputs={"r.u": 1.0})),
         use(r"BacksolveAdjoint\(\) is wrong for constrained systems.*RecursiveCheckpointAdjoint",
             lambda s: simulate(s, 1.0, adjoint=diffrax.BacksolveAdjoint())),
         use(r"ConstantStepSize\(\) needs a step: use diffrax\.StepTo\(ts=",
@@ -420,7 +420,7 @@ def use(message, call, error=ModelError):
         use(r"ts must be finite", lambda s: simulate(s, 1.0, ts=[0.5, np.nan])),
         use(r"needs t0 < t1; got t0=0\.0, t1=-1\.0", lambda s: simulate(s, -1.0)),
         use(r"t1 must be a finite number; got nan", lambda s: simulate(s, np.nan)),
-        use(r"rtol=1e-16 cannot be reached in float64.*rtol ≥ 2e-15", lambda s: simulate(s, 1.0, rtol=1e-16)),
+        use(r"rtol=1e-16 cannot be reached in float64.*rtol ≥ 3e-15", lambda s: simulate(s, 1.0, rtol=1e-16)),
         use(r"atol must be a number ≥ 0; got -1", lambda s: simulate(s, 1.0, atol=-1.0)),
     ],
 )  # fmt: skip
@@ -432,9 +432,12 @@ def test_inputs():
     system = compiled(component(lambda self, ev: decay(self, ev, Eq(self.variable("y"), self.input("u")))))
     with pytest.raises(ModelError, match=r"input 'c\.u' has no default: give it with inputs=\{'c\.u': function"):
         simulate(system, 1.0)
-    with pytest.raises(ModelError, match=r"'c\.v' is no input of this system: did you mean 'c\.u'"):
+    with pytest.raises(ModelError, match=r"'c\.v' is not an input of this system: did you mean 'c\.u'"):
         simulate(system, 1.0, inputs={"c.v": 1.0})
-    with pytest.raises(ModelError, match=r"input 'c\.u' must be a function of time or a constant.*LinearInterpolation"):
+    with pytest.raises(
+        ModelError,
+        match=r"input 'c\.u' is a number, samples or a function.*\(3,\).*\(times, values\)",
+    ):
         simulate(system, 1.0, inputs={"c.u": jnp.ones(3)})
     for call in (system.initialize, lambda: system.vector_field(0.0, jnp.ones(1))):
         with pytest.raises(ModelError, match=r"input 'c\.u' has no default: give it"):
@@ -470,5 +473,5 @@ def test_a_start_at_a_singular_point():
         x = self.variable("x", start=0.0, fixed=True)
         self.add_equations(Eq(der(x), -1 / x))
 
-    with pytest.raises(SimulationError, match=r"derivative of 'c\.x' is not finite at the start.*initial="):
+    with pytest.raises(SimulationError, match=r"derivative of 'c\.x' \(row 0 of F\) is -inf at the start.*division"):
         simulate(compiled(component(write)), 1.0, ts=jnp.array([1.0]))

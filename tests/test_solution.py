@@ -159,7 +159,7 @@ def test_failure_without_throw_keeps_what_was_reached(blowup):
 
 
 def test_failure_raises_in_plain_words(blowup):
-    with pytest.raises(SimulationError, match=r"max_steps=200.*Raise max_steps.*rtol=1e-06.*last saved time is 0\.9"):
+    with pytest.raises(SimulationError, match=r"at t=1: max_steps=200.*'c\.x' is .* infinite near t=1,"):
         simulate(blowup, 1.5, ts=jnp.array([0.3, 0.6, 0.9, 1.2, 1.5]), max_steps=200)
 
 

@@ -18,6 +18,7 @@ from jax.core import Tracer
 from ..errors import InitializationError
 from ..lowering.gather import Gather, take
 from ..lowering.plan import SystemPlan
+from ..system.inputs import read_inputs
 from ..system.system_at import Point
 from .ladder import FAILED, find_root
 from .rows import InitialRows, Row, initial_rows
@@ -200,7 +201,7 @@ def find_initial(
 ) -> InitialPoint:
     """`initialize`, compiled once for each structure where nothing is traced."""
     dtype = system.parameters.values.dtype
-    inputs = {name: v if callable(v) else jnp.asarray(v, dtype) for name, v in (inputs or {}).items()}
+    inputs = read_inputs(system.inputs, dtype, inputs)
     initial = {name: jnp.asarray(v, dtype) for name, v in sorted((initial or {}).items())}
     arguments = (system, jnp.asarray(t0, dtype), inputs, initial, solve_for)
     if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments)):

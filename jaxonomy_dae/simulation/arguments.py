@@ -6,14 +6,15 @@ from typing import Any
 import diffrax
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from ..errors import ModelError, nearest
+from ..errors import ModelError
 from ..system.system import AcausalSystem
 
 
-def check_arguments(system, t0, t1, ts, inputs, initial, adjoint, solver, max_steps):
+def check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_controller, max_steps):
     """Raises a `ModelError` that says which argument cannot work, and what would."""
     if not isinstance(system, AcausalSystem):
         raise ModelError(f"simulate needs an AcausalSystem (call the AcausalCompiler); got {type(system).__name__}")
@@ -32,27 +33,22 @@ def check_arguments(system, t0, t1, ts, inputs, initial, adjoint, solver, max_st
         )
     if not isinstance(max_steps, int) or max_steps < 1:
         raise ModelError(f"max_steps must be a positive integer; got {max_steps!r}")
+    if isinstance(stepsize_controller, diffrax.ConstantStepSize):
+        raise ModelError(
+            "stepsize_controller=ConstantStepSize() needs a step: use diffrax.StepTo(ts=jnp.linspace(t0, t1, n))"
+        )
     _check_interval(t0, t1, ts)
-    known = system.inputs
-    for name, value in (inputs or {}).items():
-        if name not in known:
-            raise ModelError(f"'{name}' is no input of this system: " + nearest(name, known))
-        if not callable(value) and np.shape(value) != ():
-            raise ModelError(
-                f"input '{name}' must be a function of time or a constant; got shape {np.shape(value)}. For samples "
-                "use diffrax.LinearInterpolation(ts, ys).evaluate"
-            )
-    for name, default in zip(known, system.plan.inputs.defaults, strict=True):
-        if default is None and name not in (inputs or {}):
-            raise ModelError(f"input '{name}' has no default: give it with inputs={{'{name}': function_of_time}}")
     for name, value in (initial or {}).items():
         if name in system.parameters.names:
             raise ModelError(f"initial: '{name}' is a parameter; use system.with_parameters({{'{name}': value}})")
         quantity = system.plan.resolve([name])[0][0]
         if quantity < 0:
             raise ModelError(f"initial: '{name}' is identically zero in this model")
-        if np.shape(value) != ():
-            raise ModelError(f"initial: '{name}' needs a scalar; got shape {np.shape(value)}")
+        if isinstance(value, str) or np.shape(value) != ():
+            found = repr(value) if isinstance(value, str) else f"shape {np.shape(value)}"
+            raise ModelError(f"initial: '{name}' needs a scalar; got {found}")
+        if jnp.issubdtype(jnp.result_type(value), jnp.complexfloating):
+            raise ModelError(f"initial: '{name}' must be real; got {jnp.result_type(value)}")
 
 
 def _concrete(value: Any) -> np.ndarray | None:

@@ -1,8 +1,10 @@
 """Solutions: every variable by name."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from html import escape
 from typing import Any
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,7 +12,10 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from ..errors import ModelError
 from ..system.system import AcausalSystem
+
+SHOWN = 8
 
 
 class Solution(eqx.Module):
@@ -19,10 +24,10 @@ class Solution(eqx.Module):
     - `ts`: the saved times, shape `(n,)`.
     - `states`: the state array at these times, shape `(n, len(system.states) + len(system.carried))`, on the hidden
         constraints.
-    - `system`, `inputs`: what was simulated.
+    - `system`, `inputs`: what was simulated; inputs as they were read.
     - `counts`: steps taken, accepted, rejected, and Jacobians of implicit solvers; `stats` adds the solver's name and
         why it was chosen.
-    - `result`: Diffrax's result code. Where the integration stopped early, later rows are infinite.
+    - `result`: Diffrax's result code. Where the integration stopped early, later rows are NaN.
 
     A solution that `equinox.filter_vmap` returns is a batch: shapes get its axis in front.
     """
@@ -36,29 +41,59 @@ class Solution(eqx.Module):
     solver: str = eqx.field(static=True, default="")
     reason: str = eqx.field(static=True, default="")
 
-    def __getitem__(self, name: str) -> Any:
-        """The values of a variable; `"time"` and `"der(...)"` of what the model differentiates are accepted.
+    def __getitem__(self, name: str | Sequence[str]) -> Any:
+        """The values of a variable, or of several: `solution["pend.x"]` has shape `(n,)`, and
+        `solution[["pend.x", "pend.y"]]` shape `(n, 2)`. `"time"` is accepted, and `"der(...)"` of what the model
+        differentiates.
 
         **Raises:**
 
         - `ModelError` for an unknown name.
         """
+        if not isinstance(name, str):
+            if not isinstance(name, Sequence) or not all(isinstance(one, str) for one in name):
+                raise ModelError(f"read a solution by names, solution['m.x'] or solution[['m.x', 'm.y']]; got {name!r}")
+            return self._columns(tuple(name))
         if name == "time":
             return self.ts
         if self.states.ndim > 2:
             return _each(self, lambda one: one[name])
-        plan = self.system.plan
-        quantity, sign = plan.resolve([name])
-        if quantity[0] < 0:  # identically zero
+        quantity, sign = self.system.plan.resolve([name])
+        column = self._state(int(quantity[0]), int(sign[0]))
+        if column is not None:
+            return column
+        given = (self.system, self.ts, self.states, self.inputs)
+        if _is_traced(given):
+            return _observed(*given, quantity, sign)[:, 0]
+        return _one(*given, jnp.asarray(quantity[0]), jnp.asarray(sign[0], self.states.dtype))
+
+    def _state(self, quantity: int, sign: int) -> Any:
+        """The values of what is zero, or in the state array; None for all else."""
+        if quantity < 0:
             return jnp.zeros(self.ts.shape, self.states.dtype)
-        place = np.flatnonzero(np.concatenate([plan.states, plan.carried]) == quantity[0])
-        if len(place):
-            column = self.states[:, int(place[0])]
-            return column if sign[0] > 0 else -column
-        leaves = jax.tree.leaves((self.system, self.ts, self.states, self.inputs))
-        if any(isinstance(leaf, Tracer) for leaf in leaves):
-            return _observe(self.system, self.ts, self.states, self.inputs, quantity, sign)
-        return _observe_all(self.system, self.ts, self.states, self.inputs, quantity[0], sign[0])
+        plan = self.system.plan
+        place = np.flatnonzero(np.concatenate([plan.states, plan.carried]) == quantity)
+        if not len(place):
+            return None
+        column = self.states[:, int(place[0])]
+        return column if sign > 0 else -column
+
+    def _columns(self, names: tuple[str, ...]) -> Any:
+        """The values of several variables, shape `(n, len(names))`, evaluated at once."""
+        if self.states.ndim > 2:
+            return _each(self, lambda one: one._columns(names))
+        quantity, sign = self.system.plan.resolve([name for name in names if name != "time"])
+        given = (self.system, self.ts, self.states, self.inputs)
+        if not (quantity >= 0).any():
+            values = jnp.zeros((*self.ts.shape, len(quantity)), self.states.dtype)
+        elif _is_traced(given):
+            values = _observed(*given, quantity, sign)
+        else:
+            chosen = _everything(*given)[:, quantity] * jnp.asarray(sign, self.states.dtype)
+            values = jnp.where(quantity < 0, 0.0, chosen)
+        found = iter(jnp.moveaxis(values, -1, 0))
+        columns = [self.ts if name == "time" else next(found) for name in names]
+        return jnp.stack(columns, axis=-1) if columns else jnp.zeros((*self.ts.shape, 0), self.states.dtype)
 
     @property
     def stats(self) -> dict[str, Any]:
@@ -79,7 +114,8 @@ class Solution(eqx.Module):
 
     def to_dict(self) -> dict[str, Any]:
         """All variables, and `"time"`, by name."""
-        return {"time": self.ts} | {name: self[name] for name in self.system.variables}
+        names = ("time", *self.system.variables)
+        return dict(zip(names, jnp.moveaxis(self._columns(names), -1, 0), strict=True))
 
     def plot(self, *names: str, ax: Any = None) -> Any:
         """Draws variables over time with Matplotlib (extra `plot`); returns the axes."""
@@ -90,35 +126,51 @@ class Solution(eqx.Module):
     def __repr__(self):
         return f"Solution({self.ts.shape[-1]} times, {len(self.system.variables)} variables)"
 
+    def _repr_html_(self) -> str:
+        rows = {"shape of states": self.states.shape, "states": ", ".join(self.system.states[:SHOWN])}
+        if len(self.system.states) > SHOWN:
+            rows["states"] += f", … ({len(self.system.states)})"
+        if not _is_traced((self.ts, self.result, self.counts)) and self.ts.size and self.ts.ndim == 1:
+            rows["time"] = f"{float(self.ts[0]):g} to {float(self.ts[-1]):g}, saved {self.ts.shape[0]} times"
+            rows["result"] = "finished" if self.result == diffrax.RESULTS.successful else f"failed: {self.result}"
+            rows["steps"] = self.counts.get("num_steps", "")
+        rows["solver"] = f"{self.solver} ({self.reason})"
+        cells = "".join(f"<tr><th>{escape(k)}</th><td>{escape(str(v))}</td></tr>" for k, v in rows.items())
+        return f"<table><caption>Solution</caption>{cells}</table>"
+
 
 def _each(batch: Solution, read: Callable[[Solution], Any]) -> Any:
     """Reads every solution of a batch."""
     return eqx.filter_vmap(read)(batch)
 
 
-def _observe(system: AcausalSystem, ts, states, inputs, quantity: np.ndarray, sign: np.ndarray):
-    def one(t, x):
-        return system._point(t, inputs).quantities(x, quantity, sign)[0]
+def _is_traced(tree: Any) -> bool:
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
-    return jax.vmap(one)(ts, states)
+
+def _observed(system: AcausalSystem, ts, states, inputs, quantity: np.ndarray, sign: np.ndarray):
+    """Quantities at all times, shape (n, quantities)."""
+    read = np.maximum(quantity, 0)
+
+    def one(t, x):
+        return system._point(t, inputs).quantities(x, read, sign)
+
+    return jnp.where(quantity < 0, 0.0, jax.vmap(one)(ts, states))
 
 
 @eqx.filter_jit
-def _all(system: AcausalSystem, ts, states, inputs, quantity, sign):
+def _everything(system: AcausalSystem, ts, states, inputs):
+    """All quantities at all times, shape (n, quantities)."""
+    every = np.arange(system.plan.extended.quantities.n)
+    return _observed(system, ts, states, inputs, every, np.ones_like(every))
+
+
+@eqx.filter_jit
+def _one(system: AcausalSystem, ts, states, inputs, quantity, sign):
     """One quantity, chosen while running: compiled once for all names."""
-    plan = system.plan
-    every = np.arange(plan.extended.quantities.n)
+    every = np.arange(system.plan.extended.quantities.n)
     ones = np.ones_like(every)
-
-    def one(t, x):
-        return system._point(t, inputs).quantities(x, every, ones)[quantity]
-
-    return jnp.where(quantity < 0, 0.0, sign * jax.vmap(one)(ts, states))
-
-
-def _observe_all(system: AcausalSystem, ts, states, inputs, quantity, sign):
-    dtype = states.dtype
-    return _all(system, ts, states, inputs, jnp.asarray(quantity), jnp.asarray(sign, dtype))
+    return sign * jax.vmap(lambda t, x: system._point(t, inputs).quantities(x, every, ones)[quantity])(ts, states)
 
 
 @eqx.filter_jit

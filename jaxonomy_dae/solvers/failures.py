@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .causes import cause_of
 from .dae_term import FlatProblem
 from .index_one import algebraic_part, consistent_slope, index_matrix
 
@@ -91,7 +92,7 @@ def _row(problem: FlatProblem, right: np.ndarray, names: Sequence[str]) -> str:
     """The first row that is not finite, by the unknown whose derivative it gives, if it gives one."""
     k = int(np.flatnonzero(~np.isfinite(right))[0])
     own = problem.mass.is_diagonal and problem.mass.array[k] != 0
-    return f"row {k} of F, the derivative of '{names[k]}'" if own else f"row {k} of F"
+    return f"the derivative of '{names[k]}' (row {k} of F)" if own else f"row {k} of F"
 
 
 def null_names(matrix: np.ndarray, names: Sequence[str]) -> str:
@@ -109,36 +110,43 @@ def null_names(matrix: np.ndarray, names: Sequence[str]) -> str:
 
 
 def explain_failure(
-    term: Any, args: Any, t: Any, y: Any, solution: Any, names: Sequence[str], max_steps: int, rtol: Any, atol: Any
-) -> str:
-    """Why an integration stopped at the last accepted point (t, y), and the unknowns worst there."""
+    term: Any, args: Any, t: Any, y: Any, names: Sequence[str], *,
+    result: Any, t0: Any, t1: Any, max_steps: int, rtol: Any, atol: Any, explicit: bool = False,
+) -> str:  # fmt: skip
+    """Why an integration stopped at the last accepted point (t, y), and what to write."""
     problem = FlatProblem(term, y, args)
     flat, time = problem.flat, jnp.asarray(t)
-    many = solution.result == diffrax.RESULTS.max_steps_reached
+    many = result == diffrax.RESULTS.max_steps_reached
     reason = f"max_steps={max_steps} was reached" if many else "no step was short enough to be accepted"
-    head = f"the integration stopped at t={float(t):g}: {reason}. "
+    start = f"the integration stopped at t={float(t):g}: {reason}. "
     right = np.asarray(problem.right(time, flat))
     if not np.isfinite(right).all():
-        return head + (
-            f"The equations are not finite there: {_row(problem, right, names)}. Look for a division by zero, or a "
-            "root or logarithm without a value"
+        value = right[~np.isfinite(right)][0]
+        where = "at the start. Start elsewhere, or look" if float(t) == float(t0) else "there. Look"
+        return start + (
+            f"The equations are not finite: {_row(problem, right, names)} is {value} {where} for a division by zero, "
+            "or a root or logarithm without a value."
         )
-    if flat.shape[0] <= LARGE:
+    if flat.shape[0] <= LARGE and problem.mass.is_singular:
         chosen, _, _, matrix = index_matrix(problem, None, time, flat)
         found = null_names(np.asarray(chosen.materialise(matrix)), names)
         if found:
-            return head + (
+            return start + (
                 f"Newton's matrix is singular there: the equations do not determine {found} (a bifurcation, or an "
                 "index above 1)."
             )
     weight = np.asarray(rtol * jnp.abs(flat) + _flat(atol, flat))
+    cause = cause_of(problem, time, flat, jnp.asarray(t1), weight, names, max_steps, explicit)
+    if cause:
+        return f"{start}{cause}."
     slope = np.abs(np.asarray(consistent_slope(problem, None, time, flat))) / weight
     worst = [k for k in np.argsort(-np.where(np.isfinite(slope), slope, np.inf))[:SHOWN] if not slope[k] == 0]
     fastest = ", ".join(f"'{names[k]}' = {float(flat[k]):.6g}" for k in worst)
     mend = (
-        "Raise max_steps, loosen the tolerances, or look for a jump or a pole: jump_ts= names times of jumps"
+        f"Raise max_steps, loosen rtol={float(rtol):g} and atol, or look for a jump or a pole: jump_ts= names times of "
+        "jumps"
         if many
         else "Look for a pole, a turning point, a jump (jump_ts= names their times), or a root or logarithm without a "
         "value just beyond"
     )
-    return head + f"Changing fastest there: {fastest}. {mend}."
+    return f"{start}Changing fastest there: {fastest}. {mend}."

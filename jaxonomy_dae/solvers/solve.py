@@ -16,11 +16,11 @@ from ..adjoint.default import default_adjoint
 from ..errors import InitializationError, ModelError, SimulationError
 from .bdf import BDF
 from .dae_term import DAETerm, FlatProblem
+from .drive import integrate, is_multistep
 from .failures import SHOWN, StartCheck, explain_failure, explain_start, start_check
 from .index_one import consistent_point, consistent_shift
-from .projected import Projected
 from .rodas5p import Rodas5P
-from .solve_arguments import check_times, tolerance_of
+from .solve_arguments import check_times, jump_times, tolerance_of
 from .step_control import StepControl
 
 SAVED_ITERATIONS = 4
@@ -35,12 +35,13 @@ def solve_dae(
     t0: Any = 0.0,
     ts: Any = None,
     solver: diffrax.AbstractSolver | None = None,
-    rtol: Any = 1e-6,
-    atol: Any = 1e-8,
+    rtol: Any = None,
+    atol: Any = None,
     args: Any = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
     jump_ts: Any = None,
+    dtmax: Any = None,
     max_steps: int = 16384,
     names: Sequence[str] | None = None,
     throw: bool = True,
@@ -54,11 +55,13 @@ def solve_dae(
     - `y0`: the start, consistent: `consistent_start` makes it so. The pair `(x, z)` for `DAETerm(f, g)`.
     - `ts`: when to save; None saves the end alone.
     - `solver`: default `Rodas5P` up to 30 unknowns, `BDF` beyond.
-    - `rtol`, `atol`: of the local error; `atol` may look like y.
+    - `rtol`, `atol`: of the local error, by default 1e-6 and 1e-8 (1e-4 and 1e-6 in single precision); `atol` may look
+        like y.
     - `args`: handed to the functions; gradients flow to it.
     - `adjoint`: how to differentiate; default `StoredAdjoint()`.
     - `stepsize_controller`, `max_steps`: of Diffrax.
-    - `jump_ts`: times at which F jumps: steps end there and the method starts anew.
+    - `jump_ts`: times at which F jumps, a number or shape (n,): steps end there and the method starts anew.
+    - `dtmax`: the longest step.
     - `names`: of the unknowns, in order, for error messages.
     - `throw`: whether to raise if the start is inconsistent or the integration fails; otherwise see `solution.result`.
 
@@ -75,15 +78,19 @@ def solve_dae(
     y0 = jax.tree.map(_inexact, y0)
     dtype = jnp.result_type(*jax.tree.leaves(y0))
     check_times(t0, t1, ts)
+    rtol, atol = default_tolerances(rtol, atol, dtype)
     check_tolerances(rtol, atol, dtype)
-    atol = tolerance_of(atol, y0)
+    # Numbers become arrays, so that a new value is no new program.
+    rtol, atol = jnp.asarray(rtol, dtype), jax.tree.map(_inexact, tolerance_of(atol, y0))
     n = sum(leaf.size for leaf in jax.tree.leaves(y0))
     if names is not None and len(names) != n:
         raise ModelError(f"names must name every unknown: {n} of them; got {len(names)}")
     if solver is None:
         solver = default_solver(n)
     if stepsize_controller is None:
-        stepsize_controller = step_control(solver, rtol, atol, jump_ts)
+        jumps = None if jump_ts is None else jump_times(jump_ts, dtype)
+        longest = None if dtmax is None else jnp.asarray(dtmax, dtype)
+        stepsize_controller = step_control(solver, rtol, atol, jumps, longest)
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ModelError(BACKSOLVE)
     t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
@@ -104,7 +111,11 @@ def solve_dae(
         if message:
             raise InitializationError(message)
         if solution.result != OK:
-            raise SimulationError(explain_failure(term, args, *last, solution, known, max_steps, rtol, atol))
+            text = explain_failure(
+                term, args, *last, known,
+                result=solution.result, t0=t0, t1=t1, max_steps=max_steps, rtol=rtol, atol=atol,
+            )  # fmt: skip
+            raise SimulationError(text)
     return solution
 
 
@@ -126,19 +137,22 @@ def default_solver(n: int) -> diffrax.AbstractSolver:
     return Rodas5P() if n <= SMALL else BDF()
 
 
-def is_multistep(solver: Any) -> bool:
-    """Whether the solver chooses step sizes itself."""
-    return isinstance(solver.solver if isinstance(solver, Projected) else solver, BDF)
-
-
-def step_control(solver: Any, rtol: Any, atol: Any, jump_ts: Any = None) -> diffrax.AbstractStepSizeController:
+def step_control(
+    solver: Any, rtol: Any, atol: Any, jump_ts: Any = None, dtmax: Any = None
+) -> diffrax.AbstractStepSizeController:
     """The step-size controller for one of our solvers."""
-    control: Any = StepControl(rtol, atol, steered=is_multistep(solver))
-    return control if jump_ts is None else diffrax.ClipStepSizeController(control, jump_ts=jnp.asarray(jump_ts))
+    control: Any = StepControl(rtol, atol, steered=is_multistep(solver), dtmax=dtmax)
+    return control if jump_ts is None else diffrax.ClipStepSizeController(control, jump_ts=jump_ts)
+
+
+def default_tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
+    """The tolerances, where they are not given by precision."""
+    single = dtype == jnp.float32
+    return (1e-4 if single else 1e-6) if rtol is None else rtol, (1e-6 if single else 1e-8) if atol is None else atol
 
 
 def check_tolerances(rtol: Any, atol: Any, dtype: Any):
-    """Refuses tolerances that are no numbers or that the precision cannot reach."""
+    """Refuses tolerances that are not numbers or that the precision cannot reach."""
     for name, value in (("rtol", rtol), ("atol", atol)):
         for leaf in jax.tree.leaves(value):
             if isinstance(leaf, Tracer):
@@ -156,52 +170,33 @@ def check_tolerances(rtol: Any, atol: Any, dtype: Any):
             if dtype == jnp.float32
             else ""
         )
+        least = _rounded_up(10 * eps)
         raise ModelError(
-            f"rtol={float(rtol):g} cannot be reached in {dtype} (eps {eps:.1e}).{switch} use rtol ≥ {10 * eps:.0e}."
+            f"rtol={float(rtol):g} cannot be reached in {dtype} (eps {eps:.1e}).{switch} use rtol ≥ {least:.0e}."
         )
+
+
+def _rounded_up(value: float) -> float:
+    """The next number of one digit."""
+    unit = 10.0 ** math.floor(math.log10(value))
+    return math.ceil(value / unit) * unit
 
 
 def _solve(term, t0, t1, y0, ts, args, tolerances, options):
     solver, adjoint, controller, max_steps = options
     check: StartCheck = start_check(FlatProblem(term, y0, args), t0, *tolerances)
-    subs = {
-        "out": diffrax.SubSaveAt(t1=True) if ts is None else diffrax.SubSaveAt(ts=ts),
-        "last": diffrax.SubSaveAt(t1=True),
-    }
-    counted = isinstance(solver, BDF)
-    solution = diffrax.diffeqsolve(
-        term,
-        solver,
-        t0,
-        t1,
-        None,
-        y0,
-        args,
-        saveat=diffrax.SaveAt(subs=subs, solver_state=counted),
-        stepsize_controller=controller,
-        adjoint=adjoint,
-        max_steps=max_steps,
-        throw=False,
+    save = diffrax.SubSaveAt(t1=True) if ts is None else diffrax.SubSaveAt(ts=ts)
+    run = integrate(
+        term, solver, t0, t1, None, y0, args, save=save, controller=controller, adjoint=adjoint, max_steps=max_steps
     )
-    stats = dict(solution.stats)
-    if counted:
-        jacobians, iterations = jax.lax.stop_gradient(solution.solver_state.counts)  # pyright: ignore
-        stats |= {"num_jacobians": jacobians, "num_newton_iterations": iterations}
-    elif isinstance(solver, Rodas5P):
-        stats |= {"num_jacobians": stats["num_steps"]}
-    times: Any = solution.ts
-    values: Any = solution.ys
-    last = (times["last"][0], jax.tree.map(lambda v: v[0], values["last"]))
-    saved = values["out"] if ts is None else _on_constraints(term, args, times["out"], values["out"], y0)
+    saved = run.ys if ts is None else _on_constraints(term, args, run.ts, run.ys, y0)
     failure: Any = diffrax.RESULTS.nonlinear_divergence
-    result = diffrax.RESULTS.where(check.is_fine, solution.result, failure)
-    out = eqx.tree_at(
-        lambda s: (s.ts, s.ys, s.stats, s.solver_state, s.result),
-        solution,
-        (times["out"], saved, stats, None, result),
-        is_leaf=lambda v: v is None,
-    )
-    return check, out, last
+    result = diffrax.RESULTS.where(check.is_fine, run.result, failure)
+    out = diffrax.Solution(
+        t0=t0, t1=t1, ts=run.ts, ys=saved, interpolation=None, stats=run.stats, result=result, solver_state=None,
+        controller_state=None, made_jump=None, event_mask=None,
+    )  # fmt: skip
+    return check, out, run.last
 
 
 def _on_constraints(term: Any, args: Any, ts: Any, ys: Any, y0: Any) -> Any:

@@ -42,3 +42,13 @@ def tolerance_of(atol: Any, y: Any) -> Any:
     if jax.tree.structure(atol) != jax.tree.structure(y) or not fits:
         raise ModelError(f"atol must be one number or look like y: expected shapes {shapes}, found {found}")
     return jax.tree.map(lambda a, v: jnp.broadcast_to(jnp.asarray(a, v.dtype), v.shape), atol, y)
+
+
+def jump_times(jump_ts: Any, dtype: Any) -> Any:
+    """Times of jumps as an array: a number or shape (n,)."""
+    array = jump_ts if isinstance(jump_ts, Tracer) else np.asarray(jump_ts)
+    if array.ndim > 1 or array.dtype.kind not in "iuf":
+        raise ModelError(f"jump_ts must be a number or shape (n,); got {array.dtype} of shape {array.shape}")
+    if not isinstance(array, Tracer) and not np.isfinite(array).all():
+        raise ModelError("jump_ts must be finite")
+    return jnp.atleast_1d(jnp.asarray(array, dtype))

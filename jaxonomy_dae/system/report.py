@@ -149,7 +149,7 @@ class SystemReport:
             f"structural index {self.index}, {self.degrees_of_freedom} degrees of freedom",
         ]
         head.append(f"state selection {self.state_selection}")
-        head.append("simulate(solver=None) takes {}: {}".format(*solver_choice(plan)))
+        head.append("simulate(solver=None) takes {}: {}".format(*solver_choice(plan)[:2]))
         sections = [
             ("differentiated", [f"{n}× {text}" for text, n in self.differentiated]),
             (f"{len(self.states)} states", [_some(self.states)]),

@@ -1,21 +1,52 @@
-"""Which solver suits a compiled system, by what the compiler knows."""
+"""Which solver suits a compiled system: by what the compiler knows, and by what earlier runs found."""
+
+from collections import OrderedDict
+from typing import NamedTuple
 
 from ..lowering.plan import SystemPlan
 
 SMALL = 30  # up to this many unknowns a factorisation costs less than the steps that a multistep method saves
+REMEMBERED = 256  # systems whose stiffness is kept in mind
+
+_stiffness: OrderedDict[str, bool] = OrderedDict()
 
 
-def solver_choice(plan: SystemPlan) -> tuple[str, str]:
-    """(the name of a solver, why): explicit unless nonlinear blocks leave algebraic unknowns to be solved with the
-    states. Stiffness depends on parameters and is not known to the compiler."""
+class Choice(NamedTuple):
+    """A solver by name and the reason for it; not `final` if a run may show that another is better."""
+
+    solver: str
+    reason: str
+    final: bool
+
+
+def solver_choice(plan: SystemPlan) -> Choice:
+    """Explicit unless nonlinear blocks leave algebraic unknowns to be solved with the states. Stiffness depends on
+    parameters and is not known to the compiler."""
     if not len(plan.carried):
-        return "Tsit5", "explicit: no nonlinear block is left; if the system is stiff, take Rodas5P or BDF"
+        return Choice("Tsit5", "explicit: no nonlinear block is left, and stability does not limit its steps", False)
     quantities = plan.extended.quantities
     if (quantities.order[plan.carried] < quantities.highest[quantities.owner[plan.carried]]).all():
-        return "Tsit5", "explicit: nonlinear blocks only tie differentiated variables to the states"
+        return Choice("Tsit5", "explicit: nonlinear blocks only tie differentiated variables to the states", False)
     names = ", ".join(plan.quantity_name[q] for q in plan.carried[:3])
     more = f" and {len(plan.carried) - 3} more" if len(plan.carried) > 3 else ""
-    why = f"nonlinear blocks leave the algebraic unknowns {names}{more}"
+    return implicit_choice(plan, f"nonlinear blocks leave the algebraic unknowns {names}{more}")
+
+
+def implicit_choice(plan: SystemPlan, why: str) -> Choice:
+    """The implicit solver for a system of this size."""
     if plan.n_state <= SMALL:
-        return "Rodas5P", why
-    return "BDF", f"{why}, and {plan.n_state} unknowns are many"
+        return Choice("Rodas5P", why, True)
+    return Choice("BDF", f"{why}, and {plan.n_state} unknowns are many", True)
+
+
+def note_stiffness(plan: SystemPlan, stiff: bool):
+    """Keeps in mind what a run found, for calls inside jit, where nothing can be found out before compiling."""
+    _stiffness[plan.digest] = stiff
+    _stiffness.move_to_end(plan.digest)
+    if len(_stiffness) > REMEMBERED:
+        _stiffness.popitem(last=False)
+
+
+def is_known_stiff(plan: SystemPlan) -> bool:
+    """Whether stability limited explicit steps in the last run."""
+    return _stiffness.get(plan.digest, False)

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from ..errors import ModelError, nearest
 from ..linear.sparse import SparseMatrix, SparsePattern, sparse_jacobian
 from ..lowering.plan import SystemPlan
+from .inputs import read_inputs
 from .parameters import Parameters
 from .system_at import READ_REFINEMENTS, SCALARS, Point
 
@@ -113,9 +114,10 @@ class AcausalSystem(eqx.Module):
     # --- computing ---------------------------------------------------------------------------------------------
 
     def _point(self, t: Any, args: Any) -> Point:
+        args = read_inputs(self.plan.inputs.names, self.parameters.values.dtype, args)
         for name, default in zip(self.plan.inputs.names, self.plan.inputs.defaults, strict=True):
-            if default is None and name not in (args or {}):
-                raise ModelError(f"input '{name}' has no default: give it as {{'{name}': function_of_time}}")
+            if default is None and name not in args:
+                raise ModelError(f"input '{name}' has no default: give it with inputs={{'{name}': function_of_time}}")
         networks = tuple(self.neural[n] for n in self.plan.network_names)
         return Point(self.plan, self.parameters.array, networks, t, args)
 

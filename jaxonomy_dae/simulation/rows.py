@@ -1,0 +1,34 @@
+"""Saved rows that the integration did not fill."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+
+def padded(
+    ts: Float[Array, " n"], x: Float[Array, "n x"], steps: Any
+) -> tuple[Float[Array, " n"], Float[Array, "n x"]]:
+    """Rows beyond the steps taken repeat the last one, so that `[-1]` is the end, its derivatives included."""
+    filled = jnp.arange(ts.shape[0]) <= steps
+    return jnp.where(filled, ts, ts[steps]), jnp.where(filled[:, None], x, x[steps])
+
+
+def not_a_number(x: Float[Array, "n x"], reached: Bool[Array, " n"], *sources: Any) -> Float[Array, "n x"]:
+    """NaN in the rows that were not reached, and in the derivatives of these rows with respect to `sources`.
+
+    Where such a row does not count (its cotangent is zero), as after `jnp.where(okay, loss, 0)`, derivatives are not
+    touched.
+    """
+    leaves = [leaf for leaf in jax.tree.leaves(sources) if eqx.is_inexact_array(leaf)]
+    total = sum((jnp.sum(leaf) for leaf in leaves), jnp.zeros((), x.dtype)).astype(x.dtype)
+    # A linear function of factors that overflow: infinity minus infinity times what is not zero, zero times zero. They
+    # depend on data, so that no compiler multiplies them beforehand.
+    large = jnp.asarray(float(jnp.finfo(x.dtype).max) ** 0.7, x.dtype)
+    one = jnp.ones((), x.dtype)
+    factor, other = (jnp.where(jnp.all(reached), one, f * large) for f in (1, 2))
+    moving = total - jax.lax.stop_gradient(total)
+    nothing = moving * factor * factor * factor - moving * other * other * other
+    return jnp.where(reached[:, None], x, nothing + jnp.nan)

@@ -1,0 +1,71 @@
+"""Step sizes for a compiled system: the controller, the first step, and where steps must end."""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from ..errors import ModelError
+from ..solvers.drive import is_implicit
+from ..solvers.solve import step_control
+from ..system.inputs import StepEnds
+from ..system.system import AcausalSystem
+
+
+def scaled_atol(system: AcausalSystem, atol: Any) -> Any:
+    """The absolute tolerance in units of the nominal values of the states."""
+    nominal = system.plan.nominal
+    if len(nominal) and (nominal != 1).any():
+        return atol * jnp.asarray(nominal, atol.dtype)
+    return atol
+
+
+def controller_for(system: AcausalSystem, solver: Any, rtol: Any, atol: Any, dtmax: Any) -> Any:
+    """The controller for tolerances: absolute ones in units of the nominal values."""
+    atol = scaled_atol(system, atol)
+    if is_implicit(solver):
+        return step_control(solver, rtol, atol, dtmax=dtmax)
+    return diffrax.PIDController(rtol=rtol, atol=atol, dtmax=dtmax)
+
+
+def clipped(controller: Any, jump_ts: Any, ends: StepEnds) -> Any:
+    """The controller with steps that end at jumps and kinks; times that the user prescribes stay as they are."""
+    if isinstance(controller, diffrax.StepTo):
+        if jump_ts is not None:
+            raise ModelError("jump_ts and StepTo both say where steps end: list the jumps in StepTo(ts=...)")
+        return controller
+    jumps = ends.jumps if jump_ts is None else [jump_ts, *ends.jumps]
+    if not jumps and not ends.kinks:
+        return controller
+    joined = [jnp.concatenate(ts) if ts else None for ts in (jumps, ends.kinks)]
+    return diffrax.ClipStepSizeController(controller, step_ts=joined[1], jump_ts=joined[0])
+
+
+def first_step(system: AcausalSystem, t0: Any, t1: Any, x0: Any, inputs: Any, order: Any, controller: Any) -> Any:
+    """The size of the first step (Hairer, Nørsett & Wanner 1993, II.4), kept out of differentiation."""
+    if isinstance(controller, diffrax.StepTo) or not x0.shape[0]:
+        return None if isinstance(controller, diffrax.StepTo) else t1 - t0
+    rtol, atol = getattr(controller, "rtol", 1e-6), getattr(controller, "atol", 1e-8)
+    frozen, t0, t1 = jax.tree.map(
+        lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, ((system, x0, inputs), t0, t1)
+    )
+    system, x0, inputs = frozen
+    scale = atol + rtol * jnp.abs(x0)
+
+    def size(v):
+        return jnp.sqrt(jnp.mean((v / scale) ** 2))
+
+    f0 = system.vector_field(t0, x0, inputs)
+    d0, d1 = size(x0), size(f0)
+    tiny = 1e-5
+    h0 = jnp.where((d0 < tiny) | (d1 < tiny), 1e-6, 0.01 * d0 / jnp.maximum(d1, tiny))
+    h0 = jnp.minimum(h0, t1 - t0)
+    d2 = size(system.vector_field(t0 + h0, x0 + h0 * f0, inputs) - f0) / h0
+    largest = jnp.maximum(d1, d2)
+    power = 1.0 / ((order or 1) + 1)
+    h1 = jnp.where(largest <= 1e-15, jnp.maximum(1e-6, h0 * 1e-3), (0.01 / jnp.maximum(largest, 1e-15)) ** power)
+    h = jnp.minimum(jnp.minimum(100 * h0, h1), t1 - t0)
+    h = jnp.where(jnp.isfinite(h) & (h > 0), h, 1e-6 * (t1 - t0))
+    return jax.lax.stop_gradient(h)  # inputs may close over what is differentiated

@@ -1,0 +1,111 @@
+"""Why steps become many or small at a point: a jump, a finite escape, stiffness, values that do not exist beyond."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .dae_term import FlatProblem
+from .index_one import consistent_slope
+
+LARGE = 300  # unknowns up to which eigenvalues are looked at
+NEAR = 10.0 ** np.arange(-15, -5)  # parts of the interval
+Slope = Callable[[Any, Any], Float[Array, " n"]]
+
+
+def cause_of(
+    problem: FlatProblem, t: Any, y: Any, t1: Any, weight: np.ndarray, names: Sequence[str], steps: int, explicit: bool
+) -> str:
+    """A sentence on what stops an integration at its last accepted point (t, y), and what to write; or nothing.
+
+    - `weight`: the tolerance of every unknown there.
+    - `steps`: that were allowed.
+    - `explicit`: whether the solver was.
+    """
+
+    @jax.jit
+    def slope(t, y):
+        return consistent_slope(problem, None, t, y)
+
+    here = np.asarray(slope(t, y))
+    if not np.isfinite(here).all() or not len(here):
+        return ""
+    return (
+        _end_of_domain(slope, here, t, y, t1, names)
+        or _jump(slope, here, t, y, weight, names)
+        or _escape(here, y, float(t), float(t1), weight, names)
+        or (_stiffness(slope, t, y, t1, steps) if explicit else "")
+    )
+
+
+def _end_of_domain(slope: Slope, here: np.ndarray, t: Any, y: Any, t1: Any, names: Sequence[str]) -> str:
+    """Whether the equations have no value just beyond the point."""
+    span = float(t1 - t)
+    for part in NEAR:
+        dt = jnp.asarray(part * span, jnp.asarray(t).dtype)
+        ahead = np.asarray(slope(t + dt, y + dt.astype(y.dtype) * here))
+        bad = np.flatnonzero(~np.isfinite(ahead))
+        if len(bad):
+            return (
+                f"Just beyond, the derivative of '{names[bad[0]]}' is not finite: a root or logarithm leaves its "
+                "domain, or a denominator vanishes. Keep the argument positive in the equation (sympy.Max, or another "
+                "law there), or end the run before"
+            )
+    return ""
+
+
+def _jump(slope: Slope, here: np.ndarray, t: Any, y: Any, weight: np.ndarray, names: Sequence[str]) -> str:
+    """Whether slopes jump across the point, in the direction of motion, as under sign(x) at x = 0."""
+    size = np.asarray(weight) / np.maximum(np.abs(here), np.finfo(here.dtype).tiny)
+    h = float(np.min(size))  # in which the fastest unknown moves by its tolerance
+    gaps = []
+    for scale in (1e2, 1e1, 1e0):
+        step = jnp.asarray(h * scale * here, y.dtype)
+        gaps.append(np.abs(np.asarray(slope(t, y + step)) - np.asarray(slope(t, y - step))))
+    if not np.isfinite(gaps).all():
+        return ""
+    wide, middle, narrow = gaps
+    # A jump has the same size at all scales; what is smooth, however steep, falls in proportion.
+    jumps = (narrow > 0.3 * wide) & (middle > 0.3 * wide) & (wide > 0.1 * np.max(np.abs(here)))
+    if not jumps.any():
+        return ""
+    k = int(np.argmax(np.where(jumps, wide / weight, 0)))
+    return (
+        f"The derivative of '{names[k]}' jumps by {wide[k]:.3g} there (sign, Piecewise, Max, Heaviside …), and the "
+        "solution stays at the jump: steps chatter to and fro across it. Smooth the law (sympy.tanh(x/small) for "
+        "sign(x)), or, if only the time decides, name the times with jump_ts="
+    )
+
+
+def _escape(here: np.ndarray, y: Any, t: float, t1: float, weight: np.ndarray, names: Sequence[str]) -> str:
+    """Whether an unknown grows so fast that it is infinite before the end."""
+    value = np.asarray(y)
+    growing = value * here > 0
+    rest = np.where(growing, np.abs(value) / np.maximum(np.abs(here), np.finfo(here.dtype).tiny), np.inf)
+    large = np.abs(value) > 1e4 * np.minimum(weight / np.maximum(np.abs(value), 1e-300) * 1e6, 1.0)
+    k = int(np.argmin(np.where(large, rest, np.inf)))
+    if not (large[k] and rest[k] < 1e-3 * (t1 - t)):
+        return ""
+    return (
+        f"'{names[k]}' is {value[k]:.3g} and grows by its own size within {rest[k]:.2g}: it becomes infinite near "
+        f"t={t + rest[k]:.6g}, and no solution goes beyond. End the run before, or look for a sign in its equation"
+    )
+
+
+def _stiffness(slope: Slope, t: Any, y: Any, t1: Any, steps: int) -> str:
+    """Whether fast decay alone demands more steps than there were."""
+    if not 0 < y.shape[0] <= LARGE:
+        return ""
+    matrix = np.asarray(jax.jacfwd(lambda v: slope(t, v))(y))
+    if not np.isfinite(matrix).all():
+        return ""
+    fastest = max(float(-np.linalg.eigvals(matrix).real.min()), 0.0)
+    if fastest * float(t1 - t) < 0.3 * steps:
+        return ""
+    return (
+        f"The system is stiff: something decays within {1 / fastest:.2g}, which explicit steps must follow to the end. "
+        "Write solver=jaxonomy_dae.solvers.Rodas5P(), BDF() for many unknowns, or leave solver= out"
+    )

@@ -1,0 +1,45 @@
+"""From explicit steps to implicit ones: found out while running.
+
+An explicit method whose steps are limited by stability rather than accuracy takes |λ|·T/3.5 of them, whatever the
+tolerance. `Watch` counts steps near the boundary of the stability region (Hairer & Wanner 1996, Solving Ordinary
+Differential Equations II, IV.2): for two points at the same time, the last two stages of a step,
+h·‖f(y₁) − f(y₁')‖ / ‖y₁ − y₁'‖ estimates h·|λ|. Such a run ends with `STIFF`, and is then made with an implicit solver.
+"""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+STIFF: Any = diffrax.RESULTS.nonlinear_divergence  # no other meaning where nothing implicit is solved
+BOUNDARY = 0.9 * 3.5  # of Tsit5's stability region along the negative real axis is at −3.5
+PATIENCE = 15  # limited steps in a row
+MANY = 2000  # steps of that size still to be taken: fewer cost less than compiling another solver
+
+
+class Watch(eqx.Module):
+    """Counts steps that stability limits.
+
+    - `end`: the end of the integration.
+    - `floor`: sizes below which changes of y do not count, shape () or (n,).
+    """
+
+    end: Any
+    floor: Any
+
+    def start(self) -> Any:
+        """The count before the first step."""
+        return jnp.zeros((), jnp.int32)
+
+    def after(self, count: Any, t0: Any, t1: Any, y: tuple[Any, Any], k: tuple[Any, Any]) -> Any:
+        """The count after a step from t0 to t1, whose last two stages are at points y with increments k = h·f(y)."""
+        weight = 1 / (self.floor + jnp.abs(y[1]))
+        moved, answered = (jnp.sum(((b - a) * weight) ** 2) for a, b in (y, k))
+        limited = (answered > BOUNDARY**2 * moved) & (self.end - t1 > MANY * (t1 - t0))
+        return jax.lax.stop_gradient(jnp.where(limited, count + 1, jnp.maximum(count - 2, 0)))
+
+    def result(self, count: Any) -> Any:
+        """`STIFF` once enough steps in a row were limited."""
+        return diffrax.RESULTS.where(count < PATIENCE, diffrax.RESULTS.successful, STIFF)

@@ -1,0 +1,256 @@
+"""Inputs: what a user gives for them, as data that a compiled program reads.
+
+`read_inputs` turns constants, samples, Diffrax interpolations and functions of time into callable pytrees or arrays:
+everything a function reads from its surroundings is read when it is given, and is a leaf. What has been read already
+passes unchanged. `step_ends` says where steps must end, so that no sample is stepped over.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from ..errors import ModelError, nearest
+from .closed_function import ClosedFunction, closed_function
+
+KINDS = ("linear", "cubic", "held")
+EXAMPLE = "inputs={'m.u': (times, values)}, or (times, values, 'held') or 'cubic'"
+
+
+class Held(eqx.Module):
+    """Samples held until the next one; where they jump, the new value counts."""
+
+    ts: Float[Array, " n"]
+    ys: Float[Array, " n"]
+
+    def evaluate(self, t: Any) -> Any:
+        """The last sample at or before t."""
+        return self.ys[jnp.clip(jnp.searchsorted(self.ts, t, side="right") - 1, 0, len(self.ts) - 1)]
+
+
+class Sampled(eqx.Module):
+    """An interpolated input. Its derivatives up to order `smoothness` are continuous: 0 for linear interpolation, 1 for
+    cubic, −1 for samples that are held."""
+
+    path: Any
+    smoothness: int = eqx.field(static=True)
+
+    def __call__(self, t: Any) -> Any:
+        return self.path.evaluate(t)
+
+
+def read_inputs(known: list[str], dtype: Any, inputs: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Inputs by name as callable pytrees and arrays of the given dtype.
+
+    **Raises:**
+
+    - `ModelError` that names an input which does not exist or cannot be read, and says what can be given.
+    """
+    if inputs is None:
+        return {}
+    if not isinstance(inputs, Mapping):
+        raise ModelError(f"inputs is a dictionary by names: {EXAMPLE}; got {type(inputs).__name__}")
+    found = {}
+    for name, value in inputs.items():
+        if name not in known:
+            raise ModelError(f"'{name}' is not an input of this system: " + nearest(name, known))
+        found[name] = _read(name, value, dtype)
+    return found
+
+
+def _read(name: str, value: Any, dtype: Any) -> Any:
+    if isinstance(value, Sampled | ClosedFunction):
+        return value
+    if isinstance(value, diffrax.LinearInterpolation | diffrax.CubicInterpolation):
+        return _interpolation(name, value)
+    if isinstance(value, diffrax.AbstractPath):
+        value = value.evaluate
+    if callable(value):
+        return _function(name, value, dtype)
+    if isinstance(value, tuple | list) and len(value) in (2, 3) and np.ndim(_quietly(value[0])) == 1:
+        return _samples(name, value, dtype)
+    return _constant(name, value, dtype)
+
+
+def _quietly(value: Any) -> Any:
+    """The value, or a number in place of what has no regular shape."""
+    try:
+        np.ndim(value)
+    except ValueError:
+        return 0.0
+    return value
+
+
+def _constant(name: str, value: Any, dtype: Any) -> Any:
+    if isinstance(value, str):
+        raise ModelError(f"input '{name}' is a number, samples or a function of time; got the text {value!r}")
+    try:
+        array = jnp.asarray(value)
+    except (TypeError, ValueError):
+        raise ModelError(
+            f"input '{name}' is a number, samples or a function of time; got {type(value).__name__}. For samples give "
+            f"{EXAMPLE}"
+        ) from None
+    if array.shape != ():
+        raise ModelError(
+            f"input '{name}' is a number, samples or a function of time; got shape {array.shape}. For samples give "
+            f"their times too: {EXAMPLE}"
+        )
+    if jnp.issubdtype(array.dtype, jnp.complexfloating):
+        raise ModelError(f"input '{name}' must be real; got {array.dtype}: give jnp.real(…) and jnp.imag(…) apart")
+    return array.astype(dtype)
+
+
+# --- functions -----------------------------------------------------------------------------------------------------
+
+
+def _function(name: str, function: Callable[[Any], Any], dtype: Any) -> ClosedFunction:
+    try:
+        out = jax.eval_shape(lambda t: function(t), jax.ShapeDtypeStruct((), dtype))
+    except jax.errors.TracerBoolConversionError:
+        raise ModelError(
+            f"input '{name}' decides by the time with a Python `if`, `and` or `min`: use jnp.where(t < …, a, b)"
+        ) from None
+    except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError):
+        raise ModelError(
+            f"input '{name}' computes with NumPy or math, which JAX cannot trace: use jax.numpy (jnp.sin for math.sin, "
+            f"jnp.interp for np.interp), or give the samples themselves: {EXAMPLE}"
+        ) from None
+    except Exception as error:
+        raise ModelError(
+            f"input '{name}' failed when called with a time: {type(error).__name__}: {str(error).splitlines()[0]}"
+            if str(error)
+            else f"input '{name}' failed when called with a time: {type(error).__name__}"
+        ) from error
+    shape = getattr(out, "shape", None)
+    if shape != ():
+        found = "nothing" if out is None else f"shape {shape}" if shape is not None else type(out).__name__
+        raise ModelError(f"input '{name}' must return one number for a time; it returned {found}")
+    if jnp.issubdtype(out.dtype, jnp.complexfloating):  # pyright: ignore[reportAttributeAccessIssue]
+        raise ModelError(f"input '{name}' must be real; it returned {out.dtype}")  # pyright: ignore
+    return closed_function(lambda t: jnp.asarray(function(t), dtype), dtype)
+
+
+# --- samples -------------------------------------------------------------------------------------------------------
+
+
+def _samples(name: str, given: tuple[Any, ...] | list[Any], dtype: Any) -> Sampled:
+    kind = given[2] if len(given) == 3 else "linear"
+    if kind not in KINDS:
+        raise ModelError(f"input '{name}': samples are 'linear', 'cubic' or 'held'; got {kind!r}")
+    times, values = (_column(name, which, v, dtype) for which, v in zip(("times", "values"), given, strict=False))
+    if times.shape != values.shape:
+        raise ModelError(
+            f"input '{name}' needs a value for every time; got {times.shape[0]} times and {values.shape[0]} values"
+        )
+    if times.shape[0] < (1 if kind == "held" else 2):
+        raise ModelError(f"input '{name}' needs two samples or more; got {times.shape[0]}")
+    _check_times(name, times)
+    if kind == "held":
+        return Sampled(Held(times, values), -1)
+    if kind == "linear":
+        return Sampled(diffrax.LinearInterpolation(times, values), 0)
+    return Sampled(diffrax.CubicInterpolation(times, diffrax.backward_hermite_coefficients(times, values)), 1)
+
+
+def _column(name: str, which: str, values: Any, dtype: Any) -> Any:
+    try:
+        array = values if isinstance(values, Tracer) else np.asarray(values)
+    except ValueError:
+        raise ModelError(f"input '{name}': {which} must have shape (n,)") from None
+    if array.ndim != 1 or array.dtype.kind not in "biuf":
+        raise ModelError(
+            f"input '{name}': {which} must be real numbers of shape (n,); got {array.dtype} of shape {array.shape}"
+        )
+    if not isinstance(array, Tracer) and not np.isfinite(array).all():
+        k = int(np.flatnonzero(~np.isfinite(array))[0])
+        raise ModelError(f"input '{name}': {which}[{k}] is {array[k]}; leave the sample out")
+    return jnp.array(array, dtype, copy=True)
+
+
+def _check_times(name: str, times: Any):
+    if isinstance(times, Tracer):
+        return
+    found = np.flatnonzero(~(np.diff(np.asarray(times, float)) > 0))
+    if len(found):
+        k = int(found[0])
+        raise ModelError(
+            f"input '{name}': times must increase; times[{k}]={times[k]} is followed by times[{k + 1}]={times[k + 1]}. "
+            "Where the input jumps, give (times, values, 'held')"
+        )
+
+
+def _interpolation(name: str, path: Any) -> Sampled:
+    out = jax.eval_shape(path.evaluate, jax.ShapeDtypeStruct((), path.ts.dtype))
+    if getattr(out, "shape", None) != ():
+        shapes = [leaf.shape for leaf in jax.tree.leaves(out)]
+        raise ModelError(f"input '{name}' needs an interpolation of values of shape (n,); it returns {shapes}")
+    for leaf in jax.tree.leaves(path):
+        if not isinstance(leaf, Tracer) and not np.isfinite(np.asarray(leaf)).all():
+            raise ModelError(
+                f"input '{name}': a value of {type(path).__name__} is not finite: leave the sample out, or fill it "
+                "with diffrax.linear_interpolation"
+            )
+    _check_times(name, path.ts)
+    return Sampled(path, 0 if isinstance(path, diffrax.LinearInterpolation) else 1)
+
+
+def check_range(inputs: Mapping[str, Any], t0: Any, t1: Any):
+    """Raises a `ModelError` if samples do not reach over the interval; held ones may end before it does."""
+    if isinstance(t0, Tracer) or isinstance(t1, Tracer):
+        return
+    for name, value in inputs.items():
+        if not isinstance(value, Sampled) or isinstance(value.path.ts, Tracer):
+            continue
+        first, last = float(value.path.ts[0]), float(value.path.ts[-1])
+        slack = 1e-6 * (float(t1) - float(t0))
+        if first > float(t0) + slack or (last < float(t1) - slack and value.smoothness >= 0):
+            raise ModelError(
+                f"the samples of input '{name}' reach from {first:g} to {last:g}, the run from {float(t0):g} to "
+                f"{float(t1):g}: give samples for all of it, or integrate over less"
+            )
+
+
+class StepEnds(NamedTuple):
+    """Times at which steps must end: `jumps` of what the equations read, where a method starts anew, and `kinks`."""
+
+    jumps: list[Any]
+    kinks: list[Any]
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return sum(len(ts) for ts in (*self.jumps, *self.kinks))
+
+
+def step_ends(plan: Any, inputs: Mapping[str, Any]) -> StepEnds:
+    """Where the samples of inputs, or the derivatives of them that the model reads, have kinks and jumps.
+
+    **Raises:**
+
+    - `ModelError` for an input that the model differentiates and that has no such derivative.
+    """
+    ends = StepEnds([], [])
+    for name, value in inputs.items():
+        if not isinstance(value, Sampled):
+            continue
+        highest = max([order for k, order in plan.inputs.quantities if plan.inputs.names[k] == name], default=0)
+        if highest > value.smoothness + 1:
+            kind = {-1: "held", 0: "linear", 1: "cubic"}[value.smoothness]
+            better = "'cubic'" if highest <= 2 else "a smooth function of time"
+            raise ModelError(
+                f"the model differentiates input '{name}' {_times(highest)}: {kind} samples do not have that "
+                f"derivative at their times. Give {better}"
+            )
+        (ends.jumps if highest > value.smoothness else ends.kinks).append(value.path.ts)
+    return ends
+
+
+def _times(count: int) -> str:
+    return {1: "once", 2: "twice"}.get(count, f"{count} times")
