@@ -1,0 +1,91 @@
+"""What a random model is: a diagram, the values that determine its point, and what must come out."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from jaxonomy_dae import AcausalDiagram, Component, EqnEnv
+
+TOLERANCE = 1e-8  # of a quantity's scale
+ROUNDING = 100 * np.finfo(float).eps
+
+
+@dataclasses.dataclass(frozen=True)
+class Expected:
+    """The true value of a variable and the error that is allowed."""
+
+    value: float
+    allowed: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """A random model.
+
+    - `initial`: what is given at the start: enough to determine the point.
+    - `expected`: true values by variable. `rates`: true time derivatives, for those that are states.
+    - `freedom`: how many states there must be; None if the family does not say (or keeps redundant ones).
+    - `refusal`: if the model has no unique solution, what the error must say (one of these words); None if it has one.
+    """
+
+    ev: EqnEnv
+    diagram: AcausalDiagram
+    initial: Mapping[str, float]
+    expected: Mapping[str, Expected]
+    rates: Mapping[str, Expected] = dataclasses.field(default_factory=dict)
+    freedom: int | None = None
+    refusal: Sequence[str] | None = None
+    motion: "Motion | None" = None
+    note: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Motion:
+    """A true trajectory: `values[name]` at the times `ts`, with the errors allowed at rtol, atol."""
+
+    ts: np.ndarray
+    values: Mapping[str, np.ndarray]
+    allowed: Mapping[str, float]
+    rtol: float
+    atol: float
+
+
+def diagram_of(rng: np.random.Generator, parts: Sequence[Component], nodes: Sequence[Sequence[Any]]) -> AcausalDiagram:
+    """The diagram of components and of nodes, lists of ports, in random order and split at random.
+
+    A node of k ports becomes one connection of all, or a chain of smaller ones.
+    """
+    diagram = AcausalDiagram()
+    connections: list[list[Any]] = []
+    for ports in nodes:
+        ports = [ports[k] for k in rng.permutation(len(ports))]
+        if len(ports) < 2:
+            continue
+        if len(ports) > 2 and rng.random() < 0.3:
+            cut = int(rng.integers(1, len(ports)))
+            connections += [ports[:cut], ports[cut:], [ports[0], ports[-1]]]
+        else:
+            connections.append(ports)
+    diagram.add(*(parts[k] for k in rng.permutation(len(parts))))
+    for k in rng.permutation(len(connections)):
+        if len(connections[k]) > 1:
+            diagram.connect(*connections[k])
+    return diagram
+
+
+def names(rng: np.random.Generator, count: int) -> list[str]:
+    """Distinct names without an order that means anything."""
+    numbers = rng.permutation(10 * count + 10)[:count]
+    return [f"{'abkqxzRCt'[int(k) % 9]}{k}" for k in numbers]
+
+
+def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    """10 to the power of a uniform number."""
+    return float(10 ** rng.uniform(low, high))
+
+
+def signed(rng: np.random.Generator, value: float) -> float:
+    """The value with a random sign."""
+    return value if rng.random() < 0.5 else -value

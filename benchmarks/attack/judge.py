@@ -1,0 +1,122 @@
+"""Right, refused or wrong: a compiled model against its independent solution."""
+
+import dataclasses
+import re
+import time
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxonomy_dae import AcausalCompiler, simulate
+from jaxonomy_dae.errors import InitializationError, ModelError, SimulationError
+
+from .case import TOLERANCE, Case, Expected
+
+# Compiling takes most of the time, and every model is run once.
+CHEAP = {
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_backend_optimization_level": 0,
+    "xla_llvm_disable_expensive_passes": True,
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """`kind`: 'right', 'refused' (by a named error that is true), 'untrue' (a right model refused, or an ill-posed one
+    refused for another reason), 'crashed' (by an error that is not the package's) or 'wrong'. `error` is the worst
+    error in units of what is allowed."""
+
+    kind: str
+    error: float
+    text: str
+    seconds: float
+
+
+def read(system, x, names: list[str], t: float = 0.0):
+    """Values of variables and d(state)/dt, by a program that XLA spends little time on."""
+    arrays, static = eqx.partition(system, eqx.is_array)
+
+    def both(arrays, x):
+        whole = eqx.combine(arrays, static)
+        return whole.observe(names, t, x), whole.vector_field(t, x)
+
+    values, rates = jax.jit(both).lower(arrays, x).compile(compiler_options=CHEAP)(arrays, x)
+    return np.asarray(values), np.asarray(rates)
+
+
+def judge(case: Case, moving: bool = False) -> Outcome:
+    """Compiles, initializes and compares; integrates as well if `moving` and the case has a motion."""
+    start = time.perf_counter()
+
+    def outcome(kind: str, error: float, text: str) -> Outcome:
+        return Outcome(kind, error, text, time.perf_counter() - start)
+
+    try:
+        system = AcausalCompiler(case.ev, case.diagram)()
+        x = system.initialize(initial={n: jnp.asarray(v) for n, v in case.initial.items()})
+        found, rates = read(system, x, list(case.expected))
+    except (ModelError, InitializationError, SimulationError) as error:
+        text = f"{type(error).__name__}: {error}"
+        is_true = case.refusal is not None and any(re.search(word, text) for word in case.refusal)
+        return outcome("refused" if is_true else "untrue", np.inf, text)
+    except eqx.EquinoxRuntimeError as error:
+        return outcome("untrue", np.inf, f"{type(error).__name__}: {error}")
+    except Exception as error:  # whatever is not the package's own
+        return outcome("crashed", np.inf, f"{type(error).__name__}: {error}")
+    if case.refusal is not None:
+        return outcome("wrong", np.inf, "a model without a unique solution was accepted")
+    worst = _worst({n: (v, case.expected[n]) for n, v in zip(case.expected, found.tolist(), strict=True)})
+    slopes = {}
+    for name, rate in zip(system.states, rates.tolist(), strict=False):
+        sign, bare = (-1.0, name[1:]) if name.startswith("-") else (1.0, name)
+        if bare in case.rates:
+            slopes[f"der({bare})"] = (sign * rate, case.rates[bare])
+    worst = max(worst, _worst(slopes), key=lambda pair: pair[0])
+    if not worst[0] <= 1.0:
+        return outcome("wrong", worst[0], worst[1])
+    if case.freedom is not None and len(system.states) != case.freedom:
+        return outcome("wrong", worst[0], f"{len(system.states)} states instead of {case.freedom}: {system.states}")
+    if moving and case.motion is not None:
+        try:
+            off = _moved(system, case)
+        except Exception as error:
+            return outcome("crashed", np.inf, f"{type(error).__name__}: {error}")
+        if not off[0] <= 1.0:
+            return outcome("wrong", off[0], off[1])
+        worst = max(worst, off, key=lambda pair: pair[0])
+    return outcome("right", worst[0], worst[1])
+
+
+def _worst(pairs: dict[str, tuple[float, Expected]]) -> tuple[float, str]:
+    worst = (0.0, "")
+    for name, (found, true) in pairs.items():
+        error = abs(found - true.value) / true.allowed
+        if not error <= worst[0]:  # NaN as well
+            worst = (
+                error if error == error else np.inf,
+                f"{name} = {found!r}, true {true.value!r}, allowed error {true.allowed:.1e}",
+            )
+            if worst[0] == np.inf:
+                break
+    return worst
+
+
+def _moved(system, case: Case) -> tuple[float, str]:
+    motion = case.motion
+    assert motion is not None
+    solution = simulate(
+        system, float(motion.ts[-1]), ts=motion.ts, initial=dict(case.initial), rtol=motion.rtol, atol=motion.atol
+    )
+    worst = (0.0, "")
+    for name, values in motion.values.items():
+        error = float(np.max(np.abs(np.asarray(solution[name]) - values))) / motion.allowed[name]
+        if not error <= worst[0]:
+            worst = (error if error == error else np.inf, f"trajectory of {name}: off by {error:.1e} × allowed")
+    return worst
+
+
+def digits(outcome: Outcome) -> float:
+    """The worst error relative to its scale."""
+    return outcome.error * TOLERANCE
