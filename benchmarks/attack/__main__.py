@@ -42,8 +42,8 @@ def main():
     given = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     families = FAMILIES if given.family == "all" else given.family.split(",")
-    kinds = ("right", "refused", "untrue", "crashed", "wrong")
-    lines = [f"{'family':<12}" + "".join(f"{k:>9}" for k in kinds) + "   worst error    ms each"]
+    kinds = ("right", "refused", "untrue", "crashed", "late", "wrong")
+    print(f"{'family':<12}" + "".join(f"{k:>9}" for k in kinds) + "   worst error    ms each   slowest", flush=True)
     for family in families:
         start = time.perf_counter()
         outcomes = attack(family, given.count, given.seed, given.moving, given.show)
@@ -51,8 +51,12 @@ def main():
         tally = collections.Counter(o.kind for o in outcomes.values())
         worst = max((o.error for o in outcomes.values() if o.kind == "right"), default=0.0)
         row = "".join(f"{tally[k]:>9}" for k in kinds)
-        lines.append(f"{family:<12}{row}{worst * 1e-8:>14.1e}{1e3 * seconds / max(1, given.count):>11.0f}")
-    print("\n".join(lines))
+        slowest = max(outcomes, key=lambda s: outcomes[s].seconds)
+        print(
+            f"{family:<12}{row}{worst * 1e-8:>14.1e}{1e3 * seconds / max(1, given.count):>11.0f}"
+            f"   seed {slowest} in {outcomes[slowest].seconds:.1f} s",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

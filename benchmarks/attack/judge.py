@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import signal
 import time
 
 import equinox as eqx
@@ -25,7 +26,7 @@ CHEAP = {
 @dataclasses.dataclass(frozen=True)
 class Outcome:
     """`kind`: 'right', 'refused' (by a named error that is true), 'untrue' (a right model refused, or an ill-posed one
-    refused for another reason), 'crashed' (by an error that is not the package's) or 'wrong'. `error` is the worst
+    refused for another reason), 'crashed' (by an error that is not the package's), 'late' or 'wrong'. `error` is the worst
     error in units of what is allowed."""
 
     kind: str
@@ -46,9 +47,30 @@ def read(system, x, names: list[str], t: float = 0.0):
     return np.asarray(values), np.asarray(rates)
 
 
-def judge(case: Case, moving: bool = False) -> Outcome:
-    """Compiles, initializes and compares; integrates as well if `moving` and the case has a motion."""
+class TooLong(Exception):
+    """A model took more than its time."""
+
+
+def _expired(*_):
+    raise TooLong
+
+
+def judge(case: Case, moving: bool = False, seconds: int = 60) -> Outcome:
+    """Compiles, initializes and compares; integrates as well if `moving` and the case has a motion. After so many
+    seconds of processor time, it is 'late'."""
+    before = signal.signal(signal.SIGVTALRM, _expired)
+    signal.setitimer(signal.ITIMER_VIRTUAL, seconds)
     start = time.perf_counter()
+    try:
+        return _judge(case, moving, start)
+    except TooLong:
+        return Outcome("late", np.inf, f"stopped after {seconds} s", time.perf_counter() - start)
+    finally:
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0)
+        signal.signal(signal.SIGVTALRM, before)
+
+
+def _judge(case: Case, moving: bool, start: float) -> Outcome:
 
     def outcome(kind: str, error: float, text: str) -> Outcome:
         return Outcome(kind, error, text, time.perf_counter() - start)
@@ -63,6 +85,8 @@ def judge(case: Case, moving: bool = False) -> Outcome:
         return outcome("refused" if is_true else "untrue", np.inf, text)
     except eqx.EquinoxRuntimeError as error:
         return outcome("untrue", np.inf, f"{type(error).__name__}: {error}")
+    except TooLong:
+        raise
     except Exception as error:  # whatever is not the package's own
         return outcome("crashed", np.inf, f"{type(error).__name__}: {error}")
     if case.refusal is not None:
@@ -81,6 +105,8 @@ def judge(case: Case, moving: bool = False) -> Outcome:
     if moving and case.motion is not None:
         try:
             off = _moved(system, case)
+        except TooLong:
+            raise
         except Exception as error:
             return outcome("crashed", np.inf, f"{type(error).__name__}: {error}")
         if not off[0] <= 1.0:

@@ -1,0 +1,47 @@
+"""Random models of eight families against independent solutions; `benchmarks/attack` makes and judges them.
+
+The long counts are `python -m benchmarks.attack`, too.
+"""
+
+import importlib
+
+import pytest
+from attack.judge import judge
+
+# Seeds of the quick run; those named were wrong or refused once.
+QUICK = {
+    "circuits": (0, 8),
+    "rods": (1, 13),
+    "gears": (2, 29),
+    "thermal": (3, 38),
+    "mechanisms": (4, 5),
+}
+# How many models of a family are judged by the slow tests, in runs of fifty.
+COUNTS = {
+    "circuits": 500,
+    "rods": 500,
+    "gears": 500,
+    "thermal": 500,
+    "mechanisms": 200,
+}
+
+
+def _judged(family: str, seed: int, moving: bool = False):
+    case = importlib.import_module(f"attack.{family}").make(seed)
+    outcome = judge(case, moving)
+    assert outcome.kind in ("right", "refused"), f"{family} {seed} ({case.note}): {outcome.kind}: {outcome.text}"
+    return outcome
+
+
+@pytest.mark.parametrize("family, seed", [(f, s) for f, seeds in QUICK.items() for s in seeds])
+def test_a_random_model(family, seed):
+    _judged(family, seed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family, first", [(f, s) for f, count in COUNTS.items() for s in range(0, count, 50)])
+def test_fifty_random_models(family, first):
+    outcomes = [_judged(family, seed, moving=seed % 50 == 0) for seed in range(first, first + 50)]
+    right = sum(o.kind == "right" for o in outcomes)
+    print(f"{family} {first}: {right} right, {50 - right} refused, worst error {max(o.error for o in outcomes):.1e}")
+    assert right >= 25  # most of them are well posed
