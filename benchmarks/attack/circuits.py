@@ -19,9 +19,7 @@ class SineVoltage(Component):
         super().__init__(ev, name)
         p, n = self.port("p", Electrical), self.port("n", Electrical)
         v, i = self.variable("v"), self.variable("i")
-        size, rate, shift = (
-            self.parameter(k, x) for k, x in (("amplitude", amplitude), ("w", w), ("phase", phase))
-        )
+        size, rate, shift = (self.parameter(k, x) for k, x in (("amplitude", amplitude), ("w", w), ("phase", phase)))
         self.add_equations(v - p.v + n.v, i - p.i, p.i + n.i, v - size * sympy.sin(rate * ev.t + shift))
 
 

@@ -1,7 +1,6 @@
 """Gear trains of inertias, springs, dampers and ideal gears, against the torques at every node."""
 
 import numpy as np
-
 from sympy import Eq
 
 from jaxonomy_dae import Component, EqnEnv

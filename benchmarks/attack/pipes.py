@@ -112,7 +112,9 @@ def make(seed: int) -> Case:
         if boundary[node] != "junction":
             continue
         done.add(node)
-        out = [(e, 1.0 if a == node else -1.0, b if a == node else a) for e, (a, b) in enumerate(edges) if node in (a, b)]
+        out = [
+            (e, 1.0 if a == node else -1.0, b if a == node else a) for e, (a, b) in enumerate(edges) if node in (a, b)
+        ]
         for e, sign, other in out:
             closing = -sum(s * q[k] for k, s, _ in out if k != e) * sign
             if other not in done and closing * dp[e] > 0 and 1e-2 < abs(closing) / liter < 1e2:

@@ -1,7 +1,6 @@
 """Thermal networks, against the heat flows at every node. Two capacities at one node give index 2."""
 
 import numpy as np
-
 from sympy import Eq
 
 from jaxonomy_dae import Component, EqnEnv
