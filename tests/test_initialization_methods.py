@@ -10,7 +10,7 @@ from sympy import Eq, atan
 
 from jaxonomy_dae import Component, EqnEnv, InitializationError, der, simulate
 from jaxonomy_dae.initialization.initialize import find_initial, is_consistent
-from jaxonomy_dae.initialization.ladder import METHODS, find_root
+from jaxonomy_dae.initialization.ladder import METHODS, Sizes, find_root
 
 # x³ − 2x + 2 = 0 has one real root, by Cardano's formula; |F| has a local minimum at √(2/3), where F = 2 − (4/3)√(2/3).
 CARDANO = -np.cbrt(1 + np.sqrt(19 / 27)) - np.cbrt(1 - np.sqrt(19 / 27))
@@ -21,9 +21,8 @@ def climb(function, start, core="all"):
     start = jnp.asarray(start, float)
     m = jax.eval_shape(function, start).shape[0]
     chosen = np.arange(start.shape[0]) if core == "all" and m >= start.shape[0] else None
-    close = lambda x: 2e-13 * (1 + jnp.max(jnp.abs(x)))  # noqa: E731
-    enough = lambda x: 4e-10 * (1 + jnp.max(jnp.abs(x)))  # noqa: E731
-    found = jax.jit(lambda x: find_root(function, m, x, np.ones(len(start)), chosen, close, enough))(start)
+    sizes = Sizes(jnp.ones(len(start)), jnp.maximum(1, jnp.abs(start)), jnp.zeros(m), jnp.zeros(m))
+    found = jax.jit(lambda x: find_root(function, m, x, sizes, chosen))(start)
     return np.asarray(found.x), METHODS[int(found.method)], float(jnp.abs(function(found.x)).max())
 
 
@@ -88,7 +87,8 @@ def test_members_of_a_batch_are_on_their_own_rungs():
     @jax.vmap
     def roots(start):
         function = lambda x: x**3 - 2 * x + 2  # noqa: E731
-        found = find_root(function, 1, start, np.ones(1), np.arange(1), lambda x: 1e-13, lambda x: 1e-10)
+        sizes = Sizes(jnp.ones(1), jnp.maximum(1, jnp.abs(start)), jnp.zeros(1), jnp.zeros(1))
+        found = find_root(function, 1, start, sizes, np.arange(1))
         return found.x, found.method
 
     x, method = roots(starts)

@@ -333,7 +333,7 @@ def _variable_table(model: _Model) -> VariableTable:
     start: list[Start | None] = []
     unit: list[str] = []
     default: list[float | None] = []
-    is_input, is_port, fixed, nominal, owner, port, is_across = [], [], [], [], [], [], []
+    is_input, is_port, fixed, nominal, bounds, owner, port, is_across = [], [], [], [], [], [], [], []
     n_ports = 0
     expressions: dict[sympy.Expr, tuple[Template, list[str]]] = {}
     for k, component in enumerate(model.components):
@@ -349,6 +349,7 @@ def _variable_table(model: _Model) -> VariableTable:
             is_port.append(variable.kind == "port")
             fixed.append(variable.fixed)
             nominal.append(variable.nominal)
+            bounds.append(variable.bounds)
             unit.append(variable.unit)
             default.append(variable.default)
             owner.append(k)
@@ -369,6 +370,7 @@ def _variable_table(model: _Model) -> VariableTable:
         start,
         np.array(fixed, bool),
         np.array(nominal, float),
+        np.array([(b.low, b.high) for b in bounds], float).reshape(-1, 2),
         unit,
         default,
         np.array(owner, np.int64),
@@ -465,7 +467,8 @@ def _add_blocks(model: _Model, diagram: AcausalDiagram, variables: VariableTable
             np.concatenate([variables.is_port, np.zeros(extra, bool)]),
             [*variables.start, *[None] * extra],
             np.concatenate([variables.fixed, np.zeros(extra, bool)]),
-            np.concatenate([variables.nominal, np.ones(extra)]),
+            np.concatenate([variables.nominal, np.zeros(extra)]),
+            np.concatenate([variables.bounds, np.tile([-np.inf, np.inf], (extra, 1))]),
             [*variables.unit, *[""] * extra],
             [*variables.default, *[None] * extra],
             np.concatenate([variables.owner, np.full(extra, -1)]),

@@ -19,6 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from ..diagnosis.wording import itemised
 from ..errors import StructuralError
 from ..model.incidence import incidence
+from ..model.scaling import equilibrated
 from ..model.tables import ZERO, EquationGroup, describe_equation, equation_offsets, written_by
 from ..model.templates import LinearTemplate, Template, template_of
 from ..structure.incidence import Incidence
@@ -119,8 +120,7 @@ def _singular_block(groups, signature: Incidence, offsets: Offsets, column, valu
 def _is_singular(dense: np.ndarray) -> bool:
     if not np.isfinite(dense).all():
         return False  # nothing can be said
-    scaled = dense / np.maximum(np.abs(dense).max(axis=1, keepdims=True), 1e-300)
-    singular = np.linalg.svd(scaled, compute_uv=False)
+    singular = np.linalg.svd(equilibrated(dense)[0].toarray(), compute_uv=False)  # units decide nothing
     return bool(singular[-1] < 1e-12 * max(singular[0], 1.0))
 
 

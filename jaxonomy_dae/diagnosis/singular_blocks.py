@@ -328,7 +328,7 @@ def _sparse_finding(plan: SystemPlan, values: _Values, step: SparseStep) -> Bloc
     left = largest @ left
     chosen = np.flatnonzero(np.abs(right) > 1e-3 * np.abs(right).max())
     dependent = np.flatnonzero(np.abs(left) > 1e-3 * np.abs(left).max())
-    names = tuple(plan.quantity_name[int(step.unknown[0][k])].removeprefix("-") for k in chosen)
+    names = tuple(plan.quantity_name[int(step.unknown[0][k])] for k in chosen)
     equations = tuple(dict.fromkeys(equation_text(plan, texts[k]) for k in dependent))
     singular = not condition < 1 / (4 * n * np.finfo(float).eps)
     causes = _sparse_causes(plan, values, step, place, left, right) if singular else ()
@@ -373,7 +373,7 @@ def _sparse_causes(
 
 
 def _finding(plan: SystemPlan, values: _Values, step: Step, b: int, condition, singular, left, right) -> BlockFinding:
-    names = [plan.quantity_name[int(u[b])].removeprefix("-") for u in step.unknown]
+    names = [plan.quantity_name[int(u[b])] for u in step.unknown]
     texts = [equation_text(plan, int(e.equation[b])) for e in step.equations]
     chosen = np.flatnonzero(np.abs(right).max(axis=1, initial=0.0) > 1e-3)
     dependent = np.flatnonzero(np.abs(left).max(axis=1, initial=0.0) > 1e-3)
@@ -417,7 +417,7 @@ def _causes(plan: SystemPlan, values: _Values, step: Step, b: int, left, right) 
         after = values.jacobian(step)[b]
         values.quantities[q] = kept
         name = plan.quantity_name[q]
-        named = (name.removeprefix("-"), float(-kept if name.startswith("-") else kept) + 0.0)
+        named = (name, float(kept) + 0.0)
         if matters(after):
             moved.append(named)
         elif kept == 0.0 and matters(after, anyhow=True):
@@ -460,7 +460,7 @@ def _constraints(plan: SystemPlan, values: _Values) -> Iterator[BlockFinding]:
     states = np.flatnonzero(np.abs(matrix[dependent]).max(axis=0, initial=0.0) > 0)
     if not len(states):
         states = np.array(sorted({k for r in dependent for k in plan.constraint_pattern[r]}), np.int64)
-    names = tuple(plan.quantity_name[int(plan.states[k])].removeprefix("-") for k in states)
+    names = tuple(plan.quantity_name[int(plan.states[k])] for k in states)
     singular = condition >= 1 / (4 * m * np.finfo(float).eps)
     at = tuple((name, float(values.quantities[plan.states[k]])) for name, k in zip(names, states, strict=True))
     yield BlockFinding(float(condition), singular, m, names, tuple(texts[e] for e in dependent), at, False)

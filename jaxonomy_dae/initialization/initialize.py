@@ -3,10 +3,11 @@
 The unknowns are the state array's entries, and parameters that are solved for. The rows are: hidden constraints,
 residuals of nonlinear blocks, values given by the caller, fixed starts, and the guesses that `initial_rows` keeps. The
 rows may be redundant, as long as they agree. A ladder of methods finds the point, kept out of differentiation; one last
-Gauss–Newton step carries the derivative, which by the implicit function theorem is exact where the rows hold.
+step carries the derivative, which by the implicit function theorem is exact. Without guesses it is a Gauss–Newton step
+of the rows; with guesses a Newton step of the conditions for the nearest point.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -18,20 +19,22 @@ from jax.core import Tracer
 from ..errors import InitializationError
 from ..lowering.gather import Gather, take
 from ..lowering.plan import SystemPlan
+from ..model.quantities import declared_scale, quantity_bounds
 from ..system.inputs import read_inputs
 from ..system.system_at import Point
-from .ladder import FAILED, find_root
+from .ladder import FAILED, Sizes, find_root, tolerance
 from .rows import InitialRows, Row, initial_rows
 
 
 class InitialPoint(NamedTuple):
-    """What the search found: `x` of shape (n_state,), `solved` the parameters solved for, the residual of every row
-    and the value it should have had (zero for equations), an index into `METHODS`, the number of evaluations, and the
-    Jacobian of the rows with respect to (x, solved)."""
+    """What the search found: `x` of shape (n_state,), `solved` the parameters solved for, the residual of every row,
+    the largest that counts as rounding and the value the row should have had (zero for equations), an index into
+    `METHODS`, the number of evaluations, and the Jacobian of the rows with respect to (x, solved)."""
 
     x: Any
     solved: Any
     residual: Any
+    limit: Any
     target: Any
     method: Any
     evaluations: Any
@@ -59,7 +62,10 @@ def initialize(
     starts = _reader(plan, rows.kept)
     if rows.direct:
         nothing = jnp.zeros((), jnp.int32)
-        return InitialPoint(x0, x0[:0], starts(point, x0) - target, target, nothing, nothing, None)
+        residual = starts(point, x0) - target
+        limit = tolerance(point.dtype) * (jnp.abs(starts(point, x0)) + _data_sizes(plan, rows, given, parameters)[0])
+        return InitialPoint(x0, x0[:0], residual, limit, target, nothing, nothing, None)
+    n_equations = plan.n_constraints + len(plan.carried)
 
     def residual(w, parameters, inputs, target):
         if len(unknown):
@@ -76,45 +82,141 @@ def initialize(
     frozen = jax.lax.stop_gradient
     settings = (frozen(parameters), frozen_inputs(inputs), frozen(target))
     start = frozen(jnp.append(x0, parameters[unknown]) if len(unknown) else x0)
-    scale = np.append(plan.nominal, np.ones(len(unknown)))
-    core = independent_rows(plan, rows, len(start))
-    eps = float(jnp.finfo(point.dtype).eps)
-    close = min(1e3 * eps, 0.1 * eps**0.6)
+    sizes = frozen(_sizes(plan, rows, given, parameters, start))
+    m = n_equations + len(rows.kept)
+    is_soft = np.arange(m) >= m - rows.n_soft
     found = frozen(
         find_root(
             lambda w: residual(w, *settings),
-            plan.n_constraints + len(plan.carried) + len(rows.kept),
+            m,
             start,
-            scale,
-            core,
-            lambda w: close * (1.0 + jnp.max(jnp.abs(w), initial=0.0)),
-            lambda w: tolerance(point.dtype, w),
+            sizes,
+            independent_rows(plan, rows, len(start)),
+            is_soft,
+            _bounds(system, plan, unknown),
         )
     )
-    remaining = residual(found.x, parameters, inputs, target)
     # Where nothing was found, there is nothing to differentiate, and the others of a batch must not notice.
     good = found.method < FAILED
-    w = found.x - _least_squares(
-        jnp.where(good, found.jacobian, jnp.asarray(np.eye(*found.jacobian.shape), point.dtype)),
-        jnp.where(good, remaining, jnp.zeros_like(remaining)),
+    jacobian = jnp.where(good, found.jacobian, jnp.asarray(np.eye(*found.jacobian.shape), point.dtype))
+    if rows.n_soft:
+        core = np.append(np.ones(n_equations, bool), rows.independent)
+        w, remaining = _nearest_point(
+            lambda w, moving: residual(w, *moving),
+            settings,
+            (parameters, inputs, target),
+            found.x,
+            jacobian,
+            found.unit,
+            sizes.soft,
+            np.flatnonzero(core & ~is_soft),
+            np.flatnonzero(is_soft),
+            good,
+        )
+    else:
+        remaining = residual(found.x, parameters, inputs, target)
+        w = found.x - _least_squares(jacobian * found.unit, jnp.where(good, remaining, 0)) * found.unit
+    full = jnp.concatenate([jnp.zeros((n_equations,), point.dtype), target])
+    limit = jnp.where(is_soft, jnp.inf, found.limit)
+    return InitialPoint(w[:n], w[n:], remaining, limit, full, found.method, found.evaluations, found.jacobian)
+
+
+def _nearest_point(
+    residual: Callable[[Any, Any], Any], settings, moving, w, jacobian, unit, distances, hard, soft, good
+) -> tuple[Any, Any]:
+    """A differentiable point next to w, in units of the unknowns: min ½|S(w)|², S the soft rows, where the hard rows
+    H(w) = 0 hold. Its conditions are ∇½|S|² + ∇(λᵀH) = 0, H = 0; of two Newton steps the first sharpens the point, and
+    the second carries the derivative. Returns w and the rows there."""
+    largest = jnp.maximum(jnp.max(jnp.abs(jacobian * unit), axis=1, initial=0.0), float(jnp.finfo(unit.dtype).tiny))
+    scale = 1 / jnp.where(distances > 0, distances, largest)
+
+    def rows(v, data):
+        return scale * residual(v * unit, data)
+
+    def conditions(z, data):
+        v, multiplier = z[: len(w)], z[len(w) :]
+
+        def lagrangian(v):
+            r = rows(v, data)
+            return 0.5 * jnp.sum(r[soft] ** 2) + jnp.dot(multiplier, r[hard])
+
+        return jnp.concatenate([jax.grad(lagrangian)(v), rows(v, data)[hard]])
+
+    v = w / unit
+    scaled = scale[:, None] * jacobian * unit
+    remaining = rows(v, settings)
+    multiplier = -_least_squares(scaled[hard].T, scaled[soft].T @ remaining[soft])
+    z = jnp.concatenate([v, multiplier])
+    matrix = jax.lax.stop_gradient(jax.jacfwd(lambda z: conditions(z, settings))(z))
+    matrix = jnp.where(good, matrix, jnp.asarray(np.eye(len(z)), z.dtype))
+    for data in (settings, moving):
+        z = jax.lax.stop_gradient(z)
+        z = z - _least_squares(matrix, jnp.where(good, conditions(z, data), 0))
+    w = z[: len(w)] * unit
+    return w, residual(jax.lax.stop_gradient(w), moving)
+
+
+def _sizes(plan: SystemPlan, rows: InitialRows, given: list, parameters: Any, start: Any) -> Sizes:
+    """What is known of the sizes of unknowns and of starts."""
+    dtype, n = parameters.dtype, plan.n_state
+    more = start.shape[0] - n
+    entries = np.concatenate([plan.states, plan.carried])
+    nominal = jnp.asarray(
+        np.append(declared_scale(plan.flat, plan.variable_map, plan.extended)[entries], np.zeros(more)), dtype
     )
-    full = jnp.concatenate([jnp.zeros((remaining.shape[0] - target.shape[0],), point.dtype), target])
-    return InitialPoint(w[:n], w[n:], remaining, full, found.method, found.evaluations, found.jacobian)
+    target, guess = _data_sizes(plan, rows, given, parameters)
+    known = jnp.maximum(jnp.maximum(jnp.append(guess, jnp.zeros(more, dtype)), jnp.abs(start)), nominal)
+    data = jnp.concatenate([jnp.zeros((plan.n_constraints + len(plan.carried),), dtype), target])
+    return Sizes(nominal, known, data, _distances(plan, rows, nominal, guess, len(data)))
+
+
+def _distances(plan: SystemPlan, rows: InitialRows, nominal: Any, guess: Any, m: int) -> Any:
+    """Distances that weigh the same when the point nearest to guesses is looked for: nominal values, or the largest
+    guess of all variables of one unit."""
+    out = jnp.zeros((m,), guess.dtype)
+    if not rows.n_soft:
+        return out
+    place = {int(q): k for k, q in enumerate((*plan.states, *plan.carried))}
+    soft = rows.kept[-rows.n_soft :]
+    where = np.array([place[row.quantity] for row in soft])
+    units = [_unit_of(plan, row.quantity) for row in soft]
+    same = np.array([[a == b for b in units] for a in units])
+    shared = jnp.max(jnp.where(same, guess[where][None, :], 0), axis=1)
+    return out.at[m - rows.n_soft :].set(jnp.where(nominal[where] > 0, nominal[where], shared))
+
+
+def _unit_of(plan: SystemPlan, quantity: int) -> str:
+    variable = plan.variable_index.get(plan.quantity_name[quantity])
+    return "" if variable is None else plan.flat.variables.unit[variable]
+
+
+def _data_sizes(plan: SystemPlan, rows: InitialRows, given: list, parameters: Any) -> tuple[Any, Any]:
+    """The sizes of the terms in the rows' targets, and in the guesses of the state array."""
+    both = _values((*rows.kept, *rows.guess), given, parameters, sizes=True)
+    return both[: len(rows.kept)], both[len(rows.kept) :]
+
+
+def _bounds(system: Any, plan: SystemPlan, unknown: np.ndarray) -> np.ndarray:
+    """The bounds of the unknowns, shape (n, 2): those of parameters are checked afterwards."""
+    entries = np.concatenate([plan.states, plan.carried])
+    free = np.tile([-np.inf, np.inf], (len(unknown), 1))
+    return np.concatenate([quantity_bounds(plan.flat, plan.variable_map, plan.extended)[entries], free])
 
 
 def _least_squares(matrix: Any, right: Any) -> Any:
-    """The least-squares solution of A·x = b; the one of least norm where A has fewer rows than columns."""
+    """The least-squares solution of A·x = b; the one of least norm where A leaves directions open."""
     m, n = matrix.shape
-    if m >= n:
-        q, r = jnp.linalg.qr(matrix)
-        return jax.scipy.linalg.solve_triangular(r, q.T @ right)
-    q, r = jnp.linalg.qr(matrix.T)
-    return q @ jax.scipy.linalg.solve_triangular(r, right, trans=1)
+    scale = 1 / jnp.maximum(jnp.max(jnp.abs(matrix), axis=1, initial=0.0), float(jnp.finfo(matrix.dtype).tiny))
+    # Rows that only open directions feel: what they take from the others is far below rounding.
+    ridge = float(jnp.finfo(matrix.dtype).eps) ** 0.75
+    stacked = jnp.concatenate([scale[:, None] * matrix, jnp.asarray(ridge * np.eye(n), matrix.dtype)])
+    q, r = jnp.linalg.qr(jax.lax.stop_gradient(stacked))
+    return jax.scipy.linalg.solve_triangular(r, q[:m].T @ (scale * right))
 
 
 def independent_rows(plan: SystemPlan, rows: InitialRows, n: int) -> np.ndarray | None:
-    """As many rows as unknowns, none of which follows from others; None if they are not known."""
-    if rows.independent is None:
+    """As many rows as unknowns, none of which follows from others; None if guesses outnumber what is open."""
+    if rows.n_soft and not all(rows.independent[-rows.n_soft :]):
         return None
     equations = plan.n_constraints + len(plan.carried)
     core = np.append(np.ones(equations, bool), rows.independent).nonzero()[0]
@@ -150,8 +252,9 @@ def _signs(rows: tuple[Row | None, ...]) -> np.ndarray:
     return np.array([1 if row is None or row.sign >= 0 else -1 for row in rows], np.int64)
 
 
-def _values(rows: tuple[Row | None, ...], given: list, parameters: Any) -> Any:
-    """The values of start rows, shape (rows,): one vectorised kernel for each distinct start expression."""
+def _values(rows: tuple[Row | None, ...], given: list, parameters: Any, sizes: bool = False) -> Any:
+    """The values of start rows, shape (rows,): one vectorised kernel for each distinct start expression. Or the sizes
+    of their terms, Σ |∂(value)/∂(parameter)|·|parameter|, which rounding is relative to."""
     members: dict[str, list[int]] = {}
     for k, row in enumerate(rows):
         key = "zero" if row is None or (row.start is None and row.given < 0) else "given"
@@ -165,13 +268,19 @@ def _values(rows: tuple[Row | None, ...], given: list, parameters: Any) -> Any:
             continue
         chosen = [rows[k] for k in places]
         if key == "given":
-            parts.append(jnp.stack([jnp.asarray(given[row.given], parameters.dtype) for row in chosen if row]))
+            stack = jnp.stack([jnp.asarray(given[row.given], parameters.dtype) for row in chosen if row])
+            parts.append(jnp.abs(stack) if sizes else stack)
             continue
         starts = [row.start for row in chosen if row and row.start]
         columns = np.array([start.parameters for start in starts], np.int64).T
         values = [take(parameters, column) for column in columns]
         time = jnp.zeros((), parameters.dtype)
-        value = starts[0].template.residual([], values, [], time, None)
+        template = starts[0].template
+
+        def kernel(values, template=template, time=time):
+            return template.residual([], values, [], time, None)
+
+        value = _term_sizes(kernel, values, template) if sizes else kernel(values)
         parts.append(jnp.broadcast_to(jnp.asarray(value, parameters.dtype), (len(places),)))
     if not parts:
         return jnp.zeros((0,), parameters.dtype)
@@ -179,17 +288,26 @@ def _values(rows: tuple[Row | None, ...], given: list, parameters: Any) -> Any:
     return take(jnp.concatenate(parts), back)
 
 
-def tolerance(dtype: Any, x: Any) -> Any:
-    """The largest residual of an initial point that counts as rounding."""
-    largest = np.max(np.abs(x), initial=0.0) if isinstance(x, np.ndarray) else jnp.max(jnp.abs(x), initial=0.0)
-    return float(jnp.finfo(dtype).eps) ** 0.6 * (1.0 + largest)
+def _term_sizes(kernel: Callable[[list], Any], values: list, template: Any) -> Any:
+    if template.expression.is_Atom:
+        return jnp.abs(kernel(values))
+    total = jnp.abs(kernel(values))
+    for k in range(len(values)):
+        tangent = [v if j == k else jnp.zeros_like(v) for j, v in enumerate(values)]
+        total = total + jnp.abs(jax.jvp(kernel, (values,), (tangent,))[1])
+    return total
 
 
 def is_consistent(found: InitialPoint) -> Any:
     """Whether all rows hold, to rounding."""
     unknown = jnp.append(found.x, found.solved)
-    holds = jnp.max(jnp.abs(found.residual), initial=0.0) <= tolerance(found.x.dtype, unknown)
-    return holds & jnp.all(jnp.isfinite(unknown))
+    return jnp.all(jnp.abs(found.residual) <= found.limit) & jnp.all(jnp.isfinite(unknown))
+
+
+def _slack(found: InitialPoint, low: np.ndarray, high: np.ndarray) -> Any:
+    """By how much rounding may put parameters solved for out of their bounds."""
+    bounds = np.maximum(np.where(np.isfinite(low), np.abs(low), 0), np.where(np.isfinite(high), np.abs(high), 0))
+    return tolerance(found.x.dtype) * jnp.maximum(jnp.abs(found.solved), jnp.asarray(bounds, found.x.dtype))
 
 
 def find_initial(
@@ -233,7 +351,7 @@ def check(
         )
         if not solve_for:
             return found._replace(x=x)
-        slack = tolerance(found.x.dtype, found.solved)
+        slack = _slack(found, low, high)
         outside = ~((found.solved >= low - slack) & (found.solved <= high + slack))
         solved = eqx.error_if(found.solved, outside, f"a parameter of {list(solve_for)} is out of its bounds")
         return found._replace(x=x, solved=solved)
@@ -241,9 +359,9 @@ def check(
     if problem is not None:
         raise InitializationError(problem)
     solved = np.asarray(found.solved)
-    slack = float(tolerance(found.x.dtype, solved))
-    for name, value, a, b in zip(solve_for, solved, low, high, strict=True):
-        if not a - slack <= value <= b + slack:
+    slack = np.asarray(_slack(found, low, high))
+    for name, value, a, b, off in zip(solve_for, solved, low, high, slack, strict=True):
+        if not a - off <= value <= b + off:
             raise InitializationError(
                 f"solve_for: the values given need {name} = {value:.6g}, which is out of its bounds [{a:g}, {b:g}]. "
                 "Give other values in initial={...}, or start the search elsewhere with "

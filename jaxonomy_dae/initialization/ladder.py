@@ -6,7 +6,11 @@ Each rung starts at the given point, and only if the one before failed:
    Deuflhard 2004, ch. 3);
 2. Levenberg–Marquardt, the damping changed as by Nielsen (1999): starts where the Jacobian is singular;
 3. Newton homotopy, F(x) = (1 − s)·F(x0) followed from s = 0 to 1 in arc length (Keller 1977; Allgower & Georg 1990),
-   to the one side and then to the other: past the local minima of |F|, where descent methods stop.
+   to the one side and then to the other: past the local minima of |F|, where descent methods stop;
+4. if some rows are soft (guesses), the nearest point: Gauss–Newton steps for the least Σ (soft rows)² on F = 0, by the
+   method of weighting (Van Loan 1985).
+
+Units decide nothing: unknowns are measured by their sizes, rows by the sizes of their terms, Σ |∂F/∂x|·|x|.
 
 All rungs are states of one machine, the body of a single loop: one residual, one Jacobian and one QR factorization are
 traced and compiled, whichever rung is at work. Under `vmap` each member is on its own rung.
@@ -18,27 +22,80 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float
 
-METHODS = ("the start was consistent", "Newton", "Levenberg–Marquardt", "homotopy", "none")
+METHODS = ("the start was consistent", "Newton", "Levenberg–Marquardt", "homotopy", "the nearest point", "none")
+NEAREST = METHODS.index("the nearest point")
 FAILED = len(METHODS) - 1
 
 # Evaluations each rung may take.
-NEWTON_LIMIT, MARQUARDT_LIMIT, HOMOTOPY_LIMIT = 60, 100, 200
+NEWTON_LIMIT, MARQUARDT_LIMIT, HOMOTOPY_LIMIT, NEAREST_LIMIT = 60, 100, 200, 200
 SHORTEST = 1e-4  # of a Newton step
 DECREASE = 1e-4  # Armijo's constant
 FIRST_DAMPING = 1e-3  # rows have a largest entry of 1 at the start
 FIRST_ARC, SHORTEST_ARC = 0.1, 1e-8
 CORRECTIONS = 4  # of a predicted point on the curve
 SMALLEST_COSINE = 0.8  # between the tangents of neighbouring points on the curve
+STEPS_OFF = 8  # points tried around a start where F or its Jacobian is not finite
+FLAT = 1e-3  # a row whose slopes are less than this, times its value, is measured by that
+TO_BOUND = 0.9  # of the way to a bound that a step would cross
+SETTLED = 1e-2  # steps of this times √eps end the search for the nearest point
+NOISE = 8.0  # rounding errors of a row, in units of eps
 
-_NEWTON, _MARQUARDT, _TRACK, _LAND, _POLISH, _DONE, _FAILED = range(7)
+_NEWTON, _MARQUARDT, _TRACK, _LAND, _POLISH, _NEAREST, _DONE, _FAILED = range(8)
+
+
+class Sizes(NamedTuple):
+    """What measures unknowns and rows: zero where nothing is known."""
+
+    nominal: Float[Array, " n"]  # declared sizes of unknowns
+    known: Float[Array, " n"]  # sizes of unknowns by their declarations, starts and guesses
+    data: Float[Array, " m"]  # sizes of what each row is compared with
+    soft: Float[Array, " m"]  # distances that weigh the same in soft rows
+
+
+def tolerance(dtype: Any) -> float:
+    """The largest residual that counts as rounding, relative to the size of a row's terms."""
+    return float(jnp.finfo(dtype).eps) ** 0.6
+
+
+def soft_weight(dtype: Any) -> float:
+    """The weight of soft rows beside others: they move these by its square, a tenth of what counts as rounding."""
+    return float(np.sqrt(0.1 * tolerance(dtype)))
+
+
+def row_sizes(jacobian: Any, x: Any, sizes: Sizes, unit: Any) -> tuple[Any, Any]:
+    """The size of each row's terms, and the rounding that the sizes of unknowns alone let expect."""
+    size = jnp.maximum(jnp.abs(x), sizes.nominal)
+    magnitude = jnp.where(jnp.isfinite(jacobian), jnp.abs(jacobian), 0)
+    eps = float(jnp.finfo(jacobian.dtype).eps)
+    return magnitude @ size, NOISE * eps * (magnitude @ jnp.maximum(unit, size) + sizes.data)
+
+
+def column_sizes(value: Any, jacobian: Any, sizes: Sizes) -> Any:
+    """A size for every unknown: as known, or else what its rows imply, |∂F/∂xⱼ|·xⱼ being of the size of their other
+    terms; 1 where nothing is known."""
+    tiny, huge = float(jnp.finfo(jacobian.dtype).tiny), 1 / float(jnp.finfo(jacobian.dtype).eps)
+    magnitude = jnp.where(jnp.isfinite(jacobian), jnp.abs(jacobian), 0)
+    offset = jnp.maximum(sizes.data, jnp.where(jnp.isfinite(value), jnp.abs(value), 0))
+    size = sizes.known
+    for _ in range(2):
+        row = jnp.maximum(offset, jnp.max(magnitude * size, axis=1, initial=0.0))
+        seen = (magnitude > tiny) & (row > tiny)[:, None]
+        ratio = jnp.where(seen, row[:, None] / jnp.where(seen, magnitude, 1), jnp.inf)
+        implied = jnp.min(ratio, axis=0, initial=jnp.inf)
+        size = jnp.where(sizes.known > 0, sizes.known, jnp.where(implied < huge, implied, 0))
+    return jnp.where(size > 0, size, 1)
 
 
 class Found(NamedTuple):
-    """A root, or the best point met; the Jacobian there; the rung that succeeded, an index into `METHODS`."""
+    """A root, or the best point met; the Jacobian there; the largest value of each row that counts as zero; the sizes
+    of the unknowns; the rung that succeeded, an index into `METHODS`."""
 
     x: Any
     jacobian: Any
+    limit: Any
+    unit: Any
     method: Any
     evaluations: Any
 
@@ -47,7 +104,7 @@ class _Machine(NamedTuple):
     """Points are (x, s). Packed into few arrays: XLA compiles a kernel for each."""
 
     scalars: Any  # see _Scalars
-    points: Any  # trial, base (the last one accepted), best, and the tangent
+    points: Any  # trial, base (the last one accepted), best, the tangent, where rungs start, and the units
     rows: Any  # F at the base, F at the start, and the weight of each equation
     jacobian: Any  # at the base, columns scaled
 
@@ -58,6 +115,7 @@ class _Scalars(NamedTuple):
     phase: Any
     method: Any
     fresh: Any  # whether the trial point is where a rung starts
+    begun: Any  # whether F has been finite
     count: Any  # evaluations on this rung
     evaluations: Any
     size: Any
@@ -72,11 +130,11 @@ class _Scalars(NamedTuple):
 def find_root(
     function: Callable[[Any], Any],
     m: int,
-    start: Any,
-    scale: np.ndarray,
+    start: Float[Array, " n"],
+    sizes: Sizes,
     core: np.ndarray | None,
-    close: Callable[[Any], Any],
-    enough: Callable[[Any], Any],
+    soft: Bool[np.ndarray, " m"] | None = None,
+    bounds: Float[np.ndarray, "n 2"] | None = None,
 ) -> Found:
     """Climbs the ladder.
 
@@ -84,15 +142,24 @@ def find_root(
 
     - `function`: F, from shape (n,) to `(m,)`.
     - `start`: where every rung starts, shape (n,).
-    - `scale`: the typical size of each unknown.
+    - `sizes`: of unknowns and of the rows' data.
     - `core`: n rows of F that are independent and determine x, for the homotopy; None leaves that rung out.
-    - `close`, `enough`: functions of x that give the largest |F| at which to stop, and the largest that counts as
-        zero where rounding prevents more.
+    - `soft`: which rows are guesses: they hold if they can; else the nearest point is taken. Without a `core` they
+        outnumber what they can choose, and the nearest point is looked for at once.
+    - `bounds`: of the unknowns; no iterate leaves them.
     """
     dtype, n = start.dtype, start.shape[0]
     eps = float(jnp.finfo(dtype).eps)
+    close, enough = min(1e3 * eps, 0.1 * tolerance(dtype)), tolerance(dtype)
     where, one = jnp.where, jnp.ones((), dtype)
-    unit = jnp.append(jnp.maximum(jnp.asarray(scale, dtype), jnp.abs(start)), one)
+    is_soft = np.zeros(m, bool) if soft is None else soft
+    hard, weighted = jnp.asarray(~is_soft), jnp.asarray(np.where(is_soft, soft_weight(dtype), 1.0), dtype)
+    has_soft = bool(is_soft.any())
+    nearest_first = has_soft and core is None
+    limits = np.array(bounds, float) if bounds is not None and np.isfinite(bounds).any() else None
+    if limits is not None:
+        low, high = jnp.asarray(limits.T, dtype)
+        start = _inside(start, low, high, sizes.known)
     origin = jnp.append(start, 0 * one)
     along = np.append(np.zeros(n), 1.0)  # the direction of s
     # The first border: no direction of its own, so that it is regular where the Jacobian at the start is not.
@@ -108,37 +175,56 @@ def find_root(
             out = where(jnp.asarray(place == k), jnp.asarray(s, dtype), out)
         return out
 
+    def bounded(ahead, here) -> Any:
+        """A step that goes most of the way to the bounds it would cross."""
+        if limits is None:
+            return ahead
+        x, base = ahead[:n], here[:n]
+        x = where(x < low, base + TO_BOUND * (low - base), where(x > high, base + TO_BOUND * (high - base), x))
+        return jnp.append(x, ahead[n])
+
     def evaluate(state: _Machine) -> _Machine:
-        x = state.points[0, :n]
+        x, unit = state.points[0, :n], state.points[5, :n]
         jacobian, value = jax.jacfwd(lambda y: (function(y),) * 2, has_aux=True)(x)
         # What a function of the user's closes over may be differentiated elsewhere: not in here.
-        value, jacobian = jax.lax.stop_gradient((value, jacobian * unit[:n]))
-        worst = jnp.max(jnp.abs(value), initial=0.0)
-        return advance(state, value, jacobian, worst <= close(x), worst <= enough(x))
+        value, jacobian = jax.lax.stop_gradient((value, jacobian))
+        begins = state.scalars[3] == 0
+        unit = where(begins, column_sizes(value, jacobian, sizes), unit)
+        size, noise = row_sizes(jacobian, x, sizes, unit)
+        size = size + sizes.data
+        reached = jnp.all(jnp.abs(value) <= close * size)
+        # Soft rows pull at the others until the last step, which carries the derivative, sets these right.
+        pulled = where(hard, 0.1 * float(np.sqrt(enough)) * size, jnp.inf)
+        nearest = state.scalars[0] == _NEAREST
+        holds = jnp.all(jnp.abs(value) <= where(nearest, pulled, enough * size) + noise)
+        return advance(state, value, jacobian * unit, jnp.append(unit, one), reached, holds)
 
-    def advance(state: _Machine, value, jacobian, reached, holds) -> _Machine:
+    def advance(state: _Machine, value, jacobian, unit, reached, holds) -> _Machine:
         s = _Scalars(*state.scalars)
         phase, fresh, arc = s.phase, s.fresh > 0, s.size
-        trial, base, best, last_tangent = state.points
-        descending, marquardt = (phase == _NEWTON) | (phase == _POLISH), phase == _MARQUARDT
+        trial, base, best, last_tangent, beginning, _ = state.points
+        nearest, marquardt = phase == _NEAREST, phase == _MARQUARDT
+        descending = (phase == _NEWTON) | (phase == _POLISH) | nearest
         tracking, landing = (phase == _TRACK) | (phase == _LAND), phase == _LAND
-        begins = s.evaluations == 0
+        begins = s.begun == 0
         # A root is a root on any rung; but what the homotopy lands on is polished first.
         stop = reached & ~tracking
 
         # Is the trial point accepted?
-        largest = jnp.max(jnp.abs(jacobian), axis=1, initial=0.0)
-        w = where(
-            begins,
-            1 / where((largest > 1e-8) & (largest < 0.1 * float(jnp.finfo(largest.dtype).max)), largest, one),
-            state.rows[2],
-        )
+        largest = jnp.maximum(jnp.max(jnp.abs(jacobian), axis=1, initial=0.0), FLAT * jnp.abs(value))
+        usable = (largest > 0) & (largest < 0.1 * float(jnp.finfo(largest.dtype).max))
+        balanced = 1 / where(usable, largest, one)
+        w = where(begins, where(hard | (sizes.soft == 0), balanced, 1 / sizes.soft), state.rows[2])
         first = where(begins, value, state.rows[1])
-        square = jnp.sum((w * value) ** 2 + 0 * largest)
+        # Where soft rows outnumber their freedom, all rungs weigh them down.
+        w_here = where(nearest | nearest_first, w * weighted, w)
+        square = jnp.sum((w_here * value) ** 2 + 0 * largest)
         finite = jnp.isfinite(square)
+        if limits is not None:
+            finite &= ~tracking | jnp.all((trial[:n] >= low) & (trial[:n] <= high))
         ratio = (s.square - square) / where(s.gain > 0, s.gain, one)
         falls = where(marquardt, ratio > 0, jnp.sqrt(square) < (1 - DECREASE * s.size) * jnp.sqrt(s.square))
-        accepted = stop | (finite & (fresh | tracking | falls))
+        accepted = stop | (finite & (fresh | tracking | nearest | falls))
         value = where(accepted, value, state.rows[0])
         jacobian = where(accepted, jacobian, state.jacobian)
         here = where(accepted, trial, base)
@@ -147,7 +233,7 @@ def find_root(
 
         # One factorization for all rungs, of the Jacobian bordered by s and stacked on the damping; two right sides
         # give the step and the tangent.
-        held = where(tracking, inside * w, w)
+        held = where(tracking, inside * w, w_here)
         short = held * (value - where(tracking, 1 - here[n], 0 * one) * first)
         curve = where(tracking, held * first, jnp.zeros_like(first))
         matrix = held[:, None] * jacobian
@@ -165,10 +251,23 @@ def find_root(
         step, tangent = solved[:, 0], solved[:, 1]
         columns = jnp.concatenate([solved, r[:, n + 1 : n + 2], (here / unit)[:, None]], axis=1)
         length, stretch, explained, extent = jnp.sqrt(jnp.sum(columns**2, axis=0))
+        size = jnp.maximum(jnp.abs(here[:n]), sizes.nominal)
+        still = jnp.all(jnp.abs(unit * step)[:n] <= NOISE * eps * size)
 
         # Newton
         fraction = where(fresh, one, where(accepted, jnp.minimum(one, 4 * s.size), 0.5 * s.size))
-        newton_fails = ~jnp.isfinite(length) | (fraction < SHORTEST) | (s.count >= NEWTON_LIMIT)
+        newton_fails = ~jnp.isfinite(length) | (fraction < SHORTEST) | (s.count >= NEWTON_LIMIT) | (still & holds)
+
+        # The nearest point: the curvature of the equations makes Gauss–Newton steps too long, by a factor that the
+        # change from the last one shows (Barzilai & Borwein 1988).
+        last_step = last_tangent
+        turned = jnp.dot(last_step, last_step - step)
+        fitting = s.size * jnp.dot(last_step, last_step) / where(turned > 0, turned, one)
+        fitting = where(turned > 0, jnp.clip(fitting, 10 * SHORTEST, one), one)
+        fitting = where(fresh, one, where(finite, fitting, 0.5 * s.size))
+        fraction = where(nearest, fitting, fraction)
+        settled = nearest & holds & finite & (length <= SETTLED * jnp.sqrt(eps) * (1 + extent))
+        nearest_fails = ~jnp.isfinite(length) | (fraction < SHORTEST) | (s.count >= NEAREST_LIMIT)
 
         # Levenberg–Marquardt
         gain = explained**2 + damping * length**2  # by which the linear model says that |F|² falls
@@ -178,8 +277,8 @@ def find_root(
         tangent = tangent * (where(fresh & ((tangent[n] < 0) ^ (s.turn < 0)), -one, one) / stretch)
         on_curve = finite & (stretch < jnp.inf) & (fresh | (length <= 0.02 * jnp.minimum(arc, one)))
         on_curve &= fresh | landing | (stretch * SMALLEST_COSINE <= 1)  # with the last tangent, a unit vector
-        within = where(s.corrections == 0, arc, 0.5 * s.growth)
-        correcting = finite & ~on_curve & (s.corrections < CORRECTIONS) & (length <= within)
+        reach = where(s.corrections == 0, arc, 0.5 * s.growth)
+        correcting = finite & ~on_curve & (s.corrections < CORRECTIONS) & (length <= reach)
         landed, passes = on_curve & landing, on_curve & ~landing
         corrected = here + where(fresh, 0 * one, one) * unit * step
         arc = where(passes, where(s.corrections <= 1, 2 * arc, arc), arc / 3)
@@ -194,47 +293,81 @@ def find_root(
         follow = where(landed, _POLISH, where(lands | (correcting & landing), _LAND, _TRACK))
 
         # What comes next
+        lost = begins & ~(finite & (~nearest | jnp.isfinite(length)))
+        steps_off = lost & (s.count < STEPS_OFF)
         fails = where(descending, newton_fails, where(marquardt, marquardt_fails, homotopy_fails))
-        failed = ~stop & (fails | (fresh & ~finite))
-        rounded = failed & holds & ~tracking & ~fresh
-        by = where(phase == _POLISH, 3, 1 + phase)
-        above = where(phase == _NEWTON, _MARQUARDT, _FAILED)
+        fails = where(nearest, nearest_fails, fails)
+        failed = ~stop & ~settled & ~steps_off & (fails | (fresh & ~finite))
+        rounded = failed & holds & ~tracking & ~nearest & ~fresh
+        done = stop | rounded | settled
+        by = where(nearest, NEAREST, where(phase == _POLISH, 3, 1 + phase))
+        last = _NEAREST if has_soft else _FAILED
+        above = where(phase == _NEWTON, _MARQUARDT, last)
         if core is not None:
             above = where(marquardt | (tracking & (s.turn > 0)), _TRACK, above)
-        above = where(rounded, _DONE, where(fresh & ~finite, _FAILED, above))
-        restarts = failed | (tracking & landed)
+        if has_soft:
+            again = (s.turn > 0) if nearest_first else jnp.zeros((), bool)
+            above = where(nearest, where(again, _MARQUARDT, _FAILED), above)
+        above = where(lost, _FAILED, above)
+        restarts = failed | (tracking & landed) | lost
         stepped = where(tracking, ahead, here + where(descending, fraction, one) * unit * step)
+        stepped = bounded(stepped, here)
         damped = where(accepted, 2 * one, 2 * s.growth)
+        # Around a start that is not finite: closer points first, on either side.
+        beginning = where(begins & ~lost, trial, beginning)
+        amount = where(s.count % 2 == 0, one, -one) * 10 ** (0.5 * s.count - 4)
+        off = bounded(origin + amount * generic * jnp.append(where(sizes.known > 0, sizes.known, one), 0 * one), origin)
+        compromise = where(marquardt, here, best)  # of all rows, where the nearest point is looked for
+        restart = where(above == _NEAREST, compromise, beginning) if has_soft else beginning
+        if nearest_first:  # where the Jacobian vanishes, descent needs a direction
+            restart = where(
+                above == _MARQUARDT, bounded(beginning + 1e-3 * unit * generic * (1 - along), restart), restart
+            )
         scalars = packed(
             *_Scalars(
-                phase=where(stop, _DONE, where(failed, above, where(tracking, follow, phase))),
-                method=where(stop | rounded, where(begins, 0, by), s.method),
+                phase=where(done, _DONE, where(failed, above, where(tracking, follow, phase))),
+                method=where(done, where(stop & begins, 0, by), s.method),
                 fresh=restarts,
-                count=where(restarts, 0, s.count + 1),
+                begun=~lost,
+                count=where(failed | (tracking & landed), 0, s.count + 1),
                 evaluations=s.evaluations + 1,
                 size=where(descending, fraction, where(marquardt, damping, arc)),
                 growth=where(tracking, length, damped),
                 square=square,
                 gain=gain,
                 holds=holds,
-                turn=where(tracking & failed, -one, s.turn),
+                turn=where(failed & (tracking | nearest), -one, s.turn),
                 corrections=where(tracking & correcting, s.corrections + 1, 0),
             )
         )
         points = jnp.stack([
-            where(failed, origin, stepped),
+            where(steps_off, off, where(failed, restart, stepped)),
             where(tracking, foot, here),
             where(marquardt & failed, here, best),
-            where(tracking, direction, last_tangent),
+            where(tracking, direction, where(nearest & finite, step, last_tangent)),
+            beginning,
+            unit,
         ])  # fmt: skip
         return _Machine(scalars, points, jnp.stack([value, first, w]), jacobian)
 
-    begin = _Scalars(_NEWTON, FAILED, 1.0, 0, 0, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0)
-    points = jnp.stack([origin, origin, origin, along])
+    begin = _Scalars(_NEAREST if nearest_first else _NEWTON, FAILED, 1.0, 0.0, 0, 0, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0)
+    points = jnp.stack([origin, origin, origin, along, origin, jnp.ones_like(origin)])
     state = _Machine(
         jnp.asarray([float(v) for v in begin], dtype), points, jnp.ones((3, m), dtype), jnp.zeros((m, n), dtype)
     )
     state = jax.lax.while_loop(lambda s: s.scalars[0] < _DONE, evaluate, state)
     s = _Scalars(*state.scalars)
     found = where(s.phase == _DONE, state.points[1], state.points[2])[:n]
-    return Found(found, state.jacobian / unit[:n], s.method.astype(jnp.int32), s.evaluations.astype(jnp.int32))
+    unit = state.points[5, :n]
+    jacobian = state.jacobian / unit
+    size, noise = row_sizes(jacobian, found, sizes, unit)
+    limit = enough * (size + sizes.data) + noise
+    return Found(found, jacobian, limit, unit, s.method.astype(jnp.int32), s.evaluations.astype(jnp.int32))
+
+
+def _inside(x: Any, low: Any, high: Any, known: Any) -> Any:
+    """A point within bounds, and off them."""
+    size = jnp.maximum(known, jnp.abs(x))
+    width = jnp.where(jnp.isfinite(high - low), high - low, jnp.where(size > 0, size, 1))
+    margin = 1e-3 * width
+    return jnp.where(x <= low, low + margin, jnp.where(x >= high, high - margin, x))

@@ -12,8 +12,8 @@ from ..lowering.plan import SystemPlan
 from ..lowering.schedule import SparseStep
 from ..model.tables import ZERO
 from ..system.system_at import input_values
-from .initialize import InitialPoint, tolerance
-from .ladder import FAILED, METHODS
+from .initialize import InitialPoint, is_consistent
+from .ladder import FAILED, METHODS, NEAREST, tolerance
 from .rows import Row, initial_rows, supports
 
 SHOWN = 12
@@ -82,16 +82,16 @@ class InitializationReport:
         self._residual = np.asarray(found.residual, float)
         self._target = np.asarray(found.target, float)[len(self._residual) - len(self._rows.kept) :]
         self._x = np.asarray(found.x, float)
-        self._limit = float(tolerance(found.x.dtype, np.append(self._x, np.asarray(found.solved, float))))
-        unknown = np.append(self._x, np.asarray(found.solved, float))
-        self.consistent = bool(np.abs(self._residual).max(initial=0.0) <= self._limit and np.isfinite(unknown).all())
+        self._limit = np.asarray(found.limit, float)
+        self._relative = tolerance(found.x.dtype)
+        self.consistent = bool(is_consistent(found))
 
     # --- starts ------------------------------------------------------------------------------------------------
 
     @property
     def _promoted(self) -> int:
         """How many of the rows kept, the last ones, are guesses."""
-        return 0 if self._rows.direct else len(self._rows.promoted)
+        return self._rows.n_soft
 
     @functools.cached_property
     def fixed(self) -> list[tuple[str, float]]:
@@ -115,8 +115,7 @@ class InitializationReport:
                 values = list(parameters[list(row.start.parameters)])
                 guess = row.sign * float(row.start.template.residual([], values, [], 0.0, None, backend="numpy"))
             name = plan.quantity_name[int(q)]
-            sign = -1.0 if name.startswith("-") else 1.0
-            out.append(Guess(name.removeprefix("-"), sign * guess + 0.0, sign * float(self._x[k]) + 0.0))
+            out.append(Guess(name, guess + 0.0, float(self._x[k]) + 0.0))
         return out
 
     @functools.cached_property
@@ -135,9 +134,10 @@ class InitializationReport:
         first = len(self._residual) - len(rows.kept)
         for k, others in supports(*self._key).items():
             involved = [k, *(position[o.name, o.given] for o in others)]
-            off = np.abs(self._residual[[first + j for j in involved]]).max()
+            chosen = [first + j for j in involved]
+            agrees = bool((np.abs(self._residual[chosen]) <= self._limit[chosen]).all())
             name, number = value(rows.kept[k])
-            out.append(Redundant(name, number, tuple(value(o) for o in others), bool(off <= self._limit)))
+            out.append(Redundant(name, number, tuple(value(o) for o in others), agrees))
         return out
 
     # --- residuals ---------------------------------------------------------------------------------------------
@@ -147,9 +147,10 @@ class InitializationReport:
         if self.consistent:
             return []
         size = np.abs(self._residual)
-        order = np.argsort(np.where(np.isfinite(size), -size, -np.inf), kind="stable")
+        ratio = size / np.maximum(self._limit, np.finfo(float).tiny)
+        order = np.argsort(np.where(np.isfinite(ratio), -ratio, -np.inf), kind="stable")
         described = self._described()
-        chosen = [int(k) for k in order if not size[k] <= self._limit]
+        chosen = [int(k) for k in order if not size[k] <= self._limit[k]]
         return [Residual(described[k][0], described[k][1], float(self._residual[k])) for k in chosen]
 
     def _described(self) -> list[tuple[str, tuple[str, ...]]]:
@@ -174,7 +175,7 @@ class InitializationReport:
         return out + starts
 
     def _names(self, quantities: np.ndarray) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(self._plan.quantity_name[int(q)].removeprefix("-") for q in quantities if q != ZERO))
+        return tuple(dict.fromkeys(self._plan.quantity_name[int(q)] for q in quantities if q != ZERO))
 
     # --- blocks ------------------------------------------------------------------------------------------------
 
@@ -307,6 +308,8 @@ class InitializationReport:
             head.append("the starts fulfil all equations; nothing had to be solved")
         elif self.method == METHODS[FAILED]:
             head.append(f"no method succeeded, {self.evaluations} evaluations")
+        elif self.method == METHODS[NEAREST]:
+            head.append(f"the nearest point to guesses that cannot all hold, {self.evaluations} evaluations")
         else:
             head.append(f"found by {self.method}, {self.evaluations} evaluations")
         sections = [
@@ -315,7 +318,7 @@ class InitializationReport:
             ("redundant, as they follow from others", [_redundancy(r) for r in self.redundant if r.agrees]),
             ("contradicting", [_contradiction(r) for r in self.redundant if not r.agrees]),
             ("fixed in the model, but outranked by values given", self.outranked),
-            ("guesses", [_guess(g, self._limit) for g in self.guesses]),
+            ("guesses", [_guess(g, self._relative) for g in self.guesses]),
             ("does not hold, worst first", [f"{r.text}: off by {abs(r.value):.3g}" for r in self.residuals]),
             ("singular", [self._singular(b).replace("\n", " ") for b in singular]),
             ("notes", self.notes),
@@ -323,8 +326,8 @@ class InitializationReport:
         return head, [(title, list(entries)) for title, entries in sections if entries]
 
 
-def _guess(g: Guess, limit: float) -> str:
-    if abs(g.moved) <= limit:
+def _guess(g: Guess, relative: float) -> str:
+    if abs(g.moved) <= relative * max(abs(g.value), abs(g.guess)):
         return f"{g.name} = {g.value:.6g}, kept"
     return f"{g.name} = {g.value:.6g}, moved by {g.moved:.3g} from {g.guess:.6g}"
 

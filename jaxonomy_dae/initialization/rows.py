@@ -1,8 +1,9 @@
 """Which starts determine the initial point.
 
 Given the plan, the values a caller names and the parameters to be solved for, returns the rows that are kept beside the
-equations: values given, fixed starts, and as many guesses as it takes to determine the rest. Which guesses are kept is
-decided once, numerically, at the declared parameter values: a row is independent if it closes a direction that the
+equations: values given and fixed starts, which must hold, and guesses, which need not, as many as it takes to determine
+the rest. The choice is a question of rank, asked at a generic point: it reads the structure alone, never the values of
+parameters or weights, so that it is right for all of them. A row is independent if it closes a direction that the
 equations and the rows before it leave open.
 """
 
@@ -13,20 +14,25 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.linalg
+import scipy.sparse as sp
 
 from ..errors import InitializationError
 from ..lowering.plan import SystemPlan
-from ..model.consistent_point import consistent_point
-from ..model.evaluate_numpy import Networks, residual_and_jacobian, slot_values, start_values
+from ..model.evaluate_numpy import Networks, generic_jacobian, slot_values, start_values
+from ..model.quantities import ABSENT, declared_scale
+from ..model.scaling import equilibrated
 from ..model.tables import ZERO, Start
+from ..structure.matching import match_in_order
 
-NUMERIC_LIMIT = 3000  # quantities up to which guesses are chosen by rank
+DENSE_LIMIT = 600  # quantities up to which ranks are numerical; above, rows are matched with quantities
 OPEN = 1e-7  # a direction less than this along a quantity leaves it determined
+RANK = 1e-11  # pivots smaller than this, of equilibrated equations, are rounding
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One start that must hold: sign·quantity equals a start expression or the caller's value `given`."""
+    """One start: sign·quantity equals a start expression or the caller's value `given`."""
 
     name: str
     quantity: int
@@ -40,42 +46,54 @@ class InitialRows:
     """What determines the initial point."""
 
     guess: tuple[Row | None, ...]  # for each entry of the state array, where its first value comes from
-    kept: tuple[Row, ...]
-    independent: tuple[bool, ...] | None  # of the rows kept, those that no other determines; None if not examined
+    kept: tuple[Row, ...]  # rows that must hold, then the guesses
+    n_soft: int  # how many of the rows kept, the last ones, are guesses
+    independent: tuple[bool, ...]  # of the rows kept, those that no row before determines
     direct: bool  # every kept row is a state and nothing else constrains the states
-    redundant: tuple[int, ...]  # rows kept that follow from others
-    promoted: tuple[str, ...]  # states that start at their guess, as nothing else determines them
+    redundant: tuple[int, ...]  # rows that must hold, though they follow from others
+    promoted: tuple[str, ...]  # states that start at or near their guess, as nothing else determines them
     dropped: tuple[str, ...]  # fixed starts that values given by the caller outrank
 
 
 @dataclasses.dataclass(frozen=True)
-class _Open:
-    """The extended system near the initial point, columns being quantities and then parameters to be solved for."""
+class _Generic:
+    """The extended system at a generic point, equilibrated; columns are quantities and then parameters solved for."""
 
-    jacobian: np.ndarray
-    point: np.ndarray
-    values: np.ndarray
+    jacobian: Any  # sparse
+    columns: np.ndarray  # by which the columns were multiplied
+    values: np.ndarray  # of parameters
     solve_for: tuple[int, ...]
 
     @property
     def n(self) -> int:
+        """How many columns are quantities."""
         return self.jacobian.shape[1] - len(self.solve_for)
 
     def row(self, row: Row) -> np.ndarray:
-        """The gradient of a start row."""
+        """The gradient of a start row, scaled."""
         out = np.zeros(self.jacobian.shape[1])
         if row.quantity != ZERO:
             out[row.quantity] = 1.0
-        if row.start is not None and row.given < 0 and set(row.start.parameters) & set(self.solve_for):
-            start = row.start
-            with jax.ensure_compile_time_eval():
-                values = [jnp.asarray(self.values[k]) for k in start.parameters]
-                slopes = jax.grad(lambda v: jnp.asarray(start.template.residual([], v, [], jnp.zeros(()), None)))
-                slope = [float(s) for s in slopes(values)]
-            for k, parameter in enumerate(start.parameters):
-                if parameter in self.solve_for:
-                    out[self.n + self.solve_for.index(parameter)] -= row.sign * slope[k]
-        return out
+        for parameter, slope in self._slopes(row):
+            out[self.n + self.solve_for.index(parameter)] -= row.sign * slope
+        out *= self.columns
+        return out / max(np.abs(out).max(initial=0.0), 1e-300)
+
+    def pattern(self, row: Row) -> list[int]:
+        """The columns on which a start row depends."""
+        places = [] if row.quantity == ZERO else [row.quantity]
+        return places + [self.n + self.solve_for.index(parameter) for parameter, _ in self._slopes(row)]
+
+    def _slopes(self, row: Row) -> list[tuple[int, float]]:
+        start = row.start
+        if start is None or row.given >= 0 or not set(start.parameters) & set(self.solve_for):
+            return []
+        with jax.ensure_compile_time_eval():
+            values = [jnp.asarray(self.values[k]) for k in start.parameters]
+            slopes = jax.grad(lambda v: jnp.asarray(start.template.residual([], v, [], jnp.zeros(()), None)))(values)
+            numbers = [float(s) for s in slopes]
+        pairs = zip(start.parameters, numbers, strict=True)
+        return [(k, slope if np.isfinite(slope) else 1.0) for k, slope in pairs if k in self.solve_for]
 
 
 @functools.lru_cache(maxsize=256)
@@ -102,37 +120,32 @@ def initial_rows(plan: SystemPlan, names: tuple[str, ...], solve_for: tuple[int,
             held.add(r.quantity)
         promoted = tuple(plan.quantity_name[q] for q in entries if q not in held)
         independent = tuple(k not in again for k in range(len(rows)))
-        return InitialRows(guess, tuple(rows), independent, True, tuple(again), promoted, ())
-    opened = _opened(plan, fixed, declared, solve_for)
-    if opened is None:
-        if solve_for:
-            raise InitializationError(
-                "solve_for: cannot tell whether the values given determine the parameters: the model has more than "
-                f"{NUMERIC_LIMIT} quantities, or its equations are not finite at the declared starts"
-            )
-        return InitialRows(guess, tuple(rows), None, False, (), (), ())
-    return _by_rank(plan, opened, overrides, fixed, guess)
+        return InitialRows(guess, tuple(rows), 0, independent, True, tuple(again), promoted, ())
+    generic = _generic(plan, solve_for)
+    ranked = _by_rank if generic.jacobian.shape[1] <= DENSE_LIMIT else _by_matching
+    return ranked(plan, generic, overrides, fixed, guess)
 
 
 def _declared(plan: SystemPlan, names: tuple[str, ...]) -> tuple[list[Row], list[Row], dict[int, Row]]:
     """Values given, fixed starts they leave, and the first start of each quantity."""
     variables = plan.flat.variables
-    values = plan.flat.parameters.values
     overrides = [
         Row(name, int(q), int(s), None, k)
         for k, (name, q, s) in enumerate(zip(names, *plan.resolve(names), strict=True))
         if q != ZERO
     ]
     overridden = {r.quantity for r in overrides}
-    value_of = start_values(variables.start, values)
+    number = start_values(variables.start, np.zeros(0))
     started: dict[int, Row] = {}
     fixed: list[Row] = []
     for v, start in enumerate(variables.start):
         if start is None:
             continue
         quantity, sign = plan.quantity_of(v)
-        if quantity == ZERO and not (variables.fixed[v] and value_of(v) != 0.0):
-            continue  # zero as it should be; any other fixed start contradicts the equations, and is kept to say so
+        if quantity == ABSENT:
+            continue
+        if quantity == ZERO and not (variables.fixed[v] and (start.parameters or number(v) != 0.0)):
+            continue  # zero as it should be; any other fixed start must turn out to be zero
         row = Row(variables.names[v], quantity, sign, start)
         if variables.fixed[v] and quantity not in overridden:
             fixed.append(row)
@@ -141,34 +154,27 @@ def _declared(plan: SystemPlan, names: tuple[str, ...]) -> tuple[list[Row], list
     return overrides, fixed, started
 
 
-def _opened(plan: SystemPlan, fixed, started, solve_for) -> _Open | None:
-    """The equations' Jacobian, rows scaled, at a point near the initial one; None if it is too large, or not finite."""
+@functools.lru_cache(maxsize=64)
+def _generic(plan: SystemPlan, solve_for: tuple[int, ...]) -> _Generic:
     extended = plan.extended
     n = extended.quantities.n_unknown
-    if n > NUMERIC_LIMIT:
-        return None
-    values = plan.flat.parameters.values
-    value_of = start_values([r.start for r in started.values()], values)
-    point = np.zeros(extended.quantities.n)
-    for k, (q, row) in enumerate(started.items()):
-        if row.start is not None and q != ZERO:
-            point[q] = row.sign * value_of(k)
-    one = start_values([r.start for r in fixed], values)
-    pins = [(r.quantity, r.sign * one(k)) for k, r in enumerate(fixed) if r.quantity != ZERO]
-    weights = Networks(tuple(plan.flat.networks.values()))
-    point, _ = consistent_point(extended, point, pins, values, 0.0, weights)
-    _, jacobian = residual_and_jacobian(extended, point, values, 0.0, weights)
-    dense = jacobian.toarray()[:, :n]
+    size = declared_scale(plan.flat, plan.variable_map, extended)
+    number = start_values(plan.flat.variables.start, np.zeros(0))
+    for v, start in enumerate(plan.flat.variables.start):
+        quantity, sign = plan.quantity_of(v)
+        if start is not None and quantity >= 0 and not start.parameters and size[quantity] == 0.0:
+            size[quantity] = sign * number(v)
+    size[size == 0.0] = 1.0
+    jacobian, point, values = generic_jacobian(extended, size, len(plan.flat.parameters))
+    jacobian = jacobian[:, :n]
     if solve_for:
-        dense = np.concatenate([dense, _parameter_columns(plan, point, values, solve_for, weights)], axis=1)
-    if not np.isfinite(dense).all():
-        return None
-    dense = dense / np.maximum(np.abs(dense).max(axis=1, keepdims=True), 1e-300)
-    return _Open(dense, point, values, solve_for)
+        jacobian = sp.hstack([jacobian, sp.csr_array(_parameter_columns(plan, point, values, solve_for))], format="csr")
+    scaled, _, columns = equilibrated(jacobian)
+    return _Generic(scaled, columns, values, solve_for)
 
 
-def _parameter_columns(plan: SystemPlan, point, values, solve_for, weights: Networks) -> np.ndarray:
-    """∂(equations)/∂(parameters), columns scaled."""
+def _parameter_columns(plan: SystemPlan, point, values, solve_for) -> np.ndarray:
+    """∂(equations)/∂(parameters)."""
     extended = plan.extended
     out = np.zeros((extended.n_equations, len(solve_for)))
     with jax.ensure_compile_time_eval():
@@ -183,61 +189,109 @@ def _parameter_columns(plan: SystemPlan, point, values, solve_for, weights: Netw
 
                 def residual(p, group=group, slots=slots, coefficients=coefficients):
                     time = jnp.zeros((), p[0].dtype)
-                    value = group.template.residual(slots, p, coefficients, time, weights)
+                    value = group.template.residual(slots, p, coefficients, time, Networks(()))
                     return jnp.broadcast_to(value, (len(group),))
 
                 tangent = [jnp.asarray(h, p.dtype) for h, p in zip(hit.T, given, strict=True)]
                 out[group.equation, j] = np.asarray(jax.jvp(residual, (given,), (tangent,))[1])
-    return out / np.maximum(np.abs(out).max(axis=0, keepdims=True, initial=0.0), 1e-300)
+    return np.where(np.isfinite(out), out, 1.0)
+
+
+def _candidates(plan: SystemPlan, guess) -> list[tuple[Row, bool]]:
+    """Guesses in the order in which they are taken, and whether each is a declared guess of a state: what a user
+    declares before zeros, states before algebraic unknowns."""
+    entries = [int(q) for q in (*plan.states, *plan.carried)]
+    n = len(plan.states)
+    ranked = sorted(range(len(entries)), key=lambda k: (guess[k] is None, k >= n, k))
+    rows = [guess[k] or Row(plan.quantity_name[entries[k]], entries[k], 1, None) for k in ranked]
+    return [(row, guess[k] is not None and k < n) for row, k in zip(rows, ranked, strict=True)]
 
 
 class _Directions:
     """The directions that equations leave open, shape (columns, freedom), closed one by one."""
 
     def __init__(self, jacobian: np.ndarray):
-        _, singular, vt = np.linalg.svd(jacobian, full_matrices=True)
-        rank = int((singular > 1e-10 * max(singular.max(initial=0.0), 1.0)).sum())
-        self.free = vt[rank:].T
+        factors: Any = scipy.linalg.qr(jacobian.T, pivoting=True)
+        q, r, _ = factors
+        pivots = np.abs(np.diag(r))
+        self.free = q[:, int((pivots > RANK * max(pivots.max(initial=0.0), 1e-300)).sum()) :]
+
+    def open(self, gradient: np.ndarray) -> bool:
+        """Whether a row of this gradient is not determined yet."""
+        return bool(np.linalg.norm(gradient @ self.free) >= OPEN)
 
     def close(self, gradient: np.ndarray) -> bool:
         """Whether a row of this gradient closes a direction; closes it."""
         along = gradient @ self.free
         size = np.linalg.norm(along)
-        if self.free.shape[1] == 0 or size < OPEN:
+        if not size >= OPEN:
             return False
-        rest = np.linalg.svd(along[None, :] / size, full_matrices=True)[2][1:]
-        self.free = self.free @ rest.T
+        # A Householder reflection turns the direction into the first column, which is left out.
+        along = along / size
+        reflector = along.copy()
+        reflector[0] += np.copysign(1.0, along[0])
+        reflector /= np.linalg.norm(reflector)
+        self.free = (self.free - 2 * np.outer(self.free @ reflector, reflector))[:, 1:]
         return True
 
 
-def _by_rank(plan: SystemPlan, opened: _Open, overrides, fixed, guess) -> InitialRows:
-    directions = _Directions(opened.jacobian)
+def _by_rank(plan: SystemPlan, generic: _Generic, overrides, fixed, guess) -> InitialRows:
+    directions = _Directions(generic.jacobian.toarray())
     kept, independent, dropped = [], [], []
-    for row in (*overrides, *fixed):
-        closes = directions.close(opened.row(row))
-        if not closes and overrides and row.given < 0:
+    settled = [not directions.open(generic.row(row)) for row in fixed]  # by the equations, whatever is given
+    for row, follows in zip((*overrides, *fixed), ([True] * len(overrides) + settled), strict=True):
+        closes = directions.close(generic.row(row))
+        if not closes and overrides and not follows:
             dropped.append(row.name)  # what the caller gave outranks it
             continue
         kept.append(row)
         independent.append(closes)
     redundant = tuple(k for k, closes in enumerate(independent) if not closes)
-    promoted = []
-    entries = [int(q) for q in (*plan.states, *plan.carried)]
-    while directions.free.shape[1]:
-        sizes = np.linalg.norm(directions.free[entries], axis=1)
-        best = sizes.max(initial=0.0)
-        if best < OPEN:
-            break
-        declared = [k for k in range(len(entries)) if sizes[k] >= 0.1 * best and guess[k] is not None]
-        k = declared[0] if declared else int(np.argmax(sizes))
-        row = guess[k] or Row(plan.quantity_name[entries[k]], entries[k], 1, None)
-        directions.close(opened.row(dataclasses.replace(row, start=None)))
-        kept.append(row)
-        independent.append(True)
-        promoted.append(plan.quantity_name[entries[k]])
-    if opened.solve_for:
-        _check_count(plan, opened, directions, [kept[k] for k in redundant], kept)
-    return InitialRows(guess, tuple(kept), tuple(independent), False, redundant, tuple(promoted), tuple(dropped))
+    candidates = _candidates(plan, guess)
+    gradients = [generic.row(dataclasses.replace(row, start=None)) for row, _ in candidates]
+    undecided = [directions.open(gradient) for gradient in gradients]
+    soft: list[tuple[Row, bool]] = []
+    for (row, is_declared), gradient, is_open in zip(candidates, gradients, undecided, strict=True):
+        if not is_open:
+            continue
+        closes = directions.close(gradient)
+        if closes or is_declared:  # guesses of equal rank share what is open
+            soft.append((row, closes))
+    if generic.solve_for:
+        _check_count(plan, generic, directions, [kept[k] for k in redundant], [*kept, *(row for row, _ in soft)])
+    return _chosen(guess, kept, independent, soft, redundant, dropped, plan)
+
+
+def _by_matching(plan: SystemPlan, generic: _Generic, overrides, fixed, guess) -> InitialRows:
+    """The same for many quantities: a row is independent if it can be matched with a quantity beside the equations and
+    the rows before it."""
+    rows = [*overrides, *fixed, *(row for row, _ in _candidates(plan, guess))]
+    hard = len(overrides) + len(fixed)
+    n_equations = generic.jacobian.shape[0]
+    bare = [row if k < hard else dataclasses.replace(row, start=None) for k, row in enumerate(rows)]
+    patterns = [generic.pattern(row) for row in bare]
+    pointer = np.concatenate([generic.jacobian.indptr, generic.jacobian.nnz + np.cumsum([len(p) for p in patterns])])
+    columns = np.concatenate([generic.jacobian.indices, *(np.array(p, np.int64) for p in patterns)])
+    matched = match_in_order(pointer, columns, generic.jacobian.shape[1], n_equations)[n_equations:] >= 0
+    is_dropped = [bool(overrides) and row.given < 0 and not m for row, m in zip(rows[:hard], matched, strict=False)]
+    kept = [row for row, gone in zip(rows[:hard], is_dropped, strict=True) if not gone]
+    independent = [bool(m) for m, gone in zip(matched[:hard], is_dropped, strict=True) if not gone]
+    redundant = tuple(k for k, alone in enumerate(independent) if not alone)
+    soft = [(row, True) for row, m in zip(rows[hard:], matched[hard:], strict=True) if m]
+    missing = generic.jacobian.shape[1] - n_equations - int(matched.sum())
+    if generic.solve_for and (missing or any(rows[k].given >= 0 for k in redundant)):
+        unknown = _some([plan.flat.parameters.names[p] for p in generic.solve_for])
+        what = "too few" if missing else "too many"
+        raise InitializationError(f"solve_for: {what} values in initial={{...}} to determine {unknown}")
+    dropped = [row.name for row, gone in zip(rows[:hard], is_dropped, strict=True) if gone]
+    return _chosen(guess, kept, independent, soft, redundant, dropped, plan)
+
+
+def _chosen(guess, kept: list[Row], independent: list[bool], soft, redundant, dropped, plan) -> InitialRows:
+    alone = (*independent, *(closes for _, closes in soft))
+    names = tuple(plan.quantity_name[row.quantity] for row, _ in soft)
+    rows = (*kept, *(row for row, _ in soft))
+    return InitialRows(guess, rows, len(soft), alone, False, redundant, names, tuple(dropped))
 
 
 # --- what follows from what ----------------------------------------------------------------------------------------
@@ -249,34 +303,34 @@ def supports(plan: SystemPlan, names: tuple[str, ...], solve_for: tuple[int, ...
     rows = initial_rows(plan, names, solve_for)
     if rows.direct:
         return {k: (next(r for r in rows.kept if r.quantity == rows.kept[k].quantity),) for k in rows.redundant}
-    _, fixed, declared = _declared(plan, names)
-    opened = _opened(plan, fixed, declared, solve_for) if rows.redundant else None
-    if opened is None or opened.n > NUMERIC_LIMIT // 3:
+    generic = _generic(plan, solve_for) if rows.redundant else None
+    if generic is None or generic.n > DENSE_LIMIT:
         return {k: () for k in rows.redundant}
-    base = [r for r, alone in zip(rows.kept, rows.independent or (), strict=True) if alone]
-    return {k: _support(opened, rows.kept[k], base)[0] for k in rows.redundant}
+    hard = len(rows.kept) - rows.n_soft
+    base = [r for r, alone in zip(rows.kept[:hard], rows.independent[:hard], strict=True) if alone]
+    return {k: _support(generic, rows.kept[k], base)[0] for k in rows.redundant}
 
 
-def _support(opened: _Open, row: Row, base: list[Row]) -> tuple[tuple[Row, ...], np.ndarray]:
+def _support(generic: _Generic, row: Row, base: list[Row]) -> tuple[tuple[Row, ...], np.ndarray]:
     """The rows of `base`, and the equations, of which a row is a combination."""
-    matrix = np.concatenate([opened.jacobian, *(opened.row(r)[None, :] for r in base)])
-    weight = np.abs(np.linalg.lstsq(matrix.T, opened.row(row), rcond=1e-12)[0])
+    matrix = np.concatenate([generic.jacobian.toarray(), *(generic.row(r)[None, :] for r in base)])
+    weight = np.abs(np.linalg.lstsq(matrix.T, generic.row(row), rcond=1e-12)[0])
     used = weight > 1e-6 * max(weight.max(initial=0.0), 1e-300)
-    n = opened.jacobian.shape[0]
+    n = generic.jacobian.shape[0]
     return tuple(r for r, u in zip(base, used[n:], strict=True) if u), np.flatnonzero(used[:n])
 
 
-def _check_count(plan: SystemPlan, opened: _Open, directions: _Directions, redundant: list[Row], kept: list[Row]):
+def _check_count(plan: SystemPlan, generic: _Generic, directions: _Directions, redundant: list[Row], kept: list[Row]):
     """Raises if the values given do not determine the parameters that are solved for, or determine one twice."""
     table = plan.flat.parameters
-    wanted = [table.names[p] for p in opened.solve_for]
+    wanted = [table.names[p] for p in generic.solve_for]
     given = [r for r in redundant if r.given >= 0]
     if given:
         base = [r for r in kept if r not in redundant]
         equations: set[int] = set()
         for row in given:
-            equations |= set(_support(opened, row, base)[1].tolist())
-        found = _parameters_of(plan, sorted(equations), set(opened.solve_for))
+            equations |= set(_support(generic, row, base)[1].tolist())
+        found = _parameters_of(plan, sorted(equations), set(generic.solve_for))
         others = f", or solve for one more parameter ({_some(found)})" if found else ""
         more = "a value" if len(given) == 1 else f"{len(given)} values"
         raise InitializationError(
@@ -284,11 +338,11 @@ def _check_count(plan: SystemPlan, opened: _Open, directions: _Directions, redun
             f"({_some(wanted)}): {_some([r.name for r in given])} follow{'s' * (len(given) == 1)} from the others. "
             f"Leave {'it' if len(given) == 1 else 'them'} out{others}."
         )
-    left = np.linalg.norm(directions.free[opened.n :], axis=1)
+    left = np.linalg.norm(directions.free[generic.n :], axis=1)
     undetermined = [w for w, size in zip(wanted, left, strict=True) if size >= OPEN]
     if undetermined:
         missing = directions.free.shape[1]
-        moving = np.linalg.norm(directions.free[: opened.n], axis=1)
+        moving = np.linalg.norm(directions.free[: generic.n], axis=1)
         pinned = {r.quantity for r in kept}
         names = [plan.quantity_name[q] for q in np.flatnonzero(moving >= OPEN) if q not in pinned]
         candidates = [n for n in names if ":" not in n]

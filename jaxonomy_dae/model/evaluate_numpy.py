@@ -86,6 +86,48 @@ def residual_and_jacobian(extended: Extended, values, parameters, t: float, netw
     return residual, sp.coo_array(data, shape=shape).tocsr()
 
 
+def generic_jacobian(extended: Extended, size: np.ndarray, n_parameters: int):
+    """A sparse Jacobian with respect to all quantities at a generic point, for questions of rank: what depends there
+    depends everywhere, or nearly so. Also the point and the parameters.
+
+    It reads nothing but the structure: not the values of parameters, nor the weights of networks. Partial derivatives
+    that are not real at the point, and those of networks, are generic numbers.
+
+    **Arguments:**
+
+    - `size`: of every quantity; the sign counts.
+    """
+    rng = np.random.default_rng(0)
+    samples = [(size * _generic(rng, size.shape), _generic(rng, (n_parameters,))) for _ in range(2)]
+    rows, columns, entries = [], [], []
+    for group in extended.groups:
+        n, k = group.quantity.shape
+        if k == 0:
+            continue
+        if group.template.opaque is not None:
+            partial = _generic(rng, (n, k))
+        else:
+            first, second = (
+                group_values(group, point, parameters, 0.5, Networks(()), partials=True)
+                for point, parameters in samples
+            )
+            partial = np.where(first == 0.0, second, first)  # zero on one branch is not zero on all
+            partial = np.where(np.isfinite(partial), partial, _generic(rng, (n, k)))
+        used = group.quantity != ZERO
+        rows.append(np.broadcast_to(group.equation[:, None], used.shape)[used])
+        columns.append(group.quantity[used])
+        entries.append(partial[used])
+    shape = (extended.n_equations, extended.quantities.n)
+    if not rows:
+        return sp.csr_array(shape), *samples[0]
+    data = (np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns)))
+    return sp.coo_array(data, shape=shape).tocsr(), *samples[0]
+
+
+def _generic(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    return rng.uniform(0.5, 1.5, shape)
+
+
 def start_values(starts, parameters: np.ndarray) -> Callable[[int], float]:
     """The value of a variable's start expression, as a function of the variable's id."""
 

@@ -48,9 +48,27 @@ def name_quantities(flat: FlatModel, variables: QuantityMap, quantities: Quantit
     return names
 
 
-def quantity_scale(flat: FlatModel, variables: QuantityMap, extended: Extended) -> np.ndarray:
-    """The nominal value of every quantity: the largest that a variable which equals it declares, else 1."""
+def declared_scale(flat: FlatModel, variables: QuantityMap, extended: Extended) -> np.ndarray:
+    """The nominal value of every quantity: the largest that a variable which equals it declares, else 0."""
     scale = np.zeros(extended.quantities.n)
     v = np.flatnonzero(variables.quantity >= 0)
     np.maximum.at(scale, variables.quantity[v], flat.variables.nominal[v])
+    return scale
+
+
+def quantity_scale(flat: FlatModel, variables: QuantityMap, extended: Extended) -> np.ndarray:
+    """The nominal value of every quantity, 1 where none is declared."""
+    scale = declared_scale(flat, variables, extended)
     return np.where(scale == 0, 1.0, scale)
+
+
+def quantity_bounds(flat: FlatModel, variables: QuantityMap, extended: Extended) -> np.ndarray:
+    """The bounds of every quantity, shape (quantities, 2): those of all variables that equal it."""
+    n = extended.quantities.n
+    low, high = np.full(n, -np.inf), np.full(n, np.inf)
+    v = np.flatnonzero(variables.quantity >= 0)
+    (a, b), q = flat.variables.bounds[v].T, variables.quantity[v]
+    flipped = variables.sign[v] < 0
+    np.maximum.at(low, q, np.where(flipped, -b, a))
+    np.minimum.at(high, q, np.where(flipped, -a, b))
+    return np.stack([low, high], axis=-1)

@@ -26,7 +26,8 @@ class VariableTable:
     is_port: np.ndarray
     start: list["Start | None"]
     fixed: np.ndarray
-    nominal: np.ndarray
+    nominal: np.ndarray  # typical sizes, 0 where none is declared
+    bounds: np.ndarray  # (n, 2)
     unit: list[str]
     default: list[float | None]
     owner: np.ndarray  # the component, −1 for variables of neural blocks

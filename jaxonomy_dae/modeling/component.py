@@ -1,7 +1,6 @@
 """The base class of everything a user models with."""
 
 import math
-import numbers
 from collections.abc import Sequence
 from typing import Any
 
@@ -171,9 +170,9 @@ class Component(metaclass=Construction):
         self.parameters[name] = Parameter(name, number, unit, interval)
         return ParameterSymbol(name)
 
-    def _declare(self, name: str, kind: str, start=None, fixed=False, nominal=1.0, unit="", default=None):
+    def _declare(self, name: str, kind: str, start=None, fixed=False, nominal=None, unit="", default=None, bounds=None):
         where = f"'{self.name}.{name}'"
-        if not (isinstance(nominal, numbers.Real) and math.isfinite(nominal) and nominal > 0):
+        if nominal is not None and not 0 < real_number(nominal, f"the nominal value of {where}"):
             raise ModelError(f"the nominal value of {where} must be a positive number; got {nominal}")
         if fixed and start is None:
             raise ModelError(f"{where} is fixed at the start but has no start value: give `start=`")
@@ -184,11 +183,20 @@ class Component(metaclass=Construction):
             wrong = [s for s in start.free_symbols if not isinstance(s, ParameterSymbol)]
             if wrong:
                 raise ModelError(f"the start value of {where} may use parameters only; it uses '{wrong[0]}'")
-        self.variables[name] = Variable(name, kind, start, bool(fixed), float(nominal), unit, default)
+        interval = Interval() if bounds is None else as_interval(bounds, where)
+        if isinstance(start, sympy.Number) and float(start) not in interval:
+            raise ModelError(f"the start value of {where} must lie in its bounds {interval}; got {start}")
+        self.variables[name] = Variable(name, kind, start, bool(fixed), float(nominal or 0.0), unit, default, interval)
         return VariableSymbol(name)
 
     def variable(
-        self, name: str, start: Any = None, fixed: bool = False, nominal: float = 1.0, unit: str = ""
+        self,
+        name: str,
+        start: Any = None,
+        fixed: bool = False,
+        nominal: float | None = None,
+        unit: str = "",
+        bounds: tuple[float, float] | Interval | None = None,
     ) -> VariableSymbol:
         """Declares a variable, an unknown function of time.
 
@@ -197,11 +205,20 @@ class Component(metaclass=Construction):
         - `name`: its local name.
         - `start`: a number or an expression in parameters: its value at the initial time.
         - `fixed`: whether `start` must hold; otherwise it guides the search for a consistent initial point.
-        - `nominal`: a positive number, its typical size in its unit; scales tolerances and projections.
+        - `nominal`: a positive number, its typical size in its unit; scales tolerances and projections, and says what
+            counts as zero. Left out, it is 1 for tolerances, and values and equations tell the rest.
         - `unit`: shown in reports and plots.
+        - `bounds`: an interval that the search for a consistent initial point does not leave, such as `(0.0, math.inf)`
+            for what stands in a logarithm or root. It acts on states and on unknowns of nonlinear blocks. A start at a
+            bound is moved off it.
+
+        **Raises:**
+
+        - `ModelError` for a start that is not a finite number or an expression in parameters, or that is out of its
+            bounds; for a nominal value that is not positive.
         """
         self._claim(name, "variable")
-        return self._declare(name, "variable", start, fixed, nominal, unit)
+        return self._declare(name, "variable", start, fixed, nominal, unit, bounds=bounds)
 
     def input(self, name: str, default: float | None = None, unit: str = "") -> VariableSymbol:
         """Declares an input: a function of time given to `simulate(inputs={"component.name": ...})`.

@@ -25,9 +25,10 @@ class Variable:
     kind: str
     start: Any
     fixed: bool
-    nominal: float
+    nominal: float  # 0 if not declared
     unit: str
     default: float | None = None
+    bounds: Interval = Interval()
 
 
 @dataclasses.dataclass(frozen=True)

@@ -23,6 +23,19 @@ def maximum_matching(pointer: np.ndarray, columns: np.ndarray, n_columns: int) -
     return np.array(row_match, np.int64)
 
 
+def match_in_order(pointer: np.ndarray, columns: np.ndarray, n_columns: int, first: int) -> np.ndarray:
+    """The same with priorities: as many of the `first` rows as possible, then each later row, in order, that can be
+    matched beside all before it."""
+    row_match = np.full(len(pointer) - 1, -1)
+    row_match[:first] = maximum_matching(pointer[: first + 1], columns[: pointer[first]], n_columns)
+    matched = row_match >= 0
+    column_match = np.full(n_columns, -1)
+    column_match[row_match[matched]] = np.flatnonzero(matched)
+    found, taken = row_match.tolist(), column_match.tolist()
+    _augment_all(pointer.tolist(), columns.tolist(), found, taken)
+    return np.array(found, np.int64)
+
+
 def _karp_sipser(start, column, column_pointer, by_column, row_match, column_match):
     """Matches vertices of degree one first: such a pair is part of some maximum matching."""
     n_rows, n_columns = len(row_match), len(column_match)

@@ -1,0 +1,238 @@
+"""Units decide nothing: the same model in other units has the same verdicts, states and digits."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from problems import compiled
+from sympy import Abs, Eq, log, sqrt
+
+from jaxonomy_dae import Component, EqnEnv, InitializationError, der
+
+
+class Written(Component):
+    """A component written by a function."""
+
+    def __init__(self, ev, write):
+        super().__init__(ev, "c")
+        write(self)
+
+
+def model(write):
+    return compiled(Written(EqnEnv(), write))
+
+
+def found(system, *names, **options):
+    """The initial values of variables."""
+    return np.asarray(system.observe(list(names), 0.0, system.initialize(**options)))
+
+
+# --- contradictions ----------------------------------------------------------------------------------------------
+
+
+def triangle(unit, nominal, y=2.0):
+    """y = 2x by way of z, beside a pressure of 1e7: x = u, y = 3u contradict each other whatever u."""
+
+    def write(self):
+        size = {"nominal": unit} if nominal else {}
+        p = self.variable("p", start=1e7, fixed=True)
+        x = self.variable("x", start=unit, fixed=True, **size)
+        y_ = self.variable("y", start=y * unit, fixed=True, **size)
+        z = self.variable("z", **size)
+        self.add_equations(Eq(der(p), -p), Eq(x + y_, z), Eq(der(x), -x), Eq(z, 3 * x))
+
+    return model(write)
+
+
+@pytest.mark.parametrize("unit, nominal", [(1e-15, False), (1e-9, True), (1e9, False)])
+def test_a_contradiction_is_one_at_any_scale(unit, nominal):
+    """The same beside quantities of 1e7, which do not excuse what is wrong in an equation of small ones."""
+    with pytest.raises(
+        InitializationError, match=r"c\.y and c\.x are fixed at 3e[-+]\d+ and 1e[-+]\d+, which contradict"
+    ):
+        triangle(unit, nominal, y=3.0).initialize()
+    right = found(triangle(unit, nominal), "c.x", "c.y", "c.z")
+    np.testing.assert_allclose(right, [unit, 2 * unit, 3 * unit], rtol=1e-14)
+
+
+# --- rows of one model in a process with others ---------------------------------------------------------------------
+
+
+def pinned(p):
+    """x = 0 by its equation, with a start p."""
+
+    def write(self):
+        q = self.parameter("p", p)
+        x, y = self.variable("x", start=q, fixed=True), self.variable("y", start=1.0, fixed=True)
+        self.add_equations(Eq(x, 0), Eq(der(y), -y + x))
+
+    return model(write)
+
+
+def test_rows_do_not_depend_on_the_values_they_were_chosen_with():
+    first = pinned(0.0)
+    assert first.initialization_report().consistent
+    for system in (first.with_parameters({"c.p": 1.0}), pinned(1.0)):
+        with pytest.raises(
+            InitializationError, match=r"start of c\.x, 1: off by 1.*|c\.x is fixed at 1, but the equations"
+        ):
+            system.initialize()
+    with pytest.raises(Exception, match="no consistent initial point"):
+        jax.block_until_ready(jax.jit(lambda p: first.with_parameters({"c.p": p}).initialize())(1.0))
+
+
+# --- the same model in other units -----------------------------------------------------------------------------------
+
+
+def scaled_cubic(k, nominal):
+    """k·(z³ − x) = 0."""
+
+    def write(self):
+        x = self.variable("x", start=0.5, fixed=True)
+        z = self.variable("z", start=0.8, **({"nominal": 1.0} if nominal else {}))
+        self.add_equations(Eq(der(x), -x), Eq(k * (z**3 - x), 0))
+
+    return model(write)
+
+
+@pytest.mark.parametrize("k", [1e-12, 1e9])
+def test_a_multiplied_equation(k):
+    assert found(scaled_cubic(k, False), "c.z")[0] == pytest.approx(0.5 ** (1 / 3), rel=1e-15)
+
+
+def charge(c0):
+    """A nonlinear capacitor, q = C0·(1 + v²)·v, with q = 2·C0: v = 1."""
+
+    def write(self):
+        q, v = self.variable("q", start=2 * c0, fixed=True), self.variable("v", start=0.3)
+        self.add_equations(Eq(c0 * (1 + v**2) * v, q), Eq(der(q), -v * c0 / 1e-6))
+
+    return model(write)
+
+
+@pytest.mark.parametrize("c0", [1e-15, 1e-9, 1e6])
+def test_charges_in_any_unit(c0):
+    assert found(charge(c0), "c.v")[0] == pytest.approx(1.0, rel=1e-14)
+
+
+def orifices(pascal, flow):
+    """Two orifices in series from 200 bar to 1 bar: the pressure between is the mean."""
+
+    def write(self):
+        a = (0.7e-5 * flow) ** 2 / pascal * 2 / 850.0
+        p = self.variable("p", start=2e7 * pascal, fixed=True)
+        q, pm = self.variable("q"), self.variable("pm", start=1.2e7 * pascal)
+        self.add_equations(
+            Eq(q * Abs(q), a * (p - pm)),
+            Eq(q * Abs(q), a * (pm - 1e5 * pascal)),
+            Eq(der(p), -q * 1.4e12 * pascal / flow),
+        )
+
+    return model(write)
+
+
+@pytest.mark.parametrize("pascal, flow", [(1.0, 1.0), (1e-6, 1.0), (1e9, 1e6)])
+def test_orifices_in_series(pascal, flow):
+    assert found(orifices(pascal, flow), "c.pm")[0] == pytest.approx(1.005e7 * pascal, rel=1e-13)
+
+
+# --- guesses -----------------------------------------------------------------------------------------------------
+
+
+def circle(x, y, radius=1.0, nominal=None):
+    """A pendulum given by guesses alone."""
+
+    def write(self):
+        r = self.parameter("r", radius)
+        gx, gy = self.parameter("gx", x), self.parameter("gy", y)
+        x_ = self.variable("x", start=gx, nominal=nominal)
+        y_ = self.variable("y", start=gy, nominal=nominal)
+        vx, vy, lam = self.variable("vx", start=0.0), self.variable("vy", start=0.0), self.variable("lam")
+        self.add_equations(
+            Eq(der(x_), vx),
+            Eq(der(y_), vy),
+            Eq(der(vx), -lam * x_),
+            Eq(der(vy), -lam * y_ - 9.81),
+            Eq(x_**2 + y_**2, r**2),
+        )
+
+    return model(write)
+
+
+@pytest.fixture(scope="module")
+def free_pendulum():
+    return circle(1.1, 1.1)
+
+
+@pytest.mark.parametrize("x, y", [(1.1, 1.1), (0.1, -1.2), (0.9, 0.1), (3.0, 4.0), (0.0, -1.1)])
+def test_guesses_yield_to_the_nearest_point(free_pendulum, x, y):
+    system = free_pendulum.with_parameters({"c.gx": x, "c.gy": y})
+    np.testing.assert_allclose(
+        found(system, "c.x", "c.y", "c.vx", "c.vy"),
+        [*(np.array([x, y]) / np.hypot(x, y)), 0, 0],
+        rtol=1e-13,
+        atol=1e-15,
+    )
+    report = system.initialization_report()
+    moved = {g.name: g.moved for g in report.guesses}
+    assert moved["c.x"] == pytest.approx(x / np.hypot(x, y) - x, abs=1e-13)
+    assert "c.y = " in str(report) and ", moved by " in str(report)
+
+
+def test_gradients_of_the_nearest_point(free_pendulum):
+    """x = r·g/|g|, by hand and by the same program: curvature enters."""
+
+    @jax.jit
+    def place(g, r):
+        return free_pendulum.with_parameters({"c.gx": g[0], "c.gy": g[1], "c.r": r}).initialize()[jnp.array([0, 2])]
+
+    g, r = jnp.array([1.1, 0.3]), 2.0
+    size = jnp.linalg.norm(g)
+    np.testing.assert_allclose(place(g, r), r * g / size, rtol=1e-13)
+    of_guess, of_radius = jax.jit(jax.jacrev(place, (0, 1)))(g, r)
+    np.testing.assert_allclose(of_guess, r / size * (jnp.eye(2) - jnp.outer(g, g) / size**2), rtol=1e-10, atol=1e-13)
+    np.testing.assert_allclose(of_radius, g / size, rtol=1e-10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("unit", [1e-12, 1e-3, 1e9])
+def test_the_nearest_point_in_other_units(unit):
+    system = circle(3 * unit, 4 * unit, unit)
+    np.testing.assert_allclose(found(system, "c.x", "c.y"), [0.6 * unit, 0.8 * unit], rtol=1e-13)
+
+
+def test_a_fixed_start_is_not_blamed_for_a_singular_guess():
+    """q·|q| = x is singular at the guess 0."""
+
+    def write(self):
+        x, q = self.variable("x", start=0.5, fixed=True), self.variable("q")
+        self.add_equations(Eq(q * Abs(q), x), Eq(der(x), -q))
+
+    np.testing.assert_allclose(found(model(write), "c.x", "c.q"), [0.5, math.sqrt(0.5)], rtol=1e-14)
+
+
+def test_a_guess_where_a_root_has_no_slope_is_stepped_off():
+    """√q + q = 3/4 from q = 0: q = 1/4."""
+
+    def write(self):
+        x, q = self.variable("x", start=0.75, fixed=True), self.variable("q")
+        self.add_equations(Eq(sqrt(q) + q, x), Eq(der(x), -q))
+
+    assert found(model(write), "c.q")[0] == pytest.approx(0.25, rel=1e-14)
+
+
+# --- bounds --------------------------------------------------------------------------------------------------------
+
+
+def test_bounds_keep_the_search_where_logarithms_are_real():
+    """ln z + z = x: Newton's step from 100 lands at −3.6, where there is no logarithm."""
+
+    def write(self):
+        x = self.variable("x", start=0.0, fixed=True)
+        z = self.variable("z", start=100.0, bounds=(0.0, math.inf))
+        self.add_equations(Eq(log(z) + z, x), Eq(der(x), -z))
+
+    system = model(write)
+    assert found(system, "c.z")[0] == pytest.approx(0.5671432904097838, rel=1e-14)  # the omega constant
