@@ -13,7 +13,17 @@ import numpy as np
 import sympy
 
 from ..errors import ModelError, nearest
-from ..model.tables import EquationGroup, FlatModel, ParameterTable, PortTable, RowInjection, Start, VariableTable
+from ..model.dependent_parameters import complete
+from ..model.tables import (
+    DependentParameters,
+    EquationGroup,
+    FlatModel,
+    ParameterTable,
+    PortTable,
+    RowInjection,
+    Start,
+    VariableTable,
+)
 from ..model.templates import (
     AnyTemplate,
     LinearTemplate,
@@ -24,6 +34,7 @@ from ..model.templates import (
     linear_coefficients,
 )
 from ..modeling.component import Component
+from ..modeling.connections import Signal
 from ..modeling.diagram import AcausalDiagram
 from ..modeling.ports import Port
 from ..modeling.symbols import ParameterSymbol, TimeSymbol, VariableSymbol
@@ -85,6 +96,7 @@ class _Model:
 
     def __init__(self, diagram: AcausalDiagram):
         self.components: list[Component] = []
+        self.top = diagram.components
         stack = list(reversed(diagram.components.values()))
         while stack:
             component = stack.pop()
@@ -109,18 +121,24 @@ class _Model:
     def _position(self, names: tuple[str, ...]) -> dict[str, int]:
         return self._positions.setdefault(names, {n: k for k, n in enumerate(names)})
 
-    def _resolve(self, k: int, path: str, table: str) -> int | None:
-        """The id behind a path as component k sees it."""
+    def _resolve(self, k: int | None, path: str, table: str) -> int | None:
+        """The id behind a path as component k sees it, or the diagram if k is None."""
         positions = self.variable_positions if table == "variables" else self.parameter_positions
         first = self.first_variable if table == "variables" else self.first_parameter
-        if path in positions[k]:
-            return int(first[k]) + positions[k][path]
-        component = self.components[k]
+        component = None if k is None else self.components[k]
+        while path.startswith("../"):
+            if component is None:
+                return None
+            path, component = path[3:], component.parent
+        if component is not None and path in positions[self.index[id(component)]]:
+            j = self.index[id(component)]
+            return int(first[j]) + positions[j][path]
         while "." in path:
             head, path = path.split(".", 1)
-            if head not in component.children:
+            children = self.top if component is None else component.children
+            if head not in children:
                 return None
-            component = component.children[head]
+            component = children[head]
             j = self.index[id(component)]
             if path in positions[j]:
                 return int(first[j]) + positions[j][path]
@@ -144,8 +162,14 @@ class _Model:
         found = self._resolve(k, path, "parameters")
         if found is None:
             component = self.components[k]
+            if path.startswith("../"):
+                parent = "the diagram" if component.parent is None else f"'{component.parent.path}'"
+                raise ModelError(
+                    f"component '{self.paths[k]}' was given an expression in the parameter '{path[3:]}', which is not "
+                    f"known in {parent}, where the component is: add it where its parameters are"
+                )
             raise ModelError(
-                f"component '{self.paths[k]}': the symbol '{path}' in its equations is no parameter of it or of a "
+                f"component '{self.paths[k]}': the symbol '{path}' in its equations is not a parameter of it or of a "
                 "child component: " + nearest(path, component.parameters)
             )
         return found
@@ -171,7 +195,8 @@ def flatten(diagram: AcausalDiagram) -> FlatModel:
     _add_components(model, builder)
     _add_learned_terms(model, builder, networks)
     ports = _add_connections(model, diagram, builder)
-    variables = _variable_table(model)
+    driven = _add_signals(model, diagram, builder)
+    variables = _variable_table(model, driven)
     parameters = _parameter_table(model)
     groups = builder.groups()
     variables, groups, rows = _add_blocks(model, diagram, variables, groups, networks)
@@ -328,7 +353,55 @@ def _add_connections(model: _Model, diagram: AcausalDiagram, builder: GroupBuild
     )
 
 
-def _variable_table(model: _Model) -> VariableTable:
+def _add_signals(model: _Model, diagram: AcausalDiagram, builder: GroupBuilder) -> set[int]:
+    """Inputs equal what drives them; returns the inputs that are driven, which are unknowns from then on."""
+    owners: list[tuple[int | None, Sequence[Signal]]] = [(None, diagram.signals)]
+    owners.extend((k, c.signals) for k, c in enumerate(model.components) if c.signals)
+    if not any(signals for _, signals in owners):
+        return set()
+    names, is_input = [], []
+    for path, component in zip(model.paths, model.components, strict=True):
+        names.extend(f"{path}.{v}" for v in component.variables)
+        is_input.extend(v.kind == "input" for v in component.variables.values())
+    driven: dict[int, str] = {}
+    for k, signals in owners:
+        where = "diagram" if k is None else f"component '{model.paths[k]}'"
+        for signal in signals:
+            ids = []
+            for symbol in signal:
+                found = model._resolve(k, symbol.path, "variables")
+                if found is None:
+                    raise ModelError(
+                        f"{where}: '{symbol.path}' is connected, but it is not a variable there: add the component to "
+                        "the diagram, and connect what it, or its direct children, declare"
+                    )
+                ids.append(found)
+            # A component's own input is given from outside; inside it drives like any variable.
+            drives = [not is_input[v] or "." not in s.path for v, s in zip(ids, signal, strict=True)]
+            what = ", ".join(f"'{names[v]}'" for v in ids)
+            if sum(drives) != 1:
+                count = "none of them drives the others" if not any(drives) else "more than one is not an input"
+                raise ModelError(
+                    f"{where}: connect({what}) joins one variable with inputs; {count}. (Two variables are made equal "
+                    "by an equation, Eq(a.x, b.x), in the component that holds both.)"
+                )
+            source = ids[drives.index(True)]
+            for v, drive in zip(ids, drives, strict=True):
+                if drive:
+                    continue
+                if v in driven:
+                    raise ModelError(
+                        f"{where}: the input '{names[v]}' is driven by '{driven[v]}' already, so '{names[source]}' "
+                        "cannot drive it too"
+                    )
+                driven[v] = names[source]
+                builder.add_linear(
+                    [(v, 0, 1.0), (source, 0, -1.0)], f"connection of {names[source]}, {names[v]}: equal signals"
+                )
+    return set(driven)
+
+
+def _variable_table(model: _Model, driven: set[int]) -> VariableTable:
     names: list[str] = []
     start: list[Start | None] = []
     unit: list[str] = []
@@ -345,13 +418,13 @@ def _variable_table(model: _Model) -> VariableTable:
             n_ports += 1
         for variable in component.variables.values():
             names.append(f"{path}.{variable.name}")
-            is_input.append(variable.kind == "input")
+            is_input.append(variable.kind == "input" and len(is_input) not in driven)
             is_port.append(variable.kind == "port")
             fixed.append(variable.fixed)
             nominal.append(variable.nominal)
             bounds.append(variable.bounds)
             unit.append(variable.unit)
-            default.append(variable.default)
+            default.append(variable.default if is_input[-1] else None)
             owner.append(k)
             port.append(place.get(variable.name, (-1, False))[0])
             is_across.append(place.get(variable.name, (-1, False))[1])
@@ -381,13 +454,57 @@ def _variable_table(model: _Model) -> VariableTable:
 
 def _parameter_table(model: _Model) -> ParameterTable:
     names, values, units, bounds = [], [], [], []
+    reads: dict[int, tuple[sympy.Expr, list[int]]] = {}  # of the dependent ones: the expression, what it reads
+    expressions: dict[int, str] = {}
     for k, component in enumerate(model.components):
         for parameter in component.parameters.values():
+            value = parameter.value
+            if isinstance(value, sympy.Expr):
+                symbols: list[Any] = sorted(value.free_symbols, key=lambda s: s.path)  # type: ignore
+                reads[len(names)] = value, [model.parameter(k, s.path) for s in symbols]
+                value = 0.0
             names.append(f"{model.paths[k]}.{parameter.name}")
-            values.append(parameter.value)
+            values.append(value)
             units.append(parameter.unit)
             bounds.append(parameter.bounds)
-    return ParameterTable(names, np.array(values, float), units, bounds)
+    for p, (value, ids) in reads.items():
+        symbols = sorted(value.free_symbols, key=lambda s: s.path)  # type: ignore
+        full = {s: sympy.Symbol(names[i]) for s, i in zip(symbols, ids, strict=True)}
+        expressions[p] = str(value.xreplace(full))
+    dependents = _dependent_parameters(reads, expressions, names)
+    array = complete(dependents, np.array(values, np.float64))
+    for p in reads:
+        if float(array[p]) not in bounds[p]:
+            must = f"lie in {bounds[p]}" if np.isfinite(array[p]) else "be finite"
+            raise ModelError(f"parameter '{names[p]}' is {expressions[p]} and must {must}; got {array[p]:g}")
+    return ParameterTable(names, array, units, bounds, dependents, expressions)
+
+
+def _dependent_parameters(
+    reads: dict[int, tuple[sympy.Expr, list[int]]], expressions: dict[int, str], names: list[str]
+) -> tuple[DependentParameters, ...]:
+    """Groups of equal templates, in an order in which everything that one reads is known."""
+    groups: list[DependentParameters] = []
+    known_templates: dict[sympy.Expr, Template] = {}
+    left = dict(reads)
+    while left:
+        ready = [p for p, (_, ids) in left.items() if not any(i in left for i in ids)]
+        if not ready:
+            p = next(iter(left))
+            raise ModelError(f"parameter '{names[p]}' is {expressions[p]}, which depends on itself")
+        rows: dict[str, tuple[Template, list[int], list[list[int]]]] = {}
+        for p in ready:
+            expression, ids = left.pop(p)
+            if expression not in known_templates:
+                symbols: list[Any] = sorted(expression.free_symbols, key=lambda s: s.path)  # type: ignore
+                known_templates[expression] = canonical(expression, (), symbols)
+            template = known_templates[expression]
+            _, targets, parameters = rows.setdefault(template.key, (template, [], []))
+            targets.append(p)
+            parameters.append(ids)
+        for template, targets, parameters in rows.values():
+            groups.append(DependentParameters(template, np.array(targets), np.array(parameters, np.int64)))
+    return tuple(groups)
 
 
 def _add_blocks(model: _Model, diagram: AcausalDiagram, variables: VariableTable, groups, networks):

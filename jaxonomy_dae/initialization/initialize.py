@@ -51,7 +51,8 @@ def initialize(
     """A pure function, to be used inside jit. Nothing is raised but for wrong names or counts: see `check`."""
     plan: SystemPlan = system.plan
     names = tuple(initial or ())
-    unknown = np.array([system.parameters.table.index(n) for n in solve_for], np.int64)
+    table = system.parameters.table
+    unknown = np.array([table.index(n) for n in solve_for], np.int64)
     rows = initial_rows(plan, names, tuple(unknown.tolist()))
     given = [initial[n] for n in names] if initial else []
     point: Point = system._point(t0, inputs)
@@ -69,7 +70,7 @@ def initialize(
 
     def residual(w, parameters, inputs, target):
         if len(unknown):
-            parameters = parameters.at[unknown].set(w[n:])
+            parameters = table.complete(parameters.at[unknown].set(w[n:]))
             target = _values(rows.kept, given, parameters)
         here = Point(plan, parameters, point.networks, t0, inputs)
         state = here.split(w[:n])

@@ -187,8 +187,9 @@ class InitializationReport:
         system, plan = self._system, self._plan
         parameters = system.parameters.array
         if self.solved:
-            index = np.array([system.parameters.table.index(n) for n, _ in self.solved])
-            parameters = parameters.at[index].set(self._found.solved)
+            table = system.parameters.table
+            index = np.array([table.index(n) for n, _ in self.solved])
+            parameters = table.complete(parameters.at[index].set(self._found.solved))
         networks = tuple(system.neural[n] for n in plan.network_names)
 
         def inputs():

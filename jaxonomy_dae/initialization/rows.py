@@ -19,6 +19,7 @@ import scipy.sparse as sp
 
 from ..errors import InitializationError
 from ..lowering.plan import SystemPlan
+from ..model.dependent_parameters import complete
 from ..model.evaluate_numpy import Networks, generic_jacobian, slot_values, start_values
 from ..model.quantities import ABSENT, declared_scale
 from ..model.scaling import equilibrated
@@ -177,10 +178,14 @@ def _parameter_columns(plan: SystemPlan, point, values, solve_for) -> np.ndarray
     """∂(equations)/∂(parameters)."""
     extended = plan.extended
     out = np.zeros((extended.n_equations, len(solve_for)))
+    everything = functools.partial(complete, plan.flat.parameters.dependents)
     with jax.ensure_compile_time_eval():
+        array = jnp.asarray(values)
+        units = [jnp.zeros_like(array).at[p].set(1.0) for p in solve_for]
+        along = [np.asarray(jax.jvp(everything, (array,), (unit,))[1]) for unit in units]
         for group in extended.groups:
-            for j, parameter in enumerate(solve_for):
-                hit = group.parameter == parameter
+            for j in range(len(solve_for)):
+                hit = along[j][group.parameter]
                 if group.template.opaque is not None or not hit.any():
                     continue
                 slots = [jnp.asarray(s) for s in slot_values(group, point)]
@@ -365,7 +370,8 @@ def _parameters_of(plan: SystemPlan, equations: list[int], without: set[int]) ->
     chosen[equations] = True
     for group in plan.extended.groups:
         found |= set(group.parameter[chosen[group.equation]].ravel().tolist())
-    return [plan.flat.parameters.names[p] for p in sorted(found - without)]
+    table = plan.flat.parameters
+    return [table.names[p] for p in sorted(found - without) if p not in table.expressions]
 
 
 def _some(names: Any, shown: int = 6) -> str:

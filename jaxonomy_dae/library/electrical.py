@@ -6,7 +6,7 @@ Conventions: potential `v` in volt, current `i` in ampere counted positive into 
 
 import sympy
 
-from ..modeling import POSITIVE, Component, Electrical, Eq, EqnEnv, der
+from ..modeling import POSITIVE, Component, Electrical, Eq, EqnEnv, Value, der
 
 
 class _TwoPin(Component):
@@ -23,7 +23,7 @@ class _TwoPin(Component):
 class VoltageSource(_TwoPin):
     """An ideal source: the voltage is the parameter `V` (volt), whatever the current."""
 
-    def __init__(self, ev: EqnEnv, name: str, v: float = 1.0):
+    def __init__(self, ev: EqnEnv, name: str, v: Value = 1.0):
         super().__init__(ev, name)
         source = self.parameter("V", v, unit="V")
         voltage, _ = self._two_pins()
@@ -33,7 +33,7 @@ class VoltageSource(_TwoPin):
 class CurrentSource(_TwoPin):
     """An ideal source: the current from `p` to `n` through it is the parameter `I` (ampere), whatever the voltage."""
 
-    def __init__(self, ev: EqnEnv, name: str, i: float = 1.0):
+    def __init__(self, ev: EqnEnv, name: str, i: Value = 1.0):
         super().__init__(ev, name)
         source = self.parameter("I", i, unit="A")
         _, current = self._two_pins()
@@ -43,7 +43,7 @@ class CurrentSource(_TwoPin):
 class Resistor(_TwoPin):
     """v = R·i, `R` in ohm; a negative one feeds energy in."""
 
-    def __init__(self, ev: EqnEnv, name: str, R: float = 1.0):
+    def __init__(self, ev: EqnEnv, name: str, R: Value = 1.0):
         super().__init__(ev, name)
         r = self.parameter("R", R, unit="Ohm")
         voltage, current = self._two_pins()
@@ -53,7 +53,7 @@ class Resistor(_TwoPin):
 class Capacitor(_TwoPin):
     """C·dv/dt = i, `C` > 0 in farad. A given `initial_voltage` (volt) holds at the start; otherwise 0 is a guess."""
 
-    def __init__(self, ev: EqnEnv, name: str, C: float = 1.0, initial_voltage: float | None = None):
+    def __init__(self, ev: EqnEnv, name: str, C: Value = 1.0, initial_voltage: Value | None = None):
         super().__init__(ev, name)
         c = self.parameter("C", C, unit="F", bounds=POSITIVE)
         v0 = self.parameter("initial_voltage", initial_voltage or 0.0, unit="V")
@@ -64,7 +64,7 @@ class Capacitor(_TwoPin):
 class Inductor(_TwoPin):
     """L·di/dt = v, `L` > 0 in henry. A given `initial_current` (ampere) holds at the start; otherwise 0 is a guess."""
 
-    def __init__(self, ev: EqnEnv, name: str, L: float = 1.0, initial_current: float | None = None):
+    def __init__(self, ev: EqnEnv, name: str, L: Value = 1.0, initial_current: Value | None = None):
         super().__init__(ev, name)
         inductance = self.parameter("L", L, unit="H", bounds=POSITIVE)
         i0 = self.parameter("initial_current", initial_current or 0.0, unit="A")

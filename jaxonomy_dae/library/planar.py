@@ -2,7 +2,7 @@
 
 from sympy import cos, sin
 
-from ..modeling import POSITIVE, Component, Eq, EqnEnv, der
+from ..modeling import POSITIVE, Component, Eq, EqnEnv, Value, der
 
 
 class PlanarPendulum(Component):
@@ -25,12 +25,12 @@ class PlanarPendulum(Component):
         self,
         ev: EqnEnv,
         name: str,
-        m: float = 1.0,
-        L: float = 1.0,
-        g_x: float = 0.0,
-        g_y: float = -9.81,
-        initial_theta: float = 0.0,
-        initial_omega: float = 0.0,
+        m: Value = 1.0,
+        L: Value = 1.0,
+        g_x: Value = 0.0,
+        g_y: Value = -9.81,
+        initial_theta: Value = 0.0,
+        initial_omega: Value = 0.0,
     ):
         super().__init__(ev, name)
         mass = self.parameter("m", m, unit="kg", bounds=POSITIVE)

@@ -6,7 +6,7 @@ flange, so an inertia obeys J·dw/dt = flange_a.tau + flange_b.tau.
 
 import sympy
 
-from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Rotational, der
+from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Rotational, Value, der
 
 
 class Inertia(Component):
@@ -20,9 +20,9 @@ class Inertia(Component):
         self,
         ev: EqnEnv,
         name: str,
-        J: float = 1.0,
-        initial_angle: float | None = None,
-        initial_speed: float | None = None,
+        J: Value = 1.0,
+        initial_angle: Value | None = None,
+        initial_speed: Value | None = None,
     ):
         super().__init__(ev, name)
         inertia = self.parameter("J", J, unit="kg*m2", bounds=POSITIVE)
@@ -55,7 +55,7 @@ class _Compliant(Component):
 class Spring(_Compliant):
     """A linear spring: tau = c·(phi_rel − phi_rel0), `c` ≥ 0 in N·m/rad, `phi_rel0` in radian."""
 
-    def __init__(self, ev: EqnEnv, name: str, c: float = 1.0, phi_rel0: float = 0.0):
+    def __init__(self, ev: EqnEnv, name: str, c: Value = 1.0, phi_rel0: Value = 0.0):
         super().__init__(ev, name)
         stiffness = self.parameter("c", c, unit="N*m/rad", bounds=NONNEGATIVE)
         rest = self.parameter("phi_rel0", phi_rel0, unit="rad")
@@ -66,7 +66,7 @@ class Spring(_Compliant):
 class Damper(_Compliant):
     """A linear damper: tau = d·w_rel with w_rel = der(phi_rel), `d` ≥ 0 in N·m·s/rad."""
 
-    def __init__(self, ev: EqnEnv, name: str, d: float = 1.0):
+    def __init__(self, ev: EqnEnv, name: str, d: Value = 1.0):
         super().__init__(ev, name)
         damping = self.parameter("d", d, unit="N*m*s/rad", bounds=NONNEGATIVE)
         phi, tau = self._two_flanges()
@@ -77,7 +77,7 @@ class Damper(_Compliant):
 class IdealGear(Component):
     """A gear without losses or inertia: flange_a.phi = ratio·flange_b.phi, 0 = ratio·flange_a.tau + flange_b.tau."""
 
-    def __init__(self, ev: EqnEnv, name: str, ratio: float = 1.0):
+    def __init__(self, ev: EqnEnv, name: str, ratio: Value = 1.0):
         super().__init__(ev, name)
         n = self.parameter("ratio", ratio)
         a, b = self.port("flange_a", Rotational), self.port("flange_b", Rotational)
@@ -97,7 +97,7 @@ class Torque(Component):
 class FixedAngle(Component):
     """A flange held at the parameter `angle` (radian)."""
 
-    def __init__(self, ev: EqnEnv, name: str, angle: float = 0.0):
+    def __init__(self, ev: EqnEnv, name: str, angle: Value = 0.0):
         super().__init__(ev, name)
         where = self.parameter("angle", angle, unit="rad")
         flange = self.port("flange", Rotational)

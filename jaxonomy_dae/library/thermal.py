@@ -3,7 +3,7 @@
 Conventions: temperature `T` in kelvin, heat flow `Q_flow` in watt counted positive into the component at a port.
 """
 
-from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Thermal, der
+from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Thermal, Value, der
 
 
 class HeatCapacitor(Component):
@@ -12,7 +12,7 @@ class HeatCapacitor(Component):
     A given `initial_temperature` (kelvin) holds at the start; otherwise 293.15 is a guess.
     """
 
-    def __init__(self, ev: EqnEnv, name: str, C: float = 1.0, initial_temperature: float | None = None):
+    def __init__(self, ev: EqnEnv, name: str, C: Value = 1.0, initial_temperature: Value | None = None):
         super().__init__(ev, name)
         capacity = self.parameter("C", C, unit="J/K", bounds=POSITIVE)
         start = 293.15 if initial_temperature is None else initial_temperature
@@ -25,7 +25,7 @@ class HeatCapacitor(Component):
 class ThermalConductor(Component):
     """Q_flow = G·(port_a.T − port_b.T), `G` ≥ 0 in watt per kelvin; `Q_flow` flows from `port_a` to `port_b`."""
 
-    def __init__(self, ev: EqnEnv, name: str, G: float = 1.0):
+    def __init__(self, ev: EqnEnv, name: str, G: Value = 1.0):
         super().__init__(ev, name)
         conductance = self.parameter("G", G, unit="W/K", bounds=NONNEGATIVE)
         a, b = self.port("port_a", Thermal), self.port("port_b", Thermal)
@@ -42,7 +42,7 @@ class ThermalConductor(Component):
 class FixedTemperature(Component):
     """A port held at the parameter `T` (kelvin)."""
 
-    def __init__(self, ev: EqnEnv, name: str, T: float = 293.15):
+    def __init__(self, ev: EqnEnv, name: str, T: Value = 293.15):
         super().__init__(ev, name)
         held = self.parameter("T", T, unit="K")
         heat = self.port("heat", Thermal)

@@ -4,7 +4,7 @@ Conventions: absolute position `x` in metre, force `f` in newton counted positiv
 mass obeys M·dv/dt = flange.f.
 """
 
-from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Translational, der
+from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Translational, Value, der
 
 
 class Mass(Component):
@@ -18,9 +18,9 @@ class Mass(Component):
         self,
         ev: EqnEnv,
         name: str,
-        M: float = 1.0,
-        initial_position: float | None = None,
-        initial_velocity: float | None = None,
+        M: Value = 1.0,
+        initial_position: Value | None = None,
+        initial_velocity: Value | None = None,
     ):
         super().__init__(ev, name)
         m = self.parameter("M", M, unit="kg", bounds=POSITIVE)
@@ -36,7 +36,7 @@ class Spring(Component):
     """A linear spring that pulls its ends together: f = K·(flange_b.x − flange_a.x − length), `K` ≥ 0 in newton per
     metre."""
 
-    def __init__(self, ev: EqnEnv, name: str, K: float = 1.0, length: float = 0.0):
+    def __init__(self, ev: EqnEnv, name: str, K: Value = 1.0, length: Value = 0.0):
         super().__init__(ev, name)
         k = self.parameter("K", K, unit="N/m", bounds=NONNEGATIVE)
         rest = self.parameter("length", length, unit="m")
@@ -49,7 +49,7 @@ class Spring(Component):
 class Damper(Component):
     """A linear damper: f = D·(flange_b.v − flange_a.v), `D` ≥ 0 in newton second per metre."""
 
-    def __init__(self, ev: EqnEnv, name: str, D: float = 1.0):
+    def __init__(self, ev: EqnEnv, name: str, D: Value = 1.0):
         super().__init__(ev, name)
         d = self.parameter("D", D, unit="N*s/m", bounds=NONNEGATIVE)
         a, b = self.port("flange_a", Translational), self.port("flange_b", Translational)
@@ -62,7 +62,7 @@ class Damper(Component):
 class Rod(Component):
     """A rigid massless rod: flange_b.x − flange_a.x = length (metre); `f` is the force that pulls its ends together."""
 
-    def __init__(self, ev: EqnEnv, name: str, length: float = 0.0):
+    def __init__(self, ev: EqnEnv, name: str, length: Value = 0.0):
         super().__init__(ev, name)
         distance = self.parameter("length", length, unit="m")
         a, b = self.port("flange_a", Translational), self.port("flange_b", Translational)
@@ -73,7 +73,7 @@ class Rod(Component):
 class FixedPosition(Component):
     """A flange held at the parameter `position` (metre)."""
 
-    def __init__(self, ev: EqnEnv, name: str, position: float = 0.0):
+    def __init__(self, ev: EqnEnv, name: str, position: Value = 0.0):
         super().__init__(ev, name)
         where = self.parameter("position", position, unit="m")
         flange = self.port("flange", Translational)

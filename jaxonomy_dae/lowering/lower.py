@@ -195,6 +195,8 @@ def _digest(flat: FlatModel, mode: str, selection: StateSelection, states: np.nd
     v = flat.variables
     starts = [None if s is None else (s.template.key, s.parameters) for s in v.start]
     feed(mode, v.names, v.is_input, v.fixed, v.nominal, v.bounds, v.default, starts, flat.parameters.names)
+    for d in flat.parameters.dependents:
+        feed(d.template.key, d.target, d.parameter)
     for g in flat.groups:
         feed(g.template.key, g.variable, g.order, g.sign, g.parameter, g.coefficient)
     for name in flat.networks:

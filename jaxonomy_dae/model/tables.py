@@ -65,6 +65,15 @@ class Start:
 
 
 @dataclasses.dataclass(frozen=True)
+class DependentParameters:
+    """Parameters computed from others by one template without slots: one row for each."""
+
+    template: Template
+    target: np.ndarray  # (n,)
+    parameter: np.ndarray  # (n, parameters of the template)
+
+
+@dataclasses.dataclass(frozen=True)
 class ParameterTable:
     """What the user declared of each parameter, by id."""
 
@@ -72,6 +81,8 @@ class ParameterTable:
     values: np.ndarray
     units: list[str]
     bounds: list[Interval]
+    dependents: tuple[DependentParameters, ...]  # each reads only what those before it have computed
+    expressions: dict[int, str]  # of the dependent ones, in full names
 
     def __len__(self):
         return len(self.names)

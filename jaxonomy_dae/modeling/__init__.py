@@ -1,6 +1,7 @@
 """What a user writes: environment, symbols, ports, components, diagrams, learned terms."""
 
 from .component import Component as Component
+from .declarations import Value as Value
 from .diagram import AcausalDiagram as AcausalDiagram
 from .environment import EqnEnv as EqnEnv
 from .interval import NONNEGATIVE as NONNEGATIVE

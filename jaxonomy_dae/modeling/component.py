@@ -7,7 +7,7 @@ from typing import Any
 import sympy
 
 from ..errors import ModelError, nearest
-from .connections import resolve_ports
+from .connections import Connection, Signal, resolve_ends
 from .construction import Construction
 from .declarations import Learned, Parameter, Variable
 from .environment import EqnEnv
@@ -54,7 +54,8 @@ class Component(metaclass=Construction):
         self.children: dict[str, Component] = {}
         self.equations: list[sympy.Expr] = []
         self.learned_terms: list[Learned] = []
-        self.connections: list[tuple[Port, ...]] = []
+        self.connections: list[Connection] = []
+        self.signals: list[Signal] = []
         self._sealed = False
 
     # --- names -------------------------------------------------------------------------------------------------
@@ -147,18 +148,24 @@ class Component(metaclass=Construction):
         **Arguments:**
 
         - `name`: its local name.
-        - `value`: a finite number (a Python or NumPy scalar).
+        - `value`: a finite number (a Python or NumPy scalar); or an expression in other parameters, of this component
+            or given by its parent, such as `Resistor(ev, "a", R=R / 2)`: the parameter then depends on those, and
+            follows them when they are set or trained.
         - `unit`: shown in reports and plots.
         - `bounds`: the admissible values: a pair (low, high) of a closed interval, or an `Interval`, whose ends may be
             open. Whatever sets the parameter keeps them: declaration, `with_parameters`, `fit`, `initialize`.
 
         **Raises:**
 
-        - `ModelError` if the value is not a finite number inside the bounds.
+        - `ModelError` if the value is not a finite number inside the bounds; for an expression, when compiled.
         """
         self._claim(name, "parameter")
         where = f"parameter '{self.name}.{name}'"
         interval = as_interval(bounds, where)
+        if isinstance(value, sympy.Expr) and not value.is_number:
+            self._check_parameters_only(value, f"the value of {where}")
+            self.parameters[name] = Parameter(name, value, unit, interval)
+            return ParameterSymbol(name)
         number = real_number(
             value,
             where,
@@ -170,6 +177,12 @@ class Component(metaclass=Construction):
         self.parameters[name] = Parameter(name, number, unit, interval)
         return ParameterSymbol(name)
 
+    @staticmethod
+    def _check_parameters_only(value: sympy.Expr, what: str):
+        wrong = sorted((s for s in value.free_symbols if not isinstance(s, ParameterSymbol)), key=str)
+        if wrong:
+            raise ModelError(f"{what} may use parameters only; it uses '{wrong[0]}'")
+
     def _declare(self, name: str, kind: str, start=None, fixed=False, nominal=None, unit="", default=None, bounds=None):
         where = f"'{self.name}.{name}'"
         if nominal is not None and not 0 < real_number(nominal, f"the nominal value of {where}"):
@@ -180,9 +193,7 @@ class Component(metaclass=Construction):
             if not isinstance(start, sympy.Expr) or start.is_number:
                 start = real_number(start, f"the start value of {where}")
             start = sympy.sympify(start)
-            wrong = [s for s in start.free_symbols if not isinstance(s, ParameterSymbol)]
-            if wrong:
-                raise ModelError(f"the start value of {where} may use parameters only; it uses '{wrong[0]}'")
+            self._check_parameters_only(start, f"the start value of {where}")
         interval = Interval() if bounds is None else as_interval(bounds, where)
         if isinstance(start, sympy.Number) and float(start) not in interval:
             raise ModelError(f"the start value of {where} must lie in its bounds {interval}; got {start}")
@@ -330,8 +341,14 @@ class Component(metaclass=Construction):
         return child
 
     def connect(self, *ends: Any) -> "Component":
-        """Connects ports of this component and of its children: `connect(a.p, b.n, …)` or `connect(a, "p", b, "n")`."""
-        self.connections.append(resolve_ports(ends, f"component '{self.name}'"))
+        """Connects ports of this component and of its children, `connect(a.p, b.n, …)` or `connect(a, "p", b, "n")`; or
+        signals: `connect(a.y, b.u)` lets the variable `y` of a child (or of this component) drive the input `u` of
+        another child, which is then an ordinary unknown."""
+        ports, signal = resolve_ends(ends, f"component '{self.name}'")
+        if ports:
+            self.connections.append(ports)
+        else:
+            self.signals.append(signal)
         return self
 
     def __repr__(self):
@@ -339,5 +356,5 @@ class Component(metaclass=Construction):
 
 
 _BASE_ATTRIBUTES = (
-    "ev name parent parameters variables ports children equations learned_terms connections _sealed".split()
+    "ev name parent parameters variables ports children equations learned_terms connections signals _sealed".split()
 )

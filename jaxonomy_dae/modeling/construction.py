@@ -1,6 +1,10 @@
-"""What happens around a component's `__init__`: it is closed when construction ends, and common slips are explained."""
+"""What happens around a component's `__init__`: symbols among its arguments are marked as its parent's, it is closed
+when construction ends, and common slips are explained."""
+
+from typing import Any
 
 from ..errors import ModelError
+from .symbols import seen_from_child
 
 
 class Construction(type):
@@ -8,7 +12,8 @@ class Construction(type):
 
     def __call__(cls, *args, **kwargs):
         try:
-            component = super().__call__(*args, **kwargs)
+            outside: tuple[Any, ...] = tuple(map(seen_from_child, args))
+            component = super().__call__(*outside, **{k: seen_from_child(v) for k, v in kwargs.items()})
         except TypeError as error:
             hint = _hint(str(error))
             if hint is None:

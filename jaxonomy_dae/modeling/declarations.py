@@ -1,18 +1,22 @@
 """What a component declares: parameters, variables, learned terms."""
 
 import dataclasses
-from typing import Any
+from typing import Any, TypeAlias
+
+import sympy
 
 from .interval import Interval
 from .symbols import TimeSymbol, VariableSymbol
 
+Value: TypeAlias = float | int | sympy.Expr  # a number, or an expression in parameters
+
 
 @dataclasses.dataclass(frozen=True)
 class Parameter:
-    """A declared parameter: its local name, value, unit and admissible values."""
+    """A declared parameter; its value is an expression if it depends on others."""
 
     name: str
-    value: float
+    value: float | sympy.Expr
     unit: str
     bounds: Interval
 

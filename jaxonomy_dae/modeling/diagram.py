@@ -4,9 +4,8 @@ from typing import Any
 
 from ..errors import ModelError
 from .component import Component
-from .connections import resolve_ports
+from .connections import Connection, Signal, resolve_ends
 from .neural import NeuralDAEBlock
-from .ports import Port
 
 
 class AcausalDiagram:
@@ -25,7 +24,8 @@ class AcausalDiagram:
     def __init__(self, name: str | None = None):
         self.name = name
         self.components: dict[str, Component] = {}
-        self.connections: list[tuple[Port, ...]] = []
+        self.connections: list[Connection] = []
+        self.signals: list[Signal] = []
         self.blocks: dict[str, NeuralDAEBlock] = {}
 
     def add(self, *components: Component) -> "AcausalDiagram":
@@ -60,18 +60,22 @@ class AcausalDiagram:
         return self
 
     def connect(self, *ends: Any) -> "AcausalDiagram":
-        """Connects ports: `connect(a.p, b.n, …)`, or `connect(a, "p", b, "n")`.
+        """Connects ports: `connect(a.p, b.n, …)`, or `connect(a, "p", b, "n")`. Connects signals: `connect(a.y, b.u)`
+        lets the variable `y` of `a` drive the input `u` of `b`, which is then an ordinary unknown.
 
         **Raises:**
 
         - `ModelError` if a port does not exist or the ports are of different domains.
         """
-        ports = resolve_ports(ends, "diagram")
+        for end in ends:
+            if isinstance(end, Component):
+                self.add(_top(end))
+        ports, signal = resolve_ends(ends, "diagram")
+        if signal:
+            self.signals.append(signal)
+            return self
         for port in ports:
-            top = port.component
-            while top.parent is not None:
-                top = top.parent
-            self.add(top)
+            self.add(_top(port.component))
         self.connections.append(ports)
         return self
 
@@ -88,3 +92,9 @@ class AcausalDiagram:
             raise ModelError(f"the name '{block.name}' is used twice: rename the neural block")
         self.blocks[block.name] = block
         return self
+
+
+def _top(component: Component) -> Component:
+    while component.parent is not None:
+        component = component.parent
+    return component

@@ -2,7 +2,8 @@
 
 A symbol is named by its path *relative to the component that uses it* (`v`, `p.i`, and `child.v` in a parent),
 so all instances of a component class share literally the same SymPy expressions. Which variable of the model a
-symbol means is decided when the diagram is flattened, by integers.
+symbol means is decided when the diagram is flattened, by integers. What a component is given by its parent begins with
+`../`, as in `../R`: a path seen from the parent (of a component at the top, from the diagram).
 """
 
 import functools
@@ -72,6 +73,24 @@ class EnvironmentTime(TimeSymbol):
 
 TIME = TimeSymbol()  # in templates, where a derivative by it is a partial derivative
 ENVIRONMENT_TIME = EnvironmentTime()
+
+
+def seen_from_child(value: Any) -> Any:
+    """An argument of a component that is being made: symbols in it, of the place where it is made, get `../` paths."""
+    if isinstance(value, sympy.Basic):
+        outside: dict[Any, Any] = {}
+        for s in value.free_symbols:
+            if isinstance(s, VariableSymbol):
+                outside[s] = VariableSymbol(f"../{s.path}", s.order)
+            elif isinstance(s, ParameterSymbol):
+                outside[s] = ParameterSymbol(f"../{s.path}")
+        return value.xreplace(outside) if outside else value
+    if type(value) in (list, tuple):
+        return type(value)(seen_from_child(v) for v in value)
+    if type(value) is dict:
+        return {k: seen_from_child(v) for k, v in value.items()}
+    return value
+
 
 # SymPy's Eq, remembering what it returned: the components of a large model write the same few equations.
 Eq = functools.lru_cache(maxsize=4096)(sympy.Eq)

@@ -77,8 +77,11 @@ class AcausalCompiler:
         flat = flatten(self.diagram)
         plan = lower(compile_flat(flat, self.state_selection, self.prefer_states))
         self._report = SystemReport(plan)
-        table = ParameterNames(flat.parameters.names, flat.parameters.units, flat.parameters.bounds, plan.digest)
-        parameters = Parameters(jnp.asarray(flat.parameters.values, dtype=jnp.zeros(()).dtype), None, (), table)
+        declared = flat.parameters
+        table = ParameterNames(
+            declared.names, declared.units, declared.bounds, declared.dependents, declared.expressions, plan.digest
+        )
+        parameters = Parameters(jnp.asarray(declared.values, dtype=jnp.zeros(()).dtype), None, (), table)
         neural = {name: _own(network) for name, network in flat.networks.items()}
         return AcausalSystem(parameters, neural, plan)
 

@@ -12,6 +12,8 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..errors import ModelError, nearest
+from ..model.dependent_parameters import complete
+from ..model.tables import DependentParameters
 from ..modeling.interval import Interval, closed_ends
 from ..modeling.real_number import real_number
 
@@ -25,6 +27,8 @@ class ParameterNames:
     names: list[str] = dataclasses.field(compare=False, hash=False)
     units: list[str] = dataclasses.field(compare=False, hash=False)
     intervals: list[Interval] = dataclasses.field(compare=False, hash=False)
+    dependents: tuple[DependentParameters, ...] = dataclasses.field(compare=False, hash=False)
+    expressions: dict[int, str] = dataclasses.field(compare=False, hash=False)
     digest: str = ""
 
     @functools.cached_property
@@ -36,6 +40,31 @@ class ParameterNames:
         if found is None:
             raise ModelError(f"'{name}' is not a parameter: " + nearest(name, self.names))
         return found
+
+    def settable(self, name: str) -> int:
+        """The index of a parameter that does not depend on others."""
+        k = self.index(name)
+        if k in self.expressions:
+            roots = " or ".join(f"'{self.names[p]}'" for p in self._roots(k))
+            raise ModelError(
+                f"parameter '{name}' is {self.expressions[k]}, computed from others: set or train {roots} instead"
+            )
+        return k
+
+    def _roots(self, k: int) -> list[int]:
+        """What a dependent parameter is computed from in the end."""
+        found, waiting = set(), [k]
+        while waiting:
+            k = waiting.pop()
+            if k in self.expressions:
+                waiting.extend(int(p) for g in self.dependents for p in g.parameter[g.target == k].ravel())
+            else:
+                found.add(k)
+        return sorted(found)
+
+    def complete(self, array: Any) -> Any:
+        """All values, shape (*batch, n), with the dependent ones computed from the others."""
+        return complete(self.dependents, array)
 
     @functools.cached_property
     def bounds(self) -> Float[np.ndarray, "n 2"]:
@@ -59,10 +88,10 @@ class Parameters(eqx.Module):
     def array(self) -> Float[Array, "*batch n"]:
         """All values, in the order of `names`."""
         if self.free is None or not self.free_index:
-            return self.values
+            return self.table.complete(self.values)
         batch = jnp.broadcast_shapes(self.values.shape[:-1], self.free.shape[:-1])
         values = jnp.broadcast_to(self.values, (*batch, self.values.shape[-1]))
-        return values.at[..., np.array(self.free_index)].set(self.free)
+        return self.table.complete(values.at[..., np.array(self.free_index)].set(self.free))
 
     @property
     def names(self) -> list[str]:
@@ -71,6 +100,13 @@ class Parameters(eqx.Module):
 
     def __getitem__(self, name: str) -> Any:
         k = self.table.index(name)
+        if k in self.table.expressions:
+            if self.values is None or (self.free_index and self.free is None):
+                raise ModelError(
+                    f"parameter '{name}' is {self.table.expressions[k]}, which a part of a partitioned system cannot "
+                    "compute: join both with equinox.combine"
+                )
+            return self.array[..., k]
         if k in self.free_index:
             part, place = self.free, self.free_index.index(k)
         else:
@@ -98,7 +134,7 @@ class Parameters(eqx.Module):
 
     def freed(self, names: tuple[str, ...]) -> "Parameters":
         """The same values with the named ones set apart in `free`."""
-        index = tuple(self.table.index(n) for n in names)
+        index = tuple(self.table.settable(n) for n in names)
         if not index:
             return self.merged()
         array = self.array
@@ -109,15 +145,28 @@ class Parameters(eqx.Module):
 
         **Raises:**
 
-        - `ModelError` for an unknown name, a value of the wrong shape, that is not a finite real number, or is out of
-            the bounds.
+        - `ModelError` for an unknown name, a parameter that is an expression in others, or a value of the wrong shape,
+            that is not a finite real number, or is out of the bounds.
         """
         array = self.array
         batch = array.shape[:-1]
         for name, value in new.items():
-            k = self.table.index(name)
+            k = self.table.settable(name)
             array = array.at[..., k].set(jnp.asarray(self._checked(k, value, batch), array.dtype))
+        array = self.table.complete(array)
+        self._check_dependents(array)
         return Parameters(array, None, (), self.table)
+
+    def _check_dependents(self, array: Any) -> None:
+        chosen = np.array(list(self.table.expressions), np.int64)
+        if not len(chosen) or isinstance(array, Tracer):
+            return
+        values = np.asarray(array)[..., chosen]
+        low, high = self.table.bounds[chosen].T
+        wrong = ~(np.isfinite(values) & (values >= low) & (values <= high)).reshape(-1, len(chosen)).all(axis=0)
+        for k in chosen[wrong].tolist():
+            name, text, interval = self.table.names[k], self.table.expressions[k], self.table.intervals[k]
+            raise ModelError(f"parameter '{name}' is {text} and must lie in {interval}; got {_text(array[..., k])}")
 
     def _checked(self, k: int, value: Any, batch: tuple[int, ...]) -> Any:
         name = self.table.names[k]
@@ -147,8 +196,12 @@ class Parameters(eqx.Module):
                 return f"Parameters({len(self)} names, no values)"
             shown = [f"{self.table.names[k]}={_text(self.free[..., j])}" for j, k in enumerate(self.free_index)]
             return f"Parameters({_some(shown)}; the others are in the frozen part)"
-        apart = {} if _is_array(self.free) else dict.fromkeys(self.free_index, "set apart")
-        array = self.array
+        apart: dict[int, str] = {}
+        array = self.values
+        if self.free_index and not _is_array(self.free):  # the frozen part
+            apart = {k: "not known here" for k in self.table.expressions} | {k: "set apart" for k in self.free_index}
+        else:
+            array = self.array
         shown = [f"{name}={apart.get(k) or _text(array[..., k])}" for k, name in enumerate(self.table.names[:SHOWN])]
         batch = f"batch of shape {array.shape[:-1]}: " if array.ndim > 1 else ""
         return f"Parameters({batch}{_some(shown, len(self))})"

@@ -257,7 +257,7 @@ class AcausalSystem(eqx.Module):
         low, high = (jnp.asarray(b, found.x.dtype) for b in table.bounds[index].reshape(-1, 2).T)
         # Rounding must not leave the bounds, nor the clip the gradient.
         solved = found.solved + jax.lax.stop_gradient(jnp.clip(found.solved, low, high) - found.solved)
-        values = self.parameters.array.at[index].set(solved)
+        values = table.complete(self.parameters.array.at[index].set(solved))
         return found.x, eqx.tree_at(lambda s: s.parameters, self, Parameters(values, None, (), table))
 
     def initialization_report(
@@ -291,5 +291,5 @@ class AcausalSystem(eqx.Module):
         for name in names:
             if name not in self.parameters.names and name in self.plan.variable_index:
                 raise ModelError(f"solve_for: '{name}' is a variable and found anyway; name parameters")
-            self.parameters.table.index(name)
+            self.parameters.table.settable(name)
         return names
