@@ -1,13 +1,15 @@
-"""A solve as functions that close over no array, and the arrays they need: what a derivative by hand starts from."""
+"""A solve as functions that close over no array, and the arrays they need: the closure-converted solve that the custom
+rule differentiates."""
 
 from typing import Any
 
 import diffrax
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 from jax import lax
+
+from .private_names import unvmap_any
 
 
 class Program(eqx.Module):
@@ -26,23 +28,51 @@ class Program(eqx.Module):
 
 
 class Shut(eqx.Module):
-    """A function that closes over nothing; called with what it closed over, `(consts, *args)`."""
+    """A function that closes over nothing; called with what it closed over, `(consts, *args)`.
 
-    closure: Any
+    As `equinox.filter_closure_convert`, but arguments may lie on other devices than those it was made with: inside
+    `shard_map` some do.
+    """
+
+    jaxpr: Any
+    inputs: Any = eqx.field(static=True)  # the structure of the arrays among the arguments
+    outputs: Any = eqx.field(static=True)  # (structure of the arrays it returns, their shapes and dtypes)
+    static: Any = eqx.field(static=True)  # (the other arguments, what it returns beside arrays), as leaves and structure
 
     def __call__(self, consts: Any, *args: Any) -> Any:
-        return eqx.tree_at(lambda c: c.consts, self.closure, consts, is_leaf=lambda leaf: leaf is None)(*args)
+        leaves, structure = jax.tree.flatten(eqx.filter(args, eqx.is_array))
+        if structure != self.inputs:
+            raise TypeError(f"a closure-converted function was made for {self.inputs}; got {structure}")
+        return self._combined(jax.core.eval_jaxpr(self.jaxpr, consts, *leaves))
 
     @property
     def out_struct(self) -> Any:
         """What it returns: shapes and dtypes, and values where they are static."""
-        return self.closure.out_struct
+        return self._combined(list(self.outputs[1]))
+
+    def _combined(self, leaves: Any) -> Any:
+        others, structure = self.static
+        return eqx.combine(jax.tree.unflatten(self.outputs[0], leaves), jax.tree.unflatten(structure, others))
 
 
 def hoist(function: Any, *args: Any) -> tuple[Shut, list[Any]]:
-    """(the function without the arrays it closes over, those arrays)."""
-    closure = eqx.filter_closure_convert(lambda *args: function(*args), *args)
-    return Shut(eqx.tree_at(lambda c: c.consts, closure, None)), list(closure.consts)  # pyright: ignore
+    """(the function without the arrays it closes over, those arrays). Shapes and dtypes will do for arguments."""
+    dynamic, static = eqx.partition(args, lambda leaf: eqx.is_array(leaf) or isinstance(leaf, jax.ShapeDtypeStruct))
+    leaves, structure = jax.tree.flatten(dynamic)
+    found: list[Any] = []
+
+    def flat(*leaves):
+        out = function(*eqx.combine(jax.tree.unflatten(structure, leaves), static))
+        arrays, others = eqx.partition(out, eqx.is_array)
+        out_leaves, out_structure = jax.tree.flatten(arrays)
+        found[:] = out_structure, jax.tree.flatten(others)
+        return out_leaves
+
+    closed = jax.make_jaxpr(flat)(*leaves)
+    out_structure, (others, others_structure) = found
+    shapes = tuple(jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in closed.out_avals)
+    shut = Shut(closed.jaxpr, structure, (out_structure, shapes), (tuple(others), others_structure))
+    return shut, list(closed.consts)
 
 
 @jax.custom_batching.custom_vmap
@@ -73,7 +103,7 @@ def going(state: Any, numbers: dict[str, Any], program: Program) -> Any:
 
 def any_member(flag: Any) -> Any:
     """Whether a flag is set for any member of the batch."""
-    return eqxi.unvmap_any(flag)
+    return unvmap_any(flag)
 
 
 def inexact(tree: Any) -> Any:

@@ -4,13 +4,13 @@ import dataclasses
 from typing import Any
 
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 from jax import lax
 
 from .closure_conversion import Program, any_member, apart, going, read, rows, unless_waiting, written
 from .packing import Parcels
+from .private_names import unvmap_max
 from .reverse_step import ReverseStep
 from .step_times import StepTimes
 
@@ -129,7 +129,7 @@ def _(residuals, cotangents, perturbed, numbers, program):
     times = StepTimes(perturbed, numbers, program)
     recorder = _Recorder(numbers, program, times)
     reverse = ReverseStep(cotangents, perturbed, numbers, program, times)
-    chunks, stride, filled = (eqxi.unvmap_max(v) for v in (chunks, stride, filled))
+    chunks, stride, filled = (unvmap_max(v) for v in (chunks, stride, filled))
     blank = jax.tree.map(jnp.zeros_like, numbers["buffers"])  # saved nowhere: dead code
     start = reverse.start(state, moves)
     parcels = Parcels(start)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from .closure_conversion import Program, any_member, inexact, read, unless_waiting
+from .private_names import SaveState
 from .step_times import StepTimes
 
 
@@ -178,8 +179,6 @@ class ReverseStep:
 
 def state_saves(state: Any) -> list[Any]:
     """The parts of Diffrax's state that belong to the parts of `SaveAt`."""
-    from diffrax._integrate import SaveState
-
     def is_save(node):
         return isinstance(node, SaveState)
 

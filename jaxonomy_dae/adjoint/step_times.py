@@ -3,12 +3,11 @@
 from typing import Any
 
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
-from diffrax._integrate import _clip_to_end
 
 from .closure_conversion import Program, inexact
+from .private_names import clip_to_end, prevbefore
 
 
 class StepTimes:
@@ -61,7 +60,7 @@ class StepTimes:
         fixed = eqx.filter(state.controller_state[0], eqx.is_inexact_array, inverse=True)
         floor = numbers["t1"]
         for _ in range(100):
-            floor = eqxi.prevbefore(floor)
+            floor = prevbefore(floor)
 
         def clock(moving, given):
             tprev, tnext, controlled = moving
@@ -70,7 +69,7 @@ class StepTimes:
                 numbers["adapt"], controller, tprev, tnext, state.y, y1, error, eqx.combine(controlled, fixed)
             )
             tprev = jnp.minimum(tprev, t1)
-            return tprev, _clip_to_end(tprev, tnext, t1, floor, keep), inexact(after)
+            return tprev, clip_to_end(tprev, tnext, t1, floor, keep), inexact(after)
 
         at = inexact(_clock(numbers | {"state": state}))
         given = self.seeds()[1]

@@ -6,13 +6,12 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
-from diffrax._heuristics import is_sde
 from jax import lax
 
 from .closure_conversion import Program, hoist, unless_waiting
+from .private_names import AbstractRungeKutta, is_sde, while_loop
 from .recorded_loop import solve
 from .reverse_step import state_saves
 
@@ -54,6 +53,11 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
         if event is not None or saveat.dense or is_sde(terms) or size * (chunk + points) > LARGEST_RECORD:
             passed = dict(passed_solver_state=passed_solver_state, passed_controller_state=passed_controller_state)
             return diffrax.RecursiveCheckpointAdjoint().loop(**given, throw=throw, **passed)
+
+        # Stages in a loop that forward mode can follow, for second derivatives.
+        if isinstance(solver, AbstractRungeKutta) and solver.scan_kind is None:
+            solver = eqx.tree_at(lambda s: s.scan_kind, solver, "bounded", is_leaf=lambda leaf: leaf is None)
+            given["solver"] = solver
 
         # Diffrax's own loop, with functions in place of solver and controller that close over nothing.
         init_state = dataclasses.replace(
@@ -122,7 +126,7 @@ def _table(max_steps: int | None) -> tuple[int, int]:
 def _inner_loop(cond_fun, body_fun, start, *, max_steps, buffers, checkpoints):
     """Saving at times within a step."""
     del checkpoints
-    return eqxi.while_loop(cond_fun, body_fun, start, max_steps=max_steps, buffers=buffers, kind="lax")
+    return while_loop(cond_fun, body_fun, start, max_steps=max_steps, buffers=buffers, kind="lax")
 
 
 def _functions(

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from diffrax._root_finder import use_stepsize_tol
 
+from ..adjoint.private_names import use_stepsize_tol
 from ..linear.algebra import LinearAlgebra
 from .dae_term import FlatProblem
 
