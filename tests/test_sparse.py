@@ -178,12 +178,12 @@ def test_a_pivot_of_zero_fails_its_own_member_alone():
 def test_pivots_that_cancel_to_zero(deficiency):
     """Integer matrices of deficient rank: no solve with the nudge aborts, and none looks like a solution."""
     rng = np.random.default_rng(deficiency)
-    k, l = np.indices((6, 6)).reshape(2, -1)
-    pattern = SparsePattern(k, l, 6)
+    rows, cols = np.indices((6, 6)).reshape(2, -1)
+    pattern = SparsePattern(rows, cols, 6)
     solve = jax.jit(lambda values, b: solve_sparse(pattern, values, b, nudged=True))
     for _ in range(50):
         low = rng.integers(-2, 3, (6, 6 - deficiency)) @ rng.integers(-2, 3, (6 - deficiency, 6))
-        x = solve(jnp.asarray(low[k, l], float), jnp.asarray(rng.normal(size=6)))
+        x = solve(jnp.asarray(low[rows, cols], float), jnp.asarray(rng.normal(size=6)))
         assert not np.isfinite(x).all() or np.abs(x).max() > 1e8
 
 

@@ -6,6 +6,7 @@ from typing import Any
 import diffrax
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 from jax import lax
 
@@ -37,7 +38,7 @@ class Shut(eqx.Module):
     jaxpr: Any
     inputs: Any = eqx.field(static=True)  # the structure of the arrays among the arguments
     outputs: Any = eqx.field(static=True)  # (structure of the arrays it returns, their shapes and dtypes)
-    static: Any = eqx.field(static=True)  # (the other arguments, what it returns beside arrays), as leaves and structure
+    static: Any = eqx.field(static=True)  # what it returns beside arrays: (leaves, structure)
 
     def __call__(self, consts: Any, *args: Any) -> Any:
         leaves, structure = jax.tree.flatten(eqx.filter(args, eqx.is_array))
@@ -75,14 +76,31 @@ def hoist(function: Any, *args: Any) -> tuple[Shut, list[Any]]:
     return shut, list(closed.consts)
 
 
-@jax.custom_batching.custom_vmap
+@jax.custom_jvp
 def unless_waiting(active, new, old):
     """`new`; in a batch, whose members wait for the slowest one, `old` where a member is not active any more."""
+    return _unless_waiting(active, new, old)
+
+
+@unless_waiting.defjvp
+def _(primals, tangents):
+    # By hand, for JAX cannot batch the derivative of a `custom_vmap` function.
+    active, (new, structure) = primals[0], jax.tree.flatten(tangents[1])
+    old = jax.tree.leaves(tangents[2])
+    moving = [k for k, leaf in enumerate(new) if leaf.dtype != jax.dtypes.float0]
+    chosen = unless_waiting(active, [new[k] for k in moving], [old[k] for k in moving])
+    for k, leaf in zip(moving, chosen, strict=True):
+        new[k] = leaf
+    return unless_waiting(*primals), jax.tree.unflatten(structure, new)
+
+
+@jax.custom_batching.custom_vmap
+def _unless_waiting(active, new, old):
     del active, old
     return new
 
 
-@unless_waiting.def_vmap
+@_unless_waiting.def_vmap
 def _(size, batched, active, new, old):
     def spread(leaf, is_batched):
         return leaf if is_batched else jnp.broadcast_to(leaf, (size, *jnp.shape(leaf)))
@@ -91,7 +109,7 @@ def _(size, batched, active, new, old):
         return jnp.where(active.reshape(active.shape + (1,) * (a.ndim - active.ndim)), a, b)
 
     new, old = jax.tree.map(spread, new, batched[1]), jax.tree.map(spread, old, batched[2])
-    out = jax.tree.map(choose, new, old) if batched[0] else unless_waiting(active, new, old)
+    out = jax.tree.map(choose, new, old) if batched[0] else _unless_waiting(active, new, old)
     return out, jax.tree.map(lambda _: True, out)
 
 

@@ -12,6 +12,7 @@ import threading
 from collections.abc import Iterator
 from typing import Any
 
+import diffrax
 import jax
 from jax.core import Tracer
 
@@ -21,6 +22,15 @@ _lock = threading.Lock()
 _here = threading.local()
 _active = 0  # contexts entered, by all threads
 _original: Any = equinox_errors.branched_error_if
+
+
+class _Unchecked(diffrax.NoProgressMeter):
+    """No progress meter. Its type keeps a solve without checks apart from the same solve with them in JAX's caches."""
+
+
+def no_progress_meter() -> diffrax.AbstractProgressMeter:
+    """What `diffeqsolve` is to be given where no progress is shown."""
+    return _Unchecked() if getattr(_here, "depth", 0) else diffrax.NoProgressMeter()
 
 
 @functools.wraps(_original)

@@ -179,6 +179,7 @@ class ReverseStep:
 
 def state_saves(state: Any) -> list[Any]:
     """The parts of Diffrax's state that belong to the parts of `SaveAt`."""
+
     def is_save(node):
         return isinstance(node, SaveState)
 

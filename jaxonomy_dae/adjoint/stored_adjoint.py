@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from .closure_conversion import Program, hoist, unless_waiting
-from .private_names import AbstractRungeKutta, is_sde, while_loop
+from .private_names import is_sde, while_loop
 from .recorded_loop import solve
 from .reverse_step import state_saves
 
@@ -32,8 +32,12 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
     `diffrax.ClipStepSizeController` and `diffrax.StepTo` are complete.
 
     Solves with events, dense output or Brownian motion, and those whose state is so large that a record would take more
-    than 32 MB, are handed to `diffrax.RecursiveCheckpointAdjoint`. As with that, forward mode is refused, second
-    derivatives included: it needs `diffrax.ForwardMode()`.
+    than 32 MB, are handed to `diffrax.RecursiveCheckpointAdjoint`. As with that, forward mode alone is refused: use
+    `diffrax.ForwardMode()`.
+
+    Second derivatives are forward mode over reverse mode: `jax.hessian`, or `jax.jvp` of `jax.grad`. They need a step
+    that forward mode can follow, as it can those of this package's solvers. Diffrax's Runge–Kutta methods loop over
+    their stages, and forward mode can follow if told to: `diffrax.Dopri5(scan_kind="bounded")`.
     """
 
     def loop(
@@ -53,11 +57,6 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
         if event is not None or saveat.dense or is_sde(terms) or size * (chunk + points) > LARGEST_RECORD:
             passed = dict(passed_solver_state=passed_solver_state, passed_controller_state=passed_controller_state)
             return diffrax.RecursiveCheckpointAdjoint().loop(**given, throw=throw, **passed)
-
-        # Stages in a loop that forward mode can follow, for second derivatives.
-        if isinstance(solver, AbstractRungeKutta) and solver.scan_kind is None:
-            solver = eqx.tree_at(lambda s: s.scan_kind, solver, "bounded", is_leaf=lambda leaf: leaf is None)
-            given["solver"] = solver
 
         # Diffrax's own loop, with functions in place of solver and controller that close over nothing.
         init_state = dataclasses.replace(

@@ -74,7 +74,7 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, throw: bo
     done = integrate(
         term, solver, t0, t1, dt0, x0, inputs,
         save=save, controller=controller, adjoint=options.adjoint, max_steps=options.max_steps,
-        progress=options.progress,
+        progress=options.progress, host_checks=throw,
     )  # fmt: skip
     consistent = is_consistent(found)
     saved, x = done.ts, jnp.asarray(done.ys)

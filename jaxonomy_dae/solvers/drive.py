@@ -6,6 +6,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 
+from ..adjoint.host_checks import no_progress_meter, without_host_checks
 from .bdf import BDF
 from .projected import Projected
 from .rodas5p import Rodas5P
@@ -39,24 +40,29 @@ def is_multistep(solver: Any) -> bool:
 def integrate(
     term: Any, solver: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, *,
     save: diffrax.SubSaveAt, controller: Any, adjoint: Any, max_steps: int, progress: bool = False,
+    host_checks: bool = False,
 ) -> Run:  # fmt: skip
-    """Integrates, saves what is asked for and the last accepted point, and counts Jacobians."""
+    """Integrates, saves what is asked for and the last accepted point, and counts Jacobians.
+
+    Diffrax' own checks of the times are left out unless `host_checks`: see `without_host_checks`.
+    """
     counted = isinstance(solver, BDF)
-    solved: Any = diffrax.diffeqsolve(
-        term,
-        solver,
-        t0,
-        t1,
-        dt0,
-        y0,
-        args,
-        saveat=diffrax.SaveAt(subs={"out": save, "last": diffrax.SubSaveAt(t1=True)}, solver_state=counted),
-        stepsize_controller=controller,
-        adjoint=adjoint,
-        max_steps=max_steps,
-        throw=False,
-        progress_meter=diffrax.TqdmProgressMeter() if progress else diffrax.NoProgressMeter(),
-    )
+    with without_host_checks(not host_checks):
+        solved: Any = diffrax.diffeqsolve(
+            term,
+            solver,
+            t0,
+            t1,
+            dt0,
+            y0,
+            args,
+            saveat=diffrax.SaveAt(subs={"out": save, "last": diffrax.SubSaveAt(t1=True)}, solver_state=counted),
+            stepsize_controller=controller,
+            adjoint=adjoint,
+            max_steps=max_steps,
+            throw=False,
+            progress_meter=diffrax.TqdmProgressMeter() if progress else no_progress_meter(),
+        )
     stats = dict(solved.stats)
     if counted:
         stats["num_jacobians"], stats["num_newton_iterations"] = jax.lax.stop_gradient(solved.solver_state.counts)

@@ -98,7 +98,7 @@ def solve_dae(
     options = (solver, adjoint or default_adjoint(), stepsize_controller, max_steps)
     arguments = (term, t0, t1, y0, ts, args, (rtol, atol), options)
     traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments))
-    check, solution, last = (_solve if traced else _compiled)(*arguments)
+    check, solution, last = _solve(*arguments, host_checks=throw) if traced else _compiled(*arguments)
     known = list(names) if names is not None else [f"y[{k}]" for k in range(n)]
     outcome = (check, solution.result)
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(outcome)):
@@ -182,12 +182,23 @@ def _rounded_up(value: float) -> float:
     return math.ceil(value / unit) * unit
 
 
-def _solve(term, t0, t1, y0, ts, args, tolerances, options):
+def _solve(term, t0, t1, y0, ts, args, tolerances, options, host_checks=False):
     solver, adjoint, controller, max_steps = options
     check: StartCheck = start_check(FlatProblem(term, y0, args), t0, *tolerances)
     save = diffrax.SubSaveAt(t1=True) if ts is None else diffrax.SubSaveAt(ts=ts)
     run = integrate(
-        term, solver, t0, t1, None, y0, args, save=save, controller=controller, adjoint=adjoint, max_steps=max_steps
+        term,
+        solver,
+        t0,
+        t1,
+        None,
+        y0,
+        args,
+        save=save,
+        controller=controller,
+        adjoint=adjoint,
+        max_steps=max_steps,
+        host_checks=host_checks,
     )
     saved = run.ys if ts is None else _on_constraints(term, args, run.ts, run.ys, y0)
     failure: Any = diffrax.RESULTS.nonlinear_divergence

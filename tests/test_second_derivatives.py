@@ -1,0 +1,105 @@
+"""Forward mode over `StoredAdjoint`: second derivatives against closed forms and against forward mode alone."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, simulate
+from jaxonomy_dae.library.planar import PlanarPendulum
+from jaxonomy_dae.solvers import BDF, DAETerm, Rodas5P, StoredAdjoint, Tsit5, solve_dae
+
+TS = jnp.array([0.5, 1.0])
+PID = diffrax.PIDController(rtol=1e-9, atol=1e-9)
+
+
+def logistic(p, solver, adjoint):
+    """y' = a·y·(1 − y), y(t0) = b at two times: a vector of a, b and t0."""
+    a, b, t0 = p
+    term = diffrax.ODETerm(lambda t, y, a: a * y * (1 - y))
+    saveat = diffrax.SaveAt(ts=TS)
+    solution = diffrax.diffeqsolve(
+        term, solver, t0, 1.0, 0.01, b, a, saveat=saveat, stepsize_controller=PID, adjoint=adjoint, throw=False
+    )
+    return jnp.sum(solution.ys * jnp.array([1.0, 2.0]))
+
+
+def logistic_exact(p):
+    a, b, t0 = p
+    return jnp.sum(jnp.array([1.0, 2.0]) / (1 + (1 / b - 1) * jnp.exp(-a * (TS - t0))))
+
+
+P = jnp.array([1.5, 0.2, 0.1])
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [
+        pytest.param(Tsit5(), id="own"),
+        pytest.param(diffrax.Dopri5(scan_kind="bounded"), id="diffrax", marks=pytest.mark.slow),
+    ],
+)
+def test_hessian_of_the_logistic_equation(solver):
+    hessian = jax.jit(jax.hessian(lambda p: logistic(p, solver, StoredAdjoint())))(P)
+    np.testing.assert_allclose(hessian, jax.hessian(logistic_exact)(P), rtol=2e-6, atol=2e-6)
+    np.testing.assert_allclose(hessian, hessian.T, rtol=1e-6, atol=1e-6)
+
+
+def test_the_same_as_forward_mode_twice():
+    """Both differentiate the same formulas, so they agree to rounding (t0 shifts the steps: left out)."""
+
+    def f(adjoint):
+        return lambda ab: logistic(jnp.append(ab, 0.1), Tsit5(), adjoint)
+
+    twice = jax.jit(jax.jacfwd(jax.jacfwd(f(diffrax.ForwardMode()))))(P[:2])
+    np.testing.assert_allclose(jax.jit(jax.hessian(f(StoredAdjoint())))(P[:2]), twice, rtol=1e-10)
+
+
+@pytest.mark.slow
+def test_batches_of_second_derivatives():
+    """Members of a batch wait for the slowest one: their second derivatives are those they have alone."""
+
+    def second(p, v):
+        return jax.jvp(jax.grad(lambda p: logistic(p, Tsit5(), StoredAdjoint())), (p,), (v,))[1]
+
+    many = jnp.stack([P, jnp.array([15.0, 0.01, 0.3]), jnp.array([0.1, 0.9, 0.0])])
+    v = jnp.array([1.0, -0.5, 0.25])
+    found = jax.jit(jax.vmap(second, (0, None)))(many, v)
+    alone = jax.jit(second)
+    for row, p in zip(found, many, strict=True):
+        np.testing.assert_allclose(row, alone(p, v), rtol=1e-10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [Rodas5P(), BDF()], ids=["rodas5p", "bdf"])
+def test_differential_algebraic(solver):
+    """x' = −a·x·z, z² = x: x(1) = (1 + a/2)⁻²."""
+    term = DAETerm(lambda t, x, z, a: -a * x * z, lambda t, x, z, a: z**2 - x)
+    start = jnp.ones(1), jnp.ones(1)
+
+    def final(a):
+        return solve_dae(term, 1.0, start, solver=solver, args=a, rtol=1e-9, atol=1e-11, throw=False).ys[0][0, 0]
+
+    found = eqx.filter_jit(jax.jacfwd(jax.grad(final)))(0.7)
+    assert found == pytest.approx(1.5 * (1 + 0.35) ** -4, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_of_a_model():
+    """A pendulum in Cartesian coordinates, by its rod's length: against second differences of the values."""
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    diagram.add(PlanarPendulum(ev, name="pend", m=1.0, L=1.0, initial_theta=-1.2, initial_omega=0.0))
+    system = AcausalCompiler(ev, diagram)()
+
+    def x(length):
+        changed = system.with_parameters({"pend.L": length})
+        return simulate(changed, 1.0, ts=TS, rtol=1e-11, atol=1e-12)["pend.x"].sum()
+
+    found = jax.jit(jax.hessian(x))(1.0)
+    h = 1e-3
+    value = jax.jit(x)
+    weights = {-2: -1, -1: 16, 0: -30, 1: 16, 2: -1}
+    second = sum(w * value(1.0 + k * h) for k, w in weights.items()) / (12 * h**2)
+    np.testing.assert_allclose(found, second, rtol=1e-4)
