@@ -151,7 +151,9 @@ PULSE = (np.array([0.0, 5.0, 5.1, 10.0]), np.array([0.0, 1.0, 0.0, 0.0]), "held"
 PULSED = 30 * (np.exp(-0.49) - np.exp(-0.5))
 
 
-@pytest.mark.parametrize("solver", [None, Rodas5P(), pytest.param(BDF(), marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "solver", [None, *(pytest.param(solver, marks=pytest.mark.slow) for solver in (Rodas5P(), BDF()))]
+)
 def test_a_short_pulse_is_seen(lag, solver):
     solution = simulate(lag, 10.0, ts=jnp.array([4.9, 5.0, 5.05, 10.0]), inputs={"m.u": PULSE}, solver=solver)
     np.testing.assert_allclose(solution["m.x"][-1], PULSED, rtol=1e-5)
@@ -181,6 +183,7 @@ def test_interpolations_are_accepted_as_they_are(lag):
         np.testing.assert_allclose(solution["m.x"], expected, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_two_sampled_inputs():
     ev = EqnEnv()
     system = compiled(Lag(ev, "a"), Lag(ev, "b"))

@@ -67,7 +67,7 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Co
     merit = _merit(flat, variables, extended, preferred)
 
     def point():
-        return _initial_point(flat, variables, extended)
+        return initial_point(flat, variables, extended)
 
     selection = select_states(
         groups,
@@ -141,7 +141,7 @@ def _merit(flat: FlatModel, variables: QuantityMap, extended: Extended, preferre
     return [(preferred.get(q, 0), int(fixed[q]), int(started[q])) for q in range(quantities.n)]
 
 
-def _initial_point(flat: FlatModel, variables: QuantityMap, extended: Extended):
+def initial_point(flat: FlatModel, variables: QuantityMap, extended: Extended):
     """All quantities near the declared starts, consistent where possible; parameters; networks."""
     quantities = extended.quantities
     values = flat.parameters.values

@@ -11,17 +11,20 @@ from jax.core import Tracer
 from ..adjoint.default import default_adjoint
 from ..errors import SimulationError
 from ..initialization.initialize import check
+from ..lowering.plan import SystemPlan
 from ..solvers import BDF, Rodas5P, Tsit5
+from ..solvers.causes import decay_at, is_stiff
 from ..solvers.drive import is_implicit
 from ..solvers.solve import check_tolerances, default_tolerances
 from ..solvers.solve_arguments import jump_times
-from ..solvers.switching import Watch
-from ..system.inputs import check_range, read_inputs, step_ends
+from ..solvers.switching import BOUNDARY, MANY, Watch
+from ..system.inputs import StepEnds, check_range, read_inputs, step_ends
 from ..system.solver_choice import Choice, implicit_choice, is_known_stiff, note_stiffness, solver_choice
+from ..system.stiffness import fastest_decay
 from ..system.system import AcausalSystem
 from .arguments import check_arguments, check_parameters
 from .failures import explain
-from .integration import Options, Outcome, run, run_compiled
+from .integration import Options, Outcome, run, run_compiled, term_of
 from .solution import Solution
 from .step_sizes import clipped, controller_for, scaled_atol
 
@@ -58,8 +61,8 @@ def simulate(
     - `solver`: any Diffrax solver for ordinary differential equations, or `solvers.BDF`, `solvers.Rodas5P` for stiff
         systems and those with nonlinear blocks. None chooses, and `solution.stats` says what and why: explicit steps,
         and where stability limits them, the run is made with Rodas5P or BDF. Inside jit, grad and vmap, the choice is
-        the one of the last run of this system outside. Systems with hidden constraints are projected onto them after
-        every step and at every saved time.
+        that of the last run of this system outside, or else follows from eigenvalues at the declared start. Systems
+        with hidden constraints are projected onto them after every step and at every saved time.
     - `rtol`, `atol`: tolerances of the local error, by default 1e-6 and 1e-8 (1e-4 and 1e-6 in single precision);
         `atol` is multiplied by the states' nominal values.
     - `inputs`: by the inputs' names: constants; samples `(times, values)`, interpolated linearly, or with `"cubic"` or
@@ -101,6 +104,7 @@ def simulate(
     jump_ts = None if jump_ts is None else jump_times(jump_ts, dtype)
     # Numbers become arrays, so that a new value is no new program.
     initial = {name: jnp.asarray(v, dtype) for name, v in sorted((initial or {}).items())}
+    duration = None if _is_traced((t0, t1)) else float(t1) - float(t0)
     t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
     if ts is not None:
         ts = jnp.asarray(ts, dtype)
@@ -108,13 +112,17 @@ def simulate(
             ts = jnp.clip(ts, t0, t1)  # `check_arguments` lets rounding pass, Diffrax does not
     given = (system, t0, t1, ts, inputs, initial)
 
-    def options(solver: Any) -> Options:
+    def options(solver: Any, found_stiff: bool = False) -> Options:
         control = stepsize_controller
         if control is None:
             control = controller_for(system, solver, rtol, atol, dtmax)
+        stops = ends
+        if found_stiff and isinstance(solver, Rodas5P) and ts is not None:
+            # Where something follows the rest at once, steps are long and no error estimate covers what is between.
+            stops = StepEnds(ends.jumps, [*ends.kinks, ts])
         return Options(
-            solver, adjoint if adjoint is not None else default_adjoint(), clipped(control, jump_ts, ends),
-            max_steps + ends.count, progress,
+            solver, adjoint if adjoint is not None else default_adjoint(), clipped(control, jump_ts, stops),
+            max_steps + stops.count, progress,
         )  # fmt: skip
 
     if solver is None:
@@ -124,11 +132,12 @@ def simulate(
         choice = Choice(type(solver).__name__, "as asked for", final=True)
     traced = _is_traced((given, options(solver)))
     switches = not choice.final and stepsize_controller is None
-    if traced and switches and is_known_stiff(system.plan):
-        choice, switches = implicit_choice(system.plan, "an earlier run of this system was stiff"), False
-        solver = SOLVERS[choice.solver]()
     if traced:
-        return _traced(run(given, options(solver), None, throw), given, choice, throw)
+        why = _stiff_without_a_run(system.plan, duration) if switches else ""
+        if why:
+            choice = implicit_choice(system.plan, why)
+            solver = SOLVERS[choice.solver]()
+        return _traced(run(given, options(solver, found_stiff=bool(why)), None, throw), given, choice, throw)
     watch = Watch(t1, scaled_atol(system, atol) / rtol) if switches else None
     outcome = run_compiled(given, options(solver), watch)
     if _is_traced(outcome):  # a network may close over a traced value, which shows in the outcome only
@@ -139,13 +148,16 @@ def simulate(
         check(system, outcome.found, t0, inputs, initial)
     if switches:
         stiff = bool(outcome.is_stiff)
+        if outcome.result == diffrax.RESULTS.max_steps_reached:
+            decay = decay_at(term_of(system, implicit=False), inputs, *outcome.last)
+            stiff = is_stiff(decay, float(t1 - outcome.last[0]), max_steps)
         note_stiffness(system.plan, stiff)
         if stiff:
             found = f"stiff: stability limits explicit steps from t={float(outcome.last[0]):.3g} on"
             choice = implicit_choice(system.plan, found)
             solver = SOLVERS[choice.solver]()
             before = {"num_explicit_steps": counts["num_steps"], "stiff_from": float(outcome.last[0])}
-            outcome = run_compiled(given, options(solver), None)
+            outcome = run_compiled(given, options(solver, found_stiff=True), None)
             counts = outcome.numbers() | before
     saved, x = outcome.ts, outcome.x
     if ts is None:
@@ -155,6 +167,16 @@ def simulate(
     if throw and not bool(diffrax.is_okay(outcome.result)):
         raise SimulationError(explain(solution, outcome.last, t0, t1, is_implicit(solver), max_steps, rtol, atol))
     return solution
+
+
+def _stiff_without_a_run(plan: SystemPlan, duration: float | None) -> str:
+    """Why a system counts as stiff where it cannot be tried first, inside jit; or nothing."""
+    found = is_known_stiff(plan)
+    if found is not None:
+        return "an earlier run of this system was stiff" if found else ""
+    if duration is None or fastest_decay(plan) * duration <= BOUNDARY * MANY:
+        return ""
+    return f"stiff: at the declared start something decays within {1 / fastest_decay(plan):.2g}"
 
 
 def _traced(outcome: Outcome, given: tuple[Any, ...], choice: Choice, throw: bool) -> Solution:

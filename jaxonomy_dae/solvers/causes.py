@@ -95,17 +95,29 @@ def _escape(here: np.ndarray, y: Any, t: float, t1: float, weight: np.ndarray, n
     )
 
 
-def _stiffness(slope: Slope, t: Any, y: Any, t1: Any, steps: int) -> str:
-    """Whether fast decay alone demands more steps than there were."""
+def decay_at(term: Any, args: Any, t: Any, y: Any) -> float:
+    """The largest −Re λ of the eigenvalues at a point; 0 if there is none, or there are many unknowns."""
+    problem = FlatProblem(term, y, args)
+    return _decay(lambda t, y: consistent_slope(problem, None, t, y), t, problem.flat)
+
+
+def _decay(slope: Slope, t: Any, y: Any) -> float:
     if not 0 < y.shape[0] <= LARGE:
-        return ""
-    matrix = np.asarray(jax.jacfwd(lambda v: slope(t, v))(y))
-    if not np.isfinite(matrix).all():
-        return ""
-    fastest = max(float(-np.linalg.eigvals(matrix).real.min()), 0.0)
-    if fastest * float(t1 - t) < 0.3 * steps:
+        return 0.0
+    matrix = np.asarray(jax.jit(jax.jacfwd(lambda v: slope(t, v)))(y))
+    return max(float(-np.linalg.eigvals(matrix).real.min()), 0.0) if np.isfinite(matrix).all() else 0.0
+
+
+def is_stiff(decay: float, duration: float, steps: int) -> bool:
+    """Whether decay alone demands more explicit steps than there were."""
+    return decay * duration > 0.3 * steps
+
+
+def _stiffness(slope: Slope, t: Any, y: Any, t1: Any, steps: int) -> str:
+    decay = _decay(slope, t, y)
+    if not is_stiff(decay, float(t1 - t), steps):
         return ""
     return (
-        f"The system is stiff: something decays within {1 / fastest:.2g}, which explicit steps must follow to the end. "
+        f"The system is stiff: something decays within {1 / decay:.2g}, which explicit steps must follow to the end. "
         "Write solver=jaxonomy_dae.solvers.Rodas5P(), BDF() for many unknowns, or leave solver= out"
     )

@@ -35,9 +35,10 @@ class Watch(eqx.Module):
 
     def after(self, count: Any, t0: Any, t1: Any, y: tuple[Any, Any], k: tuple[Any, Any]) -> Any:
         """The count after a step from t0 to t1, whose last two stages are at points y with increments k = h·f(y)."""
-        weight = 1 / (self.floor + jnp.abs(y[1]))
-        moved, answered = (jnp.sum(((b - a) * weight) ** 2) for a, b in (y, k))
-        limited = (answered > BOUNDARY**2 * moved) & (self.end - t1 > MANY * (t1 - t0))
+        weight = self.floor + jnp.abs(y[1])
+        # One sum, not one for each norm: small steps cost what the kernels in them are.
+        excess = jnp.sum(((k[1] - k[0]) ** 2 - BOUNDARY**2 * (y[1] - y[0]) ** 2) / weight**2)
+        limited = (excess > 0) & (self.end - t1 > MANY * (t1 - t0))
         return jax.lax.stop_gradient(jnp.where(limited, count + 1, jnp.maximum(count - 2, 0)))
 
     def result(self, count: Any) -> Any:

@@ -47,6 +47,6 @@ def note_stiffness(plan: SystemPlan, stiff: bool):
         _stiffness.popitem(last=False)
 
 
-def is_known_stiff(plan: SystemPlan) -> bool:
-    """Whether stability limited explicit steps in the last run."""
-    return _stiffness.get(plan.digest, False)
+def is_known_stiff(plan: SystemPlan) -> bool | None:
+    """Whether stability limited explicit steps in the last run; None if there was none."""
+    return _stiffness.get(plan.digest)
