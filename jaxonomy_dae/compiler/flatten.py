@@ -200,7 +200,7 @@ def flatten(diagram: AcausalDiagram) -> FlatModel:
     parameters = _parameter_table(model)
     groups = builder.groups()
     variables, groups, rows = _add_blocks(model, diagram, variables, groups, networks)
-    return FlatModel(variables, parameters, groups, networks, rows, model.paths, ports)
+    return FlatModel(variables, parameters, groups, networks, rows, model.paths, ports, diagram.name or "")
 
 
 def _add_components(model: _Model, builder: GroupBuilder):

@@ -69,6 +69,11 @@ def listed(names: Iterable[str], shown: int = SHOWN, joint: str = "and") -> str:
     return f" {joint} ".join([", ".join(names[:-1]), names[-1]]) if len(names) > 1 else "".join(names)
 
 
+def some(names: Sequence[str], shown: int = SHOWN) -> str:
+    """a, b, c; of long lists the beginning."""
+    return ", ".join(names[:shown]) + (", …" if len(names) > shown else "")
+
+
 def counted(n: int, what: str) -> str:
     """1 equation, 2 equations."""
     return f"{n} {what}{'' if n == 1 else 's'}"

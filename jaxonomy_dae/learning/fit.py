@@ -1,6 +1,7 @@
 """Training: gradient descent with Optax, and nonlinear least squares with Optimistix."""
 
 import dataclasses
+import html
 import math
 import warnings
 from collections.abc import Callable, Sequence
@@ -23,7 +24,7 @@ from .bounds import Unbounded, project
 Model = TypeVar("Model", bound=eqx.Module)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class Fit(Generic[Model]):
     """The outcome of a training run.
 
@@ -40,6 +41,15 @@ class Fit(Generic[Model]):
     best_step: int
     best_loss: float
     message: str
+
+    def __repr__(self):
+        first = f"{self.history[0]:.6g}" if len(self.history) else "none"
+        return f"Fit(loss {first} → {self.best_loss:.6g}, best after {self.best_step} steps: {self.message})"
+
+    def _repr_html_(self) -> str:
+        """The outcome for a notebook; the model folds."""
+        model = getattr(self.model, "_repr_html_", lambda: f"<code>{html.escape(repr(self.model))}</code>")()
+        return f"<p><code>{html.escape(repr(self))}</code></p><details><summary>model</summary>{model}</details>"
 
 
 def split(model: Any, train: Any) -> tuple[Any, Any]:

@@ -194,7 +194,7 @@ def _digest(flat: FlatModel, mode: str, selection: StateSelection, states: np.nd
 
     v = flat.variables
     starts = [None if s is None else (s.template.key, s.parameters) for s in v.start]
-    feed(mode, v.names, v.is_input, v.fixed, v.nominal, v.bounds, v.default, starts, flat.parameters.names)
+    feed(flat.name, mode, v.names, v.is_input, v.fixed, v.nominal, v.bounds, v.default, starts, flat.parameters.names)
     for d in flat.parameters.dependents:
         feed(d.template.key, d.target, d.parameter)
     for g in flat.groups:

@@ -136,6 +136,7 @@ class FlatModel:
     rows: tuple[RowInjection, ...]
     components: list[str]  # full names, by id
     ports: PortTable
+    name: str = ""  # of the diagram
 
     @property
     def n_equations(self) -> int:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import sympy
 
 from ..errors import ModelError, nearest
@@ -131,6 +132,8 @@ class Component(metaclass=Construction):
                 f"component '{self.name}': a {what} cannot be named '{name}', because every component has an "
                 "attribute of that name; rename it"
             )
+        if f"{name}[0]" in self.variables and not any(term.name == name for term in self.learned_terms):
+            raise ModelError(f"component '{self.name}' uses the name '{name}' twice: it is a vector variable already")
         if any(term.name == name for term in self.learned_terms):
             raise ModelError(f"component '{self.name}' uses the name '{name}' twice: it is a learned term already")
 
@@ -230,6 +233,37 @@ class Component(metaclass=Construction):
         """
         self._claim(name, "variable")
         return self._declare(name, "variable", start, fixed, nominal, unit, bounds=bounds)
+
+    def vector(
+        self,
+        name: str,
+        count: int,
+        start: Any = None,
+        fixed: bool = False,
+        nominal: float | None = None,
+        unit: str = "",
+        bounds: tuple[float, float] | Interval | None = None,
+    ) -> tuple[VariableSymbol, ...]:
+        """Declares a vector of variables, `name[0]`, `name[1]`, …; returns their symbols.
+
+        **Arguments:**
+
+        - `name`: of the vector; in the solution, `solution["component.name[0]"]`.
+        - `count`: how many entries.
+        - `start`: a sequence with a start for each (None where there is none), or one for all.
+        - `fixed`, `nominal`, `unit`, `bounds`: of all entries, as in `variable`; what has no start is not fixed.
+        """
+        self._claim(name, "variable")
+        if not isinstance(count, int) or count < 1:
+            raise ModelError(f"vector variable '{self.name}.{name}' needs a positive number of entries; got {count!r}")
+        is_sequence = isinstance(start, Sequence | np.ndarray) and not isinstance(start, str)
+        starts = list(start) if is_sequence else [start] * count
+        if len(starts) != count:
+            raise ModelError(f"vector variable '{self.name}.{name}' has {count} entries, but {len(starts)} starts")
+        return tuple(
+            self._declare(f"{name}[{k}]", "variable", s, fixed and s is not None, nominal, unit, bounds=bounds)
+            for k, s in enumerate(starts)
+        )
 
     def input(self, name: str, default: float | None = None, unit: str = "") -> VariableSymbol:
         """Declares an input: a function of time given to `simulate(inputs={"component.name": ...})`.

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import html
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -18,6 +19,7 @@ from ..modeling.interval import Interval, closed_ends
 from ..modeling.real_number import real_number
 
 SHOWN = 12
+HTML_SHOWN = 200
 
 
 @dataclasses.dataclass(frozen=True)
@@ -189,6 +191,26 @@ class Parameters(eqx.Module):
             if real_number(number, where) not in self.table.intervals[k]:
                 raise ModelError(f"{where} must lie in {self.table.intervals[k]}; got {float(number):g}")
         return value
+
+    @property
+    def batch(self) -> tuple[int, ...]:
+        """The shape of a batch of systems; () for one, and for what holds no values."""
+        shapes = [leaf.shape[:-1] for leaf in (self.values, self.free) if leaf is not None and _is_array(leaf)]
+        return shapes[0] if shapes else ()
+
+    def _repr_html_(self) -> str:
+        """A table for notebooks: names, values, units, admissible values, and what dependent ones are computed from."""
+        if self.values is None or self.free_index and self.free is None or not _is_array(self.values):
+            return f"<code>{html.escape(repr(self))}</code>"
+        rows = []
+        for k, (name, value) in enumerate(self.items()[:HTML_SHOWN]):
+            interval, text = self.table.intervals[k], self.table.expressions.get(k, "")
+            bounds = "" if interval == Interval() else str(interval)
+            cells = (name, _text(value), self.table.units[k], bounds, text and f"= {text}")
+            rows.append("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in cells) + "</tr>")
+        more = f"<p>… and {len(self) - HTML_SHOWN} more</p>" if len(self) > HTML_SHOWN else ""
+        head = "".join(f"<th>{h}</th>" for h in ("parameter", "value", "unit", "bounds", "depends on"))
+        return f"<table><tr>{head}</tr>{''.join(rows)}</table>{more}"
 
     def __repr__(self):
         if not _is_array(self.values):  # the trained part of a partitioned system, or a mask

@@ -1,5 +1,6 @@
 """The compiled model."""
 
+import html
 from collections.abc import Mapping, Sequence
 from typing import Any, overload
 
@@ -10,6 +11,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from ..diagnosis.wording import counted, some
 from ..errors import ModelError, nearest
 from ..linear.sparse import SparseMatrix, SparsePattern, sparse_jacobian
 from ..lowering.plan import SystemPlan
@@ -66,6 +68,31 @@ class AcausalSystem(eqx.Module):
         from .report import SystemReport
 
         return SystemReport(self.plan)
+
+    def __repr__(self):
+        plan = self.plan
+        counts = [
+            counted(len(self.states), "state") + f" ({some(self.states)})" * bool(self.states),
+            counted(len(self.algebraics), "algebraic variable"),
+            counted(len(self.parameters), "parameter"),
+        ]
+        if plan.inputs.names:
+            counts.append(counted(len(plan.inputs.names), "input") + f" ({some(plan.inputs.names)})")
+        if self.neural:
+            counts.append(counted(len(self.neural), "network") + f" ({some(list(self.neural))})")
+        name = f"'{plan.flat.name}': " * bool(plan.flat.name)
+        batch = self.parameters.batch
+        return f"AcausalSystem({name}{', '.join(counts)}{f', a batch of shape {batch}' if batch else ''})"
+
+    def _repr_html_(self) -> str:
+        """The system for a notebook: its counts, and sections that fold."""
+        sections = [
+            ("states", [", ".join([*self.states, *self.carried])]),
+            ("parameters", [self.parameters._repr_html_()]),
+            ("report", [self.report._repr_html_()]),
+        ]
+        folded = "".join(f"<details><summary>{title}</summary>{''.join(body)}</details>" for title, body in sections)
+        return f"<p><code>{html.escape(repr(self))}</code></p>{folded}"
 
     # --- changing ----------------------------------------------------------------------------------------------
 
