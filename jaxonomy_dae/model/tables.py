@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..modeling.interval import Interval
+from .pickling import functions_by_name, named_functions
 from .templates import AnyTemplate, OpaqueFunction, Template
 
 ZERO = -1
@@ -137,6 +138,12 @@ class FlatModel:
     components: list[str]  # full names, by id
     ports: PortTable
     name: str = ""  # of the diagram
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"networks": functions_by_name(self.networks)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state | {"networks": named_functions(state["networks"])})
 
     @property
     def n_equations(self) -> int:

@@ -63,6 +63,9 @@ class Template:
     n_coefficients = 0
     opaque: "OpaqueFunction | None" = None
 
+    def __reduce__(self):
+        return template_of, (self.expression, self.slots, self.n_parameters)  # kernels are made again
+
     @property
     def arguments(self) -> list[sympy.Symbol]:
         """The symbols of the slots, of the parameters, and of time."""

@@ -15,6 +15,7 @@ from ..diagnosis.wording import counted, some
 from ..errors import ModelError, nearest
 from ..linear.sparse import SparseMatrix, SparsePattern, sparse_jacobian
 from ..lowering.plan import SystemPlan
+from ..model.pickling import functions_by_name, named_functions
 from .inputs import read_inputs
 from .parameters import Parameters
 from .system_at import READ_REFINEMENTS, SCALARS, Point
@@ -68,6 +69,9 @@ class AcausalSystem(eqx.Module):
         from .report import SystemReport
 
         return SystemReport(self.plan)
+
+    def __reduce__(self):
+        return _unpickled, (self.parameters, functions_by_name(self.neural), self.plan)
 
     def __repr__(self):
         plan = self.plan
@@ -320,3 +324,7 @@ class AcausalSystem(eqx.Module):
                 raise ModelError(f"solve_for: '{name}' is a variable and found anyway; name parameters")
             self.parameters.table.settable(name)
         return names
+
+
+def _unpickled(parameters: Parameters, neural: Any, plan: SystemPlan) -> AcausalSystem:
+    return AcausalSystem(parameters, named_functions(neural), plan)
