@@ -185,6 +185,15 @@ def test_training_a_root():
     assert float(found.parameters["c.k"]) == pytest.approx(9.0, rel=1e-6)
 
 
+def test_training_says_if_a_value_that_follows_leaves_its_bounds():
+    ev = EqnEnv()
+    a, g = Resistor(ev, "a", 3.0), Ground(ev, "g")
+    c = Capacitor(ev, "c", C=a.R)
+    system = compiled(a, c, g, connect=[(a.p, c.p), (a.n, c.n, g.p)])
+    with pytest.warns(RuntimeWarning, match=r"parameter 'c\.C' is a\.R and must lie in \(0, inf\); got -2"):
+        fit(system, lambda s: (s.parameters["a.R"] + 2) ** 2, optax.sgd(0.5), 1, train="a.R", progress=False)
+
+
 @pytest.mark.parametrize(
     "make, message",
     [

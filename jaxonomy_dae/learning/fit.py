@@ -81,6 +81,12 @@ def _with_free(trainable: Any, values: Any) -> Any:
     return eqx.tree_at(lambda s: s.parameters.free, trainable, values)
 
 
+def _check_dependents(model: Any) -> None:
+    problem = model.parameters.dependent_problem if isinstance(model, AcausalSystem) else None
+    if problem is not None:
+        warnings.warn(f"{problem}. Bound the parameters it depends on, too", RuntimeWarning, stacklevel=3)
+
+
 def _check_data(args: tuple) -> None:
     for path, leaf in jax.tree_util.tree_leaves_with_path(args):
         if eqx.is_inexact_array_like(leaf) and not np.isfinite(np.asarray(leaf)).all():
@@ -100,7 +106,8 @@ def fit(
     """Minimises a loss by gradient steps; keeps the best iterate.
 
     Declared bounds of parameters hold in every iterate: a step is projected onto a closed end, and towards an open end
-    goes nine tenths of the way at most.
+    goes nine tenths of the way at most. A parameter that is an expression in trained ones may leave its bounds, which a
+    `RuntimeWarning` then says.
 
     **Arguments:**
 
@@ -185,6 +192,7 @@ def fit(
                 bar.update()
                 bar.set_postfix(loss=f"{number:.3e}", best=f"{history[best_step]:.3e}")
     fitted, last = (_merged(eqx.combine(weights, frozen)) for weights in (best, trainable))
+    _check_dependents(fitted)
     return Fit(fitted, last, np.array(history), best_step, history[best_step], message)
 
 
@@ -272,4 +280,5 @@ def fit_least_squares(
         )
         return Fit(model, model, np.array([first]), 0, first, "no better point was found")
     fitted = _merged(eqx.combine(found, frozen))
+    _check_dependents(fitted)
     return Fit(fitted, fitted, np.array([first, last]), int(taken), last, f"{int(taken)} steps were taken")

@@ -156,19 +156,26 @@ class Parameters(eqx.Module):
             k = self.table.settable(name)
             array = array.at[..., k].set(jnp.asarray(self._checked(k, value, batch), array.dtype))
         array = self.table.complete(array)
-        self._check_dependents(array)
-        return Parameters(array, None, (), self.table)
+        changed = Parameters(array, None, (), self.table)
+        problem = changed.dependent_problem
+        if problem is not None:
+            raise ModelError(problem)
+        return changed
 
-    def _check_dependents(self, array: Any) -> None:
+    @property
+    def dependent_problem(self) -> str | None:
+        """What is wrong with a parameter that is computed from others: not finite, or out of its bounds."""
+        array = self.array
         chosen = np.array(list(self.table.expressions), np.int64)
         if not len(chosen) or isinstance(array, Tracer):
-            return
+            return None
         values = np.asarray(array)[..., chosen]
         low, high = self.table.bounds[chosen].T
         wrong = ~(np.isfinite(values) & (values >= low) & (values <= high)).reshape(-1, len(chosen)).all(axis=0)
         for k in chosen[wrong].tolist():
             name, text, interval = self.table.names[k], self.table.expressions[k], self.table.intervals[k]
-            raise ModelError(f"parameter '{name}' is {text} and must lie in {interval}; got {_text(array[..., k])}")
+            return f"parameter '{name}' is {text} and must lie in {interval}; got {_text(array[..., k])}"
+        return None
 
     def _checked(self, k: int, value: Any, batch: tuple[int, ...]) -> Any:
         name = self.table.names[k]
