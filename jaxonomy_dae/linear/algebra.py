@@ -11,11 +11,13 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 
 from ..errors import ModelError
 from .mass import Mass
-from .sparse import SparsePattern, available, compressed, solve_sparse
+from .operator import SparseLinearOperator
+from .sparse import SparsePattern, compressed, solve_sparse
 from .written_out import solve as solve_unrolled
 
 UNROLLED_INVERSE = 4  # up to this many unknowns the inverse is written out
@@ -62,6 +64,14 @@ class Dense(eqx.Module):
             return lu, order
         return _substitute(lu, jnp.eye(n, dtype=matrix.dtype)[order])
 
+    def operator(self, matrix: Any) -> lx.AbstractLinearOperator:
+        """The matrix as a Lineax operator."""
+        return lx.MatrixLinearOperator(matrix)
+
+    def blank(self, n: int, dtype: Any) -> Any:
+        """Something that looks like a matrix."""
+        return jnp.zeros((n, n), dtype)
+
     def empty(self, n: int, dtype: Any) -> Any:
         """Something that looks like a factorisation."""
         square = jnp.zeros((n, n), dtype)
@@ -74,22 +84,23 @@ class Dense(eqx.Module):
             return _substitute(lu, b[order][:, None])[:, 0]
         return factor @ b
 
+    def apply_transposed(self, factor: Any, c: Any) -> Any:
+        """W⁻ᵀ c, without derivatives."""
+        if not isinstance(factor, tuple):
+            return factor.T @ c
+        lu, order = factor
+        y = jax.lax.linalg.triangular_solve(lu, c[:, None], left_side=True, lower=False, transpose_a=True)
+        y = jax.lax.linalg.triangular_solve(lu, y, left_side=True, lower=True, transpose_a=True, unit_diagonal=True)
+        return jnp.zeros_like(c).at[order].set(y[:, 0])
+
     def solve(self, factor: Any, matrix: Any, b: Any) -> Any:
         """W⁻¹ b, differentiable."""
         factor = jax.lax.stop_gradient(factor)
-
-        def transposed(_, c):
-            if isinstance(factor, tuple):
-                lu, order = factor
-                y = jax.lax.linalg.triangular_solve(lu, c[:, None], left_side=True, lower=False, transpose_a=True)
-                y = jax.lax.linalg.triangular_solve(
-                    lu, y, left_side=True, lower=True, transpose_a=True, unit_diagonal=True
-                )
-                return jnp.zeros_like(c).at[order].set(y[:, 0])
-            return factor.T @ c
-
         return jax.lax.custom_linear_solve(
-            lambda x: matrix @ x, b, lambda _, c: self.apply(factor, None, c), transposed
+            lambda x: matrix @ x,
+            b,
+            lambda _, c: self.apply(factor, None, c),
+            lambda _, c: self.apply_transposed(factor, c),
         )
 
 
@@ -130,9 +141,17 @@ class Sparse(eqx.Module):
         """The values themselves."""
         return matrix
 
+    def operator(self, matrix: Any) -> lx.AbstractLinearOperator:
+        """The matrix as a Lineax operator."""
+        return SparseLinearOperator(matrix, _with_diagonal(self.pattern))
+
+    def blank(self, n: int, dtype: Any) -> Any:
+        """Something that looks like a matrix."""
+        return jnp.zeros((len(self.pattern) + n,), dtype)
+
     def empty(self, n: int, dtype: Any) -> Any:
         """Something that looks like what `factor` returns."""
-        return jnp.zeros((len(self.pattern) + n,), dtype)
+        return self.blank(n, dtype)
 
     def apply(self, factor: Any, matrix: Any, b: Any) -> Any:
         """W⁻¹ b, without derivatives."""
@@ -153,20 +172,3 @@ def _diagonal(mass: Mass) -> np.ndarray:
     if not mass.is_diagonal:
         raise ModelError("sparse steps need a diagonal mass matrix: give its diagonal, shape (n,)")
     return mass.array
-
-
-LinearAlgebra = Dense | Sparse
-SPARSE_FROM = 128  # unknowns from which a sparse factorisation is taken, where the pattern is sparse enough
-SPARSE_DENSITY = 0.15
-DENSE_UPTO = 1000  # unknowns for which dense algebra will do if the extra is missing
-
-
-def choose(given: LinearAlgebra | None, n: int, pattern: Any) -> LinearAlgebra:
-    """The linear algebra for n unknowns: dense for few, and where no pattern is known or it is nearly full."""
-    if given is not None:
-        return given
-    if pattern is None or n < SPARSE_FROM or pattern.density > SPARSE_DENSITY:
-        return Dense()
-    if n <= DENSE_UPTO and not available():
-        return Dense()
-    return Sparse(pattern)

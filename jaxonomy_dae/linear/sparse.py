@@ -232,6 +232,21 @@ def solve_sparse(
     return jax.lax.custom_linear_solve(matvec, b, solve, transpose_solve)
 
 
+def factorised_solve(
+    pattern: SparsePattern, values: Float[Array, " nnz"], b: Float[Array, " n"], transpose: bool = False
+) -> Float[Array, " n"]:
+    """As `solve_sparse`, without derivatives."""
+    klu()
+    if not is_double():
+        raise ValueError(
+            "sparse solves compute in float64: call jax.config.update('jax_enable_x64', True) at the start"
+        )
+    if pattern.coalesced is not None:
+        pattern, inverse = pattern.coalesced
+        values = jnp.zeros(len(pattern), values.dtype).at[inverse].add(values)
+    return _factorized(pattern, values, b, transpose, False)
+
+
 ULPS = 16  # changes of entries, in units of their rounding
 ZERO = 1e-200  # takes the place of a zero
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from ..initialization.initialize import InitialPoint, check, initialize, is_consistent
-from ..linear.algebra import SPARSE_FROM
+from ..linear.choice import SPARSE_FROM
 from ..solvers import BDF, DAETerm, Tsit5
 from ..solvers.drive import integrate, is_implicit
 from ..solvers.projected import with_projection

@@ -6,9 +6,10 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import lineax as lx
 from jax.flatten_util import ravel_pytree
 
-from ..linear.algebra import LinearAlgebra, choose
+from ..linear.choice import choose
 from .bdf_coefficients import Coefficients, coefficients, interpolate
 from .dae_term import FlatProblem
 from .index_one import consistent_point, consistent_slope
@@ -72,7 +73,8 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
 
     - `max_order`: 1 to 5.
     - `fixed_order`: stay at `max_order` once it is reached; for convergence studies.
-    - `linear`: the linear algebra; None chooses by size.
+    - `linear_solver`: any Lineax solver, such as `lineax.GMRES(rtol, atol)`, or one of `jaxonomy_dae.linear`; None
+        chooses by size. It is handed a `SparseLinearOperator` where the term has a pattern.
     - `algebraic_errors`: whether the error test counts what is not differentiated. Without, steps are fewer, often by
         far where M is not diagonal, and the ends of steps are as good; but dense output of an algebraic unknown that
         varies faster than the rest has no check. None counts where M is diagonal, except in `simulate`, which solves
@@ -87,7 +89,7 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
 
     max_order: int = eqx.field(static=True, default=5)
     fixed_order: bool = eqx.field(static=True, default=False)
-    linear: LinearAlgebra | None = None
+    linear_solver: lx.AbstractLinearSolver | None = None
     algebraic_errors: bool | None = eqx.field(static=True, default=None)
     projection: Projection | None = None
     root_finder: Any = Tolerances()
@@ -109,13 +111,13 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
     def func(self, terms, t0, y0, args):
         """dy/dt of the solution through a consistent point."""
         problem = FlatProblem(terms, y0, args)
-        return problem.unravel(consistent_slope(problem, self.linear, t0, problem.flat))
+        return problem.unravel(consistent_slope(problem, self.linear_solver, t0, problem.flat))
 
     def init(self, terms, t0, t1, y0, args):
         problem = FlatProblem(terms, y0, args)
         y = problem.flat
-        linear = choose(self.linear, y.shape[0], problem.pattern)
-        slope = consistent_slope(problem, self.linear, t0, y)
+        linear = choose(self.linear_solver, y.shape[0], problem.pattern, problem.mass)
+        slope = consistent_slope(problem, self.linear_solver, t0, y)
         return self._fresh(y, slope, t1 - t0, linear.empty(y.shape[0], y.dtype), jnp.zeros((2,), jnp.int32))
 
     def _fresh(self, y, slope, h, factor, counts) -> _State:
@@ -133,14 +135,14 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         """One step, with error estimate and dense output."""
         problem = FlatProblem(terms, y0, args)
         y = problem.flat
-        linear = choose(self.linear, y.shape[0], problem.pattern)
+        linear = choose(self.linear_solver, y.shape[0], problem.pattern, problem.mass)
         h = jnp.asarray(t1 - t0)
         state = solver_state
         if made_jump is not False:
 
             def restart():
-                moved, _ = consistent_point(problem, self.linear, t0, y)  # algebraic unknowns jump too
-                slope = consistent_slope(problem, self.linear, t0, moved)
+                moved, _ = consistent_point(problem, self.linear_solver, t0, y)  # algebraic unknowns jump too
+                slope = consistent_slope(problem, self.linear_solver, t0, moved)
                 return moved, self._fresh(moved, slope, h, state.factor, state.counts)
 
             y, state = jax.lax.cond(made_jump, restart, lambda: (y, state))

@@ -4,20 +4,23 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import lineax as lx
 
-from ..linear.algebra import LinearAlgebra, choose
+from ..linear.choice import choose
 from .dae_term import FlatProblem
 
 
-def index_matrix(problem: FlatProblem, linear: LinearAlgebra | None, t: Any, y: Any) -> tuple[Any, Any, Any, Any]:
+def index_matrix(
+    problem: FlatProblem, linear: lx.AbstractLinearSolver | None, t: Any, y: Any
+) -> tuple[Any, Any, Any, Any]:
     """(linear algebra, F, ∂F/∂y, M − P ∂F/∂y): with P the projector onto the algebraic equations, the last is regular
     if and only if the index is 1."""
-    chosen = choose(linear, y.shape[0], problem.pattern)
+    chosen = choose(linear, y.shape[0], problem.pattern, problem.mass)
     right, jacobian = chosen.jacobian(lambda v: problem.right(t, v), y)
     return chosen, right, jacobian, chosen.index_matrix(problem.mass, jacobian)
 
 
-def consistent_slope(problem: FlatProblem, linear: LinearAlgebra | None, t: Any, y: Any) -> Any:
+def consistent_slope(problem: FlatProblem, linear: lx.AbstractLinearSolver | None, t: Any, y: Any) -> Any:
     """dy/dt at a consistent point: M y' = F in the differential equations, P (∂F/∂t + ∂F/∂y y') = 0 in the others."""
     if not problem.mass.is_singular:
         chosen, right, _, matrix = index_matrix(problem, linear, t, y)
@@ -28,7 +31,7 @@ def consistent_slope(problem: FlatProblem, linear: LinearAlgebra | None, t: Any,
     return chosen.solve(chosen.factor(matrix), matrix, b)
 
 
-def consistent_shift(problem: FlatProblem, linear: LinearAlgebra | None, t: Any, y: Any, start: Any) -> Any:
+def consistent_shift(problem: FlatProblem, linear: lx.AbstractLinearSolver | None, t: Any, y: Any, start: Any) -> Any:
     """A Newton step onto the algebraic equations that leaves M y as it was at the start: zero at a consistent point.
 
     Large steps there and back would leave rounding errors in M y, so every step mends it.
@@ -39,7 +42,7 @@ def consistent_shift(problem: FlatProblem, linear: LinearAlgebra | None, t: Any,
 
 
 def consistent_point(
-    problem: FlatProblem, linear: LinearAlgebra | None, t: Any, y: Any, max_steps: int = 50
+    problem: FlatProblem, linear: lx.AbstractLinearSolver | None, t: Any, y: Any, max_steps: int = 50
 ) -> tuple[Any, Any]:
     """Newton's method onto the algebraic equations from y, M y left alone: the point, and the size of the last step.
 

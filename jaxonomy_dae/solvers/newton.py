@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from ..adjoint.private_names import use_stepsize_tol
-from ..linear.algebra import LinearAlgebra
+from ..linear.choice import LinearAlgebra
 from .dae_term import FlatProblem
 
 CONVERGED = 0.1  # of the local error's tolerance (Brenan, Campbell & Petzold 1996, section 5.2.2)

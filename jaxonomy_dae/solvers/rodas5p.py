@@ -5,9 +5,10 @@ from typing import Any, ClassVar
 import diffrax
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 
-from ..linear.algebra import LinearAlgebra, choose
+from ..linear.choice import choose
 from .dae_term import FlatProblem
 from .index_one import consistent_point, consistent_slope
 
@@ -83,13 +84,14 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
 
     **Arguments:**
 
-    - `linear`: the linear algebra; None chooses by size.
+    - `linear_solver`: any Lineax solver, such as `lineax.GMRES(rtol, atol)`, or one of `jaxonomy_dae.linear`; None
+        chooses by size. It is handed a `SparseLinearOperator` where the term has a pattern.
 
     Takes a `DAETerm` or a `diffrax.ODETerm`. Explicit time dependence is differentiated: F must be differentiable in t
     between the jumps that the step-size controller knows of.
     """
 
-    linear: LinearAlgebra | None = None
+    linear_solver: lx.AbstractLinearSolver | None = None
 
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar = Rodas5PInterpolation
@@ -106,16 +108,16 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
     def func(self, terms, t0, y0, args):
         """dy/dt of the solution through a consistent point."""
         problem = FlatProblem(terms, y0, args)
-        return problem.unravel(consistent_slope(problem, self.linear, t0, problem.flat))
+        return problem.unravel(consistent_slope(problem, self.linear_solver, t0, problem.flat))
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         """One step, with error estimate and dense output."""
         problem = FlatProblem(terms, y0, args)
         mass, y = problem.mass, problem.flat
         dtype = y.dtype
-        linear = choose(self.linear, y.shape[0], problem.pattern)
+        linear = choose(self.linear_solver, y.shape[0], problem.pattern, problem.mass)
         if made_jump is not False:  # algebraic unknowns jump too
-            y = jax.lax.cond(made_jump, lambda: consistent_point(problem, self.linear, t0, y)[0], lambda: y)
+            y = jax.lax.cond(made_jump, lambda: consistent_point(problem, self.linear_solver, t0, y)[0], lambda: y)
         h_time = jnp.asarray(t1 - t0)
         h = h_time.astype(dtype)
         # A step of length zero occurs where a batch waits for its slowest member.

@@ -1,0 +1,73 @@
+"""The linear algebra of implicit steps by a Lineax solver that the user chose."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+
+
+class ByLineax(eqx.Module):
+    """Matrices as `storage` keeps them, dense or sparse; solves by a Lineax solver.
+
+    A solver that does not succeed gives not-a-number, so that the step is rejected. Derivatives are taken of the linear
+    equation and not through the solver.
+    """
+
+    storage: Any
+    solver: lx.AbstractLinearSolver
+
+    def jacobian(self, function: Any, y: Any) -> tuple[Any, Any]:
+        """(F(y), ∂F/∂y)."""
+        return self.storage.jacobian(function, y)
+
+    def combine(self, mass: Any, a: Any, jacobian: Any) -> Any:
+        """a·M − ∂F/∂y."""
+        return self.storage.combine(mass, a, jacobian)
+
+    def index_matrix(self, mass: Any, jacobian: Any) -> Any:
+        """M − P·∂F/∂y with P the projector onto the algebraic equations."""
+        return self.storage.index_matrix(mass, jacobian)
+
+    def materialise(self, matrix: Any) -> Any:
+        """The matrix as an array, shape (n, n)."""
+        return self.storage.materialise(matrix)
+
+    def operator(self, matrix: Any) -> lx.AbstractLinearOperator:
+        """The matrix as a Lineax operator."""
+        return self.storage.operator(matrix)
+
+    def factor(self, matrix: Any) -> tuple[Any, Any]:
+        """The matrix, and the arrays of the solver's state."""
+        state = self.solver.init(self.operator(matrix), {})
+        return matrix, eqx.filter(state, eqx.is_array)
+
+    def empty(self, n: int, dtype: Any) -> Any:
+        """Something that looks like what `factor` returns."""
+        shapes = eqx.filter_eval_shape(self.factor, self.storage.blank(n, dtype))
+        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+
+    def apply(self, factor: Any, matrix: Any, b: Any) -> Any:
+        """W⁻¹ b, without derivatives."""
+        return self._applied(jax.lax.stop_gradient(factor), b, transposed=False)
+
+    def _applied(self, factor: Any, b: Any, transposed: bool) -> Any:
+        matrix, arrays = factor
+        shapes = eqx.filter_eval_shape(lambda m: self.solver.init(self.operator(m), {}), matrix)
+        static = eqx.filter(shapes, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct), inverse=True)
+        state, options = eqx.combine(arrays, static), {}
+        if transposed:
+            state, options = self.solver.transpose(state, options)
+        x, result, _ = self.solver.compute(state, b, options)
+        return jnp.where(result == lx.RESULTS.successful, x, jnp.nan)
+
+    def solve(self, factor: Any, matrix: Any, b: Any) -> Any:
+        """W⁻¹ b, differentiable."""
+        factor = jax.lax.stop_gradient(factor)
+        return jax.lax.custom_linear_solve(
+            self.operator(matrix).mv,
+            b,
+            lambda _, c: self._applied(factor, c, transposed=False),
+            lambda _, c: self._applied(factor, c, transposed=True),
+        )

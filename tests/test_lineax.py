@@ -1,0 +1,194 @@
+"""Our operators and solvers in `lineax.linear_solve`, and Lineax' solvers in BDF and Rodas5P, against dense algebra."""
+
+import importlib.util
+
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+from testset.heat import heat_exact, sundials_heat2d
+
+from jaxonomy_dae import ModelError
+from jaxonomy_dae.linear import KLU, Dense, SparseLinearOperator, SparsePattern, WrittenOut
+from jaxonomy_dae.linear.choice import choose
+from jaxonomy_dae.solvers import BDF, DAETerm, Rodas5P, solve_dae
+
+installed = pytest.mark.skipif(importlib.util.find_spec("klujax") is None, reason='needs the extra "sparse"')
+TIGHT = dict(rtol=1e-11, atol=1e-11)
+
+
+def sparse_example(n: int = 40):
+    """Values, a pattern with a place that occurs twice, and a right-hand side; diagonally dominant."""
+    rng = np.random.default_rng(0)
+    rows = np.concatenate([np.arange(n), rng.integers(0, n, 2 * n), [0]])
+    cols = np.concatenate([np.arange(n), rng.integers(0, n, 2 * n), [0]])
+    values = np.concatenate([rng.uniform(8, 10, n), rng.uniform(-1, 1, 2 * n), [0.5]])
+    return jnp.asarray(values), SparsePattern(rows, cols, n), jnp.asarray(rng.normal(size=n))
+
+
+# --- the operator --------------------------------------------------------------------------------------------------
+
+
+def test_the_operator_is_its_matrix():
+    rng = np.random.default_rng(1)
+    pattern = SparsePattern(rng.integers(0, 5, 12), rng.integers(0, 7, 12), 7, 5)
+    operator = SparseLinearOperator(jnp.asarray(rng.normal(size=12)), pattern)
+    matrix = operator.as_matrix()
+    x, y = jnp.asarray(rng.normal(size=7)), jnp.asarray(rng.normal(size=5))
+    np.testing.assert_allclose(operator.mv(x), matrix @ x, rtol=1e-14)
+    np.testing.assert_allclose(operator.T.mv(y), matrix.T @ y, rtol=1e-14)
+    np.testing.assert_allclose(operator.T.as_matrix(), matrix.T)
+    assert (operator.in_size(), operator.out_size()) == (7, 5)
+    assert lx.materialise(operator) is operator and lx.linearise(operator) is operator
+    np.testing.assert_allclose((operator + operator).as_matrix(), 2 * matrix)
+    np.testing.assert_allclose(lx.conj(operator).mv(x), matrix @ x, rtol=1e-14)
+    with pytest.raises(ValueError, match=r"\(12,\)"):
+        SparseLinearOperator(jnp.ones(3), pattern)
+
+
+@pytest.mark.parametrize(
+    "offsets, known",
+    [
+        ((0,), "is_diagonal is_tridiagonal is_lower_triangular is_upper_triangular"),
+        ((-1, 0, 1), "is_tridiagonal"),
+        ((0, 2), "is_upper_triangular"),
+        ((-3, 0), "is_lower_triangular"),
+        ((-2, 2), ""),
+    ],
+)
+def test_what_the_pattern_says(offsets, known):
+    n = 6
+    rows, cols = np.array([(i, i + o) for o in offsets for i in range(n) if 0 <= i + o < n]).T
+    operator = SparseLinearOperator(jnp.arange(1.0, len(rows) + 1), SparsePattern(rows, cols, n))
+    matrix = np.asarray(operator.as_matrix())
+    for name in ("is_diagonal", "is_tridiagonal", "is_lower_triangular", "is_upper_triangular"):
+        assert getattr(lx, name)(operator) == (name in known.split())
+    np.testing.assert_array_equal(lx.diagonal(operator), np.diag(matrix))
+    for found, k in zip(lx.tridiagonal(operator), (0, -1, 1), strict=True):
+        np.testing.assert_array_equal(found, np.diag(matrix, k))
+    assert lx.is_symmetric(SparseLinearOperator(operator.values, operator.pattern, lx.symmetric_tag))
+
+
+# --- solvers -------------------------------------------------------------------------------------------------------
+
+
+def dense_example(n: int):
+    rng = np.random.default_rng(n)
+    return jnp.asarray(rng.normal(size=(n, n)) + 3 * np.eye(n)), jnp.asarray(rng.normal(size=n))
+
+
+@pytest.mark.parametrize(
+    "solver, n",
+    [(WrittenOut(), 1), (WrittenOut(), 4), (Dense(), 3), (Dense(), 20), (Dense(), 40)],
+    ids=lambda v: v if isinstance(v, int) else type(v).__name__,
+)
+def test_dense_solvers(solver, n):
+    matrix, b = dense_example(n)
+
+    def solve(matrix, b):
+        return lx.linear_solve(lx.MatrixLinearOperator(matrix), b, solver).value
+
+    np.testing.assert_allclose(jax.jit(solve)(matrix, b), np.linalg.solve(matrix, b), **TIGHT)
+    batch = jnp.stack([matrix, 2 * matrix]), jnp.stack([b, b**2])
+    np.testing.assert_allclose(jax.vmap(solve)(*batch), np.linalg.solve(batch[0], batch[1][..., None])[..., 0], **TIGHT)
+    gradient = jax.jacrev(lambda m: solve(m, b).sum())(matrix)
+    x, adjoint = np.linalg.solve(matrix, b), np.linalg.solve(matrix.T, np.ones(n))
+    np.testing.assert_allclose(gradient, -np.outer(adjoint, x), **TIGHT)
+    check_grads(solve, (matrix, b), order=1, modes=["fwd"])
+
+
+@installed
+def test_klu():
+    values, pattern, b = sparse_example()
+
+    def solve(values, b):
+        return lx.linear_solve(SparseLinearOperator(values, pattern), b, KLU()).value
+
+    matrix = np.asarray(pattern.dense(values))
+    np.testing.assert_allclose(jax.jit(solve)(values, b), np.linalg.solve(matrix, b), **TIGHT)
+    np.testing.assert_allclose(
+        jax.vmap(solve, (None, 0))(values, jnp.stack([b, 2 * b]))[1], 2 * solve(values, b), **TIGHT
+    )
+    x, adjoint = np.linalg.solve(matrix, b), np.linalg.solve(matrix.T, np.ones(len(b)))
+    gradient = jax.grad(lambda v: solve(v, b).sum())(values)
+    np.testing.assert_allclose(gradient, -adjoint[pattern.rows] * x[pattern.cols], **TIGHT)
+    with pytest.raises(ValueError, match="SparseLinearOperator"):
+        lx.linear_solve(lx.MatrixLinearOperator(jnp.asarray(matrix)), b, KLU())
+
+
+def test_iterative_solvers_take_the_operator():
+    values, pattern, b = sparse_example()
+    found = lx.linear_solve(SparseLinearOperator(values, pattern), b, lx.GMRES(rtol=1e-12, atol=1e-12)).value
+    np.testing.assert_allclose(found, np.linalg.solve(pattern.dense(values), b), rtol=1e-9, atol=1e-10)
+
+
+def test_structures_and_scales():
+    """Between pytrees; rows in other units; a singular matrix is reported."""
+    matrix, b = dense_example(4)
+    rows = jnp.array([1e-12, 1.0, 1e9, 1e-3])
+    operator = lx.PyTreeLinearOperator(
+        [[rows[:1, None] * matrix[:1, :2], rows[:1, None] * matrix[:1, 2:]],
+         [rows[1:, None] * matrix[1:, :2], rows[1:, None] * matrix[1:, 2:]]],
+        [jax.ShapeDtypeStruct((1,), b.dtype), jax.ShapeDtypeStruct((3,), b.dtype)],
+    )  # fmt: skip
+    expected = np.linalg.solve(matrix, b)
+    for solver in (WrittenOut(), Dense()):
+        found = lx.linear_solve(operator, [rows[:1] * b[:1], rows[1:] * b[1:]], solver).value
+        np.testing.assert_allclose(jnp.concatenate(found), expected, **TIGHT)
+        singular = lx.linear_solve(lx.MatrixLinearOperator(jnp.zeros((2, 2))), jnp.ones(2), solver, throw=False)
+        assert singular.result == lx.RESULTS.singular
+    with pytest.raises(ValueError, match="Dense"):
+        lx.linear_solve(lx.MatrixLinearOperator(jnp.eye(7)), jnp.ones(7), WrittenOut())
+
+
+# --- in implicit steps ---------------------------------------------------------------------------------------------
+
+
+def test_heat_on_a_plate_by_gmres():
+    """heat2d with BDF and GMRES: the pattern is given, and no matrix is factorised."""
+    problem = sundials_heat2d(m=8)
+    one = problem.index_one()
+    n = one.y0.shape[0]
+    jacobian = np.asarray(jax.jacfwd(lambda y: one.F(0.0, y, one.args()))(jnp.asarray(one.y0)))
+    rows, cols = np.nonzero(jacobian)
+    term = DAETerm(one.F, mass=one.mass, pattern=SparsePattern(rows, cols, n))
+    solver = BDF(linear_solver=lx.GMRES(rtol=1e-10, atol=1e-12))
+    found = solve_dae(term, problem.t1, jnp.asarray(one.y0), solver=solver, args=one.args(), rtol=1e-7, atol=1e-9)
+    exact = heat_exact(8, [problem.t1])[0]
+    names = [f"plate.u{k // 8}_{k % 8}" for k in range(64)]
+    expected = np.array([exact[names.index(name)] for name in one.names])
+    np.testing.assert_allclose(found.ys[0], expected, atol=2e-5)
+
+
+@pytest.mark.parametrize(
+    "linear_solver",
+    [
+        lx.GMRES(rtol=1e-12, atol=1e-14),
+        lx.LU(),
+        pytest.param(WrittenOut(), marks=pytest.mark.slow),
+        pytest.param(Dense(), marks=pytest.mark.slow),
+    ],
+    ids=lambda v: type(v).__name__,
+)
+@pytest.mark.parametrize("method", [BDF, pytest.param(Rodas5P, marks=pytest.mark.slow)])
+def test_any_lineax_solver(method, linear_solver):
+    """x' = −a·x·z, z² = x: x(1) = (1 + a/2)⁻², with its derivative."""
+    term = DAETerm(lambda t, x, z, a: -a * x * z, lambda t, x, z, a: z**2 - x)
+
+    def final(a):
+        solver = method(linear_solver=linear_solver)
+        start = jnp.ones(1), jnp.ones(1)
+        return solve_dae(term, 1.0, start, solver=solver, args=a, rtol=1e-8, atol=1e-10, throw=False).ys[0][0, 0]
+
+    value, slope = jax.jit(jax.value_and_grad(final))(0.7)
+    np.testing.assert_allclose([value, slope], [1.35**-2, -(1.35**-3)], rtol=1e-6)
+
+
+def test_what_is_not_a_solver_is_refused():
+    term = DAETerm(lambda t, y, a: -y, mass=[1.0])
+    with pytest.raises(ModelError, match="lineax.GMRES"):
+        choose("gmres", 1, None, term.mass)
+    with pytest.raises(ModelError, match="pattern="):
+        solve_dae(term, 1.0, jnp.ones(1), solver=Rodas5P(linear_solver=KLU()))
