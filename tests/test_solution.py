@@ -10,6 +10,7 @@ from problems import angle_solution, compiled, damped_oscillation, oscillator, p
 from sympy import Eq
 
 from jaxonomy_dae import AcausalSystem, Component, EqnEnv, ModelError, SimulationError, Solution, der, simulate
+from jaxonomy_dae.simulation import solution as solution_module
 
 TS = jnp.array([0.0, 0.4, 1.1])
 
@@ -58,7 +59,41 @@ def test_unknown_names(solution):
 def test_to_dict_has_everything(solution, system):
     everything = solution.to_dict()
     assert list(everything) == ["time", *system.variables]
-    np.testing.assert_array_equal(everything["spring.f"], solution["spring.f"])
+    for name in ("time", "mass.x", "spring.f", "spring.flange_a.f", "wall.flange.x"):
+        np.testing.assert_array_equal(everything[name], solution[name], err_msg=name)
+
+
+def test_to_dict_evaluates_once(solution, monkeypatch):
+    evaluated = []
+    everything = solution_module._everything
+    monkeypatch.setattr(solution_module, "_everything", lambda *given: (evaluated.append(1), everything(*given))[1])
+    monkeypatch.setattr(solution_module, "_one", None)
+    solution.to_dict()
+    assert len(evaluated) == 1
+
+
+def test_several_names_are_columns(solution):
+    names = ["spring.f", "time", "mass.x", "spring.flange_a.f", "der(mass.v)", "wall.flange.x"]
+    found = solution[names]
+    assert found.shape == (3, 6)
+    for k, name in enumerate(names):
+        np.testing.assert_array_equal(found[:, k], solution[name], err_msg=name)
+    assert solution[[]].shape == (3, 0)
+    inside = eqx.filter_jit(lambda s: s[names])(solution)
+    np.testing.assert_allclose(inside, found, rtol=1e-14)
+    batch = eqx.filter_vmap(lambda x0: simulate(solution.system, 1.1, ts=TS, initial={"mass.x": x0}))(jnp.ones(2))
+    assert batch[names].shape == (2, 3, 6)
+    for wrong in (0, None, ["mass.x", 1]):
+        with pytest.raises(ModelError, match=r"by names, solution\['m\.x'\] or solution\[\['m\.x', 'm\.y'\]\]"):
+            solution[wrong]
+    with pytest.raises(ModelError, match=r"'mass\.xx'"):
+        solution[["mass.x", "mass.xx"]]
+
+
+def test_html(solution):
+    text = solution._repr_html_()
+    for part in ("finished", "0 to 1.1", "mass.x, mass.v", "Tsit5"):
+        assert part in text
 
 
 def test_a_solution_is_a_pytree(solution):

@@ -41,7 +41,7 @@ class Solution(eqx.Module):
     solver: str = eqx.field(static=True, default="")
     reason: str = eqx.field(static=True, default="")
 
-    def __getitem__(self, name: str | Sequence[str]) -> Any:
+    def __getitem__(self, name: Any) -> Any:
         """The values of a variable, or of several: `solution["pend.x"]` has shape `(n,)`, and
         `solution[["pend.x", "pend.y"]]` shape `(n, 2)`. `"time"` is accepted, and `"der(...)"` of what the model
         differentiates.
