@@ -27,6 +27,7 @@ import scipy.sparse as sp
 from jaxtyping import Array, Float
 
 from ..errors import ModelError
+from .written_out import solve_dense
 
 EXTRA = 'pip install "jaxonomy_dae[sparse]"'
 DENSE = 1000  # simultaneous equations that dense elimination may solve if there is no sparse solver: about 20 ms
@@ -312,7 +313,7 @@ def solve_block(pattern: SparsePattern, values: Any, right: Any) -> Any:
             f"the model has {pattern.n} simultaneous equations; sparse solves compute in float64: call "
             "jax.config.update('jax_enable_x64', True) at the start"
         )
-    return jnp.linalg.solve(pattern.dense(values), right)
+    return solve_dense(pattern.dense(values), right)
 
 
 def check_solvable(n: int):

@@ -5,6 +5,7 @@ The traced program grows with the number of steps, not of the equations in them.
 
 import copy
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -12,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..linear.sparse import solve_block
-from ..linear.written_out import UNROLLED, solve
+from ..linear.torn import solve_torn
+from ..linear.written_out import UNROLLED, solve, solve_dense
 from ..lowering.gather import Chunk, Gather, take
 from ..lowering.program import PlannedEquation, PlannedRepeat, PlannedSparse, PlannedStep, Program
 from ..model.evaluate_numpy import Networks
@@ -74,8 +76,10 @@ class Evaluation:
         """The local unknown for which the equation, affine in it, holds."""
         equation = planned.equation
         positions = [k for k, s in enumerate(equation.slots) if s.local == unknown]
-        if equation.template.n_coefficients > LONG_SUM:
-            return self._solved_long_sum(planned, positions[0])
+        outside = [k for k in range(len(equation.slots)) if k != positions[0]]
+        if equation.template.n_coefficients > LONG_SUM and all(isinstance(planned.sources[k], Gather) for k in outside):
+            weights = -equation.coefficient[:, outside] / equation.coefficient[:, [positions[0]]]
+            return _signed(planned.signs[positions[0]], self._long_sum(planned, outside, weights), self.dtype)
         local = list(local)
         local[unknown] = 0.0
         arguments = self._arguments(planned, local)
@@ -87,17 +91,15 @@ class Evaluation:
         slope = sum(_signed(planned.signs[k], partials[k], self.dtype) for k in positions)
         return -rest / slope
 
-    def _solved_long_sum(self, planned: PlannedEquation, position: int) -> Any:
-        equation = planned.equation
-        n = equation.coefficient.shape[0]
-        others = [k for k in range(len(equation.slots)) if k != position]
-        sources = [planned.sources[k] for k in others]
+    def _long_sum(self, planned: PlannedEquation, positions: Sequence[int], weights: np.ndarray) -> Any:
+        """Σ weight·slot over slots that are gathered."""
+        n = len(weights)
+        sources = [planned.sources[k] for k in positions]
         joined = Gather(*(np.concatenate([getattr(s, f) for s in sources]) for f in ("chunk", "offset", "sign")))
         values = joined.read(self.chunks, self.dtype)
-        values = jnp.reshape(jnp.broadcast_to(values, (len(others) * n,)), (len(others), n))
-        weights = -equation.coefficient[:, others] / equation.coefficient[:, [position]]
+        values = jnp.reshape(jnp.broadcast_to(values, (len(positions) * n,)), (len(positions), n))
         total = jnp.sum(values * jnp.asarray(weights.T, self.dtype), axis=0)
-        return _signed(planned.signs[position], total[0] if n == 1 else total, self.dtype)
+        return total[0] if n == 1 else total
 
     def _step(self, planned: PlannedStep, refine: int) -> list[Any]:
         step = planned.step
@@ -120,7 +122,7 @@ class Evaluation:
         if not tearing.tearing:
             return follow([])
         if not step.carried:
-            return self._affine(follow, residuals, len(tearing.tearing), shape)
+            return self._linear_block(planned, shape)
         z = [self._filled(self.read(g), shape) for g in planned.guess]
         if refine == 0:
             self.residuals.extend(residuals(z))
@@ -194,19 +196,42 @@ class Evaluation:
                 values.append(_signed(sign, take(self._filled(slopes[k], shape), instances), self.dtype))
         return jnp.concatenate(residuals), jnp.concatenate(values) if partials else None
 
-    def _affine(self, follow, residuals, m: int, shape: tuple[int, ...]) -> list[Any]:
-        """The local unknowns of a linear block: affine in its tearing variables, as the residuals are."""
-        zero = [jnp.zeros(shape, self.dtype)] * m
-        if m > UNROLLED:
-            return follow(newton(residuals, zero))
-        (r, base), push = jax.linearize(lambda z: (residuals(z), follow(z)), zero)
-        one = jnp.ones(shape, self.dtype)
-        columns = [push([one if j == k else zero[0] for j in range(m)]) for k in range(m)]
-        z = solve([[column[0][e] for column in columns] for e in range(m)], [-v for v in r])
-        return [
-            functools.reduce(lambda total, pair: total + pair[0] * pair[1][1][u], zip(z, columns, strict=True), value)
-            for u, value in enumerate(base)
-        ]
+    def _linear_block(self, planned: PlannedStep, shape: tuple[int, ...]) -> list[Any]:
+        """The unknowns of linear blocks of one shape."""
+        matrix: dict[tuple[int, int], Any] = {}
+        right = []
+        blank = [0.0] * len(planned.step.unknown)
+        for e, equation in enumerate(planned.equations):
+            rest, slopes = self._affine_parts(equation, blank)
+            right.append(self._filled(-rest, shape))
+            for u, slope in slopes:
+                matrix[e, u] = matrix[e, u] + slope if (e, u) in matrix else slope
+        return solve_torn(planned.step.tearing, matrix, right)
+
+    def _affine_parts(self, planned: PlannedEquation, blank: list[Any]) -> tuple[Any, list[tuple[int, Any]]]:
+        """The residual where all local unknowns are zero, and its slopes as (local unknown, slope)."""
+        equation = planned.equation
+        template = equation.template
+        inside = [k for k, s in enumerate(equation.slots) if s.local >= 0]
+        arguments = self._arguments(planned, blank)
+        if template.n_coefficients:
+            coefficients = arguments[2]
+            outside = [k for k in range(len(equation.slots)) if k not in inside]
+            partials: Any = {k: self._constant(coefficients[k]) for k in inside}
+            if len(outside) > LONG_SUM:
+                rest = self._long_sum(planned, outside, equation.coefficient[:, outside])
+            else:
+                rest = functools.reduce(
+                    lambda total, k: total + self._constant(coefficients[k]) * arguments[0][k], outside, 0.0
+                )
+        else:
+            rest = template.residual(*arguments)
+            # A network's output stands alone, its inputs are outside.
+            partials = {inside[0]: 1.0} if template.opaque is not None else template.partial_values(*arguments)
+        return rest, [(equation.slots[k].local, _signed(planned.signs[k], partials[k], self.dtype)) for k in inside]
+
+    def _constant(self, value: Any) -> Any:
+        return value if isinstance(value, float) else jnp.asarray(value, self.dtype)
 
     def _filled(self, value: Any, shape: tuple[int, ...]) -> Any:
         return jnp.broadcast_to(jnp.asarray(value, self.dtype), shape)
@@ -230,7 +255,7 @@ def newton(residuals, z: list[Any]) -> list[Any]:
     basis = jnp.eye(m, dtype=stacked.dtype).reshape(m, m, *([1] * z[0].ndim))
     columns = jax.vmap(push)(jnp.broadcast_to(basis, (m, *stacked.shape)))  # (unknown, equation, *batch)
     matrix = jnp.moveaxis(columns, (1, 0), (-2, -1))
-    step = jnp.linalg.solve(matrix, jnp.moveaxis(value, 0, -1)[..., None])[..., 0]
+    step = solve_dense(matrix, jnp.moveaxis(value, 0, -1))
     return list(stacked - jnp.moveaxis(step, -1, 0))
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..linear.sparse import solve_block, sparse_jacobian
-from ..linear.written_out import UNROLLED, solve
+from ..linear.written_out import UNROLLED, solve, solve_dense
 from ..lowering.gather import Gather, take
 from ..lowering.plan import ConstraintGroup, PlannedRow, SystemPlan
 from ..lowering.program import Program
@@ -152,7 +152,7 @@ class Point:
         if plan.carried_pattern is not None:
             matrix = sparse_jacobian(of_z, plan.carried_pattern)(state[n:])
             return jnp.concatenate([slopes, -solve_block(plan.carried_pattern, matrix, value)])
-        return jnp.concatenate([slopes, -jnp.linalg.solve(jax.jacfwd(of_z)(state[n:]), value)])
+        return jnp.concatenate([slopes, -solve_dense(jax.jacfwd(of_z)(state[n:]), value)])
 
     def _carried(self, t: Any, state: Any) -> list[Any]:
         """The residuals of nonlinear blocks at the tearing variables in the state."""
