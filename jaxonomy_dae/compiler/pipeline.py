@@ -10,10 +10,10 @@ from ..diagnosis.structure import check_structure
 from ..diagnosis.wording import itemised, listed
 from ..errors import ModelError, StructuralError, nearest
 from ..model.consistent_point import consistent_point
-from ..model.evaluate_numpy import Networks, start_values
+from ..model.evaluate_numpy import Networks
 from ..model.extended import Extended
 from ..model.incidence import incidence
-from ..model.quantities import QuantityMap, map_quantities, name_quantities, quantity_scale
+from ..model.quantities import QuantityMap, map_quantities, name_quantities, quantity_scale, start_guess
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, describe_equation, equation_offsets, written_by
 from .differentiate_equations import differentiate_equations
 from .eliminate_aliases import eliminate_aliases
@@ -143,19 +143,9 @@ def _merit(flat: FlatModel, variables: QuantityMap, extended: Extended, preferre
 
 def initial_point(flat: FlatModel, variables: QuantityMap, extended: Extended):
     """All quantities near the declared starts, consistent where possible; parameters; networks."""
-    quantities = extended.quantities
     values = flat.parameters.values
     networks = Networks(tuple(flat.networks.values()))
-    value_of = start_values(flat.variables.start, values)
-    guess = np.zeros(quantities.n)
-    pins: dict[int, float] = {}
-    for v, start in enumerate(flat.variables.start):
-        q, sign = variables[v]
-        if start is None or q < 0:
-            continue
-        guess[q] = sign * value_of(v)
-        if flat.variables.fixed[v]:
-            pins[q] = guess[q]
+    guess, pins = start_guess(flat, variables, extended.quantities.n)
     point, _ = consistent_point(extended, guess, list(pins.items()), values, 0.0, networks)
     return point, values, networks
 

@@ -12,10 +12,11 @@ from ..linear.sparse import check_solvable
 from ..model.extended import Extended, ExtendedGroup
 from ..model.quantities import QuantityMap, quantity_scale
 from ..model.tables import ZERO, FlatModel, RowInjection
+from .entry_sizes import EntrySizes
 from .gather import Gather
 from .plan import ConstraintGroup, InputTable, PlannedRow, SystemPlan
 from .program import Layout, Program, plan
-from .schedule import AnyStep, SparseStep, build_schedule
+from .schedule import AnyStep, SparseStep, Step, build_schedule
 
 
 def _needed(steps: Sequence[AnyStep], targets: np.ndarray, n: int) -> tuple[AnyStep, ...]:
@@ -38,7 +39,7 @@ def lower(model: CompiledModel) -> SystemPlan:
     state_order = selection.states  # as they lie in the state array
     quantities = extended.quantities
     n = quantities.n
-    steps = build_schedule(extended, blocks)
+    steps = build_schedule(extended, blocks, EntrySizes(flat, variable_map, extended))
     for step in steps:
         if isinstance(step, SparseStep):
             check_solvable(step.n)
@@ -93,7 +94,7 @@ def lower(model: CompiledModel) -> SystemPlan:
     opaque |= {r.opaque.index: r.opaque for r in flat.rows}
     functions = tuple(opaque[k].function if k in opaque else None for k in range(len(flat.networks)))
     return SystemPlan(
-        _digest(flat, mode, selection, state_order, extended),
+        _digest(flat, mode, selection, state_order, extended, steps),
         flat,
         model.alias,
         variable_map,
@@ -183,7 +184,14 @@ def _plan_row(row: RowInjection, inputs, variables: QuantityMap, states, layout:
     return PlannedRow(row.opaque, rows, gathers, tuple(signs.tolist()), inputs[0])
 
 
-def _digest(flat: FlatModel, mode: str, selection: StateSelection, states: np.ndarray, extended: Extended) -> str:
+def _digest(
+    flat: FlatModel,
+    mode: str,
+    selection: StateSelection,
+    states: np.ndarray,
+    extended: Extended,
+    steps: Sequence[AnyStep],
+) -> str:
     """A digest of all that determines the plan."""
     hasher = hashlib.sha256()
 
@@ -204,4 +212,8 @@ def _digest(flat: FlatModel, mode: str, selection: StateSelection, states: np.nd
     for row in flat.rows:
         feed(row.opaque.index, row.targets, row.inputs, sorted(row.opaque.time_positions))
     feed(states, selection.constraints, selection.dummies, extended.base, extended.level)
+    for step in steps:
+        # How a block is torn depends on the values of the parameters.
+        if len(step.unknown) > 1 or isinstance(step, SparseStep):
+            feed(step.tearing if isinstance(step, Step) else "whole", *step.unknown)
     return hasher.hexdigest()

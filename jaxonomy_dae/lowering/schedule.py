@@ -13,7 +13,8 @@ import numpy as np
 from ..compiler.order_blocks import Blocks
 from ..model.extended import Extended, ExtendedGroup
 from ..model.templates import AnyTemplate
-from ..structure.tearing import Tearing, tear
+from ..structure.tearing import Sizes, Tearing, tear
+from .entry_sizes import EntrySizes
 
 # A block stays whole, its matrix sparse, if it has more tearing variables than TORN: dense elimination then takes more
 # than KLU (30 unknowns: 0.2 ms and 0.09 ms; 200: 0.8 and 0.12). Or if it is longer than WRITTEN_OUT, because XLA needs
@@ -121,8 +122,8 @@ class SparseStep:
 AnyStep = Step | SparseStep
 
 
-def build_schedule(extended: Extended, blocks: Blocks) -> tuple[AnyStep, ...]:
-    """Groups the blocks into steps."""
+def build_schedule(extended: Extended, blocks: Blocks, entry_sizes: EntrySizes) -> tuple[AnyStep, ...]:
+    """Groups the blocks into steps; `entry_sizes` are those of the Jacobian's entries, near the start."""
     group_of = np.empty(extended.n_equations, np.int64)
     row_of = np.empty(extended.n_equations, np.int64)
     for g, group in enumerate(extended.groups):
@@ -146,7 +147,7 @@ def build_schedule(extended: Extended, blocks: Blocks) -> tuple[AnyStep, ...]:
         shapes.setdefault((int(blocks.level[b]), detail[2]), []).append(b)
     large: dict[tuple[int, bool], list[int]] = {}
     for (level, _), members in shapes.items():
-        found = _block_step(extended, level, [details[b] for b in members], group_of, row_of)
+        found = _block_step(extended, level, [details[b] for b in members], group_of, row_of, entry_sizes)
         if isinstance(found, Step):
             keyed.append(((level, 1, int(details[members[0]][0][0])), found))
         else:
@@ -197,7 +198,9 @@ def _block_detail(extended: Extended, blocks: Blocks, b: int, group_of, row_of):
     return equations, unknowns, shape
 
 
-def _block_step(extended: Extended, level: int, details: list[tuple], group_of, row_of) -> Step | bool:
+def _block_step(
+    extended: Extended, level: int, details: list[tuple], group_of, row_of, entry_sizes: EntrySizes
+) -> Step | bool:
     """The step of blocks of one shape; or, if they are to stay whole, whether they are linear."""
     shape = details[0][2]
     templates = [extended.groups[g].template for g, _ in shape]
@@ -206,7 +209,16 @@ def _block_step(extended: Extended, level: int, details: list[tuple], group_of, 
     if len(shape) > WRITTEN_OUT[linear]:
         return linear
     contains, solvable = [], []
-    for template, inside, (_, slots) in zip(templates, positions, shape, strict=True):
+    entries: dict[tuple[int, int], np.ndarray] = {}
+    numbers = set()
+    for e, (template, inside, (g, slots)) in enumerate(zip(templates, positions, shape, strict=True)):
+        rows = row_of[np.array([d[0][e] for d in details])]
+        for k in inside:
+            at = (e, slots[k])
+            size = entry_sizes.of(g, k)[rows]
+            entries[at] = np.maximum(entries[at], size) if at in entries else size
+            if template.n_coefficients or entry_sizes.is_number(g, k):
+                numbers.add(at)
         contains.append(frozenset(slots[k] for k in inside))
         safe = set()
         for u in contains[-1]:
@@ -214,7 +226,7 @@ def _block_step(extended: Extended, level: int, details: list[tuple], group_of, 
             if len(where) == 1 and template.coefficient_never_vanishes(where[0]):
                 safe.add(u)
         solvable.append(frozenset(safe))
-    torn = tear(contains, solvable)
+    torn = tear(contains, solvable, Sizes(entries, frozenset(numbers)))
     if len(torn.tearing) > TORN:
         return linear
     equations = []

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Int
 
+from .evaluate_numpy import start_values
 from .extended import Extended, Quantities
 from .tables import ZERO, AliasTable, FlatModel
 
@@ -72,3 +73,18 @@ def quantity_bounds(flat: FlatModel, variables: QuantityMap, extended: Extended)
     np.maximum.at(low, q, np.where(flipped, -b, a))
     np.minimum.at(high, q, np.where(flipped, -a, b))
     return np.stack([low, high], axis=-1)
+
+
+def start_guess(flat: FlatModel, variables: QuantityMap, n: int) -> tuple[np.ndarray, dict[int, float]]:
+    """The declared starts of all n quantities (zero where there is none), and those that are fixed."""
+    value_of = start_values(flat.variables.start, flat.parameters.values)
+    guess = np.zeros(n)
+    fixed: dict[int, float] = {}
+    for v, start in enumerate(flat.variables.start):
+        q, sign = variables[v]
+        if start is None or q < 0:
+            continue
+        guess[q] = sign * value_of(v)
+        if flat.variables.fixed[v]:
+            fixed[q] = guess[q]
+    return guess, fixed

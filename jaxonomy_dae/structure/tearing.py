@@ -83,13 +83,12 @@ class _Growth:
         return not (fixed and (self.raw[e, v] <= self.raw[e, u]).all())
 
 
-def tear(
-    contains: Sequence[frozenset[int]], solvable: Sequence[frozenset[int]], sizes: Sizes | None = None
-) -> Tearing:
+def tear(contains: Sequence[frozenset[int]], solvable: Sequence[frozenset[int]], sizes: Sizes | None = None) -> Tearing:
     """Tears one block, or blocks of one pattern; with `sizes`, growth is bounded."""
     n = len(contains)
     growing = None if sizes is None else _Growth(sizes)
     left: list[set[int]] = [set(c) for c in contains]
+    solvable = list(solvable)
     equations_of: list[list[int]] = [[] for _ in range(n)]
     for e, unknowns in enumerate(contains):
         for u in sorted(unknowns):
@@ -142,8 +141,11 @@ def tear(
             e = heapq.heappop(ready)
             if not is_open[e] or not _is_ready(left[e], solvable[e]):
                 continue
-            closed = e
             (u,) = left[e]
+            if growing is not None and not growing.allows(e, u, contains[e] - {u}):
+                solvable[e] = solvable[e] - {u}
+                continue
+            closed = e
             sequence.append((e, u))
         else:
             lost, seen, u = heapq.heappop(best)

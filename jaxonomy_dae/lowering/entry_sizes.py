@@ -1,0 +1,49 @@
+"""The sizes of the Jacobian's entries, for the choice of pivots when a model is compiled."""
+
+import numpy as np
+
+from ..model.evaluate_numpy import Networks, group_values
+from ..model.extended import Extended
+from ..model.quantities import QuantityMap, quantity_scale, start_guess
+from ..model.tables import FlatModel
+
+
+class EntrySizes:
+    """|∂(residual)/∂(slot)| of every equation, with the parameters of the model as compiled.
+
+    What depends on variables is looked at near the declared starts: at two points, so that what happens to vanish at
+    one does not count as zero. What is not finite there counts as the largest entry of its equation.
+    """
+
+    def __init__(self, flat: FlatModel, variables: QuantityMap, extended: Extended):
+        self.extended = extended
+        self.parameters = flat.parameters.values
+        guess, _ = start_guess(flat, variables, extended.quantities.n)
+        self.points = (guess, guess + quantity_scale(flat, variables, extended))
+        self.networks = Networks(tuple(flat.networks.values()))
+        self._groups: dict[int, np.ndarray] = {}
+
+    def of(self, group: int, slot: int) -> np.ndarray:
+        """Sizes over the instances of a group of equations."""
+        if group not in self._groups:
+            self._groups[group] = self._evaluated(group)
+        return self._groups[group][:, slot]
+
+    def is_number(self, group: int, slot: int) -> bool:
+        """Whether the entry depends on nothing, parameters included."""
+        template = self.extended.groups[group].template
+        if template.opaque is not None:
+            return slot == 0
+        return template.coefficient_is_constant(slot) and bool(getattr(template.partials[slot], "is_Number", False))
+
+    def _evaluated(self, group: int) -> np.ndarray:
+        chosen = self.extended.groups[group]
+        if chosen.template.opaque is not None:
+            return np.ones(chosen.quantity.shape)
+        found = [
+            np.abs(group_values(chosen, point, self.parameters, 0.0, self.networks, partials=True))
+            for point in self.points
+        ]
+        size = np.fmax(*found)
+        largest = np.where(np.isfinite(size), size, 0.0).max(axis=1, keepdims=True, initial=0.0)
+        return np.where(np.isfinite(size), size, np.where(largest > 0, largest, 1.0))
