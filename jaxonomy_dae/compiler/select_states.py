@@ -20,7 +20,8 @@ from ..model.extended import Extended
 from ..model.tables import ZERO, EquationGroup, equation_offsets
 
 POOR_PIVOT = 0.1  # a preferred pivot may be this much smaller than the best one
-SINGULAR_PIVOT = 1e-9
+SINGULAR = 1e-9  # singular value of an equilibrated matrix
+EQUILIBRATIONS = 8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -204,7 +205,9 @@ def _dummy_derivatives(dense, c, columns, quantities, merit, scale, name, equati
 
 def _pivots(matrix: np.ndarray, keys: list[tuple]) -> list[int] | None:
     """As many columns as rows, nonsingular together: the least wanted as states whose pivots are not poor."""
-    work = matrix / np.maximum(np.abs(matrix).max(axis=1, keepdims=True, initial=0.0), 1e-300)
+    if _is_singular(matrix):
+        return None
+    work = matrix / np.abs(matrix).max(axis=1, keepdims=True)
     free_rows = list(range(work.shape[0]))
     free_columns = list(range(work.shape[1]))
     picked: list[int] = []
@@ -214,7 +217,7 @@ def _pivots(matrix: np.ndarray, keys: list[tuple]) -> list[int] | None:
         sub = np.abs(work[np.ix_(free_rows, free_columns)])
         best_of_column = sub.max(axis=0)
         best = best_of_column.max()
-        if not best > SINGULAR_PIVOT:
+        if not best > 0:
             return None
         good = [k for k in range(len(free_columns)) if best_of_column[k] >= POOR_PIVOT * best]
         k = min(good, key=lambda k: keys[free_columns[k]])
@@ -225,3 +228,14 @@ def _pivots(matrix: np.ndarray, keys: list[tuple]) -> list[int] | None:
             factors = work[free_rows, column] / work[row, column]
             work[free_rows] -= np.outer(factors, work[row])
     return sorted(picked)
+
+
+def _is_singular(matrix: np.ndarray) -> bool:
+    """Whether rows depend on each other, in units in which all rows and columns are alike (Ruiz 2001): those of an
+    equation or a variable do not decide."""
+    if matrix.shape[0] > matrix.shape[1]:
+        return True
+    for _ in range(EQUILIBRATIONS):
+        rows, columns = (np.abs(matrix).max(axis=axis, keepdims=True, initial=0.0) for axis in (1, 0))
+        matrix = matrix / np.sqrt(np.where(rows > 0, rows, 1.0) * np.where(columns > 0, columns, 1.0))
+    return bool(np.linalg.svd(matrix, compute_uv=False)[-1] <= SINGULAR)

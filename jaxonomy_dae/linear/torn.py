@@ -13,8 +13,9 @@ Three things keep the result right (Skeel 1980, Math. Comp. 35:817; Higham 2002,
    and errors show in the last m equations only.
 2. One or more steps of iterative refinement with the residuals of those: what an unstable elimination loses, a factor
    γ of 1/eps, the first step brings back to γ² eps.
-3. The scaled residual |A x − b| ≤ c eps (|A| |x| + |b|) of every equation that rounding can have spoilt. Where it does
-   not hold, x is not-a-number: a loud failure, not a wrong number.
+3. The residual of every equation that rounding can have spoilt is checked: |A x − b| ≤ c eps (|A| |x| + |b|), or, where
+   the unknowns are of very different sizes, the same in the norm of the matrix with rows and columns equilibrated.
+   Where neither holds, x is not-a-number: a loud failure, not a wrong number.
 
 Entries are scalars or arrays of one shape (a batch of blocks); which are zero is known when the program is traced.
 Derivatives are those of x = A⁻¹ b, from solves by the same elimination.
@@ -32,7 +33,8 @@ from ..structure.tearing import Tearing
 from .written_out import UNROLLED, inverse
 
 CORRECTIONS = 2  # the second one for blocks in which errors can grow over several links
-TOLERATED = 2.0**20  # of the scaled residual, in units of eps: 2e-10 in double precision
+TOLERATED = 2.0**20  # residual of an equation in units of eps times its terms: 2e-10 in double precision
+TOLERATED_NORM = 2.0**8  # the same in the equilibrated norm: 6e-14, what elimination with pivoting may leave
 
 Entries = Mapping[tuple[int, int], Any]
 
@@ -105,6 +107,7 @@ class _Elimination:
         self.depth = self._depths(tearing.sequence, self.rows)
         # The same for the transpose, in which equations and unknowns change places.
         self.depth_transposed = self._depths([(u, e) for e, u in reversed(tearing.sequence)], self.columns)
+        self.can_grow = max(self.depth.values(), default=0) > 1
         # W = −L⁻¹ F, by unknowns.
         self.w: dict[int, Any] = {}
         for e, u in tearing.sequence:
@@ -204,7 +207,7 @@ class _Elimination:
                 x[u] = x[u] + self._along(u, change)
         # What depends on tearing variables alone is as good as they are.
         checked = [*tearing.residuals, *(e for e, u in tearing.sequence if self.depth[u] > 1)]
-        return _verified(x, b, [self.rows[e] for e in checked], checked)
+        return self._verified(x, b, self.rows, checked)
 
     def transpose_solve(self, g: Sequence[Any]) -> list[Any]:
         """A⁻ᵀ g: one entry for each equation."""
@@ -236,25 +239,41 @@ class _Elimination:
             follow(self._schur_solve(missing, transposed=True), None)
             y = [a + b for a, b in zip(kept, y, strict=True)]
         checked = [*tearing.tearing, *(u for e, u in tearing.sequence if self.depth_transposed[e] > 1)]
-        return _verified(y, g, [self.columns[u] for u in checked], checked)
+        return self._verified(y, g, self.columns, checked)
 
     @property
     def corrections(self) -> int:
-        return 1 if max(self.depth.values(), default=0) <= 1 else CORRECTIONS
+        """How many are made."""
+        return CORRECTIONS if self.can_grow else 1
+
+    def _verified(self, x: list[Any], b: Sequence[Any], rows: list[list[tuple[int, Any]]], places) -> list[Any]:
+        """x, or not-a-number if one of the equations at `places` does not hold to rounding."""
+        dtype = x[0].dtype
+        eps, tiny = float(jnp.finfo(dtype).eps), float(jnp.finfo(dtype).tiny)
+        norm = None
+        if self.can_grow or len(self.tearing.tearing) > 1:
+            largest = [_largest([a for _, a in row]) for row in rows]
+            units: list[list[Any]] = [[] for _ in x]  # 1 / the unit of each unknown
+            for row, size in zip(rows, largest, strict=True):
+                for v, a in row:
+                    units[v].append(abs(a) / size)
+            norm = _largest([_largest(unit) * value for unit, value in zip(units, x, strict=True)])
+        holds: Any = True
+        for place in places:
+            products = [_product(a, x[v]) for v, a in rows[place]]
+            residual = jnp.abs(_less(b[place], products))
+            size = _total([jnp.abs(b[place]), *(jnp.abs(p) for p in products)], None)
+            allowed = TOLERATED * eps * size
+            if norm is not None:
+                allowed = jnp.maximum(allowed, TOLERATED_NORM * eps * largest[place] * norm)
+            # Below the second term, products have lost digits to underflow.
+            fine = residual <= allowed + TOLERATED / eps * tiny
+            holds = holds & fine
+        return [jnp.where(holds, v, jnp.nan) for v in x]
 
 
-def _verified(x: list[Any], b: Sequence[Any], rows: Sequence[Sequence[tuple[int, Any]]], places) -> list[Any]:
-    """x, or not-a-number if one of the equations does not hold to rounding."""
-    dtype = x[0].dtype
-    eps, tiny = float(jnp.finfo(dtype).eps), float(jnp.finfo(dtype).tiny)
-    holds = None
-    for row, place in zip(rows, places, strict=True):
-        products = [_product(a, x[v]) for v, a in row]
-        size = _total([jnp.abs(b[place]), *(jnp.abs(p) for p in products)], None)
-        # Below the second term, products have lost digits to underflow.
-        fine = jnp.abs(_less(b[place], products)) <= TOLERATED * eps * size + TOLERATED / eps * tiny
-        holds = fine if holds is None else holds & fine
-    return [jnp.where(holds, v, jnp.nan) for v in x]
+def _largest(values: Sequence[Any]) -> Any:
+    return functools.reduce(jnp.maximum, [abs(v) for v in values])
 
 
 def _rows(matrix: Entries, n: int) -> list[list[tuple[int, Any]]]:

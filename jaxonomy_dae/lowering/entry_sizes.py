@@ -1,11 +1,14 @@
 """The sizes of the Jacobian's entries, for the choice of pivots when a model is compiled."""
 
+from typing import Any
+
 import numpy as np
 
 from ..model.evaluate_numpy import Networks, group_values
 from ..model.extended import Extended
 from ..model.quantities import QuantityMap, quantity_scale, start_guess
 from ..model.tables import FlatModel
+from ..model.templates import Template
 
 
 class EntrySizes:
@@ -32,9 +35,10 @@ class EntrySizes:
     def is_number(self, group: int, slot: int) -> bool:
         """Whether the entry depends on nothing, parameters included."""
         template = self.extended.groups[group].template
-        if template.opaque is not None:
-            return slot == 0
-        return template.coefficient_is_constant(slot) and bool(getattr(template.partials[slot], "is_Number", False))
+        if isinstance(template, Template):
+            partial: Any = template.partials[slot]
+            return bool(partial.is_Number)
+        return template.coefficient_is_constant(slot)
 
     def _evaluated(self, group: int) -> np.ndarray:
         chosen = self.extended.groups[group]

@@ -217,7 +217,7 @@ def _block_step(
             at = (e, slots[k])
             size = entry_sizes.of(g, k)[rows]
             entries[at] = np.maximum(entries[at], size) if at in entries else size
-            if template.n_coefficients or entry_sizes.is_number(g, k):
+            if entry_sizes.is_number(g, k):
                 numbers.add(at)
         contains.append(frozenset(slots[k] for k in inside))
         safe = set()

@@ -235,7 +235,7 @@ class Point:
                  for b in range(m)]
                 for a in range(m)
             ]  # fmt: skip
-            multiplier = solve(gram, value, positive=True)
+            multiplier = solve(gram, value, positive=True)  # of a definite matrix: scales do not matter
             moved = [
                 s - float(weight[c]) * _sum([rows[a][c] * multiplier[a] for a in range(m) if c in pattern[a]], zero)
                 for c, s in enumerate(state[:n])
@@ -250,6 +250,9 @@ class Point:
         value, pull = jax.vjp(vector, x)
         jacobian = jax.vmap(lambda e: pull(e)[0])(jnp.eye(value.shape[0], dtype=self.dtype))
         w = jnp.asarray(weight[:n], self.dtype)
+        # Each constraint in units of its gradient: multiplied by 1e9 it is projected onto alike.
+        unit = 1 / jnp.sqrt(jnp.sum(jax.lax.stop_gradient(jacobian) ** 2 * w, axis=1))
+        jacobian, value = jacobian * unit[:, None], value * unit
         multiplier = jnp.linalg.solve((jacobian * w) @ jacobian.T, value)
         return self.split(jnp.concatenate([x - w * (jacobian.T @ multiplier), rest]))
 

@@ -1,0 +1,301 @@
+"""Blocks of simultaneous equations keep their digits whatever the values, units and order of what is in them.
+
+References: closed forms, and dense solutions by NumPy of the same equations written down here.
+"""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der
+from jaxonomy_dae.library.electrical import Capacitor, Ground, Resistor, VoltageSource
+from jaxonomy_dae.linear.torn import solve_torn
+from jaxonomy_dae.linear.written_out import solve, solve_dense
+from jaxonomy_dae.structure.tearing import LINKS, Sizes, tear
+
+# --- the solver of torn blocks ------------------------------------------------------------------------------------
+
+
+def ladder_block(rs, rp):
+    """A·x = b of an attenuator between 1 V and 0 V: voltages of the nodes, series currents, shunt currents."""
+    n = len(rp)
+    a, b = np.zeros((3 * n + 1,) * 2), np.zeros(3 * n + 1)
+    for k in range(n + 1):  # v[k − 1] − v[k] = rs[k] i[k]
+        a[k, n + k] = -rs[k]
+        if k > 0:
+            a[k, k - 1] = 1
+        if k < n:
+            a[k, k] = -1
+    b[0] = -1
+    for k in range(n):
+        a[n + 1 + k, [k, 2 * n + 1 + k]] = 1, -rp[k]
+        a[2 * n + 1 + k, [n + k, n + k + 1, 2 * n + 1 + k]] = 1, -1, -1
+    return a, b
+
+
+def torn(a, numbers, bounded=True):
+    """The tearing that a compiler chooses for the values in `a`; `numbers` tells which entries are no parameters."""
+    contains = [frozenset(np.flatnonzero(row).tolist()) for row in a]
+    places = [(e, u) for e, row in enumerate(contains) for u in sorted(row)]
+    sizes = Sizes({p: np.abs(a[p])[None] for p in places}, frozenset(p for p in places if numbers[p]))
+    return tear(contains, contains, sizes if bounded else None)
+
+
+def entries(a, pattern):
+    return {(int(e), int(u)): a[e, u] for e, u in zip(*np.nonzero(pattern), strict=True)}
+
+
+def solved(tearing, pattern):
+    return jax.jit(lambda a, b: jnp.stack(solve_torn(tearing, entries(a, pattern), list(b))))
+
+
+@pytest.mark.parametrize("n", [3, pytest.param(10, marks=pytest.mark.slow)])
+def test_a_tearing_serves_parameters_it_was_not_chosen_for(n):
+    """The order of elimination is fixed for resistors of 1 Ω; then they take values over eight decades."""
+    rng = np.random.default_rng(n)
+    ones, _ = ladder_block(np.ones(n + 1), np.ones(n))
+    others, _ = ladder_block(np.full(n + 1, 2.0), np.full(n, 2.0))
+    function = solved(torn(ones, ones == others), ones != 0)
+    cases = [(np.full(n + 1, s), np.full(n, p)) for s, p in itertools.product((1e-4, 1e-2, 1.0, 1e2, 1e4), repeat=2)]
+    cases += [(10 ** rng.uniform(-4, 4, n + 1), 10 ** rng.uniform(-4, 4, n)) for _ in range(20)]
+    for rs, rp in cases:
+        a, b = ladder_block(rs, rp)
+        expected = np.linalg.solve(a, b)
+        np.testing.assert_allclose(function(a, b)[:n], expected[:n], rtol=0, atol=1e-13)
+
+
+def test_growth_is_bounded_when_a_block_is_torn():
+    n = 12
+    a, _ = ladder_block(np.full(n + 1, 100.0), np.ones(n))
+    other, _ = ladder_block(np.full(n + 1, 50.0), np.full(n, 2.0))
+    assert len(torn(a, a == other, bounded=False).tearing) == 1  # a march along the whole ladder
+    assert len(torn(a, a == other).tearing) >= n // LINKS
+
+
+def test_an_unstable_elimination_is_mended_or_loud_never_wrong():
+    """A march along ladders with growing ratios Rs/Rp: right to 1e-9 while it can be mended, then not-a-number."""
+    n = 5
+    ones, _ = ladder_block(np.ones(n + 1), np.ones(n))
+    function = solved(torn(ones, ones != 0, bounded=False), ones != 0)
+    outcomes = []
+    for ratio in 10.0 ** np.arange(0, 6):
+        a, b = ladder_block(np.full(n + 1, ratio), np.ones(n))
+        x = np.asarray(function(a, b))
+        outcomes.append("nan" if np.isnan(x).any() else np.abs(x - np.linalg.solve(a, b))[:n].max())
+    assert "nan" in outcomes  # otherwise this shows nothing
+    assert all(o == "nan" or o < 1e-9 for o in outcomes), outcomes
+    assert outcomes[0] < 1e-12 and outcomes[1] < 1e-12
+
+
+def random_block(rng, n):
+    """A sparse regular block, its solution known, its equations and unknowns in units of 1e-9 to 1e9."""
+    while True:
+        a = np.where(rng.random((n, n)) < 2.5 / n, rng.normal(size=(n, n)), 0.0)
+        a[np.arange(n), rng.permutation(n)] = rng.normal(size=n)
+        if np.linalg.cond(a) < 1e4:
+            return a
+
+
+@pytest.mark.parametrize("n", [3, 6, pytest.param(12, marks=pytest.mark.slow)])
+def test_random_blocks_in_random_units(n):
+    """The unknowns are known beforehand; each entry is scaled by its equation's and its unknown's unit."""
+    rng = np.random.default_rng(7 + n)
+    a = random_block(rng, n)
+    numbers = np.zeros(a.shape, bool)
+    function = solved(torn(a, numbers), a != 0)
+    for _ in range(30):
+        x = rng.normal(size=n)
+        rows, columns = 10.0 ** rng.uniform(-9, 9, n), 10.0 ** rng.uniform(-9, 9, n)
+        found = function(a * rows[:, None] / columns, (a @ x) * rows)
+        np.testing.assert_allclose(found / columns, x, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("n", [3, pytest.param(10, marks=pytest.mark.slow)])
+def test_derivatives_of_a_block(n):
+    """∂x/∂a = −A⁻¹ ∂A x in forward and in reverse mode, and second derivatives against differences of the first."""
+    rng = np.random.default_rng(n)
+    a, b = ladder_block(10 ** rng.uniform(-2, 2, n + 1), 10 ** rng.uniform(-2, 2, n))
+    other, _ = ladder_block(np.full(n + 1, 7.0), np.full(n, 3.0))
+    pattern = a != 0
+    tearing = torn(a, a == other)
+
+    def function(a, b):
+        return jnp.stack(solve_torn(tearing, entries(a, pattern), list(b)))
+
+    c = rng.normal(size=len(b))
+    a_dot = np.where(pattern, rng.normal(size=a.shape), 0.0) * a
+    expected = -c @ np.linalg.solve(a, a_dot @ np.linalg.solve(a, b))
+    forward = c @ jax.jvp(lambda a: function(a, b), (a,), (a_dot,))[1]
+    gradient = jax.jit(jax.grad(lambda a: c @ function(a, b)))
+    reverse = jnp.sum(gradient(a) * a_dot)
+    scale = np.abs(c) @ np.abs(np.linalg.solve(a, a_dot @ np.linalg.solve(a, b)))
+    np.testing.assert_allclose(forward, expected, rtol=0, atol=1e-12 * scale)
+    np.testing.assert_allclose(reverse, expected, rtol=0, atol=1e-12 * scale)
+    second = jax.jvp(gradient, (a,), (a_dot,))[1]
+    inverse = np.linalg.inv(a)
+    # gradient = −(A⁻ᵀ c)(A⁻¹ b)ᵀ on the pattern
+    y, x = inverse.T @ c, inverse @ b
+    exact = np.outer(inverse.T @ a_dot.T @ y, x) + np.outer(y, inverse @ a_dot @ x)
+    exact = np.where(pattern, exact, 0.0)
+    np.testing.assert_allclose(second, exact, rtol=0, atol=1e-10 * np.abs(exact).max())
+
+
+def test_batches_members_of_which_need_different_pivots():
+    n = 4
+    ones, b = ladder_block(np.ones(n + 1), np.ones(n))
+    other, _ = ladder_block(np.full(n + 1, 2.0), np.full(n, 2.0))
+    function = solved(torn(ones, ones == other), ones != 0)
+    batch = np.stack(
+        [ladder_block(np.full(n + 1, s), np.full(n, p))[0] for s, p in ((1e4, 1e-4), (1e-4, 1e4), (1.0, 1.0))]
+    )
+    found = jax.vmap(function, in_axes=(0, None))(batch, b)
+    for a, x in zip(batch, found, strict=True):
+        np.testing.assert_allclose(x[:n], np.linalg.solve(a, b)[:n], rtol=0, atol=1e-13)
+
+
+def test_a_singular_block_is_not_a_number():
+    a = np.array([[1.0, 1.0], [1.0, 1.0]])
+    function = solved(torn(a, np.zeros((2, 2), bool)), a != 0)
+    assert np.isnan(function(a, np.array([1.0, 2.0]))).all()
+
+
+@pytest.mark.parametrize("n", [2, 3, 5])
+def test_pivots_do_not_depend_on_the_scale_of_an_equation(n):
+    """Partial pivoting alone would take the row that is written in large units, whatever its pivot is worth."""
+    rng = np.random.default_rng(n)
+    for _ in range(20):
+        a, x = rng.normal(size=(n, n)), rng.normal(size=n)
+        a[0, 0] = 1e-14
+        scale = np.ones(n)
+        scale[0] = 1e18
+        exact = np.linalg.solve(a, a @ x)
+        rows, right = (a * scale[:, None]), (a @ x) * scale
+        tolerance = 1e-14 * np.linalg.cond(a) * n
+        written = solve([[jnp.asarray(v) for v in row] for row in rows], [jnp.asarray(v) for v in right])
+        np.testing.assert_allclose(jnp.stack(written), exact, rtol=0, atol=10 * tolerance)
+        np.testing.assert_allclose(
+            solve_dense(jnp.asarray(rows), jnp.asarray(right)), exact, rtol=0, atol=10 * tolerance
+        )
+
+
+# --- compiled models ----------------------------------------------------------------------------------------------
+
+
+def attenuator(n, rs=1.0, rp=1.0):
+    """n sections of the library's resistors between a source of 1 V and a capacitor at 0 V."""
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    source, ground, end = VoltageSource(ev, "V", v=1.0), Ground(ev, "G"), Capacitor(ev, "C", initial_voltage=0.0)
+    low, at = [source.n, ground.p, end.n], source.p
+    for k in range(n):
+        s, p = Resistor(ev, f"s{k}", R=rs), Resistor(ev, f"p{k}", R=rp)
+        diagram.connect(at, s.p)
+        diagram.connect(s.n, p.p)
+        low.append(p.n)
+        at = s.n
+    last = Resistor(ev, "last", R=rs)
+    diagram.connect(at, last.p)
+    diagram.connect(last.n, end.p)
+    diagram.connect(*low)
+    return AcausalCompiler(ev, diagram)()
+
+
+def node_voltages(rs, rp):
+    """Nodal analysis of the attenuator."""
+    n = len(rp)
+    g = np.diag(1 / rs[:-1] + 1 / rs[1:] + 1 / rp) - np.diag(1 / rs[1:-1], 1) - np.diag(1 / rs[1:-1], -1)
+    b = np.zeros(n)
+    b[0] = 1 / rs[0]
+    return np.linalg.solve(g, b)
+
+
+def observed(system, n):
+    return np.asarray(system.observe([f"p{k}.v" for k in range(n)], 0.0, jnp.zeros(1)))
+
+
+@pytest.mark.parametrize(("rs", "rp"), [(1.0, 1.0), (100.0, 1.0), (1.0, 100.0), (1e4, 1e-4), (1e-4, 1e4)])
+@pytest.mark.parametrize("n", [2, 12, pytest.param(40, marks=pytest.mark.slow)])
+def test_attenuators(n, rs, rp):
+    found = observed(attenuator(n, rs, rp), n)
+    np.testing.assert_allclose(found, node_voltages(np.full(n + 1, rs), np.full(n, rp)), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("n", [4, pytest.param(12, marks=pytest.mark.slow)])
+def test_parameters_changed_after_compiling(n):
+    """The tearing is that of 1 Ω everywhere; gradients against central differences of nodal analysis."""
+    rng = np.random.default_rng(n)
+    names = [f"s{k}.R" for k in range(n)] + ["last.R"] + [f"p{k}.R" for k in range(n)]
+    weights = rng.normal(size=n)
+    compiled = attenuator(n)
+
+    def voltages(values):
+        system = compiled.with_parameters(dict(zip(names, values, strict=True)))
+        v = system.observe([f"p{k}.v" for k in range(n)], 0.0, jnp.zeros(1))
+        return jnp.asarray(weights) @ v, v
+
+    cases = [np.concatenate([np.full(n + 1, s), np.full(n, p)]) for s, p in ((1e4, 1.0), (1.0, 1e4), (1e4, 1e-4))]
+    cases += [10 ** rng.uniform(-4, 4, 2 * n + 1) for _ in range(10)] + [10 ** rng.uniform(-1, 1, 2 * n + 1)]
+    function = jax.jit(jax.vmap(jax.value_and_grad(voltages, has_aux=True)))
+    (_, batch), gradients = function(jnp.array(cases))
+    for values, found in zip(cases, batch, strict=True):
+        expected = node_voltages(values[: n + 1], values[n + 1 :])
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+    values, gradient = cases[-1], gradients[-1]
+    for k in range(2 * n + 1):
+        h = np.zeros(2 * n + 1)
+        h[k] = 1e-5 * values[k]
+        up, down = values + h, values - h
+        change = node_voltages(up[: n + 1], up[n + 1 :]) - node_voltages(down[: n + 1], down[n + 1 :])
+        np.testing.assert_allclose(gradient[k], weights @ change / (2 * h[k]), rtol=1e-6, atol=1e-9)
+
+
+# --- the choice of states, and projection --------------------------------------------------------------------------
+
+
+class Levers(Component):
+    """Two rigid couplings of three carriages, written in units `u` of length and with equations multiplied by `k`."""
+
+    def __init__(self, ev, name, k=1.0, u=1.0, order=(0, 1)):
+        super().__init__(ev, name)
+        x = [self.variable(f"x{i}", start=s * u, nominal=u) for i, s in enumerate((0.3, 0.6, 1.5))]
+        v = [self.variable(f"v{i}", nominal=u) for i in range(3)]
+        f = [self.variable(f"f{i}", nominal=u) for i in range(2)]
+        self.add_equations(*(der(a) - b for a, b in zip(x, v, strict=True)))
+        self.add_equations(der(v[0]) + x[0] - 2 * f[0], der(v[1]) + f[0] - 5 * f[1], der(v[2]) + f[1])
+        constraints = [k * (2 * x[0] - x[1]), k * (5 * x[1] - 2 * x[2])]
+        self.add_equations(*(constraints[i] for i in order))
+
+
+def levers(mode, **options):
+    ev = EqnEnv()
+    diagram = AcausalDiagram()
+    diagram.add(Levers(ev, "c", **options))
+    return AcausalCompiler(ev, diagram, state_selection=mode)()
+
+
+RESCALED = ({"k": 1e9}, {"k": 1e-9}, {"k": 1e-12}, {"u": 1e-12}, {"u": 1e9}, {"k": 1e9, "u": 1e-6}, {"order": (1, 0)})
+
+
+def test_scales_and_order_do_not_choose_states():
+    plain = levers("dummy_derivatives").states
+    assert len(plain) == 2
+    for options in RESCALED:
+        assert levers("dummy_derivatives", **options).states == plain, options
+
+
+def test_projection_in_any_units():
+    """The nearest point of x1 = 2 x0, x2 = 5/2 x1 in the norm of nominal values, in closed form; more constraints than
+    the elimination written out takes would use LAPACK: both are compared."""
+    start = np.array([0.31, 0.58, 1.52])
+    along = np.array([1.0, 2.0, 5.0])
+    nearest = along * (along @ start) / (along @ along)
+    for options in ({}, *RESCALED):
+        system = levers("projection", **options)
+        u = options.get("u", 1.0)
+        place = [system.states.index(f"c.x{i}") for i in range(3)]
+        x = np.zeros(len(system.states))
+        x[place] = start * u
+        moved = np.asarray(system.project(0.0, jnp.asarray(x)))
+        np.testing.assert_allclose(moved[place] / u, nearest, rtol=1e-13, err_msg=str(options))
