@@ -17,12 +17,15 @@ import jax  # noqa: E402  (it reads XLA_FLAGS)
 FAMILIES = ("resistors", "circuits", "rods", "gears", "thermal", "pipes", "mechanisms", "descriptors")
 
 
-def attack(family: str, count: int, seed: int, moving: int = 0, show: int = 5):
-    """Judges `count` models of a family from `seed` on; every `moving`-th is integrated as well. Returns the outcomes
-    by seed."""
+def attack(family: str, count: int, seed: int, moving: int = 0, show: int = 5, units: str = ""):
+    """Judges `count` models of a family from `seed` on; every `moving`-th is integrated as well. With `units`, the
+    models are written in other units first. Returns the outcomes by seed."""
+    from . import rescaled
     from .judge import judge
 
     make = importlib.import_module(f".{family}", __package__).make
+    if units:
+        make = rescaled.family(make, units)
     outcomes = {}
     for s in range(seed, seed + count):
         case = make(s)
@@ -41,6 +44,7 @@ def main():
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--moving", type=int, default=0, help="integrate every so many-th model too (0: none)")
     parser.add_argument("--show", type=int, default=5, help="how many failures of a family are printed")
+    parser.add_argument("--units", default="", help="rescale: equations, parameters, units or all")
     given = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     families = FAMILIES if given.family == "all" else given.family.split(",")
@@ -48,7 +52,7 @@ def main():
     print(f"{'family':<12}" + "".join(f"{k:>9}" for k in kinds) + "   worst error    ms each   slowest", flush=True)
     for family in families:
         start = time.perf_counter()
-        outcomes = attack(family, given.count, given.seed, given.moving, given.show)
+        outcomes = attack(family, given.count, given.seed, given.moving, given.show, given.units)
         seconds = time.perf_counter() - start
         tally = collections.Counter(o.kind for o in outcomes.values())
         worst = max((o.error for o in outcomes.values() if o.kind == "right"), default=0.0)

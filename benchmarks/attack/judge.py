@@ -25,9 +25,12 @@ CHEAP = {
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """`kind`: 'right', 'refused' (by a named error that is true), 'untrue' (a right model refused, or an ill-posed one
-    refused for another reason), 'crashed' (by an error that is not the package's), 'late' or 'wrong'. `error` is the worst
-    error in units of what is allowed."""
+    """What became of a model.
+
+    - `kind`: 'right'; 'refused', by a named error that is true; 'untrue', a right model refused, or an ill-posed one
+        refused for another reason; 'crashed', by an error that is not the package's; 'late'; or 'wrong'.
+    - `error`: the worst error in units of what is allowed. `text`: where it was, or the error's message.
+    """
 
     kind: str
     error: float

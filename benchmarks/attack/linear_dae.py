@@ -20,8 +20,8 @@ class NoUniqueSolution(ArithmeticError):
 
 @dataclasses.dataclass(frozen=True)
 class Flow:
-    """All consistent points at a time: y = y0 + P·x and y' = d0 + Q·x for any values x of the `free` unknowns; `dy_known`
-    says which rows of y' are determined."""
+    """All consistent points at a time: y = y0 + P·x and y' = d0 + Q·x for any values x of the `free` unknowns.
+    `dy_known` says which rows of y' are determined."""
 
     free: list[int]
     y0: np.ndarray

@@ -113,7 +113,7 @@ def make(seed: int) -> Case:
             initial[f"{label[k]}.{axis}"] = float(place[k, j])
             initial[f"{label[k]}.v{axis}"] = float(v[2 * k + j])
     if rank < len(edges):
-        words = ["determine", "contradict", "singular", "redundant", "follow", "too many"]
+        words = ["depend", "determine", "contradict", "singular", "redundant", "follow", "too many"]
         return Case(ev, diagram, initial, {}, refusal=words, note=f"{note}; redundant")
     gamma = np.array([2 * np.sum((v[2 * b : 2 * b + 2] - v[2 * a : 2 * a + 2]) ** 2) for a, b in edges])
     inverse = np.repeat(1 / m[pivots:], 2)

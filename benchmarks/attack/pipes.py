@@ -1,7 +1,7 @@
 """Networks of pipes and orifices with turbulent laws, sources and tanks, whose solution is chosen first.
 
-Pressures and flows are drawn at random, and the branches' coefficients are what they must be. As the law of every branch
-rises strictly, the network has no other solution (Birkhoff & Diaz 1956).
+Pressures and flows are drawn at random, and the branches' coefficients are what they must be. As the law of every
+branch rises strictly, the network has no other solution (Birkhoff & Diaz 1956).
 """
 
 import numpy as np
@@ -105,7 +105,7 @@ def make(seed: int) -> Case:
     kinds = [("turbulent", "orifice", "mixed", "laminar")[j] for j in rng.choice(4, len(edges), p=share)]
     dp = np.array([pressure[a] - pressure[b] for a, b in edges])
     q = np.array([liter * np.sign(d) * log_uniform(rng, -1, 1) for d in dp])
-    # Nodes without reservoir, tank or supply: one of their branches, whose other end is not yet done, closes the balance.
+    # At a junction one branch, whose other end is not yet done, closes the balance.
     boundary = ["reservoir", *rng.choice(["reservoir", "tank", "supply", "junction"], n - 1, p=[0.15, 0.15, 0.1, 0.6])]
     done: set[int] = set()
     for node in rng.permutation(n).tolist():
