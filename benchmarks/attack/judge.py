@@ -58,7 +58,7 @@ def _expired(*_):
     raise TooLong
 
 
-def judge(case: Case, moving: bool = False, seconds: int = 60) -> Outcome:
+def judge(case: Case, moving: bool = False, seconds: int = 30) -> Outcome:
     """Compiles, initializes and compares; integrates as well if `moving` and the case has a motion. After so many
     seconds of processor time, it is 'late'."""
     before = signal.signal(signal.SIGVTALRM, _expired)

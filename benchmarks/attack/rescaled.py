@@ -22,8 +22,7 @@ NAME = "m"
 class Written:
     """A diagram as equations in full names: SymPy expressions in `variables[name]` and `parameters[name]`.
 
-    `starts` are expressions in parameters, with whether they are fixed; `kin` joins variables that a connection makes
-    equal, so that they have one unit."""
+    `starts` are expressions in parameters, with whether they are fixed."""
 
     variables: list[str]
     parameters: dict[str, float]
@@ -149,12 +148,8 @@ class _Whole(Component):
             name = model.variables[k]
             start, fixed = model.starts.get(name, (None, False))
             s = factors.variable[name]
-            self.variable(
-                plain(name),
-                start=None if start is None else there(start) / s,
-                fixed=fixed,
-                nominal=model.nominal[name] / s,
-            )
+            declared = {"nominal": model.nominal[name] / s} if model.nominal.get(name) else {}
+            self.variable(plain(name), start=None if start is None else there(start) / s, fixed=fixed, **declared)
         for k in rows:
             self.add_equations(factors.equation[k] * there(model.equations[k]))
 
