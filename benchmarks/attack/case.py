@@ -38,6 +38,7 @@ class Case:
     freedom: int | None = None
     refusal: Sequence[str] | None = None
     motion: "Motion | None" = None
+    t0: float = 0.0
     note: str = ""
 
 

@@ -80,8 +80,8 @@ def _judge(case: Case, moving: bool, start: float) -> Outcome:
 
     try:
         system = AcausalCompiler(case.ev, case.diagram)()
-        x = system.initialize(initial={n: jnp.asarray(v) for n, v in case.initial.items()})
-        found, rates = read(system, x, list(case.expected))
+        x = system.initialize(case.t0, initial={n: jnp.asarray(v) for n, v in case.initial.items()})
+        found, rates = read(system, x, list(case.expected), case.t0)
     except (ModelError, InitializationError, SimulationError) as error:
         text = f"{type(error).__name__}: {error}"
         is_true = case.refusal is not None and any(re.search(word, text) for word in case.refusal)
