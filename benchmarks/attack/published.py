@@ -3,7 +3,6 @@
 import sys
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxonomy_dae import AcausalCompiler
