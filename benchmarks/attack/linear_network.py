@@ -91,7 +91,7 @@ class LinearNetwork:
         if end and not np.any(forcing[1:]):
             motion = self._motion(at, x, end, largest, found)
         return Case(
-            self.ev, diagram, initial, true(found), true(rates), len(at.free), None, motion, f"{note}, size {n}"
+            self.ev, diagram, initial, true(found), true(rates), len(at.free), motion=motion, note=f"{note}, size {n}"
         )
 
     def _motion(self, at, x, end, largest, found) -> Motion:
