@@ -4,11 +4,12 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix
 import pytest
-from problems import compiled
+from problems import compiled, pendulum
 from sympy import Eq, atan
 
-from jaxonomy_dae import Component, EqnEnv, InitializationError, der, simulate
+from jaxonomy_dae import Component, EqnEnv, InitializationError, ModelError, der, simulate
 from jaxonomy_dae.initialization.initialize import find_initial, is_consistent
 from jaxonomy_dae.initialization.ladder import METHODS, Sizes, find_root
 
@@ -174,3 +175,22 @@ def test_a_run_from_an_inconsistent_start_is_no_success():
     # z² = p·x − 1 and dx/dt = −z: z falls by p/2 per time, from √(p − 1).
     np.testing.assert_allclose(z[jnp.array([0, 2])], [1.0 - 0.1, 2.0 - 0.25], rtol=1e-6)
     assert okay.tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize("solver", [optimistix.LevenbergMarquardt, optimistix.Dogleg])
+def test_a_solver_of_the_users_own(solver):
+    """y = −√(1 − x²) and its slope −x/y, by way of any Optimistix solver, loose tolerances included."""
+    system, own = pendulum(), solver(rtol=1e-6, atol=1e-6)
+
+    @jax.jit
+    def height(x):
+        return system.observe("pend.y", 0.0, system.initialize(initial={"pend.x": x, "pend.vx": 1.6}, solver=own))
+
+    value, slope = jax.value_and_grad(height)(0.6)
+    assert float(value) == pytest.approx(-0.8, rel=1e-11)
+    assert float(slope) == pytest.approx(0.75, rel=1e-9)
+
+
+def test_what_is_not_a_solver_is_refused():
+    with pytest.raises(ModelError, match=r"solver is an Optimistix root finder.*got 'lm'"):
+        pendulum().initialize(solver="lm")

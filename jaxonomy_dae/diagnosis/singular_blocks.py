@@ -19,6 +19,7 @@ import scipy.sparse.linalg
 from ..lowering.plan import SystemPlan
 from ..lowering.schedule import SparseStep, Step, StepEquation
 from ..model.evaluate_numpy import Networks, opaque_values
+from ..model.scaling import equilibrated
 from ..model.tables import ZERO, describe_equation
 from ..model.templates import LinearTemplate, OpaqueTemplate
 
@@ -291,25 +292,26 @@ def _estimate(matrix: np.ndarray) -> float:
 def _sparse_finding(plan: SystemPlan, values: _Values, step: SparseStep) -> BlockFinding | None:
     """What is wrong with a sparse block, whose unknowns are solved for on the way if it is linear."""
     n = step.n
-    place = {int(q): k for k, q in enumerate(step.unknown[0])}
-    rows, columns, entries, texts = [], [], [], []
+    column = np.full(len(values.quantities), -1)  # ZERO is −1: the last entry
+    column[step.unknown[0]] = np.arange(n)
+    texts = np.concatenate([equation.equation for equation in step.equations])
+    rows, columns, entries = [], [], []
     if not step.carried:
         values.quantities[step.unknown[0]] = 0.0
+    first = 0
     for equation in step.equations:
-        first = len(texts)
-        texts += [int(e) for e in equation.equation]
         partials = values.partials(equation)
         for k, slot in enumerate(equation.slots):
-            for i, q in enumerate(slot.quantity.tolist()):
-                if q in place:
-                    rows.append(first + i)
-                    columns.append(place[q])
-                    entries.append(partials[i, k])
-    matrix = sp.csc_array((np.array(entries, float), (rows, columns)), shape=(n, n))
+            inside = np.flatnonzero(column[slot.quantity] >= 0)
+            rows.append(first + inside)
+            columns.append(column[slot.quantity[inside]])
+            entries.append(partials[inside, k])
+        first += len(equation.equation)
+    matrix = sp.csc_array((np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))), shape=(n, n))
     if not np.isfinite(matrix.data).all():
         return None  # what is not finite has another cause than rank
-    largest = sp.diags_array(1 / (abs(matrix).max(axis=1).toarray().ravel() + TINY))
-    scaled = sp.csc_array(largest @ matrix)
+    balanced, left_scale, right_scale = equilibrated(matrix)
+    scaled = sp.csc_array(balanced)
     linalg: Any = scipy.sparse.linalg
     factors: Any = None
     condition = np.inf
@@ -321,17 +323,17 @@ def _sparse_finding(plan: SystemPlan, values: _Values, step: SparseStep) -> Bloc
         pass
     if factors is not None and not step.carried:
         residual = np.concatenate([values.residual(e) for e in step.equations])
-        values.quantities[step.unknown[0]] = factors.solve(-(largest @ residual))
+        values.quantities[step.unknown[0]] = right_scale * factors.solve(-left_scale * residual)
     if condition < ILL_CONDITIONED:
         return None
     left, right = _null_vectors(scaled)
-    left = largest @ left
     chosen = np.flatnonzero(np.abs(right) > 1e-3 * np.abs(right).max())
     dependent = np.flatnonzero(np.abs(left) > 1e-3 * np.abs(left).max())
+    left, right = left_scale * left, right_scale * right
     names = tuple(plan.quantity_name[int(step.unknown[0][k])] for k in chosen)
-    equations = tuple(dict.fromkeys(equation_text(plan, texts[k]) for k in dependent))
+    equations = tuple(dict.fromkeys(equation_text(plan, int(texts[k])) for k in dependent))
     singular = not condition < 1 / (4 * n * np.finfo(float).eps)
-    causes = _sparse_causes(plan, values, step, place, left, right) if singular else ()
+    causes = _sparse_causes(plan, values, step, column, left, right) if singular else ()
     return BlockFinding(condition, singular, n, names, equations, causes, bool(causes))
 
 
@@ -350,7 +352,7 @@ def _null_vectors(matrix: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _sparse_causes(
-    plan: SystemPlan, values: _Values, step: SparseStep, place: dict[int, int], left: np.ndarray, right: np.ndarray
+    plan: SystemPlan, values: _Values, step: SparseStep, column: np.ndarray, left: np.ndarray, right: np.ndarray
 ) -> tuple[tuple[str, float], ...]:
     """The parameters p a change of which makes the block regular: uᵀ·∂J/∂p·v ≠ 0 for the null vectors u and v."""
     effect = np.zeros(len(values.parameters))
@@ -358,13 +360,13 @@ def _sparse_causes(
     for equation in step.equations:
         u = left[first : first + len(equation.equation)]
         first += len(u)
-        columns = [np.array([place.get(int(q), -1) for q in slot.quantity]) for slot in equation.slots]
+        columns = [column[slot.quantity] for slot in equation.slots]
         v = np.stack([np.where(c >= 0, right[c], 0.0) for c in columns], axis=-1)
         before = values.partials(equation)
         for j in range(equation.parameter.shape[1]):
             p = equation.parameter[:, j]
             moved = values.parameters.copy()
-            moved[p] += 1e-3 * np.maximum(1.0, np.abs(moved[p]))
+            moved[p] += 1e-3 * np.where(moved[p] == 0, 1.0, np.abs(moved[p]))
             change = values.partials(equation, moved) - before
             np.add.at(effect, p, u * (change * v).sum(axis=1))
     size = np.abs(np.where(np.isfinite(effect), effect, np.inf))
@@ -401,7 +403,7 @@ def _causes(plan: SystemPlan, values: _Values, step: Step, b: int, left, right) 
     found: list[tuple[str, float]] = []
     for p in sorted({int(p) for e in step.equations for p in e.parameter[b]}):
         parameters = values.parameters.copy()
-        parameters[p] += 1e-3 * max(1.0, abs(parameters[p]))
+        parameters[p] += 1e-3 * (abs(parameters[p]) or 1.0)
         if matters(values.jacobian(step, parameters)[b]):
             found.append((plan.flat.parameters.names[p], float(values.parameters[p])))
     # A parameter that is not zero only scales what is: the cause is what is zero.
@@ -413,7 +415,7 @@ def _causes(plan: SystemPlan, values: _Values, step: Step, b: int, left, right) 
     sources = {int(e.slots[s].quantity[b]) for e in step.equations for s in _slots_of_partials(e)} - {ZERO}
     for q in sorted(sources):
         kept = values.quantities[q]
-        values.quantities[q] = kept + 1e-3 * max(1.0, abs(kept))
+        values.quantities[q] = kept + 1e-3 * (abs(kept) or 1.0)
         after = values.jacobian(step)[b]
         values.quantities[q] = kept
         name = plan.quantity_name[q]
@@ -430,7 +432,8 @@ def _constraints(plan: SystemPlan, values: _Values) -> Iterator[BlockFinding]:
     m = plan.n_constraints
     if not m or plan.constraint_pattern is None or m > DENSE_LIMIT:
         return
-    place = {int(q): k for k, q in enumerate(plan.states)}
+    place = np.full(len(values.quantities), -1)
+    place[plan.states] = np.arange(len(plan.states))
     matrix, texts = np.zeros((m, len(plan.states))), []
     row = 0
     for planned in plan.constraints:
@@ -444,10 +447,10 @@ def _constraints(plan: SystemPlan, values: _Values) -> Iterator[BlockFinding]:
             out = group.template.partial_values(slots, p, c, values.t, values.networks, backend="numpy")
         for k, partial in enumerate(out):
             partial = np.broadcast_to(np.asarray(partial, float), (len(group),)) * group.sign[:, k]
-            for i, q in enumerate(group.quantity[:, k].tolist()):
-                if q in place:
-                    matrix[row + i, place[q]] += partial[i]
-        texts += [equation_text(plan, int(e)) for e in group.equation]
+            where = place[group.quantity[:, k]]
+            inside = np.flatnonzero(where >= 0)
+            matrix[row + inside, where[inside]] += partial[inside]
+        texts += group.equation.tolist()
         row += len(group)
     if not np.isfinite(matrix).all():
         return
@@ -463,7 +466,9 @@ def _constraints(plan: SystemPlan, values: _Values) -> Iterator[BlockFinding]:
     names = tuple(plan.quantity_name[int(plan.states[k])] for k in states)
     singular = condition >= 1 / (4 * m * np.finfo(float).eps)
     at = tuple((name, float(values.quantities[plan.states[k]])) for name, k in zip(names, states, strict=True))
-    yield BlockFinding(float(condition), singular, m, names, tuple(texts[e] for e in dependent), at, False)
+    yield BlockFinding(
+        float(condition), singular, m, names, tuple(equation_text(plan, texts[e]) for e in dependent), at, False
+    )
 
 
 def equation_text(plan: SystemPlan, equation: int) -> str:

@@ -17,11 +17,13 @@ import numpy as np
 from jax.core import Tracer
 
 from ..errors import InitializationError
+from ..linear.least_squares import least_squares
 from ..lowering.gather import Gather, take
 from ..lowering.plan import SystemPlan
 from ..model.quantities import declared_scale, quantity_bounds
 from ..system.inputs import read_inputs
 from ..system.system_at import Point
+from .given_solver import find_root_with
 from .ladder import FAILED, Sizes, find_root, tolerance
 from .rows import InitialRows, Row, initial_rows
 
@@ -47,6 +49,7 @@ def initialize(
     inputs: Mapping[str, Any] | None,
     initial: Mapping[str, Any] | None,
     solve_for: tuple[str, ...] = (),
+    solver: Any = None,
 ) -> InitialPoint:
     """A pure function, to be used inside jit. Nothing is raised but for wrong names or counts: see `check`."""
     plan: SystemPlan = system.plan
@@ -86,17 +89,16 @@ def initialize(
     sizes = frozen(_sizes(plan, rows, given, parameters, start))
     m = n_equations + len(rows.kept)
     is_soft = np.arange(m) >= m - rows.n_soft
-    found = frozen(
-        find_root(
-            lambda w: residual(w, *settings),
-            m,
-            start,
-            sizes,
-            independent_rows(plan, rows, len(start)),
-            is_soft,
-            _bounds(system, plan, unknown),
-        )
-    )
+    core = independent_rows(plan, rows, len(start))
+
+    def function(w):
+        return residual(w, *settings)
+
+    if solver is None:
+        found = find_root(function, m, start, sizes, core, is_soft, _bounds(system, plan, unknown))
+    else:
+        found = find_root_with(solver, function, start, sizes, is_soft, core is not None or not rows.n_soft)
+    found = frozen(found)
     # Where nothing was found, there is nothing to differentiate, and the others of a batch must not notice.
     good = found.method < FAILED
     jacobian = jnp.where(good, found.jacobian, jnp.asarray(np.eye(*found.jacobian.shape), point.dtype))
@@ -116,7 +118,7 @@ def initialize(
         )
     else:
         remaining = residual(found.x, parameters, inputs, target)
-        w = found.x - _least_squares(jacobian * found.unit, jnp.where(good, remaining, 0)) * found.unit
+        w = found.x - least_squares(jacobian * found.unit, jnp.where(good, remaining, 0)) * found.unit
     full = jnp.concatenate([jnp.zeros((n_equations,), point.dtype), target])
     limit = jnp.where(is_soft, jnp.inf, found.limit)
     return InitialPoint(w[:n], w[n:], remaining, limit, full, found.method, found.evaluations, found.jacobian)
@@ -146,13 +148,13 @@ def _nearest_point(
     v = w / unit
     scaled = scale[:, None] * jacobian * unit
     remaining = rows(v, settings)
-    multiplier = -_least_squares(scaled[hard].T, scaled[soft].T @ remaining[soft])
+    multiplier = -least_squares(scaled[hard].T, scaled[soft].T @ remaining[soft])
     z = jnp.concatenate([v, multiplier])
     matrix = jax.lax.stop_gradient(jax.jacfwd(lambda z: conditions(z, settings))(z))
     matrix = jnp.where(good, matrix, jnp.asarray(np.eye(len(z)), z.dtype))
     for data in (settings, moving):
         z = jax.lax.stop_gradient(z)
-        z = z - _least_squares(matrix, jnp.where(good, conditions(z, data), 0))
+        z = z - least_squares(matrix, jnp.where(good, conditions(z, data), 0))
     w = z[: len(w)] * unit
     return w, residual(jax.lax.stop_gradient(w), moving)
 
@@ -202,17 +204,6 @@ def _bounds(system: Any, plan: SystemPlan, unknown: np.ndarray) -> np.ndarray:
     entries = np.concatenate([plan.states, plan.carried])
     free = np.tile([-np.inf, np.inf], (len(unknown), 1))
     return np.concatenate([quantity_bounds(plan.flat, plan.variable_map, plan.extended)[entries], free])
-
-
-def _least_squares(matrix: Any, right: Any) -> Any:
-    """The least-squares solution of A·x = b; the one of least norm where A leaves directions open."""
-    m, n = matrix.shape
-    scale = 1 / jnp.maximum(jnp.max(jnp.abs(matrix), axis=1, initial=0.0), float(jnp.finfo(matrix.dtype).tiny))
-    # Rows that only open directions feel: what they take from the others is far below rounding.
-    ridge = float(jnp.finfo(matrix.dtype).eps) ** 0.75
-    stacked = jnp.concatenate([scale[:, None] * matrix, jnp.asarray(ridge * np.eye(n), matrix.dtype)])
-    q, r = jnp.linalg.qr(jax.lax.stop_gradient(stacked))
-    return jax.scipy.linalg.solve_triangular(r, q[:m].T @ (scale * right))
 
 
 def independent_rows(plan: SystemPlan, rows: InitialRows, n: int) -> np.ndarray | None:
@@ -317,12 +308,13 @@ def find_initial(
     inputs: Mapping[str, Any] | None,
     initial: Mapping[str, Any] | None,
     solve_for: tuple[str, ...] = (),
+    solver: Any = None,
 ) -> InitialPoint:
     """`initialize`, compiled once for each structure where nothing is traced."""
     dtype = system.parameters.values.dtype
     inputs = read_inputs(system.inputs, dtype, inputs)
     initial = {name: jnp.asarray(v, dtype) for name, v in sorted((initial or {}).items())}
-    arguments = (system, jnp.asarray(t0, dtype), inputs, initial, solve_for)
+    arguments = (system, jnp.asarray(t0, dtype), inputs, initial, solve_for, solver)
     if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments)):
         found = _compiled(*arguments)
         # An input's function may close over a traced value, which shows in the outcome only.

@@ -24,8 +24,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-METHODS = ("the start was consistent", "Newton", "Levenberg–Marquardt", "homotopy", "the nearest point", "none")
+METHODS = (
+    "the start was consistent",
+    "Newton",
+    "Levenberg–Marquardt",
+    "homotopy",
+    "the nearest point",
+    "the solver asked for",
+    "none",
+)
 NEAREST = METHODS.index("the nearest point")
+GIVEN = METHODS.index("the solver asked for")
 FAILED = len(METHODS) - 1
 
 # Evaluations each rung may take.

@@ -4,9 +4,11 @@ Only the choice of states needs numbers before the model runs. They are computed
 model will run in, from the same templates the lowered system uses.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -56,14 +58,25 @@ def group_values(group: ExtendedGroup, values, parameters, t: float, networks: N
 
 
 def opaque_values(group: Any, slots, t, networks: Networks, partials: bool) -> np.ndarray:
-    def residual(column, time):
-        return group.template.residual(list(column), (), (), time, Networks(networks.weights))
-
     with jax.ensure_compile_time_eval():  # these are constants, also while a user's function is being traced
         values = jnp.asarray(np.stack(slots))
-        function = jax.jit(jax.vmap(jax.jacfwd(residual) if partials else residual, in_axes=(1, None)))
-        out = np.asarray(function(values, jnp.asarray(t, values.dtype)), float)
+        kernel = _opaque_kernel(group.template, partials)
+        out = np.asarray(kernel(networks.weights, values, jnp.asarray(t, values.dtype)), float)
     return out * group.sign if partials else out
+
+
+@functools.lru_cache(maxsize=256)
+def _opaque_kernel(template: Any, partials: bool) -> Callable[[Any, Any, Any], Any]:
+    """Compiled once for each template, whatever the weights."""
+
+    @eqx.filter_jit
+    def kernel(weights, values, time):
+        def residual(column):
+            return template.residual(list(column), (), (), time, Networks(weights))
+
+        return jax.vmap(jax.jacfwd(residual) if partials else residual, in_axes=1)(values)
+
+    return kernel
 
 
 def residual_and_jacobian(extended: Extended, values, parameters, t: float, networks: Networks):

@@ -231,7 +231,12 @@ class AcausalSystem(eqx.Module):
 
     @overload
     def initialize(
-        self, t0: Any = 0.0, inputs: Mapping[str, Any] | None = None, initial: Mapping[str, Any] | None = None
+        self,
+        t0: Any = 0.0,
+        inputs: Mapping[str, Any] | None = None,
+        initial: Mapping[str, Any] | None = None,
+        *,
+        solver: Any = None,
     ) -> Array: ...
 
     @overload
@@ -242,6 +247,7 @@ class AcausalSystem(eqx.Module):
         initial: Mapping[str, Any] | None = None,
         *,
         solve_for: Sequence[str],
+        solver: Any = None,
     ) -> tuple[Array, "AcausalSystem"]: ...
 
     def initialize(
@@ -251,6 +257,7 @@ class AcausalSystem(eqx.Module):
         initial: Mapping[str, Any] | None = None,
         *,
         solve_for: Sequence[str] | None = None,
+        solver: Any = None,
     ) -> Any:
         """A consistent state at `t0`: all equations, hidden ones included, and the fixed starts hold.
 
@@ -263,6 +270,9 @@ class AcausalSystem(eqx.Module):
         - `solve_for`: parameters that are unknown: as many more values as there are names must be given in `initial`
             or be fixed in components. The search starts at their present values. A rest length for which a mass is in
             equilibrium at 0.3 m: `initial={"m.x": 0.3, "m.v": 0.0, "der(m.v)": 0.0}, solve_for=["spring.length"]`.
+        - `solver`: an Optimistix root finder or least-squares solver, such as
+            `optimistix.LevenbergMarquardt(rtol=1e-8, atol=1e-8)`, instead of the ladder of methods. It sees unknowns
+            and rows divided by their sizes.
 
         **Returns:**
 
@@ -276,10 +286,13 @@ class AcausalSystem(eqx.Module):
             of equations is singular there, if the values given are too few or too many for `solve_for`, or if a
             parameter found is out of its bounds. Inside jit, what depends on values is an Equinox run-time error.
         """
+        from ..initialization.given_solver import check_solver
         from ..initialization.initialize import check, find_initial
 
         names = self._names_to_solve_for(solve_for)
-        found = find_initial(self, t0, inputs, initial, names)
+        if solver is not None:
+            check_solver(solver)
+        found = find_initial(self, t0, inputs, initial, names, solver)
         found = check(self, found, t0, inputs, initial, names)
         if solve_for is None:
             return found.x
