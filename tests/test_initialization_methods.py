@@ -196,3 +196,32 @@ def test_a_solver_of_the_users_own(solver):
 def test_what_is_not_a_solver_is_refused():
     with pytest.raises(ModelError, match=r"solver is an Optimistix root finder.*got 'lm'"):
         pendulum().initialize(solver="lm")
+
+
+class Chain(Component):
+    """Three pendula; the length of each rod but the first is 1 + λ/10, λ the multiplier of the rod before: index 7."""
+
+    def __init__(self, ev, name, heights):
+        super().__init__(ev, name)
+        length = 1.0
+        for k, height in enumerate(heights, 1):
+            x, y = self.variable(f"x{k}", start=0.5), self.variable(f"y{k}", start=height, fixed=True)
+            v, lam = self.variable(f"v{k}", start=0.0, fixed=True), self.variable(f"l{k}", start=9.0)
+            self.add_equations(
+                Eq(der(y), v), Eq(der(der(x)), -x * lam), Eq(der(v), 9.8 - y * lam), Eq(x**2 + y**2, length**2)
+            )
+            length = 1.0 + 0.1 * lam
+
+
+def test_a_chain_of_high_index_starts_one_block_after_the_other():
+    """At rest λ₁ = g·y₁ and λ₁″ = 2|a|² + g·a_y, from λ₁ = |v|² + g·y₁; λ₂·L² = g·y₂ − L·L″ with L = 1 + λ₁/10."""
+    g, y1, y2, y3 = 9.8, 0.9, 1.5, 0.5
+    first = g * y1
+    ax, ay = -first * np.sqrt(1 - y1**2), g - first * y1
+    length, bend = 1 + 0.1 * first, 0.1 * (2 * (ax**2 + ay**2) + g * ay)
+    second = (g * y2 - length * bend) / length**2
+    system = compiled(Chain(EqnEnv(), "c", (y1, y2, y3)))
+    x = system.initialize()
+    names = ["c.x1", "c.l1", "c.x2", "c.l2", "c.x3"]
+    expected = [np.sqrt(1 - y1**2), first, np.sqrt(length**2 - y2**2), second, np.sqrt((1 + 0.1 * second) ** 2 - y3**2)]
+    np.testing.assert_allclose(system.observe(names, 0.0, x), expected, rtol=1e-12)

@@ -24,8 +24,9 @@ from ..model.quantities import declared_scale, quantity_bounds
 from ..system.inputs import read_inputs
 from ..system.system_at import Point
 from .given_solver import find_root_with
-from .ladder import FAILED, Sizes, find_root, tolerance
+from .ladder import FAILED, STAGED, Sizes, find_root, tolerance
 from .rows import InitialRows, Row, initial_rows
+from .stages import solve_in_stages, stages
 
 
 class InitialPoint(NamedTuple):
@@ -94,10 +95,16 @@ def initialize(
     def function(w):
         return residual(w, *settings)
 
+    staged = None if len(unknown) else stages(plan, rows)
+    declared = start
+    if staged is not None:
+        start = frozen(solve_in_stages(function, start, sizes, *staged))
     if solver is None:
         found = find_root(function, m, start, sizes, core, is_soft, _bounds(system, plan, unknown))
     else:
         found = find_root_with(solver, function, start, sizes, is_soft, core is not None or not rows.n_soft)
+    if staged is not None:
+        found = found._replace(method=jnp.where((found.method == 0) & jnp.any(start != declared), STAGED, found.method))
     found = frozen(found)
     # Where nothing was found, there is nothing to differentiate, and the others of a batch must not notice.
     good = found.method < FAILED

@@ -31,10 +31,12 @@ METHODS = (
     "homotopy",
     "the nearest point",
     "the solver asked for",
+    "one block after the other",
     "none",
 )
 NEAREST = METHODS.index("the nearest point")
 GIVEN = METHODS.index("the solver asked for")
+STAGED = METHODS.index("one block after the other")
 FAILED = len(METHODS) - 1
 
 # Evaluations each rung may take.
@@ -184,6 +186,9 @@ def find_root(
             out = where(jnp.asarray(place == k), jnp.asarray(s, dtype), out)
         return out
 
+    def is_nearest(phase) -> Any:
+        return phase == _NEAREST if has_soft else np.zeros((), bool)  # a constant, with all that hangs on it
+
     def bounded(ahead, here) -> Any:
         """A step that goes most of the way to the bounds it would cross."""
         if limits is None:
@@ -204,15 +209,15 @@ def find_root(
         reached = jnp.all(jnp.abs(value) <= close * size)
         # Soft rows pull at the others until the last step, which carries the derivative, sets these right.
         pulled = where(hard, 0.1 * float(np.sqrt(enough)) * size, jnp.inf)
-        nearest = state.scalars[0] == _NEAREST
-        holds = jnp.all(jnp.abs(value) <= where(nearest, pulled, enough * size) + noise)
+        allowed = where(is_nearest(state.scalars[0]), pulled, enough * size) if has_soft else enough * size
+        holds = jnp.all(jnp.abs(value) <= allowed + noise)
         return advance(state, value, jacobian * unit, jnp.append(unit, one), reached, holds)
 
     def advance(state: _Machine, value, jacobian, unit, reached, holds) -> _Machine:
         s = _Scalars(*state.scalars)
         phase, fresh, arc = s.phase, s.fresh > 0, s.size
         trial, base, best, last_tangent, beginning, _ = state.points
-        nearest, marquardt = phase == _NEAREST, phase == _MARQUARDT
+        nearest, marquardt = is_nearest(phase), phase == _MARQUARDT
         descending = (phase == _NEWTON) | (phase == _POLISH) | nearest
         tracking, landing = (phase == _TRACK) | (phase == _LAND), phase == _LAND
         begins = s.begun == 0
