@@ -9,8 +9,8 @@ import dataclasses
 
 import numpy as np
 
+from ..model.linear_template import LinearTemplate
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel
-from ..model.templates import LinearTemplate
 
 Row = list[tuple[int, int, float]]  # (variable, order, coefficient)
 

@@ -13,7 +13,13 @@ import numpy as np
 import sympy
 
 from ..errors import ModelError, nearest
+from ..expressions.from_sympy import UnsupportedExpression, read, symbols_of
+from ..expressions.node import Node
+from ..expressions.to_sympy import shortened
 from ..model.dependent_parameters import complete
+from ..model.linear_template import LinearTemplate
+from ..model.opaque import OpaqueFunction, OpaqueTemplate
+from ..model.symbolic import SymbolicTemplate, canonical, linear_coefficients
 from ..model.tables import (
     DependentParameters,
     EquationGroup,
@@ -24,27 +30,19 @@ from ..model.tables import (
     Start,
     VariableTable,
 )
-from ..model.templates import (
-    AnyTemplate,
-    LinearTemplate,
-    OpaqueFunction,
-    OpaqueTemplate,
-    Template,
-    canonical,
-    linear_coefficients,
-)
+from ..model.template import AbstractTemplate
 from ..modeling.component import Component
 from ..modeling.connections import Signal
 from ..modeling.diagram import AcausalDiagram
 from ..modeling.ports import Port
-from ..modeling.symbols import ParameterSymbol, TimeSymbol, VariableSymbol
+from ..modeling.symbols import ParameterSymbol, TimeSymbol, VariableSymbol, symbol_label
 
 
 @dataclasses.dataclass
 class _Rows:
     """A group under construction."""
 
-    template: AnyTemplate
+    template: AbstractTemplate
     variable: list[np.ndarray] = dataclasses.field(default_factory=list)
     order: list[np.ndarray] = dataclasses.field(default_factory=list)
     parameter: list[np.ndarray] = dataclasses.field(default_factory=list)
@@ -58,7 +56,7 @@ class GroupBuilder:
     def __init__(self):
         self._rows: dict[str, _Rows] = {}
 
-    def add(self, template: AnyTemplate, variable, order, parameter, coefficient, origin: Sequence[str]):
+    def add(self, template: AbstractTemplate, variable, order, parameter, coefficient, origin: Sequence[str]):
         """Adds n instances: arrays of shape (n, slots), (n, slots), (n, parameters), (n, coefficients)."""
         rows = self._rows.setdefault(template.key, _Rows(template))
         n = len(origin)
@@ -204,13 +202,18 @@ def flatten(diagram: AcausalDiagram) -> FlatModel:
 
 
 def _add_components(model: _Model, builder: GroupBuilder):
+    read_once: dict[int, Any] = {}  # of an expression, by its id: equal components hold the same objects
     by_shape: dict[tuple, list[int]] = {}
     for k, c in enumerate(model.components):
         if c.equations:
-            by_shape.setdefault((tuple(c.equations), tuple(c.variables), tuple(c.parameters)), []).append(k)
-    for (equations, local_variables, local_parameters), members in by_shape.items():
+            for residual in c.equations:
+                if id(residual) not in read_once:
+                    read_once[id(residual)] = _read(residual, model.paths[k])
+            graphs = tuple(read_once[id(r)] for r in c.equations)
+            by_shape.setdefault((graphs, tuple(c.variables), tuple(c.parameters)), []).append(k)
+    for (graphs, local_variables, local_parameters), members in by_shape.items():
         position = {name: k for k, name in enumerate((*local_variables, *local_parameters))}
-        for residual in equations:
+        for graph, residual in zip(graphs, model.components[members[0]].equations, strict=True):
             # Slots follow the order of declaration, never names, so names change nothing but names.
             def rank(s, position=position, members=members):
                 # Symbols of children come after one's own, in the order the children's ids give.
@@ -219,7 +222,7 @@ def _add_components(model: _Model, builder: GroupBuilder):
                 resolve = model.variable if isinstance(s, VariableSymbol) else model.parameter
                 return (1, resolve(members[0], s.path), getattr(s, "order", 0))
 
-            symbols = residual.free_symbols
+            symbols = [s for s in symbols_of(residual) if symbol_label(s) in graph.leaves]
             for s in symbols:
                 if not isinstance(s, VariableSymbol | ParameterSymbol | TimeSymbol):
                     raise ModelError(
@@ -228,19 +231,26 @@ def _add_components(model: _Model, builder: GroupBuilder):
                     )
             variables = sorted((s for s in symbols if isinstance(s, VariableSymbol)), key=rank)
             parameters = sorted((s for s in symbols if isinstance(s, ParameterSymbol)), key=rank)
-            coefficients = linear_coefficients(residual, variables)
+            coefficients = linear_coefficients(graph, variables)
             ids = _ids(model, members, [v.path for v in variables], "variable")
             parameter_ids = _ids(model, members, [p.path for p in parameters], "parameter")
             order = np.tile([v.order for v in variables], (len(members), 1))
-            text = f"0 = {residual}"
+            text = f"0 = {shortened(residual)}"
             origin = [f"{model.paths[k]}: {text}" for k in members]
             if coefficients is None:
-                template: AnyTemplate = canonical(residual, variables, parameters)
+                template: AbstractTemplate = canonical(graph, variables, parameters)
                 builder.add(template, ids, order, parameter_ids, np.zeros((len(members), 0)), origin)
             else:
                 template = LinearTemplate(len(variables))
                 rows = np.tile(coefficients, (len(members), 1))
                 builder.add(template, ids, order, np.zeros((len(members), 0)), rows, origin)
+
+
+def _read(expression: Any, component: str) -> Node:
+    try:
+        return read(expression, symbol_label)
+    except UnsupportedExpression as error:
+        raise ModelError(f"component '{component}': 0 = {shortened(expression)}: {error}") from None
 
 
 def _ids(model: _Model, members: list[int], paths: list[str], kind: str) -> np.ndarray:
@@ -408,7 +418,7 @@ def _variable_table(model: _Model, driven: set[int]) -> VariableTable:
     default: list[float | None] = []
     is_input, is_port, fixed, nominal, bounds, owner, port, is_across = [], [], [], [], [], [], [], []
     n_ports = 0
-    expressions: dict[sympy.Expr, tuple[Template, list[str]]] = {}
+    expressions: dict[sympy.Expr, tuple[SymbolicTemplate, list[str]]] = {}
     for k, component in enumerate(model.components):
         path = model.paths[k]
         place: dict[str, tuple[int, bool]] = {}
@@ -433,7 +443,8 @@ def _variable_table(model: _Model, driven: set[int]) -> VariableTable:
                 continue
             if variable.start not in expressions:
                 symbols = sorted(variable.start.free_symbols, key=lambda s: model.parameter(k, s.path))  # type: ignore
-                expressions[variable.start] = (canonical(variable.start, (), symbols), [s.path for s in symbols])  # type: ignore
+                graph = _read(variable.start, path)
+                expressions[variable.start] = (canonical(graph, (), symbols), [s.path for s in symbols])  # type: ignore
             template, paths = expressions[variable.start]
             start.append(Start(template, tuple(model.parameter(k, p) for p in paths)))
     return VariableTable(
@@ -485,19 +496,19 @@ def _dependent_parameters(
 ) -> tuple[DependentParameters, ...]:
     """Groups of equal templates, in an order in which everything that one reads is known."""
     groups: list[DependentParameters] = []
-    known_templates: dict[sympy.Expr, Template] = {}
+    known_templates: dict[sympy.Expr, SymbolicTemplate] = {}
     left = dict(reads)
     while left:
         ready = [p for p, (_, ids) in left.items() if not any(i in left for i in ids)]
         if not ready:
             p = next(iter(left))
             raise ModelError(f"parameter '{names[p]}' is {expressions[p]}, which depends on itself")
-        rows: dict[str, tuple[Template, list[int], list[list[int]]]] = {}
+        rows: dict[str, tuple[SymbolicTemplate, list[int], list[list[int]]]] = {}
         for p in ready:
             expression, ids = left.pop(p)
             if expression not in known_templates:
                 symbols: list[Any] = sorted(expression.free_symbols, key=lambda s: s.path)  # type: ignore
-                known_templates[expression] = canonical(expression, (), symbols)
+                known_templates[expression] = canonical(_read(expression, names[p].rpartition(".")[0]), (), symbols)
             template = known_templates[expression]
             _, targets, parameters = rows.setdefault(template.key, (template, [], []))
             targets.append(p)

@@ -2,52 +2,39 @@
 
 Index reduction trusts the incidence: where the highest derivatives of several equations cancel in a linear combination,
 it stops too early (two equations with C·(y₁′ − y₂′) and C·(y₂′ − y₁′) are one differential and one algebraic equation).
-Where the coefficients are constants or parameters, the combination is found exactly: a left null vector w of a diagonal
-block of the system Jacobian, in rational functions of the parameters. The equation Σ wᵢ Fᵢ^(cᵢ − c_min), in which the
-highest derivatives are gone, replaces one of lowest cᵢ, and index reduction starts again: the linear combination method
-of Tan, Nedialkov & Pryce (2017).
+Where a diagonal block of the system Jacobian has a left null vector w that is the same wherever the model is, a number
+or a function of the parameters, the equation Σ wᵢ Fᵢ^(cᵢ − c_min), in which the highest derivatives are gone, replaces
+one of lowest cᵢ, and index reduction starts again: the linear combination method of Tan, Nedialkov & Pryce (2017).
 """
 
-import dataclasses
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 import scipy.sparse as sp
-import sympy
 from scipy.sparse.csgraph import connected_components
 
 from ..diagnosis.wording import itemised
 from ..errors import StructuralError
+from ..expressions.differentiate import partial_derivative
+from ..expressions.kernel import Kernel
+from ..expressions.node import Node, constant, number
+from ..expressions.substitute import substitute
 from ..model.incidence import incidence
-from ..model.scaling import equilibrated
 from ..model.tables import ZERO, EquationGroup, describe_equation, equation_offsets, written_by
-from ..model.templates import LinearTemplate, Template, template_of
+from ..modeling.symbols import TIME_LABEL
 from ..structure.incidence import Incidence
 from ..structure.matching import maximum_matching
 from ..structure.pantelides import Offsets, reduce_index
+from .combine_equations import combine, graph_of, group_of, near, quantity_label, somewhere
+from .null_vectors import left_null_vectors, weights_in_parameters
 
-LARGEST_BLOCK = 60
-ROUNDS = 20
-TRIALS = 4  # random points at which a block that depends on the point must be singular to be refused
+LARGEST_BLOCK = 200
+ROUNDS = 100
+TRIALS = 12  # random points, of which STATES are used: those where the equations have values
+STATES = 3
+PARAMETERS = 4  # sample values of the parameters
 COMBINED = "combination of "
 SOURCES = 4  # equations named
-
-
-@dataclasses.dataclass(frozen=True)
-class _Equation:
-    """One equation with its symbols: quantities are (variable, order), parameters ids."""
-
-    expression: Any
-    origin: str
-
-
-def _quantity(variable: int, order: int) -> sympy.Symbol:
-    return sympy.Symbol(f"v{variable}_{order}", real=True)
-
-
-def _parameter(k: int) -> sympy.Symbol:
-    # Positive: no parameter that divides is zero, and roots of squares simplify.
-    return sympy.Symbol(f"q{k}", positive=True)
 
 
 def reduce_with_cancellation(
@@ -65,12 +52,18 @@ def reduce_with_cancellation(
     signature = incidence(groups, column, n_unknown)
     for _ in range(ROUNDS):
         offsets = reduce_index(signature, least)
-        found = _singular_block(groups, signature, offsets, column, values)
-        if found is None:
+        jacobian = _Jacobian(groups, offsets, column, values)
+        replaced, added, combined = [], [], []
+        for equations in _blocks_of_several(signature, offsets):
+            found = _combination(jacobian, equations)
+            if found is not None:
+                combined = [describe_equation(groups, int(e)) for e in equations]
+                replaced.append(found[0])
+                added.append(found[1])
+        if not added:
             return groups, signature, offsets, tuple(notes)
-        combined = [describe_equation(groups, int(e)) for e in found[0]]
-        groups, note = _replace(groups, offsets, column, *found)
-        notes.append(note)
+        notes += [f"highest derivatives cancel in a {group.origin[0]}" for group in added]
+        groups = (*_without(groups, replaced), *added)
         signature = incidence(groups, column, n_unknown)
         if (maximum_matching(signature.pointer, signature.variable, n_unknown) < 0).any():
             raise StructuralError(_dependent(combined))
@@ -96,32 +89,181 @@ def _blocks(signature: Incidence, offsets: Offsets) -> tuple[np.ndarray, np.ndar
     return label, np.bincount(label)[label]
 
 
-def _singular_block(groups, signature: Incidence, offsets: Offsets, column, values):
-    """(equations, columns) of the first diagonal block of several equations with constant entries that is singular."""
+def _blocks_of_several(signature: Incidence, offsets: Offsets) -> list[np.ndarray]:
+    """The equations of each diagonal block that has more than one, up to a size."""
     label, _ = _blocks(signature, offsets)
     sizes = np.bincount(label)
-    first = equation_offsets(groups)
     order = np.argsort(label, kind="stable")
     start = np.concatenate([[0], np.cumsum(sizes)])
-    for b in np.flatnonzero((sizes > 1) & (sizes <= LARGEST_BLOCK)).tolist():
-        equations = np.sort(order[start[b] : start[b + 1]])
-        columns = offsets.matched_variable[equations]
-        for trial in range(TRIALS):
-            dense, constant = _entries(groups, first, equations, columns, offsets, column, values, trial)
-            if not _is_singular(dense):
-                break
-            if constant:
-                return equations, columns
-        else:
-            raise StructuralError(_hidden([describe_equation(groups, int(e)) for e in equations]))
-    return None
+    chosen = np.flatnonzero((sizes > 1) & (sizes <= LARGEST_BLOCK)).tolist()
+    return [np.sort(order[start[b] : start[b + 1]]) for b in chosen]
 
 
-def _is_singular(dense: np.ndarray) -> bool:
-    if not np.isfinite(dense).all():
-        return False  # nothing can be said
-    singular = np.linalg.svd(equilibrated(dense)[0].toarray(), compute_uv=False)  # units decide nothing
-    return bool(singular[-1] < 1e-12 * max(singular[0], 1.0))
+class _Jacobian:
+    """∂F_e/∂(highest derivative of a column): numbers at random points, and graphs."""
+
+    def __init__(self, groups: tuple[EquationGroup, ...], offsets: Offsets, column: np.ndarray, values: np.ndarray):
+        self.groups = groups
+        self.offsets = offsets
+        self.column = column
+        self.values = values
+        self.first = equation_offsets(groups)
+        self._partials: dict[tuple[int, int], np.ndarray] = {}
+
+    def place(self, e: int) -> tuple[int, int]:
+        """(group, row) of an equation."""
+        g = int(np.searchsorted(self.first, e, side="right") - 1)
+        return g, e - int(self.first[g])
+
+    def partials(self, g: int, trial: int) -> np.ndarray:
+        """Of all equations of a group, signs included, shape (n, slots)."""
+        if (g, trial) not in self._partials:
+            group = self.groups[g]
+            point = np.where(group.variable == ZERO, 0.0, group.sign * somewhere(group.variable, group.order, trial))
+            if group.template.opaque is not None:  # any function
+                slots = range(point.shape[1])
+                any_slopes = [np.ones(len(group)), *(somewhere(group.variable[:, 0], k, trial) for k in slots[1:])]
+                found = tuple(any_slopes)
+            else:
+                p, c = list(self.values[group.parameter].T), list(group.coefficient.T)
+                t = 0.37 + 0.1 * trial
+                found = group.template.partial_values(list(point.T), p, c, t, None, backend="numpy")
+            spread = [np.broadcast_to(np.asarray(v, float), (len(group),)) for v in found]
+            self._partials[g, trial] = np.stack(spread, axis=-1) * group.sign if spread else np.zeros(point.shape)
+        return self._partials[g, trial]
+
+    def hits(self, e: int, columns: np.ndarray) -> list[tuple[int, int]]:
+        """The slots of an equation that hold highest derivatives of these columns: (slot, position of the column)."""
+        g, i = self.place(e)
+        group = self.groups[g]
+        where = {int(c): k for k, c in enumerate(columns)}
+        found = []
+        for slot, (v, order) in enumerate(zip(group.variable[i].tolist(), group.order[i].tolist(), strict=True)):
+            j = where.get(int(self.column[v]), -1) if v != ZERO and self.column[v] >= 0 else -1
+            if j >= 0 and order + self.offsets.equation[e] == self.offsets.variable[columns[j]]:
+                found.append((slot, j))
+        return found
+
+    def at(self, equations: np.ndarray, columns: np.ndarray, trial: int) -> np.ndarray:
+        """The matrix at a random point."""
+        dense = np.zeros((len(equations), len(columns)))
+        for k, e in enumerate(equations.tolist()):
+            g, i = self.place(e)
+            for slot, j in self.hits(e, columns):
+                dense[k, j] += self.partials(g, trial)[i, slot]
+        return dense
+
+    def is_constant(self, equations: np.ndarray, columns: np.ndarray) -> bool:
+        """Whether no entry depends on the point."""
+        return all(
+            self.groups[self.place(e)[0]].template.coefficient_is_constant(slot)
+            for e in equations.tolist()
+            for slot, _ in self.hits(e, columns)
+        )
+
+
+def _combination(jacobian: _Jacobian, equations: np.ndarray) -> tuple[int, EquationGroup] | None:
+    """For a block that is singular wherever the model is: an equation of it, and what replaces that equation.
+
+    **Raises:**
+
+    - `StructuralError` if it is singular for the given parameter values alone, or in a way that depends on the point.
+    """
+    groups, offsets = jacobian.groups, jacobian.offsets
+    columns = offsets.matched_variable[equations]
+    trials, matrices = [], []
+    wanted = 1 if jacobian.is_constant(equations, columns) else STATES
+    for trial in range(TRIALS):
+        matrix = jacobian.at(equations, columns, trial)
+        if not np.isfinite(matrix).all():
+            continue  # the equations have no values there
+        if not left_null_vectors(matrix):
+            return None
+        trials.append(trial)
+        matrices.append(matrix)
+        if len(trials) == wanted:
+            break
+    if not trials:
+        return None
+    everywhere = left_null_vectors(np.hstack(matrices))
+    texts = [describe_equation(groups, int(e)) for e in equations]
+    if not everywhere:
+        raise StructuralError(_hidden(texts))
+    used = np.flatnonzero(everywhere[0])
+    c = offsets.equation[equations[used]]
+    written = []
+    for e, k in zip(equations[used].tolist(), (c - c.min()).tolist(), strict=True):
+        g, i = jacobian.place(e)
+        graph = graph_of(groups[g], i, k)
+        if graph is None:
+            raise StructuralError(_hidden(texts))
+        written.append(graph)
+    sources = [texts[k] for k in used]
+    unit = int(np.flatnonzero(c == c.min())[0])
+    top = _highest(jacobian, columns, int(c.min()))
+    found = _weights(written, top, unit, jacobian.values, trials)
+    if found is None:
+        lines = itemised([(written_by(t) or "", t) for t in sources])
+        raise StructuralError("\n".join([_FOR_THESE_VALUES, *lines]))
+    combined = combine(written, found, top, jacobian.values)
+    if combined is None:
+        raise StructuralError(_hidden(sources))
+    if not any(label[0] == "quantity" for label in combined.leaves):
+        raise StructuralError(_dependent(sources))
+    named = list(dict.fromkeys(p for t in sources for p in t.removeprefix(COMBINED).split("; ")))
+    origin = COMBINED + "; ".join([*named[:SOURCES], *(["…"] if len(named) > SOURCES else [])])
+    return int(equations[used[unit]]), group_of(combined, origin)
+
+
+_FOR_THESE_VALUES = (
+    "these equations are singular for the given parameter values, though not in general. Change the parameters, or "
+    "state the constraint that follows as an equation of its own:"
+)
+
+
+def _highest(jacobian: _Jacobian, columns: np.ndarray, lowest: int) -> list:
+    """The labels of the quantities that cancel."""
+    variable_of = {int(jacobian.column[v]): v for v in np.flatnonzero(jacobian.column >= 0).tolist()}
+    return [quantity_label(variable_of[int(j)], int(jacobian.offsets.variable[j]) - lowest) for j in columns]
+
+
+def _weights(
+    written: Sequence[Node], top: Sequence, unit: int, values: np.ndarray, trials: Sequence[int]
+) -> list[Node] | None:
+    """Weights in parameters with which the quantities `top` cancel in the equations; the one at `unit` is 1."""
+    entries = [[partial_derivative(e, label) for label in top] for e in written]
+    rows: list[list[Node]] = [[] for _ in written]
+    for trial in trials:
+        for row, given in zip(rows, entries, strict=True):
+            for graph in given:
+                point = {
+                    label: constant(float(somewhere(label[1], label[2], trial)))
+                    for label in graph.leaves
+                    if label[0] == "quantity"
+                }
+                if TIME_LABEL in graph.leaves:
+                    point[TIME_LABEL] = constant(0.37 + 0.1 * trial)
+                row.append(substitute(graph, point) if point else graph)
+    kept = [j for j in range(len(rows[0])) if any(number(row[j]) != 0 for row in rows)]
+    rows = [[row[j] for j in kept] for row in rows]
+    labels = sorted(frozenset().union(*(g.leaves for row in rows for g in row)), key=repr)
+    samples = np.array([near(values, k) for k in range(PARAMETERS if labels else 1)])
+
+    def evaluate(graphs: Sequence[Node]) -> np.ndarray:
+        found = Kernel(graphs, labels)([samples[:, label[1]] for label in labels], "numpy")
+        return np.stack([np.broadcast_to(np.asarray(v, float), (len(samples),)) for v in found])
+
+    return weights_in_parameters(rows, evaluate, unit)
+
+
+def _without(groups: tuple[EquationGroup, ...], equations: Sequence[int]) -> tuple[EquationGroup, ...]:
+    first = equation_offsets(groups)
+    out = []
+    for g, group in enumerate(groups):
+        rows = [k for k in range(len(group)) if int(first[g]) + k not in equations]
+        if rows:
+            out.append(group if len(rows) == len(group) else group.take(rows))
+    return tuple(out)
 
 
 def _hidden(origins: list[str]) -> str:
@@ -139,7 +281,7 @@ def zero_pivots(groups, signature: Incidence, offsets: Offsets, column, values) 
     found = []
     for g, group in enumerate(groups):
         template = group.template
-        if not isinstance(template, Template) or not template.n_parameters or not len(group):
+        if not template.n_parameters or not len(group):
             continue
         equation = np.arange(first[g], first[g + 1])
         alone = count[equation] == 1
@@ -151,134 +293,7 @@ def zero_pivots(groups, signature: Incidence, offsets: Offsets, column, values) 
         if not len(slots) or not all(template.coefficient_is_constant(int(k)) for k in slots):
             continue
         point = [np.ones(len(group))] * len(template.slots)
-        with np.errstate(all="ignore"):
-            partial = template.partial_values(point, list(values[group.parameter].T), [], 0.0, None, backend="numpy")
+        partial = template.partial_values(point, list(values[group.parameter].T), [], 0.0, None, backend="numpy")
         total = sum(used[:, k] * group.sign[:, k] * partial[k] for k in slots.tolist())
         found.append(equation[used.any(axis=1) & (total == 0)])
     return np.concatenate(found) if found else np.zeros(0, np.int64)
-
-
-def _entries(groups, first, equations, columns, offsets: Offsets, column, values, trial: int):
-    """(∂Fᵢ/∂(highest derivative of column j), whether these are constants); others are taken at a random point."""
-    place = {int(c): k for k, c in enumerate(columns)}
-    dense = np.zeros((len(equations), len(columns)))
-    constant = True
-    for k, e in enumerate(equations.tolist()):
-        g = int(np.searchsorted(first, e, side="right") - 1)
-        group, i = groups[g], e - int(first[g])
-        template = group.template
-        variable, order, sign = (a[i].tolist() for a in (group.variable, group.order, group.sign))
-        hit = []
-        for slot, v in enumerate(variable):
-            j = place.get(int(column[v]), -1) if v != ZERO and column[v] >= 0 else -1
-            if j >= 0 and order[slot] + offsets.equation[e] == offsets.variable[columns[j]]:
-                constant &= template.coefficient_is_constant(slot)
-                hit.append((slot, j))
-        point = [
-            0.0 if v == ZERO else s * _somewhere(v, o, trial) for v, o, s in zip(variable, order, sign, strict=True)
-        ]
-        if template.opaque is not None:
-            partial = [1.0, *(_somewhere(k, slot, trial) for slot in range(1, len(point)))]  # a network is any function
-        else:
-            with np.errstate(all="ignore"):
-                chosen, coefficient = list(values[group.parameter[i]]), list(group.coefficient[i])
-                partial = template.partial_values(point, chosen, coefficient, 0.37, None, backend="numpy")
-        for slot, j in hit:
-            dense[k, j] += sign[slot] * float(partial[slot])
-    return dense, constant
-
-
-def _somewhere(variable: int, order: int, trial: int) -> float:
-    """A number in ±(0.5, 1.5) without pattern, always the same for the same quantity."""
-    x = np.sin(12.9898 * (variable + 1) + 78.233 * (order + 1) + 37.719 * trial) * 43758.5453
-    x -= np.floor(x)
-    return float(0.5 + x if trial % 2 else -0.5 - x)
-
-
-def _symbolic(groups, e: int, times: int) -> _Equation:
-    """An equation, differentiated `times` times, in quantities and parameters."""
-    first = equation_offsets(groups)
-    g = int(np.searchsorted(first, e, side="right") - 1)
-    group, i = groups[g], e - int(first[g])
-    template = group.template
-    for _ in range(times):
-        template = template.derivative
-    values = []
-    for base, q in template.slots:
-        v = int(group.variable[i, base])
-        values.append(
-            sympy.S.Zero if v == ZERO else int(group.sign[i, base]) * _quantity(v, int(group.order[i, base]) + q)
-        )
-    if isinstance(template, LinearTemplate):
-        terms = [sympy.nsimplify(c) * s for c, s in zip(group.coefficient[i].tolist(), values, strict=True)]
-        return _Equation(sympy.Add(*terms), group.origin[i])
-    assert isinstance(template, Template)
-    symbols = template.arguments
-    replaced = dict(zip(symbols, [*values, *(_parameter(int(k)) for k in group.parameter[i])], strict=False))
-    return _Equation(template.expression.xreplace(replaced), group.origin[i])
-
-
-def _replace(groups, offsets: Offsets, column, equations, columns):
-    c = offsets.equation[equations]
-    lowest = int(c.min())
-    written = [_symbolic(groups, int(e), int(k) - lowest) for e, k in zip(equations, c, strict=True)]
-    variable_of = {int(column[v]): v for v in np.flatnonzero(column >= 0).tolist()}
-    top = [_quantity(variable_of[int(j)], int(offsets.variable[j]) - lowest) for j in columns]
-    matrix = sympy.Matrix([[sympy.diff(w.expression, t) for t in top] for w in written])
-    null = matrix.T.nullspace(simplify=True)
-    if not null:
-        lines = itemised([(written_by(w.origin) or "", w.origin) for w in written])
-        raise StructuralError(
-            "\n".join(
-                [
-                    "these equations are singular for the given parameter values, though not in general. Change the "
-                    "parameters, or state the constraint that follows as an equation of its own:",
-                    *lines,
-                ]
-            )
-        )
-    weights = list(null[0])
-    combined = sympy.Add(*(w * equation.expression for w, equation in zip(weights, written, strict=True)))
-    for symbol in sorted(combined.free_symbols, key=str):
-        if str(symbol).startswith("v") and sympy.simplify(sympy.diff(combined, symbol)) == 0:
-            combined = combined.subs(symbol, 0)
-    combined = sympy.nsimplify(combined) if combined.is_number else combined
-    used = [k for k, w in enumerate(weights) if w != 0]
-    sources = list(dict.fromkeys(p for k in used for p in written[k].origin.removeprefix(COMBINED).split("; ")))
-    origin = COMBINED + "; ".join([*sources[:SOURCES], *(["…"] if len(sources) > SOURCES else [])])
-    if not any(str(s).startswith("v") for s in combined.free_symbols):
-        raise StructuralError(_dependent([written[k].origin for k in used]))
-    replaced = next(int(equations[k]) for k in used if c[k] == lowest)
-    new = _group(combined, origin)
-    first = equation_offsets(groups)
-    g = int(np.searchsorted(first, replaced, side="right") - 1)
-    rest = [k for k in range(len(groups[g])) if k != replaced - int(first[g])]
-    kept = (*groups[:g], groups[g].take(rest), *groups[g + 1 :], new)
-    return tuple(k for k in kept if len(k)), f"highest derivatives cancel in a {origin}"
-
-
-def _group(expression: Any, origin: str) -> EquationGroup:
-    """A group of one equation from its symbolic form."""
-    quantities = sorted(
-        tuple(map(int, str(s)[1:].split("_"))) for s in expression.free_symbols if str(s).startswith("v")
-    )
-    parameters = sorted(int(str(s)[1:]) for s in expression.free_symbols if str(s).startswith("q"))
-    slots = tuple((k, 0) for k in range(len(quantities)))
-    placeholder = Template(sympy.S.Zero, slots, len(parameters))
-    replaced = dict(
-        zip(
-            [*(_quantity(*q) for q in quantities), *(_parameter(p) for p in parameters)],
-            placeholder.arguments,
-            strict=False,
-        )
-    )
-    template = template_of(expression.xreplace(replaced), slots, len(parameters))
-    return EquationGroup(
-        template,
-        np.array([[v for v, _ in quantities]], np.int64),
-        np.array([[o for _, o in quantities]], np.int64),
-        np.ones((1, len(quantities)), np.int64),
-        np.array([parameters], np.int64).reshape(1, -1),
-        np.zeros((1, 0)),
-        [origin],
-    )

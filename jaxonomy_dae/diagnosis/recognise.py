@@ -20,12 +20,11 @@ import dataclasses
 
 import numpy as np
 import scipy.sparse as sp
-import sympy
 from scipy.sparse.csgraph import connected_components
 
 from ..model.coefficients import Entries, entries_of
+from ..model.linear_template import LinearTemplate
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, written_by
-from ..model.templates import LinearTemplate, Template
 from .explain import Explainer
 from .wording import listed, words
 
@@ -273,20 +272,9 @@ def _invariant(group: EquationGroup, weight: np.ndarray) -> np.ndarray:
     rest = np.flatnonzero(~out)
     if not len(rest):
         return out
-    template, order = group.template, group.order
-    if isinstance(template, LinearTemplate):
-        terms = group.coefficient * weight
-        zero = [np.where(order == o, terms, 0.0).sum(axis=1) == 0 for o in range(int(order.max()) + 1)]
-        return np.all(zero, axis=0)
-    if isinstance(template, Template):
-        patterns, which = np.unique(np.hstack([weight[rest], order[rest]]), axis=0, return_inverse=True)
-        k = weight.shape[1]
-        fits = []
-        for pattern in patterns.tolist():
-            sums: dict[float, list] = {}
-            for partial, w, o in zip(template.partials, pattern[:k], pattern[k:], strict=True):
-                if w:
-                    sums.setdefault(o, []).append(int(w) * partial)
-            fits.append(all(sympy.Add(*terms) == 0 for terms in sums.values()))
-        out[rest] = np.array(fits)[which.ravel()]
+    unmoved = np.ones(len(rest), bool)
+    for o in np.unique(group.order[rest]).tolist():  # a function of time and its derivatives move independently
+        direction = np.where(group.order[rest] == o, weight[rest], 0).astype(np.int64)
+        unmoved &= group.template.is_unmoved(direction, group.coefficient[rest])
+    out[rest] = unmoved
     return out

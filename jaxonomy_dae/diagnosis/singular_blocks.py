@@ -10,18 +10,15 @@ import functools
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg
 
 from ..lowering.plan import SystemPlan
 from ..lowering.schedule import SparseStep, Step, StepEquation
-from ..model.evaluate_numpy import Networks, opaque_values
+from ..model.evaluate_numpy import Networks
 from ..model.scaling import equilibrated
 from ..model.tables import ZERO, describe_equation
-from ..model.templates import LinearTemplate, OpaqueTemplate
 
 DENSE_LIMIT = 200  # unknowns up to which a block gets a singular value decomposition
 ILL_CONDITIONED = 1e12
@@ -83,24 +80,12 @@ def _local(equation: StepEquation) -> list[int]:
 def _never_vanishes(equation: StepEquation) -> bool:
     """Whether the equation's only local unknown has a coefficient that is a nonzero number."""
     positions = _local(equation)
-    template = equation.template
-    if len(positions) != 1:
-        return False
-    if isinstance(template, LinearTemplate):
-        return True
-    if isinstance(template, OpaqueTemplate):
-        return positions[0] == 0
-    return bool(template.partials[positions[0]].is_number)
+    return len(positions) == 1 and equation.template.coefficient_is_number(positions[0])
 
 
 def _slots_of_partials(equation: StepEquation) -> list[int]:
     """The slots on which the equation's local partial derivatives depend."""
-    template, positions = equation.template, _local(equation)
-    if isinstance(template, LinearTemplate):
-        return []
-    if isinstance(template, OpaqueTemplate):
-        return [] if positions == [0] else list(range(len(equation.slots)))
-    return sorted({s for p in positions for s in template._partial_slots[p]})
+    return sorted(frozenset().union(*(equation.template.slots_of_partial(p) for p in _local(equation))))
 
 
 class _Values:
@@ -129,8 +114,6 @@ class _Values:
         slots = self.slots(equation)
         n = equation.parameter.shape[0]
         signs = np.stack([s.sign for s in equation.slots], axis=-1)
-        if equation.template.opaque is not None:
-            return self._opaque(equation, slots, True)
         p = list((self.parameters if parameters is None else parameters)[equation.parameter].T)
         c = list(equation.coefficient.T)
         with np.errstate(all="ignore"):
@@ -139,22 +122,10 @@ class _Values:
 
     def residual(self, equation: StepEquation) -> np.ndarray:
         slots = self.slots(equation)
-        if equation.template.opaque is not None:
-            return self._opaque(equation, slots, False)
         p, c = list(self.parameters[equation.parameter].T), list(equation.coefficient.T)
         with np.errstate(all="ignore"):
             out = equation.template.residual(slots, p, c, self.t, self.networks, backend="numpy")
         return np.broadcast_to(np.asarray(out, float), (equation.parameter.shape[0],))
-
-    def _opaque(self, equation: StepEquation, slots, partials: bool) -> np.ndarray:
-        @dataclasses.dataclass
-        class Group:
-            template: Any
-            sign: np.ndarray
-
-        group = Group(equation.template, np.stack([s.sign for s in equation.slots], axis=-1))
-        slots = [np.broadcast_to(s, (equation.parameter.shape[0],)) for s in slots]
-        return opaque_values(group, slots, self.t, self.networks, partials)
 
     def jacobian(self, step: Step, parameters: np.ndarray | None = None) -> np.ndarray:
         """Of a step's n blocks, shape (n, k, k)."""
@@ -173,11 +144,7 @@ class _Values:
             (k,) = [k for k in _local(equation) if equation.slots[k].local == u]
             slots, n = self.slots(equation), step.n
             p, c = list(self.parameters[equation.parameter].T), list(equation.coefficient.T)
-            time: Any = self.t
-            if equation.template.opaque is not None:
-                slots, time = [jnp.asarray(s) for s in slots], jnp.asarray(self.t)
-            with np.errstate(all="ignore"), jax.ensure_compile_time_eval():
-                out = equation.template.solve(k, slots, p, c, time, self.networks, backend="numpy")
+            out = equation.template.solve(k, slots, p, c, self.t, self.networks, backend="numpy")
             self.quantities[step.unknown[u]] = np.broadcast_to(np.asarray(out, float), (n,)) * equation.slots[k].sign
 
     def solve(self, step: Step):

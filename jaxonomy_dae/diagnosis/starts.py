@@ -10,9 +10,9 @@ import numpy as np
 from ..errors import StructuralError
 from ..model.evaluate_numpy import start_values
 from ..model.extended import Extended
+from ..model.linear_template import LinearTemplate
 from ..model.quantities import QuantityMap
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel
-from ..model.templates import LinearTemplate
 from ..structure.dulmage_mendelsohn import dulmage_mendelsohn
 from ..structure.incidence import Incidence, compress
 from ..structure.matching import maximum_matching

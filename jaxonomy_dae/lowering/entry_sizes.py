@@ -1,14 +1,11 @@
 """The sizes of the Jacobian's entries, for the choice of pivots when a model is compiled."""
 
-from typing import Any
-
 import numpy as np
 
 from ..model.evaluate_numpy import Networks, group_values
 from ..model.extended import Extended
 from ..model.quantities import QuantityMap, quantity_scale, start_guess
 from ..model.tables import FlatModel
-from ..model.templates import Template
 
 
 class EntrySizes:
@@ -34,11 +31,7 @@ class EntrySizes:
 
     def is_number(self, group: int, slot: int) -> bool:
         """Whether the entry depends on nothing, parameters included."""
-        template = self.extended.groups[group].template
-        if isinstance(template, Template):
-            partial: Any = template.partials[slot]
-            return bool(partial.is_Number)
-        return template.coefficient_is_constant(slot)
+        return self.extended.groups[group].template.coefficient_is_number(slot)
 
     def _evaluated(self, group: int) -> np.ndarray:
         chosen = self.extended.groups[group]

@@ -12,9 +12,9 @@ from ..compiler.select_states import StateSelection
 from ..errors import ModelError, nearest
 from ..linear.sparse import SparsePattern
 from ..model.extended import Extended, ExtendedGroup
+from ..model.opaque import OpaqueFunction
 from ..model.quantities import QuantityMap
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel
-from ..model.templates import OpaqueFunction
 from . import pattern
 from .gather import Gather
 from .program import Program

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..compiler.order_blocks import Blocks
 from ..model.extended import Extended, ExtendedGroup
-from ..model.templates import AnyTemplate
+from ..model.template import AbstractTemplate
 from ..structure.tearing import Sizes, Tearing, tear
 from .entry_sizes import EntrySizes
 
@@ -37,7 +37,7 @@ class SlotSource:
 class StepEquation:
     """One equation of a step."""
 
-    template: AnyTemplate
+    template: AbstractTemplate
     slots: tuple[SlotSource, ...]
     parameter: np.ndarray  # (n, parameters)
     coefficient: np.ndarray  # (n, coefficients)

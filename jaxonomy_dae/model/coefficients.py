@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 
 from .tables import ZERO, EquationGroup
-from .templates import LinearTemplate, Template
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,18 +23,6 @@ class Entries:
         )  # fmt: skip
 
 
-def _numbers(group: EquationGroup) -> np.ndarray:
-    """∂(residual)/∂(slot's variable), shape (n, slots), NaN where it is no number."""
-    template = group.template
-    n, k = group.variable.shape
-    if isinstance(template, LinearTemplate):
-        return group.coefficient * group.sign
-    if isinstance(template, Template):
-        values = [float(p) if p.is_Number else np.nan for p in template.partials]  # pyright: ignore
-        return np.broadcast_to(values, (n, k)) * group.sign if k else np.zeros((n, 0))
-    return np.broadcast_to([1.0, *[np.nan] * (k - 1)], (n, k)) * group.sign
-
-
 def entries_of(groups: tuple[EquationGroup, ...], unknown: np.ndarray) -> Entries:
     rows, variables, orders, coefficients = [], [], [], []
     first = 0
@@ -46,7 +33,7 @@ def entries_of(groups: tuple[EquationGroup, ...], unknown: np.ndarray) -> Entrie
         rows.append(np.broadcast_to(np.arange(first, first + n)[:, None], (n, k))[used])
         variables.append(group.variable[used])
         orders.append(group.order[used])
-        coefficients.append(_numbers(group)[used])
+        coefficients.append((group.template.numbers(group.coefficient) * group.sign)[used])
         first += n
     row, variable, order = (np.concatenate(a) if a else np.zeros(0, np.int64) for a in (rows, variables, orders))
     return Entries(row, variable, order, np.concatenate(coefficients) if coefficients else np.zeros(0), first)

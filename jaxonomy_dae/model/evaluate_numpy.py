@@ -4,19 +4,15 @@ Only the choice of states needs numbers before the model runs. They are computed
 model will run in, from the same templates the lowered system uses.
 """
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
 
 from .extended import Extended, ExtendedGroup
+from .opaque import OpaqueFunction
 from .tables import ZERO
-from .templates import OpaqueFunction
 
 
 class Networks:
@@ -47,36 +43,11 @@ def group_values(group: ExtendedGroup, values, parameters, t: float, networks: N
     p = list(parameters[group.parameter].T)
     c = list(group.coefficient.T)
     n = len(group)
-    with np.errstate(all="ignore"):
-        if group.template.opaque is not None:
-            return opaque_values(group, slots, t, networks, partials)
-        if partials:
-            out = group.template.partial_values(slots, p, c, t, networks, backend="numpy")
-            return np.stack([np.broadcast_to(np.asarray(x, float), (n,)) for x in out], axis=-1) * group.sign
-        out = group.template.residual(slots, p, c, t, networks, backend="numpy")
-        return np.broadcast_to(np.asarray(out, float), (n,))
-
-
-def opaque_values(group: Any, slots, t, networks: Networks, partials: bool) -> np.ndarray:
-    with jax.ensure_compile_time_eval():  # these are constants, also while a user's function is being traced
-        values = jnp.asarray(np.stack(slots))
-        kernel = _opaque_kernel(group.template, partials)
-        out = np.asarray(kernel(networks.weights, values, jnp.asarray(t, values.dtype)), float)
-    return out * group.sign if partials else out
-
-
-@functools.lru_cache(maxsize=256)
-def _opaque_kernel(template: Any, partials: bool) -> Callable[[Any, Any, Any], Any]:
-    """Compiled once for each template, whatever the weights."""
-
-    @eqx.filter_jit
-    def kernel(weights, values, time):
-        def residual(column):
-            return template.residual(list(column), (), (), time, Networks(weights))
-
-        return jax.vmap(jax.jacfwd(residual) if partials else residual, in_axes=1)(values)
-
-    return kernel
+    if partials:
+        out = group.template.partial_values(slots, p, c, t, networks, backend="numpy")
+        return np.stack([np.broadcast_to(np.asarray(x, float), (n,)) for x in out], axis=-1) * group.sign
+    out = group.template.residual(slots, p, c, t, networks, backend="numpy")
+    return np.broadcast_to(np.asarray(out, float), (n,))
 
 
 def residual_and_jacobian(extended: Extended, values, parameters, t: float, networks: Networks):

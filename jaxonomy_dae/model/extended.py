@@ -11,7 +11,7 @@ import numpy as np
 
 from ..structure.incidence import compress
 from .tables import ZERO
-from .templates import AnyTemplate
+from .template import AbstractTemplate
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Quantities:
 class ExtendedGroup:
     """Instances of one template at one level of differentiation; slots are quantities (ZERO: constant zero)."""
 
-    template: AnyTemplate
+    template: AbstractTemplate
     equation: np.ndarray  # extended equation numbers (n,)
     base: np.ndarray  # the equation as written that each comes from (n,)
     level: int

@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 
 from ..modeling.interval import Interval
+from .opaque import OpaqueFunction
 from .pickling import functions_by_name, named_functions
-from .templates import AnyTemplate, OpaqueFunction, Template
+from .symbolic import SymbolicTemplate
+from .template import AbstractTemplate
 
 ZERO = -1
 
@@ -61,7 +63,7 @@ class PortTable:
 class Start:
     """A start value: an expression in parameters, as a template without slots, and the parameters it reads."""
 
-    template: Template
+    template: SymbolicTemplate
     parameters: tuple[int, ...]
 
 
@@ -69,7 +71,7 @@ class Start:
 class DependentParameters:
     """Parameters computed from others by one template without slots: one row for each."""
 
-    template: Template
+    template: SymbolicTemplate
     target: np.ndarray  # (n,)
     parameter: np.ndarray  # (n, parameters of the template)
 
@@ -93,7 +95,7 @@ class ParameterTable:
 class EquationGroup:
     """All instances of one template: instance i's slot k is sign[i, k]·(variable[i, k])^(order[i, k])."""
 
-    template: AnyTemplate
+    template: AbstractTemplate
     variable: np.ndarray
     order: np.ndarray
     sign: np.ndarray

@@ -6,7 +6,8 @@ from typing import Any
 import sympy
 
 from ..errors import ModelError
-from .symbols import ENVIRONMENT_TIME, TIME, VariableSymbol
+from ..expressions.from_sympy import symbols_of
+from .symbols import VariableSymbol
 
 
 @functools.lru_cache(maxsize=4096)
@@ -24,6 +25,6 @@ def residual_of(equation: Any) -> sympy.Expr:
         raise ModelError(f"{equation!r} is not an equation")
     if residual.has(sympy.I):
         raise ModelError(f"the equation {equation} has a complex coefficient: write its real and imaginary part as two")
-    if not any(isinstance(s, VariableSymbol) for s in residual.free_symbols):
+    if not any(isinstance(s, VariableSymbol) for s in symbols_of(residual)):
         raise ModelError(f"the equation {equation} contains no variable")
-    return residual.xreplace({ENVIRONMENT_TIME: TIME})  # pyright: ignore[reportReturnType]
+    return residual

@@ -7,11 +7,15 @@ symbol means is decided when the diagram is flattened, by integers. What a compo
 """
 
 import functools
+from collections.abc import Hashable
 from typing import Any
 
 import sympy
 
 from ..errors import ModelError
+from ..expressions.differentiate import directional_derivative, raised
+from ..expressions.from_sympy import UnsupportedExpression, read, symbols_of
+from ..expressions.to_sympy import shortened, write
 
 
 class VariableSymbol(sympy.Symbol):
@@ -71,8 +75,17 @@ class EnvironmentTime(TimeSymbol):
         raise ModelError("`diff` by ev.t does not see that variables change in time: write der(x), der(x * y), …")
 
 
-TIME = TimeSymbol()  # in templates, where a derivative by it is a partial derivative
 ENVIRONMENT_TIME = EnvironmentTime()
+TIME_LABEL = ("time",)
+
+
+def symbol_label(symbol: sympy.Symbol) -> Hashable:
+    """The label of a symbol in expression graphs."""
+    if isinstance(symbol, VariableSymbol):
+        return ("variable", symbol.path, symbol.order)
+    if isinstance(symbol, ParameterSymbol):
+        return ("parameter of", symbol.path)
+    return TIME_LABEL if isinstance(symbol, TimeSymbol) else ("symbol", symbol.name)
 
 
 def seen_from_child(value: Any) -> Any:
@@ -115,14 +128,20 @@ def der(expression: Any) -> Any:
     expression = sympy.sympify(expression)
     if isinstance(expression, VariableSymbol):
         return VariableSymbol(expression.path, expression.order + 1)
-    partial = sympy.diff(expression.xreplace({ENVIRONMENT_TIME: TIME}), TIME)
-    total = partial.xreplace({TIME: ENVIRONMENT_TIME})
-    for symbol in sorted(expression.free_symbols, key=lambda s: s.sort_key()):
+    symbols = {symbol_label(s): s for s in symbols_of(expression)}
+    moved = {}
+    for label, symbol in symbols.items():
         if isinstance(symbol, VariableSymbol):
-            total += sympy.diff(expression, symbol) * VariableSymbol(symbol.path, symbol.order + 1)
+            above = VariableSymbol(symbol.path, symbol.order + 1)
+            moved[label] = symbol_label(above)
+            symbols = symbols | {symbol_label(above): above}
         elif not isinstance(symbol, ParameterSymbol | TimeSymbol):
             raise ModelError(
-                f"der({expression}): the symbol '{symbol}' was declared by no component. "
+                f"der({shortened(expression)}): the symbol '{symbol}' was declared by no component. "
                 "Use the symbols that `self.variable(...)` and `self.parameter(...)` return."
             )
-    return total
+    try:
+        slope = directional_derivative(read(expression, symbol_label), raised(moved, TIME_LABEL))
+    except UnsupportedExpression as error:
+        raise ModelError(f"der({shortened(expression)}): {error}") from None
+    return write(slope, symbols.__getitem__)

@@ -1,0 +1,131 @@
+"""A linear combination of equations, in which some quantities cancel, as a new equation."""
+
+from collections.abc import Hashable, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..expressions.differentiate import partial_derivative
+from ..expressions.kernel import Kernel
+from ..expressions.node import ZERO as ZERO_NODE
+from ..expressions.node import Node, constant, leaf, linear, multiply, scale
+from ..expressions.substitute import substitute
+from ..model.linear_template import LinearTemplate
+from ..model.symbolic import SymbolicTemplate, parameter_label, slot_label, template_of
+from ..model.tables import ZERO, EquationGroup
+from ..modeling.symbols import TIME_LABEL
+from .null_vectors import CANCELLED
+
+POINTS = 4
+
+
+def quantity_label(variable: int, order: int) -> Hashable:
+    return ("quantity", variable, order)
+
+
+def somewhere(variable: Any, order: Any, trial: int) -> Any:
+    """Numbers in ±(0.5, 1.5) without pattern, always the same for the same quantity and trial."""
+    x = np.sin(12.9898 * (np.asarray(variable) + 1) + 78.233 * (np.asarray(order) + 1) + 37.719 * trial) * 43758.5453
+    x = 0.5 + x - np.floor(x)
+    return x if trial % 2 else -x
+
+
+def near(values: np.ndarray, trial: int) -> np.ndarray:
+    """Other parameter values of the same signs; those given for trial 0."""
+    if trial == 0:
+        return values
+    factor = 0.25 + np.abs(somewhere(np.arange(len(values)), 3, trial))
+    return np.where(values == 0, factor, values * factor)
+
+
+def graph_of(group: EquationGroup, i: int, times: int) -> Node | None:
+    """Equation i of a group, differentiated `times` times, in quantities and the model's parameters; None for a
+    function that is evaluated in JAX only."""
+    template = group.template
+    for _ in range(times):
+        template = template.derivative
+    slots = {}
+    for base, q in template.slots:
+        v = int(group.variable[i, base])
+        placed = leaf(quantity_label(v, int(group.order[i, base]) + q))
+        slots[slot_label((base, q))] = ZERO_NODE if v == ZERO else scale(int(group.sign[i, base]), placed)
+    if isinstance(template, LinearTemplate):
+        return linear(zip(map(_exact, group.coefficient[i].tolist()), slots.values(), strict=True))
+    if not isinstance(template, SymbolicTemplate):
+        return None
+    parameters = {parameter_label(k): leaf(("of model", int(p))) for k, p in enumerate(group.parameter[i])}
+    return substitute(template.graph, slots | parameters)
+
+
+def _exact(value: float) -> int | float:
+    return int(value) if float(value).is_integer() and abs(value) < 1e15 else value
+
+
+class Samples:
+    """Values of graphs at random points: quantities anywhere, parameters near those given."""
+
+    def __init__(self, graphs: Sequence[Node], values: np.ndarray):
+        labels = sorted(frozenset().union(*(g.leaves for g in graphs)), key=repr)
+        self._labels = labels
+        self._points = [[self._value(label, values, k) for label in labels] for k in range(3 * POINTS)]
+
+    @staticmethod
+    def _value(label, values: np.ndarray, trial: int) -> float:
+        if label[0] == "quantity":
+            return float(somewhere(label[1], label[2], trial))
+        return 0.37 + 0.1 * trial if label == TIME_LABEL else float(near(values, trial // 3)[label[1]])
+
+    def __call__(self, graphs: Sequence[Node]) -> np.ndarray:
+        """Shape (graphs, points)."""
+        columns = list(np.array(self._points).T) if self._labels else []
+        n = len(self._points)
+        found = Kernel(graphs, self._labels)(columns, "numpy")
+        return np.stack([np.broadcast_to(np.asarray(v, float), (n,)) for v in found])
+
+
+def combine(
+    equations: Sequence[Node], weights: Sequence[Node], gone: Sequence[Hashable], values: np.ndarray
+) -> Node | None:
+    """Σ weight·equation without the quantities that cancel; None if those in `gone` do not."""
+    terms = [multiply(w, e) for w, e in zip(weights, equations, strict=True)]
+    total = linear((1, t) for t in terms)
+    quantities = sorted(
+        (label for label in frozenset().union(*(e.leaves for e in equations)) if label[0] == "quantity"), key=repr
+    )
+    samples = Samples([*equations, *weights], values)
+    cancelled = []
+    for label in quantities:
+        slopes = samples([multiply(w, partial_derivative(e, label)) for w, e in zip(weights, equations, strict=True)])
+        finite = np.isfinite(slopes).all(axis=0)
+        small = np.abs(slopes.sum(axis=0)) <= CANCELLED * np.abs(slopes).sum(axis=0)
+        if finite.any() and small[finite].all():
+            cancelled.append(label)
+    if not set(gone) <= set(cancelled) | (set(gone) - set(quantities)):
+        return None
+    before = samples(terms)
+    for value in (0, 1, 0.7):
+        rest = substitute(total, {label: constant(value) for label in cancelled})
+        after = samples([rest])[0]
+        finite = np.isfinite(before).all(axis=0)
+        same = np.abs(after - before.sum(axis=0)) <= 1e-9 * np.abs(before).sum(axis=0)
+        if finite.any() and same[finite].all():
+            return rest
+    return None
+
+
+def group_of(graph: Node, origin: str) -> EquationGroup:
+    """A group of one equation."""
+    quantities = sorted(label[1:] for label in graph.leaves if label[0] == "quantity")
+    parameters = sorted(label[1] for label in graph.leaves if label[0] == "of model")
+    replaced = {quantity_label(*q): leaf(slot_label((k, 0))) for k, q in enumerate(quantities)}
+    replaced |= {("of model", p): leaf(parameter_label(k)) for k, p in enumerate(parameters)}
+    slots = tuple((k, 0) for k in range(len(quantities)))
+    return EquationGroup(
+        template_of(substitute(graph, replaced), slots, len(parameters)),
+        np.array([[v for v, _ in quantities]], np.int64),
+        np.array([[o for _, o in quantities]], np.int64),
+        np.ones((1, len(quantities)), np.int64),
+        np.array([parameters], np.int64).reshape(1, -1),
+        np.zeros((1, 0)),
+        [origin],
+    )

@@ -1,0 +1,126 @@
+"""Left null vectors of matrices that are known at sample points.
+
+A square block of the system Jacobian is singular wherever the model is if some w(p) ≠ 0 has wᵀJ(x, p) = 0 for all
+states x. Given the block's entries as graphs and as numbers at several states, w is found from the matrices of all
+states side by side; whether it depends on the parameters p, from their values at other parameters. What counts as zero
+is decided by size relative to the terms that cancel, so no unit and no rounding of coefficients matters.
+"""
+
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+
+import numpy as np
+
+from ..expressions.node import ONE, ZERO, Node, Number, constant, divide, linear, multiply, scale
+
+DEFICIENT = 1e-11  # singular values below, of an equilibrated matrix, are examined
+CANCELLED = 1e-11  # of the terms: a sum this small is zero
+LARGEST_DENOMINATOR = 1000
+
+
+def equilibrated(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The matrix with rows and columns scaled to a largest entry near 1 (Ruiz 2001), and the row scales."""
+    rows = np.ones(matrix.shape[0])
+    scaled = matrix
+    for _ in range(6):
+        r = np.sqrt(np.abs(scaled).max(axis=1, initial=0.0))
+        c = np.sqrt(np.abs(scaled).max(axis=0, initial=0.0))
+        r, c = np.where(r > 0, r, 1.0), np.where(c > 0, c, 1.0)
+        scaled = scaled / r[:, None] / c
+        rows = rows / r
+    return scaled, rows
+
+
+def cancels(weights: np.ndarray, matrix: np.ndarray) -> bool:
+    """Whether wᵀA = 0, to rounding of the terms of every column."""
+    terms = weights[:, None] * matrix
+    return bool((np.abs(terms.sum(axis=0)) <= CANCELLED * np.abs(terms).sum(axis=0)).all())
+
+
+def left_null_vectors(matrix: np.ndarray) -> list[np.ndarray]:
+    """Vectors w with wᵀA = 0, each with an entry 1 where the others have none; fewest entries first."""
+    scaled, rows = equilibrated(matrix)
+    u, s, _ = np.linalg.svd(scaled, full_matrices=True)
+    s = np.append(s, np.zeros(matrix.shape[0]))[: matrix.shape[0]]
+    null = u[:, s <= DEFICIENT * max(s[0], 1e-300)].T.copy()
+    chosen: list[int] = []
+    for k in range(len(null)):  # Gauss–Jordan elimination with complete pivoting
+        r, c = np.unravel_index(np.argmax(np.abs(null[k:])), null[k:].shape)
+        null[[k, k + int(r)]] = null[[k + int(r), k]]
+        null[k] /= null[k, c]
+        others = np.arange(len(null)) != k
+        null[others] -= np.outer(null[others, c], null[k])
+        chosen.append(int(c))
+    null[np.abs(null) < 1e-8] = 0.0
+    found = [w * rows / rows[c] for w, c in zip(null, chosen, strict=True)]
+    found = [w for w in found if cancels(w, matrix)]
+    return sorted(found, key=lambda w: (np.count_nonzero(w), *np.flatnonzero(w).tolist()))
+
+
+def rational(value: float) -> Number:
+    """The simple fraction that a number rounds, if there is one."""
+    simple = Fraction(value).limit_denominator(LARGEST_DENOMINATOR)
+    return simple if abs(float(simple) - value) <= 1e-11 * abs(value) else value
+
+
+def weights_in_parameters(
+    graphs: Sequence[Sequence[Node]], values: Callable[[Sequence[Node]], np.ndarray], unit: int
+) -> list[Node] | None:
+    """w(p) with w[unit] = 1 and wᵀA(p) = 0, in graphs; None if there is none.
+
+    **Arguments:**
+
+    - `graphs`: the entries of A, by rows; their leaves are parameters.
+    - `values`: of graphs, at sample parameters: shape (graphs, samples).
+    """
+    m, n = len(graphs), len(graphs[0])
+    numbers = values([g for row in graphs for g in row]).reshape(m, n, -1)
+    if not np.isfinite(numbers).all():
+        return None
+    samples = [left_null_vectors(numbers[:, :, k]) for k in range(numbers.shape[2])]
+    if any(len(found) != 1 or found[0][unit] == 0 for found in samples):
+        return None
+    weights = np.array([found[0] / found[0][unit] for found in samples])
+    if (np.abs(weights - weights[0]) <= 1e-10 * np.abs(weights[0])).all():
+        return [constant(rational(float(w))) for w in weights[0]]
+    return _solved(graphs, numbers, values, unit)
+
+
+def _solved(graphs, numbers: np.ndarray, values, unit: int) -> list[Node] | None:
+    """By elimination: Σ_{i ≠ unit} wᵢ Aᵢⱼ = −A_unit,j, the pivots chosen by size at the first sample."""
+    others = [k for k in range(len(graphs)) if k != unit]
+    # Rows are the equations of this system, one for each column j of A; the last entry is the right-hand side.
+    table = [[graphs[i][j] for i in others] + [scale(-1, graphs[unit][j])] for j in range(len(graphs[0]))]
+    size = np.array([[np.abs(numbers[i, j]) for i in others] + [np.abs(numbers[unit, j])] for j in range(len(table))])
+    order: list[tuple[int, int]] = []
+    free_rows, free_columns = set(range(len(table))), set(range(len(others)))
+    while free_columns:
+        current = values([g for row in table for g in row]).reshape(len(table), len(others) + 1, -1)
+        candidates = [
+            (abs(current[r, c, 0]) / max(size[r, :, 0].max(), 1e-300), -r, -c)
+            for r in free_rows
+            for c in free_columns
+            if (np.abs(current[r, c]) > CANCELLED * size[r, c]).all()
+        ]
+        if not candidates:
+            return None
+        _, r, c = max(candidates)
+        r, c = -r, -c
+        order.append((r, c))
+        free_rows.discard(r)
+        free_columns.discard(c)
+        for k in range(len(table)):
+            if k == r or table[k][c] is ZERO:
+                continue
+            factor = divide(table[k][c], table[r][c])
+            ratio = np.abs(current[k, c] / current[r, c])
+            size[k] = size[k] + ratio * size[r]
+            row = [linear([(1, a), (-1, multiply(factor, b))]) for a, b in zip(table[k], table[r], strict=True)]
+            updated = values(row)
+            small = (np.abs(updated) <= CANCELLED * size[k]).all(axis=1)
+            table[k] = [ZERO if s or j == c else g for j, (g, s) in enumerate(zip(row, small, strict=True))]
+    weights: list[Node] = [ZERO] * len(graphs)
+    weights[unit] = ONE
+    for r, c in order:
+        weights[others[c]] = divide(table[r][-1], table[r][c])
+    return weights

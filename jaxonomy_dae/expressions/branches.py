@@ -1,0 +1,84 @@
+"""Where the nodes of a graph are needed: the conditions under which a value reaches the results.
+
+A node that stands only in a branch is not needed where another branch is taken. There its value may be infinite or not
+a number, and so may its derivative, which a product with zero does not remove. The kernels put a harmless argument in
+its place, so that values and derivatives of any order, forward and reverse, never see it.
+"""
+
+from collections.abc import Sequence
+
+from .functions import TABLE
+from .node import Node, postorder
+
+Literal = tuple[Node, bool]
+Needed = frozenset[frozenset[Literal]]  # a union of intersections of conditions and their negations
+
+ALWAYS: Needed = frozenset([frozenset()])
+NEVER: Needed = frozenset()
+LARGEST = 32  # intersections, above which a node counts as always needed
+
+
+def is_partial(node: Node) -> bool:
+    """Whether the node or its derivatives are infinite, or not a number, for some arguments."""
+    if node.operation == "product":
+        return any(not isinstance(e, int) or e < 0 for e in node.data)
+    if node.operation == "power":
+        return True
+    return node.operation in TABLE and any(s is not None for s in TABLE[node.operation].safe)
+
+
+def needed_where(roots: Sequence[Node]) -> dict[Node, Needed]:
+    """The conditions under which each node below the roots is needed."""
+    order = postorder(roots)
+    if not any(n.operation == "select" for n in order):
+        return dict.fromkeys(order, ALWAYS)
+    needed: dict[Node, Needed] = dict.fromkeys(order, NEVER)
+    for root in roots:
+        needed[root] = ALWAYS
+    for node in reversed(order):
+        here = needed[node]
+        if node.operation == "select":
+            condition, yes, no = node.arguments
+            needed[condition] = _union(needed[condition], here)
+            needed[yes] = _union(needed[yes], _within(here, (condition, True)))
+            needed[no] = _union(needed[no], _within(here, (condition, False)))
+        else:
+            for argument in node.arguments:
+                needed[argument] = _union(needed[argument], here)
+    return needed
+
+
+def _within(needed: Needed, literal: Literal) -> Needed:
+    opposite = (literal[0], not literal[1])
+    return frozenset(parts | {literal} for parts in needed if opposite not in parts)
+
+
+def _union(a: Needed, b: Needed) -> Needed:
+    if a is b or not b:
+        return a
+    return _shortened(a | b) if a else b
+
+
+def _shortened(needed: Needed) -> Needed:
+    """The same union with fewer intersections: c ∧ p or ¬c ∧ p is p, and p or p ∧ q is p."""
+    parts = set(needed)
+    changed = True
+    while changed and len(parts) > 1:
+        changed = False
+        for part in sorted(parts, key=len):
+            if any(other < part for other in parts):
+                parts.discard(part)
+                changed = True
+                break
+            merged = None
+            for condition, holds in part:
+                rest = part - {(condition, holds)}
+                if rest | {(condition, not holds)} in parts:
+                    merged = rest, rest | {(condition, not holds)}
+                    break
+            if merged is not None:
+                parts -= {part, merged[1]}
+                parts.add(merged[0])
+                changed = True
+                break
+    return frozenset(parts) if len(parts) <= LARGEST else ALWAYS

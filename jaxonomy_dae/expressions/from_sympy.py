@@ -1,0 +1,251 @@
+"""Reads SymPy expressions into graphs."""
+
+from collections.abc import Callable, Hashable, Sequence
+from fractions import Fraction
+from typing import Any
+
+import sympy
+from sympy.codegen import cfunctions
+
+from .functions import apply, polygamma
+from .node import (
+    FALSE,
+    ONE,
+    TRUE,
+    Node,
+    add,
+    both,
+    compare,
+    constant,
+    divide,
+    either,
+    leaf,
+    linear,
+    multiply,
+    negate,
+    power,
+    select,
+)
+
+
+class UnsupportedExpression(Exception):
+    """What an expression contains that cannot be evaluated: a sentence."""
+
+
+def symbols_of(expression: Any) -> set[sympy.Symbol]:
+    """The symbols of an expression, found in time linear in its size."""
+    seen: set[int] = set()
+    out = set()
+    stack = [expression]
+    while stack:
+        e = stack.pop()
+        if id(e) in seen:
+            continue
+        seen.add(id(e))
+        if isinstance(e, sympy.Symbol):
+            out.add(e)
+        else:
+            stack.extend(e.args)
+    return out
+
+
+def read(expression: Any, label: Callable[[Any], Hashable]) -> Node:
+    """The graph of a SymPy expression; a symbol becomes the leaf `label(symbol)`.
+
+    **Raises:**
+
+    - `UnsupportedExpression` naming what cannot be evaluated.
+    """
+    known: dict[int, Node] = {}
+    stack: list[tuple[Any, bool]] = [(expression, False)]
+    while stack:
+        e, finished = stack.pop()
+        if id(e) in known:
+            continue
+        inside = _inside(e)
+        if finished or not inside:
+            known[id(e)] = leaf(label(e)) if isinstance(e, sympy.Symbol) else _read(e, [known[id(a)] for a in inside])
+        else:
+            stack.append((e, True))
+            stack.extend((a, False) for a in inside if id(a) not in known)
+    return known[id(expression)]
+
+
+def _inside(e: Any) -> Sequence[Any]:
+    if isinstance(e, sympy.Piecewise):
+        return [part for pair in e.args for part in pair.args]
+    if isinstance(e, sympy.Integral | sympy.Sum | sympy.Product | sympy.Derivative | sympy.Subs):
+        raise UnsupportedExpression(f"{type(e).__name__} cannot be evaluated: write out its value")
+    return e.args
+
+
+def _read(e: Any, inside: list[Node]) -> Node:
+    if isinstance(e, sympy.Integer):
+        return constant(int(e))
+    if isinstance(e, sympy.Rational):
+        return constant(Fraction(int(e.p), int(e.q)))
+    if e is sympy.zoo or e is sympy.nan:
+        raise UnsupportedExpression(f"it contains {e}, the result of a division by zero")
+    if e is sympy.I:
+        raise UnsupportedExpression("it contains the imaginary unit I, but equations are between real numbers")
+    if isinstance(e, sympy.Number | sympy.NumberSymbol):
+        return constant(float(e))
+    if e == sympy.true:
+        return TRUE
+    if e == sympy.false:
+        return FALSE
+    kind = type(e)
+    if kind in _NAMED:
+        return apply(_NAMED[kind], *inside)
+    if kind in _WRITTEN:
+        return _WRITTEN[kind](*inside)
+    if isinstance(e, sympy.besseli) and e.args[0] in (0, 1):
+        return apply(f"besseli{e.args[0]}", inside[1])
+    if isinstance(e, sympy.polygamma) and isinstance(e.args[0], sympy.Integer):
+        return polygamma(int(e.args[0]), inside[1])
+    if isinstance(e, sympy.core.function.AppliedUndef):
+        raise UnsupportedExpression(
+            f"{e.func} is a function without a definition: declare a variable, or put a JAX function into the "
+            "equations with self.function(...)"
+        )
+    raise UnsupportedExpression(
+        f"the function {kind.__name__} cannot be evaluated in JAX: put a JAX function into the equations with "
+        "self.function(...)"
+    )
+
+
+def _reciprocal(name: str) -> Callable[[Node], Node]:
+    return lambda u: power(apply(name, u), -1)
+
+
+def _of_reciprocal(name: str) -> Callable[[Node], Node]:
+    return lambda u: apply(name, power(u, -1))
+
+
+def _folded(name: str) -> Callable[..., Node]:
+    def fold(*arguments: Node) -> Node:
+        total = arguments[0]
+        for argument in arguments[1:]:
+            total = apply(name, total, argument)
+        return total
+
+    return fold
+
+
+def _piecewise(*parts: Node) -> Node:
+    value = constant(float("nan"))
+    for branch, condition in reversed(list(zip(parts[::2], parts[1::2], strict=True))):
+        value = select(condition, branch, value)
+    return value
+
+
+def _log(u: Node, base: Node | None = None) -> Node:
+    return apply("log", u) if base is None else divide(apply("log", u), apply("log", base))
+
+
+def _factorial(u: Node) -> Node:
+    return apply("gamma", linear([(1, u)], 1))
+
+
+def _beta(a: Node, b: Node | None = None) -> Node:
+    b = a if b is None else b
+    logs = [(1, apply("loggamma", a)), (1, apply("loggamma", b)), (-1, apply("loggamma", add(a, b)))]
+    return apply("exp", linear(logs))
+
+
+def _frac(u: Node) -> Node:
+    return linear([(1, u), (-1, apply("floor", u))])
+
+
+def _exclusive_or(*conditions: Node) -> Node:
+    total = FALSE
+    for c in conditions:
+        total = either(both(total, negate(c)), both(negate(total), c))
+    return total
+
+
+def _log_to(base: int) -> Callable[[Node], Node]:
+    return lambda u: divide(apply("log", u), apply("log", constant(base)))
+
+
+_NAMED = {
+    sympy.exp: "exp",
+    sympy.sin: "sin",
+    sympy.cos: "cos",
+    sympy.tan: "tan",
+    sympy.asin: "asin",
+    sympy.acos: "acos",
+    sympy.atan: "atan",
+    sympy.sinh: "sinh",
+    sympy.cosh: "cosh",
+    sympy.tanh: "tanh",
+    sympy.asinh: "asinh",
+    sympy.acosh: "acosh",
+    sympy.atanh: "atanh",
+    sympy.erf: "erf",
+    sympy.erfc: "erfc",
+    sympy.erfinv: "erfinv",
+    sympy.gamma: "gamma",
+    sympy.loggamma: "loggamma",
+    sympy.sinc: "sinc",
+    sympy.Abs: "abs",
+    sympy.sign: "sign",
+    sympy.floor: "floor",
+    sympy.ceiling: "ceiling",
+    sympy.atan2: "atan2",
+    sympy.Mod: "mod",
+    cfunctions.expm1: "expm1",
+    cfunctions.log1p: "log1p",
+    cfunctions.hypot: "hypot",
+}
+
+_WRITTEN: dict[Any, Callable[..., Node]] = {
+    sympy.Add: add,
+    sympy.Mul: multiply,
+    sympy.Pow: power,
+    sympy.log: _log,
+    sympy.Max: _folded("max"),
+    sympy.Min: _folded("min"),
+    sympy.Piecewise: _piecewise,
+    sympy.Heaviside: lambda u, at_zero: apply("heaviside", u, at_zero),
+    sympy.frac: _frac,
+    sympy.factorial: _factorial,
+    sympy.beta: _beta,
+    sympy.binomial: lambda n, k: divide(_factorial(n), multiply(_factorial(k), _factorial(linear([(1, n), (-1, k)])))),
+    sympy.erf2: lambda a, b: linear([(1, apply("erf", b)), (-1, apply("erf", a))]),
+    sympy.erfcinv: lambda u: apply("erfinv", linear([(-1, u)], 1)),
+    sympy.digamma: lambda u: polygamma(0, u),
+    sympy.trigamma: lambda u: polygamma(1, u),
+    sympy.cot: _reciprocal("tan"),
+    sympy.sec: _reciprocal("cos"),
+    sympy.csc: _reciprocal("sin"),
+    sympy.coth: _reciprocal("tanh"),
+    sympy.sech: _reciprocal("cosh"),
+    sympy.csch: _reciprocal("sinh"),
+    sympy.acot: _of_reciprocal("atan"),
+    sympy.asec: _of_reciprocal("acos"),
+    sympy.acsc: _of_reciprocal("asin"),
+    sympy.acoth: _of_reciprocal("atanh"),
+    sympy.asech: _of_reciprocal("acosh"),
+    sympy.acsch: _of_reciprocal("asinh"),
+    sympy.And: both,
+    sympy.Or: either,
+    sympy.Not: negate,
+    sympy.Xor: _exclusive_or,
+    sympy.ITE: lambda c, a, b: either(both(c, a), both(negate(c), b)),
+    sympy.Lt: lambda a, b: compare("less", a, b),
+    sympy.Gt: lambda a, b: compare("less", b, a),
+    sympy.Le: lambda a, b: compare("less_equal", a, b),
+    sympy.Ge: lambda a, b: compare("less_equal", b, a),
+    sympy.Eq: lambda a, b: compare("equal", a, b),
+    sympy.Ne: lambda a, b: negate(compare("equal", a, b)),
+    sympy.re: lambda u: u,
+    sympy.conjugate: lambda u: u,
+    sympy.KroneckerDelta: lambda a, b: select(compare("equal", a, b), ONE, constant(0)),
+    cfunctions.exp2: lambda u: power(constant(2), u),
+    cfunctions.log2: _log_to(2),
+    cfunctions.log10: _log_to(10),
+    cfunctions.Sqrt: lambda u: power(u, Fraction(1, 2)),
+    cfunctions.Cbrt: lambda u: power(u, Fraction(1, 3)),
+    cfunctions.fma: lambda a, b, c: add(multiply(a, b), c),
+}

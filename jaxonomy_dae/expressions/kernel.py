@@ -1,0 +1,200 @@
+"""Kernels: graphs evaluated in NumPy or in JAX, each shared node once."""
+
+from collections.abc import Callable, Hashable, Sequence
+from fractions import Fraction
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from .branches import ALWAYS, is_partial, needed_where
+from .functions import TABLE
+from .node import Node, postorder
+
+_BACKENDS: dict[str, Any] = {"numpy": np, "jax": jnp}
+_Operation = Callable[..., Any]
+
+
+class Kernel:
+    """A function of the leaves' values, in the order of `labels`, that returns one value for each root.
+
+    In NumPy everything is float64: what is not real is not a number, never complex.
+    """
+
+    def __init__(self, roots: Sequence[Node], labels: Sequence[Hashable]):
+        position = {label: k for k, label in enumerate(labels)}
+        needed = needed_where(roots)
+        guard = {n: needed[n] for n in needed if needed[n] != ALWAYS and is_partial(n)}
+
+        def before(node: Node):
+            conditions = {c for part in guard.get(node, ()) for c, _ in part}
+            return (*node.arguments, *sorted(conditions, key=lambda c: c.digest))
+
+        order = postorder(roots, before)
+        place = {n: k for k, n in enumerate(order)}
+        self._leaves = [(place[n], position[n.data]) for n in order if n.operation == "leaf"]
+        self._constants = [(place[n], _constant(n)) for n in order if n.operation in ("constant", "true", "false")]
+        self._steps = [
+            (
+                place[n],
+                n,
+                tuple(place[a] for a in n.arguments),
+                [[(place[c], holds) for c, holds in sorted(p, key=_by_digest)] for p in _sorted(guard.get(n, ()))],
+            )
+            for n in order
+            if n.operation not in ("leaf", "constant", "true", "false")
+        ]
+        self._results = [place[r] for r in roots]
+        self._compiled: dict[str, list] = {}
+
+    def _operations(self, backend: str) -> list:
+        if backend not in self._compiled:
+            xp = _BACKENDS[backend]
+            self._compiled[backend] = [
+                (k, _operation(node, xp, backend), arguments, guard, _safe(node))
+                for k, node, arguments, guard in self._steps
+            ]
+        return self._compiled[backend]
+
+    def __call__(self, values: Sequence[Any], backend: str = "jax") -> list[Any]:
+        if backend == "numpy":
+            with np.errstate(all="ignore"):
+                return self._run([np.asarray(v, float) for v in values], backend)
+        return self._run(values, backend)
+
+    def _run(self, values: Sequence[Any], backend: str) -> list[Any]:
+        xp = _BACKENDS[backend]
+        found: list[Any] = [None] * (len(self._leaves) + len(self._constants) + len(self._steps))
+        for k, position in self._leaves:
+            found[k] = values[position]
+        for k, value in self._constants:
+            found[k] = value
+        for k, function, arguments, guard, safe in self._operations(backend):
+            inside = [found[a] for a in arguments]
+            if guard:
+                active = _active(found, guard)
+                inside = [
+                    v if s is None or isinstance(v, float) else xp.where(active, v, s)
+                    for v, s in zip(inside, safe, strict=True)
+                ]
+            found[k] = function(*inside)
+        return [found[r] for r in self._results]
+
+
+def _by_digest(literal):
+    return literal[0].digest
+
+
+def _sorted(needed: Any) -> list:
+    return sorted(needed, key=lambda part: sorted((c.digest, holds) for c, holds in part))
+
+
+def _active(found: list[Any], guard: list) -> Any:
+    """Whether the node is needed: a union of intersections."""
+    total = None
+    for part in guard:
+        inside = None
+        for k, holds in part:
+            literal = found[k] if holds else ~found[k]
+            inside = literal if inside is None else inside & literal
+        total = inside if total is None else total | inside
+    return total
+
+
+def _constant(node: Node) -> Any:
+    if node.operation != "constant":
+        return np.bool_(node.operation == "true")
+    return float(node.data)
+
+
+def _safe(node: Node) -> tuple[float | None, ...]:
+    if node.operation == "product":
+        return tuple(None if isinstance(e, int) and e > 0 else 1.0 for e in node.data)
+    if node.operation == "power":
+        return (1.0, 1.0)
+    return TABLE[node.operation].safe if node.operation in TABLE else (None,) * len(node.arguments)
+
+
+def _operation(node: Node, xp: Any, backend: str) -> _Operation:
+    operation = node.operation
+    if operation == "sum":
+        return _sum(*node.data)
+    if operation == "product":
+        return _product(node.data, xp)
+    if operation in TABLE:
+        return getattr(TABLE[operation], backend)
+    return {
+        "power": xp.power,
+        "select": xp.where,
+        "less": lambda a, b: xp.less(a, b),
+        "less_equal": lambda a, b: xp.less_equal(a, b),
+        "equal": lambda a, b: xp.equal(a, b),
+        "not": lambda a: ~a,
+        "and": _all,
+        "or": _any,
+    }[operation]
+
+
+def _all(*conditions: Any) -> Any:
+    total = conditions[0]
+    for c in conditions[1:]:
+        total = total & c
+    return total
+
+
+def _any(*conditions: Any) -> Any:
+    total = conditions[0]
+    for c in conditions[1:]:
+        total = total | c
+    return total
+
+
+def _sum(start: Any, coefficients: Sequence[Any]) -> _Operation:
+    start = float(start)
+    # A positive term first, so that no sign is changed for nothing.
+    order = sorted(range(len(coefficients)), key=lambda k: coefficients[k] < 0)
+    scaled = [(k, float(coefficients[k])) for k in order]
+
+    begins = start != 0 and scaled[0][1] == -1  # start − x rather than −x + start
+
+    def function(*terms: Any) -> Any:
+        total = start if begins else None
+        for k, c in scaled:
+            term = terms[k]
+            if total is None:
+                total = term if c == 1 else -term if c == -1 else c * term
+            elif c == 1:
+                total = total + term
+            elif c == -1:
+                total = total - term
+            else:
+                total = total + c * term
+        return total if begins or start == 0 else total + start
+
+    return function
+
+
+def _product(exponents: Sequence[Any], xp: Any) -> _Operation:
+    def raised(base: Any, exponent: Any) -> Any:
+        if exponent == 1:
+            return base
+        if isinstance(exponent, int):
+            return base**exponent
+        if exponent == Fraction(1, 2):
+            return xp.sqrt(base)
+        return xp.power(base, float(exponent))
+
+    def function(*bases: Any) -> Any:
+        over, under = None, None
+        for base, exponent in zip(bases, exponents, strict=True):
+            if exponent > 0:
+                value = raised(base, exponent)
+                over = value if over is None else over * value
+            else:
+                value = raised(base, -exponent)
+                under = value if under is None else under * value
+        if under is None:
+            return over
+        return (1.0 if over is None else over) / under
+
+    return function

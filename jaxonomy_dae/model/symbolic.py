@@ -1,0 +1,133 @@
+"""Templates of equations written as expressions, and how these become templates."""
+
+import functools
+import math
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..expressions.differentiate import directional_derivative, partial_derivative, raised
+from ..expressions.kernel import Kernel
+from ..expressions.node import ONE, ZERO, Node, constant, divide, leaf, linear, number, scale, split
+from ..expressions.substitute import substitute
+from ..modeling.symbols import TIME_LABEL, ParameterSymbol, VariableSymbol, symbol_label
+from .template import AbstractTemplate, Slot
+
+
+def slot_label(slot: Slot) -> Hashable:
+    return ("slot", *slot)
+
+
+def parameter_label(k: int) -> Hashable:
+    return ("parameter", k)
+
+
+class SymbolicTemplate(AbstractTemplate):
+    """An expression in slots, parameters and time; its `graph` has the leaves labelled by the functions above."""
+
+    n_coefficients = 0
+
+    def __init__(self, graph: Node, slots: tuple[Slot, ...], n_parameters: int):
+        self.graph = graph
+        self.slots = slots
+        self.n_parameters = n_parameters
+        self.key = f"{graph.digest.hex()}|{slots}|{n_parameters}"
+        self._labels = [*map(slot_label, slots), *map(parameter_label, range(n_parameters)), TIME_LABEL]
+        self._kernels: dict[Any, Kernel] = {}
+
+    @functools.cached_property
+    def partials(self) -> tuple[Node, ...]:
+        """∂(residual)/∂(slot) for each slot."""
+        return tuple(partial_derivative(self.graph, slot_label(s)) for s in self.slots)
+
+    @functools.cached_property
+    def derivative(self) -> "SymbolicTemplate":
+        moved = {slot_label(s): slot_label((s[0], s[1] + 1)) for s in self.slots}
+        total = directional_derivative(self.graph, raised(moved, TIME_LABEL))
+        slots = sorted({*self.slots, *((b, q + 1) for b, q in self.slots)})
+        return template_of(total, tuple(s for s in slots if slot_label(s) in total.leaves), self.n_parameters)
+
+    @functools.cached_property
+    def _slots_of_partials(self) -> tuple[frozenset[int], ...]:
+        position = {slot_label(s): k for k, s in enumerate(self.slots)}
+        return tuple(frozenset(position[f] for f in p.leaves if f in position) for p in self.partials)
+
+    def slots_of_partial(self, position: int) -> frozenset[int]:
+        return self._slots_of_partials[position]
+
+    def coefficient_is_constant(self, position: int) -> bool:
+        return not self._slots_of_partials[position] and TIME_LABEL not in self.partials[position].leaves
+
+    def coefficient_is_number(self, position: int) -> bool:
+        return number(self.partials[position]) not in (None, 0)
+
+    def coefficient_never_vanishes(self, position: int) -> bool:
+        if not self.coefficient_is_constant(position):
+            return False
+        factor, rest = split(self.partials[position])
+        if factor == 0:
+            return False
+        return (
+            rest is ONE
+            or rest.operation == "leaf"
+            or (rest.operation == "product" and all(b.operation == "leaf" for b in rest.arguments))
+        )
+
+    def numbers(self, coefficients: np.ndarray) -> np.ndarray:
+        values = [number(p) for p in self.partials]
+        row = np.array([np.nan if v is None else float(v) for v in values])
+        return np.broadcast_to(row, (len(coefficients), len(self.slots)))
+
+    def is_unmoved(self, direction: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+        patterns, which = np.unique(direction, axis=0, return_inverse=True)
+        zero = [linear(zip(p, self.partials, strict=True)) is ZERO for p in patterns.tolist()]
+        return np.array(zero, bool)[which.ravel()]
+
+    def _evaluate(self, key: Any, graphs: Callable[[], Sequence[Node]], slots, parameters, t, backend: str) -> list:
+        if key not in self._kernels:
+            self._kernels[key] = Kernel(graphs(), self._labels)
+        return self._kernels[key]([*slots, *parameters, t], backend)
+
+    def residual(self, slots, parameters, coefficients, t, networks, backend="jax") -> Any:
+        return self._evaluate("residual", lambda: [self.graph], slots, parameters, t, backend)[0]
+
+    def partial_values(self, slots, parameters, coefficients, t, networks, backend="jax") -> tuple:
+        return tuple(self._evaluate("partials", lambda: self.partials, slots, parameters, t, backend))
+
+    def solve(self, position: int, slots, parameters, coefficients, t, networks, backend="jax") -> Any:
+        def solved() -> list[Node]:
+            rest = substitute(self.graph, {slot_label(self.slots[position]): constant(0)})
+            return [scale(-1, divide(rest, self.partials[position]))]
+
+        return self._evaluate(("solve", position), solved, slots, parameters, t, backend)[0]
+
+
+@functools.lru_cache(maxsize=4096)
+def template_of(graph: Node, slots: tuple[Slot, ...], n_parameters: int) -> SymbolicTemplate:
+    """The one template of this canonical residual."""
+    return SymbolicTemplate(graph, slots, n_parameters)
+
+
+def canonical(
+    residual: Node, variables: Sequence[VariableSymbol], parameters: Sequence[ParameterSymbol]
+) -> SymbolicTemplate:
+    """The template of a residual in symbols: slot k stands for variables[k], parameter k for parameters[k]."""
+    replaced = {symbol_label(v): leaf(slot_label((k, 0))) for k, v in enumerate(variables)}
+    replaced |= {symbol_label(p): leaf(parameter_label(k)) for k, p in enumerate(parameters)}
+    slots = tuple((k, 0) for k in range(len(variables)))
+    return template_of(substitute(residual, replaced), slots, len(parameters))
+
+
+def linear_coefficients(residual: Node, variables: Sequence[VariableSymbol]) -> tuple[float, ...] | None:
+    """The coefficients of a residual that is a linear form in its variables with numeric coefficients, else None."""
+    if residual.operation == "sum":
+        start, terms = residual.data[0], zip(residual.arguments, residual.data[1], strict=True)
+    else:
+        start, terms = 0, [(residual, 1)]
+    found = {node.data: float(c) for node, c in terms if node.operation == "leaf"}
+    labels = [symbol_label(v) for v in variables]
+    if start != 0 or not variables or not all(math.isfinite(c) for c in found.values()):
+        return None
+    inside = len(found) == len(residual.arguments or (residual,)) and set(found) == set(labels)
+    return tuple(found[label] for label in labels) if inside else None

@@ -1,0 +1,78 @@
+"""Templates: canonical residuals with slots.
+
+An equation of the model is a template and a row of integers that fill its slots. All symbolic work — derivatives,
+partial derivatives, solving for a slot, compilation — is done once per distinct equation shape.
+
+A slot is a pair (base, q): the q-th time derivative of what stands in base slot `base`. A template as written has the
+slots (0, 0), (1, 0), …; its derivative has slots with higher q too.
+"""
+
+import abc
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+Slot = tuple[int, int]
+
+
+class AbstractTemplate(abc.ABC):
+    """One residual shape, and all that can be asked of it.
+
+    Values are given as lists: of slots in the order of `slots`, of parameters, of coefficients; each a scalar or an
+    array over instances, of one shape. `backend` is "jax" or "numpy". `networks` evaluates opaque functions.
+    """
+
+    slots: tuple[Slot, ...]
+    n_parameters: int
+    n_coefficients: int
+    key: str  # equal for equal templates
+    opaque: Any = None  # the function that is evaluated in JAX only, if any
+
+    @property
+    @abc.abstractmethod
+    def derivative(self) -> "AbstractTemplate":
+        """The template of the residual's time derivative."""
+
+    @abc.abstractmethod
+    def residual(self, slots, parameters, coefficients, t, networks, backend="jax") -> Any:
+        """The residual's value."""
+
+    @abc.abstractmethod
+    def partial_values(self, slots, parameters, coefficients, t, networks, backend="jax") -> tuple:
+        """The values of ∂(residual)/∂(slot), one for each slot."""
+
+    @abc.abstractmethod
+    def solve(self, position: int, slots, parameters, coefficients, t, networks, backend="jax") -> Any:
+        """The value of the slot at `position` for which the residual, affine in it, is zero; the value given there is
+        not read."""
+
+    @abc.abstractmethod
+    def slots_of_partial(self, position: int) -> frozenset[int]:
+        """The positions of the slots on which ∂(residual)/∂(slot at `position`) depends."""
+
+    @abc.abstractmethod
+    def coefficient_is_constant(self, position: int) -> bool:
+        """Whether ∂(residual)/∂(slot) depends on parameters and numbers only."""
+
+    @abc.abstractmethod
+    def coefficient_is_number(self, position: int) -> bool:
+        """Whether ∂(residual)/∂(slot) is a number other than zero."""
+
+    @abc.abstractmethod
+    def coefficient_never_vanishes(self, position: int) -> bool:
+        """Whether ∂(residual)/∂(slot) is a nonzero number or a product of parameters, safe to divide by."""
+
+    @abc.abstractmethod
+    def numbers(self, coefficients: np.ndarray) -> np.ndarray:
+        """∂(residual)/∂(slot) where it is a number, else NaN: shape (n, slots), for coefficients of n instances."""
+
+    @abc.abstractmethod
+    def is_unmoved(self, direction: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+        """Whether Σ direction·∂(residual)/∂(slot) is zero wherever the slots are; `direction` are integers of shape
+        (n, slots), the result has shape (n,)."""
+
+    def is_affine_in(self, positions: Sequence[int]) -> bool:
+        """Whether the residual is affine, jointly, in the slots at these positions."""
+        chosen = frozenset(positions)
+        return all(self.slots_of_partial(k).isdisjoint(chosen) for k in positions)
