@@ -32,8 +32,8 @@ class UnsupportedExpression(Exception):
     """What an expression contains that cannot be evaluated: a sentence."""
 
 
-def symbols_of(expression: Any) -> set[sympy.Symbol]:
-    """The symbols of an expression, found in time linear in its size."""
+def atoms_of(expression: Any) -> set:
+    """The symbols and numbers of an expression, found in time linear in its size."""
     seen: set[int] = set()
     out = set()
     stack = [expression]
@@ -42,11 +42,16 @@ def symbols_of(expression: Any) -> set[sympy.Symbol]:
         if id(e) in seen:
             continue
         seen.add(id(e))
-        if isinstance(e, sympy.Symbol):
-            out.add(e)
-        else:
+        if e.args:
             stack.extend(e.args)
+        else:
+            out.add(e)
     return out
+
+
+def symbols_of(expression: Any) -> set[sympy.Symbol]:
+    """The symbols of an expression."""
+    return {a for a in atoms_of(expression) if isinstance(a, sympy.Symbol)}
 
 
 def read(expression: Any, label: Callable[[Any], Hashable]) -> Node:

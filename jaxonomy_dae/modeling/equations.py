@@ -6,7 +6,7 @@ from typing import Any
 import sympy
 
 from ..errors import ModelError
-from ..expressions.from_sympy import symbols_of
+from ..expressions.from_sympy import atoms_of
 from .symbols import VariableSymbol
 
 
@@ -23,8 +23,9 @@ def residual_of(equation: Any) -> sympy.Expr:
         residual = sympy.sympify(equation)
     if not isinstance(residual, sympy.Expr):
         raise ModelError(f"{equation!r} is not an equation")
-    if residual.has(sympy.I):
+    atoms = atoms_of(residual)
+    if sympy.I in atoms:
         raise ModelError(f"the equation {equation} has a complex coefficient: write its real and imaginary part as two")
-    if not any(isinstance(s, VariableSymbol) for s in symbols_of(residual)):
+    if not any(isinstance(s, VariableSymbol) for s in atoms):
         raise ModelError(f"the equation {equation} contains no variable")
     return residual
