@@ -12,23 +12,11 @@ from fractions import Fraction
 import numpy as np
 
 from ..expressions.node import ONE, ZERO, Node, Number, constant, divide, linear, multiply, scale
+from ..model.scaling import equilibrated
 
 DEFICIENT = 1e-11  # singular values below, of an equilibrated matrix, are examined
 CANCELLED = 1e-11  # of the terms: a sum this small is zero
 LARGEST_DENOMINATOR = 1000
-
-
-def equilibrated(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The matrix with rows and columns scaled to a largest entry near 1 (Ruiz 2001), and the row scales."""
-    rows = np.ones(matrix.shape[0])
-    scaled = matrix
-    for _ in range(6):
-        r = np.sqrt(np.abs(scaled).max(axis=1, initial=0.0))
-        c = np.sqrt(np.abs(scaled).max(axis=0, initial=0.0))
-        r, c = np.where(r > 0, r, 1.0), np.where(c > 0, c, 1.0)
-        scaled = scaled / r[:, None] / c
-        rows = rows / r
-    return scaled, rows
 
 
 def cancels(weights: np.ndarray, matrix: np.ndarray) -> bool:
@@ -39,8 +27,8 @@ def cancels(weights: np.ndarray, matrix: np.ndarray) -> bool:
 
 def left_null_vectors(matrix: np.ndarray) -> list[np.ndarray]:
     """Vectors w with wᵀA = 0, each with an entry 1 where the others have none; fewest entries first."""
-    scaled, rows = equilibrated(matrix)
-    u, s, _ = np.linalg.svd(scaled, full_matrices=True)
+    scaled, rows, _ = equilibrated(matrix)
+    u, s, _ = np.linalg.svd(scaled.toarray(), full_matrices=True)
     s = np.append(s, np.zeros(matrix.shape[0]))[: matrix.shape[0]]
     null = u[:, s <= DEFICIENT * max(s[0], 1e-300)].T.copy()
     chosen: list[int] = []

@@ -6,10 +6,6 @@ from .functions import TABLE, apply
 from .node import ONE, ZERO, Node, leaf, linear, multiply, postorder, power, scale, select
 
 
-class NotDifferentiable(Exception):
-    """A function whose derivative is not known, by name."""
-
-
 def directional_derivative(node: Node, direction: Mapping[Hashable, Node]) -> Node:
     """Σ ∂node/∂leaf · direction[leaf], over the labels of leaves in `direction`.
 
@@ -56,8 +52,6 @@ def _slope(n: Node, inner: list[Node]) -> Node:
     terms = []
     for partial, direction in zip(TABLE[operation].partials(*n.arguments), inner, strict=True):
         if direction is not ZERO:
-            if partial is None:
-                raise NotDifferentiable(operation)
             terms.append((1, multiply(partial, direction)))
     return linear(terms)
 

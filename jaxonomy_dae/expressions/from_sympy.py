@@ -162,6 +162,15 @@ def _frac(u: Node) -> Node:
     return linear([(1, u), (-1, apply("floor", u))])
 
 
+def _sinc(u: Node) -> Node:
+    """sin(u)/u, by its series where the quotient and its derivatives cancel."""
+    square = power(u, 2)
+    series = ONE
+    for k in range(12, 0, -1):
+        series = linear([(Fraction(-1, 2 * k * (2 * k + 1)), multiply(square, series))], 1)
+    return select(compare("less", square, ONE), series, divide(apply("sin", u), u))
+
+
 def _exclusive_or(*conditions: Node) -> Node:
     total = FALSE
     for c in conditions:
@@ -192,7 +201,6 @@ _NAMED = {
     sympy.erfinv: "erfinv",
     sympy.gamma: "gamma",
     sympy.loggamma: "loggamma",
-    sympy.sinc: "sinc",
     sympy.Abs: "abs",
     sympy.sign: "sign",
     sympy.floor: "floor",
@@ -214,6 +222,7 @@ _WRITTEN: dict[Any, Callable[..., Node]] = {
     sympy.Piecewise: _piecewise,
     sympy.Heaviside: lambda u, at_zero: apply("heaviside", u, at_zero),
     sympy.frac: _frac,
+    sympy.sinc: _sinc,
     sympy.factorial: _factorial,
     sympy.beta: _beta,
     sympy.binomial: lambda n, k: divide(_factorial(n), multiply(_factorial(k), _factorial(linear([(1, n), (-1, k)])))),

@@ -42,13 +42,13 @@ HALF = Fraction(1, 2)
 class Function:
     """A function of one or more arguments.
 
-    `partials(*arguments)` gives its derivatives, a node for each argument; None where none is known.
+    `partials(*arguments)` gives its derivatives, a node for each argument.
     """
 
     name: str
     numpy: Callable[..., Any]
     jax: Callable[..., Any]
-    partials: Callable[..., tuple[Node | None, ...]]
+    partials: Callable[..., tuple[Node, ...]]
     sympy: Any
     safe: tuple[float | None, ...] = (None,)
 
@@ -75,28 +75,6 @@ def _one_plus(c: int, u: Node) -> Node:
 
 def _zero(*arguments: Node) -> tuple[Node, ...]:
     return (ZERO,) * len(arguments)
-
-
-def _sinc(xp, x):
-    x, small = xp.asarray(x), xp.abs(x) < 1e-4
-    there = xp.where(small, 1.0, x)
-    return xp.where(small, 1 - x * x / 6, xp.sin(there) / there)
-
-
-def _sinc_slope(xp, x):
-    x, small = xp.asarray(x), xp.abs(x) < 1e-2
-    there = xp.where(small, 1.0, x)
-    series = -x / 3 * (1 - x * x / 10 * (1 - x * x / 28 * (1 - x * x / 54)))
-    return xp.where(small, series, (there * xp.cos(there) - xp.sin(there)) / (there * there))
-
-
-def _sinc_curvature(xp, x):
-    """sinc″ = −sinc − 2 sinc′/x, with its series near zero."""
-    x, small = xp.asarray(x), xp.abs(x) < 5e-2
-    there = xp.where(small, 1.0, x)
-    s = x * x
-    series = -1 / 3 + s / 10 * (1 - 5 * s / 84 * (1 - 7 * s / 270 * (1 - 9 * s / 616)))
-    return xp.where(small, series, -_sinc(xp, there) - 2 * _sinc_slope(xp, there) / there)
 
 
 def _polygamma(xp, special, n, x):
@@ -187,17 +165,6 @@ _rows = [
         1.0,
     ),
     _unary("loggamma", ssp.gammaln, jsp.gammaln, lambda u: polygamma(0, u), sympy.loggamma, 1.0),
-    _unary("sinc", lambda x: _sinc(np, x), lambda x: _sinc(jnp, x), lambda u: apply("sinc_slope", u), sympy.sinc),
-    _unary(
-        "sinc_slope",
-        lambda x: _sinc_slope(np, x),
-        lambda x: _sinc_slope(jnp, x),
-        lambda u: apply("sinc_curvature", u),
-        None,
-    ),
-    Function(
-        "sinc_curvature", lambda x: _sinc_curvature(np, x), lambda x: _sinc_curvature(jnp, x), lambda u: (None,), None
-    ),
     _unary("besseli0", ssp.i0, _bessel_i(0), lambda u: apply("besseli1", u), lambda u: sympy.besseli(0, u), 0.0),
     _unary(
         "besseli1",

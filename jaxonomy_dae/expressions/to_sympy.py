@@ -33,10 +33,7 @@ def _write(n: Node, inside: list[Any]) -> Any:
         return sympy.Mul(*(a ** _number(e) for a, e in zip(inside, n.data, strict=True)))
     if operation in _OPERATIONS:
         return _OPERATIONS[operation](*inside)
-    function = TABLE[operation].sympy
-    if function is None:
-        raise AssertionError(f"{operation} has no name in SymPy")
-    return function(*inside)
+    return TABLE[operation].sympy(*inside)
 
 
 _OPERATIONS: dict[str, Callable[..., Any]] = {
