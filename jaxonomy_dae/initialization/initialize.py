@@ -288,7 +288,7 @@ def _values(rows: tuple[Row | None, ...], given: list, parameters: Any, sizes: b
 
 
 def _term_sizes(kernel: Callable[[list], Any], values: list, template: Any) -> Any:
-    if template.expression.is_Atom:
+    if not template.graph.arguments:
         return jnp.abs(kernel(values))
     total = jnp.abs(kernel(values))
     for k in range(len(values)):

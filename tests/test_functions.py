@@ -1,0 +1,185 @@
+"""Every function of SymPy that a user would write: values and derivatives, explicit, in constraints that index
+reduction differentiates twice, and in nonlinear equations."""
+
+import jax
+import jax.numpy as jnp
+import mpmath as mp
+import numpy as np
+import pytest
+import sympy
+from function_table import FUNCTIONS
+
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, ModelError, der
+from jaxonomy_dae.modeling import Eq
+
+NAMES = list(FUNCTIONS)
+POINTS = np.array([point for _, _, point in FUNCTIONS.values()])
+SPEED = 0.3
+
+
+class Written(Component):
+    def __init__(self, ev, write):
+        super().__init__(ev, "c")
+        write(self, ev.t)
+
+
+def compiled(write, **options):
+    ev = EqnEnv()
+    return AcausalCompiler(ev, AcausalDiagram().add(Written(ev, write)), **options)()
+
+
+@pytest.fixture(scope="module")
+def explicit():
+    """y = f(x), y' and y″ for every function, while x″ = −x."""
+
+    def write(c, t):
+        for k, (f, _, point) in enumerate(FUNCTIONS.values()):
+            x = c.variable(f"x{k}", start=point, fixed=True)
+            v = c.variable(f"v{k}", start=SPEED, fixed=True)
+            y, slope, curve = (c.variable(f"{n}{k}") for n in ("y", "s", "c"))
+            c.add_equations(Eq(der(x), v), Eq(der(v), -x), Eq(y, f(x)), Eq(der(y), slope), Eq(der(slope), curve))
+
+    names = [f"c.{n}{k}" for k in range(len(NAMES)) for n in ("x", "v")]
+    return compiled(write, state_selection="dummy_derivatives", prefer_states=names)
+
+
+def observed(system, kind):
+    names = [f"c.{kind}{k}" for k in range(len(NAMES))]
+    index = np.array([[system.states.index(f"c.{n}{k}") for k in range(len(NAMES))] for n in ("x", "v")])
+
+    @jax.jit
+    def at(x, v):
+        state = jnp.zeros(len(system.states)).at[index[0]].set(x).at[index[1]].set(v)
+        return system.observe(names, 0.0, state)
+
+    return at
+
+
+def reference(order):
+    """(d/dt)^order f(x(t)) with x′ = v = SPEED and v′ = −x, in 40 digits."""
+    out = []
+    with mp.workdps(40):
+        for _, f, point in FUNCTIONS.values():
+            x, v = mp.mpf(float(point)), mp.mpf(SPEED)
+            first, second = (mp.diff(f, x, n, h=mp.mpf("1e-10")) for n in (1, 2))
+            out.append(float((f(x), first * v, second * v**2 - first * x)[order]))
+    return np.array(out)
+
+
+@pytest.mark.parametrize(("kind", "order"), [("y", 0), ("s", 1), ("c", 2)])
+def test_value_and_derivatives_in_time(explicit, kind, order):
+    found = np.asarray(observed(explicit, kind)(POINTS, np.full(len(POINTS), SPEED)))
+    expected = reference(order)
+    wrong = [n for n, a, b in zip(NAMES, found, expected, strict=True) if not abs(a - b) <= 1e-10 * max(1.0, abs(b))]
+    assert not wrong, [(n, found[NAMES.index(n)], expected[NAMES.index(n)]) for n in wrong]
+
+
+def test_reverse_is_forward(explicit):
+    """The curvature, whose equation was differentiated twice, differentiated once more."""
+    at = observed(explicit, "c")
+    v = jnp.full(len(POINTS), SPEED)
+    one = jnp.ones(len(POINTS))
+    _, forward = jax.jit(lambda x: jax.jvp(lambda x: at(x, v), (x,), (one,)))(jnp.asarray(POINTS))
+    reverse = jax.jit(jax.grad(lambda x: at(x, v).sum()))(jnp.asarray(POINTS))
+    with mp.workdps(40):
+        third = []
+        for _, f, point in FUNCTIONS.values():
+            d1, d2, d3 = (mp.diff(f, mp.mpf(float(point)), n, h=mp.mpf("1e-8")) for n in (1, 2, 3))
+            third.append(float(d3 * mp.mpf(SPEED) ** 2 - d2 * point - d1))
+    for name, a, b, c in zip(NAMES, forward, reverse, third, strict=True):
+        scale = max(1.0, abs(c))
+        assert abs(a - b) <= 1e-9 * scale, name
+        assert abs(a - c) <= 1e-8 * scale, (name, float(a), c)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_in_a_nonlinear_block(name):
+    """z and w determine each other through f; value and both derivatives by a parameter, against mpmath."""
+    f, g, point = FUNCTIONS[name]
+
+    def write(c, t):
+        p = c.parameter("p", 0.1)
+        x = c.variable("x", start=point, fixed=True)
+        z, w = c.variable("z", start=0.0), c.variable("w", start=0.0)
+        c.add_equations(Eq(der(x), -x), Eq(w, p * f(x + 0.01 * z)), Eq(z + z**3, w + p))
+
+    system = compiled(write)
+
+    def solved(p):
+        there = system.with_parameters({"c.p": p})
+        return there.observe(["c.z"], 0.0, there.initialize())[0]
+
+    def root(p):
+        inner = lambda z: z + z**3 - p * g(mp.mpf(float(point)) + mp.mpf(0.01) * z) - p  # noqa: E731
+        return mp.findroot(inner, 0.1 * float(p))
+
+    with mp.workdps(30):
+        value, slope = float(root(mp.mpf(0.1))), float(mp.diff(root, mp.mpf(0.1), h=mp.mpf("1e-8")))
+    assert abs(float(solved(0.1)) - value) <= 1e-10
+    forward, reverse = jax.jacfwd(solved)(0.1), jax.jacrev(solved)(0.1)
+    assert abs(forward - reverse) <= 1e-9 * max(1.0, abs(slope))
+    assert abs(forward - slope) <= 1e-7 * max(1.0, abs(slope))
+
+
+@pytest.mark.parametrize(
+    ("f", "message"),
+    [
+        (lambda x: sympy.LambertW(x), "c'.*LambertW cannot be evaluated in JAX"),
+        (lambda x: sympy.Function("g")(x), "g is a function without a definition"),
+        (lambda x: sympy.Integral(sympy.exp(-(sympy.Symbol("s") ** 2)), (sympy.Symbol("s"), 0, x)), "Integral"),
+        (lambda x: sympy.Piecewise((x, x > 0), (sympy.zoo, True)), "division by zero"),
+        (lambda x: sympy.besselj(2, x), "besselj cannot be evaluated in JAX"),
+        (lambda x: sympy.DiracDelta(x), "DiracDelta cannot be evaluated"),
+    ],
+)
+def test_what_jax_lacks_is_refused(f, message):
+    def write(c, t):
+        x = c.variable("x", start=0.5, fixed=True)
+        c.add_equations(der(x) + f(x))
+
+    with pytest.raises(ModelError, match=message):
+        compiled(write)
+
+
+def test_derivatives_of_steps_are_zero():
+    ev = EqnEnv()
+
+    class Steps(Component):
+        def __init__(self):
+            super().__init__(ev, "c")
+            x = self.variable("x")
+            assert der(sympy.sign(x)) == 0
+            assert der(sympy.Heaviside(x)) == 0
+            assert der(sympy.floor(x)) == 0
+            assert der(der(sympy.Abs(x))) == sympy.sign(x) * der(der(x))
+            slope = der(sympy.Max(x, 0))
+            assert slope.subs({x: 2}) == der(x)
+            assert slope.subs({x: -2}) == 0
+
+    Steps()
+
+
+def test_conditions_that_mix_time_and_variables():
+    def write(c, t):
+        x = c.variable("x", start=0.5, fixed=True)
+        y = c.variable("y")
+        c.add_equations(der(x) + x, Eq(y, sympy.Piecewise((x, (t > 1) & (x > 0)), (-x, (t > 2) | (x < 0)), (7, True))))
+
+    system = compiled(write)
+    for t, x, y in ((0.5, 0.5, 7.0), (1.5, 0.5, 0.5), (1.5, -0.5, 0.5), (2.5, 0.0, 0.0)):
+        assert float(system.observe(["c.y"], t, jnp.array([x]))[0]) == y
+
+
+def test_a_negative_base_is_not_a_number():
+    """A fractional power of a negative number is NaN, at compile time too, where the test points are negative."""
+
+    def write(c, t):
+        p = c.variable("p", start=200.0, fixed=True)
+        q, m = c.variable("q"), c.variable("m", start=100.0)
+        c.add_equations(Eq(q, 0.1 * (p - m) ** 0.6), Eq(q, 0.1 * sympy.sqrt(m - 1)), Eq(der(p), -q))
+
+    system = compiled(write)
+    m, q = map(float, system.observe(["c.m", "c.q"], 0.0, system.initialize()))
+    assert abs(q - 0.1 * (200 - m) ** 0.6) < 1e-9
+    assert abs(q - 0.1 * (m - 1) ** 0.5) < 1e-9
