@@ -13,6 +13,7 @@ from .construction import Construction
 from .declarations import Learned, Parameter, Variable
 from .environment import EqnEnv
 from .equations import residual_of
+from .functions import of_scalars
 from .interval import Interval, as_interval
 from .names import check_name
 from .ports import Domain, Port
@@ -315,24 +316,51 @@ class Component(metaclass=Construction):
 
         - `ModelError` if the network does not take `(len(inputs),)` or does not return a vector.
         """
-        self._claim(name, "learned term")
+        return self._opaque("learned term", name, network, inputs, outputs)
+
+    def function(
+        self, name: str, function: Any, inputs: Sequence[Any], outputs: int | None = None
+    ) -> tuple[VariableSymbol, ...]:
+        """Puts a JAX function into the equations as it is: the untrained twin of `learned`.
+
+        **Arguments:**
+
+        - `name`: its outputs are the variables `component.name` (one output) or `component.name[0]`, …
+        - `function`: `function(x, y, …)`, a scalar for each input, that returns a scalar or a vector `(outputs,)`: any
+            function that JAX can trace and differentiate, such as an interpolation table. If it is a pytree (an
+            `equinox.Module`, or a method of one), the arrays in it are leaves of the system, and
+            `system.partition("component.name")` makes them trainable.
+        - `inputs`: symbols of variables (or `ev.t`), in this order.
+        - `outputs`: how many outputs; found by tracing the function when left out.
+
+        **Returns:**
+
+        A tuple of symbols, for any equation; where index reduction differentiates them, so does `jax.jvp`.
+
+        **Raises:**
+
+        - `ModelError` if the function cannot be called with that many scalars.
+        """
+        if not callable(function):
+            raise ModelError(f"function '{self.name}.{name}': expected something to call; got {function!r}")
+        return self._opaque("function", name, of_scalars(function), inputs, outputs)
+
+    def _opaque(self, what: str, name: str, network: Any, inputs: Sequence[Any], outputs: int | None):
+        self._claim(name, what)
         from .neural import count_outputs
 
+        where = f"{what} '{self.name}.{name}'"
         if not callable(network):
-            raise ModelError(f"learned term '{self.name}.{name}': the network must be callable; got {network!r}")
+            raise ModelError(f"{where}: the network must be callable; got {network!r}")
         symbols = []
         for entry in inputs:
             entry = sympy.sympify(entry)
             if not isinstance(entry, VariableSymbol | TimeSymbol):
-                raise ModelError(
-                    f"learned term '{self.name}.{name}': inputs are symbols of variables or ev.t; got '{entry}'"
-                )
+                raise ModelError(f"{where}: inputs are symbols of variables or ev.t; got '{entry}'")
             symbols.append(entry)
-        found = count_outputs(network, len(symbols), f"learned term '{self.name}.{name}'")
+        found = count_outputs(network, len(symbols), where)
         if outputs is not None and outputs != found:
-            raise ModelError(
-                f"learned term '{self.name}.{name}': expected {outputs} outputs, but the network returns {found}"
-            )
+            raise ModelError(f"{where}: expected {outputs} outputs, but the {_noun(what)} returns {found}")
         names = [name] if found == 1 else [f"{name}[{k}]" for k in range(found)]
         declared = tuple(self._declare(n, "learned") for n in names)
         self.learned_terms.append(Learned(name, network, tuple(symbols), declared))
@@ -392,3 +420,7 @@ class Component(metaclass=Construction):
 _BASE_ATTRIBUTES = (
     "ev name parent parameters variables ports children equations learned_terms connections signals _sealed".split()
 )
+
+
+def _noun(what: str) -> str:
+    return "network" if what == "learned term" else what
