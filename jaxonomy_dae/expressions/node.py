@@ -30,6 +30,12 @@ class Node:
     digest: bytes
     leaves: frozenset
 
+    def __reduce__(self):
+        order = postorder([self])
+        place = {n: k for k, n in enumerate(order)}
+        rows = tuple((n.operation, tuple(place[a] for a in n.arguments), n.data) for n in order)
+        return _restored, (rows,)
+
     def __repr__(self):
         return f"Node({self.operation}, {self.data!r}, {len(self.arguments)} arguments)"
 
@@ -56,6 +62,14 @@ def make(operation: str, arguments: tuple[Node, ...] = (), data: Any = None) -> 
                 leaves = argument.leaves | leaves if leaves else argument.leaves
         node.leaves = leaves
     return _unique.setdefault(digest, node)
+
+
+def _restored(rows: tuple) -> Node:
+    """The last of nodes listed as (operation, positions of arguments, data)."""
+    nodes: list[Node] = []
+    for operation, positions, data in rows:
+        nodes.append(make(operation, tuple(nodes[k] for k in positions), data))
+    return nodes[-1]
 
 
 def leaf(label: Hashable) -> Node:

@@ -96,6 +96,9 @@ class OpaqueTemplate(AbstractTemplate):
     def is_unmoved(self, direction: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
         return ~(direction != 0).any(axis=1)
 
+    def __reduce__(self):
+        return OpaqueTemplate, (self.opaque, self.output, self._q)
+
     def _grouped(self, inputs) -> list[list]:
         """The inputs' derivatives, one list for each order."""
         n = self._n

@@ -36,6 +36,9 @@ class SymbolicTemplate(AbstractTemplate):
         self._labels = [*map(slot_label, slots), *map(parameter_label, range(n_parameters)), TIME_LABEL]
         self._kernels: dict[Any, Kernel] = {}
 
+    def __reduce__(self):
+        return template_of, (self.graph, self.slots, self.n_parameters)  # kernels are made again
+
     @functools.cached_property
     def partials(self) -> tuple[Node, ...]:
         """∂(residual)/∂(slot) for each slot."""
