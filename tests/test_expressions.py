@@ -102,6 +102,8 @@ def test_branches_not_taken_are_never_seen():
             assert np.isfinite(forward).all(), k
             np.testing.assert_allclose(forward, reverse, rtol=1e-13, atol=1e-14)
             assert np.isfinite(jax.jacfwd(jax.jacrev(f))(z)).all()
+        partials = Kernel([partial_derivative(graph(grown(2, 0)), "x")], ["x", "y"])
+        assert np.isfinite(jax.grad(lambda x, p=partials: p([x, 0.3])[0])(-0.7))
 
 
 def test_a_shared_part_outside_branches_is_not_changed():

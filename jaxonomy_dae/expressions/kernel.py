@@ -39,7 +39,9 @@ class Kernel:
                 place[n],
                 n,
                 tuple(place[a] for a in n.arguments),
-                [[(place[c], holds) for c, holds in sorted(p, key=_by_digest)] for p in _sorted(guard.get(n, ()))],
+                [[(place[c], holds) for c, holds in sorted(p, key=_by_digest)] for p in _sorted(guard[n])]
+                if n in guard
+                else None,
             )
             for n in order
             if n.operation not in ("leaf", "constant", "true", "false")
@@ -71,7 +73,7 @@ class Kernel:
             found[k] = value
         for k, function, arguments, guard, safe in self._operations(backend):
             inside = [found[a] for a in arguments]
-            if guard:
+            if guard is not None:
                 active = _active(found, guard)
                 inside = [
                     v if s is None or isinstance(v, float) else xp.where(active, v, s)
@@ -90,14 +92,14 @@ def _sorted(needed: Any) -> list:
 
 
 def _active(found: list[Any], guard: list) -> Any:
-    """Whether the node is needed: a union of intersections."""
-    total = None
+    """Whether the node is needed: a union of intersections; of none if it never is."""
+    total = np.bool_(False)
     for part in guard:
         inside = None
         for k, holds in part:
             literal = found[k] if holds else ~found[k]
             inside = literal if inside is None else inside & literal
-        total = inside if total is None else total | inside
+        total = inside | total
     return total
 
 
