@@ -93,9 +93,9 @@ def _sorted(needed: Any) -> list:
 
 def _active(found: list[Any], guard: list) -> Any:
     """Whether the node is needed: a union of intersections; of none if it never is."""
-    total = np.bool_(False)
+    total: Any = np.bool_(False)
     for part in guard:
-        inside = None
+        inside: Any = None
         for k, holds in part:
             literal = found[k] if holds else ~found[k]
             inside = literal if inside is None else inside & literal
