@@ -12,7 +12,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-from jaxonomy_dae.solvers import BDF, Rodas5P, StepControl, StoredAdjoint, Tsit5
+from jaxonomy_dae.solvers import BDF, DAETerm, Rodas5P, StepControl, StoredAdjoint, Tsit5, solve_dae
 
 STORED, RECURSIVE = StoredAdjoint(), diffrax.RecursiveCheckpointAdjoint()
 ARGS = (jnp.array([1.5, 1.0]), jnp.array([[0.1, -0.2], [0.3, 0.2]]))
@@ -303,3 +303,14 @@ def test_nothing_recorded_without_differentiation():
     other = jax.jit(lambda: solve(ARGS, Y0, diffrax.ForwardMode(), saveat=saveat))()
     assert {k: int(v) for k, v in mine.stats.items()} == {k: int(v) for k, v in other.stats.items()}
     agree((mine.ts[0][:10], mine.ys[0]["a"][:10]), (other.ts[0][:10], other.ys[0]["a"][:10]), 1e-14)
+
+
+def test_without_rank_promotion():
+    """`jax_numpy_rank_promotion="raise"`, here with BDF: x' = −a·z, z = x, so ∂x(1)/∂a = −exp(−a)."""
+    term = DAETerm(lambda t, x, z, a: -a * z, lambda t, x, z, a: z - x)
+
+    def final(a):
+        return solve_dae(term, 1.0, (jnp.ones(2), jnp.ones(2)), solver=BDF(), args=a, throw=False).ys[0][0, 0]
+
+    with jax.numpy_rank_promotion("raise"):
+        assert jax.jit(jax.grad(final))(0.7) == pytest.approx(-np.exp(-0.7), rel=1e-4)

@@ -244,7 +244,7 @@ def ravel_like(y: Any) -> Any:
 def _advance(phi: Any, e: Any, order: Any, max_order: int) -> Any:
     """The differences after a step: φ*_k + e, and below it sums; e itself is kept where order k + 1 would read it."""
     rows = jnp.arange(ROWS, dtype=order.dtype)[:, None]
-    inside = jnp.where(rows <= order, phi, 0) + jnp.where(rows == order, 1, 0) * e
+    inside = jnp.where(rows <= order, phi, 0) + jnp.where(rows == order, 1, 0) * e[None, :]
     sums = jnp.cumsum(inside[::-1], axis=0)[::-1]
     out = jnp.where(rows <= order, sums, phi)
-    return jnp.where((rows == order + 1) & (order < max_order), e, out)
+    return jnp.where((rows == order + 1) & (order < max_order), e[None, :], out)
