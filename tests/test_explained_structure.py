@@ -30,6 +30,9 @@ KINDS = {
 }  # fmt: skip
 
 
+EV = EqnEnv()
+
+
 def model(parts: dict[str, str], *nodes: str, order=None, rename=lambda name: name, **options):
     """A diagram from "name": "Class" and nodes such as "s.p r.p"."""
     ev = EqnEnv()
@@ -47,7 +50,7 @@ def component(write, name="c"):
             super().__init__(ev, name)
             write(self, ev)
 
-    return Written(EqnEnv(), name)
+    return Written(EV, name)
 
 
 def law(names: str, *equations, **starts):
@@ -76,7 +79,7 @@ def hollow():
         assert p.name == "p"
         self.connect(r.n, n)
 
-    sub, ev = component(write, "sub"), EqnEnv()
+    sub, ev = component(write, "sub"), EV
     s, g, r = VoltageSource(ev, "s"), Ground(ev, "g"), Resistor(ev, "r")
     return compiled(s, sub, g, r, connect=[(s.p, sub.p, r.p), (s.n, sub.n, r.n, g.p)])
 
