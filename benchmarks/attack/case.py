@@ -28,6 +28,7 @@ class Case:
     - `expected`: true values by variable. `rates`: true time derivatives, for those that are states.
     - `freedom`: how many states there must be; None if the family does not say (or keeps redundant ones).
     - `refusal`: if the model has no unique solution, what the error must say (one of these words); None if it has one.
+    - `may_refuse`: what an error may truly say of a model that has a solution, but asks for more than is promised.
     """
 
     ev: EqnEnv
@@ -39,6 +40,7 @@ class Case:
     refusal: Sequence[str] | None = None
     motion: "Motion | None" = None
     t0: float = 0.0
+    may_refuse: Sequence[str] = ()
     note: str = ""
 
 

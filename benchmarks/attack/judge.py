@@ -84,7 +84,7 @@ def _judge(case: Case, moving: bool, start: float) -> Outcome:
         found, rates = read(system, x, list(case.expected), case.t0)
     except (ModelError, InitializationError, SimulationError) as error:
         text = f"{type(error).__name__}: {error}"
-        is_true = case.refusal is not None and any(re.search(word, text) for word in case.refusal)
+        is_true = any(re.search(word, text) for word in (*(case.refusal or ()), *case.may_refuse))
         return outcome("refused" if is_true else "untrue", np.inf, text)
     except eqx.EquinoxRuntimeError as error:
         return outcome("untrue", np.inf, f"{type(error).__name__}: {error}")
