@@ -189,7 +189,7 @@ class Blocks(Component):
 @pytest.mark.parametrize(
     "n, expected, reason",
     [
-        (0, "Tsit5", "explicit: no nonlinear block is left; if the system is stiff, take Rodas5P or BDF"),
+        (0, "Tsit5", "explicit: no nonlinear block is left; implicit if a run turns out to be stiff"),
         (1, "Rodas5P", "nonlinear blocks leave the algebraic unknowns b.z0"),
         (
             16,

@@ -34,23 +34,32 @@ def cause_of(
     if not np.isfinite(here).all() or not len(here):
         return ""
     return (
-        _end_of_domain(slope, here, t, y, t1, names)
+        _end_of_domain(problem, here, t, y, t1, names)
         or _jump(slope, here, t, y, weight, names)
         or _escape(here, y, float(t), float(t1), weight, names)
         or (_stiffness(slope, t, y, t1, steps) if explicit else "")
     )
 
 
-def _end_of_domain(slope: Slope, here: np.ndarray, t: Any, y: Any, t1: Any, names: Sequence[str]) -> str:
+def first_bad_row(problem: FlatProblem, right: np.ndarray, names: Sequence[str]) -> str:
+    """The first row that is not finite, by the unknown whose derivative it gives, if it gives one."""
+    k = int(np.flatnonzero(~np.isfinite(right))[0])
+    own = problem.mass.is_diagonal and problem.mass.array[k] != 0
+    return f"the derivative of '{names[k]}' (row {k} of F)" if own else f"row {k} of F"
+
+
+def _end_of_domain(
+    problem: FlatProblem, here: np.ndarray, t: Any, y: Any, t1: Any, names: Sequence[str]
+) -> str:  # fmt: skip
     """Whether the equations have no value just beyond the point."""
+    right = jax.jit(problem.right)
     span = float(t1 - t)
     for part in NEAR:
         dt = jnp.asarray(part * span, jnp.asarray(t).dtype)
-        ahead = np.asarray(slope(t + dt, y + dt.astype(y.dtype) * here))
-        bad = np.flatnonzero(~np.isfinite(ahead))
-        if len(bad):
+        ahead = np.asarray(right(t + dt, y + dt.astype(y.dtype) * here))
+        if not np.isfinite(ahead).all():
             return (
-                f"Just beyond, the derivative of '{names[bad[0]]}' is not finite: a root or logarithm leaves its "
+                f"Just beyond, {first_bad_row(problem, ahead, names)} is not finite: a root or logarithm leaves its "
                 "domain, or a denominator vanishes. Keep the argument positive in the equation (sympy.Max, or another "
                 "law there), or end the run before"
             )

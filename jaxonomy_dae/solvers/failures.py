@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .causes import cause_of
+from .causes import cause_of, first_bad_row
 from .dae_term import FlatProblem
 from .index_one import algebraic_part, consistent_slope, index_matrix
 
@@ -88,13 +88,6 @@ def explain_start(check: StartCheck, names: Sequence[str]) -> str:
     return ""
 
 
-def _row(problem: FlatProblem, right: np.ndarray, names: Sequence[str]) -> str:
-    """The first row that is not finite, by the unknown whose derivative it gives, if it gives one."""
-    k = int(np.flatnonzero(~np.isfinite(right))[0])
-    own = problem.mass.is_diagonal and problem.mass.array[k] != 0
-    return f"the derivative of '{names[k]}' (row {k} of F)" if own else f"row {k} of F"
-
-
 def null_names(matrix: np.ndarray, names: Sequence[str]) -> str:
     """The unknowns that a singular matrix leaves undetermined, by name; nothing if it is regular."""
     if not np.isfinite(matrix).all():
@@ -124,8 +117,8 @@ def explain_failure(
         value = right[~np.isfinite(right)][0]
         where = "at the start. Start elsewhere, or look" if float(t) == float(t0) else "there. Look"
         return start + (
-            f"The equations are not finite: {_row(problem, right, names)} is {value} {where} for a division by zero, "
-            "or a root or logarithm without a value."
+            f"The equations are not finite: {first_bad_row(problem, right, names)} is {value} {where} for a division by "
+            "zero, or a root or logarithm without a value."
         )
     if flat.shape[0] <= LARGE and problem.mass.is_singular:
         chosen, _, _, matrix = index_matrix(problem, None, time, flat)

@@ -23,7 +23,7 @@ def solver_choice(plan: SystemPlan) -> Choice:
     """Explicit unless nonlinear blocks leave algebraic unknowns to be solved with the states. Stiffness depends on
     parameters and is not known to the compiler."""
     if not len(plan.carried):
-        return Choice("Tsit5", "explicit: no nonlinear block is left, and stability does not limit its steps", False)
+        return Choice("Tsit5", "explicit: no nonlinear block is left; implicit if a run turns out to be stiff", False)
     quantities = plan.extended.quantities
     if (quantities.order[plan.carried] < quantities.highest[quantities.owner[plan.carried]]).all():
         return Choice("Tsit5", "explicit: nonlinear blocks only tie differentiated variables to the states", False)
