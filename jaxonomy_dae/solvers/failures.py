@@ -117,8 +117,8 @@ def explain_failure(
         value = right[~np.isfinite(right)][0]
         where = "at the start. Start elsewhere, or look" if float(t) == float(t0) else "there. Look"
         return start + (
-            f"The equations are not finite: {first_bad_row(problem, right, names)} is {value} {where} for a division by "
-            "zero, or a root or logarithm without a value."
+            f"The equations are not finite: {first_bad_row(problem, right, names)} is {value} {where} for a division "
+            "by zero, or a root or logarithm without a value."
         )
     if flat.shape[0] <= LARGE and problem.mass.is_singular:
         chosen, _, _, matrix = index_matrix(problem, None, time, flat)
