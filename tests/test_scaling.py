@@ -57,6 +57,33 @@ def test_a_contradiction_is_one_at_any_scale(unit, nominal):
     np.testing.assert_allclose(right, [unit, 2 * unit, 3 * unit], rtol=1e-14)
 
 
+@pytest.mark.parametrize("v", [1e-16, 1e-9])
+def test_velocities_that_are_rounding_errors(v):
+    """A mass held by two rods is at rest; another falls beside it and tells how fast is fast."""
+
+    def write(self):
+        start = {"x": 0.5, "y": math.sqrt(0.75), "vx": v, "vy": -2 * v, "z": 1.0, "vz": 1.5}
+        x, y, vx, vy, z, vz = (self.variable(n, start=s, fixed=True) for n, s in start.items())
+        a, b = self.variable("a"), self.variable("b")
+        self.add_equations(
+            Eq(der(x), vx),
+            Eq(der(y), vy),
+            Eq(der(vx), -a * x - b * (x - 1)),
+            Eq(der(vy), -(a + b) * y - 9.81),
+            Eq(x**2 + y**2, 1),
+            Eq((x - 1) ** 2 + y**2, 1),
+            Eq(der(z), vz),
+            Eq(der(vz), -9.81),
+        )
+
+    system = model(write)
+    if v > 1e-15:
+        with pytest.raises(InitializationError, match=r"off by|contradict|fixed at"):
+            system.initialize()
+    else:
+        np.testing.assert_allclose(found(system, "c.vx", "c.vy", "c.vz"), [0, 0, 1.5], rtol=1e-15, atol=1e-15)
+
+
 # --- rows of one model in a process with others ---------------------------------------------------------------------
 
 

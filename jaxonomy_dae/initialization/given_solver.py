@@ -49,7 +49,7 @@ def find_root_with(
     dtype = start.dtype
     value, jacobian = linearized(start)
     unit = column_sizes(value, jacobian, sizes)
-    largest = jnp.max(jnp.where(jnp.isfinite(jacobian), jnp.abs(jacobian * unit), 0), axis=1, initial=0.0)
+    largest = jnp.max(jnp.where(jnp.isfinite(jacobian), jnp.abs(jacobian * unit[None, :]), 0), axis=1, initial=0.0)
     weight = 1 / jnp.where(largest > 0, largest, 1)
     if not square:
         weight = weight * jnp.asarray(np.where(soft, soft_weight(dtype), 1.0), dtype)
@@ -58,7 +58,7 @@ def find_root_with(
     )
     x = jax.lax.stop_gradient(found.value) * unit
     value, jacobian = linearized(x)
-    sharper = x - unit * least_squares(weight[:, None] * jacobian * unit, weight * value)
+    sharper = x - unit * least_squares(weight[:, None] * jacobian * unit[None, :], weight * value)
     x = jnp.where(jnp.all(jnp.isfinite(sharper)), sharper, x)
     value, jacobian = linearized(x)
     size, noise = row_sizes(jacobian, x, sizes, unit)

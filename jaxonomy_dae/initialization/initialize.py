@@ -89,6 +89,8 @@ def initialize(
     start = frozen(jnp.append(x0, parameters[unknown]) if len(unknown) else x0)
     sizes = frozen(_sizes(plan, rows, given, parameters, start))
     m = n_equations + len(rows.kept)
+    if m > len(start):
+        sizes = frozen(_with_velocities(sizes, start[:n], plan, system._point(t0, inputs)))
     is_soft = np.arange(m) >= m - rows.n_soft
     core = independent_rows(plan, rows, len(start))
 
@@ -125,7 +127,7 @@ def initialize(
         )
     else:
         remaining = residual(found.x, parameters, inputs, target)
-        w = found.x - least_squares(jacobian * found.unit, jnp.where(good, remaining, 0)) * found.unit
+        w = found.x - least_squares(jacobian * found.unit[None, :], jnp.where(good, remaining, 0)) * found.unit
     full = jnp.concatenate([jnp.zeros((n_equations,), point.dtype), target])
     limit = jnp.where(is_soft, jnp.inf, found.limit)
     return InitialPoint(w[:n], w[n:], remaining, limit, full, found.method, found.evaluations, found.jacobian)
@@ -137,7 +139,9 @@ def _nearest_point(
     """A differentiable point next to w, in units of the unknowns: min ½|S(w)|², S the soft rows, where the hard rows
     H(w) = 0 hold. Its conditions are ∇½|S|² + ∇(λᵀH) = 0, H = 0; of two Newton steps the first sharpens the point, and
     the second carries the derivative. Returns w and the rows there."""
-    largest = jnp.maximum(jnp.max(jnp.abs(jacobian * unit), axis=1, initial=0.0), float(jnp.finfo(unit.dtype).tiny))
+    largest = jnp.maximum(
+        jnp.max(jnp.abs(jacobian * unit[None, :]), axis=1, initial=0.0), float(jnp.finfo(unit.dtype).tiny)
+    )
     scale = 1 / jnp.where(distances > 0, distances, largest)
 
     def rows(v, data):
@@ -153,7 +157,7 @@ def _nearest_point(
         return jnp.concatenate([jax.grad(lagrangian)(v), rows(v, data)[hard]])
 
     v = w / unit
-    scaled = scale[:, None] * jacobian * unit
+    scaled = scale[:, None] * jacobian * unit[None, :]
     remaining = rows(v, settings)
     multiplier = -least_squares(scaled[hard].T, scaled[soft].T @ remaining[soft])
     z = jnp.concatenate([v, multiplier])
@@ -178,6 +182,22 @@ def _sizes(plan: SystemPlan, rows: InitialRows, given: list, parameters: Any, st
     known = jnp.maximum(jnp.maximum(jnp.append(guess, jnp.zeros(more, dtype)), jnp.abs(start)), nominal)
     data = jnp.concatenate([jnp.zeros((plan.n_constraints + len(plan.carried),), dtype), target])
     return Sizes(nominal, known, data, _distances(plan, rows, nominal, guess, len(data)))
+
+
+def _with_velocities(sizes: Sizes, x: Any, plan: SystemPlan, here: Point) -> Sizes:
+    """Redundant velocities that are all rounding errors have no size by which the others could be judged: positions
+    and a frequency give one. All that moves tells the frequency ω, by |x'| = ω|x| and |x''| = ω²|x|."""
+    owner, place = plan.extended.quantities.owner, {int(q): k for k, q in enumerate(plan.states)}
+    pairs = [(k, place[q + 1]) for q, k in place.items() if q + 1 in place and owner[q] == owner[q + 1]]
+    if not pairs:
+        return sizes
+    position, velocity = np.array(pairs).T
+    acceleration = jnp.abs(here.semi_explicit(x)[velocity])
+    fastest = jnp.max(jnp.where(jnp.isfinite(acceleration), acceleration, 0))
+    largest = jnp.max(sizes.known[position])
+    largest = jnp.where(largest > 0, largest, jnp.inf)
+    frequency = jnp.maximum(jnp.max(sizes.known[velocity]) / largest, jnp.sqrt(fastest / largest))
+    return sizes._replace(known=sizes.known.at[velocity].max(frequency * sizes.known[position]))
 
 
 def _distances(plan: SystemPlan, rows: InitialRows, nominal: Any, guess: Any, m: int) -> Any:

@@ -91,7 +91,7 @@ def column_sizes(value: Any, jacobian: Any, sizes: Sizes) -> Any:
     offset = jnp.maximum(sizes.data, jnp.where(jnp.isfinite(value), jnp.abs(value), 0))
     size = sizes.known
     for _ in range(2):
-        row = jnp.maximum(offset, jnp.max(magnitude * size, axis=1, initial=0.0))
+        row = jnp.maximum(offset, jnp.max(magnitude * size[None, :], axis=1, initial=0.0))
         seen = (magnitude > tiny) & (row > tiny)[:, None]
         ratio = jnp.where(seen, row[:, None] / jnp.where(seen, magnitude, 1), jnp.inf)
         implied = jnp.min(ratio, axis=0, initial=jnp.inf)
@@ -211,7 +211,7 @@ def find_root(
         pulled = where(hard, 0.1 * float(np.sqrt(enough)) * size, jnp.inf)
         allowed = where(is_nearest(state.scalars[0]), pulled, enough * size) if has_soft else enough * size
         holds = jnp.all(jnp.abs(value) <= allowed + noise)
-        return advance(state, value, jacobian * unit, jnp.append(unit, one), reached, holds)
+        return advance(state, value, jacobian * unit[None, :], jnp.append(unit, one), reached, holds)
 
     def advance(state: _Machine, value, jacobian, unit, reached, holds) -> _Machine:
         s = _Scalars(*state.scalars)
@@ -373,7 +373,7 @@ def find_root(
     s = _Scalars(*state.scalars)
     found = where(s.phase == _DONE, state.points[1], state.points[2])[:n]
     unit = state.points[5, :n]
-    jacobian = state.jacobian / unit
+    jacobian = state.jacobian / unit[None, :]
     size, noise = row_sizes(jacobian, found, sizes, unit)
     limit = enough * (size + sizes.data) + noise
     return Found(found, jacobian, limit, unit, s.method.astype(jnp.int32), s.evaluations.astype(jnp.int32))

@@ -78,7 +78,7 @@ def solve_in_stages(
         jacobian, value = jax.jacfwd(lambda y: (function(y),) * 2, has_aux=True)(trial)
         value, jacobian = jax.lax.stop_gradient((value, jacobian))
         unit = column_sizes(value, jacobian, sizes)
-        jacobian, value = (jacobian * unit)[row_of], value[row_of]
+        jacobian, value = (jacobian * unit[None, :])[row_of], value[row_of]
         inside = jnp.asarray(block, jnp.int32) == number
         largest = jnp.max(jnp.abs(jacobian), axis=1)
         weight = jnp.where(inside & (largest > 0), 1 / jnp.where(largest > 0, largest, 1), 0)
