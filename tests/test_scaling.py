@@ -250,6 +250,36 @@ def test_a_guess_where_a_root_has_no_slope_is_stepped_off():
     assert found(model(write), "c.q")[0] == pytest.approx(0.25, rel=1e-14)
 
 
+@pytest.mark.parametrize("c", [8e-30, 8.0, 8e30])
+def test_a_power_without_slope_at_the_start(c):
+    """x³ = c from 0, where nothing tells the size of x to first order."""
+
+    def write(self):
+        x, y = self.variable("x"), self.variable("y", start=1.0, fixed=True)
+        self.add_equations(Eq(x**3, c), Eq(der(y), -y))
+
+    assert found(model(write), "c.x")[0] == pytest.approx(2 * (c / 8) ** (1 / 3), rel=1e-13)
+
+
+def test_flows_without_guesses():
+    """Turbulent pipes in series from a tank, k·q·|q| of 2e7 Pa at 2e-4 m³/s, whose flows have no slope at rest."""
+    k, pressure = 2e7 / 2e-4**2, 6e7
+
+    def write(self):
+        p = self.variable("p", start=pressure, fixed=True)
+        p1, p2, q1, q2, q3 = (self.variable(n) for n in ("p1", "p2", "q1", "q2", "q3"))
+        self.add_equations(
+            Eq(der(p), -q1 * 1e9),
+            Eq(p - p1, k * q1 * Abs(q1)),
+            Eq(p1 - p2, k * q2 * Abs(q2)),
+            Eq(p2, k * q3 * Abs(q3)),
+            Eq(q1, q2),
+            Eq(q2, q3 + 0 * p1),
+        )
+
+    np.testing.assert_allclose(found(model(write), "c.q1", "c.p1", "c.p2"), [2e-4, 4e7, 2e7], rtol=1e-12)
+
+
 # --- bounds --------------------------------------------------------------------------------------------------------
 
 

@@ -53,6 +53,11 @@ TO_BOUND = 0.9  # of the way to a bound that a step would cross
 SETTLED = 1e-2  # steps of this times √eps end the search for the nearest point
 NOISE = 8.0  # rounding errors of a row, in units of eps
 
+# An unknown of which nothing is known, and on which nothing depends at the start to first order, as on q in q·|q| at
+# zero, gets its size from the powers that slopes at these distances show. Then the search begins at the start.
+_PROBES = (1.0, 1.0 / 16)
+_SIZED = -1.0 - len(_PROBES)
+
 _NEWTON, _MARQUARDT, _TRACK, _LAND, _POLISH, _NEAREST, _DONE, _FAILED = range(8)
 
 
@@ -83,18 +88,19 @@ def row_sizes(jacobian: Any, x: Any, sizes: Sizes, unit: Any) -> tuple[Any, Any]
     return magnitude @ size, NOISE * eps * (magnitude @ jnp.maximum(unit, size) + sizes.data)
 
 
-def column_sizes(value: Any, jacobian: Any, sizes: Sizes) -> Any:
+def column_sizes(value: Any, jacobian: Any, sizes: Sizes, power: Any = None) -> Any:
     """A size for every unknown: as known, or else what its rows imply, |∂F/∂xⱼ|·xⱼ being of the size of their other
-    terms; 1 where nothing is known."""
+    terms; 1 where nothing is known. With `power`, shape (m, n), terms are |jacobian|·xⱼ**power."""
     tiny, huge = float(jnp.finfo(jacobian.dtype).tiny), 1 / float(jnp.finfo(jacobian.dtype).eps)
     magnitude = jnp.where(jnp.isfinite(jacobian), jnp.abs(jacobian), 0)
     offset = jnp.maximum(sizes.data, jnp.where(jnp.isfinite(value), jnp.abs(value), 0))
     size = sizes.known
     for _ in range(2):
-        row = jnp.maximum(offset, jnp.max(magnitude * size[None, :], axis=1, initial=0.0))
+        terms = magnitude * (size[None, :] if power is None else size[None, :] ** power)
+        row = jnp.maximum(offset, jnp.max(terms, axis=1, initial=0.0))
         seen = (magnitude > tiny) & (row > tiny)[:, None]
         ratio = jnp.where(seen, row[:, None] / jnp.where(seen, magnitude, 1), jnp.inf)
-        implied = jnp.min(ratio, axis=0, initial=jnp.inf)
+        implied = jnp.min(ratio if power is None else ratio ** (1 / power), axis=0, initial=jnp.inf)
         size = jnp.where(sizes.known > 0, sizes.known, jnp.where(implied < huge, implied, 0))
     return jnp.where(size > 0, size, 1)
 
@@ -126,7 +132,7 @@ class _Scalars(NamedTuple):
     phase: Any
     method: Any
     fresh: Any  # whether the trial point is where a rung starts
-    begun: Any  # whether F has been finite
+    begun: Any  # 1 once F has been finite; on the way there, see `_PROBES`
     count: Any  # evaluations on this rung
     evaluations: Any
     size: Any
@@ -198,12 +204,11 @@ def find_root(
         return jnp.append(x, ahead[n])
 
     def evaluate(state: _Machine) -> _Machine:
-        x, unit = state.points[0, :n], state.points[5, :n]
+        x = state.points[0, :n]
         jacobian, value = jax.jacfwd(lambda y: (function(y),) * 2, has_aux=True)(x)
         # What a function of the user's closes over may be differentiated elsewhere: not in here.
         value, jacobian = jax.lax.stop_gradient((value, jacobian))
-        begins = state.scalars[3] == 0
-        unit = where(begins, column_sizes(value, jacobian, sizes), unit)
+        probing, probe, unit = probed(state, value, jacobian)
         size, noise = row_sizes(jacobian, x, sizes, unit)
         size = size + sizes.data
         reached = jnp.all(jnp.abs(value) <= close * size)
@@ -211,7 +216,31 @@ def find_root(
         pulled = where(hard, 0.1 * float(np.sqrt(enough)) * size, jnp.inf)
         allowed = where(is_nearest(state.scalars[0]), pulled, enough * size) if has_soft else enough * size
         holds = jnp.all(jnp.abs(value) <= allowed + noise)
-        return advance(state, value, jacobian * unit[None, :], jnp.append(unit, one), reached, holds)
+        ahead = advance(state, value, jacobian * unit[None, :], jnp.append(unit, one), reached, holds)
+        return jax.tree.map(lambda a, b: where(probing, a, b), probe, ahead)
+
+    def probed(state: _Machine, value, jacobian) -> tuple[Any, _Machine, Any]:
+        """Whether the sizes of unknowns are still being found; the next state if so; and the sizes."""
+        begun, (trial, base, *others, stored) = state.scalars[3], state.points
+        first, last = begun == 0, begun == -float(len(_PROBES))
+        flat = where(first, (sizes.known == 0) & ~jnp.any(jacobian != 0, axis=0), stored[:n] < 0)
+        probing = first & jnp.all(jnp.isfinite(value)) & jnp.any(flat) | (begun < 0) & (begun > _SIZED)
+        base, value = where(first, trial, base), where(first, value, state.rows[1])
+        slopes, before = jnp.abs(jacobian), jnp.abs(state.jacobian)
+        comparable = flat[None, :] & last & (slopes > 0) & (before > 0) & jnp.isfinite(before)
+        growth = jnp.log(where(comparable, before / slopes, one)) / float(np.log(_PROBES[0] / _PROBES[1]))
+        power = 1 + jnp.clip(growth, 0, 8)
+        known_slopes = where(first, jacobian, where(flat[None, :] & ~last, jacobian, state.jacobian))
+        implied = column_sizes(value, known_slopes / power, sizes, power)
+        unit = where(first | last, implied, stored[:n])
+        distance = where(first, _PROBES[0], where(last, 0.0, _PROBES[1]))
+        trial = base + distance * jnp.append(where(flat, one, 0 * one), 0 * one)
+        kept = where(last, unit, where(flat, -one, one))
+        points = jnp.stack([trial, base, *others, jnp.append(kept, one)])
+        counted = jnp.asarray(np.eye(len(_Scalars._fields))[[3, 5]], dtype)
+        scalars = state.scalars - counted[0] + counted[1]
+        rows = jnp.stack([value, value, state.rows[2]])
+        return probing, _Machine(scalars, points, rows, known_slopes), unit
 
     def advance(state: _Machine, value, jacobian, unit, reached, holds) -> _Machine:
         s = _Scalars(*state.scalars)
@@ -220,7 +249,7 @@ def find_root(
         nearest, marquardt = is_nearest(phase), phase == _MARQUARDT
         descending = (phase == _NEWTON) | (phase == _POLISH) | nearest
         tracking, landing = (phase == _TRACK) | (phase == _LAND), phase == _LAND
-        begins = s.begun == 0
+        begins = s.begun <= 0
         # A root is a root on any rung; but what the homotopy lands on is polished first.
         stop = reached & ~tracking
 
@@ -292,9 +321,12 @@ def find_root(
         on_curve = finite & (stretch < jnp.inf) & (fresh | (length <= 0.02 * jnp.minimum(arc, one)))
         on_curve &= fresh | landing | (stretch * SMALLEST_COSINE <= 1)  # with the last tangent, a unit vector
         reach = where(s.corrections == 0, arc, 0.5 * s.growth)
-        correcting = finite & ~on_curve & (s.corrections < CORRECTIONS) & (length <= reach)
-        landed, passes = on_curve & landing, on_curve & ~landing
         corrected = here + where(fresh, 0 * one, one) * unit * step
+        # A correction past s = 1, from a prediction before it, would miss the root: a shorter arc lands.
+        passed = on_curve & ~fresh & ~landing & ((corrected[n] - 1) * (base[n] - 1) < 0)
+        on_curve &= ~passed
+        correcting = finite & ~on_curve & ~passed & (s.corrections < CORRECTIONS) & (length <= reach)
+        landed, passes = on_curve & landing, on_curve & ~landing
         arc = where(passes, where(s.corrections <= 1, 2 * arc, arc), arc / 3)
         arc = where(fresh, FIRST_ARC, jnp.minimum(arc, 1 + extent))
         rest = (1 - corrected[n]) / tangent[n]  # of the way to s = 1, along the tangent
