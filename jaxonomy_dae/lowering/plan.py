@@ -16,6 +16,7 @@ from ..model.opaque import OpaqueFunction
 from ..model.quantities import QuantityMap
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel
 from . import pattern
+from .dummy_blocks import DummyBlocks, dummy_blocks
 from .gather import Gather
 from .program import Program
 from .schedule import TORN, AnyStep
@@ -117,6 +118,11 @@ class SystemPlan:
         n, found = len(self.states), self.dae_pattern
         inside = (found.rows >= n) & (found.cols >= n)
         return SparsePattern(found.rows[inside] - n, found.cols[inside] - n, len(self.carried))
+
+    @functools.cached_property
+    def dummy_blocks(self) -> tuple[DummyBlocks, ...]:
+        """The nonlinear blocks whose unknowns were dropped from the candidates for states."""
+        return dummy_blocks(self.steps, self.selection.dummies) if len(self.carried) else ()
 
     def quantity_of(self, variable: int) -> tuple[int, int]:
         """(quantity, sign) of a variable; quantity ZERO if it is identically zero."""

@@ -5,12 +5,13 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ..solvers.failures import explain_failure
-from ..system.system import AcausalSystem
+from ..solvers.choice_guard import SINGULAR_CHOICE
+from ..solvers.failures import SHOWN, explain_failure
 from .integration import term_of
 from .solution import Solution
 from .step_sizes import scaled_atol
 
+NEARLY = 1e-2  # of the first determinant: a singular choice explains a failure so close to it
 PROBES = 64  # times at which inputs are looked at
 
 
@@ -23,13 +24,15 @@ def explain(
     bad = _bad_input(inputs, float(t0), float(t), float(t1))
     if bad:
         return f"the integration stopped at t={float(t):g}: {bad}"
+    singular = _singular_choice(solution, t, x)
+    if singular:
+        return f"{singular}."
     names = [*system.states, *system.carried]
-    text = explain_failure(
+    return explain_failure(
         term_of(system, implicit), inputs, t, x, names,
         result=solution.result, t0=t0, t1=t1, max_steps=max_steps, rtol=rtol, atol=scaled_atol(system, atol),
         explicit=not implicit,
     )  # fmt: skip
-    return f"{text} {_chart_hint(system)}".rstrip()
 
 
 def _bad_input(inputs: dict[str, Any], t0: float, t: float, t1: float) -> str:
@@ -47,10 +50,25 @@ def _bad_input(inputs: dict[str, Any], t0: float, t: float, t1: float) -> str:
     return ""
 
 
-def _chart_hint(system: AcausalSystem) -> str:
-    if system.plan.mode != "dummy_derivatives" or not system.carried:
+def _singular_choice(solution: Solution, t: Any, x: Any) -> str:
+    """What the states do not determine at a point, if that is where and why the run ended."""
+    system, inputs = solution.system, solution.inputs
+    plan = system.plan
+    if not plan.dummy_blocks:
         return ""
+    here = np.abs(np.asarray(system.dummy_determinants(t, x, inputs)))
+    first = np.abs(np.asarray(system.dummy_determinants(solution.ts[0], solution.states[0], inputs)))
+    # Other causes may end a run just before: steps too many, or too short.
+    if solution.result != SINGULAR_CHOICE and not (here <= NEARLY * first).any():
+        return ""
+    columns = [column for block in plan.dummy_blocks for column in block.columns]
+    lost = columns[int(np.argmin(here))]
+    values = np.asarray(x)[len(plan.states) + lost]
+    shown = ", ".join(f"'{system.carried[c]}' = {v:.3g}" for c, v in list(zip(lost, values, strict=True))[:SHOWN])
+    states = ", ".join(f"'{name}'" for name in system.states[:SHOWN])
+    more = f" and {len(system.states) - SHOWN} more" if len(system.states) > SHOWN else ""
     return (
-        f"Perhaps the states {', '.join(system.states[:4])} have become a singular choice, which "
-        'state_selection="auto" avoids.'
+        f"the integration stopped at t={float(t):.6g}: the states {states}{more} have become a singular choice. There "
+        f"they do not determine {shown}, and which branch goes on cannot be told. "
+        'Compile with state_selection="auto", which has no such points, or with other prefer_states'
     )

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from ..initialization.initialize import InitialPoint, check, initialize, is_consistent
 from ..linear.choice import SPARSE_FROM
 from ..solvers import BDF, DAETerm, Tsit5
+from ..solvers.choice_guard import ChoiceGuard
 from ..solvers.drive import integrate, is_implicit
 from ..solvers.projected import with_projection
 from ..solvers.switching import STIFF, Watch
@@ -67,7 +68,7 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, throw: bo
     x0, controller = found.x, options.controller
     implicit = is_implicit(options.solver)
     term = term_of(system, implicit)
-    solver = _prepared(system, options.solver, implicit, watch)
+    solver = _prepared(system, options.solver, implicit, watch, _atol(system, controller))
     own_start = implicit and not isinstance(controller, diffrax.StepTo)
     dt0 = None if own_start else first_step(system, t0, t1, x0, inputs, solver.order(term), controller)
     save = diffrax.SubSaveAt(t0=True, steps=True) if ts is None else diffrax.SubSaveAt(ts=ts)
@@ -100,18 +101,34 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, throw: bo
 run_compiled = eqx.filter_jit(run)
 
 
-def _prepared(system: AcausalSystem, solver: Any, implicit: bool, watch: Watch | None) -> Any:
+def _prepared(system: AcausalSystem, solver: Any, implicit: bool, watch: Watch | None, atol: Any) -> Any:
     """The solver with what the system fills in: projections, what to watch."""
     if isinstance(solver, Tsit5) and watch is not None:
         solver = Tsit5(watch=watch)
+    # A minimal set of states may become a singular choice on the way.
+    guard = ChoiceGuard(system.dummy_determinants, atol) if system.plan.dummy_blocks else None
     if system.is_constrained and not implicit:
-        return with_projection(solver, system.project, strict=bool(system.carried))
+        return with_projection(solver, system.project, strict=bool(system.carried), guard=guard)
     if isinstance(solver, BDF):
         if solver.algebraic_errors is None:
             solver = dataclasses.replace(solver, algebraic_errors=False)
         if system.plan.n_constraints and solver.projection is None:
             solver = dataclasses.replace(solver, projection=system.project)
-        return solver
-    if system.plan.n_constraints and implicit:
-        return with_projection(solver, system.project, strict=False)
+        return dataclasses.replace(solver, guard=guard)
+    if implicit and system.plan.n_constraints:
+        return with_projection(solver, system.project, strict=False, guard=guard)
+    if implicit and guard is not None:
+        return with_projection(solver, _unchanged, strict=False, guard=guard)
     return solver
+
+
+def _atol(system: AcausalSystem, controller: Any) -> Any:
+    """The largest absolute tolerance in units of the nominal values; zero for steps of prescribed sizes."""
+    while isinstance(controller, diffrax.ClipStepSizeController):
+        controller = controller.controller
+    return jax.lax.stop_gradient(jnp.max(jnp.asarray(getattr(controller, "atol", 0.0)) / system.plan.nominal))
+
+
+def _unchanged(t: Any, x: Any, args: Any) -> Any:
+    """The projection of an implicit solver that has no constraint left: it solves nonlinear blocks itself."""
+    return x

@@ -11,6 +11,7 @@ from jax.flatten_util import ravel_pytree
 
 from ..linear.choice import choose
 from .bdf_coefficients import Coefficients, coefficients, interpolate
+from .choice_guard import ChoiceGuard
 from .dae_term import FlatProblem
 from .index_one import consistent_point, consistent_slope
 from .newton import Tolerances, implicit_step
@@ -55,6 +56,7 @@ class _State(eqx.Module):
     last_cj: Any
     contraction: Any  # ρ/(1−ρ) of the last Newton iterations
     counts: Any  # Jacobians (and factorisations), Newton iterations
+    largest: Any  # of the determinants measured, each; None if there are none
 
 
 class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
@@ -82,6 +84,7 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
     - `rtol`, `atol`, `norm`: given where the step-size controller has none; else left out.
     - `projection`: `(t, y, args) -> y`, onto hidden constraints: applied inside the step, before the history is
         updated. `simulate` fills it in.
+    - `guard`: as in `Projected`.
 
     Takes a `DAETerm` or a `diffrax.ODETerm`; wants `StepControl(rtol, atol, steered=True)` and works with
     `diffrax.PIDController(rtol, atol)`.
@@ -92,6 +95,7 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
     linear_solver: lx.AbstractLinearSolver | None = None
     algebraic_errors: bool | None = eqx.field(static=True, default=None)
     projection: Projection | None = None
+    guard: ChoiceGuard | None = None
     root_finder: Any = Tolerances()
     root_find_max_steps: int = eqx.field(static=True, default=4)
 
@@ -118,9 +122,19 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         y = problem.flat
         linear = choose(self.linear_solver, y.shape[0], problem.pattern, problem.mass)
         slope = consistent_slope(problem, self.linear_solver, t0, y)
-        return self._fresh(y, slope, t1 - t0, linear.empty(y.shape[0], y.dtype), jnp.zeros((2,), jnp.int32))
+        return self._fresh(
+            y,
+            slope,
+            t1 - t0,
+            linear.empty(y.shape[0], y.dtype),
+            jnp.zeros((2,), jnp.int32),
+            self._measured(t0, y0, args),
+        )
 
-    def _fresh(self, y, slope, h, factor, counts) -> _State:
+    def _measured(self, t, y, args):
+        return None if self.guard is None else self.guard.measure(t, y, args)
+
+    def _fresh(self, y, slope, h, factor, counts, largest) -> _State:
         """The history of order 1 with one derivative known."""
         h = jnp.asarray(h)
         one, zero = jnp.array(1, jnp.int32), jnp.array(0, jnp.int32)
@@ -129,6 +143,7 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         return _State(
             phi, h * jnp.arange(1, ROWS + 1, dtype=h.dtype), one, zero, zero, jnp.zeros_like(still), still,
             jnp.array(True), factor, jnp.zeros_like(still), jnp.zeros_like(still), jnp.full((), 20.0, h.dtype), counts,
+            largest,
         )  # fmt: skip
 
     def step(self, terms, t0, t1, y0, args, solver_state: _State, made_jump):
@@ -143,7 +158,8 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
             def restart():
                 moved, _ = consistent_point(problem, self.linear_solver, t0, y)  # algebraic unknowns jump too
                 slope = consistent_slope(problem, self.linear_solver, t0, moved)
-                return moved, self._fresh(moved, slope, h, state.factor, state.counts)
+                largest = self._measured(t0, problem.unravel(moved), args)
+                return moved, self._fresh(moved, slope, h, state.factor, state.counts, largest)
 
             y, state = jax.lax.cond(made_jump, restart, lambda: (y, state))
         rtol, atol, norm = self.root_finder.values(y.dtype)
@@ -169,6 +185,10 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
             moved = ravel_like(self.projection(t1, problem.unravel(y1), args))
             y1 = jnp.where(solved.converged, moved, y1)
         e = y1 - predicted
+        allowed, largest, result = True, state.largest, diffrax.RESULTS.successful
+        if self.guard is not None:
+            verdict = self.guard.judge(largest, t1, problem.unravel(y1), args)
+            allowed, largest, result = verdict.allowed, verdict.largest, verdict.result(result)
 
         # Error estimates at this order and its neighbours, after Brenan, Campbell & Petzold, eq. 5.2.31 ff.
         still = jax.lax.stop_gradient
@@ -194,7 +214,7 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         kf = k.astype(y.dtype)
         total, total_1, total_2 = (kf + 1) * err, kf * err_1, (kf - 1) * err_2
         fall = jnp.where(k > 2, jnp.maximum(total_1, total_2) <= total, (k == 2) & (total_1 <= 0.5 * total))
-        accepted = solved.converged & (c.test.astype(y.dtype) * e_norm < 1.0)
+        accepted = solved.converged & allowed & (c.test.astype(y.dtype) * e_norm < 1.0)
 
         same = jnp.abs(still(h) - state.last_step) <= 1e-6 * state.last_step
         steady = jnp.where(same & (k == state.last_order), state.steady, 0)
@@ -218,7 +238,7 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         factor = jnp.where(wish >= 2, 2.0, jnp.where(wish <= 1, jnp.clip(wish, 0.5, 0.9), 1.0))
         factor = jnp.where(starting, jnp.where(first, 1.0, 2.0), factor)
         again = 0.9 * (2 * err + 1e-4) ** (-1 / (kf + 1))
-        again = jnp.where(solved.converged & ~retried, jnp.clip(again, 0.25, 0.9), 0.25)
+        again = jnp.where(solved.converged & allowed & ~retried, jnp.clip(again, 0.25, 0.9), 0.25)
         factor = jnp.where(accepted, factor, jnp.where(jnp.isfinite(again), again, 0.25))
 
         updated = _advance(phi, e, k, self.max_order)
@@ -226,14 +246,14 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         new_state = _State(
             updated, c.psi, next_order, k, steady.astype(jnp.int32), h_, h_ * factor.astype(h_.dtype), starting,
             solved.factor, solved.factor_cj, still(cj), solved.contraction,
-            state.counts + jnp.stack([solved.factorisations, solved.iterations]),
+            state.counts + jnp.stack([solved.factorisations, solved.iterations]), largest,
         )  # fmt: skip
         value = jnp.where(jnp.isfinite(y1), y1, y)
         scale = atol + jnp.maximum(jnp.abs(y), jnp.abs(value)) * rtol
         y_error = encoded(factor, accepted) * still(jnp.broadcast_to(scale, y.shape))
         # Diffrax fills unused rows with infinity, which integers do not have.
         dense = dict(y0=y0, phi=jax.vmap(problem.unravel)(updated), psi=c.psi, order=k.astype(c.psi.dtype))
-        return problem.unravel(y1), problem.unravel(y_error), dense, new_state, diffrax.RESULTS.successful
+        return problem.unravel(y1), problem.unravel(y_error), dense, new_state, result
 
 
 def ravel_like(y: Any) -> Any:

@@ -9,6 +9,8 @@ import jax.numpy as jnp
 from diffrax import AbstractSolver
 from diffrax import AbstractWrappedSolver as _Wrapped
 
+from .choice_guard import ChoiceGuard
+
 Projection = Callable[[Any, Any, Any], Any]
 
 
@@ -26,11 +28,14 @@ class Projected(_Wrapped):
     - `projection`: a function `(t, y, args) -> y` such as `system.project`; `simulate` fills it in if left out.
     - `strict`: whether the distance moved counts as an error of the step. A step that has slipped to another branch of
         an implicit function is then rejected, however well its own error estimate looks.
+    - `guard`: ends the run with `RESULTS.singular` where a minimal set of states becomes a singular choice. `simulate`
+        fills it in.
     """
 
     solver: AbstractSolver
     projection: Projection | None = None
     strict: bool = eqx.field(static=True, default=False)
+    guard: ChoiceGuard | None = None
 
     def __check_init__(self):
         if isinstance(self.solver, Projected):
@@ -75,11 +80,15 @@ class Projected(_Wrapped):
         return self.solver.error_order(terms)
 
     def init(self, terms, t0, t1, y0, args):
-        return self.solver.init(terms, t0, t1, y0, args)
+        state = self.solver.init(terms, t0, t1, y0, args)
+        return state if self.guard is None else (state, self.guard.measure(t0, y0, args))
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         if self.projection is None:
             raise ValueError("Projected needs a projection outside simulate(): Projected(solver, system.project)")
+        largest: Any = None
+        if self.guard is not None:
+            solver_state, largest = solver_state
         y1, y_error, dense_info, solver_state, result = self.solver.step(
             terms, t0, t1, y0, args, solver_state, made_jump
         )
@@ -87,16 +96,25 @@ class Projected(_Wrapped):
         if self.strict and y_error is not None:
             moved = jax.tree.map(lambda a, b: jnp.abs(a - b), projected, y1)
             y_error = jax.tree.map(lambda e, m: jnp.abs(e) + m, y_error, moved)
+        if self.guard is not None:
+            if made_jump is not False:
+                largest = jnp.where(made_jump, self.guard.measure(t0, y0, args), largest)
+            verdict = self.guard.judge(largest, t1, projected, args)
+            if y_error is not None:
+                y_error = jax.tree.map(lambda e: jnp.where(verdict.allowed, e, jnp.inf), y_error)
+            solver_state, result = (solver_state, verdict.largest), verdict.result(result)
         return projected, y_error, dense_info, solver_state, result
 
     def func(self, terms, t0, y0, args):
         return self.solver.func(terms, t0, y0, args)
 
 
-def with_projection(solver: AbstractSolver, projection: Projection, strict: bool) -> Projected:
+def with_projection(
+    solver: AbstractSolver, projection: Projection, strict: bool, guard: ChoiceGuard | None = None
+) -> Projected:
     """The solver wrapped, or its own wrapper filled in."""
     if isinstance(solver, _Wrapped) and isinstance(getattr(solver, "projection", None), Callable):
         return solver  # type: ignore[return-value]
     if type(solver) is Projected:
-        return eqx.tree_at(lambda s: s.projection, solver, projection, is_leaf=lambda v: v is None)
-    return Projected(solver, projection, strict)
+        return Projected(solver.solver, projection, solver.strict, guard)
+    return Projected(solver, projection, strict, guard)

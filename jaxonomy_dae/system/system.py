@@ -203,6 +203,14 @@ class AcausalSystem(eqx.Module):
         """The state moved onto the hidden constraints (nothing to do if there are none)."""
         return self._point(t, args).project(x, iterations)
 
+    def dummy_determinants(self, t: Any, x: Float[Array, " n"], args: Any = None) -> Float[Array, " blocks"]:
+        """The determinants that vanish where the choice of states is singular, one for every nonlinear block that
+        determines variables left out of a minimal set; not differentiated."""
+        frozen, t, x, args = jax.tree.map(
+            lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf, (self, t, x, args)
+        )
+        return jax.lax.stop_gradient(frozen._point(t, args).dummy_determinants(x))
+
     @property
     def is_constrained(self) -> bool:
         """Whether a state must satisfy hidden constraints, or carries unknowns of nonlinear blocks."""

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..linear.sparse import solve_block, sparse_jacobian
+from ..linear.sparse import SparsePattern, solve_block, sparse_jacobian
 from ..linear.written_out import UNROLLED, solve, solve_dense
 from ..lowering.gather import Gather, take
 from ..lowering.plan import ConstraintGroup, PlannedRow, SystemPlan
@@ -160,6 +160,42 @@ class Point:
 
     def carried_vector(self, t: Any, state: Any) -> Any:
         return jnp.concatenate([jnp.reshape(r, (-1,)) for r in self._carried(t, state)])
+
+    def dummy_determinants(self, x: Any) -> Any:
+        """det ∂g/∂z of every block that determines dummy derivatives z, each equation g = 0 in units of its gradient
+        with respect to all states, shape (blocks,). Zero where the choice of states is singular."""
+        plan = self.plan
+        n, m = len(plan.states), len(plan.carried)
+        state = self.split(x)
+        if isinstance(state, tuple) and m == 1:
+            return jnp.stack([self._only_determinant(state)])
+
+        def g(x):
+            return self.carried_vector(self.t, self.split(x))
+
+        if plan.carried_pattern is not None and plan.dae_pattern is not None:
+            inside = plan.dae_pattern.rows >= n
+            rows, cols = plan.dae_pattern.rows[inside] - n, plan.dae_pattern.cols[inside]
+            pattern = SparsePattern(rows, cols, plan.n_state, n_rows=m)
+            jacobian = pattern.dense(sparse_jacobian(g, pattern)(x))
+        else:
+            jacobian = (jax.jacrev if 4 * m < n else jax.jacfwd)(g)(x)
+        jacobian = jacobian * jnp.asarray(plan.nominal, self.dtype)
+        size = jnp.sqrt(jnp.sum(jacobian**2, axis=1, keepdims=True))
+        matrix = (jacobian / jnp.where(size == 0, 1, size))[:, n:]
+        found = [matrix[b.rows[:, :, None], b.columns[:, None, :]] for b in plan.dummy_blocks]
+        return jnp.concatenate([b[:, 0, 0] if b.shape[-1] == 1 else jnp.linalg.det(b) for b in found])
+
+    def _only_determinant(self, state: tuple) -> Any:
+        """The same of a single equation, on scalars, which XLA fuses."""
+        _, push = jax.linearize(lambda *x: self._carried(self.t, x)[0], *state)
+        one, zero = jnp.ones((), self.dtype), jnp.zeros((), self.dtype)
+        gradient = [
+            float(w) * push(*(one if j == k else zero for j in range(len(state))))
+            for k, w in enumerate(self.plan.nominal)
+        ]
+        size = jnp.sqrt(_sum([g * g for g in gradient], zero))
+        return jnp.reshape(gradient[-1] / jnp.where(size == 0, 1, size), ())
 
     def refined(self, state: Any, count: int) -> Any:
         """The state after Newton corrections of the tearing variables of nonlinear blocks, block by block."""

@@ -1,0 +1,53 @@
+"""Steps that would carry a minimal set of states through a point where it is a singular choice.
+
+Where nonlinear equations g(x, z) = 0 give the variables z that are left out of the states x, a zero of det ∂g/∂z is a
+branch point: the equations hold on both branches, before and behind, and no residual tells them apart. Near it z varies
+like the root of x, so an error of 1e-8 in x, small under usual tolerances, is 1e-4 in z.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+Determinants = Float[Array, " blocks"]
+
+SINGULAR_CHOICE: Any = diffrax.RESULTS.singular
+NEAREST = 1e-4  # of the largest determinant so far
+IN_DOUBT = 30.0  # absolute tolerances: a variable this close to the branch point may have passed it
+REFUSED = 0.5  # of the nearest: a step that goes further is not accepted, so that the end is found from one side
+
+
+class Verdict(eqx.Module):
+    """On a step: whether it may be kept, whether the run goes on if it is, and the largest determinants so far."""
+
+    allowed: Bool[Array, ""]
+    goes_on: Bool[Array, ""]
+    largest: Determinants
+
+    def result(self, other: Any) -> Any:
+        """The solver's own result, or `SINGULAR_CHOICE`."""
+        return diffrax.RESULTS.where(self.goes_on, other, SINGULAR_CHOICE)
+
+
+class ChoiceGuard(eqx.Module):
+    """Ends a run where a determinant has nearly vanished, and rejects steps at whose end one has changed its sign.
+
+    - `measure`: `(t, y, args) -> determinants`, about 1 where regular.
+    - `atol`: the absolute tolerance of the run in units of the nominal values, which says what "nearly" is.
+    """
+
+    measure: Callable[[Any, Any, Any], Determinants]
+    atol: Any
+
+    def judge(self, largest: Determinants, t: Any, y: Any, args: Any) -> Verdict:
+        """Judges a step by its end."""
+        found = self.measure(t, y, args)
+        along, size = jnp.sign(largest) * found, jnp.abs(largest)
+        nearest = jnp.maximum(NEAREST * size, jnp.minimum(IN_DOUBT * self.atol, 0.1))
+        return Verdict(
+            jnp.all(along > REFUSED * nearest), jnp.all(along > nearest), jnp.where(along > size, found, largest)
+        )
