@@ -12,7 +12,7 @@ from fractions import Fraction
 import numpy as np
 
 from ..expressions.node import ONE, ZERO, Node, Number, constant, divide, linear, multiply, scale
-from ..model.scaling import equilibrated
+from ..model.scaling import equilibrated, geometric_scales
 
 DEFICIENT = 1e-11  # singular values below, of an equilibrated matrix, are examined
 CANCELLED = 1e-11  # of the terms: a sum this small is zero
@@ -28,9 +28,27 @@ def cancels(weights: np.ndarray, matrix: np.ndarray) -> bool:
 def left_null_vectors(matrix: np.ndarray) -> list[np.ndarray]:
     """Vectors w with wᵀA = 0, each with an entry 1 where the others have none; fewest entries first."""
     scaled, rows, _ = equilibrated(matrix)
-    u, s, _ = np.linalg.svd(scaled.toarray(), full_matrices=True)
-    s = np.append(s, np.zeros(matrix.shape[0]))[: matrix.shape[0]]
-    null = u[:, s <= DEFICIENT * max(s[0], 1e-300)].T.copy()
+    null = _small(scaled.toarray())
+    found = _verified(null, rows, matrix)
+    if len(found) < len(null):  # perhaps for want of better scaling
+        r, c = geometric_scales(matrix)
+        better, rows, _ = equilibrated(r[:, None] * matrix * c)
+        more = _verified(_small(better.toarray()), r * rows, matrix)
+        found = more if len(more) > len(found) else found
+    return sorted(found, key=lambda w: (np.count_nonzero(w), *np.flatnonzero(w).tolist()))
+
+
+def _small(scaled: np.ndarray) -> np.ndarray:
+    """Left singular vectors of small singular values, as rows."""
+    u, s, _ = np.linalg.svd(scaled, full_matrices=True)
+    s = np.append(s, np.zeros(scaled.shape[0]))[: scaled.shape[0]]
+    return u[:, s <= DEFICIENT * max(s[0], 1e-300)].T.copy()
+
+
+def _verified(null: np.ndarray, rows: np.ndarray, matrix: np.ndarray) -> list[np.ndarray]:
+    """Sparse combinations of the null vectors of diag(rows)·A, as those of A; without those with which columns of A
+    do not cancel."""
+    null = null.copy()
     chosen: list[int] = []
     for k in range(len(null)):  # Gauss–Jordan elimination with complete pivoting
         r, c = np.unravel_index(np.argmax(np.abs(null[k:])), null[k:].shape)
@@ -41,8 +59,7 @@ def left_null_vectors(matrix: np.ndarray) -> list[np.ndarray]:
         chosen.append(int(c))
     null[np.abs(null) < 1e-8] = 0.0
     found = [w * rows / rows[c] for w, c in zip(null, chosen, strict=True)]
-    found = [w for w in found if cancels(w, matrix)]
-    return sorted(found, key=lambda w: (np.count_nonzero(w), *np.flatnonzero(w).tolist()))
+    return [w for w in found if cancels(w, matrix)]
 
 
 def rational(value: float) -> Number:

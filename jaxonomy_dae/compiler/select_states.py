@@ -17,11 +17,11 @@ from scipy.sparse.csgraph import connected_components
 from ..errors import StructuralError
 from ..model.evaluate_numpy import Networks, group_values
 from ..model.extended import Extended
+from ..model.scaling import equilibrated, geometric_scales
 from ..model.tables import ZERO, EquationGroup, equation_offsets
 
 POOR_PIVOT = 0.1  # a preferred pivot may be this much smaller than the best one
 SINGULAR = 1e-9  # singular value of an equilibrated matrix
-EQUILIBRATIONS = 8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -231,11 +231,16 @@ def _pivots(matrix: np.ndarray, keys: list[tuple]) -> list[int] | None:
 
 
 def _is_singular(matrix: np.ndarray) -> bool:
-    """Whether rows depend on each other, in units in which all rows and columns are alike (Ruiz 2001): those of an
-    equation or a variable do not decide."""
+    """Whether rows depend on each other, in units in which all rows and columns are alike: those of an equation or a
+    variable do not decide."""
     if matrix.shape[0] > matrix.shape[1]:
         return True
-    for _ in range(EQUILIBRATIONS):
-        rows, columns = (np.abs(matrix).max(axis=axis, keepdims=True, initial=0.0) for axis in (1, 0))
-        matrix = matrix / np.sqrt(np.where(rows > 0, rows, 1.0) * np.where(columns > 0, columns, 1.0))
-    return bool(np.linalg.svd(matrix, compute_uv=False)[-1] <= SINGULAR)
+    if not _looks_singular(matrix):
+        return False
+    r, c = geometric_scales(matrix)
+    return _looks_singular(r[:, None] * matrix * c)
+
+
+def _looks_singular(matrix: np.ndarray) -> bool:
+    scaled = equilibrated(matrix)[0].toarray()
+    return bool(np.linalg.svd(scaled, compute_uv=False)[-1] <= SINGULAR)

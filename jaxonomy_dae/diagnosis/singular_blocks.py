@@ -17,7 +17,7 @@ import scipy.sparse.linalg
 from ..lowering.plan import SystemPlan
 from ..lowering.schedule import SparseStep, Step, StepEquation
 from ..model.evaluate_numpy import Networks
-from ..model.scaling import equilibrated
+from ..model.scaling import equilibrated, geometric_scales
 from ..model.tables import ZERO, describe_equation
 
 DENSE_LIMIT = 200  # unknowns up to which a block gets a singular value decomposition
@@ -229,6 +229,12 @@ def _conditions(matrices: np.ndarray):
     if not (condition < ILL_CONDITIONED).all():  # perhaps for want of better scaling
         scaled = _equilibrated(matrices, PASSES)
         condition = _ratio(np.linalg.svd(scaled, compute_uv=False))
+    for b in np.flatnonzero(~(condition < ILL_CONDITIONED)):
+        r, c = geometric_scales(matrices[b])
+        better = _equilibrated((r[:, None] * matrices[b] * c)[None], PASSES)
+        least = _ratio(np.linalg.svd(better, compute_uv=False))[0]
+        if least < condition[b]:
+            scaled[b], condition[b] = better[0], least
 
     def null(b: int, transposed: bool) -> np.ndarray:
         u, s, vt = np.linalg.svd(scaled[b])
@@ -246,14 +252,7 @@ def _ratio(singular: np.ndarray) -> np.ndarray:
 
 def _estimate(matrix: np.ndarray) -> float:
     """A lower bound of a large block's condition number, by a sparse factorization (Hager 1984)."""
-    linalg: Any = scipy.sparse.linalg
-    sparse = sp.csc_array(matrix)
-    try:
-        factors = linalg.splu(sparse)
-    except RuntimeError:
-        return np.inf
-    inverse = linalg.LinearOperator(matrix.shape, matvec=factors.solve, rmatvec=lambda v: factors.solve(v, trans="T"))
-    return float(linalg.onenormest(sparse) * linalg.onenormest(inverse, t=1))
+    return _factored(sp.csc_array(matrix))[1]
 
 
 def _sparse_finding(plan: SystemPlan, values: _Values, step: SparseStep) -> BlockFinding | None:
@@ -277,17 +276,16 @@ def _sparse_finding(plan: SystemPlan, values: _Values, step: SparseStep) -> Bloc
     matrix = sp.csc_array((np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))), shape=(n, n))
     if not np.isfinite(matrix.data).all():
         return None  # what is not finite has another cause than rank
-    balanced, left_scale, right_scale = equilibrated(matrix)
-    scaled = sp.csc_array(balanced)
-    linalg: Any = scipy.sparse.linalg
-    factors: Any = None
-    condition = np.inf
-    try:
-        factors = linalg.splu(scaled)
-        inverse = linalg.LinearOperator((n, n), matvec=factors.solve, rmatvec=lambda v: factors.solve(v, trans="T"))
-        condition = float(linalg.onenormest(scaled) * linalg.onenormest(inverse, t=1))
-    except RuntimeError:  # exactly singular
-        pass
+    scaled, left_scale, right_scale = equilibrated(matrix)
+    factors, condition = _factored(sp.csc_array(scaled))
+    if not condition < ILL_CONDITIONED:  # perhaps for want of better scaling
+        r, c = geometric_scales(matrix)
+        better, more_left, more_right = equilibrated(sp.diags_array(r) @ matrix @ sp.diags_array(c))
+        found, least = _factored(sp.csc_array(better))
+        if least < condition:
+            scaled, factors, condition = better, found, least
+            left_scale, right_scale = r * more_left, c * more_right
+    scaled = sp.csc_array(scaled)
     if factors is not None and not step.carried:
         residual = np.concatenate([values.residual(e) for e in step.equations])
         values.quantities[step.unknown[0]] = right_scale * factors.solve(-left_scale * residual)
@@ -302,6 +300,17 @@ def _sparse_finding(plan: SystemPlan, values: _Values, step: SparseStep) -> Bloc
     singular = not condition < 1 / (4 * n * np.finfo(float).eps)
     causes = _sparse_causes(plan, values, step, column, left, right) if singular else ()
     return BlockFinding(condition, singular, n, names, equations, causes, bool(causes))
+
+
+def _factored(matrix: Any) -> tuple[Any, float]:
+    """The factors of a sparse matrix, None if it is exactly singular, and an estimate of its condition number."""
+    linalg: Any = scipy.sparse.linalg
+    try:
+        factors = linalg.splu(matrix)
+    except RuntimeError:
+        return None, np.inf
+    inverse = linalg.LinearOperator(matrix.shape, matvec=factors.solve, rmatvec=lambda v: factors.solve(v, trans="T"))
+    return factors, float(linalg.onenormest(matrix) * linalg.onenormest(inverse, t=1))
 
 
 def _null_vectors(matrix: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -127,6 +127,9 @@ def initialize(
         )
     else:
         remaining = residual(found.x, parameters, inputs, target)
+        # What rounding leaves of the gradient of a row that no unknown moves would count as much as other rows.
+        settled = np.isin(np.arange(m), n_equations + np.array(rows.settled, int))
+        jacobian = jnp.where(settled[:, None], 0, jacobian)
         w = found.x - least_squares(jacobian * found.unit[None, :], jnp.where(good, remaining, 0)) * found.unit
     full = jnp.concatenate([jnp.zeros((n_equations,), point.dtype), target])
     limit = jnp.where(is_soft, jnp.inf, found.limit)

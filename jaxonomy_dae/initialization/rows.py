@@ -22,7 +22,7 @@ from ..lowering.plan import SystemPlan
 from ..model.dependent_parameters import complete
 from ..model.evaluate_numpy import Networks, generic_jacobian, slot_values, start_values
 from ..model.quantities import ABSENT, declared_scale
-from ..model.scaling import equilibrated
+from ..model.scaling import equilibrated, geometric_scales
 from ..model.tables import ZERO, Start
 from ..structure.matching import match_in_order
 
@@ -52,6 +52,7 @@ class InitialRows:
     independent: tuple[bool, ...]  # of the rows kept, those that no row before determines
     direct: bool  # every kept row is a state and nothing else constrains the states
     redundant: tuple[int, ...]  # rows that must hold, though they follow from others
+    settled: tuple[int, ...]  # of these, rows that follow from equations alone: no unknown moves them
     promoted: tuple[str, ...]  # states that start at or near their guess, as nothing else determines them
     dropped: tuple[str, ...]  # fixed starts that values given by the caller outrank
 
@@ -121,7 +122,7 @@ def initial_rows(plan: SystemPlan, names: tuple[str, ...], solve_for: tuple[int,
             held.add(r.quantity)
         promoted = tuple(plan.quantity_name[q] for q in entries if q not in held)
         independent = tuple(k not in again for k in range(len(rows)))
-        return InitialRows(guess, tuple(rows), 0, independent, True, tuple(again), promoted, ())
+        return InitialRows(guess, tuple(rows), 0, independent, True, tuple(again), (), promoted, ())
     generic = _generic(plan, solve_for)
     ranked = _by_rank if generic.jacobian.shape[1] <= DENSE_LIMIT else _by_matching
     return ranked(plan, generic, overrides, fixed, guess)
@@ -171,7 +172,24 @@ def _generic(plan: SystemPlan, solve_for: tuple[int, ...]) -> _Generic:
     if solve_for:
         jacobian = sp.hstack([jacobian, sp.csr_array(_parameter_columns(plan, point, values, solve_for))], format="csr")
     scaled, _, columns = equilibrated(jacobian)
+    if scaled.shape[1] <= DENSE_LIMIT and (rank := _rank(scaled)) < scaled.shape[0]:  # perhaps for want of scaling
+        r, c = geometric_scales(jacobian)
+        better, _, more = equilibrated(sp.csr_array(sp.diags_array(r) @ jacobian @ sp.diags_array(c)))
+        if _rank(better) > rank:
+            scaled, columns = better, c * more
     return _Generic(scaled, columns, values, solve_for)
+
+
+def _pivoted(jacobian: np.ndarray) -> tuple[np.ndarray, int]:
+    """An orthogonal basis whose first `rank` columns span the rows, and that rank."""
+    factors: Any = scipy.linalg.qr(jacobian.T, pivoting=True)
+    q, r, _ = factors
+    pivots = np.abs(np.diag(r))
+    return q, int((pivots > RANK * max(pivots.max(initial=0.0), 1e-300)).sum())
+
+
+def _rank(jacobian: Any) -> int:
+    return _pivoted(jacobian.toarray())[1]
 
 
 def _parameter_columns(plan: SystemPlan, point, values, solve_for) -> np.ndarray:
@@ -216,10 +234,8 @@ class _Directions:
     """The directions that equations leave open, shape (columns, freedom), closed one by one."""
 
     def __init__(self, jacobian: np.ndarray):
-        factors: Any = scipy.linalg.qr(jacobian.T, pivoting=True)
-        q, r, _ = factors
-        pivots = np.abs(np.diag(r))
-        self.free = q[:, int((pivots > RANK * max(pivots.max(initial=0.0), 1e-300)).sum()) :]
+        q, rank = _pivoted(jacobian)
+        self.free = q[:, rank:]
 
     def open(self, gradient: np.ndarray) -> bool:
         """Whether a row of this gradient is not determined yet."""
@@ -242,13 +258,15 @@ class _Directions:
 
 def _by_rank(plan: SystemPlan, generic: _Generic, overrides, fixed, guess) -> InitialRows:
     directions = _Directions(generic.jacobian.toarray())
-    kept, independent, dropped = [], [], []
-    settled = [not directions.open(generic.row(row)) for row in fixed]  # by the equations, whatever is given
-    for row, follows in zip((*overrides, *fixed), ([True] * len(overrides) + settled), strict=True):
+    kept, independent, dropped, settled = [], [], [], []
+    alone = [not directions.open(generic.row(row)) for row in (*overrides, *fixed)]  # whatever is given
+    for row, follows in zip((*overrides, *fixed), alone, strict=True):
         closes = directions.close(generic.row(row))
-        if not closes and overrides and not follows:
+        if not closes and overrides and not follows and row.given < 0:
             dropped.append(row.name)  # what the caller gave outranks it
             continue
+        if follows:
+            settled.append(len(kept))
         kept.append(row)
         independent.append(closes)
     redundant = tuple(k for k, closes in enumerate(independent) if not closes)
@@ -264,7 +282,7 @@ def _by_rank(plan: SystemPlan, generic: _Generic, overrides, fixed, guess) -> In
             soft.append((row, closes))
     if generic.solve_for:
         _check_count(plan, generic, directions, [kept[k] for k in redundant], [*kept, *(row for row, _ in soft)])
-    return _chosen(guess, kept, independent, soft, redundant, dropped, plan)
+    return _chosen(guess, kept, independent, soft, redundant, tuple(settled), dropped, plan)
 
 
 def _by_matching(plan: SystemPlan, generic: _Generic, overrides, fixed, guess) -> InitialRows:
@@ -289,14 +307,14 @@ def _by_matching(plan: SystemPlan, generic: _Generic, overrides, fixed, guess) -
         what = "too few" if missing else "too many"
         raise InitializationError(f"solve_for: {what} values in initial={{...}} to determine {unknown}")
     dropped = [row.name for row, gone in zip(rows[:hard], is_dropped, strict=True) if gone]
-    return _chosen(guess, kept, independent, soft, redundant, dropped, plan)
+    return _chosen(guess, kept, independent, soft, redundant, (), dropped, plan)
 
 
-def _chosen(guess, kept: list[Row], independent: list[bool], soft, redundant, dropped, plan) -> InitialRows:
+def _chosen(guess, kept: list[Row], independent: list[bool], soft, redundant, settled, dropped, plan) -> InitialRows:
     alone = (*independent, *(closes for _, closes in soft))
     names = tuple(plan.quantity_name[row.quantity] for row, _ in soft)
     rows = (*kept, *(row for row, _ in soft))
-    return InitialRows(guess, rows, len(soft), alone, False, redundant, names, tuple(dropped))
+    return InitialRows(guess, rows, len(soft), alone, False, redundant, settled, names, tuple(dropped))
 
 
 # --- what follows from what ----------------------------------------------------------------------------------------

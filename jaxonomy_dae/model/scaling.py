@@ -4,8 +4,31 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
+import scipy.sparse.linalg
 
 PASSES = 10
+LARGEST_EXPONENT = 300.0  # of ten, for a scale
+
+
+def geometric_scales(matrix: Any) -> tuple[np.ndarray, np.ndarray]:
+    """r and c for which the logarithms of the entries of diag(r)·A·diag(c) are nearest to zero (Curtis & Reid 1972).
+
+    Matrices that differ by scalings of rows and columns alone come out equal, however far apart the scales are. Entries
+    that are rounding errors count as much as others, so this answers whether a matrix that looks singular after
+    `equilibrated` is regular, not the other way round.
+    """
+    a: Any = sp.coo_array(matrix)
+    a.eliminate_zeros()
+    n, m = a.shape
+    if not a.nnz:
+        return np.ones(n), np.ones(m)
+    row, column = a.coords
+    k = np.arange(len(row))
+    pattern = sp.csr_array((np.ones(2 * len(k)), (np.tile(k, 2), np.append(row, n + column))), shape=(len(k), n + m))
+    linalg: Any = scipy.sparse.linalg
+    found = linalg.lsmr(pattern, -np.log10(np.abs(a.data)), atol=1e-4, btol=1e-4, maxiter=20 * (n + m))[0]
+    exponent = np.clip(found, -LARGEST_EXPONENT, LARGEST_EXPONENT)
+    return 10.0 ** exponent[:n], 10.0 ** exponent[n:]
 
 
 def equilibrated(matrix: Any, passes: int = PASSES) -> tuple[Any, np.ndarray, np.ndarray]:

@@ -1,0 +1,117 @@
+"""Derivatives that cancel in float coefficients, and questions of rank in any units."""
+
+import numpy as np
+import pytest
+import scipy.optimize
+import sympy
+from attack import descriptors
+
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der
+from jaxonomy_dae.compiler.null_vectors import cancels, left_null_vectors
+from jaxonomy_dae.compiler.select_states import _is_singular
+from jaxonomy_dae.diagnosis.singular_blocks import ILL_CONDITIONED, _conditions
+from jaxonomy_dae.model.evaluate_numpy import group_values
+from jaxonomy_dae.model.scaling import geometric_scales
+
+
+class _Written(Component):
+    def __init__(self, ev, names, equations):
+        super().__init__(ev, "d")
+        self.add_equations(*equations(*(self.variable(name) for name in names), ev.t))
+
+
+def _compiled(names, equations):
+    ev = EqnEnv()
+    return AcausalCompiler(ev, AcausalDiagram().add(_Written(ev, names, equations)))()
+
+
+def _chain(n: int, seed: int, singular: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Aliases a·x = b·y around a ring, with ratios up to 1e60: singular if the product of the ratios is 1. The matrix
+    and its left null vector in that case."""
+    rng = np.random.default_rng(seed)
+    plain = np.eye(n) - np.roll(np.eye(n), 1, axis=1)
+    plain[0, 0] = 1.0 if singular else 3.0
+    rows, columns = (10.0 ** rng.uniform(-15, 15, n) for _ in range(2))
+    return rows[:, None] * plain * columns, 1 / rows
+
+
+@pytest.mark.parametrize("n", [2, 7, 30])
+@pytest.mark.parametrize("seed", range(3))
+def test_units_do_not_decide_a_rank(n, seed):
+    regular, _ = _chain(n, seed, singular=False)
+    singular, null = _chain(n, seed, singular=True)
+    assert _conditions(regular[None])[0][0] < ILL_CONDITIONED
+    assert not _conditions(singular[None])[0][0] < ILL_CONDITIONED
+    assert not _is_singular(regular) and _is_singular(singular)
+    assert left_null_vectors(regular) == []
+    (found,) = left_null_vectors(singular)
+    assert cancels(found, singular)
+    np.testing.assert_allclose(found / null, found[0] / null[0], rtol=1e-10)
+
+
+def test_scales_undo_any_scaling():
+    rng = np.random.default_rng(0)
+    plain = rng.uniform(0.5, 1.5, (6, 5)) * (rng.random((6, 5)) < 0.7)
+    scaled = 10.0 ** rng.uniform(-30, 30, (6, 1)) * plain * 10.0 ** rng.uniform(-30, 30, 5)
+
+    def freed(matrix):
+        r, c = geometric_scales(matrix)
+        return r[:, None] * matrix * c
+
+    np.testing.assert_allclose(freed(scaled), freed(plain), rtol=0.05)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_derivatives_that_cancel_in_floats(seed):
+    s = 10.0 ** np.random.default_rng(seed).uniform(-12, 9, 4)
+
+    def equations(x, y, t):
+        current = 1e-6 * (s[0] * der(x) - s[1] * der(y))
+        return s[2] * (current + 0.3 * s[0] * x - 0.1), s[3] * (-current + 0.7 * s[1] * y - 0.2)
+
+    system = _compiled(["x", "y"], equations)
+    assert len(system.states) == 1
+    start = system.initialize(initial={"d.x": 1 / s[0]})
+    # The sum of the equations is 0.3·X + 0.7·Y = 0.3, in X = s₀·x and Y = s₁·y.
+    np.testing.assert_allclose(np.asarray(system.observe("d.x", 0.0, start)) * s[0], 1, rtol=1e-9)
+    np.testing.assert_allclose(np.asarray(system.observe("d.y", 0.0, start)) * s[1], 0, atol=1e-9)
+    rate = {"d.x": -0.14e6 / s[0], "d.y": 0.06e6 / s[1]}[system.states[0]]
+    np.testing.assert_allclose(np.asarray(system.vector_field(0.0, start)), [rate], rtol=1e-9)
+
+
+def test_given_values_that_follow_from_equations_move_nothing():
+    # Values that the equations alone determine have gradients of rounding errors.
+    case = descriptors.make(10)
+    system = AcausalCompiler(case.ev, case.diagram)()
+    x = system.initialize(initial=case.initial)
+    np.testing.assert_allclose(x, [case.initial[n] for n in system.states], rtol=1e-9)
+    rates = [case.rates[n].value for n in system.states]
+    np.testing.assert_allclose(system.vector_field(0.0, x), rates, rtol=1e-8)
+
+
+def test_a_long_equation_differentiated_twice():
+    n = 60
+
+    def equations(p, v, force, t):
+        z = p
+        for _ in range(n):
+            z = z + sympy.sin(z) / 100
+        return der(p) - v, der(v) - force, z - 1 - t
+
+    plan = _compiled(["p", "v", "force"], equations).plan
+    p = scipy.optimize.brentq(lambda p: _maps(p, n)[0] - 1, 0, 1, xtol=1e-15)
+    _, first, second = _maps(p, n)
+    values = np.array([p, 1 / first, -second / first**3])  # p, der(p), der(der(p)): z = 1 + t
+    assert plan.extended.quantities.order.tolist() == [0, 1, 2]
+    for group in plan.extended.groups:
+        np.testing.assert_allclose(group_values(group, values, np.zeros(0), 0.0, ()), 0, atol=1e-13)
+    assert sorted(plan.extended.level.tolist()) == [0, 1, 2]
+
+
+def _maps(z: float, n: int) -> tuple[float, float, float]:
+    """z and its first two derivatives after z ← z + sin(z)/100, n times."""
+    first, second = 1.0, 0.0
+    for _ in range(n):
+        slope, bend = 1 + np.cos(z) / 100, -np.sin(z) / 100
+        z, first, second = z + np.sin(z) / 100, slope * first, bend * first**2 + slope * second
+    return z, first, second
