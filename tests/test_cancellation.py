@@ -2,15 +2,12 @@
 
 import numpy as np
 import pytest
-import scipy.optimize
-import sympy
 from attack import descriptors
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der
 from jaxonomy_dae.compiler.null_vectors import cancels, left_null_vectors
 from jaxonomy_dae.compiler.select_states import _is_singular
 from jaxonomy_dae.diagnosis.singular_blocks import ILL_CONDITIONED, _conditions
-from jaxonomy_dae.model.evaluate_numpy import group_values
 from jaxonomy_dae.model.scaling import geometric_scales
 
 
@@ -87,31 +84,3 @@ def test_given_values_that_follow_from_equations_move_nothing():
     np.testing.assert_allclose(x, [case.initial[n] for n in system.states], rtol=1e-9)
     rates = [case.rates[n].value for n in system.states]
     np.testing.assert_allclose(system.vector_field(0.0, x), rates, rtol=1e-8)
-
-
-def test_a_long_equation_differentiated_twice():
-    n = 60
-
-    def equations(p, v, force, t):
-        z = p
-        for _ in range(n):
-            z = z + sympy.sin(z) / 100
-        return der(p) - v, der(v) - force, z - 1 - t
-
-    plan = _compiled(["p", "v", "force"], equations).plan
-    p = scipy.optimize.brentq(lambda p: _maps(p, n)[0] - 1, 0, 1, xtol=1e-15)
-    _, first, second = _maps(p, n)
-    values = np.array([p, 1 / first, -second / first**3])  # p, der(p), der(der(p)): z = 1 + t
-    assert plan.extended.quantities.order.tolist() == [0, 1, 2]
-    for group in plan.extended.groups:
-        np.testing.assert_allclose(group_values(group, values, np.zeros(0), 0.0, ()), 0, atol=1e-13)
-    assert sorted(plan.extended.level.tolist()) == [0, 1, 2]
-
-
-def _maps(z: float, n: int) -> tuple[float, float, float]:
-    """z and its first two derivatives after z ← z + sin(z)/100, n times."""
-    first, second = 1.0, 0.0
-    for _ in range(n):
-        slope, bend = 1 + np.cos(z) / 100, -np.sin(z) / 100
-        z, first, second = z + np.sin(z) / 100, slope * first, bend * first**2 + slope * second
-    return z, first, second
