@@ -27,7 +27,6 @@ import scipy.sparse as sp
 from jaxtyping import Array, Float
 
 from ..errors import ModelError
-from .written_out import solve_dense
 
 EXTRA = 'pip install "jaxonomy_dae[sparse]"'
 DENSE = 1000  # simultaneous equations that dense elimination may solve if there is no sparse solver: about 20 ms
@@ -298,22 +297,6 @@ def _on_host(rows: np.ndarray, cols: np.ndarray, values: Any, b: Any) -> Any:
         return out.reshape(*batch, n)
 
     return jax.pure_callback(solved, jax.ShapeDtypeStruct(b.shape, b.dtype), values, b, vmap_method="expand_dims")
-
-
-def solve_block(pattern: SparsePattern, values: Any, right: Any) -> Any:
-    """A·x = b by KLU; by dense elimination where KLU is not available and A is not too large for that.
-
-    **Raises:** `ModelError` where neither is possible.
-    """
-    if is_double() and available():
-        return solve_sparse(pattern, values, right)
-    check_solvable(pattern.n)
-    if pattern.n > DENSE:
-        raise ModelError(
-            f"the model has {pattern.n} simultaneous equations; sparse solves compute in float64: call "
-            "jax.config.update('jax_enable_x64', True) at the start"
-        )
-    return solve_dense(pattern.dense(values), right)
 
 
 def check_solvable(n: int):

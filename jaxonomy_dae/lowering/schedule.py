@@ -17,11 +17,12 @@ from ..structure.tearing import Sizes, Tearing, tear
 from .entry_sizes import EntrySizes
 
 # A block stays whole, its matrix sparse, if it has more tearing variables than TORN: dense elimination then takes more
-# than KLU (30 unknowns: 0.2 ms and 0.09 ms; 200: 0.8 and 0.12). Or if it is longer than WRITTEN_OUT, because XLA needs
-# 50 ms for each equation written out (a resistor grid with a block of 98 took 5.4 s, and 0.4 s whole). A nonlinear one
-# may be longer, for all unknowns of a block that stays whole lie in the state array.
+# than KLU (30 unknowns: 0.2 ms and 0.09 ms; 200: 0.8 and 0.12). Or if it is longer than WRITTEN_OUT, because XLA's time
+# grows with every equation written out: the gradient of a linear block of 34 takes 3.7 s of compilation, and 1.1 s
+# whole, at equal run times. A nonlinear one may be longer, for all unknowns of a block that stays whole lie in the
+# state array.
 TORN = 32
-WRITTEN_OUT = {True: 50, False: 200}  # by whether the block is linear
+WRITTEN_OUT = {True: 20, False: 200}  # by whether the block is linear
 
 
 @dataclasses.dataclass(frozen=True)

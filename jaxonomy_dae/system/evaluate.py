@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..linear.sparse import solve_block
 from ..linear.torn import solve_torn
+from ..linear.whole import solve_whole
 from ..linear.written_out import UNROLLED, solve, solve_dense
 from ..lowering.gather import Chunk, Gather, take
 from ..lowering.program import PlannedEquation, PlannedRepeat, PlannedSparse, PlannedStep, Program
@@ -159,7 +159,7 @@ class Evaluation:
         def solved(u: Any) -> Any:
             """One Newton step, exact if the equations are affine."""
             residual, values = self._whole(planned, u, partials=True)
-            return u - solve_block(planned.pattern, values, residual)
+            return u - solve_whole(planned.pattern, values, residual, checked=planned.guess is None)
 
         if planned.guess is None:
             return solved(jnp.zeros(planned.step.n, self.dtype))

@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..linear.sparse import SparsePattern, solve_block, sparse_jacobian
+from ..linear.sparse import SparsePattern, sparse_jacobian
+from ..linear.whole import solve_whole
 from ..linear.written_out import UNROLLED, solve, solve_dense
 from ..lowering.gather import Gather, take
 from ..lowering.plan import ConstraintGroup, PlannedRow, SystemPlan
@@ -151,7 +152,7 @@ class Point:
 
         if plan.carried_pattern is not None:
             matrix = sparse_jacobian(of_z, plan.carried_pattern)(state[n:])
-            return jnp.concatenate([slopes, -solve_block(plan.carried_pattern, matrix, value)])
+            return jnp.concatenate([slopes, -solve_whole(plan.carried_pattern, matrix, value)])
         return jnp.concatenate([slopes, -solve_dense(jax.jacfwd(of_z)(state[n:]), value)])
 
     def _carried(self, t: Any, state: Any) -> list[Any]:
