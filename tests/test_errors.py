@@ -277,7 +277,7 @@ def connects_what_is_not_there():
              lambda: AcausalDiagram().connect(Resistor(EV, "r").p, Mass(EV, "m").flange)),
         case(r"at least two ports; got .r\.p. only", lambda: AcausalDiagram().connect(Resistor(EV, "r").p)),
         case(r"needs a port name after 'g'", lambda: AcausalDiagram().connect(Resistor(EV, "r").p, Ground(EV, "g"))),
-        case(r"takes ports, or a component and a port name; got 'p'", lambda: AcausalDiagram().connect("p", "n")),
+        case(r"takes ports, symbols of variables, or a component and a name; got 'p'", lambda: AcausalDiagram().connect("p", "n")),
         case(r"'outer' connects outer\.inner\.r\.p.*its own ports and its children's", connects_a_grandchild),
         case(r"outside\.p.*not part of the diagram: add it", connects_what_is_not_there),
         case(r"components 'r' and 'g' were made with two EqnEnvs", two_environments),

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from ..diagnosis.singular_blocks import ILL_CONDITIONED, BlockFinding, equation_text, examine_blocks
 from ..lowering.plan import SystemPlan
 from ..lowering.schedule import SparseStep
 from ..model.tables import ZERO
@@ -15,6 +14,7 @@ from ..system.system_at import input_values
 from .initialize import InitialPoint, is_consistent
 from .ladder import FAILED, METHODS, NEAREST, tolerance
 from .rows import Row, initial_rows, supports
+from .singular_blocks import ILL_CONDITIONED, BlockFinding, equation_text, examine_blocks
 
 SHOWN = 12
 HTML_SHOWN = 200
