@@ -8,8 +8,8 @@ import jaxonomy_dae
 
 ROOT = Path(jaxonomy_dae.__file__).parent
 ORDER = [
-    "errors", "modeling", "structure", "linear", "adjoint", "solvers", "model", "diagnosis", "compiler", "lowering",
-    "system", "initialization", "simulation", "learning", "plotting", "library",
+    "errors", "expressions", "modeling", "structure", "linear", "adjoint", "solvers", "model", "diagnosis", "compiler",
+    "lowering", "system", "initialization", "simulation", "learning", "plotting", "library",
 ]  # fmt: skip
 # Methods that hand over to a room above their own, when they are called.
 DEFERRED = {("system", "initialization"), ("simulation", "plotting")}
