@@ -7,7 +7,7 @@ from attack import descriptors
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der
 from jaxonomy_dae.compiler.null_vectors import cancels, left_null_vectors
 from jaxonomy_dae.compiler.select_states import _is_singular
-from jaxonomy_dae.diagnosis.singular_blocks import ILL_CONDITIONED, _conditions
+from jaxonomy_dae.initialization.singular_blocks import ILL_CONDITIONED, _conditions
 from jaxonomy_dae.model.scaling import geometric_scales
 
 
