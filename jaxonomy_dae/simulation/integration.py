@@ -126,7 +126,9 @@ def _atol(system: AcausalSystem, controller: Any) -> Any:
     """The largest absolute tolerance in units of the nominal values; zero for steps of prescribed sizes."""
     while isinstance(controller, diffrax.ClipStepSizeController):
         controller = controller.controller
-    return jax.lax.stop_gradient(jnp.max(jnp.asarray(getattr(controller, "atol", 0.0)) / system.plan.nominal))
+    return jax.lax.stop_gradient(
+        jnp.max(jnp.asarray(getattr(controller, "atol", 0.0)) / system.plan.nominal, initial=0.0)
+    )
 
 
 def _unchanged(t: Any, x: Any, args: Any) -> Any:
