@@ -102,8 +102,8 @@ def structure(system: "AcausalSystem", ax: Any = None) -> Any:
 
 
 def _equation_label(plan: Any, equation: int) -> str:
-    from .model.tables import describe_equation
+    from .model.tables import provenance_of
 
-    text = describe_equation(plan.groups, int(plan.extended.base[equation])).replace("0 = ", "")
+    text = str(provenance_of(plan.groups, int(plan.extended.base[equation]))).replace("0 = ", "")
     text = text if len(text) <= 40 else text[:39] + "…"
     return text + "\u2032" * int(plan.extended.level[equation])

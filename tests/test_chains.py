@@ -144,7 +144,7 @@ def changing(k, y, x, p):
 
 
 def far_back(k, y, x, p):
-    """Every link reads the first, which is no repetition before but known when the run starts."""
+    """Every link reads the first, which does not repeat what came before but is known when the run starts."""
     return p * y[k - 1] + 0.1 * y[0] * x if k else x**2
 
 

@@ -83,7 +83,7 @@ def test_tree_at_replaces_parameters_and_networks():
 def test_systems_are_pytrees_of_arrays(rc):
     leaves = jax.tree.leaves(rc)
     assert leaves and all(isinstance(leaf, jax.Array) for leaf in leaves)
-    assert jax.tree.structure(rc) == jax.tree.structure(rc_circuit(R=7.0))  # values are no part of the structure
+    assert jax.tree.structure(rc) == jax.tree.structure(rc_circuit(R=7.0))  # values are not part of the structure
     assert jax.tree.structure(rc) != jax.tree.structure(pendulum())
 
 

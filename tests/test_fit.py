@@ -20,7 +20,7 @@ TS = jnp.array([0.5, 1.0, 2.0])
 
 
 class Bowl(eqx.Module):
-    """A plain Equinox module: a point to be moved to a minimum, and a label that is no array."""
+    """A plain Equinox module: a point to be moved to a minimum, and a label that is not an array."""
 
     x: jax.Array
     y: jax.Array

@@ -73,7 +73,7 @@ def test_pattern_of_the_semi_explicit_form(model):
     state = jnp.asarray(np.random.default_rng(0).uniform(0.4, 1.2, plan.n_state))
 
     def residual(state):
-        point = system._point(0.2, None)
+        point = system.at(0.2, None)
         state = point.split(state)
         f = point.run(plan.derivative, state, refine=0).read(plan.next_derivative)
         return jnp.concatenate([jnp.broadcast_to(f, (n,)), point.carried_vector(point.t, state)])

@@ -148,7 +148,7 @@ def test_preferred_states_are_taken_where_they_are_regular():
 
 @pytest.mark.parametrize("theta, good, bad", [(-np.pi / 2, "x", "y"), (0.0, "y", "x")])
 def test_a_singular_choice_of_states_is_vetoed(theta, good, bad):
-    """At its lowest point a pendulum's height is no state: numbers decide, not structure alone."""
+    """At its lowest point a pendulum's height is not a state: numbers decide, not structure alone."""
     assert minimal(theta) == ({good, f"v{good}"}, "")
     states, notes = minimal(theta, f"pend.{bad}", f"pend.v{bad}")
     assert states == {good, f"v{good}"}

@@ -57,7 +57,7 @@ def test_systems(name, again):
         traced.append(None)
         return system.vector_field(0.0, x)
 
-    if not system.neural:  # whose functions are no arguments of jax.jit
+    if not system.neural:  # whose functions cannot be arguments of jax.jit
         np.testing.assert_array_equal(field(copied, state), field(system, state))
         assert len(traced) == 1  # equal as a key: the second call found the first one's program
     np.testing.assert_allclose(copied.initialize(), state, rtol=1e-12)

@@ -50,7 +50,7 @@ def test_variables_by_name(solution):
 
 
 def test_unknown_names(solution):
-    with pytest.raises(ModelError, match=r"'mass\.xx' is no variable: did you mean 'mass\.x'"):
+    with pytest.raises(ModelError, match=r"'mass\.xx' is not a variable: did you mean 'mass\.x'"):
         solution["mass.xx"]
     with pytest.raises(ModelError, match=r"'der\(der\(der\(mass\.x\)\)\)' occurs nowhere.*only 'mass\.x'"):
         solution["der(der(der(mass.x)))"]

@@ -37,7 +37,7 @@ def ladder_block(rs, rp):
 
 
 def torn(a, numbers, bounded=True):
-    """The tearing that a compiler chooses for the values in `a`; `numbers` tells which entries are no parameters."""
+    """The tearing that a compiler chooses for the values in `a`; `numbers` tells which entries are not parameters."""
     contains = [frozenset(np.flatnonzero(row).tolist()) for row in a]
     places = [(e, u) for e, row in enumerate(contains) for u in sorted(row)]
     sizes = Sizes({p: np.abs(a[p])[None] for p in places}, frozenset(p for p in places if numbers[p]))

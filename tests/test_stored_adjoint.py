@@ -256,7 +256,7 @@ def test_closures():
 
 @pytest.mark.slow
 def test_networks():
-    """Modules with functions and static parts in `args`; arrays that are no floats are left alone."""
+    """Modules with functions and static parts in `args`; arrays that are not floats are left alone."""
     network = eqx.nn.MLP(2, 2, 4, 1, jnp.tanh, key=jax.random.key(1))
     table = jnp.array([1, 0])
     term = diffrax.ODETerm(lambda t, y, args: args[0](y)[args[1]] - y)

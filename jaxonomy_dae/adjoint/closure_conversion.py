@@ -130,7 +130,7 @@ def inexact(tree: Any) -> Any:
 
 
 def rows(tree: Any, count: int) -> Any:
-    """Room for several of the like."""
+    """A zero table with `count` rows like `tree`."""
     return jax.tree.map(lambda leaf: jnp.zeros((count, *jnp.shape(leaf)), jnp.result_type(leaf)), tree)
 
 

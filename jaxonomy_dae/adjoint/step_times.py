@@ -14,7 +14,7 @@ class StepTimes:
     """Derivatives of tprev and tnext, taken along in the forward direction.
 
     A step-size controller multiplies the last step by a factor, and factors count as constants, so the ends of steps
-    depend on no state. What is left are a few numbers, here called seeds: the start, the first step, the end, and the
+    depend on no state. What is left is a few numbers, here called seeds: the start, the first step, the end, and the
     controller's own times, as far as they are differentiated. Mostly there are none.
     """
 

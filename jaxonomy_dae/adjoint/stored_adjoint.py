@@ -15,7 +15,7 @@ from .private_names import is_sde, while_loop
 from .recorded_loop import solve
 from .reverse_step import state_saves
 
-LARGEST_RECORD = 2**25  # bytes; above, storing steps is no longer what is cheap
+LARGEST_RECORD = 2**25  # bytes; above, storing steps is no longer cheap
 
 
 class StoredAdjoint(diffrax.AbstractAdjoint):

@@ -11,6 +11,7 @@ from ..expressions.node import ZERO as ZERO_NODE
 from ..expressions.node import Node, constant, leaf, linear, multiply, scale
 from ..expressions.substitute import substitute
 from ..model.linear_template import LinearTemplate
+from ..model.provenance import Provenance
 from ..model.symbolic import SymbolicTemplate, parameter_label, slot_label, template_of
 from ..model.tables import ZERO, EquationGroup
 from ..modeling.symbols import TIME_LABEL
@@ -113,7 +114,7 @@ def combine(
     return None
 
 
-def group_of(graph: Node, origin: str) -> EquationGroup:
+def group_of(graph: Node, provenance: Provenance) -> EquationGroup:
     """A group of one equation."""
     quantities = sorted(label[1:] for label in graph.leaves if label[0] == "quantity")
     parameters = sorted(label[1] for label in graph.leaves if label[0] == "of model")
@@ -127,5 +128,5 @@ def group_of(graph: Node, origin: str) -> EquationGroup:
         np.ones((1, len(quantities)), np.int64),
         np.array([parameters], np.int64).reshape(1, -1),
         np.zeros((1, 0)),
-        [origin],
+        [provenance],
     )

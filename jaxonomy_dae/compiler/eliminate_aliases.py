@@ -10,6 +10,7 @@ import dataclasses
 import numpy as np
 
 from ..model.linear_template import LinearTemplate
+from ..model.provenance import Provenance
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel
 
 Row = list[tuple[int, int, float]]  # (variable, order, coefficient)
@@ -95,32 +96,32 @@ def eliminate_aliases(model: FlatModel) -> tuple[tuple[EquationGroup, ...], Alia
         differentiated[group.variable[group.order > 0]] = True
     classes = _Classes(model, differentiated)
 
-    rows: list[tuple[Row, str]] = []
+    rows: list[tuple[Row, Provenance]] = []
     others: list[EquationGroup] = []
     for group in model.groups:
         if not isinstance(group.template, LinearTemplate):
             others.append(group)
             continue
-        for v, o, c, origin in zip(
-            group.variable.tolist(), group.order.tolist(), group.coefficient.tolist(), group.origin, strict=True
+        for v, o, c, provenance in zip(
+            group.variable.tolist(), group.order.tolist(), group.coefficient.tolist(), group.provenance, strict=True
         ):
-            rows.append((list(zip(v, o, c, strict=True)), origin))
+            rows.append((list(zip(v, o, c, strict=True)), provenance))
 
-    eliminated: list[tuple[str, int]] = []
+    eliminated: list[tuple[Provenance, int]] = []
     pending = rows
     changed = True
     while changed:
         # Short rows first, to a fixed point, then one sweep over the long ones: near-linear in all.
         changed = False
         kept = []
-        for row, origin in pending:
+        for row, provenance in pending:
             row = classes.canonical(row)
             replaced = classes.absorb(row) if 1 <= len(row) <= 2 else None
             if replaced is not None:
-                eliminated.append((origin, replaced))
+                eliminated.append((provenance, replaced))
                 changed = True
             else:
-                kept.append((row, origin))
+                kept.append((row, provenance))
         pending = kept
 
     root = np.empty(n, np.int64)
@@ -141,10 +142,10 @@ def _substitute(group: EquationGroup, table: AliasTable) -> EquationGroup:
     return dataclasses.replace(group, variable=variable, order=order, sign=sign)
 
 
-def _linear_groups(rows: list[tuple[Row, str]]) -> list[EquationGroup]:
-    by_length: dict[int, list[tuple[Row, str]]] = {}
-    for row, origin in rows:
-        by_length.setdefault(len(row), []).append((row, origin))
+def _linear_groups(rows: list[tuple[Row, Provenance]]) -> list[EquationGroup]:
+    by_length: dict[int, list[tuple[Row, Provenance]]] = {}
+    for row, provenance in rows:
+        by_length.setdefault(len(row), []).append((row, provenance))
     groups = []
     for length, members in by_length.items():
         shape = (len(members), length)
@@ -159,7 +160,7 @@ def _linear_groups(rows: list[tuple[Row, str]]) -> list[EquationGroup]:
                 np.ones(shape, np.int64),
                 np.zeros((shape[0], 0), np.int64),
                 coefficient,
-                [origin for _, origin in members],
+                [provenance for _, provenance in members],
             )
         )
     return groups

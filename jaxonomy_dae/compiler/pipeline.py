@@ -14,7 +14,7 @@ from ..model.evaluate_numpy import Networks
 from ..model.extended import Extended
 from ..model.incidence import incidence
 from ..model.quantities import QuantityMap, map_quantities, name_quantities, quantity_scale, start_guess
-from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, describe_equation, equation_offsets, written_by
+from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, locate, provenance_of
 from .differentiate_equations import differentiate_equations
 from .eliminate_aliases import eliminate_aliases
 from .order_blocks import Blocks, order_blocks
@@ -77,7 +77,7 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Co
         quantity_scale(flat, variables, extended),
         point,
         lambda q: names[q],
-        lambda e: describe_equation(groups, int(e)),
+        lambda e: str(provenance_of(groups, int(e))),
     )
     selection = dataclasses.replace(selection, notes=(*_loose_ports(flat), *starts, *notes, *selection.notes))
     known = np.zeros(extended.quantities.n, bool)
@@ -85,13 +85,13 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Co
     known[extended.quantities.n_unknown :] = True
     blocks = order_blocks(extended, known, selection.constraints)
     if isinstance(blocks, np.ndarray):
-        left = [describe_equation(groups, int(extended.base[e])) for e in blocks]
+        left = [provenance_of(groups, int(extended.base[e])) for e in blocks]
         raise StructuralError(
             "\n".join(
                 [
                     "after index reduction nothing is left for these equations to determine: they follow from the "
                     "others, or contradict them. Remove or change one of:",
-                    *itemised([(written_by(t) or "", t) for t in left]),
+                    *itemised(left),
                 ]
             )
         )
@@ -100,12 +100,11 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Co
 
 
 def _zero_pivot(flat: FlatModel, groups: tuple[EquationGroup, ...], equation: int) -> str:
-    first = equation_offsets(groups)
-    g = int(np.searchsorted(first, equation, side="right") - 1)
-    parameters = groups[g].parameter[equation - int(first[g])].tolist()
+    group, place = locate(groups, equation)
+    parameters = group.parameter[place].tolist()
     values = [f"{flat.parameters.names[p]} = {flat.parameters.values[p]:g}" for p in dict.fromkeys(parameters)]
     return (
-        f"the equation {describe_equation(groups, equation)} determines nothing for {', '.join(values)}: the "
+        f"the equation {group.provenance[place]} determines nothing for {', '.join(values)}: the "
         "coefficient of what it should determine is zero. Give other values, or leave the component out."
     )
 
@@ -121,7 +120,7 @@ def _preferred(flat: FlatModel, variables: QuantityMap, names: Sequence[str]) ->
     out = {}
     for k, name in enumerate(names):
         if name not in index:
-            raise ModelError(f"prefer_states: '{name}' is no variable: " + nearest(name, index))
+            raise ModelError(f"prefer_states: '{name}' is not a variable: " + nearest(name, index))
         q, _ = variables[index[name]]
         if q >= 0:
             out.setdefault(q, len(names) - k)
@@ -164,7 +163,7 @@ def _check_row_targets(flat: FlatModel, variables: QuantityMap, selection: State
             if variables[v][0] not in states:
                 name = flat.variables.names[v]
                 raise ModelError(
-                    f"neural block '{row.opaque.name}': its target '{name}' is no state, so it has no row to "
+                    f"neural block '{row.opaque.name}': its target '{name}' is not a state, so it has no row to "
                     f"add to. The states are {listed}. To make it one, compile with prefer_states=['{name}']; or "
-                    "use inject='equation', which needs no state."
+                    "use inject='equation', which does not need a state."
                 )

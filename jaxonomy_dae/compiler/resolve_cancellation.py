@@ -20,7 +20,8 @@ from ..expressions.kernel import Kernel
 from ..expressions.node import Node, constant, number
 from ..expressions.substitute import substitute
 from ..model.incidence import incidence
-from ..model.tables import ZERO, EquationGroup, describe_equation, equation_offsets, written_by
+from ..model.provenance import Provenance, combination
+from ..model.tables import ZERO, EquationGroup, equation_offsets, provenance_of
 from ..modeling.symbols import TIME_LABEL
 from ..structure.incidence import Incidence
 from ..structure.matching import maximum_matching
@@ -33,8 +34,6 @@ ROUNDS = 100
 TRIALS = 12  # random points, of which STATES are used: those where the equations have values
 STATES = 3
 PARAMETERS = 4  # sample values of the parameters
-COMBINED = "combination of "
-SOURCES = 4  # equations named
 
 
 def reduce_with_cancellation(
@@ -57,12 +56,12 @@ def reduce_with_cancellation(
         for equations in _blocks_of_several(signature, offsets):
             found = _combination(jacobian, equations)
             if found is not None:
-                combined = [describe_equation(groups, int(e)) for e in equations]
+                combined = [provenance_of(groups, int(e)) for e in equations]
                 replaced.append(found[0])
                 added.append(found[1])
         if not added:
             return groups, signature, offsets, tuple(notes)
-        notes += [f"highest derivatives cancel in a {group.origin[0]}" for group in added]
+        notes += [f"highest derivatives cancel in a {group.provenance[0]}" for group in added]
         groups = (*_without(groups, replaced), *added)
         signature = incidence(groups, column, n_unknown)
         if (maximum_matching(signature.pointer, signature.variable, n_unknown) < 0).any():
@@ -70,10 +69,10 @@ def reduce_with_cancellation(
     raise StructuralError(_dependent(combined))
 
 
-def _dependent(origins: list[str]) -> str:
+def _dependent(equations: list[Provenance]) -> str:
     """The message for equations that depend on each other, or contradict."""
     lines = ["these equations depend on each other, or contradict. Remove or change one of:"]
-    return "\n".join(lines + itemised([(written_by(o) or "", o) for o in origins]))
+    return "\n".join(lines + itemised(equations))
 
 
 def _blocks(signature: Incidence, offsets: Offsets) -> tuple[np.ndarray, np.ndarray]:
@@ -186,9 +185,9 @@ def _combination(jacobian: _Jacobian, equations: np.ndarray) -> tuple[int, Equat
     if not trials:
         return None
     everywhere = left_null_vectors(np.hstack(matrices))
-    texts = [describe_equation(groups, int(e)) for e in equations]
+    provenance = [provenance_of(groups, int(e)) for e in equations]
     if not everywhere:
-        raise StructuralError(_hidden(texts))
+        raise StructuralError(_hidden(provenance))
     used = np.flatnonzero(everywhere[0])
     c = offsets.equation[equations[used]]
     written = []
@@ -196,23 +195,20 @@ def _combination(jacobian: _Jacobian, equations: np.ndarray) -> tuple[int, Equat
         g, i = jacobian.place(e)
         graph = graph_of(groups[g], i, k)
         if graph is None:
-            raise StructuralError(_hidden(texts))
+            raise StructuralError(_hidden(provenance))
         written.append(graph)
-    sources = [texts[k] for k in used]
+    sources = [provenance[k] for k in used]
     unit = int(np.flatnonzero(c == c.min())[0])
     top = _highest(jacobian, columns, int(c.min()))
     found = _weights(written, top, unit, jacobian.values, trials)
     if found is None:
-        lines = itemised([(written_by(t) or "", t) for t in sources])
-        raise StructuralError("\n".join([_FOR_THESE_VALUES, *lines]))
+        raise StructuralError("\n".join([_FOR_THESE_VALUES, *itemised(sources)]))
     combined = combine(written, found, top, jacobian.values)
     if combined is None:
         raise StructuralError(_hidden(sources))
     if not any(label[0] == "quantity" for label in combined.leaves):
         raise StructuralError(_dependent(sources))
-    named = list(dict.fromkeys(p for t in sources for p in t.removeprefix(COMBINED).split("; ")))
-    origin = COMBINED + "; ".join([*named[:SOURCES], *(["…"] if len(named) > SOURCES else [])])
-    return int(equations[used[unit]]), group_of(combined, origin)
+    return int(equations[used[unit]]), group_of(combined, combination(sources))
 
 
 _FOR_THESE_VALUES = (
@@ -266,12 +262,12 @@ def _without(groups: tuple[EquationGroup, ...], equations: Sequence[int]) -> tup
     return tuple(out)
 
 
-def _hidden(origins: list[str]) -> str:
+def _hidden(equations: list[Provenance]) -> str:
     lines = [
         "these equations depend on each other in their highest derivatives, wherever the model is. Remove or change "
         "one, or state the constraint that they hide as an equation of its own:"
     ]
-    return "\n".join(lines + itemised([(written_by(o) or "", o) for o in origins]))
+    return "\n".join(lines + itemised(equations))
 
 
 def zero_pivots(groups, signature: Incidence, offsets: Offsets, column, values) -> np.ndarray:

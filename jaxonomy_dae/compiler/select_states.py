@@ -30,7 +30,7 @@ class StateSelection:
 
     states: np.ndarray  # quantities
     constraints: np.ndarray  # extended equations
-    dummies: np.ndarray  # candidate quantities that are no states
+    dummies: np.ndarray  # candidate quantities that are not states
     projected: np.ndarray  # equations as written whose hidden constraints are projected onto
     notes: tuple[str, ...]
 
@@ -178,7 +178,7 @@ def _dummy_derivatives(dense, c, columns, quantities, merit, scale, name, equati
     for level in range(1, int(c.max()) + 1):
         rows = np.flatnonzero(c >= level)
         available = available[quantities.highest[columns[available]] >= level]
-        # If the (d − level + 1)-th derivative is a dummy, the quantity below it is no state.
+        # If the (d − level + 1)-th derivative is a dummy, the quantity below it is not a state.
         below = quantities.first[columns[available]] + quantities.highest[columns[available]] - level
         matrix = dense[np.ix_(rows, available)] * scale[below]
         picked = _pivots(matrix, [(merit(int(q)), -int(q)) for q in below])

@@ -7,7 +7,7 @@ wrote these, and what their ports share.
 import numpy as np
 
 from ..model.coefficients import Entries
-from ..model.tables import ZERO, AliasTable, FlatModel, describe_equation, equation_offsets, written_by
+from ..model.tables import ZERO, AliasTable, FlatModel, equation_offsets, provenance_of
 from .wording import DomainWords, listed, words
 
 LARGEST = 400  # equations among which the smallest dependent set is sought
@@ -21,6 +21,7 @@ class Explainer:
         self.entries = entries
         self.determined_by = determined_by
         self.start = np.searchsorted(entries.row, np.arange(entries.n_rows + 1))
+        self.number = {name: k for k, name in enumerate(flat.components)}
 
     def behind(self, rows: list[int]) -> tuple[np.ndarray, np.ndarray]:
         """The equations, with those that determine their known variables; and all variables in them."""
@@ -71,12 +72,12 @@ class Explainer:
 
     def _ports_of(self, component: str, variables: np.ndarray) -> list[str]:
         """The ports of a component that these variables belong to."""
-        ports = np.unique(self.flat.variables.port[variables]).tolist()
-        return [name for name in (self.flat.ports.names[p] for p in ports) if name.rpartition(".")[0] == component]
+        ports = np.unique(self.flat.variables.port[variables])
+        return [self.flat.ports.names[p] for p in ports if self.flat.ports.owner[p] == self.number[component]]
 
     def components(self, rows) -> list[str]:
         """The components that wrote these equations, in the order of the model."""
-        found = {written_by(describe_equation(self.flat.groups, int(r))) for r in rows}
+        found = {provenance_of(self.flat.groups, int(r)).component for r in rows}
         return [c for c in self.flat.components if c in found]  # connections and networks are none
 
     def once_too_often(self, rows, variables, kind: str) -> str:
@@ -96,7 +97,7 @@ class Explainer:
                 f"the ports {own} of '{names[0]}' are connected with each other, but '{names[0]}' fixes the "
                 f"{word.between} between them. Remove the connection, or put {word.bridge} into it."
             )
-        if all(self.flat.ports.count(n) == 1 for n in names):
+        if all(self.flat.ports.count(self.number[n]) == 1 for n in names):
             every = "both fix" if len(names) == 2 else "each fix"
             return (
                 f"{listed(names)} {every} the {word.across} of one node. Keep one of them, or put {word.bridge} "

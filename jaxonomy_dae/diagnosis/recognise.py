@@ -24,7 +24,7 @@ from scipy.sparse.csgraph import connected_components
 
 from ..model.coefficients import Entries, entries_of
 from ..model.linear_template import LinearTemplate
-from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, written_by
+from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel
 from .explain import Explainer
 from .wording import listed, words
 
@@ -183,7 +183,7 @@ def _cuts(flat: FlatModel, groups, alias: AliasTable, known: np.ndarray) -> list
     for group in groups:
         if isinstance(group.template, LinearTemplate):
             unit = (np.abs(group.coefficient) == 1).all(axis=1) & (group.order == 0).all(axis=1)
-            connection[first : first + len(group)] = unit & [written_by(o) is None for o in group.origin]
+            connection[first : first + len(group)] = unit & [not p.is_written for p in group.provenance]
         first += len(group)
     inside = entries.take(connection[entries.row])
     rows, row = np.unique(inside.row, return_inverse=True)
@@ -213,10 +213,11 @@ def _floating(flat: FlatModel, groups, alias: AliasTable) -> tuple[list[str], se
     texts, components = [], set()
     for (domain, name), members in kinds.items():
         for island in _islands(flat, groups, alias, np.array(members)):
-            owners = [flat.components[c] for c in np.unique(variables.owner[island])]
+            numbers = np.unique(variables.owner[island])
+            owners = [flat.components[c] for c in numbers]
             loose = [ports.names[p] for p in np.unique(variables.port[island]) if ports.is_loose[p]]
             if len(owners) == 1 and len(loose) == len(island):
-                whole = len(loose) == ports.count(owners[0])
+                whole = len(loose) == ports.count(int(numbers[0]))
                 text = f"'{owners[0]}' is connected to nothing: connect {listed(loose)}"
                 texts.append(text + (", or leave it out." if whole else "."))
             else:

@@ -1,6 +1,6 @@
 """Fixed starts that repeat or contradict each other.
 
-A fixed start is an equation that holds at the initial time. Too many of them are no fault as long as they agree, and
+A fixed start is an equation that holds at the initial time. Too many of them do no harm as long as they agree, and
 whether they do usually depends on parameters, so that initialization decides. What certainly contradicts (plain
 numbers) is an error here; what must agree is noted in the report.
 """
@@ -100,7 +100,7 @@ def _check_linear(flat: FlatModel, groups, numbers: dict[tuple[int, int], tuple[
             pairs = zip(group.variable[k].tolist(), group.order[k].tolist(), strict=True)
             names = [flat.variables.names[numbers[q][0]] for q in pairs]
             raise StructuralError(
-                f"the fixed starts of {listed(names)} contradict the equation {group.origin[k]}. Free one of them "
+                f"the fixed starts of {listed(names)} contradict the equation {group.provenance[k]}. Free one of them "
                 "(fixed=False), or give values that agree."
             )
 
@@ -132,9 +132,10 @@ def dependent_starts(flat: FlatModel, variables: QuantityMap, extended: Extended
     over, _ = dulmage_mendelsohn(pattern, matched)
     notes = []
     for equations, inside in over:
-        names = [flat.variables.names[pins[int(pinned[k - n])]] for k in equations if k >= n]
+        started = [pins[int(pinned[k - n])] for k in equations if k >= n]
+        names = [flat.variables.names[v] for v in started]
         surplus = len(equations) - len(inside)
-        if len(names) > 1 and len({name.rpartition(".")[0] for name in names}) == 1:
+        if len(names) > 1 and len(set(flat.variables.owner[started].tolist())) == 1:
             continue  # one component's own affair: its author fixed what its author made agree
         if len(names) == 1:
             notes.append(

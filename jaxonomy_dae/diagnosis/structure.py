@@ -9,7 +9,8 @@ import numpy as np
 
 from ..errors import StructuralError
 from ..model.incidence import incidence
-from ..model.tables import AliasTable, EquationGroup, FlatModel, describe_equation, written_by
+from ..model.provenance import Provenance
+from ..model.tables import AliasTable, EquationGroup, FlatModel, provenance_of
 from ..structure.dulmage_mendelsohn import dulmage_mendelsohn
 from ..structure.incidence import Incidence
 from ..structure.matching import maximum_matching
@@ -44,26 +45,28 @@ def check_structure(
         texts = []
         for rows, variables in found.equations:
             if not len(variables):
-                text = describe_equation(flat.groups, int(rows[0]))
+                text = provenance_of(flat.groups, int(rows[0]))
                 texts.append(
                     f"this equation contains no unknown: {text}. Remove it, or declare its input as a variable."
                 )
                 continue
             names = [flat.variables.names[v] for v in variables if not flat.variables.is_port[v]]
             names = names or [flat.variables.names[v] for v in variables]
-            texts.append(_too_many([describe_equation(flat.groups, int(r)) for r in rows], len(variables), names))
+            texts.append(_too_many([provenance_of(flat.groups, int(r)) for r in rows], len(variables), names))
     else:
         texts = [
             _too_many(
-                [describe_equation(groups, int(r)) for r in rows], len(columns), _names(flat, alias, unknown, columns)
+                [provenance_of(groups, int(r)) for r in rows],
+                len(columns),
+                [flat.variables.names[v] for v in _best(flat, alias, unknown, columns)],
             )
             for rows, columns in over
             if len(columns)
         ]
-        empty = [describe_equation(groups, int(rows[0])) for rows, columns in over if not len(columns)]
+        empty = [provenance_of(groups, int(rows[0])) for rows, columns in over if not len(columns)]
         texts += _repeated(flat, empty) if empty else []
     texts += [
-        _too_few(flat, len(rows), _names(flat, alias, unknown, columns), np.isin(alias.root, unknown[columns]))
+        _too_few(flat, len(rows), _best(flat, alias, unknown, columns), np.isin(alias.root, unknown[columns]))
         for rows, columns in under
     ]
     raise StructuralError(_joined(texts, found.more))
@@ -80,7 +83,7 @@ def _joined(texts: list[str], unseen: int = 0) -> str:
     return "\n".join(["the equations do not fit together:", *(f"- {t}" for t in texts[:PARTS]), *more])
 
 
-def _too_many(equations: list[str], n_unknowns: int, names: list[str]) -> str:
+def _too_many(equations: list[Provenance], n_unknowns: int, names: list[str]) -> str:
     n = len(equations)
     if n > n_unknowns:
         lines = [
@@ -89,12 +92,10 @@ def _too_many(equations: list[str], n_unknowns: int, names: list[str]) -> str:
         ]
     else:
         lines = ["one of these equations repeats or contradicts the others. Remove or change one of:"]
-    own = [e for e in equations if written_by(e) is not None]
-    others = [e for e in equations if written_by(e) is None]
-    return "\n".join(lines + itemised([(written_by(e) or "", e) for e in (*own, *others)]))
+    return "\n".join(lines + itemised(sorted(equations, key=lambda e: not e.is_written)))
 
 
-def _repeated(flat: FlatModel, empty: list[str]) -> list[str]:
+def _repeated(flat: FlatModel, empty: list[Provenance]) -> list[str]:
     """What to say of equations in which alias elimination has left no variable."""
     column = np.cumsum(~flat.variables.is_input) - 1
     column[flat.variables.is_input] = -1
@@ -103,7 +104,7 @@ def _repeated(flat: FlatModel, empty: list[str]) -> list[str]:
     over, _ = dulmage_mendelsohn(whole, maximum_matching(whole.pointer, whole.variable, whole.n_variables))
     texts = []
     for rows, columns in over:
-        equations = [describe_equation(flat.groups, int(r)) for r in rows]
+        equations = [provenance_of(flat.groups, int(r)) for r in rows]
         if not set(empty).isdisjoint(equations):
             empty = [e for e in empty if e not in equations]
             names = [flat.variables.names[v] for v in unknown[columns] if not flat.variables.is_port[v]]
@@ -118,37 +119,38 @@ def _unused_inside(flat: FlatModel) -> np.ndarray:
     unused = ~flat.ports.has_inside
     for group in flat.groups:
         if len(group) and group.variable.shape[1]:
-            port = flat.variables.port[group.variable[[written_by(o) is not None for o in group.origin]]]
+            port = flat.variables.port[group.variable[[p.is_written for p in group.provenance]]]
             unused[port[port >= 0]] = False
     return unused
 
 
-def _too_few(flat: FlatModel, n_equations: int, names: list[str], concerned: np.ndarray) -> str:
+def _too_few(flat: FlatModel, n_equations: int, variables: np.ndarray, concerned: np.ndarray) -> str:
+    names = [flat.variables.names[v] for v in variables.tolist()]
     missing = len(names) - n_equations
     unused = _unused_inside(flat)
     port = flat.variables.port[concerned & (flat.variables.port >= 0)]
-    hollow = [flat.ports.names[p] for p in np.unique(port[unused[port]]).tolist()]
-    owners = {name.rpartition(".")[0] for name in names}
-    loose = [p for p, is_loose in zip(flat.ports.names, flat.ports.is_loose.tolist(), strict=True) if is_loose]
-    near = [p for p in loose if p.rpartition(".")[0] in owners]
+    hollow = np.unique(port[unused[port]])
+    owners = np.unique(flat.variables.owner[variables])
+    near = np.flatnonzero(flat.ports.is_loose & np.isin(flat.ports.owner, owners))
     if n_equations == 0:
         text = f"nothing determines {listed(names, joint='or')}"
     else:
         text = f"only {counted(n_equations, 'equation')} for {counted(len(names), 'unknown')}, {listed(names)}"
-    if hollow:
-        inside = listed(dict.fromkeys(p.rpartition(".")[0] for p in hollow))
-        return f"inside {inside} nothing uses {listed(hollow)}: connect it there, or write its equations."
-    if near:
-        return f"{text}: {'is' if len(near) == 1 else 'are'} {listed(near)} meant to be connected?"
+    if len(hollow):
+        inside = listed(flat.components[k] for k in flat.ports.owner[hollow])
+        mend = "it there, or write its" if len(hollow) == 1 else "them there, or write their"
+        return f"inside {inside} nothing uses {listed(flat.ports.names[p] for p in hollow)}: connect {mend} equations."
+    if len(near):
+        close = listed(flat.ports.names[p] for p in near)
+        return f"{text}: {'is' if len(near) == 1 else 'are'} {close} meant to be connected?"
     if len(names) == 1:
         return f"{text}: add an equation for it, declare it as an input, or leave it out."
     what = "an equation" if missing == 1 else f"{missing} equations"
     return f"{text}: add {what}, or declare {'one' if missing == 1 else missing} of them as an input."
 
 
-def _names(flat: FlatModel, alias: AliasTable, unknown: np.ndarray, columns: np.ndarray) -> list[str]:
-    """For each column, the variable that names it best: no port, if there is one."""
+def _best(flat: FlatModel, alias: AliasTable, unknown: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """For each column, the variable that names it best: not one of a port, where there is another."""
     variables = flat.variables
     order = np.lexsort((np.arange(len(variables)), variables.is_port, alias.order, alias.root))
-    first = order[np.searchsorted(alias.root[order], unknown[columns])]
-    return [variables.names[v] for v in first.tolist()]
+    return order[np.searchsorted(alias.root[order], unknown[columns])]

@@ -4,6 +4,8 @@ import collections
 import dataclasses
 from collections.abc import Iterable, Sequence
 
+from ..model.provenance import Provenance
+
 SHOWN = 6
 
 
@@ -79,12 +81,12 @@ def counted(n: int, what: str) -> str:
     return f"{n} {what}{'' if n == 1 else 's'}"
 
 
-def itemised(items: Sequence[tuple[str, str]], shown: int = SHOWN) -> list[str]:
-    """Indented lines of (component, equation), those of one component together; long lists are cut."""
-    count = collections.Counter(items)
-    lines = [f"  {item[1]}" + (f"  (written {n} times)" if n > 1 else "") for item, n in list(count.items())[:shown]]
+def itemised(equations: Sequence[Provenance], shown: int = SHOWN) -> list[str]:
+    """A line for each equation; long lists are cut, and the components of the rest named."""
+    count = collections.Counter(equations)
+    lines = [f"  {e}" + (f"  (written {n} times)" if n > 1 else "") for e, n in list(count.items())[:shown]]
     rest = list(count)[shown:]
     if rest:
-        owners = list(dict.fromkeys(owner for owner, _ in rest if owner))
+        owners = [e.component for e in rest if e.is_written]
         lines.append(f"  … and {len(rest)} more" + (f", of {listed(owners, 4)}" if owners else ""))
     return lines

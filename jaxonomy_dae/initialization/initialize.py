@@ -22,7 +22,7 @@ from ..lowering.gather import Gather, take
 from ..lowering.plan import SystemPlan
 from ..model.quantities import declared_scale, quantity_bounds
 from ..system.inputs import read_inputs
-from ..system.system_at import Point
+from ..system.system_at import SystemAt
 from .given_solver import find_root_with
 from .ladder import FAILED, STAGED, Sizes, find_root, tolerance
 from .rows import InitialRows, Row, initial_rows
@@ -59,7 +59,7 @@ def initialize(
     unknown = np.array([table.index(n) for n in solve_for], np.int64)
     rows = initial_rows(plan, names, tuple(unknown.tolist()))
     given = [initial[n] for n in names] if initial else []
-    point: Point = system._point(t0, inputs)
+    point: SystemAt = system.at(t0, inputs)
     parameters = point.parameters
     n = plan.n_state
     x0 = _values(rows.guess, given, parameters) * jnp.asarray(_signs(rows.guess), point.dtype)
@@ -76,7 +76,7 @@ def initialize(
         if len(unknown):
             parameters = table.complete(parameters.at[unknown].set(w[n:]))
             target = _values(rows.kept, given, parameters)
-        here = Point(plan, parameters, point.networks, t0, inputs)
+        here = SystemAt(plan, parameters, point.networks, t0, inputs)
         state = here.split(w[:n])
         parts = [here.constraint_vector(state)]
         if len(plan.carried):
@@ -90,7 +90,7 @@ def initialize(
     sizes = frozen(_sizes(plan, rows, given, parameters, start))
     m = n_equations + len(rows.kept)
     if m > len(start):
-        sizes = frozen(_with_velocities(sizes, start[:n], plan, system._point(t0, inputs)))
+        sizes = frozen(_with_velocities(sizes, start[:n], plan, system.at(t0, inputs)))
     is_soft = np.arange(m) >= m - rows.n_soft
     core = independent_rows(plan, rows, len(start))
 
@@ -187,7 +187,7 @@ def _sizes(plan: SystemPlan, rows: InitialRows, given: list, parameters: Any, st
     return Sizes(nominal, known, data, _distances(plan, rows, nominal, guess, len(data)))
 
 
-def _with_velocities(sizes: Sizes, x: Any, plan: SystemPlan, here: Point) -> Sizes:
+def _with_velocities(sizes: Sizes, x: Any, plan: SystemPlan, here: SystemAt) -> Sizes:
     """Redundant velocities that are all rounding errors have no size by which the others could be judged: positions
     and a frequency give one. All that moves tells the frequency ω, by |x'| = ω|x| and |x''| = ω²|x|."""
     owner, place = plan.extended.quantities.owner, {int(q): k for k, q in enumerate(plan.states)}
@@ -252,7 +252,7 @@ def _reader(plan: SystemPlan, kept: tuple[Row, ...]):
     place = {int(q): k for k, q in enumerate((*plan.states, *plan.carried))}
     in_state = all(int(q) in place for q in quantity)
 
-    def starts(here: Point, x):
+    def starts(here: SystemAt, x):
         if not len(quantity):
             return jnp.zeros((0,), here.dtype)
         if in_state:

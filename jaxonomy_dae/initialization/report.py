@@ -1,7 +1,6 @@
 """What initialization did, in user names: for `system.initialization_report()`, and for the text of its errors."""
 
 import functools
-import html
 from typing import Any, NamedTuple
 
 import jax
@@ -10,14 +9,13 @@ import numpy as np
 from ..lowering.plan import SystemPlan
 from ..lowering.schedule import SparseStep
 from ..model.tables import ZERO
+from ..system.sections import SHOWN, Sections, some
 from ..system.system_at import input_values
 from .initialize import InitialPoint, is_consistent
 from .ladder import FAILED, METHODS, NEAREST, tolerance
 from .rows import Row, initial_rows, supports
-from .singular_blocks import ILL_CONDITIONED, BlockFinding, equation_text, examine_blocks
+from .singular_blocks import ILL_CONDITIONED, BlockFinding, examine_blocks
 
-SHOWN = 12
-HTML_SHOWN = 200
 WORST = 5
 CONDITION_LIMIT = 500  # unknowns up to which the condition of the initial equations is computed
 
@@ -51,7 +49,7 @@ class Residual(NamedTuple):
     value: float
 
 
-class InitializationReport:
+class InitializationReport(Sections):
     """What initialization did; `print(report)` shows it.
 
     - `consistent`: whether a point was found at which everything holds.
@@ -164,14 +162,14 @@ class InitializationReport:
         out = []
         for planned in plan.constraints:
             for e, q in zip(planned.group.equation, planned.group.quantity, strict=True):
-                out.append((equation_text(plan, int(e)), self._names(q)))
+                out.append((plan.describe(int(e)), self._names(q)))
         for step in plan.steps:
             if step.carried:
                 whole = isinstance(step, SparseStep)
                 for equation in step.equations if whole else [step.equations[e] for e in step.tearing.residuals]:
                     for b in range(len(equation.equation)):
                         slots = np.array([s.quantity[b] for s in equation.slots])
-                        out.append((equation_text(plan, int(equation.equation[b])), self._names(slots)))
+                        out.append((plan.describe(int(equation.equation[b])), self._names(slots)))
         return out + starts
 
     def _names(self, quantities: np.ndarray) -> tuple[str, ...]:
@@ -216,7 +214,7 @@ class InitializationReport:
         for block in self.blocks:
             if not block.singular:
                 out.append(
-                    f"the block of {_some(block.variables)} is ill-conditioned, {block.condition:.1e}: about "
+                    f"the block of {some(block.variables)} is ill-conditioned, {block.condition:.1e}: about "
                     f"{int(np.log10(block.condition))} digits of its solution are lost"
                 )
         if self._condition is not None and self._condition > ILL_CONDITIONED:
@@ -248,7 +246,7 @@ class InitializationReport:
             )
         lines = ["no consistent initial point was found; what does not hold, worst first:"]
         for r in self.residuals[:WORST]:
-            variables = "" if r.text.startswith("start of ") else f", in {_some(r.variables)}"
+            variables = "" if r.text.startswith("start of ") else f", in {some(r.variables)}"
             lines.append(f"  {r.text}{variables}: off by {abs(r.value):.3g}")
         if len(self.residuals) > WORST:
             lines.append(f"  … and {len(self.residuals) - WORST} more")
@@ -266,38 +264,17 @@ class InitializationReport:
         at = f" with {causes}" if causes else ""
         if block.causes_are_parameters:
             names = [n for n, _ in block.causes]
-            mend = f"Give {names[0]} another value" if len(names) == 1 else f"Give one of {_some(names)} another value"
+            mend = f"Give {names[0]} another value" if len(names) == 1 else f"Give one of {some(names)} another value"
         else:
             mend = "Start elsewhere, with `initial={...}` or other parameters"
         lines = [
-            f"the equations are singular at the initial point{at}: they do not determine {_some(block.variables)}",
+            f"the equations are singular at the initial point{at}: they do not determine {some(block.variables)}",
             *(f"  {text}" for text in block.equations[:SHOWN]),
         ]
         if len(block.equations) > SHOWN:
             lines.append(f"  … and {len(block.equations) - SHOWN} more")
         lines.append(f"{mend}, or remove from the model what has become superfluous.")
         return "\n".join(lines)
-
-    def __str__(self):
-        head, sections = self._contents()
-        lines = list(head)
-        for title, entries in sections:
-            more = [f"    … and {len(entries) - SHOWN} more"] if len(entries) > SHOWN else []
-            lines += [f"{title}:", *(f"    {e}" for e in entries[:SHOWN]), *more]
-        return "\n".join(lines)
-
-    __repr__ = __str__
-
-    def _repr_html_(self) -> str:
-        """The same for a notebook: sections that fold."""
-        head, sections = self._contents()
-        out = [f"<p>{'<br>'.join(html.escape(line) for line in head)}</p>"]
-        for title, entries in sections:
-            items = "".join(f"<li><code>{html.escape(e)}</code></li>" for e in entries[:HTML_SHOWN])
-            more = f"<li>… and {len(entries) - HTML_SHOWN} more</li>" if len(entries) > HTML_SHOWN else ""
-            opened = " open" if len(entries) <= SHOWN else ""
-            out.append(f"<details{opened}><summary>{html.escape(title)}</summary><ul>{items}{more}</ul></details>")
-        return "".join(out)
 
     def _contents(self) -> tuple[list[str], list[tuple[str, list[str]]]]:
         singular = [b for b in self.blocks if b.singular]
@@ -354,8 +331,3 @@ def _contradiction(r: Redundant) -> str:
 
 def _joined(names: list[str]) -> str:
     return ", ".join(names[:-1]) + " and " + names[-1]
-
-
-def _some(names: Any) -> str:
-    names = list(names)
-    return ", ".join(names[:SHOWN]) + (f", … ({len(names)} in all)" if len(names) > SHOWN else "")

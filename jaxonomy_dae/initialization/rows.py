@@ -367,8 +367,8 @@ def _check_count(plan: SystemPlan, generic: _Generic, directions: _Directions, r
         missing = directions.free.shape[1]
         moving = np.linalg.norm(directions.free[: generic.n], axis=1)
         pinned = {r.quantity for r in kept}
-        names = [plan.quantity_name[q] for q in np.flatnonzero(moving >= OPEN) if q not in pinned]
-        candidates = [n for n in names if ":" not in n]
+        free = [q for q in np.flatnonzero(moving >= OPEN).tolist() if q not in pinned]
+        candidates = [plan.quantity_name[q] for q in free if plan.is_visible(q)]
         if candidates:
             hint = f"Give {'one' if missing == 1 else missing} of: {_some(candidates)}"
         else:

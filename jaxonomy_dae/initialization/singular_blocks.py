@@ -18,7 +18,7 @@ from ..lowering.plan import SystemPlan
 from ..lowering.schedule import SparseStep, Step, StepEquation
 from ..model.evaluate_numpy import Networks
 from ..model.scaling import equilibrated, geometric_scales
-from ..model.tables import ZERO, describe_equation
+from ..model.tables import ZERO
 
 DENSE_LIMIT = 200  # unknowns up to which a block gets a singular value decomposition
 ILL_CONDITIONED = 1e12
@@ -296,7 +296,7 @@ def _sparse_finding(plan: SystemPlan, values: _Values, step: SparseStep) -> Bloc
     dependent = np.flatnonzero(np.abs(left) > 1e-3 * np.abs(left).max())
     left, right = left_scale * left, right_scale * right
     names = tuple(plan.quantity_name[int(step.unknown[0][k])] for k in chosen)
-    equations = tuple(dict.fromkeys(equation_text(plan, int(texts[k])) for k in dependent))
+    equations = tuple(dict.fromkeys(plan.describe(int(texts[k])) for k in dependent))
     singular = not condition < 1 / (4 * n * np.finfo(float).eps)
     causes = _sparse_causes(plan, values, step, column, left, right) if singular else ()
     return BlockFinding(condition, singular, n, names, equations, causes, bool(causes))
@@ -352,7 +352,7 @@ def _sparse_causes(
 
 def _finding(plan: SystemPlan, values: _Values, step: Step, b: int, condition, singular, left, right) -> BlockFinding:
     names = [plan.quantity_name[int(u[b])] for u in step.unknown]
-    texts = [equation_text(plan, int(e.equation[b])) for e in step.equations]
+    texts = [plan.describe(int(e.equation[b])) for e in step.equations]
     chosen = np.flatnonzero(np.abs(right).max(axis=1, initial=0.0) > 1e-3)
     dependent = np.flatnonzero(np.abs(left).max(axis=1, initial=0.0) > 1e-3)
     variables = tuple(names[u] for u in chosen) or tuple(names)
@@ -443,11 +443,5 @@ def _constraints(plan: SystemPlan, values: _Values) -> Iterator[BlockFinding]:
     singular = condition >= 1 / (4 * m * np.finfo(float).eps)
     at = tuple((name, float(values.quantities[plan.states[k]])) for name, k in zip(names, states, strict=True))
     yield BlockFinding(
-        float(condition), singular, m, names, tuple(equation_text(plan, texts[e]) for e in dependent), at, False
+        float(condition), singular, m, names, tuple(plan.describe(texts[e]) for e in dependent), at, False
     )
-
-
-def equation_text(plan: SystemPlan, equation: int) -> str:
-    level = int(plan.extended.level[equation])
-    text = describe_equation(plan.groups, int(plan.extended.base[equation]))
-    return text + (f", differentiated {level}×" if level else "")

@@ -13,8 +13,9 @@ from ..errors import ModelError, nearest
 from ..linear.sparse import SparsePattern
 from ..model.extended import Extended, ExtendedGroup
 from ..model.opaque import OpaqueFunction
+from ..model.provenance import differentiated
 from ..model.quantities import QuantityMap
-from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel
+from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, provenance_of
 from . import pattern
 from .dummy_blocks import DummyBlocks, dummy_blocks
 from .gather import Gather
@@ -128,10 +129,22 @@ class SystemPlan:
         """(quantity, sign) of a variable; quantity ZERO if it is identically zero."""
         return self.variable_map[variable]
 
+    def describe(self, equation: int) -> str:
+        """The text of an extended equation."""
+        base, level = int(self.extended.base[equation]), int(self.extended.level[equation])
+        return differentiated(provenance_of(self.groups, base), level)
+
     @property
     def visible_variables(self) -> list[str]:
         """The names a user may read: all but those made for corrected derivatives."""
-        return [n for n in self.flat.variables.names if ":" not in n]
+        table = self.flat.variables
+        return [n for n, is_internal in zip(table.names, table.is_internal.tolist(), strict=True) if not is_internal]
+
+    def is_visible(self, quantity: int) -> bool:
+        """Whether a quantity equals a variable that a user may read, or is a derivative of one."""
+        quantities, table = self.extended.quantities, self.flat.variables
+        lowest = int(quantities.first[quantities.owner[quantity]])
+        return bool(np.isin(self.variable_map.quantity[~table.is_internal], (quantity, lowest)).any())
 
     def resolve(self, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
         """(quantities, signs) of variables by name; `"der(name)"` is accepted where the model has that derivative."""
@@ -141,7 +154,7 @@ class SystemPlan:
             while inner.startswith("der(") and inner.endswith(")"):
                 order, inner = order + 1, inner[4:-1]
             if inner not in self.variable_index:
-                raise ModelError(f"'{name}' is no variable: " + nearest(inner, self.visible_variables))
+                raise ModelError(f"'{name}' is not a variable: " + nearest(inner, self.visible_variables))
             q, s = self.quantity_of(self.variable_index[inner])
             if q != ZERO and order:
                 quantities = self.extended.quantities

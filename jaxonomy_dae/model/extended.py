@@ -26,7 +26,7 @@ class Quantities:
 
     @property
     def n_unknown(self) -> int:
-        """How many quantities are no inputs."""
+        """How many quantities are not inputs."""
         return int(self.first[self.n_unknown_columns])
 
     @property

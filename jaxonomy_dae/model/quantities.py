@@ -40,7 +40,7 @@ def name_quantities(flat: FlatModel, variables: QuantityMap, quantities: Quantit
     for v in np.flatnonzero((variables.quantity >= 0) & (variables.sign > 0)).tolist():
         q, name = int(variables.quantity[v]), flat.variables.names[v]
         is_root = order[q] == 0 and quantities.variable[owner[q]] == v
-        rank = (int(":" in name), int(flat.variables.is_port[v]), int(not is_root), v)
+        rank = (int(flat.variables.is_internal[v]), int(flat.variables.is_port[v]), int(not is_root), v)
         if rank < best[q]:
             best[q], names[q] = rank, name
     for q in range(quantities.n):

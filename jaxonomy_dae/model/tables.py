@@ -4,9 +4,7 @@ A variable is an integer; a *quantity* is one of its derivatives, order 0 includ
 of integers. After alias elimination a slot also has a sign, and variable −1 stands for the constant zero.
 """
 
-import collections
 import dataclasses
-import functools
 from typing import Any
 
 import numpy as np
@@ -14,6 +12,7 @@ import numpy as np
 from ..modeling.interval import Interval
 from .opaque import OpaqueFunction
 from .pickling import functions_by_name, named_functions
+from .provenance import Provenance
 from .symbolic import SymbolicTemplate
 from .template import AbstractTemplate
 
@@ -36,6 +35,7 @@ class VariableTable:
     owner: np.ndarray  # the component, −1 for variables of neural blocks
     port: np.ndarray  # the port it belongs to, −1 if none
     is_across: np.ndarray
+    is_internal: np.ndarray  # made by the compiler, and not to be read by users
 
     def __len__(self):
         return len(self.names)
@@ -47,16 +47,13 @@ class PortTable:
 
     names: list[str]
     domains: list[str]
+    owner: np.ndarray  # the component
     is_loose: np.ndarray
     has_inside: np.ndarray
 
-    @functools.cached_property
-    def _counts(self) -> collections.Counter[str]:
-        return collections.Counter(name.rpartition(".")[0] for name in self.names)
-
-    def count(self, component: str) -> int:
+    def count(self, component: int) -> int:
         """How many ports a component has."""
-        return self._counts[component]
+        return int((self.owner == component).sum())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,7 +98,7 @@ class EquationGroup:
     sign: np.ndarray
     parameter: np.ndarray
     coefficient: np.ndarray
-    origin: list[str]
+    provenance: list[Provenance]
 
     def __len__(self):
         return self.variable.shape[0]
@@ -115,7 +112,7 @@ class EquationGroup:
             self.sign[rows],
             self.parameter[rows],
             self.coefficient[rows],
-            [self.origin[r] for r in rows],
+            [self.provenance[r] for r in rows],
         )
 
 
@@ -159,7 +156,7 @@ class AliasTable:
     root: np.ndarray
     order: np.ndarray
     sign: np.ndarray
-    eliminated: list[tuple[str, int]]  # the equations the aliases came from, and the variable each one replaced
+    eliminated: list[tuple[Provenance, int]]  # the equations the aliases came from, and the variable each one replaced
 
 
 def equation_offsets(groups: tuple[EquationGroup, ...]) -> np.ndarray:
@@ -167,14 +164,14 @@ def equation_offsets(groups: tuple[EquationGroup, ...]) -> np.ndarray:
     return np.concatenate([[0], np.cumsum([len(g) for g in groups])]).astype(np.int64)
 
 
-def written_by(origin: str) -> str | None:
-    """The component or network an equation's text begins with ("r.p: …"); None for connections and combinations."""
-    head, colon, _ = origin.partition(": ")
-    return head if colon and " " not in head else None
-
-
-def describe_equation(groups: tuple[EquationGroup, ...], equation: int) -> str:
-    """Where an equation comes from, in user names."""
+def locate(groups: tuple[EquationGroup, ...], equation: int) -> tuple[EquationGroup, int]:
+    """The group of an equation, and its place there."""
     offsets = equation_offsets(groups)
     g = int(np.searchsorted(offsets, equation, side="right") - 1)
-    return groups[g].origin[equation - int(offsets[g])]
+    return groups[g], equation - int(offsets[g])
+
+
+def provenance_of(groups: tuple[EquationGroup, ...], equation: int) -> Provenance:
+    """Where an equation comes from."""
+    group, place = locate(groups, equation)
+    return group.provenance[place]

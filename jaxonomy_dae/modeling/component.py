@@ -363,7 +363,7 @@ class Component(metaclass=Construction):
             raise ModelError(f"{where}: expected {outputs} outputs, but the {_noun(what)} returns {found}")
         names = [name] if found == 1 else [f"{name}[{k}]" for k in range(found)]
         declared = tuple(self._declare(n, "learned") for n in names)
-        self.learned_terms.append(Learned(name, network, tuple(symbols), declared))
+        self.learned_terms.append(Learned(name, network, tuple(symbols), declared, _noun(what)))
         return declared
 
     def add_equations(self, *equations: Any) -> None:

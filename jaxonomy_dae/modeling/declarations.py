@@ -37,9 +37,10 @@ class Variable:
 
 @dataclasses.dataclass(frozen=True)
 class Learned:
-    """A network in the equations: outputs = network(inputs), all named by local variables."""
+    """A network or function in the equations: outputs = network(inputs), all named by local variables."""
 
     name: str
     network: Any
     inputs: tuple[VariableSymbol | TimeSymbol, ...]
     outputs: tuple[VariableSymbol, ...]
+    noun: str = "network"  # or "function"

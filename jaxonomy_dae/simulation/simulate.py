@@ -102,7 +102,7 @@ def simulate(
     rtol, atol = jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype)
     dtmax = None if dtmax is None else jnp.asarray(dtmax, dtype)
     jump_ts = None if jump_ts is None else jump_times(jump_ts, dtype)
-    # Numbers become arrays, so that a new value is no new program.
+    # Numbers become arrays, so that another value is not another program.
     initial = {name: jnp.asarray(v, dtype) for name, v in sorted((initial or {}).items())}
     duration = None if _is_traced((t0, t1)) else float(t1) - float(t0)
     t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)

@@ -153,7 +153,7 @@ def _observed(system: AcausalSystem, ts, states, inputs, quantity: np.ndarray, s
     read = np.maximum(quantity, 0)
 
     def one(t, x):
-        return system._point(t, inputs).quantities(x, read, sign)
+        return system.at(t, inputs).quantities(x, read, sign)
 
     return jnp.where(quantity < 0, 0.0, jax.vmap(one)(ts, states))
 
@@ -170,7 +170,7 @@ def _one(system: AcausalSystem, ts, states, inputs, quantity, sign):
     """One quantity, chosen while running: compiled once for all names."""
     every = np.arange(system.plan.extended.quantities.n)
     ones = np.ones_like(every)
-    return sign * jax.vmap(lambda t, x: system._point(t, inputs).quantities(x, every, ones)[quantity])(ts, states)
+    return sign * jax.vmap(lambda t, x: system.at(t, inputs).quantities(x, every, ones)[quantity])(ts, states)
 
 
 @eqx.filter_jit

@@ -84,7 +84,7 @@ def _jump(slope: Slope, here: np.ndarray, t: Any, y: Any, weight: np.ndarray, na
     k = int(np.argmax(np.where(jumps, wide / weight, 0)))
     return (
         f"The derivative of '{names[k]}' jumps by {wide[k]:.3g} there (sign, Piecewise, Max, Heaviside …), and the "
-        "solution stays at the jump: steps chatter to and fro across it. Smooth the law (sympy.tanh(x/small) for "
+        "solution stays at the jump: steps chatter back and forth across it. Smooth the law (sympy.tanh(x/small) for "
         "sign(x)), or, if only the time decides, name the times with jump_ts="
     )
 

@@ -80,7 +80,7 @@ def solve_dae(
     check_times(t0, t1, ts)
     rtol, atol = default_tolerances(rtol, atol, dtype)
     check_tolerances(rtol, atol, dtype)
-    # Numbers become arrays, so that a new value is no new program.
+    # Numbers become arrays, so that another value is not another program.
     rtol, atol = jnp.asarray(rtol, dtype), jax.tree.map(_inexact, tolerance_of(atol, y0))
     n = sum(leaf.size for leaf in jax.tree.leaves(y0))
     if names is not None and len(names) != n:

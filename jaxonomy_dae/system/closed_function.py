@@ -51,7 +51,7 @@ def closed_function(function: Callable[[Any], Any], dtype: Any) -> ClosedFunctio
 
 
 def _with_numbers_lifted(jaxpr: Jaxpr) -> tuple[Jaxpr, list[Any]]:
-    """The numbers written in a program become constants, so that new ones are no new program."""
+    """The numbers written in a program become constants, so that other numbers are not another program."""
     atoms = [atom for equation in jaxpr.eqns for atom in equation.invars] + list(jaxpr.outvars)
     lifted = [atom for atom in atoms if isinstance(atom, Literal) and _is_data(atom)]
     if not lifted:

@@ -17,9 +17,7 @@ from ..model.dependent_parameters import complete
 from ..model.tables import DependentParameters
 from ..modeling.interval import Interval, closed_ends
 from ..modeling.real_number import real_number
-
-SHOWN = 12
-HTML_SHOWN = 200
+from .sections import HTML_SHOWN, SHOWN
 
 
 @dataclasses.dataclass(frozen=True)

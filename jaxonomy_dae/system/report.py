@@ -1,22 +1,19 @@
 """The report of a compilation, in user names."""
 
 import functools
-import html
 
 import numpy as np
 
 from ..lowering.plan import SystemPlan
 from ..lowering.schedule import SparseStep
 from ..model.incidence import incidence
-from ..model.tables import describe_equation
+from ..model.tables import provenance_of
 from ..structure.pantelides import Offsets, reduce_index
+from .sections import Sections, some
 from .solver_choice import solver_choice
 
-SHOWN = 12
-HTML_SHOWN = 200
 
-
-class SystemReport:
+class SystemReport(Sections):
     """What the compiler did; `print(report)` shows it.
 
     Attributes count and name: `n_equations`, `n_unknowns`, `n_aliases`, `index` (structural, of the model as written),
@@ -63,7 +60,7 @@ class SystemReport:
         """(equation, number of differentiations) where that is not zero."""
         counts = self._offsets.equation
         groups = self._plan.flat.groups
-        return [(describe_equation(groups, int(e)), int(counts[e])) for e in np.flatnonzero(counts)]
+        return [(str(provenance_of(groups, int(e))), int(counts[e])) for e in np.flatnonzero(counts)]
 
     @property
     def states(self) -> list[str]:
@@ -89,12 +86,7 @@ class SystemReport:
     def constraints(self) -> list[str]:
         """The hidden constraints the state is projected onto."""
         plan = self._plan
-        out = []
-        for e in plan.selection.constraints:
-            level = int(plan.extended.level[e])
-            text = describe_equation(plan.groups, int(plan.extended.base[e]))
-            out.append(text + (f", differentiated {level}×" if level else ""))
-        return out
+        return [plan.describe(int(e)) for e in plan.selection.constraints]
 
     @property
     def blocks(self) -> list[str]:
@@ -106,7 +98,7 @@ class SystemReport:
                 kind = "linear" if step.linear else "nonlinear"
                 for block in range(int(step.block.max()) + 1):
                     names = [plan.quantity_name[q] for q in step.unknown[0][step.block == block]]
-                    out.append(f"{kind} block of {len(names)}: {_some(names)}; solved whole, sparse")
+                    out.append(f"{kind} block of {len(names)}: {some(names)}; solved whole, sparse")
                 continue
             if len(step.unknown) == 1 and step.linear:
                 continue
@@ -114,29 +106,8 @@ class SystemReport:
             torn = [names[u] for u in step.tearing.tearing]
             kind = "linear" if step.linear else "nonlinear"
             times = f"{step.n} × " if step.n > 1 else ""
-            out.append(f"{times}{kind} block of {len(names)}: {_some(names)}; torn at {_some(torn)}")
+            out.append(f"{times}{kind} block of {len(names)}: {some(names)}; torn at {some(torn)}")
         return out
-
-    def __str__(self):
-        head, sections = self._contents()
-        lines = list(head)
-        for title, entries in sections:
-            more = [f"    … and {len(entries) - SHOWN} more"] if len(entries) > SHOWN else []
-            lines += [f"{title}:", *(f"    {e}" for e in entries[:SHOWN]), *more]
-        return "\n".join(lines)
-
-    __repr__ = __str__
-
-    def _repr_html_(self) -> str:
-        """The same for a notebook: sections that fold."""
-        head, sections = self._contents()
-        out = [f"<p>{'<br>'.join(html.escape(line) for line in head)}</p>"]
-        for title, entries in sections:
-            items = "".join(f"<li><code>{html.escape(e)}</code></li>" for e in entries[:HTML_SHOWN])
-            more = f"<li>… and {len(entries) - HTML_SHOWN} more</li>" if len(entries) > HTML_SHOWN else ""
-            opened = " open" if len(entries) <= SHOWN else ""
-            out.append(f"<details{opened}><summary>{html.escape(title)}</summary><ul>{items}{more}</ul></details>")
-        return "".join(out)
 
     def _contents(self) -> tuple[list[str], list[tuple[str, list[str]]]]:
         plan = self._plan
@@ -152,16 +123,12 @@ class SystemReport:
         head.append("simulate(solver=None) takes {}: {}".format(*solver_choice(plan)[:2]))
         sections = [
             ("differentiated", [f"{n}× {text}" for text, n in self.differentiated]),
-            (f"{len(self.states)} states", [_some(self.states)]),
-            ("algebraic unknowns in the state array", [_some(self.carried)]),
-            (f"{len(self.algebraics)} algebraic variables", [_some(self.algebraics)]),
+            (f"{len(self.states)} states", [some(self.states)]),
+            ("algebraic unknowns in the state array", [some(self.carried)]),
+            (f"{len(self.algebraics)} algebraic variables", [some(self.algebraics)]),
             ("hidden constraints, projected onto", self.constraints),
             ("simultaneous blocks", self.blocks),
             ("notes", self.notes),
         ]
         kept = [(title, [e for e in entries if e]) for title, entries in sections]
         return head, [(title, entries) for title, entries in kept if entries]
-
-
-def _some(names: list[str]) -> str:
-    return ", ".join(names[:SHOWN]) + (f", … ({len(names)} in all)" if len(names) > SHOWN else "")

@@ -18,7 +18,7 @@ from ..lowering.plan import SystemPlan
 from ..model.pickling import functions_by_name, named_functions
 from .inputs import read_inputs
 from .parameters import Parameters
-from .system_at import READ_REFINEMENTS, SCALARS, Point
+from .system_at import READ_REFINEMENTS, SCALARS, SystemAt
 
 
 class AcausalSystem(eqx.Module):
@@ -52,7 +52,7 @@ class AcausalSystem(eqx.Module):
 
     @property
     def algebraics(self) -> list[str]:
-        """The variables that are no states, nor equal to one."""
+        """The variables that are neither states nor equal to one."""
         chosen = set(self.plan.states.tolist())
         inputs = set(self.plan.inputs.names)
         names = self.plan.variable_index
@@ -144,26 +144,27 @@ class AcausalSystem(eqx.Module):
 
     # --- computing ---------------------------------------------------------------------------------------------
 
-    def _point(self, t: Any, args: Any) -> Point:
+    def at(self, t: Any, args: Any = None) -> SystemAt:
+        """The system at a time, with these inputs, ready to be evaluated at states."""
         args = read_inputs(self.plan.inputs.names, self.parameters.values.dtype, args)
         for name, default in zip(self.plan.inputs.names, self.plan.inputs.defaults, strict=True):
             if default is None and name not in args:
                 raise ModelError(f"input '{name}' has no default: give it with inputs={{'{name}': function_of_time}}")
         networks = tuple(self.neural[n] for n in self.plan.network_names)
-        return Point(self.plan, self.parameters.array, networks, t, args)
+        return SystemAt(self.plan, self.parameters.array, networks, t, args)
 
     def vector_field(self, t: Any, x: Float[Array, " n"], args: Any = None) -> Float[Array, " n"]:
         """d(state)/dt for `diffrax.ODETerm(system.vector_field)`; `args` is the dictionary of inputs, or None."""
         if self.plan.n_state > SCALARS:
-            return self._point(t, args).vector_field(x)
+            return self.at(t, args).vector_field(x)
         # Reverse mode recomputes a small field rather than storing what it needs of every stage: a few fused kernels
         # instead of a store for each intermediate value, a quarter of the time of a gradient.
-        return eqx.filter_checkpoint(lambda s, t, x, args: s._point(t, args).vector_field(x))(self, t, x, args)
+        return eqx.filter_checkpoint(lambda s, t, x, args: s.at(t, args).vector_field(x))(self, t, x, args)
 
     def semi_explicit(self, t: Any, x: Float[Array, " n"], args: Any = None) -> Float[Array, " n"]:
         """The right-hand side of M d(state)/dt = F(t, state): slopes of the differential states, then the residuals of
         nonlinear blocks, whose rows of `mass` are zero."""
-        return self._point(t, args).semi_explicit(x)
+        return self.at(t, args).semi_explicit(x)
 
     @property
     def mass(self) -> np.ndarray:
@@ -192,7 +193,7 @@ class AcausalSystem(eqx.Module):
                 f"the Jacobian of these {self.plan.n_state} states is dense, too large to list its entries: use "
                 "jax.jvp(system.vector_field, …) for its products with vectors"
             )
-        point = self._point(t, args)
+        point = self.at(t, args)
         if len(self.plan.carried):
             x = jax.lax.stop_gradient(point.join(point.refined(point.split(x), READ_REFINEMENTS))) + (
                 x - jax.lax.stop_gradient(x)
@@ -201,7 +202,7 @@ class AcausalSystem(eqx.Module):
 
     def project(self, t: Any, x: Float[Array, " n"], args: Any = None, iterations: int = 1) -> Float[Array, " n"]:
         """The state moved onto the hidden constraints (nothing to do if there are none)."""
-        return self._point(t, args).project(x, iterations)
+        return self.at(t, args).project(x, iterations)
 
     def dummy_determinants(self, t: Any, x: Float[Array, " n"], args: Any = None) -> Float[Array, " blocks"]:
         """The determinants that vanish where the choice of states is singular, one for every nonlinear block that
@@ -209,7 +210,7 @@ class AcausalSystem(eqx.Module):
         frozen, t, x, args = jax.tree.map(
             lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf, (self, t, x, args)
         )
-        return jax.lax.stop_gradient(frozen._point(t, args).dummy_determinants(x))
+        return jax.lax.stop_gradient(frozen.at(t, args).dummy_determinants(x))
 
     @property
     def is_constrained(self) -> bool:
@@ -218,7 +219,7 @@ class AcausalSystem(eqx.Module):
 
     def constraint_residual(self, t: Any, x: Float[Array, " n"], args: Any = None) -> Float[Array, " m"]:
         """The residuals of all hidden constraints at a state."""
-        point = self._point(t, args)
+        point = self.at(t, args)
         state = point.split(x)
         parts = [point.constraint_vector(state)]
         if len(self.plan.carried):
@@ -234,7 +235,7 @@ class AcausalSystem(eqx.Module):
         """
         single = isinstance(names, str)
         quantity, sign = self.plan.resolve([names] if single else list(names))
-        values = self._point(t, args).quantities(x, quantity, sign)
+        values = self.at(t, args).quantities(x, quantity, sign)
         return values[0] if single else values
 
     @overload

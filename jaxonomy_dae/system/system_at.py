@@ -48,7 +48,7 @@ def _time_derivative(function: Callable) -> Callable:
     return lambda s: jax.jvp(function, (s,), (jnp.ones_like(s),))[1]
 
 
-class Point:
+class SystemAt:
     """A system at one time and state, ready to be evaluated."""
 
     def __init__(self, plan: SystemPlan, parameters: Any, networks: tuple, t: Any, inputs: Any):

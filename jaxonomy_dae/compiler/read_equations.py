@@ -1,0 +1,69 @@
+"""Equations of components as templates and rows of integers."""
+
+from typing import Any
+
+import numpy as np
+
+from ..errors import ModelError
+from ..expressions.from_sympy import UnsupportedExpression, read, symbols_of
+from ..expressions.node import Node
+from ..expressions.to_sympy import shortened
+from ..model.linear_template import LinearTemplate
+from ..model.provenance import Provenance
+from ..model.symbolic import canonical, linear_coefficients
+from ..model.template import AbstractTemplate
+from ..modeling.symbols import ParameterSymbol, TimeSymbol, VariableSymbol, symbol_label
+from .group_builder import GroupBuilder
+from .number_model import ModelNumbers, ids_of
+
+
+def add_components(model: ModelNumbers, builder: GroupBuilder):
+    read_once: dict[int, Any] = {}  # of an expression, by its id: equal components hold the same objects
+    by_shape: dict[tuple, list[int]] = {}
+    for k, c in enumerate(model.components):
+        if c.equations:
+            for residual in c.equations:
+                if id(residual) not in read_once:
+                    read_once[id(residual)] = read_expression(residual, model.paths[k])
+            graphs = tuple(read_once[id(r)] for r in c.equations)
+            by_shape.setdefault((graphs, tuple(c.variables), tuple(c.parameters)), []).append(k)
+    for (graphs, local_variables, local_parameters), members in by_shape.items():
+        position = {name: k for k, name in enumerate((*local_variables, *local_parameters))}
+        for graph, residual in zip(graphs, model.components[members[0]].equations, strict=True):
+            # Slots follow the order of declaration, never names, so names change nothing but names.
+            def rank(s, position=position, members=members):
+                # Symbols of children come after one's own, in the order the children's ids give.
+                if s.path in position:
+                    return (0, position[s.path], getattr(s, "order", 0))
+                resolve = model.variable if isinstance(s, VariableSymbol) else model.parameter
+                return (1, resolve(members[0], s.path), getattr(s, "order", 0))
+
+            symbols = [s for s in symbols_of(residual) if symbol_label(s) in graph.leaves]
+            for s in symbols:
+                if not isinstance(s, VariableSymbol | ParameterSymbol | TimeSymbol):
+                    raise ModelError(
+                        f"component '{model.paths[members[0]]}': the symbol '{s}' was declared by no component; "
+                        "declare it with self.variable(...) or self.parameter(...) and use the symbol that returns"
+                    )
+            variables = sorted((s for s in symbols if isinstance(s, VariableSymbol)), key=rank)
+            parameters = sorted((s for s in symbols if isinstance(s, ParameterSymbol)), key=rank)
+            coefficients = linear_coefficients(graph, variables)
+            ids = ids_of(model, members, [v.path for v in variables], "variable")
+            parameter_ids = ids_of(model, members, [p.path for p in parameters], "parameter")
+            order = np.tile([v.order for v in variables], (len(members), 1))
+            text = f"0 = {shortened(residual)}"
+            provenance = [Provenance(text, model.paths[k]) for k in members]
+            if coefficients is None:
+                template: AbstractTemplate = canonical(graph, variables, parameters)
+                builder.add(template, ids, order, parameter_ids, np.zeros((len(members), 0)), provenance)
+            else:
+                template = LinearTemplate(len(variables))
+                rows = np.tile(coefficients, (len(members), 1))
+                builder.add(template, ids, order, np.zeros((len(members), 0)), rows, provenance)
+
+
+def read_expression(expression: Any, component: str) -> Node:
+    try:
+        return read(expression, symbol_label)
+    except UnsupportedExpression as error:
+        raise ModelError(f"component '{component}': 0 = {shortened(expression)}: {error}") from None
