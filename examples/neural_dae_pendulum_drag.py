@@ -318,7 +318,7 @@ def report_training(loss, norm, fitted):
 
 
 def validate_tutorial(truth, model, fitted, data):
-    # A network of zeros gives no drag at all.
+    # A network of zeros is no drag at all.
     ideal = eqx.tree_at(lambda s: s.neural["drag"], model, jnp.zeros_like(model.neural["drag"]))
     kept = train_by_hand(model, data, KEPT)
     runs = {"no drag": follow(ideal), "truth": truth, "kept": follow(kept), "best": follow(fitted.model)}

@@ -70,8 +70,8 @@ class ModelNumbers:
                 *(f"{c.name}.{v}" for c in component.children.values() for v in c.variables),
             ]
             raise ModelError(
-                f"component '{self.paths[k]}': the symbol '{path}' in its equations is not a variable of it or of a child "
-                "component: " + nearest(path, inside)
+                f"component '{self.paths[k]}': the symbol '{path}' in its equations is not a variable of it or of a "
+                "child component: " + nearest(path, inside)
             )
         return found
 
