@@ -13,6 +13,7 @@ from testset.heat import heat_exact, sundials_heat2d
 from jaxonomy_dae import ModelError
 from jaxonomy_dae.linear import KLU, Dense, SparseLinearOperator, SparsePattern, WrittenOut
 from jaxonomy_dae.linear.choice import choose
+from jaxonomy_dae.linear.least_squares import least_squares
 from jaxonomy_dae.solvers import BDF, DAETerm, Rodas5P, solve_dae
 
 installed = pytest.mark.skipif(importlib.util.find_spec("klujax") is None, reason='needs the extra "sparse"')
@@ -192,3 +193,18 @@ def test_what_is_not_a_solver_is_refused():
         choose("gmres", 1, None, term.mass)
     with pytest.raises(ModelError, match="pattern="):
         solve_dae(term, 1.0, jnp.ones(1), solver=Rodas5P(linear_solver=KLU()))
+
+
+# --- least squares ------------------------------------------------------------------------------------------------
+
+
+def test_rows_of_zeros_say_nothing():
+    """In units of the smallest number there is, 1e-17 on the right of an empty row became 1e291: a mechanism of which a
+    part is rigid started at 1e272."""
+    rng = np.random.default_rng(3)
+    matrix, right = rng.normal(size=(9, 6)), rng.normal(size=9)
+    size = np.max(np.abs(matrix), axis=1, keepdims=True)
+    expected = np.linalg.lstsq(matrix / size, right / size[:, 0])[0]
+    full = np.insert(matrix, [0, 4, 9], 0.0, axis=0), np.insert(right, [0, 4, 9], [1e-17, -1e-16, 1.0])
+    found = least_squares(*(jnp.asarray(a) for a in full))
+    np.testing.assert_allclose(found, expected, rtol=1e-12)

@@ -299,3 +299,41 @@ def test_projection_in_any_units():
         x[place] = start * u
         moved = np.asarray(system.project(0.0, jnp.asarray(x)))
         np.testing.assert_allclose(moved[place] / u, nearest, rtol=1e-13, err_msg=str(options))
+
+
+# --- nonlinear blocks that are alike ----------------------------------------------------------------------------------
+
+
+class Filter(Component):
+    """x' = −2·z0, z + z³ + c·Σ z³ = (k + 1)·x for z of number k: a block of `m` unknowns."""
+
+    def __init__(self, ev, name, m, c=0.1):
+        super().__init__(ev, name)
+        x = self.variable("x")
+        z = [self.variable(f"z{k}", start=0.3) for k in range(m)]
+        c = self.parameter("c", c)
+        self.add_equations(der(x) + 2 * z[0])
+        self.add_equations(*(v + v**3 + c * sum(w**3 for w in z) - (k + 1) * x for k, v in enumerate(z)))
+
+
+@pytest.mark.parametrize("m, n", [(1, 2), (5, 3)])
+def test_the_field_of_nonlinear_blocks_that_are_alike(m, n):
+    """`vector_field` failed with an `IndexError` where two blocks are alike. The rates of their unknowns are compared
+    with those of the implicit function theorem."""
+    ev = EqnEnv()
+    diagram = AcausalDiagram().add(*(Filter(ev, f"f{k}", m) for k in range(n)))
+    system = AcausalCompiler(ev, diagram)()
+    start = {f"f{k}.x": 0.5 + k for k in range(n)}
+    state = system.initialize(initial={name: jnp.asarray(v) for name, v in start.items()})
+    names = (*system.states, *(system.plan.quantity_name[q] for q in system.plan.carried))
+    rates = dict(zip(names, np.asarray(jax.jit(lambda x: system.vector_field(0.0, x))(state)), strict=True))
+    for k in range(n):
+        z = np.asarray(system.observe([f"f{k}.z{j}" for j in range(m)], 0.0, state))
+        drive = np.arange(1, m + 1)
+        np.testing.assert_allclose(z + z**3 + 0.1 * np.sum(z**3), drive * (0.5 + k), rtol=1e-12)
+        slopes = np.diag(1 + 3 * z**2) + 0.1 * 3 * z**2
+        assert rates[f"f{k}.x"] == pytest.approx(-2 * z[0], rel=1e-12)
+        expected = np.linalg.solve(slopes, -2 * drive * z[0])
+        carried = [j for j in range(m) if f"f{k}.z{j}" in rates]
+        assert carried
+        np.testing.assert_allclose([rates[f"f{k}.z{j}"] for j in carried], expected[carried], rtol=1e-11)

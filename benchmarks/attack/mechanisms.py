@@ -7,7 +7,7 @@ from sympy import Eq
 from jaxonomy_dae import Component, EqnEnv, der
 from jaxonomy_dae.modeling import Domain
 
-from .case import TOLERANCE, Case, Expected, diagram_of, log_uniform, names
+from .case import ROUNDING, TOLERANCE, Case, Expected, diagram_of, log_uniform, names
 
 Planar = Domain("Planar", across=(("x", "m"), ("y", "m")), through=(("fx", "N"), ("fy", "N")))
 
@@ -123,6 +123,7 @@ def make(seed: int) -> Case:
     a = weight - inverse * (moving.T @ lam)
     expected, rates = {}, {}
     strong, fast = max(np.max(np.abs(lam), initial=0), 1e-3), float(np.max(np.abs(a)))
+    rounding = ROUNDING * (g + float(np.max(np.abs(inverse * (moving.T @ lam)))))  # where weight and rods balance
     for (_, _, name), value in zip(rods, lam.tolist(), strict=True):
         expected[f"{name}.lam"] = Expected(value, TOLERANCE * strong * 10)
     for k in range(pivots, n):
@@ -131,8 +132,8 @@ def make(seed: int) -> Case:
             expected[f"{label[k]}.{axis}"] = Expected(float(place[k, j]), TOLERANCE)
             expected[f"{label[k]}.v{axis}"] = Expected(float(v[2 * k + j]), 10 * TOLERANCE)
             rates[f"{label[k]}.{axis}"] = Expected(float(v[2 * k + j]), 10 * TOLERANCE)
-            rates[f"{label[k]}.v{axis}"] = Expected(float(a[row]), 10 * TOLERANCE * fast)
+            rates[f"{label[k]}.v{axis}"] = Expected(float(a[row]), 10 * TOLERANCE * fast + rounding)
             expected[f"{label[k]}.at.f{axis}"] = Expected(
-                float(m[k] * (a[row] - weight[row])), 10 * TOLERANCE * fast * float(m[k])
+                float(m[k] * (a[row] - weight[row])), (10 * TOLERANCE * fast + rounding) * float(m[k])
             )
     return Case(ev, diagram, initial, expected, rates, note=note)

@@ -1,7 +1,5 @@
 """Dense least squares that also answers where a matrix leaves directions open."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,10 +8,11 @@ from jaxtyping import Array, Float
 
 def least_squares(matrix: Float[Array, "m n"], right: Float[Array, " m"]) -> Float[Array, " n"]:
     """The least-squares solution of A·x = b, rows equilibrated; near the one of least norm where A leaves directions
-    open. Differentiable with respect to b alone."""
+    open. Rows of zeros say nothing, whatever stands in b. Differentiable with respect to b alone."""
     m, n = matrix.shape
-    tiny: Any = float(jnp.finfo(matrix.dtype).tiny)
-    scale = 1 / jnp.maximum(jnp.max(jnp.abs(matrix), axis=1, initial=0.0), tiny)
+    largest = jnp.max(jnp.abs(matrix), axis=1, initial=0.0)
+    empty = largest < float(jnp.finfo(matrix.dtype).tiny)
+    scale = jnp.where(empty, 0, 1 / jnp.where(empty, 1, largest))
     # Rows that only open directions feel: what they take from the others is far below rounding.
     ridge = float(jnp.finfo(matrix.dtype).eps) ** 0.75
     stacked = jnp.concatenate([scale[:, None] * matrix, jnp.asarray(ridge * np.eye(n), matrix.dtype)])

@@ -137,8 +137,8 @@ class SystemAt:
             x, z = list(state[:n]), list(state[n:])
 
             def along(rates: list[Any]) -> list[Any]:
-                def g(t, x, z):
-                    return self._carried(t, (*x, *z))
+                def g(t, x, z):  # blocks that are alike have one residual, an array
+                    return [v for r in self._carried(t, (*x, *z)) for v in (r if jnp.ndim(r) else [r])]
 
                 return jax.jvp(g, (self.t, x, z), (jnp.ones_like(self.t), slopes, rates))[1]
 
