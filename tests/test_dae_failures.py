@@ -153,9 +153,9 @@ def test_a_model_that_is_not_finite_at_its_start():
     with pytest.raises(SimulationError) as caught:
         simulate(system, 1.0)
     assert str(caught.value) == (
-        "the integration stopped at t=0: no step was short enough to be accepted. The equations are not finite: "
-        "the derivative of 'cell.x' (row 0 of F) is nan at the start. Start elsewhere, or look for a division by zero, "
-        "or a root or logarithm without a value."
+        "the integration stopped at t=0: an equation is not finite at the start, cell: 0 = der(x) - z + sqrt(x - 2), "
+        "with 'cell.x' = 1, 'cell.z' = 1. Start elsewhere, or look for a division by zero, or a root or logarithm "
+        "without a real value."
     )
     found = simulate(system, 1.0, ts=TS[:4], throw=False)
     assert found.result != diffrax.RESULTS.successful

@@ -32,6 +32,7 @@ from jaxonomy_dae import (
 from jaxonomy_dae.library.electrical import Ground, Resistor
 from jaxonomy_dae.library.planar import PlanarPendulum
 from jaxonomy_dae.library.translational import Mass, Spring
+from jaxonomy_dae.modeling import Eq as our_eq
 
 EV = EqnEnv()
 
@@ -167,6 +168,36 @@ class Empty(Component):
         case(r"cannot compare them with if.*Piecewise",
              lambda: component(lambda s, ev: 1 if s.variable("x") > 0 else 2)),
         case(r"cannot compare.*Max or Min", lambda: component(lambda s, ev: max(s.variable("x"), 0))),
+        case(r"floor\(x\)", lambda: component(lambda s, ev: int(s.variable("x")))),
+        case(r"floor\(x\)", lambda: component(lambda s, ev: round(s.variable("x")))),
+        case(r"return a tuple of symbols.*y\[0\]", lambda: component(lambda s, ev: -s.vector("x", 1))),
+        case(r"a string stands where a number", lambda: component(lambda s, ev: s.variable("x") + "1")),
+        case(r"sides of an equation.*of type ndarray: write one equation for each entry",
+             lambda: component(lambda s, ev: our_eq(s.variable("x"), np.ones(2)))),
+        case(r"sides of an equation.*'c' of type str.*component\[\"name\"\]",
+             lambda: component(lambda s, ev: our_eq(s.variable("x"), s.name))),
+        case(r"made of symbols and numbers.*component\[\"name\"\]",
+             lambda: component(lambda s, ev: s.output("y", s.name))),
+        case(r"der takes one expression; got \(x\[0\], x\[1\]\)",
+             lambda: component(lambda s, ev: der(s.vector("x", 2)))),
+        case(r"der takes an expression in variables; got x > 0",
+             lambda: component(lambda s, ev: der(s.variable("x") > 0))),
+        case(r"one of them is nan or not real",
+             lambda: component(lambda s, ev: s.add_equations(Eq(s.variable("x"), sympy.nan)))),
+        case(r"contains no variable: use the symbols that self\.variable",
+             lambda: component(lambda s, ev: s.add_equations(Eq(sympy.Function("x")(ev.t), 1)))),
+        case(r"'c': 0 = .*: it contains -oo, which is not a finite number",
+             lambda: compiled(component(lambda s, ev: s.add_equations(Eq(s.variable("x"), np.inf * s.input("u")))))),
+        case(r"function 'c\.f' computes with NumPy or math, which JAX cannot trace: use jax\.numpy",
+             lambda: component(lambda s, ev: s.function("f", math.sin, [s.variable("x")]))),
+        case(r"function 'c\.f' decides by its input with a Python `if`",
+             lambda: component(lambda s, ev: s.function("f", lambda x: x if x > 0 else -x, [s.variable("x")]))),
+        case(r"function 'c\.f' failed when called with its 2 inputs: TypeError",
+             lambda: component(lambda s, ev: s.function("f", jnp.sin, [s.variable("x"), ev.t]))),
+        case(r"parameter 'c\.k' must be a real number; got the complex number I",
+             lambda: component(lambda s, ev: s.parameter("k", sympy.I))),
+        case(r"parameter 'c\.k' must be a number; got NoneType$",
+             lambda: component(lambda s, ev: s.parameter("k", None))),
         case(r"SymPy's functions", lambda: component(lambda s, ev: math.sin(s.variable("x")))),
         case(r"SymPy's functions", lambda: component(lambda s, ev: np.sin(s.variable("x")))),
         case(r"SymPy's functions", lambda: component(lambda s, ev: jnp.sin(s.variable("x")))),
@@ -186,6 +217,16 @@ WRONG_TYPES = [
      lambda: simulate(jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), rc_circuit()), 1.0)),
     (r"first argument of a component is an EqnEnv; got str", lambda: Ground("ground", "g")),
     (r"parameter 'r\.R' must be a number; got list.*with_parameters\(\{'r\.R'", lambda: Resistor(EV, "r", [1.0])),
+    (r"'c\.x': fixed is True or False; got 'no'", lambda: component(lambda s, ev: s.variable("x", 1.0, fixed="no"))),
+    (r"parameter 'c\.k': unit is a text such as 'kg'; got 1",
+     lambda: component(lambda s, ev: s.parameter("k", 1.0, 1))),
+    (r"the constant 'g' of EqnEnv must be a real number; got the string '9\.81'", lambda: EqnEnv(g="9.81")),
+    (r"Resistor: the environment comes first, then the name: Resistor\(ev, \"name\"", lambda: Resistor("r")),
+    (r"got a list: write diagram\.add\(\*components\)", lambda: AcausalDiagram().add([Ground(EV, "g")])),
+    (r"got the class Ground: make a component of it, Ground\(ev", lambda: AcausalDiagram().add(Ground)),
+    (r"initial is a dictionary by names.*got list", lambda: simulate(rc_circuit(), 1.0, initial=[1.0])),
+    (r"initial is a dictionary by names.*got list", lambda: rc_circuit().initialize(initial=[1.0])),
+    (r"parameters are given by names.*got list", lambda: rc_circuit().with_parameters([1.0])),
     (r"port 'c\.p' needs a Domain such as Electrical; got 'electrical'",
      lambda: component(lambda s, ev: s.port("p", "electrical"))),
     (r"is not an equation", lambda: component(lambda s, ev: s.add_equations(sympy.Matrix([s.variable("x")])))),
@@ -395,7 +436,7 @@ def use(message, call, error=ModelError):
         use(r"'r\.r' is not a parameter: did you mean 'r\.R'", lambda s: s.parameters["r.r"]),
         use(r"parameter 'r\.R' must be finite; got inf", lambda s: s.with_parameters({"r.R": np.inf})),
         use(r"parameter 'r\.R' must be a real number; got the string", lambda s: s.with_parameters({"r.R": "2"})),
-        use(r"parameter 'r\.R' must be a real number; got a complex", lambda s: s.with_parameters({"r.R": 1j})),
+        use(r"parameter 'r\.R' must be a real number; got the complex", lambda s: s.with_parameters({"r.R": 1j})),
         use(r"parameter 'c\.C' must lie in \(0, inf\); got 0", lambda s: s.with_parameters({"c.C": 0.0})),
         use(r"parameter 'r\.R' is a scalar; got shape \(3,\).*filter_vmap",
             lambda s: s.with_parameters({"r.R": jnp.ones(3)})),
@@ -418,6 +459,11 @@ def use(message, call, error=ModelError):
         use(r"ts must lie between t0=0\.0 and t1=1\.0; 1\.5 does not", lambda s: simulate(s, 1.0, ts=[0.5, 1.5])),
         use(r"ts must lie between t0=0\.0 and t1=1\.0; -0\.5 does not", lambda s: simulate(s, 1.0, ts=[-0.5, 0.5])),
         use(r"ts must have shape \(n,\), n ≥ 1; got \(0,\)", lambda s: simulate(s, 1.0, ts=jnp.zeros(0))),
+        use(r"t1 must be a finite number; got the string '1': leave the quotes out", lambda s: simulate(s, "1")),
+        use(r"rtol must be a number ≥ 0; got the string '1e-3'", lambda s: simulate(s, 1.0, rtol="1e-3")),
+        use(r"dtmax must be positive; got 0", lambda s: simulate(s, 1.0, dtmax=0.0)),
+        use(r"initial: 'c\.v' must be finite; got nan", lambda s: simulate(s, 1.0, initial={"c.v": np.nan})),
+        use(r"initial: 'c\.v' must be finite; got nan", lambda s: s.initialize(initial={"c.v": np.nan})),
         use(r"ts must be finite", lambda s: simulate(s, 1.0, ts=[0.5, np.nan])),
         use(r"needs t0 < t1; got t0=0\.0, t1=-1\.0", lambda s: simulate(s, -1.0)),
         use(r"t1 must be a finite number; got nan", lambda s: simulate(s, np.nan)),
@@ -474,5 +520,7 @@ def test_a_start_at_a_singular_point():
         x = self.variable("x", start=0.0, fixed=True)
         self.add_equations(Eq(der(x), -1 / x))
 
-    with pytest.raises(SimulationError, match=r"derivative of 'c\.x' \(row 0 of F\) is -inf at the start.*division"):
+    with pytest.raises(
+        SimulationError, match=r"not finite at the start, c: 0 = der\(x\) \+ 1/x, with 'c\.x' = 0\. .*division"
+    ):
         simulate(compiled(component(write)), 1.0, ts=jnp.array([1.0]))

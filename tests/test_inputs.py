@@ -258,7 +258,7 @@ class Wide(eqx.Module):
         (math.sin, r"'m\.u' computes with NumPy or math.*jnp\.sin"),
         (lambda t: np.interp(t, [0.0, 1.0], [0.0, 1.0]), r"'m\.u' computes with NumPy.*jnp\.interp for np\.interp"),
         (lambda t: 1.0 if t > 1 else 0.0, r"'m\.u' decides by the time with a Python `if`.*jnp\.where"),
-        (lambda t, x: t, r"'m\.u' failed when called with a time: TypeError"),
+        (lambda t, x: t, r"'m\.u' failed when called with the time: TypeError"),
         (lambda t: None, r"'m\.u' must return one number for a time; it returned nothing"),
         (lambda t: jnp.ones(1), r"'m\.u' must return one number for a time; it returned shape \(1,\)"),
         (Wide(), r"'m\.u' must return one number for a time; it returned shape \(3,\)"),

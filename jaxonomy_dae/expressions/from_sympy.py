@@ -91,6 +91,8 @@ def _read(e: Any, inside: list[Node]) -> Node:
         return constant(Fraction(int(e.p), int(e.q)))
     if e is sympy.zoo or e is sympy.nan:
         raise UnsupportedExpression(f"it contains {e}, the result of a division by zero")
+    if e is sympy.oo or e is -sympy.oo:
+        raise UnsupportedExpression(f"it contains {e}, which is not a finite number")
     if e is sympy.I:
         raise UnsupportedExpression("it contains the imaginary unit I, but equations are between real numbers")
     if isinstance(e, sympy.Number | sympy.NumberSymbol):

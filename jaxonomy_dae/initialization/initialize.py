@@ -24,6 +24,7 @@ from ..model.quantities import declared_scale, quantity_bounds
 from ..system.inputs import read_inputs
 from ..system.system_at import SystemAt
 from .given_solver import find_root_with
+from .initial_values import check_initial
 from .ladder import FAILED, STAGED, Sizes, find_root, tolerance
 from .rows import InitialRows, Row, initial_rows
 from .stages import solve_in_stages, stages
@@ -342,6 +343,7 @@ def find_initial(
 ) -> InitialPoint:
     """`initialize`, compiled once for each structure where nothing is traced."""
     dtype = system.parameters.values.dtype
+    check_initial(system, initial)
     inputs = read_inputs(system.inputs, dtype, inputs)
     initial = {name: jnp.asarray(v, dtype) for name, v in sorted((initial or {}).items())}
     arguments = (system, jnp.asarray(t0, dtype), inputs, initial, solve_for, solver)

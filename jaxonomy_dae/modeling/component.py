@@ -165,6 +165,8 @@ class Component(metaclass=Construction):
         """
         self._claim(name, "parameter")
         where = f"parameter '{self.name}.{name}'"
+        if not isinstance(unit, str):
+            raise ModelError(f"{where}: unit is a text such as 'kg'; got {unit!r}")
         interval = as_interval(bounds, where)
         if isinstance(value, sympy.Expr) and not value.is_number:
             self._check_parameters_only(value, f"the value of {where}")
@@ -189,6 +191,10 @@ class Component(metaclass=Construction):
 
     def _declare(self, name: str, kind: str, start=None, fixed=False, nominal=None, unit="", default=None, bounds=None):
         where = f"'{self.name}.{name}'"
+        if not isinstance(fixed, bool | np.bool_):
+            raise ModelError(f"{where}: fixed is True or False; got {fixed!r}")
+        if not isinstance(unit, str):
+            raise ModelError(f"{where}: unit is a text such as 'm/s'; got {unit!r}")
         if nominal is not None and not 0 < real_number(nominal, f"the nominal value of {where}"):
             raise ModelError(f"the nominal value of {where} must be a positive number; got {nominal}")
         if fixed and start is None:
@@ -342,7 +348,7 @@ class Component(metaclass=Construction):
         - `ModelError` if the function cannot be called with that many scalars.
         """
         if not callable(function):
-            raise ModelError(f"function '{self.name}.{name}': expected something to call; got {function!r}")
+            raise ModelError(f"function '{self.name}.{name}': the function must be callable; got {function!r}")
         return self._opaque("function", name, of_scalars(function), inputs, outputs)
 
     def _opaque(self, what: str, name: str, network: Any, inputs: Sequence[Any], outputs: int | None):
@@ -351,14 +357,14 @@ class Component(metaclass=Construction):
 
         where = f"{what} '{self.name}.{name}'"
         if not callable(network):
-            raise ModelError(f"{where}: the network must be callable; got {network!r}")
+            raise ModelError(f"{where}: the {_noun(what)} must be callable; got {network!r}")
         symbols = []
         for entry in inputs:
             entry = sympy.sympify(entry)
             if not isinstance(entry, VariableSymbol | TimeSymbol):
                 raise ModelError(f"{where}: inputs are symbols of variables or ev.t; got '{entry}'")
             symbols.append(entry)
-        found = count_outputs(network, len(symbols), where)
+        found = count_outputs(network, len(symbols), where, noun=_noun(what))
         if outputs is not None and outputs != found:
             raise ModelError(f"{where}: expected {outputs} outputs, but the {_noun(what)} returns {found}")
         names = [name] if found == 1 else [f"{name}[{k}]" for k in range(found)]

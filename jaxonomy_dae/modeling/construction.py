@@ -3,8 +3,10 @@ when construction ends, and common slips are explained."""
 
 from typing import Any
 
+from sympy import SympifyError
+
 from ..errors import ModelError
-from .symbols import seen_from_child
+from .symbols import SHADOWED, seen_from_child
 
 
 class Construction(type):
@@ -14,19 +16,31 @@ class Construction(type):
         try:
             outside: tuple[Any, ...] = tuple(map(seen_from_child, args))
             component = super().__call__(*outside, **{k: seen_from_child(v) for k, v in kwargs.items()})
-        except TypeError as error:
-            hint = _hint(str(error))
+        except (TypeError, SympifyError) as error:
+            hint = _hint(error, cls.__name__)
             if hint is None:
                 raise
-            raise ModelError(f"{cls.__name__}: {hint} ({error})") from error
+            first = str(error).split("\n")[0]
+            detail = "" if " at 0x" in first else f" ({first})"  # objects without a name say nothing
+            raise ModelError(f"{cls.__name__}: {hint}{detail}") from error
         if "_sealed" not in component.__dict__:
-            raise ModelError(f"{cls.__name__}: its __init__ must begin with super().__init__(ev, name)")
+            raise ModelError(f"{cls.__name__}: {_HOW_TO_BEGIN}")
         component._sealed = True
         return component
 
 
-def _hint(error: str) -> str | None:
-    """What was probably meant where symbols were treated as numbers."""
+_HOW_TO_BEGIN = "its __init__ must begin with super().__init__(ev, name)"
+
+
+def _hint(raised: Exception, name: str) -> str | None:
+    """What was probably meant, for slips that raise errors which do not say so."""
+    error = str(raised)
+    if isinstance(raised, SympifyError):
+        return f"what stands in an equation is made of symbols and numbers. {SHADOWED}"
+    if "Component.__init__() missing" in error:
+        return _HOW_TO_BEGIN
+    if f"{name}.__init__() missing" in error and "'name'" in error:
+        return f'the environment comes first, then the name: {name}(ev, "name", …)'
     if "cannot determine truth value of Relational" in error:
         return (
             "variables and parameters have no value yet when equations are written, so Python cannot compare them with "
@@ -37,4 +51,13 @@ def _hint(error: str) -> str | None:
             "a function of numbers was called with a symbol. In equations, use SymPy's functions (sympy.sin, "
             "sympy.sqrt, …), not those of math, numpy or jax.numpy"
         )
+    if "Cannot convert symbols to int" in error or "Cannot round symbolic expression" in error:
+        return "int() and round() are for numbers. In equations, write floor(x) or floor(x + 1/2) from SymPy"
+    if "operand" in error and "'tuple'" in error:
+        return (
+            "vector(), learned() and function() return a tuple of symbols, also if there is only one: write "
+            "`y, = self.learned(...)`, or use its entries y[0], y[1], …"
+        )
+    if "operand" in error and "'str'" in error:
+        return "a string stands where a number or symbol is meant: leave the quotes out"
     return None

@@ -37,7 +37,7 @@ class AcausalDiagram:
         """
         for component in components:
             if not isinstance(component, Component):
-                raise ModelError(f"only components can be added to a diagram; got {type(component).__name__}")
+                raise ModelError(f"only components can be added to a diagram; got {_described(component)}")
             if component.parent is not None:
                 raise ModelError(f"component '{component.path}' is part of '{component.parent.path}': add that one")
             other = next(iter(self.components.values()), component)
@@ -92,6 +92,14 @@ class AcausalDiagram:
             raise ModelError(f"the name '{block.name}' is used twice: rename the neural block")
         self.blocks[block.name] = block
         return self
+
+
+def _described(wrong: Any) -> str:
+    if isinstance(wrong, list | tuple):
+        return f"a {type(wrong).__name__}: write diagram.add(*components)"
+    if isinstance(wrong, type):
+        return f'the class {wrong.__name__}: make a component of it, {wrong.__name__}(ev, "name")'
+    return type(wrong).__name__
 
 
 def _top(component: Component) -> Component:

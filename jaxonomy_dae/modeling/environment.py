@@ -1,5 +1,6 @@
 """What all components of one model share."""
 
+from .real_number import real_number
 from .symbols import ENVIRONMENT_TIME, TimeSymbol
 
 
@@ -12,6 +13,10 @@ class EqnEnv:
         `ev.constants["gravity"]`. They are plain numbers: what is to be trained or varied should be a parameter.
 
     `ev.t` is the symbol of time; it may stand in any equation.
+
+    **Raises:**
+
+    - `ModelError` for a constant that is not a finite real number.
     """
 
     t: TimeSymbol
@@ -19,7 +24,7 @@ class EqnEnv:
 
     def __init__(self, **constants: float):
         self.t = ENVIRONMENT_TIME
-        self.constants = dict(constants)
+        self.constants = {k: real_number(v, f"the constant '{k}' of EqnEnv") for k, v in constants.items()}
 
     def __repr__(self):
         inside = ", ".join(f"{k}={v}" for k, v in self.constants.items())

@@ -17,7 +17,10 @@ def residual_of(equation: Any) -> sympy.Expr:
         residual = equation.lhs - equation.rhs  # pyright: ignore[reportOperatorIssue]
     elif isinstance(equation, bool | sympy.logic.boolalg.BooleanAtom):
         raise ModelError(
-            f"an equation is always {equation}; does it say what you mean? (`a == b` compares; write `Eq(a, b)`)"
+            "an equation is always True and says nothing (`a == b` compares symbols; write `Eq(a, b)`)"
+            if equation
+            else "an equation is always False: its sides can never be equal, or one of them is nan or not real "
+            "(`a == b` compares symbols; write `Eq(a, b)`)"
         )
     else:
         residual = sympy.sympify(equation)
@@ -27,5 +30,7 @@ def residual_of(equation: Any) -> sympy.Expr:
     if sympy.I in atoms:
         raise ModelError(f"the equation {equation} has a complex coefficient: write its real and imaginary part as two")
     if not any(isinstance(s, VariableSymbol) for s in atoms):
-        raise ModelError(f"the equation {equation} contains no variable")
+        raise ModelError(
+            f"the equation {equation} contains no variable: use the symbols that self.variable(...) returns"
+        )
     return residual

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from ..errors import ModelError
 from .component import Component
+from .untraceable import why_untraceable
 
 
 def as_weights(theta: Any) -> Any:
@@ -16,8 +17,9 @@ def as_weights(theta: Any) -> Any:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf) if eqx.is_inexact_array_like(leaf) else leaf, theta)
 
 
-def count_outputs(network: Callable, inputs: int, where: str, theta: Any = None) -> int:
-    """The number of outputs of `network(u)` or `network(t, u, theta)`, found without computing anything."""
+def count_outputs(network: Callable, inputs: int, where: str, theta: Any = None, noun: str = "network") -> int:
+    """The number of outputs of `network(u)` or `network(t, u, theta)`, found without computing anything; `noun` is what
+    errors call it."""
     dtypes = [leaf.dtype for leaf in jax.tree.leaves((network, theta)) if eqx.is_inexact_array(leaf)]
     dtype = dtypes[0] if dtypes else jnp.zeros(()).dtype
     u = jax.ShapeDtypeStruct((inputs,), dtype)
@@ -27,13 +29,15 @@ def count_outputs(network: Callable, inputs: int, where: str, theta: Any = None)
         else:
             out = eqx.filter_eval_shape(network, jax.ShapeDtypeStruct((), dtype), u, theta)
     except Exception as error:
-        signature = f"network(u) with u of shape ({inputs},)"
-        if theta is not None:
-            signature = f"network(t, u, theta) with u of shape ({inputs},)"
-        raise ModelError(f"{where}: calling {signature} failed: {error}") from error
+        if noun == "function":
+            why = why_untraceable(error, "its input" if inputs == 1 else f"its {inputs} inputs", "x")
+            raise ModelError(f"{where} {why}") from error
+        signature = "network(u)" if theta is None else "network(t, u, theta)"
+        why = why_untraceable(error, "its inputs", "u[0]")
+        raise ModelError(f"{where}: calling {signature} with u of shape ({inputs},) failed: it {why}") from error
     if not (hasattr(out, "shape") and len(out.shape) == 1):
         found = getattr(out, "shape", type(out).__name__)
-        raise ModelError(f"{where}: the network must return a vector of shape (outputs,); got shape {found}")
+        raise ModelError(f"{where}: the {noun} must return a vector of shape (outputs,); got shape {found}")
     return out.shape[0]
 
 

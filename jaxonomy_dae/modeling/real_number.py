@@ -5,6 +5,7 @@ import numbers
 from typing import Any
 
 import numpy as np
+import sympy
 
 from ..errors import ModelError
 
@@ -14,24 +15,33 @@ def real_number(value: Any, where: str, hint: str = "") -> float:
 
     **Raises:**
 
-    - `ModelError` for strings, complex numbers, arrays of several numbers, tracers, and what is not finite.
+    - `ModelError` for strings, complex numbers, arrays of several numbers, tracers, and what is not finite; `hint` says
+        what to do with arrays and tracers.
     """
     given: Any = value
     text = ""
     if isinstance(value, str):
         text = f"; got the string {value!r}: write {value} without quotes"
-    elif _is_complex(value) or (isinstance(value, numbers.Complex) and not isinstance(value, numbers.Real)):
+    elif _is_complex(value):
         text = f"; got the complex number {value}: write its real and imaginary part as two parameters"
     if text:
         raise ModelError(f"{where} must be a real number{text}")
     try:
         number = float(given)
     except (TypeError, ValueError):
-        raise ModelError(f"{where} must be a number; got {type(value).__name__}{hint}") from None
+        raise ModelError(f"{where} must be a number; got {type(value).__name__}{hint * _is_array(value)}") from None
     if not math.isfinite(number):
         raise ModelError(f"{where} must be finite; got {number}")
     return number
 
 
 def _is_complex(value: Any) -> bool:
+    if isinstance(value, sympy.Expr):
+        return bool(value.has(sympy.I))
+    if isinstance(value, numbers.Complex):
+        return not isinstance(value, numbers.Real)
     return np.issubdtype(getattr(value, "dtype", np.float64), np.complexfloating)
+
+
+def _is_array(value: Any) -> bool:
+    return hasattr(value, "dtype") or isinstance(value, list | tuple)

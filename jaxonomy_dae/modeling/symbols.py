@@ -105,8 +105,33 @@ def seen_from_child(value: Any) -> Any:
     return value
 
 
-# SymPy's Eq, remembering what it returned: the components of a large model write the same few equations.
-Eq = functools.lru_cache(maxsize=4096)(sympy.Eq)
+_remembered = functools.lru_cache(maxsize=4096)(sympy.Eq)  # large models write the same few equations
+
+
+SHADOWED = (
+    "A variable that has the name of an attribute of every component, such as `name` or `output`, is written "
+    'component["name"]'
+)
+
+
+def Eq(left: Any, right: Any) -> Any:
+    """The equation left = right: SymPy's `Eq`.
+
+    **Raises:**
+
+    - `ModelError` if a side is not an expression or a number.
+    """
+    try:
+        return _remembered(left, right)
+    except (TypeError, sympy.SympifyError):
+        wrong = next((side for side in (left, right) if not isinstance(side, sympy.Expr | int | float)), right)
+        many = isinstance(wrong, list | tuple | sympy.MatrixBase) or getattr(wrong, "ndim", 0)
+        mend = ": write one equation for each entry" if many else ""
+        if isinstance(wrong, str) or callable(wrong):
+            mend = f". {SHADOWED}"
+        raise ModelError(
+            f"the sides of an equation are expressions or numbers; got {wrong!r} of type {type(wrong).__name__}{mend}"
+        ) from None
 
 
 def der(expression: Any) -> Any:
@@ -123,9 +148,13 @@ def der(expression: Any) -> Any:
 
     **Raises:**
 
-    - `ModelError` if the expression has a symbol that no component declared.
+    - `ModelError` if the expression has a symbol that no component declared, or is not an expression.
     """
+    if isinstance(expression, tuple | list):
+        raise ModelError(f"der takes one expression; got {expression}: write der of each entry")
     expression = sympy.sympify(expression)
+    if not isinstance(expression, sympy.Expr):
+        raise ModelError(f"der takes an expression in variables; got {expression}")
     if isinstance(expression, VariableSymbol):
         return VariableSymbol(expression.path, expression.order + 1)
     symbols = {symbol_label(s): s for s in symbols_of(expression)}

@@ -6,15 +6,16 @@ from typing import Any
 import diffrax
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
 from ..errors import ModelError
+from ..initialization.initial_values import check_initial
+from ..solvers.solve_arguments import check_finite, check_longest_step
 from ..system.system import AcausalSystem
 
 
-def check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_controller, max_steps):
+def check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_controller, dtmax, max_steps):
     """Raises a `ModelError` that says which argument cannot work, and what would."""
     if not isinstance(system, AcausalSystem):
         raise ModelError(f"simulate needs an AcausalSystem (call the AcausalCompiler); got {type(system).__name__}")
@@ -37,18 +38,9 @@ def check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_contr
         raise ModelError(
             "stepsize_controller=ConstantStepSize() needs a step: use diffrax.StepTo(ts=jnp.linspace(t0, t1, n))"
         )
+    check_longest_step(dtmax)
     _check_interval(t0, t1, ts)
-    for name, value in (initial or {}).items():
-        if name in system.parameters.names:
-            raise ModelError(f"initial: '{name}' is a parameter; use system.with_parameters({{'{name}': value}})")
-        quantity = system.plan.resolve([name])[0][0]
-        if quantity < 0:
-            raise ModelError(f"initial: '{name}' is identically zero in this model")
-        if isinstance(value, str) or np.shape(value) != ():
-            found = repr(value) if isinstance(value, str) else f"shape {np.shape(value)}"
-            raise ModelError(f"initial: '{name}' needs a scalar; got {found}")
-        if jnp.issubdtype(jnp.result_type(value), jnp.complexfloating):
-            raise ModelError(f"initial: '{name}' must be real; got {jnp.result_type(value)}")
+    check_initial(system, initial)
 
 
 def _concrete(value: Any) -> np.ndarray | None:
@@ -56,10 +48,8 @@ def _concrete(value: Any) -> np.ndarray | None:
 
 
 def _check_interval(t0, t1, ts):
+    check_finite(t0=t0, t1=t1)
     a, b = _concrete(t0), _concrete(t1)
-    for name, value in (("t0", a), ("t1", b)):
-        if value is not None and (value.shape != () or not math.isfinite(value)):
-            raise ModelError(f"{name} must be a finite number; got {value}")
     if a is not None and b is not None and not a < b:
         raise ModelError(f"the interval needs t0 < t1; got t0={float(a)}, t1={float(b)}")
     if ts is None:
@@ -83,7 +73,8 @@ def _check_interval(t0, t1, ts):
     outside = saved[(saved < low) | (saved > high)]
     if len(outside):
         raise ModelError(
-            f"ts must lie between t0={t0} and t1={t1}; {outside[0]} does not. Extend the interval or drop it"
+            f"ts must lie between t0={t0} and t1={t1}; {outside[0]} does not. Extend the interval, or leave that time "
+            "out"
         )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from ..solvers.choice_guard import SINGULAR_CHOICE
 from ..solvers.failures import SHOWN, explain_failure
 from .integration import term_of
+from .not_finite import equation_not_finite
 from .solution import Solution
 from .step_sizes import scaled_atol
 
@@ -24,6 +25,13 @@ def explain(
     bad = _bad_input(inputs, float(t0), float(t), float(t1))
     if bad:
         return f"the integration stopped at t={float(t):g}: {bad}"
+    equation = equation_not_finite(system, inputs, t, x)
+    if equation:
+        where, mend = ("at the start", "Start elsewhere, or look") if float(t) == float(t0) else ("there", "Look")
+        return (
+            f"the integration stopped at t={float(t):g}: an equation is not finite {where}, {equation}. {mend} for a "
+            "division by zero, or a root or logarithm without a real value."
+        )
     singular = _singular_choice(solution, t, x)
     if singular:
         return f"{singular}."

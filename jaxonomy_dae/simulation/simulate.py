@@ -91,7 +91,7 @@ def simulate(
 
     - `ModelError` for arguments that cannot work; `InitializationError`; `SimulationError`.
     """
-    check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_controller, max_steps)
+    check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_controller, dtmax, max_steps)
     dtype = system.parameters.values.dtype
     inputs = read_inputs(system.inputs, dtype, inputs)
     check_range(inputs, t0, t1)

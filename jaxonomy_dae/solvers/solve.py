@@ -20,7 +20,7 @@ from .drive import integrate, is_multistep
 from .failures import SHOWN, StartCheck, explain_failure, explain_start, start_check
 from .index_one import consistent_point, consistent_shift
 from .rodas5p import Rodas5P
-from .solve_arguments import check_times, jump_times, tolerance_of
+from .solve_arguments import check_longest_step, check_times, jump_times, tolerance_of
 from .step_control import StepControl
 
 SAVED_ITERATIONS = 4
@@ -78,6 +78,7 @@ def solve_dae(
     y0 = jax.tree.map(_inexact, y0)
     dtype = jnp.result_type(*jax.tree.leaves(y0))
     check_times(t0, t1, ts)
+    check_longest_step(dtmax)
     rtol, atol = default_tolerances(rtol, atol, dtype)
     check_tolerances(rtol, atol, dtype)
     # Numbers become arrays, so that another value is not another program.
@@ -157,6 +158,8 @@ def check_tolerances(rtol: Any, atol: Any, dtype: Any):
         for leaf in jax.tree.leaves(value):
             if isinstance(leaf, Tracer):
                 continue
+            if isinstance(leaf, str):
+                raise ModelError(f"{name} must be a number ≥ 0; got the string {leaf!r}: leave the quotes out")
             number = np.asarray(leaf, float)
             if not (np.isfinite(number).all() and (number >= 0).all()):
                 raise ModelError(f"{name} must be a number ≥ 0; got {value}")
@@ -164,16 +167,12 @@ def check_tolerances(rtol: Any, atol: Any, dtype: Any):
         return
     eps = float(jnp.finfo(dtype).eps)
     if float(rtol) < 10 * eps:
-        switch = (
-            ' Switch to double precision with jax.config.update("jax_enable_x64", True) before the model is '
-            "compiled, or"
-            if dtype == jnp.float32
-            else ""
-        )
-        least = _rounded_up(10 * eps)
-        raise ModelError(
-            f"rtol={float(rtol):g} cannot be reached in {dtype} (eps {eps:.1e}).{switch} use rtol ≥ {least:.0e}."
-        )
+        least = f"rtol ≥ {_rounded_up(10 * eps):.0e}."
+        mend = f"Use {least}"
+        if dtype == jnp.float32:
+            switch = 'jax.config.update("jax_enable_x64", True)'
+            mend = f"Switch to double precision with {switch} before the model is compiled, or use {least}"
+        raise ModelError(f"rtol={float(rtol):g} cannot be reached in {dtype} (eps {eps:.1e}). {mend}")
 
 
 def _rounded_up(value: float) -> float:

@@ -11,11 +11,29 @@ from jax.core import Tracer
 from ..errors import ModelError
 
 
-def check_times(t0: Any, t1: Any, ts: Any):
-    """Refuses an interval that is none, and times to save that are not in it, in order."""
-    for name, value in (("t0", t0), ("t1", t1)):
-        if not isinstance(value, Tracer) and not (np.shape(value) == () and math.isfinite(value)):
+def check_finite(**numbers: Any) -> None:
+    """Refuses what is not a finite number, by the names of the arguments."""
+    for name, value in numbers.items():
+        if isinstance(value, Tracer):
+            continue
+        if isinstance(value, str):
+            raise ModelError(f"{name} must be a finite number; got the string {value!r}: leave the quotes out")
+        if np.shape(value) != () or not math.isfinite(value):
             raise ModelError(f"{name} must be a finite number; got {value}")
+
+
+def check_longest_step(dtmax: Any) -> None:
+    """Refuses a longest step that is not positive."""
+    if dtmax is None or isinstance(dtmax, Tracer):
+        return
+    check_finite(dtmax=dtmax)
+    if not dtmax > 0:
+        raise ModelError(f"dtmax must be positive; got {dtmax}")
+
+
+def check_times(t0: Any, t1: Any, ts: Any):
+    """Refuses ends that are not finite, and times to save that are not between them, in order."""
+    check_finite(t0=t0, t1=t1)
     if ts is None:
         return
     if np.ndim(ts) != 1 or not np.shape(ts)[0]:

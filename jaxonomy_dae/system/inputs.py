@@ -17,6 +17,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..errors import ModelError, nearest
+from ..modeling.untraceable import uses_numpy, why_untraceable
 from .closed_function import ClosedFunction, closed_function
 
 KINDS = ("linear", "cubic", "held")
@@ -104,6 +105,8 @@ def _constant(name: str, value: Any, dtype: Any) -> Any:
         )
     if jnp.issubdtype(array.dtype, jnp.complexfloating):
         raise ModelError(f"input '{name}' must be real; got {array.dtype}: give jnp.real(…) and jnp.imag(…) apart")
+    if not isinstance(array, Tracer) and not np.isfinite(array):
+        raise ModelError(f"input '{name}' must be finite; got {array}")
     return array.astype(dtype)
 
 
@@ -113,21 +116,10 @@ def _constant(name: str, value: Any, dtype: Any) -> Any:
 def _function(name: str, function: Callable[[Any], Any], dtype: Any) -> ClosedFunction:
     try:
         out = jax.eval_shape(lambda t: function(t), jax.ShapeDtypeStruct((), dtype))
-    except jax.errors.TracerBoolConversionError:
-        raise ModelError(
-            f"input '{name}' decides by the time with a Python `if`, `and` or `min`: use jnp.where(t < …, a, b)"
-        ) from None
-    except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError):
-        raise ModelError(
-            f"input '{name}' computes with NumPy or math, which JAX cannot trace: use jax.numpy (jnp.sin for math.sin, "
-            f"jnp.interp for np.interp), or give the samples themselves: {EXAMPLE}"
-        ) from None
     except Exception as error:
-        raise ModelError(
-            f"input '{name}' failed when called with a time: {type(error).__name__}: {str(error).splitlines()[0]}"
-            if str(error)
-            else f"input '{name}' failed when called with a time: {type(error).__name__}"
-        ) from error
+        why = why_untraceable(error, "the time", "t")
+        samples = f", or give the samples themselves: {EXAMPLE}" if uses_numpy(error) else ""
+        raise ModelError(f"input '{name}' {why}{samples}") from error
     shape = getattr(out, "shape", None)
     if shape != ():
         found = "nothing" if out is None else f"shape {shape}" if shape is not None else type(out).__name__

@@ -148,6 +148,8 @@ class Parameters(eqx.Module):
         - `ModelError` for an unknown name, a parameter that is an expression in others, or a value of the wrong shape,
             that is not a finite real number, or is out of the bounds.
         """
+        if not isinstance(new, Mapping):
+            raise ModelError(f"parameters are given by names, {{'m.k': 2.0}}; got {type(new).__name__}")
         array = self.array
         batch = array.shape[:-1]
         for name, value in new.items():
@@ -189,7 +191,7 @@ class Parameters(eqx.Module):
                 f"equinox.filter_vmap(lambda v: system.with_parameters({{'{name}': v}}))(values)"
             )
         if jnp.issubdtype(jnp.result_type(value), jnp.complexfloating):
-            raise ModelError(f"{where} must be a real number; got a complex one: {value}")
+            raise ModelError(f"{where} must be a real number; got the complex number {value}")
         if isinstance(value, Tracer):
             return value
         for number in np.ravel(np.asarray(value)):

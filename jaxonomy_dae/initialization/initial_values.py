@@ -1,0 +1,31 @@
+"""Values at the initial time that a caller gives, checked before anything is compiled."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from ..errors import ModelError
+from ..system.system import AcausalSystem
+
+
+def check_initial(system: AcausalSystem, initial: Any) -> None:
+    """Raises a `ModelError` that names a value of `initial={...}` which cannot be meant."""
+    if initial is None:
+        return
+    if not isinstance(initial, Mapping):
+        raise ModelError(f"initial is a dictionary by names, initial={{'m.x': 1.0}}; got {type(initial).__name__}")
+    for name, value in initial.items():
+        if name in system.parameters.names:
+            raise ModelError(f"initial: '{name}' is a parameter; use system.with_parameters({{'{name}': value}})")
+        if system.plan.resolve([name])[0][0] < 0:
+            raise ModelError(f"initial: '{name}' is identically zero in this model")
+        if isinstance(value, str) or np.shape(value) != ():
+            found = repr(value) if isinstance(value, str) else f"shape {np.shape(value)}"
+            raise ModelError(f"initial: '{name}' needs a scalar; got {found}")
+        if jnp.issubdtype(jnp.result_type(value), jnp.complexfloating):
+            raise ModelError(f"initial: '{name}' must be real; got {jnp.result_type(value)}")
+        if not isinstance(value, Tracer) and not np.isfinite(np.asarray(value, float)):
+            raise ModelError(f"initial: '{name}' must be finite; got {value}")

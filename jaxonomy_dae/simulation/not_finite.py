@@ -1,0 +1,47 @@
+"""The equation that has no finite value at a point."""
+
+from typing import Any
+
+import numpy as np
+
+from ..lowering.schedule import StepEquation
+from ..model.evaluate_numpy import Networks
+from ..system.system import AcausalSystem
+
+SHOWN = 4
+ANY = 0.5  # in place of what the equation is to determine
+
+
+def equation_not_finite(system: AcausalSystem, inputs: Any, t: Any, x: Any) -> str:
+    """The first equation, in the order of solution, that reads finite values and is not finite itself, with what it
+    reads; nothing if there is none."""
+    plan = system.plan
+    every = np.arange(plan.extended.quantities.n)
+    found = system.at(t, inputs).quantities(x, every, np.ones_like(every))
+    values = np.append(np.asarray(found, float), 0.0)  # ZERO is −1: the last entry
+    finite = np.isfinite(values)
+    parameters = np.asarray(system.parameters.array, float)
+    networks = Networks(tuple(system.neural[n] for n in plan.network_names))
+    for step in plan.steps:
+        own = np.zeros(len(values), bool)
+        own[np.concatenate(step.unknown)] = True
+        for equation in step.equations:
+            reads = np.stack([s.quantity for s in equation.slots], axis=-1)
+            slots = [s.sign * np.where(finite[s.quantity], values[s.quantity], ANY) for s in equation.slots]
+            p, c = list(parameters[equation.parameter].T), list(equation.coefficient.T)
+            with np.errstate(all="ignore"):
+                residual = equation.template.residual(slots, p, c, float(t), networks, backend="numpy")
+            wrong = ~np.isfinite(np.broadcast_to(np.asarray(residual, float), (len(reads),)))
+            wrong &= (finite[reads] | own[reads]).all(axis=1)
+            if wrong.any():
+                return _text(system, equation, int(np.argmax(wrong)), values, finite, parameters)
+    return ""
+
+
+def _text(system: AcausalSystem, equation: StepEquation, place: int, values, finite, parameters) -> str:
+    plan = system.plan
+    read = dict.fromkeys(int(s.quantity[place]) for s in equation.slots)
+    given = {plan.quantity_name[q]: values[q] for q in read if q >= 0 and finite[q]}
+    given |= {plan.flat.parameters.names[p]: parameters[p] for p in equation.parameter[place].tolist()}
+    shown = ", ".join(f"'{name}' = {value:.6g}" for name, value in list(given.items())[:SHOWN])
+    return plan.describe(int(equation.equation[place])) + (f", with {shown}" if shown else "")
