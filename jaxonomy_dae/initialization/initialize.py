@@ -21,6 +21,7 @@ from ..linear.least_squares import least_squares
 from ..lowering.gather import Gather, take
 from ..lowering.plan import SystemPlan
 from ..model.quantities import declared_scale, quantity_bounds
+from ..system.evaluate import Refinement
 from ..system.inputs import read_inputs
 from ..system.system_at import SystemAt
 from .given_solver import find_root_with
@@ -259,7 +260,7 @@ def _reader(plan: SystemPlan, kept: tuple[Row, ...]):
         if in_state:
             where = np.array([place[int(q)] for q in quantity])
             return take(x, where) * jnp.asarray(np.where(sign < 0, -1, 1), here.dtype)
-        evaluation = here.run(plan.everything, here.split(x), refine=0)
+        evaluation = here.run(plan.everything, here.split(x), Refinement.NONE)
         gather: Gather = plan.everything.layout.gather(quantity, sign)
         return jnp.broadcast_to(jnp.asarray(evaluation.read(gather), here.dtype), (len(quantity),))
 

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..solvers.choice_guard import SINGULAR_CHOICE
-from ..solvers.failures import SHOWN, explain_failure
+from ..solvers.failures import SHOWN, explain_failure, how_it_stopped
+from .failed_blocks import failed_block
 from .integration import term_of
 from .not_finite import equation_not_finite
 from .solution import Solution
@@ -17,11 +18,18 @@ PROBES = 64  # times at which inputs are looked at
 
 
 def explain(
-    solution: Solution, last: tuple[Any, Any], t0: Any, t1: Any, implicit: bool, max_steps: int, rtol: Any, atol: Any
+    solution: Solution,
+    first: tuple[Any, Any],
+    last: tuple[Any, Any],
+    t1: Any,
+    implicit: bool,
+    max_steps: int,
+    rtol: Any,
+    atol: Any,
 ) -> str:
-    """Why the integration from t0 to t1 stopped at its last accepted point (t, x), and what to do."""
+    """Why the integration from `first` to t1 stopped at its last accepted point (t, x), and what to do."""
     system, inputs = solution.system, solution.inputs
-    t, x = last
+    (t0, _), (t, x) = first, last
     bad = _bad_input(inputs, float(t0), float(t), float(t1))
     if bad:
         return f"the integration stopped at t={float(t):g}: {bad}"
@@ -32,9 +40,12 @@ def explain(
             f"the integration stopped at t={float(t):g}: an equation is not finite {where}, {equation}. {mend} for a "
             "division by zero, or a root or logarithm without a real value."
         )
-    singular = _singular_choice(solution, t, x)
+    singular = _singular_choice(solution, first, t, x)
     if singular:
         return f"{singular}."
+    block = failed_block(system, first, last, t1, inputs)
+    if block:
+        return how_it_stopped(solution.result, t, max_steps) + block
     names = [*system.states, *system.carried]
     return explain_failure(
         term_of(system, implicit), inputs, t, x, names,
@@ -58,16 +69,16 @@ def _bad_input(inputs: dict[str, Any], t0: float, t: float, t1: float) -> str:
     return ""
 
 
-def _singular_choice(solution: Solution, t: Any, x: Any) -> str:
+def _singular_choice(solution: Solution, first: tuple[Any, Any], t: Any, x: Any) -> str:
     """What the states do not determine at a point, if that is where and why the run ended."""
     system, inputs = solution.system, solution.inputs
     plan = system.plan
     if not plan.dummy_blocks:
         return ""
     here = np.abs(np.asarray(system.dummy_determinants(t, x, inputs)))
-    first = np.abs(np.asarray(system.dummy_determinants(solution.ts[0], solution.states[0], inputs)))
+    before = np.abs(np.asarray(system.dummy_determinants(*first, inputs)))
     # Other causes may end a run just before: steps too many, or too short.
-    if solution.result != SINGULAR_CHOICE and not (here <= NEARLY * first).any():
+    if solution.result != SINGULAR_CHOICE and not (here <= NEARLY * before).any():
         return ""
     columns = [column for block in plan.dummy_blocks for column in block.columns]
     lost = columns[int(np.argmin(here))]

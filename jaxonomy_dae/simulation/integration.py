@@ -80,11 +80,16 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, throw: bo
     consistent = is_consistent(found)
     saved, x = done.ts, jnp.asarray(done.ys)
     filled = jnp.isfinite(saved)
+    last, okay = done.last, diffrax.is_okay(done.result)
     if system.is_constrained:
         safe, times = jnp.where(filled[:, None], x, x0), jnp.where(filled, saved, t0)
         projected = jax.vmap(lambda t, y: system.project(t, y, inputs, iterations=SAVED_ITERATIONS))(times, safe)
+        # The run counts as failed at the first row at which nonlinear blocks have no solution.
+        lost = filled & jnp.all(jnp.isfinite(x), axis=1) & ~jnp.all(jnp.isfinite(projected), axis=1)
+        found_all, k = ~jnp.any(lost), jnp.argmax(lost)
+        last = jax.tree.map(lambda a, b: jnp.where(found_all, a, b), last, (times[k], safe[k]))
+        okay = okay & found_all
         x = jnp.where(filled[:, None], projected, x)
-    okay = diffrax.is_okay(done.result)
     if ts is None:
         steps = done.stats["num_accepted_steps"]
         saved, x = padded(saved, x, steps)
@@ -93,9 +98,10 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, throw: bo
         saved = ts
     x = not_a_number(x, filled & consistent, x0, system, inputs)
     failure: Any = diffrax.RESULTS.nonlinear_divergence
-    result = diffrax.RESULTS.where(consistent, done.result, failure)
+    result = diffrax.RESULTS.where(okay | ~diffrax.is_okay(done.result), done.result, failure)
+    result = diffrax.RESULTS.where(consistent, result, failure)
     stiff = consistent & (done.result == STIFF) if watch is not None else jnp.array(False)
-    return Outcome(found._replace(jacobian=None), saved, x, done.last, done.stats, result, stiff)
+    return Outcome(found._replace(jacobian=None), saved, x, last, done.stats, result, stiff)
 
 
 run_compiled = eqx.filter_jit(run)

@@ -165,7 +165,9 @@ def simulate(
         saved, x = saved[:taken], x[:taken]
     solution = Solution(saved, x, system, inputs, counts, outcome.result, choice.solver, choice.reason)
     if throw and not bool(diffrax.is_okay(outcome.result)):
-        raise SimulationError(explain(solution, outcome.last, t0, t1, is_implicit(solver), max_steps, rtol, atol))
+        first = t0, outcome.found.x
+        text = explain(solution, first, outcome.last, t1, is_implicit(solver), max_steps, rtol, atol)
+        raise SimulationError(text)
     return solution
 
 

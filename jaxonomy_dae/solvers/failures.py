@@ -102,6 +102,13 @@ def null_names(matrix: np.ndarray, names: Sequence[str]) -> str:
     return ", ".join(f"'{names[k]}'" for k in np.argsort(-null)[:SHOWN] if null[k] > 1e-3)
 
 
+def how_it_stopped(result: Any, t: Any, max_steps: int) -> str:
+    """The first sentence of an explanation."""
+    many = result == diffrax.RESULTS.max_steps_reached
+    reason = f"max_steps={max_steps} was reached" if many else "no step was short enough to be accepted"
+    return f"the integration stopped at t={float(t):g}: {reason}. "
+
+
 def explain_failure(
     term: Any, args: Any, t: Any, y: Any, names: Sequence[str], *,
     result: Any, t0: Any, t1: Any, max_steps: int, rtol: Any, atol: Any, explicit: bool = False,
@@ -110,8 +117,7 @@ def explain_failure(
     problem = FlatProblem(term, y, args)
     flat, time = problem.flat, jnp.asarray(t)
     many = result == diffrax.RESULTS.max_steps_reached
-    reason = f"max_steps={max_steps} was reached" if many else "no step was short enough to be accepted"
-    start = f"the integration stopped at t={float(t):g}: {reason}. "
+    start = how_it_stopped(result, t, max_steps)
     right = np.asarray(problem.right(time, flat))
     if not np.isfinite(right).all():
         value = right[~np.isfinite(right)][0]

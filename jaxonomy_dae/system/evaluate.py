@@ -1,11 +1,19 @@
 """Evaluation: steps become gathers, vectorised kernels and chunks of results.
 
 The traced program grows with the number of steps, not of the equations in them.
+
+Nonlinear blocks are solved from the values their unknowns have in the state array. What is returned fulfils their
+equations,
+
+    |r| ≤ c Σ |∂r/∂s| |s| + c' eps Σ |∂r/∂s|      over all that stands in an equation,
+
+or is not-a-number: an iteration that diverged, cycles, or rests where |r| is smallest but not zero.
 """
 
 import copy
+import enum
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -21,6 +29,17 @@ from ..model.evaluate_numpy import Networks
 
 UNROLLED_REPETITIONS = 4  # of a loop, written out in each of its iterations
 LONG_SUM = 16  # linear equations with more terms are one gather and one sum
+NEWTON_STEPS = 60  # to the root of a nonlinear block, at most; a double root takes 27
+ROUGH = 1e-2  # residual of an equation relative to its terms, where one Newton correction is made
+ROUNDING = 1e2  # in units of eps, of terms that are 1: what constants within an equation may leave
+
+
+class Refinement(enum.Enum):
+    """What is done about the unknowns of nonlinear blocks before they are used."""
+
+    NONE = "none"  # they are read from the state as they are
+    ONCE = "once"  # one Newton correction, for states that are nearly right
+    ROOT = "root"  # Newton's method until the equations hold to rounding
 
 
 class Evaluation:
@@ -34,8 +53,18 @@ class Evaluation:
         self.networks = networks
         self.residuals: list[Any] = []  # of carried steps, if nothing is refined
 
-    def run(self, program: Program, refine: int):
-        """Evaluates all steps; the tearing variables of carried steps get `refine` Newton corrections."""
+    def frozen(self) -> "Evaluation":
+        """The same without derivatives."""
+        parts = self.chunks, self.parameters, self.t, self.networks.weights
+        chunks, parameters, t, weights = jax.tree.map(
+            lambda leaf: jax.lax.stop_gradient(leaf) if isinstance(leaf, jax.Array) else leaf, parts
+        )
+        other = Evaluation((), (), parameters, t, Networks(weights))
+        other.chunks = chunks
+        return other
+
+    def run(self, program: Program, refine: Refinement):
+        """Evaluates all steps."""
         for planned in program.steps:
             if isinstance(planned, PlannedRepeat):
                 self.chunks.extend(self._repeat(planned))
@@ -87,7 +116,7 @@ class Evaluation:
             value = equation.template.solve(positions[0], *arguments)
             return _signed(planned.signs[positions[0]], value, self.dtype)
         rest = equation.template.residual(*arguments)
-        partials = equation.template.partial_values(*arguments)
+        partials = template.partial_values(*arguments)
         slope = sum(_signed(planned.signs[k], partials[k], self.dtype) for k in positions)
         return -rest / slope
 
@@ -101,34 +130,67 @@ class Evaluation:
         total = jnp.sum(values * jnp.asarray(weights.T, self.dtype), axis=0)
         return total[0] if n == 1 else total
 
-    def _step(self, planned: PlannedStep, refine: int) -> list[Any]:
+    def _step(self, planned: PlannedStep, refine: Refinement) -> list[Any]:
         step = planned.step
-        tearing = step.tearing
         shape = () if step.n == 1 else (step.n,)
-        blank: list[Any] = [None] * len(step.unknown)
-
-        def follow(z: list[Any]) -> list[Any]:
-            local = list(blank)
-            for u, value in zip(tearing.tearing, z, strict=True):
-                local[u] = value
-            for e, u in tearing.sequence:
-                local[u] = self._filled(self._solved(planned.equations[e], u, local), shape)
-            return local
-
-        def residuals(z: list[Any]) -> list[Any]:
-            local = follow(z)
-            return [self._filled(self._residual(planned.equations[e], local), shape) for e in tearing.residuals]
-
-        if not tearing.tearing:
-            return follow([])
+        if not step.tearing.tearing:
+            return self._follow(planned, [])
         if not step.carried:
             return self._linear_block(planned, shape)
         z = [self._filled(self.read(g), shape) for g in planned.guess]
-        if refine == 0:
-            self.residuals.extend(residuals(z))
-        for _ in range(refine):
-            z = newton(residuals, z)
-        return follow(z)
+        if refine is Refinement.NONE:
+            self.residuals.extend(self._residuals(planned, z))
+            return self._follow(planned, z)
+        if refine is Refinement.ONCE:
+            local = self._follow(planned, self._corrected(planned, z))
+            holds = self._holds(planned, local, ROUGH)
+        else:
+            still, tolerated = self.frozen(), rounding(self.dtype)
+            z, holds = find_root(
+                lambda z: still._holds(planned, still._follow(planned, z), tolerated),
+                functools.partial(still._corrected, planned),
+                functools.partial(self._corrected, planned),
+                z,
+            )
+            local = self._follow(planned, z)
+        return [jnp.where(holds, u, jnp.nan) for u in local]
+
+    def _corrected(self, planned: PlannedStep, z: list[Any]) -> list[Any]:
+        """The tearing variables after one Newton step."""
+        return newton(functools.partial(self._residuals, planned), z)
+
+    def _follow(self, planned: PlannedStep, z: list[Any]) -> list[Any]:
+        """All unknowns of a step, from its tearing variables."""
+        step = planned.step
+        shape = () if step.n == 1 else (step.n,)
+        local: list[Any] = [None] * len(step.unknown)
+        for u, value in zip(step.tearing.tearing, z, strict=True):
+            local[u] = value
+        for e, u in step.tearing.sequence:
+            local[u] = self._filled(self._solved(planned.equations[e], u, local), shape)
+        return local
+
+    def _residuals(self, planned: PlannedStep, z: list[Any]) -> list[Any]:
+        """Of the equations that the tearing variables must fulfil."""
+        local = self._follow(planned, z)
+        like = z[0]
+        equations = [planned.equations[e] for e in planned.step.tearing.residuals]
+        return [self._filled(self._residual(equation, local), like.shape) for equation in equations]
+
+    def _holds(self, planned: PlannedStep, local: list[Any], tolerated: float) -> Any:
+        """Whether these equations hold, for each of the step's blocks."""
+        holds: Any = True
+        for e in planned.step.tearing.residuals:
+            template = planned.equations[e].equation.template
+            slots, parameters, *rest = self._arguments(planned.equations[e], local)
+            arguments = (*jax.lax.stop_gradient((slots, parameters)), *rest)
+            slots, residual = arguments[0], jax.lax.stop_gradient(template.residual(*arguments))
+            if template.opaque is not None:  # y − N(u): the network is not differentiated for this
+                slots, partials = [slots[0], slots[0] - residual], (1.0, 1.0)
+            else:
+                partials = template.partial_values(*arguments)
+            holds = holds & is_small(residual, slots, partials, tolerated)
+        return holds
 
     def _repeat(self, planned: PlannedRepeat) -> list[Any]:
         """The unknowns of all repetitions, each of shape (count · n,)."""
@@ -142,7 +204,7 @@ class Evaluation:
             outside, parameters = given
             inner = Evaluation(carried, outside, parameters, self.t, Networks(self.networks.weights))
             for step in planned.body:
-                inner.chunks.extend(inner._step(step, refine=0))
+                inner.chunks.extend(inner._step(step, Refinement.NONE))
             if planned.following is not None:
                 carried = self._filled(inner.read(planned.following), carried.shape)
             return carried, tuple(inner.chunks[2:])
@@ -153,29 +215,54 @@ class Evaluation:
         _, chunks = jax.lax.scan(repetition, read(planned.first), given, unroll=UNROLLED_REPETITIONS)
         return [jnp.reshape(c, (-1,)) for c in chunks]
 
-    def _sparse_step(self, planned: PlannedSparse, refine: int) -> Any:
+    def _sparse_step(self, planned: PlannedSparse, refine: Refinement) -> Any:
         """The unknowns of large blocks, shape (n,)."""
-
-        def solved(u: Any) -> Any:
-            """One Newton step, exact if the equations are affine."""
-            residual, values = self._whole(planned, u, partials=True)
-            return u - solve_whole(planned.pattern, values, residual, checked=planned.guess is None)
-
         if planned.guess is None:
-            return solved(jnp.zeros(planned.step.n, self.dtype))
+            return self._whole_corrected(planned, jnp.zeros(planned.step.n, self.dtype))
         u = self.read(planned.guess)
-        if refine == 0:
-            self.residuals.append(self._whole(planned, u, partials=False)[0])
-        for _ in range(refine):
-            u = solved(u)
-        return u
+        if refine is Refinement.NONE:
+            there = self._beside(u)
+            self.residuals.extend(
+                self._filled(there._residual(equation, []), (len(equation.equation.equation),))
+                for equation in planned.equations
+            )
+            return u
+        if refine is Refinement.ONCE:
+            u = self._whole_corrected(planned, u)
+            holds = self._whole_holds(planned, u, ROUGH)
+        else:
+            still, tolerated = self.frozen(), rounding(self.dtype)
+            (u,), holds = find_root(
+                lambda z: still._whole_holds(planned, z[0], tolerated),
+                lambda z: [still._whole_corrected(planned, z[0])],
+                lambda z: [self._whole_corrected(planned, z[0])],
+                [u],
+            )
+        return jnp.where(holds, u, jnp.nan)
 
-    def _whole(self, planned: PlannedSparse, u: Any, partials: bool) -> tuple[Any, Any]:
-        """The residuals of a sparse step's equations at its unknowns u, and the values of their matrix."""
-        there = copy.copy(self)
-        there.chunks = [*self.chunks, u]
-        residuals, values = [], []
-        for equation, entries in zip(planned.equations, planned.entries, strict=True):
+    def _whole_corrected(self, planned: PlannedSparse, u: Any) -> Any:
+        """The unknowns of large blocks after one Newton step, which is exact if the equations are affine."""
+        equations = self._whole(planned, u)
+        residual = jnp.concatenate([r for r, _, _ in equations])
+        values = [
+            _signed(sign, take(self._filled(partials[k], r.shape), instances), self.dtype)
+            for (r, _, partials), entries in zip(equations, planned.entries, strict=True)
+            for k, instances, sign in entries
+        ]
+        checked = planned.guess is None
+        return u - solve_whole(planned.pattern, jnp.concatenate(values), residual, checked=checked)
+
+    def _whole_holds(self, planned: PlannedSparse, u: Any, tolerated: float) -> Any:
+        """Whether all equations of large blocks hold."""
+        return functools.reduce(
+            lambda holds, equation: holds & jnp.all(is_small(*equation, tolerated)), self._whole(planned, u), True
+        )
+
+    def _whole(self, planned: PlannedSparse, u: Any) -> list[tuple[Any, list[Any], Sequence[Any]]]:
+        """The residuals, slots and partial derivatives of a sparse step's equations at its unknowns u."""
+        there = self._beside(u)
+        out = []
+        for equation in planned.equations:
             template = equation.equation.template
             shape = (len(equation.equation.equation),)
             arguments: Any = there._arguments(equation, [])
@@ -184,17 +271,19 @@ class Evaluation:
             def residual(*slots, template=template, rest=rest, shape=shape):
                 return self._filled(template.residual(list(slots), *rest), shape)
 
-            residuals.append(residual(*slots))
-            if not partials:
-                continue
             if template.opaque is not None:
                 slots = [self._filled(s, shape) for s in slots]
-                slopes = [_slope(residual, slots, k) for k in range(len(slots))]
+                partials: Sequence[Any] = [_slope(residual, slots, k) for k in range(len(slots))]
             else:
-                slopes = template.partial_values(slots, *rest)
-            for k, instances, sign in entries:
-                values.append(_signed(sign, take(self._filled(slopes[k], shape), instances), self.dtype))
-        return jnp.concatenate(residuals), jnp.concatenate(values) if partials else None
+                partials = template.partial_values(slots, *rest)
+            out.append((residual(*slots), slots, partials))
+        return out
+
+    def _beside(self, u: Any) -> "Evaluation":
+        """The same with one more chunk."""
+        there = copy.copy(self)
+        there.chunks = [*self.chunks, u]
+        return there
 
     def _linear_block(self, planned: PlannedStep, shape: tuple[int, ...]) -> list[Any]:
         """The unknowns of linear blocks of one shape."""
@@ -242,7 +331,51 @@ def _slope(function, slots: list[Any], k: int) -> Any:
     return jax.jvp(lambda s: function(*slots[:k], s, *slots[k + 1 :]), (slots[k],), (jnp.ones_like(slots[k]),))[1]
 
 
-def newton(residuals, z: list[Any]) -> list[Any]:
+def rounding(dtype: Any) -> float:
+    """The residual relative to its terms that counts as rounding: what initialization allows, too."""
+    return float(jnp.finfo(dtype).eps) ** 0.6
+
+
+def is_small(residual: Any, slots: Sequence[Any], partials: Sequence[Any], tolerated: float) -> Any:
+    """Whether a residual is small beside its terms, |∂r/∂s|·|s| each."""
+    residual, slots, partials = jax.lax.stop_gradient((residual, slots, partials))
+    floor = ROUNDING * float(jnp.finfo(jnp.result_type(residual)).eps) / tolerated
+    terms = [abs(p) * (jnp.abs(s) + floor) for p, s in zip(partials, slots, strict=True)]
+    allowed = tolerated * functools.reduce(jnp.add, terms)
+    # Where a slope is infinite, as that of a root at zero, the equation holds exactly or not at all.
+    return jnp.abs(residual) <= jnp.where(allowed < jnp.inf, allowed, 0)
+
+
+def find_root(
+    holds: Callable[[list[Any]], Any],
+    corrected: Callable[[list[Any]], list[Any]],
+    differentiable: Callable[[list[Any]], list[Any]],
+    z: list[Any],
+) -> tuple[list[Any], Any]:
+    """Newton's method from z until all `holds`, one verdict for each of a batch of problems; and the verdicts.
+
+    The search is not differentiated. Two more steps of the `differentiable` correction follow: by the implicit function
+    theorem the first carries first derivatives and the second one second derivatives.
+    """
+
+    def going(carry):
+        _, found, count = carry
+        return ~jnp.all(found) & (count < NEWTON_STEPS)
+
+    def body(carry):
+        z, found, count = carry
+        z = [jnp.where(found, a, b) for a, b in zip(z, corrected(z), strict=True)]
+        return z, holds(z), count + 1
+
+    z = jax.lax.stop_gradient(z)
+    z, found, _ = jax.lax.while_loop(going, body, (z, holds(z), 0))
+    z = jax.lax.stop_gradient(z)
+    for _ in range(2):
+        z = differentiable(z)
+    return z, found
+
+
+def newton(residuals: Callable[[list[Any]], list[Any]], z: list[Any]) -> list[Any]:
     """One Newton step for r(z) = 0, lists of arrays of one shape (a batch of problems); exact if r is affine."""
     m = len(z)
     if m <= UNROLLED:

@@ -16,9 +16,10 @@ from ..errors import ModelError, nearest
 from ..linear.sparse import SparseMatrix, SparsePattern, sparse_jacobian
 from ..lowering.plan import SystemPlan
 from ..model.pickling import functions_by_name, named_functions
+from .evaluate import Refinement
 from .inputs import read_inputs
 from .parameters import Parameters
-from .system_at import READ_REFINEMENTS, SCALARS, SystemAt
+from .system_at import SCALARS, SystemAt
 
 
 class AcausalSystem(eqx.Module):
@@ -195,7 +196,7 @@ class AcausalSystem(eqx.Module):
             )
         point = self.at(t, args)
         if len(self.plan.carried):
-            x = jax.lax.stop_gradient(point.join(point.refined(point.split(x), READ_REFINEMENTS))) + (
+            x = jax.lax.stop_gradient(point.join(point.refined(point.split(x), Refinement.ROOT))) + (
                 x - jax.lax.stop_gradient(x)
             )
         return SparseMatrix(sparse_jacobian(point.vector_field, pattern)(x), pattern)

@@ -18,11 +18,9 @@ from ..lowering.gather import Gather, take
 from ..lowering.plan import ConstraintGroup, PlannedRow, SystemPlan
 from ..lowering.program import Program
 from ..model.evaluate_numpy import Networks
-from .evaluate import Evaluation, newton
+from .evaluate import Evaluation, Refinement, newton
 
 SCALARS = 32  # up to this many states, tracing is done on scalars
-FIELD_REFINEMENTS = 1
-READ_REFINEMENTS = 4
 
 
 def input_values(plan: SystemPlan, given: Any, t: Any, dtype) -> tuple:
@@ -70,7 +68,7 @@ class SystemAt:
             return jnp.stack(x) if len(x) else jnp.zeros((0,))
         return x
 
-    def run(self, program: Program, state: Any, refine: int, t: Any = None) -> Evaluation:
+    def run(self, program: Program, state: Any, refine: Refinement, t: Any = None) -> Evaluation:
         """Evaluates a program."""
         t = self.t if t is None else t
         inputs = input_values(self.plan, self.inputs, t, self.dtype)
@@ -83,7 +81,7 @@ class SystemAt:
         plan = self.plan
         state = self.split(x)
         if len(plan.carried):
-            state = self.refined(state, FIELD_REFINEMENTS)
+            state = self.refined(state, Refinement.ONCE)
         slopes, evaluation = self._slopes(state)
         if plan.carried_rates is not None:
             slopes = self._appended(slopes, evaluation, plan.carried_rates)
@@ -106,7 +104,7 @@ class SystemAt:
         """dx/dt of the differential states, and all that was computed on the way."""
         plan = self.plan
         n = len(plan.states)
-        evaluation = self.run(plan.derivative, state, refine=0)
+        evaluation = self.run(plan.derivative, state, Refinement.NONE)
         if isinstance(state, tuple):
             slopes: Any = [evaluation.read(_only(plan.next_derivative, k)) for k in range(n)]
             slopes = [jnp.asarray(s, self.dtype) for s in slopes]
@@ -157,7 +155,7 @@ class SystemAt:
 
     def _carried(self, t: Any, state: Any) -> list[Any]:
         """The residuals of nonlinear blocks at the tearing variables in the state."""
-        return self.run(self.plan.carried_residuals, state, refine=0, t=t).residuals
+        return self.run(self.plan.carried_residuals, state, Refinement.NONE, t=t).residuals
 
     def carried_vector(self, t: Any, state: Any) -> Any:
         return jnp.concatenate([jnp.reshape(r, (-1,)) for r in self._carried(t, state)])
@@ -198,10 +196,11 @@ class SystemAt:
         size = jnp.sqrt(_sum([g * g for g in gradient], zero))
         return jnp.reshape(gradient[-1] / jnp.where(size == 0, 1, size), ())
 
-    def refined(self, state: Any, count: int) -> Any:
-        """The state after Newton corrections of the tearing variables of nonlinear blocks, block by block."""
+    def refined(self, state: Any, refine: Refinement) -> Any:
+        """The state after Newton corrections of the tearing variables of nonlinear blocks, block by block;
+        not-a-number where these blocks' equations do not hold then."""
         plan = self.plan
-        evaluation = self.run(plan.carried_residuals, state, refine=count)
+        evaluation = self.run(plan.carried_residuals, state, refine)
         gather = plan.carried_residuals.layout.gather(plan.carried)
         return self._appended(state[: len(plan.states)], evaluation, gather)
 
@@ -218,7 +217,7 @@ class SystemAt:
 
     def constraints(self, state: Any) -> list[Any]:
         """The hidden constraints' residuals, one array for each template: scalars, or shape (instances,)."""
-        evaluation = self.run(self.plan.constraint_program, state, refine=0)
+        evaluation = self.run(self.plan.constraint_program, state, Refinement.NONE)
         return [self._constraint(evaluation, group) for group in self.plan.constraints]
 
     def _constraint(self, evaluation: Evaluation, planned: ConstraintGroup) -> Any:
@@ -247,7 +246,7 @@ class SystemAt:
         for _ in range(iterations if plan.n_constraints else 0):
             state = self._least_norm_step(state)
         if len(plan.carried):
-            state = self.refined(state, iterations)
+            state = self.refined(state, Refinement.ONCE if iterations == 1 else Refinement.ROOT)
         return self.join(state)
 
     def _least_norm_step(self, state: Any) -> Any:
@@ -297,7 +296,7 @@ class SystemAt:
 
     def quantities(self, x: Any, quantity: np.ndarray, sign: np.ndarray) -> Any:
         """The values of quantities with signs, shape (len(quantity),)."""
-        evaluation = self.run(self.plan.everything, self.split(x), refine=READ_REFINEMENTS)
+        evaluation = self.run(self.plan.everything, self.split(x), Refinement.ROOT)
         gather = self.plan.everything.layout.gather(quantity, sign)
         return jnp.broadcast_to(jnp.asarray(evaluation.read(gather), self.dtype), (len(quantity),))
 

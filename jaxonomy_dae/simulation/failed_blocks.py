@@ -1,0 +1,140 @@
+"""Which block of simultaneous equations ends a run, and why.
+
+Every quantity is computed at the last accepted point as a run computes it, and just beyond. The first step of the
+schedule with an unknown that is not finite, though all it reads is, has failed: because its matrix is singular, because
+the order in which it is eliminated divides by zero, or because Newton's method finds no root.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from ..initialization.singular_blocks import BlockFinding, examine_blocks
+from ..lowering.schedule import AnyStep, SparseStep
+from ..model.tables import ZERO
+from ..solvers.dae_term import FlatProblem
+from ..solvers.index_one import consistent_slope
+from ..system.system import AcausalSystem
+from ..system.system_at import input_values
+from .integration import term_of
+
+SHOWN = 4
+NEAR = 10.0 ** np.arange(-15, -5)  # parts of the interval
+Point = tuple[Any, Any]
+
+
+def failed_block(system: AcausalSystem, first: Point, last: Point, t1: Any, inputs: dict[str, Any]) -> str:
+    """A sentence on the block that fails at the last accepted point (t, x) or just beyond it, or nothing.
+
+    - `first`: the point where the run began: what was ill-conditioned there did not end it.
+    """
+    t, x = last
+    failed = _first_failed(system, t, x, inputs)
+    if failed is not None:
+        return _why(system, failed, t, x, inputs, "at the start" if float(t) == float(first[0]) else "there")
+    found = _findings(system, t, x, inputs)
+    if found:
+        known = {block.variables for block in _findings(system, *first, inputs)}
+        new = [block for block in found if block.variables not in known]
+        if new:
+            return _singular(new[0], "there")
+    return _just_beyond(system, t, x, t1, inputs) if len(system.plan.carried) else ""
+
+
+def _first_failed(system: AcausalSystem, t: Any, x: Any, inputs: dict[str, Any]) -> AnyStep | None:
+    """The first step of two and more equations, or a nonlinear one, that has no value."""
+    plan = system.plan
+    computed = np.flatnonzero(plan.everything.layout.chunk != -2)
+    values = np.full(plan.extended.quantities.n + 1, np.nan)
+    values[computed] = _quantities(system, t, jnp.asarray(x), inputs, tuple(computed.tolist()))
+    values[ZERO] = 0.0
+    for step in plan.steps:
+        if np.isfinite(values[np.concatenate(step.unknown)]).all():
+            continue
+        if not np.isfinite(values[step.needs()]).all():
+            return None
+        return step if len(step.unknown) > 1 or isinstance(step, SparseStep) or not step.linear else None
+    return None
+
+
+@eqx.filter_jit
+def _quantities(system: AcausalSystem, t: Any, x: Any, inputs: dict[str, Any], chosen: tuple[int, ...]) -> Any:
+    return system.at(t, inputs).quantities(x, np.array(chosen), np.ones(len(chosen), np.int64))
+
+
+def _findings(system: AcausalSystem, t: Any, x: Any, inputs: dict[str, Any]) -> list[BlockFinding]:
+    """The blocks that are singular, or nearly so."""
+    plan, parameters = system.plan, system.parameters.array
+
+    def values():
+        return np.array([float(v) for v in input_values(plan, inputs, t, parameters.dtype)])
+
+    networks = tuple(system.neural[n] for n in plan.network_names)
+    return list(examine_blocks(plan, np.asarray(parameters, float), networks, float(t), np.asarray(x), values))
+
+
+def _why(system: AcausalSystem, step: AnyStep, t: Any, x: Any, inputs: dict[str, Any], place: str) -> str:
+    plan = system.plan
+    names = [plan.quantity_name[q] for q in np.concatenate(step.unknown).tolist()]
+    for block in _findings(system, t, x, inputs):
+        if set(block.variables) & set(names):
+            return _singular(block, place)
+    if not step.linear:
+        return _no_root(system, step, x, f"has no solution {place}")
+    return (
+        f"The block of equations for {_some(names)} has no accurate solution {place}, though it is not singular: the "
+        "order in which it is eliminated was chosen for the parameter values that the model was compiled with, and "
+        f"fails at the present ones. Compile the model with these values.{_equations(system, step)}"
+    )
+
+
+def _singular(block: BlockFinding, place: str) -> str:
+    causes = ", ".join(f"'{name}' = {value:.6g}" for name, value in block.causes[:SHOWN])
+    nearly = "singular" if block.singular else f"nearly singular (condition number {block.condition:.1e})"
+    one = f"The equation for {_some(block.variables)} is" if block.size == 1 else (
+        f"The block of {block.size} equations that is to determine {_some(block.variables)} is"
+    )  # fmt: skip
+    texts = "".join(f"\n  {text}" for text in block.equations[:SHOWN])
+    return f"{one} {nearly} {place}{f', with {causes}' if causes else ''}:{texts}\n"
+
+
+def _no_root(system: AcausalSystem, step: AnyStep, x: Any, what: str) -> str:
+    plan = system.plan
+    place = {int(q): k for k, q in enumerate((*plan.states, *plan.carried))}
+    guessed = np.concatenate(step.guessed).tolist()
+    shown = [f"'{plan.quantity_name[q]}' = {float(x[place[q]]):.6g}" for q in guessed[:SHOWN]]
+    more = f" and {len(guessed) - SHOWN} more" if len(guessed) > SHOWN else ""
+    one = "equation" if len(step.equations) == 1 else "block of equations"
+    return (
+        f"The nonlinear {one} for {', '.join(shown)}{more} {what}: Newton's method does not converge from these values "
+        "(a turning point, at which two solutions meet and end; a jump to another branch; or a law without a "
+        f"solution).{_equations(system, step)}"
+    )
+
+
+def _just_beyond(system: AcausalSystem, t: Any, x: Any, t1: Any, inputs: dict[str, Any]) -> str:
+    """The nonlinear block that loses its root just beyond a point, from which its unknowns are solved for."""
+    plan = system.plan
+    problem = FlatProblem(term_of(system, implicit=True), x, inputs)
+    slope = np.asarray(consistent_slope(problem, None, jnp.asarray(t), jnp.asarray(x))).copy()
+    slope[len(plan.states) :] = 0
+    if not np.isfinite(slope).all():
+        return ""
+    for part in NEAR:
+        dt = part * float(t1 - t)
+        failed = _first_failed(system, t + dt, np.asarray(x) + dt * slope, inputs)
+        if failed is not None and not failed.linear:
+            return _no_root(system, failed, x, "has no solution just beyond")
+    return ""
+
+
+def _equations(system: AcausalSystem, step: AnyStep) -> str:
+    texts = dict.fromkeys(system.plan.describe(int(e)) for equation in step.equations for e in equation.equation)
+    return "".join(f"\n  {text}" for text in list(texts)[:SHOWN]) + ("\n  …" if len(texts) > SHOWN else "")
+
+
+def _some(names: Any) -> str:
+    names = [f"'{name}'" for name in names]
+    return ", ".join(names[:SHOWN]) + (f" and {len(names) - SHOWN} more" if len(names) > SHOWN else "")
