@@ -116,7 +116,7 @@ class Evaluation:
             value = equation.template.solve(positions[0], *arguments)
             return _signed(planned.signs[positions[0]], value, self.dtype)
         rest = equation.template.residual(*arguments)
-        partials = template.partial_values(*arguments)
+        partials = equation.template.partial_values(*arguments)
         slope = sum(_signed(planned.signs[k], partials[k], self.dtype) for k in positions)
         return -rest / slope
 
@@ -153,7 +153,8 @@ class Evaluation:
                 z,
             )
             local = self._follow(planned, z)
-        return [jnp.where(holds, u, jnp.nan) for u in local]
+        nan = jnp.full(shape, jnp.nan, self.dtype)
+        return [jax.lax.select(holds, u, nan) for u in local]
 
     def _corrected(self, planned: PlannedStep, z: list[Any]) -> list[Any]:
         """The tearing variables after one Newton step."""
@@ -179,18 +180,19 @@ class Evaluation:
 
     def _holds(self, planned: PlannedStep, local: list[Any], tolerated: float) -> Any:
         """Whether these equations hold, for each of the step's blocks."""
-        holds: Any = True
+        verdicts = []
         for e in planned.step.tearing.residuals:
             template = planned.equations[e].equation.template
             slots, parameters, *rest = self._arguments(planned.equations[e], local)
-            arguments = (*jax.lax.stop_gradient((slots, parameters)), *rest)
-            slots, residual = arguments[0], jax.lax.stop_gradient(template.residual(*arguments))
+            slots, parameters = jax.lax.stop_gradient((slots, parameters))
+            arguments = slots, parameters, *rest
+            residual = template.residual(*arguments)
             if template.opaque is not None:  # y − N(u): the network is not differentiated for this
                 slots, partials = [slots[0], slots[0] - residual], (1.0, 1.0)
             else:
                 partials = template.partial_values(*arguments)
-            holds = holds & is_small(residual, slots, partials, tolerated)
-        return holds
+            verdicts.append(is_small(residual, slots, partials, tolerated))
+        return functools.reduce(jnp.logical_and, verdicts)
 
     def _repeat(self, planned: PlannedRepeat) -> list[Any]:
         """The unknowns of all repetitions, each of shape (count · n,)."""
@@ -338,12 +340,11 @@ def rounding(dtype: Any) -> float:
 
 def is_small(residual: Any, slots: Sequence[Any], partials: Sequence[Any], tolerated: float) -> Any:
     """Whether a residual is small beside its terms, |∂r/∂s|·|s| each."""
-    residual, slots, partials = jax.lax.stop_gradient((residual, slots, partials))
     floor = ROUNDING * float(jnp.finfo(jnp.result_type(residual)).eps) / tolerated
     terms = [abs(p) * (jnp.abs(s) + floor) for p, s in zip(partials, slots, strict=True)]
     allowed = tolerated * functools.reduce(jnp.add, terms)
     # Where a slope is infinite, as that of a root at zero, the equation holds exactly or not at all.
-    return jnp.abs(residual) <= jnp.where(allowed < jnp.inf, allowed, 0)
+    return (jnp.abs(residual) <= allowed) & ((allowed < jnp.inf) | (residual == 0))
 
 
 def find_root(
