@@ -5,6 +5,9 @@ differentiated, below their last derivative. They fall into independent parts (c
 Jacobian with respect to the candidates is constant, or where the user forces it, dummy derivatives (Mattsson &
 Söderlind 1993) leave a minimal set of states, chosen by numerical pivots. In every other part all candidates are
 states and the hidden constraints are kept for projection: no choice of fewer states would be regular everywhere.
+
+What equations determine one variable after the other without any state (a pin at a constant place, a prescribed
+motion) is set apart first: it is known and not a state.
 """
 
 import dataclasses
@@ -32,6 +35,7 @@ class StateSelection:
     constraints: np.ndarray  # extended equations
     dummies: np.ndarray  # candidate quantities that are not states
     projected: np.ndarray  # equations as written whose hidden constraints are projected onto
+    settled: np.ndarray  # quantities that no state influences
     notes: tuple[str, ...]
 
 
@@ -45,6 +49,9 @@ class _Entries:
     group: np.ndarray
     instance: np.ndarray
     slot: np.ndarray
+
+    def take(self, which: np.ndarray) -> "_Entries":
+        return _Entries(*(getattr(self, field.name)[which] for field in dataclasses.fields(self)))
 
 
 def _entries(groups: tuple[EquationGroup, ...], extended: Extended) -> _Entries:
@@ -70,6 +77,45 @@ def _entries(groups: tuple[EquationGroup, ...], extended: Extended) -> _Entries:
             collected.append(value)
     joined = [np.concatenate(v) if v else np.zeros(0, np.int64) for v in out]
     return _Entries(joined[0], joined[1], joined[2].astype(bool), *joined[3:])
+
+
+def _settled(groups: tuple[EquationGroup, ...], extended: Extended, c: np.ndarray) -> tuple[list[int], list[int]]:
+    """Equations that each determine one variable, not differentiated there, from parameters, time, inputs and
+    variables so determined before; and the columns of those variables."""
+    quantities = extended.quantities
+    first = equation_offsets(groups)
+    rows_of: dict[int, list[int]] = {}  # by column
+    unknowns: dict[int, dict[int, int | None]] = {}  # of each equation: the slot of each column, None if v' or v twice
+    for g, group in enumerate(groups):
+        chosen = np.flatnonzero(c[first[g] : first[g + 1]] > 0)
+        for i in chosen.tolist():
+            row = int(first[g]) + i
+            slots: dict[int, int | None] = {}
+            for slot, (v, order) in enumerate(zip(group.variable[i].tolist(), group.order[i].tolist(), strict=True)):
+                column = int(quantities.column[v]) if v != ZERO else -1
+                if 0 <= column < quantities.n_unknown_columns:
+                    slots[column] = None if order or column in slots else slot
+            unknowns[row] = slots
+            for column in slots:
+                rows_of.setdefault(column, []).append(row)
+    found_rows: list[int] = []
+    found_columns: list[int] = []
+    ready = [row for row, slots in unknowns.items() if len(slots) == 1]
+    while ready:
+        row = ready.pop()
+        if len(unknowns[row]) != 1:
+            continue
+        ((column, slot),) = unknowns[row].items()
+        template = groups[int(np.searchsorted(first, row, side="right") - 1)].template
+        if slot is None or c[row] != quantities.highest[column] or not template.coefficient_is_constant(slot):
+            continue
+        found_rows.append(row)
+        found_columns.append(column)
+        for other in rows_of[column]:
+            del unknowns[other][column]
+            if len(unknowns[other]) == 1:
+                ready.append(other)
+    return found_rows, found_columns
 
 
 def select_states(
@@ -101,11 +147,24 @@ def select_states(
     order, owner = quantities.order[:unknown], quantities.owner[:unknown]
     candidate = order < quantities.highest[owner]
     c = np.bincount(extended.base) - 1
-    constrained = np.flatnonzero(c > 0)
     entries = _entries(groups, extended)
     notes: list[str] = []
     is_dummy = np.zeros(unknown, bool)
     projected = np.zeros(len(c), bool)
+    settled = np.zeros(unknown, bool)
+    alone = np.zeros(len(c), bool)
+    if mode != "projection":
+        rows, columns = _settled(groups, extended, c)
+        alone[rows] = True
+        settled = np.isin(owner, columns)
+        is_dummy = settled & candidate
+        entries = entries.take(~alone[entries.row] & ~np.isin(entries.column, columns))
+        notes += [
+            f"{name(int(q))} was preferred as a state, but equations without states determine it"
+            for q in np.flatnonzero(is_dummy)
+            if merit(int(q))[0] > 0
+        ]
+    constrained = np.flatnonzero((c > 0) & ~alone)
 
     if len(constrained):
         shape = (len(c), quantities.n_unknown_columns)
@@ -134,7 +193,14 @@ def select_states(
     states = np.flatnonzero(candidate & ~is_dummy)
     below_last = extended.level < c[extended.base]
     constraints = np.flatnonzero(below_last & projected[extended.base])
-    return StateSelection(states, constraints, np.flatnonzero(is_dummy), np.flatnonzero(projected), tuple(notes))
+    return StateSelection(
+        states,
+        constraints,
+        np.flatnonzero(is_dummy & ~settled),
+        np.flatnonzero(projected),
+        np.flatnonzero(settled),
+        tuple(notes),
+    )
 
 
 def _parts(entries: _Entries, constrained: np.ndarray, shape: tuple[int, int]):

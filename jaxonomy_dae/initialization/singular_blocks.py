@@ -64,6 +64,9 @@ def _plan_check(plan: SystemPlan) -> _Check:
             for slot in _slots_of_partials(equation):
                 source = equation.slots[slot]
                 wanted[source.quantity[source.quantity != ZERO]] = True
+    settled = plan.selection.settled
+    for planned in plan.constraints:
+        wanted[settled[np.isin(settled, planned.group.quantity)]] = True
     for k in reversed(range(len(plan.steps))):
         step = plan.steps[k]
         if any(wanted[q].any() for q in step.unknown):

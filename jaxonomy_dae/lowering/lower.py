@@ -142,6 +142,7 @@ def _constraints(extended: Extended, selection: StateSelection, states: np.ndarr
     wanted = np.zeros(extended.n_equations, bool)
     wanted[selection.constraints] = True
     position = {int(q): k for k, q in enumerate(states)}
+    settled = set(selection.settled.tolist())
     groups, slots = [], []
     pattern: list[frozenset[int]] | None = []
     for group in extended.groups:
@@ -161,7 +162,7 @@ def _constraints(extended: Extended, selection: StateSelection, states: np.ndarr
         groups.append(taken)
         slots.append(taken.quantity.ravel())
         for row in taken.quantity.tolist():
-            used = [q for q in row if q != ZERO and q < extended.quantities.n_unknown]
+            used = [q for q in row if q != ZERO and q < extended.quantities.n_unknown and q not in settled]
             if pattern is not None and all(q in position for q in used):
                 pattern.append(frozenset(position[q] for q in used))
             else:
