@@ -12,7 +12,7 @@ from problems import compiled
 
 from jaxonomy_dae import Component, EqnEnv, der
 from jaxonomy_dae.lowering import merge
-from jaxonomy_dae.lowering.program import PlannedRepeat, PlannedSparse
+from jaxonomy_dae.lowering.program import PlannedLoop, PlannedSparse
 
 TIGHT = dict(rtol=1e-12, atol=1e-13)
 
@@ -71,7 +71,7 @@ def test_cascade(law):
     """Values, and derivatives in both modes."""
     n, t = 16, 0.3
     system = cascade(n, law)
-    assert PlannedRepeat in kinds(system) and len(kinds(system)) < 6
+    assert PlannedLoop in kinds(system) and len(kinds(system)) < 6
     x = jnp.asarray(np.random.default_rng(0).normal(size=n))
     a = np.array([gain(k) for k in range(n)])
     reference = cascade_slopes(t, by_name(system, x, n), a, law)
@@ -152,7 +152,7 @@ def far_back(k, y, x, p):
 def test_recursions(rule):
     n = 44
     system = compiled(Recursion(EqnEnv(), "c", n, rule))
-    assert PlannedRepeat in kinds(system) and len(kinds(system)) < 24
+    assert PlannedLoop in kinds(system) and len(kinds(system)) < 24
 
     def reference(x, p):
         y: list = []

@@ -194,7 +194,7 @@ class Blocks(Component):
         (
             16,
             "BDF",
-            "nonlinear blocks leave the algebraic unknowns b.z0, b.z1, b.z2 and 13 more, and 32 unknowns are many",
+            "nonlinear blocks leave the algebraic unknowns b.z0, b.z1, b.z2 and 13 more; cheaper for 32 unknowns",
         ),
     ],
 )

@@ -149,7 +149,7 @@ class Empty(Component):
              lambda: component(lambda s, ev: s.parameter("k", 2j))),
         case(r"parameter 'm\.M' must lie in \(0, inf\); got -1", lambda: Mass(EV, "m", -1.0)),
         case(r"parameter 's\.K' must lie in \[0, inf\); got -2", lambda: Spring(EV, "s", -2.0)),
-        case(r"parameter 'c\.k': the bounds \[2, 1\] hold no number",
+        case(r"parameter 'c\.k': the bounds \[2, 1\] contain no number",
              lambda: component(lambda s, ev: s.parameter("k", 1.5, bounds=(2.0, 1.0)))),
         case(r"start value of 'c\.x' must be a real number; got the string '1'",
              lambda: component(lambda s, ev: s.variable("x", start="1"))),
@@ -483,7 +483,7 @@ def test_inputs():
         simulate(system, 1.0, inputs={"c.v": 1.0})
     with pytest.raises(
         ModelError,
-        match=r"input 'c\.u' is a number, samples or a function.*\(3,\).*\(times, values\)",
+        match=r"input 'c\.u' must be a number, samples or a function.*\(3,\).*\(times, values\)",
     ):
         simulate(system, 1.0, inputs={"c.u": jnp.ones(3)})
     for call in (system.initialize, lambda: system.vector_field(0.0, jnp.ones(1))):

@@ -295,7 +295,7 @@ CASES = {
             "x y z", lambda c: Eq(c.x + c.y + c.z, sin(c.x)), lambda c: Eq(c.x + 2 * c.y + c.z, 0),
             lambda c: Eq(2 * c.x + 4 * c.y + 2 * c.z, 0),
         ),
-        "these equations depend on each other, or contradict. Remove or change one of:\n"
+        "these equations depend on each other, or contradict each other. Remove or change one of:\n"
         "  c: 0 = x + 2*y + z\n"
         "  c: 0 = 2*x + 4*y + 2*z",
     ),
@@ -445,11 +445,12 @@ def test_parts_of_a_hundred_thousand_equations():
          ["'a.x' and 'b.x' are one quantity, and both starts are fixed: they must agree; one of them is enough"]),
         (lambda: model({"a": "Mass", "b": "Mass", "r": "Rod"}, "a.flange r.flange_a", "b.flange r.flange_b",
                        a={"initial_velocity": 1.0}, b={"initial_velocity": 1.0}),
-         ["2 starts are fixed for 1 degree of freedom, those of 'a.v' and 'b.v': they must agree, or free 1 of them"]),
+         ["2 starts are fixed for 1 degree of freedom, those of 'a.v' and 'b.v': they must agree; if not, free 1 of "
+          "them"]),
         (lambda: law("x y", lambda c: Eq(c.x, -c.y), lambda c: Eq(der(c.x), -c.x), x=1.0, y=-1.0),
          ["'c.x' and 'c.y' are one quantity, and both starts are fixed: they agree, so one of them is enough"]),
         (lambda: law("x y", lambda c: Eq(c.x**2, 4), lambda c: Eq(der(c.y), c.x), x=2.0),
-         ["the start of 'c.x' is fixed, but follows from the equations: they must agree, or free it"]),
+         ["the start of 'c.x' is fixed, but the equations determine it: both must agree; if not, free the start"]),
         (lambda: compiled(PlanarPendulum(EqnEnv(), "p")),
          []),  # the pendulum made its own starts agree
     ],

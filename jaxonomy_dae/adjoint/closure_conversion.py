@@ -28,7 +28,7 @@ class Program(eqx.Module):
     points: int = eqx.field(static=True)  # how many such points are kept
 
 
-class Shut(eqx.Module):
+class ClosureConverted(eqx.Module):
     """A function that closes over nothing; called with what it closed over, `(consts, *args)`.
 
     As `equinox.filter_closure_convert`, but arguments may lie on other devices than those it was made with: inside
@@ -56,7 +56,7 @@ class Shut(eqx.Module):
         return eqx.combine(jax.tree.unflatten(self.outputs[0], leaves), jax.tree.unflatten(structure, others))
 
 
-def hoist(function: Any, *args: Any) -> tuple[Shut, list[Any]]:
+def closure_convert(function: Any, *args: Any) -> tuple[ClosureConverted, list[Any]]:
     """(the function without the arrays it closes over, those arrays). Shapes and dtypes will do for arguments."""
     dynamic, static = eqx.partition(args, lambda leaf: eqx.is_array(leaf) or isinstance(leaf, jax.ShapeDtypeStruct))
     leaves, structure = jax.tree.flatten(dynamic)
@@ -72,8 +72,8 @@ def hoist(function: Any, *args: Any) -> tuple[Shut, list[Any]]:
     closed = jax.make_jaxpr(flat)(*leaves)
     out_structure, (others, others_structure) = found
     shapes = tuple(jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in closed.out_avals)
-    shut = Shut(closed.jaxpr, structure, (out_structure, shapes), (tuple(others), others_structure))
-    return shut, list(closed.consts)
+    converted = ClosureConverted(closed.jaxpr, structure, (out_structure, shapes), (tuple(others), others_structure))
+    return converted, list(closed.consts)
 
 
 @jax.custom_jvp

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from .closure_conversion import Program, any_member, apart, going, read, rows, unless_waiting, written
-from .packing import Parcels
+from .packing import Packing
 from .private_names import unvmap_max
 from .reverse_step import ReverseStep
 from .step_times import StepTimes
@@ -44,7 +44,7 @@ class _Recorder:
         self.numbers, self.program, self.times = numbers, program, times
         state = numbers["state"]
         carry = self._taken_apart(state, jnp.full_like(state.tprev, -jnp.inf), times.start())
-        self.row, self.rest = (Parcels(part) for part in carry)
+        self.row, self.rest = (Packing(part) for part in carry)
         self.start = self.pack(carry)
 
     def _taken_apart(self, state, last, moves):
@@ -132,7 +132,7 @@ def _(residuals, cotangents, perturbed, numbers, program):
     chunks, stride, filled = (unvmap_max(v) for v in (chunks, stride, filled))
     blank = jax.tree.map(jnp.zeros_like, numbers["buffers"])  # saved nowhere: dead code
     start = reverse.start(state, moves)
-    parcels = Parcels(start)
+    packing = Packing(start)
 
     def again(q, record, _):
         point = q // stride
@@ -142,7 +142,7 @@ def _(residuals, cotangents, perturbed, numbers, program):
 
     def backwards(packed, row):
         row, accepted = row
-        return parcels.pack(reverse.step(parcels.unpack(packed), recorder.row.unpack(row), accepted))
+        return packing.pack(reverse.step(packing.unpack(packed), recorder.row.unpack(row), accepted))
 
     def advance(loop):
         q, record, filled, packed = loop
@@ -155,6 +155,6 @@ def _(residuals, cotangents, perturbed, numbers, program):
         record, filled = lax.cond(q > 0, again, lambda _, *same: same, q - 1, record, filled)
         return q - 1, record, filled, packed
 
-    loop = (chunks - 1, record, filled, parcels.pack(start))
+    loop = (chunks - 1, record, filled, packing.pack(start))
     *_, packed = lax.while_loop(lambda loop: loop[0] >= 0, advance, loop)
-    return reverse.finish(parcels.unpack(packed))
+    return reverse.finish(packing.unpack(packed))

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from .closure_conversion import Program, hoist, unless_waiting
+from .closure_conversion import Program, closure_convert, unless_waiting
 from .private_names import is_sde, while_loop
 from .recorded_loop import solve
 from .reverse_step import state_saves
@@ -24,11 +24,11 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
     Gradients are those of `diffrax.RecursiveCheckpointAdjoint`, to rounding, at a small multiple of the cost of the
     solve. What a step started from is recorded during the solve, in a table of a few dozen rows. Where a solve takes
     more steps than rows, it is run once more in pieces, from points kept on the way (checkpointing with two levels,
-    Griewank & Walther 2008, Evaluating Derivatives, chapter 12). Memory does not grow with `max_steps` to speak of, and
+    Griewank & Walther 2008, Evaluating Derivatives, chapter 12). Memory hardly grows with `max_steps`, and
     without differentiation nothing is recorded.
 
-    Rejected steps take no part, so what is not finite in them does no harm. Step sizes count as constant, but for what
-    they take from the times given: derivatives with respect to `t0`, `t1`, `dt0`, `SaveAt(ts=...)` and the times of
+    Rejected steps take no part, so what is not finite in them does no harm. Step sizes count as constant, except where
+    they follow from the times given: derivatives with respect to `t0`, `t1`, `dt0`, `SaveAt(ts=...)` and the times of
     `diffrax.ClipStepSizeController` and `diffrax.StepTo` are complete.
 
     Solves with events, dense output or Brownian motion, and those whose state is so large that a record would take more
@@ -90,9 +90,9 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
 
             start = _without_buffers(start)
             flag = jnp.array(True)
-            shut, consts = hoist(body, start, buffers, flag, flag)
+            converted, consts = closure_convert(body, start, buffers, flag, flag)
             program = Program(
-                **functions, body=shut, max_steps=max_steps, chunk=chunk, points=points,
+                **functions, body=converted, max_steps=max_steps, chunk=chunk, points=points,
             )  # fmt: skip
             final, buffers = solve(numbers | dict(state=start, buffers=buffers, body=consts), program)
             return _with_buffers(final, buffers)
@@ -144,16 +144,16 @@ def _functions(
         both = eqx.combine(controller, others)
         return both.adapt_step_size(tprev, tnext, y, y1, args, y_error, order, state)
 
-    def hoist_both(made_jump):
-        step = hoist(take_step, s.tprev, s.tnext, s.y, s.solver_state, made_jump)
+    def convert_both(made_jump):
+        step = closure_convert(take_step, s.tprev, s.tnext, s.y, s.solver_state, made_jump)
         y1, y_error, *_ = step[0].out_struct
-        return step, hoist(adapt, controller, s.tprev, s.tnext, s.y, y1, y_error, s.controller_state)
+        return step, closure_convert(adapt, controller, s.tprev, s.tnext, s.y, y1, y_error, s.controller_state)
 
     made_jump = s.made_jump
-    step, adapted = hoist_both(made_jump)
+    step, adapted = convert_both(made_jump)
     if made_jump is False and adapted[0].out_struct[3] is not False:
         made_jump = jnp.array(False)
-        step, adapted = hoist_both(made_jump)
+        step, adapted = convert_both(made_jump)
     y1, _, dense, *_ = step[0].out_struct
     parts = jax.tree.leaves(saveat.subs, is_leaf=lambda node: isinstance(node, diffrax.SubSaveAt))
     none = None, []
@@ -162,10 +162,10 @@ def _functions(
         def saved(t, tprev, tnext, dense):
             return part.fn(t, solver.interpolation_cls(t0=tprev, t1=tnext, **dense).evaluate(t), args)
 
-        return none if part.ts is None else hoist(saved, s.tprev, s.tprev, s.tnext, dense)
+        return none if part.ts is None else closure_convert(saved, s.tprev, s.tprev, s.tnext, dense)
 
     def save_step(part):
-        return hoist(lambda t, y: part.fn(t, y, args), s.tprev, y1) if part.steps else none
+        return closure_convert(lambda t, y: part.fn(t, y, args), s.tprev, y1) if part.steps else none
 
     at_ts, at_steps = [save_ts(part) for part in parts], [save_step(part) for part in parts]
     functions = dict(
@@ -184,25 +184,25 @@ class _Solver:
     """What Diffrax's loop asks of a solver."""
 
     def __init__(self, step, consts, solver, terms):
-        self.hoisted, self.consts, self.interpolation_cls = step, consts, solver.interpolation_cls
+        self.function, self.consts, self.interpolation_cls = step, consts, solver.interpolation_cls
         self.order = solver.error_order(terms)
 
     def error_order(self, terms):
         return self.order
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        return self.hoisted(self.consts, t0, t1, y0, solver_state, made_jump)
+        return self.function(self.consts, t0, t1, y0, solver_state, made_jump)
 
 
 class _Controller:
     """What Diffrax's loop asks of a controller, but no step is accepted where a member of a batch waits."""
 
     def __init__(self, adapt, consts, controller):
-        self.hoisted, self.consts, self.controller = adapt, consts, controller
+        self.function, self.consts, self.controller = adapt, consts, controller
 
     def adapt_step_size(self, t0, t1, y0, y1, args, y_error, order, state):
         state, active = state
-        keep, *rest, state, result = self.hoisted(self.consts, self.controller, t0, t1, y0, y1, y_error, state)
+        keep, *rest, state, result = self.function(self.consts, self.controller, t0, t1, y0, y1, y_error, state)
         return unless_waiting(active, jnp.asarray(keep), jnp.array(False)), *rest, (state, active), result
 
 

@@ -43,7 +43,7 @@ def add_components(model: ModelNumbers, builder: GroupBuilder):
                 if not isinstance(s, VariableSymbol | ParameterSymbol | TimeSymbol):
                     raise ModelError(
                         f"component '{model.paths[members[0]]}': the symbol '{s}' was declared by no component; "
-                        "declare it with self.variable(...) or self.parameter(...) and use the symbol that returns"
+                        "declare it with self.variable(...) or self.parameter(...) and use the symbol they return"
                     )
             variables = sorted((s for s in symbols if isinstance(s, VariableSymbol)), key=rank)
             parameters = sorted((s for s in symbols if isinstance(s, ParameterSymbol)), key=rank)

@@ -71,7 +71,7 @@ def reduce_with_cancellation(
 
 def _dependent(equations: list[Provenance]) -> str:
     """The message for equations that depend on each other, or contradict."""
-    lines = ["these equations depend on each other, or contradict. Remove or change one of:"]
+    lines = ["these equations depend on each other, or contradict each other. Remove or change one of:"]
     return "\n".join(lines + itemised(equations))
 
 
@@ -264,8 +264,8 @@ def _without(groups: tuple[EquationGroup, ...], equations: Sequence[int]) -> tup
 
 def _hidden(equations: list[Provenance]) -> str:
     lines = [
-        "these equations depend on each other in their highest derivatives, wherever the model is. Remove or change "
-        "one, or state the constraint that they hide as an equation of its own:"
+        "these equations depend on each other in their highest derivatives, at every point. Remove or change one, "
+        "or state the constraint that they hide as an equation of its own:"
     ]
     return "\n".join(lines + itemised(equations))
 

@@ -261,8 +261,8 @@ def _dummy_derivatives(dense, c, columns, quantities, merit, scale, name, equati
         for k in picked:
             if k not in wanted and merit(int(below[k]))[0] > 0:
                 notes.append(
-                    f"{name(int(below[k]))} was preferred as a state, but without it the constraints would be "
-                    "near-singular at the initial point"
+                    f"{name(int(below[k]))} was preferred as a state, but the constraints have to determine it: any "
+                    "other choice is nearly singular at the initial point"
                 )
         chosen.extend(int(below[k]) for k in picked)
         available = available[picked]

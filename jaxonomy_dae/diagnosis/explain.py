@@ -147,7 +147,8 @@ class Explainer:
             return ""
         at_ports = [int(flat.variables.port[v]) for v in variables if flat.variables.port[v] >= 0]
         word = words(flat.ports.domains[at_ports[0]] if at_ports else "")
+        fix = "fixes" if len(names) == 1 else "fix"
         return (
-            f"{listed(names)} fix every {word.through} between two parts of the model: one too many. Remove one of "
+            f"{listed(names)} {fix} every {word.through} between two parts of the model: one too many. Remove one of "
             f"them, or connect {word.bridge} in parallel with one of them."
         )

@@ -139,12 +139,13 @@ def dependent_starts(flat: FlatModel, variables: QuantityMap, extended: Extended
             continue  # one component's own affair: its author fixed what its author made agree
         if len(names) == 1:
             notes.append(
-                f"the start of '{names[0]}' is fixed, but follows from the equations: they must agree, or free it"
+                f"the start of '{names[0]}' is fixed, but the equations determine it: both must agree; if not, free "
+                "the start"
             )
         elif names:
             free = counted(max(len(names) - surplus, 0), "degree") + " of freedom"
             notes.append(
-                f"{len(names)} starts are fixed for {free}, those of {listed(names)}: they must agree, or free "
+                f"{len(names)} starts are fixed for {free}, those of {listed(names)}: they must agree; if not, free "
                 f"{surplus} of them"
             )
     return tuple(notes)

@@ -285,7 +285,7 @@ class InitializationReport(Sections):
         elif self.method == METHODS[0]:
             head.append("the starts fulfil all equations; nothing had to be solved")
         elif self.method == METHODS[FAILED]:
-            head.append(f"no method succeeded, {self.evaluations} evaluations")
+            head.append(f"no method succeeded ({self.evaluations} evaluations)")
         elif self.method == METHODS[NEAREST]:
             head.append(f"the nearest point to guesses that cannot all hold, {self.evaluations} evaluations")
         else:

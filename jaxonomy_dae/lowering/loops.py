@@ -20,7 +20,7 @@ TRIAL = 32  # repetitions looked at before a whole run is
 
 
 @dataclasses.dataclass(frozen=True)
-class Repeat:
+class Loop:
     """A run of `count` repetitions of the steps in `body` (as they are in the first).
 
     A read is a place in the concatenation of all outside slots of the body, by step, equation, slot and instance.
@@ -35,7 +35,7 @@ class Repeat:
     unknown: tuple[tuple[np.ndarray, ...], ...]  # of every step of the body, its unknowns, each (count, n)
 
 
-def find_repeats(steps: Sequence[AnyStep], n_quantities: int) -> list[AnyStep | Repeat]:
+def find_loops(steps: Sequence[AnyStep], n_quantities: int) -> list[AnyStep | Loop]:
     """The steps, with runs of repetitions in place of their steps."""
     n = len(steps)
     if n < 2 * LEAST:
@@ -49,16 +49,16 @@ def find_repeats(steps: Sequence[AnyStep], n_quantities: int) -> list[AnyStep | 
         for u, quantities in enumerate(step.unknown):
             source[quantities] = np.stack(np.broadcast_arrays(k, u, np.arange(len(quantities))), axis=1)
     runs = [_run_lengths(shape[:-p] == shape[p:]) for p in range(1, min(LONGEST, n // LEAST) + 1)]
-    out: list[AnyStep | Repeat] = []
+    out: list[AnyStep | Loop] = []
     k = 0
     while k < n:
         found = None
         for period, run in enumerate(runs, start=1):
             count = 1 + int(run[k]) // period if k < len(run) else 1
             if count >= LEAST:
-                found = _repeat(steps, k, period, min(count, TRIAL), source)
+                found = _loop(steps, k, period, min(count, TRIAL), source)
                 if found is not None and count > TRIAL:
-                    found = _repeat(steps, k, period, count, source)
+                    found = _loop(steps, k, period, count, source)
                 if found is not None:
                     break
         out.append(steps[k] if found is None else found)
@@ -97,7 +97,7 @@ def _reads(step: Step) -> np.ndarray:
     return np.concatenate(outside) if outside else np.zeros(0, np.int64)
 
 
-def _repeat(steps: Sequence[AnyStep], start: int, period: int, count: int, source: np.ndarray) -> Repeat | None:
+def _loop(steps: Sequence[AnyStep], start: int, period: int, count: int, source: np.ndarray) -> Loop | None:
     """The longest run that begins at `start`, of at most `count` repetitions; None if there are too few."""
     own = steps[start : start + period * count]
     chosen: list[Step] = [s for s in own if isinstance(s, Step)]
@@ -117,7 +117,7 @@ def _repeat(steps: Sequence[AnyStep], start: int, period: int, count: int, sourc
     chosen = chosen[: count * period]
     inside = follows[count - 1]
     place = np.stack([(where[0, :, 0] - start) % period, where[0, :, 1], where[0, :, 2]], axis=1)
-    return Repeat(
+    return Loop(
         tuple(chosen[:period]),
         count,
         reads[:count],

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..linear import sparse
-from .loops import Repeat
+from .loops import Loop
 from .schedule import AnyStep, SlotSource, SparseStep, Step, StepEquation
 
 MANY = 150  # thin steps in a row that are worth merging: written out they cost XLA seconds
@@ -19,10 +19,10 @@ LEAST = 50  # steps in one merged system
 THIN = 64  # blocks in a step
 
 
-def merge_thin(steps: Sequence[AnyStep | Repeat], n_quantities: int, without_package: int) -> list[AnyStep | Repeat]:
+def merge_thin(steps: Sequence[AnyStep | Loop], n_quantities: int, without_package: int) -> list[AnyStep | Loop]:
     """The steps, long runs of thin ones merged; systems of more than `without_package` unknowns only where a sparse
     solver is installed."""
-    out: list[AnyStep | Repeat] = []
+    out: list[AnyStep | Loop] = []
     run: list[Step] = []
     for step in [*steps, None]:
         if isinstance(step, Step) and not step.carried and step.n <= THIN:

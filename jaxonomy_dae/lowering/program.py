@@ -13,7 +13,7 @@ import numpy as np
 from ..linear.sparse import DENSE, SparsePattern
 from ..model.tables import ZERO
 from .gather import Gather
-from .loops import Repeat, find_repeats
+from .loops import Loop, find_loops
 from .merge import merge_thin
 from .schedule import AnyStep, SparseStep, Step, StepEquation
 
@@ -66,7 +66,7 @@ class PlannedSparse:
 
 
 @dataclasses.dataclass(frozen=True)
-class PlannedRepeat:
+class PlannedLoop:
     """A loop over the repetitions of a few steps.
 
     Within it, chunk 0 are the values carried over from the repetitions before, chunk 1 what each repetition reads from
@@ -85,7 +85,7 @@ class PlannedRepeat:
 class Program:
     """Planned steps and the layout of all they compute."""
 
-    steps: tuple[PlannedStep | PlannedSparse | PlannedRepeat, ...]
+    steps: tuple[PlannedStep | PlannedSparse | PlannedLoop, ...]
     layout: Layout
 
 
@@ -101,10 +101,10 @@ def plan(
     place[carried] = len(states) + np.arange(len(carried))
     next_chunk = 2
     planned = []
-    for step in merge_thin(find_repeats(steps, n_quantities), n_quantities, DENSE):
+    for step in merge_thin(find_loops(steps, n_quantities), n_quantities, DENSE):
         layout = Layout(chunk, offset)
-        if isinstance(step, Repeat):
-            planned.append(_plan_repeat(step, layout))
+        if isinstance(step, Loop):
+            planned.append(_plan_loop(step, layout))
             unknown = [quantities.ravel() for each in step.unknown for quantities in each]
         elif isinstance(step, SparseStep):
             unknown = step.unknown
@@ -126,36 +126,36 @@ def _plan_equation(equation: StepEquation, layout: Layout) -> PlannedEquation:
     return PlannedEquation(equation, tuple(sources), tuple(_uniform(s.sign) for s in equation.slots))
 
 
-def _plan_repeat(repeat: Repeat, layout: Layout) -> PlannedRepeat:
+def _plan_loop(loop: Loop, layout: Layout) -> PlannedLoop:
     """Plans a loop; `layout` is that of what lies before it."""
     chunk_of = {}  # of (step of the body, unknown), within the loop
-    for p, step in enumerate(repeat.body):
+    for p, step in enumerate(loop.body):
         for u in range(len(step.unknown)):
             chunk_of[p, u] = 2 + len(chunk_of)
     # A register holds a value of `back` repetitions ago; it is filled from the register of one less.
     registers: dict[tuple[int, int, int, int], int] = {}
     first: list[int] = []
-    for read in np.flatnonzero(repeat.back > 0).tolist():
-        for back in range(1, int(repeat.back[read]) + 1):
-            key = (back, *repeat.source[read].tolist())
+    for read in np.flatnonzero(loop.back > 0).tolist():
+        for back in range(1, int(loop.back[read]) + 1):
+            key = (back, *loop.source[read].tolist())
             if key not in registers:
                 registers[key] = len(registers)
-                first.append(int(repeat.reads[repeat.back[read] - back, read]))
+                first.append(int(loop.reads[loop.back[read] - back, read]))
     handed = [
         (chunk_of[p, u], instance) if back == 1 else (0, registers[back - 1, p, u, instance])
         for back, p, u, instance in registers
     ]
-    outside = np.flatnonzero((repeat.back < 0) & (repeat.reads[0] != ZERO))
-    chunk = np.full(len(repeat.back), -1, np.int64)
-    offset = np.zeros(len(repeat.back), np.int64)
+    outside = np.flatnonzero((loop.back < 0) & (loop.reads[0] != ZERO))
+    chunk = np.full(len(loop.back), -1, np.int64)
+    offset = np.zeros(len(loop.back), np.int64)
     chunk[outside], offset[outside] = 1, np.arange(len(outside))
-    for read in np.flatnonzero(repeat.back >= 0).tolist():
-        back, (p, u, instance) = int(repeat.back[read]), repeat.source[read].tolist()
+    for read in np.flatnonzero(loop.back >= 0).tolist():
+        back, (p, u, instance) = int(loop.back[read]), loop.source[read].tolist()
         chunk[read] = 0 if back else chunk_of[p, u]
         offset[read] = registers[back, p, u, instance] if back else instance
 
     body, read, parameter = [], 0, 0
-    for step in repeat.body:
+    for step in loop.body:
         equations = []
         for equation in step.equations:
             sources: list[Gather | int] = []
@@ -174,15 +174,15 @@ def _plan_repeat(repeat: Repeat, layout: Layout) -> PlannedRepeat:
                 PlannedEquation(renumbered, tuple(sources), tuple(_uniform(s.sign) for s in equation.slots))
             )
         body.append(PlannedStep(step, tuple(equations), ()))
-    return PlannedRepeat(
-        repeat.count,
+    return PlannedLoop(
+        loop.count,
         tuple(body),
         layout.gather(np.array(first)) if first else None,
         Gather(np.array([c for c, _ in handed]), np.array([k for _, k in handed]), np.ones(len(handed), np.int64))
         if first
         else None,
-        layout.gather(repeat.reads[:, outside].ravel()) if len(outside) else None,
-        repeat.parameters,
+        layout.gather(loop.reads[:, outside].ravel()) if len(outside) else None,
+        loop.parameters,
     )
 
 

@@ -9,7 +9,7 @@ from .evaluate_numpy import start_values
 from .extended import Extended, Quantities
 from .tables import ZERO, AliasTable, FlatModel
 
-ABSENT = -2  # the quantity of a variable that the equations left no quantity for
+ABSENT = -2  # the quantity of a variable that occurs in none of the remaining equations
 
 
 @dataclasses.dataclass(frozen=True)

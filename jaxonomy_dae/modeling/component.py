@@ -227,11 +227,11 @@ class Component(metaclass=Construction):
         - `start`: a number or an expression in parameters: its value at the initial time.
         - `fixed`: whether `start` must hold; otherwise it guides the search for a consistent initial point.
         - `nominal`: a positive number, its typical size in its unit; scales tolerances and projections, and says what
-            counts as zero. Left out, it is 1 for tolerances, and values and equations tell the rest.
+            counts as zero. If left out, it is 1 for tolerances; elsewhere sizes are taken from values and equations.
         - `unit`: shown in reports and plots.
         - `bounds`: an interval that the search for a consistent initial point does not leave, such as `(0.0, math.inf)`
-            for what stands in a logarithm or root. It acts on states and on unknowns of nonlinear blocks. A start at a
-            bound is moved off it.
+            for what stands in a logarithm or root. It acts on states and on unknowns of nonlinear blocks. A start on a
+            bound is moved inside.
 
         **Raises:**
 
@@ -341,7 +341,8 @@ class Component(metaclass=Construction):
 
         **Returns:**
 
-        A tuple of symbols, for any equation; where index reduction differentiates them, so does `jax.jvp`.
+        A tuple of symbols, for use in any equation; where index reduction differentiates them, the function is
+        differentiated with `jax.jvp`.
 
         **Raises:**
 

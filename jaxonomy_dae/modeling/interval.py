@@ -51,7 +51,7 @@ def as_interval(bounds: Any, where: str) -> Interval:
         found = Interval(low, high)
     empty = not found.low <= found.high or (found.low == found.high and (found.open_low or found.open_high))
     if empty:  # comparisons with NaN are false
-        raise ModelError(f"{where}: the bounds {found} hold no number")
+        raise ModelError(f"{where}: the bounds {found} contain no number")
     return found
 
 

@@ -59,7 +59,7 @@ class NeuralDAEBlock:
 
     **Raises:**
 
-    - `ModelError` if targets or inputs are malformed, or the network's output does not have one entry a target.
+    - `ModelError` if targets or inputs are malformed, or the network's output does not have one entry for each target.
     """
 
     def __init__(

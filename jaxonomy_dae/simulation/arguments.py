@@ -84,7 +84,7 @@ def check_parameters(system: AcausalSystem):
     bad = np.flatnonzero(~np.isfinite(values))
     if len(bad):
         name = system.parameters.names[bad[0]]
-        raise ModelError(f"parameter '{name}' is not finite: {values[bad[0]]}. Set it with with_parameters")
+        raise ModelError(f"parameter '{name}' is not finite: {values[bad[0]]}. Set it with system.with_parameters")
     for name, network in system.neural.items():
         for leaf in jax.tree.leaves(eqx.filter(network, eqx.is_inexact_array)):
             if not np.isfinite(np.asarray(leaf)).all():

@@ -88,6 +88,6 @@ def _singular_choice(solution: Solution, first: tuple[Any, Any], t: Any, x: Any)
     more = f" and {len(system.states) - SHOWN} more" if len(system.states) > SHOWN else ""
     return (
         f"the integration stopped at t={float(t):.6g}: the states {states}{more} have become a singular choice. There "
-        f"they do not determine {shown}, and which branch goes on cannot be told. "
+        f"they no longer determine {shown}, and it cannot be told which branch continues. "
         'Compile with state_selection="auto", which has no such points, or with other prefer_states'
     )

@@ -77,17 +77,17 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
     - `fixed_order`: stay at `max_order` once it is reached; for convergence studies.
     - `linear_solver`: any Lineax solver, such as `lineax.GMRES(rtol, atol)`, or one of `jaxonomy_dae.linear`; None
         chooses by size. It is handed a `SparseLinearOperator` where the term has a pattern.
-    - `algebraic_errors`: whether the error test counts what is not differentiated. Without, steps are fewer, often by
-        far where M is not diagonal, and the ends of steps are as good; but dense output of an algebraic unknown that
-        varies faster than the rest has no check. None counts where M is diagonal, except in `simulate`, which solves
-        the algebraic equations again at saved times.
+    - `algebraic_errors`: whether the error test counts what is not differentiated. If not, there
+        are fewer steps (often far fewer where M is not diagonal), and their ends are as accurate; but nothing checks
+        the dense output of an algebraic unknown that varies faster than the rest. None counts it where M is diagonal,
+        except in `simulate`, which solves the algebraic equations again at saved times.
     - `rtol`, `atol`, `norm`: given where the step-size controller has none; else left out.
     - `projection`: `(t, y, args) -> y`, onto hidden constraints: applied inside the step, before the history is
         updated. `simulate` fills it in.
     - `guard`: as in `Projected`.
 
-    Takes a `DAETerm` or a `diffrax.ODETerm`; wants `StepControl(rtol, atol, steered=True)` and works with
-    `diffrax.PIDController(rtol, atol)`.
+    Takes a `DAETerm` or a `diffrax.ODETerm`. Its step-size controller is `StepControl(rtol, atol, steered=True)`;
+    `diffrax.PIDController(rtol, atol)` works too.
     """
 
     max_order: int = eqx.field(static=True, default=5)

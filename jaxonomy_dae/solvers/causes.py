@@ -61,7 +61,7 @@ def _end_of_domain(
             return (
                 f"Just beyond, {first_bad_row(problem, ahead, names)} is not finite: a root or logarithm leaves its "
                 "domain, or a denominator vanishes. Keep the argument positive in the equation (sympy.Max, or another "
-                "law there), or end the run before"
+                "law there), or end the run earlier"
             )
     return ""
 
@@ -85,7 +85,7 @@ def _jump(slope: Slope, here: np.ndarray, t: Any, y: Any, weight: np.ndarray, na
     return (
         f"The derivative of '{names[k]}' jumps by {wide[k]:.3g} there (sign, Piecewise, Max, Heaviside …), and the "
         "solution stays at the jump: steps chatter back and forth across it. Smooth the law (sympy.tanh(x/small) for "
-        "sign(x)), or, if only the time decides, name the times with jump_ts="
+        "sign(x)), or, if the jump depends on time alone, name the times with jump_ts="
     )
 
 
@@ -100,7 +100,8 @@ def _escape(here: np.ndarray, y: Any, t: float, t1: float, weight: np.ndarray, n
         return ""
     return (
         f"'{names[k]}' is {value[k]:.3g} and grows by its own size within {rest[k]:.2g}: it becomes infinite near "
-        f"t={t + rest[k]:.6g}, and no solution goes beyond. End the run before, or look for a sign in its equation"
+        f"t={t + rest[k]:.6g}, and no solution continues beyond that. End the run earlier, or check the signs in its "
+        "equation"
     )
 
 

@@ -24,7 +24,7 @@ from ..linear.torn import solve_torn
 from ..linear.whole import solve_whole
 from ..linear.written_out import UNROLLED, solve, solve_dense
 from ..lowering.gather import Chunk, Gather, take
-from ..lowering.program import PlannedEquation, PlannedRepeat, PlannedSparse, PlannedStep, Program
+from ..lowering.program import PlannedEquation, PlannedLoop, PlannedSparse, PlannedStep, Program
 from ..model.evaluate_numpy import Networks
 
 UNROLLED_REPETITIONS = 4  # of a loop, written out in each of its iterations
@@ -66,8 +66,8 @@ class Evaluation:
     def run(self, program: Program, refine: Refinement):
         """Evaluates all steps."""
         for planned in program.steps:
-            if isinstance(planned, PlannedRepeat):
-                self.chunks.extend(self._repeat(planned))
+            if isinstance(planned, PlannedLoop):
+                self.chunks.extend(self._loop(planned))
             elif isinstance(planned, PlannedSparse):
                 self.chunks.append(self._sparse_step(planned, refine))
             else:
@@ -194,7 +194,7 @@ class Evaluation:
             verdicts.append(is_small(residual, slots, partials, tolerated))
         return functools.reduce(jnp.logical_and, verdicts)
 
-    def _repeat(self, planned: PlannedRepeat) -> list[Any]:
+    def _loop(self, planned: PlannedLoop) -> list[Any]:
         """The unknowns of all repetitions, each of shape (count · n,)."""
 
         def read(gather: Gather | None) -> Any:

@@ -90,21 +90,23 @@ def _quietly(value: Any) -> Any:
 
 def _constant(name: str, value: Any, dtype: Any) -> Any:
     if isinstance(value, str):
-        raise ModelError(f"input '{name}' is a number, samples or a function of time; got the text {value!r}")
+        raise ModelError(f"input '{name}' must be a number, samples or a function of time; got the text {value!r}")
     try:
         array = jnp.asarray(value)
     except (TypeError, ValueError):
         raise ModelError(
-            f"input '{name}' is a number, samples or a function of time; got {type(value).__name__}. For samples give "
-            f"{EXAMPLE}"
+            f"input '{name}' must be a number, samples or a function of time; got {type(value).__name__}. For samples "
+            f"give {EXAMPLE}"
         ) from None
     if array.shape != ():
         raise ModelError(
-            f"input '{name}' is a number, samples or a function of time; got shape {array.shape}. For samples give "
-            f"their times too: {EXAMPLE}"
+            f"input '{name}' must be a number, samples or a function of time; got shape {array.shape}. For samples "
+            f"give their times too: {EXAMPLE}"
         )
     if jnp.issubdtype(array.dtype, jnp.complexfloating):
-        raise ModelError(f"input '{name}' must be real; got {array.dtype}: give jnp.real(…) and jnp.imag(…) apart")
+        raise ModelError(
+            f"input '{name}' must be real; got {array.dtype}: give jnp.real(…) and jnp.imag(…) as two inputs"
+        )
     if not isinstance(array, Tracer) and not np.isfinite(array):
         raise ModelError(f"input '{name}' must be finite; got {array}")
     return array.astype(dtype)
@@ -141,8 +143,9 @@ def _samples(name: str, given: tuple[Any, ...] | list[Any], dtype: Any) -> Sampl
         raise ModelError(
             f"input '{name}' needs a value for every time; got {times.shape[0]} times and {values.shape[0]} values"
         )
-    if times.shape[0] < (1 if kind == "held" else 2):
-        raise ModelError(f"input '{name}' needs two samples or more; got {times.shape[0]}")
+    least = 1 if kind == "held" else 2
+    if times.shape[0] < least:
+        raise ModelError(f"input '{name}': {kind} samples are at least {least}; got {times.shape[0]}")
     _check_times(name, times)
     if kind == "held":
         return Sampled(Held(times, values), -1)

@@ -36,7 +36,7 @@ def implicit_choice(plan: SystemPlan, why: str) -> Choice:
     """The implicit solver for a system of this size."""
     if plan.n_state <= SMALL:
         return Choice("Rodas5P", why, True)
-    return Choice("BDF", f"{why}, and {plan.n_state} unknowns are many", True)
+    return Choice("BDF", f"{why}; cheaper for {plan.n_state} unknowns", True)
 
 
 def note_stiffness(plan: SystemPlan, stiff: bool):

@@ -191,7 +191,7 @@ class AcausalSystem(eqx.Module):
         pattern = self.jacobian_pattern
         if pattern is None:
             raise ModelError(
-                f"the Jacobian of these {self.plan.n_state} states is dense, too large to list its entries: use "
+                f"the Jacobian of these {self.plan.n_state} states is dense and too large to list its entries: use "
                 "jax.jvp(system.vector_field, …) for its products with vectors"
             )
         point = self.at(t, args)
@@ -344,7 +344,7 @@ class AcausalSystem(eqx.Module):
         names = tuple(dict.fromkeys(solve_for or ()))
         for name in names:
             if name not in self.parameters.names and name in self.plan.variable_index:
-                raise ModelError(f"solve_for: '{name}' is a variable and found anyway; name parameters")
+                raise ModelError(f"solve_for: '{name}' is a variable, which is found anyway: name parameters")
             self.parameters.table.settable(name)
         return names
 
