@@ -57,6 +57,25 @@ PROBLEMS = {
 }
 
 
+# Without guesses, from zero, where all slopes of several equations vanish.
+STATIONARY = {
+    "squares": (lambda x: jnp.stack([x[0] ** 2 - 1, x[1] ** 2 - 4]), [1.0, 2.0]),
+    "turbulent flows": (
+        lambda x: jnp.stack([x[0] * jnp.abs(x[0]) - 3, x[1] * jnp.abs(x[1]) + 4, x[0] + x[1] - x[2]]),
+        [np.sqrt(3), -2.0, np.sqrt(3) - 2],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", STATIONARY)
+def test_a_second_climb_where_nothing_is_known(name):
+    """Every rung ended where it began: zero is nobody's guess, and the sizes of unknowns are tried as one."""
+    function, root = STATIONARY[name]
+    nothing = jnp.zeros(len(root))
+    found = jax.jit(lambda x: find_root(function, len(root), x, Sizes(*[nothing] * 4), np.arange(len(root))))(nothing)
+    np.testing.assert_allclose(found.x, root, rtol=1e-12)
+
+
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_the_rung(name):
     function, start, method, root = PROBLEMS[name]

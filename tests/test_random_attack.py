@@ -15,7 +15,7 @@ QUICK = {
     "rods": (3, 13),
     "gears": (2, 29),
     "thermal": (3, 38),
-    "pipes": (11,),
+    "pipes": (11, 84),
     "mechanisms": (7, 34),
 }
 # How many models of a family are judged by the slow tests, in runs of fifty.

@@ -10,6 +10,9 @@ Each rung starts at the given point, and only if the one before failed:
 4. if some rows are soft (guesses), the nearest point: Gauss–Newton steps for the least Σ (soft rows)² on F = 0, by the
    method of weighting (Van Loan 1985).
 
+Where unknowns have no guess, zero stands for one, and there slopes may vanish, as of q·|q|: no rung leads away. So, if
+all have failed, the ladder is climbed once more with those unknowns at their sizes.
+
 Units decide nothing: unknowns are measured by their sizes, rows by the sizes of their terms, Σ |∂F/∂x|·|x|.
 
 All rungs are states of one machine, the body of a single loop: one residual, one Jacobian and one QR factorization are
@@ -57,6 +60,7 @@ NOISE = 8.0  # rounding errors of a row, in units of eps
 # zero, gets its size from the powers that slopes at these distances show. Then the search begins at the start.
 _PROBES = (1.0, 1.0 / 16)
 _SIZED = -1.0 - len(_PROBES)
+_AGAIN = _SIZED - 1  # the start of the second climb
 
 _NEWTON, _MARQUARDT, _TRACK, _LAND, _POLISH, _NEAREST, _DONE, _FAILED = range(8)
 
@@ -132,7 +136,7 @@ class _Scalars(NamedTuple):
     phase: Any
     method: Any
     fresh: Any  # whether the trial point is where a rung starts
-    begun: Any  # 1 once F has been finite; on the way there, see `_PROBES`
+    begun: Any  # 1 once F has been finite, 2 on the second climb; on the way there, see `_PROBES`
     count: Any  # evaluations on this rung
     evaluations: Any
     size: Any
@@ -173,6 +177,7 @@ def find_root(
     hard, weighted = jnp.asarray(~is_soft), jnp.asarray(np.where(is_soft, soft_weight(dtype), 1.0), dtype)
     has_soft = bool(is_soft.any())
     nearest_first = has_soft and core is None
+    first_rung = _NEAREST if nearest_first else _NEWTON
     limits = np.array(bounds, float) if bounds is not None and np.isfinite(bounds).any() else None
     if limits is not None:
         low, high = jnp.asarray(limits.T, dtype)
@@ -249,7 +254,7 @@ def find_root(
         nearest, marquardt = is_nearest(phase), phase == _MARQUARDT
         descending = (phase == _NEWTON) | (phase == _POLISH) | nearest
         tracking, landing = (phase == _TRACK) | (phase == _LAND), phase == _LAND
-        begins = s.begun <= 0
+        begins, second = s.begun <= 0, (s.begun > 1) | (s.begun == _AGAIN)
         # A root is a root on any rung; but what the homotopy lands on is polished first.
         stop = reached & ~tracking
 
@@ -356,6 +361,8 @@ def find_root(
             above = where(nearest, where(again, _MARQUARDT, _FAILED), above)
         above = where(lost, _FAILED, above)
         restarts = failed | (tracking & landed) | lost
+        unguessed = jnp.append(sizes.known == 0, False)
+        climbs_again = failed & (above == _FAILED) & ~second & ~lost & jnp.any(unguessed)
         stepped = where(tracking, ahead, here + where(descending, fraction, one) * unit * step)
         stepped = bounded(stepped, here)
         damped = where(accepted, 2 * one, 2 * s.growth)
@@ -369,12 +376,14 @@ def find_root(
             restart = where(
                 above == _MARQUARDT, bounded(beginning + 1e-3 * unit * generic * (1 - along), restart), restart
             )
+        restart = where(climbs_again, bounded(where(unguessed, unit * generic, origin), origin), restart)
+        above = where(climbs_again, first_rung, above)
         scalars = packed(
             *_Scalars(
                 phase=where(done, _DONE, where(failed, above, where(tracking, follow, phase))),
                 method=where(done, where(stop & begins, 0, by), s.method),
                 fresh=restarts,
-                begun=~lost,
+                begun=where(climbs_again, _AGAIN, where(lost, 0.0, where(second, 2.0, 1.0))),
                 count=where(failed | (tracking & landed), 0, s.count + 1),
                 evaluations=s.evaluations + 1,
                 size=where(descending, fraction, where(marquardt, damping, arc)),
@@ -382,7 +391,7 @@ def find_root(
                 square=square,
                 gain=gain,
                 holds=holds,
-                turn=where(failed & (tracking | nearest), -one, s.turn),
+                turn=where(climbs_again, one, where(failed & (tracking | nearest), -one, s.turn)),
                 corrections=where(tracking & correcting, s.corrections + 1, 0),
             )
         )
@@ -396,7 +405,7 @@ def find_root(
         ])  # fmt: skip
         return _Machine(scalars, points, jnp.stack([value, first, w]), jacobian)
 
-    begin = _Scalars(_NEAREST if nearest_first else _NEWTON, FAILED, 1.0, 0.0, 0, 0, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0)
+    begin = _Scalars(first_rung, FAILED, 1.0, 0.0, 0, 0, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0)
     points = jnp.stack([origin, origin, origin, along, origin, jnp.ones_like(origin)])
     state = _Machine(
         jnp.asarray([float(v) for v in begin], dtype), points, jnp.ones((3, m), dtype), jnp.zeros((m, n), dtype)
