@@ -21,16 +21,16 @@ def attack(family: str, count: int, seed: int, moving: int = 0, show: int = 5, u
     """Judges `count` models of a family from `seed` on; every `moving`-th is integrated as well. With `units`, the
     models are written in other units first. Returns the outcomes by seed."""
     from . import rescaled
-    from .judge import judge
+    from .judge import judged
 
     make = importlib.import_module(f".{family}", __package__).make
     if units:
         make = rescaled.family(make, units)
     outcomes = {}
-    for s in range(seed, seed + count):
-        case = make(s)
-        outcomes[s] = judge(case, bool(moving) and s % moving == 0)
-        if outcomes[s].kind not in ("right", "refused") and show > 0:
+    cases = ((s, make(s)) for s in range(seed, seed + count))
+    for s, case, outcome in judged(cases, lambda s: bool(moving) and s % moving == 0):
+        outcomes[s] = outcome
+        if outcome.kind not in ("right", "refused") and show > 0:
             show -= 1
             text = outcomes[s].text
             print(f"  {family} {s} ({case.note}): {outcomes[s].kind}: {text[:400]}", flush=True)

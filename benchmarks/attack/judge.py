@@ -1,9 +1,11 @@
 """Right, refused or wrong: a compiled model against its independent solution."""
 
 import dataclasses
+import gc
 import re
 import signal
 import time
+from collections.abc import Callable, Iterable, Iterator
 
 import equinox as eqx
 import jax
@@ -21,6 +23,8 @@ CHEAP = {
     "xla_backend_optimization_level": 0,
     "xla_llvm_disable_expensive_passes": True,
 }
+
+KEPT = 10  # models whose programs are kept
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,6 +52,16 @@ def read(system, x, names: list[str], t: float = 0.0):
 
     values, rates = jax.jit(both).lower(arrays, x).compile(compiler_options=CHEAP)(arrays, x)
     return np.asarray(values), np.asarray(rates)
+
+
+def judged(cases: Iterable[tuple[int, Case]], moving: Callable[[int], bool]) -> Iterator[tuple[int, Case, Outcome]]:
+    """Judges cases one after the other. Compiled programs are dropped on the way: each holds some memory maps, of which
+    a process has 65,530 on Linux by default."""
+    for count, (seed, case) in enumerate(cases, 1):
+        yield seed, case, judge(case, moving(seed))
+        if count % KEPT == 0:
+            jax.clear_caches()
+            gc.collect()
 
 
 class TooLong(Exception):
