@@ -7,6 +7,7 @@ from attack import descriptors
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der
 from jaxonomy_dae.compiler.null_vectors import cancels, left_null_vectors
 from jaxonomy_dae.compiler.select_states import _is_singular
+from jaxonomy_dae.errors import InitializationError, StructuralError
 from jaxonomy_dae.initialization.singular_blocks import ILL_CONDITIONED, _conditions
 from jaxonomy_dae.model.scaling import geometric_scales
 
@@ -84,3 +85,45 @@ def test_given_values_that_follow_from_equations_move_nothing():
     np.testing.assert_allclose(x, [case.initial[n] for n in system.states], rtol=1e-9)
     rates = [case.rates[n].value for n in system.states]
     np.testing.assert_allclose(system.vector_field(0.0, x), rates, rtol=1e-8)
+
+
+def test_a_given_value_that_is_a_rounding_error():
+    """y = p·x − q·x with p = q to rounding: given as zero, it must not move x, which is given, too; given as more, it
+    contradicts it."""
+
+    class Difference(Component):
+        def __init__(self, ev, name):
+            super().__init__(ev, name)
+            x, y, z = (self.variable(k) for k in "xyz")
+            p, q = self.parameter("p", 0.1 + 0.2), self.parameter("q", 0.3)
+            self.add_equations(der(x) + x - y, y + z - p * x, z - q * x)
+
+    ev = EqnEnv()
+    system = AcausalCompiler(ev, AcausalDiagram().add(Difference(ev, "d")))()
+    found = system.initialize(initial={"d.y": 0.0, "d.x": 0.7})
+    np.testing.assert_allclose(found, [0.7], rtol=1e-14)
+    with pytest.raises(InitializationError, match="contradict"):
+        system.initialize(initial={"d.y": 1e-9, "d.x": 0.7})
+
+
+class _Slow(Component):
+    """(p − q)·x' + x = 0."""
+
+    def __init__(self, ev, p, q):
+        super().__init__(ev, "d")
+        x, p, q = self.variable("x"), self.parameter("p", p), self.parameter("q", q)
+        self.add_equations((p - q) * der(x) + x)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e9, 1e-12])
+def test_a_coefficient_that_is_a_rounding_error(unit):
+    """p − q determines nothing if p and q are equal to rounding; a difference of 1e-9 is a difference."""
+
+    def compiled(p, q):
+        ev = EqnEnv()
+        return AcausalCompiler(ev, AcausalDiagram().add(_Slow(ev, p * unit, q * unit)))()
+
+    for q in (0.1 + 0.2, 0.3):
+        with pytest.raises(StructuralError, match="determines nothing for d.p"):
+            compiled(0.3, q)
+    assert compiled(0.3, 0.3 + 1e-9).states == ["d.x"]

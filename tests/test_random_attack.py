@@ -18,6 +18,7 @@ QUICK = {
     "thermal": (3, 38),
     "pipes": (11, 84),
     "mechanisms": (7, 34),
+    "descriptors": (27,),
 }
 # How many models of a family are judged by the slow tests, in runs of fifty.
 COUNTS = {

@@ -27,13 +27,15 @@ from ..structure.incidence import Incidence
 from ..structure.matching import maximum_matching
 from ..structure.pantelides import Offsets, reduce_index
 from .combine_equations import combine, graph_of, group_of, near, quantity_label, somewhere
-from .null_vectors import left_null_vectors, weights_in_parameters
+from .null_vectors import CANCELLED, left_null_vectors, weights_in_parameters
 
 LARGEST_BLOCK = 200
 ROUNDS = 100
 TRIALS = 12  # random points, of which STATES are used: those where the equations have values
 STATES = 3
 PARAMETERS = 4  # sample values of the parameters
+PERTURBATIONS = 8  # of parameters, by this much:
+SMALL = 2.0**-20
 
 
 def reduce_with_cancellation(
@@ -271,7 +273,8 @@ def _hidden(equations: list[Provenance]) -> str:
 
 
 def zero_pivots(groups, signature: Incidence, offsets: Offsets, column, values) -> np.ndarray:
-    """Equations that alone determine a quantity, whose coefficient is zero for the given parameter values."""
+    """Equations that alone determine a quantity, whose coefficient is zero for the given parameter values, to rounding
+    of its terms."""
     count = _blocks(signature, offsets)[1]
     first = equation_offsets(groups)
     found = []
@@ -288,8 +291,16 @@ def zero_pivots(groups, signature: Incidence, offsets: Offsets, column, values) 
         slots = np.flatnonzero(used.any(axis=0))
         if not len(slots) or not all(template.coefficient_is_constant(int(k)) for k in slots):
             continue
-        point = [np.ones(len(group))] * len(template.slots)
-        partial = template.partial_values(point, list(values[group.parameter].T), [], 0.0, None, backend="numpy")
-        total = sum(used[:, k] * group.sign[:, k] * partial[k] for k in slots.tolist())
-        found.append(equation[used.any(axis=1) & (total == 0)])
+        here = values[group.parameter]
+
+        def total(parameters, template=template, group=group, used=used, slots=slots):
+            point = [np.ones(len(group))] * len(template.slots)
+            partial = template.partial_values(point, list(parameters.T), [], 0.0, None, backend="numpy")
+            return sum(used[:, k] * group.sign[:, k] * partial[k] for k in slots.tolist())
+
+        coefficient = total(here)
+        # The terms of a coefficient are seen in how it answers to small relative changes of its parameters.
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], (PERTURBATIONS, here.shape[1]))
+        moved = [np.abs(total(here * (1 + SMALL * s)) - coefficient) / SMALL for s in signs]
+        found.append(equation[used.any(axis=1) & (np.abs(coefficient) <= CANCELLED * np.max(moved, axis=0))])
     return np.concatenate(found) if found else np.zeros(0, np.int64)

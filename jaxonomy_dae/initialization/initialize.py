@@ -26,9 +26,11 @@ from ..system.inputs import read_inputs
 from ..system.system_at import SystemAt
 from .given_solver import find_root_with
 from .initial_values import check_initial
-from .ladder import FAILED, STAGED, Sizes, find_root, tolerance
+from .ladder import FAILED, NOISE, STAGED, Sizes, find_root, tolerance
 from .rows import InitialRows, Row, initial_rows
 from .stages import solve_in_stages, stages
+
+PERTURBATIONS = 8  # of the start, and of parameters, that show the sizes of terms
 
 
 class InitialPoint(NamedTuple):
@@ -96,8 +98,15 @@ def initialize(
     is_soft = np.arange(m) >= m - rows.n_soft
     core = independent_rows(plan, rows, len(start))
 
+    state = {int(q) for q in (*plan.states, *plan.carried)}
+    read = [n_equations + k for k, row in enumerate(rows.kept) if row.quantity not in state]
+    excused = None
+    if read and rows.redundant and not rows.n_soft:
+        excused = frozen(_rounding(residual, settings, start, sizes, np.array(read)))
+
     def function(w):
-        return residual(w, *settings)
+        value = residual(w, *settings)
+        return value if excused is None else jnp.where(excused > 0, 0, value)
 
     staged = None if len(unknown) else stages(plan, rows)
     declared = start
@@ -135,7 +144,38 @@ def initialize(
         w = found.x - least_squares(jacobian * found.unit[None, :], jnp.where(good, remaining, 0)) * found.unit
     full = jnp.concatenate([jnp.zeros((n_equations,), point.dtype), target])
     limit = jnp.where(is_soft, jnp.inf, found.limit)
+    if excused is not None:
+        limit = limit + excused
     return InitialPoint(w[:n], w[n:], remaining, limit, full, found.method, found.evaluations, found.jacobian)
+
+
+def _rounding(residual: Callable[..., Any], settings, start: Any, sizes: Sizes, read: np.ndarray) -> Any:
+    """Rows that are rounding errors and nothing else, among those at `read`, of variables outside of the state: they
+    hold at the start, and neither it nor rounded parameters move them by more. Returns what rounding may leave of
+    each, shape (m,), zero for other rows.
+
+    A variable that is zero because its terms cancel depends on the state by rounding errors. In units of these, other
+    rows would give way to it."""
+    parameters, inputs, target = settings
+    dtype = start.dtype
+
+    def rows(w, parameters):
+        return residual(w, parameters, inputs, target)
+
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (PERTURBATIONS, len(start) + len(parameters)))
+    moves, changes = np.split(signs, [len(start)], axis=1)
+    size = jnp.maximum(jnp.abs(start), sizes.known)
+    none = np.zeros((PERTURBATIONS, 1))
+    along = (
+        jnp.asarray(np.concatenate([moves, none * moves]), dtype) * size,
+        jnp.asarray(np.concatenate([none * changes, changes]), dtype) * parameters,
+    )
+    value = rows(start, parameters)
+    moved = jax.vmap(lambda v, p: jax.jvp(rows, (start, parameters), (v, p))[1])(*along)
+    slope, terms = (jnp.max(jnp.abs(m), axis=0) for m in jnp.split(moved, 2))
+    noise = NOISE * float(jnp.finfo(dtype).eps) * terms
+    chosen = jnp.asarray(np.isin(np.arange(len(value)), read))
+    return jnp.where(chosen & (jnp.abs(value) <= noise) & (slope <= noise), noise, 0)
 
 
 def _nearest_point(
