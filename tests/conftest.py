@@ -5,6 +5,7 @@ import os
 import hypothesis
 import jax
 import jaxtyping
+import pytest
 
 os.environ["MPLBACKEND"] = "Agg"
 
@@ -17,3 +18,26 @@ jaxtyping.install_import_hook("jaxonomy_dae", "beartype.beartype")
 # The same examples in every run, and no deadline: the first call of a jitted function compiles it.
 hypothesis.settings.register_profile("deterministic", derandomize=True, deadline=None, database=None)
 hypothesis.settings.load_profile("deterministic")
+
+
+def pytest_addoption(parser):
+    parser.addoption(
+        "--units", type=int, default=None, help="compile every model again in random units of this seed, and compare"
+    )
+
+
+@pytest.fixture(autouse=True)
+def in_other_units(request):
+    """With `--units`, every model that a test compiles must have the same verdict and states in other units."""
+    seed = request.config.getoption("--units")
+    if seed is None or "units" in request.node.nodeid.partition("::")[0]:
+        yield
+        return
+    from other_units import compare_verdicts, is_rescalable, watched
+    from rescaling import KINDS
+
+    with watched() as seen:
+        yield
+    for compiler, old in seen:
+        if is_rescalable(compiler):
+            compare_verdicts(compiler, old, KINDS[seed % len(KINDS)], seed)

@@ -42,13 +42,13 @@ class Outcome:
     seconds: float
 
 
-def read(system, x, names: list[str], t: float = 0.0):
+def read(system, x, names: list[str], t: float = 0.0, inputs: dict[str, float] | None = None):
     """Values of variables and d(state)/dt, by a program that XLA spends little time on."""
     arrays, static = eqx.partition(system, eqx.is_array)
 
     def both(arrays, x):
         whole = eqx.combine(arrays, static)
-        return whole.observe(names, t, x), whole.vector_field(t, x)
+        return whole.observe(names, t, x, inputs), whole.vector_field(t, x, inputs)
 
     values, rates = jax.jit(both).lower(arrays, x).compile(compiler_options=CHEAP)(arrays, x)
     return np.asarray(values), np.asarray(rates)

@@ -21,6 +21,7 @@ from ..errors import InitializationError
 from ..lowering.plan import SystemPlan
 from ..model.dependent_parameters import complete
 from ..model.evaluate_numpy import Networks, generic_jacobian, slot_values, start_values
+from ..model.natural_sizes import natural_sizes
 from ..model.quantities import ABSENT, declared_scale
 from ..model.scaling import equilibrated, geometric_scales
 from ..model.tables import ZERO, Start
@@ -29,6 +30,7 @@ from ..structure.matching import match_in_order
 DENSE_LIMIT = 600  # quantities up to which ranks are numerical; above, rows are matched with quantities
 OPEN = 1e-7  # a direction less than this along a quantity leaves it determined
 RANK = 1e-11  # pivots smaller than this, of equilibrated equations, are rounding
+EVEN = 1e-2  # a smallest entry above which a matrix is as well scaled as it can be
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,17 +169,27 @@ def _generic(plan: SystemPlan, solve_for: tuple[int, ...]) -> _Generic:
         if start is not None and quantity >= 0 and not start.parameters and size[quantity] == 0.0:
             size[quantity] = sign * number(v)
     size[size == 0.0] = 1.0
-    jacobian, point, values = generic_jacobian(extended, size, len(plan.flat.parameters))
+    n_parameters = len(plan.flat.parameters)
+    parameter_size = np.ones(n_parameters)
+    if n <= DENSE_LIMIT:  # parameters, as generic numbers, would make some equations stiff beside others
+        size, parameter_size = natural_sizes(extended, size, n_parameters)
+    jacobian, point, values = generic_jacobian(extended, size, parameter_size)
     jacobian = jacobian[:, :n]
     if solve_for:
         jacobian = sp.hstack([jacobian, sp.csr_array(_parameter_columns(plan, point, values, solve_for))], format="csr")
-    scaled, _, columns = equilibrated(jacobian)
-    if scaled.shape[1] <= DENSE_LIMIT and (rank := _rank(scaled)) < scaled.shape[0]:  # perhaps for want of scaling
-        r, c = geometric_scales(jacobian)
-        better, _, more = equilibrated(sp.csr_array(sp.diags_array(r) @ jacobian @ sp.diags_array(c)))
-        if _rank(better) > rank:
-            scaled, columns = better, c * more
+    scaled, columns = _scaled(jacobian)
     return _Generic(scaled, columns, values, solve_for)
+
+
+def _scaled(jacobian: Any) -> tuple[Any, np.ndarray]:
+    """The Jacobian with rows and columns scaled, and the columns' scales."""
+    scaled, _, columns = equilibrated(jacobian)
+    if scaled.shape[1] > DENSE_LIMIT or not scaled.nnz or np.abs(scaled.data[scaled.data != 0]).min() > EVEN:
+        return scaled, columns
+    # Directions that are open must not look closed because of units.
+    r, c = geometric_scales(jacobian)
+    better, _, more = equilibrated(sp.csr_array(sp.diags_array(r) @ jacobian @ sp.diags_array(c)))
+    return (better, c * more) if _rank(better) >= _rank(scaled) else (scaled, columns)
 
 
 def _pivoted(jacobian: np.ndarray) -> tuple[np.ndarray, int]:

@@ -433,9 +433,12 @@ def _constraints(plan: SystemPlan, values: _Values) -> Iterator[BlockFinding]:
         row += len(group)
     if not np.isfinite(matrix).all():
         return
-    u, s, _ = np.linalg.svd(_equilibrated(matrix[None], PASSES if m > 1 else 0)[0])
-    s = np.append(s, np.zeros(max(0, m - len(s))))[:m]
-    condition = np.inf if s[-1] == 0 else s[0] / s[-1]
+    u, s, condition = _spectrum(matrix)
+    if not condition < ILL_CONDITIONED:  # perhaps for want of better scaling
+        r, c = geometric_scales(matrix)
+        better = _spectrum(r[:, None] * matrix * c)
+        if better[2] < condition:
+            u, s, condition = better
     if condition < ILL_CONDITIONED:
         return
     dependent = np.flatnonzero(np.abs(u[:, s <= max(s[0], 1e-300) / ILL_CONDITIONED]).max(axis=1, initial=0.0) > 1e-3)
@@ -448,3 +451,11 @@ def _constraints(plan: SystemPlan, values: _Values) -> Iterator[BlockFinding]:
     yield BlockFinding(
         float(condition), singular, m, names, tuple(plan.describe(texts[e]) for e in dependent), at, False
     )
+
+
+def _spectrum(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Left singular vectors and singular values of the equilibrated matrix, one for each row, and its condition."""
+    m = len(matrix)
+    u, s, _ = np.linalg.svd(_equilibrated(matrix[None], PASSES if m > 1 else 0)[0])
+    s = np.append(s, np.zeros(max(0, m - len(s))))[:m]
+    return u, s, np.inf if s[-1] == 0 else float(s[0] / s[-1])

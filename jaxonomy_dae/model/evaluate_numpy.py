@@ -70,7 +70,7 @@ def residual_and_jacobian(extended: Extended, values, parameters, t: float, netw
     return residual, sp.coo_array(data, shape=shape).tocsr()
 
 
-def generic_jacobian(extended: Extended, size: np.ndarray, n_parameters: int):
+def generic_jacobian(extended: Extended, size: np.ndarray, parameter_size: np.ndarray):
     """A sparse Jacobian with respect to all quantities at a generic point, for questions of rank: what depends there
     depends everywhere, or nearly so. Also the point and the parameters.
 
@@ -79,24 +79,24 @@ def generic_jacobian(extended: Extended, size: np.ndarray, n_parameters: int):
 
     **Arguments:**
 
-    - `size`: of every quantity; the sign counts.
+    - `size`: of every quantity; the sign counts. `parameter_size`: of every parameter.
     """
     rng = np.random.default_rng(0)
-    samples = [(size * _generic(rng, size.shape), _generic(rng, (n_parameters,))) for _ in range(2)]
+    samples = [(size * generic(rng, size.shape), parameter_size * generic(rng, parameter_size.shape)) for _ in range(2)]
     rows, columns, entries = [], [], []
     for group in extended.groups:
         n, k = group.quantity.shape
         if k == 0:
             continue
         if group.template.opaque is not None:
-            partial = _generic(rng, (n, k))
+            partial = generic(rng, (n, k))
         else:
             first, second = (
                 group_values(group, point, parameters, 0.5, Networks(()), partials=True)
                 for point, parameters in samples
             )
             partial = np.where(first == 0.0, second, first)  # zero on one branch is not zero on all
-            partial = np.where(np.isfinite(partial), partial, _generic(rng, (n, k)))
+            partial = np.where(np.isfinite(partial), partial, generic(rng, (n, k)))
         used = group.quantity != ZERO
         rows.append(np.broadcast_to(group.equation[:, None], used.shape)[used])
         columns.append(group.quantity[used])
@@ -108,7 +108,8 @@ def generic_jacobian(extended: Extended, size: np.ndarray, n_parameters: int):
     return sp.coo_array(data, shape=shape).tocsr(), *samples[0]
 
 
-def _generic(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+def generic(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """Numbers near 1 without pattern."""
     return rng.uniform(0.5, 1.5, shape)
 
 
