@@ -180,6 +180,33 @@ def compiled(
     return AcausalCompiler(components[0].ev, diagram, **options)()
 
 
+EV = EqnEnv()  # of components that are made where they are written
+
+
+def component(write: Callable[[Component, EqnEnv], Any], name: str = "c") -> Component:
+    """A component whose class body is the function `write(self, ev)`."""
+
+    class Written(Component):
+        def __init__(self, ev, name):
+            super().__init__(ev, name)
+            write(self, ev)
+
+    return Written(EV, name)
+
+
+def rc_ladder(n: int) -> AcausalSystem:
+    """A source, n resistors in a row, and a capacitor to ground after each."""
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    source, ground = VoltageSource(ev, "source"), Ground(ev, "ground")
+    diagram.connect(source.n, ground.p)
+    before = source.p
+    for k in range(n):
+        r, c = Resistor(ev, f"r{k}"), Capacitor(ev, f"c{k}", initial_voltage=0.0)
+        diagram.connect(before, r.p).connect(r.n, c.p).connect(c.n, ground.p)
+        before = r.n
+    return AcausalCompiler(ev, diagram)()
+
+
 class FreeMass(Component):
     """The library's `Mass`, except that its mass may be any number."""
 

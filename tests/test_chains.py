@@ -148,11 +148,8 @@ def far_back(k, y, x, p):
     return p * y[k - 1] + 0.1 * y[0] * x if k else x**2
 
 
-@pytest.mark.parametrize("rule", [look_back, two_kinds, changing, far_back])
-def test_recursions(rule):
-    n = 44
-    system = compiled(Recursion(EqnEnv(), "c", n, rule))
-    assert PlannedLoop in kinds(system) and len(kinds(system)) < 24
+def check(system, rule, n):
+    """Values and slopes in both modes, against the recursion written out."""
 
     def reference(x, p):
         y: list = []
@@ -160,17 +157,22 @@ def test_recursions(rule):
             y.append(rule(k, y, x, p))
         return y
 
-    x = jnp.array([0.7])
-    np.testing.assert_allclose(
-        system.observe([f"c.y{k}" for k in range(n)], 0.0, x), np.array(reference(0.7, 0.8)), **TIGHT
-    )
-
     def slope(p, x):
         return system.with_parameters({"c.p": p}).vector_field(0.0, jnp.array([x]))[0]
 
+    found = system.observe([f"c.y{k}" for k in range(n)], 0.0, jnp.array([0.7]))
+    np.testing.assert_allclose(found, np.array(reference(0.7, 0.8)), **TIGHT)
     expected = jax.jit(jax.jacfwd(lambda p, x: -reference(x, p)[-1], argnums=(0, 1)))(0.8, 0.7)
     for mode in (jax.jacfwd, jax.jacrev):
         np.testing.assert_allclose(jax.jit(mode(slope, argnums=(0, 1)))(0.8, 0.7), expected, **TIGHT)
+
+
+@pytest.mark.parametrize("rule", [look_back, two_kinds, changing, far_back])
+def test_recursions(rule):
+    n = 44
+    system = compiled(Recursion(EqnEnv(), "c", n, rule))
+    assert PlannedLoop in kinds(system) and len(kinds(system)) < 24
+    check(system, rule, n)
 
 
 def test_an_irregular_chain_is_one_sparse_system(monkeypatch):
@@ -189,19 +191,4 @@ def test_an_irregular_chain_is_one_sparse_system(monkeypatch):
 
     system = compiled(Recursion(EqnEnv(), "c", n, rule))
     assert PlannedSparse in kinds(system) and len(kinds(system)) < 10
-
-    def reference(x, p):
-        y: list = []
-        for k in range(n):
-            y.append(rule(k, y, x, p))
-        return y
-
-    def slope(p, x):
-        return system.with_parameters({"c.p": p}).vector_field(0.0, jnp.array([x]))[0]
-
-    np.testing.assert_allclose(
-        system.observe([f"c.y{k}" for k in range(n)], 0.0, jnp.array([0.7])), np.array(reference(0.7, 0.8)), **TIGHT
-    )
-    expected = jax.jit(jax.jacfwd(lambda p, x: -reference(x, p)[-1], argnums=(0, 1)))(0.8, 0.7)
-    for mode in (jax.jacfwd, jax.jacrev):
-        np.testing.assert_allclose(jax.jit(mode(slope, argnums=(0, 1)))(0.8, 0.7), expected, **TIGHT)
+    check(system, rule, n)

@@ -8,10 +8,10 @@ import random
 
 import numpy as np
 import pytest
-from problems import FreeMass, compiled
+from problems import EV, FreeMass, compiled, component
 from sympy import Eq, exp, sin
 
-from jaxonomy_dae import AcausalDiagram, Component, EqnEnv, ModelError, StructuralError, der
+from jaxonomy_dae import AcausalDiagram, EqnEnv, ModelError, StructuralError, der
 from jaxonomy_dae.library.electrical import Capacitor, CurrentSource, Ground, Inductor, Resistor, VoltageSource
 from jaxonomy_dae.library.planar import PlanarPendulum
 from jaxonomy_dae.library.thermal import FixedTemperature, HeatCapacitor, ThermalConductor
@@ -30,9 +30,6 @@ KINDS = {
 }  # fmt: skip
 
 
-EV = EqnEnv()
-
-
 def model(parts: dict[str, str], *nodes: str, order=None, rename=lambda name: name, **options):
     """A diagram from "name": "Class" and nodes such as "s.p r.p"."""
     ev = EqnEnv()
@@ -40,17 +37,6 @@ def model(parts: dict[str, str], *nodes: str, order=None, rename=lambda name: na
     made = {n: KINDS[parts[n]](ev, rename(n), **options.get(n, {})) for n in names}
     connect = [[getattr(made[n], p) for n, p in (end.split(".") for end in node.split())] for node in nodes]
     return compiled(*made.values(), connect=connect)
-
-
-def component(write, name="c"):
-    """A component whose class body is `write(self, ev)`."""
-
-    class Written(Component):
-        def __init__(self, ev, name):
-            super().__init__(ev, name)
-            write(self, ev)
-
-    return Written(EV, name)
 
 
 def law(names: str, *equations, **starts):

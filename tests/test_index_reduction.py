@@ -6,6 +6,7 @@ import scipy.sparse as sp
 import sympy
 from hypothesis import given
 from hypothesis import strategies as st
+from problems import rc_ladder
 from scipy.sparse.csgraph import maximum_bipartite_matching
 from testset import PROBLEMS
 
@@ -268,25 +269,13 @@ def test_offsets_are_pryces(n, random):
 # --- size ------------------------------------------------------------------------------------------------------
 
 
-def ladder(n):
-    diagram = AcausalDiagram()
-    source, ground = VoltageSource(EV, "source"), Ground(EV, "ground")
-    diagram.connect(source.n, ground.p)
-    before = source.p
-    for k in range(n):
-        r, c = Resistor(EV, f"r{k}"), Capacitor(EV, f"c{k}", initial_voltage=0.0)
-        diagram.connect(before, r.p).connect(r.n, c.p).connect(c.n, ground.p)
-        before = r.n
-    return AcausalCompiler(EV, diagram)()
-
-
 @pytest.mark.parametrize("sizes", [(100, 400), pytest.param((100, 10_000), marks=pytest.mark.slow)])
 def test_the_program_does_not_grow_with_the_model(sizes):
     import jax
 
     lengths = []
     for n in sizes:
-        system = ladder(n)
+        system = rc_ladder(n)
         x = np.zeros(n)
         lengths.append(len(jax.make_jaxpr(lambda x, system=system: system.vector_field(0.0, x))(x).eqns))
     assert lengths[0] == lengths[1]
@@ -303,7 +292,7 @@ def test_ladder_against_scipy():
     reference = scipy.integrate.solve_ivp(
         lambda t, v: a @ v + b, (0, 10), np.zeros(n), method="DOP853", rtol=1e-12, atol=1e-14
     ).y[:, -1]
-    solution = simulate(ladder(n), 10.0, ts=np.array([10.0]), rtol=1e-8, atol=1e-10)
+    solution = simulate(rc_ladder(n), 10.0, ts=np.array([10.0]), rtol=1e-8, atol=1e-10)
     found = np.array([float(solution[f"c{k}.v"][0]) for k in range(n)])
     np.testing.assert_allclose(found, reference, atol=1e-6)  # 100 × the local tolerance
 

@@ -4,12 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from problems import compiled, drag_on, mlp, oscillator, pendulum, rc_circuit
+from problems import compiled, drag_on, mlp, oscillator, pendulum, rc_circuit, rc_ladder
 from test_chains import cascade
 from test_large_blocks import Grid
 
-from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, ModelError, der
-from jaxonomy_dae.library.electrical import Capacitor, Ground, Resistor, VoltageSource
+from jaxonomy_dae import Component, EqnEnv, ModelError, der
 from jaxonomy_dae.lowering import pattern
 
 
@@ -89,15 +88,7 @@ def test_pattern_of_the_semi_explicit_form(model):
 
 @pytest.mark.parametrize("n", [300, pytest.param(20_000, marks=pytest.mark.slow)])
 def test_ladder_is_tridiagonal(n):
-    ev, diagram = EqnEnv(), AcausalDiagram()
-    source, ground = VoltageSource(ev, "source"), Ground(ev, "ground")
-    diagram.connect(source.n, ground.p)
-    before = source.p
-    for k in range(n):
-        r, c = Resistor(ev, f"r{k}"), Capacitor(ev, f"c{k}", initial_voltage=0.0)
-        diagram.connect(before, r.p).connect(r.n, c.p).connect(c.n, ground.p)
-        before = r.n
-    system = AcausalCompiler(ev, diagram)()
+    system = rc_ladder(n)
     found = system.jacobian_pattern
     k = np.arange(n)
     expected = np.concatenate([k * n + k, k[1:] * n + k[:-1], k[:-1] * n + k[1:]])

@@ -9,6 +9,7 @@ import jax
 import jax.core
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Bool, Int, PyTree
 
 from .private_names import unvmap_any
 
@@ -77,7 +78,7 @@ def closure_convert(function: Any, *args: Any) -> tuple[ClosureConverted, list[A
 
 
 @jax.custom_jvp
-def unless_waiting(active, new, old):
+def unless_waiting(active: Bool[Array, ""], new: PyTree, old: PyTree) -> PyTree:
     """`new`; in a batch, whose members wait for the slowest one, `old` where a member is not active any more."""
     return _unless_waiting(active, new, old)
 
@@ -113,38 +114,38 @@ def _(size, batched, active, new, old):
     return out, jax.tree.map(lambda _: True, out)
 
 
-def going(state: Any, numbers: dict[str, Any], program: Program) -> Any:
+def going(state: Any, numbers: dict[str, Any], program: Program) -> Bool[Array, ""]:
     """Whether a solve takes another step."""
     on = (state.tprev < numbers["t1"]) & diffrax.is_successful(state.result)
     return on if program.max_steps is None else on & (state.num_steps < program.max_steps)
 
 
-def any_member(flag: Any) -> Any:
+def any_member(flag: Bool[Array, ""]) -> Bool[Array, ""]:
     """Whether a flag is set for any member of the batch."""
     return unvmap_any(flag)
 
 
-def inexact(tree: Any) -> Any:
+def inexact(tree: PyTree) -> PyTree:
     """The leaves that can have derivatives."""
     return eqx.filter(tree, eqx.is_inexact_array)
 
 
-def rows(tree: Any, count: int) -> Any:
+def rows(tree: PyTree, count: int) -> PyTree:
     """A zero table with `count` rows like `tree`."""
     return jax.tree.map(lambda leaf: jnp.zeros((count, *jnp.shape(leaf)), jnp.result_type(leaf)), tree)
 
 
-def written(table: Any, index: Any, row: Any) -> Any:
+def written(table: PyTree, index: Int[Array, ""], row: PyTree) -> PyTree:
     """The table with a row set."""
     return jax.tree.map(lambda a, b: lax.dynamic_update_index_in_dim(a, b, index, 0), table, row)
 
 
-def read(table: Any, index: Any) -> Any:
+def read(table: PyTree, index: Int[Array, ""]) -> PyTree:
     """A row of the table."""
     return jax.tree.map(lambda a: lax.dynamic_index_in_dim(a, index, 0, keepdims=False), table)
 
 
-def apart(true: Any, function: Any, carry: Any, *args: Any) -> Any:
+def apart(true: Bool[Array, ""], function: Any, carry: PyTree, *args: PyTree) -> PyTree:
     """`function(carry, *args)`, which looks like the carry, as a computation of its own.
 
     XLA on CPU runs a computation in plain order if none of its arrays is larger than 512 bytes, and as a graph of tasks

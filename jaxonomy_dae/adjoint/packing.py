@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, PyTree, Shaped
 
 LARGEST = 512  # bytes, see `apart`
 
@@ -15,7 +16,7 @@ class Packing:
     Every array that a loop carries costs XLA on CPU some copies an iteration, whatever its size.
     """
 
-    def __init__(self, tree: Any):
+    def __init__(self, tree: PyTree):
         leaves, self.structure = jax.tree.flatten(tree)
         self.shapes = [jnp.shape(leaf) for leaf in leaves]
         unfilled: dict[Any, tuple[int, int]] = {}  # of each dtype, the vector being filled, and its bytes so far
@@ -30,7 +31,7 @@ class Packing:
             self.members[place].append(i)
             unfilled[dtype] = place, filled + size
 
-    def pack(self, tree: Any) -> list[Any]:
+    def pack(self, tree: PyTree) -> list[Shaped[Array, "..."]]:
         """The vectors."""
         leaves = jax.tree.leaves(tree)
         return [
@@ -38,7 +39,7 @@ class Packing:
             for inside in self.members
         ]
 
-    def unpack(self, vectors: list[Any]) -> Any:
+    def unpack(self, vectors: list[Shaped[Array, "..."]]) -> PyTree:
         """The tree."""
         leaves: list[Any] = [None] * len(self.shapes)
         for inside, vector in zip(self.members, vectors, strict=True):

@@ -5,6 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
 
 from .closure_conversion import Program, inexact
 from .private_names import clip_to_end, prevbefore
@@ -26,7 +27,7 @@ class StepTimes:
         self.wanted = [flag for flag, leaf in pairs if eqx.is_inexact_array(leaf)]
         self.count = sum(leaf.size for flag, leaf in zip(self.wanted, self.leaves, strict=True) if flag)
 
-    def seeds(self) -> Any:
+    def seeds(self) -> PyTree[Float[Array, "seeds ..."]]:
         """Derivatives of ((tprev, tnext, controller's state), (t1, controller)) at the start, shapes (seeds, ...)."""
         out, row = [], 0
         for wanted, leaf in zip(self.wanted, self.leaves, strict=True):
@@ -37,7 +38,7 @@ class StepTimes:
             out.append(hot.reshape(self.count, *leaf.shape))
         return jax.tree.unflatten(self.structure, out)
 
-    def split(self, total: Any) -> Any:
+    def split(self, total: Float[Array, " seeds"]) -> PyTree:
         """The seeds' cotangents where they belong, None elsewhere."""
         out, row = [], 0
         for wanted, leaf in zip(self.wanted, self.leaves, strict=True):
@@ -45,11 +46,11 @@ class StepTimes:
             row += leaf.size if wanted else 0
         return jax.tree.unflatten(self.structure, out)
 
-    def start(self) -> Any:
+    def start(self) -> PyTree[Float[Array, "seeds ..."]]:
         """The derivatives of (tprev, tnext, controller's state) at the start."""
         return self.seeds()[0] if self.count else ()
 
-    def after(self, state: Any, moves: Any) -> Any:
+    def after(self, state: Any, moves: PyTree[Float[Array, "seeds ..."]]) -> PyTree[Float[Array, "seeds ..."]]:
         """The same after the step that a state is about to attempt."""
         if not self.count:
             return ()

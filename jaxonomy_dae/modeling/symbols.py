@@ -7,6 +7,7 @@ symbol means is decided when the diagram is flattened, by integers. What a compo
 """
 
 import functools
+import sys
 from collections.abc import Hashable
 from typing import Any
 
@@ -18,7 +19,38 @@ from ..expressions.from_sympy import UnsupportedExpression, read, symbols_of
 from ..expressions.to_sympy import shortened, write
 
 
-class VariableSymbol(sympy.Symbol):
+class ComponentSymbol(sympy.Symbol):
+    """A symbol whose comparison with a number is refused: SymPy would say False, whatever the value will be."""
+
+    __slots__ = ()
+
+    def __eq__(self, other):
+        if isinstance(other, int | float):
+            _refuse(f"`{self} == {other}`", self, other)
+        return super().__eq__(other)
+
+    def __ne__(self, other):
+        if isinstance(other, int | float):
+            _refuse(f"`{self} != {other}`", self, other)
+        return super().__ne__(other)
+
+    __hash__ = sympy.Symbol.__hash__
+
+
+def _refuse(comparison: str, symbol: sympy.Symbol, number: Any):
+    """Raises a `ModelError` unless SymPy or this package compares symbols as what they are."""
+    caller, package = sys._getframe(1), __name__
+    while caller is not None and (package == __name__ or package.startswith(("jaxtyping", "beartype"))):
+        caller, package = caller.f_back, caller.f_globals.get("__name__", "")
+    if package.split(".")[0] not in ("sympy", __name__.split(".")[0]):
+        raise ModelError(
+            f"{comparison} compares the symbol, which has no value yet when equations are written: the answer would be "
+            f"the same whatever its value is. For a branch write Piecewise((a, Eq({symbol}, {number})), (b, True)), "
+            f"for an equation Eq({symbol}, {number})"
+        )
+
+
+class VariableSymbol(ComponentSymbol):
     """A variable, or its `order`-th time derivative, seen from one component."""
 
     __slots__ = ("order", "path")
@@ -37,7 +69,7 @@ class VariableSymbol(sympy.Symbol):
         return (self.path, self.order), {}
 
 
-class ParameterSymbol(sympy.Symbol):
+class ParameterSymbol(ComponentSymbol):
     """A parameter seen from one component."""
 
     __slots__ = ("path",)

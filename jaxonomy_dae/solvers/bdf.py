@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, Int
 
 from ..linear.choice import choose
 from .bdf_coefficients import Coefficients, coefficients, interpolate
@@ -43,19 +44,19 @@ class BDFInterpolation(diffrax.AbstractLocalInterpolation):
 class _State(eqx.Module):
     """What a step needs of those before it; names as in Brenan, Campbell & Petzold (1996)."""
 
-    phi: Any  # scaled divided differences, shape (ROWS, n)
-    psi: Any  # sums of past step sizes, shape (ROWS,)
-    order: Any  # of the step to come
-    last_order: Any
-    steady: Any  # steps taken with the same size and order
-    last_step: Any
-    planned: Any  # the next step's size, as proposed
+    phi: Float[Array, "rows n"]  # scaled divided differences
+    psi: Float[Array, " rows"]  # sums of past step sizes
+    order: Int[Array, ""]  # of the step to come
+    last_order: Int[Array, ""]
+    steady: Int[Array, ""]  # steps taken with the same size and order
+    last_step: Float[Array, ""]
+    planned: Float[Array, ""]  # the next step's size, as proposed
     starting: Any  # whether order and size still double and rise
     factor: Any
-    factor_cj: Any  # the coefficient the factorisation was made with
-    last_cj: Any
-    contraction: Any  # ρ/(1−ρ) of the last Newton iterations
-    counts: Any  # Jacobians (and factorisations), Newton iterations
+    factor_cj: Float[Array, ""]  # the coefficient the factorisation was made with
+    last_cj: Float[Array, ""]
+    contraction: Float[Array, ""]  # ρ/(1−ρ) of the last Newton iterations
+    counts: Int[Array, "2"]  # Jacobians (and factorisations), Newton iterations
     largest: Any  # of the determinants measured, each; None if there are none
 
 
@@ -256,12 +257,14 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         return problem.unravel(y1), problem.unravel(y_error), dense, new_state, result
 
 
-def ravel_like(y: Any) -> Any:
+def ravel_like(y: Any) -> Float[Array, " n"]:
     """A solution as one vector."""
     return ravel_pytree(y)[0]
 
 
-def _advance(phi: Any, e: Any, order: Any, max_order: int) -> Any:
+def _advance(
+    phi: Float[Array, "rows n"], e: Float[Array, " n"], order: Int[Array, ""], max_order: int
+) -> Float[Array, "rows n"]:
     """The differences after a step: φ*_k + e, and below it sums; e itself is kept where order k + 1 would read it."""
     rows = jnp.arange(ROWS, dtype=order.dtype)[:, None]
     inside = jnp.where(rows <= order, phi, 0) + jnp.where(rows == order, 1, 0) * e[None, :]

@@ -4,25 +4,26 @@ Brenan, Campbell & Petzold (1996), Numerical Solution of Initial-Value Problems 
 section 5.2. All arrays have one entry for each difference, orders 0 to 5; those above the order in use are masked.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float, Int
 
 
 class Coefficients(NamedTuple):
     """What a step of size h and order k multiplies differences with."""
 
-    psi: Any  # ψ_i(n+1): sums of the last i + 1 step sizes
-    beta: Any  # φ*_i = β_i φ_i
-    sigma: Any  # of the error estimates
-    gamma: Any  # y'_predicted = Σ γ_i φ*_i
-    upto: Any  # 1 for i ≤ k
-    leading: Any  # c_j: dy/dt = y'_predicted + c_j (y − y_predicted)
-    test: Any  # the error test is test·|y − y_predicted| ≤ 1
+    psi: Float[Array, " rows"]  # ψ_i(n+1): sums of the last i + 1 step sizes
+    beta: Float[Array, " rows"]  # φ*_i = β_i φ_i
+    sigma: Float[Array, " rows"]  # of the error estimates
+    gamma: Float[Array, " rows"]  # y'_predicted = Σ γ_i φ*_i
+    upto: Float[Array, " rows"]  # 1 for i ≤ k
+    leading: Float[Array, ""]  # c_j: dy/dt = y'_predicted + c_j (y − y_predicted)
+    test: Float[Array, ""]  # the error test is test·|y − y_predicted| ≤ 1
 
 
-def coefficients(h: Any, psi: Any, order: Any) -> Coefficients:
+def coefficients(h: Float[Array, ""], psi: Float[Array, " rows"], order: Int[Array, ""]) -> Coefficients:
     """The coefficients for a step of size h after steps with the sums `psi`."""
     rows = psi.shape[0]
     index = jnp.arange(rows, dtype=order.dtype)
@@ -41,7 +42,9 @@ def coefficients(h: Any, psi: Any, order: Any) -> Coefficients:
     return Coefficients(new, jnp.where(inside, beta, 1), sigma, gamma * mask, mask, -alpha_s / h, test)
 
 
-def interpolate(after: Any, psi: Any, order: Any) -> Any:
+def interpolate(
+    after: Float[Array, ""], psi: Float[Array, " rows"], order: Int[Array, ""] | Float[Array, ""]
+) -> Float[Array, " rows"]:
     """The weights of the differences in the solution at t_n + `after`."""
     rows = psi.shape[0]
     shifted = jnp.concatenate([jnp.zeros((1,), psi.dtype), psi[: rows - 2]])

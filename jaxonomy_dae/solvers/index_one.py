@@ -5,14 +5,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import lineax as lx
+from jaxtyping import Array, ArrayLike, Float
 
-from ..linear.choice import choose
+from ..linear.choice import LinearAlgebra, choose
 from .dae_term import FlatProblem
 
 
 def index_matrix(
-    problem: FlatProblem, linear: lx.AbstractLinearSolver | None, t: Any, y: Any
-) -> tuple[Any, Any, Any, Any]:
+    problem: FlatProblem, linear: lx.AbstractLinearSolver | None, t: Float[ArrayLike, ""], y: Float[Array, " n"]
+) -> tuple[LinearAlgebra, Float[Array, " n"], Any, Any]:
     """(linear algebra, F, ∂F/∂y, M − P ∂F/∂y): with P the projector onto the algebraic equations, the last is regular
     if and only if the index is 1."""
     chosen = choose(linear, y.shape[0], problem.pattern, problem.mass)
@@ -20,7 +21,9 @@ def index_matrix(
     return chosen, right, jacobian, chosen.index_matrix(problem.mass, jacobian)
 
 
-def consistent_slope(problem: FlatProblem, linear: lx.AbstractLinearSolver | None, t: Any, y: Any) -> Any:
+def consistent_slope(
+    problem: FlatProblem, linear: lx.AbstractLinearSolver | None, t: Float[ArrayLike, ""], y: Float[Array, " n"]
+) -> Float[Array, " n"]:
     """dy/dt at a consistent point: M y' = F in the differential equations, P (∂F/∂t + ∂F/∂y y') = 0 in the others."""
     if not problem.mass.is_singular:
         chosen, right, _, matrix = index_matrix(problem, linear, t, y)
@@ -31,7 +34,13 @@ def consistent_slope(problem: FlatProblem, linear: lx.AbstractLinearSolver | Non
     return chosen.solve(chosen.factor(matrix), matrix, b)
 
 
-def consistent_shift(problem: FlatProblem, linear: lx.AbstractLinearSolver | None, t: Any, y: Any, start: Any) -> Any:
+def consistent_shift(
+    problem: FlatProblem,
+    linear: lx.AbstractLinearSolver | None,
+    t: Float[ArrayLike, ""],
+    y: Float[Array, " n"],
+    start: Float[Array, " n"],
+) -> Float[Array, " n"]:
     """A Newton step onto the algebraic equations that leaves M y as it was at the start: zero at a consistent point.
 
     Large steps there and back would leave rounding errors in M y, so every step mends it.
@@ -42,8 +51,12 @@ def consistent_shift(problem: FlatProblem, linear: lx.AbstractLinearSolver | Non
 
 
 def consistent_point(
-    problem: FlatProblem, linear: lx.AbstractLinearSolver | None, t: Any, y: Any, max_steps: int = 50
-) -> tuple[Any, Any]:
+    problem: FlatProblem,
+    linear: lx.AbstractLinearSolver | None,
+    t: Float[ArrayLike, ""],
+    y: Float[Array, " n"],
+    max_steps: int = 50,
+) -> tuple[Float[Array, " n"], Float[Array, ""]]:
     """Newton's method onto the algebraic equations from y, M y left alone: the point, and the size of the last step.
 
     Differentiable by one exact step at the end.
@@ -68,7 +81,7 @@ def consistent_point(
     return found + consistent_shift(problem, linear, t, found, y), size
 
 
-def algebraic_part(problem: FlatProblem, v: Any) -> Any:
+def algebraic_part(problem: FlatProblem, v: Float[Array, " n"]) -> Float[Array, " n"]:
     """P v: the part in the algebraic equations."""
     p = jnp.asarray(problem.mass.algebraic, v.dtype)
     return p * v if problem.mass.is_diagonal else p @ v

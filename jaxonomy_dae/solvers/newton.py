@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ..adjoint.private_names import use_stepsize_tol
 from ..linear.choice import LinearAlgebra
@@ -37,30 +38,30 @@ class Tolerances(eqx.Module):
 class Solved(NamedTuple):
     """The outcome of `implicit_step`."""
 
-    y: Any
-    converged: Any
-    factor: Any
-    factor_cj: Any
-    contraction: Any
-    factorisations: Any
-    iterations: Any
+    y: Float[Array, " n"]
+    converged: Bool[Array, ""]
+    factor: Any  # as the linear algebra keeps it
+    factor_cj: Float[Array, ""]
+    contraction: Float[Array, ""]
+    factorisations: Int[Array, ""]
+    iterations: Int[Array, ""]
 
 
 def implicit_step(
     problem: FlatProblem,
     linear: LinearAlgebra,
-    t: Any,
-    predicted: Any,
-    slope: Any,
-    cj: Any,
+    t: Float[ArrayLike, ""],
+    predicted: Float[Array, " n"],
+    slope: Float[Array, " n"],
+    cj: Float[Array, ""],
     *,
-    weight: Any,
+    weight: Float[Array, " n"],
     norm: Callable[[Any], Any],
     max_iterations: int,
     factor: Any,
-    factor_cj: Any,
-    last_cj: Any,
-    contraction: Any,
+    factor_cj: Float[Array, ""],
+    last_cj: Float[Array, ""],
+    contraction: Float[Array, ""],
 ) -> Solved:
     """Solves M (slope + c_j (y − predicted)) = F(t, y).
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
+from jaxtyping import Array, Float
 
 from ..linear.choice import choose
 from .dae_term import FlatProblem
@@ -144,8 +145,8 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
         return problem.unravel(y1), problem.unravel(stages[-1]), dense, None, diffrax.RESULTS.successful
 
 
-def _combine(coefficients: np.ndarray, stages: list[Any]) -> Any:
-    total = None
+def _combine(coefficients: Float[np.ndarray, " k"], stages: list[Float[Array, " n"]]) -> Float[Array, " n"]:
+    total: Any = None
     for c, stage in zip(coefficients, stages, strict=False):
         if c:
             total = float(c) * stage if total is None else total + float(c) * stage

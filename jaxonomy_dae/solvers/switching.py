@@ -12,6 +12,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
 
 STIFF: Any = diffrax.RESULTS.nonlinear_divergence  # no other meaning where nothing implicit is solved
 BOUNDARY = 0.9 * 3.5  # of Tsit5's stability region along the negative real axis is at −3.5
@@ -29,11 +30,18 @@ class Watch(eqx.Module):
     end: Any
     floor: Any
 
-    def start(self) -> Any:
+    def start(self) -> Int[Array, ""]:
         """The count before the first step."""
         return jnp.zeros((), jnp.int32)
 
-    def after(self, count: Any, t0: Any, t1: Any, y: tuple[Any, Any], k: tuple[Any, Any]) -> Any:
+    def after(
+        self,
+        count: Int[Array, ""],
+        t0: Any,
+        t1: Any,
+        y: tuple[Float[Array, " n"], Float[Array, " n"]],
+        k: tuple[Float[Array, " n"], Float[Array, " n"]],
+    ) -> Int[Array, ""]:
         """The count after a step from t0 to t1, whose last two stages are at points y with increments k = h·f(y)."""
         weight = self.floor + jnp.abs(y[1])
         # One sum, not one for each norm: small steps cost what the kernels in them are.
@@ -41,6 +49,6 @@ class Watch(eqx.Module):
         limited = (excess > 0) & (self.end - t1 > MANY * (t1 - t0))
         return jax.lax.stop_gradient(jnp.where(limited, count + 1, jnp.maximum(count - 2, 0)))
 
-    def result(self, count: Any) -> Any:
+    def result(self, count: Int[Array, ""]) -> Any:
         """`STIFF` once enough steps in a row were limited."""
         return diffrax.RESULTS.where(count < PATIENCE, diffrax.RESULTS.successful, STIFF)

@@ -2,12 +2,12 @@
 
 import functools
 import operator
-from typing import Any
 
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from .switching import Watch
 
@@ -51,6 +51,6 @@ class Tsit5(diffrax.Tsit5):
         return y1, y_error, dict(y0=y0, y1=y1, k=jnp.stack(k)), (slope, count), result
 
 
-def _combine(coefficients: np.ndarray, k: list[Any]) -> Any:
+def _combine(coefficients: Float[np.ndarray, " stages"], k: list[Float[Array, " n"]]) -> Float[Array, " n"]:
     terms = [float(c) * slope for c, slope in zip(coefficients, k, strict=True) if c != 0]
     return functools.reduce(operator.add, terms)

@@ -4,8 +4,8 @@ from collections import OrderedDict
 from typing import NamedTuple
 
 from ..lowering.plan import SystemPlan
+from ..solvers.solve import SMALL
 
-SMALL = 30  # up to this many unknowns a factorisation costs less than the steps that a multistep method saves
 REMEMBERED = 256  # systems whose stiffness is kept in mind
 
 _stiffness: OrderedDict[str, bool] = OrderedDict()
