@@ -18,6 +18,8 @@ from jax.core import Tracer
 
 from ..errors import InitializationError
 from ..linear.least_squares import least_squares
+from ..linear.sparse import sparse_jacobian
+from ..linear.whole import solve_whole
 from ..lowering.gather import Gather, take
 from ..lowering.plan import SystemPlan
 from ..model.quantities import declared_scale, quantity_bounds
@@ -28,6 +30,7 @@ from .given_solver import find_root_with
 from .initial_values import check_initial
 from .ladder import FAILED, NOISE, STAGED, Sizes, find_root, tolerance
 from .rows import InitialRows, Row, initial_rows
+from .sparse_newton import SparseRows, sparse_newton, sparse_rows
 from .stages import solve_in_stages, stages
 
 PERTURBATIONS = 8  # of the start, and of parameters, that show the sizes of terms
@@ -108,12 +111,21 @@ def initialize(
         value = residual(w, *settings)
         return value if excused is None else jnp.where(excused > 0, 0, value)
 
+    full = jnp.concatenate([jnp.zeros((n_equations,), point.dtype), target])
+    bounds = _bounds(system, plan, unknown)
+    sparse = None if len(unknown) or solver is not None else sparse_rows(plan, rows)
+    if sparse is not None:
+        alone = np.append(np.ones(n_equations, bool), rows.independent)
+        return _large_point(
+            lambda w, moving: residual(w, *moving), settings, (parameters, inputs, target), start, sizes, sparse,
+            core, np.flatnonzero(alone & ~is_soft), np.flatnonzero(is_soft), bounds, full,
+        )  # fmt: skip
     staged = None if len(unknown) else stages(plan, rows)
     declared = start
     if staged is not None:
         start = frozen(solve_in_stages(function, start, sizes, *staged))
     if solver is None:
-        found = find_root(function, m, start, sizes, core, is_soft, _bounds(system, plan, unknown))
+        found = find_root(function, m, start, sizes, core, is_soft, bounds)
     else:
         found = find_root_with(solver, function, start, sizes, is_soft, core is not None or not rows.n_soft)
     if staged is not None:
@@ -142,11 +154,49 @@ def initialize(
         settled = np.isin(np.arange(m), n_equations + np.array(rows.settled, int))
         jacobian = jnp.where(settled[:, None], 0, jacobian)
         w = found.x - least_squares(jacobian * found.unit[None, :], jnp.where(good, remaining, 0)) * found.unit
-    full = jnp.concatenate([jnp.zeros((n_equations,), point.dtype), target])
     limit = jnp.where(is_soft, jnp.inf, found.limit)
     if excused is not None:
         limit = limit + excused
     return InitialPoint(w[:n], w[n:], remaining, limit, full, found.method, found.evaluations, found.jacobian)
+
+
+def _large_point(
+    residual: Callable[[Any, Any], Any], settings, moving, start, sizes: Sizes, sparse: SparseRows, core, hard, soft,
+    bounds, full,
+) -> InitialPoint:  # fmt: skip
+    """The point of a large sparse model: the ladder is climbed only where sparse Newton steps do not arrive, and what
+    carries the derivative is sparse unless guesses cannot all hold."""
+    frozen = jax.lax.stop_gradient
+    n, m = len(start), len(full)
+    is_soft = np.isin(np.arange(m), soft)
+
+    def function(w):
+        return residual(w, settings)
+
+    near = frozen(sparse_newton(function, start, sizes, sparse, bounds))
+
+    def climb(state):
+        found = find_root(function, m, start, sizes, core, is_soft, bounds)
+        return found.x, found.limit, found.method, found.evaluations, jnp.array(False)
+
+    # A loop, not a branch: what it closes over must stay out of batches.
+    state = near.x, near.limit, near.method, near.evaluations, ~near.holds
+    x, limit, method, evaluations, _ = frozen(jax.lax.while_loop(lambda state: state[-1], climb, state))
+    good = method < FAILED
+    remaining = residual(x, moving)
+    values = frozen(sparse_jacobian(function, sparse.pattern)(x))
+    step = solve_whole(sparse.square, values[sparse.inside], remaining[sparse.core], checked=False)
+    w = jnp.where(good, x - step, x)
+    if len(soft):
+
+        def some_cannot():
+            jacobian = jnp.where(good, sparse.pattern.dense(values), jnp.asarray(np.eye(m, n), start.dtype))
+            unit = jnp.where(sizes.known > 0, sizes.known, 1)
+            return _nearest_point(residual, settings, moving, x, jacobian, unit, sizes.soft, hard, soft, good)
+
+        all_hold = jnp.all(jnp.abs(frozen(remaining)) <= limit)
+        w, remaining = jax.lax.cond(all_hold, lambda: (w, remaining), some_cannot)
+    return InitialPoint(w, w[:0], remaining, jnp.where(is_soft, jnp.inf, limit), full, method, evaluations, None)
 
 
 def _rounding(residual: Callable[..., Any], settings, start: Any, sizes: Sizes, read: np.ndarray) -> Any:

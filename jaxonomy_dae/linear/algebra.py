@@ -49,6 +49,10 @@ class Dense(eqx.Module):
             return jnp.diag(m) - p[:, None] * jacobian
         return m - p @ jacobian
 
+    def row_sizes(self, jacobian: Any, y: Any) -> Any:
+        """|∂F/∂y| |y|: the sizes of the terms in each row of F."""
+        return jnp.abs(jacobian) @ jnp.abs(y)
+
     def materialise(self, matrix: Any) -> Any:
         """The matrix as an array, shape (n, n)."""
         return matrix
@@ -132,6 +136,10 @@ class Sparse(eqx.Module):
         """M − P·∂F/∂y with P the projector onto the algebraic equations: regular if and only if the index is 1."""
         p = jnp.asarray(mass.algebraic, jacobian.dtype)
         return jnp.concatenate([-p[self.pattern.rows] * jacobian, jnp.asarray(_diagonal(mass), jacobian.dtype)])
+
+    def row_sizes(self, jacobian: Any, y: Any) -> Any:
+        """|∂F/∂y| |y|: the sizes of the terms in each row of F."""
+        return self.pattern.multiply(jnp.abs(jacobian), jnp.abs(y))
 
     def materialise(self, matrix: Any) -> Any:
         """The matrix as an array, shape (n, n)."""

@@ -30,6 +30,10 @@ class ByLineax(eqx.Module):
         """M − P·∂F/∂y with P the projector onto the algebraic equations."""
         return self.storage.index_matrix(mass, jacobian)
 
+    def row_sizes(self, jacobian: Any, y: Any) -> Any:
+        """|∂F/∂y| |y|: the sizes of the terms in each row of F."""
+        return self.storage.row_sizes(jacobian, y)
+
     def materialise(self, matrix: Any) -> Any:
         """The matrix as an array, shape (n, n)."""
         return self.storage.materialise(matrix)

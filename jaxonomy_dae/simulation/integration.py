@@ -14,9 +14,9 @@ from ..solvers import BDF, DAETerm, Tsit5
 from ..solvers.choice_guard import ChoiceGuard
 from ..solvers.drive import integrate, is_implicit
 from ..solvers.projected import with_projection
+from ..solvers.rows import not_a_number, padded
 from ..solvers.switching import STIFF, Watch
 from ..system.system import AcausalSystem
-from .rows import not_a_number, padded
 from .step_sizes import first_step
 
 SAVED_ITERATIONS = 3

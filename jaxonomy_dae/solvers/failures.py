@@ -13,16 +13,24 @@ from .causes import cause_of, first_bad_row
 from .dae_term import FlatProblem
 from .index_one import algebraic_part, consistent_slope, index_matrix
 
+ROUNDING = 64.0  # errors of a row, in units of eps times its terms
 LARGE = 300  # unknowns up to which matrices are looked at
 SHOWN = 4
 
 
+INDEX = (
+    "the index is above 1, or the equations are {} at the start: they do not determine {}. Differentiate the "
+    "constraints, or write the model as a Component: jaxonomy_dae.AcausalCompiler reduces the index"
+)
+
+
 class StartCheck(eqx.Module):
-    """What `explain_start` reads: the residual of the algebraic equations, the step that would mend it in units of the
-    tolerance, and the matrix that is regular if the index is 1 (or None)."""
+    """What `explain_start` reads: the residual of the algebraic equations and what rounding may leave of it, the step
+    that would mend it in units of the tolerance, and the matrix that is regular if the index is 1 (or None)."""
 
     right: Any
     residual: Any
+    rounding: Any
     shift: Any
     matrix: Any
 
@@ -42,13 +50,16 @@ def start_check(problem: FlatProblem, t: Any, rtol: Any, atol: Any) -> StartChec
     problem_y = jax.lax.stop_gradient(problem.flat)
     if not problem.mass.is_singular:
         empty = jnp.zeros((0,), problem_y.dtype)
-        return StartCheck(problem.right(t, problem_y), empty, empty, None)
-    chosen, right, _, matrix = index_matrix(problem, None, t, problem_y)
+        return StartCheck(problem.right(t, problem_y), empty, empty, empty, None)
+    chosen, right, jacobian, matrix = index_matrix(problem, None, t, problem_y)
     residual = algebraic_part(problem, right)
     weight = rtol * jnp.abs(problem_y) + _flat(atol, problem_y)
     shift = chosen.apply(chosen.factor(matrix), matrix, residual) / weight
+    rounding = ROUNDING * float(jnp.finfo(problem_y.dtype).eps) * chosen.row_sizes(jacobian, problem_y)
+    if not problem.mass.is_diagonal:
+        rounding = jnp.abs(jnp.asarray(problem.mass.algebraic, problem_y.dtype)) @ rounding
     looked_at = chosen.materialise(matrix) if problem_y.shape[0] <= LARGE else None
-    return jax.lax.stop_gradient(StartCheck(right, residual, shift, looked_at))
+    return jax.lax.stop_gradient(StartCheck(right, residual, rounding, shift, looked_at))
 
 
 def _flat(atol: Any, like: Any) -> Any:
@@ -69,14 +80,13 @@ def explain_start(check: StartCheck, names: Sequence[str]) -> str:
     if check.matrix is not None:
         found = null_names(np.asarray(check.matrix), names)
         if found:
-            return (
-                f"the index is above 1, or the equations are singular at the start: they do not determine {found}. "
-                "Differentiate the constraints, or write the model as a Component: jaxonomy_dae.AcausalCompiler "
-                "reduces the index"
-            )
+            return INDEX.format("singular", found)
     shift = np.abs(np.asarray(check.shift))
     if shift.size and not shift.max(initial=0.0) <= 1:
         residual = np.abs(np.asarray(check.residual))
+        if (residual <= np.asarray(check.rounding)).all():  # they hold: what is wrong is the matrix
+            worst = np.argsort(-np.where(np.isfinite(shift), shift, np.inf))[:SHOWN]
+            return INDEX.format("nearly singular", ", ".join(f"'{names[k]}'" for k in worst))
         rows = [k for k in np.argsort(-residual)[:SHOWN] if residual[k] > 0]
         moved = [k for k in np.argsort(-np.where(np.isfinite(shift), shift, np.inf))[:SHOWN] if not shift[k] <= 1]
         return (

@@ -20,6 +20,7 @@ from .drive import integrate, is_multistep
 from .failures import SHOWN, StartCheck, explain_failure, explain_start, start_check
 from .index_one import consistent_point, consistent_shift
 from .rodas5p import Rodas5P
+from .rows import not_a_number
 from .solve_arguments import check_longest_step, check_times, jump_times, tolerance_of
 from .step_control import StepControl
 
@@ -63,7 +64,8 @@ def solve_dae(
     - `jump_ts`: times at which F jumps, a number or shape (n,): steps end there and the method starts anew.
     - `dtmax`: the longest step.
     - `names`: of the unknowns, in order, for error messages.
-    - `throw`: whether to raise if the start is inconsistent or the integration fails; otherwise see `solution.result`.
+    - `throw`: whether to raise if the start is inconsistent or the integration fails; otherwise see `solution.result`;
+        rows that were not reached are NaN, and so are their derivatives.
 
     **Returns:**
 
@@ -199,12 +201,14 @@ def _solve(term, t0, t1, y0, ts, args, tolerances, options, host_checks=False):
         max_steps=max_steps,
         host_checks=host_checks,
     )
+    reached = jnp.isfinite(run.ts)
     saved = run.ys if ts is None else _on_constraints(term, args, run.ts, run.ys, y0)
+    saved = jax.tree.map(lambda y: not_a_number(y, reached, y0, args), saved)
     failure: Any = diffrax.RESULTS.nonlinear_divergence
     result = diffrax.RESULTS.where(check.is_fine, run.result, failure)
     out = diffrax.Solution(
-        t0=t0, t1=t1, ts=run.ts, ys=saved, interpolation=None, stats=run.stats, result=result, solver_state=None,
-        controller_state=None, made_jump=None, event_mask=None,
+        t0=t0, t1=t1, ts=run.ts if ts is None else ts, ys=saved, interpolation=None, stats=run.stats, result=result,
+        solver_state=None, controller_state=None, made_jump=None, event_mask=None,
     )  # fmt: skip
     return check, out, run.last
 

@@ -1,0 +1,148 @@
+"""Newton's method for starts of large sparse models: a line search, and no dense matrix.
+
+Given the rows of initialization and where the entries of their Jacobian lie, returns the point at which all of them
+hold, guesses included, or says that it found none; then the ladder climbs on. A Jacobian costs as many directional
+derivatives as its pattern has colours, a step one factorization by KLU.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ..linear.choice import SPARSE_DENSITY, SPARSE_FROM
+from ..linear.sparse import SparsePattern, available, is_double, sparse_jacobian
+from ..linear.whole import solve_whole
+from ..lowering.plan import SystemPlan
+from ..lowering.schedule import SparseStep
+from .ladder import DECREASE, METHODS, NEWTON_LIMIT, NOISE, SHORTEST, Sizes, tolerance
+from .rows import InitialRows
+
+
+class SparseRows(NamedTuple):
+    """Where the entries of the Jacobian of all rows lie; as many rows as unknowns, none of which follows from others;
+    and their entries, as a square pattern."""
+
+    pattern: SparsePattern
+    core: Int[np.ndarray, " n"]
+    square: SparsePattern
+    inside: Int[np.ndarray, " entries"]
+
+
+class SparseFound(NamedTuple):
+    """The last point, the largest value of each row that counts as zero, whether all rows hold, an index into
+    `METHODS`, and the evaluations it took."""
+
+    x: Float[Array, " n"]
+    limit: Float[Array, " m"]
+    holds: Bool[Array, ""]
+    method: Int[Array, ""]
+    evaluations: Int[Array, ""]
+
+
+@functools.lru_cache(maxsize=64)
+def sparse_rows(plan: SystemPlan, rows: InitialRows) -> SparseRows | None:
+    """The pattern of the rows; None if dense algebra will do, or must."""
+    n, equations = plan.n_state, plan.n_constraints + len(plan.carried)
+    core = np.append(np.ones(equations, bool), rows.independent).nonzero()[0]
+    if rows.n_soft and any(isinstance(step, SparseStep) and step.linear for step in plan.steps):
+        return None  # the nearest point to guesses is a branch, and batches cannot have sparse solves in one
+    if n < SPARSE_FROM or len(core) != n or not (is_double() and available()):
+        return None
+    if (plan.n_constraints and plan.constraint_pattern is None) or (len(plan.carried) and plan.dae_pattern is None):
+        return None
+    place = {int(q): k for k, q in enumerate((*plan.states, *plan.carried))}
+    if not all(row.quantity in place for row in rows.kept):
+        return None
+    reads = [sorted(read) for read in plan.constraint_pattern or ()] if plan.n_constraints else []
+    lengths = [len(read) for read in reads]
+    row = [np.repeat(np.arange(len(reads)), lengths)]
+    column = [np.array([c for read in reads for c in read], np.int64)]
+    if len(plan.carried) and plan.dae_pattern is not None:
+        below = plan.dae_pattern.rows >= len(plan.states)
+        row.append(plan.dae_pattern.rows[below] - len(plan.states) + len(reads))
+        column.append(plan.dae_pattern.cols[below])
+    row.append(equations + np.arange(len(rows.kept)))
+    column.append(np.array([place[r.quantity] for r in rows.kept], np.int64))
+    pattern = SparsePattern(np.concatenate(row), np.concatenate(column), n, equations + len(rows.kept))
+    if pattern.density > SPARSE_DENSITY:
+        return None
+    number = np.full(pattern.n_rows, -1)
+    number[core] = np.arange(n)
+    inside = np.flatnonzero(number[pattern.rows] >= 0)
+    return SparseRows(pattern, core, SparsePattern(number[pattern.rows[inside]], pattern.cols[inside], n), inside)
+
+
+def sparse_newton(
+    function: Callable[[Any], Any],
+    start: Float[Array, " n"],
+    sizes: Sizes,
+    rows: SparseRows,
+    bounds: Float[np.ndarray, "n 2"],
+) -> SparseFound:
+    """Newton's method from `start`, steps halved until the residual falls and no bound is crossed."""
+    dtype = start.dtype
+    eps, enough = float(jnp.finfo(dtype).eps), tolerance(dtype)
+    close = min(1e3 * eps, 0.1 * enough)
+    low, high = jnp.asarray(bounds.T, dtype)
+    start = jnp.clip(start, low, high)
+    unit = jnp.where(sizes.known > 0, sizes.known, 1)
+    jacobian = sparse_jacobian(function, rows.pattern)
+
+    def evaluate(x):
+        value, values = jax.lax.stop_gradient((function(x), jacobian(x)))
+        magnitude = jnp.where(jnp.isfinite(values), jnp.abs(values), 0)
+        reach = jnp.maximum(jnp.abs(x), sizes.nominal)
+        size = rows.pattern.multiply(magnitude, reach) + sizes.data
+        noise = NOISE * eps * (rows.pattern.multiply(magnitude, jnp.maximum(unit, reach)) + sizes.data)
+        return value, values, size, noise
+
+    def largest(values):
+        magnitude = jnp.abs(values) * unit[rows.pattern.cols]
+        found = jnp.zeros(rows.pattern.n_rows, dtype).at[rows.pattern.rows].max(magnitude)
+        return 1 / jnp.where((found > 0) & (found < jnp.inf), found, 1)
+
+    def merit_of(value, weight):
+        return jnp.sqrt(jnp.sum((weight * value)[rows.core] ** 2))
+
+    def newton_step(value, values):
+        return -solve_whole(rows.square, values[rows.inside], value[rows.core], checked=False)
+
+    value, values, size, noise = evaluate(start)
+    weight = largest(values)
+
+    def body(state):
+        base, value, values, step, merit, fraction, count, _ = state
+        trial = base + fraction * step
+        trial_value, trial_values, size, noise = evaluate(trial)
+        trial_merit = merit_of(trial_value, weight)
+        inside = jnp.all((trial >= low) & (trial <= high))
+        arrived = jnp.all(jnp.abs(trial_value) <= close * size + noise) & inside
+        accepted = arrived | (inside & (trial_merit < (1 - DECREASE * fraction) * merit))
+
+        moved = trial, trial_value, trial_values, newton_step(trial_value, trial_values), trial_merit
+        # Not a branch: what it closes over must stay out of batches.
+        base, value, values, step, merit = (
+            jnp.where(accepted, a, b) for a, b in zip(moved, (base, value, values, step, merit), strict=True)
+        )
+        fraction = jnp.where(accepted, jnp.minimum(1.0, 4 * fraction), 0.5 * fraction)
+        return base, value, values, step, merit, fraction, count + 1, arrived
+
+    def going(state):
+        *_, step, _, fraction, count, done = state
+        return ~done & (fraction >= SHORTEST) & (count < NEWTON_LIMIT) & jnp.all(jnp.isfinite(step))
+
+    done = jnp.all(jnp.abs(value) <= close * size + noise)
+    step = newton_step(value, values)
+    state = (start, value, values, step, merit_of(value, weight), jnp.ones((), dtype), jnp.ones((), jnp.int32), done)
+    x, value, values, *_, evaluations, _ = jax.lax.while_loop(going, body, state)
+    magnitude = jnp.abs(values)
+    reach = jnp.maximum(jnp.abs(x), sizes.nominal)
+    noise = NOISE * eps * (rows.pattern.multiply(magnitude, jnp.maximum(unit, reach)) + sizes.data)
+    limit = enough * (rows.pattern.multiply(magnitude, reach) + sizes.data) + noise
+    method = jnp.where(evaluations > 1, METHODS.index("Newton"), 0).astype(jnp.int32)
+    return SparseFound(x, limit, jnp.all(jnp.abs(value) <= limit), method, evaluations)
