@@ -96,9 +96,9 @@ def folded():
 
 
 FOLDED = (
-    "the integration stopped at t=4: no step was short enough to be accepted. Changing fastest there: 'cell.z' = 1, "
-    "'cell.x' = -2. Look for a pole, a turning point, a jump (jump_ts= names their times), or a root or logarithm "
-    "without a value just beyond."
+    "the integration stopped at t=4: no step was short enough to be accepted. The nonlinear equation for 'cell.z' = 1 "
+    "has no solution just beyond: Newton's method does not converge from these values (a turning point, at which two "
+    "solutions meet and end; a jump to another branch; or a law without a solution).\n  cell: 0 = -x + z**3 - 3*z"
 )
 
 
