@@ -8,7 +8,8 @@ from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der
 from jaxonomy_dae.compiler.null_vectors import cancels, left_null_vectors
 from jaxonomy_dae.compiler.select_states import _is_singular
 from jaxonomy_dae.errors import InitializationError, StructuralError
-from jaxonomy_dae.initialization.singular_blocks import ILL_CONDITIONED, _conditions
+from jaxonomy_dae.initialization.block_finding import ILL_CONDITIONED
+from jaxonomy_dae.initialization.condition import conditions
 from jaxonomy_dae.model.scaling import geometric_scales
 
 
@@ -38,8 +39,8 @@ def _chain(n: int, seed: int, singular: bool) -> tuple[np.ndarray, np.ndarray]:
 def test_units_do_not_decide_a_rank(n, seed):
     regular, _ = _chain(n, seed, singular=False)
     singular, null = _chain(n, seed, singular=True)
-    assert _conditions(regular[None])[0][0] < ILL_CONDITIONED
-    assert not _conditions(singular[None])[0][0] < ILL_CONDITIONED
+    assert conditions(regular[None])[0][0] < ILL_CONDITIONED
+    assert not conditions(singular[None])[0][0] < ILL_CONDITIONED
     assert not _is_singular(regular) and _is_singular(singular)
     assert left_null_vectors(regular) == []
     (found,) = left_null_vectors(singular)

@@ -83,7 +83,7 @@ class ModelNumbers:
                 parent = "the diagram" if component.parent is None else f"'{component.parent.path}'"
                 raise ModelError(
                     f"component '{self.paths[k]}' was given an expression in the parameter '{path[3:]}', which is not "
-                    f"known in {parent}, where the component is: add it where its parameters are"
+                    f"known in {parent}, where the component was added: add it where that parameter is declared"
                 )
             raise ModelError(
                 f"component '{self.paths[k]}': the symbol '{path}' in its equations is not a parameter of it or of a "

@@ -11,10 +11,11 @@ from ..lowering.schedule import SparseStep
 from ..model.tables import ZERO
 from ..system.sections import SHOWN, Sections, some
 from ..system.system_at import input_values
+from .block_finding import ILL_CONDITIONED, BlockFinding
 from .initialize import InitialPoint, is_consistent
 from .ladder import FAILED, METHODS, NEAREST, tolerance
 from .rows import Row, initial_rows, supports
-from .singular_blocks import ILL_CONDITIONED, BlockFinding, examine_blocks
+from .singular_blocks import examine_blocks
 
 WORST = 5
 CONDITION_LIMIT = 500  # unknowns up to which the condition of the initial equations is computed
@@ -47,6 +48,7 @@ class Residual(NamedTuple):
     text: str
     variables: tuple[str, ...]
     value: float
+    is_start: bool = False
 
 
 class InitializationReport(Sections):
@@ -149,7 +151,8 @@ class InitializationReport(Sections):
         order = np.argsort(np.where(np.isfinite(ratio), -ratio, -np.inf), kind="stable")
         described = self._described()
         chosen = [int(k) for k in order if not size[k] <= self._limit[k]]
-        return [Residual(described[k][0], described[k][1], float(self._residual[k])) for k in chosen]
+        equations = len(self._residual) - len(self._rows.kept)
+        return [Residual(*described[k], float(self._residual[k]), is_start=k >= equations) for k in chosen]
 
     def _described(self) -> list[tuple[str, tuple[str, ...]]]:
         """The text and the variables of every row, as `initialize` orders them."""
@@ -246,7 +249,7 @@ class InitializationReport(Sections):
             )
         lines = ["no consistent initial point was found; what does not hold, worst first:"]
         for r in self.residuals[:WORST]:
-            variables = "" if r.text.startswith("start of ") else f", in {some(r.variables)}"
+            variables = "" if r.is_start else f", in {some(r.variables)}"
             lines.append(f"  {r.text}{variables}: off by {abs(r.value):.3g}")
         if len(self.residuals) > WORST:
             lines.append(f"  … and {len(self.residuals) - WORST} more")

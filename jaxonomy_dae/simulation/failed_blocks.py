@@ -11,7 +11,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from ..initialization.singular_blocks import BlockFinding, examine_blocks
+from ..initialization.block_finding import BlockFinding
+from ..initialization.singular_blocks import examine_blocks
 from ..lowering.schedule import AnyStep, SparseStep
 from ..model.tables import ZERO
 from ..solvers.dae_term import FlatProblem

@@ -1,0 +1,20 @@
+"""What is found out about blocks that are singular, or nearly so."""
+
+import dataclasses
+
+DENSE_LIMIT = 200  # unknowns up to which a block gets a singular value decomposition
+ILL_CONDITIONED = 1e12
+
+
+@dataclasses.dataclass(frozen=True)
+class BlockFinding:
+    """A block that is singular, or nearly so: the variables it leaves open, the equations that depend on each other,
+    and the parameters and variables that make it so, with their values."""
+
+    condition: float
+    singular: bool
+    size: int
+    variables: tuple[str, ...]
+    equations: tuple[str, ...]
+    causes: tuple[tuple[str, float], ...]
+    causes_are_parameters: bool

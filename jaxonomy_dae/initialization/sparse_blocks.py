@@ -1,0 +1,81 @@
+"""Large blocks that are singular at a point, examined by a sparse factorization."""
+
+import numpy as np
+import scipy.sparse as sp
+
+from ..lowering.plan import SystemPlan
+from ..lowering.schedule import SparseStep
+from ..model.scaling import equilibrated, geometric_scales
+from .block_finding import DENSE_LIMIT, ILL_CONDITIONED, BlockFinding
+from .block_values import BlockValues
+from .condition import factored, null_vectors
+
+
+def sparse_finding(plan: SystemPlan, values: BlockValues, step: SparseStep) -> BlockFinding | None:
+    """What is wrong with a sparse block, whose unknowns are solved for on the way if it is linear."""
+    n = step.n
+    column = np.full(len(values.quantities), -1)  # ZERO is −1: the last entry
+    column[step.unknown[0]] = np.arange(n)
+    texts = np.concatenate([equation.equation for equation in step.equations])
+    rows, columns, entries = [], [], []
+    if not step.carried:
+        values.quantities[step.unknown[0]] = 0.0
+    first = 0
+    for equation in step.equations:
+        partials = values.partials(equation)
+        for k, slot in enumerate(equation.slots):
+            inside = np.flatnonzero(column[slot.quantity] >= 0)
+            rows.append(first + inside)
+            columns.append(column[slot.quantity[inside]])
+            entries.append(partials[inside, k])
+        first += len(equation.equation)
+    matrix = sp.csc_array((np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))), shape=(n, n))
+    if not np.isfinite(matrix.data).all():
+        return None  # what is not finite has another cause than rank
+    scaled, left_scale, right_scale = equilibrated(matrix)
+    factors, condition = factored(sp.csc_array(scaled))
+    if not condition < ILL_CONDITIONED:  # perhaps for want of better scaling
+        r, c = geometric_scales(matrix)
+        better, more_left, more_right = equilibrated(sp.diags_array(r) @ matrix @ sp.diags_array(c))
+        found, least = factored(sp.csc_array(better))
+        if least < condition:
+            scaled, factors, condition = better, found, least
+            left_scale, right_scale = r * more_left, c * more_right
+    scaled = sp.csc_array(scaled)
+    if factors is not None and not step.carried:
+        residual = np.concatenate([values.residual(e) for e in step.equations])
+        values.quantities[step.unknown[0]] = right_scale * factors.solve(-left_scale * residual)
+    if condition < ILL_CONDITIONED:
+        return None
+    left, right = null_vectors(scaled)
+    chosen = np.flatnonzero(np.abs(right) > 1e-3 * np.abs(right).max())
+    dependent = np.flatnonzero(np.abs(left) > 1e-3 * np.abs(left).max())
+    left, right = left_scale * left, right_scale * right
+    names = tuple(plan.quantity_name[int(step.unknown[0][k])] for k in chosen)
+    equations = tuple(dict.fromkeys(plan.describe(int(texts[k])) for k in dependent))
+    singular = not condition < 1 / (4 * n * np.finfo(float).eps)
+    causes = _causes(plan, values, step, column, left, right) if singular else ()
+    return BlockFinding(condition, singular, n, names, equations, causes, bool(causes))
+
+
+def _causes(
+    plan: SystemPlan, values: BlockValues, step: SparseStep, column: np.ndarray, left: np.ndarray, right: np.ndarray
+) -> tuple[tuple[str, float], ...]:
+    """The parameters p a change of which makes the block regular: uᵀ·∂J/∂p·v ≠ 0 for the null vectors u and v."""
+    effect = np.zeros(len(values.parameters))
+    first = 0
+    for equation in step.equations:
+        u = left[first : first + len(equation.equation)]
+        first += len(u)
+        columns = [column[slot.quantity] for slot in equation.slots]
+        v = np.stack([np.where(c >= 0, right[c], 0.0) for c in columns], axis=-1)
+        before = values.partials(equation)
+        for j in range(equation.parameter.shape[1]):
+            p = equation.parameter[:, j]
+            moved = values.parameters.copy()
+            moved[p] += 1e-3 * np.where(moved[p] == 0, 1.0, np.abs(moved[p]))
+            change = values.partials(equation, moved) - before
+            np.add.at(effect, p, u * (change * v).sum(axis=1))
+    size = np.abs(np.where(np.isfinite(effect), effect, np.inf))
+    found = np.flatnonzero(size > 1e-6 * size.max(initial=0.0))[:DENSE_LIMIT]
+    return tuple((plan.flat.parameters.names[p], float(values.parameters[p])) for p in found)
