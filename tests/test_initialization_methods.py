@@ -10,6 +10,7 @@ from problems import compiled, pendulum
 from sympy import Eq, atan
 
 from jaxonomy_dae import Component, EqnEnv, InitializationError, ModelError, der, simulate
+from jaxonomy_dae.initialization import initialize as initialization
 from jaxonomy_dae.initialization.initialize import find_initial, is_consistent
 from jaxonomy_dae.initialization.ladder import METHODS, Sizes, find_root
 
@@ -244,3 +245,20 @@ def test_a_chain_of_high_index_starts_one_block_after_the_other():
     names = ["c.x1", "c.l1", "c.x2", "c.l2", "c.x3"]
     expected = [np.sqrt(1 - y1**2), first, np.sqrt(length**2 - y2**2), second, np.sqrt((1 + 0.1 * second) ** 2 - y3**2)]
     np.testing.assert_allclose(system.observe(names, 0.0, x), expected, rtol=1e-12)
+
+
+class Circle(Component):
+    """x³ + y³ + x = r, y − x³ + y³ = 2·r, r' = −r."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        x, y, r = (self.variable(k, start=1.0) for k in "xyr")
+        self.add_equations(Eq(x**3 + y**3 + x, r), Eq(y - x**3 + y**3, 2 * r), der(r) + r)
+
+
+def test_the_last_step_is_checked(monkeypatch):
+    """The step that carries the derivative once went from a root to 1e272, unseen."""
+    assert np.isfinite(compiled(Circle(EqnEnv(), "sound")).initialize()).all()
+    monkeypatch.setattr(initialization, "least_squares", lambda matrix, right: 1e3 + 0 * (right @ matrix))
+    with pytest.raises(InitializationError, match="no consistent initial point"):
+        compiled(Circle(EqnEnv(), "broken")).initialize(initial={"broken.r": 2.0})

@@ -152,11 +152,16 @@ def initialize(
         remaining = residual(found.x, parameters, inputs, target)
         # What rounding leaves of the gradient of a row that no unknown moves would count as much as other rows.
         settled = np.isin(np.arange(m), n_equations + np.array(rows.settled, int))
-        jacobian = jnp.where(settled[:, None], 0, jacobian)
-        w = found.x - least_squares(jacobian * found.unit[None, :], jnp.where(good, remaining, 0)) * found.unit
+        jacobian = jnp.where(settled[:, None], 0, jacobian) * found.unit[None, :]
+        step = least_squares(jacobian, jnp.where(good, remaining, 0))
+        w = found.x - step * found.unit
     limit = jnp.where(is_soft, jnp.inf, found.limit)
     if excused is not None:
         limit = limit + excused
+    if not rows.n_soft:  # what held still does, though redundant rows that differ by rounding share the difference
+        held = jnp.abs(frozen(remaining)) <= limit
+        kept = jnp.abs(frozen(remaining - jacobian @ step)) <= limit / tolerance(point.dtype) ** 0.5
+        w = jnp.where(good & jnp.any(held & ~kept), jnp.nan, w)
     return InitialPoint(w[:n], w[n:], remaining, limit, full, found.method, found.evaluations, found.jacobian)
 
 
