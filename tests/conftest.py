@@ -1,6 +1,8 @@
 """Settings every test relies on. They must be made before `jaxonomy_dae` is first imported."""
 
+import gc
 import os
+from pathlib import Path
 
 import hypothesis
 import jax
@@ -18,6 +20,18 @@ jaxtyping.install_import_hook("jaxonomy_dae", "beartype.beartype")
 # The same examples in every run, and no deadline: the first call of a jitted function compiles it.
 hypothesis.settings.register_profile("deterministic", derandomize=True, deadline=None, database=None)
 hypothesis.settings.load_profile("deterministic")
+
+MAPPINGS = Path("/proc/self/maps")  # on Linux
+MOST_MAPPINGS = 20_000  # a third of what Linux allows by default
+
+
+@pytest.fixture(autouse=True)
+def room_for_compiled_programs():
+    """Compiled programs are memory mappings; XLA crashes where it gets no more of them."""
+    yield
+    if MAPPINGS.exists() and MAPPINGS.read_bytes().count(b"\n") > MOST_MAPPINGS:
+        jax.clear_caches()
+        gc.collect()
 
 
 def pytest_addoption(parser):

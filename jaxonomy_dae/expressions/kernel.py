@@ -163,6 +163,8 @@ def _sum(start: Any, coefficients: Sequence[Any]) -> _Operation:
         total = start if begins else None
         for k, c in scaled:
             term = terms[k]
+            if _is_nought(term):
+                continue
             if total is None:
                 total = term if c == 1 else -term if c == -1 else c * term
             elif c == 1:
@@ -171,9 +173,16 @@ def _sum(start: Any, coefficients: Sequence[Any]) -> _Operation:
                 total = total - term
             else:
                 total = total + c * term
+        if total is None:
+            return start
         return total if begins or start == 0 else total + start
 
     return function
+
+
+def _is_nought(value: Any) -> bool:
+    """Whether a value is the number zero when a program is traced: an unknown whose share is taken out."""
+    return isinstance(value, float) and value == 0.0
 
 
 def _product(exponents: Sequence[Any], xp: Any) -> _Operation:
@@ -188,6 +197,8 @@ def _product(exponents: Sequence[Any], xp: Any) -> _Operation:
 
     def function(*bases: Any) -> Any:
         over, under = None, None
+        if any(_is_nought(base) and exponent > 0 for base, exponent in zip(bases, exponents, strict=True)):
+            return 0.0
         for base, exponent in zip(bases, exponents, strict=True):
             if exponent > 0:
                 value = raised(base, exponent)

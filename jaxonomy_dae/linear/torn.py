@@ -17,6 +17,10 @@ Three things keep the result right (Skeel 1980, Math. Comp. 35:817; Higham 2002,
    the unknowns are of very different sizes, the same in the norm of the matrix with rows and columns equilibrated.
    Where neither holds, x is not-a-number: a loud failure, not a wrong number.
 
+Where there is one tearing variable z, and no u depends on another u other than by plain numbers that do not enlarge
+it, none of this is needed: S, L⁻¹ c and L⁻¹ F are sums of products of entries, so that their rounding is that of
+relative changes of the entries by a few eps. All that is left to check is that S is more than rounding left of its terms.
+
 Entries are scalars or arrays of one shape (a batch of blocks); which are zero is known when the program is traced.
 Derivatives are those of x = A⁻¹ b, from solves by the same elimination.
 """
@@ -35,6 +39,7 @@ from .written_out import UNROLLED, inverse
 CORRECTIONS = 2  # the second one for blocks in which errors can grow over several links
 TOLERATED = 2.0**20  # residual of an equation in units of eps times its terms: 2e-10 in double precision
 TOLERATED_NORM = 2.0**8  # the same in the equilibrated norm: 6e-14, what elimination with pivoting may leave
+TOLERATED_LOSS = 2.0**8  # the least that may be left of the terms of S, in units of eps
 
 Entries = Mapping[tuple[int, int], Any]
 
@@ -108,6 +113,8 @@ class _Elimination:
         # The same for the transpose, in which equations and unknowns change places.
         self.depth_transposed = self._depths([(u, e) for e, u in reversed(tearing.sequence)], self.columns)
         self.can_grow = max(self.depth.values(), default=0) > 1
+        self.exact = m == 1 and not self.can_grow
+        self.exact_transposed = self.exact and max(self.depth_transposed.values(), default=0) <= 1
         # W = −L⁻¹ F, by unknowns.
         self.w: dict[int, Any] = {}
         for e, u in tearing.sequence:
@@ -117,6 +124,8 @@ class _Elimination:
         schur = [self._row_of_schur(e) for e in tearing.residuals]
         if self.written_out:
             dense = [[self._filled(row.get(j, 0.0)) for j in range(m)] for row in schur]
+            if self.exact:
+                dense[0][0] = self._more_than_rounding(dense[0][0])
             self.inverse = inverse(dense) if m > 1 else [[1 / dense[0][0]]]
         else:
             dense = jnp.stack([jnp.moveaxis(row, 0, -1) for row in schur], axis=-2)  # (*batch, m, m)
@@ -128,11 +137,29 @@ class _Elimination:
 
     @staticmethod
     def _depths(sequence: Sequence[tuple[int, int]], rows: list[list[tuple[int, Any]]]) -> dict[int, int]:
-        """How many links each unknown of the sequence is away from the tearing variables."""
+        """How many links each unknown of the sequence is away from the tearing variables.
+
+        An equation that gives it by plain numbers, none of which enlarge what is known, is not a link.
+        """
         depth: dict[int, int] = {}
         for e, u in sequence:
-            depth[u] = 1 + max((depth.get(v, 0) for v, _ in rows[e] if v != u), default=0)
+            known = [(v, a) for v, a in rows[e] if v in depth]
+            link = 1
+            if all(isinstance(a, int | float) for v, a in rows[e] if v in depth or v == u):
+                pivot = next(abs(a) for v, a in rows[e] if v == u)
+                link = int(sum(abs(a) for _, a in known) > pivot)
+            depth[u] = max([1, *(depth[v] + link for v, _ in known)])
         return depth
+
+    def _more_than_rounding(self, schur: Any) -> Any:
+        """The only entry of S, or not-a-number where it is what rounding left of its terms."""
+        sizes: dict[int, Any] = {self.tearing.tearing[0]: 1.0}  # |L⁻¹| |F|
+        for e, u in self.tearing.sequence:
+            terms = [_product(abs(a), sizes[v]) for v, a in self.rows[e] if v in sizes]
+            sizes[u] = _product(abs(self.over_pivot[u]), _total(terms, None)) if terms else 0.0
+        (e,) = self.tearing.residuals
+        size = _total([_product(abs(a), sizes[v]) for v, a in self.rows[e]], None)
+        return jnp.where(abs(schur) > TOLERATED_LOSS * float(jnp.finfo(self.like.dtype).eps) * size, schur, jnp.nan)
 
     # Rows over the tearing variables: {place: entry} where few, an array of shape (m, *batch) where many.
 
@@ -193,6 +220,8 @@ class _Elimination:
             _less(b[e], [_product(a, x[v]) for v, a in self.rows[e] if x[v] is not None]) for e in tearing.residuals
         ]
         follow(self._schur_solve(rest, transposed=False))
+        if self.exact:
+            return x
         for k in range(self.corrections):
             missing = [_less(b[e], [_product(a, x[v]) for v, a in self.rows[e]]) for e in tearing.residuals]
             change = self._schur_solve(missing, transposed=False)
@@ -233,6 +262,8 @@ class _Elimination:
                 total = total + self.w[u] * g[u]
             s = list(total)
         follow(self._schur_solve(s, transposed=True), g)
+        if self.exact_transposed:
+            return y
         for _ in range(self.corrections):
             missing = [_less(g[u], [_product(a, y[r]) for r, a in self.columns[u]]) for u in tearing.tearing]
             kept = list(y)

@@ -48,7 +48,7 @@ class LinearTemplate(AbstractTemplate):
     def residual(self, slots, parameters, coefficients, t, networks, backend="jax"):
         total = 0.0
         for c, s in zip(coefficients, slots, strict=True):
-            total = total + _scaled(c, s)
+            total = total + scaled(c, s)
         return total
 
     def partial_values(self, slots, parameters, coefficients, t, networks, backend="jax"):
@@ -59,12 +59,13 @@ class LinearTemplate(AbstractTemplate):
         total = None
         for k, s in enumerate(slots):
             if k != position:
-                term = _scaled(-coefficients[k] / divisor, s)
+                term = scaled(-coefficients[k] / divisor, s)
                 total = term if total is None else total + term
         return 0.0 if total is None else total
 
 
-def _scaled(c: Any, s: Any) -> Any:
+def scaled(c: Any, s: Any) -> Any:
+    """c·s for a numeric coefficient, a number or one for each instance."""
     if np.ndim(c) == 0:
         if c == 1:
             return s

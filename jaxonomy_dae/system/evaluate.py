@@ -13,6 +13,7 @@ or is not-a-number: an iteration that diverged, cycles, or rests where |r| is sm
 import copy
 import enum
 import functools
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -26,6 +27,7 @@ from ..linear.written_out import UNROLLED, solve, solve_dense
 from ..lowering.gather import Chunk, Gather, take
 from ..lowering.program import PlannedEquation, PlannedLoop, PlannedSparse, PlannedStep, Program
 from ..model.evaluate_numpy import Networks
+from ..model.linear_template import scaled
 
 UNROLLED_REPETITIONS = 4  # of a loop, written out in each of its iterations
 LONG_SUM = 16  # linear equations with more terms are one gather and one sum
@@ -312,9 +314,8 @@ class Evaluation:
             if len(outside) > LONG_SUM:
                 rest = self._long_sum(planned, outside, equation.coefficient[:, outside])
             else:
-                rest = functools.reduce(
-                    lambda total, k: total + self._constant(coefficients[k]) * arguments[0][k], outside, 0.0
-                )
+                terms = [scaled(coefficients[k], arguments[0][k]) for k in outside]
+                rest = functools.reduce(operator.add, terms) if terms else 0.0
         else:
             rest = template.residual(*arguments)
             # A network's output stands alone, its inputs are outside.
