@@ -7,6 +7,7 @@ import itertools
 
 import jax
 import jax.numpy as jnp
+import mpmath
 import numpy as np
 import pytest
 
@@ -14,7 +15,7 @@ from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der
 from jaxonomy_dae.library.electrical import Capacitor, Ground, Resistor, VoltageSource
 from jaxonomy_dae.linear.torn import solve_torn
 from jaxonomy_dae.linear.written_out import solve, solve_dense
-from jaxonomy_dae.structure.tearing import LINKS, Sizes, tear
+from jaxonomy_dae.structure.tearing import LINKS, Sizes, Tearing, tear
 
 # --- the solver of torn blocks ------------------------------------------------------------------------------------
 
@@ -141,6 +142,58 @@ def test_derivatives_of_a_block(n):
     exact = np.outer(inverse.T @ a_dot.T @ y, x) + np.outer(y, inverse @ a_dot @ x)
     exact = np.where(pattern, exact, 0.0)
     np.testing.assert_allclose(second, exact, rtol=0, atol=1e-10 * np.abs(exact).max())
+
+
+def arrow(rng, n):
+    """Equations that give unknowns from one tearing variable, some of them by plain numbers from others as well."""
+    a, numbers = np.zeros((n, n)), np.zeros((n, n), bool)
+    a[np.arange(n - 1), np.arange(n - 1)] = rng.normal(size=n - 1)
+    a[:, -1] = rng.normal(size=n) * (rng.random(n) < 0.7)
+    a[-1] = rng.normal(size=n)
+    a[0, -1] = 1.3
+    for e in range(1, n - 1):
+        if rng.random() < 0.5:
+            numbers[e] = True
+            a[e, e], a[e, -1] = 1.0, rng.choice([0.0, 1.0])
+            a[e, rng.integers(e)] = rng.choice([-1.0, 1.0, 0.5])
+    return a, numbers
+
+
+def exact_solution(a, b):
+    """x of A·x = b, and the change of x under relative changes of the entries by one (Skeel 1979)."""
+    with mpmath.workdps(60):
+        inverse = mpmath.inverse(mpmath.matrix(a.tolist()))
+        x = inverse * mpmath.matrix(b.tolist())
+        inverse, x = np.array(inverse.tolist(), float).reshape(a.shape), np.array(x.tolist(), float).ravel()
+    return x, np.abs(inverse) @ (np.abs(a) @ np.abs(x) + np.abs(b))
+
+
+@pytest.mark.parametrize("n", [3, 4, 7])
+def test_one_tearing_variable_costs_no_digits(n):
+    """Entries and right-hand sides over twelve decades, units over eighteen, and terms that cancel: the error is that
+    of relative changes of the entries by some eps, in each unknown, for A and for its transpose."""
+    rng = np.random.default_rng(n)
+    a, numbers = arrow(rng, n)
+    tearing = Tearing(tuple((e, e) for e in range(n - 1)), (n - 1,), (n - 1,))
+    pattern = (a != 0) & ~numbers
+    fixed = {(int(e), int(u)): float(a[e, u]) for e, u in zip(*np.nonzero(numbers & (a != 0)), strict=True)}
+
+    def function(a, b):
+        return jnp.stack(solve_torn(tearing, entries(a, pattern) | fixed, list(b)))
+
+    def adjoint(a, b):
+        return jax.vjp(lambda b: function(a, b), b)[1](b)[0]
+
+    function, adjoint = jax.jit(function), jax.jit(adjoint)
+    for _ in range(25):
+        some, b = np.where(numbers, a, a * 10 ** rng.uniform(-6, 6, a.shape)), rng.normal(size=n)
+        b *= 10 ** rng.uniform(-6, 6, n)
+        if rng.random() < 0.5:  # the last equation is one of the others, or nearly
+            u = rng.integers(n - 1)
+            some[-1, -1] = some[-1, u] / some[u, u] * some[u, -1] * (1 + rng.choice([1e-3, 1e-8]))
+        for found, matrix in ((function(some, b), some), (adjoint(some, b), some.T)):
+            x, change = exact_solution(matrix, b)
+            assert (np.abs(found - x) <= 20 * n * np.finfo(float).eps * change).all()
 
 
 def test_batches_members_of_which_need_different_pivots():

@@ -182,7 +182,7 @@ def _sum(start: Any, coefficients: Sequence[Any]) -> _Operation:
 
 def _is_nought(value: Any) -> bool:
     """Whether a value is the number zero when a program is traced: an unknown whose share is taken out."""
-    return isinstance(value, float) and value == 0.0
+    return isinstance(value, float) and bool(value == 0.0)
 
 
 def _product(exponents: Sequence[Any], xp: Any) -> _Operation:

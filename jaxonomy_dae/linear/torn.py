@@ -17,9 +17,8 @@ Three things keep the result right (Skeel 1980, Math. Comp. 35:817; Higham 2002,
    the unknowns are of very different sizes, the same in the norm of the matrix with rows and columns equilibrated.
    Where neither holds, x is not-a-number: a loud failure, not a wrong number.
 
-Where there is one tearing variable z, and no u depends on another u other than by plain numbers that do not enlarge
-it, none of this is needed: S, L⁻¹ c and L⁻¹ F are sums of products of entries, so that their rounding is that of
-relative changes of the entries by a few eps. All that is left to check is that S is more than rounding left of its terms.
+Where there is one tearing variable and errors cannot grow over several links, corrections converge if S is more than
+what rounding left of its terms, and this is checked in place of the residuals.
 
 Entries are scalars or arrays of one shape (a batch of blocks); which are zero is known when the program is traced.
 Derivatives are those of x = A⁻¹ b, from solves by the same elimination.
@@ -113,8 +112,8 @@ class _Elimination:
         # The same for the transpose, in which equations and unknowns change places.
         self.depth_transposed = self._depths([(u, e) for e, u in reversed(tearing.sequence)], self.columns)
         self.can_grow = max(self.depth.values(), default=0) > 1
+        self.chained = any(v in self.over_pivot and v != u for e, u in tearing.sequence for v, _ in self.rows[e])
         self.exact = m == 1 and not self.can_grow
-        self.exact_transposed = self.exact and max(self.depth_transposed.values(), default=0) <= 1
         # W = −L⁻¹ F, by unknowns.
         self.w: dict[int, Any] = {}
         for e, u in tearing.sequence:
@@ -139,13 +138,13 @@ class _Elimination:
     def _depths(sequence: Sequence[tuple[int, int]], rows: list[list[tuple[int, Any]]]) -> dict[int, int]:
         """How many links each unknown of the sequence is away from the tearing variables.
 
-        An equation that gives it by plain numbers, none of which enlarge what is known, is not a link.
+        An equation with plain numbers only, which do not enlarge what is known, is not a link.
         """
         depth: dict[int, int] = {}
         for e, u in sequence:
             known = [(v, a) for v, a in rows[e] if v in depth]
             link = 1
-            if all(isinstance(a, int | float) for v, a in rows[e] if v in depth or v == u):
+            if all(isinstance(a, int | float) for _, a in rows[e]):
                 pivot = next(abs(a) for v, a in rows[e] if v == u)
                 link = int(sum(abs(a) for _, a in known) > pivot)
             depth[u] = max([1, *(depth[v] + link for v, _ in known)])
@@ -208,20 +207,21 @@ class _Elimination:
         tearing = self.tearing
         x: list[Any] = [None] * len(b)
 
+        def given(e: int, u: int) -> Any:
+            known = [_product(a, x[v]) for v, a in self.rows[e] if v != u and x[v] is not None]
+            return _product(self.over_pivot[u], _less(b[e], known))
+
         def follow(z: list[Any] | None):
             for u, value in zip(tearing.tearing, z or [None] * len(tearing.tearing), strict=True):
                 x[u] = value
             for e, u in tearing.sequence:
-                known = [_product(a, x[v]) for v, a in self.rows[e] if v != u and x[v] is not None]
-                x[u] = _product(self.over_pivot[u], _less(b[e], known))
+                x[u] = given(e, u)
 
         follow(None)
         rest = [
             _less(b[e], [_product(a, x[v]) for v, a in self.rows[e] if x[v] is not None]) for e in tearing.residuals
         ]
         follow(self._schur_solve(rest, transposed=False))
-        if self.exact:
-            return x
         for k in range(self.corrections):
             missing = [_less(b[e], [_product(a, x[v]) for v, a in self.rows[e]]) for e in tearing.residuals]
             change = self._schur_solve(missing, transposed=False)
@@ -234,6 +234,8 @@ class _Elimination:
                 x[u] = z
             for _, u in tearing.sequence:
                 x[u] = x[u] + self._along(u, change)
+        if self.exact:
+            return x
         # What depends on tearing variables alone is as good as they are.
         checked = [*tearing.residuals, *(e for e, u in tearing.sequence if self.depth[u] > 1)]
         return self._verified(x, b, self.rows, checked)
@@ -262,20 +264,20 @@ class _Elimination:
                 total = total + self.w[u] * g[u]
             s = list(total)
         follow(self._schur_solve(s, transposed=True), g)
-        if self.exact_transposed:
-            return y
         for _ in range(self.corrections):
             missing = [_less(g[u], [_product(a, y[r]) for r, a in self.columns[u]]) for u in tearing.tearing]
             kept = list(y)
             follow(self._schur_solve(missing, transposed=True), None)
             y = [a + b for a, b in zip(kept, y, strict=True)]
+        if self.exact:
+            return y
         checked = [*tearing.tearing, *(u for e, u in tearing.sequence if self.depth_transposed[e] > 1)]
         return self._verified(y, g, self.columns, checked)
 
     @property
     def corrections(self) -> int:
         """How many are made."""
-        return CORRECTIONS if self.can_grow else 1
+        return CORRECTIONS if self.chained else 1
 
     def _verified(self, x: list[Any], b: Sequence[Any], rows: list[list[tuple[int, Any]]], places) -> list[Any]:
         """x, or not-a-number if one of the equations at `places` does not hold to rounding."""
