@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 GROWTH = 100.0  # of an error in a tearing variable, in equilibrated units
-LINKS = 3  # in a row whose growth depends on parameters or the state: they may change after the choice was made
+LINKS = 1  # in rows whose growth depends on parameters or the state: they may change after the choice was made
 EQUILIBRATIONS = 4
 
 
