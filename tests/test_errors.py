@@ -29,6 +29,7 @@ from jaxonomy_dae import (
     der,
     simulate,
 )
+from jaxonomy_dae.learning import fit
 from jaxonomy_dae.library.electrical import Ground, Resistor
 from jaxonomy_dae.library.planar import PlanarPendulum
 from jaxonomy_dae.library.translational import Mass, Spring
@@ -205,11 +206,19 @@ def test_writing_a_component(message, call, error):
 # --- wrong types -------------------------------------------------------------------------------------------------
 
 # conftest.py has the signatures' types checked before these messages can be raised, so they are tested without it.
+KNOTS = jnp.linspace(0.0, 1.0, 3)
 WRONG_TYPES = [
     (r"the system is a batch, its parameters have shape \(3, 4\).*equinox\.filter_vmap",
      lambda: simulate(jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), rc_circuit()), 1.0)),
     (r"first argument of a component is an EqnEnv; got str", lambda: Ground("ground", "g")),
     (r"parameter 'r\.R' must be a number; got list.*with_parameters\(\{'r\.R'", lambda: Resistor(EV, "r", [1.0])),
+    (r"function 'c\.f': the function must be callable; got LinearInterp.*give its method \.evaluate",
+     lambda: component(lambda s, ev: s.function("f", diffrax.LinearInterpolation(KNOTS, KNOTS), [s.variable("x")]))),
+    (r"function 'c\.f': inputs is a list of symbols; write inputs=\[x\]",
+     lambda: component(lambda s, ev: s.function("f", jnp.sin, s.variable("x")))),
+    (r"'c\.x': bounds are a pair", lambda: component(lambda s, ev: s.variable("x", bounds=("0", "1")))),
+    (r"neural block's name cannot contain '\['", lambda: pendulum(drag_on("vx", name="a[0]"))),
+    (r"optimizer must be one of Optax.*got 'adam'", lambda: fit(rc_circuit(), lambda s: 0.0, "adam", 1, train=["r.R"])),
     (r"'c\.x': fixed is True or False; got 'no'", lambda: component(lambda s, ev: s.variable("x", 1.0, fixed="no"))),
     (r"parameter 'c\.k': unit is a text such as 'kg'; got 1",
      lambda: component(lambda s, ev: s.parameter("k", 1.0, 1))),
@@ -403,7 +412,8 @@ MINIMAL = {"state_selection": "dummy_derivatives", "prefer_states": ["pend.vx", 
              lambda: NeuralDAEBlock(quadratic, targets="pend.vx", name="drag")),
         case(r"expected \(component, \"variable\"\).*got \('pend', 'vx'\)",
              lambda: NeuralDAEBlock(quadratic, targets=[("pend", "vx")], name="drag")),
-        case(r"string without dots; got 'a\.b'", lambda: NeuralDAEBlock(quadratic, targets=["pend.vx"], name="a.b")),
+        case(r"string without dots or spaces; got 'a\.b'",
+             lambda: NeuralDAEBlock(quadratic, targets=["pend.vx"], name="a.b")),
     ],
 )  # fmt: skip
 def test_neural_blocks(message, call, error):
@@ -457,6 +467,10 @@ def use(message, call, error=ModelError):
         use(r"dtmax must be positive; got 0", lambda s: simulate(s, 1.0, dtmax=0.0)),
         use(r"initial: 'c\.v' must be finite; got nan", lambda s: simulate(s, 1.0, initial={"c.v": np.nan})),
         use(r"initial: 'c\.v' must be finite; got nan", lambda s: s.initialize(initial={"c.v": np.nan})),
+        use(r"t1 must be a finite number; got None", lambda s: simulate(s, None)),
+        use(r"ts must be numbers; got <U3", lambda s: simulate(s, 1.0, ts=["0.5", "1"])),
+        use(r"a state of this system has shape \(1,\); got \(2,\)", lambda s: s.observe("c.v", 0.0, jnp.ones(2))),
+        use(r"a state of this system has shape \(1,\); got \(2,\)", lambda s: s.vector_field(0.0, jnp.ones(2))),
         use(r"ts must be finite", lambda s: simulate(s, 1.0, ts=[0.5, np.nan])),
         use(r"needs t0 < t1; got t0=0\.0, t1=-1\.0", lambda s: simulate(s, -1.0)),
         use(r"t1 must be a finite number; got nan", lambda s: simulate(s, np.nan)),

@@ -132,7 +132,7 @@ def test_vectors(start, expected):
     "write, message",
     [
         (lambda c: c.vector("r", 0), "'c.r' needs a positive number of entries; got 0"),
-        (lambda c: c.vector("r", 2, start=[1.0]), "'c.r' has 2 entries, but 1 starts"),
+        (lambda c: c.vector("r", 2, start=[1.0]), "'c.r' needs 2 starts; got 1"),
         (lambda c: (c.vector("r", 2), c.vector("r", 3)), "uses the name 'r' twice: it is a vector variable"),
         (lambda c: (c.vector("r", 2), c.parameter("r", 3.0)), "uses the name 'r' twice: it is a vector variable"),
     ],

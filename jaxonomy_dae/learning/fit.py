@@ -132,6 +132,8 @@ def fit(
     """
     if not isinstance(steps, int) or steps < 0:
         raise ModelError(f"steps must be a number of updates ≥ 0; got {steps!r}")
+    if not isinstance(optimizer, optax.GradientTransformation):
+        raise ModelError(f"optimizer must be one of Optax, such as optax.adam(0.02); got {optimizer!r}")
     trainable, frozen = split(model, train)
     if not jax.tree.leaves(trainable):
         raise ModelError("nothing is to be trained: `train` selects no arrays of the model")

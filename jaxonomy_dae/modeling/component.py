@@ -266,7 +266,7 @@ class Component(metaclass=Construction):
         is_sequence = isinstance(start, Sequence | np.ndarray) and not isinstance(start, str)
         starts = list(start) if is_sequence else [start] * count
         if len(starts) != count:
-            raise ModelError(f"vector variable '{self.name}.{name}' has {count} entries, but {len(starts)} starts")
+            raise ModelError(f"vector variable '{self.name}.{name}' needs {count} starts; got {len(starts)}")
         return tuple(
             self._declare(f"{name}[{k}]", "variable", s, fixed and s is not None, nominal, unit, bounds=bounds)
             for k, s in enumerate(starts)
@@ -349,7 +349,8 @@ class Component(metaclass=Construction):
         - `ModelError` if the function cannot be called with that many scalars.
         """
         if not callable(function):
-            raise ModelError(f"function '{self.name}.{name}': the function must be callable; got {function!r}")
+            method = ": give its method .evaluate" if hasattr(function, "evaluate") else ""
+            raise ModelError(f"function '{self.name}.{name}': the function must be callable; got {function!r}{method}")
         return self._opaque("function", name, of_scalars(function), inputs, outputs)
 
     def _opaque(self, what: str, name: str, network: Any, inputs: Sequence[Any], outputs: int | None):
@@ -359,6 +360,8 @@ class Component(metaclass=Construction):
         where = f"{what} '{self.name}.{name}'"
         if not callable(network):
             raise ModelError(f"{where}: the {_noun(what)} must be callable; got {network!r}")
+        if isinstance(inputs, sympy.Basic):
+            raise ModelError(f"{where}: inputs is a list of symbols; write inputs=[{inputs}]")
         symbols = []
         for entry in inputs:
             entry = sympy.sympify(entry)

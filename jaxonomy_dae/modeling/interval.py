@@ -45,6 +45,8 @@ def as_interval(bounds: Any, where: str) -> Interval:
         found = bounds
     else:
         try:
+            if any(isinstance(end, str) for end in bounds):
+                raise TypeError
             low, high = (float(end) for end in bounds)
         except (TypeError, ValueError):
             raise ModelError(f"{where}: bounds are a pair (low, high) or an Interval; got {bounds!r}") from None

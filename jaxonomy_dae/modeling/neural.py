@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from ..errors import ModelError
 from .component import Component
+from .names import check_name
 from .untraceable import why_untraceable
 
 
@@ -37,7 +38,8 @@ def count_outputs(network: Callable, inputs: int, where: str, theta: Any = None,
         raise ModelError(f"{where}: calling {signature} with u of shape ({inputs},) failed: it {why}") from error
     if not (hasattr(out, "shape") and len(out.shape) == 1):
         found = getattr(out, "shape", type(out).__name__)
-        raise ModelError(f"{where}: the {noun} must return a vector of shape (outputs,); got shape {found}")
+        scalar = "a scalar or " if noun == "function" else ""
+        raise ModelError(f"{where}: the {noun} must return {scalar}a vector of shape (outputs,); got shape {found}")
     return out.shape[0]
 
 
@@ -73,8 +75,7 @@ class NeuralDAEBlock:
         inject: Literal["equation", "row"] = "equation",
     ):
         where = f"neural block '{name}'"
-        if not isinstance(name, str) or not name or "." in name:
-            raise ModelError(f"a neural block's name is a non-empty string without dots; got {name!r}")
+        check_name(name, "neural block")
         if not callable(network):
             raise ModelError(f"{where}: the network must be callable; got {network!r}")
         if inject not in ("equation", "row"):

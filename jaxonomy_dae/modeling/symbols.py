@@ -156,6 +156,8 @@ def Eq(left: Any, right: Any) -> Any:
     try:
         return _remembered(left, right)
     except (TypeError, sympy.SympifyError):
+        if any(getattr(side, "ndim", None) == 0 for side in (left, right)):  # arrays of one number cannot be hashed
+            return _remembered(*(float(s) if getattr(s, "ndim", None) == 0 else s for s in (left, right)))
         wrong = next((side for side in (left, right) if not isinstance(side, sympy.Expr | int | float)), right)
         many = isinstance(wrong, list | tuple | sympy.MatrixBase) or getattr(wrong, "ndim", 0)
         mend = ": write one equation for each entry" if many else ""

@@ -56,6 +56,8 @@ def _check_interval(t0, t1, ts):
         return
     if np.ndim(ts) != 1 or not np.shape(ts)[0]:
         raise ModelError(f"ts must have shape (n,), n ≥ 1; got {np.shape(ts)}")
+    if not isinstance(ts, Tracer) and np.asarray(ts).dtype.kind not in "biuf":
+        raise ModelError(f"ts must be numbers; got {np.asarray(ts).dtype}")
     saved = _concrete(ts)
     if saved is None:
         return

@@ -18,7 +18,7 @@ def check_finite(**numbers: Any) -> None:
             continue
         if isinstance(value, str):
             raise ModelError(f"{name} must be a finite number; got the string {value!r}: leave the quotes out")
-        if np.shape(value) != () or not math.isfinite(value):
+        if value is None or np.shape(value) != () or not math.isfinite(value):
             raise ModelError(f"{name} must be a finite number; got {value}")
 
 

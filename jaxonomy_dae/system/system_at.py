@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..errors import ModelError
 from ..linear.sparse import SparsePattern, sparse_jacobian
 from ..linear.whole import solve_whole
 from ..linear.written_out import UNROLLED, solve, solve_dense
@@ -58,7 +59,12 @@ class SystemAt:
         self.t = jnp.asarray(t, self.dtype)
 
     def split(self, x: Any) -> Any:
-        """The state as a tuple of scalars if it is small."""
+        """The state as a tuple of scalars if it is small.
+
+        **Raises:** `ModelError` for another shape.
+        """
+        if jnp.shape(x) != (self.plan.n_state,):
+            raise ModelError(f"a state of this system has shape ({self.plan.n_state},); got {jnp.shape(x)}")
         return tuple(x[k] for k in range(x.shape[0])) if self.plan.n_state <= SCALARS else x
 
     @staticmethod
