@@ -340,3 +340,15 @@ def test_batches_with_the_stock_controller(solver):
     # z' = −a·z/(3z² + 1), so that 3/2·(z² − 1) + ln z = −a·t from z(0) = 1: z in closed form up to one logarithm.
     z = np.asarray(end(jnp.asarray(rates)))
     np.testing.assert_allclose(1.5 * (z**2 - 1) + np.log(z), -rates, rtol=0, atol=1e-5)  # a hundred times rtol
+
+
+@pytest.mark.parametrize("decay", [1e3, 1e6])
+def test_stiff_unknowns_between_the_ends_of_steps(decay):
+    """x' = −λ (x − cos t) is cos t but for 1/λ, and right at the ends of steps, however long; between them the
+    polynomial was off by 0.07."""
+    ts = jnp.linspace(0.0, 10.0, 101)
+    term = DAETerm(lambda t, x, a: -a * (x - jnp.cos(t)), mass=[1.0])
+    found = solve_dae(term, 10.0, jnp.ones(1), ts=ts, solver=Rodas5P(), args=decay, rtol=1e-6, atol=1e-8)
+    exact = (decay**2 * np.cos(ts) + decay * np.sin(ts) + np.exp(-decay * ts)) / (1 + decay**2)
+    np.testing.assert_allclose(found.ys[:, 0], exact, rtol=0, atol=2e-6)
+    assert found.stats["num_steps"] < 80

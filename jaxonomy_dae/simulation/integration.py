@@ -12,7 +12,7 @@ from ..initialization.initialize import InitialPoint, check, initialize, is_cons
 from ..linear.choice import SPARSE_FROM
 from ..solvers import BDF, DAETerm, Tsit5
 from ..solvers.choice_guard import ChoiceGuard
-from ..solvers.drive import integrate, is_implicit
+from ..solvers.drive import integrate, is_implicit, right_between_steps
 from ..solvers.projected import with_projection
 from ..solvers.rows import not_a_number, padded
 from ..solvers.switching import STIFF, Watch
@@ -68,7 +68,8 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, throw: bo
     x0, controller = found.x, options.controller
     implicit = is_implicit(options.solver)
     term = term_of(system, implicit)
-    solver = _prepared(system, options.solver, implicit, watch, _atol(system, controller))
+    chosen = options.solver if ts is None else right_between_steps(options.solver)
+    solver = _prepared(system, chosen, implicit, watch, _atol(system, controller))
     own_start = implicit and not isinstance(controller, diffrax.StepTo)
     dt0 = None if own_start else first_step(system, t0, t1, x0, inputs, solver.order(term), controller)
     save = diffrax.SubSaveAt(t0=True, steps=True) if ts is None else diffrax.SubSaveAt(ts=ts)

@@ -18,7 +18,7 @@ from ..solvers.drive import is_implicit
 from ..solvers.solve import check_tolerances, default_tolerances
 from ..solvers.solve_arguments import jump_times
 from ..solvers.switching import BOUNDARY, MANY, Watch
-from ..system.inputs import StepEnds, check_range, read_inputs, step_ends
+from ..system.inputs import check_range, read_inputs, step_ends
 from ..system.solver_choice import Choice, implicit_choice, is_known_stiff, note_stiffness, solver_choice
 from ..system.stiffness import fastest_decay
 from ..system.system import AcausalSystem
@@ -112,17 +112,13 @@ def simulate(
             ts = jnp.clip(ts, t0, t1)  # `check_arguments` lets rounding pass, Diffrax does not
     given = (system, t0, t1, ts, inputs, initial)
 
-    def options(solver: Any, found_stiff: bool = False) -> Options:
+    def options(solver: Any) -> Options:
         control = stepsize_controller
         if control is None:
             control = controller_for(system, solver, rtol, atol, dtmax)
-        stops = ends
-        if found_stiff and isinstance(solver, Rodas5P) and ts is not None:
-            # Where something follows the rest at once, steps are long and no error estimate covers what is between.
-            stops = StepEnds(ends.jumps, [*ends.kinks, ts])
         return Options(
-            solver, adjoint if adjoint is not None else default_adjoint(), clipped(control, jump_ts, stops),
-            max_steps + stops.count, progress,
+            solver, adjoint if adjoint is not None else default_adjoint(), clipped(control, jump_ts, ends),
+            max_steps + ends.count, progress,
         )  # fmt: skip
 
     if solver is None:
@@ -137,7 +133,7 @@ def simulate(
         if why:
             choice = implicit_choice(system.plan, why)
             solver = SOLVERS[choice.solver]()
-        return _traced(run(given, options(solver, found_stiff=bool(why)), None, throw), given, choice, throw)
+        return _traced(run(given, options(solver), None, throw), given, choice, throw)
     watch = Watch(t1, scaled_atol(system, atol) / rtol) if switches else None
     outcome = run_compiled(given, options(solver), watch)
     if _is_traced(outcome):  # a network may close over a traced value, which shows in the outcome only
@@ -157,7 +153,7 @@ def simulate(
             choice = implicit_choice(system.plan, found)
             solver = SOLVERS[choice.solver]()
             before = {"num_explicit_steps": counts["num_steps"], "stiff_from": float(outcome.last[0])}
-            outcome = run_compiled(given, options(solver, found_stiff=True), None)
+            outcome = run_compiled(given, options(solver), None)
             counts = outcome.numbers() | before
     saved, x = outcome.ts, outcome.x
     if ts is None:

@@ -1,5 +1,6 @@
 """One integration by Diffrax, as `solve_dae` and `simulate` need it."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import diffrax
@@ -30,6 +31,13 @@ def inner(solver: Any) -> Any:
 def is_implicit(solver: Any) -> bool:
     """Whether the solver takes differential-algebraic equations."""
     return isinstance(inner(solver), BDF | Rodas5P)
+
+
+def right_between_steps(solver: Any) -> Any:
+    """The solver with an error test that covers its dense output, where values within steps are saved."""
+    if isinstance(solver, Projected):
+        return dataclasses.replace(solver, solver=right_between_steps(solver.solver))
+    return dataclasses.replace(solver, dense_errors=True) if isinstance(solver, Rodas5P) else solver
 
 
 def is_multistep(solver: Any) -> bool:

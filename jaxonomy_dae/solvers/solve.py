@@ -16,7 +16,7 @@ from ..adjoint.default import default_adjoint
 from ..errors import InitializationError, ModelError, SimulationError
 from .bdf import BDF
 from .dae_term import DAETerm, FlatProblem
-from .drive import integrate, is_multistep
+from .drive import integrate, is_multistep, right_between_steps
 from .failures import SHOWN, StartCheck, explain_failure, explain_start, start_check
 from .index_one import consistent_point, consistent_shift
 from .rodas5p import Rodas5P
@@ -189,7 +189,7 @@ def _solve(term, t0, t1, y0, ts, args, tolerances, options, host_checks=False):
     save = diffrax.SubSaveAt(t1=True) if ts is None else diffrax.SubSaveAt(ts=ts)
     run = integrate(
         term,
-        solver,
+        solver if ts is None else right_between_steps(solver),
         t0,
         t1,
         None,
