@@ -119,15 +119,16 @@ def test_more_steps_than_rows(t1, max_steps):
     agree(slope, forward)
 
 
+def swung(scale, y0):
+    """A number that depends on a pendulum of this time scale."""
+    term = diffrax.ODETerm(lambda t, y, args: args * jnp.stack([y[1], -jnp.sin(y[0])]))
+    return total(solve(scale, y0, STORED, term=term, saveat=diffrax.SaveAt(ts=TS)))
+
+
 def test_batches():
     """Members that take different numbers of steps, some more than the record has rows, others few."""
     scale = jnp.array([0.05, 1.0, 40.0])
-    term = diffrax.ODETerm(lambda t, y, args: args * jnp.stack([y[1], -jnp.sin(y[0])]))
-
-    def loss(scale, y0, adjoint):
-        return total(solve(scale, y0, adjoint, term=term, saveat=diffrax.SaveAt(ts=TS)))
-
-    gradient = jax.grad(lambda scale, y0: loss(scale, y0, STORED), argnums=(0, 1))
+    gradient = jax.grad(swung, argnums=(0, 1))
     y0 = jnp.stack([Y0, 1.1 * Y0, 0.5 * Y0])
     batch = jax.jit(jax.vmap(gradient))(scale, y0)
     each = [jax.jit(gradient)(s, y) for s, y in zip(scale, y0, strict=True)]
@@ -140,18 +141,13 @@ def test_batches():
 def test_nested_and_outer_batches():
     """vmap of vmap, and the gradient of a vmap with what is shared between its members."""
     scale = jnp.array([0.05, 1.0, 4.0])
-    term = diffrax.ODETerm(lambda t, y, args: args * jnp.stack([y[1], -jnp.sin(y[0])]))
-
-    def loss(scale, y0, adjoint):
-        return total(solve(scale, y0, adjoint, term=term, saveat=diffrax.SaveAt(ts=TS)))
-
-    gradient = jax.grad(lambda scale, y0: loss(scale, y0, STORED), argnums=(0, 1))
+    gradient = jax.grad(swung, argnums=(0, 1))
     y0 = jnp.stack([Y0, 1.1 * Y0, 0.5 * Y0])
     batch = jax.jit(jax.vmap(gradient))(scale, y0)
     nested = jax.jit(jax.vmap(jax.vmap(gradient)))(scale[None], y0[None])
     agree(nested, jax.tree.map(lambda leaf: leaf[None], batch), 1e-7)
-    shared = jax.jit(jax.grad(lambda y0: jax.vmap(lambda s: loss(s, y0, STORED))(scale).sum()))(Y0)
-    parts = jax.jit(jax.vmap(jax.grad(lambda y0, s: loss(s, y0, STORED)), (None, 0)))(Y0, scale)
+    shared = jax.jit(jax.grad(lambda y0: jax.vmap(lambda s: swung(s, y0))(scale).sum()))(Y0)
+    parts = jax.jit(jax.vmap(jax.grad(lambda y0, s: swung(s, y0)), (None, 0)))(Y0, scale)
     agree(shared, parts.sum(axis=0), 1e-7)
 
 

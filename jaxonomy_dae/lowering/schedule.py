@@ -45,14 +45,10 @@ class StepEquation:
     equation: np.ndarray  # extended equations (n,)
 
 
-@dataclasses.dataclass(frozen=True)
-class Step:
-    """n blocks of one shape. `unknown[u]` are the quantities of the local unknown u, shape (n,)."""
+class AbstractStep:
+    """What steps share, whose blocks are written out or sparse."""
 
-    level: int
-    equations: tuple[StepEquation, ...]
     unknown: tuple[np.ndarray, ...]
-    tearing: Tearing
     linear: bool
 
     @property
@@ -61,8 +57,19 @@ class Step:
 
     @property
     def carried(self) -> bool:
-        """Whether the tearing variables are part of the state array, to be refined by Newton's method."""
+        """Whether unknowns are part of the state array, to be refined by Newton's method."""
         return not self.linear
+
+
+@dataclasses.dataclass(frozen=True)
+class Step(AbstractStep):
+    """n blocks of one shape. `unknown[u]` are the quantities of the local unknown u, shape (n,)."""
+
+    level: int
+    equations: tuple[StepEquation, ...]
+    unknown: tuple[np.ndarray, ...]
+    tearing: Tearing
+    linear: bool
 
     @property
     def torn(self) -> list[np.ndarray]:
@@ -81,7 +88,7 @@ class Step:
 
 
 @dataclasses.dataclass(frozen=True)
-class SparseStep:
+class SparseStep(AbstractStep):
     """Large blocks of one level, solved together as one sparse system.
 
     An equation here is a group of a template's instances, its slots given by quantity, those of the step's own unknowns
@@ -94,15 +101,6 @@ class SparseStep:
     block: np.ndarray  # of every unknown, the number of its block
     equation_block: tuple[np.ndarray, ...]  # of every equation
     linear: bool
-
-    @property
-    def n(self) -> int:
-        return len(self.unknown[0])
-
-    @property
-    def carried(self) -> bool:
-        """Whether the unknowns are part of the state array, to be refined by Newton's method."""
-        return not self.linear
 
     @property
     def torn(self) -> list[np.ndarray]:

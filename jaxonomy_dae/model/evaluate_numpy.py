@@ -4,11 +4,12 @@ Only the choice of states needs numbers before the model runs. They are computed
 model will run in, from the same templates the lowered system uses.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
+from jaxtyping import Float
 
 from .extended import Extended, ExtendedGroup
 from .opaque import OpaqueFunction
@@ -50,24 +51,30 @@ def group_values(group: ExtendedGroup, values, parameters, t: float, networks: N
     return np.broadcast_to(np.asarray(out, float), (n,))
 
 
-def residual_and_jacobian(extended: Extended, values, parameters, t: float, networks: Networks):
+def residual_and_jacobian(
+    extended: Extended, values, parameters, t: float, networks: Networks
+) -> tuple[Float[np.ndarray, " equations"], Any]:
     """All residuals, and the sparse Jacobian with respect to all quantities."""
     residual = np.empty(extended.n_equations)
-    rows, columns, entries = [], [], []
+    partials = []
     for group in extended.groups:
         residual[group.equation] = group_values(group, values, parameters, t, networks, partials=False)
-        if group.quantity.shape[1] == 0:
-            continue
-        partial = group_values(group, values, parameters, t, networks, partials=True)
-        used = group.quantity != ZERO
-        rows.append(np.broadcast_to(group.equation[:, None], used.shape)[used])
-        columns.append(group.quantity[used])
-        entries.append(partial[used])
+        if group.quantity.shape[1]:
+            partials.append((group, group_values(group, values, parameters, t, networks, partials=True)))
+    return residual, _jacobian(extended, partials)
+
+
+def _jacobian(extended: Extended, partials: Sequence[tuple[ExtendedGroup, np.ndarray]]) -> Any:
+    """The sparse Jacobian of all equations, from the partial derivatives (n, slots) of groups that have slots."""
     shape = (extended.n_equations, extended.quantities.n)
-    if not rows:
-        return residual, sp.csr_array(shape)
+    if not partials:
+        return sp.csr_array(shape)
+    used = [group.quantity != ZERO for group, _ in partials]
+    rows = [np.broadcast_to(g.equation[:, None], u.shape)[u] for (g, _), u in zip(partials, used, strict=True)]
+    columns = [g.quantity[u] for (g, _), u in zip(partials, used, strict=True)]
+    entries = [partial[u] for (_, partial), u in zip(partials, used, strict=True)]
     data = (np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns)))
-    return residual, sp.coo_array(data, shape=shape).tocsr()
+    return sp.coo_array(data, shape=shape).tocsr()
 
 
 def generic_jacobian(extended: Extended, size: np.ndarray, parameter_size: np.ndarray):
@@ -83,7 +90,7 @@ def generic_jacobian(extended: Extended, size: np.ndarray, parameter_size: np.nd
     """
     rng = np.random.default_rng(0)
     samples = [(size * generic(rng, size.shape), parameter_size * generic(rng, parameter_size.shape)) for _ in range(2)]
-    rows, columns, entries = [], [], []
+    partials = []
     for group in extended.groups:
         n, k = group.quantity.shape
         if k == 0:
@@ -97,15 +104,8 @@ def generic_jacobian(extended: Extended, size: np.ndarray, parameter_size: np.nd
             )
             partial = np.where(first == 0.0, second, first)  # zero on one branch is not zero on all
             partial = np.where(np.isfinite(partial), partial, generic(rng, (n, k)))
-        used = group.quantity != ZERO
-        rows.append(np.broadcast_to(group.equation[:, None], used.shape)[used])
-        columns.append(group.quantity[used])
-        entries.append(partial[used])
-    shape = (extended.n_equations, extended.quantities.n)
-    if not rows:
-        return sp.csr_array(shape), *samples[0]
-    data = (np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns)))
-    return sp.coo_array(data, shape=shape).tocsr(), *samples[0]
+        partials.append((group, partial))
+    return _jacobian(extended, partials), *samples[0]
 
 
 def generic(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
