@@ -12,7 +12,8 @@ from sympy import Eq, atan
 from jaxonomy_dae import Component, EqnEnv, InitializationError, ModelError, der, simulate
 from jaxonomy_dae.initialization import initialize as initialization
 from jaxonomy_dae.initialization.initialize import find_initial, is_consistent
-from jaxonomy_dae.initialization.ladder import METHODS, Sizes, find_root
+from jaxonomy_dae.initialization.ladder import METHODS, find_root
+from jaxonomy_dae.initialization.sizes import Sizes
 
 # x³ − 2x + 2 = 0 has one real root, by Cardano's formula; |F| has a local minimum at √(2/3), where F = 2 − (4/3)√(2/3).
 CARDANO = -np.cbrt(1 + np.sqrt(19 / 27)) - np.cbrt(1 - np.sqrt(19 / 27))

@@ -11,7 +11,8 @@ from jaxtyping import Array, Bool, Float
 
 from ..errors import ModelError
 from ..linear.least_squares import least_squares
-from .ladder import FAILED, GIVEN, Found, Sizes, column_sizes, row_sizes, soft_weight, tolerance
+from .ladder import FAILED, GIVEN, Found
+from .sizes import Sizes, column_sizes, row_sizes, soft_weight, tolerance
 
 MAX_STEPS = 1000
 

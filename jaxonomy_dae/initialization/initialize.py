@@ -28,8 +28,9 @@ from ..system.inputs import read_inputs
 from ..system.system_at import SystemAt
 from .given_solver import find_root_with
 from .initial_values import check_initial
-from .ladder import FAILED, NOISE, STAGED, Sizes, find_root, tolerance
+from .ladder import FAILED, STAGED, find_root
 from .rows import InitialRows, Row, initial_rows
+from .sizes import NOISE, Sizes, tolerance
 from .sparse_newton import SparseRows, sparse_newton, sparse_rows
 from .stages import solve_in_stages, stages
 

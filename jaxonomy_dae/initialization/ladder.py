@@ -27,6 +27,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from .machine import Machine, Scalars
+from .probing import SIZED, probed
+from .sizes import NOISE, Sizes, row_sizes, soft_weight, tolerance
+
 METHODS = (
     "the start was consistent",
     "Newton",
@@ -54,59 +58,10 @@ STEPS_OFF = 8  # points tried around a start where F or its Jacobian is not fini
 FLAT = 1e-3  # a row whose slopes are less than this, times its value, is measured by that
 TO_BOUND = 0.9  # of the way to a bound that a step would cross
 SETTLED = 1e-2  # steps of this times √eps end the search for the nearest point
-NOISE = 8.0  # rounding errors of a row, in units of eps
 
-# An unknown of which nothing is known, and on which nothing depends at the start to first order, as on q in q·|q| at
-# zero, gets its size from the powers that slopes at these distances show. Then the search begins at the start.
-_PROBES = (1.0, 1.0 / 16)
-_SIZED = -1.0 - len(_PROBES)
-_AGAIN = _SIZED - 1  # the start of the second climb
+AGAIN = SIZED - 1  # what `Scalars.begun` is at the start of the second climb
 
 _NEWTON, _MARQUARDT, _TRACK, _LAND, _POLISH, _NEAREST, _DONE, _FAILED = range(8)
-
-
-class Sizes(NamedTuple):
-    """What measures unknowns and rows: zero where nothing is known."""
-
-    nominal: Float[Array, " n"]  # declared sizes of unknowns
-    known: Float[Array, " n"]  # sizes of unknowns by their declarations, starts and guesses
-    data: Float[Array, " m"]  # sizes of what each row is compared with
-    soft: Float[Array, " m"]  # distances that weigh the same in soft rows
-
-
-def tolerance(dtype: Any) -> float:
-    """The largest residual that counts as rounding, relative to the size of a row's terms."""
-    return float(jnp.finfo(dtype).eps) ** 0.6
-
-
-def soft_weight(dtype: Any) -> float:
-    """The weight of soft rows beside others: they move these by its square, a tenth of what counts as rounding."""
-    return float(np.sqrt(0.1 * tolerance(dtype)))
-
-
-def row_sizes(jacobian: Any, x: Any, sizes: Sizes, unit: Any) -> tuple[Any, Any]:
-    """The size of each row's terms, and the rounding that the sizes of unknowns alone let expect."""
-    size = jnp.maximum(jnp.abs(x), sizes.nominal)
-    magnitude = jnp.where(jnp.isfinite(jacobian), jnp.abs(jacobian), 0)
-    eps = float(jnp.finfo(jacobian.dtype).eps)
-    return magnitude @ size, NOISE * eps * (magnitude @ jnp.maximum(unit, size) + sizes.data)
-
-
-def column_sizes(value: Any, jacobian: Any, sizes: Sizes, power: Any = None) -> Any:
-    """A size for every unknown: as known, or else what its rows imply, |∂F/∂xⱼ|·xⱼ being of the size of their other
-    terms; 1 where nothing is known. With `power`, shape (m, n), terms are |jacobian|·xⱼ**power."""
-    tiny, huge = float(jnp.finfo(jacobian.dtype).tiny), 1 / float(jnp.finfo(jacobian.dtype).eps)
-    magnitude = jnp.where(jnp.isfinite(jacobian), jnp.abs(jacobian), 0)
-    offset = jnp.maximum(sizes.data, jnp.where(jnp.isfinite(value), jnp.abs(value), 0))
-    size = sizes.known
-    for _ in range(2):
-        terms = magnitude * (size[None, :] if power is None else size[None, :] ** power)
-        row = jnp.maximum(offset, jnp.max(terms, axis=1, initial=0.0))
-        seen = (magnitude > tiny) & (row > tiny)[:, None]
-        ratio = jnp.where(seen, row[:, None] / jnp.where(seen, magnitude, 1), jnp.inf)
-        implied = jnp.min(ratio if power is None else ratio ** (1 / power), axis=0, initial=jnp.inf)
-        size = jnp.where(sizes.known > 0, sizes.known, jnp.where(implied < huge, implied, 0))
-    return jnp.where(size > 0, size, 1)
 
 
 class Found(NamedTuple):
@@ -119,33 +74,6 @@ class Found(NamedTuple):
     unit: Any
     method: Any
     evaluations: Any
-
-
-class _Machine(NamedTuple):
-    """Points are (x, s). Packed into few arrays: XLA compiles a kernel for each."""
-
-    scalars: Any  # see _Scalars
-    points: Any  # trial, base (the last one accepted), best, the tangent, where rungs start, and the units
-    rows: Any  # F at the base, F at the start, and the weight of each equation
-    jacobian: Any  # at the base, columns scaled
-
-
-class _Scalars(NamedTuple):
-    """`size` is the fraction of a Newton step, the damping, or the length of arc."""
-
-    phase: Any
-    method: Any
-    fresh: Any  # whether the trial point is where a rung starts
-    begun: Any  # 1 once F has been finite, 2 on the second climb; on the way there, see `_PROBES`
-    count: Any  # evaluations on this rung
-    evaluations: Any
-    size: Any
-    growth: Any  # of the damping when a step is rejected; on the curve, the length of the last correction
-    square: Any  # |F|² at the base, weighted
-    gain: Any  # by which the linear model says it will fall
-    holds: Any  # whether |F| at the base counts as zero
-    turn: Any  # which way the curve is followed
-    corrections: Any
 
 
 def find_root(
@@ -208,12 +136,12 @@ def find_root(
         x = where(x < low, base + TO_BOUND * (low - base), where(x > high, base + TO_BOUND * (high - base), x))
         return jnp.append(x, ahead[n])
 
-    def evaluate(state: _Machine) -> _Machine:
+    def evaluate(state: Machine) -> Machine:
         x = state.points[0, :n]
         jacobian, value = jax.jacfwd(lambda y: (function(y),) * 2, has_aux=True)(x)
         # What a function of the user's closes over may be differentiated elsewhere: not in here.
         value, jacobian = jax.lax.stop_gradient((value, jacobian))
-        probing, probe, unit = probed(state, value, jacobian)
+        probing, probe, unit = probed(state, value, jacobian, sizes)
         size, noise = row_sizes(jacobian, x, sizes, unit)
         size = size + sizes.data
         reached = jnp.all(jnp.abs(value) <= close * size)
@@ -224,37 +152,14 @@ def find_root(
         ahead = advance(state, value, jacobian * unit[None, :], jnp.append(unit, one), reached, holds)
         return jax.tree.map(lambda a, b: where(probing, a, b), probe, ahead)
 
-    def probed(state: _Machine, value, jacobian) -> tuple[Any, _Machine, Any]:
-        """Whether the sizes of unknowns are still being found; the next state if so; and the sizes."""
-        begun, (trial, base, *others, stored) = state.scalars[3], state.points
-        first, last = begun == 0, begun == -float(len(_PROBES))
-        flat = where(first, (sizes.known == 0) & ~jnp.any(jacobian != 0, axis=0), stored[:n] < 0)
-        probing = first & jnp.all(jnp.isfinite(value)) & jnp.any(flat) | (begun < 0) & (begun > _SIZED)
-        base, value = where(first, trial, base), where(first, value, state.rows[1])
-        slopes, before = jnp.abs(jacobian), jnp.abs(state.jacobian)
-        comparable = flat[None, :] & last & (slopes > 0) & (before > 0) & jnp.isfinite(before)
-        growth = jnp.log(where(comparable, before / slopes, one)) / float(np.log(_PROBES[0] / _PROBES[1]))
-        power = 1 + jnp.clip(growth, 0, 8)
-        known_slopes = where(first, jacobian, where(flat[None, :] & ~last, jacobian, state.jacobian))
-        implied = column_sizes(value, known_slopes / power, sizes, power)
-        unit = where(first | last, implied, stored[:n])
-        distance = where(first, _PROBES[0], where(last, 0.0, _PROBES[1]))
-        trial = base + distance * jnp.append(where(flat, one, 0 * one), 0 * one)
-        kept = where(last, unit, where(flat, -one, one))
-        points = jnp.stack([trial, base, *others, jnp.append(kept, one)])
-        counted = jnp.asarray(np.eye(len(_Scalars._fields))[[3, 5]], dtype)
-        scalars = state.scalars - counted[0] + counted[1]
-        rows = jnp.stack([value, value, state.rows[2]])
-        return probing, _Machine(scalars, points, rows, known_slopes), unit
-
-    def advance(state: _Machine, value, jacobian, unit, reached, holds) -> _Machine:
-        s = _Scalars(*state.scalars)
+    def advance(state: Machine, value, jacobian, unit, reached, holds) -> Machine:
+        s = Scalars(*state.scalars)
         phase, fresh, arc = s.phase, s.fresh > 0, s.size
         trial, base, best, last_tangent, beginning, _ = state.points
         nearest, marquardt = is_nearest(phase), phase == _MARQUARDT
         descending = (phase == _NEWTON) | (phase == _POLISH) | nearest
         tracking, landing = (phase == _TRACK) | (phase == _LAND), phase == _LAND
-        begins, second = s.begun <= 0, (s.begun > 1) | (s.begun == _AGAIN)
+        begins, second = s.begun <= 0, (s.begun > 1) | (s.begun == AGAIN)
         # A root is a root on any rung; but what the homotopy lands on is polished first.
         stop = reached & ~tracking
 
@@ -379,11 +284,11 @@ def find_root(
         restart = where(climbs_again, bounded(where(unguessed, unit * generic, origin), origin), restart)
         above = where(climbs_again, first_rung, above)
         scalars = packed(
-            *_Scalars(
+            *Scalars(
                 phase=where(done, _DONE, where(failed, above, where(tracking, follow, phase))),
                 method=where(done, where(stop & begins, 0, by), s.method),
                 fresh=restarts,
-                begun=where(climbs_again, _AGAIN, where(lost, 0.0, where(second, 2.0, 1.0))),
+                begun=where(climbs_again, AGAIN, where(lost, 0.0, where(second, 2.0, 1.0))),
                 count=where(failed | (tracking & landed), 0, s.count + 1),
                 evaluations=s.evaluations + 1,
                 size=where(descending, fraction, where(marquardt, damping, arc)),
@@ -403,15 +308,15 @@ def find_root(
             beginning,
             unit,
         ])  # fmt: skip
-        return _Machine(scalars, points, jnp.stack([value, first, w]), jacobian)
+        return Machine(scalars, points, jnp.stack([value, first, w]), jacobian)
 
-    begin = _Scalars(first_rung, FAILED, 1.0, 0.0, 0, 0, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0)
+    begin = Scalars(first_rung, FAILED, 1.0, 0.0, 0, 0, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0)
     points = jnp.stack([origin, origin, origin, along, origin, jnp.ones_like(origin)])
-    state = _Machine(
+    state = Machine(
         jnp.asarray([float(v) for v in begin], dtype), points, jnp.ones((3, m), dtype), jnp.zeros((m, n), dtype)
     )
     state = jax.lax.while_loop(lambda s: s.scalars[0] < _DONE, evaluate, state)
-    s = _Scalars(*state.scalars)
+    s = Scalars(*state.scalars)
     found = where(s.phase == _DONE, state.points[1], state.points[2])[:n]
     unit = state.points[5, :n]
     jacobian = state.jacobian / unit[None, :]

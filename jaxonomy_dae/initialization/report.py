@@ -13,9 +13,10 @@ from ..system.sections import SHOWN, Sections, some
 from ..system.system_at import input_values
 from .block_finding import ILL_CONDITIONED, BlockFinding
 from .initialize import InitialPoint, is_consistent
-from .ladder import FAILED, METHODS, NEAREST, tolerance
+from .ladder import FAILED, METHODS, NEAREST
 from .rows import Row, initial_rows, supports
 from .singular_blocks import examine_blocks
+from .sizes import tolerance
 
 WORST = 5
 CONDITION_LIMIT = 500  # unknowns up to which the condition of the initial equations is computed

@@ -19,8 +19,9 @@ from ..linear.sparse import SparsePattern, available, is_double, sparse_jacobian
 from ..linear.whole import solve_whole
 from ..lowering.plan import SystemPlan
 from ..lowering.schedule import SparseStep
-from .ladder import DECREASE, METHODS, NEWTON_LIMIT, NOISE, SHORTEST, Sizes, tolerance
+from .ladder import DECREASE, METHODS, NEWTON_LIMIT, SHORTEST
 from .rows import InitialRows
+from .sizes import NOISE, Sizes, tolerance
 
 
 class SparseRows(NamedTuple):

@@ -18,8 +18,8 @@ from scipy.sparse.csgraph import connected_components
 
 from ..lowering.plan import SystemPlan
 from ..structure.matching import maximum_matching
-from .ladder import Sizes, column_sizes
 from .rows import InitialRows
+from .sizes import Sizes, column_sizes
 
 LEAST_LEVEL = 2  # times that a constraint must have been differentiated for stages to be worth their compile time
 LIMIT = 40  # steps in a block

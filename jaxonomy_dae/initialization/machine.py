@@ -1,0 +1,30 @@
+"""The state of the loop that climbs the ladder."""
+
+from typing import Any, NamedTuple
+
+
+class Machine(NamedTuple):
+    """Points are (x, s). Packed into few arrays: XLA compiles a kernel for each."""
+
+    scalars: Any  # see Scalars
+    points: Any  # trial, base (the last one accepted), best, the tangent, where rungs start, and the units
+    rows: Any  # F at the base, F at the start, and the weight of each equation
+    jacobian: Any  # at the base, columns scaled
+
+
+class Scalars(NamedTuple):
+    """`size` is the fraction of a Newton step, the damping, or the length of arc."""
+
+    phase: Any
+    method: Any
+    fresh: Any  # whether the trial point is where a rung starts
+    begun: Any  # 1 once F has been finite, 2 on the second climb; on the way there, see `probing`
+    count: Any  # evaluations on this rung
+    evaluations: Any
+    size: Any
+    growth: Any  # of the damping when a step is rejected; on the curve, the length of the last correction
+    square: Any  # |F|² at the base, weighted
+    gain: Any  # by which the linear model says it will fall
+    holds: Any  # whether |F| at the base counts as zero
+    turn: Any  # which way the curve is followed
+    corrections: Any

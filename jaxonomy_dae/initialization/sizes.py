@@ -1,0 +1,53 @@
+"""What measures unknowns and rows of initialization: so that units decide nothing."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+NOISE = 8.0  # rounding errors of a row, in units of eps
+
+
+class Sizes(NamedTuple):
+    """What measures unknowns and rows: zero where nothing is known."""
+
+    nominal: Float[Array, " n"]  # declared sizes of unknowns
+    known: Float[Array, " n"]  # sizes of unknowns by their declarations, starts and guesses
+    data: Float[Array, " m"]  # sizes of what each row is compared with
+    soft: Float[Array, " m"]  # distances that weigh the same in soft rows
+
+
+def tolerance(dtype: Any) -> float:
+    """The largest residual that counts as rounding, relative to the size of a row's terms."""
+    return float(jnp.finfo(dtype).eps) ** 0.6
+
+
+def soft_weight(dtype: Any) -> float:
+    """The weight of soft rows beside others: they move these by its square, a tenth of what counts as rounding."""
+    return float(np.sqrt(0.1 * tolerance(dtype)))
+
+
+def row_sizes(jacobian: Any, x: Any, sizes: Sizes, unit: Any) -> tuple[Any, Any]:
+    """The size of each row's terms, and the rounding that the sizes of unknowns alone let expect."""
+    size = jnp.maximum(jnp.abs(x), sizes.nominal)
+    magnitude = jnp.where(jnp.isfinite(jacobian), jnp.abs(jacobian), 0)
+    eps = float(jnp.finfo(jacobian.dtype).eps)
+    return magnitude @ size, NOISE * eps * (magnitude @ jnp.maximum(unit, size) + sizes.data)
+
+
+def column_sizes(value: Any, jacobian: Any, sizes: Sizes, power: Any = None) -> Any:
+    """A size for every unknown: as known, or else what its rows imply, |∂F/∂xⱼ|·xⱼ being of the size of their other
+    terms; 1 where nothing is known. With `power`, shape (m, n), terms are |jacobian|·xⱼ**power."""
+    tiny, huge = float(jnp.finfo(jacobian.dtype).tiny), 1 / float(jnp.finfo(jacobian.dtype).eps)
+    magnitude = jnp.where(jnp.isfinite(jacobian), jnp.abs(jacobian), 0)
+    offset = jnp.maximum(sizes.data, jnp.where(jnp.isfinite(value), jnp.abs(value), 0))
+    size = sizes.known
+    for _ in range(2):
+        terms = magnitude * (size[None, :] if power is None else size[None, :] ** power)
+        row = jnp.maximum(offset, jnp.max(terms, axis=1, initial=0.0))
+        seen = (magnitude > tiny) & (row > tiny)[:, None]
+        ratio = jnp.where(seen, row[:, None] / jnp.where(seen, magnitude, 1), jnp.inf)
+        implied = jnp.min(ratio if power is None else ratio ** (1 / power), axis=0, initial=jnp.inf)
+        size = jnp.where(sizes.known > 0, sizes.known, jnp.where(implied < huge, implied, 0))
+    return jnp.where(size > 0, size, 1)
