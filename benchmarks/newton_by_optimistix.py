@@ -2,8 +2,8 @@
 
 The same iteration for Robertson's equations with algebraic conservation, once as `lax.while_loop` with a derivative by
 the implicit function theorem, as `solvers/newton.py` has it, and once behind `optimistix.root_find` with its implicit
-adjoint. Prints, forward and for the gradient of a scan over steps: lines of StableHLO, CPU seconds of tracing and of compilation,
-CPU microseconds of a step, and whether the program calls back to the host.
+adjoint. Prints, forward and for the gradient of a scan over steps: lines of StableHLO, CPU seconds of tracing and of
+compilation, CPU microseconds of a step, and whether the program calls back to the host.
 
     python benchmarks/newton_by_optimistix.py
 """
@@ -132,7 +132,8 @@ def main():
             running = min(clocked(lambda c=compiled: c(k))[1] for _ in range(REPETITIONS))
             text = lowered.as_text()
             print(
-                f"{mode:9} {solve.__name__:14} {len(text.splitlines()):4} lines; tracing {min(tracing):.2f} s, compiling {min(compiling):.2f} s, "
+                f"{mode:9} {solve.__name__:14} {len(text.splitlines()):4} lines; "
+                f"tracing {min(tracing):.2f} s, compiling {min(compiling):.2f} s, "
                 f"{1e6 * running / steps:.2f} µs a step; callbacks: {'callback' in text}"
             )
 
