@@ -122,6 +122,42 @@ def test_in_a_nonlinear_block(name):
     assert abs(forward - slope) <= 1e-7 * max(1.0, abs(slope))
 
 
+def maps(count, a, b, sin, sqrt, tanh):
+    """`count` nested maps of two numbers."""
+    for _ in range(count):
+        a, b = sin(a + b) / sqrt(1 + a**2 + b**2), tanh(a * b) + a
+    return a, b
+
+
+def test_sixty_nested_maps_in_one_equation():
+    """2⁶⁰ terms if anything were written out."""
+
+    def write(c, t):
+        x, y = c.variable("x", start=0.3, fixed=True), c.variable("y", start=0.2, fixed=True)
+        with sympy.evaluate(False):  # SymPy asks everything it makes for its sign, by way of all its parts
+            a, b = maps(60, x, y, sympy.sin, sympy.sqrt, sympy.tanh)
+        c.add_equations(der(x) + a, der(y) + b)
+
+    system = compiled(write)
+    point = jnp.array([0.3, 0.2])
+    # Operation by operation: XLA takes minutes to fuse them.
+    with jax.disable_jit():
+        found, pull = jax.vjp(lambda x: system.vector_field(0.0, x), point)
+        slopes = np.stack([np.asarray(pull(unit)[0]) for unit in jnp.eye(2)])
+    with mp.workdps(40):
+
+        def exact(*at):
+            return [-v for v in maps(60, *at, mp.sin, mp.sqrt, mp.tanh)]
+
+        at = [mp.mpf(float(v)) for v in point]
+        value = [float(v) for v in exact(*at)]
+        gradient = [
+            [float(mp.diff(lambda x, y, k=k: exact(x, y)[k], at, n=n)) for n in ((1, 0), (0, 1))] for k in (0, 1)
+        ]
+    np.testing.assert_allclose(found, value, rtol=1e-12)
+    np.testing.assert_allclose(slopes, gradient, rtol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("f", "message"),
     [
