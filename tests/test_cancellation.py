@@ -1,7 +1,9 @@
 """Derivatives that cancel in float coefficients, and questions of rank in any units."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
+import sympy
 from attack import descriptors
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der
@@ -128,3 +130,19 @@ def test_a_coefficient_that_is_a_rounding_error(unit):
         with pytest.raises(StructuralError, match="determines nothing for d.p"):
             compiled(0.3, q)
     assert compiled(0.3, 0.3 + 1e-9).states == ["d.x"]
+
+
+@pytest.mark.parametrize("factor", [1.0, 1e-12, 1e9])
+def test_a_sum_over_equal_variables_that_rounding_leaves(factor):
+    """0.1 a + 0.2 b − 0.3 c + u = 0 where a = b = c: 5e-17 a is none of it, so that u = 0 and nothing determines a."""
+
+    def equations(a, b, c, u, v, t):
+        total = factor * (0.1 * a + 0.2 * b - 0.3 * c + u)
+        return (a - b, b - c, total, der(v) + v + u)
+
+    assert 0.1 + 0.2 - 0.3 != 0.0
+    with pytest.raises(StructuralError):
+        _compiled("abcuv", lambda a, b, c, u, v, t: (*equations(a, b, c, u, v, t), u + v - sympy.cos(t)))
+    system = _compiled("abcuv", lambda a, b, c, u, v, t: (*equations(a, b, c, u, v, t), der(a) + a))
+    assert sorted(system.states) == ["d.a", "d.v"]
+    assert float(system.observe(["d.u"], 0.0, jnp.array([1e3, 2.0]))[0]) == 0.0

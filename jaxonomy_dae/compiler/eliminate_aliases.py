@@ -14,6 +14,7 @@ from ..model.provenance import Provenance
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel
 
 Row = list[tuple[int, int, float]]  # (variable, order, coefficient)
+ROUNDING = 1e-15  # of the sizes of the terms that are merged
 
 
 class _Classes:
@@ -54,14 +55,16 @@ class _Classes:
         return v, order, sign
 
     def canonical(self, row: Row) -> Row:
-        """The row in roots, terms of equal quantity merged."""
+        """The row in roots, terms of equal quantity merged; what rounding leaves of terms that cancel is nothing."""
         merged: dict[tuple[int, int], float] = {}
+        size: dict[tuple[int, int], float] = {}
         for v, order, c in row:
             root, more, sign = self.find(v)
             if root != ZERO:
                 key = (root, order + more)
                 merged[key] = merged.get(key, 0.0) + sign * c
-        return [(v, order, c) for (v, order), c in merged.items() if c != 0.0]
+                size[key] = size.get(key, 0.0) + abs(c)
+        return [(v, order, c) for (v, order), c in merged.items() if abs(c) > ROUNDING * size[v, order]]
 
     def absorb(self, row: Row) -> int | None:
         """Uses a canonical row of one or two terms as an alias, if it is one; returns the variable it replaces."""
