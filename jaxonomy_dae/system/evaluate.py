@@ -187,7 +187,7 @@ class Evaluation:
             template = planned.equations[e].equation.template
             slots, parameters, *rest = self._arguments(planned.equations[e], local)
             slots, parameters = jax.lax.stop_gradient((slots, parameters))
-            arguments = slots, parameters, *rest
+            arguments: Any = (slots, parameters, *rest)
             residual = template.residual(*arguments)
             if template.opaque is not None:  # y − N(u): the network is not differentiated for this
                 slots, partials = [slots[0], slots[0] - residual], (1.0, 1.0)
