@@ -67,6 +67,7 @@ def flow(e: np.ndarray, a: np.ndarray, forcing: np.ndarray, bound_first: Sequenc
     """
     n, m = a.shape[1], len(a)
     scale = np.maximum(np.max(np.abs(e), axis=1), np.max(np.abs(a), axis=1)).astype(LARGE)
+    scale[scale == 0] = 1  # 0 = f, at a node to which nothing is connected but a source
     e, a = e.astype(LARGE) / scale[:, None], a.astype(LARGE) / scale[:, None]
     last = order * n
     table = np.zeros((m * (order + 1), last + 2 * n + 1), LARGE)  # columns: y^(order+1), …, y', y, 1
