@@ -151,11 +151,14 @@ def arrow(rng, n):
     a[:, -1] = rng.normal(size=n) * (rng.random(n) < 0.7)
     a[-1] = rng.normal(size=n)
     a[0, -1] = 1.3
+    of_numbers: list[int] = []
     for e in range(1, n - 1):
+        from_other = int(rng.choice(of_numbers)) if of_numbers else None
         if rng.random() < 0.5:
-            numbers[e] = True
-            a[e, e], a[e, -1] = 1.0, rng.choice([0.0, 1.0])
-            a[e, rng.integers(e)] = rng.choice([-1.0, 1.0, 0.5])
+            numbers[e], a[e], a[e, e], a[e, -1] = True, 0.0, 1.0, rng.choice([-1.0, 1.0])
+            of_numbers.append(e)
+        if from_other is not None:
+            a[e, from_other] = rng.choice([-1.0, 1.0, 0.5]) if numbers[e].all() else rng.normal()
     return a, numbers
 
 

@@ -25,7 +25,7 @@ Derivatives are those of x = A⁻¹ b, from solves by the same elimination.
 """
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -106,13 +106,10 @@ class _Elimination:
         self.columns = _rows({(u, e): a for (e, u), a in matrix.items()}, n)
         self.over_pivot = {u: 1 / matrix[e, u] for e, u in tearing.sequence}
         self.place = {u: j for j, u in enumerate(tearing.tearing)}
-        self.equation_of = {u: e for e, u in tearing.sequence}
         self.written_out = m <= UNROLLED
-        self.depth = self._depths(tearing.sequence, self.rows)
-        # The same for the transpose, in which equations and unknowns change places.
-        self.depth_transposed = self._depths([(u, e) for e, u in reversed(tearing.sequence)], self.columns)
-        self.can_grow = max(self.depth.values(), default=0) > 1
-        self.chained = any(v in self.over_pivot and v != u for e, u in tearing.sequence for v, _ in self.rows[e])
+        self.giving = {e for e, _ in tearing.sequence}
+        self.can_grow = self._links() > 1
+        self.chained = any(_others(self.rows[e], u, self.over_pivot) for e, u in tearing.sequence)
         self.exact = m == 1 and not self.can_grow
         # W = −L⁻¹ F, by unknowns.
         self.w: dict[int, Any] = {}
@@ -134,21 +131,20 @@ class _Elimination:
     def _filled(self, value: Any) -> Any:
         return jnp.broadcast_to(jnp.asarray(value, self.like.dtype), self.like.shape)
 
-    @staticmethod
-    def _depths(sequence: Sequence[tuple[int, int]], rows: list[list[tuple[int, Any]]]) -> dict[int, int]:
-        """How many links each unknown of the sequence is away from the tearing variables.
+    def _links(self) -> int:
+        """How many links there are at most from a tearing variable to an unknown of the sequence.
 
         An equation with plain numbers only, which do not enlarge what is known, is not a link.
         """
-        depth: dict[int, int] = {}
-        for e, u in sequence:
-            known = [(v, a) for v, a in rows[e] if v in depth]
+        links: dict[int, int] = {}
+        for e, u in self.tearing.sequence:
+            known = [(v, a) for v, a in self.rows[e] if v in links]
             link = 1
-            if all(isinstance(a, int | float) for _, a in rows[e]):
-                pivot = next(abs(a) for v, a in rows[e] if v == u)
+            if all(isinstance(a, int | float) for _, a in self.rows[e]):
+                pivot = next(abs(a) for v, a in self.rows[e] if v == u)
                 link = int(sum(abs(a) for _, a in known) > pivot)
-            depth[u] = max([1, *(depth[v] + link for v, _ in known)])
-        return depth
+            links[u] = link + max((links[v] for v, _ in known), default=0)
+        return max(links.values(), default=0)
 
     def _more_than_rounding(self, schur: Any) -> Any:
         """The only entry of S, or not-a-number where it is what rounding left of its terms."""
@@ -237,7 +233,7 @@ class _Elimination:
         if self.exact:
             return x
         # What depends on tearing variables alone is as good as they are.
-        checked = [*tearing.residuals, *(e for e, u in tearing.sequence if self.depth[u] > 1)]
+        checked = [*tearing.residuals, *(e for e, u in tearing.sequence if _others(self.rows[e], u, self.over_pivot))]
         return self._verified(x, b, self.rows, checked)
 
     def transpose_solve(self, g: Sequence[Any]) -> list[Any]:
@@ -271,7 +267,7 @@ class _Elimination:
             y = [a + b for a, b in zip(kept, y, strict=True)]
         if self.exact:
             return y
-        checked = [*tearing.tearing, *(u for e, u in tearing.sequence if self.depth_transposed[e] > 1)]
+        checked = [*tearing.tearing, *(u for e, u in tearing.sequence if _others(self.columns[u], e, self.giving))]
         return self._verified(y, g, self.columns, checked)
 
     @property
@@ -304,6 +300,11 @@ class _Elimination:
             fine = residual <= allowed + TOLERATED / eps * tiny
             holds = fine if holds is True else holds & fine
         return [jnp.where(holds, v, jnp.nan) for v in x]
+
+
+def _others(row: list[tuple[int, Any]], own: int, places: Container[int]) -> bool:
+    """Whether a row has entries at some of the places, other than its own."""
+    return any(v in places and v != own for v, _ in row)
 
 
 def _rows(matrix: Entries, n: int) -> list[list[tuple[int, Any]]]:
