@@ -248,7 +248,18 @@ def test_a_chain_of_high_index_starts_one_block_after_the_other():
     np.testing.assert_allclose(system.observe(names, 0.0, x), expected, rtol=1e-12)
 
 
-class Circle(Component):
+def test_climbing_again_comes_to_an_end():
+    """Without a root, and with starts of further climbs at which nothing is finite."""
+    nothing = jnp.zeros(2)
+
+    def function(x):
+        return jnp.stack([x[0] ** 2 + 1, x[1] ** 2 + 1]) + jnp.where(jnp.sum(x**2) > 0.25, jnp.nan, 0)
+
+    found = jax.jit(lambda x: find_root(function, 2, x, Sizes(*[nothing] * 4), np.arange(2)))(nothing)
+    assert METHODS[int(found.method)] == "none"
+
+
+class Cubics(Component):
     """x³ + y³ + x = r, y − x³ + y³ = 2·r, r' = −r."""
 
     def __init__(self, ev, name):
@@ -259,7 +270,7 @@ class Circle(Component):
 
 def test_the_last_step_is_checked(monkeypatch):
     """The step that carries the derivative once went from a root to 1e272, unseen."""
-    assert np.isfinite(compiled(Circle(EqnEnv(), "sound")).initialize()).all()
+    assert np.isfinite(compiled(Cubics(EqnEnv(), "sound")).initialize()).all()
     monkeypatch.setattr(initialization, "least_squares", lambda matrix, right: 1e3 + 0 * (right @ matrix))
     with pytest.raises(InitializationError, match="no consistent initial point"):
-        compiled(Circle(EqnEnv(), "broken")).initialize(initial={"broken.r": 2.0})
+        compiled(Cubics(EqnEnv(), "broken")).initialize(initial={"broken.r": 2.0})

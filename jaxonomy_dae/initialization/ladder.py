@@ -11,7 +11,7 @@ Each rung starts at the given point, and only if the one before failed:
    method of weighting (Van Loan 1985).
 
 Where unknowns have no guess, zero stands for one, and there slopes may vanish, as of q·|q|: no rung leads away. So, if
-all have failed, the ladder is climbed once more with those unknowns at their sizes.
+all have failed, the ladder is climbed again with those unknowns at their sizes, then with every other one negative.
 
 Units decide nothing: unknowns are measured by their sizes, rows by the sizes of their terms, Σ |∂F/∂x|·|x|.
 
@@ -59,7 +59,8 @@ FLAT = 1e-3  # a row whose slopes are less than this, times its value, is measur
 TO_BOUND = 0.9  # of the way to a bound that a step would cross
 SETTLED = 1e-2  # steps of this times √eps end the search for the nearest point
 
-AGAIN = SIZED - 1  # what `Scalars.begun` is at the start of the second climb
+AGAIN = SIZED - 1  # what `Scalars.begun` is at the start of the second climb, and one less for each further one
+CLIMBS = 3
 
 _NEWTON, _MARQUARDT, _TRACK, _LAND, _POLISH, _NEAREST, _DONE, _FAILED = range(8)
 
@@ -105,6 +106,7 @@ def find_root(
     hard, weighted = jnp.asarray(~is_soft), jnp.asarray(np.where(is_soft, soft_weight(dtype), 1.0), dtype)
     has_soft = bool(is_soft.any())
     nearest_first = has_soft and core is None
+    alternating = (-1.0) ** np.arange(n + 1)
     first_rung = _NEAREST if nearest_first else _NEWTON
     limits = np.array(bounds, float) if bounds is not None and np.isfinite(bounds).any() else None
     if limits is not None:
@@ -159,7 +161,8 @@ def find_root(
         nearest, marquardt = is_nearest(phase), phase == _MARQUARDT
         descending = (phase == _NEWTON) | (phase == _POLISH) | nearest
         tracking, landing = (phase == _TRACK) | (phase == _LAND), phase == _LAND
-        begins, second = s.begun <= 0, (s.begun > 1) | (s.begun == AGAIN)
+        begins = s.begun <= 0
+        climb = where(begins, where(s.begun <= AGAIN, AGAIN + 2 - s.begun, one), s.begun)
         # A root is a root on any rung; but what the homotopy lands on is polished first.
         stop = reached & ~tracking
 
@@ -267,7 +270,7 @@ def find_root(
         above = where(lost, _FAILED, above)
         restarts = failed | (tracking & landed) | lost
         unguessed = jnp.append(sizes.known == 0, False)
-        climbs_again = failed & (above == _FAILED) & ~second & ~lost & jnp.any(unguessed)
+        climbs_again = failed & (above == _FAILED) & (climb < CLIMBS) & ~lost & jnp.any(unguessed)
         stepped = where(tracking, ahead, here + where(descending, fraction, one) * unit * step)
         stepped = bounded(stepped, here)
         damped = where(accepted, 2 * one, 2 * s.growth)
@@ -281,14 +284,18 @@ def find_root(
             restart = where(
                 above == _MARQUARDT, bounded(beginning + 1e-3 * unit * generic * (1 - along), restart), restart
             )
-        restart = where(climbs_again, bounded(where(unguessed, unit * generic, origin), origin), restart)
+        climb_begins = AGAIN + 2 - climb
+        elsewhere = unit * generic * where(climb > 1, jnp.asarray(alternating, dtype), one)
+        restart = where(climbs_again, bounded(where(unguessed, elsewhere, origin), origin), restart)
         above = where(climbs_again, first_rung, above)
         scalars = packed(
             *Scalars(
                 phase=where(done, _DONE, where(failed, above, where(tracking, follow, phase))),
                 method=where(done, where(stop & begins, 0, by), s.method),
                 fresh=restarts,
-                begun=where(climbs_again, AGAIN, where(lost, 0.0, where(second, 2.0, 1.0))),
+                begun=where(
+                    climbs_again, climb_begins - 1, where(lost, where(climb > 1, climb_begins, 0 * one), climb)
+                ),
                 count=where(failed | (tracking & landed), 0, s.count + 1),
                 evaluations=s.evaluations + 1,
                 size=where(descending, fraction, where(marquardt, damping, arc)),

@@ -18,7 +18,7 @@ class Scalars(NamedTuple):
     phase: Any
     method: Any
     fresh: Any  # whether the trial point is where a rung starts
-    begun: Any  # 1 once F has been finite, 2 on the second climb; on the way there, see `probing`
+    begun: Any  # the number of the climb once F has been finite; on the way there, see `probing`
     count: Any  # evaluations on this rung
     evaluations: Any
     size: Any
