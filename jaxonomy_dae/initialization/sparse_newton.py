@@ -61,8 +61,8 @@ def sparse_rows(plan: SystemPlan, rows: InitialRows) -> SparseRows | None:
         return None
     reads = [sorted(read) for read in plan.constraint_pattern or ()] if plan.n_constraints else []
     lengths = [len(read) for read in reads]
-    row = [np.repeat(np.arange(len(reads)), lengths)]
-    column = [np.array([c for read in reads for c in read], np.int64)]
+    row: list[np.ndarray] = [np.repeat(np.arange(len(reads)), lengths)]
+    column: list[np.ndarray] = [np.array([c for read in reads for c in read], np.int64)]
     if len(plan.carried) and plan.dae_pattern is not None:
         below = plan.dae_pattern.rows >= len(plan.states)
         row.append(plan.dae_pattern.rows[below] - len(plan.states) + len(reads))
