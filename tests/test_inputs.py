@@ -265,7 +265,7 @@ class Wide(eqx.Module):
         (lambda t: jnp.exp(jnp.complex128(1j) * t.astype(complex)), r"'m\.u' must be real; it returned complex128"),
         (1j, r"'m\.u' must be real; got complex128"),
         ("2", r"'m\.u' must be a number, samples or a function of time; got the text '2'"),
-        (jnp.ones(3), r"'m\.u' is a number, samples.*got shape \(3,\)"),
+        (jnp.ones(3), r"'m\.u' must be a number, samples.*got shape \(3,\)"),
         ({"t": 1.0}, r"'m\.u' must be a number, samples or a function of time; got dict"),
         (([0.0, 1.0, 0.5, 10.0], np.ones(4)), r"'m\.u': times must increase; times\[1\]=1\.0 is followed by"),
         (([0.0, 5.0, 5.0, 10.0], np.ones(4)), r"times must increase.*'held'"),

@@ -295,7 +295,7 @@ class _Elimination:
             size = _total([_magnitude(b[place]), *(_magnitude(p) for p in products)], None)
             allowed = _product(TOLERATED * eps, size)
             if norm is not None:
-                allowed = _largest([allowed, _product(TOLERATED_NORM * eps, _product(largest[place], norm))])
+                allowed = _largest([allowed, _product(_product(TOLERATED_NORM * eps, largest[place]), norm)])
             # Below the second term, products have lost digits to underflow.
             fine = residual <= allowed + TOLERATED / eps * tiny
             holds = fine if holds is True else holds & fine
