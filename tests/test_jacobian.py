@@ -10,6 +10,7 @@ from test_large_blocks import Grid
 
 from jaxonomy_dae import Component, EqnEnv, ModelError, der
 from jaxonomy_dae.lowering import pattern
+from jaxonomy_dae.system.evaluate import Refinement
 
 
 class Implicit(Component):
@@ -74,7 +75,7 @@ def test_pattern_of_the_semi_explicit_form(model):
     def residual(state):
         point = system.at(0.2, None)
         state = point.split(state)
-        f = point.run(plan.derivative, state, refine=0).read(plan.next_derivative)
+        f = point.run(plan.derivative, state, Refinement.NONE).read(plan.next_derivative)
         return jnp.concatenate([jnp.broadcast_to(f, (n,)), point.carried_vector(point.t, state)])
 
     assert len(system.carried)

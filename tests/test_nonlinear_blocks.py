@@ -3,6 +3,8 @@
 References: closed forms, and the equations themselves evaluated in NumPy.
 """
 
+import re
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -206,5 +208,8 @@ class Meeting(Component):
 
 def test_a_block_that_becomes_singular_is_named():
     message = failure(compiled(Meeting(EqnEnv(), "m")))
-    assert "The block of 2 equations that is to determine 'm." in message and "singular there" in message
+    # How near the last step comes is a matter of rounding.
+    assert re.search(
+        r"The block of 2 equations that is to determine 'm\.[xy]', 'm\.[xy]' is (nearly )?singular .*there", message
+    )
     assert "m: 0 = w*y + x - 2" in message and "'m.w' = 1" in message

@@ -112,7 +112,7 @@ def _finding(
     dependent = np.flatnonzero(np.abs(left).max(axis=1, initial=0.0) > 1e-3)
     variables = tuple(names[u] for u in chosen) or tuple(names)
     equations = tuple(dict.fromkeys(texts[e] for e in dependent)) or tuple(dict.fromkeys(texts))
-    causes = _causes(plan, values, step, b, left, right) if singular else ()
+    causes = _causes(plan, values, step, b, left, right) if singular or left.shape[1] else ()
     parameters = bool(causes) and causes[0][0] in plan.flat.parameters.names
     return BlockFinding(condition, singular, len(names), variables, equations, causes, parameters)
 
