@@ -51,6 +51,6 @@ class Tsit5(diffrax.Tsit5):
         return y1, y_error, dict(y0=y0, y1=y1, k=jnp.stack(k)), (slope, count), result
 
 
-def _combine(coefficients: Float[np.ndarray, " stages"], k: list[Float[Array, " n"]]) -> Float[Array, " n"]:
+def _combine(coefficients: Float[np.ndarray, " stages"], k: list[Float[Array, "*shape"]]) -> Float[Array, "*shape"]:
     terms = [float(c) * slope for c, slope in zip(coefficients, k, strict=True) if c != 0]
     return functools.reduce(operator.add, terms)
