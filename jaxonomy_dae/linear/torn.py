@@ -35,7 +35,7 @@ import numpy as np
 from ..structure.tearing import Tearing
 from .written_out import UNROLLED, inverse
 
-CORRECTIONS = 2  # the second one for blocks in which errors can grow over several links
+CORRECTIONS = 2  # where an unknown of the sequence depends on another; else one is enough
 TOLERATED = 2.0**20  # residual of an equation in units of eps times its terms: 2e-10 in double precision
 TOLERATED_NORM = 2.0**8  # the same in the equilibrated norm: 6e-14, what elimination with pivoting may leave
 TOLERATED_LOSS = 2.0**8  # the least that may be left of the terms of S, in units of eps
@@ -53,7 +53,8 @@ def solve_torn(tearing: Tearing, matrix: Entries, right: Sequence[Any]) -> list[
         the right-hand side.
     - `right`: an array for each equation.
 
-    **Returns:** the unknowns, in order; not-a-number where the residual is not small.
+    **Returns:** the unknowns, in order; not-a-number where the residual is not small, or where nothing but rounding is
+    left of the pivot of the tearing variable.
     """
     numbers = {at: a for at, a in matrix.items() if not isinstance(a, jax.Array)}
     arrays = {at: a for at, a in matrix.items() if isinstance(a, jax.Array)}
