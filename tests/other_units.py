@@ -76,8 +76,8 @@ def is_rescalable(compiler: AcausalCompiler) -> bool:
 def compare_verdicts(
     compiler: AcausalCompiler, old: AcausalSystem | ModelError, kind: str, seed: int, shuffled: bool = False
 ) -> Pair | None:
-    """Compiles the model in other units: it must be refused if `old` is an error, or else have the same states
-    (as many degrees of freedom, where variables are scaled). Returns both systems, if there are any."""
+    """Compiles the model in other units: it must be refused if `old` is an error, or else have the same states.
+    Returns both systems, if there are any."""
     flat = flatten(compiler.diagram)
     rng = np.random.default_rng([seed, KINDS.index(kind)])
     ev, diagram, factors = rescaled(rng, flat, kind, shuffled)
@@ -90,10 +90,8 @@ def compare_verdicts(
         assert type(old) is type(new), f"{kind} {seed}: in old units {old}\nin new units {new}"
         return None
     pair = Pair(old, new, dict(zip(flat.variables.names, factors.variable.tolist(), strict=True)))
-    if kind in ("equations", "parameters"):
-        states = sorted(q for q, _, _ in pair.old_quantities(new.states))
-        assert states == sorted(old.plan.states.tolist()), f"{kind} {seed}: {old.states} in new units {new.states}"
-    # What was another's equal, or its derivative, may be a state of its own when it is a multiple.
+    states = sorted(q for q, _, _ in pair.old_quantities(new.states))
+    assert states == sorted(old.plan.states.tolist()), f"{kind} {seed}: {old.states} in new units {new.states}"
     freedom = old.report.degrees_of_freedom, new.report.degrees_of_freedom
     assert freedom[0] == freedom[1], f"{kind} {seed}: {freedom} degrees of freedom, {old.states}, {new.states}"
     return pair

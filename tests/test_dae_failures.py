@@ -44,7 +44,7 @@ ENDS = {
 CAUSES = {
     "turning point": "Look for a pole, a turning point, a jump (jump_ts= names their times), or a root or logarithm",
     "root": "Just beyond, row 1 of F is not finite: a root or logarithm leaves its domain",
-    "pole": "it becomes infinite near t=1, and no solution goes beyond",
+    "pole": "and no solution continues beyond that",
     "not a number": "row 1 of F",
 }
 ENDS = {name: (DAETerm(f, g), *rest) for name, (f, g, *rest) in ENDS.items()}

@@ -41,7 +41,7 @@ def triangle(unit, nominal, y=2.0):
         x = self.variable("x", start=unit, fixed=True, **size)
         y_ = self.variable("y", start=y * unit, fixed=True, **size)
         z = self.variable("z", **size)
-        self.add_equations(Eq(der(p), -p), Eq(x + y_, z), Eq(der(x), -x), Eq(z, 3 * x))
+        self.add_equations(Eq(der(p), -p), Eq(x + y_, z), Eq(der(x), -x), Eq(z, self.parameter("k", 3.0) * x))
 
     return model(write)
 

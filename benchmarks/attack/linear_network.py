@@ -108,5 +108,6 @@ class LinearNetwork:
             if r.name in found:
                 parts = [c * ys[:, k] for k, c in r.values.items()] + [c * dys[:, k] for k, c in r.rates.items()]
                 values[r.name] = sum(parts, np.full(len(ts), r.constant))
-                allowed[r.name] = 1e-6 * max(largest[r.kind], 1e-6)
+                grown = max((float(np.max(np.abs(part))) for part in parts), default=0.0)
+                allowed[r.name] = 1e-6 * max(largest[r.kind], grown, 1e-6)
         return Motion(ts, values, allowed, 1e-9, 1e-11)

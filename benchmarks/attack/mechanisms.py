@@ -1,6 +1,7 @@
 """Point masses in the plane joined by rigid rods (index 3, Cartesian coordinates), against a solve for accelerations
 and multipliers."""
 
+import mpmath
 import numpy as np
 from sympy import Eq
 
@@ -54,6 +55,17 @@ class Pivot(Component):
         super().__init__(ev, name)
         port = self.port("at", Planar)
         self.add_equations(Eq(port.x, self.parameter("x", x)), Eq(port.y, self.parameter("y", y)))
+
+
+def _solved(jacobian: np.ndarray, inverse: np.ndarray, weight: np.ndarray, gamma: np.ndarray):
+    """Multipliers and accelerations, in fifty digits: what balances must not be rounding errors of the reference."""
+    if not len(gamma):
+        return np.zeros(0), weight
+    with mpmath.workdps(50):
+        j, w, s = mpmath.matrix(jacobian.tolist()), mpmath.matrix(weight.tolist()), mpmath.diag(inverse.tolist())
+        lam = mpmath.lu_solve(j * s * j.T, j * w + mpmath.matrix(gamma.tolist()))
+        a = w - s * (j.T * lam)
+        return np.array(lam.T.tolist()[0], float), np.array(a.T.tolist()[0], float)
 
 
 def make(seed: int) -> Case:
@@ -119,8 +131,7 @@ def make(seed: int) -> Case:
     inverse = np.repeat(1 / m[pivots:], 2)
     weight = np.tile([0.0, -g], masses)
     # a = weight − M⁻¹·Jᵀ·λ with the force −2·λ·(b − a) on b; J·a = −γ.
-    lam = np.linalg.solve((moving * inverse) @ moving.T, moving @ weight + gamma) if edges else np.zeros(0)
-    a = weight - inverse * (moving.T @ lam)
+    lam, a = _solved(moving, inverse, weight, gamma)
     expected, rates = {}, {}
     strong, fast = max(np.max(np.abs(lam), initial=0), 1e-3), float(np.max(np.abs(a)))
     rounding = ROUNDING * (g + float(np.max(np.abs(inverse * (moving.T @ lam)))))  # where weight and rods balance

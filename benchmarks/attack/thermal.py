@@ -10,7 +10,17 @@ from jaxonomy_dae.modeling import Thermal
 from .case import Case, log_uniform, names, signed
 from .linear_network import LinearNetwork
 
-WORDS = ["determine", "contradict", "singular", "redundant", "follow", "too many", "nothing holds", "connected"]
+WORDS = [
+    "determine",
+    "contradict",
+    "singular",
+    "redundant",
+    "follow",
+    "too many",
+    "nothing holds",
+    "connected",
+    "both fix",
+]
 
 
 class Heater(Component):

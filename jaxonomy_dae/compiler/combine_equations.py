@@ -49,7 +49,7 @@ def graph_of(group: EquationGroup, i: int, times: int) -> Node | None:
     for base, q in template.slots:
         v = int(group.variable[i, base])
         placed = leaf(quantity_label(v, int(group.order[i, base]) + q))
-        slots[slot_label((base, q))] = ZERO_NODE if v == ZERO else scale(int(group.sign[i, base]), placed)
+        slots[slot_label((base, q))] = ZERO_NODE if v == ZERO else scale(_exact(float(group.factor[i, base])), placed)
     if isinstance(template, LinearTemplate):
         return linear(zip(map(_exact, group.coefficient[i].tolist()), slots.values(), strict=True))
     if not isinstance(template, SymbolicTemplate):
@@ -125,7 +125,7 @@ def group_of(graph: Node, provenance: Provenance) -> EquationGroup:
         template_of(substitute(graph, replaced), slots, len(parameters)),
         np.array([[v for v, _ in quantities]], np.int64),
         np.array([[o for _, o in quantities]], np.int64),
-        np.ones((1, len(quantities)), np.int64),
+        np.ones((1, len(quantities))),
         np.array([parameters], np.int64).reshape(1, -1),
         np.zeros((1, 0)),
         [provenance],

@@ -50,7 +50,7 @@ def differentiate_equations(
             slot_q = np.array([q for _, q in template.slots], np.int64)
             v = group.variable[np.ix_(rows, slot_base)] if len(slot_base) else np.zeros((len(rows), 0), np.int64)
             o = group.order[np.ix_(rows, slot_base)] + slot_q if len(slot_base) else v
-            s = group.sign[np.ix_(rows, slot_base)] if len(slot_base) else v
+            s = group.factor[np.ix_(rows, slot_base)] if len(slot_base) else v
             zero = v == ZERO
             quantity = np.where(zero, ZERO, first[column[v]] + o)
             out.append(

@@ -55,7 +55,7 @@ class GroupBuilder:
                     rows.template,
                     variable,
                     np.concatenate(rows.order),
-                    np.ones_like(variable),
+                    np.ones(variable.shape),
                     np.concatenate(rows.parameter),
                     np.concatenate(rows.coefficient),
                     rows.provenance,

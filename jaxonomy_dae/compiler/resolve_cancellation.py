@@ -117,10 +117,10 @@ class _Jacobian:
         return g, e - int(self.first[g])
 
     def partials(self, g: int, trial: int) -> np.ndarray:
-        """Of all equations of a group, signs included, shape (n, slots)."""
+        """Of all equations of a group, factors included, shape (n, slots)."""
         if (g, trial) not in self._partials:
             group = self.groups[g]
-            point = np.where(group.variable == ZERO, 0.0, group.sign * somewhere(group.variable, group.order, trial))
+            point = np.where(group.variable == ZERO, 0.0, group.factor * somewhere(group.variable, group.order, trial))
             if group.template.opaque is not None:  # any function
                 slots = range(point.shape[1])
                 any_slopes = [np.ones(len(group)), *(somewhere(group.variable[:, 0], k, trial) for k in slots[1:])]
@@ -130,7 +130,7 @@ class _Jacobian:
                 t = 0.37 + 0.1 * trial
                 found = group.template.partial_values(list(point.T), p, c, t, None, backend="numpy")
             spread = [np.broadcast_to(np.asarray(v, float), (len(group),)) for v in found]
-            self._partials[g, trial] = np.stack(spread, axis=-1) * group.sign if spread else np.zeros(point.shape)
+            self._partials[g, trial] = np.stack(spread, axis=-1) * group.factor if spread else np.zeros(point.shape)
         return self._partials[g, trial]
 
     def hits(self, e: int, columns: np.ndarray) -> list[tuple[int, int]]:
@@ -296,7 +296,7 @@ def zero_pivots(groups, signature: Incidence, offsets: Offsets, column, values) 
         def total(parameters, template=template, group=group, used=used, slots=slots):
             point = [np.ones(len(group))] * len(template.slots)
             partial = template.partial_values(point, list(parameters.T), [], 0.0, None, backend="numpy")
-            return sum(used[:, k] * group.sign[:, k] * partial[k] for k in slots.tolist())
+            return sum(used[:, k] * group.factor[:, k] * partial[k] for k in slots.tolist())
 
         coefficient = total(here)
         # The terms of a coefficient are seen in how it answers to small relative changes of its parameters.

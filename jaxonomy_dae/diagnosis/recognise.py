@@ -235,13 +235,13 @@ def _islands(flat: FlatModel, groups, alias: AliasTable, members: np.ndarray) ->
     plain = (alias.root[members] != ZERO) & (alias.order[members] == 0)
     root = alias.root[members]
     held[root[~plain & (root != ZERO)]] = True
-    shift[root[plain]] = alias.sign[members[plain]]
-    held[root[plain][shift[root[plain]] != alias.sign[members[plain]]]] = True
+    shift[root[plain]] = 1 / alias.factor[members[plain]]
+    held[root[plain][shift[root[plain]] != 1 / alias.factor[members[plain]]]] = True
     held |= flat.variables.is_input
     rows, columns, first = [], [], 0
     moved = []  # whether an equation notices the shift
     for group in groups:
-        weight = np.where(group.variable == ZERO, 0.0, shift[group.variable]) * group.sign
+        weight = np.where(group.variable == ZERO, 0.0, shift[group.variable]) * group.factor
         i, k = np.nonzero(weight)
         rows.append(first + i)
         columns.append(group.variable[i, k])

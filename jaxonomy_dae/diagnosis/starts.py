@@ -41,7 +41,7 @@ def check_equal_starts(flat: FlatModel, groups: tuple[EquationGroup, ...], alias
         name, start = table.names[v], table.start[v]
         assert start is not None
         number = None if start.parameters else value_of(v)
-        key, sign = (int(alias.root[v]), int(alias.order[v])), int(alias.sign[v])
+        key, factor = (int(alias.root[v]), int(alias.order[v])), float(alias.factor[v])
         if key[0] == ZERO:
             if number:
                 raise StructuralError(
@@ -54,18 +54,21 @@ def check_equal_starts(flat: FlatModel, groups: tuple[EquationGroup, ...], alias
                 f"the start of '{name}' is fixed, but its value comes from the input '{table.names[key[0]]}'. Free the "
                 "start (fixed=False)."
             )
-        if number is not None and key in numbers and not _equal(numbers[key][1], sign * number):
+        if number is not None and key in numbers and not _equal(numbers[key][1], number / factor):
             w, other = numbers[key]
-            relation = "are equal" if alias.sign[w] == sign else "are equal but for the sign"
+            ratio = factor / float(alias.factor[w])
+            relation = {1.0: "are equal", -1.0: "are equal but for the sign"}.get(
+                ratio, f"differ by the factor {ratio:g}"
+            )
             raise StructuralError(
                 f"'{table.names[w]}' and '{name}' {relation}, but their starts are fixed at "
-                f"{other * alias.sign[w]:g} and {number:g}. Free one of them (fixed=False)."
+                f"{other * float(alias.factor[w]):g} and {number:g}. Free one of them (fixed=False)."
             )
         if number is not None:
-            numbers.setdefault(key, (v, sign * number))
+            numbers.setdefault(key, (v, number / factor))
         if key in first:
             w = first[key]
-            same = sign == alias.sign[w] and table.start[w] == start
+            same = factor == alias.factor[w] and table.start[w] == start
             settled = same or (key in numbers and numbers[key][0] == w and number is not None)
             notes.append(
                 f"'{table.names[w]}' and '{name}' are one quantity, and both starts are fixed: "

@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import StructuralError
 from ..model.incidence import incidence
 from ..model.provenance import Provenance
-from ..model.tables import AliasTable, EquationGroup, FlatModel, provenance_of
+from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, provenance_of
 from ..structure.dulmage_mendelsohn import dulmage_mendelsohn
 from ..structure.incidence import Incidence
 from ..structure.matching import maximum_matching
@@ -56,9 +56,7 @@ def check_structure(
     else:
         texts = [
             _too_many(
-                [provenance_of(groups, int(r)) for r in rows],
-                len(columns),
-                [flat.variables.names[v] for v in _best(flat, alias, unknown, columns)],
+                *_with_multiples(flat, alias, rows, groups, columns, _best(flat, alias, unknown, columns).tolist())
             )
             for rows, columns in over
             if len(columns)
@@ -93,6 +91,29 @@ def _too_many(equations: list[Provenance], n_unknowns: int, names: list[str]) ->
     else:
         lines = ["one of these equations repeats or contradicts the others. Remove or change one of:"]
     return "\n".join(lines + itemised(sorted(equations, key=lambda e: not e.is_written)))
+
+
+def _with_multiples(
+    flat: FlatModel, alias: AliasTable, rows: np.ndarray, groups: tuple[EquationGroup, ...], columns, names: list[int]
+) -> tuple[list[Provenance], int, list[str]]:
+    """Equations that compete, the number of their unknowns, and the names of these: those included that say that a
+    variable they read is a multiple of another."""
+    equations = [provenance_of(groups, int(r)) for r in rows]
+    chosen = set(equations)
+    read = {
+        v
+        for group in flat.groups
+        for provenance, variables in zip(group.provenance, group.variable.tolist(), strict=True)
+        if provenance in chosen
+        for v in variables
+    }
+    multiples = [
+        (p, v) for p, v in alias.eliminated if v in read and alias.root[v] != ZERO and abs(alias.factor[v]) != 1
+    ]
+    place = {p: k for k, p in enumerate(p for group in flat.groups for p in group.provenance)}
+    equations = sorted([*equations, *(p for p, _ in multiples)], key=lambda p: place.get(p, len(place)))
+    shown = dict.fromkeys([*names, *(v for _, v in multiples)])
+    return equations, len(columns) + len(multiples), [flat.variables.names[v] for v in shown]
 
 
 def _repeated(flat: FlatModel, empty: list[Provenance]) -> list[str]:

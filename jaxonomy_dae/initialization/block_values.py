@@ -37,18 +37,18 @@ class BlockValues:
         if not self._have_inputs and any((s.quantity >= first).any() for s in equation.slots):
             self.quantities[first:-1] = self._inputs()
             self._have_inputs = True
-        return [s.sign * self.quantities[s.quantity] for s in equation.slots]
+        return [s.factor * self.quantities[s.quantity] for s in equation.slots]
 
     def partials(self, equation: StepEquation, parameters: np.ndarray | None = None) -> np.ndarray:
-        """∂(residual)/∂(slot), signs included, shape (n, slots)."""
+        """∂(residual)/∂(slot), factors included, shape (n, slots)."""
         slots = self.slots(equation)
         n = equation.parameter.shape[0]
-        signs = np.stack([s.sign for s in equation.slots], axis=-1)
+        factors = np.stack([s.factor for s in equation.slots], axis=-1)
         p = list((self.parameters if parameters is None else parameters)[equation.parameter].T)
         c = list(equation.coefficient.T)
         with np.errstate(all="ignore"):
             out = equation.template.partial_values(slots, p, c, self.t, self.networks, backend="numpy")
-            return np.stack([np.broadcast_to(np.asarray(v, float), (n,)) for v in out], axis=-1) * signs
+            return np.stack([np.broadcast_to(np.asarray(v, float), (n,)) for v in out], axis=-1) * factors
 
     def residual(self, equation: StepEquation) -> np.ndarray:
         slots = self.slots(equation)
@@ -75,7 +75,7 @@ class BlockValues:
             slots, n = self.slots(equation), step.n
             p, c = list(self.parameters[equation.parameter].T), list(equation.coefficient.T)
             out = equation.template.solve(k, slots, p, c, self.t, self.networks, backend="numpy")
-            self.quantities[step.unknown[u]] = np.broadcast_to(np.asarray(out, float), (n,)) * equation.slots[k].sign
+            self.quantities[step.unknown[u]] = np.broadcast_to(np.asarray(out, float), (n,)) / equation.slots[k].factor
 
     def solve(self, step: Step):
         """The unknowns of a linear step."""

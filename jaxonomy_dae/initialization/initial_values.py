@@ -20,8 +20,6 @@ def check_initial(system: AcausalSystem, initial: Any) -> None:
     for name, value in initial.items():
         if name in system.parameters.names:
             raise ModelError(f"initial: '{name}' is a parameter; use system.with_parameters({{'{name}': value}})")
-        if system.plan.resolve([name])[0][0] < 0:
-            raise ModelError(f"initial: '{name}' is identically zero in this model")
         if isinstance(value, str) or np.shape(value) != ():
             found = repr(value) if isinstance(value, str) else f"shape {np.shape(value)}"
             raise ModelError(f"initial: '{name}' needs a scalar; got {found}")
@@ -29,3 +27,6 @@ def check_initial(system: AcausalSystem, initial: Any) -> None:
             raise ModelError(f"initial: '{name}' must be real; got {jnp.result_type(value)}")
         if not isinstance(value, Tracer) and not np.isfinite(np.asarray(value, float)):
             raise ModelError(f"initial: '{name}' must be finite; got {value}")
+        if system.plan.resolve([name])[0][0] < 0 and (isinstance(value, Tracer) or float(value) != 0.0):
+            found = "a value that is traced" if isinstance(value, Tracer) else f"{float(value):g}"
+            raise ModelError(f"initial: '{name}' is identically zero in this model; got {found}. Leave it out")

@@ -20,7 +20,7 @@ from ..errors import InitializationError
 from ..linear.least_squares import least_squares
 from ..linear.sparse import sparse_jacobian
 from ..linear.whole import solve_whole
-from ..lowering.gather import Gather, take
+from ..lowering.gather import Gather, take, times
 from ..lowering.plan import SystemPlan
 from ..model.quantities import declared_scale, quantity_bounds
 from ..system.evaluate import Refinement
@@ -33,6 +33,7 @@ from .rows import InitialRows, Row, initial_rows
 from .sizes import NOISE, Sizes, tolerance
 from .sparse_newton import SparseRows, sparse_newton, sparse_rows
 from .stages import solve_in_stages, stages
+from .typical_sizes import typical_sizes
 
 PERTURBATIONS = 8  # of the start, and of parameters, that show the sizes of terms
 
@@ -70,7 +71,7 @@ def initialize(
     point: SystemAt = system.at(t0, inputs)
     parameters = point.parameters
     n = plan.n_state
-    x0 = _values(rows.guess, given, parameters) * jnp.asarray(_signs(rows.guess), point.dtype)
+    x0 = _values(rows.guess, given, parameters) * jnp.asarray(_units(rows.guess), point.dtype)
     target = _values(rows.kept, given, parameters)
     starts = _reader(plan, rows.kept)
     if rows.direct:
@@ -126,7 +127,8 @@ def initialize(
     if staged is not None:
         start = frozen(solve_in_stages(function, start, sizes, *staged))
     if solver is None:
-        found = find_root(function, m, start, sizes, core, is_soft, bounds)
+        typical = np.append(typical_sizes(plan), np.ones(len(unknown)))
+        found = find_root(function, m, start, sizes, core, is_soft, bounds, typical)
     else:
         found = find_root_with(solver, function, start, sizes, is_soft, core is not None or not rows.n_soft)
     if staged is not None:
@@ -310,21 +312,23 @@ def _distances(plan: SystemPlan, rows: InitialRows, nominal: Any, guess: Any, m:
     place = {int(q): k for k, q in enumerate((*plan.states, *plan.carried))}
     soft = rows.kept[-rows.n_soft :]
     where = np.array([place[row.quantity] for row in soft])
-    units = [_unit_of(plan, row.quantity) for row in soft]
+    units = [_unit_of(plan, row.name) for row in soft]
+    factor = jnp.asarray(np.abs([row.factor for row in soft]), guess.dtype)
     same = np.array([[a == b for b in units] for a in units])
-    shared = jnp.max(jnp.where(same, guess[where][None, :], 0), axis=1)
-    return out.at[m - rows.n_soft :].set(jnp.where(nominal[where] > 0, nominal[where], shared))
+    shared = jnp.max(jnp.where(same, (factor * guess[where])[None, :], 0), axis=1)
+    return out.at[m - rows.n_soft :].set(jnp.where(nominal[where] > 0, factor * nominal[where], shared))
 
 
-def _unit_of(plan: SystemPlan, quantity: int) -> str:
-    variable = plan.variable_index.get(plan.quantity_name[quantity])
+def _unit_of(plan: SystemPlan, name: str) -> str:
+    variable = plan.variable_index.get(name)
     return "" if variable is None else plan.flat.variables.unit[variable]
 
 
 def _data_sizes(plan: SystemPlan, rows: InitialRows, given: list, parameters: Any) -> tuple[Any, Any]:
     """The sizes of the terms in the rows' targets, and in the guesses of the state array."""
     both = _values((*rows.kept, *rows.guess), given, parameters, sizes=True)
-    return both[: len(rows.kept)], both[len(rows.kept) :]
+    units = jnp.asarray(np.abs(_units(rows.guess)), parameters.dtype)
+    return both[: len(rows.kept)], both[len(rows.kept) :] * units
 
 
 def _bounds(system: Any, plan: SystemPlan, unknown: np.ndarray) -> np.ndarray:
@@ -346,7 +350,7 @@ def independent_rows(plan: SystemPlan, rows: InitialRows, n: int) -> np.ndarray 
 def _reader(plan: SystemPlan, kept: tuple[Row, ...]):
     """The values of the rows' variables as a function of the point and the state array."""
     quantity = np.array([r.quantity for r in kept], np.int64)
-    sign = np.array([r.sign for r in kept], np.int64)
+    factor = np.array([r.factor for r in kept], float)
     place = {int(q): k for k, q in enumerate((*plan.states, *plan.carried))}
     in_state = all(int(q) in place for q in quantity)
 
@@ -355,9 +359,9 @@ def _reader(plan: SystemPlan, kept: tuple[Row, ...]):
             return jnp.zeros((0,), here.dtype)
         if in_state:
             where = np.array([place[int(q)] for q in quantity])
-            return take(x, where) * jnp.asarray(np.where(sign < 0, -1, 1), here.dtype)
+            return times(jnp.asarray(factor, here.dtype) if (factor != 1).any() else 1.0, take(x, where))
         evaluation = here.run(plan.everything, here.split(x), Refinement.NONE)
-        gather: Gather = plan.everything.layout.gather(quantity, sign)
+        gather: Gather = plan.everything.layout.gather(quantity, factor)
         return jnp.broadcast_to(jnp.asarray(evaluation.read(gather), here.dtype), (len(quantity),))
 
     return starts
@@ -368,8 +372,9 @@ def frozen_inputs(inputs: Any) -> Any:
     return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, inputs)
 
 
-def _signs(rows: tuple[Row | None, ...]) -> np.ndarray:
-    return np.array([1 if row is None or row.sign >= 0 else -1 for row in rows], np.int64)
+def _units(rows: tuple[Row | None, ...]) -> np.ndarray:
+    """What one unit of each row's variable is in units of its quantity."""
+    return np.array([1.0 if row is None else 1.0 / (row.factor or 1.0) for row in rows])
 
 
 def _values(rows: tuple[Row | None, ...], given: list, parameters: Any, sizes: bool = False) -> Any:

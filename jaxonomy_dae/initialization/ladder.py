@@ -85,6 +85,7 @@ def find_root(
     core: np.ndarray | None,
     soft: Bool[np.ndarray, " m"] | None = None,
     bounds: Float[np.ndarray, "n 2"] | None = None,
+    typical: Float[np.ndarray, " n"] | None = None,
 ) -> Found:
     """Climbs the ladder.
 
@@ -97,7 +98,26 @@ def find_root(
     - `soft`: which rows are guesses: they hold if they can; else the nearest point is taken. Without a `core` they
         outnumber what they can choose, and the nearest point is looked for at once.
     - `bounds`: of the unknowns; no iterate leaves them.
+    - `typical`: sizes of the unknowns where nothing is known, as powers of two: the search is in units of these.
     """
+    if typical is None or (typical == 1.0).all():
+        return _climb(function, m, start, sizes, core, soft, bounds)
+    unit = jnp.asarray(typical, start.dtype)
+    measured = sizes._replace(nominal=sizes.nominal / unit, known=sizes.known / unit)
+    limits = None if bounds is None else bounds / typical[:, None]
+    found = _climb(lambda y: function(y * unit), m, start / unit, measured, core, soft, limits)
+    return found._replace(x=found.x * unit, jacobian=found.jacobian / unit, unit=found.unit * unit)
+
+
+def _climb(
+    function: Callable[[Any], Any],
+    m: int,
+    start: Float[Array, " n"],
+    sizes: Sizes,
+    core: np.ndarray | None,
+    soft: Bool[np.ndarray, " m"] | None,
+    bounds: Float[np.ndarray, "n 2"] | None,
+) -> Found:
     dtype, n = start.dtype, start.shape[0]
     eps = float(jnp.finfo(dtype).eps)
     close, enough = min(1e3 * eps, 0.1 * tolerance(dtype)), tolerance(dtype)

@@ -114,7 +114,7 @@ class InitializationReport(Sections):
             guess = 0.0
             if row is not None and row.given < 0 and row.start is not None:
                 values = list(parameters[list(row.start.parameters)])
-                guess = row.sign * float(row.start.template.residual([], values, [], 0.0, None, backend="numpy"))
+                guess = float(row.start.template.residual([], values, [], 0.0, None, backend="numpy")) / row.factor
             name = plan.quantity_name[int(q)]
             out.append(Guess(name, guess + 0.0, float(self._x[k]) + 0.0))
         return out

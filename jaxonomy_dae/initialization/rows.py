@@ -35,11 +35,11 @@ EVEN = 1e-2  # a smallest entry above which a matrix is as well scaled as it can
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One start: sign·quantity equals a start expression or the caller's value `given`."""
+    """One start: factor·quantity equals a start expression or the caller's value `given`."""
 
     name: str
     quantity: int
-    sign: int
+    factor: float
     start: Start | None
     given: int = -1
 
@@ -79,7 +79,7 @@ class _Generic:
         if row.quantity != ZERO:
             out[row.quantity] = 1.0
         for parameter, slope in self._slopes(row):
-            out[self.n + self.solve_for.index(parameter)] -= row.sign * slope
+            out[self.n + self.solve_for.index(parameter)] -= slope / (row.factor or 1.0)
         out *= self.columns
         return out / max(np.abs(out).max(initial=0.0), 1e-300)
 
@@ -134,7 +134,7 @@ def _declared(plan: SystemPlan, names: tuple[str, ...]) -> tuple[list[Row], list
     """Values given, fixed starts they leave, and the first start of each quantity."""
     variables = plan.flat.variables
     overrides = [
-        Row(name, int(q), int(s), None, k)
+        Row(name, int(q), float(s), None, k)
         for k, (name, q, s) in enumerate(zip(names, *plan.resolve(names), strict=True))
         if q != ZERO
     ]
@@ -145,12 +145,12 @@ def _declared(plan: SystemPlan, names: tuple[str, ...]) -> tuple[list[Row], list
     for v, start in enumerate(variables.start):
         if start is None:
             continue
-        quantity, sign = plan.quantity_of(v)
+        quantity, factor = plan.quantity_of(v)
         if quantity == ABSENT:
             continue
         if quantity == ZERO and not (variables.fixed[v] and (start.parameters or number(v) != 0.0)):
             continue  # zero as it should be; any other fixed start must turn out to be zero
-        row = Row(variables.names[v], quantity, sign, start)
+        row = Row(variables.names[v], quantity, factor, start)
         if variables.fixed[v] and quantity not in overridden:
             fixed.append(row)
         started.setdefault(quantity, row)
@@ -165,14 +165,14 @@ def _generic(plan: SystemPlan, solve_for: tuple[int, ...]) -> _Generic:
     size = declared_scale(plan.flat, plan.variable_map, extended)
     number = start_values(plan.flat.variables.start, np.zeros(0))
     for v, start in enumerate(plan.flat.variables.start):
-        quantity, sign = plan.quantity_of(v)
+        quantity, factor = plan.quantity_of(v)
         if start is not None and quantity >= 0 and not start.parameters and size[quantity] == 0.0:
-            size[quantity] = sign * number(v)
+            size[quantity] = number(v) / factor
     size[size == 0.0] = 1.0
     n_parameters = len(plan.flat.parameters)
     parameter_size = np.ones(n_parameters)
     if n <= DENSE_LIMIT:  # parameters, as generic numbers, would make some equations stiff beside others
-        size, parameter_size = natural_sizes(extended, size, n_parameters)
+        size, parameter_size = natural_sizes(extended, size, np.zeros(n_parameters))
     jacobian, point, values = generic_jacobian(extended, size, parameter_size)
     jacobian = jacobian[:, :n]
     if solve_for:
@@ -238,7 +238,7 @@ def _candidates(plan: SystemPlan, guess) -> list[tuple[Row, bool]]:
     entries = [int(q) for q in (*plan.states, *plan.carried)]
     n = len(plan.states)
     ranked = sorted(range(len(entries)), key=lambda k: (guess[k] is None, k >= n, k))
-    rows = [guess[k] or Row(plan.quantity_name[entries[k]], entries[k], 1, None) for k in ranked]
+    rows = [guess[k] or Row(plan.quantity_name[entries[k]], entries[k], 1.0, None) for k in ranked]
     return [(row, guess[k] is not None and k < n) for row, k in zip(rows, ranked, strict=True)]
 
 

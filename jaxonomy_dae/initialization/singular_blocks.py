@@ -170,14 +170,14 @@ def _constraints(plan: SystemPlan, values: BlockValues) -> Iterator[BlockFinding
     for planned in plan.constraints:
         group = planned.group
         padded = np.append(values.quantities[:-1], 0.0)
-        slots = list((group.sign * padded[group.quantity]).T)
+        slots = list((group.factor * padded[group.quantity]).T)
         if np.isnan(slots).any() or group.template.opaque is not None:
             return
         p, c = list(values.parameters[group.parameter].T), list(group.coefficient.T)
         with np.errstate(all="ignore"):
             out = group.template.partial_values(slots, p, c, values.t, values.networks, backend="numpy")
         for k, partial in enumerate(out):
-            partial = np.broadcast_to(np.asarray(partial, float), (len(group),)) * group.sign[:, k]
+            partial = np.broadcast_to(np.asarray(partial, float), (len(group),)) * group.factor[:, k]
             where = place[group.quantity[:, k]]
             inside = np.flatnonzero(where >= 0)
             matrix[row + inside, where[inside]] += partial[inside]

@@ -9,6 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 UNROLLED = 6
+# By how much a pivot must be larger than the one above it. XLA computes a comparison anew in every fused loop that
+# reads it, with other roundings: were equal pivots compared as they are, some loops would exchange rows, others not.
+LARGER = 1.0873
 
 
 def solve(matrix: Sequence[Sequence[Any]], right: Sequence[Any], *, positive: bool = False) -> list[Any]:
@@ -40,7 +43,7 @@ def solve_many(
     for k in range(n):
         for r in range(k + 1, n if not positive else 0):
             # Bubble the largest pivot up to row k.
-            swap = jnp.abs(a[r][k]) * unit[r] > jnp.abs(a[k][k]) * unit[k]
+            swap = jnp.abs(a[r][k]) * unit[r] > LARGER * jnp.abs(a[k][k]) * unit[k]
             for c in range(k, n):
                 a[k][c], a[r][c] = jnp.where(swap, a[r][c], a[k][c]), jnp.where(swap, a[k][c], a[r][c])
             for c in range(len(b[k])):

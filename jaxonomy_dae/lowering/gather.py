@@ -32,13 +32,20 @@ def take(array: Any, index: np.ndarray) -> Any:
     return array[index]
 
 
+def times(factor: Any, value: Any) -> Any:
+    """factor·value; nothing is multiplied by 1 or −1, if the factor is a Python number."""
+    if isinstance(factor, float) and abs(factor) == 1.0:
+        return value if factor > 0 else -value
+    return factor * value
+
+
 @dataclasses.dataclass(frozen=True)
 class Gather:
-    """n values with signs. `chunk` −1 in all places is the constant zero."""
+    """n values, each times a factor. `chunk` −1 in all places is the constant zero."""
 
     chunk: np.ndarray
     offset: np.ndarray
-    sign: np.ndarray
+    factor: np.ndarray
 
     def read(self, chunks: list[Chunk], dtype) -> Any:
         """The values: a scalar if n is 1 (or a Python 0.0 where all are zero), else an array of shape (n,)."""
@@ -47,17 +54,14 @@ class Gather:
             return 0.0
         if n == 1:
             value = _entry(chunks[self.chunk[0]], int(self.offset[0]))
-            return value if self.sign[0] > 0 else -value
+            return times(float(self.factor[0]), value)
         if (self.chunk == self.chunk[0]).all():
             source = chunks[self.chunk[0]]
             value = source if _is_scalar(source) else take(source, self.offset)
         else:
             value = self._from_several(chunks, dtype)
-        if (self.sign > 0).all():
-            return value
-        if (self.sign < 0).all():
-            return -value
-        return value * jnp.asarray(self.sign, dtype)
+        same = (self.factor == self.factor[0]).all()
+        return times(float(self.factor[0]) if same else jnp.asarray(self.factor, dtype), value)
 
     def _from_several(self, chunks: list[Chunk], dtype) -> Any:
         used = np.unique(self.chunk)

@@ -77,7 +77,7 @@ def _shape(step: AnyStep, number: int) -> tuple:
             (
                 e.template.key,
                 tuple(s.local for s in e.slots),
-                tuple(s.sign.tobytes() + (s.quantity == ZERO).tobytes() for s in e.slots),
+                tuple(s.factor.tobytes() + (s.quantity == ZERO).tobytes() for s in e.slots),
                 e.coefficient.tobytes(),
             )
             for e in step.equations

@@ -62,7 +62,9 @@ def lower(model: CompiledModel) -> SystemPlan:
     planned_constraints = tuple(
         ConstraintGroup(
             g,
-            tuple(constraint_program.layout.gather(g.quantity[:, k], g.sign[:, k]) for k in range(g.quantity.shape[1])),
+            tuple(
+                constraint_program.layout.gather(g.quantity[:, k], g.factor[:, k]) for k in range(g.quantity.shape[1])
+            ),
         )
         for g in constraint_groups
     )
@@ -155,7 +157,7 @@ def _constraints(extended: Extended, selection: StateSelection, states: np.ndarr
             group.base[rows],
             group.level,
             group.quantity[rows],
-            group.sign[rows],
+            group.factor[rows],
             group.parameter[rows],
             group.coefficient[rows],
         )
@@ -172,17 +174,17 @@ def _constraints(extended: Extended, selection: StateSelection, states: np.ndarr
 
 
 def _of(variables: QuantityMap, chosen: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """(quantities, signs) of the chosen variables."""
+    """(quantities, factors) of the chosen variables."""
     v = np.array(chosen, np.int64)
-    return variables.quantity[v], variables.sign[v]
+    return variables.quantity[v], variables.factor[v]
 
 
 def _plan_row(row: RowInjection, inputs, variables: QuantityMap, states, layout: Layout) -> PlannedRow:
     position = {int(q): k for k, q in enumerate(states)}
-    targets, signs = _of(variables, row.targets)
+    targets, factors = _of(variables, row.targets)
     gathers = tuple(layout.gather(np.array([q]), np.array([s])) for q, s in zip(*inputs, strict=True))
     rows = tuple(position[q] for q in targets.tolist())
-    return PlannedRow(row.opaque, rows, gathers, tuple(signs.tolist()), inputs[0])
+    return PlannedRow(row.opaque, rows, gathers, tuple(factors.tolist()), inputs[0])
 
 
 def _digest(
@@ -207,7 +209,7 @@ def _digest(
     for d in flat.parameters.dependents:
         feed(d.template.key, d.target, d.parameter)
     for g in flat.groups:
-        feed(g.template.key, g.variable, g.order, g.sign, g.parameter, g.coefficient)
+        feed(g.template.key, g.variable, g.order, g.factor, g.parameter, g.coefficient)
     for name in flat.networks:
         feed(name)
     for row in flat.rows:

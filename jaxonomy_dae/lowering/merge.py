@@ -79,7 +79,7 @@ def _one(steps: Sequence[Step]) -> SparseStep:
 def _joined(equations: Sequence[StepEquation]) -> StepEquation:
     first = equations[0]
     slots = tuple(
-        SlotSource(-1, np.concatenate([s.quantity for s in same]), np.concatenate([s.sign for s in same]))
+        SlotSource(-1, np.concatenate([s.quantity for s in same]), np.concatenate([s.factor for s in same]))
         for same in zip(*(e.slots for e in equations), strict=True)
     )
     return StepEquation(

@@ -38,7 +38,7 @@ class PlannedRow:
     opaque: OpaqueFunction
     rows: tuple[int, ...]
     inputs: tuple[Gather, ...]
-    sign: tuple[int, ...]
+    factor: tuple[float, ...]
     quantities: np.ndarray  # of the inputs
 
 
@@ -125,8 +125,8 @@ class SystemPlan:
         """The nonlinear blocks whose unknowns were dropped from the candidates for states."""
         return dummy_blocks(self.steps, self.selection.dummies) if len(self.carried) else ()
 
-    def quantity_of(self, variable: int) -> tuple[int, int]:
-        """(quantity, sign) of a variable; quantity ZERO if it is identically zero."""
+    def quantity_of(self, variable: int) -> tuple[int, float]:
+        """(quantity, factor) of a variable; quantity ZERO if it is identically zero."""
         return self.variable_map[variable]
 
     def describe(self, equation: int) -> str:
@@ -147,8 +147,8 @@ class SystemPlan:
         return bool(np.isin(self.variable_map.quantity[~table.is_internal], (quantity, lowest)).any())
 
     def resolve(self, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-        """(quantities, signs) of variables by name; `"der(name)"` is accepted where the model has that derivative."""
-        quantity, sign = [], []
+        """(quantities, factors) of variables by name; `"der(name)"` is accepted where the model has that derivative."""
+        quantity, factor = [], []
         for name in names:
             order, inner = 0, name
             while inner.startswith("der(") and inner.endswith(")"):
@@ -161,5 +161,5 @@ class SystemPlan:
                 if quantities.order[q] + order > quantities.highest[quantities.owner[q]]:
                     raise ModelError(f"'{name}' occurs nowhere in the model: only '{inner}' does")
             quantity.append(q if q == ZERO else q + order)
-            sign.append(s)
-        return np.array(quantity, np.int64), np.array(sign, np.int64)
+            factor.append(s)
+        return np.array(quantity, np.int64), np.array(factor, float)

@@ -25,22 +25,22 @@ class Layout:
     chunk: np.ndarray
     offset: np.ndarray
 
-    def gather(self, quantity: np.ndarray, sign: np.ndarray | None = None) -> Gather:
+    def gather(self, quantity: np.ndarray, factor: np.ndarray | None = None) -> Gather:
         quantity = np.atleast_1d(quantity)
         zero = quantity == ZERO
-        sign = np.ones(len(quantity), np.int64) if sign is None else np.where(sign == 0, 1, np.atleast_1d(sign))
+        factor = np.ones(len(quantity)) if factor is None else np.where(factor == 0, 1.0, np.atleast_1d(factor))
         chunk, offset = np.full(len(quantity), -1, np.int64), np.zeros(len(quantity), np.int64)
         chunk[~zero], offset[~zero] = self.chunk[quantity[~zero]], self.offset[quantity[~zero]]
         if (chunk == -2).any():
             raise AssertionError("a quantity is read before it is computed")
-        return Gather(chunk, offset, sign)
+        return Gather(chunk, offset, factor)
 
 
 @dataclasses.dataclass(frozen=True)
 class PlannedEquation:
     equation: StepEquation
     sources: tuple[Gather | int, ...]  # a gather, or −1 − u for the local unknown u
-    signs: tuple[Any, ...]  # of local slots
+    factors: tuple[Any, ...]  # of local slots
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +55,7 @@ class PlannedStep:
 @dataclasses.dataclass(frozen=True)
 class PlannedSparse:
     """A sparse step: its equations read its own unknowns as a chunk that follows all others. `entries` lists, for each
-    equation, (slot, instances, signs) of the slots that are unknowns; in this order their partial derivatives are the
+    equation, (slot, instances, factors) of the slots that are unknowns; in this order their partial derivatives are the
     values of the matrix at the places of `pattern`."""
 
     step: SparseStep
@@ -122,8 +122,8 @@ def plan(
 
 
 def _plan_equation(equation: StepEquation, layout: Layout) -> PlannedEquation:
-    sources = [-1 - s.local if s.local >= 0 else layout.gather(s.quantity, s.sign) for s in equation.slots]
-    return PlannedEquation(equation, tuple(sources), tuple(_uniform(s.sign) for s in equation.slots))
+    sources = [-1 - s.local if s.local >= 0 else layout.gather(s.quantity, s.factor) for s in equation.slots]
+    return PlannedEquation(equation, tuple(sources), tuple(_uniform(s.factor) for s in equation.slots))
 
 
 def _plan_loop(loop: Loop, layout: Layout) -> PlannedLoop:
@@ -164,21 +164,21 @@ def _plan_loop(loop: Loop, layout: Layout) -> PlannedLoop:
                     sources.append(-1 - slot.local)
                     continue
                 here = slice(read, read + step.n)
-                sources.append(Gather(chunk[here], offset[here], np.where(slot.sign == 0, 1, slot.sign)))
+                sources.append(Gather(chunk[here], offset[here], np.where(slot.factor == 0, 1.0, slot.factor)))
                 read += step.n
             size = equation.parameter.size
             numbers = parameter + np.arange(size).reshape(equation.parameter.shape)
             parameter += size
             renumbered = dataclasses.replace(equation, parameter=numbers)
             equations.append(
-                PlannedEquation(renumbered, tuple(sources), tuple(_uniform(s.sign) for s in equation.slots))
+                PlannedEquation(renumbered, tuple(sources), tuple(_uniform(s.factor) for s in equation.slots))
             )
         body.append(PlannedStep(step, tuple(equations), ()))
     return PlannedLoop(
         loop.count,
         tuple(body),
         layout.gather(np.array(first)) if first else None,
-        Gather(np.array([c for c, _ in handed]), np.array([k for _, k in handed]), np.ones(len(handed), np.int64))
+        Gather(np.array([c for c, _ in handed]), np.array([k for _, k in handed]), np.ones(len(handed)))
         if first
         else None,
         layout.gather(loop.reads[:, outside].ravel()) if len(outside) else None,
@@ -193,13 +193,13 @@ def _plan_sparse(step: SparseStep, layout: Layout, place: np.ndarray) -> Planned
     equations, entries, rows, cols = [], [], [], []
     first = 0
     for equation in step.equations:
-        sources = tuple(layout.gather(slot.quantity, slot.sign) for slot in equation.slots)
-        equations.append(PlannedEquation(equation, sources, (1,) * len(sources)))
+        sources = tuple(layout.gather(slot.quantity, slot.factor) for slot in equation.slots)
+        equations.append(PlannedEquation(equation, sources, (1.0,) * len(sources)))
         here = []
         for k, slot in enumerate(equation.slots):
             instances = np.flatnonzero(local[slot.quantity] >= 0)
             if len(instances):
-                here.append((k, instances, _uniform(slot.sign[instances])))
+                here.append((k, instances, _uniform(slot.factor[instances])))
                 rows.append(first + instances)
                 cols.append(local[slot.quantity[instances]])
         entries.append(tuple(here))
@@ -210,8 +210,8 @@ def _plan_sparse(step: SparseStep, layout: Layout, place: np.ndarray) -> Planned
 
 
 def _from_state(place: np.ndarray) -> Gather:
-    return Gather(np.zeros(len(place), np.int64), place, np.ones(len(place), np.int64))
+    return Gather(np.zeros(len(place), np.int64), place, np.ones(len(place)))
 
 
-def _uniform(sign: np.ndarray) -> Any:
-    return int(sign[0]) if (sign == sign[0]).all() else sign
+def _uniform(factor: np.ndarray) -> Any:
+    return float(factor[0]) if (factor == factor[0]).all() else factor

@@ -31,7 +31,7 @@ class SlotSource:
 
     local: int  # −1: from outside
     quantity: np.ndarray
-    sign: np.ndarray
+    factor: np.ndarray
 
 
 @dataclasses.dataclass(frozen=True)
@@ -178,7 +178,7 @@ def _single_steps(group: ExtendedGroup, g: int, row_of, blocks: Blocks, places, 
 
 def _equation(group: ExtendedGroup, rows: np.ndarray, local: dict[int, int]) -> StepEquation:
     slots = tuple(
-        SlotSource(local.get(k, -1), group.quantity[rows, k], group.sign[rows, k])
+        SlotSource(local.get(k, -1), group.quantity[rows, k], group.factor[rows, k])
         for k in range(group.quantity.shape[1])
     )
     return StepEquation(group.template, slots, group.parameter[rows], group.coefficient[rows], group.equation[rows])

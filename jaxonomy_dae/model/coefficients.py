@@ -33,7 +33,7 @@ def entries_of(groups: tuple[EquationGroup, ...], unknown: np.ndarray) -> Entrie
         rows.append(np.broadcast_to(np.arange(first, first + n)[:, None], (n, k))[used])
         variables.append(group.variable[used])
         orders.append(group.order[used])
-        coefficients.append((group.template.numbers(group.coefficient) * group.sign)[used])
+        coefficients.append((group.template.numbers(group.coefficient) * group.factor)[used])
         first += n
     row, variable, order = (np.concatenate(a) if a else np.zeros(0, np.int64) for a in (rows, variables, orders))
     return Entries(row, variable, order, np.concatenate(coefficients) if coefficients else np.zeros(0), first)

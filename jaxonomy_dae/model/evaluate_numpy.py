@@ -35,7 +35,7 @@ class Networks:
 def slot_values(group: ExtendedGroup, values: np.ndarray) -> list[np.ndarray]:
     """The values of each slot over the group's instances."""
     padded = np.append(values, 0.0)  # ZERO is −1: the last entry
-    return list((group.sign * padded[group.quantity]).T)
+    return list((group.factor * padded[group.quantity]).T)
 
 
 def group_values(group: ExtendedGroup, values, parameters, t: float, networks: Networks, partials: bool):
@@ -46,7 +46,7 @@ def group_values(group: ExtendedGroup, values, parameters, t: float, networks: N
     n = len(group)
     if partials:
         out = group.template.partial_values(slots, p, c, t, networks, backend="numpy")
-        return np.stack([np.broadcast_to(np.asarray(x, float), (n,)) for x in out], axis=-1) * group.sign
+        return np.stack([np.broadcast_to(np.asarray(x, float), (n,)) for x in out], axis=-1) * group.factor
     out = group.template.residual(slots, p, c, t, networks, backend="numpy")
     return np.broadcast_to(np.asarray(out, float), (n,))
 
@@ -86,7 +86,7 @@ def generic_jacobian(extended: Extended, size: np.ndarray, parameter_size: np.nd
 
     **Arguments:**
 
-    - `size`: of every quantity; the sign counts. `parameter_size`: of every parameter.
+    - `size`: of every quantity; the factor counts. `parameter_size`: of every parameter.
     """
     rng = np.random.default_rng(0)
     samples = [(size * generic(rng, size.shape), parameter_size * generic(rng, parameter_size.shape)) for _ in range(2)]

@@ -53,7 +53,7 @@ class ExtendedGroup:
     base: np.ndarray  # the equation as written that each comes from (n,)
     level: int
     quantity: np.ndarray  # (n, slots)
-    sign: np.ndarray
+    factor: np.ndarray
     parameter: np.ndarray
     coefficient: np.ndarray
 

@@ -18,7 +18,7 @@ DAMPING = 1e-3  # keeps sizes that nothing tells where they are
 
 
 def natural_sizes(
-    extended: Extended, size: Float[np.ndarray, " n"], n_parameters: int
+    extended: Extended, size: Float[np.ndarray, " n"], parameters: Float[np.ndarray, " p"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " p"]]:
     """Sizes s with |∂F_e/∂x_q|·s_q near 1 in units of each equation, in the least-squares sense of logarithms (Curtis &
     Reid 1972, where the entries depend on the sizes as well).
@@ -26,9 +26,11 @@ def natural_sizes(
     **Arguments:**
 
     - `size`: of every quantity, with signs, from which the search begins: those other than ±1 are declared and stay.
+    - `parameters`: values that stay; zero for those whose size is looked for, too.
     """
-    known = np.abs(size) != 1.0
-    quantity, parameter = size.copy(), np.ones(n_parameters)
+    n_parameters = len(parameters)
+    known = np.append(np.abs(size) != 1.0, parameters != 0.0)
+    quantity, parameter = size.copy(), np.where(parameters == 0.0, 1.0, parameters)
     for _ in range(ROUNDS):
         table = _logarithms(extended, quantity, parameter)
         if table is None:
@@ -39,8 +41,7 @@ def natural_sizes(
         places = np.concatenate([k, k, by_quantity[0], by_parameter[0]])
         unknowns = np.concatenate([n + n_parameters + row, column, by_quantity[1], n + by_parameter[1]])
         powers = np.concatenate([np.ones(2 * len(k)), by_quantity[2], by_parameter[2]])
-        held = np.append(known, np.zeros(n_parameters, bool))
-        powers[(unknowns < len(held)) & held[np.minimum(unknowns, len(held) - 1)]] = 0.0
+        powers[(unknowns < len(known)) & known[np.minimum(unknowns, len(known) - 1)]] = 0.0
         matrix = sp.csr_array((powers, (places, unknowns)), shape=shape)
         linalg: Any = scipy.sparse.linalg
         found = linalg.lsmr(matrix, -logarithm, damp=DAMPING, atol=1e-4, btol=1e-4, maxiter=20 * n)[0]

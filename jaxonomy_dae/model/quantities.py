@@ -3,7 +3,7 @@
 import dataclasses
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from .evaluate_numpy import start_values
 from .extended import Extended, Quantities
@@ -14,13 +14,13 @@ ABSENT = -2  # the quantity of a variable that occurs in none of the remaining e
 
 @dataclasses.dataclass(frozen=True)
 class QuantityMap:
-    """Every variable of the model as sign·quantity; quantity ZERO (sign 0) if it is identically zero."""
+    """Every variable of the model as factor·quantity; quantity ZERO (factor 0) if it is identically zero."""
 
     quantity: Int[np.ndarray, " variables"]
-    sign: Int[np.ndarray, " variables"]
+    factor: Float[np.ndarray, " variables"]
 
-    def __getitem__(self, variable: int) -> tuple[int, int]:
-        return int(self.quantity[variable]), int(self.sign[variable])
+    def __getitem__(self, variable: int) -> tuple[int, float]:
+        return int(self.quantity[variable]), float(self.factor[variable])
 
 
 def map_quantities(alias: AliasTable, quantities: Quantities) -> QuantityMap:
@@ -28,7 +28,7 @@ def map_quantities(alias: AliasTable, quantities: Quantities) -> QuantityMap:
     column = np.where(alias.root == ZERO, -1, quantities.column[alias.root])
     reached = (column >= 0) & (alias.order <= np.append(quantities.highest, -1)[column])
     quantity = np.where(reached, quantities.first[column] + alias.order, ABSENT)
-    return QuantityMap(np.where(alias.root == ZERO, ZERO, quantity), alias.sign)
+    return QuantityMap(np.where(alias.root == ZERO, ZERO, quantity), alias.factor)
 
 
 def name_quantities(flat: FlatModel, variables: QuantityMap, quantities: Quantities) -> list[str]:
@@ -37,7 +37,7 @@ def name_quantities(flat: FlatModel, variables: QuantityMap, quantities: Quantit
     names: list[str] = [""] * quantities.n
     best: list[tuple] = [(2,)] * quantities.n
     owner, order = quantities.owner, quantities.order
-    for v in np.flatnonzero((variables.quantity >= 0) & (variables.sign > 0)).tolist():
+    for v in np.flatnonzero((variables.quantity >= 0) & (variables.factor == 1)).tolist():
         q, name = int(variables.quantity[v]), flat.variables.names[v]
         is_root = order[q] == 0 and quantities.variable[owner[q]] == v
         rank = (int(flat.variables.is_internal[v]), int(flat.variables.is_port[v]), int(not is_root), v)
@@ -53,7 +53,7 @@ def declared_scale(flat: FlatModel, variables: QuantityMap, extended: Extended) 
     """The nominal value of every quantity: the largest that a variable which equals it declares, else 0."""
     scale = np.zeros(extended.quantities.n)
     v = np.flatnonzero(variables.quantity >= 0)
-    np.maximum.at(scale, variables.quantity[v], flat.variables.nominal[v])
+    np.maximum.at(scale, variables.quantity[v], flat.variables.nominal[v] / np.abs(variables.factor[v]))
     return scale
 
 
@@ -68,10 +68,9 @@ def quantity_bounds(flat: FlatModel, variables: QuantityMap, extended: Extended)
     n = extended.quantities.n
     low, high = np.full(n, -np.inf), np.full(n, np.inf)
     v = np.flatnonzero(variables.quantity >= 0)
-    (a, b), q = flat.variables.bounds[v].T, variables.quantity[v]
-    flipped = variables.sign[v] < 0
-    np.maximum.at(low, q, np.where(flipped, -b, a))
-    np.minimum.at(high, q, np.where(flipped, -a, b))
+    (a, b), q = (flat.variables.bounds[v] / variables.factor[v, None]).T, variables.quantity[v]
+    np.maximum.at(low, q, np.minimum(a, b))
+    np.minimum.at(high, q, np.maximum(a, b))
     return np.stack([low, high], axis=-1)
 
 
@@ -81,10 +80,10 @@ def start_guess(flat: FlatModel, variables: QuantityMap, n: int) -> tuple[np.nda
     guess = np.zeros(n)
     fixed: dict[int, float] = {}
     for v, start in enumerate(flat.variables.start):
-        q, sign = variables[v]
+        q, factor = variables[v]
         if start is None or q < 0:
             continue
-        guess[q] = sign * value_of(v)
+        guess[q] = value_of(v) / factor
         if flat.variables.fixed[v]:
             fixed[q] = guess[q]
     return guess, fixed

@@ -1,7 +1,7 @@
 """The tables passes read and write: integers and templates, no user symbols.
 
 A variable is an integer; a *quantity* is one of its derivatives, order 0 included. An equation is a template and rows
-of integers. After alias elimination a slot also has a sign, and variable −1 stands for the constant zero.
+of integers. After alias elimination a slot also has a factor, and variable −1 stands for the constant zero.
 """
 
 import dataclasses
@@ -90,12 +90,12 @@ class ParameterTable:
 
 @dataclasses.dataclass(frozen=True)
 class EquationGroup:
-    """All instances of one template: instance i's slot k is sign[i, k]·(variable[i, k])^(order[i, k])."""
+    """All instances of one template: instance i's slot k is factor[i, k]·(variable[i, k])^(order[i, k])."""
 
     template: AbstractTemplate
     variable: np.ndarray
     order: np.ndarray
-    sign: np.ndarray
+    factor: np.ndarray
     parameter: np.ndarray
     coefficient: np.ndarray
     provenance: list[Provenance]
@@ -109,7 +109,7 @@ class EquationGroup:
             self.template,
             self.variable[rows],
             self.order[rows],
-            self.sign[rows],
+            self.factor[rows],
             self.parameter[rows],
             self.coefficient[rows],
             [self.provenance[r] for r in rows],
@@ -151,11 +151,11 @@ class FlatModel:
 
 @dataclasses.dataclass(frozen=True)
 class AliasTable:
-    """Each variable as sign·(root)^(order): root ZERO with sign 0 for a variable that is identically zero."""
+    """Each variable as factor·(root)^(order): root ZERO with factor 0 for a variable that is identically zero."""
 
     root: np.ndarray
     order: np.ndarray
-    sign: np.ndarray
+    factor: np.ndarray
     eliminated: list[tuple[Provenance, int]]  # the equations the aliases came from, and the variable each one replaced
 
 

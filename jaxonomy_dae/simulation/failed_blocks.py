@@ -62,7 +62,7 @@ def _first_failed(system: AcausalSystem, t: Any, x: Any, inputs: dict[str, Any])
 
 @eqx.filter_jit
 def _quantities(system: AcausalSystem, t: Any, x: Any, inputs: dict[str, Any], chosen: tuple[int, ...]) -> Any:
-    return system.at(t, inputs).quantities(x, np.array(chosen), np.ones(len(chosen), np.int64))
+    return system.at(t, inputs).quantities(x, np.array(chosen), np.ones(len(chosen)))
 
 
 def _findings(system: AcausalSystem, t: Any, x: Any, inputs: dict[str, Any]) -> list[BlockFinding]:

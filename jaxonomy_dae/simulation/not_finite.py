@@ -17,7 +17,7 @@ def equation_not_finite(system: AcausalSystem, inputs: Any, t: Any, x: Any) -> s
     reads; nothing if there is none."""
     plan = system.plan
     every = np.arange(plan.extended.quantities.n)
-    found = system.at(t, inputs).quantities(x, every, np.ones_like(every))
+    found = system.at(t, inputs).quantities(x, every, np.ones(len(every)))
     values = np.append(np.asarray(found, float), 0.0)  # ZERO is −1: the last entry
     finite = np.isfinite(values)
     parameters = np.asarray(system.parameters.array, float)
@@ -27,7 +27,7 @@ def equation_not_finite(system: AcausalSystem, inputs: Any, t: Any, x: Any) -> s
         own[np.concatenate(step.unknown)] = True
         for equation in step.equations:
             reads = np.stack([s.quantity for s in equation.slots], axis=-1)
-            slots = [s.sign * np.where(finite[s.quantity], values[s.quantity], ANY) for s in equation.slots]
+            slots = [s.factor * np.where(finite[s.quantity], values[s.quantity], ANY) for s in equation.slots]
             p, c = list(parameters[equation.parameter].T), list(equation.coefficient.T)
             with np.errstate(all="ignore"):
                 residual = equation.template.residual(slots, p, c, float(t), networks, backend="numpy")

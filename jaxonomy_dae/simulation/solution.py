@@ -13,6 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..errors import ModelError
+from ..lowering.gather import times
 from ..system.system import AcausalSystem
 
 SHOWN = 8
@@ -58,16 +59,16 @@ class Solution(eqx.Module):
             return self.ts
         if self.states.ndim > 2:
             return _each(self, lambda one: one[name])
-        quantity, sign = self.system.plan.resolve([name])
-        column = self._state(int(quantity[0]), int(sign[0]))
+        quantity, factor = self.system.plan.resolve([name])
+        column = self._state(int(quantity[0]), float(factor[0]))
         if column is not None:
             return column
         given = (self.system, self.ts, self.states, self.inputs)
         if _is_traced(given):
-            return _observed(*given, quantity, sign)[:, 0]
-        return _one(*given, jnp.asarray(quantity[0]), jnp.asarray(sign[0], self.states.dtype))
+            return _observed(*given, quantity, factor)[:, 0]
+        return _one(*given, jnp.asarray(quantity[0]), jnp.asarray(factor[0], self.states.dtype))
 
-    def _state(self, quantity: int, sign: int) -> Any:
+    def _state(self, quantity: int, factor: float) -> Any:
         """The values of what is zero, or in the state array; None for all else."""
         if quantity < 0:
             return jnp.zeros(self.ts.shape, self.states.dtype)
@@ -76,20 +77,20 @@ class Solution(eqx.Module):
         if not len(place):
             return None
         column = self.states[:, int(place[0])]
-        return column if sign > 0 else -column
+        return times(factor, column)
 
     def _columns(self, names: tuple[str, ...]) -> Any:
         """The values of several variables, shape `(n, len(names))`, evaluated at once."""
         if self.states.ndim > 2:
             return _each(self, lambda one: one._columns(names))
-        quantity, sign = self.system.plan.resolve([name for name in names if name != "time"])
+        quantity, factor = self.system.plan.resolve([name for name in names if name != "time"])
         given = (self.system, self.ts, self.states, self.inputs)
         if not (quantity >= 0).any():
             values = jnp.zeros((*self.ts.shape, len(quantity)), self.states.dtype)
         elif _is_traced(given):
-            values = _observed(*given, quantity, sign)
+            values = _observed(*given, quantity, factor)
         else:
-            chosen = _everything(*given)[:, quantity] * jnp.asarray(sign, self.states.dtype)
+            chosen = _everything(*given)[:, quantity] * jnp.asarray(factor, self.states.dtype)
             values = jnp.where(quantity < 0, 0.0, chosen)
         found = iter(jnp.moveaxis(values, -1, 0))
         columns = [self.ts if name == "time" else next(found) for name in names]
@@ -148,12 +149,12 @@ def _is_traced(tree: Any) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
-def _observed(system: AcausalSystem, ts, states, inputs, quantity: np.ndarray, sign: np.ndarray):
+def _observed(system: AcausalSystem, ts, states, inputs, quantity: np.ndarray, factor: np.ndarray):
     """Quantities at all times, shape (n, quantities)."""
     read = np.maximum(quantity, 0)
 
     def one(t, x):
-        return system.at(t, inputs).quantities(x, read, sign)
+        return system.at(t, inputs).quantities(x, read, factor)
 
     return jnp.where(quantity < 0, 0.0, jax.vmap(one)(ts, states))
 
@@ -162,15 +163,15 @@ def _observed(system: AcausalSystem, ts, states, inputs, quantity: np.ndarray, s
 def _everything(system: AcausalSystem, ts, states, inputs):
     """All quantities at all times, shape (n, quantities)."""
     every = np.arange(system.plan.extended.quantities.n)
-    return _observed(system, ts, states, inputs, every, np.ones_like(every))
+    return _observed(system, ts, states, inputs, every, np.ones(len(every)))
 
 
 @eqx.filter_jit
-def _one(system: AcausalSystem, ts, states, inputs, quantity, sign):
+def _one(system: AcausalSystem, ts, states, inputs, quantity, factor):
     """One quantity, chosen while running: compiled once for all names."""
     every = np.arange(system.plan.extended.quantities.n)
-    ones = np.ones_like(every)
-    return sign * jax.vmap(lambda t, x: system.at(t, inputs).quantities(x, every, ones)[quantity])(ts, states)
+    ones = np.ones(len(every))
+    return factor * jax.vmap(lambda t, x: system.at(t, inputs).quantities(x, every, ones)[quantity])(ts, states)
 
 
 @eqx.filter_jit

@@ -1,5 +1,6 @@
 """What index 1 means for a solver: a slope at a consistent point, and a way back to one."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -9,6 +10,9 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ..linear.choice import LinearAlgebra, choose
 from .dae_term import FlatProblem
+
+SHORTEST = 1e-6  # of a Newton step
+SURE = 1e-6  # steps so small are taken whole: rounding, not curvature, decides how long the next one is
 
 
 def index_matrix(
@@ -41,13 +45,30 @@ def consistent_shift(
     y: Float[Array, " n"],
     start: Float[Array, " n"],
 ) -> Float[Array, " n"]:
-    """A Newton step onto the algebraic equations that leaves M y as it was at the start: zero at a consistent point.
+    """A Newton step onto the algebraic equations that leaves M y as it was at the start: zero at a consistent point."""
+    return _newton_step(problem, linear, t, y, start)(y)
+
+
+def _newton_step(
+    problem: FlatProblem,
+    linear: lx.AbstractLinearSolver | None,
+    t: Float[ArrayLike, ""],
+    y: Float[Array, " n"],
+    start: Float[Array, " n"],
+) -> Callable[[Float[Array, " n"]], Float[Array, " n"]]:
+    """The Newton step at a point, with the matrix factored at y.
 
     Large steps there and back would leave rounding errors in M y, so every step mends it.
     """
-    chosen, right, _, matrix = index_matrix(problem, linear, t, y)
-    b = algebraic_part(problem, right) + problem.mass.times(start - y)
-    return chosen.solve(chosen.factor(matrix), matrix, b)
+    chosen, at_y, _, matrix = index_matrix(problem, linear, t, y)
+    factors = chosen.factor(matrix)
+
+    def step(v: Float[Array, " n"]) -> Float[Array, " n"]:
+        right = at_y if v is y else problem.right(t, v)
+        b = algebraic_part(problem, right) + problem.mass.times(start - v)
+        return chosen.solve(factors, matrix, b)
+
+    return step
 
 
 def consistent_point(
@@ -59,24 +80,42 @@ def consistent_point(
 ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
     """Newton's method onto the algebraic equations from y, M y left alone: the point, and the size of the last step.
 
-    Differentiable by one exact step at the end.
+    Steps are shortened until the next one, with the same matrix, is shorter (the natural monotonicity test, Deuflhard
+    2004, section 3.3): far from a solution of exponentials, whole steps wander. Differentiable by one exact step at the
+    end.
     """
     if not problem.mass.is_singular:
         return y, jnp.zeros((), y.dtype)
     frozen = jax.lax.stop_gradient
     still, t_still, y_still = problem.frozen(), frozen(t), frozen(y)
-    eps = jnp.finfo(y.dtype).eps
+    eps = float(jnp.finfo(y.dtype).eps)
 
     def going(carry):
-        _, size, count = carry
-        return (size > 10 * eps) & (count < max_steps)
+        _, size, fraction, count = carry
+        return (size > 10 * eps) & (fraction >= SHORTEST) & (count < max_steps)
 
     def body(carry):
-        v, _, count = carry
-        d = consistent_shift(still, linear, t_still, v, y_still)
-        return v + d, jnp.max(jnp.abs(d) / (1 + jnp.abs(v)), initial=0.0), count + 1
+        v, _, fraction, count = carry
+        step = _newton_step(still, linear, t_still, v, y_still)
+        d = step(v)
 
-    found, size, _ = jax.lax.while_loop(going, body, (y_still, jnp.asarray(jnp.inf, y.dtype), 0))
+        def length(of):
+            return jnp.max(jnp.abs(of) / (1 + jnp.abs(v)), initial=0.0)
+
+        size = length(d)
+
+        def falls(fraction):
+            return (size <= SURE) | (length(step(v + fraction * d)) <= (1 - fraction / 4) * size)
+
+        def shorten(state):
+            return state[0] / 2, falls(state[0] / 2)
+
+        fraction = jnp.minimum(2 * fraction, 1)
+        fraction, _ = jax.lax.while_loop(lambda s: ~s[1] & (s[0] >= SHORTEST), shorten, (fraction, falls(fraction)))
+        return v + fraction * d, size, fraction, count + 1
+
+    begin = (y_still, jnp.asarray(jnp.inf, y.dtype), jnp.ones((), y.dtype), 0)
+    found, size, *_ = jax.lax.while_loop(going, body, begin)
     found = y + frozen(found - y_still)
     return found + consistent_shift(problem, linear, t, found, y), size
 

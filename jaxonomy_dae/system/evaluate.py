@@ -24,7 +24,7 @@ import numpy as np
 from ..linear.torn import solve_torn
 from ..linear.whole import solve_whole
 from ..linear.written_out import UNROLLED, solve, solve_dense
-from ..lowering.gather import Chunk, Gather, take
+from ..lowering.gather import Chunk, Gather, take, times
 from ..lowering.program import PlannedEquation, PlannedLoop, PlannedSparse, PlannedStep, Program
 from ..model.evaluate_numpy import Networks
 from ..model.linear_template import scaled
@@ -82,11 +82,11 @@ class Evaluation:
 
     def _arguments(self, planned: PlannedEquation, local: list[Any]):
         slots = []
-        for source, sign in zip(planned.sources, planned.signs, strict=True):
+        for source, factor in zip(planned.sources, planned.factors, strict=True):
             if isinstance(source, Gather):
                 slots.append(self.read(source))
             else:
-                slots.append(_signed(sign, local[-1 - source], self.dtype))
+                slots.append(_scaled(factor, local[-1 - source], self.dtype))
         equation = planned.equation
         n = equation.parameter.shape[0]
         if n == 1:
@@ -110,23 +110,23 @@ class Evaluation:
         outside = [k for k in range(len(equation.slots)) if k != positions[0]]
         if equation.template.n_coefficients > LONG_SUM and all(isinstance(planned.sources[k], Gather) for k in outside):
             weights = -equation.coefficient[:, outside] / equation.coefficient[:, [positions[0]]]
-            return _signed(planned.signs[positions[0]], self._long_sum(planned, outside, weights), self.dtype)
+            return _scaled(1 / planned.factors[positions[0]], self._long_sum(planned, outside, weights), self.dtype)
         local = list(local)
         local[unknown] = 0.0
         arguments = self._arguments(planned, local)
         if len(positions) == 1:
             value = equation.template.solve(positions[0], *arguments)
-            return _signed(planned.signs[positions[0]], value, self.dtype)
+            return _scaled(1 / planned.factors[positions[0]], value, self.dtype)
         rest = equation.template.residual(*arguments)
         partials = equation.template.partial_values(*arguments)
-        slope = sum(_signed(planned.signs[k], partials[k], self.dtype) for k in positions)
+        slope = sum(_scaled(planned.factors[k], partials[k], self.dtype) for k in positions)
         return -rest / slope
 
     def _long_sum(self, planned: PlannedEquation, positions: Sequence[int], weights: np.ndarray) -> Any:
         """Σ weight·slot over slots that are gathered."""
         n = len(weights)
         sources = [planned.sources[k] for k in positions]
-        joined = Gather(*(np.concatenate([getattr(s, f) for s in sources]) for f in ("chunk", "offset", "sign")))
+        joined = Gather(*(np.concatenate([getattr(s, f) for s in sources]) for f in ("chunk", "offset", "factor")))
         values = joined.read(self.chunks, self.dtype)
         values = jnp.reshape(jnp.broadcast_to(values, (len(positions) * n,)), (len(positions), n))
         total = jnp.sum(values * jnp.asarray(weights.T, self.dtype), axis=0)
@@ -249,9 +249,9 @@ class Evaluation:
         equations = self._whole(planned, u)
         residual = jnp.concatenate([r for r, _, _ in equations])
         values = [
-            _signed(sign, take(self._filled(partials[k], r.shape), instances), self.dtype)
+            _scaled(factor, take(self._filled(partials[k], r.shape), instances), self.dtype)
             for (r, _, partials), entries in zip(equations, planned.entries, strict=True)
-            for k, instances, sign in entries
+            for k, instances, factor in entries
         ]
         checked = planned.guess is None
         return u - solve_whole(planned.pattern, jnp.concatenate(values), residual, checked=checked)
@@ -320,7 +320,7 @@ class Evaluation:
             rest = template.residual(*arguments)
             # A network's output stands alone, its inputs are outside.
             partials = {inside[0]: 1.0} if template.opaque is not None else template.partial_values(*arguments)
-        return rest, [(equation.slots[k].local, _signed(planned.signs[k], partials[k], self.dtype)) for k in inside]
+        return rest, [(equation.slots[k].local, _scaled(planned.factors[k], partials[k], self.dtype)) for k in inside]
 
     def _constant(self, value: Any) -> Any:
         return value if isinstance(value, float) else jnp.asarray(value, self.dtype)
@@ -394,7 +394,5 @@ def newton(residuals: Callable[[list[Any]], list[Any]], z: list[Any]) -> list[An
     return list(stacked - jnp.moveaxis(step, -1, 0))
 
 
-def _signed(sign: Any, value: Any, dtype) -> Any:
-    if isinstance(sign, int):
-        return value if sign > 0 else -value
-    return value * jnp.asarray(sign, dtype)
+def _scaled(factor: Any, value: Any, dtype) -> Any:
+    return times(factor if isinstance(factor, float) else jnp.asarray(factor, dtype), value)

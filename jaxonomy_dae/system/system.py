@@ -235,8 +235,8 @@ class AcausalSystem(eqx.Module):
         - `ModelError` for an unknown name.
         """
         single = isinstance(names, str)
-        quantity, sign = self.plan.resolve([names] if single else list(names))
-        values = self.at(t, args).quantities(x, quantity, sign)
+        quantity, factor = self.plan.resolve([names] if single else list(names))
+        values = self.at(t, args).quantities(x, quantity, factor)
         return values[0] if single else values
 
     @overload

@@ -15,7 +15,7 @@ from ..errors import ModelError
 from ..linear.sparse import SparsePattern, sparse_jacobian
 from ..linear.whole import solve_whole
 from ..linear.written_out import UNROLLED, solve, solve_dense
-from ..lowering.gather import Gather, take
+from ..lowering.gather import Gather, take, times
 from ..lowering.plan import ConstraintGroup, PlannedRow, SystemPlan
 from ..lowering.program import Program
 from ..model.evaluate_numpy import Networks
@@ -125,11 +125,11 @@ class SystemAt:
         entries = iter(u)
         full = [self.t if k in row.opaque.time_positions else next(entries) for k in range(row.opaque.n_inputs)]
         out = row.opaque(self.networks[row.opaque.index], self.t, jnp.stack(full))
-        for k, (target, sign) in enumerate(zip(row.rows, row.sign, strict=True)):
+        for k, (target, factor) in enumerate(zip(row.rows, row.factor, strict=True)):
             if isinstance(slopes, list):
-                slopes[target] = slopes[target] + sign * out[k]
+                slopes[target] = slopes[target] + times(1 / factor, out[k])
             else:
-                slopes = slopes.at[target].add(sign * out[k])
+                slopes = slopes.at[target].add(times(1 / factor, out[k]))
         return slopes
 
     def _with_carried(self, state: Any, slopes: Any) -> Any:
@@ -300,10 +300,10 @@ class SystemAt:
 
     # --- reading -----------------------------------------------------------------------------------------------
 
-    def quantities(self, x: Any, quantity: np.ndarray, sign: np.ndarray) -> Any:
-        """The values of quantities with signs, shape (len(quantity),)."""
+    def quantities(self, x: Any, quantity: np.ndarray, factor: np.ndarray) -> Any:
+        """The values of quantities with factors, shape (len(quantity),)."""
         evaluation = self.run(self.plan.everything, self.split(x), Refinement.ROOT)
-        gather = self.plan.everything.layout.gather(quantity, sign)
+        gather = self.plan.everything.layout.gather(quantity, factor)
         return jnp.broadcast_to(jnp.asarray(evaluation.read(gather), self.dtype), (len(quantity),))
 
 
@@ -315,4 +315,4 @@ def _sum(terms: list[Any], zero: Any) -> Any:
 
 
 def _only(gather, k: int):
-    return type(gather)(gather.chunk[k : k + 1], gather.offset[k : k + 1], gather.sign[k : k + 1])
+    return type(gather)(gather.chunk[k : k + 1], gather.offset[k : k + 1], gather.factor[k : k + 1])
