@@ -16,6 +16,7 @@ from ..model.scaling import equilibrated, geometric_scales
 
 DEFICIENT = 1e-11  # singular values below, of an equilibrated matrix, are examined
 CANCELLED = 1e-11  # of the terms: a sum this small is zero
+NOTHING = (1e-8, 1e-13)  # weights below are left out, the larger ones if columns cancel without them
 LARGEST_DENOMINATOR = 1000
 
 
@@ -57,9 +58,11 @@ def _verified(null: np.ndarray, rows: np.ndarray, matrix: np.ndarray) -> list[np
         others = np.arange(len(null)) != k
         null[others] -= np.outer(null[others, c], null[k])
         chosen.append(int(c))
-    null[np.abs(null) < 1e-8] = 0.0
-    found = [w * rows / rows[c] for w, c in zip(null, chosen, strict=True)]
-    return [w for w in found if cancels(w, matrix)]
+    found = []
+    for w, c in zip(null, chosen, strict=True):
+        candidates = (np.where(np.abs(w) < least, 0.0, w) * rows / rows[c] for least in NOTHING)
+        found.append(next((w for w in candidates if cancels(w, matrix)), None))
+    return [w for w in found if w is not None]
 
 
 def rational(value: float) -> Number:
