@@ -36,6 +36,7 @@ from .stages import solve_in_stages, stages
 from .typical_sizes import typical_sizes
 
 PERTURBATIONS = 8  # of the start, and of parameters, that show the sizes of terms
+CANCELLED = 1e3  # rounding errors of what is zero because its terms cancel, in units of eps times its typical size
 
 
 class InitialPoint(NamedTuple):
@@ -107,7 +108,7 @@ def initialize(
     read = [n_equations + k for k, row in enumerate(rows.kept) if row.quantity not in state]
     excused = None
     if read and rows.redundant and not rows.n_soft:
-        excused = frozen(_rounding(residual, settings, start, sizes, np.array(read)))
+        excused = frozen(_rounding(residual, settings, start, sizes, _typical_of_rows(plan, rows, n_equations, read)))
 
     def function(w):
         value = residual(w, *settings)
@@ -127,7 +128,8 @@ def initialize(
     if staged is not None:
         start = frozen(solve_in_stages(function, start, sizes, *staged))
     if solver is None:
-        typical = np.append(typical_sizes(plan), np.ones(len(unknown)))
+        entries = np.concatenate([plan.states, plan.carried]).astype(np.int64)
+        typical = np.append(typical_sizes(plan)[entries], np.ones(len(unknown)))
         found = find_root(function, m, start, sizes, core, is_soft, bounds, typical)
     else:
         found = find_root_with(solver, function, start, sizes, is_soft, core is not None or not rows.n_soft)
@@ -207,10 +209,21 @@ def _large_point(
     return InitialPoint(w, w[:0], remaining, jnp.where(is_soft, jnp.inf, limit), full, method, evaluations, None)
 
 
-def _rounding(residual: Callable[..., Any], settings, start: Any, sizes: Sizes, read: np.ndarray) -> Any:
-    """Rows that are rounding errors and nothing else, among those at `read`, of variables outside of the state: they
-    hold at the start, and neither it nor rounded parameters move them by more. Returns what rounding may leave of
-    each, shape (m,), zero for other rows.
+def _typical_of_rows(plan: SystemPlan, rows: InitialRows, first: int, read: list[int]) -> np.ndarray:
+    """Typical sizes of what the rows at `read` compare, shape (m,), zero for others; the rows of starts begin at
+    `first`."""
+    out = np.zeros(first + len(rows.kept))
+    typical = typical_sizes(plan)
+    for k in read:
+        row = rows.kept[k - first]
+        out[k] = abs(row.factor) * typical[row.quantity] if row.quantity >= 0 else 0.0
+    return out
+
+
+def _rounding(residual: Callable[..., Any], settings, start: Any, sizes: Sizes, typical: np.ndarray) -> Any:
+    """Rows that are rounding errors and nothing else, among those of variables outside of the state, whose `typical`
+    sizes are given: they hold at the start, and neither it nor rounded parameters move them by more. Returns what
+    rounding may leave of each, shape (m,), zero for other rows.
 
     A variable that is zero because its terms cancel depends on the state by rounding errors. In units of these, other
     rows would give way to it."""
@@ -231,9 +244,9 @@ def _rounding(residual: Callable[..., Any], settings, start: Any, sizes: Sizes, 
     value = rows(start, parameters)
     moved = jax.vmap(lambda v, p: jax.jvp(rows, (start, parameters), (v, p))[1])(*along)
     slope, terms = (jnp.max(jnp.abs(m), axis=0) for m in jnp.split(moved, 2))
-    noise = NOISE * float(jnp.finfo(dtype).eps) * terms
-    chosen = jnp.asarray(np.isin(np.arange(len(value)), read))
-    return jnp.where(chosen & (jnp.abs(value) <= noise) & (slope <= noise), noise, 0)
+    eps = float(jnp.finfo(dtype).eps)
+    noise = NOISE * eps * terms + CANCELLED * eps * jnp.asarray(typical, dtype)
+    return jnp.where(jnp.asarray(typical > 0) & (jnp.abs(value) <= noise) & (slope <= noise), noise, 0)
 
 
 def _nearest_point(

@@ -29,7 +29,7 @@ from jaxtyping import Array, Bool, Float
 
 from .machine import Machine, Scalars
 from .probing import SIZED, probed
-from .sizes import NOISE, Sizes, row_sizes, soft_weight, tolerance
+from .sizes import NOISE, Sizes, column_sizes, row_sizes, soft_weight, tolerance
 
 METHODS = (
     "the start was consistent",
@@ -158,11 +158,14 @@ def _climb(
         x = where(x < low, base + TO_BOUND * (low - base), where(x > high, base + TO_BOUND * (high - base), x))
         return jnp.append(x, ahead[n])
 
-    def evaluate(state: Machine) -> Machine:
-        x = state.points[0, :n]
+    def linearized(x) -> tuple[Any, Any]:
         jacobian, value = jax.jacfwd(lambda y: (function(y),) * 2, has_aux=True)(x)
         # What a function of the user's closes over may be differentiated elsewhere: not in here.
-        value, jacobian = jax.lax.stop_gradient((value, jacobian))
+        return jax.lax.stop_gradient((value, jacobian))
+
+    def evaluate(state: Machine) -> Machine:
+        x = state.points[0, :n]
+        value, jacobian = linearized(x)
         probing, probe, unit = probed(state, value, jacobian, sizes)
         size, noise = row_sizes(jacobian, x, sizes, unit)
         size = size + sizes.data
@@ -337,11 +340,18 @@ def _climb(
         ])  # fmt: skip
         return Machine(scalars, points, jnp.stack([value, first, w]), jacobian)
 
-    begin = Scalars(first_rung, FAILED, 1.0, 0.0, 0, 0, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0)
-    points = jnp.stack([origin, origin, origin, along, origin, jnp.ones_like(origin)])
-    state = Machine(
-        jnp.asarray([float(v) for v in begin], dtype), points, jnp.ones((3, m), dtype), jnp.zeros((m, n), dtype)
-    )
+    # A start that holds, as most do, needs no rung: in a batch of such starts the loop does not run at all.
+    value, jacobian = linearized(start)
+    unit = column_sizes(value, jacobian, sizes)
+    size, _ = row_sizes(jacobian, start, sizes, unit)
+    stays = jnp.all(jnp.abs(value) <= close * (size + sizes.data)) & jnp.all(jnp.isfinite(jacobian))
+    stays &= jnp.all((sizes.known > 0) | jnp.any(jacobian != 0, axis=0))
+    begin = Scalars(
+        where(stays, _DONE, first_rung), where(stays, 0, FAILED), 1.0, 0.0, 0, where(stays, 1, 0), 1.0, 1.0, 0.0, 0.0,
+        0.0, 1.0, 0,
+    )  # fmt: skip
+    points = jnp.stack([origin, origin, origin, along, origin, jnp.append(where(stays, unit, one), one)])
+    state = Machine(packed(*begin), points, jnp.ones((3, m), dtype), jacobian * unit[None, :])
     state = jax.lax.while_loop(lambda s: s.scalars[0] < _DONE, evaluate, state)
     s = Scalars(*state.scalars)
     found = where(s.phase == _DONE, state.points[1], state.points[2])[:n]

@@ -15,12 +15,12 @@ DECADES = 30  # that they may span: single precision has 38
 
 
 @functools.lru_cache(maxsize=64)
-def typical_sizes(plan: SystemPlan) -> Float[np.ndarray, " n"]:
-    """Of the entries of the state array, at the parameter values the model was compiled with; powers of two, by which
-    numbers are multiplied without rounding. They say where a search begins to look, and decide nothing else."""
-    entries = np.concatenate([plan.states, plan.carried]).astype(np.int64)
+def typical_sizes(plan: SystemPlan) -> Float[np.ndarray, " quantities"]:
+    """Of all quantities, at the parameter values the model was compiled with; powers of two, by which numbers are
+    multiplied without rounding. They say where a search begins to look and what may be rounding, and decide nothing
+    else."""
     if plan.extended.quantities.n_unknown > DENSE_LIMIT:
-        return np.ones(len(entries))
+        return np.ones(plan.extended.quantities.n)
     size = declared_scale(plan.flat, plan.variable_map, plan.extended)
     value_of = start_values(plan.flat.variables.start, plan.flat.parameters.values)
     for v, start in enumerate(plan.flat.variables.start):
@@ -30,5 +30,5 @@ def typical_sizes(plan: SystemPlan) -> Float[np.ndarray, " n"]:
             size[quantity] = value if np.isfinite(value) else 0.0
     size[size == 0.0] = 1.0
     found, _ = natural_sizes(plan.extended, size, plan.flat.parameters.values)
-    decades = np.clip(np.log10(np.abs(found[entries])), -DECADES, DECADES)
+    decades = np.clip(np.log10(np.abs(found)), -DECADES, DECADES)
     return 2.0 ** np.round(decades / np.log10(2.0))
