@@ -19,7 +19,10 @@ from ..expressions.differentiate import partial_derivative
 from ..expressions.kernel import Kernel
 from ..expressions.node import Node, constant, number
 from ..expressions.substitute import substitute
+from ..model.evaluate_numpy import Networks, group_values
+from ..model.extended import ExtendedGroup
 from ..model.incidence import incidence
+from ..model.natural_sizes import natural_sizes
 from ..model.provenance import Provenance, combination
 from ..model.tables import ZERO, EquationGroup, equation_offsets, provenance_of
 from ..modeling.symbols import TIME_LABEL
@@ -154,6 +157,39 @@ class _Jacobian:
                 dense[k, j] += self.partials(g, trial)[i, slot]
         return dense
 
+    def at_natural_size(self, equations: np.ndarray, columns: np.ndarray, trial: int) -> np.ndarray:
+        """The matrix at a random point where all terms of the equations are alike, whatever the units: what depends on
+        the point may look constant where one term is too small to be seen."""
+        rows: dict[int, list[int]] = {}
+        for e in equations.tolist():
+            g, i = self.place(e)
+            rows.setdefault(g, []).append(i)
+        number: dict[tuple[int, int], int] = {}
+        groups, order = [], []
+        for g, chosen in rows.items():
+            group = self.groups[g].take(chosen)
+            pairs = zip(group.variable.ravel().tolist(), group.order.ravel().tolist(), strict=True)
+            found = [ZERO if v == ZERO else number.setdefault((v, q), len(number)) for v, q in pairs]
+            quantity = np.array(found, np.int64).reshape(group.variable.shape)
+            own = len(order) + np.arange(len(chosen))
+            order += [int(self.first[g]) + i for i in chosen]
+            groups.append(
+                ExtendedGroup(group.template, own, own, 0, quantity, group.factor, group.parameter, group.coefficient)
+            )
+        size, _ = natural_sizes(groups, len(order), np.ones(len(number)), self.values)
+        pairs = np.array(list(number), np.int64).reshape(-1, 2)
+        point = np.abs(size) * somewhere(pairs[:, 0], pairs[:, 1], trial)
+        place = {e: k for k, e in enumerate(equations.tolist())}
+        dense = np.zeros((len(equations), len(columns)))
+        for group in groups:
+            if group.template.opaque is not None:
+                return self.at(equations, columns, trial)
+            partials = group_values(group, point, self.values, 0.37 + 0.1 * trial, Networks(()), partials=True)
+            for i, e in enumerate(order[int(group.equation[0]) : int(group.equation[-1]) + 1]):
+                for slot, j in self.hits(e, columns):
+                    dense[place[e], j] += partials[i, slot]
+        return dense
+
     def is_constant(self, equations: np.ndarray, columns: np.ndarray) -> bool:
         """Whether no entry depends on the point."""
         return all(
@@ -186,6 +222,10 @@ def _combination(jacobian: _Jacobian, equations: np.ndarray) -> tuple[int, Equat
             break
     if not trials:
         return None
+    if wanted > 1:
+        natural = [jacobian.at_natural_size(equations, columns, trial) for trial in trials]
+        if any(np.isfinite(matrix).all() and not left_null_vectors(matrix) for matrix in natural):
+            return None
     everywhere = left_null_vectors(np.hstack(matrices))
     provenance = [provenance_of(groups, int(e)) for e in equations]
     if not everywhere:

@@ -302,17 +302,19 @@ def _sizes(plan: SystemPlan, rows: InitialRows, given: list, parameters: Any, st
 
 def _with_velocities(sizes: Sizes, x: Any, plan: SystemPlan, here: SystemAt) -> Sizes:
     """Redundant velocities that are all rounding errors have no size by which the others could be judged: positions
-    and a frequency give one. All that moves tells the frequency ω, by |x'| = ω|x| and |x''| = ω²|x|."""
+    and a frequency give one. All that moves tells the frequency ω, by |x'| = ω|x| and |x''| = ω²|x|, each position in
+    units of its typical size."""
     owner, place = plan.extended.quantities.owner, {int(q): k for k, q in enumerate(plan.states)}
     pairs = [(k, place[q + 1]) for q, k in place.items() if q + 1 in place and owner[q] == owner[q + 1]]
     if not pairs:
         return sizes
     position, velocity = np.array(pairs).T
-    acceleration = jnp.abs(here.semi_explicit(x)[velocity])
+    unit = jnp.asarray(typical_sizes(plan)[plan.states[position]], x.dtype)
+    acceleration = jnp.abs(here.semi_explicit(x)[velocity]) / unit
     fastest = jnp.max(jnp.where(jnp.isfinite(acceleration), acceleration, 0))
-    largest = jnp.max(sizes.known[position])
+    largest = jnp.max(sizes.known[position] / unit)
     largest = jnp.where(largest > 0, largest, jnp.inf)
-    frequency = jnp.maximum(jnp.max(sizes.known[velocity]) / largest, jnp.sqrt(fastest / largest))
+    frequency = jnp.maximum(jnp.max(sizes.known[velocity] / unit) / largest, jnp.sqrt(fastest / largest))
     return sizes._replace(known=sizes.known.at[velocity].max(frequency * sizes.known[position]))
 
 

@@ -29,6 +29,6 @@ def typical_sizes(plan: SystemPlan) -> Float[np.ndarray, " quantities"]:
             value = value_of(v) / factor
             size[quantity] = value if np.isfinite(value) else 0.0
     size[size == 0.0] = 1.0
-    found, _ = natural_sizes(plan.extended, size, plan.flat.parameters.values)
+    found, _ = natural_sizes(plan.extended.groups, plan.extended.n_equations, size, plan.flat.parameters.values)
     decades = np.clip(np.log10(np.abs(found)), -DECADES, DECADES)
     return 2.0 ** np.round(decades / np.log10(2.0))

@@ -1,5 +1,6 @@
 """Sizes of quantities and parameters at which all terms of all equations are alike, whatever the units."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,7 @@ import scipy.sparse.linalg
 from jaxtyping import Float
 
 from .evaluate_numpy import Networks, generic, group_values
-from .extended import Extended, ExtendedGroup
+from .extended import ExtendedGroup
 from .tables import ZERO
 
 ROUNDS = 3
@@ -18,7 +19,10 @@ DAMPING = 1e-3  # keeps sizes that nothing tells where they are
 
 
 def natural_sizes(
-    extended: Extended, size: Float[np.ndarray, " n"], parameters: Float[np.ndarray, " p"]
+    groups: Sequence[ExtendedGroup],
+    n_equations: int,
+    size: Float[np.ndarray, " n"],
+    parameters: Float[np.ndarray, " p"],
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " p"]]:
     """Sizes s with |∂F_e/∂x_q|·s_q near 1 in units of each equation, in the least-squares sense of logarithms (Curtis &
     Reid 1972, where the entries depend on the sizes as well).
@@ -32,12 +36,12 @@ def natural_sizes(
     known = np.append(np.abs(size) != 1.0, parameters != 0.0)
     quantity, parameter = size.copy(), np.where(parameters == 0.0, 1.0, parameters)
     for _ in range(ROUNDS):
-        table = _logarithms(extended, quantity, parameter)
+        table = _logarithms(groups, quantity, parameter)
         if table is None:
             break
         logarithm, row, column, by_quantity, by_parameter = table
         k, n = np.arange(len(row)), len(quantity)
-        shape = (len(k), n + n_parameters + extended.n_equations)
+        shape = (len(k), n + n_parameters + n_equations)
         places = np.concatenate([k, k, by_quantity[0], by_parameter[0]])
         unknowns = np.concatenate([n + n_parameters + row, column, by_quantity[1], n + by_parameter[1]])
         powers = np.concatenate([np.ones(2 * len(k)), by_quantity[2], by_parameter[2]])
@@ -52,14 +56,14 @@ def natural_sizes(
     return quantity, parameter
 
 
-def _logarithms(extended: Extended, quantity: np.ndarray, parameter: np.ndarray):
+def _logarithms(groups: Sequence[ExtendedGroup], quantity: np.ndarray, parameter: np.ndarray):
     """log₁₀ |∂F_e/∂x_q|·|x_q| of all entries at a generic point of these sizes, their equations and quantities, and
     their powers in quantities and parameters as (entry, argument, power)."""
     rng = np.random.default_rng(1)
     point, parameters = quantity * generic(rng, quantity.shape), parameter * generic(rng, parameter.shape)
     out: list[list[np.ndarray]] = [[] for _ in range(9)]
     first = 0
-    for group in extended.groups:
+    for group in groups:
         if group.quantity.shape[1] == 0 or group.template.opaque is not None:
             continue
         entry = _sizes(group, point, parameters)
