@@ -11,7 +11,8 @@ from sympy import Eq, sqrt
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, ModelError, der
 from jaxonomy_dae.learning import fit, fit_least_squares
-from jaxonomy_dae.library.electrical import Capacitor, Electrical, Ground, Resistor, VoltageSource
+from jaxonomy_dae.library.electrical import Capacitor, Ground, Resistor, VoltageSource
+from jaxonomy_dae.modeling import Electrical
 
 
 class Halves(Component):

@@ -1,0 +1,132 @@
+"""Resistors, capacitors, inductors and what is made of them."""
+
+from ...modeling import NONNEGATIVE, POSITIVE, Component, Electrical, Eq, EqnEnv, Thermal, Value, der
+from .two_pin import TwoPin, TwoPorts
+
+
+class Resistor(TwoPin):
+    """v = R·i, `R` in ohm; a negative one feeds energy in."""
+
+    def __init__(self, ev: EqnEnv, name: str, R: Value = 1.0):
+        super().__init__(ev, name)
+        r = self.parameter("R", R, unit="Ohm")
+        voltage, current = self._two_pins()
+        self.add_equations(Eq(voltage, r * current))
+
+
+class HeatedResistor(TwoPin):
+    """A resistor that changes with its temperature and heats what it touches: v = R·(1 + alpha·(T − T_ref))·i, the heat
+    v·i leaves at the port `heat`.
+
+    `R` > 0 in ohm at `T_ref` (kelvin), `alpha` in 1/kelvin, `T` the temperature of the port.
+    """
+
+    def __init__(self, ev: EqnEnv, name: str, R: Value = 1.0, alpha: Value = 0.0, T_ref: Value = 293.15):
+        super().__init__(ev, name)
+        r = self.parameter("R", R, unit="Ohm", bounds=POSITIVE)
+        slope = self.parameter("alpha", alpha, unit="1/K")
+        reference = self.parameter("T_ref", T_ref, unit="K")
+        voltage, current = self._two_pins()
+        heat = self.port("heat", Thermal)
+        self.add_equations(
+            Eq(voltage, r * (1 + slope * (heat.T - reference)) * current), Eq(heat.Q_flow, -voltage * current)
+        )
+
+
+class Capacitor(TwoPin):
+    """C·dv/dt = i, `C` > 0 in farad. A given `initial_voltage` (volt) holds at the start; otherwise 0 is a guess."""
+
+    def __init__(self, ev: EqnEnv, name: str, C: Value = 1.0, initial_voltage: Value | None = None):
+        super().__init__(ev, name)
+        c = self.parameter("C", C, unit="F", bounds=POSITIVE)
+        v0 = self.parameter("initial_voltage", initial_voltage or 0.0, unit="V")
+        voltage, current = self._two_pins(v=dict(start=v0, fixed=initial_voltage is not None))
+        self.add_equations(Eq(c * der(voltage), current))
+
+
+class Inductor(TwoPin):
+    """L·di/dt = v, `L` > 0 in henry. A given `initial_current` (ampere) holds at the start; otherwise 0 is a guess."""
+
+    def __init__(self, ev: EqnEnv, name: str, L: Value = 1.0, initial_current: Value | None = None):
+        super().__init__(ev, name)
+        inductance = self.parameter("L", L, unit="H", bounds=POSITIVE)
+        i0 = self.parameter("initial_current", initial_current or 0.0, unit="A")
+        voltage, current = self._two_pins(i=dict(start=i0, fixed=initial_current is not None))
+        self.add_equations(Eq(inductance * der(current), voltage))
+
+
+class MutualInductor(TwoPorts):
+    """Two coupled coils: v1 = L1·di1/dt + M·di2/dt, v2 = M·di1/dt + L2·di2/dt.
+
+    `L1`, `L2` > 0 and the mutual inductance `M` in henry, M² < L1·L2. Given initial currents (ampere) hold at the
+    start.
+    """
+
+    def __init__(
+        self,
+        ev: EqnEnv,
+        name: str,
+        L1: Value = 1.0,
+        L2: Value = 1.0,
+        M: Value = 0.5,
+        initial_current1: Value | None = None,
+        initial_current2: Value | None = None,
+    ):
+        super().__init__(ev, name)
+        first = self.parameter("L1", L1, unit="H", bounds=POSITIVE)
+        second = self.parameter("L2", L2, unit="H", bounds=POSITIVE)
+        mutual = self.parameter("M", M, unit="H")
+        starts = {}
+        for k, given in ((1, initial_current1), (2, initial_current2)):
+            start = self.parameter(f"initial_current{k}", given or 0.0, unit="A")
+            starts[f"i{k}"] = dict(start=start, fixed=given is not None)
+        v1, i1, v2, i2 = self._two_ports(**starts)
+        self.add_equations(
+            Eq(v1, first * der(i1) + mutual * der(i2)),
+            Eq(v2, mutual * der(i1) + second * der(i2)),
+        )
+
+
+class Potentiometer(Component):
+    """A resistor with a slider: `R`·position between `n` and `slider`, R·(1 − position) between `slider` and `p`.
+
+    `R` > 0 in ohm; the input `position` lies between 0 (at `n`) and 1 (at `p`), and is 0.5 unless it is given.
+    """
+
+    def __init__(self, ev: EqnEnv, name: str, R: Value = 1.0):
+        super().__init__(ev, name)
+        r = self.parameter("R", R, unit="Ohm", bounds=POSITIVE)
+        position = self.input("position", default=0.5)
+        p, slider, n = (self.port(k, Electrical) for k in ("p", "slider", "n"))
+        self.add_equations(
+            Eq(p.v - slider.v, r * (1 - position) * p.i),
+            Eq(n.v - slider.v, r * position * n.i),
+            Eq(p.i + slider.i + n.i, 0),
+        )
+
+
+class Memristor(TwoPin):
+    """A resistor whose resistance follows the charge that has passed: v = (R_on·w + R_off·(1 − w))·i, dw/dt = k·i.
+
+    `R_on`, `R_off` ≥ 0 in ohm, the drift `k` in 1/(A·s); `w` is the doped part, between 0 and 1 if the charge is small
+    enough, and starts at `initial_w`. Linear drift: Strukov, Snider, Stewart & Williams (2008), Nature 453:80, eqs. 5
+    and 6.
+    """
+
+    def __init__(
+        self,
+        ev: EqnEnv,
+        name: str,
+        R_on: Value = 100.0,
+        R_off: Value = 16e3,
+        k: Value = 1e4,
+        initial_w: Value = 0.1,
+    ):
+        super().__init__(ev, name)
+        on = self.parameter("R_on", R_on, unit="Ohm", bounds=NONNEGATIVE)
+        off = self.parameter("R_off", R_off, unit="Ohm", bounds=NONNEGATIVE)
+        drift = self.parameter("k", k, unit="1/(A*s)")
+        w0 = self.parameter("initial_w", initial_w)
+        w = self.variable("w", start=w0, fixed=True)
+        voltage, current = self._two_pins()
+        self.add_equations(Eq(voltage, (on * w + off * (1 - w)) * current), Eq(der(w), drift * current))

@@ -1,0 +1,200 @@
+"""Sources of voltage and current: constant, of time, of a signal, controlled."""
+
+from sympy import Piecewise, floor, pi, sin
+
+from ...modeling import POSITIVE, Eq, EqnEnv, Value
+from .two_pin import TwoPin, TwoPorts
+
+
+class VoltageSource(TwoPin):
+    """An ideal source: the voltage is the parameter `V` (volt), whatever the current."""
+
+    def __init__(self, ev: EqnEnv, name: str, v: Value = 1.0):
+        super().__init__(ev, name)
+        source = self.parameter("V", v, unit="V")
+        voltage, _ = self._two_pins()
+        self.add_equations(Eq(voltage, source))
+
+
+class CurrentSource(TwoPin):
+    """An ideal source: the current from `p` to `n` through it is the parameter `I` (ampere), whatever the voltage."""
+
+    def __init__(self, ev: EqnEnv, name: str, i: Value = 1.0):
+        super().__init__(ev, name)
+        source = self.parameter("I", i, unit="A")
+        _, current = self._two_pins()
+        self.add_equations(Eq(current, source))
+
+
+class SignalVoltage(TwoPin):
+    """An ideal source: the voltage is the input `u` (volt)."""
+
+    def __init__(self, ev: EqnEnv, name: str):
+        super().__init__(ev, name)
+        u = self.input("u", unit="V")
+        voltage, _ = self._two_pins()
+        self.add_equations(Eq(voltage, u))
+
+
+class SignalCurrent(TwoPin):
+    """An ideal source: the current from `p` to `n` through it is the input `u` (ampere)."""
+
+    def __init__(self, ev: EqnEnv, name: str):
+        super().__init__(ev, name)
+        u = self.input("u", unit="A")
+        _, current = self._two_pins()
+        self.add_equations(Eq(current, u))
+
+
+class _OfTime(TwoPin):
+    """A source whose value is an expression in time."""
+
+    def _drive(self, quantity: str, value):
+        voltage, current = self._two_pins()
+        self.add_equations(Eq(voltage if quantity == "v" else current, value))
+
+    def _sine(self, amplitude: Value, frequency: Value, phase: Value, offset: Value, unit: str):
+        a = self.parameter("amplitude", amplitude, unit=unit)
+        f = self.parameter("frequency", frequency, unit="Hz")
+        shift = self.parameter("phase", phase, unit="rad")
+        return self.parameter("offset", offset, unit=unit) + a * sin(2 * pi * f * self.ev.t + shift)
+
+    def _step(self, height: Value, start_time: Value, offset: Value, unit: str):
+        h = self.parameter("height", height, unit=unit)
+        t0 = self.parameter("start_time", start_time, unit="s")
+        return self.parameter("offset", offset, unit=unit) + h * Piecewise((1, self.ev.t >= t0), (0, True))
+
+    def _pulse(self, height: Value, period: Value, width: Value, start_time: Value, offset: Value, unit: str):
+        h = self.parameter("height", height, unit=unit)
+        length = self.parameter("period", period, unit="s", bounds=POSITIVE)
+        part = self.parameter("width", width)
+        t0 = self.parameter("start_time", start_time, unit="s")
+        cycle = (self.ev.t - t0) / length
+        on = Piecewise((1, (cycle >= 0) & (cycle - floor(cycle) < part)), (0, True))
+        return self.parameter("offset", offset, unit=unit) + h * on
+
+
+class SineVoltage(_OfTime):
+    """v = offset + amplitude·sin(2π·frequency·t + phase), in volt, hertz and radian."""
+
+    def __init__(
+        self,
+        ev: EqnEnv,
+        name: str,
+        amplitude: Value = 1.0,
+        frequency: Value = 1.0,
+        phase: Value = 0.0,
+        offset: Value = 0.0,
+    ):
+        super().__init__(ev, name)
+        self._drive("v", self._sine(amplitude, frequency, phase, offset, "V"))
+
+
+class SineCurrent(_OfTime):
+    """i = offset + amplitude·sin(2π·frequency·t + phase), in ampere, hertz and radian."""
+
+    def __init__(
+        self,
+        ev: EqnEnv,
+        name: str,
+        amplitude: Value = 1.0,
+        frequency: Value = 1.0,
+        phase: Value = 0.0,
+        offset: Value = 0.0,
+    ):
+        super().__init__(ev, name)
+        self._drive("i", self._sine(amplitude, frequency, phase, offset, "A"))
+
+
+class StepVoltage(_OfTime):
+    """v = offset, and offset + height from `start_time` (second) on, in volt: name that time with
+    `simulate(jump_ts=...)`."""
+
+    def __init__(self, ev: EqnEnv, name: str, height: Value = 1.0, start_time: Value = 0.0, offset: Value = 0.0):
+        super().__init__(ev, name)
+        self._drive("v", self._step(height, start_time, offset, "V"))
+
+
+class StepCurrent(_OfTime):
+    """i = offset, and offset + height from `start_time` (second) on, in ampere: name that time with
+    `simulate(jump_ts=...)`."""
+
+    def __init__(self, ev: EqnEnv, name: str, height: Value = 1.0, start_time: Value = 0.0, offset: Value = 0.0):
+        super().__init__(ev, name)
+        self._drive("i", self._step(height, start_time, offset, "A"))
+
+
+class PulseVoltage(_OfTime):
+    """v = offset + height in the first part `width` (0 to 1) of every `period` (second) from `start_time` on, else
+    offset, in volt: name the times of its edges with `simulate(jump_ts=...)`."""
+
+    def __init__(
+        self,
+        ev: EqnEnv,
+        name: str,
+        height: Value = 1.0,
+        period: Value = 1.0,
+        width: Value = 0.5,
+        start_time: Value = 0.0,
+        offset: Value = 0.0,
+    ):
+        super().__init__(ev, name)
+        self._drive("v", self._pulse(height, period, width, start_time, offset, "V"))
+
+
+class PulseCurrent(_OfTime):
+    """i = offset + height in the first part `width` (0 to 1) of every `period` (second) from `start_time` on, else
+    offset, in ampere: name the times of its edges with `simulate(jump_ts=...)`."""
+
+    def __init__(
+        self,
+        ev: EqnEnv,
+        name: str,
+        height: Value = 1.0,
+        period: Value = 1.0,
+        width: Value = 0.5,
+        start_time: Value = 0.0,
+        offset: Value = 0.0,
+    ):
+        super().__init__(ev, name)
+        self._drive("i", self._pulse(height, period, width, start_time, offset, "A"))
+
+
+class VoltageControlledVoltage(TwoPorts):
+    """v2 = gain·v1, i1 = 0."""
+
+    def __init__(self, ev: EqnEnv, name: str, gain: Value = 1.0):
+        super().__init__(ev, name)
+        k = self.parameter("gain", gain)
+        v1, i1, v2, _ = self._two_ports()
+        self.add_equations(Eq(v2, k * v1), Eq(i1, 0))
+
+
+class VoltageControlledCurrent(TwoPorts):
+    """i2 = transconductance·v1 (siemens), i1 = 0; i2 flows from `p2` to `n2` through the source."""
+
+    def __init__(self, ev: EqnEnv, name: str, transconductance: Value = 1.0):
+        super().__init__(ev, name)
+        k = self.parameter("transconductance", transconductance, unit="S")
+        v1, i1, _, i2 = self._two_ports()
+        self.add_equations(Eq(i2, k * v1), Eq(i1, 0))
+
+
+class CurrentControlledVoltage(TwoPorts):
+    """v2 = transresistance·i1 (ohm), v1 = 0."""
+
+    def __init__(self, ev: EqnEnv, name: str, transresistance: Value = 1.0):
+        super().__init__(ev, name)
+        k = self.parameter("transresistance", transresistance, unit="Ohm")
+        v1, i1, v2, _ = self._two_ports()
+        self.add_equations(Eq(v2, k * i1), Eq(v1, 0))
+
+
+class CurrentControlledCurrent(TwoPorts):
+    """i2 = gain·i1, v1 = 0; i2 flows from `p2` to `n2` through the source."""
+
+    def __init__(self, ev: EqnEnv, name: str, gain: Value = 1.0):
+        super().__init__(ev, name)
+        k = self.parameter("gain", gain)
+        v1, i1, _, i2 = self._two_ports()
+        self.add_equations(Eq(i2, k * i1), Eq(v1, 0))
