@@ -1,0 +1,146 @@
+"""Linear blocks with memory: input `u`, output `y`."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ...errors import ModelError
+from ...modeling import POSITIVE, Component, Eq, EqnEnv, Value, der
+
+
+class Integrator(Component):
+    """dy/dt = k·u, from `initial_y` at the start."""
+
+    def __init__(self, ev: EqnEnv, name: str, k: Value = 1.0, initial_y: Value = 0.0):
+        super().__init__(ev, name)
+        gain, y0 = self.parameter("k", k), self.parameter("initial_y", initial_y)
+        u, y = self.input("u"), self.variable("y", start=y0, fixed=True)
+        self.add_equations(Eq(der(y), gain * u))
+
+
+class FirstOrder(Component):
+    """T·dy/dt = k·u − y, `T` > 0 in second, from `initial_y` at the start."""
+
+    def __init__(self, ev: EqnEnv, name: str, k: Value = 1.0, T: Value = 1.0, initial_y: Value = 0.0):
+        super().__init__(ev, name)
+        gain, y0 = self.parameter("k", k), self.parameter("initial_y", initial_y)
+        lag = self.parameter("T", T, unit="s", bounds=POSITIVE)
+        u, y = self.input("u"), self.variable("y", start=y0, fixed=True)
+        self.add_equations(Eq(lag * der(y), gain * u - y))
+
+
+class SecondOrder(Component):
+    """y''/w² + 2·D·y'/w + y = k·u, `w` > 0 in rad/s, `D` the damping ratio, from rest at `initial_y`."""
+
+    def __init__(self, ev: EqnEnv, name: str, k: Value = 1.0, w: Value = 1.0, D: Value = 1.0, initial_y: Value = 0.0):
+        super().__init__(ev, name)
+        gain, y0 = self.parameter("k", k), self.parameter("initial_y", initial_y)
+        frequency, damping = self.parameter("w", w, unit="rad/s", bounds=POSITIVE), self.parameter("D", D)
+        u, y = self.input("u"), self.variable("y", start=y0, fixed=True)
+        v = self.variable("v", start=0.0, fixed=True)
+        self.add_equations(Eq(der(y), v), Eq(der(v), frequency * (frequency * (gain * u - y) - 2 * damping * v)))
+
+
+class DerivativeFilter(Component):
+    """y = k·(u − x)/T with T·dx/dt = u − x: the derivative of `u`, filtered by a lag `T` > 0 (second).
+
+    It starts at y = 0 unless `initial_x` is given.
+    """
+
+    def __init__(self, ev: EqnEnv, name: str, k: Value = 1.0, T: Value = 0.01, initial_x: Value | None = None):
+        super().__init__(ev, name)
+        gain, lag = self.parameter("k", k), self.parameter("T", T, unit="s", bounds=POSITIVE)
+        u = self.input("u")
+        x0 = self.parameter("initial_x", initial_x or 0.0)
+        x = self.variable("x", start=x0, fixed=initial_x is not None)
+        y = self.variable("y", start=None if initial_x is not None else 0.0, fixed=initial_x is None)
+        self.add_equations(Eq(y, gain * (u - x) / lag), Eq(lag * der(x), u - x))
+
+
+class StateSpace(Component):
+    """dx/dt = A·x + B·u, y = C·x + D·u, with numbers in the matrices.
+
+    **Arguments:**
+
+    - `A`, `B`, `C`, `D`: shapes (n, n), (n, m), (p, n), (p, m); `D` is zero if left out. With m = 1 the input is `u`,
+        with p = 1 the output is `y`; else they are `u1`, `u2`, … and `y1`, `y2`, …
+    - `initial_x`: shape (n,), zero if left out.
+    """
+
+    def __init__(
+        self, ev: EqnEnv, name: str, A: Any, B: Any, C: Any, D: Any = None, initial_x: Sequence[Value] | None = None
+    ):
+        super().__init__(ev, name)
+        a, b, c = (np.atleast_2d(np.asarray(matrix, float)) for matrix in (A, B, C))
+        n, m, p = a.shape[0], b.shape[1], c.shape[0]
+        d = np.zeros((p, m)) if D is None else np.atleast_2d(np.asarray(D, float))
+        for what, matrix, shape in (("A", a, (n, n)), ("B", b, (n, m)), ("C", c, (p, n)), ("D", d, (p, m))):
+            if matrix.shape != shape:
+                raise ModelError(f"'{name}': {what} has shape {matrix.shape}, expected {shape}")
+        starts = [0.0] * n if initial_x is None else list(initial_x)
+        if len(starts) != n:
+            raise ModelError(f"'{name}': initial_x has {len(starts)} entries, expected {n}")
+        u = [self.input("u" if m == 1 else f"u{j}") for j in range(1, m + 1)]
+        x0 = [self.parameter(f"initial_x{k}", start) for k, start in enumerate(starts, 1)]
+        x = [self.variable(f"x{k}", start=start, fixed=True) for k, start in enumerate(x0, 1)]
+        self.add_equations(*(Eq(der(x[k]), _row(a[k], x) + _row(b[k], u)) for k in range(n)))
+        for k in range(p):
+            self.output("y" if p == 1 else f"y{k + 1}", _row(c[k], x) + _row(d[k], u))
+
+
+class TransferFunction(Component):
+    """y = N(s)/D(s)·u, from rest, in controllable canonical form (Kailath 1980, section 2.1).
+
+    `numerator` and `denominator` are coefficients of falling powers of s; the numerator's degree is at most the
+    denominator's.
+    """
+
+    def __init__(self, ev: EqnEnv, name: str, numerator: Any, denominator: Any):
+        super().__init__(ev, name)
+        top, bottom = np.asarray(numerator, float), np.asarray(denominator, float)
+        if not len(bottom) or bottom[0] == 0.0:
+            raise ModelError(f"'{name}': the first coefficient of the denominator must not be zero")
+        if len(top) > len(bottom):
+            raise ModelError(
+                f"'{name}': the numerator's degree, {len(top) - 1}, is above the denominator's, {len(bottom) - 1}"
+            )
+        n = len(bottom) - 1
+        a = bottom / bottom[0]
+        b = np.concatenate([np.zeros(n + 1 - len(top)), top]) / bottom[0]
+        u = self.input("u")
+        x = [self.variable(f"x{k}", start=0.0, fixed=True) for k in range(1, n + 1)]
+        for k in range(n - 1):
+            self.add_equations(Eq(der(x[k]), x[k + 1]))
+        if n:
+            self.add_equations(Eq(der(x[-1]), u - _row(a[:0:-1], x)))
+        self.output("y", b[0] * u + _row((b[1:] - b[0] * a[1:])[::-1], x))
+
+
+class PadeDelay(Component):
+    """u delayed by `T` > 0 seconds, as Padé's approximation of e^(−T·s) of order (n, n), from rest.
+
+    The phase is right to 1 % up to about w·T = n (Golub & Van Loan 2013, section 9.3.1, for the coefficients).
+    """
+
+    def __init__(self, ev: EqnEnv, name: str, T: Value = 1.0, n: int = 4):
+        super().__init__(ev, name)
+        if n < 1:
+            raise ModelError(f"'{name}': n must be at least 1; got {n}")
+        lag = self.parameter("T", T, unit="s", bounds=POSITIVE)
+        # e^(−s) ≈ Σ cₖ·(−s)ᵏ / Σ cₖ·sᵏ; states in units of T: x[k] = Tᵏ·dᵏx/dtᵏ.
+        c = [1.0]
+        for k in range(1, n + 1):
+            c.append(c[-1] * (n - k + 1) / (k * (2 * n - k + 1)))
+        u = self.input("u")
+        x = [self.variable(f"x{k}", start=0.0, fixed=True) for k in range(1, n + 1)]
+        for k in range(n - 1):
+            self.add_equations(Eq(lag * der(x[k]), x[k + 1]))
+        top = (u - _row(np.array(c[:n]), x)) / c[n]  # the highest derivative
+        self.add_equations(Eq(lag * der(x[-1]), top))
+        signed = [ck * (-1) ** k for k, ck in enumerate(c)]
+        self.output("y", _row(np.array(signed[:n]), x) + signed[n] * top)
+
+
+def _row(numbers: np.ndarray, symbols: Sequence[Any]) -> Any:
+    return sum((float(k) * s for k, s in zip(numbers, symbols, strict=True) if k), 0)

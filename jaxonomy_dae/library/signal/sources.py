@@ -1,0 +1,107 @@
+"""Signals that come from nowhere: functions of time."""
+
+import jax
+import jax.numpy as jnp
+from sympy import Max, Min, Piecewise, floor, pi, sin
+
+from ...errors import ModelError
+from ...modeling import POSITIVE, Component, EqnEnv, Value
+
+
+class Constant(Component):
+    """y = k."""
+
+    def __init__(self, ev: EqnEnv, name: str, k: Value = 1.0):
+        super().__init__(ev, name)
+        self.output("y", self.parameter("k", k))
+
+
+class Step(Component):
+    """y = offset, and offset + height from `start_time` (second) on: name that time with `simulate(jump_ts=...)`."""
+
+    def __init__(self, ev: EqnEnv, name: str, height: Value = 1.0, start_time: Value = 0.0, offset: Value = 0.0):
+        super().__init__(ev, name)
+        h, o = self.parameter("height", height), self.parameter("offset", offset)
+        t0 = self.parameter("start_time", start_time, unit="s")
+        self.output("y", o + h * Piecewise((1, ev.t >= t0), (0, True)))
+
+
+class Ramp(Component):
+    """y rises from `offset` by `height` within `duration` > 0 seconds from `start_time` on, and stays."""
+
+    def __init__(
+        self,
+        ev: EqnEnv,
+        name: str,
+        height: Value = 1.0,
+        duration: Value = 1.0,
+        start_time: Value = 0.0,
+        offset: Value = 0.0,
+    ):
+        super().__init__(ev, name)
+        h, o = self.parameter("height", height), self.parameter("offset", offset)
+        length = self.parameter("duration", duration, unit="s", bounds=POSITIVE)
+        t0 = self.parameter("start_time", start_time, unit="s")
+        self.output("y", o + h * Min(Max((ev.t - t0) / length, 0), 1))
+
+
+class Sine(Component):
+    """y = offset + amplitude·sin(2π·frequency·t + phase), in hertz and radian."""
+
+    def __init__(
+        self,
+        ev: EqnEnv,
+        name: str,
+        amplitude: Value = 1.0,
+        frequency: Value = 1.0,
+        phase: Value = 0.0,
+        offset: Value = 0.0,
+    ):
+        super().__init__(ev, name)
+        a, o = self.parameter("amplitude", amplitude), self.parameter("offset", offset)
+        f, shift = self.parameter("frequency", frequency, unit="Hz"), self.parameter("phase", phase, unit="rad")
+        self.output("y", o + a * sin(2 * pi * f * ev.t + shift))
+
+
+class Pulse(Component):
+    """y = offset + height in the first part `width` (0 to 1) of every `period` (second) from `start_time` on, else
+    offset: name the times of its edges with `simulate(jump_ts=...)`."""
+
+    def __init__(
+        self,
+        ev: EqnEnv,
+        name: str,
+        height: Value = 1.0,
+        period: Value = 1.0,
+        width: Value = 0.5,
+        start_time: Value = 0.0,
+        offset: Value = 0.0,
+    ):
+        super().__init__(ev, name)
+        h, o, part = (self.parameter(k, v) for k, v in (("height", height), ("offset", offset), ("width", width)))
+        length = self.parameter("period", period, unit="s", bounds=POSITIVE)
+        t0 = self.parameter("start_time", start_time, unit="s")
+        cycle = (ev.t - t0) / length
+        on = Piecewise((1, (cycle >= 0) & (cycle - floor(cycle) < part)), (0, True))
+        self.output("y", o + h * on)
+
+
+class Noise(Component):
+    """y runs in straight lines between independent normal values of standard deviation `std`, one every `interval` > 0
+    seconds: the same for the same `key` (`jax.random.key(0)`) however long the run. Its kinks are not step ends: give
+    `simulate(dtmax=...)` where single values matter."""
+
+    def __init__(self, ev: EqnEnv, name: str, key: jax.Array, std: Value = 1.0, interval: float = 1.0):
+        super().__init__(ev, name)
+        if not interval > 0:
+            raise ModelError(f"'{name}': interval must be > 0; got {interval}")
+        size = self.parameter("std", std)
+
+        def value(t):
+            count = jnp.floor(t / interval)
+            number = count.astype(jnp.int32)
+            first, second = (jax.random.normal(jax.random.fold_in(key, number + k), dtype=t.dtype) for k in (0, 1))
+            return first + (second - first) * (t / interval - count)
+
+        (unit,) = self.function("unit", value, inputs=[ev.t])
+        self.output("y", size * unit)

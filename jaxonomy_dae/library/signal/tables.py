@@ -1,0 +1,111 @@
+"""Tables as functions of signals; the values in them are arrays of the system, and trainable."""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.interpolate import RegularGridInterpolator
+from jaxtyping import Array, Float
+
+from ...errors import ModelError
+from ...modeling import Component, EqnEnv
+
+KINDS = ("linear", "cubic")
+
+
+class _Curve(eqx.Module):
+    """Values at grid points, interpolated anew where they are trained."""
+
+    x: np.ndarray = eqx.field(converter=np.asarray)
+    y: Float[Array, " n"]
+    kind: str = eqx.field(static=True)
+
+    def __call__(self, u):
+        x = jnp.asarray(self.x, self.y.dtype)
+        if self.kind == "linear":
+            return diffrax.LinearInterpolation(x, self.y).evaluate(u)
+        return diffrax.CubicInterpolation(x, diffrax.backward_hermite_coefficients(x, self.y)).evaluate(u)
+
+
+class _Surface(eqx.Module):
+    x: np.ndarray = eqx.field(converter=np.asarray)
+    y: np.ndarray = eqx.field(converter=np.asarray)
+    z: Float[Array, "n m"]
+
+    def __call__(self, u1, u2):
+        grid = (jnp.asarray(self.x, self.z.dtype), jnp.asarray(self.y, self.z.dtype))
+        beyond: Any = None  # the last piece goes on
+        table: Callable[[Any], Any] = RegularGridInterpolator(grid, self.z, bounds_error=False, fill_value=beyond)
+        return table(jnp.stack([u1, u2])[None])[0]
+
+
+class Table1D(Component):
+    """y = f(u), interpolated between the points (x, y).
+
+    **Arguments:**
+
+    - `x`: increasing, shape (n,), n ≥ 2. `values`: shape (n,).
+    - `kind`: 'linear', or 'cubic': Hermite splines with backward differences, once differentiable (Morrill et al. 2022,
+        arXiv:2106.11028). Outside of the points the last piece goes on.
+
+    **Raises:**
+
+    - `ModelError` if the points are not increasing, not finite, or their numbers disagree.
+    """
+
+    def __init__(self, ev: EqnEnv, name: str, x: Any, values: Any, kind: str = "linear"):
+        super().__init__(ev, name)
+        points, found = _increasing(x, name, "x"), _finite(values, name, "values")
+        if found.shape != points.shape:
+            raise ModelError(f"'{name}': values has shape {found.shape}, x has {points.shape}: they must agree")
+        if kind not in KINDS:
+            raise ModelError(f"'{name}': kind must be one of {', '.join(KINDS)}; got {kind!r}")
+        (value,) = self.function("table", _Curve(points, jnp.asarray(found), kind), inputs=[self.input("u")])
+        self.output("y", value)
+
+
+class Table2D(Component):
+    """y = f(u1, u2), bilinear between the points of a grid; outside of it the last piece goes on.
+
+    **Arguments:**
+
+    - `x`, `y`: increasing, shapes (n,) and (m,). `values`: shape (n, m).
+
+    **Raises:**
+
+    - `ModelError` if the points are not increasing, not finite, or shapes disagree.
+    """
+
+    def __init__(self, ev: EqnEnv, name: str, x: Any, y: Any, values: Any):
+        super().__init__(ev, name)
+        first, second = _increasing(x, name, "x"), _increasing(y, name, "y")
+        found = _finite(values, name, "values")
+        if found.shape != (len(first), len(second)):
+            raise ModelError(f"'{name}': values has shape {found.shape}; x and y ask for {(len(first), len(second))}")
+        surface = _Surface(first, second, jnp.asarray(found))
+        (value,) = self.function("table", surface, inputs=[self.input("u1"), self.input("u2")])
+        self.output("y", value)
+
+
+def _finite(values: Any, name: str, what: str) -> np.ndarray:
+    found = np.asarray(values, float)
+    if not np.isfinite(found).all():
+        place = int(np.argmin(np.isfinite(found).ravel()))
+        raise ModelError(f"'{name}': {what} is not finite at entry {place} ({found.ravel()[place]})")
+    return found
+
+
+def _increasing(values: Any, name: str, what: str) -> np.ndarray:
+    found = _finite(values, name, what)
+    if found.ndim != 1 or len(found) < 2:
+        raise ModelError(f"'{name}': {what} needs a row of at least 2 points; got shape {found.shape}")
+    if not (np.diff(found) > 0).all():
+        place = int(np.argmin(np.diff(found) > 0))
+        raise ModelError(
+            f"'{name}': {what} must increase, but entry {place + 1} ({found[place + 1]:g}) follows {found[place]:g}: "
+            "sort it"
+        )
+    return found

@@ -1,0 +1,165 @@
+"""Every causal block against a closed form or an independent computation."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+import scipy.interpolate
+import scipy.signal
+import scipy.special
+from problems import compiled
+from scipy.linalg import expm
+
+import jaxonomy_dae.library.signal as sig
+from jaxonomy_dae import EqnEnv, ModelError, simulate
+
+ROUNDING = 1e-12  # of blocks without memory
+X, VALUES = np.array([0.0, 1.0, 1.5, 3.0]), np.array([1.0, -1.0, 2.0, 0.5])
+GRID = np.random.default_rng(0).normal(size=(4, 3))
+
+
+def test_blocks_without_memory():
+    ev = EqnEnv()
+    parts = [
+        sig.Gain(ev, "gain", 3.0), sig.Sum(ev, "error", (1.0, -2.0, 0.5)), sig.Product(ev, "product", 3),
+        sig.Saturation(ev, "cut", -0.5, 0.75), sig.DeadZone(ev, "dead", 0.4),
+        sig.Table1D(ev, "line", X, VALUES), sig.Table1D(ev, "curve", X, VALUES, kind="cubic"),
+        sig.Table2D(ev, "map", X, [0.0, 1.0, 4.0], GRID), sig.Constant(ev, "c", 2.0),
+    ]  # fmt: skip
+    system = compiled(*parts, connect=[(parts[-1].y, parts[0].u)])
+    slopes = np.diff(VALUES) / np.diff(X)
+    curve = scipy.interpolate.CubicHermiteSpline(X, VALUES, np.append(slopes[:1], slopes))
+    line = scipy.interpolate.interp1d(X, VALUES, fill_value="extrapolate")
+    surface = scipy.interpolate.RegularGridInterpolator((X, [0.0, 1.0, 4.0]), GRID, bounds_error=False, fill_value=None)
+    names = ["gain.y", "error.y", "product.y", "cut.y", "dead.y", "line.y", "curve.y", "map.y"]
+    observe = jax.jit(lambda inputs: system.observe(names, 0.0, system.initialize(inputs=inputs), inputs))
+    for u in (-1.0, -0.3, 0.2, 0.7, 1.3, 2.9, 4.0):
+        inputs = {"error.u1": u, "error.u2": 0.1, "error.u3": 0.2, "product.u1": u, "product.u2": 2.0}
+        inputs |= {"product.u3": -1.5, "cut.u": u, "dead.u": u, "line.u": u, "curve.u": u, "map.u1": u, "map.u2": 1.7}
+        expected = [
+            6.0, u - 0.2 + 0.1, -3.0 * u, np.clip(u, -0.5, 0.75), np.sign(u) * max(abs(u) - 0.4, 0.0), float(line(u)),
+            float(curve(u)), float(surface([u, 1.7])[0]),
+        ]  # fmt: skip
+        found = observe({k: jnp.asarray(v) for k, v in inputs.items()})
+        np.testing.assert_allclose(found, expected, rtol=ROUNDING, atol=ROUNDING)
+
+
+W = 2.0  # rad/s of the input sin(W·t)
+TS = np.linspace(0.0, 3.0, 7)
+
+
+def response(numerator, denominator):
+    """The response to sin(W·t) from rest, by the exponential of the matrix with the oscillator appended."""
+    a, b, c, d = scipy.signal.tf2ss(numerator, denominator)
+    n = len(a)
+    whole = np.zeros((n + 2, n + 2))
+    whole[:n, :n], whole[:n, n] = a, b[:, 0]
+    whole[n, n + 1], whole[n + 1, n] = W, -W
+    states = np.array([expm(whole * t) @ np.append(np.zeros(n + 1), 1.0) for t in TS])
+    return states[:, :n] @ c[0] + d[0, 0] * states[:, n]
+
+
+@functools.cache
+def dynamic():
+    ev = EqnEnv()
+    source = sig.Sine(ev, "source", 1.0, W / (2 * np.pi))
+    delay = scipy.interpolate.pade([(-0.5) ** k / float(scipy.special.factorial(k)) for k in range(9)], 4)
+    blocks = {
+        sig.Integrator(ev, "sum", 2.0): response([2.0], [1.0, 0.0]),
+        sig.FirstOrder(ev, "lag", 3.0, 0.5): response([3.0], [0.5, 1.0]),
+        sig.SecondOrder(ev, "swing", 2.0, 4.0, 0.3): response([32.0], [1.0, 2.4, 16.0]),
+        sig.DerivativeFilter(ev, "slope", 2.0, 0.1): response([2.0, 0.0], [0.1, 1.0]),
+        sig.TransferFunction(ev, "tf", [2.0, 1.0, 3.0], [0.5, 1.0, 2.0]): response([2.0, 1.0, 3.0], [0.5, 1.0, 2.0]),
+        sig.StateSpace(ev, "ss", [[0, 1], [-2, -0.5]], [[0], [1]], [[1, 0.2]], [[0.3]]): response(
+            *(v.ravel() for v in scipy.signal.ss2tf([[0, 1], [-2, -0.5]], [[0], [1]], [[1, 0.2]], [[0.3]]))
+        ),
+        sig.PadeDelay(ev, "late", 0.5, 4): response(delay[0].coeffs, delay[1].coeffs),
+    }
+    system = compiled(source, *blocks, connect=[(source.y, block.u) for block in blocks])
+    return system, {f"{block.name}.y": true for block, true in blocks.items()}
+
+
+def test_blocks_with_memory():
+    system, expected = dynamic()
+    solution = simulate(system, 3.0, ts=TS, rtol=1e-9, atol=1e-11)
+    for name, true in expected.items():
+        # rtol 1e-9 for each of fewer than 200 steps.
+        np.testing.assert_allclose(solution[name], true, rtol=0, atol=2e-7 * np.abs(true).max(), err_msg=name)
+    late = np.where(TS < 0.5, 0.0, np.sin(W * (TS - 0.5)))
+    assert np.abs(np.asarray(solution["late.y"]) - late)[2:].max() < 1e-2  # what order 4 leaves
+
+
+def test_a_controlled_plant_against_scipy():
+    """A lag behind a PID controller with limits, and another behind a PI controller; the limit is reached."""
+    ev = EqnEnv()
+    step, ramp = sig.Step(ev, "step", 2.0, 0.5), sig.Ramp(ev, "ramp", 1.0, 2.0, 0.25)
+    pid = sig.PID(ev, "pid", 3.0, 0.8, 0.1, 0.5, 8.0, 0.7, low=-1.0, high=2.5)
+    pi = sig.PI(ev, "pi", 2.0, 0.6)
+    first, second = sig.FirstOrder(ev, "first", 1.0, 0.4), sig.FirstOrder(ev, "second", 1.5, 0.3)
+    system = compiled(
+        step, ramp, pid, pi, first, second,
+        connect=[
+            (step.y, pid.setpoint), (first.y, pid.measured), (pid.y, first.u),
+            (ramp.y, pi.setpoint), (second.y, pi.measured), (pi.y, second.u),
+        ],
+    )  # fmt: skip
+    solution = simulate(system, 3.0, ts=TS, rtol=1e-9, atol=1e-11, jump_ts=[0.25, 0.5, 2.25])
+
+    def slopes(t, s):
+        y, i, smooth, x, z = s
+        r, q = 2.0 * (t >= 0.5), min(max((t - 0.25) / 2.0, 0.0), 1.0)
+        v = 3.0 * (0.7 * r - y) + i - 3.0 * 8.0 * (y - smooth)
+        u = min(max(v, -1.0), 2.5)
+        return [
+            (u - y) / 0.4, 3.0 * (r - y) / 0.8 + (u - v) / 0.5, (y - smooth) * 8.0 / 0.1,
+            (q - z) / 0.6, (1.5 * 2.0 * (q - z + x) - z) / 0.3,
+        ]  # fmt: skip
+
+    at = [np.zeros(5)]
+    for a, b in zip([0.0, 0.25, 0.5, 2.25], [0.25, 0.5, 2.25, 3.0], strict=True):
+        inside = TS[(TS > a) & (TS <= b)]
+        run = scipy.integrate.solve_ivp(
+            slopes, (a + 1e-14, b), at[-1], "Radau", rtol=1e-10, atol=1e-12, t_eval=np.union1d(inside, [b])
+        )
+        for t, column in zip(run.t, run.y.T, strict=True):
+            if t in inside or t == b:
+                at.append(column)
+    table = {t: s for t, s in zip(np.union1d(TS, [0.25, 0.5, 2.25]), at, strict=True)}
+    expected = np.array([table[t] for t in TS])
+    assert float(jnp.max(solution["pid.v"])) > 2.5  # the limit matters
+    # Tolerances of 1e-9 here and 1e-10 there; the limit is left and reached between steps.
+    np.testing.assert_allclose(solution["first.y"], expected[:, 0], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(solution["second.y"], expected[:, 4], rtol=0, atol=1e-6)
+
+
+def test_noise_belongs_to_its_key():
+    ev = EqnEnv()
+    system = compiled(sig.Noise(ev, "n", jax.random.key(3), 2.0, 0.1), sig.Noise(ev, "m", jax.random.key(4), 2.0, 0.1))
+    read = jax.jit(jax.vmap(lambda t: system.observe(["n.y", "m.y"], t, system.initialize(t0=t))))
+    values = np.asarray(read(jnp.arange(2000.0) * 0.1))
+    # 2,000 independent values: the mean's deviation is 2/√2000, the variance's 4·√(2/2000); four of each.
+    assert np.abs(values.mean(axis=0)).max() < 4 * 2 / np.sqrt(2000)
+    assert np.abs(values.var(axis=0) - 4.0).max() < 4 * 4 * np.sqrt(2 / 2000)
+    assert abs(np.corrcoef(values.T)[0, 1]) < 4 / np.sqrt(2000)
+    between = np.asarray(read(jnp.array([0.7, 0.725, 0.8])))[:, 0]
+    assert between[1] == pytest.approx(0.75 * between[0] + 0.25 * between[2], rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda ev: sig.Table1D(ev, "t", [0, 2, 1], [0, 1, 2]), r"'t': x must increase, but entry 2 \(1\) follows 2"),
+        (lambda ev: sig.Table1D(ev, "t", [0, 1], [0, 1, 2]), r"'t': values has shape \(3,\), x has \(2,\)"),
+        (lambda ev: sig.Table1D(ev, "t", [0, 1], [0, np.nan]), r"'t': values is not finite at entry 1"),
+        (lambda ev: sig.Table2D(ev, "t", [0, 1], [0, 1], [[1, 2]]), r"'t': values has shape \(1, 2\)"),
+        (lambda ev: sig.TransferFunction(ev, "f", [1, 0], [2]), r"'f': the numerator's degree, 1, is above"),
+        (lambda ev: sig.StateSpace(ev, "s", [[1, 0]], [[1]], [[1]]), r"'s': A has shape \(1, 2\)"),
+        (lambda ev: sig.FirstOrder(ev, "f", T=0.0), r"f\.T"),
+    ],
+)
+def test_wrong_values_are_named(make, message):
+    with pytest.raises(ModelError, match=message):
+        make(EqnEnv())
