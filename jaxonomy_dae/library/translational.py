@@ -4,7 +4,10 @@ Conventions: absolute position `x` in metre, force `f` in newton counted positiv
 mass obeys M·dv/dt = flange.f.
 """
 
+import sympy
+
 from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Translational, Value, der
+from .laws import penetration, stribeck
 
 
 class Mass(Component):
@@ -32,7 +35,18 @@ class Mass(Component):
         self.add_equations(Eq(x, flange.x), Eq(der(x), v), Eq(m * der(v), flange.f))
 
 
-class Spring(Component):
+class _Compliant(Component):
+    """Two flanges and one force that pulls them together: s = flange_b.x − flange_a.x."""
+
+    def _two_flanges(self) -> tuple[sympy.Symbol, sympy.Symbol]:
+        a, b = self.port("flange_a", Translational), self.port("flange_b", Translational)
+        s = self.variable("s", unit="m")
+        f = self.variable("f", unit="N")
+        self.add_equations(Eq(s, b.x - a.x), Eq(b.f, f), Eq(a.f + b.f, 0))
+        return s, f
+
+
+class Spring(_Compliant):
     """A linear spring that pulls its ends together: f = K·(flange_b.x − flange_a.x − length), `K` ≥ 0 in newton per
     metre."""
 
@@ -40,23 +54,19 @@ class Spring(Component):
         super().__init__(ev, name)
         k = self.parameter("K", K, unit="N/m", bounds=NONNEGATIVE)
         rest = self.parameter("length", length, unit="m")
-        a, b = self.port("flange_a", Translational), self.port("flange_b", Translational)
-        s = self.variable("s", unit="m")
-        f = self.variable("f", unit="N")
-        self.add_equations(Eq(s, b.x - a.x), Eq(f, k * (s - rest)), Eq(b.f, f), Eq(a.f + b.f, 0))
+        s, f = self._two_flanges()
+        self.add_equations(Eq(f, k * (s - rest)))
 
 
-class Damper(Component):
+class Damper(_Compliant):
     """A linear damper: f = D·(flange_b.v − flange_a.v), `D` ≥ 0 in newton second per metre."""
 
     def __init__(self, ev: EqnEnv, name: str, D: Value = 1.0):
         super().__init__(ev, name)
         d = self.parameter("D", D, unit="N*s/m", bounds=NONNEGATIVE)
-        a, b = self.port("flange_a", Translational), self.port("flange_b", Translational)
-        s = self.variable("s", unit="m")
+        s, f = self._two_flanges()
         v = self.variable("v", unit="m/s")
-        f = self.variable("f", unit="N")
-        self.add_equations(Eq(s, b.x - a.x), Eq(v, der(s)), Eq(f, d * v), Eq(b.f, f), Eq(a.f + b.f, 0))
+        self.add_equations(Eq(v, der(s)), Eq(f, d * v))
 
 
 class Rod(Component):
@@ -78,3 +88,150 @@ class FixedPosition(Component):
         where = self.parameter("position", position, unit="m")
         flange = self.port("flange", Translational)
         self.add_equations(Eq(flange.x, where))
+
+
+class SpringDamper(_Compliant):
+    """A linear spring and damper side by side: f = K·(s − length) + D·v with v = der(s), `K`, `D` ≥ 0."""
+
+    def __init__(self, ev: EqnEnv, name: str, K: Value = 1.0, D: Value = 1.0, length: Value = 0.0):
+        super().__init__(ev, name)
+        stiffness = self.parameter("K", K, unit="N/m", bounds=NONNEGATIVE)
+        damping = self.parameter("D", D, unit="N*s/m", bounds=NONNEGATIVE)
+        relaxed = self.parameter("length", length, unit="m")
+        s, f = self._two_flanges()
+        speed = self.variable("v", unit="m/s")
+        self.add_equations(Eq(speed, der(s)), Eq(f, stiffness * (s - relaxed) + damping * speed))
+
+
+class NonlinearSpring(_Compliant):
+    """A spring that hardens (or softens) with the cube: f = K·e + K3·e³ with e = s − length (Duffing 1918).
+
+    `K` in N/m, `K3` in N/m3.
+    """
+
+    def __init__(self, ev: EqnEnv, name: str, K: Value = 1.0, K3: Value = 0.0, length: Value = 0.0):
+        super().__init__(ev, name)
+        linear = self.parameter("K", K, unit="N/m")
+        cubic = self.parameter("K3", K3, unit="N/m3")
+        relaxed = self.parameter("length", length, unit="m")
+        s, f = self._two_flanges()
+        e = s - relaxed
+        self.add_equations(Eq(f, linear * e + cubic * e**3))
+
+
+class Backlash(_Compliant):
+    """Play between two parts: nothing is transmitted while |s| < gap/2; beyond, f = K·δ + D·dδ/dt with the
+    penetration δ, whose corners are rounded over `smooth` (metre).
+
+    `gap` ≥ 0 in metre, `K` ≥ 0 in N/m, `D` ≥ 0 in N*s/m.
+    """
+
+    def __init__(
+        self,
+        ev: EqnEnv,
+        name: str,
+        gap: Value = 0.01,
+        K: Value = 1e4,
+        D: Value = 10.0,
+        smooth: Value = 1e-4,
+    ):
+        super().__init__(ev, name)
+        play = self.parameter("gap", gap, unit="m", bounds=NONNEGATIVE)
+        stiffness = self.parameter("K", K, unit="N/m", bounds=NONNEGATIVE)
+        damping = self.parameter("D", D, unit="N*s/m", bounds=NONNEGATIVE)
+        corner = self.parameter("smooth", smooth, unit="m", bounds=POSITIVE)
+        s, f = self._two_flanges()
+        speed = self.variable("v", unit="m/s")
+        depth, slope = penetration(s, play, corner)
+        self.add_equations(Eq(speed, der(s)), Eq(f, stiffness * depth + damping * slope * speed))
+
+
+class Friction(_Compliant):
+    """Dry and viscous friction between two parts that slide on each other, smooth in v = der(s):
+    f = [sliding + (breakaway − sliding)·exp(−(v/stribeck_speed)²)]·tanh(v/smooth) + viscous·v
+    (Armstrong-Hélouvry, Dupont & Canudas de Wit 1994, Automatica 30:1083).
+
+    `sliding`, `breakaway` ≥ 0 in newton, `viscous` ≥ 0 in N*s/m, `stribeck_speed`, `smooth` > 0 in
+    metre per second. It does not stick: under a force below `breakaway` parts creep at a speed below `smooth`.
+    """
+
+    def __init__(
+        self,
+        ev: EqnEnv,
+        name: str,
+        sliding: Value = 1.0,
+        breakaway: Value = 1.5,
+        stribeck_speed: Value = 0.1,
+        viscous: Value = 0.0,
+        smooth: Value = 1e-3,
+    ):
+        super().__init__(ev, name)
+        coulomb = self.parameter("sliding", sliding, unit="N", bounds=NONNEGATIVE)
+        static = self.parameter("breakaway", breakaway, unit="N", bounds=NONNEGATIVE)
+        fades = self.parameter("stribeck_speed", stribeck_speed, unit="m/s", bounds=POSITIVE)
+        fluid = self.parameter("viscous", viscous, unit="N*s/m", bounds=NONNEGATIVE)
+        width = self.parameter("smooth", smooth, unit="m/s", bounds=POSITIVE)
+        s, f = self._two_flanges()
+        speed = self.variable("v", unit="m/s")
+        self.add_equations(Eq(speed, der(s)), Eq(f, stribeck(speed, coulomb, static, fades, fluid, width)))
+
+
+class Force(Component):
+    """A force on a flange, from outside: the input `f` (N), which is 0 unless `simulate` is given it."""
+
+    def __init__(self, ev: EqnEnv, name: str):
+        super().__init__(ev, name)
+        flange = self.port("flange", Translational)
+        f = self.input("f", default=0.0, unit="N")
+        self.add_equations(Eq(flange.f, -f))
+
+
+class PositionSource(Component):
+    """A flange moved by the input `u`: flange.x = u (metre); what drives it must be differentiable in
+    time as often as the model asks."""
+
+    def __init__(self, ev: EqnEnv, name: str):
+        super().__init__(ev, name)
+        flange = self.port("flange", Translational)
+        self.add_equations(Eq(flange.x, self.input("u", unit="m")))
+
+
+class SpeedSource(Component):
+    """A flange moved at the speed of the input `u` (metre per second), from `initial_position` (metre) on."""
+
+    def __init__(self, ev: EqnEnv, name: str, initial_position: Value = 0.0):
+        super().__init__(ev, name)
+        start = self.parameter("initial_position", initial_position, unit="m")
+        flange = self.port("flange", Translational)
+        where = self.variable("x", start=start, fixed=True, unit="m")
+        self.add_equations(Eq(where, flange.x), Eq(der(where), self.input("u", unit="m/s")))
+
+
+class PositionSensor(Component):
+    """The output `y` is the position of a flange (metre); it takes no force."""
+
+    def __init__(self, ev: EqnEnv, name: str):
+        super().__init__(ev, name)
+        flange = self.port("flange", Translational)
+        self.output("y", flange.x, unit="m")
+        self.add_equations(Eq(flange.f, 0))
+
+
+class SpeedSensor(Component):
+    """The output `y` is the speed of a flange (metre per second); it takes no force."""
+
+    def __init__(self, ev: EqnEnv, name: str):
+        super().__init__(ev, name)
+        flange = self.port("flange", Translational)
+        self.output("y", der(flange.x), unit="m/s")
+        self.add_equations(Eq(flange.f, 0))
+
+
+class ForceSensor(Component):
+    """Two flanges that move as one; the output `y` is the force into `flange_a` (newton)."""
+
+    def __init__(self, ev: EqnEnv, name: str):
+        super().__init__(ev, name)
+        a, b = self.port("flange_a", Translational), self.port("flange_b", Translational)
+        self.output("y", a.f, unit="N")
+        self.add_equations(Eq(a.x, b.x), Eq(a.f + b.f, 0))
