@@ -8,7 +8,7 @@ import contextlib
 import itertools
 
 import pytest
-import test_index_reduction
+import test_determinism
 import test_jacobian
 import test_modeling
 import test_scaling
@@ -34,7 +34,7 @@ MODELS = test_jacobian.MODELS | {
     "attenuator": lambda: test_stable_blocks.attenuator(12, 100.0, 1.0),
     "levers": lambda: test_stable_blocks.levers("dummy_derivatives"),
     "levers, projected": lambda: test_stable_blocks.levers("projection"),
-    "ladder": lambda: test_index_reduction.ladder(4),
+    "ladder": lambda: test_determinism.ladder(stages=4),
     "learned resistor": lambda: discharge(mlp(1, 1), "i"),
     "squares": lambda: test_modeling.single(test_modeling.Squares(EqnEnv(), "c")),
     "prescribed motion": lambda: test_modeling.single(test_modeling.Moved(EqnEnv(), "c")),

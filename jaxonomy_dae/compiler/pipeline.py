@@ -13,8 +13,9 @@ from ..model.consistent_point import consistent_point
 from ..model.evaluate_numpy import Networks
 from ..model.extended import Extended
 from ..model.incidence import incidence
-from ..model.quantities import QuantityMap, map_quantities, name_quantities, quantity_scale, start_guess
+from ..model.quantities import QuantityMap, declared_scale, map_quantities, name_quantities, start_guess
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, locate, provenance_of
+from ..model.typical_sizes import typical_sizes
 from .differentiate_equations import differentiate_equations
 from .eliminate_aliases import eliminate_aliases
 from .order_blocks import Blocks, order_blocks
@@ -74,7 +75,7 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Co
         extended,
         mode,
         lambda q: merit[q],
-        quantity_scale(flat, variables, extended),
+        _scale(flat, variables, extended),
         point,
         lambda q: names[q],
         lambda e: str(provenance_of(groups, int(e))),
@@ -97,6 +98,14 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Co
         )
     _check_row_targets(flat, variables, selection, names, mode)
     return CompiledModel(flat, alias, groups, extended, variables, selection, blocks, mode, tuple(names))
+
+
+def _scale(flat: FlatModel, variables: QuantityMap, extended: Extended) -> np.ndarray:
+    """The sizes by which variables are compared as states: as declared, or what their equations imply."""
+    declared = declared_scale(flat, variables, extended)
+    if not extended.level.any():
+        return np.where(declared == 0.0, 1.0, declared)
+    return np.where(declared == 0.0, typical_sizes(flat, variables, extended), declared)
 
 
 def _zero_pivot(flat: FlatModel, groups: tuple[EquationGroup, ...], equation: int) -> str:

@@ -33,7 +33,6 @@ from .rows import InitialRows, Row, initial_rows
 from .sizes import NOISE, Sizes, tolerance
 from .sparse_newton import SparseRows, sparse_newton, sparse_rows
 from .stages import solve_in_stages, stages
-from .typical_sizes import typical_sizes
 
 PERTURBATIONS = 8  # of the start, and of parameters, that show the sizes of terms
 CANCELLED = 1e3  # rounding errors of what is zero because its terms cancel, in units of eps times its typical size
@@ -129,7 +128,7 @@ def initialize(
         start = frozen(solve_in_stages(function, start, sizes, *staged))
     if solver is None:
         entries = np.concatenate([plan.states, plan.carried]).astype(np.int64)
-        typical = np.append(typical_sizes(plan)[entries], np.ones(len(unknown)))
+        typical = np.append(plan.typical_sizes[entries], np.ones(len(unknown)))
         found = find_root(function, m, start, sizes, core, is_soft, bounds, typical)
     else:
         found = find_root_with(solver, function, start, sizes, is_soft, core is not None or not rows.n_soft)
@@ -213,7 +212,7 @@ def _typical_of_rows(plan: SystemPlan, rows: InitialRows, first: int, read: list
     """Typical sizes of what the rows at `read` compare, shape (m,), zero for others; the rows of starts begin at
     `first`."""
     out = np.zeros(first + len(rows.kept))
-    typical = typical_sizes(plan)
+    typical = plan.typical_sizes
     for k in read:
         row = rows.kept[k - first]
         out[k] = abs(row.factor) * typical[row.quantity] if row.quantity >= 0 else 0.0
@@ -309,7 +308,7 @@ def _with_velocities(sizes: Sizes, x: Any, plan: SystemPlan, here: SystemAt) -> 
     if not pairs:
         return sizes
     position, velocity = np.array(pairs).T
-    unit = jnp.asarray(typical_sizes(plan)[plan.states[position]], x.dtype)
+    unit = jnp.asarray(plan.typical_sizes[plan.states[position]], x.dtype)
     acceleration = jnp.abs(here.semi_explicit(x)[velocity]) / unit
     fastest = jnp.max(jnp.where(jnp.isfinite(acceleration), acceleration, 0))
     largest = jnp.max(sizes.known[position] / unit)

@@ -16,6 +16,7 @@ from ..model.opaque import OpaqueFunction
 from ..model.provenance import differentiated
 from ..model.quantities import QuantityMap
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, provenance_of
+from ..model.typical_sizes import typical_sizes
 from . import pattern
 from .dummy_blocks import DummyBlocks, dummy_blocks
 from .gather import Gather
@@ -124,6 +125,11 @@ class SystemPlan:
     def dummy_blocks(self) -> tuple[DummyBlocks, ...]:
         """The nonlinear blocks whose unknowns were dropped from the candidates for states."""
         return dummy_blocks(self.steps, self.selection.dummies) if len(self.carried) else ()
+
+    @functools.cached_property
+    def typical_sizes(self) -> np.ndarray:
+        """Of all quantities: they say where a search begins to look, and what may be rounding."""
+        return typical_sizes(self.flat, self.variable_map, self.extended)
 
     def quantity_of(self, variable: int) -> tuple[int, float]:
         """(quantity, factor) of a variable; quantity ZERO if it is identically zero."""
