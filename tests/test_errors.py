@@ -531,3 +531,9 @@ def test_a_start_at_a_singular_point():
         SimulationError, match=r"not finite at the start, c: 0 = der\(x\) \+ 1/x, with 'c\.x' = 0\. .*division"
     ):
         simulate(compiled(component(write)), 1.0, ts=jnp.array([1.0]))
+
+
+@pytest.mark.parametrize("t0", [{"pend.x": 0.1}, "0", [0.0, 1.0]])
+def test_a_start_time_is_a_number(t0):
+    with pytest.raises(ModelError, match=r"t0 must be a time, a number; got .* Values at the start go to initial="):
+        pendulum().initialize(t0)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from ..errors import InitializationError
+from ..errors import InitializationError, ModelError
 from ..linear.least_squares import least_squares
 from ..linear.sparse import sparse_jacobian
 from ..linear.whole import solve_whole
@@ -459,6 +459,8 @@ def find_initial(
 ) -> InitialPoint:
     """`initialize`, compiled once for each structure where nothing is traced."""
     dtype = system.parameters.values.dtype
+    if np.shape(t0) != () or isinstance(t0, Mapping | str):
+        raise ModelError(f"t0 must be a time, a number; got {t0!r}. Values at the start go to initial={{...}}")
     check_initial(system, initial)
     inputs = read_inputs(system.inputs, dtype, inputs)
     initial = {name: jnp.asarray(v, dtype) for name, v in sorted((initial or {}).items())}
