@@ -9,6 +9,7 @@ from .modeling import Component as Component
 from .modeling import Domain as Domain
 from .modeling import Electrical as Electrical
 from .modeling import EqnEnv as EqnEnv
+from .modeling import Hydraulic as Hydraulic
 from .modeling import Interval as Interval
 from .modeling import NeuralDAEBlock as NeuralDAEBlock
 from .modeling import Rotational as Rotational

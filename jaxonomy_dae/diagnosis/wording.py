@@ -46,6 +46,14 @@ WORDS = {
         "Connect a HeatCapacitor or a FixedTemperature",
         "a thermal conductor",
     ),
+    "Hydraulic": DomainWords(
+        "pressure",
+        "pressure difference",
+        "mass flow",
+        "nothing determines the pressures of {names}: no pressure source, tank or capacity is connected",
+        "Connect a PressureSource, a Tank or a HydraulicCapacity",
+        "a pipe",
+    ),
 }
 
 

@@ -1,0 +1,115 @@
+"""Thermal components together, against closed forms and SciPy's solution of equations derived by hand."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+from problems import compiled
+
+from jaxonomy_dae import EqnEnv, ModelError, simulate
+from jaxonomy_dae.library.thermal import (
+    Convection,
+    FixedTemperature,
+    HeatCapacitor,
+    HeatFlowSensor,
+    HeatFlowSource,
+    Radiation,
+    TemperatureSensor,
+    TemperatureSource,
+    Wall,
+)
+
+END = 7200.0
+TS = np.linspace(0.0, END, 25)
+
+
+def outside(t):
+    return 285.0 + 12.0 * jnp.sin(2 * jnp.pi * t / 3000.0)
+
+
+def wall_temperatures(r, c, inside, starts):
+    """T_1, T_2, … of a wall of layers between `outside` and a constant temperature, by DOP853 at rtol 1e-12."""
+    links = [r[0] / 2, *(np.add(r[:-1], r[1:]) / 2), r[-1] / 2]
+
+    def field(t, T):
+        along = np.array([285.0 + 12.0 * np.sin(2 * np.pi * t / 3000.0), *T, inside])
+        flows = -np.diff(along) / links
+        return -np.diff(flows) / c
+
+    return scipy.integrate.solve_ivp(field, (0, END), starts, "DOP853", TS, rtol=1e-12, atol=1e-10).y
+
+
+def radiating_time(T, T0, around, rate):
+    """The time at which T' = −rate·(T⁴ − around⁴) has come from T0 to T, by partial fractions."""
+
+    def primitive(T):
+        return np.log((T + around) / (T - around)) + 2 * np.arctan(T / around)
+
+    return (primitive(T) - primitive(T0)) / (4 * around**3 * rate)
+
+
+def test_networks():
+    ev = EqnEnv()
+    # A heated body that air cools, with sensors in between.
+    heater, body = HeatFlowSource(ev, "heater"), HeatCapacitor(ev, "body", 800.0, 350.0)
+    skin, air = Convection(ev, "skin", 12.0, 0.05), FixedTemperature(ev, "air")
+    meter, probe = HeatFlowSensor(ev, "meter"), TemperatureSensor(ev, "probe")
+    # A body that radiates, and one that radiates to absolute zero.
+    ball, glow = HeatCapacitor(ev, "ball", 2000.0, 900.0), Radiation(ev, "glow", 0.8, 0.02)
+    around = FixedTemperature(ev, "around", 300.0)
+    star, shine = HeatCapacitor(ev, "star", 500.0, 700.0), Radiation(ev, "shine", 0.6, 0.03)
+    space = FixedTemperature(ev, "space", 0.0)
+    # A wall between changing weather and a room.
+    r, c, starts = [0.02, 0.5, 0.1], [3e3, 8e2, 5e3], [284.0, 288.0, 292.0]
+    weather, wall = TemperatureSource(ev, "weather"), Wall(ev, "wall", r, c, starts)
+    into, room = HeatFlowSensor(ev, "into"), FixedTemperature(ev, "room", 294.0)
+    system = compiled(
+        heater, ball, star, weather,
+        connect=[
+            (heater.heat, body.heat, meter.port_a, probe.heat), (meter.port_b, skin.port_a), (skin.port_b, air.heat),
+            (ball.heat, glow.port_a), (glow.port_b, around.heat),
+            (star.heat, shine.port_b), (shine.port_a, space.heat),
+            (weather.heat, wall.port_a), (wall.port_b, into.port_a), (into.port_b, room.heat),
+        ],
+    )  # fmt: skip
+    assert system.report.degrees_of_freedom == 6
+    solution = simulate(
+        system, END, ts=TS, rtol=1e-10, atol=1e-10, inputs={"heater.Q_flow": 30.0, "weather.T": outside}
+    )
+    # rtol 1e-10 of at most 900 K is 1e-7 K in a step, and errors decay: ten of them. Flows: times their conductances.
+    tolerance = 1e-6
+    conductance, final = 12.0 * 0.05, 293.15 + 30.0 / (12.0 * 0.05)
+    expected = final + (350.0 - final) * np.exp(-conductance / 800.0 * TS)
+    np.testing.assert_allclose(solution["probe.T"], expected, rtol=0, atol=tolerance)
+    np.testing.assert_allclose(solution["meter.Q_flow"], conductance * (expected - 293.15), rtol=0, atol=tolerance)
+
+    rate = 0.8 * 5.670374419e-8 * 0.02 / 2000.0
+    T = np.asarray(solution["ball.T"])
+    error = (radiating_time(T, 900.0, 300.0, rate) - TS) * rate * (T**4 - 300.0**4)  # time off, times the slope
+    np.testing.assert_allclose(error, 0, atol=tolerance)
+    assert 300.0 < T[-1] < 650.0
+
+    rate = 0.6 * 5.670374419e-8 * 0.03 / 500.0
+    np.testing.assert_allclose(solution["star.T"], (700.0**-3 + 3 * rate * TS) ** (-1 / 3), rtol=0, atol=tolerance)
+    np.testing.assert_allclose(solution["shine.Q_flow"], -rate * 500.0 * solution["star.T"] ** 4, rtol=1e-12)
+
+    expected = wall_temperatures(r, c, 294.0, starts)
+    found = np.array([solution[f"wall.capacitor{k}.T"] for k in (1, 2, 3)])
+    np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance)
+    leaving = (expected[2] - 294.0) / (r[2] / 2)
+    np.testing.assert_allclose(solution["into.Q_flow"], leaving, rtol=0, atol=tolerance / (r[2] / 2))
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda ev: Convection(ev, "c", A=-1.0), r"'c\.A' must lie in \[0, inf\); got -1"),
+        (lambda ev: Radiation(ev, "r", eps=1.2), r"'r\.eps' must lie in \[0, 1\]; got 1\.2"),
+        (lambda ev: Wall(ev, "w", [1.0, -2.0], [1.0, 1.0]), r"'w\.R2' must lie in \(0, inf\); got -2"),
+        (lambda ev: Wall(ev, "w", [1.0, 2.0], [1.0]), r"wall 'w' needs .*got 2 in R, 1 in C and 2 in initial_temp"),
+        (lambda ev: Wall(ev, "w", [], []), r"wall 'w' needs .*got 0 in R"),
+    ],
+)
+def test_refused(make, message):
+    with pytest.raises(ModelError, match=message):
+        make(EqnEnv())
