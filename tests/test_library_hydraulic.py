@@ -120,13 +120,13 @@ def test_networks():
     assert_near(solution["bag.p"], 150e3 + e * (c0 * c + s0 * s))
     assert_near(solution["column.m_flow"], flow)
 
-    def root(dp, small):
+    def signed_root(dp, small):
         return dp / np.sqrt(np.hypot(dp, small))
 
     def flows(t, p, level):
-        through = (0.6 + 0.4 * np.cos(2 * t)) * 1e-4 * 0.6 * np.sqrt(2 * RHO) * root(115e3 - p, 1e3)
+        through = (0.6 + 0.4 * np.cos(2 * t)) * 1e-4 * 0.6 * np.sqrt(2 * RHO) * signed_root(115e3 - p, 1e3)
         area = np.pi * 0.01**2 / 4
-        onwards = area * np.sqrt(2 * RHO * 0.01 / (0.03 * 5.0)) * root(p - ATMOSPHERE - RHO * G * level, 2e3)
+        onwards = area * np.sqrt(2 * RHO * 0.01 / (0.03 * 5.0)) * signed_root(p - ATMOSPHERE - RHO * G * level, 2e3)
         return through, onwards
 
     def filled(t, y):

@@ -86,8 +86,8 @@ class Wall(Component):
     """A wall of n layers, from `port_a` to `port_b`: each has a resistance, and its capacity in the middle of it.
 
     C_k·d(T_k)/dt = Q_(k−1) − Q_k with Q_k = (T_k − T_(k+1))/(R_k/2 + R_(k+1)/2), and Q_0 = (port_a.T − T_1)/(R_1/2),
-    Q_n = (T_n − port_b.T)/(R_n/2). The layers are the children `capacitor1`, …, the conductances between them the
-    children `conductor0`, …, `conductorn`.
+    Q_n = (T_n − port_b.T)/(R_n/2). T_1 is `capacitor1.T`, Q_0 is `conductor0.Q_flow`, and so on: capacities and
+    conductances are children.
 
     **Arguments:**
 
