@@ -1,0 +1,31 @@
+"""Sizes of quantities of which nothing is declared, by what their equations say."""
+
+import numpy as np
+from jaxtyping import Float
+
+from .evaluate_numpy import start_values
+from .extended import Extended
+from .natural_sizes import natural_sizes
+from .quantities import QuantityMap, declared_scale
+from .tables import FlatModel
+
+LIMIT = 600  # quantities up to which sizes are looked for
+DECADES = 30  # that they may span: single precision has 38
+
+
+def typical_sizes(flat: FlatModel, variables: QuantityMap, extended: Extended) -> Float[np.ndarray, " quantities"]:
+    """Of all quantities, at the parameter values the model was compiled with; powers of two, by which numbers are
+    multiplied without rounding."""
+    if extended.quantities.n_unknown > LIMIT:
+        return np.ones(extended.quantities.n)
+    size = declared_scale(flat, variables, extended)
+    value_of = start_values(flat.variables.start, flat.parameters.values)
+    for v, start in enumerate(flat.variables.start):
+        quantity, factor = variables[v]
+        if start is not None and quantity >= 0 and size[quantity] == 0.0:
+            value = value_of(v) / factor
+            size[quantity] = value if np.isfinite(value) else 0.0
+    size[size == 0.0] = 1.0
+    found, _ = natural_sizes(extended.groups, extended.n_equations, size, flat.parameters.values)
+    decades = np.clip(np.log10(np.abs(found)), -DECADES, DECADES)
+    return 2.0 ** np.round(decades / np.log10(2.0))
