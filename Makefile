@@ -42,7 +42,7 @@ demo: $(VENV)/.stamp-demo
 	$(BIN)/python examples/neural_dae_pendulum_drag.py
 
 # Most of the time goes into compiling programs that run once. XLA's older code generator takes half of it and makes
-# slower programs; test-all and test-floors run with the one that users have.
+# slower programs; test-floors runs with the one that users have.
 QUICK_COMPILES := XLA_FLAGS="$$XLA_FLAGS --xla_cpu_use_fusion_emitters=false"
 IN_PARALLEL := -n auto --dist loadfile
 
@@ -50,7 +50,7 @@ test: $(VENV)/.stamp-dev
 	$(QUICK_COMPILES) $(BIN)/python -m pytest $(IN_PARALLEL)
 
 test-all: $(VENV)/.stamp-dev
-	$(BIN)/python -m pytest $(IN_PARALLEL) -m "slow or not slow"
+	$(QUICK_COMPILES) $(BIN)/python -m pytest $(IN_PARALLEL) -m "slow or not slow"
 
 lint: $(VENV)/.stamp-dev
 	$(BIN)/ruff check .

@@ -21,15 +21,19 @@ jaxtyping.install_import_hook("jaxonomy_dae", "beartype.beartype")
 hypothesis.settings.register_profile("deterministic", derandomize=True, deadline=None, database=None)
 hypothesis.settings.load_profile("deterministic")
 
-MAPPINGS = Path("/proc/self/maps")  # on Linux
+MAPPINGS, PAGES = Path("/proc/self/maps"), Path("/proc/self/statm")  # on Linux
 MOST_MAPPINGS = 20_000  # a third of what Linux allows by default
+MOST_MEMORY = 4e9  # bytes
 
 
 @pytest.fixture(autouse=True)
 def room_for_compiled_programs():
-    """Compiled programs are memory mappings; XLA crashes where it gets no more of them."""
+    """Compiled programs are memory mappings, of which XLA crashes where it gets no more, and memory."""
     yield
-    if MAPPINGS.exists() and MAPPINGS.read_bytes().count(b"\n") > MOST_MAPPINGS:
+    if not MAPPINGS.exists():
+        return
+    resident = int(PAGES.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    if resident > MOST_MEMORY or MAPPINGS.read_bytes().count(b"\n") > MOST_MAPPINGS:
         jax.clear_caches()
         gc.collect()
 
