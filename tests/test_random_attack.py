@@ -35,8 +35,6 @@ COUNTS = {
     "descriptors": 500,
     "mechanisms": 200,
 }
-# A start that agrees with the equations to 1.2e-9, for the rounding of their coefficients, is called contradicting.
-UNTRUE = {("descriptors", 101)}
 
 
 @pytest.mark.parametrize("family, seed", [(f, s) for f, seeds in QUICK.items() for s in seeds])
@@ -55,6 +53,5 @@ def test_a_hundred_random_models(family, first):
     assert run.returncode == 0, run.stderr[-2000:]
     *failed, counts = run.stdout.splitlines()
     right, refused, *others = (int(n) for n in counts.split()[1:7])
-    untrue = sum((family, seed) in UNTRUE for seed in range(first, first + 100))
-    assert right + refused + sum(others) == 100 and others == [untrue, 0, 0, 0], "\n".join(failed)
+    assert right + refused + sum(others) == 100 and not any(others), "\n".join(failed)
     assert right >= 50  # most models are well posed
