@@ -27,7 +27,8 @@ class Pair:
     factor: dict[str, float]
 
     def old_quantities(self, names: list[str]) -> list[tuple[int, int, float]]:
-        """(quantity, sign, factor) of the old model for each new state."""
+        """For each new state: the old quantity, its value where the old variable of that name is 1, and the value of
+        that variable where the new one is 1."""
         back = {new_name(n): n for n in self.factor}
         out = []
         for name in names:
@@ -35,7 +36,7 @@ class Pair:
             order = bare.count("der(")
             variable = back[bare.replace("der(", "").replace(")", "")]
             quantity, alias = self.old.plan.variable_map[self.old.plan.variable_index[variable]]
-            out.append((quantity + order, sign * alias, self.factor[variable]))
+            out.append((quantity + order, sign / alias if alias else 0.0, self.factor[variable]))
         return out
 
 

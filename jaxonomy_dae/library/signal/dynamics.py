@@ -120,7 +120,8 @@ class TransferFunction(Component):
 class PadeDelay(Component):
     """u delayed by `T` > 0 seconds, as Padé's approximation of e^(−T·s) of order (n, n), from rest.
 
-    The phase is right to 1 % up to about w·T = n (Golub & Van Loan 2013, section 9.3.1, for the coefficients).
+    At w·T = n the phase is off by 7 % for n = 1, 1.7 % for n = 2 and 0.2 % for n = 4, below that by less (coefficients:
+    Golub & Van Loan 2013, section 9.3.1).
     """
 
     def __init__(self, ev: EqnEnv, name: str, T: Value = 1.0, n: int = 4):
