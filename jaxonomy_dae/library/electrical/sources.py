@@ -1,8 +1,7 @@
 """Sources of voltage and current: constant, of time, of a signal, controlled."""
 
-from sympy import Piecewise, floor, pi, sin
-
 from ...modeling import POSITIVE, Eq, EqnEnv, Value
+from ..laws import pulse, sine, step
 from .two_pin import TwoPin, TwoPorts
 
 
@@ -57,21 +56,19 @@ class _OfTime(TwoPin):
         a = self.parameter("amplitude", amplitude, unit=unit)
         f = self.parameter("frequency", frequency, unit="Hz")
         shift = self.parameter("phase", phase, unit="rad")
-        return self.parameter("offset", offset, unit=unit) + a * sin(2 * pi * f * self.ev.t + shift)
+        return self.parameter("offset", offset, unit=unit) + sine(self.ev.t, a, f, shift)
 
     def _step(self, height: Value, start_time: Value, offset: Value, unit: str):
         h = self.parameter("height", height, unit=unit)
         t0 = self.parameter("start_time", start_time, unit="s")
-        return self.parameter("offset", offset, unit=unit) + h * Piecewise((1, self.ev.t >= t0), (0, True))
+        return self.parameter("offset", offset, unit=unit) + h * step(self.ev.t, t0)
 
     def _pulse(self, height: Value, period: Value, width: Value, start_time: Value, offset: Value, unit: str):
         h = self.parameter("height", height, unit=unit)
         length = self.parameter("period", period, unit="s", bounds=POSITIVE)
         part = self.parameter("width", width)
         t0 = self.parameter("start_time", start_time, unit="s")
-        cycle = (self.ev.t - t0) / length
-        on = Piecewise((1, (cycle >= 0) & (cycle - floor(cycle) < part)), (0, True))
-        return self.parameter("offset", offset, unit=unit) + h * on
+        return self.parameter("offset", offset, unit=unit) + h * pulse(self.ev.t, length, part, t0)
 
 
 class SineVoltage(_OfTime):

@@ -2,10 +2,11 @@
 
 import jax
 import jax.numpy as jnp
-from sympy import Max, Min, Piecewise, floor, pi, sin
+from sympy import Max, Min
 
 from ...errors import ModelError
 from ...modeling import POSITIVE, Component, EqnEnv, Value
+from ..laws import pulse, sine, step
 
 
 class Constant(Component):
@@ -23,7 +24,7 @@ class Step(Component):
         super().__init__(ev, name)
         h, o = self.parameter("height", height), self.parameter("offset", offset)
         t0 = self.parameter("start_time", start_time, unit="s")
-        self.output("y", o + h * Piecewise((1, ev.t >= t0), (0, True)))
+        self.output("y", o + h * step(ev.t, t0))
 
 
 class Ramp(Component):
@@ -60,7 +61,7 @@ class Sine(Component):
         super().__init__(ev, name)
         a, o = self.parameter("amplitude", amplitude), self.parameter("offset", offset)
         f, shift = self.parameter("frequency", frequency, unit="Hz"), self.parameter("phase", phase, unit="rad")
-        self.output("y", o + a * sin(2 * pi * f * ev.t + shift))
+        self.output("y", o + sine(ev.t, a, f, shift))
 
 
 class Pulse(Component):
@@ -81,9 +82,7 @@ class Pulse(Component):
         h, o, part = (self.parameter(k, v) for k, v in (("height", height), ("offset", offset), ("width", width)))
         length = self.parameter("period", period, unit="s", bounds=POSITIVE)
         t0 = self.parameter("start_time", start_time, unit="s")
-        cycle = (ev.t - t0) / length
-        on = Piecewise((1, (cycle >= 0) & (cycle - floor(cycle) < part)), (0, True))
-        self.output("y", o + h * on)
+        self.output("y", o + h * pulse(ev.t, length, part, t0))
 
 
 class Noise(Component):
