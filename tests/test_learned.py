@@ -316,3 +316,32 @@ def test_row_injection_leaves_the_constraint_alone():
     np.testing.assert_allclose(x_row, x, rtol=1e-12)  # rounding, here and below
     np.testing.assert_allclose((slope_row - slope)[:2], [0.0, 5.0], atol=1e-12)
     assert float(lam_row) == pytest.approx(float(lam), rel=1e-12)
+
+
+class Speedometer(Component):
+    """A mass on a spring whose speed `v` is shown in km/h for x in metre, and whose position `w` in other units."""
+
+    def __init__(self, ev):
+        super().__init__(ev, "c")
+        x = self.variable("x", start=1.0, fixed=True)
+        v, w = self.variable("v", start=0.0, fixed=True), self.variable("w")
+        self.add_equations(v - 3.6 * der(x), der(v) + 3.6 * 2.0 * x, w + 5 * x)
+
+
+@pytest.mark.parametrize("inject", ["row", "equation"])
+def test_a_correction_of_a_multiple(inject):
+    """A correction −v/2 of the rate of v = 3.6·x' is the damping of x'' + x'/2 + 2·x = 0, in closed form."""
+    ev = EqnEnv()
+    part = Speedometer(ev)
+    drag = NeuralDAEBlock(
+        lambda t, u, theta: (theta * u[0])[None], jnp.array(-0.5), targets=[(part, "v")], name="n", inject=inject
+    )
+    system = compiled(part, blocks=[drag], state_selection="dummy_derivatives")
+    assert len(system.states) == 2
+    solution = simulate(system, 2.0, ts=TS, **SOLVE)
+    a, w = 0.25, np.sqrt(2.0 - 0.25**2)
+    x = np.exp(-a * T) * (np.cos(w * T) + a / w * np.sin(w * T))
+    speed = -2.0 / w * np.exp(-a * T) * np.sin(w * T)
+    np.testing.assert_allclose(solution["c.x"], x, **CLOSE)
+    np.testing.assert_allclose(solution["c.v"], 3.6 * speed, **CLOSE)
+    np.testing.assert_allclose(solution["c.w"], -5 * x, **CLOSE)
