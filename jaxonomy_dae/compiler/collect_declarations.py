@@ -9,6 +9,7 @@ from ..errors import ModelError
 from ..model.dependent_parameters import complete
 from ..model.symbolic import SymbolicTemplate, canonical
 from ..model.tables import DependentParameters, ParameterTable, Start, VariableTable
+from ..modeling.declarations import full_name
 from .number_model import ModelNumbers
 from .read_equations import read_expression
 
@@ -18,7 +19,7 @@ def variable_table(model: ModelNumbers, driven: set[int]) -> VariableTable:
     start: list[Start | None] = []
     unit: list[str] = []
     default: list[float | None] = []
-    is_input, is_port, fixed, nominal, bounds, owner, port, is_across = [], [], [], [], [], [], [], []
+    is_input, is_port, is_internal, fixed, nominal, bounds, owner, port, is_across = [], [], [], [], [], [], [], [], []
     n_ports = 0
     expressions: dict[sympy.Expr, tuple[SymbolicTemplate, list[str]]] = {}
     for k, component in enumerate(model.components):
@@ -29,9 +30,10 @@ def variable_table(model: ModelNumbers, driven: set[int]) -> VariableTable:
                 place |= {f"{p.name}.{name}": (n_ports, across) for name, _ in table}
             n_ports += 1
         for variable in component.variables.values():
-            names.append(f"{path}.{variable.name}")
+            names.append(full_name(path, variable.name))
             is_input.append(variable.kind == "input" and len(is_input) not in driven)
             is_port.append(variable.kind == "port")
+            is_internal.append(variable.kind == "start")
             fixed.append(variable.fixed)
             nominal.append(variable.nominal)
             bounds.append(variable.bounds)
@@ -62,7 +64,7 @@ def variable_table(model: ModelNumbers, driven: set[int]) -> VariableTable:
         np.array(owner, np.int64),
         np.array(port, np.int64),
         np.array(is_across, bool),
-        np.zeros(len(names), bool),
+        np.array(is_internal, bool),
     )
 
 

@@ -10,7 +10,7 @@ import sympy
 from ..errors import ModelError, nearest
 from .connections import Connection, Signal, resolve_ends
 from .construction import Construction
-from .declarations import Learned, Parameter, Variable
+from .declarations import START, Learned, Parameter, Variable, full_name
 from .environment import EqnEnv
 from .equations import residual_of
 from .functions import of_scalars
@@ -190,7 +190,7 @@ class Component(metaclass=Construction):
             raise ModelError(f"{what} may use parameters only; it uses '{wrong[0]}'")
 
     def _declare(self, name: str, kind: str, start=None, fixed=False, nominal=None, unit="", default=None, bounds=None):
-        where = f"'{self.name}.{name}'"
+        where = f"'{full_name(self.name, name)}'"
         if not isinstance(fixed, bool | np.bool_):
             raise ModelError(f"{where}: fixed is True or False; got {fixed!r}")
         if not isinstance(unit, str):
@@ -271,6 +271,35 @@ class Component(metaclass=Construction):
             self._declare(f"{name}[{k}]", "variable", s, fixed and s is not None, nominal, unit, bounds=bounds)
             for k, s in enumerate(starts)
         )
+
+    def start(self, derivative: Any, value: Any, fixed: bool = False) -> None:
+        """Says what a derivative is at the initial time: `self.start(der(x), 2.0)`.
+
+        **Arguments:**
+
+        - `derivative`: `der(x)`, `der(der(x))`, … of a variable of this component or of a child.
+        - `value`: a number or an expression in parameters.
+        - `fixed`: whether it must hold; otherwise it guides the search for a consistent initial point, where equations
+            have several solutions for the derivative, and where it is free.
+
+        **Raises:**
+
+        - `ModelError` if it is not the derivative of a variable, for a second start of the same derivative, and for a
+            value as in `variable`.
+        """
+        if not isinstance(derivative, VariableSymbol) or not derivative.order:
+            mend = "; for the variable itself, say start= where it is declared" if derivative in self._own() else ""
+            found = f"got {derivative}{mend}"
+            raise ModelError(f"component '{self.name}': start takes a derivative such as der(x); {found}")
+        name = f"{derivative}{START}"
+        if name in self.variables:
+            raise ModelError(f"component '{self.name}': {derivative} has a start already")
+        if self._sealed:
+            raise ModelError(f"component '{self.path}' is complete: say the start of {derivative} inside its __init__")
+        self.add_equations(sympy.Eq(self._declare(name, "start", value, fixed), derivative, evaluate=False))
+
+    def _own(self) -> list[VariableSymbol]:
+        return [VariableSymbol(name) for name in self.variables]
 
     def input(self, name: str, default: float | None = None, unit: str = "") -> VariableSymbol:
         """Declares an input: a function of time given to `simulate(inputs={"component.name": ...})`.

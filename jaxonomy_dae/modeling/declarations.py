@@ -8,6 +8,7 @@ import sympy
 from .interval import Interval
 from .symbols import TimeSymbol, VariableSymbol
 
+START = ":start"  # ends the name of what is declared by the start of a derivative
 Value: TypeAlias = float | int | sympy.Expr  # a number, or an expression in parameters
 
 
@@ -23,7 +24,8 @@ class Parameter:
 
 @dataclasses.dataclass(frozen=True)
 class Variable:
-    """A declared variable: `kind` is 'variable', 'input', 'output', 'learned' or 'port'."""
+    """A declared variable: `kind` is 'variable', 'input', 'output', 'learned', 'port', or 'start' for what equals a
+    derivative and has a start."""
 
     name: str
     kind: str
@@ -44,3 +46,9 @@ class Learned:
     inputs: tuple[VariableSymbol | TimeSymbol, ...]
     outputs: tuple[VariableSymbol, ...]
     noun: str = "network"  # or "function"
+
+
+def full_name(path: str, name: str) -> str:
+    """The name in the model of a variable that a component declares: `path.x`, `der(path.x)`."""
+    before, der, inner = name.removesuffix(START).rpartition("der(") if name.endswith(START) else ("", "", name)
+    return f"{before}{der}{path}.{inner}"

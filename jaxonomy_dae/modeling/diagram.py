@@ -22,6 +22,8 @@ class AcausalDiagram:
     """
 
     def __init__(self, name: str | None = None):
+        if name is not None and not isinstance(name, str):
+            raise ModelError(f"the name of a diagram is a text; got {_described(name)}")
         self.name = name
         self.components: dict[str, Component] = {}
         self.connections: list[Connection] = []
