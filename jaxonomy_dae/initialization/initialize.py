@@ -2,9 +2,10 @@
 
 The unknowns are the state array's entries, and parameters that are solved for. The rows are: hidden constraints,
 residuals of nonlinear blocks, values given by the caller, fixed starts, and the guesses that `initial_rows` keeps. The
-rows may be redundant, as long as they agree. A ladder of methods finds the point, kept out of differentiation; one last
-step carries the derivative, which by the implicit function theorem is exact. Without guesses it is a Gauss–Newton step
-of the rows; with guesses a Newton step of the conditions for the nearest point.
+rows may be redundant, as long as they agree. A ladder of methods finds the point, kept out of differentiation. Of two
+last steps the first carries first derivatives, which by the implicit function theorem are exact, and the second one
+second derivatives. Without guesses they are Gauss–Newton steps of the rows; with guesses Newton steps of the conditions
+for the nearest point.
 """
 
 from collections.abc import Callable, Mapping
@@ -153,12 +154,16 @@ def initialize(
             good,
         )
     else:
-        remaining = residual(found.x, parameters, inputs, target)
         # What rounding leaves of the gradient of a row that no unknown moves would count as much as other rows.
         settled = np.isin(np.arange(m), n_equations + np.array(rows.settled, int))
         jacobian = jnp.where(settled[:, None], 0, jacobian) * found.unit[None, :]
-        step = least_squares(jacobian, jnp.where(good, remaining, 0))
-        w = found.x - step * found.unit
+
+        def correct(w):
+            remaining = residual(w, parameters, inputs, target)
+            step = least_squares(jacobian, jnp.where(good, remaining, 0))
+            return w - step * found.unit, (remaining, step)
+
+        w, (remaining, step) = _twice(correct, found.x)
     limit = jnp.where(is_soft, jnp.inf, found.limit)
     if excused is not None:
         limit = limit + excused
@@ -192,10 +197,14 @@ def _large_point(
     state = near.x, near.limit, near.method, near.evaluations, ~near.holds
     x, limit, method, evaluations, _ = frozen(jax.lax.while_loop(lambda state: state[-1], climb, state))
     good = method < FAILED
-    remaining = residual(x, moving)
     values = frozen(sparse_jacobian(function, sparse.pattern)(x))
-    step = solve_whole(sparse.square, values[sparse.inside], remaining[sparse.core], checked=False)
-    w = jnp.where(good, x - step, x)
+
+    def correct(w):
+        remaining = residual(w, moving)
+        step = solve_whole(sparse.square, values[sparse.inside], remaining[sparse.core], checked=False)
+        return jnp.where(good, w - step, w), remaining
+
+    w, remaining = _twice(correct, x)
     if len(soft):
 
         def some_cannot():
@@ -252,8 +261,8 @@ def _nearest_point(
     residual: Callable[[Any, Any], Any], settings, moving, w, jacobian, unit, distances, hard, soft, good
 ) -> tuple[Any, Any]:
     """A differentiable point next to w, in units of the unknowns: min ½|S(w)|², S the soft rows, where the hard rows
-    H(w) = 0 hold. Its conditions are ∇½|S|² + ∇(λᵀH) = 0, H = 0; of two Newton steps the first sharpens the point, and
-    the second carries the derivative. Returns w and the rows there."""
+    H(w) = 0 hold. Its conditions are ∇½|S|² + ∇(λᵀH) = 0, H = 0; a Newton step sharpens the point, and two more carry
+    first and second derivatives. Returns w and the rows there."""
     largest = jnp.maximum(
         jnp.max(jnp.abs(jacobian * unit[None, :]), axis=1, initial=0.0), float(jnp.finfo(unit.dtype).tiny)
     )
@@ -278,11 +287,20 @@ def _nearest_point(
     z = jnp.concatenate([v, multiplier])
     matrix = jax.lax.stop_gradient(jax.jacfwd(lambda z: conditions(z, settings))(z))
     matrix = jnp.where(good, matrix, jnp.asarray(np.eye(len(z)), z.dtype))
-    for data in (settings, moving):
-        z = jax.lax.stop_gradient(z)
-        z = z - least_squares(matrix, jnp.where(good, conditions(z, data), 0))
+
+    def correct(z, data):
+        return z - least_squares(matrix, jnp.where(good, conditions(z, data), 0))
+
+    z = jax.lax.stop_gradient(correct(jax.lax.stop_gradient(z), settings))
+    z, _ = _twice(lambda z: (correct(z, moving), None), z)
     w = z[: len(w)] * unit
     return w, residual(jax.lax.stop_gradient(w), moving)
+
+
+def _twice(step: Callable[[Any], tuple[Any, Any]], w: Any) -> tuple[Any, Any]:
+    """w after two steps, in a loop, so that they are compiled once; and what the first one found on the way."""
+    w, seen = jax.lax.scan(lambda w, _: step(w), w, length=2)
+    return w, jax.tree.map(lambda a: a[0], seen)
 
 
 def _sizes(plan: SystemPlan, rows: InitialRows, given: list, parameters: Any, start: Any) -> Sizes:

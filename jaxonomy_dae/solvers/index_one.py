@@ -81,8 +81,8 @@ def consistent_point(
     """Newton's method onto the algebraic equations from y, M y left alone: the point, and the size of the last step.
 
     Steps are shortened until the next one, with the same matrix, is shorter (the natural monotonicity test, Deuflhard
-    2004, section 3.3): far from a solution of exponentials, whole steps wander. Differentiable by one exact step at the
-    end.
+    2004, section 3.3): far from a solution of exponentials, whole steps wander. Two steps at the end carry first and
+    second derivatives.
     """
     if not problem.mass.is_singular:
         return y, jnp.zeros((), y.dtype)
@@ -117,7 +117,10 @@ def consistent_point(
     begin = (y_still, jnp.asarray(jnp.inf, y.dtype), jnp.ones((), y.dtype), 0)
     found, size, *_ = jax.lax.while_loop(going, body, begin)
     found = y + frozen(found - y_still)
-    return found + consistent_shift(problem, linear, t, found, y), size
+    step = _newton_step(problem, linear, t, found, y)
+    for _ in range(2):
+        found = found + step(found)
+    return found, size
 
 
 def algebraic_part(problem: FlatProblem, v: Float[Array, " n"]) -> Float[Array, " n"]:
