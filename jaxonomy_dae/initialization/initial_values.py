@@ -27,6 +27,7 @@ def check_initial(system: AcausalSystem, initial: Any) -> None:
             raise ModelError(f"initial: '{name}' must be real; got {jnp.result_type(value)}")
         if not isinstance(value, Tracer) and not np.isfinite(np.asarray(value, float)):
             raise ModelError(f"initial: '{name}' must be finite; got {value}")
-        if system.plan.resolve([name])[0][0] < 0 and (isinstance(value, Tracer) or float(value) != 0.0):
-            found = "a value that is traced" if isinstance(value, Tracer) else f"{float(value):g}"
+        is_zero = system.plan.resolve([name])[0][0] < 0
+        if is_zero and not isinstance(value, Tracer) and float(value) != 0.0:
+            found = f"{float(value):g}"
             raise ModelError(f"initial: '{name}' is identically zero in this model; got {found}. Leave it out")

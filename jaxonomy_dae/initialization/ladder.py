@@ -101,11 +101,11 @@ def find_root(
     - `typical`: sizes of the unknowns where nothing is known, as powers of two: the search is in units of these.
     """
     if typical is None or (typical == 1.0).all():
-        return _climb(function, m, start, sizes, core, soft, bounds)
+        return _climb(function, m, start, sizes, core, soft, bounds, in_units=False)
     unit = jnp.asarray(typical, start.dtype)
     measured = sizes._replace(nominal=sizes.nominal / unit, known=sizes.known / unit)
     limits = None if bounds is None else bounds / typical[:, None]
-    found = _climb(lambda y: function(y * unit), m, start / unit, measured, core, soft, limits)
+    found = _climb(lambda y: function(y * unit), m, start / unit, measured, core, soft, limits, in_units=True)
     return found._replace(x=found.x * unit, jacobian=found.jacobian / unit, unit=found.unit * unit)
 
 
@@ -117,7 +117,9 @@ def _climb(
     core: np.ndarray | None,
     soft: Bool[np.ndarray, " m"] | None,
     bounds: Float[np.ndarray, "n 2"] | None,
+    in_units: bool,
 ) -> Found:
+    """`in_units`: whether unknowns are measured in typical sizes; otherwise slopes at the start show their sizes."""
     dtype, n = start.dtype, start.shape[0]
     eps = float(jnp.finfo(dtype).eps)
     close, enough = min(1e3 * eps, 0.1 * tolerance(dtype)), tolerance(dtype)
@@ -308,7 +310,7 @@ def _climb(
                 above == _MARQUARDT, bounded(beginning + 1e-3 * unit * generic * (1 - along), restart), restart
             )
         climb_begins = AGAIN + 2 - climb
-        elsewhere = unit * generic * where(climb > 1, jnp.asarray(alternating, dtype), one)
+        elsewhere = generic * (one if in_units else unit) * where(climb > 1, jnp.asarray(alternating, dtype), one)
         restart = where(climbs_again, bounded(where(unguessed, elsewhere, origin), origin), restart)
         above = where(climbs_again, first_rung, above)
         scalars = packed(

@@ -136,7 +136,6 @@ def _declared(plan: SystemPlan, names: tuple[str, ...]) -> tuple[list[Row], list
     overrides = [
         Row(name, int(q), float(s), None, k)
         for k, (name, q, s) in enumerate(zip(names, *plan.resolve(names), strict=True))
-        if q != ZERO
     ]
     overridden = {r.quantity for r in overrides}
     number = start_values(variables.start, np.zeros(0))

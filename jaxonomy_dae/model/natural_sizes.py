@@ -25,7 +25,8 @@ def natural_sizes(
     parameters: Float[np.ndarray, " p"],
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " p"]]:
     """Sizes s with |∂F_e/∂x_q|·s_q near 1 in units of each equation, in the least-squares sense of logarithms (Curtis &
-    Reid 1972, where the entries depend on the sizes as well).
+    Reid 1972, where the entries depend on the sizes as well). What an equation has without quantities, such as the
+    pressure of a reservoir, is a term like others where its parameters are known.
 
     **Arguments:**
 
@@ -35,25 +36,44 @@ def natural_sizes(
     n_parameters = len(parameters)
     known = np.append(np.abs(size) != 1.0, parameters != 0.0)
     quantity, parameter = size.copy(), np.where(parameters == 0.0, 1.0, parameters)
+    constant = _constants(groups, parameters)
     for _ in range(ROUNDS):
         table = _logarithms(groups, quantity, parameter)
         if table is None:
             break
         logarithm, row, column, by_quantity, by_parameter = table
         k, n = np.arange(len(row)), len(quantity)
-        shape = (len(k), n + n_parameters + n_equations)
-        places = np.concatenate([k, k, by_quantity[0], by_parameter[0]])
-        unknowns = np.concatenate([n + n_parameters + row, column, by_quantity[1], n + by_parameter[1]])
-        powers = np.concatenate([np.ones(2 * len(k)), by_quantity[2], by_parameter[2]])
+        alone = len(k) + np.arange(len(constant[0]))
+        shape = (len(k) + len(alone), n + n_parameters + n_equations)
+        places = np.concatenate([alone, k, k, by_quantity[0], by_parameter[0]])
+        rows = n + n_parameters + np.concatenate([constant[1], row])
+        unknowns = np.concatenate([rows, column, by_quantity[1], n + by_parameter[1]])
+        powers = np.concatenate([np.ones(len(alone) + 2 * len(k)), by_quantity[2], by_parameter[2]])
         powers[(unknowns < len(known)) & known[np.minimum(unknowns, len(known) - 1)]] = 0.0
         matrix = sp.csr_array((powers, (places, unknowns)), shape=shape)
         linalg: Any = scipy.sparse.linalg
-        found = linalg.lsmr(matrix, -logarithm, damp=DAMPING, atol=1e-4, btol=1e-4, maxiter=20 * n)[0]
+        sizes = np.append(logarithm, constant[0])
+        found = linalg.lsmr(matrix, -sizes, damp=DAMPING, atol=1e-4, btol=1e-4, maxiter=20 * n)[0]
         moved = 10.0 ** np.clip(found[: n + n_parameters], -60, 60)
         quantity, parameter = quantity * moved[:n], parameter * moved[n:]
         if np.abs(found[: n + n_parameters]).max(initial=0.0) < 0.3:
             break
     return quantity, parameter
+
+
+def _constants(groups: Sequence[ExtendedGroup], parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """log₁₀ |F_e| where all quantities are zero, and the equations e; none that reads a parameter without a value."""
+    values, equations = [np.zeros(0)], [np.zeros(0, np.int64)]
+    nothing = np.zeros(1 + max((int(g.quantity.max(initial=-1)) for g in groups), default=0))
+    for group in groups:
+        if group.template.opaque is not None:
+            continue
+        with np.errstate(all="ignore"):
+            there = np.abs(group_values(group, nothing, parameters, 0.5, Networks(()), partials=False))
+        used = (there > 0) & np.isfinite(there) & (parameters[group.parameter] != 0.0).all(axis=1)
+        values.append(np.log10(there[used]))
+        equations.append(group.equation[used])
+    return np.concatenate(values), np.concatenate(equations)
 
 
 def _logarithms(groups: Sequence[ExtendedGroup], quantity: np.ndarray, parameter: np.ndarray):
