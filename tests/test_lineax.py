@@ -8,11 +8,12 @@ import lineax as lx
 import numpy as np
 import pytest
 from jax.test_util import check_grads
+from sympy import Eq
 from testset.heat import heat_exact, sundials_heat2d
 
-from jaxonomy_dae import ModelError
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, ModelError, SimulationError, der, simulate
 from jaxonomy_dae.linear import KLU, Dense, SparseLinearOperator, SparsePattern, WrittenOut
-from jaxonomy_dae.linear.choice import choose
+from jaxonomy_dae.linear.choice import check_linear_solver, choose
 from jaxonomy_dae.linear.least_squares import least_squares
 from jaxonomy_dae.solvers import BDF, DAETerm, Rodas5P, solve_dae
 
@@ -208,3 +209,80 @@ def test_rows_of_zeros_say_nothing():
     full = np.insert(matrix, [0, 4, 9], 0.0, axis=0), np.insert(right, [0, 4, 9], [1e-17, -1e-16, 1.0])
     found = least_squares(*(jnp.asarray(a) for a in full))
     np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+# --- blocks of compiled models -------------------------------------------------------------------------------------
+
+
+class Membrane(Component):
+    """A grid of m × m points: 5u + cubic·u³ − Σ neighbours = load, and one state that follows the middle."""
+
+    def __init__(self, ev, name, m, cubic):
+        super().__init__(ev, name)
+        load = self.parameter("load", 2.0)
+        x = self.variable("x", start=0.0, fixed=True)
+        u = np.array(self.vector("u", m * m)).reshape(m, m)
+        near = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if abs(i) + abs(j) == 1]
+        for i, j in np.ndindex(m, m):
+            sides = [u[i + a, j + b] for a, b in near if 0 <= i + a < m and 0 <= j + b < m]
+            self.add_equations(Eq(5 * u[i, j] + cubic * u[i, j] ** 3 - sum(sides), load * (1 + i + 2 * j)))
+        self.add_equations(Eq(der(x), u[m // 2, m // 2] - x))
+
+
+def membrane(m=5, cubic=0, **options):
+    ev = EqnEnv()
+    diagram = AcausalDiagram()
+    diagram.add(Membrane(ev, "m", m, cubic))
+    return AcausalCompiler(ev, diagram, **options)()
+
+
+def membrane_by_hand(m, cubic):
+    """The displacements, shape (m²,), by Newton's method."""
+    line = np.eye(m, k=1) + np.eye(m, k=-1)
+    matrix = 5 * np.eye(m * m) - np.kron(line, np.eye(m)) - np.kron(np.eye(m), line)
+    right = 2.0 * np.array([1.0 + i + 2 * j for i, j in np.ndindex(m, m)])
+    u = np.zeros(m * m)
+    for _ in range(50):
+        u = u - np.linalg.solve(matrix + 3 * cubic * np.diag(u**2), matrix @ u + cubic * u**3 - right)
+    return u
+
+
+GIVEN = {
+    "gmres": lx.GMRES(rtol=1e-8, atol=1e-8, restart=40, max_steps=200),
+    "rough": lx.GMRES(rtol=1e-3, atol=1e-3, restart=40, max_steps=200),  # corrected by solving again
+    "lu": lx.LU(),
+    "dense": Dense(),
+    "klu": KLU(),
+}
+
+
+@pytest.mark.parametrize("name", ["rough", *(pytest.param(k, marks=pytest.mark.slow) for k in GIVEN if k != "rough")])
+def test_a_given_solver_for_blocks(name):
+    if name == "klu":
+        pytest.importorskip("klujax")
+    system = membrane(linear_solver=GIVEN[name])
+    exact = membrane_by_hand(5, 0)
+
+    def middle(load):
+        return system.with_parameters({"m.load": load}).observe([f"m.u[{k}]" for k in (11, 12, 13)], 0.0, jnp.zeros(1))
+
+    # Equations hold to rounding, and the condition number is 9.
+    np.testing.assert_allclose(jax.jit(middle)(2.0), exact[11:14], rtol=1e-13)
+    np.testing.assert_allclose(jax.jit(jax.jacrev(middle))(2.0), exact[11:14] / 2, rtol=1e-13)
+
+
+@pytest.mark.slow
+def test_a_given_solver_for_nonlinear_blocks():
+    system = membrane(m=8, cubic=0.5, linear_solver=GIVEN["gmres"])
+    assert len(system.carried) == 64
+    found = system.observe([f"m.u[{k}]" for k in range(64)], 0.0, system.initialize())
+    np.testing.assert_allclose(found, membrane_by_hand(8, 0.5), rtol=1e-12)  # the condition number is 20
+
+
+def test_a_given_solver_that_fails_is_named():
+    system = membrane(linear_solver=lx.GMRES(rtol=1e-8, atol=1e-8, restart=1, max_steps=1))
+    with pytest.raises(SimulationError, match="was not solved .*, though it is not singular: linear_solver=GMRES"):
+        simulate(system, 1.0)
+    for wrong, text in ((lx.GMRES, "the class GMRES: write GMRES"), ("gmres", "got 'gmres'")):
+        with pytest.raises(ModelError, match=text):
+            check_linear_solver(wrong)

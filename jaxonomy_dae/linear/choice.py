@@ -30,10 +30,7 @@ def choose(given: Any, n: int, pattern: Any, mass: Mass) -> LinearAlgebra:
         if pattern is None or n < SPARSE_FROM or pattern.density > SPARSE_DENSITY:
             return Dense()
         return Dense() if n <= DENSE_UPTO and not available() else Sparse(pattern)
-    if not isinstance(given, lx.AbstractLinearSolver):
-        raise ModelError(
-            f"linear_solver must be a Lineax solver such as lineax.GMRES(rtol, atol); got {type(given).__name__}"
-        )
+    check_linear_solver(given)
     if isinstance(given, direct.KLU):
         if pattern is None:
             raise ModelError("KLU needs to know where entries lie: DAETerm(..., pattern=SparsePattern(rows, cols, n))")
@@ -41,3 +38,10 @@ def choose(given: Any, n: int, pattern: Any, mass: Mass) -> LinearAlgebra:
     if isinstance(given, direct.Dense):
         return Dense()
     return ByLineax(Sparse(pattern) if pattern is not None and mass.is_diagonal else Dense(), given)
+
+
+def check_linear_solver(given: Any):
+    """**Raises:** `ModelError` for what is not a Lineax solver."""
+    if not isinstance(given, lx.AbstractLinearSolver):
+        what = f"the class {given.__name__}: write {given.__name__}(...)" if isinstance(given, type) else repr(given)
+        raise ModelError(f"linear_solver must be a Lineax solver such as lineax.GMRES(rtol, atol); got {what}")

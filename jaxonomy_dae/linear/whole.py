@@ -13,23 +13,32 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float
 
 from ..errors import ModelError
+from .operator import SparseLinearOperator
 from .sparse import DENSE, SparsePattern, available, check_solvable, is_double, solve_sparse
 
 LAPACK = 48  # unknowns up to which dense elimination is faster than KLU, which takes 40 µs to begin
 GOOD = 2.0**10  # residual in units of eps times the terms of an equation, above which a solution of KLU is refined
 REFINEMENTS = 2  # of a solution by KLU, at most
+MORE_REFINEMENTS = 10  # the same, of a solution by an iterative method
 TOLERATED = 2.0**20  # the same, above which a solution is refused: 2e-10 in double precision
 TOLERATED_NORM = 2.0**8  # in units of eps times the largest unknown of the scaled system, for each √n
 
 
 def solve_whole(
-    pattern: SparsePattern, values: Float[Array, " nnz"], right: Float[Array, " n"], *, checked: bool = True
+    pattern: SparsePattern,
+    values: Float[Array, " nnz"],
+    right: Float[Array, " n"],
+    *,
+    checked: bool = True,
+    solver: lx.AbstractLinearSolver | None = None,
 ) -> Float[Array, " n"]:
-    """x with A·x = b; not-a-number where an equation does not hold to rounding, unless it is not to be `checked`.
+    """x with A·x = b; not-a-number where an equation does not hold to rounding, unless it is not to be `checked`. A
+    `solver` of Lineax' takes the place of LAPACK and KLU.
 
     Differentiable with respect to `values` and `right` by the implicit function theorem.
 
@@ -39,7 +48,7 @@ def solve_whole(
         pattern, inverse = pattern.coalesced
         values = jnp.zeros(len(pattern), values.dtype).at[inverse].add(values)
     n = pattern.n
-    dense = n <= LAPACK or not (is_double() and available())
+    dense = solver is None and (n <= LAPACK or not (is_double() and available()))
     if dense:
         check_solvable(n)
         if n > DENSE:
@@ -50,7 +59,10 @@ def solve_whole(
     rows, columns = _scales(pattern, jax.lax.stop_gradient(values))
     scaled = values * rows[pattern.rows] * columns[pattern.cols]
     frozen = jax.lax.stop_gradient(scaled)
-    solve = _lapack(pattern, frozen) if dense else _klu(pattern, frozen)
+    if solver is not None:
+        solve, most = _by_lineax(pattern, frozen, solver), MORE_REFINEMENTS
+    else:
+        solve, most = _lapack(pattern, frozen) if dense else _klu(pattern, frozen), REFINEMENTS
 
     def solution(b: Any, transpose: bool) -> Any:
         eps, tiny = float(jnp.finfo(b.dtype).eps), float(jnp.finfo(b.dtype).tiny)
@@ -72,7 +84,7 @@ def solve_whole(
             x = x + solve(missing, transpose)
         else:  # a loop, not a branch: what it closes over must stay out of batches
             begin = x, missing, jnp.any(jnp.abs(missing) > GOOD * eps * size), 0
-            x, *_ = jax.lax.while_loop(lambda carry: carry[2] & (carry[3] < REFINEMENTS), refined, begin)
+            x, *_ = jax.lax.while_loop(lambda carry: carry[2] & (carry[3] < most), refined, begin)
         if not checked:
             return x
         missing, size = residual(x)
@@ -125,3 +137,16 @@ def _lapack(pattern: SparsePattern, values: Any) -> Any:
 
 def _klu(pattern: SparsePattern, values: Any) -> Any:
     return lambda b, transpose: solve_sparse(pattern, values, b, transpose, nudged=True)
+
+
+def _by_lineax(pattern: SparsePattern, values: Any, solver: lx.AbstractLinearSolver) -> Any:
+    operator = SparseLinearOperator(values, pattern)
+
+    def solve(b: Any, transpose: bool) -> Any:
+        # In units of its size, for tolerances are absolute, too. Whether it succeeded, the residual tells.
+        size = jnp.max(jnp.abs(b))
+        unit = jnp.where(size > 0, size, 1)
+        found = lx.linear_solve(operator.T if transpose else operator, b / unit, solver, throw=False).value
+        return jnp.where(jnp.all(jnp.isfinite(found)), unit * found, 0)
+
+    return solve

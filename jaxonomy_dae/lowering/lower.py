@@ -4,6 +4,7 @@ import hashlib
 from collections.abc import Sequence
 from typing import Any
 
+import lineax as lx
 import numpy as np
 
 from ..compiler.pipeline import CompiledModel
@@ -32,8 +33,8 @@ def _needed(steps: Sequence[AnyStep], targets: np.ndarray, n: int) -> tuple[AnyS
     return tuple(reversed(kept))
 
 
-def lower(model: CompiledModel) -> SystemPlan:
-    """Builds the plan."""
+def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = None) -> SystemPlan:
+    """Builds the plan; `linear_solver` is for blocks that stay whole."""
     flat, variable_map, groups, extended = model.flat, model.variables, model.groups, model.extended
     selection, blocks, mode, quantity_name = model.selection, model.blocks, model.mode, list(model.quantity_name)
     state_order = selection.states  # as they lie in the state array
@@ -41,14 +42,14 @@ def lower(model: CompiledModel) -> SystemPlan:
     n = quantities.n
     steps = build_schedule(extended, blocks, EntrySizes(flat, variable_map, extended))
     for step in steps:
-        if isinstance(step, SparseStep):
+        if isinstance(step, SparseStep) and linear_solver is None:
             check_solvable(step.n)
     carried = [quantities for step in steps for quantities in step.guessed]
     carried = np.concatenate(carried) if carried else np.zeros(0, np.int64)
     input_quantities = np.arange(quantities.n_unknown, n)
 
     def program(chosen: Sequence[AnyStep]) -> Program:
-        return plan(chosen, state_order, input_quantities, n, carried)
+        return plan(chosen, state_order, input_quantities, n, carried, linear_solver)
 
     nonlinear = [s for s in steps if s.carried]
     residual_needs = np.concatenate([np.zeros(0, np.int64), *(s.needs() for s in nonlinear)])
@@ -96,7 +97,7 @@ def lower(model: CompiledModel) -> SystemPlan:
     opaque |= {r.opaque.index: r.opaque for r in flat.rows}
     functions = tuple(opaque[k].function if k in opaque else None for k in range(len(flat.networks)))
     return SystemPlan(
-        _digest(flat, mode, selection, state_order, extended, steps),
+        _digest(flat, mode, selection, state_order, extended, steps, linear_solver),
         flat,
         model.alias,
         variable_map,
@@ -123,6 +124,7 @@ def lower(model: CompiledModel) -> SystemPlan:
         rows,
         tuple(flat.networks),
         functions,
+        linear_solver,
     )
 
 
@@ -194,6 +196,7 @@ def _digest(
     states: np.ndarray,
     extended: Extended,
     steps: Sequence[AnyStep],
+    linear_solver: Any,
 ) -> str:
     """A digest of all that determines the plan."""
     hasher = hashlib.sha256()
@@ -214,6 +217,8 @@ def _digest(
         feed(name)
     for row in flat.rows:
         feed(row.opaque.index, row.targets, row.inputs, sorted(row.opaque.time_positions))
+    if linear_solver is not None:
+        feed(repr(linear_solver))
     feed(states, selection.constraints, selection.dummies, extended.base, extended.level)
     for step in steps:
         # How a block is torn depends on the values of the parameters.

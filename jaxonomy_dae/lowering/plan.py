@@ -5,6 +5,7 @@ import functools
 from collections.abc import Sequence
 from typing import Any
 
+import lineax as lx
 import numpy as np
 
 from ..compiler.order_blocks import Blocks
@@ -84,9 +85,12 @@ class SystemPlan:
     rows: tuple[PlannedRow, ...]
     network_names: tuple[str, ...]
     functions: tuple[Any, ...]
+    linear_solver: lx.AbstractLinearSolver | None  # of blocks that stay whole
 
     def __eq__(self, other):
-        return isinstance(other, SystemPlan) and self.digest == other.digest and self.functions == other.functions
+        if not isinstance(other, SystemPlan) or self.digest != other.digest:
+            return False
+        return self.functions == other.functions and bool(self.linear_solver == other.linear_solver)
 
     def __hash__(self):
         return hash(self.digest)

@@ -8,6 +8,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
+import lineax as lx
 import numpy as np
 
 from ..linear.sparse import DENSE, SparsePattern
@@ -63,6 +64,7 @@ class PlannedSparse:
     entries: tuple[tuple[tuple[int, np.ndarray, Any], ...], ...]
     pattern: SparsePattern
     guess: Gather | None
+    linear_solver: lx.AbstractLinearSolver | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,9 +92,15 @@ class Program:
 
 
 def plan(
-    steps: Sequence[AnyStep], states: np.ndarray, inputs: np.ndarray, n_quantities: int, carried: np.ndarray
+    steps: Sequence[AnyStep],
+    states: np.ndarray,
+    inputs: np.ndarray,
+    n_quantities: int,
+    carried: np.ndarray,
+    linear_solver: lx.AbstractLinearSolver | None,
 ) -> Program:
-    """Plans the evaluation of `steps`; the state array holds `states`, then `carried`."""
+    """Plans the evaluation of `steps`; the state array holds `states`, then `carried`. `linear_solver` is for sparse
+    steps."""
     chunk = np.full(n_quantities, -2, np.int64)
     offset = np.zeros(n_quantities, np.int64)
     chunk[states], offset[states] = 0, np.arange(len(states))
@@ -109,7 +117,7 @@ def plan(
         elif isinstance(step, SparseStep):
             unknown = step.unknown
             chunk[unknown[0]], offset[unknown[0]] = next_chunk, np.arange(step.n)
-            planned.append(_plan_sparse(step, layout, place))
+            planned.append(_plan_sparse(step, layout, place, linear_solver))
         else:
             unknown = step.unknown
             equations = tuple(_plan_equation(e, layout) for e in step.equations)
@@ -186,7 +194,7 @@ def _plan_loop(loop: Loop, layout: Layout) -> PlannedLoop:
     )
 
 
-def _plan_sparse(step: SparseStep, layout: Layout, place: np.ndarray) -> PlannedSparse:
+def _plan_sparse(step: SparseStep, layout: Layout, place: np.ndarray, linear_solver: Any) -> PlannedSparse:
     """Plans a sparse step; `layout` has its unknowns already."""
     local = np.full(len(place) + 1, -1, np.int64)  # the last entry is the constant zero
     local[step.unknown[0]] = np.arange(step.n)
@@ -206,7 +214,7 @@ def _plan_sparse(step: SparseStep, layout: Layout, place: np.ndarray) -> Planned
         first += len(equation.equation)
     pattern = SparsePattern(np.concatenate(rows), np.concatenate(cols), step.n)
     guess = _from_state(place[step.unknown[0]]) if step.carried else None
-    return PlannedSparse(step, tuple(equations), tuple(entries), pattern, guess)
+    return PlannedSparse(step, tuple(equations), tuple(entries), pattern, guess, linear_solver)
 
 
 def _from_state(place: np.ndarray) -> Gather:

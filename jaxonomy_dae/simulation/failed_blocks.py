@@ -84,6 +84,12 @@ def _why(system: AcausalSystem, step: AnyStep, t: Any, x: Any, inputs: dict[str,
             return _singular(block, place)
     if not step.linear:
         return _no_root(system, step, x, f"has no solution {place}")
+    if isinstance(step, SparseStep) and plan.linear_solver is not None:
+        return (
+            f"The block of equations for {_some(names)} was not solved {place}, though it is not singular: "
+            f"linear_solver={plan.linear_solver} did not converge. Let it take more steps (of GMRES, a larger restart "
+            f"and max_steps), or compile without linear_solver.{_equations(system, step)}"
+        )
     return (
         f"The block of equations for {_some(names)} has no accurate solution {place}, though it is not singular: the "
         "order in which it is eliminated was chosen for the parameter values that the model was compiled with, and "

@@ -5,10 +5,12 @@ from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
+import lineax as lx
 
 from ..compiler.flatten import flatten
 from ..compiler.pipeline import compile_flat
 from ..errors import ModelError
+from ..linear.choice import check_linear_solver
 from ..lowering.lower import lower
 from ..modeling.diagram import AcausalDiagram
 from ..modeling.environment import EqnEnv
@@ -31,6 +33,10 @@ class AcausalCompiler:
         candidates and projects onto the hidden constraints; `"auto"` takes dummy derivatives where the constraints'
         Jacobian is constant, projection elsewhere.
     - `prefer_states`: names of variables that should be states, the most important first.
+    - `linear_solver`: a Lineax solver, such as `lineax.GMRES(rtol=1e-8, atol=1e-8)`, for large blocks of simultaneous
+        equations, which is given a `SparseLinearOperator` with rows and columns scaled. What it leaves is corrected by
+        solving again until every equation holds to rounding, or is not-a-number. By default LAPACK up to 48 equations,
+        then KLU.
 
     **Raises** (when called):
 
@@ -47,6 +53,7 @@ class AcausalCompiler:
         *,
         state_selection: Mode = "auto",
         prefer_states: Sequence[str] = (),
+        linear_solver: lx.AbstractLinearSolver | None = None,
     ):
         if not isinstance(ev, EqnEnv) or not isinstance(diagram, AcausalDiagram):
             raise ModelError("AcausalCompiler(ev, diagram) needs an EqnEnv and an AcausalDiagram")
@@ -60,10 +67,13 @@ class AcausalCompiler:
             raise ModelError(f"state_selection is 'auto', 'dummy_derivatives' or 'projection'; got {state_selection!r}")
         if isinstance(prefer_states, str):
             raise ModelError(f"prefer_states is a list of names; write prefer_states=[{prefer_states!r}]")
+        if linear_solver is not None:
+            check_linear_solver(linear_solver)
         self.ev = ev
         self.diagram = diagram
         self.state_selection = state_selection
         self.prefer_states = tuple(prefer_states)
+        self.linear_solver = linear_solver
         self._report: SystemReport | None = None
 
     @property
@@ -75,7 +85,7 @@ class AcausalCompiler:
 
     def __call__(self) -> AcausalSystem:
         flat = flatten(self.diagram)
-        plan = lower(compile_flat(flat, self.state_selection, self.prefer_states))
+        plan = lower(compile_flat(flat, self.state_selection, self.prefer_states), self.linear_solver)
         self._report = SystemReport(plan)
         declared = flat.parameters
         table = ParameterNames(
