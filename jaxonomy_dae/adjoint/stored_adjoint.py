@@ -16,13 +16,14 @@ from .recorded_loop import solve
 from .reverse_step import state_saves
 
 LARGEST_RECORD = 2**25  # bytes; above, storing steps is no longer cheap
+ROOMY_RECORD = 2**20  # bytes of a record that may have more rows than are needed
 
 
 class StoredAdjoint(diffrax.AbstractAdjoint):
     """Differentiates the numerical solution itself, step by step backwards, from a record of the accepted steps.
 
     Gradients are those of `diffrax.RecursiveCheckpointAdjoint`, to rounding, at a small multiple of the cost of the
-    solve. What a step started from is recorded during the solve, in a table of a few dozen rows. Where a solve takes
+    solve. What a step started from is recorded during the solve, in a table of 64 to 256 rows. Where a solve takes
     more steps than rows, it is run once more in pieces, from points kept on the way (checkpointing with two levels,
     Griewank & Walther 2008, Evaluating Derivatives, chapter 12). Memory hardly grows with `max_steps`, and
     without differentiation nothing is recorded.
@@ -49,11 +50,11 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
             args=args, terms=terms, solver=solver, stepsize_controller=stepsize_controller, event=event, saveat=saveat,
             t0=t0, t1=t1, dt0=dt0, max_steps=max_steps, init_state=init_state, progress_meter=progress_meter,
         )  # fmt: skip
-        chunk, points = _table(max_steps)
         size = sum(
             leaf.size * leaf.dtype.itemsize
             for leaf in jax.tree.leaves(_arrays((init_state.y, init_state.solver_state)))
         )
+        chunk, points = _table(max_steps, size)
         if event is not None or saveat.dense or is_sde(terms) or size * (chunk + points) > LARGEST_RECORD:
             passed = dict(passed_solver_state=passed_solver_state, passed_controller_state=passed_controller_state)
             return diffrax.RecursiveCheckpointAdjoint().loop(**given, throw=throw, **passed)
@@ -116,9 +117,12 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
         return final_state, stats
 
 
-def _table(max_steps: int | None) -> tuple[int, int]:
-    """(rows of the record, points kept): with steps for eight times their product, pieces are run again 4.5 times."""
-    chunk = 64 if max_steps is None else max(64, math.isqrt(max_steps // 4))
+def _table(max_steps: int | None, size: int) -> tuple[int, int]:
+    """(rows of the record, points kept) for states of `size` bytes: with steps for eight times their product, pieces
+    are run again 4.5 times. Small states have more rows, so that most solves need no second run."""
+    chunk = min(max(ROOMY_RECORD // max(size, 1), 64), 256)
+    if max_steps is not None:
+        chunk = max(chunk, math.isqrt(max_steps // 4))
     return chunk, chunk // 2 // 2 * 2
 
 

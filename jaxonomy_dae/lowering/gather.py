@@ -14,6 +14,16 @@ import numpy as np
 Chunk = Any  # an array of shape (n,), a scalar, or a tuple of scalars
 
 
+FEW = 256  # entries that are read as scalars together
+
+
+def entries(array: Any) -> list[Any]:
+    """The entries of an array of shape (n,), as scalars. Backwards, their cotangents are joined; those of entries read
+    one by one would be padded and summed, and XLA may compute each anew for every place of the sum."""
+    n = array.shape[0]
+    return [jnp.reshape(v, ()) for v in jax.lax.split(array, (1,) * n)] if n else []
+
+
 def take(array: Any, index: np.ndarray) -> Any:
     """array[index] for a static index, as a slice where the index is an arithmetic progression."""
     n = len(index)

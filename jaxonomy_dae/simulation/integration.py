@@ -111,7 +111,7 @@ run_compiled = eqx.filter_jit(run)
 def _prepared(system: AcausalSystem, solver: Any, implicit: bool, watch: Watch | None, atol: Any) -> Any:
     """The solver with what the system fills in: projections, what to watch."""
     if isinstance(solver, Tsit5) and watch is not None:
-        solver = Tsit5(watch=watch)
+        solver = Tsit5(looped=solver.looped, watch=watch)
     # A minimal set of states may become a singular choice on the way.
     guard = ChoiceGuard(system.dummy_determinants, atol) if system.plan.dummy_blocks else None
     if system.is_constrained and not implicit:

@@ -57,12 +57,22 @@ def first_step(system: AcausalSystem, t0: Any, t1: Any, x0: Any, inputs: Any, or
     def size(v):
         return jnp.sqrt(jnp.mean((v / scale) ** 2))
 
-    f0 = system.vector_field(t0, x0, inputs)
-    d0, d1 = size(x0), size(f0)
     tiny = 1e-5
-    h0 = jnp.where((d0 < tiny) | (d1 < tiny), 1e-6, 0.01 * d0 / jnp.maximum(d1, tiny))
-    h0 = jnp.minimum(h0, t1 - t0)
-    d2 = size(system.vector_field(t0 + h0, x0 + h0 * f0, inputs) - f0) / h0
+
+    def probe(f0):
+        d0, d1 = size(x0), size(f0)
+        h0 = jnp.where((d0 < tiny) | (d1 < tiny), 1e-6, 0.01 * d0 / jnp.maximum(d1, tiny))
+        return jnp.minimum(h0, t1 - t0)
+
+    def slope(point, _):
+        t, x = point
+        f = system.vector_field(t, x, inputs)
+        h0 = probe(f)
+        return (t0 + h0, x0 + h0 * f), f
+
+    _, (f0, f1) = jax.lax.scan(slope, (t0, x0), length=2)  # a loop: the field is compiled once
+    h0, d1 = probe(f0), size(f0)
+    d2 = size(f1 - f0) / h0
     largest = jnp.maximum(d1, d2)
     power = 1.0 / ((order or 1) + 1)
     h1 = jnp.where(largest <= 1e-15, jnp.maximum(1e-6, h0 * 1e-3), (0.01 / jnp.maximum(largest, 1e-15)) ** power)

@@ -1,6 +1,7 @@
 """Rodas5P, a stiffly accurate Rosenbrock method for stiff and differential-algebraic equations."""
 
-from typing import Any, ClassVar
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -12,13 +13,14 @@ from jaxtyping import Array, Float
 
 from ..linear.choice import choose
 from .dae_term import FlatProblem
+from .field_size import is_large
 from .index_one import consistent_point, consistent_slope
 
 # Steinebach (2023), "Construction of Rosenbrock–Wanner method Rodas5P and numerical benchmarks within the Julia
 # Differential Equations package", BIT Numerical Mathematics 63:27, in the form without products by the Jacobian
 # (Hairer & Wanner 1996, Solving Ordinary Differential Equations II, IV.7, eq. 7.25).
 GAMMA = 0.21193756319429014
-A = np.zeros((6, 5))
+A = np.zeros((8, 8))
 A[1, :1] = 3.0
 A[2, :2] = 2.849394379747939, 0.45842242204463923
 A[3, :3] = -6.954028509809101, 2.489845061869568, -10.358996098473584
@@ -26,7 +28,9 @@ A[4, :4] = 2.8029986275628964, 0.5072464736228206, -0.3988312541770524, -0.04721
 A[5, :5] = (
     -7.502846399306121, 2.561846144803919, -11.627539656261098, -0.18268767659942256, 0.030198172008377946,
 )  # fmt: skip
-C = np.zeros((8, 7))
+A[6], A[7] = A[5], A[5]
+A[6, 5] = A[7, 5] = A[7, 6] = 1.0
+C = np.zeros((8, 8))
 C[1, :1] = -14.155112264123755
 C[2, :2] = -17.97296035885952, -2.859693295451294
 C[3, :3] = 147.12150275711716, -1.41221402718213, 71.68940251302358
@@ -57,6 +61,29 @@ H = np.array(
 DEFECT_AT = 0.4  # the part of a step at which dense output is compared with the equations
 
 
+class Row(NamedTuple):
+    """A stage solves (M/(γh) − J) k = F(t + node·h, y + Σ a·k) + M Σ c·k / h + d·h·∂F/∂t, k the stages before it."""
+
+    a: Any
+    c: Any
+    d: Any
+    node: Any
+    moves: bool = True  # whether d is not zero
+
+
+def _rows() -> tuple[Row, ...]:
+    """The stages after the first, and the defect of the dense output, which has the form of a stage."""
+    last = np.append(A[7, :7], 1.0)  # y1 = y + Σ last·k
+    u = DEFECT_AT
+    value = u * last + u * (1 - u) * (H[0] + u * (H[1] + u * H[2]))
+    rate = last + (1 - 2 * u) * H[0] + (2 * u - 3 * u**2) * H[1] + (3 * u**2 - 4 * u**3) * H[2]
+    stages = [Row(A[i], C[i], float(D[i]), float(NODES[i]), bool(D[i])) for i in range(1, 8)]
+    return (*stages, Row(value, -rate, 0.0, u, False))
+
+
+ROWS = _rows()
+
+
 class Rodas5PInterpolation(diffrax.AbstractLocalInterpolation):
     """The method's own dense output, of order 4 (Steinebach 2023, eq. 11)."""
 
@@ -80,13 +107,6 @@ class Rodas5PInterpolation(diffrax.AbstractLocalInterpolation):
         return jax.tree.map(one, self.y0, self.y1, self.k)
 
 
-def _inside(u: float, y0: Any, y1: Any, k: Any) -> tuple[Any, Any]:
-    """Dense output at a part u of the step, and its derivative by u."""
-    value = (1 - u) * y0 + u * (y1 + (1 - u) * (k[0] + u * (k[1] + u * k[2])))
-    slope = y1 - y0 + (1 - 2 * u) * k[0] + (2 * u - 3 * u**2) * k[1] + (3 * u**2 - 4 * u**3) * k[2]
-    return value, slope
-
-
 class Rodas5P(diffrax.AbstractAdaptiveSolver):
     """Rosenbrock method of order 5(4) for M dy/dt = F(t, y), index 1, and for stiff ordinary equations.
 
@@ -104,12 +124,15 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
         then be so long that the polynomial between them is not. `simulate` and `solve_dae` ask for it where times to
         save are given; algebraic unknowns they solve for again at these times.
 
+    - `looped`: whether to loop over the stages; None decides by the size of F.
+
     Takes a `DAETerm` or a `diffrax.ODETerm`. Explicit time dependence is differentiated: F must be differentiable in t
     between the jumps that the step-size controller knows of.
     """
 
     linear_solver: lx.AbstractLinearSolver | None = None
     dense_errors: bool = eqx.field(static=True, default=False)
+    looped: bool | None = eqx.field(static=True, default=None)
 
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar = Rodas5PInterpolation
@@ -144,31 +167,50 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
         slope = jax.jvp(lambda t: problem.right(t, y), (t0,), (jnp.ones_like(t0),))[1]
         matrix = linear.combine(mass, inverse / GAMMA, jacobian)
         factor = linear.factor(matrix)
-        stages: list[Any] = []
-        point = y
-        for i in range(8):
-            if i:
-                point = y + _combine(A[i], stages) if i <= 5 else point + stages[-1]
-                right = problem.right(t0 + float(NODES[i]) * h_time, point)
-            b = right
-            if i:
-                b = b + mass.times(inverse * _combine(C[i], stages))
-            if D[i]:
-                b = b + (float(D[i]) * h) * slope
-            stages.append(linear.solve(factor, matrix, b))
-        y1 = point + stages[-1]
+
+        def stage(row: Row, stages: Any) -> Any:
+            right = problem.right(t0 + row.node * h_time, y + _combine(row.a, stages))
+            b = right + mass.times(inverse * _combine(row.c, stages))
+            return linear.solve(factor, matrix, b + (row.d * h) * slope if row.moves else b)
+
+        first = linear.solve(factor, matrix, right + (float(D[0]) * h) * slope)
+        rows = ROWS if self.dense_errors else ROWS[:-1]
+        looped = is_large(problem.right, t0, y) if self.looped is None else self.looped
+        stages = _in_a_loop(stage, rows, first) if looped else _written_out(stage, rows, first)
+        y1 = y + _combine(A[7], stages) + stages[7]
         k = jnp.stack([_combine(row, stages) for row in H])
-        error = stages[-1]
+        error = stages[7]
         if self.dense_errors:
-            value, rate = _inside(DEFECT_AT, y, y1, k)
-            defect = problem.right(t0 + DEFECT_AT * h_time, value) - mass.times(inverse * rate)
-            within = mass.differential_part(linear.apply(factor, None, jax.lax.stop_gradient(defect)))
+            within = mass.differential_part(jax.lax.stop_gradient(stages[8]))
             error = jnp.maximum(jnp.abs(error), jnp.abs(within))
         dense = dict(y0=problem.unravel(y), y1=problem.unravel(y1), k=jax.vmap(problem.unravel)(k))
         return problem.unravel(y1), problem.unravel(error), dense, None, diffrax.RESULTS.successful
 
 
-def _combine(coefficients: Float[np.ndarray, " k"], stages: list[Float[Array, " n"]]) -> Float[Array, " n"]:
+def _written_out(stage: Callable[[Row, Any], Any], rows: Sequence[Row], first: Float[Array, " n"]) -> list[Any]:
+    stages = [first]
+    for row in rows:
+        stages.append(stage(row, stages))
+    return stages
+
+
+def _in_a_loop(stage: Callable[[Row, Any], Any], rows: Sequence[Row], first: Float[Array, " n"]) -> Any:
+    """The same, shape (1 + rows, n)."""
+
+    def body(stages, given):
+        place, *row = given
+        return stages.at[place].set(stage(Row(*row), stages[:8])), None
+
+    tables = [np.array([getattr(row, name) for row in rows]) for name in ("a", "c", "d", "node")]
+    given = np.arange(1, len(rows) + 1), *(jnp.asarray(table, first.dtype) for table in tables)
+    empty = jnp.zeros((max(len(rows) + 1, 8), len(first)), first.dtype)
+    return jax.lax.scan(body, empty.at[0].set(first), given)[0]
+
+
+def _combine(coefficients: Any, stages: Any) -> Float[Array, " n"]:
+    """Σ coefficient·stage over a list or an array of stages."""
+    if not isinstance(stages, list):
+        return jnp.tensordot(jnp.asarray(coefficients, stages.dtype), stages[:8], 1)
     total: Any = None
     for c, stage in zip(coefficients, stages, strict=False):
         if c:

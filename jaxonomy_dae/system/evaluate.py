@@ -24,7 +24,7 @@ import numpy as np
 from ..linear.torn import solve_torn
 from ..linear.whole import solve_whole
 from ..linear.written_out import UNROLLED, solve, solve_dense
-from ..lowering.gather import Chunk, Gather, take, times
+from ..lowering.gather import FEW, Chunk, Gather, entries, take, times
 from ..lowering.program import PlannedEquation, PlannedLoop, PlannedSparse, PlannedStep, Program
 from ..model.evaluate_numpy import Networks
 from ..model.linear_template import scaled
@@ -50,6 +50,7 @@ class Evaluation:
     def __init__(self, state: Chunk, inputs: Chunk, parameters: Any, t: Any, networks: Networks):
         self.chunks: list[Chunk] = [state, inputs]
         self.parameters = parameters
+        self._scalars: list[Any] | None = None
         self.dtype = parameters.dtype
         self.t = t
         self.networks = networks
@@ -76,6 +77,14 @@ class Evaluation:
                 self.chunks.extend(self._step(planned, refine))
         return self
 
+    def parameter(self, k: int) -> Any:
+        """A parameter, a scalar."""
+        if self.parameters.shape[0] > FEW:
+            return self.parameters[k]
+        if self._scalars is None:
+            self._scalars = entries(self.parameters)
+        return self._scalars[k]
+
     def read(self, gather: Gather) -> Any:
         """Gathered values: a scalar, or an array."""
         return gather.read(self.chunks, self.dtype)
@@ -90,11 +99,11 @@ class Evaluation:
         equation = planned.equation
         n = equation.parameter.shape[0]
         if n == 1:
-            parameters = [self.parameters[int(k)] for k in equation.parameter[0]]
+            parameters = [self.parameter(int(k)) for k in equation.parameter[0]]
             coefficients: list[Any] = [float(c) for c in equation.coefficient[0]]
         else:
             parameters = [
-                self.parameters[int(column[0])] if (column == column[0]).all() else take(self.parameters, column)
+                self.parameter(int(column[0])) if (column == column[0]).all() else take(self.parameters, column)
                 for column in equation.parameter.T
             ]
             coefficients = [float(c[0]) if (c == c[0]).all() else c for c in equation.coefficient.T]
@@ -254,7 +263,8 @@ class Evaluation:
             for k, instances, factor in entries
         ]
         checked = planned.guess is None
-        return u - solve_whole(planned.pattern, jnp.concatenate(values), residual, checked=checked)
+        matrix = jnp.concatenate(values)
+        return u - solve_whole(planned.pattern, matrix, residual, checked=checked, solver=planned.linear_solver)
 
     def _whole_holds(self, planned: PlannedSparse, u: Any, tolerated: float) -> Any:
         """Whether all equations of large blocks hold."""

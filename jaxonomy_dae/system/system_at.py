@@ -15,10 +15,11 @@ from ..errors import ModelError
 from ..linear.sparse import SparsePattern, sparse_jacobian
 from ..linear.whole import solve_whole
 from ..linear.written_out import UNROLLED, solve, solve_dense
-from ..lowering.gather import Gather, take, times
+from ..lowering.gather import Gather, entries, take, times
 from ..lowering.plan import ConstraintGroup, PlannedRow, SystemPlan
 from ..lowering.program import Program
 from ..model.evaluate_numpy import Networks
+from ..solvers.field_size import is_large
 from .evaluate import Evaluation, Refinement, newton
 
 SCALARS = 32  # up to this many states, tracing is done on scalars
@@ -65,7 +66,7 @@ class SystemAt:
         """
         if jnp.shape(x) != (self.plan.n_state,):
             raise ModelError(f"a state of this system has shape ({self.plan.n_state},); got {jnp.shape(x)}")
-        return tuple(x[k] for k in range(x.shape[0])) if self.plan.n_state <= SCALARS else x
+        return tuple(entries(x)) if self.plan.n_state <= SCALARS else x
 
     @staticmethod
     def join(x: Any) -> Any:
@@ -156,7 +157,8 @@ class SystemAt:
 
         if plan.carried_pattern is not None:
             matrix = sparse_jacobian(of_z, plan.carried_pattern)(state[n:])
-            return jnp.concatenate([slopes, -solve_whole(plan.carried_pattern, matrix, value)])
+            rates = -solve_whole(plan.carried_pattern, matrix, value, solver=plan.linear_solver)
+            return jnp.concatenate([slopes, rates])
         return jnp.concatenate([slopes, -solve_dense(jax.jacfwd(of_z)(state[n:]), value)])
 
     def _carried(self, t: Any, state: Any) -> list[Any]:
@@ -231,7 +233,7 @@ class SystemAt:
         slots = [evaluation.read(g) for g in planned.slots]
         n = len(group)
         if n == 1:
-            parameters = [self.parameters[int(k)] for k in group.parameter[0]]
+            parameters = [evaluation.parameter(int(k)) for k in group.parameter[0]]
             coefficients: list[Any] = [float(c) for c in group.coefficient[0]]
         else:
             parameters = [take(self.parameters, column) for column in group.parameter.T]
@@ -249,8 +251,11 @@ class SystemAt:
         tearing variables of nonlinear blocks refined."""
         plan = self.plan
         state = self.split(x)
-        for _ in range(iterations if plan.n_constraints else 0):
-            state = self._least_norm_step(state)
+        if plan.n_constraints and iterations > 1 and is_large(self._least_norm_step, state):
+            state, _ = jax.lax.scan(lambda state, _: (self._least_norm_step(state), None), state, length=iterations)
+        else:
+            for _ in range(iterations if plan.n_constraints else 0):
+                state = self._least_norm_step(state)
         if len(plan.carried):
             state = self.refined(state, Refinement.ONCE if iterations == 1 else Refinement.ROOT)
         return self.join(state)
