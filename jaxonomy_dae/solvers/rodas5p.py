@@ -176,7 +176,7 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
         first = linear.solve(factor, matrix, right + (float(D[0]) * h) * slope)
         rows = ROWS if self.dense_errors else ROWS[:-1]
         looped = is_large(problem.right, t0, y) if self.looped is None else self.looped
-        stages = _in_a_loop(stage, rows, first) if looped else _written_out(stage, rows, first)
+        stages = _in_a_loop(stage, rows, first, h_time.dtype) if looped else _written_out(stage, rows, first)
         y1 = y + _combine(A[7], stages) + stages[7]
         k = jnp.stack([_combine(row, stages) for row in H])
         error = stages[7]
@@ -194,15 +194,18 @@ def _written_out(stage: Callable[[Row, Any], Any], rows: Sequence[Row], first: F
     return stages
 
 
-def _in_a_loop(stage: Callable[[Row, Any], Any], rows: Sequence[Row], first: Float[Array, " n"]) -> Any:
+def _in_a_loop(
+    stage: Callable[[Row, Any], Any], rows: Sequence[Row], first: Float[Array, " n"], time_dtype: Any
+) -> Any:
     """The same, shape (1 + rows, n)."""
 
     def body(stages, given):
         place, *row = given
         return stages.at[place].set(stage(Row(*row), stages[:8])), None
 
-    tables = [np.array([getattr(row, name) for row in rows]) for name in ("a", "c", "d", "node")]
-    given = np.arange(1, len(rows) + 1), *(jnp.asarray(table, first.dtype) for table in tables)
+    kinds = dict(a=first.dtype, c=first.dtype, d=first.dtype, node=time_dtype)
+    tables = (jnp.asarray([getattr(row, name) for row in rows], kind) for name, kind in kinds.items())
+    given = np.arange(1, len(rows) + 1), *tables
     empty = jnp.zeros((max(len(rows) + 1, 8), len(first)), first.dtype)
     return jax.lax.scan(body, empty.at[0].set(first), given)[0]
 

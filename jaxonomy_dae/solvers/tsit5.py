@@ -42,7 +42,7 @@ class Tsit5(diffrax.Tsit5):
         if made_jump is not False:
             slope = jax.lax.cond(made_jump, lambda _: terms.vf(t0, y0, args), lambda s: s, slope)
         first = terms.prod(slope, control)
-        looped = is_large(terms.vf, t0, y0, args) if self.looped is None else self.looped
+        looped = is_large(lambda t, y: terms.vf(t, y, args), t0, y0) if self.looped is None else self.looped
         stages = self._looped if looped else self._written_out
         before, y1, slope, k = stages(terms, t0, t1, y0, args, control, first)
         y_error = _combine(tableau.b_error, k)
@@ -77,7 +77,8 @@ class Tsit5(diffrax.Tsit5):
             slope = terms.vf(t0 + c * (t1 - t0), y, args)
             return (k.at[i].set(terms.prod(slope, control)), y, slope), None
 
-        given = jnp.asarray(weights, y0.dtype), jnp.asarray(tableau.c, y0.dtype), np.arange(1, n + 1)
+        nodes = jnp.asarray(tableau.c, jnp.asarray(t1 - t0).dtype)
+        given = jnp.asarray(weights, y0.dtype), nodes, np.arange(1, n + 1)
         k = jnp.zeros((n + 1, *y0.shape), y0.dtype).at[0].set(first)
         (k, y1, slope), _ = jax.lax.scan(stage, (k, y0, jnp.zeros_like(first)), given)
         before = y0 + jnp.tensordot(jnp.asarray(weights[-2], y0.dtype), k, 1)
