@@ -111,6 +111,8 @@ def main():
     columns = "".join(f"{c:>8}" for c in 2 * ("trace s", "XLA s", "lines"))
     print(f"{'model':<20}{'equations':>10}{'solver':>9}{columns}{'ratio':>7}", flush=True)
     for name, system, t1, stiff in models(chosen):
+        if not len(system.parameters):
+            continue  # nothing to differentiate by
         solver = implicit_choice(system.plan, "").solver if stiff or len(system.carried) else "Tsit5"
 
         def end(system, t1=t1, solver=solver):
