@@ -376,3 +376,8 @@ def test_index_two_is_not_called_an_inconsistent_start(n):
     start = jnp.full(n, 0.1 + 0.2), jnp.full(n, 0.3)
     with pytest.raises(InitializationError, match="the index is above 1, or the equations are (nearly )?singular"):
         solve_dae(term, 1.0, start, solver=BDF())
+
+
+def test_a_mass_matrix_that_is_a_function():
+    with pytest.raises(ModelError, match="is constant; got a function. Where M varies, make the slopes z unknowns"):
+        DAETerm(lambda t, y, args: y, mass=lambda t, y: jnp.eye(2))

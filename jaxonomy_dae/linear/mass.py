@@ -15,6 +15,11 @@ class Mass:
     """A constant mass matrix, known when the program is traced: its diagonal, shape (n,), or the matrix, (n, n)."""
 
     def __init__(self, matrix: Any):
+        if callable(matrix):
+            raise ModelError(
+                "the mass matrix of a DAETerm is constant; got a function. Where M varies, make the slopes z unknowns: "
+                "DAETerm(lambda t, x, z, args: z, lambda t, x, z, args: M(t, x) @ z - F(t, x, args))"
+            )
         try:
             array = np.asarray(matrix, float)
         except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError):
