@@ -1,6 +1,6 @@
 """How long programs of medium models take to compile: value alone, and value with gradient.
 
-Models of 10 to 300 equations of different shapes: the published test set, a double pendulum of rigid arms, networks of
+Models of 3 to 120 equations of different shapes: the published test set, a double pendulum of rigid arms, networks of
 turbulent pipes, circuits. Every program ends at one saved time; the gradient is that of the sum of the states there, by
 all parameters. Processor seconds are those of all threads.
 
@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from sympy import Eq, cos, sin
 
-from jaxonomy_dae import AcausalCompiler, AcausalDiagram, AcausalSystem, Component, EqnEnv, der, simulate
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, AcausalSystem, Component, EqnEnv, der, simulate, solvers
 from jaxonomy_dae.system.solver_choice import implicit_choice
 
 from .attack import circuits, pipes
@@ -116,8 +116,6 @@ def main():
         solver = implicit_choice(system.plan, "").solver if stiff or len(system.carried) else "Tsit5"
 
         def end(system, t1=t1, solver=solver):
-            from jaxonomy_dae import solvers
-
             method = getattr(solvers, solver)()
             solution = simulate(system, t1, ts=jnp.array([t1]), solver=method, throw=False)
             return sum(jnp.sum(solution[n]) for n in system.states[:STATES])

@@ -108,19 +108,18 @@ def test_of_a_model():
 
 
 class Cubic(Component):
-    """y = x³ + x with y fixed at the start, or given along with a guess of x that does not hold."""
+    """y = x³ + x with y fixed at the start."""
 
-    def __init__(self, ev, name, fixed):
+    def __init__(self, ev, name):
         super().__init__(ev, name)
         p = self.parameter("p", 10.0)
-        x = self.variable("x", start=None if fixed else p / 2)
-        y = self.variable("y", start=p, fixed=fixed)
+        x, y = self.variable("x"), self.variable("y", start=p, fixed=True)
         self.add_equations(Eq(der(x), -x), Eq(y, x**3 + x))
 
 
 def test_of_a_start():
-    """x³ + x = p has x' = 1/(3x² + 1), x'' = −6x x'²/(3x² + 1); a guess of x alone is x = p/2."""
-    system = compiled(Cubic(EqnEnv(), "c", fixed=True))
+    """x³ + x = p has x' = 1/(3x² + 1), x'' = −6x x'²/(3x² + 1)."""
+    system = compiled(Cubic(EqnEnv(), "c"))
 
     def x(p):
         return system.with_parameters({"c.p": p}).initialize()[0]

@@ -9,7 +9,7 @@ from jaxonomy_dae import Component, EqnEnv, der
 
 
 class Branches(Component):
-    """A tank between a reservoir and a supply: two turbulent pipes and an orifice, no guess anywhere."""
+    """A turbulent pipe and an orifice from one reservoir to another, and a supply beside them; no guess anywhere."""
 
     def __init__(self, ev, name, pressure, flow):
         super().__init__(ev, name)

@@ -288,7 +288,11 @@ class Component(metaclass=Construction):
             value as in `variable`.
         """
         if not isinstance(derivative, VariableSymbol) or not derivative.order:
-            mend = "; for the variable itself, say start= where it is declared" if derivative in self._own() else ""
+            mend = (
+                "; for the variable itself, say start= where it is declared"
+                if str(derivative) in self.variables
+                else ""
+            )
             found = f"got {derivative}{mend}"
             raise ModelError(f"component '{self.name}': start takes a derivative such as der(x); {found}")
         name = f"{derivative}{START}"
@@ -297,9 +301,6 @@ class Component(metaclass=Construction):
         if self._sealed:
             raise ModelError(f"component '{self.path}' is complete: say the start of {derivative} inside its __init__")
         self.add_equations(sympy.Eq(self._declare(name, "start", value, fixed), derivative, evaluate=False))
-
-    def _own(self) -> list[VariableSymbol]:
-        return [VariableSymbol(name) for name in self.variables]
 
     def input(self, name: str, default: float | None = None, unit: str = "") -> VariableSymbol:
         """Declares an input: a function of time given to `simulate(inputs={"component.name": ...})`.
