@@ -15,7 +15,11 @@ from .modeling import NeuralDAEBlock as NeuralDAEBlock
 from .modeling import Rotational as Rotational
 from .modeling import Thermal as Thermal
 from .modeling import Translational as Translational
+from .modeling import assign as assign
 from .modeling import der as der
+from .modeling import pre as pre
+from .modeling import reinit as reinit
+from .modeling import terminate as terminate
 from .simulation.simulate import simulate as simulate
 from .simulation.solution import Solution as Solution
 from .system.acausal_compiler import AcausalCompiler as AcausalCompiler

@@ -10,6 +10,7 @@ from ..model.dependent_parameters import complete
 from ..model.symbolic import SymbolicTemplate, canonical
 from ..model.tables import DependentParameters, ParameterTable, Start, VariableTable
 from ..modeling.declarations import full_name
+from ..modeling.interval import Interval
 from .number_model import ModelNumbers
 from .read_equations import read_expression
 
@@ -33,7 +34,7 @@ def variable_table(model: ModelNumbers, driven: set[int]) -> VariableTable:
             names.append(full_name(path, variable.name))
             is_input.append(variable.kind == "input" and len(is_input) not in driven)
             is_port.append(variable.kind == "port")
-            is_internal.append(variable.kind == "start")
+            is_internal.append(variable.kind in ("start", "event"))
             fixed.append(variable.fixed)
             nominal.append(variable.nominal)
             bounds.append(variable.bounds)
@@ -93,7 +94,16 @@ def parameter_table(model: ModelNumbers) -> ParameterTable:
         if float(array[p]) not in bounds[p]:
             must = f"lie in {bounds[p]}" if np.isfinite(array[p]) else "be finite"
             raise ModelError(f"parameter '{names[p]}' is {expressions[p]} and must {must}; got {array[p]:g}")
-    return ParameterTable(names, array, units, bounds, dependents, expressions)
+    discrete = model.discrete
+    return ParameterTable(
+        [*names, *(f"pre({names[p]})" for p in discrete)],
+        np.concatenate([array, array[discrete]]),
+        [*units, *(units[p] for p in discrete)],
+        [*bounds, *(Interval() for _ in discrete)],
+        dependents,
+        expressions,
+        discrete,
+    )
 
 
 def _dependent_parameters(

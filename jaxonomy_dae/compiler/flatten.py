@@ -11,6 +11,7 @@ from ..model.tables import FlatModel
 from ..modeling.diagram import AcausalDiagram
 from .add_networks import add_corrections, add_learned_terms
 from .collect_declarations import parameter_table, variable_table
+from .collect_events import event_table
 from .connect_ports import connect_ports
 from .connect_signals import connect_signals
 from .group_builder import GroupBuilder
@@ -37,4 +38,5 @@ def flatten(diagram: AcausalDiagram) -> FlatModel:
     parameters = parameter_table(model)
     groups = builder.groups()
     variables, groups, rows = add_corrections(model, diagram, variables, groups, networks)
-    return FlatModel(variables, parameters, groups, networks, rows, model.paths, ports, diagram.name or "")
+    events = event_table(model)
+    return FlatModel(variables, parameters, groups, networks, rows, model.paths, ports, diagram.name or "", events)

@@ -30,6 +30,11 @@ class ModelNumbers:
         n_parameters = [len(c.parameters) for c in self.components]
         self.first_variable = np.concatenate([[0], np.cumsum(n_variables)]).astype(np.int64)
         self.first_parameter = np.concatenate([[0], np.cumsum(n_parameters)]).astype(np.int64)
+        # What discrete variables were before an event follows all parameters, in the order of the variables.
+        flags = [parameter.is_discrete for c in self.components for parameter in c.parameters.values()]
+        self.discrete = np.flatnonzero(np.array(flags, bool))
+        self.previous = np.full(len(flags), -1, np.int64)
+        self.previous[self.discrete] = len(flags) + np.arange(len(self.discrete))
         # One position table for each distinct list of names.
         self._positions: dict[tuple[str, ...], dict[str, int]] = {}
         self.variable_positions = [self._position(tuple(c.variables)) for c in self.components]

@@ -12,7 +12,7 @@ from ..model.linear_template import LinearTemplate
 from ..model.provenance import Provenance
 from ..model.symbolic import canonical, linear_coefficients
 from ..model.template import AbstractTemplate
-from ..modeling.symbols import ParameterSymbol, TimeSymbol, VariableSymbol, symbol_label
+from ..modeling.symbols import ParameterSymbol, PreviousSymbol, TimeSymbol, VariableSymbol, symbol_label
 from .group_builder import GroupBuilder
 from .number_model import ModelNumbers, ids_of
 
@@ -33,10 +33,11 @@ def add_components(model: ModelNumbers, builder: GroupBuilder):
             # Slots follow the order of declaration, never names, so names change nothing but names.
             def rank(s, position=position, members=members):
                 # Symbols of children come after one's own, in the order the children's ids give.
+                nth = getattr(s, "order", int(isinstance(s, PreviousSymbol)))
                 if s.path in position:
-                    return (0, position[s.path], getattr(s, "order", 0))
+                    return (0, position[s.path], nth)
                 resolve = model.variable if isinstance(s, VariableSymbol) else model.parameter
-                return (1, resolve(members[0], s.path), getattr(s, "order", 0))
+                return (1, resolve(members[0], s.path), nth)
 
             symbols = [s for s in symbols_of(residual) if symbol_label(s) in graph.leaves]
             for s in symbols:
@@ -50,6 +51,8 @@ def add_components(model: ModelNumbers, builder: GroupBuilder):
             coefficients = linear_coefficients(graph, variables)
             ids = ids_of(model, members, [v.path for v in variables], "variable")
             parameter_ids = ids_of(model, members, [p.path for p in parameters], "parameter")
+            before = [isinstance(p, PreviousSymbol) for p in parameters]
+            parameter_ids[:, before] = model.previous[parameter_ids[:, before]]
             order = np.tile([v.order for v in variables], (len(members), 1))
             text = f"0 = {shortened(residual)}"
             provenance = [Provenance(text, model.paths[k]) for k in members]

@@ -105,7 +105,7 @@ class InitializationReport(Sections):
         plan, rows = self._plan, self._rows
         n = len(rows.kept) - self._promoted
         held = {r.quantity for r in rows.kept[:n]}
-        parameters = np.asarray(self._system.parameters.array, float)
+        parameters = np.asarray(self._system.numbers, float)
         out = []
         for k, q in enumerate((*plan.states, *plan.carried)):
             if int(q) in held:
@@ -187,7 +187,7 @@ class InitializationReport(Sections):
 
     def _examine(self):
         system, plan = self._system, self._plan
-        parameters = system.parameters.array
+        parameters = system.numbers
         if self.solved:
             table = system.parameters.table
             index = np.array([table.index(n) for n, _ in self.solved])

@@ -16,6 +16,7 @@ from ..model.tables import ZERO, FlatModel, RowInjection
 from .entry_sizes import EntrySizes
 from .gather import Gather
 from .plan import ConstraintGroup, InputTable, PlannedRow, SystemPlan
+from .plan_events import plan_events
 from .program import Layout, Program, plan
 from .schedule import AnyStep, SparseStep, Step, build_schedule
 
@@ -71,6 +72,7 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
     )
 
     everything = program(steps)
+    events = plan_events(flat, variable_map, state_order, quantity_name, lambda q: program(_needed(steps, q, n)))
     row_inputs = [_of(variable_map, row.inputs) for row in flat.rows]
     following = state_order + 1
     rates = carried + 1 if _rates_hold(flat, variable_map, extended, for_residuals, carried) else carried[:0]
@@ -125,6 +127,7 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
         tuple(flat.networks),
         functions,
         linear_solver,
+        events,
     )
 
 
@@ -217,6 +220,20 @@ def _digest(
         feed(name)
     for row in flat.rows:
         feed(row.opaque.index, row.targets, row.inputs, sorted(row.opaque.time_positions))
+    e = flat.events
+    feed(
+        e.text,
+        e.guard,
+        e.message,
+        e.immediate,
+        e.event,
+        e.state,
+        e.discrete,
+        e.value,
+        e.constant,
+        flat.parameters.discrete,
+    )
+    feed(*((start.template.key, start.parameters) for clock in e.clocks for start in clock))
     if linear_solver is not None:
         feed(repr(linear_solver))
     feed(states, selection.constraints, selection.dummies, extended.base, extended.level)

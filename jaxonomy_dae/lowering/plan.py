@@ -21,6 +21,7 @@ from ..model.typical_sizes import typical_sizes
 from . import pattern
 from .dummy_blocks import DummyBlocks, dummy_blocks
 from .gather import Gather
+from .plan_events import EventPlan
 from .program import Program
 from .schedule import TORN, AnyStep
 
@@ -86,6 +87,7 @@ class SystemPlan:
     network_names: tuple[str, ...]
     functions: tuple[Any, ...]
     linear_solver: lx.AbstractLinearSolver | None  # of blocks that stay whole
+    events: EventPlan | None
 
     def __eq__(self, other):
         if not isinstance(other, SystemPlan) or self.digest != other.digest:

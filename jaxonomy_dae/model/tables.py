@@ -83,9 +83,15 @@ class ParameterTable:
     bounds: list[Interval]
     dependents: tuple[DependentParameters, ...]  # each reads only what those before it have computed
     expressions: dict[int, str]  # of the dependent ones, in full names
+    discrete: np.ndarray  # those that events assign; as many more at the end are what these were before an event
 
     def __len__(self):
         return len(self.names)
+
+    @property
+    def n_declared(self) -> int:
+        """How many there are without the values before events."""
+        return len(self.names) - len(self.discrete)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,6 +132,29 @@ class RowInjection:
 
 
 @dataclasses.dataclass(frozen=True)
+class EventTable:
+    """The events of a model, sampled ones first; and what they write, one row for each action."""
+
+    text: tuple[str, ...]  # of each event
+    guard: np.ndarray  # (events,): the variable that falls through zero; −1 for sampled ones
+    clocks: tuple[tuple[Start, Start], ...]  # period and offset of the sampled ones
+    message: tuple[str | None, ...]  # with which an event ends the run
+    immediate: tuple[bool, ...]  # whether an event happens at the initial time, if its condition holds there
+    event: np.ndarray  # (actions,)
+    state: np.ndarray  # (actions,): the variable that starts anew, or −1
+    discrete: np.ndarray  # (actions,): the place among the discrete variables of the one assigned, or −1
+    value: np.ndarray  # (actions,): the variable that has the value, or −1 for …
+    constant: np.ndarray  # (actions,): … a number
+
+    def __len__(self):
+        return len(self.text)
+
+
+_NONE = np.zeros(0, np.int64)
+NO_EVENTS = EventTable((), _NONE, (), (), (), _NONE, _NONE, _NONE, _NONE, np.zeros(0))
+
+
+@dataclasses.dataclass(frozen=True)
 class FlatModel:
     """A flattened model."""
 
@@ -137,6 +166,7 @@ class FlatModel:
     components: list[str]  # full names, by id
     ports: PortTable
     name: str = ""  # of the diagram
+    events: EventTable = NO_EVENTS
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"networks": functions_by_name(self.networks)}

@@ -4,6 +4,10 @@ from .component import Component as Component
 from .declarations import Value as Value
 from .diagram import AcausalDiagram as AcausalDiagram
 from .environment import EqnEnv as EqnEnv
+from .events import assign as assign
+from .events import pre as pre
+from .events import reinit as reinit
+from .events import terminate as terminate
 from .interval import NONNEGATIVE as NONNEGATIVE
 from .interval import POSITIVE as POSITIVE
 from .interval import Interval as Interval

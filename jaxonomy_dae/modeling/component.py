@@ -13,15 +13,17 @@ from .construction import Construction
 from .declarations import START, Learned, Parameter, Variable, full_name
 from .environment import EqnEnv
 from .equations import residual_of
+from .event_declarations import EventDeclarations
+from .events import When
 from .functions import of_scalars
 from .interval import Interval, as_interval
 from .names import check_name
 from .ports import Domain, Port
 from .real_number import real_number
-from .symbols import ParameterSymbol, TimeSymbol, VariableSymbol
+from .symbols import DiscreteSymbol, ParameterSymbol, TimeSymbol, VariableSymbol
 
 
-class Component(metaclass=Construction):
+class Component(EventDeclarations, metaclass=Construction):
     """The base class of all components: subclass it, and declare physics in `__init__`.
 
     ```python
@@ -58,6 +60,7 @@ class Component(metaclass=Construction):
         self.learned_terms: list[Learned] = []
         self.connections: list[Connection] = []
         self.signals: list[Signal] = []
+        self.events: list[When] = []
         self._sealed = False
 
     # --- names -------------------------------------------------------------------------------------------------
@@ -79,7 +82,8 @@ class Component(metaclass=Construction):
         if name in self.variables:
             return VariableSymbol(self._outside_path() + name)
         if name in self.parameters:
-            return ParameterSymbol(self._outside_path() + name)
+            kind = DiscreteSymbol if self.parameters[name].is_discrete else ParameterSymbol
+            return kind(self._outside_path() + name)
         raise ModelError(
             f"component '{self.path}' has no variable or parameter '{name}': "
             + nearest(name, [*self.variables, *self.parameters])
@@ -163,25 +167,28 @@ class Component(metaclass=Construction):
 
         - `ModelError` if the value is not a finite number inside the bounds; for an expression, when compiled.
         """
-        self._claim(name, "parameter")
-        where = f"parameter '{self.name}.{name}'"
+        return ParameterSymbol(self._declare_parameter(name, "parameter", value, unit, bounds))
+
+    def _declare_parameter(self, name: str, kind: str, value: Any, unit: str, bounds: Any = None) -> str:
+        """Declares a parameter or a discrete variable; returns its name."""
+        self._claim(name, kind)
+        where = f"{kind} '{self.name}.{name}'"
         if not isinstance(unit, str):
             raise ModelError(f"{where}: unit is a text such as 'kg'; got {unit!r}")
-        interval = as_interval(bounds, where)
+        interval = Interval() if bounds is None else as_interval(bounds, where)
         if isinstance(value, sympy.Expr) and not value.is_number:
             self._check_parameters_only(value, f"the value of {where}")
-            self.parameters[name] = Parameter(name, value, unit, interval)
-            return ParameterSymbol(name)
-        number = real_number(
-            value,
-            where,
-            ". To vary or differentiate it, compile once and use "
-            f"`system.with_parameters({{'{self.name}.{name}': value}})`",
-        )
-        if number not in interval:
-            raise ModelError(f"{where} must lie in {interval}; got {number:g}")
-        self.parameters[name] = Parameter(name, number, unit, interval)
-        return ParameterSymbol(name)
+        else:
+            value = real_number(
+                value,
+                where,
+                ". To vary or differentiate it, compile once and use "
+                f"`system.with_parameters({{'{self.name}.{name}': value}})`",
+            )
+            if value not in interval:
+                raise ModelError(f"{where} must lie in {interval}; got {value:g}")
+        self.parameters[name] = Parameter(name, value, unit, interval, kind != "parameter")
+        return name
 
     @staticmethod
     def _check_parameters_only(value: sympy.Expr, what: str):
@@ -458,8 +465,8 @@ class Component(metaclass=Construction):
 
 
 _BASE_ATTRIBUTES = (
-    "ev name parent parameters variables ports children equations learned_terms connections signals _sealed".split()
-)
+    "ev name parent parameters variables ports children equations learned_terms connections signals events _sealed"
+).split()
 
 
 def _noun(what: str) -> str:

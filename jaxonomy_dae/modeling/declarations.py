@@ -14,18 +14,20 @@ Value: TypeAlias = float | int | sympy.Expr  # a number, or an expression in par
 
 @dataclasses.dataclass(frozen=True)
 class Parameter:
-    """A declared parameter; its value is an expression if it depends on others."""
+    """A declared parameter; its value is an expression if it depends on others. That of a discrete variable is what it
+    starts at."""
 
     name: str
     value: float | sympy.Expr
     unit: str
     bounds: Interval
+    is_discrete: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
 class Variable:
-    """A declared variable: `kind` is 'variable', 'input', 'output', 'learned', 'port', or 'start' for what equals a
-    derivative and has a start."""
+    """A declared variable: `kind` is 'variable', 'input', 'output', 'learned', 'port', 'start' for what equals a
+    derivative and has a start, or 'event' for what guards and actions compute."""
 
     name: str
     kind: str

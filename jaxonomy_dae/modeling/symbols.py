@@ -85,6 +85,24 @@ class ParameterSymbol(ComponentSymbol):
         return (self.path,), {}
 
 
+class DiscreteSymbol(ParameterSymbol):
+    """A discrete variable: constant between events, so that equations read it as they read a parameter."""
+
+    __slots__ = ()
+
+
+class PreviousSymbol(ParameterSymbol):
+    """A discrete variable before the event that is being handled."""
+
+    __slots__ = ()
+
+    @functools.lru_cache(maxsize=65536)  # noqa: B019
+    def __new__(cls, path: str):
+        symbol = ComponentSymbol.__new__(cls, f"pre({path})", real=True)
+        symbol.path = path
+        return symbol
+
+
 class TimeSymbol(sympy.Symbol):
     """The independent variable."""
 
@@ -115,6 +133,8 @@ def symbol_label(symbol: sympy.Symbol) -> Hashable:
     """The label of a symbol in expression graphs."""
     if isinstance(symbol, VariableSymbol):
         return ("variable", symbol.path, symbol.order)
+    if isinstance(symbol, PreviousSymbol):
+        return ("before", symbol.path)
     if isinstance(symbol, ParameterSymbol):
         return ("parameter of", symbol.path)
     return TIME_LABEL if isinstance(symbol, TimeSymbol) else ("symbol", symbol.name)
@@ -128,7 +148,7 @@ def seen_from_child(value: Any) -> Any:
             if isinstance(s, VariableSymbol):
                 outside[s] = VariableSymbol(f"../{s.path}", s.order)
             elif isinstance(s, ParameterSymbol):
-                outside[s] = ParameterSymbol(f"../{s.path}")
+                outside[s] = type(s)(f"../{s.path}")
         return value.xreplace(outside) if outside else value
     if type(value) in (list, tuple):
         return type(value)(seen_from_child(v) for v in value)

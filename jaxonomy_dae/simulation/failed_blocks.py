@@ -19,7 +19,7 @@ from ..solvers.dae_term import FlatProblem
 from ..solvers.index_one import consistent_slope
 from ..system.system import AcausalSystem
 from ..system.system_at import input_values
-from .integration import term_of
+from .preparation import term_of
 
 SHOWN = 4
 NEAR = 10.0 ** np.arange(-15, -5)  # parts of the interval
@@ -67,7 +67,7 @@ def _quantities(system: AcausalSystem, t: Any, x: Any, inputs: dict[str, Any], c
 
 def _findings(system: AcausalSystem, t: Any, x: Any, inputs: dict[str, Any]) -> list[BlockFinding]:
     """The blocks that are singular, or nearly so."""
-    plan, parameters = system.plan, system.parameters.array
+    plan, parameters = system.plan, system.numbers
 
     def values():
         return np.array([float(v) for v in input_values(plan, inputs, t, parameters.dtype)])

@@ -5,15 +5,19 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from ..hybrid.solver import TOO_MANY
 from ..solvers.choice_guard import SINGULAR_CHOICE
 from ..solvers.failures import SHOWN, explain_failure, how_it_stopped
+from .event_log import EventLog
 from .failed_blocks import failed_block
-from .integration import term_of
 from .not_finite import equation_not_finite
+from .preparation import term_of
 from .solution import Solution
 from .step_sizes import scaled_atol
 
 NEARLY = 1e-2  # of the first determinant: a singular choice explains a failure so close to it
+SHRINKING = 0.98  # intervals between events that become this much shorter each time accumulate
+CHATTERING = 1e-6  # events closer than this part of the time that has passed
 PROBES = 64  # times at which inputs are looked at
 
 
@@ -30,6 +34,8 @@ def explain(
     """Why the integration from `first` to t1 stopped at its last accepted point (t, x), and what to do."""
     system, inputs = solution.system, solution.inputs
     (t0, _), (t, x) = first, last
+    if solution.result == TOO_MANY and solution.events is not None:
+        return _too_many_events(solution.events, float(t))
     bad = _bad_input(inputs, float(t0), float(t), float(t1))
     if bad:
         return f"the integration stopped at t={float(t):g}: {bad}"
@@ -52,6 +58,32 @@ def explain(
         result=solution.result, t0=t0, t1=t1, max_steps=max_steps, rtol=rtol, atol=scaled_atol(system, atol),
         explicit=not implicit,
     )  # fmt: skip
+
+
+def _too_many_events(events: EventLog, t: float) -> str:
+    """Which event happens again and again, and towards which time."""
+    which = np.asarray(events.which, int)
+    counts = np.bincount(which[which >= 0], minlength=len(events.all_names))
+    most = int(np.argmax(counts))
+    times = np.asarray(events.ts)[which == most]
+    text = (
+        f"more than {len(which)} events by t={t:.6g}, {counts[most]} of them '{events.all_names[most]}'. Give a larger "
+        "max_events if they are meant"
+    )
+    apart = np.diff(times[-8:])
+    ratios = apart[1:] / apart[:-1] if len(apart) > 2 and (apart[:-1] > 0).all() else np.ones(1)
+    if ratios.max() < SHRINKING:
+        end = times[-1] + apart[-1] * ratios[-1] / (1 - ratios[-1])
+        return (
+            f"{text}; but the times between them shrink, each to {ratios[-1]:.3g} of the one before, and accumulate at "
+            f"t={end:.6g}. Let the model come to rest before: when(…, terminate(…)), or a mode in which it stays"
+        )
+    if len(apart) and apart[-1] < CHATTERING * max(abs(t), apart.max()):
+        return (
+            f"{text}; but they follow each other at once: the event undoes what made it happen. Let the conditions "
+            "for switching on and off lie apart (hysteresis), or smooth the relation"
+        )
+    return f"{text}."
 
 
 def _bad_input(inputs: dict[str, Any], t0: float, t: float, t1: float) -> str:

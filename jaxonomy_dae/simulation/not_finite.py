@@ -20,7 +20,7 @@ def equation_not_finite(system: AcausalSystem, inputs: Any, t: Any, x: Any) -> s
     found = system.at(t, inputs).quantities(x, every, np.ones(len(every)))
     values = np.append(np.asarray(found, float), 0.0)  # ZERO is −1: the last entry
     finite = np.isfinite(values)
-    parameters = np.asarray(system.parameters.array, float)
+    parameters = np.asarray(system.numbers, float)
     networks = Networks(tuple(system.neural[n] for n in plan.network_names))
     for step in plan.steps:
         own = np.zeros(len(values), bool)

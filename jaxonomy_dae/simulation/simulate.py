@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
@@ -24,7 +25,8 @@ from ..system.stiffness import fastest_decay
 from ..system.system import AcausalSystem
 from .arguments import check_arguments, check_parameters
 from .failures import explain
-from .integration import Options, Outcome, run, run_compiled, term_of
+from .integration import Options, Outcome, run, run_compiled
+from .preparation import term_of
 from .solution import Solution
 from .step_sizes import clipped, controller_for, scaled_atol
 
@@ -47,6 +49,7 @@ def simulate(
     jump_ts: Any = None,
     dtmax: Any = None,
     max_steps: int = 16384,
+    max_events: int = 100,
     progress: bool = False,
     throw: bool = True,
 ) -> Solution:
@@ -76,6 +79,7 @@ def simulate(
         starts anew.
     - `dtmax`: the longest step.
     - `max_steps`: bounds the steps taken, beside those that end at samples; with `ts=None` as many rows are reserved.
+    - `max_events`: bounds the events of conditions; `solution.events` has room for as many.
     - `progress`: shows a progress bar.
     - `throw`: whether to raise if the integration fails; otherwise see `solution.result`; rows that were not
         reached are NaN, and so are their derivatives.
@@ -118,7 +122,7 @@ def simulate(
             control = controller_for(system, solver, rtol, atol, dtmax)
         return Options(
             solver, adjoint if adjoint is not None else default_adjoint(), clipped(control, jump_ts, ends),
-            max_steps + ends.count, progress,
+            max_steps + ends.count, progress, max_events,
         )  # fmt: skip
 
     if solver is None:
@@ -155,13 +159,17 @@ def simulate(
             before = {"num_explicit_steps": counts["num_steps"], "stiff_from": float(outcome.last[0])}
             outcome = run_compiled(given, options(solver), None)
             counts = outcome.numbers() | before
-    saved, x = outcome.ts, outcome.x
+    saved, x, discrete = outcome.ts, outcome.x, outcome.discrete
     if ts is None:
         taken = counts["num_accepted_steps"] + 1
-        saved, x = saved[:taken], x[:taken]
-    solution = Solution(saved, x, system, inputs, counts, outcome.result, choice.solver, choice.reason)
+        saved, x, discrete = jax.tree.map(lambda rows: rows[:taken], (saved, x, discrete))
+    solution = Solution(
+        saved, x, system, inputs, counts, outcome.result, choice.solver, choice.reason, discrete, outcome.events
+    )
     if throw and not bool(diffrax.is_okay(outcome.result)):
         first = t0, outcome.found.x
+        if outcome.held is not None:
+            solution = eqx.tree_at(lambda s: s.system, solution, system.holding(outcome.held))
         text = explain(solution, first, outcome.last, t1, is_implicit(solver), max_steps, rtol, atol)
         raise SimulationError(text)
     return solution
@@ -182,7 +190,10 @@ def _traced(outcome: Outcome, given: tuple[Any, ...], choice: Choice, throw: boo
     system, inputs, x = given[0], given[4], outcome.x
     if throw:
         x = outcome.result.error_if(x, ~diffrax.is_okay(outcome.result))
-    return Solution(outcome.ts, x, system, inputs, outcome.stats, outcome.result, choice.solver, choice.reason)
+    return Solution(
+        outcome.ts, x, system, inputs, outcome.stats, outcome.result, choice.solver, choice.reason, outcome.discrete,
+        outcome.events,
+    )  # fmt: skip
 
 
 def _is_traced(tree: Any) -> bool:

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from ..errors import ModelError
 from ..lowering.gather import times
 from ..system.system import AcausalSystem
+from .event_log import EventLog
 
 SHOWN = 8
 
@@ -28,6 +29,9 @@ class Solution(eqx.Module):
     - `system`, `inputs`: what was simulated; inputs as they were read.
     - `counts`: steps taken, accepted, rejected, and Jacobians of implicit solvers; `stats` adds the solver's name and
         why it was chosen.
+    - `discrete`: the values of discrete variables at these times, shape `(n, len(system.discretes))`; None without
+        events. At the time of an event, what it wrote.
+    - `events`: the events of conditions, see `EventLog`; None if the model has none.
     - `result`: Diffrax's result code. Where the integration stopped early, later rows are NaN.
 
     A solution that `equinox.filter_vmap` returns is a batch: shapes get its axis in front.
@@ -41,6 +45,8 @@ class Solution(eqx.Module):
     result: Any
     solver: str = eqx.field(static=True, default="")
     reason: str = eqx.field(static=True, default="")
+    discrete: Float[Array, "n q"] | None = None
+    events: EventLog | None = None
 
     def __getitem__(self, name: Any) -> Any:
         """The values of a variable, or of several: `solution["pend.x"]` has shape `(n,)`, and
@@ -59,11 +65,13 @@ class Solution(eqx.Module):
             return self.ts
         if self.states.ndim > 2:
             return _each(self, lambda one: one[name])
+        if self.discrete is not None and name in self.system.discretes:
+            return self.discrete[:, self.system.discretes.index(name)]
         quantity, factor = self.system.plan.resolve([name])
         column = self._state(int(quantity[0]), float(factor[0]))
         if column is not None:
             return column
-        given = (self.system, self.ts, self.states, self.inputs)
+        given = (self.system, self.ts, self.states, self.inputs, self.discrete)
         if _is_traced(given):
             return _observed(*given, quantity, factor)[:, 0]
         return _one(*given, jnp.asarray(quantity[0]), jnp.asarray(factor[0], self.states.dtype))
@@ -83,8 +91,9 @@ class Solution(eqx.Module):
         """The values of several variables, shape `(n, len(names))`, evaluated at once."""
         if self.states.ndim > 2:
             return _each(self, lambda one: one._columns(names))
-        quantity, factor = self.system.plan.resolve([name for name in names if name != "time"])
-        given = (self.system, self.ts, self.states, self.inputs)
+        own = {"time": self.ts} | {n: self[n] for n in names if n in self.system.discretes}
+        quantity, factor = self.system.plan.resolve([name for name in names if name not in own])
+        given = (self.system, self.ts, self.states, self.inputs, self.discrete)
         if not (quantity >= 0).any():
             values = jnp.zeros((*self.ts.shape, len(quantity)), self.states.dtype)
         elif _is_traced(given):
@@ -93,7 +102,7 @@ class Solution(eqx.Module):
             chosen = _everything(*given)[:, quantity] * jnp.asarray(factor, self.states.dtype)
             values = jnp.where(quantity < 0, 0.0, chosen)
         found = iter(jnp.moveaxis(values, -1, 0))
-        columns = [self.ts if name == "time" else next(found) for name in names]
+        columns = [own[name] if name in own else next(found) for name in names]
         return jnp.stack(columns, axis=-1) if columns else jnp.zeros((*self.ts.shape, 0), self.states.dtype)
 
     @property
@@ -102,20 +111,20 @@ class Solution(eqx.Module):
         return {**self.counts, "solver": self.solver, "reason": self.reason}
 
     def __contains__(self, name: str) -> bool:
-        return name == "time" or name in self.system.plan.variable_index
+        return name == "time" or name in self.system.plan.variable_index or name in self.system.discretes
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self.system.variables)
+        return iter([*self.system.variables, *self.system.discretes])
 
     def constraint_residual(self) -> Float[Array, "*batch n m"]:
         """The residuals of all hidden constraints at the saved times, shape `(n, constraints)`."""
         if self.states.ndim > 2:
             return _each(self, Solution.constraint_residual)
-        return _constraint_residual(self.system, self.ts, self.states, self.inputs)
+        return _constraint_residual(self.system, self.ts, self.states, self.inputs, self.discrete)
 
     def to_dict(self) -> dict[str, Any]:
         """All variables, and `"time"`, by name."""
-        names = ("time", *self.system.variables)
+        names = ("time", *self)
         return dict(zip(names, jnp.moveaxis(self._columns(names), -1, 0), strict=True))
 
     def plot(self, *names: str, ax: Any = None) -> Any:
@@ -149,31 +158,34 @@ def _is_traced(tree: Any) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
-def _observed(system: AcausalSystem, ts, states, inputs, quantity: np.ndarray, factor: np.ndarray):
+def _held(system: AcausalSystem, values: Any) -> AcausalSystem:
+    return system if values is None else system.holding(values)
+
+
+def _observed(system: AcausalSystem, ts, states, inputs, discrete, quantity: np.ndarray, factor: np.ndarray):
     """Quantities at all times, shape (n, quantities)."""
     read = np.maximum(quantity, 0)
 
-    def one(t, x):
-        return system.at(t, inputs).quantities(x, read, factor)
+    def one(t, x, q):
+        return _held(system, q).at(t, inputs).quantities(x, read, factor)
 
-    return jnp.where(quantity < 0, 0.0, jax.vmap(one)(ts, states))
+    return jnp.where(quantity < 0, 0.0, jax.vmap(one)(ts, states, discrete))
 
 
 @eqx.filter_jit
-def _everything(system: AcausalSystem, ts, states, inputs):
+def _everything(system: AcausalSystem, ts, states, inputs, discrete):
     """All quantities at all times, shape (n, quantities)."""
     every = np.arange(system.plan.extended.quantities.n)
-    return _observed(system, ts, states, inputs, every, np.ones(len(every)))
+    return _observed(system, ts, states, inputs, discrete, every, np.ones(len(every)))
 
 
 @eqx.filter_jit
-def _one(system: AcausalSystem, ts, states, inputs, quantity, factor):
+def _one(system: AcausalSystem, ts, states, inputs, discrete, quantity, factor):
     """One quantity, chosen while running: compiled once for all names."""
     every = np.arange(system.plan.extended.quantities.n)
-    ones = np.ones(len(every))
-    return factor * jax.vmap(lambda t, x: system.at(t, inputs).quantities(x, every, ones)[quantity])(ts, states)
+    return factor * _observed(system, ts, states, inputs, discrete, every, np.ones(len(every)))[:, quantity]
 
 
 @eqx.filter_jit
-def _constraint_residual(system: AcausalSystem, ts, states, inputs):
-    return jax.vmap(lambda t, x: system.constraint_residual(t, x, inputs))(ts, states)
+def _constraint_residual(system: AcausalSystem, ts, states, inputs, discrete):
+    return jax.vmap(lambda t, x, q: _held(system, q).constraint_residual(t, x, inputs))(ts, states, discrete)

@@ -88,10 +88,12 @@ class AcausalCompiler:
         plan = lower(compile_flat(flat, self.state_selection, self.prefer_states), self.linear_solver)
         self._report = SystemReport(plan)
         declared = flat.parameters
+        n = declared.n_declared
         table = ParameterNames(
-            declared.names, declared.units, declared.bounds, declared.dependents, declared.expressions, plan.digest
-        )
-        parameters = Parameters(jnp.asarray(declared.values, dtype=jnp.zeros(()).dtype), None, (), table)
+            declared.names[:n], declared.units[:n], declared.bounds[:n], declared.dependents, declared.expressions,
+            plan.digest,
+        )  # fmt: skip
+        parameters = Parameters(jnp.asarray(declared.values[:n], dtype=jnp.zeros(()).dtype), None, (), table)
         neural = {name: _own(network) for name, network in flat.networks.items()}
         return AcausalSystem(parameters, neural, plan)
 

@@ -15,6 +15,7 @@ from ..diagnosis.wording import counted, some
 from ..errors import ModelError, nearest
 from ..linear.sparse import SparseMatrix, SparsePattern, sparse_jacobian
 from ..lowering.plan import SystemPlan
+from ..model.dependent_parameters import complete
 from ..model.pickling import functions_by_name, named_functions
 from .evaluate import Refinement
 from .inputs import read_inputs
@@ -152,7 +153,41 @@ class AcausalSystem(eqx.Module):
             if default is None and name not in args:
                 raise ModelError(f"input '{name}' has no default: give it with inputs={{'{name}': function_of_time}}")
         networks = tuple(self.neural[n] for n in self.plan.network_names)
-        return SystemAt(self.plan, self.parameters.array, networks, t, args)
+        return SystemAt(self.plan, self.numbers, networks, t, args)
+
+    @property
+    def numbers(self) -> Float[Array, " m"]:
+        """What equations read of parameters: all of them, then the discrete variables as before an event."""
+        array = self.parameters.array
+        events = self.plan.events
+        if events is None or not len(events.discrete):
+            return array
+        return jnp.concatenate([array, array[..., events.discrete]], axis=-1)
+
+    def holding(self, values: Any) -> "AcausalSystem":
+        """The system while its discrete variables have these values, shape `(len(discretes),)`."""
+        events = self.plan.events
+        if events is None or not len(events.discrete):
+            return self
+        array = complete(events.dependents, self.parameters.array.at[events.discrete].set(values))
+        return eqx.tree_at(lambda s: s.parameters, self, Parameters(array, None, (), self.parameters.table))
+
+    def around_event(self, t: Any, values: Any, previous: Any, args: Any = None) -> SystemAt:
+        """`at`, with discrete variables that have these values and had others before the event at hand."""
+        held = self.holding(values)
+        point = held.at(t, args)
+        return SystemAt(self.plan, jnp.concatenate([held.parameters.array, previous]), point.networks, t, point.inputs)
+
+    @property
+    def discrete_values(self) -> Float[Array, " q"]:
+        """The values of the discrete variables at the start."""
+        events = self.plan.events
+        return jnp.zeros((0,)) if events is None else self.parameters.array[..., events.discrete]
+
+    @property
+    def discretes(self) -> list[str]:
+        """The names of the discrete variables."""
+        return [] if self.plan.events is None else [self.parameters.names[p] for p in self.plan.events.discrete]
 
     def vector_field(self, t: Any, x: Float[Array, " n"], args: Any = None) -> Float[Array, " n"]:
         """d(state)/dt for `diffrax.ODETerm(system.vector_field)`; `args` is the dictionary of inputs, or None."""

@@ -17,6 +17,7 @@ from ..linear.whole import solve_whole
 from ..linear.written_out import UNROLLED, solve, solve_dense
 from ..lowering.gather import Gather, entries, take, times
 from ..lowering.plan import ConstraintGroup, PlannedRow, SystemPlan
+from ..lowering.plan_events import EventPlan
 from ..lowering.program import Program
 from ..model.evaluate_numpy import Networks
 from ..solvers.field_size import is_large
@@ -303,13 +304,50 @@ class SystemAt:
         multiplier = jnp.linalg.solve((jacobian * w) @ jacobian.T, value)
         return self.split(jnp.concatenate([x - w * (jacobian.T @ multiplier), rest]))
 
+    # --- events ------------------------------------------------------------------------------------------------
+
+    def guards(self, x: Any) -> Any:
+        """The guards of all events of conditions, shape (guards,)."""
+        events = self._events()
+        evaluation = self.run(events.guards, self.split(x), Refinement.ONCE)
+        return self._filled(evaluation, events.guard)
+
+    def event_values(self, x: Any) -> Any:
+        """What the actions of all events would write, shape (actions,)."""
+        events = self._events()
+        read = self._filled(self.run(events.values, self.split(x), Refinement.ROOT), events.value)
+        return jnp.where(events.table.value < 0, jnp.asarray(events.table.constant, self.dtype), read)
+
+    def clocks(self) -> tuple[Any, Any]:
+        """Periods and offsets of sampled events, shape (clocks,) each."""
+
+        def value(start):
+            numbers = [self.parameters[p] for p in start.parameters]
+            return jnp.asarray(start.template.residual([], numbers, [], self.t, None), self.dtype)
+
+        clocks = self._events().table.clocks
+        if not clocks:
+            return jnp.zeros((0,), self.dtype), jnp.zeros((0,), self.dtype)
+        periods, offsets = zip(*clocks, strict=True)
+        return jnp.stack([value(start) for start in periods]), jnp.stack([value(start) for start in offsets])
+
+    def _events(self) -> EventPlan:
+        if self.plan.events is None:
+            raise ModelError("this system has no events")
+        return self.plan.events
+
+    def _filled(self, evaluation: Evaluation, gather: Gather) -> Any:
+        n = len(gather.chunk)
+        if not n:
+            return jnp.zeros((0,), self.dtype)
+        return jnp.broadcast_to(jnp.asarray(evaluation.read(gather), self.dtype), (n,))
+
     # --- reading -----------------------------------------------------------------------------------------------
 
     def quantities(self, x: Any, quantity: np.ndarray, factor: np.ndarray) -> Any:
         """The values of quantities with factors, shape (len(quantity),)."""
         evaluation = self.run(self.plan.everything, self.split(x), Refinement.ROOT)
-        gather = self.plan.everything.layout.gather(quantity, factor)
-        return jnp.broadcast_to(jnp.asarray(evaluation.read(gather), self.dtype), (len(quantity),))
+        return self._filled(evaluation, self.plan.everything.layout.gather(quantity, factor))
 
 
 def _sum(terms: list[Any], zero: Any) -> Any:

@@ -1,0 +1,1 @@
+"""Events within one solve: guards, resets and clocks around any Diffrax solver."""

@@ -1,0 +1,70 @@
+"""Step sizes with steps that end at events."""
+
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from .problem import HybridState
+from .term import bound
+
+ENDED: Any = diffrax.RESULTS.event_occurred  # Diffrax asks the controller last, so that it must say so
+GROWTH = 1e3  # of the step after one that an event made short
+
+
+class EventControl(diffrax.AbstractAdaptiveStepSizeController):
+    """The step sizes of another controller, but steps end at events: one in which an event was found is tried again up
+    to there, and none goes beyond the next tick of a clock."""
+
+    controller: Any
+
+    @property
+    def rtol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.controller.rtol
+
+    @property
+    def atol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.controller.atol
+
+    @property
+    def norm(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.controller.norm
+
+    def wrap(self, direction):
+        return EventControl(self.controller.wrap(direction))  # pyright: ignore[reportCallIssue]
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        """The end of the first step; and the state of the controller, with how long a step would have been that an
+        event made shorter."""
+        end, state = self.controller.init(bound(terms, y0.q), t0, t1, y0.x, dt0, args, func, error_order)
+        return jnp.minimum(end, _due(y0)), (state, jnp.full_like(jnp.asarray(t0), jnp.inf))
+
+    def adapt_step_size(self, t0, t1, y0, y1, args, y_error, error_order, controller_state):
+        """Whether the step is kept, and the next one."""
+        inner, wished = controller_state
+        keep, start, end, jump, new, result = self.controller.adapt_step_size(
+            t0, t1, y0.x, y1.x, args, y_error, error_order, inner
+        )
+        request = lax.stop_gradient(y1.request)
+        early = keep & jnp.isfinite(request)
+        h = end - start
+        h = jnp.where(keep & ~early & jnp.isfinite(wished), jnp.maximum(h, jnp.minimum(wished, GROWTH * h)), h)
+        end = start + lax.stop_gradient(h)
+        kept = keep & ~early
+        start = jnp.where(early, t0, start)
+        end = jnp.where(early, request, end)
+        due = jnp.where(kept, _due(y1), _due(y0))
+        # What is cut short for a clock goes on with its own step size.
+        cut = end > due
+        wished = jnp.where(early, t1 - t0, jnp.where(keep, jnp.inf, wished))
+        wished = jnp.where(cut & ~early, h, wished)
+        end = jnp.where(cut, due, end)
+        result = diffrax.RESULTS.where(kept & (y1.ended > 0), ENDED, result)
+        new = jax.tree.map(lambda a, b: jnp.where(early, b, a), new, inner)
+        return kept, start, end, jump, (new, lax.stop_gradient(wished)), result
+
+
+def _due(y: HybridState) -> Any:
+    return lax.stop_gradient(jnp.min(y.due, initial=jnp.inf))

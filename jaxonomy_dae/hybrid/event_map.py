@@ -1,0 +1,129 @@
+"""What happens at one instant: events one after another, each a map at a frozen time.
+
+A step ends at a time t₁ that counts as a constant. The event happens at τ = t₁ + δ with δ = −g/ġ, zero but for
+rounding; its derivative is that of the time of the crossing, by the implicit function theorem. The map
+
+    xₑ = x₁ + f⁻·δ,   (x⁺, q⁺) = R(τ, xₑ, q),   x₁' = x⁺ − f⁺·δ
+
+has the value R and, f⁻ and f⁺ being constants, the saltation matrix as its derivative (Aizerman & Gantmacher 1958). A
+clock ticks at τ = offset + k·period, a function of parameters, in the same manner.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from ..adjoint.closure_conversion import any_member
+from .problem import AbstractHybridProblem, HybridState, one_hot
+
+CONDITIONS_AT_ONE_INSTANT = 32  # more than these take another step, of no length to speak of
+SMALL = 1e-12  # of a guard's size in the step before: counts as zero
+ROUNDING = 1e-9  # of that size, over a step: counts as no change
+
+
+class Instant(eqx.Module):
+    """An instant while it is handled: the events that are left, which of them were made true by another event, the
+    delay δ of the last one, and the discrete values before the instant."""
+
+    state: HybridState
+    left: Any
+    caused: Any
+    delay: Any
+    previous: Any
+
+
+def handle(
+    problem: AbstractHybridProblem, t: Any, state: HybridState, due: Any, size: Any, window: Any, span: Any, args: Any,
+    at_start: bool = False,
+) -> HybridState:  # fmt: skip
+    """The state after all events of an instant.
+
+    - `due`: which events happen, shape (clocks + guards,).
+    - `size`: of the guards in the step before, shape (guards,); `span`: that step's length; `window`: the time within
+        which a guard counts as having reached zero.
+    - `at_start`: whether this is the initial time, which does not move with parameters; what happens there is not
+        logged.
+    """
+    c, g = problem.n_clocks, problem.n_guards
+    ends = jnp.asarray(problem.ends).astype(t.dtype)
+
+    def one(instant: Instant) -> Instant:
+        state, q = instant.state, instant.state.q
+        before = problem.slope(t, state.x, q, args)
+        event = jnp.argmax(instant.left)
+        is_clock = event < c
+        delay = jnp.zeros_like(t)
+        if g:
+            values = problem.guards(t, state.x, q, args)
+            _, rates = problem.rates(t, state.x, q, args, before)
+            k = jnp.clip(event - c, 0, g - 1)
+            rate = rates[k]
+            crossing = -values[k] / jnp.where(rate == 0, 1.0, rate)
+            crossing = jnp.where(instant.caused[k], instant.delay, crossing)
+            delay = jnp.where(is_clock, delay, crossing)
+        else:
+            rate = jnp.zeros_like(t)
+        if at_start:
+            delay = jnp.zeros_like(t)
+        elif c:
+            exact = problem.due(state.ticks)[jnp.clip(event, 0, c - 1)]
+            delay = jnp.where(is_clock, exact - lax.stop_gradient(exact), delay)
+        time = t + delay
+        x, new = problem.written(time, state.x + before * delay, q, instant.previous, event, args)
+        after = problem.slope(t, x, new, args)
+        ticks = state.ticks + one_hot(event, c).astype(state.ticks.dtype)
+        logged = ~is_clock & (not at_start)
+        row = jnp.where(logged, state.count.astype(int), state.times.shape[0])
+        armed, left, caused = _following(problem, t, x, new, after, instant, event, size, window, span, args)
+        state = HybridState(
+            x - after * delay,
+            new,
+            armed,
+            state.request,
+            ticks,
+            lax.stop_gradient(problem.due(ticks)),
+            state.count + logged.astype(state.count.dtype),
+            state.times.at[row].set(time, mode="drop"),
+            state.which.at[row].set(event.astype(state.which.dtype), mode="drop"),
+            state.rate.at[row].set(lax.stop_gradient(rate), mode="drop"),
+            jnp.maximum(state.ended, ends[event]),
+        )
+        # Clocks that tick together read what was before all of them.
+        previous = jnp.where(jnp.any(left[:c]), instant.previous, new) if c else new
+        return Instant(state, left, caused, delay, previous)
+
+    def step(instant: Instant, _: None) -> tuple[Instant, None]:
+        going = jnp.any(instant.left)
+
+        def go(instant: Instant) -> Instant:
+            return jax.tree.map(lambda a, b: jnp.where(going, a, b), one(instant), instant)
+
+        return lax.cond(any_member(going), go, lambda instant: instant, instant), None
+
+    nothing = jnp.zeros((g,), bool)
+    start = Instant(state, due, nothing, jnp.zeros_like(t), state.q)
+    length = c + min(2 * g, CONDITIONS_AT_ONE_INSTANT)
+    instant, _ = lax.scan(step, start, length=length)
+    return instant.state
+
+
+def _following(problem, t, x, q, slope, instant: Instant, event, size, window, span, args):
+    """(armed guards, events left, which of the guards' were made true by an event) after an event."""
+    c, g = problem.n_clocks, problem.n_guards
+    left = instant.left & ~one_hot(event, c + g)
+    if not g:
+        return instant.state.armed, left, instant.caused
+    value, rate = problem.rates(t, x, q, args, slope)
+    here = event - c == jnp.arange(g)
+    zero = jnp.abs(value) <= jnp.maximum(SMALL * size, jnp.abs(rate) * window)
+    # One that seems to fall from zero by rounding alone is waited for: if it does fall, the next step finds it.
+    true = jnp.where(zero, rate * span < -ROUNDING * size, value < 0)
+    was_armed = (instant.state.armed > 0.5) & ~here
+    # What this event made true happens next; what was to happen does so unless this event undid it.
+    caused = was_armed & true & ~zero
+    next_ones = (was_armed | left[c:]) & true & ~here
+    armed = jnp.where(true, next_ones, True)
+    return armed.astype(instant.state.armed.dtype), jnp.concatenate([left[:c], next_ones]), caused

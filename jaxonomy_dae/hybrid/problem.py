@@ -1,0 +1,100 @@
+"""What a model with events gives to the solver that watches over it."""
+
+import abc
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+
+class AbstractHybridProblem(eqx.Module):
+    """Equations whose discrete values `q` stay constant between events.
+
+    Sampled events come first, `n_clocks` of them, then `n_guards` events of conditions: each has a guard that falls
+    through zero where its condition becomes true.
+    """
+
+    n_clocks: eqx.AbstractVar[int]
+    n_guards: eqx.AbstractVar[int]
+    ends: eqx.AbstractVar[tuple[bool, ...]]  # which events end the run
+    immediate: eqx.AbstractVar[tuple[bool, ...]]  # which happen at the initial time, if their conditions hold there
+
+    @abc.abstractmethod
+    def term(self, q: Float[Array, " q"]) -> diffrax.AbstractTerm:
+        """The term while the discrete values are q."""
+
+    @abc.abstractmethod
+    def prepared(self, solver: diffrax.AbstractSolver, q: Float[Array, " q"]) -> diffrax.AbstractSolver:
+        """The solver for that term."""
+
+    @abc.abstractmethod
+    def field(self, t: Any, x: Float[Array, " n"], q: Float[Array, " q"], args: Any) -> Float[Array, " n"]:
+        """dx/dt."""
+
+    @abc.abstractmethod
+    def guards(self, t: Any, x: Float[Array, " n"], q: Float[Array, " q"], args: Any) -> Float[Array, " guards"]:
+        """The guards' values."""
+
+    @abc.abstractmethod
+    def written(
+        self, t: Any, x: Float[Array, " n"], q: Float[Array, " q"], previous: Float[Array, " q"], event: Any, args: Any
+    ) -> tuple[Float[Array, " n"], Float[Array, " q"]]:
+        """(x, q) after an event, consistent; `previous` are the discrete values before the instant."""
+
+    @abc.abstractmethod
+    def clocks(self) -> tuple[Float[Array, " clocks"], Float[Array, " clocks"]]:
+        """Periods and offsets of the sampled events."""
+
+    def due(self, ticks: Float[Array, " clocks"]) -> Float[Array, " clocks"]:
+        """When each sampled event happens next, after so many ticks."""
+        period, offset = self.clocks()
+        return offset + ticks * period
+
+    def slope(self, t: Any, x: Any, q: Any, args: Any) -> Float[Array, " n"]:
+        """dx/dt, not differentiated."""
+        frozen, *point = still((self, t, x, q, args))
+        return lax.stop_gradient(frozen.field(*point))
+
+    def rates(
+        self, t: Any, x: Any, q: Any, args: Any, slope: Any
+    ) -> tuple[Float[Array, " guards"], Float[Array, " guards"]]:
+        """The guards' values, and how fast they change where x does with this slope; not differentiated."""
+        frozen, t, x, q, args = still((self, t, x, q, args))
+        return jax.jvp(lambda t, x: frozen.guards(t, x, q, args), (t, x), (jnp.ones_like(t), slope))
+
+
+class HybridState(eqx.Module):
+    """What is integrated: the state `x`, the discrete values `q`, and the bookkeeping of events.
+
+    - `armed`: 1.0 for guards that have been positive since their event.
+    - `request`: where the step that was tried should have ended, or infinity.
+    - `ticks`, `due`: how often each clock has ticked, and when it does next.
+    - `count`, `times`, `which`, `rate`: how many events there were, and of the first ones the time, the number of the
+        event and how fast its guard fell.
+    - `ended`: 1.0 once an event has ended the run.
+    """
+
+    x: Float[Array, " n"]
+    q: Float[Array, " q"]
+    armed: Float[Array, " guards"]
+    request: Float[Array, ""]
+    ticks: Float[Array, " clocks"]
+    due: Float[Array, " clocks"]
+    count: Float[Array, ""]
+    times: Float[Array, " events"]
+    which: Float[Array, " events"]
+    rate: Float[Array, " events"]
+    ended: Float[Array, ""]
+
+
+def still(tree: Any) -> Any:
+    """The same, not differentiated."""
+    return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf, tree)
+
+
+def one_hot(index: Any, n: int) -> Bool[Array, " n"]:
+    return jnp.arange(n) == index

@@ -1,0 +1,60 @@
+"""Where in a step the first guard falls through zero."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+from jax import lax
+
+ITERATIONS = 48
+BISECT_EVERY = 6
+
+
+def first_crossing(
+    guards: Callable[[Any], Any], armed: Any, low: Any, high: Any, at_low: Any, at_high: Any, going: Any
+) -> Any:
+    """The first zero of armed guards between `low`, where all are positive, and `high`, where one is not.
+
+    The Illinois variant of regula falsi (Dowell & Jarratt 1971) on the guard that comes first by linear interpolation;
+    bisection now and then, and while the bracket begins where a guard is zero because its event has just been.
+    """
+    one = jnp.array(1, jnp.int32)
+    eps = jnp.finfo(jnp.result_type(high)).eps
+    floor = jnp.maximum(1e-13 * (high - low), 4 * eps * jnp.abs(high))
+    tiny = jnp.finfo(jnp.result_type(at_low)).tiny
+    start = low
+
+    def estimate(low, high, at_low, at_high):
+        each = low + (high - low) * at_low / jnp.maximum(at_low - at_high, tiny)
+        return jnp.min(jnp.where(armed & (at_high <= 0), each, jnp.inf))
+
+    def body(carry):
+        low, high, at_low, at_high, side, last, _, k = carry
+        width = high - low
+        t = jnp.clip(estimate(low, high, at_low, at_high), low + 1e-13 * width, high - 1e-13 * width)
+        begins_at_zero = (low == start) & jnp.any(armed & (at_high <= 0) & (at_low <= 1e-6 * jnp.abs(at_high)))
+        t = jnp.where((k % BISECT_EVERY == BISECT_EVERY - 1) | begins_at_zero, 0.5 * (low + high), t)
+        value = guards(t)
+        hit = jnp.any(armed & (value <= 0))
+        again = jnp.where(hit, side == 1, side == -1)
+        new_low = jnp.where(hit, jnp.where(again, 0.5 * at_low, at_low), value)
+        new_high = jnp.where(hit, value, jnp.where(again, 0.5 * at_high, at_high))
+        return (
+            jnp.where(hit, low, t),
+            jnp.where(hit, t, high),
+            new_low,
+            new_high,
+            jnp.where(hit, one, -one),
+            t,
+            jnp.abs(t - last),
+            k + 1,
+        )
+
+    def unfinished(carry):
+        *_, moved, k = carry
+        return going & (k < ITERATIONS) & (moved > floor)
+
+    zero = jnp.zeros_like(one)
+    carry = (low, high, jnp.maximum(at_low, 0.0), at_high, zero, high, high - low, zero)
+    *_, last, _, _ = lax.while_loop(unfinished, body, carry)
+    return last

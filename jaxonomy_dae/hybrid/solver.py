@@ -1,0 +1,202 @@
+"""Any solver, with steps that end at events."""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from ..adjoint.closure_conversion import any_member
+from .event_map import handle
+from .problem import HybridState, still
+from .search import first_crossing
+from .term import bound, problem_of
+
+WINDOW = 1e-6  # of a step: a guard that reaches zero so close to its end counts as having done so
+# Where guards are looked at, as parts of a step; and how far, as a part of its size, a guard may be from the parabola
+# through its values at the first, the middle and the last of these. One that bends more may cross zero unseen, and the
+# step is taken in halves.
+LOOKS = np.array([0.0, 0.23, 0.5, 0.79, 1.0])
+BEND = 0.1
+NEARLY = 0.01  # of a guard's size in the step: beyond that it is not at zero at its end
+
+TOO_MANY: Any = diffrax.RESULTS.max_steps_rejected  # events
+
+
+def _off_parabola() -> np.ndarray:
+    """The distances of the values at LOOKS from the parabola through the first, the middle and the last, (2, 5)."""
+    chosen, others = LOOKS[[0, 2, 4]], LOOKS[[1, 3]]
+    weights = np.vander(others, 3) @ np.linalg.inv(np.vander(chosen, 3))
+    out = np.zeros((2, len(LOOKS)))
+    out[:, [0, 2, 4]] = -weights
+    out[[0, 1], [1, 3]] = 1.0
+    return out
+
+
+_OFF_PARABOLA = _off_parabola()
+
+
+class HybridInterpolation(diffrax.AbstractLocalInterpolation):
+    """Within a step, x of the inner solver's dense output; at its end, what events made of it."""
+
+    t0: Any
+    t1: Any
+    inner: Any
+    y0: HybridState
+    y1: HybridState
+    fired: Any
+
+    def evaluate(self, t0, t1=None, left=True):
+        if t1 is not None:
+            return jax.tree.map(jnp.subtract, self.evaluate(t1), self.evaluate(t0))
+        before = eqx.tree_at(lambda y: y.x, self.y0, self.inner(self.t0, self.t1, t0))
+        at_end = self.fired & (t0 >= self.t1)
+        return jax.tree.map(lambda a, b: jnp.where(at_end, a, b), self.y1, before)
+
+
+class _Dense(eqx.Module):
+    """The inner solver's dense output."""
+
+    interpolation: Any = eqx.field(static=True)
+    info: Any
+
+    def __call__(self, t0: Any, t1: Any, t: Any) -> Any:
+        return self.interpolation(t0=t0, t1=t1, **self.info).evaluate(t)
+
+
+class WithEvents(diffrax.AbstractWrappedSolver):
+    """Takes the steps of a solver, and ends one where an event happens.
+
+    - `solver`: the problem prepares it for the discrete values at hand.
+    - `max_events`: more of them end the run with `TOO_MANY`.
+    """
+
+    solver: diffrax.AbstractSolver
+    max_events: int = eqx.field(static=True)
+
+    term_structure = diffrax.AbstractTerm
+    interpolation_cls = HybridInterpolation  # pyright: ignore[reportAssignmentType]
+
+    @property
+    def term_compatible_contr_kwargs(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return {}
+
+    @property
+    def scan_kind(self):
+        """How the wrapped solver loops over its stages."""
+        return self.solver.scan_kind  # pyright: ignore[reportAttributeAccessIssue]
+
+    @property
+    def root_finder(self):
+        """How the wrapped solver finds roots."""
+        return self.solver.root_finder  # pyright: ignore[reportAttributeAccessIssue]
+
+    @property
+    def root_find_max_steps(self):
+        """How long the wrapped solver looks for roots."""
+        return self.solver.root_find_max_steps  # pyright: ignore[reportAttributeAccessIssue]
+
+    def order(self, terms):
+        return self.solver.order(terms)
+
+    def strong_order(self, terms):
+        return self.solver.strong_order(terms)
+
+    def error_order(self, terms):
+        return self.solver.error_order(terms)
+
+    def func(self, terms, t0, y0, args):
+        if isinstance(y0, HybridState):
+            return self.solver.func(bound(terms, y0.q), t0, y0.x, args)
+        return self.solver.func(terms, t0, y0, args)
+
+    def init(self, terms, t0, t1, y0, args):
+        solver = problem_of(terms).prepared(self.solver, y0.q)
+        return solver.init(bound(terms, y0.q), t0, t1, y0.x, args), jnp.array(False)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        problem = problem_of(terms)
+        inner_state, jumped = solver_state
+        made_jump = jumped if made_jump is False else made_jump | jumped
+        solver = problem.prepared(self.solver, y0.q)
+        x1, y_error, info, inner_state, result = solver.step(
+            bound(terms, y0.q), t0, t1, y0.x, args, inner_state, made_jump
+        )
+        dense = _Dense(solver.interpolation_cls, info)
+        found = _looked_at(problem, dense, t0, t1, y0, x1, args)
+        request, due, armed, size, window = found
+        state = HybridState(
+            x1,
+            y0.q,
+            armed,
+            jnp.full_like(t1, jnp.inf),
+            y0.ticks,
+            y0.due,
+            y0.count,
+            y0.times,
+            y0.which,
+            y0.rate,
+            y0.ended,
+        )
+        fired = jnp.any(due)
+
+        def events(state):
+            return handle(problem, t1, state, due, size, window, t1 - t0, args)
+
+        y1 = lax.cond(any_member(fired), events, lambda state: state, state)
+        y1 = jax.tree.map(lambda a, b: jnp.where(fired, a, b), y1, state)
+        dense_info = dict(inner=dense, y0=y0, y1=y1, fired=fired)
+        y1 = eqx.tree_at(lambda y: y.request, y1, request)
+        result = diffrax.RESULTS.where(y1.count > self.max_events, TOO_MANY, result)
+        return y1, y_error, dense_info, (inner_state, fired), result
+
+
+def _looked_at(problem, dense, t0, t1, y0: HybridState, x1, args):
+    """(end of the step to take instead, or infinity; which events happen at its end; which guards are armed then; the
+    guards' sizes; the time within which they count as zero), none of it differentiated."""
+    problem, dense, t0, t1, y0, x1, args = still((problem, dense, t0, t1, y0, x1, args))
+    h, q, g = t1 - t0, y0.q, problem.n_guards
+    eps = jnp.finfo(t1.dtype).eps
+    window = jnp.maximum(WINDOW * h, 8 * eps * jnp.abs(t1))
+    ticking = y0.due <= t1 + 8 * eps * jnp.abs(t1)
+    if not g:
+        return jnp.full_like(t1, jnp.inf), ticking, y0.armed, jnp.zeros((0,), x1.dtype), window
+
+    def guards(t):
+        return problem.guards(t, dense(t0, t1, t), q, args)
+
+    times = t0 + h * jnp.asarray(LOOKS[:-1], t1.dtype)
+    values = jnp.concatenate([jax.vmap(guards)(times), problem.guards(t1, x1, q, args)[None]])
+    size = jnp.max(jnp.abs(values), axis=0)
+    # A guard that was positive anywhere before is armed.
+    positive = jnp.concatenate([(y0.armed > 0.5)[None], values[1:] > 0])
+    armed = lax.associative_scan(jnp.logical_or, positive)
+    crossed = armed[:-1] & (values[1:] < 0)
+    crossed = crossed.at[-1].set(armed[-2] & (values[-1] <= 0))
+    last = values[-1]
+
+    def at_end():
+        _, rate = problem.rates(t1, x1, q, args, problem.slope(t1, x1, q, args))
+        return (rate < 0) & (jnp.abs(last) <= -rate * window)
+
+    doubtful = jnp.any(armed[-1] & (last <= NEARLY * size))
+    near = lax.cond(any_member(doubtful), at_end, lambda: jnp.zeros((g,), bool)) & armed[-1]
+    bent = jnp.any(jnp.abs(jnp.asarray(_OFF_PARABOLA, values.dtype) @ values) > BEND * size)
+    bent = bent & (h > 1e3 * window)
+    within = jnp.any(crossed[:-1], axis=0)
+    inside = jnp.any(within | (crossed[-1] & ~near))
+
+    def located():
+        place = jnp.argmax(jnp.any(crossed, axis=1))
+        ends = jnp.append(times, t1)
+        return first_crossing(
+            guards, armed[place], ends[place], ends[place + 1], values[place], values[place + 1], inside
+        )
+
+    where = lax.cond(any_member(inside), located, lambda: t1)
+    request = jnp.where(bent, t0 + 0.5 * h, jnp.where(inside, where, jnp.inf))
+    due = jnp.concatenate([ticking, near]) & ~inside & ~bent
+    return request, due, armed[-1].astype(y0.armed.dtype), size, window

@@ -1,0 +1,36 @@
+"""Where a run with events begins."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from .event_map import handle
+from .problem import AbstractHybridProblem, HybridState
+
+
+def start(problem: AbstractHybridProblem, t0: Any, x0: Any, q0: Any, args: Any, logged: int) -> HybridState:
+    """The state at the initial time, after the clocks that tick there, and after the events that are immediate."""
+    c, g = problem.n_clocks, problem.n_guards
+    dtype = t0.dtype
+    nothing, infinite = jnp.zeros((), dtype), jnp.full((logged,), jnp.inf, dtype)
+    period, offset = (lax.stop_gradient(v) for v in problem.clocks())
+    tolerance = 8 * jnp.finfo(dtype).eps * jnp.abs(t0)
+    ticks = jnp.maximum(jnp.ceil((t0 - tolerance - offset) / period), 0.0)
+    armed = size = jnp.zeros((0,), dtype)
+    holding = jnp.zeros((0,), bool)
+    if g:
+        value, rate = problem.rates(t0, x0, q0, args, problem.slope(t0, x0, q0, args))
+        holding = jnp.where(value == 0, rate < 0, value < 0)
+        armed, size = (~holding).astype(dtype), jnp.abs(value)
+    state = HybridState(
+        x0, q0, armed, jnp.asarray(jnp.inf, dtype), ticks, lax.stop_gradient(problem.due(ticks)), nothing,
+        infinite, jnp.full_like(infinite, -1.0), jnp.zeros_like(infinite), nothing,
+    )  # fmt: skip
+    at_once = np.array(problem.immediate[c:], bool)
+    if not c and not at_once.any():
+        return state
+    due_conditions = holding & at_once
+    due = jnp.concatenate([state.due <= t0 + tolerance, due_conditions])
+    return handle(problem, t0, state, due, size, tolerance, tolerance, args, at_start=True)

@@ -1,0 +1,33 @@
+"""The term of a problem with events, as Diffrax sees it."""
+
+from typing import Any
+
+import diffrax
+
+from .problem import AbstractHybridProblem, HybridState
+
+
+class HybridTerm(diffrax.AbstractTerm):
+    """Stands for the equations; a solver asks it for those that hold while the discrete values are q."""
+
+    problem: AbstractHybridProblem
+
+    def vf(self, t: Any, y: HybridState, args: Any) -> Any:
+        return self.problem.field(t, y.x, y.q, args)
+
+    def contr(self, t0: Any, t1: Any, **kwargs: Any) -> Any:
+        return t1 - t0
+
+    def prod(self, vf: Any, control: Any) -> Any:
+        raise NotImplementedError("a solver for events takes steps by the term of the discrete values at hand")
+
+
+def problem_of(terms: Any) -> AbstractHybridProblem:
+    """The problem in the terms that Diffrax hands to a solver or a controller: it wraps a term in its direction."""
+    return terms.problem if isinstance(terms, HybridTerm) else terms.term.problem
+
+
+def bound(terms: Any, q: Any) -> Any:
+    """The terms while the discrete values are q."""
+    term = problem_of(terms).term(q)
+    return term if isinstance(terms, HybridTerm) else type(terms)(term, terms.direction)

@@ -1,0 +1,208 @@
+"""How a component declares discrete variables and events."""
+
+from typing import Any
+
+import sympy
+
+from ..errors import ModelError
+from .environment import EqnEnv
+from .events import Action, Assign, Reinit, Sampled, Terminate, When, guard_of, relation_in_discretes
+from .symbols import DiscreteSymbol, PreviousSymbol, VariableSymbol
+
+
+class EventDeclarations:
+    """The part of `Component` that concerns events."""
+
+    # What the rest of it has.
+    ev: EqnEnv
+    name: str
+    path: str
+    events: list[When]
+    equations: list[sympy.Expr]
+    _sealed: bool
+    _declare: Any
+    _declare_parameter: Any
+    _check_parameters_only: Any
+
+    def discrete(self, name: str, start: Any = 0.0, unit: str = "") -> DiscreteSymbol:
+        """Declares a discrete variable: constant but for the events that assign it.
+
+        **Arguments:**
+
+        - `name`: its local name; `solution["component.name"]` is a step function of time.
+        - `start`: a number or an expression in parameters: its value from the initial time to the first event that
+            assigns it. It is a parameter of the system, `system.with_parameters({"component.name": 1.0})`.
+        - `unit`: shown in reports and plots.
+
+        **Raises:**
+
+        - `ModelError` for a start that is not a finite number or an expression in parameters.
+        """
+        return DiscreteSymbol(self._declare_parameter(name, "discrete variable", start, unit))
+
+    def sampled(self, period: Any, offset: Any = 0.0) -> Sampled:
+        """A condition for `when` that becomes true again and again, at offset + k·period for k = 0, 1, 2, …
+
+        **Arguments:**
+
+        - `period` > 0, `offset`: second; numbers or expressions in parameters, which may be trained. Of instants
+            before the initial time, and of the initial time itself, nothing happens.
+        """
+        parts = []
+        for what, value in (("period", period), ("offset", offset)):
+            found = sympy.sympify(value)
+            where = f"component '{self.name}': the {what} of sampled"
+            if not isinstance(found, sympy.Expr):
+                raise ModelError(f"{where} is a number or an expression in parameters; got {value!r}")
+            self._check_parameters_only(found, where)
+            if any(isinstance(s, DiscreteSymbol) for s in found.free_symbols):
+                raise ModelError(f"{where} must not change between events; it uses a discrete variable: {found}")
+            parts.append(found)
+        if parts[0].is_number and not float(parts[0]) > 0:
+            raise ModelError(f"component '{self.name}': the period of sampled must be positive; got {parts[0]}")
+        return Sampled(*parts)
+
+    def either(self, mode: Any, then: Any, otherwise: Any) -> None:
+        """Adds an equation with two branches: `then` is zero while the mode holds, `otherwise` is zero while it does
+        not. An ideal switch is `self.either(Eq(closed, 1), v, i)`.
+
+        **Arguments:**
+
+        - `mode`: a relation in discrete variables, or one of them, which is true if it is not zero.
+        - `then`, `otherwise`: expressions. Both must determine something at the level at which the other does: where
+            one branch would hold back a state (a position, a speed), write it for the derivative of that state, and
+            let the event that begins the mode set the state.
+
+        **Raises:**
+
+        - `ModelError` for a mode that is not discrete.
+        """
+        where = f"component '{self.name}': either"
+        condition = relation_in_discretes(mode, where)
+        self.add_equations(sympy.Piecewise((sympy.sympify(then), condition), (sympy.sympify(otherwise), True)))
+
+    def complementary(self, gap: Any, force: Any, name: str = "active") -> DiscreteSymbol:
+        """Adds gap ≥ 0, force ≥ 0 and gap·force = 0: one of the two is zero, and the other is not negative.
+
+        An ideal diode is `self.complementary(-v, i)`: it blocks while the voltage is negative and conducts without
+        voltage while the current is positive.
+
+        **Arguments:**
+
+        - `gap`, `force`: expressions, both of algebraic variables or of derivatives, not of states.
+        - `name`: of the discrete variable that says which one is zero: 1 while the gap is, 0 while the force is. At the
+            initial time it becomes what the equations ask for.
+
+        **Returns:**
+
+        The discrete variable.
+        """
+        active = self.discrete(name, start=0)
+        self.either(sympy.Eq(active, 1), gap, force)
+        self._event(sympy.sympify(force) <= 0, (Assign(active, sympy.Integer(0)),), sympy.Eq(active, 1), True)
+        self._event(sympy.sympify(gap) <= 0, (Assign(active, sympy.Integer(1)),), sympy.Eq(active, 0), True)
+        return active
+
+    def when(self, condition: Any, *actions: Action, on: Any = None) -> None:
+        """Declares an event: what happens at the instant at which a condition becomes true.
+
+        ```python
+        self.when(h <= 0, reinit(v, -e * pre(v)))                       # a ball bounces
+        self.when(T > high, assign(on, 0))                              # a thermostat
+        self.when(self.sampled(0.1), assign(u, Kp * (r - y)))           # a sampled controller
+        ```
+
+        **Arguments:**
+
+        - `condition`: a relation (`<`, `<=`, `>`, `>=`) in variables, discrete variables, parameters and time, several
+            of them in `And` and `Or`, or `self.sampled(period)`. The event happens where it turns from false to true,
+            and not again before it has been false; not at the initial time, if it holds there.
+        - `actions`: `reinit(state, value)`, `assign(discrete, value)`, `terminate("why")`. In values, variables are
+            those before the event. Discrete variables are those before the event if read as `pre(d)`; read as `d`, what
+            this event assigns to `d`.
+        - `on`: a relation in discrete variables; the event happens only while it holds.
+
+        **Raises:**
+
+        - `ModelError` for conditions and actions that cannot be meant.
+        """
+        self._event(condition, actions, on, immediate=False)
+
+    def _event(self, condition: Any, actions: tuple[Action, ...], on: Any, immediate: bool) -> None:
+        if self._sealed:
+            raise ModelError(f"component '{self.path}' is complete: declare its events inside __init__ of its class")
+        where = f"component '{self.name}': when"
+        if not actions:
+            raise ModelError(f"{where}({condition}): say what happens: reinit(…), assign(…) or terminate(…)")
+        for action in actions:
+            if not isinstance(action, Reinit | Assign | Terminate):
+                raise ModelError(
+                    f"{where}: what happens is said with reinit(…), assign(…) and terminate(…); got {action!r}"
+                )
+        number = len(self.events)
+        clock = condition if isinstance(condition, Sampled) else None
+        guard, text = None, f"sampled({getattr(clock, 'period', '')})"
+        if clock is None:
+            text = str(condition) if on is None else f"{condition}, on={on}"
+            expression = guard_of(condition, where)
+            if on is not None:
+                expression = sympy.Max(expression, guard_of(relation_in_discretes(on, f"{where}, on"), where))
+            if not any(isinstance(s, VariableSymbol | DiscreteSymbol) for s in expression.free_symbols) and not any(
+                s is self.ev.t for s in expression.free_symbols
+            ):
+                raise ModelError(f"{where}({condition}): the condition contains no variable: it never changes")
+            past = [s for s in expression.free_symbols if isinstance(s, PreviousSymbol)]
+            if past:
+                raise ModelError(f"{where}({condition}): a condition is on the present: write {past[0].path}")
+            guard = self._hidden(f":when[{number}]", expression)
+        elif on is not None:
+            raise ModelError(f"{where}: on= is for conditions on variables; a sampled event always happens")
+        values = self._values(actions, number, where)
+        self.events.append(When(text, guard, clock, tuple(actions), values, immediate))
+
+    def _hidden(self, name: str, expression: sympy.Expr) -> str:
+        """Declares a variable that equals an expression, and is not shown."""
+        symbol = self._declare(name, "event")
+        self.equations.append(symbol - expression)
+        return name
+
+    def _values(self, actions: tuple[Action, ...], number: int, where: str) -> tuple:
+        """What the actions write, as numbers and names of hidden variables."""
+        new: dict[DiscreteSymbol, sympy.Expr] = {}
+        targets: list[Any] = []
+        for action in actions:
+            if isinstance(action, Terminate):
+                continue
+            if action.target in targets:
+                raise ModelError(f"{where}: '{action.target}' is given two values by one event")
+            if isinstance(action, Reinit) and action.target.order and isinstance(action.target, VariableSymbol):
+                raise ModelError(
+                    f"{where}: reinit takes a variable, not {action.target}: declare the derivative as a variable, "
+                    f"Eq(v, {action.target}), and write reinit(v, …)"
+                )
+            targets.append(action.target)
+            if isinstance(action, Assign):
+                new[action.target] = action.value
+        values: list[str | float | None] = []
+        for k, action in enumerate(actions):
+            if isinstance(action, Terminate):
+                values.append(None)
+                continue
+            value = _with_new_values(action.value, new, (), where)
+            if value.is_number:
+                values.append(float(value))
+            else:
+                values.append(self._hidden(f":when[{number},{k}]", value))
+        return tuple(values)
+
+
+def _with_new_values(value: Any, new: dict, above: tuple, where: str) -> Any:
+    """A value in which discrete variables that the same event assigns are what they are assigned."""
+    read = sorted((s for s in value.free_symbols if s in new), key=str)
+    for symbol in read:
+        if symbol in above:
+            raise ModelError(
+                f"{where}: the values of {', '.join(str(s) for s in above)} depend on each other; read the value "
+                f"before the event with pre({symbol})"
+            )
+    return value.xreplace({s: _with_new_values(new[s], new, (*above, s), where) for s in read})

@@ -1,0 +1,174 @@
+"""What a component says of events: conditions, and what happens when they become true."""
+
+import dataclasses
+from typing import Any, TypeAlias
+
+import sympy
+from sympy.logic.boolalg import BooleanAtom, BooleanFunction, to_nnf
+
+from ..errors import ModelError
+from .symbols import DiscreteSymbol, ParameterSymbol, PreviousSymbol, TimeSymbol, VariableSymbol
+
+ALWAYS = sympy.true
+
+
+@dataclasses.dataclass(frozen=True)
+class Reinit:
+    """A state that starts anew at `value`."""
+
+    target: VariableSymbol
+    value: sympy.Expr
+
+
+@dataclasses.dataclass(frozen=True)
+class Assign:
+    """A discrete variable that takes a `value`."""
+
+    target: DiscreteSymbol
+    value: sympy.Expr
+
+
+@dataclasses.dataclass(frozen=True)
+class Terminate:
+    """The end of the run."""
+
+    message: str
+
+
+Action: TypeAlias = Reinit | Assign | Terminate
+
+
+@dataclasses.dataclass(frozen=True)
+class Sampled:
+    """A condition that becomes true at offset, offset + period, …"""
+
+    period: sympy.Expr
+    offset: sympy.Expr
+
+
+@dataclasses.dataclass(frozen=True)
+class When:
+    """One `when` of a component: `guard` is the name of the hidden variable that falls through zero where the condition
+    becomes true, `clock` the period and the offset of a sampled one. `values` are the names of the hidden variables, or
+    the numbers, that the actions write; `text` is what the user wrote. One that is `immediate` happens at the initial
+    time, too, if its condition holds there."""
+
+    text: str
+    guard: str | None
+    clock: Sampled | None
+    actions: tuple[Action, ...]
+    values: tuple[str | float | None, ...]
+    immediate: bool = False
+
+
+def pre(symbol: Any) -> sympy.Expr:
+    """The value of a variable before the event that is being handled; for use in `reinit` and `assign`.
+
+    **Raises:**
+
+    - `ModelError` for what is neither a variable nor a discrete variable.
+    """
+    if isinstance(symbol, DiscreteSymbol):
+        return PreviousSymbol(symbol.path)
+    if isinstance(symbol, VariableSymbol):
+        return symbol  # actions read continuous variables before the event anyway
+    raise ModelError(f"pre takes a variable or a discrete variable; got {symbol}")
+
+
+def reinit(variable: Any, value: Any) -> Reinit:
+    """In `when`: lets a state start anew. In `value`, variables have their values before the event.
+
+    **Raises:**
+
+    - `ModelError` if the first argument is not a variable, or the value is not an expression.
+    """
+    if isinstance(variable, ParameterSymbol):
+        kind = "discrete variable: write assign(…)" if isinstance(variable, DiscreteSymbol) else "parameter"
+        raise ModelError(f"reinit takes a variable; '{variable}' is a {kind}")
+    if not isinstance(variable, VariableSymbol):
+        raise ModelError(f"reinit takes a variable; got {variable}")
+    return Reinit(variable, _expression(value, f"reinit({variable}, …)"))
+
+
+def assign(variable: Any, value: Any) -> Assign:
+    """In `when`: gives a discrete variable a value, which it keeps until the next event that assigns it.
+
+    **Raises:**
+
+    - `ModelError` if the first argument is not a discrete variable, or the value is not an expression.
+    """
+    if not isinstance(variable, DiscreteSymbol):
+        mend = ": write reinit(…)" if isinstance(variable, VariableSymbol) else ""
+        raise ModelError(f"assign takes a discrete variable, as self.discrete(…) returns; got {variable}{mend}")
+    return Assign(variable, _expression(value, f"assign({variable}, …)"))
+
+
+def terminate(message: str) -> Terminate:
+    """In `when`: ends the run. `solution.events.terminated` then has the message."""
+    if not isinstance(message, str) or not message:
+        raise ModelError(f"terminate takes a text that says why the run ends; got {message!r}")
+    return Terminate(message)
+
+
+def _expression(value: Any, where: str) -> sympy.Expr:
+    try:
+        found = sympy.sympify(value)
+    except (sympy.SympifyError, TypeError):
+        found = None
+    if isinstance(value, str) or not isinstance(found, sympy.Expr):
+        raise ModelError(f"{where}: the value is an expression or a number; got {value!r}")
+    return found
+
+
+def guard_of(condition: Any, where: str) -> sympy.Expr:
+    """An expression that is positive where a condition is false, and falls through zero where it becomes true."""
+    relation: Any = condition
+    if isinstance(condition, BooleanAtom | bool):
+        raise ModelError(f"{where}: the condition is always {condition}: it contains no variable")
+    if isinstance(condition, sympy.And):
+        return sympy.Max(*(guard_of(c, where) for c in condition.args))
+    if isinstance(condition, sympy.Or):
+        return sympy.Min(*(guard_of(c, where) for c in condition.args))
+    if isinstance(condition, sympy.Not):
+        return guard_of(to_nnf(condition), where)
+    if _is_discrete(condition):
+        return sympy.Piecewise((-1, condition), (1, True))
+    if isinstance(condition, sympy.LessThan | sympy.StrictLessThan):
+        return relation.lhs - relation.rhs
+    if isinstance(condition, sympy.GreaterThan | sympy.StrictGreaterThan):
+        return relation.rhs - relation.lhs
+    return _refused(condition, where)
+
+
+def relation_in_discretes(mode: Any, where: str) -> Any:
+    """A condition that changes by events alone: a relation in discrete variables, or one of them, true if not zero.
+
+    **Raises:**
+
+    - `ModelError` for anything else.
+    """
+    if isinstance(mode, DiscreteSymbol):
+        return sympy.Ne(mode, 0)
+    if not _is_discrete(mode):
+        raise ModelError(f"{where}: the mode is a relation in discrete variables, or one of them; got {mode}")
+    return mode
+
+
+def _is_discrete(condition: Any) -> bool:
+    """Whether nothing in a relation changes between events."""
+    symbols = condition.free_symbols
+    return isinstance(condition, sympy.core.relational.Relational | BooleanFunction) and not any(
+        isinstance(s, VariableSymbol | TimeSymbol) for s in symbols
+    )
+
+
+def _refused(condition: Any, where: str) -> sympy.Expr:
+    if isinstance(condition, sympy.Eq | sympy.Ne):
+        raise ModelError(
+            f"{where}: {condition} holds at single instants only, if ever: write <= or >=, for a crossing in one "
+            "direction; == is for discrete variables"
+        )
+    raise ModelError(
+        f"{where}: the condition is a relation such as h <= 0, several of them in And or Or, or self.sampled(T); "
+        f"got {condition!r}"
+    )

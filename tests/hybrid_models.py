@@ -1,0 +1,81 @@
+"""Models with events that several tests share."""
+
+from sympy import Abs, sign
+
+from jaxonomy_dae import (
+    AcausalCompiler,
+    AcausalDiagram,
+    AcausalSystem,
+    Component,
+    EqnEnv,
+    assign,
+    der,
+    pre,
+    reinit,
+    terminate,
+)
+from jaxonomy_dae.modeling import Eq
+
+
+def compiled(component: type, name: str, **arguments) -> AcausalSystem:
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    diagram.add(component(ev, name, **arguments))
+    return AcausalCompiler(ev, diagram)()
+
+
+class Ball(Component):
+    """A ball that bounces, and counts how often."""
+
+    def __init__(self, ev, name, h0=1.0, e=0.8, g=9.81, stop=None):
+        super().__init__(ev, name)
+        restitution, gravity, height = self.parameter("e", e), self.parameter("g", g), self.parameter("h0", h0)
+        h = self.variable("h", start=height, fixed=True)
+        v = self.variable("v", start=0.0, fixed=True)
+        n = self.discrete("n", start=0)
+        self.add_equations(Eq(der(h), v), Eq(der(v), -gravity))
+        self.when(h <= 0, reinit(v, -restitution * pre(v)), reinit(h, 0), assign(n, pre(n) + 1))
+        if stop is not None:
+            self.when(n >= stop, terminate("bounced enough"))
+
+
+class Thermostat(Component):
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        C, G = self.parameter("C", 1.0), self.parameter("G", 0.1)
+        P, outside = self.parameter("P", 10.0), self.parameter("outside", 20.0)
+        T = self.variable("T", start=20.0, fixed=True)
+        q = self.variable("q")
+        on = self.discrete("on", start=1)
+        self.add_equations(Eq(C * der(T), q - G * (T - outside)), Eq(q, on * P))
+        self.when(T < 49, assign(on, 1))
+        self.when(T > 51, assign(on, 0))
+
+
+class SampledPI(Component):
+    """A lag of first order and a controller that sees it ten times a second."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        Kp, Ki = self.parameter("Kp", 2.0), self.parameter("Ki", 3.0)
+        T, r = self.parameter("T", 0.1), self.parameter("r", 1.0)
+        x = self.variable("x", start=0.0, fixed=True)
+        u, total = self.discrete("u"), self.discrete("I")
+        self.add_equations(Eq(der(x), -x + u))
+        self.when(self.sampled(T), assign(u, Kp * (r - x) + pre(total)), assign(total, pre(total) + Ki * T * (r - x)))
+
+
+class Stick(Component):
+    """A mass pushed by a growing force against dry friction: it sticks until the force is large enough, slides, and
+    sticks again when it has come to rest; written as an acceleration that is zero while it sticks."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        m, mu = self.parameter("m", 2.0), self.parameter("mu", 3.0)
+        x = self.variable("x", start=0.0, fixed=True)
+        v = self.variable("v", start=0.0, fixed=True)
+        push = self.variable("push")
+        mode = self.discrete("mode", start=0)
+        force = 4 * (1 - (ev.t - 1) ** 2)
+        self.add_equations(Eq(push, force), Eq(der(x), v), Eq(m * der(v), Abs(mode) * (push - mu * mode)))
+        self.when(Abs(push) >= mu, assign(mode, sign(push)), on=Eq(mode, 0))
+        self.when(mode * v <= 0, assign(mode, 0), reinit(v, 0), on=Eq(Abs(mode), 1))
