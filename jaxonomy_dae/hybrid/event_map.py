@@ -9,7 +9,7 @@ has the value R and, f⁻ and f⁺ being constants, the saltation matrix as its 
 clock ticks at τ = offset + k·period, a function of parameters, in the same manner.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -35,18 +35,27 @@ class Instant(eqx.Module):
     previous: Any
 
 
-def handle(
-    problem: AbstractHybridProblem, t: Any, state: HybridState, due: Any, size: Any, window: Any, span: Any, args: Any,
-    at_start: bool = False,
-) -> HybridState:  # fmt: skip
-    """The state after all events of an instant.
+class Arrival(NamedTuple):
+    """What a step meets at its end, not differentiated.
 
     - `due`: which events happen, shape (clocks + guards,).
-    - `size`: of the guards in the step before, shape (guards,); `span`: that step's length; `window`: the time within
-        which a guard counts as having reached zero.
-    - `at_start`: whether this is the initial time, which does not move with parameters; what happens there is not
-        logged.
+    - `jumped`: which guards jumped over zero, so that their events do not move in time, shape (guards,).
+    - `size`: of the guards in the step, shape (guards,).
+    - `window`: the time within which a guard counts as having reached zero; `span`: the length of the step.
     """
+
+    due: Any
+    jumped: Any
+    size: Any
+    window: Any
+    span: Any
+
+
+def handle(
+    problem: AbstractHybridProblem, t: Any, state: HybridState, arrival: Arrival, args: Any, at_start: bool = False
+) -> HybridState:
+    """The state after all events of an instant. At the initial time, `at_start`, events do not move with parameters and
+    are not logged."""
     c, g = problem.n_clocks, problem.n_guards
     ends = jnp.asarray(problem.ends).astype(t.dtype)
 
@@ -77,7 +86,7 @@ def handle(
         ticks = state.ticks + one_hot(event, c).astype(state.ticks.dtype)
         logged = ~is_clock & (not at_start)
         row = jnp.where(logged, state.count.astype(int), state.times.shape[0])
-        armed, left, caused = _following(problem, t, x, new, after, instant, event, size, window, span, args)
+        armed, left, caused = _following(problem, t, x, new, after, instant, event, arrival, args)
         state = HybridState(
             x - after * delay,
             new,
@@ -103,14 +112,13 @@ def handle(
 
         return lax.cond(any_member(going), go, lambda instant: instant, instant), None
 
-    nothing = jnp.zeros((g,), bool)
-    start = Instant(state, due, nothing, jnp.zeros_like(t), state.q)
+    start = Instant(state, arrival.due, arrival.jumped, jnp.zeros_like(t), state.q)
     length = c + min(2 * g, CONDITIONS_AT_ONE_INSTANT)
     instant, _ = lax.scan(step, start, length=length)
     return instant.state
 
 
-def _following(problem, t, x, q, slope, instant: Instant, event, size, window, span, args):
+def _following(problem, t, x, q, slope, instant: Instant, event, arrival: Arrival, args):
     """(armed guards, events left, which of the guards' were made true by an event) after an event."""
     c, g = problem.n_clocks, problem.n_guards
     left = instant.left & ~one_hot(event, c + g)
@@ -118,9 +126,9 @@ def _following(problem, t, x, q, slope, instant: Instant, event, size, window, s
         return instant.state.armed, left, instant.caused
     value, rate = problem.rates(t, x, q, args, slope)
     here = event - c == jnp.arange(g)
-    zero = jnp.abs(value) <= jnp.maximum(SMALL * size, jnp.abs(rate) * window)
+    zero = jnp.abs(value) <= jnp.maximum(SMALL * arrival.size, jnp.abs(rate) * arrival.window)
     # One that seems to fall from zero by rounding alone is waited for: if it does fall, the next step finds it.
-    true = jnp.where(zero, rate * span < -ROUNDING * size, value < 0)
+    true = jnp.where(zero, rate * arrival.span < -ROUNDING * arrival.size, value < 0)
     was_armed = (instant.state.armed > 0.5) & ~here
     # What this event made true happens next; what was to happen does so unless this event undid it.
     caused = was_armed & true & ~zero

@@ -23,6 +23,8 @@ class AbstractHybridProblem(eqx.Module):
     ends: eqx.AbstractVar[tuple[bool, ...]]  # which events end the run
     immediate: eqx.AbstractVar[tuple[bool, ...]]  # which happen at the initial time, if their conditions hold there
 
+    resolution: eqx.AbstractVar[Any]  # a time that is nothing beside the run, but more than rounding
+
     @abc.abstractmethod
     def term(self, q: Float[Array, " q"]) -> diffrax.AbstractTerm:
         """The term while the discrete values are q."""

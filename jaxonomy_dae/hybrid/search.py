@@ -11,9 +11,9 @@ BISECT_EVERY = 6
 
 
 def first_crossing(
-    guards: Callable[[Any], Any], armed: Any, low: Any, high: Any, at_low: Any, at_high: Any, going: Any
+    guards: Callable[[Any], Any], falling: Any, low: Any, high: Any, at_low: Any, at_high: Any, going: Any
 ) -> Any:
-    """The first zero of armed guards between `low`, where all are positive, and `high`, where one is not.
+    """The first zero of the guards that are `falling`, positive at `low` and not so at `high`.
 
     The Illinois variant of regula falsi (Dowell & Jarratt 1971) on the guard that comes first by linear interpolation;
     bisection now and then, and while the bracket begins where a guard is zero because its event has just been.
@@ -26,16 +26,16 @@ def first_crossing(
 
     def estimate(low, high, at_low, at_high):
         each = low + (high - low) * at_low / jnp.maximum(at_low - at_high, tiny)
-        return jnp.min(jnp.where(armed & (at_high <= 0), each, jnp.inf))
+        return jnp.min(jnp.where(falling & (at_high <= 0), each, jnp.inf))
 
     def body(carry):
         low, high, at_low, at_high, side, last, _, k = carry
         width = high - low
         t = jnp.clip(estimate(low, high, at_low, at_high), low + 1e-13 * width, high - 1e-13 * width)
-        begins_at_zero = (low == start) & jnp.any(armed & (at_high <= 0) & (at_low <= 1e-6 * jnp.abs(at_high)))
+        begins_at_zero = (low == start) & jnp.any(falling & (at_high <= 0) & (at_low <= 1e-6 * jnp.abs(at_high)))
         t = jnp.where((k % BISECT_EVERY == BISECT_EVERY - 1) | begins_at_zero, 0.5 * (low + high), t)
         value = guards(t)
-        hit = jnp.any(armed & (value <= 0))
+        hit = jnp.any(falling & (value <= 0))
         again = jnp.where(hit, side == 1, side == -1)
         new_low = jnp.where(hit, jnp.where(again, 0.5 * at_low, at_low), value)
         new_high = jnp.where(hit, value, jnp.where(again, 0.5 * at_high, at_high))

@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 
 from ..adjoint.closure_conversion import any_member
-from .event_map import handle
+from .event_map import Arrival, handle
 from .problem import HybridState, still
 from .search import first_crossing
 from .term import bound, problem_of
@@ -127,7 +127,7 @@ class WithEvents(diffrax.AbstractWrappedSolver):
         )
         dense = _Dense(solver.interpolation_cls, info)
         found = _looked_at(problem, dense, t0, t1, y0, x1, args)
-        request, due, armed, size, window = found
+        request, armed, arrival = found
         state = HybridState(
             x1,
             y0.q,
@@ -141,10 +141,10 @@ class WithEvents(diffrax.AbstractWrappedSolver):
             y0.rate,
             y0.ended,
         )
-        fired = jnp.any(due)
+        fired = jnp.any(arrival.due)
 
         def events(state):
-            return handle(problem, t1, state, due, size, window, t1 - t0, args)
+            return handle(problem, t1, state, arrival, args)
 
         y1 = lax.cond(any_member(fired), events, lambda state: state, state)
         y1 = jax.tree.map(lambda a, b: jnp.where(fired, a, b), y1, state)
@@ -155,15 +155,15 @@ class WithEvents(diffrax.AbstractWrappedSolver):
 
 
 def _looked_at(problem, dense, t0, t1, y0: HybridState, x1, args):
-    """(end of the step to take instead, or infinity; which events happen at its end; which guards are armed then; the
-    guards' sizes; the time within which they count as zero), none of it differentiated."""
+    """(the end of the step to take instead, or infinity; which guards are armed at its end; what it meets there), not
+    differentiated."""
     problem, dense, t0, t1, y0, x1, args = still((problem, dense, t0, t1, y0, x1, args))
     h, q, g = t1 - t0, y0.q, problem.n_guards
-    eps = jnp.finfo(t1.dtype).eps
-    window = jnp.maximum(WINDOW * h, 8 * eps * jnp.abs(t1))
-    ticking = y0.due <= t1 + 8 * eps * jnp.abs(t1)
+    window = jnp.maximum(WINDOW * h, problem.resolution)
+    ticking = y0.due <= t1 + 0.25 * problem.resolution
     if not g:
-        return jnp.full_like(t1, jnp.inf), ticking, y0.armed, jnp.zeros((0,), x1.dtype), window
+        none = jnp.zeros((0,), bool)
+        return jnp.full_like(t1, jnp.inf), y0.armed, Arrival(ticking, none, jnp.zeros((0,), x1.dtype), window, h)
 
     def guards(t):
         return problem.guards(t, dense(t0, t1, t), q, args)
@@ -174,8 +174,8 @@ def _looked_at(problem, dense, t0, t1, y0: HybridState, x1, args):
     # A guard that was positive anywhere before is armed.
     positive = jnp.concatenate([(y0.armed > 0.5)[None], values[1:] > 0])
     armed = lax.associative_scan(jnp.logical_or, positive)
-    crossed = armed[:-1] & (values[1:] < 0)
-    crossed = crossed.at[-1].set(armed[-2] & (values[-1] <= 0))
+    # One may also reach zero and stay.
+    crossed = armed[:-1] & ((values[1:] < 0) | ((values[1:] == 0) & (values[:-1] > 0)))
     last = values[-1]
 
     def at_end():
@@ -186,17 +186,22 @@ def _looked_at(problem, dense, t0, t1, y0: HybridState, x1, args):
     near = lax.cond(any_member(doubtful), at_end, lambda: jnp.zeros((g,), bool)) & armed[-1]
     bent = jnp.any(jnp.abs(jnp.asarray(_OFF_PARABOLA, values.dtype) @ values) > BEND * size)
     bent = bent & (h > 1e3 * window)
-    within = jnp.any(crossed[:-1], axis=0)
+    # In a step too short to be parted, what has crossed has jumped.
+    short = h <= 4 * problem.resolution
+    jumped = jnp.any(crossed, axis=0) & ~near & short
+    near = near | jumped
+    within = jnp.any(crossed[:-1], axis=0) & ~short
     inside = jnp.any(within | (crossed[-1] & ~near))
 
     def located():
         place = jnp.argmax(jnp.any(crossed, axis=1))
         ends = jnp.append(times, t1)
         return first_crossing(
-            guards, armed[place], ends[place], ends[place + 1], values[place], values[place + 1], inside
+            guards, crossed[place], ends[place], ends[place + 1], values[place], values[place + 1], inside
         )
 
     where = lax.cond(any_member(inside), located, lambda: t1)
+    where = jnp.maximum(where, t0 + 2 * problem.resolution)
     request = jnp.where(bent, t0 + 0.5 * h, jnp.where(inside, where, jnp.inf))
     due = jnp.concatenate([ticking, near]) & ~inside & ~bent
-    return request, due, armed[-1].astype(y0.armed.dtype), size, window
+    return request, armed[-1].astype(y0.armed.dtype), Arrival(due, jumped, size, window, h)

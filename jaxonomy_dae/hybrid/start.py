@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from .event_map import handle
+from .event_map import Arrival, handle
 from .problem import AbstractHybridProblem, HybridState
 
 
@@ -16,7 +16,7 @@ def start(problem: AbstractHybridProblem, t0: Any, x0: Any, q0: Any, args: Any, 
     dtype = t0.dtype
     nothing, infinite = jnp.zeros((), dtype), jnp.full((logged,), jnp.inf, dtype)
     period, offset = (lax.stop_gradient(v) for v in problem.clocks())
-    tolerance = 8 * jnp.finfo(dtype).eps * jnp.abs(t0)
+    tolerance = problem.resolution
     ticks = jnp.maximum(jnp.ceil((t0 - tolerance - offset) / period), 0.0)
     armed = size = jnp.zeros((0,), dtype)
     holding = jnp.zeros((0,), bool)
@@ -33,4 +33,5 @@ def start(problem: AbstractHybridProblem, t0: Any, x0: Any, q0: Any, args: Any, 
         return state
     due_conditions = holding & at_once
     due = jnp.concatenate([state.due <= t0 + tolerance, due_conditions])
-    return handle(problem, t0, state, due, size, tolerance, tolerance, args, at_start=True)
+    arrival = Arrival(due, jnp.zeros((g,), bool), size, tolerance, tolerance)
+    return handle(problem, t0, state, arrival, args, at_start=True)

@@ -6,7 +6,7 @@ import sympy
 
 from ..errors import ModelError
 from .environment import EqnEnv
-from .events import Action, Assign, Reinit, Sampled, Terminate, When, guard_of, relation_in_discretes
+from .events import Action, Assign, Reinit, Sampled, Terminate, When, guard_of, relation_in_discretes, while_on
 from .symbols import DiscreteSymbol, PreviousSymbol, VariableSymbol
 
 
@@ -103,7 +103,7 @@ class EventDeclarations:
         self._event(sympy.sympify(gap) <= 0, (Assign(active, sympy.Integer(1)),), sympy.Eq(active, 0), True)
         return active
 
-    def when(self, condition: Any, *actions: Action, on: Any = None) -> None:
+    def when(self, condition: Any, *actions: Action, on: Any = None, at_start: bool = False) -> None:
         """Declares an event: what happens at the instant at which a condition becomes true.
 
         ```python
@@ -116,17 +116,18 @@ class EventDeclarations:
 
         - `condition`: a relation (`<`, `<=`, `>`, `>=`) in variables, discrete variables, parameters and time, several
             of them in `And` and `Or`, or `self.sampled(period)`. The event happens where it turns from false to true,
-            and not again before it has been false; not at the initial time, if it holds there.
+            and not again before it has been false.
         - `actions`: `reinit(state, value)`, `assign(discrete, value)`, `terminate("why")`. In values, variables are
             those before the event. Discrete variables are those before the event if read as `pre(d)`; read as `d`, what
             this event assigns to `d`.
         - `on`: a relation in discrete variables; the event happens only while it holds.
+        - `at_start`: whether the event happens at the initial time, if the condition holds there.
 
         **Raises:**
 
         - `ModelError` for conditions and actions that cannot be meant.
         """
-        self._event(condition, actions, on, immediate=False)
+        self._event(condition, actions, on, at_start)
 
     def _event(self, condition: Any, actions: tuple[Action, ...], on: Any, immediate: bool) -> None:
         if self._sealed:
@@ -146,7 +147,7 @@ class EventDeclarations:
             text = str(condition) if on is None else f"{condition}, on={on}"
             expression = guard_of(condition, where)
             if on is not None:
-                expression = sympy.Max(expression, guard_of(relation_in_discretes(on, f"{where}, on"), where))
+                expression = while_on(expression, relation_in_discretes(on, f"{where}, on"))
             if not any(isinstance(s, VariableSymbol | DiscreteSymbol) for s in expression.free_symbols) and not any(
                 s is self.ev.t for s in expression.free_symbols
             ):

@@ -125,19 +125,27 @@ def guard_of(condition: Any, where: str) -> sympy.Expr:
     relation: Any = condition
     if isinstance(condition, BooleanAtom | bool):
         raise ModelError(f"{where}: the condition is always {condition}: it contains no variable")
-    if isinstance(condition, sympy.And):
-        return sympy.Max(*(guard_of(c, where) for c in condition.args))
-    if isinstance(condition, sympy.Or):
-        return sympy.Min(*(guard_of(c, where) for c in condition.args))
-    if isinstance(condition, sympy.Not):
-        return guard_of(to_nnf(condition), where)
     if _is_discrete(condition):
         return sympy.Piecewise((-1, condition), (1, True))
+    if isinstance(condition, sympy.And | sympy.Or):
+        # What only events change switches the guard of the others on or off.
+        fixed = [c for c in condition.args if _is_discrete(c)]
+        others = [guard_of(c, where) for c in condition.args if not _is_discrete(c)]
+        if isinstance(condition, sympy.And):
+            return while_on(sympy.Max(*others), sympy.And(*fixed))
+        return sympy.Piecewise((-1, sympy.Or(*fixed)), (sympy.Min(*others), True))
+    if isinstance(condition, sympy.Not):
+        return guard_of(to_nnf(condition), where)
     if isinstance(condition, sympy.LessThan | sympy.StrictLessThan):
         return relation.lhs - relation.rhs
     if isinstance(condition, sympy.GreaterThan | sympy.StrictGreaterThan):
         return relation.rhs - relation.lhs
     return _refused(condition, where)
+
+
+def while_on(guard: sympy.Expr, condition: Any) -> sympy.Expr:
+    """A guard that is there only while a condition in discrete variables holds."""
+    return sympy.Piecewise((guard, condition), (1, True))
 
 
 def relation_in_discretes(mode: Any, where: str) -> Any:

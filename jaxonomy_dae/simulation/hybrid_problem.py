@@ -4,14 +4,17 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
 from ..hybrid.control import EventControl
 from ..hybrid.problem import AbstractHybridProblem
 from ..solvers.switching import Watch
 from ..system.system import AcausalSystem
+from ..system.system_at import SystemAt
 from .preparation import prepared, term_of
 
+RESOLUTION = 32.0  # times the spacing of floating-point numbers at the largest time of a run
 RESTART = 8  # Gauss–Newton steps onto the constraints after an event
 
 
@@ -21,6 +24,7 @@ class SystemProblem(AbstractHybridProblem):
     system: AcausalSystem
     watch: Watch | None
     tolerance: Any
+    resolution: Any
     implicit: bool = eqx.field(static=True)
     n_clocks: int = eqx.field(static=True)
     n_guards: int = eqx.field(static=True)
@@ -40,7 +44,7 @@ class SystemProblem(AbstractHybridProblem):
         return self.system.holding(q).at(t, args).guards(x)
 
     def clocks(self):
-        return self.system.at(0.0, {}).clocks()
+        return SystemAt(self.system.plan, self.system.numbers, (), 0.0, {}).clocks()
 
     def written(self, t, x, q, previous, event, args):
         events: Any = self.system.plan.events
@@ -57,12 +61,16 @@ class SystemProblem(AbstractHybridProblem):
         return x, q
 
 
-def problem_for(system: AcausalSystem, implicit: bool, watch: Watch | None, tolerance: Any) -> SystemProblem:
-    """The problem of a system that has events."""
+def problem_for(
+    system: AcausalSystem, t0: Any, t1: Any, implicit: bool, watch: Watch | None, tolerance: Any
+) -> SystemProblem:
+    """The problem of a system that has events, to be run from t0 to t1."""
+    largest = jax.lax.stop_gradient(jnp.maximum(jnp.maximum(jnp.abs(t0), jnp.abs(t1)), t1 - t0))
     events: Any = system.plan.events
     ends = tuple(message is not None for message in events.table.message)
     return SystemProblem(
         system=system, watch=watch, tolerance=tolerance, implicit=implicit,
+        resolution=RESOLUTION * jnp.finfo(t1.dtype).eps * largest,
         n_clocks=events.n_clocks, n_guards=len(events) - events.n_clocks, ends=ends, immediate=events.table.immediate,
     )  # fmt: skip
 

@@ -73,7 +73,7 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, throw: bo
     y0: Any = x0
     saved_of: Any = _whole
     if system.plan.events is not None:
-        problem = problem_for(system, implicit, watch, tolerance)
+        problem = problem_for(system, t0, t1, implicit, watch, tolerance)
         y0 = start(problem, t0, x0, system.discrete_values, inputs, options.max_events)
         term, solver = HybridTerm(problem), WithEvents(chosen, options.max_events)
         controller = with_event_control(controller)

@@ -35,3 +35,7 @@ from .sources import StepVoltage as StepVoltage
 from .sources import VoltageControlledCurrent as VoltageControlledCurrent
 from .sources import VoltageControlledVoltage as VoltageControlledVoltage
 from .sources import VoltageSource as VoltageSource
+from .switching import IdealDiode as IdealDiode
+from .switching import IdealThyristor as IdealThyristor
+from .switching import Switch as Switch
+from .switching import TimedSwitch as TimedSwitch

@@ -12,6 +12,13 @@ from .algebra import Saturation as Saturation
 from .algebra import Sum as Sum
 from .control import PI as PI
 from .control import PID as PID
+from .discrete import Counter as Counter
+from .discrete import DiscretePI as DiscretePI
+from .discrete import DiscreteTransferFunction as DiscreteTransferFunction
+from .discrete import Hysteresis as Hysteresis
+from .discrete import PulseWidth as PulseWidth
+from .discrete import SampledDelay as SampledDelay
+from .discrete import SampleHold as SampleHold
 from .dynamics import DerivativeFilter as DerivativeFilter
 from .dynamics import FirstOrder as FirstOrder
 from .dynamics import Integrator as Integrator

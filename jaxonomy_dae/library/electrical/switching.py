@@ -1,0 +1,86 @@
+"""Components that switch: their equations change at events, which are found and differentiated exactly."""
+
+import sympy
+from sympy import And
+
+from ...modeling import NONNEGATIVE, Eq, EqnEnv, Value, assign
+from .two_pin import TwoPin
+
+
+class Switch(TwoPin):
+    """An ideal switch with a resistance `Ron` while closed and a conductance `Goff` while open (ohm, siemens, ≥ 0):
+    v = Ron·i or i = Goff·v. It is closed while the input `u` is above `threshold`; the discrete variable `closed` is 1
+    or 0.
+
+    With Ron = 0 and Goff = 0 it is ideal, and no loop of closed switches and voltage sources, and no part that only
+    open switches hold, can be solved for its currents and voltages.
+    """
+
+    def __init__(self, ev: EqnEnv, name: str, Ron: Value = 0.0, Goff: Value = 0.0, threshold: Value = 0.5):
+        super().__init__(ev, name)
+        on = self.parameter("Ron", Ron, unit="Ohm", bounds=NONNEGATIVE)
+        off = self.parameter("Goff", Goff, unit="S", bounds=NONNEGATIVE)
+        level = self.parameter("threshold", threshold)
+        u = self.input("u")
+        closed = self.discrete("closed", start=0)
+        v, i = self._two_pins()
+        self.either(Eq(closed, 1), v - on * i, i - off * v)
+        self.when(u > level, assign(closed, 1), on=Eq(closed, 0), at_start=True)
+        self.when(u < level, assign(closed, 0), on=Eq(closed, 1), at_start=True)
+
+
+class TimedSwitch(TwoPin):
+    """An ideal switch that closes at `time` (second), or opens if `opens`: v = Ron·i while closed, i = Goff·v while
+    open (ohm, siemens, ≥ 0). The time of switching is a parameter, and what follows is differentiable by it."""
+
+    def __init__(
+        self, ev: EqnEnv, name: str, time: Value = 1.0, opens: bool = False, Ron: Value = 0.0, Goff: Value = 0.0
+    ):
+        super().__init__(ev, name)
+        instant = self.parameter("time", time, unit="s")
+        on = self.parameter("Ron", Ron, unit="Ohm", bounds=NONNEGATIVE)
+        off = self.parameter("Goff", Goff, unit="S", bounds=NONNEGATIVE)
+        closed = self.discrete("closed", start=int(opens))
+        v, i = self._two_pins()
+        self.either(Eq(closed, 1), v - on * i, i - off * v)
+        self.when(ev.t >= instant, assign(closed, int(not opens)), on=Eq(closed, int(opens)), at_start=True)
+
+
+def _knee(v: sympy.Expr, i: sympy.Expr, on: sympy.Expr, off: sympy.Expr, knee: sympy.Expr) -> tuple:
+    """What is zero while a diode conducts, and what is zero while it blocks; neither is negative."""
+    return knee + on * (i - off * knee) - v, i - off * v
+
+
+class IdealDiode(TwoPin):
+    """A diode with two straight branches (Cellier & Kofman 2006, Continuous System Simulation, chapter 9).
+
+    While it conducts, v = Vknee + Ron·(i − Goff·Vknee); while it blocks, i = Goff·v, with v ≤ Vknee. `Ron` in ohm,
+    `Goff` in siemens, `Vknee` in volt, ≥ 0; all zero is the ideal diode. The discrete variable `active` is 1 while it
+    conducts. Parts of a circuit that only blocking diodes hold have no potential: give these a small `Goff`.
+    """
+
+    def __init__(self, ev: EqnEnv, name: str, Ron: Value = 0.0, Goff: Value = 0.0, Vknee: Value = 0.0):
+        super().__init__(ev, name)
+        on = self.parameter("Ron", Ron, unit="Ohm", bounds=NONNEGATIVE)
+        off = self.parameter("Goff", Goff, unit="S", bounds=NONNEGATIVE)
+        knee = self.parameter("Vknee", Vknee, unit="V", bounds=NONNEGATIVE)
+        v, i = self._two_pins()
+        self.complementary(*_knee(v, i, on, off, knee))
+
+
+class IdealThyristor(TwoPin):
+    """A diode that blocks until the input `fire` is above 0.5 while v exceeds Vknee, and conducts until the current
+    has gone; parameters as of `IdealDiode`."""
+
+    def __init__(self, ev: EqnEnv, name: str, Ron: Value = 0.0, Goff: Value = 0.0, Vknee: Value = 0.0):
+        super().__init__(ev, name)
+        on = self.parameter("Ron", Ron, unit="Ohm", bounds=NONNEGATIVE)
+        off = self.parameter("Goff", Goff, unit="S", bounds=NONNEGATIVE)
+        knee = self.parameter("Vknee", Vknee, unit="V", bounds=NONNEGATIVE)
+        fire = self.input("fire")
+        active = self.discrete("active", start=0)
+        v, i = self._two_pins()
+        drop, current = _knee(v, i, on, off, knee)
+        self.either(Eq(active, 1), drop, current)
+        self.when(And(drop < 0, fire > 0.5), assign(active, 1), on=Eq(active, 0), at_start=True)
+        self.when(current <= 0, assign(active, 0), on=Eq(active, 1), at_start=True)

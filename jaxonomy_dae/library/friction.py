@@ -1,0 +1,122 @@
+"""Dry friction that sticks: three modes of motion and one of none, for clutches, brakes and sliding parts.
+
+Modes: 0 stuck, 1 and −1 sliding forward and backward, 2 free, without normal force. While parts stick, the friction is
+whatever keeps their relative acceleration zero (Otter, Elmqvist & Mattsson 1999, "Hybrid modeling in Modelica based on
+the synchronous data flow principle"; here the branch is an equation of its own, and the mode a discrete variable).
+"""
+
+from typing import Any
+
+from sympy import Abs, And, Max, Ne, Piecewise, sign
+
+from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Rotational, Translational, Value, assign, der
+
+STANDSTILL = 1e-6  # a speed below which parts that are pressed together stick at once
+
+
+def stick_slip(
+    component: Component, speed: Any, friction: Any, sliding: Any, breakaway: Any, pressed: Any = None
+) -> None:
+    """Adds the friction between two parts to a component.
+
+    **Arguments:**
+
+    - `speed`: the relative speed, a variable; `friction`: the force that opposes it, a variable.
+    - `sliding`: the friction while the parts slide, ≥ 0; zero where they are not pressed together.
+    - `breakaway`: the largest friction while they stick, ≥ sliding.
+    - `pressed`: what is positive while the parts are pressed together; None if they always are.
+    """
+    mode = component.discrete("mode", start=2)
+    branch = Piecewise((0, Eq(mode, 2)), (mode * sliding, True))
+    component.either(Eq(mode, 0), der(speed), friction - branch)
+    direction = Piecewise((1, speed > STANDSTILL), (-1, speed < -STANDSTILL), (0, True))
+    moving = Eq(Abs(mode), 1)
+    if pressed is None:
+        component.when(Eq(mode, 2), assign(mode, direction), at_start=True)
+        component.when(mode * speed <= 0, assign(mode, 0), on=moving)
+    else:
+        component.when(pressed <= 0, assign(mode, 2), on=Ne(mode, 2), at_start=True)
+        component.when(pressed > 0, assign(mode, direction), on=Eq(mode, 2), at_start=True)
+        component.when(And(mode * speed <= 0, pressed > 0), assign(mode, 0), on=moving)
+    component.when(Abs(friction) >= breakaway, assign(mode, sign(friction)), on=Eq(mode, 0))
+
+
+class Clutch(Component):
+    """Two shafts pressed together: the input `u` is the normal force as a part of `fn_max`.
+
+    While they slide, tau = mode·mu·cgeo·fn with fn = fn_max·max(u, 0); they stick until |tau| reaches peak times that;
+    w_rel = der(flange_b.phi − flange_a.phi). `mu`, `fn_max` (newton), `cgeo` (metre) ≥ 0; `peak` ≥ 1.
+    """
+
+    def __init__(
+        self, ev: EqnEnv, name: str, mu: Value = 0.5, fn_max: Value = 1.0, cgeo: Value = 1.0, peak: Value = 1.0
+    ):
+        super().__init__(ev, name)
+        coefficient = self.parameter("mu", mu, bounds=NONNEGATIVE)
+        largest = self.parameter("fn_max", fn_max, unit="N", bounds=NONNEGATIVE)
+        geometry = self.parameter("cgeo", cgeo, unit="m", bounds=NONNEGATIVE)
+        ratio = self.parameter("peak", peak, bounds=(1.0, float("inf")))
+        a, b = self.port("flange_a", Rotational), self.port("flange_b", Rotational)
+        u = self.input("u")
+        phi = self.variable("phi_rel", unit="rad")
+        w = self.variable("w_rel", unit="rad/s")
+        tau = self.variable("tau", unit="N*m")
+        slipping = self.variable("slipping", unit="N*m")
+        self.add_equations(
+            Eq(phi, b.phi - a.phi),
+            Eq(w, der(phi)),
+            Eq(b.tau, tau),
+            Eq(a.tau + b.tau, 0),
+            Eq(slipping, coefficient * geometry * largest * Max(u, 0)),
+        )
+        stick_slip(self, w, tau, slipping, ratio * slipping, pressed=u)
+
+
+class Brake(Component):
+    """A shaft pressed against the ground: as `Clutch`, with the shaft's own speed `w`."""
+
+    def __init__(
+        self, ev: EqnEnv, name: str, mu: Value = 0.5, fn_max: Value = 1.0, cgeo: Value = 1.0, peak: Value = 1.0
+    ):
+        super().__init__(ev, name)
+        coefficient = self.parameter("mu", mu, bounds=NONNEGATIVE)
+        largest = self.parameter("fn_max", fn_max, unit="N", bounds=NONNEGATIVE)
+        geometry = self.parameter("cgeo", cgeo, unit="m", bounds=NONNEGATIVE)
+        ratio = self.parameter("peak", peak, bounds=(1.0, float("inf")))
+        flange = self.port("flange", Rotational)
+        u = self.input("u")
+        w = self.variable("w", unit="rad/s")
+        slipping = self.variable("slipping", unit="N*m")
+        self.add_equations(Eq(w, der(flange.phi)), Eq(slipping, coefficient * geometry * largest * Max(u, 0)))
+        stick_slip(self, w, flange.tau, slipping, ratio * slipping, pressed=u)
+
+
+class StickingFriction(Component):
+    """Dry friction between two sliding parts that sticks: f opposes v_rel = der(flange_b.x − flange_a.x) with the
+    force `sliding` (newton, > 0), and holds the parts together up to `breakaway` ≥ sliding."""
+
+    def __init__(self, ev: EqnEnv, name: str, sliding: Value = 1.0, breakaway: Value | None = None):
+        super().__init__(ev, name)
+        coulomb = self.parameter("sliding", sliding, unit="N", bounds=POSITIVE)
+        static = self.parameter("breakaway", sliding if breakaway is None else breakaway, unit="N", bounds=POSITIVE)
+        a, b = self.port("flange_a", Translational), self.port("flange_b", Translational)
+        v = self.variable("v_rel", unit="m/s")
+        f = self.variable("f", unit="N")
+        self.add_equations(Eq(v, der(b.x - a.x)), Eq(b.f, f), Eq(a.f + b.f, 0))
+        stick_slip(self, v, f, coulomb, static)
+
+
+class OneWayClutch(Component):
+    """A freewheel: flange_b may run faster than flange_a, never slower. While they are locked, der(w_rel) = 0 with a
+    torque tau ≥ 0 from a to b; while free, tau = 0 with w_rel ≥ 0. The discrete variable `locked` is 1 or 0."""
+
+    def __init__(self, ev: EqnEnv, name: str):
+        super().__init__(ev, name)
+        a, b = self.port("flange_a", Rotational), self.port("flange_b", Rotational)
+        w = self.variable("w_rel", unit="rad/s")
+        tau = self.variable("tau", unit="N*m")
+        locked = self.discrete("locked", start=0)
+        self.add_equations(Eq(w, der(b.phi - a.phi)), Eq(b.tau, -tau), Eq(a.tau + b.tau, 0))
+        self.either(Eq(locked, 1), der(w), tau)
+        self.when(w <= 0, assign(locked, 1), on=Eq(locked, 0), at_start=True)
+        self.when(tau <= 0, assign(locked, 0), on=Eq(locked, 1), at_start=True)

@@ -1,0 +1,150 @@
+"""Blocks that act at instants: sampled controllers, and relays. Inputs are `u`, outputs `y`."""
+
+from collections.abc import Sequence
+
+import sympy
+
+from ...errors import ModelError
+from ...modeling import POSITIVE, Component, Eq, EqnEnv, Value, assign, pre
+
+
+class SampleHold(Component):
+    """y is the input `u` as it was at the last of the instants 0, period, 2·period, … (second)."""
+
+    def __init__(self, ev: EqnEnv, name: str, period: Value = 0.1, initial_y: Value = 0.0):
+        super().__init__(ev, name)
+        T = self.parameter("period", period, unit="s", bounds=POSITIVE)
+        start = self.parameter("initial_y", initial_y)
+        u, y = self.input("u"), self.variable("y")
+        held = self.discrete("held", start=start)
+        self.add_equations(Eq(y, held))
+        self.when(self.sampled(T), assign(held, u))
+
+
+class DiscretePI(Component):
+    """A sampled controller: every `period` (second), y = kp·u + I with I the sum of ki·period·u so far, bounded by
+    `lower` and `upper`; the sum waits while y is at a bound and u drives it further."""
+
+    def __init__(
+        self, ev: EqnEnv, name: str, kp: Value = 1.0, ki: Value = 1.0, period: Value = 0.1,
+        lower: Value = -sympy.oo, upper: Value = sympy.oo,
+    ):  # fmt: skip
+        super().__init__(ev, name)
+        proportional, integral = self.parameter("kp", kp), self.parameter("ki", ki)
+        T = self.parameter("period", period, unit="s", bounds=POSITIVE)
+        u, y = self.input("u"), self.variable("y")
+        held, total = self.discrete("held"), self.discrete("total")
+        wished = proportional * u + pre(total)
+        bounded, free = wished, sympy.true
+        if upper is not sympy.oo:
+            high = self.parameter("upper", upper)
+            bounded, free = sympy.Min(bounded, high), sympy.And(free, sympy.Or(wished <= high, u <= 0))
+        if lower is not -sympy.oo:
+            low = self.parameter("lower", lower)
+            bounded, free = sympy.Max(bounded, low), sympy.And(free, sympy.Or(wished >= low, u >= 0))
+        self.add_equations(Eq(y, held))
+        step = sympy.Piecewise((integral * T * u, free), (0, True))
+        self.when(self.sampled(T), assign(held, bounded), assign(total, pre(total) + step))
+
+
+class DiscreteTransferFunction(Component):
+    """y = (b₀ + b₁·z⁻¹ + … ) / (1 + a₁·z⁻¹ + …) · u every `period` (second), from rest.
+
+    **Arguments:**
+
+    - `numerator`, `denominator`: coefficients of falling powers of z, the first of the denominator not zero; no more in
+        the numerator than in the denominator.
+    """
+
+    def __init__(
+        self, ev: EqnEnv, name: str, numerator: Sequence[float], denominator: Sequence[float], period: Value = 0.1
+    ):
+        super().__init__(ev, name)
+        n = len(denominator) - 1
+        if n < 0 or denominator[0] == 0 or not 0 < len(numerator) <= n + 1:
+            raise ModelError(
+                f"'{name}': the denominator begins with a number that is not zero and has at least as many as the "
+                f"numerator; got {list(numerator)} over {list(denominator)}"
+            )
+        a = [float(c) / float(denominator[0]) for c in denominator]
+        b = [0.0] * (n + 1 - len(numerator)) + [float(c) / float(denominator[0]) for c in numerator]
+        T = self.parameter("period", period, unit="s", bounds=POSITIVE)
+        u, y = self.input("u"), self.variable("y")
+        held = self.discrete("held")
+        self.add_equations(Eq(y, held))
+        # Transposed direct form II (Oppenheim & Schafer 2010, section 6.3).
+        memory = [self.discrete(f"x{k}") for k in range(1, n + 1)]
+        out = b[0] * u + (pre(memory[0]) if n else 0)
+        kept = [
+            assign(memory[k], b[k + 1] * u - a[k + 1] * out + (pre(memory[k + 1]) if k + 1 < n else 0))
+            for k in range(n)
+        ]
+        self.when(self.sampled(T), assign(held, out), *kept)
+
+
+class SampledDelay(Component):
+    """y is the input as it was `samples` periods (second) ago; `initial_y` until then."""
+
+    def __init__(self, ev: EqnEnv, name: str, samples: int = 1, period: Value = 0.1, initial_y: Value = 0.0):
+        super().__init__(ev, name)
+        if not isinstance(samples, int) or samples < 1:
+            raise ModelError(f"'{name}': samples is a positive integer; got {samples!r}")
+        T = self.parameter("period", period, unit="s", bounds=POSITIVE)
+        start = self.parameter("initial_y", initial_y)
+        u, y = self.input("u"), self.variable("y")
+        line = [self.discrete(f"x{k}", start=start) for k in range(samples + 1)]
+        self.add_equations(Eq(y, line[-1]))
+        moved = [assign(later, pre(before)) for before, later in zip(line, line[1:], strict=False)]
+        self.when(self.sampled(T), assign(line[0], u), *moved)
+
+
+class Hysteresis(Component):
+    """A relay: y becomes `high` where the input `u` rises above `upper`, and `low` where it falls below `lower`.
+
+    The discrete variable `on` is 1 or 0; `initially_on` says which it is while `u` lies between.
+    """
+
+    def __init__(
+        self, ev: EqnEnv, name: str, lower: Value = 0.0, upper: Value = 1.0, low: Value = 0.0, high: Value = 1.0,
+        initially_on: bool = False,
+    ):  # fmt: skip
+        super().__init__(ev, name)
+        down, up = self.parameter("lower", lower), self.parameter("upper", upper)
+        least, most = self.parameter("low", low), self.parameter("high", high)
+        u, y = self.input("u"), self.variable("y")
+        on = self.discrete("on", start=int(initially_on))
+        self.add_equations(Eq(y, least + (most - least) * on))
+        self.when(u > up, assign(on, 1), at_start=True)
+        self.when(u < down, assign(on, 0), at_start=True)
+
+
+class PulseWidth(Component):
+    """Pulse-width modulation: every `period` (second), y = `height` for the part `u` of it (the input as it is at its
+    beginning, between 0 and 1), and 0 for the rest."""
+
+    def __init__(self, ev: EqnEnv, name: str, period: Value = 0.1, height: Value = 1.0):
+        super().__init__(ev, name)
+        T = self.parameter("period", period, unit="s", bounds=POSITIVE)
+        amplitude = self.parameter("height", height)
+        u, y = self.input("u"), self.variable("y")
+        on, until = self.discrete("on"), self.discrete("until", start=-1.0)
+        self.add_equations(Eq(y, amplitude * on))
+        share = sympy.Min(sympy.Max(u, 0), 1)
+        self.when(
+            self.sampled(T),
+            assign(until, ev.t + T * share),
+            assign(on, sympy.Piecewise((1, u > 0), (0, True))),
+        )
+        self.when(ev.t >= until, assign(on, 0), on=Eq(on, 1))
+
+
+class Counter(Component):
+    """y counts how often the input `u` has risen above `threshold`."""
+
+    def __init__(self, ev: EqnEnv, name: str, threshold: Value = 0.5):
+        super().__init__(ev, name)
+        level = self.parameter("threshold", threshold)
+        u, y = self.input("u"), self.variable("y")
+        count = self.discrete("count")
+        self.add_equations(Eq(y, count))
+        self.when(u > level, assign(count, pre(count) + 1))
