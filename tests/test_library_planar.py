@@ -15,7 +15,7 @@ from testset.problem import load
 import jaxonomy_dae.library.planar as pl
 import jaxonomy_dae.library.rotational as rot
 import jaxonomy_dae.library.translational as line
-from jaxonomy_dae import EqnEnv, ModelError, simulate
+from jaxonomy_dae import EqnEnv, InitializationError, ModelError, StructuralError, simulate
 
 TS = np.linspace(0.0, 2.0, 9)
 TIGHT = dict(rtol=1e-9, atol=1e-11)
@@ -248,16 +248,6 @@ def double_reference(ts, values):
     return integrated(slopes, [start1, start1 + start2, 0.0, 0.0], ts)
 
 
-@pytest.mark.parametrize("mode", ["auto", "dummy_derivatives"])
-def test_double_pendulum(mode):
-    solution = simulate(double_pendulum(mode), 2.0, ts=TS, **TIGHT)
-    p, q, u, v = double_reference(TS, RODS.values())
-    for name, true in {"j1.phi": p, "j2.phi": q - p, "j1.omega": u, "j2.omega": v - u}.items():
-        np.testing.assert_allclose(solution[name], true, rtol=0, atol=MEASURED * np.abs(true).max(), err_msg=name)
-    if mode == "dummy_derivatives":
-        assert set(double_pendulum(mode).states) == {"a.body.phi", "a.body.omega", "b.body.phi", "b.body.omega"}
-
-
 def energy(solution, bodies, values):
     """Kinetic and potential energy of uniform rods, from masses and lengths."""
     total = 0.0
@@ -268,11 +258,20 @@ def energy(solution, bodies, values):
     return total
 
 
-def test_a_double_pendulum_keeps_its_energy():
-    """Over ten swings, to 1e-9 for each of fewer than 10,000 steps."""
-    solution = simulate(double_pendulum("dummy_derivatives"), 20.0, ts=np.linspace(0.0, 20.0, 41), **TIGHT)
+@pytest.mark.parametrize("mode", [pytest.param("auto", marks=pytest.mark.slow), "dummy_derivatives"])
+def test_double_pendulum(mode):
+    system = double_pendulum(mode)
+    if mode == "dummy_derivatives":
+        assert set(system.states) == {"a.body.phi", "a.body.omega", "b.body.phi", "b.body.omega"}
+    ts = np.concatenate([TS, np.linspace(2.5, 20.0, 36)])
+    solution = simulate(system, 20.0, ts=ts, **TIGHT)
+    p, q, u, v = double_reference(TS, RODS.values())
+    for name, true in {"j1.phi": p, "j2.phi": q - p, "j1.omega": u, "j2.omega": v - u}.items():
+        found = solution[name][: len(TS)]  # later, the motion is chaotic: neighbours part
+        np.testing.assert_allclose(found, true, rtol=0, atol=MEASURED * np.abs(true).max(), err_msg=name)
     total = np.asarray(energy(solution, "ab", RODS))
-    np.testing.assert_allclose(total, total[0], rtol=0, atol=1e-5 * np.ptp(solution["a.body.y"]) * GRAVITY)
+    # Of what is exchanged; 1e-9 for each of fewer than 10,000 steps.
+    np.testing.assert_allclose(total, total[0], rtol=0, atol=1e-5 * GRAVITY * np.ptp(solution["a.body.y"]))
 
 
 def gradients(system, names, values, output, t1):
@@ -499,3 +498,35 @@ def test_andrews_mechanism_of_bodies_and_pins():
 def test_wrong_values_are_named(make, named):
     with pytest.raises(ModelError, match=named):
         make(EqnEnv())
+
+
+def test_what_nothing_holds_is_said_once():
+    """It was said once for x and once for y, in terms of levels."""
+    b = Bench()
+    link, pin = b(pl.Link, "link"), b(pl.Revolute, "pin")
+    b.join(link.frame_b, pin.frame_a)
+    with pytest.raises(
+        StructuralError, match="^nothing holds 'link' and 'pin': no body and no world .*Body or a World"
+    ):
+        b.compile()
+
+
+def test_two_worlds_at_one_link():
+    b = Bench()
+    west, east, link = b(pl.World, "west"), b(pl.World, "east", 1.0), b(pl.Link, "link")
+    b.chain(west.frame, link.frame_a, link.frame_b, east.frame)
+    with pytest.raises(StructuralError, match="'west', 'east' and 'link' form a loop.* difference of 'phi'"):
+        b.compile()
+
+
+def test_two_pins_between_two_bodies():
+    """The force along the line between the pins is not determined."""
+    b = Bench()
+    world, hinge = b(pl.World, "world"), b(pl.Revolute, "hinge")
+    one, other = b(pl.MassiveLink, "one"), b(pl.MassiveLink, "other")
+    near, far = b(pl.Revolute, "near"), b(pl.Revolute, "far")
+    b.chain(world.frame, hinge.frame_a, one.frame_b, far.frame_a, far.frame_b, other.frame_b)
+    b.join(hinge.frame_b, one.frame_a, near.frame_a)
+    b.join(near.frame_b, other.frame_a)
+    with pytest.raises(InitializationError, match="singular"):
+        b.compile().initialize()

@@ -6,8 +6,17 @@ library for teaching Modelica"): a frame has an absolute position `x`, `y` in me
 world's x axis, counter-clockwise, and a force `fx`, `fy` in newton along the world's axes and a torque `tau` in newton
 metre, counted positive into the component. Angles are not wrapped: a frame that turned twice has phi = 4π.
 
-Constraints are Newton's and Euler's equations with the joints' equations beside them, as in Haug 1989, "Computer Aided
-Kinematics and Dynamics of Mechanical Systems", chapters 2, 3 and 6; loops are closed by connecting frames.
+A mechanism is Newton's and Euler's equations with the joints' constraints beside them, as in Haug 1989, "Computer Aided
+Kinematics and Dynamics of Mechanical Systems", chapters 2, 3 and 6. Loops are closed by connecting frames. The forces
+in joints must be determined, so parts that are held twice in the same way (two pins between the same two bodies) are
+refused.
+
+By default all positions and speeds are states, and are projected onto the constraints. In a chain that is not closed,
+the bodies' angles are a minimal set that is good in every position, smaller and faster:
+
+```python
+AcausalCompiler(ev, diagram, state_selection="dummy_derivatives", prefer_states=["rod.body.phi", "rod.body.omega"])
+```
 """
 
 from .bodies import Body as Body
