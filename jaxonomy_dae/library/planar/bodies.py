@@ -42,8 +42,9 @@ class Body(Component):
     - `g_x`, `g_y`: gravity's components (metre per second squared).
     - `initial_x`, `initial_y` (metre), `initial_phi` (radian), `initial_vx`, `initial_vy` (metre per second),
         `initial_omega` (radian per second): they hold at the start where they are given.
-    - `guess_x`, `guess_y`, `guess_phi`: where the search for a start begins for what is not given. A closed loop has
-        several positions in which it fits together; the guesses choose among them.
+    - `guess_x`, `guess_y`, `guess_phi`: where the search for a start begins for what is not given; the parameters
+        `initial_x`, … are then the guesses. A closed loop has several positions in which it fits together, and the
+        guesses choose among them.
     """
 
     def __init__(
