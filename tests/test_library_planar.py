@@ -334,7 +334,7 @@ def four_bar():
 
 def loop(phi, crank, coupler, rocker, ground):
     """The angles of coupler and rocker, and their derivatives by the crank's angle, of an open four-bar loop: two
-    circles meet, above the line between their centres (Haug 1989, section 3.1)."""
+    circles meet, above the line between their centres."""
     x, y = ground - crank * np.cos(phi), -crank * np.sin(phi)  # from the crank's end to the rocker's pin
     span = np.hypot(x, y)
     at = np.arctan2(y, x) + np.arccos((coupler**2 + span**2 - rocker**2) / (2 * coupler * span))

@@ -98,7 +98,7 @@ class Link(TwoFrames):
         frame_b.x = frame_a.x + dx,   frame_b.y = frame_a.y + dy,   frame_b.phi = phi
         0 = frame_a.f + frame_b.f,   0 = frame_a.tau + frame_b.tau + dx·frame_b.fy − dy·frame_b.fx
 
-    (Haug 1989, equation 2.4.8, for the place of a point of a body.)
+    (Haug 1989, section 2.4, for the place of a point of a body.)
 
     **Arguments:**
 
