@@ -12,6 +12,7 @@ from .modeling import EqnEnv as EqnEnv
 from .modeling import Hydraulic as Hydraulic
 from .modeling import Interval as Interval
 from .modeling import NeuralDAEBlock as NeuralDAEBlock
+from .modeling import Planar as Planar
 from .modeling import Rotational as Rotational
 from .modeling import Thermal as Thermal
 from .modeling import Translational as Translational

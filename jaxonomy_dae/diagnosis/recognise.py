@@ -225,7 +225,7 @@ def _floating(flat: FlatModel, groups, alias: AliasTable) -> tuple[list[str], se
                 hint = f" ({listed(loose)} {'is' if len(loose) == 1 else 'are'} not connected)" if loose else ""
                 texts.append(f"{say.floating.format(names=listed(owners))}. {say.mend}{hint}.")
             components.update(owners)
-    return texts, components
+    return list(dict.fromkeys(texts)), components  # x and y of one frame float alike
 
 
 def _islands(flat: FlatModel, groups, alias: AliasTable, members: np.ndarray) -> list[np.ndarray]:

@@ -55,20 +55,24 @@ WORDS = {
         "a pipe",
     ),
 }
+# Of domains with several across quantities, which messages call by their names.
+SEVERAL = {
+    "Planar": ("nothing holds {names}: no body and no world is connected", "Connect a Body or a World", "a joint"),
+}
 
 
 def words(domain: str, across: str = "potential", through: str = "flow") -> DomainWords:
-    """The words of a domain; for a user's own domain, the names of its variables."""
+    """The words of a domain; for a domain of several quantities and a user's own, the names of its variables."""
     if domain in WORDS:
         return WORDS[domain]
-    return DomainWords(
-        across,
-        f"difference of '{across}'",
-        through,
-        f"nothing determines the level of '{across}' at the {domain} ports of {{names}}: only its differences matter",
-        f"Connect a component that fixes '{across}'",
-        "a component",
-    )
+    if domain in SEVERAL:
+        floating, mend, bridge = SEVERAL[domain]
+    else:
+        floating = (
+            f"nothing determines the level of '{across}' at the {domain} ports of {{names}}: only its differences"
+        )
+        floating, mend, bridge = f"{floating} matter", f"Connect a component that fixes '{across}'", "a component"
+    return DomainWords(across, f"difference of '{across}'", through, floating, mend, bridge)
 
 
 def listed(names: Iterable[str], shown: int = SHOWN, joint: str = "and") -> str:

@@ -15,6 +15,7 @@ from .neural import NeuralDAEBlock as NeuralDAEBlock
 from .ports import Domain as Domain
 from .ports import Electrical as Electrical
 from .ports import Hydraulic as Hydraulic
+from .ports import Planar as Planar
 from .ports import Rotational as Rotational
 from .ports import Thermal as Thermal
 from .ports import Translational as Translational

@@ -24,6 +24,11 @@ Electrical = Domain("Electrical", across=(("v", "V"),), through=(("i", "A"),))
 Translational = Domain("Translational", across=(("x", "m"),), through=(("f", "N"),))
 Rotational = Domain("Rotational", across=(("phi", "rad"),), through=(("tau", "N*m"),))
 Thermal = Domain("Thermal", across=(("T", "K"),), through=(("Q_flow", "W"),))
+Planar = Domain(
+    "Planar",
+    across=(("x", "m"), ("y", "m"), ("phi", "rad")),
+    through=(("fx", "N"), ("fy", "N"), ("tau", "N*m")),
+)
 Hydraulic = Domain("Hydraulic", across=(("p", "Pa"),), through=(("m_flow", "kg/s"),))
 
 

@@ -1,8 +1,8 @@
-"""Planar mechanics in Cartesian coordinates."""
+"""A pendulum in Cartesian coordinates, in one component."""
 
 from sympy import cos, sin
 
-from ..modeling import POSITIVE, Component, Eq, EqnEnv, Value, der
+from ...modeling import POSITIVE, Component, Eq, EqnEnv, Value, der
 
 
 class PlanarPendulum(Component):

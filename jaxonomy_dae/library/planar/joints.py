@@ -1,0 +1,97 @@
+"""Joints between two frames, with a flange for what drives or brakes them."""
+
+from sympy import cos, sin
+
+from ...modeling import Eq, EqnEnv, Rotational, Translational, Value, der
+from .two_frames import TwoFrames
+
+
+class Revolute(TwoFrames):
+    """A pin: two frames at one point, free to turn (Haug 1989, section 3.3).
+
+        frame_b.x = frame_a.x,   frame_b.y = frame_a.y,   frame_b.phi = frame_a.phi + phi,   dphi/dt = omega
+        0 = frame_a.f + frame_b.f,   0 = frame_a.tau + frame_b.tau
+        flange.phi = phi,   frame_b.tau = −flange.tau
+
+    What is connected to `flange` turns frame_b against frame_a: a motor, or a spring and a damper from the flange to a
+    `rotational.FixedAngle`. An inertia there turns with the angle `phi`, relative to frame_a. Left unconnected, the pin
+    is free.
+
+    **Arguments:**
+
+    - `initial_phi` (radian), `initial_omega` (radian per second): they hold at the start where they are given.
+    - `guess_phi` (radian): where the search for a start begins if `initial_phi` is not given. In a closed loop it
+        chooses among the positions in which the loop fits together.
+    """
+
+    def __init__(
+        self,
+        ev: EqnEnv,
+        name: str,
+        initial_phi: Value | None = None,
+        initial_omega: Value | None = None,
+        guess_phi: Value = 0.0,
+    ):
+        super().__init__(ev, name)
+        phi0 = self.parameter("initial_phi", guess_phi if initial_phi is None else initial_phi, unit="rad")
+        omega0 = self.parameter("initial_omega", 0.0 if initial_omega is None else initial_omega, unit="rad/s")
+        a, b = self._two_frames()
+        flange = self.port("flange", Rotational)
+        phi = self.variable("phi", start=phi0, fixed=initial_phi is not None, unit="rad")
+        omega = self.variable("omega", start=omega0, fixed=initial_omega is not None, unit="rad/s")
+        self.add_equations(
+            Eq(b.x, a.x),
+            Eq(b.y, a.y),
+            Eq(b.phi, a.phi + phi),
+            Eq(der(phi), omega),
+            Eq(flange.phi, phi),
+            Eq(b.tau, -flange.tau),
+        )
+        self._balance()
+
+
+class Prismatic(TwoFrames):
+    """A slide: frame_b moves along an axis that is fixed in frame_a, and does not turn (Haug 1989, section 3.3).
+
+        dx = s·cos(frame_a.phi + angle),   dy = s·sin(frame_a.phi + angle),   ds/dt = v
+        frame_b.x = frame_a.x + dx,   frame_b.y = frame_a.y + dy,   frame_b.phi = frame_a.phi
+        0 = frame_a.f + frame_b.f,   0 = frame_a.tau + frame_b.tau + dx·frame_b.fy − dy·frame_b.fx
+        flange.x = s,   frame_b.fx·cos(frame_a.phi + angle) + frame_b.fy·sin(frame_a.phi + angle) = −flange.f
+
+    What is connected to `flange` pushes frame_b away from frame_a: a source of force, or a spring and a damper from the
+    flange to a `translational.FixedPosition`. Left unconnected, the slide is free.
+
+    **Arguments:**
+
+    - `angle`: of the axis in frame_a (radian).
+    - `initial_s` (metre), `initial_v` (metre per second): they hold at the start where they are given.
+    - `guess_s` (metre): where the search for a start begins if `initial_s` is not given.
+    """
+
+    def __init__(
+        self,
+        ev: EqnEnv,
+        name: str,
+        angle: Value = 0.0,
+        initial_s: Value | None = None,
+        initial_v: Value | None = None,
+        guess_s: Value = 0.0,
+    ):
+        super().__init__(ev, name)
+        inclination = self.parameter("angle", angle, unit="rad")
+        s0 = self.parameter("initial_s", guess_s if initial_s is None else initial_s, unit="m")
+        v0 = self.parameter("initial_v", 0.0 if initial_v is None else initial_v, unit="m/s")
+        a, b = self._two_frames()
+        flange = self.port("flange", Translational)
+        s = self.variable("s", start=s0, fixed=initial_s is not None, unit="m")
+        v = self.variable("v", start=v0, fixed=initial_v is not None, unit="m/s")
+        along_x, along_y = cos(a.phi + inclination), sin(a.phi + inclination)
+        self.add_equations(
+            Eq(b.x, a.x + s * along_x),
+            Eq(b.y, a.y + s * along_y),
+            Eq(b.phi, a.phi),
+            Eq(der(s), v),
+            Eq(flange.x, s),
+            Eq(b.fx * along_x + b.fy * along_y, -flange.f),
+        )
+        self._balance(s * along_x, s * along_y)
