@@ -15,6 +15,7 @@ from .connect_ports import connect_ports
 from .connect_signals import connect_signals
 from .group_builder import GroupBuilder
 from .number_model import ModelNumbers
+from .read_accounts import read_accounts
 from .read_equations import add_components
 
 
@@ -37,4 +38,5 @@ def flatten(diagram: AcausalDiagram) -> FlatModel:
     parameters = parameter_table(model)
     groups = builder.groups()
     variables, groups, rows = add_corrections(model, diagram, variables, groups, networks)
-    return FlatModel(variables, parameters, groups, networks, rows, model.paths, ports, diagram.name or "")
+    accounts = read_accounts(model)
+    return FlatModel(variables, parameters, groups, networks, rows, model.paths, ports, diagram.name or "", accounts)

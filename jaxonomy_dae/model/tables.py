@@ -126,6 +126,22 @@ class RowInjection:
 
 
 @dataclasses.dataclass(frozen=True)
+class AccountGroup:
+    """Energies or powers that components declare: instance i of one template, whose slot k is
+    (variable[i, k])^(order[i, k])."""
+
+    kind: str
+    template: SymbolicTemplate
+    variable: np.ndarray
+    order: np.ndarray
+    parameter: np.ndarray
+    component: np.ndarray
+
+    def __len__(self):
+        return len(self.component)
+
+
+@dataclasses.dataclass(frozen=True)
 class FlatModel:
     """A flattened model."""
 
@@ -137,6 +153,7 @@ class FlatModel:
     components: list[str]  # full names, by id
     ports: PortTable
     name: str = ""  # of the diagram
+    accounts: tuple[AccountGroup, ...] = ()
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"networks": functions_by_name(self.networks)}
