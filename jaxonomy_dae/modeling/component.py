@@ -501,7 +501,10 @@ class Component(metaclass=Construction):
         return f"{type(self).__name__}({self.path!r})"
 
 
-_BASE_ATTRIBUTES = "ev name parent parameters variables ports children equations learned_terms connections signals accounts _sealed".split()
+_BASE_ATTRIBUTES = (
+    *"ev name parent parameters variables ports children equations".split(),
+    *"learned_terms connections signals accounts _sealed".split(),
+)
 
 
 def _noun(what: str) -> str:
