@@ -3,6 +3,7 @@
 import functools
 import sys
 
+import control
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -333,7 +334,6 @@ def test_a_state_space_is_shown():
 
 
 def test_to_control():
-    control = pytest.importorskip("control")
     space = linearize(motor(), {"source.u": 0.0}, ["motor.rotor.w"])
     theirs = space.to_control()
     assert theirs.input_labels == ["source_u"] and theirs.output_labels == ["motor_rotor_w"]

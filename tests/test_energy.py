@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from problems import compiled, damped_oscillation, oscillator, pendulum
-from sympy import Eq
+from sympy import Eq, Symbol
 
 import jaxonomy_dae.library.electrical as el
 import jaxonomy_dae.library.hydraulic as hy
@@ -100,7 +100,9 @@ def test_heat_goes_to_the_heat_port():
     room = th.FixedTemperature(ev, "room", T=290.0)
     system = compiled(
         source, r, ground, body, skin, room,
-        connect=[(source.p, r.p), (source.n, r.n, ground.p), (r.heat, body.heat, skin.port_a), (skin.port_b, room.heat)],
+        connect=[
+            (source.p, r.p), (source.n, r.n, ground.p), (r.heat, body.heat, skin.port_a), (skin.port_b, room.heat),
+        ],
     )  # fmt: skip
     solution = simulate(system, 20.0, ts=jnp.linspace(0.0, 20.0, 5), **TIGHT)
     assert_energy_balance(solution, rtol=BALANCED)
@@ -157,6 +159,7 @@ def test_redundant_states_balance():
     assert_energy_balance(solution, rtol=BALANCED)
 
 
+@pytest.mark.slow
 def test_an_implicit_block_balances():
     """A capacitor is discharged through a diode and a resistor."""
     ev = EqnEnv()
@@ -167,6 +170,7 @@ def test_an_implicit_block_balances():
     assert_energy_balance(simulate(system, 0.02, ts=jnp.linspace(0.0, 0.02, 4), **TIGHT), rtol=BALANCED)
 
 
+@pytest.mark.slow
 def test_hydraulics():
     """A pump's shaft drives fluid from a tank through an orifice into an accumulator, with inertia and compliance."""
     ev = EqnEnv()
@@ -274,10 +278,8 @@ def test_what_cannot_be_declared():
             Block(EqnEnv(), "b", declare)
     with pytest.raises(ModelError, match=r"component 'b' is complete: declare its energy inside __init__"):
         Block(EqnEnv(), "b").declare_energy(1.0)
-    import sympy
-
     with pytest.raises(ModelError, match="symbol 'q' was declared by no component"):
-        compiled(Block(EqnEnv(), "b", lambda c, *_: c.declare_energy(sympy.Symbol("q") ** 2)))
+        compiled(Block(EqnEnv(), "b", lambda c, *_: c.declare_energy(Symbol("q") ** 2)))
     silent = simulate(compiled(Block(EqnEnv(), "b")), 1.0)
     with pytest.raises(ModelError, match="no component of this model declares energies"):
         silent.energy()

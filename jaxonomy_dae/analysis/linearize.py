@@ -150,13 +150,12 @@ def _place(system: AcausalSystem, name: str) -> int:
 
 
 def _checked_names(system: AcausalSystem, given: Any, what: str) -> list[str]:
-    known = system.inputs if what == "inputs" else None
     if isinstance(given, str):
         raise ModelError(f"{what} is a list of names; write {what}=[{given!r}]")
     names = list(given)
-    for name in names if known is not None else ():
-        if name not in known:
-            raise ModelError(f"'{name}' is not an input of this system: " + nearest(name, known))
+    for name in names if what == "inputs" else ():
+        if name not in system.inputs:
+            raise ModelError(f"'{name}' is not an input of this system: " + nearest(name, system.inputs))
     if len(set(names)) < len(names):
         raise ModelError(f"{what}: a name stands twice in {names}")
     return names

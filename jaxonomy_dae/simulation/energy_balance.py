@@ -50,8 +50,8 @@ def energy_balance(solution: Solution, rtol: float, atol: float) -> EnergyBalanc
     scale = max(float(np.abs(change).sum(axis=1).max()), passed)
     stored = change.sum(axis=1)
     error = (stored - (supplied - lost)) / (scale if scale > 0 else 1.0)
-    arrays = (jnp.asarray(a, solution.states.dtype) for a in (stored, supplied, lost, error))
-    return EnergyBalance(*arrays, scale)
+    stored, supplied, lost, error = (jnp.asarray(a, solution.states.dtype) for a in (stored, supplied, lost, error))
+    return EnergyBalance(stored, supplied, lost, error, scale)
 
 
 def _integrals(solution: Solution, rtol: float, atol: float) -> tuple[np.ndarray, np.ndarray]:
