@@ -160,6 +160,26 @@ def test_a_common_change_is_named():
         steady_state(system)
 
 
+@pytest.mark.parametrize("C1, C2, G", [(1.0, 1.0, 1.0), (1e-9, 1e6, 1e-6), (1e-12, 1e12, 1e5)])
+def test_units_decide_nothing(C1, C2, G):
+    """A body that hangs by a thousandth of the conductance between the two is held; without it, neither is."""
+    for held in (True, False):
+        ev = EqnEnv()
+        a, b, link = th.HeatCapacitor(ev, "a", C=C1), th.HeatCapacitor(ev, "b", C=C2), th.ThermalConductor(ev, "l", G=G)
+        thread = th.ThermalConductor(ev, "thread", G=1e-3 * G)
+        room = th.FixedTemperature(ev, "room", T=310.0)
+        parts = (a, b, link, thread, room) if held else (a, b, link)
+        joined = [(a.heat, link.port_a), (link.port_b, b.heat)]
+        system = compiled(
+            *parts, connect=[*joined, (b.heat, thread.port_a), (thread.port_b, room.heat)][: 4 if held else 2]
+        )
+        if held:
+            np.testing.assert_allclose(steady_state(system)[["a.T", "b.T"]], 310.0, rtol=ROUNDING)
+            continue
+        with pytest.raises(SteadyStateError, match=r"a common change of a\.T, b\.T"):
+            steady_state(system)
+
+
 def test_no_equilibrium():
     class Fleeing(Component):
         """dx/dt = 1 + x² never vanishes."""
@@ -343,6 +363,8 @@ def test_to_control():
         space.frequency_response(omega).values[:, 0, 0],
         rtol=ROUNDING,
     )
+    with pytest.raises(ModelError, match=r"needs inputs and outputs: name inputs in linearize"):
+        linearize(oscillator(), [], ["mass.x"]).to_control()
 
 
 # --- sweeps ------------------------------------------------------------------------------------------------------

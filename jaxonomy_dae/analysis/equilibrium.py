@@ -24,7 +24,7 @@ from ..model.quantities import declared_scale, quantity_bounds
 from ..system.system import AcausalSystem
 
 PASSES = 4  # of equilibration
-SINGULAR = 1e3  # in units of eps and of the number of unknowns: a singular value that is rounding
+SINGULAR = 1e2  # in units of eps and of the number of unknowns: a singular value that is rounding
 
 
 class Equilibrium(NamedTuple):
@@ -94,10 +94,11 @@ def open_directions(found: Equilibrium) -> tuple[Float[Array, " k"], Float[Array
     them, as rows: unknowns in units of their scales. Not differentiated."""
     m, k = found.jacobian.shape
     matrix = jax.lax.stop_gradient(found.jacobian * found.unit[None, :])
-    for _ in range(PASSES):
+    for sweep in range(PASSES):  # the first one takes scales of rows and columns away, the others balance (Ruiz 2001)
         for axis in (1, 0):
-            largest = jnp.sqrt(jnp.max(jnp.abs(matrix), axis=axis, keepdims=True, initial=0.0))
-            matrix = matrix / jnp.where(largest > 0, largest, 1)
+            largest = jnp.max(jnp.abs(matrix), axis=axis, keepdims=True, initial=0.0)
+            largest = jnp.where(largest > 0, largest, 1)
+            matrix = matrix / (jnp.sqrt(largest) if sweep else largest)
     padded = jnp.concatenate([matrix, jnp.zeros((max(k - m, 0), k), matrix.dtype)])
     _, values, directions = jnp.linalg.svd(padded, full_matrices=False)
     return values / jnp.where(values[0] > 0, values[0], 1), directions

@@ -10,6 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Complex, Float
 
+from ..errors import ModelError
 from ..optional import optional_module
 from .frequency import FrequencyResponse
 
@@ -69,8 +70,16 @@ class StateSpace(eqx.Module):
     def to_control(self) -> Any:
         """The same as a `control.StateSpace` of python-control (extra `control`), names included; its signals are the
         deviations from `x0`, `u0` and `y0`. Dots in names become underscores, since python-control joins names by
-        dots."""
+        dots.
+
+        **Raises:**
+
+        - `ImportError` that names the extra; `ModelError` without inputs or outputs, which python-control needs.
+        """
         control = optional_module("control", "control", "to_control needs python-control")
+        if not self.inputs or not self.outputs:
+            missing = "inputs" if not self.inputs else "outputs"
+            raise ModelError(f"python-control needs inputs and outputs: name {missing} in linearize(...)")
         matrices = [np.asarray(m) for m in (self.A, self.B, self.C, self.D)]
         names = {
             kind: [name.replace(".", "_") for name in given]
