@@ -346,7 +346,7 @@ def test_arguments_of_linearize():
 def test_a_state_space_is_shown():
     space = linearize(motor(), {"source.u": 0.0}, ["motor.rotor.w"])
     text = repr(space)
-    assert text.startswith("StateSpace(3 states, 1 inputs, 1 outputs)") and "B: motor.inductor.i, " in text
+    assert text.startswith("StateSpace(3 states, 1 input, 1 output)") and "B: motor.inductor.i, " in text
     html = space._repr_html_()
     assert "<th>motor.rotor.w</th>" in html and html.count("<table>") == 4
     batch = eqx.filter_vmap(lambda r: linearize(motor().with_parameters({"motor.R": r}), {"source.u": 0.0}, []))

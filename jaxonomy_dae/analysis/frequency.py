@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
+from ..diagnosis.wording import counted
 from ..errors import ModelError, nearest
 from ..system.system import AcausalSystem
 from .operating_point import OperatingPoint
@@ -42,8 +43,8 @@ class FrequencyResponse(eqx.Module):
         return self.values[..., places[0], places[1]]
 
     def __repr__(self):
-        many = f"{self.omega.shape[-1]} frequencies, {len(self.outputs)} outputs, {len(self.inputs)} inputs"
-        return f"FrequencyResponse({many})"
+        pairs = f"{counted(len(self.outputs), 'output')} to {counted(len(self.inputs), 'input')}"
+        return f"FrequencyResponse({pairs} at {self.omega.shape[-1]} frequencies)"
 
 
 def frequency_response(

@@ -10,6 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Complex, Float
 
+from ..diagnosis.wording import counted
 from ..errors import ModelError
 from ..optional import optional_module
 from .frequency import FrequencyResponse
@@ -88,10 +89,9 @@ class StateSpace(eqx.Module):
         return control.StateSpace(*matrices, **names)
 
     def __repr__(self):
-        counts = f"{len(self.states)} states, {len(self.inputs)} inputs, {len(self.outputs)} outputs"
+        lines = [self._head()]
         if np.ndim(self.A) != 2 or isinstance(self.A, Tracer):
-            return f"StateSpace({counts})"
-        lines = [f"StateSpace({counts})"]
+            return lines[0]
         for letter, matrix, rows, columns in self._tables():
             lines.append(f"{letter}: {_names(rows)} by {_names(columns)}")
             lines += ["    " + "  ".join(f"{v:>11}" for v in row) for row in _entries(matrix)]
@@ -99,10 +99,9 @@ class StateSpace(eqx.Module):
 
     def _repr_html_(self) -> str:
         """The four matrices as tables that fold."""
-        counts = f"StateSpace({len(self.states)} states, {len(self.inputs)} inputs, {len(self.outputs)} outputs)"
+        out = [f"<p><code>{self._head()}</code></p>"]
         if np.ndim(self.A) != 2 or isinstance(self.A, Tracer):
-            return f"<p><code>{counts}</code></p>"
-        out = [f"<p><code>{counts}</code></p>"]
+            return out[0]
         for letter, matrix, rows, columns in self._tables():
             head = "".join(f"<th>{escape(n)}</th>" for n in ("", *columns[:SHOWN]))
             body = "".join(
@@ -111,6 +110,10 @@ class StateSpace(eqx.Module):
             )
             out.append(f"<details open><summary>{letter}</summary><table><tr>{head}</tr>{body}</table></details>")
         return "".join(out)
+
+    def _head(self) -> str:
+        kinds = (("state", self.states), ("input", self.inputs), ("output", self.outputs))
+        return f"StateSpace({', '.join(counted(len(names), kind) for kind, names in kinds)})"
 
     def _tables(self) -> list[tuple[str, Any, tuple[str, ...], tuple[str, ...]]]:
         tables = [
