@@ -1,8 +1,17 @@
 """Differentiable acausal modeling: components and equations in, one Equinox module out."""
 
+from .analysis import FrequencyResponse as FrequencyResponse
+from .analysis import OperatingPoint as OperatingPoint
+from .analysis import StateSpace as StateSpace
+from .analysis import Sweep as Sweep
+from .analysis import frequency_response as frequency_response
+from .analysis import linearize as linearize
+from .analysis import steady_state as steady_state
+from .analysis import sweep as sweep
 from .errors import InitializationError as InitializationError
 from .errors import ModelError as ModelError
 from .errors import SimulationError as SimulationError
+from .errors import SteadyStateError as SteadyStateError
 from .errors import StructuralError as StructuralError
 from .modeling import AcausalDiagram as AcausalDiagram
 from .modeling import Component as Component

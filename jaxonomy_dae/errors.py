@@ -16,6 +16,10 @@ class InitializationError(RuntimeError):
     """No consistent initial point was found."""
 
 
+class SteadyStateError(RuntimeError):
+    """No equilibrium was found, or one that does not determine all states."""
+
+
 class SimulationError(RuntimeError):
     """The integration stopped before its end."""
 

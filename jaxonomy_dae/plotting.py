@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .errors import ModelError
+from .optional import optional_module
 
 if TYPE_CHECKING:
     from .simulation.solution import Solution
@@ -14,11 +15,7 @@ NAMED = 40  # up to this many unknowns, rows and columns are labelled
 
 
 def _pyplot() -> Any:
-    try:
-        import matplotlib.pyplot as plt
-    except ImportError as error:
-        raise ImportError("plotting needs Matplotlib: pip install 'jaxonomy_dae[plot]'") from error
-    return plt
+    return optional_module("matplotlib.pyplot", "plot", "plotting needs Matplotlib")
 
 
 def plot_solution(solution: "Solution", *names: str, ax: Any = None) -> Any:

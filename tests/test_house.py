@@ -8,8 +8,9 @@ import jaxonomy_dae
 
 ROOT = Path(jaxonomy_dae.__file__).parent
 ORDER = [
-    "errors", "expressions", "modeling", "structure", "linear", "adjoint", "solvers", "model", "diagnosis", "compiler",
-    "lowering", "system", "initialization", "simulation", "learning", "plotting", "library",
+    "errors", "optional", "expressions", "modeling", "structure", "linear", "adjoint", "solvers", "model", "diagnosis",
+    "compiler", "lowering", "system", "initialization", "simulation", "learning", "analysis", "plotting", "testing",
+    "library",
 ]  # fmt: skip
 # Methods that hand over to a room above their own, when they are called.
 DEFERRED = {("system", "initialization"), ("simulation", "plotting")}

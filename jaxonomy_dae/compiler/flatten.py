@@ -16,6 +16,7 @@ from .connect_ports import connect_ports
 from .connect_signals import connect_signals
 from .group_builder import GroupBuilder
 from .number_model import ModelNumbers
+from .read_accounts import read_accounts
 from .read_equations import add_components
 
 
@@ -38,5 +39,6 @@ def flatten(diagram: AcausalDiagram) -> FlatModel:
     parameters = parameter_table(model)
     groups = builder.groups()
     variables, groups, rows = add_corrections(model, diagram, variables, groups, networks)
-    events = event_table(model)
-    return FlatModel(variables, parameters, groups, networks, rows, model.paths, ports, diagram.name or "", events)
+    events, accounts = event_table(model), read_accounts(model)
+    name = diagram.name or ""
+    return FlatModel(variables, parameters, groups, networks, rows, model.paths, ports, name, events, accounts)

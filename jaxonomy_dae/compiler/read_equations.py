@@ -27,27 +27,9 @@ def add_components(model: ModelNumbers, builder: GroupBuilder):
                     read_once[id(residual)] = read_expression(residual, model.paths[k])
             graphs = tuple(read_once[id(r)] for r in c.equations)
             by_shape.setdefault((graphs, tuple(c.variables), tuple(c.parameters)), []).append(k)
-    for (graphs, local_variables, local_parameters), members in by_shape.items():
-        position = {name: k for k, name in enumerate((*local_variables, *local_parameters))}
+    for (graphs, _, _), members in by_shape.items():
         for graph, residual in zip(graphs, model.components[members[0]].equations, strict=True):
-            # Slots follow the order of declaration, never names, so names change nothing but names.
-            def rank(s, position=position, members=members):
-                # Symbols of children come after one's own, in the order the children's ids give.
-                nth = getattr(s, "order", int(isinstance(s, PreviousSymbol)))
-                if s.path in position:
-                    return (0, position[s.path], nth)
-                resolve = model.variable if isinstance(s, VariableSymbol) else model.parameter
-                return (1, resolve(members[0], s.path), nth)
-
-            symbols = [s for s in symbols_of(residual) if symbol_label(s) in graph.leaves]
-            for s in symbols:
-                if not isinstance(s, VariableSymbol | ParameterSymbol | TimeSymbol):
-                    raise ModelError(
-                        f"component '{model.paths[members[0]]}': the symbol '{s}' was declared by no component; "
-                        "declare it with self.variable(...) or self.parameter(...) and use the symbol they return"
-                    )
-            variables = sorted((s for s in symbols if isinstance(s, VariableSymbol)), key=rank)
-            parameters = sorted((s for s in symbols if isinstance(s, ParameterSymbol)), key=rank)
+            variables, parameters = slots_of(model, members[0], residual, graph)
             coefficients = linear_coefficients(graph, variables)
             ids = ids_of(model, members, [v.path for v in variables], "variable")
             parameter_ids = ids_of(model, members, [p.path for p in parameters], "parameter")
@@ -63,6 +45,39 @@ def add_components(model: ModelNumbers, builder: GroupBuilder):
                 template = LinearTemplate(len(variables))
                 rows = np.tile(coefficients, (len(members), 1))
                 builder.add(template, ids, order, np.zeros((len(members), 0)), rows, provenance)
+
+
+def slots_of(
+    model: ModelNumbers, k: int, expression: Any, graph: Node
+) -> tuple[list[VariableSymbol], list[ParameterSymbol]]:
+    """The variables and parameters in an expression of component k. Slots follow the order of declaration, never names,
+    so names change nothing but names.
+
+    **Raises:**
+
+    - `ModelError` for a symbol that no component declared.
+    """
+    component = model.components[k]
+    position = {name: place for place, name in enumerate((*component.variables, *component.parameters))}
+
+    def rank(s):
+        # Symbols of children come after one's own, in the order the children's ids give.
+        nth = getattr(s, "order", int(isinstance(s, PreviousSymbol)))
+        if s.path in position:
+            return (0, position[s.path], nth)
+        resolve = model.variable if isinstance(s, VariableSymbol) else model.parameter
+        return (1, resolve(k, s.path), nth)
+
+    symbols = [s for s in symbols_of(expression) if symbol_label(s) in graph.leaves]
+    for s in symbols:
+        if not isinstance(s, VariableSymbol | ParameterSymbol | TimeSymbol):
+            raise ModelError(
+                f"component '{model.paths[k]}': the symbol '{s}' was declared by no component; "
+                "declare it with self.variable(...) or self.parameter(...) and use the symbol they return"
+            )
+    variables = sorted((s for s in symbols if isinstance(s, VariableSymbol)), key=rank)
+    parameters = sorted((s for s in symbols if isinstance(s, ParameterSymbol)), key=rank)
+    return variables, parameters
 
 
 def read_expression(expression: Any, component: str) -> Node:

@@ -4,7 +4,7 @@ Conventions: absolute pressure `p` in pascal, mass flow `m_flow` in kilogram per
 component at a port. The port of a component that has one is `fluid`. A component with two has
 dp = port_a.p − port_b.p, and `m_flow` flows from `port_a` to `port_b`. The fluid's density `rho` (kg/m³) and dynamic
 viscosity `mu` (Pa·s) are parameters of each component that needs them, by default water's at 20 °C. The kinetic energy
-of the flow at ports is neglected.
+of the flow at ports is neglected. In accounts of energy, the power at a port is p·m_flow/rho.
 
 Sources: H. E. Merritt, Hydraulic Control Systems (Wiley, 1967), for orifices, compliances, pumps and cylinders;
 F. M. White, Fluid Mechanics (McGraw-Hill), the chapter on viscous flow in ducts, for pipes.
@@ -32,24 +32,28 @@ GRAVITY = 9.80665  # m/s²
 
 
 class PressureSource(Component):
-    """A port held at the parameter `p` (pascal), whatever the flow."""
+    """A port held at the parameter `p` (pascal), whatever the flow. `rho` > 0 in kg/m³ is for the account of energy."""
 
-    def __init__(self, ev: EqnEnv, name: str, p: Value = ATMOSPHERE):
+    def __init__(self, ev: EqnEnv, name: str, p: Value = ATMOSPHERE, rho: Value = DENSITY):
         super().__init__(ev, name)
         held = self.parameter("p", p, unit="Pa")
+        density = self.parameter("rho", rho, unit="kg/m3", bounds=POSITIVE)
         fluid = self.port("fluid", Hydraulic)
         self.add_equations(Eq(fluid.p, held))
+        self.declare_supply(-held * fluid.m_flow / density)
 
 
 class MassFlowSource(Component):
     """A mass flow out of the port, from outside: the input `m_flow` (kg/s), which is 0 unless `simulate` is given
-    it."""
+    it. `rho` > 0 in kg/m³ is for the account of energy."""
 
-    def __init__(self, ev: EqnEnv, name: str):
+    def __init__(self, ev: EqnEnv, name: str, rho: Value = DENSITY):
         super().__init__(ev, name)
+        density = self.parameter("rho", rho, unit="kg/m3", bounds=POSITIVE)
         fluid = self.port("fluid", Hydraulic)
         flow = self.input("m_flow", default=0.0, unit="kg/s")
         self.add_equations(Eq(fluid.m_flow, -flow))
+        self.declare_supply(fluid.p * flow / density)
 
 
 class Tank(Component):
@@ -82,6 +86,7 @@ class Tank(Component):
             Eq(density * area * der(level), fluid.m_flow),
             Eq(fluid.p, ambient + density * gravity * level),
         )
+        self.declare_energy(area * level * ambient, density * gravity * area * level**2 / 2)
 
 
 class HydraulicCapacity(Component):
@@ -102,6 +107,7 @@ class HydraulicCapacity(Component):
         fluid = self.port("fluid", Hydraulic)
         p = self.variable("p", start=p0, fixed=initial_pressure is not None, nominal=1e5, unit="Pa")
         self.add_equations(Eq(p, fluid.p), Eq(density * compliance * der(p), fluid.m_flow))
+        self.declare_energy(compliance * p**2 / 2)
 
 
 class Accumulator(Component):
@@ -138,6 +144,15 @@ class Accumulator(Component):
             Eq(gas, total - volume),
             Eq(fluid.p, precharge * (total / gas) ** exponent),
         )
+        self.declare_energy(precharge * total * _work_of_compression(total / gas, exponent))
+
+
+def _work_of_compression(ratio: sympy.Expr, n: sympy.Expr) -> sympy.Expr:
+    """(ratio^(n − 1) − 1)/(n − 1), the work on a gas in units of p0·V0; near n = 1 by its series in n − 1."""
+    above, log = n - 1, sympy.log(ratio)
+    near = sympy.Abs(above) < 1e-5  # beyond, cancellation costs less than the series would
+    series = log * (1 + above * log / 2)
+    return sympy.Piecewise((series, near), ((ratio**above - 1) / above, True))
 
 
 class _TwoPort(Component):
@@ -170,6 +185,7 @@ class _Restriction(_TwoPort):
         dp, flow = self._two_ports()
         root = _regularised_root(dp, small)
         self.add_equations(Eq(flow, opening * area * discharge * sympy.sqrt(2 * density) * root))
+        self.declare_dissipation(dp * flow / density)
 
 
 class Orifice(_Restriction):
@@ -234,6 +250,7 @@ class LaminarPipe(_TwoPort):
         viscosity = self.parameter("mu", mu, unit="Pa*s", bounds=POSITIVE)
         dp, flow = self._two_ports()
         self.add_equations(Eq(flow, sympy.pi * diameter**4 * density / (128 * viscosity * length) * dp))
+        self.declare_dissipation(dp * flow / density)
 
 
 class TurbulentPipe(_TwoPort):
@@ -265,22 +282,34 @@ class TurbulentPipe(_TwoPort):
         area = sympy.pi * diameter**2 / 4
         root = _regularised_root(dp, small)
         self.add_equations(Eq(flow, area * sympy.sqrt(2 * density * diameter / (friction * length)) * root))
+        self.declare_dissipation(dp * flow / density)
 
 
 class Inertance(_TwoPort):
     """The inertia of the fluid in a duct: (L/A)·d(m_flow)/dt = dp, the length `L` > 0 in metre, the cross-section
     `A` > 0 in square metre.
 
-    A given `initial_m_flow` (kg/s) holds at the start; otherwise 0 is a guess.
+    A given `initial_m_flow` (kg/s) holds at the start; otherwise 0 is a guess. `rho` > 0 in kg/m³ is for the account of
+    energy.
     """
 
-    def __init__(self, ev: EqnEnv, name: str, L: Value = 1.0, A: Value = 1e-4, initial_m_flow: Value | None = None):
+    def __init__(
+        self,
+        ev: EqnEnv,
+        name: str,
+        L: Value = 1.0,
+        A: Value = 1e-4,
+        initial_m_flow: Value | None = None,
+        rho: Value = DENSITY,
+    ):
         super().__init__(ev, name)
+        density = self.parameter("rho", rho, unit="kg/m3", bounds=POSITIVE)
         length = self.parameter("L", L, unit="m", bounds=POSITIVE)
         area = self.parameter("A", A, unit="m2", bounds=POSITIVE)
         start = self.parameter("initial_m_flow", initial_m_flow or 0.0, unit="kg/s")
         dp, flow = self._two_ports(m_flow=dict(start=start, fixed=initial_m_flow is not None))
         self.add_equations(Eq(length / area * der(flow), dp))
+        self.declare_energy(length / area * flow**2 / (2 * density))
 
 
 class Pump(_TwoPort):
@@ -339,6 +368,7 @@ class Cylinder(Component):
             Eq(f, area * (fluid.p - ambient)),
             Eq(flange.f, -f),
         )
+        self.declare_energy(ambient * area * x)  # the work against what acts on the other side
 
 
 class PressureSensor(Component):

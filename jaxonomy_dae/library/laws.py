@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from sympy import Piecewise, exp, floor, pi, sin, sqrt, tanh
+from sympy import Piecewise, asinh, exp, floor, pi, sin, sqrt, tanh
 
 
 def penetration(s: Any, gap: Any, smooth: Any) -> tuple[Any, Any]:
@@ -12,6 +12,15 @@ def penetration(s: Any, gap: Any, smooth: Any) -> tuple[Any, Any]:
     root_above, root_below = sqrt(above**2 + smooth**2), sqrt(below**2 + smooth**2)
     depth = (above + root_above - below - root_below) / 2
     return depth, 1 + (above / root_above + below / root_below) / 2
+
+
+def penetration_energy(s: Any, gap: Any, smooth: Any) -> Any:
+    """The integral of the penetration over `s`."""
+    total = 0
+    for beyond in (s - gap / 2, -s - gap / 2):
+        root = sqrt(beyond**2 + smooth**2)
+        total += (beyond**2 + beyond * root + smooth**2 * asinh(beyond / smooth)) / 4
+    return total
 
 
 def stribeck(v: Any, sliding: Any, breakaway: Any, stribeck_speed: Any, viscous: Any, smooth: Any) -> Any:

@@ -7,7 +7,7 @@ flange, so an inertia obeys J·dw/dt = flange_a.tau + flange_b.tau.
 import sympy
 
 from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Rotational, Value, der
-from .laws import penetration, stribeck
+from .laws import penetration, penetration_energy, stribeck
 
 
 class Inertia(Component):
@@ -40,6 +40,7 @@ class Inertia(Component):
             Eq(der(w), acceleration),
             Eq(inertia * acceleration, a.tau + b.tau),
         )
+        self.declare_energy(inertia * w**2 / 2)
 
 
 class _Compliant(Component):
@@ -62,6 +63,7 @@ class Spring(_Compliant):
         rest = self.parameter("phi_rel0", phi_rel0, unit="rad")
         phi, tau = self._two_flanges()
         self.add_equations(Eq(tau, stiffness * (phi - rest)))
+        self.declare_energy(stiffness * (phi - rest) ** 2 / 2)
 
 
 class Damper(_Compliant):
@@ -73,6 +75,7 @@ class Damper(_Compliant):
         phi, tau = self._two_flanges()
         w = self.variable("w_rel", unit="rad/s")
         self.add_equations(Eq(w, der(phi)), Eq(tau, damping * w))
+        self.declare_dissipation(tau * w)
 
 
 class IdealGear(Component):
@@ -93,6 +96,7 @@ class Torque(Component):
         flange = self.port("flange", Rotational)
         tau = self.input("tau", default=0.0, unit="N*m")
         self.add_equations(Eq(flange.tau, -tau))
+        self.declare_supply(tau * der(flange.phi))
 
 
 class FixedAngle(Component):
@@ -117,6 +121,8 @@ class SpringDamper(_Compliant):
         phi_rel, tau = self._two_flanges()
         speed = self.variable("w_rel", unit="rad/s")
         self.add_equations(Eq(speed, der(phi_rel)), Eq(tau, stiffness * (phi_rel - relaxed) + damping * speed))
+        self.declare_energy(stiffness * (phi_rel - relaxed) ** 2 / 2)
+        self.declare_dissipation(damping * speed**2)
 
 
 class NonlinearSpring(_Compliant):
@@ -133,6 +139,7 @@ class NonlinearSpring(_Compliant):
         phi_rel, tau = self._two_flanges()
         e = phi_rel - relaxed
         self.add_equations(Eq(tau, linear * e + cubic * e**3))
+        self.declare_energy(linear * e**2 / 2 + cubic * e**4 / 4)
 
 
 class Backlash(_Compliant):
@@ -160,6 +167,8 @@ class Backlash(_Compliant):
         speed = self.variable("w_rel", unit="rad/s")
         depth, slope = penetration(phi_rel, play, corner)
         self.add_equations(Eq(speed, der(phi_rel)), Eq(tau, stiffness * depth + damping * slope * speed))
+        self.declare_energy(stiffness * penetration_energy(phi_rel, play, corner))
+        self.declare_dissipation(damping * slope * speed**2)
 
 
 class Friction(_Compliant):
@@ -190,6 +199,7 @@ class Friction(_Compliant):
         phi_rel, tau = self._two_flanges()
         speed = self.variable("w_rel", unit="rad/s")
         self.add_equations(Eq(speed, der(phi_rel)), Eq(tau, stribeck(speed, coulomb, static, fades, fluid, width)))
+        self.declare_dissipation(tau * speed)
 
 
 class AngleSource(Component):
@@ -200,6 +210,7 @@ class AngleSource(Component):
         super().__init__(ev, name)
         flange = self.port("flange", Rotational)
         self.add_equations(Eq(flange.phi, self.input("u", unit="rad")))
+        self.declare_supply(-flange.tau * der(flange.phi))
 
 
 class SpeedSource(Component):
@@ -211,6 +222,7 @@ class SpeedSource(Component):
         flange = self.port("flange", Rotational)
         where = self.variable("phi", start=start, fixed=True, unit="rad")
         self.add_equations(Eq(where, flange.phi), Eq(der(where), self.input("u", unit="rad/s")))
+        self.declare_supply(-flange.tau * der(where))
 
 
 class AngleSensor(Component):

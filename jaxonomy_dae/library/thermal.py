@@ -30,6 +30,7 @@ class HeatCapacitor(Component):
         heat = self.port("heat", Thermal)
         temperature = self.variable("T", start=t0, fixed=initial_temperature is not None, nominal=300.0, unit="K")
         self.add_equations(Eq(temperature, heat.T), Eq(capacity * der(temperature), heat.Q_flow))
+        self.declare_energy(capacity * temperature)
 
 
 class _TwoPort(Component):
@@ -142,6 +143,7 @@ class FixedTemperature(Component):
         held = self.parameter("T", T, unit="K")
         heat = self.port("heat", Thermal)
         self.add_equations(Eq(heat.T, held))
+        self.declare_supply(-heat.Q_flow)
 
 
 class TemperatureSource(Component):
@@ -153,6 +155,7 @@ class TemperatureSource(Component):
         heat = self.port("heat", Thermal)
         held = self.input("T", default=293.15, unit="K")
         self.add_equations(Eq(heat.T, held))
+        self.declare_supply(-heat.Q_flow)
 
 
 class HeatFlowSource(Component):
@@ -164,6 +167,7 @@ class HeatFlowSource(Component):
         heat = self.port("heat", Thermal)
         flow = self.input("Q_flow", default=0.0, unit="W")
         self.add_equations(Eq(heat.Q_flow, -flow))
+        self.declare_supply(flow)
 
 
 class TemperatureSensor(Component):

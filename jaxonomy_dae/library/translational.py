@@ -7,7 +7,7 @@ mass obeys M·dv/dt = flange.f.
 import sympy
 
 from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Translational, Value, der
-from .laws import penetration, stribeck
+from .laws import penetration, penetration_energy, stribeck
 
 
 class Mass(Component):
@@ -33,6 +33,7 @@ class Mass(Component):
         x = self.variable("x", start=x0, fixed=initial_position is not None, unit="m")
         v = self.variable("v", start=v0, fixed=initial_velocity is not None, unit="m/s")
         self.add_equations(Eq(x, flange.x), Eq(der(x), v), Eq(m * der(v), flange.f))
+        self.declare_energy(m * v**2 / 2)
 
 
 class _Compliant(Component):
@@ -56,6 +57,7 @@ class Spring(_Compliant):
         rest = self.parameter("length", length, unit="m")
         s, f = self._two_flanges()
         self.add_equations(Eq(f, k * (s - rest)))
+        self.declare_energy(k * (s - rest) ** 2 / 2)
 
 
 class Damper(_Compliant):
@@ -67,6 +69,7 @@ class Damper(_Compliant):
         s, f = self._two_flanges()
         v = self.variable("v", unit="m/s")
         self.add_equations(Eq(v, der(s)), Eq(f, d * v))
+        self.declare_dissipation(f * v)
 
 
 class Rod(Component):
@@ -101,6 +104,8 @@ class SpringDamper(_Compliant):
         s, f = self._two_flanges()
         speed = self.variable("v", unit="m/s")
         self.add_equations(Eq(speed, der(s)), Eq(f, stiffness * (s - relaxed) + damping * speed))
+        self.declare_energy(stiffness * (s - relaxed) ** 2 / 2)
+        self.declare_dissipation(damping * speed**2)
 
 
 class NonlinearSpring(_Compliant):
@@ -117,6 +122,7 @@ class NonlinearSpring(_Compliant):
         s, f = self._two_flanges()
         e = s - relaxed
         self.add_equations(Eq(f, linear * e + cubic * e**3))
+        self.declare_energy(linear * e**2 / 2 + cubic * e**4 / 4)
 
 
 class Backlash(_Compliant):
@@ -144,6 +150,8 @@ class Backlash(_Compliant):
         speed = self.variable("v", unit="m/s")
         depth, slope = penetration(s, play, corner)
         self.add_equations(Eq(speed, der(s)), Eq(f, stiffness * depth + damping * slope * speed))
+        self.declare_energy(stiffness * penetration_energy(s, play, corner))
+        self.declare_dissipation(damping * slope * speed**2)
 
 
 class Friction(_Compliant):
@@ -174,6 +182,7 @@ class Friction(_Compliant):
         s, f = self._two_flanges()
         speed = self.variable("v", unit="m/s")
         self.add_equations(Eq(speed, der(s)), Eq(f, stribeck(speed, coulomb, static, fades, fluid, width)))
+        self.declare_dissipation(f * speed)
 
 
 class Force(Component):
@@ -184,6 +193,7 @@ class Force(Component):
         flange = self.port("flange", Translational)
         f = self.input("f", default=0.0, unit="N")
         self.add_equations(Eq(flange.f, -f))
+        self.declare_supply(f * der(flange.x))
 
 
 class PositionSource(Component):
@@ -194,6 +204,7 @@ class PositionSource(Component):
         super().__init__(ev, name)
         flange = self.port("flange", Translational)
         self.add_equations(Eq(flange.x, self.input("u", unit="m")))
+        self.declare_supply(-flange.f * der(flange.x))
 
 
 class SpeedSource(Component):
@@ -205,6 +216,7 @@ class SpeedSource(Component):
         flange = self.port("flange", Translational)
         where = self.variable("x", start=start, fixed=True, unit="m")
         self.add_equations(Eq(where, flange.x), Eq(der(where), self.input("u", unit="m/s")))
+        self.declare_supply(-flange.f * der(where))
 
 
 class PositionSensor(Component):

@@ -218,6 +218,8 @@ def _digest(
         feed(g.template.key, g.variable, g.order, g.factor, g.parameter, g.coefficient)
     for name in flat.networks:
         feed(name)
+    for a in flat.accounts:
+        feed(a.kind, a.template.key, a.variable, a.order, a.parameter, a.component)
     for row in flat.rows:
         feed(row.opaque.index, row.targets, row.inputs, sorted(row.opaque.time_positions))
     e = flat.events

@@ -155,6 +155,22 @@ NO_EVENTS = EventTable((), _NONE, (), (), (), _NONE, _NONE, _NONE, _NONE, np.zer
 
 
 @dataclasses.dataclass(frozen=True)
+class AccountGroup:
+    """Energies or powers that components declare: instance i of one template, whose slot k is
+    (variable[i, k])^(order[i, k])."""
+
+    kind: str
+    template: SymbolicTemplate
+    variable: np.ndarray
+    order: np.ndarray
+    parameter: np.ndarray
+    component: np.ndarray
+
+    def __len__(self):
+        return len(self.component)
+
+
+@dataclasses.dataclass(frozen=True)
 class FlatModel:
     """A flattened model."""
 
@@ -167,6 +183,7 @@ class FlatModel:
     ports: PortTable
     name: str = ""  # of the diagram
     events: EventTable = NO_EVENTS
+    accounts: tuple[AccountGroup, ...] = ()
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"networks": functions_by_name(self.networks)}

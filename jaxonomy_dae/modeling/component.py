@@ -10,7 +10,7 @@ import sympy
 from ..errors import ModelError, nearest
 from .connections import Connection, Signal, resolve_ends
 from .construction import Construction
-from .declarations import START, Learned, Parameter, Variable, full_name
+from .declarations import START, Account, Learned, Parameter, Variable, full_name
 from .environment import EqnEnv
 from .equations import residual_of
 from .event_declarations import EventDeclarations
@@ -61,6 +61,7 @@ class Component(EventDeclarations, metaclass=Construction):
         self.connections: list[Connection] = []
         self.signals: list[Signal] = []
         self.events: list[When] = []
+        self.accounts: list[Account] = []
         self._sealed = False
 
     # --- names -------------------------------------------------------------------------------------------------
@@ -432,6 +433,49 @@ class Component(EventDeclarations, metaclass=Construction):
             except TypeError:  # not even hashable, such as a matrix
                 raise ModelError(f"component '{self.name}': {equation!r} is not an equation") from None
 
+    # --- energy ------------------------------------------------------------------------------------------------
+
+    def declare_energy(self, *expressions: Any) -> None:
+        """Says what energy the component stores (joule): `self.declare_energy(m * v**2 / 2)`.
+
+        The declarations of energy, dissipation and supply are read by `solution.energy()` and checked against each
+        other by `jaxonomy_dae.testing.assert_energy_balance`. They are no equations: simulations do not compute them.
+
+        **Arguments:**
+
+        - `expressions`: in variables, their derivatives and parameters of this component or of its children; or names
+            of its variables. Several are added up.
+
+        **Raises:**
+
+        - `ModelError` for what is not an expression or a name; for unknown symbols, when compiled.
+        """
+        self._declare_accounts("energy", expressions)
+
+    def declare_dissipation(self, *expressions: Any) -> None:
+        """Says what power is lost in the component, to where the model does not follow it (watt): `d * v**2`. A heat
+        that leaves at a thermal port is not lost. Otherwise as `declare_energy`."""
+        self._declare_accounts("dissipation", expressions)
+
+    def declare_supply(self, *expressions: Any) -> None:
+        """Says what power the component brings into the model from outside (watt), negative where it takes power out.
+        Otherwise as `declare_energy`."""
+        self._declare_accounts("supply", expressions)
+
+    def _declare_accounts(self, kind: str, expressions: tuple[Any, ...]):
+        if self._sealed:
+            raise ModelError(f"component '{self.path}' is complete: declare its {kind} inside __init__ of its class")
+        for given in expressions:
+            expression = self.symbol(given) if isinstance(given, str) else given
+            if isinstance(given, int | float):
+                expression = sympy.sympify(given)
+            if not isinstance(expression, sympy.Expr):
+                raise ModelError(
+                    f"component '{self.name}': {kind} is an expression in variables and parameters, or the name of a "
+                    f"variable; got {given!r}"
+                )
+            self.accounts.append(Account(kind, expression))
+
     # --- hierarchy ---------------------------------------------------------------------------------------------
 
     def add(self, child: "Component") -> Any:
@@ -465,8 +509,9 @@ class Component(EventDeclarations, metaclass=Construction):
 
 
 _BASE_ATTRIBUTES = (
-    "ev name parent parameters variables ports children equations learned_terms connections signals events _sealed"
-).split()
+    *"ev name parent parameters variables ports children equations".split(),
+    *"learned_terms connections signals events accounts _sealed".split(),
+)
 
 
 def _noun(what: str) -> str:

@@ -50,6 +50,14 @@ class Learned:
     noun: str = "network"  # or "function"
 
 
+@dataclasses.dataclass(frozen=True)
+class Account:
+    """A declared energy or power: `kind` is 'energy', 'dissipation' or 'supply'."""
+
+    kind: str
+    expression: sympy.Expr
+
+
 def full_name(path: str, name: str) -> str:
     """The name in the model of a variable that a component declares: `path.x`, `der(path.x)`."""
     before, der, inner = name.removesuffix(START).rpartition("der(") if name.endswith(START) else ("", "", name)

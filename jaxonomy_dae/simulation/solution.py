@@ -15,7 +15,9 @@ from jaxtyping import Array, Float
 from ..errors import ModelError
 from ..lowering.gather import times
 from ..system.system import AcausalSystem
+from .accounts import account_values, chosen_terms
 from .event_log import EventLog
+from .labelled import data_frame, data_set
 
 SHOWN = 8
 
@@ -126,6 +128,60 @@ class Solution(eqx.Module):
         """All variables, and `"time"`, by name."""
         names = ("time", *self)
         return dict(zip(names, jnp.moveaxis(self._columns(names), -1, 0), strict=True))
+
+    def energy(self, component: str | None = None) -> Float[Array, "*batch n"]:
+        """The energy stored at the saved times (joule), shape `(n,)`: the sum of all that components declare, or of one
+        component and what it contains.
+
+        **Raises:**
+
+        - `ModelError` for an unknown component, and if no component of the model declares energies or powers.
+        """
+        return self._account("energy", component)
+
+    def dissipation(self, component: str | None = None) -> Float[Array, "*batch n"]:
+        """The power that is lost (watt), shape `(n,)`; otherwise as `energy`."""
+        return self._account("dissipation", component)
+
+    def supply(self, component: str | None = None) -> Float[Array, "*batch n"]:
+        """The power that comes from outside (watt), shape `(n,)`, negative where it leaves; otherwise as `energy`."""
+        return self._account("supply", component)
+
+    def _account(self, kind: str, component: str | None) -> Any:
+        chosen = chosen_terms(self.system.plan, kind, component)
+        if self.states.ndim > 2:
+            return _each(self, lambda one: one._account(kind, component))
+        return jnp.sum(account_values(self.system, self.ts, self.states, self.inputs, self.discrete)[:, chosen], axis=1)
+
+    def energy_balance_error(self, *, rtol: float = 1e-8, atol: float = 1e-10) -> Float[Array, " n"]:
+        """By how much the account of energy fails to balance at the saved times, shape `(n,)`:
+
+            [stored(t) − stored(t0) − ∫(supply − dissipation) dt] / scale
+
+        from the first saved time t0 on. The scale is the largest of all that was stored, supplied or lost on the way,
+        so that 0 is a balance and 1 is nothing like it.
+
+        The integral is that of a second run from the first saved state, with the tolerances `rtol` and `atol`: powers
+        at the four Gauss points between its steps and saved times, read along its dense output. What remains is the
+        error of the saved states, or a declaration that is wrong or missing.
+
+        **Raises:**
+
+        - `ModelError` inside jit, of a batch, of a solution with rows that were not reached, and of a model with events,
+            which may change what is stored at an instant.
+        """
+        from .energy_balance import energy_balance
+
+        return energy_balance(self, rtol, atol).error
+
+    def to_pandas(self, *names: str) -> Any:
+        """The variables named, or all, as a `pandas.DataFrame` indexed by time (extra `pandas`)."""
+        return data_frame(self, names)
+
+    def to_xarray(self, *names: str) -> Any:
+        """The variables named, or all, as an `xarray.Dataset` over `time`, with units (extra `xarray`); a batch adds
+        the dimensions `batch_0`, `batch_1`, …"""
+        return data_set(self, names)
 
     def plot(self, *names: str, ax: Any = None) -> Any:
         """Draws variables over time with Matplotlib (extra `plot`); returns the axes."""

@@ -40,5 +40,6 @@ class IdealOpAmp(Component):
     def __init__(self, ev: EqnEnv, name: str):
         super().__init__(ev, name)
         plus, minus = self.port("plus", Electrical), self.port("minus", Electrical)
-        self.port("out", Electrical)
+        out = self.port("out", Electrical)
         self.add_equations(Eq(plus.v, minus.v), Eq(plus.i, 0), Eq(minus.i, 0))
+        self.declare_supply(-out.v * out.i)

@@ -12,6 +12,7 @@ class Resistor(TwoPin):
         r = self.parameter("R", R, unit="Ohm")
         voltage, current = self._two_pins()
         self.add_equations(Eq(voltage, r * current))
+        self.declare_dissipation(voltage * current)
 
 
 class HeatedResistor(TwoPin):
@@ -42,6 +43,7 @@ class Capacitor(TwoPin):
         v0 = self.parameter("initial_voltage", initial_voltage or 0.0, unit="V")
         voltage, current = self._two_pins(v=dict(start=v0, fixed=initial_voltage is not None))
         self.add_equations(Eq(c * der(voltage), current))
+        self.declare_energy(c * voltage**2 / 2)
 
 
 class Inductor(TwoPin):
@@ -53,6 +55,7 @@ class Inductor(TwoPin):
         i0 = self.parameter("initial_current", initial_current or 0.0, unit="A")
         voltage, current = self._two_pins(i=dict(start=i0, fixed=initial_current is not None))
         self.add_equations(Eq(inductance * der(current), voltage))
+        self.declare_energy(inductance * current**2 / 2)
 
 
 class MutualInductor(TwoPorts):
@@ -85,6 +88,7 @@ class MutualInductor(TwoPorts):
             Eq(v1, first * der(i1) + mutual * der(i2)),
             Eq(v2, mutual * der(i1) + second * der(i2)),
         )
+        self.declare_energy(first * i1**2 / 2, mutual * i1 * i2, second * i2**2 / 2)
 
 
 class Potentiometer(Component):
@@ -103,6 +107,7 @@ class Potentiometer(Component):
             Eq(n.v - slider.v, r * position * n.i),
             Eq(p.i + slider.i + n.i, 0),
         )
+        self.declare_dissipation((p.v - slider.v) * p.i, (n.v - slider.v) * n.i)
 
 
 class Memristor(TwoPin):
@@ -130,3 +135,4 @@ class Memristor(TwoPin):
         w = self.variable("w", start=w0, fixed=True)
         voltage, current = self._two_pins()
         self.add_equations(Eq(voltage, (on * w + off * (1 - w)) * current), Eq(der(w), drift * current))
+        self.declare_dissipation(voltage * current)

@@ -25,3 +25,4 @@ class Diode(TwoPin):
         x = voltage / thermal
         below = Min(x, LARGEST_EXPONENT)
         self.add_equations(Eq(current, saturation * (exp(below) * (1 + x - below) - 1) + voltage / leak))
+        self.declare_dissipation(voltage * current)

@@ -11,8 +11,9 @@ class VoltageSource(TwoPin):
     def __init__(self, ev: EqnEnv, name: str, v: Value = 1.0):
         super().__init__(ev, name)
         source = self.parameter("V", v, unit="V")
-        voltage, _ = self._two_pins()
+        voltage, current = self._two_pins()
         self.add_equations(Eq(voltage, source))
+        self.declare_supply(-voltage * current)
 
 
 class CurrentSource(TwoPin):
@@ -21,8 +22,9 @@ class CurrentSource(TwoPin):
     def __init__(self, ev: EqnEnv, name: str, i: Value = 1.0):
         super().__init__(ev, name)
         source = self.parameter("I", i, unit="A")
-        _, current = self._two_pins()
+        voltage, current = self._two_pins()
         self.add_equations(Eq(current, source))
+        self.declare_supply(-voltage * current)
 
 
 class SignalVoltage(TwoPin):
@@ -31,8 +33,9 @@ class SignalVoltage(TwoPin):
     def __init__(self, ev: EqnEnv, name: str):
         super().__init__(ev, name)
         u = self.input("u", unit="V")
-        voltage, _ = self._two_pins()
+        voltage, current = self._two_pins()
         self.add_equations(Eq(voltage, u))
+        self.declare_supply(-voltage * current)
 
 
 class SignalCurrent(TwoPin):
@@ -41,8 +44,9 @@ class SignalCurrent(TwoPin):
     def __init__(self, ev: EqnEnv, name: str):
         super().__init__(ev, name)
         u = self.input("u", unit="A")
-        _, current = self._two_pins()
+        voltage, current = self._two_pins()
         self.add_equations(Eq(current, u))
+        self.declare_supply(-voltage * current)
 
 
 class _OfTime(TwoPin):
@@ -51,6 +55,7 @@ class _OfTime(TwoPin):
     def _drive(self, quantity: str, value):
         voltage, current = self._two_pins()
         self.add_equations(Eq(voltage if quantity == "v" else current, value))
+        self.declare_supply(-voltage * current)
 
     def _sine(self, amplitude: Value, frequency: Value, phase: Value, offset: Value, unit: str):
         a = self.parameter("amplitude", amplitude, unit=unit)
@@ -163,8 +168,9 @@ class VoltageControlledVoltage(TwoPorts):
     def __init__(self, ev: EqnEnv, name: str, gain: Value = 1.0):
         super().__init__(ev, name)
         k = self.parameter("gain", gain)
-        v1, i1, v2, _ = self._two_ports()
+        v1, i1, v2, i2 = self._two_ports()
         self.add_equations(Eq(v2, k * v1), Eq(i1, 0))
+        self.declare_supply(-v2 * i2)
 
 
 class VoltageControlledCurrent(TwoPorts):
@@ -173,8 +179,9 @@ class VoltageControlledCurrent(TwoPorts):
     def __init__(self, ev: EqnEnv, name: str, transconductance: Value = 1.0):
         super().__init__(ev, name)
         k = self.parameter("transconductance", transconductance, unit="S")
-        v1, i1, _, i2 = self._two_ports()
+        v1, i1, v2, i2 = self._two_ports()
         self.add_equations(Eq(i2, k * v1), Eq(i1, 0))
+        self.declare_supply(-v2 * i2)
 
 
 class CurrentControlledVoltage(TwoPorts):
@@ -183,8 +190,9 @@ class CurrentControlledVoltage(TwoPorts):
     def __init__(self, ev: EqnEnv, name: str, transresistance: Value = 1.0):
         super().__init__(ev, name)
         k = self.parameter("transresistance", transresistance, unit="Ohm")
-        v1, i1, v2, _ = self._two_ports()
+        v1, i1, v2, i2 = self._two_ports()
         self.add_equations(Eq(v2, k * i1), Eq(v1, 0))
+        self.declare_supply(-v2 * i2)
 
 
 class CurrentControlledCurrent(TwoPorts):
@@ -193,5 +201,6 @@ class CurrentControlledCurrent(TwoPorts):
     def __init__(self, ev: EqnEnv, name: str, gain: Value = 1.0):
         super().__init__(ev, name)
         k = self.parameter("gain", gain)
-        v1, i1, _, i2 = self._two_ports()
+        v1, i1, v2, i2 = self._two_ports()
         self.add_equations(Eq(i2, k * i1), Eq(v1, 0))
+        self.declare_supply(-v2 * i2)

@@ -51,3 +51,4 @@ class PlanarPendulum(Component):
             Eq(mass * der(vy), -2 * lam * y + mass * gy),
             Eq(x**2 + y**2, length**2),
         )
+        self.declare_energy(mass * (vx**2 + vy**2) / 2, -mass * (gx * x + gy * y))

@@ -1,0 +1,77 @@
+"""Responses to sinusoids."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Complex, Float
+
+from ..diagnosis.wording import counted
+from ..errors import ModelError, nearest
+from ..system.system import AcausalSystem
+from .operating_point import OperatingPoint
+
+
+class FrequencyResponse(eqx.Module):
+    """How outputs answer sinusoidal inputs: `response["load.w", "source.u"]` is complex, shape `(k,)`.
+
+    - `omega`: angular frequencies (rad/s), shape `(k,)`.
+    - `values`: shape `(k, outputs, inputs)`: the magnitude is the ratio of amplitudes, the angle the phase.
+    - `inputs`, `outputs`: names.
+    """
+
+    omega: Float[Array, " k"]
+    values: Complex[Array, "k p m"]
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    outputs: tuple[str, ...] = eqx.field(static=True)
+
+    def __getitem__(self, pair: Any) -> Complex[Array, " k"]:
+        """The response of one output to one input.
+
+        **Raises:**
+
+        - `ModelError` for what is not a pair of names, and an unknown name.
+        """
+        if not (isinstance(pair, tuple) and len(pair) == 2):
+            raise ModelError(f"read a response by two names, response['output', 'input']; got {pair!r}")
+        places = []
+        for name, known, kind in zip(pair, (self.outputs, self.inputs), ("output", "input"), strict=True):
+            if name not in known:
+                raise ModelError(f"'{name}' is not an {kind} of this response: " + nearest(str(name), known))
+            places.append(known.index(name))
+        return self.values[..., places[0], places[1]]
+
+    def __repr__(self):
+        pairs = f"{counted(len(self.outputs), 'output')} to {counted(len(self.inputs), 'input')}"
+        return f"FrequencyResponse({pairs} at {self.omega.shape[-1]} frequencies)"
+
+
+def frequency_response(
+    system: AcausalSystem,
+    *,
+    inputs: Sequence[str] | Mapping[str, Any],
+    outputs: Sequence[str],
+    omega: Any,
+    at: OperatingPoint | None = None,
+    t: Any = 0.0,
+) -> FrequencyResponse:
+    """How outputs answer small sinusoids at inputs, around an operating point.
+
+    **Arguments:**
+
+    - `inputs`, `outputs`, `at`, `t`: as in `linearize`.
+    - `omega`: angular frequencies (rad/s), shape `(k,)`.
+
+    **Returns:**
+
+    A `FrequencyResponse`: `response["output", "input"]` is complex, shape `(k,)`. Differentiable; one dense solve for
+    each frequency.
+
+    **Raises:**
+
+    - as `linearize`.
+    """
+    from .linearize import linearize  # whose result has the responses made here
+
+    return linearize(system, inputs, outputs, at=at, t=t).frequency_response(jnp.asarray(omega))

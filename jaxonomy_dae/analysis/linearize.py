@@ -1,0 +1,182 @@
+"""`linearize`: a model near a point, as a linear state space."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..errors import ModelError, nearest
+from ..system.evaluate import Refinement
+from ..system.inputs import read_inputs
+from ..system.system import AcausalSystem
+from .operating_point import OperatingPoint
+from .state_space import StateSpace
+from .steady_state import check_system, equilibrium_from, is_traced, point_of
+from .tangent import Coordinates, choose_coordinates
+
+
+def linearize(
+    system: AcausalSystem,
+    inputs: Sequence[str] | Mapping[str, Any],
+    outputs: Sequence[str],
+    *,
+    at: OperatingPoint | None = None,
+    t: Any = 0.0,
+    states: Sequence[str] | None = None,
+) -> StateSpace:
+    """The linear state space of small deviations from an operating point, with exact derivatives.
+
+    **Arguments:**
+
+    - `system`: a compiled system.
+    - `inputs`: the names of inputs; or a dictionary with their values at the point, where they have no default.
+    - `outputs`: the names of variables; `"der(...)"` of what the model differentiates is one too.
+    - `at`: the point, from `steady_state`. If left out, the equilibrium that a search from the initial point finds;
+        states on which nothing depends, such as the angle of a free shaft, stay where they are.
+    - `t`: the time, if `at` is left out.
+    - `states`: which states are coordinates, where hidden constraints make some redundant.
+
+    **Returns:**
+
+    A `StateSpace`, whose states are the system's differential states. Where hidden constraints make states redundant,
+    it is reduced to the tangent of the constraints: the coordinates are named states (of a pendulum that hangs,
+    `pend.x` and `pend.vx`), as many as there are degrees of freedom; the others follow from them. It is differentiable
+    with respect to parameters and networks, the movement of the operating point included. Inside `jit`, `grad` and
+    `vmap`, redundant states need `states`, since the choice depends on values.
+
+    **Raises:**
+
+    - `ModelError` for unknown names, an input without a value, an input that the model differentiates (its response has
+        no state space), and `states` that are not coordinates.
+    - `SteadyStateError` if `at` is left out and there is no equilibrium.
+    """
+    check_system(system)
+    given = dict(inputs) if isinstance(inputs, Mapping) else {}
+    names, outputs = _checked_names(system, inputs, "inputs"), _checked_names(system, outputs, "outputs")
+    quantity, factor = system.plan.resolve(outputs)
+    _check_inputs(system, names, given, at)
+    if at is None:
+        found, t, read = equilibrium_from(system, t, given, None, (), throw=True)
+        at = point_of(system, found, t, read, drifting=(), singular_is_error=False, throw=True)
+    if jnp.ndim(at.x) != 1:
+        raise ModelError("the operating point is a batch: linearize each with equinox.filter_vmap")
+    values = read_inputs(system.inputs, at.x.dtype, {**at.inputs, **given})
+    u = jnp.stack([_value_at(system, values, name, at.t) for name in names]) if names else at.x[:0]
+    arguments = (system, at.t, at.x, values, u, tuple(names), tuple(quantity.tolist()), tuple(factor.tolist()))
+    parts = _partials(*arguments) if is_traced(arguments) else _compiled(*arguments)
+    coordinates = _coordinates(system, parts[1], states)
+    return _reduced(system, parts, at.x, u, coordinates, tuple(names), tuple(outputs))
+
+
+def _partials(
+    system: AcausalSystem, t: Any, x: Any, values: Any, u: Any, names: tuple[str, ...],
+    quantity: tuple[int, ...], factor: tuple[float, ...],
+) -> Any:  # fmt: skip
+    """Slopes, constraints and outputs, and their Jacobians with respect to states and inputs: ((f, h, y), (∂/∂x, ∂/∂u)
+    of each)."""
+    n = len(system.plan.states)
+    which, scale = np.array(quantity, np.int64), np.array(factor)
+
+    def everything(state, u):
+        here = system.at(t, {**values, **dict(zip(names, u, strict=True))})
+        full = here.split(jnp.concatenate([state, x[n:]]))
+        if len(system.plan.carried):  # which follow the states and the inputs
+            full = here.refined(full, Refinement.ROOT)
+        joined = here.join(full)
+        read = here.quantities(joined, np.maximum(which, 0), scale) if len(which) else joined[:0]
+        y = jnp.where(jnp.asarray(which < 0), 0.0, read)
+        return here.semi_explicit(joined)[:n], here.constraint_vector(full), y
+
+    return everything(x[:n], u), jax.jacfwd(everything, (0, 1))(x[:n], u)
+
+
+_compiled = eqx.filter_jit(_partials)
+
+
+def _reduced(
+    system: AcausalSystem, parts: Any, x: Any, u: Any, coordinates: Coordinates, names: tuple[str, ...],
+    outputs: tuple[str, ...],
+) -> StateSpace:  # fmt: skip
+    """The state space on the tangent of the constraints: ∂h/∂d·δd + ∂h/∂q·δq = 0 gives the dependent states d from the
+    coordinates q. Inputs that hidden constraints contain are differentiated, and have been refused."""
+    (slopes, _, y), ((f_x, f_u), (h_x, _), (y_x, y_u)) = parts
+    kept, dependent, rows = coordinates
+    states = tuple(system.states[k] for k in kept)
+    if len(dependent):
+        inner = h_x[rows][:, dependent]
+        d_q = -jnp.linalg.solve(inner, h_x[rows][:, kept])
+        f_x = f_x[:, kept] + f_x[:, dependent] @ d_q
+        y_x = y_x[:, kept] + y_x[:, dependent] @ d_q
+    return StateSpace(f_x[kept], f_u[kept], y_x, y_u, x[kept], u, y, slopes[kept], states, names, outputs)
+
+
+def _coordinates(system: AcausalSystem, jacobians: Any, wanted: Sequence[str] | None) -> Coordinates:
+    """Which states are coordinates: those asked for, or a choice by the values of the constraints' Jacobian."""
+    n, c = len(system.states), system.plan.n_constraints
+    h_x = jacobians[1][0]
+    if not c:
+        if wanted is not None and set(wanted) != set(system.states):
+            raise ModelError(f"states: no hidden constraint makes a state redundant; all are needed: {system.states}")
+        return Coordinates(np.arange(n), np.arange(0), np.arange(0))
+    scaled = None if is_traced(h_x) else np.asarray(h_x) * np.asarray(system.plan.nominal[:n])
+    chosen = None if scaled is None else choose_coordinates(scaled)
+    if wanted is None:
+        if chosen is None:
+            raise ModelError(
+                "inside jit, grad and vmap, which states are coordinates on the hidden constraints cannot be chosen by "
+                f"values: name {n - c} of them, linearize(..., states=[...]); the states are {system.states}"
+            )
+        return chosen
+    kept = [_place(system, name) for name in wanted]
+    dependent = np.setdiff1d(np.arange(n), kept)
+    rows = np.arange(c) if chosen is None else chosen.rows
+    if len(set(kept)) != n - len(rows):
+        raise ModelError(f"states: {n - len(rows)} coordinates are needed, of {system.states}; got {list(wanted)}")
+    if scaled is not None and len(choose_coordinates(scaled[rows][:, dependent]).dependent) < len(rows):
+        raise ModelError(
+            f"states: {list(wanted)} do not determine the other states at this point; "
+            f"{[system.states[k] for k in chosen.kept]} do"  # pyright: ignore[reportOptionalMemberAccess]
+        )
+    return Coordinates(np.array(kept, np.int64), dependent, rows)
+
+
+def _place(system: AcausalSystem, name: str) -> int:
+    if name not in system.states:
+        raise ModelError(f"states: '{name}' is not a state: " + nearest(name, system.states))
+    return system.states.index(name)
+
+
+def _checked_names(system: AcausalSystem, given: Any, what: str) -> list[str]:
+    if isinstance(given, str):
+        raise ModelError(f"{what} is a list of names; write {what}=[{given!r}]")
+    names = list(given)
+    for name in names if what == "inputs" else ():
+        if name not in system.inputs:
+            raise ModelError(f"'{name}' is not an input of this system: " + nearest(name, system.inputs))
+    if len(set(names)) < len(names):
+        raise ModelError(f"{what}: a name stands twice in {names}")
+    return names
+
+
+def _check_inputs(system: AcausalSystem, names: list[str], given: Mapping[str, Any], at: OperatingPoint | None):
+    """Every input has a value, and the model differentiates none that is asked for."""
+    table = system.plan.inputs
+    differentiated = {table.names[k] for k, order in table.quantities if order}
+    for name, default in zip(table.names, table.defaults, strict=True):
+        if default is None and name not in given and (at is None or name not in at.inputs):
+            where = f"inputs={{'{name}': 0.0}}" if name in names else "at=steady_state(system, inputs={...})"
+            raise ModelError(f"input '{name}' has no default, so its value at the point must be given: {where}")
+        if name in names and name in differentiated:
+            raise ModelError(
+                f"the model differentiates input '{name}', so its response has no state space: let it drive the input "
+                "through a lag (library.signal), and linearize from the lag's input"
+            )
+
+
+def _value_at(system: AcausalSystem, values: Mapping[str, Any], name: str, t: Any) -> Any:
+    table = system.plan.inputs
+    value = values.get(name, table.defaults[table.names.index(name)])
+    return jnp.asarray(value(t) if callable(value) else value, t.dtype)

@@ -1,0 +1,95 @@
+"""A point of a model, read by names."""
+
+from collections.abc import Sequence
+from html import escape
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from ..errors import ModelError
+from ..system.system import AcausalSystem
+
+SHOWN = 8
+
+
+class OperatingPoint(eqx.Module):
+    """A consistent point of a system: `point["pend.x"]` is a scalar, `point[["pend.x", "pend.y"]]` has shape `(2,)`.
+
+    - `x`: the state array, shape `(len(system.states) + len(system.carried),)`.
+    - `system`, `t`, `inputs`: whose point it is, the time, and the inputs as they were read.
+    - `residual`: the largest of all that should be zero there, each in units of what rounding may leave of it: at most
+        1 where the point is what it claims to be.
+
+    A point that `equinox.filter_vmap` returns is a batch: shapes get its axis in front.
+    """
+
+    x: Float[Array, " n"]
+    system: AcausalSystem
+    t: Float[Array, ""]
+    inputs: dict[str, Any]
+    residual: Float[Array, ""]
+
+    def __getitem__(self, name: Any) -> Any:
+        """The value of a variable, or of several; `"der(...)"` of what the model differentiates, and `"time"`.
+
+        **Raises:**
+
+        - `ModelError` for an unknown name.
+        """
+        single = isinstance(name, str)
+        if not single and not (isinstance(name, Sequence) and all(isinstance(one, str) for one in name)):
+            raise ModelError(f"read a point by names, point['m.x'] or point[['m.x', 'm.y']]; got {name!r}")
+        names = [name] if single else list(name)
+        if self.x.ndim > 1:
+            return eqx.filter_vmap(lambda one: one[name])(self)
+        quantity, factor = self.system.plan.resolve([n for n in names if n != "time"])
+        given = (self.system, self.t, self.x, self.inputs)
+        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(given)):
+            values = _every_quantity(*given)
+        else:
+            values = _compiled(*given)
+        zero = jnp.asarray(quantity < 0)
+        found = iter(jnp.where(zero, 0.0, values[np.maximum(quantity, 0)] * jnp.asarray(factor, self.x.dtype)))
+        read = [self.t if n == "time" else next(found) for n in names]
+        return read[0] if single else jnp.stack(read) if read else jnp.zeros((0,), self.x.dtype)
+
+    @property
+    def start(self) -> dict[str, Any]:
+        """The states by name: `simulate(system, t1, initial=point.start)` goes on from here."""
+        return {name: self.x[..., k] for k, name in enumerate(self.system.states)}
+
+    def to_dict(self) -> dict[str, Any]:
+        """All variables by name."""
+        names = self.system.variables
+        return dict(zip(names, jnp.moveaxis(self[names], -1, 0), strict=True))
+
+    def _shown(self) -> list[tuple[str, str]]:
+        return [(name, _text(value)) for name, value in list(self.start.items())[:SHOWN]]
+
+    def __repr__(self):
+        more = ", …" if len(self.system.states) > SHOWN else ""
+        return f"OperatingPoint({', '.join(f'{n}={v}' for n, v in self._shown())}{more})"
+
+    def _repr_html_(self) -> str:
+        rows = "".join(f"<tr><th>{escape(n)}</th><td>{escape(v)}</td></tr>" for n, v in self._shown())
+        more = f"<tr><td>… ({len(self.system.states)} states)</td></tr>" if len(self.system.states) > SHOWN else ""
+        return f"<table><caption>OperatingPoint</caption>{rows}{more}</table>"
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, Tracer):
+        return str(value)
+    return f"{float(value):.6g}" if np.ndim(value) == 0 else f"shape {np.shape(value)}"
+
+
+def _every_quantity(system: AcausalSystem, t: Any, x: Any, inputs: Any) -> Any:
+    every = np.arange(system.plan.extended.quantities.n)
+    return system.at(t, inputs).quantities(x, every, np.ones(len(every)))
+
+
+_compiled = eqx.filter_jit(_every_quantity)

@@ -1,0 +1,140 @@
+"""Linear state spaces with names."""
+
+from html import escape
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Complex, Float
+
+from ..diagnosis.wording import counted
+from ..errors import ModelError
+from ..optional import optional_module
+from .frequency import FrequencyResponse
+
+SHOWN = 6  # rows and columns of matrices that are printed
+
+
+class StateSpace(eqx.Module):
+    """d(x − x0)/dt = dx0 + A·(x − x0) + B·(u − u0), y − y0 = C·(x − x0) + D·(u − u0).
+
+    - `A`, `B`, `C`, `D`: shapes `(n, n)`, `(n, m)`, `(p, n)`, `(p, m)`.
+    - `states`, `inputs`, `outputs`: names of what x, u and y hold, in this order.
+    - `x0`, `u0`, `y0`: the point of linearization; `dx0`, the derivatives there, vanishes at an equilibrium.
+
+    Units are those of the variables, and per second in A and B.
+    """
+
+    A: Float[Array, "n n"]
+    B: Float[Array, "n m"]
+    C: Float[Array, "p n"]
+    D: Float[Array, "p m"]
+    x0: Float[Array, " n"]
+    u0: Float[Array, " m"]
+    y0: Float[Array, " p"]
+    dx0: Float[Array, " n"]
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    outputs: tuple[str, ...] = eqx.field(static=True)
+
+    def poles(self) -> Complex[Array, " n"]:
+        """The eigenvalues of A (1/s), those that decay slowest first; differentiable where they are distinct."""
+        if not self.states:
+            return jnp.zeros((0,), _complex(self.A))
+        found = jnp.linalg.eigvals(self.A)
+        return found[jnp.lexsort((found.imag, -found.real))]
+
+    def frequency_response(self, omega: Any) -> FrequencyResponse:
+        """The response to sinusoids, C·(jω − A)⁻¹·B + D.
+
+        **Arguments:**
+
+        - `omega`: angular frequencies (rad/s), shape `(k,)`.
+
+        **Returns:**
+
+        A `FrequencyResponse`, `response["output", "input"]` of shape `(k,)`. At a pole on the imaginary axis it is
+        infinite or not-a-number.
+        """
+        omega = jnp.atleast_1d(jnp.asarray(omega, self.A.dtype))
+        a, b, c, d = (m.astype(_complex(m)) for m in (self.A, self.B, self.C, self.D))
+        eye = jnp.eye(len(self.states), dtype=a.dtype)
+
+        def at(w):
+            return c @ jnp.linalg.solve(jax.lax.complex(jnp.zeros_like(w), w) * eye - a, b) + d
+
+        return FrequencyResponse(omega, jax.vmap(at)(omega), self.inputs, self.outputs)
+
+    def to_control(self) -> Any:
+        """The same as a `control.StateSpace` of python-control (extra `control`), names included; its signals are the
+        deviations from `x0`, `u0` and `y0`. Dots in names become underscores, since python-control joins names by
+        dots.
+
+        **Raises:**
+
+        - `ImportError` that names the extra; `ModelError` without inputs or outputs, which python-control needs.
+        """
+        control = optional_module("control", "control", "to_control needs python-control")
+        if not self.inputs or not self.outputs:
+            missing = "inputs" if not self.inputs else "outputs"
+            raise ModelError(f"python-control needs inputs and outputs: name {missing} in linearize(...)")
+        matrices = [np.asarray(m) for m in (self.A, self.B, self.C, self.D)]
+        names = {
+            kind: [name.replace(".", "_") for name in given]
+            for kind, given in (("states", self.states), ("inputs", self.inputs), ("outputs", self.outputs))
+        }
+        return control.StateSpace(*matrices, **names)
+
+    def __repr__(self):
+        lines = [self._head()]
+        if np.ndim(self.A) != 2 or isinstance(self.A, Tracer):
+            return lines[0]
+        for letter, matrix, rows, columns in self._tables():
+            lines.append(f"{letter}: {_names(rows)} by {_names(columns)}")
+            lines += ["    " + "  ".join(f"{v:>11}" for v in row) for row in _entries(matrix)]
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        """The four matrices as tables that fold."""
+        out = [f"<p><code>{self._head()}</code></p>"]
+        if np.ndim(self.A) != 2 or isinstance(self.A, Tracer):
+            return out[0]
+        for letter, matrix, rows, columns in self._tables():
+            head = "".join(f"<th>{escape(n)}</th>" for n in ("", *columns[:SHOWN]))
+            body = "".join(
+                f"<tr><th>{escape(name)}</th>{''.join(f'<td>{v}</td>' for v in row)}</tr>"
+                for name, row in zip(rows, _entries(matrix), strict=False)
+            )
+            out.append(f"<details open><summary>{letter}</summary><table><tr>{head}</tr>{body}</table></details>")
+        return "".join(out)
+
+    def _head(self) -> str:
+        kinds = (("state", self.states), ("input", self.inputs), ("output", self.outputs))
+        return f"StateSpace({', '.join(counted(len(names), kind) for kind, names in kinds)})"
+
+    def _tables(self) -> list[tuple[str, Any, tuple[str, ...], tuple[str, ...]]]:
+        tables = [
+            ("A", self.A, self.states, self.states),
+            ("B", self.B, self.states, self.inputs),
+            ("C", self.C, self.outputs, self.states),
+            ("D", self.D, self.outputs, self.inputs),
+        ]
+        return [table for table in tables if table[1].size]
+
+
+def _complex(matrix: Any) -> Any:
+    """The complex type of the same precision."""
+    return np.result_type(matrix.dtype, np.complex64)
+
+
+def _names(names: tuple[str, ...]) -> str:
+    return ", ".join(names[:SHOWN]) + (f", … ({len(names)})" if len(names) > SHOWN else "")
+
+
+def _entries(matrix: Any) -> list[list[str]]:
+    """The first rows and columns, as text; an ellipsis stands for the others."""
+    rows = [[f"{v:.5g}" for v in row[:SHOWN]] + ["…"] * (len(row) > SHOWN) for row in np.asarray(matrix)[:SHOWN]]
+    return rows + [["…"]] * (len(matrix) > SHOWN)

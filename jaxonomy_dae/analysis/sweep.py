@@ -1,0 +1,182 @@
+"""Sweeps: one function of a system for many values of named parameters, at once."""
+
+import itertools
+from collections.abc import Callable, Mapping
+from html import escape
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from ..errors import ModelError
+from ..optional import optional_module
+from ..simulation.labelled import dataset_of
+from ..simulation.simulate import simulate
+from ..simulation.solution import Solution
+from ..system.system import AcausalSystem
+from .steady_state import check_system
+
+
+class Sweep(eqx.Module):
+    """Results with the parameter values they belong to.
+
+    - `axes`: the values of each parameter by name: shape `(k,)`. In a grid, each parameter is an axis of the results,
+        in this order; zipped, all share the first axis.
+    - `values`: what the function returned, a pytree whose arrays have the axes of the sweep in front. `sweep[key]` is
+        `sweep.values[key]`: of simulations, `sweep["c.v"]` has shape `(*shape, times)`.
+    - `zipped`: whether the parameters vary together.
+    """
+
+    axes: dict[str, Any]
+    values: Any
+    zipped: bool = eqx.field(static=True)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The shape of the sweep: one entry for each parameter of a grid, one in all if zipped."""
+        sizes = tuple(len(v) for v in self.axes.values())
+        return sizes[:1] if self.zipped else sizes
+
+    def __getitem__(self, key: Any) -> Any:
+        """What the function returned, by its keys: `sweep["c.v"]`."""
+        return self.values[key]
+
+    def to_xarray(self) -> Any:
+        """The results as an `xarray.Dataset` (extra `xarray`), with the parameters as coordinates. A grid has one
+        dimension for each parameter; zipped, the one dimension is `case`. Simulations have all variables over
+        `time`; of a function's result, entries of a dictionary are variables, and an array is `value`."""
+        xarray = optional_module("xarray", "xarray", "to_xarray needs xarray")
+        axes = {name: np.asarray(values) for name, values in self.axes.items()}
+        dims = ("case",) if self.zipped else tuple(axes)
+        coordinates = {n: ("case", v) if self.zipped else v for n, v in axes.items()}
+        if isinstance(self.values, Solution):
+            first = np.asarray(self.values.ts).reshape(-1, self.values.ts.shape[-1])
+            return dataset_of(xarray, self.values, dims, coordinates | {"time": ("time", first[0])})
+        entries = self.values if isinstance(self.values, Mapping) else {"value": self.values}
+        variables = {}
+        for name, value in entries.items():
+            array = np.asarray(value)
+            more = tuple(f"{name}_{k}" for k in range(array.ndim - len(dims)))
+            variables[name] = ((*dims, *more), array)
+        return xarray.Dataset(variables, coords=coordinates)
+
+    def __repr__(self):
+        return f"Sweep({self._described()})"
+
+    def _described(self) -> str:
+        axes = [f"{name}: {_span(values)}" for name, values in self.axes.items()]
+        return f"{' with ' if self.zipped else ' × '}".join(axes)
+
+    def _repr_html_(self) -> str:
+        rows = [(name, _span(values)) for name, values in self.axes.items()]
+        rows += [("shape", str(self.shape)), ("results", _kinds(self.values))]
+        cells = "".join(f"<tr><th>{escape(k)}</th><td>{escape(v)}</td></tr>" for k, v in rows)
+        return f"<table><caption>Sweep{' (zipped)' if self.zipped else ''}</caption>{cells}</table>"
+
+
+def sweep(
+    system: AcausalSystem,
+    parameters: Mapping[str, Any],
+    function: Callable[[AcausalSystem], Any] | None = None,
+    *,
+    zipped: bool = False,
+    **options: Any,
+) -> Sweep:
+    """Calls a function of the system for many parameter values at once: one compiled program, vectorized.
+
+    **Arguments:**
+
+    - `system`: a compiled system.
+    - `parameters`: values by parameters' names, each of shape `(k,)`.
+    - `function`: from the system with its new values to an array or a pytree of arrays, such as
+        `lambda s: steady_state(s)["load.v"]`; it is traced. If left out, the system is simulated.
+    - `zipped`: by default all combinations are computed, a grid with one axis for each parameter, in the order of
+        `parameters`. With `zipped=True` the parameters vary together, and all have the same number of values.
+    - `options`: of `simulate`, if no function is given; `t1` and `ts` are needed.
+
+    **Returns:**
+
+    A `Sweep`. It is differentiable. The same function called again with other values is not compiled anew.
+
+    **Raises:**
+
+    - `ModelError` for an unknown parameter, a value out of its bounds, and shapes that do not fit. A run or a search
+        that fails is an Equinox run-time error; with `throw=False` it is not-a-number.
+    """
+    check_system(system)
+    columns = {name: _values(system, name, given) for name, given in _named(parameters).items()}
+    if function is None:
+        if options.get("ts") is None or "t1" not in options:
+            raise ModelError("a sweep of simulations needs t1=..., and ts=..., so that all runs save the same times")
+        function = _Simulation(options)
+    elif options:
+        raise ModelError(f"{', '.join(options)}: options of simulate are for a sweep without a function")
+    elif not callable(function):
+        raise ModelError(f"the function takes a system, lambda s: steady_state(s)['m.x']; got {function!r}")
+    sizes = [len(v) for v in columns.values()]
+    if zipped and len(set(sizes)) > 1:
+        found = ", ".join(f"{len(v)} for '{n}'" for n, v in columns.items())
+        raise ModelError(f"zipped parameters vary together, so each needs as many values; got {found}")
+    if zipped:
+        flat = jnp.stack(list(columns.values()), axis=-1)
+        shape = (sizes[0],)
+    else:
+        places = np.array(list(itertools.product(*map(range, sizes))), np.int64).reshape(-1, len(sizes))
+        flat = jnp.stack([v[places[:, k]] for k, v in enumerate(columns.values())], axis=-1)
+        shape = tuple(sizes)
+    results = _mapped(function, system, tuple(columns), flat)
+    shaped = jax.tree.map(lambda a: jnp.reshape(a, (*shape, *a.shape[1:])) if eqx.is_array(a) else a, results)
+    return Sweep(columns, shaped, zipped)
+
+
+class _Simulation(eqx.Module):
+    """`simulate` with its options."""
+
+    options: dict[str, Any]
+
+    def __call__(self, system: AcausalSystem) -> Solution:
+        return simulate(system, **self.options)
+
+
+@eqx.filter_jit
+def _mapped(function: Any, system: AcausalSystem, names: tuple[str, ...], values: Any) -> Any:
+    def one(row):
+        return function(system.with_parameters(dict(zip(names, row, strict=True))))
+
+    return eqx.filter_vmap(one)(values)
+
+
+def _named(parameters: Any) -> Mapping[str, Any]:
+    if not isinstance(parameters, Mapping) or not parameters:
+        raise ModelError(f"a sweep takes values by parameters' names, {{'r.R': [1.0, 2.0]}}; got {parameters!r}")
+    return parameters
+
+
+def _values(system: AcausalSystem, name: str, given: Any) -> Any:
+    """The values of one parameter, within its bounds."""
+    table = system.parameters.table
+    interval = table.intervals[table.settable(name)]
+    values = jnp.asarray(given, system.parameters.values.dtype)
+    if values.ndim != 1 or not len(values):
+        raise ModelError(f"the values of parameter '{name}' need shape (k,), k ≥ 1; got {values.shape}")
+    if not isinstance(values, Tracer):
+        for number in np.asarray(values).tolist():
+            if not np.isfinite(number) or number not in interval:
+                raise ModelError(f"parameter '{name}' must lie in {interval}; got {number:g}")
+    return values
+
+
+def _span(values: Any) -> str:
+    if isinstance(values, Tracer):
+        return f"{len(values)} values"
+    least, largest = float(np.min(values)), float(np.max(values))
+    return f"{least:g}" if len(values) == 1 else f"{len(values)} values from {least:g} to {largest:g}"
+
+
+def _kinds(values: Any) -> str:
+    if isinstance(values, Mapping):
+        return ", ".join(f"{k} {np.shape(v)}" for k, v in values.items())
+    return repr(values) if isinstance(values, Solution) else str(np.shape(values)) if eqx.is_array(values) else "pytree"

@@ -1,0 +1,44 @@
+"""Which states are coordinates on the hidden constraints.
+
+Given the Jacobian of c constraints with respect to n states that are redundant by r ≤ c, returns r constraints and r
+states that they determine from the others: the n − r others are coordinates of the tangent space.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+ALIKE = 0.5  # of the largest pivot: what counts as equally good, so that rounding decides nothing
+SINGULAR = 1e-10  # a pivot, relative to the first, that is rounding
+
+
+class Coordinates(NamedTuple):
+    """The states that are coordinates, those that follow from them, and the constraints that say how."""
+
+    kept: np.ndarray
+    dependent: np.ndarray
+    rows: np.ndarray
+
+
+def choose_coordinates(jacobian: Float[np.ndarray, "c n"]) -> Coordinates:
+    """Gaussian elimination with complete pivoting, each constraint in units of its gradient. Of pivots that are alike
+    the last state gives way, so that positions and velocities are chosen alike."""
+    c, n = jacobian.shape
+    norm = np.linalg.norm(jacobian, axis=1, keepdims=True)
+    left = jacobian / np.where(norm > 0, norm, 1)
+    rows, columns = [], []
+    for _ in range(min(c, n)):
+        size = np.abs(left)
+        largest = size.max(initial=0.0)
+        if largest <= SINGULAR:
+            break
+        alike = np.argwhere(size >= ALIKE * largest)
+        row, column = alike[np.lexsort((alike[:, 0], -alike[:, 1]))[0]]
+        rows.append(int(row))
+        columns.append(int(column))
+        pivot_row = left[row] / left[row, column]
+        left = left - np.outer(left[:, column], pivot_row)
+        left[row], left[:, column] = 0.0, 0.0
+    dependent = np.array(sorted(columns), np.int64)
+    return Coordinates(np.setdiff1d(np.arange(n), dependent), dependent, np.array(sorted(rows), np.int64))

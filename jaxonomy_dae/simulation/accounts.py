@@ -1,0 +1,119 @@
+"""What components declare of energy and power, evaluated at states.
+
+Each term is an expression in quantities of the model. A derivative that the model itself does not have, such as the
+speed of the end of a massless spring, is taken along the vector field.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from ..errors import ModelError, nearest
+from ..lowering.plan import SystemPlan
+from ..model.evaluate_numpy import Networks
+from ..model.tables import ZERO, AccountGroup
+from ..system.system import AcausalSystem
+
+
+def chosen_terms(plan: SystemPlan, kind: str, component: str | None) -> np.ndarray:
+    """The numbers of the terms of one kind, of a component and what it contains.
+
+    **Raises:**
+
+    - `ModelError` for an unknown component, and if the model declares nothing.
+    """
+    accounts, names = plan.flat.accounts, plan.flat.components
+    if not accounts:
+        raise ModelError(
+            "no component of this model declares energies or powers: use self.declare_energy(...), "
+            "self.declare_dissipation(...) and self.declare_supply(...) in its __init__"
+        )
+    kinds = np.repeat([a.kind for a in accounts], [len(a) for a in accounts])
+    owners = np.concatenate([a.component for a in accounts])
+    inside = np.ones(len(names), bool)
+    if component is not None:
+        if component not in names:
+            raise ModelError(f"'{component}' is not a component: " + nearest(component, names))
+        inside = np.array([n == component or n.startswith(f"{component}.") for n in names])
+    return np.flatnonzero((kinds == kind) & inside[owners])
+
+
+def account_values(system: AcausalSystem, ts: Any, states: Any, inputs: Any, discrete: Any = None) -> Any:
+    """The values of all terms at all times, shape (n, terms); `discrete` holds the discrete values, if there are."""
+    given = (system, ts, states, inputs, discrete)
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(given)):
+        return _terms(*given)
+    return _compiled(*given)
+
+
+def _terms(system: AcausalSystem, ts: Any, states: Any, inputs: Any, discrete: Any) -> Any:
+    def one(t, x, q):
+        return _at_one_time(system if q is None else system.holding(q), t, x, inputs)
+
+    return jax.vmap(one)(ts, states, discrete)
+
+
+_compiled = eqx.filter_jit(_terms)
+
+
+def _at_one_time(system: AcausalSystem, t: Any, x: Any, inputs: Any) -> Any:
+    plan = system.plan
+    every = np.arange(plan.extended.quantities.n)
+
+    def quantities(t, x):
+        return system.at(t, inputs).quantities(x, every, np.ones(len(every)))
+
+    slots = [_slots(plan, group) for group in plan.flat.accounts]
+    if any(missing.any() for _, _, missing in slots):
+        along = (jnp.ones_like(t), system.at(t, inputs).vector_field(x))
+        values, slopes = jax.jvp(quantities, (t, x), along)
+    else:
+        values = slopes = quantities(t, x)
+    array = system.numbers
+    networks = Networks(tuple(system.neural[n] for n in plan.network_names))
+    parts = []
+    for group, (quantity, factor, missing) in zip(plan.flat.accounts, slots, strict=True):
+        read = jnp.where(missing, slopes[quantity], values[quantity]) * jnp.asarray(factor, values.dtype)
+        parameters = [array[column] for column in group.parameter.T]
+        value = group.template.residual(list(read.T), parameters, [], t, networks)
+        parts.append(jnp.broadcast_to(jnp.asarray(value, values.dtype), (len(group),)))
+    return jnp.concatenate(parts)
+
+
+def _slots(plan: SystemPlan, group: AccountGroup) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Quantities and factors of the slots, shape (n, slots), and where a further derivative is to be taken."""
+    table = plan.extended.quantities
+    quantity = np.zeros(group.variable.shape, np.int64)
+    factor, missing = np.zeros(group.variable.shape), np.zeros(group.variable.shape, bool)
+    for place, variable in np.ndenumerate(group.variable):
+        q, scale = plan.quantity_of(int(variable))
+        if q == ZERO:
+            continue
+        order = int(group.order[place])
+        short = int(table.order[q]) + order - int(table.highest[table.owner[q]])
+        if short > 1:
+            raise ModelError(_too_high(plan, group, int(variable), order))
+        quantity[place], factor[place], missing[place] = q + order - max(short, 0), scale, short > 0
+    return quantity, factor, missing
+
+
+def _too_high(plan: SystemPlan, group: AccountGroup, variable: int, order: int) -> str:
+    name = "der(" * order + plan.flat.variables.names[variable] + ")" * order
+    owner = plan.flat.components[int(group.component[0])]
+    return (
+        f"component '{owner}' declares {group.kind} in {name}, but the model has neither that derivative nor the one "
+        "below it: declare it in variables of the component"
+    )
+
+
+def silent_components(plan: SystemPlan) -> Sequence[str]:
+    """Components with ports that declare nothing, nor do those that they contain."""
+    names, ports = plan.flat.components, plan.flat.ports
+    declared = {names[int(k)] for group in plan.flat.accounts for k in group.component}
+    has_port = [names[int(k)] for k in dict.fromkeys(ports.owner.tolist())]
+    return [n for n in has_port if not any(d == n or d.startswith(f"{n}.") for d in declared)]

@@ -1,0 +1,346 @@
+"""Accounts of energy: what components declare, read from solutions, and whether it balances."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import test_library_electrical as electrical
+import test_library_mechanical as mechanical
+from problems import compiled, damped_oscillation, oscillator, pendulum
+from sympy import Eq, Symbol
+
+import jaxonomy_dae.library.electrical as el
+import jaxonomy_dae.library.hydraulic as hy
+import jaxonomy_dae.library.rotational as rot
+import jaxonomy_dae.library.thermal as th
+import jaxonomy_dae.library.translational as tr
+from jaxonomy_dae import Component, EqnEnv, ModelError, Translational, der, simulate
+from jaxonomy_dae.testing import assert_energy_balance
+
+TIGHT = {"rtol": 1e-9, "atol": 1e-11}
+BALANCED = 1e-7  # a hundred times the tolerance of these runs
+
+
+@functools.cache
+def rlc():
+    """A step of 5 V on a resistor, a coil and a capacitor in series."""
+    ev = EqnEnv()
+    source, r = el.VoltageSource(ev, "source", 5.0), el.Resistor(ev, "r", 1.5)
+    coil, c = el.Inductor(ev, "l", 0.2, initial_current=0.0), el.Capacitor(ev, "c", 0.1, initial_voltage=0.0)
+    ground = el.Ground(ev, "ground")
+    return compiled(
+        source, r, coil, c, ground,
+        connect=[(source.p, r.p), (r.n, coil.p), (coil.n, c.p), (c.n, source.n, ground.p)],
+    )  # fmt: skip
+
+
+def test_terms_of_an_oscillator():
+    """½·M·v² + ½·K·x², lost at D·v², nothing supplied."""
+    ts = np.linspace(0.0, 3.0, 7)
+    solution = simulate(oscillator(), 3.0, ts=ts, **TIGHT)
+    x, v = damped_oscillation(ts)
+    np.testing.assert_allclose(solution.energy("mass"), v**2, rtol=0, atol=BALANCED)
+    np.testing.assert_allclose(solution.energy("spring"), 2.5 * x**2, rtol=0, atol=BALANCED)
+    np.testing.assert_allclose(solution.energy(), v**2 + 2.5 * x**2, rtol=0, atol=BALANCED)
+    np.testing.assert_allclose(solution.dissipation(), 0.6 * v**2, rtol=0, atol=BALANCED)
+    np.testing.assert_array_equal(solution.supply(), 0.0)
+    np.testing.assert_array_equal(solution.dissipation("mass"), 0.0)
+    assert np.max(np.abs(solution.energy_balance_error())) < BALANCED
+    assert_energy_balance(solution, rtol=BALANCED)
+
+
+def test_a_loose_run_is_off_by_its_own_error():
+    """What the saved states lose of ½·M·v² + ½·K·x² against the closed form is what the balance finds."""
+    ts = np.linspace(0.0, 6.0, 7)
+    solution = simulate(oscillator(), 6.0, ts=ts, rtol=1e-4, atol=1e-6)
+    x, v = damped_oscillation(ts)
+    lost = np.asarray(solution.energy()) - (v**2 + 2.5 * x**2)
+    error = np.asarray(solution.energy_balance_error())
+    scale = np.max(np.abs(lost)) / np.max(np.abs(error))  # the size that errors are relative to
+    energy = float(solution.energy()[0])
+    assert 0.5 * energy < scale < 5 * energy
+    np.testing.assert_allclose(error * scale, lost, rtol=0, atol=BALANCED * energy)
+
+
+def test_rlc():
+    """The source gives 5 V·q, the capacitor takes half of it in the end, the resistor the rest."""
+    solution = simulate(rlc(), 4.0, ts=jnp.array([0.0, 0.1, 0.5, 2.0, 4.0]), **TIGHT)
+    assert_energy_balance(solution, rtol=BALANCED)
+    i, v = np.asarray(solution["l.i"]), np.asarray(solution["c.v"])
+    np.testing.assert_allclose(solution.energy(), 0.1 * i**2 + 0.05 * v**2, rtol=1e-12)
+    np.testing.assert_allclose(solution.supply("source"), 5.0 * i, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(solution.dissipation("r"), 1.5 * i**2, rtol=1e-12, atol=1e-15)
+
+
+def test_a_dc_motor_in_its_parts():
+    """Electrical power becomes mechanical; a load takes it, and the name of a composite adds up its parts."""
+    ev = EqnEnv()
+    machine, source = el.DCMotor(ev, "motor", R=1.2, L=1e-2, k=0.1, J=1e-3, d=2e-3), el.SignalVoltage(ev, "source")
+    ground, load = el.Ground(ev, "ground"), rot.Torque(ev, "load")
+    system = compiled(
+        machine, source, ground, load,
+        connect=[(source.p, machine.p), (source.n, machine.n, ground.p), (machine.flange, load.flange)],
+    )  # fmt: skip
+    solution = simulate(
+        system, 1.0, ts=jnp.linspace(0.0, 1.0, 5),
+        inputs={"source.u": lambda t: 12.0 * jnp.sin(20.0 * t), "load.tau": -0.05}, **TIGHT,
+    )  # fmt: skip
+    assert_energy_balance(solution, rtol=BALANCED)
+    i, w = np.asarray(solution["motor.inductor.i"]), np.asarray(solution["motor.rotor.w"])
+    np.testing.assert_allclose(solution.dissipation("motor"), 1.2 * i**2 + 2e-3 * w**2, rtol=1e-12)
+    np.testing.assert_allclose(solution.supply("load"), -0.05 * w, rtol=1e-12, atol=1e-15)
+
+
+def test_heat_goes_to_the_heat_port():
+    """The power of a heated resistor is stored in a body and leaves to the surroundings: nothing is lost."""
+    ev = EqnEnv()
+    source, r, ground = el.VoltageSource(ev, "source", 10.0), el.HeatedResistor(ev, "r", 4.0), el.Ground(ev, "ground")
+    body, skin = th.HeatCapacitor(ev, "body", C=30.0, initial_temperature=300.0), th.Convection(ev, "skin", h=8.0)
+    room = th.FixedTemperature(ev, "room", T=290.0)
+    system = compiled(
+        source, r, ground, body, skin, room,
+        connect=[
+            (source.p, r.p), (source.n, r.n, ground.p), (r.heat, body.heat, skin.port_a), (skin.port_b, room.heat),
+        ],
+    )  # fmt: skip
+    solution = simulate(system, 20.0, ts=jnp.linspace(0.0, 20.0, 5), **TIGHT)
+    assert_energy_balance(solution, rtol=BALANCED)
+    np.testing.assert_array_equal(solution.dissipation(), 0.0)
+    np.testing.assert_allclose(solution.supply("source"), 25.0, rtol=1e-12)
+    np.testing.assert_allclose(
+        solution.supply("room"), -8.0 * (np.asarray(solution["body.T"]) - 290.0), rtol=1e-9
+    )  # fmt: skip
+
+
+def test_mechanics_that_is_not_linear():
+    """A mass on a hardening spring with friction, driven against a stop with play by a moving end."""
+    ev = EqnEnv()
+    mass = tr.Mass(ev, "mass", 0.5, initial_position=0.02, initial_velocity=0.0)
+    spring, friction = tr.NonlinearSpring(ev, "spring", K=40.0, K3=2e4), tr.Friction(ev, "friction", sliding=0.1)
+    stop, wall = tr.Backlash(ev, "stop", gap=0.02, K=500.0, D=1.0, smooth=1e-3), tr.FixedPosition(ev, "wall")
+    soft, shaker = tr.SpringDamper(ev, "soft", K=20.0, D=0.3), tr.PositionSource(ev, "shaker")
+    system = compiled(
+        mass, spring, friction, stop, wall, soft, shaker,
+        connect=[
+            (wall.flange, spring.flange_a, friction.flange_a, stop.flange_a),
+            (mass.flange, spring.flange_b, friction.flange_b, stop.flange_b, soft.flange_b),
+            (soft.flange_a, shaker.flange),
+        ],
+    )  # fmt: skip
+    inputs = {"shaker.u": lambda t: 0.03 * jnp.sin(9.0 * t)}
+    solution = simulate(system, 1.0, ts=jnp.linspace(0.0, 1.0, 6), inputs=inputs, **TIGHT)
+    assert_energy_balance(solution, rtol=10 * BALANCED)  # creeping friction: |f'| is 250 times the sliding force
+    speed = 0.27 * np.cos(9.0 * np.asarray(solution.ts))
+    np.testing.assert_allclose(
+        solution.supply(), -np.asarray(solution["shaker.flange.f"]) * speed, rtol=1e-9, atol=1e-12
+    )  # fmt: skip
+
+
+def test_a_speed_that_the_model_does_not_have():
+    """A force on the end of a massless spring: its speed is that of the force's change, f'/K, and of the mass."""
+    ev = EqnEnv()
+    force, spring = tr.Force(ev, "force"), tr.Spring(ev, "spring", K=3.0)
+    mass = tr.Mass(ev, "mass", 2.0, initial_position=0.0, initial_velocity=0.0)
+    system = compiled(force, spring, mass, connect=[(force.flange, spring.flange_b), (spring.flange_a, mass.flange)])
+    inputs = {"force.f": lambda t: 1.5 * jnp.sin(2.0 * t)}
+    solution = simulate(system, 2.0, ts=jnp.linspace(0.0, 2.0, 5), inputs=inputs, **TIGHT)
+    t = np.asarray(solution.ts)
+    with pytest.raises(ModelError, match="occurs nowhere"):
+        solution["der(force.flange.x)"]
+    speed = np.asarray(solution["mass.v"]) + 3.0 * np.cos(2.0 * t) / 3.0
+    np.testing.assert_allclose(solution.supply(), 1.5 * np.sin(2.0 * t) * speed, rtol=1e-12, atol=1e-15)
+    assert_energy_balance(solution, rtol=BALANCED)
+
+
+def test_redundant_states_balance():
+    solution = simulate(pendulum(), 2.0, ts=jnp.linspace(0.0, 2.0, 5), **TIGHT)
+    np.testing.assert_allclose(solution.energy(), solution.energy()[0], rtol=BALANCED)
+    assert_energy_balance(solution, rtol=BALANCED)
+
+
+@pytest.mark.slow
+def test_an_implicit_block_balances():
+    """A capacitor is discharged through a diode and a resistor."""
+    ev = EqnEnv()
+    c, d = el.Capacitor(ev, "c", 1e-3, initial_voltage=2.0), el.Diode(ev, "d")
+    r, ground = el.Resistor(ev, "r", 10.0), el.Ground(ev, "ground")
+    system = compiled(c, d, r, ground, connect=[(c.p, d.p), (d.n, r.p), (r.n, c.n, ground.p)])
+    assert system.carried
+    assert_energy_balance(simulate(system, 0.02, ts=jnp.linspace(0.0, 0.02, 4), **TIGHT), rtol=BALANCED)
+
+
+@pytest.mark.slow
+def test_hydraulics():
+    """A pump's shaft drives fluid from a tank through an orifice into an accumulator, with inertia and compliance."""
+    ev = EqnEnv()
+    tank, pump = hy.Tank(ev, "tank", A=0.01, initial_level=1.0), hy.Pump(ev, "pump", D=1e-6)
+    speed, duct = rot.SpeedSource(ev, "speed"), hy.Inertance(ev, "duct", L=2.0, A=1e-4, initial_m_flow=0.0)
+    volume, orifice = (
+        hy.HydraulicCapacity(ev, "volume", C=1e-10, initial_pressure=2e5),
+        hy.Orifice(ev, "orifice", A=5e-6),
+    )
+    store = hy.Accumulator(ev, "store", V0=1e-3, p0=1.5e5, n=1.4, initial_volume=1e-5)
+    leak, outside = hy.LaminarPipe(ev, "leak", D=1e-3, L=0.5), hy.PressureSource(ev, "outside")
+    system = compiled(
+        tank, pump, speed, duct, volume, orifice, store, leak, outside,
+        connect=[
+            (tank.fluid, pump.port_b), (pump.port_a, volume.fluid, duct.port_a), (speed.flange, pump.flange),
+            (duct.port_b, orifice.port_a), (orifice.port_b, store.fluid, leak.port_a), (leak.port_b, outside.fluid),
+        ],
+    )  # fmt: skip
+    solution = simulate(system, 0.5, ts=jnp.linspace(0.0, 0.5, 4), inputs={"speed.u": -20.0}, **TIGHT)
+    assert_energy_balance(solution, rtol=BALANCED)
+
+
+@pytest.mark.parametrize("n", [1.0, 1.4])
+def test_the_energy_of_an_accumulator(n):
+    """The work of the fluid against the gas, ∫ p0·(V0/(V0 − V))^n dV, by quadrature."""
+    ev = EqnEnv()
+    store, supply = (
+        hy.Accumulator(ev, "store", V0=2.0, p0=3.0, n=n, initial_volume=0.0),
+        hy.MassFlowSource(ev, "supply"),
+    )
+    system = compiled(store, supply, connect=[(store.fluid, supply.fluid)])
+    solution = simulate(system, 1.0, ts=jnp.array([0.0, 1.0]), inputs={"supply.m_flow": 998.2}, **TIGHT)
+    places, weights = np.polynomial.legendre.leggauss(20)
+    work = np.sum(weights / 2 * 3.0 * (2.0 / (2.0 - (1 + places) / 2)) ** n)
+    np.testing.assert_allclose(solution.energy()[1] - solution.energy()[0], work, rtol=BALANCED)
+
+
+def test_every_circuit_without_storage():
+    """What all electrical components without storage bring in is lost at the same instant."""
+    system, inputs, _ = electrical.static()
+    solution = simulate(system, 1.0, ts=jnp.array([1.0]), inputs=inputs)
+    lost = float(solution.dissipation()[0])
+    assert lost > 100.0
+    np.testing.assert_allclose(solution.supply()[0], lost, rtol=electrical.ROUNDING)
+
+
+@pytest.mark.slow
+def test_every_electrical_storage():
+    solution = electrical.run(electrical.dynamic()[0])
+    assert_energy_balance(solution, rtol=1e-6)  # the second run is not told the times at which sources jump
+
+
+@pytest.mark.slow
+def test_every_mechanical_component():
+    system, inputs, _ = mechanical.model()
+    solution = simulate(system, 2.0, ts=jnp.array([0.0, 0.5, 2.0]), inputs=inputs, **TIGHT)
+    assert_energy_balance(solution, rtol=BALANCED)
+
+
+# --- declarations ------------------------------------------------------------------------------------------------
+
+
+class Block(Component):
+    """A mass on a spring and a damper, with its declarations given from outside."""
+
+    def __init__(self, ev, name, declare=lambda c, m, k, d, x, v: None):
+        super().__init__(ev, name)
+        m, k, d = self.parameter("m", 2.0), self.parameter("k", 5.0), self.parameter("d", 0.6)
+        x, v = self.variable("x", start=0.7, fixed=True), self.variable("v", start=-0.4, fixed=True)
+        self.add_equations(Eq(der(x), v), Eq(m * der(v), -k * x - d * v))
+        self.output("lost", d * v**2)
+        declare(self, m, k, d, x, v)
+
+
+def right(c, m, k, d, x, v):
+    c.declare_energy(m * v**2 / 2, k * x**2 / 2)
+    c.declare_dissipation("lost")
+
+
+def half_of_the_spring(c, m, k, d, x, v):
+    c.declare_energy(m * v**2 / 2, k * x**2 / 4)
+    c.declare_dissipation(d * v**2)
+
+
+def no_damper(c, m, k, d, x, v):
+    c.declare_energy(m * v**2 / 2, k * x**2 / 2)
+
+
+def wrong_sign(c, m, k, d, x, v):
+    c.declare_energy(m * v**2 / 2, k * x**2 / 2)
+    c.declare_supply(d * v**2)
+
+
+def test_a_declaration_by_name():
+    solution = simulate(compiled(Block(EqnEnv(), "b", right)), 2.0, ts=jnp.array([0.0, 1.0, 2.0]), **TIGHT)
+    assert_energy_balance(solution, rtol=BALANCED)
+
+
+@pytest.mark.parametrize("wrong", [half_of_the_spring, no_damper, wrong_sign])
+def test_a_wrong_declaration_is_detected(wrong):
+    solution = simulate(compiled(Block(EqnEnv(), "b", wrong)), 2.0, ts=jnp.array([0.0, 1.0, 2.0]))
+    message = r"the account of energy is off by .* of .* J at t=.*: stored .* J, supplied .* J, lost .* J since t=0"
+    with pytest.raises(AssertionError, match=message):
+        assert_energy_balance(solution)
+
+
+def test_a_component_that_declares_nothing_is_named():
+    class Brake(Component):
+        def __init__(self, ev, name):
+            super().__init__(ev, name)
+            flange = self.port("flange", Translational)
+            self.add_equations(Eq(flange.f, 3.0 * der(flange.x)))
+
+    ev = EqnEnv()
+    mass, brake = tr.Mass(ev, "mass", initial_position=0.0, initial_velocity=1.0), Brake(ev, "brake")
+    system = compiled(mass, brake, connect=[(mass.flange, brake.flange)])
+    with pytest.raises(AssertionError, match=r"These components declare nothing: brake\."):
+        assert_energy_balance(simulate(system, 1.0))
+
+
+def test_what_cannot_be_declared():
+    for declare, message in [
+        (lambda c, *_: c.declare_energy("speed"), r"component 'b' has no variable or parameter 'speed'"),
+        (lambda c, *_: c.declare_supply(None), r"component 'b': supply is an expression.*got None"),
+    ]:
+        with pytest.raises(ModelError, match=message):
+            Block(EqnEnv(), "b", declare)
+    with pytest.raises(ModelError, match=r"component 'b' is complete: declare its energy inside __init__"):
+        Block(EqnEnv(), "b").declare_energy(1.0)
+    with pytest.raises(ModelError, match="symbol 'q' was declared by no component"):
+        compiled(Block(EqnEnv(), "b", lambda c, *_: c.declare_energy(Symbol("q") ** 2)))
+    silent = simulate(compiled(Block(EqnEnv(), "b")), 1.0)
+    with pytest.raises(ModelError, match="no component of this model declares energies"):
+        silent.energy()
+    with pytest.raises(ModelError, match=r"'bb' is not a component: did you mean 'b'"):
+        simulate(compiled(Block(EqnEnv(), "b", right)), 1.0).energy("bb")
+
+    def jerk(c, m, k, d, x, v):
+        c.declare_energy(m * der(der(der(v))))
+
+    with pytest.raises(
+        ModelError, match=r"'b' declares energy in der\(der\(der\(b\.v\)\)\), but the model has neither"
+    ):
+        simulate(compiled(Block(EqnEnv(), "b", jerk)), 1.0).energy()
+
+
+def test_declarations_cost_a_simulation_nothing():
+    """They are no equations, and what is compiled for a run is the same program."""
+    plain, declared = compiled(Block(EqnEnv(), "b")), compiled(Block(EqnEnv(), "b", right))
+    assert plain.variables == declared.variables and plain.report.n_equations == declared.report.n_equations
+    assert plain.plan != declared.plan  # another plan, so that neither is taken for the other
+    texts = [str(jax.make_jaxpr(s.vector_field)(0.0, jnp.ones(2))) for s in (plain, declared)]
+    assert texts[0] == texts[1]
+
+
+def test_accounts_inside_jit_and_batches():
+    system, ts = compiled(Block(EqnEnv(), "b", right)), jnp.array([0.0, 1.0])
+
+    def lost(d):
+        return simulate(system.with_parameters({"b.d": d}), 1.0, ts=ts, **TIGHT).energy()[-1]
+
+    step = 1e-4  # central differences: their error is of the order of step², and of the tolerance by step
+    slope = (lost(0.6 + step) - lost(0.6 - step)) / (2 * step)
+    np.testing.assert_allclose(jax.jit(jax.grad(lost))(0.6), slope, rtol=1e-4)
+    batch = eqx.filter_vmap(lambda d: simulate(system.with_parameters({"b.d": d}), 1.0, ts=ts))(jnp.array([0.0, 0.6]))
+    assert batch.energy().shape == (2, 2)
+    np.testing.assert_allclose(batch.energy()[0, 1], batch.energy()[0, 0], rtol=1e-4)
+    with pytest.raises(ModelError, match="this is a batch"):
+        batch.energy_balance_error()
+    with pytest.raises(ModelError, match="outside jit"):
+        jax.jit(lambda d: simulate(system.with_parameters({"b.d": d}), 1.0, ts=ts).energy_balance_error())(0.6)
