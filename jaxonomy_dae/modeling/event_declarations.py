@@ -20,6 +20,7 @@ class EventDeclarations:
     events: list[When]
     equations: list[sympy.Expr]
     _sealed: bool
+    add_equations: Any
     _declare: Any
     _declare_parameter: Any
     _check_parameters_only: Any
