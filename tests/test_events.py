@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from hybrid_models import Ball, SampledPI, Stick, Thermostat, compiled
 
-from jaxonomy_dae import SimulationError, simulate
+from jaxonomy_dae import ModelError, SimulationError, simulate
 from jaxonomy_dae.solvers import BDF, Rodas5P, Tsit5
 
 BOUNCES = [0.451523640985731, 1.1739614665629, 1.75191172702464, 2.21427193539402, 2.58416010208954, 2.88007063544594]
@@ -171,3 +171,21 @@ def test_reverse_is_forward(ball):
     reverse = jax.jit(jax.jacrev(lambda p: height_and_sixth(ball, p)))(p)
     forward = jax.jit(jax.jacfwd(lambda p: height_and_sixth(ball, p, adjoint=diffrax.ForwardMode())))(p)
     np.testing.assert_allclose(reverse, forward, rtol=1e-9)
+
+
+def test_both_sides_of_an_event(ball):
+    solution = simulate(ball, 1.0, ts=jnp.array([1.0]), **TIGHT)
+    impact = 9.81 * BOUNCES[0]
+    np.testing.assert_allclose(solution.events.before["ball.v"][0], -impact, rtol=1e-9)
+    np.testing.assert_allclose(solution.events.after["ball.v"][0], 0.8 * impact, rtol=1e-9)
+    np.testing.assert_allclose(solution.events.transversality[0], impact, rtol=1e-9)
+    assert solution.events.after["ball.n"][0] == 1 and np.isnan(solution.events.before["ball.v"][1])
+
+    def impact_speed(h0):
+        changed = ball.with_parameters({"ball.h0": h0})
+        return simulate(changed, 1.0, ts=jnp.array([1.0]), save_events=True, **TIGHT).events.before["ball.v"][0]
+
+    # v = −√(2·g·h0)
+    assert float(jax.grad(impact_speed)(1.0)) == pytest.approx(-np.sqrt(9.81 / 2), rel=1e-9)
+    with pytest.raises(ModelError, match="save_events=True"):
+        jax.grad(lambda h: simulate(ball, 1.0, ts=jnp.array([h])).events.before["ball.v"][0])(0.9)

@@ -81,11 +81,12 @@ def handle(
             exact = problem.due(state.ticks)[jnp.clip(event, 0, c - 1)]
             delay = jnp.where(is_clock, exact - lax.stop_gradient(exact), delay)
         time = t + delay
-        x, new = problem.written(time, state.x + before * delay, q, instant.previous, event, args)
+        reached = state.x + before * delay
+        x, new = problem.written(time, reached, q, instant.previous, event, args)
         after = problem.slope(t, x, new, args)
         ticks = state.ticks + one_hot(event, c).astype(state.ticks.dtype)
         logged = ~is_clock & (not at_start)
-        row = jnp.where(logged, state.count.astype(int), state.times.shape[0])
+        row = jnp.where(logged, state.count.astype(int), state.times.shape[0] + 1)
         armed, left, caused = _following(problem, t, x, new, after, instant, event, arrival, args)
         state = HybridState(
             x - after * delay,
@@ -95,10 +96,12 @@ def handle(
             ticks,
             lax.stop_gradient(problem.due(ticks)),
             state.count + logged.astype(state.count.dtype),
-            state.times.at[row].set(time, mode="drop"),
-            state.which.at[row].set(event.astype(state.which.dtype), mode="drop"),
-            state.rate.at[row].set(lax.stop_gradient(rate), mode="drop"),
+            _noted(state.times, row, time),
+            _noted(state.which, row, event),
+            _noted(state.rate, row, lax.stop_gradient(rate)),
             jnp.maximum(state.ended, ends[event]),
+            _noted(state.before, row, jnp.concatenate([reached, q])),
+            _noted(state.after, row, jnp.concatenate([x, new])),
         )
         # Clocks that tick together read what was before all of them.
         previous = jnp.where(jnp.any(left[:c]), instant.previous, new) if c else new
@@ -116,6 +119,11 @@ def handle(
     length = c + min(2 * g, CONDITIONS_AT_ONE_INSTANT)
     instant, _ = lax.scan(step, start, length=length)
     return instant.state
+
+
+def _noted(rows: Any, row: Any, value: Any) -> Any:
+    """Rows with one of them written; nothing is if there is no such row."""
+    return rows.at[row].set(value.astype(rows.dtype), mode="drop") if rows.shape[0] else rows
 
 
 def _following(problem, t, x, q, slope, instant: Instant, event, arrival: Arrival, args):

@@ -77,6 +77,7 @@ class HybridState(eqx.Module):
     - `ticks`, `due`: how often each clock has ticked, and when it does next.
     - `count`, `times`, `which`, `rate`: how many events there were, and of the first ones the time, the number of the
         event and how fast its guard fell.
+    - `before`, `after`: (x, q) at the times of the first events, on both sides; no rows if they are not asked for.
     - `ended`: 1.0 once an event has ended the run.
     """
 
@@ -91,6 +92,8 @@ class HybridState(eqx.Module):
     which: Float[Array, " events"]
     rate: Float[Array, " events"]
     ended: Float[Array, ""]
+    before: Float[Array, "rows m"]
+    after: Float[Array, "rows m"]
 
 
 def still(tree: Any) -> Any:

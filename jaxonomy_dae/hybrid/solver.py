@@ -128,19 +128,7 @@ class WithEvents(diffrax.AbstractWrappedSolver):
         dense = _Dense(solver.interpolation_cls, info)
         found = _looked_at(problem, dense, t0, t1, y0, x1, args)
         request, armed, arrival = found
-        state = HybridState(
-            x1,
-            y0.q,
-            armed,
-            jnp.full_like(t1, jnp.inf),
-            y0.ticks,
-            y0.due,
-            y0.count,
-            y0.times,
-            y0.which,
-            y0.rate,
-            y0.ended,
-        )
+        state = eqx.tree_at(lambda y: (y.x, y.armed, y.request), y0, (x1, armed, jnp.full_like(t1, jnp.inf)))
         fired = jnp.any(arrival.due)
 
         def events(state):

@@ -10,8 +10,13 @@ from .event_map import Arrival, handle
 from .problem import AbstractHybridProblem, HybridState
 
 
-def start(problem: AbstractHybridProblem, t0: Any, x0: Any, q0: Any, args: Any, logged: int) -> HybridState:
-    """The state at the initial time, after the clocks that tick there, and after the events that are immediate."""
+def start(
+    problem: AbstractHybridProblem, t0: Any, x0: Any, q0: Any, args: Any, logged: int, sides: bool
+) -> HybridState:
+    """The state at the initial time, after the clocks that tick there, and after the events that are immediate.
+
+    `logged` says for how many events there is room, `sides` whether the states before and after them are kept.
+    """
     c, g = problem.n_clocks, problem.n_guards
     dtype = t0.dtype
     nothing, infinite = jnp.zeros((), dtype), jnp.full((logged,), jnp.inf, dtype)
@@ -24,9 +29,10 @@ def start(problem: AbstractHybridProblem, t0: Any, x0: Any, q0: Any, args: Any, 
         value, rate = problem.rates(t0, x0, q0, args, problem.slope(t0, x0, q0, args))
         holding = jnp.where(value == 0, rate < 0, value < 0)
         armed, size = (~holding).astype(dtype), jnp.abs(value)
+    rows = jnp.full((logged if sides else 0, len(x0) + len(q0)), jnp.nan, dtype)
     state = HybridState(
         x0, q0, armed, jnp.asarray(jnp.inf, dtype), ticks, lax.stop_gradient(problem.due(ticks)), nothing,
-        infinite, jnp.full_like(infinite, -1.0), jnp.zeros_like(infinite), nothing,
+        infinite, jnp.full_like(infinite, -1.0), jnp.zeros_like(infinite), nothing, rows, rows,
     )  # fmt: skip
     at_once = np.array(problem.immediate[c:], bool)
     if not c and not at_once.any():

@@ -1,5 +1,6 @@
 """The events of a run."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -9,53 +10,132 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from ..errors import ModelError
 from ..hybrid.problem import HybridState
-from ..lowering.plan_events import EventPlan
+from ..system.system import AcausalSystem
+
+SHOWN = 12
 
 
 class EventLog(eqx.Module):
-    """`solution.events`: the events of conditions in the order in which they happened; sampled ones are not listed.
-
-    - `ts`: the times, shape `(max_events,)`, infinite beyond the last event; differentiable.
-    - `which`: the number of each event among `all_names`, −1 where there was none.
-    - `transversality`: how fast the condition was reached, in its units per second. An event whose transversality is
-        near zero only grazes its condition, and its time hardly has a derivative.
-    - `count`: how many there were.
-    """
+    """What a run noted of its events, one row for each, as far as there is room."""
 
     ts: Float[Array, "*batch events"]
     which: Float[Array, "*batch events"]
     transversality: Float[Array, "*batch events"]
     count: Float[Array, "*batch"]
-    all_names: tuple[str, ...] = eqx.field(static=True)
-    messages: tuple[str | None, ...] = eqx.field(static=True)
+    before: Float[Array, "*batch rows m"]
+    after: Float[Array, "*batch rows m"]
 
     @classmethod
-    def of(cls, state: HybridState, plan: EventPlan) -> "EventLog":
+    def of(cls, state: HybridState) -> "EventLog":
         """The log in the last state of a run."""
-        return cls(
-            state.times, jax.lax.stop_gradient(state.which), jnp.abs(state.rate), jax.lax.stop_gradient(state.count),
-            plan.names, plan.table.message,
-        )  # fmt: skip
+        frozen = jax.lax.stop_gradient((state.which, jnp.abs(state.rate), state.count))
+        return cls(state.times, *frozen, state.before, state.after)
+
+
+class Events:
+    """`solution.events`: the events of conditions in the order in which they happened; sampled ones are not listed.
+
+    - `ts`: the times, shape `(max_events,)`, infinite beyond the last event; differentiable.
+    - `which`: the number of each event among `all_names`, −1 where there was none.
+    - `names`: what happened, in order: the conditions as they were written.
+    - `transversality`: how fast the condition was reached, in its units per second. An event whose transversality is
+        near zero only grazes its condition, and its time hardly has a derivative.
+    - `before`, `after`: variables on both sides, `solution.events.before["ball.v"]` has shape `(max_events,)`, NaN
+        beyond the last event; differentiable, along with the time of the event.
+    - `count`: how many there were; outside jit also `len(solution.events)`.
+    - `terminated`: with what `terminate(...)` ended the run, or None.
+    """
+
+    def __init__(self, log: EventLog, system: AcausalSystem, inputs: Any):
+        self._log, self._system, self._inputs = log, system, inputs
+        self._table: Any = system.plan.events
+
+    @property
+    def ts(self) -> Array:
+        return self._log.ts
+
+    @property
+    def which(self) -> Array:
+        return self._log.which
+
+    @property
+    def transversality(self) -> Array:
+        return self._log.transversality
+
+    @property
+    def count(self) -> Array:
+        return self._log.count
+
+    @property
+    def all_names(self) -> Sequence[str]:
+        return self._table.names
+
+    @property
+    def names(self) -> list[str]:
+        return [self.all_names[k] for k in self._numbers()]
+
+    @property
+    def terminated(self) -> str | None:
+        messages = [self._table.table.message[k] for k in self._numbers()]
+        return messages[-1] if messages else None
+
+    @property
+    def before(self) -> "Side":
+        return Side(self._log.ts, self._log.before, self._system, self._inputs)
+
+    @property
+    def after(self) -> "Side":
+        return Side(self._log.ts, self._log.after, self._system, self._inputs)
+
+    def _numbers(self) -> list[int]:
+        if isinstance(self.which, Tracer) or self.which.ndim != 1:
+            raise ModelError("the names of events are those of one run, outside jit: read .which and .all_names")
+        return [int(k) for k in np.asarray(self.which) if k >= 0]
 
     def __len__(self) -> int:
         return int(self.count)
 
-    @property
-    def names(self) -> list[str]:
-        """What happened, in order: the conditions as they were written."""
-        return [self.all_names[int(k)] for k in np.asarray(self.which) if k >= 0]
-
-    @property
-    def terminated(self) -> str | None:
-        """With what `terminate(...)` ended the run, or None."""
-        messages = [self.messages[int(k)] for k in np.asarray(self.which) if k >= 0]
-        return messages[-1] if messages else None
-
     def __repr__(self):
         if isinstance(self.count, Tracer) or self.count.ndim:
-            return f"EventLog(ts of shape {self.ts.shape})"
-        ts: Any = np.asarray(self.ts)[: len(self)]
-        rows = [f"  {t:.9g}  {name}" for t, name in zip(ts[:12], self.names, strict=False)]
-        more = [f"  … and {len(self) - 12} more"] if len(self) > 12 else []
-        return "\n".join([f"EventLog({len(self)} events)", *rows, *more])
+            return f"Events(ts of shape {self.ts.shape})"
+        rows = [f"  {t:.9g}  {name}" for t, name in zip(np.asarray(self.ts)[:SHOWN], self.names, strict=False)]
+        more = [f"  … and {len(self) - SHOWN} more"] if len(self) > SHOWN else []
+        return "\n".join([f"Events({len(self)})", *rows, *more])
+
+
+class Side:
+    """Variables by name, on one side of the events."""
+
+    def __init__(self, ts: Any, rows: Any, system: AcausalSystem, inputs: Any):
+        self._given = (system, ts, rows, inputs)
+
+    def __getitem__(self, name: str) -> Array:
+        system, ts, rows, inputs = self._given
+        if not rows.shape[-2]:
+            raise ModelError(
+                "states on both sides of events were not kept, which costs memory in a large model or inside jit: "
+                "give simulate(..., save_events=True)"
+            )
+        if name in system.discretes:
+            return rows[..., len(system.plan.nominal) + system.discretes.index(name)]
+        quantity, factor = system.plan.resolve([name])
+        if rows.ndim > 2:
+            return eqx.filter_vmap(_observed, in_axes=(eqx.if_array(0), 0, 0, eqx.if_array(0), None, None))(
+                system, ts, rows, inputs, quantity, factor
+            )
+        return _observed(system, ts, rows, inputs, quantity, factor)
+
+
+def _observed(system: AcausalSystem, ts: Any, rows: Any, inputs: Any, quantity: np.ndarray, factor: np.ndarray) -> Any:
+    n, happened = len(system.plan.nominal), jnp.isfinite(ts)
+
+    def one(t, row):
+        point = system.holding(row[n:]).at(t, inputs)
+        return point.quantities(row[:n], np.maximum(quantity, 0), factor)[0]
+
+    # Rows without an event are evaluated at the first one, and left out.
+    safe_t, safe = jnp.where(happened, ts, ts[0]), jnp.where(happened[:, None], rows, rows[0])
+    values = jnp.where(quantity[0] < 0, 0.0, jax.vmap(one)(safe_t, safe))
+    return jnp.where(happened, values, jnp.nan)

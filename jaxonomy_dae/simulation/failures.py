@@ -8,7 +8,7 @@ import numpy as np
 from ..hybrid.solver import TOO_MANY
 from ..solvers.choice_guard import SINGULAR_CHOICE
 from ..solvers.failures import SHOWN, explain_failure, how_it_stopped
-from .event_log import EventLog
+from .event_log import Events
 from .failed_blocks import failed_block
 from .not_finite import equation_not_finite
 from .preparation import term_of
@@ -34,7 +34,7 @@ def explain(
     """Why the integration from `first` to t1 stopped at its last accepted point (t, x), and what to do."""
     system, inputs = solution.system, solution.inputs
     (t0, _), (t, x) = first, last
-    if solution.result == TOO_MANY and solution.events is not None:
+    if solution.result == TOO_MANY and solution.event_log is not None:
         return _too_many_events(solution.events, float(t))
     bad = _bad_input(inputs, float(t0), float(t), float(t1))
     if bad:
@@ -60,7 +60,7 @@ def explain(
     )  # fmt: skip
 
 
-def _too_many_events(events: EventLog, t: float) -> str:
+def _too_many_events(events: Events, t: float) -> str:
     """Which event happens again and again, and towards which time."""
     which = np.asarray(events.which, int)
     counts = np.bincount(which[which >= 0], minlength=len(events.all_names))

@@ -32,6 +32,7 @@ class Options(eqx.Module):
     max_steps: int = eqx.field(static=True)
     progress: bool = eqx.field(static=True)
     max_events: int = eqx.field(static=True, default=0)
+    save_events: bool = eqx.field(static=True, default=False)
 
 
 class Outcome(eqx.Module):
@@ -74,7 +75,7 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, throw: bo
     saved_of: Any = _whole
     if system.plan.events is not None:
         problem = problem_for(system, t0, t1, implicit, watch, tolerance)
-        y0 = start(problem, t0, x0, system.discrete_values, inputs, options.max_events)
+        y0 = start(problem, t0, x0, system.discrete_values, inputs, options.max_events, options.save_events)
         term, solver = HybridTerm(problem), WithEvents(chosen, options.max_events)
         controller = with_event_control(controller)
         saved_of = _state_and_discrete
@@ -89,7 +90,7 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, throw: bo
     discrete, events, held = None, None, None
     if system.plan.events is not None:
         x, discrete = x
-        events = EventLog.of(last[1], system.plan.events)
+        events = EventLog.of(last[1])
         held, last = last[1].q, (last[0], last[1].x)
     x = jnp.asarray(x)
     filled = jnp.isfinite(saved)

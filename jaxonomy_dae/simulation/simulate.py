@@ -30,6 +30,7 @@ from .preparation import term_of
 from .solution import Solution
 from .step_sizes import clipped, controller_for, scaled_atol
 
+FEW_NUMBERS = 20_000  # on one side of all events
 SOLVERS = {"Tsit5": Tsit5, "Rodas5P": Rodas5P, "BDF": BDF}
 
 
@@ -50,6 +51,7 @@ def simulate(
     dtmax: Any = None,
     max_steps: int = 16384,
     max_events: int = 100,
+    save_events: bool | None = None,
     progress: bool = False,
     throw: bool = True,
 ) -> Solution:
@@ -80,6 +82,8 @@ def simulate(
     - `dtmax`: the longest step.
     - `max_steps`: bounds the steps taken, beside those that end at samples; with `ts=None` as many rows are reserved.
     - `max_events`: bounds the events of conditions; `solution.events` has room for as many.
+    - `save_events`: whether `solution.events` also has variables before and after events; None: outside jit, and if
+        they take little room.
     - `progress`: shows a progress bar.
     - `throw`: whether to raise if the integration fails; otherwise see `solution.result`; rows that were not
         reached are NaN, and so are their derivatives.
@@ -116,13 +120,18 @@ def simulate(
             ts = jnp.clip(ts, t0, t1)  # `check_arguments` lets rounding pass, Diffrax does not
     given = (system, t0, t1, ts, inputs, initial)
 
+    sides = save_events
+    if sides is None:
+        few = max_events * (system.plan.n_state + len(system.discretes)) <= FEW_NUMBERS
+        sides = few and not _is_traced((given, adjoint, stepsize_controller))
+
     def options(solver: Any) -> Options:
         control = stepsize_controller
         if control is None:
             control = controller_for(system, solver, rtol, atol, dtmax)
         return Options(
             solver, adjoint if adjoint is not None else default_adjoint(), clipped(control, jump_ts, ends),
-            max_steps + ends.count, progress, max_events,
+            max_steps + ends.count, progress, max_events, sides,
         )  # fmt: skip
 
     if solver is None:

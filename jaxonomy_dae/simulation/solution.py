@@ -16,7 +16,7 @@ from ..errors import ModelError
 from ..lowering.gather import times
 from ..system.system import AcausalSystem
 from .accounts import account_values, chosen_terms
-from .event_log import EventLog
+from .event_log import EventLog, Events
 from .labelled import data_frame, data_set
 
 SHOWN = 8
@@ -33,7 +33,6 @@ class Solution(eqx.Module):
         why it was chosen.
     - `discrete`: the values of discrete variables at these times, shape `(n, len(system.discretes))`; None without
         events. At the time of an event, what it wrote.
-    - `events`: the events of conditions, see `EventLog`; None if the model has none.
     - `result`: Diffrax's result code. Where the integration stopped early, later rows are NaN.
 
     A solution that `equinox.filter_vmap` returns is a batch: shapes get its axis in front.
@@ -48,7 +47,7 @@ class Solution(eqx.Module):
     solver: str = eqx.field(static=True, default="")
     reason: str = eqx.field(static=True, default="")
     discrete: Float[Array, "n q"] | None = None
-    events: EventLog | None = None
+    event_log: EventLog | None = None
 
     def __getitem__(self, name: Any) -> Any:
         """The values of a variable, or of several: `solution["pend.x"]` has shape `(n,)`, and
@@ -106,6 +105,18 @@ class Solution(eqx.Module):
         found = iter(jnp.moveaxis(values, -1, 0))
         columns = [own[name] if name in own else next(found) for name in names]
         return jnp.stack(columns, axis=-1) if columns else jnp.zeros((*self.ts.shape, 0), self.states.dtype)
+
+    @property
+    def events(self) -> Events:
+        """The events of conditions: `.ts`, `.names`, `.before["m.x"]`, `.after["m.x"]`, `.transversality`.
+
+        **Raises:**
+
+        - `ModelError` if the model has no events.
+        """
+        if self.event_log is None:
+            raise ModelError("this model has no events: declare them with self.when(...)")
+        return Events(self.event_log, self.system, self.inputs)
 
     @property
     def stats(self) -> dict[str, Any]:
