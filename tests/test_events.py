@@ -189,3 +189,18 @@ def test_both_sides_of_an_event(ball):
     assert float(jax.grad(impact_speed)(1.0)) == pytest.approx(-np.sqrt(9.81 / 2), rel=1e-9)
     with pytest.raises(ModelError, match="save_events=True"):
         jax.grad(lambda h: simulate(ball, 1.0, ts=jnp.array([h])).events.before["ball.v"][0])(0.9)
+
+
+def test_second_derivatives_are_refused(ball):
+    def height(e):
+        return simulate(ball.with_parameters({"ball.e": e}), 1.0, ts=jnp.array([1.0]))["ball.h"][-1]
+
+    with pytest.raises(ModelError, match="second derivatives through events"):
+        jax.hessian(height)(0.8)
+    with pytest.raises(ModelError, match="second derivatives through events"):
+
+        def forward(e):
+            changed = ball.with_parameters({"ball.e": e})
+            return simulate(changed, 1.0, ts=jnp.array([1.0]), adjoint=diffrax.ForwardMode())["ball.h"][-1]
+
+        jax.jacfwd(jax.jacfwd(forward))(0.8)

@@ -7,8 +7,9 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float
+
+from .first_order import constant_once
 
 
 class AbstractHybridProblem(eqx.Module):
@@ -57,15 +58,16 @@ class AbstractHybridProblem(eqx.Module):
         return offset + ticks * period
 
     def slope(self, t: Any, x: Any, q: Any, args: Any) -> Float[Array, " n"]:
-        """dx/dt, not differentiated."""
-        frozen, *point = still((self, t, x, q, args))
-        return lax.stop_gradient(frozen.field(*point))
+        """dx/dt, a constant of first derivatives."""
+        frozen, *point = constant_once((self, t, x, q, args))
+        return frozen.field(*point)
 
     def rates(
         self, t: Any, x: Any, q: Any, args: Any, slope: Any
     ) -> tuple[Float[Array, " guards"], Float[Array, " guards"]]:
-        """The guards' values, and how fast they change where x does with this slope; not differentiated."""
-        frozen, t, x, q, args = still((self, t, x, q, args))
+        """The guards' values, and how fast they change where x does with this slope: constants of first
+        derivatives."""
+        frozen, t, x, q, args = constant_once((self, t, x, q, args))
         return jax.jvp(lambda t, x: frozen.guards(t, x, q, args), (t, x), (jnp.ones_like(t), slope))
 
 

@@ -38,6 +38,11 @@ def check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_contr
         raise ModelError(
             "stepsize_controller=ConstantStepSize() needs a step: use diffrax.StepTo(ts=jnp.linspace(t0, t1, n))"
         )
+    if system.plan.events is not None and isinstance(stepsize_controller, diffrax.StepTo):
+        raise ModelError(
+            "stepsize_controller=StepTo(...) prescribes where steps end, but this model has events, at which they must "
+            "end too: leave it out, or bound the steps with dtmax="
+        )
     check_longest_step(dtmax)
     _check_interval(t0, t1, ts)
     check_initial(system, initial)

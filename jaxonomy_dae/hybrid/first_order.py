@@ -1,0 +1,47 @@
+"""Constants of first derivatives that would not be constants of second ones."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
+
+from ..errors import ModelError
+
+
+def constant_once(tree: Any) -> Any:
+    """The same, a constant for first derivatives; whoever differentiates these again is told that they cannot.
+
+    The map of an event takes slopes as constants. Its first derivative is exact, its second one is not.
+    """
+    return jax.tree.map(lambda leaf: _constant(leaf) if eqx.is_inexact_array(leaf) else leaf, tree)
+
+
+@jax.custom_jvp
+def _constant(value):
+    return value
+
+
+@_constant.defjvp
+def _(primals, tangents):
+    (value,) = primals
+    return _not_again(value), jnp.zeros_like(value)
+
+
+@jax.custom_jvp
+def _not_again(value):
+    return value
+
+
+def _refused(primals, tangents):
+    (value,), (tangent,) = primals, tangents
+    if not isinstance(tangent, SymbolicZero):
+        raise ModelError(
+            "second derivatives through events are not computed: the map of an event is exact to first order. Take "
+            "differences of gradients"
+        )
+    return value, jnp.zeros_like(value)
+
+
+_not_again.defjvp(_refused, symbolic_zeros=True)
