@@ -8,7 +8,7 @@ import sympy
 from ..errors import ModelError
 from ..model.dependent_parameters import complete
 from ..model.symbolic import SymbolicTemplate, canonical
-from ..model.tables import DependentParameters, ParameterTable, Start, VariableTable
+from ..model.tables import LIVE, DependentParameters, ParameterTable, Start, VariableTable
 from ..modeling.declarations import full_name
 from ..modeling.interval import Interval
 from .number_model import ModelNumbers
@@ -94,15 +94,21 @@ def parameter_table(model: ModelNumbers) -> ParameterTable:
         if float(array[p]) not in bounds[p]:
             must = f"lie in {bounds[p]}" if np.isfinite(array[p]) else "be finite"
             raise ModelError(f"parameter '{names[p]}' is {expressions[p]} and must {must}; got {array[p]:g}")
-    discrete = model.discrete
+    # Beside what was declared: relations that are events, 2 while they are as their sides say, and what discrete
+    # variables were before an event.
+    n_relations = len(model.relations)
+    names += [f"relation {k}" for k in range(n_relations)]
+    array = np.concatenate([array, np.full(n_relations, LIVE)])
+    n_more = n_relations + len(model.discrete)
     return ParameterTable(
-        [*names, *(f"pre({names[p]})" for p in discrete)],
-        np.concatenate([array, array[discrete]]),
-        [*units, *(units[p] for p in discrete)],
-        [*bounds, *(Interval() for _ in discrete)],
+        [*names, *(f"pre({names[p]})" for p in model.discrete)],
+        np.concatenate([array, array[model.discrete]]),
+        [*units, *[""] * n_more],
+        [*bounds, *[Interval()] * n_more],
         dependents,
         expressions,
-        discrete,
+        model.discrete,
+        n_relations,
     )
 
 

@@ -52,6 +52,7 @@ def event_table(model: ModelNumbers) -> EventTable:
         tuple((_in_parameters(model, k, w.clock.period), _in_parameters(model, k, w.clock.offset)) for k, w in ordered
               if w.clock is not None),
         tuple(next((a.message for a in w.actions if isinstance(a, Terminate)), None) for _, w in ordered),
+        tuple(when.noted for _, when in ordered),
         tuple(when.immediate for _, when in ordered),
         event,
         state,

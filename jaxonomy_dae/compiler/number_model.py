@@ -7,6 +7,8 @@ from ..modeling.component import Component
 from ..modeling.diagram import AcausalDiagram
 from ..modeling.ports import Port
 
+RELATION = ":relation["  # begins the path of a relation that is an event
+
 
 class ModelNumbers:
     """Ids of everything in a diagram, in the order it was added."""
@@ -30,11 +32,15 @@ class ModelNumbers:
         n_parameters = [len(c.parameters) for c in self.components]
         self.first_variable = np.concatenate([[0], np.cumsum(n_variables)]).astype(np.int64)
         self.first_parameter = np.concatenate([[0], np.cumsum(n_parameters)]).astype(np.int64)
-        # What discrete variables were before an event follows all parameters, in the order of the variables.
+        # After all parameters follow the relations that are events, then what discrete variables were before an event,
+        # in the order of these.
         flags = [parameter.is_discrete for c in self.components for parameter in c.parameters.values()]
-        self.discrete = np.flatnonzero(np.array(flags, bool))
-        self.previous = np.full(len(flags), -1, np.int64)
-        self.previous[self.discrete] = len(flags) + np.arange(len(self.discrete))
+        n_relations = [c.relations for c in self.components]
+        self.first_relation = len(flags) + np.concatenate([[0], np.cumsum(n_relations)]).astype(np.int64)
+        self.relations = np.arange(len(flags), int(self.first_relation[-1]))
+        self.discrete = np.concatenate([np.flatnonzero(np.array(flags, bool)), self.relations])
+        self.previous = np.full(int(self.first_relation[-1]), -1, np.int64)
+        self.previous[self.discrete] = len(self.previous) + np.arange(len(self.discrete))
         # One position table for each distinct list of names.
         self._positions: dict[tuple[str, ...], dict[str, int]] = {}
         self.variable_positions = [self._position(tuple(c.variables)) for c in self.components]
@@ -80,7 +86,13 @@ class ModelNumbers:
             )
         return found
 
+    def relation(self, k: int, number: int) -> int:
+        """The place among the parameters of a relation that is an event of component k."""
+        return int(self.first_relation[k]) + number
+
     def parameter(self, k: int, path: str) -> int:
+        if path.startswith(RELATION):
+            return self.relation(k, int(path[len(RELATION) : -1]))
         found = self.resolve(k, path, "parameters")
         if found is None:
             component = self.components[k]

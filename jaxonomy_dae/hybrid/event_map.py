@@ -57,6 +57,7 @@ def handle(
     """The state after all events of an instant. At the initial time, `at_start`, events do not move with parameters and
     are not logged."""
     c, g = problem.n_clocks, problem.n_guards
+    noted = jnp.asarray(problem.noted)
     ends = jnp.asarray(problem.ends).astype(t.dtype)
 
     def one(instant: Instant) -> Instant:
@@ -85,7 +86,7 @@ def handle(
         x, new = problem.written(time, reached, q, instant.previous, event, args)
         after = problem.slope(t, x, new, args)
         ticks = state.ticks + one_hot(event, c).astype(state.ticks.dtype)
-        logged = ~is_clock & (not at_start)
+        logged = ~is_clock & noted[event] & (not at_start)
         row = jnp.where(logged, state.count.astype(int), state.times.shape[0] + 1)
         armed, left, caused = _following(problem, t, x, new, after, instant, event, arrival, args)
         state = HybridState(

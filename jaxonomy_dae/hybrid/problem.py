@@ -24,6 +24,7 @@ class AbstractHybridProblem(eqx.Module):
     ends: eqx.AbstractVar[tuple[bool, ...]]  # which events end the run
     immediate: eqx.AbstractVar[tuple[bool, ...]]  # which happen at the initial time, if their conditions hold there
 
+    noted: eqx.AbstractVar[tuple[bool, ...]]  # which are counted and listed
     resolution: eqx.AbstractVar[Any]  # a time that is nothing beside the run, but more than rounding
 
     @abc.abstractmethod

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from sympy import Piecewise, asinh, exp, floor, pi, sin, sqrt, tanh
+from sympy import asinh, exp, pi, sin, sqrt, tanh
 
 
 def penetration(s: Any, gap: Any, smooth: Any) -> tuple[Any, Any]:
@@ -32,14 +32,3 @@ def stribeck(v: Any, sliding: Any, breakaway: Any, stribeck_speed: Any, viscous:
 def sine(t: Any, amplitude: Any, frequency: Any, phase: Any) -> Any:
     """amplitude·sin(2π·frequency·t + phase)."""
     return amplitude * sin(2 * pi * frequency * t + phase)
-
-
-def step(t: Any, start_time: Any) -> Any:
-    """0, and 1 from `start_time` on."""
-    return Piecewise((1, t >= start_time), (0, True))
-
-
-def pulse(t: Any, period: Any, width: Any, start_time: Any) -> Any:
-    """1 in the first part `width` of every `period` from `start_time` on, else 0."""
-    cycle = (t - start_time) / period
-    return Piecewise((1, (cycle >= 0) & (cycle - floor(cycle) < width)), (0, True))

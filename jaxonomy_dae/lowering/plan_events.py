@@ -28,7 +28,8 @@ class EventPlan:
     value: Gather  # for actions that write a number, the constant zero
     state: np.ndarray  # where in the state array an action writes, or −1
     factor: np.ndarray  # of the variable that it writes, in units of the state
-    discrete: np.ndarray  # the parameters that are discrete variables
+    discrete: np.ndarray  # the parameters that are discrete variables, relations that are events last
+    n_visible: int  # how many of them were declared
     dependents: tuple[DependentParameters, ...]  # the parameters that follow them
 
     @property
@@ -73,7 +74,8 @@ def plan_events(
             )
         place[row], factor[row] = position[quantity], scale
     return EventPlan(
-        table, n_clocks, guards, guard, values, value, place, factor, flat.parameters.discrete, _following(flat)
+        table, n_clocks, guards, guard, values, value, place, factor, flat.parameters.discrete, 
+        len(flat.parameters.discrete) - flat.parameters.n_relations, _following(flat)
     )  # fmt: skip
 
 

@@ -17,6 +17,7 @@ from .symbolic import SymbolicTemplate
 from .template import AbstractTemplate
 
 ZERO = -1
+LIVE = 2.0  # a relation that is as its sides say
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,15 +84,16 @@ class ParameterTable:
     bounds: list[Interval]
     dependents: tuple[DependentParameters, ...]  # each reads only what those before it have computed
     expressions: dict[int, str]  # of the dependent ones, in full names
-    discrete: np.ndarray  # those that events assign; as many more at the end are what these were before an event
+    discrete: np.ndarray  # those that events assign, relations last
+    n_relations: int  # how many relations follow what was declared; then comes what `discrete` was before an event
 
     def __len__(self):
         return len(self.names)
 
     @property
     def n_declared(self) -> int:
-        """How many there are without the values before events."""
-        return len(self.names) - len(self.discrete)
+        """How many were declared."""
+        return len(self.names) - len(self.discrete) - self.n_relations
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,6 +141,7 @@ class EventTable:
     guard: np.ndarray  # (events,): the variable that falls through zero; −1 for sampled ones
     clocks: tuple[tuple[Start, Start], ...]  # period and offset of the sampled ones
     message: tuple[str | None, ...]  # with which an event ends the run
+    noted: tuple[bool, ...]  # whether an event is listed; others only say that equations change
     immediate: tuple[bool, ...]  # whether an event happens at the initial time, if its condition holds there
     event: np.ndarray  # (actions,)
     state: np.ndarray  # (actions,): the variable that starts anew, or −1
@@ -151,7 +154,7 @@ class EventTable:
 
 
 _NONE = np.zeros(0, np.int64)
-NO_EVENTS = EventTable((), _NONE, (), (), (), _NONE, _NONE, _NONE, _NONE, np.zeros(0))
+NO_EVENTS = EventTable((), _NONE, (), (), (), (), _NONE, _NONE, _NONE, _NONE, np.zeros(0))
 
 
 @dataclasses.dataclass(frozen=True)

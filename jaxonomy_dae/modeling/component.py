@@ -61,6 +61,7 @@ class Component(EventDeclarations, metaclass=Construction):
         self.connections: list[Connection] = []
         self.signals: list[Signal] = []
         self.events: list[When] = []
+        self.relations = 0
         self.accounts: list[Account] = []
         self._sealed = False
 
@@ -510,7 +511,7 @@ class Component(EventDeclarations, metaclass=Construction):
 
 _BASE_ATTRIBUTES = (
     *"ev name parent parameters variables ports children equations".split(),
-    *"learned_terms connections signals events accounts _sealed".split(),
+    *"learned_terms connections signals events relations accounts _sealed".split(),
 )
 
 

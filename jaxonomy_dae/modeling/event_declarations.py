@@ -3,11 +3,14 @@
 from typing import Any
 
 import sympy
+from sympy.logic.boolalg import BooleanAtom
 
 from ..errors import ModelError
 from .environment import EqnEnv
 from .events import Action, Assign, Reinit, Sampled, Terminate, When, guard_of, relation_in_discretes, while_on
-from .symbols import DiscreteSymbol, PreviousSymbol, VariableSymbol
+from .symbols import DiscreteSymbol, PreviousSymbol, RelationSymbol, VariableSymbol
+
+LIVE = 2  # a relation that is as its sides say
 
 
 class EventDeclarations:
@@ -19,6 +22,7 @@ class EventDeclarations:
     path: str
     events: list[When]
     equations: list[sympy.Expr]
+    relations: int
     _sealed: bool
     add_equations: Any
     _declare: Any
@@ -104,6 +108,36 @@ class EventDeclarations:
         self._event(sympy.sympify(gap) <= 0, (Assign(active, sympy.Integer(1)),), sympy.Eq(active, 0), True)
         return active
 
+    def relation(self, condition: Any, edges: tuple[Sampled, Any, Sampled, Any] | None = None) -> Any:
+        """A condition for `Piecewise` whose changes are events: steps end where it turns, on either side equations see
+        it as it is there, and derivatives know that the time of the change moves.
+
+        ```python
+        self.output("y", Piecewise((h, self.relation(ev.t >= start)), (0, True)))
+        ```
+
+        **Arguments:**
+
+        - `condition`: as in `when`, without clocks.
+        - `edges`: for a condition that turns periodically, `(up, 1, down, 0)`: two clocks, and what the condition
+            becomes when they tick, expressions in parameters. It is then not watched otherwise.
+
+        **Raises:**
+
+        - `ModelError` for what is not a condition.
+        """
+        if isinstance(condition, BooleanAtom | bool):
+            return condition
+        known = RelationSymbol(self.relations)
+        self.relations += 1
+        live = None if edges is None else sympy.Eq(known, LIVE)
+        for holds, value in ((condition, 1), (sympy.Not(condition), 0)):
+            self._event(holds, (Assign(known, sympy.Integer(value)),), live, True, noted=False)
+        if edges is not None:
+            for clock, value in (edges[:2], edges[2:]):
+                self._event(clock, (Assign(known, sympy.sympify(value)),), None, False, noted=False)
+        return sympy.Or(sympy.Eq(known, 1), sympy.And(sympy.Eq(known, LIVE), condition))
+
     def when(self, condition: Any, *actions: Action, on: Any = None, at_start: bool = False) -> None:
         """Declares an event: what happens at the instant at which a condition becomes true.
 
@@ -130,7 +164,7 @@ class EventDeclarations:
         """
         self._event(condition, actions, on, at_start)
 
-    def _event(self, condition: Any, actions: tuple[Action, ...], on: Any, immediate: bool) -> None:
+    def _event(self, condition: Any, actions: tuple[Action, ...], on: Any, immediate: bool, noted: bool = True) -> None:
         if self._sealed:
             raise ModelError(f"component '{self.path}' is complete: declare its events inside __init__ of its class")
         where = f"component '{self.name}': when"
@@ -160,7 +194,7 @@ class EventDeclarations:
         elif on is not None:
             raise ModelError(f"{where}: on= is for conditions on variables; a sampled event always happens")
         values = self._values(actions, number, where)
-        self.events.append(When(text, guard, clock, tuple(actions), values, immediate))
+        self.events.append(When(text, guard, clock, tuple(actions), values, immediate, noted))
 
     def _hidden(self, name: str, expression: sympy.Expr) -> str:
         """Declares a variable that equals an expression, and is not shown."""

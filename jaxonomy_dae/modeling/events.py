@@ -7,7 +7,7 @@ import sympy
 from sympy.logic.boolalg import BooleanAtom, BooleanFunction, to_nnf
 
 from ..errors import ModelError
-from .symbols import DiscreteSymbol, ParameterSymbol, PreviousSymbol, TimeSymbol, VariableSymbol
+from .symbols import DiscreteSymbol, ParameterSymbol, PreviousSymbol, RelationSymbol, TimeSymbol, VariableSymbol
 
 ALWAYS = sympy.true
 
@@ -24,7 +24,7 @@ class Reinit:
 class Assign:
     """A discrete variable that takes a `value`."""
 
-    target: DiscreteSymbol
+    target: DiscreteSymbol | RelationSymbol
     value: sympy.Expr
 
 
@@ -51,7 +51,7 @@ class When:
     """One `when` of a component: `guard` is the name of the hidden variable that falls through zero where the condition
     becomes true, `clock` the period and the offset of a sampled one. `values` are the names of the hidden variables, or
     the numbers, that the actions write; `text` is what the user wrote. One that is `immediate` happens at the initial
-    time, too, if its condition holds there."""
+    time, too, if its condition holds there; one that is not `noted` only says that equations change."""
 
     text: str
     guard: str | None
@@ -59,6 +59,7 @@ class When:
     actions: tuple[Action, ...]
     values: tuple[str | float | None, ...]
     immediate: bool = False
+    noted: bool = True
 
 
 def pre(symbol: Any) -> sympy.Expr:

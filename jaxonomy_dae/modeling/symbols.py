@@ -91,6 +91,22 @@ class DiscreteSymbol(ParameterSymbol):
     __slots__ = ()
 
 
+class RelationSymbol(ParameterSymbol):
+    """Whether a relation of a component counts as true, 1, or as false, 0; 2 where it is as its sides say."""
+
+    __slots__ = ("number",)
+    number: int
+
+    @functools.lru_cache(maxsize=65536)  # noqa: B019
+    def __new__(cls, number: int):
+        symbol = ComponentSymbol.__new__(cls, f":relation[{number}]", real=True)
+        symbol.path, symbol.number = f":relation[{number}]", number
+        return symbol
+
+    def __getnewargs_ex__(self):
+        return (self.number,), {}
+
+
 class PreviousSymbol(ParameterSymbol):
     """A discrete variable before the event that is being handled."""
 
@@ -147,6 +163,8 @@ def seen_from_child(value: Any) -> Any:
         for s in value.free_symbols:
             if isinstance(s, VariableSymbol):
                 outside[s] = VariableSymbol(f"../{s.path}", s.order)
+            elif isinstance(s, RelationSymbol):
+                raise ModelError(f"a relation that is an event stays in the component that wrote it: {value}")
             elif isinstance(s, ParameterSymbol):
                 outside[s] = type(s)(f"../{s.path}")
         return value.xreplace(outside) if outside else value

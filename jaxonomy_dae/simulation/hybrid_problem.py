@@ -30,6 +30,7 @@ class SystemProblem(AbstractHybridProblem):
     n_guards: int = eqx.field(static=True)
     ends: tuple[bool, ...] = eqx.field(static=True)
     immediate: tuple[bool, ...] = eqx.field(static=True)
+    noted: tuple[bool, ...] = eqx.field(static=True)
 
     def term(self, q):
         return term_of(self.system.holding(q), self.implicit)
@@ -72,6 +73,7 @@ def problem_for(
         system=system, watch=watch, tolerance=tolerance, implicit=implicit,
         resolution=RESOLUTION * jnp.finfo(t1.dtype).eps * largest,
         n_clocks=events.n_clocks, n_guards=len(events) - events.n_clocks, ends=ends, immediate=events.table.immediate,
+        noted=events.table.noted,
     )  # fmt: skip
 
 

@@ -17,6 +17,7 @@ from ..linear.sparse import SparseMatrix, SparsePattern, sparse_jacobian
 from ..lowering.plan import SystemPlan
 from ..model.dependent_parameters import complete
 from ..model.pickling import functions_by_name, named_functions
+from ..model.tables import LIVE
 from .evaluate import Refinement
 from .inputs import read_inputs
 from .parameters import Parameters
@@ -34,6 +35,7 @@ class AcausalSystem(eqx.Module):
     parameters: Parameters
     neural: dict[str, Any]
     plan: SystemPlan = eqx.field(static=True)
+    modes: Float[Array, "*batch relations"] | None = None  # of relations that are events, within a run
 
     # --- names -------------------------------------------------------------------------------------------------
 
@@ -157,37 +159,49 @@ class AcausalSystem(eqx.Module):
 
     @property
     def numbers(self) -> Float[Array, " m"]:
-        """What equations read of parameters: all of them, then the discrete variables as before an event."""
+        """What equations read of parameters: all that were declared, then the relations that are events, then the
+        discrete variables as before an event."""
         array = self.parameters.array
         events = self.plan.events
         if events is None or not len(events.discrete):
             return array
-        return jnp.concatenate([array, array[..., events.discrete]], axis=-1)
+        values = self.discrete_values
+        return jnp.concatenate([array, values[..., events.n_visible :], values], axis=-1)
 
     def holding(self, values: Any) -> "AcausalSystem":
-        """The system while its discrete variables have these values, shape `(len(discretes),)`."""
+        """The system while its discrete variables, and after them its relations, have these values."""
         events = self.plan.events
         if events is None or not len(events.discrete):
             return self
-        array = complete(events.dependents, self.parameters.array.at[events.discrete].set(values))
-        return eqx.tree_at(lambda s: s.parameters, self, Parameters(array, None, (), self.parameters.table))
+        visible = values[: events.n_visible]
+        array = complete(events.dependents, self.parameters.array.at[events.discrete[: events.n_visible]].set(visible))
+        parameters = Parameters(array, None, (), self.parameters.table)
+        return AcausalSystem(parameters, self.neural, self.plan, values[events.n_visible :])
 
     def around_event(self, t: Any, values: Any, previous: Any, args: Any = None) -> SystemAt:
         """`at`, with discrete variables that have these values and had others before the event at hand."""
         held = self.holding(values)
         point = held.at(t, args)
-        return SystemAt(self.plan, jnp.concatenate([held.parameters.array, previous]), point.networks, t, point.inputs)
+        numbers = point.parameters.at[-len(previous) :].set(previous) if len(previous) else point.parameters
+        return SystemAt(self.plan, numbers, point.networks, t, point.inputs)
 
     @property
     def discrete_values(self) -> Float[Array, " q"]:
-        """The values of the discrete variables at the start."""
+        """The values of the discrete variables at the start, and of the relations that are events."""
         events = self.plan.events
-        return jnp.zeros((0,)) if events is None else self.parameters.array[..., events.discrete]
+        if events is None:
+            return jnp.zeros((0,))
+        array = self.parameters.array
+        visible = array[..., events.discrete[: events.n_visible]]
+        n_relations = len(events.discrete) - events.n_visible
+        live = jnp.full((*visible.shape[:-1], n_relations), LIVE, array.dtype)
+        return jnp.concatenate([visible, live if self.modes is None else self.modes], axis=-1)
 
     @property
     def discretes(self) -> list[str]:
         """The names of the discrete variables."""
-        return [] if self.plan.events is None else [self.parameters.names[p] for p in self.plan.events.discrete]
+        events = self.plan.events
+        return [] if events is None else [self.parameters.names[p] for p in events.discrete[: events.n_visible]]
 
     def vector_field(self, t: Any, x: Float[Array, " n"], args: Any = None) -> Float[Array, " n"]:
         """d(state)/dt for `diffrax.ODETerm(system.vector_field)`; `args` is the dictionary of inputs, or None."""

@@ -1,7 +1,8 @@
 """Sources of voltage and current: constant, of time, of a signal, controlled."""
 
 from ...modeling import POSITIVE, Eq, EqnEnv, Value
-from ..laws import pulse, sine, step
+from ..laws import sine
+from ..steps import pulse, step
 from .two_pin import TwoPin, TwoPorts
 
 
@@ -66,14 +67,14 @@ class _OfTime(TwoPin):
     def _step(self, height: Value, start_time: Value, offset: Value, unit: str):
         h = self.parameter("height", height, unit=unit)
         t0 = self.parameter("start_time", start_time, unit="s")
-        return self.parameter("offset", offset, unit=unit) + h * step(self.ev.t, t0)
+        return self.parameter("offset", offset, unit=unit) + h * step(self, t0)
 
     def _pulse(self, height: Value, period: Value, width: Value, start_time: Value, offset: Value, unit: str):
         h = self.parameter("height", height, unit=unit)
         length = self.parameter("period", period, unit="s", bounds=POSITIVE)
         part = self.parameter("width", width)
         t0 = self.parameter("start_time", start_time, unit="s")
-        return self.parameter("offset", offset, unit=unit) + h * pulse(self.ev.t, length, part, t0)
+        return self.parameter("offset", offset, unit=unit) + h * pulse(self, length, part, t0)
 
 
 class SineVoltage(_OfTime):
@@ -109,8 +110,7 @@ class SineCurrent(_OfTime):
 
 
 class StepVoltage(_OfTime):
-    """v = offset, and offset + height from `start_time` (second) on, in volt: name that time with
-    `simulate(jump_ts=...)`."""
+    """v = offset, and offset + height from `start_time` (second) on, in volt. The step is an event."""
 
     def __init__(self, ev: EqnEnv, name: str, height: Value = 1.0, start_time: Value = 0.0, offset: Value = 0.0):
         super().__init__(ev, name)
@@ -118,8 +118,7 @@ class StepVoltage(_OfTime):
 
 
 class StepCurrent(_OfTime):
-    """i = offset, and offset + height from `start_time` (second) on, in ampere: name that time with
-    `simulate(jump_ts=...)`."""
+    """i = offset, and offset + height from `start_time` (second) on, in ampere. The step is an event."""
 
     def __init__(self, ev: EqnEnv, name: str, height: Value = 1.0, start_time: Value = 0.0, offset: Value = 0.0):
         super().__init__(ev, name)
@@ -128,7 +127,7 @@ class StepCurrent(_OfTime):
 
 class PulseVoltage(_OfTime):
     """v = offset + height in the first part `width` (0 to 1) of every `period` (second) from `start_time` on, else
-    offset, in volt: name the times of its edges with `simulate(jump_ts=...)`."""
+    offset, in volt. Its edges are events."""
 
     def __init__(
         self,
@@ -146,7 +145,7 @@ class PulseVoltage(_OfTime):
 
 class PulseCurrent(_OfTime):
     """i = offset + height in the first part `width` (0 to 1) of every `period` (second) from `start_time` on, else
-    offset, in ampere: name the times of its edges with `simulate(jump_ts=...)`."""
+    offset, in ampere. Its edges are events."""
 
     def __init__(
         self,

@@ -6,7 +6,8 @@ from sympy import Max, Min
 
 from ...errors import ModelError
 from ...modeling import POSITIVE, Component, EqnEnv, Value
-from ..laws import pulse, sine, step
+from ..laws import sine
+from ..steps import pulse, step
 
 
 class Constant(Component):
@@ -18,13 +19,13 @@ class Constant(Component):
 
 
 class Step(Component):
-    """y = offset, and offset + height from `start_time` (second) on: name that time with `simulate(jump_ts=...)`."""
+    """y = offset, and offset + height from `start_time` (second) on. The step is an event."""
 
     def __init__(self, ev: EqnEnv, name: str, height: Value = 1.0, start_time: Value = 0.0, offset: Value = 0.0):
         super().__init__(ev, name)
         h, o = self.parameter("height", height), self.parameter("offset", offset)
         t0 = self.parameter("start_time", start_time, unit="s")
-        self.output("y", o + h * step(ev.t, t0))
+        self.output("y", o + h * step(self, t0))
 
 
 class Ramp(Component):
@@ -66,7 +67,7 @@ class Sine(Component):
 
 class Pulse(Component):
     """y = offset + height in the first part `width` (0 to 1) of every `period` (second) from `start_time` on, else
-    offset: name the times of its edges with `simulate(jump_ts=...)`."""
+    offset. Its edges are events."""
 
     def __init__(
         self,
@@ -82,7 +83,7 @@ class Pulse(Component):
         h, o, part = (self.parameter(k, v) for k, v in (("height", height), ("offset", offset), ("width", width)))
         length = self.parameter("period", period, unit="s", bounds=POSITIVE)
         t0 = self.parameter("start_time", start_time, unit="s")
-        self.output("y", o + h * pulse(ev.t, length, part, t0))
+        self.output("y", o + h * pulse(self, length, part, t0))
 
 
 class Noise(Component):
