@@ -24,6 +24,9 @@ from jaxonomy_dae import AcausalCompiler, Component, EqnEnv, ModelError, der
 from jaxonomy_dae.initialization.rows import initial_rows
 
 MODELS = test_jacobian.MODELS | {
+    # Its numbers are in every equation: in other units no two nodes are alike, and a program of forty kinds of nodes
+    # takes XLA minutes and gigabytes.
+    "nonlinear grid": lambda: test_jacobian.Grid(4, cubic=0.5).system(),
     "free mass": lambda: oscillator(kind=FreeMass),
     "learned drag": lambda: pendulum(drag_on("vx", "vy", network=mlp(2, 2))),
     "contradiction": lambda: test_scaling.triangle(1.0, False, y=3.0),

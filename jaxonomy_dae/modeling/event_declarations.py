@@ -136,7 +136,9 @@ class EventDeclarations:
         if edges is not None:
             for clock, value in (edges[:2], edges[2:]):
                 self._event(clock, (Assign(known, sympy.sympify(value)),), None, False, noted=False)
-        return sympy.Or(sympy.Eq(known, 1), sympy.And(sympy.Eq(known, LIVE), condition))
+        holds: Any = sympy.Eq(known, 1)
+        unknown: Any = sympy.Eq(known, LIVE)
+        return sympy.Or(holds, sympy.And(unknown, condition))
 
     def when(self, condition: Any, *actions: Action, on: Any = None, at_start: bool = False) -> None:
         """Declares an event: what happens at the instant at which a condition becomes true.
@@ -204,7 +206,7 @@ class EventDeclarations:
 
     def _values(self, actions: tuple[Action, ...], number: int, where: str) -> tuple:
         """What the actions write, as numbers and names of hidden variables."""
-        new: dict[DiscreteSymbol, sympy.Expr] = {}
+        new: dict[Any, sympy.Expr] = {}
         targets: list[Any] = []
         for action in actions:
             if isinstance(action, Terminate):
