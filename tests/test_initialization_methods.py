@@ -274,3 +274,20 @@ def test_the_last_step_is_checked(monkeypatch):
     monkeypatch.setattr(initialization, "least_squares", lambda matrix, right: 1e3 + 0 * (right @ matrix))
     with pytest.raises(InitializationError, match="no consistent initial point"):
         compiled(Cubics(EqnEnv(), "broken")).initialize(initial={"broken.r": 2.0})
+
+
+class Circle(Component):
+    """A point that runs around the unit circle, x' = −y."""
+
+    def __init__(self, ev, x0):
+        super().__init__(ev, "c")
+        x, y = self.variable("x", start=x0), self.variable("y", start=0.0)
+        self.add_equations(Eq(x**2 + y**2, 1), Eq(der(x), -y))
+
+
+@pytest.mark.parametrize("x0", [1.3, 2.0])
+def test_a_guess_beside_a_fold(x0):
+    """The nearest point of the circle is (1, 0), where y has no slope: the search stopped in front of it, and the error
+    said that no point was found. There, x as the only state does not tell which way y goes."""
+    with pytest.raises(InitializationError, match=r"singular .*do not determine der\(c\.x\)"):
+        compiled(Circle(EqnEnv(), x0)).initialize()

@@ -140,7 +140,10 @@ def _climb(
     generic = 1.0 + 0.5 * np.cos(np.arange(1, n + 2))
     along, generic = jnp.asarray(along, dtype), jnp.asarray(generic, dtype)
     inside = jnp.asarray(np.ones(m) if core is None else np.isin(np.arange(m), core), dtype)
-    floor = 0.0 if m >= n else 1e2 * eps  # with fewer equations than unknowns, steps of least norm
+    # Steps of least norm, with fewer equations than unknowns; and on the way to the nearest point, which may lie where
+    # an unknown has no slope, as at the side of a circle.
+    least = 1e2 * eps
+    floor = 0.0 if m >= n else least
 
     def packed(*scalars) -> Any:
         place = np.arange(len(scalars))  # selects, unlike a stack, become one kernel
@@ -221,7 +224,7 @@ def _climb(
         relaxed = s.size * where(accepted, jnp.maximum(0.1, 1 - (2 * ratio - 1) ** 3), s.growth)
         damping = where(fresh, FIRST_DAMPING, relaxed)
         border = where(tracking & ~landing, where(fresh, generic, last_tangent), along)
-        shift = jnp.sqrt(where(marquardt, damping, 0 * one) + floor)
+        shift = jnp.sqrt(where(marquardt, damping, 0 * one) + where(nearest, least, floor))
         stacked = jnp.concatenate([
             jnp.concatenate([matrix, curve[:, None], -short[:, None], jnp.zeros((m, 1), dtype)], axis=1),
             jnp.concatenate([border, jnp.asarray([0.0, 1.0], dtype)])[None, :],
