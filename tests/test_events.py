@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from hybrid_models import Ball, SampledPI, Stick, Thermostat, compiled
 
-from jaxonomy_dae import ModelError, SimulationError, simulate
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, ModelError, SimulationError, simulate
+from jaxonomy_dae.library import signal
 from jaxonomy_dae.solvers import BDF, Rodas5P, Tsit5
 
 BOUNCES = [0.451523640985731, 1.1739614665629, 1.75191172702464, 2.21427193539402, 2.58416010208954, 2.88007063544594]
@@ -204,3 +205,51 @@ def test_second_derivatives_are_refused(ball):
             return simulate(changed, 1.0, ts=jnp.array([1.0]), adjoint=diffrax.ForwardMode())["ball.h"][-1]
 
         jax.jacfwd(jax.jacfwd(forward))(0.8)
+
+
+def test_a_step_by_its_time():
+    """x' = u − x with a step of u at t₀: x(2) = 1 − e^{t₀ − 2}. The derivative by t₀ was zero."""
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    source, lag = signal.Step(ev, "step", start_time=0.5), signal.FirstOrder(ev, "lag")
+    diagram.add(source, lag)
+    diagram.connect(source.y, lag.u)
+    system = AcausalCompiler(ev, diagram)()
+
+    def last(t0):
+        changed = system.with_parameters({"step.start_time": t0})
+        return simulate(changed, 2.0, ts=jnp.array([2.0]), **TIGHT)["lag.y"][-1]
+
+    assert float(last(0.5)) == pytest.approx(1 - np.exp(-1.5), rel=1e-9)
+    assert float(jax.grad(last)(0.5)) == pytest.approx(-np.exp(-1.5), rel=1e-8)
+    assert float(last(-1.0)) == pytest.approx(1 - np.exp(-2.0), rel=1e-9)  # it is over when the run begins
+    # Outside of a run, the relation is as its sides say.
+    assert float(system.observe("step.y", 0.4, jnp.zeros(1))) == 0.0
+    assert float(system.observe("step.y", 0.6, jnp.zeros(1))) == 1.0
+    assert system.parameters.names == [
+        "step.height",
+        "step.offset",
+        "step.start_time",
+        "lag.k",
+        "lag.initial_y",
+        "lag.T",
+    ]
+
+
+def test_a_pulse_by_its_times():
+    """The integral of pulses of width w·T from t₀ on, two of them whole at t = 0.75 and the third up to there:
+    2·(2·w·T + t − t₀ − 2T)."""
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    source = signal.Pulse(ev, "pulse", height=2.0, period=0.3, width=0.4, start_time=0.1)
+    total = signal.Integrator(ev, "total")
+    diagram.add(source, total)
+    diagram.connect(source.y, total.u)
+    system = AcausalCompiler(ev, diagram)()
+
+    def last(p):
+        changed = system.with_parameters({"pulse.period": p[0], "pulse.width": p[1], "pulse.start_time": p[2]})
+        return simulate(changed, 0.75, ts=jnp.array([0.75]), **TIGHT)["total.y"][-1]
+
+    value, slopes = jax.value_and_grad(last)(jnp.array([0.3, 0.4, 0.1]))
+    assert float(value) == pytest.approx(2 * (0.24 + 0.05), rel=1e-12)
+    np.testing.assert_allclose(slopes, [2 * (2 * 0.4 - 2), 2 * 2 * 0.3, -2.0], rtol=1e-12)
+    assert system.discretes == [] and len(simulate(system, 0.75).events) == 0
