@@ -326,7 +326,7 @@ def test_stick_and_slip():
         events(solution), [t1, t1 + slip, t1 + slip + wait], atol=SMOOTH, err_msg=str(solution.events)
     )
     np.testing.assert_allclose(solution["m.x"], [0, *x, moved, *(moved + x)], atol=SMOOTH)
-    np.testing.assert_array_equal(solution["f.mode"], [0, -1, -1, 0, -1, -1])
+    np.testing.assert_array_equal(solution["f.mode"], [0, 1, 1, 0, 1, 1])
 
 
 def test_a_freewheel():

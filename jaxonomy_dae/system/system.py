@@ -170,7 +170,9 @@ class AcausalSystem(eqx.Module):
         if events is None or not len(events.discrete):
             return self
         array = complete(events.dependents, self.parameters.array.at[events.discrete].set(values))
-        return eqx.tree_at(lambda s: s.parameters, self, Parameters(array, None, (), self.parameters.table))
+        # A start that is an expression holds at the start alone.
+        table = self.parameters.table.given(events.discrete)
+        return eqx.tree_at(lambda s: s.parameters, self, Parameters(array, None, (), table))
 
     def around_event(self, t: Any, values: Any, previous: Any, args: Any = None) -> SystemAt:
         """`at`, with discrete variables that have these values and had others before the event at hand."""
