@@ -5,7 +5,8 @@ rounding; its derivative is that of the time of the crossing, by the implicit fu
 
     xₑ = x₁ + f⁻·δ,   (x⁺, q⁺) = R(τ, xₑ, q),   x₁' = x⁺ − f⁺·δ
 
-has the value R and, f⁻ and f⁺ being constants, the saltation matrix as its derivative (Aizerman & Gantmacher 1958). A
+has the value R and, f⁻ and f⁺ being constants, the saltation matrix as its derivative (Aizerman & Gantmacher 1958). Its
+second derivative is not that of the flow, and is refused. A
 clock ticks at τ = offset + k·period, a function of parameters, in the same manner.
 """
 
@@ -14,6 +15,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from equinox.internal import nondifferentiable
 from jax import lax
 
 from ..adjoint.closure_conversion import any_member
@@ -22,6 +24,23 @@ from .problem import AbstractHybridProblem, HybridState, one_hot
 CONDITIONS_AT_ONE_INSTANT = 32  # more than these take another step, of no length to speak of
 SMALL = 1e-12  # of a guard's size in the step before: counts as zero
 ROUNDING = 1e-9  # of that size, over a step: counts as no change
+SECOND = (
+    "second derivatives through events are not available: take differences of first ones, or Gauss–Newton products of "
+    "Jacobians"
+)
+
+
+@jax.custom_jvp
+def differentiable_once(x: Any) -> Any:
+    """The same; an error where it is differentiated twice."""
+    return x
+
+
+@differentiable_once.defjvp
+def _once(primals, tangents):
+    (x,), (tangent,) = primals, tangents
+    marked = nondifferentiable(x, msg=SECOND)
+    return x, jnp.where(jnp.isfinite(marked), tangent, tangent)  # so that the tangent depends on what is marked
 
 
 class Instant(eqx.Module):
@@ -80,6 +99,7 @@ def handle(
         elif c:
             exact = problem.due(state.ticks)[jnp.clip(event, 0, c - 1)]
             delay = jnp.where(is_clock, exact - lax.stop_gradient(exact), delay)
+        delay = differentiable_once(delay)
         time = t + delay
         x, new = problem.written(time, state.x + before * delay, q, instant.previous, event, args)
         after = problem.slope(t, x, new, args)

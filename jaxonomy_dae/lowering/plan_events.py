@@ -72,6 +72,12 @@ def plan_events(
                 f"state: the equations determine it at every instant. The states are {shown or 'none'}"
             )
         place[row], factor[row] = position[quantity], scale
+        for other in range(row):
+            if table.event[other] == table.event[row] and place[other] == place[row]:
+                raise ModelError(
+                    f"{table.text[table.event[row]]}: '{flat.variables.names[table.state[other]]}' and "
+                    f"'{flat.variables.names[v]}' are one state, which is given two values by one event: reinit one"
+                )
     return EventPlan(
         table, n_clocks, guards, guard, values, value, place, factor, flat.parameters.discrete, _following(flat)
     )  # fmt: skip
