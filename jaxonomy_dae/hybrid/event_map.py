@@ -73,8 +73,8 @@ class Arrival(NamedTuple):
 def handle(
     problem: AbstractHybridProblem, t: Any, state: HybridState, arrival: Arrival, args: Any, at_start: bool = False
 ) -> HybridState:
-    """The state after all events of an instant. At the initial time, `at_start`, events do not move with parameters and
-    are not logged."""
+    """The state after all events of an instant. At the initial time, `at_start`, events do not move with parameters,
+    and are logged only if they end the run."""
     c, g = problem.n_clocks, problem.n_guards
     ends = jnp.asarray(problem.ends).astype(t.dtype)
 
@@ -104,7 +104,7 @@ def handle(
         x, new = problem.written(time, state.x + before * delay, q, instant.previous, event, args)
         after = problem.slope(t, x, new, args)
         ticks = state.ticks + one_hot(event, c).astype(state.ticks.dtype)
-        logged = ~is_clock & (not at_start)
+        logged = (~is_clock & (not at_start)) | (ends[event] > 0)
         row = jnp.where(logged, state.count.astype(int), state.times.shape[0])
         armed, left, caused = _following(problem, t, x, new, after, instant, event, arrival, args)
         state = HybridState(

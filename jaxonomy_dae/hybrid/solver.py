@@ -21,9 +21,11 @@ WINDOW = 1e-6  # of a step: a guard that reaches zero so close to its end counts
 # step is taken in halves.
 LOOKS = np.array([0.0, 0.23, 0.5, 0.79, 1.0])
 BEND = 0.1
+DEPTH = 1e-9  # of its size: how far below zero such a parabola must reach to be followed
 NEARLY = 0.01  # of a guard's size in the step: beyond that it is not at zero at its end
 
 TOO_MANY: Any = diffrax.RESULTS.max_steps_rejected  # events
+NOT_FINITE: Any = diffrax.RESULTS.nonlinear_divergence  # what an event wrote
 
 
 def _off_parabola() -> np.ndarray:
@@ -150,6 +152,8 @@ class WithEvents(diffrax.AbstractWrappedSolver):
         y1 = jax.tree.map(lambda a, b: jnp.where(fired, a, b), y1, state)
         dense_info = dict(inner=dense, y0=y0, y1=y1, fired=fired)
         y1 = eqx.tree_at(lambda y: y.request, y1, request)
+        finite = jnp.all(jnp.isfinite(y1.x)) & jnp.all(jnp.isfinite(y1.q))
+        result = diffrax.RESULTS.where(fired & ~finite & jnp.all(jnp.isfinite(x1)), NOT_FINITE, result)
         result = diffrax.RESULTS.where(y1.count > self.max_events, TOO_MANY, result)
         return y1, y_error, dense_info, (inner_state, fired), result
 
@@ -202,6 +206,24 @@ def _looked_at(problem, dense, t0, t1, y0: HybridState, x1, args):
 
     where = lax.cond(any_member(inside), located, lambda: t1)
     where = jnp.maximum(where, t0 + 2 * problem.resolution)
-    request = jnp.where(bent, t0 + 0.5 * h, jnp.where(inside, where, jnp.inf))
-    due = jnp.concatenate([ticking, near]) & ~inside & ~bent
+    dip = jnp.where(h > 1e3 * window, _dip(values, armed, jnp.any(crossed, axis=0), size), jnp.inf)
+    request = jnp.minimum(jnp.where(inside, where, jnp.inf), t0 + dip * h)
+    request = jnp.where(bent, t0 + 0.5 * h, request)
+    due = jnp.concatenate([ticking, near]) & ~jnp.isfinite(request)
     return request, armed[-1].astype(y0.armed.dtype), Arrival(due, jumped, size, window, h)
+
+
+def _dip(values, armed, crossed, size):
+    """Where, as a part of the step, a guard that is positive wherever it was looked at is negative by the parabola
+    through its values at the ends and in the middle, at its lowest; or infinity. The step is taken up to there."""
+    left, middle, right = values[0], values[len(LOOKS) // 2], values[-1]
+    bend = 2 * (left - 2 * middle + right)
+    slope = 4 * middle - 3 * left - right
+    curved = bend > 0
+    bend = jnp.where(curved, bend, 1.0)
+    place = -0.5 * slope / bend
+    before = jnp.sum(jnp.asarray(LOOKS, values.dtype)[:, None] <= place, axis=0) - 1
+    was_armed = jnp.take_along_axis(armed, jnp.clip(before, 0, len(LOOKS) - 1)[None], axis=0)[0]
+    lowest = left + 0.5 * slope * place
+    dips = curved & was_armed & ~crossed & (1e-3 < place) & (place < 1) & (lowest < -DEPTH * size)
+    return jnp.min(jnp.where(dips, place, jnp.inf))
