@@ -418,6 +418,7 @@ def test_coupled_clutches():
 @pytest.mark.slow
 def test_the_gradient_of_coupled_clutches():
     """Central differences at h = 1e-4 are right to h² and 1e-9/h: 1e-6 beside third derivatives of order 100."""
+    clutches()  # compiled outside of jit
     slope = jax.jit(jax.grad(lambda mu: coupled(mu)["J1.phi"][-1]))(0.5)
     differences = central(lambda mu: float(coupled(mu)["J1.phi"][-1]), 0.5, 1e-4)
     assert float(slope) == pytest.approx(differences, rel=1e-5)
