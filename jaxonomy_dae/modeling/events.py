@@ -117,7 +117,7 @@ def _expression(value: Any, where: str) -> sympy.Expr:
         found = None
     if isinstance(value, str) or not isinstance(found, sympy.Expr):
         raise ModelError(f"{where}: the value is an expression or a number; got {value!r}")
-    if found.is_number and not (found.is_extended_real and sympy.S(found).is_finite):
+    if found.is_number and not (found.is_extended_real and found.is_finite):
         raise ModelError(f"{where}: the value must be finite and real; got {value!r}")
     return found
 

@@ -49,7 +49,9 @@ def _check_periods(system: AcausalSystem):
     if system.plan.events is None or not system.plan.events.n_clocks:
         return
     periods = _concrete(SystemAt(system.plan, system.numbers, (), 0.0, {}).clocks()[0])
-    bad = [] if periods is None else np.flatnonzero(~(periods > 0))
+    if periods is None:
+        return
+    bad = np.flatnonzero(~(periods > 0))
     if len(bad):
         name = system.plan.events.names[bad[0]]
         raise ModelError(
