@@ -5,7 +5,8 @@ rounding; its derivative is that of the time of the crossing, by the implicit fu
 
     xₑ = x₁ + f⁻·δ,   (x⁺, q⁺) = R(τ, xₑ, q),   x₁' = x⁺ − f⁺·δ
 
-has the value R and, f⁻ and f⁺ being constants, the saltation matrix as its derivative (Aizerman & Gantmacher 1958). A
+has the value R and, f⁻ and f⁺ being constants, the saltation matrix as its derivative (Aizerman & Gantmacher 1958). Its
+second derivative is not that of the flow, and is refused. A
 clock ticks at τ = offset + k·period, a function of parameters, in the same manner.
 """
 
@@ -14,6 +15,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from ..adjoint.closure_conversion import any_member
@@ -26,13 +28,14 @@ ROUNDING = 1e-9  # of that size, over a step: counts as no change
 
 class Instant(eqx.Module):
     """An instant while it is handled: the events that are left, which of them were made true by another event, the
-    delay δ of the last one, and the discrete values before the instant."""
+    delay δ of the last one, the discrete values before the instant, and dx/dt after it."""
 
     state: HybridState
     left: Any
     caused: Any
     delay: Any
     previous: Any
+    slope: Any
 
 
 class Arrival(NamedTuple):
@@ -53,9 +56,11 @@ class Arrival(NamedTuple):
 
 def handle(
     problem: AbstractHybridProblem, t: Any, state: HybridState, arrival: Arrival, args: Any, at_start: bool = False
-) -> HybridState:
-    """The state after all events of an instant. At the initial time, `at_start`, events do not move with parameters and
-    are not logged."""
+) -> tuple[HybridState, Any]:
+    """The state after all events of an instant, and dx/dt there.
+
+    At the initial time, `at_start`, events do not move with parameters, and are logged only if they end the run.
+    """
     c, g = problem.n_clocks, problem.n_guards
     noted = jnp.asarray(problem.noted)
     ends = jnp.asarray(problem.ends).astype(t.dtype)
@@ -86,7 +91,7 @@ def handle(
         x, new = problem.written(time, reached, q, instant.previous, event, args)
         after = problem.slope(t, x, new, args)
         ticks = state.ticks + one_hot(event, c).astype(state.ticks.dtype)
-        logged = ~is_clock & noted[event] & (not at_start)
+        logged = (~is_clock & noted[event] & (not at_start)) | (ends[event] > 0)
         row = jnp.where(logged, state.count.astype(int), state.times.shape[0] + 1)
         armed, left, caused = _following(problem, t, x, new, after, instant, event, arrival, args)
         state = HybridState(
@@ -106,7 +111,7 @@ def handle(
         )
         # Clocks that tick together read what was before all of them.
         previous = jnp.where(jnp.any(left[:c]), instant.previous, new) if c else new
-        return Instant(state, left, caused, delay, previous)
+        return Instant(state, left, caused, delay, previous, after)
 
     def step(instant: Instant, _: None) -> tuple[Instant, None]:
         going = jnp.any(instant.left)
@@ -116,10 +121,10 @@ def handle(
 
         return lax.cond(any_member(going), go, lambda instant: instant, instant), None
 
-    start = Instant(state, arrival.due, arrival.jumped, jnp.zeros_like(t), state.q)
+    start = Instant(state, arrival.due, arrival.jumped, jnp.zeros_like(t), state.q, jnp.zeros_like(state.x))
     length = c + min(2 * g, CONDITIONS_AT_ONE_INSTANT)
     instant, _ = lax.scan(step, start, length=length)
-    return instant.state
+    return instant.state, instant.slope
 
 
 def _noted(rows: Any, row: Any, value: Any) -> Any:
@@ -139,8 +144,9 @@ def _following(problem, t, x, q, slope, instant: Instant, event, arrival: Arriva
     # One that seems to fall from zero by rounding alone is waited for: if it does fall, the next step finds it.
     true = jnp.where(zero, rate * arrival.span < -ROUNDING * arrival.size, value < 0)
     was_armed = (instant.state.armed > 0.5) & ~here
-    # What this event made true happens next; what was to happen does so unless this event undid it.
-    caused = was_armed & true & ~zero
-    next_ones = (was_armed | left[c:]) & true & ~here
+    # What this event made true happens next; what was to happen does so, unless it is revocable and undone.
+    stands = left[c:] & ~np.array(problem.revocable[c:], bool)
+    caused = ((was_armed & true) | stands) & ~zero
+    next_ones = ((was_armed | left[c:]) & true & ~here) | stands
     armed = jnp.where(true, next_ones, True)
     return armed.astype(instant.state.armed.dtype), jnp.concatenate([left[:c], next_ones]), caused

@@ -25,6 +25,7 @@ class AbstractHybridProblem(eqx.Module):
     immediate: eqx.AbstractVar[tuple[bool, ...]]  # which happen at the initial time, if their conditions hold there
 
     noted: eqx.AbstractVar[tuple[bool, ...]]  # which are counted and listed
+    revocable: eqx.AbstractVar[tuple[bool, ...]]  # which another event may undo before they happen
     resolution: eqx.AbstractVar[Any]  # a time that is nothing beside the run, but more than rounding
 
     @abc.abstractmethod

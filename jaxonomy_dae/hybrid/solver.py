@@ -19,20 +19,21 @@ WINDOW = 1e-6  # of a step: a guard that reaches zero so close to its end counts
 # Where guards are looked at, as parts of a step; and how far, as a part of its size, a guard may be from the parabola
 # through its values at the first, the middle and the last of these. One that bends more may cross zero unseen, and the
 # step is taken in halves.
-LOOKS = np.array([0.0, 0.23, 0.5, 0.79, 1.0])
+LOOKS = np.array([0.0, 0.13, 0.31, 0.5, 0.67, 0.86, 1.0])
+FITTED = [0, 3, 6]
 BEND = 0.1
+DEPTH = 1e-9  # of a guard's size: what a parabola must reach below zero, beside what it leaves in doubt
 NEARLY = 0.01  # of a guard's size in the step: beyond that it is not at zero at its end
 
 TOO_MANY: Any = diffrax.RESULTS.max_steps_rejected  # events
+NOT_FINITE: Any = diffrax.RESULTS.nonlinear_divergence  # what an event wrote
 
 
 def _off_parabola() -> np.ndarray:
-    """The distances of the values at LOOKS from the parabola through the first, the middle and the last, (2, 5)."""
-    chosen, others = LOOKS[[0, 2, 4]], LOOKS[[1, 3]]
-    weights = np.vander(others, 3) @ np.linalg.inv(np.vander(chosen, 3))
-    out = np.zeros((2, len(LOOKS)))
-    out[:, [0, 2, 4]] = -weights
-    out[[0, 1], [1, 3]] = 1.0
+    """The distances of the values at LOOKS from the parabola through the first, the middle and the last."""
+    others = [k for k in range(len(LOOKS)) if k not in FITTED]
+    out = np.eye(len(LOOKS))[others]
+    out[:, FITTED] = -np.vander(LOOKS[others], 3) @ np.linalg.inv(np.vander(LOOKS[FITTED], 3))
     return out
 
 
@@ -48,13 +49,17 @@ class HybridInterpolation(diffrax.AbstractLocalInterpolation):
     y0: HybridState
     y1: HybridState
     fired: Any
+    slope: Any
+    resolution: Any
 
     def evaluate(self, t0, t1=None, left=True):
         if t1 is not None:
             return jax.tree.map(jnp.subtract, self.evaluate(t1), self.evaluate(t0))
         before = eqx.tree_at(lambda y: y.x, self.y0, self.inner(self.t0, self.t1, t0))
-        at_end = self.fired & (t0 >= self.t1)
-        return jax.tree.map(lambda a, b: jnp.where(at_end, a, b), self.y1, before)
+        # Times within rounding of the event are those of the event; one that moves goes along the solution after it.
+        at_end = self.fired & (t0 >= self.t1 - self.resolution)
+        after = eqx.tree_at(lambda y: y.x, self.y1, self.y1.x + self.slope * (t0 - lax.stop_gradient(self.t1)))
+        return jax.tree.map(lambda a, b: jnp.where(at_end, a, b), after, before)
 
 
 class _Dense(eqx.Module):
@@ -134,10 +139,12 @@ class WithEvents(diffrax.AbstractWrappedSolver):
         def events(state):
             return handle(problem, t1, state, arrival, args)
 
-        y1 = lax.cond(any_member(fired), events, lambda state: state, state)
+        y1, slope = lax.cond(any_member(fired), events, lambda state: (state, jnp.zeros_like(x1)), state)
         y1 = jax.tree.map(lambda a, b: jnp.where(fired, a, b), y1, state)
-        dense_info = dict(inner=dense, y0=y0, y1=y1, fired=fired)
+        dense_info = dict(inner=dense, y0=y0, y1=y1, fired=fired, slope=slope, resolution=problem.resolution)
         y1 = eqx.tree_at(lambda y: y.request, y1, request)
+        finite = jnp.all(jnp.isfinite(y1.x)) & jnp.all(jnp.isfinite(y1.q))
+        result = diffrax.RESULTS.where(fired & ~finite & jnp.all(jnp.isfinite(x1)), NOT_FINITE, result)
         result = diffrax.RESULTS.where(y1.count > self.max_events, TOO_MANY, result)
         return y1, y_error, dense_info, (inner_state, fired), result
 
@@ -172,7 +179,8 @@ def _looked_at(problem, dense, t0, t1, y0: HybridState, x1, args):
 
     doubtful = jnp.any(armed[-1] & (last <= NEARLY * size))
     near = lax.cond(any_member(doubtful), at_end, lambda: jnp.zeros((g,), bool)) & armed[-1]
-    bent = jnp.any(jnp.abs(jnp.asarray(_OFF_PARABOLA, values.dtype) @ values) > BEND * size)
+    off = jnp.max(jnp.abs(jnp.asarray(_OFF_PARABOLA, values.dtype) @ values), axis=0)
+    bent = jnp.any(off > BEND * size)
     bent = bent & (h > 1e3 * window)
     # In a step too short to be parted, what has crossed has jumped.
     short = h <= 4 * problem.resolution
@@ -190,6 +198,25 @@ def _looked_at(problem, dense, t0, t1, y0: HybridState, x1, args):
 
     where = lax.cond(any_member(inside), located, lambda: t1)
     where = jnp.maximum(where, t0 + 2 * problem.resolution)
-    request = jnp.where(bent, t0 + 0.5 * h, jnp.where(inside, where, jnp.inf))
-    due = jnp.concatenate([ticking, near]) & ~inside & ~bent
+    dip = jnp.where(h > 1e3 * window, _dip(values, armed, jnp.any(crossed, axis=0), 2 * off - DEPTH * size), jnp.inf)
+    request = jnp.minimum(jnp.where(inside, where, jnp.inf), t0 + dip * h)
+    request = jnp.where(bent, t0 + 0.5 * h, request)
+    due = jnp.concatenate([ticking, near]) & ~jnp.isfinite(request)
     return request, armed[-1].astype(y0.armed.dtype), Arrival(due, jumped, size, window, h)
+
+
+def _dip(values, armed, crossed, doubt):
+    """Where, as a part of the step, a guard that is positive wherever it was looked at is lowest by the parabola
+    through its values at the ends and in the middle, if it may be negative there; or infinity. The step is taken up to
+    there, and so on until what the parabola leaves in `doubt` is decided."""
+    left, middle, right = values[jnp.array(FITTED)]
+    bend = 2 * (left - 2 * middle + right)
+    slope = 4 * middle - 3 * left - right
+    curved = bend > 0
+    bend = jnp.where(curved, bend, 1.0)
+    place = -0.5 * slope / bend
+    before = jnp.sum(jnp.asarray(LOOKS, values.dtype)[:, None] <= place, axis=0) - 1
+    was_armed = jnp.take_along_axis(armed, jnp.clip(before, 0, len(LOOKS) - 1)[None], axis=0)[0]
+    lowest = left + 0.5 * slope * place
+    dips = curved & was_armed & ~crossed & (1e-3 < place) & (place < 1) & (lowest < doubt)
+    return jnp.min(jnp.where(dips, place, jnp.inf))

@@ -40,4 +40,4 @@ def start(
     due_conditions = holding & at_once
     due = jnp.concatenate([state.due <= t0 + tolerance, due_conditions])
     arrival = Arrival(due, jnp.zeros((g,), bool), size, tolerance, tolerance)
-    return handle(problem, t0, state, arrival, args, at_start=True)
+    return handle(problem, t0, state, arrival, args, at_start=True)[0]

@@ -72,7 +72,14 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
     )
 
     everything = program(steps)
-    events = plan_events(flat, variable_map, state_order, quantity_name, lambda q: program(_needed(steps, q, n)))
+    events = plan_events(
+        flat,
+        variable_map,
+        state_order,
+        quantity_name,
+        lambda q: _needed(steps, q, n),
+        lambda q: program(_needed(steps, q, n)),
+    )
     row_inputs = [_of(variable_map, row.inputs) for row in flat.rows]
     following = state_order + 1
     rates = carried + 1 if _rates_hold(flat, variable_map, extended, for_residuals, carried) else carried[:0]

@@ -1,6 +1,7 @@
 """How a compiled system evaluates its events: programs for conditions and for what events write."""
 
 import dataclasses
+import graphlib
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -10,6 +11,7 @@ from ..model.quantities import QuantityMap
 from ..model.tables import ZERO, DependentParameters, EventTable, FlatModel
 from .gather import Gather
 from .program import Program
+from .schedule import AnyStep
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,17 +48,20 @@ def plan_events(
     variables: QuantityMap,
     states: np.ndarray,
     names: Sequence[str],
+    needed: Callable[[np.ndarray], Sequence[AnyStep]],
     program: Callable[[np.ndarray], Program],
 ) -> EventPlan | None:
-    """Plans the events of a model; `program` makes the program that computes given quantities. None if it has none.
+    """Plans the events of a model; `needed` are the steps that given quantities depend on, `program` evaluates them.
+    None if it has no events.
 
     **Raises:**
 
-    - `ModelError` for a `reinit` of what is not a state.
+    - `ModelError` if sampled events need each other's results; for a `reinit` of what is not a state.
     """
     table = flat.events
     if not len(table):
         return None
+    table = _in_order(table, _reads(flat, variables, needed))
     n_clocks = len(table.clocks)
     guards, guard = _read(variables, table.guard[n_clocks:], program)
     values, value = _read(variables, table.value, program)
@@ -73,9 +78,58 @@ def plan_events(
                 f"state: the equations determine it at every instant. The states are {shown or 'none'}"
             )
         place[row], factor[row] = position[quantity], scale
+        for other in range(row):
+            if table.event[other] == table.event[row] and place[other] == place[row]:
+                raise ModelError(
+                    f"{table.text[table.event[row]]}: '{flat.variables.names[table.state[other]]}' and "
+                    f"'{flat.variables.names[v]}' are one state, which is given two values by one event: reinit one"
+                )
     return EventPlan(
         table, n_clocks, guards, guard, values, value, place, factor, flat.parameters.discrete, 
         len(flat.parameters.discrete) - flat.parameters.n_relations, _following(flat)
+    )  # fmt: skip
+
+
+def _reads(flat: FlatModel, variables: QuantityMap, needed: Callable) -> list[set[int]]:
+    """The discrete variables that each sampled event reads as they are at its instant, through equations too."""
+    table = flat.events
+    place = {int(p): k for k, p in enumerate(flat.parameters.discrete)}
+    out = []
+    for event in range(len(table.clocks)):
+        values = table.value[(table.event == event) & (table.value >= 0)]
+        found: set[int] = set()
+        for step in needed(variables.quantity[values]):
+            for equation in step.equations:
+                found |= {place[p] for p in np.unique(equation.parameter).tolist() if p in place}
+        out.append(found)
+    return out
+
+
+def _in_order(table: EventTable, reads: list[set[int]]) -> EventTable:
+    """The events in the order in which they happen at one instant: of sampled ones, those that write what others read
+    come first."""
+    writes = [set(table.discrete[(table.event == e) & (table.discrete >= 0)].tolist()) for e in range(len(reads))]
+    sorter: graphlib.TopologicalSorter[int] = graphlib.TopologicalSorter({e: () for e in range(len(reads))})
+    for e, read in enumerate(reads):
+        sorter.add(e, *(k for k, written in enumerate(writes) if k != e and read & written))
+    try:
+        order = list(sorter.static_order())
+    except graphlib.CycleError as error:
+        names = ", ".join(f"'{table.text[e]}'" for e in dict.fromkeys(error.args[1]))
+        raise ModelError(
+            f"the sampled events {names} need each other's results at the same instant, directly or through "
+            "equations: let one of them read the value before, pre(…)"
+        ) from None
+    everything = [*order, *range(len(reads), len(table))]
+    place = np.argsort(np.array(everything, np.int64), kind="stable")
+
+    def moved(column: Sequence) -> tuple:
+        return tuple(column[e] for e in everything)
+
+    return dataclasses.replace(
+        table, text=moved(table.text), guard=table.guard[everything], clocks=tuple(table.clocks[e] for e in order),
+        message=moved(table.message), noted=moved(table.noted), revocable=moved(table.revocable),
+        immediate=moved(table.immediate), event=place[table.event] if len(table.event) else table.event,
     )  # fmt: skip
 
 

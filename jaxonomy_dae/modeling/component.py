@@ -20,7 +20,7 @@ from .interval import Interval, as_interval
 from .names import check_name
 from .ports import Domain, Port
 from .real_number import real_number
-from .symbols import DiscreteSymbol, ParameterSymbol, TimeSymbol, VariableSymbol
+from .symbols import DiscreteSymbol, ParameterSymbol, PreviousSymbol, TimeSymbol, VariableSymbol
 
 
 class Component(EventDeclarations, metaclass=Construction):
@@ -194,7 +194,10 @@ class Component(EventDeclarations, metaclass=Construction):
 
     @staticmethod
     def _check_parameters_only(value: sympy.Expr, what: str):
-        wrong = sorted((s for s in value.free_symbols if not isinstance(s, ParameterSymbol)), key=str)
+        wrong = sorted(
+            (s for s in value.free_symbols if not isinstance(s, ParameterSymbol) or isinstance(s, PreviousSymbol)),
+            key=str,
+        )
         if wrong:
             raise ModelError(f"{what} may use parameters only; it uses '{wrong[0]}'")
 

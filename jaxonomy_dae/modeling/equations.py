@@ -7,7 +7,7 @@ import sympy
 
 from ..errors import ModelError
 from ..expressions.from_sympy import atoms_of
-from .symbols import VariableSymbol
+from .symbols import PreviousSymbol, VariableSymbol
 
 
 @functools.lru_cache(maxsize=4096)
@@ -29,6 +29,9 @@ def residual_of(equation: Any) -> sympy.Expr:
     atoms = atoms_of(residual)
     if sympy.I in atoms:
         raise ModelError(f"the equation {equation} has a complex coefficient: write its real and imaginary part as two")
+    previous = sorted((s for s in atoms if isinstance(s, PreviousSymbol)), key=str)
+    if previous:
+        raise ModelError(f"the equation {equation} holds at all times: {previous[0]} is for reinit and assign in when")
     if not any(isinstance(s, VariableSymbol) for s in atoms):
         raise ModelError(
             f"the equation {equation} contains no variable: use the symbols that self.variable(...) returns"

@@ -104,8 +104,12 @@ class EventDeclarations:
         """
         active = self.discrete(name, start=0)
         self.either(sympy.Eq(active, 1), gap, force)
-        self._event(sympy.sympify(force) <= 0, (Assign(active, sympy.Integer(0)),), sympy.Eq(active, 1), True)
-        self._event(sympy.sympify(gap) <= 0, (Assign(active, sympy.Integer(1)),), sympy.Eq(active, 0), True)
+        self._event(
+            sympy.sympify(force) <= 0, (Assign(active, sympy.Integer(0)),), sympy.Eq(active, 1), True, revocable=True
+        )
+        self._event(
+            sympy.sympify(gap) <= 0, (Assign(active, sympy.Integer(1)),), sympy.Eq(active, 0), True, revocable=True
+        )
         return active
 
     def relation(self, condition: Any, edges: tuple[Sampled, Any, Sampled, Any] | None = None) -> Any:
@@ -132,7 +136,7 @@ class EventDeclarations:
         self.relations += 1
         live = None if edges is None else sympy.Eq(known, LIVE)
         for holds, value in ((condition, 1), (sympy.Not(condition), 0)):
-            self._event(holds, (Assign(known, sympy.Integer(value)),), live, True, noted=False)
+            self._event(holds, (Assign(known, sympy.Integer(value)),), live, True, noted=False, revocable=True)
         if edges is not None:
             for clock, value in (edges[:2], edges[2:]):
                 self._event(clock, (Assign(known, sympy.sympify(value)),), None, False, noted=False)
@@ -166,7 +170,10 @@ class EventDeclarations:
         """
         self._event(condition, actions, on, at_start)
 
-    def _event(self, condition: Any, actions: tuple[Action, ...], on: Any, immediate: bool, noted: bool = True) -> None:
+    def _event(
+        self, condition: Any, actions: tuple[Action, ...], on: Any, immediate: bool, noted: bool = True,
+        revocable: bool = False,
+    ) -> None:  # fmt: skip
         if self._sealed:
             raise ModelError(f"component '{self.path}' is complete: declare its events inside __init__ of its class")
         where = f"component '{self.name}': when"
@@ -196,7 +203,7 @@ class EventDeclarations:
         elif on is not None:
             raise ModelError(f"{where}: on= is for conditions on variables; a sampled event always happens")
         values = self._values(actions, number, where)
-        self.events.append(When(text, guard, clock, tuple(actions), values, immediate, noted))
+        self.events.append(When(text, guard, clock, tuple(actions), values, immediate, noted, revocable))
 
     def _hidden(self, name: str, expression: sympy.Expr) -> str:
         """Declares a variable that equals an expression, and is not shown."""

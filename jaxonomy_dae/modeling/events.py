@@ -51,7 +51,8 @@ class When:
     """One `when` of a component: `guard` is the name of the hidden variable that falls through zero where the condition
     becomes true, `clock` the period and the offset of a sampled one. `values` are the names of the hidden variables, or
     the numbers, that the actions write; `text` is what the user wrote. One that is `immediate` happens at the initial
-    time, too, if its condition holds there; one that is not `noted` only says that equations change."""
+    time, too, if its condition holds there; one that is not `noted` only says that equations change. One that is
+    `revocable` does not happen if another event at the same instant has made its condition false again."""
 
     text: str
     guard: str | None
@@ -60,6 +61,7 @@ class When:
     values: tuple[str | float | None, ...]
     immediate: bool = False
     noted: bool = True
+    revocable: bool = False
 
 
 def pre(symbol: Any) -> sympy.Expr:
@@ -118,6 +120,8 @@ def _expression(value: Any, where: str) -> sympy.Expr:
         found = None
     if isinstance(value, str) or not isinstance(found, sympy.Expr):
         raise ModelError(f"{where}: the value is an expression or a number; got {value!r}")
+    if found.is_number and not (found.is_extended_real and found.is_finite):
+        raise ModelError(f"{where}: the value must be finite and real; got {value!r}")
     return found
 
 

@@ -13,6 +13,7 @@ from ..errors import ModelError
 from ..initialization.initial_values import check_initial
 from ..solvers.solve_arguments import check_finite, check_longest_step
 from ..system.system import AcausalSystem
+from ..system.system_at import SystemAt
 
 
 def check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_controller, dtmax, max_steps):
@@ -46,6 +47,21 @@ def check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_contr
     check_longest_step(dtmax)
     _check_interval(t0, t1, ts)
     check_initial(system, initial)
+    _check_periods(system)
+
+
+def _check_periods(system: AcausalSystem):
+    if system.plan.events is None or not system.plan.events.n_clocks:
+        return
+    periods = _concrete(SystemAt(system.plan, system.numbers, (), 0.0, {}).clocks()[0])
+    if periods is None:
+        return
+    bad = np.flatnonzero(~(periods > 0))
+    if len(bad):
+        name = system.plan.events.names[bad[0]]
+        raise ModelError(
+            f"'{name}': the period must be positive; it is {periods[bad[0]]:g}. Set it with with_parameters"
+        )
 
 
 def _concrete(value: Any) -> np.ndarray | None:

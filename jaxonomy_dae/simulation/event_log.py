@@ -35,7 +35,8 @@ class EventLog(eqx.Module):
 
 
 class Events:
-    """`solution.events`: the events of conditions in the order in which they happened; sampled ones are not listed.
+    """`solution.events`: the events of conditions in the order in which they happened. Sampled ones and those at the
+    initial time are listed only if they end the run.
 
     - `ts`: the times, shape `(max_events,)`, infinite beyond the last event; differentiable.
     - `which`: the number of each event among `all_names`, −1 where there was none.

@@ -8,6 +8,7 @@ import numpy as np
 from ..hybrid.solver import TOO_MANY
 from ..solvers.choice_guard import SINGULAR_CHOICE
 from ..solvers.failures import SHOWN, explain_failure, how_it_stopped
+from ..system.system import AcausalSystem
 from .event_log import Events
 from .failed_blocks import failed_block
 from .not_finite import equation_not_finite
@@ -36,6 +37,13 @@ def explain(
     (t0, _), (t, x) = first, last
     if solution.result == TOO_MANY and solution.event_log is not None:
         return _too_many_events(solution.events, float(t))
+    written = _written_not_finite(system, x)
+    if written:
+        return f"the integration stopped at t={float(t):g}: an event gave {written} a value that is not finite" + (
+            ", or left states that the hidden constraints do not admit: let it write, with reinit(...), all that jumps"
+            if system.is_constrained
+            else ""
+        )
     bad = _bad_input(inputs, float(t0), float(t), float(t1))
     if bad:
         return f"the integration stopped at t={float(t):g}: {bad}"
@@ -58,6 +66,16 @@ def explain(
         result=solution.result, t0=t0, t1=t1, max_steps=max_steps, rtol=rtol, atol=scaled_atol(system, atol),
         explicit=not implicit,
     )  # fmt: skip
+
+
+def _written_not_finite(system: AcausalSystem, x: Any) -> str:
+    """The discrete variables and states that are not finite after an event; or nothing."""
+    if system.plan.events is None:
+        return ""
+    names = system.discretes
+    pairs = [*zip(names, np.asarray(system.discrete_values)[: len(names)], strict=True)]
+    pairs += [*zip(system.states, np.asarray(x)[: len(system.states)], strict=True)]
+    return ", ".join(repr(name) for name, value in pairs if not np.isfinite(value))
 
 
 def _too_many_events(events: Events, t: float) -> str:

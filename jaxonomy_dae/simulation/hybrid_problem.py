@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from ..errors import ModelError
 from ..hybrid.control import EventControl
 from ..hybrid.problem import AbstractHybridProblem
 from ..solvers.switching import Watch
@@ -15,6 +16,7 @@ from ..system.system_at import SystemAt
 from .preparation import prepared, term_of
 
 RESOLUTION = 32.0  # times the spacing of floating-point numbers at the largest time of a run
+CONSISTENT = 1e-4  # of a state's size: what projection may change of what an event writes and leaves
 RESTART = 8  # Gauss–Newton steps onto the constraints after an event
 
 
@@ -31,6 +33,7 @@ class SystemProblem(AbstractHybridProblem):
     ends: tuple[bool, ...] = eqx.field(static=True)
     immediate: tuple[bool, ...] = eqx.field(static=True)
     noted: tuple[bool, ...] = eqx.field(static=True)
+    revocable: tuple[bool, ...] = eqx.field(static=True)
 
     def term(self, q):
         return term_of(self.system.holding(q), self.implicit)
@@ -58,7 +61,11 @@ class SystemProblem(AbstractHybridProblem):
         place, new = events.table.discrete[is_discrete], values[is_discrete]
         q = q.at[place].add(jnp.where(happens[is_discrete], new - q[place], 0.0))
         if self.system.is_constrained:
-            x = self.system.holding(q).project(t, x, args, iterations=RESTART)
+            projected = self.system.holding(q).project(t, x, args, iterations=RESTART)
+            n, typical = len(self.system.plan.states), self.system.plan.typical_sizes[self.system.plan.states]
+            allowed = CONSISTENT * (jnp.abs(x[:n]) + jnp.asarray(typical, x.dtype))
+            consistent = jnp.all(jnp.abs(projected[:n] - x[:n]) <= allowed)
+            x = jnp.where(consistent, projected, jnp.nan)
         return x, q
 
 
@@ -74,11 +81,22 @@ def problem_for(
         resolution=RESOLUTION * jnp.finfo(t1.dtype).eps * largest,
         n_clocks=events.n_clocks, n_guards=len(events) - events.n_clocks, ends=ends, immediate=events.table.immediate,
         noted=events.table.noted,
+        revocable=events.table.revocable,
     )  # fmt: skip
 
 
 def with_event_control(controller: Any) -> Any:
-    """The controller whose steps end at events; what clips steps at jumps of inputs stays outside."""
+    """The controller whose steps end at events; what clips steps at jumps of inputs stays outside.
+
+    **Raises:**
+
+    - `ModelError` for a controller whose steps end where they end.
+    """
+    if isinstance(controller, diffrax.StepTo):
+        raise ModelError(
+            "this system has events, and steps end at events: stepsize_controller=StepTo(...) cannot be kept. Leave it "
+            "out, or bound the steps with dtmax="
+        )
     if isinstance(controller, diffrax.ClipStepSizeController):
         return eqx.tree_at(lambda c: c.controller, controller, with_event_control(controller.controller))
     return EventControl(controller)  # pyright: ignore[reportCallIssue]

@@ -73,7 +73,10 @@ def integrate(
         )
     stats = dict(solved.stats)
     if counted:
-        stats["num_jacobians"], stats["num_newton_iterations"] = jax.lax.stop_gradient(solved.solver_state.counts)
+        state = solved.solver_state
+        while isinstance(state, tuple):  # of solvers around BDF, which comes first
+            state = state[0]
+        stats["num_jacobians"], stats["num_newton_iterations"] = jax.lax.stop_gradient(state.counts)
     elif is_implicit(solver):
         stats["num_jacobians"] = stats["num_steps"]
     last = jax.tree.map(lambda v: v[0], (solved.ts["last"], solved.ys["last"]))

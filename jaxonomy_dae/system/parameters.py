@@ -66,6 +66,19 @@ class ParameterNames:
         """All values, shape (*batch, n), with the dependent ones computed from the others."""
         return complete(self.dependents, array)
 
+    def given(self, chosen: np.ndarray) -> "ParameterNames":
+        """The same table, in which these parameters are given even where they were computed from others."""
+        if not any(int(k) in self.expressions for k in chosen):
+            return self
+        dependents = tuple(
+            DependentParameters(group.template, group.target[rows], group.parameter[rows])
+            for group in self.dependents
+            if (rows := ~np.isin(group.target, chosen)).any()
+        )
+        expressions = {k: text for k, text in self.expressions.items() if k not in chosen}
+        digest = f"{self.digest} given {list(map(int, chosen))}"
+        return dataclasses.replace(self, dependents=dependents, expressions=expressions, digest=digest)
+
     @functools.cached_property
     def bounds(self) -> Float[np.ndarray, "n 2"]:
         """The least and the greatest admissible value of each parameter."""

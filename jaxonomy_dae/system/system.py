@@ -173,10 +173,11 @@ class AcausalSystem(eqx.Module):
         events = self.plan.events
         if events is None or not len(events.discrete):
             return self
-        visible = values[: events.n_visible]
-        array = complete(events.dependents, self.parameters.array.at[events.discrete[: events.n_visible]].set(visible))
-        parameters = Parameters(array, None, (), self.parameters.table)
-        return AcausalSystem(parameters, self.neural, self.plan, values[events.n_visible :])
+        n, chosen = events.n_visible, events.discrete[: events.n_visible]
+        array = complete(events.dependents, self.parameters.array.at[chosen].set(values[:n]))
+        # A start that is an expression holds at the start alone.
+        parameters = Parameters(array, None, (), self.parameters.table.given(chosen))
+        return AcausalSystem(parameters, self.neural, self.plan, values[n:])
 
     def around_event(self, t: Any, values: Any, previous: Any, args: Any = None) -> SystemAt:
         """`at`, with discrete variables that have these values and had others before the event at hand."""
