@@ -28,7 +28,8 @@ ROUNDING = 1e-9  # of that size, over a step: counts as no change
 
 class Instant(eqx.Module):
     """An instant while it is handled: the events that are left, which of them were made true by another event, the
-    delay δ of the last one, the discrete values before the instant, and dx/dt after it."""
+    delay δ of the last one, the discrete values before the instant, dx/dt after it,
+    and the state before the instant."""
 
     state: HybridState
     left: Any
@@ -36,6 +37,7 @@ class Instant(eqx.Module):
     delay: Any
     previous: Any
     slope: Any
+    arrived: Any
 
 
 class Arrival(NamedTuple):
@@ -111,7 +113,7 @@ def handle(
         )
         # Clocks that tick together read what was before all of them.
         previous = jnp.where(jnp.any(left[:c]), instant.previous, new) if c else new
-        return Instant(state, left, caused, delay, previous, after)
+        return Instant(state, left, caused, delay, previous, after, instant.arrived)
 
     def step(instant: Instant, _: None) -> tuple[Instant, None]:
         going = jnp.any(instant.left)
@@ -121,7 +123,7 @@ def handle(
 
         return lax.cond(any_member(going), go, lambda instant: instant, instant), None
 
-    start = Instant(state, arrival.due, arrival.jumped, jnp.zeros_like(t), state.q, jnp.zeros_like(state.x))
+    start = Instant(state, arrival.due, arrival.jumped, jnp.zeros_like(t), state.q, jnp.zeros_like(state.x), state.x)
     length = c + min(2 * g, CONDITIONS_AT_ONE_INSTANT)
     instant, _ = lax.scan(step, start, length=length)
     return instant.state, instant.slope
@@ -144,8 +146,11 @@ def _following(problem, t, x, q, slope, instant: Instant, event, arrival: Arriva
     # One that seems to fall from zero by rounding alone is waited for: if it does fall, the next step finds it.
     true = jnp.where(zero, rate * arrival.span < -ROUNDING * arrival.size, value < 0)
     was_armed = (instant.state.armed > 0.5) & ~here
-    # What this event made true happens next; what was to happen does so, unless it is revocable and undone.
-    stands = left[c:] & ~np.array(problem.revocable[c:], bool)
+    # What this event made true happens next. What was to happen does so, though a state starts anew: unless what was
+    # assigned makes its condition false, or it is revocable and undone.
+    at_arrival, rate_there = problem.rates(t, instant.arrived, q, args, slope)
+    reached = at_arrival <= jnp.maximum(SMALL * arrival.size, jnp.abs(rate_there) * arrival.window)
+    stands = left[c:] & ~np.array(problem.revocable[c:], bool) & reached
     caused = ((was_armed & true) | stands) & ~zero
     next_ones = ((was_armed | left[c:]) & true & ~here) | stands
     armed = jnp.where(true, next_ones, True)

@@ -77,7 +77,8 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
         variable_map,
         state_order,
         quantity_name,
-        lambda q: _needed(steps, q, n),
+        steps,
+        n,
         lambda q: program(_needed(steps, q, n)),
     )
     row_inputs = [_of(variable_map, row.inputs) for row in flat.rows]

@@ -11,7 +11,7 @@ from ..model.quantities import QuantityMap
 from ..model.tables import ZERO, DependentParameters, EventTable, FlatModel
 from .gather import Gather
 from .program import Program
-from .schedule import AnyStep
+from .schedule import AnyStep, Step
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,11 +48,12 @@ def plan_events(
     variables: QuantityMap,
     states: np.ndarray,
     names: Sequence[str],
-    needed: Callable[[np.ndarray], Sequence[AnyStep]],
+    steps: Sequence[AnyStep],
+    n: int,
     program: Callable[[np.ndarray], Program],
 ) -> EventPlan | None:
-    """Plans the events of a model; `needed` are the steps that given quantities depend on, `program` evaluates them.
-    None if it has no events.
+    """Plans the events of a model; `steps` determine its `n` quantities, and `program` makes the
+    program that computes chosen ones. None if it has no events.
 
     **Raises:**
 
@@ -61,7 +62,7 @@ def plan_events(
     table = flat.events
     if not len(table):
         return None
-    table = _in_order(table, _reads(flat, variables, needed))
+    table = _in_order(table, _reads(flat, variables, steps, n))
     n_clocks = len(table.clocks)
     guards, guard = _read(variables, table.guard[n_clocks:], program)
     values, value = _read(variables, table.value, program)
@@ -90,19 +91,35 @@ def plan_events(
     )  # fmt: skip
 
 
-def _reads(flat: FlatModel, variables: QuantityMap, needed: Callable) -> list[set[int]]:
+def _reads(flat: FlatModel, variables: QuantityMap, steps: Sequence[AnyStep], n: int) -> list[set[int]]:
     """The discrete variables that each sampled event reads as they are at its instant, through equations too."""
     table = flat.events
     place = {int(p): k for k, p in enumerate(flat.parameters.discrete)}
     out = []
     for event in range(len(table.clocks)):
         values = table.value[(table.event == event) & (table.value >= 0)]
-        found: set[int] = set()
-        for step in needed(variables.quantity[values]):
-            for equation in step.equations:
-                found |= {place[p] for p in np.unique(equation.parameter).tolist() if p in place}
-        out.append(found)
+        found = _parameters_behind(variables.quantity[values], steps, n)
+        out.append({place[p] for p in found if p in place})
     return out
+
+
+def _parameters_behind(quantities: np.ndarray, steps: Sequence[AnyStep], n: int) -> set[int]:
+    """The parameters of all equations that determine quantities, states apart."""
+    wanted = np.zeros(n, bool)
+    wanted[quantities[quantities != ZERO]] = True
+    found: set[int] = set()
+    for step in reversed(steps):
+        hit = np.any([wanted[unknown] for unknown in step.unknown], axis=0)
+        if not hit.any():
+            continue
+        for equation in step.equations:
+            rows = hit if isinstance(step, Step) else slice(None)  # of a large block, all equations
+            found.update(np.unique(equation.parameter[rows]).tolist())
+            for slot in equation.slots:
+                if slot.local < 0:
+                    quantity = slot.quantity[rows]
+                    wanted[quantity[quantity != ZERO]] = True
+    return found
 
 
 def _in_order(table: EventTable, reads: list[set[int]]) -> EventTable:
