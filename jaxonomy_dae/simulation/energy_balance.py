@@ -32,22 +32,24 @@ def energy_balance(solution: Solution, rtol: float, atol: float) -> EnergyBalanc
 
     **Raises:**
 
-    - `ModelError` inside jit, of a batch, of a solution with rows that were not reached, and of a model with events.
+    - `ModelError` inside jit, of a batch, of a solution with rows that were not reached, and of a model whose
+        events write states or discrete variables.
     """
     system, ts = solution.system, solution.ts
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(solution)):
         raise ModelError("the balance of energy needs numbers: ask for it outside jit, grad and vmap")
     if ts.ndim != 1:
         raise ModelError(f"the balance of energy is that of one solution; this is a batch of shape {ts.shape[:-1]}")
-    if system.plan.events is not None:
+    events = system.plan.events
+    if events is not None and (system.discretes or (events.state >= 0).any()):
         raise ModelError(
-            "the balance of energy does not know what events do to the energies stored: this model has events. "
-            "solution.energy(), .supply() and .dissipation() can be read"
+            "the balance of energy does not know what events do to the energies stored: this model has some that write "
+            "states or discrete variables. solution.energy(), .supply() and .dissipation() can be read"
         )
     if not bool(jnp.all(jnp.isfinite(solution.states))):
         raise ModelError("the solution has rows that were not reached: there is nothing to balance")
     energies = [chosen_terms(system.plan, kind, None) for kind in ("energy", "supply", "dissipation")]
-    change = np.asarray(account_values(system, ts, solution.states, solution.inputs))
+    change = np.asarray(account_values(system, ts, solution.states, solution.inputs, solution.discrete))
     change = (change - change[0])[:, energies[0]]
     work = _integrals(solution, rtol, atol)
     supplied, lost = (work[0][:, chosen].sum(axis=1) for chosen in energies[1:])
@@ -81,7 +83,7 @@ def _integrals(solution: Solution, rtol: float, atol: float) -> tuple[np.ndarray
     half = np.diff(knots)[:, None] / 2
     nodes = knots[:-1, None] + half * (1 + places)
     fine = again(jnp.asarray(nodes.ravel(), solution.ts.dtype))
-    values = np.asarray(account_values(system, fine.ts, fine.states, fine.inputs), float)
+    values = np.asarray(account_values(system, fine.ts, fine.states, fine.inputs, fine.discrete), float)
     values = values.reshape(*nodes.shape, terms)
     at_saved = np.searchsorted(knots, saved)
     sums = []

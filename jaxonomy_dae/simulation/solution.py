@@ -178,8 +178,8 @@ class Solution(eqx.Module):
 
         **Raises:**
 
-        - `ModelError` inside jit, of a batch, of a solution with rows that were not reached, and of a model with
-            events, which may change what is stored at an instant.
+        - `ModelError` inside jit, of a batch, of a solution with rows that were not reached, and of a model whose
+            events write states or discrete variables, which may change what is stored at an instant.
         """
         from .energy_balance import energy_balance
 
