@@ -8,8 +8,9 @@ import sympy
 from ..errors import ModelError
 from ..model.dependent_parameters import complete
 from ..model.symbolic import SymbolicTemplate, canonical
-from ..model.tables import LIVE, DependentParameters, ParameterTable, Start, VariableTable
+from ..model.tables import DependentParameters, ParameterTable, Start, VariableTable
 from ..modeling.declarations import full_name
+from ..modeling.events import LIVE
 from ..modeling.interval import Interval
 from .number_model import ModelNumbers
 from .read_equations import read_expression
@@ -98,7 +99,7 @@ def parameter_table(model: ModelNumbers) -> ParameterTable:
     # variables were before an event.
     n_relations = len(model.relations)
     names += [f"relation {k}" for k in range(n_relations)]
-    array = np.concatenate([array, np.full(n_relations, LIVE)])
+    array = np.concatenate([array, np.full(n_relations, float(LIVE))])
     n_more = n_relations + len(model.discrete)
     return ParameterTable(
         [*names, *(f"pre({names[p]})" for p in model.discrete)],

@@ -6,8 +6,8 @@ rounding; its derivative is that of the time of the crossing, by the implicit fu
     xₑ = x₁ + f⁻·δ,   (x⁺, q⁺) = R(τ, xₑ, q),   x₁' = x⁺ − f⁺·δ
 
 has the value R and, f⁻ and f⁺ being constants, the saltation matrix as its derivative (Aizerman & Gantmacher 1958). Its
-second derivative is not that of the flow, and is refused. A
-clock ticks at τ = offset + k·period, a function of parameters, in the same manner.
+second derivative is not that of the flow, and is refused. A clock ticks at τ = offset + k·period, a function of
+parameters, in the same manner.
 """
 
 from typing import Any, NamedTuple
@@ -28,8 +28,8 @@ ROUNDING = 1e-9  # of that size, over a step: counts as no change
 
 class Instant(eqx.Module):
     """An instant while it is handled: the events that are left, which of them were made true by another event, the
-    delay δ of the last one, the discrete values before the instant, dx/dt after it,
-    and the state before the instant."""
+    delay δ of the last one, the discrete values before the instant, dx/dt after the last event, and the state before
+    the instant."""
 
     state: HybridState
     left: Any

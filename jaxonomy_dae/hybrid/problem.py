@@ -23,7 +23,6 @@ class AbstractHybridProblem(eqx.Module):
     n_guards: eqx.AbstractVar[int]
     ends: eqx.AbstractVar[tuple[bool, ...]]  # which events end the run
     immediate: eqx.AbstractVar[tuple[bool, ...]]  # which happen at the initial time, if their conditions hold there
-
     noted: eqx.AbstractVar[tuple[bool, ...]]  # which are counted and listed
     revocable: eqx.AbstractVar[tuple[bool, ...]]  # which another event may undo before they happen
     resolution: eqx.AbstractVar[Any]  # a time that is nothing beside the run, but more than rounding

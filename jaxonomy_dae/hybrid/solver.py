@@ -131,8 +131,7 @@ class WithEvents(diffrax.AbstractWrappedSolver):
             bound(terms, y0.q), t0, t1, y0.x, args, inner_state, made_jump
         )
         dense = _Dense(solver.interpolation_cls, info)
-        found = _looked_at(problem, dense, t0, t1, y0, x1, args)
-        request, armed, arrival = found
+        request, armed, arrival = _looked_at(problem, dense, t0, t1, y0, x1, args)
         state = eqx.tree_at(lambda y: (y.x, y.armed, y.request), y0, (x1, armed, jnp.full_like(t1, jnp.inf)))
         fired = jnp.any(arrival.due)
 

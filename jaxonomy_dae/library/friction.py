@@ -93,12 +93,13 @@ class Brake(Component):
 
 class StickingFriction(Component):
     """Dry friction between two sliding parts that sticks: f opposes v_rel = der(flange_b.x − flange_a.x) with the
-    force `sliding` (newton, > 0), and holds the parts together up to `breakaway` ≥ sliding."""
+    force `sliding` (newton, > 0), and holds the parts together up to `breakaway` ≥ sliding, which is `sliding` if left
+    out."""
 
     def __init__(self, ev: EqnEnv, name: str, sliding: Value = 1.0, breakaway: Value | None = None):
         super().__init__(ev, name)
         coulomb = self.parameter("sliding", sliding, unit="N", bounds=POSITIVE)
-        static = self.parameter("breakaway", sliding if breakaway is None else breakaway, unit="N", bounds=POSITIVE)
+        static = self.parameter("breakaway", coulomb if breakaway is None else breakaway, unit="N", bounds=POSITIVE)
         a, b = self.port("flange_a", Translational), self.port("flange_b", Translational)
         v = self.variable("v_rel", unit="m/s")
         f = self.variable("f", unit="N")

@@ -52,8 +52,8 @@ def plan_events(
     n: int,
     program: Callable[[np.ndarray], Program],
 ) -> EventPlan | None:
-    """Plans the events of a model; `steps` determine its `n` quantities, and `program` makes the
-    program that computes chosen ones. None if it has no events.
+    """Plans the events of a model; `steps` determine its `n` quantities, and `program` makes the program
+    that computes chosen ones. None if it has no events.
 
     **Raises:**
 
@@ -86,7 +86,7 @@ def plan_events(
                     f"'{flat.variables.names[v]}' are one state, which is given two values by one event: reinit one"
                 )
     return EventPlan(
-        table, n_clocks, guards, guard, values, value, place, factor, flat.parameters.discrete, 
+        table, n_clocks, guards, guard, values, value, place, factor, flat.parameters.discrete,
         len(flat.parameters.discrete) - flat.parameters.n_relations, _following(flat)
     )  # fmt: skip
 

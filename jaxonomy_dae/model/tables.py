@@ -17,7 +17,6 @@ from .symbolic import SymbolicTemplate
 from .template import AbstractTemplate
 
 ZERO = -1
-LIVE = 2.0  # a relation that is as its sides say
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,10 +7,8 @@ from sympy.logic.boolalg import BooleanAtom
 
 from ..errors import ModelError
 from .environment import EqnEnv
-from .events import Action, Assign, Reinit, Sampled, Terminate, When, guard_of, relation_in_discretes, while_on
+from .events import LIVE, Action, Assign, Reinit, Sampled, Terminate, When, guard_of, relation_in_discretes, while_on
 from .symbols import DiscreteSymbol, PreviousSymbol, RelationSymbol, VariableSymbol
-
-LIVE = 2  # a relation that is as its sides say
 
 
 class EventDeclarations:
@@ -50,8 +48,12 @@ class EventDeclarations:
 
         **Arguments:**
 
-        - `period` > 0, `offset`: second; numbers or expressions in parameters, which may be trained. Of instants
-            before the initial time, and of the initial time itself, nothing happens.
+        - `period` > 0, `offset`: second; numbers or expressions in parameters, which may be trained. It is
+            true at the initial time, too, if that is one of these instants; those before it are left out.
+
+        **Raises:**
+
+        - `ModelError` for what is not an expression in parameters, and a period that is not positive.
         """
         parts = []
         for what, value in (("period", period), ("offset", offset)):

@@ -9,7 +9,7 @@ from sympy.logic.boolalg import BooleanAtom, BooleanFunction, to_nnf
 from ..errors import ModelError
 from .symbols import DiscreteSymbol, ParameterSymbol, PreviousSymbol, RelationSymbol, TimeSymbol, VariableSymbol
 
-ALWAYS = sympy.true
+LIVE = 2  # a relation that is as its sides say
 
 
 @dataclasses.dataclass(frozen=True)

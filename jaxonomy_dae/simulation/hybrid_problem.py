@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ..errors import ModelError
 from ..hybrid.control import EventControl
 from ..hybrid.problem import AbstractHybridProblem
 from ..solvers.switching import Watch
@@ -86,17 +85,7 @@ def problem_for(
 
 
 def with_event_control(controller: Any) -> Any:
-    """The controller whose steps end at events; what clips steps at jumps of inputs stays outside.
-
-    **Raises:**
-
-    - `ModelError` for a controller whose steps end where they end.
-    """
-    if isinstance(controller, diffrax.StepTo):
-        raise ModelError(
-            "this system has events, and steps end at events: stepsize_controller=StepTo(...) cannot be kept. Leave it "
-            "out, or bound the steps with dtmax="
-        )
+    """The controller whose steps end at events; what clips steps at jumps of inputs stays outside."""
     if isinstance(controller, diffrax.ClipStepSizeController):
         return eqx.tree_at(lambda c: c.controller, controller, with_event_control(controller.controller))
     return EventControl(controller)  # pyright: ignore[reportCallIssue]

@@ -17,7 +17,7 @@ from ..linear.sparse import SparseMatrix, SparsePattern, sparse_jacobian
 from ..lowering.plan import SystemPlan
 from ..model.dependent_parameters import complete
 from ..model.pickling import functions_by_name, named_functions
-from ..model.tables import LIVE
+from ..modeling.events import LIVE
 from .evaluate import Refinement
 from .inputs import read_inputs
 from .parameters import Parameters
