@@ -7,7 +7,7 @@ import numpy as np
 
 from ..errors import ModelError, nearest
 from ..model.opaque import OpaqueFunction, OpaqueTemplate
-from ..model.provenance import Provenance
+from ..model.provenance import Provenance, Provenances
 from ..model.tables import RowInjection, VariableTable
 from ..modeling.diagram import AcausalDiagram
 from ..modeling.symbols import TimeSymbol, VariableSymbol
@@ -43,7 +43,7 @@ def _add_opaque(
         [[o for _, o in pairs]],
         np.zeros((1, 0)),
         np.zeros((1, 0)),
-        [Provenance(f"output {output} of the {noun}", opaque.name)],
+        Provenances.of([Provenance(f"output {output} of the {noun}", opaque.name)]),
     )
 
 

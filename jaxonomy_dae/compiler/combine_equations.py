@@ -11,7 +11,7 @@ from ..expressions.node import ZERO as ZERO_NODE
 from ..expressions.node import Node, constant, leaf, linear, multiply, scale
 from ..expressions.substitute import substitute
 from ..model.linear_template import LinearTemplate
-from ..model.provenance import Provenance
+from ..model.provenance import Provenance, Provenances
 from ..model.symbolic import SymbolicTemplate, parameter_label, slot_label, template_of
 from ..model.tables import ZERO, EquationGroup
 from ..modeling.symbols import TIME_LABEL
@@ -128,5 +128,5 @@ def group_of(graph: Node, provenance: Provenance) -> EquationGroup:
         np.ones((1, len(quantities))),
         np.array([parameters], np.int64).reshape(1, -1),
         np.zeros((1, 0)),
-        [provenance],
+        Provenances.of([provenance]),
     )

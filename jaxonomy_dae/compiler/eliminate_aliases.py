@@ -4,101 +4,77 @@ Given linear equations a = 0, a = c·b and a = c·dᵏb/dtᵏ with numbers c, re
 remains is a smaller model in root variables; every eliminated variable stays observable through the `AliasTable`.
 Replacing a velocity by the derivative of its position lowers the index by the number of equations that only name a
 derivative.
+
+Most of them say that two variables are equal, or opposite, or that one is zero: those are joined at once, as the
+connected components of a graph. The others follow one by one.
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from ..model.linear_template import LinearTemplate
-from ..model.provenance import Provenance
-from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel
+from ..model.provenance import Provenances
+from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, VariableTable
 
-# (variable, order, coefficient, what rounding may have added to or taken from the coefficient)
-Row = list[tuple[int, int, float, float]]
 ROUNDING = 1e-15  # of a coefficient as it was written
 EPS = 2.0**-52
 DECADES = 30.0  # that factors span at most: single precision has 38
+SWEEPS = 8  # after which equations of any length are looked at one by one
 
 
+@dataclasses.dataclass(frozen=True)
+class _Terms:
+    """Linear equations, term by term in the order of the equations: coefficient·(variable)^(order)."""
+
+    row: np.ndarray
+    variable: np.ndarray
+    order: np.ndarray
+    coefficient: np.ndarray
+    noise: np.ndarray  # what rounding may have added to or taken from the coefficient
+
+    def take(self, index: np.ndarray) -> "_Terms":
+        return _Terms(*(getattr(self, f.name)[index] for f in dataclasses.fields(self)))
+
+
+@dataclasses.dataclass
 class _Classes:
-    """Union–find over variables with a factor and a derivative offset to the root."""
+    """Each variable as factor·(root)^(order); root ZERO if it is identically zero."""
 
-    def __init__(self, model: FlatModel, differentiated: np.ndarray):
-        n = len(model.variables)
-        self.parent = list(range(n))
-        self.order = [0] * n
-        self.factor = [1.0] * n
-        self.products = [0] * n  # how many factors other than ±1 were multiplied
-        self.decades = [(0.0, 0.0)] * n  # of the smallest and largest factors of a root's members
-        v = model.variables
-        has_start = np.array([s is not None for s in v.start], bool)
+    root: np.ndarray
+    order: np.ndarray
+    factor: np.ndarray
+    products: np.ndarray  # how many factors other than ±1 were multiplied
+    decades: np.ndarray  # (n, 2): of the smallest and largest factors of a root's members
+    merit: np.ndarray  # the variable of larger merit stays
+    is_input: np.ndarray
+
+    @classmethod
+    def alone(cls, v: VariableTable, differentiated: np.ndarray) -> "_Classes":
+        """Each variable for itself."""
+        n = len(v)
         # The better root: an input, then what is differentiated, fixed, started, no port variable; then the first.
-        self.merit = list(
-            zip(
-                v.is_input.tolist(),
-                differentiated.tolist(),
-                v.fixed.tolist(),
-                has_start.tolist(),
-                (~v.is_port).tolist(),
-                [-k for k in range(n)],
-                strict=True,
-            )
-        )
-        self.is_input = v.is_input.tolist()
+        better = np.lexsort((-np.arange(n), ~v.is_port, v.has_start, v.fixed, differentiated, v.is_input))
+        merit = np.empty(n, np.int64)
+        merit[better] = np.arange(n)
+        zeros = np.zeros(n, np.int64)
+        return cls(np.arange(n), zeros, np.ones(n), zeros.copy(), np.zeros((n, 2)), merit, v.is_input)
 
-    def find(self, v: int) -> tuple[int, int, float, int]:
-        """(root, order, factor, products) of a variable; root ZERO if it is identically zero."""
-        path = []
-        while v != ZERO and self.parent[v] != v:
-            path.append(v)
-            v = self.parent[v]
-        order, factor, products = 0, 1.0, 0
-        for w in reversed(path):
-            order += self.order[w]
-            factor *= self.factor[w]
-            products += self.products[w]
-            self.parent[w], self.order[w], self.factor[w], self.products[w] = v, order, factor, products
-        return v, order, factor, products
-
-    def canonical(self, row: Row) -> Row:
-        """The row in roots, terms of equal quantity merged; what rounding leaves of terms that cancel is nothing."""
-        merged: dict[tuple[int, int], float] = {}
-        noise: dict[tuple[int, int], float] = {}
-        for v, order, c, error in row:
-            root, more, factor, products = self.find(v)
-            if root != ZERO:
-                key, c = (root, order + more), factor * c
-                merged[key] = merged.get(key, 0.0) + c
-                noise[key] = noise.get(key, 0.0) + abs(factor) * error + EPS * products * abs(c)
-        return [(v, order, c, noise[v, order]) for (v, order), c in merged.items() if abs(c) > noise[v, order]]
-
-    def absorb(self, row: Row) -> int | None:
-        """Uses a canonical row of one or two terms as an alias, if it is one; returns the variable it replaces."""
-        if len(row) == 1:
-            v, order, _, _ = row[0]
-            if order == 0 and not self.is_input[v]:
-                self.parent[v] = ZERO
-                return v
-            return None
-        (a, p, ca, _), (b, q, cb, _) = row
-        if a == b:
-            return None
-        if (p == q == 0 and self.merit[a] > self.merit[b]) or p > 0:
-            a, p, ca, b, q, cb = b, q, cb, a, p, ca
-        if p > 0 or self.is_input[a]:
-            return None
-        factor = -cb / ca
-        if not 0 < abs(factor) < np.inf:
-            return None
-        moved = np.log10(abs(factor))
-        smallest = min(self.decades[b][0], self.decades[a][0] + moved)
-        largest = max(self.decades[b][1], self.decades[a][1] + moved)
-        if max(-smallest, largest) > DECADES:
-            return None
-        self.decades[b] = smallest, largest
-        self.parent[a], self.order[a], self.factor[a], self.products[a] = b, q, factor, int(abs(factor) != 1.0)
-        return a
+    def link(self, old: np.ndarray, root: np.ndarray, order: np.ndarray, factor: np.ndarray, products: np.ndarray):
+        """Former roots become factor·(root)^(order)."""
+        n = len(self.root)
+        to = np.arange(n + 1)  # the last place is ZERO's
+        more, times, count = np.zeros(n + 1, np.int64), np.ones(n + 1), np.zeros(n + 1, np.int64)
+        to[old], more[old], times[old], count[old] = root, order, factor, products
+        to[n] = ZERO
+        own = self.root
+        self.root = to[own]
+        self.order = self.order + more[own]
+        self.factor = self.factor * times[own]
+        self.products = self.products + count[own]
 
 
 def eliminate_aliases(model: FlatModel) -> tuple[tuple[EquationGroup, ...], AliasTable]:
@@ -110,45 +86,201 @@ def eliminate_aliases(model: FlatModel) -> tuple[tuple[EquationGroup, ...], Alia
     differentiated = np.zeros(n, bool)
     for group in model.groups:
         differentiated[group.variable[group.order > 0]] = True
-    classes = _Classes(model, differentiated)
+    classes = _Classes.alone(model.variables, differentiated)
+    linear = [g for g in model.groups if isinstance(g.template, LinearTemplate)]
+    others = [g for g in model.groups if not isinstance(g.template, LinearTemplate)]
+    terms, n_rows = _terms_of(linear)
+    rest = np.ones(n_rows, bool)
+    replaced = np.full(n_rows, ZERO)  # by each equation that is used
+    sweep = 0
+    while True:
+        terms = _canonical(terms.take(rest[terms.row]), classes)
+        found = _join(terms, n_rows, classes)
+        if (found == ZERO).all():
+            rows = np.unique(terms.row) if sweep >= SWEEPS else _short(terms, n_rows)
+            found = _follow(terms.take(np.isin(terms.row, rows)), n_rows, classes)
+            sweep += 1
+        used = np.flatnonzero(found != ZERO)
+        if not len(used):
+            break
+        replaced[used] = found[used]
+        rest[used] = False
+    is_zero = classes.root == ZERO
+    used = np.flatnonzero(~rest)
+    provenance = Provenances.joined([g.provenance for g in linear])
+    table = AliasTable(
+        classes.root,
+        np.where(is_zero, 0, classes.order),
+        np.where(is_zero, 0.0, classes.factor),
+        provenance.take(used),
+        replaced[used],
+    )
+    groups = _linear_groups(terms, np.flatnonzero(rest), provenance)
+    return (*groups, *(_substitute(g, table) for g in others)), table
 
-    rows: list[tuple[Row, Provenance]] = []
-    others: list[EquationGroup] = []
-    for group in model.groups:
-        if not isinstance(group.template, LinearTemplate):
-            others.append(group)
-            continue
-        for v, o, c, provenance in zip(
-            group.variable.tolist(), group.order.tolist(), group.coefficient.tolist(), group.provenance, strict=True
-        ):
-            rows.append(([(*term, ROUNDING * abs(term[2])) for term in zip(v, o, c, strict=True)], provenance))
 
-    eliminated: list[tuple[Provenance, int]] = []
-    pending = rows
-    changed = True
-    while changed:
-        # Short rows first, to a fixed point, then one sweep over the long ones: near-linear in all.
-        changed = False
-        kept = []
-        for row, provenance in pending:
-            row = classes.canonical(row)
-            replaced = classes.absorb(row) if 1 <= len(row) <= 2 else None
-            if replaced is not None:
-                eliminated.append((provenance, replaced))
-                changed = True
-            else:
-                kept.append((row, provenance))
-        pending = kept
+def _terms_of(groups: Sequence[EquationGroup]) -> tuple[_Terms, int]:
+    """The terms of all rows, and how many rows there are."""
+    first = np.concatenate([[0], np.cumsum([len(g) for g in groups])]).astype(np.int64)
+    row = [np.repeat(k + np.arange(len(g)), g.variable.shape[1]) for k, g in zip(first[:-1], groups, strict=True)]
+    none = [np.zeros(0, np.int64)]
+    coefficient = np.concatenate([np.zeros(0), *(g.coefficient.ravel() for g in groups)])
+    return _Terms(
+        np.concatenate(none + row),
+        np.concatenate(none + [g.variable.ravel() for g in groups]),
+        np.concatenate(none + [g.order.ravel() for g in groups]),
+        coefficient,
+        ROUNDING * np.abs(coefficient),
+    ), int(first[-1])
 
-    root = np.empty(n, np.int64)
-    order = np.empty(n, np.int64)
-    factor = np.empty(n)
-    for v in range(n):
-        root[v], order[v], factor[v], _ = classes.find(v)
-    factor[root == ZERO] = 0.0
-    order[root == ZERO] = 0
-    table = AliasTable(root, order, factor, eliminated)
-    return (*_linear_groups(pending), *(_substitute(g, table) for g in others)), table
+
+def _canonical(terms: _Terms, classes: _Classes) -> _Terms:
+    """The rows in roots, terms of equal quantity merged; what rounding leaves of terms that cancel is nothing."""
+    terms = terms.take(classes.root[terms.variable] != ZERO)
+    v = terms.variable
+    factor = classes.factor[v]
+    coefficient = factor * terms.coefficient
+    noise = np.abs(factor) * terms.noise + EPS * classes.products[v] * np.abs(coefficient)
+    root, order = classes.root[v], terms.order + classes.order[v]
+    by = np.lexsort((order, root, terms.row))
+    row, root, order = terms.row[by], root[by], order[by]
+    new = np.ones(len(by), bool)
+    new[1:] = (np.diff(row) != 0) | (np.diff(root) != 0) | (np.diff(order) != 0)
+    first = np.flatnonzero(new)
+    if len(first):
+        coefficient, noise = np.add.reduceat(coefficient[by], first), np.add.reduceat(noise[by], first)
+    merged = _Terms(row[first], root[first], order[first], coefficient, noise)
+    in_place = np.argsort(by[first], kind="stable")  # terms stay in the order they were written in
+    return merged.take(in_place[(np.abs(coefficient) > noise)[in_place]])
+
+
+def _starts(terms: _Terms, n_rows: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of each row: how many terms it has, and the first one's place."""
+    count = np.bincount(terms.row, minlength=n_rows)
+    return count, np.cumsum(count) - count
+
+
+def _short(terms: _Terms, n_rows: int) -> np.ndarray:
+    """The rows of one or two terms."""
+    count, _ = _starts(terms, n_rows)
+    return np.flatnonzero((count >= 1) & (count <= 2))
+
+
+def _join(terms: _Terms, n_rows: int, classes: _Classes) -> np.ndarray:
+    """Uses all rows a = 0 and a = ±b at once; returns the variable that each row replaces, or −1."""
+    found = np.full(n_rows, ZERO)
+    count, start = _starts(terms, n_rows)
+    n = len(classes.root)  # in the graph, ZERO is the last node
+    v = np.append(terms.variable, n)
+    single = np.flatnonzero(count == 1)
+    single = single[(terms.order[start[single]] == 0) & ~classes.is_input[v[start[single]]]]
+    pair = np.flatnonzero(count == 2)
+    a, b = start[pair], start[pair] + 1
+    equal = (terms.order[a] == 0) & (terms.order[b] == 0)
+    pair = pair[equal & (np.abs(terms.coefficient[a]) == np.abs(terms.coefficient[b]))]
+    a, b = start[pair], start[pair] + 1
+    row = np.concatenate([single, pair])
+    if not len(row):
+        return found
+    left = np.concatenate([v[start[single]], v[a]])
+    right = np.concatenate([np.full(len(single), n), v[b]])
+    sign = np.concatenate([np.ones(len(single)), np.sign(-terms.coefficient[b] / terms.coefficient[a])])
+    nodes, ends = np.unique(np.concatenate([left, right]), return_inverse=True)
+    left, right = np.sort(ends.reshape(2, -1), axis=0)
+    edge, first = np.unique(left * len(nodes) + right, return_index=True)  # of rows that say the same, the first
+    graph = sp.csr_array((np.ones(len(first)), (left[first], right[first])), shape=(len(nodes),) * 2)
+    n_parts, part = connected_components(graph, directed=False)
+    is_fixed = np.append(classes.is_input, True)[nodes]  # a part may have one of those: it is the root
+    too_many = np.bincount(part, is_fixed, n_parts) > 1
+    merit = np.append(classes.merit, n)[nodes]
+    by = np.lexsort((merit, part))
+    top = by[np.flatnonzero(np.append(np.diff(part[by]) != 0, True))]  # of each part
+    # Beyond all nodes, one that reaches every root: one search finds the trees of all parts.
+    every = len(nodes)
+    i, j = np.append(left[first], top), np.append(right[first], np.full(n_parts, every))
+    _, before = breadth_first_order(sp.csr_array((np.ones(len(i)), (i, j)), shape=(every + 1,) * 2), every, False)
+    before = before[:every]
+    child = np.flatnonzero((before != every) & ~too_many[part])
+    if not len(child):
+        return found
+    lower, upper = np.minimum(child, before[child]), np.maximum(child, before[child])
+    chosen = first[np.searchsorted(edge, lower * len(nodes) + upper)]
+    up, total = np.arange(every), np.ones(every)
+    up[child], total[child] = before[child], sign[chosen]
+    while not np.array_equal(up[up], up):
+        total, up = total * total[up], up[up]
+    names = np.append(np.arange(n), ZERO)[nodes]
+    old, root = names[child], names[up[child]]
+    found[row[chosen]] = old
+    kept = root != ZERO
+    np.minimum.at(classes.decades[:, 0], root[kept], classes.decades[old[kept], 0])
+    np.maximum.at(classes.decades[:, 1], root[kept], classes.decades[old[kept], 1])
+    none = np.zeros(len(child), np.int64)
+    classes.link(old, root, none, total[child], none)
+    return found
+
+
+def _follow(terms: _Terms, n_rows: int, classes: _Classes) -> np.ndarray:
+    """Uses rows a = c·dᵏb/dtᵏ one after the other; returns the variable that each row replaces, or −1."""
+    found = np.full(n_rows, ZERO)
+    links: dict[int, tuple[int, int, float, int]] = {}
+
+    def find(v: int) -> tuple[int, int, float, int]:
+        order, factor, products, path = 0, 1.0, 0, []
+        while v in links:
+            path.append(v)
+            v = links[v][0]
+        for w in reversed(path):
+            _, o, f, p = links[w]
+            order, factor, products = order + o, factor * f, products + p
+            links[w] = v, order, factor, products
+        return v, order, factor, products
+
+    rows: dict[int, list[tuple[int, int, float, float]]] = {}
+    columns = (terms.row, terms.variable, terms.order, terms.coefficient, terms.noise)
+    for row, *term in zip(*(c.tolist() for c in columns), strict=True):
+        rows.setdefault(row, []).append(tuple(term))
+    for row, members in rows.items():
+        merged: dict[tuple[int, int], float] = {}
+        noise: dict[tuple[int, int], float] = {}
+        for v, order, c, error in members:
+            root, more, factor, products = find(v)
+            if root != ZERO:
+                key, c = (root, order + more), factor * c
+                merged[key] = merged.get(key, 0.0) + c
+                noise[key] = noise.get(key, 0.0) + abs(factor) * error + EPS * products * abs(c)
+        left = [(*key, c) for key, c in merged.items() if abs(c) > noise[key]]
+        link = _as_link(left, classes) if 1 <= len(left) <= 2 else None
+        if link is not None:
+            found[row], links[link[0]] = link[0], link[1]
+    if links:
+        old = np.array(list(links))
+        root, order, factor, products = zip(*map(find, links), strict=True)
+        classes.link(old, np.array(root), np.array(order), np.array(factor), np.array(products))
+    return found
+
+
+def _as_link(row: list[tuple[int, int, float]], classes: _Classes) -> tuple[int, tuple[int, int, float, int]] | None:
+    """The variable that a row of one or two terms replaces, and by what; None if it replaces none."""
+    if len(row) == 1:
+        v, order, _ = row[0]
+        return None if order or classes.is_input[v] else (v, (ZERO, 0, 1.0, 0))
+    (a, p, ca), (b, q, cb) = row
+    if a == b:
+        return None
+    if (p == q == 0 and classes.merit[a] > classes.merit[b]) or p > 0:
+        a, p, ca, b, q, cb = b, q, cb, a, p, ca
+    if p > 0 or classes.is_input[a]:
+        return None
+    factor = -cb / ca
+    if not 0 < abs(factor) < np.inf:
+        return None
+    smallest, largest = classes.decades[a] + np.log10(abs(factor))
+    smallest, largest = min(classes.decades[b, 0], smallest), max(classes.decades[b, 1], largest)
+    if max(-smallest, largest) > DECADES:
+        return None
+    classes.decades[b] = smallest, largest
+    return a, (b, q, factor, int(abs(factor) != 1.0))
 
 
 def _substitute(group: EquationGroup, table: AliasTable) -> EquationGroup:
@@ -158,25 +290,22 @@ def _substitute(group: EquationGroup, table: AliasTable) -> EquationGroup:
     return dataclasses.replace(group, variable=variable, order=order, factor=factor)
 
 
-def _linear_groups(rows: list[tuple[Row, Provenance]]) -> list[EquationGroup]:
-    by_length: dict[int, list[tuple[Row, Provenance]]] = {}
-    for row, provenance in rows:
-        by_length.setdefault(len(row), []).append((row, provenance))
+def _linear_groups(terms: _Terms, rows: np.ndarray, provenance: Provenances) -> list[EquationGroup]:
+    """The rows by their length, in the order of the first of each."""
+    count, start = _starts(terms, int(rows[-1]) + 1 if len(rows) else 0)
     groups = []
-    for length, members in by_length.items():
-        shape = (len(members), length)
-        variable = np.array([[v for v, *_ in r] for r, _ in members], np.int64).reshape(shape)
-        order = np.array([[o for _, o, *_ in r] for r, _ in members], np.int64).reshape(shape)
-        coefficient = np.array([[c for _, _, c, _ in r] for r, _ in members], float).reshape(shape)
+    for length in dict.fromkeys(count[rows].tolist()):
+        members = rows[count[rows] == length]
+        at = start[members][:, None] + np.arange(length)
         groups.append(
             EquationGroup(
                 LinearTemplate(length),
-                variable,
-                order,
-                np.ones(shape),
-                np.zeros((shape[0], 0), np.int64),
-                coefficient,
-                [provenance for _, provenance in members],
+                terms.variable[at],
+                terms.order[at],
+                np.ones(at.shape),
+                np.zeros((len(members), 0), np.int64),
+                terms.coefficient[at],
+                provenance.take(members),
             )
         )
     return groups

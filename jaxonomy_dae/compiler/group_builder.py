@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..model.linear_template import LinearTemplate
-from ..model.provenance import Provenance
+from ..model.provenance import Provenance, Provenances
 from ..model.tables import EquationGroup
 from ..model.template import AbstractTemplate
 
@@ -20,7 +20,7 @@ class _Rows:
     order: list[np.ndarray] = dataclasses.field(default_factory=list)
     parameter: list[np.ndarray] = dataclasses.field(default_factory=list)
     coefficient: list[np.ndarray] = dataclasses.field(default_factory=list)
-    provenance: list[Provenance] = dataclasses.field(default_factory=list)
+    provenance: list[Provenances] = dataclasses.field(default_factory=list)
 
 
 class GroupBuilder:
@@ -30,7 +30,7 @@ class GroupBuilder:
         self._rows: dict[str, _Rows] = {}
 
     def add(
-        self, template: AbstractTemplate, variable, order, parameter, coefficient, provenance: Sequence[Provenance]
+        self, template: AbstractTemplate, variable, order, parameter, coefficient, provenance: Provenances
     ):
         """Adds n instances: arrays of shape (n, slots), (n, slots), (n, parameters), (n, coefficients)."""
         rows = self._rows.setdefault(template.key, _Rows(template))
@@ -39,12 +39,12 @@ class GroupBuilder:
         rows.order.append(np.asarray(order, np.int64).reshape(n, -1))
         rows.parameter.append(np.asarray(parameter, np.int64).reshape(n, template.n_parameters))
         rows.coefficient.append(np.asarray(coefficient, np.float64).reshape(n, template.n_coefficients))
-        rows.provenance.extend(provenance)
+        rows.provenance.append(provenance)
 
     def add_linear(self, terms: Sequence[tuple[int, int, float]], provenance: Provenance):
         """Adds Σ coefficient·variable^(order) = 0."""
         variable, order, coefficient = zip(*terms, strict=True)
-        self.add(LinearTemplate(len(terms)), [variable], [order], np.zeros((1, 0)), [coefficient], [provenance])
+        self.add(LinearTemplate(len(terms)), [variable], [order], np.zeros((1, 0)), [coefficient], Provenances.of([provenance]))
 
     def groups(self) -> tuple[EquationGroup, ...]:
         out = []
@@ -58,7 +58,7 @@ class GroupBuilder:
                     np.ones(variable.shape),
                     np.concatenate(rows.parameter),
                     np.concatenate(rows.coefficient),
-                    rows.provenance,
+                    Provenances.joined(rows.provenance),
                 )
             )
         return tuple(out)

@@ -9,7 +9,7 @@ from ..expressions.from_sympy import UnsupportedExpression, read, symbols_of
 from ..expressions.node import Node
 from ..expressions.to_sympy import shortened
 from ..model.linear_template import LinearTemplate
-from ..model.provenance import Provenance
+from ..model.provenance import Provenance, Provenances
 from ..model.symbolic import canonical, linear_coefficients
 from ..model.template import AbstractTemplate
 from ..modeling.symbols import ParameterSymbol, PreviousSymbol, TimeSymbol, VariableSymbol, symbol_label
@@ -37,7 +37,7 @@ def add_components(model: ModelNumbers, builder: GroupBuilder):
             parameter_ids[:, before] = model.previous[parameter_ids[:, before]]
             order = np.tile([v.order for v in variables], (len(members), 1))
             text = f"0 = {shortened(residual)}"
-            provenance = [Provenance(text, model.paths[k]) for k in members]
+            provenance = Provenances.of([Provenance(text, model.paths[k]) for k in members])
             if coefficients is None:
                 template: AbstractTemplate = canonical(graph, variables, parameters)
                 builder.add(template, ids, order, parameter_ids, np.zeros((len(members), 0)), provenance)

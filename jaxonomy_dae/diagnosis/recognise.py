@@ -183,7 +183,7 @@ def _cuts(flat: FlatModel, groups, alias: AliasTable, known: np.ndarray) -> list
     for group in groups:
         if isinstance(group.template, LinearTemplate):
             unit = (np.abs(group.coefficient) == 1).all(axis=1) & (group.order == 0).all(axis=1)
-            connection[first : first + len(group)] = unit & [not p.is_written for p in group.provenance]
+            connection[first : first + len(group)] = unit & ~group.provenance.is_written
         first += len(group)
     inside = entries.take(connection[entries.row])
     rows, row = np.unique(inside.row, return_inverse=True)

@@ -108,7 +108,9 @@ def _with_multiples(
         for v in variables
     }
     multiples = [
-        (p, v) for p, v in alias.eliminated if v in read and alias.root[v] != ZERO and abs(alias.factor[v]) != 1
+        (p, v)
+        for p, v in zip(alias.eliminated, alias.replaced.tolist(), strict=True)
+        if v in read and alias.root[v] != ZERO and abs(alias.factor[v]) != 1
     ]
     place = {p: k for k, p in enumerate(p for group in flat.groups for p in group.provenance)}
     equations = sorted([*equations, *(p for p, _ in multiples)], key=lambda p: place.get(p, len(place)))
@@ -140,7 +142,7 @@ def _unused_inside(flat: FlatModel) -> np.ndarray:
     unused = ~flat.ports.has_inside
     for group in flat.groups:
         if len(group) and group.variable.shape[1]:
-            port = flat.variables.port[group.variable[[p.is_written for p in group.provenance]]]
+            port = flat.variables.port[group.variable[group.provenance.is_written]]
             unused[port[port >= 0]] = False
     return unused
 

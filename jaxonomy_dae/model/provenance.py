@@ -1,7 +1,9 @@
 """Where an equation comes from, as data: passes ask it, messages print it."""
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple, overload
+
+import numpy as np
 
 SOURCES = 4  # equations named
 
@@ -24,6 +26,81 @@ class Provenance(NamedTuple):
 
     def __str__(self):
         return f"{self.component}: {self.statement}" if self.component else self.statement
+
+
+class Provenances(Sequence["Provenance"]):
+    """The provenance of each row of a group. An entry is made when it is asked for: a large model has millions, of
+    which none is read.
+
+    Row i is entry `item[i]` of source `source[i]`; a source is a list, or a function of such numbers.
+    """
+
+    __slots__ = ("_item", "_source", "_sources", "_written")
+
+    def __init__(self, sources: Sequence["Source"], written: Sequence[bool], source: np.ndarray, item: np.ndarray):
+        self._sources = tuple(sources)
+        self._written = tuple(written)
+        self._source = source
+        self._item = item
+
+    @classmethod
+    def of(cls, entries: Sequence["Provenance"]) -> "Provenances":
+        """Those of a list."""
+        entries = list(entries)
+        written = np.array([p.is_written for p in entries], bool)
+        return cls((entries.__getitem__,) * 2, (False, True), written.astype(np.int64), np.arange(len(entries)))
+
+    @classmethod
+    def made(cls, source: "Source", items: np.ndarray, is_written: bool) -> "Provenances":
+        """Those that one function makes of numbers."""
+        return cls((source,), (is_written,), np.zeros(len(items), np.int64), np.asarray(items, np.int64))
+
+    @classmethod
+    def joined(cls, parts: Sequence["Provenances"]) -> "Provenances":
+        """Those of several groups, one after the other."""
+        if len(parts) == 1:
+            return parts[0]
+        places: dict[tuple[int, bool], int] = {}
+        sources: list[Source] = []
+        source = []
+        for part in parts:
+            own = np.empty(len(part._sources), np.int64)
+            for k, (function, written) in enumerate(zip(part._sources, part._written, strict=True)):
+                own[k] = places.setdefault((id(function), written), len(sources))
+                if own[k] == len(sources):
+                    sources.append(function)
+            source.append(own[part._source])
+        item = np.concatenate([part._item for part in parts]) if parts else np.zeros(0, np.int64)
+        written = [w for _, w in places]
+        return cls(sources, written, np.concatenate(source) if parts else item, item)
+
+    def take(self, rows: np.ndarray) -> "Provenances":
+        """Those of some rows."""
+        return Provenances(self._sources, self._written, self._source[rows], self._item[rows])
+
+    @property
+    def is_written(self) -> np.ndarray:
+        """Of each, whether a component or a network wrote the equation."""
+        return np.array(self._written, bool)[self._source]
+
+    def __len__(self):
+        return len(self._item)
+
+    @overload
+    def __getitem__(self, index: int) -> "Provenance": ...
+    @overload
+    def __getitem__(self, index: slice) -> "Provenances": ...
+    def __getitem__(self, index):
+        if isinstance(index, slice):
+            return self.take(np.arange(len(self))[index])
+        return self._sources[self._source[index]](int(self._item[index]))
+
+    def __iter__(self) -> Iterator["Provenance"]:
+        for source, item in zip(self._source.tolist(), self._item.tolist(), strict=True):
+            yield self._sources[source](item)
+
+
+Source = Callable[[int], Provenance]
 
 
 def combination(equations: Sequence[Provenance]) -> Provenance:

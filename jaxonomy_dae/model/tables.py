@@ -12,7 +12,7 @@ import numpy as np
 from ..modeling.interval import Interval
 from .opaque import OpaqueFunction
 from .pickling import functions_by_name, named_functions
-from .provenance import Provenance
+from .provenance import Provenance, Provenances
 from .symbolic import SymbolicTemplate
 from .template import AbstractTemplate
 
@@ -36,6 +36,11 @@ class VariableTable:
     port: np.ndarray  # the port it belongs to, −1 if none
     is_across: np.ndarray
     is_internal: np.ndarray  # made by the compiler, and not to be read by users
+
+    @property
+    def has_start(self) -> np.ndarray:
+        """Whether each has a start."""
+        return np.array([s is not None for s in self.start], bool)
 
     def __len__(self):
         return len(self.names)
@@ -105,7 +110,7 @@ class EquationGroup:
     factor: np.ndarray
     parameter: np.ndarray
     coefficient: np.ndarray
-    provenance: list[Provenance]
+    provenance: Provenances
 
     def __len__(self):
         return self.variable.shape[0]
@@ -119,7 +124,7 @@ class EquationGroup:
             self.factor[rows],
             self.parameter[rows],
             self.coefficient[rows],
-            [self.provenance[r] for r in rows],
+            self.provenance.take(rows),
         )
 
 
@@ -206,7 +211,8 @@ class AliasTable:
     root: np.ndarray
     order: np.ndarray
     factor: np.ndarray
-    eliminated: list[tuple[Provenance, int]]  # the equations the aliases came from, and the variable each one replaced
+    eliminated: Provenances  # of the equations the aliases came from
+    replaced: np.ndarray  # the variable that each of these replaced
 
 
 def equation_offsets(groups: tuple[EquationGroup, ...]) -> np.ndarray:
