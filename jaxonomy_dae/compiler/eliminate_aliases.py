@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.sparse.csgraph import breadth_first_order, connected_components
+from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from ..model.linear_template import LinearTemplate
 from ..model.provenance import Provenances
@@ -188,16 +188,18 @@ def _join(terms: _Terms, n_rows: int, classes: _Classes) -> np.ndarray:
     nodes, ends = np.unique(np.concatenate([left, right]), return_inverse=True)
     left, right = np.sort(ends.reshape(2, -1), axis=0)
     edge, first = np.unique(left * len(nodes) + right, return_index=True)  # of rows that say the same, the first
-    graph = sp.csr_array((np.ones(len(first)), (left[first], right[first])), shape=(len(nodes),) * 2)
-    n_parts, part = connected_components(graph, directed=False)
+    # Of a loop, the equation that was written last is left over: it repeats the others, or contradicts them.
+    graph = sp.csr_array((row[first] + 1.0, (left[first], right[first])), shape=(len(nodes),) * 2)
+    tree = sp.coo_array(minimum_spanning_tree(graph))
+    n_parts, part = connected_components(tree, directed=False)
     is_fixed = np.append(classes.is_input, True)[nodes]  # a part may have one of those: it is the root
     too_many = np.bincount(part, is_fixed, n_parts) > 1
     merit = np.append(classes.merit, n)[nodes]
     by = np.lexsort((merit, part))
     top = by[np.flatnonzero(np.append(np.diff(part[by]) != 0, True))]  # of each part
-    # Beyond all nodes, one that reaches every root: one search finds the trees of all parts.
+    # Beyond all nodes, one that reaches every root: one search visits the trees of all parts.
     every = len(nodes)
-    i, j = np.append(left[first], top), np.append(right[first], np.full(n_parts, every))
+    i, j = np.append(tree.coords[0], top), np.append(tree.coords[1], np.full(n_parts, every))
     _, before = breadth_first_order(sp.csr_array((np.ones(len(i)), (i, j)), shape=(every + 1,) * 2), every, False)
     before = before[:every]
     child = np.flatnonzero((before != every) & ~too_many[part])
