@@ -7,7 +7,7 @@ import numpy as np
 
 from ..errors import ModelError, nearest
 from ..model.opaque import OpaqueFunction, OpaqueTemplate
-from ..model.provenance import Provenance, Provenances
+from ..model.provenance import Provenance, Provenances, Written
 from ..model.tables import RowInjection, VariableTable
 from ..modeling.diagram import AcausalDiagram
 from ..modeling.symbols import TimeSymbol, VariableSymbol
@@ -17,33 +17,37 @@ from .number_model import ModelNumbers
 
 def add_learned_terms(model: ModelNumbers, builder: GroupBuilder, networks: dict[str, Any]):
     """Adds an equation for each output of the networks and functions in components."""
-    for k, component in enumerate(model.components):
-        for term in component.learned_terms:
-            name = f"{model.paths[k]}.{term.name}"
+    for i in model.instances:
+        for term in i.component.learned_terms:
+            name = f"{i.path}.{term.name}"  # one for all components of an array
             times = frozenset(j for j, s in enumerate(term.inputs) if isinstance(s, TimeSymbol))
             opaque = OpaqueFunction(len(networks), name, None, len(term.inputs), times)
             networks[name] = term.network
-            inputs = [(model.variable(k, s.path), s.order) for s in term.inputs if isinstance(s, VariableSymbol)]
+            inputs = [(model.variable(i, s.path), s.order) for s in term.inputs if isinstance(s, VariableSymbol)]
             for j, output in enumerate(term.outputs):
-                _add_opaque(builder, opaque, term.noun, j, (model.variable(k, output.path), 0), inputs)
+                source = Written(f"output {j} of the {term.noun}", [f"{model.paths[k]}.{term.name}" for k in i.number])
+                provenance = Provenances.made(source, np.arange(len(i)), True)
+                _add_opaque(builder, opaque, j, (model.variable(i, output.path), 0), inputs, provenance)
 
 
 def _add_opaque(
     builder: GroupBuilder,
     opaque: OpaqueFunction,
-    noun: str,
     output: int,
-    y: tuple[int, int],
-    inputs: list[tuple[int, int]],
+    y: tuple[np.ndarray, int],
+    inputs: list[tuple[np.ndarray, int]],
+    provenance: Provenances,
 ):
+    """Adds an equation for each of n places where a function stands: variables have shape (n,)."""
     pairs = [y, *inputs]
+    n = len(provenance)
     builder.add(
         OpaqueTemplate(opaque, output),
-        [[v for v, _ in pairs]],
-        [[o for _, o in pairs]],
-        np.zeros((1, 0)),
-        np.zeros((1, 0)),
-        Provenances.of([Provenance(f"output {output} of the {noun}", opaque.name)]),
+        np.stack([v for v, _ in pairs], axis=1),
+        np.tile([o for _, o in pairs], (n, 1)),
+        np.zeros((n, 0)),
+        np.zeros((n, 0)),
+        provenance,
     )
 
 
@@ -63,7 +67,7 @@ def add_corrections(model: ModelNumbers, diagram: AcausalDiagram, variables: Var
     def find(reference, block, what: str) -> int:
         component, name = reference
         if component is not None:
-            if id(component) not in model.index:
+            if id(component) not in model.of:
                 raise ModelError(
                     f"neural block '{block.name}': its {what} '{component.path}.{name}' belongs to a component that "
                     "is not part of the diagram: add it"
@@ -99,7 +103,9 @@ def add_corrections(model: ModelNumbers, diagram: AcausalDiagram, variables: Var
             w = len(names)
             names.append(f"{block.name}[{j}]")
             corrections.setdefault(v, []).append(w)
-            _add_opaque(builder, opaque, "network", j, (w, 0), [(i, 0) for i in inputs])
+            provenance = Provenances.of([Provenance(f"output {j} of the network", block.name)])
+            columns = [(np.array([i]), 0) for i in inputs]
+            _add_opaque(builder, opaque, j, (np.array([w]), 0), columns, provenance)
     if corrections:
         target_index = np.full(len(names) + len(corrections), -1)
         for v, ws in corrections.items():
@@ -125,7 +131,7 @@ def add_corrections(model: ModelNumbers, diagram: AcausalDiagram, variables: Var
             names,
             np.concatenate([variables.is_input, np.zeros(extra, bool)]),
             np.concatenate([variables.is_port, np.zeros(extra, bool)]),
-            [*variables.start, *[None] * extra],
+            variables.start.padded(extra),
             np.concatenate([variables.fixed, np.zeros(extra, bool)]),
             np.concatenate([variables.nominal, np.zeros(extra)]),
             np.concatenate([variables.bounds, np.tile([-np.inf, np.inf], (extra, 1))]),

@@ -1,5 +1,6 @@
 """What components declare of variables and parameters, as tables."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -8,89 +9,134 @@ import sympy
 from ..errors import ModelError
 from ..model.dependent_parameters import complete
 from ..model.symbolic import SymbolicTemplate, canonical
-from ..model.tables import DependentParameters, ParameterTable, Start, VariableTable
-from ..modeling.declarations import full_name
+from ..model.tables import DependentParameters, ParameterTable, StartGroup, Starts, VariableTable
+from ..modeling.declarations import EachValue, Variable
 from ..modeling.events import LIVE
 from ..modeling.interval import Interval
-from .number_model import ModelNumbers
+from .number_model import Instances, ModelNumbers
 from .read_equations import read_expression
 
 
 def variable_table(model: ModelNumbers, driven: set[int]) -> VariableTable:
-    names: list[str] = []
-    start: list[Start | None] = []
-    unit: list[str] = []
-    default: list[float | None] = []
-    is_input, is_port, is_internal, fixed, nominal, bounds, owner, port, is_across = [], [], [], [], [], [], [], [], []
-    n_ports = 0
-    expressions: dict[sympy.Expr, tuple[SymbolicTemplate, list[str]]] = {}
-    for k, component in enumerate(model.components):
-        path = model.paths[k]
-        place: dict[str, tuple[int, bool]] = {}
-        for p in component.ports.values():
-            for table, across in ((p.domain.across, True), (p.domain.through, False)):
-                place |= {f"{p.name}.{name}": (n_ports, across) for name, _ in table}
-            n_ports += 1
-        for variable in component.variables.values():
-            names.append(full_name(path, variable.name))
-            is_input.append(variable.kind == "input" and len(is_input) not in driven)
-            is_port.append(variable.kind == "port")
-            is_internal.append(variable.kind in ("start", "event"))
-            fixed.append(variable.fixed)
-            nominal.append(variable.nominal)
-            bounds.append(variable.bounds)
-            unit.append(variable.unit)
-            default.append(variable.default if is_input[-1] else None)
-            owner.append(k)
-            port.append(place.get(variable.name, (-1, False))[0])
-            is_across.append(place.get(variable.name, (-1, False))[1])
-            if variable.start is None:
-                start.append(None)
-                continue
-            if variable.start not in expressions:
-                symbols = sorted(variable.start.free_symbols, key=lambda s: model.parameter(k, s.path))  # type: ignore
-                graph = read_expression(variable.start, path)
-                expressions[variable.start] = (canonical(graph, (), symbols), [s.path for s in symbols])  # type: ignore
-            template, paths = expressions[variable.start]
-            start.append(Start(template, tuple(model.parameter(k, p) for p in paths)))
+    records: list[tuple[Variable, int, bool]] = []  # declared variables, each with its port and whether it is across
+    record = np.empty(model.n_variables, np.int64)
+    owner = np.empty(model.n_variables, np.int64)
+    port = np.full(model.n_variables, -1, np.int64)
+    places: list[int] = []
+    rows: list[int] = []
+    owners: list[int] = []
+    started: list[tuple[Variable, Instances, int]] = []
+    for i in model.instances:
+        component = i.component
+        in_port = {
+            f"{p.name}.{name}": (j, across)
+            for j, p in enumerate(component.ports.values())
+            for table, across in ((p.domain.across, True), (p.domain.through, False))
+            for name, _ in table
+        }
+        first = len(records)
+        for k, variable in enumerate(component.variables.values()):
+            records.append((variable, *in_port.get(variable.name, (-1, False))))
+            if variable.start is not None:
+                started.append((variable, i, k))
+        n = len(component.variables)
+        if len(i) == 1:
+            start = int(i.variable[0])
+            places.extend(range(start, start + n))
+            rows.extend(range(first, first + n))
+            owners.extend([int(i.number[0])] * n)
+        else:
+            at = i.variable[:, None] + np.arange(n)
+            record[at] = first + np.arange(n)
+            owner[at] = i.number[:, None]
+            port[at] = i.port[:, None]
+    record[places], owner[places] = rows, owners
+
+    def column(of, dtype: Any) -> np.ndarray:
+        return np.array([of(*entry) for entry in records], dtype)[record]
+
+    first_port = np.empty(model.n_components, np.int64)
+    for i in model.instances:
+        first_port[i.number] = i.port
+    own_port = column(lambda v, p, a: p, np.int64)
+    port = np.where(own_port >= 0, first_port[owner] + own_port, -1)
+    is_input = column(lambda v, p, a: v.kind == "input", bool)
+    is_input[list(driven)] = False
+    default = column(lambda v, p, a: v.default, object)
+    default[~is_input] = None
+    bounds = np.array([(v.bounds.low, v.bounds.high) for v, *_ in records], float).reshape(-1, 2)
     return VariableTable(
-        names,
-        np.array(is_input, bool),
-        np.array(is_port, bool),
-        start,
-        np.array(fixed, bool),
-        np.array(nominal, float),
-        np.array([(b.low, b.high) for b in bounds], float).reshape(-1, 2),
-        unit,
-        default,
-        np.array(owner, np.int64),
-        np.array(port, np.int64),
-        np.array(is_across, bool),
-        np.array(is_internal, bool),
+        model.variable_names,
+        is_input,
+        column(lambda v, p, a: v.kind == "port", bool),
+        _starts(model, started),
+        column(lambda v, p, a: v.fixed, bool),
+        column(lambda v, p, a: v.nominal, float),
+        bounds[record],
+        column(lambda v, p, a: v.unit, object).tolist(),
+        default.tolist(),
+        owner,
+        port,
+        column(lambda v, p, a: a, bool),
+        column(lambda v, p, a: v.kind in ("start", "event"), bool),
     )
 
 
+def _starts(model: ModelNumbers, started: Sequence[tuple[Variable, Instances, int]]) -> Starts:
+    """The starts of variables, each declared as the k-th of a component."""
+    read: dict[sympy.Expr, tuple[SymbolicTemplate, list[str]]] = {}
+    groups: dict[tuple[str, tuple[str, ...]], tuple[SymbolicTemplate, list[str], list[tuple[Instances, int]]]] = {}
+    for variable, i, k in started:
+        expression = variable.start
+        if expression not in read:
+            symbols: list[Any] = sorted(expression.free_symbols, key=lambda s: int(model.parameter(i, s.path)[0]))
+            graph = read_expression(expression, model.path(i))
+            read[expression] = canonical(graph, (), symbols), [s.path for s in symbols]
+        template, paths = read[expression]
+        groups.setdefault((template.key, tuple(paths)), (template, paths, []))[2].append((i, k))
+    found = []
+    for template, paths, members in groups.values():
+        ids = np.concatenate([i.variable + k for i, k in members])
+        columns = [np.concatenate(c) for c in zip(*_parameters(model, members, paths), strict=True)]
+        found.append(StartGroup(template, ids, np.stack(columns, axis=1) if columns else np.zeros((len(ids), 0), np.int64)))
+    return Starts(model.n_variables, found)
+
+
+def _parameters(model: ModelNumbers, members: Sequence[tuple[Instances, int]], paths: Sequence[str]):
+    """The ids of parameters for each member, one array for each path."""
+    for i, _ in members:
+        own = i.parameter_positions
+        yield [i.parameter + own[path] if path in own else model.parameter(i, path) for path in paths]
+
+
 def parameter_table(model: ModelNumbers) -> ParameterTable:
-    names, values, units, bounds = [], [], [], []
+    n = model.n_parameters
+    names, units, bounds = [""] * n, [""] * n, [Interval()] * n
+    values = np.zeros(n)
     reads: dict[int, tuple[sympy.Expr, list[int]]] = {}  # of the dependent ones: the expression, what it reads
-    expressions: dict[int, str] = {}
-    for k, component in enumerate(model.components):
-        for parameter in component.parameters.values():
-            value = parameter.value
+    for i in model.instances:
+        for k, parameter in enumerate(i.component.parameters.values()):
+            value, ids = parameter.value, (i.parameter + k).tolist()
+            for p, c in zip(ids, i.number.tolist(), strict=True):
+                names[p], units[p], bounds[p] = f"{model.paths[c]}.{parameter.name}", parameter.unit, parameter.bounds
             if isinstance(value, sympy.Expr):
                 symbols: list[Any] = sorted(value.free_symbols, key=lambda s: s.path)  # type: ignore
-                reads[len(names)] = value, [model.parameter(k, s.path) for s in symbols]
-                value = 0.0
-            names.append(f"{model.paths[k]}.{parameter.name}")
-            values.append(value)
-            units.append(parameter.unit)
-            bounds.append(parameter.bounds)
-    for p, (value, ids) in reads.items():
+                columns = np.stack([model.parameter(i, s.path) for s in symbols], axis=1)
+                reads.update((p, (value, row)) for p, row in zip(ids, columns.tolist(), strict=True))
+            elif isinstance(value, EachValue):
+                values[ids] = value.values[_place_in(value, i)]
+            elif len(ids) == 1:
+                values[ids[0]] = value
+            else:
+                values[ids] = value
+    expressions: dict[int, str] = {}
+    for p, (value, ids) in sorted(reads.items()):
         symbols = sorted(value.free_symbols, key=lambda s: s.path)  # type: ignore
         full = {s: sympy.Symbol(names[i]) for s, i in zip(symbols, ids, strict=True)}
         expressions[p] = str(value.xreplace(full))
+    reads = dict(sorted(reads.items()))
     dependents = _dependent_parameters(reads, expressions, names)
-    array = complete(dependents, np.array(values, np.float64))
+    array = complete(dependents, values)
     for p in reads:
         if float(array[p]) not in bounds[p]:
             must = f"lie in {bounds[p]}" if np.isfinite(array[p]) else "be finite"
@@ -111,6 +157,15 @@ def parameter_table(model: ModelNumbers) -> ParameterTable:
         model.discrete,
         n_relations,
     )
+
+
+def _place_in(value: EachValue, i: Instances) -> np.ndarray:
+    """Which component of the array that was given the values each instance belongs to."""
+    rows, at = np.arange(len(i)), i
+    while at.component is not value.prototype:
+        assert at.parent is not None
+        rows, at = at.up[rows], at.parent
+    return rows % len(value.values)
 
 
 def _dependent_parameters(

@@ -6,21 +6,42 @@ import numpy as np
 
 from ..model.symbolic import canonical
 from ..model.tables import NO_EVENTS, EventTable, Start
-from ..modeling.events import Assign, Terminate
-from .number_model import ModelNumbers
+from ..modeling.events import Assign, Terminate, When
+from .number_model import Instances, ModelNumbers
 from .read_equations import read_expression
 
 
 def event_table(model: ModelNumbers) -> EventTable:
     """The sampled events, then those of conditions, in the order of declaration."""
-    found = [(k, when) for k, component in enumerate(model.components) for when in component.events]
+    found: list[tuple[int, int, Instances, int, When]] = []
+    for i in model.instances:
+        for n, when in enumerate(i.component.events):
+            found.extend((k, n, i, row, when) for row, k in enumerate(i.number.tolist()))
     if not found:
         return NO_EVENTS
-    sampled = [(k, when) for k, when in found if when.clock is not None]
-    ordered = sampled + [pair for pair in found if pair[1].clock is None]
+    found.sort(key=lambda entry: (entry[4].clock is None, entry[0], entry[1]))
     place = {int(p): i for i, p in enumerate(model.discrete)}
+    known: dict[tuple[int, str, bool], np.ndarray] = {}
+
+    def variable(i: Instances, path: str, row: int) -> int:
+        key = (id(i), path, True)
+        if key not in known:
+            known[key] = model.variable(i, path)
+        return int(known[key][row])
+
+    def parameter(i: Instances, path: str, row: int) -> int:
+        key = (id(i), path, False)
+        if key not in known:
+            known[key] = model.parameter(i, path)
+        return int(known[key][row])
+
+    def in_parameters(i: Instances, row: int, expression: Any) -> Start:
+        symbols: list[Any] = sorted(expression.free_symbols, key=lambda s: parameter(i, s.path, row))
+        graph = read_expression(expression, model.paths[i.number[row]])
+        return Start(canonical(graph, (), symbols), tuple(parameter(i, s.path, row) for s in symbols))
+
     rows: list[tuple[int, int, int, int, float]] = []
-    for e, (k, when) in enumerate(ordered):
+    for e, (_, _, i, row, when) in enumerate(found):
         for action, value in zip(when.actions, when.values, strict=True):
             if isinstance(action, Terminate):
                 continue
@@ -29,32 +50,27 @@ def event_table(model: ModelNumbers) -> EventTable:
             rows.append(
                 (
                     e,
-                    -1 if isinstance(action, Assign) else model.variable(k, target),
-                    place[model.parameter(k, target)] if isinstance(action, Assign) else -1,
-                    model.variable(k, value) if is_name else -1,
+                    -1 if isinstance(action, Assign) else variable(i, target, row),
+                    place[parameter(i, target, row)] if isinstance(action, Assign) else -1,
+                    variable(i, value, row) if is_name else -1,
                     0.0 if is_name else float(value),  # type: ignore[arg-type]
                 )
             )
     columns = list(zip(*rows, strict=True)) or [()] * 5
     event, state, discrete, value = (np.array(c, np.int64) for c in columns[:4])
+    whens = [when for *_, when in found]
     return EventTable(
-        tuple(f"{model.paths[k]}: when({when.text})" for k, when in ordered),
-        np.array([-1 if when.guard is None else model.variable(k, when.guard) for k, when in ordered], np.int64),
-        tuple((_in_parameters(model, k, w.clock.period), _in_parameters(model, k, w.clock.offset)) for k, w in ordered
+        tuple(f"{model.paths[k]}: when({when.text})" for k, *_, when in found),
+        np.array([-1 if w.guard is None else variable(i, w.guard, row) for _, _, i, row, w in found], np.int64),
+        tuple((in_parameters(i, row, w.clock.period), in_parameters(i, row, w.clock.offset)) for _, _, i, row, w in found
               if w.clock is not None),
-        tuple(next((a.message for a in w.actions if isinstance(a, Terminate)), None) for _, w in ordered),
-        tuple(when.noted for _, when in ordered),
-        tuple(when.revocable for _, when in ordered),
-        tuple(when.immediate for _, when in ordered),
+        tuple(next((a.message for a in w.actions if isinstance(a, Terminate)), None) for w in whens),
+        tuple(when.noted for when in whens),
+        tuple(when.revocable for when in whens),
+        tuple(when.immediate for when in whens),
         event,
         state,
         discrete,
         value,
         np.array(columns[4], float),
     )  # fmt: skip
-
-
-def _in_parameters(model: ModelNumbers, component: int, expression: Any) -> Start:
-    symbols: list[Any] = sorted(expression.free_symbols, key=lambda s: model.parameter(component, s.path))
-    graph = read_expression(expression, model.paths[component])
-    return Start(canonical(graph, (), symbols), tuple(model.parameter(component, s.path) for s in symbols))

@@ -2,58 +2,62 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from ..errors import ModelError
 from ..model.provenance import Provenance
 from ..modeling.connections import Signal
 from ..modeling.diagram import AcausalDiagram
 from .group_builder import GroupBuilder
-from .number_model import ModelNumbers
+from .number_model import Instances, ModelNumbers
 
 
 def connect_signals(model: ModelNumbers, diagram: AcausalDiagram, builder: GroupBuilder) -> set[int]:
     """Inputs equal what drives them; returns the inputs that are driven, which are unknowns from then on."""
-    owners: list[tuple[int | None, Sequence[Signal]]] = [(None, diagram.signals)]
-    owners.extend((k, c.signals) for k, c in enumerate(model.components) if c.signals)
+    owners: list[tuple[Instances | None, Sequence[Signal]]] = [(None, diagram.signals)]
+    owners.extend((i, i.component.signals) for i in model.instances if i.component.signals)
     if not any(signals for _, signals in owners):
         return set()
-    names, is_input = [], []
-    for path, component in zip(model.paths, model.components, strict=True):
-        names.extend(f"{path}.{v}" for v in component.variables)
-        is_input.extend(v.kind == "input" for v in component.variables.values())
+    names = model.variable_names
+    is_input = np.zeros(model.n_variables, bool)
+    for i in model.instances:
+        for k, v in enumerate(i.component.variables.values()):
+            is_input[i.variable + k] = v.kind == "input"
     driven: dict[int, str] = {}
-    for k, signals in owners:
-        where = "diagram" if k is None else f"component '{model.paths[k]}'"
+    for i, signals in owners:
+        paths = ["diagram"] if i is None else [f"component '{model.paths[k]}'" for k in i.number.tolist()]
         for signal in signals:
-            ids = []
+            columns = []
             for symbol in signal:
-                found = model.resolve(k, symbol.path, "variables")
+                found = model.resolve(i, symbol.path, "variables")
                 if found is None:
                     raise ModelError(
-                        f"{where}: '{symbol.path}' is connected, but it is not a variable there: add the component to "
-                        "the diagram, and connect what it, or its direct children, declare"
+                        f"{paths[0]}: '{symbol.path}' is connected, but it is not a variable there: add the component "
+                        "to the diagram, and connect what it, or its direct children, declare"
                     )
-                ids.append(found)
-            # A component's own input is given from outside; inside it drives like any variable.
-            drives = [not is_input[v] or "." not in s.path for v, s in zip(ids, signal, strict=True)]
-            what = ", ".join(f"'{names[v]}'" for v in ids)
-            if sum(drives) != 1:
-                count = "none of them drives the others" if not any(drives) else "more than one is not an input"
-                raise ModelError(
-                    f"{where}: connect({what}) joins one variable with inputs; {count}. (Two variables are made equal "
-                    "by an equation, Eq(a.x, b.x), in the component that holds both.)"
-                )
-            source = ids[drives.index(True)]
-            for v, drive in zip(ids, drives, strict=True):
-                if drive:
-                    continue
-                if v in driven:
+                columns.append(found)
+            for where, ids in zip(paths, np.stack(columns, axis=1).tolist(), strict=True):
+                # A component's own input is given from outside; inside it drives like any variable.
+                drives = [not is_input[v] or "." not in s.path for v, s in zip(ids, signal, strict=True)]
+                what = ", ".join(f"'{names[v]}'" for v in ids)
+                if sum(drives) != 1:
+                    count = "none of them drives the others" if not any(drives) else "more than one is not an input"
                     raise ModelError(
-                        f"{where}: the input '{names[v]}' is driven by '{driven[v]}' already, so '{names[source]}' "
-                        "cannot drive it too"
+                        f"{where}: connect({what}) joins one variable with inputs; {count}. (Two variables are made "
+                        "equal by an equation, Eq(a.x, b.x), in the component that holds both.)"
                     )
-                driven[v] = names[source]
-                builder.add_linear(
-                    [(v, 0, 1.0), (source, 0, -1.0)],
-                    Provenance(f"connection of {names[source]}, {names[v]}: equal signals"),
-                )
+                source = ids[drives.index(True)]
+                for v, drive in zip(ids, drives, strict=True):
+                    if drive:
+                        continue
+                    if v in driven:
+                        raise ModelError(
+                            f"{where}: the input '{names[v]}' is driven by '{driven[v]}' already, so '{names[source]}' "
+                            "cannot drive it too"
+                        )
+                    driven[v] = names[source]
+                    builder.add_linear(
+                        [(v, 0, 1.0), (source, 0, -1.0)],
+                        Provenance(f"connection of {names[source]}, {names[v]}: equal signals"),
+                    )
     return set(driven)

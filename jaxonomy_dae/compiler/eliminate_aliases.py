@@ -57,7 +57,7 @@ class _Classes:
         """Each variable for itself."""
         n = len(v)
         # The better root: an input, then what is differentiated, fixed, started, no port variable; then the first.
-        better = np.lexsort((-np.arange(n), ~v.is_port, v.has_start, v.fixed, differentiated, v.is_input))
+        better = np.lexsort((-np.arange(n), ~v.is_port, v.start.is_given, v.fixed, differentiated, v.is_input))
         merit = np.empty(n, np.int64)
         merit[better] = np.arange(n)
         zeros = np.zeros(n, np.int64)

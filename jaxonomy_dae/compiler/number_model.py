@@ -1,129 +1,270 @@
 """Numbers components, variables and parameters of a diagram, and finds what a path means to a component."""
 
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 
 from ..errors import ModelError, nearest
+from ..modeling.arrays import ComponentArray
 from ..modeling.component import Component
+from ..modeling.declarations import full_name
 from ..modeling.diagram import AcausalDiagram
-from ..modeling.ports import Port
 
 RELATION = ":relation["  # begins the path of a relation that is an event
+
+
+@dataclasses.dataclass(eq=False)
+class Instances:
+    """All instances of one component object: one, or as many as the arrays have that it is in.
+
+    Instance i of the model is component `number[i]`; the ids of its variables begin at `variable[i]`, …
+    """
+
+    component: Component
+    parent: "Instances | None"
+    up: np.ndarray  # the instance of the parent that each belongs to
+    array: ComponentArray | None  # whose prototype the component is
+    shape: tuple[int, ...]  # of all arrays that it is in, the outermost first
+    path: str  # without indices
+    number: np.ndarray
+    variable: np.ndarray
+    parameter: np.ndarray
+    relation: np.ndarray
+    port: np.ndarray
+    variable_positions: dict[str, int]
+    parameter_positions: dict[str, int]
+
+    def __len__(self):
+        return len(self.number)
+
+
+def _own(c: Component) -> tuple[int, ...]:
+    """How many components, variables, parameters, relations and ports a component is and has."""
+    return 1, len(c.variables), len(c.parameters), c.relations, len(c.ports)
+
+
+def _child(entry: Any) -> tuple[Component, ComponentArray | None]:
+    return (entry.prototype, entry) if isinstance(entry, ComponentArray) else (entry, None)
 
 
 class ModelNumbers:
     """Ids of everything in a diagram, in the order it was added."""
 
     def __init__(self, diagram: AcausalDiagram):
-        self.components: list[Component] = []
-        self.top = diagram.components
-        stack = list(reversed(diagram.components.values()))
-        while stack:
-            component = stack.pop()
-            self.components.append(component)
-            stack.extend(reversed(component.children.values()))
-        if not self.components:
+        if not diagram.components:
             raise ModelError("the diagram has no components: add some with diagram.add(...)")
-        self.index = {id(c): k for k, c in enumerate(self.components)}
-        paths: dict[int, str] = {}
-        for c in self.components:
-            paths[id(c)] = c.name if c.parent is None else f"{paths[id(c.parent)]}.{c.name}"
-        self.paths = [paths[id(c)] for c in self.components]
-        n_variables = [len(c.variables) for c in self.components]
-        n_parameters = [len(c.parameters) for c in self.components]
-        self.first_variable = np.concatenate([[0], np.cumsum(n_variables)]).astype(np.int64)
-        self.first_parameter = np.concatenate([[0], np.cumsum(n_parameters)]).astype(np.int64)
-        # After all parameters follow the relations that are events, then what discrete variables were before an event,
-        # in the order of these.
-        flags = [parameter.is_discrete for c in self.components for parameter in c.parameters.values()]
-        n_relations = [c.relations for c in self.components]
-        self.first_relation = len(flags) + np.concatenate([[0], np.cumsum(n_relations)]).astype(np.int64)
-        self.relations = np.arange(len(flags), int(self.first_relation[-1]))
-        self.discrete = np.concatenate([np.flatnonzero(np.array(flags, bool)), self.relations])
-        self.previous = np.full(int(self.first_relation[-1]), -1, np.int64)
-        self.previous[self.discrete] = len(self.previous) + np.arange(len(self.discrete))
+        self.top = diagram.components
+        self.instances: list[Instances] = []
         # One position table for each distinct list of names.
         self._positions: dict[tuple[str, ...], dict[str, int]] = {}
-        self.variable_positions = [self._position(tuple(c.variables)) for c in self.components]
-        self.parameter_positions = [self._position(tuple(c.parameters)) for c in self.components]
+        self._number(self._counted())
+        self.of: dict[int, Instances] = {id(i.component): i for i in self.instances}
+        self.paths: list[str] = self._paths()
+        # After all parameters follow the relations that are events, then what discrete variables were before an event,
+        # in the order of these.
+        flagged = [np.zeros(0, np.int64)]
+        for i in self.instances:
+            places = [k for k, p in enumerate(i.component.parameters.values()) if p.is_discrete]
+            if places:
+                flagged.append((i.parameter[:, None] + np.array(places)).ravel())
+        self.relations = self.n_parameters + np.arange(self.n_relations)
+        self.discrete = np.concatenate([np.sort(np.concatenate(flagged)), self.relations])
+        self.previous = np.full(self.n_parameters + self.n_relations, -1, np.int64)
+        self.previous[self.discrete] = len(self.previous) + np.arange(len(self.discrete))
+
+    def _counted(self) -> dict[int, np.ndarray]:
+        """Of each component object, by id: how many of everything one instance of it is and has inside."""
+        order: list[Component] = []
+        waiting = [_child(c)[0] for c in self.top.values()]
+        while waiting:
+            component = waiting.pop()
+            order.append(component)
+            waiting.extend(_child(c)[0] for c in component.children.values())
+        counts: dict[int, np.ndarray] = {}
+        for component in reversed(order):
+            counts[id(component)] = np.array(_own(component)) + sum(self._sizes(component.children, counts))
+        return counts
+
+    @staticmethod
+    def _sizes(children: dict[str, Any], counts: dict[int, np.ndarray]) -> list[np.ndarray]:
+        """Of each child or array: how many of everything it is and has inside."""
+        found = [_child(entry) for entry in children.values()]
+        return [counts[id(child)] * (array.size if array else 1) for child, array in found]
+
+    def _number(self, counts: dict[int, np.ndarray]):
+        """Lists all instances, a component before its children, the instances of an array one after the other."""
+        stack: list[tuple[Any, Instances | None, np.ndarray]] = []
+
+        def push(children: dict[str, Any], parent: Instances | None, first: np.ndarray):
+            """`first` has the ids from which those of the children go on, shape (instances of the parent, 5)."""
+            if children:
+                sizes = np.cumsum(self._sizes(children, counts), axis=0)
+                starts = [first, *(first + size for size in sizes[:-1])]
+                stack.extend(reversed([(c, parent, f) for c, f in zip(children.values(), starts, strict=True)]))
+
+        total = sum(self._sizes(self.top, counts))
+        self.n_components, self.n_variables, self.n_parameters, self.n_relations, self.n_ports = map(int, total)
+        push(self.top, None, np.array([[0, 0, 0, self.n_parameters, 0]]))
+        while stack:
+            entry, parent, first = stack.pop()
+            component, array = _child(entry)
+            up = np.arange(len(first))
+            shape = parent.shape if parent else ()
+            if array:
+                stride = counts[id(component)]
+                first = (first[:, None] + np.arange(array.size)[:, None] * stride).reshape(-1, len(stride))
+                up = np.repeat(up, array.size)
+                shape = (*shape, *array.shape)
+            found = Instances(
+                component,
+                parent,
+                up,
+                array,
+                shape,
+                component.name if parent is None else f"{parent.path}.{component.name}",
+                *first.T,
+                self._position(tuple(component.variables)),
+                self._position(tuple(component.parameters)),
+            )
+            self.instances.append(found)
+            push(component.children, found, first + np.array(_own(component)))
+
+    def _paths(self) -> list[str]:
+        paths = [""] * self.n_components
+        for i in self.instances:
+            above = [""] if i.parent is None else [f"{paths[k]}." for k in i.parent.number.tolist()]
+            name = i.component.name
+            labels = [""] if i.array is None else [i.array.label(k) for k in range(i.array.size)]
+            own = [f"{p}{name}{label}" for p in above for label in labels]
+            for k, path in zip(i.number.tolist(), own, strict=True):
+                paths[k] = path
+        return paths
+
+    @functools.cached_property
+    def variable_names(self) -> list[str]:
+        """The full names of all variables, by id."""
+        names = [""] * self.n_variables
+        for i in self.instances:
+            for k, name in enumerate(i.component.variables):
+                for v, c in zip((i.variable + k).tolist(), i.number.tolist(), strict=True):
+                    names[v] = full_name(self.paths[c], name)
+        return names
 
     def _position(self, names: tuple[str, ...]) -> dict[str, int]:
         return self._positions.setdefault(names, {n: k for k, n in enumerate(names)})
 
-    def resolve(self, k: int | None, path: str, table: str) -> int | None:
-        """The id behind a path as component k sees it, or the diagram if k is None."""
-        positions = self.variable_positions if table == "variables" else self.parameter_positions
-        first = self.first_variable if table == "variables" else self.first_parameter
-        component = None if k is None else self.components[k]
+    def resolve(self, i: Instances | None, path: str, table: str) -> np.ndarray | None:
+        """The ids behind a path as each instance of i sees it, or the diagram if i is None."""
+        n = 1 if i is None else len(i)
+        at, rows = i, np.arange(n)
+        below, rows_below = at, rows
         while path.startswith("../"):
-            if component is None:
+            if at is None:
                 return None
-            path, component = path[3:], component.parent
-        if component is not None and path in positions[self.index[id(component)]]:
-            j = self.index[id(component)]
-            return int(first[j]) + positions[j][path]
-        while "." in path:
-            head, path = path.split(".", 1)
-            children = self.top if component is None else component.children
-            if head not in children:
+            below, rows_below = at, rows
+            path, rows, at = path[3:], at.up[rows], at.parent
+        if ":" in path and below is not None and below.array is not None:  # what an array was given for its instances
+            array, _, argument = path.partition(":")
+            name = below.array.arguments.get(argument) if array == below.array.name else None
+            return None if name is None else below.parameter[rows_below] + below.parameter_positions[name]
+        while True:
+            if at is not None:
+                own = at.variable_positions if table == "variables" else at.parameter_positions
+                if path in own:
+                    return (at.variable if table == "variables" else at.parameter)[rows] + own[path]
+            head, dot, path = path.partition(".")
+            children = self.top if at is None else at.component.children
+            name, bracket, index = head.partition("[")
+            entry = children.get(head) if not bracket else children.get(name)
+            if not dot or entry is None:
                 return None
-            component = children[head]
-            j = self.index[id(component)]
-            if path in positions[j]:
-                return int(first[j]) + positions[j][path]
-        return None
+            child, array = _child(entry)
+            if (array is None) == bool(bracket):
+                return None
+            if array is not None:
+                try:
+                    place = np.ravel_multi_index([int(k) for k in index.rstrip("]").split(",")], array.shape)
+                except ValueError:
+                    return None
+                rows = rows * array.size + place
+            at = self.of[id(child)]
 
-    def variable(self, k: int, path: str) -> int:
-        found = self.resolve(k, path, "variables")
+    def variable(self, i: Instances, path: str) -> np.ndarray:
+        """The ids of a variable, shape (instances,)."""
+        found = self.resolve(i, path, "variables")
         if found is None:
-            component = self.components[k]
-            inside = [
-                *component.variables,
-                *(f"{c.name}.{v}" for c in component.children.values() for v in c.variables),
-            ]
+            inside = [*i.component.variables]
+            for c in i.component.children.values():
+                child, array = _child(c)
+                inside += [f"{child.name}{array.label(0) if array else ''}.{v}" for v in child.variables]
             raise ModelError(
-                f"component '{self.paths[k]}': the symbol '{path}' in its equations is not a variable of it or of a "
+                f"component '{self.path(i)}': the symbol '{path}' in its equations is not a variable of it or of a "
                 "child component: " + nearest(path, inside)
             )
         return found
 
-    def relation(self, k: int, number: int) -> int:
-        """The place among the parameters of a relation that is an event of component k."""
-        return int(self.first_relation[k]) + number
-
-    def parameter(self, k: int, path: str) -> int:
+    def parameter(self, i: Instances, path: str) -> np.ndarray:
+        """The ids of a parameter, or of a relation that is an event, shape (instances,)."""
         if path.startswith(RELATION):
-            return self.relation(k, int(path[len(RELATION) : -1]))
-        found = self.resolve(k, path, "parameters")
+            return i.relation + int(path[len(RELATION) : -1])
+        found = self.resolve(i, path, "parameters")
         if found is None:
-            component = self.components[k]
+            component = i.component
+            if path.startswith("../") and ":" in path:
+                array, _, argument = path.rpartition("/")[2].partition(":")
+                raise ModelError(
+                    f"array '{array}': '{argument}' has a value for each component, and "
+                    f"{type(self._prototype(i, array)).__name__} uses it elsewhere than as the value of a parameter: "
+                    f"declare it there, self.parameter('{argument}', {argument}), and use the symbol that this returns"
+                )
             if path.startswith("../"):
                 parent = "the diagram" if component.parent is None else f"'{component.parent.path}'"
                 raise ModelError(
-                    f"component '{self.paths[k]}' was given an expression in the parameter '{path[3:]}', which is not "
+                    f"component '{self.path(i)}' was given an expression in the parameter '{path[3:]}', which is not "
                     f"known in {parent}, where the component was added: add it where that parameter is declared"
                 )
             raise ModelError(
-                f"component '{self.paths[k]}': the symbol '{path}' in its equations is not a parameter of it or of a "
+                f"component '{self.path(i)}': the symbol '{path}' in its equations is not a parameter of it or of a "
                 "child component: " + nearest(path, component.parameters)
             )
         return found
 
-    def port_variable(self, port: Port, name: str) -> int:
-        k = self.index.get(id(port.component))
-        if k is None:
-            raise ModelError(f"{port!r} is connected, but its component is not part of the diagram: add it")
-        return int(self.first_variable[k]) + self.variable_positions[k][f"{port.name}.{name}"]
+    @staticmethod
+    def _prototype(i: Instances, array: str) -> Component:
+        while i.parent is not None and (i.array is None or i.array.name != array):
+            i = i.parent
+        return i.component
+
+    def path(self, i: Instances) -> str:
+        """The full name of the first instance."""
+        return self.paths[i.number[0]]
 
 
-def ids_of(model: ModelNumbers, members: list[int], paths: list[str], kind: str) -> np.ndarray:
-    """Ids of `paths` in each member component, shape (members, paths)."""
-    out = np.empty((len(members), len(paths)), np.int64)
-    for j, path in enumerate(paths):
-        positions = (model.variable_positions if kind == "variable" else model.parameter_positions)[members[0]]
-        if path in positions:
-            first = model.first_variable if kind == "variable" else model.first_parameter
-            out[:, j] = first[members] + positions[path]
-        else:
-            resolve = model.variable if kind == "variable" else model.parameter
-            out[:, j] = [resolve(k, path) for k in members]
-    return out
+class Members:
+    """All instances of several component objects of one shape, in the model's order."""
+
+    def __init__(self, model: ModelNumbers, parts: Sequence[Instances]):
+        self.model, self.parts = model, parts
+        number = np.concatenate([i.number for i in parts])
+        self.order = np.argsort(number, kind="stable")
+        self.number = number[self.order]
+        self._first = {
+            "variable": np.concatenate([i.variable for i in parts])[self.order],
+            "parameter": np.concatenate([i.parameter for i in parts])[self.order],
+        }
+
+    def ids(self, paths: Sequence[str], kind: str) -> np.ndarray:
+        """Ids of `paths` in each, shape (instances, paths)."""
+        out = np.empty((len(self.number), len(paths)), np.int64)
+        one = self.parts[0]
+        positions = one.variable_positions if kind == "variable" else one.parameter_positions
+        resolve = self.model.variable if kind == "variable" else self.model.parameter
+        for j, path in enumerate(paths):
+            if path in positions:
+                out[:, j] = self._first[kind] + positions[path]
+            else:
+                out[:, j] = np.concatenate([resolve(i, path) for i in self.parts])[self.order]
+        return out

@@ -141,12 +141,10 @@ def _merit(flat: FlatModel, variables: QuantityMap, extended: Extended, preferre
     quantities = extended.quantities
     fixed = np.zeros(quantities.n, int)
     started = np.zeros(quantities.n, int)
-    for v, start in enumerate(flat.variables.start):
-        q, _ = variables[v]
-        if start is not None and q >= 0:
-            started[q] = 1
-            fixed[q] |= int(flat.variables.fixed[v])
-    return [(preferred.get(q, 0), int(fixed[q]), int(started[q])) for q in range(quantities.n)]
+    chosen = flat.variables.start.is_given & (variables.quantity >= 0)
+    started[variables.quantity[chosen]] = 1
+    fixed[variables.quantity[chosen & flat.variables.fixed]] = 1
+    return [(preferred.get(q, 0), f, s) for q, (f, s) in enumerate(zip(fixed.tolist(), started.tolist(), strict=True))]
 
 
 def initial_point(flat: FlatModel, variables: QuantityMap, extended: Extended):

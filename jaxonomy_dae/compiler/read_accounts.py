@@ -6,7 +6,7 @@ import sympy
 from ..expressions.node import Node
 from ..model.symbolic import canonical
 from ..model.tables import AccountGroup
-from .number_model import ModelNumbers, ids_of
+from .number_model import Instances, Members, ModelNumbers
 from .read_equations import read_expression, slots_of
 
 
@@ -18,25 +18,26 @@ def read_accounts(model: ModelNumbers) -> tuple[AccountGroup, ...]:
     - `ModelError` for a symbol that no component declared.
     """
     read_once: dict[sympy.Expr, Node] = {}
-    members: dict[tuple, list[int]] = {}
-    for k, component in enumerate(model.components):
-        for account in component.accounts:
-            shape = (account.kind, account.expression, tuple(component.variables), tuple(component.parameters))
-            members.setdefault(shape, []).append(k)
+    owners: dict[tuple, list[Instances]] = {}
+    for i in model.instances:
+        for account in i.component.accounts:
+            shape = (account.kind, account.expression, tuple(i.component.variables), tuple(i.component.parameters))
+            owners.setdefault(shape, []).append(i)
     groups = []
-    for (kind, expression, *_), owners in members.items():
+    for (kind, expression, *_), parts in owners.items():
         if expression not in read_once:
-            read_once[expression] = read_expression(expression, model.paths[owners[0]])
+            read_once[expression] = read_expression(expression, model.path(parts[0]))
         graph = read_once[expression]
-        variables, parameters = slots_of(model, owners[0], expression, graph)
+        variables, parameters = slots_of(model, parts[0], expression, graph)
+        members = Members(model, parts)
         groups.append(
             AccountGroup(
                 kind,
                 canonical(graph, variables, parameters),
-                ids_of(model, owners, [v.path for v in variables], "variable"),
-                np.tile(np.array([v.order for v in variables], np.int64), (len(owners), 1)),
-                ids_of(model, owners, [p.path for p in parameters], "parameter"),
-                np.array(owners, np.int64),
+                members.ids([v.path for v in variables], "variable"),
+                np.tile(np.array([v.order for v in variables], np.int64), (len(members.number), 1)),
+                members.ids([p.path for p in parameters], "parameter"),
+                members.number,
             )
         )
     return tuple(groups)

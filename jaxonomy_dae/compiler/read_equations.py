@@ -9,55 +9,57 @@ from ..expressions.from_sympy import UnsupportedExpression, read, symbols_of
 from ..expressions.node import Node
 from ..expressions.to_sympy import shortened
 from ..model.linear_template import LinearTemplate
-from ..model.provenance import Provenance, Provenances
+from ..model.provenance import Provenances, Written
 from ..model.symbolic import canonical, linear_coefficients
 from ..model.template import AbstractTemplate
 from ..modeling.symbols import ParameterSymbol, PreviousSymbol, TimeSymbol, VariableSymbol, symbol_label
 from .group_builder import GroupBuilder
-from .number_model import ModelNumbers, ids_of
+from .number_model import Instances, Members, ModelNumbers
 
 
 def add_components(model: ModelNumbers, builder: GroupBuilder):
     read_once: dict[int, Any] = {}  # of an expression, by its id: equal components hold the same objects
-    by_shape: dict[tuple, list[int]] = {}
-    for k, c in enumerate(model.components):
+    by_shape: dict[tuple, list[Instances]] = {}
+    for i in model.instances:
+        c = i.component
         if c.equations:
             for residual in c.equations:
                 if id(residual) not in read_once:
-                    read_once[id(residual)] = read_expression(residual, model.paths[k])
+                    read_once[id(residual)] = read_expression(residual, model.path(i))
             graphs = tuple(read_once[id(r)] for r in c.equations)
-            by_shape.setdefault((graphs, tuple(c.variables), tuple(c.parameters)), []).append(k)
-    for (graphs, _, _), members in by_shape.items():
-        for graph, residual in zip(graphs, model.components[members[0]].equations, strict=True):
-            variables, parameters = slots_of(model, members[0], residual, graph)
+            by_shape.setdefault((graphs, tuple(c.variables), tuple(c.parameters)), []).append(i)
+    for (graphs, _, _), parts in by_shape.items():
+        members = Members(model, parts)
+        number = members.number
+        for graph, residual in zip(graphs, parts[0].component.equations, strict=True):
+            variables, parameters = slots_of(model, parts[0], residual, graph)
             coefficients = linear_coefficients(graph, variables)
-            ids = ids_of(model, members, [v.path for v in variables], "variable")
-            parameter_ids = ids_of(model, members, [p.path for p in parameters], "parameter")
+            ids = members.ids([v.path for v in variables], "variable")
+            parameter_ids = members.ids([p.path for p in parameters], "parameter")
             before = [isinstance(p, PreviousSymbol) for p in parameters]
             parameter_ids[:, before] = model.previous[parameter_ids[:, before]]
-            order = np.tile([v.order for v in variables], (len(members), 1))
-            text = f"0 = {shortened(residual)}"
-            provenance = Provenances.of([Provenance(text, model.paths[k]) for k in members])
+            order = np.tile([v.order for v in variables], (len(number), 1))
+            provenance = Provenances.made(Written(f"0 = {shortened(residual)}", model.paths), number, True)
             if coefficients is None:
                 template: AbstractTemplate = canonical(graph, variables, parameters)
-                builder.add(template, ids, order, parameter_ids, np.zeros((len(members), 0)), provenance)
+                builder.add(template, ids, order, parameter_ids, np.zeros((len(number), 0)), provenance)
             else:
                 template = LinearTemplate(len(variables))
-                rows = np.tile(coefficients, (len(members), 1))
-                builder.add(template, ids, order, np.zeros((len(members), 0)), rows, provenance)
+                rows = np.tile(coefficients, (len(number), 1))
+                builder.add(template, ids, order, np.zeros((len(number), 0)), rows, provenance)
 
 
 def slots_of(
-    model: ModelNumbers, k: int, expression: Any, graph: Node
+    model: ModelNumbers, i: Instances, expression: Any, graph: Node
 ) -> tuple[list[VariableSymbol], list[ParameterSymbol]]:
-    """The variables and parameters in an expression of component k. Slots follow the order of declaration, never names,
+    """The variables and parameters in an expression of a component. Slots follow the order of declaration, never names,
     so names change nothing but names.
 
     **Raises:**
 
     - `ModelError` for a symbol that no component declared.
     """
-    component = model.components[k]
+    component = i.component
     position = {name: place for place, name in enumerate((*component.variables, *component.parameters))}
 
     def rank(s):
@@ -66,13 +68,13 @@ def slots_of(
         if s.path in position:
             return (0, position[s.path], nth)
         resolve = model.variable if isinstance(s, VariableSymbol) else model.parameter
-        return (1, resolve(k, s.path), nth)
+        return (1, int(resolve(i, s.path)[0]), nth)
 
     symbols = [s for s in symbols_of(expression) if symbol_label(s) in graph.leaves]
     for s in symbols:
         if not isinstance(s, VariableSymbol | ParameterSymbol | TimeSymbol):
             raise ModelError(
-                f"component '{model.paths[k]}': the symbol '{s}' was declared by no component; "
+                f"component '{model.path(i)}': the symbol '{s}' was declared by no component; "
                 "declare it with self.variable(...) or self.parameter(...) and use the symbol they return"
             )
     variables = sorted((s for s in symbols if isinstance(s, VariableSymbol)), key=rank)

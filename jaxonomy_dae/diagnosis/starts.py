@@ -8,7 +8,6 @@ numbers) is an error here; what must agree is noted in the report.
 import numpy as np
 
 from ..errors import StructuralError
-from ..model.evaluate_numpy import start_values
 from ..model.extended import Extended
 from ..model.linear_template import LinearTemplate
 from ..model.quantities import QuantityMap
@@ -33,14 +32,14 @@ def check_equal_starts(flat: FlatModel, groups: tuple[EquationGroup, ...], alias
     """
     table = flat.variables
     fixed = np.flatnonzero(table.fixed).tolist()
-    value_of = start_values(table.start, flat.parameters.values)
+    values = table.start.values(flat.parameters.values)
     notes: list[str] = []
     first: dict[tuple[int, int], int] = {}
     numbers: dict[tuple[int, int], tuple[int, float]] = {}
     for v in fixed:
         name, start = table.names[v], table.start[v]
         assert start is not None
-        number = None if start.parameters else value_of(v)
+        number = None if start.parameters else float(values[v])
         key, factor = (int(alias.root[v]), int(alias.order[v])), float(alias.factor[v])
         if key[0] == ZERO:
             if number:

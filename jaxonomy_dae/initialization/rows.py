@@ -20,7 +20,7 @@ import scipy.sparse as sp
 from ..errors import InitializationError
 from ..lowering.plan import SystemPlan
 from ..model.dependent_parameters import complete
-from ..model.evaluate_numpy import Networks, generic_jacobian, slot_values, start_values
+from ..model.evaluate_numpy import Networks, generic_jacobian, slot_values
 from ..model.natural_sizes import natural_sizes
 from ..model.quantities import ABSENT, declared_scale
 from ..model.scaling import equilibrated, geometric_scales
@@ -138,18 +138,16 @@ def _declared(plan: SystemPlan, names: tuple[str, ...]) -> tuple[list[Row], list
         for k, (name, q, s) in enumerate(zip(names, *plan.resolve(names), strict=True))
     ]
     overridden = {r.quantity for r in overrides}
-    number = start_values(variables.start, np.zeros(0))
+    is_zero = variables.start.is_number & (variables.start.values(plan.flat.parameters.values) == 0.0)
     started: dict[int, Row] = {}
     fixed: list[Row] = []
-    for v, start in enumerate(variables.start):
-        if start is None:
-            continue
+    for v in np.flatnonzero(variables.start.is_given).tolist():
         quantity, factor = plan.quantity_of(v)
         if quantity == ABSENT:
             continue
-        if quantity == ZERO and not (variables.fixed[v] and (start.parameters or number(v) != 0.0)):
+        if quantity == ZERO and not (variables.fixed[v] and not is_zero[v]):
             continue  # zero as it should be; any other fixed start must turn out to be zero
-        row = Row(variables.names[v], quantity, factor, start)
+        row = Row(variables.names[v], quantity, factor, variables.start[v])
         if variables.fixed[v] and quantity not in overridden:
             fixed.append(row)
         started.setdefault(quantity, row)
@@ -162,11 +160,12 @@ def _generic(plan: SystemPlan, solve_for: tuple[int, ...]) -> _Generic:
     extended = plan.extended
     n = extended.quantities.n_unknown
     size = declared_scale(plan.flat, plan.variable_map, extended)
-    number = start_values(plan.flat.variables.start, np.zeros(0))
-    for v, start in enumerate(plan.flat.variables.start):
+    starts = plan.flat.variables.start
+    values = starts.values(plan.flat.parameters.values)
+    for v in np.flatnonzero(starts.is_number).tolist():
         quantity, factor = plan.quantity_of(v)
-        if start is not None and quantity >= 0 and not start.parameters and size[quantity] == 0.0:
-            size[quantity] = number(v) / factor
+        if quantity >= 0 and size[quantity] == 0.0:
+            size[quantity] = values[v] / factor
     size[size == 0.0] = 1.0
     n_parameters = len(plan.flat.parameters)
     parameter_size = np.ones(n_parameters)

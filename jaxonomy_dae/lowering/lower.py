@@ -218,8 +218,9 @@ def _digest(
             hasher.update(b"|")
 
     v = flat.variables
-    starts = [None if s is None else (s.template.key, s.parameters) for s in v.start]
-    feed(flat.name, mode, v.names, v.is_input, v.fixed, v.nominal, v.bounds, v.default, starts, flat.parameters.names)
+    feed(flat.name, mode, v.names, v.is_input, v.fixed, v.nominal, v.bounds, v.default, flat.parameters.names)
+    for s in v.start.groups:
+        feed(s.template.key, s.variable, s.parameter)
     for d in flat.parameters.dependents:
         feed(d.template.key, d.target, d.parameter)
     for g in flat.groups:

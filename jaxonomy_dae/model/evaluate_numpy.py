@@ -4,7 +4,7 @@ Only the choice of states needs numbers before the model runs. They are computed
 model will run in, from the same templates the lowered system uses.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -111,14 +111,3 @@ def generic_jacobian(extended: Extended, size: np.ndarray, parameter_size: np.nd
 def generic(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
     """Numbers near 1 without pattern."""
     return rng.uniform(0.5, 1.5, shape)
-
-
-def start_values(starts, parameters: np.ndarray) -> Callable[[int], float]:
-    """The value of a variable's start expression, as a function of the variable's id."""
-
-    def value(variable: int) -> float:
-        start = starts[variable]
-        chosen = list(parameters[list(start.parameters)])
-        return float(start.template.residual([], chosen, [], 0.0, None, backend="numpy"))
-
-    return value

@@ -28,7 +28,7 @@ class Provenance(NamedTuple):
         return f"{self.component}: {self.statement}" if self.component else self.statement
 
 
-class Provenances(Sequence["Provenance"]):
+class Provenances(Sequence[Provenance]):
     """The provenance of each row of a group. An entry is made when it is asked for: a large model has millions, of
     which none is read.
 
@@ -44,7 +44,7 @@ class Provenances(Sequence["Provenance"]):
         self._item = item
 
     @classmethod
-    def of(cls, entries: Sequence["Provenance"]) -> "Provenances":
+    def of(cls, entries: Sequence[Provenance]) -> "Provenances":
         """Those of a list."""
         entries = list(entries)
         written = np.array([p.is_written for p in entries], bool)
@@ -101,6 +101,16 @@ class Provenances(Sequence["Provenance"]):
 
 
 Source = Callable[[int], Provenance]
+
+
+class Written:
+    """Source of provenances: one equation of many components, chosen by number."""
+
+    def __init__(self, statement: str, components: Sequence[str]):
+        self.statement, self.components = statement, components
+
+    def __call__(self, component: int) -> Provenance:
+        return Provenance(self.statement, self.components[component])
 
 
 def combination(equations: Sequence[Provenance]) -> Provenance:

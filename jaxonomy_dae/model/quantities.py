@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, Int
 
-from .evaluate_numpy import start_values
 from .extended import Extended, Quantities
 from .tables import ZERO, AliasTable, FlatModel
 
@@ -76,14 +75,9 @@ def quantity_bounds(flat: FlatModel, variables: QuantityMap, extended: Extended)
 
 def start_guess(flat: FlatModel, variables: QuantityMap, n: int) -> tuple[np.ndarray, dict[int, float]]:
     """The declared starts of all n quantities (zero where there is none), and those that are fixed."""
-    value_of = start_values(flat.variables.start, flat.parameters.values)
     guess = np.zeros(n)
-    fixed: dict[int, float] = {}
-    for v, start in enumerate(flat.variables.start):
-        q, factor = variables[v]
-        if start is None or q < 0:
-            continue
-        guess[q] = value_of(v) / factor
-        if flat.variables.fixed[v]:
-            fixed[q] = guess[q]
-    return guess, fixed
+    chosen = np.flatnonzero(flat.variables.start.is_given & (variables.quantity >= 0))
+    q, fixed = variables.quantity[chosen], flat.variables.fixed[chosen]
+    value = flat.variables.start.values(flat.parameters.values)[chosen] / variables.factor[chosen]
+    guess[q] = value
+    return guess, dict(zip(q[fixed].tolist(), value[fixed].tolist(), strict=True))

@@ -5,7 +5,8 @@ of integers. After alias elimination a slot also has a factor, and variable −1
 """
 
 import dataclasses
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, overload
 
 import numpy as np
 
@@ -20,13 +21,78 @@ ZERO = -1
 
 
 @dataclasses.dataclass(frozen=True)
+class Start:
+    """A start value: an expression in parameters, as a template without slots, and the parameters it reads."""
+
+    template: SymbolicTemplate
+    parameters: tuple[int, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class StartGroup:
+    """The starts of several variables that one template computes, each from its own parameters."""
+
+    template: SymbolicTemplate
+    variable: np.ndarray  # (n,)
+    parameter: np.ndarray  # (n, parameters of the template)
+
+
+class Starts(Sequence[Start | None]):
+    """The start of every variable, None where there is none."""
+
+    def __init__(self, n: int, groups: Sequence[StartGroup]):
+        self.groups = tuple(groups)
+        self._place = np.full((n, 2), -1, np.int64)
+        for k, group in enumerate(self.groups):
+            self._place[group.variable] = np.stack([np.full(len(group.variable), k), np.arange(len(group.variable))], 1)
+
+    @property
+    def is_given(self) -> np.ndarray:
+        """Whether each has a start."""
+        return self._place[:, 0] >= 0
+
+    @property
+    def is_number(self) -> np.ndarray:
+        """Whether each has a start that no parameter changes."""
+        number = [group.parameter.shape[1] == 0 for group in self.groups]
+        return np.array([*number, False], bool)[self._place[:, 0]]
+
+    def values(self, parameters: np.ndarray) -> np.ndarray:
+        """The starts of all variables, zero where there is none."""
+        out = np.zeros(len(self))
+        for group in self.groups:
+            columns = list(parameters[group.parameter].T)
+            out[group.variable] = group.template.residual([], columns, [], 0.0, None, backend="numpy")
+        return out
+
+    def padded(self, extra: int) -> "Starts":
+        """The same with more variables, which have none."""
+        return Starts(len(self) + extra, self.groups)
+
+    def __len__(self):
+        return len(self._place)
+
+    @overload
+    def __getitem__(self, index: int) -> "Start | None": ...
+    @overload
+    def __getitem__(self, index: slice) -> "list[Start | None]": ...
+    def __getitem__(self, index):
+        if isinstance(index, slice):
+            return [self[k] for k in range(len(self))[index]]
+        group, place = self._place[index].tolist()
+        if group < 0:
+            return None
+        return Start(self.groups[group].template, tuple(self.groups[group].parameter[place].tolist()))
+
+
+@dataclasses.dataclass(frozen=True)
 class VariableTable:
     """What the user declared of each variable, by id."""
 
     names: list[str]
     is_input: np.ndarray
     is_port: np.ndarray
-    start: list["Start | None"]
+    start: Starts
     fixed: np.ndarray
     nominal: np.ndarray  # typical sizes, 0 where none is declared
     bounds: np.ndarray  # (n, 2)
@@ -36,11 +102,6 @@ class VariableTable:
     port: np.ndarray  # the port it belongs to, −1 if none
     is_across: np.ndarray
     is_internal: np.ndarray  # made by the compiler, and not to be read by users
-
-    @property
-    def has_start(self) -> np.ndarray:
-        """Whether each has a start."""
-        return np.array([s is not None for s in self.start], bool)
 
     def __len__(self):
         return len(self.names)
@@ -59,14 +120,6 @@ class PortTable:
     def count(self, component: int) -> int:
         """How many ports a component has."""
         return int((self.owner == component).sum())
-
-
-@dataclasses.dataclass(frozen=True)
-class Start:
-    """A start value: an expression in parameters, as a template without slots, and the parameters it reads."""
-
-    template: SymbolicTemplate
-    parameters: tuple[int, ...]
 
 
 @dataclasses.dataclass(frozen=True)

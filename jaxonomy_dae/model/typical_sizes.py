@@ -3,7 +3,6 @@
 import numpy as np
 from jaxtyping import Float
 
-from .evaluate_numpy import start_values
 from .extended import Extended
 from .natural_sizes import natural_sizes
 from .quantities import QuantityMap, declared_scale
@@ -19,11 +18,11 @@ def typical_sizes(flat: FlatModel, variables: QuantityMap, extended: Extended) -
     if extended.quantities.n_unknown > LIMIT:
         return np.ones(extended.quantities.n)
     size = declared_scale(flat, variables, extended)
-    value_of = start_values(flat.variables.start, flat.parameters.values)
-    for v, start in enumerate(flat.variables.start):
+    values = flat.variables.start.values(flat.parameters.values)
+    for v in np.flatnonzero(flat.variables.start.is_given).tolist():
         quantity, factor = variables[v]
-        if start is not None and quantity >= 0 and size[quantity] == 0.0:
-            value = value_of(v) / factor
+        if quantity >= 0 and size[quantity] == 0.0:
+            value = values[v] / factor
             size[quantity] = value if np.isfinite(value) else 0.0
     size[size == 0.0] = 1.0
     found, _ = natural_sizes(extended.groups, extended.n_equations, size, flat.parameters.values)

@@ -8,6 +8,7 @@ import numpy as np
 import sympy
 
 from ..errors import ModelError, nearest
+from .arrays import ComponentArray, make_array
 from .connections import Connection, Signal, resolve_ends
 from .construction import Construction
 from .declarations import START, Account, Learned, Parameter, Variable, full_name
@@ -55,7 +56,7 @@ class Component(EventDeclarations, metaclass=Construction):
         self.parameters: dict[str, Parameter] = {}
         self.variables: dict[str, Variable] = {}
         self.ports: dict[str, Port] = {}
-        self.children: dict[str, Component] = {}
+        self.children: dict[str, Any] = {}  # components and arrays of them
         self.equations: list[sympy.Expr] = []
         self.learned_terms: list[Learned] = []
         self.connections: list[Connection] = []
@@ -72,20 +73,20 @@ class Component(EventDeclarations, metaclass=Construction):
         """The component's full name: `parent.child`."""
         return self.name if self.parent is None else f"{self.parent.path}.{self.name}"
 
-    def _outside_path(self) -> str:
+    def outside_path(self) -> str:
         """The path of this component as seen from the nearest ancestor that is still being written."""
         if not self._sealed:
             return ""
-        above = "" if self.parent is None else self.parent._outside_path()
+        above = "" if self.parent is None else self.parent.outside_path()
         return f"{above}{self.name}."
 
     def symbol(self, name: str) -> sympy.Symbol:
         """The symbol of a declared variable or parameter, as the component now being written sees it."""
         if name in self.variables:
-            return VariableSymbol(self._outside_path() + name)
+            return VariableSymbol(self.outside_path() + name)
         if name in self.parameters:
             kind = DiscreteSymbol if self.parameters[name].is_discrete else ParameterSymbol
-            return kind(self._outside_path() + name)
+            return kind(self.outside_path() + name)
         raise ModelError(
             f"component '{self.path}' has no variable or parameter '{name}': "
             + nearest(name, [*self.variables, *self.parameters])
@@ -497,15 +498,39 @@ class Component(EventDeclarations, metaclass=Construction):
         self.children[child.name] = child
         return child
 
+    def add_array(
+        self, name: str, kind: "type[Component]", shape: int | tuple[int, ...], *args: Any, **kwargs: Any
+    ) -> ComponentArray:
+        """Adds an array of equal components; returns it. Its names are `"self.name[17].variable"`.
+
+        **Arguments:**
+
+        - `name`: of the array.
+        - `kind`: the class of its components.
+        - `shape`: how many, or a tuple for an array of several dimensions.
+        - `args`, `kwargs`: for `kind(ev, name, *args, **kwargs)`. NumPy arrays of the array's shape hold a value for each
+            component; all else is the same for all.
+
+        A learned term or function of `kind` is one for all components of the array, `system.neural["self.name.term"]`.
+
+        **Raises:**
+
+        - `ModelError` for a shape that is not positive, arrays of another shape, and values that the component refuses.
+        """
+        self._claim(name, "child component")
+        array = make_array(self.ev, name, kind, shape, args, kwargs)
+        array.prototype.parent = self
+        self.children[name] = array
+        return array
+
     def connect(self, *ends: Any) -> "Component":
         """Connects ports of this component and of its children, `connect(a.p, b.n, …)` or `connect(a, "p", b, "n")`; or
         signals: `connect(a.y, b.u)` lets the variable `y` of a child (or of this component) drive the input `u` of
         another child, which is then an ordinary unknown."""
-        ports, signal = resolve_ends(ends, f"component '{self.name}'")
-        if ports:
-            self.connections.append(ports)
-        else:
-            self.signals.append(signal)
+        connection, signals = resolve_ends(ends, f"component '{self.name}'")
+        if connection:
+            self.connections.append(connection)
+        self.signals.extend(signals)
         return self
 
     def __repr__(self):

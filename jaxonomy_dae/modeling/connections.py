@@ -1,63 +1,111 @@
 """What `connect` is given: ports of one domain, or one variable and the inputs it drives."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from ..errors import ModelError, nearest
+from .arrays import ComponentArray, PortArray
 from .construction import Construction
 from .ports import Port
 from .symbols import VariableSymbol
 
-Connection = tuple[Port, ...]
 Signal = tuple[VariableSymbol, ...]
 
 
-def resolve_ends(ends: Sequence[Any], where: str) -> tuple[Connection, Signal]:
+@dataclasses.dataclass(frozen=True)
+class Connection:
+    """Ports that meet at one node; or arrays of one shape of which the first meet, the second, and so on."""
+
+    ends: tuple[Port | PortArray, ...]
+    by_element: bool = False
+
+
+def resolve_ends(ends: Sequence[Any], where: str) -> tuple[Connection | None, list[Signal]]:
     """Reads the arguments of a `connect` call: ports, or symbols of variables, one of the two returned empty; a pair
     (component, name) stands for either."""
     found: list[Any] = []
     rest = list(ends)
     while rest:
         end = rest.pop(0)
-        if isinstance(type(end), Construction):
+        if isinstance(type(end), Construction) or isinstance(end, ComponentArray):
             if not rest or not isinstance(rest[0], str):
                 raise ModelError(f"{where}: connect(component, \"port\", …) needs a port name after '{end.path}'")
             name = rest.pop(0)
-            if name not in end.ports and name not in end.variables:
-                what, known = ("port", end.ports) if end.ports else ("variable", end.variables)
+            inner = end.inner if isinstance(end, ComponentArray) else end
+            if name not in inner.ports and name not in inner.variables:
+                what, known = ("port", inner.ports) if inner.ports else ("variable", inner.variables)
                 raise ModelError(f"component '{end.path}' has no {what} '{name}': " + nearest(name, known))
-            end = end.ports[name] if name in end.ports else end[name]
-        if not isinstance(end, Port | VariableSymbol) or (isinstance(end, VariableSymbol) and end.order):
+            end = end[name] if name not in inner.ports else getattr(end, name)
+        if not _is_port(end) and not _is_signal(end):
             raise ModelError(
                 f"{where}: connect takes ports, symbols of variables, or a component and a name; got {end!r}"
             )
         found.append(end)
-    kinds = {isinstance(end, Port) for end in found}
+    kinds = {_is_port(end) for end in found}
     if len(kinds) > 1:
         raise ModelError(f"{where}: connect joins ports, or a variable and inputs; got both: {_listed(found)}")
     if len(found) < 2:
         what = "ports" if kinds != {False} else "ends"
         got = f"{_listed(found)} only" if found else "none"
         raise ModelError(f"{where}: connect needs at least two {what}; got {got}")
+    shapes = [_shape(end) for end in found]
+    arrays = {shape for shape in shapes if shape}
+    by_element = () not in shapes
+    if by_element and len(arrays) > 1 or not by_element and sum(map(bool, shapes)) > 1:
+        what = "arrays of one shape join element by element, an array and one port at one node"
+        raise ModelError(f"{where}: {what}; got {_listed(found)} of shapes {', '.join(map(str, shapes))}")
     if kinds == {False}:
-        return (), tuple(found)
-    _check_ports(found, where)
-    return tuple(found), ()
+        if by_element:
+            return None, list(zip(*(end.ravel() for end in found), strict=True))
+        return None, [tuple(s for end in found for s in (end.ravel() if isinstance(end, np.ndarray) else [end]))]
+    _check_ports(found, by_element, where)
+    return Connection(tuple(found), by_element), []
 
 
-def _check_ports(ports: Sequence[Port], where: str) -> None:
-    seen: set[int] = set()
-    for port in ports:
-        if port.domain != ports[0].domain:
+def _is_port(end: Any) -> bool:
+    return isinstance(end, Port | PortArray)
+
+
+def _is_signal(end: Any) -> bool:
+    symbols = end.ravel() if isinstance(end, np.ndarray) else [end]
+    return all(isinstance(s, VariableSymbol) and not s.order for s in symbols) and len(symbols) > 0
+
+
+def _shape(end: Any) -> tuple[int, ...]:
+    return end.chosen.numbers.shape if isinstance(end, PortArray) else getattr(end, "shape", ())
+
+
+def _check_ports(ends: Sequence[Port | PortArray], by_element: bool, where: str) -> None:
+    seen: dict[int, list[np.ndarray]] = {}
+    first = ends[0].port if isinstance(ends[0], PortArray) else ends[0]
+    for end in ends:
+        port = end.port if isinstance(end, PortArray) else end
+        if port.domain != first.domain:
             raise ModelError(
-                f"{where}: cannot connect {port!r} to {ports[0]!r}: a connection joins ports of one domain"
+                f"{where}: cannot connect {end!r} to {ends[0]!r}: a connection joins ports of one domain"
             )
-        if id(port) in seen:
+        numbers = end.chosen.numbers if isinstance(end, PortArray) else np.zeros((), np.int64)
+        others = seen.setdefault(id(port), [])
+        twice = any((numbers == other).any() for other in others)
+        if not by_element:
+            twice |= len(np.unique(numbers)) < numbers.size
+        if twice:
             raise ModelError(
                 f"{where}: '{port.component.path}.{port.name}' is connected to itself: name each port once"
             )
-        seen.add(id(port))
+        others.append(numbers)
 
 
 def _listed(ends: Sequence[Any]) -> str:
-    return ", ".join(f"'{e.component.path}.{e.name}'" if isinstance(e, Port) else f"'{e}'" for e in ends)
+    return ", ".join(_named(end) for end in ends)
+
+
+def _named(end: Any) -> str:
+    if isinstance(end, Port):
+        return f"'{end.component.path}.{end.name}'"
+    if isinstance(end, PortArray):
+        return f"'{end!r}'".partition(": ")[0] + "'"
+    return f"'{end}'"

@@ -1,15 +1,27 @@
 """What a component declares: parameters, variables, learned terms."""
 
 import dataclasses
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
+import numpy as np
 import sympy
 
 from .interval import Interval
 from .symbols import TimeSymbol, VariableSymbol
 
+if TYPE_CHECKING:
+    from .component import Component
+
 START = ":start"  # ends the name of what is declared by the start of a derivative
 Value: TypeAlias = float | int | sympy.Expr  # a number, or an expression in parameters
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class EachValue:
+    """What the instances of an array have, in their order."""
+
+    values: np.ndarray
+    prototype: "Component"  # of the array
 
 
 @dataclasses.dataclass(frozen=True)
@@ -18,10 +30,14 @@ class Parameter:
     starts at."""
 
     name: str
-    value: float | sympy.Expr
+    value: float | sympy.Expr | EachValue
     unit: str
     bounds: Interval
     is_discrete: bool = False
+
+    def with_value(self, value: float | sympy.Expr | EachValue) -> "Parameter":
+        """The same declaration with another value."""
+        return dataclasses.replace(self, value=value)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -3,9 +3,13 @@
 from typing import Any
 
 from ..errors import ModelError
+from .arrays import ComponentArray, make_array
 from .component import Component
 from .connections import Connection, Signal, resolve_ends
+from .environment import EqnEnv
+from .names import check_name
 from .neural import NeuralDAEBlock
+from .ports import Port
 
 
 class AcausalDiagram:
@@ -25,7 +29,7 @@ class AcausalDiagram:
         if name is not None and not isinstance(name, str):
             raise ModelError(f"the name of a diagram is a text; got {_described(name)}")
         self.name = name
-        self.components: dict[str, Component] = {}
+        self.components: dict[str, Component | ComponentArray] = {}
         self.connections: list[Connection] = []
         self.signals: list[Signal] = []
         self.blocks: dict[str, NeuralDAEBlock] = {}
@@ -61,6 +65,26 @@ class AcausalDiagram:
             self.components[component.name] = component
         return self
 
+    def add_array(
+        self, ev: EqnEnv, name: str, kind: type[Component], shape: int | tuple[int, ...], *args: Any, **kwargs: Any
+    ) -> ComponentArray:
+        """Adds an array of equal components, as `Component.add_array` does, and returns it.
+
+        **Raises:**
+
+        - `ModelError` as that method, and if the name is used already.
+        """
+        check_name(name, "component")
+        if name in self.components or name in self.blocks:
+            raise ModelError(f"the diagram has '{name}' already: give the array another name")
+        if any(c.ev is not ev for c in self.components.values()):
+            raise ModelError(
+                f"array '{name}' was given another EqnEnv than the components of the diagram: make all with the same one"
+            )
+        array = make_array(ev, name, kind, shape, args, kwargs)
+        self.components[name] = array
+        return array
+
     def connect(self, *ends: Any) -> "AcausalDiagram":
         """Connects ports: `connect(a.p, b.n, …)`, or `connect(a, "p", b, "n")`. Connects signals: `connect(a.y, b.u)`
         lets the variable `y` of `a` drive the input `u` of `b`, which is then an ordinary unknown.
@@ -72,13 +96,13 @@ class AcausalDiagram:
         for end in ends:
             if isinstance(end, Component):
                 self.add(_top(end))
-        ports, signal = resolve_ends(ends, "diagram")
-        if signal:
-            self.signals.append(signal)
-            return self
-        for port in ports:
-            self.add(_top(port.component))
-        self.connections.append(ports)
+        connection, signals = resolve_ends(ends, "diagram")
+        self.signals.extend(signals)
+        if connection:
+            for end in connection.ends:
+                if isinstance(end, Port):
+                    self.add(_top(end.component))
+            self.connections.append(connection)
         return self
 
     def add_neural_correction_block(self, block: NeuralDAEBlock) -> "AcausalDiagram":

@@ -1,0 +1,247 @@
+"""Arrays of components: one component object stands for all instances, and what differs between them is data."""
+
+import inspect
+import math
+import operator
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+import sympy
+
+from ..errors import ModelError
+from .declarations import EachValue
+from .ports import Port
+from .symbols import ParameterSymbol, VariableSymbol
+
+if TYPE_CHECKING:
+    from .component import Component
+    from .environment import EqnEnv
+
+
+class ComponentArray:
+    """Equal components under one name, made by `add_array`.
+
+    It is indexed like a NumPy array: `cells[0]` is a component, `cells[:-1]`, `cells[1, :]` and `cells[[0, 2]]` are parts
+    of the array. Attributes are those of all components chosen: `cells[1:].p` is an array of ports, for `connect`,
+    `cells.v` one of symbols.
+    """
+
+    def __init__(
+        self,
+        prototype: "Component",
+        shape: tuple[int, ...],
+        arguments: dict[str, str | None] | None = None,
+        numbers: np.ndarray | None = None,
+        inner: "Component | None" = None,
+        above: str | None = None,
+    ):
+        self.prototype = prototype
+        self.shape = shape  # of the whole array
+        self.arguments = arguments or {}  # with one value an instance: the parameter of the prototype that has them
+        self.numbers = np.arange(math.prod(shape)).reshape(shape) if numbers is None else numbers  # of those chosen
+        self.inner = inner or prototype  # the prototype, or a component inside it
+        self.above = above  # the path of the one instance that contains the array, if it was reached through that
+
+    @property
+    def name(self) -> str:
+        """The array's name in the component or diagram that has it."""
+        return self.prototype.name
+
+    @property
+    def path(self) -> str:
+        """The array's full name."""
+        return self.prototype.path
+
+    @property
+    def ev(self) -> "EqnEnv":
+        """The environment of its components."""
+        return self.prototype.ev
+
+    @property
+    def parent(self) -> "Component | None":
+        """The component that has it."""
+        return self.prototype.parent
+
+    @property
+    def size(self) -> int:
+        """How many instances the whole array has."""
+        return math.prod(self.shape)
+
+    def label(self, number: int) -> str:
+        """The index of an instance as names have it: `[17]`, `[2,3]`."""
+        return "[" + ",".join(map(str, np.unravel_index(number, self.shape))) + "]"
+
+    def instance(self, number: int) -> str:
+        """The path of what was chosen of an instance, as the component now being written sees it, with a final dot."""
+        above, inside, at = self.above, "", self.inner
+        while at is not self.prototype:
+            inside, at = f"{at.name}.{inside}", at.parent
+        if above is None:
+            above = "" if self.parent is None else self.parent.outside_path()
+        return f"{above}{self.name}{self.label(number)}.{inside}"
+
+    def _chosen(self, numbers: np.ndarray, inner: "Component") -> "ComponentArray":
+        return ComponentArray(self.prototype, self.shape, self.arguments, numbers, inner, self.above)
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, str):
+            if index in self.inner.ports or index in self.inner.children:
+                return getattr(self, index)
+            return self.symbols(self.inner.symbol(index), index)
+        try:
+            return self._chosen(np.asarray(self.numbers[index]), self.inner)
+        except (IndexError, TypeError, ValueError) as error:
+            raise ModelError(f"array '{self.path}' has shape {self.numbers.shape}: {error}") from None
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        inner = self.inner
+        if name in inner.ports:
+            return PortArray(inner.ports[name], self)
+        if name in inner.children:
+            child = inner.children[name]
+            if not isinstance(child, ComponentArray):
+                return self._chosen(self.numbers, child)
+            if self.numbers.ndim:
+                raise ModelError(f"'{self.path}.{name}' is an array in an array: choose one component of '{self.path}'")
+            above = self.instance(int(self.numbers))
+            return ComponentArray(child.prototype, child.shape, child.arguments, above=above)
+        if name in inner.variables or name in inner.parameters:
+            return self.symbols(inner.symbol(name), name)
+        raise AttributeError(f"{type(inner).__name__} has no attribute '{name}'")
+
+    def symbols(self, symbol: Any, name: str) -> Any:
+        """The symbol that a declared name has in each component: an array of symbols, or that of one component."""
+        found = np.empty(self.numbers.shape, object)
+        for place, number in np.ndenumerate(self.numbers):
+            path = self.instance(int(number)) + name
+            found[place] = (
+                VariableSymbol(path, symbol.order) if isinstance(symbol, VariableSymbol) else type(symbol)(path)
+            )
+        return found if found.ndim else found[()]
+
+    def __len__(self) -> int:
+        if not self.numbers.ndim:
+            raise TypeError(f"'{self.path}{self.label(int(self.numbers))}' is one component")
+        return len(self.numbers)
+
+    def __iter__(self) -> Iterator[Any]:
+        return (self[k] for k in range(len(self)))
+
+    def __repr__(self):
+        kind = type(self.inner).__name__
+        if not self.numbers.ndim:
+            return f"{kind}({self.instance(int(self.numbers))[:-1]!r})"
+        part = " of them" if self.numbers.size < self.size else ""
+        return f"{kind}({self.inner.path!r}, {' × '.join(map(str, self.numbers.shape))}{part})"
+
+
+class PortArray:
+    """A port of all components chosen of an array; its variables are attributes, arrays of symbols."""
+
+    def __init__(self, port: Port, chosen: ComponentArray):
+        self.port = port
+        self.chosen = chosen
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        symbol = getattr(self.port, name)  # which raises for what the domain lacks
+        return self.chosen.symbols(symbol, f"{self.port.name}.{name}")
+
+    def __repr__(self):
+        numbers = self.chosen.numbers
+        which = self.chosen.label(int(numbers)) if not numbers.ndim else f", {' × '.join(map(str, numbers.shape))}"
+        return f"{self.chosen.path}{which}.{self.port.name}: {self.port.domain.name} port"
+
+
+def make_array(ev: "EqnEnv", name: str, kind: type, shape: Any, args: tuple, kwargs: dict[str, Any]) -> ComponentArray:
+    """An array of components `kind(ev, name, *args, **kwargs)`; arrays among the arguments hold one value for each.
+
+    **Raises:**
+
+    - `ModelError` for a shape that is not positive, arrays of another shape, and values that are not finite numbers or
+        are out of the bounds of the parameter that they are given for.
+    """
+    where = f"array '{name}'"
+    sizes = _sizes(shape, where)
+    if not isinstance(kind, type):
+        raise ModelError(f"{where}: the class of its components is needed, as in add_array(…, Resistor, 10); got {kind!r}")
+    values: dict[str, np.ndarray] = {}
+    names = list(inspect.signature(kind.__init__).parameters)[3:]  # after self, ev, name
+    given = [_each(v, names[k] if k < len(names) else str(k), sizes, name, values) for k, v in enumerate(args)]
+    marked = {k: _each(v, k, sizes, name, values) for k, v in kwargs.items()}
+    prototype = kind(ev, name, *given, **marked)
+    return ComponentArray(prototype, sizes, _give_values(prototype, values, sizes))
+
+
+def _sizes(shape: Any, where: str) -> tuple[int, ...]:
+    try:
+        found = tuple(operator.index(n) for n in (shape if isinstance(shape, tuple | list) else (shape,)))
+    except TypeError:
+        raise ModelError(f"{where}: its shape is a positive integer or a tuple of them; got {shape!r}") from None
+    if not found or min(found) < 1:
+        raise ModelError(f"{where}: its shape is a positive integer or a tuple of them; got {shape!r}")
+    return found
+
+
+def _each(value: Any, name: str, shape: tuple[int, ...], array: str, values: dict[str, np.ndarray]) -> Any:
+    """An argument as the prototype gets it: a symbol in place of an array, which goes to `values`."""
+    where = f"array '{array}'"
+    if isinstance(value, jax.core.Tracer):
+        raise ModelError(
+            f"{where}: {name} must be concrete when the model is written. To vary or differentiate it, compile once and "
+            "use system.with_parameters"
+        )
+    if not isinstance(value, np.ndarray | jax.Array) or not value.ndim or value.dtype == object:
+        return value
+    if value.shape != shape:
+        raise ModelError(
+            f"{where} has shape {shape}, but the values of {name} have shape {value.shape}: give one for each component; "
+            "what is the same for all is a number, a tuple or a list"
+        )
+    if np.issubdtype(value.dtype, np.complexfloating):
+        raise ModelError(f"{where}: the values of {name} must be real numbers; got complex ones")
+    numbers = np.asarray(value, np.float64).ravel()
+    if not np.isfinite(numbers).all():
+        wrong = int(np.flatnonzero(~np.isfinite(numbers))[0])
+        raise ModelError(f"{where}: the values of {name} must be finite; got {numbers[wrong]} at position {wrong}")
+    values[name] = numbers
+    return ParameterSymbol(f"{array}:{name}")
+
+
+def _give_values(
+    prototype: "Component", values: dict[str, np.ndarray], shape: tuple[int, ...]
+) -> dict[str, str | None]:
+    """Gives parameters of the prototype, and of what is inside it, the values of the instances; returns the parameter
+    of the prototype that has those of each argument."""
+    if not values:
+        return {}
+    arguments: dict[str, str | None] = dict.fromkeys(values)
+    whole = ComponentArray(prototype, shape)
+    waiting = [(prototype, 1)]
+    while waiting:
+        component, depth = waiting.pop()
+        symbols = {ParameterSymbol(f"{'../' * depth}{prototype.name}:{name}"): v for name, v in values.items()}
+        for parameter in list(component.parameters.values()):
+            if not isinstance(parameter.value, sympy.Expr) or not parameter.value.free_symbols <= set(symbols):
+                continue
+            used = sorted(parameter.value.free_symbols, key=str)
+            numbers = sympy.lambdify(used, parameter.value, "numpy")(*(symbols[s] for s in used))  # type: ignore[index]
+            numbers = np.broadcast_to(np.asarray(numbers, np.float64), (math.prod(shape),))
+            for k, number in enumerate(numbers.tolist()):
+                if number not in parameter.bounds:
+                    inside = f"{component.path.removeprefix(prototype.path)}.{parameter.name}"
+                    raise ModelError(
+                        f"parameter '{prototype.name}{whole.label(k)}{inside}' must lie in {parameter.bounds}; "
+                        f"got {number:g}"
+                    )
+            component.parameters[parameter.name] = parameter.with_value(EachValue(numbers, prototype))
+            if component is prototype and len(used) == 1 and parameter.value is used[0]:
+                arguments[str(used[0]).rpartition(":")[2]] = parameter.name
+        for child in component.children.values():
+            waiting.append((child.prototype if isinstance(child, ComponentArray) else child, depth + 1))
+    return arguments
