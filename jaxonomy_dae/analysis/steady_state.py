@@ -73,7 +73,7 @@ def equilibrium_from(
     begin = find_initial(system, t, inputs, initial)
     if throw:
         begin = check(system, begin, t, inputs, initial)
-    inputs, t = read_inputs(system.inputs, dtype, inputs), jnp.asarray(t, dtype)
+    inputs, t = read_inputs(system.inputs, dtype, system.plan.one_by_one(inputs, "inputs")), jnp.asarray(t, dtype)
     given = (system, t, begin.x, inputs)
     if not is_traced(given):
         found = compiled_search(*given, drifting)

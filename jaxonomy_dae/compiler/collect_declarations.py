@@ -98,7 +98,9 @@ def _starts(model: ModelNumbers, started: Sequence[tuple[Variable, Instances, in
     for template, paths, members in groups.values():
         ids = np.concatenate([i.variable + k for i, k in members])
         columns = [np.concatenate(c) for c in zip(*_parameters(model, members, paths), strict=True)]
-        found.append(StartGroup(template, ids, np.stack(columns, axis=1) if columns else np.zeros((len(ids), 0), np.int64)))
+        found.append(
+            StartGroup(template, ids, np.stack(columns, axis=1) if columns else np.zeros((len(ids), 0), np.int64))
+        )
     return Starts(model.n_variables, found)
 
 

@@ -62,8 +62,8 @@ def event_table(model: ModelNumbers) -> EventTable:
     return EventTable(
         tuple(f"{model.paths[k]}: when({when.text})" for k, *_, when in found),
         np.array([-1 if w.guard is None else variable(i, w.guard, row) for _, _, i, row, w in found], np.int64),
-        tuple((in_parameters(i, row, w.clock.period), in_parameters(i, row, w.clock.offset)) for _, _, i, row, w in found
-              if w.clock is not None),
+        tuple((in_parameters(i, row, w.clock.period), in_parameters(i, row, w.clock.offset))
+              for _, _, i, row, w in found if w.clock is not None),
         tuple(next((a.message for a in w.actions if isinstance(a, Terminate)), None) for w in whens),
         tuple(when.noted for when in whens),
         tuple(when.revocable for when in whens),

@@ -97,7 +97,7 @@ def _list_ports(model: ModelNumbers) -> _Ports:
                 position[id(port)] = j
             shape = tuple((p.name, p.domain) for p in i.component.ports.values())
             shapes.setdefault((shape, id(i.variable_positions)), []).append(i)
-    for (shape, _) in shapes:
+    for shape, _ in shapes:
         for _, d in shape:
             numbers.setdefault(d, len(numbers))
     names = [""] * model.n_ports

@@ -15,7 +15,7 @@ from .collect_events import event_table
 from .connect_ports import connect_ports
 from .connect_signals import connect_signals
 from .group_builder import GroupBuilder
-from .number_model import ModelNumbers
+from .number_model import ModelNumbers, array_names
 from .read_accounts import read_accounts
 from .read_equations import add_components
 
@@ -41,4 +41,6 @@ def flatten(diagram: AcausalDiagram) -> FlatModel:
     variables, groups, rows = add_corrections(model, diagram, variables, groups, networks)
     events, accounts = event_table(model), read_accounts(model)
     name = diagram.name or ""
-    return FlatModel(variables, parameters, groups, networks, rows, model.paths, ports, name, events, accounts)
+    return FlatModel(
+        variables, parameters, groups, networks, rows, model.paths, ports, name, events, accounts, array_names(model)
+    )

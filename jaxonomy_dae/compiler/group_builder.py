@@ -29,9 +29,7 @@ class GroupBuilder:
     def __init__(self):
         self._rows: dict[str, _Rows] = {}
 
-    def add(
-        self, template: AbstractTemplate, variable, order, parameter, coefficient, provenance: Provenances
-    ):
+    def add(self, template: AbstractTemplate, variable, order, parameter, coefficient, provenance: Provenances):
         """Adds n instances: arrays of shape (n, slots), (n, slots), (n, parameters), (n, coefficients)."""
         rows = self._rows.setdefault(template.key, _Rows(template))
         n = len(provenance)
@@ -44,7 +42,14 @@ class GroupBuilder:
     def add_linear(self, terms: Sequence[tuple[int, int, float]], provenance: Provenance):
         """Adds Σ coefficient·variable^(order) = 0."""
         variable, order, coefficient = zip(*terms, strict=True)
-        self.add(LinearTemplate(len(terms)), [variable], [order], np.zeros((1, 0)), [coefficient], Provenances.of([provenance]))
+        self.add(
+            LinearTemplate(len(terms)),
+            [variable],
+            [order],
+            np.zeros((1, 0)),
+            [coefficient],
+            Provenances.of([provenance]),
+        )
 
     def groups(self) -> tuple[EquationGroup, ...]:
         out = []

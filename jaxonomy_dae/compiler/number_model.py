@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import ModelError, nearest
+from ..model.array_names import ArrayEntry, ArrayNames
 from ..modeling.arrays import ComponentArray
 from ..modeling.component import Component
 from ..modeling.declarations import full_name
@@ -85,7 +86,8 @@ class ModelNumbers:
             waiting.extend(_child(c)[0] for c in component.children.values())
         counts: dict[int, np.ndarray] = {}
         for component in reversed(order):
-            counts[id(component)] = np.array(_own(component)) + sum(self._sizes(component.children, counts))
+            inside = self._sizes(component.children, counts)
+            counts[id(component)] = np.sum([np.array(_own(component)), *inside], axis=0)
         return counts
 
     @staticmethod
@@ -105,8 +107,10 @@ class ModelNumbers:
                 starts = [first, *(first + size for size in sizes[:-1])]
                 stack.extend(reversed([(c, parent, f) for c, f in zip(children.values(), starts, strict=True)]))
 
-        total = sum(self._sizes(self.top, counts))
-        self.n_components, self.n_variables, self.n_parameters, self.n_relations, self.n_ports = map(int, total)
+        total = np.sum(self._sizes(self.top, counts), axis=0)
+        self.n_components, self.n_variables, self.n_parameters, self.n_relations, self.n_ports = map(
+            int, total.tolist()
+        )
         push(self.top, None, np.array([[0, 0, 0, self.n_parameters, 0]]))
         while stack:
             entry, parent, first = stack.pop()
@@ -118,6 +122,7 @@ class ModelNumbers:
                 first = (first[:, None] + np.arange(array.size)[:, None] * stride).reshape(-1, len(stride))
                 up = np.repeat(up, array.size)
                 shape = (*shape, *array.shape)
+            number, variable, parameter, relation, port = first.T
             found = Instances(
                 component,
                 parent,
@@ -125,7 +130,11 @@ class ModelNumbers:
                 array,
                 shape,
                 component.name if parent is None else f"{parent.path}.{component.name}",
-                *first.T,
+                number,
+                variable,
+                parameter,
+                relation,
+                port,
                 self._position(tuple(component.variables)),
                 self._position(tuple(component.parameters)),
             )
@@ -160,7 +169,7 @@ class ModelNumbers:
         """The ids behind a path as each instance of i sees it, or the diagram if i is None."""
         n = 1 if i is None else len(i)
         at, rows = i, np.arange(n)
-        below, rows_below = at, rows
+        below, rows_below = None, rows
         while path.startswith("../"):
             if at is None:
                 return None
@@ -268,3 +277,20 @@ class Members:
             else:
                 out[:, j] = np.concatenate([resolve(i, path) for i in self.parts])[self.order]
         return out
+
+
+def array_names(model: ModelNumbers) -> ArrayNames:
+    """What names without indices mean."""
+    entries = {}
+    for i in model.instances:
+        if not i.shape:
+            continue
+        levels, at, level = [], i, i.path.count(".")
+        while at is not None:
+            if at.array is not None:
+                levels.append((level, len(at.array.shape)))
+            at, level = at.parent, level - 1
+        entries[i.path] = ArrayEntry(
+            i.shape, tuple(reversed(levels)), i.variable, i.parameter, i.variable_positions, i.parameter_positions
+        )
+    return ArrayNames(entries)

@@ -12,6 +12,7 @@ from ..compiler.order_blocks import Blocks
 from ..compiler.select_states import StateSelection
 from ..errors import ModelError, nearest
 from ..linear.sparse import SparsePattern
+from ..model.array_names import inner_name, one_by_one
 from ..model.extended import Extended, ExtendedGroup
 from ..model.opaque import OpaqueFunction
 from ..model.provenance import differentiated
@@ -158,14 +159,34 @@ class SystemPlan:
         lowest = int(quantities.first[quantities.owner[quantity]])
         return bool(np.isin(self.variable_map.quantity[~table.is_internal], (quantity, lowest)).any())
 
+    def entries(self, name: str) -> tuple[list[str], tuple[int, ...]] | None:
+        """The names of the entries of an array of variables, and its shape; None if the name is not that of one."""
+        order, inner = inner_name(name)
+        if inner in self.variable_index:
+            return None
+        ids = self.flat.arrays.variables(inner)
+        if ids is None:
+            return None
+        names = self.flat.variables.names
+        return [f"{'der(' * order}{names[v]}{')' * order}" for v in ids.ravel().tolist()], ids.shape
+
+    def one_by_one(self, given: Any, what: str) -> Any:
+        """Values by name, with those of arrays under the names of their entries."""
+        return one_by_one(self.flat.arrays, self.flat.variables.names, given, what)
+
     def resolve(self, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
         """(quantities, factors) of variables by name; `"der(name)"` is accepted where the model has that derivative."""
         quantity, factor = [], []
         for name in names:
-            order, inner = 0, name
-            while inner.startswith("der(") and inner.endswith(")"):
-                order, inner = order + 1, inner[4:-1]
+            order, inner = inner_name(name)
             if inner not in self.variable_index:
+                ids = self.flat.arrays.variables(inner)
+                if ids is not None:
+                    first = self.flat.variables.names[int(ids.ravel()[0])]
+                    raise ModelError(
+                        f"'{name}' is an array of shape {ids.shape}: name one of its entries, such as '{first}', or "
+                        "read it alone"
+                    )
                 raise ModelError(f"'{name}' is not a variable: " + nearest(inner, self.visible_variables))
             q, s = self.quantity_of(self.variable_index[inner])
             if q != ZERO and order:

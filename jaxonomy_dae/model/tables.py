@@ -11,6 +11,7 @@ from typing import Any, overload
 import numpy as np
 
 from ..modeling.interval import Interval
+from .array_names import ArrayNames
 from .opaque import OpaqueFunction
 from .pickling import functions_by_name, named_functions
 from .provenance import Provenance, Provenances
@@ -245,6 +246,7 @@ class FlatModel:
     name: str = ""  # of the diagram
     events: EventTable = NO_EVENTS
     accounts: tuple[AccountGroup, ...] = ()
+    arrays: ArrayNames = ArrayNames()
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"networks": functions_by_name(self.networks)}

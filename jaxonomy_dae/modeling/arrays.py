@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 import sympy
+from jax.core import Tracer
 
 from ..errors import ModelError
 from .declarations import EachValue
@@ -23,9 +24,9 @@ if TYPE_CHECKING:
 class ComponentArray:
     """Equal components under one name, made by `add_array`.
 
-    It is indexed like a NumPy array: `cells[0]` is a component, `cells[:-1]`, `cells[1, :]` and `cells[[0, 2]]` are parts
-    of the array. Attributes are those of all components chosen: `cells[1:].p` is an array of ports, for `connect`,
-    `cells.v` one of symbols.
+    It is indexed like a NumPy array: `cells[0]` is a component, `cells[:-1]`, `cells[1, :]` and `cells[[0, 2]]` are
+    parts of the array. Attributes are those of all components chosen: `cells[1:].p` is an array of ports, for
+    `connect`, `cells.v` one of symbols.
     """
 
     def __init__(
@@ -34,14 +35,14 @@ class ComponentArray:
         shape: tuple[int, ...],
         arguments: dict[str, str | None] | None = None,
         numbers: np.ndarray | None = None,
-        inner: "Component | None" = None,
+        inner: Any = None,
         above: str | None = None,
     ):
         self.prototype = prototype
         self.shape = shape  # of the whole array
         self.arguments = arguments or {}  # with one value an instance: the parameter of the prototype that has them
         self.numbers = np.arange(math.prod(shape)).reshape(shape) if numbers is None else numbers  # of those chosen
-        self.inner = inner or prototype  # the prototype, or a component inside it
+        self.inner: Component = inner or prototype  # the prototype, or a component inside it
         self.above = above  # the path of the one instance that contains the array, if it was reached through that
 
     @property
@@ -75,7 +76,8 @@ class ComponentArray:
 
     def instance(self, number: int) -> str:
         """The path of what was chosen of an instance, as the component now being written sees it, with a final dot."""
-        above, inside, at = self.above, "", self.inner
+        above, inside = self.above, ""
+        at: Any = self.inner
         while at is not self.prototype:
             inside, at = f"{at.name}.{inside}", at.parent
         if above is None:
@@ -169,7 +171,9 @@ def make_array(ev: "EqnEnv", name: str, kind: type, shape: Any, args: tuple, kwa
     where = f"array '{name}'"
     sizes = _sizes(shape, where)
     if not isinstance(kind, type):
-        raise ModelError(f"{where}: the class of its components is needed, as in add_array(…, Resistor, 10); got {kind!r}")
+        raise ModelError(
+            f"{where}: the class of its components is needed, as in add_array(…, Resistor, 10); got {kind!r}"
+        )
     values: dict[str, np.ndarray] = {}
     names = list(inspect.signature(kind.__init__).parameters)[3:]  # after self, ev, name
     given = [_each(v, names[k] if k < len(names) else str(k), sizes, name, values) for k, v in enumerate(args)]
@@ -191,17 +195,17 @@ def _sizes(shape: Any, where: str) -> tuple[int, ...]:
 def _each(value: Any, name: str, shape: tuple[int, ...], array: str, values: dict[str, np.ndarray]) -> Any:
     """An argument as the prototype gets it: a symbol in place of an array, which goes to `values`."""
     where = f"array '{array}'"
-    if isinstance(value, jax.core.Tracer):
+    if isinstance(value, Tracer):
         raise ModelError(
-            f"{where}: {name} must be concrete when the model is written. To vary or differentiate it, compile once and "
-            "use system.with_parameters"
+            f"{where}: {name} must be concrete when the model is written. To vary or differentiate it, compile once "
+            "and use system.with_parameters"
         )
     if not isinstance(value, np.ndarray | jax.Array) or not value.ndim or value.dtype == object:
         return value
     if value.shape != shape:
         raise ModelError(
-            f"{where} has shape {shape}, but the values of {name} have shape {value.shape}: give one for each component; "
-            "what is the same for all is a number, a tuple or a list"
+            f"{where} has shape {shape}, but the values of {name} have shape {value.shape}: give one for each "
+            "component; what is the same for all is a number, a tuple or a list"
         )
     if np.issubdtype(value.dtype, np.complexfloating):
         raise ModelError(f"{where}: the values of {name} must be real numbers; got complex ones")

@@ -84,9 +84,7 @@ def _check_ports(ends: Sequence[Port | PortArray], by_element: bool, where: str)
     for end in ends:
         port = end.port if isinstance(end, PortArray) else end
         if port.domain != first.domain:
-            raise ModelError(
-                f"{where}: cannot connect {end!r} to {ends[0]!r}: a connection joins ports of one domain"
-            )
+            raise ModelError(f"{where}: cannot connect {end!r} to {ends[0]!r}: a connection joins ports of one domain")
         numbers = end.chosen.numbers if isinstance(end, PortArray) else np.zeros((), np.int64)
         others = seen.setdefault(id(port), [])
         twice = any((numbers == other).any() for other in others)

@@ -79,7 +79,7 @@ class AcausalDiagram:
             raise ModelError(f"the diagram has '{name}' already: give the array another name")
         if any(c.ev is not ev for c in self.components.values()):
             raise ModelError(
-                f"array '{name}' was given another EqnEnv than the components of the diagram: make all with the same one"
+                f"array '{name}' was given another EqnEnv than the diagram's components: make all with the same one"
             )
         array = make_array(ev, name, kind, shape, args, kwargs)
         self.components[name] = array

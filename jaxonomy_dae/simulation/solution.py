@@ -68,6 +68,10 @@ class Solution(eqx.Module):
             return _each(self, lambda one: one[name])
         if self.discrete is not None and name in self.system.discretes:
             return self.discrete[:, self.system.discretes.index(name)]
+        entries = self._entries(name)
+        if entries is not None:
+            names, shape = entries
+            return self._columns(tuple(names)).reshape(*self.ts.shape, *shape)
         quantity, factor = self.system.plan.resolve([name])
         column = self._state(int(quantity[0]), float(factor[0]))
         if column is not None:
@@ -76,6 +80,15 @@ class Solution(eqx.Module):
         if _is_traced(given):
             return _observed(*given, quantity, factor)[:, 0]
         return _one(*given, jnp.asarray(quantity[0]), jnp.asarray(factor[0], self.states.dtype))
+
+    def _entries(self, name: str) -> tuple[list[str], tuple[int, ...]] | None:
+        """The names of the entries of an array, and its shape."""
+        plan = self.system.plan
+        ids = plan.flat.arrays.parameters(name)
+        discrete = plan.flat.parameters.discrete
+        if ids is not None and self.discrete is not None and np.isin(ids, discrete).all():
+            return [plan.flat.parameters.names[p] for p in ids.ravel().tolist()], ids.shape
+        return plan.entries(name)
 
     def _state(self, quantity: int, factor: float) -> Any:
         """The values of what is zero, or in the state array; None for all else."""
@@ -95,7 +108,10 @@ class Solution(eqx.Module):
         own = {"time": self.ts} | {n: self[n] for n in names if n in self.system.discretes}
         quantity, factor = self.system.plan.resolve([name for name in names if name not in own])
         given = (self.system, self.ts, self.states, self.inputs, self.discrete)
-        if not (quantity >= 0).any():
+        inside = _places(self.system, quantity)
+        if inside is not None:
+            values = jnp.where(quantity < 0, 0.0, self.states[:, inside] * jnp.asarray(factor, self.states.dtype))
+        elif not (quantity >= 0).any():
             values = jnp.zeros((*self.ts.shape, len(quantity)), self.states.dtype)
         elif _is_traced(given):
             values = _observed(*given, quantity, factor)
@@ -124,7 +140,8 @@ class Solution(eqx.Module):
         return {**self.counts, "solver": self.solver, "reason": self.reason}
 
     def __contains__(self, name: str) -> bool:
-        return name == "time" or name in self.system.plan.variable_index or name in self.system.discretes
+        known = name == "time" or name in self.system.plan.variable_index or name in self.system.discretes
+        return known or self._entries(name) is not None
 
     def __iter__(self) -> Iterator[str]:
         return iter([*self.system.variables, *self.system.discretes])
@@ -223,6 +240,15 @@ def _each(batch: Solution, read: Callable[[Solution], Any]) -> Any:
 
 def _is_traced(tree: Any) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
+
+
+def _places(system: AcausalSystem, quantity: np.ndarray) -> np.ndarray | None:
+    """Where in the state array quantities are, of which some may be zero; None if one is not there."""
+    plan = system.plan
+    place = np.full(plan.extended.quantities.n + 1, -1)  # the last entry stands for zero
+    place[np.concatenate([plan.states, plan.carried])] = np.arange(plan.n_state)
+    found = place[quantity]
+    return np.maximum(found, 0) if plan.n_state and (found[quantity >= 0] >= 0).all() else None
 
 
 def _held(system: AcausalSystem, values: Any) -> AcausalSystem:

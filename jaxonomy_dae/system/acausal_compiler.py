@@ -91,7 +91,7 @@ class AcausalCompiler:
         n = declared.n_declared
         table = ParameterNames(
             declared.names[:n], declared.units[:n], declared.bounds[:n], declared.dependents, declared.expressions,
-            plan.digest,
+            flat.arrays, plan.digest,
         )  # fmt: skip
         parameters = Parameters(jnp.asarray(declared.values[:n], dtype=jnp.zeros(()).dtype), None, (), table)
         neural = {name: _own(network) for name, network in flat.networks.items()}

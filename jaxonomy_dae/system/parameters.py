@@ -13,6 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..errors import ModelError, nearest
+from ..model.array_names import ArrayNames
 from ..model.dependent_parameters import complete
 from ..model.tables import DependentParameters
 from ..modeling.interval import Interval, closed_ends
@@ -29,6 +30,7 @@ class ParameterNames:
     intervals: list[Interval] = dataclasses.field(compare=False, hash=False)
     dependents: tuple[DependentParameters, ...] = dataclasses.field(compare=False, hash=False)
     expressions: dict[int, str] = dataclasses.field(compare=False, hash=False)
+    arrays: ArrayNames = dataclasses.field(default_factory=ArrayNames, compare=False, hash=False)
     digest: str = ""
 
     @functools.cached_property
@@ -40,6 +42,15 @@ class ParameterNames:
         if found is None:
             raise ModelError(f"'{name}' is not a parameter: " + nearest(name, self.names))
         return found
+
+    def entries(self, name: str) -> np.ndarray | None:
+        """The indices of the parameters behind the name of an array, in its shape; None if it is not that of one."""
+        return None if name in self._index else self.arrays.parameters(name)
+
+    def one_by_one(self, name: str) -> list[str]:
+        """The names of the entries of an array of parameters; the name itself if it is not that of one."""
+        found = self.entries(name)
+        return [name] if found is None else [self.names[k] for k in found.ravel().tolist()]
 
     def settable(self, name: str) -> int:
         """The index of a parameter that does not depend on others."""
@@ -112,6 +123,12 @@ class Parameters(eqx.Module):
         return list(self.table.names)
 
     def __getitem__(self, name: str) -> Any:
+        entries = self.table.entries(name)
+        if entries is not None:
+            if not self.free_index:
+                return self.array[..., entries]
+            parts = [self[self.table.names[k]] for k in entries.ravel().tolist()]
+            return jnp.stack(parts, axis=-1).reshape(*parts[0].shape, *entries.shape)
         k = self.table.index(name)
         if k in self.table.expressions:
             if self.values is None or (self.free_index and self.free is None):
@@ -147,7 +164,7 @@ class Parameters(eqx.Module):
 
     def freed(self, names: tuple[str, ...]) -> "Parameters":
         """The same values with the named ones set apart in `free`."""
-        index = tuple(self.table.settable(n) for n in names)
+        index = tuple(dict.fromkeys(self.table.settable(n) for name in names for n in self.table.one_by_one(name)))
         if not index:
             return self.merged()
         array = self.array
@@ -166,6 +183,11 @@ class Parameters(eqx.Module):
         array = self.array
         batch = array.shape[:-1]
         for name, value in new.items():
+            entries = self.table.entries(name)
+            if entries is not None:
+                checked = jnp.asarray(self._checked_array(name, entries, value, batch), array.dtype)
+                array = array.at[..., entries].set(checked)
+                continue
             k = self.table.settable(name)
             array = array.at[..., k].set(jnp.asarray(self._checked(k, value, batch), array.dtype))
         array = self.table.complete(array)
@@ -210,6 +232,29 @@ class Parameters(eqx.Module):
         for number in np.ravel(np.asarray(value)):
             if real_number(number, where) not in self.table.intervals[k]:
                 raise ModelError(f"{where} must lie in {self.table.intervals[k]}; got {float(number):g}")
+        return value
+
+    def _checked_array(self, name: str, entries: np.ndarray, value: Any, batch: tuple[int, ...]) -> Any:
+        """The values of an array of parameters: a number for all of them, or an array of their shape."""
+        for k in entries.ravel().tolist():
+            self.table.settable(self.table.names[k])
+        shape, where = np.shape(value), f"parameter '{name}'"
+        if isinstance(value, str) or shape not in ((), entries.shape, (*batch, *entries.shape)):
+            found = repr(value) if isinstance(value, str) else f"shape {shape}"
+            raise ModelError(f"{where} is an array of shape {entries.shape}: give a number or that shape; got {found}")
+        if jnp.issubdtype(jnp.result_type(value), jnp.complexfloating):
+            raise ModelError(f"{where} must be real; got {jnp.result_type(value)}")
+        if isinstance(value, Tracer):
+            return value
+        low, high = np.moveaxis(self.table.bounds[entries], -1, 0)
+        numbers = np.broadcast_to(np.asarray(value, np.float64), np.broadcast_shapes(shape, entries.shape))
+        right = np.isfinite(numbers) & (numbers >= low) & (numbers <= high)
+        if not right.all():
+            at = tuple(np.argwhere(~right)[0])
+            k = int(entries[at[len(at) - entries.ndim :]])
+            raise ModelError(
+                f"parameter '{self.table.names[k]}' must lie in {self.table.intervals[k]}; got {numbers[at]:g}"
+            )
         return value
 
     @property

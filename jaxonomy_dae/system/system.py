@@ -124,8 +124,9 @@ class AcausalSystem(eqx.Module):
         """
         chosen_networks = {n for n in names if n in self.neural}
         chosen_parameters = tuple(n for n in dict.fromkeys(names) if n not in self.neural)
+        known = set(self.parameters.names)
         for name in chosen_parameters:
-            if name not in self.parameters.names:
+            if name not in known and self.parameters.table.entries(name) is None:
                 raise ModelError(
                     f"'{name}' is neither a network nor a parameter: "
                     + nearest(name, [*self.neural, *self.parameters.names])
@@ -150,7 +151,7 @@ class AcausalSystem(eqx.Module):
 
     def at(self, t: Any, args: Any = None) -> SystemAt:
         """The system at a time, with these inputs, ready to be evaluated at states."""
-        args = read_inputs(self.plan.inputs.names, self.parameters.values.dtype, args)
+        args = read_inputs(self.plan.inputs.names, self.parameters.values.dtype, self.plan.one_by_one(args, "inputs"))
         for name, default in zip(self.plan.inputs.names, self.plan.inputs.defaults, strict=True):
             if default is None and name not in args:
                 raise ModelError(f"input '{name}' has no default: give it with inputs={{'{name}': function_of_time}}")
@@ -278,13 +279,17 @@ class AcausalSystem(eqx.Module):
         return jnp.concatenate(parts)
 
     def observe(self, names: str | Sequence[str], t: Any, x: Float[Array, " n"], args: Any = None) -> Any:
-        """The values of variables at a state: a scalar for one name, shape `(len(names),)` for several.
+        """The values of variables at a state: a scalar for one name, shape `(len(names),)` for several; for the name of
+        an array, `"cell.v"`, its shape.
 
         **Raises:**
 
         - `ModelError` for an unknown name.
         """
         single = isinstance(names, str)
+        entries = self.plan.entries(names) if isinstance(names, str) else None
+        if entries is not None:
+            return self.observe(entries[0], t, x, args).reshape(entries[1])
         quantity, factor = self.plan.resolve([names] if single else list(names))
         values = self.at(t, args).quantities(x, quantity, factor)
         return values[0] if single else values
@@ -352,6 +357,7 @@ class AcausalSystem(eqx.Module):
         names = self._names_to_solve_for(solve_for)
         if solver is not None:
             check_solver(solver)
+        initial, inputs = (self.plan.one_by_one(g, w) for g, w in ((initial, "initial"), (inputs, "inputs")))
         found = find_initial(self, t0, inputs, initial, names, solver)
         found = check(self, found, t0, inputs, initial, names)
         if solve_for is None:
@@ -383,6 +389,7 @@ class AcausalSystem(eqx.Module):
         from ..initialization.report import InitializationReport
 
         names = self._names_to_solve_for(solve_for)
+        initial, inputs = (self.plan.one_by_one(g, w) for g, w in ((initial, "initial"), (inputs, "inputs")))
         found = find_initial(self, t0, inputs, initial, names)
         if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((found, self, t0))):
             raise ModelError("initialization_report needs numbers: call it outside jit, grad and vmap")
@@ -391,7 +398,7 @@ class AcausalSystem(eqx.Module):
     def _names_to_solve_for(self, solve_for: Sequence[str] | None) -> tuple[str, ...]:
         if isinstance(solve_for, str):
             raise ModelError(f"solve_for is a list of parameters' names; write solve_for=[{solve_for!r}]")
-        names = tuple(dict.fromkeys(solve_for or ()))
+        names = tuple(dict.fromkeys(n for name in solve_for or () for n in self.parameters.table.one_by_one(name)))
         for name in names:
             if name not in self.parameters.names and name in self.plan.variable_index:
                 raise ModelError(f"solve_for: '{name}' is a variable, which is found anyway: name parameters")

@@ -1,0 +1,132 @@
+"""What a name without indices means in a model with arrays of components: `cell.v` is all of `cell[0].v`, …"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..errors import ModelError
+
+
+@dataclasses.dataclass(frozen=True)
+class ArrayEntry:
+    """A component that is in arrays: their shape, the level of the path at which each array stands, and how many
+    dimensions it has; the ids of the first variable and the first parameter of each instance."""
+
+    shape: tuple[int, ...]
+    levels: tuple[tuple[int, int], ...]
+    variable: np.ndarray
+    parameter: np.ndarray
+    variable_positions: dict[str, int]
+    parameter_positions: dict[str, int]
+
+
+@dataclasses.dataclass(frozen=True)
+class ArrayNames:
+    """All components that are in arrays, by their paths without indices."""
+
+    entries: dict[str, ArrayEntry] = dataclasses.field(default_factory=dict)
+
+    def variables(self, name: str) -> np.ndarray | None:
+        """The ids behind the name of an array of variables, in its shape; None if it is not the name of one."""
+        return self._find(name, True)
+
+    def parameters(self, name: str) -> np.ndarray | None:
+        """The ids behind the name of an array of parameters, in its shape; None if it is not the name of one."""
+        return self._find(name, False)
+
+    def _find(self, name: str, variables: bool) -> np.ndarray | None:
+        pieces = name.split(".") if self.entries else []
+        for cut in range(len(pieces) - 1, 0, -1):
+            entry = self.entries.get(".".join(p.partition("[")[0] for p in pieces[:cut]))
+            if entry is None:
+                continue
+            own = ".".join(pieces[cut:])
+            positions = entry.variable_positions if variables else entry.parameter_positions
+            index = _index(entry, pieces[:cut])
+            if own not in positions or index is None:
+                continue
+            ids = (entry.variable if variables else entry.parameter) + positions[own]
+            try:
+                found = ids.reshape(entry.shape)[index]
+            except IndexError:
+                continue
+            return found if found.ndim else None
+        return None
+
+
+def _index(entry: ArrayEntry, path: list[str]) -> tuple[int | slice, ...] | None:
+    """What the indices that a path has choose; None if they are not indices of its arrays."""
+    dimensions = dict(entry.levels)
+    index: list[int | slice] = []
+    for level, piece in enumerate(path):
+        _, bracket, inside = piece.partition("[")
+        if not bracket:
+            index.extend([slice(None)] * dimensions.get(level, 0))
+            continue
+        numbers = inside.removesuffix("]").split(",")
+        if len(numbers) != dimensions.get(level, 0) or not all(n.isdecimal() for n in numbers):
+            return None
+        index.extend(int(n) for n in numbers)
+    return tuple(index)
+
+
+def inner_name(name: str) -> tuple[int, str]:
+    """How often `der(…)` stands around a name, and the name inside."""
+    order = 0
+    while name.startswith("der(") and name.endswith(")"):
+        order, name = order + 1, name[4:-1]
+    return order, name
+
+
+def one_by_one(arrays: ArrayNames, names: list[str], given: Any, what: str) -> Any:
+    """Values by name, with those of arrays of variables under the names of their entries: a number for all, or an
+    array of the same shape; for samples, (times, values of shape (times, *shape), …).
+
+    **Raises:**
+
+    - `ModelError` for values of another shape.
+    """
+    if not isinstance(given, Mapping) or not arrays.entries:
+        return given
+    out = {}
+    for name, value in given.items():
+        order, inner = inner_name(name) if isinstance(name, str) else (0, "")
+        ids = arrays.variables(inner)
+        if ids is None:
+            out[name] = value
+            continue
+        full = [f"{'der(' * order}{names[v]}{')' * order}" for v in ids.ravel().tolist()]
+        samples = isinstance(value, tuple | list) and len(value) in (2, 3) and np.ndim(_first(value)) == 1
+        if samples and np.ndim(value[1]) > 1:
+            columns = jnp.asarray(value[1])
+            if columns.shape[1:] != ids.shape:
+                raise ModelError(
+                    f"{what}: the samples of '{name}' need shape (times, {_text(ids.shape)}); got {columns.shape}"
+                )
+            columns = columns.reshape(len(columns), -1)
+            out |= {n: (value[0], columns[:, k], *value[2:]) for k, n in enumerate(full)}
+        elif samples or callable(value) or np.shape(value) == ():
+            out |= dict.fromkeys(full, value)
+        elif np.shape(value) == ids.shape:
+            out |= dict(zip(full, jnp.asarray(value).ravel(), strict=True))
+        else:
+            raise ModelError(
+                f"{what}: '{name}' is an array of shape ({_text(ids.shape)}): give a number or an array of that shape; "
+                f"got shape {np.shape(value)}"
+            )
+    return out
+
+
+def _first(value: Any) -> Any:
+    try:
+        np.ndim(value[0])
+    except ValueError:  # of no regular shape
+        return 0.0
+    return value[0]
+
+
+def _text(shape: tuple[int, ...]) -> str:
+    return ", ".join(map(str, shape))
