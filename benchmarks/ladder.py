@@ -20,7 +20,17 @@ from pathlib import Path
 import numpy as np
 
 SIZES = (10, 100, 1000, 4000, 9000, 20000)
-OTHERS = [("grid", 100), ("chain", 300), ("resistors", 60), ("cascade", 100), ("cascade", 1000), ("cascade", 10000)]
+OTHERS = [
+    ("array", 1000),
+    ("array", 20000),
+    ("array", 100000),
+    ("grid", 100),
+    ("chain", 300),
+    ("resistors", 60),
+    ("cascade", 100),
+    ("cascade", 1000),
+    ("cascade", 10000),
+]
 RTOL = 1e-6
 END = 10.0
 
@@ -40,6 +50,23 @@ def ladder(n: int):
         diagram.connect(r.n, c.p)
         diagram.connect(c.n, ground.p)
         before = r.n
+    return ev, diagram
+
+
+def array(n: int):
+    """The same ladder from two arrays of components."""
+    from jaxonomy_dae import AcausalDiagram, EqnEnv
+    from jaxonomy_dae.library.electrical import Capacitor, Ground, Resistor, VoltageSource
+
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    source, ground = VoltageSource(ev, "source", v=1.0), Ground(ev, "ground")
+    r = diagram.add_array(ev, "r", Resistor, n)
+    c = diagram.add_array(ev, "c", Capacitor, n, initial_voltage=0.0)
+    diagram.connect(source.p, r[0].p)
+    diagram.connect(r[:-1].n, r[1:].p)
+    diagram.connect(r.n, c.p)
+    diagram.connect(c.n, ground.p)
+    diagram.connect(source.n, ground.p)
     return ev, diagram
 
 
@@ -168,7 +195,7 @@ def recursion(n: int) -> np.ndarray:
     return np.array(out)
 
 
-MODELS = {"ladder": ladder, "grid": grid, "chain": chain, "resistors": resistors, "cascade": cascade}
+MODELS = {"ladder": ladder, "array": array, "grid": grid, "chain": chain, "resistors": resistors, "cascade": cascade}
 
 
 def reference(n: int) -> np.ndarray:
@@ -206,7 +233,7 @@ def measure(kind: str, n: int) -> dict:
 
     ev, diagram = lap("build", lambda: MODELS[kind](n))
     system = lap("compile", AcausalCompiler(ev, diagram))
-    end = END if kind == "ladder" else 1.0
+    end = END if kind in ("ladder", "array") else 1.0
 
     def solve():
         solution = simulate(system, t1=end, ts=jnp.array([end]), rtol=RTOL)
@@ -219,9 +246,11 @@ def measure(kind: str, n: int) -> dict:
     out["index"] = system.report.index
     out["steps"] = solution.stats["num_steps"]
     out["memory"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-    if kind == "ladder":
-        voltages = np.array([solution[f"c{k}.v"][0] for k in {0, n // 2, n - 1}])
-        out["error"] = float(np.max(np.abs(voltages - reference(n)[list({0, n // 2, n - 1})])))
+    if kind in ("ladder", "array"):
+        nodes = [0, n // 2, n - 1]
+        names = [f"c{k}.v" if kind == "ladder" else f"c[{k}].v" for k in nodes]
+        voltages = np.array([solution[name][0] for name in names])
+        out["error"] = float(np.max(np.abs(voltages - reference(n)[nodes])))
     if kind == "resistors":
         found = system.observe([f"c{k}.i" for k in range(4)], 0.0, system.initialize())
         out["error"] = float(np.max(np.abs(found - currents(n))))

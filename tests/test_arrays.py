@@ -269,6 +269,10 @@ def other_domain():
     diagram.connect(cells.a, nodes.heat)
 
 
+def a_list():
+    array_of(Gated, 2, times, limit=[1.0, 2.0])
+
+
 def used_twice():
     ev, diagram, _ = array_of(Cell, 4)
     diagram.add_array(ev, "cell", Cell, 2)
@@ -299,10 +303,11 @@ def wrong_start():
         (out_of_bounds, r"parameter 'cell\[1\].c.C' must lie in \(0, inf\); got -1"),
         (not_finite, r"array 'cell': the values of R must be finite; got nan at position 1"),
         (undeclared, r"array 'cell': 'a' has a value for each component, and Careless uses it elsewhere"),
-        (lengths_disagree, r"arrays of one shape join element by element.*'cell, 3.a', 'cell, 2.b'"),
+        (lengths_disagree, r"arrays of one shape join element by element.*'cell.a \(3\)', 'cell.b \(2\)'"),
         (beyond, r"array 'cell' has shape \(4,\): index 4 is out of bounds"),
         (itself, r"'cell.a' is connected to itself"),
         (other_domain, r"a connection joins ports of one domain"),
+        (a_list, r"must be a number; got list.*Values of limit for each component are given as a NumPy array"),
         (used_twice, r"the diagram has 'cell' already: give the array another name"),
         (read_in_a_list, r"'cell.c.v' is an array of shape \(3,\): name one of its entries, such as 'cell\[0\].c.v'"),
         (

@@ -155,9 +155,15 @@ class PortArray:
         return self.chosen.symbols(symbol, f"{self.port.name}.{name}")
 
     def __repr__(self):
+        return f"{self.described}: {self.port.domain.name} port{'s' if self.chosen.numbers.ndim else ''}"
+
+    @property
+    def described(self) -> str:
+        """Its name, and how many ports it has."""
         numbers = self.chosen.numbers
-        which = self.chosen.label(int(numbers)) if not numbers.ndim else f", {' × '.join(map(str, numbers.shape))}"
-        return f"{self.chosen.path}{which}.{self.port.name}: {self.port.domain.name} port"
+        if not numbers.ndim:
+            return f"{self.chosen.path}{self.chosen.label(int(numbers))}.{self.port.name}"
+        return f"{self.chosen.path}.{self.port.name} ({' × '.join(map(str, numbers.shape))})"
 
 
 def make_array(ev: "EqnEnv", name: str, kind: type, shape: Any, args: tuple, kwargs: dict[str, Any]) -> ComponentArray:
@@ -178,8 +184,23 @@ def make_array(ev: "EqnEnv", name: str, kind: type, shape: Any, args: tuple, kwa
     names = list(inspect.signature(kind.__init__).parameters)[3:]  # after self, ev, name
     given = [_each(v, names[k] if k < len(names) else str(k), sizes, name, values) for k, v in enumerate(args)]
     marked = {k: _each(v, k, sizes, name, values) for k, v in kwargs.items()}
-    prototype = kind(ev, name, *given, **marked)
+    try:
+        prototype = kind(ev, name, *given, **marked)
+    except ModelError as error:
+        lists = [k for k, v in kwargs.items() if isinstance(v, list | tuple) and np.shape(_regular(v)) == sizes]
+        if not lists:
+            raise
+        raise ModelError(f"{error}. Values of {lists[0]} for each component are given as a NumPy array") from None
     return ComponentArray(prototype, sizes, _give_values(prototype, values, sizes))
+
+
+def _regular(value: Any) -> Any:
+    """A list, or None if its parts differ in length."""
+    try:
+        np.shape(value)
+    except ValueError:
+        return None
+    return value
 
 
 def _sizes(shape: Any, where: str) -> tuple[int, ...]:

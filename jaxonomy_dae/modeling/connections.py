@@ -105,5 +105,5 @@ def _named(end: Any) -> str:
     if isinstance(end, Port):
         return f"'{end.component.path}.{end.name}'"
     if isinstance(end, PortArray):
-        return f"'{end!r}'".partition(": ")[0] + "'"
+        return f"'{end.described}'"
     return f"'{end}'"

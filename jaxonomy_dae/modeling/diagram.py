@@ -42,6 +42,8 @@ class AcausalDiagram:
         - `ModelError` if a name is used twice, or a component belongs to another one already.
         """
         for component in components:
+            if isinstance(component, ComponentArray) and self.components.get(component.name) is component:
+                continue
             if not isinstance(component, Component):
                 raise ModelError(f"only components can be added to a diagram; got {_described(component)}")
             if component.parent is not None:
@@ -123,6 +125,8 @@ class AcausalDiagram:
 def _described(wrong: Any) -> str:
     if isinstance(wrong, list | tuple):
         return f"a {type(wrong).__name__}: write diagram.add(*components)"
+    if isinstance(wrong, ComponentArray):
+        return f"the array '{wrong.path}': diagram.add_array makes and adds one"
     if isinstance(wrong, type):
         return f'the class {wrong.__name__}: make a component of it, {wrong.__name__}(ev, "name")'
     return type(wrong).__name__

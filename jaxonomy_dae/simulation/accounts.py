@@ -37,9 +37,9 @@ def chosen_terms(plan: SystemPlan, kind: str, component: str | None) -> np.ndarr
     owners = np.concatenate([a.component for a in accounts])
     inside = np.ones(len(names), bool)
     if component is not None:
-        if component not in names:
+        inside = np.array([n == component or n.startswith((f"{component}.", f"{component}[")) for n in names])
+        if not inside.any():
             raise ModelError(f"'{component}' is not a component: " + nearest(component, names))
-        inside = np.array([n == component or n.startswith(f"{component}.") for n in names])
     return np.flatnonzero((kinds == kind) & inside[owners])
 
 
