@@ -20,7 +20,7 @@ from jaxonomy_dae import (
     der,
     simulate,
 )
-from jaxonomy_dae.library.electrical import Capacitor, Ground, Resistor, VoltageSource
+from jaxonomy_dae.library.electrical import Capacitor, Ground, Inductor, Resistor, VoltageSource
 from jaxonomy_dae.library.thermal import HeatCapacitor, ThermalConductor
 
 RTOL, ATOL = 1e-9, 1e-12
@@ -121,6 +121,66 @@ def test_a_grid_of_two_dimensions():
     a = (joined - np.diag(joined.sum(axis=0))) * G / C
     np.testing.assert_allclose(solution["node.T"][1].ravel(), scipy.linalg.expm(a) @ start.ravel(), rtol=10 * RTOL)
     np.testing.assert_array_equal(solution["node[2,1].T"], solution["node.T"][:, 2, 1])
+
+
+@pytest.mark.parametrize("seed", [*range(4), *(pytest.param(k, marks=pytest.mark.slow) for k in range(4, 40))])
+def test_random_networks(seed):
+    """Resistors, capacitors and inductors between random nodes: connections by element and at one node, with indices in
+    random order, against the same network of single components."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(3, 8))
+    kinds = {"r": Resistor, "l": Inductor, "c": Capacitor}
+    values = {k: rng.uniform(0.5, 2.0, n) for k in kinds}
+    order = {k: rng.permutation(n) for k in kinds}
+    arrays, singles = (EqnEnv(), AcausalDiagram()), (EqnEnv(), AcausalDiagram())
+
+    def build(ev, diagram, in_array: bool):
+        source, ground = VoltageSource(ev, "source", v=1.0), Ground(ev, "ground")
+        starts = {"c": {"initial_voltage": 0.1}, "l": {"initial_current": 0.2}, "r": {}}
+        parts = {
+            k: diagram.add_array(ev, k, kind, n, values[k], **starts[k])
+            if in_array
+            else [kind(ev, f"{k}{j}", float(values[k][j]), **starts[k]) for j in range(n)]
+            for k, kind in kinds.items()
+        }
+        diagram.connect(source.n, ground.p)
+        if in_array:
+            r, li, c = parts["r"], parts["l"], parts["c"]
+            diagram.connect(source.p, r[order["r"][: n - 1]].p)
+            diagram.connect(r[order["r"]].n, li[order["l"]].p, c[order["c"]].p)
+            diagram.connect(r[int(order["r"][-1])].p, r[int(order["r"][0])].n)
+            diagram.connect(li.n, c.n)
+            diagram.connect(c[::2].n, ground.p)
+            if n > 3:
+                diagram.connect(c[1].n, c[3].n)
+            diagram.connect(c[1].n, ground.p)
+            return
+        for j in range(n):
+            a, b, d = (parts[k][order[k][j]] for k in ("r", "l", "c"))
+            diagram.connect(a.n, b.p, d.p)
+            if j < n - 1:
+                diagram.connect(source.p, a.p)
+            diagram.connect(parts["l"][j].n, parts["c"][j].n)
+            if j % 2 == 0 or j == 1:
+                diagram.connect(parts["c"][j].n, ground.p)
+        diagram.connect(parts["r"][order["r"][-1]].p, parts["r"][order["r"][0]].n)
+        if n > 3:
+            diagram.connect(parts["c"][1].n, parts["c"][3].n)
+
+    build(*arrays, True)
+    build(*singles, False)
+    one, other = AcausalCompiler(*arrays)(), AcausalCompiler(*singles)()
+
+    def slopes(system):
+        x = system.initialize()
+        return {
+            s.replace("[", "").replace("]", ""): v
+            for s, v in zip(system.states, system.vector_field(0.0, x), strict=True)
+        }
+
+    found, expected = slopes(one), slopes(other)
+    assert set(found) == set(expected)
+    np.testing.assert_allclose([found[k] for k in expected], list(expected.values()), rtol=1e-10, atol=1e-10)
 
 
 class Row(Component):
@@ -291,6 +351,10 @@ def value_out_of_bounds():
     ladder(3, True).with_parameters({"cell.c.C": np.array([1.0, 1.0, -2.0])})
 
 
+def every_step_of_many():
+    simulate(ladder(100, True), t1=1.0, max_steps=10_000_000)
+
+
 def wrong_start():
     ladder(3, True).initialize(initial={"cell.c.v": np.zeros(2)})
 
@@ -315,6 +379,7 @@ def wrong_start():
             r"parameter 'cell.r.R' is an array of shape \(3,\): give a number or that shape; got shape \(4,\)",
         ),
         (value_out_of_bounds, r"parameter 'cell\[2\].c.C' must lie in \(0, inf\); got -2"),
+        (every_step_of_many, r"reserves max_steps \+ 1 = 10000001 rows for 100 states, 7.5 GiB: say when to save, ts="),
         (wrong_start, r"initial: 'cell.c.v' is an array of shape \(3\): give a number or an array of that shape"),
     ],
 )

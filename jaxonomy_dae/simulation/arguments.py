@@ -15,6 +15,8 @@ from ..solvers.solve_arguments import check_finite, check_longest_step
 from ..system.system import AcausalSystem
 from ..system.system_at import SystemAt
 
+MOST_ROOM = 4 * 2**30  # bytes that saved steps may reserve
+
 
 def check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_controller, dtmax, max_steps):
     """Raises a `ModelError` that says which argument cannot work, and what would."""
@@ -35,6 +37,12 @@ def check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_contr
         )
     if not isinstance(max_steps, int) or max_steps < 1:
         raise ModelError(f"max_steps must be a positive integer; got {max_steps!r}")
+    room = (max_steps + 1) * system.plan.n_state * system.parameters.values.dtype.itemsize
+    if ts is None and room > MOST_ROOM:
+        raise ModelError(
+            f"saving every step (ts=None) reserves max_steps + 1 = {max_steps + 1} rows for {system.plan.n_state} "
+            f"states, {room / 2**30:.1f} GiB: say when to save, ts=jnp.linspace(t0, t1, 101), or lower max_steps"
+        )
     if isinstance(stepsize_controller, diffrax.ConstantStepSize):
         raise ModelError(
             "stepsize_controller=ConstantStepSize() needs a step: use diffrax.StepTo(ts=jnp.linspace(t0, t1, n))"

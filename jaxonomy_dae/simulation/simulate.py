@@ -99,7 +99,8 @@ def simulate(
 
     - `ModelError` for arguments that cannot work; `InitializationError`; `SimulationError`.
     """
-    initial, inputs = (system.plan.one_by_one(g, w) for g, w in ((initial, "initial"), (inputs, "inputs")))
+    if isinstance(system, AcausalSystem):  # `check_arguments` says what to do with anything else
+        initial, inputs = (system.plan.one_by_one(g, w) for g, w in ((initial, "initial"), (inputs, "inputs")))
     check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_controller, dtmax, max_steps)
     dtype = system.parameters.values.dtype
     inputs = read_inputs(system.inputs, dtype, inputs)
