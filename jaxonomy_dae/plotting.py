@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from .simulation.solution import Solution
     from .system.system import AcausalSystem
 
+SEPARATE = 12  # entries of an array that get a colour each
 NAMED = 40  # up to this many unknowns, rows and columns are labelled
 
 
@@ -23,7 +24,7 @@ def plot_solution(solution: "Solution", *names: str, ax: Any = None) -> Any:
 
     **Arguments:**
 
-    - `names`: of variables; default: the differential states.
+    - `names`: of variables; default: the differential states. An array of more than 12 is drawn in one colour.
     - `ax`: Matplotlib axes to draw into; new ones by default.
     """
     plt = _pyplot()
@@ -34,11 +35,18 @@ def plot_solution(solution: "Solution", *names: str, ax: Any = None) -> Any:
         _, ax = plt.subplots(figsize=(7.0, 3.5), layout="constrained")
     units = dict(zip(solution.system.plan.flat.variables.names, solution.system.plan.flat.variables.unit, strict=True))
     time = np.asarray(solution.ts)
-    shown = [units.get(n, "") for n in names]
+    names = tuple(one for name in names for one in _lines(solution, name))
+    first = {name: (solution.system.plan.entries(name) or ([name],))[0][0] for name in names}
+    shown = [units.get(first[n], "") for n in names]
     common = shown[0] if len(set(shown)) == 1 else None
     for name, unit in zip(names, shown, strict=True):
         label = name if common is not None or not unit else f"{name} [{unit}]"
-        ax.plot(time, np.asarray(solution[name]), label=label, linewidth=1.6)
+        values = np.asarray(solution[name])
+        if values.ndim == 1:
+            ax.plot(time, values, label=label, linewidth=1.6)
+            continue
+        colour = ax.plot(time, values.reshape(len(time), -1)[:, 0], label=label, linewidth=0.8)[0].get_color()
+        ax.plot(time, values.reshape(len(time), -1)[:, 1:], color=colour, linewidth=0.8, alpha=0.5)
     ax.set_xlabel("time [s]")
     if common:
         ax.set_ylabel(f"{names[0]} [{common}]" if len(names) == 1 else f"[{common}]")
@@ -48,6 +56,12 @@ def plot_solution(solution: "Solution", *names: str, ax: Any = None) -> Any:
     if len(names) > 1:
         ax.legend()
     return ax
+
+
+def _lines(solution: "Solution", name: str) -> list[str]:
+    """The names under which a variable, or an array of variables, is drawn."""
+    entries = solution.system.plan.entries(name)
+    return [name] if entries is None or len(entries[0]) > SEPARATE else entries[0]
 
 
 def structure(system: "AcausalSystem", ax: Any = None) -> Any:

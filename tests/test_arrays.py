@@ -263,6 +263,17 @@ def test_networks_events_and_inputs_in_arrays():
     np.testing.assert_array_equal(again.parameters["gate.limit"], limit)
 
 
+def test_plots():
+    """Each entry of a small array is a line with its name; a large one has one name."""
+    pytest.importorskip("matplotlib")
+    few, many = (simulate(ladder(n, True), t1=1.0, ts=jnp.linspace(0.0, 1.0, 5)) for n in (3, 20))
+    axes = few.plot("cell.c.v", "source.v")
+    assert [line.get_label() for line in axes.lines] == [*(f"cell[{k}].c.v" for k in range(3)), "source.v"]
+    axes = many.plot("cell.c.v")
+    assert len(axes.lines) == 20 and axes.lines[0].get_label() == "cell.c.v"
+    assert axes.get_ylabel() == "cell.c.v [V]"
+
+
 def test_training_an_array():
     """`partition` by the array's name sets all its entries apart."""
     system = ladder(3, True, np.ones(3))
