@@ -283,6 +283,21 @@ def test_training_an_array():
     np.testing.assert_array_equal(joined.parameters["cell.r.R"], np.ones(3))
 
 
+class Sum(Component):
+    """y is the sum of some numbers."""
+
+    def __init__(self, ev, name, a):
+        super().__init__(ev, name)
+        self.add_equations(Eq(self.variable("y"), sum(self.parameter(f"a{k}", v) for k, v in enumerate(a))))
+
+
+def test_values_in_a_list():
+    ev, diagram, _ = array_of(Sum, 3, a=[np.array([1.0, 2.0, 3.0]), 10.0])
+    system = AcausalCompiler(ev, diagram)()
+    np.testing.assert_array_equal(system.observe("cell.y", 0.0, system.initialize()), [11.0, 12.0, 13.0])
+    np.testing.assert_array_equal(system.parameters["cell.a0"], [1.0, 2.0, 3.0])
+
+
 class Careless(Component):
     """Uses its argument without declaring it."""
 

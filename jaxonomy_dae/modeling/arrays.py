@@ -221,7 +221,9 @@ def _each(value: Any, name: str, shape: tuple[int, ...], array: str, values: dic
             f"{where}: {name} must be concrete when the model is written. To vary or differentiate it, compile once "
             "and use system.with_parameters"
         )
-    if not isinstance(value, np.ndarray | jax.Array) or not value.ndim or value.dtype == object:
+    if isinstance(value, tuple | list) and any(_is_array(v) for v in value):
+        return [_each(v, f"{name}[{k}]", shape, array, values) for k, v in enumerate(value)]
+    if not _is_array(value):
         return value
     if value.shape != shape:
         raise ModelError(
@@ -236,6 +238,10 @@ def _each(value: Any, name: str, shape: tuple[int, ...], array: str, values: dic
         raise ModelError(f"{where}: the values of {name} must be finite; got {numbers[wrong]} at position {wrong}")
     values[name] = numbers
     return ParameterSymbol(f"{array}:{name}")
+
+
+def _is_array(value: Any) -> bool:
+    return isinstance(value, np.ndarray | jax.Array) and value.ndim > 0 and value.dtype != object
 
 
 def _give_values(

@@ -508,8 +508,8 @@ class Component(EventDeclarations, metaclass=Construction):
         - `name`: of the array.
         - `kind`: the class of its components.
         - `shape`: how many, or a tuple for an array of several dimensions.
-        - `args`, `kwargs`: for `kind(ev, name, *args, **kwargs)`. NumPy arrays of the array's shape hold a value for
-            each component; all else is the same for all.
+        - `args`, `kwargs`: for `kind(ev, name, *args, **kwargs)`. NumPy arrays of the array's shape, alone or in a
+            list, hold a value for each component; all else is the same for all.
 
         A learned term or function of `kind` is one for all components of the array, `system.neural["self.name.term"]`.
 
