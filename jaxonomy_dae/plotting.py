@@ -34,7 +34,7 @@ def plot_solution(solution: "Solution", *names: str, ax: Any = None) -> Any:
         _, ax = plt.subplots(figsize=(7.0, 3.5), layout="constrained")
     units = dict(zip(solution.system.plan.flat.variables.names, solution.system.plan.flat.variables.unit, strict=True))
     time = np.asarray(solution.ts)
-    shown = [units.get(n, "") for n in names]
+    shown = ["" if units.get(n) == "1" else units.get(n, "") for n in names]
     common = shown[0] if len(set(shown)) == 1 else None
     for name, unit in zip(names, shown, strict=True):
         label = name if common is not None or not unit else f"{name} [{unit}]"
