@@ -2,7 +2,9 @@
 
 Given the graph of an equation, a condition or a value, and the units of its leaves (None where a unit is not known),
 returns a sentence for each operation whose arguments do not fit. What has no known unit fits everything, so no sentence
-rests on one. A constant is a number without unit; zero fits everything.
+rests on one. Zero fits everything. Other constants are numbers without unit where they are multiplied, or added within
+products and functions; in equations, comparisons, branches, min and max they have the unit of what they stand beside.
+Functions of time and numbers alone, such as sin(100*time), have no known unit: nothing else in them could have one.
 """
 
 import dataclasses
@@ -14,12 +16,13 @@ from typing import Any
 
 import sympy
 
-from ..expressions.node import Node, postorder
+from ..expressions.node import Node, leaf, linear, postorder
 from ..expressions.to_sympy import shortened, write
 from .unit import NUMBER, Unit, interval, is_close, product
 
 UnitOf = Callable[[Hashable], Unit | None]
 
+TIME = frozenset([("time",)])  # the leaves of functions of time
 LARGEST_PLAIN = 4
 KEEP_UNIT = ("abs", "max", "min", "hypot", "mod")
 TO_NUMBER = ("sign", "heaviside")
@@ -27,7 +30,7 @@ RATIO = "atan2"
 CONDITIONS = ("true", "false", "not", "and", "or")
 COMPARISONS = ("less", "less_equal", "equal")
 ONE_UNIT = {
-    "sum": "terms of one sum need one unit",
+    "sum": "what is added or equal needs one unit",
     "select": "branches need one unit",
     "less": "sides of a comparison need one unit",
     "less_equal": "sides of a comparison need one unit",
@@ -67,13 +70,9 @@ def misfits_of_condition(graph: Node, unit_of: UnitOf) -> list[str]:
 
 def misfits_of_value(graph: Node, unit_of: UnitOf, expected: Unit | None, name: str) -> list[str]:
     """Of an expression that gives what is called `name` its value."""
-    walk = _Walk(unit_of)
-    walk.run(graph, (), is_zero=False)
-    value = walk.known[graph]
-    if expected is not None and not (value is not None and value.is_constant):
-        pair = [Term(lambda: name, Measured(expected)), Term(lambda: _text(graph), value, -1.0)]
-        walk.agree(pair, "a value needs the unit of what it is given to", is_zero=True)
-    return walk.found
+    target = leaf(("value", name))
+    walk = _Walk(lambda label: expected if label == target.data else unit_of(label))
+    return walk.run(linear([(1, target), (-1, graph)]), (), is_zero=True)
 
 
 def misfit_of_units(named: Sequence[tuple[str, Unit | None]]) -> str | None:
@@ -116,13 +115,15 @@ class _Walk:
         if operation == "leaf":
             unit = self.unit_of(node.data)
             return None if unit is None else Measured(unit)
+        if node.leaves == TIME:
+            return None
         if operation == "constant":
             value = float(node.data)
             return Measured(NUMBER, value, is_constant=True) if value and math.isfinite(value) else None
         if operation == "sum":
             start, coefficients = node.data
             terms = [
-                Term(lambda c=c, a=a: _text(a, c), known, float(c))
+                Term(lambda c=c, a=a: _text(a, c), None if a.leaves == TIME and abs(c) != 1 else known, float(c))
                 for c, a, known in zip(coefficients, node.arguments, inside, strict=True)
             ]
             if start:
@@ -177,7 +178,7 @@ class _Walk:
 
     def _needs_number(self, node: Node, rule: str) -> None:
         value = self.known[node]
-        if value is None or value.is_constant:
+        if value is None or value.is_constant or node.leaves == TIME:
             return
         if value.unit.dimension:
             self.found.append(f"{rule}, but '{_text(node)}' is in {value.unit}")
@@ -190,6 +191,7 @@ class _Walk:
         values = list(values)
         points = {v.unit for v in values if v is not None and v.unit.zero}
         terms = [Term(lambda a=a: _text(a), v) for a, v in zip(nodes, values, strict=True)]
+        terms = [t for t in terms if t.value is None or not t.value.is_constant] or terms
         others = [v for v in values if v is not None and not v.unit.zero]
         if points and others:
             named = [(t.name(), t.value.unit) for t in terms if t.value is not None]
@@ -232,30 +234,39 @@ class _Walk:
         values = [
             (t, dataclasses.replace(v, unit=interval(v.unit), number=abs(v.number * t.coefficient))) for t, v in known
         ]
-        dimension = _most_common([v.unit.dimension for _, v in values])
-        reference = next(t for t in values if t[1].unit.dimension == dimension)
-        odd = next((t for t in values if t[1].unit.dimension != dimension), None)
-        if odd is not None:
-            a, b = sorted((reference, odd), key=lambda pair: pair[1].is_constant)
-            self.found.append(f"{rule}, but '{a[0].name()}' is in {a[1].unit} and {_called(*b)}")
+        if is_zero:
+            values = [(t, v) for t, v in values if not v.is_constant] or values
+        dimensions = [v.unit.dimension for _, v in values]
+        if any(d != dimensions[0] for d in dimensions):
+            self._note(rule, values, _most_common(dimensions), lambda v: v.unit.dimension)
             return None
         measured = [(t, v) for t, v in values if not v.is_constant]
         if not measured:
             return Measured(NUMBER, is_constant=True) if all_known else None
         scale = _common_scale([v for _, v in measured])
         if scale is None:
-            a = measured[0]
-            b = next(m for m in measured if not is_close(m[1].unit.scale, a[1].unit.scale))
-            self.found.append(
-                f"{rule}, but '{a[0].name()}' is in {a[1].unit} and '{b[0].name()}' in {b[1].unit} "
-                f"({_conversion(a[1].unit, b[1].unit)})"
-            )
+            self._note(rule, measured, _most_common([v.unit.scale for _, v in measured]), lambda v: v.unit.scale)
             return None
         text = next((v.unit.text for _, v in measured if is_close(v.unit.scale, scale)), "")
         numbers = [v.number for _, v in measured]
         number = numbers[0] if all(is_close(n, numbers[0]) for n in numbers) and len(values) == len(measured) else 1.0
         is_loose = any(v.is_loose for _, v in values)
-        return Measured(Unit(dimension, scale, zero, text), number, is_loose=is_loose)
+        return Measured(Unit(dimensions[0], scale, zero, text), number, is_loose=is_loose)
+
+    def _note(
+        self, rule: str, values: list[tuple[Term, Measured]], usual: Any, aspect: Callable[[Measured], Any]
+    ) -> None:
+        """Notes that an aspect of the values, which is `usual` for most of them, is not the same for all."""
+        named = sorted(((v.is_constant, len(t.name()), t.name(), v) for t, v in values), key=lambda row: row[:3])
+        one = next(row for row in named if aspect(row[-1]) == usual)
+        odd = next(row for row in named if aspect(row[-1]) != usual)
+        (_, _, a, first), (_, _, b, second) = sorted((one, odd), key=named.index)
+        said = f"and '{b}' in {second.unit}"
+        if second.is_constant:
+            said = f"and {b} is a number: declare a parameter with a unit for it"
+        elif first.unit.dimension == second.unit.dimension:
+            said += f" ({_conversion(first.unit, second.unit)})"
+        self.found.append(f"{rule}, but '{a}' is in {first.unit} {said}")
 
 
 def _most_common(items: Sequence[Any]) -> Any:
@@ -285,20 +296,12 @@ def _is_plain(number: float) -> bool:
 
 def _conversion(a: Unit, b: Unit) -> str:
     """What one of the coarser unit is in the other one."""
-    if not is_close(a.scale, b.scale):
-        fine, coarse = sorted((a, b), key=lambda u: u.scale)
-        one, other = (f"1 {u}" if u.text else str(u) for u in (coarse, fine))
-        if fine.text:
-            return f"{one} is {coarse.scale / fine.scale:.6g} {fine}"
-        return f"{one} is {coarse.scale / fine.scale:.6g} times {other}"
-    scale_of_own = a if a.zero else b
-    return f"0 {scale_of_own} is {scale_of_own.zero:.6g} K"
-
-
-def _called(term: Term, value: Measured) -> str:
-    if value.is_constant:
-        return f"{term.name()} is a number: declare a parameter with a unit for it"
-    return f"'{term.name()}' in {value.unit}"
+    if is_close(a.scale, b.scale):
+        own = a if a.zero else b
+        return f"0 {own} is {own.zero:.6g} K"
+    fine, coarse = sorted((a, b), key=lambda u: u.scale)
+    ratio = f"{coarse.scale / fine.scale:.6g}"
+    return f"1 {coarse} is {ratio} {fine}" if coarse.text and fine.text else f"a factor of {ratio}"
 
 
 def _text(node: Node | None, coefficient: Any = 1) -> str:
@@ -310,7 +313,7 @@ def _text(node: Node | None, coefficient: Any = 1) -> str:
 
 
 def name_of(label: Any) -> str:
-    """How a leaf is called: labels are ("variable", path, order), or (kind, path), or ("time",)."""
+    """How a leaf is called: labels are ("variable", path, order), or (kind, name), or ("time",)."""
     if label[0] == "variable":
         return "der(" * label[2] + label[1] + ")" * label[2]
     return label[-1]

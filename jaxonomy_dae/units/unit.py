@@ -53,7 +53,8 @@ def rate(unit: Unit, order: int) -> Unit:
         return unit
     found = product([(unit, Fraction(1)), (SECOND, Fraction(-order))])
     power = "" if order == 1 else str(order)
-    return dataclasses.replace(found, text=f"{unit.text}/s{power}" if unit.text.isalpha() and not unit.zero else "")
+    is_simple = unit.text not in ("", "1") and not unit.zero and not set(unit.text) & set("/ ^-")
+    return dataclasses.replace(found, text=f"{unit.text}/s{power}" if is_simple else "")
 
 
 def interval(unit: Unit) -> Unit:

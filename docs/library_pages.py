@@ -1,0 +1,333 @@
+"""Pages of the component library, made from the code when the documentation is built (a hook of MkDocs).
+
+Each domain of `jaxonomy_dae.library` gets a page with its components: what they are, ports, parameters, variables,
+equations and events. A component is made once, with its default arguments, and asked for what it declares.
+"""
+
+import importlib
+import inspect
+import math
+import pkgutil
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import jax
+import sympy
+from sympy.printing.precedence import precedence
+from sympy.printing.str import StrPrinter
+
+import jaxonomy_dae.library
+from jaxonomy_dae import Component, EqnEnv
+from jaxonomy_dae.modeling.events import Assign, Reinit, Sampled, Terminate, When
+from jaxonomy_dae.modeling.interval import Interval
+from jaxonomy_dae.modeling.symbols import RelationSymbol
+
+# Of components that need more than an environment and a name.
+ARGUMENTS: dict[str, dict[str, Any]] = {
+    "DiscreteTransferFunction": {"numerator": [1.0], "denominator": [1.0, -0.5]},
+    "Noise": {"key": jax.random.key(0)},
+    "StateSpace": {"A": [[-1.0]], "B": [[1.0]], "C": [[1.0]]},
+    "Table1D": {"x": [0.0, 1.0], "values": [0.0, 1.0]},
+    "Table2D": {"x": [0.0, 1.0], "y": [0.0, 1.0], "values": [[0.0, 1.0], [1.0, 2.0]]},
+    "TransferFunction": {"numerator": [1.0], "denominator": [1.0, 1.0]},
+}
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+TITLE = "Library"
+
+
+# --- what there is -----------------------------------------------------------------------------------------------
+
+
+def classes_of(domain: str) -> list[type[Component]]:
+    """The components of a domain, in the order in which its code, or its list of names, has them."""
+    module = importlib.import_module(f"{jaxonomy_dae.library.__name__}.{domain}")
+    is_package = hasattr(module, "__path__")
+    found = {
+        value: None
+        for name, value in vars(module).items()
+        if inspect.isclass(value)
+        and issubclass(value, Component)
+        and not name.startswith("_")
+        and (value.__module__.startswith(f"{module.__name__}.") if is_package else value.__module__ == module.__name__)
+    }
+    return list(found)
+
+
+def domains() -> list[str]:
+    """The domains that have components, signals last."""
+    names = [m.name for m in pkgutil.iter_modules(jaxonomy_dae.library.__path__)]
+    return sorted((n for n in names if classes_of(n)), key=lambda n: (n == "signal", n))
+
+
+def components_of(domain: str) -> list[Component]:
+    """A component of each class of a domain."""
+    return [make(cls) for cls in classes_of(domain)]
+
+
+def make(cls: type[Component]) -> Component:
+    return cls(EqnEnv(), cls.__name__.lower(), **ARGUMENTS.get(cls.__name__, {}))
+
+
+@contextmanager
+def equations_as_written() -> Iterator[list[Any]]:
+    """The equations that components are given meanwhile, both sides of them, outermost component only."""
+    written: list[Any] = []
+    plain = Component.add_equations
+
+    def noted(self: Component, *equations: Any) -> None:
+        written.extend((self, equation) for equation in equations)
+        plain(self, *equations)
+
+    Component.add_equations = noted
+    try:
+        yield written
+    finally:
+        Component.add_equations = plain
+
+
+# --- texts -------------------------------------------------------------------------------------------------------
+
+
+class Printer(StrPrinter):
+    """Expressions as one writes them in plain text: v = R·i², √(x), −a."""
+
+    def _print_Mul(self, expr: Any) -> str:
+        number, rest = expr.as_coeff_Mul()
+        if number < 0:
+            inside = self._print(-expr)
+            return f"−({inside})" if isinstance(-expr, sympy.Add) else f"−{inside}"
+        above, below = sympy.fraction(expr, exact=True)
+        if below != 1:
+            denominator = self._inside(below, precedence(below) <= precedence(expr) and not below.is_Pow)
+            return f"{self._inside(above, above.is_Add)}/{denominator}"
+        return "·".join(self._inside(f, f.is_Add or f.is_Piecewise) for f in sympy.Mul.make_args(expr))
+
+    def _print_Add(self, expr: Any, order: Any = None) -> str:
+        terms = sorted(self._as_ordered_terms(expr, order=order), key=lambda t: t.could_extract_minus_sign())
+        text = ""
+        for term in terms:
+            negative = term.could_extract_minus_sign()
+            inside = self._print(-term if negative else term)
+            sign = (" − " if negative else " + ") if text else ("−" if negative else "")
+            text += sign + (f"({inside})" if negative and (-term).is_Add else inside)
+        return text
+
+    def _print_Pow(self, expr: Any, rational: bool = False) -> str:
+        base, exponent = expr.base, expr.exp
+        if exponent == sympy.Rational(1, 2):
+            return f"√({self._print(base)})"
+        if exponent.is_Rational and exponent < 0:
+            return f"1/{self._inside(base**-exponent, not (base**-exponent).is_Atom and not (base**-exponent).is_Pow)}"
+        text = self._inside(base, not base.is_Atom and not base.is_Function)
+        if exponent.is_Integer:
+            return text + str(exponent).translate(SUPERSCRIPTS)
+        return f"{text}^{self._inside(exponent, not exponent.is_Atom)}"
+
+    def _inside(self, expr: Any, parenthesised: bool) -> str:
+        return f"({self._print(expr)})" if parenthesised else self._print(expr)
+
+    def _print_Float(self, expr: Any) -> str:
+        return f"{float(expr):g}".replace("-", "−")
+
+    def _print_Integer(self, expr: Any) -> str:
+        return str(expr).replace("-", "−")
+
+    def _print_Pi(self, expr: Any) -> str:
+        return "π"
+
+    def _print_Abs(self, expr: Any) -> str:
+        return f"|{self._print(expr.args[0])}|"
+
+    def _print_Relational(self, expr: Any) -> str:
+        signs = {"==": "=", "!=": "≠", "<=": "≤", ">=": "≥"}
+        return f"{self._print(expr.lhs)} {signs.get(expr.rel_op, expr.rel_op)} {self._print(expr.rhs)}"
+
+    def _print_And(self, expr: Any) -> str:
+        return " and ".join(sorted(self._print(a) for a in expr.args))
+
+    def _print_Or(self, expr: Any) -> str:
+        live = [a for a in expr.args if isinstance(a, sympy.And) and a.atoms(RelationSymbol)]
+        if live:  # a relation whose changes are events
+            return self._print(sympy.And(*(a for a in live[0].args if not a.atoms(RelationSymbol))))
+        return " or ".join(sorted(self._print(a) for a in expr.args))
+
+    def _print_Piecewise(self, expr: Any) -> str:
+        parts = []
+        for value, condition in expr.args:
+            when = "otherwise" if condition == sympy.true else f"if {self._print(condition)}"
+            parts.append(f"{self._print(value)} {when}")
+        return f"({', '.join(parts)})"
+
+
+def text_of(expression: Any) -> str:
+    return Printer().doprint(sympy.sympify(expression))
+
+
+def equation_text(equation: Any) -> str:
+    if isinstance(equation, sympy.Eq):
+        return f"{text_of(equation.lhs)} = {text_of(equation.rhs)}"
+    text = text_of(equation)
+    return f"0 = {text.removeprefix('(').removesuffix(')') if isinstance(equation, sympy.Piecewise) else text}"
+
+
+def event_text(event: When) -> str:
+    if isinstance(event.clock, Sampled):
+        offset = f", from {text_of(event.clock.offset)} s on" if event.clock.offset else ""
+        condition = f"every {text_of(event.clock.period)} s{offset}"
+    else:
+        condition = f"when {event.text}".replace(", on=", ", while ").replace("<=", "≤").replace(">=", "≥")
+    return f"{condition}: {', '.join(map(_action_text, event.actions))}"
+
+
+def _action_text(action: Any) -> str:
+    if isinstance(action, Terminate):
+        return f"the run ends, “{action.message}”"
+    assert isinstance(action, Assign | Reinit)
+    return f"{action.target} becomes {text_of(action.value)}"
+
+
+def bounds_text(interval: Interval) -> str:
+    low, high = interval.low, interval.high
+    if low == -math.inf and high == math.inf:
+        return ""
+    above = f"> {low:g}" if interval.open_low else f"≥ {low:g}"
+    below = f"< {high:g}" if interval.open_high else f"≤ {high:g}"
+    return above if high == math.inf else below if low == -math.inf else f"{above}, {below}"
+
+
+def table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> list[str]:
+    """A Markdown table, without the columns that are empty; nothing if there are no rows."""
+    rows = list(rows)
+    kept = [k for k in range(len(head)) if any(row[k] for row in rows)]
+    lines = [[head[k] for k in kept], ["---"] * len(kept), *([row[k] for k in kept] for row in rows)]
+    return ["| " + " | ".join(line) + " |" for line in lines] + [""] if rows else []
+
+
+def code(text: str) -> str:
+    return f"`{text}`" if text else ""
+
+
+# --- pages -------------------------------------------------------------------------------------------------------
+
+
+def component_section(cls: type[Component]) -> list[str]:
+    with equations_as_written() as written:
+        component = make(cls)
+    signature = inspect.signature(cls.__init__)
+    given = [p for p in signature.parameters.values() if p.name not in ("self", "ev", "name")]
+    arguments = "".join(
+        f", {p.name}" + ("" if p.default is p.empty else f"={p.default!r}")
+        for p in given
+        if p.kind is not p.VAR_KEYWORD
+    )
+    lines = [f"## {cls.__name__}", "", "```python", f"{cls.__name__}(ev, name{arguments})", "```", ""]
+    lines += [inspect.getdoc(cls) or "", ""]
+    lines += table(
+        ("Port", "Domain", "Variables"),
+        (
+            (
+                code(p.name),
+                p.domain.name,
+                ", ".join(f"`{v}` [{unit}]" for v, unit in (*p.domain.across, *p.domain.through)),
+            )
+            for p in component.ports.values()
+        ),
+    )
+    lines += table(
+        ("Parameter", "Default", "Unit", "Bounds"),
+        (
+            (code(p.name), _value_text(p.value), _unit_text(p.unit), bounds_text(p.bounds))
+            for p in component.parameters.values()
+            if not p.is_discrete
+        ),
+    )
+    shown = [v for v in component.variables.values() if v.kind not in ("port", "start", "event")]
+    discrete = [p for p in component.parameters.values() if p.is_discrete]
+    lines += table(
+        ("Variable", "Kind", "Unit", "Start"),
+        [
+            *((code(v.name), _kind_text(v.kind), _unit_text(v.unit), _start_text(v)) for v in shown),
+            *((code(p.name), "discrete", _unit_text(p.unit), _value_text(p.value)) for p in discrete),
+        ],
+    )
+    own = [equation_text(equation) for owner, equation in written if owner is component]
+    if own:
+        lines += ["```text", *own, "```", ""]
+    events = [event_text(event) for event in component.events if event.noted]
+    if events:
+        lines += ["Events:", "", "```text", *events, "```", ""]
+    if component.children:
+        lines += ["Parts:", ""]
+        lines += table(("Part", "Component"), ((code(c.name), type(c).__name__) for c in component.children.values()))
+        joined = [" — ".join(_end_text(component, port) for port in ends) for ends in component.connections]
+        lines += ["```text", *joined, "```", ""] if joined else []
+    return lines
+
+
+def _kind_text(kind: str) -> str:
+    return {"learned": "function"}.get(kind, kind)
+
+
+def _value_text(value: Any) -> str:
+    return code(text_of(value))
+
+
+def _unit_text(unit: str) -> str:
+    return "" if unit == "" else unit
+
+
+def _start_text(variable: Any) -> str:
+    if variable.default is not None:
+        return f"`{variable.default:g}` unless given"
+    if variable.start is None:
+        return ""
+    return f"{code(text_of(variable.start))}{'' if variable.fixed else ' (a guess)'}"
+
+
+def _end_text(component: Component, port: Any) -> str:
+    return port.name if port.component is component else f"{port.component.name}.{port.name}"
+
+
+def page(domain: str) -> str:
+    """The page of a domain, in Markdown."""
+    module = importlib.import_module(f"{jaxonomy_dae.library.__name__}.{domain}")
+    head, _, rest = (inspect.getdoc(module) or "").partition("\n")
+    lines = [f"# {domain.capitalize()}", "", f"`{module.__name__}`: {head}", rest, ""]
+    for cls in classes_of(domain):
+        lines += component_section(cls)
+    return "\n".join(lines)
+
+
+def overview() -> str:
+    """The first page: all components of all domains, with the first sentence of what they are."""
+    lines = [
+        "# Components",
+        "",
+        "The components of `jaxonomy_dae.library`, by domain. The pages are made from the code: what they show is what",
+        "is compiled. All components take the environment and a name first; the values of parameters may be numbers or,",
+        "within a component, expressions in its parameters.",
+        "",
+    ]
+    for domain in domains():
+        lines += [f"## [{domain.capitalize()}]({domain}.md)", ""]
+        names = (f"[{cls.__name__}]({domain}.md#{cls.__name__.lower()})" for cls in classes_of(domain))
+        lines += [", ".join(names), ""]
+    return "\n".join(lines)
+
+
+# --- hooks of MkDocs ---------------------------------------------------------------------------------------------
+
+
+def on_config(config: Any) -> Any:
+    pages = ["library/index.md", *({d.capitalize(): f"library/{d}.md"} for d in domains())]
+    config.nav = [{TITLE: pages} if TITLE in entry else entry for entry in config.nav]
+    return config
+
+
+def on_files(files: Any, config: Any) -> Any:
+    from mkdocs.structure.files import File
+
+    for name, content in [("index", overview()), *((d, page(d)) for d in domains())]:
+        files.append(File.generated(config, f"library/{name}.md", content=content))
+    return files
