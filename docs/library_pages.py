@@ -14,14 +14,13 @@ from typing import Any
 
 import jax
 import sympy
-from sympy.printing.precedence import precedence
 from sympy.printing.str import StrPrinter
 
 import jaxonomy_dae.library
 from jaxonomy_dae import Component, EqnEnv
-from jaxonomy_dae.modeling.events import Assign, Reinit, Sampled, Terminate, When
+from jaxonomy_dae.modeling.events import Assign, Reinit, Sampled, Terminate
 from jaxonomy_dae.modeling.interval import Interval
-from jaxonomy_dae.modeling.symbols import RelationSymbol
+from jaxonomy_dae.modeling.symbols import ParameterSymbol, RelationSymbol
 
 # Of components that need more than an environment and a name.
 ARGUMENTS: dict[str, dict[str, Any]] = {
@@ -40,7 +39,7 @@ TITLE = "Library"
 
 
 def classes_of(domain: str) -> list[type[Component]]:
-    """The components of a domain, in the order in which its code, or its list of names, has them."""
+    """The components of a domain, in the order in which its code has them."""
     module = importlib.import_module(f"{jaxonomy_dae.library.__name__}.{domain}")
     is_package = hasattr(module, "__path__")
     found = {
@@ -51,7 +50,8 @@ def classes_of(domain: str) -> list[type[Component]]:
         and not name.startswith("_")
         and (value.__module__.startswith(f"{module.__name__}.") if is_package else value.__module__ == module.__name__)
     }
-    return list(found)
+    modules = list(dict.fromkeys(cls.__module__ for cls in found))
+    return sorted(found, key=lambda cls: (modules.index(cls.__module__), inspect.getsourcelines(cls)[1]))
 
 
 def domains() -> list[str]:
@@ -70,20 +70,34 @@ def make(cls: type[Component]) -> Component:
 
 
 @contextmanager
-def equations_as_written() -> Iterator[list[Any]]:
-    """The equations that components are given meanwhile, both sides of them, outermost component only."""
-    written: list[Any] = []
-    plain = Component.add_equations
+def as_written() -> Iterator[tuple[list[Any], list[Any]]]:
+    """The equations and events that components are given meanwhile, each with its component."""
+    equations: list[Any] = []
+    events: list[Any] = []
+    add_equations, event = Component.add_equations, Component._event
 
-    def noted(self: Component, *equations: Any) -> None:
-        written.extend((self, equation) for equation in equations)
-        plain(self, *equations)
+    def noted_equations(self: Component, *given: Any) -> None:
+        equations.extend((self, equation) for equation in given)
+        add_equations(self, *given)
 
-    Component.add_equations = noted
+    def noted_event(
+        self: Component,
+        condition: Any,
+        actions: Any,
+        on: Any,
+        immediate: bool,
+        noted: bool = True,
+        revocable: bool = False,
+    ) -> None:
+        if noted:
+            events.append((self, condition, actions, on))
+        event(self, condition, actions, on, immediate, noted, revocable)
+
+    Component.add_equations, Component._event = noted_equations, noted_event
     try:
-        yield written
+        yield equations, events
     finally:
-        Component.add_equations = plain
+        Component.add_equations, Component._event = add_equations, event
 
 
 # --- texts -------------------------------------------------------------------------------------------------------
@@ -95,19 +109,22 @@ class Printer(StrPrinter):
     def _print_Mul(self, expr: Any) -> str:
         number, rest = expr.as_coeff_Mul()
         if number < 0:
-            inside = self._print(-expr)
-            return f"−({inside})" if isinstance(-expr, sympy.Add) else f"−{inside}"
+            return f"−{self._inside(-expr, (-expr).is_Add)}"
+        if number == sympy.Float(1):
+            return self._print(rest)
         above, below = sympy.fraction(expr, exact=True)
-        if below != 1:
-            denominator = self._inside(below, precedence(below) <= precedence(expr) and not below.is_Pow)
-            return f"{self._inside(above, above.is_Add)}/{denominator}"
-        return "·".join(self._inside(f, f.is_Add or f.is_Piecewise) for f in sympy.Mul.make_args(expr))
+        if below is not sympy.S.One:
+            return f"{self._inside(above, above.is_Add)}/{self._inside(below, below.is_Mul or below.is_Add)}"
+        factors = sorted(sympy.Mul.make_args(expr), key=_rank)
+        turned = [f.is_Add and all(map(_is_negative, f.args)) for f in factors]
+        text = "·".join(self._inside(-f if turn else f, f.is_Add) for f, turn in zip(factors, turned, strict=True))
+        return ("−" if sum(turned) % 2 else "") + text
 
     def _print_Add(self, expr: Any, order: Any = None) -> str:
-        terms = sorted(self._as_ordered_terms(expr, order=order), key=lambda t: t.could_extract_minus_sign())
+        terms = sorted(self._as_ordered_terms(expr, order=order), key=lambda t: (_is_negative(t), not t.is_number))
         text = ""
         for term in terms:
-            negative = term.could_extract_minus_sign()
+            negative = _is_negative(term)
             inside = self._print(-term if negative else term)
             sign = (" − " if negative else " + ") if text else ("−" if negative else "")
             text += sign + (f"({inside})" if negative and (-term).is_Add else inside)
@@ -115,14 +132,15 @@ class Printer(StrPrinter):
 
     def _print_Pow(self, expr: Any, rational: bool = False) -> str:
         base, exponent = expr.base, expr.exp
-        if exponent == sympy.Rational(1, 2):
-            return f"√({self._print(base)})"
         if exponent.is_Rational and exponent < 0:
-            return f"1/{self._inside(base**-exponent, not (base**-exponent).is_Atom and not (base**-exponent).is_Pow)}"
+            below = base**-exponent
+            return f"1/{self._inside(below, below.is_Mul or below.is_Add)}"
+        if exponent == sympy.Rational(1, 2):
+            return f"√{self._inside(base, not base.is_Integer)}"
         text = self._inside(base, not base.is_Atom and not base.is_Function)
         if exponent.is_Integer:
             return text + str(exponent).translate(SUPERSCRIPTS)
-        return f"{text}^{self._inside(exponent, not exponent.is_Atom)}"
+        return f"{text}^{self._inside(exponent, not exponent.is_Symbol)}"
 
     def _inside(self, expr: Any, parenthesised: bool) -> str:
         return f"({self._print(expr)})" if parenthesised else self._print(expr)
@@ -132,6 +150,11 @@ class Printer(StrPrinter):
 
     def _print_Integer(self, expr: Any) -> str:
         return str(expr).replace("-", "−")
+
+    def _print_TimeSymbol(self, expr: Any) -> str:
+        return "t"
+
+    _print_EnvironmentTime = _print_TimeSymbol
 
     def _print_Pi(self, expr: Any) -> str:
         return "π"
@@ -160,6 +183,20 @@ class Printer(StrPrinter):
         return f"({', '.join(parts)})"
 
 
+def _is_negative(term: Any) -> bool:
+    return bool(term.as_coeff_Mul()[0] < 0)
+
+
+def _rank(factor: Any) -> tuple[int, str]:
+    """Numbers first, then parameters, sums, variables and functions."""
+    base = factor.base if factor.is_Pow else factor
+    if base.is_number:
+        return (0 if base.is_Number else 1), str(factor)
+    if base.is_Symbol:
+        return (2 if isinstance(base, ParameterSymbol) else 4), str(factor)
+    return (3 if base.is_Add else 5), str(factor)
+
+
 def text_of(expression: Any) -> str:
     return Printer().doprint(sympy.sympify(expression))
 
@@ -171,13 +208,13 @@ def equation_text(equation: Any) -> str:
     return f"0 = {text.removeprefix('(').removesuffix(')') if isinstance(equation, sympy.Piecewise) else text}"
 
 
-def event_text(event: When) -> str:
-    if isinstance(event.clock, Sampled):
-        offset = f", from {text_of(event.clock.offset)} s on" if event.clock.offset else ""
-        condition = f"every {text_of(event.clock.period)} s{offset}"
+def event_text(condition: Any, actions: Iterable[Any], on: Any) -> str:
+    if isinstance(condition, Sampled):
+        offset = f", from {text_of(condition.offset)} s on" if condition.offset else ""
+        text = f"every {text_of(condition.period)} s{offset}"
     else:
-        condition = f"when {event.text}".replace(", on=", ", while ").replace("<=", "≤").replace(">=", "≥")
-    return f"{condition}: {', '.join(map(_action_text, event.actions))}"
+        text = f"when {text_of(condition)}" + (f", while {text_of(on)}" if on is not None else "")
+    return f"{text}: {', '.join(map(_action_text, actions))}"
 
 
 def _action_text(action: Any) -> str:
@@ -212,7 +249,7 @@ def code(text: str) -> str:
 
 
 def component_section(cls: type[Component]) -> list[str]:
-    with equations_as_written() as written:
+    with as_written() as (equations, events):
         component = make(cls)
     signature = inspect.signature(cls.__init__)
     given = [p for p in signature.parameters.values() if p.name not in ("self", "ev", "name")]
@@ -251,12 +288,12 @@ def component_section(cls: type[Component]) -> list[str]:
             *((code(p.name), "discrete", _unit_text(p.unit), _value_text(p.value)) for p in discrete),
         ],
     )
-    own = [equation_text(equation) for owner, equation in written if owner is component]
+    own = [equation_text(equation) for owner, equation in equations if owner is component]
     if own:
         lines += ["```text", *own, "```", ""]
-    events = [event_text(event) for event in component.events if event.noted]
-    if events:
-        lines += ["Events:", "", "```text", *events, "```", ""]
+    happens = [event_text(*event) for owner, *event in events if owner is component]
+    if happens:
+        lines += ["Events:", "", "```text", *happens, "```", ""]
     if component.children:
         lines += ["Parts:", ""]
         lines += table(("Part", "Component"), ((code(c.name), type(c).__name__) for c in component.children.values()))
@@ -304,9 +341,10 @@ def overview() -> str:
     lines = [
         "# Components",
         "",
-        "The components of `jaxonomy_dae.library`, by domain. The pages are made from the code: what they show is what",
-        "is compiled. All components take the environment and a name first; the values of parameters may be numbers or,",
-        "within a component, expressions in its parameters.",
+        "The components of `jaxonomy_dae.library`, by domain. These pages are made from the code: equations, defaults",
+        "and units are those that are compiled. All components take the environment and a name first; the values of",
+        "parameters may be numbers or, within a component, expressions in its parameters. The unit of numbers is 1;",
+        "what has no unit, as most signals, takes that of what it is connected to.",
         "",
     ]
     for domain in domains():

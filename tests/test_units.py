@@ -265,7 +265,7 @@ def test_the_whole_message():
         "units do not fit in 2 places:\n"
         "- one (Spring): 0 = -k*x**2 + f: what is added or equal needs one unit, but 'f' is in N and 'k*x**2' in J "
         "(2 more components like it)\n"
-        "- one (Spring): 0 = -time + x: what is added or equal needs one unit, but 'time' is in s and 'x' in m "
+        "- one (Spring): 0 = -time + x: what is added or equal needs one unit, but 'x' is in m and 'time' in s "
         "(2 more components like it)"
     )
     AcausalCompiler(EV, diagram)  # is asked for nothing
@@ -303,7 +303,7 @@ def test_starts_and_dependent_parameters():
 
     assert wrong(Cart(EV, "c")) == [
         f"c (Cart): the start of 'x' = v0: {ADDED}, but 'x' is in m and 'v0' in m/s",
-        f"c (Cart): the start of 'der(y)' = x0: {ADDED}, but 'der(y)' is in m/s and 'x0' in m",
+        f"c (Cart): the start of 'der(y)' = x0: {ADDED}, but 'x0' is in m and 'der(y)' in m/s",
         f"c (Cart): 'area' = x0**2: {ADDED}, but 'area' is in m and 'x0**2' in m2",
     ]
 
@@ -330,7 +330,7 @@ def test_variables_of_children_have_the_units_of_the_child():
 
     assert wrong(Holder(EV, "one", "m"), Holder(EV, "two", "")) == []
     (line,) = wrong(Holder(EV, "one", "m"), Holder(EV, "two", "kg"))
-    assert line == f"two (Holder): 0 = -x.a + y: {ADDED}, but 'x.a' is in kg and 'y' in m"
+    assert line == f"two (Holder): 0 = -x.a + y: {ADDED}, but 'y' is in m and 'x.a' in kg"
 
 
 class Ball(Component):
@@ -374,7 +374,7 @@ def test_branches_of_an_equation_need_not_agree():
 
     assert wrong(Valve(EV, "v", "m3/s")) == []
     (line,) = wrong(Valve(EV, "v", "kg/s"))
-    assert line.endswith(f"{ADDED}, but 'leak' is in kg/s and 'q' in m3/s")
+    assert line.endswith(f"{ADDED}, but 'q' is in m3/s and 'leak' in kg/s")
 
 
 def test_accounts_of_energy():
