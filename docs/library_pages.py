@@ -17,7 +17,7 @@ import sympy
 from sympy.printing.str import StrPrinter
 
 import jaxonomy_dae.library
-from jaxonomy_dae import Component, EqnEnv
+from jaxonomy_dae import Component, Domain, EqnEnv
 from jaxonomy_dae.modeling.events import Assign, Reinit, Sampled, Terminate
 from jaxonomy_dae.modeling.interval import Interval
 from jaxonomy_dae.modeling.symbols import ParameterSymbol, RelationSymbol
@@ -260,21 +260,11 @@ def component_section(cls: type[Component]) -> list[str]:
     )
     lines = [f"## {cls.__name__}", "", "```python", f"{cls.__name__}(ev, name{arguments})", "```", ""]
     lines += [inspect.getdoc(cls) or "", ""]
-    lines += table(
-        ("Port", "Domain", "Variables"),
-        (
-            (
-                code(p.name),
-                p.domain.name,
-                ", ".join(f"`{v}` [{unit}]" for v, unit in (*p.domain.across, *p.domain.through)),
-            )
-            for p in component.ports.values()
-        ),
-    )
+    lines += [_ports_text(component), ""]
     lines += table(
         ("Parameter", "Default", "Unit", "Bounds"),
         (
-            (code(p.name), _value_text(p.value), _unit_text(p.unit), bounds_text(p.bounds))
+            (code(p.name), _value_text(p.value), p.unit, bounds_text(p.bounds))
             for p in component.parameters.values()
             if not p.is_discrete
         ),
@@ -284,8 +274,8 @@ def component_section(cls: type[Component]) -> list[str]:
     lines += table(
         ("Variable", "Kind", "Unit", "Start"),
         [
-            *((code(v.name), _kind_text(v.kind), _unit_text(v.unit), _start_text(v)) for v in shown),
-            *((code(p.name), "discrete", _unit_text(p.unit), _value_text(p.value)) for p in discrete),
+            *((code(v.name), _kind_text(v.kind), v.unit, _start_text(v)) for v in shown),
+            *((code(p.name), "discrete", p.unit, _value_text(p.value)) for p in discrete),
         ],
     )
     own = [equation_text(equation) for owner, equation in equations if owner is component]
@@ -302,16 +292,25 @@ def component_section(cls: type[Component]) -> list[str]:
     return lines
 
 
+def _ports_text(component: Component) -> str:
+    """Ports: `p`, `n` (Electrical: `v` [V], `i` [A])."""
+    by_domain: dict[Domain, list[str]] = {}
+    for port in component.ports.values():
+        by_domain.setdefault(port.domain, []).append(code(port.name))
+    groups = []
+    for domain, names in by_domain.items():
+        quantities = ", ".join(f"{code(name)} [{unit}]" for name, unit in (*domain.across, *domain.through))
+        groups.append(f"{', '.join(names)} ({domain.name}: {quantities})")
+    label = "Port" if len(component.ports) == 1 else "Ports"
+    return f"{label}: {'; '.join(groups)}." if groups else ""
+
+
 def _kind_text(kind: str) -> str:
-    return {"learned": "function"}.get(kind, kind)
+    return {"learned": "function", "variable": ""}.get(kind, kind)
 
 
 def _value_text(value: Any) -> str:
     return code(text_of(value))
-
-
-def _unit_text(unit: str) -> str:
-    return "" if unit == "" else unit
 
 
 def _start_text(variable: Any) -> str:

@@ -388,7 +388,7 @@ def test_accounts_of_energy():
             self.declare_dissipation(J * w * der(w))
 
     assert wrong(Flywheel(EV, "f")) == [
-        "f (Flywheel): the supply J*w**2: what is added or equal needs one unit, but 'supply' is in W and 'J*w**2' in J"
+        "f (Flywheel): the supply J*w**2: what is added or equal needs one unit, but 'J*w**2' is in J and 'supply' in W"
     ]
 
 
