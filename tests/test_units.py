@@ -127,6 +127,8 @@ RIGHT = {
     "numbers beside a quantity": of(
         "m", "K", "m", write=lambda a, b, c: (Eq(a, 5), Eq(c, Piecewise((2, b > 350), (Max(a, 3), True))), Eq(a, c + 1))
     ),
+    "numbers in a difference": of("W", "K", "W/K", write=lambda q, T, g: Eq(q, g * (T - 293.15))),
+    "a number of degC": of("degC", "W", "W/K", write=lambda c, q, g: (Eq(c, 20), Eq(q, g * (c - 20)))),
     "zero": of("m", "m", write=lambda a, b: Eq(Max(a, 0), Piecewise((b, b > 0), (0, True)))),
     "numbers": of("1", "K", "1/K", write=lambda y, dT, alpha: Eq(y, 1 + alpha * dT)),
     "a number of percent": of("%", "%", write=lambda y, u: Eq(y, 100 - u)),
@@ -160,6 +162,7 @@ UNKNOWN = {
     "a factor": of("N", "", "s", write=lambda a, k, t: Eq(a, k * t)),
     "a function": of("1", "", write=lambda a, b: Eq(a, sin(b) + exp(b))),
     "an exponent": of("1", "", "m", write=lambda a, n, x: Eq(a, (x / x) ** n)),
+    "a base and an exponent": of("m2", "", "", write=lambda a, b, n: Eq(a, b**n)),
     "a base": of("1", "", "1", write=lambda a, b, n: Eq(a, b**n)),
     "with a number": of("m", "", "m", write=lambda a, b, c: Eq(a, (b + 1) * c)),
     "of both kinds": of("m", "", "s", write=lambda a, b, c: (Eq(a, b), Eq(c, b))),
@@ -183,10 +186,7 @@ MISFITS = [
     (of("m", "m", write=lambda x, y: Eq(der(x), y)), f"{ADDED}, but 'b' is in m and 'der(a)' in m/s"),
     (of("m", "m", write=lambda x, y: Eq(x, y + EV.t)), f"{ADDED}, but 'a' is in m and 'time' in s"),
     (of("1", "K", write=lambda y, dT: Eq(y, 1 + dT)), f"{ADDED}, but 'a' is in 1 and 'b' in K"),
-    (
-        of("m", "1", write=lambda x, y: Eq(y * x, x * (x + 5))),
-        f"{ADDED}, but 'a' is in m and 5 is a number: declare a parameter with a unit for it",
-    ),
+    (of("m", "1", write=lambda x, y: Eq(y * x, x * (x + 5))), f"{ADDED}, but 'a*b' is in m and 'a*(a + 5)' in m2"),
     (of("mm", "m", write=lambda a, b: Eq(a, b)), f"{ADDED}, but 'a' is in mm and 'b' in m (1 m is 1000 mm)"),
     (of("mm", "m", write=lambda a, b: Eq(a, 2 * b)), f"{ADDED}, but 'a' is in mm and '2*b' in m (1 m is 1000 mm)"),
     (
@@ -223,6 +223,10 @@ MISFITS = [
     ),
     (
         of("K", "degC", write=lambda k, c: Eq(k, c)),
+        f"{ADDED}, but the zero of 'b', in degC, does not cancel: convert it to K, or take a difference, in 'a'",
+    ),
+    (
+        of("K", "degC", write=lambda k, c: Eq(k, c + 20)),
         f"{ADDED}, but the zero of 'b', in degC, does not cancel: convert it to K, or take a difference, in 'a'",
     ),
     (
@@ -345,6 +349,17 @@ class Ball(Component):
         self.add_equations(Eq(der(h), v), Eq(der(v), 0))
         self.when(And(h <= low, v < limit), reinit(v, -e * pre(v)), reinit(h, 0), assign(n, pre(n) + one))
         self.when(self.sampled(T), assign(n, 0))
+
+
+def test_relations_that_are_events_are_reported_once():
+    class Step(Component):
+        def __init__(self, ev, name):
+            super().__init__(ev, name)
+            start = self.parameter("start", 1.0, unit="m")
+            self.output("y", Piecewise((1, self.relation(ev.t >= start)), (0, True)))
+
+    (line,) = wrong(Step(EV, "step"))
+    assert line.endswith("sides of a comparison need one unit, but 'time' is in s and 'start' in m")
 
 
 @pytest.mark.parametrize(

@@ -165,6 +165,8 @@ def _statements(component: Component, unit_of: UnitOf) -> Iterator[Statement]:
         for value, action in zip(when.values, when.actions, strict=True)
         if isinstance(value, str) and not isinstance(action, Terminate)
     }
+    # A relation that is an event stands in an equation, too.
+    unseen = {name for when in component.events if not when.noted for name in (when.guard, *when.values)}
     for equation in component.equations:
         # What events compute are hidden variables, each with an equation of its own.
         event = None
@@ -172,6 +174,8 @@ def _statements(component: Component, unit_of: UnitOf) -> Iterator[Statement]:
             event = next((s for s in symbols_of(equation) if s.name in guards or s.name in writes), None)
         if event is None:
             yield Statement(f"0 = {shortened(equation)}", equation, misfits_of_equation)
+        elif event.name in unseen:
+            continue
         elif event.name in guards:
             yield Statement(f"when({guards[event.name].text})", event - equation, misfits_of_condition)
         else:

@@ -2,8 +2,7 @@
 
 Given the graph of an equation, a condition or a value, and the units of its leaves (None where a unit is not known),
 returns a sentence for each operation whose arguments do not fit. What has no known unit fits everything, so no sentence
-rests on one. Zero fits everything. Other constants are numbers without unit where they are multiplied, or added within
-products and functions; in equations, comparisons, branches, min and max they have the unit of what they stand beside.
+rests on one. Constants are numbers without unit where they multiply, and fit what they are added to or compared with.
 Functions of time and numbers alone, such as sin(100*time), have no known unit: nothing else in them could have one.
 """
 
@@ -16,7 +15,7 @@ from typing import Any
 
 import sympy
 
-from ..expressions.node import Node, leaf, linear, postorder
+from ..expressions.node import Node, Number, leaf, linear, postorder, scale
 from ..expressions.to_sympy import shortened, write
 from .unit import NUMBER, Unit, interval, is_close, product
 
@@ -127,15 +126,14 @@ class _Walk:
                 for c, a, known in zip(coefficients, node.arguments, inside, strict=True)
             ]
             if start:
-                terms.append(Term(lambda: _text(None, start), Measured(NUMBER, is_constant=True), float(start)))
+                terms.append(Term(lambda: str(start), Measured(NUMBER, is_constant=True), float(start)))
             return self.agree(terms, ONE_UNIT["sum"], is_zero)
         if operation == "product":
             return self._product(node, inside, [Fraction(e).limit_denominator(10**6) for e in node.data])
         if operation == "power":
             self._needs_number(node.arguments[1], "an exponent is a number")
-            if inside[1] is None or not inside[1].is_constant:
-                self._needs_number(node.arguments[0], "what is raised to an exponent that is not constant is a number")
-            return Measured(NUMBER)
+            self._needs_number(node.arguments[0], "what is raised to an exponent that is not constant is a number")
+            return None if inside[0] is None else Measured(NUMBER)
         if operation in CONDITIONS:
             return None
         if operation in COMPARISONS:
@@ -191,7 +189,6 @@ class _Walk:
         values = list(values)
         points = {v.unit for v in values if v is not None and v.unit.zero}
         terms = [Term(lambda a=a: _text(a), v) for a, v in zip(nodes, values, strict=True)]
-        terms = [t for t in terms if t.value is None or not t.value.is_constant] or terms
         others = [v for v in values if v is not None and not v.unit.zero]
         if points and others:
             named = [(t.name(), t.value.unit) for t in terms if t.value is not None]
@@ -217,12 +214,13 @@ class _Walk:
                 self.found.append(f"{rule}, but {misfit_of_units(named)}")
                 return None
             weight = sum(t.coefficient for t, _ in points)
-            start = sum(t.coefficient for t, v in known if v.is_constant)
+            start = sum(t.coefficient * v.number for t, v in known if v.is_constant)
+            quantities = sum(not v.is_constant for _, v in known)
             if weight and start and is_close(start * unit.scale, weight * unit.zero):
                 known = [(t, v) for t, v in known if not v.is_constant]  # T + 273.15
             elif is_zero:
-                cancels = abs(weight) < 1e-9 or len(terms) == 1
-                if all_known and not cancels and not start and not any(v.is_loose for _, v in known):
+                cancels = abs(weight) < 1e-9 or quantities == 1
+                if all_known and not cancels and not any(v.is_loose for _, v in known):
                     other = next((t for t, v in known if not v.unit.zero), points[0][0])
                     self.found.append(
                         f"{rule}, but the zero of '{points[0][0].name()}', in {unit}, does not cancel: convert it to "
@@ -232,41 +230,39 @@ class _Walk:
             elif is_close(abs(weight), 1.0):
                 zero = unit.zero
         values = [
-            (t, dataclasses.replace(v, unit=interval(v.unit), number=abs(v.number * t.coefficient))) for t, v in known
+            (t, dataclasses.replace(v, unit=interval(v.unit), number=abs(v.number * t.coefficient)))
+            for t, v in known
+            if not v.is_constant
         ]
-        if is_zero:
-            values = [(t, v) for t, v in values if not v.is_constant] or values
+        if not values:
+            return Measured(NUMBER, is_constant=True) if all_known else None
         dimensions = [v.unit.dimension for _, v in values]
         if any(d != dimensions[0] for d in dimensions):
             self._note(rule, values, _most_common(dimensions), lambda v: v.unit.dimension)
             return None
-        measured = [(t, v) for t, v in values if not v.is_constant]
-        if not measured:
-            return Measured(NUMBER, is_constant=True) if all_known else None
-        scale = _common_scale([v for _, v in measured])
-        if scale is None:
-            self._note(rule, measured, _most_common([v.unit.scale for _, v in measured]), lambda v: v.unit.scale)
+        common = _common_scale([v for _, v in values])
+        if common is None:
+            self._note(rule, values, _most_common([v.unit.scale for _, v in values]), lambda v: v.unit.scale)
             return None
-        text = next((v.unit.text for _, v in measured if is_close(v.unit.scale, scale)), "")
-        numbers = [v.number for _, v in measured]
-        number = numbers[0] if all(is_close(n, numbers[0]) for n in numbers) and len(values) == len(measured) else 1.0
+        text = next((v.unit.text for _, v in values if is_close(v.unit.scale, common)), "")
+        numbers = [v.number for _, v in values]
+        has_one = all(is_close(n, numbers[0]) for n in numbers) and not any(v.is_constant for _, v in known)
+        number = numbers[0] if has_one else 1.0
         is_loose = any(v.is_loose for _, v in values)
-        return Measured(Unit(dimensions[0], scale, zero, text), number, is_loose=is_loose)
+        return Measured(Unit(dimensions[0], common, zero, text), number, is_loose=is_loose)
 
     def _note(
         self, rule: str, values: list[tuple[Term, Measured]], usual: Any, aspect: Callable[[Measured], Any]
     ) -> None:
         """Notes that an aspect of the values, which is `usual` for most of them, is not the same for all."""
-        named = sorted(((v.is_constant, len(t.name()), t.name(), v) for t, v in values), key=lambda row: row[:3])
-        one = next(row for row in named if aspect(row[-1]) == usual)
-        odd = next(row for row in named if aspect(row[-1]) != usual)
-        (_, _, a, first), (_, _, b, second) = sorted((one, odd), key=named.index)
-        said = f"and '{b}' in {second.unit}"
-        if second.is_constant:
-            said = f"and {b} is a number: declare a parameter with a unit for it"
-        elif first.unit.dimension == second.unit.dimension:
-            said += f" ({_conversion(first.unit, second.unit)})"
-        self.found.append(f"{rule}, but '{a}' is in {first.unit} {said}")
+        named = sorted(((t.name(), v) for t, v in values), key=lambda row: (len(row[0]), row[0]))
+        one = next(row for row in named if aspect(row[1]) == usual)
+        odd = next(row for row in named if aspect(row[1]) != usual)
+        (a, first), (b, second) = sorted((one, odd), key=named.index)
+        factor = ""
+        if first.unit.dimension == second.unit.dimension:
+            factor = f" ({_conversion(first.unit, second.unit)})"
+        self.found.append(f"{rule}, but '{a}' is in {first.unit} and '{b}' in {second.unit}{factor}")
 
 
 def _most_common(items: Sequence[Any]) -> Any:
@@ -304,12 +300,8 @@ def _conversion(a: Unit, b: Unit) -> str:
     return f"1 {coarse} is {ratio} {fine}" if coarse.text and fine.text else f"a factor of {ratio}"
 
 
-def _text(node: Node | None, coefficient: Any = 1) -> str:
-    factor = abs(sympy.Rational(coefficient.numerator, coefficient.denominator) if isinstance(coefficient, Fraction)
-                 else sympy.sympify(coefficient))  # fmt: skip
-    if node is None:
-        return f"{float(factor):g}"
-    return shortened(factor * write(node, lambda label: sympy.Symbol(name_of(label))))
+def _text(node: Node, coefficient: Number = 1) -> str:
+    return shortened(write(scale(abs(coefficient), node), lambda label: sympy.Symbol(name_of(label))))
 
 
 def name_of(label: Any) -> str:
