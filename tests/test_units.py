@@ -7,6 +7,7 @@ import pytest
 from library_pages import components_of, domains
 from problems import compiled
 from sympy import Abs, And, Heaviside, Max, Min, Mod, Piecewise, atan2, exp, log, pi, sign, sin, sqrt
+from testset import PROBLEMS
 
 from jaxonomy_dae import (
     AcausalCompiler,
@@ -456,6 +457,12 @@ def test_components_of_the_library_declare_units(domain):
         if not declared.unit and getattr(declared, "kind", "") not in ("event", "start")
     ]
     assert set(without) <= set(ANY_UNIT)
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_published_models_fit(name):
+    _, diagram = PROBLEMS[name].build()
+    check_units(diagram)
 
 
 # --- cost --------------------------------------------------------------------------------------------------------
