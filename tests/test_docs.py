@@ -45,6 +45,11 @@ def test_every_name_in_the_api_exists():
             assert hasattr(importlib.import_module(module), last), name
 
 
+def test_what_components_inherit_is_in_the_api():
+    text = (DOCS / "api" / "modeling.md").read_text()
+    assert "::: jaxonomy_dae.Component\n    options:\n      inherited_members: true\n" in text  # when, discrete, …
+
+
 def test_all_domains_have_pages():
     assert {
         "electrical", "friction", "hydraulic", "planar", "rotational", "signal", "thermal", "translational",
