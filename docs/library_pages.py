@@ -210,8 +210,8 @@ def equation_text(equation: Any) -> str:
 
 def event_text(condition: Any, actions: Iterable[Any], on: Any) -> str:
     if isinstance(condition, Sampled):
-        offset = f", from {text_of(condition.offset)} s on" if condition.offset else ""
-        text = f"every {text_of(condition.period)} s{offset}"
+        offset = f", from {text_of(condition.offset)} on" if condition.offset else ""
+        text = f"every {text_of(condition.period)} seconds{offset}"
     else:
         text = f"when {text_of(condition)}" + (f", while {text_of(on)}" if on is not None else "")
     return f"{text}: {', '.join(map(_action_text, actions))}"

@@ -98,7 +98,7 @@ def test_events_and_parts():
     assert "0 = v − Ron·i if closed = 1, i − Goff·v otherwise" in electrical
     assert "| `inductor` | Inductor |" in electrical and "inductor.n — emf.p" in electrical
     signal = page("signal")
-    assert "every period s: held becomes u" in signal
+    assert "every period seconds: held becomes u" in signal
     assert "y = height·(1 if t ≥ start_time, 0 otherwise) + offset" in signal
 
 

@@ -71,7 +71,7 @@ class Radiation(_TwoPort):
     metre.
 
     The emissivity 0 ≤ `eps` ≤ 1 is that of a small body in large surroundings; for surfaces that face each other, the
-    effective one of both, view factor included. sigma = 5.670374419e-8 W/(m²·K⁴).
+    effective one of both, view factor included. The parameter `sigma` is 5.670374419e-8 W/(m²·K⁴).
     """
 
     def __init__(self, ev: EqnEnv, name: str, eps: Value = 0.9, A: Value = 1.0):
