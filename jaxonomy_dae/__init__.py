@@ -13,6 +13,7 @@ from .errors import ModelError as ModelError
 from .errors import SimulationError as SimulationError
 from .errors import SteadyStateError as SteadyStateError
 from .errors import StructuralError as StructuralError
+from .errors import UnitError as UnitError
 from .modeling import AcausalDiagram as AcausalDiagram
 from .modeling import Component as Component
 from .modeling import Domain as Domain

@@ -12,6 +12,10 @@ class StructuralError(ModelError):
     """The equations and the unknowns do not fit together, whatever their values."""
 
 
+class UnitError(ModelError):
+    """Units do not fit together, or a text is not a unit."""
+
+
 class InitializationError(RuntimeError):
     """No consistent initial point was found."""
 

@@ -38,6 +38,7 @@ def plot_solution(solution: "Solution", *names: str, ax: Any = None) -> Any:
     names = tuple(one for name in names for one in _lines(solution, name))
     first = {name: (solution.system.plan.entries(name) or ([name],))[0][0] for name in names}
     shown = [units.get(first[n], "") for n in names]
+    shown = ["" if unit == "1" else unit for unit in shown]
     common = shown[0] if len(set(shown)) == 1 else None
     for name, unit in zip(names, shown, strict=True):
         label = name if common is not None or not unit else f"{name} [{unit}]"

@@ -11,13 +11,14 @@ from sympy import Abs, And, Max, Ne, Piecewise, sign
 
 from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Rotational, Translational, Value, assign, der
 
-STANDSTILL = 1e-6  # a speed below which parts that are pressed together stick at once
+STANDSTILL = 1e-6  # m/s or rad/s
 
 
 def stick_slip(
     component: Component, speed: Any, friction: Any, sliding: Any, breakaway: Any, pressed: Any = None
 ) -> None:
-    """Adds the friction between two parts to a component.
+    """Adds the friction between two parts to a component; below the speed of its parameter `standstill`, parts that are
+    pressed together stick at once.
 
     **Arguments:**
 
@@ -26,10 +27,11 @@ def stick_slip(
     - `breakaway`: the largest friction while they stick, ≥ sliding.
     - `pressed`: what is positive while the parts are pressed together; None if they always are.
     """
-    mode = component.discrete("mode", start=2)
+    mode = component.discrete("mode", start=2, unit="1")
+    still = component.parameter("standstill", STANDSTILL, unit=component.variables[str(speed)].unit, bounds=POSITIVE)
     branch = Piecewise((0, Eq(mode, 2)), (mode * sliding, True))
     component.either(Eq(mode, 0), der(speed), friction - branch)
-    direction = Piecewise((1, speed > STANDSTILL), (-1, speed < -STANDSTILL), (0, True))
+    direction = Piecewise((1, speed > still), (-1, speed < -still), (0, True))
     moving = Eq(Abs(mode), 1)
     if pressed is None:
         component.when(Eq(mode, 2), assign(mode, direction), at_start=True)
@@ -45,19 +47,20 @@ class Clutch(Component):
     """Two shafts pressed together: the input `u` is the normal force as a part of `fn_max`.
 
     While they slide, tau = mode·mu·cgeo·fn with fn = fn_max·max(u, 0); they stick until |tau| reaches peak times that;
-    w_rel = der(flange_b.phi − flange_a.phi). `mu`, `fn_max` (newton), `cgeo` (metre) ≥ 0; `peak` ≥ 1.
+    w_rel = der(flange_b.phi − flange_a.phi). `mu`, `fn_max` (newton), `cgeo` (metre) ≥ 0; `peak` ≥ 1. Shafts that are
+    pressed together at a speed below the parameter `standstill` (rad/s) stick at once.
     """
 
     def __init__(
         self, ev: EqnEnv, name: str, mu: Value = 0.5, fn_max: Value = 1.0, cgeo: Value = 1.0, peak: Value = 1.0
     ):
         super().__init__(ev, name)
-        coefficient = self.parameter("mu", mu, bounds=NONNEGATIVE)
+        coefficient = self.parameter("mu", mu, unit="1", bounds=NONNEGATIVE)
         largest = self.parameter("fn_max", fn_max, unit="N", bounds=NONNEGATIVE)
         geometry = self.parameter("cgeo", cgeo, unit="m", bounds=NONNEGATIVE)
-        ratio = self.parameter("peak", peak, bounds=(1.0, float("inf")))
+        ratio = self.parameter("peak", peak, unit="1", bounds=(1.0, float("inf")))
         a, b = self.port("flange_a", Rotational), self.port("flange_b", Rotational)
-        u = self.input("u")
+        u = self.input("u", unit="1")
         phi = self.variable("phi_rel", unit="rad")
         w = self.variable("w_rel", unit="rad/s")
         tau = self.variable("tau", unit="N*m")
@@ -79,12 +82,12 @@ class Brake(Component):
         self, ev: EqnEnv, name: str, mu: Value = 0.5, fn_max: Value = 1.0, cgeo: Value = 1.0, peak: Value = 1.0
     ):
         super().__init__(ev, name)
-        coefficient = self.parameter("mu", mu, bounds=NONNEGATIVE)
+        coefficient = self.parameter("mu", mu, unit="1", bounds=NONNEGATIVE)
         largest = self.parameter("fn_max", fn_max, unit="N", bounds=NONNEGATIVE)
         geometry = self.parameter("cgeo", cgeo, unit="m", bounds=NONNEGATIVE)
-        ratio = self.parameter("peak", peak, bounds=(1.0, float("inf")))
+        ratio = self.parameter("peak", peak, unit="1", bounds=(1.0, float("inf")))
         flange = self.port("flange", Rotational)
-        u = self.input("u")
+        u = self.input("u", unit="1")
         w = self.variable("w", unit="rad/s")
         slipping = self.variable("slipping", unit="N*m")
         self.add_equations(Eq(w, der(flange.phi)), Eq(slipping, coefficient * geometry * largest * Max(u, 0)))
@@ -116,7 +119,7 @@ class OneWayClutch(Component):
         a, b = self.port("flange_a", Rotational), self.port("flange_b", Rotational)
         w = self.variable("w_rel", unit="rad/s")
         tau = self.variable("tau", unit="N*m")
-        locked = self.discrete("locked", start=0)
+        locked = self.discrete("locked", start=0, unit="1")
         self.add_equations(Eq(w, der(b.phi - a.phi)), Eq(b.tau, -tau), Eq(a.tau + b.tau, 0))
         self.either(Eq(locked, 1), der(w), tau)
         self.when(w <= 0, assign(locked, 1), on=Eq(locked, 0), at_start=True)

@@ -133,7 +133,7 @@ class Accumulator(Component):
         super().__init__(ev, name)
         total = self.parameter("V0", V0, unit="m3", bounds=POSITIVE)
         precharge = self.parameter("p0", p0, unit="Pa", bounds=POSITIVE)
-        exponent = self.parameter("n", n, bounds=POSITIVE)
+        exponent = self.parameter("n", n, unit="1", bounds=POSITIVE)
         start = self.parameter("initial_volume", initial_volume or 0.0, unit="m3")
         density = self.parameter("rho", rho, unit="kg/m3", bounds=POSITIVE)
         fluid = self.port("fluid", Hydraulic)
@@ -179,7 +179,7 @@ class _Restriction(_TwoPort):
 
     def _restrict(self, A: Value, Cd: Value, rho: Value, dp_small: Value, opening: sympy.Expr):
         area = self.parameter("A", A, unit="m2", bounds=NONNEGATIVE)
-        discharge = self.parameter("Cd", Cd, bounds=POSITIVE)
+        discharge = self.parameter("Cd", Cd, unit="1", bounds=POSITIVE)
         density = self.parameter("rho", rho, unit="kg/m3", bounds=POSITIVE)
         small = self.parameter("dp_small", dp_small, unit="Pa", bounds=POSITIVE)
         dp, flow = self._two_ports()
@@ -225,7 +225,7 @@ class Valve(_Restriction):
         dp_small: Value = 100.0,
     ):
         super().__init__(ev, name)
-        self._restrict(A, Cd, rho, dp_small, self.input("opening", default=1.0))
+        self._restrict(A, Cd, rho, dp_small, self.input("opening", default=1.0, unit="1"))
 
 
 class LaminarPipe(_TwoPort):
@@ -275,7 +275,7 @@ class TurbulentPipe(_TwoPort):
         super().__init__(ev, name)
         diameter = self.parameter("D", D, unit="m", bounds=POSITIVE)
         length = self.parameter("L", L, unit="m", bounds=POSITIVE)
-        friction = self.parameter("f", f, bounds=POSITIVE)
+        friction = self.parameter("f", f, unit="1", bounds=POSITIVE)
         density = self.parameter("rho", rho, unit="kg/m3", bounds=POSITIVE)
         small = self.parameter("dp_small", dp_small, unit="Pa", bounds=POSITIVE)
         dp, flow = self._two_ports()

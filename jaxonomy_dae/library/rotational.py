@@ -83,7 +83,7 @@ class IdealGear(Component):
 
     def __init__(self, ev: EqnEnv, name: str, ratio: Value = 1.0):
         super().__init__(ev, name)
-        n = self.parameter("ratio", ratio)
+        n = self.parameter("ratio", ratio, unit="1")
         a, b = self.port("flange_a", Rotational), self.port("flange_b", Rotational)
         self.add_equations(Eq(a.phi, n * b.phi), Eq(n * a.tau + b.tau, 0))
 

@@ -71,16 +71,17 @@ class Radiation(_TwoPort):
     metre.
 
     The emissivity 0 ≤ `eps` ≤ 1 is that of a small body in large surroundings; for surfaces that face each other, the
-    effective one of both, view factor included. sigma = 5.670374419e-8 W/(m²·K⁴).
+    effective one of both, view factor included. The parameter `sigma` is 5.670374419e-8 W/(m²·K⁴).
     """
 
     def __init__(self, ev: EqnEnv, name: str, eps: Value = 0.9, A: Value = 1.0):
         super().__init__(ev, name)
-        emissivity = self.parameter("eps", eps, bounds=(0.0, 1.0))
+        emissivity = self.parameter("eps", eps, unit="1", bounds=(0.0, 1.0))
         area = self.parameter("A", A, unit="m2", bounds=NONNEGATIVE)
+        sigma = self.parameter("sigma", STEFAN_BOLTZMANN, unit="W/(m2*K4)", bounds=POSITIVE)
         _, flow = self._two_ports()
         difference = self.port_a.T**4 - self.port_b.T**4
-        self.add_equations(Eq(flow, emissivity * STEFAN_BOLTZMANN * area * difference))
+        self.add_equations(Eq(flow, emissivity * sigma * area * difference))
 
 
 class Wall(Component):

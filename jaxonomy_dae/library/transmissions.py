@@ -11,7 +11,7 @@ class Planetary(Component):
 
     def __init__(self, ev: EqnEnv, name: str, ratio: Value = 2.0):
         super().__init__(ev, name)
-        n = self.parameter("ratio", ratio, bounds=POSITIVE)
+        n = self.parameter("ratio", ratio, unit="1", bounds=POSITIVE)
         sun, carrier, ring = (self.port(k, Rotational) for k in ("sun", "carrier", "ring"))
         self.add_equations(
             Eq((1 + n) * carrier.phi, sun.phi + n * ring.phi),

@@ -162,7 +162,7 @@ class Component(EventDeclarations, metaclass=Construction):
         - `value`: a finite number (a Python or NumPy scalar); or an expression in other parameters, of this component
             or given by its parent, such as `Resistor(ev, "a", R=R / 2)`: the parameter then depends on those, and
             follows them when they are set or trained.
-        - `unit`: shown in reports and plots.
+        - `unit`: shown in reports and plots, and compared by `AcausalCompiler(check_units=True)`.
         - `bounds`: the admissible values: a pair (low, high) of a closed interval, or an `Interval`, whose ends may be
             open. Whatever sets the parameter keeps them: declaration, `with_parameters`, `fit`, `initialize`.
 
@@ -241,7 +241,7 @@ class Component(EventDeclarations, metaclass=Construction):
         - `fixed`: whether `start` must hold; otherwise it guides the search for a consistent initial point.
         - `nominal`: a positive number, its typical size in its unit; scales tolerances and projections, and says what
             counts as zero. If left out, it is 1 for tolerances; elsewhere sizes are taken from values and equations.
-        - `unit`: shown in reports and plots.
+        - `unit`: shown in reports and plots, and compared by `AcausalCompiler(check_units=True)`.
         - `bounds`: an interval that the search for a consistent initial point does not leave, such as `(0.0, math.inf)`
             for what stands in a logarithm or root. It acts on states and on unknowns of nonlinear blocks. A start on a
             bound is moved inside.

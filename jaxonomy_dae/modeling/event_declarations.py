@@ -104,7 +104,7 @@ class EventDeclarations:
 
         The discrete variable.
         """
-        active = self.discrete(name, start=0)
+        active = self.discrete(name, start=0, unit="1")
         self.either(sympy.Eq(active, 1), gap, force)
         self._event(
             sympy.sympify(force) <= 0, (Assign(active, sympy.Integer(0)),), sympy.Eq(active, 1), True, revocable=True

@@ -13,7 +13,18 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class Domain:
-    """A physical domain: its across variables and its through variables, with units."""
+    """A physical domain: the quantities that ports of it have.
+
+    ```python
+    Magnetic = Domain("Magnetic", across=(("V_m", "A"),), through=(("Phi", "Wb"),))
+    ```
+
+    **Arguments:**
+
+    - `name`: what messages call it.
+    - `across`: pairs of a name and a unit, of quantities that are equal where ports are joined.
+    - `through`: the same, of quantities that sum to zero there, counted positive into the component.
+    """
 
     name: str
     across: tuple[tuple[str, str], ...]

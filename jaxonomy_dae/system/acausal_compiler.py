@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import lineax as lx
 
+from ..compiler.check_units import check_units as check_units_of
 from ..compiler.flatten import flatten
 from ..compiler.pipeline import compile_flat
 from ..errors import ModelError
@@ -37,10 +38,13 @@ class AcausalCompiler:
         equations, which is given a `SparseLinearOperator` with rows and columns scaled. What it leaves is corrected by
         solving again until every equation holds to rounding, or is not-a-number. By default LAPACK up to 48 equations,
         then KLU.
+    - `check_units`: whether declared units are compared, in equations, starts, events, accounts of energy and connected
+        signals; needs the extra `units`.
 
     **Raises** (when called):
 
     - `ModelError`: the model is not well formed.
+    - `UnitError`: units do not fit together.
     - `StructuralError`: equations and unknowns do not fit together.
 
     `compiler.report` says what was done, after the call.
@@ -54,6 +58,7 @@ class AcausalCompiler:
         state_selection: Mode = "auto",
         prefer_states: Sequence[str] = (),
         linear_solver: lx.AbstractLinearSolver | None = None,
+        check_units: bool = False,
     ):
         if not isinstance(ev, EqnEnv) or not isinstance(diagram, AcausalDiagram):
             raise ModelError("AcausalCompiler(ev, diagram) needs an EqnEnv and an AcausalDiagram")
@@ -74,6 +79,7 @@ class AcausalCompiler:
         self.state_selection = state_selection
         self.prefer_states = tuple(prefer_states)
         self.linear_solver = linear_solver
+        self.check_units = check_units
         self._report: SystemReport | None = None
 
     @property
@@ -85,6 +91,8 @@ class AcausalCompiler:
 
     def __call__(self) -> AcausalSystem:
         flat = flatten(self.diagram)
+        if self.check_units:
+            check_units_of(self.diagram)
         plan = lower(compile_flat(flat, self.state_selection, self.prefer_states), self.linear_solver)
         self._report = SystemReport(plan)
         declared = flat.parameters

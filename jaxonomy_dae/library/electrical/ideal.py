@@ -18,7 +18,7 @@ class IdealTransformer(TwoPorts):
 
     def __init__(self, ev: EqnEnv, name: str, n: Value = 1.0):
         super().__init__(ev, name)
-        ratio = self.parameter("n", n)
+        ratio = self.parameter("n", n, unit="1")
         v1, i1, v2, i2 = self._two_ports()
         self.add_equations(Eq(v1, ratio * v2), Eq(i2, -ratio * i1))
 

@@ -100,7 +100,7 @@ class Potentiometer(Component):
     def __init__(self, ev: EqnEnv, name: str, R: Value = 1.0):
         super().__init__(ev, name)
         r = self.parameter("R", R, unit="Ohm", bounds=POSITIVE)
-        position = self.input("position", default=0.5)
+        position = self.input("position", default=0.5, unit="1")
         p, slider, n = (self.port(k, Electrical) for k in ("p", "slider", "n"))
         self.add_equations(
             Eq(p.v - slider.v, r * (1 - position) * p.i),
@@ -131,8 +131,8 @@ class Memristor(TwoPin):
         on = self.parameter("R_on", R_on, unit="Ohm", bounds=NONNEGATIVE)
         off = self.parameter("R_off", R_off, unit="Ohm", bounds=NONNEGATIVE)
         drift = self.parameter("k", k, unit="1/(A*s)")
-        w0 = self.parameter("initial_w", initial_w)
-        w = self.variable("w", start=w0, fixed=True)
+        w0 = self.parameter("initial_w", initial_w, unit="1")
+        w = self.variable("w", start=w0, fixed=True, unit="1")
         voltage, current = self._two_pins()
         self.add_equations(Eq(voltage, (on * w + off * (1 - w)) * current), Eq(der(w), drift * current))
         self.declare_dissipation(voltage * current)

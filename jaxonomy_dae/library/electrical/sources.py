@@ -72,7 +72,7 @@ class _OfTime(TwoPin):
     def _pulse(self, height: Value, period: Value, width: Value, start_time: Value, offset: Value, unit: str):
         h = self.parameter("height", height, unit=unit)
         length = self.parameter("period", period, unit="s", bounds=POSITIVE)
-        part = self.parameter("width", width)
+        part = self.parameter("width", width, unit="1")
         t0 = self.parameter("start_time", start_time, unit="s")
         return self.parameter("offset", offset, unit=unit) + h * pulse(self, length, part, t0)
 
@@ -166,7 +166,7 @@ class VoltageControlledVoltage(TwoPorts):
 
     def __init__(self, ev: EqnEnv, name: str, gain: Value = 1.0):
         super().__init__(ev, name)
-        k = self.parameter("gain", gain)
+        k = self.parameter("gain", gain, unit="1")
         v1, i1, v2, i2 = self._two_ports()
         self.add_equations(Eq(v2, k * v1), Eq(i1, 0))
         self.declare_supply(-v2 * i2)
@@ -199,7 +199,7 @@ class CurrentControlledCurrent(TwoPorts):
 
     def __init__(self, ev: EqnEnv, name: str, gain: Value = 1.0):
         super().__init__(ev, name)
-        k = self.parameter("gain", gain)
+        k = self.parameter("gain", gain, unit="1")
         v1, i1, v2, i2 = self._two_ports()
         self.add_equations(Eq(i2, k * i1), Eq(v1, 0))
         self.declare_supply(-v2 * i2)

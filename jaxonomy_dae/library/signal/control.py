@@ -45,11 +45,11 @@ class PID(Component):
         initial_i: Value = 0.0,
     ):
         super().__init__(ev, name)
-        gain, weight = self.parameter("k", k), self.parameter("b", b)
+        gain, weight = self.parameter("k", k), self.parameter("b", b, unit="1")
         reset, rate, track = (
             self.parameter(p, v, unit="s", bounds=POSITIVE) for p, v in (("Ti", Ti), ("Td", Td), ("Tt", Tt))
         )
-        most = self.parameter("N", N, bounds=POSITIVE)
+        most = self.parameter("N", N, unit="1", bounds=POSITIVE)
         setpoint, measured = self.input("setpoint"), self.input("measured")
         i = self.variable("i", start=self.parameter("initial_i", initial_i), fixed=True)
         d = self.variable("d", start=0.0, fixed=True)

@@ -36,7 +36,7 @@ class SecondOrder(Component):
     def __init__(self, ev: EqnEnv, name: str, k: Value = 1.0, w: Value = 1.0, D: Value = 1.0, initial_y: Value = 0.0):
         super().__init__(ev, name)
         gain, y0 = self.parameter("k", k), self.parameter("initial_y", initial_y)
-        frequency, damping = self.parameter("w", w, unit="rad/s", bounds=POSITIVE), self.parameter("D", D)
+        frequency, damping = self.parameter("w", w, unit="rad/s", bounds=POSITIVE), self.parameter("D", D, unit="1")
         u, y = self.input("u"), self.variable("y", start=y0, fixed=True)
         v = self.variable("v", start=0.0, fixed=True)
         self.add_equations(Eq(der(y), v), Eq(der(v), frequency * (frequency * (gain * u - y) - 2 * damping * v)))

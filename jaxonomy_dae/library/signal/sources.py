@@ -80,7 +80,10 @@ class Pulse(Component):
         offset: Value = 0.0,
     ):
         super().__init__(ev, name)
-        h, o, part = (self.parameter(k, v) for k, v in (("height", height), ("offset", offset), ("width", width)))
+        h, o, part = (
+            self.parameter(k, v, unit=unit)
+            for k, v, unit in (("height", height, ""), ("offset", offset, ""), ("width", width, "1"))
+        )
         length = self.parameter("period", period, unit="s", bounds=POSITIVE)
         t0 = self.parameter("start_time", start_time, unit="s")
         self.output("y", o + h * pulse(self, length, part, t0))
