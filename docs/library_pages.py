@@ -18,6 +18,7 @@ from sympy.printing.str import StrPrinter
 
 import jaxonomy_dae.library
 from jaxonomy_dae import Component, Domain, EqnEnv
+from jaxonomy_dae.modeling.arrays import ComponentArray, PortArray
 from jaxonomy_dae.modeling.events import Assign, Reinit, Sampled, Terminate
 from jaxonomy_dae.modeling.interval import Interval
 from jaxonomy_dae.modeling.symbols import ParameterSymbol, RelationSymbol
@@ -286,8 +287,8 @@ def component_section(cls: type[Component]) -> list[str]:
         lines += ["Events:", "", "```text", *happens, "```", ""]
     if component.children:
         lines += ["Parts:", ""]
-        lines += table(("Part", "Component"), ((code(c.name), type(c).__name__) for c in component.children.values()))
-        joined = [" — ".join(_end_text(component, port) for port in ends) for ends in component.connections]
+        lines += table(("Part", "Component"), ((code(c.name), _part_text(c)) for c in component.children.values()))
+        joined = [" — ".join(_end_text(component, end) for end in c.ends) for c in component.connections]
         lines += ["```text", *joined, "```", ""] if joined else []
     return lines
 
@@ -321,7 +322,16 @@ def _start_text(variable: Any) -> str:
     return f"{code(text_of(variable.start))}{'' if variable.fixed else ' (a guess)'}"
 
 
+def _part_text(part: Any) -> str:
+    """A component's class; of an array, its shape too."""
+    if isinstance(part, ComponentArray):
+        return f"{type(part.prototype).__name__}, {' × '.join(map(str, part.shape))}"
+    return type(part).__name__
+
+
 def _end_text(component: Component, port: Any) -> str:
+    if isinstance(port, PortArray):
+        return port.described
     return port.name if port.component is component else f"{port.component.name}.{port.name}"
 
 
