@@ -55,7 +55,7 @@ class _Cell(TwoPin):
     def _circuit(
         self,
         soc: Any,
-        ocv: Sequence[Value],
+        ocv: Any,
         Q: Value,
         R: Sequence[Value],
         C: Sequence[Value],
@@ -109,7 +109,7 @@ class Cell(_Cell):
 
     **Arguments:**
 
-    - `soc`: increasing, shape (m,), m ≥ 2. `ocv`: the voltages there, the parameters `ocv1`, `ocv2`, … Outside of the
+    - `soc`: increasing, shape (m,), m ≥ 2. `ocv`: the m voltages there, the parameters `ocv1`, `ocv2`, … Outside of the
         points the last piece goes on.
     - `Q` > 0: the capacity (ampere hour).
     - `R0` > 0: the series resistance (ohm).
@@ -129,7 +129,7 @@ class Cell(_Cell):
         ev: EqnEnv,
         name: str,
         soc: Any,
-        ocv: Sequence[Value],
+        ocv: Any,
         Q: Value = 1.0,
         R0: Value = 0.01,
         R: Sequence[Value] = (),
@@ -177,7 +177,7 @@ class HeatedCell(_Cell):
         ev: EqnEnv,
         name: str,
         soc: Any,
-        ocv: Sequence[Value],
+        ocv: Any,
         Q: Value = 1.0,
         R0: Value = 0.01,
         R: Sequence[Value] = (),
@@ -208,24 +208,24 @@ class HeatedCell(_Cell):
 
 
 # What may be one value for a pack or one for each of its cells: unit and bounds.
-_OF_CELLS: dict[str, tuple[str, Any]] = {
+_OF_CELLS: dict[str, tuple[str, Interval]] = {
     "Q": ("A*h", POSITIVE),
     "R0": ("Ohm", POSITIVE),
     "eta": ("", EFFICIENCY),
-    "initial_soc": ("", None),
-    "Ea": ("J/mol", None),
-    "dUdT": ("V/K", None),
+    "initial_soc": ("", Interval()),
+    "Ea": ("J/mol", Interval()),
+    "dUdT": ("V/K", Interval()),
     "T_ref": ("K", POSITIVE),
     "C_heat": ("J/K", POSITIVE),
     "G_coolant": ("W/K", NONNEGATIVE),
-    "initial_temperature": ("K", None),
+    "initial_temperature": ("K", Interval()),
 }
 
 
 class _Pack(Component):
     """Rows of cells in parallel, one after the other in series, from `p` to `n`."""
 
-    def _each(self, what: str, value: Any, shape: tuple[int, int], unit: str, bounds: Any) -> Any:
+    def _each(self, what: str, value: Any, shape: tuple[int, int], unit: str, bounds: Interval) -> Any:
         """The values for the cells, an array of objects: a parameter of the pack where there is one for all."""
         each = np.empty(shape, object)
         if not np.ndim(value):
@@ -247,7 +247,7 @@ class _Pack(Component):
         kind: Callable[..., Any],
         shape: tuple[int, int],
         soc: Any,
-        ocv: Sequence[Value],
+        ocv: Any,
         R: Sequence[Any],
         C: Sequence[Any],
         initial_v: Sequence[Any] | None,
@@ -263,12 +263,12 @@ class _Pack(Component):
         p, n = self.port("p", Electrical), self.port("n", Electrical)
         volts = [self.parameter(f"ocv{k}", value, unit="V") for k, value in enumerate(ocv, start=1)]
 
-        def of_pairs(what: str, given: Sequence[Any], unit: str, bounds: Any) -> list[Any]:
+        def of_pairs(what: str, given: Sequence[Any], unit: str, bounds: Interval) -> list[Any]:
             return [self._each(f"{what}{k}", value, shape, unit, bounds) for k, value in enumerate(given, start=1)]
 
         pairs = {"R": of_pairs("R", R, "Ohm", POSITIVE), "C": of_pairs("C", C, "F", POSITIVE)}
         if initial_v is not None:
-            pairs["initial_v"] = of_pairs("initial_v", initial_v, "V", None)
+            pairs["initial_v"] = of_pairs("initial_v", initial_v, "V", Interval())
         each = self._values(shape, values)
         cells: Any = np.empty(shape, object)
         for k, j in np.ndindex(*shape):
@@ -306,7 +306,7 @@ class Pack(_Pack):
         series: int,
         parallel: int,
         soc: Any,
-        ocv: Sequence[Value],
+        ocv: Any,
         Q: Any = 1.0,
         R0: Any = 0.01,
         R: Sequence[Any] = (),
@@ -349,7 +349,7 @@ class HeatedPack(_Pack):
         series: int,
         parallel: int,
         soc: Any,
-        ocv: Sequence[Value],
+        ocv: Any,
         Q: Any = 1.0,
         R0: Any = 0.01,
         R: Sequence[Any] = (),
