@@ -253,7 +253,7 @@ def rectifier():
             lambda n: balance(0.0, *n, v0)[0] * 1e3, [0.0, 0.0], tol=1e-15, jac=lambda n: balance(0.0, *n, v0)[1] * 1e3
         ).x
         a, b, v = integrated(slopes, [*nodes, v0], TS_RECTIFIER, "Radau")
-        # What the nodes have drifted by is taken back, by Newton's method; the sum of both rows holds no large currents.
+        # What the nodes have drifted by is taken back by Newton's method; the sum of rows holds no large currents.
         for k, t in enumerate(TS_RECTIFIER):
             for _ in range(4):
                 residual, by_nodes, *_ = balance(t, a[k], b[k], v[k])
@@ -261,7 +261,7 @@ def rectifier():
                 a[k], b[k] = np.array([a[k], b[k]]) - np.linalg.solve(both @ by_nodes, both @ residual)
         return {"c.v": v, "d0.p.v": a, "d1.p.v": b}
 
-    return ReferenceSystem(make, expected, TS_RECTIFIER, "c.v")
+    return ReferenceSystem(make, expected, TS_RECTIFIER, "c.v", differences=None)
 
 
 TS_RECTIFIER = np.linspace(0.0, 0.025, 11)
