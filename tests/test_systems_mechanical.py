@@ -267,16 +267,19 @@ def triple_pendulum():
 
 # --- all of them ---------------------------------------------------------------------------------------------------
 
-SYSTEMS = [tanks, lift, quarter_car, planetary]
-LONG = pytest.param(triple_pendulum, marks=pytest.mark.slow)
+SYSTEMS = [tanks, lift, quarter_car, planetary, triple_pendulum]
 
 
-@pytest.mark.parametrize("reference", [*SYSTEMS, LONG])
+def with_slow(*slow):
+    return [pytest.param(s, marks=pytest.mark.slow) if s in slow else s for s in SYSTEMS]
+
+
+@pytest.mark.parametrize("reference", with_slow(triple_pendulum))
 def test_solution(reference):
     check_solution(reference)
 
 
-@pytest.mark.parametrize("reference", [*SYSTEMS, LONG])
+@pytest.mark.parametrize("reference", with_slow(tanks, triple_pendulum))
 def test_gradient(reference):
     check_gradient(reference)
 
@@ -286,4 +289,11 @@ def test_gradient(reference):
 def test_energy_of_linkages(make):
     """Their motion is checked in test_library_planar."""
     solution = simulate(make(), 1.0, ts=TS_PENDULUM, **planar.TIGHT)
+    assert_energy_balance(solution, rtol=MEASURED)
+
+
+@pytest.mark.slow
+def test_energy_of_planar_components():
+    system, inputs, _ = planar.components()
+    solution = simulate(system, 1.0, ts=TS_PENDULUM, inputs=inputs, **planar.TIGHT)
     assert_energy_balance(solution, rtol=MEASURED)
