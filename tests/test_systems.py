@@ -61,7 +61,7 @@ def drive():
     return ReferenceSystem(make, expected, TS_DRIVE, "load.w", inputs)
 
 
-TS_DRIVE = np.linspace(0.0, 1.0, 9)
+TS_DRIVE = np.linspace(0.0, 0.25, 9)
 
 
 def drive_matrices(p):
