@@ -13,6 +13,7 @@ from problems import compiled, damped_oscillation, oscillator, pendulum
 from sympy import Eq, Symbol
 
 import jaxonomy_dae.library.electrical as el
+import jaxonomy_dae.library.friction as fr
 import jaxonomy_dae.library.hydraulic as hy
 import jaxonomy_dae.library.rotational as rot
 import jaxonomy_dae.library.thermal as th
@@ -230,6 +231,38 @@ def test_every_mechanical_component():
     system, inputs, _ = mechanical.model()
     solution = simulate(system, 2.0, ts=jnp.array([0.0, 0.5, 2.0]), inputs=inputs, **TIGHT)
     assert_energy_balance(solution, rtol=BALANCED)
+
+
+def test_what_switches_and_friction_lose():
+    """A brake, a clutch and a sliding part of 6, 1 and 0.5 N·m or N; a switch of 1 Ω that closes at 0.5 s, a diode."""
+    ev = EqnEnv()
+    wheel, brake = rot.Inertia(ev, "wheel", 2.0, 0.0, 6.0), fr.Brake(ev, "brake", mu=0.4, fn_max=10.0, cgeo=1.5)
+    first, second = rot.Inertia(ev, "first", 1.0, 0.0, 4.0), rot.Inertia(ev, "second", 1.0, 0.0, 0.0)
+    clutch, ground = fr.Clutch(ev, "clutch", mu=0.5, fn_max=2.0), el.Ground(ev, "ground")
+    sled, ice, floor = (
+        tr.Mass(ev, "sled", 1.0, 0.0, 1.0),
+        fr.StickingFriction(ev, "ice", 0.5),
+        tr.FixedPosition(ev, "f"),
+    )
+    source, r = el.VoltageSource(ev, "source", 3.0), el.Resistor(ev, "r", 2.0)
+    switch, rd = el.TimedSwitch(ev, "switch", time=0.5, Ron=1.0, Goff=0.01), el.Resistor(ev, "rd", 2.2)
+    diode = el.IdealDiode(ev, "diode", Ron=0.1, Vknee=0.7)
+    system = compiled(
+        wheel, brake, first, second, clutch, ground, sled, ice, floor, source, r, switch, rd, diode,
+        connect=[
+            (wheel.flange_a, brake.flange), (first.flange_b, clutch.flange_a), (clutch.flange_b, second.flange_a),
+            (floor.flange, ice.flange_a), (ice.flange_b, sled.flange), (source.p, r.p, rd.p), (r.n, switch.p),
+            (rd.n, diode.p), (source.n, switch.n, diode.n, ground.p),
+        ],
+    )  # fmt: skip
+    ts = np.array([0.25, 0.75, 1.5])
+    solution = simulate(system, 1.75, ts=ts, inputs={"brake.u": 1.0, "clutch.u": 1.0}, **TIGHT)
+    open_current = 3.0 / (2.0 + 100.0)
+    for name, lost in {
+        "brake": 6 * (6 - 3 * ts), "clutch": 4 - 2 * ts, "ice": 0.5 * (1 - 0.5 * ts), "diode": [0.8] * 3,
+        "switch": [100.0 * open_current**2, 1.0, 1.0],
+    }.items():  # fmt: skip
+        np.testing.assert_allclose(solution.dissipation(name), lost, rtol=BALANCED, err_msg=name)
 
 
 # --- declarations ------------------------------------------------------------------------------------------------

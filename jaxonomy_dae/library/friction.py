@@ -73,6 +73,7 @@ class Clutch(Component):
             Eq(slipping, coefficient * geometry * largest * Max(u, 0)),
         )
         stick_slip(self, w, tau, slipping, ratio * slipping, pressed=u)
+        self.declare_dissipation(tau * w)
 
 
 class Brake(Component):
@@ -92,6 +93,7 @@ class Brake(Component):
         slipping = self.variable("slipping", unit="N*m")
         self.add_equations(Eq(w, der(flange.phi)), Eq(slipping, coefficient * geometry * largest * Max(u, 0)))
         stick_slip(self, w, flange.tau, slipping, ratio * slipping, pressed=u)
+        self.declare_dissipation(flange.tau * w)
 
 
 class StickingFriction(Component):
@@ -108,6 +110,7 @@ class StickingFriction(Component):
         f = self.variable("f", unit="N")
         self.add_equations(Eq(v, der(b.x - a.x)), Eq(b.f, f), Eq(a.f + b.f, 0))
         stick_slip(self, v, f, coulomb, static)
+        self.declare_dissipation(f * v)
 
 
 class OneWayClutch(Component):

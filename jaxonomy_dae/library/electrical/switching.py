@@ -25,6 +25,7 @@ class Switch(TwoPin):
         closed = self.discrete("closed", start=0, unit="1")
         v, i = self._two_pins()
         self.either(Eq(closed, 1), v - on * i, i - off * v)
+        self.declare_dissipation(v * i)
         self.when(u > level, assign(closed, 1), on=Eq(closed, 0), at_start=True)
         self.when(u < level, assign(closed, 0), on=Eq(closed, 1), at_start=True)
 
@@ -43,6 +44,7 @@ class TimedSwitch(TwoPin):
         closed = self.discrete("closed", start=int(opens), unit="1")
         v, i = self._two_pins()
         self.either(Eq(closed, 1), v - on * i, i - off * v)
+        self.declare_dissipation(v * i)
         self.when(ev.t >= instant, assign(closed, int(not opens)), on=Eq(closed, int(opens)), at_start=True)
 
 
@@ -66,6 +68,7 @@ class IdealDiode(TwoPin):
         knee = self.parameter("Vknee", Vknee, unit="V", bounds=NONNEGATIVE)
         v, i = self._two_pins()
         self.complementary(*_knee(v, i, on, off, knee))
+        self.declare_dissipation(v * i)
 
 
 class IdealThyristor(TwoPin):
@@ -82,5 +85,6 @@ class IdealThyristor(TwoPin):
         v, i = self._two_pins()
         drop, current = _knee(v, i, on, off, knee)
         self.either(Eq(active, 1), drop, current)
+        self.declare_dissipation(v * i)
         self.when(And(drop < 0, fire > 0.5), assign(active, 1), on=Eq(active, 0), at_start=True)
         self.when(current <= 0, assign(active, 0), on=Eq(active, 1), at_start=True)

@@ -89,6 +89,7 @@ class Body(Component):
             Eq(mass * der(vy), frame.fy + mass * gy),
             Eq(inertia * der(omega), frame.tau),
         )
+        self.declare_energy(mass * (vx**2 + vy**2) / 2, inertia * omega**2 / 2, -mass * (gx * x + gy * y))
 
 
 class Link(TwoFrames):

@@ -44,6 +44,8 @@ class SpringDamper(TwoFrames):
             Eq(a.tau, 0),
             Eq(b.tau, 0),
         )
+        self.declare_energy(stiffness * (s - relaxed) ** 2 / 2)
+        self.declare_dissipation(damping * v**2)
 
 
 class Force(Component):
@@ -57,6 +59,7 @@ class Force(Component):
         frame = self.port("frame", Planar)
         fx, fy = (self.input(k, default=0.0, unit="N") for k in ("fx", "fy"))
         self.add_equations(Eq(frame.fx, -fx), Eq(frame.fy, -fy), Eq(frame.tau, 0))
+        self.declare_supply(fx * der(frame.x), fy * der(frame.y))
 
 
 class Torque(Component):
@@ -70,3 +73,4 @@ class Torque(Component):
         frame = self.port("frame", Planar)
         tau = self.input("tau", default=0.0, unit="N*m")
         self.add_equations(Eq(frame.tau, -tau), Eq(frame.fx, 0), Eq(frame.fy, 0))
+        self.declare_supply(tau * der(frame.phi))

@@ -12,8 +12,7 @@ from jaxtyping import Array, Float
 
 from ...errors import ModelError
 from ...modeling import Component, EqnEnv
-
-KINDS = ("linear", "cubic")
+from ..interpolation import finite, increasing, known_kind
 
 
 class _Curve(eqx.Module):
@@ -58,11 +57,10 @@ class Table1D(Component):
 
     def __init__(self, ev: EqnEnv, name: str, x: Any, values: Any, kind: str = "linear"):
         super().__init__(ev, name)
-        points, found = _increasing(x, name, "x"), _finite(values, name, "values")
+        points, found = increasing(x, name, "x"), finite(values, name, "values")
         if found.shape != points.shape:
             raise ModelError(f"'{name}': values has shape {found.shape}, x has {points.shape}: they must agree")
-        if kind not in KINDS:
-            raise ModelError(f"'{name}': kind must be one of {', '.join(KINDS)}; got {kind!r}")
+        known_kind(kind, name)
         (value,) = self.function("table", _Curve(points, jnp.asarray(found), kind), inputs=[self.input("u")])
         self.output("y", value)
 
@@ -81,31 +79,10 @@ class Table2D(Component):
 
     def __init__(self, ev: EqnEnv, name: str, x: Any, y: Any, values: Any):
         super().__init__(ev, name)
-        first, second = _increasing(x, name, "x"), _increasing(y, name, "y")
-        found = _finite(values, name, "values")
+        first, second = increasing(x, name, "x"), increasing(y, name, "y")
+        found = finite(values, name, "values")
         if found.shape != (len(first), len(second)):
             raise ModelError(f"'{name}': values has shape {found.shape}; x and y ask for {(len(first), len(second))}")
         surface = _Surface(first, second, jnp.asarray(found))
         (value,) = self.function("table", surface, inputs=[self.input("u1"), self.input("u2")])
         self.output("y", value)
-
-
-def _finite(values: Any, name: str, what: str) -> np.ndarray:
-    found = np.asarray(values, float)
-    if not np.isfinite(found).all():
-        place = int(np.argmin(np.isfinite(found).ravel()))
-        raise ModelError(f"'{name}': {what} is not finite at entry {place} ({found.ravel()[place]})")
-    return found
-
-
-def _increasing(values: Any, name: str, what: str) -> np.ndarray:
-    found = _finite(values, name, what)
-    if found.ndim != 1 or len(found) < 2:
-        raise ModelError(f"'{name}': {what} needs a row of at least 2 points; got shape {found.shape}")
-    if not (np.diff(found) > 0).all():
-        place = int(np.argmin(np.diff(found) > 0))
-        raise ModelError(
-            f"'{name}': {what} must increase, but entry {place + 1} ({found[place + 1]:g}) follows {found[place]:g}: "
-            "sort it"
-        )
-    return found

@@ -1,0 +1,390 @@
+"""Cells of batteries as equivalent circuits, and packs of them.
+
+Conventions: a cell has `v = p.v − n.v`, and `i` flows from `p` to `n` through it, so that a current i > 0 charges. The
+state of charge `soc` is 1 where the cell is full and 0 where it is empty; neither is a limit.
+
+Sources: G. L. Plett, Battery Management Systems, volume I: Battery Modeling (Artech House, 2015), chapter 2, for the
+circuit; D. Bernardi, E. Pawlikowski and J. Newman (1985), J. Electrochem. Soc. 132:5, for the heat.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import sympy
+from sympy import Max, exp
+
+from ..errors import ModelError
+from ..modeling import (
+    NONNEGATIVE,
+    POSITIVE,
+    Component,
+    Electrical,
+    Eq,
+    EqnEnv,
+    Interval,
+    Thermal,
+    Value,
+    der,
+)
+from .electrical.two_pin import TwoPin
+from .interpolation import increasing, interpolated, known_kind
+from .thermal import HeatCapacitor, ThermalConductor
+
+GAS_CONSTANT = 8.31446261815324  # J/(mol·K), CODATA 2018
+HOUR = 3600  # s
+EFFICIENCY = Interval(0.0, 1.0, open_low=True)
+
+
+class _Circuit(NamedTuple):
+    """What the terminal voltage and the heat are made of."""
+
+    voltage: Any
+    current: Any
+    soc: Any
+    reacting: Any  # the part of the current that charges or discharges
+    table: Any  # the open-circuit voltage in the table
+    table_energy: Any  # its integral over the charge, joule
+    overpotentials: Any  # the sum of those of the RC pairs
+    heat: Any  # what the RC pairs lose
+
+
+class _Cell(TwoPin):
+    """The parts that cells share."""
+
+    def _circuit(
+        self,
+        soc: Any,
+        ocv: Any,
+        Q: Value,
+        R: Sequence[Value],
+        C: Sequence[Value],
+        eta: Value,
+        initial_soc: Value,
+        initial_v: Sequence[Value] | None,
+        kind: str,
+    ) -> _Circuit:
+        name = self.name
+        points = increasing(soc, name, "soc")
+        if len(ocv) != len(points):
+            raise ModelError(f"'{name}': ocv has {len(ocv)} entries, soc has {len(points)}: they must agree")
+        starts = [0.0] * len(R) if initial_v is None else list(initial_v)
+        if not len(R) == len(C) == len(starts):
+            raise ModelError(
+                f"'{name}' needs a resistance, a capacity and, if given, a voltage for each RC pair; got {len(R)} in "
+                f"R, {len(C)} in C and {len(starts)} in initial_v"
+            )
+        known_kind(kind, name)
+        volts = [self.parameter(f"ocv{k}", value, unit="V") for k, value in enumerate(ocv, start=1)]
+        charge = HOUR * self.parameter("Q", Q, unit="A*h", bounds=POSITIVE)
+        efficiency = self.parameter("eta", eta, bounds=EFFICIENCY)
+        z = self.variable("soc", start=self.parameter("initial_soc", initial_soc), fixed=True)
+        voltage, current = self._two_pins()
+        reacting = current - (1 - efficiency) * Max(current, 0)
+        self.add_equations(Eq(charge * der(z), reacting))
+        overpotentials, heat = sympy.Integer(0), sympy.Integer(0)
+        for k, (resistance, capacity, start) in enumerate(zip(R, C, starts, strict=True), start=1):
+            r = self.parameter(f"R{k}", resistance, unit="Ohm", bounds=POSITIVE)
+            c = self.parameter(f"C{k}", capacity, unit="F", bounds=POSITIVE)
+            v0 = self.parameter(f"initial_v{k}", start, unit="V")
+            v = self.variable(f"v{k}", start=v0, fixed=True, unit="V")
+            self.add_equations(Eq(c * der(v), current - v / r))
+            self.declare_energy(c * v**2 / 2)
+            overpotentials += v
+            heat += v**2 / r
+        table, integral = interpolated(z, points, volts, kind)
+        return _Circuit(voltage, current, z, reacting, table, charge * integral, overpotentials, heat)
+
+
+class Cell(_Cell):
+    """A cell as an equivalent circuit with n pairs of a resistor and a capacitor (Plett 2015, chapter 2):
+
+        v = ocv + R0·i + v_1 + … + v_n
+        3600·Q·d(soc)/dt = i where the cell is discharged, eta·i where it is charged
+        C_k·d(v_k)/dt = i − v_k/R_k
+
+    The open-circuit voltage `ocv` (volt) is interpolated in a table over the state of charge `soc`. It stores
+    3600·Q·∫ ocv d(soc) from the table's first point on, and C_k·v_k²/2; it loses R0·i² + Σ v_k²/R_k, and the part
+    1 − eta of the power ocv·i that charges.
+
+    **Arguments:**
+
+    - `soc`: increasing, shape (m,), m ≥ 2. `ocv`: the m voltages there, the parameters `ocv1`, `ocv2`, … Outside of the
+        points the last piece goes on.
+    - `Q` > 0: the capacity (ampere hour).
+    - `R0` > 0: the series resistance (ohm).
+    - `R`, `C`: the resistances (ohm) and capacities (farad) of the pairs, each > 0: the parameters `R1`, `C1`, …
+    - `eta`: the coulombic efficiency, 0 < eta ≤ 1.
+    - `initial_soc`: the state of charge at the start. `initial_v`: the pairs' voltages at the start; all zero, as in a
+        cell that has rested, if left out.
+    - `kind`: of the interpolation, 'linear' or 'cubic', as in `signal.Table1D`.
+
+    **Raises:**
+
+    - `ModelError` if `soc` is not increasing or has less than two points, or if numbers of entries disagree.
+    """
+
+    def __init__(
+        self,
+        ev: EqnEnv,
+        name: str,
+        soc: Any,
+        ocv: Any,
+        Q: Value = 1.0,
+        R0: Value = 0.01,
+        R: Sequence[Value] = (),
+        C: Sequence[Value] = (),
+        eta: Value = 1.0,
+        initial_soc: Value = 1.0,
+        initial_v: Sequence[Value] | None = None,
+        kind: str = "linear",
+    ):
+        super().__init__(ev, name)
+        resistance = self.parameter("R0", R0, unit="Ohm", bounds=POSITIVE)
+        c = self._circuit(soc, ocv, Q, R, C, eta, initial_soc, initial_v, kind)
+        voltage = self.output("ocv", c.table, unit="V")
+        self.add_equations(Eq(c.voltage, voltage + resistance * c.current + c.overpotentials))
+        self.declare_energy(c.table_energy)
+        self.declare_dissipation(resistance * c.current**2, c.heat, voltage * (c.current - c.reacting))
+
+
+class HeatedCell(_Cell):
+    """A `Cell` that has a temperature T, that of the port `heat`, at which its heat leaves:
+
+        v = ocv + r·i + v_1 + … + v_n,   r = R0·exp(Ea/R_gas·(1/T − 1/T_ref))
+        ocv = table(soc) + dUdT·(T − T_ref)
+        3600·Q·d(soc)/dt = j,   j = i where the cell is discharged, eta·i where it is charged
+        C_k·d(v_k)/dt = i − v_k/R_k
+        heat.Q_flow = −[r·i² + Σ v_k²/R_k + ocv·(i − j) + dUdT·T·j]
+
+    The last term of the heat is the reversible one, of the reaction's entropy (Bernardi, Pawlikowski & Newman 1985,
+    with one reaction and no mixing); R_gas = 8.314 J/(mol·K). The cell stores 3600·Q·∫ (table − dUdT·T_ref) d(soc) and
+    C_k·v_k²/2. Its heat capacity is not in it: connect a `thermal.HeatCapacitor`.
+
+    **Arguments:**
+
+    - `Ea`: the activation energy of the series resistance (joule per mole), `R0` > 0 (ohm) at `T_ref` > 0 (kelvin).
+    - `dUdT`: the entropic coefficient (volt per kelvin).
+    - The others are those of `Cell`.
+
+    **Raises:**
+
+    - `ModelError` as `Cell`.
+    """
+
+    def __init__(
+        self,
+        ev: EqnEnv,
+        name: str,
+        soc: Any,
+        ocv: Any,
+        Q: Value = 1.0,
+        R0: Value = 0.01,
+        R: Sequence[Value] = (),
+        C: Sequence[Value] = (),
+        eta: Value = 1.0,
+        initial_soc: Value = 1.0,
+        initial_v: Sequence[Value] | None = None,
+        kind: str = "linear",
+        Ea: Value = 0.0,
+        dUdT: Value = 0.0,
+        T_ref: Value = 298.15,
+    ):
+        super().__init__(ev, name)
+        resistance = self.parameter("R0", R0, unit="Ohm", bounds=POSITIVE)
+        activation = self.parameter("Ea", Ea, unit="J/mol")
+        entropy = self.parameter("dUdT", dUdT, unit="V/K")
+        reference = self.parameter("T_ref", T_ref, unit="K", bounds=POSITIVE)
+        heat = self.port("heat", Thermal)
+        c = self._circuit(soc, ocv, Q, R, C, eta, initial_soc, initial_v, kind)
+        voltage = self.output("ocv", c.table + entropy * (heat.T - reference), unit="V")
+        r = self.output("r", resistance * exp(activation / GAS_CONSTANT * (1 / heat.T - 1 / reference)), unit="Ohm")
+        lost = r * c.current**2 + c.heat + voltage * (c.current - c.reacting)
+        self.add_equations(
+            Eq(c.voltage, voltage + r * c.current + c.overpotentials),
+            Eq(heat.Q_flow, -(lost + entropy * heat.T * c.reacting)),
+        )
+        self.declare_energy(c.table_energy, -HOUR * self.symbol("Q") * entropy * reference * c.soc)
+
+
+# What may be one value for a pack or one for each of its cells: unit and bounds.
+_OF_CELLS: dict[str, tuple[str, Interval]] = {
+    "Q": ("A*h", POSITIVE),
+    "R0": ("Ohm", POSITIVE),
+    "eta": ("", EFFICIENCY),
+    "initial_soc": ("", Interval()),
+    "Ea": ("J/mol", Interval()),
+    "dUdT": ("V/K", Interval()),
+    "T_ref": ("K", POSITIVE),
+    "C_heat": ("J/K", POSITIVE),
+    "G_coolant": ("W/K", NONNEGATIVE),
+    "initial_temperature": ("K", Interval()),
+}
+
+
+class _Pack(Component):
+    """Rows of cells in parallel, one after the other in series, from `p` to `n`."""
+
+    def _each(self, what: str, value: Any, shape: tuple[int, int], unit: str, bounds: Interval) -> Any:
+        """The values for the cells, an array of objects: a parameter of the pack where there is one for all."""
+        each = np.empty(shape, object)
+        if not np.ndim(value):
+            each[:] = self.parameter(what, value, unit=unit, bounds=bounds)
+        elif np.shape(value) == shape:
+            each[:] = np.asarray(value, object)
+        else:
+            raise ModelError(
+                f"'{self.name}': {what} has shape {np.shape(value)}: give one value for all cells, or one for each in "
+                f"shape {shape}"
+            )
+        return each
+
+    def _values(self, shape: tuple[int, int], values: dict[str, Any]) -> dict[str, Any]:
+        return {what: self._each(what, value, shape, *_OF_CELLS[what]) for what, value in values.items()}
+
+    def _cells(
+        self,
+        kind: Callable[..., Any],
+        shape: tuple[int, int],
+        soc: Any,
+        ocv: Any,
+        R: Sequence[Any],
+        C: Sequence[Any],
+        initial_v: Sequence[Any] | None,
+        table: str,
+        values: dict[str, Any],
+    ) -> Any:
+        """Adds the cells and connects them; returns them, an array of the given shape."""
+        if min(shape) < 1:
+            raise ModelError(
+                f"pack '{self.name}' needs at least one cell in series and in parallel; got series={shape[0]}, "
+                f"parallel={shape[1]}"
+            )
+        p, n = self.port("p", Electrical), self.port("n", Electrical)
+        volts = [self.parameter(f"ocv{k}", value, unit="V") for k, value in enumerate(ocv, start=1)]
+
+        def of_pairs(what: str, given: Sequence[Any], unit: str, bounds: Interval) -> list[Any]:
+            return [self._each(f"{what}{k}", value, shape, unit, bounds) for k, value in enumerate(given, start=1)]
+
+        pairs = {"R": of_pairs("R", R, "Ohm", POSITIVE), "C": of_pairs("C", C, "F", POSITIVE)}
+        if initial_v is not None:
+            pairs["initial_v"] = of_pairs("initial_v", initial_v, "V", Interval())
+        each = self._values(shape, values)
+        cells: Any = np.empty(shape, object)
+        for k, j in np.ndindex(*shape):
+            options = {what: found[k, j] for what, found in each.items()}
+            options |= {what: [found[k, j] for found in given] for what, given in pairs.items()}
+            cells[k, j] = self.add(kind(self.ev, f"cell{k + 1}_{j + 1}", soc, volts, kind=table, **options))
+        self.connect(p, *(cell.p for cell in cells[0]))
+        for above, below in zip(cells[:-1], cells[1:], strict=True):
+            self.connect(*(cell.n for cell in above), *(cell.p for cell in below))
+        self.connect(*(cell.n for cell in cells[-1]), n)
+        return cells
+
+
+class Pack(_Pack):
+    """A pack of `Cell`s: `series` rows one after the other between `p` and `n`, each of `parallel` cells side by side.
+
+    The cells are `cell1_1`, `cell1_2`, …, the row first, from `p` on: `pack.cell1_2.soc`.
+
+    **Arguments:**
+
+    - `series`, `parallel`: how many, each ≥ 1.
+    - The others are those of `Cell`. `Q`, `R0`, `eta`, `initial_soc` and the entries of `R`, `C` and `initial_v` are
+        one value for all cells, a parameter of the pack, or an array of shape (series, parallel), whose entries are
+        parameters of the cells.
+
+    **Raises:**
+
+    - `ModelError` for a pack without cells and for arrays of another shape; otherwise as `Cell`.
+    """
+
+    def __init__(
+        self,
+        ev: EqnEnv,
+        name: str,
+        series: int,
+        parallel: int,
+        soc: Any,
+        ocv: Any,
+        Q: Any = 1.0,
+        R0: Any = 0.01,
+        R: Sequence[Any] = (),
+        C: Sequence[Any] = (),
+        eta: Any = 1.0,
+        initial_soc: Any = 1.0,
+        initial_v: Sequence[Any] | None = None,
+        kind: str = "linear",
+    ):
+        super().__init__(ev, name)
+        values = {"Q": Q, "R0": R0, "eta": eta, "initial_soc": initial_soc}
+        self._cells(Cell, (series, parallel), soc, ocv, R, C, initial_v, kind, values)
+
+
+class HeatedPack(_Pack):
+    """A `Pack` of `HeatedCell`s with heat capacities, between which and to a coolant heat flows:
+
+        C_heat·dT/dt = (heat of the cell) + G_coolant·(coolant.T − T) + Σ G_neighbour·(T_neighbour − T)
+
+    Neighbours are the next cell in a row and the cell of the same place in the next row. The temperature of `cell1_2`
+    is `body1_2.T`, the heat from it to the coolant `cooling1_2.Q_flow`.
+
+    **Arguments:**
+
+    - `C_heat` > 0: the heat capacity of a cell (joule per kelvin). `G_coolant` ≥ 0: the conductance from a cell to the
+        port `coolant` (watt per kelvin). `initial_temperature` (kelvin) holds at the start. One value for all cells or
+        an array, as in `Pack`, and so are `Ea`, `dUdT` and `T_ref`.
+    - `G_neighbour` ≥ 0: the conductance between neighbours (watt per kelvin).
+    - The others are those of `Pack` and `HeatedCell`.
+
+    **Raises:**
+
+    - `ModelError` as `Pack`.
+    """
+
+    def __init__(
+        self,
+        ev: EqnEnv,
+        name: str,
+        series: int,
+        parallel: int,
+        soc: Any,
+        ocv: Any,
+        Q: Any = 1.0,
+        R0: Any = 0.01,
+        R: Sequence[Any] = (),
+        C: Sequence[Any] = (),
+        eta: Any = 1.0,
+        initial_soc: Any = 1.0,
+        initial_v: Sequence[Any] | None = None,
+        kind: str = "linear",
+        Ea: Any = 0.0,
+        dUdT: Any = 0.0,
+        T_ref: Any = 298.15,
+        C_heat: Any = 50.0,
+        G_neighbour: Value = 0.5,
+        G_coolant: Any = 0.1,
+        initial_temperature: Any = 298.15,
+    ):
+        super().__init__(ev, name)
+        shape = (series, parallel)
+        values = {"Q": Q, "R0": R0, "eta": eta, "initial_soc": initial_soc, "Ea": Ea, "dUdT": dUdT, "T_ref": T_ref}
+        cells = self._cells(HeatedCell, shape, soc, ocv, R, C, initial_v, kind, values)
+        thermal = {"C_heat": C_heat, "G_coolant": G_coolant, "initial_temperature": initial_temperature}
+        each = self._values(shape, thermal)
+        between = self.parameter("G_neighbour", G_neighbour, unit="W/K", bounds=NONNEGATIVE)
+        coolant = self.port("coolant", Thermal)
+        heats: Any = np.empty(shape, object)
+        for k, j in np.ndindex(*shape):
+            place = f"{k + 1}_{j + 1}"
+            body = HeatCapacitor(ev, f"body{place}", each["C_heat"][k, j], each["initial_temperature"][k, j])
+            cooling = ThermalConductor(ev, f"cooling{place}", each["G_coolant"][k, j])
+            heats[k, j] = self.add(body).heat
+            self.connect(cells[k, j].heat, heats[k, j], self.add(cooling).port_a)
+            self.connect(cooling.port_b, coolant)
+        for k, j in np.ndindex(*shape):
+            for where, after in (("beside", (k, j + 1)), ("below", (k + 1, j))):
+                if after[0] < series and after[1] < parallel:
+                    link = self.add(ThermalConductor(ev, f"{where}{k + 1}_{j + 1}", between))
+                    self.connect(heats[k, j], link.port_a)
+                    self.connect(link.port_b, heats[after])

@@ -1,0 +1,92 @@
+"""Interpolation between points: checks of the points, and the interpolant as an expression.
+
+An expression is evaluated for all components of one kind at once, however many there are, and its values may be
+parameters. Tables of signals (`signal.tables`) interpolate in the same way, as functions with arrays of their own.
+"""
+
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from sympy import Max, Min
+
+from ..errors import ModelError
+
+KINDS = ("linear", "cubic")
+
+
+def interpolated(u: Any, x: np.ndarray, values: Sequence[Any], kind: str) -> tuple[Any, Any]:
+    """The interpolant of `values` at the increasing points `x`, and its integral over `u` from the first point.
+
+    Kinds are those of `signal.Table1D`; with 'cubic', the slope at the end of a piece is that of its chord. Outside of
+    the points the last piece goes on.
+    """
+    return _interpolated(u, tuple(x.tolist()), tuple(values), kind)
+
+
+@functools.lru_cache(maxsize=64)  # the cells of a pack have the same expression; SymPy takes 20 ms to make it
+def _interpolated(u: Any, x: tuple[float, ...], values: tuple[Any, ...], kind: str) -> tuple[Any, Any]:
+    last = len(x) - 2
+    value, integral = values[0], values[0] * (u - x[0])
+    before: Any = None
+    for k, a in enumerate(x[:-1]):
+        width = x[k + 1] - a
+        rise = values[k + 1] - values[k]
+        chord = rise / width
+        inside = u - a if k == 0 else Max(u - a, 0)
+        beyond = 0 if k == last else Max(u - a - width, 0)
+        if k < last:
+            inside = Min(inside, width)
+        bend = 0 if kind == "linear" or before is None else (chord - before) / width
+        slope = chord if kind == "linear" or before is None else before
+        # slope·s + 2·bend·s² − bend·s³/width has the value `rise` and the slope `chord` at s = width.
+        value += slope * inside + 2 * bend * inside**2 - bend / width * inside**3
+        integral += slope * inside**2 / 2 + 2 * bend * inside**3 / 3 - bend / width * inside**4 / 4 + rise * beyond
+        before = chord
+    return value, integral
+
+
+def finite(values: Any, name: str, what: str) -> np.ndarray:
+    """An array of the values.
+
+    **Raises:**
+
+    - `ModelError` if one of them is not finite.
+    """
+    found = np.asarray(values, float)
+    if not np.isfinite(found).all():
+        place = int(np.argmin(np.isfinite(found).ravel()))
+        raise ModelError(f"'{name}': {what} is not finite at entry {place} ({found.ravel()[place]})")
+    return found
+
+
+def increasing(values: Any, name: str, what: str) -> np.ndarray:
+    """An array of at least two increasing points.
+
+    **Raises:**
+
+    - `ModelError` if they are not.
+    """
+    found = finite(values, name, what)
+    if found.ndim != 1 or len(found) < 2:
+        raise ModelError(f"'{name}': {what} needs a row of at least 2 points; got shape {found.shape}")
+    if not (np.diff(found) > 0).all():
+        place = int(np.argmin(np.diff(found) > 0))
+        raise ModelError(
+            f"'{name}': {what} must increase, but entry {place + 1} ({found[place + 1]:g}) follows {found[place]:g}: "
+            "sort it"
+        )
+    return found
+
+
+def known_kind(kind: str, name: str) -> str:
+    """The kind of interpolation.
+
+    **Raises:**
+
+    - `ModelError` if it is unknown.
+    """
+    if kind not in KINDS:
+        raise ModelError(f"'{name}': kind must be one of {', '.join(KINDS)}; got {kind!r}")
+    return kind

@@ -1,0 +1,142 @@
+"""What is checked of a reference system: its solution, its account of energy, and its gradient by every parameter."""
+
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.integrate
+from scipy.linalg import expm
+
+from jaxonomy_dae import AcausalSystem, simulate
+from jaxonomy_dae.testing import assert_energy_balance
+
+MEASURED = 1e-7  # a hundred times the tolerance of the runs, whose errors add up over hundreds of steps and decay
+
+
+class ReferenceSystem(NamedTuple):
+    """A system of library components, and what is known of it without this package.
+
+    `expected` maps values of parameters, by name, to values of variables at `ts`. Errors may be `tolerance` of the
+    largest value. `output` is what is differentiated, at the last time. `balance` bounds the error of the account of
+    energy, `differences` what differences of `expected` differ from the gradient by; None where they take too long.
+    """
+
+    make: Callable[[], AcausalSystem]
+    expected: Callable[[Mapping[str, float]], Mapping[str, Any]]
+    ts: np.ndarray
+    output: str
+    inputs: Mapping[str, Any] = {}
+    tolerance: float = MEASURED
+    balance: float = MEASURED
+    differences: float | None = 1e-5
+    rtol: float = 1e-9
+
+
+@functools.cache
+def system_of(reference: Callable[[], ReferenceSystem]) -> tuple[ReferenceSystem, AcausalSystem]:
+    found = reference()
+    return found, found.make()
+
+
+def run(reference: Callable[[], ReferenceSystem]):
+    known, system = system_of(reference)
+    return simulate(
+        system, known.ts[-1], ts=known.ts, inputs=known.inputs, rtol=known.rtol, atol=1e-2 * known.rtol
+    )  # fmt: skip
+
+
+def values_of(system: AcausalSystem) -> dict[str, float]:
+    """The parameters that can be set."""
+    table = system.parameters.table
+    names = [n for k, n in enumerate(system.parameters.names) if k not in table.expressions]
+    return {n: float(system.parameters[n]) for n in names}
+
+
+def check_solution(reference: Callable[[], ReferenceSystem]) -> None:
+    """The solution against the reference, and the account of energy along it."""
+    known, system = system_of(reference)
+    solution = run(reference)
+    for name, true in known.expected(values_of(system)).items():
+        scale = np.abs(true).max()
+        np.testing.assert_allclose(solution[name], true, rtol=0, atol=known.tolerance * scale, err_msg=name)
+    assert_energy_balance(solution, rtol=known.balance)
+
+
+def check_gradient(reference: Callable[[], ReferenceSystem]) -> None:
+    """The gradient by every parameter: reverse against forward mode, and against differences of the reference."""
+    known, system = system_of(reference)
+    run(reference)  # inside jit the solver is that of a run before
+    at = values_of(system)
+
+    def last(v, adjoint=None):
+        changed = system.with_parameters(dict(zip(at, v, strict=True)))
+        solution = simulate(
+            changed, known.ts[-1], ts=jnp.asarray(known.ts[-1:]), inputs=known.inputs, adjoint=adjoint,
+            rtol=known.rtol, atol=1e-2 * known.rtol,
+        )  # fmt: skip
+        return solution[known.output][0]
+
+    values = jnp.array(list(at.values()))
+    reverse = jax.jit(jax.grad(last))(values)
+    forward = jax.jit(jax.jacfwd(lambda v: last(v, diffrax.ForwardMode())))(values)
+    # Parameters have units and sizes of their own: each derivative is in units of the parameter's value.
+    sizes = np.where(np.array(values) == 0, 1.0, np.abs(np.array(values)))
+    reverse, forward = np.asarray(reverse) * sizes, np.asarray(forward) * sizes
+    scale = np.abs(forward).max()
+    np.testing.assert_allclose(reverse, forward, rtol=0, atol=1e-8 * scale)
+    if known.differences is None:
+        return
+
+    def true(name, move):
+        return float(known.expected(at | {name: at[name] + move})[known.output][-1])
+
+    step = 1e-4  # relative: truncation is of the order of its square, 1e-8, times a third derivative
+    differences = [
+        (true(n, step * size) - true(n, -step * size)) / (2 * step) for n, size in zip(at, sizes, strict=True)
+    ]  # fmt: skip
+    np.testing.assert_allclose(reverse, differences, rtol=0, atol=known.differences * scale)
+
+
+# --- references ----------------------------------------------------------------------------------------------------
+
+
+def integrated(
+    slopes: Callable, start: Any, ts: np.ndarray, method: str = "DOP853", ends: Any = (), rtol: float = 1e-12
+) -> np.ndarray:
+    """SciPy's solution, begun anew at each of `ends`, where slopes may have kinks; shape (states, times)."""
+    knots = np.unique([ts[0], *[e for e in ends if ts[0] < e < ts[-1]], ts[-1]])
+    rows, state = [np.asarray(start, float)[:, None]], np.asarray(start, float)
+    for a, b in zip(knots, knots[1:], strict=False):
+        inside = ts[(ts > a) & (ts <= b)]
+        solved = scipy.integrate.solve_ivp(
+            slopes, (a, b), state, method, np.union1d(inside, b), rtol=rtol, atol=0.1 * rtol
+        )
+        assert solved.success
+        state = solved.y[:, -1]
+        rows.append(solved.y[:, : len(inside)])
+    return np.concatenate(rows, axis=1)
+
+
+def linear(a: Any, x0: Any, b: Any, ts: np.ndarray) -> np.ndarray:
+    """x' = a·x + b from x0 at ts[0], shape (states, times)."""
+    n = len(x0)
+    whole = np.zeros((n + 1, n + 1))
+    whole[:n, :n], whole[:n, n] = a, b
+    return np.array([(expm(whole * (t - ts[0])) @ [*x0, 1.0])[:n] for t in ts]).T
+
+
+def driven(a: Any, x0: Any, b: Any, times: np.ndarray, values: np.ndarray, ts: np.ndarray) -> np.ndarray:
+    """x' = a·x + b @ (u, u', 1) with u in straight lines between samples, exactly; shape (states, times)."""
+    n = len(x0)
+    whole = np.zeros((n + 3, n + 3))
+    whole[:n, :n], whole[:n, n:], whole[n, n + 1] = a, b, 1.0
+    knots, state, found = np.union1d(times, ts), np.asarray(x0, float), {float(ts[0]): np.asarray(x0, float)}
+    for start, end in zip(knots, knots[1:], strict=False):
+        slope = (np.interp(end, times, values) - np.interp(start, times, values)) / (end - start)
+        state = (expm(whole * (end - start)) @ [*state, np.interp(start, times, values), slope, 1.0])[:n]
+        found[float(end)] = state
+    return np.array([found[float(t)] for t in ts]).T
