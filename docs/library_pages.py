@@ -24,7 +24,12 @@ from jaxonomy_dae.modeling.interval import Interval
 from jaxonomy_dae.modeling.symbols import ParameterSymbol, RelationSymbol
 
 # Of components that need more than an environment and a name.
+BATTERY = {"soc": [0.0, 0.5, 1.0], "ocv": [3.0, 3.7, 4.2]}
 ARGUMENTS: dict[str, dict[str, Any]] = {
+    "Cell": BATTERY,
+    "HeatedCell": BATTERY,
+    "HeatedPack": BATTERY | {"series": 3, "parallel": 2},
+    "Pack": BATTERY | {"series": 3, "parallel": 2},
     "DiscreteTransferFunction": {"numerator": [1.0], "denominator": [1.0, -0.5]},
     "Noise": {"key": jax.random.key(0)},
     "StateSpace": {"A": [[-1.0]], "B": [[1.0]], "C": [[1.0]]},

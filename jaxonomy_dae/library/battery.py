@@ -7,7 +7,7 @@ Sources: G. L. Plett, Battery Management Systems, volume I: Battery Modeling (Ar
 circuit; D. Bernardi, E. Pawlikowski and J. Newman (1985), J. Electrochem. Soc. 132:5, for the heat.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -226,25 +226,22 @@ class _Pack(Component):
     """Rows of cells in parallel, one after the other in series, from `p` to `n`."""
 
     def _each(self, what: str, value: Any, shape: tuple[int, int], unit: str, bounds: Interval) -> Any:
-        """The values for the cells, an array of objects: a parameter of the pack where there is one for all."""
-        each = np.empty(shape, object)
+        """What the cells are given: a parameter of the pack where there is one value for all, else an array."""
         if not np.ndim(value):
-            each[:] = self.parameter(what, value, unit=unit, bounds=bounds)
-        elif np.shape(value) == shape:
-            each[:] = np.asarray(value, object)
-        else:
+            return self.parameter(what, value, unit=unit, bounds=bounds)
+        if np.shape(value) != shape:
             raise ModelError(
                 f"'{self.name}': {what} has shape {np.shape(value)}: give one value for all cells, or one for each in "
                 f"shape {shape}"
             )
-        return each
+        return np.asarray(value)
 
     def _values(self, shape: tuple[int, int], values: dict[str, Any]) -> dict[str, Any]:
         return {what: self._each(what, value, shape, *_OF_CELLS[what]) for what, value in values.items()}
 
     def _cells(
         self,
-        kind: Callable[..., Any],
+        kind: type[Component],
         shape: tuple[int, int],
         soc: Any,
         ocv: Any,
@@ -266,26 +263,22 @@ class _Pack(Component):
         def of_pairs(what: str, given: Sequence[Any], unit: str, bounds: Interval) -> list[Any]:
             return [self._each(f"{what}{k}", value, shape, unit, bounds) for k, value in enumerate(given, start=1)]
 
-        pairs = {"R": of_pairs("R", R, "Ohm", POSITIVE), "C": of_pairs("C", C, "F", POSITIVE)}
+        options = {"R": of_pairs("R", R, "Ohm", POSITIVE), "C": of_pairs("C", C, "F", POSITIVE)}
         if initial_v is not None:
-            pairs["initial_v"] = of_pairs("initial_v", initial_v, "V", Interval())
-        each = self._values(shape, values)
-        cells: Any = np.empty(shape, object)
-        for k, j in np.ndindex(*shape):
-            options = {what: found[k, j] for what, found in each.items()}
-            options |= {what: [found[k, j] for found in given] for what, given in pairs.items()}
-            cells[k, j] = self.add(kind(self.ev, f"cell{k + 1}_{j + 1}", soc, volts, kind=table, **options))
-        self.connect(p, *(cell.p for cell in cells[0]))
-        for above, below in zip(cells[:-1], cells[1:], strict=True):
-            self.connect(*(cell.n for cell in above), *(cell.p for cell in below))
-        self.connect(*(cell.n for cell in cells[-1]), n)
+            options["initial_v"] = of_pairs("initial_v", initial_v, "V", Interval())
+        options |= self._values(shape, values)
+        cells = self.add_array("cell", kind, shape, np.asarray(soc).tolist(), volts, kind=table, **options)
+        self.connect(p, cells[0].p)
+        self.connect(cells[:-1].n, cells[1:].p)
+        self.connect(cells[:, :-1].n, cells[:, 1:].n)
+        self.connect(cells[-1].n, n)
         return cells
 
 
 class Pack(_Pack):
     """A pack of `Cell`s: `series` rows one after the other between `p` and `n`, each of `parallel` cells side by side.
 
-    The cells are `cell1_1`, `cell1_2`, …, the row first, from `p` on: `pack.cell1_2.soc`.
+    The cells are an array of shape (series, parallel), from `p` on: `pack.cell.soc`, `pack.cell[0,1].soc`.
 
     **Arguments:**
 
@@ -326,8 +319,8 @@ class HeatedPack(_Pack):
 
         C_heat·dT/dt = (heat of the cell) + G_coolant·(coolant.T − T) + Σ G_neighbour·(T_neighbour − T)
 
-    Neighbours are the next cell in a row and the cell of the same place in the next row. The temperature of `cell1_2`
-    is `body1_2.T`, the heat from it to the coolant `cooling1_2.Q_flow`.
+    Neighbours are the next cell in a row and the cell of the same place in the next row. The temperature of
+    `cell[0,1]` is `body[0,1].T`, the heat from it to the coolant `cooling[0,1].Q_flow`.
 
     **Arguments:**
 
@@ -374,17 +367,15 @@ class HeatedPack(_Pack):
         each = self._values(shape, thermal)
         between = self.parameter("G_neighbour", G_neighbour, unit="W/K", bounds=NONNEGATIVE)
         coolant = self.port("coolant", Thermal)
-        heats: Any = np.empty(shape, object)
-        for k, j in np.ndindex(*shape):
-            place = f"{k + 1}_{j + 1}"
-            body = HeatCapacitor(ev, f"body{place}", each["C_heat"][k, j], each["initial_temperature"][k, j])
-            cooling = ThermalConductor(ev, f"cooling{place}", each["G_coolant"][k, j])
-            heats[k, j] = self.add(body).heat
-            self.connect(cells[k, j].heat, heats[k, j], self.add(cooling).port_a)
-            self.connect(cooling.port_b, coolant)
-        for k, j in np.ndindex(*shape):
-            for where, after in (("beside", (k, j + 1)), ("below", (k + 1, j))):
-                if after[0] < series and after[1] < parallel:
-                    link = self.add(ThermalConductor(ev, f"{where}{k + 1}_{j + 1}", between))
-                    self.connect(heats[k, j], link.port_a)
-                    self.connect(link.port_b, heats[after])
+        bodies = self.add_array("body", HeatCapacitor, shape, each["C_heat"], each["initial_temperature"])
+        cooling = self.add_array("cooling", ThermalConductor, shape, each["G_coolant"])
+        self.connect(cells.heat, bodies.heat, cooling.port_a)
+        self.connect(cooling.port_b, coolant)
+        if parallel > 1:
+            beside = self.add_array("beside", ThermalConductor, (series, parallel - 1), between)
+            self.connect(bodies[:, :-1].heat, beside.port_a)
+            self.connect(bodies[:, 1:].heat, beside.port_b)
+        if series > 1:
+            below = self.add_array("below", ThermalConductor, (series - 1, parallel), between)
+            self.connect(bodies[:-1].heat, below.port_a)
+            self.connect(bodies[1:].heat, below.port_b)

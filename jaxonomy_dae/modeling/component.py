@@ -499,7 +499,7 @@ class Component(EventDeclarations, metaclass=Construction):
         return child
 
     def add_array(
-        self, name: str, kind: "type[Component]", shape: int | tuple[int, ...], *args: Any, **kwargs: Any
+        self, name: str, kind: "type[Component]", shape: int | tuple[int, ...], /, *args: Any, **kwargs: Any
     ) -> ComponentArray:
         """Adds an array of equal components; returns it. Its names are `"self.name[17].variable"`.
 

@@ -68,7 +68,7 @@ class AcausalDiagram:
         return self
 
     def add_array(
-        self, ev: EqnEnv, name: str, kind: type[Component], shape: int | tuple[int, ...], *args: Any, **kwargs: Any
+        self, ev: EqnEnv, name: str, kind: type[Component], shape: int | tuple[int, ...], /, *args: Any, **kwargs: Any
     ) -> ComponentArray:
         """Adds an array of equal components, as `Component.add_array` does, and returns it.
 
