@@ -11,6 +11,7 @@ from jax import lax
 from .closure_conversion import Program, any_member, apart, going, read, rows, unless_waiting, written
 from .packing import Packing
 from .private_names import unvmap_max
+from .resting import held_back
 from .reverse_step import ReverseStep
 from .step_times import StepTimes
 
@@ -77,7 +78,8 @@ class _Recorder:
             active = going(state, self.numbers, self.program)
             new, buffers = self.program.body(self.numbers["body"], state, buffers, active, first)
             accepted = active & (new.num_accepted_steps > state.num_accepted_steps)
-            after = new, jnp.where(accepted, state.tnext, last), self.times.after(state, moves)
+            new, held = held_back(state, new, accepted, self.numbers, self.program)
+            after = new, jnp.where(accepted, state.tnext, last), self.times.after(state, moves, held)
             after = unless_waiting(active, after, carry)
             return self.pack(self._taken_apart(*after)), buffers, accepted
 

@@ -5,7 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from .closure_conversion import Program, inexact
 from .private_names import clip_to_end, prevbefore
@@ -50,8 +50,11 @@ class StepTimes:
         """The derivatives of (tprev, tnext, controller's state) at the start."""
         return self.seeds()[0] if self.count else ()
 
-    def after(self, state: Any, moves: PyTree[Float[Array, "seeds ..."]]) -> PyTree[Float[Array, "seeds ..."]]:
-        """The same after the step that a state is about to attempt."""
+    def after(
+        self, state: Any, moves: PyTree[Float[Array, "seeds ..."]], held: Bool[Array, ""]
+    ) -> PyTree[Float[Array, "seeds ..."]]:
+        """The same after the step that a state is about to attempt; the next step keeps its length if it is held
+        back."""
         if not self.count:
             return ()
         program, numbers = self.program, self.numbers
@@ -74,7 +77,8 @@ class StepTimes:
 
         at = inexact(_clock(numbers | {"state": state}))
         given = self.seeds()[1]
-        return jax.vmap(lambda a, b: jax.jvp(clock, at, (a, b))[1])(moves, given)
+        tprev, tnext, controlled = jax.vmap(lambda a, b: jax.jvp(clock, at, (a, b))[1])(moves, given)
+        return tprev, jnp.where(held, tprev, tnext), controlled
 
 
 def _clock(tree: dict[str, Any]) -> Any:

@@ -13,6 +13,7 @@ from jax import lax
 from .closure_conversion import Program, closure_convert, unless_waiting
 from .private_names import is_sde, while_loop
 from .recorded_loop import solve
+from .resting import resting_rate
 from .reverse_step import state_saves
 
 LARGEST_RECORD = 2**25  # bytes; above, storing steps is no longer cheap
@@ -27,6 +28,10 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
     more steps than rows, it is run once more in pieces, from points kept on the way (checkpointing with two levels,
     Griewank & Walther 2008, Evaluating Derivatives, chapter 12). Memory hardly grows with `max_steps`, and
     without differentiation nothing is recorded.
+
+    Where an explicit method's state rests, its error is zero, and steps would grow without limit; the derivative, which
+    is the motion after a small push, would not be resolved. A run that is differentiated holds such steps back to a
+    tenth of the time scale of the field there.
 
     Rejected steps take no part, so what is not finite in them does no harm. Step sizes count as constant, except where
     they follow from the times given: derivatives with respect to `t0`, `t1`, `dt0`, `SaveAt(ts=...)` and the times of
@@ -172,12 +177,13 @@ def _functions(
         return closure_convert(lambda t, y: part.fn(t, y, args), s.tprev, y1) if part.steps else none
 
     at_ts, at_steps = [save_ts(part) for part in parts], [save_step(part) for part in parts]
+    rate = resting_rate(terms, solver, stepsize_controller, s.tprev, s.y, args)
     functions = dict(
-        step=step[0], adapt=adapted[0], jumps=made_jump is not False, every=tuple(int(part.steps) for part in parts),
+        rate=rate[0], step=step[0], adapt=adapted[0], jumps=made_jump is not False, every=tuple(int(part.steps) for part in parts),
         save_ts=tuple(f for f, _ in at_ts), save_steps=tuple(f for f, _ in at_steps),
     )  # fmt: skip
     numbers = dict(
-        step=step[1], adapt=adapted[1], controller=controller, t1=jnp.asarray(t1),
+        rate=rate[1], step=step[1], adapt=adapted[1], controller=controller, t1=jnp.asarray(t1),
         ts=tuple(part.ts for part in parts),
         save_ts=tuple(c for _, c in at_ts), save_steps=tuple(c for _, c in at_steps),
     )  # fmt: skip

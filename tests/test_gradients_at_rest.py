@@ -1,0 +1,100 @@
+"""Derivatives of runs whose state rests at an equilibrium: its error is zero, so it says nothing about steps.
+
+Unresolved, ∂x(1)/∂x(0) of an undamped oscillator of 20 rad/s came out as 14,000 in place of cos 20.
+"""
+
+import functools
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from sympy import Eq
+
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der, simulate
+
+# At rest, a step of a tenth of the time scale errs by less than 1e-8 of the motion; 20 rad/s take 200 of them.
+RESOLVED = 2e-6
+OMEGA = 20.0
+
+
+class Oscillator(Component):
+    """x'' = −ω²·(x − offset) − d·x' + θ + u."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        w, d, theta = self.parameter("w", OMEGA), self.parameter("d", 0.0), self.parameter("theta", 0.0)
+        x0, offset = self.parameter("x0", 0.0), self.parameter("offset", 0.0)
+        x, v = self.variable("x", start=x0 + offset, fixed=True), self.variable("v", start=0.0, fixed=True)
+        u = self.input("u", default=0.0)
+        self.add_equations(Eq(der(x), v), Eq(der(v), -(w**2) * (x - offset) - d * v + theta + u))
+
+
+@functools.cache
+def system():
+    ev, diagram = EqnEnv(), AcausalDiagram("at rest")
+    diagram.add(Oscillator(ev, "m"))
+    return AcausalCompiler(ev, diagram)()
+
+
+def end(value, name="m.x0", t1=1.0, others=(), **options):
+    changed = system().with_parameters({name: value, **dict(others)})
+    return simulate(changed, t1=t1, ts=jnp.array([t1]), rtol=1e-9, atol=1e-11, **options)["m.x"][0]
+
+
+@pytest.mark.parametrize("solver", [None, diffrax.Tsit5(), diffrax.Dopri5()], ids=["ours", "Tsit5", "Dopri5"])
+def test_by_the_start(solver):
+    assert abs(float(jax.grad(end)(0.0, solver=solver)) - np.cos(OMEGA)) < RESOLVED
+
+
+def test_by_a_force_that_is_zero():
+    """As a policy that begins with zero output: x = θ·(1 − cos ωt)/ω²."""
+    expected = (1 - np.cos(OMEGA)) / OMEGA**2
+    assert abs(float(jax.grad(end)(0.0, "m.theta")) - expected) < RESOLVED / OMEGA**2
+
+
+@pytest.mark.parametrize("offset", [0.3, -7e4])
+def test_at_an_equilibrium_that_is_not_zero(offset):
+    """There, rounding moves the state a little all the time."""
+    found = jax.grad(end)(0.0, others={"m.offset": offset}.items())
+    assert abs(float(found) - np.cos(OMEGA)) < RESOLVED
+
+
+def test_pushed_later():
+    """Rest for 0.5 s, then a force of 1: the derivative by the start is that of the motion all the way."""
+    force = (jnp.array([0.0, 0.5, 1.0]), jnp.array([0.0, 1.0, 1.0]), "held")
+    value, slope = jax.value_and_grad(end)(0.0, inputs={"m.u": force})
+    assert abs(float(value) - (1 - np.cos(OMEGA / 2)) / OMEGA**2) < 1e-7 / OMEGA
+    assert abs(float(slope) - np.cos(OMEGA)) < RESOLVED
+
+
+def test_in_batches_and_under_jit():
+    """Members at rest beside members that move."""
+    starts = jnp.array([0.0, 1e-3, 0.0, 1.0])
+    found = jax.jit(jax.vmap(jax.grad(end)))(starts)
+    np.testing.assert_allclose(found, np.cos(OMEGA), atol=RESOLVED)
+
+
+def test_by_the_time_too():
+    """x(T) = x0·cos ωT: derivatives by both at rest, and beside it."""
+    for x0 in (0.0, 1e-3):
+        found = jax.grad(lambda x, t: end(x, t1=t), argnums=(0, 1))(x0, 1.0)
+        np.testing.assert_allclose(found, [np.cos(OMEGA), -x0 * OMEGA * np.sin(OMEGA)], atol=RESOLVED)
+
+
+def test_without_differentiation_steps_grow():
+    """Nothing is held back where no derivative is asked for."""
+    assert simulate(system(), t1=1.0, ts=jnp.array([1.0])).stats["num_steps"] < 20
+
+
+def test_damped_motion():
+    """The derivative by the damping of a motion from afar, against differences of the closed form."""
+
+    def exact(x0, d):
+        w = np.sqrt(OMEGA**2 - d**2 / 4)
+        return x0 * np.exp(-d / 2) * (np.cos(w) + d / (2 * w) * np.sin(w))
+
+    slope = jax.grad(lambda d: end(1.0, others={"m.d": d}.items()))(2.0)
+    expected = (exact(1.0, 2.0 + 1e-5) - exact(1.0, 2.0 - 1e-5)) / 2e-5
+    assert abs(float(slope) - expected) < 1e-7
