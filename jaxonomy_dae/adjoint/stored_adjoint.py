@@ -179,7 +179,8 @@ def _functions(
     at_ts, at_steps = [save_ts(part) for part in parts], [save_step(part) for part in parts]
     rate = resting_rate(terms, solver, stepsize_controller, s.tprev, s.y, args)
     functions = dict(
-        rate=rate[0], step=step[0], adapt=adapted[0], jumps=made_jump is not False, every=tuple(int(part.steps) for part in parts),
+        rate=rate[0], step=step[0], adapt=adapted[0], jumps=made_jump is not False,
+        every=tuple(int(part.steps) for part in parts),
         save_ts=tuple(f for f, _ in at_ts), save_steps=tuple(f for f, _ in at_steps),
     )  # fmt: skip
     numbers = dict(
