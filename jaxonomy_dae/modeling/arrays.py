@@ -4,7 +4,7 @@ import inspect
 import math
 import operator
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import jax
 import numpy as np
@@ -240,7 +240,7 @@ def _each(value: Any, name: str, shape: tuple[int, ...], array: str, values: dic
     return ParameterSymbol(f"{array}:{name}")
 
 
-def _is_array(value: Any) -> bool:
+def _is_array(value: Any) -> TypeGuard[np.ndarray | jax.Array]:
     return isinstance(value, np.ndarray | jax.Array) and value.ndim > 0 and value.dtype != object
 
 
