@@ -83,6 +83,14 @@ def test_by_the_time_too():
         np.testing.assert_allclose(found, [np.cos(OMEGA), -x0 * OMEGA * np.sin(OMEGA)], atol=RESOLVED)
 
 
+@pytest.mark.parametrize(
+    "adjoint", [diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint()], ids=["forward", "checkpoints"]
+)
+def test_by_other_adjoints(adjoint):
+    by = jax.jacfwd if isinstance(adjoint, diffrax.ForwardMode) else jax.grad
+    assert abs(float(by(lambda x0: end(x0, adjoint=adjoint))(0.0)) - np.cos(OMEGA)) < RESOLVED
+
+
 def test_without_differentiation_steps_grow():
     """Nothing is held back where no derivative is asked for."""
     assert simulate(system(), t1=1.0, ts=jnp.array([1.0])).stats["num_steps"] < 20
