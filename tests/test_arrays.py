@@ -19,6 +19,7 @@ from jaxonomy_dae import (
     assign,
     der,
     simulate,
+    steady_state,
 )
 from jaxonomy_dae.library.electrical import Capacitor, Ground, Inductor, Resistor, VoltageSource
 from jaxonomy_dae.library.thermal import HeatCapacitor, ThermalConductor
@@ -261,6 +262,16 @@ def test_networks_events_and_inputs_in_arrays():
     np.testing.assert_array_equal(system.observe("gate.x", 0.0, started), [0.1, 0.2, 0.25])
     again = pickle.loads(pickle.dumps(system))
     np.testing.assert_array_equal(again.parameters["gate.limit"], limit)
+
+
+def test_the_steady_state_of_an_array():
+    """Inputs and starts by the array's name: 0 = 1 + x/2 + u."""
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    diagram.add_array(ev, "gate", Gated, 3, jax.tree_util.Partial(times, jnp.array(0.5)), limit=9.0)
+    system = AcausalCompiler(ev, diagram)()
+    u = np.array([-1.5, -2.0, -3.0])
+    found = steady_state(system, inputs={"gate.u": u}, initial={"gate.x": np.ones(3)})
+    np.testing.assert_allclose(system.observe("gate.x", 0.0, found.x), -2 * (1 + u), rtol=1e-9)
 
 
 def test_plots():
