@@ -274,6 +274,23 @@ def test_the_steady_state_of_an_array():
     np.testing.assert_allclose(system.observe("gate.x", 0.0, found.x), -2 * (1 + u), rtol=1e-9)
 
 
+def test_frames_preferences_and_chains_of_one():
+    """Names of arrays in `to_pandas`, `prefer_states` and `in`; slices that are empty; ports by index."""
+    pytest.importorskip("pandas")
+    for n in (1, 3):
+        ev, diagram = EqnEnv(), AcausalDiagram()
+        network = jax.tree_util.Partial(times, jnp.array(0.5))
+        gates = diagram.add_array(ev, "gate", Gated, n, network)
+        diagram.connect(gates[:-1].x, gates[1:].u)
+        system = AcausalCompiler(ev, diagram, prefer_states=["gate.x"])()
+        assert list(system.states) == [f"gate[{k}].x" for k in range(n)]
+        assert "gate.limit" in system.parameters and "gate.u" not in system.parameters
+        frame = simulate(system, t1=0.1, ts=jnp.array([0.0, 0.1])).to_pandas("gate.x")
+        assert list(frame.columns) == [f"gate[{k}].x" for k in range(n)]
+    _, diagram, cells = array_of(Cell, 3)
+    assert len(cells.a) == 3 and repr(cells.a[1]) == repr(cells[1].a) == "cell[1].a: Electrical port"
+
+
 def test_plots():
     """Each entry of a small array is a line with its name; a large one has one name."""
     pytest.importorskip("matplotlib")
@@ -370,6 +387,35 @@ def a_list():
     array_of(Gated, 2, times, limit=[1.0, 2.0])
 
 
+class Choosing(Component):
+    """Chooses an equation by its argument."""
+
+    def __init__(self, ev, name, mode=1.0):
+        super().__init__(ev, name)
+        x = self.variable("x", start=0.0, fixed=True)
+        self.add_equations(Eq(der(x), 1.0 if mode is None else -x))
+
+
+def unused():
+    array_of(Choosing, 2, mode=np.array([0.0, 1.0]))
+
+
+def texts():
+    array_of(Cell, 2, R=np.array(["a", "b"]))
+
+
+def expressions():
+    array_of(Cell, 2, R=np.array([object(), object()]))
+
+
+def given_twice():
+    ladder(3, True).with_parameters({"cell[0].r.R": 7.0, "cell.r.R": 1.0})
+
+
+def started_twice():
+    ladder(3, True).initialize(initial={"cell.c.v": 1.0, "cell[0].c.v": 2.0})
+
+
 def used_twice():
     ev, diagram, _ = array_of(Cell, 4)
     diagram.add_array(ev, "cell", Cell, 2)
@@ -403,12 +449,17 @@ def wrong_start():
         (not_positive, r"array 'cell': its shape is a positive integer or a tuple of them; got 0"),
         (out_of_bounds, r"parameter 'cell\[1\].c.C' must lie in \(0, inf\); got -1"),
         (not_finite, r"array 'cell': the values of R must be finite; got nan at position 1"),
-        (undeclared, r"array 'cell': 'a' has a value for each component, and Careless uses it elsewhere"),
+        (undeclared, r"array 'cell': 'a' has a value for each component, and Careless uses it in an equation"),
         (lengths_disagree, r"arrays of one shape join element by element.*'cell.a \(3\)', 'cell.b \(2\)'"),
         (beyond, r"array 'cell' has shape \(4,\): index 4 is out of bounds"),
         (itself, r"'cell.a' is connected to itself"),
         (other_domain, r"a connection joins ports of one domain"),
         (a_list, r"must be a number; got list.*Values of limit for each component are given as a NumPy array"),
+        (unused, r"'mode' has a value for each component, but Choosing does not use it in a parameter or an equation"),
+        (texts, r"the values of R must be real numbers; got texts"),
+        (expressions, r"the values of R must be real numbers; got entries of type object"),
+        (given_twice, r"parameter 'cell\[0\].r.R' is given twice, by its own name and as part of an array"),
+        (started_twice, r"initial: 'cell\[0\].c.v' is given twice"),
         (used_twice, r"the diagram has 'cell' already: give the array another name"),
         (read_in_a_list, r"'cell.c.v' is an array of shape \(3,\): name one of its entries, such as 'cell\[0\].c.v'"),
         (

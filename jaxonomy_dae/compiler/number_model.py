@@ -226,7 +226,7 @@ class ModelNumbers:
                 array, _, argument = path.rpartition("/")[2].partition(":")
                 raise ModelError(
                     f"array '{array}': '{argument}' has a value for each component, and "
-                    f"{type(self._prototype(i, array)).__name__} uses it elsewhere than as the value of a parameter: "
+                    f"{type(self._prototype(i, array)).__name__} uses it in an equation, a start or an expression: "
                     f"declare it there, self.parameter('{argument}', {argument}), and use the symbol that this returns"
                 )
             if path.startswith("../"):

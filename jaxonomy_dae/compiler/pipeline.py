@@ -127,13 +127,20 @@ def _preferred(flat: FlatModel, variables: QuantityMap, names: Sequence[str]) ->
     """How strongly each quantity was asked for as a state."""
     index = {n: k for k, n in enumerate(flat.variables.names)}
     out = {}
-    for k, name in enumerate(names):
+    full = [n for name in names for n in _entries(flat, name)]
+    for k, name in enumerate(full):
         if name not in index:
             raise ModelError(f"prefer_states: '{name}' is not a variable: " + nearest(name, index))
         q, _ = variables[index[name]]
         if q >= 0:
-            out.setdefault(q, len(names) - k)
+            out.setdefault(q, len(full) - k)
     return out
+
+
+def _entries(flat: FlatModel, name: str) -> list[str]:
+    """The names of the entries of an array of variables; the name itself if it is not that of one."""
+    ids = flat.arrays.variables(name)
+    return [name] if ids is None else [flat.variables.names[v] for v in ids.ravel().tolist()]
 
 
 def _merit(flat: FlatModel, variables: QuantityMap, extended: Extended, preferred: dict[int, int]) -> list[tuple]:

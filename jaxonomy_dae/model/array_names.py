@@ -91,13 +91,27 @@ def one_by_one(arrays: ArrayNames, names: list[str], given: Any, what: str) -> A
     """
     if not isinstance(given, Mapping) or not arrays.entries:
         return given
-    out = {}
+    out: dict[Any, Any] = {}
+
+    def put(values: dict[Any, Any]):
+        twice = next((name for name in values if name in out), None)
+        if twice is not None:
+            raise ModelError(f"{what}: '{twice}' is given twice, by its own name and as part of an array")
+        out.update(values)
+
     for name, value in given.items():
         order, inner = inner_name(name) if isinstance(name, str) else (0, "")
         ids = arrays.variables(inner)
         if ids is None:
-            out[name] = value
+            put({name: value})
             continue
+        if isinstance(value, tuple | list) and _shape(value) == ids.shape:
+            if what == "inputs" and len(value) in (2, 3):
+                raise ModelError(
+                    f"inputs: '{name}' is an array of shape ({_text(ids.shape)}), and a list may be samples: give "
+                    "values as a NumPy array, or samples of shape (times, *shape) as (times, values)"
+                )
+            value = np.asarray(value)
         full = [f"{'der(' * order}{names[v]}{')' * order}" for v in ids.ravel().tolist()]
         samples = isinstance(value, tuple | list) and len(value) in (2, 3) and np.ndim(_first(value)) == 1
         if samples and np.ndim(value[1]) > 1:
@@ -107,17 +121,25 @@ def one_by_one(arrays: ArrayNames, names: list[str], given: Any, what: str) -> A
                     f"{what}: the samples of '{name}' need shape (times, {_text(ids.shape)}); got {columns.shape}"
                 )
             columns = columns.reshape(len(columns), -1)
-            out |= {n: (value[0], columns[:, k], *value[2:]) for k, n in enumerate(full)}
+            put({n: (value[0], columns[:, k], *value[2:]) for k, n in enumerate(full)})
         elif samples or callable(value) or np.shape(value) == ():
-            out |= dict.fromkeys(full, value)
+            put(dict.fromkeys(full, value))
         elif np.shape(value) == ids.shape:
-            out |= dict(zip(full, jnp.asarray(value).ravel(), strict=True))
+            put(dict(zip(full, jnp.asarray(value).ravel(), strict=True)))
         else:
             raise ModelError(
                 f"{what}: '{name}' is an array of shape ({_text(ids.shape)}): give a number or an array of that shape; "
                 f"got shape {np.shape(value)}"
             )
     return out
+
+
+def _shape(value: Any) -> tuple[int, ...] | None:
+    """The shape of a list of numbers, None if it has none."""
+    try:
+        return np.shape(value)
+    except ValueError:
+        return None
 
 
 def _first(value: Any) -> Any:

@@ -12,7 +12,9 @@ import sympy
 from jax.core import Tracer
 
 from ..errors import ModelError
+from .construction import Construction
 from .declarations import EachValue
+from .events import Sampled
 from .ports import Port
 from .symbols import ParameterSymbol, VariableSymbol
 
@@ -154,6 +156,12 @@ class PortArray:
         symbol = getattr(self.port, name)  # which raises for what the domain lacks
         return self.chosen.symbols(symbol, f"{self.port.name}.{name}")
 
+    def __getitem__(self, index: Any) -> "PortArray":
+        return PortArray(self.port, self.chosen[index])
+
+    def __len__(self) -> int:
+        return len(self.chosen)
+
     def __repr__(self):
         return f"{self.described}: {self.port.domain.name} port{'s' if self.chosen.numbers.ndim else ''}"
 
@@ -176,7 +184,7 @@ def make_array(ev: "EqnEnv", name: str, kind: type, shape: Any, args: tuple, kwa
     """
     where = f"array '{name}'"
     sizes = _sizes(shape, where)
-    if not isinstance(kind, type):
+    if not isinstance(kind, Construction):
         raise ModelError(
             f"{where}: the class of its components is needed, as in add_array(…, Resistor, 10); got {kind!r}"
         )
@@ -230,9 +238,15 @@ def _each(value: Any, name: str, shape: tuple[int, ...], array: str, values: dic
             f"{where} has shape {shape}, but the values of {name} have shape {value.shape}: give one for each "
             "component; what is the same for all is a number, a tuple or a list"
         )
-    if np.issubdtype(value.dtype, np.complexfloating):
-        raise ModelError(f"{where}: the values of {name} must be real numbers; got complex ones")
-    numbers = np.asarray(value, np.float64).ravel()
+    try:
+        if np.issubdtype(value.dtype, np.complexfloating):
+            raise TypeError
+        numbers = np.asarray(value, np.float64).ravel()
+    except (TypeError, ValueError):
+        raise ModelError(
+            f"{where}: the values of {name} must be real numbers; got {_kind_of(value)}. A factor that is a parameter "
+            "goes to the component as an argument of its own"
+        ) from None
     if not np.isfinite(numbers).all():
         wrong = int(np.flatnonzero(~np.isfinite(numbers))[0])
         raise ModelError(f"{where}: the values of {name} must be finite; got {numbers[wrong]} at position {wrong}")
@@ -241,7 +255,15 @@ def _each(value: Any, name: str, shape: tuple[int, ...], array: str, values: dic
 
 
 def _is_array(value: Any) -> TypeGuard[np.ndarray | jax.Array]:
-    return isinstance(value, np.ndarray | jax.Array) and value.ndim > 0 and value.dtype != object
+    return isinstance(value, np.ndarray | jax.Array) and value.ndim > 0
+
+
+def _kind_of(value: Any) -> str:
+    """What is in an array, in a word."""
+    kinds = {"c": "complex numbers", "U": "texts", "S": "texts"}
+    if value.dtype == object:
+        return f"entries of type {type(value.flat[0]).__name__}" if value.size else "no numbers"
+    return kinds.get(value.dtype.kind, f"entries of type {value.dtype}")
 
 
 def _give_values(
@@ -252,16 +274,24 @@ def _give_values(
     if not values:
         return {}
     arguments: dict[str, str | None] = dict.fromkeys(values)
+    unused = set(values)
     whole = ComponentArray(prototype, shape)
     waiting = [(prototype, 1)]
     while waiting:
         component, depth = waiting.pop()
         symbols = {ParameterSymbol(f"{'../' * depth}{prototype.name}:{name}"): v for name, v in values.items()}
+        read = [*component.equations, *(v.start for v in component.variables.values() if v.start is not None)]
+        read += [p.value for p in component.parameters.values() if isinstance(p.value, sympy.Expr)]
+        read += [account.expression for account in component.accounts]
+        read += [part for when in component.events if isinstance(when.clock, Sampled)
+                 for part in (when.clock.period, when.clock.offset)]  # fmt: skip
+        used_here = set().union(*(expression.free_symbols for expression in read))
+        unused -= {str(s).rpartition(":")[2] for s in used_here & set(symbols)}
         for parameter in list(component.parameters.values()):
             if not isinstance(parameter.value, sympy.Expr) or not parameter.value.free_symbols <= set(symbols):
                 continue
             used = sorted(parameter.value.free_symbols, key=str)
-            numbers = sympy.lambdify(used, parameter.value, "numpy")(*(symbols[s] for s in used))  # type: ignore[index]
+            numbers = sympy.lambdify(used, parameter.value, ["scipy", "numpy"])(*(symbols[s] for s in used))  # type: ignore[index]
             numbers = np.broadcast_to(np.asarray(numbers, np.float64), (math.prod(shape),))
             for k, number in enumerate(numbers.tolist()):
                 if number not in parameter.bounds:
@@ -275,4 +305,10 @@ def _give_values(
                 arguments[str(used[0]).rpartition(":")[2]] = parameter.name
         for child in component.children.values():
             waiting.append((child.prototype if isinstance(child, ComponentArray) else child, depth + 1))
+    if unused:
+        name = sorted(unused)[0]
+        raise ModelError(
+            f"array '{prototype.name}': '{name}' has a value for each component, but {type(prototype).__name__} does "
+            "not use it in a parameter or an equation. What chooses between equations must be the same for all"
+        )
     return arguments

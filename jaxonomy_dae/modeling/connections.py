@@ -71,7 +71,7 @@ def _is_port(end: Any) -> bool:
 
 def _is_signal(end: Any) -> bool:
     symbols = end.ravel() if isinstance(end, np.ndarray) else [end]
-    return all(isinstance(s, VariableSymbol) and not s.order for s in symbols) and len(symbols) > 0
+    return all(isinstance(s, VariableSymbol) and not s.order for s in symbols)
 
 
 def _shape(end: Any) -> tuple[int, ...]:

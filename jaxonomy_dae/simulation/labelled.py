@@ -18,9 +18,15 @@ def data_frame(solution: "Solution", names: tuple[str, ...]) -> Any:
         raise ModelError(
             f"a data frame holds one solution, this is a batch of shape {solution.ts.shape[:-1]}: use to_xarray()"
         )
-    chosen = names or tuple(solution)
+    chosen = _one_by_one(solution, names) or tuple(solution)
     index = pandas.Index(np.asarray(solution.ts), name="time")
     return pandas.DataFrame(np.asarray(solution[list(chosen)]), index=index, columns=list(chosen))
+
+
+def _one_by_one(solution: "Solution", names: tuple[str, ...]) -> tuple[str, ...]:
+    """Names, with those of the entries in place of an array's."""
+    plan = solution.system.plan
+    return tuple(one for name in names for one in (plan.entries(name) or ([name],))[0])
 
 
 def data_set(solution: "Solution", names: tuple[str, ...]) -> Any:
@@ -37,7 +43,7 @@ def dataset_of(
     xarray: Any, solution: "Solution", dims: tuple[str, ...], coordinates: dict[str, Any], names: tuple[str, ...] = ()
 ) -> Any:
     """The variables of a solution, or of a batch that has the dimensions `dims`, with their units."""
-    chosen = names or tuple(solution)
+    chosen = _one_by_one(solution, names) or tuple(solution)
     table = solution.system.plan.flat.variables
     units = dict(zip(table.names, table.unit, strict=True))
     columns = np.moveaxis(np.asarray(solution[list(chosen)]), -1, 0)

@@ -147,6 +147,9 @@ class Parameters(eqx.Module):
             )
         return part[..., place]
 
+    def __contains__(self, name: object) -> bool:
+        return isinstance(name, str) and (name in self.table._index or self.table.entries(name) is not None)
+
     def __iter__(self) -> Iterator[str]:
         return iter(self.table.names)
 
@@ -182,9 +185,16 @@ class Parameters(eqx.Module):
             raise ModelError(f"parameters are given by names, {{'m.k': 2.0}}; got {type(new).__name__}")
         array = self.array
         batch = array.shape[:-1]
+        seen: set[int] = set()
         for name, value in new.items():
             entries = self.table.entries(name)
+            chosen = {self.table.index(name)} if entries is None else set(entries.ravel().tolist())
+            if seen & chosen:
+                twice = self.table.names[min(seen & chosen)]
+                raise ModelError(f"parameter '{twice}' is given twice, by its own name and as part of an array")
+            seen |= chosen
             if entries is not None:
+                value = np.asarray(value) if isinstance(value, list | tuple) else value
                 checked = jnp.asarray(self._checked_array(name, entries, value, batch), array.dtype)
                 array = array.at[..., entries].set(checked)
                 continue
