@@ -3,6 +3,7 @@
 import json
 import pathlib
 
+import jax
 import numpy as np
 import pytest
 
@@ -11,11 +12,13 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(autouse=True)
-def drawing_nowhere():
+def as_in_a_notebook():
+    """Figures are drawn nowhere, and types are promoted as they are by default: Optax needs it."""
     plt = pytest.importorskip("matplotlib.pyplot")
     backend, settings = plt.get_backend(), dict(plt.rcParams)
     plt.switch_backend("Agg")
-    yield
+    with jax.numpy_dtype_promotion("standard"):
+        yield
     plt.close("all")
     plt.rcParams.update(settings)
     plt.switch_backend(backend)
