@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 FLOORS := .venv-floors
 
-NOTEBOOK := examples/neural_dae_pendulum_drag.ipynb
+NOTEBOOKS := examples/neural_dae_pendulum_drag.ipynb $(wildcard examples/gallery/*.ipynb)
 
 # $(call make-venv,DIR,CANDIDATES): a virtual environment from the first interpreter that is new enough.
 define make-venv
@@ -25,7 +25,7 @@ help:
 	@echo "demo         train the pendulum's drag network (examples/)"
 	@echo "test         quick tests;  test-all: the slow ones too;  test-floors: on the oldest dependencies"
 	@echo "check        lint, types, test, docs, wheel: all that must pass"
-	@echo "bench        benchmarks;  notebook: execute the example notebook in place;  clean: remove products"
+	@echo "bench        benchmarks;  notebook: execute the example notebooks in place;  clean: remove products"
 
 $(BIN)/python:
 	$(call make-venv,$(VENV),"$(PYTHON)" python3.13 python3.12 python3.11 python3.14)
@@ -91,7 +91,7 @@ bench: $(VENV)/.stamp-dev
 	@set -e; for f in benchmarks/[!_]*.py; do echo "== $$f"; $(BIN)/python "$$f"; done
 
 notebook: $(VENV)/.stamp-dev
-	$(BIN)/jupyter-execute --inplace $(NOTEBOOK)
+	$(BIN)/jupyter-execute --inplace $(NOTEBOOKS)
 
 clean:
 	rm -rf build dist site .pytest_cache .ruff_cache .hypothesis examples/output $(FLOORS)

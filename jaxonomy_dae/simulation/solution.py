@@ -105,9 +105,10 @@ class Solution(eqx.Module):
         """The values of several variables, shape `(n, len(names))`, evaluated at once."""
         if self.states.ndim > 2:
             return _each(self, lambda one: one._columns(names))
-        held: Any = self.discrete
-        places = {} if held is None else {n: k for k, n in enumerate(self.system.discretes)}
-        own = {"time": self.ts} | {n: held[:, places[n]] for n in names if n in places}
+        own = {"time": self.ts}
+        if self.discrete is not None:
+            places = {n: k for k, n in enumerate(self.system.discretes)}
+            own |= {n: self.discrete[:, places[n]] for n in names if n in places}
         quantity, factor = self.system.plan.resolve([name for name in names if name not in own])
         given = (self.system, self.ts, self.states, self.inputs, self.discrete)
         inside = _places(self.system, quantity)
