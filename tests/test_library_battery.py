@@ -85,6 +85,7 @@ def test_cells_at_constant_current():
 # --- a cell with heat ----------------------------------------------------------------------------------------------
 
 HEATED = {"cell.Q": 2.2, "cell.R0": 0.04, "cell.R1": 0.02, "cell.C1": 1.5e3, "cell.Ea": 2.5e4, "cell.dUdT": 3e-4,
+          "cell.gas_constant": GAS,
           "cell.T_ref": 298.15, "cell.initial_soc": 0.9, "cell.initial_v1": -0.01, "cell.eta": 0.97, "body.C": 45.0,
           "body.initial_temperature": 285.0, "skin.h": 5.0, "skin.A": 0.004, "air.T": 280.0, "load.R": 0.9,
           **{f"cell.ocv{k}": float(v) for k, v in enumerate(OCV, 1)}}  # fmt: skip
@@ -114,7 +115,7 @@ def heated_reference(values, ts):
     table = curve(np.array([p[f"cell.ocv{k}"] for k in range(1, 7)]))
 
     def current(soc, v1, T):
-        r = p["cell.R0"] * np.exp(p["cell.Ea"] / GAS * (1 / T - 1 / p["cell.T_ref"]))
+        r = p["cell.R0"] * np.exp(p["cell.Ea"] / p["cell.gas_constant"] * (1 / T - 1 / p["cell.T_ref"]))
         ocv = table(soc) + p["cell.dUdT"] * (T - p["cell.T_ref"])
         return -(ocv + v1) / (p["load.R"] + r), r
 

@@ -77,8 +77,9 @@ class _Cell(TwoPin):
         known_kind(kind, name)
         volts = [self.parameter(f"ocv{k}", value, unit="V") for k, value in enumerate(ocv, start=1)]
         charge = HOUR * self.parameter("Q", Q, unit="A*h", bounds=POSITIVE)
-        efficiency = self.parameter("eta", eta, bounds=EFFICIENCY)
-        z = self.variable("soc", start=self.parameter("initial_soc", initial_soc), fixed=True)
+        efficiency = self.parameter("eta", eta, unit="1", bounds=EFFICIENCY)
+        start = self.parameter("initial_soc", initial_soc, unit="1")
+        z = self.variable("soc", start=start, fixed=True, unit="1")
         voltage, current = self._two_pins()
         reacting = current - (1 - efficiency) * Max(current, 0)
         self.add_equations(Eq(charge * der(z), reacting))
@@ -198,7 +199,8 @@ class HeatedCell(_Cell):
         heat = self.port("heat", Thermal)
         c = self._circuit(soc, ocv, Q, R, C, eta, initial_soc, initial_v, kind)
         voltage = self.output("ocv", c.table + entropy * (heat.T - reference), unit="V")
-        r = self.output("r", resistance * exp(activation / GAS_CONSTANT * (1 / heat.T - 1 / reference)), unit="Ohm")
+        gas = self.parameter("gas_constant", GAS_CONSTANT, unit="J/(mol*K)", bounds=POSITIVE)
+        r = self.output("r", resistance * exp(activation / gas * (1 / heat.T - 1 / reference)), unit="Ohm")
         lost = r * c.current**2 + c.heat + voltage * (c.current - c.reacting)
         self.add_equations(
             Eq(c.voltage, voltage + r * c.current + c.overpotentials),
@@ -211,8 +213,8 @@ class HeatedCell(_Cell):
 _OF_CELLS: dict[str, tuple[str, Interval]] = {
     "Q": ("A*h", POSITIVE),
     "R0": ("Ohm", POSITIVE),
-    "eta": ("", EFFICIENCY),
-    "initial_soc": ("", Interval()),
+    "eta": ("1", EFFICIENCY),
+    "initial_soc": ("1", Interval()),
     "Ea": ("J/mol", Interval()),
     "dUdT": ("V/K", Interval()),
     "T_ref": ("K", POSITIVE),
