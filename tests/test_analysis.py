@@ -112,6 +112,7 @@ def test_derivatives_of_a_steady_state():
     np.testing.assert_allclose(jax.vmap(temperature, (0, None))(many, at[1]), expected(many, at[1]), rtol=ROUNDING)
 
 
+@pytest.mark.slow
 def test_redundant_states_of_a_pendulum():
     """All candidates are kept as states, with x² + y² = L² and its derivative: at rest the rod carries the weight,
     2·lam·L = m·g."""

@@ -84,7 +84,7 @@ def test_a_ladder_with_values_for_each():
     assert "cell.c.v" in solution and "cell.c.x" not in solution and "cell[6].c.v" not in solution
 
 
-@pytest.mark.parametrize("n", [2, 3, 11])
+@pytest.mark.parametrize("n", [3, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 11))])
 def test_the_same_as_single_components(n):
     """The same states, values and counts, and gradients by every parameter."""
     R = np.random.default_rng(n).uniform(0.5, 2.0, n)

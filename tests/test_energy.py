@@ -156,6 +156,7 @@ def test_a_speed_that_the_model_does_not_have():
     assert_energy_balance(solution, rtol=BALANCED)
 
 
+@pytest.mark.slow
 def test_redundant_states_balance():
     solution = simulate(pendulum(), 2.0, ts=jnp.linspace(0.0, 2.0, 5), **TIGHT)
     np.testing.assert_allclose(solution.energy(), solution.energy()[0], rtol=BALANCED)
@@ -233,6 +234,7 @@ def test_every_mechanical_component():
     assert_energy_balance(solution, rtol=BALANCED)
 
 
+@pytest.mark.slow
 def test_what_switches_and_friction_lose():
     """A brake, a clutch and a sliding part of 6, 1 and 0.5 N·m or N; a switch of 1 Ω that closes at 0.5 s, a diode."""
     ev = EqnEnv()

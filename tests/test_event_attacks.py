@@ -173,6 +173,7 @@ def test_a_discrete_variable_as_the_parameter_of_a_child():
     np.testing.assert_array_equal(solution["g.other.n"], [1, 1, 1])
 
 
+@pytest.mark.slow
 def test_a_pendulum_at_a_wall():
     """Cartesian, so that both speeds are reset on a hidden constraint; in the angle by SciPy."""
 

@@ -144,6 +144,7 @@ def test_a_cell_that_heats_itself():
     np.testing.assert_allclose(solution.dissipation(), lost, rtol=1e-12)  # the cell's heat leaves at its port
 
 
+@pytest.mark.slow
 def test_gradients_of_a_cell_that_heats_itself():
     """By every parameter: reverse against forward mode, and against differences of the reference."""
     system, values = heated(), jnp.array(list(HEATED.values()))

@@ -136,6 +136,7 @@ def bridge_by_brute_force(source, v_load, R=None):
     return fits[0]
 
 
+@pytest.mark.slow
 def test_a_bridge_against_all_of_its_modes():
     ev = EqnEnv()
     source, series = el.SineVoltage(ev, "src", 10.0, 1.0), el.Resistor(ev, "rs", 1.0)
@@ -209,7 +210,7 @@ def charging(opens=False):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("opens", [False, True])
+@pytest.mark.parametrize("opens", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_timed_switch(opens):
     """v = 12·(1 − exp(−s/τ)), τ = 1 s, with s the time for which it has been closed: dv/d(time) is ∓12·exp(−s)."""
     system, ts = charging(opens), np.array([0.3, 0.7, 1.1, 2.0])
@@ -242,6 +243,7 @@ def test_a_switch_that_a_signal_drives():
     np.testing.assert_allclose(events(solution), [1 / 12, 5 / 12, 13 / 12, 17 / 12], atol=SMOOTH)
 
 
+@pytest.mark.slow
 def test_a_dimmer():
     """A thyristor fired at the time a of every period of 10·sin(2πt), onto 4 Ω; the charge in a period is
     10/4·(1 + cos 2πa)/2π, and its derivative by a is −10/4·sin 2πa."""
@@ -276,6 +278,7 @@ def test_a_dimmer():
 # --- friction that sticks --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_brake():
     """w falls at the rate r = mu·cgeo·fn_max·u/J, to rest at w₀/r after the angle w₀²/2r: dphi/dmu = −phi/mu."""
     ev = EqnEnv()
@@ -407,6 +410,7 @@ def coupled(mu, **options):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_coupled_clutches():
     """CoupledClutches of the Modelica Standard Library, against its closed form in extended precision; a Modelica
     tool's published event times are off by up to 4e-6 s."""

@@ -206,6 +206,7 @@ def components():
     return b.compile(), inputs, expected
 
 
+@pytest.mark.slow
 def test_components_against_references():
     system, inputs, expected = components()
     solution = simulate(system, 2.0, ts=TS, inputs=inputs, **TIGHT)

@@ -400,11 +400,11 @@ def with_slow(*slow):
     return [pytest.param(s, marks=pytest.mark.slow) if s in slow else s for s in SYSTEMS]
 
 
-@pytest.mark.parametrize("reference", with_slow(wien))
+@pytest.mark.parametrize("reference", with_slow(wien, rectifier))
 def test_solution(reference):
     check_solution(reference)
 
 
-@pytest.mark.parametrize("reference", with_slow(wien, rectifier, house))
+@pytest.mark.parametrize("reference", with_slow(wien, rectifier, house, chua))
 def test_gradient(reference):
     check_gradient(reference)

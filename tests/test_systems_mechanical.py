@@ -274,12 +274,12 @@ def with_slow(*slow):
     return [pytest.param(s, marks=pytest.mark.slow) if s in slow else s for s in SYSTEMS]
 
 
-@pytest.mark.parametrize("reference", with_slow(triple_pendulum))
+@pytest.mark.parametrize("reference", with_slow(tanks, triple_pendulum))
 def test_solution(reference):
     check_solution(reference)
 
 
-@pytest.mark.parametrize("reference", with_slow(tanks, triple_pendulum))
+@pytest.mark.parametrize("reference", with_slow(tanks, triple_pendulum, lift, quarter_car))
 def test_gradient(reference):
     check_gradient(reference)
 
