@@ -39,11 +39,14 @@ def resolve_ends(ends: Sequence[Any], where: str) -> tuple[Connection | None, li
                 what, known = ("port", inner.ports) if inner.ports else ("variable", inner.variables)
                 raise ModelError(f"component '{end.path}' has no {what} '{name}': " + nearest(name, known))
             end = end[name] if name not in inner.ports else getattr(end, name)
-        if not _is_port(end) and not _is_signal(end):
+        if type(end) is not Port and not _is_port(end) and not _is_signal(end):
             raise ModelError(
                 f"{where}: connect takes ports, symbols of variables, or a component and a name; got {end!r}"
             )
         found.append(end)
+    if len(found) > 1 and all(type(end) is Port for end in found):  # as nearly always, in models with many
+        _check_single_ports(found, where)
+        return Connection(tuple(found)), []
     kinds = {_is_port(end) for end in found}
     if len(kinds) > 1:
         raise ModelError(f"{where}: connect joins ports, or a variable and inputs; got both: {_listed(found)}")
@@ -78,22 +81,34 @@ def _shape(end: Any) -> tuple[int, ...]:
     return end.chosen.numbers.shape if isinstance(end, PortArray) else getattr(end, "shape", ())
 
 
+def _check_single_ports(ports: Sequence[Port], where: str) -> None:
+    domain, seen = ports[0].domain, set()
+    for port in ports:
+        if port.domain is not domain and port.domain != domain:
+            raise ModelError(_TWO_DOMAINS.format(where, port, ports[0]))
+        if id(port) in seen:
+            raise ModelError(_ITSELF.format(where, port.component.path, port.name))
+        seen.add(id(port))
+
+
+_TWO_DOMAINS = "{}: cannot connect {!r} to {!r}: a connection joins ports of one domain"
+_ITSELF = "{}: '{}.{}' is connected to itself: name each port once"
+
+
 def _check_ports(ends: Sequence[Port | PortArray], by_element: bool, where: str) -> None:
     seen: dict[int, list[np.ndarray]] = {}
     first = ends[0].port if isinstance(ends[0], PortArray) else ends[0]
     for end in ends:
         port = end.port if isinstance(end, PortArray) else end
         if port.domain != first.domain:
-            raise ModelError(f"{where}: cannot connect {end!r} to {ends[0]!r}: a connection joins ports of one domain")
+            raise ModelError(_TWO_DOMAINS.format(where, end, ends[0]))
         numbers = end.chosen.numbers if isinstance(end, PortArray) else np.zeros((), np.int64)
         others = seen.setdefault(id(port), [])
         twice = any((numbers == other).any() for other in others)
         if not by_element:
             twice |= len(np.unique(numbers)) < numbers.size
         if twice:
-            raise ModelError(
-                f"{where}: '{port.component.path}.{port.name}' is connected to itself: name each port once"
-            )
+            raise ModelError(_ITSELF.format(where, port.component.path, port.name))
         others.append(numbers)
 
 
