@@ -21,7 +21,6 @@ def variable_table(model: ModelNumbers, driven: set[int]) -> VariableTable:
     records: list[tuple[Variable, int, bool]] = []  # declared variables, each with its port and whether it is across
     record = np.empty(model.n_variables, np.int64)
     owner = np.empty(model.n_variables, np.int64)
-    port = np.full(model.n_variables, -1, np.int64)
     places: list[int] = []
     rows: list[int] = []
     owners: list[int] = []
@@ -49,7 +48,6 @@ def variable_table(model: ModelNumbers, driven: set[int]) -> VariableTable:
             at = i.variable[:, None] + np.arange(n)
             record[at] = first + np.arange(n)
             owner[at] = i.number[:, None]
-            port[at] = i.port[:, None]
     record[places], owner[places] = rows, owners
 
     def column(of, dtype: Any) -> np.ndarray:
