@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from sympy import Eq
 
-from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der, simulate
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, assign, der, pre, reinit, simulate
 
 # At rest, a step of a tenth of the time scale errs by less than 1e-8 of the motion; 20 rad/s take 200 of them.
 RESOLVED = 2e-6
@@ -106,3 +106,56 @@ def test_damped_motion():
     slope = jax.grad(lambda d: end(1.0, others={"m.d": d}.items()))(2.0)
     expected = (exact(1.0, 2.0 + 1e-5) - exact(1.0, 2.0 - 1e-5)) / 2e-5
     assert abs(float(slope) - expected) < 1e-7
+
+
+class Counted(Oscillator):
+    """Beside the oscillator, a clock that counts, and a guard that falls through zero late."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        count, x = self.discrete("count", start=0.0), self.x
+        self.when(self.sampled(0.7), assign(count, pre(count) + 1))
+        self.when(ev.t > 0.31, reinit(x, pre(x) + self.x0))
+
+
+@functools.cache
+def counted():
+    ev, diagram = EqnEnv(), AcausalDiagram("counted")
+    diagram.add(Counted(ev, "m"))
+    return AcausalCompiler(ev, diagram)()
+
+
+@pytest.mark.parametrize("adjoint", [None, diffrax.ForwardMode()], ids=["stored", "forward"])
+def test_between_events(adjoint):
+    """The start counts twice: once at 0, and once more at 0.31."""
+
+    def last(x0):
+        changed = counted().with_parameters({"m.x0": x0})
+        return simulate(changed, t1=1.0, ts=jnp.array([1.0]), rtol=1e-9, atol=1e-11, adjoint=adjoint)["m.x"][0]
+
+    slope = jax.jacfwd(last) if adjoint else jax.grad(last)
+    assert abs(float(slope(0.0)) - np.cos(OMEGA) - np.cos(0.69 * OMEGA)) < 2 * RESOLVED
+
+
+class Beside(Oscillator):
+    """A large state that rests, 1e7 Pa, beside motion in parts of a micrometre."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        p = self.variable("p", start=1e7, fixed=True)
+        self.add_equations(Eq(der(p), 1e3 * (1e7 - p)))
+
+
+def test_the_units_of_what_rests_do_not_count():
+    """Motion beside it is seen as such, in some 80 steps: the long one after one that a jump cuts is allowed."""
+    ev, diagram = EqnEnv(), AcausalDiagram("beside")
+    diagram.add(Beside(ev, "m"))
+    system = AcausalCompiler(ev, diagram)()
+
+    def last(x0):
+        changed, jumps = system.with_parameters({"m.x0": x0}), [0.3, 0.5, 0.77]
+        solution = simulate(changed, t1=1.0, ts=jnp.array([1.0]), rtol=1e-6, atol=1e-12, max_steps=150, jump_ts=jumps)
+        return solution["m.x"][0]
+
+    value, slope = jax.value_and_grad(last)(1e-7)
+    assert abs(float(slope) - np.cos(OMEGA)) < 1e-3

@@ -13,7 +13,7 @@ from jax import lax
 from .closure_conversion import Program, closure_convert, unless_waiting
 from .private_names import is_sde, while_loop
 from .recorded_loop import solve
-from .resting import resting_rate
+from .resting import steps_at_rest
 from .reverse_step import state_saves
 
 LARGEST_RECORD = 2**25  # bytes; above, storing steps is no longer cheap
@@ -177,14 +177,14 @@ def _functions(
         return closure_convert(lambda t, y: part.fn(t, y, args), s.tprev, y1) if part.steps else none
 
     at_ts, at_steps = [save_ts(part) for part in parts], [save_step(part) for part in parts]
-    rate = resting_rate(terms, solver, stepsize_controller, s.tprev, s.y, args)
+    rest = steps_at_rest(terms, solver, stepsize_controller, s.tprev, s.y, args)
     functions = dict(
-        rate=rate[0], step=step[0], adapt=adapted[0], jumps=made_jump is not False,
+        rest=rest[0], step=step[0], adapt=adapted[0], jumps=made_jump is not False,
         every=tuple(int(part.steps) for part in parts),
         save_ts=tuple(f for f, _ in at_ts), save_steps=tuple(f for f, _ in at_steps),
     )  # fmt: skip
     numbers = dict(
-        rate=rate[1], step=step[1], adapt=adapted[1], controller=controller, t1=jnp.asarray(t1),
+        rest=rest[1], step=step[1], adapt=adapted[1], controller=controller, t1=jnp.asarray(t1),
         ts=tuple(part.ts for part in parts),
         save_ts=tuple(c for _, c in at_ts), save_steps=tuple(c for _, c in at_steps),
     )  # fmt: skip
