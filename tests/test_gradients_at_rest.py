@@ -13,8 +13,9 @@ import pytest
 from sympy import Eq
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, assign, der, pre, reinit, simulate
+from jaxonomy_dae.solvers import BDF, Rodas5P
 
-# At rest, a step of a tenth of the time scale errs by less than 1e-8 of the motion; 20 rad/s take 200 of them.
+# At rest, a step errs by rtol/0.03, 3e-8 of the motion; 20 rad s take some 60 of them.
 RESOLVED = 2e-6
 OMEGA = 20.0
 
@@ -159,3 +160,67 @@ def test_the_units_of_what_rests_do_not_count():
 
     value, slope = jax.value_and_grad(last)(1e-7)
     assert abs(float(slope) - np.cos(OMEGA)) < 1e-3
+
+
+class Implicit(Component):
+    """The force is the root of an equation that stays: steps are implicit by default."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        x0, w = self.parameter("x0", 0.0), self.parameter("w", OMEGA)
+        x, v = self.variable("x", start=x0, fixed=True), self.variable("v", start=0.0, fixed=True)
+        f = self.variable("f")
+        self.add_equations(Eq(der(x), v), Eq(der(v), f), Eq(f + 1e-3 * f**3, -(w**2) * x))
+
+
+@functools.cache
+def implicit():
+    ev, diagram = EqnEnv(), AcausalDiagram("implicit")
+    diagram.add(Implicit(ev, "m"))
+    return AcausalCompiler(ev, diagram)()
+
+
+def last_implicit(x0, **options):
+    changed = implicit().with_parameters({"m.x0": x0})
+    return simulate(changed, t1=1.0, ts=jnp.array([1.0]), rtol=1e-9, atol=1e-11, **options)["m.x"][0]
+
+
+@pytest.mark.parametrize("x0", [0.0, 1e-13, 1e-10])
+@pytest.mark.parametrize(
+    "solver",
+    [None, BDF(), diffrax.Tsit5(), pytest.param(diffrax.Kvaerno5(), marks=pytest.mark.slow)],
+    ids=["default", "BDF", "Tsit5", "Kvaerno5"],
+)
+def test_other_methods_and_motion_that_tolerances_do_not_see(solver, x0):
+    """In a second run pushed by 3 %, errors are 1e-9/0.03 of the motion a step, in some 60 steps; BDF has a second
+    order's start and thousands."""
+    found = jax.grad(lambda x0: last_implicit(x0, solver=solver))(x0)
+    assert abs(float(found) - np.cos(OMEGA)) < (1e-4 if isinstance(solver, BDF) else RESOLVED)
+
+
+def test_implicit_methods_by_forward_mode():
+    found = jax.jacfwd(lambda x0: last_implicit(x0, adjoint=diffrax.ForwardMode()))(0.0)
+    assert abs(float(found) - np.cos(OMEGA)) < RESOLVED
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_stiff_motion_that_has_died_away_costs_few_steps(count):
+    """At rest, with rates of 1e5 and 1e3 beside 1: the push dies away, and steps may grow again."""
+
+    class Decays(Component):
+        def __init__(self, ev, name):
+            super().__init__(ev, name)
+            for k in range(count):
+                x = self.variable(f"x{k}", start=self.parameter(f"start{k}", 0.0), fixed=True)
+                self.add_equations(Eq(der(x), -(10.0 ** [0, 3, 5][k]) * x))
+
+    ev, diagram = EqnEnv(), AcausalDiagram("decays")
+    diagram.add(Decays(ev, "m"))
+    system = AcausalCompiler(ev, diagram)()
+
+    def last(start):
+        changed = system.with_parameters({"m.start0": start})
+        solution = simulate(changed, t1=3.0, ts=jnp.array([3.0]), solver=Rodas5P(), max_steps=400)
+        return solution["m.x0"][0]
+
+    assert abs(float(jax.grad(last)(0.0)) - np.exp(-3)) < 1e-4  # rtol 1e-6/0.03 a step

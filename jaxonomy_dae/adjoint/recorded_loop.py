@@ -44,23 +44,23 @@ class _Recorder:
     def __init__(self, numbers: dict[str, Any], program: Program, times: StepTimes):
         self.numbers, self.program, self.times = numbers, program, times
         state = numbers["state"]
-        carry = self._taken_apart(state, jnp.full_like(state.tprev, -jnp.inf), times.start())
+        carry = self._taken_apart(state, jnp.full_like(state.tprev, -jnp.inf), times.start(), numbers["pushed"])
         self.row, self.rest = (Packing(part) for part in carry)
         self.start = self.pack(carry)
 
-    def _taken_apart(self, state, last, moves):
+    def _taken_apart(self, state, last, moves, pushed):
         names = ("y", "solver_state", "tprev", "tnext") + (("made_jump",) if self.program.jumps else ())
         row = {name: getattr(state, name) for name in names} | dict(last=last, moves=moves[:2])
-        return row, (dataclasses.replace(state, **dict.fromkeys(names)), moves[2:])
+        return row, (dataclasses.replace(state, **dict.fromkeys(names)), moves[2:], pushed)
 
     def pack(self, carry):
         return self.row.pack(carry[0]), self.rest.pack(carry[1])
 
     def unpack(self, packed):
-        """(state, end of the last accepted step, derivatives of the times)."""
-        row, (state, moves) = self.row.unpack(packed[0]), self.rest.unpack(packed[1])
+        """(state, end of the last accepted step, derivatives of the times, second run at rest)."""
+        row, (state, moves, pushed) = self.row.unpack(packed[0]), self.rest.unpack(packed[1])
         last, first_moves = row.pop("last"), row.pop("moves")
-        return dataclasses.replace(state, **row), last, (*first_moves, *moves)
+        return dataclasses.replace(state, **row), last, (*first_moves, *moves), pushed
 
     def going(self, packed):
         return any_member(going(self.unpack(packed)[0], self.numbers, self.program))
@@ -74,12 +74,12 @@ class _Recorder:
         def attempt(loop):
             packed, buffers, _ = loop
             carry = self.unpack(packed)
-            state, last, moves = carry
+            state, last, moves, pushed = carry
             active = going(state, self.numbers, self.program)
             new, buffers = self.program.body(self.numbers["body"], state, buffers, active, first)
             accepted = active & (new.num_accepted_steps > state.num_accepted_steps)
-            new, held = held_back(state, new, accepted, self.numbers, self.program)
-            after = new, jnp.where(accepted, state.tnext, last), self.times.after(state, moves, held)
+            new, held, pushed = held_back(state, new, accepted, pushed, self.numbers, self.program)
+            after = new, jnp.where(accepted, state.tnext, last), self.times.after(state, moves, held), pushed
             after = unless_waiting(active, after, carry)
             return self.pack(self._taken_apart(*after)), buffers, accepted
 
@@ -120,7 +120,7 @@ def _(perturbed, numbers, program):
     loop = (start, numbers["buffers"], zero, one, rows(start, points + 1), recorder.empty(), zero)
     loop = lax.while_loop(lambda loop: recorder.going(loop[0]), advance, loop)
     carry, buffers, chunks, stride, kept, record, filled = loop
-    state, _, moves = recorder.unpack(carry)
+    state, _, moves, _ = recorder.unpack(carry)
     return (state, buffers), (state, moves, chunks, stride, kept, record, filled)
 
 

@@ -1,7 +1,8 @@
-"""Steps of explicit methods while the state rests.
+"""Steps of a run that is differentiated, while its state rests.
 
-The error of a step is that of the state. Where the state rests, it is zero whatever the step, but the derivative of the
-solution, which is the motion after a small push, needs steps that are short beside the field's own time scale.
+The error of a step is that of the state. Where the state rests, or moves less than tolerances see, it is zero whatever
+the step; but the derivative of the solution, which is the motion after a small push, needs steps that resolve this
+motion. So there a second run is taken along that was given such a push, and steps are not longer than it allows.
 """
 
 import dataclasses
@@ -12,100 +13,170 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
-from .closure_conversion import Program, any_member, closure_convert
+from .closure_conversion import Program, any_member
 
-STILL = 1e-9  # what a relative change of the state by so much would also bring about is no motion
-GROWTH = 2.0  # of steps, from which on it is looked whether the state rests
-REACH = 0.1  # of the time scale, for a step at rest: a method of order 5 errs by less than 1e-8 there
-
-
-def steps_at_rest(terms: Any, solver: Any, controller: Any, t: Any, y: Any, args: Any) -> tuple[Any, list]:
-    """The function `rest` of a `Program`, and the arrays it closes over: None and none where steps are not held
-    back."""
-    if not is_held_back(terms, solver, controller, y):
-        return None, []
-    return closure_convert(lambda t, h, y0, y1: _longest(terms, t, h, y0, y1, args), t, t, y, y)
+# In units of the state and what tolerances make of zero, |y| + atol/rtol:
+PUSH = 0.03  # what the second run is pushed by; its error is then 33·rtol of it
+MOTION = 0.01  # a state rests that would move by less in all the time
+STILL = 1e-3  # of the tolerance: so does one that moves by less during a step
+GROWTH = 1.8  # of steps, from which on it is looked whether the state rests
+SETTLING = 3  # tiny steps after a push, which is to fulfil what Newton solves at the end of a step
+TRIES = 50  # to find a step that the second run allows; it is given up after as many
 
 
-def is_held_back(terms: Any, solver: Any, controller: Any, y: Any) -> bool:
-    """Whether steps may be held back: those of explicit methods, for a state that is one array (beside what events
-    keep), unless they are prescribed."""
-    while isinstance(solver, diffrax.AbstractWrappedSolver):
-        solver = solver.solver
-    while hasattr(controller, "controller"):
-        controller = controller.controller
-    prescribed = isinstance(controller, diffrax.StepTo | diffrax.ConstantStepSize)
-    x = _moving(y)
-    is_plain = isinstance(getattr(terms, "term", terms), diffrax.ODETerm) or x is not y
-    is_array = isinstance(x, jax.Array) and x.ndim == 1 and x.size > 0
-    return is_plain and is_array and isinstance(solver, diffrax.AbstractERK) and not prescribed
+class Pushed(eqx.Module):
+    """The second run: where it stands, whether it exists; and how it would go on after the step to take next.
+
+    `given_up` is set where no step was short enough for it, so that it limits nothing any more.
+    """
+
+    y: Float[Array, " n"]
+    solver_state: Any
+    fresh: Bool[Array, ""]
+    exists: Bool[Array, ""]
+    given_up: Bool[Array, ""]
+    next_y: Float[Array, " n"]
+    next_state: Any
+    allowed: Float[Array, ""]  # how long the step after the next one may be
 
 
-def _moving(y: Any) -> Any:
-    """What the field moves: y, or `y.x` where events keep more beside it."""
-    return y if isinstance(y, jax.Array) else getattr(y, "x", y)
+class Step(eqx.Module):
+    """An attempted step from (t0, y0) to t1, where y1 is the state after it: y0 if it was rejected; whether the field
+    jumps there; and the step to take next, from `start` to `end`."""
+
+    t0: Any
+    t1: Any
+    y0: Any
+    y1: Any
+    accepted: Any
+    jump: Any
+    start: Any
+    end: Any
 
 
-def _longest(terms: Any, t: Any, used: Array, y0: Any, y1: Any, args: Any) -> Array:
-    """How long the step may be that follows one of length `used` from y0 to y1: infinite unless the state rests, and
-    otherwise a part of the time in which a small push grows or turns at first, √(|v|/|J²v|), J by differences."""
-    x0, x = _moving(y0), _moving(y1)
-    eps = jnp.finfo(x.dtype).eps
-    largest = jnp.max(jnp.abs(x))
-    size = jnp.sqrt(eps) * jnp.where(largest > 0, jnp.abs(x) + 1e-3 * largest, 1.0)
-    # A push without pattern.
-    k = jnp.arange(x.size, dtype=x.dtype)
-    pattern = jnp.where(jnp.sin(12.9898 * k + 1.0) > 0, 1.0, -1.0) * (1.0 + 0.5 * jnp.sin(78.233 * k))
+class Resting(eqx.Module):
+    """What is needed to take a second run along. `restrained` changes the end of the next step."""
 
-    def field(x):
-        return terms.vf(t, x if _moving(y1) is y1 else eqx.tree_at(lambda y: y.x, y1, x), args)
+    terms: Any
+    solver: Any
+    controller: Any
+    args: Any
+    span: Any
 
-    def once(carry, k):
-        # The field itself, what relative changes do to it, then its differences along the push and along where that
-        # leads.
-        at_rest, blurred, push, product = carry
-        here = field(x + jnp.where(k == 0, 0.0, jnp.where(k == 1, STILL * jnp.abs(x) * pattern, push)))
-        change = here - at_rest
-        factor = jnp.max(jnp.abs(change / size)) / jnp.max(jnp.abs(push / size))
-        along = jnp.where(factor > 0, change / jnp.where(factor > 0, factor, 1.0), push)
-        turns = k > 1
-        after = (
-            jnp.where(k == 0, here, at_rest),
-            jnp.where(k == 1, jnp.abs(change), blurred),
-            jnp.where(turns, along, push),
-            jnp.where(turns, product * factor, product),
+    @staticmethod
+    def of(terms: Any, solver: Any, controller: Any, y: Any, args: Any, span: Any) -> "Resting | None":
+        """None where steps are prescribed or have no error estimate, and for a state that is not one array (beside
+        what events keep)."""
+        base = _innermost(controller)
+        rtol, x = getattr(base, "rtol", None), _moving(y)
+        is_array = isinstance(x, jax.Array) and x.ndim == 1 and x.size > 0
+        is_adaptive = isinstance(_inner(solver), diffrax.AbstractAdaptiveSolver) and rtol is not None
+        prescribed = isinstance(base, diffrax.StepTo | diffrax.ConstantStepSize)
+        if prescribed or not is_array or not is_adaptive:
+            return None
+        return Resting(terms, _small(solver), base, args, span)
+
+    def begin(self, t: Any, y: Any) -> Pushed:
+        """No second run yet."""
+        resting, y = still((self, y))
+        terms, solver, x, _ = resting._between_events(y, y)
+        shapes = jax.eval_shape(lambda: solver.init(terms, t, t, x, resting.args))
+        state = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+        no = jnp.array(False)
+        return Pushed(x, state, no, no, no, x, state, jnp.full_like(jnp.asarray(t), jnp.inf))
+
+    def restrained(self, step: Step, pushed: Pushed) -> tuple[Array, Pushed]:
+        """The end of the next step, and the second run where that begins."""
+        resting, step, pushed = still((self, step, pushed))
+        grows = step.end - step.start > GROWTH * (step.t1 - step.t0)
+        look = jnp.where(step.accepted, pushed.exists | grows, pushed.exists) & ~pushed.given_up
+        return lax.cond(
+            any_member(look),
+            lambda *given: resting._looked(*given),
+            lambda _, step, pushed: (step.end, pushed),
+            look,
+            step,
+            pushed,
         )
-        return after, None
 
-    none = jnp.zeros_like(x)
-    (_, blurred, _, product), _ = lax.scan(once, (none, none, size * pattern, jnp.ones((), x.dtype)), jnp.arange(4))
-    rests = jnp.all(jnp.abs(x - x0) <= STILL * jnp.abs(x) + used * blurred)
-    scale = REACH / jnp.sqrt(jnp.where(product > 0, product, 1.0))
-    longest = jnp.where(product > 0, jnp.maximum(used, scale), jnp.inf)
-    return jnp.where(rests, longest, jnp.inf).astype(used.dtype)
+    def _looked(self, look: Bool[Array, ""], step: Step, pushed: Pushed) -> tuple[Array, Pushed]:
+        terms, solver, x, changed = self._between_events(step.y0, step.y1)
+        rests = jnp.where(step.accepted, self._rests(_moving(step.y0), x, step.t1 - step.t0), pushed.exists) & look
+        on, new = step.accepted & pushed.exists, step.accepted & ~pushed.exists
+        k = jnp.arange(x.size, dtype=x.dtype)
+        pattern = jnp.where(jnp.sin(12.9898 * k + 1.0) > 0, 1.0, -1.0) * (1.0 + 0.5 * jnp.sin(78.233 * k))
+        y = jnp.where(on, pushed.next_y, jnp.where(new, x + PUSH * self._scale(x) * pattern, pushed.y))
+        state = jax.tree.map(lambda a, b: jnp.where(on, a, b), pushed.next_state, pushed.solver_state)
+        fresh = jnp.where(on, step.jump | changed, new | pushed.fresh)
+        longest = jnp.where(on, pushed.allowed, jnp.inf)
+        start, end = step.start, jnp.minimum(step.end, step.start + longest)
+        order = solver.error_order(terms)
+        idle = y, pushed.next_y, pushed.next_state, end, jnp.full_like(end, jnp.inf), ~rests, jnp.array(0)
+
+        def attempt(found):
+            """With a step up to `end`; and if that was too long, what would do. The first ones from a fresh push are as
+            good as none, and put it where the constraints and algebraic equations hold."""
+            y, _, _, end, _, done, tries = found
+            settles = fresh & (tries < SETTLING)
+            planned, end = end, jnp.where(settles, start + 1e-6 * (end - start), end)
+            y1, error, _, state1, result = solver.step(terms, start, end, y, self.args, state, fresh)
+            _, controlled = self.controller.init(terms, start, end, y, end - start, self.args, None, order)
+            keep, _, following, *_ = self.controller.adapt_step_size(
+                start, end, y, y1, self.args, error, order, controlled
+            )
+            keep = keep & jnp.all(jnp.isfinite(y1)) & diffrax.is_okay(result)
+            shorter = jnp.where(jnp.isfinite(following), jnp.clip(following - start, 0.0, 0.5 * (end - start)), 0.0)
+            shorter = jnp.maximum(shorter, 0.1 * (end - start))
+            settled = settles & jnp.all(jnp.isfinite(y1))
+            keep = keep & ~settles
+            end = jnp.where(keep, end, jnp.where(settles, planned, start + shorter))
+            after = jnp.where(settled, y1, y), y1, state1, end, following - end, keep, tries + 1
+            return jax.tree.map(lambda a, b: jnp.where(done, a, b), found, after)
+
+        found = lax.while_loop(
+            lambda found: any_member(~found[5] & (found[6] < TRIES)), attempt, jax.tree.map(jnp.asarray, idle)
+        )
+        y, next_y, next_state, end, allowed, done, _ = found
+        exists = rests & done
+        given_up = pushed.given_up | (rests & ~done)
+        after = Pushed(y, state, fresh, exists, given_up, next_y, next_state, allowed)
+        kept = eqx.tree_at(lambda p: p.exists, pushed, pushed.exists & ~look)
+        after = jax.tree.map(lambda a, b: jnp.where(exists, a, b), after, kept)
+        after = eqx.tree_at(lambda p: p.given_up, after, given_up)
+        return jnp.where(exists, end, step.end), after
+
+    def _rests(self, x0: Array, x1: Array, h: Array) -> Bool[Array, ""]:
+        moved = jnp.abs(x1 - x0)
+        rtol, atol = self._tolerances(x1)
+        slowly = moved * (self.span / jnp.where(h > 0, h, 1.0)) <= MOTION * self._scale(x1)
+        return jnp.all(slowly | (moved <= STILL * (atol + rtol * jnp.abs(x1))))
+
+    def _scale(self, x: Array) -> Array:
+        rtol, atol = self._tolerances(x)
+        return jnp.abs(x) + atol / jnp.maximum(rtol, jnp.finfo(x.dtype).eps)
+
+    def _tolerances(self, x: Array) -> tuple[Array, Array]:
+        return tuple(jnp.asarray(v, x.dtype) for v in (self.controller.rtol, self.controller.atol))
+
+    def _between_events(self, y0: Any, y1: Any) -> tuple[Any, Any, Any, Any]:
+        """(terms, solver, state) after a step, and whether an event changed them."""
+        if isinstance(y1, jax.Array):
+            return self.terms, self.solver, y1, False
+        return self.solver.between_events(self.terms, y0, y1)
 
 
 def held_back(
-    state: Any, new: Any, accepted: Bool[Array, ""], numbers: dict[str, Any], program: Program
-) -> tuple[Any, Bool[Array, ""]]:
-    """Diffrax's state after an attempted step, its next step shortened where y rests; and whether it was."""
+    state: Any, new: Any, accepted: Bool[Array, ""], pushed: Any, numbers: dict[str, Any], program: Program
+) -> tuple[Any, Bool[Array, ""], Any]:
+    """Diffrax's state after an attempted step, its next step shortened where y rests; whether it was; and the second
+    run."""
     if program.rest is None:
-        return new, jnp.array(False)
-    used, asked = state.tnext - state.tprev, new.tnext - new.tprev
-    longest = _where_steps_grow(
-        accepted & (asked > GROWTH * used),
-        lambda used, y0, y1: program.rest(numbers["rest"], new.tprev, used, y0, y1), used, state.y, new.y,
-    )  # fmt: skip
-    held = asked > longest
-    return dataclasses.replace(new, tnext=jnp.where(held, new.tprev + longest, new.tnext)), held
-
-
-def _where_steps_grow(grows: Bool[Array, ""], longest: Any, used: Array, y0: Any, y1: Any) -> Array:
-    """`longest(used, y0, y1)`, infinite where steps do not grow."""
-    found = lax.cond(any_member(grows), longest, lambda used, *_: jnp.full_like(used, jnp.inf), used, y0, y1)
-    return jnp.where(grows, found, jnp.inf)
+        return new, jnp.array(False), pushed
+    step = Step(state.tprev, state.tnext, state.y, new.y, accepted, new.made_jump, new.tprev, new.tnext)
+    end, pushed = program.rest(numbers["rest"], step, pushed)
+    return dataclasses.replace(new, tnext=end), end < new.tnext, pushed
 
 
 class HeldBack(diffrax.AbstractAdaptiveStepSizeController):
@@ -114,6 +185,7 @@ class HeldBack(diffrax.AbstractAdaptiveStepSizeController):
 
     controller: Any
     terms: Any
+    solver: Any
 
     @property
     def rtol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -128,23 +200,54 @@ class HeldBack(diffrax.AbstractAdaptiveStepSizeController):
         return self.controller.norm
 
     def wrap(self, direction):
-        return HeldBack(self.controller.wrap(direction), self.terms)  # pyright: ignore[reportCallIssue]
+        return HeldBack(self.controller.wrap(direction), self.terms, self.solver)  # pyright: ignore[reportCallIssue]
+
+    def _resting(self, y, args, span) -> Resting:
+        found = Resting.of(self.terms, self.solver, self.controller, y, args, span)
+        assert found is not None
+        return found
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         """As the other controller's."""
-        return self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        end, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        return end, (state, t1 - t0, self._resting(y0, args, t1 - t0).begin(t0, y0))
 
     def adapt_step_size(self, t0, t1, y0, y1, args, y_error, error_order, controller_state):
         """Whether the step is kept, and the next one."""
+        state, span, pushed = controller_state
         keep, start, end, jump, state, result = self.controller.adapt_step_size(
-            t0, t1, y0, y1, args, y_error, error_order, controller_state
+            t0, t1, y0, y1, args, y_error, error_order, state
         )
-        given = (self.terms, t1, args, y0, y1, t1 - t0, end - start)
-        terms, t, args, a, b, used, asked = jax.tree.map(
-            lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, given
-        )
-        longest = _where_steps_grow(
-            keep & (asked > GROWTH * used),
-            lambda used, y0, y1: _longest(terms, t, used, y0, y1, args), used, a, b,
-        )  # fmt: skip
-        return keep, start, jnp.where(asked > longest, start + longest, end), jump, state, result
+        after = jax.tree.map(lambda a, b: jnp.where(keep, b, a), y0, y1)
+        step = Step(t0, t1, y0, after, keep, jump, start, end)
+        end, pushed = self._resting(y0, args, span).restrained(step, pushed)
+        return keep, start, end, jump, (state, span, pushed), result
+
+
+def still(tree: Any) -> Any:
+    """The same, not differentiated."""
+    return jax.tree.map(lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, tree)
+
+
+def _moving(y: Any) -> Any:
+    """The state: y, or `y.x` where events keep more beside it."""
+    return y if isinstance(y, jax.Array) else getattr(y, "x", y)
+
+
+def _inner(solver: Any) -> Any:
+    while isinstance(solver, diffrax.AbstractWrappedSolver):
+        solver = solver.solver
+    return solver
+
+
+def _small(solver: Any) -> Any:
+    """The solver, its stages in a loop if it can: what is rarely run shall compile fast."""
+    if isinstance(solver, diffrax.AbstractWrappedSolver):
+        return dataclasses.replace(solver, solver=_small(solver.solver))
+    return dataclasses.replace(solver, looped=True) if hasattr(solver, "looped") else solver
+
+
+def _innermost(controller: Any) -> Any:
+    while hasattr(controller, "controller"):
+        controller = controller.controller
+    return controller

@@ -13,7 +13,7 @@ from jax import lax
 from .closure_conversion import Program, closure_convert, unless_waiting
 from .private_names import is_sde, while_loop
 from .recorded_loop import solve
-from .resting import steps_at_rest
+from .resting import Resting, Step
 from .reverse_step import state_saves
 
 LARGEST_RECORD = 2**25  # bytes; above, storing steps is no longer cheap
@@ -29,9 +29,9 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
     Griewank & Walther 2008, Evaluating Derivatives, chapter 12). Memory hardly grows with `max_steps`, and
     without differentiation nothing is recorded.
 
-    Where an explicit method's state rests, its error is zero, and steps would grow without limit; the derivative, which
-    is the motion after a small push, would not be resolved. A run that is differentiated holds such steps back to a
-    tenth of the time scale of the field there.
+    Where the state rests, its error is zero, and steps would grow without limit; the derivative, which is the motion
+    after a small push, would not be resolved. There, a run that is differentiated takes along a second one that was
+    given such a push, and its steps are not longer than that one's error allows.
 
     Rejected steps take no part, so what is not finite in them does no harm. Step sizes count as constant, except where
     they follow from the times given: derivatives with respect to `t0`, `t1`, `dt0`, `SaveAt(ts=...)` and the times of
@@ -177,14 +177,19 @@ def _functions(
         return closure_convert(lambda t, y: part.fn(t, y, args), s.tprev, y1) if part.steps else none
 
     at_ts, at_steps = [save_ts(part) for part in parts], [save_step(part) for part in parts]
-    rest = steps_at_rest(terms, solver, stepsize_controller, s.tprev, s.y, args)
+    rest, pushed = none, ()
+    resting = Resting.of(terms, solver, stepsize_controller, s.y, args, t1 - s.tprev)
+    if resting is not None:
+        pushed = resting.begin(s.tprev, s.y)
+        tried = Step(s.tprev, s.tnext, s.y, s.y, jnp.array(False), made_jump, s.tprev, s.tnext)
+        rest = closure_convert(lambda *given: resting.restrained(*given), tried, pushed)
     functions = dict(
         rest=rest[0], step=step[0], adapt=adapted[0], jumps=made_jump is not False,
         every=tuple(int(part.steps) for part in parts),
         save_ts=tuple(f for f, _ in at_ts), save_steps=tuple(f for f, _ in at_steps),
     )  # fmt: skip
     numbers = dict(
-        rest=rest[1], step=step[1], adapt=adapted[1], controller=controller, t1=jnp.asarray(t1),
+        rest=rest[1], pushed=pushed, step=step[1], adapt=adapted[1], controller=controller, t1=jnp.asarray(t1),
         ts=tuple(part.ts for part in parts),
         save_ts=tuple(c for _, c in at_ts), save_steps=tuple(c for _, c in at_steps),
     )  # fmt: skip

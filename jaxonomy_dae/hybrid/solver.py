@@ -118,6 +118,11 @@ class WithEvents(diffrax.AbstractWrappedSolver):
             return self.solver.func(bound(terms, y0.q), t0, y0.x, args)
         return self.solver.func(terms, t0, y0, args)
 
+    def between_events(self, terms, y0, y1):
+        """(terms, solver, state) after a step from y0 to y1, and whether an event at its end changed them."""
+        solver = problem_of(terms).prepared(self.solver, y1.q)
+        return bound(terms, y1.q), solver, y1.x, jnp.any(y0.q != y1.q)
+
     def init(self, terms, t0, t1, y0, args):
         solver = problem_of(terms).prepared(self.solver, y0.q)
         return solver.init(bound(terms, y0.q), t0, t1, y0.x, args), jnp.array(False)

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ..adjoint.resting import HeldBack, is_held_back
+from ..adjoint.resting import HeldBack, Resting
 from ..adjoint.stored_adjoint import StoredAdjoint
 from ..hybrid.problem import HybridState
 from ..hybrid.solver import WithEvents
@@ -81,8 +81,8 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, throw: bo
         term, solver = HybridTerm(problem), WithEvents(chosen, options.max_events)
         controller = with_event_control(controller)
         saved_of = _state_and_discrete
-    if not isinstance(options.adjoint, StoredAdjoint) and is_held_back(term, solver, controller, y0):
-        controller = HeldBack(controller, term)  # pyright: ignore[reportCallIssue]
+    if not isinstance(options.adjoint, StoredAdjoint) and Resting.of(term, solver, controller, y0, inputs, t1 - t0):
+        controller = HeldBack(controller, term, solver)  # pyright: ignore[reportCallIssue]
     save = diffrax.SubSaveAt(t0=True, steps=True, fn=saved_of) if ts is None else diffrax.SubSaveAt(ts=ts, fn=saved_of)
     done = integrate(
         term, solver, t0, t1, dt0, y0, inputs,

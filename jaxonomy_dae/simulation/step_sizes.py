@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from ..errors import ModelError
 from ..solvers.drive import is_implicit
 from ..solvers.solve import step_control
+from ..solvers.step_control import UNSEEN
 from ..system.inputs import StepEnds
 from ..system.system import AcausalSystem
 
@@ -61,7 +62,8 @@ def first_step(system: AcausalSystem, t0: Any, t1: Any, x0: Any, inputs: Any, or
 
     def probe(f0):
         d0, d1 = size(x0), size(f0)
-        h0 = jnp.where((d0 < tiny) | (d1 < tiny), 1e-6, 0.01 * d0 / jnp.maximum(d1, tiny))
+        least = 1e-6 * jnp.minimum(t1 - t0, 1.0)
+        h0 = jnp.where((d0 < tiny) | (d1 < tiny), least, 0.01 * d0 / jnp.maximum(d1, tiny))
         return jnp.minimum(h0, t1 - t0)
 
     def slope(point, _):
@@ -77,5 +79,6 @@ def first_step(system: AcausalSystem, t0: Any, t1: Any, x0: Any, inputs: Any, or
     power = 1.0 / ((order or 1) + 1)
     h1 = jnp.where(largest <= 1e-15, jnp.maximum(1e-6, h0 * 1e-3), (0.01 / jnp.maximum(largest, 1e-15)) ** power)
     h = jnp.minimum(jnp.minimum(100 * h0, h1), t1 - t0)
+    h = jnp.where(d1**2 < UNSEEN * d2, jnp.minimum(h, 0.1 * d1 / jnp.maximum(d2, 1e-15)), h)
     h = jnp.where(jnp.isfinite(h) & (h > 0), h, 1e-6 * (t1 - t0))
     return jax.lax.stop_gradient(h)  # inputs may close over what is differentiated

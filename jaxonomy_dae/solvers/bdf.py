@@ -215,6 +215,7 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         kf = k.astype(y.dtype)
         total, total_1, total_2 = (kf + 1) * err, kf * err_1, (kf - 1) * err_2
         fall = jnp.where(k > 2, jnp.maximum(total_1, total_2) <= total, (k == 2) & (total_1 <= 0.5 * total))
+        fall = fall & (total > 0)  # where nothing moves, derivatives need a high order
         accepted = solved.converged & allowed & (c.test.astype(y.dtype) * e_norm < 1.0)
 
         same = jnp.abs(still(h) - state.last_step) <= 1e-6 * state.last_step
@@ -224,8 +225,8 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         err_up = size(e_ - row(k + 1)) / (kf + 2)
         total_up = (kf + 2) * err_up
         stay = (k == self.max_order) | (k + 1 >= steady) | (k - state.last_order == 1)
-        best_below = (k > 1) & (total_1 <= jnp.minimum(total, total_up))
-        up = ~stay & ~fall & ~best_below & jnp.where(k == 1, total_up < 0.5 * total, total_up < total)
+        best_below = (k > 1) & (total > 0) & (total_1 <= jnp.minimum(total, total_up))
+        up = ~stay & ~fall & ~best_below & (jnp.where(k == 1, total_up < 0.5 * total, total_up < total) | (total == 0))
         down = fall | (~stay & best_below)
         change = jnp.where(up, 1, jnp.where(down, -1, 0))
         estimate = jnp.where(up, err_up, jnp.where(down, err_1, err))

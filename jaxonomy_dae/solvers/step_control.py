@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import optimistix as optx
 
 SAFETY = 0.9
+UNSEEN = 1e3  # tolerances: the first step resolves smaller motion, too, which the error of a step would not see
 # A solver that chooses its own step sizes writes them into its error estimate, whose norm e a controller reads back:
 # e = SAFETY/φ for a growth or a rejection by the factor φ (what the ordinary formula for order 1 makes of it too), and
 # e = SAFETY + (1 − SAFETY)·φ for a step that is kept though the next shall be smaller.
@@ -87,10 +88,12 @@ class StepControl(diffrax.AbstractAdaptiveStepSizeController):
         ahead = func(terms, t0 + h0, jax.tree.map(lambda y, s: y + (h0 * s).astype(y.dtype), y0, slope), args)
         d2 = size(jax.tree.map(jnp.subtract, ahead, slope)) / h0
         d1 = jnp.maximum(d1, d2 * h0)
+        rests = d1 == 0
         rate = jnp.maximum(d2 / jnp.maximum(d1, tiny), 1 / interval)
+        d1 = jnp.maximum(d1, UNSEEN * rate)
         target = 0.25 if order == 1 else 0.01
         h = (target / jnp.maximum(d1 * rate**order, tiny)) ** (1 / (order + 1))
-        h = jnp.where(jnp.isfinite(h) & (h > 0), h, 1e-6 * interval)
+        h = jnp.where(jnp.isfinite(h) & (h > 0) & ~rests, h, 1e-6 * interval)
         return jax.lax.stop_gradient(jnp.minimum(h, 0.1 * interval).astype(interval.dtype))
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
