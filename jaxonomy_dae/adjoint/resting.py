@@ -16,6 +16,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from .closure_conversion import Program, any_member
+from .private_names import use_stepsize_tol
 
 # In units of the state and what tolerances make of zero, |y| + atol/rtol:
 PUSH = 0.03  # what the second run is pushed by; its error is then 33·rtol of it
@@ -76,7 +77,7 @@ class Resting(eqx.Module):
         prescribed = isinstance(base, diffrax.StepTo | diffrax.ConstantStepSize)
         if prescribed or not is_array or not is_adaptive:
             return None
-        return Resting(terms, _small(solver), base, args, span)
+        return Resting(terms, _small(solver, base), base, args, span)
 
     def begin(self, t: Any, y: Any) -> Pushed:
         """No second run yet."""
@@ -158,7 +159,7 @@ class Resting(eqx.Module):
         return jnp.abs(x) + atol / jnp.maximum(rtol, jnp.finfo(x.dtype).eps)
 
     def _tolerances(self, x: Array) -> tuple[Array, Array]:
-        return tuple(jnp.asarray(v, x.dtype) for v in (self.controller.rtol, self.controller.atol))
+        return jnp.asarray(self.controller.rtol, x.dtype), jnp.asarray(self.controller.atol, x.dtype)
 
     def _between_events(self, y0: Any, y1: Any) -> tuple[Any, Any, Any, Any]:
         """(terms, solver, state) after a step, and whether an event changed them."""
@@ -240,11 +241,19 @@ def _inner(solver: Any) -> Any:
     return solver
 
 
-def _small(solver: Any) -> Any:
-    """The solver, its stages in a loop if it can: what is rarely run shall compile fast."""
+def _small(solver: Any, controller: Any) -> Any:
+    """The solver, its stages in a loop if it can: what is rarely run shall compile fast. Where its iterations have the
+    controller's tolerances, these are filled in, as Diffrax does before a run."""
     if isinstance(solver, diffrax.AbstractWrappedSolver):
-        return dataclasses.replace(solver, solver=_small(solver.solver))
-    return dataclasses.replace(solver, looped=True) if hasattr(solver, "looped") else solver
+        return dataclasses.replace(solver, solver=_small(solver.solver, controller))
+    if hasattr(solver, "looped"):
+        solver = dataclasses.replace(solver, looped=True)
+    finder = getattr(solver, "root_finder", None)
+    if finder is not None:
+        open_ = [n for n in ("rtol", "atol", "norm") if getattr(finder, n, None) is use_stepsize_tol]
+        values = {name: getattr(controller, name) for name in open_}
+        solver = dataclasses.replace(solver, root_finder=dataclasses.replace(finder, **values))
+    return solver
 
 
 def _innermost(controller: Any) -> Any:

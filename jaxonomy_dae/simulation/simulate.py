@@ -79,8 +79,8 @@ def simulate(
     - `stepsize_controller`: instead of the controller made from the tolerances.
     - `jump_ts`: times at which functions given as inputs jump, a number or shape `(n,)`: steps end there and the method
         starts anew.
-    - `dtmax`: the longest step. With an implicit solver or events, derivatives of a run that rests at an equilibrium
-        need one that resolves the motion after a small push: nothing else limits steps there.
+    - `dtmax`: the longest step. Derivatives by the amplitude of an input at which this is zero need one, if the input
+        is faster than what it acts on: nothing shows such a motion to the step control.
     - `max_steps`: bounds the steps taken, beside those that end at samples; with `ts=None` as many rows are reserved.
     - `max_events`: bounds the events of conditions; `solution.events` has room for as many.
     - `save_events`: whether `solution.events` also has variables before and after events; None: outside jit, and if
