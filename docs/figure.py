@@ -42,9 +42,9 @@ def panels(axes: Any, true: Any, data: Any, runs: dict[str, Any], laws: dict[str
     v = np.array([np.asarray(true["pend.vx"])[at], np.asarray(true["pend.vy"])[at]])
     tip = np.array([x[at], y[at]]) - 0.55 * v / np.hypot(*v)
     model.annotate("", tip, (x[at], y[at]), arrowprops={"arrowstyle": "-|>", "color": truth, "lw": 2})
-    model.text(tip[0], tip[1] + 0.1, "drag =\nnetwork(v)", color=truth, ha="center", va="bottom", fontsize=10)
+    model.text(tip[0] - 0.12, tip[1] - 0.08, "drag = network(v)", color=truth, ha="center", va="top", fontsize=10)
     model.text(-0.02, 0.14, "x² + y² = L²", color=ink, ha="right", fontsize=10)
-    model.set(aspect="equal", xlim=(-1.25, 1.25), ylim=(-1.3, 0.85))
+    model.set(aspect="equal", xlim=(-0.95, 1.25), ylim=(-1.45, 0.7))
     model.axis("off")
 
     def angle(run):

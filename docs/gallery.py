@@ -37,7 +37,8 @@ def overview() -> str:
     lines = ["# Gallery", "", "Notebooks to read from top to bottom, or to run: they lie in `examples/gallery`.", ""]
     for path in notebooks():
         title, about = introduction_of(path)[:2]
-        lines += [f"## [{title.removeprefix('# ')}]({path.name})", "", about, ""]
+        sentences = about[: about.rindex(".") + 1]  # what comes after begins a list
+        lines += [f"## [{title.removeprefix('# ')}]({path.name})", "", sentences, ""]
         lines += [f"[![The last figure]({path.stem}.png)]({path.name})", ""]
     return "\n".join(lines)
 

@@ -268,8 +268,9 @@ def test_house():
 
     # Heat is conserved: what came in went out or is stored; each term is an integral by trapezoids of 15 minutes.
     balance = names["balance"]
-    assert abs(sum(balance.values()) - 2 * balance["stored"]) < 1e-3 * balance["heater"]
-    assert names["run"].energy_balance_error().max() < 1e-5
+    came, went = (sum(balance[name] for name in side) for side in (("heater", "sun"), ("wall", "windows", "stored")))
+    assert abs(came - went) < 1e-3 * came
+    assert np.abs(names["run"].energy_balance_error()).max() < 1e-5
     assert names["lowest"] > 0
 
     # Costs and the best choice, by the exact solution and a search without derivatives.
@@ -290,4 +291,7 @@ def test_house():
         lambda x: costs(x[0] / 10, 290.15 + x[1]).sum(), [10 * found[0], 0.0], method="Nelder-Mead",
         options={"xatol": 1e-5, "fatol": 1e-7},
     )  # fmt: skip
-    np.testing.assert_allclose(best, search.x / [10, 1], rtol=0, atol=[5e-4, 1e-2])  # m, K
+    # Heat and insulation balance at 900 for a metre, and second derivatives are 8e3 and 13: gradients good to 1e-3, as runs
+    # at rtol 1e-6 have them, place the optimum to 0.1 mm.
+    np.testing.assert_allclose(best[0], search.x[0] / 10, rtol=0, atol=5e-4)
+    np.testing.assert_allclose(best[1], search.x[1], rtol=0, atol=1e-2)
