@@ -138,6 +138,17 @@ def test_equations_as_text():
     assert equation_text(a - b) == "0 = a − b"
 
 
+def test_the_gallery_has_an_overview():
+    gallery = pytest.importorskip("gallery")  # a hook, which needs MkDocs
+    text = gallery.overview()
+    for path in gallery.notebooks():
+        section = text[text.index(f"]({path.name})") :]
+        assert re.match(r"\]\([^)]+\)\n\n[^#]+\.\n\n\[!", section)  # heading, whole sentences, figure
+        assert f"({path.stem}.png)" in section
+        assert gallery.last_figure_of(path).startswith(b"\x89PNG")
+    assert len(gallery.notebooks()) > 4
+
+
 # --- the tutorial ------------------------------------------------------------------------------------------------
 
 NUMBER = r"-?\d+(?:\.\d*)?"

@@ -291,7 +291,7 @@ def test_house():
         lambda x: costs(x[0] / 10, 290.15 + x[1]).sum(), [10 * found[0], 0.0], method="Nelder-Mead",
         options={"xatol": 1e-5, "fatol": 1e-7},
     )  # fmt: skip
-    # Heat and insulation balance at 900 for a metre, and second derivatives are 8e3 and 13: gradients good to 1e-3, as runs
-    # at rtol 1e-6 have them, place the optimum to 0.1 mm.
+    # Heat and insulation balance at 900 for a metre, and second derivatives are 8e3 and 13: gradients good to 1e-3, as
+    # those of runs at rtol 1e-6 are, place the optimum to 0.1 mm.
     np.testing.assert_allclose(best[0], search.x[0] / 10, rtol=0, atol=5e-4)
     np.testing.assert_allclose(best[1], search.x[1], rtol=0, atol=1e-2)
