@@ -1,12 +1,15 @@
-"""The figure at the head of the README: the pendulum whose drag is learned, in one row of pictures.
+"""The figures of README and tutorial, for light pages and dark ones, in `docs/images/`.
 
-    python docs/figure.py
+    python docs/figures.py
 
-trains the model of `examples/neural_dae_pendulum_drag.py` and writes `docs/images/pendulum-light.svg` and
-`pendulum-dark.svg`, for pages of either kind.
+`pendulum-*.svg` shows the model of `examples/neural_dae_pendulum_drag.py`, trained as there; `tutorial-*.svg` what the
+blocks of `docs/tutorial.md` compute, which are run one after the other.
 """
 
+import contextlib
+import io
 import pathlib
+import re
 import sys
 from typing import Any
 
@@ -67,6 +70,10 @@ def panels(axes: Any, true: Any, data: Any, runs: dict[str, Any], laws: dict[str
     pull.set(xlabel="time [s]", ylabel="pull of the rod [N]")
 
     titles = ("Physics, with a gap", "Trained on positions", "The law comes out,", "and a force never measured")
+    dress(axes, titles, ink, faint)
+
+
+def dress(axes: Any, titles: tuple[str, ...], ink: str, faint: str) -> None:
     for ax, title in zip(axes, titles, strict=True):
         ax.set_title(title, color=ink, fontsize=12.5, fontweight="bold", pad=10)
         ax.patch.set_alpha(0)
@@ -77,7 +84,7 @@ def panels(axes: Any, true: Any, data: Any, runs: dict[str, Any], laws: dict[str
         ax.spines[["bottom", "left"]].set_color(faint)
 
 
-def main() -> None:
+def pendulum() -> None:
     true = study.angle_equation(study.HIGH_RELEASE, lambda v: -study.DRAG * study.speed(v) * v, study.SAMPLES)
     noise = study.NOISE * jax.random.normal(jax.random.key(1), (len(study.SAMPLES), 2))
     data = np.asarray(study.positions(true) + noise)
@@ -85,8 +92,6 @@ def main() -> None:
     runs = {name: study.follow(systems[name], study.SAMPLES) for name in ("no drag", "learned")}
     grid = np.linspace(0.0, float(np.hypot(true["pend.vx"], true["pend.vy"]).max()), 100)
     laws = {"grid": grid, "truth": study.DRAG * grid**2, "learned": study.law_of(systems["learned"], grid)}
-    IMAGES.mkdir(exist_ok=True)
-    plt.rcParams["svg.hashsalt"] = "pendulum"  # the same figure is the same file
     for kind, inks in INKS.items():
         figure, axes = plt.subplots(1, 4, figsize=(13, 3.3), width_ratios=[1, 1.15, 1, 1.15], layout="constrained")
         panels(axes, true, data, runs, laws, inks)
@@ -100,9 +105,50 @@ def main() -> None:
         figure.legend(
             handles=handles, loc="outside lower center", ncols=4, frameon=False, labelcolor=inks[0], fontsize=10
         )
-        figure.savefig(IMAGES / f"pendulum-{kind}.svg", transparent=True, metadata={"Date": None})
-        plt.close(figure)
+        save(figure, f"pendulum-{kind}")
+
+
+def save(figure: Any, name: str) -> None:
+    IMAGES.mkdir(exist_ok=True)
+    plt.rcParams["svg.hashsalt"] = name  # the same figure is the same file
+    figure.savefig(IMAGES / f"{name}.svg", transparent=True, metadata={"Date": None})
+    plt.close(figure)
+
+
+def tutorial() -> None:
+    blocks = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs" / "tutorial.md").read_text(), re.M | re.S)
+    n: dict[str, Any] = {}
+    with contextlib.redirect_stdout(io.StringIO()):
+        for block in blocks:
+            exec(block, n)
+    ts = np.linspace(0.0, 1800.0, 361)
+    opened = {"pi.setpoint": 333.15, "room.T": (n["opened"], n["room_T"])}
+    controlled = n["simulate"](n["controlled"], 1800.0, ts=ts, inputs=opened)["block.T"] - 273.15
+    trained, before = (
+        n["simulate"](s, 1800.0, ts=ts, inputs=n["inputs"])["block.T"] - 273.15
+        for s in (n["trained"].model, n["model"])
+    )
+    u = np.linspace(0.0, 45.0, 91)
+    learned = np.array([float(n["law"](np.array([x]))[0]) for x in u])
+    reached = np.asarray(n["measured"]) - 293.15
+    for kind, (ink, faint, blue, orange) in INKS.items():
+        figure, axes = plt.subplots(1, 3, figsize=(10, 2.9), layout="constrained")
+        held, record, law = axes
+        held.axhline(60.0, color=orange, lw=1, ls=":")
+        held.plot(ts / 60, controlled, color=blue, lw=1.8)
+        held.set(xlabel="time [min]", ylabel="temperature [°C]")
+        record.plot(np.asarray(n["record"]) / 60, np.asarray(n["measured"]) - 273.15, "o", color=orange, ms=3.4, mew=0)
+        record.plot(ts / 60, before, color=faint, lw=1.2)
+        record.plot(ts / 60, trained, color=blue, lw=1.6)
+        record.set(xlabel="time [min]", ylabel="temperature [°C]")
+        law.plot(u, n["true_law"](u), color=orange, lw=5, alpha=0.45, solid_capstyle="round")
+        law.plot(u, learned, color=blue, lw=1.8)
+        law.plot(reached, np.zeros_like(reached), "|", color=orange, ms=7, clip_on=False)
+        law.set(xlabel="difference in temperature [K]", ylabel="heat flow [W]", xlim=(0, 45), ylim=(0, None))
+        dress(axes, ("Under control", "The record, and the model", "The law"), ink, faint)
+        save(figure, f"tutorial-{kind}")
 
 
 if __name__ == "__main__":
-    main()
+    pendulum()
+    tutorial()
