@@ -60,7 +60,7 @@ types: $(VENV)/.stamp-dev
 	$(BIN)/pyright
 
 docs: $(VENV)/.stamp-dev
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 # The wheel alone, in an environment without the development tools, seen from outside the repository.
 wheel: $(VENV)/.stamp-dev

@@ -185,6 +185,12 @@ def test_least_squares_on_a_plain_module():
     data = jnp.array([1.0, 4.0])
     result = fit_least_squares(bowl(), lambda m, d: jnp.stack([m.x, m.y**2]) - d, args=(data,))
     assert float(result.model.x) == pytest.approx(1.0) and abs(float(result.model.y)) == pytest.approx(2.0)
+    assert result.message.startswith("converged")
+
+
+def test_least_squares_says_that_its_steps_were_used_up():
+    result = fit_least_squares(bowl(), lambda m: jnp.stack([m.x - 1, 10 * (m.y - m.x**2)]), steps=2)
+    assert "not yet converged" in repr(result)
 
 
 # --- bounds ------------------------------------------------------------------------------------------------------

@@ -227,7 +227,8 @@ def fit_least_squares(
 
     **Returns:**
 
-    A `Fit` whose `history` has the first and the last value of ½ Σ residuals².
+    A `Fit` whose `history` has the first and the last value of ½ Σ residuals². Its `message` says whether
+    the steps sufficed. If no better point was found, a `RuntimeWarning` says so.
 
     **Raises:**
 
@@ -260,12 +261,13 @@ def fit_least_squares(
         )
         value = inside(found.value)
         cost = [0.5 * jnp.sum(function(w, (frozen, args)) ** 2) for w in (trainable, value)]
-        return value, found.stats["num_steps"], cost
+        converged = found.result == optx.RESULTS.successful
+        return value, found.stats["num_steps"], cost, converged
 
     start = trainable if coordinates is None else _with_free(trainable, coordinates.start)
     try:
         with forward_mode():
-            found, taken, cost = run(trainable, start, frozen, args)
+            found, taken, cost, converged = run(trainable, start, frozen, args)
     except TypeError as error:
         if "forward-mode" not in str(error):
             raise
@@ -283,4 +285,7 @@ def fit_least_squares(
         return Fit(model, model, np.array([first]), 0, first, "no better point was found")
     fitted = _merged(eqx.combine(found, frozen))
     _check_dependents(fitted)
-    return Fit(fitted, fitted, np.array([first, last]), int(taken), last, f"{int(taken)} steps were taken")
+    message = f"converged after {int(taken)} steps"
+    if not converged:
+        message = f"stopped after {int(taken)} steps, not yet converged; `steps` allows more"
+    return Fit(fitted, fitted, np.array([first, last]), int(taken), last, message)

@@ -22,7 +22,8 @@ class AcausalDiagram:
     diagram.connect(resistor, "n", ground, "p")
     ```
 
-    A connected component is added by itself; `add` is needed for those without connections only.
+    A component whose port is connected is added by itself; `add` is needed for the others, those joined by signals alone
+    among them.
     """
 
     def __init__(self, name: str | None = None):
