@@ -22,8 +22,8 @@ class AcausalDiagram:
     diagram.connect(resistor, "n", ground, "p")
     ```
 
-    A component whose port is connected is added by itself; `add` is needed for the others, those joined by signals alone
-    among them.
+    A component whose port is connected is added by itself; `add` is needed for the others, those joined by signals
+    alone among them.
     """
 
     def __init__(self, name: str | None = None):
