@@ -22,6 +22,7 @@ from ..modeling import (
     Rotational,
     Translational,
     Value,
+    assign,
     der,
 )
 
@@ -226,6 +227,57 @@ class Valve(_Restriction):
     ):
         super().__init__(ev, name)
         self._restrict(A, Cd, rho, dp_small, self.input("opening", default=1.0, unit="1"))
+
+
+class CheckValve(_TwoPort):
+    """A valve that lets fluid pass from `port_a` to `port_b` only: two straight branches, as an ideal diode has.
+
+    While it is open, dp = p_crack + R·m_flow with m_flow ≥ 0; while it is shut, m_flow = 0 with dp ≤ p_crack. The
+    cracking pressure `p_crack` in pascal and the resistance `R` in pascal second per kilogram are ≥ 0; both zero is the
+    ideal valve. The discrete variable `active` is 1 while it is open. In series with an `Orifice`, flow is turbulent.
+    """
+
+    def __init__(self, ev: EqnEnv, name: str, p_crack: Value = 0.0, R: Value = 0.0, rho: Value = DENSITY):
+        super().__init__(ev, name)
+        crack = self.parameter("p_crack", p_crack, unit="Pa", bounds=NONNEGATIVE)
+        resistance = self.parameter("R", R, unit="Pa*s/kg", bounds=NONNEGATIVE)
+        density = self.parameter("rho", rho, unit="kg/m3", bounds=POSITIVE)
+        dp, flow = self._two_ports()
+        self.complementary(crack + resistance * flow - dp, flow)
+        self.declare_dissipation(dp * flow / density)
+
+
+class ReliefValve(_TwoPort):
+    """A valve that opens where dp reaches `p_open`, and shuts where it has fallen to `p_close` < p_open (pascal).
+
+    While it is open, it is an `Orifice` with `A` ≥ 0, `Cd` > 0, `rho` > 0 and `dp_small` > 0; while it is shut,
+    m_flow = 0. The discrete variable `opened` is 1 or 0, at the start by dp ≥ p_open.
+    """
+
+    def __init__(
+        self,
+        ev: EqnEnv,
+        name: str,
+        p_open: Value = 1e7,
+        p_close: Value = 9e6,
+        A: Value = 1e-4,
+        Cd: Value = 0.6,
+        rho: Value = DENSITY,
+        dp_small: Value = 100.0,
+    ):
+        super().__init__(ev, name)
+        upper, lower = self.parameter("p_open", p_open, unit="Pa"), self.parameter("p_close", p_close, unit="Pa")
+        area = self.parameter("A", A, unit="m2", bounds=NONNEGATIVE)
+        discharge = self.parameter("Cd", Cd, unit="1", bounds=POSITIVE)
+        density = self.parameter("rho", rho, unit="kg/m3", bounds=POSITIVE)
+        small = self.parameter("dp_small", dp_small, unit="Pa", bounds=POSITIVE)
+        opened = self.discrete("opened", start=0, unit="1")
+        dp, flow = self._two_ports()
+        through = area * discharge * sympy.sqrt(2 * density) * _regularised_root(dp, small)
+        self.either(Eq(opened, 1), flow - through, flow)
+        self.declare_dissipation(dp * flow / density)
+        self.when(dp >= upper, assign(opened, 1), on=Eq(opened, 0), at_start=True)
+        self.when(dp <= lower, assign(opened, 0), on=Eq(opened, 1))
 
 
 class LaminarPipe(_TwoPort):
