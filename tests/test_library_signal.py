@@ -135,6 +135,27 @@ def test_a_controlled_plant_against_scipy():
     np.testing.assert_allclose(solution["second.y"], expected[:, 4], rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("Tt", [None, 0.25])
+def test_a_limited_pi_controller(Tt):
+    """A lag behind it that can reach its setpoint of 1 only slowly; without back-calculation it would overshoot."""
+    ev = EqnEnv()
+    pi, lag = sig.PI(ev, "pi", 4.0, 0.5, low=-0.2, high=1.2, Tt=Tt), sig.FirstOrder(ev, "lag", 1.0, 0.8)
+    system = compiled(pi, lag, connect=[(lag.y, pi.measured), (pi.y, lag.u)])
+    solution = simulate(system, 3.0, ts=TS, inputs={"pi.setpoint": 1.0}, rtol=1e-9, atol=1e-11)
+
+    def slopes(t, s):
+        y, i = s  # in the form of PID: i = k·x
+        v = 4.0 * (1.0 - y) + i
+        u = min(max(v, -0.2), 1.2)
+        return [(u - y) / 0.8, 4.0 * (1.0 - y) / 0.5 + (u - v) / (Tt or 0.5)]
+
+    run = scipy.integrate.solve_ivp(slopes, (0, 3), [0, 0], "Radau", t_eval=TS, rtol=1e-11, atol=1e-13, max_step=0.01)
+    assert float(jnp.max(solution["pi.v"])) > 1.2
+    # As above.
+    np.testing.assert_allclose(solution["lag.y"], run.y[0], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(4.0 * solution["pi.x"], run.y[1], rtol=0, atol=1e-6)
+
+
 def test_noise_belongs_to_its_key():
     ev = EqnEnv()
     system = compiled(sig.Noise(ev, "n", jax.random.key(3), 2.0, 0.1), sig.Noise(ev, "m", jax.random.key(4), 2.0, 0.1))

@@ -1,21 +1,51 @@
 """Controllers: inputs `setpoint` and `measured`, output `y`."""
 
-from sympy import Max, Min, S
+from sympy import Expr, Max, Min, S, Symbol
 
 from ...modeling import POSITIVE, Component, Eq, EqnEnv, Value, der
 
 
 class PI(Component):
-    """y = k·(e + x), Ti·dx/dt = e with e = setpoint − measured, `Ti` > 0 in second; x starts at `initial_x`."""
+    """y = v = k·(e + x), Ti·dx/dt = e with e = setpoint − measured, `Ti` > 0 in second; x starts at `initial_x`.
 
-    def __init__(self, ev: EqnEnv, name: str, k: Value = 1.0, Ti: Value = 1.0, initial_x: Value = 0.0):
+    With `low` or `high`, y = v only between them, and back-calculation keeps the integral from winding up, as in `PID`:
+    Ti·dx/dt = e + (Ti/Tt)·(y − v)/k. `Tt` > 0 in second is `Ti` if left out.
+    """
+
+    def __init__(
+        self,
+        ev: EqnEnv,
+        name: str,
+        k: Value = 1.0,
+        Ti: Value = 1.0,
+        initial_x: Value = 0.0,
+        low: Value | None = None,
+        high: Value | None = None,
+        Tt: Value | None = None,
+    ):
         super().__init__(ev, name)
         gain, reset = self.parameter("k", k), self.parameter("Ti", Ti, unit="s", bounds=POSITIVE)
         setpoint, measured = self.input("setpoint"), self.input("measured")
         x = self.variable("x", start=self.parameter("initial_x", initial_x), fixed=True)
         error = setpoint - measured
-        self.add_equations(Eq(reset * der(x), error))
-        self.output("y", gain * (error + x))
+        if low is None and high is None:
+            self.add_equations(Eq(reset * der(x), error))
+            self.output("y", gain * (error + x))
+            return
+        track = self.parameter("Tt", reset if Tt is None else Tt, unit="s", bounds=POSITIVE)
+        v = self.output("v", gain * (error + x))
+        y = self.output("y", _limited(self, v, low, high))
+        self.add_equations(Eq(reset * der(x), error + reset / track * (y - v) / gain))
+
+
+def _limited(component: Component, v: Symbol, low: Value | None, high: Value | None) -> Expr:
+    """v, but not below `low` nor above `high`, which become parameters."""
+    limited = v
+    if low is not None:
+        limited = Max(limited, component.parameter("low", low))
+    if high is not None:
+        limited = Min(limited, component.parameter("high", high))
+    return limited * S.One
 
 
 class PID(Component):
@@ -55,12 +85,7 @@ class PID(Component):
         d = self.variable("d", start=0.0, fixed=True)
         smooth = self.variable("smooth")  # the measured value behind the filter
         v = self.output("v", gain * (weight * setpoint - measured) + i + d)
-        limited = v
-        if low is not None:
-            limited = Max(limited, self.parameter("low", low))
-        if high is not None:
-            limited = Min(limited, self.parameter("high", high))
-        y = self.output("y", limited * S.One)
+        y = self.output("y", _limited(self, v, low, high))
         self.add_equations(
             Eq(der(i), gain * (setpoint - measured) / reset + (y - v) / track),
             Eq(rate / most * der(smooth), measured - smooth),
