@@ -151,6 +151,15 @@ def test_accumulation_is_named(ball):
     assert "4.06" in str(raised.value)
 
 
+def test_too_many_events_inside_jit(ball):
+    def run(e):
+        system = ball.with_parameters({"ball.e": e})
+        return simulate(system, 5.0, ts=jnp.array([5.0]), max_events=20)["ball.h"]
+
+    with pytest.raises(Exception, match="more than max_events=20 events"):
+        jax.block_until_ready(jax.jit(run)(0.8))
+
+
 def test_members_of_a_batch_are_as_alone(ball):
     restitutions = jnp.linspace(0.7, 0.9, 5)
 

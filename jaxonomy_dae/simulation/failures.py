@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import diffrax
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -20,6 +22,26 @@ NEARLY = 1e-2  # of the first determinant: a singular choice explains a failure 
 SHRINKING = 0.98  # intervals between events that become this much shorter each time accumulate
 CHATTERING = 1e-6  # events closer than this part of the time that has passed
 PROBES = 64  # times at which inputs are looked at
+
+
+def raised(x: Any, result: Any, has_events: bool, max_steps: int, max_events: int) -> Any:
+    """x, or an error while running: for traced runs, of which no more than a code is known."""
+    codes = diffrax.RESULTS
+    lost = "nonlinear blocks have no solution there, or the start is not consistent"
+    many = f"more than max_events={max_events} events" if has_events else "too many rejected steps"
+    texts = [
+        (codes.max_steps_reached, f"max_steps={max_steps} was reached"),
+        (codes.dt_min_reached, "no step was short enough to be accepted"),
+        (TOO_MANY, many),
+        (SINGULAR_CHOICE, "the states have become a singular choice"),
+        (codes.nonlinear_divergence, f"{lost}, or an event wrote a value that is not finite" if has_events else lost),
+    ]
+    index = sum(k * (result == code) for k, (code, _) in enumerate(texts, start=1))
+    found = ["it failed", *(text for _, text in texts)]
+    messages = [
+        f"the integration stopped: {text}. simulate(...) outside jit, grad and vmap says where" for text in found
+    ]
+    return eqx.branched_error_if(x, ~diffrax.is_okay(result), index, messages)
 
 
 def explain(

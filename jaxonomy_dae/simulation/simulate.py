@@ -24,7 +24,7 @@ from ..system.solver_choice import Choice, implicit_choice, is_known_stiff, note
 from ..system.stiffness import fastest_decay
 from ..system.system import AcausalSystem
 from .arguments import check_arguments, check_parameters
-from .failures import explain
+from .failures import explain, raised
 from .integration import Options, Outcome, run, run_compiled
 from .preparation import term_of
 from .solution import Solution
@@ -149,11 +149,11 @@ def simulate(
         if why:
             choice = implicit_choice(system.plan, why)
             solver = SOLVERS[choice.solver]()
-        return _traced(run(given, options(solver), None, throw), given, choice, throw)
+        return _traced(run(given, options(solver), None, throw), given, choice, throw, (max_steps, max_events))
     watch = Watch(t1, scaled_atol(system, atol) / rtol) if switches else None
     outcome = run_compiled(given, options(solver), watch)
     if _is_traced(outcome):  # a network may close over a traced value, which shows in the outcome only
-        return _traced(run(given, options(solver), None, throw), given, choice, throw)
+        return _traced(run(given, options(solver), None, throw), given, choice, throw, (max_steps, max_events))
     counts = outcome.numbers()
     if throw:
         check_parameters(system)
@@ -197,11 +197,11 @@ def _stiff_without_a_run(plan: SystemPlan, duration: float | None) -> str:
     return f"stiff: at the declared start something decays within {1 / fastest_decay(plan):.2g}"
 
 
-def _traced(outcome: Outcome, given: tuple[Any, ...], choice: Choice, throw: bool) -> Solution:
+def _traced(outcome: Outcome, given: tuple[Any, ...], choice: Choice, throw: bool, bounds: tuple[int, int]) -> Solution:
     """The solution where nothing can be looked at: inside jit, grad or vmap."""
     system, inputs, x = given[0], given[4], outcome.x
     if throw:
-        x = outcome.result.error_if(x, ~diffrax.is_okay(outcome.result))
+        x = raised(x, outcome.result, system.plan.events is not None, *bounds)
     return Solution(
         outcome.ts, x, system, inputs, outcome.stats, outcome.result, choice.solver, choice.reason, outcome.discrete,
         outcome.events,
