@@ -36,7 +36,7 @@ def raised(x: Any, result: Any, has_events: bool, max_steps: int, max_events: in
         (SINGULAR_CHOICE, "the states have become a singular choice"),
         (codes.nonlinear_divergence, f"{lost}, or an event wrote a value that is not finite" if has_events else lost),
     ]
-    index = sum(k * (result == code) for k, (code, _) in enumerate(texts, start=1))
+    index = sum(jnp.where(result == code, k, 0) for k, (code, _) in enumerate(texts, start=1))
     found = ["it failed", *(text for _, text in texts)]
     messages = [
         f"the integration stopped: {text}. simulate(...) outside jit, grad and vmap says where" for text in found
