@@ -23,6 +23,7 @@ class ReferenceSystem(NamedTuple):
     `expected` maps values of parameters, by name, to values of variables at `ts`. Errors may be `tolerance` of the
     largest value. `output` is what is differentiated, at the last time. `balance` bounds the error of the account of
     energy, `differences` what differences of `expected` differ from the gradient by; None where they take too long.
+    Derivatives are taken in units of a parameter's value, and of `size` for those that are zero.
     """
 
     make: Callable[[], AcausalSystem]
@@ -34,6 +35,7 @@ class ReferenceSystem(NamedTuple):
     balance: float = MEASURED
     differences: float | None = 1e-5
     rtol: float = 1e-9
+    size: float = 1.0
 
 
 @functools.cache
@@ -84,7 +86,7 @@ def check_gradient(reference: Callable[[], ReferenceSystem]) -> None:
     reverse = jax.jit(jax.grad(last))(values)
     forward = jax.jit(jax.jacfwd(lambda v: last(v, diffrax.ForwardMode())))(values)
     # Parameters have units and sizes of their own: each derivative is in units of the parameter's value.
-    sizes = np.where(np.array(values) == 0, 1.0, np.abs(np.array(values)))
+    sizes = np.where(np.array(values) == 0, known.size, np.abs(np.array(values)))
     reverse, forward = np.asarray(reverse) * sizes, np.asarray(forward) * sizes
     scale = np.abs(forward).max()
     np.testing.assert_allclose(reverse, forward, rtol=0, atol=1e-8 * scale)

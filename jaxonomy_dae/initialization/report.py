@@ -6,12 +6,15 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from ..diagnosis.redundant_constraints import ModelAt, dependent_constraints, no_freedom
+from ..diagnosis.wording import listed
 from ..lowering.plan import SystemPlan
 from ..lowering.schedule import SparseStep
 from ..model.tables import ZERO
 from ..system.sections import SHOWN, Sections, some
 from ..system.system_at import input_values
 from .block_finding import ILL_CONDITIONED, BlockFinding
+from .constraints_at import constraints_at
 from .initialize import InitialPoint, is_consistent
 from .ladder import FAILED, METHODS, NEAREST
 from .rows import Row, initial_rows, supports
@@ -186,19 +189,29 @@ class InitializationReport(Sections):
         return list(self._examine()) if self.consistent else []
 
     def _examine(self):
-        system, plan = self._system, self._plan
+        with jax.ensure_compile_time_eval():
+            yield from examine_blocks(self._plan, *self._numbers(), self.time, self._x, self._read)
+
+    def _numbers(self) -> tuple[np.ndarray, tuple]:
+        """All parameters, those solved for included, and the networks' weights."""
+        system = self._system
         parameters = system.numbers
         if self.solved:
             table = system.parameters.table
             index = np.array([table.index(n) for n, _ in self.solved])
             parameters = table.complete(parameters.at[index].set(self._found.solved))
-        networks = tuple(system.neural[n] for n in plan.network_names)
+        return np.asarray(parameters, float), tuple(system.neural[n] for n in self._plan.network_names)
 
-        def inputs():
-            return np.array([float(v) for v in input_values(plan, self._inputs, self.time, parameters.dtype)])
+    def _read(self) -> np.ndarray:
+        """The values of the inputs' quantities."""
+        dtype = self._system.numbers.dtype
+        return np.array([float(v) for v in input_values(self._plan, self._inputs, self.time, dtype)])
 
+    @functools.cached_property
+    def _constraints(self) -> ModelAt | None:
+        """The model at the point, for questions about its constraints; None if it has none, or too many."""
         with jax.ensure_compile_time_eval():
-            yield from examine_blocks(plan, np.asarray(parameters, float), networks, self.time, self._x, inputs)
+            return constraints_at(self._plan, *self._numbers(), self.time, self._x, self._read)
 
     @functools.cached_property
     def _condition(self) -> float | None:
@@ -256,6 +269,13 @@ class InitializationReport(Sections):
             lines.append(f"  … and {len(self.residuals) - WORST} more")
         contradictions = [r for r in self.redundant if not r.agrees]
         lines += [_contradiction(r) for r in contradictions[:4]]
+        if self._constraints is not None:
+            lines += [
+                f"the constraints of {listed(names, 12)} leave no degree of freedom: they are as many as what they "
+                "restrict. If something should move freely there, one of them holds what others hold already: take it "
+                "out, or let it yield."
+                for names in no_freedom(self._constraints)
+            ]
         if not contradictions:
             lines.append(
                 f"Newton's method, Levenberg–Marquardt and homotopy did not find a solution in {self.evaluations} "
@@ -264,6 +284,14 @@ class InitializationReport(Sections):
         return "\n".join(lines)
 
     def _singular(self, block: BlockFinding) -> str:
+        dependent = dependent_constraints(self._constraints) if self._constraints is not None else []
+        if any(found.is_redundant or len(found.components) > 1 for found in dependent):
+            return "\n".join(
+                [
+                    f"the equations are singular at the initial point: they do not determine {some(block.variables)}",
+                    *(str(found) for found in dependent[:SHOWN]),
+                ]
+            )
         causes = ", ".join(f"{n} = {v:.6g}" for n, v in block.causes[:6])
         at = f" with {causes}" if causes else ""
         if block.causes_are_parameters:
