@@ -346,7 +346,7 @@ def test_a_pack_of_384_cells():
         (lambda ev: Cell(ev, "c", SOC, OCV, R=[0.1, 0.2], C=[1.0]), r"'c' needs .*got 2 in R, 1 in C and 2 in initial"),
         (lambda ev: Cell(ev, "c", SOC, OCV, eta=1.1), r"'c\.eta' must lie in \(0, 1\]; got 1\.1"),
         (lambda ev: HeatedCell(ev, "c", SOC, OCV, T_ref=0.0), r"'c\.T_ref' must lie in \(0, inf\); got 0"),
-        (lambda ev: Pack(ev, "k", 0, 2, SOC, OCV), r"pack 'k' needs at least one cell .*series=0, parallel=2"),
+        (lambda ev: Pack(ev, "k", 0, 2, SOC, OCV), r"'k': series must be at least 1, an integer; got 0"),
         (lambda ev: Pack(ev, "k", 3, 2, SOC, OCV, R0=[0.1] * 3), r"'k': R0 has shape \(3,\): .* shape \(3, 2\)"),
         (lambda ev: Pack(ev, "k", 2, 2, SOC, OCV, Q=-1.0), r"'k\.Q' must lie in"),
         (lambda ev: Pack(ev, "k", 2, 2, SOC, OCV, Q=[[1.0, 1.0], [1.0, -1.0]]), r"'cell\[1,1\]\.Q' must lie"),

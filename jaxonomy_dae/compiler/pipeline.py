@@ -54,7 +54,7 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Co
     least = np.zeros(len(flat.variables), np.int64)  # the highest derivative of each root that a variable is equal to
     np.maximum.at(least, alias.root[named], alias.order[named])
     groups, signature, offsets, notes = reduce_with_cancellation(
-        groups, column, len(unknown), least[unknown], flat.parameters.values
+        groups, column, len(unknown), least[unknown], flat.parameters.values, flat.parameters.names
     )
     zero = zero_pivots(groups, signature, offsets, column, flat.parameters.values)
     if len(zero):

@@ -3,6 +3,7 @@
 from sympy import Max, Min, S
 
 from ...modeling import POSITIVE, Component, Eq, EqnEnv, Value, der
+from ..arguments import in_order
 
 
 class PI(Component):
@@ -60,6 +61,8 @@ class PID(Component):
             limited = Max(limited, self.parameter("low", low))
         if high is not None:
             limited = Min(limited, self.parameter("high", high))
+        if low is not None and high is not None:
+            in_order(self, "low", "high")
         y = self.output("y", limited * S.One)
         self.add_equations(
             Eq(der(i), gain * (setpoint - measured) / reset + (y - v) / track),
