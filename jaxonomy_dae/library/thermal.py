@@ -7,6 +7,7 @@ Source: F. P. Incropera and D. P. DeWitt, Fundamentals of Heat and Mass Transfer
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import sympy
@@ -117,8 +118,8 @@ class Wall(Component):
         super().__init__(ev, name)
         R, C = row(R, name, "R"), row(C, name, "C")
         n = len(R)
-        each = isinstance(initial_temperature, Sequence | np.ndarray) and np.ndim(initial_temperature)
-        starts = row(initial_temperature, name, "initial_temperature") if each else [initial_temperature] * n
+        given: Any = initial_temperature
+        starts = row(given, name, "initial_temperature") if np.ndim(given) else [given] * n
         if n == 0 or not n == len(C) == len(starts):
             raise ModelError(
                 f"wall '{name}' needs a resistance, a capacity and, if given, a temperature for each layer; got {n} in "
