@@ -282,6 +282,8 @@ class CubicConductor(Component):
 
 
 def chua():
+    """Chua's circuit, with a conductor that is a cubic."""
+
     def make():
         ev = EqnEnv()
         c1, c2 = el.Capacitor(ev, "c1", 1e-8, 0.1), el.Capacitor(ev, "c2", 1e-7, -0.2)

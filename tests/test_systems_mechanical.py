@@ -254,6 +254,8 @@ def chain(p, names, pins):
 
 
 def double_pendulum():
+    """Two uniform rods on pins, from rest."""
+
     def expected(p):
         q, w = chain(p, ("a", "b"), ("j1", "j2"))
         return {"j1.phi": q[0] - p["world.phi"], "j2.phi": q[1] - q[0], "j2.omega": w[1] - w[0]}
