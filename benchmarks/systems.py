@@ -26,8 +26,7 @@ stored, supplied and lost, as the components declare it, relative to the largest
 
 The tests of these systems compare their gradients too: of one output by every parameter that can be set, reverse with
 forward mode to 1e-8 of the largest derivative (each in units of its parameter's value), and with differences of the
-reference to 1e-5. Of the pack, reverse and forward mode are compared
-along one direction of all its parameters.
+reference to 1e-5. Of the pack, reverse and forward mode are compared along one direction of all its parameters.
 
 | System | Equations | States | Solver | Error | Energy |
 |---|---|---|---|---|---|
@@ -50,7 +49,7 @@ def main() -> None:
         text = " ".join((inspect.getdoc(reference) or "").split()).partition(". ")[0].rstrip(".")
         name = f"`{reference.__module__}.{reference.__name__}`"
         rows.append(
-            f"| {name}: {text[0].lower() + text[1:]} | {system.plan.flat.n_equations} | {len(system.states)} | "
+            f"| {name}: {text} | {system.plan.flat.n_equations} | {len(system.states)} | "
             f"{found.solver} | {found.error:.1e} | {found.energy:.1e} |"
         )
         print(f"{time.perf_counter() - start:6.1f} s  {reference.__name__}", flush=True)

@@ -131,7 +131,7 @@ def _of_part(model: ModelAt, entries: ConstraintEntries, rows: np.ndarray) -> li
     size = np.zeros_like(changed)
     for k in range(right.shape[1]):
         move = column_scale * right[:, k]
-        step = STEP / max(np.abs(move).max(), 1e-300) * max(np.abs(model.values[position]).max(initial=0.0), 1.0)
+        step = STEP * (np.abs(model.values[position] / column_scale).max(initial=0.0) or 1.0)
         ahead, behind = model.values.copy(), model.values.copy()
         ahead[position] += step * move
         behind[position] -= step * move
