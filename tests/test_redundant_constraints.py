@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 import test_library_planar as planar
 from problems import compiled, component
+from rescaling import KINDS, rescaled
 
 import jaxonomy_dae.library.planar as pl
 import jaxonomy_dae.library.rotational as rot
-from jaxonomy_dae import EqnEnv, InitializationError, StructuralError
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, InitializationError, StructuralError
+from jaxonomy_dae.compiler.flatten import flatten
 from jaxonomy_dae.modeling import Eq, der
 
 MODES = ["dummy_derivatives", pytest.param("auto", marks=pytest.mark.slow)]
@@ -143,6 +145,23 @@ def test_two_pins_between_two_bodies(mode):
     assert b.refusal(mode).splitlines()[-1] == expected
 
 
+def test_redundancy_is_found_in_other_units():
+    """A point that fulfils the constraints to fewer digits leaves the Jacobian that much short of singular: this model,
+    in units of 1e-12 to 1e9 of its own, was started."""
+    b = Linkage()
+    one, other = b(pl.MassiveLink, "one"), b(pl.MassiveLink, "other")
+    b.pin("hinge", b(pl.World, "world").frame, one.frame_a)
+    b.pin("near", one.frame_a, other.frame_a)
+    b.pin("far", one.frame_b, other.frame_b)
+    diagram = AcausalDiagram()
+    diagram.add(*b.parts)
+    for ends in b.joined:
+        diagram.connect(*ends)
+    ev, changed, _ = rescaled(np.random.default_rng([3, KINDS.index("all")]), flatten(diagram), "all", False)
+    with pytest.raises((StructuralError, InitializationError), match="one of them follows from the others in every"):
+        AcausalCompiler(ev, changed, state_selection="dummy_derivatives")().initialize()
+
+
 def test_what_hangs_on_the_loop_is_not_named():
     """A pendulum on the coupler moves as it likes."""
     b = Linkage()
@@ -213,6 +232,13 @@ def test_two_bodies_in_line():
     text = in_line().refusal("dummy_derivatives")
     assert "at this point the constraints of 'one', 'two', 'first', 'second' and 'third' depend on each other" in text
     assert "though not nearby" in text and text.endswith(POSITION) and "every position" not in text
+
+
+@pytest.mark.slow
+def test_a_note_of_two_bodies_in_line():
+    """A root of second order is found to half of the digits: there a pin bears 1e9 N."""
+    notes = in_line().compile().initialization_report().notes
+    assert any("'first', 'second' and 'third' depend on each other, though not nearby" in note for note in notes)
 
 
 def test_a_parallelogram_in_line():

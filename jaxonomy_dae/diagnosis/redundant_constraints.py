@@ -33,6 +33,7 @@ from .wording import listed, words
 
 LARGEST = 600  # constraints of a part that is examined
 DEPENDENT = 1e-7  # a singular value of the equilibrated Jacobian: roots of second order are found to half of the digits
+ALWAYS = 1e-12  # the same where it is constant: no point that is found decides
 STEP = 1e-4  # relative, of differences that tell the cases apart: their error is its square
 UNCHANGED = 1e-5  # relative
 MECHANICAL = ("Planar", "Translational", "Rotational")
@@ -123,7 +124,8 @@ def _of_part(model: ModelAt, entries: ConstraintEntries, rows: np.ndarray) -> li
         return []
     scaled, row_scale, column_scale = equilibrated(at)
     u, s, vt = np.linalg.svd(scaled.toarray())
-    rank = int((s > DEPENDENT * max(s[0], 1e-300)).sum())
+    small = ALWAYS if entries.constant.all() else DEPENDENT
+    rank = int((s > small * max(s[0], 1e-300)).sum())
     left, right = u[:, rank:], vt[rank:].T
     if not left.shape[1]:
         return []

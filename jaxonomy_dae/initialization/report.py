@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from ..diagnosis.redundant_constraints import ModelAt, dependent_constraints, no_freedom
+from ..diagnosis.redundant_constraints import DependentConstraints, ModelAt, dependent_constraints, no_freedom
 from ..diagnosis.wording import listed
 from ..lowering.plan import SystemPlan
 from ..lowering.schedule import SparseStep
@@ -22,6 +22,7 @@ from .singular_blocks import examine_blocks
 from .sizes import tolerance
 
 WORST = 5
+SUSPICIOUS = 1e7  # the condition number from which on constraints are asked whether they are redundant
 CONDITION_LIMIT = 500  # unknowns up to which the condition of the initial equations is computed
 
 
@@ -186,11 +187,16 @@ class InitializationReport(Sections):
 
     @functools.cached_property
     def blocks(self) -> list[BlockFinding]:
+        return [b for b in self._suspected if not b.condition < ILL_CONDITIONED]
+
+    @functools.cached_property
+    def _suspected(self) -> list[BlockFinding]:
+        """Blocks that are singular, ill-conditioned, or so far from well-conditioned that redundancy may be why."""
         return list(self._examine()) if self.consistent else []
 
     def _examine(self):
         with jax.ensure_compile_time_eval():
-            yield from examine_blocks(self._plan, *self._numbers(), self.time, self._x, self._read)
+            yield from examine_blocks(self._plan, *self._numbers(), self.time, self._x, self._read, SUSPICIOUS)
 
     def _numbers(self) -> tuple[np.ndarray, tuple]:
         """All parameters, those solved for included, and the networks' weights."""
@@ -214,6 +220,10 @@ class InitializationReport(Sections):
             return constraints_at(self._plan, *self._numbers(), self.time, self._x, self._read)
 
     @functools.cached_property
+    def _dependent(self) -> list[DependentConstraints]:
+        return dependent_constraints(self._constraints) if self._constraints is not None else []
+
+    @functools.cached_property
     def _condition(self) -> float | None:
         """The condition number of the initial equations, rows and columns scaled."""
         jacobian = self._found.jacobian
@@ -234,6 +244,8 @@ class InitializationReport(Sections):
                     f"the block of {some(block.variables)} is ill-conditioned, {block.condition:.1e}: about "
                     f"{int(np.log10(block.condition))} digits of its solution are lost"
                 )
+        if self._suspected and not any(block.singular for block in self._suspected):
+            out += [str(found) for found in self._dependent]
         if self._condition is not None and self._condition > ILL_CONDITIONED:
             out.append(
                 f"the initial equations are ill-conditioned, {self._condition:.1e}: the starts hardly determine the "
@@ -248,9 +260,12 @@ class InitializationReport(Sections):
         """The text of the `InitializationError` this amounts to, or None if the model can start here."""
         if not self.consistent:
             return self._inconsistent()
-        for block in self._examine():
+        for block in self._suspected:
             if block.singular:
                 return self._singular(block)
+        # Redundant constraints are singular only as far as the point fulfils them.
+        if self._suspected and any(found.is_redundant for found in self._dependent):
+            return self._singular(self._suspected[0])
         return None
 
     def _inconsistent(self) -> str:
@@ -284,7 +299,7 @@ class InitializationReport(Sections):
         return "\n".join(lines)
 
     def _singular(self, block: BlockFinding) -> str:
-        dependent = dependent_constraints(self._constraints) if self._constraints is not None else []
+        dependent = self._dependent
         if any(found.is_redundant or len(found.components) > 1 for found in dependent):
             return "\n".join(
                 [
