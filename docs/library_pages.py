@@ -360,6 +360,9 @@ def overview() -> str:
         "parameters may be numbers or, within a component, expressions in its parameters. The unit of numbers is 1;",
         "what has no unit, as most signals, takes that of what it is connected to.",
         "",
+        "What each component is checked against, and with what error, has a page:",
+        "[Components and their references](../components.md).",
+        "",
     ]
     for domain in domains():
         lines += [f"## [{domain.capitalize()}]({domain}.md)", ""]

@@ -10,6 +10,7 @@ import scipy.integrate
 import scipy.interpolate
 import scipy.signal
 import scipy.special
+from component_references import checks, measured
 from problems import compiled
 from scipy.linalg import expm
 
@@ -21,6 +22,19 @@ X, VALUES = np.array([0.0, 1.0, 1.5, 3.0]), np.array([1.0, -1.0, 2.0, 0.5])
 GRID = np.random.default_rng(0).normal(size=(4, 3))
 
 
+@checks(
+    {
+        sig.Gain: ("arithmetic", "gain.y"),
+        sig.Constant: ("arithmetic", "gain.y"),
+        sig.Sum: ("arithmetic", "error.y"),
+        sig.Product: ("arithmetic", "product.y"),
+        sig.Saturation: ("NumPy's clip", "cut.y"),
+        sig.DeadZone: ("arithmetic", "dead.y"),
+        sig.Table1D: ("SciPy's interp1d and CubicHermiteSpline", "line.y", "curve.y"),
+        sig.Table2D: ("SciPy's RegularGridInterpolator", "map.y"),
+    },
+    origin="rounding",
+)
 def test_blocks_without_memory():
     ev = EqnEnv()
     parts = [
@@ -44,7 +58,8 @@ def test_blocks_without_memory():
             float(curve(u)), float(surface([u, 1.7])[0]),
         ]  # fmt: skip
         found = observe({k: jnp.asarray(v) for k, v in inputs.items()})
-        np.testing.assert_allclose(found, expected, rtol=ROUNDING, atol=ROUNDING)
+        for name, value, true in zip(names, np.asarray(found), expected, strict=True):
+            measured(name, value, true, ROUNDING * (1.0 + abs(true)), scale=abs(true) or 1.0)
 
 
 W = 2.0  # rad/s of the input sin(W·t)
@@ -82,16 +97,43 @@ def dynamic():
     return system, {f"{block.name}.y": true for block, true in blocks.items()}
 
 
+RESPONSE = "matrix exponential of SciPy's tf2ss"
+
+
+@checks(
+    {
+        sig.Sine: (RESPONSE, "sum.y"),
+        sig.Integrator: (RESPONSE, "sum.y"),
+        sig.FirstOrder: (RESPONSE, "lag.y"),
+        sig.SecondOrder: (RESPONSE, "swing.y"),
+        sig.DerivativeFilter: (RESPONSE, "slope.y"),
+        sig.TransferFunction: (RESPONSE, "tf.y"),
+        sig.StateSpace: ("matrix exponential of SciPy's ss2tf", "ss.y"),
+        sig.PadeDelay: ("matrix exponential of SciPy's pade", "late.y"),
+    },
+    origin="rtol 1e-9 for each of fewer than 200 steps",
+)
 def test_blocks_with_memory():
     system, expected = dynamic()
     solution = simulate(system, 3.0, ts=TS, rtol=1e-9, atol=1e-11)
     for name, true in expected.items():
-        # rtol 1e-9 for each of fewer than 200 steps.
-        np.testing.assert_allclose(solution[name], true, rtol=0, atol=2e-7 * np.abs(true).max(), err_msg=name)
+        measured(name, solution[name], true, 2e-7 * np.abs(true).max())
     late = np.where(TS < 0.5, 0.0, np.sin(W * (TS - 0.5)))
     assert np.abs(np.asarray(solution["late.y"]) - late)[2:].max() < 1e-2  # what order 4 leaves
 
 
+LOOP = "SciPy's Radau of the loop's equations, from kink to kink"
+
+
+@checks(
+    {
+        sig.PID: (LOOP, "first.y"),
+        sig.Step: (LOOP, "first.y"),
+        sig.PI: (LOOP, "second.y"),
+        sig.Ramp: (LOOP, "second.y"),
+    },
+    origin="rtol 1e-9 here and 1e-10 there; the limit is left and reached between steps",
+)
 def test_a_controlled_plant_against_scipy():
     """A lag behind a PID controller with limits, and another behind a PI controller; the limit is reached."""
     ev = EqnEnv()
@@ -130,12 +172,16 @@ def test_a_controlled_plant_against_scipy():
     table = {t: s for t, s in zip(np.union1d(TS, [0.25, 0.5, 2.25]), at, strict=True)}
     expected = np.array([table[t] for t in TS])
     assert float(jnp.max(solution["pid.v"])) > 2.5  # the limit matters
-    # Tolerances of 1e-9 here and 1e-10 there; the limit is left and reached between steps.
-    np.testing.assert_allclose(solution["first.y"], expected[:, 0], rtol=0, atol=1e-6)
-    np.testing.assert_allclose(solution["second.y"], expected[:, 4], rtol=0, atol=1e-6)
+    measured("first.y", solution["first.y"], expected[:, 0], 1e-6)
+    measured("second.y", solution["second.y"], expected[:, 4], 1e-6)
 
 
 @pytest.mark.parametrize("Tt", [None, 0.25])
+@checks(
+    {sig.PI: ("SciPy's solution of a loop with a lag, limited", "lag.y", "pi.x")},
+    origin="rtol 1e-9 here and 1e-11 there; the limit is left between steps",
+    Tt=lambda: 0.25,
+)
 def test_a_limited_pi_controller(Tt):
     """A lag behind it that can reach its setpoint of 1 only slowly; without back-calculation it would overshoot."""
     ev = EqnEnv()
@@ -151,20 +197,23 @@ def test_a_limited_pi_controller(Tt):
 
     run = scipy.integrate.solve_ivp(slopes, (0, 3), [0, 0], "Radau", t_eval=TS, rtol=1e-11, atol=1e-13, max_step=0.01)
     assert float(jnp.max(solution["pi.v"])) > 1.2
-    # As above.
-    np.testing.assert_allclose(solution["lag.y"], run.y[0], rtol=0, atol=1e-6)
-    np.testing.assert_allclose(4.0 * solution["pi.x"], run.y[1], rtol=0, atol=1e-6)
+    measured("lag.y", solution["lag.y"], run.y[0], 1e-6)
+    measured("pi.x", 4.0 * solution["pi.x"], run.y[1], 1e-6)
 
 
+@checks(
+    {sig.Noise: ("mean, variance and correlation of independent normal values", "mean", "variance", "correlation")},
+    origin="four standard deviations of 2,000 values",
+)
 def test_noise_belongs_to_its_key():
     ev = EqnEnv()
     system = compiled(sig.Noise(ev, "n", jax.random.key(3), 2.0, 0.1), sig.Noise(ev, "m", jax.random.key(4), 2.0, 0.1))
     read = jax.jit(jax.vmap(lambda t: system.observe(["n.y", "m.y"], t, system.initialize(t0=t))))
     values = np.asarray(read(jnp.arange(2000.0) * 0.1))
     # 2,000 independent values: the mean's deviation is 2/√2000, the variance's 4·√(2/2000); four of each.
-    assert np.abs(values.mean(axis=0)).max() < 4 * 2 / np.sqrt(2000)
-    assert np.abs(values.var(axis=0) - 4.0).max() < 4 * 4 * np.sqrt(2 / 2000)
-    assert abs(np.corrcoef(values.T)[0, 1]) < 4 / np.sqrt(2000)
+    measured("mean", values.mean(axis=0), 0.0, 4 * 2 / np.sqrt(2000), scale=2.0)
+    measured("variance", values.var(axis=0), 4.0, 4 * 4 * np.sqrt(2 / 2000))
+    measured("correlation", np.corrcoef(values.T)[0, 1], 0.0, 4 / np.sqrt(2000), scale=1.0)
     between = np.asarray(read(jnp.array([0.7, 0.725, 0.8])))[:, 0]
     assert between[1] == pytest.approx(0.75 * between[0] + 0.25 * between[2], rel=1e-9)
 

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
+from component_references import checks, measured
 from problems import compiled
 
 from jaxonomy_dae import EqnEnv, ModelError, simulate
@@ -16,6 +17,7 @@ from jaxonomy_dae.library.thermal import (
     Radiation,
     TemperatureSensor,
     TemperatureSource,
+    ThermalConductor,
     Wall,
 )
 
@@ -48,6 +50,24 @@ def radiating_time(T, T0, around, rate):
     return (primitive(T) - primitive(T0)) / (4 * around**3 * rate)
 
 
+@checks(
+    {
+        HeatCapacitor: ("exponential of Newton's cooling", "probe.T"),
+        Convection: ("exponential of Newton's cooling", "meter.Q_flow"),
+        FixedTemperature: ("exponential of Newton's cooling", "probe.T"),
+        HeatFlowSource: ("exponential of Newton's cooling", "probe.T"),
+        HeatFlowSensor: ("exponential of Newton's cooling", "meter.Q_flow"),
+        TemperatureSensor: ("exponential of Newton's cooling", "probe.T"),
+        Radiation: (
+            "T' = −k·(T⁴ − T₀⁴) by partial fractions, and T⁻³ towards absolute zero",
+            "ball.T", "star.T", "shine.Q_flow",
+        ),
+        Wall: ("SciPy's DOP853 of the layers' equations", "wall.capacitor.T", "into.Q_flow"),
+        TemperatureSource: ("SciPy's DOP853 of the layers' equations", "wall.capacitor.T"),
+        ThermalConductor: ("SciPy's DOP853 of the layers' equations", "wall.capacitor.T", "into.Q_flow"),
+    },
+    origin="rtol 1e-10 of at most 900 K is 1e-7 K in a step, and errors decay: ten of them; flows: times conductances",
+)  # fmt: skip
 def test_networks():
     ev = EqnEnv()
     # A heated body that air cools, with sensors in between.
@@ -80,24 +100,24 @@ def test_networks():
     tolerance = 1e-6
     conductance, final = 12.0 * 0.05, 293.15 + 30.0 / (12.0 * 0.05)
     expected = final + (350.0 - final) * np.exp(-conductance / 800.0 * TS)
-    np.testing.assert_allclose(solution["probe.T"], expected, rtol=0, atol=tolerance)
-    np.testing.assert_allclose(solution["meter.Q_flow"], conductance * (expected - 293.15), rtol=0, atol=tolerance)
+    measured("probe.T", solution["probe.T"], expected, tolerance)
+    measured("meter.Q_flow", solution["meter.Q_flow"], conductance * (expected - 293.15), tolerance)
 
     rate = 0.8 * 5.670374419e-8 * 0.02 / 2000.0
     T = np.asarray(solution["ball.T"])
     error = (radiating_time(T, 900.0, 300.0, rate) - TS) * rate * (T**4 - 300.0**4)  # time off, times the slope
-    np.testing.assert_allclose(error, 0, atol=tolerance)
+    measured("ball.T", error, 0, tolerance, scale=900.0)
     assert 300.0 < T[-1] < 650.0
 
     rate = 0.6 * 5.670374419e-8 * 0.03 / 500.0
-    np.testing.assert_allclose(solution["star.T"], (700.0**-3 + 3 * rate * TS) ** (-1 / 3), rtol=0, atol=tolerance)
-    np.testing.assert_allclose(solution["shine.Q_flow"], -rate * 500.0 * solution["star.T"] ** 4, rtol=1e-12)
+    expected = (700.0**-3 + 3 * rate * TS) ** (-1 / 3)
+    measured("star.T", solution["star.T"], expected, tolerance)
+    measured("shine.Q_flow", solution["shine.Q_flow"], -rate * 500.0 * expected**4, tolerance * rate * 500 * 4 * 700**3)
 
     expected = wall_temperatures(r, c, 294.0, starts)
     found = np.array([solution[f"wall.capacitor{k}.T"] for k in (1, 2, 3)])
-    np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance)
-    leaving = (expected[2] - 294.0) / (r[2] / 2)
-    np.testing.assert_allclose(solution["into.Q_flow"], leaving, rtol=0, atol=tolerance / (r[2] / 2))
+    measured("wall.capacitor.T", found, expected, tolerance)
+    measured("into.Q_flow", solution["into.Q_flow"], (expected[2] - 294.0) / (r[2] / 2), tolerance / (r[2] / 2))
 
 
 @pytest.mark.parametrize(

@@ -252,7 +252,7 @@ def rectifier():
         nodes = scipy.optimize.root(
             lambda n: balance(0.0, *n, v0)[0] * 1e3, [0.0, 0.0], tol=1e-15, jac=lambda n: balance(0.0, *n, v0)[1] * 1e3
         ).x
-        a, b, v = integrated(slopes, [*nodes, v0], TS_RECTIFIER, "Radau", rtol=1e-10)
+        a, b, v = integrated(slopes, [*nodes, v0], TS_RECTIFIER, rtol=1e-11)
         # What the nodes have drifted by is taken back by Newton's method; the sum of rows holds no large currents.
         for k, t in enumerate(TS_RECTIFIER):
             for _ in range(4):
@@ -261,7 +261,7 @@ def rectifier():
                 a[k], b[k] = np.array([a[k], b[k]]) - np.linalg.solve(both @ by_nodes, both @ residual)
         return {"c.v": v, "d0.p.v": a, "d1.p.v": b}
 
-    return ReferenceSystem(make, expected, TS_RECTIFIER, "c.v", differences=None)
+    return ReferenceSystem(make, expected, TS_RECTIFIER, "c.v")
 
 
 TS_RECTIFIER = np.linspace(0.0, 0.025, 11)
@@ -282,6 +282,8 @@ class CubicConductor(Component):
 
 
 def chua():
+    """Chua's circuit, with a conductor that is a cubic."""
+
     def make():
         ev = EqnEnv()
         c1, c2 = el.Capacitor(ev, "c1", 1e-8, 0.1), el.Capacitor(ev, "c2", 1e-7, -0.2)

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..diagnosis.redundant_constraints import ModelAt, dependent_constraints
 from ..diagnosis.starts import check_equal_starts, dependent_starts
 from ..diagnosis.structure import check_structure
 from ..diagnosis.wording import itemised, listed
@@ -53,7 +54,7 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Co
     least = np.zeros(len(flat.variables), np.int64)  # the highest derivative of each root that a variable is equal to
     np.maximum.at(least, alias.root[named], alias.order[named])
     groups, signature, offsets, notes = reduce_with_cancellation(
-        groups, column, len(unknown), least[unknown], flat.parameters.values
+        groups, column, len(unknown), least[unknown], flat.parameters.values, flat.parameters.names
     )
     zero = zero_pivots(groups, signature, offsets, column, flat.parameters.values)
     if len(zero):
@@ -70,6 +71,11 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Co
     def point():
         return initial_point(flat, variables, extended)
 
+    def dependent(settled: np.ndarray) -> list[str]:
+        values, parameters, networks = point()
+        at = ModelAt(flat, alias, variables, groups, extended, settled, values, parameters, 0.0, networks)
+        return [str(found) for found in dependent_constraints(at)]
+
     selection = select_states(
         groups,
         extended,
@@ -79,6 +85,7 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Co
         point,
         lambda q: names[q],
         lambda e: str(provenance_of(groups, int(e))),
+        dependent,
     )
     selection = dataclasses.replace(selection, notes=(*_loose_ports(flat), *starts, *notes, *selection.notes))
     known = np.zeros(extended.quantities.n, bool)

@@ -13,7 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
-from ..diagnosis.wording import itemised
+from ..diagnosis.wording import itemised, some
 from ..errors import StructuralError
 from ..expressions.differentiate import partial_derivative
 from ..expressions.kernel import Kernel
@@ -42,11 +42,17 @@ SMALL = 2.0**-20
 
 
 def reduce_with_cancellation(
-    groups: tuple[EquationGroup, ...], column: np.ndarray, n_unknown: int, least: np.ndarray, values: np.ndarray
+    groups: tuple[EquationGroup, ...],
+    column: np.ndarray,
+    n_unknown: int,
+    least: np.ndarray,
+    values: np.ndarray,
+    names: Sequence[str],
 ) -> tuple[tuple[EquationGroup, ...], Incidence, Offsets, tuple[str, ...]]:
     """Index reduction, repeated until no diagonal block with constant coefficients is singular.
 
-    Returns the equations, changed where something cancelled, their incidence and offsets, and notes.
+    Returns the equations, changed where something cancelled, their incidence and offsets, and notes. `values` and
+    `names` are those of parameters.
 
     **Raises:**
 
@@ -59,7 +65,7 @@ def reduce_with_cancellation(
         jacobian = _Jacobian(groups, offsets, column, values)
         replaced, added, combined = [], [], []
         for equations in _blocks_of_several(signature, offsets):
-            found = _combination(jacobian, equations)
+            found = _combination(jacobian, equations, names)
             if found is not None:
                 combined = [provenance_of(groups, int(e)) for e in equations]
                 replaced.append(found[0])
@@ -199,7 +205,7 @@ class _Jacobian:
         )
 
 
-def _combination(jacobian: _Jacobian, equations: np.ndarray) -> tuple[int, EquationGroup] | None:
+def _combination(jacobian: _Jacobian, equations: np.ndarray, names: Sequence[str]) -> tuple[int, EquationGroup] | None:
     """For a block that is singular wherever the model is: an equation of it, and what replaces that equation.
 
     **Raises:**
@@ -244,7 +250,9 @@ def _combination(jacobian: _Jacobian, equations: np.ndarray) -> tuple[int, Equat
     top = _highest(jacobian, columns, int(c.min()))
     found = _weights(written, top, unit, jacobian.values, trials)
     if found is None:
-        raise StructuralError("\n".join([_FOR_THESE_VALUES, *itemised(sources)]))
+        here = [jacobian.place(e) for e in equations[used].tolist()]
+        concerned = dict.fromkeys(p for g, i in here for p in groups[g].parameter[i].tolist())
+        raise StructuralError("\n".join([_for_values(jacobian.values, names, list(concerned)), *itemised(sources)]))
     combined = combine(written, found, top, jacobian.values)
     if combined is None:
         raise StructuralError(_hidden(sources))
@@ -253,10 +261,14 @@ def _combination(jacobian: _Jacobian, equations: np.ndarray) -> tuple[int, Equat
     return int(equations[used[unit]]), group_of(combined, combination(sources))
 
 
-_FOR_THESE_VALUES = (
-    "these equations are singular for the given parameter values, though not in general. Change the parameters, or "
-    "state the constraint that follows as an equation of its own:"
-)
+def _for_values(values: np.ndarray, names: Sequence[str], concerned: list[int]) -> str:
+    """The message for equations that are singular with these parameters: zeros, where there are, else all."""
+    shown = [p for p in concerned if values[p] == 0.0] or concerned
+    given = some([f"{names[p]} = {values[p]:g}" for p in shown])
+    return (
+        f"these equations are singular for {given or 'the given parameter values'}, though not in general. Change the "
+        "parameters, or state the constraint that follows as an equation of its own:"
+    )
 
 
 def _highest(jacobian: _Jacobian, columns: np.ndarray, lowest: int) -> list:

@@ -11,14 +11,13 @@ motion) is set apart first: it is known and not a state.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
-import scipy.sparse as sp
-from scipy.sparse.csgraph import connected_components
 
 from ..errors import StructuralError
-from ..model.evaluate_numpy import Networks, group_values
+from ..model.constraint_jacobian import constraint_entries, evaluate, independent_parts
+from ..model.evaluate_numpy import Networks
 from ..model.extended import Extended
 from ..model.scaling import equilibrated, geometric_scales
 from ..model.tables import ZERO, EquationGroup, equation_offsets
@@ -37,46 +36,6 @@ class StateSelection:
     projected: np.ndarray  # equations as written whose hidden constraints are projected onto
     settled: np.ndarray  # quantities that no state influences
     notes: tuple[str, ...]
-
-
-@dataclasses.dataclass(frozen=True)
-class _Entries:
-    """Entries of the constraint Jacobian: ∂F_row/∂(variable column), at the matching orders."""
-
-    row: np.ndarray
-    column: np.ndarray
-    constant: np.ndarray
-    group: np.ndarray
-    instance: np.ndarray
-    slot: np.ndarray
-
-    def take(self, which: np.ndarray) -> "_Entries":
-        return _Entries(*(getattr(self, field.name)[which] for field in dataclasses.fields(self)))
-
-
-def _entries(groups: tuple[EquationGroup, ...], extended: Extended) -> _Entries:
-    quantities = extended.quantities
-    c = np.bincount(extended.base) - 1
-    first = equation_offsets(groups)
-    out: list[list[np.ndarray]] = [[] for _ in range(6)]
-    for g, group in enumerate(groups):
-        count = c[first[g] : first[g + 1]]
-        if not len(group) or group.variable.shape[1] == 0 or not (count > 0).any():
-            continue
-        used = (group.variable != ZERO) & (count > 0)[:, None]
-        column = np.where(used, quantities.column[group.variable], 0)
-        used &= column < quantities.n_unknown_columns
-        highest = quantities.highest[np.where(used, column, 0)]
-        used &= (group.order + count[:, None] == highest) & (highest > 0)
-        instance, slot = np.nonzero(used)
-        if not len(instance):
-            continue
-        constant = np.array([group.template.coefficient_is_constant(k) for k in range(group.variable.shape[1])])
-        values = (first[g] + instance, column[instance, slot], constant[slot], np.full(len(slot), g), instance, slot)
-        for collected, value in zip(out, values, strict=True):
-            collected.append(value)
-    joined = [np.concatenate(v) if v else np.zeros(0, np.int64) for v in out]
-    return _Entries(joined[0], joined[1], joined[2].astype(bool), *joined[3:])
 
 
 def _settled(groups: tuple[EquationGroup, ...], extended: Extended, c: np.ndarray) -> tuple[list[int], list[int]]:
@@ -127,6 +86,7 @@ def select_states(
     point: Callable[[], tuple[np.ndarray, np.ndarray, Networks]],
     name: Callable[[int], str],
     equation_name: Callable[[int], str],
+    dependent: Callable[[np.ndarray], list[str]],
 ) -> StateSelection:
     """Selects states.
 
@@ -137,6 +97,7 @@ def select_states(
     - `scale`: the typical size of every quantity.
     - `point`: called only if numbers are needed: all quantities near the initial point, parameters, networks.
     - `name`, `equation_name`: of a quantity and of an equation, for messages.
+    - `dependent`: called only if constraints depend on each other: which ones, given the settled quantities.
 
     **Raises:**
 
@@ -147,7 +108,7 @@ def select_states(
     order, owner = quantities.order[:unknown], quantities.owner[:unknown]
     candidate = order < quantities.highest[owner]
     c = np.bincount(extended.base) - 1
-    entries = _entries(groups, extended)
+    entries = constraint_entries(groups, extended)
     notes: list[str] = []
     is_dummy = np.zeros(unknown, bool)
     projected = np.zeros(len(c), bool)
@@ -168,7 +129,7 @@ def select_states(
 
     if len(constrained):
         shape = (len(c), quantities.n_unknown_columns)
-        parts = _parts(entries, constrained, shape)
+        parts = independent_parts(entries, constrained, shape)
         numbers = None
         for rows, members in parts:
             constant = entries.constant[members].all()
@@ -176,7 +137,8 @@ def select_states(
                 projected[rows] = True
                 continue
             if numbers is None:
-                numbers = _evaluate(groups, extended, entries, point)
+                values, parameters, networks = point()
+                numbers = evaluate(groups, extended, entries, values, parameters, 0.0, networks)
             columns = np.unique(entries.column[members])
             dense = np.zeros((len(rows), len(columns)))
             np.add.at(
@@ -184,9 +146,9 @@ def select_states(
                 (np.searchsorted(rows, entries.row[members]), np.searchsorted(columns, entries.column[members])),
                 numbers[members],
             )
-            chosen, more = _dummy_derivatives(
-                dense, c[rows], columns, quantities, merit, scale, name, [equation_name(r) for r in rows]
-            )
+            chosen, more = _dummy_derivatives(dense, c[rows], columns, quantities, merit, scale, name)
+            if chosen is None:
+                raise StructuralError(_dependence(dependent(np.flatnonzero(settled)), map(equation_name, rows[:6])))
             is_dummy[chosen] = True
             notes.extend(more)
 
@@ -203,41 +165,20 @@ def select_states(
     )
 
 
-def _parts(entries: _Entries, constrained: np.ndarray, shape: tuple[int, int]):
-    """Independent sets of constrained equations, as (equations, indices of their entries), in order."""
-    n_rows, n_columns = shape
-    graph = sp.coo_array(
-        (np.ones(len(entries.row)), (entries.row, n_rows + entries.column)), shape=(n_rows + n_columns,) * 2
+def _dependence(found: list[str], equations: Iterable[str]) -> str:
+    """The text of an error about constraints that depend on each other."""
+    if found:
+        return "\n".join(found)
+    return (
+        f"the constraints {'; '.join(equations)} do not determine as many variables as there are constraints at the "
+        "initial point: one of them follows from the others, or the start values are at a singular position. Remove "
+        'the redundant constraint, or change the start values, or use state_selection="projection".'
     )
-    _, label = connected_components(graph, directed=False)
-    by_label: dict[int, list[int]] = {}
-    for r in constrained.tolist():
-        by_label.setdefault(int(label[r]), []).append(r)
-    members: dict[int, list[int]] = {key: [] for key in by_label}
-    for k, r in enumerate(entries.row.tolist()):
-        members[int(label[r])].append(k)
-    return [(np.array(rows), np.array(members[key], np.int64)) for key, rows in by_label.items()]
 
 
-def _evaluate(groups, extended: Extended, entries: _Entries, point) -> np.ndarray:
-    """The numbers of all entries; those that depend on the point are taken at the initial point."""
-    values, parameters, networks = point()
-    by_base = {}
-    first = equation_offsets(groups)
-    for group in extended.groups:
-        if group.level == 0:
-            g = int(np.searchsorted(first, group.base[0], side="right") - 1)
-            by_base[g] = group
-    numbers = np.empty(len(entries.row))
-    for g in np.unique(entries.group):
-        here = entries.group == g
-        partials = group_values(by_base[int(g)], values, parameters, 0.0, networks, partials=True)
-        numbers[here] = partials[entries.instance[here], entries.slot[here]]
-    return numbers
-
-
-def _dummy_derivatives(dense, c, columns, quantities, merit, scale, name, equations):
-    """Mattsson & Söderlind's selection, level by level: the candidate quantities that become dummies."""
+def _dummy_derivatives(dense, c, columns, quantities, merit, scale, name):
+    """Mattsson & Söderlind's selection, level by level: the candidate quantities that become dummies, None if rows
+    depend on each other; and notes."""
     notes: list[str] = []
     chosen: list[int] = []
     available = np.arange(len(columns))
@@ -249,13 +190,7 @@ def _dummy_derivatives(dense, c, columns, quantities, merit, scale, name, equati
         matrix = dense[np.ix_(rows, available)] * scale[below]
         picked = _pivots(matrix, [(merit(int(q)), -int(q)) for q in below])
         if picked is None:
-            raise StructuralError(
-                "the constraints "
-                + "; ".join(equations[r] for r in rows[:6])
-                + " do not determine as many variables as there are constraints at the initial point: one of them "
-                "follows from the others, or the start values are at a singular position. Remove the redundant "
-                'constraint, or change the start values, or use state_selection="projection".'
-            )
+            return None, notes
         by_merit = sorted(range(len(below)), key=lambda k: (merit(int(below[k])), -int(below[k])))
         wanted = set(by_merit[: len(picked)])
         for k in picked:

@@ -4,6 +4,8 @@ Given equations of the flattened model that depend on each other, finds the fewe
 wrote these, and what their ports share.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from ..model.coefficients import Entries
@@ -80,15 +82,22 @@ class Explainer:
         found = {provenance_of(self.flat.groups, int(r)).component for r in rows}
         return [c for c in self.flat.components if c in found]  # connections and networks are none
 
-    def once_too_often(self, rows, variables, kind: str) -> str:
-        """That components determine the same thing twice."""
+    def quantity(self, variables) -> str:
+        """What the port variables among these are called at their ports."""
+        table = self.flat.variables
+        return table.names[variables[table.port[variables] >= 0][0]].rsplit(".", 1)[1]
+
+    def where(self, rows, variables) -> tuple[tuple[str, ...], tuple[int, ...]]:
+        """The components that wrote these equations, and the ports of these variables."""
+        ports = np.unique(self.flat.variables.port[variables])
+        return tuple(self.components(rows)), tuple(ports[ports >= 0].tolist())
+
+    def once_too_often(self, rows, variables, kind: str, quantities: Sequence[str]) -> str:
+        """That components determine the same thing twice, which has these names at their ports."""
         table = self.flat.variables
         at_ports = variables[table.port[variables] >= 0]
         names = self.components(rows)
-        word = words(
-            self.flat.ports.domains[table.port[at_ports[0]]],
-            *([table.names[at_ports[0]].rsplit(".", 1)[1]] * 2),
-        )
+        word = words(self.flat.ports.domains[table.port[at_ports[0]]], quantities, quantities[0])
         if kind == "through":
             return self._flows(rows, np.unique(table.port[at_ports]), word)
         if len(names) == 1:

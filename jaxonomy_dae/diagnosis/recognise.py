@@ -48,13 +48,17 @@ def recognise(flat: FlatModel, groups: tuple[EquationGroup, ...], alias: AliasTa
     floating, afloat = _floating(flat, groups, alias)
     cycles = _loops(entries, determined_by)
     texts, equations = list(floating), []
+    too_often: dict[tuple, list] = {}  # by kind and place: x and y of one joint are one fault
     for rows in [*([r] for r in sorted(twice)[:FINDINGS]), *cycles[:FINDINGS]]:
         rows, variables = say.behind(rows)
         kind = say.kind(rows, variables)
         if kind == "mixed":
             equations.append((rows, variables))
         elif kind == "across" or not set(say.components(rows)) <= afloat:
-            texts.append(say.once_too_often(rows, variables, kind))
+            seen = too_often.setdefault((kind, *say.where(rows, variables)), [rows, variables, kind, []])
+            seen[3].append(say.quantity(variables))
+    for rows, variables, kind, quantities in too_often.values():
+        texts.append(say.once_too_often(rows, variables, kind, list(dict.fromkeys(quantities))))
     if not texts:
         for rows in _cuts(flat, groups, alias, determined_by >= 0)[:FINDINGS]:
             sources = say.sources(rows, groups, alias)
@@ -221,7 +225,7 @@ def _floating(flat: FlatModel, groups, alias: AliasTable) -> tuple[list[str], se
                 text = f"'{owners[0]}' is connected to nothing: connect {listed(loose)}"
                 texts.append(text + (", or leave it out." if whole else "."))
             else:
-                say = words(domain, name)
+                say = words(domain, [name])
                 hint = f" ({listed(loose)} {'is' if len(loose) == 1 else 'are'} not connected)" if loose else ""
                 texts.append(f"{say.floating.format(names=listed(owners))}. {say.mend}{hint}.")
             components.update(owners)

@@ -15,6 +15,7 @@ from ..structure.dulmage_mendelsohn import dulmage_mendelsohn
 from ..structure.incidence import Incidence
 from ..structure.matching import maximum_matching
 from .recognise import recognise
+from .redundant_constraints import too_many
 from .wording import counted, itemised, listed
 
 PARTS = 4
@@ -54,13 +55,22 @@ def check_structure(
             names = names or [flat.variables.names[v] for v in variables]
             texts.append(_too_many([provenance_of(flat.groups, int(r)) for r in rows], len(variables), names))
     else:
-        texts = [
-            _too_many(
-                *_with_multiples(flat, alias, rows, groups, columns, _best(flat, alias, unknown, columns).tolist())
+        texts = []
+        for rows, columns in over:
+            if not len(columns):
+                continue
+            mechanical = too_many(
+                flat,
+                alias,
+                [provenance_of(groups, int(r)) for r in rows],
+                np.flatnonzero(np.isin(alias.root, unknown[columns])),
             )
-            for rows, columns in over
-            if len(columns)
-        ]
+            if mechanical:
+                texts.append(mechanical)
+                under = [one for one in under if not _only_through(flat, np.isin(alias.root, unknown[one[1]]))]
+                continue
+            best = _best(flat, alias, unknown, columns).tolist()
+            texts.append(_too_many(*_with_multiples(flat, alias, rows, groups, columns, best)))
         empty = [provenance_of(groups, int(rows[0])) for rows, columns in over if not len(columns)]
         texts += _repeated(flat, empty) if empty else []
     texts += [
@@ -170,6 +180,12 @@ def _too_few(flat: FlatModel, n_equations: int, variables: np.ndarray, concerned
         return f"{text}: add an equation for it, declare it as an input, or leave it out."
     what = "an equation" if missing == 1 else f"{missing} equations"
     return f"{text}: add {what}, or declare {'one' if missing == 1 else missing} of them as an input."
+
+
+def _only_through(flat: FlatModel, concerned: np.ndarray) -> bool:
+    """Whether these variables are flows at ports: what constraints that are too many leave open."""
+    at_ports = concerned & (flat.variables.port >= 0)
+    return bool(at_ports.any() and not flat.variables.is_across[at_ports].any())
 
 
 def _best(flat: FlatModel, alias: AliasTable, unknown: np.ndarray, columns: np.ndarray) -> np.ndarray:

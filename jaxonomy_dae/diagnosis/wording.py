@@ -38,6 +38,14 @@ WORDS = {
         "Connect a Mass or a FixedPosition",
         "a spring",
     ),
+    "Rotational": DomainWords(
+        "angle",
+        "difference of angles",
+        "torque",
+        "nothing holds {names}: no inertia and no fixed angle is connected",
+        "Connect an Inertia or a FixedAngle",
+        "a spring",
+    ),
     "Thermal": DomainWords(
         "temperature",
         "temperature difference",
@@ -61,7 +69,7 @@ SEVERAL = {
 }
 
 
-def words(domain: str, across: str = "potential", through: str = "flow") -> DomainWords:
+def words(domain: str, across: Sequence[str] = ("potential",), through: str = "flow") -> DomainWords:
     """The words of a domain; for a domain of several quantities and a user's own, the names of its variables."""
     if domain in WORDS:
         return WORDS[domain]
@@ -69,10 +77,10 @@ def words(domain: str, across: str = "potential", through: str = "flow") -> Doma
         floating, mend, bridge = SEVERAL[domain]
     else:
         floating = (
-            f"nothing determines the level of '{across}' at the {domain} ports of {{names}}: only its differences"
+            f"nothing determines the level of {listed(across)} at the {domain} ports of {{names}}: only its differences"
         )
-        floating, mend, bridge = f"{floating} matter", f"Connect a component that fixes '{across}'", "a component"
-    return DomainWords(across, f"difference of '{across}'", through, floating, mend, bridge)
+        floating, mend, bridge = f"{floating} matter", f"Connect a component that fixes {listed(across)}", "a component"
+    return DomainWords(listed(across), f"difference of {listed(across)}", through, floating, mend, bridge)
 
 
 def listed(names: Iterable[str], shown: int = SHOWN, joint: str = "and") -> str:

@@ -6,12 +6,15 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from ..diagnosis.redundant_constraints import DependentConstraints, ModelAt, dependent_constraints, no_freedom
+from ..diagnosis.wording import listed
 from ..lowering.plan import SystemPlan
 from ..lowering.schedule import SparseStep
 from ..model.tables import ZERO
 from ..system.sections import SHOWN, Sections, some
 from ..system.system_at import input_values
 from .block_finding import ILL_CONDITIONED, BlockFinding
+from .constraints_at import constraints_at
 from .initialize import InitialPoint, is_consistent
 from .ladder import FAILED, METHODS, NEAREST
 from .rows import Row, initial_rows, supports
@@ -19,6 +22,7 @@ from .singular_blocks import examine_blocks
 from .sizes import tolerance
 
 WORST = 5
+SUSPICIOUS = 1e7  # the condition number from which on constraints are asked whether they are redundant
 CONDITION_LIMIT = 500  # unknowns up to which the condition of the initial equations is computed
 
 
@@ -183,22 +187,41 @@ class InitializationReport(Sections):
 
     @functools.cached_property
     def blocks(self) -> list[BlockFinding]:
+        return [b for b in self._suspected if not b.condition < ILL_CONDITIONED]
+
+    @functools.cached_property
+    def _suspected(self) -> list[BlockFinding]:
+        """Blocks that are singular, ill-conditioned, or so far from well-conditioned that redundancy may be why."""
         return list(self._examine()) if self.consistent else []
 
     def _examine(self):
-        system, plan = self._system, self._plan
+        with jax.ensure_compile_time_eval():
+            yield from examine_blocks(self._plan, *self._numbers(), self.time, self._x, self._read, SUSPICIOUS)
+
+    def _numbers(self) -> tuple[np.ndarray, tuple]:
+        """All parameters, those solved for included, and the networks' weights."""
+        system = self._system
         parameters = system.numbers
         if self.solved:
             table = system.parameters.table
             index = np.array([table.index(n) for n, _ in self.solved])
             parameters = table.complete(parameters.at[index].set(self._found.solved))
-        networks = tuple(system.neural[n] for n in plan.network_names)
+        return np.asarray(parameters, float), tuple(system.neural[n] for n in self._plan.network_names)
 
-        def inputs():
-            return np.array([float(v) for v in input_values(plan, self._inputs, self.time, parameters.dtype)])
+    def _read(self) -> np.ndarray:
+        """The values of the inputs' quantities."""
+        dtype = self._system.numbers.dtype
+        return np.array([float(v) for v in input_values(self._plan, self._inputs, self.time, dtype)])
 
+    @functools.cached_property
+    def _constraints(self) -> ModelAt | None:
+        """The model at the point, for questions about its constraints; None if it has none, or too many."""
         with jax.ensure_compile_time_eval():
-            yield from examine_blocks(plan, np.asarray(parameters, float), networks, self.time, self._x, inputs)
+            return constraints_at(self._plan, *self._numbers(), self.time, self._x, self._read)
+
+    @functools.cached_property
+    def _dependent(self) -> list[DependentConstraints]:
+        return dependent_constraints(self._constraints) if self._constraints is not None else []
 
     @functools.cached_property
     def _condition(self) -> float | None:
@@ -221,6 +244,8 @@ class InitializationReport(Sections):
                     f"the block of {some(block.variables)} is ill-conditioned, {block.condition:.1e}: about "
                     f"{int(np.log10(block.condition))} digits of its solution are lost"
                 )
+        if self._suspected and not any(block.singular for block in self._suspected):
+            out += [str(found) for found in self._dependent]
         if self._condition is not None and self._condition > ILL_CONDITIONED:
             out.append(
                 f"the initial equations are ill-conditioned, {self._condition:.1e}: the starts hardly determine the "
@@ -235,9 +260,12 @@ class InitializationReport(Sections):
         """The text of the `InitializationError` this amounts to, or None if the model can start here."""
         if not self.consistent:
             return self._inconsistent()
-        for block in self._examine():
+        for block in self._suspected:
             if block.singular:
                 return self._singular(block)
+        # Redundant constraints are singular only as far as the point fulfils them.
+        if self._suspected and any(found.is_redundant for found in self._dependent):
+            return self._singular(self._suspected[0])
         return None
 
     def _inconsistent(self) -> str:
@@ -256,6 +284,13 @@ class InitializationReport(Sections):
             lines.append(f"  … and {len(self.residuals) - WORST} more")
         contradictions = [r for r in self.redundant if not r.agrees]
         lines += [_contradiction(r) for r in contradictions[:4]]
+        if self._constraints is not None:
+            lines += [
+                f"the constraints of {listed(names, 12)} leave no degree of freedom: they are as many as what they "
+                "restrict. If something should move freely there, one of them holds what others hold already: take it "
+                "out, or let it yield."
+                for names in no_freedom(self._constraints)
+            ]
         if not contradictions:
             lines.append(
                 f"Newton's method, Levenberg–Marquardt and homotopy did not find a solution in {self.evaluations} "
@@ -264,6 +299,14 @@ class InitializationReport(Sections):
         return "\n".join(lines)
 
     def _singular(self, block: BlockFinding) -> str:
+        dependent = self._dependent
+        if any(found.is_redundant or len(found.components) > 1 for found in dependent):
+            return "\n".join(
+                [
+                    f"the equations are singular at the initial point: they do not determine {some(block.variables)}",
+                    *(str(found) for found in dependent[:SHOWN]),
+                ]
+            )
         causes = ", ".join(f"{n} = {v:.6g}" for n, v in block.causes[:6])
         at = f" with {causes}" if causes else ""
         if block.causes_are_parameters:

@@ -64,7 +64,13 @@ def _never_vanishes(equation: StepEquation) -> bool:
 
 
 def examine_blocks(
-    plan: SystemPlan, parameters, networks: tuple, t: float, x, inputs: Callable[[], np.ndarray]
+    plan: SystemPlan,
+    parameters,
+    networks: tuple,
+    t: float,
+    x,
+    inputs: Callable[[], np.ndarray],
+    limit: float = ILL_CONDITIONED,
 ) -> Iterator[BlockFinding]:
     """The blocks that are singular at a state, or ill-conditioned, in the order they are solved; the first singular
     one ends the search, as nothing after it can be computed.
@@ -73,6 +79,7 @@ def examine_blocks(
 
     - `parameters`, `x`: flat arrays.
     - `inputs`: a function that gives the values of the inputs' quantities; called only if they are needed.
+    - `limit`: the condition number from which on a block that is written out is reported.
     """
     check = _plan_check(plan)
     if not check.examined and not plan.n_constraints:
@@ -93,7 +100,7 @@ def examine_blocks(
             matrices = values.jacobian(step)
             condition, left, right = conditions(matrices)
             size = len(step.unknown)
-            for b in np.flatnonzero(~(condition < ILL_CONDITIONED)):
+            for b in np.flatnonzero(~(condition < limit)):
                 singular = not condition[b] < 1 / (4 * size * eps)
                 yield _finding(plan, values, step, int(b), float(condition[b]), singular, left(int(b)), right(int(b)))
                 if singular:

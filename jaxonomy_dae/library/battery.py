@@ -27,8 +27,9 @@ from ..modeling import (
     Value,
     der,
 )
+from .arguments import count, increasing, row
 from .electrical.two_pin import TwoPin
-from .interpolation import increasing, interpolated, known_kind
+from .interpolation import interpolated, known_kind
 from .thermal import HeatCapacitor, ThermalConductor
 
 GAS_CONSTANT = 8.31446261815324  # J/(mol·K), CODATA 2018
@@ -66,9 +67,10 @@ class _Cell(TwoPin):
     ) -> _Circuit:
         name = self.name
         points = increasing(soc, name, "soc")
+        ocv, R, C = row(ocv, name, "ocv"), row(R, name, "R"), row(C, name, "C")
         if len(ocv) != len(points):
             raise ModelError(f"'{name}': ocv has {len(ocv)} entries, soc has {len(points)}: they must agree")
-        starts = [0.0] * len(R) if initial_v is None else list(initial_v)
+        starts = [0.0] * len(R) if initial_v is None else row(initial_v, name, "initial_v")
         if not len(R) == len(C) == len(starts):
             raise ModelError(
                 f"'{name}' needs a resistance, a capacity and, if given, a voltage for each RC pair; got {len(R)} in "
@@ -224,6 +226,10 @@ _OF_CELLS: dict[str, tuple[str, Interval]] = {
 }
 
 
+def _shape(name: str, series: Any, parallel: Any) -> tuple[int, int]:
+    return count(series, name, "series"), count(parallel, name, "parallel")
+
+
 class _Pack(Component):
     """Rows of cells in parallel, one after the other in series, from `p` to `n`."""
 
@@ -254,11 +260,13 @@ class _Pack(Component):
         values: dict[str, Any],
     ) -> Any:
         """Adds the cells and connects them; returns them, an array of the given shape."""
-        if min(shape) < 1:
-            raise ModelError(
-                f"pack '{self.name}' needs at least one cell in series and in parallel; got series={shape[0]}, "
-                f"parallel={shape[1]}"
-            )
+        points = increasing(soc, self.name, "soc")
+        ocv, R, C = row(ocv, self.name, "ocv"), row(R, self.name, "R"), row(C, self.name, "C")
+        if len(ocv) != len(points):
+            raise ModelError(f"'{self.name}': ocv has {len(ocv)} entries, soc has {len(points)}: they must agree")
+        if initial_v is not None:
+            initial_v = row(initial_v, self.name, "initial_v")
+        known_kind(table, self.name)
         p, n = self.port("p", Electrical), self.port("n", Electrical)
         volts = [self.parameter(f"ocv{k}", value, unit="V") for k, value in enumerate(ocv, start=1)]
 
@@ -269,7 +277,7 @@ class _Pack(Component):
         if initial_v is not None:
             options["initial_v"] = of_pairs("initial_v", initial_v, "V", Interval())
         options |= self._values(shape, values)
-        cells = self.add_array("cell", kind, shape, np.asarray(soc).tolist(), volts, kind=table, **options)
+        cells = self.add_array("cell", kind, shape, points.tolist(), volts, kind=table, **options)
         self.connect(p, cells[0].p)
         self.connect(cells[:-1].n, cells[1:].p)
         self.connect(cells[:, :-1].n, cells[:, 1:].n)
@@ -313,7 +321,7 @@ class Pack(_Pack):
     ):
         super().__init__(ev, name)
         values = {"Q": Q, "R0": R0, "eta": eta, "initial_soc": initial_soc}
-        self._cells(Cell, (series, parallel), soc, ocv, R, C, initial_v, kind, values)
+        self._cells(Cell, _shape(name, series, parallel), soc, ocv, R, C, initial_v, kind, values)
 
 
 class HeatedPack(_Pack):
@@ -362,7 +370,7 @@ class HeatedPack(_Pack):
         initial_temperature: Any = 298.15,
     ):
         super().__init__(ev, name)
-        shape = (series, parallel)
+        shape = _shape(name, series, parallel)
         values = {"Q": Q, "R0": R0, "eta": eta, "initial_soc": initial_soc, "Ea": Ea, "dUdT": dUdT, "T_ref": T_ref}
         cells = self._cells(HeatedCell, shape, soc, ocv, R, C, initial_v, kind, values)
         thermal = {"C_heat": C_heat, "G_coolant": G_coolant, "initial_temperature": initial_temperature}

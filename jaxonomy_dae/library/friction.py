@@ -10,6 +10,7 @@ from typing import Any
 from sympy import Abs, And, Max, Ne, Piecewise, sign
 
 from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Rotational, Translational, Value, assign, der
+from .arguments import in_order
 
 STANDSTILL = 1e-6  # m/s or rad/s
 
@@ -105,6 +106,7 @@ class StickingFriction(Component):
         super().__init__(ev, name)
         coulomb = self.parameter("sliding", sliding, unit="N", bounds=POSITIVE)
         static = self.parameter("breakaway", coulomb if breakaway is None else breakaway, unit="N", bounds=POSITIVE)
+        in_order(self, "sliding", "breakaway")
         a, b = self.port("flange_a", Translational), self.port("flange_b", Translational)
         v = self.variable("v_rel", unit="m/s")
         f = self.variable("f", unit="N")

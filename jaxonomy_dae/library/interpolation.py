@@ -47,39 +47,6 @@ def _interpolated(u: Any, x: tuple[float, ...], values: tuple[Any, ...], kind: s
     return value, integral
 
 
-def finite(values: Any, name: str, what: str) -> np.ndarray:
-    """An array of the values.
-
-    **Raises:**
-
-    - `ModelError` if one of them is not finite.
-    """
-    found = np.asarray(values, float)
-    if not np.isfinite(found).all():
-        place = int(np.argmin(np.isfinite(found).ravel()))
-        raise ModelError(f"'{name}': {what} is not finite at entry {place} ({found.ravel()[place]})")
-    return found
-
-
-def increasing(values: Any, name: str, what: str) -> np.ndarray:
-    """An array of at least two increasing points.
-
-    **Raises:**
-
-    - `ModelError` if they are not.
-    """
-    found = finite(values, name, what)
-    if found.ndim != 1 or len(found) < 2:
-        raise ModelError(f"'{name}': {what} needs a row of at least 2 points; got shape {found.shape}")
-    if not (np.diff(found) > 0).all():
-        place = int(np.argmin(np.diff(found) > 0))
-        raise ModelError(
-            f"'{name}': {what} must increase, but entry {place + 1} ({found[place + 1]:g}) follows {found[place]:g}: "
-            "sort it"
-        )
-    return found
-
-
 def known_kind(kind: str, name: str) -> str:
     """The kind of interpolation.
 

@@ -7,11 +7,14 @@ Source: F. P. Incropera and D. P. DeWitt, Fundamentals of Heat and Mass Transfer
 """
 
 from collections.abc import Sequence
+from typing import Any
 
+import numpy as np
 import sympy
 
 from ..errors import ModelError
 from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Thermal, Value, der
+from .arguments import row
 
 STEFAN_BOLTZMANN = 5.670374419e-8  # W/(m²·K⁴), CODATA 2018
 
@@ -108,13 +111,15 @@ class Wall(Component):
         self,
         ev: EqnEnv,
         name: str,
-        R: Sequence[Value] = (1.0,),
-        C: Sequence[Value] = (1.0,),
-        initial_temperature: Value | Sequence[Value] | None = None,
+        R: Sequence[Value] | np.ndarray = (1.0,),
+        C: Sequence[Value] | np.ndarray = (1.0,),
+        initial_temperature: Value | Sequence[Value] | np.ndarray | None = None,
     ):
         super().__init__(ev, name)
+        R, C = row(R, name, "R"), row(C, name, "C")
         n = len(R)
-        starts = list(initial_temperature) if isinstance(initial_temperature, Sequence) else [initial_temperature] * n
+        given: Any = initial_temperature
+        starts = row(given, name, "initial_temperature") if np.ndim(given) else [given] * n
         if n == 0 or not n == len(C) == len(starts):
             raise ModelError(
                 f"wall '{name}' needs a resistance, a capacity and, if given, a temperature for each layer; got {n} in "

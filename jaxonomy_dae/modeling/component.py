@@ -105,7 +105,12 @@ class Component(EventDeclarations, metaclass=Construction):
             declared = [*self.__dict__.get("variables", ()), *self.__dict__.get("parameters", ())]
             if name in declared:
                 return self.symbol(name)
-        raise AttributeError(f"{type(self).__name__} has no attribute '{name}'")
+        tables = ("ports", "children", "variables", "parameters")
+        declared = [n for table in tables for n in self.__dict__.get(table, ()) if "." not in n]
+        raise AttributeError(
+            f"{type(self).__name__} '{self.__dict__.get('name', '')}' has no attribute '{name}'"
+            + (f": {nearest(name, declared)}" if declared and not name.startswith("_") else "")
+        )
 
     def __setattr__(self, name: str, value: Any):
         # `self.v = self.variable("v")` is allowed and stores nothing: a stored symbol would keep the inside's name.
@@ -182,6 +187,8 @@ class Component(EventDeclarations, metaclass=Construction):
         if isinstance(value, sympy.Expr) and not value.is_number:
             self._check_parameters_only(value, f"the value of {where}")
         else:
+            if kind == "parameter" and isinstance(value, bool | np.bool_):
+                raise ModelError(f"{where} must be a number; got {value}")
             value = real_number(
                 value,
                 where,

@@ -21,7 +21,7 @@ def real_number(value: Any, where: str, hint: str = "") -> float:
     given: Any = value
     text = ""
     if isinstance(value, str):
-        text = f"; got the string {value!r}: write {value} without quotes"
+        text = f"; got the string {value!r}" + (f": write {value} without quotes" if _is_numeral(value) else "")
     elif _is_complex(value):
         text = f"; got the complex number {value}: write its real and imaginary part as two parameters"
     if text:
@@ -33,6 +33,14 @@ def real_number(value: Any, where: str, hint: str = "") -> float:
     if not math.isfinite(number):
         raise ModelError(f"{where} must be finite; got {number}")
     return number
+
+
+def _is_numeral(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _is_complex(value: Any) -> bool:

@@ -154,7 +154,10 @@ class AcausalSystem(eqx.Module):
         args = read_inputs(self.plan.inputs.names, self.parameters.values.dtype, self.plan.one_by_one(args, "inputs"))
         for name, default in zip(self.plan.inputs.names, self.plan.inputs.defaults, strict=True):
             if default is None and name not in args:
-                raise ModelError(f"input '{name}' has no default: give it with inputs={{'{name}': function_of_time}}")
+                raise ModelError(
+                    f"input '{name}' has no default: connect a signal to it, or give it with "
+                    f"inputs={{'{name}': function_of_time}}"
+                )
         networks = tuple(self.neural[n] for n in self.plan.network_names)
         return SystemAt(self.plan, self.numbers, networks, t, args)
 

@@ -72,7 +72,7 @@ class _OfTime(TwoPin):
     def _pulse(self, height: Value, period: Value, width: Value, start_time: Value, offset: Value, unit: str):
         h = self.parameter("height", height, unit=unit)
         length = self.parameter("period", period, unit="s", bounds=POSITIVE)
-        part = self.parameter("width", width, unit="1")
+        part = self.parameter("width", width, unit="1", bounds=(0.0, 1.0))
         t0 = self.parameter("start_time", start_time, unit="s")
         return self.parameter("offset", offset, unit=unit) + h * pulse(self, length, part, t0)
 

@@ -3,6 +3,7 @@
 import sympy
 from sympy import And
 
+from ...errors import ModelError
 from ...modeling import NONNEGATIVE, Eq, EqnEnv, Value, assign
 from .two_pin import TwoPin
 
@@ -41,6 +42,8 @@ class TimedSwitch(TwoPin):
         instant = self.parameter("time", time, unit="s")
         on = self.parameter("Ron", Ron, unit="Ohm", bounds=NONNEGATIVE)
         off = self.parameter("Goff", Goff, unit="S", bounds=NONNEGATIVE)
+        if opens not in (True, False):
+            raise ModelError(f"'{name}': opens is True or False; got {opens!r}")
         closed = self.discrete("closed", start=int(opens), unit="1")
         v, i = self._two_pins()
         self.either(Eq(closed, 1), v - on * i, i - off * v)

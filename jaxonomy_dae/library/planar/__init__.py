@@ -8,8 +8,8 @@ metre, counted positive into the component. Angles are not wrapped: a frame that
 
 A mechanism is Newton's and Euler's equations with the joints' constraints beside them, as in Haug 1989, "Computer Aided
 Kinematics and Dynamics of Mechanical Systems", chapters 2, 3 and 6. Loops are closed by connecting frames. The forces
-in joints must be determined, so parts that are held twice in the same way (two pins between the same two bodies) are
-refused.
+in joints must be determined, so parts that are held twice in the same way (two pins between the same two bodies, a
+third bar in a parallelogram) are refused, by name: take one out, or let one yield, with a `SpringDamper`.
 
 By default all positions and speeds are states, and are projected onto the constraints. In a chain that is not closed,
 the bodies' angles are a minimal set that is good in every position, smaller and faster:

@@ -2,10 +2,12 @@
 
 from collections.abc import Sequence
 
+import numpy as np
 from sympy import Max, Min
 
 from ...errors import ModelError
 from ...modeling import NONNEGATIVE, Component, EqnEnv, Value
+from ..arguments import count, in_order, row
 
 
 class Gain(Component):
@@ -19,8 +21,9 @@ class Gain(Component):
 class Sum(Component):
     """y = k1·u1 + k2·u2 + …, as many inputs as there are `gains`: `Sum(ev, "error", (1, -1))` is a difference."""
 
-    def __init__(self, ev: EqnEnv, name: str, gains: Sequence[Value] = (1.0, 1.0)):
+    def __init__(self, ev: EqnEnv, name: str, gains: Sequence[Value] | np.ndarray = (1.0, 1.0)):
         super().__init__(ev, name)
+        gains = row(gains, name, "gains")
         if not gains:
             raise ModelError(f"'{name}': gains must name at least one input")
         terms = [self.parameter(f"k{j}", k) * self.input(f"u{j}") for j, k in enumerate(gains, 1)]
@@ -32,10 +35,8 @@ class Product(Component):
 
     def __init__(self, ev: EqnEnv, name: str, n: int = 2):
         super().__init__(ev, name)
-        if n < 1:
-            raise ModelError(f"'{name}': n must be at least 1; got {n}")
         product = self.input("u1")
-        for j in range(2, n + 1):
+        for j in range(2, count(n, name, "n") + 1):
             product = product * self.input(f"u{j}")
         self.output("y", product)
 
@@ -46,6 +47,7 @@ class Saturation(Component):
     def __init__(self, ev: EqnEnv, name: str, low: Value = -1.0, high: Value = 1.0):
         super().__init__(ev, name)
         least, most = self.parameter("low", low), self.parameter("high", high)
+        in_order(self, "low", "high")
         self.output("y", Min(Max(self.input("u"), least), most))
 
 

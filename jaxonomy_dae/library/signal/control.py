@@ -3,6 +3,7 @@
 from sympy import Expr, Max, Min, S, Symbol
 
 from ...modeling import POSITIVE, Component, Eq, EqnEnv, Value, der
+from ..arguments import in_order
 
 
 class PI(Component):
@@ -45,6 +46,8 @@ def _limited(component: Component, v: Symbol, low: Value | None, high: Value | N
         limited = Max(limited, component.parameter("low", low))
     if high is not None:
         limited = Min(limited, component.parameter("high", high))
+    if low is not None and high is not None:
+        in_order(component, "low", "high")
     return limited * S.One
 
 

@@ -2,10 +2,12 @@
 
 from collections.abc import Sequence
 
+import numpy as np
 import sympy
 
 from ...errors import ModelError
 from ...modeling import POSITIVE, Component, Eq, EqnEnv, Value, assign, pre
+from ..arguments import count, finite, in_order
 
 
 class SampleHold(Component):
@@ -42,6 +44,8 @@ class DiscretePI(Component):
         if lower is not -sympy.oo:
             low = self.parameter("lower", lower)
             bounded, free = sympy.Max(bounded, low), sympy.And(free, sympy.Or(wished >= low, u >= 0))
+        if upper is not sympy.oo and lower is not -sympy.oo:
+            in_order(self, "lower", "upper")
         self.add_equations(Eq(y, held))
         step = sympy.Piecewise((integral * T * u, free), (0, True))
         self.when(self.sampled(T), assign(held, bounded), assign(total, pre(total) + step))
@@ -60,6 +64,8 @@ class DiscreteTransferFunction(Component):
         self, ev: EqnEnv, name: str, numerator: Sequence[float], denominator: Sequence[float], period: Value = 0.1
     ):
         super().__init__(ev, name)
+        below, above = finite(denominator, name, "denominator"), finite(numerator, name, "numerator")
+        denominator, numerator = np.atleast_1d(below).tolist(), np.atleast_1d(above).tolist()
         n = len(denominator) - 1
         if n < 0 or denominator[0] == 0 or not 0 < len(numerator) <= n + 1:
             raise ModelError(
@@ -87,8 +93,7 @@ class SampledDelay(Component):
 
     def __init__(self, ev: EqnEnv, name: str, samples: int = 1, period: Value = 0.1, initial_y: Value = 0.0):
         super().__init__(ev, name)
-        if not isinstance(samples, int) or samples < 1:
-            raise ModelError(f"'{name}': samples is a positive integer; got {samples!r}")
+        samples = count(samples, name, "samples")
         T = self.parameter("period", period, unit="s", bounds=POSITIVE)
         start = self.parameter("initial_y", initial_y)
         u, y = self.input("u"), self.variable("y")
@@ -110,6 +115,7 @@ class Hysteresis(Component):
     ):  # fmt: skip
         super().__init__(ev, name)
         down, up = self.parameter("lower", lower), self.parameter("upper", upper)
+        in_order(self, "lower", "upper")
         least, most = self.parameter("low", low), self.parameter("high", high)
         u, y = self.input("u"), self.variable("y")
         on = self.discrete("on", start=int(initially_on), unit="1")

@@ -7,6 +7,7 @@ import numpy as np
 
 from ...errors import ModelError
 from ...modeling import POSITIVE, Component, Eq, EqnEnv, Value, der
+from ..arguments import count, finite, row
 
 
 class Integrator(Component):
@@ -72,13 +73,13 @@ class StateSpace(Component):
         self, ev: EqnEnv, name: str, A: Any, B: Any, C: Any, D: Any = None, initial_x: Sequence[Value] | None = None
     ):
         super().__init__(ev, name)
-        a, b, c = (np.atleast_2d(np.asarray(matrix, float)) for matrix in (A, B, C))
+        a, b, c = (np.atleast_2d(finite(m, name, what)) for what, m in (("A", A), ("B", B), ("C", C)))
         n, m, p = a.shape[0], b.shape[1], c.shape[0]
-        d = np.zeros((p, m)) if D is None else np.atleast_2d(np.asarray(D, float))
+        d = np.zeros((p, m)) if D is None else np.atleast_2d(finite(D, name, "D"))
         for what, matrix, shape in (("A", a, (n, n)), ("B", b, (n, m)), ("C", c, (p, n)), ("D", d, (p, m))):
             if matrix.shape != shape:
                 raise ModelError(f"'{name}': {what} has shape {matrix.shape}, expected {shape}")
-        starts = [0.0] * n if initial_x is None else list(initial_x)
+        starts = [0.0] * n if initial_x is None else row(initial_x, name, "initial_x")
         if len(starts) != n:
             raise ModelError(f"'{name}': initial_x has {len(starts)} entries, expected {n}")
         u = [self.input("u" if m == 1 else f"u{j}") for j in range(1, m + 1)]
@@ -98,7 +99,10 @@ class TransferFunction(Component):
 
     def __init__(self, ev: EqnEnv, name: str, numerator: Any, denominator: Any):
         super().__init__(ev, name)
-        top, bottom = np.asarray(numerator, float), np.asarray(denominator, float)
+        top = np.atleast_1d(finite(numerator, name, "numerator"))
+        bottom = np.atleast_1d(finite(denominator, name, "denominator"))
+        if not len(top):
+            raise ModelError(f"'{name}': the numerator needs at least one coefficient; got none")
         if not len(bottom) or bottom[0] == 0.0:
             raise ModelError(f"'{name}': the first coefficient of the denominator must not be zero")
         if len(top) > len(bottom):
@@ -126,8 +130,7 @@ class PadeDelay(Component):
 
     def __init__(self, ev: EqnEnv, name: str, T: Value = 1.0, n: int = 4):
         super().__init__(ev, name)
-        if n < 1:
-            raise ModelError(f"'{name}': n must be at least 1; got {n}")
+        n = count(n, name, "n")
         lag = self.parameter("T", T, unit="s", bounds=POSITIVE)
         # e^(−s) ≈ Σ cₖ·(−s)ᵏ / Σ cₖ·sᵏ; states in units of T: x[k] = Tᵏ·dᵏx/dtᵏ.
         c = [1.0]

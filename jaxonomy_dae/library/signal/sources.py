@@ -2,10 +2,11 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from sympy import Max, Min
 
 from ...errors import ModelError
-from ...modeling import POSITIVE, Component, EqnEnv, Value
+from ...modeling import NONNEGATIVE, POSITIVE, Component, EqnEnv, Value
 from ..laws import sine
 from ..steps import pulse, step
 
@@ -80,10 +81,8 @@ class Pulse(Component):
         offset: Value = 0.0,
     ):
         super().__init__(ev, name)
-        h, o, part = (
-            self.parameter(k, v, unit=unit)
-            for k, v, unit in (("height", height, ""), ("offset", offset, ""), ("width", width, "1"))
-        )
+        h, o = self.parameter("height", height), self.parameter("offset", offset)
+        part = self.parameter("width", width, unit="1", bounds=(0.0, 1.0))
         length = self.parameter("period", period, unit="s", bounds=POSITIVE)
         t0 = self.parameter("start_time", start_time, unit="s")
         self.output("y", o + h * pulse(self, length, part, t0))
@@ -96,9 +95,11 @@ class Noise(Component):
 
     def __init__(self, ev: EqnEnv, name: str, key: jax.Array, std: Value = 1.0, interval: float = 1.0):
         super().__init__(ev, name)
-        if not interval > 0:
-            raise ModelError(f"'{name}': interval must be > 0; got {interval}")
-        size = self.parameter("std", std)
+        if not isinstance(interval, float | int | np.number) or not interval > 0:
+            raise ModelError(f"'{name}': interval must be a number > 0; got {interval!r}")
+        if not isinstance(key, jax.Array):
+            raise ModelError(f"'{name}': key is a key of random numbers, such as jax.random.key(0); got {key!r}")
+        size = self.parameter("std", std, bounds=NONNEGATIVE)
 
         def value(t):
             count = jnp.floor(t / interval)

@@ -12,7 +12,8 @@ from jaxtyping import Array, Float
 
 from ...errors import ModelError
 from ...modeling import Component, EqnEnv
-from ..interpolation import finite, increasing, known_kind
+from ..arguments import finite, increasing
+from ..interpolation import known_kind
 
 
 class _Curve(eqx.Module):

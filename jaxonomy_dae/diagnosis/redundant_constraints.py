@@ -1,0 +1,326 @@
+"""Constraints that depend on each other at a point: a loop of a mechanism that is closed twice, and the like.
+
+Given a compiled model and a consistent point, returns which constraints depend on each other: where their Jacobian G
+lacks rank. For every combination u of rows with uᵀG = 0 there are two cases, told apart by the second derivative along
+the directions v that G leaves free (Gv = 0):
+
+- *redundant*: the constraint uᵀg changes only in the third order along all of them, (uᵀ·∂G[v])·v' = 0. It follows from
+  the others wherever the parts move, and the forces of these constraints are not determined;
+- *singular*: it changes in the second order. The constraints depend on each other here, as where parts are in line, and
+  not nearby.
+
+Alias elimination has removed the equations of many joints. Which of these pass u on from one constraint to the next is
+read off a graph: they are the edges of trees of equal variables, with what u demands at the nodes.
+"""
+
+import collections
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
+
+from ..model.constraint_jacobian import ConstraintEntries, constraint_entries, evaluate, independent_parts
+from ..model.evaluate_numpy import Networks
+from ..model.extended import Extended
+from ..model.linear_template import LinearTemplate
+from ..model.provenance import Provenance
+from ..model.quantities import QuantityMap
+from ..model.scaling import equilibrated
+from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, equation_offsets, provenance_of
+from .wording import listed, words
+
+LARGEST = 600  # constraints of a part that is examined
+DEPENDENT = 1e-7  # a singular value of the equilibrated Jacobian: roots of second order are found to half of the digits
+ALWAYS = 1e-12  # the same where it is constant: no point that is found decides
+STEP = 1e-4  # relative, of differences that tell the cases apart: their error is its square
+UNCHANGED = 1e-5  # relative
+MECHANICAL = ("Planar", "Translational", "Rotational")
+SHOWN = 12  # names
+YIELDS = "or replace one by a part that yields, such as a spring"
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelAt:
+    """A compiled model, and the values of all its quantities at a point."""
+
+    flat: FlatModel
+    alias: AliasTable
+    variables: QuantityMap
+    groups: tuple[EquationGroup, ...]
+    extended: Extended
+    settled: np.ndarray  # quantities that equations determine without any state
+    values: np.ndarray
+    parameters: np.ndarray
+    t: float
+    networks: Networks
+
+
+@dataclasses.dataclass(frozen=True)
+class DependentConstraints:
+    """A set of constraints that depend on each other: the components that write them, how many of them follow from the
+    others, and whether they do so everywhere, or only at this point."""
+
+    components: tuple[str, ...]
+    count: int
+    is_redundant: bool
+    forces: str  # what they leave open
+
+    def __str__(self):
+        names = listed(self.components, SHOWN)
+        if not self.is_redundant:
+            return (
+                f"at this point the constraints of {names} depend on each other, though not nearby (as where parts are "
+                "in line): it does not determine how they go on. Start elsewhere, with `initial={...}` or other "
+                "parameters."
+            )
+        follow = "one of them follows" if self.count == 1 else f"{self.count} of them follow"
+        mechanical = self.forces == "forces"
+        mend = f", {YIELDS}" if mechanical else ""
+        return (
+            f"the constraints of {names} depend on each other: {follow} from the others in every position, so nothing "
+            f"determines how they share their {self.forces}. Take one of these components out{mend}."
+        )
+
+
+def dependent_constraints(model: ModelAt) -> list[DependentConstraints]:
+    """The constraints that depend on each other at the point, redundant ones first."""
+    entries, parts = _parts(model)
+    found = []
+    for rows, members in parts:
+        if len(rows) <= LARGEST:
+            found += _of_part(model, entries.take(members), rows)
+    return sorted(found, key=lambda f: not f.is_redundant)
+
+
+def _parts(model: ModelAt) -> tuple[ConstraintEntries, list[tuple[np.ndarray, np.ndarray]]]:
+    quantities = model.extended.quantities
+    entries = constraint_entries(model.groups, model.extended)
+    entries = entries.take(~np.isin(entries.column, quantities.owner[model.settled]))
+    n_rows = equation_offsets(model.groups)[-1]
+    shape = (int(n_rows), quantities.n_unknown_columns)
+    return entries, independent_parts(entries, np.unique(entries.row), shape)
+
+
+def _of_part(model: ModelAt, entries: ConstraintEntries, rows: np.ndarray) -> list[DependentConstraints]:
+    columns = np.unique(entries.column)
+    place = (np.searchsorted(rows, entries.row), np.searchsorted(columns, entries.column))
+    quantities = model.extended.quantities
+    c = np.bincount(model.extended.base) - 1
+    if len(np.unique(c[rows])) > 1:
+        return []  # constraints of several orders: their Jacobian is no derivative by one set of quantities
+    position = quantities.first[columns] + quantities.highest[columns] - c[rows[0]]
+
+    def jacobian(values: np.ndarray) -> np.ndarray:
+        matrix = np.zeros((len(rows), len(columns)))
+        numbers = evaluate(model.groups, model.extended, entries, values, model.parameters, model.t, model.networks)
+        np.add.at(matrix, place, numbers)
+        return matrix
+
+    with np.errstate(all="ignore"):
+        at = jacobian(model.values)
+    if not np.isfinite(at).all():
+        return []
+    scaled, row_scale, column_scale = equilibrated(at)
+    u, s, vt = np.linalg.svd(scaled.toarray())
+    small = ALWAYS if entries.constant.all() else DEPENDENT
+    rank = int((s > small * max(s[0], 1e-300)).sum())
+    left, right = u[:, rank:], vt[rank:].T
+    if not left.shape[1]:
+        return []
+    changed = np.zeros((left.shape[1], right.shape[1], right.shape[1]))
+    size = np.zeros_like(changed)
+    for k in range(right.shape[1]):
+        move = column_scale * right[:, k]
+        step = STEP * (np.abs(model.values[position] / column_scale).max(initial=0.0) or 1.0)
+        ahead, behind = model.values.copy(), model.values.copy()
+        ahead[position] += step * move
+        behind[position] -= step * move
+        slope = row_scale[:, None] * (jacobian(ahead) - jacobian(behind)) / (2 * step) * column_scale
+        changed[:, k] = left.T @ slope @ right
+        size[:, k] = np.abs(left.T) @ np.abs(slope) @ np.abs(right)
+    kept, still = _unchanged(changed.reshape(len(changed), -1), float(size.max(initial=0.0)))
+    found = []
+    for basis, is_redundant in ((left @ still, True), (left @ kept, False)):
+        for support in _connected(basis, at):
+            count = int(np.linalg.matrix_rank(basis[support], tol=1e-6))
+            weight = row_scale[support, None] * basis[support]
+            names, forces = _behind(model, rows[support], weight)
+            if names:
+                found.append(DependentConstraints(names, count, is_redundant, forces))
+    return found
+
+
+def _unchanged(changed: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray]:
+    """Combinations of rows: those that are not zero, and those that are; as columns."""
+    u, s, _ = np.linalg.svd(changed)
+    s = np.append(s, np.zeros(max(0, len(u) - len(s))))[: len(u)]
+    zero = s <= UNCHANGED * size
+    return u[:, ~zero], u[:, zero]
+
+
+def _connected(basis: np.ndarray, matrix: np.ndarray) -> list[np.ndarray]:
+    """The rows of a basis that are not zero, in sets that share no column of the matrix."""
+    support = np.flatnonzero(np.abs(basis).max(axis=1, initial=0.0) > 1e-6)
+    if not len(support):
+        return []
+    row, column = np.nonzero(matrix[support])
+    n, m = len(support), matrix.shape[1]
+    graph = sp.coo_array((np.ones(len(row)), (row, n + column)), shape=(n + m, n + m))
+    _, label = connected_components(graph, directed=False)
+    return [support[label[:n] == k] for k in dict.fromkeys(label[:n].tolist())]
+
+
+# --- who wrote them ----------------------------------------------------------------------------------------------
+
+
+def _behind(model: ModelAt, equations: np.ndarray, weight: np.ndarray) -> tuple[tuple[str, ...], str]:
+    """The components that a combination of equations goes through, and what their ports call forces.
+
+    `weight` has a column for each of the combinations.
+    """
+    flat = model.flat
+    wanted: dict[tuple[str, str], list[np.ndarray]] = {}
+    names: set[str] = set()
+    for equation, w in zip(equations.tolist(), weight, strict=True):
+        source = provenance_of(model.groups, equation)
+        for one in source.sources or (source,):
+            wanted.setdefault((one.component, one.statement), []).append(w)
+            names.add(one.component)
+    demand = _demands(model, wanted)
+    names |= _ties(flat, model.alias, demand)
+    ports = np.unique(flat.variables.port[list(demand)]) if demand else np.zeros(0, np.int64)
+    domains = {flat.ports.domains[p] for p in ports.tolist() if p >= 0}
+    mechanical = not domains or domains & {*MECHANICAL}
+    forces = "forces" if mechanical else f"{words(sorted(domains)[0]).through}s"
+    return _named(flat, names), forces
+
+
+def _only_holds(flat: FlatModel, component: str) -> bool:
+    return flat.ports.count(flat.components.index(component)) == 1
+
+
+def _composites(components: list[str]) -> tuple[str, ...]:
+    """Parts of one component under its name, as long as more than one name is left."""
+    parents = collections.Counter(c.rpartition(".")[0] for c in components)
+    found = dict.fromkeys(
+        parent if parent and parents[parent] > 1 else c for c in components for parent in [c.rpartition(".")[0]]
+    )
+    return tuple(found) if len(found) > 1 else tuple(components)
+
+
+def _demands(model: ModelAt, wanted: dict[tuple[str, str], list[np.ndarray]]) -> dict[int, np.ndarray]:
+    """Σ weight·∂(equation)/∂(variable) of every variable as written, where it is not zero."""
+    quantity, factor = model.variables.quantity, model.variables.factor
+    padded = np.append(model.values, 0.0)
+    values = np.where(quantity >= ZERO, padded[np.maximum(quantity, ZERO)], np.nan) * factor
+    out: dict[int, np.ndarray] = {}
+    for group in model.flat.groups:
+        for i, source in enumerate(group.provenance):
+            for w in wanted.get((source.component, source.statement), ())[:1]:
+                one = group.take([i])
+                slots = list((one.factor * np.append(values, 0.0)[one.variable]).T)
+                arguments = list(model.parameters[one.parameter].T), list(one.coefficient.T), model.t, model.networks
+                partials = one.template.partial_values(slots, *arguments, backend="numpy")
+                for k, partial in enumerate(partials):
+                    v = int(one.variable[0, k])
+                    if v != ZERO:
+                        slope = float(np.ravel(np.asarray(partial, float))[0]) * float(one.factor[0, k])
+                        out[v] = out.get(v, 0.0) + slope * w
+    return {v: d for v, d in out.items() if np.isfinite(d).all() and np.abs(d).max() > 0}
+
+
+def _ties(flat: FlatModel, alias: AliasTable, demand: dict[int, np.ndarray]) -> set[str]:
+    """The components of equations a = ±b through which demands reach each other, or what holds."""
+    trees = {int(alias.root[v]) for v in demand}
+    edges: list[tuple[str, list[tuple[int, float]]]] = []  # the component, and the ends with their coefficients
+    at: dict[int, list[int]] = {}
+    for group in flat.groups:
+        if not isinstance(group.template, LinearTemplate) and group.variable.shape[1] != 1:
+            continue
+        for i in np.flatnonzero(np.isin(alias.root[group.variable], list(trees)).all(axis=1)).tolist():
+            variables, orders = group.variable[i].tolist(), group.order[i]
+            if len(variables) > 2 or orders.any() or len({int(alias.root[v]) for v in variables}) > 1:
+                continue
+            linear = isinstance(group.template, LinearTemplate)
+            slopes = (group.coefficient[i] if linear else np.ones(1)) * group.factor[i]
+            for v in variables:
+                at.setdefault(v, []).append(len(edges))
+            edges.append((group.provenance[i].component, list(zip(variables, slopes.tolist(), strict=True))))
+    left = {v: np.array(d) for v, d in demand.items()}
+    scale = max(float(np.abs(d).max()) for d in demand.values()) if demand else 1.0
+    open_ = {v: set(numbers) for v, numbers in at.items()}
+    queue = collections.deque(v for v, numbers in open_.items() if len(numbers) == 1)
+    names = set()
+    while queue:
+        v = queue.popleft()
+        if len(open_[v]) != 1:
+            continue
+        (number,) = open_[v]
+        component, ends = edges[number]
+        own = dict(ends)[v]
+        passed = -left.pop(v, np.zeros(1)) / own
+        if component and np.abs(passed).max() > 1e-6 * scale:
+            names.add(component)
+        open_[v].clear()
+        for other, slope in ends:
+            if other != v:
+                left[other] = left.get(other, 0.0) + passed * slope
+                open_[other].discard(number)
+                if len(open_[other]) == 1:
+                    queue.append(other)
+    return names
+
+
+def behind(flat: FlatModel, alias: AliasTable, equations: Sequence[Provenance]) -> tuple[str, ...]:
+    """The components that wrote these equations, and those through which they reach each other; what only holds is
+    left out."""
+    wanted = {(e.component, e.statement) for one in equations for e in one.sources or (one,)}
+    random = np.random.default_rng(0)
+    demand: dict[int, np.ndarray] = {}
+    for group in flat.groups:
+        for source, variables in zip(group.provenance, group.variable.tolist(), strict=True):
+            if (source.component, source.statement) in wanted:
+                demand.update((v, random.uniform(0.5, 1.5, 1)) for v in variables if v != ZERO and v not in demand)
+    names = {component for component, _ in wanted} | _ties(flat, alias, demand)
+    return _named(flat, names)
+
+
+def _named(flat: FlatModel, names: set[str]) -> tuple[str, ...]:
+    """In the order of the model, without what only holds, and parts of one component under its name."""
+    components = [c for c in flat.components if c in names]
+    return _composites([c for c in components if not _only_holds(flat, c)] or components)
+
+
+def no_freedom(model: ModelAt) -> list[tuple[str, ...]]:
+    """Components of parts in which there are as many constraints as variables they restrict."""
+    entries, parts = _parts(model)
+    found = []
+    for rows, members in parts:
+        inside = entries.take(members)
+        if len(rows) == len(np.unique(inside.column)) and not inside.constant.all():
+            equations = [provenance_of(model.groups, r) for r in rows.tolist()]
+            found.append(behind(model.flat, model.alias, equations))
+    return found
+
+
+def too_many(flat: FlatModel, alias: AliasTable, equations: Sequence[Provenance], variables: np.ndarray) -> str:
+    """What to say of mechanical constraints that are more than the positions they determine; empty if they are
+    something else.
+
+    `variables` are those that the equations determine, and their aliases.
+    """
+    port = flat.variables.port[variables]
+    at_ports = variables[port >= 0]
+    domains = {flat.ports.domains[p] for p in port[port >= 0].tolist()}
+    names = behind(flat, alias, equations)
+    if not len(at_ports) or not flat.variables.is_across[at_ports].all() or not domains <= {*MECHANICAL}:
+        return ""
+    if len(names) < 2:
+        return ""
+    return (
+        f"the constraints of {listed(names, SHOWN)} determine the same positions more than once: they repeat each "
+        "other, so that nothing determines how they share their forces, or contradict each other. Take one of these "
+        f"components out, {YIELDS}."
+    )

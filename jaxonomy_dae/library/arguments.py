@@ -1,0 +1,86 @@
+"""Checks of arguments that are no parameters: rows of numbers, counts, values in order.
+
+Each raises a `ModelError` that names the component and the argument.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from ..errors import ModelError
+from ..modeling import Component
+
+
+def finite(values: Any, name: str, what: str) -> np.ndarray:
+    """An array of the values.
+
+    **Raises:**
+
+    - `ModelError` if they are no array of numbers, or if one of them is not finite.
+    """
+    try:
+        found = np.asarray(values, float)
+    except (TypeError, ValueError):
+        raise ModelError(f"'{name}': {what} must be numbers, in rows of one length; got {values!r}") from None
+    if not np.isfinite(found).all():
+        place = int(np.argmin(np.isfinite(found).ravel()))
+        raise ModelError(f"'{name}': {what} is not finite at entry {place} ({found.ravel()[place]})")
+    return found
+
+
+def increasing(values: Any, name: str, what: str) -> np.ndarray:
+    """An array of at least two increasing points.
+
+    **Raises:**
+
+    - `ModelError` if they are not.
+    """
+    found = finite(values, name, what)
+    if found.ndim != 1 or len(found) < 2:
+        raise ModelError(f"'{name}': {what} needs a row of at least 2 points; got shape {found.shape}")
+    if not (np.diff(found) > 0).all():
+        place = int(np.argmin(np.diff(found) > 0))
+        raise ModelError(
+            f"'{name}': {what} must increase, but entry {place + 1} ({found[place + 1]:g}) follows {found[place]:g}: "
+            "sort it"
+        )
+    return found
+
+
+def row(values: Any, name: str, what: str) -> list[Any]:
+    """A list of the values, which may be expressions.
+
+    **Raises:**
+
+    - `ModelError` if it is one value, or a text.
+    """
+    if isinstance(values, str) or not hasattr(values, "__len__") or getattr(values, "ndim", 1) == 0:
+        raise ModelError(f"'{name}': {what} is a row of values, such as [1.0, 2.0]; got {values!r}")
+    return list(values)
+
+
+def count(value: Any, name: str, what: str) -> int:
+    """A positive integer.
+
+    **Raises:**
+
+    - `ModelError` if it is not.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+        raise ModelError(f"'{name}': {what} must be at least 1, an integer; got {value!r}")
+    return int(value)
+
+
+def in_order(component: Component, low: str, high: str) -> None:
+    """Checks that a parameter is not above another, where both are numbers.
+
+    **Raises:**
+
+    - `ModelError` if it is.
+    """
+    least, most = (component.parameters[name].value for name in (low, high))
+    if isinstance(least, float) and isinstance(most, float) and least > most:
+        raise ModelError(
+            f"'{component.name}': {low} must not be above {high}; got {low}={least:g} and {high}={most:g}: exchange "
+            "them"
+        )
