@@ -9,6 +9,7 @@ import numpy as np
 import optax
 import pytest
 from problems import compiled, pendulum, rc_circuit
+from sympy import Piecewise
 
 from jaxonomy_dae import (
     AcausalCompiler,
@@ -126,10 +127,11 @@ class Everything(Component):
         super().__init__(ev, name)
         T, first = self.parameter("T", 0.1), self.parameter("first", 2.0)
         x = self.variable("x", start=1.0, fixed=True)
-        i = self.variable("i")
+        i, y = self.variable("i"), self.variable("y")
         n, mode = self.discrete("n", start=first / 4), self.discrete("mode", start=1)
         self.add_equations(Eq(der(x), -i))
         self.either(Eq(mode, 1), i - x, i)
+        self.add_equations(Piecewise((y - n, x > n), (y, True)))  # a relation in a variable is not a mode
         self.when(x < 0.5, reinit(x, 2 * x), assign(mode, 0))
         self.when(x > 9, terminate("too large"))
         self.when(self.sampled(T, 0.05), assign(n, pre(n) + x))
