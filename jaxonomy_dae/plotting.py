@@ -13,19 +13,25 @@ if TYPE_CHECKING:
 
 SEPARATE = 12  # entries of an array that get a colour each
 NAMED = 40  # up to this many unknowns, rows and columns are labelled
+LINES = 40  # up to this many events are marked by lines as high as the axes, more by ticks at the bottom
+DASHES = [(0, (5, 3)), (0, (1, 2)), (0, (5, 2, 1, 2)), (0, (9, 3))]  # of events with different names, if few
+TICK = 0.04  # of the height of the axes
+ROUNDING = 1e-6  # of the time that is drawn
 
 
 def _pyplot() -> Any:
     return optional_module("matplotlib.pyplot", "plot", "plotting needs Matplotlib")
 
 
-def plot_solution(solution: "Solution", *names: str, ax: Any = None) -> Any:
-    """Draws variables over time, and returns the axes.
+def plot_solution(solution: "Solution", *names: str, ax: Any = None, events: bool = True) -> Any:
+    """Draws variables over time, discrete ones as steps, and returns the axes.
 
     **Arguments:**
 
     - `names`: of variables; default: the differential states. An array of more than 12 is drawn in one colour.
     - `ax`: Matplotlib axes to draw into; new ones by default.
+    - `events`: whether the events in `solution.events` are marked by thin vertical lines, more than 40 by ticks. The
+        legend names them, if there are few.
     """
     plt = _pyplot()
     names = names or tuple(n for n in solution.system.states if n in solution)
@@ -33,36 +39,96 @@ def plot_solution(solution: "Solution", *names: str, ax: Any = None) -> Any:
         raise ModelError("nothing to plot: the system has no states; name some variables")
     if ax is None:
         _, ax = plt.subplots(figsize=(7.0, 3.5), layout="constrained")
-    units = dict(zip(solution.system.plan.flat.variables.names, solution.system.plan.flat.variables.unit, strict=True))
+    flat = solution.system.plan.flat
+    units = dict(zip(flat.variables.names, flat.variables.unit, strict=True))
+    units |= dict(zip(flat.parameters.names, flat.parameters.units, strict=True))
     time = np.asarray(solution.ts)
     names = tuple(one for name in names for one in _lines(solution, name))
-    first = {name: (solution.system.plan.entries(name) or ([name],))[0][0] for name in names}
+    first = {name: _entries(solution, name)[0] for name in names}
     shown = [units.get(first[n], "") for n in names]
     shown = ["" if unit == "1" else unit for unit in shown]
     common = shown[0] if len(set(shown)) == 1 else None
     for name, unit in zip(names, shown, strict=True):
         label = name if common is not None or not unit else f"{name} [{unit}]"
         values = np.asarray(solution[name])
+        style = "steps-post" if first[name] in solution.system.discretes else "default"
         if values.ndim == 1:
-            ax.plot(time, values, label=label, linewidth=1.6)
+            points = (time, values) if style == "default" else _steps(solution, name)
+            ax.plot(*points, label=label, linewidth=1.6, drawstyle=style)
             continue
-        colour = ax.plot(time, values.reshape(len(time), -1)[:, 0], label=label, linewidth=0.8)[0].get_color()
-        ax.plot(time, values.reshape(len(time), -1)[:, 1:], color=colour, linewidth=0.8, alpha=0.5)
+        rest = values.reshape(len(time), -1)
+        line = ax.plot(time, rest[:, 0], label=label, linewidth=0.8, drawstyle=style)[0]
+        ax.plot(time, rest[:, 1:], color=line.get_color(), linewidth=0.8, alpha=0.5, drawstyle=style)
+    marked = _mark_events(solution, ax) if events else False
     ax.set_xlabel("time [s]")
     if common:
         ax.set_ylabel(f"{names[0]} [{common}]" if len(names) == 1 else f"[{common}]")
     elif len(names) == 1:
         ax.set_ylabel(names[0])
     ax.grid(True, alpha=0.3)
-    if len(names) > 1:
+    if len(names) > 1 or marked:
         ax.legend()
     return ax
 
 
+def _entries(solution: "Solution", name: str) -> list[str]:
+    """The names of the entries of an array, or the one name of a variable."""
+    entries = solution._entries(name)
+    return [name] if entries is None else entries[0]
+
+
 def _lines(solution: "Solution", name: str) -> list[str]:
     """The names under which a variable, or an array of variables, is drawn."""
-    entries = solution.system.plan.entries(name)
-    return [name] if entries is None or len(entries[0]) > SEPARATE else entries[0]
+    entries = _entries(solution, name)
+    return [name] if len(entries) > SEPARATE else entries
+
+
+def _steps(solution: "Solution", name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Times and values of a discrete variable: the saved ones, and what it was given by events between them, as far as
+    that was kept."""
+    time, values = np.asarray(solution.ts), np.asarray(solution[name])
+    log = solution.event_log
+    if log is None or not log.after.shape[-2]:
+        return time, values
+    happened, chosen = np.asarray(log.ts), _seen(solution)
+    written = np.asarray(solution.events.after[name])[chosen]
+    every = np.concatenate([happened[chosen], time])  # what was saved at an event is what comes after it
+    order = np.argsort(every, kind="stable")
+    return every[order], np.concatenate([written, values])[order]
+
+
+def _seen(solution: "Solution") -> np.ndarray:
+    """Which of the noted events lie within the saved times."""
+    ts, time = np.asarray(solution.events.ts), np.asarray(solution.ts)
+    time = time[np.isfinite(time)]
+    if not time.size:
+        return np.zeros(len(ts), bool)
+    slack = ROUNDING * (time.max() - time.min())  # a run that ends with an event is saved there
+    return (ts >= time.min() - slack) & (ts <= time.max() + slack)
+
+
+def _mark_events(solution: "Solution", ax: Any) -> bool:
+    """Marks the events within the saved times; whether there are any."""
+    log = solution.event_log
+    if log is None or solution.ts.ndim > 1:  # of a batch, each member has events of its own
+        return False
+    chosen = _seen(solution)
+    ts = np.asarray(log.ts)[chosen]
+    names = [solution.events.all_names[int(k)] for k in np.asarray(log.which)[chosen]]
+    groups = {name: ts[[one == name for one in names]] for name in dict.fromkeys(names)}
+    if len(groups) > 1 and (len(ts) > LINES or len(groups) > len(DASHES)):
+        groups = {"events": ts}
+    collections = optional_module("matplotlib.collections", "plot", "plotting needs Matplotlib")
+    labelled = ax.get_legend_handles_labels()[1]
+    height = 1.0 if len(ts) <= LINES else TICK
+    for (name, at), dash in zip(groups.items(), DASHES, strict=False):
+        marks = collections.LineCollection(
+            [[(t, 0.0), (t, height)] for t in at], transform=ax.get_xaxis_transform(), zorder=1, colors="0.45",
+            linewidths=0.8, linestyles=[dash if height == 1.0 else "solid"],
+            label="_" * (name in labelled) + name,  # a legend leaves out what begins with "_"
+        )  # fmt: skip
+        ax.add_collection(marks, autolim=False)
+    return bool(groups)
 
 
 def structure(system: "AcausalSystem", ax: Any = None) -> Any:

@@ -9,9 +9,23 @@ import numpy as np
 import optax
 import pytest
 from problems import compiled, pendulum, rc_circuit
+from sympy import Piecewise
 
-from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, ModelError, der
+from jaxonomy_dae import (
+    AcausalCompiler,
+    AcausalDiagram,
+    Component,
+    EqnEnv,
+    ModelError,
+    assign,
+    der,
+    pre,
+    reinit,
+    terminate,
+)
 from jaxonomy_dae.learning import fit
+from jaxonomy_dae.library import signal
+from jaxonomy_dae.modeling import Eq
 
 
 @pytest.fixture(scope="module")
@@ -101,6 +115,85 @@ def test_a_fit_in_one_line(rc):
     result = fit(rc, lambda s: s.parameters["r.R"] ** 2, optax.sgd(0.25), 2, train="r.R", progress=False)
     assert repr(result) == "Fit(loss 4 → 0.25, best after 2 steps: all 2 steps were taken)"
     assert "0.25" in result._repr_html_()
+
+
+# --- events in reports -------------------------------------------------------------------------------------------
+
+
+class Everything(Component):
+    """An event of each kind, and an equation with two branches."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        T, first = self.parameter("T", 0.1), self.parameter("first", 2.0)
+        x = self.variable("x", start=1.0, fixed=True)
+        i, y = self.variable("i"), self.variable("y")
+        n, mode = self.discrete("n", start=first / 4), self.discrete("mode", start=1)
+        self.add_equations(Eq(der(x), -i))
+        self.either(Eq(mode, 1), i - x, i)
+        self.add_equations(Piecewise((y - n, x > n), (y, True)))  # a relation in a variable is not a mode
+        self.when(x < 0.5, reinit(x, 2 * x), assign(mode, 0))
+        self.when(x > 9, terminate("too large"))
+        self.when(self.sampled(T, 0.05), assign(n, pre(n) + x))
+
+
+def section(report, title):
+    lines = str(report).splitlines()
+    start = lines.index(f"{title}:") + 1
+    end = next((k for k in range(start, len(lines)) if not lines[k].startswith("    ")), len(lines))
+    return [line.strip() for line in lines[start:end]]
+
+
+def test_a_report_lists_events():
+    system = compiled(Everything(EqnEnv(), "c"))
+    report = system.report
+    assert section(report, "2 discrete variables") == ["c.n = 0.5, c.mode = 1"]
+    assert section(report, "2 events") == [
+        "c: when(x < 0.5): reinit(c.x, …), assign(c.mode, 0)",
+        "c: when(x > 9): terminate('too large')",
+    ]
+    assert section(report, "1 clock") == ["c: when(sampled(T)), every 0.1 s from 0.05 s: assign(c.n, …)"]
+    (mode,) = section(report, "equations that change with a mode")
+    assert mode.startswith("c: 0 = Piecewise(") and "Eq(mode, 1)" in mode
+    assert "too large" in report._repr_html_() and "<summary>1 clock</summary>" in report._repr_html_()
+
+    # Starts and periods are those of the system at hand; of a batch, those that were declared.
+    changed = system.with_parameters({"c.T": 0.25, "c.first": 6.0, "c.mode": 0.0})
+    assert section(changed.report, "2 discrete variables") == ["c.n = 1.5, c.mode = 0"]
+    assert "every 0.25 s" in str(changed.report)
+    trainable, frozen = changed.partition("c.T")
+    assert "every 0.25 s" in str(eqx.combine(trainable, frozen).report)
+    batch = eqx.filter_vmap(lambda T: system.with_parameters({"c.T": T}))(jnp.array([0.2, 0.3]))
+    for part in (batch, trainable, frozen, jax.tree.map(lambda _: False, system)):
+        assert "every 0.1 s" in str(part.report)
+    printed = []
+    jax.jit(lambda s: printed.append((str(changed.report), str(s.report))))(changed)
+    assert "every 0.25 s" in printed[0][0] and "every 0.1 s" in printed[0][1]
+
+
+def test_jumps_of_sources_are_not_events_of_a_report():
+    report = str(compiled(signal.Pulse(EqnEnv(), "pulse")).report)
+    assert not any(word in report for word in ("event", "clock", "discrete", "mode", "relation"))
+
+
+def test_a_report_without_events(rc):
+    report = str(rc.report)
+    assert not any(word in report for word in ("event", "clock", "discrete", "mode"))
+
+
+def test_one_of_each_in_a_report():
+    class Decay(Component):
+        def __init__(self, ev, name):
+            super().__init__(ev, name)
+            x, u, k = self.variable("x", start=1.0, fixed=True), self.input("u", default=0.0), self.parameter("k", 2.0)
+            self.add_equations(der(x) + k * x - u)
+
+    lines = str(compiled(Decay(EqnEnv(), "c")).report).splitlines()
+    assert lines[0] == "1 equation, 1 unknown, 1 parameter, 1 input"
+    assert lines[1] == "0 aliases eliminated, 1 equation of 1 shape remains"
+    assert lines[2].endswith(", 1 degree of freedom") and lines[5] == "1 state:"
+    several = str(pendulum().report)
+    assert "2 degrees of freedom" in several and "4 states:" in several
 
 
 # --- vectors of variables ----------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 import diffrax
 import equinox as eqx
+import hybrid_models
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -259,6 +260,61 @@ def test_plot(solution):
     _, given = plt.subplots()
     assert solution.plot("spring.f", ax=given) is given
     assert given.get_ylabel() == "spring.f [N]"
+    plt.close("all")
+
+
+def marks(axes):
+    """The labels of the events that are marked, and the times and heights of their lines."""
+    return {
+        c.get_label(): ([float(at[0, 0]) for at in c.get_segments()], float(c.get_segments()[0][1, 1]))
+        for c in axes.collections
+    }
+
+
+def test_events_in_figures():
+    plt = pytest.importorskip("matplotlib.pyplot")
+    room = hybrid_models.compiled(hybrid_models.Thermostat, "room")
+    coarse = simulate(room, 5.0, ts=jnp.linspace(0.0, 5.0, 6))
+    off, on, again = np.asarray(coarse.events.ts[:3])
+    axes = coarse.plot("room.T")
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == [
+        "room.T", "room: when(T > 51)", "room: when(T < 49)"
+    ]  # fmt: skip
+    assert marks(axes) == {"room: when(T > 51)": ([off, again], 1.0), "room: when(T < 49)": ([on], 1.0)}
+    assert axes.get_ylim()[0] > 15.0  # the lines do not widen the axes
+    coarse.plot("room.q", ax=axes)
+    assert [text.get_text() for text in axes.get_legend().get_texts()].count("room: when(T < 49)") == 1
+    bare = coarse.plot("room.T", events=False)
+    assert not bare.collections and bare.get_legend() is None
+    # Steps are where the events were, between saved times too.
+    line = coarse.plot("room.on", events=False).lines[0]
+    assert line.get_drawstyle() == "steps-post"
+    np.testing.assert_array_equal(line.get_xdata(), [0, 1, 2, 3, off, 4, on, again, 5])
+    np.testing.assert_array_equal(line.get_ydata(), [1, 1, 1, 1, 0, 0, 1, 0, 0])
+    # Those outside of the saved times are not shown; many are ticks.
+    late = simulate(room, 5.0, ts=jnp.array([4.5, 5.0]))
+    assert marks(late.plot("room.T")) == {"room: when(T > 51)": ([float(late.events.ts[2])], 1.0)}
+    many = simulate(room, 30.0, ts=jnp.linspace(0.0, 30.0, 61))
+    (name, (times, height)), *others = marks(many.plot("room.T")).items()
+    assert name == "events" and len(times) == len(many.events) > 40 and height < 0.1 and not others
+    plt.close("all")
+
+
+def test_the_event_that_ends_a_run_is_marked():
+    plt = pytest.importorskip("matplotlib.pyplot")
+    solution = simulate(hybrid_models.compiled(hybrid_models.Ball, "ball", stop=3), 3.0)
+    axes = solution.plot("ball.h", "ball.n")
+    assert [len(times) for times, _ in marks(axes).values()] == [3, 1]
+    assert axes.lines[0].get_drawstyle() == "default" and axes.lines[1].get_ydata()[-1] == 3
+    plt.close("all")
+
+
+def test_a_sampled_controller_is_drawn_in_steps():
+    plt = pytest.importorskip("matplotlib.pyplot")
+    solution = simulate(hybrid_models.compiled(hybrid_models.SampledPI, "loop"), 0.4, ts=jnp.linspace(0.0, 0.4, 9))
+    axes = solution.plot("loop.x", "loop.u")
+    assert [line.get_drawstyle() for line in axes.lines] == ["default", "steps-post"] and not axes.collections
+    np.testing.assert_array_equal(axes.lines[1].get_ydata(), solution["loop.u"])
     plt.close("all")
 
 

@@ -214,11 +214,12 @@ class Solution(eqx.Module):
         the dimensions `batch_0`, `batch_1`, …"""
         return data_set(self, names)
 
-    def plot(self, *names: str, ax: Any = None) -> Any:
-        """Draws variables over time with Matplotlib (extra `plot`); returns the axes."""
+    def plot(self, *names: str, ax: Any = None, events: bool = True) -> Any:
+        """Draws variables over time with Matplotlib (extra `plot`), discrete ones as steps, and marks events unless
+        `events=False`; returns the axes."""
         from ..plotting import plot_solution
 
-        return plot_solution(self, *names, ax=ax)
+        return plot_solution(self, *names, ax=ax, events=events)
 
     def __repr__(self):
         return f"Solution({self.ts.shape[-1]} times, {len(self.system.variables)} variables)"

@@ -118,6 +118,17 @@ class Parameters(eqx.Module):
         return self.table.complete(values.at[..., np.array(self.free_index)].set(self.free))
 
     @property
+    def known(self) -> Float[np.ndarray, " n"] | None:
+        """All values of one system, outside jit; None of a batch, and of what holds only some of them."""
+        parts = [self.values, self.free] if self.free_index else [self.values]
+        if self.batch or not all(_is_array(part) and not isinstance(part, Tracer) for part in parts):
+            return None
+        values = np.array(self.values)
+        if self.free_index:
+            values[list(self.free_index)] = self.free
+        return self.table.complete(values)
+
+    @property
     def names(self) -> list[str]:
         """The parameters' names."""
         return list(self.table.names)

@@ -4,11 +4,13 @@ import functools
 
 import numpy as np
 
+from ..diagnosis.wording import counted
 from ..lowering.plan import SystemPlan
 from ..lowering.schedule import SparseStep
 from ..model.incidence import incidence
 from ..model.tables import provenance_of
 from ..structure.pantelides import Offsets, reduce_index
+from .event_report import clock_events, condition_events, discrete_starts, mode_equations
 from .sections import Sections, some
 from .solver_choice import solver_choice
 
@@ -18,12 +20,16 @@ class SystemReport(Sections):
 
     Attributes count and name: `n_equations`, `n_unknowns`, `n_aliases`, `index` (structural, of the model as written),
     `differentiated` (pairs of an equation's text and how often), `states`, `algebraics`, `carried`, `constraints`,
-    `blocks` (of more than one equation, or nonlinear), `notes`.
+    `blocks` (of more than one equation, or nonlinear), `notes`. Of a model with events also `discretes` (with their
+    starts), `events` of conditions, `clocks`, and `modes` (equations that change with discrete variables).
+
+    `values` are those of all parameters, as they were declared if not given: starts and periods depend on them.
     """
 
-    def __init__(self, plan: SystemPlan):
+    def __init__(self, plan: SystemPlan, values: np.ndarray | None = None):
         self._plan = plan
         flat = plan.flat
+        self._values = flat.parameters.values if values is None else values
         self.n_equations = flat.n_equations
         self.n_unknowns = len(flat.variables) - int(flat.variables.is_input.sum())
         self.n_aliases = len(plan.alias.eliminated)
@@ -109,23 +115,55 @@ class SystemReport(Sections):
             out.append(f"{times}{kind} block of {len(names)}: {some(names)}; torn at {some(torn)}")
         return out
 
+    @property
+    def discretes(self) -> list[str]:
+        """The discrete variables and their starts."""
+        return discrete_starts(self._plan.flat, self._values)
+
+    @property
+    def events(self) -> list[str]:
+        """The events of conditions, and what they do. What only marks the jump of a source is left out."""
+        return condition_events(self._plan.flat)
+
+    @property
+    def clocks(self) -> list[str]:
+        """The sampled events, their periods and offsets, and what they do."""
+        return clock_events(self._plan.flat, self._values)
+
+    @property
+    def modes(self) -> list[str]:
+        """The equations with two branches, of which a discrete variable chooses one."""
+        return mode_equations(self._plan.flat)
+
     def _contents(self) -> tuple[list[str], list[tuple[str, list[str]]]]:
         plan = self._plan
+        flat, n_remaining = plan.flat, sum(len(g) for g in plan.groups)
+        counts = [
+            counted(self.n_equations, "equation"),
+            counted(self.n_unknowns, "unknown"),
+            counted(flat.parameters.n_declared, "parameter"),
+            *([counted(len(plan.inputs.names), "input")] if plan.inputs.names else []),
+            *([counted(len(plan.network_names), "network")] if plan.network_names else []),
+        ]
         head = [
-            f"{self.n_equations} equations, {self.n_unknowns} unknowns, {len(plan.flat.parameters)} parameters"
-            + (f", {len(plan.inputs.names)} inputs" if plan.inputs.names else "")
-            + (f", {len(plan.network_names)} networks" if plan.network_names else ""),
-            f"{self.n_aliases} aliases eliminated, {sum(len(g) for g in plan.groups)} equations of "
-            f"{len({g.template.key for g in plan.groups})} shapes remain",
-            f"structural index {self.index}, {self.degrees_of_freedom} degrees of freedom",
+            ", ".join(counts),
+            f"{self.n_aliases} alias{'' if self.n_aliases == 1 else 'es'} eliminated, "
+            f"{counted(n_remaining, 'equation')} of {counted(len({g.template.key for g in plan.groups}), 'shape')} "
+            f"remain{'s' if n_remaining == 1 else ''}",
+            f"structural index {self.index}, {counted(self.degrees_of_freedom, 'degree')} of freedom",
         ]
         head.append(f"state selection {self.state_selection}")
         head.append("simulate(solver=None) takes {}: {}".format(*solver_choice(plan)[:2]))
+        discretes, events, clocks = self.discretes, self.events, self.clocks
         sections = [
             ("differentiated", [f"{n}× {text}" for text, n in self.differentiated]),
-            (f"{len(self.states)} states", [some(self.states)]),
+            (counted(len(self.states), "state"), [some(self.states)]),
             ("algebraic unknowns in the state array", [some(self.carried)]),
-            (f"{len(self.algebraics)} algebraic variables", [some(self.algebraics)]),
+            (counted(len(self.algebraics), "algebraic variable"), [some(self.algebraics)]),
+            (counted(len(discretes), "discrete variable"), [some(discretes)]),
+            (counted(len(events), "event"), events),
+            (counted(len(clocks), "clock"), clocks),
+            ("equations that change with a mode", self.modes),
             ("hidden constraints, projected onto", self.constraints),
             ("simultaneous blocks", self.blocks),
             ("notes", self.notes),

@@ -72,7 +72,7 @@ class AcausalSystem(eqx.Module):
         """What the compiler did, to be printed."""
         from .report import SystemReport
 
-        return SystemReport(self.plan)
+        return SystemReport(self.plan, self.parameters.known)
 
     def __reduce__(self):
         return _unpickled, (self.parameters, functions_by_name(self.neural), self.plan)
