@@ -53,6 +53,7 @@ def model(write):
 # --- right, by independent computations ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_discrete_variable_whose_start_is_an_expression():
     """It begins at 2·a, is doubled at t = 1 and t = 2, and y is its integral: 2·a·(1 + 2 + 4/2) at t = 2.5. The start
     must not be computed again after events."""
@@ -95,6 +96,7 @@ def falling_balls(T, e):
             h[1], v = h[0], np.array([total - LIGHT * apart, total + HEAVY * apart]) / (HEAVY + LIGHT)
 
 
+@pytest.mark.slow
 def test_balls_on_balls():
     def write(self, ev):
         e = self.parameter("e", 0.9)

@@ -20,6 +20,10 @@ RESOLVED = 2e-6
 OMEGA = 20.0
 
 
+def slow(*values):
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
 class Oscillator(Component):
     """x'' = −ω²·(x − offset) − d·x' + θ + u."""
 
@@ -44,7 +48,7 @@ def end(value, name="m.x0", t1=1.0, others=(), **options):
     return simulate(changed, t1=t1, ts=jnp.array([t1]), rtol=1e-9, atol=1e-11, **options)["m.x"][0]
 
 
-@pytest.mark.parametrize("solver", [None, diffrax.Tsit5(), diffrax.Dopri5()], ids=["ours", "Tsit5", "Dopri5"])
+@pytest.mark.parametrize("solver", [None, diffrax.Tsit5(), slow(diffrax.Dopri5())], ids=["ours", "Tsit5", "Dopri5"])
 def test_by_the_start(solver):
     assert abs(float(jax.grad(end)(0.0, solver=solver)) - np.cos(OMEGA)) < RESOLVED
 
@@ -55,7 +59,7 @@ def test_by_a_force_that_is_zero():
     assert abs(float(jax.grad(end)(0.0, "m.theta")) - expected) < RESOLVED / OMEGA**2
 
 
-@pytest.mark.parametrize("offset", [0.3, -7e4])
+@pytest.mark.parametrize("offset", [slow(0.3), -7e4])
 def test_at_an_equilibrium_that_is_not_zero(offset):
     """There, rounding moves the state a little all the time."""
     found = jax.grad(end)(0.0, others={"m.offset": offset}.items())
@@ -85,7 +89,7 @@ def test_by_the_time_too():
 
 
 @pytest.mark.parametrize(
-    "adjoint", [diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint()], ids=["forward", "checkpoints"]
+    "adjoint", [diffrax.ForwardMode(), slow(diffrax.RecursiveCheckpointAdjoint())], ids=["forward", "checkpoints"]
 )
 def test_by_other_adjoints(adjoint):
     by = jax.jacfwd if isinstance(adjoint, diffrax.ForwardMode) else jax.grad
@@ -97,6 +101,7 @@ def test_without_differentiation_steps_grow():
     assert simulate(system(), t1=1.0, ts=jnp.array([1.0])).stats["num_steps"] < 20
 
 
+@pytest.mark.slow
 def test_damped_motion():
     """The derivative by the damping of a motion from afar, against differences of the closed form."""
 
@@ -126,7 +131,7 @@ def counted():
     return AcausalCompiler(ev, diagram)()
 
 
-@pytest.mark.parametrize("adjoint", [None, diffrax.ForwardMode()], ids=["stored", "forward"])
+@pytest.mark.parametrize("adjoint", [None, slow(diffrax.ForwardMode())], ids=["stored", "forward"])
 def test_between_events(adjoint):
     """The start counts twice: once at 0, and once more at 0.31."""
 
@@ -185,10 +190,10 @@ def last_implicit(x0, **options):
     return simulate(changed, t1=1.0, ts=jnp.array([1.0]), rtol=1e-9, atol=1e-11, **options)["m.x"][0]
 
 
-@pytest.mark.parametrize("x0", [0.0, 1e-13, 1e-10])
+@pytest.mark.parametrize("x0", [0.0, slow(1e-13), slow(1e-10)])
 @pytest.mark.parametrize(
     "solver",
-    [None, BDF(), diffrax.Tsit5(), pytest.param(diffrax.Kvaerno5(), marks=pytest.mark.slow)],
+    [None, BDF(), slow(diffrax.Tsit5()), slow(diffrax.Kvaerno5())],
     ids=["default", "BDF", "Tsit5", "Kvaerno5"],
 )
 def test_other_methods_and_motion_that_tolerances_do_not_see(solver, x0):
@@ -202,7 +207,7 @@ def test_implicit_methods_by_forward_mode():
     assert abs(float(found) - np.cos(OMEGA)) < RESOLVED
 
 
-@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize("count", [slow(1), 3])
 def test_stiff_motion_that_has_died_away_costs_few_steps(count):
     """At rest, with rates of 1e5 and 1e3 beside 1: the push dies away, and steps may grow again."""
 

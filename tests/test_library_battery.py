@@ -280,6 +280,7 @@ def small():
 ROWS = "SciPy's DOP853 of all cells, with the currents of a row in closed form"
 
 
+@pytest.mark.slow
 @checks(
     {HeatedPack: (ROWS, "pack.cell.soc", "pack.body.T", "pack.p.v")},
     origin="rtol 1e-9 for each of fewer than 200 steps",

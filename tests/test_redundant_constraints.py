@@ -120,6 +120,7 @@ def test_a_parallelogram_with_a_third_bar(mode):
     assert b.refusal(mode).splitlines()[-1] == REDUNDANT.format(LOOP, "one of them follows")
 
 
+@pytest.mark.slow
 def test_what_the_message_says_mends_it():
     """With a spring in place of the bar, the same parallelogram starts."""
     b = Linkage()
@@ -145,6 +146,7 @@ def test_two_pins_between_two_bodies(mode):
     assert b.refusal(mode).splitlines()[-1] == expected
 
 
+@pytest.mark.slow
 def test_redundancy_is_found_in_other_units():
     """A point that fulfils the constraints to fewer digits leaves the Jacobian that much short of singular: this model,
     in units of 1e-12 to 1e9 of its own, was started."""

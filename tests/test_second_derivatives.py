@@ -49,6 +49,7 @@ def test_hessian_of_the_logistic_equation(solver):
     np.testing.assert_allclose(hessian, hessian.T, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_same_as_forward_mode_twice():
     """Both differentiate the same formulas, so they agree to rounding (t0 shifts the steps: left out)."""
 

@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import numpy as np
+import pytest
 from problems import environment
 
 PROGRAM = """
@@ -47,6 +48,7 @@ print(json.dumps(out))
 """
 
 
+@pytest.mark.slow
 def test_gradients_on_two_devices():
     """exp(−k) and its derivative, for k on two devices."""
     env = environment() | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
