@@ -631,6 +631,11 @@ def test_a_relief_valve_opens_and_shuts():
     measured("slope", slope, exact, 1e-6 * abs(exact))
 
 
+def test_a_relief_valve_shuts_below_where_it_opens():
+    with pytest.raises(ModelError, match="'valve': p_close must not be above p_open"):
+        hyd.ReliefValve(EqnEnv(), "valve", p_open=1e6, p_close=4e6)
+
+
 def test_a_relief_valve_may_begin_open():
     ev = EqnEnv()
     high, low = hyd.PressureSource(ev, "high", p=6e6), hyd.PressureSource(ev, "low", p=1e5)

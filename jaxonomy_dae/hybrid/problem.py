@@ -99,10 +99,5 @@ class HybridState(eqx.Module):
     after: Float[Array, "rows m"]
 
 
-def still(tree: Any) -> Any:
-    """The same, not differentiated."""
-    return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf, tree)
-
-
 def one_hot(index: Any, n: int) -> Bool[Array, " n"]:
     return jnp.arange(n) == index

@@ -10,8 +10,9 @@ import numpy as np
 from jax import lax
 
 from ..adjoint.closure_conversion import any_member
+from ..adjoint.resting import still
 from .event_map import Arrival, handle
-from .problem import HybridState, still
+from .problem import HybridState
 from .search import first_crossing
 from .term import bound, problem_of
 

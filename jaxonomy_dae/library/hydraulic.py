@@ -25,6 +25,7 @@ from ..modeling import (
     assign,
     der,
 )
+from .arguments import in_order
 
 DENSITY = 998.2  # kg/m³, water at 20 °C
 VISCOSITY = 1.002e-3  # Pa·s, water at 20 °C
@@ -267,6 +268,7 @@ class ReliefValve(_TwoPort):
     ):
         super().__init__(ev, name)
         upper, lower = self.parameter("p_open", p_open, unit="Pa"), self.parameter("p_close", p_close, unit="Pa")
+        in_order(self, "p_close", "p_open")
         area = self.parameter("A", A, unit="m2", bounds=NONNEGATIVE)
         discharge = self.parameter("Cd", Cd, unit="1", bounds=POSITIVE)
         density = self.parameter("rho", rho, unit="kg/m3", bounds=POSITIVE)
