@@ -44,7 +44,7 @@ class Instances:
 
 def _own(c: Component) -> tuple[int, ...]:
     """How many components, variables, parameters, relations and ports a component is and has."""
-    return 1, len(c.variables), len(c.parameters), c.relations, len(c.ports)
+    return 1, len(c.variables), len(c.parameters), len(c.relations), len(c.ports)
 
 
 def _child(entry: Any) -> tuple[Component, ComponentArray | None]:
