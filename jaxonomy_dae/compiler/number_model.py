@@ -64,7 +64,7 @@ class ModelNumbers:
         self._number(self._counted())
         self.of: dict[int, Instances] = {id(i.component): i for i in self.instances}
         self.paths: list[str] = self._paths()
-        # After all parameters follow the relations that are events, then what discrete variables were before an event,
+        # After all parameters follow the hidden discrete variables, then what discrete variables were before an event,
         # in the order of these.
         flagged = [np.zeros(0, np.int64)]
         for i in self.instances:

@@ -30,7 +30,7 @@ class EventPlan:
     value: Gather  # for actions that write a number, the constant zero
     state: np.ndarray  # where in the state array an action writes, or −1
     factor: np.ndarray  # of the variable that it writes, in units of the state
-    discrete: np.ndarray  # the parameters that are discrete variables, relations that are events last
+    discrete: np.ndarray  # the parameters that are discrete variables, hidden ones last
     n_visible: int  # how many of them were declared
     dependents: tuple[DependentParameters, ...]  # the parameters that follow them
 

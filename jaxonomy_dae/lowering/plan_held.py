@@ -33,5 +33,5 @@ def plan_held(table: HeldTable, variables: QuantityMap, program: Callable[[np.nd
         return None
 
     last = np.searchsorted(table.owner, np.arange(len(table)), side="right") - 1
-    read = (read_variables(variables, chosen, program) for chosen in (table.active, table.level, table.force))
-    return HeldPlan(table, *(part for pair in read for part in pair), last)
+    active, level, force = (read_variables(variables, v, program) for v in (table.active, table.level, table.force))
+    return HeldPlan(table, *active, *level, *force, last)

@@ -81,7 +81,8 @@ class ModeDeclarations(EventDeclarations):
                 f"order={order}"
             )
         active = self.discrete(name, start=start, unit="1")
-        closed, open_ = sympy.Eq(active, 1), sympy.Eq(active, 0)
+        closed: Any = sympy.Eq(active, 1)
+        open_: Any = sympy.Eq(active, 0)
         impulse = self._either(closed, gap, force, order, active)
         if impulse is None:
             self._event(force <= 0, (Assign(active, sympy.Integer(0)),), closed, True, revocable=True)
@@ -104,8 +105,8 @@ class ModeDeclarations(EventDeclarations):
         shown = f"{gap <= 0}, on={open_}"
         self._event(gap + depth <= 0, struck, open_, True, revocable=True, text=shown)
         self._event(force <= 0, (Assign(active, no), Assign(lifted, no)), closed, True, revocable=True)
-        apart = sympy.And(open_, sympy.Ne(lifted, 1))
-        self._event(gap >= clearance, (Assign(lifted, yes),), apart, True, noted=False)
+        low: Any = sympy.Ne(lifted, 1)
+        self._event(gap >= clearance, (Assign(lifted, yes),), sympy.And(open_, low), True, noted=False)
         return active
 
     def relation(self, condition: Any, edges: tuple[Sampled, Any, Sampled, Any] | None = None) -> Any:
@@ -163,7 +164,8 @@ class ModeDeclarations(EventDeclarations):
         impulse = self._hidden_discrete(0.0)
         *zero, top = levels
         number = len(self.held_branches)
-        acts = sympy.Or(condition, sympy.Ne(impulse, 0))
+        asked: Any = sympy.Ne(impulse, 0)
+        acts = sympy.Or(condition, asked)
         self.add_equations(sympy.Piecewise((top + impulse * zero[-1], acts), (otherwise, True)))
         self.held_branches.append(
             Held(

@@ -162,7 +162,7 @@ class AcausalSystem(eqx.Module):
 
     @property
     def numbers(self) -> Float[Array, " m"]:
-        """What equations read of parameters: all that were declared, then the relations that are events, then the
+        """What equations read of parameters: all that were declared, then the hidden discrete variables, then all
         discrete variables as before an event."""
         array = self.parameters.array
         events = self.plan.events
@@ -177,7 +177,7 @@ class AcausalSystem(eqx.Module):
         return jnp.concatenate([array, values[..., events.n_visible :], values], axis=-1)
 
     def holding(self, values: Any) -> "AcausalSystem":
-        """The system while its discrete variables, and after them its relations, have these values."""
+        """The system while its discrete variables, and after them the hidden ones, have these values."""
         events = self.plan.events
         if events is None or not len(events.discrete):
             return self
@@ -196,7 +196,7 @@ class AcausalSystem(eqx.Module):
 
     @property
     def discrete_values(self) -> Float[Array, " q"]:
-        """The values of the discrete variables at the start, and of the relations that are events."""
+        """The values of the discrete variables at the start, and of the hidden ones."""
         events = self.plan.events
         if events is None:
             return jnp.zeros((0,))

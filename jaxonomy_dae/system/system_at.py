@@ -328,13 +328,15 @@ class SystemAt:
         w = jnp.asarray(weight[:n], self.dtype)
         # Each constraint in units of its gradient: multiplied by 1e9 it is projected onto alike.
         size = jnp.sqrt(jnp.sum(jax.lax.stop_gradient(jacobian) ** 2 * w, axis=1))
-        absent = jnp.zeros_like(size)
-        if plan.held is not None:
+        absent: Any = None
+        if plan.held is not None:  # a row that asks for nothing is zero, and is left out
             active, _ = self.held(array)
-            absent = jnp.append(absent[: plan.n_constraints], 1 - active[plan.held.table.owner])
-        unit = 1 / jnp.where(absent > 0, 1.0, size)
+            absent = jnp.append(jnp.zeros(plan.n_constraints, self.dtype), 1 - active[plan.held.table.owner])
+            size = size + absent
+        unit = 1 / size
         jacobian, value = jacobian * unit[:, None], value * unit
-        multiplier = jnp.linalg.solve((jacobian * w) @ jacobian.T + jnp.diag(absent), value)
+        gram = (jacobian * w) @ jacobian.T
+        multiplier = jnp.linalg.solve(gram if absent is None else gram + jnp.diag(absent), value)
         return self.split(jnp.concatenate([x - w * (jacobian.T @ multiplier), rest]))
 
     # --- events ------------------------------------------------------------------------------------------------
