@@ -63,13 +63,14 @@ class SystemProblem(AbstractHybridProblem):
         before = q
         place, new = events.table.discrete[is_discrete], values[is_discrete]
         q = q.at[place].add(jnp.where(happens[is_discrete], new - q[place], 0.0))
+        struck = True
         if self.system.plan.held is not None:
-            x, q = self.struck(t, x, before, q, args)
-        return self.admitted(t, x, q, args), q
+            x, q, struck = self.struck(t, x, before, q, args)
+        return jnp.where(struck, self.admitted(t, x, q, args), jnp.nan), q
 
-    def struck(self, t: Any, x: Any, before: Any, q: Any, args: Any) -> tuple[Any, Any]:
-        """(x, q) after the impulses of the constraints that begin to hold with q, or that q asks for; not-a-number if
-        they do not do what they should.
+    def struck(self, t: Any, x: Any, before: Any, q: Any, args: Any) -> tuple[Any, Any, Any]:
+        """(x, q) after the impulses of the constraints that begin to hold with q, or that q asks for; and whether they
+        do what they should.
 
         An equation e' + κ·e = 0 takes the place of e' = 0. States along ∂f/∂κ at κ = 0 are those after the impulse
         that takes e away: exact where e is affine in what jumps (speeds; charges of linear capacitors). What is closed
@@ -104,7 +105,7 @@ class SystemProblem(AbstractHybridProblem):
         _, levels_after = self.system.holding(q).at(t, args).held(after)
         e, left = levels[held.last], levels_after[held.last]
         done = jnp.abs(left - (1 - strength) * e) <= LEFT * jnp.abs(strength * e)
-        return jnp.where(jnp.all(done | (strength == 0)) & ~wrong, after, jnp.nan), q
+        return after, q, jnp.all(done | (strength == 0)) & ~wrong
 
     def admitted(self, t: Any, x: Any, q: Any, args: Any) -> Any:
         """The state on the constraints that hold with q; not-a-number if it is not near them."""

@@ -85,6 +85,7 @@ def test_a_string_by_every_solver(bob, solver):
     np.testing.assert_allclose(end, AT_1_5, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_string_by_bdf(bob):
     end, times = flown(bob, 5.2, solver=BDF())
     # A multistep method restarts twice, and keeps its tolerance a step, not over the run.
@@ -99,13 +100,16 @@ ADJOINTS = {
 }
 
 
-@pytest.mark.parametrize("adjoint", ["stored", pytest.param("recursive", marks=pytest.mark.slow), "forward"])
+@pytest.mark.parametrize(
+    "adjoint", ["stored", *(pytest.param(a, marks=pytest.mark.slow) for a in ("recursive", "forward"))]
+)
 def test_derivatives_of_a_string(bob, adjoint):
     jacobian = jax.jacfwd if adjoint == "forward" else jax.jacrev
     found = jacobian(lambda v0: flown(bob, v0, adjoint=ADJOINTS[adjoint])[0])(5.2)
     np.testing.assert_allclose(found, BY_V0, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_string_stays_taut_for_long(bob):
     """Slow enough it never goes slack: a pendulum, held to the circle for many periods, with its energy."""
     solution = simulate(bob.with_parameters({"bob.v0": 3.0}), 60.0, rtol=1e-6, atol=1e-6)
@@ -116,6 +120,7 @@ def test_a_string_stays_taut_for_long(bob):
     np.testing.assert_allclose(x * vx + y * vy, 0.0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_batch_of_strings(bob):
     """Members with no event and with two: each is its own run."""
     speeds = jnp.array([1.0, 3.0, 4.6, 5.0, 5.2, 6.0, 8.0])
@@ -131,6 +136,7 @@ def test_the_report_tells_the_index(bob):
     assert bob.report.index_changes == ["bob: L - sqrt(x**2 + y**2) = 0 while Eq(taut, 1): index 3 while it does"]
 
 
+@pytest.mark.slow
 @checks(
     {planar.String: ("pendulum and parabola of a string that goes slack, elliptic integrals", "place", "events")},
     origin=ORIGIN,
@@ -188,6 +194,7 @@ def test_a_ball_on_a_stop():
     measured("by height", by[1], BY_HEIGHT, SMOOTH)
 
 
+@pytest.mark.slow
 def test_a_ball_comes_to_rest():
     """It bounces while e·v is above the rest speed, then stays, carried by its weight."""
     M, e, rest = 2.0, 0.5, 0.1
@@ -204,6 +211,7 @@ def test_a_ball_comes_to_rest():
     np.testing.assert_allclose(solution["stop.f"][-1], 9.81 * M, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_mass_is_lifted_off_and_set_down():
     """A force 15·sin t on 1 kg that rests on the ground: it lifts at sin t = g/15, flies, and lands. Between, x is the
     twice integrated force."""
@@ -236,6 +244,7 @@ def test_a_mass_is_lifted_off_and_set_down():
     np.testing.assert_allclose(found, expected, rtol=1e-6)  # of differences with a step of 1e-5
 
 
+@pytest.mark.slow
 @checks({Rope: ("momentum of two masses that a rope joins", "speeds", "events", "by mass")}, origin=ORIGIN)
 def test_a_rope_between_two_carts():
     """A cart that runs away at 3 m/s tows another of mass 2 after 0.5 s: both go on at 3·m/(m + 2)."""
@@ -254,6 +263,7 @@ def test_a_rope_between_two_carts():
     measured("by mass", jax.grad(lambda m: run(m)["first.x"][-1])(1.0), 1.0, SMOOTH)
 
 
+@pytest.mark.slow
 def test_equal_masses_exchange_their_speeds():
     """Three carts in a row, restitution 1: the last runs off with the speed of the first."""
     ev = EqnEnv()
@@ -294,6 +304,7 @@ def test_a_jerk_lifts_what_rests_on_the_ground():
 # --- shafts and capacitors that are joined ---------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @checks({DogClutch: ("momentum of shafts that are joined", "speeds", "later", "by inertia")}, origin=ORIGIN)
 def test_a_dog_clutch():
     """Joined from 0.5 to 1.5 s, with a torque of 3 N·m on the first shaft."""
@@ -337,6 +348,7 @@ def test_dog_clutches_that_close_at_once(closed):
     np.testing.assert_allclose([solution[f"j{k}.w"][-1] for k in range(4)], expected, atol=1e-9)
 
 
+@pytest.mark.slow
 @checks({el.JoiningSwitch: ("charge of two capacitors that are joined", "voltage", "discharge", "by C")}, origin=ORIGIN)
 def test_two_capacitors_joined():
     """1 mF at 10 V and 3 mF at 2 V are joined at 0.5 s: 4 V, then a discharge through 100 Ω."""
@@ -373,6 +385,7 @@ def test_a_run_that_cannot_begin_in_its_mode(bob):
         simulate(stop, 1.0)
 
 
+@pytest.mark.slow
 def test_a_run_that_begins_beyond_a_stop():
     stop = falling(HardStop(EqnEnv(), "stop"), height=-0.5)
     with pytest.raises(SimulationError, match="began a mode whose constraint is far from what it asks for"):
@@ -389,6 +402,7 @@ class Square(Component):
         self.add_equations(Eq(der(q), p.i), Eq(p.i + n.i, 0), Eq(p.v - n.v, sqrt(q)))
 
 
+@pytest.mark.slow
 def test_a_jump_that_is_not_affine_is_refused():
     """The charge of nonlinear capacitors after a jump is not found by one linear step: no number rather than a wrong
     one."""
