@@ -63,10 +63,10 @@ class SystemProblem(AbstractHybridProblem):
         before = q
         place, new = events.table.discrete[is_discrete], values[is_discrete]
         q = q.at[place].add(jnp.where(happens[is_discrete], new - q[place], 0.0))
-        struck = True
-        if self.system.plan.held is not None:
-            x, q, struck = self.struck(t, x, before, q, args)
-        return jnp.where(struck, self.admitted(t, x, q, args), jnp.nan), q
+        if self.system.plan.held is None:
+            return self.admitted(t, x, q, args), q
+        x, q, done = self.struck(t, x, before, q, args)
+        return jnp.where(done, self.admitted(t, x, q, args), jnp.nan), q
 
     def struck(self, t: Any, x: Any, before: Any, q: Any, args: Any) -> tuple[Any, Any, Any]:
         """(x, q) after the impulses of the constraints that begin to hold with q, or that q asks for; and whether they
