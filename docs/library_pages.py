@@ -80,7 +80,7 @@ def as_written() -> Iterator[tuple[list[Any], list[Any]]]:
     """The equations and events that components are given meanwhile, each with its component."""
     equations: list[Any] = []
     events: list[Any] = []
-    add_equations, event = Component.add_equations, Component._event
+    add_equations, event, either = Component.add_equations, Component._event, Component._either
 
     def noted_equations(self: Component, *given: Any) -> None:
         equations.extend((self, equation) for equation in given)
@@ -94,16 +94,23 @@ def as_written() -> Iterator[tuple[list[Any], list[Any]]]:
         immediate: bool,
         noted: bool = True,
         revocable: bool = False,
+        text: str | None = None,
     ) -> None:
         if noted:
             events.append((self, condition, actions, on))
-        event(self, condition, actions, on, immediate, noted, revocable)
+        event(self, condition, actions, on, immediate, noted, revocable, text)
 
-    Component.add_equations, Component._event = noted_equations, noted_event
+    def noted_either(self: Component, condition: Any, then: Any, otherwise: Any, order: int, pushes: Any) -> Any:
+        so_far = len(equations)
+        impulse = either(self, condition, then, otherwise, order, pushes)
+        equations[so_far:] = [(self, sympy.Piecewise((then, condition), (otherwise, True)))]
+        return impulse
+
+    Component.add_equations, Component._event, Component._either = noted_equations, noted_event, noted_either
     try:
         yield equations, events
     finally:
-        Component.add_equations, Component._event = add_equations, event
+        Component.add_equations, Component._event, Component._either = add_equations, event, either
 
 
 # --- texts -------------------------------------------------------------------------------------------------------
@@ -219,8 +226,15 @@ def event_text(condition: Any, actions: Iterable[Any], on: Any) -> str:
         offset = f", from {text_of(condition.offset)} on" if condition.offset else ""
         text = f"every {text_of(condition.period)} seconds{offset}"
     else:
-        text = f"when {text_of(condition)}" + (f", while {text_of(on)}" if on is not None else "")
-    return f"{text}: {', '.join(map(_action_text, actions))}"
+        # What is not shown says only that a gap has opened.
+        shown = condition.xreplace({s: sympy.Integer(1) for s in condition.free_symbols if _is_hidden(s)})
+        text = f"when {text_of(shown)}" + (f", while {text_of(on)}" if on is not None else "")
+    told = (a for a in actions if isinstance(a, Terminate) or not _is_hidden(a.target))
+    return f"{text}: {', '.join(map(_action_text, told))}"
+
+
+def _is_hidden(symbol: Any) -> bool:
+    return isinstance(symbol, RelationSymbol)
 
 
 def _action_text(action: Any) -> str:

@@ -54,7 +54,7 @@ def test_what_components_inherit_is_in_the_api():
 
 def test_all_domains_have_pages():
     assert {
-        "electrical", "friction", "hydraulic", "planar", "rotational", "signal", "thermal", "translational",
+        "contacts", "electrical", "friction", "hydraulic", "planar", "rotational", "signal", "thermal", "translational",
         "transmissions",
     } <= {*domains()}  # fmt: skip
     text = overview()

@@ -98,7 +98,7 @@ def make(seed: int) -> Case:
     as_parameters = rng.random() < 0.3
     part = Descriptor(ev, "sys", variables, rng.permutation(n), e, a, f, as_parameters)
     # A rank that depends on parameters' values is named, not resolved: with other values the index is another.
-    may_refuse = ["singular for the given parameter values"] if as_parameters and blocks else []
+    may_refuse = ["singular for .*, though not in general"] if as_parameters and blocks else []
     size = np.abs(right) @ np.abs(np.concatenate([x, z])) + 1e-3 * np.abs(right).sum(1)
     quick = np.abs(right) @ np.abs(np.concatenate([j @ x, dz])) + 1e-3 * np.abs(right).sum(1)
     expected = {f"sys.{v}": Expected(float(y[k]), TOLERANCE * size[k]) for k, v in enumerate(variables)}

@@ -11,7 +11,6 @@ from ..model.dependent_parameters import complete
 from ..model.symbolic import SymbolicTemplate, canonical
 from ..model.tables import DependentParameters, ParameterTable, StartGroup, Starts, VariableTable
 from ..modeling.declarations import EachValue, Variable
-from ..modeling.events import LIVE
 from ..modeling.interval import Interval
 from .number_model import Instances, ModelNumbers
 from .read_equations import read_expression
@@ -141,11 +140,14 @@ def parameter_table(model: ModelNumbers) -> ParameterTable:
         if float(array[p]) not in bounds[p]:
             must = f"lie in {bounds[p]}" if np.isfinite(array[p]) else "be finite"
             raise ModelError(f"parameter '{names[p]}' is {expressions[p]} and must {must}; got {array[p]:g}")
-    # Beside what was declared: relations that are events, 2 while they are as their sides say, and what discrete
+    # Beside what was declared: hidden discrete variables, such as relations that are events, and what discrete
     # variables were before an event.
     n_relations = len(model.relations)
     names += [f"relation {k}" for k in range(n_relations)]
-    array = np.concatenate([array, np.full(n_relations, float(LIVE))])
+    starts = np.zeros(n_relations)
+    for i in model.instances:
+        starts[i.relation[:, None] - model.n_parameters + np.arange(len(i.component.relations))] = i.component.relations
+    array = np.concatenate([array, starts])
     n_more = n_relations + len(model.discrete)
     return ParameterTable(
         [*names, *(f"pre({names[p]})" for p in model.discrete)],

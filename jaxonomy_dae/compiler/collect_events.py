@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from ..model.symbolic import canonical
-from ..model.tables import NO_EVENTS, EventTable, Start
+from ..model.tables import NO_EVENTS, EventTable, HeldTable, Start
 from ..modeling.events import Assign, Terminate, When
 from .number_model import Instances, ModelNumbers
 from .read_equations import read_expression
@@ -74,3 +74,29 @@ def event_table(model: ModelNumbers) -> EventTable:
         value,
         np.array(columns[4], float),
     )  # fmt: skip
+
+
+def held_table(model: ModelNumbers) -> HeldTable:
+    """The branches that are differentiated, in the order of declaration."""
+    place = {int(p): k for k, p in enumerate(model.discrete)}
+    found = sorted(
+        (
+            (k, n, row, i)
+            for i in model.instances
+            for n in range(len(i.component.held_branches))
+            for row, k in enumerate(i.number.tolist())
+        ),
+        key=lambda entry: entry[:2],
+    )
+    text, active, impulse, force, closed, level, owner = [], [], [], [], [], [], []
+    for number, (k, n, row, i) in enumerate(found):
+        held = i.component.held_branches[n]
+        text.append(f"{model.paths[k]}: {held.text}")
+        active.append(model.variable(i, held.active)[row])
+        impulse.append(place[int(model.parameter(i, held.impulse.path)[row])])
+        force.append(-1 if held.force is None else model.variable(i, held.force)[row])
+        closed.append(-1 if held.closed is None else place[int(model.parameter(i, held.closed.path)[row])])
+        level += [model.variable(i, name)[row] for name in held.levels]
+        owner += [number] * len(held.levels)
+    columns = (active, impulse, force, closed, level, owner)
+    return HeldTable(tuple(text), *(np.array(column, np.int64) for column in columns))

@@ -11,7 +11,7 @@ from ..model.tables import FlatModel
 from ..modeling.diagram import AcausalDiagram
 from .add_networks import add_corrections, add_learned_terms
 from .collect_declarations import parameter_table, variable_table
-from .collect_events import event_table
+from .collect_events import event_table, held_table
 from .connect_ports import connect_ports
 from .connect_signals import connect_signals
 from .group_builder import GroupBuilder
@@ -39,8 +39,9 @@ def flatten(diagram: AcausalDiagram) -> FlatModel:
     parameters = parameter_table(model)
     groups = builder.groups()
     variables, groups, rows = add_corrections(model, diagram, variables, groups, networks)
-    events, accounts = event_table(model), read_accounts(model)
+    events, held, accounts = event_table(model), held_table(model), read_accounts(model)
     name = diagram.name or ""
     return FlatModel(
-        variables, parameters, groups, networks, rows, model.paths, ports, name, events, accounts, array_names(model)
-    )
+        variables, parameters, groups, networks, rows, model.paths, ports, name, events, held, accounts,
+        array_names(model),
+    )  # fmt: skip

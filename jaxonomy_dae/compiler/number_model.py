@@ -44,7 +44,7 @@ class Instances:
 
 def _own(c: Component) -> tuple[int, ...]:
     """How many components, variables, parameters, relations and ports a component is and has."""
-    return 1, len(c.variables), len(c.parameters), c.relations, len(c.ports)
+    return 1, len(c.variables), len(c.parameters), len(c.relations), len(c.ports)
 
 
 def _child(entry: Any) -> tuple[Component, ComponentArray | None]:
@@ -64,7 +64,7 @@ class ModelNumbers:
         self._number(self._counted())
         self.of: dict[int, Instances] = {id(i.component): i for i in self.instances}
         self.paths: list[str] = self._paths()
-        # After all parameters follow the relations that are events, then what discrete variables were before an event,
+        # After all parameters follow the hidden discrete variables, then what discrete variables were before an event,
         # in the order of these.
         flagged = [np.zeros(0, np.int64)]
         for i in self.instances:

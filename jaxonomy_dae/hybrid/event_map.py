@@ -70,7 +70,9 @@ def handle(
     def one(instant: Instant) -> Instant:
         state, q = instant.state, instant.state.q
         before = problem.slope(t, state.x, q, args)
-        event = jnp.argmax(instant.left)
+        # Where nothing is left, as in some members of a batch, nothing happens: derivatives of what would have happened
+        # need not be finite.
+        event = jnp.where(jnp.any(instant.left), jnp.argmax(instant.left), c + g)
         is_clock = event < c
         delay = jnp.zeros_like(t)
         if g:

@@ -26,7 +26,7 @@ from ..lowering.plan import SystemPlan
 from ..model.quantities import declared_scale, quantity_bounds
 from ..system.evaluate import Refinement
 from ..system.inputs import read_inputs
-from ..system.system_at import SystemAt
+from ..system.system_at import SystemAt, input_values
 from .given_solver import find_root_with
 from .initial_values import check_initial
 from .ladder import FAILED, STAGED, find_root
@@ -495,15 +495,18 @@ _compiled = eqx.filter_jit(initialize)
 
 
 def check(
-    system: Any, found: InitialPoint, t0: Any, inputs: Any, initial: Any, solve_for: tuple[str, ...] = ()
-) -> InitialPoint:
+    system: Any, found: InitialPoint, t0: Any, inputs: Any, initial: Any, solve_for: tuple[str, ...] = (),
+    running: bool = False,
+) -> InitialPoint:  # fmt: skip
     """The same point; raises an `InitializationError` if it is not consistent, if a block of equations is singular
-    there, or if a parameter solved for is out of its bounds."""
+    there, or if a parameter solved for is out of its bounds. While a program is `running`, functions of time in
+    `inputs` may hold what is traced."""
     from .report import InitializationReport  # which reads what is defined here
 
     table = system.parameters.table
     low, high = table.bounds[np.array([table.index(n) for n in solve_for], np.int64)].T
-    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((found, system, t0))):
+    driving = input_values(system.plan, inputs, t0, found.x.dtype) if running else ()
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((found, system, t0, driving))):
         x = eqx.error_if(
             found.x,
             ~is_consistent(found),

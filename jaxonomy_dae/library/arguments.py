@@ -84,3 +84,15 @@ def in_order(component: Component, low: str, high: str) -> None:
             f"'{component.name}': {low} must not be above {high}; got {low}={least:g} and {high}={most:g}: exchange "
             "them"
         )
+
+
+def yes_or_no(value: Any, name: str, what: str) -> int:
+    """1 for True, 0 for False.
+
+    **Raises:**
+
+    - `ModelError` for anything else.
+    """
+    if value not in (True, False):
+        raise ModelError(f"'{name}': {what} is True or False; got {value!r}")
+    return int(value)

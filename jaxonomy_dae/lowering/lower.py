@@ -17,6 +17,7 @@ from .entry_sizes import EntrySizes
 from .gather import Gather
 from .plan import ConstraintGroup, InputTable, PlannedRow, SystemPlan
 from .plan_events import plan_events
+from .plan_held import plan_held
 from .program import Layout, Program, plan
 from .schedule import AnyStep, SparseStep, Step, build_schedule
 
@@ -81,6 +82,7 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
         n,
         lambda q: program(_needed(steps, q, n)),
     )
+    held = plan_held(flat.held, variable_map, lambda q: program(_needed(steps, q, n)))
     row_inputs = [_of(variable_map, row.inputs) for row in flat.rows]
     following = state_order + 1
     rates = carried + 1 if _rates_hold(flat, variable_map, extended, for_residuals, carried) else carried[:0]
@@ -136,6 +138,7 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
         functions,
         linear_solver,
         events,
+        held,
     )
 
 
@@ -236,6 +239,8 @@ def _digest(
         e.text,
         e.guard,
         e.message,
+        e.noted,
+        e.revocable,
         e.immediate,
         e.event,
         e.state,
@@ -245,6 +250,8 @@ def _digest(
         flat.parameters.discrete,
     )
     feed(*((start.template.key, start.parameters) for clock in e.clocks for start in clock))
+    h = flat.held
+    feed(h.text, h.active, h.impulse, h.force, h.closed, h.level, h.owner, flat.parameters.n_relations)
     if linear_solver is not None:
         feed(repr(linear_solver))
     feed(states, selection.constraints, selection.dummies, extended.base, extended.level)

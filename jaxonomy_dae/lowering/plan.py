@@ -23,6 +23,7 @@ from . import pattern
 from .dummy_blocks import DummyBlocks, dummy_blocks
 from .gather import Gather
 from .plan_events import EventPlan
+from .plan_held import HeldPlan
 from .program import Program
 from .schedule import TORN, AnyStep
 
@@ -89,6 +90,7 @@ class SystemPlan:
     functions: tuple[Any, ...]
     linear_solver: lx.AbstractLinearSolver | None  # of blocks that stay whole
     events: EventPlan | None
+    held: HeldPlan | None  # constraints that come and go with modes
 
     def __eq__(self, other):
         if not isinstance(other, SystemPlan) or self.digest != other.digest:
@@ -105,6 +107,11 @@ class SystemPlan:
     @property
     def n_constraints(self) -> int:
         return len(self.selection.constraints)
+
+    @property
+    def n_projected(self) -> int:
+        """How many residuals states are projected onto: the hidden constraints, and those that modes bring."""
+        return self.n_constraints + (0 if self.held is None else len(self.held.table.level))
 
     @functools.cached_property
     def jacobian_pattern(self) -> SparsePattern | None:

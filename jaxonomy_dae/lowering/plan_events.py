@@ -30,7 +30,7 @@ class EventPlan:
     value: Gather  # for actions that write a number, the constant zero
     state: np.ndarray  # where in the state array an action writes, or −1
     factor: np.ndarray  # of the variable that it writes, in units of the state
-    discrete: np.ndarray  # the parameters that are discrete variables, relations that are events last
+    discrete: np.ndarray  # the parameters that are discrete variables, hidden ones last
     n_visible: int  # how many of them were declared
     dependents: tuple[DependentParameters, ...]  # the parameters that follow them
 
@@ -64,8 +64,8 @@ def plan_events(
         return None
     table = _in_order(table, _reads(flat, variables, steps, n))
     n_clocks = len(table.clocks)
-    guards, guard = _read(variables, table.guard[n_clocks:], program)
-    values, value = _read(variables, table.value, program)
+    guards, guard = read_variables(variables, table.guard[n_clocks:], program)
+    values, value = read_variables(variables, table.value, program)
     position = {int(q): k for k, q in enumerate(states)}
     place, factor = np.full(len(table.state), -1, np.int64), np.ones(len(table.state))
     for row, v in enumerate(table.state.tolist()):
@@ -150,7 +150,7 @@ def _in_order(table: EventTable, reads: list[set[int]]) -> EventTable:
     )  # fmt: skip
 
 
-def _read(
+def read_variables(
     variables: QuantityMap, chosen: np.ndarray, program: Callable[[np.ndarray], Program]
 ) -> tuple[Program, Gather]:
     """The program that computes variables, and where it has them; −1 stands for zero."""

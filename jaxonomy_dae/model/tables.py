@@ -142,8 +142,8 @@ class ParameterTable:
     bounds: list[Interval]
     dependents: tuple[DependentParameters, ...]  # each reads only what those before it have computed
     expressions: dict[int, str]  # of the dependent ones, in full names
-    discrete: np.ndarray  # those that events assign, relations last
-    n_relations: int  # how many relations follow what was declared; then comes what `discrete` was before an event
+    discrete: np.ndarray  # those that events assign, hidden ones last, such as relations that are events
+    n_relations: int  # how many hidden ones follow what was declared; then comes what `discrete` was before an event
 
     def __len__(self):
         return len(self.names)
@@ -217,6 +217,25 @@ NO_EVENTS = EventTable((), _NONE, (), (), (), (), (), _NONE, _NONE, _NONE, _NONE
 
 
 @dataclasses.dataclass(frozen=True)
+class HeldTable:
+    """The branches of `either` that are differentiated: constraints that come and go with modes."""
+
+    text: tuple[str, ...]  # of each
+    active: np.ndarray  # (held,): the variable that is 1 while it holds, and 0 otherwise
+    impulse: np.ndarray  # (held,): the place among the discrete variables of what lets an impulse act
+    force: np.ndarray  # (held,): the variable that is never negative, or −1
+    closed: np.ndarray  # (held,): the place among the discrete variables of the one that lets go at 0, or −1
+    level: np.ndarray  # (levels,): the variables that are zero while they hold …
+    owner: np.ndarray  # (levels,): … each with its constraint, the highest derivative of a constraint last
+
+    def __len__(self):
+        return len(self.text)
+
+
+NONE_HELD = HeldTable((), *(_NONE,) * 6)
+
+
+@dataclasses.dataclass(frozen=True)
 class AccountGroup:
     """Energies or powers that components declare: instance i of one template, whose slot k is
     (variable[i, k])^(order[i, k])."""
@@ -245,6 +264,7 @@ class FlatModel:
     ports: PortTable
     name: str = ""  # of the diagram
     events: EventTable = NO_EVENTS
+    held: HeldTable = NONE_HELD
     accounts: tuple[AccountGroup, ...] = ()
     arrays: ArrayNames = ArrayNames()
 

@@ -14,17 +14,17 @@ from .construction import Construction
 from .declarations import START, Account, Learned, Parameter, Variable, full_name
 from .environment import EqnEnv
 from .equations import residual_of
-from .event_declarations import EventDeclarations
-from .events import When
+from .events import Held, When
 from .functions import of_scalars
 from .interval import Interval, as_interval
+from .mode_declarations import ModeDeclarations
 from .names import check_name
 from .ports import Domain, Port
 from .real_number import real_number
 from .symbols import DiscreteSymbol, ParameterSymbol, PreviousSymbol, TimeSymbol, VariableSymbol
 
 
-class Component(EventDeclarations, metaclass=Construction):
+class Component(ModeDeclarations, metaclass=Construction):
     """The base class of all components: subclass it, and declare physics in `__init__`.
 
     ```python
@@ -62,7 +62,8 @@ class Component(EventDeclarations, metaclass=Construction):
         self.connections: list[Connection] = []
         self.signals: list[Signal] = []
         self.events: list[When] = []
-        self.relations = 0
+        self.relations: list[float] = []
+        self.held_branches: list[Held] = []
         self.accounts: list[Account] = []
         self._sealed = False
 
@@ -546,7 +547,7 @@ class Component(EventDeclarations, metaclass=Construction):
 
 _BASE_ATTRIBUTES = (
     *"ev name parent parameters variables ports children equations".split(),
-    *"learned_terms connections signals events relations accounts _sealed".split(),
+    *"learned_terms connections signals events relations held_branches accounts _sealed".split(),
 )
 
 

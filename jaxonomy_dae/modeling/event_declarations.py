@@ -3,12 +3,11 @@
 from typing import Any
 
 import sympy
-from sympy.logic.boolalg import BooleanAtom
 
 from ..errors import ModelError
 from .environment import EqnEnv
-from .events import LIVE, Action, Assign, Reinit, Sampled, Terminate, When, guard_of, relation_in_discretes, while_on
-from .symbols import DiscreteSymbol, PreviousSymbol, RelationSymbol, VariableSymbol
+from .events import Action, Assign, Reinit, Sampled, Terminate, When, guard_of, relation_in_discretes, while_on
+from .symbols import DiscreteSymbol, PreviousSymbol, VariableSymbol
 
 
 class EventDeclarations:
@@ -20,7 +19,6 @@ class EventDeclarations:
     path: str
     events: list[When]
     equations: list[sympy.Expr]
-    relations: int
     _sealed: bool
     add_equations: Any
     _declare: Any
@@ -69,83 +67,6 @@ class EventDeclarations:
             raise ModelError(f"component '{self.name}': the period of sampled must be positive; got {parts[0]}")
         return Sampled(*parts)
 
-    def either(self, mode: Any, then: Any, otherwise: Any) -> None:
-        """Adds an equation with two branches: `then` is zero while the mode holds, `otherwise` is zero while it does
-        not. An ideal switch is `self.either(Eq(closed, 1), v, i)`.
-
-        **Arguments:**
-
-        - `mode`: a relation in discrete variables, or one of them, which is true if it is not zero.
-        - `then`, `otherwise`: expressions. Both must determine something at the level at which the other does: where
-            one branch would hold back a state (a position, a speed), write it for the derivative of that state, and
-            let the event that begins the mode set the state.
-
-        **Raises:**
-
-        - `ModelError` for a mode that is not discrete.
-        """
-        where = f"component '{self.name}': either"
-        condition = relation_in_discretes(mode, where)
-        self.add_equations(sympy.Piecewise((sympy.sympify(then), condition), (sympy.sympify(otherwise), True)))
-
-    def complementary(self, gap: Any, force: Any, name: str = "active") -> DiscreteSymbol:
-        """Adds gap ≥ 0, force ≥ 0 and gap·force = 0: one of the two is zero, and the other is not negative.
-
-        An ideal diode is `self.complementary(-v, i)`: it blocks while the voltage is negative and conducts without
-        voltage while the current is positive.
-
-        **Arguments:**
-
-        - `gap`, `force`: expressions, both of algebraic variables or of derivatives, not of states.
-        - `name`: of the discrete variable that says which one is zero: 1 while the gap is, 0 while the force is. At the
-            initial time it becomes what the equations ask for.
-
-        **Returns:**
-
-        The discrete variable.
-        """
-        active = self.discrete(name, start=0, unit="1")
-        self.either(sympy.Eq(active, 1), gap, force)
-        self._event(
-            sympy.sympify(force) <= 0, (Assign(active, sympy.Integer(0)),), sympy.Eq(active, 1), True, revocable=True
-        )
-        self._event(
-            sympy.sympify(gap) <= 0, (Assign(active, sympy.Integer(1)),), sympy.Eq(active, 0), True, revocable=True
-        )
-        return active
-
-    def relation(self, condition: Any, edges: tuple[Sampled, Any, Sampled, Any] | None = None) -> Any:
-        """A condition for `Piecewise` whose changes are events: steps end where it turns, on either side equations see
-        it as it is there, and derivatives know that the time of the change moves.
-
-        ```python
-        self.output("y", Piecewise((h, self.relation(ev.t >= start)), (0, True)))
-        ```
-
-        **Arguments:**
-
-        - `condition`: as in `when`, without clocks.
-        - `edges`: for a condition that turns periodically, `(up, 1, down, 0)`: two clocks, and what the condition
-            becomes when they tick, expressions in parameters. It is then not watched otherwise.
-
-        **Raises:**
-
-        - `ModelError` for what is not a condition.
-        """
-        if isinstance(condition, BooleanAtom | bool):
-            return condition
-        known = RelationSymbol(self.relations)
-        self.relations += 1
-        live = None if edges is None else sympy.Eq(known, LIVE)
-        for holds, value in ((condition, 1), (sympy.Not(condition), 0)):
-            self._event(holds, (Assign(known, sympy.Integer(value)),), live, True, noted=False, revocable=True)
-        if edges is not None:
-            for clock, value in (edges[:2], edges[2:]):
-                self._event(clock, (Assign(known, sympy.sympify(value)),), None, False, noted=False)
-        holds: Any = sympy.Eq(known, 1)
-        unknown: Any = sympy.Eq(known, LIVE)
-        return sympy.Or(holds, sympy.And(unknown, condition))
-
     def when(self, condition: Any, *actions: Action, on: Any = None, at_start: bool = False) -> None:
         """Declares an event: what happens at the instant at which a condition becomes true.
 
@@ -174,7 +95,7 @@ class EventDeclarations:
 
     def _event(
         self, condition: Any, actions: tuple[Action, ...], on: Any, immediate: bool, noted: bool = True,
-        revocable: bool = False,
+        revocable: bool = False, text: str | None = None,
     ) -> None:  # fmt: skip
         if self._sealed:
             raise ModelError(f"component '{self.path}' is complete: declare its events inside __init__ of its class")
@@ -188,9 +109,9 @@ class EventDeclarations:
                 )
         number = len(self.events)
         clock = condition if isinstance(condition, Sampled) else None
-        guard, text = None, f"sampled({getattr(clock, 'period', '')})"
+        guard, shown = None, f"sampled({getattr(clock, 'period', '')})"
         if clock is None:
-            text = str(condition) if on is None else f"{condition}, on={on}"
+            shown = text or (str(condition) if on is None else f"{condition}, on={on}")
             expression = guard_of(condition, where)
             if on is not None:
                 expression = while_on(expression, relation_in_discretes(on, f"{where}, on"))
@@ -205,7 +126,7 @@ class EventDeclarations:
         elif on is not None:
             raise ModelError(f"{where}: on= is for conditions on variables; a sampled event always happens")
         values = self._values(actions, number, where)
-        self.events.append(When(text, guard, clock, tuple(actions), values, immediate, noted, revocable))
+        self.events.append(When(shown, guard, clock, tuple(actions), values, immediate, noted, revocable))
 
     def _hidden(self, name: str, expression: sympy.Expr) -> str:
         """Declares a variable that equals an expression, and is not shown."""

@@ -64,6 +64,21 @@ class When:
     revocable: bool = False
 
 
+@dataclasses.dataclass(frozen=True)
+class Held:
+    """A branch of `either` that is differentiated: the names of the hidden variables that are it and its derivatives
+    below the highest, all zero while the branch holds, and of the one that is 1 while it does and 0 otherwise; and the
+    discrete variable by which an event lets an impulse act. One that only pushes also has the hidden variable of its
+    force, and the discrete variable that lets go at 0."""
+
+    text: str
+    levels: tuple[str, ...]
+    active: str
+    impulse: RelationSymbol
+    force: str | None = None
+    closed: DiscreteSymbol | None = None
+
+
 def pre(symbol: Any) -> sympy.Expr:
     """The value of a variable before the event that is being handled; for use in `reinit` and `assign`.
 

@@ -13,6 +13,7 @@ from ..solvers.failures import SHOWN, explain_failure, how_it_stopped
 from ..system.system import AcausalSystem
 from .event_log import Events
 from .failed_blocks import failed_block
+from .hybrid_problem import CONSISTENT, RESTART
 from .not_finite import equation_not_finite
 from .preparation import term_of
 from .solution import Solution
@@ -62,7 +63,10 @@ def explain(
     written = _written_not_finite(system, x)
     if written:
         return f"the integration stopped at t={float(t):g}: an event gave {written} a value that is not finite" + (
-            ", or left states that the hidden constraints do not admit: let it write, with reinit(...), all that jumps"
+            ", or began a mode whose constraint is far from what it asks for, or that no impulse brings about"
+            if system.plan.held is not None
+            else ", or left states that the hidden constraints do not admit: let it write, with reinit(...), all that "
+            "jumps"
             if system.is_constrained
             else ""
         )
@@ -88,6 +92,28 @@ def explain(
         result=solution.result, t0=t0, t1=t1, max_steps=max_steps, rtol=rtol, atol=scaled_atol(system, atol),
         explicit=not implicit,
     )  # fmt: skip
+
+
+def mode_at_start(system: AcausalSystem, inputs: dict[str, Any], t0: Any, x0: Any) -> str:
+    """The constraints that do not hold although a run begins in their modes; or nothing."""
+    held = system.plan.held
+    if held is None:
+        return ""
+    active, levels = map(np.asarray, system.at(t0, inputs).held(x0))
+    projected = np.asarray(system.project(t0, x0, inputs, iterations=RESTART))
+    n, typical = len(system.plan.states), system.plan.typical_sizes[system.plan.states]
+    moved = np.abs(projected - np.asarray(x0))[:n] / (np.abs(np.asarray(x0))[:n] + typical)
+    if (moved <= CONSISTENT).all():
+        return ""
+    lines = []
+    for k in np.flatnonzero(active > 0).tolist():
+        values = levels[held.table.owner == k]
+        found = ", ".join(f"its derivative {v:.3g}" if level else f"it is {v:.3g}" for level, v in enumerate(values))
+        lines.append(f"'{held.table.text[k]}': {found}")
+    return (
+        f"the run cannot begin at t={float(t0):g} in the mode of " + "; ".join(lines) + ". Give starts at which these "
+        "are zero, or begin in the other mode"
+    )
 
 
 def _written_not_finite(system: AcausalSystem, x: Any) -> str:

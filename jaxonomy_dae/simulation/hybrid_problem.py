@@ -17,6 +17,9 @@ from .preparation import prepared, term_of
 RESOLUTION = 32.0  # times the spacing of floating-point numbers at the largest time of a run
 CONSISTENT = 1e-4  # of a state's size: what projection may change of what an event writes and leaves
 RESTART = 8  # Gauss–Newton steps onto the constraints after an event
+LEFT = 1e-6  # of what an impulse takes away: what may be left of it
+PULL = 1e-9  # of the largest impulse: what counts as none
+TRIES = 3  # how often what would have to pull lets go, before a jump is given up
 
 
 class SystemProblem(AbstractHybridProblem):
@@ -57,15 +60,63 @@ class SystemProblem(AbstractHybridProblem):
         place = events.state[is_state]
         new = (values / jnp.asarray(events.factor, values.dtype))[is_state]
         x = x.at[place].add(jnp.where(happens[is_state], new - x[place], 0.0))
+        before = q
         place, new = events.table.discrete[is_discrete], values[is_discrete]
         q = q.at[place].add(jnp.where(happens[is_discrete], new - q[place], 0.0))
-        if self.system.is_constrained:
-            projected = self.system.holding(q).project(t, x, args, iterations=RESTART)
-            n, typical = len(self.system.plan.states), self.system.plan.typical_sizes[self.system.plan.states]
-            allowed = CONSISTENT * (jnp.abs(x[:n]) + jnp.asarray(typical, x.dtype))
-            consistent = jnp.all(jnp.abs(projected[:n] - x[:n]) <= allowed)
-            x = jnp.where(consistent, projected, jnp.nan)
-        return x, q
+        if self.system.plan.held is None:
+            return self.admitted(t, x, q, args), q
+        x, q, done = self.struck(t, x, before, q, args)
+        return jnp.where(done, self.admitted(t, x, q, args), jnp.nan), q
+
+    def struck(self, t: Any, x: Any, before: Any, q: Any, args: Any) -> tuple[Any, Any, Any]:
+        """(x, q) after the impulses of the constraints that begin to hold with q, or that q asks for; and whether they
+        do what they should.
+
+        An equation e' + κ·e = 0 takes the place of e' = 0. States along ∂f/∂κ at κ = 0 are those after the impulse
+        that takes e away: exact where e is affine in what jumps (speeds; charges of linear capacitors). What is closed
+        and only pushes lets go if its impulse would be negative (Moreau 1988).
+        """
+        plan: Any = self.system.plan
+        held, n = plan.held, len(plan.states)
+        place, pushes = held.table.impulse, held.table.closed >= 0
+        closed = held.table.closed[pushes]
+        held_before, _ = self.system.holding(before).at(t, args).held(x)
+        _, levels = self.system.holding(q).at(t, args).held(x)
+
+        def attempt(q, _):
+            """The jump with q; and q without what this jump would have to pull instead of push."""
+            holds, _ = self.system.holding(q).at(t, args).held(x)
+            strength = jnp.where(q[place] == 0, holds * (1 - held_before), q[place])
+
+            def responds(strength):
+                system = self.system.holding(q.at[place].set(strength))
+                return system.vector_field(t, x, args), system.at(t, args).held_forces(x)
+
+            _, (change, pushed) = jax.jvp(responds, (strength,), (strength,))
+            pulls = (holds > 0) & (strength == 0) & (pushed < -PULL * jnp.max(jnp.abs(pushed)))
+            lets_go = pulls[pushes]
+            return q.at[closed].set(jnp.where(lets_go, 0.0, q[closed])), (change, strength, jnp.any(lets_go))
+
+        length = 1 + min(int(pushes.sum()), TRIES)
+        q, tried = jax.lax.scan(attempt, q, length=length)
+        change, strength, wrong = jax.tree.map(lambda rows: rows[-1], tried)
+        q = q.at[place].set(0.0)
+        after = x.at[:n].add(change[:n])
+        _, levels_after = self.system.holding(q).at(t, args).held(after)
+        e, left = levels[held.last], levels_after[held.last]
+        done = jnp.abs(left - (1 - strength) * e) <= LEFT * jnp.abs(strength * e)
+        return after, q, jnp.all(done | (strength == 0)) & ~wrong
+
+    def admitted(self, t: Any, x: Any, q: Any, args: Any) -> Any:
+        """The state on the constraints that hold with q; not-a-number if it is not near them."""
+        plan = self.system.plan
+        if not self.system.is_constrained:
+            return x
+        projected = self.system.holding(q).project(t, x, args, iterations=RESTART)
+        n, typical = len(plan.states), plan.typical_sizes[plan.states]
+        allowed = CONSISTENT * (jnp.abs(x[:n]) + jnp.asarray(typical, x.dtype))
+        consistent = jnp.all(jnp.abs(projected[:n] - x[:n]) <= allowed)
+        return jnp.where(consistent, projected, jnp.nan)
 
 
 def problem_for(

@@ -64,7 +64,7 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, throw: bo
     system, t0, t1, ts, inputs, initial = given
     found = initialize(system, t0, inputs, initial)
     if throw:
-        found = check(system, found, t0, inputs, initial)
+        found = check(system, found, t0, inputs, initial, running=True)
     x0, controller = found.x, options.controller
     implicit = is_implicit(options.solver)
     chosen = options.solver if ts is None else right_between_steps(options.solver)
@@ -75,8 +75,12 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, throw: bo
     dt0 = None if own_start else first_step(system, t0, t1, x0, inputs, solver.order(term), controller)
     y0: Any = x0
     saved_of: Any = _whole
+    consistent = is_consistent(found)
     if system.plan.events is not None:
         problem = problem_for(system, t0, t1, implicit, watch, tolerance)
+        if system.plan.held is not None:
+            admitted = jnp.all(jnp.isfinite(problem.admitted(t0, x0, system.discrete_values, inputs)))
+            consistent = consistent & admitted
         y0 = start(problem, t0, x0, system.discrete_values, inputs, options.max_events, options.save_events)
         term, solver = HybridTerm(problem), WithEvents(chosen, options.max_events)
         controller = with_event_control(controller)
@@ -89,7 +93,6 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, throw: bo
         save=save, controller=controller, adjoint=options.adjoint, max_steps=options.max_steps,
         progress=options.progress, host_checks=throw,
     )  # fmt: skip
-    consistent = is_consistent(found)
     saved, x, last = done.ts, done.ys, done.last
     discrete, events, held = None, None, None
     if system.plan.events is not None:

@@ -35,10 +35,10 @@ def prepared(system: AcausalSystem, solver: Any, implicit: bool, watch: Watch | 
     if isinstance(solver, BDF):
         if solver.algebraic_errors is None:
             solver = dataclasses.replace(solver, algebraic_errors=False)
-        if system.plan.n_constraints and solver.projection is None:
+        if system.plan.n_projected and solver.projection is None:
             solver = dataclasses.replace(solver, projection=system.project)
         return dataclasses.replace(solver, guard=guard)
-    if implicit and system.plan.n_constraints:
+    if implicit and system.plan.n_projected:
         return with_projection(solver, system.project, strict=False, guard=guard)
     if implicit and guard is not None:
         return with_projection(solver, _unchanged, strict=False, guard=guard)

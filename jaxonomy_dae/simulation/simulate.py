@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax.core import Tracer
 
 from ..adjoint.default import default_adjoint
-from ..errors import SimulationError
+from ..errors import InitializationError, SimulationError
 from ..initialization.initialize import check
 from ..lowering.plan import SystemPlan
 from ..solvers import BDF, Rodas5P, Tsit5
@@ -24,7 +24,7 @@ from ..system.solver_choice import Choice, implicit_choice, is_known_stiff, note
 from ..system.stiffness import fastest_decay
 from ..system.system import AcausalSystem
 from .arguments import check_arguments, check_parameters
-from .failures import explain, raised
+from .failures import explain, mode_at_start, raised
 from .integration import Options, Outcome, run, run_compiled
 from .preparation import term_of
 from .solution import Solution
@@ -180,6 +180,9 @@ def simulate(
     )
     if throw and not bool(diffrax.is_okay(outcome.result)):
         first = t0, outcome.found.x
+        mode = mode_at_start(system, inputs, *first)
+        if mode:
+            raise InitializationError(mode)
         if outcome.held is not None:
             solution = eqx.tree_at(lambda s: s.system, solution, system.holding(outcome.held))
         text = explain(solution, first, outcome.last, t1, is_implicit(solver), max_steps, rtol, atol)

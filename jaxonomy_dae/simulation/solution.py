@@ -105,7 +105,7 @@ class Solution(eqx.Module):
         """The values of several variables, shape `(n, len(names))`, evaluated at once."""
         if self.states.ndim > 2:
             return _each(self, lambda one: one._columns(names))
-        own = {"time": self.ts}
+        own = {"time": self.ts} if "time" in names else {}
         if self.discrete is not None:
             places = {n: k for k, n in enumerate(self.system.discretes)}
             own |= {n: self.discrete[:, places[n]] for n in names if n in places}
@@ -121,9 +121,12 @@ class Solution(eqx.Module):
         else:
             chosen = _everything(*given)[:, quantity] * jnp.asarray(factor, self.states.dtype)
             values = jnp.where(quantity < 0, 0.0, chosen)
-        found = iter(jnp.moveaxis(values, -1, 0))
-        columns = [own[name] if name in own else next(found) for name in names]
-        return jnp.stack(columns, axis=-1) if columns else jnp.zeros((*self.ts.shape, 0), self.states.dtype)
+        if not own:
+            return values
+        place = {name: k for k, name in enumerate(own)}
+        others = iter(range(len(own), len(own) + values.shape[-1]))
+        order = np.array([place[name] if name in place else next(others) for name in names])
+        return jnp.concatenate([jnp.stack([*own.values()], axis=-1), values], axis=-1)[:, order]
 
     @property
     def events(self) -> Events:

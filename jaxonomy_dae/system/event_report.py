@@ -56,14 +56,15 @@ def _noted(table: EventTable) -> list[int]:
 
 
 def _actions(flat: FlatModel, event: int) -> str:
-    """What an event does, in the words in which it is declared; values that are not numbers are left out."""
+    """What an event does, in the words in which it is declared; values that are not numbers are left out, and what is
+    not shown."""
     table = flat.events
     out = []
     for row in np.flatnonzero(table.event == event).tolist():
         value = "…" if table.value[row] >= 0 else f"{table.constant[row]:g}"
         if table.state[row] >= 0:
             out.append(f"reinit({flat.variables.names[table.state[row]]}, {value})")
-        else:
+        elif table.discrete[row] < len(_declared(flat)):
             name = flat.parameters.names[flat.parameters.discrete[table.discrete[row]]]
             out.append(f"assign({name}, {value})")
     message = table.message[event]

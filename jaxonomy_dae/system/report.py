@@ -21,7 +21,8 @@ class SystemReport(Sections):
     Attributes count and name: `n_equations`, `n_unknowns`, `n_aliases`, `index` (structural, of the model as written),
     `differentiated` (pairs of an equation's text and how often), `states`, `algebraics`, `carried`, `constraints`,
     `blocks` (of more than one equation, or nonlinear), `notes`. Of a model with events also `discretes` (with their
-    starts), `events` of conditions, `clocks`, and `modes` (equations that change with discrete variables).
+    starts), `events` of conditions, `clocks`, `modes` (equations that change with discrete variables) and
+    `index_changes` (the constraints that come and go with them, and the index while they hold).
 
     `values` are those of all parameters, as they were declared if not given: starts and periods depend on them.
     """
@@ -135,6 +136,13 @@ class SystemReport(Sections):
         """The equations with two branches, of which a discrete variable chooses one."""
         return mode_equations(self._plan.flat)
 
+    @property
+    def index_changes(self) -> list[str]:
+        """The constraints that come and go with modes, and the index of each while it holds."""
+        held = self._plan.flat.held
+        index = np.bincount(held.owner, minlength=len(held)) + 1
+        return [f"{text}: index {k} while it does" for text, k in zip(held.text, index.tolist(), strict=True)]
+
     def _contents(self) -> tuple[list[str], list[tuple[str, list[str]]]]:
         plan = self._plan
         flat, n_remaining = plan.flat, sum(len(g) for g in plan.groups)
@@ -164,6 +172,7 @@ class SystemReport(Sections):
             (counted(len(events), "event"), events),
             (counted(len(clocks), "clock"), clocks),
             ("equations that change with a mode", self.modes),
+            ("constraints that come and go", self.index_changes),
             ("hidden constraints, projected onto", self.constraints),
             ("simultaneous blocks", self.blocks),
             ("notes", self.notes),

@@ -17,7 +17,6 @@ from ..linear.sparse import SparseMatrix, SparsePattern, sparse_jacobian
 from ..lowering.plan import SystemPlan
 from ..model.dependent_parameters import complete
 from ..model.pickling import functions_by_name, named_functions
-from ..modeling.events import LIVE
 from .evaluate import Refinement
 from .inputs import read_inputs
 from .parameters import Parameters
@@ -35,7 +34,7 @@ class AcausalSystem(eqx.Module):
     parameters: Parameters
     neural: dict[str, Any]
     plan: SystemPlan = eqx.field(static=True)
-    modes: Float[Array, "*batch relations"] | None = None  # of relations that are events, within a run
+    modes: Float[Array, "*batch relations"] | None = None  # hidden discrete variables, within a run
 
     # --- names -------------------------------------------------------------------------------------------------
 
@@ -163,17 +162,22 @@ class AcausalSystem(eqx.Module):
 
     @property
     def numbers(self) -> Float[Array, " m"]:
-        """What equations read of parameters: all that were declared, then the relations that are events, then the
+        """What equations read of parameters: all that were declared, then the hidden discrete variables, then all
         discrete variables as before an event."""
         array = self.parameters.array
         events = self.plan.events
         if events is None or not len(events.discrete):
-            return array
+            # Without events, hidden discrete variables stay as they start.
+            table = self.plan.flat.parameters
+            if not table.n_relations:
+                return array
+            hidden = jnp.asarray(table.values[table.n_declared : table.n_declared + table.n_relations], array.dtype)
+            return jnp.concatenate([array, jnp.broadcast_to(hidden, (*array.shape[:-1], len(hidden)))], axis=-1)
         values = self.discrete_values
         return jnp.concatenate([array, values[..., events.n_visible :], values], axis=-1)
 
     def holding(self, values: Any) -> "AcausalSystem":
-        """The system while its discrete variables, and after them its relations, have these values."""
+        """The system while its discrete variables, and after them the hidden ones, have these values."""
         events = self.plan.events
         if events is None or not len(events.discrete):
             return self
@@ -192,15 +196,15 @@ class AcausalSystem(eqx.Module):
 
     @property
     def discrete_values(self) -> Float[Array, " q"]:
-        """The values of the discrete variables at the start, and of the relations that are events."""
+        """The values of the discrete variables at the start, and of the hidden ones."""
         events = self.plan.events
         if events is None:
             return jnp.zeros((0,))
         array = self.parameters.array
         visible = array[..., events.discrete[: events.n_visible]]
-        n_relations = len(events.discrete) - events.n_visible
-        live = jnp.full((*visible.shape[:-1], n_relations), LIVE, array.dtype)
-        return jnp.concatenate([visible, live if self.modes is None else self.modes], axis=-1)
+        starts = self.plan.flat.parameters.values[events.discrete[events.n_visible :]]
+        hidden = jnp.broadcast_to(jnp.asarray(starts, array.dtype), (*visible.shape[:-1], len(starts)))
+        return jnp.concatenate([visible, hidden if self.modes is None else self.modes], axis=-1)
 
     @property
     def discretes(self) -> list[str]:
@@ -270,7 +274,7 @@ class AcausalSystem(eqx.Module):
     @property
     def is_constrained(self) -> bool:
         """Whether a state must satisfy hidden constraints, or carries unknowns of nonlinear blocks."""
-        return bool(self.plan.n_constraints or len(self.plan.carried))
+        return bool(self.plan.n_projected or len(self.plan.carried))
 
     def constraint_residual(self, t: Any, x: Float[Array, " n"], args: Any = None) -> Float[Array, " m"]:
         """The residuals of all hidden constraints at a state."""

@@ -18,6 +18,7 @@ from ..linear.written_out import UNROLLED, solve, solve_dense
 from ..lowering.gather import Gather, entries, take, times
 from ..lowering.plan import ConstraintGroup, PlannedRow, SystemPlan
 from ..lowering.plan_events import EventPlan
+from ..lowering.plan_held import HeldPlan
 from ..lowering.program import Program
 from ..model.evaluate_numpy import Networks
 from ..solvers.field_size import is_large
@@ -247,15 +248,42 @@ class SystemAt:
         values = [jnp.reshape(v, (-1,)) for v in self.constraints(state)]
         return jnp.concatenate(values) if values else jnp.zeros((0,), self.dtype)
 
+    def held(self, x: Any) -> tuple[Any, Any]:
+        """Of the constraints that come and go with modes: 1.0 where one holds, 0.0 otherwise, shape (held,), and all
+        levels, shape (levels,), which are zero while it does."""
+        plan = self._held()
+        state = self.split(x)
+        active = self._filled(self.run(plan.active_program, state, Refinement.NONE), plan.active)
+        return active, self._filled(self.run(plan.level_program, state, Refinement.ONCE), plan.level)
+
+    def held_forces(self, x: Any) -> Any:
+        """What those that only push exert, shape (held,), zero for all others."""
+        plan = self._held()
+        return self._filled(self.run(plan.force_program, self.split(x), Refinement.ONCE), plan.force)
+
+    def _held(self) -> HeldPlan:
+        if self.plan.held is None:
+            raise ModelError("no constraint of this system comes and goes with modes")
+        return self.plan.held
+
+    def _projected_onto(self, x: Any) -> Any:
+        """All residuals that states are projected onto: zero, whatever the state, where a mode does not ask for one."""
+        residuals = self.constraint_vector(self.split(x))
+        if self.plan.held is None:
+            return residuals
+        active, levels = self.held(x)
+        holds = active[self.plan.held.table.owner] > 0
+        return jnp.concatenate([residuals, jnp.where(holds, levels, 0.0)])
+
     def project(self, x: Any, iterations: int) -> Any:
-        """The state moved onto the hidden constraints by Gauss–Newton steps of least (nominal-weighted) norm, and the
-        tearing variables of nonlinear blocks refined."""
+        """The state moved onto the hidden constraints, and onto those of the modes at hand, by Gauss–Newton steps of
+        least (nominal-weighted) norm, and the tearing variables of nonlinear blocks refined."""
         plan = self.plan
         state = self.split(x)
-        if plan.n_constraints and iterations > 1 and is_large(self._least_norm_step, state):
+        if plan.n_projected and iterations > 1 and is_large(self._least_norm_step, state):
             state, _ = jax.lax.scan(lambda state, _: (self._least_norm_step(state), None), state, length=iterations)
         else:
-            for _ in range(iterations if plan.n_constraints else 0):
+            for _ in range(iterations if plan.n_projected else 0):
                 state = self._least_norm_step(state)
         if len(plan.carried):
             state = self.refined(state, Refinement.ONCE if iterations == 1 else Refinement.ROOT)
@@ -265,7 +293,7 @@ class SystemAt:
         plan = self.plan
         n = len(plan.states)
         weight = plan.nominal**2
-        if isinstance(state, tuple) and plan.n_constraints <= UNROLLED:
+        if isinstance(state, tuple) and plan.n_constraints <= UNROLLED and plan.held is None:
             rest = state[n:]
 
             def h(*x):
@@ -293,15 +321,22 @@ class SystemAt:
         x, rest = array[:n], array[n:]
 
         def vector(x):
-            return self.constraint_vector(self.split(jnp.concatenate([x, rest])))
+            return self._projected_onto(jnp.concatenate([x, rest]))
 
         value, pull = jax.vjp(vector, x)
         jacobian = jax.vmap(lambda e: pull(e)[0])(jnp.eye(value.shape[0], dtype=self.dtype))
         w = jnp.asarray(weight[:n], self.dtype)
         # Each constraint in units of its gradient: multiplied by 1e9 it is projected onto alike.
-        unit = 1 / jnp.sqrt(jnp.sum(jax.lax.stop_gradient(jacobian) ** 2 * w, axis=1))
+        size = jnp.sqrt(jnp.sum(jax.lax.stop_gradient(jacobian) ** 2 * w, axis=1))
+        absent: Any = None
+        if plan.held is not None:  # a row that asks for nothing is zero, and is left out
+            active, _ = self.held(array)
+            absent = jnp.append(jnp.zeros(plan.n_constraints, self.dtype), 1 - active[plan.held.table.owner])
+            size = size + absent
+        unit = 1 / size
         jacobian, value = jacobian * unit[:, None], value * unit
-        multiplier = jnp.linalg.solve((jacobian * w) @ jacobian.T, value)
+        gram = (jacobian * w) @ jacobian.T
+        multiplier = jnp.linalg.solve(gram if absent is None else gram + jnp.diag(absent), value)
         return self.split(jnp.concatenate([x - w * (jacobian.T @ multiplier), rest]))
 
     # --- events ------------------------------------------------------------------------------------------------

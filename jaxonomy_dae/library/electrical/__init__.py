@@ -37,5 +37,6 @@ from .sources import VoltageControlledVoltage as VoltageControlledVoltage
 from .sources import VoltageSource as VoltageSource
 from .switching import IdealDiode as IdealDiode
 from .switching import IdealThyristor as IdealThyristor
+from .switching import JoiningSwitch as JoiningSwitch
 from .switching import Switch as Switch
 from .switching import TimedSwitch as TimedSwitch

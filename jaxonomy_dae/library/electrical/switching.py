@@ -3,8 +3,8 @@
 import sympy
 from sympy import And
 
-from ...errors import ModelError
 from ...modeling import NONNEGATIVE, Eq, EqnEnv, Value, assign
+from ..arguments import yes_or_no
 from .two_pin import TwoPin
 
 
@@ -42,9 +42,7 @@ class TimedSwitch(TwoPin):
         instant = self.parameter("time", time, unit="s")
         on = self.parameter("Ron", Ron, unit="Ohm", bounds=NONNEGATIVE)
         off = self.parameter("Goff", Goff, unit="S", bounds=NONNEGATIVE)
-        if opens not in (True, False):
-            raise ModelError(f"'{name}': opens is True or False; got {opens!r}")
-        closed = self.discrete("closed", start=int(opens), unit="1")
+        closed = self.discrete("closed", start=yes_or_no(opens, name, "opens"), unit="1")
         v, i = self._two_pins()
         self.either(Eq(closed, 1), v - on * i, i - off * v)
         self.declare_dissipation(v * i)
@@ -91,3 +89,22 @@ class IdealThyristor(TwoPin):
         self.declare_dissipation(v * i)
         self.when(And(drop < 0, fire > 0.5), assign(active, 1), on=Eq(active, 0), at_start=True)
         self.when(current <= 0, assign(active, 0), on=Eq(active, 1), at_start=True)
+
+
+class JoiningSwitch(TwoPin):
+    """An ideal switch between nodes whose voltages capacitors hold: v = 0 while it is closed, i = 0 while it is open.
+
+    Where it closes, voltages jump to one by a pulse of the current, and charge is conserved. For that, capacitors and
+    voltage sources must determine the voltage across the open switch; anywhere else use `Switch`. It is closed while
+    the input `u` is above `threshold`; the discrete variable `closed` is 1 or 0.
+    """
+
+    def __init__(self, ev: EqnEnv, name: str, threshold: Value = 0.5):
+        super().__init__(ev, name)
+        level = self.parameter("threshold", threshold)
+        u = self.input("u")
+        closed = self.discrete("closed", start=0, unit="1")
+        v, i = self._two_pins()
+        self.either(Eq(closed, 1), v, i, order=1)
+        self.when(u > level, assign(closed, 1), on=Eq(closed, 0), at_start=True)
+        self.when(u < level, assign(closed, 0), on=Eq(closed, 1), at_start=True)

@@ -25,6 +25,7 @@ from .bodies import MassiveLink as MassiveLink
 from .bodies import World as World
 from .forces import Force as Force
 from .forces import SpringDamper as SpringDamper
+from .forces import String as String
 from .forces import Torque as Torque
 from .joints import Prismatic as Prismatic
 from .joints import Revolute as Revolute

@@ -2,7 +2,8 @@
 
 from sympy import sqrt
 
-from ...modeling import NONNEGATIVE, Component, Eq, EqnEnv, Planar, Value, der
+from ...modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Planar, Value, der
+from ..arguments import yes_or_no
 from .two_frames import TwoFrames
 
 
@@ -46,6 +47,40 @@ class SpringDamper(TwoFrames):
         )
         self.declare_energy(stiffness * (s - relaxed) ** 2 / 2)
         self.declare_dissipation(damping * v**2)
+
+
+class String(TwoFrames):
+    """A massless string that cannot be stretched, between two frames that it keeps no further apart than its length.
+
+        dx = frame_b.x − frame_a.x,   dy = frame_b.y − frame_a.y,   s = √(dx² + dy²) ≤ length
+        frame_b.fx = f·dx/s,   frame_b.fy = f·dy/s,   0 = frame_a.f + frame_b.f
+
+    While s < length it is slack, and f = 0; while it is taut, the force `f` ≥ 0 pulls its ends together. Where it
+    becomes taut, the speed at which its ends part is taken away, by an impulse (Pfeiffer & Glocker 1996, "Multibody
+    Dynamics with Unilateral Contacts", chapter 8). The discrete variable `taut` is 1 or 0.
+
+    **Arguments:**
+
+    - `length` > 0: metre.
+    - `taut`: whether it is at the initial time, where s = length and ds/dt = 0 must hold then.
+    - `clearance` > 0: by how much it may be overstretched just after it has become slack (metre).
+    """
+
+    def __init__(
+        self, ev: EqnEnv, name: str, length: Value = 1.0, taut: bool = False, clearance: Value = 1e-9
+    ):  # fmt: skip
+        super().__init__(ev, name)
+        longest = self.parameter("length", length, unit="m", bounds=POSITIVE)
+        tiny = self.parameter("clearance", clearance, unit="m", bounds=POSITIVE)
+        a, b = self._two_frames()
+        f = self.variable("f", unit="N")
+        dx, dy = b.x - a.x, b.y - a.y
+        s = sqrt(dx**2 + dy**2)
+        self.output("s", s, unit="m")
+        self.add_equations(Eq(b.fx, f * dx / s), Eq(b.fy, f * dy / s), Eq(a.tau, 0), Eq(b.tau, 0))
+        self.add_equations(Eq(a.fx + b.fx, 0), Eq(a.fy + b.fy, 0))
+        start = yes_or_no(taut, name, "taut")
+        self.complementary(longest - s, f, "taut", order=2, clearance=tiny, start=start)
 
 
 class Force(Component):

@@ -1,0 +1,92 @@
+"""Parts that meet and part: stops, ropes, dog clutches. Nothing gives way: speeds jump, by impulses that conserve
+momentum over all parts that are joined at that instant (Pfeiffer & Glocker 1996, "Multibody Dynamics with Unilateral
+Contacts").
+"""
+
+from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Rotational, Translational, Value, assign, der
+from .arguments import yes_or_no
+
+CLEARANCE = 1e-9  # metre
+REST_SPEED = 1e-3  # metre per second
+
+
+class HardStop(Component):
+    """A rigid stop between two flanges: s = flange_b.x − flange_a.x does not fall below `length`.
+
+    While s > length nothing is transmitted; while the flanges touch, the force `f` ≥ 0 pushes them apart. Where they
+    meet at a speed v, they part again at `restitution`·v (Newton 1687), unless that is not above `rest_speed`: then
+    they stay, until f has fallen to zero. The discrete variable `touching` is 1 or 0.
+
+    **Arguments:**
+
+    - `length`: metre. `restitution`: from 0 to 1. `rest_speed` ≥ 0: metre per second.
+    - `touching`: whether they touch at the initial time, where s = length and der(s) = 0 must hold then.
+    - `clearance` > 0: by how much the flanges may overlap just after f has let go (metre).
+    """
+
+    def __init__(
+        self,
+        ev: EqnEnv,
+        name: str,
+        length: Value = 0.0,
+        restitution: Value = 0.0,
+        rest_speed: Value = REST_SPEED,
+        touching: bool = False,
+        clearance: Value = CLEARANCE,
+    ):
+        super().__init__(ev, name)
+        least = self.parameter("length", length, unit="m")
+        back = self.parameter("restitution", restitution, unit="1", bounds=(0.0, 1.0))
+        slow = self.parameter("rest_speed", rest_speed, unit="m/s", bounds=NONNEGATIVE)
+        tiny = self.parameter("clearance", clearance, unit="m", bounds=POSITIVE)
+        a, b = self.port("flange_a", Translational), self.port("flange_b", Translational)
+        s, f = self.variable("s", unit="m"), self.variable("f", unit="N")
+        self.add_equations(Eq(s, b.x - a.x), Eq(b.f, -f), Eq(a.f + b.f, 0))
+        start = yes_or_no(touching, name, "touching")
+        self.complementary(
+            s - least, f, "touching", order=2, restitution=back, rest_speed=slow, clearance=tiny, start=start
+        )
+
+
+class Rope(Component):
+    """A massless rope that cannot be stretched, between two flanges: s = flange_b.x − flange_a.x ≤ length.
+
+    While s < length it is slack; while it is taut, the force `f` ≥ 0 pulls its ends together. Where it becomes taut,
+    the speed at which its ends part is taken away. The discrete variable `taut` is 1 or 0.
+
+    **Arguments:**
+
+    - `length`: metre. `taut`: whether it is at the initial time, where s = length and der(s) = 0 must hold then.
+    - `clearance` > 0: by how much it may be overstretched just after it has become slack (metre).
+    """
+
+    def __init__(
+        self, ev: EqnEnv, name: str, length: Value = 1.0, taut: bool = False, clearance: Value = CLEARANCE
+    ):  # fmt: skip
+        super().__init__(ev, name)
+        most = self.parameter("length", length, unit="m")
+        tiny = self.parameter("clearance", clearance, unit="m", bounds=POSITIVE)
+        a, b = self.port("flange_a", Translational), self.port("flange_b", Translational)
+        s, f = self.variable("s", unit="m"), self.variable("f", unit="N")
+        self.add_equations(Eq(s, b.x - a.x), Eq(b.f, f), Eq(a.f + b.f, 0))
+        start = yes_or_no(taut, name, "taut")
+        self.complementary(most - s, f, "taut", order=2, clearance=tiny, start=start)
+
+
+class DogClutch(Component):
+    """A clutch whose teeth lock two shafts: they turn as one while it is engaged, and freely while it is not.
+
+    It engages where the input `u` rises above 0.5: the speeds jump to one, by an impulse of the torque `tau` that flows
+    from flange_a to flange_b. w_rel = der(flange_b.phi − flange_a.phi). The discrete variable `engaged` is 1 or 0.
+    """
+
+    def __init__(self, ev: EqnEnv, name: str):
+        super().__init__(ev, name)
+        a, b = self.port("flange_a", Rotational), self.port("flange_b", Rotational)
+        u = self.input("u", unit="1")
+        w, tau = self.variable("w_rel", unit="rad/s"), self.variable("tau", unit="N*m")
+        engaged = self.discrete("engaged", start=0, unit="1")
+        self.add_equations(Eq(w, der(b.phi - a.phi)), Eq(b.tau, -tau), Eq(a.tau + b.tau, 0))
+        self.either(Eq(engaged, 1), w, tau, order=1)
+        self.when(u > 0.5, assign(engaged, 1), on=Eq(engaged, 0), at_start=True)
+        self.when(u < 0.5, assign(engaged, 0), on=Eq(engaged, 1), at_start=True)
