@@ -44,7 +44,7 @@ demo: $(VENV)/.stamp-demo
 # Most of the time goes into compiling programs that run once. XLA's older code generator takes half of it and makes
 # slower programs; test-floors runs with the one that users have.
 QUICK_COMPILES := XLA_FLAGS="$$XLA_FLAGS --xla_cpu_use_fusion_emitters=false"
-IN_PARALLEL := -n auto --dist loadfile
+IN_PARALLEL := -n auto --dist loadscope
 
 test: $(VENV)/.stamp-dev
 	$(QUICK_COMPILES) $(BIN)/python -m pytest $(IN_PARALLEL)

@@ -100,9 +100,8 @@ ADJOINTS = {
 }
 
 
-@pytest.mark.parametrize(
-    "adjoint", ["stored", *(pytest.param(a, marks=pytest.mark.slow) for a in ("recursive", "forward"))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("adjoint", [*ADJOINTS])
 def test_derivatives_of_a_string(bob, adjoint):
     jacobian = jax.jacfwd if adjoint == "forward" else jax.jacrev
     found = jacobian(lambda v0: flown(bob, v0, adjoint=ADJOINTS[adjoint])[0])(5.2)
@@ -174,6 +173,7 @@ BOUNCES = [0.451523640985731, 1.1739614665629, 1.75191172702464, 2.2142719353940
 AT_3, BY_RESTITUTION, BY_HEIGHT = 0.0687074609657657, 1.16388772098508, 0.0917386610428829
 
 
+@pytest.mark.slow
 @checks(
     {HardStop: ("closed form of a bouncing ball", "height", "bounces", "by restitution", "by height")}, origin=ORIGIN
 )
@@ -332,6 +332,7 @@ def test_a_dog_clutch():
 SHAFTS = {"J": (1.0, 2.0, 0.5, 3.0), "w": (10.0, -1.0, 4.0, 0.5)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("closed", [(1, 1, 1), (1, 0, 1), (0, 1, 1)])
 def test_dog_clutches_that_close_at_once(closed):
     """Four shafts; those joined at the start turn with their common momentum, whatever the order."""
@@ -377,6 +378,7 @@ def test_two_capacitors_joined():
 # --- what is refused -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_run_that_cannot_begin_in_its_mode(bob):
     with pytest.raises(jd.InitializationError, match=r"cannot begin at t=0 in the mode of 'bob: L - sqrt"):
         simulate(bob, 1.0, initial={"bob.y": -0.7})

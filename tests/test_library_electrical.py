@@ -317,6 +317,7 @@ def test_circuits_with_storage():
         measured(name, solution[name], true, 2e-7 * np.abs(true).max())
 
 
+@pytest.mark.slow
 def test_gradients_of_a_circuit():
     """Of the end's values with respect to every parameter: reverse against forward mode."""
     system, expected = dynamic()

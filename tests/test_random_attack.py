@@ -44,9 +44,19 @@ def test_a_random_model(family, seed):
     assert outcome.kind in ("right", "refused"), f"({case.note}): {outcome.kind}: {outcome.text[:1000]}"
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("family, first", [(f, s) for f, count in COUNTS.items() for s in range(0, count, 100)])
-def test_a_hundred_random_models(family, first):
+def hundreds(family: str) -> type:
+    """The slow tests of a family, as a class: classes may run beside each other, on several workers."""
+
+    class Hundreds:
+        @pytest.mark.slow
+        @pytest.mark.parametrize("first", range(0, COUNTS[family], 100))
+        def test_a_hundred_random_models(self, first):
+            judge_a_hundred(family, first)
+
+    return Hundreds
+
+
+def judge_a_hundred(family: str, first: int):
     """In a process of its own, whose XLA optimizes nothing: every program runs once."""
     command = [sys.executable, "-m", "benchmarks.attack", "--family", family, "--count", "100", "--seed", str(first)]
     run = subprocess.run([*command, "--moving", "50", "--show", "9"], cwd=ROOT, capture_output=True, text=True)
@@ -55,3 +65,13 @@ def test_a_hundred_random_models(family, first):
     right, refused, *others = (int(n) for n in counts.split()[1:7])
     assert right + refused + sum(others) == 100 and not any(others), "\n".join(failed)
     assert right >= 50  # most models are well posed
+
+
+TestResistors = hundreds("resistors")
+TestCircuits = hundreds("circuits")
+TestRods = hundreds("rods")
+TestGears = hundreds("gears")
+TestThermal = hundreds("thermal")
+TestPipes = hundreds("pipes")
+TestDescriptors = hundreds("descriptors")
+TestMechanisms = hundreds("mechanisms")

@@ -438,7 +438,8 @@ class Thermometer(Component):
 
 # --- the library -------------------------------------------------------------------------------------------------
 
-ANY_UNIT = ("Switch.u", "Switch.threshold")  # compared with each other alone; as all signals, they may have any unit
+# Compared with each other alone; as all signals, they may have any unit.
+ANY_UNIT = ("Switch.u", "Switch.threshold", "JoiningSwitch.u", "JoiningSwitch.threshold")
 
 
 @pytest.mark.parametrize("domain", domains())
