@@ -26,7 +26,7 @@ stored, supplied and lost, as the components declare it, relative to the largest
 
 The tests of these systems compare their gradients too: of one output by every parameter that can be set, reverse with
 forward mode to 1e-8 of the largest derivative (each in units of its parameter's value), and with differences of the
-reference to 1e-5. Of the pack, reverse and forward mode are compared along one direction of all its parameters.
+reference to 1e-5. Of the pack, the 2,323 derivatives in both modes are those of a shorter run at rtol 1e-6.
 
 | System | Equations | States | Solver | Error | Energy |
 |---|---|---|---|---|---|

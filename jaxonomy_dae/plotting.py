@@ -73,7 +73,7 @@ def plot_solution(solution: "Solution", *names: str, ax: Any = None, events: boo
 
 def _entries(solution: "Solution", name: str) -> list[str]:
     """The names of the entries of an array, or the one name of a variable."""
-    entries = solution._entries(name)
+    entries = solution.system.plan.entries(name)
     return [name] if entries is None else entries[0]
 
 

@@ -213,12 +213,12 @@ class FreeMass(Component):
     def __init__(self, ev: EqnEnv, name: str, M: float = 1.0, initial_position=None, initial_velocity=None):
         super().__init__(ev, name)
         m = self.parameter("M", M, unit="kg")
-        x0 = self.parameter("initial_position", initial_position or 0.0)
+        s0 = self.parameter("initial_position", initial_position or 0.0)
         v0 = self.parameter("initial_velocity", initial_velocity or 0.0)
         flange = self.port("flange", Translational)
-        x = self.variable("x", start=x0, fixed=initial_position is not None)
+        s = self.variable("s", start=s0, fixed=initial_position is not None)
         v = self.variable("v", start=v0, fixed=initial_velocity is not None)
-        self.add_equations(Eq(x, flange.x), Eq(der(x), v), Eq(m * der(v), flange.f))
+        self.add_equations(Eq(s, flange.s), Eq(der(s), v), Eq(m * der(v), flange.f))
 
 
 def rc_circuit(R: float = 2.0, C: float = 0.5, V: float = 3.0, v0: float = 0.0) -> AcausalSystem:

@@ -269,7 +269,7 @@ def test_poles_and_their_gradient():
     system = oscillator()
 
     def pole(damping):
-        space = linearize(system.with_parameters({"damper.D": damping}), [], ["mass.x"])
+        space = linearize(system.with_parameters({"damper.D": damping}), [], ["mass.s"])
         return space.poles()[1]
 
     a, w = 0.6 / 4, np.sqrt(2.5 - 0.15**2)
@@ -306,7 +306,7 @@ def test_coordinates_on_constraints():
     with pytest.raises(ModelError, match=r"'pend\.z' is not a state"):
         linearize(system, [], [], states=["pend.x", "pend.z"])
     with pytest.raises(ModelError, match="no hidden constraint makes a state redundant"):
-        linearize(oscillator(), [], [], states=["mass.x"])
+        linearize(oscillator(), [], [], states=["mass.s"])
 
 
 def test_an_implicit_block_is_eliminated():
@@ -331,7 +331,7 @@ def test_arguments_of_linearize():
     with pytest.raises(ModelError, match=r"write outputs=\['motor\.rotor\.w'\]"):
         linearize(motor(), {"source.u": 0.0}, "motor.rotor.w")
     with pytest.raises(ModelError, match="stands twice"):
-        linearize(oscillator(), [], ["mass.x", "mass.x"])
+        linearize(oscillator(), [], ["mass.s", "mass.s"])
     ev = EqnEnv()
     shaker, mass = tr.PositionSource(ev, "shaker"), tr.Mass(ev, "mass")
     driven = compiled(shaker, mass, connect=[(shaker.flange, mass.flange)])
@@ -365,7 +365,7 @@ def test_to_control():
         rtol=ROUNDING,
     )
     with pytest.raises(ModelError, match=r"needs inputs and outputs: name inputs in linearize"):
-        linearize(oscillator(), [], ["mass.x"]).to_control()
+        linearize(oscillator(), [], ["mass.s"]).to_control()
 
 
 # --- sweeps ------------------------------------------------------------------------------------------------------
@@ -436,16 +436,16 @@ def test_arguments_of_a_sweep():
 def test_solutions_as_tables():
     ts = jnp.array([0.0, 0.4, 1.1])
     solution = simulate(oscillator(), 1.1, ts=ts)
-    frame = solution.to_pandas("mass.x", "spring.f")
-    assert list(frame.columns) == ["mass.x", "spring.f"] and frame.index.name == "time"
+    frame = solution.to_pandas("mass.s", "spring.f")
+    assert list(frame.columns) == ["mass.s", "spring.f"] and frame.index.name == "time"
     np.testing.assert_array_equal(frame.index, ts)
     np.testing.assert_array_equal(frame["spring.f"], solution["spring.f"])
     assert list(solution.to_pandas().columns) == solution.system.variables
     data = solution.to_xarray()
     assert data["mass.v"].dims == ("time",) and data["mass.v"].attrs == {"units": "m/s"}
     np.testing.assert_array_equal(data["mass.v"], solution["mass.v"])
-    batch = eqx.filter_vmap(lambda x: simulate(oscillator(), 1.1, ts=ts, initial={"mass.x": x}))(jnp.ones(2))
-    assert batch.to_xarray("mass.x")["mass.x"].dims == ("batch_0", "time")
+    batch = eqx.filter_vmap(lambda x: simulate(oscillator(), 1.1, ts=ts, initial={"mass.s": x}))(jnp.ones(2))
+    assert batch.to_xarray("mass.s")["mass.s"].dims == ("batch_0", "time")
     with pytest.raises(ModelError, match="this is a batch of shape"):
         batch.to_pandas()
 

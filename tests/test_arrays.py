@@ -421,11 +421,6 @@ def used_twice():
     diagram.add_array(ev, "cell", Cell, 2)
 
 
-def read_in_a_list():
-    system = ladder(3, True)
-    system.observe(["cell.c.v", "source.v"], 0.0, system.initialize())
-
-
 def wrong_values():
     ladder(3, True).with_parameters({"cell.r.R": np.ones(4)})
 
@@ -461,14 +456,13 @@ def wrong_start():
         (given_twice, r"parameter 'cell\[0\].r.R' is given twice, by its own name and as part of an array"),
         (started_twice, r"initial: 'cell\[0\].c.v' is given twice"),
         (used_twice, r"the diagram has 'cell' already: give the array another name"),
-        (read_in_a_list, r"'cell.c.v' is an array of shape \(3,\): name one of its entries, such as 'cell\[0\].c.v'"),
         (
             wrong_values,
             r"parameter 'cell.r.R' is an array of shape \(3,\): give a number or that shape; got shape \(4,\)",
         ),
         (value_out_of_bounds, r"parameter 'cell\[2\].c.C' must lie in \(0, inf\); got -2"),
         (every_step_of_many, r"reserves max_steps \+ 1 = 10000001 rows for 100 states, 7.5 GiB: say when to save, ts="),
-        (wrong_start, r"initial: 'cell.c.v' is an array of shape \(3\): give a number or an array of that shape"),
+        (wrong_start, r"initial: 'cell.c.v' is an array of shape \(3,\): give a number or an array of that shape"),
     ],
 )
 def test_bad_input(attempt, message):

@@ -142,8 +142,8 @@ def test_the_last_row_inside_jit():
     system = oscillator()
 
     def last(x0, read=-1):
-        solution = simulate(system, 1.1, initial={"mass.x": x0}, rtol=1e-9, atol=1e-11, max_steps=64)
-        return solution["mass.x"][read], solution.ts[read], solution["spring.f"][read]
+        solution = simulate(system, 1.1, initial={"mass.s": x0}, rtol=1e-9, atol=1e-11, max_steps=64)
+        return solution["mass.s"][read], solution.ts[read], solution["spring.f"][read]
 
     x0 = jnp.array(0.2)
     unit = damped_oscillation(np.array(1.1), x0=1.0, v0=0.0)[0]

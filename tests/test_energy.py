@@ -150,7 +150,7 @@ def test_a_speed_that_the_model_does_not_have():
     solution = simulate(system, 2.0, ts=jnp.linspace(0.0, 2.0, 5), inputs=inputs, **TIGHT)
     t = np.asarray(solution.ts)
     with pytest.raises(ModelError, match="occurs nowhere"):
-        solution["der(force.flange.x)"]
+        solution["der(force.flange.s)"]
     speed = np.asarray(solution["mass.v"]) + 3.0 * np.cos(2.0 * t) / 3.0
     np.testing.assert_allclose(solution.supply(), 1.5 * np.sin(2.0 * t) * speed, rtol=1e-12, atol=1e-15)
     assert_energy_balance(solution, rtol=BALANCED)
@@ -319,7 +319,7 @@ def test_a_component_that_declares_nothing_is_named():
         def __init__(self, ev, name):
             super().__init__(ev, name)
             flange = self.port("flange", Translational)
-            self.add_equations(Eq(flange.f, 3.0 * der(flange.x)))
+            self.add_equations(Eq(flange.f, 3.0 * der(flange.s)))
 
     ev = EqnEnv()
     mass, brake = tr.Mass(ev, "mass", initial_position=0.0, initial_velocity=1.0), Brake(ev, "brake")

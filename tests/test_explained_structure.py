@@ -428,7 +428,7 @@ def test_parts_of_a_hundred_thousand_equations():
         (lambda: model({"g": "Ground"}), ["nothing is connected to 'g.p': nothing flows there"]),
         (lambda: model({"a": "Mass", "b": "Mass"}, "a.flange b.flange",
                        a={"initial_position": 1.0}, b={"initial_position": 1.0}),
-         ["'a.x' and 'b.x' are one quantity, and both starts are fixed: they must agree; one of them is enough"]),
+         ["'a.s' and 'b.s' are one quantity, and both starts are fixed: they must agree; one of them is enough"]),
         (lambda: model({"a": "Mass", "b": "Mass", "r": "Rod"}, "a.flange r.flange_a", "b.flange r.flange_b",
                        a={"initial_velocity": 1.0}, b={"initial_velocity": 1.0}),
          ["2 starts are fixed for 1 degree of freedom, those of 'a.v' and 'b.v': they must agree; if not, free 1 of "

@@ -196,9 +196,9 @@ def test_rigid_rod_between_masses():
     diagram = AcausalDiagram().connect(m1.flange, (rod := Rod(EV, "rod", length=1.5)).flange_a)
     diagram.connect(rod.flange_b, m2.flange)
     system = AcausalCompiler(EV, diagram)()
-    assert system.report.index == 3 and system.states == ["m1.x", "m1.v"]
+    assert system.report.index == 3 and system.states == ["m1.s", "m1.v"]
     solution = simulate(system, 1.0, ts=np.array([1.0]), rtol=1e-9)
-    assert float(solution["m2.x"][0]) == pytest.approx(3.5, rel=1e-10)
+    assert float(solution["m2.s"][0]) == pytest.approx(3.5, rel=1e-10)
 
 
 # --- cancellation that structure cannot see --------------------------------------------------------------------
@@ -300,4 +300,4 @@ def test_ladder_against_scipy():
 def test_unused_wall_is_fine():
     wall, mass = FixedPosition(EV, "wall", position=1.0), Mass(EV, "m", initial_position=0.0, initial_velocity=1.0)
     system = compiled(wall, mass)
-    assert system.states == ["m.x", "m.v"]
+    assert system.states == ["m.s", "m.v"]

@@ -100,7 +100,7 @@ TOO_MANY = (
 
 def texts():
     """All texts, as one text: computed in other processes too."""
-    rest = {"mass.x": 0.3, "mass.v": 0.0, "der(mass.v)": 0.0}
+    rest = {"mass.s": 0.3, "mass.v": 0.0, "der(mass.v)": 0.0}
     model = oscillator()
     return [
         str(pendulum().initialization_report(initial={"pend.x": 0.6, "pend.vx": 1.6})),
@@ -192,7 +192,7 @@ def test_residuals_are_sorted_and_named():
 def test_no_report_inside_jit():
     system = oscillator()
     with pytest.raises(ModelError, match="outside jit"):
-        jax.jit(lambda x: system.initialization_report(initial={"mass.x": x}).time)(1.0)
+        jax.jit(lambda x: system.initialization_report(initial={"mass.s": x}).time)(1.0)
 
 
 # --- parameters solved for ---------------------------------------------------------------------------------------
@@ -286,7 +286,7 @@ def test_names_to_solve_for_are_checked():
     with pytest.raises(ModelError, match=r"write solve_for=\['spring\.K'\]"):
         system.initialize(solve_for="spring.K")
     with pytest.raises(ModelError, match="is a variable"):
-        system.initialize(solve_for=["mass.x"])
+        system.initialize(solve_for=["mass.s"])
 
 
 # --- singular blocks ---------------------------------------------------------------------------------------------
@@ -424,7 +424,7 @@ def test_a_hanging_load_in_equilibrium():
         connect=[(wall.flange, s1.flange_a, d.flange_a), (s1.flange_b, m1.flange, s2.flange_a, d.flange_b),
                  (s2.flange_b, m2.flange)],
     )  # fmt: skip
-    initial = {"m1.x": 1.0, "m2.x": 3.0, "der(m1.v)": 0.0, "der(m2.v)": 0.0}
+    initial = {"m1.s": 1.0, "m2.s": 3.0, "der(m1.v)": 0.0, "der(m2.v)": 0.0}
     _, found = system.initialize(initial=initial, solve_for=["s1.length", "s2.length"])
     assert float(found.parameters["s1.length"]) == pytest.approx(1.0, rel=1e-12)
     assert float(found.parameters["s2.length"]) == pytest.approx(2.0, rel=1e-12)

@@ -130,12 +130,12 @@ def test_targets_inside_other_components(by_name):
 def test_a_corrected_position_moves_what_is_attached(mode):
     """x' = v + N is the velocity that the damper sees: M·v' = −K·x − D·(v + N)."""
     system = oscillator(
-        drag_on("x", network=lambda u: 0.5 * u), compiler={"state_selection": mode}, M=2.0, D=0.6, K=5.0
+        drag_on("s", network=lambda u: 0.5 * u), compiler={"state_selection": mode}, M=2.0, D=0.6, K=5.0
     )  # fmt: skip
-    at = {"mass.x": 0.4, "mass.v": -0.3}
+    at = {"mass.s": 0.4, "mass.v": -0.3}
     x = jnp.array([at[n] for n in system.states])
     slope = dict(zip(system.states, system.vector_field(0.0, x), strict=True))
-    assert float(slope["mass.x"]) == pytest.approx(-0.3 + 0.2, rel=1e-12)
+    assert float(slope["mass.s"]) == pytest.approx(-0.3 + 0.2, rel=1e-12)
     assert float(slope["mass.v"]) == pytest.approx((-5.0 * 0.4 - 0.6 * (-0.3 + 0.2)) / 2.0, rel=1e-12)
 
 

@@ -182,11 +182,11 @@ def test_a_ball_on_a_stop():
 
     def height(e, h):
         return simulate(system.with_parameters({"stop.restitution": e, "mass.initial_position": h}), 3.0, **given)[
-            "mass.x"
+            "mass.s"
         ][-1]
 
     solution = simulate(system, 3.0, **given)
-    measured("height", solution["mass.x"][-1], AT_3, SMOOTH)
+    measured("height", solution["mass.s"][-1], AT_3, SMOOTH)
     measured("bounces", solution.events.ts[:6], BOUNCES, 1e-10)
     by = jax.grad(height, (0, 1))(0.8, 1.0)
     measured("by restitution", by[0], BY_RESTITUTION, SMOOTH)
@@ -206,7 +206,7 @@ def test_a_ball_comes_to_rest():
     t0 = np.sqrt(2 / 9.81)
     times = t0 + np.concatenate([[0.0], np.cumsum(2 * t0 * e ** np.arange(1, count + 1))])
     np.testing.assert_allclose(solution.events.ts[: count + 1], times, atol=1e-9)
-    assert abs(float(solution["mass.x"][-1])) < 1e-12 and abs(float(solution["mass.v"][-1])) < 1e-12
+    assert abs(float(solution["mass.s"][-1])) < 1e-12 and abs(float(solution["mass.v"][-1])) < 1e-12
     np.testing.assert_allclose(solution["stop.f"][-1], 9.81 * M, rtol=1e-12)
 
 
@@ -233,7 +233,7 @@ def test_a_mass_is_lifted_off_and_set_down():
     np.testing.assert_allclose(solution.events.ts[:2], [lift, land], atol=1e-9)
     inside = (ts > lift) & (ts < land)
     # The flight begins where all of x, v and the acceleration are zero.
-    np.testing.assert_allclose(solution["mass.x"], np.where(inside, flight(np.asarray(ts)), 0.0), atol=SMOOTH)
+    np.testing.assert_allclose(solution["mass.s"], np.where(inside, flight(np.asarray(ts)), 0.0), atol=SMOOTH)
     np.testing.assert_allclose(solution["stop.f"], np.where(inside, 0.0, g - a * np.sin(ts)), atol=1e-7)
     found = jax.jacrev(lambda g: run(g).events.ts[:2])(g)
     lift_by = 1 / np.sqrt(a**2 - g**2)
@@ -259,7 +259,7 @@ def test_a_rope_between_two_carts():
     measured("events", solution.events.ts[:1], [0.5], 1e-10)
     measured("speeds", [solution["first.v"][-1], solution["second.v"][-1]], [1.0, 1.0], SMOOTH)
     # x(2) = 2 + 1.5·3m/(m + 2), its derivative 9/(m + 2)².
-    measured("by mass", jax.grad(lambda m: run(m)["first.x"][-1])(1.0), 1.0, SMOOTH)
+    measured("by mass", jax.grad(lambda m: run(m)["first.s"][-1])(1.0), 1.0, SMOOTH)
 
 
 @pytest.mark.slow
@@ -275,7 +275,7 @@ def test_equal_masses_exchange_their_speeds():
     solution = simulate(compiled(*carts, *stops, connect=joints), 2.0, **TIGHT)
     np.testing.assert_allclose(solution.events.ts[:2], [0.5, 1.0], atol=1e-10)
     np.testing.assert_allclose([solution[f"m{k}.v"][-1] for k in range(3)], [0.0, 0.0, 2.0], atol=1e-9)
-    np.testing.assert_allclose([solution[f"m{k}.x"][-1] for k in range(3)], [1.0, 2.0, 4.0], atol=1e-8)
+    np.testing.assert_allclose([solution[f"m{k}.s"][-1] for k in range(3)], [1.0, 2.0, 4.0], atol=1e-8)
 
 
 def test_a_jerk_lifts_what_rests_on_the_ground():
@@ -296,8 +296,8 @@ def test_a_jerk_lifts_what_rests_on_the_ground():
     np.testing.assert_allclose(solution.events.ts[0], jerk, atol=1e-10)
     assert float(solution["stop.touching"][-1]) == 0
     since = 0.3 - jerk
-    np.testing.assert_allclose(solution["low.x"][-1], common * since - g * since**2 / 2, atol=1e-9)
-    np.testing.assert_allclose(solution["high.x"][-1], 1 + common * since - g * since**2 / 2, atol=1e-9)
+    np.testing.assert_allclose(solution["low.s"][-1], common * since - g * since**2 / 2, atol=1e-9)
+    np.testing.assert_allclose(solution["high.s"][-1], 1 + common * since - g * since**2 / 2, atol=1e-9)
 
 
 # --- shafts and capacitors that are joined ---------------------------------------------------------------------------

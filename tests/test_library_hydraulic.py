@@ -68,7 +68,7 @@ PUSHED = "closed form of a piston behind a narrow pipe"
         TurbulentPipe: ("SciPy's DOP853 of a node between a valve and a pipe", "tower.level", "pipe.m_flow"),
         Pump: (PUMPED, "pump.w", "pump.dp", "pump.m_flow"),
         Accumulator: (f"{PUMPED}; Boyle's law", "gas.V_fluid", "slow.fluid.p"),
-        Cylinder: (PUSHED, "load.v", "piston.x", "piston.f"),
+        Cylinder: (PUSHED, "load.v", "piston.s", "piston.f"),
     },
     origin="a hundred errors of one step at rtol 1e-10, over a few hundred that decay",
 )
@@ -185,7 +185,7 @@ def test_networks():
     reached, time = 1e-3 * (110e3 - ATMOSPHERE) / drag, 20.0 / drag
     e = np.exp(-TS / time)
     assert_near(solution, "load.v", reached * (1 - e))
-    assert_near(solution, "piston.x", reached * (TS - time * (1 - e)))
+    assert_near(solution, "piston.s", reached * (TS - time * (1 - e)))
     assert_near(solution, "piston.f", 20.0 * reached / time * e)
 
 
@@ -213,7 +213,7 @@ def test_stiff_transmission():
     w = np.sqrt(K / (M + J * ratio**2))
     x = ratio * tau / K * (1 - np.cos(w * TS))
     acceleration = ratio * tau / K * w**2 * np.cos(w * TS)
-    assert_near(solution, "load.x", x)
+    assert_near(solution, "load.s", x)
     assert_near(solution, "shaft.phi", ratio * x)
     assert_near(solution, "cylinder.fluid.p", ATMOSPHERE + (M * acceleration + K * x) / A)
     np.testing.assert_allclose(solution["pump.dp"] * D, -(tau - J * ratio * acceleration), atol=TOLERANCE * tau)

@@ -69,7 +69,7 @@ def model():
     ):
         t = "t" if d is line else "r"
         fixed, push = (line.FixedPosition, line.Force) if d is line else (rot.FixedAngle, rot.Torque)
-        position, speed = ("x", "v") if d is line else ("phi", "w")
+        position, speed = ("s", "v") if d is line else ("phi", "w")
 
         def body(name, m, x0, v0, mass=mass, mass_start=mass_start):
             part = add(mass, name, m, **dict(zip(mass_start, (x0, v0), strict=True)))
@@ -132,7 +132,7 @@ def model():
     x, v = oscillator(*values), oscillator_speed(*values)
     pull, brake = k * (x - left - slack), -d * v
     carried = m1 * (brake - pull) / (m1 + m2) + pull  # m1·x'' = bar.f − pull
-    expected |= {"one.x": x, "two.x": x + length, "coil.f": pull, "oil.f": brake, "bar.f": carried}
+    expected |= {"one.s": x, "two.s": x + length, "coil.f": pull, "oil.f": brake, "bar.f": carried}
 
     # Sun driven by τ, inertias on all three: Lagrange's equations with the sun and the ring free.
     gear = add(Planetary, "gear", 3.0)
@@ -154,7 +154,7 @@ def model():
         join(push.flange, shaft.flange_a)
         join(shaft.flange_b, part.shaft)
         join(part.line, sled.flange)
-        expected[f"{name}_sled.x"] = ratio * 0.5 / (0.1 + ratio**2 * 4.0) * TS**2 / 2
+        expected[f"{name}_sled.s"] = ratio * 0.5 / (0.1 + ratio**2 * 4.0) * TS**2 / 2
     system = compiled(*parts, connect=joined)
     inputs = {"t_push.f": 6.0, "r_push.tau": 6.0, "torque.tau": 1.2}
     inputs |= {f"{n}_torque.tau": 0.5 for n in ("rack", "screw", "wheel")}
@@ -171,7 +171,7 @@ LAGRANGE = "Lagrange's equations, solved by hand"
 
 def pairs(t, d):
     """What is alike on lines and on shafts."""
-    position, speed = ("x", "v") if t == "t" else ("phi", "w")
+    position, speed = ("s", "v") if t == "t" else ("phi", "w")
     moving, held, push, moved, at, scale = (
         (d.Mass, d.FixedPosition, d.Force, d.PositionSource, d.PositionSensor, d.ForceSensor)
         if t == "t"
@@ -197,14 +197,14 @@ def pairs(t, d):
     pairs("t", line)
     | pairs("r", rot)
     | {
-        line.FixedPosition: (OSCILLATION, "one.x", "t_soft_m.x"),
-        line.Spring: (OSCILLATION, "one.x", "coil.f"),
-        line.Damper: (OSCILLATION, "one.x", "oil.f"),
-        line.Rod: (f"{OSCILLATION}, with the force in the rod", "two.x", "bar.f"),
+        line.FixedPosition: (OSCILLATION, "one.s", "t_soft_m.s"),
+        line.Spring: (OSCILLATION, "one.s", "coil.f"),
+        line.Damper: (OSCILLATION, "one.s", "oil.f"),
+        line.Rod: (f"{OSCILLATION}, with the force in the rod", "two.s", "bar.f"),
         Planetary: (LAGRANGE, "sun.phi", "ring.phi", "carrier.phi"),
-        RackAndPinion: (LAGRANGE, "rack_sled.x"),
-        LeadScrew: (LAGRANGE, "screw_sled.x"),
-        Wheel: (LAGRANGE, "wheel_sled.x"),
+        RackAndPinion: (LAGRANGE, "rack_sled.s"),
+        LeadScrew: (LAGRANGE, "screw_sled.s"),
+        Wheel: (LAGRANGE, "wheel_sled.s"),
     },
     origin="rtol 1e-9 for each of fewer than 500 steps, and 1e-10 of SciPy's",
 )

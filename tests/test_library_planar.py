@@ -185,6 +185,13 @@ def components():
         b.chain(world.frame, shaft.frame_a, turn.flange, shaft.flange, shaft.frame_b, reach.frame_a)
         inputs[f"{name}_angle.u"] = motion
         ends.append(reach.frame_b)
+    # At the end of the first, a detour: 0.3 along a line at 0.4 with axes turned by 0.7 there, and back.
+    there, back = (
+        b(pl.Link, "there", 0.3 * np.cos(0.4), 0.3 * np.sin(0.4), 0.7),
+        b(pl.Link, "back", -0.3 * np.cos(0.3), 0.3 * np.sin(0.3), -0.7),
+    )
+    b.chain(ends[0], there.frame_a, there.frame_b, back.frame_a)
+    ends[0] = back.frame_b
     seen, between = b(pl.AbsoluteSensor, "seen"), b(pl.RelativeSensor, "between")
     b.join(seen.frame, between.frame_a, ends[0])
     b.join(between.frame_b, ends[1])
@@ -220,7 +227,7 @@ TURNED = "trigonometry of two arms that turn as prescribed"
         pl.Body: (
             f"{SWING}; {PUSHED}", "bob.x", "bob.y", "bob.vx", "bob.frame.fx", "bob.frame.fy", "puck.x", "puck.phi",
         ),
-        pl.Link: (SWING, "bob.x", "bob.y", "bob.frame.fx", "bob.frame.fy"),
+        pl.Link: (f"{SWING}; arms that turn as prescribed", "bob.x", "bob.y", "bob.frame.fx", "bob.frame.fy", "seen.x"),
         pl.MassiveLink: ("Jacobi's elliptic functions of a rod, and a damped oscillation", "rod.body.phi", "wrist.phi"),
         pl.Revolute: (f"{SWING}; a damped oscillation", "pin.phi", "pin.omega", "wrist.phi"),
         pl.Prismatic: (

@@ -110,7 +110,7 @@ def test_capacitor_loop_through_a_source_has_index_two(ev):
 def test_mass_spring_damper():
     solution = simulate(oscillator(), 2.0, ts=TS, **SOLVE)
     x, v = damped_oscillation(T)
-    np.testing.assert_allclose(solution["mass.x"], x, **CLOSE)
+    np.testing.assert_allclose(solution["mass.s"], x, **CLOSE)
     np.testing.assert_allclose(solution["mass.v"], v, **CLOSE)
     np.testing.assert_allclose(solution["spring.f"], 5.0 * x, **CLOSE)
     np.testing.assert_allclose(solution["damper.f"], 0.6 * v, **CLOSE)
@@ -125,11 +125,11 @@ def test_two_masses_rigidly_connected(ev):
         wall, spring, a, rod, b,
         connect=[(wall.flange, spring.flange_a), (spring.flange_b, a.flange, rod.flange_a), (rod.flange_b, b.flange)],
     )  # fmt: skip
-    assert sorted(system.states) == ["a.v", "a.x"] and system.report.index == 3
+    assert sorted(system.states) == ["a.s", "a.v"] and system.report.index == 3
     solution = simulate(system, 2.0, ts=TS, **SOLVE)
     x = 0.5 * np.cos(T)  # K/(M1 + M2) = 1, at rest at x = 0
-    np.testing.assert_allclose(solution["a.x"], x, **CLOSE)
-    np.testing.assert_allclose(solution["b.x"], x + 0.3, **CLOSE)
+    np.testing.assert_allclose(solution["a.s"], x, **CLOSE)
+    np.testing.assert_allclose(solution["b.s"], x + 0.3, **CLOSE)
     np.testing.assert_allclose(solution["b.v"], -0.5 * np.sin(T), **CLOSE)
     np.testing.assert_allclose(solution["r.f"], 3.0 * x, **CLOSE)  # what accelerates b
     np.testing.assert_allclose(solution["spring.f"], 4.0 * x, **CLOSE)
@@ -187,7 +187,7 @@ class Unit(Component):
         flange = self.port("flange", Translational)
         mass = self.add(Mass(ev, "mass", 2.0, initial_position=0.3, initial_velocity=0.0))
         self.connect(flange, mass.flange)
-        self.output("double", 2 * flange.x)
+        self.output("double", 2 * flange.s)
         self.output("pull", flange.f)
 
 

@@ -225,7 +225,7 @@ def check_chain(chain):
     n = len(masses)
     system = build_chain(*chain)
     place = {name: k for k, name in enumerate(system.states)}
-    order = [place[f"m{k}.{v}"] for v in ("x", "v") for k in range(n)]
+    order = [place[f"m{k}.{v}"] for v in ("s", "v") for k in range(n)]
     assert len(place) == 2 * n
     jacobian, slope = _affine(system, jnp.zeros(2 * n))
     a, b = chain_equations(*chain)
@@ -262,7 +262,7 @@ def test_motions_are_matrix_exponentials(masses, k, start):
     """One structure, compiled once; its parameters and initial values vary."""
     names = ["m0.M", "m1.M", "m2.M", "s0_0.K", "s0_1.K", "s1_0.K", "s2_0.K"]
     system = three_masses().with_parameters(dict(zip(names, [*masses, *k], strict=True)))
-    states = [f"m{i}.{v}" for v in ("x", "v") for i in range(3)]
+    states = [f"m{i}.{v}" for v in ("s", "v") for i in range(3)]
     ts = np.array([0.7, 1.5])
     initial = dict(zip(states, start, strict=True))
     solution = simulate(system, 1.5, ts=ts, initial=initial, rtol=1e-9, atol=1e-11)

@@ -33,34 +33,34 @@ def test_variables_by_name(solution):
     x, v = damped_oscillation(np.asarray(TS))
     assert isinstance(solution, Solution) and isinstance(solution.system, AcausalSystem)
     for name, expected in {
-        "mass.x": x,  # a state
+        "mass.s": x,  # a state
         "mass.v": v,
-        "der(mass.x)": v,
+        "der(mass.s)": v,
         "der(mass.v)": (-0.6 * v - 5.0 * x) / 2.0,
-        "der(der(mass.x))": (-0.6 * v - 5.0 * x) / 2.0,
-        "mass.flange.x": x,  # equal to a state
+        "der(der(mass.s))": (-0.6 * v - 5.0 * x) / 2.0,
+        "mass.flange.s": x,  # equal to a state
         "spring.f": 5.0 * x,  # solved for
         "spring.flange_a.f": -5.0 * x,  # eliminated, with a sign
-        "wall.flange.x": 0.0 * x,  # a parameter
+        "wall.flange.s": 0.0 * x,  # a parameter
     }.items():
         assert solution[name].shape == (3,)
         np.testing.assert_allclose(solution[name], expected, rtol=0, atol=1e-7, err_msg=name)  # 100 × tolerance
     np.testing.assert_array_equal(solution["time"], TS)
     np.testing.assert_array_equal(solution.ts, TS)
-    assert "mass.x" in solution and "time" in solution and "mass.y" not in solution
+    assert "mass.s" in solution and "time" in solution and "mass.y" not in solution
 
 
 def test_unknown_names(solution):
-    with pytest.raises(ModelError, match=r"'mass\.xx' is not a variable: did you mean 'mass\.x'"):
-        solution["mass.xx"]
-    with pytest.raises(ModelError, match=r"'der\(der\(der\(mass\.x\)\)\)' occurs nowhere.*only 'mass\.x'"):
-        solution["der(der(der(mass.x)))"]
+    with pytest.raises(ModelError, match=r"'mass\.ss' is not a variable: did you mean 'mass\.s'"):
+        solution["mass.ss"]
+    with pytest.raises(ModelError, match=r"'der\(der\(der\(mass\.s\)\)\)' occurs nowhere.*only 'mass\.s'"):
+        solution["der(der(der(mass.s)))"]
 
 
 def test_to_dict_has_everything(solution, system):
     everything = solution.to_dict()
     assert list(everything) == ["time", *system.variables]
-    for name in ("time", "mass.x", "spring.f", "spring.flange_a.f", "wall.flange.x"):
+    for name in ("time", "mass.s", "spring.f", "spring.flange_a.f", "wall.flange.s"):
         np.testing.assert_array_equal(everything[name], solution[name], err_msg=name)
 
 
@@ -74,7 +74,7 @@ def test_to_dict_evaluates_once(solution, monkeypatch):
 
 
 def test_several_names_are_columns(solution):
-    names = ["spring.f", "time", "mass.x", "spring.flange_a.f", "der(mass.v)", "wall.flange.x"]
+    names = ["spring.f", "time", "mass.s", "spring.flange_a.f", "der(mass.v)", "wall.flange.s"]
     found = solution[names]
     assert found.shape == (3, 6)
     for k, name in enumerate(names):
@@ -82,18 +82,18 @@ def test_several_names_are_columns(solution):
     assert solution[[]].shape == (3, 0)
     inside = eqx.filter_jit(lambda s: s[names])(solution)
     np.testing.assert_allclose(inside, found, rtol=1e-14)
-    batch = eqx.filter_vmap(lambda x0: simulate(solution.system, 1.1, ts=TS, initial={"mass.x": x0}))(jnp.ones(2))
+    batch = eqx.filter_vmap(lambda x0: simulate(solution.system, 1.1, ts=TS, initial={"mass.s": x0}))(jnp.ones(2))
     assert batch[names].shape == (2, 3, 6)
-    for wrong in (0, None, ["mass.x", 1]):
+    for wrong in (0, None, ["mass.s", 1]):
         with pytest.raises(ModelError, match=r"by names, solution\['m\.x'\] or solution\[\['m\.x', 'm\.y'\]\]"):
             solution[wrong]
-    with pytest.raises(ModelError, match=r"'mass\.xx'"):
-        solution[["mass.x", "mass.xx"]]
+    with pytest.raises(ModelError, match=r"'mass\.ss'"):
+        solution[["mass.s", "mass.ss"]]
 
 
 def test_html(solution):
     text = solution._repr_html_()
-    for part in ("finished", "0 to 1.1", "mass.x, mass.v", "Tsit5"):
+    for part in ("finished", "0 to 1.1", "mass.s, mass.v", "Tsit5"):
         assert part in text
 
 
@@ -106,14 +106,14 @@ def test_a_solution_is_a_pytree(solution):
 def test_solutions_may_leave_jit(system):
     @eqx.filter_jit
     def run(x0):
-        solution = simulate(system, 1.1, ts=TS, initial={"mass.x": x0})
+        solution = simulate(system, 1.1, ts=TS, initial={"mass.s": x0})
         return solution, solution["spring.f"]
 
     solution, f = run(jnp.array(0.2))
     x = damped_oscillation(np.asarray(TS), x0=0.2)[0]
-    np.testing.assert_allclose(solution["mass.x"], x, rtol=0, atol=1e-4)  # a hundred times the tolerance
+    np.testing.assert_allclose(solution["mass.s"], x, rtol=0, atol=1e-4)  # a hundred times the tolerance
     np.testing.assert_array_equal(solution["spring.f"], f)
-    np.testing.assert_allclose(f, 5.0 * solution["mass.x"], rtol=1e-12)
+    np.testing.assert_allclose(f, 5.0 * solution["mass.s"], rtol=1e-12)
 
 
 def test_stats_and_result(solution):
@@ -131,14 +131,14 @@ def test_without_times_every_step_is_saved(system):
     t = np.asarray(solution.ts)
     assert t[0] == 0.0 and t[-1] == 1.1 and (np.diff(t) > 0).all()
     assert len(t) == solution.stats["num_accepted_steps"] + 1 > 5
-    np.testing.assert_allclose(solution["mass.x"], damped_oscillation(t)[0], rtol=0, atol=1e-7)
+    np.testing.assert_allclose(solution["mass.s"], damped_oscillation(t)[0], rtol=0, atol=1e-7)
     assert solution["spring.f"].shape == t.shape
 
 
 def test_another_start_time(system):
     """The model does not know the time, so only the interval's length matters."""
     solution = simulate(system, 4.1, t0=3.0, ts=TS + 3.0, rtol=1e-9, atol=1e-11)
-    np.testing.assert_allclose(solution["mass.x"], damped_oscillation(np.asarray(TS))[0], rtol=0, atol=1e-7)
+    np.testing.assert_allclose(solution["mass.s"], damped_oscillation(np.asarray(TS))[0], rtol=0, atol=1e-7)
 
 
 def test_rounding_in_times_is_forgiven(system):
@@ -146,7 +146,7 @@ def test_rounding_in_times_is_forgiven(system):
     ts = np.arange(4) * 0.1
     assert ts[-1] > 0.3
     solution = simulate(system, 0.3, ts=ts.tolist(), rtol=1e-9, atol=1e-11)
-    np.testing.assert_allclose(solution["mass.x"], damped_oscillation(ts)[0], rtol=0, atol=1e-7)
+    np.testing.assert_allclose(solution["mass.s"], damped_oscillation(ts)[0], rtol=0, atol=1e-7)
 
 
 def test_constraint_residuals():
@@ -254,8 +254,8 @@ def test_a_constrained_systems_rows_up_to_a_failure():
 def test_plot(solution):
     plt = pytest.importorskip("matplotlib.pyplot")
     axes = solution.plot()
-    assert [line.get_label() for line in axes.lines] == ["mass.x [m]", "mass.v [m/s]"]
-    np.testing.assert_array_equal(axes.lines[0].get_ydata(), solution["mass.x"])
+    assert [line.get_label() for line in axes.lines] == ["mass.s [m]", "mass.v [m/s]"]
+    np.testing.assert_array_equal(axes.lines[0].get_ydata(), solution["mass.s"])
     assert axes.get_xlabel() == "time [s]"
     _, given = plt.subplots()
     assert solution.plot("spring.f", ax=given) is given

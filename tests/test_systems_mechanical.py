@@ -117,10 +117,10 @@ def lift():
         start = [p["chamber.initial_pressure"], p["mass.initial_position"], p["mass.initial_velocity"]]
         pressure, x, v = integrated(slopes, start, TS_LIFT, ends=OPENED[0])
         assert x[-1] - x[0] > 0.1
-        return {"chamber.p": pressure, "mass.x": x, "mass.v": v, "valve.m_flow": fed(TS_LIFT, pressure)}
+        return {"chamber.p": pressure, "mass.s": x, "mass.v": v, "valve.m_flow": fed(TS_LIFT, pressure)}
 
     return ReferenceSystem(
-        make, expected, TS_LIFT, "mass.x", {"valve.opening": OPENED, "weight.f": WEIGHT}
+        make, expected, TS_LIFT, "mass.s", {"valve.opening": OPENED, "weight.f": WEIGHT}
     )  # fmt: skip
 
 
@@ -168,9 +168,9 @@ def quarter_car():
         start = [p[f"{part}.initial_{what}"] for part in ("body", "wheel") for what in ("position", "velocity")]
         x, v, y, w = driven(a, start, b, ALONG, ROAD, TS_CAR)
         force = k * (x - y - p["strut.length"]) + d * (v - w)
-        return {"body.x": x, "body.v": v, "wheel.x": y, "wheel.v": w, "strut.f": force}
+        return {"body.s": x, "body.v": v, "wheel.s": y, "wheel.v": w, "strut.f": force}
 
-    return ReferenceSystem(make, expected, TS_CAR, "body.x", {"road.u": (ALONG, ROAD)})
+    return ReferenceSystem(make, expected, TS_CAR, "body.s", {"road.u": (ALONG, ROAD)})
 
 
 TS_CAR = np.array([0.0, 0.13, 0.25, 0.42, 0.5, 0.77, 1.0])

@@ -65,18 +65,18 @@ def make(seed: int) -> Case:
             terms = {x[b]: k, x[a]: -k}
             pull(a, b, terms, -k * length)
             net.read(f"{name}.f", "f", terms, constant=-k * length)
-            net.read(f"{name}.s", "x", {x[b]: 1.0, x[a]: -1.0})
+            net.read(f"{name}.s_rel", "x", {x[b]: 1.0, x[a]: -1.0})
             net.read(f"{name}.flange_a.f", "f", {j: -c for j, c in terms.items()}, constant=k * length)
         else:
             part = Damper(ev, name, k)
             pull(a, b, {v[b]: k, v[a]: -k})
             net.read(f"{name}.f", "f", {v[b]: k, v[a]: -k})
-            net.read(f"{name}.v", "v", {v[b]: 1.0, v[a]: -1.0})
+            net.read(f"{name}.v_rel", "v", {v[b]: 1.0, v[a]: -1.0})
         net.parts.append(part)
         for flange, node in ((part.flange_a, a), (part.flange_b, b)):
             net.nodes[node].append(flange)
-            net.start_name[x[node]] = f"{name}.{flange.name}.x"
-            net.read(f"{name}.{flange.name}.x", "x", {x[node]: 1.0})
+            net.start_name[x[node]] = f"{name}.{flange.name}.s"
+            net.read(f"{name}.{flange.name}.s", "x", {x[node]: 1.0})
     heavy = rng.random()
     for node in range(n):
         name = label[len(edges) + node]
@@ -85,8 +85,8 @@ def make(seed: int) -> Case:
             m = value()
             part = Mass(ev, name, m)
             inertia[node][v[node]] = m
-            net.start_name[x[node]], net.start_name[v[node]] = f"{name}.x", f"{name}.v"
-            net.read(f"{name}.x", "x", {x[node]: 1.0})
+            net.start_name[x[node]], net.start_name[v[node]] = f"{name}.s", f"{name}.v"
+            net.read(f"{name}.s", "x", {x[node]: 1.0})
             net.read(f"{name}.v", "v", {v[node]: 1.0})
             net.read(f"{name}.flange.f", "f", {}, {v[node]: m})
         elif choice < heavy + 0.15:

@@ -10,7 +10,8 @@ import numpy as np
 
 from ..errors import ModelError, nearest
 from ..system.evaluate import Refinement
-from ..system.inputs import read_inputs
+from ..system.input_values import by_entry
+from ..system.inputs import read_inputs, value_at
 from ..system.system import AcausalSystem
 from .operating_point import OperatingPoint
 from .state_space import StateSpace
@@ -32,7 +33,8 @@ def linearize(
     **Arguments:**
 
     - `system`: a compiled system.
-    - `inputs`: the names of inputs; or a dictionary with their values at the point, where they have no default.
+    - `inputs`: the names of inputs; or a dictionary with their values at the point, where they have no default. An
+        array's name stands for those of all entries, here and in `outputs` and `states`.
     - `outputs`: the names of variables; `"der(...)"` of what the model differentiates is one too.
     - `at`: the point, from `steady_state`. If left out, the equilibrium that a search from the initial point finds;
         states on which nothing depends, such as the angle of a free shaft, stay where they are.
@@ -54,8 +56,10 @@ def linearize(
     - `SteadyStateError` if `at` is left out and there is no equilibrium.
     """
     check_system(system)
-    given = dict(inputs) if isinstance(inputs, Mapping) else {}
+    dtype = system.parameters.values.dtype
     names, outputs = _checked_names(system, inputs, "inputs"), _checked_names(system, outputs, "outputs")
+    states = None if states is None else system.plan.entry_names(states)
+    given = by_entry(system.plan, read_inputs(system.plan, dtype, inputs)) if isinstance(inputs, Mapping) else {}
     quantity, factor = system.plan.resolve(outputs)
     _check_inputs(system, names, given, at)
     if at is None:
@@ -63,7 +67,7 @@ def linearize(
         at = point_of(system, found, t, read, drifting=(), singular_is_error=False, throw=True)
     if jnp.ndim(at.x) != 1:
         raise ModelError("the operating point is a batch: linearize each with equinox.filter_vmap")
-    values = read_inputs(system.inputs, at.x.dtype, {**at.inputs, **given})
+    values = read_inputs(system.plan, dtype, {**by_entry(system.plan, at.inputs), **given})
     u = jnp.stack([_value_at(system, values, name, at.t) for name in names]) if names else at.x[:0]
     arguments = (system, at.t, at.x, values, u, tuple(names), tuple(quantity.tolist()), tuple(factor.tolist()))
     parts = _partials(*arguments) if is_traced(arguments) else _compiled(*arguments)
@@ -152,7 +156,7 @@ def _place(system: AcausalSystem, name: str) -> int:
 def _checked_names(system: AcausalSystem, given: Any, what: str) -> list[str]:
     if isinstance(given, str):
         raise ModelError(f"{what} is a list of names; write {what}=[{given!r}]")
-    names = list(given)
+    names = system.plan.entry_names(given)
     for name in names if what == "inputs" else ():
         if name not in system.inputs:
             raise ModelError(f"'{name}' is not an input of this system: " + nearest(name, system.inputs))
@@ -164,9 +168,10 @@ def _checked_names(system: AcausalSystem, given: Any, what: str) -> list[str]:
 def _check_inputs(system: AcausalSystem, names: list[str], given: Mapping[str, Any], at: OperatingPoint | None):
     """Every input has a value, and the model differentiates none that is asked for."""
     table = system.plan.inputs
-    differentiated = {table.names[k] for k, order in table.quantities if order}
+    known = given if at is None else {**by_entry(system.plan, at.inputs), **given}
+    differentiated = {table.names[k] for k in table.owner[table.order > 0].tolist()}
     for name, default in zip(table.names, table.defaults, strict=True):
-        if default is None and name not in given and (at is None or name not in at.inputs):
+        if default is None and name not in known:
             where = f"inputs={{'{name}': 0.0}}" if name in names else "at=steady_state(system, inputs={...})"
             raise ModelError(f"input '{name}' has no default, so its value at the point must be given: {where}")
         if name in names and name in differentiated:
@@ -179,4 +184,4 @@ def _check_inputs(system: AcausalSystem, names: list[str], given: Mapping[str, A
 def _value_at(system: AcausalSystem, values: Mapping[str, Any], name: str, t: Any) -> Any:
     table = system.plan.inputs
     value = values.get(name, table.defaults[table.names.index(name)])
-    return jnp.asarray(value(t) if callable(value) else value, t.dtype)
+    return jnp.asarray(value_at(value, t), t.dtype)

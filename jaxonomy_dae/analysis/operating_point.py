@@ -35,7 +35,8 @@ class OperatingPoint(eqx.Module):
     residual: Float[Array, ""]
 
     def __getitem__(self, name: Any) -> Any:
-        """The value of a variable, or of several; `"der(...)"` of what the model differentiates, and `"time"`.
+        """The value of a variable, or of several; `"der(...)"` of what the model differentiates, and `"time"`. For the
+        name of an array, its shape; among several names, it stands for those of all entries.
 
         **Raises:**
 
@@ -44,10 +45,14 @@ class OperatingPoint(eqx.Module):
         single = isinstance(name, str)
         if not single and not (isinstance(name, Sequence) and all(isinstance(one, str) for one in name)):
             raise ModelError(f"read a point by names, point['m.x'] or point[['m.x', 'm.y']]; got {name!r}")
-        names = [name] if single else list(name)
         if self.x.ndim > 1:
             return eqx.filter_vmap(lambda one: one[name])(self)
-        quantity, factor = self.system.plan.resolve([n for n in names if n != "time"])
+        plan = self.system.plan
+        array = plan.entries(name) if isinstance(name, str) else None
+        if array is not None:
+            return self[array[0]].reshape(array[1])
+        names = [name] if single else plan.entry_names(name)
+        quantity, factor = plan.resolve([n for n in names if n != "time"])
         given = (self.system, self.t, self.x, self.inputs)
         if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(given)):
             values = _every_quantity(*given)

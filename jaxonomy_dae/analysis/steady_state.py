@@ -70,11 +70,11 @@ def equilibrium_from(
 ) -> tuple[Equilibrium, Any, dict[str, Any]]:
     """The search from the initial point; the time and the inputs as arrays and as they were read."""
     dtype = system.parameters.values.dtype
-    inputs, initial = (system.plan.one_by_one(g, w) for g, w in ((inputs, "inputs"), (initial, "initial")))
+    initial = system.plan.one_by_one(initial)
     begin = find_initial(system, t, inputs, initial)
     if throw:
         begin = check(system, begin, t, inputs, initial)
-    inputs, t = read_inputs(system.inputs, dtype, inputs), jnp.asarray(t, dtype)
+    inputs, t = read_inputs(system.plan, dtype, inputs), jnp.asarray(t, dtype)
     given = (system, t, begin.x, inputs)
     if not is_traced(given):
         found = compiled_search(*given, drifting)

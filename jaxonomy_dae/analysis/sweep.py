@@ -23,8 +23,8 @@ from .steady_state import check_system
 class Sweep(eqx.Module):
     """Results with the parameter values they belong to.
 
-    - `axes`: the values of each parameter by name: shape `(k,)`. In a grid, each parameter is an axis of the results,
-        in this order; zipped, all share the first axis.
+    - `axes`: the values of each parameter by name: shape `(k,)`, or `(k, *shape)` of an array. In a grid, each
+        parameter is an axis of the results, in this order; zipped, all share the first axis.
     - `values`: what the function returned, a pytree whose arrays have the axes of the sweep in front. `sweep[key]` is
         `sweep.values[key]`: of simulations, `sweep["c.v"]` has shape `(*shape, times)`.
     - `zipped`: whether the parameters vary together.
@@ -49,9 +49,14 @@ class Sweep(eqx.Module):
         dimension for each parameter; zipped, the one dimension is `case`. Simulations have all variables over
         `time`; of a function's result, entries of a dictionary are variables, and an array is `value`."""
         xarray = optional_module("xarray", "xarray", "to_xarray needs xarray")
-        axes = {name: np.asarray(values) for name, values in self.axes.items()}
-        dims = ("case",) if self.zipped else tuple(axes)
-        coordinates = {n: ("case", v) if self.zipped else v for n, v in axes.items()}
+        dims = ("case",) if self.zipped else tuple(self.axes)
+        coordinates = {}
+        for name, values in self.axes.items():
+            array = np.asarray(values)
+            entries = tuple(f"{name}_{k}" for k in range(array.ndim - 1))
+            # What has more dimensions than one cannot be the coordinate of the dimension of its name.
+            label = name if array.ndim == 1 else f"{name} values"
+            coordinates[label] = (("case" if self.zipped else name, *entries), array)
         if isinstance(self.values, Solution):
             first = np.asarray(self.values.ts).reshape(-1, self.values.ts.shape[-1])
             return dataset_of(xarray, self.values, dims, coordinates | {"time": ("time", first[0])})
@@ -90,7 +95,8 @@ def sweep(
     **Arguments:**
 
     - `system`: a compiled system.
-    - `parameters`: values by parameters' names, each of shape `(k,)`.
+    - `parameters`: values by parameters' names, each of shape `(k,)`. For the name of an array of parameters, each
+        value is for all of its entries; values of shape `(k, *shape)` are for one each.
     - `function`: from the system with its new values to an array or a pytree of arrays, such as
         `lambda s: steady_state(s)["load.v"]`; it is traced. If left out, the system is simulated.
     - `zipped`: by default all combinations are computed, a grid with one axis for each parameter, in the order of
@@ -121,13 +127,13 @@ def sweep(
         found = ", ".join(f"{len(v)} for '{n}'" for n, v in columns.items())
         raise ModelError(f"zipped parameters vary together, so each needs as many values; got {found}")
     if zipped:
-        flat = jnp.stack(list(columns.values()), axis=-1)
+        rows = tuple(columns.values())
         shape = (sizes[0],)
     else:
         places = np.array(list(itertools.product(*map(range, sizes))), np.int64).reshape(-1, len(sizes))
-        flat = jnp.stack([v[places[:, k]] for k, v in enumerate(columns.values())], axis=-1)
+        rows = tuple(v[places[:, k]] for k, v in enumerate(columns.values()))
         shape = tuple(sizes)
-    results = _mapped(function, system, tuple(columns), flat)
+    results = _mapped(function, system, tuple(columns), rows)
     shaped = jax.tree.map(lambda a: jnp.reshape(a, (*shape, *a.shape[1:])) if eqx.is_array(a) else a, results)
     return Sweep(columns, shaped, zipped)
 
@@ -142,11 +148,11 @@ class _Simulation(eqx.Module):
 
 
 @eqx.filter_jit
-def _mapped(function: Any, system: AcausalSystem, names: tuple[str, ...], values: Any) -> Any:
+def _mapped(function: Any, system: AcausalSystem, names: tuple[str, ...], rows: tuple[Any, ...]) -> Any:
     def one(row):
         return function(system.with_parameters(dict(zip(names, row, strict=True))))
 
-    return eqx.filter_vmap(one)(values)
+    return eqx.filter_vmap(one)(rows)
 
 
 def _named(parameters: Any) -> Mapping[str, Any]:
@@ -156,16 +162,23 @@ def _named(parameters: Any) -> Mapping[str, Any]:
 
 
 def _values(system: AcausalSystem, name: str, given: Any) -> Any:
-    """The values of one parameter, within its bounds."""
+    """The values of one parameter, or of an array of them, within their bounds."""
     table = system.parameters.table
-    interval = table.intervals[table.settable(name)]
+    entries = table.entries(name)
+    shape = () if entries is None else entries.shape
     values = jnp.asarray(given, system.parameters.values.dtype)
-    if values.ndim != 1 or not len(values):
-        raise ModelError(f"the values of parameter '{name}' need shape (k,), k ≥ 1; got {values.shape}")
+    if not values.ndim or values.shape[1:] not in ((), shape) or not values.size:
+        either = f" or (k, {', '.join(map(str, shape))})" if shape else ""
+        raise ModelError(f"the values of parameter '{name}' need shape (k,){either}, k ≥ 1; got {values.shape}")
+    places = np.array([table.settable(one) for one in table.one_by_one(name)])
     if not isinstance(values, Tracer):
-        for number in np.asarray(values).tolist():
-            if not np.isfinite(number) or number not in interval:
-                raise ModelError(f"parameter '{name}' must lie in {interval}; got {number:g}")
+        low, high = table.bounds[places].T
+        numbers = np.broadcast_to(np.asarray(values).reshape(len(values), -1), (len(values), len(places)))
+        wrong = np.argwhere(~(np.isfinite(numbers) & (numbers >= low) & (numbers <= high)))
+        if len(wrong):
+            k = int(places[wrong[0, 1]])
+            got = numbers[tuple(wrong[0])]
+            raise ModelError(f"parameter '{table.names[k]}' must lie in {table.intervals[k]}; got {got:g}")
     return values
 
 

@@ -25,8 +25,9 @@ from ..lowering.gather import Gather, take, times
 from ..lowering.plan import SystemPlan
 from ..model.quantities import declared_scale, quantity_bounds
 from ..system.evaluate import Refinement
+from ..system.input_values import input_values
 from ..system.inputs import read_inputs
-from ..system.system_at import SystemAt, input_values
+from ..system.system_at import SystemAt
 from .given_solver import find_root_with
 from .initial_values import check_initial
 from .ladder import FAILED, STAGED, find_root
@@ -480,7 +481,7 @@ def find_initial(
     if np.shape(t0) != () or isinstance(t0, Mapping | str):
         raise ModelError(f"t0 must be a time, a number; got {t0!r}. Values at the start go to initial={{...}}")
     check_initial(system, initial)
-    inputs = read_inputs(system.inputs, dtype, inputs)
+    inputs = read_inputs(system.plan, dtype, inputs)
     initial = {name: jnp.asarray(v, dtype) for name, v in sorted((initial or {}).items())}
     arguments = (system, jnp.asarray(t0, dtype), inputs, initial, solve_for, solver)
     if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments)):

@@ -11,8 +11,8 @@ from ..diagnosis.wording import listed
 from ..lowering.plan import SystemPlan
 from ..lowering.schedule import SparseStep
 from ..model.tables import ZERO
+from ..system.input_values import input_values
 from ..system.sections import SHOWN, Sections, some
-from ..system.system_at import input_values
 from .block_finding import ILL_CONDITIONED, BlockFinding
 from .constraints_at import constraints_at
 from .initialize import InitialPoint, is_consistent
@@ -211,7 +211,7 @@ class InitializationReport(Sections):
     def _read(self) -> np.ndarray:
         """The values of the inputs' quantities."""
         dtype = self._system.numbers.dtype
-        return np.array([float(v) for v in input_values(self._plan, self._inputs, self.time, dtype)])
+        return np.array(input_values(self._plan, self._inputs, self.time, dtype), float)
 
     @functools.cached_property
     def _constraints(self) -> ModelAt | None:

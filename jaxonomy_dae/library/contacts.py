@@ -11,16 +11,16 @@ REST_SPEED = 1e-3  # metre per second
 
 
 class HardStop(Component):
-    """A rigid stop between two flanges: s = flange_b.x − flange_a.x does not fall below `length`.
+    """A rigid stop between two flanges: s_rel = flange_b.s − flange_a.s does not fall below `length`.
 
-    While s > length nothing is transmitted; while the flanges touch, the force `f` ≥ 0 pushes them apart. Where they
-    meet at a speed v, they part again at `restitution`·v (Newton 1687), unless that is not above `rest_speed`: then
-    they stay, until f has fallen to zero. The discrete variable `touching` is 1 or 0.
+    While s_rel > length nothing is transmitted; while the flanges touch, the force `f` ≥ 0 pushes them apart. Where
+    they meet at a speed v, they part again at `restitution`·v (Newton 1687), unless that is not above `rest_speed`:
+    then they stay, until f has fallen to zero. The discrete variable `touching` is 1 or 0.
 
     **Arguments:**
 
     - `length`: metre. `restitution`: from 0 to 1. `rest_speed` ≥ 0: metre per second.
-    - `touching`: whether they touch at the initial time, where s = length and der(s) = 0 must hold then.
+    - `touching`: whether they touch at the initial time, where s_rel = length and der(s_rel) = 0 must hold then.
     - `clearance` > 0: by how much the flanges may overlap just after f has let go (metre).
     """
 
@@ -40,8 +40,8 @@ class HardStop(Component):
         slow = self.parameter("rest_speed", rest_speed, unit="m/s", bounds=NONNEGATIVE)
         tiny = self.parameter("clearance", clearance, unit="m", bounds=POSITIVE)
         a, b = self.port("flange_a", Translational), self.port("flange_b", Translational)
-        s, f = self.variable("s", unit="m"), self.variable("f", unit="N")
-        self.add_equations(Eq(s, b.x - a.x), Eq(b.f, -f), Eq(a.f + b.f, 0))
+        s, f = self.variable("s_rel", unit="m"), self.variable("f", unit="N")
+        self.add_equations(Eq(s, b.s - a.s), Eq(b.f, -f), Eq(a.f + b.f, 0))
         start = yes_or_no(touching, name, "touching")
         self.complementary(
             s - least, f, "touching", order=2, restitution=back, rest_speed=slow, clearance=tiny, start=start
@@ -49,14 +49,15 @@ class HardStop(Component):
 
 
 class Rope(Component):
-    """A massless rope that cannot be stretched, between two flanges: s = flange_b.x − flange_a.x ≤ length.
+    """A massless rope that cannot be stretched, between two flanges: s_rel = flange_b.s − flange_a.s ≤ length.
 
-    While s < length it is slack; while it is taut, the force `f` ≥ 0 pulls its ends together. Where it becomes taut,
-    the speed at which its ends part is taken away. The discrete variable `taut` is 1 or 0.
+    While s_rel < length it is slack; while it is taut, the force `f` ≥ 0 pulls its ends together. Where it becomes
+    taut, the speed at which its ends part is taken away. The discrete variable `taut` is 1 or 0.
 
     **Arguments:**
 
-    - `length`: metre. `taut`: whether it is at the initial time, where s = length and der(s) = 0 must hold then.
+    - `length`: metre. `taut`: whether it is at the initial time, where s_rel = length and der(s_rel) = 0 must hold
+        then.
     - `clearance` > 0: by how much it may be overstretched just after it has become slack (metre).
     """
 
@@ -67,8 +68,8 @@ class Rope(Component):
         most = self.parameter("length", length, unit="m")
         tiny = self.parameter("clearance", clearance, unit="m", bounds=POSITIVE)
         a, b = self.port("flange_a", Translational), self.port("flange_b", Translational)
-        s, f = self.variable("s", unit="m"), self.variable("f", unit="N")
-        self.add_equations(Eq(s, b.x - a.x), Eq(b.f, f), Eq(a.f + b.f, 0))
+        s, f = self.variable("s_rel", unit="m"), self.variable("f", unit="N")
+        self.add_equations(Eq(s, b.s - a.s), Eq(b.f, f), Eq(a.f + b.f, 0))
         start = yes_or_no(taut, name, "taut")
         self.complementary(most - s, f, "taut", order=2, clearance=tiny, start=start)
 

@@ -98,7 +98,7 @@ class Brake(Component):
 
 
 class StickingFriction(Component):
-    """Dry friction between two sliding parts that sticks: f opposes v_rel = der(flange_b.x − flange_a.x) with the
+    """Dry friction between two sliding parts that sticks: f opposes v_rel = der(flange_b.s − flange_a.s) with the
     force `sliding` (newton, > 0), and holds the parts together up to `breakaway` ≥ sliding, which is `sliding` if left
     out."""
 
@@ -110,22 +110,42 @@ class StickingFriction(Component):
         a, b = self.port("flange_a", Translational), self.port("flange_b", Translational)
         v = self.variable("v_rel", unit="m/s")
         f = self.variable("f", unit="N")
-        self.add_equations(Eq(v, der(b.x - a.x)), Eq(b.f, f), Eq(a.f + b.f, 0))
+        self.add_equations(Eq(v, der(b.s - a.s)), Eq(b.f, f), Eq(a.f + b.f, 0))
         stick_slip(self, v, f, coulomb, static)
         self.declare_dissipation(f * v)
 
 
 class OneWayClutch(Component):
-    """A freewheel: flange_b may run faster than flange_a, never slower. While they are locked, der(w_rel) = 0 with a
-    torque tau ≥ 0 from a to b; while free, tau = 0 with w_rel ≥ 0. The discrete variable `locked` is 1 or 0."""
+    """A freewheel, and a clutch beside it: flange_b may run faster than flange_a, never slower.
 
-    def __init__(self, ev: EqnEnv, name: str):
+    While they are locked, der(w_rel) = 0 with a torque tau from a to b that is not below −peak·slipping; while
+    w_rel = der(flange_b.phi − flange_a.phi) ≥ 0 is free, tau = −slipping, with slipping = mu·cgeo·fn_max·max(u, 0). The
+    input `u` is 0 if nothing drives it, and then there is no friction. The discrete variable `locked` is 1 or 0.
+
+    `mu`, `fn_max` (newton), `cgeo` (metre) ≥ 0; `peak` ≥ 1.
+    """
+
+    def __init__(
+        self, ev: EqnEnv, name: str, mu: Value = 0.5, fn_max: Value = 1.0, cgeo: Value = 1.0, peak: Value = 1.0
+    ):
         super().__init__(ev, name)
+        coefficient = self.parameter("mu", mu, unit="1", bounds=NONNEGATIVE)
+        largest = self.parameter("fn_max", fn_max, unit="N", bounds=NONNEGATIVE)
+        geometry = self.parameter("cgeo", cgeo, unit="m", bounds=NONNEGATIVE)
+        ratio = self.parameter("peak", peak, unit="1", bounds=(1.0, float("inf")))
         a, b = self.port("flange_a", Rotational), self.port("flange_b", Rotational)
+        u = self.input("u", default=0.0, unit="1")
         w = self.variable("w_rel", unit="rad/s")
         tau = self.variable("tau", unit="N*m")
+        slipping = self.variable("slipping", unit="N*m")
         locked = self.discrete("locked", start=0, unit="1")
-        self.add_equations(Eq(w, der(b.phi - a.phi)), Eq(b.tau, -tau), Eq(a.tau + b.tau, 0))
-        self.either(Eq(locked, 1), der(w), tau)
+        self.add_equations(
+            Eq(w, der(b.phi - a.phi)),
+            Eq(b.tau, -tau),
+            Eq(a.tau + b.tau, 0),
+            Eq(slipping, coefficient * geometry * largest * Max(u, 0)),
+        )
+        self.either(Eq(locked, 1), der(w), tau + slipping)
         self.when(w <= 0, assign(locked, 1), on=Eq(locked, 0), at_start=True)
-        self.when(tau <= 0, assign(locked, 0), on=Eq(locked, 1), at_start=True)
+        self.when(tau <= -ratio * slipping, assign(locked, 0), on=Eq(locked, 1), at_start=True)
+        self.declare_dissipation(-tau * w)

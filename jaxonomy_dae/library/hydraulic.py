@@ -393,7 +393,7 @@ class Pump(_TwoPort):
 
 class Cylinder(Component):
     """A piston that the fluid pushes towards larger positions: f = A·(fluid.p − p_ambient) acts on what is connected to
-    the flange (flange.f = −f), and fluid.m_flow = rho·A·v with v = d(flange.x)/dt.
+    the flange (flange.f = −f), and fluid.m_flow = rho·A·v with v = d(flange.s)/dt.
 
     The piston's area `A` > 0 in square metre, `rho` > 0 in kg/m³, `p_ambient` (pascal) acts on the other side. Its ends
     are not stops. Source: Merritt (1967), the chapter on hydraulic power elements.
@@ -412,17 +412,17 @@ class Cylinder(Component):
         density = self.parameter("rho", rho, unit="kg/m3", bounds=POSITIVE)
         ambient = self.parameter("p_ambient", p_ambient, unit="Pa")
         fluid, flange = self.port("fluid", Hydraulic), self.port("flange", Translational)
-        x = self.variable("x", unit="m")
+        s = self.variable("s", unit="m")
         v = self.variable("v", unit="m/s")
         f = self.variable("f", unit="N")
         self.add_equations(
-            Eq(x, flange.x),
-            Eq(v, der(x)),
+            Eq(s, flange.s),
+            Eq(v, der(s)),
             Eq(fluid.m_flow, density * area * v),
             Eq(f, area * (fluid.p - ambient)),
             Eq(flange.f, -f),
         )
-        self.declare_energy(ambient * area * x)  # the work against what acts on the other side
+        self.declare_energy(ambient * area * s)  # the work against what acts on the other side
 
 
 class PressureSensor(Component):

@@ -1,12 +1,13 @@
 """Translational mechanics along a line.
 
-Conventions: absolute position `x` in metre, force `f` in newton counted positive into the component at a flange, so a
+Conventions: absolute position `s` in metre, force `f` in newton counted positive into the component at a flange, so a
 mass obeys M·dv/dt = flange.f.
 """
 
 import sympy
+from sympy import Piecewise
 
-from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Translational, Value, der
+from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Translational, Value, assign, der
 from .laws import penetration, penetration_energy, stribeck
 
 
@@ -27,28 +28,28 @@ class Mass(Component):
     ):
         super().__init__(ev, name)
         m = self.parameter("M", M, unit="kg", bounds=POSITIVE)
-        x0 = self.parameter("initial_position", initial_position or 0.0, unit="m")
+        s0 = self.parameter("initial_position", initial_position or 0.0, unit="m")
         v0 = self.parameter("initial_velocity", initial_velocity or 0.0, unit="m/s")
         flange = self.port("flange", Translational)
-        x = self.variable("x", start=x0, fixed=initial_position is not None, unit="m")
+        s = self.variable("s", start=s0, fixed=initial_position is not None, unit="m")
         v = self.variable("v", start=v0, fixed=initial_velocity is not None, unit="m/s")
-        self.add_equations(Eq(x, flange.x), Eq(der(x), v), Eq(m * der(v), flange.f))
+        self.add_equations(Eq(s, flange.s), Eq(der(s), v), Eq(m * der(v), flange.f))
         self.declare_energy(m * v**2 / 2)
 
 
 class _Compliant(Component):
-    """Two flanges and one force that pulls them together: s = flange_b.x − flange_a.x."""
+    """Two flanges and one force that pulls them together: s_rel = flange_b.s − flange_a.s."""
 
     def _two_flanges(self) -> tuple[sympy.Symbol, sympy.Symbol]:
         a, b = self.port("flange_a", Translational), self.port("flange_b", Translational)
-        s = self.variable("s", unit="m")
+        s = self.variable("s_rel", unit="m")
         f = self.variable("f", unit="N")
-        self.add_equations(Eq(s, b.x - a.x), Eq(b.f, f), Eq(a.f + b.f, 0))
+        self.add_equations(Eq(s, b.s - a.s), Eq(b.f, f), Eq(a.f + b.f, 0))
         return s, f
 
 
 class Spring(_Compliant):
-    """A linear spring that pulls its ends together: f = K·(flange_b.x − flange_a.x − length), `K` ≥ 0 in newton per
+    """A linear spring that pulls its ends together: f = K·(flange_b.s − flange_a.s − length), `K` ≥ 0 in newton per
     metre."""
 
     def __init__(self, ev: EqnEnv, name: str, K: Value = 1.0, length: Value = 0.0):
@@ -61,26 +62,26 @@ class Spring(_Compliant):
 
 
 class Damper(_Compliant):
-    """A linear damper: f = D·(flange_b.v − flange_a.v), `D` ≥ 0 in newton second per metre."""
+    """A linear damper: f = D·der(flange_b.s − flange_a.s), `D` ≥ 0 in newton second per metre."""
 
     def __init__(self, ev: EqnEnv, name: str, D: Value = 1.0):
         super().__init__(ev, name)
         d = self.parameter("D", D, unit="N*s/m", bounds=NONNEGATIVE)
         s, f = self._two_flanges()
-        v = self.variable("v", unit="m/s")
+        v = self.variable("v_rel", unit="m/s")
         self.add_equations(Eq(v, der(s)), Eq(f, d * v))
         self.declare_dissipation(f * v)
 
 
 class Rod(Component):
-    """A rigid massless rod: flange_b.x − flange_a.x = length (metre); `f` is the force that pulls its ends together."""
+    """A rigid massless rod: flange_b.s − flange_a.s = length (metre); `f` is the force that pulls its ends together."""
 
     def __init__(self, ev: EqnEnv, name: str, length: Value = 0.0):
         super().__init__(ev, name)
         distance = self.parameter("length", length, unit="m")
         a, b = self.port("flange_a", Translational), self.port("flange_b", Translational)
         f = self.variable("f", unit="N")
-        self.add_equations(Eq(b.x - a.x, distance), Eq(b.f, f), Eq(a.f + b.f, 0))
+        self.add_equations(Eq(b.s - a.s, distance), Eq(b.f, f), Eq(a.f + b.f, 0))
 
 
 class FixedPosition(Component):
@@ -90,11 +91,12 @@ class FixedPosition(Component):
         super().__init__(ev, name)
         where = self.parameter("position", position, unit="m")
         flange = self.port("flange", Translational)
-        self.add_equations(Eq(flange.x, where))
+        self.add_equations(Eq(flange.s, where))
 
 
 class SpringDamper(_Compliant):
-    """A linear spring and damper side by side: f = K·(s − length) + D·v with v = der(s), `K`, `D` ≥ 0."""
+    """A linear spring and damper side by side: f = K·(s_rel − length) + D·v_rel with v_rel = der(s_rel), where `K`,
+    `D` ≥ 0."""
 
     def __init__(self, ev: EqnEnv, name: str, K: Value = 1.0, D: Value = 1.0, length: Value = 0.0):
         super().__init__(ev, name)
@@ -102,14 +104,14 @@ class SpringDamper(_Compliant):
         damping = self.parameter("D", D, unit="N*s/m", bounds=NONNEGATIVE)
         relaxed = self.parameter("length", length, unit="m")
         s, f = self._two_flanges()
-        speed = self.variable("v", unit="m/s")
+        speed = self.variable("v_rel", unit="m/s")
         self.add_equations(Eq(speed, der(s)), Eq(f, stiffness * (s - relaxed) + damping * speed))
         self.declare_energy(stiffness * (s - relaxed) ** 2 / 2)
         self.declare_dissipation(damping * speed**2)
 
 
 class NonlinearSpring(_Compliant):
-    """A spring that hardens (or softens) with the cube: f = K·e + K3·e³ with e = s − length (Duffing 1918).
+    """A spring that hardens (or softens) with the cube: f = K·e + K3·e³ with e = s_rel − length (Duffing 1918).
 
     `K` in N/m, `K3` in N/m3.
     """
@@ -126,7 +128,7 @@ class NonlinearSpring(_Compliant):
 
 
 class Backlash(_Compliant):
-    """Play between two parts: nothing is transmitted while |s| < gap/2; beyond, f = K·δ + D·dδ/dt with the
+    """Play between two parts: nothing is transmitted while |s_rel| < gap/2; beyond, f = K·δ + D·dδ/dt with the
     penetration δ, whose corners are rounded over `smooth` (metre).
 
     `gap` ≥ 0 in metre, `K` ≥ 0 in N/m, `D` ≥ 0 in N*s/m.
@@ -147,15 +149,42 @@ class Backlash(_Compliant):
         damping = self.parameter("D", D, unit="N*s/m", bounds=NONNEGATIVE)
         corner = self.parameter("smooth", smooth, unit="m", bounds=POSITIVE)
         s, f = self._two_flanges()
-        speed = self.variable("v", unit="m/s")
+        speed = self.variable("v_rel", unit="m/s")
         depth, slope = penetration(s, play, corner)
         self.add_equations(Eq(speed, der(s)), Eq(f, stiffness * depth + damping * slope * speed))
         self.declare_energy(stiffness * penetration_energy(s, play, corner))
         self.declare_dissipation(damping * slope * speed**2)
 
 
+class ElasticStop(_Compliant):
+    """A spring and a damper that push and do not pull: with the depth e = length − s_rel, f = 0 for e ≤ 0, and
+    f = −K·e + D·v_rel for e > 0, where the damper's force is limited to ±K·e, so that f is continuous and never
+    positive (the law of ElastoGap in the Modelica Standard Library 4).
+
+    `K`, `D` ≥ 0; `length` in metre. The discrete variable `touching` is 1 or 0.
+    """
+
+    def __init__(self, ev: EqnEnv, name: str, K: Value = 1e4, D: Value = 10.0, length: Value = 0.0):
+        super().__init__(ev, name)
+        stiffness = self.parameter("K", K, unit="N/m", bounds=NONNEGATIVE)
+        damping = self.parameter("D", D, unit="N*s/m", bounds=NONNEGATIVE)
+        least = self.parameter("length", length, unit="m")
+        s, f = self._two_flanges()
+        speed = self.variable("v_rel", unit="m/s")
+        touching = self.discrete("touching", start=0, unit="1")
+        depth = Piecewise((least - s, Eq(touching, 1)), (0, True))
+        pushed = stiffness * depth
+        meets, parts = (self.relation(r) for r in (damping * speed < -pushed, damping * speed > pushed))
+        brake = Piecewise((-pushed, meets), (pushed, parts), (damping * speed, True))
+        self.add_equations(Eq(speed, der(s)), Eq(f, brake - pushed))
+        self.when(s < least, assign(touching, 1), on=Eq(touching, 0), at_start=True)
+        self.when(s >= least, assign(touching, 0), on=Eq(touching, 1), at_start=True)
+        self.declare_energy(stiffness * depth**2 / 2)
+        self.declare_dissipation(brake * speed)
+
+
 class Friction(_Compliant):
-    """Dry and viscous friction between two parts that slide on each other, smooth in v = der(s):
+    """Dry and viscous friction between two parts that slide on each other, smooth in v = v_rel = der(s_rel):
     f = [sliding + (breakaway − sliding)·exp(−(v/stribeck_speed)²)]·tanh(v/smooth) + viscous·v
     (Armstrong-Hélouvry, Dupont & Canudas de Wit 1994, Automatica 30:1083).
 
@@ -180,7 +209,7 @@ class Friction(_Compliant):
         fluid = self.parameter("viscous", viscous, unit="N*s/m", bounds=NONNEGATIVE)
         width = self.parameter("smooth", smooth, unit="m/s", bounds=POSITIVE)
         s, f = self._two_flanges()
-        speed = self.variable("v", unit="m/s")
+        speed = self.variable("v_rel", unit="m/s")
         self.add_equations(Eq(speed, der(s)), Eq(f, stribeck(speed, coulomb, static, fades, fluid, width)))
         self.declare_dissipation(f * speed)
 
@@ -193,18 +222,18 @@ class Force(Component):
         flange = self.port("flange", Translational)
         f = self.input("f", default=0.0, unit="N")
         self.add_equations(Eq(flange.f, -f))
-        self.declare_supply(f * der(flange.x))
+        self.declare_supply(f * der(flange.s))
 
 
 class PositionSource(Component):
-    """A flange moved by the input `u`: flange.x = u (metre); what drives it must be differentiable in
+    """A flange moved by the input `u`: flange.s = u (metre); what drives it must be differentiable in
     time as often as the model asks."""
 
     def __init__(self, ev: EqnEnv, name: str):
         super().__init__(ev, name)
         flange = self.port("flange", Translational)
-        self.add_equations(Eq(flange.x, self.input("u", unit="m")))
-        self.declare_supply(-flange.f * der(flange.x))
+        self.add_equations(Eq(flange.s, self.input("u", unit="m")))
+        self.declare_supply(-flange.f * der(flange.s))
 
 
 class SpeedSource(Component):
@@ -214,8 +243,8 @@ class SpeedSource(Component):
         super().__init__(ev, name)
         start = self.parameter("initial_position", initial_position, unit="m")
         flange = self.port("flange", Translational)
-        where = self.variable("x", start=start, fixed=True, unit="m")
-        self.add_equations(Eq(where, flange.x), Eq(der(where), self.input("u", unit="m/s")))
+        where = self.variable("s", start=start, fixed=True, unit="m")
+        self.add_equations(Eq(where, flange.s), Eq(der(where), self.input("u", unit="m/s")))
         self.declare_supply(-flange.f * der(where))
 
 
@@ -225,7 +254,7 @@ class PositionSensor(Component):
     def __init__(self, ev: EqnEnv, name: str):
         super().__init__(ev, name)
         flange = self.port("flange", Translational)
-        self.output("y", flange.x, unit="m")
+        self.output("y", flange.s, unit="m")
         self.add_equations(Eq(flange.f, 0))
 
 
@@ -235,7 +264,7 @@ class SpeedSensor(Component):
     def __init__(self, ev: EqnEnv, name: str):
         super().__init__(ev, name)
         flange = self.port("flange", Translational)
-        self.output("y", der(flange.x), unit="m/s")
+        self.output("y", der(flange.s), unit="m/s")
         self.add_equations(Eq(flange.f, 0))
 
 
@@ -246,4 +275,4 @@ class ForceSensor(Component):
         super().__init__(ev, name)
         a, b = self.port("flange_a", Translational), self.port("flange_b", Translational)
         self.output("y", a.f, unit="N")
-        self.add_equations(Eq(a.x, b.x), Eq(a.f + b.f, 0))
+        self.add_equations(Eq(a.s, b.s), Eq(a.f + b.f, 0))

@@ -21,27 +21,27 @@ class Planetary(Component):
 
 
 class RackAndPinion(Component):
-    """A pinion on a rack, or a wheel that rolls: line.x = radius·shaft.phi, shaft.tau = −radius·line.f.
+    """A pinion on a rack, or a wheel that rolls: line.s = radius·shaft.phi, shaft.tau = −radius·line.f.
 
-    `radius` > 0 in metre; line.x is counted from where the angle is zero.
+    `radius` > 0 in metre; line.s is counted from where the angle is zero.
     """
 
     def __init__(self, ev: EqnEnv, name: str, radius: Value = 0.1):
         super().__init__(ev, name)
         r = self.parameter("radius", radius, unit="m", bounds=POSITIVE)
         shaft, line = self.port("shaft", Rotational), self.port("line", Translational)
-        self.add_equations(Eq(line.x, r * shaft.phi), Eq(shaft.tau, -r * line.f))
+        self.add_equations(Eq(line.s, r * shaft.phi), Eq(shaft.tau, -r * line.f))
 
 
 class LeadScrew(Component):
-    """A screw in a nut: line.x = lead·shaft.phi/(2π), shaft.tau = −lead·line.f/(2π), `lead` > 0 in metre a turn."""
+    """A screw in a nut: line.s = lead·shaft.phi/(2π), shaft.tau = −lead·line.f/(2π), `lead` > 0 in metre a turn."""
 
     def __init__(self, ev: EqnEnv, name: str, lead: Value = 0.005):
         super().__init__(ev, name)
         p = self.parameter("lead", lead, unit="m", bounds=POSITIVE)
         shaft, line = self.port("shaft", Rotational), self.port("line", Translational)
-        self.add_equations(Eq(line.x, p * shaft.phi / (2 * pi)), Eq(shaft.tau, -p * line.f / (2 * pi)))
+        self.add_equations(Eq(line.s, p * shaft.phi / (2 * pi)), Eq(shaft.tau, -p * line.f / (2 * pi)))
 
 
 class Wheel(RackAndPinion):
-    """A wheel that rolls without slip: line.x = radius·shaft.phi, shaft.tau = −radius·line.f, `radius` > 0 in metre."""
+    """A wheel that rolls without slip: line.s = radius·shaft.phi, shaft.tau = −radius·line.f, `radius` > 0 in metre."""

@@ -15,6 +15,7 @@ Chunk = Any  # an array of shape (n,), a scalar, or a tuple of scalars
 
 
 FEW = 256  # entries that are read as scalars together
+SCALARS = 32  # up to this many states, or inputs, tracing is done on scalars
 
 
 def entries(array: Any) -> list[Any]:

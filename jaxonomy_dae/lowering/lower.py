@@ -94,15 +94,16 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
 
     columns = quantities.owner[input_quantities]
     roots = quantities.variable[columns]
-    input_roots = list(dict.fromkeys(roots.tolist()))
     variables = flat.variables
-    for v in np.flatnonzero(variables.is_input).tolist():
-        if v not in input_roots:
-            input_roots.append(v)  # declared but unused: still a name `simulate` accepts
+    # Those that are declared but unused follow: they are still names that `simulate` accepts.
+    input_roots = list(dict.fromkeys([*roots.tolist(), *np.flatnonzero(variables.is_input).tolist()]))
+    place = {v: k for k, v in enumerate(input_roots)}
     inputs = InputTable(
         [variables.names[v] for v in input_roots],
         [variables.default[v] for v in input_roots],
-        [(input_roots.index(int(v)), int(o)) for v, o in zip(roots, quantities.order[input_quantities], strict=True)],
+        np.array(input_roots, np.int64),
+        np.array([place[v] for v in roots.tolist()], np.int64),
+        quantities.order[input_quantities],
     )
     in_state = np.concatenate([state_order, carried])
     opaque = {g.template.opaque.index: g.template.opaque for g in extended.groups if g.template.opaque is not None}

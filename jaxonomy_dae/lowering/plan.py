@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import lineax as lx
@@ -49,11 +49,22 @@ class PlannedRow:
 
 @dataclasses.dataclass(frozen=True)
 class InputTable:
-    """Which inputs the model has; quantities are listed as (input, order)."""
+    """Which inputs the model has, and which variables they are; quantities are derivatives of an order of an input."""
 
     names: list[str]
     defaults: list[float | None]
-    quantities: list[tuple[int, int]]
+    variables: np.ndarray
+    owner: np.ndarray  # the input of each quantity
+    order: np.ndarray
+
+    @functools.cached_property
+    def place(self) -> dict[str, int]:
+        """Where an input stands in `names`."""
+        return {name: k for k, name in enumerate(self.names)}
+
+    def highest(self, places: np.ndarray) -> int:
+        """How often the model differentiates one of these inputs."""
+        return int(np.max(self.order[np.isin(self.owner, places)], initial=0))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,19 +178,41 @@ class SystemPlan:
         return bool(np.isin(self.variable_map.quantity[~table.is_internal], (quantity, lowest)).any())
 
     def entries(self, name: str) -> tuple[list[str], tuple[int, ...]] | None:
-        """The names of the entries of an array of variables, and its shape; None if the name is not that of one."""
+        """The names of the entries of an array of variables, discrete ones too, and its shape; None if the name is not
+        that of one."""
         order, inner = inner_name(name)
         if inner in self.variable_index:
             return None
+        parameters = self.flat.parameters
+        ids = self.flat.arrays.parameters(name)
+        if ids is not None and np.isin(ids, parameters.discrete).all():
+            return [parameters.names[p] for p in ids.ravel().tolist()], ids.shape
         ids = self.flat.arrays.variables(inner)
         if ids is None:
             return None
         names = self.flat.variables.names
         return [f"{'der(' * order}{names[v]}{')' * order}" for v in ids.ravel().tolist()], ids.shape
 
-    def one_by_one(self, given: Any, what: str) -> Any:
-        """Values by name, with those of arrays under the names of their entries."""
-        return one_by_one(self.flat.arrays, self.flat.variables.names, given, what)
+    def entry_names(self, names: Iterable[str]) -> list[str]:
+        """Names, with those of the entries in place of an array's."""
+        return [one for name in names for one in (self.entries(name) or ([name],))[0]]
+
+    def one_by_one(self, initial: Any) -> Any:
+        """Initial values by name, with those of arrays under the names of their entries."""
+        return one_by_one(self.flat.arrays, self.flat.variables.names, initial)
+
+    def input_places(self, name: Any) -> np.ndarray | None:
+        """Where in the table of inputs one stands, of shape (), or those of an array in its shape; None if the name is
+        neither."""
+        table = self.inputs
+        if name in table.place:
+            return np.array(table.place[name])
+        ids = self.flat.arrays.variables(name) if isinstance(name, str) and len(table.names) else None
+        if ids is None:
+            return None
+        order = np.argsort(table.variables)
+        found = order[np.minimum(np.searchsorted(table.variables, ids, sorter=order), len(order) - 1)]
+        return found if np.array_equal(table.variables[found], ids) else None
 
     def resolve(self, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
         """(quantities, factors) of variables by name; `"der(name)"` is accepted where the model has that derivative."""
@@ -190,10 +223,7 @@ class SystemPlan:
                 ids = self.flat.arrays.variables(inner)
                 if ids is not None:
                     first = self.flat.variables.names[int(ids.ravel()[0])]
-                    raise ModelError(
-                        f"'{name}' is an array of shape {ids.shape}: name one of its entries, such as '{first}', or "
-                        "read it alone"
-                    )
+                    raise ModelError(f"'{name}' is an array of shape {ids.shape}: name one of its entries, '{first}'")
                 raise ModelError(f"'{name}' is not a variable: " + nearest(inner, self.visible_variables))
             q, s = self.quantity_of(self.variable_index[inner])
             if q != ZERO and order:

@@ -37,6 +37,18 @@ class ArrayNames:
         """The ids behind the name of an array of parameters, in its shape; None if it is not the name of one."""
         return self._find(name, False)
 
+    def dimensions(self, name: str) -> tuple[str, ...]:
+        """Names of the dimensions of an array of variables: the paths of the arrays that the name leaves whole."""
+        pieces = name.split(".")
+        for cut in range(len(pieces) - 1, 0, -1):
+            bare = [p.partition("[")[0] for p in pieces[:cut]]
+            entry = self.entries.get(".".join(bare))
+            own = ".".join(pieces[cut:])
+            if entry is not None and (own in entry.variable_positions or own in entry.parameter_positions):
+                whole = [(".".join(bare[: level + 1]), n) for level, n in entry.levels if "[" not in pieces[level]]
+                return tuple(p if n == 1 else f"{p}_{k}" for p, n in whole for k in range(n))
+        return ()
+
     def _find(self, name: str, variables: bool) -> np.ndarray | None:
         pieces = name.split(".") if self.entries else []
         for cut in range(len(pieces) - 1, 0, -1):
@@ -81,74 +93,51 @@ def inner_name(name: str) -> tuple[int, str]:
     return order, name
 
 
-def one_by_one(arrays: ArrayNames, names: list[str], given: Any, what: str) -> Any:
-    """Values by name, with those of arrays of variables under the names of their entries: a number for all, or an
-    array of the same shape; for samples, (times, values of shape (times, *shape), …).
+def one_by_one(arrays: ArrayNames, names: list[str], initial: Any) -> Any:
+    """Initial values by name, with those of arrays of variables under the names of their entries: a number for all, or
+    an array of the same shape.
 
     **Raises:**
 
     - `ModelError` for values of another shape.
     """
-    if not isinstance(given, Mapping) or not arrays.entries:
-        return given
+    if not isinstance(initial, Mapping) or not arrays.entries:
+        return initial
     out: dict[Any, Any] = {}
 
     def put(values: dict[Any, Any]):
         twice = next((name for name in values if name in out), None)
         if twice is not None:
-            raise ModelError(f"{what}: '{twice}' is given twice, by its own name and as part of an array")
+            raise ModelError(f"initial: '{twice}' is given twice, by its own name and as part of an array")
         out.update(values)
 
-    for name, value in given.items():
+    for name, value in initial.items():
         order, inner = inner_name(name) if isinstance(name, str) else (0, "")
         ids = arrays.variables(inner)
         if ids is None:
             put({name: value})
             continue
-        if isinstance(value, tuple | list) and _shape(value) == ids.shape:
-            if what == "inputs" and len(value) in (2, 3):
-                raise ModelError(
-                    f"inputs: '{name}' is an array of shape ({_text(ids.shape)}), and a list may be samples: give "
-                    "values as a NumPy array, or samples of shape (times, *shape) as (times, values)"
-                )
-            value = np.asarray(value)
         full = [f"{'der(' * order}{names[v]}{')' * order}" for v in ids.ravel().tolist()]
-        samples = isinstance(value, tuple | list) and len(value) in (2, 3) and np.ndim(_first(value)) == 1
-        if samples and np.ndim(value[1]) > 1:
-            columns = jnp.asarray(value[1])
-            if columns.shape[1:] != ids.shape:
-                raise ModelError(
-                    f"{what}: the samples of '{name}' need shape (times, {_text(ids.shape)}); got {columns.shape}"
-                )
-            columns = columns.reshape(len(columns), -1)
-            put({n: (value[0], columns[:, k], *value[2:]) for k, n in enumerate(full)})
-        elif samples or callable(value) or np.shape(value) == ():
+        shape = regular_shape(value)
+        if shape == ():
             put(dict.fromkeys(full, value))
-        elif np.shape(value) == ids.shape:
+        elif shape == ids.shape:
             put(dict(zip(full, jnp.asarray(value).ravel(), strict=True)))
         else:
-            raise ModelError(
-                f"{what}: '{name}' is an array of shape ({_text(ids.shape)}): give a number or an array of that shape; "
-                f"got shape {np.shape(value)}"
-            )
+            raise ModelError(f"initial: {wrong_shape(name, ids.shape, value)}")
     return out
 
 
-def _shape(value: Any) -> tuple[int, ...] | None:
-    """The shape of a list of numbers, None if it has none."""
+def wrong_shape(name: str, shape: tuple[int, ...], value: Any) -> str:
+    """What an array of variables takes, and what it was given."""
+    found = regular_shape(value)
+    got = "rows of different lengths" if found is None else f"shape {found}"
+    return f"'{name}' is an array of shape {shape}: give a number or an array of that shape; got {got}"
+
+
+def regular_shape(value: Any) -> tuple[int, ...] | None:
+    """The shape of numbers, nested lists and arrays; None if they have none."""
     try:
         return np.shape(value)
-    except ValueError:
+    except (ValueError, TypeError):  # rows of different lengths; traced arrays in a list
         return None
-
-
-def _first(value: Any) -> Any:
-    try:
-        np.ndim(value[0])
-    except ValueError:  # of no regular shape
-        return 0.0
-    return value[0]
-
-
-def _text(shape: tuple[int, ...]) -> str:
-    return ", ".join(map(str, shape))

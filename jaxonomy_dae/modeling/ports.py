@@ -32,7 +32,7 @@ class Domain:
 
 
 Electrical = Domain("Electrical", across=(("v", "V"),), through=(("i", "A"),))
-Translational = Domain("Translational", across=(("x", "m"),), through=(("f", "N"),))
+Translational = Domain("Translational", across=(("s", "m"),), through=(("f", "N"),))
 Rotational = Domain("Rotational", across=(("phi", "rad"),), through=(("tau", "N*m"),))
 Thermal = Domain("Thermal", across=(("T", "K"),), through=(("Q_flow", "W"),))
 Planar = Domain(

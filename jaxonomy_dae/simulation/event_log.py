@@ -121,6 +121,10 @@ class Side:
             )
         if name in system.discretes:
             return rows[..., len(system.plan.nominal) + system.discretes.index(name)]
+        array = system.plan.entries(name)
+        if array is not None:
+            each = jnp.stack([self[one] for one in array[0]], axis=-1)
+            return each.reshape(*each.shape[:-1], *array[1])
         quantity, factor = system.plan.resolve([name])
         if rows.ndim > 2:
             return eqx.filter_vmap(_observed, in_axes=(eqx.if_array(0), 0, 0, eqx.if_array(0), None, None))(

@@ -17,8 +17,8 @@ from ..lowering.schedule import AnyStep, SparseStep
 from ..model.tables import ZERO
 from ..solvers.dae_term import FlatProblem
 from ..solvers.index_one import consistent_slope
+from ..system.input_values import input_values
 from ..system.system import AcausalSystem
-from ..system.system_at import input_values
 from .preparation import term_of
 
 SHOWN = 4
@@ -70,7 +70,7 @@ def _findings(system: AcausalSystem, t: Any, x: Any, inputs: dict[str, Any]) -> 
     plan, parameters = system.plan, system.numbers
 
     def values():
-        return np.array([float(v) for v in input_values(plan, inputs, t, parameters.dtype)])
+        return np.array(input_values(plan, inputs, t, parameters.dtype), float)
 
     networks = tuple(system.neural[n] for n in plan.network_names)
     return list(examine_blocks(plan, np.asarray(parameters, float), networks, float(t), np.asarray(x), values))

@@ -8,8 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..hybrid.solver import TOO_MANY
+from ..lowering.plan import SystemPlan
 from ..solvers.choice_guard import SINGULAR_CHOICE
 from ..solvers.failures import SHOWN, explain_failure, how_it_stopped
+from ..system.inputs import value_at
 from ..system.system import AcausalSystem
 from .event_log import Events
 from .failed_blocks import failed_block
@@ -70,7 +72,7 @@ def explain(
             if system.is_constrained
             else ""
         )
-    bad = _bad_input(inputs, float(t0), float(t), float(t1))
+    bad = _bad_input(system.plan, inputs, float(t0), float(t), float(t1))
     if bad:
         return f"the integration stopped at t={float(t):g}: {bad}"
     equation = equation_not_finite(system, inputs, t, x)
@@ -152,16 +154,19 @@ def _too_many_events(events: Events, t: float) -> str:
     return f"{text}."
 
 
-def _bad_input(inputs: dict[str, Any], t0: float, t: float, t1: float) -> str:
+def _bad_input(plan: SystemPlan, inputs: dict[str, Any], t0: float, t: float, t1: float) -> str:
     """The input that is not finite at the last accepted point or beyond it, if one is."""
     near = t + (t1 - t) * np.concatenate([[0.0], 10.0 ** np.linspace(-15, 0, PROBES)])
     for name, value in inputs.items():
         for s in near if callable(value) else near[:1]:
-            found = float(np.asarray(value(jnp.asarray(s)) if callable(value) else value))
-            if not np.isfinite(found):
+            found = np.ravel(value_at(value, jnp.asarray(s)))
+            if not np.isfinite(found).all():
+                k = int(np.flatnonzero(~np.isfinite(found))[0])
+                places = plan.input_places(name)
+                which = name if places is None or len(found) < places.size else plan.inputs.names[places.ravel()[k]]
                 where = f" at t={s:.6g}" if callable(value) else ""
                 return (
-                    f"input '{name}' is {found}{where}. Give a value at every time from {t0:g} to {t1:g} "
+                    f"input '{which}' is {found[k]}{where}. Give a value at every time from {t0:g} to {t1:g} "
                     "(jnp.nan_to_num, or samples without gaps)."
                 )
     return ""

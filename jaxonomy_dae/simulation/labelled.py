@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import ModelError
+from ..model.array_names import inner_name
 from ..optional import optional_module
 
 if TYPE_CHECKING:
@@ -18,15 +19,9 @@ def data_frame(solution: "Solution", names: tuple[str, ...]) -> Any:
         raise ModelError(
             f"a data frame holds one solution, this is a batch of shape {solution.ts.shape[:-1]}: use to_xarray()"
         )
-    chosen = _one_by_one(solution, names) or tuple(solution)
+    chosen = solution.system.plan.entry_names(names) or list(solution)
     index = pandas.Index(np.asarray(solution.ts), name="time")
-    return pandas.DataFrame(np.asarray(solution[list(chosen)]), index=index, columns=list(chosen))
-
-
-def _one_by_one(solution: "Solution", names: tuple[str, ...]) -> tuple[str, ...]:
-    """Names, with those of the entries in place of an array's."""
-    plan = solution.system.plan
-    return tuple(one for name in names for one in (plan.entries(name) or ([name],))[0])
+    return pandas.DataFrame(np.asarray(solution[chosen]), index=index, columns=chosen)
 
 
 def data_set(solution: "Solution", names: tuple[str, ...]) -> Any:
@@ -42,13 +37,22 @@ def data_set(solution: "Solution", names: tuple[str, ...]) -> Any:
 def dataset_of(
     xarray: Any, solution: "Solution", dims: tuple[str, ...], coordinates: dict[str, Any], names: tuple[str, ...] = ()
 ) -> Any:
-    """The variables of a solution, or of a batch that has the dimensions `dims`, with their units."""
-    chosen = _one_by_one(solution, names) or tuple(solution)
-    table = solution.system.plan.flat.variables
+    """The variables of a solution, or of a batch that has the dimensions `dims`, with their units. An array that is
+    named is one variable, with a dimension for each that it has."""
+    plan = solution.system.plan
+    table = plan.flat.variables
     units = dict(zip(table.names, table.unit, strict=True))
-    columns = np.moveaxis(np.asarray(solution[list(chosen)]), -1, 0)
-    variables = {
-        name: ((*dims, "time"), values, {"units": units[name]} if units.get(name) else {})
-        for name, values in zip(chosen, columns, strict=True)
-    }
+    arrays = {name: found for name in names if (found := plan.entries(name)) is not None}
+    chosen = [name for name in names if name not in arrays] if names else list(solution)
+    columns = np.moveaxis(np.asarray(solution[chosen]), -1, 0) if chosen else ()
+    over = (*dims, "time")
+
+    def attributes(name: str) -> dict[str, str]:
+        return {"units": units[name]} if units.get(name) else {}
+
+    variables: dict[str, Any] = {n: (over, values, attributes(n)) for n, values in zip(chosen, columns, strict=True)}
+    for name, (one_by_one, _) in arrays.items():
+        inner = inner_name(name)[1]
+        unit = attributes(one_by_one[0])
+        variables[name] = ((*over, *plan.flat.arrays.dimensions(inner)), np.asarray(solution[name]), unit)
     return xarray.Dataset(variables, coords=coordinates)

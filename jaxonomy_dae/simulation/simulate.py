@@ -101,10 +101,10 @@ def simulate(
     - `ModelError` for arguments that cannot work; `InitializationError`; `SimulationError`.
     """
     if isinstance(system, AcausalSystem):  # `check_arguments` says what to do with anything else
-        initial, inputs = (system.plan.one_by_one(g, w) for g, w in ((initial, "initial"), (inputs, "inputs")))
+        initial = system.plan.one_by_one(initial)
     check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_controller, dtmax, max_steps)
     dtype = system.parameters.values.dtype
-    inputs = read_inputs(system.inputs, dtype, inputs)
+    inputs = read_inputs(system.plan, dtype, inputs)
     check_range(inputs, t0, t1)
     ends = step_ends(system.plan, inputs)
     rtol, atol = default_tolerances(rtol, atol, dtype)

@@ -52,7 +52,8 @@ class Solution(eqx.Module):
     def __getitem__(self, name: Any) -> Any:
         """The values of a variable, or of several: `solution["pend.x"]` has shape `(n,)`, and
         `solution[["pend.x", "pend.y"]]` shape `(n, 2)`. `"time"` is accepted, and `"der(...)"` of what the model
-        differentiates.
+        differentiates. `solution["cell.v"]` of an array has shape `(n, *shape)`; among several names, it stands for
+        those of all entries.
 
         **Raises:**
 
@@ -61,14 +62,14 @@ class Solution(eqx.Module):
         if not isinstance(name, str):
             if not isinstance(name, Sequence) or not all(isinstance(one, str) for one in name):
                 raise ModelError(f"read a solution by names, solution['m.x'] or solution[['m.x', 'm.y']]; got {name!r}")
-            return self._columns(tuple(name))
+            return self._columns(tuple(self.system.plan.entry_names(name)))
         if name == "time":
             return self.ts
         if self.states.ndim > 2:
             return _each(self, lambda one: one[name])
         if self.discrete is not None and name in self.system.discretes:
             return self.discrete[:, self.system.discretes.index(name)]
-        entries = self._entries(name)
+        entries = self.system.plan.entries(name)
         if entries is not None:
             names, shape = entries
             return self._columns(tuple(names)).reshape(*self.ts.shape, *shape)
@@ -80,15 +81,6 @@ class Solution(eqx.Module):
         if _is_traced(given):
             return _observed(*given, quantity, factor)[:, 0]
         return _one(*given, jnp.asarray(quantity[0]), jnp.asarray(factor[0], self.states.dtype))
-
-    def _entries(self, name: str) -> tuple[list[str], tuple[int, ...]] | None:
-        """The names of the entries of an array, and its shape."""
-        plan = self.system.plan
-        ids = plan.flat.arrays.parameters(name)
-        discrete = plan.flat.parameters.discrete
-        if ids is not None and self.discrete is not None and np.isin(ids, discrete).all():
-            return [plan.flat.parameters.names[p] for p in ids.ravel().tolist()], ids.shape
-        return plan.entries(name)
 
     def _state(self, quantity: int, factor: float) -> Any:
         """The values of what is zero, or in the state array; None for all else."""
@@ -147,7 +139,7 @@ class Solution(eqx.Module):
 
     def __contains__(self, name: str) -> bool:
         known = name == "time" or name in self.system.plan.variable_index or name in self.system.discretes
-        return known or self._entries(name) is not None
+        return known or self.system.plan.entries(name) is not None
 
     def __iter__(self) -> Iterator[str]:
         return iter([*self.system.variables, *self.system.discretes])

@@ -2,7 +2,8 @@
 
 `read_inputs` turns constants, samples, Diffrax interpolations and functions of time into callable pytrees or arrays:
 everything a function reads from its surroundings is read when it is given, and is a leaf. What has been read already
-passes unchanged. `step_ends` says where steps must end, so that no sample is stepped over.
+passes unchanged; what is given for an array of inputs stays one array. `step_ends` says where steps must end, so that
+no sample is stepped over.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,6 +18,8 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..errors import ModelError, nearest
+from ..lowering.plan import SystemPlan
+from ..model.array_names import regular_shape, wrong_shape
 from ..modeling.untraceable import uses_numpy, why_untraceable
 from .closed_function import ClosedFunction, closed_function
 
@@ -28,7 +31,7 @@ class Held(eqx.Module):
     """Samples held until the next one; where they jump, the new value counts."""
 
     ts: Float[Array, " n"]
-    ys: Float[Array, " n"]
+    ys: Float[Array, "n *shape"]
 
     def evaluate(self, t: Any) -> Any:
         """The last sample at or before t."""
@@ -46,8 +49,25 @@ class Sampled(eqx.Module):
         return self.path.evaluate(t)
 
 
-def read_inputs(known: list[str], dtype: Any, inputs: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Inputs by name as callable pytrees and arrays of the given dtype.
+class Entry(eqx.Module):
+    """One input of an array of them: `index` counts its entries row by row."""
+
+    source: Any
+    index: int = eqx.field(static=True)
+
+    def __call__(self, t: Any) -> Any:
+        found = value_at(self.source, t)
+        return jnp.ravel(found)[self.index] if jnp.ndim(found) else found
+
+
+def value_at(source: Any, t: Any) -> Any:
+    """The value of what has been read, at a time."""
+    return source(t) if callable(source) else source
+
+
+def read_inputs(plan: SystemPlan, dtype: Any, inputs: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Inputs by name as callable pytrees and arrays of the given dtype: scalars, or for the name of an array of inputs,
+    scalars for all of them or arrays in its shape.
 
     **Raises:**
 
@@ -58,34 +78,56 @@ def read_inputs(known: list[str], dtype: Any, inputs: Mapping[str, Any] | None) 
     if not isinstance(inputs, Mapping):
         raise ModelError(f"inputs is a dictionary by names: {EXAMPLE}; got {type(inputs).__name__}")
     found = {}
+    covered = np.zeros(len(plan.inputs.names), bool)
     for name, value in inputs.items():
-        if name not in known:
-            raise ModelError(f"'{name}' is not an input of this system: " + nearest(name, known))
-        found[name] = _read(name, value, dtype)
+        places = plan.input_places(name)
+        if places is None:
+            raise ModelError(f"'{name}' is not an input of this system: " + nearest(name, plan.inputs.names))
+        if covered[places].any():
+            twice = plan.inputs.names[places[covered[places]][0] if places.ndim else places]
+            raise ModelError(f"inputs: '{twice}' is given twice, by its own name and as part of an array")
+        covered[places] = True
+        found[name] = _read(name, value, dtype, places.shape)
     return found
 
 
-def _read(name: str, value: Any, dtype: Any) -> Any:
-    if isinstance(value, Sampled | ClosedFunction):
+def _read(name: str, value: Any, dtype: Any, shape: tuple[int, ...]) -> Any:
+    """What was given for an input, or for an array of inputs of this shape."""
+    if isinstance(value, Sampled | ClosedFunction | Entry):
         return value
     if isinstance(value, diffrax.LinearInterpolation | diffrax.CubicInterpolation):
-        return _interpolation(name, value)
+        return _interpolation(name, value, shape)
     if isinstance(value, diffrax.AbstractPath):
         value = value.evaluate
     if callable(value):
-        return _function(name, value, dtype)
-    if isinstance(value, tuple | list) and len(value) in (2, 3) and np.ndim(_quietly(value[0])) == 1:
-        return _samples(name, value, dtype)
+        return _function(name, value, dtype, shape)
+    if isinstance(value, tuple | list) and len(value) in (2, 3):
+        if shape and regular_shape(value) == shape:
+            raise ModelError(
+                f"inputs: '{name}' is an array of shape {shape}, and a list may be samples: give values as a NumPy "
+                "array, or samples of shape (times, *shape) as (times, values)"
+            )
+        if len(regular_shape(value[0]) or ()) == 1:
+            return _samples(name, value, dtype, shape)
+    if shape:
+        return _constants(name, value, dtype, shape)
     return _constant(name, value, dtype)
 
 
-def _quietly(value: Any) -> Any:
-    """The value, or a number in place of what has no regular shape."""
-    try:
-        np.ndim(value)
-    except ValueError:
-        return 0.0
-    return value
+def _constants(name: str, value: Any, dtype: Any, shape: tuple[int, ...]) -> Any:
+    """Numbers for an array of inputs, in its shape."""
+    found = regular_shape(value)
+    if found == ():
+        return _constant(name, value, dtype)
+    if found != shape:
+        raise ModelError(f"inputs: {wrong_shape(name, shape, value)}")
+    array = value if isinstance(value, jax.Array) else np.asarray(value)
+    if array.dtype.kind not in "biuf":
+        raise ModelError(f"inputs: '{name}' must be real numbers; got {array.dtype}")
+    if not isinstance(array, Tracer) and not np.isfinite(array).all():
+        index = tuple(np.argwhere(~np.isfinite(np.asarray(array)))[0].tolist())
+        raise ModelError(f"input '{name}' must be finite; its entry {list(index)} is {array[index]}")
+    return jnp.asarray(array, dtype)
 
 
 def _constant(name: str, value: Any, dtype: Any) -> Any:
@@ -115,7 +157,7 @@ def _constant(name: str, value: Any, dtype: Any) -> Any:
 # --- functions -----------------------------------------------------------------------------------------------------
 
 
-def _function(name: str, function: Callable[[Any], Any], dtype: Any) -> ClosedFunction:
+def _function(name: str, function: Callable[[Any], Any], dtype: Any, allowed: tuple[int, ...]) -> ClosedFunction:
     try:
         out = jax.eval_shape(lambda t: function(t), jax.ShapeDtypeStruct((), dtype))
     except Exception as error:
@@ -123,9 +165,10 @@ def _function(name: str, function: Callable[[Any], Any], dtype: Any) -> ClosedFu
         samples = f", or give the samples themselves: {EXAMPLE}" if uses_numpy(error) else ""
         raise ModelError(f"input '{name}' {why}{samples}") from error
     shape = getattr(out, "shape", None)
-    if shape != ():
+    if shape not in ((), allowed):
         found = "nothing" if out is None else f"shape {shape}" if shape is not None else type(out).__name__
-        raise ModelError(f"input '{name}' must return one number for a time; it returned {found}")
+        wanted = f"one number or an array of shape {allowed}" if allowed else "one number"
+        raise ModelError(f"input '{name}' must return {wanted} for a time; it returned {found}")
     if jnp.issubdtype(out.dtype, jnp.complexfloating):  # pyright: ignore[reportAttributeAccessIssue]
         raise ModelError(f"input '{name}' must be real; it returned {out.dtype}")  # pyright: ignore
     return closed_function(lambda t: jnp.asarray(function(t), dtype), dtype)
@@ -134,12 +177,14 @@ def _function(name: str, function: Callable[[Any], Any], dtype: Any) -> ClosedFu
 # --- samples -------------------------------------------------------------------------------------------------------
 
 
-def _samples(name: str, given: tuple[Any, ...] | list[Any], dtype: Any) -> Sampled:
+def _samples(name: str, given: tuple[Any, ...] | list[Any], dtype: Any, shape: tuple[int, ...]) -> Sampled:
     kind = given[2] if len(given) == 3 else "linear"
     if kind not in KINDS:
         raise ModelError(f"input '{name}': samples are 'linear', 'cubic' or 'held'; got {kind!r}")
-    times, values = (_column(name, which, v, dtype) for which, v in zip(("times", "values"), given, strict=False))
-    if times.shape != values.shape:
+    times = _column(name, "times", given[0], dtype)
+    for_each = shape and len(regular_shape(given[1]) or ()) > 1
+    values = _column(name, "values", given[1], dtype, shape if for_each else ())
+    if times.shape != values.shape[:1]:
         raise ModelError(
             f"input '{name}' needs a value for every time; got {times.shape[0]} times and {values.shape[0]} values"
         )
@@ -154,18 +199,21 @@ def _samples(name: str, given: tuple[Any, ...] | list[Any], dtype: Any) -> Sampl
     return Sampled(diffrax.CubicInterpolation(times, diffrax.backward_hermite_coefficients(times, values)), 1)
 
 
-def _column(name: str, which: str, values: Any, dtype: Any) -> Any:
+def _column(name: str, which: str, values: Any, dtype: Any, shape: tuple[int, ...] = ()) -> Any:
+    """Real and finite numbers of shape (n, *shape)."""
+    wanted = f"({', '.join(['n', *map(str, shape)])}{'' if shape else ','})"
     try:
         array = values if isinstance(values, Tracer) else np.asarray(values)
     except ValueError:
-        raise ModelError(f"input '{name}': {which} must have shape (n,)") from None
-    if array.ndim != 1 or array.dtype.kind not in "biuf":
+        raise ModelError(f"input '{name}': {which} must have shape {wanted}") from None
+    if array.ndim == 0 or array.shape[1:] != shape or array.dtype.kind not in "biuf":
         raise ModelError(
-            f"input '{name}': {which} must be real numbers of shape (n,); got {array.dtype} of shape {array.shape}"
+            f"input '{name}': {which} must be real numbers of shape {wanted}; got {array.dtype} of shape {array.shape}"
         )
     if not isinstance(array, Tracer) and not np.isfinite(array).all():
-        k = int(np.flatnonzero(~np.isfinite(array))[0])
-        raise ModelError(f"input '{name}': {which}[{k}] is {array[k]}; leave the sample out")
+        index = tuple(np.argwhere(~np.isfinite(array))[0].tolist())
+        where = ", ".join(map(str, index))
+        raise ModelError(f"input '{name}': {which}[{where}] is {array[index]}; leave the sample out")
     return jnp.array(array, dtype, copy=True)
 
 
@@ -181,11 +229,12 @@ def _check_times(name: str, times: Any):
         )
 
 
-def _interpolation(name: str, path: Any) -> Sampled:
+def _interpolation(name: str, path: Any, shape: tuple[int, ...]) -> Sampled:
     out = jax.eval_shape(path.evaluate, jax.ShapeDtypeStruct((), path.ts.dtype))
-    if getattr(out, "shape", None) != ():
+    if getattr(out, "shape", None) not in ((), shape):
         shapes = [leaf.shape for leaf in jax.tree.leaves(out)]
-        raise ModelError(f"input '{name}' needs an interpolation of values of shape (n,); it returns {shapes}")
+        either = f" or {('n', *shape)}".replace("'", "") if shape else ""
+        raise ModelError(f"input '{name}' needs an interpolation of values of shape (n,){either}; it returns {shapes}")
     for leaf in jax.tree.leaves(path):
         if not isinstance(leaf, Tracer) and not np.isfinite(np.asarray(leaf)).all():
             raise ModelError(
@@ -224,7 +273,7 @@ class StepEnds(NamedTuple):
         return sum(len(ts) for ts in (*self.jumps, *self.kinks))
 
 
-def step_ends(plan: Any, inputs: Mapping[str, Any]) -> StepEnds:
+def step_ends(plan: SystemPlan, inputs: Mapping[str, Any]) -> StepEnds:
     """Where the samples of inputs, or the derivatives of them that the model reads, have kinks and jumps.
 
     **Raises:**
@@ -235,7 +284,8 @@ def step_ends(plan: Any, inputs: Mapping[str, Any]) -> StepEnds:
     for name, value in inputs.items():
         if not isinstance(value, Sampled):
             continue
-        highest = max([order for k, order in plan.inputs.quantities if plan.inputs.names[k] == name], default=0)
+        places = plan.input_places(name)
+        highest = 0 if places is None else plan.inputs.highest(places)
         if highest > value.smoothness + 1:
             kind = {-1: "held", 0: "linear", 1: "cubic"}[value.smoothness]
             better = "'cubic'" if highest <= 2 else "a smooth function of time"

@@ -14,13 +14,15 @@ from jaxtyping import Array, Float
 from ..diagnosis.wording import counted, some
 from ..errors import ModelError, nearest
 from ..linear.sparse import SparseMatrix, SparsePattern, sparse_jacobian
+from ..lowering.gather import SCALARS
 from ..lowering.plan import SystemPlan
 from ..model.dependent_parameters import complete
 from ..model.pickling import functions_by_name, named_functions
 from .evaluate import Refinement
+from .input_values import missing_input
 from .inputs import read_inputs
 from .parameters import Parameters
-from .system_at import SCALARS, SystemAt
+from .system_at import SystemAt
 
 
 class AcausalSystem(eqx.Module):
@@ -150,13 +152,13 @@ class AcausalSystem(eqx.Module):
 
     def at(self, t: Any, args: Any = None) -> SystemAt:
         """The system at a time, with these inputs, ready to be evaluated at states."""
-        args = read_inputs(self.plan.inputs.names, self.parameters.values.dtype, self.plan.one_by_one(args, "inputs"))
-        for name, default in zip(self.plan.inputs.names, self.plan.inputs.defaults, strict=True):
-            if default is None and name not in args:
-                raise ModelError(
-                    f"input '{name}' has no default: connect a signal to it, or give it with "
-                    f"inputs={{'{name}': function_of_time}}"
-                )
+        args = read_inputs(self.plan, self.parameters.values.dtype, args)
+        missing = missing_input(self.plan, args)
+        if missing is not None:
+            raise ModelError(
+                f"input '{missing}' has no default: connect a signal to it, or give it with "
+                f"inputs={{'{missing}': function_of_time}}"
+            )
         networks = tuple(self.neural[n] for n in self.plan.network_names)
         return SystemAt(self.plan, self.numbers, networks, t, args)
 
@@ -287,7 +289,7 @@ class AcausalSystem(eqx.Module):
 
     def observe(self, names: str | Sequence[str], t: Any, x: Float[Array, " n"], args: Any = None) -> Any:
         """The values of variables at a state: a scalar for one name, shape `(len(names),)` for several; for the name of
-        an array, `"cell.v"`, its shape.
+        an array, `"cell.v"`, its shape. Among several names, it stands for those of all entries.
 
         **Raises:**
 
@@ -297,7 +299,7 @@ class AcausalSystem(eqx.Module):
         entries = self.plan.entries(names) if isinstance(names, str) else None
         if entries is not None:
             return self.observe(entries[0], t, x, args).reshape(entries[1])
-        quantity, factor = self.plan.resolve([names] if single else list(names))
+        quantity, factor = self.plan.resolve([names] if single else self.plan.entry_names(names))
         values = self.at(t, args).quantities(x, quantity, factor)
         return values[0] if single else values
 
@@ -364,7 +366,7 @@ class AcausalSystem(eqx.Module):
         names = self._names_to_solve_for(solve_for)
         if solver is not None:
             check_solver(solver)
-        initial, inputs = (self.plan.one_by_one(g, w) for g, w in ((initial, "initial"), (inputs, "inputs")))
+        initial = self.plan.one_by_one(initial)
         found = find_initial(self, t0, inputs, initial, names, solver)
         found = check(self, found, t0, inputs, initial, names)
         if solve_for is None:
@@ -396,7 +398,7 @@ class AcausalSystem(eqx.Module):
         from ..initialization.report import InitializationReport
 
         names = self._names_to_solve_for(solve_for)
-        initial, inputs = (self.plan.one_by_one(g, w) for g, w in ((initial, "initial"), (inputs, "inputs")))
+        initial = self.plan.one_by_one(initial)
         found = find_initial(self, t0, inputs, initial, names)
         if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((found, self, t0))):
             raise ModelError("initialization_report needs numbers: call it outside jit, grad and vmap")

@@ -4,7 +4,6 @@ All functions take the static plan, the flat parameters, the networks, time, the
 systems are traced on scalars, which XLA fuses into a few kernels; large ones on arrays.
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -15,7 +14,7 @@ from ..errors import ModelError
 from ..linear.sparse import SparsePattern, sparse_jacobian
 from ..linear.whole import solve_whole
 from ..linear.written_out import UNROLLED, solve, solve_dense
-from ..lowering.gather import Gather, entries, take, times
+from ..lowering.gather import SCALARS, Gather, entries, take, times
 from ..lowering.plan import ConstraintGroup, PlannedRow, SystemPlan
 from ..lowering.plan_events import EventPlan
 from ..lowering.plan_held import HeldPlan
@@ -23,31 +22,7 @@ from ..lowering.program import Program
 from ..model.evaluate_numpy import Networks
 from ..solvers.field_size import is_large
 from .evaluate import Evaluation, Refinement, newton
-
-SCALARS = 32  # up to this many states, tracing is done on scalars
-
-
-def input_values(plan: SystemPlan, given: Any, t: Any, dtype) -> tuple:
-    """The values of all input quantities at time t: functions of time or constants, differentiated by jvp."""
-    given = given or {}
-
-    def value(k: int) -> Callable:
-        name = plan.inputs.names[k]
-        source = given.get(name, plan.inputs.defaults[k])
-        if callable(source):
-            return lambda s: jnp.asarray(source(s), dtype)
-        return lambda s: jnp.asarray(source, dtype)
-
-    def derivative(function: Callable, order: int) -> Callable:
-        for _ in range(order):
-            function = _time_derivative(function)
-        return function
-
-    return tuple(derivative(value(k), order)(t) for k, order in plan.inputs.quantities)
-
-
-def _time_derivative(function: Callable) -> Callable:
-    return lambda s: jax.jvp(function, (s,), (jnp.ones_like(s),))[1]
+from .input_values import input_values
 
 
 class SystemAt:

@@ -93,10 +93,10 @@ class Body(Component):
 
 
 class Link(TwoFrames):
-    """A rigid link without mass: frame_b is fixed in frame_a at the offset (rx, ry), and turned by no angle.
+    """A rigid link without mass: frame_b is fixed in frame_a at the offset (rx, ry), and turned by the angle `phi`.
 
-        dx = rx·cos phi − ry·sin phi,   dy = rx·sin phi + ry·cos phi,   phi = frame_a.phi
-        frame_b.x = frame_a.x + dx,   frame_b.y = frame_a.y + dy,   frame_b.phi = phi
+        dx = rx·cos(frame_a.phi) − ry·sin(frame_a.phi),   frame_b.x = frame_a.x + dx
+        dy = rx·sin(frame_a.phi) + ry·cos(frame_a.phi),   frame_b.y = frame_a.y + dy,   frame_b.phi = frame_a.phi + phi
         0 = frame_a.f + frame_b.f,   0 = frame_a.tau + frame_b.tau + dx·frame_b.fy − dy·frame_b.fx
 
     (Haug 1989, section 2.4, for the place of a point of a body.)
@@ -104,15 +104,17 @@ class Link(TwoFrames):
     **Arguments:**
 
     - `rx`, `ry`: from frame_a to frame_b along the axes of frame_a (metre).
+    - `phi`: from the axes of frame_a to those of frame_b (radian); 0 if left out, and then not a parameter.
     """
 
-    def __init__(self, ev: EqnEnv, name: str, rx: Value = 1.0, ry: Value = 0.0):
+    def __init__(self, ev: EqnEnv, name: str, rx: Value = 1.0, ry: Value = 0.0, phi: Value | None = None):
         super().__init__(ev, name)
         ahead, aside = self.parameter("rx", rx, unit="m"), self.parameter("ry", ry, unit="m")
+        turned = 0 if phi is None else self.parameter("phi", phi, unit="rad")
         a, b = self._two_frames()
         dx = ahead * cos(a.phi) - aside * sin(a.phi)
         dy = ahead * sin(a.phi) + aside * cos(a.phi)
-        self.add_equations(Eq(b.x, a.x + dx), Eq(b.y, a.y + dy), Eq(b.phi, a.phi))
+        self.add_equations(Eq(b.x, a.x + dx), Eq(b.y, a.y + dy), Eq(b.phi, a.phi + turned))
         self._balance(dx, dy)
 
 

@@ -56,7 +56,7 @@ class Prismatic(TwoFrames):
         dx = s·cos(frame_a.phi + angle),   dy = s·sin(frame_a.phi + angle),   ds/dt = v
         frame_b.x = frame_a.x + dx,   frame_b.y = frame_a.y + dy,   frame_b.phi = frame_a.phi
         0 = frame_a.f + frame_b.f,   0 = frame_a.tau + frame_b.tau + dx·frame_b.fy − dy·frame_b.fx
-        flange.x = s,   frame_b.fx·cos(frame_a.phi + angle) + frame_b.fy·sin(frame_a.phi + angle) = −flange.f
+        flange.s = s,   frame_b.fx·cos(frame_a.phi + angle) + frame_b.fy·sin(frame_a.phi + angle) = −flange.f
 
     What is connected to `flange` pushes frame_b away from frame_a: a source of force, or a spring and a damper from the
     flange to a `translational.FixedPosition`. Left unconnected, the slide is free.
@@ -91,7 +91,7 @@ class Prismatic(TwoFrames):
             Eq(b.y, a.y + s * along_y),
             Eq(b.phi, a.phi),
             Eq(der(s), v),
-            Eq(flange.x, s),
+            Eq(flange.s, s),
             Eq(b.fx * along_x + b.fy * along_y, -flange.f),
         )
         self._balance(s * along_x, s * along_y)
