@@ -295,3 +295,16 @@ def test_house():
     # those of runs at rtol 1e-6 are, place the optimum to 0.1 mm.
     np.testing.assert_allclose(best[0], search.x[0] / 10, rtol=0, atol=5e-4)
     np.testing.assert_allclose(best[1], search.x[1], rtol=0, atol=1e-2)
+
+
+def test_through_the_bounce():
+    names = names_after("bounce")
+    np.testing.assert_allclose(names["hit"], names["exact_hit"], rtol=0, atol=1e-9)  # parabolas: rounding, amplified
+    # The runs have rtol 1e-10, the difference a step of 1e-5.
+    np.testing.assert_allclose(names["slope"], names["difference"], rtol=1e-4)
+    # 184 heights with their true noise: 1, give or take sqrt(2/184) = 0.1.
+    assert abs(names["fit"].best_loss - 1) < 0.3
+    speeds = names["seen"]
+    law = jax.vmap(names["learned"].neural["ball.law"])(speeds[:, None])[:, 0]
+    np.testing.assert_allclose(law, names["truth"](speeds), rtol=0, atol=0.03)  # the noise over falls of 0.2 m
+    assert np.abs(names["hit"] - names["wanted"]).max() < 0.1
