@@ -338,3 +338,17 @@ def test_inlines_inside_jit():
     # One program: no call back to Python but Equinox's run-time checks.
     text = str(jax.make_jaxpr(last)(1.0))
     assert "while" in text
+
+
+def test_a_system_compiled_inside_a_traced_function():
+    """Its parameters are numbers: it may be kept."""
+    kept = []
+
+    @jax.jit
+    def end(x0):
+        if not kept:
+            kept.append(rc_circuit())
+        return simulate(kept[0], 1.0, ts=jnp.array([1.0]), initial={"c.v": x0})["c.v"][0]
+
+    assert float(end(0.5)) == pytest.approx(float(rc_voltage(1.0, v0=0.5)), abs=1e-6)
+    assert float(kept[0].parameters["r.R"]) == 2.0

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import lineax as lx
 
@@ -101,7 +102,9 @@ class AcausalCompiler:
             declared.names[:n], declared.units[:n], declared.bounds[:n], declared.dependents, declared.expressions,
             flat.arrays, plan.digest,
         )  # fmt: skip
-        parameters = Parameters(jnp.asarray(declared.values[:n], dtype=jnp.zeros(()).dtype), None, (), table)
+        with jax.ensure_compile_time_eval():  # also where it is called while a function is traced
+            values = jnp.asarray(declared.values[:n], dtype=jnp.zeros(()).dtype)
+        parameters = Parameters(values, None, (), table)
         neural = {name: _own(network) for name, network in flat.networks.items()}
         return AcausalSystem(parameters, neural, plan)
 
