@@ -36,7 +36,7 @@ def main() -> None:
 
     for path in sorted((ROOT / "tests").glob("test_library_*.py")):
         importlib.import_module(path.stem)
-    for name in ("test_events", "test_pendulum", "test_rotational"):
+    for name in ("test_events", "test_modelica_examples", "test_pendulum", "test_rotational"):
         importlib.import_module(name)
     found: dict[str, dict[str, Measurement]] = {}
     failed: list[str] = []
