@@ -119,13 +119,13 @@ def driven():
             changed,
             2.0,
             ts=jnp.array([1.0, 2.0]),
-            initial={"mass.s": values["x"], "mass.v": values["v"]},
+            initial={"mass.x": values["x"], "mass.v": values["v"]},
             inputs={"mass.u": Ramp(values["a"], values["b"])},
             rtol=1e-11,
             atol=1e-12,
             adjoint=adjoint,
         )
-        return solution["mass.s"] @ jnp.array([1.0, 2.0])
+        return solution["mass.x"] @ jnp.array([1.0, 2.0])
 
     values = {k: jnp.asarray(v) for k, v in dict(w=2.0, x=0.3, v=-0.2, a=0.7, b=0.4).items()}
     reverse = jax.jit(jax.value_and_grad(loss))(values)
