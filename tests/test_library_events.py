@@ -113,7 +113,7 @@ def by_modes(ts, x, on, guard, slopes):
 RON, GOFF = 0.05, 1e-3
 
 
-def bridge_by_brute_force(source, v_load, R=None):
+def bridge_by_brute_force(source, v_load, R=None, goff=GOFF, knee=0.0):
     """(potentials, currents, conducting) of a bridge whose output is held at v_load, or loaded by R.
 
     The sixteen modes of four diodes, and the one in which none contradicts itself. Nodes: 0 the source's other end,
@@ -125,10 +125,12 @@ def bridge_by_brute_force(source, v_load, R=None):
         # Unknowns: potentials of nodes 1, 2, 3 and the current out of the load's source.
         A, b = np.zeros((4, 4)), np.zeros(4)
         A[0, 0], b[0] = 1.0, source  # (source − v1)/Rs flows into node 1
-        conductances = [1 / RON if on else GOFF for on in modes]
-        for (p, n), conductance in zip(ends, conductances, strict=True):
-            for node, other in ((p, n), (n, p)):
+        conductances = np.array([1 / RON if on else goff for on in modes])
+        offsets = np.array([goff * knee - knee / RON if on else 0.0 for on in modes])
+        for (p, n), conductance, offset in zip(ends, conductances, offsets, strict=True):
+            for node, other, sign in ((p, n, 1), (n, p, -1)):
                 if node:
+                    b[node - 1] -= sign * offset
                     A[node - 1, node - 1] += conductance
                     if other:
                         A[node - 1, other - 1] -= conductance
@@ -138,16 +140,21 @@ def bridge_by_brute_force(source, v_load, R=None):
         v1, v2, v3, i = np.linalg.solve(A, b)
         node = [0.0, v1, v2, v3]
         voltage = np.array([node[p] - node[n] for p, n in ends])
-        if all((v >= -1e-12) if on else (v <= 1e-12) for v, on in zip(voltage, modes, strict=True)):
-            fits.append((np.array(node), i, voltage * conductances, modes))
+        if all((v - knee >= -1e-12) if on else (v - knee <= 1e-12) for v, on in zip(voltage, modes, strict=True)):
+            fits.append((np.array(node), i, voltage * conductances + offsets, modes))
     return fits[0]
 
 
-@pytest.mark.slow
-def test_a_bridge_against_all_of_its_modes():
+@pytest.mark.parametrize(
+    "goff, knee",
+    [(1e-6, 0.6)]
+    + [pytest.param(*v, marks=pytest.mark.slow) for v in ((GOFF, 0.0), (1e-9, 0.6), (1e-10, 0.7), (1e-8, 0.0))],
+)
+def test_a_bridge_against_all_of_its_modes(goff, knee):
+    """Two diodes carry one current, but for leakage, and block at one instant."""
     ev = EqnEnv()
     source, series = el.SineVoltage(ev, "src", 10.0, 1.0), el.Resistor(ev, "rs", 1.0)
-    d = [el.IdealDiode(ev, f"d{k}", Ron=RON, Goff=GOFF) for k in range(4)]
+    d = [el.IdealDiode(ev, f"d{k}", Ron=RON, Goff=goff, Vknee=knee) for k in range(4)]
     tank, load = el.Capacitor(ev, "c", 0.05, initial_voltage=1.0), el.Resistor(ev, "r", 20.0)
     system = circuit(
         source, series, *d, tank, load,
@@ -162,16 +169,20 @@ def test_a_bridge_against_all_of_its_modes():
     v = np.asarray(solution["c.v"])
     # At every saved time, the mode and the currents are those of the only mode of sixteen that fits.
     for k, t in enumerate(ts):
-        node, _, currents, modes = bridge_by_brute_force(10 * np.sin(2 * np.pi * t), v[k])
+        node, _, currents, modes = bridge_by_brute_force(10 * np.sin(2 * np.pi * t), v[k], goff=goff, knee=knee)
         found = [float(solution[f"d{j}.i"][k]) for j in range(4)]
         np.testing.assert_allclose(found, currents, atol=1e-10)
         drop = [float(solution[f"d{j}.v"][k]) for j in range(4)]
-        if min(abs(x) for x in drop) > 1e-9:
+        if min(abs(x - knee) for x in drop) > 1e-9:
             assert [bool(solution[f"d{j}.active"][k]) for j in range(4)] == list(modes)
+
     # And the voltage is what these currents make of it: the right side is continuous, with kinks that steps of
     # 0.01 s cross with errors below 1e-7.
+    def charging(t, v):
+        return (bridge_by_brute_force(10 * np.sin(2 * np.pi * t), v[0], goff=goff, knee=knee)[1] - v / 20.0) / 0.05
+
     reference = scipy.integrate.solve_ivp(
-        lambda t, v: (bridge_by_brute_force(10 * np.sin(2 * np.pi * t), v[0])[1] - v / 20.0) / 0.05,
+        charging,
         (0.0, 0.5), [1.0], "RK45", t_eval=ts[:21], rtol=1e-9, atol=1e-9, max_step=0.01,
     )  # fmt: skip
     np.testing.assert_allclose(v[:21], reference.y[0], atol=1e-7)

@@ -17,6 +17,7 @@ from ..model.incidence import incidence
 from ..model.quantities import QuantityMap, declared_scale, map_quantities, name_quantities, start_guess
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, locate, provenance_of
 from ..model.typical_sizes import typical_sizes
+from ..structure.pantelides import match_highest
 from .differentiate_equations import differentiate_equations
 from .eliminate_aliases import eliminate_aliases
 from .order_blocks import Blocks, order_blocks
@@ -48,13 +49,14 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Co
     unknown = np.flatnonzero(roots & ~is_input)
     column[unknown] = np.arange(len(unknown))
     signature = incidence(groups, column, len(unknown))
-    check_structure(flat, groups, alias, signature, unknown)
-    started = check_equal_starts(flat, groups, alias)
     named = np.flatnonzero(alias.root != ZERO)
     least = np.zeros(len(flat.variables), np.int64)  # the highest derivative of each root that a variable is equal to
     np.maximum.at(least, alias.root[named], alias.order[named])
+    matching = match_highest(signature, least[unknown])
+    check_structure(flat, groups, alias, signature, unknown, matching)
+    started = check_equal_starts(flat, groups, alias)
     groups, signature, offsets, notes = reduce_with_cancellation(
-        groups, column, len(unknown), least[unknown], flat.parameters.values, flat.parameters.names
+        groups, signature, column, least[unknown], matching, flat.parameters.values, flat.parameters.names
     )
     zero = zero_pivots(groups, signature, offsets, column, flat.parameters.values)
     if len(zero):

@@ -43,25 +43,28 @@ SMALL = 2.0**-20
 
 def reduce_with_cancellation(
     groups: tuple[EquationGroup, ...],
+    signature: Incidence,
     column: np.ndarray,
-    n_unknown: int,
     least: np.ndarray,
+    matching: np.ndarray,
     values: np.ndarray,
     names: Sequence[str],
 ) -> tuple[tuple[EquationGroup, ...], Incidence, Offsets, tuple[str, ...]]:
     """Index reduction, repeated until no diagonal block with constant coefficients is singular.
 
-    Returns the equations, changed where something cancelled, their incidence and offsets, and notes. `values` and
-    `names` are those of parameters.
+    `signature` is the incidence of the equations, `matching` what `match_highest` finds in it; `values` and `names` are
+    those of parameters. Returns the equations, changed where something cancelled, their incidence and offsets, and
+    notes.
 
     **Raises:**
 
     - `StructuralError` if a block is singular for the given parameter values alone, or equations depend on each other.
     """
     notes: list[str] = []
-    signature = incidence(groups, column, n_unknown)
+    n_unknown = signature.n_variables
+    highest: np.ndarray | None = matching
     for _ in range(ROUNDS):
-        offsets = reduce_index(signature, least)
+        offsets = reduce_index(signature, least, highest)
         jacobian = _Jacobian(groups, offsets, column, values)
         replaced, added, combined = [], [], []
         for equations in _blocks_of_several(signature, offsets):
@@ -74,7 +77,7 @@ def reduce_with_cancellation(
             return groups, signature, offsets, tuple(notes)
         notes += [f"highest derivatives cancel in a {group.provenance[0]}" for group in added]
         groups = (*_without(groups, replaced), *added)
-        signature = incidence(groups, column, n_unknown)
+        signature, highest = incidence(groups, column, n_unknown), None
         if (maximum_matching(signature.pointer, signature.variable, n_unknown) < 0).any():
             raise StructuralError(_dependent(combined))
     raise StructuralError(_dependent(combined))

@@ -27,16 +27,20 @@ def check_structure(
     alias: AliasTable,
     pattern: Incidence,
     unknown: np.ndarray,
+    matching: np.ndarray,
 ) -> None:
     """Raises a `StructuralError` in user names if the model is certainly singular.
 
     `groups` and `alias` are those after alias elimination; `unknown` lists the variable behind each column of the
-    incidence `pattern`. After the check, every equation can be matched with an unknown of its own.
+    incidence `pattern`; `matching` gives some of the equations an unknown each, perhaps all. After the check, every
+    equation can be matched with an unknown of its own.
     """
     found = recognise(flat, groups, alias)
     if found.texts:
         raise StructuralError(_joined(found.texts, found.more))
-    matched = maximum_matching(pattern.pointer, pattern.variable, pattern.n_variables)
+    matched = matching
+    if (matched < 0).any():
+        matched = maximum_matching(pattern.pointer, pattern.variable, pattern.n_variables)
     taken = np.zeros(pattern.n_variables, bool)
     taken[matched[matched >= 0]] = True
     if (matched >= 0).all() and taken.all() and not found.equations:

@@ -23,7 +23,8 @@ from .problem import AbstractHybridProblem, HybridState, one_hot
 
 CONDITIONS_AT_ONE_INSTANT = 32  # more than these take another step, of no length to speak of
 SMALL = 1e-12  # of a guard's size in the step before: counts as zero
-ROUNDING = 1e-9  # of that size, over a step: counts as no change
+REACHED = 1e-9  # of that size: counts as zero at an instant that the guard has reached
+ROUNDING = 1e-12  # of that size, over a step: counts as no change
 
 
 class Instant(eqx.Module):
@@ -45,8 +46,8 @@ class Arrival(NamedTuple):
 
     - `due`: which events happen, shape (clocks + guards,).
     - `jumped`: which guards jumped over zero, so that their events do not move in time, shape (guards,).
-    - `size`: of the guards in the step, shape (guards,).
-    - `window`: the time within which a guard counts as having reached zero; `span`: the length of the step.
+    - `size`: of the guards of late, shape (guards,).
+    - `window`: the time within which a guard counts as having reached zero; `span`: how long steps have been of late.
     """
 
     due: Any
@@ -81,6 +82,9 @@ def handle(
             k = jnp.clip(event - c, 0, g - 1)
             rate = rates[k]
             crossing = -values[k] / jnp.where(rate == 0, 1.0, rate)
+            # Where another event has made the guard slow, rounding is all that is left of its value.
+            frozen = lax.stop_gradient(crossing)
+            crossing = crossing + (jnp.clip(frozen, -arrival.window, arrival.window) - frozen)
             crossing = jnp.where(instant.caused[k], instant.delay, crossing)
             delay = jnp.where(is_clock, delay, crossing)
         else:
@@ -102,6 +106,8 @@ def handle(
             x - after * delay,
             new,
             armed,
+            state.size,
+            state.span,
             state.request,
             ticks,
             lax.stop_gradient(problem.due(ticks)),
@@ -144,7 +150,8 @@ def _following(problem, t, x, q, slope, instant: Instant, event, arrival: Arriva
         return instant.state.armed, left, instant.caused
     value, rate = problem.rates(t, x, q, args, slope)
     here = event - c == jnp.arange(g)
-    zero = jnp.abs(value) <= jnp.maximum(SMALL * arrival.size, jnp.abs(rate) * arrival.window)
+    rounding = jnp.where(left[c:], REACHED, SMALL) * arrival.size
+    zero = jnp.abs(value) <= jnp.maximum(rounding, jnp.abs(rate) * arrival.window)
     # One that seems to fall from zero by rounding alone is waited for: if it does fall, the next step finds it.
     true = jnp.where(zero, rate * arrival.span < -ROUNDING * arrival.size, value < 0)
     was_armed = (instant.state.armed > 0.5) & ~here

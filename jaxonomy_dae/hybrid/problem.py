@@ -76,6 +76,7 @@ class HybridState(eqx.Module):
     """What is integrated: the state `x`, the discrete values `q`, and the bookkeeping of events.
 
     - `armed`: 1.0 for guards that have been positive since their event.
+    - `size`, `span`: how large the guards, and how long the steps, have been of late.
     - `request`: where the step that was tried should have ended, or infinity.
     - `ticks`, `due`: how often each clock has ticked, and when it does next.
     - `count`, `times`, `which`, `rate`: how many events there were, and of the first ones the time, the number of the
@@ -87,6 +88,8 @@ class HybridState(eqx.Module):
     x: Float[Array, " n"]
     q: Float[Array, " q"]
     armed: Float[Array, " guards"]
+    size: Float[Array, " guards"]
+    span: Float[Array, ""]
     request: Float[Array, ""]
     ticks: Float[Array, " clocks"]
     due: Float[Array, " clocks"]

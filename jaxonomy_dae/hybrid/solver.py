@@ -24,6 +24,7 @@ LOOKS = np.array([0.0, 0.13, 0.31, 0.5, 0.67, 0.86, 1.0])
 FITTED = [0, 3, 6]
 BEND = 0.1
 DEPTH = 1e-9  # of a guard's size: what a parabola must reach below zero, beside what it leaves in doubt
+FORGOTTEN = 0.8  # what a step leaves of how large guards were, and how long steps: next to events they are short
 NEARLY = 0.01  # of a guard's size in the step: beyond that it is not at zero at its end
 
 TOO_MANY: Any = diffrax.RESULTS.max_steps_rejected  # events
@@ -138,7 +139,8 @@ class WithEvents(diffrax.AbstractWrappedSolver):
         )
         dense = _Dense(solver.interpolation_cls, info)
         request, armed, arrival = _looked_at(problem, dense, t0, t1, y0, x1, args)
-        state = eqx.tree_at(lambda y: (y.x, y.armed, y.request), y0, (x1, armed, jnp.full_like(t1, jnp.inf)))
+        changed = x1, armed, arrival.size, arrival.span, jnp.full_like(t1, jnp.inf)
+        state = eqx.tree_at(lambda y: (y.x, y.armed, y.size, y.span, y.request), y0, changed)
         fired = jnp.any(arrival.due)
 
         def events(state):
@@ -159,17 +161,25 @@ def _looked_at(problem, dense, t0, t1, y0: HybridState, x1, args):
     differentiated."""
     problem, dense, t0, t1, y0, x1, args = still((problem, dense, t0, t1, y0, x1, args))
     h, q, g = t1 - t0, y0.q, problem.n_guards
-    window = jnp.maximum(WINDOW * h, problem.resolution)
+    span = jnp.maximum(h, FORGOTTEN * y0.span)
+    window = jnp.maximum(WINDOW * span, problem.resolution)
     ticking = y0.due <= t1 + 0.25 * problem.resolution
     if not g:
         none = jnp.zeros((0,), bool)
-        return jnp.full_like(t1, jnp.inf), y0.armed, Arrival(ticking, none, jnp.zeros((0,), x1.dtype), window, h)
+        return jnp.full_like(t1, jnp.inf), y0.armed, Arrival(ticking, none, y0.size, window, span)
+
+    # One that an event left at zero may begin below it, by rounding: then that is its zero.
+    begin = problem.guards(t0, dense(t0, t1, t0), q, args)
+    zero = jnp.where(y0.armed > 0.5, jnp.minimum(begin, 0.0), 0.0)
 
     def guards(t):
-        return problem.guards(t, dense(t0, t1, t), q, args)
+        return problem.guards(t, dense(t0, t1, t), q, args) - zero
 
-    times = t0 + h * jnp.asarray(LOOKS[:-1], t1.dtype)
-    values = jnp.concatenate([jax.vmap(guards)(times), problem.guards(t1, x1, q, args)[None]])
+    times = t0 + h * jnp.asarray(LOOKS[1:-1], t1.dtype)
+    values = jnp.concatenate([
+        (begin - zero)[None], jax.vmap(guards)(times), (problem.guards(t1, x1, q, args) - zero)[None]
+    ])  # fmt: skip
+    times = jnp.append(t0, times)
     size = jnp.max(jnp.abs(values), axis=0)
     # A guard that was positive anywhere before is armed.
     positive = jnp.concatenate([(y0.armed > 0.5)[None], values[1:] > 0])
@@ -186,7 +196,8 @@ def _looked_at(problem, dense, t0, t1, y0: HybridState, x1, args):
     near = lax.cond(any_member(doubtful), at_end, lambda: jnp.zeros((g,), bool)) & armed[-1]
     off = jnp.max(jnp.abs(jnp.asarray(_OFF_PARABOLA, values.dtype) @ values), axis=0)
     bent = jnp.any(off > BEND * size)
-    bent = bent & (h > 1e3 * window)
+    long = h > 1e3 * jnp.maximum(WINDOW * h, problem.resolution)
+    bent = bent & long
     # In a step too short to be parted, what has crossed has jumped.
     short = h <= 4 * problem.resolution
     jumped = jnp.any(crossed, axis=0) & ~near & short
@@ -203,11 +214,12 @@ def _looked_at(problem, dense, t0, t1, y0: HybridState, x1, args):
 
     where = lax.cond(any_member(inside), located, lambda: t1)
     where = jnp.maximum(where, t0 + 2 * problem.resolution)
-    dip = jnp.where(h > 1e3 * window, _dip(values, armed, jnp.any(crossed, axis=0), 2 * off - DEPTH * size), jnp.inf)
+    dip = jnp.where(long, _dip(values, armed, jnp.any(crossed, axis=0), 2 * off - DEPTH * size), jnp.inf)
     request = jnp.minimum(jnp.where(inside, where, jnp.inf), t0 + dip * h)
     request = jnp.where(bent, t0 + 0.5 * h, request)
     due = jnp.concatenate([ticking, near]) & ~jnp.isfinite(request)
-    return request, armed[-1].astype(y0.armed.dtype), Arrival(due, jumped, size, window, h)
+    arrival = Arrival(due, jumped, jnp.maximum(size, FORGOTTEN * y0.size), window, span)
+    return request, armed[-1].astype(y0.armed.dtype), arrival
 
 
 def _dip(values, armed, crossed, doubt):

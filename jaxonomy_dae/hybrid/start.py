@@ -31,8 +31,8 @@ def start(
         armed, size = (~holding).astype(dtype), jnp.abs(value)
     rows = jnp.full((logged if sides else 0, len(x0) + len(q0)), jnp.nan, dtype)
     state = HybridState(
-        x0, q0, armed, jnp.asarray(jnp.inf, dtype), ticks, lax.stop_gradient(problem.due(ticks)), nothing,
-        infinite, jnp.full_like(infinite, -1.0), jnp.zeros_like(infinite), nothing, rows, rows,
+        x0, q0, armed, size, nothing, jnp.asarray(jnp.inf, dtype), ticks, lax.stop_gradient(problem.due(ticks)),
+        nothing, infinite, jnp.full_like(infinite, -1.0), jnp.zeros_like(infinite), nothing, rows, rows,
     )  # fmt: skip
     at_once = np.array(problem.immediate[c:], bool)
     if not c and not at_once.any():

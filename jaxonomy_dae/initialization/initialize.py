@@ -458,8 +458,12 @@ def _term_sizes(kernel: Callable[[list], Any], values: list, template: Any) -> A
 
 def is_consistent(found: InitialPoint) -> Any:
     """Whether all rows hold, to rounding."""
-    unknown = jnp.append(found.x, found.solved)
-    return jnp.all(jnp.abs(found.residual) <= found.limit) & jnp.all(jnp.isfinite(unknown))
+    # What is not traced is compared by NumPy: each operation by itself would be a program to compile.
+    parts: Any = (found.residual, found.limit, found.x, found.solved)
+    traced = any(isinstance(part, Tracer) for part in parts)
+    xp: Any = jnp if traced else np
+    residual, limit, x, solved = parts if traced else map(np.asarray, parts)
+    return xp.all(xp.abs(residual) <= limit) & xp.all(xp.isfinite(xp.append(x, solved)))
 
 
 def _slack(found: InitialPoint, low: np.ndarray, high: np.ndarray) -> Any:
@@ -523,6 +527,8 @@ def check(
     problem = InitializationReport(system, found, t0, inputs, initial, solve_for).problem
     if problem is not None:
         raise InitializationError(problem)
+    if not solve_for:
+        return found
     solved = np.asarray(found.solved)
     slack = np.asarray(_slack(found, low, high))
     for name, value, a, b, off in zip(solve_for, solved, low, high, slack, strict=True):

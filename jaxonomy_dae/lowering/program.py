@@ -27,14 +27,18 @@ class Layout:
     offset: np.ndarray
 
     def gather(self, quantity: np.ndarray, factor: np.ndarray | None = None) -> Gather:
-        quantity = np.atleast_1d(quantity)
+        """Where to read quantities, shape (n,), each times its factor."""
+        factor = np.ones(len(quantity)) if factor is None else factor
+        return self.gathers(quantity[None], factor[None])[0]
+
+    def gathers(self, quantity: np.ndarray, factor: np.ndarray) -> list[Gather]:
+        """Where to read each row of quantities, shape (rows, n), with factors of that shape."""
         zero = quantity == ZERO
-        factor = np.ones(len(quantity)) if factor is None else np.where(factor == 0, 1.0, np.atleast_1d(factor))
-        chunk, offset = np.full(len(quantity), -1, np.int64), np.zeros(len(quantity), np.int64)
-        chunk[~zero], offset[~zero] = self.chunk[quantity[~zero]], self.offset[quantity[~zero]]
+        chunk, offset = np.where(zero, -1, self.chunk[quantity]), np.where(zero, 0, self.offset[quantity])
         if (chunk == -2).any():
             raise AssertionError("a quantity is read before it is computed")
-        return Gather(chunk, offset, factor)
+        factor = np.where(factor == 0, 1.0, factor)
+        return [Gather(*row) for row in zip(chunk, offset, factor, strict=True)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,7 +134,10 @@ def plan(
 
 
 def _plan_equation(equation: StepEquation, layout: Layout) -> PlannedEquation:
-    sources = [-1 - s.local if s.local >= 0 else layout.gather(s.quantity, s.factor) for s in equation.slots]
+    read = [s for s in equation.slots if s.local < 0]
+    rows = layout.gathers(np.array([s.quantity for s in read]), np.array([s.factor for s in read])) if read else []
+    gathers = iter(rows)
+    sources = [-1 - s.local if s.local >= 0 else next(gathers) for s in equation.slots]
     return PlannedEquation(equation, tuple(sources), tuple(_uniform(s.factor) for s in equation.slots))
 
 

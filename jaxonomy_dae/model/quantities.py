@@ -33,18 +33,17 @@ def map_quantities(alias: AliasTable, quantities: Quantities) -> QuantityMap:
 def name_quantities(flat: FlatModel, variables: QuantityMap, quantities: Quantities) -> list[str]:
     """A user's name for every quantity: of a variable that equals it, best not of a port; a quantity that equals no
     variable is the derivative of one."""
+    order, table = quantities.order, flat.variables
+    v = np.flatnonzero((variables.quantity >= 0) & (variables.factor == 1))
+    q = variables.quantity[v]
+    is_root = (order[q] == 0) & (quantities.variable[quantities.owner[q]] == v)
+    sorting = np.lexsort((v, ~is_root, table.is_port[v], table.is_internal[v], q))
+    named, first = np.unique(q[sorting], return_index=True)
     names: list[str] = [""] * quantities.n
-    best: list[tuple] = [(2,)] * quantities.n
-    owner, order = quantities.owner, quantities.order
-    for v in np.flatnonzero((variables.quantity >= 0) & (variables.factor == 1)).tolist():
-        q, name = int(variables.quantity[v]), flat.variables.names[v]
-        is_root = order[q] == 0 and quantities.variable[owner[q]] == v
-        rank = (int(flat.variables.is_internal[v]), int(flat.variables.is_port[v]), int(not is_root), v)
-        if rank < best[q]:
-            best[q], names[q] = rank, name
-    for q in range(quantities.n):
-        if not names[q]:
-            names[q] = f"der({names[q - 1]})"
+    for k, best in zip(named.tolist(), v[sorting[first]].tolist(), strict=True):
+        names[k] = table.names[best]
+    for k in np.setdiff1d(np.arange(quantities.n), named).tolist():
+        names[k] = f"der({names[k - 1]})"
     return names
 
 

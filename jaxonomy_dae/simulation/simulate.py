@@ -7,6 +7,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 
 from ..adjoint.default import default_adjoint
@@ -120,7 +121,7 @@ def simulate(
     if ts is not None:
         ts = jnp.asarray(ts, dtype)
         if not _is_traced((t0, t1, ts)):
-            ts = jnp.clip(ts, t0, t1)  # `check_arguments` lets rounding pass, Diffrax does not
+            ts = jnp.asarray(np.clip(ts, t0, t1), dtype)  # `check_arguments` lets rounding pass, Diffrax does not
     given = (system, t0, t1, ts, inputs, initial)
 
     sides = save_events
@@ -150,7 +151,7 @@ def simulate(
             choice = implicit_choice(system.plan, why)
             solver = SOLVERS[choice.solver]()
         return _traced(run(given, options(solver), None, throw), given, choice, throw, (max_steps, max_events))
-    watch = Watch(t1, scaled_atol(system, atol) / rtol) if switches else None
+    watch = Watch(t1, jnp.asarray(np.divide(scaled_atol(system, atol), rtol), dtype)) if switches else None
     outcome = run_compiled(given, options(solver), watch)
     if _is_traced(outcome):  # a network may close over a traced value, which shows in the outcome only
         return _traced(run(given, options(solver), None, throw), given, choice, throw, (max_steps, max_events))

@@ -36,12 +36,28 @@ class Offsets:
         return int(self.variable.sum() - self.equation.sum())
 
 
-def reduce_index(incidence: Incidence, least: np.ndarray | None = None) -> Offsets:
+def match_highest(incidence: Incidence, least: np.ndarray | None = None) -> np.ndarray:
+    """A maximum matching of the equations with their highest derivatives, `least` as in `reduce_index`; −1 for
+    equations that it leaves out. If it leaves none, no index needs to be reduced."""
+    columns = incidence.variable
+    active = incidence.order == _highest(incidence, least)[columns]
+    rows = incidence.rows[active]
+    start = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=incidence.n_equations))])
+    return maximum_matching(start, columns[active], incidence.n_variables)
+
+
+def _highest(incidence: Incidence, least: np.ndarray | None) -> np.ndarray:
+    d = np.zeros(incidence.n_variables, np.int64)
+    np.maximum.at(d, incidence.variable, incidence.order)
+    return d if least is None else np.maximum(d, least)
+
+
+def reduce_index(incidence: Incidence, least: np.ndarray | None = None, matching: np.ndarray | None = None) -> Offsets:
     """Pantelides' algorithm.
 
     `least` gives orders that the variables must reach in any case, because eliminated variables equal these
-    derivatives. The incidence must have a perfect matching, otherwise the algorithm would not end; `check_structure`
-    makes sure of that before, in user names.
+    derivatives; `matching` is what `match_highest` finds, if it is known. The incidence must have a perfect matching,
+    otherwise the algorithm would not end; `check_structure` makes sure of that before, in user names.
 
     **Raises:**
 
@@ -49,17 +65,10 @@ def reduce_index(incidence: Incidence, least: np.ndarray | None = None) -> Offse
     """
     n_equations, n = incidence.n_equations, incidence.n_variables
     pointer, columns, sigma = incidence.pointer, incidence.variable, incidence.order
-    c = np.zeros(n_equations, np.int64)
-    d = np.zeros(n, np.int64)
-    np.maximum.at(d, columns, sigma)
-    if least is not None:
-        d = np.maximum(d, least)
+    c, d = np.zeros(n_equations, np.int64), _highest(incidence, least)
 
     # A maximum matching along the highest derivatives first; only what it leaves out needs the careful search.
-    active = sigma == d[columns]
-    rows = incidence.rows[active]
-    start = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n_equations))])
-    match_equation = maximum_matching(start, columns[active], n)
+    match_equation = match_highest(incidence, least) if matching is None else matching
     match_variable = np.full(n, -1, np.int64)
     matched = np.flatnonzero(match_equation >= 0)
     match_variable[match_equation[matched]] = matched
