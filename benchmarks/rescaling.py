@@ -5,6 +5,7 @@ p → q·p for parameters and every equation times a number: the physics is the 
 digits.
 """
 
+import collections
 import dataclasses
 import re
 from collections.abc import Callable
@@ -40,14 +41,14 @@ class Factors:
 
 def random_factors(rng: np.random.Generator, model: FlatModel, kind: str) -> Factors:
     """`kind`: 'equations' scales only equations; 'parameters' these and parameters; 'units' also variables, all of one
-    declared unit alike; 'all' everything by itself. Factors lie between 1e-12 and 1e9."""
+    declared unit alike; 'all' everything by itself; 'none' nothing. Factors lie between 1e-12 and 1e9."""
 
     def factors(n: int, wanted: bool = True) -> np.ndarray:
         return 10 ** rng.uniform(SMALLEST, LARGEST, n) if wanted else np.ones(n)
 
-    assert kind in KINDS, kind
-    equation = factors(model.n_equations)
-    parameter = factors(len(model.parameters), kind != "equations")
+    assert kind in (*KINDS, "none"), kind
+    equation = factors(model.n_equations, kind != "none")
+    parameter = factors(len(model.parameters), kind not in ("equations", "none"))
     if kind == "units":
         units = sorted(set(model.variables.unit))
         of_unit = dict(zip(units, factors(len(units)), strict=True))
@@ -124,20 +125,23 @@ class _Whole(Component):
                 **given,
             )
         equations: list[Any] = []
-        opaque: dict[int, tuple[OpaqueFunction, dict[int, tuple[EquationGroup, int]]]] = {}
+        uses: dict[Any, dict[int, tuple[EquationGroup, int]]] = {}
         for group in model.groups:
+            seen: collections.Counter = collections.Counter()
             for i in range(len(group)):
                 equations.append(_residual(ev, group, i, at, parameter))
                 if equations[-1] is None:
-                    function = group.template.opaque
-                    opaque.setdefault(function.index, (function, {}))[1][group.template.output] = (group, i)
+                    # One use of the network has one output of each number, and its own inputs.
+                    use = group.template.opaque, *group.variable[i, 1:].tolist(), *group.order[i, 1:].tolist()
+                    uses.setdefault((*use, seen[use]), {})[group.template.output] = (group, i)
+                    seen[use] += 1
         for k in rows.tolist():
             if equations[k] is not None:
                 self.add_equations(factors.equation[k] * equations[k])
-        for function, written in opaque.values():
-            self._learn(ev, model, factors, function, written)
+        for k, ((function, *_), written) in enumerate(uses.items()):
+            self._learn(ev, model, factors, function, written, f"n_{k}_{plain(function.name)}")
 
-    def _learn(self, ev: EqnEnv, model: FlatModel, factors: Factors, function: OpaqueFunction, written):
+    def _learn(self, ev: EqnEnv, model: FlatModel, factors: Factors, function: OpaqueFunction, written, name: str):
         """The outputs of a network equal the variables that stood for them."""
         group, i = written[0]
         variable, order = group.variable[i, 1:].tolist(), group.order[i, 1:].tolist()
@@ -156,7 +160,7 @@ class _Whole(Component):
         network = Scaled(model.networks[function.name], function.function, tuple(scales), old)
         if function.function is not None:
             inputs.append(ev.t)
-        outputs = self.learned(f"n_{plain(function.name)}", network, inputs)
+        outputs = self.learned(name, network, inputs)
         for v, y in zip(results, outputs, strict=True):
             self.add_equations(VariableSymbol(plain(model.variables.names[v])) - y)
 

@@ -220,9 +220,8 @@ def test_nonlinear_grid_over_time():
 
 
 def test_without_the_package_small_blocks_are_dense(monkeypatch):
-    with monkeypatch.context() as patch:
-        patch.setattr(sparse, "available", lambda: False)
-        grid = Grid(6)
-        np.testing.assert_allclose(currents(grid.system()), grid.reference(), rtol=1e-9, atol=1e-12)
-        with pytest.raises(ModelError, match=r'simultaneous equations.*pip install "jaxonomy_dae\[sparse\]"'):
-            Grid(20).system()
+    monkeypatch.setattr(sparse, "available", lambda: False)
+    grid = Grid(6)
+    np.testing.assert_allclose(currents(grid.system()), grid.reference(), rtol=1e-9, atol=1e-12)
+    with pytest.raises(ModelError, match=r'simultaneous equations.*pip install "jaxonomy_dae\[sparse\]"'):
+        Grid(20).system()

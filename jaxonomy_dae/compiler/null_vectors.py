@@ -17,7 +17,9 @@ from ..model.scaling import equilibrated, geometric_scales
 DEFICIENT = 1e-11  # singular values below, of an equilibrated matrix, are examined
 CANCELLED = 1e-11  # of the terms: a sum this small is zero
 NOTHING = (1e-8, 1e-13)  # weights below are left out, the larger ones if columns cancel without them
+REFINEMENTS = 2
 LARGEST_DENOMINATOR = 1000
+SIMPLE = 1_000_000  # numerator times denominator: beyond, fractions come as near to any number by chance
 
 
 def cancels(weights: np.ndarray, matrix: np.ndarray) -> bool:
@@ -62,13 +64,28 @@ def _verified(null: np.ndarray, rows: np.ndarray, matrix: np.ndarray) -> list[np
     for w, c in zip(null, chosen, strict=True):
         candidates = (np.where(np.abs(w) < least, 0.0, w) * rows / rows[c] for least in NOTHING)
         found.append(next((w for w in candidates if cancels(w, matrix)), None))
-    return [w for w in found if w is not None]
+    return [_refined(w, matrix) for w in found if w is not None]
+
+
+def _refined(w: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """The same to rounding: a combination is combined again with others, and what is left of what cancels grows."""
+    used = np.flatnonzero(w)
+    better = w.copy()
+    for _ in range(REFINEMENTS):
+        terms = better[used, None] * matrix[used]
+        size = np.abs(terms).max(axis=0, initial=0.0)
+        terms = terms[:, size > 0] / size[size > 0]
+        left = terms.astype(np.longdouble).sum(axis=0).astype(float)
+        others = better[used] != 1.0
+        better[used[others]] *= 1 + np.linalg.lstsq(terms[others].T, -left, rcond=None)[0]
+    return better if cancels(better, matrix) else w
 
 
 def rational(value: float) -> Number:
     """The simple fraction that a number rounds, if there is one."""
-    simple = Fraction(value).limit_denominator(LARGEST_DENOMINATOR)
-    return simple if abs(float(simple) - value) <= 1e-11 * abs(value) else value
+    found = Fraction(value).limit_denominator(LARGEST_DENOMINATOR)
+    is_simple = abs(found.numerator) * found.denominator <= SIMPLE
+    return found if is_simple and abs(float(found) - value) <= 1e-11 * abs(value) else value
 
 
 def weights_in_parameters(

@@ -16,7 +16,7 @@ from ..model.extended import Extended
 from ..model.incidence import incidence
 from ..model.quantities import QuantityMap, declared_scale, map_quantities, name_quantities, start_guess
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, locate, provenance_of
-from ..model.typical_sizes import typical_sizes
+from ..model.typical_sizes import unrounded_sizes
 from ..structure.pantelides import match_highest
 from .differentiate_equations import differentiate_equations
 from .eliminate_aliases import eliminate_aliases
@@ -114,7 +114,7 @@ def _scale(flat: FlatModel, variables: QuantityMap, extended: Extended) -> np.nd
     declared = declared_scale(flat, variables, extended)
     if not extended.level.any():
         return np.where(declared == 0.0, 1.0, declared)
-    return np.where(declared == 0.0, typical_sizes(flat, variables, extended), declared)
+    return np.where(declared == 0.0, unrounded_sizes(flat, variables, extended), declared)
 
 
 def _zero_pivot(flat: FlatModel, groups: tuple[EquationGroup, ...], equation: int) -> str:

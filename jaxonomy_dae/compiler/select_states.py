@@ -23,6 +23,7 @@ from ..model.scaling import equilibrated, geometric_scales
 from ..model.tables import ZERO, EquationGroup, equation_offsets
 
 POOR_PIVOT = 0.1  # a preferred pivot may be this much smaller than the best one
+ALIKE = 1e-6  # pivots that differ by less are equal: rounding, and units, do not choose
 SINGULAR = 1e-9  # singular value of an equilibrated matrix
 
 
@@ -223,7 +224,7 @@ def _pivots(matrix: np.ndarray, keys: list[tuple]) -> list[int] | None:
         good = [k for k in range(len(free_columns)) if best_of_column[k] >= POOR_PIVOT * best]
         k = min(good, key=lambda k: keys[free_columns[k]])
         column = free_columns.pop(k)
-        row = free_rows.pop(int(np.argmax(sub[:, k])))
+        row = free_rows.pop(int(np.argmax(sub[:, k] >= (1 - ALIKE) * best_of_column[k])))
         picked.append(column)
         if free_rows:
             factors = work[free_rows, column] / work[row, column]

@@ -19,12 +19,15 @@ import numpy as np
 from jax import lax
 
 from ..adjoint.closure_conversion import any_member
+from ..adjoint.resting import still
 from .problem import AbstractHybridProblem, HybridState, one_hot
 
 CONDITIONS_AT_ONE_INSTANT = 32  # more than these take another step, of no length to speak of
 SMALL = 1e-12  # of a guard's size in the step before: counts as zero
 REACHED = 1e-9  # of that size: counts as zero at an instant that the guard has reached
+FLAT = 1e-9  # of that size, over a step: a change so small may be one of rates alone
 ROUNDING = 1e-12  # of that size, over a step: counts as no change
+AHEAD = 1e-3  # of a step: how far ahead a guard that is flat at zero is looked at
 
 
 class Instant(eqx.Module):
@@ -143,7 +146,8 @@ def _noted(rows: Any, row: Any, value: Any) -> Any:
 
 
 def _following(problem, t, x, q, slope, instant: Instant, event, arrival: Arrival, args):
-    """(armed guards, events left, which of the guards' were made true by an event) after an event."""
+    """(armed guards, events left, which guards an event made true) after an event, not differentiated."""
+    problem, t, x, q, slope, instant, args = still((problem, t, x, q, slope, instant, args))
     c, g = problem.n_clocks, problem.n_guards
     left = instant.left & ~one_hot(event, c + g)
     if not g:
@@ -152,8 +156,16 @@ def _following(problem, t, x, q, slope, instant: Instant, event, arrival: Arriva
     here = event - c == jnp.arange(g)
     rounding = jnp.where(left[c:], REACHED, SMALL) * arrival.size
     zero = jnp.abs(value) <= jnp.maximum(rounding, jnp.abs(rate) * arrival.window)
-    # One that seems to fall from zero by rounding alone is waited for: if it does fall, the next step finds it.
-    true = jnp.where(zero, rate * arrival.span < -ROUNDING * arrival.size, value < 0)
+    # A force that keeps a contact closed leaves a guard of the open contact at zero without a slope: what it does next
+    # decides. One that seems to fall by rounding alone is waited for: if it does fall, the next step finds it.
+    flat = zero & (jnp.abs(rate) * arrival.span <= FLAT * arrival.size)
+
+    def mean_rate():
+        later, ahead = t + AHEAD * arrival.span, x + slope * AHEAD * arrival.span
+        return 0.5 * (rate + problem.rates(later, ahead, q, args, problem.slope(later, ahead, q, args))[1])
+
+    falling = jnp.where(flat, lax.cond(any_member(jnp.any(flat)), mean_rate, lambda: rate), rate)
+    true = jnp.where(zero, falling * arrival.span < -ROUNDING * arrival.size, value < 0)
     was_armed = (instant.state.armed > 0.5) & ~here
     # What this event made true happens next. What was to happen does so, though a state starts anew: unless what was
     # assigned makes its condition false, or it is revocable and undone.

@@ -11,7 +11,7 @@ from jax import lax
 
 from ..adjoint.closure_conversion import any_member
 from ..adjoint.resting import still
-from .event_map import Arrival, handle
+from .event_map import REACHED, Arrival, handle
 from .problem import HybridState
 from .search import first_crossing
 from .term import bound, problem_of
@@ -170,7 +170,8 @@ def _looked_at(problem, dense, t0, t1, y0: HybridState, x1, args):
 
     # One that an event left at zero may begin below it, by rounding: then that is its zero.
     begin = problem.guards(t0, dense(t0, t1, t0), q, args)
-    zero = jnp.where(y0.armed > 0.5, jnp.minimum(begin, 0.0), 0.0)
+    by_rounding = (y0.armed > 0.5) & (begin >= -REACHED * y0.size)
+    zero = jnp.where(by_rounding, jnp.minimum(begin, 0.0), 0.0)
 
     def guards(t):
         return problem.guards(t, dense(t0, t1, t), q, args) - zero

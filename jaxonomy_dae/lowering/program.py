@@ -34,7 +34,8 @@ class Layout:
     def gathers(self, quantity: np.ndarray, factor: np.ndarray) -> list[Gather]:
         """Where to read each row of quantities, shape (rows, n), with factors of that shape."""
         zero = quantity == ZERO
-        chunk, offset = np.where(zero, -1, self.chunk[quantity]), np.where(zero, 0, self.offset[quantity])
+        chunk, offset = np.full_like(quantity, -1), np.zeros_like(quantity)
+        chunk[~zero], offset[~zero] = self.chunk[quantity[~zero]], self.offset[quantity[~zero]]
         if (chunk == -2).any():
             raise AssertionError("a quantity is read before it is computed")
         factor = np.where(factor == 0, 1.0, factor)

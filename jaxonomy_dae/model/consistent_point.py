@@ -7,6 +7,7 @@ import scipy.sparse as sp
 
 from .evaluate_numpy import Networks, residual_and_jacobian
 from .extended import Extended
+from .scaling import equilibrated
 
 
 @np.errstate(all="ignore")  # numbers that overflow end the search
@@ -19,9 +20,10 @@ def consistent_point(
     networks: Networks,
     iterations: int = 60,
 ) -> tuple[np.ndarray, float]:
-    """A point near `guess` where the equations and the fixed starts hold: damped Gauss–Newton steps of least norm.
+    """A point near `guess` where the equations and the fixed starts hold: damped Gauss–Newton steps of least norm, in
+    units in which all rows and columns of the Jacobian are alike.
 
-    Returns the values of all quantities and the largest residual left; inputs stay as in `guess`.
+    Returns the values of all quantities and the largest residual left, so measured; inputs stay as in `guess`.
     """
     n = extended.quantities.n_unknown
     pins = np.array([q for q, _ in fixed], np.int64)
@@ -36,15 +38,18 @@ def consistent_point(
         return np.concatenate([r, values[pins] - targets]), jacobian
 
     r, jacobian = evaluate(values)
+    largest = np.inf
     for _ in range(iterations):
-        size = np.linalg.norm(r)
-        if not np.isfinite(size) or size <= 1e-13 * (1 + np.abs(values).max(initial=0.0)):
-            break
-        full = sp.vstack([jacobian, pin_rows]).tocsr()[:, :n]
+        full: Any = sp.vstack([jacobian, pin_rows]).tocsr()[:, :n]
         if not np.isfinite(full.data).all():
             break
+        scaled, rows, columns = equilibrated(full)
+        size = np.linalg.norm(rows * r)
+        largest = float(np.abs(rows * r).max(initial=0.0))
+        if not np.isfinite(size) or size <= 1e-15 * (1 + np.abs(values[:n] / columns).max(initial=0.0)):
+            break
         try:
-            step = _least_norm(full, -r)
+            step = columns * _least_norm(scaled, -rows * r)
         except np.linalg.LinAlgError:
             break
         scale, accepted = 1.0, False
@@ -52,14 +57,14 @@ def consistent_point(
             trial = values.copy()
             trial[:n] += scale * step
             r_trial, jacobian_trial = evaluate(trial)
-            if np.isfinite(r_trial).all() and np.linalg.norm(r_trial) < (1 - 1e-4 * scale) * size:
+            if np.isfinite(r_trial).all() and np.linalg.norm(rows * r_trial) < (1 - 1e-4 * scale) * size:
                 accepted = True
                 break
             scale *= 0.5
         if not accepted:
             break
         values, r, jacobian = trial, r_trial, jacobian_trial
-    return values, float(np.abs(r).max(initial=0.0))
+    return values, largest
 
 
 def _least_norm(matrix: Any, right: np.ndarray) -> np.ndarray:

@@ -12,9 +12,11 @@ from .evaluate_numpy import Networks, generic, group_values
 from .extended import ExtendedGroup
 from .tables import ZERO
 
-ROUNDS = 3
+ROUNDS = 6
 STEP = 1e-3  # of the logarithm of an argument
+FARTHEST = 100.0  # decades from one that a size may be looked for
 STEEPEST = 8.0  # power that an entry is taken for
+ACCURACY = 1e-9  # of the least squares: what depends on units should be far below what decides
 DAMPING = 1e-3  # keeps sizes that nothing tells where they are
 
 
@@ -53,12 +55,18 @@ def natural_sizes(
         matrix = sp.csr_array((powers, (places, unknowns)), shape=shape)
         linalg: Any = scipy.sparse.linalg
         sizes = np.append(logarithm, constant[0])
-        found = linalg.lsmr(matrix, -sizes, damp=DAMPING, atol=1e-4, btol=1e-4, maxiter=20 * n)[0]
-        moved = 10.0 ** np.clip(found[: n + n_parameters], -60, 60)
-        quantity, parameter = quantity * moved[:n], parameter * moved[n:]
+        found = linalg.lsmr(matrix, -sizes, damp=DAMPING, atol=ACCURACY, btol=ACCURACY, maxiter=20 * n)[0]
+        quantity, parameter = _moved(quantity, found[:n]), _moved(parameter, found[n : n + n_parameters])
         if np.abs(found[: n + n_parameters]).max(initial=0.0) < 0.3:
             break
     return quantity, parameter
+
+
+def _moved(size: np.ndarray, decades: np.ndarray) -> np.ndarray:
+    """Sizes times powers of ten, up to a limit; those that do not move stay whatever they are."""
+    there = np.log10(np.abs(size))
+    limited = np.clip(there + np.clip(decades, -60, 60), np.minimum(there, -FARTHEST), np.maximum(there, FARTHEST))
+    return np.where(decades == 0.0, size, np.sign(size) * 10.0**limited)
 
 
 def _constants(groups: Sequence[ExtendedGroup], parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -94,7 +102,7 @@ def _logarithms(groups: Sequence[ExtendedGroup], quantity: np.ndarray, parameter
         place[used] = first + np.arange(used.sum())
         first += int(used.sum())
         column = np.where(used, group.quantity, 0)
-        values = np.log10(entry[used] * np.abs(point[column[used]]))
+        values = np.log10(entry[used]) + np.log10(np.abs(point[column[used]]))
         rows = np.broadcast_to(group.equation[:, None], used.shape)[used]
         for collected, value in zip(out[:3], (values, rows, column[used]), strict=True):
             collected.append(value)

@@ -15,6 +15,11 @@ DECADES = 30  # that they may span: single precision has 38
 def typical_sizes(flat: FlatModel, variables: QuantityMap, extended: Extended) -> Float[np.ndarray, " quantities"]:
     """Of all quantities, at the parameter values the model was compiled with; powers of two, by which numbers are
     multiplied without rounding."""
+    return 2.0 ** np.round(np.log2(unrounded_sizes(flat, variables, extended)))
+
+
+def unrounded_sizes(flat: FlatModel, variables: QuantityMap, extended: Extended) -> Float[np.ndarray, " quantities"]:
+    """The same, the closer to each other in other units."""
     if extended.quantities.n_unknown > LIMIT:
         return np.ones(extended.quantities.n)
     size = declared_scale(flat, variables, extended)
@@ -26,5 +31,4 @@ def typical_sizes(flat: FlatModel, variables: QuantityMap, extended: Extended) -
             size[quantity] = value if np.isfinite(value) else 0.0
     size[size == 0.0] = 1.0
     found, _ = natural_sizes(extended.groups, extended.n_equations, size, flat.parameters.values)
-    decades = np.clip(np.log10(np.abs(found)), -DECADES, DECADES)
-    return 2.0 ** np.round(decades / np.log10(2.0))
+    return 10.0 ** np.clip(np.log10(np.abs(found)), -DECADES, DECADES)
