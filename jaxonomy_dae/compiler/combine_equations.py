@@ -1,6 +1,6 @@
 """A linear combination of equations, in which some quantities cancel, as a new equation."""
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from ..modeling.symbols import TIME_LABEL
 from .null_vectors import CANCELLED
 
 POINTS = 4
+NEARER = 6  # how often sample points come nearer to zero
 
 
 def quantity_label(variable: int, order: int) -> Hashable:
@@ -29,6 +30,11 @@ def somewhere(variable: Any, order: Any, trial: int) -> Any:
     x = np.sin(12.9898 * (np.asarray(variable) + 1) + 78.233 * (np.asarray(order) + 1) + 37.719 * trial) * 43758.5453
     x = 0.5 + x - np.floor(x)
     return x if trial % 2 else -x
+
+
+def tried(variable: Any, order: Any, trial: int) -> Any:
+    """The same for the first trials, then ever nearer to zero: what overflows near one has a value at last."""
+    return somewhere(variable, order, trial) * 10.0 ** (-3 * (trial // 4))
 
 
 def near(values: np.ndarray, trial: int) -> np.ndarray:
@@ -63,17 +69,33 @@ def _exact(value: float) -> int | float:
 
 
 class Samples:
-    """Values of graphs at random points: quantities anywhere, parameters near those given."""
+    """Values of graphs at random points: quantities near ±1, or if graphs have no values there, near their natural
+    sizes or nearer to zero; parameters near those given."""
 
-    def __init__(self, graphs: Sequence[Node], values: np.ndarray):
+    def __init__(self, graphs: Sequence[Node], values: np.ndarray, natural: Callable[[], Mapping[Hashable, float]]):
         labels = sorted(frozenset().union(*(g.leaves for g in graphs)), key=repr)
         self._labels = labels
-        self._points = [[self._value(label, values, k) for label in labels] for k in range(3 * POINTS)]
+        sizes: Mapping[Hashable, float] = {}
+        best, most = [], -1
+        for k in range(NEARER + 1):
+            factor = 0.1 ** max(k - 1, 0)
+            unit = [factor * sizes.get(label, 1.0) for label in labels]
+            self._points = [
+                [self._value(label, values, p, u) for label, u in zip(labels, unit, strict=True)]
+                for p in range(3 * POINTS)
+            ]
+            with_values = int(np.isfinite(self(graphs)).all(axis=0).sum())
+            if with_values > most:
+                best, most = self._points, with_values
+            if with_values == len(self._points):
+                break
+            sizes = sizes or natural()
+        self._points = best
 
     @staticmethod
-    def _value(label, values: np.ndarray, trial: int) -> float:
+    def _value(label, values: np.ndarray, trial: int, size: float) -> float:
         if label[0] == "quantity":
-            return float(somewhere(label[1], label[2], trial))
+            return size * float(somewhere(label[1], label[2], trial))
         return 0.37 + 0.1 * trial if label == TIME_LABEL else float(near(values, trial // 3)[label[1]])
 
     def __call__(self, graphs: Sequence[Node]) -> np.ndarray:
@@ -84,22 +106,33 @@ class Samples:
         return np.stack([np.broadcast_to(np.asarray(v, float), (n,)) for v in found])
 
 
+@np.errstate(all="ignore")  # points where equations overflow are left out
 def combine(
-    equations: Sequence[Node], weights: Sequence[Node], gone: Sequence[Hashable], values: np.ndarray
+    equations: Sequence[Node],
+    weights: Sequence[Node],
+    gone: Sequence[Hashable],
+    values: np.ndarray,
+    natural: Callable[[], Mapping[Hashable, float]],
 ) -> Node | None:
-    """Σ weight·equation without the quantities that cancel; None if those in `gone` do not."""
+    """Σ weight·equation without the quantities that cancel; None if those in `gone` do not.
+
+    `values` are those of the parameters; `natural` gives sizes of quantities at which the equations have values.
+    """
     terms = [multiply(w, e) for w, e in zip(weights, equations, strict=True)]
     total = linear((1, t) for t in terms)
     quantities = sorted(
         (label for label in frozenset().union(*(e.leaves for e in equations)) if label[0] == "quantity"), key=repr
     )
-    samples = Samples([*equations, *weights], values)
+    samples = Samples([*equations, *weights], values, natural)
     cancelled = []
     for label in quantities:
         slopes = samples([multiply(w, partial_derivative(e, label)) for w, e in zip(weights, equations, strict=True)])
         finite = np.isfinite(slopes).all(axis=0)
-        small = np.abs(slopes.sum(axis=0)) <= CANCELLED * np.abs(slopes).sum(axis=0)
-        if finite.any() and small[finite].all():
+        size = np.abs(slopes).sum(axis=0)
+        small = np.abs(slopes.sum(axis=0)) <= CANCELLED * size
+        # Where there are values at some points only, slopes of zero may be what underflowed.
+        seen = finite.all() or (size[finite] > 0).any()
+        if finite.any() and seen and small[finite].all():
             cancelled.append(label)
     if not set(gone) <= set(cancelled) | (set(gone) - set(quantities)):
         return None

@@ -7,7 +7,7 @@ or a function of the parameters, the equation Σ wᵢ Fᵢ^(cᵢ − c_min), in 
 one of lowest cᵢ, and index reduction starts again: the linear combination method of Tan, Nedialkov & Pryce (2017).
 """
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 
 import numpy as np
 import scipy.sparse as sp
@@ -29,13 +29,14 @@ from ..modeling.symbols import TIME_LABEL
 from ..structure.incidence import Incidence
 from ..structure.matching import maximum_matching
 from ..structure.pantelides import Offsets, reduce_index
-from .combine_equations import combine, graph_of, group_of, near, quantity_label, somewhere
+from .combine_equations import combine, graph_of, group_of, near, quantity_label, somewhere, tried
 from .null_vectors import CANCELLED, left_null_vectors, weights_in_parameters
 
 LARGEST_BLOCK = 200
 ROUNDS = 100
-TRIALS = 12  # random points, of which STATES are used: those where the equations have values
+TRIALS = 44  # random points, of which STATES are used: the first where the equations have values
 STATES = 3
+HIGHER = 8  # derivatives that a quantity's size is taken for
 PARAMETERS = 4  # sample values of the parameters
 PERTURBATIONS = 8  # of parameters, by this much:
 SMALL = 2.0**-20
@@ -132,7 +133,7 @@ class _Jacobian:
         """Of all equations of a group, factors included, shape (n, slots)."""
         if (g, trial) not in self._partials:
             group = self.groups[g]
-            point = np.where(group.variable == ZERO, 0.0, group.factor * somewhere(group.variable, group.order, trial))
+            point = np.where(group.variable == ZERO, 0.0, group.factor * tried(group.variable, group.order, trial))
             if group.template.opaque is not None:  # any function
                 slots = range(point.shape[1])
                 any_slopes = [np.ones(len(group)), *(somewhere(group.variable[:, 0], k, trial) for k in slots[1:])]
@@ -166,9 +167,9 @@ class _Jacobian:
                 dense[k, j] += self.partials(g, trial)[i, slot]
         return dense
 
-    def at_natural_size(self, equations: np.ndarray, columns: np.ndarray, trial: int) -> np.ndarray:
-        """The matrix at a random point where all terms of the equations are alike, whatever the units: what depends on
-        the point may look constant where one term is too small to be seen."""
+    def _at_natural_sizes(self, equations: np.ndarray) -> tuple[list[ExtendedGroup], list[int], np.ndarray, np.ndarray]:
+        """The equations by themselves, in groups; their numbers, in that order; their quantities as (variable, order),
+        and sizes of these at which all terms are alike, whatever the units."""
         rows: dict[int, list[int]] = {}
         for e in equations.tolist():
             g, i = self.place(e)
@@ -186,8 +187,21 @@ class _Jacobian:
                 ExtendedGroup(group.template, own, own, 0, quantity, group.factor, group.parameter, group.coefficient)
             )
         size, _ = natural_sizes(groups, len(order), np.ones(len(number)), self.values)
-        pairs = np.array(list(number), np.int64).reshape(-1, 2)
-        point = np.abs(size) * somewhere(pairs[:, 0], pairs[:, 1], trial)
+        return groups, order, np.array(list(number), np.int64).reshape(-1, 2), np.abs(size)
+
+    def natural(self, equations: np.ndarray) -> dict[Hashable, float]:
+        """Sizes of the quantities of equations, by their labels; those of the lower derivatives for higher ones."""
+        _, _, pairs, size = self._at_natural_sizes(equations)
+        found: dict[Hashable, float] = {}
+        for (v, q), s in sorted(zip(map(tuple, pairs.tolist()), size.tolist(), strict=True), reverse=True):
+            found |= {quantity_label(v, k): s for k in range(q, q + HIGHER)}
+        return found
+
+    def at_natural_size(self, equations: np.ndarray, columns: np.ndarray, trial: int) -> np.ndarray:
+        """The matrix at a random point where all terms of the equations are alike: what depends on the point may look
+        constant where one term is too small to be seen."""
+        groups, order, pairs, size = self._at_natural_sizes(equations)
+        point = size * somewhere(pairs[:, 0], pairs[:, 1], trial)
         place = {e: k for k, e in enumerate(equations.tolist())}
         dense = np.zeros((len(equations), len(columns)))
         for group in groups:
@@ -256,7 +270,7 @@ def _combination(jacobian: _Jacobian, equations: np.ndarray, names: Sequence[str
         here = [jacobian.place(e) for e in equations[used].tolist()]
         concerned = dict.fromkeys(p for g, i in here for p in groups[g].parameter[i].tolist())
         raise StructuralError("\n".join([_for_values(jacobian.values, names, list(concerned)), *itemised(sources)]))
-    combined = combine(written, found, top, jacobian.values)
+    combined = combine(written, found, top, jacobian.values, lambda: jacobian.natural(equations[used]))
     if combined is None:
         raise StructuralError(_hidden(sources))
     if not any(label[0] == "quantity" for label in combined.leaves):
@@ -290,7 +304,7 @@ def _weights(
         for row, given in zip(rows, entries, strict=True):
             for graph in given:
                 point = {
-                    label: constant(float(somewhere(label[1], label[2], trial)))
+                    label: constant(float(tried(label[1], label[2], trial)))
                     for label in graph.leaves
                     if label[0] == "quantity"
                 }

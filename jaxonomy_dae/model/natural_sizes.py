@@ -12,11 +12,10 @@ from .evaluate_numpy import Networks, generic, group_values
 from .extended import ExtendedGroup
 from .tables import ZERO
 
-ROUNDS = 6
+ROUNDS = 3
 STEP = 1e-3  # of the logarithm of an argument
 FARTHEST = 100.0  # decades from one that a size may be looked for
 STEEPEST = 8.0  # power that an entry is taken for
-ACCURACY = 1e-9  # of the least squares: what depends on units should be far below what decides
 DAMPING = 1e-3  # keeps sizes that nothing tells where they are
 
 
@@ -55,7 +54,7 @@ def natural_sizes(
         matrix = sp.csr_array((powers, (places, unknowns)), shape=shape)
         linalg: Any = scipy.sparse.linalg
         sizes = np.append(logarithm, constant[0])
-        found = linalg.lsmr(matrix, -sizes, damp=DAMPING, atol=ACCURACY, btol=ACCURACY, maxiter=20 * n)[0]
+        found = linalg.lsmr(matrix, -sizes, damp=DAMPING, atol=1e-4, btol=1e-4, maxiter=20 * n)[0]
         quantity, parameter = _moved(quantity, found[:n]), _moved(parameter, found[n : n + n_parameters])
         if np.abs(found[: n + n_parameters]).max(initial=0.0) < 0.3:
             break
