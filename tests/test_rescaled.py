@@ -9,6 +9,7 @@ import itertools
 
 import pytest
 import test_determinism
+import test_index_reduction
 import test_jacobian
 import test_linear_daes
 import test_modeling
@@ -90,6 +91,13 @@ def test_states_of_combined_equations(kind, seed):
     with watched() as seen:
         test_linear_daes.compiled(test_linear_daes.written(test_linear_daes.MIXED))
     compare_verdicts(*seen[-1], kind, seed)
+
+
+def test_exponentials_that_overflow():
+    """Where a variable near one is many volts, the amplifier's transistors have no values; it was refused."""
+    with watched() as seen:
+        test_index_reduction.test_transistor_amplifier_has_five_degrees_of_freedom()
+    compare_verdicts(*seen[-1], "all", 3)
 
 
 @pytest.mark.parametrize("name, kind", [("implicit", "all"), ("contradiction", "units")])

@@ -168,7 +168,7 @@ def initial_point(flat: FlatModel, variables: QuantityMap, extended: Extended):
     values = flat.parameters.values
     networks = Networks(tuple(flat.networks.values()))
     guess, pins = start_guess(flat, variables, extended.quantities.n)
-    point, _ = consistent_point(extended, guess, list(pins.items()), values, 0.0, networks)
+    point = consistent_point(extended, guess, list(pins.items()), values, 0.0, networks)
     return point, values, networks
 
 

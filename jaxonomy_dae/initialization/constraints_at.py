@@ -31,7 +31,7 @@ def constraints_at(
     if quantities.n > quantities.n_unknown:
         guess[quantities.n_unknown :] = inputs()
     evaluated = Networks(networks)
-    values, _ = consistent_point(plan.extended, guess, list(pins.items()), parameters, t, evaluated)
+    values = consistent_point(plan.extended, guess, list(pins.items()), parameters, t, evaluated)
     return ModelAt(
         plan.flat, plan.alias, plan.variable_map, plan.groups, plan.extended, plan.selection.settled, values,
         parameters, t, evaluated,

@@ -19,11 +19,11 @@ def consistent_point(
     t: float,
     networks: Networks,
     iterations: int = 60,
-) -> tuple[np.ndarray, float]:
+) -> np.ndarray:
     """A point near `guess` where the equations and the fixed starts hold: damped Gauss–Newton steps of least norm, in
     units in which all rows and columns of the Jacobian are alike.
 
-    Returns the values of all quantities and the largest residual left, so measured; inputs stay as in `guess`.
+    Returns the values of all quantities; inputs stay as in `guess`.
     """
     n = extended.quantities.n_unknown
     pins = np.array([q for q, _ in fixed], np.int64)
@@ -38,14 +38,12 @@ def consistent_point(
         return np.concatenate([r, values[pins] - targets]), jacobian
 
     r, jacobian = evaluate(values)
-    largest = np.inf
     for _ in range(iterations):
         full: Any = sp.vstack([jacobian, pin_rows]).tocsr()[:, :n]
         if not np.isfinite(full.data).all():
             break
         scaled, rows, columns = equilibrated(full)
         size = np.linalg.norm(rows * r)
-        largest = float(np.abs(rows * r).max(initial=0.0))
         if not np.isfinite(size) or size <= 1e-15 * (1 + np.abs(values[:n] / columns).max(initial=0.0)):
             break
         try:
@@ -64,7 +62,7 @@ def consistent_point(
         if not accepted:
             break
         values, r, jacobian = trial, r_trial, jacobian_trial
-    return values, largest
+    return values
 
 
 def _least_norm(matrix: Any, right: np.ndarray) -> np.ndarray:

@@ -19,7 +19,7 @@ def typical_sizes(flat: FlatModel, variables: QuantityMap, extended: Extended) -
 
 
 def unrounded_sizes(flat: FlatModel, variables: QuantityMap, extended: Extended) -> Float[np.ndarray, " quantities"]:
-    """The same, the closer to each other in other units."""
+    """The same, not rounded: rounded, sizes that differ by little may differ by two, and choose other states."""
     if extended.quantities.n_unknown > LIMIT:
         return np.ones(extended.quantities.n)
     size = declared_scale(flat, variables, extended)
