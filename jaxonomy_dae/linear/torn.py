@@ -33,8 +33,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..structure.tearing import Tearing
-from .written_out import UNROLLED, inverse
+from .inverse import FORMULA, inverse
+from .once import once
+from .written_out import UNROLLED
 
+APART = 8  # equations of a block from which on what its phases hand on is computed once, and not where it is read
 CORRECTIONS = 2  # where an unknown of the sequence depends on another; else one is enough
 TOLERATED = 2.0**20  # residual of an equation in units of eps times its terms: 2e-10 in double precision
 TOLERATED_NORM = 2.0**8  # the same in the equilibrated norm: 6e-14, what elimination with pivoting may leave
@@ -92,8 +95,8 @@ def solve_torn(tearing: Tearing, matrix: Entries, right: Sequence[Any]) -> list[
     return solved(arrays, list(right))
 
 
-def _parts(stacked: Any) -> list[Any]:
-    return [stacked[k] for k in range(stacked.shape[0])]
+def _parts(rows: Any) -> list[Any]:
+    return [rows[k] for k in range(rows.shape[0])]
 
 
 class _Elimination:
@@ -108,6 +111,7 @@ class _Elimination:
         self.over_pivot = {u: 1 / matrix[e, u] for e, u in tearing.sequence}
         self.place = {u: j for j, u in enumerate(tearing.tearing)}
         self.written_out = m <= UNROLLED
+        self.in_batches_only = m <= FORMULA and n <= APART and not like.shape
         self.giving = {e for e, _ in tearing.sequence}
         self.can_grow = self._links() > 1
         self.chained = any(_others(self.rows[e], u, self.over_pivot) for e, u in tearing.sequence)
@@ -123,7 +127,7 @@ class _Elimination:
             dense = [[self._filled(row.get(j, 0.0)) for j in range(m)] for row in schur]
             if self.exact:
                 dense[0][0] = self._more_than_rounding(dense[0][0])
-            self.inverse = inverse(dense) if m > 1 else [[1 / dense[0][0]]]
+            self.inverse = inverse(dense)
         else:
             dense = jnp.stack([jnp.moveaxis(row, 0, -1) for row in schur], axis=-2)  # (*batch, m, m)
             self.unit = 1 / jnp.max(jnp.abs(dense), axis=-1, keepdims=True)
@@ -185,8 +189,9 @@ class _Elimination:
         """S⁻¹ s or S⁻ᵀ s."""
         if self.written_out:
             m = len(s)
+            s = self._once(s)
             entry = (lambda r, c: self.inverse[c][r]) if transposed else (lambda r, c: self.inverse[r][c])
-            return [_total([entry(r, c) * s[c] for c in range(m)], None) for r in range(m)]
+            return self._once([_total([entry(r, c) * s[c] for c in range(m)], None) for r in range(m)])
         b = jnp.moveaxis(jnp.stack(s), 0, -1)[..., None]
         solve = functools.partial(jax.lax.linalg.triangular_solve, self.lu, left_side=True)
         if transposed:
@@ -278,6 +283,16 @@ class _Elimination:
 
     def _verified(self, x: list[Any], b: Sequence[Any], rows: list[list[tuple[int, Any]]], places) -> list[Any]:
         """x, or not-a-number if one of the equations at `places` does not hold to rounding."""
+        holds = self._hold(x, b, rows, places)
+        (holds,) = self._once([holds])
+        return [jnp.where(holds, v, jnp.nan) for v in x]
+
+    def _once(self, values: list[Any]) -> list[Any]:
+        """The same, computed once where many expressions follow."""
+        return values if self.exact else once(values, self.in_batches_only)
+
+    def _hold(self, x: list[Any], b: Sequence[Any], rows: list[list[tuple[int, Any]]], places) -> Any:
+        """Whether the equations at `places` hold to rounding."""
         dtype = x[0].dtype
         eps, tiny = float(jnp.finfo(dtype).eps), float(jnp.finfo(dtype).tiny)
         norm = None
@@ -300,7 +315,7 @@ class _Elimination:
             # Below the second term, products have lost digits to underflow.
             fine = residual <= allowed + TOLERATED / eps * tiny
             holds = fine if holds is True else holds & fine
-        return [jnp.where(holds, v, jnp.nan) for v in x]
+        return holds
 
 
 def _others(row: list[tuple[int, Any]], own: int, places: Container[int]) -> bool:

@@ -104,18 +104,23 @@ def solve_whole(
 def _scales(pattern: SparsePattern, values: Any) -> tuple[Any, Any]:
     """Factors of rows and of columns, powers of two, that bring their largest entries near one."""
     size = jnp.abs(values)
-    rows = _over(jnp.zeros(pattern.n, values.dtype).at[pattern.rows].max(size))
-    columns = _over(jnp.zeros(pattern.n, values.dtype).at[pattern.cols].max(size * rows[pattern.rows]))
-    again = _over(
+    rows = over(jnp.zeros(pattern.n, values.dtype).at[pattern.rows].max(size))
+    columns = over(jnp.zeros(pattern.n, values.dtype).at[pattern.cols].max(size * rows[pattern.rows]))
+    again = over(
         jnp.zeros(pattern.n, values.dtype).at[pattern.rows].max(size * rows[pattern.rows] * columns[pattern.cols])
     )
     return rows * again, columns
 
 
-def _over(size: Any) -> Any:
-    """1 / size to a power of two; 1 where there is nothing to scale."""
-    _, exponent = jnp.frexp(size)
-    return jnp.where((size > 0) & jnp.isfinite(size), jnp.ldexp(jnp.ones_like(size), -exponent), 1.0)
+def over(size: Any) -> Any:
+    """1 / size to a power of two, from the bits of its exponent; 1 where there is nothing to scale."""
+    kind = jnp.finfo(size.dtype)
+    whole = jnp.int64 if kind.bits == 64 else jnp.int32
+    bias = kind.maxexp - 1
+    exponent = jax.lax.bitcast_convert_type(size, whole) >> kind.nmant
+    power = jax.lax.bitcast_convert_type((2 * bias - 1 - exponent) << kind.nmant, size.dtype)
+    # No power of two is one over what is subnormal, or near the largest number.
+    return jnp.where((exponent > 0) & (exponent < 2 * bias - 1), power, 1.0)
 
 
 def _lapack(pattern: SparsePattern, values: Any) -> Any:

@@ -10,7 +10,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental.xla_metadata import set_xla_metadata
+
+from ..linear.once import joined
 
 Chunk = Any  # an array of shape (n,), a scalar, or a tuple of scalars
 
@@ -83,19 +84,7 @@ class Gather:
             start[c] = position
             parts.append(part)
             position += part.shape[0]
-        return take(_joined(parts), start[self.chunk] + np.maximum(self.offset, 0))
-
-
-@jax.jit
-def _concatenation(*parts: Any) -> Any:
-    return jnp.concatenate(parts)
-
-
-def _joined(parts: list[Any]) -> Any:
-    """Their concatenation, in a call that XLA does not take apart. Fused with what computes the parts, kernels for
-    CPUs compute all that the parts share anew for each, and what that shares again: exponentially often."""
-    with set_xla_metadata(inlineable="false"):
-        return _concatenation(*parts)
+        return take(joined(parts), start[self.chunk] + np.maximum(self.offset, 0))
 
 
 def _is_scalar(chunk: Chunk) -> bool:

@@ -1,0 +1,63 @@
+"""Values that XLA computes once.
+
+A kernel for CPUs computes anew what it reads, if that is cheap, and what that reads again: sums of products that many
+outputs share, exponentially often. What a call returns that XLA does not take apart is computed once.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.experimental.xla_metadata import set_xla_metadata
+
+
+def joined(parts: Sequence[Any]) -> Any:
+    """The concatenation of arrays, computed once."""
+    return _called(_concatenation, parts)
+
+
+def stacked(rows: Sequence[Any]) -> Any:
+    """Arrays of one shape as the rows of one, computed once."""
+    return _called(_stack, rows)
+
+
+def once(values: Sequence[Any], in_batches_only: bool = False) -> list[Any]:
+    """Arrays of one shape, computed once; perhaps only if they are batched: to read them back costs time, too, more
+    than a few scalars do."""
+    return _once_in_batches(list(values)) if in_batches_only else _once(values)
+
+
+def _once(values: Sequence[Any]) -> list[Any]:
+    rows = stacked(values)
+    return [rows[k] for k in range(len(values))]
+
+
+@jax.custom_batching.custom_vmap
+def _once_in_batches(values):
+    return values
+
+
+@_once_in_batches.def_vmap
+def _(size, batched, values):
+    (batched,) = batched
+    values = [v if b else jnp.broadcast_to(v, (size, *v.shape)) for v, b in zip(values, batched, strict=True)]
+    return _once(values), [True] * len(values)
+
+
+@jax.jit
+def _concatenation(*parts: Any) -> Any:
+    return jnp.concatenate(parts)
+
+
+@jax.jit
+def _stack(*rows: Any) -> Any:
+    return jnp.stack(rows)
+
+
+def _called(function: Any, parts: Sequence[Any]) -> Any:
+    # XLA for GPUs takes a call that stays for a graph of commands.
+    if jax.default_backend() != "cpu":
+        return function(*parts)
+    with set_xla_metadata(inlineable="false"):
+        return function(*parts)
