@@ -12,7 +12,7 @@ from ..expressions.node import Node, constant, leaf, linear, multiply, scale
 from ..expressions.substitute import substitute
 from ..model.linear_template import LinearTemplate
 from ..model.provenance import Provenance, Provenances
-from ..model.symbolic import SymbolicTemplate, parameter_label, slot_label, template_of
+from ..model.symbolic import SymbolicTemplate, number_label, parameter_label, slot_label, template_of
 from ..model.tables import ZERO, EquationGroup
 from ..modeling.symbols import TIME_LABEL
 from .null_vectors import CANCELLED
@@ -61,7 +61,8 @@ def graph_of(group: EquationGroup, i: int, times: int) -> Node | None:
     if not isinstance(template, SymbolicTemplate):
         return None
     parameters = {parameter_label(k): leaf(("of model", int(p))) for k, p in enumerate(group.parameter[i])}
-    return substitute(template.graph, slots | parameters)
+    numbers = {number_label(k): constant(_exact(c)) for k, c in enumerate(group.coefficient[i].tolist())}
+    return substitute(template.graph, slots | parameters | numbers)
 
 
 def _exact(value: float) -> int | float:

@@ -11,9 +11,9 @@ from ..expressions.to_sympy import shortened
 from ..model.linear_template import LinearTemplate
 from ..model.provenance import Provenances, Written
 from ..model.symbolic import canonical, linear_coefficients
-from ..model.template import AbstractTemplate
 from ..modeling.symbols import ParameterSymbol, PreviousSymbol, TimeSymbol, VariableSymbol, symbol_label
 from .group_builder import GroupBuilder
+from .lift_numbers import Rows, lifted
 from .number_model import Instances, Members, ModelNumbers
 
 
@@ -28,6 +28,7 @@ def add_components(model: ModelNumbers, builder: GroupBuilder):
                     read_once[id(residual)] = read_expression(residual, model.path(i))
             graphs = tuple(read_once[id(r)] for r in c.equations)
             by_shape.setdefault((graphs, tuple(c.variables), tuple(c.parameters)), []).append(i)
+    nonlinear: list[Rows] = []
     for (graphs, _, _), parts in by_shape.items():
         members = Members(model, parts)
         number = members.number
@@ -41,12 +42,13 @@ def add_components(model: ModelNumbers, builder: GroupBuilder):
             order = np.tile([v.order for v in variables], (len(number), 1))
             provenance = Provenances.made(Written(f"0 = {shortened(residual)}", model.paths), number, True)
             if coefficients is None:
-                template: AbstractTemplate = canonical(graph, variables, parameters)
-                builder.add(template, ids, order, parameter_ids, np.zeros((len(number), 0)), provenance)
+                nonlinear.append(Rows(canonical(graph, variables, parameters), ids, order, parameter_ids, provenance))
             else:
-                template = LinearTemplate(len(variables))
                 rows = np.tile(coefficients, (len(number), 1))
-                builder.add(template, ids, order, np.zeros((len(number), 0)), rows, provenance)
+                none = np.zeros((len(number), 0))
+                builder.add(LinearTemplate(len(variables)), ids, order, none, rows, provenance)
+    for (template, ids, order, parameter_ids, provenance), rows in lifted(nonlinear):
+        builder.add(template, ids, order, parameter_ids, rows, provenance)
 
 
 def slots_of(

@@ -28,11 +28,12 @@ def substitute(node: Node, replaced: Mapping[Hashable, Node]) -> Node:
         elif n.operation == "leaf":
             known[n] = replaced[n.data]
         else:
-            known[n] = _rebuilt(n, [known[a] for a in n.arguments])
+            known[n] = rebuilt(n, [known[a] for a in n.arguments])
     return known[node]
 
 
-def _rebuilt(n: Node, inside: Sequence[Node]) -> Node:
+def rebuilt(n: Node, inside: Sequence[Node]) -> Node:
+    """The node with other arguments, simplified."""
     operation = n.operation
     if operation == "sum":
         return linear(zip(n.data[1], inside, strict=True), n.data[0])

@@ -18,8 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ..adjoint.closure_conversion import any_member
+from ..adjoint.closure_conversion import any_member, written
 from ..adjoint.resting import still
+from .first_order import constant_once
 from .problem import AbstractHybridProblem, HybridState, one_hot
 
 CONDITIONS_AT_ONE_INSTANT = 32  # more than these take another step, of no length to speak of
@@ -47,12 +48,16 @@ class Instant(eqx.Module):
 class Arrival(NamedTuple):
     """What a step meets at its end, not differentiated.
 
+    - `slope`: dx/dt there, before any event.
+    - `rate`: how fast the guards change, shape (guards,); at the initial time only.
     - `due`: which events happen, shape (clocks + guards,).
     - `jumped`: which guards jumped over zero, so that their events do not move in time, shape (guards,).
     - `size`: of the guards of late, shape (guards,).
     - `window`: the time within which a guard counts as having reached zero; `span`: how long steps have been of late.
     """
 
+    slope: Any
+    rate: Any
     due: Any
     jumped: Any
     size: Any
@@ -72,39 +77,34 @@ def handle(
     ends = jnp.asarray(problem.ends).astype(t.dtype)
 
     def one(instant: Instant) -> Instant:
-        state, q = instant.state, instant.state.q
-        before = problem.slope(t, state.x, q, args)
+        state, q, before = instant.state, instant.state.q, instant.slope
         # Where nothing is left, as in some members of a batch, nothing happens: derivatives of what would have happened
         # need not be finite.
         event = jnp.where(jnp.any(instant.left), jnp.argmax(instant.left), c + g)
         is_clock = event < c
-        delay = jnp.zeros_like(t)
-        if g:
+        k = jnp.clip(event - c, 0, max(g - 1, 0))
+        delay = rate = jnp.zeros_like(t)
+        if at_start and g:
+            rate = arrival.rate[k]
+        elif g:
             values = problem.guards(t, state.x, q, args)
-            _, rates = problem.rates(t, state.x, q, args, before)
-            k = jnp.clip(event - c, 0, g - 1)
-            rate = rates[k]
+            rate = problem.rates(t, state.x, q, args, before)[1][k]
             crossing = -values[k] / jnp.where(rate == 0, 1.0, rate)
             # Where another event has made the guard slow, rounding is all that is left of its value.
             frozen = lax.stop_gradient(crossing)
             crossing = crossing + (jnp.clip(frozen, -arrival.window, arrival.window) - frozen)
             crossing = jnp.where(instant.caused[k], instant.delay, crossing)
             delay = jnp.where(is_clock, delay, crossing)
-        else:
-            rate = jnp.zeros_like(t)
-        if at_start:
-            delay = jnp.zeros_like(t)
-        elif c:
+        if c and not at_start:
             exact = problem.due(state.ticks)[jnp.clip(event, 0, c - 1)]
             delay = jnp.where(is_clock, exact - lax.stop_gradient(exact), delay)
         time = t + delay
         reached = state.x + before * delay
         x, new = problem.written(time, reached, q, instant.previous, event, args)
-        after = problem.slope(t, x, new, args)
         ticks = state.ticks + one_hot(event, c).astype(state.ticks.dtype)
         logged = (~is_clock & noted[event] & (not at_start)) | (ends[event] > 0)
         row = jnp.where(logged, state.count.astype(int), state.times.shape[0] + 1)
-        armed, left, caused = _following(problem, t, x, new, after, instant, event, arrival, args)
+        after, armed, left, caused = _following(problem, t, x, new, instant, event, arrival, args)
         state = HybridState(
             x - after * delay,
             new,
@@ -134,7 +134,7 @@ def handle(
 
         return lax.cond(any_member(going), go, lambda instant: instant, instant), None
 
-    start = Instant(state, arrival.due, arrival.jumped, jnp.zeros_like(t), state.q, jnp.zeros_like(state.x), state.x)
+    start = Instant(state, arrival.due, arrival.jumped, jnp.zeros_like(t), state.q, arrival.slope, state.x)
     length = c + min(2 * g, CONDITIONS_AT_ONE_INSTANT)
     instant, _ = lax.scan(step, start, length=length)
     return instant.state, instant.slope
@@ -145,34 +145,53 @@ def _noted(rows: Any, row: Any, value: Any) -> Any:
     return rows.at[row].set(value.astype(rows.dtype), mode="drop") if rows.shape[0] else rows
 
 
-def _following(problem, t, x, q, slope, instant: Instant, event, arrival: Arrival, args):
-    """(armed guards, events left, which guards an event made true) after an event, not differentiated."""
-    problem, t, x, q, slope, instant, args = still((problem, t, x, q, slope, instant, args))
+def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, args):
+    """(dx/dt, armed guards, events left, which guards an event made true) after an event, not differentiated."""
     c, g = problem.n_clocks, problem.n_guards
     left = instant.left & ~one_hot(event, c + g)
     if not g:
-        return instant.state.armed, left, instant.caused
-    value, rate = problem.rates(t, x, q, args, slope)
+        return problem.slope(t, x, q, args), instant.state.armed, left, instant.caused
+    problem, t, x, q, args = still(constant_once((problem, t, x, q, args)))
+    instant = still(instant)
     here = event - c == jnp.arange(g)
     rounding = jnp.where(left[c:], REACHED, SMALL) * arrival.size
-    zero = jnp.abs(value) <= jnp.maximum(rounding, jnp.abs(rate) * arrival.window)
+    ahead = AHEAD * arrival.span
+
+    def is_zero(value, rate):
+        return jnp.abs(value) <= jnp.maximum(rounding, jnp.abs(rate) * arrival.window)
+
+    def is_flat(value, rate):
+        return is_zero(value, rate) & (jnp.abs(rate) * arrival.span <= FLAT * arrival.size)
+
+    # Guards and their rates after the event, with what was before it, and, where one is flat, a little ahead: in a
+    # loop, for XLA compiles the equations as often as they are written.
+    def look(carry):
+        k, slope, values, rates = carry
+        point = jnp.where(k == 0, x, jnp.where(k == 1, instant.arrived, x + slope * ahead))
+        time = jnp.where(k == 2, t + ahead, t)
+        own = problem.slope(time, point, q, args)
+        slope = jnp.where(k == 0, own, slope)
+        value, rate = problem.rates(time, point, q, args, jnp.where(k == 2, own, slope))
+        return k + 1, slope, written(values, k, value), written(rates, k, rate)
+
+    def unfinished(carry):
+        k, _, values, rates = carry
+        return (k < 2) | ((k == 2) & jnp.any(is_flat(values[0], rates[0])))
+
+    rows = jnp.zeros((3, g), x.dtype)
+    _, slope, values, rates = lax.while_loop(unfinished, look, (jnp.array(0), jnp.zeros_like(x), rows, rows))
+    (value, at_arrival, _), (rate, rate_there, rate_ahead) = values, rates
     # A force that keeps a contact closed leaves a guard of the open contact at zero without a slope: what it does next
     # decides. One that seems to fall by rounding alone is waited for: if it does fall, the next step finds it.
-    flat = zero & (jnp.abs(rate) * arrival.span <= FLAT * arrival.size)
-
-    def mean_rate():
-        later, ahead = t + AHEAD * arrival.span, x + slope * AHEAD * arrival.span
-        return 0.5 * (rate + problem.rates(later, ahead, q, args, problem.slope(later, ahead, q, args))[1])
-
-    falling = jnp.where(flat, lax.cond(any_member(jnp.any(flat)), mean_rate, lambda: rate), rate)
+    falling = jnp.where(is_flat(value, rate), 0.5 * (rate + rate_ahead), rate)
+    zero = is_zero(value, rate)
     true = jnp.where(zero, falling * arrival.span < -ROUNDING * arrival.size, value < 0)
     was_armed = (instant.state.armed > 0.5) & ~here
     # What this event made true happens next. What was to happen does so, though a state starts anew: unless what was
     # assigned makes its condition false, or it is revocable and undone.
-    at_arrival, rate_there = problem.rates(t, instant.arrived, q, args, slope)
     reached = at_arrival <= jnp.maximum(SMALL * arrival.size, jnp.abs(rate_there) * arrival.window)
     stands = left[c:] & ~np.array(problem.revocable[c:], bool) & reached
     caused = ((was_armed & true) | stands) & ~zero
     next_ones = ((was_armed | left[c:]) & true & ~here) | stands
     armed = jnp.where(true, next_ones, True)
-    return armed.astype(instant.state.armed.dtype), jnp.concatenate([left[:c], next_ones]), caused
+    return slope, armed.astype(instant.state.armed.dtype), jnp.concatenate([left[:c], next_ones]), caused

@@ -164,23 +164,25 @@ def _looked_at(problem, dense, t0, t1, y0: HybridState, x1, args):
     span = jnp.maximum(h, FORGOTTEN * y0.span)
     window = jnp.maximum(WINDOW * span, problem.resolution)
     ticking = y0.due <= t1 + 0.25 * problem.resolution
+
+    def slope():
+        return problem.slope(t1, x1, q, args)
+
     if not g:
         none = jnp.zeros((0,), bool)
-        return jnp.full_like(t1, jnp.inf), y0.armed, Arrival(ticking, none, y0.size, window, span)
-
-    # One that an event left at zero may begin below it, by rounding: then that is its zero.
-    begin = problem.guards(t0, dense(t0, t1, t0), q, args)
-    by_rounding = (y0.armed > 0.5) & (begin >= -REACHED * y0.size)
-    zero = jnp.where(by_rounding, jnp.minimum(begin, 0.0), 0.0)
+        before = lax.cond(any_member(jnp.any(ticking)), slope, lambda: jnp.zeros_like(x1))
+        return jnp.full_like(t1, jnp.inf), y0.armed, Arrival(before, y0.size, ticking, none, y0.size, window, span)
 
     def guards(t):
         return problem.guards(t, dense(t0, t1, t), q, args) - zero
 
-    times = t0 + h * jnp.asarray(LOOKS[1:-1], t1.dtype)
-    values = jnp.concatenate([
-        (begin - zero)[None], jax.vmap(guards)(times), (problem.guards(t1, x1, q, args) - zero)[None]
-    ])  # fmt: skip
-    times = jnp.append(t0, times)
+    times = jnp.append(t0 + h * jnp.asarray(LOOKS[:-1], t1.dtype), t1)
+    states = jnp.concatenate([jax.vmap(lambda t: dense(t0, t1, t))(times[:-1]), x1[None]])
+    values = jax.vmap(lambda t, x: problem.guards(t, x, q, args))(times, states)
+    # One that an event left at zero may begin below it, by rounding: then that is its zero.
+    by_rounding = (y0.armed > 0.5) & (values[0] >= -REACHED * y0.size)
+    zero = jnp.where(by_rounding, jnp.minimum(values[0], 0.0), 0.0)
+    values = values - zero
     size = jnp.max(jnp.abs(values), axis=0)
     # A guard that was positive anywhere before is armed.
     positive = jnp.concatenate([(y0.armed > 0.5)[None], values[1:] > 0])
@@ -190,17 +192,19 @@ def _looked_at(problem, dense, t0, t1, y0: HybridState, x1, args):
     last = values[-1]
 
     def at_end():
-        _, rate = problem.rates(t1, x1, q, args, problem.slope(t1, x1, q, args))
-        return (rate < 0) & (jnp.abs(last) <= -rate * window)
+        before = slope()
+        _, rate = problem.rates(t1, x1, q, args, before)
+        return before, (rate < 0) & (jnp.abs(last) <= -rate * window)
 
-    doubtful = jnp.any(armed[-1] & (last <= NEARLY * size))
-    near = lax.cond(any_member(doubtful), at_end, lambda: jnp.zeros((g,), bool)) & armed[-1]
+    short = h <= 4 * problem.resolution
+    doubtful = jnp.any(armed[-1] & (last <= NEARLY * size)) | jnp.any(ticking) | short
+    before, near = lax.cond(any_member(doubtful), at_end, lambda: (jnp.zeros_like(x1), jnp.zeros((g,), bool)))
+    near = near & armed[-1]
     off = jnp.max(jnp.abs(jnp.asarray(_OFF_PARABOLA, values.dtype) @ values), axis=0)
     bent = jnp.any(off > BEND * size)
     long = h > 1e3 * jnp.maximum(WINDOW * h, problem.resolution)
     bent = bent & long
     # In a step too short to be parted, what has crossed has jumped.
-    short = h <= 4 * problem.resolution
     jumped = jnp.any(crossed, axis=0) & ~near & short
     near = near | jumped
     within = jnp.any(crossed[:-1], axis=0) & ~short
@@ -208,9 +212,8 @@ def _looked_at(problem, dense, t0, t1, y0: HybridState, x1, args):
 
     def located():
         place = jnp.argmax(jnp.any(crossed, axis=1))
-        ends = jnp.append(times, t1)
         return first_crossing(
-            guards, crossed[place], ends[place], ends[place + 1], values[place], values[place + 1], inside
+            guards, crossed[place], times[place], times[place + 1], values[place], values[place + 1], inside
         )
 
     where = lax.cond(any_member(inside), located, lambda: t1)
@@ -219,7 +222,7 @@ def _looked_at(problem, dense, t0, t1, y0: HybridState, x1, args):
     request = jnp.minimum(jnp.where(inside, where, jnp.inf), t0 + dip * h)
     request = jnp.where(bent, t0 + 0.5 * h, request)
     due = jnp.concatenate([ticking, near]) & ~jnp.isfinite(request)
-    arrival = Arrival(due, jumped, jnp.maximum(size, FORGOTTEN * y0.size), window, span)
+    arrival = Arrival(before, y0.size, due, jumped, jnp.maximum(size, FORGOTTEN * y0.size), window, span)
     return request, armed[-1].astype(y0.armed.dtype), arrival
 
 

@@ -23,7 +23,7 @@ def start(
     period, offset = (lax.stop_gradient(v) for v in problem.clocks())
     tolerance = problem.resolution
     ticks = jnp.maximum(jnp.ceil((t0 - tolerance - offset) / period), 0.0)
-    armed = size = jnp.zeros((0,), dtype)
+    armed = size = rate = jnp.zeros((0,), dtype)
     holding = jnp.zeros((0,), bool)
     if g:
         value, rate = problem.rates(t0, x0, q0, args, problem.slope(t0, x0, q0, args))
@@ -39,5 +39,5 @@ def start(
         return state
     due_conditions = holding & at_once
     due = jnp.concatenate([state.due <= t0 + tolerance, due_conditions])
-    arrival = Arrival(due, jnp.zeros((g,), bool), size, tolerance, tolerance)
+    arrival = Arrival(jnp.zeros_like(x0), rate, due, jnp.zeros((g,), bool), size, tolerance, tolerance)
     return handle(problem, t0, state, arrival, args, at_start=True)[0]

@@ -12,7 +12,8 @@ from . import written_out
 from .once import stacked
 
 FORMULA = 3  # rows up to which the elimination is written out and fused with what reads it
-IN_BATCHES = 4  # the same, written out as operations on arrays: XLA takes 4 s for batches of 6 × 6, and LAPACK no longer
+# The same in batches, where it is written out as operations on arrays: XLA takes 4 s for 6 × 6, and LAPACK no longer.
+IN_BATCHES = 4
 
 
 def inverse(matrix: Sequence[Sequence[Any]]) -> list[list[Any]]:

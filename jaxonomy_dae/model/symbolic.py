@@ -5,11 +5,13 @@ import math
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ..expressions.differentiate import directional_derivative, partial_derivative, raised
 from ..expressions.kernel import Kernel
-from ..expressions.node import ONE, ZERO, Node, constant, divide, leaf, linear, number, scale, split
+from ..expressions.node import ONE, ZERO, Node, constant, divide, leaf, linear, scale, split
 from ..expressions.substitute import substitute
 from ..modeling.symbols import TIME_LABEL, ParameterSymbol, VariableSymbol, symbol_label
 from .template import AbstractTemplate, Slot
@@ -23,21 +25,27 @@ def parameter_label(k: int) -> Hashable:
     return ("parameter", k)
 
 
+def number_label(k: int) -> Hashable:
+    return ("number", k)
+
+
 class SymbolicTemplate(AbstractTemplate):
-    """An expression in slots, parameters and time; its `graph` has the leaves labelled by the functions above."""
+    """An expression in slots, parameters, coefficients and time; its `graph` has the leaves labelled by the functions
+    above. Coefficients are numbers other than zero that belong to the instance."""
 
-    n_coefficients = 0
-
-    def __init__(self, graph: Node, slots: tuple[Slot, ...], n_parameters: int):
+    def __init__(self, graph: Node, slots: tuple[Slot, ...], n_parameters: int, n_coefficients: int = 0):
         self.graph = graph
         self.slots = slots
         self.n_parameters = n_parameters
-        self.key = f"{graph.digest.hex()}|{slots}|{n_parameters}"
-        self._labels = [*map(slot_label, slots), *map(parameter_label, range(n_parameters)), TIME_LABEL]
+        self.n_coefficients = n_coefficients
+        self.key = f"{graph.digest.hex()}|{slots}|{n_parameters}|{n_coefficients}"
+        self._numbers = [number_label(k) for k in range(n_coefficients)]
+        parameters = map(parameter_label, range(n_parameters))
+        self._labels = [*map(slot_label, slots), *parameters, *self._numbers, TIME_LABEL]
         self._kernels: dict[Any, Kernel] = {}
 
-    def __reduce__(self):
-        return template_of, (self.graph, self.slots, self.n_parameters)  # kernels are made again
+    def __reduce__(self):  # kernels are made again
+        return template_of, (self.graph, self.slots, self.n_parameters, self.n_coefficients)
 
     @functools.cached_property
     def partials(self) -> tuple[Node, ...]:
@@ -49,7 +57,8 @@ class SymbolicTemplate(AbstractTemplate):
         moved = {slot_label(s): slot_label((s[0], s[1] + 1)) for s in self.slots}
         total = directional_derivative(self.graph, raised(moved, TIME_LABEL))
         slots = sorted({*self.slots, *((b, q + 1) for b, q in self.slots)})
-        return template_of(total, tuple(s for s in slots if slot_label(s) in total.leaves), self.n_parameters)
+        used = tuple(s for s in slots if slot_label(s) in total.leaves)
+        return template_of(total, used, self.n_parameters, self.n_coefficients)
 
     @functools.cached_property
     def _slots_of_partials(self) -> tuple[frozenset[int], ...]:
@@ -63,7 +72,9 @@ class SymbolicTemplate(AbstractTemplate):
         return not self._slots_of_partials[position] and TIME_LABEL not in self.partials[position].leaves
 
     def coefficient_is_number(self, position: int) -> bool:
-        return number(self.partials[position]) not in (None, 0)
+        factor, rest = split(self.partials[position])
+        bases = rest.arguments if rest.operation == "product" else () if rest is ONE else (rest,)
+        return factor != 0 and all(b.operation == "leaf" and b.data in self._numbers for b in bases)
 
     def coefficient_never_vanishes(self, position: int) -> bool:
         if not self.coefficient_is_constant(position):
@@ -78,38 +89,50 @@ class SymbolicTemplate(AbstractTemplate):
         )
 
     def numbers(self, coefficients: np.ndarray) -> np.ndarray:
-        values = [number(p) for p in self.partials]
-        row = np.array([np.nan if v is None else float(v) for v in values])
-        return np.broadcast_to(row, (len(coefficients), len(self.slots)))
+        out = np.full((len(coefficients), len(self.slots)), np.nan)
+        for k, partial in enumerate(self.partials):
+            if partial is ZERO or self.coefficient_is_number(k):
+                out[:, k] = Kernel([partial], self._numbers)(list(coefficients.T), "numpy")[0]
+        return out
 
     def is_unmoved(self, direction: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-        patterns, which = np.unique(direction, axis=0, return_inverse=True)
-        zero = [linear(zip(p, self.partials, strict=True)) is ZERO for p in patterns.tolist()]
+        n = len(self.slots)
+        patterns, which = np.unique(np.hstack([direction, coefficients]), axis=0, return_inverse=True)
+        zero = []
+        for pattern in patterns.tolist():
+            values = dict(zip(self._numbers, map(constant, pattern[n:]), strict=True))
+            partials = [substitute(p, values) for p in self.partials] if values else self.partials
+            zero.append(linear(zip(pattern[:n], partials, strict=True)) is ZERO)
         return np.array(zero, bool)[which.ravel()]
 
-    def _evaluate(self, key: Any, graphs: Callable[[], Sequence[Node]], slots, parameters, t, backend: str) -> list:
+    def _evaluate(self, key: Any, graphs: Callable[[], Sequence[Node]], arguments: tuple[Any, ...], backend: str):
         if key not in self._kernels:
             self._kernels[key] = Kernel(graphs(), self._labels)
-        return self._kernels[key]([*slots, *parameters, t], backend)
+        slots, parameters, coefficients, t = arguments
+        arrays = [v for v in (*slots, *parameters) if isinstance(v, jax.Array)]
+        if arrays:
+            dtype = arrays[0].dtype
+            coefficients = [c if np.ndim(c) == 0 else jnp.asarray(c, dtype) for c in coefficients]
+        return self._kernels[key]([*slots, *parameters, *coefficients, t], backend)
 
     def residual(self, slots, parameters, coefficients, t, networks, backend="jax") -> Any:
-        return self._evaluate("residual", lambda: [self.graph], slots, parameters, t, backend)[0]
+        return self._evaluate("residual", lambda: [self.graph], (slots, parameters, coefficients, t), backend)[0]
 
     def partial_values(self, slots, parameters, coefficients, t, networks, backend="jax") -> tuple:
-        return tuple(self._evaluate("partials", lambda: self.partials, slots, parameters, t, backend))
+        return tuple(self._evaluate("partials", lambda: self.partials, (slots, parameters, coefficients, t), backend))
 
     def solve(self, position: int, slots, parameters, coefficients, t, networks, backend="jax") -> Any:
         def solved() -> list[Node]:
             rest = substitute(self.graph, {slot_label(self.slots[position]): constant(0)})
             return [scale(-1, divide(rest, self.partials[position]))]
 
-        return self._evaluate(("solve", position), solved, slots, parameters, t, backend)[0]
+        return self._evaluate(("solve", position), solved, (slots, parameters, coefficients, t), backend)[0]
 
 
 @functools.lru_cache(maxsize=4096)
-def template_of(graph: Node, slots: tuple[Slot, ...], n_parameters: int) -> SymbolicTemplate:
+def template_of(graph: Node, slots: tuple[Slot, ...], n_parameters: int, n_coefficients: int = 0) -> SymbolicTemplate:
     """The one template of this canonical residual."""
-    return SymbolicTemplate(graph, slots, n_parameters)
+    return SymbolicTemplate(graph, slots, n_parameters, n_coefficients)
 
 
 def canonical(

@@ -27,7 +27,7 @@ from ..linear.written_out import UNROLLED, solve, solve_dense
 from ..lowering.gather import FEW, Chunk, Gather, entries, take, times
 from ..lowering.program import PlannedEquation, PlannedLoop, PlannedSparse, PlannedStep, Program
 from ..model.evaluate_numpy import Networks
-from ..model.linear_template import scaled
+from ..model.linear_template import LinearTemplate, scaled
 
 UNROLLED_REPETITIONS = 4  # of a loop, written out in each of its iterations
 LONG_SUM = 16  # linear equations with more terms are one gather and one sum
@@ -117,7 +117,8 @@ class Evaluation:
         equation = planned.equation
         positions = [k for k, s in enumerate(equation.slots) if s.local == unknown]
         outside = [k for k in range(len(equation.slots)) if k != positions[0]]
-        if equation.template.n_coefficients > LONG_SUM and all(isinstance(planned.sources[k], Gather) for k in outside):
+        is_long = isinstance(equation.template, LinearTemplate) and len(outside) >= LONG_SUM
+        if is_long and all(isinstance(planned.sources[k], Gather) for k in outside):
             weights = -equation.coefficient[:, outside] / equation.coefficient[:, [positions[0]]]
             return _scaled(1 / planned.factors[positions[0]], self._long_sum(planned, outside, weights), self.dtype)
         local = list(local)
@@ -317,7 +318,7 @@ class Evaluation:
         template = equation.template
         inside = [k for k, s in enumerate(equation.slots) if s.local >= 0]
         arguments = self._arguments(planned, blank)
-        if template.n_coefficients:
+        if isinstance(template, LinearTemplate):
             coefficients = arguments[2]
             outside = [k for k in range(len(equation.slots)) if k not in inside]
             partials: Any = {k: self._constant(coefficients[k]) for k in inside}

@@ -1,0 +1,159 @@
+"""Numbers that are written in equations: many instances with numbers of their own share one template."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+import sympy
+
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der, simulate
+from jaxonomy_dae.modeling import Eq
+
+N = 12
+GAINS = 0.5 + 0.25 * np.arange(N)
+
+
+def compiled(kind, gains=GAINS, **more):
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    for k, gain in enumerate(gains):
+        diagram.add(kind(ev, f"c{k}", float(gain), **more))
+    return AcausalCompiler(ev, diagram)()
+
+
+def templates(system) -> int:
+    return len({group.template.key for group in system.plan.flat.groups})
+
+
+class Falling(Component):
+    """x' = −c sin x: tan(x/2) falls exponentially."""
+
+    def __init__(self, ev, name, c):
+        super().__init__(ev, name)
+        x = self.variable("x", start=1.5, fixed=True)
+        self.add_equations(Eq(der(x), -c * sympy.sin(x)))
+
+
+def test_one_template_for_many_numbers():
+    system = compiled(Falling)
+    assert templates(system) == 1
+    solution = simulate(system, 2.0, ts=jnp.array([1.0, 2.0]), rtol=1e-9, atol=1e-11)
+    for k, c in enumerate(GAINS):
+        true = 2 * np.arctan(np.tan(0.75) * np.exp(-c * np.array([1.0, 2.0])))
+        np.testing.assert_allclose(solution[f"c{k}.x"], true, rtol=1e-7)  # a hundred times the run's rtol
+
+
+def test_few_numbers_stay_in_their_templates():
+    assert templates(compiled(Falling, GAINS[:3])) == 3
+
+
+class Cubic(Component):
+    """y + c y³ + 2 z = x and z = d·sin(y) − 0.1 cos(3 y), a nonlinear block; x' = −y."""
+
+    def __init__(self, ev, name, c):
+        super().__init__(ev, name)
+        x = self.variable("x", start=1.0, fixed=True)
+        y, z = self.variable("y", start=0.5), self.variable("z")
+        d = 0.2 * c + 0.1
+        self.add_equations(
+            Eq(der(x), -y), Eq(y + c * y**3 + 2 * z, x), Eq(z, d * sympy.sin(y) - 0.1 * sympy.cos(3 * y))
+        )
+
+
+@pytest.mark.parametrize("order", ["as written", "reversed"])
+def test_nonlinear_blocks_with_numbers(order):
+    gains = GAINS if order == "as written" else GAINS[::-1]
+    system = compiled(Cubic, gains)
+    assert templates(system) == 3
+    solution = simulate(system, 1.0, ts=jnp.array([0.0, 1.0]), rtol=1e-9, atol=1e-11)
+    for k, c in enumerate(gains):
+        x, y, z = (np.asarray(solution[f"c{k}.{name}"]) for name in "xyz")
+        d = 0.2 * c + 0.1
+        # To rounding, as Newton's method leaves them.
+        np.testing.assert_allclose(y + c * y**3 + 2 * z, x, atol=1e-9)
+        np.testing.assert_allclose(z, d * np.sin(y) - 0.1 * np.cos(3 * y), atol=1e-9)
+
+        def slope(_, y, c=c, d=d):  # by y as the state: x' = −y
+            return -y / (1 + 3 * c * y**2 + 2 * (d * np.cos(y) + 0.3 * np.sin(3 * y)))
+
+        true = scipy.integrate.solve_ivp(slope, (0, 1), [y[0]], rtol=1e-11, atol=1e-12).y[0, -1]
+        np.testing.assert_allclose(y[1], true, rtol=1e-7)
+
+
+class Pendulum(Component):
+    """A pendulum whose length and mass are numbers: x² + y² = L² is differentiated twice."""
+
+    def __init__(self, ev, name, length, mass=None):
+        super().__init__(ev, name)
+        mass = 1.0 + length if mass is None else mass
+        x = self.variable("x", start=length * np.sin(0.5), fixed=True)
+        y = self.variable("y", start=-length * np.cos(0.5))
+        vx, vy = self.variable("vx", start=0.0, fixed=True), self.variable("vy", start=0.0)
+        force = self.variable("force")
+        self.add_equations(
+            Eq(der(x), vx),
+            Eq(der(y), vy),
+            Eq(mass * der(vx), -force * x / length),
+            Eq(mass * der(vy), -force * y / length - mass * 9.81),
+            Eq(x**2 + y**2, length**2),
+        )
+
+
+def test_constraints_with_numbers():
+    system = compiled(Pendulum)
+    # Two for the speeds, one of them shared by x and y; two for the forces; one for the rod.
+    assert templates(system) <= 5
+    solution = simulate(system, 1.0, ts=jnp.array([1.0]), rtol=1e-9, atol=1e-11)
+    for k, length in enumerate(GAINS):
+
+        def swing(_, state, length=length):
+            return [state[1], -9.81 / length * np.sin(state[0])]
+
+        angle = scipy.integrate.solve_ivp(swing, (0, 1), [0.5, 0.0], rtol=1e-11, atol=1e-12).y[0, -1]
+        np.testing.assert_allclose(solution[f"c{k}.x"][0], length * np.sin(angle), atol=1e-7)
+
+
+class Seesaw(Component):
+    """The derivatives of x and y cancel in a combination whose weights are numbers, so that x + y = c·sin t is hidden;
+    x' − x'... is not: x = c·sin t − y, y' = −y."""
+
+    def __init__(self, ev, name, c):
+        super().__init__(ev, name)
+        x, y = self.variable("x"), self.variable("y", start=1.0, fixed=True)
+        u = self.variable("u")
+        self.add_equations(
+            Eq(c * der(x) + c * der(y) + sympy.sin(u), u * 1.5),
+            Eq(2 * c * der(x) + 2 * c * der(y) + sympy.sin(u), u * 2.5 - (x + y - c * sympy.sin(ev.t)) * 3.0),
+            Eq(der(y), -y * sympy.sqrt(1 + c**2) / sympy.sqrt(1 + c**2)),
+        )
+
+
+def test_weights_that_are_numbers():
+    def run(c):
+        system = compiled(Seesaw, c)
+        solution = simulate(system, 1.0, ts=jnp.array([0.0, 1.0]), rtol=1e-9, atol=1e-11)
+        return np.array([[solution[f"c{k}.{v}"] for v in "xyu"] for k in range(len(c))])
+
+    # Each alone has its numbers in its own template.
+    together = run(GAINS)
+    alone = np.concatenate([run(GAINS[k : k + 1]) for k in (0, 5, 11)])
+    np.testing.assert_allclose(together[[0, 5, 11]], alone, rtol=1e-6, atol=1e-8)
+
+
+def test_single_precision():
+    with jax.enable_x64(False):
+        solution = simulate(compiled(Falling), 1.0, ts=jnp.array([1.0]))
+        assert solution["c3.x"].dtype == jnp.float32
+        true = 2 * np.arctan(np.tan(0.75) * np.exp(-GAINS[3]))
+        np.testing.assert_allclose(solution["c3.x"][0], true, rtol=1e-4)
+
+
+def test_gradients_through_them():
+    system = compiled(Falling)
+
+    def last(start):
+        return jnp.sum(simulate(system, 1.0, ts=jnp.array([1.0]), start={"c3.x": start}, rtol=1e-9)["c3.x"])
+
+    # dx/dx₀ = sin x / sin x₀
+    value, slope = jax.value_and_grad(last)(1.5)
+    np.testing.assert_allclose(slope, np.sin(value) / np.sin(1.5), rtol=1e-6)
