@@ -5,7 +5,7 @@ each instance, where many templates would be equal but for them: coordinates and
 what parameters cost.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -45,7 +45,7 @@ def lifted(rows: Sequence[Rows]) -> list[tuple[Rows, np.ndarray]]:
             continue
         columns = list(zip(*(v.numbers for v in variants.values()), strict=True))
         differ = [j for j, column in enumerate(columns) if any(c != column[0] for c in column)]
-        filled = {_label(j): constant(column[0]) for j, column in enumerate(columns)}
+        filled: dict[Hashable, Node] = {_label(j): constant(column[0]) for j, column in enumerate(columns)}
         filled |= {_label(j): leaf(number_label(k)) for k, j in enumerate(differ)}
         template = template_of(substitute(graph, filled), slots, n_parameters, len(differ))
         for numbers, members in variants.values():

@@ -1,0 +1,117 @@
+"""Small inverses, values that are computed once, and scales by bits.
+
+References: NumPy's inverse, closed forms, and sizes of compiled programs.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxonomy_dae.linear import inverse as inverses
+from jaxonomy_dae.linear.inverse import inverse
+from jaxonomy_dae.linear.once import joined, once, stacked
+from jaxonomy_dae.linear.torn import solve_torn
+from jaxonomy_dae.linear.whole import over
+from jaxonomy_dae.structure.tearing import Tearing
+
+
+@pytest.fixture(params=["cpu", "elsewhere"])
+def backend(request, monkeypatch):
+    """The program made for this backend; what is made for others runs here as well."""
+    if request.param != "cpu":
+        monkeypatch.setattr(jax, "default_backend", lambda: request.param)
+    jax.clear_caches()
+    yield request.param
+    jax.clear_caches()
+
+
+def by_entries(a):
+    m = a.shape[0]
+    rows = inverse([[a[r, c] for c in range(m)] for r in range(m)])
+    return jnp.stack([jnp.stack(row) for row in rows])
+
+
+@pytest.mark.parametrize("m", range(1, 8))
+def test_inverses(m, backend):
+    rng = np.random.default_rng(m)
+    a = rng.normal(size=(5, m, m)) * 10.0 ** rng.integers(-9, 9, (5, m, 1))
+    for k in range(m):  # pivots are where they are not looked for first
+        a[:, k, k] *= 1e-14 if m > 1 else 1
+    # Errors of elimination with pivoting are eps times the condition of the scaled matrix.
+    condition = np.linalg.cond(a / np.abs(a).max(axis=-1, keepdims=True)).max()
+    tolerance = 50 * np.finfo(float).eps * condition
+    true = np.linalg.inv(a / np.abs(a).max(axis=-1, keepdims=True)) / np.abs(a).max(axis=-1)[:, None, :]
+    size = np.abs(true).max(axis=-2, keepdims=True)  # columns of an inverse have the units of the rows
+    one = np.stack([jax.jit(by_entries)(x) for x in a])
+    mapped = jax.jit(jax.vmap(by_entries))(a)
+    as_arrays = np.moveaxis(jax.jit(by_entries)(jnp.moveaxis(jnp.asarray(a), 0, -1)), -1, 0)
+    twice = jax.jit(jax.vmap(jax.vmap(by_entries)))(a[None])[0]
+    for found in (one, mapped, as_arrays, twice):
+        np.testing.assert_allclose(found / size, true / size, atol=tolerance)
+
+
+@pytest.mark.parametrize("m", [2, 5])
+def test_singular_ones_are_not_finite(m):
+    a = np.ones((m, m))
+    assert not np.any(np.isfinite(jax.jit(by_entries)(a)))
+
+
+def test_values_computed_once(backend):
+    x, y = jnp.array([1.0, 2.0]), jnp.array([3.0, 4.0])
+    np.testing.assert_array_equal(joined([x, y, x[:1]]), [1, 2, 3, 4, 1])
+    np.testing.assert_array_equal(stacked([x, y]), [[1, 2], [3, 4]])
+    for in_batches_only in (False, True):
+
+        def both(a, b, in_batches_only=in_batches_only):
+            one, two = once([a, b], in_batches_only)
+            return one * two
+
+        assert float(jax.jit(both)(x[0], y[0])) == 3
+        np.testing.assert_array_equal(jax.jit(jax.vmap(both))(x, y), [3, 8])
+        np.testing.assert_array_equal(jax.jit(jax.vmap(both, (None, 0)))(x[1], y), [6, 8])
+
+
+def test_only_cpus_get_calls_that_stay(backend):
+    text = jax.jit(lambda a, b: once([a, b])).lower(1.0, 2.0).as_text()
+    assert ("inlineable" in text) == (backend == "cpu")
+
+
+def dense_torn(n, m):
+    """A block that is full above and left of what is zero in a torn order, and its right-hand side."""
+    rng = np.random.default_rng(n)
+    a = rng.normal(size=(n, n))
+    k = n - m
+    a[:k, :k] = np.tril(a[:k, :k]) + 4 * np.eye(k)
+    sequence = tuple((e, e) for e in range(k))
+    return Tearing(sequence, tuple(range(k, n)), tuple(range(k, n))), a, rng.normal(size=n)
+
+
+@pytest.mark.parametrize(("n", "m"), [(9, 2), (12, 4), (14, 5)])
+def test_programs_of_torn_blocks_do_not_grow_when_compiled(n, m):
+    tearing, a, b = dense_torn(n, m)
+
+    def solve(a, b):
+        matrix = {(int(e), int(u)): a[e, u] for e, u in zip(*np.nonzero(dense_torn(n, m)[1]), strict=True)}
+        return jnp.stack(solve_torn(tearing, matrix, list(b)))
+
+    lowered = jax.jit(solve).lower(a, b)
+    compiled = lowered.compile()
+    np.testing.assert_allclose(compiled(a, b), np.linalg.solve(a, b), rtol=1e-10)
+    written, made = (len(text.splitlines()) for text in (lowered.as_text(), compiled.as_text()))
+    # Each operation once, and parameters of kernels: three times. Computed where they are read, ten to thirteen times.
+    assert made < 5 * written
+
+
+def test_scales_are_powers_of_two_near_one_over():
+    for dtype in (np.float64, np.float32):
+        kind = np.finfo(dtype)
+        x = np.geomspace(kind.tiny * 8, kind.max / 8, 201).astype(dtype)
+        scale = np.asarray(over(jnp.asarray(x)))
+        assert scale.dtype == dtype
+        mantissa, _ = np.frexp(scale)
+        assert np.all(mantissa == 0.5)
+        product = scale.astype(float) * x
+        assert np.all((product >= 0.5) & (product <= 1))
+        odd = np.array([0, kind.smallest_subnormal, np.inf, np.nan], dtype)
+        np.testing.assert_array_equal(over(jnp.asarray(odd)), np.ones(4))
