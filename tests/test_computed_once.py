@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxonomy_dae.linear import inverse as inverses
 from jaxonomy_dae.linear.inverse import inverse
 from jaxonomy_dae.linear.once import joined, once, stacked
 from jaxonomy_dae.linear.torn import solve_torn
