@@ -330,6 +330,16 @@ def test_pre_is_for_actions(where):
         model(write)
 
 
+@pytest.mark.parametrize(
+    "write",
+    [lambda self, y, d: self.either(Eq(d, 1), y > 1, y), lambda self, y, d: self.complementary(y, Eq(y, 2))],
+    ids=["either", "complementary"],
+)
+def test_branches_that_are_not_expressions(write):
+    with pytest.raises(ModelError, match=r"component 'c': (either|complementary): .*y.* is not an expression"):
+        model(lambda self, ev: write(self, self.variable("y"), self.discrete("d")))
+
+
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 2 * sympy.I])
 def test_values_that_are_not_finite_numbers(value):
     def write(self, ev):

@@ -1,5 +1,7 @@
 """Numbers that are written in equations: many instances with numbers of their own share one template."""
 
+import random
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +10,7 @@ import scipy.integrate
 import sympy
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der, simulate
+from jaxonomy_dae.compiler import lift_numbers
 from jaxonomy_dae.modeling import Eq
 
 N = 12
@@ -17,7 +20,7 @@ GAINS = 0.5 + 0.25 * np.arange(N)  # c2 has 1.0, a factor that is not there
 def compiled(kind, gains=GAINS, **more):
     ev, diagram = EqnEnv(), AcausalDiagram()
     for k, gain in enumerate(gains):
-        diagram.add(kind(ev, f"c{k}", float(gain), **more))
+        diagram.add(kind(ev, f"c{k}", gain.item(), **more))
     return AcausalCompiler(ev, diagram)()
 
 
@@ -45,6 +48,36 @@ def test_one_template_for_many_numbers():
 
 def test_few_numbers_stay_in_their_templates():
     assert templates(compiled(Falling, GAINS[:3])) == 3
+
+
+class Thrown(Component):
+    """p c x' = −x³, with a parameter beside a number in the coefficient: x = 1/√(1 + 2 t/(p c)); the switch at its own
+    level of u is reported with it."""
+
+    def __init__(self, ev, name, c):
+        super().__init__(ev, name)
+        x, p = self.variable("x", start=1.0, fixed=True), self.parameter("p", 1.0 + c)
+        y = self.variable("y")
+        on = self.discrete("on", 3.0)
+        self.add_equations(Eq(p * c * der(x), -(x**3)))
+        self.either(on > c, Eq(y, x), Eq(y, c * sympy.cos(x)))
+
+
+def test_numbers_beside_parameters_and_modes():
+    system = compiled(Thrown)
+    solution = simulate(system, 1.0, ts=jnp.array([1.0]), rtol=1e-9, atol=1e-11)
+    report = str(system.report)
+    for k, c in enumerate(GAINS):
+        x = 1 / np.sqrt(1 + 2 / (c * (1 + c)))
+        np.testing.assert_allclose(solution[f"c{k}.x"][0], x, rtol=1e-7)
+        np.testing.assert_allclose(solution[f"c{k}.y"][0], x if 3 > c else c * np.cos(x), rtol=1e-7)
+        assert f"c{k}: " in report
+
+    def last(p):
+        return simulate(system.with_parameters({"c4.p": p}), 1.0, ts=jnp.array([1.0]), rtol=1e-9)["c4.x"][0]
+
+    c, p = GAINS[4], 2.0
+    np.testing.assert_allclose(jax.grad(last)(p), (1 + 2 / (c * p)) ** -1.5 / (c * p**2), rtol=1e-6)
 
 
 class Cubic(Component):
@@ -155,3 +188,78 @@ def test_gradients_through_them():
     # dx/dx₀ = sin x / sin x₀
     value, slope = jax.value_and_grad(last)(1.5)
     np.testing.assert_allclose(slope, np.sin(value) / np.sin(1.5), rtol=1e-6)
+
+
+def drawn(r, atoms, depth):
+    """A random expression as nested tuples, with places for numbers."""
+    if depth == 0 or r.random() < 0.15:
+        return r.choice([*atoms, "number"])
+    kind = r.choice(["sum", "product", "quotient", "sin", "exp", "power", "exponential", "atan2", "max", "branches"])
+    parts = {"sum": 2, "product": 2, "quotient": 2, "atan2": 2, "max": 2, "branches": 3}.get(kind, 1)
+    kind = ("power", r.choice([2, 3, -1, 0.5])) if kind == "power" else kind
+    return (kind, *(drawn(r, atoms, depth - 1) for _ in range(parts)))
+
+
+def read(tree, symbols, number):
+    if tree == "number":
+        return number()
+    if isinstance(tree, str):
+        return symbols[tree]
+    kind, a, b, c = tree[0], *(read(part, symbols, number) for part in tree[1:]), *[None] * (4 - len(tree))
+    if isinstance(kind, tuple):
+        return (1 + a**2) ** kind[1]
+    return {
+        "sum": lambda: number() * a + number() * b,
+        "product": lambda: a * b,
+        "quotient": lambda: a / (2 + number() / 10 * sympy.sin(b)),
+        "sin": lambda: sympy.sin(number() * a),
+        "exp": lambda: sympy.exp(-number() * sympy.tanh(a)),
+        "exponential": lambda: (abs(number()) + 0.1) ** sympy.tanh(a),
+        "atan2": lambda: sympy.atan2(a, 3 + sympy.cos(b)),
+        "max": lambda: sympy.Max(a, b, number()),
+        "branches": lambda: sympy.Piecewise((a, b < number()), (c, True)),
+    }[kind]()
+
+
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 12))])
+def test_random_laws(seed, monkeypatch):
+    """Laws whose numbers are taken out give what each gives with its own template: values, slopes, names."""
+    r = random.Random(seed)
+    slope, block, output = (drawn(r, ["x", "y", "p", "t"], 4) for _ in range(3))
+
+    class Law(Component):
+        def __init__(self, ev, name, seed):
+            super().__init__(ev, name)
+            q = random.Random(seed)
+
+            def number():
+                special = special_too and q.random() < 0.2
+                return q.choice([0, 1, -1, 2]) if special else q.choice([round(q.uniform(-2, 2), 1), q.uniform(-2, 2)])
+
+            x = self.variable("x", start=round(q.uniform(-1, 1), 1), fixed=True)
+            y, z, p = self.variable("y", start=0.1), self.variable("z"), self.parameter("p", q.uniform(0.5, 2))
+            symbols = {"x": x, "y": y, "t": ev.t, "p": p}
+            self.add_equations(
+                Eq(der(x), -x + sympy.tanh(read(slope, symbols, number))),
+                Eq(y + number() / 100 * sympy.sin(y), sympy.tanh(read(block, {**symbols, "y": x}, number))),
+                Eq(z, sympy.tanh(read(output, symbols, number))),
+            )
+
+    special_too = r.random() < 0.5
+    taken = compiled(Law, 1000 * seed + np.arange(N))
+    monkeypatch.setattr(lift_numbers, "MANY", 10**9)
+    each = compiled(Law, 1000 * seed + np.arange(N))
+    assert templates(taken) <= templates(each) - (10 if seed == 0 else 0)  # some fold to too many shapes
+    names = list(taken.variables)
+    assert names == list(each.variables)
+    assert taken.states == each.states
+    order = [[*taken.states, *taken.carried].index(n) for n in [*each.states, *each.carried]]
+    x = [s.initialize() for s in (taken, each)]
+    for t, away in ((0.0, 0.0), (0.7, 0.05)):
+        both = [(s, v + away) for s, v in zip((taken, each), x, strict=True)]
+        values, same = (np.asarray(s.observe(names, t, v)) for s, v in both)
+        one, other = (np.asarray(jax.jacfwd(lambda v, s=s, t=t: s.vector_field(t, v, None))(v)) for s, v in both)
+        assert np.all(np.isfinite(values))
+        # Both are computed from the same numbers in the same way, up to the order of sums.
+        np.testing.assert_allclose(values, same, rtol=1e-11, atol=1e-11)
+        np.testing.assert_allclose(one[np.ix_(order, order)], other, rtol=1e-10, atol=1e-10)

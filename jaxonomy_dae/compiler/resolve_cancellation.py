@@ -364,7 +364,8 @@ def zero_pivots(groups, signature: Incidence, offsets: Offsets, column, values) 
 
         def total(parameters, template=template, group=group, used=used, slots=slots):
             point = [np.ones(len(group))] * len(template.slots)
-            partial = template.partial_values(point, list(parameters.T), [], 0.0, None, backend="numpy")
+            given = list(parameters.T), list(group.coefficient.T)
+            partial = template.partial_values(point, *given, 0.0, None, backend="numpy")
             return sum(used[:, k] * group.factor[:, k] * partial[k] for k in slots.tolist())
 
         coefficient = total(here)

@@ -32,14 +32,14 @@ class ModeDeclarations(EventDeclarations):
         **Arguments:**
 
         - `mode`: a relation in discrete variables, or one of them, which is true if it is not zero.
-        - `then`, `otherwise`: expressions.
+        - `then`, `otherwise`: expressions that are zero, or SymPy `Eq`s.
         - `order`: how many times `then` must be differentiated to determine what `otherwise` does. 0: both determine
             an algebraic variable, or a derivative. 1: `then` is in voltages of capacitors, or in speeds (a dog clutch,
             with its torque in `otherwise`). 2: it is in positions (a string, with its tension in `otherwise`).
 
         **Raises:**
 
-        - `ModelError` for a mode that is not discrete, and an order that is none of these.
+        - `ModelError` for a mode that is not discrete, a branch that is neither, and an order that is none of these.
         """
         self._either(relation_in_discretes(mode, f"component '{self.name}': either"), then, otherwise, order, None)
 
@@ -74,7 +74,7 @@ class ModeDeclarations(EventDeclarations):
 
         - `ModelError` for a restitution without `order=2`, and what is not an expression.
         """
-        gap, force = sympy.sympify(gap), sympy.sympify(force)
+        gap, force = (_expression(e, f"component '{self.name}': complementary:") for e in (gap, force))
         if restitution is not None and order != HIGHEST:
             raise ModelError(
                 f"component '{self.name}': complementary: a restitution is for gaps between positions, order=2; got "
@@ -154,7 +154,10 @@ class ModeDeclarations(EventDeclarations):
         where = f"component '{self.name}': either"
         if isinstance(order, bool) or order not in range(HIGHEST + 1):
             raise ModelError(f"{where}: order says how many times a branch is differentiated, 0, 1 or 2; got {order!r}")
-        then, otherwise = sympy.sympify(then), sympy.sympify(otherwise)
+        then, otherwise = (
+            _expression(b.lhs - b.rhs if isinstance(b, sympy.Eq) else b, f"{where}: the branch")
+            for b in (then, otherwise)
+        )
         if not order:
             self.add_equations(sympy.Piecewise((then, condition), (otherwise, True)))
             return None
@@ -178,3 +181,10 @@ class ModeDeclarations(EventDeclarations):
             )
         )
         return impulse
+
+
+def _expression(value: Any, where: str) -> Any:
+    found = sympy.sympify(value)
+    if not isinstance(found, sympy.Expr):
+        raise ModelError(f"{where} {value} is not an expression")
+    return found

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..model.symbolic import SymbolicTemplate, parameter_label
+from ..model.symbolic import SymbolicTemplate, number_label, parameter_label
 from ..model.tables import EventTable, FlatModel, Start
 
 
@@ -37,7 +37,7 @@ def mode_equations(flat: FlatModel) -> list[str]:
             continue
         labels = [parameter_label(k) for k in range(group.template.n_parameters)]
         condition = group.template.graph.arguments[0]
-        if condition.leaves <= set(labels):
+        if condition.leaves <= {*labels, *map(number_label, range(group.template.n_coefficients))}:
             read = [k for k, label in enumerate(labels) if label in condition.leaves]
             rows = np.flatnonzero(np.isin(group.parameter[:, read], discrete).any(axis=1))
             out += [str(group.provenance[row]) for row in rows.tolist()]
