@@ -11,11 +11,16 @@ from .symbols import PreviousSymbol, VariableSymbol
 
 
 @functools.lru_cache(maxsize=4096)
+def zero_of(equation: Any) -> Any:
+    """What is zero, of an equation or an expression."""
+    if isinstance(equation, sympy.Eq):
+        return equation.lhs - equation.rhs  # pyright: ignore[reportOperatorIssue]
+    return sympy.sympify(equation)
+
+
 def residual_of(equation: Any) -> sympy.Expr:
     """What must be zero for an equation to hold."""
-    if isinstance(equation, sympy.Eq):
-        residual = equation.lhs - equation.rhs  # pyright: ignore[reportOperatorIssue]
-    elif isinstance(equation, bool | sympy.logic.boolalg.BooleanAtom):
+    if isinstance(equation, bool | sympy.logic.boolalg.BooleanAtom):
         raise ModelError(
             "an equation is always True and says nothing (`a == b` compares symbols; write `Eq(a, b)`)"
             if equation
@@ -23,7 +28,7 @@ def residual_of(equation: Any) -> sympy.Expr:
             "(`a == b` compares symbols; write `Eq(a, b)`)"
         )
     else:
-        residual = sympy.sympify(equation)
+        residual = zero_of(equation)
     if not isinstance(residual, sympy.Expr):
         raise ModelError(f"{equation!r} is not an equation")
     atoms = atoms_of(residual)

@@ -6,6 +6,7 @@ import sympy
 from sympy.logic.boolalg import BooleanAtom
 
 from ..errors import ModelError
+from .equations import zero_of
 from .event_declarations import EventDeclarations
 from .events import LIVE, Assign, Held, Sampled, relation_in_discretes
 from .symbols import DiscreteSymbol, RelationSymbol, der
@@ -154,10 +155,7 @@ class ModeDeclarations(EventDeclarations):
         where = f"component '{self.name}': either"
         if isinstance(order, bool) or order not in range(HIGHEST + 1):
             raise ModelError(f"{where}: order says how many times a branch is differentiated, 0, 1 or 2; got {order!r}")
-        then, otherwise = (
-            _expression(b.lhs - b.rhs if isinstance(b, sympy.Eq) else b, f"{where}: the branch")
-            for b in (then, otherwise)
-        )
+        then, otherwise = (_expression(zero_of(b), f"{where}: the branch") for b in (then, otherwise))
         if not order:
             self.add_equations(sympy.Piecewise((then, condition), (otherwise, True)))
             return None
