@@ -10,7 +10,6 @@ from ..expressions.from_sympy import atoms_of
 from .symbols import PreviousSymbol, VariableSymbol
 
 
-@functools.lru_cache(maxsize=4096)
 def zero_of(equation: Any) -> Any:
     """What is zero, of an equation or an expression."""
     if isinstance(equation, sympy.Eq):
@@ -18,6 +17,7 @@ def zero_of(equation: Any) -> Any:
     return sympy.sympify(equation)
 
 
+@functools.lru_cache(maxsize=4096)
 def residual_of(equation: Any) -> sympy.Expr:
     """What must be zero for an equation to hold."""
     if isinstance(equation, bool | sympy.logic.boolalg.BooleanAtom):
@@ -27,8 +27,7 @@ def residual_of(equation: Any) -> sympy.Expr:
             else "an equation is always False: its sides can never be equal, or one of them is nan or not real "
             "(`a == b` compares symbols; write `Eq(a, b)`)"
         )
-    else:
-        residual = zero_of(equation)
+    residual = zero_of(equation)
     if not isinstance(residual, sympy.Expr):
         raise ModelError(f"{equation!r} is not an equation")
     atoms = atoms_of(residual)
