@@ -14,6 +14,7 @@ from ..expressions.node import Node, Number, constant, leaf, linear, multiply, n
 from ..expressions.substitute import rebuilt, substitute
 from ..model.provenance import Provenances
 from ..model.symbolic import SymbolicTemplate, number_label, template_of
+from ..model.template import AbstractTemplate
 
 MANY = 8  # templates of one shape, from which on their numbers are taken out
 KEPT = (-1, 0, 1)  # numbers that belong to a shape
@@ -21,25 +22,27 @@ _ANY = leaf(("number", "any"))
 
 
 class Rows(NamedTuple):
-    """Equations of one template: arrays of shape (n, slots), (n, slots), (n, parameters)."""
+    """Equations of one template: arrays of shape (n, slots), (n, slots), (n, parameters), (n, coefficients)."""
 
-    template: SymbolicTemplate
+    template: AbstractTemplate
     variable: np.ndarray
     order: np.ndarray
     parameter: np.ndarray
+    coefficient: np.ndarray
     provenance: Provenances
 
 
-def lifted(rows: Sequence[Rows]) -> list[tuple[Rows, np.ndarray]]:
-    """The same, each with its coefficients, shape (n, coefficients)."""
-    out = [(r, np.zeros((len(r.provenance), 0))) for r in rows]
-    if len({r.template.key for r in rows}) <= MANY:
+def lifted(rows: Sequence[Rows]) -> list[Rows]:
+    """The same, in order."""
+    out = list(rows)
+    symbolic = [(k, r.template) for k, r in enumerate(rows) if isinstance(r.template, SymbolicTemplate)]
+    if len({template.key for _, template in symbolic}) <= MANY:
         return out
     shapes: dict[tuple[Any, ...], dict[str, _Variant]] = {}
-    for k, r in enumerate(rows):
-        graph, numbers = _shape(r.template.graph)
-        variants = shapes.setdefault((graph, r.template.slots, r.template.n_parameters), {})
-        variants.setdefault(r.template.key, _Variant(numbers, [])).members.append(k)
+    for k, template in symbolic:
+        graph, numbers = _shape(template.graph)
+        variants = shapes.setdefault((graph, template.slots, template.n_parameters), {})
+        variants.setdefault(template.key, _Variant(numbers, [])).members.append(k)
     for (graph, slots, n_parameters), variants in shapes.items():
         if len(variants) <= MANY:
             continue
@@ -51,7 +54,7 @@ def lifted(rows: Sequence[Rows]) -> list[tuple[Rows, np.ndarray]]:
         for numbers, members in variants.values():
             for k in members:
                 coefficients = np.tile([float(numbers[j]) for j in differ], (len(rows[k].provenance), 1))
-                out[k] = rows[k]._replace(template=template), coefficients
+                out[k] = rows[k]._replace(template=template, coefficient=coefficients)
     return out
 
 

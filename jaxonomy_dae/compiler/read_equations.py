@@ -11,6 +11,7 @@ from ..expressions.to_sympy import shortened
 from ..model.linear_template import LinearTemplate
 from ..model.provenance import Provenances, Written
 from ..model.symbolic import canonical, linear_coefficients
+from ..model.template import AbstractTemplate
 from ..modeling.symbols import ParameterSymbol, PreviousSymbol, TimeSymbol, VariableSymbol, symbol_label
 from .group_builder import GroupBuilder
 from .lift_numbers import Rows, lifted
@@ -28,7 +29,7 @@ def add_components(model: ModelNumbers, builder: GroupBuilder):
                     read_once[id(residual)] = read_expression(residual, model.path(i))
             graphs = tuple(read_once[id(r)] for r in c.equations)
             by_shape.setdefault((graphs, tuple(c.variables), tuple(c.parameters)), []).append(i)
-    nonlinear: list[Rows] = []
+    rows: list[Rows] = []
     for (graphs, _, _), parts in by_shape.items():
         members = Members(model, parts)
         number = members.number
@@ -42,13 +43,15 @@ def add_components(model: ModelNumbers, builder: GroupBuilder):
             order = np.tile([v.order for v in variables], (len(number), 1))
             provenance = Provenances.made(Written(f"0 = {shortened(residual)}", model.paths), number, True)
             if coefficients is None:
-                nonlinear.append(Rows(canonical(graph, variables, parameters), ids, order, parameter_ids, provenance))
+                template: AbstractTemplate = canonical(graph, variables, parameters)
+                numbers = np.zeros((len(number), 0))
             else:
-                rows = np.tile(coefficients, (len(number), 1))
-                none = np.zeros((len(number), 0))
-                builder.add(LinearTemplate(len(variables)), ids, order, none, rows, provenance)
-    for (template, ids, order, parameter_ids, provenance), rows in lifted(nonlinear):
-        builder.add(template, ids, order, parameter_ids, rows, provenance)
+                template = LinearTemplate(len(variables))
+                numbers = np.tile(coefficients, (len(number), 1))
+                parameter_ids = np.zeros((len(number), 0))
+            rows.append(Rows(template, ids, order, parameter_ids, numbers, provenance))
+    for row in lifted(rows):
+        builder.add(*row)
 
 
 def slots_of(

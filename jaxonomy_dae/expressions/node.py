@@ -78,6 +78,8 @@ def leaf(label: Hashable) -> Node:
 
 
 def constant(value: Number) -> Node:
+    if value == 0:
+        value = 0  # what cancels in floats is the same zero
     if isinstance(value, Fraction) and value.denominator == 1:
         value = value.numerator
     return make("constant", (), value)

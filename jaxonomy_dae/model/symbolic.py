@@ -99,10 +99,11 @@ class SymbolicTemplate(AbstractTemplate):
         n = len(self.slots)
         patterns, which = np.unique(np.hstack([direction, coefficients]), axis=0, return_inverse=True)
         zero = []
-        for pattern in patterns.tolist():
-            values = dict(zip(self._numbers, map(constant, pattern[n:]), strict=True))
+        for pattern in patterns:
+            values = dict(zip(self._numbers, map(constant, pattern[n:].tolist()), strict=True))
             partials = [substitute(p, values) for p in self.partials] if values else self.partials
-            zero.append(linear(zip(pattern[:n], partials, strict=True)) is ZERO)
+            along = pattern[:n].astype(direction.dtype).tolist()
+            zero.append(linear(zip(along, partials, strict=True)) is ZERO)
         return np.array(zero, bool)[which.ravel()]
 
     def _evaluate(self, key: Any, graphs: Callable[[], Sequence[Node]], arguments: tuple[Any, ...], backend: str):
