@@ -93,7 +93,7 @@ class Cubic(Component):
         )
 
 
-@pytest.mark.parametrize("order", ["as written", "reversed"])
+@pytest.mark.parametrize("order", ["as written", pytest.param("reversed", marks=pytest.mark.slow)])
 def test_nonlinear_blocks_with_numbers(order):
     gains = GAINS if order == "as written" else GAINS[::-1]
     system = compiled(Cubic, gains)
