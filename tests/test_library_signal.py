@@ -15,7 +15,7 @@ from problems import compiled
 from scipy.linalg import expm
 
 import jaxonomy_dae.library.signal as sig
-from jaxonomy_dae import EqnEnv, ModelError, simulate
+from jaxonomy_dae import EqnEnv, InitializationError, ModelError, simulate
 
 ROUNDING = 1e-12  # of blocks without memory
 X, VALUES = np.array([0.0, 1.0, 1.5, 3.0]), np.array([1.0, -1.0, 2.0, 0.5])
@@ -60,6 +60,46 @@ def test_blocks_without_memory():
         found = observe({k: jnp.asarray(v) for k, v in inputs.items()})
         for name, value, true in zip(names, np.asarray(found), expected, strict=True):
             measured(name, value, true, ROUNDING * (1.0 + abs(true)), scale=abs(true) or 1.0)
+
+
+def loop(k, law=None):
+    """y = k·(u − law(y)), without memory."""
+    ev = EqnEnv()
+    u, gain, error = sig.Constant(ev, "u", 3.0), sig.Gain(ev, "gain", k), sig.Sum(ev, "error", (1.0, -1.0))
+    back = sig.Gain(ev, "back", 1.0) if law is None else law(ev, "back")
+    pairs = [(u.y, error.u1), (back.y, error.u2), (error.y, gain.u), (gain.y, back.u)]
+    return compiled(u, gain, error, back, connect=pairs)
+
+
+def test_loops_without_memory_are_solved():
+    linear = loop(4.0)
+    for k in (4.0, -7.0, 1e6):
+        system = linear.with_parameters({"gain.k": k})
+        np.testing.assert_allclose(system.observe("gain.y", 0.0, system.initialize()), 3 * k / (1 + k), rtol=ROUNDING)
+
+    def loudness(k):
+        system = linear.with_parameters({"gain.k": k})
+        return system.observe("gain.y", 0.0, system.initialize())
+
+    np.testing.assert_allclose(jax.grad(loudness)(4.0), 3 / 25, rtol=ROUNDING)
+    limited = loop(4.0, lambda ev, name: sig.Saturation(ev, name, -0.5, 0.75))
+    # 4·(3 − 0.75), beyond the limit
+    np.testing.assert_allclose(limited.observe("gain.y", 0.0, limited.initialize()), 9.0, rtol=ROUNDING)
+    curved = loop(0.5, lambda ev, name: sig.Table1D(ev, name, [-9.0, 0.0, 9.0], [-81.0, 0.0, 81.0]))
+    np.testing.assert_allclose(curved.observe("gain.y", 0.0, curved.initialize()), 1.5 / 5.5, rtol=ROUNDING)
+
+
+def test_a_loop_without_a_solution_is_named():
+    with pytest.raises(InitializationError, match=r"gain"):
+        system = loop(4.0).with_parameters({"gain.k": -1.0})
+        system.initialize()
+
+
+def test_an_input_that_nothing_drives_is_named():
+    ev = EqnEnv()
+    system = compiled(sig.Gain(ev, "gain", 2.0))
+    with pytest.raises(ModelError, match=r"gain\.u"):
+        simulate(system, 1.0)
 
 
 W = 2.0  # rad/s of the input sin(W·t)
