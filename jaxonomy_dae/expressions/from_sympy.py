@@ -26,6 +26,7 @@ from .node import (
     power,
     select,
 )
+from .without_overflow import logarithm, logarithm_of_one_plus, product, raised
 
 
 class UnsupportedExpression(Exception):
@@ -147,7 +148,7 @@ def _piecewise(*parts: Node) -> Node:
 
 
 def _log(u: Node, base: Node | None = None) -> Node:
-    return apply("log", u) if base is None else divide(apply("log", u), apply("log", base))
+    return logarithm(u) if base is None else divide(logarithm(u), apply("log", base))
 
 
 def _factorial(u: Node) -> Node:
@@ -210,15 +211,15 @@ _NAMED = {
     sympy.atan2: "atan2",
     sympy.Mod: "mod",
     cfunctions.expm1: "expm1",
-    cfunctions.log1p: "log1p",
     cfunctions.hypot: "hypot",
 }
 
 _WRITTEN: dict[Any, Callable[..., Node]] = {
     sympy.Add: add,
-    sympy.Mul: multiply,
-    sympy.Pow: power,
+    sympy.Mul: product,
+    sympy.Pow: raised,
     sympy.log: _log,
+    cfunctions.log1p: logarithm_of_one_plus,
     sympy.Max: _folded("max"),
     sympy.Min: _folded("min"),
     sympy.Piecewise: _piecewise,
@@ -236,7 +237,7 @@ _WRITTEN: dict[Any, Callable[..., Node]] = {
     sympy.sec: _reciprocal("cos"),
     sympy.csc: _reciprocal("sin"),
     sympy.coth: _reciprocal("tanh"),
-    sympy.sech: _reciprocal("cosh"),
+    sympy.sech: lambda u: apply("sech", u),
     sympy.csch: _reciprocal("sinh"),
     sympy.acot: _of_reciprocal("atan"),
     sympy.asec: _of_reciprocal("acos"),

@@ -117,6 +117,25 @@ def _hypot(xp):
     return function
 
 
+def _logistic(xp):
+    """1/(1 + exp(−x)), with all derivatives finite and digits kept on both sides."""
+
+    def function(x):
+        positive = x > 0
+        small = xp.exp(xp.where(positive, -x, x))
+        return xp.where(positive, 1.0, small) / (1 + small)
+
+    return function
+
+
+def _sech(xp):
+    def function(x):
+        negative = xp.where(x > 0, -x, x)
+        return 2 * xp.exp(negative) / (1 + xp.exp(2 * negative))
+
+    return function
+
+
 _rows = [
     _unary("exp", np.exp, jnp.exp, lambda u: apply("exp", u), sympy.exp, 0.0),
     _unary("expm1", np.expm1, jnp.expm1, lambda u: apply("exp", u), cfunctions.expm1, 0.0),
@@ -131,6 +150,27 @@ _rows = [
     _unary("sinh", np.sinh, jnp.sinh, lambda u: apply("cosh", u), sympy.sinh, 0.0),
     _unary("cosh", np.cosh, jnp.cosh, lambda u: apply("sinh", u), sympy.cosh, 0.0),
     _unary("tanh", np.tanh, jnp.tanh, lambda u: _one_plus(-1, apply("tanh", u)), sympy.tanh),
+    _unary(
+        "logistic",
+        _logistic(np),
+        _logistic(jnp),
+        lambda u: multiply(apply("logistic", u), apply("logistic", scale(-1, u))),
+        lambda u: 1 / (1 + sympy.exp(-u)),
+    ),
+    _unary(
+        "softplus",
+        lambda x: np.logaddexp(x, 0.0),
+        lambda x: jnp.logaddexp(x, 0.0),
+        lambda u: apply("logistic", u),
+        lambda u: sympy.log(1 + sympy.exp(u)),
+    ),
+    _unary(
+        "sech",
+        _sech(np),
+        _sech(jnp),
+        lambda u: scale(-1, multiply(apply("tanh", u), apply("sech", u))),
+        sympy.sech,
+    ),
     _unary("asinh", np.arcsinh, jnp.arcsinh, lambda u: power(_one_plus(1, u), -HALF), sympy.asinh),
     _unary("acosh", np.arccosh, jnp.arccosh, lambda u: power(linear([(1, _squared(u))], -1), -HALF), sympy.acosh, 2.0),
     _unary("atanh", np.arctanh, jnp.arctanh, lambda u: power(_one_plus(-1, u), -1), sympy.atanh, 0.0),
