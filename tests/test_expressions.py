@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import mpmath as mp
 import numpy as np
 import sympy
 from test_functions import compiled
@@ -111,6 +112,45 @@ def test_a_shared_part_outside_branches_is_not_changed():
     kernel = Kernel([graph(sympy.Piecewise((sympy.sqrt(X), X > 1), (X, True)) + sympy.sqrt(X))], ["x"])
     assert float(kernel([jnp.array(0.25)])[0]) == 0.75
     assert np.isnan(kernel([np.array(-0.25)], "numpy")[0])
+
+
+EXP = sympy.exp
+FINITE_EVERYWHERE = {
+    "logistic": 1 / (1 + EXP(X)),
+    "scaled and shifted": 3 / (2 + 5 * EXP(2 - X / 3)),
+    "exp over 1 + exp": EXP(X) / (1 + EXP(X)),
+    "other factors": EXP(X) / (2 + 5 * EXP(X)),
+    "slope of the logistic": EXP(-2 * X) / (1 + EXP(-2 * X)) ** 2,
+    "softplus": sympy.log(1 + EXP(X)),
+    "softplus, base 2": sympy.log(3 + 2 * EXP(-X), 2),
+    "log of cosh, written out": sympy.log(EXP(X) + EXP(-X)),
+    "log of a sum": sympy.log(2 * EXP(X) + EXP(3 * X)),
+    "reciprocal of cosh": 1 / sympy.cosh(X),
+    "its square": sympy.cosh(2 * X) ** -2,
+    "sech": sympy.sech(X),
+    "reciprocal root": (1 + EXP(X)) ** sympy.Rational(-1, 2),
+    "reciprocal root of cosh": sympy.cosh(X) ** sympy.Rational(-3, 2),
+}
+
+
+def test_what_is_finite_though_its_parts_overflow():
+    """Value, slope and curvature where exp(x) is beyond the largest number, by symbols, forward and in reverse."""
+    nodes = [graph(expression) for expression in FINITE_EVERYWHERE.values()]
+    slopes = [partial_derivative(node, "x") for node in nodes]
+    kernel = Kernel([*nodes, *slopes, *(partial_derivative(slope, "x") for slope in slopes)], ["x"])
+    value = Kernel(nodes, ["x"])
+    values = lambda x: jnp.stack(value([x]))  # noqa: E731
+    forward = jax.jit(lambda x: jnp.stack([values(x), jax.jacfwd(values)(x), jax.jacfwd(jax.jacfwd(values))(x)]))
+    reverse = jax.jit(lambda x: jnp.stack([values(x), jax.jacrev(values)(x), jax.jacrev(jax.jacrev(values))(x)]))
+    true = [sympy.lambdify(X, [f.diff(X, k) for f in FINITE_EVERYWHERE.values()], "mpmath") for k in range(3)]
+    for x in (-900.0, -40.0, -1.3, 0.0, 0.7, 35.0, 200.0, 900.0):
+        with mp.workdps(900):
+            expected = np.array([[float(v) for v in f(mp.mpf(x))] for f in true])
+        written = np.reshape(kernel([np.array(x)], "numpy"), expected.shape)
+        for found in (written, forward(jnp.array(x)), reverse(jnp.array(x))):
+            # atol: JAX's derivatives of the logistic function are differences of numbers of size 1
+            np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-15)
+        assert np.isfinite(reverse(jnp.array(x, jnp.float32))).all()
 
 
 def test_numpy_and_jax_agree():

@@ -1,14 +1,14 @@
 """Forms whose parts overflow though they are finite.
 
 1/(1 + eˣ) is finite for all x, yet eˣ is not, and its derivative becomes 0·∞ far from the step; log(1 + eˣ) becomes
-infinite. Reciprocals, products and logarithms that are of such forms are read as functions that are finite with all their
+infinite. Powers, products and logarithms of such forms are read as functions that are finite with all their
 derivatives: the logistic function, its integral, and the hyperbolic secant.
 """
 
 from fractions import Fraction
 from typing import NamedTuple
 
-from .functions import apply
+from .functions import HALF, apply
 from .node import Node, Number, constant, linear, multiply, number, power, scale, split
 
 
@@ -22,14 +22,23 @@ class _OnePlusExp(NamedTuple):
 def raised(base: Node, exponent: Node) -> Node:
     """base^exponent."""
     e = number(exponent)
-    if e is None or not e < 0:
+    if e is None or (e > 0 and e == int(e)):
         return power(base, exponent)
     seen = _one_plus_exp(base)
     if seen is not None:
-        return multiply(power(constant(seen.factor), e), power(apply("logistic", scale(-1, seen.exponent)), -e))
+        if e == int(e):
+            overflows_nowhere = power(apply("logistic", scale(-1, seen.exponent)), -e)
+        else:
+            overflows_nowhere = apply("exp", scale(e, apply("softplus", seen.exponent)))
+        return multiply(power(constant(seen.factor), e), overflows_nowhere)
     c, rest = split(base)
     if rest.operation == "cosh" and c > 0:
-        return multiply(power(constant(c), e), power(apply("sech", *rest.arguments), -e))
+        (u,) = rest.arguments
+        if e == int(e):
+            return multiply(power(constant(c), e), power(apply("sech", u), -e))
+        # log(2·cosh u) = softplus(2·u) − u
+        logarithm_of_twice = linear([(1, apply("softplus", scale(2, u))), (-1, u)])
+        return multiply(power(scale(HALF, constant(c)), e), apply("exp", scale(e, logarithm_of_twice)))
     return power(base, e)
 
 
