@@ -213,3 +213,28 @@ def test_a_block_that_becomes_singular_is_named():
         r"The block of 2 equations that is to determine 'm\.[xy]', 'm\.[xy]' is (nearly )?singular .*there", message
     )
     assert "m: 0 = w*y + x - 2" in message and "'m.w' = 1" in message
+
+
+class Row(Component):
+    """Cells in a row: 0 = D (z[i−1] − 2 z[i] + z[i+1]) − z[i]³ + (1 + i/10) u, and u' = −u."""
+
+    def __init__(self, ev, n, diffusion):
+        super().__init__(ev, "c")
+        d, k = self.parameter("D", diffusion), self.parameter("k", 1.0)
+        u = self.variable("u", start=1.0, fixed=True)
+        z = [self.variable(f"z{i}", start=0.9) for i in range(n)]
+        self.add_equations(der(u) + u)
+        for i in range(n):
+            left, right = z[max(i - 1, 0)], z[min(i + 1, n - 1)]
+            self.add_equations(d * (left - 2 * z[i] + right) - k * z[i] ** 3 + u * (1 + 0.1 * i))
+
+
+@pytest.mark.parametrize("n, diffusion", [(3, 1.0), (10, 0.01), pytest.param(20, 1.0, marks=pytest.mark.slow)])
+def test_a_row_of_cells(n, diffusion):
+    system = compiled(Row(EqnEnv(), n, diffusion))
+    solution = simulate(system, 1.0, ts=[0.0, 1.0], rtol=1e-9, atol=1e-12)
+    u, z = np.asarray(solution["c.u"]), np.stack([solution[f"c.z{i}"] for i in range(n)])
+    np.testing.assert_allclose(u, np.exp([0.0, -1.0]), rtol=1e-8)
+    padded = np.concatenate([z[:1], z, z[-1:]])
+    residual = diffusion * (padded[:-2] - 2 * z + padded[2:]) - z**3 + u * (1 + 0.1 * np.arange(n)[:, None])
+    np.testing.assert_allclose(residual, 0.0, atol=1e-12)  # blocks are solved to rounding, of terms of size 1

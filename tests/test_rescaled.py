@@ -6,8 +6,10 @@ the same with its random models and with published problems, and `pytest --units
 
 import contextlib
 import itertools
+import random
 
 import pytest
+import sympy
 import test_determinism
 import test_index_reduction
 import test_jacobian
@@ -140,3 +142,50 @@ def test_starts_that_count(family, seed):
     that fulfil everything else were found."""
     make = {"circuits": circuits.make, "mechanisms": mechanisms.make}[family]
     assert starts_that_count(in_other_units(make(seed), seed, "all")) == starts_that_count(make(seed))
+
+
+LAWS = (
+    lambda z, k: k * z**3,
+    lambda z, k: k * sympy.exp(z),
+    lambda z, k: k * sympy.sin(z),
+    lambda z, k: k * z * sympy.Abs(z),
+    lambda z, k: k * sympy.sqrt(1 + z**2),
+    lambda z, k: k * z**5 - z,
+)
+
+
+class Cells(Component):
+    """A random network of cells, 0 = Σ D (z_j − z_i) − law(z_i) + (1 + i/10) u, while u' = −u for each u: whatever
+    these are, they determine the cells."""
+
+    def __init__(self, ev, seed):
+        super().__init__(ev, "c")
+        rng = random.Random(seed)
+        n = rng.randint(2, 9)
+        conductance, factor = self.parameter("D", 2.0), self.parameter("k", 3.0)
+        if seed % 3 == 0:
+            conductance, factor = 2.0, 3.0
+        us = [self.variable(f"u{j}", start=1.0, fixed=True) for j in range(rng.randint(1, 3))]
+        z = [self.variable(f"z{i}", start=rng.choice([None, 0.9, 1.0, 2.5])) for i in range(n)]
+        flow = [-rng.choice(LAWS)(z[0], factor), *(0 for _ in z[1:])]
+        for i in range(1, n):
+            other = rng.randrange(i)
+            flow[i] += conductance * (z[other] - z[i])
+            flow[other] += conductance * (z[i] - z[other])
+            if rng.random() < 0.6:
+                flow[i] -= rng.choice(LAWS)(z[i], factor)
+        self.add_equations(*(der(u) + u for u in us))
+        self.add_equations(*(f + (1 + 0.1 * i) * rng.choice(us) for i, f in enumerate(flow)))
+
+
+@pytest.mark.parametrize("seed", [*range(8), *(pytest.param(k, marks=pytest.mark.slow) for k in range(8, 30))])
+def test_reactions_beside_diffusion(seed):
+    """Sizes at which questions of rank are asked made reactions vanish: the cells then determined u, and its start was
+    taken for a contradiction."""
+    with watched() as seen:
+        compiled(Cells(EqnEnv(), seed))
+    compiler, system = seen[-1]
+    pairs = [compare_verdicts(compiler, system, kind, seed) for kind in KINDS]
+    for each in (system, *(pair.new for pair in pairs if pair is not None)):
+        rows = initial_rows(each.plan, ())
+        assert all(rows.independent) and not rows.n_soft, [row.name for row in rows.kept]

@@ -186,7 +186,7 @@ class _Jacobian:
             groups.append(
                 ExtendedGroup(group.template, own, own, 0, quantity, group.factor, group.parameter, group.coefficient)
             )
-        size, _ = natural_sizes(groups, len(order), np.ones(len(number)), self.values)
+        size, _ = natural_sizes(groups, len(order), np.ones(len(number)), self.values, by_terms=True)
         return groups, order, np.array(list(number), np.int64).reshape(-1, 2), np.abs(size)
 
     def natural(self, equations: np.ndarray) -> dict[Hashable, float]:

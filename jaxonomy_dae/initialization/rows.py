@@ -170,7 +170,8 @@ def _generic(plan: SystemPlan, solve_for: tuple[int, ...]) -> _Generic:
     n_parameters = len(plan.flat.parameters)
     parameter_size = np.ones(n_parameters)
     if n <= DENSE_LIMIT:  # parameters, as generic numbers, would make some equations stiff beside others
-        size, parameter_size = natural_sizes(extended.groups, extended.n_equations, size, np.zeros(n_parameters))
+        none = np.zeros(n_parameters)
+        size, parameter_size = natural_sizes(extended.groups, extended.n_equations, size, none, by_terms=True)
     jacobian, point, values = generic_jacobian(extended, size, parameter_size)
     jacobian = jacobian[:, :n]
     if solve_for:

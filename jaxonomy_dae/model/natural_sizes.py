@@ -1,14 +1,14 @@
 """Sizes of quantities and parameters at which all terms of all equations are alike, whatever the units."""
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg
 from jaxtyping import Float
 
-from .evaluate_numpy import Networks, generic, group_values
+from .evaluate_numpy import Networks, generic, group_values, slot_values
 from .extended import ExtendedGroup
 from .tables import ZERO
 
@@ -17,6 +17,26 @@ STEP = 1e-3  # of the logarithm of an argument
 FARTHEST = 100.0  # decades from one that a size may be looked for
 STEEPEST = 8.0  # power that an entry is taken for
 DAMPING = 1e-3  # keeps sizes that nothing tells where they are
+RELUCTANCE = 0.1  # weight of a decade by which a size has moved, beside one by which a term is off
+
+
+class _Seen(NamedTuple):
+    """log₁₀ of what equations have at a generic point: entries of the Jacobian, constants or terms; the equation of
+    each; and their powers in quantities and in parameters, each as (place, argument, power)."""
+
+    logarithm: np.ndarray
+    equation: np.ndarray
+    by_quantity: tuple[np.ndarray, np.ndarray, np.ndarray]
+    by_parameter: tuple[np.ndarray, np.ndarray, np.ndarray]
+
+    def powers(self, n_quantities: int, n_parameters: int, n_equations: int) -> Any:
+        """The powers in quantities, parameters and units of equations, a sparse matrix."""
+        k = np.arange(len(self.equation))
+        first = n_quantities + n_parameters
+        rows = np.concatenate([self.by_quantity[0], self.by_parameter[0], k])
+        columns = np.concatenate([self.by_quantity[1], n_quantities + self.by_parameter[1], first + self.equation])
+        powers = np.concatenate([self.by_quantity[2], self.by_parameter[2], np.ones(len(k))])
+        return sp.csr_array((powers, (rows, columns)), shape=(len(k), first + n_equations))
 
 
 def natural_sizes(
@@ -24,6 +44,7 @@ def natural_sizes(
     n_equations: int,
     size: Float[np.ndarray, " n"],
     parameters: Float[np.ndarray, " p"],
+    by_terms: bool = False,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " p"]]:
     """Sizes s with |∂F_e/∂x_q|·s_q near 1 in units of each equation, in the least-squares sense of logarithms (Curtis &
     Reid 1972, where the entries depend on the sizes as well). What an equation has without quantities, such as the
@@ -33,28 +54,28 @@ def natural_sizes(
 
     - `size`: of every quantity, with signs, from which the search begins: those other than ±1 are declared and stay.
     - `parameters`: values that stay; zero for those whose size is looked for, too.
+    - `by_terms`: terms count as well as entries, which do not see that one of their terms is lost beside others; and
+        sizes move only for what it gains.
     """
-    n_parameters = len(parameters)
-    known = np.append(np.abs(size) != 1.0, parameters != 0.0)
+    n, n_parameters = len(size), len(parameters)
+    known = np.concatenate([np.abs(size) != 1.0, parameters != 0.0, np.zeros(n_equations, bool)])
     quantity, parameter = size.copy(), np.where(parameters == 0.0, 1.0, parameters)
-    constant = _constants(groups, parameters)
+    begun = np.log10(np.abs(np.append(quantity, parameter)))
+    constants = _constants(groups, parameters)
     for _ in range(ROUNDS):
-        table = _logarithms(groups, quantity, parameter)
-        if table is None:
+        entries = _seen(groups, quantity, parameter, _entries, by_columns=True)
+        if not len(entries.logarithm):
             break
-        logarithm, row, column, by_quantity, by_parameter = table
-        k, n = np.arange(len(row)), len(quantity)
-        alone = len(k) + np.arange(len(constant[0]))
-        shape = (len(k) + len(alone), n + n_parameters + n_equations)
-        places = np.concatenate([alone, k, k, by_quantity[0], by_parameter[0]])
-        rows = n + n_parameters + np.concatenate([constant[1], row])
-        unknowns = np.concatenate([rows, column, by_quantity[1], n + by_parameter[1]])
-        powers = np.concatenate([np.ones(len(alone) + 2 * len(k)), by_quantity[2], by_parameter[2]])
-        powers[(unknowns < len(known)) & known[np.minimum(unknowns, len(known) - 1)]] = 0.0
-        matrix = sp.csr_array((powers, (places, unknowns)), shape=shape)
+        seen = [entries, constants] + ([_seen(groups, quantity, parameter, _terms)] if by_terms else [])
+        matrix: Any = sp.vstack([s.powers(n, n_parameters, n_equations) for s in seen], format="csr")
+        matrix.data[known[matrix.indices]] = 0.0
+        off = np.concatenate([s.logarithm for s in seen])
+        if by_terms:
+            moved = np.log10(np.abs(np.append(quantity, parameter))) - begun
+            stay = sp.eye_array(len(moved), matrix.shape[1]) * RELUCTANCE
+            matrix, off = sp.vstack([matrix, stay], format="csr"), np.append(off, RELUCTANCE * moved)
         linalg: Any = scipy.sparse.linalg
-        sizes = np.append(logarithm, constant[0])
-        found = linalg.lsmr(matrix, -sizes, damp=DAMPING, atol=1e-4, btol=1e-4, maxiter=20 * n)[0]
+        found = linalg.lsmr(matrix, -off, damp=DAMPING, atol=1e-4, btol=1e-4, maxiter=20 * n)[0]
         quantity, parameter = _moved(quantity, found[:n]), _moved(parameter, found[n : n + n_parameters])
         if np.abs(found[: n + n_parameters]).max(initial=0.0) < 0.3:
             break
@@ -68,8 +89,8 @@ def _moved(size: np.ndarray, decades: np.ndarray) -> np.ndarray:
     return np.where(decades == 0.0, size, np.sign(size) * 10.0**limited)
 
 
-def _constants(groups: Sequence[ExtendedGroup], parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """log₁₀ |F_e| where all quantities are zero, and the equations e; none that reads a parameter without a value."""
+def _constants(groups: Sequence[ExtendedGroup], parameters: np.ndarray) -> _Seen:
+    """|F_e| where all quantities are zero; none that reads a parameter without a value."""
     values, equations = [np.zeros(0)], [np.zeros(0, np.int64)]
     nothing = np.zeros(1 + max((int(g.quantity.max(initial=-1)) for g in groups), default=0))
     for group in groups:
@@ -80,55 +101,75 @@ def _constants(groups: Sequence[ExtendedGroup], parameters: np.ndarray) -> tuple
         used = (there > 0) & np.isfinite(there) & (parameters[group.parameter] != 0.0).all(axis=1)
         values.append(np.log10(there[used]))
         equations.append(group.equation[used])
-    return np.concatenate(values), np.concatenate(equations)
+    none = _joined([])
+    return _Seen(np.concatenate(values), np.concatenate(equations), none, none)
 
 
-def _logarithms(groups: Sequence[ExtendedGroup], quantity: np.ndarray, parameter: np.ndarray):
-    """log₁₀ |∂F_e/∂x_q|·|x_q| of all entries at a generic point of these sizes, their equations and quantities, and
-    their powers in quantities and parameters as (entry, argument, power)."""
+_Sizes = Callable[[ExtendedGroup, np.ndarray, np.ndarray], np.ndarray]
+
+
+def _seen(
+    groups: Sequence[ExtendedGroup],
+    quantity: np.ndarray,
+    parameter: np.ndarray,
+    sizes: _Sizes,
+    by_columns: bool = False,
+) -> _Seen:
+    """What groups have at a generic point of these sizes. Where it belongs to a quantity, `by_columns`, it is
+    multiplied by the quantity's size."""
     rng = np.random.default_rng(1)
     point, parameters = quantity * generic(rng, quantity.shape), parameter * generic(rng, parameter.shape)
-    out: list[list[np.ndarray]] = [[] for _ in range(9)]
+    logarithms: list[np.ndarray] = [np.zeros(0)]
+    equations: list[np.ndarray] = [np.zeros(0, np.int64)]
+    powers: tuple[list, list] = [], []
     first = 0
     for group in groups:
         if group.quantity.shape[1] == 0 or group.template.opaque is not None:
             continue
-        entry = _sizes(group, point, parameters)
-        used = (entry > 0) & np.isfinite(entry) & (group.quantity != ZERO)
+        size = sizes(group, point, parameters)
+        used = (size > 0) & np.isfinite(size)
+        if by_columns:
+            used &= group.quantity != ZERO
         if not used.any():
             continue
-        place = np.full(entry.shape, -1)
+        place = np.full(size.shape, -1)
         place[used] = first + np.arange(used.sum())
         first += int(used.sum())
-        column = np.where(used, group.quantity, 0)
-        values = np.log10(entry[used]) + np.log10(np.abs(point[column[used]]))
-        rows = np.broadcast_to(group.equation[:, None], used.shape)[used]
-        for collected, value in zip(out[:3], (values, rows, column[used]), strict=True):
-            collected.append(value)
-        if all(group.template.coefficient_is_number(j) for j in range(entry.shape[1])):
+        logarithm = np.log10(size[used])
+        if by_columns:
+            column = group.quantity[used]
+            logarithm = logarithm + np.log10(np.abs(point[column]))
+            powers[0].append((place[used], column, np.ones(len(column))))
+        logarithms.append(logarithm)
+        equations.append(np.broadcast_to(group.equation[:, None], used.shape)[used])
+        if by_columns and all(group.template.coefficient_is_number(j) for j in range(size.shape[1])):
             continue
-        arguments = [(3, point, group.quantity), (6, parameters, group.parameter)]
-        for base, vector, ids in arguments:
+        for collected, vector, ids in zip(powers, (point, parameters), (group.quantity, group.parameter), strict=True):
             for j in range(ids.shape[1]):
                 moved = vector.copy()
                 moved[ids[:, j]] *= 1 + STEP
-                after = _sizes(group, *((moved, parameters) if base == 3 else (point, moved)))
+                after = sizes(group, *((moved, parameters) if vector is point else (point, moved)))
                 with np.errstate(all="ignore"):
-                    power = np.log(after / entry) / np.log1p(STEP)
+                    power = np.log(after / size) / np.log1p(STEP)
                 hit = used & np.isfinite(power) & (np.abs(power) > 1e-6) & (ids[:, j] != ZERO)[:, None]
                 owner = np.broadcast_to(ids[:, j][:, None], used.shape)
-                for offset, value in enumerate((place[hit], owner[hit], np.clip(power[hit], -STEEPEST, STEEPEST))):
-                    out[base + offset].append(value)
-    if not first:
-        return None
-    logarithm, row, column, *powers = (np.concatenate(v) if v else np.zeros(0) for v in out)
-    return logarithm, row, column, _integers(powers[:3]), _integers(powers[3:])
+                collected.append((place[hit], owner[hit], np.clip(power[hit], -STEEPEST, STEEPEST)))
+    return _Seen(np.concatenate(logarithms), np.concatenate(equations), _joined(powers[0]), _joined(powers[1]))
 
 
-def _integers(powers: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return powers[0].astype(np.int64), powers[1].astype(np.int64), powers[2]
+def _joined(powers: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    places, arguments, values = zip(*powers, strict=True) if powers else ([], [], [])
+    none = np.zeros(0, np.int64)
+    return np.concatenate([none, *places]), np.concatenate([none, *arguments]), np.concatenate([np.zeros(0), *values])
 
 
-def _sizes(group: ExtendedGroup, point: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+def _entries(group: ExtendedGroup, point: np.ndarray, parameters: np.ndarray) -> np.ndarray:
     with np.errstate(all="ignore"):
         return np.abs(group_values(group, point, parameters, 0.5, Networks(()), partials=True))
+
+
+def _terms(group: ExtendedGroup, point: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+    slots, p, c = slot_values(group, point), list(parameters[group.parameter].T), list(group.coefficient.T)
+    with np.errstate(all="ignore"):
+        found = group.template.term_values(slots, p, c, 0.5)
+    return np.abs(np.array([np.broadcast_to(v, (len(group),)) for v in found], float).reshape(-1, len(group)).T)

@@ -13,6 +13,7 @@ from ..expressions.differentiate import directional_derivative, partial_derivati
 from ..expressions.kernel import Kernel
 from ..expressions.node import ONE, ZERO, Node, constant, divide, leaf, linear, scale, split
 from ..expressions.substitute import substitute
+from ..expressions.terms import terms
 from ..modeling.symbols import TIME_LABEL, ParameterSymbol, VariableSymbol, symbol_label
 from .template import AbstractTemplate, Slot
 
@@ -121,6 +122,11 @@ class SymbolicTemplate(AbstractTemplate):
 
     def partial_values(self, slots, parameters, coefficients, t, networks, backend="jax") -> tuple:
         return tuple(self._evaluate("partials", lambda: self.partials, (slots, parameters, coefficients, t), backend))
+
+    def term_values(self, slots, parameters, coefficients, t) -> list:
+        if all(self.coefficient_is_number(k) for k in range(len(self.slots))):
+            return []
+        return self._evaluate("terms", lambda: terms(self.graph), (slots, parameters, coefficients, t), "numpy")
 
     def solve(self, position: int, slots, parameters, coefficients, t, networks, backend="jax") -> Any:
         def solved() -> list[Node]:

@@ -42,6 +42,11 @@ class AbstractTemplate(abc.ABC):
     def partial_values(self, slots, parameters, coefficients, t, networks, backend="jax") -> tuple:
         """The values of ∂(residual)/∂(slot), one for each slot."""
 
+    def term_values(self, slots, parameters, coefficients, t) -> list:
+        """The values of the terms that the residual is a sum of, in NumPy; none where the partial derivatives show them
+        all, in a linear equation."""
+        return []
+
     @abc.abstractmethod
     def solve(self, position: int, slots, parameters, coefficients, t, networks, backend="jax") -> Any:
         """The value of the slot at `position` for which the residual, affine in it, is zero; the value given there is
