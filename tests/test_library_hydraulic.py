@@ -26,6 +26,7 @@ from jaxonomy_dae.library.hydraulic import (
     Valve,
 )
 from jaxonomy_dae.library.rotational import Inertia, Torque
+from jaxonomy_dae.solvers import BDF
 
 END = 10.0
 TS = np.linspace(0.0, END, 21)
@@ -241,6 +242,27 @@ def test_valve_and_pipe_in_series():
     np.testing.assert_allclose(solution["upper.level"], 2.0 - narrow * lost, rtol=5e-8)
     np.testing.assert_allclose(solution["lower.level"], 0.5 + wide * lost, rtol=5e-8)
     np.testing.assert_allclose(solution["valve.m_flow"], K * np.sqrt(RHO * G) * root, rtol=5e-8)
+
+
+@pytest.mark.parametrize("solver", [None, pytest.param(BDF(), marks=pytest.mark.slow)])
+def test_tanks_come_to_rest(solver):
+    """Differences of pressures fall to rounding errors of the pressures, and flows with them: they were told not to
+    fulfil their equations, which have no terms but such differences."""
+    ev = EqnEnv()
+    upper, lower = Tank(ev, "upper", A=1.0, initial_level=1.0), Tank(ev, "lower", A=0.5, initial_level=0.2)
+    pipe, orifice = TurbulentPipe(ev, "pipe", D=0.05, L=10.0), Orifice(ev, "orifice", A=1e-3)
+    beside = LaminarPipe(ev, "beside", D=0.02, L=5.0)
+    connect = [
+        (upper.fluid, pipe.port_a, beside.port_a), (pipe.port_b, orifice.port_a),
+        (orifice.port_b, lower.fluid, beside.port_b),
+    ]  # fmt: skip
+    system = compiled(upper, connect=connect)
+    solution = simulate(system, 2e4, ts=[0.0, 1e3, 2e4], solver=solver)
+    # What is left decays like exp(−t/300 s); rounding of 1e5 Pa is 1e-15 m of a level, that of flows adds up over time.
+    level = (1.0 * 1.0 + 0.5 * 0.2) / 1.5
+    np.testing.assert_allclose(solution["upper.level"][-1], level, atol=1e-9)
+    np.testing.assert_allclose(solution["lower.level"][-1], level, atol=1e-9)
+    assert abs(solution["pipe.m_flow"][-1]) < 1e-6
 
 
 @pytest.mark.parametrize(

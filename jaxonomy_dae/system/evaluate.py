@@ -5,9 +5,10 @@ The traced program grows with the number of steps, not of the equations in them.
 Nonlinear blocks are solved from the values their unknowns have in the state array. What is returned fulfils their
 equations,
 
-    |r| ≤ c Σ |∂r/∂s| |s| + c' eps Σ |∂r/∂s|      over all that stands in an equation,
+    |r| ≤ c Σ |∂r/∂s| |s| + c' eps Σ |∂r/∂s| + c'' Σ |∂r/∂s| δs      over all that stands in an equation,
 
-or is not-a-number: an iteration that diverged, cycles, or rests where |r| is smallest but not zero.
+where δs is what rounding may have left in what was eliminated; or is not-a-number: an iteration that diverged, cycles,
+or rests where |r| is smallest but not zero.
 """
 
 import copy
@@ -33,6 +34,7 @@ UNROLLED_REPETITIONS = 4  # of a loop, written out in each of its iterations
 LONG_SUM = 16  # linear equations with more terms are one gather and one sum
 NEWTON_STEPS = 60  # to the root of a nonlinear block, at most; a double root takes 27
 ROUGH = 1e-2  # residual of an equation relative to its terms, where one Newton correction is made
+NOISE = 8.0  # times what rounding may have left in an equation
 ROUNDING = 1e2  # in units of eps, of terms that are 1: what constants within an equation may leave
 
 
@@ -192,19 +194,49 @@ class Evaluation:
 
     def _holds(self, planned: PlannedStep, local: list[Any], tolerated: float) -> Any:
         """Whether these equations hold, for each of the step's blocks."""
+        noise = self._noise(planned, local)
         verdicts = []
         for e in planned.step.tearing.residuals:
-            template = planned.equations[e].equation.template
-            slots, parameters, *rest = self._arguments(planned.equations[e], local)
-            slots, parameters = jax.lax.stop_gradient((slots, parameters))
-            arguments: Any = (slots, parameters, *rest)
-            residual = template.residual(*arguments)
-            if template.opaque is not None:  # y − N(u): the network is not differentiated for this
-                slots, partials = [slots[0], slots[0] - residual], (1.0, 1.0)
-            else:
-                partials = template.partial_values(*arguments)
-            verdicts.append(is_small(residual, slots, partials, tolerated))
+            residual, slots, partials = self._terms(planned.equations[e], local)
+            left = [p * n for p, n in zip(partials, self._of_slots(planned.equations[e], noise), strict=False)]
+            verdicts.append(is_small(residual, slots, partials, tolerated, left))
         return functools.reduce(jnp.logical_and, verdicts)
+
+    def _noise(self, planned: PlannedStep, local: list[Any]) -> list[Any]:
+        """What rounding may have left in each unknown that follows from others (a running error analysis, Wilkinson
+        1963): a difference of pressures is not known to its own digits, but to theirs."""
+        noise: list[Any] = [0.0] * len(local)
+        eps = float(jnp.finfo(self.dtype).eps)
+        for e, u in planned.step.tearing.sequence:
+            equation = planned.equations[e]
+            _, slots, partials = self._terms(equation, local)
+            places = [s.local for s in equation.equation.slots]
+            before = self._of_slots(equation, noise)
+            slope, total = 0.0, 0.0
+            for place, factor, s, p, n in zip(places, equation.factors, slots, partials, before, strict=False):
+                if place == u:
+                    slope = slope + _scaled(factor, p, self.dtype)
+                else:
+                    total = total + jnp.abs(p) * (eps * jnp.abs(s) + n)
+            noise[u] = total / jnp.abs(slope)
+        return noise
+
+    def _of_slots(self, planned: PlannedEquation, noise: list[Any]) -> list[Any]:
+        """The noise of an equation's slots."""
+        pairs = zip(planned.equation.slots, planned.factors, strict=True)
+        return [0.0 if s.local < 0 else _scaled(abs(f), noise[s.local], self.dtype) for s, f in pairs]
+
+    def _terms(self, planned: PlannedEquation, local: list[Any]) -> tuple[Any, list[Any], Sequence[Any]]:
+        """An equation's residual, slots and partial derivatives, not differentiated. Of a network's output, y − N(u),
+        those of y and N(u)."""
+        template = planned.equation.template
+        slots, parameters, *rest = self._arguments(planned, local)
+        slots, parameters = jax.lax.stop_gradient((slots, parameters))
+        arguments: Any = (slots, parameters, *rest)
+        residual = template.residual(*arguments)
+        if template.opaque is not None:
+            return residual, [slots[0], slots[0] - residual], (1.0, 1.0)
+        return residual, slots, template.partial_values(*arguments)
 
     def _loop(self, planned: PlannedLoop) -> list[Any]:
         """The unknowns of all repetitions, each of shape (count · n,)."""
@@ -350,11 +382,15 @@ def rounding(dtype: Any) -> float:
     return float(jnp.finfo(dtype).eps) ** 0.6
 
 
-def is_small(residual: Any, slots: Sequence[Any], partials: Sequence[Any], tolerated: float) -> Any:
-    """Whether a residual is small beside its terms, |∂r/∂s|·|s| each."""
-    floor = ROUNDING * float(jnp.finfo(jnp.result_type(residual)).eps) / tolerated
+def is_small(
+    residual: Any, slots: Sequence[Any], partials: Sequence[Any], tolerated: float, noise: Sequence[Any] = ()
+) -> Any:
+    """Whether a residual is small beside its terms, |∂r/∂s|·|s| each, or beside the `noise` in them."""
+    eps = float(jnp.finfo(jnp.result_type(residual)).eps)
+    floor = ROUNDING * eps / tolerated
     terms = [abs(p) * (jnp.abs(s) + floor) for p, s in zip(partials, slots, strict=True)]
     allowed = tolerated * functools.reduce(jnp.add, terms)
+    allowed = functools.reduce(jnp.add, [NOISE * jnp.abs(n) for n in noise], allowed)
     # Where a slope is infinite, as that of a root at zero, the equation holds exactly or not at all.
     return (jnp.abs(residual) <= allowed) & ((allowed < jnp.inf) | (residual == 0))
 
