@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
+import scipy.optimize
 from component_references import checks, measured
 from problems import compiled
 
@@ -118,6 +119,44 @@ def test_networks():
     found = np.array([solution[f"wall.capacitor{k}.T"] for k in (1, 2, 3)])
     measured("wall.capacitor.T", found, expected, tolerance)
     measured("into.Q_flow", solution["into.Q_flow"], (expected[2] - 294.0) / (r[2] / 2), tolerance / (r[2] / 2))
+
+
+def test_temperatures_that_radiation_determines():
+    """A shield between two bodies: of the roots of a fourth power only the one above zero is a temperature."""
+    ev = EqnEnv()
+    bodies = [HeatCapacitor(ev, f"body{k}", C, T) for k, (C, T) in enumerate([(100.0, 280.0), (50.0, 340.0)])]
+    left, right = Radiation(ev, "left", 0.9, 1.0), Radiation(ev, "right", 0.4, 0.7)
+    mount, frame = ThermalConductor(ev, "mount", 0.5), HeatCapacitor(ev, "frame", 80.0, 310.0)
+    system = compiled(
+        *bodies, mount, frame,
+        connect=[
+            (bodies[0].heat, left.port_a), (left.port_b, right.port_a, mount.port_a), (right.port_b, bodies[1].heat),
+            (mount.port_b, frame.heat),
+        ],
+    )  # fmt: skip
+    solution = simulate(system, 200.0, ts=[0.0, 50.0, 200.0], rtol=1e-10, atol=1e-9)
+    sigma, capacities = 5.670374419e-8, np.array([100.0, 50.0, 80.0])
+
+    def flows(shield, T):
+        from_left = 0.9 * sigma * (T[0] ** 4 - shield**4)
+        to_right = 0.4 * 0.7 * sigma * (shield**4 - T[1] ** 4)
+        return from_left, to_right, 0.5 * (shield - T[2])
+
+    def shield(T):
+        return scipy.optimize.brentq(lambda s: flows(s, T)[0] - flows(s, T)[1] - flows(s, T)[2], 1.0, 1e3, xtol=1e-12)
+
+    def field(t, T):
+        from_left, to_right, to_frame = flows(shield(T), T)
+        return np.array([-from_left, to_right, to_frame]) / capacities
+
+    start = [280.0, 340.0, 310.0]
+    true = scipy.integrate.solve_ivp(
+        field, (0.0, 200.0), start, "DOP853", t_eval=[0.0, 50.0, 200.0], rtol=1e-11, atol=1e-9
+    ).y
+    # rtol 1e-10 of 340 K is 3e-8 K in a step, and errors decay: ten of them.
+    for k, name in enumerate(("body0.T", "body1.T", "frame.T")):
+        np.testing.assert_allclose(solution[name], true[k], atol=3e-7)
+    np.testing.assert_allclose(solution["left.port_b.T"], [shield(T) for T in true.T], atol=3e-7)
 
 
 @pytest.mark.parametrize(

@@ -83,8 +83,9 @@ class Radiation(_TwoPort):
         area = self.parameter("A", A, unit="m2", bounds=NONNEGATIVE)
         sigma = self.parameter("sigma", STEFAN_BOLTZMANN, unit="W/(m2*K4)", bounds=POSITIVE)
         _, flow = self._two_ports()
-        difference = self.port_a.T**4 - self.port_b.T**4
-        self.add_equations(Eq(flow, emissivity * sigma * area * difference))
+        # Continued below zero so that it still rises there: the search for a start finds no negative temperatures.
+        a, b = (T**3 * sympy.Abs(T) for T in (self.port_a.T, self.port_b.T))
+        self.add_equations(Eq(flow, emissivity * sigma * area * (a - b)))
 
 
 class Wall(Component):
