@@ -26,8 +26,10 @@ from .problem import AbstractHybridProblem, HybridState, one_hot
 CONDITIONS_AT_ONE_INSTANT = 32  # more than these take another step, of no length to speak of
 SMALL = 1e-12  # of a guard's size in the step before: counts as zero
 REACHED = 1e-9  # of that size: counts as zero at an instant that the guard has reached
+CLOSE = 0.01  # of that size: what is farther away is not at zero, however fast it is
 FLAT = 1e-9  # of that size, over a step: a change so small may be one of rates alone
 ROUNDING = 1e-12  # of that size, over a step: counts as no change
+STEADY = 0.1  # of a slope: a change during the delay that leaves it worth following back
 AHEAD = 1e-3  # of a step: how far ahead a guard that is flat at zero is looked at
 
 
@@ -104,9 +106,11 @@ def handle(
         ticks = state.ticks + one_hot(event, c).astype(state.ticks.dtype)
         logged = (~is_clock & noted[event] & (not at_start)) | (ends[event] > 0)
         row = jnp.where(logged, state.count.astype(int), state.times.shape[0] + 1)
-        after, armed, left, caused = _following(problem, t, x, new, instant, event, arrival, args)
+        after, slow, armed, left, caused = _following(problem, t, x, new, instant, event, arrival, delay, args)
+        # What is too fast to be followed back, as a current that a blocked diode stops, has that value at once.
+        back = delay - (1.0 - slow) * lax.stop_gradient(delay)
         state = HybridState(
-            x - after * delay,
+            x - after * back,
             new,
             armed,
             state.size,
@@ -145,42 +149,50 @@ def _noted(rows: Any, row: Any, value: Any) -> Any:
     return rows.at[row].set(value.astype(rows.dtype), mode="drop") if rows.shape[0] else rows
 
 
-def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, args):
-    """(dx/dt, armed guards, events left, which guards an event made true) after an event, not differentiated."""
+def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, delay, args):
+    """(dx/dt, in which states it hardly changes during the delay, armed guards, events left, which guards an event made
+    true) after an event, not differentiated."""
     c, g = problem.n_clocks, problem.n_guards
     left = instant.left & ~one_hot(event, c + g)
     if not g:
-        return problem.slope(t, x, q, args), instant.state.armed, left, instant.caused
-    problem, t, x, q, args = still(constant_once((problem, t, x, q, args)))
+        return problem.slope(t, x, q, args), jnp.ones_like(x), instant.state.armed, left, instant.caused
+    problem, t, x, q, delay, args = still(constant_once((problem, t, x, q, delay, args)))
     instant = still(instant)
     here = event - c == jnp.arange(g)
     rounding = jnp.where(left[c:], REACHED, SMALL) * arrival.size
     ahead = AHEAD * arrival.span
 
+    def within(rate):
+        """How far from zero a guard may be that reaches it, or has left it, within the window."""
+        return jnp.minimum(jnp.abs(rate) * arrival.window, CLOSE * arrival.size)
+
     def is_zero(value, rate):
-        return jnp.abs(value) <= jnp.maximum(rounding, jnp.abs(rate) * arrival.window)
+        return jnp.abs(value) <= jnp.maximum(rounding, within(rate))
 
     def is_flat(value, rate):
         return is_zero(value, rate) & (jnp.abs(rate) * arrival.span <= FLAT * arrival.size)
 
-    # Guards and their rates after the event, with what was before it, and, where one is flat, a little ahead: in a
-    # loop, for XLA compiles the equations as often as they are written.
+    # Slopes, guards and their rates after the event, with what was before it, before the delay, and, where a guard is
+    # flat, a little ahead: in a loop, for XLA compiles the equations as often as they are written.
     def look(carry):
-        k, slope, values, rates = carry
-        point = jnp.where(k == 0, x, jnp.where(k == 1, instant.arrived, x + slope * ahead))
-        time = jnp.where(k == 2, t + ahead, t)
-        own = problem.slope(time, point, q, args)
-        slope = jnp.where(k == 0, own, slope)
-        value, rate = problem.rates(time, point, q, args, jnp.where(k == 2, own, slope))
-        return k + 1, slope, written(values, k, value), written(rates, k, rate)
+        k, slopes, values, rates = carry
+        slope = slopes[0]
+        places = jnp.stack([x, instant.arrived, x - slope * delay, x + slope * ahead])
+        time = jnp.where(k == 3, t + ahead, t)
+        own = problem.slope(time, places[k], q, args)
+        slopes = written(slopes, k, own)
+        value, rate = problem.rates(time, places[k], q, args, jnp.where((k == 0) | (k == 3), own, slope))
+        return k + 1, slopes, written(values, k, value), written(rates, k, rate)
 
     def unfinished(carry):
         k, _, values, rates = carry
-        return (k < 2) | ((k == 2) & jnp.any(is_flat(values[0], rates[0])))
+        return (k < 3) | ((k == 3) & jnp.any(is_flat(values[0], rates[0])))
 
-    rows = jnp.zeros((3, g), x.dtype)
-    _, slope, values, rates = lax.while_loop(unfinished, look, (jnp.array(0), jnp.zeros_like(x), rows, rows))
-    (value, at_arrival, _), (rate, rate_there, rate_ahead) = values, rates
+    rows = jnp.zeros((4, g), x.dtype)
+    begin = jnp.array(0), jnp.zeros((4, *x.shape), x.dtype), rows, rows
+    _, (slope, _, earlier, _), values, rates = lax.while_loop(unfinished, look, begin)
+    slow = (jnp.abs(earlier - slope) <= STEADY * jnp.abs(slope)).astype(x.dtype)
+    (value, at_arrival, _, _), (rate, rate_there, _, rate_ahead) = values, rates
     # A force that keeps a contact closed leaves a guard of the open contact at zero without a slope: what it does next
     # decides. One that seems to fall by rounding alone is waited for: if it does fall, the next step finds it.
     falling = jnp.where(is_flat(value, rate), 0.5 * (rate + rate_ahead), rate)
@@ -189,9 +201,9 @@ def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, args
     was_armed = (instant.state.armed > 0.5) & ~here
     # What this event made true happens next. What was to happen does so, though a state starts anew: unless what was
     # assigned makes its condition false, or it is revocable and undone.
-    reached = at_arrival <= jnp.maximum(SMALL * arrival.size, jnp.abs(rate_there) * arrival.window)
+    reached = at_arrival <= jnp.maximum(SMALL * arrival.size, within(rate_there))
     stands = left[c:] & ~np.array(problem.revocable[c:], bool) & reached
     caused = ((was_armed & true) | stands) & ~zero
     next_ones = ((was_armed | left[c:]) & true & ~here) | stands
     armed = jnp.where(true, next_ones, True)
-    return slope, armed.astype(instant.state.armed.dtype), jnp.concatenate([left[:c], next_ones]), caused
+    return slope, slow, armed.astype(instant.state.armed.dtype), jnp.concatenate([left[:c], next_ones]), caused
