@@ -70,6 +70,9 @@ def explain(
             else ", or left states that the hidden constraints do not admit: let it write, with reinit(...), all that "
             "jumps"
             if system.is_constrained
+            else ", or began a mode in which equations are singular, as where ideal switches and diodes short-circuit "
+            "a source or a capacitor: give those a resistance, Ron=1e-5"
+            if system.report.modes
             else ""
         )
     bad = _bad_input(system.plan, inputs, float(t0), float(t), float(t1))
