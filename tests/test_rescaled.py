@@ -178,7 +178,7 @@ class Cells(Component):
         self.add_equations(*(f + (1 + 0.1 * i) * rng.choice(us) for i, f in enumerate(flow)))
 
 
-@pytest.mark.parametrize("seed", [*range(8), *(pytest.param(k, marks=pytest.mark.slow) for k in range(8, 30))])
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(k, marks=pytest.mark.slow) for k in range(2, 30))])
 def test_reactions_beside_diffusion(seed):
     """Sizes at which questions of rank are asked made reactions vanish: the cells then determined u, and its start was
     taken for a contradiction."""
