@@ -189,7 +189,9 @@ def _join(terms: _Terms, n_rows: int, classes: _Classes) -> np.ndarray:
     left, right = np.sort(ends.reshape(2, -1), axis=0)
     edge, first = np.unique(left * len(nodes) + right, return_index=True)  # of rows that say the same, the first
     # Of a loop, the equation that was written last is left over: it repeats the others, or contradicts them.
-    graph = sp.csr_array((row[first] + 1.0, (left[first], right[first])), shape=(len(nodes),) * 2)
+    # (Older versions of SciPy span trees of graphs with 32-bit indices only.)
+    places = left[first].astype(np.int32), right[first].astype(np.int32)
+    graph = sp.csr_array((row[first] + 1.0, places), shape=(len(nodes),) * 2)
     tree = sp.coo_array(minimum_spanning_tree(graph))
     n_parts, part = connected_components(tree, directed=False)
     is_fixed = np.append(classes.is_input, True)[nodes]  # a part may have one of those: it is the root
