@@ -175,7 +175,8 @@ def held_back(
     run."""
     if program.rest is None:
         return new, jnp.array(False), pushed
-    step = Step(state.tprev, state.tnext, state.y, new.y, accepted, new.made_jump, new.tprev, new.tnext)
+    jump = new.made_jump if program.jumps else False  # some versions of JAX make an array of a constant
+    step = Step(state.tprev, state.tnext, state.y, new.y, accepted, jump, new.tprev, new.tnext)
     end, pushed = program.rest(numbers["rest"], step, pushed)
     return dataclasses.replace(new, tnext=end), end < new.tnext, pushed
 
