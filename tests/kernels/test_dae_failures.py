@@ -9,35 +9,30 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import sympy
-from problems import compiled
 
-from jaxonomy_dae import Component, EqnEnv, InitializationError, ModelError, SimulationError, der, simulate
+from jaxonomy_dae import InitializationError, ModelError, SimulationError
 from jaxonomy_dae.solvers import BDF, DAETerm, Rodas5P, consistent_start, solve_dae
+from jaxonomy_dae.solvers.dae_term import FlatProblem
+from jaxonomy_dae.solvers.failures import explain_start, start_check
 
-ONE, NONE = jnp.ones(1), jnp.zeros(1)
+ONE, NONE = np.ones(1), np.zeros(1)
 NAMES = ("a.x", "a.z")
-TS = jnp.linspace(0.0, 2.0, 9)
-SOLVERS = pytest.mark.parametrize("solver", [BDF(), Rodas5P()], ids=["bdf", "rodas5p"])
+TS = np.linspace(0.0, 2.0, 9)
 ALSO_RODAS5P = pytest.mark.parametrize(
     "solver", [BDF(), pytest.param(Rodas5P(), marks=pytest.mark.slow)], ids=["bdf", "rodas5p"]
 )
 
 
-def falling(t, x, z, args):
-    return -ONE
+# --- ends ----------------------------------------------------------------------------------------------------------
 
-
-# x' and 0 = g, the start, where the solution ends, and (x, z) until there.
+# x' and 0 = g from the start (x, z) = (1, 1), and (x, z) until the end at t = 1.
 ENDS = {
-    "turning point": (falling, lambda t, x, z, a: z**2 - x, (ONE, ONE), 1.0, lambda t: (1 - t, np.sqrt(1 - t))),
-    "root": (falling, lambda t, x, z, a: z - jnp.sqrt(x), (ONE, ONE), 1.0, lambda t: (1 - t, np.sqrt(1 - t))),
-    "pole": (lambda t, x, z, a: z**2, lambda t, x, z, a: z - x, (ONE, ONE), 1.0, lambda t: (1 / (1 - t),) * 2),
+    "turning point": (lambda t, x, z: -1 + 0 * x, lambda t, x, z: z**2 - x, lambda t: (1 - t, np.sqrt(1 - t))),
+    "root": (lambda t, x, z: -1 + 0 * x, lambda t, x, z: z - jnp.sqrt(x), lambda t: (1 - t, np.sqrt(1 - t))),
+    "pole": (lambda t, x, z: z**2, lambda t, x, z: z - x, lambda t: (1 / (1 - t),) * 2),
     "not a number": (
-        lambda t, x, z, a: -x,
-        lambda t, x, z, a: z - x * jnp.where(t > 1, jnp.nan, 1.0),
-        (ONE, ONE),
-        1.0,
+        lambda t, x, z: -x,
+        lambda t, x, z: z - x * jnp.where(t > 1, jnp.nan, 1.0),
         lambda t: (np.exp(-t),) * 2,
     ),
 }
@@ -47,157 +42,91 @@ CAUSES = {
     "pole": "and no solution continues beyond that",
     "not a number": "row 1 of F",
 }
-ENDS = {name: (DAETerm(f, g), *rest) for name, (f, g, *rest) in ENDS.items()}
-
-
-@SOLVERS
-@pytest.mark.parametrize(
-    "end", [end if end == "turning point" else pytest.param(end, marks=pytest.mark.slow) for end in ENDS]
-)
-def test_an_end_of_the_solution_is_reported(end, solver):
-    term, y0, time, exact = ENDS[end]
-    with pytest.raises(SimulationError) as caught:
-        solve_dae(term, 2.0, y0, ts=TS, solver=solver, names=NAMES)
-    message = str(caught.value)
-    assert message.startswith("the integration stopped at t=") and CAUSES[end] in message
-    reached = float(message.split("t=")[1].split(":")[0])
-    assert abs(reached - time) < 1e-4
-    found = solve_dae(term, 2.0, y0, ts=TS, solver=solver, throw=False)
-    assert found.result == diffrax.RESULTS.dt_min_reached
-    before = np.asarray(TS) < 0.9
-    for part, value in zip(found.ys, exact(np.asarray(TS)[before]), strict=True):
-        # 1e-4 here too: errors of 1e-6 per step, amplified as the solution steepens.
-        np.testing.assert_allclose(part[before, 0], value, rtol=1e-4)
-        assert np.isnan(part[np.asarray(TS) > 1.1]).all()
-
-
-# --- through a compiled model --------------------------------------------------------------------------------------
-
-
-class Cell(Component):
-    """x' = rate(x, z), 0 = law(x, z), a nonlinear block."""
-
-    def __init__(self, ev, rate, law, x0, z0):
-        super().__init__(ev, "cell")
-        x, z = self.variable("x", start=x0, fixed=True), self.variable("z", start=z0)
-        self.add_equations(der(x) - rate(x, z), law(x, z))
-
-
-def cell(rate, law, x0, z0):
-    return compiled(Cell(EqnEnv(), rate, law, x0, z0))
-
-
-@pytest.fixture(scope="module")
-def folded():
-    """x falls from 2 along x = z³ − 3z, which turns back at z = 1, x = −2, t = 4."""
-    system = cell(lambda x, z: -1, lambda x, z: z**3 - 3 * z - x, 2.0, 2.0)
-    assert list(system.carried) == ["cell.z"]
-    return system
-
-
-FOLDED = (
-    "the integration stopped at t=4: no step was short enough to be accepted. The nonlinear equation for 'cell.z' = 1 "
-    "has no solution just beyond: Newton's method does not converge from these values (a turning point, at which two "
-    "solutions meet and end; a jump to another branch; or a law without a solution).\n  cell: 0 = -x + z**3 - 3*z"
+FAST = 1e4  # 1/s
+SMOOTH = (lambda t, x, z: FAST * z, lambda t, x, z: z - jnp.cos(FAST * t), None)  # x = sin(FAST·t)
+EQUATIONS = [*ENDS.values(), SMOOTH]
+# One program for all of them: `args` says which.
+CHOSEN = DAETerm(
+    lambda t, x, z, which: jax.lax.select_n(which, *(f(t, x, z) for f, _, _ in EQUATIONS)),
+    lambda t, x, z, which: jax.lax.select_n(which, *(g(t, x, z) for _, g, _ in EQUATIONS)),
 )
 
 
-@SOLVERS
-def test_a_model_reports_its_turning_point(folded, solver):
-    ts = jnp.linspace(0.0, 6.0, 13)
-    with pytest.raises(SimulationError) as caught:
-        simulate(folded, 6.0, ts=ts, solver=solver)
-    assert str(caught.value) == FOLDED
-    found = simulate(folded, 6.0, ts=ts, solver=solver, throw=False)
-    assert found.result == diffrax.RESULTS.dt_min_reached
-    before = np.asarray(ts) < 3.9
-    # z is solved for again at saved times: as exact as x, which is linear in time.
-    x, z = np.asarray(found["cell.x"])[before], np.asarray(found["cell.z"])[before]
-    np.testing.assert_allclose(x, 2 - np.asarray(ts)[before], atol=1e-9)
-    np.testing.assert_allclose(z**3 - 3 * z, x, atol=1e-9)
-    assert np.isnan(np.asarray(found.states)[np.asarray(ts) > 4.1]).all()
+def solve_chosen(which, solver, y0=(ONE, ONE), **options):
+    return solve_dae(
+        CHOSEN, 2.0, y0, ts=TS, solver=solver, names=NAMES, max_steps=1000, args=jnp.asarray(which, jnp.int32), **options
+    )
 
 
 @ALSO_RODAS5P
-def test_a_model_reports_too_few_steps(folded, solver):
+@pytest.mark.parametrize("end", ENDS)
+def test_an_end_of_the_solution_is_reported(end, solver):
+    which, exact = list(ENDS).index(end), ENDS[end][2]
     with pytest.raises(SimulationError) as caught:
-        simulate(folded, 3.0, solver=solver, max_steps=5)
+        solve_chosen(which, solver)
     message = str(caught.value)
-    assert "max_steps=5 was reached. Changing fastest there: 'cell.x' = " in message
-    assert "Raise max_steps, loosen rtol=1e-06 and atol, or look for a jump or a pole: jump_ts= names" in message
-    found = simulate(folded, 3.0, solver=solver, max_steps=5, throw=False)
-    assert found.result == diffrax.RESULTS.max_steps_reached
-    assert np.isfinite(np.asarray(found.states)).all() and 1 < len(found.ts) <= 6
-
-
-@pytest.mark.slow
-@SOLVERS
-@pytest.mark.parametrize(
-    "rate, law",
-    [
-        (lambda x, z: z**2, lambda x, z: z + z**3 - x - x**3),
-        (lambda x, z: -1, lambda x, z: z + sympy.exp(z) - sympy.sqrt(x) - sympy.exp(sympy.sqrt(x))),
-    ],
-    ids=["pole", "root"],
-)
-def test_models_report_poles_and_roots(rate, law, solver):
-    system = cell(rate, law, 1.0, 1.0)
-    with pytest.raises(SimulationError, match="the integration stopped at t=") as caught:
-        simulate(system, 6.0, solver=solver)
-    assert abs(float(str(caught.value).split("t=")[1].split(":")[0]) - 1) < 1e-4
-    assert "'cell.z'" in str(caught.value) or "not finite" in str(caught.value) or "infinite" in str(caught.value)
-
-
-def test_a_model_that_is_not_finite_at_its_start():
-    system = cell(lambda x, z: -sympy.sqrt(x - 2) + z, lambda x, z: z + z**3 - x - x**3, 1.0, 1.0)
-    with pytest.raises(SimulationError) as caught:
-        simulate(system, 1.0)
-    assert str(caught.value) == (
-        "the integration stopped at t=0: an equation is not finite at the start, cell: 0 = der(x) - z + sqrt(x - 2), "
-        "with 'cell.x' = 1, 'cell.z' = 1. Start elsewhere, or look for a division by zero, or a root or logarithm "
-        "without a real value."
-    )
-    found = simulate(system, 1.0, ts=TS[:4], throw=False)
-    assert found.result != diffrax.RESULTS.successful
-
-
-# --- steps ---------------------------------------------------------------------------------------------------------
+    assert message.startswith("the integration stopped at t=") and CAUSES[end] in message
+    reached = float(message.split("t=")[1].split(":")[0])
+    assert abs(reached - 1) < 1e-4
+    found = solve_chosen(which, solver, throw=False)
+    assert found.result == diffrax.RESULTS.dt_min_reached
+    before = TS < 0.9
+    for part, value in zip(found.ys, exact(TS[before]), strict=True):
+        # 1e-4 here too: errors of 1e-6 per step, amplified as the solution steepens.
+        part = np.asarray(part)
+        np.testing.assert_allclose(part[before, 0], value, rtol=1e-4)
+        assert np.isnan(part[TS > 1.1]).all()
 
 
 @ALSO_RODAS5P
 def test_too_few_steps(solver):
-    term = DAETerm(lambda t, x, z, a: 50 * z, lambda t, x, z, a: z - jnp.cos(50 * t))  # x = sin(50·t)
-    with pytest.raises(SimulationError, match="max_steps=20 was reached. Changing fastest there: 'a.[xz]' = "):
-        solve_dae(term, 2.0, (NONE, ONE), ts=TS, solver=solver, names=NAMES, max_steps=20)
-    found = solve_dae(term, 2.0, (NONE, ONE), ts=TS, solver=solver, max_steps=20, throw=False)
+    which = EQUATIONS.index(SMOOTH)
+    with pytest.raises(SimulationError, match="max_steps=1000 was reached. Changing fastest there: 'a.[xz]' = "):
+        solve_chosen(which, solver, (NONE, ONE))
+    found = solve_chosen(which, solver, (NONE, ONE), throw=False)
     assert found.result == diffrax.RESULTS.max_steps_reached
-    assert np.asarray(found.ys[0])[0] == 0 and np.isnan(np.asarray(found.ys[0])[1:]).all()
+    x = np.asarray(found.ys[0])
+    assert x[0] == 0 and np.isnan(x[1:]).all()
+
+
+@ALSO_RODAS5P
+def test_a_start_that_is_not_consistent_is_not_solved_from(solver):
+    wrong = ONE, np.full(1, 2.0)
+    with pytest.raises(InitializationError, match="inconsistent start, the algebraic equations do not hold: row 1"):
+        solve_chosen(0, solver, wrong)
+    assert solve_chosen(0, solver, wrong, throw=False).result == diffrax.RESULTS.nonlinear_divergence
 
 
 # --- starts --------------------------------------------------------------------------------------------------------
 
 # x' = −x, z + z³ = x, w = z·x: (q, r) = (z, w) follow from p = x.
 TERM = DAETerm(lambda t, x, z, a: -x, lambda t, x, z, a: jnp.stack([z[0] + z[0] ** 3 - x[0], z[1] - z[0] * x[0]]))
-WRONG = (ONE, jnp.array([0.5, 0.1]))
+WRONG = (ONE, np.array([0.5, 0.1]))
+ROOT = np.real(np.roots([1, 0, 1, -1])[-1])  # the real root of z³ + z − 1
+GOOD = (ONE, np.array([ROOT, ROOT]))
 PQR = ("p", "q", "r")
 
 
+def falling(t, x, z, args):
+    return -jnp.ones(1)
+
+
+def wrong_with_the_start(term, y0, names=NAMES):
+    """What `solve_dae` says of a start, or nothing."""
+    check = jax.jit(lambda y0: start_check(FlatProblem(term, y0, None), jnp.asarray(0.0), 1e-6, jnp.asarray(1e-8)))(y0)
+    return explain_start(check, names)
+
+
 def test_an_inconsistent_start_is_mended():
-    with pytest.raises(InitializationError) as caught:
-        solve_dae(TERM, 1.0, WRONG, names=PQR)
-    assert str(caught.value) == (
+    assert wrong_with_the_start(TERM, WRONG, PQR) == (
         "inconsistent start, the algebraic equations do not hold: row 2 of F is off by 0.4, row 1 of F is off by "
         "0.375. To mend it 'r', 'q' must move: y0 = jaxonomy_dae.solvers.consistent_start(term, y0), or "
         "system.initialize() for a compiled model"
     )
-    assert solve_dae(TERM, 1.0, WRONG, throw=False).result == diffrax.RESULTS.nonlinear_divergence
     mended = consistent_start(TERM, WRONG)
-    z = np.real(np.roots([1, 0, 1, -1])[-1])  # the real root of z³ + z − 1
     assert mended[0] == 1
-    np.testing.assert_allclose(mended[1], [z, z], rtol=1e-14)
-    found = solve_dae(TERM, 1.0, mended)
-    assert found.result == diffrax.RESULTS.successful
-    np.testing.assert_allclose(found.ys[0][0], np.exp(-1.0), rtol=1e-6)  # a few times rtol would do
+    np.testing.assert_allclose(mended[1], GOOD[1], rtol=1e-14)
+    assert wrong_with_the_start(TERM, mended, PQR) == ""
 
 
 def test_traced_starts_fail_while_running():
@@ -213,36 +142,52 @@ def test_traced_starts_fail_while_running():
         return consistent_start(DAETerm(falling, lambda t, x, z, a: z**2 + x), (ONE, z))[1]
 
     with pytest.raises(Exception, match="no consistent start: Newton's method did not converge"):
-        jax.block_until_ready(start(jnp.array([0.5])))
+        jax.block_until_ready(start(np.array([0.5])))
 
 
 def test_no_consistent_start():
     with pytest.raises(InitializationError) as caught:
-        consistent_start(DAETerm(falling, lambda t, x, z, a: z**2 + x), (ONE, jnp.array([0.5])), names=NAMES)
+        consistent_start(DAETerm(falling, lambda t, x, z, a: z**2 + x), (ONE, np.array([0.5])), names=NAMES)
     assert str(caught.value) == (
         "no consistent start was found near y0; still moving: 'a.z'. Give a better y0, and check that the algebraic "
         "equations determine the algebraic unknowns (index 1)"
     )
 
 
-@ALSO_RODAS5P
-def test_an_index_above_one_is_named(solver):
-    term = DAETerm(lambda t, x, z, a: z, lambda t, x, z, a: x - 1)  # x = 1, z = 0: consistent, but z needs x'
-    with pytest.raises(InitializationError) as caught:
-        solve_dae(term, 1.0, (ONE, NONE), solver=solver, names=NAMES)
-    assert str(caught.value) == (
+INDEX_TWO = DAETerm(lambda t, x, z, a: z, lambda t, x, z, a: x - 1)  # x = 1, z = 0: consistent, but z needs x'
+
+
+def test_an_index_above_one_is_named():
+    assert wrong_with_the_start(INDEX_TWO, (ONE, NONE)) == (
         "the index is above 1, or the equations are singular at the start: they do not determine 'a.z'. Differentiate "
         "the constraints, or write the model as a Component: jaxonomy_dae.AcausalCompiler reduces the index"
     )
-    assert solve_dae(term, 1.0, (ONE, NONE), solver=solver, throw=False).result != diffrax.RESULTS.successful
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [BDF(), Rodas5P()], ids=["bdf", "rodas5p"])
+def test_an_index_above_one_is_not_solved(solver):
+    with pytest.raises(InitializationError, match="the index is above 1"):
+        solve_dae(INDEX_TWO, 1.0, (ONE, NONE), solver=solver, names=NAMES)
+    found = solve_dae(INDEX_TWO, 1.0, (ONE, NONE), solver=solver, throw=False)
+    assert found.result != diffrax.RESULTS.successful
 
 
 def test_not_finite_at_the_start():
     term = DAETerm(falling, lambda t, x, z, a: z - jnp.sqrt(x - 2))
-    with pytest.raises(InitializationError) as caught:
-        solve_dae(term, 1.0, (ONE, ONE), names=NAMES)
-    assert str(caught.value) == "the equations are not finite at the start: row 1 of F is nan. Start elsewhere"
-    assert solve_dae(term, 1.0, (ONE, ONE), throw=False).result != diffrax.RESULTS.successful
+    assert wrong_with_the_start(term, (ONE, ONE)) == (
+        "the equations are not finite at the start: row 1 of F is nan. Start elsewhere"
+    )
+
+
+@pytest.mark.parametrize("n", [1, 160])
+def test_index_two_is_not_called_an_inconsistent_start(n):
+    """x' = z − x, 0 = x − 0.3, from x = 0.1 + 0.2: a rounding error off, which no step can mend. Matrices of more than
+    300 unknowns are not looked at."""
+    term = DAETerm(lambda t, x, z, a: z - x, lambda t, x, z, a: x - 0.3)
+    said = wrong_with_the_start(term, (np.full(n, 0.1 + 0.2), np.full(n, 0.3)), [f"y[{k}]" for k in range(2 * n)])
+    singular = "singular" if n == 1 else "nearly singular"
+    assert said.startswith(f"the index is above 1, or the equations are {singular}")
 
 
 # --- arguments -----------------------------------------------------------------------------------------------------
@@ -252,8 +197,7 @@ def minus(t, y, args):
     return -y
 
 
-GOOD = consistent_start(TERM, WRONG)
-SINGLE = jax.tree.map(lambda v: v.astype(jnp.float32), GOOD)
+SINGLE = jax.tree.map(lambda v: v.astype(np.float32), GOOD)
 FUNCTIONS = "a DAETerm is made of functions: DAETerm(f, g), or DAETerm(F, mass=M)"
 SHAPE = "mass must be a finite square matrix (n, n), or its diagonal (n,); got shape "
 BAD = {
@@ -275,16 +219,16 @@ BAD = {
         SHAPE + "(2,) with entries that are not finite",
     ),
     "mass of another size": (
-        lambda: solve_dae(DAETerm(minus, mass=np.ones(3)), 1.0, jnp.ones(2)),
+        lambda: solve_dae(DAETerm(minus, mass=np.ones(3)), 1.0, np.ones(2)),
         "mass has shape (3,), but y has 2 values: it must be (2, 2) or (2,)",
     ),
     "traced mass": (
-        lambda: jax.jit(lambda m: solve_dae(DAETerm(minus, mass=m), 1.0, jnp.ones(2)).ys)(jnp.ones(2)),
+        lambda: jax.jit(lambda m: solve_dae(DAETerm(minus, mass=m), 1.0, np.ones(2)).ys)(np.ones(2)),
         "the mass matrix of a DAETerm is constant: it cannot be traced. Move what varies into F, or solve for other "
         "variables",
     ),
     "F": (
-        lambda: solve_dae(DAETerm(lambda t, y, a: y[:1], mass=np.ones(2)), 1.0, jnp.ones(2)),
+        lambda: solve_dae(DAETerm(lambda t, y, a: y[:1], mass=np.ones(2)), 1.0, np.ones(2)),
         "F must return what it is the derivative of: expected shapes [(2,)], found [(1,)]",
     ),
     "f": (
@@ -296,13 +240,13 @@ BAD = {
         "g must return as many values as z has: 2; it returned 1. Every algebraic unknown needs one equation",
     ),
     "no pair": (
-        lambda: solve_dae(TERM, 1.0, jnp.ones(3)),
+        lambda: solve_dae(TERM, 1.0, np.ones(3)),
         "the solution of DAETerm(f, g) is a pair (x, z); got PyTreeDef(*)",
     ),
     "names": (lambda: solve_dae(TERM, 1.0, GOOD, names=["p"]), "names must name every unknown: 3 of them; got 1"),
     "negative rtol": (lambda: solve_dae(TERM, 1.0, GOOD, rtol=-1.0), "rtol must be a number ≥ 0; got -1.0"),
     "atol": (
-        lambda: solve_dae(TERM, 1.0, GOOD, atol=jnp.ones(2)),
+        lambda: solve_dae(TERM, 1.0, GOOD, atol=np.ones(2)),
         "atol must be one number or look like y: expected shapes [(1,), (2,)], found [(2,)]",
     ),
     "single precision": (
@@ -312,11 +256,11 @@ BAD = {
     ),
     "no end": (lambda: solve_dae(TERM, np.nan, GOOD), "t1 must be a finite number; got nan"),
     "times outside": (
-        lambda: solve_dae(TERM, 1.0, GOOD, ts=jnp.array([0.5, 2.0])),
+        lambda: solve_dae(TERM, 1.0, GOOD, ts=np.array([0.5, 2.0])),
         "ts must lie between t0=0 and t1=1; they reach from 0.5 to 2",
     ),
     "times backwards": (
-        lambda: solve_dae(TERM, 1.0, GOOD, ts=jnp.array([0.5, 0.2])),
+        lambda: solve_dae(TERM, 1.0, GOOD, ts=np.array([0.5, 0.2])),
         "ts must be sorted in the direction of integration",
     ),
     "times of rank 0": (lambda: solve_dae(TERM, 1.0, GOOD, ts=0.5), "ts must have shape (n,), n ≥ 1; got ()"),
@@ -358,24 +302,15 @@ def test_bdf_needs_tolerances_outside_of_diffrax():
         solver.step(TERM, jnp.asarray(0.0), jnp.asarray(0.1), GOOD, None, state, False)
 
 
-@ALSO_RODAS5P
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [BDF(), Rodas5P()], ids=["bdf", "rodas5p"])
 def test_a_regular_mass_matrix_is_an_ordinary_equation(solver):
     matrix, field = np.array([[2.0, 1.0], [1.0, 3.0]]), np.array([[-1.0, 0.5], [0.0, -2.0]])
     term = DAETerm(lambda t, y, a: jnp.asarray(field) @ y, mass=matrix)
-    solution = solve_dae(term, 1.0, jnp.array([1.0, 2.0]), solver=solver, rtol=1e-8, atol=1e-10)
+    solution = solve_dae(term, 1.0, np.array([1.0, 2.0]), solver=solver, rtol=1e-8, atol=1e-10)
     values, vectors = np.linalg.eig(np.linalg.solve(matrix, field))
     exact = np.real(vectors @ (np.exp(values) * np.linalg.solve(vectors, [1.0, 2.0])))
     np.testing.assert_allclose(solution.ys[0], exact, rtol=1e-6)  # a hundred steps' worth of rtol
-
-
-@pytest.mark.parametrize("n", [1, 160])
-def test_index_two_is_not_called_an_inconsistent_start(n):
-    """x' = z − x, 0 = x − 0.3, from x = 0.1 + 0.2: a rounding error off, which no step can mend. Matrices of more than
-    300 unknowns are not looked at."""
-    term = DAETerm(lambda t, x, z, a: z - x, lambda t, x, z, a: x - 0.3)
-    start = jnp.full(n, 0.1 + 0.2), jnp.full(n, 0.3)
-    with pytest.raises(InitializationError, match="the index is above 1, or the equations are (nearly )?singular"):
-        solve_dae(term, 1.0, start, solver=BDF())
 
 
 def test_a_mass_matrix_that_is_a_function():
