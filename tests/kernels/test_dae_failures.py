@@ -53,9 +53,8 @@ CHOSEN = DAETerm(
 
 
 def solve_chosen(which, solver, y0=(ONE, ONE), **options):
-    return solve_dae(
-        CHOSEN, 2.0, y0, ts=TS, solver=solver, names=NAMES, max_steps=1000, args=jnp.asarray(which, jnp.int32), **options
-    )
+    which = jnp.asarray(which, jnp.int32)
+    return solve_dae(CHOSEN, 2.0, y0, ts=TS, solver=solver, names=NAMES, max_steps=1000, args=which, **options)
 
 
 @ALSO_RODAS5P

@@ -135,9 +135,8 @@ def slow(*values):
 
 @pytest.mark.parametrize(
     "problem, direction",
-    [("semi-explicit", 1), ("full singular mass", -1)]
-    + [slow("semi-explicit", -1), slow("full singular mass", 1), slow("full regular mass", -1)]
-    + [slow(problem, 1) for problem in ("diagonal mass", "full regular mass", "ordinary")],
+    [("semi-explicit", 1), slow("semi-explicit", -1), slow("full singular mass", -1), slow("full regular mass", -1)]
+    + [slow(problem, 1) for problem in PROBLEMS if problem != "semi-explicit"],
 )
 def test_rodas5p(problem, direction):
     between, end = slopes(problem, "rodas5p", direction=direction).T
@@ -146,7 +145,7 @@ def test_rodas5p(problem, direction):
     assert (between > 3.8).all(), between
 
 
-@pytest.mark.parametrize("order", [slow(1), 2, slow(3), slow(4), 5])
+@pytest.mark.parametrize("order", [slow(1), slow(2), slow(3), slow(4), 5])
 @pytest.mark.parametrize("direction", [1, slow(-1)])
 def test_bdf(order, direction):
     close_to(slopes("semi-explicit", order, direction=direction), order)
