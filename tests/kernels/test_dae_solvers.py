@@ -15,7 +15,8 @@ from jaxonomy_dae.linear import KLU, Dense
 from jaxonomy_dae.linear.sparse import SparsePattern
 from jaxonomy_dae.solvers import BDF, DAETerm, Projected, Rodas5P, StepControl, solve_dae
 
-SOLVERS = pytest.mark.parametrize("solver", [BDF(), Rodas5P()], ids=["bdf", "rodas5p"])
+RODAS5P = Rodas5P()
+SOLVERS = pytest.mark.parametrize("solver", [BDF(), RODAS5P], ids=["bdf", "rodas5p"])
 ALSO_RODAS5P = pytest.mark.parametrize(
     "solver", [BDF(), pytest.param(Rodas5P(), marks=pytest.mark.slow)], ids=["bdf", "rodas5p"]
 )
@@ -90,39 +91,6 @@ def test_robertson_over_eleven_decades(solver):
     assert int(solution.stats["num_steps"]) < 2000
 
 
-# --- jumps ---------------------------------------------------------------------------------------------------------
-
-JUMP = 0.4321
-
-
-def kicked(t, x, z, args):
-    return -50 * x + z
-
-
-def kick(t, x, z, args):
-    return z + z**3 - jnp.where(t < JUMP, 0.0, 10.0)  # z = 2 after the jump
-
-
-@ALSO_BDF
-def test_jumps_that_are_named_cost_less(solver):
-    term, start = DAETerm(kicked, kick), (np.zeros(1), np.zeros(1))
-    ts = np.array([0.3, 0.44, 0.5, 1.0])
-
-    def solve(named):
-        return solve_dae(term, 1.0, start, ts=ts, solver=solver, jump_ts=np.array([named]), throw=False)
-
-    told, untold = solve(JUMP), solve(0.1)  # at 0.1 nothing happens: one step end more
-    assert told.result == diffrax.RESULTS.successful
-    after = np.maximum(ts - JUMP, 0)
-    exact = 2 / 50 * (1 - np.exp(-50 * after))
-    # A hundred times the tolerances, 1e-6 relative and 1e-8 absolute.
-    np.testing.assert_allclose(np.asarray(told.ys[0])[:, 0], exact, rtol=1e-4, atol=1e-6)
-    np.testing.assert_allclose(np.asarray(told.ys[1])[:, 0], np.where(after > 0, 2.0, 0.0), atol=1e-6)
-    error = np.abs(np.asarray(untold.ys[0])[:, 0] - exact).max()
-    more = int(untold.stats["num_steps"]) > int(told.stats["num_steps"]) + 5
-    assert error > 1e-4 or more or untold.result != diffrax.RESULTS.successful
-
-
 # --- error norms --------------------------------------------------------------------------------------------------
 
 
@@ -142,7 +110,6 @@ def test_algebraic_errors_can_be_left_out():
 # --- linear algebra ------------------------------------------------------------------------------------------------
 
 
-@functools.cache
 def heat_in_a_rod(solver, linear):
     """Its ends are held: algebraic equations u = 0 there. sin(πx) decays with the discrete eigenvalue: (u at t = 0.1,
     the closed form)."""
@@ -162,43 +129,138 @@ def heat_in_a_rod(solver, linear):
     return np.asarray(found), u0 * np.exp(-0.1 * 4 / h**2 * np.sin(np.pi * h / 2) ** 2)
 
 
-@pytest.mark.parametrize("solver", [BDF, pytest.param(Rodas5P, marks=slow)])
-def test_sparse_steps(solver):
-    pytest.importorskip("klujax")
-    found, exact = heat_in_a_rod(solver, KLU)
-    np.testing.assert_allclose(found, exact, rtol=1e-4, atol=1e-6)  # a hundred times rtol
-
-
 @slow
 @pytest.mark.parametrize("solver", [BDF, Rodas5P])
 def test_sparse_steps_are_dense_steps(solver):
     pytest.importorskip("klujax")
     (sparse, exact), (dense, _) = (heat_in_a_rod(solver, linear) for linear in (KLU, Dense))
-    np.testing.assert_allclose(dense, exact, rtol=1e-4, atol=1e-6)
+    for found in (sparse, dense):
+        np.testing.assert_allclose(found, exact, rtol=1e-4, atol=1e-6)  # a hundred times rtol
     np.testing.assert_allclose(
         sparse, dense, rtol=2e-6, atol=1e-8
     )  # rounding changes BDF's decisions, within the tolerances
 
 
-# --- saved values, direction ---------------------------------------------------------------------------------------
+# --- jumps, directions, tolerances: one program for three problems ---------------------------------------------------
 
 
 def circle(t, x, z, args):
-    return jnp.array([-x[1] * z[0], x[0] * z[0]])
+    return jnp.stack([-x[1] * z[0], x[0] * z[0]])
 
 
 def one(t, x, z, args):
     return z + z**3 - 2 * (x[0] ** 2 + x[1] ** 2)  # z = 1 on the unit circle
 
 
-START = np.array([1.0, 0.0]), np.ones(1)
-
-
 def exact_turn(ts):
     return np.stack([np.cos(ts), np.sin(ts)], axis=1)
 
 
-@ALSO_RODAS5P
+JUMP = 0.4321
+
+
+def kicked(t, x, z, args):
+    return jnp.stack([-50 * x[0] + z[0], 0 * z[0]])
+
+
+def kick(t, x, z, args):
+    return z + z**3 - jnp.where(t < JUMP, 0.0, 10.0)  # z = 2 after the jump
+
+
+def follower(t, x, z, decay):
+    return jnp.stack([-decay * (x[0] - jnp.cos(t)), 0 * z[0]])
+
+
+def nothing(t, x, z, args):
+    return z
+
+
+CIRCLE, KICKED, FOLLOWER = ((circle, one), (kicked, kick), (follower, nothing))
+PAIRS = [CIRCLE, KICKED, FOLLOWER]
+START = np.array([1.0, 0.0]), np.ones(1)
+
+
+class Program:
+    """(problem, interval, start, times, tolerance, a time of a jump, decay) to a solution."""
+
+    def __init__(self, solver):
+        self.traces = 0
+
+        def f(t, x, z, args):
+            self.traces += 1
+            return jax.lax.select_n(args[0], *(f(t, x, z, args[1]) for f, _ in PAIRS))
+
+        def g(t, x, z, args):
+            return jax.lax.select_n(args[0], *(g(t, x, z, args[1]) for _, g in PAIRS))
+
+        @jax.jit
+        def run(which, t0, t1, y0, ts, rtol, jump, decay):
+            solution = solve_dae(
+                DAETerm(f, g), t1, y0, t0=t0, ts=ts, solver=solver, rtol=rtol, atol=rtol / 100, jump_ts=jump,
+                args=(which, decay), throw=False,
+            )  # fmt: skip
+            return solution.ys, solution.stats["num_steps"], diffrax.is_okay(solution.result)
+
+        self.run = run
+
+    def __call__(self, pair, ts, rtol, y0=START, t0=0.0, jump=0.0, decay=1.0):
+        which, end = np.int32(PAIRS.index(pair)), np.array(ts[-1])
+        return self.run(which, np.array(t0), end, y0, ts, np.array(rtol), np.array([jump]), np.array(decay))
+
+
+program = functools.cache(Program)
+
+
+@ALSO_BDF
+def test_jumps_that_are_named_cost_less(solver):
+    ts = np.linspace(0.0, 1.0, 101)
+    start = np.zeros(2), np.zeros(1)
+    (x, z), told, okay = program(solver)(KICKED, ts, 1e-6, start, jump=JUMP)
+    assert okay
+    after = np.maximum(ts - JUMP, 0)
+    exact = 2 / 50 * (1 - np.exp(-50 * after))
+    # A hundred times the tolerances, 1e-6 relative and 1e-8 absolute.
+    np.testing.assert_allclose(np.asarray(x)[:, 0], exact, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(np.asarray(z)[:, 0], np.where(after > 0, 2.0, 0.0), atol=1e-6)
+    (x, _), untold, okay = program(solver)(KICKED, ts, 1e-6, start, jump=0.1)  # where nothing happens
+    assert np.abs(np.asarray(x)[:, 0] - exact).max() > 1e-4 or untold > told + 5 or not okay
+
+
+@ALSO_BDF
+def test_there_and_back(solver):
+    (x, z), _, _ = program(solver)(CIRCLE, np.linspace(0.0, 6.0, 101), 1e-8)
+    ts = np.linspace(6.0, 0.0, 101)
+    (back, _), _, _ = program(solver)(CIRCLE, ts, 1e-8, (np.asarray(x)[-1], np.asarray(z)[-1]), t0=6.0)
+    for found, times in ((x, ts[::-1]), (back, ts)):
+        np.testing.assert_allclose(found, exact_turn(times), rtol=0, atol=1e-6)  # a hundred times the tolerance
+
+
+@ALSO_BDF
+def test_new_tolerances_are_no_new_program(solver):
+    ts = np.linspace(0.0, 1.0, 101)
+    coarse, taken = program(solver)(CIRCLE, ts, 1e-3)[0][0], program(solver).traces
+    fine = program(solver)(CIRCLE, ts, 1e-9)[0][0]
+    assert taken > 0 and program(solver).traces == taken
+    assert np.abs(fine - exact_turn(ts)).max() < 1e-7  # a hundred times rtol
+    assert 1e-7 < np.abs(coarse - exact_turn(ts)).max() < 0.1  # the other program's tolerance was in force
+
+
+@pytest.mark.parametrize("decay", [1e3, 1e6])
+def test_stiff_unknowns_between_the_ends_of_steps(decay):
+    """x' = −λ (x − cos t) is cos t but for 1/λ, and right at the ends of steps, however long; between them the
+    polynomial was off by 0.07."""
+    ts = np.linspace(0.0, 10.0, 101)
+    (x, _), steps, _ = program(RODAS5P)(FOLLOWER, ts, 1e-6, (np.array([1.0, 0.0]), np.zeros(1)), decay=decay)
+    exact = (decay**2 * np.cos(ts) + decay * np.sin(ts) + np.exp(-decay * ts)) / (1 + decay**2)
+    np.testing.assert_allclose(np.asarray(x)[:, 0], exact, rtol=0, atol=2e-6)
+    assert steps < 80
+
+
+# --- dense output, single precision, batches -------------------------------------------------------------------------
+
+
+@slow
+@SOLVERS
 def test_dense_output_is_what_is_saved(solver):
     ts = np.linspace(0.0, 6.0, 37)
     controller = StepControl(1e-8, 1e-10, steered=isinstance(solver, BDF))
@@ -216,56 +278,13 @@ def test_dense_output_is_what_is_saved(solver):
     np.testing.assert_allclose(run()[1][0], exact_turn(ts), rtol=0, atol=1e-6)  # a hundred times the tolerance
 
 
-class Turn:
-    """The circle at any times and tolerances, by one program."""
-
-    def __init__(self, solver):
-        self.traces = 0
-
-        def counted(t, x, z, args):
-            self.traces += 1
-            return circle(t, x, z, args)
-
-        @jax.jit
-        def run(t0, t1, y0, ts, rtol):
-            return solve_dae(
-                DAETerm(counted, one), t1, y0, t0=t0, ts=ts, solver=solver, rtol=rtol, atol=rtol / 100, throw=False
-            ).ys
-
-        self.run = run
-
-
-turn = functools.cache(Turn)
-
-
-@ALSO_BDF
-def test_there_and_back(solver):
-    run = turn(solver).run
-    end = jax.tree.map(lambda v: np.asarray(v)[-1], run(0.0, 6.0, START, np.array([1.0, 4.0, 6.0]), 1e-8))
-    ts = np.array([5.0, 3.0, 0.0])
-    back = run(6.0, 0.0, end, ts, 1e-8)
-    np.testing.assert_allclose(back[0], exact_turn(ts), rtol=0, atol=1e-6)
-
-
-@ALSO_BDF
-def test_new_tolerances_are_no_new_program(solver):
-    ts = np.array([0.2, 0.5, 1.0])
-    coarse, taken = turn(solver).run(0.0, 1.0, START, ts, 1e-3)[0], turn(solver).traces
-    fine = turn(solver).run(0.0, 1.0, START, ts, 1e-9)[0]
-    assert taken > 0 and turn(solver).traces == taken
-    assert np.abs(fine - exact_turn(ts)).max() < 1e-7  # a hundred times rtol
-    assert 1e-7 < np.abs(coarse - exact_turn(ts)).max() < 0.1  # the other program's tolerance was in force
-
-
-@ALSO_BDF
+@slow
+@SOLVERS
 def test_single_precision(solver):
     y0 = jax.tree.map(lambda v: v.astype(np.float32), START)
     solution = solve_dae(DAETerm(circle, one), 6.0, y0, solver=solver, rtol=1e-4, atol=1e-5)
     assert {v.dtype for v in jax.tree.leaves(solution.ys)} == {np.dtype(np.float32)}
     np.testing.assert_allclose(solution.ys[0][0], [np.cos(6.0), np.sin(6.0)], rtol=0, atol=1e-2)  # a hundred times rtol
-
-
-# --- batches, stiff unknowns ---------------------------------------------------------------------------------------
 
 
 @slow
@@ -285,17 +304,3 @@ def test_batches_with_the_stock_controller(solver):
     # z' = −a·z/(3z² + 1), so that 3/2·(z² − 1) + ln z = −a·t from z(0) = 1: z in closed form up to one logarithm.
     z = np.asarray(end(jnp.asarray(rates)))
     np.testing.assert_allclose(1.5 * (z**2 - 1) + np.log(z), -rates, rtol=0, atol=1e-5)  # a hundred times rtol
-
-
-FOLLOWER = DAETerm(lambda t, x, a: -a * (x - jnp.cos(t)), mass=[1.0])
-
-
-@pytest.mark.parametrize("decay", [1e3, 1e6])
-def test_stiff_unknowns_between_the_ends_of_steps(decay):
-    """x' = −λ (x − cos t) is cos t but for 1/λ, and right at the ends of steps, however long; between them the
-    polynomial was off by 0.07."""
-    ts = np.linspace(0.0, 10.0, 101)
-    found = solve_dae(FOLLOWER, 10.0, np.ones(1), ts=ts, solver=Rodas5P(), args=np.array(decay), rtol=1e-6, atol=1e-8)
-    exact = (decay**2 * np.cos(ts) + decay * np.sin(ts) + np.exp(-decay * ts)) / (1 + decay**2)
-    np.testing.assert_allclose(np.asarray(found.ys)[:, 0], exact, rtol=0, atol=2e-6)
-    assert found.stats["num_steps"] < 80

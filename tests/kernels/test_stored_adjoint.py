@@ -111,14 +111,14 @@ def test_more_steps_than_rows(t1, max_steps):
         solved = solve(args, y0, adjoint, t1=t1, dt0=None, controller=controller, term=term, max_steps=max_steps)
         return jnp.array([1.0, 2.0]) @ jnp.mean(solved.ys[0], axis=1)
 
-    value, slope = jax.jit(jax.value_and_grad(lambda args: final(args, STORED)))(1.0)
+    value, slope = jax.jit(jax.value_and_grad(lambda args: final(args, STORED)))(np.array(1.0))
     exact = np.array([np.cos(t1) + 0.5 * np.sin(t1), 0.5 * np.cos(t1) - np.sin(t1)]) @ [1.0, 2.0]
     turned = t1 * np.array([0.5 * np.cos(t1) - np.sin(t1), -np.cos(t1) - 0.5 * np.sin(t1)]) @ [1.0, 2.0]
     # Steps of 0.07 with an error constant of about 1e-4 at order 5: 1e-4·0.07^5·t1 = 3e-8 of the angle, times t1.
     np.testing.assert_allclose(value, exact, atol=1e-7)
     np.testing.assert_allclose(slope, turned, atol=1e-7 * t1)
     if copies > 1:
-        forward = jax.jit(jax.jacfwd(lambda args: final(args, diffrax.ForwardMode())))(1.0)
+        forward = jax.jit(jax.jacfwd(lambda args: final(args, diffrax.ForwardMode())))(np.array(1.0))
         agree(slope, forward)
 
 
@@ -175,7 +175,7 @@ def test_end_in_closed_form():
     def final(t0, t1):
         return solve(-0.5, jnp.array([2.0]), STORED, t0=t0, t1=t1, term=term, controller=controller).ys[0, 0]
 
-    value, (by_start, by_end) = jax.jit(jax.value_and_grad(final, (0, 1)))(0.5, 2.0)
+    value, (by_start, by_end) = jax.jit(jax.value_and_grad(final, (0, 1)))(np.array(0.5), np.array(2.0))
     y = 2 * np.exp(-0.25 * (2.0**2 - 0.5**2))
     np.testing.assert_allclose([value, by_start, by_end], [y, 0.25 * y, -y], rtol=1e-8)
 
@@ -203,7 +203,7 @@ def slope_with_rejected_steps(adjoint):
         solved = solve(a, np.array([1.0]), adjoint, t1=1.0, dt0=20.0, term=term, controller=strict)
         return solved.ys[0, 0], solved.stats["num_rejected_steps"]
 
-    return jax.jit(jax.value_and_grad(final, has_aux=True))(1.9)
+    return jax.jit(jax.value_and_grad(final, has_aux=True))(np.array(1.9))
 
 
 def test_rejected_steps_do_no_harm():
