@@ -262,7 +262,7 @@ def test_a_model_that_is_not_finite_at_its_start(folded, solver):
         simulate(system, 6.0, ts=TS, solver=solver)
     assert str(caught.value) == (
         "the integration stopped at t=0: an equation is not finite at the start, cell: 0 = -a*sqrt(-b + x) + der(x) + "
-        "1, with 'cell.a' = 1, 'cell.b' = 3, 'cell.x' = 2. Start elsewhere, or look for a division by zero, or a root "
+        "1, with 'cell.x' = 2, 'cell.a' = 1, 'cell.b' = 3. Start elsewhere, or look for a division by zero, or a root "
         "or logarithm without a real value."
     )
     found = simulate(system, 6.0, ts=TS, solver=solver, throw=False)
