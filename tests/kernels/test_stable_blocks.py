@@ -12,9 +12,10 @@ import mpmath
 import numpy as np
 import pytest
 from attack import circuits
+from problems import compiled
+from shared_models import attenuator, levers
 
-from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der
-from jaxonomy_dae.library.electrical import Capacitor, Ground, Resistor, VoltageSource
+from jaxonomy_dae import AcausalCompiler, Component, EqnEnv, der
 from jaxonomy_dae.linear.torn import solve_torn
 from jaxonomy_dae.linear.written_out import solve, solve_dense
 from jaxonomy_dae.structure.tearing import LINKS, Sizes, Tearing, tear
@@ -102,7 +103,7 @@ def random_block(rng, n):
             return a
 
 
-@pytest.mark.parametrize("n", [3, 6, pytest.param(12, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [pytest.param(3, marks=pytest.mark.slow), 6, pytest.param(12, marks=pytest.mark.slow)])
 def test_random_blocks_in_random_units(n):
     """The unknowns are known beforehand; each entry is scaled by its equation's and its unknown's unit."""
     rng = np.random.default_rng(7 + n)
@@ -130,14 +131,18 @@ def test_derivatives_of_a_block(n):
 
     c = rng.normal(size=len(b))
     a_dot = np.where(pattern, rng.normal(size=a.shape), 0.0) * a
+
+    @jax.jit
+    def derivatives(a, a_dot):
+        gradient = jax.grad(lambda a: c @ function(a, b))
+        reverse, second = jax.jvp(gradient, (a,), (a_dot,))
+        return c @ jax.jvp(lambda a: function(a, b), (a,), (a_dot,))[1], jnp.sum(reverse * a_dot), second
+
+    forward, reverse, second = derivatives(a, a_dot)
     expected = -c @ np.linalg.solve(a, a_dot @ np.linalg.solve(a, b))
-    forward = c @ jax.jvp(lambda a: function(a, b), (a,), (a_dot,))[1]
-    gradient = jax.jit(jax.grad(lambda a: c @ function(a, b)))
-    reverse = jnp.sum(gradient(a) * a_dot)
     scale = np.abs(c) @ np.abs(np.linalg.solve(a, a_dot @ np.linalg.solve(a, b)))
     np.testing.assert_allclose(forward, expected, rtol=0, atol=1e-12 * scale)
     np.testing.assert_allclose(reverse, expected, rtol=0, atol=1e-12 * scale)
-    second = jax.jvp(gradient, (a,), (a_dot,))[1]
     inverse = np.linalg.inv(a)
     # gradient = −(A⁻ᵀ c)(A⁻¹ b)ᵀ on the pattern
     y, x = inverse.T @ c, inverse @ b
@@ -173,7 +178,7 @@ def exact_solution(a, b):
     return x, np.abs(inverse) @ (np.abs(a) @ np.abs(x) + np.abs(b))
 
 
-@pytest.mark.parametrize("n", [3, 4, 7])
+@pytest.mark.parametrize("n", [pytest.param(3, marks=pytest.mark.slow), 4, pytest.param(7, marks=pytest.mark.slow)])
 def test_one_tearing_variable_costs_no_digits(n):
     """Entries and right-hand sides over twelve decades, units over eighteen, and terms that cancel: the error is that
     of relative changes of the entries by some eps, in each unknown, for A and for its transpose."""
@@ -186,17 +191,18 @@ def test_one_tearing_variable_costs_no_digits(n):
     def function(a, b):
         return jnp.stack(solve_torn(tearing, entries(a, pattern) | fixed, list(b)))
 
-    def adjoint(a, b):
-        return jax.vjp(lambda b: function(a, b), b)[1](b)[0]
+    @jax.jit
+    def both(a, b):
+        found, back = jax.vjp(lambda b: function(a, b), b)
+        return found, back(b)[0]
 
-    function, adjoint = jax.jit(function), jax.jit(adjoint)
     for _ in range(25):
         some, b = np.where(numbers, a, a * 10 ** rng.uniform(-6, 6, a.shape)), rng.normal(size=n)
         b *= 10 ** rng.uniform(-6, 6, n)
         if rng.random() < 0.5:  # the last equation is one of the others, or nearly
             u = rng.integers(n - 1)
             some[-1, -1] = some[-1, u] / some[u, u] * some[u, -1] * (1 + rng.choice([1e-3, 1e-8]))
-        for found, matrix in ((function(some, b), some), (adjoint(some, b), some.T)):
+        for found, matrix in zip(both(some, b), (some, some.T), strict=True):
             x, change = exact_solution(matrix, b)
             assert (np.abs(found - x) <= 20 * n * np.finfo(float).eps * change).all()
 
@@ -209,8 +215,8 @@ def test_batches_members_of_which_need_different_pivots():
     batch = np.stack(
         [ladder_block(np.full(n + 1, s), np.full(n, p))[0] for s, p in ((1e4, 1e-4), (1e-4, 1e4), (1.0, 1.0))]
     )
-    found = jax.vmap(function, in_axes=(0, None))(batch, b)
-    for a, x in zip(batch, found, strict=True):
+    found = jax.jit(jax.vmap(function, in_axes=(0, None)))(batch, b)
+    for a, x in zip(batch, np.asarray(found), strict=True):
         np.testing.assert_allclose(x[:n], np.linalg.solve(a, b)[:n], rtol=0, atol=1e-13)
 
 
@@ -220,44 +226,29 @@ def test_a_singular_block_is_not_a_number():
     assert np.isnan(function(a, np.array([1.0, 2.0]))).all()
 
 
-@pytest.mark.parametrize("n", [2, 3, 5])
+@pytest.mark.parametrize("n", [pytest.param(2, marks=pytest.mark.slow), 3, pytest.param(5, marks=pytest.mark.slow)])
 def test_pivots_do_not_depend_on_the_scale_of_an_equation(n):
     """Partial pivoting alone would take the row that is written in large units, whatever its pivot is worth."""
     rng = np.random.default_rng(n)
-    for _ in range(20):
-        a, x = rng.normal(size=(n, n)), rng.normal(size=n)
-        a[0, 0] = 1e-14
-        scale = np.ones(n)
-        scale[0] = 1e18
-        exact = np.linalg.solve(a, a @ x)
-        rows, right = (a * scale[:, None]), (a @ x) * scale
-        tolerance = 1e-14 * np.linalg.cond(a) * n
-        written = solve([[jnp.asarray(v) for v in row] for row in rows], [jnp.asarray(v) for v in right])
-        np.testing.assert_allclose(jnp.stack(written), exact, rtol=0, atol=10 * tolerance)
-        np.testing.assert_allclose(
-            solve_dense(jnp.asarray(rows), jnp.asarray(right)), exact, rtol=0, atol=10 * tolerance
-        )
+    a, x = rng.normal(size=(20, n, n)), rng.normal(size=(20, n))
+    a[:, 0, 0] = 1e-14
+    right = np.einsum("kij,kj->ki", a, x)
+    exact = np.linalg.solve(a, right[..., None])[..., 0]
+    scale = np.ones(n)
+    scale[0] = 1e18
+
+    @jax.jit
+    @jax.vmap
+    def both(rows, right):
+        written = solve([[rows[e, u] for u in range(n)] for e in range(n)], [right[e] for e in range(n)])
+        return jnp.stack(written), solve_dense(rows, right)
+
+    tolerance = 10 * 1e-14 * np.linalg.cond(a) * n
+    for found in both(a * scale[:, None], right * scale):
+        assert (np.abs(found - exact) <= tolerance[:, None]).all()
 
 
 # --- compiled models ----------------------------------------------------------------------------------------------
-
-
-def attenuator(n, rs=1.0, rp=1.0):
-    """n sections of the library's resistors between a source of 1 V and a capacitor at 0 V."""
-    ev, diagram = EqnEnv(), AcausalDiagram()
-    source, ground, end = VoltageSource(ev, "V", v=1.0), Ground(ev, "G"), Capacitor(ev, "C", initial_voltage=0.0)
-    low, at = [source.n, ground.p, end.n], source.p
-    for k in range(n):
-        s, p = Resistor(ev, f"s{k}", R=rs), Resistor(ev, f"p{k}", R=rp)
-        diagram.connect(at, s.p)
-        diagram.connect(s.n, p.p)
-        low.append(p.n)
-        at = s.n
-    last = Resistor(ev, "last", R=rs)
-    diagram.connect(at, last.p)
-    diagram.connect(last.n, end.p)
-    diagram.connect(*low)
-    return AcausalCompiler(ev, diagram)()
 
 
 def node_voltages(rs, rp):
@@ -270,11 +261,18 @@ def node_voltages(rs, rp):
 
 
 def observed(system, n):
-    return np.asarray(system.observe([f"p{k}.v" for k in range(n)], 0.0, jnp.zeros(1)))
+    return np.asarray(jax.jit(lambda x: system.observe([f"p{k}.v" for k in range(n)], 0.0, x))(np.zeros(1)))
 
 
-@pytest.mark.parametrize(("rs", "rp"), [(1.0, 1.0), (100.0, 1.0), (1.0, 100.0), (1e4, 1e-4), (1e-4, 1e4)])
-@pytest.mark.parametrize("n", [2, 12, pytest.param(40, marks=pytest.mark.slow)])
+RATIOS = ((100.0, 1.0), (1e-4, 1e4), (1.0, 1.0), (1.0, 100.0), (1e4, 1e-4))
+
+
+@pytest.mark.parametrize(
+    ("n", "rs", "rp"),
+    [(12, *ratio) for ratio in RATIOS[:2]]
+    + [pytest.param(12, *ratio, marks=pytest.mark.slow) for ratio in RATIOS[2:]]
+    + [pytest.param(n, *ratio, marks=pytest.mark.slow) for n in (2, 40) for ratio in RATIOS],
+)
 def test_attenuators(n, rs, rp):
     found = observed(attenuator(n, rs, rp), n)
     np.testing.assert_allclose(found, node_voltages(np.full(n + 1, rs), np.full(n, rp)), rtol=0, atol=1e-12)
@@ -286,17 +284,17 @@ def test_parameters_changed_after_compiling(n):
     rng = np.random.default_rng(n)
     names = [f"s{k}.R" for k in range(n)] + ["last.R"] + [f"p{k}.R" for k in range(n)]
     weights = rng.normal(size=n)
-    compiled = attenuator(n)
+    plain = attenuator(n)
 
     def voltages(values):
-        system = compiled.with_parameters(dict(zip(names, values, strict=True)))
+        system = plain.with_parameters(dict(zip(names, values, strict=True)))
         v = system.observe([f"p{k}.v" for k in range(n)], 0.0, jnp.zeros(1))
-        return jnp.asarray(weights) @ v, v
+        return weights @ v, v
 
     cases = [np.concatenate([np.full(n + 1, s), np.full(n, p)]) for s, p in ((1e4, 1.0), (1.0, 1e4), (1e4, 1e-4))]
     cases += [10 ** rng.uniform(-4, 4, 2 * n + 1) for _ in range(10)] + [10 ** rng.uniform(-1, 1, 2 * n + 1)]
     function = jax.jit(jax.vmap(jax.value_and_grad(voltages, has_aux=True)))
-    (_, batch), gradients = function(jnp.array(cases))
+    (_, batch), gradients = jax.tree.map(np.asarray, function(np.array(cases)))
     for values, found in zip(cases, batch, strict=True):
         expected = node_voltages(values[: n + 1], values[n + 1 :])
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
@@ -309,77 +307,28 @@ def test_parameters_changed_after_compiling(n):
         np.testing.assert_allclose(gradient[k], weights @ change / (2 * h[k]), rtol=1e-6, atol=1e-9)
 
 
-# --- the choice of states, and projection --------------------------------------------------------------------------
+# --- projection -----------------------------------------------------------------------------------------------------
 
 
-class Levers(Component):
-    """Two rigid couplings of three carriages, written in units `u` of length and with equations multiplied by `k`."""
-
-    def __init__(self, ev, name, k=1.0, u=1.0, order=(0, 1)):
-        super().__init__(ev, name)
-        x = [self.variable(f"x{i}", start=s * u, nominal=u) for i, s in enumerate((0.3, 0.6, 1.5))]
-        v = [self.variable(f"v{i}", nominal=u) for i in range(3)]
-        f = [self.variable(f"f{i}", nominal=u) for i in range(2)]
-        self.add_equations(*(der(a) - b for a, b in zip(x, v, strict=True)))
-        self.add_equations(der(v[0]) + x[0] - 2 * f[0], der(v[1]) + f[0] - 5 * f[1], der(v[2]) + f[1])
-        a, b = self.parameter("a", 2.0), self.parameter("b", 2.5)
-        constraints = [k * (a * x[0] - x[1]), k * (2 * b * x[1] - 2 * x[2])]
-        self.add_equations(*(constraints[i] for i in order))
+RESCALED = ({"k": 1e9}, {"k": 1e-9}, {"k": 1e-12}, {"u": 1e-12}, {"u": 1e9}, {"order": (1, 0)})
 
 
-def levers(mode, **options):
-    ev = EqnEnv()
-    diagram = AcausalDiagram()
-    diagram.add(Levers(ev, "c", **options))
-    return AcausalCompiler(ev, diagram, state_selection=mode)()
-
-
-RESCALED = ({"k": 1e9}, {"k": 1e-9}, {"k": 1e-12}, {"u": 1e-12}, {"u": 1e9}, {"k": 1e9, "u": 1e-6}, {"order": (1, 0)})
-
-
-def test_scales_and_order_do_not_choose_states():
-    plain = levers("dummy_derivatives").states
-    assert len(plain) == 2
-    for options in RESCALED:
-        assert levers("dummy_derivatives", **options).states == plain, options
-
-
-class Geared(Component):
-    """Two speeds joined by A·v = D·w, a mass on a spring and a wheel that is driven."""
-
-    def __init__(self, ev, name, A, D):
-        super().__init__(ev, name)
-        A, D = self.parameter("A", A), self.parameter("D", D)
-        x, phi, q, p = (self.variable(k) for k in ("x", "phi", "q", "p"))
-        v, w = self.variable("v", start=0.0), self.variable("w", start=0.0)
-        self.add_equations(der(x) - v, der(phi) - w, q - A * v, q - D * w)
-        self.add_equations(der(v) + x + A * p, der(w) - 1 - D * p)
-
-
-@pytest.mark.parametrize("prefer", ["v", "w"])
-@pytest.mark.parametrize("ratio", [1e-6, 0.01, 1.0, 100.0, 1e6])
-def test_preferred_states_whatever_the_coefficients(prefer, ratio):
-    """Which of two speeds is a state is a choice as good as the other, though their coefficients differ; a preference
-    was ignored where they did by more than ten times."""
-    ev = EqnEnv()
-    diagram = AcausalDiagram().add(Geared(ev, "m", 1.0, ratio))
-    assert f"m.{prefer}" in AcausalCompiler(ev, diagram, prefer_states=[f"m.{prefer}"])().states
-
-
-def test_projection_in_any_units():
+@pytest.mark.parametrize(
+    "options", [{}, {"k": 1e9, "u": 1e-6}, *(pytest.param(given, marks=pytest.mark.slow) for given in RESCALED)]
+)
+def test_projection_in_any_units(options):
     """The nearest point of x1 = 2 x0, x2 = 5/2 x1 in the norm of nominal values, in closed form; more constraints than
     the elimination written out takes would use LAPACK: both are compared."""
     start = np.array([0.31, 0.58, 1.52])
     along = np.array([1.0, 2.0, 5.0])
     nearest = along * (along @ start) / (along @ along)
-    for options in ({}, *RESCALED):
-        system = levers("projection", **options)
-        u = options.get("u", 1.0)
-        place = [system.states.index(f"c.x{i}") for i in range(3)]
-        x = np.zeros(len(system.states))
-        x[place] = start * u
-        moved = np.asarray(system.project(0.0, jnp.asarray(x)))
-        np.testing.assert_allclose(moved[place] / u, nearest, rtol=1e-13, err_msg=str(options))
+    system = levers("projection", **options)
+    u = options.get("u", 1.0)
+    place = [system.states.index(f"c.x{i}") for i in range(3)]
+    x = np.zeros(len(system.states))
+    x[place] = start * u
+    moved = np.asarray(jax.jit(lambda x: system.project(0.0, x))(x))
+    np.testing.assert_allclose(moved[place] / u, nearest, rtol=1e-13)
 
 
 # --- nonlinear blocks that are alike ----------------------------------------------------------------------------------
@@ -397,19 +346,24 @@ class Filter(Component):
         self.add_equations(*(v + v**3 + c * sum(w**3 for w in z) - (k + 1) * x for k, v in enumerate(z)))
 
 
-@pytest.mark.parametrize("m, n", [(2, 2), (1, 7)])
+@pytest.mark.parametrize("m, n", [(2, 2), pytest.param(1, 7, marks=pytest.mark.slow)])
 def test_the_field_of_nonlinear_blocks_that_are_alike(m, n):
     """`vector_field` failed with an `IndexError` where two blocks are alike. The rates of their unknowns are compared
     with those of the implicit function theorem."""
     ev = EqnEnv()
-    diagram = AcausalDiagram().add(*(Filter(ev, f"f{k}", m) for k in range(n)))
-    system = AcausalCompiler(ev, diagram)()
-    start = {f"f{k}.x": 0.5 + k for k in range(n)}
-    state = system.initialize(initial={name: jnp.asarray(v) for name, v in start.items()})
+    system = compiled(*(Filter(ev, f"f{k}", m) for k in range(n)))
+    unknowns = [f"f{k}.z{j}" for k in range(n) for j in range(m)]
+
+    @jax.jit
+    def run(start):
+        state = system.initialize(initial={f"f{k}.x": start[k] for k in range(n)})
+        return system.observe(unknowns, 0.0, state), system.vector_field(0.0, state)
+
+    values, slopes = (np.asarray(v) for v in run(0.5 + np.arange(n)))
     names = (*system.states, *(system.plan.quantity_name[q] for q in system.plan.carried))
-    rates = dict(zip(names, np.asarray(jax.jit(lambda x: system.vector_field(0.0, x))(state)), strict=True))
+    rates = dict(zip(names, slopes, strict=True))
     for k in range(n):
-        z = np.asarray(system.observe([f"f{k}.z{j}" for j in range(m)], 0.0, state))
+        z = values[k * m : (k + 1) * m]
         drive = np.arange(1, m + 1)
         np.testing.assert_allclose(z + z**3 + 0.1 * np.sum(z**3), drive * (0.5 + k), rtol=1e-12)
         slopes = np.diag(1 + 3 * z**2) + 0.1 * 3 * z**2
@@ -421,6 +375,7 @@ def test_the_field_of_nonlinear_blocks_that_are_alike(m, n):
         np.testing.assert_allclose([rates[f"f{k}.z{j}"] for j in carried], expected[carried], rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_equal_pivots():
     """A circuit with blocks whose pivots tie: XLA compares them anew in every loop, and where it rounds differently, as
     it does without optimization, some loops exchanged rows and others did not (a residual of 4, and not-a-number)."""
