@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import pytest
-from jax.test_util import check_grads
 from sympy import Eq
 from testset.heat import heat_exact, sundials_heat2d
 
@@ -27,7 +26,7 @@ def sparse_example(n: int = 40):
     rows = np.concatenate([np.arange(n), rng.integers(0, n, 2 * n), [0]])
     cols = np.concatenate([np.arange(n), rng.integers(0, n, 2 * n), [0]])
     values = np.concatenate([rng.uniform(8, 10, n), rng.uniform(-1, 1, 2 * n), [0.5]])
-    return jnp.asarray(values), SparsePattern(rows, cols, n), jnp.asarray(rng.normal(size=n))
+    return values, SparsePattern(rows, cols, n), rng.normal(size=n)
 
 
 # --- the operator --------------------------------------------------------------------------------------------------
@@ -36,16 +35,26 @@ def sparse_example(n: int = 40):
 def test_the_operator_is_its_matrix():
     rng = np.random.default_rng(1)
     pattern = SparsePattern(rng.integers(0, 5, 12), rng.integers(0, 7, 12), 7, 5)
-    operator = SparseLinearOperator(jnp.asarray(rng.normal(size=12)), pattern)
-    matrix = operator.as_matrix()
-    x, y = jnp.asarray(rng.normal(size=7)), jnp.asarray(rng.normal(size=5))
-    np.testing.assert_allclose(operator.mv(x), matrix @ x, rtol=1e-14)
-    np.testing.assert_allclose(operator.T.mv(y), matrix.T @ y, rtol=1e-14)
-    np.testing.assert_allclose(operator.T.as_matrix(), matrix.T)
-    assert (operator.in_size(), operator.out_size()) == (7, 5)
-    assert lx.materialise(operator) is operator and lx.linearise(operator) is operator
-    np.testing.assert_allclose((operator + operator).as_matrix(), 2 * matrix)
-    np.testing.assert_allclose(lx.conj(operator).mv(x), matrix @ x, rtol=1e-14)
+    values, x, y = rng.normal(size=12), rng.normal(size=7), rng.normal(size=5)
+
+    @jax.jit
+    def everything(values, x, y):
+        operator = SparseLinearOperator(values, pattern)
+        assert (operator.in_size(), operator.out_size()) == (7, 5)
+        assert lx.materialise(operator) is operator and lx.linearise(operator) is operator
+        return (
+            operator.as_matrix(), operator.T.as_matrix().T, (operator + operator).as_matrix() / 2,
+            operator.mv(x), lx.conj(operator).mv(x), operator.T.mv(y),
+        )  # fmt: skip
+
+    matrix = np.zeros((5, 7))
+    np.add.at(matrix, (pattern.rows, pattern.cols), values)
+    *matrices, product, conjugated, transposed = everything(values, x, y)
+    for found in matrices:
+        np.testing.assert_allclose(found, matrix, rtol=1e-14)
+    for found in (product, conjugated):
+        np.testing.assert_allclose(found, matrix @ x, rtol=1e-14)
+    np.testing.assert_allclose(transposed, matrix.T @ y, rtol=1e-14)
     with pytest.raises(ValueError, match=r"\(12,\)"):
         SparseLinearOperator(jnp.ones(3), pattern)
 
@@ -63,12 +72,13 @@ def test_the_operator_is_its_matrix():
 def test_what_the_pattern_says(offsets, known):
     n = 6
     rows, cols = np.array([(i, i + o) for o in offsets for i in range(n) if 0 <= i + o < n]).T
-    operator = SparseLinearOperator(jnp.arange(1.0, len(rows) + 1), SparsePattern(rows, cols, n))
-    matrix = np.asarray(operator.as_matrix())
+    operator = SparseLinearOperator(jnp.asarray(np.arange(1.0, len(rows) + 1)), SparsePattern(rows, cols, n))
     for name in ("is_diagonal", "is_tridiagonal", "is_lower_triangular", "is_upper_triangular"):
         assert getattr(lx, name)(operator) == (name in known.split())
-    np.testing.assert_array_equal(lx.diagonal(operator), np.diag(matrix))
-    for found, k in zip(lx.tridiagonal(operator), (0, -1, 1), strict=True):
+    parts = jax.jit(lambda v: (lx.diagonal(o := SparseLinearOperator(v, operator.pattern)), *lx.tridiagonal(o)))
+    matrix = np.zeros((n, n))
+    matrix[rows, cols] = operator.values
+    for found, k in zip(parts(operator.values), (0, 0, -1, 1), strict=True):
         np.testing.assert_array_equal(found, np.diag(matrix, k))
     assert lx.is_symmetric(SparseLinearOperator(operator.values, operator.pattern, lx.symmetric_tag))
 
@@ -78,69 +88,95 @@ def test_what_the_pattern_says(offsets, known):
 
 def dense_example(n: int):
     rng = np.random.default_rng(n)
-    return jnp.asarray(rng.normal(size=(n, n)) + 3 * np.eye(n)), jnp.asarray(rng.normal(size=n))
+    return rng.normal(size=(n, n)) + 3 * np.eye(n), rng.normal(size=n)
 
 
 @pytest.mark.parametrize(
     "solver, n",
-    [(WrittenOut(), 1), (WrittenOut(), 4), (Dense(), 3), (Dense(), 20), (Dense(), 40)],
+    [(WrittenOut(), 4), (Dense(), 20)]
+    + [pytest.param(*case, marks=pytest.mark.slow) for case in ((WrittenOut(), 1), (Dense(), 3), (Dense(), 40))],
     ids=lambda v: v if isinstance(v, int) else type(v).__name__,
 )
 def test_dense_solvers(solver, n):
     matrix, b = dense_example(n)
+    m_dot, b_dot = dense_example(n + 50)[0][:n, :n], b[::-1].copy()
 
-    def solve(matrix, b):
-        return lx.linear_solve(lx.MatrixLinearOperator(matrix), b, solver).value
+    @jax.jit
+    def everything(matrix, b, m_dot, b_dot):
+        """A solution, a batch of two, a gradient, a derivative along a direction."""
 
-    np.testing.assert_allclose(jax.jit(solve)(matrix, b), np.linalg.solve(matrix, b), **TIGHT)
-    batch = jnp.stack([matrix, 2 * matrix]), jnp.stack([b, b**2])
-    np.testing.assert_allclose(jax.vmap(solve)(*batch), np.linalg.solve(batch[0], batch[1][..., None])[..., 0], **TIGHT)
-    gradient = jax.jacrev(lambda m: solve(m, b).sum())(matrix)
+        def solve(matrix, b):
+            return lx.linear_solve(lx.MatrixLinearOperator(matrix), b, solver).value
+
+        batch = jax.vmap(solve)(jnp.stack([matrix, 2 * matrix]), jnp.stack([b, b**2]))
+        gradient = jax.jacrev(lambda m: solve(m, b).sum())(matrix)
+        return solve(matrix, b), batch, gradient, jax.jvp(solve, (matrix, b), (m_dot, b_dot))[1]
+
+    found, batch, gradient, forward = everything(matrix, b, m_dot, b_dot)
     x, adjoint = np.linalg.solve(matrix, b), np.linalg.solve(matrix.T, np.ones(n))
+    np.testing.assert_allclose(found, x, **TIGHT)
+    np.testing.assert_allclose(batch, [x, np.linalg.solve(2 * matrix, b**2)], **TIGHT)
     np.testing.assert_allclose(gradient, -np.outer(adjoint, x), **TIGHT)
-    check_grads(solve, (matrix, b), order=1, modes=["fwd"])
+    np.testing.assert_allclose(forward, np.linalg.solve(matrix, b_dot - m_dot @ x), **TIGHT)
 
 
 @installed
 def test_klu():
     values, pattern, b = sparse_example()
 
-    def solve(values, b):
-        return lx.linear_solve(SparseLinearOperator(values, pattern), b, KLU()).value
+    @jax.jit
+    def everything(values, b):
+        def solve(values, b):
+            return lx.linear_solve(SparseLinearOperator(values, pattern), b, KLU()).value
 
-    matrix = np.asarray(pattern.dense(values))
-    np.testing.assert_allclose(jax.jit(solve)(values, b), np.linalg.solve(matrix, b), **TIGHT)
-    np.testing.assert_allclose(
-        jax.vmap(solve, (None, 0))(values, jnp.stack([b, 2 * b]))[1], 2 * solve(values, b), **TIGHT
-    )
+        batch = jax.vmap(solve, (None, 0))(values, jnp.stack([b, 2 * b]))
+        return solve(values, b), batch, jax.grad(lambda v: solve(v, b).sum())(values)
+
+    matrix = np.zeros((40, 40))
+    np.add.at(matrix, (pattern.rows, pattern.cols), values)
+    found, batch, gradient = everything(values, b)
     x, adjoint = np.linalg.solve(matrix, b), np.linalg.solve(matrix.T, np.ones(len(b)))
-    gradient = jax.grad(lambda v: solve(v, b).sum())(values)
+    np.testing.assert_allclose(found, x, **TIGHT)
+    np.testing.assert_allclose(batch, [x, 2 * x], **TIGHT)
     np.testing.assert_allclose(gradient, -adjoint[pattern.rows] * x[pattern.cols], **TIGHT)
     with pytest.raises(ValueError, match="SparseLinearOperator"):
-        lx.linear_solve(lx.MatrixLinearOperator(jnp.asarray(matrix)), b, KLU())
+        lx.linear_solve(lx.MatrixLinearOperator(jnp.asarray(matrix)), jnp.asarray(b), KLU())
 
 
 def test_iterative_solvers_take_the_operator():
     values, pattern, b = sparse_example()
-    found = lx.linear_solve(SparseLinearOperator(values, pattern), b, lx.GMRES(rtol=1e-12, atol=1e-12)).value
-    np.testing.assert_allclose(found, np.linalg.solve(pattern.dense(values), b), rtol=1e-9, atol=1e-10)
+    matrix = np.zeros((40, 40))
+    np.add.at(matrix, (pattern.rows, pattern.cols), values)
+
+    @jax.jit
+    def solve(values, b):
+        solver = lx.GMRES(rtol=1e-12, atol=1e-12)
+        return lx.linear_solve(SparseLinearOperator(values, pattern), b, solver, throw=False).value
+
+    np.testing.assert_allclose(solve(values, b), np.linalg.solve(matrix, b), rtol=1e-9, atol=1e-10)
 
 
 def test_structures_and_scales():
     """Between pytrees; rows in other units; a singular matrix is reported."""
     matrix, b = dense_example(4)
-    rows = jnp.array([1e-12, 1.0, 1e9, 1e-3])
-    operator = lx.PyTreeLinearOperator(
-        [[rows[:1, None] * matrix[:1, :2], rows[:1, None] * matrix[:1, 2:]],
-         [rows[1:, None] * matrix[1:, :2], rows[1:, None] * matrix[1:, 2:]]],
-        [jax.ShapeDtypeStruct((1,), b.dtype), jax.ShapeDtypeStruct((3,), b.dtype)],
-    )  # fmt: skip
-    expected = np.linalg.solve(matrix, b)
-    for solver in (WrittenOut(), Dense()):
-        found = lx.linear_solve(operator, [rows[:1] * b[:1], rows[1:] * b[1:]], solver).value
-        np.testing.assert_allclose(jnp.concatenate(found), expected, **TIGHT)
-        singular = lx.linear_solve(lx.MatrixLinearOperator(jnp.zeros((2, 2))), jnp.ones(2), solver, throw=False)
-        assert singular.result == lx.RESULTS.singular
+    rows = np.array([1e-12, 1.0, 1e9, 1e-3])
+
+    @jax.jit
+    def everything(scaled, right):
+        operator = lx.PyTreeLinearOperator(
+            [[scaled[:1, :2], scaled[:1, 2:]], [scaled[1:, :2], scaled[1:, 2:]]],
+            [jax.ShapeDtypeStruct((1,), b.dtype), jax.ShapeDtypeStruct((3,), b.dtype)],
+        )
+        found = []
+        for solver in (WrittenOut(), Dense()):
+            regular = lx.linear_solve(operator, [right[:1], right[1:]], solver, throw=False).value
+            singular = lx.linear_solve(lx.MatrixLinearOperator(jnp.zeros((2, 2))), jnp.ones(2), solver, throw=False)
+            found.append((jnp.concatenate(regular), singular.result == lx.RESULTS.singular))
+        return found
+
+    for found, is_singular in everything(rows[:, None] * matrix, rows * b):
+        np.testing.assert_allclose(found, np.linalg.solve(matrix, b), **TIGHT)
+        assert is_singular
     with pytest.raises(ValueError, match="Dense"):
         lx.linear_solve(lx.MatrixLinearOperator(jnp.eye(7)), jnp.ones(7), WrittenOut())
 
@@ -148,12 +184,13 @@ def test_structures_and_scales():
 # --- in implicit steps ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_heat_on_a_plate_by_gmres():
     """heat2d with BDF and GMRES: the pattern is given, and no matrix is factorised."""
     problem = sundials_heat2d(m=8)
     one = problem.index_one()
     n = one.y0.shape[0]
-    jacobian = np.asarray(jax.jacfwd(lambda y: one.F(0.0, y, one.args()))(jnp.asarray(one.y0)))
+    jacobian = np.asarray(jax.jit(jax.jacfwd(lambda y: one.F(0.0, y, one.args())))(one.y0))
     rows, cols = np.nonzero(jacobian)
     term = DAETerm(one.F, mass=one.mass, pattern=SparsePattern(rows, cols, n))
     solver = BDF(linear_solver=lx.GMRES(rtol=1e-10, atol=1e-12))
@@ -168,7 +205,7 @@ def test_heat_on_a_plate_by_gmres():
     "linear_solver",
     [
         lx.GMRES(rtol=1e-12, atol=1e-14),
-        lx.LU(),
+        pytest.param(lx.LU(), marks=pytest.mark.slow),
         pytest.param(WrittenOut(), marks=pytest.mark.slow),
         pytest.param(Dense(), marks=pytest.mark.slow),
     ],
@@ -181,7 +218,7 @@ def test_any_lineax_solver(method, linear_solver):
 
     def final(a):
         solver = method(linear_solver=linear_solver)
-        start = jnp.ones(1), jnp.ones(1)
+        start = np.ones(1), np.ones(1)
         return solve_dae(term, 1.0, start, solver=solver, args=a, rtol=1e-8, atol=1e-10, throw=False).ys[0][0, 0]
 
     value, slope = jax.jit(jax.value_and_grad(final))(0.7)
@@ -207,7 +244,7 @@ def test_rows_of_zeros_say_nothing():
     size = np.max(np.abs(matrix), axis=1, keepdims=True)
     expected = np.linalg.lstsq(matrix / size, right / size[:, 0])[0]
     full = np.insert(matrix, [0, 4, 9], 0.0, axis=0), np.insert(right, [0, 4, 9], [1e-17, -1e-16, 1.0])
-    found = least_squares(*(jnp.asarray(a) for a in full))
+    found = jax.jit(least_squares)(*full)
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
@@ -267,8 +304,9 @@ def test_a_given_solver_for_blocks(name):
         return system.with_parameters({"m.load": load}).observe([f"m.u[{k}]" for k in (11, 12, 13)], 0.0, jnp.zeros(1))
 
     # Equations hold to rounding, and the condition number is 9.
-    np.testing.assert_allclose(jax.jit(middle)(2.0), exact[11:14], rtol=1e-13)
-    np.testing.assert_allclose(jax.jit(jax.jacrev(middle))(2.0), exact[11:14] / 2, rtol=1e-13)
+    value, slope = jax.jit(lambda load: (middle(load), jax.jacrev(middle)(load)))(2.0)
+    np.testing.assert_allclose(value, exact[11:14], rtol=1e-13)
+    np.testing.assert_allclose(slope, exact[11:14] / 2, rtol=1e-13)
 
 
 @pytest.mark.slow
@@ -279,10 +317,14 @@ def test_a_given_solver_for_nonlinear_blocks():
     np.testing.assert_allclose(found, membrane_by_hand(8, 0.5), rtol=1e-12)  # the condition number is 20
 
 
+def test_what_is_not_a_solver_for_blocks_is_refused():
+    for wrong, text in ((lx.GMRES, "the class GMRES: write GMRES"), ("gmres", "got 'gmres'")):
+        with pytest.raises(ModelError, match=text):
+            check_linear_solver(wrong)
+
+
+@pytest.mark.slow
 def test_a_given_solver_that_fails_is_named():
     system = membrane(linear_solver=lx.GMRES(rtol=1e-8, atol=1e-8, restart=1, max_steps=1))
     with pytest.raises(SimulationError, match="was not solved .*, though it is not singular: linear_solver=GMRES"):
         simulate(system, 1.0)
-    for wrong, text in ((lx.GMRES, "the class GMRES: write GMRES"), ("gmres", "got 'gmres'")):
-        with pytest.raises(ModelError, match=text):
-            check_linear_solver(wrong)

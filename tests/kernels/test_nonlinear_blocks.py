@@ -154,7 +154,7 @@ def solutions_of_the_pair(system):
     @jax.jit
     @jax.vmap
     def program(u):
-        state = np.array([1.0, 1.3, 0.1])
+        state = jnp.array([1.0, 1.3, 0.1])
         given = {"m.u": u}
         return system.observe(["m.z0", "m.z1"], 0.0, state, given), system.vector_field(0.0, state, given)[1:]
 
