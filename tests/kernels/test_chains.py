@@ -7,44 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import sympy
 from problems import compiled
+from shared_models import cascade, gain
 
 from jaxonomy_dae import Component, EqnEnv, der
 from jaxonomy_dae.lowering import merge
 from jaxonomy_dae.lowering.program import PlannedLoop, PlannedSparse
 
 TIGHT = dict(rtol=1e-12, atol=1e-13)
-
-
-class Filter(Component):
-    """der(x) = u − x, y = a·law(u) + b·x: a filter whose input reaches its output at once."""
-
-    def __init__(self, ev, name, a, b, law):
-        super().__init__(ev, name)
-        a, b = self.parameter("a", a), self.parameter("b", b)
-        u, y = self.variable("u"), self.variable("y")
-        x = self.variable("x", start=0.1, fixed=True)
-        self.add_equations(der(x) - (u - x), y - a * law(u) - b * x)
-
-
-class Cascade(Component):
-    """n filters in series; the first is fed 1 + sin t."""
-
-    def __init__(self, ev, name, n, law):
-        super().__init__(ev, name)
-        parts = [self.add(Filter(ev, f"f{k}", gain(k), 0.2, law)) for k in range(n)]
-        self.add_equations(parts[0].u - sympy.sin(ev.t) - 1)
-        for before, after in zip(parts, parts[1:], strict=False):
-            self.add_equations(after.u - before.y)
-
-
-def gain(k):
-    return float(0.9 + 0.05 * np.sin(k))
-
-
-def cascade(n, law=lambda u: u):
-    return compiled(Cascade(EqnEnv(), "c", n, law))
 
 
 def cascade_slopes(t, x, a, law):
@@ -66,25 +36,35 @@ def by_name(system, array, n):
     return np.asarray(array)[..., [place[f"c.f{k}.x"] for k in range(n)]]
 
 
-@pytest.mark.parametrize("law", [lambda u: u, lambda u: u / (1 + u**2)], ids=["linear", "nonlinear"])
+@pytest.mark.parametrize(
+    "law",
+    [pytest.param(lambda u: u, marks=pytest.mark.slow), lambda u: u / (1 + u**2)],
+    ids=["linear", "nonlinear"],
+)
 def test_cascade(law):
     """Values, and derivatives in both modes."""
     n, t = 16, 0.3
     system = cascade(n, law)
     assert PlannedLoop in kinds(system) and len(kinds(system)) < 6
-    x = jnp.asarray(np.random.default_rng(0).normal(size=n))
+    x = np.random.default_rng(0).normal(size=n)
     a = np.array([gain(k) for k in range(n)])
     reference = cascade_slopes(t, by_name(system, x, n), a, law)
-    np.testing.assert_allclose(by_name(system, jax.jit(lambda x: system.vector_field(t, x))(x), n), reference, **TIGHT)
-    # Every output, too.
-    outputs = system.observe([f"c.f{k}.y" for k in range(n - 1)], t, x)
-    np.testing.assert_allclose(outputs, reference[1:] + by_name(system, x, n)[1:], **TIGHT)
 
     def last(gains, x):
         changed = system.with_parameters({f"c.f{k}.a": gains[k] for k in range(n)})
         return jnp.sum(changed.vector_field(t, x) ** 2)
 
-    forward, reverse = (jax.jit(mode(last, argnums=(0, 1)))(jnp.asarray(a), x) for mode in (jax.jacfwd, jax.jacrev))
+    @jax.jit
+    def everything(a, x):
+        """Slopes, those of a batch, every output, derivatives in both modes."""
+        outputs = system.observe([f"c.f{k}.y" for k in range(n - 1)], t, x)
+        batch = jax.vmap(lambda x: system.vector_field(t, x))(jnp.stack([x, 2 * x]))
+        slopes = [mode(last, argnums=(0, 1))(a, x) for mode in (jax.jacfwd, jax.jacrev)]
+        return system.vector_field(t, x), batch, outputs, slopes
+
+    field, batch, outputs, (forward, reverse) = jax.tree.map(np.asarray, everything(a, x))
+    np.testing.assert_allclose(by_name(system, field, n), reference, **TIGHT)
+    np.testing.assert_allclose(outputs, reference[1:] + by_name(system, x, n)[1:], **TIGHT)
     for one, other in zip(forward, reverse, strict=True):
         np.testing.assert_allclose(one, other, **TIGHT)
     h = 1e-5  # the differences' errors: h² ~ 1e-10, and 1e-16 / h ~ 1e-11
@@ -92,8 +72,9 @@ def test_cascade(law):
         e = h * np.eye(n)[k]
         values = [np.sum(cascade_slopes(t, by_name(system, x, n), a + s * e, law) ** 2) for s in (1, -1)]
         np.testing.assert_allclose(forward[0][k], (values[0] - values[1]) / (2 * h), rtol=1e-7, atol=1e-8)
-    batch = jax.vmap(lambda x: system.vector_field(t, x))(jnp.stack([x, 2 * x]))
-    np.testing.assert_allclose(batch[1], system.vector_field(t, 2 * x), **TIGHT)
+    for member, at in zip(batch, (x, 2 * x), strict=True):
+        expected = cascade_slopes(t, by_name(system, at, n), a, law)
+        np.testing.assert_allclose(by_name(system, member, n), expected, **TIGHT)
 
 
 @pytest.mark.parametrize("sizes", [(100, 400), pytest.param((100, 10_000), marks=pytest.mark.slow)])
@@ -160,14 +141,23 @@ def check(system, rule, n):
     def slope(p, x):
         return system.with_parameters({"c.p": p}).vector_field(0.0, jnp.array([x]))[0]
 
-    found = system.observe([f"c.y{k}" for k in range(n)], 0.0, jnp.array([0.7]))
-    np.testing.assert_allclose(found, np.array(reference(0.7, 0.8)), **TIGHT)
-    expected = jax.jit(jax.jacfwd(lambda p, x: -reference(x, p)[-1], argnums=(0, 1)))(0.8, 0.7)
-    for mode in (jax.jacfwd, jax.jacrev):
-        np.testing.assert_allclose(jax.jit(mode(slope, argnums=(0, 1)))(0.8, 0.7), expected, **TIGHT)
+    @jax.jit
+    def everything(p, x):
+        outputs = system.observe([f"c.y{k}" for k in range(n)], 0.0, x[None])
+        return outputs, [mode(slope, argnums=(0, 1))(p, x) for mode in (jax.jacfwd, jax.jacrev)]
+
+    outputs, slopes = everything(0.8, np.array(0.7))
+    np.testing.assert_allclose(outputs, reference(0.7, 0.8), **TIGHT)
+    h = 1e-30  # of complex steps: exact to rounding
+    expected = [-np.imag(reference(*at)[-1]) / h for at in ((0.7, 0.8 + h * 1j), (0.7 + h * 1j, 0.8))]
+    for found in slopes:
+        np.testing.assert_allclose(found, expected, **TIGHT)
 
 
-@pytest.mark.parametrize("rule", [look_back, two_kinds, changing, far_back])
+SLOW_RULES = [pytest.param(rule, marks=pytest.mark.slow) for rule in (look_back, changing)]
+
+
+@pytest.mark.parametrize("rule", [two_kinds, far_back, *SLOW_RULES])
 def test_recursions(rule):
     n = 44
     system = compiled(Recursion(EqnEnv(), "c", n, rule))

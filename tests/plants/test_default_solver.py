@@ -203,11 +203,16 @@ def test_a_member_that_fails_is_not_a_number(ts):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_published_problems_with_nothing_said(name):
+    """All within 50·rtol, as test_testset.py asks of every solver, and errors fall with the tolerance."""
     problem = PROBLEMS[name]
     system = problem.compile()
-    for rtol in (1e-4, 1e-6):
+    uncertain, found = 10.0**-problem.digits, {}
+    for rtol in (1e-4, 1e-6, 1e-8):
         solution = simulate(system, problem.t1, t0=problem.t0, ts=np.array([problem.t1]), **problem.tolerances(rtol))
-        worst = problem.errors({n: float(solution[n][-1]) for n in problem.reference})
-        assert max(worst.values()) <= 50 * rtol + 10.0**-problem.digits
+        found[rtol] = max(problem.errors({n: float(solution[n][-1]) for n in problem.reference}).values())
+        assert found[rtol] <= 50 * rtol + uncertain
         if problem.stiff:
             assert solution.stats["stiff_from"] > 0
+    for coarse, fine in ((1e-4, 1e-6), (1e-6, 1e-8)):
+        # Below the tolerance itself an error may be small by chance (its sign changes) and has nothing to prove.
+        assert found[fine] < found[coarse] or found[fine] <= max(fine, uncertain), found

@@ -27,7 +27,7 @@ def law(rate, x0=1.0):
 
 def failure(system, end=2.0, **options):
     with pytest.raises(SimulationError) as caught:
-        simulate(system, end, ts=jnp.array([end]), max_steps=options.pop("max_steps", 400), **options)
+        simulate(system, end, ts=np.array([end]), max_steps=options.pop("max_steps", 400), **options)
     return str(caught.value)
 
 
