@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
-from test_library_events import RON, bridge_by_brute_force
+from diode_bridges import RON, bridge_by_brute_force
 
 import jaxonomy_dae.library.electrical as el
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, simulate
@@ -72,7 +72,7 @@ def test_the_program_does_not_grow_with_the_bank():
 
         def end(v):
             changed = system.with_parameters({"src.amplitude": v})
-            return simulate(changed, 0.1, ts=jnp.array([0.1]), max_events=100, save_events=False).states
+            return simulate(changed, 0.1, ts=np.array([0.1]), max_events=100, save_events=False).states
 
         return operations(jax.make_jaxpr(end)(jnp.array(10.0)).jaxpr)
 
