@@ -75,7 +75,7 @@ SAVED = {
 }
 
 
-@pytest.mark.parametrize("saved", [pytest.param(s, marks=[] if s == "parts" else pytest.mark.slow) for s in SAVED])
+@pytest.mark.parametrize("saved", [pytest.param(s, marks=[] if s == "ts" else pytest.mark.slow) for s in SAVED])
 def test_what_is_saved(saved):
     both(lambda args, y0, adjoint: total(solve(args, y0, adjoint, saveat=SAVED[saved])), ARGS, Y0, argnums=(0, 1))
 

@@ -25,10 +25,6 @@ print(jaxonomy_dae.__file__)
 """
 
 
-def test_importing_changes_nothing():
-    assert run(IMPORT).strip().startswith(str(ROOT))
-
-
 SINGLE = """
 import jax, jax.numpy as jnp, numpy as np
 from problems import angle_solution, drag_on, pendulum
@@ -40,12 +36,10 @@ try:
     simulate(system, 1.0, rtol=1e-6)
 except ModelError as error:
     print(error)
-plain = simulate(system, 1.0, ts=jnp.array([1.0]))
-truth = angle_solution(-1.2, 0.0, [1.0], force=lambda vx, vy: (-0.5 * vx * abs(vx), 0.0))
-assert abs(float(plain["pend.x"][0]) - truth.x[0]) < 1e-3
-
-ts = jnp.array([0.5, 1.0, 1.5])
+ts = np.array([0.5, 1.0, 1.5], np.float32)
+plain = simulate(system, 1.5, ts=ts)
 solution = simulate(system, 1.5, ts=ts, rtol=1e-4, atol=1e-6)
+np.testing.assert_array_equal(plain.states, solution.states)  # what is taken where nothing is said
 assert solution.states.dtype == solution["pend.lam"].dtype == jnp.float32
 expected = angle_solution(-1.2, 0.0, ts, force=lambda vx, vy: (-0.5 * vx * abs(vx), 0.0))
 # Ten times the tolerance, at speeds up to 1.
@@ -58,15 +52,21 @@ print("done")
 """
 
 
+def test_importing_changes_nothing():
+    assert run(IMPORT).strip().startswith(str(ROOT))
+
+
 @pytest.fixture(scope="module")
 def single():
     return run(SINGLE)
 
 
+@pytest.mark.slow
 def test_single_precision_works_with_loose_tolerances(single):
     assert single.strip().endswith("done")
 
 
+@pytest.mark.slow
 def test_single_precision_explains_why_tolerances_are_out_of_reach(single):
     for part in ("rtol=1e-06", "float32", "jax_enable_x64", "rtol ≥ 2e-06"):
         assert part in single
