@@ -75,7 +75,8 @@ SAVED = {
 }
 
 
-@pytest.mark.parametrize("saved", [pytest.param(s, marks=[] if s == "ts" else pytest.mark.slow) for s in SAVED])
+@pytest.mark.slow
+@pytest.mark.parametrize("saved", SAVED)
 def test_what_is_saved(saved):
     both(lambda args, y0, adjoint: total(solve(args, y0, adjoint, saveat=SAVED[saved])), ARGS, Y0, argnums=(0, 1))
 
@@ -129,7 +130,29 @@ def swung(scale, y0):
 
 
 def test_batches():
-    """Members that take different numbers of steps, some more than the record has rows, others few."""
+    """y'' = −k²·y: members that take different numbers of steps, some more than the record has rows, others few."""
+    term = diffrax.ODETerm(lambda t, y, k: k * jnp.stack([y[1], -y[0]]))
+    controller = diffrax.PIDController(rtol=1e-8, atol=1e-8)
+
+    def loss(k, y0, adjoint=STORED):
+        solved = solve(k, y0, adjoint, term=term, saveat=diffrax.SaveAt(ts=TS), controller=controller)
+        return jnp.sum(solved.ys @ np.array([1.0, 2.0]))
+
+    def exact(k, y0):
+        c, s = jnp.cos(k * TS), jnp.sin(k * TS)
+        return jnp.sum((c - 2 * s) * y0[0] + (s + 2 * c) * y0[1])
+
+    k = np.array([0.05, 1.0, 40.0])
+    y0 = np.stack([Y0, 1.1 * Y0, 0.5 * Y0])
+    found, expected = (jax.jit(jax.vmap(jax.grad(f, argnums=(0, 1))))(k, y0) for f in (loss, exact))
+    # Some 160 radians at 1e-8 a step: 1e-6, and by k that times the end, 3.9.
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_batches_are_their_members():
+    """Members that take different numbers of steps; to rounding."""
     scale = np.array([0.05, 1.0, 40.0])
     gradient = jax.jit(jax.grad(swung, argnums=(0, 1)))
     y0 = np.stack([Y0, 1.1 * Y0, 0.5 * Y0])
@@ -167,6 +190,7 @@ def test_times():
     assert all(np.abs(leaf).min() > 1e-8 for leaf in slopes)
 
 
+@pytest.mark.slow
 def test_end_in_closed_form():
     """y(t1) of y' = a·y·t: dy/dt1 = a·t1·y and dy/dt0 = −a·t0·y, to the solver's accuracy."""
     term = diffrax.ODETerm(lambda t, y, a: a * y * t)
@@ -310,6 +334,7 @@ def test_nothing_recorded_without_differentiation():
     agree((mine.ts[0][:10], mine.ys[0]["a"][:10]), (other.ts[0][:10], other.ys[0]["a"][:10]), 1e-14)
 
 
+@pytest.mark.slow
 def test_without_rank_promotion():
     """`jax_numpy_rank_promotion="raise"`, here with BDF: x' = −a·z, z = x, so ∂x(1)/∂a = −exp(−a)."""
     term = DAETerm(lambda t, x, z, a: -a * z, lambda t, x, z, a: z - x)
