@@ -4,6 +4,7 @@ import dataclasses
 
 import hypothesis
 import hypothesis.strategies as st
+import pytest
 from pencils import pencils
 from shared_models import written
 
@@ -20,19 +21,30 @@ def plan_of(component: Component):
     return lower(compile_flat(flatten(diagram), "auto", ()))
 
 
-@hypothesis.settings(max_examples=40)
-@hypothesis.given(pencils(mixed=False, largest=7))
-def test_index_and_freedom_of_permuted_pencils(pencil):
+EXAMPLES = pytest.mark.parametrize("examples", [10, pytest.param(60, marks=pytest.mark.slow)])
+
+
+@EXAMPLES
+def test_index_and_freedom_of_permuted_pencils(examples):
     """Where nothing cancels, the structure tells the index and the degrees of freedom."""
+    check = hypothesis.given(pencils(mixed=False, largest=7))(check_permuted)
+    hypothesis.settings(max_examples=examples)(check)()
+
+
+def check_permuted(pencil):
     report = SystemReport(plan_of(written(pencil)))
     assert report.degrees_of_freedom == pencil.dynamic
     assert report.index == max(pencil.blocks, default=0)
 
 
-@hypothesis.settings(max_examples=25)
-@hypothesis.given(pencils(), st.randoms(use_true_random=False))
-def test_freedom_of_mixed_pencils(pencil, rng):
+@EXAMPLES
+def test_freedom_of_mixed_pencils(examples):
     """Whatever cancels, there are as many states as dynamic modes; order and names of anything change nothing."""
+    check = hypothesis.given(pencils(), st.randoms(use_true_random=False))(check_mixed)
+    hypothesis.settings(max_examples=examples)(check)()
+
+
+def check_mixed(pencil, rng):
     report = SystemReport(plan_of(written(pencil)))
     assert report.degrees_of_freedom == len(report.states) == pencil.dynamic
     shuffled = dataclasses.replace(

@@ -17,7 +17,7 @@ import pytest
 from testset import PROBLEMS
 from testset.problem import load
 
-from jaxonomy_dae.solvers import BDF, DAETerm, Rodas5P, consistent_start, solve_dae
+from jaxonomy_dae.solvers import BDF, DAETerm, Rodas5P, StoredAdjoint, consistent_start, solve_dae
 
 SOLVERS = {"bdf": BDF(), "rodas5p": Rodas5P()}
 slow = pytest.mark.slow
@@ -69,7 +69,8 @@ def weighted(name, y):
 @functools.cache
 def gradient(name, solver, mode):
     adjoint = {
-        "reverse": diffrax.RecursiveCheckpointAdjoint(),
+        "reverse": StoredAdjoint(),
+        "recursive": diffrax.RecursiveCheckpointAdjoint(),
         "direct": diffrax.DirectAdjoint(),
         "forward": diffrax.ForwardMode(),
     }[mode]
@@ -82,8 +83,11 @@ def gradient(name, solver, mode):
     return np.asarray(jax.jit(differentiate(loss))(np.zeros(len(CASES[name].parameters))))
 
 
+PAIRS = [("robertson", "bdf"), ("robertson", "rodas5p"), ("chemakzo", "rodas5p"), ("transamp", "bdf")]
+
+
 @slow
-@pytest.mark.parametrize("name, solver", [(name, solver) for name in CASES for solver in SOLVERS])
+@pytest.mark.parametrize("name, solver", PAIRS)
 def test_reverse_is_forward(name, solver):
     reverse, forward = gradient(name, solver, "reverse"), gradient(name, solver, "forward")
     assert np.abs(reverse).min() > 0
@@ -103,16 +107,16 @@ def differences(name):
 
 
 @slow
-@pytest.mark.parametrize("name, solver", [(name, solver) for name in CASES for solver in SOLVERS])
+@pytest.mark.parametrize("name, solver", PAIRS)
 def test_reverse_is_the_difference(name, solver):
     found = gradient(name, solver, "reverse")
     np.testing.assert_allclose(found, differences(name), rtol=1e-5, atol=1e-5 * np.abs(found).max())
 
 
 @slow
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_direct_adjoint_agrees(solver):
-    found = gradient("robertson", solver, "direct")
+@pytest.mark.parametrize("solver, adjoint", [("bdf", "direct"), ("bdf", "recursive"), ("rodas5p", "recursive")])
+def test_other_adjoints_agree(solver, adjoint):
+    found = gradient("robertson", solver, adjoint)
     np.testing.assert_allclose(found, gradient("robertson", solver, "forward"), rtol=1e-8)
 
 

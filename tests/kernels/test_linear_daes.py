@@ -44,7 +44,7 @@ def test_a_point_of_a_mixed_pencil():
 
 
 @pytest.mark.slow
-@hypothesis.settings(max_examples=30, suppress_health_check=list(hypothesis.HealthCheck))
+@hypothesis.settings(max_examples=15, suppress_health_check=list(hypothesis.HealthCheck))
 @hypothesis.given(pencils(largest=5))
 def test_points_of_many_mixed_pencils(pencil):
     check_point(pencil)

@@ -12,7 +12,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-from jaxonomy_dae.solvers import BDF, DAETerm, Rodas5P, StepControl, StoredAdjoint, Tsit5, solve_dae
+from jaxonomy_dae.solvers import BDF, DAETerm, StoredAdjoint, Tsit5, solve_dae
 
 STORED, RECURSIVE = StoredAdjoint(), diffrax.RecursiveCheckpointAdjoint()
 ARGS = (np.array([1.5, 1.0]), np.array([[0.1, -0.2], [0.3, 0.2]]))
@@ -81,23 +81,16 @@ def test_what_is_saved(saved):
     both(lambda args, y0, adjoint: total(solve(args, y0, adjoint, saveat=SAVED[saved])), ARGS, Y0, argnums=(0, 1))
 
 
-STIFF = {
-    "kvaerno5": (diffrax.Kvaerno5(), diffrax.PIDController(rtol=1e-5, atol=1e-7)),
-    "rodas5p": (Rodas5P(), StepControl(rtol=1e-6, atol=1e-8)),
-    "bdf": (BDF(), StepControl(rtol=1e-6, atol=1e-8, steered=True)),
-}
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("name", STIFF)
-def test_implicit_solvers(name):
-    solver, controller = STIFF[name]
+def test_an_implicit_solver():
+    """Another's; ours are compared in test_dae_gradients.py."""
+    controller = diffrax.PIDController(rtol=1e-5, atol=1e-7)
 
     def loss(args, y0, adjoint):
-        return total(solve(args, y0, adjoint, solver=solver, controller=controller, saveat=diffrax.SaveAt(ts=TS)))
+        saveat = diffrax.SaveAt(ts=TS)
+        return total(solve(args, y0, adjoint, solver=diffrax.Kvaerno5(), controller=controller, saveat=saveat))
 
-    with jax.numpy_dtype_promotion("standard" if name == "bdf" else "strict"):
-        both(loss, ARGS, Y0, argnums=(0, 1))
+    both(loss, ARGS, Y0, argnums=(0, 1))
 
 
 @pytest.mark.parametrize("t1, max_steps", [(20.0, 4096), pytest.param(170.0, None, marks=pytest.mark.slow)])
