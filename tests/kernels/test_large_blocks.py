@@ -63,6 +63,35 @@ def test_resistor_grid(n):
     assert f"linear block of {block.n}" in str(system.report) and "solved whole" in str(system.report)
 
 
+def test_gradients_of_a_whole_block(monkeypatch):
+    """In both modes, against central differences of nodal analysis."""
+    grid = Grid(3)
+    system = whole_whatever_size(monkeypatch, grid)
+    assert whole(system)
+    edges, weights = (3, 10), np.array([1.0, -2.0, 0.5])
+    order = [system.states.index(f"c{k}.v") for k in range(3)]
+    x = np.zeros(3)
+    x[order] = grid.v0
+
+    def loss(G, x):
+        changed = system.with_parameters({f"r{k}.R": 1 / G[j] for j, k in enumerate(edges)})
+        return changed.vector_field(0.0, x)[np.array(order)] @ weights
+
+    def reference(G):
+        other = Grid(3)
+        other.G[list(edges)] = G
+        return other.reference() @ weights
+
+    at = np.array([0.8, 1.3])
+    value, reverse, forward = jax.jit(lambda G, x: (loss(G, x), jax.grad(loss)(G, x), jax.jacfwd(loss)(G, x)))(at, x)
+    np.testing.assert_allclose(value, reference(at), rtol=1e-11)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-11)
+    h = 1e-4  # the differences' error is h² ~ 1e-8
+    slopes = [(reference(at + h * e) - reference(at - h * e)) / (2 * h) for e in np.eye(2)]
+    np.testing.assert_allclose(reverse, slopes, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.slow
 def test_whole_and_torn_blocks_agree(monkeypatch):
     """Values, and gradients in both modes and by central differences."""
     grid = Grid(3)
@@ -113,6 +142,7 @@ def test_learned_terms_in_a_whole_block(monkeypatch):
     np.testing.assert_allclose(currents(system), grid.reference(), rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_gradients_of_a_nonlinear_grid(monkeypatch):
     grid = Grid(3, cubic=0.5)
     system = whole_whatever_size(monkeypatch, grid)

@@ -193,6 +193,7 @@ def test_a_failure_among_128_to_300_unknowns_is_explained():
 
 
 @installed
+@pytest.mark.slow
 def test_a_pivot_of_zero_fails_its_own_member_alone():
     """max(z, 0) = x: from t = 1 on the column of z is zero."""
     term = cells(70, lambda x, z: jnp.maximum(z, 0) - x)
