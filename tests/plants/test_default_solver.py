@@ -131,6 +131,7 @@ def test_inside_transformations(stiff):
 # --- saved rows inside jit -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_last_row_inside_jit():
     """`ts=None`: rows beyond the last step repeat it, with its derivatives."""
     system = oscillator()

@@ -92,6 +92,7 @@ class Meeting(Component):
         self.add_equations(x + y - 1, x + w * y - 2, der(w) - 1, der(q) - x)
 
 
+@pytest.mark.slow
 def test_a_block_that_becomes_singular_is_named():
     message = failure(compiled(Meeting(EqnEnv(), "m")))
     # How near the last step comes is a matter of rounding.
