@@ -74,6 +74,14 @@ def test_an_input_that_is_not_finite(driven, value, place):
     assert abs(float(message.split(" at t=")[2].split(". ")[0]) - place) < 0.05
 
 
+@pytest.mark.slow
+def test_an_input_with_a_pole(driven):
+    message = failure(driven, inputs={"c.u": lambda t: 1 / jnp.maximum(1.0 - t, 0.0)})
+    assert "input 'c.u' is " in message and "divi" not in message
+    assert abs(stopped_at(message) - 1) < 0.05
+    assert abs(float(message.split(" at t=")[2].split(". ")[0]) - 1) < 0.05
+
+
 def test_a_finite_escape(driven):
     """x' = 1 + x² from 1: x = tan(t + π/4), infinite at π/4."""
     message = failure(driven.with_parameters({"c.a": 0.0, "c.b": 1.0}), inputs=step(9.0, 1.0))
