@@ -128,7 +128,8 @@ def test_an_inconsistent_start_is_mended():
     assert wrong_with_the_start(TERM, mended, PQR) == ""
 
 
-def test_traced_starts_fail_while_running():
+@pytest.mark.slow
+def test_solves_from_traced_starts_fail_while_running():
     @jax.jit
     def end(z):
         return solve_dae(TERM, 1.0, (ONE, z)).ys[0]
@@ -136,6 +137,8 @@ def test_traced_starts_fail_while_running():
     with pytest.raises(Exception, match="inconsistent start: see jaxonomy_dae.solvers.consistent_start"):
         jax.block_until_ready(end(WRONG[1]))
 
+
+def test_traced_starts_fail_while_running():
     @jax.jit
     def start(z):
         return consistent_start(DAETerm(falling, lambda t, x, z, a: z**2 + x), (ONE, z))[1]
