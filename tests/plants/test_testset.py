@@ -103,7 +103,8 @@ def at_start(name):
     return problem, dict(zip(names, np.asarray(values), strict=True))
 
 
-@pytest.mark.parametrize("name", [n if n == "caraxis" else pytest.param(n, marks=pytest.mark.slow) for n in MODELS])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MODELS)
 def test_models_start_where_the_index_one_equations_do(name):
     # The index-1 equations start from published values, algebraic unknowns solved in closed form where they are not
     # published: rounding is the only difference, amplified by the condition of the constraints (below 1e3 here).
