@@ -167,9 +167,9 @@ def test_recursions(rule):
 
 def test_an_irregular_chain_is_one_sparse_system(monkeypatch):
     """Links at random, with two rules: no repetition, but affine in the links together."""
-    monkeypatch.setattr(merge, "MANY", 40)
-    monkeypatch.setattr(merge, "LEAST", 30)
-    n = 80
+    monkeypatch.setattr(merge, "MANY", 20)
+    monkeypatch.setattr(merge, "LEAST", 15)
+    n = 40
     rng = np.random.default_rng(0)
     before = [int(rng.integers(max(0, k - 3), k)) if k else 0 for k in range(n)]
     first = rng.uniform(size=n) < 0.4

@@ -15,7 +15,10 @@ from jaxonomy_dae.linear.whole import over
 from jaxonomy_dae.structure.tearing import Tearing
 
 
-@pytest.fixture(params=["cpu", "elsewhere"])
+BACKENDS = ["cpu", "elsewhere"]
+
+
+@pytest.fixture(params=BACKENDS)
 def backend(request, monkeypatch):
     """The program made for this backend; what is made for others runs here as well. Tests trace functions of their
     own, so that none is found in JAX's cache that was traced for another backend."""
@@ -30,8 +33,18 @@ def by_entries(a):
     return jnp.stack([jnp.stack(row) for row in rows])
 
 
-@pytest.mark.parametrize("m", [pytest.param(m, marks=() if m in (3, 5) else pytest.mark.slow) for m in range(1, 8)])
-def test_inverses(m, backend):
+QUICK = [("cpu", 3), ("cpu", 5), ("elsewhere", 3)]
+
+
+@pytest.mark.parametrize(
+    "backend, m",
+    [
+        *QUICK,
+        *(pytest.param(b, m, marks=pytest.mark.slow) for b in BACKENDS for m in range(1, 8) if (b, m) not in QUICK),
+    ],
+    indirect=["backend"],
+)
+def test_inverses(backend, m):
     rng = np.random.default_rng(m)
     a = rng.normal(size=(5, m, m)) * 10.0 ** rng.integers(-9, 9, (5, m, 1))
     for k in range(m):  # pivots are where they are not looked for first

@@ -42,7 +42,8 @@ def test_patterns_are_compared_by_content():
     single, inverse = pattern.coalesced
     assert single.coalesced is None and len(single) < len(pattern)
     summed = np.bincount(inverse, values, len(single))
-    np.testing.assert_allclose(*jax.jit(lambda: (single.dense(summed), pattern.dense(values)))())
+    both = jax.jit(lambda summed, values: (single.dense(summed), pattern.dense(values)))
+    np.testing.assert_allclose(*both(summed, values))
     for rows, cols, message in (([0, 3], [0, 0], "rows must lie"), ([0], [-1], "cols must lie"), ([0], [0, 1], "one")):
         with pytest.raises(ValueError, match=message):
             SparsePattern(np.array(rows), np.array(cols), 3)
@@ -71,7 +72,7 @@ def test_jacobian_is_the_dense_one():
     pattern, values, b = random_matrix()
 
     def fun(y):
-        return jnp.sin(pattern.multiply(values, y)) + y**3
+        return jnp.sin(pattern.multiply(jnp.asarray(values), y)) + y**3
 
     single = pattern.coalesced[0]
     found = sparse_jacobian(fun, single)
@@ -141,7 +142,7 @@ def test_derivatives_of_the_solution(transpose):
     def found(values, b):
         return solve_sparse(pattern, jnp.asarray(values), jnp.asarray(b), transpose)
 
-    matrix = np.asarray(pattern.dense(values))
+    matrix = np.asarray(pattern.dense(jnp.asarray(values)))
     np.testing.assert_allclose(found(values, b), np.linalg.solve(matrix.T if transpose else matrix, b), **TIGHT)
     check_grads(found, (jnp.asarray(values), jnp.asarray(b)), order=2, modes=["fwd", "rev"])
 
@@ -246,7 +247,7 @@ def test_missing_package_names_the_extra(monkeypatch):
     sparse.klu.cache_clear()
     pattern, values, b = random_matrix()
     with pytest.raises(MissingSparseSolver, match=r'pip install "jaxonomy_dae\[sparse\]"'):
-        solve_sparse(pattern, values, b)
+        solve_sparse(pattern, jnp.asarray(values), jnp.asarray(b))
     sparse.klu.cache_clear()
 
 
