@@ -14,7 +14,6 @@ from jaxonomy_dae.linear.torn import solve_torn
 from jaxonomy_dae.linear.whole import over
 from jaxonomy_dae.structure.tearing import Tearing
 
-
 BACKENDS = ["cpu", "elsewhere"]
 
 
@@ -114,7 +113,7 @@ def dense_torn(n, m):
 
 
 @pytest.mark.parametrize(
-    ("n", "m"), [pytest.param(9, 2, marks=pytest.mark.slow), pytest.param(12, 4, marks=pytest.mark.slow), (14, 5)]
+    ("n", "m"), [(9, 2), pytest.param(12, 4, marks=pytest.mark.slow), pytest.param(14, 5, marks=pytest.mark.slow)]
 )
 def test_programs_of_torn_blocks_do_not_grow_when_compiled(n, m):
     tearing, a, b = dense_torn(n, m)
