@@ -165,6 +165,7 @@ def test_recursions(rule):
     check(system, rule, n)
 
 
+@pytest.mark.slow
 def test_an_irregular_chain_is_one_sparse_system(monkeypatch):
     """Links at random, with two rules: no repetition, but affine in the links together."""
     monkeypatch.setattr(merge, "MANY", 20)

@@ -42,9 +42,10 @@ def onto_circle(t, y, projects):
     return jnp.where(projects, projected, y)
 
 
+@slow
 @pytest.mark.parametrize(
     "solver",
-    [BDF(projection=onto_circle), pytest.param(Projected(Rodas5P(), onto_circle), marks=slow)],
+    [BDF(projection=onto_circle), Projected(Rodas5P(), onto_circle)],
     ids=["bdf", "rodas5p"],
 )
 def test_projection_keeps_hidden_constraints(solver):

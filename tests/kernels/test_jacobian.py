@@ -19,7 +19,7 @@ def covers(found, dense: np.ndarray):
     return not np.any(dense[~inside])
 
 
-QUICK = ("implicit", "cascade")
+QUICK = ("cascade",)
 
 
 @pytest.mark.parametrize("model", [m if m in QUICK else pytest.param(m, marks=pytest.mark.slow) for m in MODELS])

@@ -62,7 +62,7 @@ class Gradients:
         return np.asarray(self._forward(self.flat))
 
 
-@pytest.fixture(scope="module", params=["auto", pytest.param("dummy_derivatives", marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=["auto", "dummy_derivatives"])
 def gradients(request):
     return Gradients(request.param)
 
@@ -77,6 +77,7 @@ def test_reverse_equals_forward(gradients, name):
     np.testing.assert_allclose(reverse, forward, rtol=1e-11, atol=1e-11 * size)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TRAINED)
 def test_reverse_equals_central_differences(gradients, name):
     direction = np.zeros(gradients.flat.shape)

@@ -24,9 +24,8 @@ SOLVERS = {"bdf": solvers.BDF(), "rodas5p": solvers.Rodas5P()}
 INDEX_ONE = [name for name, problem in PROBLEMS.items() if problem.given]
 MODELS = list(PROBLEMS)
 
-# One program serves all tolerances of a case; every run of the tests solves the first, for each takes seconds to
-# compile. Each form with both solvers, each problem's model with one or both. What `simulate` chooses is in
-# test_default_solver.py, on all problems.
+# One program serves all tolerances of a case. Each form with both solvers, each problem's model with one or both; what
+# `simulate` chooses is in test_default_solver.py.
 CASES = [
     ("transamp", "rodas5p", "raw"),
     ("chemakzo", "bdf", "semi-explicit"),
@@ -49,12 +48,6 @@ CASES = [
     ("pendulum_cash", "rodas5p", "model"),
     ("pendulum_period2", "bdf", "model"),
 ]
-QUICK = CASES[:1]
-
-
-def cases():
-    """(problem, solver, form), marked slow unless quick."""
-    return [pytest.param(*c, id="-".join(c), marks=() if c in QUICK else pytest.mark.slow) for c in CASES]
 
 
 @functools.cache
@@ -72,7 +65,8 @@ def errors(name, solver, form, rtol):
     return problem.errors(outcome.values)
 
 
-@pytest.mark.parametrize(("name", "solver", "form"), cases())
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "solver", "form"), CASES, ids=["-".join(case) for case in CASES])
 def test_errors_are_within_the_tolerances_and_fall_with_them(name, solver, form):
     uncertain = 10.0 ** -PROBLEMS[name].digits  # of the reference itself
     found = {rtol: errors(name, solver, form, rtol) for rtol in TOLERANCES}
