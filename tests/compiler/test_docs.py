@@ -10,7 +10,7 @@ import pytest
 from library_pages import classes_of, components_of, domains, equation_text, overview, page, text_of
 from sympy import Abs, Eq, Max, Piecewise, Rational, Symbol, exp, pi, sqrt, symbols
 
-DOCS = pathlib.Path(__file__).parents[1] / "docs"
+DOCS = pathlib.Path(__file__).parents[2] / "docs"
 MODULES = ("solvers", "linear", "learning", "plotting", "testing")
 
 

@@ -1,6 +1,7 @@
 """The rooms of the package import one way: docs/development.md draws them in this order."""
 
 import ast
+import functools
 import graphlib
 from pathlib import Path
 
@@ -16,13 +17,13 @@ ORDER = [
 DEFERRED = {("system", "initialization"), ("simulation", "plotting")}
 
 
-def modules() -> dict[tuple[str, ...], Path]:
-    return {path.relative_to(ROOT).with_suffix("").parts: path for path in sorted(ROOT.rglob("*.py"))}
+@functools.cache
+def modules() -> dict[tuple[str, ...], ast.AST]:
+    return {p.relative_to(ROOT).with_suffix("").parts: ast.parse(p.read_text()) for p in sorted(ROOT.rglob("*.py"))}
 
 
-def imports(name: tuple[str, ...], path: Path, everywhere: bool):
+def imports(name: tuple[str, ...], tree: ast.AST, everywhere: bool):
     """The package's own modules that a module imports; only when it is imported itself, unless `everywhere`."""
-    tree = ast.parse(path.read_text())
     nodes = ast.walk(tree) if everywhere else _at_import(tree)
     for node in nodes:
         if isinstance(node, ast.ImportFrom) and node.level:
@@ -49,9 +50,9 @@ def test_every_room_is_in_the_order():
 def test_imports_run_one_way():
     upward = [
         f"{'/'.join(name)} imports {'/'.join(target)}"
-        for name, path in modules().items()
+        for name, tree in modules().items()
         if name[0] != "__init__"
-        for target in imports(name, path, everywhere=True)
+        for target in imports(name, tree, everywhere=True)
         if ORDER.index(target[0]) > ORDER.index(name[0]) and (name[0], target[0]) not in DEFERRED
     ]
     assert not upward
@@ -60,8 +61,8 @@ def test_imports_run_one_way():
 def test_no_circle_of_modules():
     packages = {name[:-1] for name in modules() if name[-1] == "__init__"}
     graph = {
-        name: {t if t not in packages else (*t, "__init__") for t in imports(name, path, everywhere=False)} - {name}
-        for name, path in modules().items()
+        name: {t if t not in packages else (*t, "__init__") for t in imports(name, tree, everywhere=False)} - {name}
+        for name, tree in modules().items()
         if name[-1] != "__init__"
     }
     list(graphlib.TopologicalSorter(graph).static_order())  # raises CycleError
