@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from problems import compiled, drag_on, environment, oscillator, pendulum, rc_circuit
-from test_broken_models import draw_recipe, names_of, outcome
+from recipes import draw_recipe, names_of, outcome
 from test_explained_structure import CASES
 
 from jaxonomy_dae import EqnEnv

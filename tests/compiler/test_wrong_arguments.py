@@ -2,11 +2,16 @@
 
 import functools
 import json
+import re
+from collections.abc import Callable
 
+import diffrax
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from problems import compiled, run
+import sympy
+from problems import EV, compiled, component, drag_on, pendulum, rc_circuit, run
 
 import jaxonomy_dae.library.battery as battery
 import jaxonomy_dae.library.electrical as el
@@ -17,12 +22,15 @@ import jaxonomy_dae.library.rotational as rot
 import jaxonomy_dae.library.signal as sig
 import jaxonomy_dae.library.thermal as th
 import jaxonomy_dae.library.translational as tr
-from jaxonomy_dae import EqnEnv, ModelError, simulate
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, ModelError, NeuralDAEBlock, simulate
+from jaxonomy_dae.learning import fit
+from jaxonomy_dae.library.electrical import Ground, Resistor
 from jaxonomy_dae.library.transmissions import LeadScrew
 
 SOC, OCV = [0.0, 1.0], [3.0, 4.0]
 NESTED = [[1.0, 2.0], [3.0]]
 
+# Signatures are checked by the tests before these messages can be raised, so both lists are tried without that check.
 # (a component made of wrong arguments, the whole error)
 REFUSED = [
     # Values of parameters.
@@ -118,16 +126,56 @@ REFUSED = [
 ]  # fmt: skip
 
 
+KNOTS = np.linspace(0.0, 1.0, 3)
+# (a pattern of the error, a call)
+WRONG_TYPES = [
+    (r"the system is a batch, its parameters have shape \(3, 4\).*equinox\.filter_vmap",
+     lambda: simulate(jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), rc_circuit()), 1.0)),
+    (r"first argument of a component is an EqnEnv; got str", lambda: Ground("ground", "g")),
+    (r"parameter 'r\.R' must be a number; got list.*with_parameters\(\{'r\.R'", lambda: Resistor(EV, "r", [1.0])),
+    (r"function 'c\.f': the function must be callable; got LinearInterp.*give its method \.evaluate",
+     lambda: component(lambda s, ev: s.function("f", diffrax.LinearInterpolation(KNOTS, KNOTS), [s.variable("x")]))),
+    (r"function 'c\.f': inputs is a list of symbols; write inputs=\[x\]",
+     lambda: component(lambda s, ev: s.function("f", jnp.sin, s.variable("x")))),
+    (r"'c\.x': bounds are a pair", lambda: component(lambda s, ev: s.variable("x", bounds=("0", "1")))),
+    (r"neural block's name cannot contain '\['", lambda: pendulum(drag_on("vx", name="a[0]"))),
+    (r"optimizer must be one of Optax.*got 'adam'", lambda: fit(rc_circuit(), lambda s: 0.0, "adam", 1, train=["r.R"])),
+    (r"'c\.x': fixed is True or False; got 'no'", lambda: component(lambda s, ev: s.variable("x", 1.0, fixed="no"))),
+    (r"parameter 'c\.k': unit is a text such as 'kg'; got 1",
+     lambda: component(lambda s, ev: s.parameter("k", 1.0, 1))),
+    (r"the constant 'g' of EqnEnv must be a real number; got the string '9\.81'", lambda: EqnEnv(g="9.81")),
+    (r"Resistor: the environment comes first, then the name: Resistor\(ev, \"name\"", lambda: Resistor("r")),
+    (r"got a list: write diagram\.add\(\*components\)", lambda: AcausalDiagram().add([Ground(EV, "g")])),
+    (r"got the class Ground: make a component of it, Ground\(ev", lambda: AcausalDiagram().add(Ground)),
+    (r"initial is a dictionary by names.*got list", lambda: simulate(rc_circuit(), 1.0, initial=[1.0])),
+    (r"initial is a dictionary by names.*got list", lambda: rc_circuit().initialize(initial=[1.0])),
+    (r"parameters are given by names.*got list", lambda: rc_circuit().with_parameters([1.0])),
+    (r"port 'c\.p' needs a Domain such as Electrical; got 'electrical'",
+     lambda: component(lambda s, ev: s.port("p", "electrical"))),
+    (r"is not an equation", lambda: component(lambda s, ev: s.add_equations(sympy.Matrix([s.variable("x")])))),
+    (r"only components can be added to a diagram; got str", lambda: AcausalDiagram().add("r")),
+    (r"needs an EqnEnv and an AcausalDiagram", lambda: AcausalCompiler(AcausalDiagram(), EV)),
+    (r"'auto', 'dummy_derivatives' or 'projection'; got 'best'",
+     lambda: AcausalCompiler(EV, AcausalDiagram(), state_selection="best")),
+    (r"inject is 'equation' or 'row'; got 'force'", lambda: pendulum(drag_on("vx", inject="force"))),
+    (r"must be callable", lambda: NeuralDAEBlock(jnp.ones(3), targets=["pend.vx"], name="drag")),
+    (r"needs an AcausalSystem.*got AcausalDiagram", lambda: simulate(AcausalDiagram(), 1.0)),
+    (r"solver must be a Diffrax solver.*got 'tsit5'", lambda: simulate(rc_circuit(), 1.0, solver="tsit5")),
+]  # fmt: skip
+
+
+def said(call: Callable) -> str:
+    """What is said of a call."""
+    try:
+        call()
+        return "accepted"
+    except ModelError as error:
+        return str(error)
+
+
 def refusals() -> list[str]:
     """What is said of each of them, in order."""
-    found = []
-    for make, _ in REFUSED:
-        try:
-            make(EqnEnv())
-            found.append("accepted")
-        except ModelError as error:
-            found.append(str(error))
-    return found
+    return [said(lambda make=make: make(EqnEnv())) for make, _ in REFUSED] + [said(call) for _, call in WRONG_TYPES]
 
 
 @functools.cache
@@ -139,6 +187,11 @@ def refusals_of_users() -> list[str]:
 @pytest.mark.parametrize("k", range(len(REFUSED)), ids=[message for _, message in REFUSED])
 def test_arguments(k):
     assert refusals_of_users()[k] == REFUSED[k][1]
+
+
+@pytest.mark.parametrize("k", range(len(WRONG_TYPES)), ids=[message for message, _ in WRONG_TYPES])
+def test_wrong_types(k):
+    assert re.search(WRONG_TYPES[k][0], refusals_of_users()[len(REFUSED) + k])
 
 
 def test_what_rows_may_be():
