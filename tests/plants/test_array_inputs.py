@@ -1,7 +1,8 @@
 """Names of arrays for what drives and reads a model: inputs, lists of names, sweeps, linearizations, data sets."""
 
+import functools
+
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,6 +25,7 @@ from jaxonomy_dae import (
 from jaxonomy_dae.simulation import integration
 
 TS = jnp.linspace(0.0, 2.0, 9)
+T = np.asarray(TS)
 TIGHT = {"rtol": 1e-9, "atol": 1e-11}
 WHEN = np.linspace(0.0, 2.0, 6)
 
@@ -41,6 +43,7 @@ class Lag(Component):
             self.add_equations(Eq(copy, u), Eq(slope, der(copy)))
 
 
+@functools.cache
 def lags(shape, **options):
     ev, diagram = EqnEnv(), AcausalDiagram()
     diagram.add_array(ev, "lag", Lag, shape, T=1.0 + np.arange(np.prod(shape)).reshape(shape) / 7, **options)
@@ -80,31 +83,42 @@ KINDS = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("shape", [(3,), (5, 8)], ids=str)
-@pytest.mark.parametrize("kind", [pytest.param(k, marks=[] if k == "cubic" else [pytest.mark.slow]) for k in KINDS])
-def test_an_array_of_inputs_is_its_entries(kind, shape):
+@pytest.mark.long("two runs with inputs of every kind")
+@pytest.mark.parametrize("shape", [(3,), pytest.param((5, 8), marks=pytest.mark.slow)], ids=str)
+def test_an_array_of_inputs_is_its_entries(shape):
     """Forty inputs are read as an array, three as scalars; the same arithmetic, so the same to rounding."""
-    system = lags(shape)
-    whole, entry = given_by(kind, shape)
-    found = run(system, {"lag.u": whole})["lag.x"]
-    assert found.shape == (len(TS), *shape)
-    names = [f"lag[{', '.join(map(str, i))}].u".replace(" ", "") for i in np.ndindex(shape)]
-    single = run(system, {n: entry(i) for n, i in zip(names, np.ndindex(shape), strict=True)})["lag.x"]
-    np.testing.assert_allclose(found, single, rtol=0, atol=1e-13)
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    names = {kind: kind.replace(" ", "_") for kind in KINDS}
+    for name in names.values():
+        diagram.add_array(ev, name, Lag, shape, T=1.0 + np.arange(np.prod(shape)).reshape(shape) / 7)
+    system = AcausalCompiler(ev, diagram)()
+    arrays, entries = {}, {}
+    for kind, name in names.items():
+        arrays[f"{name}.u"], entry = given_by(kind, shape)
+        for i in np.ndindex(shape):
+            entries[f"{name}[{','.join(map(str, i))}].u"] = entry(i)
+    whole, single = (run(system, inputs, adjoint=diffrax.ForwardMode()) for inputs in (arrays, entries))
+    for name in names.values():
+        assert whole[f"{name}.x"].shape == (len(TS), *shape)
+        np.testing.assert_allclose(whole[f"{name}.x"], single[f"{name}.x"], rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("n", [3, 40])
+@pytest.mark.parametrize("n", [3, pytest.param(40, marks=pytest.mark.slow)])
 def test_the_model_differentiates_them(n):
     """du/dt of functions for all, and of defaults that are constant."""
     phases = np.arange(n) * 1.0
-    driven = run(lags(n, differentiated=True), {"lag.u": lambda t: jnp.sin(t + phases)})
-    np.testing.assert_allclose(driven["lag.slope"], np.cos(TS[:, None] + phases), rtol=0, atol=1e-14)
-    left = run(lags(n, differentiated=True, default=3.0), {"lag[1].u": lambda t: t})
-    np.testing.assert_array_equal(left["lag.slope"], np.broadcast_to(np.arange(n) == 1, (len(TS), n)))
-    rest = 3.0 * -np.expm1(-TS / (1 + 2 / 7))
-    np.testing.assert_allclose(left["lag[2].x"], rest, rtol=0, atol=1e-8)
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    for name, default in (("driven", None), ("left", 3.0)):
+        diagram.add_array(ev, name, Lag, n, 1.0 + np.arange(n) / 7, default=default, differentiated=True)
+    inputs = {"driven.u": lambda t: jnp.sin(t + phases), "left[1].u": lambda t: t}
+    found = run(AcausalCompiler(ev, diagram)(), inputs, adjoint=diffrax.ForwardMode())
+    np.testing.assert_allclose(found["driven.slope"], np.cos(T[:, None] + phases), rtol=0, atol=1e-14)
+    np.testing.assert_array_equal(found["left.slope"], np.broadcast_to(np.arange(n) == 1, (len(T), n)))
+    rest = 3.0 * -np.expm1(-T / (1 + 2 / 7))
+    np.testing.assert_allclose(found["left[2].x"], rest, rtol=0, atol=1e-8)
 
 
+@pytest.mark.long("a reverse-mode gradient of a run, and a batch of runs")
 def test_gradients_and_batches():
     """x(2) of lags that are driven by samples is linear in them: x = ∂x/∂u·u, each by its own samples alone."""
     system, values = lags(3), samples((3,))
@@ -112,14 +126,18 @@ def test_gradients_and_batches():
     def last(values):
         return run(system, {"lag.u": (WHEN, values)}, TS[-1:])["lag.x"][-1]
 
-    slope = jax.jacrev(last)(jnp.array(values))
+    @jax.jit
+    def slope_and_batch(values):
+        return jax.jacrev(last)(values), jax.vmap(last)(jnp.stack([values, 2 * values]))
+
+    one = np.asarray(last(values))
+    slope, batch = map(np.asarray, slope_and_batch(jnp.array(values)))
     np.testing.assert_array_equal(np.abs(slope).max(1) > 0, np.eye(3, dtype=bool))
-    np.testing.assert_allclose(jnp.einsum("ikj,kj->i", slope, values), last(values), rtol=0, atol=1e-8)
+    np.testing.assert_allclose(np.einsum("ikj,kj->i", slope, values), one, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(batch, [one, 2 * one], rtol=0, atol=1e-8)  # linear, from rest
     before = integration.run_compiled._cached._cache_size()  # pyright: ignore[reportFunctionMemberAccess]
     last(values + 1.0)
     assert integration.run_compiled._cached._cache_size() == before  # pyright: ignore[reportFunctionMemberAccess]
-    batch = eqx.filter_vmap(last)(jnp.stack([values, 2 * values]))
-    np.testing.assert_allclose(batch, [last(values), 2 * last(values)], rtol=0, atol=1e-8)
 
 
 class Gate(Lag):
@@ -138,13 +156,14 @@ def gates():
     return AcausalCompiler(ev, diagram)()
 
 
+@pytest.mark.long("a run with events")
 def test_among_several_names(gates):
     """An array's name stands for its entries in lists, and gives its shape alone."""
     solution = run(gates, {})
     each = [f"gate[{k}].x" for k in range(2)]
     np.testing.assert_array_equal(solution[["time", "gate.x"]], solution[["time", *each]])
     np.testing.assert_array_equal(solution[["gate.seen", "gate[0].x"]][:, :2], solution["gate.seen"])
-    np.testing.assert_allclose(solution["gate.x"], -np.expm1(-TS[:, None] / np.array([1.0, 2.0])), rtol=0, atol=1e-8)
+    np.testing.assert_allclose(solution["gate.x"], -np.expm1(-T[:, None] / np.array([1.0, 2.0])), rtol=0, atol=1e-8)
     x = gates.initialize(initial={"gate.x": np.array([0.25, 0.5])})
     np.testing.assert_array_equal(gates.observe(["gate.x", "gate[1].u"], 0.0, x), [0.25, 0.5, 1.0])
     events = solution.events
@@ -169,13 +188,14 @@ def test_points_and_linearizations(gates):
     np.testing.assert_allclose(alone.B, [[0.0], [0.5]], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_sweeps(gates):
     """One value for all entries, or one for each; T = 0 is not admissible."""
     pytest.importorskip("xarray")
     T = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 0.5]])
     options = {"t1": 2.0, "ts": TS, **TIGHT}
     each, every = sweep(gates, {"gate.T": T}, **options), sweep(gates, {"gate.T": T[:, 0]}, **options)
-    exact = -np.expm1(-TS[None, :, None] / T[:, None, :])
+    exact = -np.expm1(-T[None, :, None] / T[:, None, :])
     np.testing.assert_allclose(each["gate.x"], exact, rtol=0, atol=1e-8)
     np.testing.assert_allclose(every["gate.x"], exact[..., :1].repeat(2, -1), rtol=0, atol=1e-8)
     np.testing.assert_array_equal(sweep(gates, {"gate.T": T}, lambda s: s.parameters["gate.T"]).values, T)
@@ -189,7 +209,9 @@ def test_sweeps(gates):
 
 def test_data_sets_have_the_dimensions_of_arrays():
     pytest.importorskip("xarray")
-    data = run(lags((2, 3)), {"lag.u": 1.0}).to_xarray("lag.x", "lag[0,1].x", "lag[1,2].u")
+    data = run(lags((2, 3)), {"lag.u": 1.0}, adjoint=diffrax.ForwardMode()).to_xarray(
+        "lag.x", "lag[0,1].x", "lag[1,2].u"
+    )
     assert data["lag.x"].dims == ("time", "lag_0", "lag_1") and data["lag[0,1].x"].dims == ("time",)
     np.testing.assert_array_equal(data["lag.x"][:, 0, 1], data["lag[0,1].x"])
 
