@@ -79,26 +79,21 @@ def check(recipe):
 generators = st.integers(0, 2**32 - 1).map(random.Random)
 
 
-@hypothesis.settings(max_examples=40)
-@hypothesis.given(generators)
-def test_models_are_refused_exactly_if_they_are_singular_and_say_what_is_wrong(rng):
-    check(draw_recipe(rng))
+@pytest.mark.long("sixteen models")
+def test_models_are_refused_exactly_if_they_are_singular_and_say_what_is_wrong():
+    """Both sound and singular models occur among these recipes, so that this tests something."""
+    seen = {check(draw_recipe(random.Random(seed))) for seed in range(16)}
+    assert {"regular", "singular"} <= seen
 
 
 @pytest.mark.slow
-@hypothesis.settings(max_examples=400, suppress_health_check=list(hypothesis.HealthCheck))
+@hypothesis.settings(max_examples=150, suppress_health_check=list(hypothesis.HealthCheck))
 @hypothesis.given(generators)
 def test_many_broken_models(rng):
     check(draw_recipe(rng))
 
 
-def test_the_recipes_reach_what_they_are_for():
-    """Both sound and singular models occur among the first recipes, so that the tests above test something."""
-    seen = {check(draw_recipe(random.Random(seed))) for seed in range(12)}
-    assert {"regular", "singular"} <= seen
-
-
-@hypothesis.settings(max_examples=25)
+@hypothesis.settings(max_examples=8)
 @hypothesis.given(generators)
 def test_names_change_nothing(rng):
     """The same model under other names: the same text under those names, or the same report."""

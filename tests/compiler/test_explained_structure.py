@@ -373,13 +373,13 @@ def chain(n: int, *more, drop: int = 0):
 
 
 def test_a_long_part_is_shortened():
-    n = 120
+    n = 40
     assert text_of(lambda: chain(n, lambda x: Eq(x[0] * x[-1], x[3]), lambda x: Eq(x[0] ** 2, x[-1]))) == (
-        "121 equations determine only 120 unknowns, 'c.x0', 'c.x1', 'c.x2', 'c.x3', 'c.x4', 'c.x5' and 114 more. "
-        "Remove one of:\n" + "".join(f"  c: 0 = x{k}*x{k + 1} - 1\n" for k in range(6)) + "  … and 115 more, of 'c'"
+        "41 equations determine only 40 unknowns, 'c.x0', 'c.x1', 'c.x2', 'c.x3', 'c.x4', 'c.x5' and 34 more. "
+        "Remove one of:\n" + "".join(f"  c: 0 = x{k}*x{k + 1} - 1\n" for k in range(6)) + "  … and 35 more, of 'c'"
     )
     assert text_of(lambda: chain(n)) == (
-        "only 119 equations for 120 unknowns, 'c.x0', 'c.x1', 'c.x2', 'c.x3', 'c.x4', 'c.x5' and 114 more: add an "
+        "only 39 equations for 40 unknowns, 'c.x0', 'c.x1', 'c.x2', 'c.x3', 'c.x4', 'c.x5' and 34 more: add an "
         "equation, or declare one of them as an input."
     )
     several = text_of(lambda: chain(n, lambda x: Eq(x[0], 1), drop=9))

@@ -184,6 +184,7 @@ def test_rigid_rod_between_masses():
 # --- cancellation that structure cannot see --------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_transistor_amplifier_has_five_degrees_of_freedom():
     # Structural index 0, true index 1, five degrees of freedom (Mazzia & Magherini 2008; rank of M is 5).
     system = PROBLEMS["transamp"].compile()

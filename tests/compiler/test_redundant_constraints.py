@@ -58,6 +58,7 @@ def test_two_drives_of_one_shaft():
 # --- loops whose constraints depend on each other ------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_parallelogram_with_a_third_bar():
     """The message listed equations, and told to change the parameters `ry` of links."""
     b = Linkage()

@@ -61,7 +61,7 @@ def pryces_offsets(sigma, matching):
         c = following
 
 
-@hypothesis.settings(max_examples=300)
+@hypothesis.settings(max_examples=150)
 @hypothesis.given(signatures())
 def test_offsets(sigma):
     n = len(sigma)
@@ -110,7 +110,7 @@ def test_known_structures(sigma, index, freedom, c):
 # --- matching ----------------------------------------------------------------------------------------------------
 
 
-@hypothesis.settings(max_examples=300)
+@hypothesis.settings(max_examples=150)
 @hypothesis.given(st.integers(1, 9).flatmap(lambda n: entries(n)), st.integers(1, 9))
 def test_matchings_are_as_large_as_scipys(matrix, rows):
     present = np.array(matrix[:rows]) != ABSENT

@@ -442,7 +442,10 @@ class Thermometer(Component):
 ANY_UNIT = ("Switch.u", "Switch.threshold", "JoiningSwitch.u", "JoiningSwitch.threshold")
 
 
-@pytest.mark.parametrize("domain", domains())
+QUICK = ("rotational", "thermal")  # the others have more components
+
+
+@pytest.mark.parametrize("domain", [d if d in QUICK else pytest.param(d, marks=pytest.mark.slow) for d in domains()])
 def test_components_of_the_library_fit(domain):
     assert components_of(domain)
     for component in components_of(domain):
@@ -460,7 +463,10 @@ def test_components_of_the_library_declare_units(domain):
     assert set(without) <= set(ANY_UNIT)
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
+LARGE = ("andrews", "caraxis", "sundials_heat2d", "sundials_slcrank")
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in LARGE else n for n in PROBLEMS])
 def test_published_models_fit(name):
     _, diagram = PROBLEMS[name].build()
     check_units(diagram)
@@ -498,7 +504,7 @@ def test_symbolic_work_is_done_once_for_each_shape(monkeypatch):
     check_units(ladder(2))
     small = dict(counts)
     counts.clear()
-    check_units(ladder(1000))
+    check_units(ladder(200))
     assert counts == small and small["misfits_of_equation"] > 10
 
 
