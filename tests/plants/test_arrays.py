@@ -140,7 +140,7 @@ def test_the_same_as_single_components(n):
     assert [s.replace("[", "").replace("]", "") for s in one.states] == list(other.states)
     assert len(one.variables) == len(other.variables) and len(one.parameters) == len(other.parameters)
 
-    x, weights = np.linspace(0.2, 0.9, n), np.linspace(1.0, 2.0, n)
+    x, weights = jnp.asarray(np.linspace(0.2, 0.9, n)), np.linspace(1.0, 2.0, n)
 
     @eqx.filter_jit
     @eqx.filter_value_and_grad
