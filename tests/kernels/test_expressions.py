@@ -61,14 +61,17 @@ def test_a_long_equation_differentiated_twice():
             a, b = (jnp.sin(a) + b) / 2, (jnp.cos(b) + a) / 2
         return x + 2 * y + (a + b) / 9 - 1
 
-    point = dict(zip(system.states, np.linspace(0.2, 0.5, len(system.states)), strict=True))
-    state = jnp.array([point[n] for n in system.states])
-    slopes = dict(zip(system.states, system.vector_field(0.0, state), strict=True))
-    q, u = (jnp.array([point[f"c.{n}"] for n in names]) for names in ("xy", "vw"))
-    acceleration = jnp.array([slopes["c.v"], slopes["c.w"]])
-    f = lambda q: constraint(q[0], q[1])  # noqa: E731
-    second = jax.jvp(lambda q: jax.jvp(f, (q,), (u,))[1], (q,), (u,))[1] + jax.jvp(f, (q,), (acceleration,))[1]
-    assert abs(float(second)) < 1e-12
+    point = dict(zip(system.states, np.linspace(0.2, 0.5, len(system.states)).tolist(), strict=True))
+
+    @jax.jit
+    def curvature():
+        slopes = dict(zip(system.states, system.vector_field(0.0, jnp.array(list(point.values()))), strict=True))
+        q, u = (jnp.array([point[f"c.{n}"] for n in names]) for names in ("xy", "vw"))
+        acceleration = jnp.array([slopes["c.v"], slopes["c.w"]])
+        f = lambda q: constraint(q[0], q[1])  # noqa: E731
+        return jax.jvp(lambda q: jax.jvp(f, (q,), (u,))[1], (q,), (u,))[1] + jax.jvp(f, (q,), (acceleration,))[1]
+
+    assert abs(float(curvature())) < 1e-12
 
 
 def test_branches_not_taken_are_never_seen():
@@ -95,16 +98,27 @@ def test_branches_not_taken_are_never_seen():
             return sympy.Piecewise((bad + good * bad, X > 0), (good * X, True))
         return sympy.Piecewise((good + X, X <= 0), (bad * sympy.sqrt(bad), True))
 
+    kernels, partials = [], []
     for k in range(20):
-        kernel = Kernel([graph(grown(1 + k % 4, 0))], ["x", "y"])
-        f = lambda z, kernel=kernel: kernel([z[0], z[1]])[0]  # noqa: E731
-        for z in (jnp.array([-0.7, 0.4]), jnp.array([0.0, 0.4])):
-            forward, reverse = jax.jacfwd(f)(z), jax.jacrev(f)(z)
-            assert np.isfinite(forward).all(), k
-            np.testing.assert_allclose(forward, reverse, rtol=1e-13, atol=1e-14)
-            assert np.isfinite(jax.jacfwd(jax.jacrev(f))(z)).all()
-        partials = Kernel([partial_derivative(graph(grown(2, 0)), "x")], ["x", "y"])
-        assert np.isfinite(jax.grad(lambda x, p=partials: p([x, 0.3])[0])(-0.7))
+        kernels.append(Kernel([graph(grown(1 + k % 4, 0))], ["x", "y"]))
+        partials.append(Kernel([partial_derivative(graph(grown(2, 0)), "x")], ["x", "y"]))
+
+    @jax.jit
+    def derivatives(z):
+        fs = [lambda z, kernel=kernel: kernel([z[0], z[1]])[0] for kernel in kernels]
+        by_symbols = [jax.grad(lambda x, p=p: p([x, 0.3])[0])(-0.7) for p in partials]
+        return (
+            jnp.stack([jax.jacfwd(f)(z) for f in fs]),
+            jnp.stack([jax.jacrev(f)(z) for f in fs]),
+            jnp.stack([jax.jacfwd(jax.jacrev(f))(z) for f in fs]),
+            jnp.stack(by_symbols),
+        )
+
+    for z in (np.array([-0.7, 0.4]), np.array([0.0, 0.4])):
+        forward, reverse, second, of_partials = derivatives(z)
+        for one in (forward, second, of_partials):
+            assert np.isfinite(one).all(), np.flatnonzero(~np.isfinite(np.reshape(one, (20, -1))).all(1))
+        np.testing.assert_allclose(forward, reverse, rtol=1e-13, atol=1e-14)
 
 
 def test_a_shared_part_outside_branches_is_not_changed():
@@ -140,17 +154,21 @@ def test_what_is_finite_though_its_parts_overflow():
     kernel = Kernel([*nodes, *slopes, *(partial_derivative(slope, "x") for slope in slopes)], ["x"])
     value = Kernel(nodes, ["x"])
     values = lambda x: jnp.stack(value([x]))  # noqa: E731
-    forward = jax.jit(lambda x: jnp.stack([values(x), jax.jacfwd(values)(x), jax.jacfwd(jax.jacfwd(values))(x)]))
-    reverse = jax.jit(lambda x: jnp.stack([values(x), jax.jacrev(values)(x), jax.jacrev(jax.jacrev(values))(x)]))
+
+    @jax.jit
+    def differentiated(x):
+        forward = jnp.stack([values(x), jax.jacfwd(values)(x), jax.jacfwd(jax.jacfwd(values))(x)])
+        return forward, jnp.stack([values(x), jax.jacrev(values)(x), jax.jacrev(jax.jacrev(values))(x)])
+
     true = [sympy.lambdify(X, [f.diff(X, k) for f in FINITE_EVERYWHERE.values()], "mpmath") for k in range(3)]
     for x in (-900.0, -40.0, -1.3, 0.0, 0.7, 35.0, 200.0, 900.0):
         with mp.workdps(900):
             expected = np.array([[float(v) for v in f(mp.mpf(x))] for f in true])
         written = np.reshape(kernel([np.array(x)], "numpy"), expected.shape)
-        for found in (written, forward(jnp.array(x)), reverse(jnp.array(x))):
+        for found in (written, *differentiated(np.array(x))):
             # atol: JAX's derivatives of the logistic function are differences of numbers of size 1
             np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-15)
-        assert np.isfinite(reverse(jnp.array(x, jnp.float32))).all()
+        assert np.isfinite(differentiated(np.array(x, np.float32))[1]).all()
 
 
 def test_numpy_and_jax_agree():
@@ -160,7 +178,7 @@ def test_numpy_and_jax_agree():
     x, y = rng.uniform(0.1, 2.0, (2, 50))
     expected = np.maximum(x, y) ** 1.5 / (1 + x**2) - np.arctan2(x, y) * (x % 0.3) + np.sqrt(y) - 2
     np.testing.assert_allclose(kernel([x, y], "numpy")[0], expected, rtol=1e-14)
-    np.testing.assert_allclose(kernel([jnp.asarray(x), jnp.asarray(y)])[0], expected, rtol=1e-13)
+    np.testing.assert_allclose(jax.jit(lambda x, y: kernel([x, y])[0])(x, y), expected, rtol=1e-13)
 
 
 def test_equal_expressions_are_one_node():
@@ -188,9 +206,15 @@ def test_a_table_in_an_equation():
         c.add_equations(Eq(der(x), -2 * y))
 
     system = compiled(write)
-    assert float(system.vector_field(0.0, jnp.array([0.25]))[0]) == -3.0
     trainable, frozen = system.partition("c.law")
-    grad = jax.grad(lambda s: eqx.combine(s, frozen).vector_field(0.0, jnp.array([0.25]))[0])(trainable)
+
+    @jax.jit
+    @jax.value_and_grad
+    def field(trainable):
+        return eqx.combine(trainable, frozen).vector_field(0.0, jnp.array([0.25]))[0]
+
+    value, grad = field(trainable)
+    assert float(value) == -3.0
     leaves = [np.asarray(g) for g in jax.tree.leaves(grad) if np.shape(g) == (3,)]
     assert any(np.allclose(g, [-1.5, -0.5, 0.0]) for g in leaves)
 
@@ -210,13 +234,20 @@ def test_functions_in_a_constraint_differentiated_twice():
         c.add_equations(Eq(a + b, 1))
 
     system = compiled(write)
-    state = system.initialize()
-    x, y, v, w = system.observe(["c.x", "c.y", "c.v", "c.w"], 0.0, state)
-    f = lambda q: shape(q[0], q[1]).sum() - 1  # noqa: E731
-    q, u = jnp.array([x, y]), jnp.array([v, w])
-    assert abs(f(q)) < 1e-10
-    assert abs(jax.jvp(f, (q,), (u,))[1]) < 1e-10
-    slopes = dict(zip(system.states, system.vector_field(0.0, state)[: len(system.states)], strict=True))
-    acceleration = jnp.array([slopes["c.v"], slopes["c.w"]])
-    second = jax.jvp(lambda q: jax.jvp(f, (q,), (u,))[1], (q,), (u,))[1] + jax.jvp(f, (q,), (acceleration,))[1]
+
+    @jax.jit
+    def hidden():
+        """The constraint and its two derivatives in time."""
+        state = system.initialize()
+        x, y, v, w = system.observe(["c.x", "c.y", "c.v", "c.w"], 0.0, state)
+        f = lambda q: shape(q[0], q[1]).sum() - 1  # noqa: E731
+        q, u = jnp.array([x, y]), jnp.array([v, w])
+        slopes = dict(zip(system.states, system.vector_field(0.0, state)[: len(system.states)], strict=True))
+        acceleration = jnp.array([slopes["c.v"], slopes["c.w"]])
+        rate, second = jax.jvp(lambda q: jax.jvp(f, (q,), (u,))[1], (q,), (u,))
+        return f(q), rate, second + jax.jvp(f, (q,), (acceleration,))[1]
+
+    value, rate, second = hidden()
+    assert abs(value) < 1e-10
+    assert abs(rate) < 1e-10
     assert abs(second) < 1e-9

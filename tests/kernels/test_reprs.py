@@ -209,16 +209,23 @@ class Rotor(Component):
         self.add_equations(der(r[0]) + w * r[1], der(r[1]) - w * r[0])
 
 
-@pytest.mark.parametrize(
-    "start, expected", [((3.0, 4.0), [3.0, 4.0]), (1.5, [1.5, 1.5]), (np.array([1.0, 2.0]), [1, 2])]
-)
-def test_vectors(start, expected):
-    system = compiled(Rotor(EqnEnv(), "c", start))
-    assert system.variables == ["c.r[0]", "c.r[1]"] and set(system.states) == set(system.variables)
-    state = system.initialize()
-    np.testing.assert_allclose(system.observe(["c.r[0]", "c.r[1]"], 0.0, state), expected)
-    slopes = system.observe(["der(c.r[0])", "der(c.r[1])"], 0.0, state)
-    np.testing.assert_allclose(slopes, [-2.0 * expected[1], 2.0 * expected[0]])
+STARTS = [((3.0, 4.0), [3.0, 4.0]), (1.5, [1.5, 1.5]), (np.array([1.0, 2.0]), [1.0, 2.0])]
+
+
+def test_vectors():
+    ev = EqnEnv()
+    system = compiled(*(Rotor(ev, f"c{k}", start) for k, (start, _) in enumerate(STARTS)))
+    names = [f"c{k}.r[{j}]" for k in range(len(STARTS)) for j in range(2)]
+    assert system.variables == names and set(system.states) == set(names)
+
+    @jax.jit
+    def started():
+        state = system.initialize()
+        return system.observe([*names, *(f"der({n})" for n in names)], 0.0, state)
+
+    expected = np.array([values for _, values in STARTS])
+    slopes = np.stack([-2.0 * expected[:, 1], 2.0 * expected[:, 0]], 1)
+    np.testing.assert_allclose(started(), [*expected.ravel(), *slopes.ravel()])
 
 
 @pytest.mark.parametrize(
