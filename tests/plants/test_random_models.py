@@ -2,6 +2,7 @@
 
 import functools
 
+import diffrax
 import equinox as eqx
 import hypothesis
 import hypothesis.strategies as st
@@ -15,7 +16,6 @@ from problems import compiled
 from jaxonomy_dae import EqnEnv, simulate
 from jaxonomy_dae.library.electrical import Capacitor, Ground, Resistor, VoltageSource
 from jaxonomy_dae.library.translational import Damper, FixedPosition, Mass, Spring
-from jaxonomy_dae.linear.written_out import solve
 
 values = st.floats(0.2, 5.0)
 
@@ -39,19 +39,19 @@ def circuits(draw, kinds="rc"):
     return n, draw(st.floats(-3.0, 3.0)), edges
 
 
-def build(circuit):
-    """The circuit as components r0, c1, …, named by their place among the edges."""
+def parts_of(ev, circuit, place):
+    """The circuit as components r0, c1, …, named by their place among the edges behind that of the circuit; and what is
+    connected."""
     n, voltage, edges = circuit
-    ev = EqnEnv()
-    source, ground = VoltageSource(ev, "source", voltage), Ground(ev, "ground")
+    source, ground = VoltageSource(ev, f"{place}_source", voltage), Ground(ev, f"{place}_ground")
     pins = [[source.n, ground.p], [source.p], *([] for _ in range(n - 2))]
     parts = [source, ground]
     for k, (kind, a, b, value) in enumerate(edges):
-        part = Resistor(ev, f"r{k}", value) if kind == "r" else Capacitor(ev, f"c{k}", value)
+        part = Resistor(ev, f"{place}_r{k}", value) if kind == "r" else Capacitor(ev, f"{place}_c{k}", value)
         parts.append(part)
         pins[a].append(part.p)
         pins[b].append(part.n)
-    return compiled(*parts, connect=[p for p in pins if len(p) > 1])  # a loose pin carries no current
+    return parts, [p for p in pins if len(p) > 1]  # a loose pin carries no current
 
 
 def independent_capacitors(circuit):
@@ -108,48 +108,56 @@ def _point(system, names, initial):
     return system.observe(names, 0.0, x), system.vector_field(0.0, x)
 
 
-def check_circuit(circuit, seed):
-    n, voltage, edges = circuit
-    system = build(circuit)
-    independent = independent_capacitors(circuit)
-    assert len(system.states) == len(independent)
-    charged = dict(zip(independent, np.random.default_rng(seed).normal(size=len(independent)), strict=True))
-    v, rate, current = nodal_analysis(circuit, charged)
-    names, expected = ["source.i", "source.v"], [current, voltage]
-    for k, (kind, a, b, x) in enumerate(edges):
-        names += [f"{kind}{k}.v", f"{kind}{k}.i", f"{kind}{k}.p.v"]
-        expected += [v[a] - v[b], (v[a] - v[b]) / x if kind == "r" else x * (rate[a] - rate[b]), v[a]]
-    found, slope = _point(system, names, {f"c{k}.v": jnp.asarray(u) for k, u in charged.items()})
+def check_circuits(circuits, seed):
+    """Several circuits in one model, which costs one compilation."""
+    ev, rng = EqnEnv(), np.random.default_rng(seed)
+    built = [parts_of(ev, circuit, f"k{j}") for j, circuit in enumerate(circuits)]
+    system = compiled(*(p for parts, _ in built for p in parts), connect=[ends for _, c in built for ends in c])
+    given, names, expected, rates = {}, [], [], {}
+    for j, circuit in enumerate(circuits):
+        _, voltage, edges = circuit
+        independent = independent_capacitors(circuit)
+        charged = dict(zip(independent, rng.normal(size=len(independent)), strict=True))
+        given |= {f"k{j}_c{k}.v": jnp.asarray(u) for k, u in charged.items()}
+        v, rate, current = nodal_analysis(circuit, charged)
+        names += [f"k{j}_source.i", f"k{j}_source.v"]
+        expected += [current, voltage]
+        for k, (kind, a, b, x) in enumerate(edges):
+            names += [f"k{j}_{kind}{k}.{n}" for n in ("v", "i", "p.v")]
+            expected += [v[a] - v[b], (v[a] - v[b]) / x if kind == "r" else x * (rate[a] - rate[b]), v[a]]
+            rates[f"k{j}_{kind}{k}.v"] = rate[a] - rate[b]
+    assert len(system.states) == len(given)
+    found, slope = _point(system, names, given)
     # Two different elimination orders of well-conditioned systems with values between 0.2 and 5.
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
-    for name, d in zip(system.states, slope, strict=True):
-        part, variable = name.split(".")
-        _, a, b, _ = edges[int(part[1:])]
-        assert variable == "v"
-        assert float(d) == pytest.approx(rate[a] - rate[b], rel=1e-9, abs=1e-9)
+    np.testing.assert_allclose(slope, [rates[name] for name in system.states], rtol=1e-9, atol=1e-9)
 
 
-@hypothesis.settings(max_examples=12)
-@hypothesis.given(circuits(), st.integers(0, 100))
+def several(strategy):
+    return st.lists(strategy, min_size=6, max_size=6)
+
+
+@hypothesis.settings(max_examples=2)
+@hypothesis.given(several(circuits()), st.integers(0, 100))
 @hypothesis.example(
-    (3, 2.0, [("r", 1, 0, 1.0), ("r", 2, 1, 2.0), ("c", 1, 2, 1.5), ("c", 0, 2, 0.5), ("c", 2, 1, 3.0)]), 0
+    [(3, 2.0, [("r", 1, 0, 1.0), ("r", 2, 1, 2.0), ("c", 1, 2, 1.5), ("c", 0, 2, 0.5), ("c", 2, 1, 3.0)])], 0
 )
-def test_resistors_and_capacitors(circuit, seed):
-    check_circuit(circuit, seed)
+def test_resistors_and_capacitors(circuits, seed):
+    check_circuits(circuits, seed)
 
 
 @pytest.mark.slow
-@hypothesis.settings(max_examples=40)
-@hypothesis.given(circuits(kinds="r"))
-def test_resistors(circuit):
-    check_circuit(circuit, 0)
+@hypothesis.settings(max_examples=5, suppress_health_check=list(hypothesis.HealthCheck))
+@hypothesis.given(several(circuits(kinds="r")))
+def test_resistors(circuits):
+    check_circuits(circuits, 0)
 
 
 @pytest.mark.slow
-@hypothesis.settings(max_examples=150)
-@hypothesis.given(circuits(), st.integers(0, 100))
-def test_many_circuits(circuit, seed):
-    check_circuit(circuit, seed)
+@hypothesis.settings(max_examples=15, suppress_health_check=list(hypothesis.HealthCheck))
+@hypothesis.given(several(circuits()), st.integers(0, 100))
+def test_many_circuits(circuits, seed):
+    check_circuits(circuits, seed)
 
 
 # --- chains of masses --------------------------------------------------------------------------------------------
@@ -167,28 +175,28 @@ def chains(draw):
     return masses, links, draw(st.booleans()), draw(st.booleans())
 
 
-def build_chain(masses, links, left, right):
-    """The chain with walls at −1 and at +1 as far as there are any, the masses anywhere between."""
-    ev = EqnEnv()
-    bodies = [Mass(ev, f"m{k}", m, initial_position=0.1 * k, initial_velocity=0.0) for k, m in enumerate(masses)]
+def chain_parts(ev, masses, links, left, right, at=""):
+    """The chain with walls at −1 and at +1 as far as there are any, the masses anywhere between; and what is
+    connected."""
+    bodies = [Mass(ev, f"{at}m{k}", m, initial_position=0.1 * k, initial_velocity=0.0) for k, m in enumerate(masses)]
     ends = [body.flange for body in bodies]
     if left:
-        ends.insert(0, FixedPosition(ev, "left", -1.0).flange)
+        ends.insert(0, FixedPosition(ev, f"{at}left", -1.0).flange)
     if right:
-        ends.append(FixedPosition(ev, "right", 1.0).flange)
+        ends.append(FixedPosition(ev, f"{at}right", 1.0).flange)
     used = links[0 if left else 1 :][: len(ends) - 1]
     connect = []
     for g, ((stiffness, damping, length), a, b) in enumerate(zip(used, ends[:-1], ends[1:], strict=True)):
-        at = a
+        end = a
         for s, k in enumerate(stiffness):
-            spring = Spring(ev, f"s{g}_{s}", k, length=length)
-            connect.append((at, spring.flange_a))
-            at = spring.flange_b
-        connect.append((at, b))
+            spring = Spring(ev, f"{at}s{g}_{s}", k, length=length)
+            connect.append((end, spring.flange_a))
+            end = spring.flange_b
+        connect.append((end, b))
         if damping is not None:
-            damper = Damper(ev, f"d{g}", damping)
+            damper = Damper(ev, f"{at}d{g}", damping)
             connect += [(a, damper.flange_a), (b, damper.flange_b)]
-    return compiled(*bodies, connect=connect)
+    return bodies, connect
 
 
 def chain_equations(masses, links, left, right):
@@ -220,36 +228,56 @@ def _affine(system, x):
     return jax.jacfwd(lambda x: system.vector_field(0.0, x))(x), system.vector_field(0.0, x)
 
 
-def check_chain(chain):
-    masses = chain[0]
-    n = len(masses)
-    system = build_chain(*chain)
+def check_chains(chains):
+    """Several chains in one model, whose Jacobian is block diagonal."""
+    ev = EqnEnv()
+    built = [chain_parts(ev, *chain, at=f"k{j}_") for j, chain in enumerate(chains)]
+    system = compiled(*(p for parts, _ in built for p in parts), connect=[ends for _, c in built for ends in c])
     place = {name: k for k, name in enumerate(system.states)}
-    order = [place[f"m{k}.{v}"] for v in ("s", "v") for k in range(n)]
-    assert len(place) == 2 * n
-    jacobian, slope = _affine(system, jnp.zeros(2 * n))
-    a, b = chain_equations(*chain)
-    np.testing.assert_allclose(np.asarray(jacobian)[np.ix_(order, order)], a, rtol=1e-9, atol=1e-9)  # rounding
-    np.testing.assert_allclose(np.asarray(slope)[order], b, rtol=1e-9, atol=1e-9)
+    order = [
+        place[f"k{j}_m{k}.{v}"] for j, (masses, *_) in enumerate(chains) for v in ("s", "v") for k in range(len(masses))
+    ]
+    assert len(place) == len(order)
+    jacobian, slope = _affine(system, jnp.zeros(len(order)))
+    a, b = zip(*(chain_equations(*chain) for chain in chains), strict=True)
+    expected = scipy.linalg.block_diag(*a)
+    np.testing.assert_allclose(np.asarray(jacobian)[np.ix_(order, order)], expected, rtol=1e-9, atol=1e-9)  # rounding
+    np.testing.assert_allclose(np.asarray(slope)[order], np.concatenate(b), rtol=1e-9, atol=1e-9)
 
 
-@hypothesis.settings(max_examples=12)
-@hypothesis.given(chains())
-def test_equations_of_chains(chain):
-    check_chain(chain)
+@hypothesis.settings(max_examples=2)
+@hypothesis.given(several(chains()))
+def test_equations_of_chains(chains):
+    check_chains(chains)
 
 
 @pytest.mark.slow
-@hypothesis.settings(max_examples=100)
-@hypothesis.given(chains())
-def test_equations_of_many_chains(chain):
-    check_chain(chain)
+@hypothesis.settings(max_examples=12, suppress_health_check=list(hypothesis.HealthCheck))
+@hypothesis.given(several(chains()))
+def test_equations_of_many_chains(chains):
+    check_chains(chains)
 
 
 @functools.cache
 def three_masses():
-    return build_chain([1.0] * 3, [([1.0, 1.0], 0.5, 0.2), ([1.0], None, 0.1), ([1.0], 0.3, 0.0), ([1.0], None, 0.0)],
-                       True, False)  # fmt: skip
+    """The motion from masses, stiffnesses and initial values."""
+    links = [([1.0, 1.0], 0.5, 0.2), ([1.0], None, 0.1), ([1.0], 0.3, 0.0), ([1.0], None, 0.0)]
+    parts, connect = chain_parts(EqnEnv(), [1.0] * 3, links, True, False)
+    system = compiled(*parts, connect=connect)
+    states = [f"m{i}.{v}" for v in ("s", "v") for i in range(3)]
+
+    @jax.jit
+    def moved(values, start):
+        changed = system.with_parameters(dict(zip(VARIED, values, strict=True)))
+        initial = dict(zip(states, start, strict=True))
+        options = {"rtol": 1e-9, "atol": 1e-11, "adjoint": diffrax.ForwardMode()}
+        return simulate(changed, 1.5, ts=TS, initial=initial, **options)[states]
+
+    return moved
+
+
+TS = np.array([0.7, 1.5])
+VARIED = ["m0.M", "m1.M", "m2.M", "s0_0.K", "s0_1.K", "s1_0.K", "s2_0.K"]
 
 
 @hypothesis.settings(max_examples=15)
@@ -260,34 +288,9 @@ def three_masses():
 )
 def test_motions_are_matrix_exponentials(masses, k, start):
     """One structure, compiled once; its parameters and initial values vary."""
-    names = ["m0.M", "m1.M", "m2.M", "s0_0.K", "s0_1.K", "s1_0.K", "s2_0.K"]
-    system = three_masses().with_parameters(dict(zip(names, [*masses, *k], strict=True)))
-    states = [f"m{i}.{v}" for v in ("s", "v") for i in range(3)]
-    ts = np.array([0.7, 1.5])
-    initial = dict(zip(states, start, strict=True))
-    solution = simulate(system, 1.5, ts=ts, initial=initial, rtol=1e-9, atol=1e-11)
+    found = three_masses()(np.array([*masses, *k]), np.array(start))
     links = [([k[0], k[1]], 0.5, 0.2), ([k[2]], None, 0.1), ([k[3]], 0.3, 0.0), ([1.0], None, 0.0)]
     a, b = chain_equations(masses, links, True, False)
     augmented = np.block([[a, b[:, None]], [np.zeros((1, 7))]])
-    expected = [(scipy.linalg.expm(augmented * t) @ [*start, 1.0])[:6] for t in ts]
-    found = np.stack([solution[n] for n in states], axis=1)
+    expected = [(scipy.linalg.expm(augmented * t) @ [*start, 1.0])[:6] for t in TS]
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7)  # a hundred times the tolerance
-
-
-# --- small linear systems ----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("n", [1, 2, 4, 6])
-@pytest.mark.parametrize("positive", [False, True])
-def test_unrolled_elimination(n, positive):
-    rng = np.random.default_rng(n)
-    a = rng.normal(size=(n, n, 5))  # a batch of five
-    if positive:
-        a = np.einsum("ikb,jkb->ijb", a, a) + np.eye(n)[:, :, None]
-    elif n > 1:
-        a[0, 0] = 0.0  # a pivot that must be avoided
-    b = rng.normal(size=(n, 5))
-    found = solve([[jnp.asarray(x) for x in row] for row in a], [jnp.asarray(x) for x in b], positive=positive)
-    expected = np.linalg.solve(np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)[..., None])[..., 0].T
-    # Rounding times the condition of random 6 by 6 matrices, some hundreds.
-    np.testing.assert_allclose(np.stack(found), expected, rtol=1e-9)

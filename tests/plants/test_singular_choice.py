@@ -16,7 +16,7 @@ ANGLES = (0.5, 1.2, 2.5, -0.5, -1.2, -2.8)
 SOLVERS = [
     pytest.param(Tsit5(), id="ours"),
     pytest.param(diffrax.Tsit5(), id="Diffrax's", marks=pytest.mark.slow),
-    pytest.param(Rodas5P(), id="Rodas5P"),
+    pytest.param(Rodas5P(), id="Rodas5P", marks=pytest.mark.slow),
     pytest.param(BDF(), id="BDF", marks=pytest.mark.slow),
 ]
 
@@ -33,6 +33,7 @@ def released(system, theta, L=1.0):
     return system.with_parameters({"pend.initial_theta": theta, "pend.L": L})
 
 
+@pytest.mark.long("a run for each way to end it")
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_right_or_refused(minimal, solver):
     for theta in ANGLES:
@@ -51,7 +52,8 @@ def test_right_or_refused(minimal, solver):
         np.testing.assert_allclose(found[:, done], expected[:, done], rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("rtol, atol", [pytest.param(1e-3, 1e-6, marks=pytest.mark.slow), (1e-3, 1e-3)])
+@pytest.mark.slow
+@pytest.mark.parametrize("rtol, atol", [(1e-3, 1e-6), (1e-3, 1e-3)])
 def test_loose_tolerances_do_not_reflect_the_motion(minimal, rtol, atol):
     rng = np.random.default_rng(3)
     for theta, L in zip(rng.uniform(-3, 3, 12), 10 ** rng.uniform(-0.5, 1.5, 12), strict=True):
@@ -68,6 +70,7 @@ def test_loose_tolerances_do_not_reflect_the_motion(minimal, rtol, atol):
         )
 
 
+@pytest.mark.slow
 def test_steps_of_a_fixed_size_are_refused_too(minimal):
     solution = simulate(
         released(minimal, 0.5), 2.0, ts=TS, solver=Tsit5(), throw=False,
@@ -76,6 +79,7 @@ def test_steps_of_a_fixed_size_are_refused_too(minimal):
     assert not bool(diffrax.is_okay(solution.result))
 
 
+@pytest.mark.slow
 def test_inside_jit(minimal):
     @eqx.filter_jit
     def run(theta):
@@ -89,6 +93,7 @@ def test_inside_jit(minimal):
     np.testing.assert_allclose(x, angle_solution(-0.5, 0.0, TS).x, rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_one_of_two_that_is_singular_is_named():
     ev = EqnEnv()
     pair = [PlanarPendulum(ev, name, initial_theta=theta) for name, theta in (("a", -1.2), ("b", 0.5))]
