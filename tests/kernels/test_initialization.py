@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from problems import RELEASE, compiled, pendulum
+from problems import RELEASE, compiled
 from sympy import Eq
 
 from jaxonomy_dae import Component, EqnEnv, InitializationError, der
@@ -115,14 +115,13 @@ def test_a_fixed_start_of_an_algebraic_variable_holds(declared):
 def test_its_gradient_is_the_implicit_functions():
     system = compiled(Cubic(EqnEnv(), "c"))
 
-    @jax.jit
     def x(p):
         return system.with_parameters({"c.p": p}).initialize()[0]
 
     # dx/dp = 1/(3x² + 1) at x = 2 and, by the same program, at x = 1.
-    assert float(jax.grad(x)(10.0)) == pytest.approx(1 / 13, rel=1e-10)
-    assert float(jax.grad(x)(2.0)) == pytest.approx(1 / 4, rel=1e-10)
-    assert float(jax.jvp(x, (2.0,), (1.0,))[1]) == pytest.approx(1 / 4, rel=1e-10)
+    slopes = jax.jit(lambda p: (jax.grad(x)(p), jax.jvp(x, (p,), (1.0,))[1]))
+    np.testing.assert_allclose(slopes(10.0), 1 / 13, rtol=1e-10)
+    np.testing.assert_allclose(slopes(2.0), 1 / 4, rtol=1e-10)
 
 
 def test_a_guess_yields_to_what_is_fixed(declared):
@@ -169,6 +168,7 @@ def test_contradicting_starts_across_a_connection():
     np.testing.assert_allclose(started(mended, {})("a.v", "b.v"), [1.0, 1.0], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_contradiction_inside_jit_raises_too():
     system = compiled(Cubic(EqnEnv(), "c", x_start=3.0, x_fixed=True))
     with pytest.raises(Exception, match="no consistent initial point"):
@@ -194,11 +194,6 @@ def test_an_alias_may_be_given_with_its_sign(given):
     """The current of a discharging capacitor determines its voltage: v = −R·i, and r.i = −c.i."""
     np.testing.assert_allclose(given("out.c.v", "out.r.i"), [2.0, 0.5], rtol=1e-12)
     np.testing.assert_allclose(given("back.c.v", "back.c.i"), [2.0, -0.5], rtol=1e-12)
-
-
-def test_values_given_that_contradict_each_other_are_named():
-    with pytest.raises(InitializationError, match=r"start of pend\.[xy]"):
-        pendulum().initialize(initial={"pend.x": 0.9, "pend.y": -0.9})
 
 
 def test_underdetermined_starts_keep_the_guesses(declared):

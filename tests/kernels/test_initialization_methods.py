@@ -170,9 +170,10 @@ def cubic(z):
     return z**3 - 2 * z + 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "law, guess, method, root",
-    [pytest.param(atan, 10.0, "Newton", 0.0, marks=pytest.mark.slow), (cubic, 2.0, "homotopy", CARDANO)],
+    [(atan, 10.0, "Newton", 0.0), (cubic, 2.0, "homotopy", CARDANO)],
 )
 def test_a_models_own_equation(law, guess, method, root):
     system = compiled(Law(EqnEnv(), "c", law, z=guess))
@@ -197,6 +198,7 @@ def test_gradients_are_exact_whichever_rung_found_the_point():
     assert float(slope) == pytest.approx(numeric, rel=1e-8)
 
 
+@pytest.mark.long("a gradient through a batch of starts")
 def test_one_member_that_fails_does_not_disturb_the_others():
     """z² = p − 1 at x = 1 has no solution for p < 1."""
     system = compiled(Law(EqnEnv(), "c", lambda z: z**2 + 1, p=2.0, z=3.0))
@@ -308,6 +310,7 @@ class Cubics(Component):
         self.add_equations(Eq(x**3 + y**3 + x, r), Eq(y - x**3 + y**3, 2 * r), der(r) + r)
 
 
+@pytest.mark.slow
 def test_the_last_step_is_checked(monkeypatch):
     """The step that carries the derivative once went from a root to 1e272, unseen."""
     assert np.isfinite(compiled(Cubics(EqnEnv(), "sound")).initialize()).all()
@@ -325,7 +328,8 @@ class Circle(Component):
         self.add_equations(Eq(x**2 + y**2, 1), Eq(der(x), -y))
 
 
-@pytest.mark.parametrize("x0", [1.3, pytest.param(2.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("x0", [1.3, 2.0])
 def test_a_guess_beside_a_fold(x0):
     """The nearest point of the circle is (1, 0), where y has no slope: the search stopped in front of it, and the error
     said that no point was found. There, x as the only state does not tell which way y goes."""

@@ -83,49 +83,67 @@ class Owner:
         return self.gain * jnp.ones_like(t)
 
 
-def agrees(lag, function, value):
-    solution = simulate(lag, 10.0, ts=END, inputs={"m.u": function})
-    np.testing.assert_allclose(solution["m.x"], constant(value), rtol=1e-5)
-    np.testing.assert_allclose(solution["m.y"], value, rtol=1e-12)
-    np.testing.assert_allclose(lag.observe("m.y", 0.0, jnp.ones(1), {"m.u": function}), value, rtol=1e-12)
+TIGHT = {"rtol": 1e-8, "atol": 1e-10, "adjoint": diffrax.ForwardMode()}
+FAST = {"adjoint": diffrax.ForwardMode()}  # whose programs compile fastest, where nothing is differentiated
+READERS = {
+    "function": lambda owner, data: from_global,
+    "object": lambda owner, data: owner,
+    "method": lambda owner, data: owner.method,
+    "partial": lambda owner, data: functools.partial(Owner.method, owner),
+    "array": lambda owner, data: lambda t: jnp.interp(t, jnp.linspace(0.0, 10.0, 5), data),
+}
 
 
-def test_a_global_that_changed_is_read_again(lag, monkeypatch):
-    for value in (1.0, 2.0, -3.0):
-        monkeypatch.setitem(globals(), "GAIN", value)
-        agrees(lag, from_global, value)
+@pytest.fixture(scope="module")
+def lags():
+    """Lags that are named after what drives them."""
+    ev = EqnEnv()
+    return compiled(*(Lag(ev, name) for name in READERS))
 
 
-@pytest.mark.parametrize("read", [lambda o: o, lambda o: o.method, lambda o: functools.partial(Owner.method, o)])
-def test_an_attribute_that_changed_is_read_again(lag, read):
-    owner = Owner(1.0)
-    agrees(lag, read(owner), 1.0)
-    owner.gain = 2.0
-    agrees(lag, read(owner), 2.0)
+@pytest.mark.long("what is read again must be read in each way alone")
+def test_what_changed_is_read_again(lags, monkeypatch):
+    """Globals, attributes and arrays: each changes by itself, so that no other makes the program be traced again."""
+    owners = {name: Owner(1.0) for name in READERS}
+    data, values = np.ones(5), dict.fromkeys(READERS, 1.0)
+    monkeypatch.setitem(globals(), "GAIN", 1.0)
 
+    def agree():
+        inputs = {f"{name}.u": read(owners[name], data) for name, read in READERS.items()}
+        solution = simulate(lags, 10.0, ts=END, inputs=inputs, **FAST)
+        for name, value in values.items():
+            np.testing.assert_allclose(solution[f"{name}.x"], constant(value), rtol=1e-5)
+            np.testing.assert_allclose(solution[f"{name}.y"], value, rtol=1e-12)
+        observed = lags.observe([f"{name}.y" for name in READERS], 0.0, jnp.ones(len(READERS)), inputs)
+        np.testing.assert_allclose(observed, list(values.values()), rtol=1e-12)
+        return solution
 
-def test_an_array_that_was_written_to_is_read_again(lag):
-    data = np.ones(5)
-
-    def table(t):
-        return jnp.interp(t, jnp.linspace(0.0, 10.0, 5), data)
-
-    first = simulate(lag, 10.0, ts=END, inputs={"m.u": table})
-    data[:] = 3.0
-    agrees(lag, table, 3.0)
-    np.testing.assert_allclose(first["m.y"], 1.0)  # a solution keeps what was simulated
+    first = agree()
+    for k, name in enumerate(READERS):
+        values[name] = 2.0 - 3 * k
+        if name == "function":
+            monkeypatch.setitem(globals(), "GAIN", values[name])
+        elif name == "array":
+            data[:] = values[name]
+        else:
+            owners[name].gain = values[name]
+        agree()
+    np.testing.assert_allclose(first["array.y"], 1.0)  # a solution keeps what was simulated
 
 
 def test_what_a_branch_reads_is_read_again(lag):
     """Numbers inside control flow are part of the traced program, not of its operands."""
     for value in (1.0, 2.0):
-        agrees(lag, lambda t, k=value: jax.lax.cond(t > -1.0, lambda: k, lambda: 0.0), value)
+        inputs = {"m.u": lambda t, k=value: jax.lax.cond(t > -1.0, lambda: k, lambda: 0.0)}
+        solution = simulate(lag, 10.0, ts=END, inputs=inputs, **FAST)
+        np.testing.assert_allclose(solution["m.x"], constant(value), rtol=1e-5)
+        np.testing.assert_allclose(solution["m.y"], value, rtol=1e-12)
 
 
 def test_new_functions_of_the_same_form_share_a_program(lag):
     def call(gain, knots):
         return simulate(
-            lag, 10.0, ts=END, inputs={"m.u": lambda t: gain * jnp.interp(t, knots, knots) + gain**2}
+            lag, 10.0, ts=END, inputs={"m.u": lambda t: gain * jnp.interp(t, knots, knots) + gain**2}, **FAST
         )["m.x"]  # fmt: skip
 
     knots = np.array([0.0, 10.0])
@@ -138,10 +156,11 @@ def test_new_functions_of_the_same_form_share_a_program(lag):
     assert integration.run_compiled._cached._cache_size() == before
 
 
+@pytest.mark.slow
 def test_inputs_of_initialization_are_not_stale(rate):
     """der(u) is an unknown of the start: initialize with two functions of one form."""
     for gain in (1.0, 2.0):
-        solution = simulate(rate, 1.0, ts=jnp.array([1.0]), inputs={"m.u": lambda t, k=gain: k * jnp.sin(t)})
+        solution = simulate(rate, 1.0, ts=jnp.array([1.0]), inputs={"m.u": lambda t, k=gain: k * jnp.sin(t)}, **FAST)
         np.testing.assert_allclose(solution["m.x"], gain * (np.sin(1.0) + 1 - np.cos(1.0)), rtol=1e-5)
 
 
@@ -151,9 +170,8 @@ PULSE = (np.array([0.0, 5.0, 5.1, 10.0]), np.array([0.0, 1.0, 0.0, 0.0]), "held"
 PULSED = 30 * (np.exp(-0.49) - np.exp(-0.5))
 
 
-@pytest.mark.parametrize(
-    "solver", [None, *(pytest.param(solver, marks=pytest.mark.slow) for solver in (Rodas5P(), BDF()))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [None, Rodas5P(), BDF()])
 def test_a_short_pulse_is_seen(lag, solver):
     solution = simulate(lag, 10.0, ts=jnp.array([4.9, 5.0, 5.05, 10.0]), inputs={"m.u": PULSE}, solver=solver)
     np.testing.assert_allclose(solution["m.x"][-1], PULSED, rtol=1e-5)
@@ -161,26 +179,49 @@ def test_a_short_pulse_is_seen(lag, solver):
     assert solution.stats["num_steps"] < 100
 
 
-def test_narrow_peaks_are_seen(lag):
-    """Linear and cubic samples of a triangle of width 0.02 around t = 5."""
-    times = np.array([0.0, 2.0, 4.99, 5.0, 5.01, 8.0, 10.0])
-    values = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-    linear = simulate(lag, 10.0, ts=END, inputs={"m.u": (times, values)})["m.x"]
-    np.testing.assert_allclose(
-        linear, convolved(lambda t: np.interp(t, times, values), breaks=times[1:-1]), rtol=1e-5
-    )  # fmt: skip
-    path = diffrax.CubicInterpolation(times, diffrax.backward_hermite_coefficients(jnp.array(times), jnp.array(values)))
-    expected = convolved(lambda t: float(path.evaluate(t)), breaks=times[1:-1])
-    for given in ((times, values, "cubic"), path):
-        np.testing.assert_allclose(simulate(lag, 10.0, ts=END, inputs={"m.u": given})["m.x"], expected, rtol=1e-5)
+PEAK = np.array([-0.01, 0.0, 0.01])  # a triangle of width 0.02, each at a time of its own
 
 
-def test_interpolations_are_accepted_as_they_are(lag):
-    path = diffrax.LinearInterpolation(jnp.array([0.0, 4.0, 10.0]), jnp.array([1.0, -1.0, 2.0]))
-    expected = convolved(lambda t: np.interp(t, path.ts, path.ys), breaks=[4.0])
-    for given in (path, path.evaluate):
-        solution = simulate(lag, 10.0, ts=END, inputs={"m.u": given}, rtol=1e-8, atol=1e-10)
-        np.testing.assert_allclose(solution["m.x"], expected, rtol=1e-7)
+@pytest.fixture(scope="module")
+def sampled():
+    """Samples of every kind, whose breaks are at different times: the solution, and what each lag must have."""
+    times = {name: np.array([0.0, *(at + PEAK), 10.0]) for name, at in (("linear", 1.0), ("cubic", 7.0), ("path", 9.0))}
+    values = np.array([0.0, 0.0, 1.0, 0.0, 0.0])
+    cubic = {
+        n: diffrax.backward_hermite_coefficients(jnp.array(times[n]), jnp.array(values)) for n in ("cubic", "path")
+    }
+    paths = {n: diffrax.CubicInterpolation(jnp.array(times[n]), c) for n, c in cubic.items()}
+    straight = diffrax.LinearInterpolation(jnp.array([0.0, 3.0, 10.0]), jnp.array([1.0, -1.0, 2.0]))
+    inputs = {
+        "held": PULSE,
+        "linear": (times["linear"], values),
+        "cubic": (times["cubic"], values, "cubic"),
+        "path": paths["path"],
+        "interpolation": straight,
+        "evaluate": straight.evaluate,
+    }
+    smooth = {n: lambda t, p=p: float(p.evaluate(t)) for n, p in paths.items()}
+    expected = {
+        "held": PULSED,
+        "linear": convolved(lambda t: np.interp(t, times["linear"], values), breaks=times["linear"][1:-1]),
+        "cubic": convolved(smooth["cubic"], breaks=times["cubic"][1:-1]),
+        "path": convolved(smooth["path"], breaks=times["path"][1:-1]),
+        "interpolation": convolved(lambda t: np.interp(t, straight.ts, straight.ys), breaks=[3.0]),
+    }
+    ev = EqnEnv()
+    system = compiled(*(Lag(ev, name) for name in inputs))
+    ts = jnp.array([4.9, 5.0, 5.05, 10.0])
+    solution = simulate(system, 10.0, ts=ts, inputs={f"{n}.u": u for n, u in inputs.items()}, **TIGHT)
+    return solution, expected | {"evaluate": expected["interpolation"]}
+
+
+@pytest.mark.long("the program of all kinds of samples, and quadrature")
+@pytest.mark.parametrize("name", ["held", "linear", "cubic", "path", "interpolation", "evaluate"])
+def test_short_pulses_and_narrow_peaks_are_seen(sampled, name):
+    solution, expected = sampled
+    np.testing.assert_allclose(solution[f"{name}.x"][-1], expected[name], rtol=1e-7)
+    if name == "held":
+        np.testing.assert_array_equal(solution["held.y"], [0.0, 1.0, 1.0, 0.0])
 
 
 @pytest.mark.slow
@@ -192,6 +233,7 @@ def test_two_sampled_inputs():
     np.testing.assert_allclose([solution["a.x"][0], solution["b.x"][0]], PULSED, rtol=1e-5)
 
 
+@pytest.mark.long("a reverse-mode gradient of a run")
 def test_sampled_values_and_times_are_differentiated(lag):
     """x(10) = 30·(e^(−0.49) − e^(−0.5))·v for a pulse of height v that begins at s: ∂/∂s = −3·e^(−0.1·(10 − s))·v."""
 
@@ -199,19 +241,21 @@ def test_sampled_values_and_times_are_differentiated(lag):
         times, values = jnp.stack([0.0 * start, start, 5.1 + 0 * start]), jnp.stack([0 * height, height, 0 * height])
         return simulate(lag, 10.0, ts=END, inputs={"m.u": (times, values, "held")}, rtol=1e-9, atol=1e-11)["m.x"][0]
 
-    value, slopes = jax.value_and_grad(last, argnums=(0, 1))(jnp.array(5.0), jnp.array(2.0))
+    value, slopes = jax.jit(jax.value_and_grad(last, argnums=(0, 1)))(5.0, 2.0)
     np.testing.assert_allclose(value, 2 * PULSED, rtol=1e-8)
     np.testing.assert_allclose(slopes[1], PULSED, rtol=1e-8)
     np.testing.assert_allclose(slopes[0], -6 * np.exp(-0.5), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_batch_of_samples(lag):
-    heights = jnp.array([1.0, -2.0, 0.5])
+    heights = np.array([1.0, -2.0, 0.5])
 
+    @jax.jit
     @jax.vmap
     def last(height):
         values = jnp.stack([0 * height, height, 0 * height, 0 * height])
-        return simulate(lag, 10.0, ts=END, inputs={"m.u": (PULSE[0], values, "held")})["m.x"][0]
+        return simulate(lag, 10.0, ts=END, inputs={"m.u": (PULSE[0], values, "held")}, **FAST)["m.x"][0]
 
     np.testing.assert_allclose(last(heights), heights * PULSED, rtol=1e-5)
 
@@ -219,18 +263,20 @@ def test_a_batch_of_samples(lag):
 def test_a_linear_input_that_is_differentiated_jumps(rate):
     """x = u(t) − u(0) + ∫u, u' is a step function."""
     times, values = np.array([0.0, 0.5, 0.52, 1.0]), np.array([0.0, 0.0, 1.0, 1.0])
-    solution = simulate(rate, 1.0, ts=jnp.array([1.0]), inputs={"m.u": (times, values)})
+    solution = simulate(rate, 1.0, ts=jnp.array([1.0]), inputs={"m.u": (times, values)}, **FAST)
     np.testing.assert_allclose(solution["m.x"], 1.0 + np.trapezoid(values, times), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_more_samples_than_steps_allowed(lag):
     times = np.linspace(0.0, 10.0, 400)
-    solution = simulate(lag, 10.0, ts=END, inputs={"m.u": (times, np.cos(times))}, max_steps=100)
+    solution = simulate(lag, 10.0, ts=END, inputs={"m.u": (times, np.cos(times))}, max_steps=100, **FAST)
     np.testing.assert_allclose(
         solution["m.x"], convolved(lambda t: np.interp(t, times, np.cos(times)), breaks=times[1:-1]), rtol=1e-6
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_longest_step(lag):
     """A pulse in a function, whose steps nobody knows."""
 
