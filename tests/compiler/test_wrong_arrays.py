@@ -86,10 +86,6 @@ def expressions():
     array_of(Cell, 2, R=np.array([object(), object()]))
 
 
-def given_twice():
-    ladder(3, True).with_parameters({"cell[0].r.R": 7.0, "cell.r.R": 1.0})
-
-
 def started_twice():
     ladder(3, True).initialize(initial={"cell.c.v": 1.0, "cell[0].c.v": 2.0})
 
@@ -131,7 +127,6 @@ def wrong_start():
         (unused, r"'mode' has a value for each component, but Choosing does not use it in a parameter or an equation"),
         (texts, r"the values of R must be real numbers; got texts"),
         (expressions, r"the values of R must be real numbers; got entries of type object"),
-        (given_twice, r"parameter 'cell\[0\].r.R' is given twice, by its own name and as part of an array"),
         (started_twice, r"initial: 'cell\[0\].c.v' is given twice"),
         (used_twice, r"the diagram has 'cell' already: give the array another name"),
         (

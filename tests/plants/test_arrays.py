@@ -120,6 +120,8 @@ def test_arrays_in_arrays(system, solution):
     np.testing.assert_array_equal(changed.parameters["row.cell.r.R"], np.full((2, 7), 1.0))
     with pytest.raises(ModelError, match=r"'row\[0\].cell\[0\].r.R' is 2\*row\[0\].R, computed from others"):
         system.with_parameters({"row.cell.r.R": 3.0})
+    with pytest.raises(ModelError, match=r"'cell\[0\].r.R' is given twice, by its own name and as part of an array"):
+        system.with_parameters({"cell[0].r.R": 7.0, "cell.r.R": 1.0})
 
 
 def test_plots(solution):
