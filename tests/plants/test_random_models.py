@@ -137,11 +137,9 @@ def several(strategy):
     return st.lists(strategy, min_size=6, max_size=6)
 
 
-@hypothesis.settings(max_examples=2)
+@pytest.mark.long("three programs, of six circuits each")
+@hypothesis.settings(max_examples=3, suppress_health_check=list(hypothesis.HealthCheck))
 @hypothesis.given(several(circuits()), st.integers(0, 100))
-@hypothesis.example(
-    [(3, 2.0, [("r", 1, 0, 1.0), ("r", 2, 1, 2.0), ("c", 1, 2, 1.5), ("c", 0, 2, 0.5), ("c", 2, 1, 3.0)])], 0
-)
 def test_resistors_and_capacitors(circuits, seed):
     check_circuits(circuits, seed)
 
@@ -156,6 +154,9 @@ def test_resistors(circuits):
 @pytest.mark.slow
 @hypothesis.settings(max_examples=15, suppress_health_check=list(hypothesis.HealthCheck))
 @hypothesis.given(several(circuits()), st.integers(0, 100))
+@hypothesis.example(
+    [(3, 2.0, [("r", 1, 0, 1.0), ("r", 2, 1, 2.0), ("c", 1, 2, 1.5), ("c", 0, 2, 0.5), ("c", 2, 1, 3.0)])], 0
+)
 def test_many_circuits(circuits, seed):
     check_circuits(circuits, seed)
 
@@ -245,7 +246,7 @@ def check_chains(chains):
     np.testing.assert_allclose(np.asarray(slope)[order], np.concatenate(b), rtol=1e-9, atol=1e-9)
 
 
-@hypothesis.settings(max_examples=2)
+@hypothesis.settings(max_examples=2, suppress_health_check=list(hypothesis.HealthCheck))
 @hypothesis.given(several(chains()))
 def test_equations_of_chains(chains):
     check_chains(chains)
