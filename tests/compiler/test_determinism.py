@@ -41,6 +41,11 @@ def systems():
     yield "oscillator", oscillator()
 
 
+@functools.cache
+def compiled_before():
+    return dict(systems())
+
+
 def everything(system) -> dict:
     """All that must not change: order, names, report and digest."""
     return {
@@ -101,8 +106,8 @@ def read(process):
 def test_the_hash_seed_changes_nothing():
     """Another Python with a seed that is not this one's."""
     seed = "1" if os.environ.get("PYTHONHASHSEED") == "0" else "0"
-    process = found_with_seed(seed, 15)
-    here = {name: everything(system) for name, system in systems()} | {"broken": broken(15)}
+    process = found_with_seed(seed, 10)
+    here = {name: everything(system) for name, system in compiled_before().items()} | {"broken": broken(10)}
     found = read(process)
     assert found.pop("texts") == {name: text for name, (_, text) in CASES.items()}
     assert set(found) == set(here)
@@ -123,7 +128,7 @@ def test_many_hash_seeds_change_nothing():
 
 
 def test_compiling_twice_gives_equal_systems():
-    for (_, first), (_, second) in zip(systems(), systems(), strict=True):
+    for (_, first), (_, second) in zip(compiled_before().items(), systems(), strict=True):
         assert first.plan == second.plan and hash(first.plan) == hash(second.plan)
         assert str(first.report) == str(second.report)
 
@@ -136,10 +141,11 @@ def dragged(name):
     return pendulum(drag_on("vx"), name=name)
 
 
-NAMES = ["a", "Z9", "_", "vx", "lambda", "E", "sin", "I", "pi", "time", "der", "q-1", "Größe", "x-0", "0"]
+NAMES = ["lambda", "E", "I", "time", "q-1", "0"]
+MORE_NAMES = ["a", "Z9", "_", "vx", "sin", "pi", "der", "Größe", "x-0"]
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, *(pytest.param(name, marks=pytest.mark.slow) for name in MORE_NAMES)])
 def test_a_components_name_changes_nothing(name):
     expected, renamed = dragged("pend"), dragged(name)
 
