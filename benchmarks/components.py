@@ -24,7 +24,7 @@ that test, and comes from where the list at the end of the page says. The page i
 
     python -m benchmarks.components
 
-which runs the tests named in the last column. A component without a reference fails `tests/test_components.py`.
+which runs the tests named in the last column. A component without a reference fails `tests/plants/test_components.py`.
 """
 
 

@@ -158,7 +158,7 @@ class MissingSparseSolver(ImportError):
 
 def is_double() -> bool:
     """Whether JAX is in 64-bit mode."""
-    return jnp.zeros(()).dtype == jnp.float64
+    return jnp.result_type(float) == jnp.float64
 
 
 @functools.cache

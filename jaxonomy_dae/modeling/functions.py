@@ -8,6 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 
 
+def _on_device(leaf: Any) -> Any:
+    """A NumPy array as one of JAX; with its type, for which `asarray` compiles no program."""
+    return jnp.asarray(leaf, jnp.result_type(leaf.dtype)) if isinstance(leaf, np.ndarray) else leaf
+
+
 class OfScalars(eqx.Module):
     """A function of scalars as a function of one vector, u ↦ (outputs,); the arrays it holds are leaves."""
 
@@ -19,4 +24,4 @@ class OfScalars(eqx.Module):
 
 def of_scalars(function: Any) -> OfScalars:
     """`function(x, y, …) -> scalar or (outputs,)` as a module; NumPy arrays in it become JAX arrays."""
-    return OfScalars(jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf, function))
+    return OfScalars(jax.tree.map(_on_device, function))

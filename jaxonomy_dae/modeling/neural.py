@@ -22,7 +22,7 @@ def count_outputs(network: Callable, inputs: int, where: str, theta: Any = None,
     """The number of outputs of `network(u)` or `network(t, u, theta)`, found without computing anything; `noun` is what
     errors call it."""
     dtypes = [leaf.dtype for leaf in jax.tree.leaves((network, theta)) if eqx.is_inexact_array(leaf)]
-    dtype = dtypes[0] if dtypes else jnp.zeros(()).dtype
+    dtype = dtypes[0] if dtypes else jnp.result_type(float)
     u = jax.ShapeDtypeStruct((inputs,), dtype)
     try:
         if theta is None:

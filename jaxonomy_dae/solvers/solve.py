@@ -125,7 +125,7 @@ def solve_dae(
 def _inexact(leaf: Any) -> Any:
     """An array of floating-point numbers; integers become the default kind."""
     array = jnp.asarray(leaf)
-    return array if jnp.issubdtype(array.dtype, jnp.inexact) else array.astype(jnp.zeros(()).dtype)
+    return array if jnp.issubdtype(array.dtype, jnp.inexact) else array.astype(jnp.result_type(float))
 
 
 OK = diffrax.RESULTS.successful

@@ -62,7 +62,7 @@ class Table1D(Component):
         if found.shape != points.shape:
             raise ModelError(f"'{name}': values has shape {found.shape}, x has {points.shape}: they must agree")
         known_kind(kind, name)
-        (value,) = self.function("table", _Curve(points, jnp.asarray(found), kind), inputs=[self.input("u")])
+        (value,) = self.function("table", _Curve(points, jnp.asarray(found, float), kind), inputs=[self.input("u")])
         self.output("y", value)
 
 
@@ -84,6 +84,6 @@ class Table2D(Component):
         found = finite(values, name, "values")
         if found.shape != (len(first), len(second)):
             raise ModelError(f"'{name}': values has shape {found.shape}; x and y ask for {(len(first), len(second))}")
-        surface = _Surface(first, second, jnp.asarray(found))
+        surface = _Surface(first, second, jnp.asarray(found, float))
         (value,) = self.function("table", surface, inputs=[self.input("u1"), self.input("u2")])
         self.output("y", value)

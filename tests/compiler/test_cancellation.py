@@ -1,0 +1,98 @@
+"""Derivatives that cancel in float coefficients, and questions of rank in any units."""
+
+import numpy as np
+import pytest
+import sympy
+
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der
+from jaxonomy_dae.compiler.null_vectors import cancels, left_null_vectors
+from jaxonomy_dae.compiler.select_states import _is_singular
+from jaxonomy_dae.errors import StructuralError
+from jaxonomy_dae.initialization.block_finding import ILL_CONDITIONED
+from jaxonomy_dae.initialization.condition import conditions
+from jaxonomy_dae.model.scaling import geometric_scales
+
+
+class _Written(Component):
+    def __init__(self, ev, names, equations):
+        super().__init__(ev, "d")
+        self.add_equations(*equations(*(self.variable(name) for name in names), ev.t))
+
+
+def _compiled(names, equations):
+    ev = EqnEnv()
+    return AcausalCompiler(ev, AcausalDiagram().add(_Written(ev, names, equations)))()
+
+
+def _chain(n: int, seed: int, singular: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Aliases a·x = b·y around a ring, with ratios up to 1e60: singular if the product of the ratios is 1. The matrix
+    and its left null vector in that case."""
+    rng = np.random.default_rng(seed)
+    plain = np.eye(n) - np.roll(np.eye(n), 1, axis=1)
+    plain[0, 0] = 1.0 if singular else 3.0
+    rows, columns = (10.0 ** rng.uniform(-15, 15, n) for _ in range(2))
+    return rows[:, None] * plain * columns, 1 / rows
+
+
+@pytest.mark.parametrize("n", [2, 7, 30])
+@pytest.mark.parametrize("seed", range(3))
+def test_units_do_not_decide_a_rank(n, seed):
+    regular, _ = _chain(n, seed, singular=False)
+    singular, null = _chain(n, seed, singular=True)
+    assert conditions(regular[None])[0][0] < ILL_CONDITIONED
+    assert not conditions(singular[None])[0][0] < ILL_CONDITIONED
+    assert not _is_singular(regular) and _is_singular(singular)
+    assert left_null_vectors(regular) == []
+    (found,) = left_null_vectors(singular)
+    assert cancels(found, singular)
+    np.testing.assert_allclose(found / null, found[0] / null[0], rtol=1e-13)  # some hundred roundings
+
+
+def test_scales_undo_any_scaling():
+    rng = np.random.default_rng(0)
+    plain = rng.uniform(0.5, 1.5, (6, 5)) * (rng.random((6, 5)) < 0.7)
+    scaled = 10.0 ** rng.uniform(-30, 30, (6, 1)) * plain * 10.0 ** rng.uniform(-30, 30, 5)
+
+    def freed(matrix):
+        r, c = geometric_scales(matrix)
+        return r[:, None] * matrix * c
+
+    np.testing.assert_allclose(freed(scaled), freed(plain), rtol=0.05)
+
+
+class _Slow(Component):
+    """(p − q)·x' + x = 0."""
+
+    def __init__(self, ev, p, q):
+        super().__init__(ev, "d")
+        x, p, q = self.variable("x"), self.parameter("p", p), self.parameter("q", q)
+        self.add_equations((p - q) * der(x) + x)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e9, 1e-12])
+def test_a_coefficient_that_is_a_rounding_error(unit):
+    """p − q determines nothing if p and q are equal to rounding; a difference of 1e-9 is a difference."""
+
+    def compiled(p, q):
+        ev = EqnEnv()
+        return AcausalCompiler(ev, AcausalDiagram().add(_Slow(ev, p * unit, q * unit)))()
+
+    for q in (0.1 + 0.2, 0.3):
+        with pytest.raises(StructuralError, match="determines nothing for d.p"):
+            compiled(0.3, q)
+    assert compiled(0.3, 0.3 + 1e-9).states == ["d.x"]
+
+
+@pytest.mark.parametrize("factor", [1.0, 1e-12, 1e9])
+def test_a_sum_over_equal_variables_that_rounding_leaves(factor):
+    """0.1 a + 0.2 b − 0.3 c + u = 0 where a = b = c: 5e-17 a is none of it, so that u = 0 and nothing determines a."""
+
+    def equations(a, b, c, u, v, t):
+        total = factor * (0.1 * a + 0.2 * b - 0.3 * c + u)
+        return (a - b, b - c, total, der(v) + v + u)
+
+    assert 0.1 + 0.2 - 0.3 != 0.0
+    with pytest.raises(StructuralError):
+        _compiled("abcuv", lambda a, b, c, u, v, t: (*equations(a, b, c, u, v, t), u + v - sympy.cos(t)))
+    system = _compiled("abcuv", lambda a, b, c, u, v, t: (*equations(a, b, c, u, v, t), der(a) + a))
+    assert sorted(system.states) == ["d.a", "d.v"]

@@ -1,0 +1,156 @@
+"""The documentation: public names are in it, and the pages of the library say what the components declare."""
+
+import functools
+import importlib
+import pathlib
+import re
+
+import pytest
+from library_pages import classes_of, components_of, domains, equation_text, overview, text_of
+from library_pages import page as write_page
+from sympy import Abs, Eq, Max, Piecewise, Rational, Symbol, exp, pi, sqrt, symbols
+
+DOCS = pathlib.Path(__file__).parents[2] / "docs"
+MODULES = ("solvers", "linear", "learning", "plotting", "testing")
+
+
+def public_names() -> list[str]:
+    """What can be imported: re-exports, and what modules without a folder define."""
+    found = []
+    for name in ("", *MODULES):
+        module = importlib.import_module(f"jaxonomy_dae.{name}".rstrip("."))
+        path = pathlib.Path(module.__file__ or "")
+        own = re.findall(r" as (\w+)$" if path.name == "__init__.py" else r"^def ([a-z]\w*)", path.read_text(), re.M)
+        found += [f"{module.__name__}.{n}" for n in own]
+    return found
+
+
+def test_public_names_are_found():
+    names = public_names()
+    assert {"jaxonomy_dae.simulate", "jaxonomy_dae.linear.KLU", "jaxonomy_dae.testing.assert_energy_balance"} <= {
+        *names
+    }
+    assert len(names) > 50
+
+
+@functools.cache
+def api() -> str:
+    return "\n".join(path.read_text() for path in sorted((DOCS / "api").glob("*.md")))
+
+
+@pytest.mark.parametrize("name", public_names())
+def test_every_public_name_is_in_the_api(name):
+    last, text = name.rpartition(".")[2], api()
+    assert re.search(rf"^::: jaxonomy_dae\.([\w.]+\.)?{last}$|`{last}`", text, re.M), name
+
+
+def test_every_name_in_the_api_exists():
+    for path in sorted((DOCS / "api").glob("*.md")):
+        for name in re.findall(r"^::: ([\w.]+)$", path.read_text(), re.M):
+            module, _, last = name.rpartition(".")
+            assert hasattr(importlib.import_module(module), last), name
+
+
+def test_what_components_inherit_is_in_the_api():
+    text = (DOCS / "api" / "modeling.md").read_text()
+    assert "::: jaxonomy_dae.Component\n    options:\n      inherited_members: true\n" in text  # when, discrete, …
+
+
+def test_all_domains_have_pages():
+    assert {
+        "contacts", "electrical", "friction", "hydraulic", "planar", "rotational", "signal", "thermal", "translational",
+        "transmissions",
+    } <= {*domains()}  # fmt: skip
+    text = overview()
+    for domain in domains():
+        assert f"({domain}.md)" in text
+        for cls in classes_of(domain):
+            assert cls.__name__ in text and not cls.__name__.startswith("_")
+
+
+page = functools.cache(write_page)
+
+
+@pytest.mark.parametrize("domain", domains())
+def test_pages_have_what_components_declare(domain):
+    sections = re.split(r"^## ", page(domain), flags=re.M)[1:]
+    for component, section in zip(components_of(domain), sections, strict=True):
+        assert section.startswith(type(component).__name__ + "\n")
+        hidden = ("port", "start", "event")
+        names = [*component.parameters, *(n for n, v in component.variables.items() if v.kind not in hidden)]
+        for name in (*names, *component.ports, *component.children):
+            assert f"`{name}`" in section
+        assert "```text" in section and "Piecewise" not in section and ":relation" not in section
+        assert "**" not in re.sub(r"\*\*(Arguments|Raises):\*\*", "", section)
+
+
+def test_a_section():
+    electrical = page("electrical")
+    start = electrical.index("## Capacitor")
+    assert electrical[start : electrical.index("## Inductor")] == (
+        "## Capacitor\n\n"
+        "```python\nCapacitor(ev, name, C=1.0, initial_voltage=None)\n```\n\n"
+        "C·dv/dt = i, `C` > 0 in farad. A given `initial_voltage` (volt) holds at the start; otherwise 0 is a guess.\n"
+        "\n"
+        "Ports: `p`, `n` (Electrical: `v` [V], `i` [A]).\n\n"
+        "| Parameter | Default | Unit | Bounds |\n| --- | --- | --- | --- |\n"
+        "| `C` | `1` | F | > 0 |\n| `initial_voltage` | `0` | V |  |\n\n"
+        "| Variable | Unit | Start |\n| --- | --- | --- |\n"
+        "| `v` | V | `initial_voltage` (a guess) |\n| `i` | A |  |\n\n"
+        "```text\nv = p.v − n.v\ni = p.i\nn.i + p.i = 0\nC·der(v) = i\n```\n\n"
+    )
+
+
+def test_events_and_parts():
+    electrical = page("electrical")
+    assert "when u > threshold, while closed = 0: closed becomes 1" in electrical
+    assert "0 = v − Ron·i if closed = 1, i − Goff·v otherwise" in electrical
+    assert "| `inductor` | Inductor |" in electrical and "inductor.n — emf.p" in electrical
+    signal = page("signal")
+    assert "every period seconds: held becomes u" in signal
+    assert "y = height·(1 if t ≥ start_time, 0 otherwise) + offset" in signal
+
+
+a, b, x = symbols("a b x", real=True)
+
+
+@pytest.mark.parametrize(
+    "expression, text",
+    [
+        (a * (b + 1), "(1 + b)·a"),
+        (-a / b, "−a/b"),
+        (a / (2 * b), "a/(2·b)"),
+        (-(a + b) * x, "−(a + b)·x"),
+        (a - (b + x) * 2, "a − 2·b − 2·x"),
+        (sqrt(a**2 + b**2), "√(a² + b²)"),
+        (1 / sqrt(a), "1/√(a)"),
+        (a**-2, "1/a²"),
+        (a ** Rational(1, 4), "a^(1/4)"),
+        (a**b, "a^b"),
+        ((a + b) ** (b - 1), "(a + b)^(b − 1)"),
+        (1.0 * a, "a"),
+        (-2.5e-7 * a, "−2.5e−07·a"),
+        (2 * pi * a, "2·π·a"),
+        (Abs(a - b) * exp(-a), "|a − b|·exp(−a)"),
+        (Piecewise((a, x >= 0), (Max(a, b), True)) * 2, "2·(a if x ≥ 0, Max(a, b) otherwise)"),
+        (Symbol("t"), "t"),
+    ],
+)
+def test_expressions_as_text(expression, text):
+    assert text_of(expression) == text
+
+
+def test_equations_as_text():
+    assert equation_text(Eq(a, b)) == "a = b"
+    assert equation_text(a - b) == "0 = a − b"
+
+
+def test_the_gallery_has_an_overview():
+    gallery = pytest.importorskip("gallery")  # a hook, which needs MkDocs
+    text = gallery.overview()
+    for path in gallery.notebooks():
+        section = text[text.index(f"]({path.name})") :]
+        assert re.match(r"\]\([^)]+\)\n\n[^#]+\.\n\n\[!", section)  # heading, whole sentences, figure
+        assert f"({path.stem}.png)" in section
+        assert gallery.last_figure_of(path).startswith(b"\x89PNG")
+    assert len(gallery.notebooks()) > 4

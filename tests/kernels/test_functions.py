@@ -1,0 +1,239 @@
+"""Every function of SymPy that a user would write: values and derivatives, explicit, in constraints that index
+reduction differentiates twice, and in nonlinear equations."""
+
+import jax
+import jax.numpy as jnp
+import mpmath as mp
+import numpy as np
+import pytest
+import sympy
+from function_table import FUNCTIONS
+from problems import run
+
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, ModelError, der
+from jaxonomy_dae.modeling import Eq
+
+NAMES = list(FUNCTIONS)
+POINTS = np.array([point for _, _, point in FUNCTIONS.values()])
+SPEED = 0.3
+
+
+class Written(Component):
+    def __init__(self, ev, write):
+        super().__init__(ev, "c")
+        write(self, ev.t)
+
+
+def compiled(write, **options):
+    ev = EqnEnv()
+    return AcausalCompiler(ev, AcausalDiagram().add(Written(ev, write)), **options)()
+
+
+@pytest.fixture(scope="module")
+def explicit():
+    """y = f(x), y' and y″ for every function, while x″ = −x."""
+
+    def write(c, t):
+        for k, (f, _, point) in enumerate(FUNCTIONS.values()):
+            x = c.variable(f"x{k}", start=point, fixed=True)
+            v = c.variable(f"v{k}", start=SPEED, fixed=True)
+            y, slope, curve = (c.variable(f"{n}{k}") for n in ("y", "s", "c"))
+            c.add_equations(Eq(der(x), v), Eq(der(v), -x), Eq(y, f(x)), Eq(der(y), slope), Eq(der(slope), curve))
+
+    names = [f"c.{n}{k}" for k in range(len(NAMES)) for n in ("x", "v")]
+    return compiled(write, state_selection="dummy_derivatives", prefer_states=names)
+
+
+@pytest.fixture(scope="module")
+def found(explicit):
+    """y, y', y″ for every function, and the curvature differentiated once more by x, forward and in reverse."""
+    names = [[f"c.{kind}{k}" for k in range(len(NAMES))] for kind in "ysc"]
+    index = np.array([[explicit.states.index(f"c.{n}{k}") for k in range(len(NAMES))] for n in ("x", "v")])
+
+    @jax.jit
+    def computed(x, v):
+        def at(x):
+            state = jnp.zeros(len(explicit.states)).at[index[0]].set(x).at[index[1]].set(v)
+            return explicit.observe(sum(names, []), 0.0, state).reshape(3, -1)
+
+        value, forward = jax.jvp(lambda x: at(x), (x,), (jnp.ones_like(x),))
+        return value, forward[2], jax.grad(lambda x: at(x)[2].sum())(x)
+
+    return [np.asarray(part) for part in computed(POINTS, np.full(len(POINTS), SPEED))]
+
+
+def reference(order):
+    """(d/dt)^order f(x(t)) with x′ = v = SPEED and v′ = −x, in 40 digits."""
+    out = []
+    with mp.workdps(40):
+        for _, f, point in FUNCTIONS.values():
+            x, v = mp.mpf(float(point)), mp.mpf(SPEED)
+            first, second = (mp.diff(f, x, n, h=mp.mpf("1e-10")) for n in (1, 2))
+            out.append(float((f(x), first * v, second * v**2 - first * x)[order]))
+    return np.array(out)
+
+
+@pytest.mark.long("59 functions in one program, with its derivatives")
+@pytest.mark.parametrize("order", [0, 1, 2])
+def test_value_and_derivatives_in_time(found, order):
+    values, expected = found[0][order], reference(order)
+    wrong = [n for n, a, b in zip(NAMES, values, expected, strict=True) if not abs(a - b) <= 1e-10 * max(1.0, abs(b))]
+    assert not wrong, [(n, values[NAMES.index(n)], expected[NAMES.index(n)]) for n in wrong]
+
+
+def test_reverse_is_forward(found):
+    """The curvature, whose equation was differentiated twice, differentiated once more."""
+    _, forward, reverse = found
+    with mp.workdps(40):
+        third = []
+        for _, f, point in FUNCTIONS.values():
+            d1, d2, d3 = (mp.diff(f, mp.mpf(float(point)), n, h=mp.mpf("1e-8")) for n in (1, 2, 3))
+            third.append(float(d3 * mp.mpf(SPEED) ** 2 - d2 * point - d1))
+    for name, a, b, c in zip(NAMES, forward, reverse, third, strict=True):
+        scale = max(1.0, abs(c))
+        assert abs(a - b) <= 1e-9 * scale, name
+        assert abs(a - c) <= 1e-8 * scale, (name, float(a), c)
+
+
+@pytest.mark.slow
+def test_in_nonlinear_blocks():
+    """z and w determine each other through f, for each function; value and both derivatives by a parameter, against
+    mpmath."""
+    n = len(NAMES)
+
+    def write(c, t):
+        for k, (f, _, point) in enumerate(FUNCTIONS.values()):
+            p, x = c.parameter(f"p{k}", 0.1), c.variable(f"x{k}", start=point, fixed=True)
+            z, w = c.variable(f"z{k}", start=0.0), c.variable(f"w{k}", start=0.0)
+            c.add_equations(Eq(der(x), -x), Eq(w, p * f(x + 0.01 * z)), Eq(z + z**3, w + p))
+
+    system = compiled(write)
+
+    @jax.jit
+    def solved(p):
+        def z(p):
+            there = system.with_parameters({f"c.p{k}": p[k] for k in range(n)})
+            return there.observe([f"c.z{k}" for k in range(n)], 0.0, there.initialize())
+
+        value, forward = jax.jvp(z, (p,), (jnp.ones(n),))
+        return value, forward, jax.grad(lambda p: z(p).sum())(p)
+
+    def root(g, point, p):
+        return mp.findroot(lambda z: z + z**3 - p * g(mp.mpf(point) + mp.mpf(0.01) * z) - p, 0.1 * float(p))
+
+    found = zip(NAMES, FUNCTIONS.values(), *map(np.asarray, solved(np.full(n, 0.1))), strict=True)
+    for name, (_, g, point), value, forward, reverse in found:
+        with mp.workdps(30):
+            of = lambda p, g=g, point=point: root(g, point, p)  # noqa: E731
+            true, slope = float(of(mp.mpf(0.1))), float(mp.diff(of, mp.mpf(0.1), h=mp.mpf("1e-8")))
+        assert abs(value - true) <= 1e-10, name
+        assert abs(forward - reverse) <= 1e-9 * max(1.0, abs(slope)), name
+        assert abs(forward - slope) <= 1e-7 * max(1.0, abs(slope)), name
+
+
+def maps(count, a, b, sin, sqrt, tanh):
+    """`count` nested maps of two numbers."""
+    for _ in range(count):
+        a, b = sin(a + b) / sqrt(1 + a**2 + b**2), tanh(a * b) + a
+    return a, b
+
+
+SIXTY = """
+import jax
+jax.config.update("jax_enable_x64", True)
+import jax.numpy as jnp, mpmath as mp, numpy as np, sympy
+from jaxonomy_dae import der
+from test_functions import compiled, maps
+
+def write(c, t):
+    x, y = c.variable("x", start=0.3, fixed=True), c.variable("y", start=0.2, fixed=True)
+    with sympy.evaluate(False):  # SymPy asks everything it makes for its sign, by way of all its parts
+        a, b = maps(60, x, y, sympy.sin, sympy.sqrt, sympy.tanh)
+    c.add_equations(der(x) + a, der(y) + b)
+
+system = compiled(write)
+point = jnp.array([0.3, 0.2])
+# Operation by operation: XLA takes minutes to fuse them.
+found, pull = jax.vjp(lambda x: system.vector_field(0.0, x), point)
+slopes = np.stack([np.asarray(pull(unit)[0]) for unit in jnp.eye(2)])
+with mp.workdps(40):
+    at = [mp.mpf(float(v)) for v in point]
+    exact = lambda k, *at: -maps(60, *at, mp.sin, mp.sqrt, mp.tanh)[k]
+    value = [float(exact(k, *at)) for k in (0, 1)]
+    gradient = [
+        [float(mp.diff(lambda *at: exact(k, *at), at, n=n)) for n in ((1, 0), (0, 1))] for k in (0, 1)
+    ]
+np.testing.assert_allclose(found, value, rtol=1e-12)
+np.testing.assert_allclose(slopes, gradient, rtol=1e-9)
+print("done")
+"""
+
+
+@pytest.mark.slow
+def test_sixty_nested_maps_in_one_equation():
+    """2⁶⁰ terms if anything were written out; in a process without the tests' checks of types, which cost most."""
+    assert run(SIXTY).strip() == "done"
+
+
+@pytest.mark.parametrize(
+    ("f", "message"),
+    [
+        (lambda x: sympy.LambertW(x), "c'.*LambertW cannot be evaluated in JAX"),
+        (lambda x: sympy.Function("g")(x), "g is a function without a definition"),
+        (lambda x: sympy.Integral(sympy.exp(-(sympy.Symbol("s") ** 2)), (sympy.Symbol("s"), 0, x)), "Integral"),
+        (lambda x: sympy.Piecewise((x, x > 0), (sympy.zoo, True)), "division by zero"),
+        (lambda x: sympy.besselj(2, x), "besselj cannot be evaluated in JAX"),
+        (lambda x: sympy.DiracDelta(x), "DiracDelta cannot be evaluated"),
+    ],
+)
+def test_what_jax_lacks_is_refused(f, message):
+    def write(c, t):
+        x = c.variable("x", start=0.5, fixed=True)
+        c.add_equations(der(x) + f(x))
+
+    with pytest.raises(ModelError, match=message):
+        compiled(write)
+
+
+def test_derivatives_of_steps_are_zero():
+    ev = EqnEnv()
+
+    class Steps(Component):
+        def __init__(self):
+            super().__init__(ev, "c")
+            x = self.variable("x")
+            assert der(sympy.sign(x)) == 0
+            assert der(sympy.Heaviside(x)) == 0
+            assert der(sympy.floor(x)) == 0
+            assert der(der(sympy.Abs(x))) == sympy.sign(x) * der(der(x))
+            slope = der(sympy.Max(x, 0))
+            assert slope.subs({x: 2}) == der(x)
+            assert slope.subs({x: -2}) == 0
+
+    Steps()
+
+
+def test_conditions_that_mix_time_and_variables():
+    def write(c, t):
+        x = c.variable("x", start=0.5, fixed=True)
+        y = c.variable("y")
+        c.add_equations(der(x) + x, Eq(y, sympy.Piecewise((x, (t > 1) & (x > 0)), (-x, (t > 2) | (x < 0)), (7, True))))
+
+    system = compiled(write)
+    at = jax.jit(lambda t, x: system.observe(["c.y"], t, x[None])[0])
+    for t, x, y in ((0.5, 0.5, 7.0), (1.5, 0.5, 0.5), (1.5, -0.5, 0.5), (2.5, 0.0, 0.0)):
+        assert float(at(t, x)) == y
+
+
+def test_a_negative_base_is_not_a_number():
+    """A fractional power of a negative number is NaN, at compile time too, where the test points are negative."""
+
+    def write(c, t):
+        p = c.variable("p", start=200.0, fixed=True)
+        q, m = c.variable("q"), c.variable("m", start=100.0)
+        c.add_equations(Eq(q, 0.1 * (p - m) ** 0.6), Eq(q, 0.1 * sympy.sqrt(m - 1)), Eq(der(p), -q))
+
+    system = compiled(write)
+    m, q = map(float, jax.jit(lambda: system.observe(["c.m", "c.q"], 0.0, system.initialize()))())
+    assert abs(q - 0.1 * (200 - m) ** 0.6) < 1e-9
+    assert abs(q - 0.1 * (m - 1) ** 0.5) < 1e-9

@@ -1,0 +1,217 @@
+"""Consistent initialization: what is fixed holds, what is a guess yields, what contradicts is named."""
+
+import jax
+import numpy as np
+import pytest
+from problems import RELEASE, compiled
+from sympy import Eq
+
+from jaxonomy_dae import Component, EqnEnv, InitializationError, der
+from jaxonomy_dae.library.electrical import Capacitor, Ground, Resistor, VoltageSource
+from jaxonomy_dae.library.planar import PlanarPendulum
+from jaxonomy_dae.library.translational import Damper, FixedPosition, Mass, Spring
+
+
+class Cubic(Component):
+    """dx/dt = −x with y = x³ + x: a start of y determines x through a nonlinear equation."""
+
+    def __init__(self, ev, name, x_start=None, x_fixed=False, y_start=10.0, y_fixed=True):
+        super().__init__(ev, name)
+        p = self.parameter("p", y_start)
+        x = self.variable("x", start=x_start, fixed=x_fixed)
+        y = self.variable("y", start=p, fixed=y_fixed)
+        self.add_equations(Eq(der(x), -x), Eq(y, x**3 + x))
+
+
+class Bare(Component):
+    """dx/dt = 1 − x, without any start."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        x = self.variable("x")
+        self.add_equations(Eq(der(x), 1 - x))
+
+
+class Discharging(Component):
+    """A capacitor on a resistor of 4 Ω."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        c, r, g = (self.add(part) for part in (Capacitor(ev, "c", 1.0), Resistor(ev, "r", 4.0), Ground(ev, "g")))
+        self.connect(c.p, r.p)
+        self.connect(c.n, r.n, g.p)
+
+
+class Charged(Component):
+    """A capacitor without a given voltage, and one that a source determines."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        s, r, g = (self.add(part) for part in (VoltageSource(ev, "s", 3.0), Resistor(ev, "r"), Ground(ev, "g")))
+        free, tied = self.add(Capacitor(ev, "free", 1.0)), self.add(Capacitor(ev, "tied", 1.0))
+        self.connect(s.p, r.p, tied.p)
+        self.connect(r.n, free.p)
+        self.connect(free.n, tied.n, s.n, g.p)
+
+
+class Oscillator(Component):
+    """A mass between a spring and a damper."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        mass = self.add(Mass(ev, "mass", 2.0, initial_position=0.7, initial_velocity=-0.4))
+        spring, damper = self.add(Spring(ev, "spring", 5.0)), self.add(Damper(ev, "damper", 0.6))
+        wall = self.add(FixedPosition(ev, "wall"))
+        self.connect(wall.flange, spring.flange_a, damper.flange_a)
+        self.connect(mass.flange, spring.flange_b, damper.flange_b)
+
+
+@pytest.fixture(scope="module")
+def declared():
+    """Models beside each other, started as they declare: initial values by name."""
+    ev = EqnEnv()
+    system = compiled(
+        Cubic(ev, "fixed"),
+        Cubic(ev, "guess", x_start=5.0),
+        Cubic(ev, "free", x_start=1.5, y_fixed=False),
+        Cubic(ev, "redundant", x_start=2.0, x_fixed=True),
+        Bare(ev, "bare"),
+        Charged(ev, "charged"),
+        PlanarPendulum(ev, "pend", initial_theta=RELEASE),
+    )
+    return started(system, {})
+
+
+@pytest.fixture(scope="module")
+def given():
+    """The same with values that are given."""
+    ev = EqnEnv()
+    system = compiled(
+        Cubic(ev, "x", x_start=2.0, x_fixed=True),
+        Cubic(ev, "y", x_start=2.0, x_fixed=True),
+        PlanarPendulum(ev, "pend", initial_theta=RELEASE),
+        Oscillator(ev, "osc"),
+        Discharging(ev, "out"),
+        Discharging(ev, "back"),
+    )
+    values = {"x.x": 1.0, "y.y": 30.0, "pend.x": 0.6, "pend.vx": 1.6, "der(osc.mass.s)": 2.5}
+    return started(system, values | {"out.c.i": -0.5, "back.r.n.i": -0.5})
+
+
+def started(system, initial):
+    @jax.jit
+    def values():
+        return system.observe(system.variables, 0.0, system.initialize(initial=initial))
+
+    found = dict(zip(system.variables, np.asarray(values()), strict=True))
+    return lambda *names: [found[name] for name in names]
+
+
+def test_a_fixed_start_of_an_algebraic_variable_holds(declared):
+    # 2³ + 2 = 10; Newton to rounding
+    np.testing.assert_allclose(declared("fixed.x", "fixed.y"), [2.0, 10.0], rtol=1e-12)
+
+
+def test_its_gradient_is_the_implicit_functions():
+    system = compiled(Cubic(EqnEnv(), "c"))
+
+    def x(p):
+        return system.with_parameters({"c.p": p}).initialize()[0]
+
+    # dx/dp = 1/(3x² + 1) at x = 2 and, by the same program, at x = 1.
+    slopes = jax.jit(lambda p: (jax.grad(x)(p), jax.jvp(x, (p,), (1.0,))[1]))
+    np.testing.assert_allclose(slopes(10.0), 1 / 13, rtol=1e-10)
+    np.testing.assert_allclose(slopes(2.0), 1 / 4, rtol=1e-10)
+
+
+def test_a_guess_yields_to_what_is_fixed(declared):
+    np.testing.assert_allclose(declared("guess.x", "guess.y"), [2.0, 10.0], rtol=1e-12)
+
+
+def test_a_guess_of_a_state_is_taken_where_nothing_else_determines_it(declared):
+    np.testing.assert_allclose(declared("free.x"), [1.5], rtol=1e-12)
+
+
+def test_without_any_start_the_state_is_zero(declared):
+    np.testing.assert_array_equal(declared("bare.x"), [0.0])
+
+
+def test_redundant_starts_that_agree_are_accepted(declared):
+    np.testing.assert_allclose(declared("redundant.x", "redundant.y"), [2.0, 10.0], rtol=1e-12)
+    # The pendulum fixes four numbers of two degrees of freedom.
+    x, y = np.cos(RELEASE), np.sin(RELEASE)
+    pend = declared("pend.x", "pend.y", "pend.vx", "pend.vy", "pend.lam")
+    np.testing.assert_allclose(pend, [x, y, 0, 0, -9.81 * y / 2], rtol=1e-12, atol=1e-12)
+
+
+def test_contradicting_starts_are_named():
+    system = compiled(Cubic(EqnEnv(), "c", x_start=3.0, x_fixed=True))
+    with pytest.raises(InitializationError, match=r"(?s)c\.[xy].*off by.*fixed=False"):
+        system.initialize()
+
+
+def test_contradicting_starts_across_a_connection():
+    """Two capacitors in parallel that are to start at different voltages."""
+    ev = EqnEnv()
+    a, b, r = Capacitor(ev, "a", 1.0, initial_voltage=1.0), Capacitor(ev, "b", 1.0, initial_voltage=2.0), Resistor(
+        ev, "r"
+    )  # fmt: skip
+    g = Ground(ev, "g")
+    system = compiled(a, b, r, g, connect=[(a.p, b.p, r.p), (a.n, b.n, r.n, g.p)])
+    with pytest.raises(
+        InitializationError,
+        match=r"(?s)start of b\.v, 2: off by 1.*b\.v and a\.v are fixed at 2 and 1.*values that agree",
+    ):
+        system.initialize()
+    # New values that agree mend it: nothing is wrong with the model.
+    mended = system.with_parameters({"b.initial_voltage": 1.0})
+    np.testing.assert_allclose(started(mended, {})("a.v", "b.v"), [1.0, 1.0], rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_contradiction_inside_jit_raises_too():
+    system = compiled(Cubic(EqnEnv(), "c", x_start=3.0, x_fixed=True))
+    with pytest.raises(Exception, match="no consistent initial point"):
+        jax.block_until_ready(jax.jit(lambda: system.initialize())())
+
+
+def test_values_given_outrank_declared_starts(given):
+    np.testing.assert_allclose(given("x.x", "x.y"), [1.0, 2.0], rtol=1e-12)
+    np.testing.assert_allclose(given("y.x", "y.y"), [3.0, 30.0], rtol=1e-12)
+
+
+def test_values_given_outrank_starts_that_follow_from_others(given):
+    """A pendulum given an x alone: y and the velocities follow, from the declared side of the circle."""
+    found = given("pend.x", "pend.y", "pend.vx", "pend.vy")
+    np.testing.assert_allclose(found, [0.6, -0.8, 1.6, 1.2], rtol=1e-10)  # x·vx + y·vy = 0
+
+
+def test_a_derivative_may_be_given(given):
+    np.testing.assert_allclose(given("osc.mass.s", "osc.mass.v", "osc.spring.f"), [0.7, 2.5, 3.5], rtol=1e-12)
+
+
+def test_an_alias_may_be_given_with_its_sign(given):
+    """The current of a discharging capacitor determines its voltage: v = −R·i, and r.i = −c.i."""
+    np.testing.assert_allclose(given("out.c.v", "out.r.i"), [2.0, 0.5], rtol=1e-12)
+    np.testing.assert_allclose(given("back.c.v", "back.c.i"), [2.0, -0.5], rtol=1e-12)
+
+
+def test_underdetermined_starts_keep_the_guesses(declared):
+    """A capacitor without a given voltage starts at its guess, 0; one that a source determines starts there."""
+    np.testing.assert_allclose(declared("charged.free.v", "charged.tied.v", "charged.r.i"), [0.0, 3.0, 3.0], atol=1e-12)
+
+
+def test_inputs_and_time_enter():
+    class Follows(Component):
+        """x + y = u(t), dx/dt = y, y fixed at the start."""
+
+        def __init__(self, ev, name):
+            super().__init__(ev, name)
+            u = self.input("u")
+            x, y = self.variable("x"), self.variable("y", start=1.0, fixed=True)
+            self.add_equations(Eq(x + y, u), Eq(der(x), y))
+
+    system = compiled(Follows(EqnEnv(), "c"))
+    inputs = {"c.u": lambda t: 5 * t}
+    found = jax.jit(lambda t: system.observe(["c.x", "c.y"], t, system.initialize(t, inputs), inputs))(2.0)
+    np.testing.assert_allclose(found, [9.0, 1.0], rtol=1e-12)
