@@ -29,7 +29,7 @@ import jaxonomy_dae.library.translational as line
 from jaxonomy_dae import AcausalSystem, EqnEnv, simulate
 from jaxonomy_dae.library.friction import Brake, Clutch, OneWayClutch
 
-FOLDER = pathlib.Path(__file__).parent / "data" / "modelica_events"
+FOLDER = pathlib.Path(__file__).parents[1] / "data" / "modelica_events"
 TIGHT = dict(rtol=1e-9, atol=1e-10)
 TOGETHER = 2e-5  # seconds: what is closer is one event; a change of modes may take several
 
