@@ -121,16 +121,26 @@ def check_gradient(reference: Callable[[], ReferenceSystem]) -> None:
 
 
 def integrated(
-    slopes: Callable, start: Any, ts: np.ndarray, method: str = "DOP853", ends: Any = (), rtol: float = 1e-12
+    slopes: Callable,
+    start: Any,
+    ts: np.ndarray,
+    method: str = "DOP853",
+    ends: Any = (),
+    rtol: float = 1e-12,
+    aside: float = 0.0,
 ) -> np.ndarray:
-    """SciPy's solution, begun anew at each of `ends`, where slopes may have kinks; shape (states, times)."""
+    """SciPy's solution, begun anew at each of `ends`, where slopes may have kinks; shape (states, times).
+
+    Where they jump, slopes at an end are taken `aside` of it, on the side where the solution is.
+    """
     knots = np.unique([ts[0], *[e for e in ends if ts[0] < e < ts[-1]], ts[-1]])
     rows, state = [np.asarray(start, float)[:, None]], np.asarray(start, float)
     for a, b in zip(knots, knots[1:], strict=False):
         inside = ts[(ts > a) & (ts <= b)]
         solved = scipy.integrate.solve_ivp(
-            slopes, (a, b), state, method, np.union1d(inside, b), rtol=rtol, atol=0.1 * rtol
-        )
+            lambda t, x, low=a + aside, high=b - aside: slopes(min(max(t, low), high), x),
+            (a, b), state, method, np.union1d(inside, b), rtol=rtol, atol=0.1 * rtol,
+        )  # fmt: skip
         assert solved.success
         state = solved.y[:, -1]
         rows.append(solved.y[:, : len(inside)])

@@ -7,8 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import test_library_electrical as electrical
-import test_library_mechanical as mechanical
 from problems import compiled, damped_oscillation, oscillator, pendulum
 from sympy import Eq, Symbol
 
@@ -210,28 +208,6 @@ def test_the_energy_of_an_accumulator(n):
     places, weights = np.polynomial.legendre.leggauss(20)
     work = np.sum(weights / 2 * 3.0 * (2.0 / (2.0 - (1 + places) / 2)) ** n)
     np.testing.assert_allclose(solution.energy()[1] - solution.energy()[0], work, rtol=BALANCED)
-
-
-def test_every_circuit_without_storage():
-    """What all electrical components without storage bring in is lost at the same instant."""
-    system, inputs, _ = electrical.static()
-    solution = simulate(system, 1.0, ts=jnp.array([1.0]), inputs=inputs)
-    lost = float(solution.dissipation()[0])
-    assert lost > 100.0
-    np.testing.assert_allclose(solution.supply()[0], lost, rtol=electrical.ROUNDING)
-
-
-@pytest.mark.slow
-def test_every_electrical_storage():
-    solution = electrical.run(electrical.dynamic()[0])
-    assert_energy_balance(solution, rtol=1e-6)  # the second run is not told the times at which sources jump
-
-
-@pytest.mark.slow
-def test_every_mechanical_component():
-    system, inputs, _ = mechanical.model()
-    solution = simulate(system, 2.0, ts=jnp.array([0.0, 0.5, 2.0]), inputs=inputs, **TIGHT)
-    assert_energy_balance(solution, rtol=BALANCED)
 
 
 @pytest.mark.slow

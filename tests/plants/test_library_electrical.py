@@ -11,11 +11,13 @@ from component_references import checks, measured
 from problems import compiled
 from scipy.linalg import expm
 from scipy.special import lambertw
+from trajectories import trajectory
 
 import jaxonomy_dae.library.electrical as el
 from jaxonomy_dae import EqnEnv, ModelError, simulate
 from jaxonomy_dae.library.rotational import Torque
 from jaxonomy_dae.library.thermal import FixedTemperature, HeatCapacitor, ThermalConductor
+from jaxonomy_dae.testing import assert_energy_balance
 
 # Solutions of linear circuits without storage: rounding alone.
 ROUNDING = 1e-12
@@ -175,9 +177,20 @@ KIRCHHOFF = "Kirchhoff's and Ohm's laws"
 )
 def test_circuits_without_storage():
     system, inputs, expected = static()
-    values = system.observe(list(expected), 0.0, system.initialize(inputs=inputs), inputs)
+    start = system.initialize(inputs=inputs)
+    values = jax.jit(lambda x: system.observe(list(expected), 0.0, x, inputs))(start)
     for name, value, true in zip(expected, np.asarray(values), expected.values(), strict=True):
         measured(name, value, true, ROUNDING * max(abs(true), 1.0), scale=abs(true) or 1.0)
+
+
+@pytest.mark.slow
+def test_energy_without_storage():
+    """What all of these components bring in is lost at the same instant."""
+    system, inputs, _ = static()
+    solution = simulate(system, 1.0, ts=jnp.array([1.0]), inputs=inputs)
+    lost = float(solution.dissipation()[0])
+    assert lost > 100.0
+    np.testing.assert_allclose(solution.supply()[0], lost, rtol=ROUNDING)
 
 
 def linear(a, x0, b, ts):
@@ -284,10 +297,6 @@ EDGES = [0.6, 0.3, 0.5, 1.1, 1.3, 1.9]
 LOAD = {"load.tau": -0.4}
 
 
-def run(system, rtol=1e-9):
-    return simulate(system, 2.0, ts=TS, rtol=rtol, atol=1e-11, inputs=LOAD, jump_ts=sorted(EDGES))
-
-
 MOTION = "matrix exponential of the armature's and the shaft's equations"
 
 
@@ -312,9 +321,19 @@ MOTION = "matrix exponential of the armature's and the shaft's equations"
 )
 def test_circuits_with_storage():
     system, expected = dynamic()
-    solution = run(system)
+    found = trajectory(system, TS, list(expected), LOAD, edges=EDGES)
     for name, true in expected.items():
-        measured(name, solution[name], true, 2e-7 * np.abs(true).max())
+        measured(name, found[name], true, 2e-7 * np.abs(true).max())
+
+
+@pytest.mark.slow
+def test_a_run_and_its_energy():
+    """The same by `simulate`, and the account of every component's energy."""
+    system, expected = dynamic()
+    solution = simulate(system, 2.0, ts=TS, rtol=1e-9, atol=1e-11, inputs=LOAD, jump_ts=sorted(EDGES))
+    for name, true in expected.items():
+        np.testing.assert_allclose(solution[name], true, rtol=0, atol=2e-7 * np.abs(true).max(), err_msg=name)
+    assert_energy_balance(solution, rtol=1e-6)  # the second run is not told the times at which sources jump
 
 
 @pytest.mark.slow
