@@ -3,8 +3,8 @@
 import functools
 
 import numpy as np
+import planar_models as planar
 import pytest
-import test_library_planar as planar
 from problems import compiled, component
 from rescaling import KINDS, rescaled
 

@@ -278,6 +278,7 @@ def test_equal_masses_exchange_their_speeds():
     np.testing.assert_allclose([solution[f"m{k}.s"][-1] for k in range(3)], [1.0, 2.0, 4.0], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_jerk_lifts_what_rests_on_the_ground():
     """A mass of 2 kg rests on the ground; a rope of 1 m from it to another of 1 kg, shot upwards at 6 m/s from 0.5 m,
     becomes taut. The ground does not pull: both go on with their common momentum."""

@@ -1,7 +1,6 @@
 """Planar mechanics against closed forms, and against SciPy's solution of reduced equations derived by hand."""
 
 import functools
-from types import SimpleNamespace
 
 import diffrax
 import jax
@@ -10,40 +9,21 @@ import numpy as np
 import pytest
 import scipy.integrate
 from component_references import checks, measured
-from problems import GRAVITY, angle_solution, compiled, elliptic_angle
+from planar_models import Bench, double_pendulum, four_bar, squeezing_mechanism
+from problems import GRAVITY, angle_solution, elliptic_angle
 from testset.problem import load
+from trajectories import trajectory
 
 import jaxonomy_dae.library.planar as pl
 import jaxonomy_dae.library.rotational as rot
 import jaxonomy_dae.library.translational as line
 from jaxonomy_dae import EqnEnv, InitializationError, ModelError, StructuralError, simulate
+from jaxonomy_dae.testing import assert_energy_balance
 
 TS = np.linspace(0.0, 2.0, 9)
 TIGHT = dict(rtol=1e-9, atol=1e-11)
 # rtol 1e-9 for each of fewer than 500 steps; SciPy's references carry 1e-10 or better.
 MEASURED = 5e-7
-
-
-class Bench:
-    """Components of one model, and the ports joined in it."""
-
-    def __init__(self):
-        self.ev, self.parts, self.joined = EqnEnv(), [], []
-
-    def __call__(self, kind, name, *args, **kwargs):
-        self.parts.append(kind(self.ev, name, *args, **kwargs))
-        return self.parts[-1]
-
-    def join(self, *ends):
-        self.joined.append(ends)
-
-    def chain(self, *ends):
-        """Joins ends in pairs."""
-        for a, b in zip(ends[::2], ends[1::2], strict=True):
-            self.join(a, b)
-
-    def compile(self, **options):
-        return compiled(*self.parts, connect=self.joined, **options)
 
 
 def integrated(slopes, start, ts=TS):
@@ -246,24 +226,12 @@ def test_components_against_references():
     solution = simulate(system, 2.0, ts=TS, inputs=inputs, **TIGHT)
     for name, true in expected.items():
         measured(name, solution[name], true, MEASURED * np.abs(true).max())
+    assert_energy_balance(solution, rtol=1e-7)  # a hundred times the tolerance
 
 
 # --- double pendulum -----------------------------------------------------------------------------------------------
 
 RODS = {"a.m": 1.0, "a.rx": 1.0, "b.m": 0.5, "b.rx": 0.8, "j1.initial_phi": 0.3, "j2.initial_phi": 0.5}
-
-
-@functools.cache
-def double_pendulum(mode):
-    """Two uniform rods; in the minimal form the states are the angles, which are good everywhere."""
-    b = Bench()
-    world, first = b(pl.World, "world"), b(pl.Revolute, "j1", initial_phi=0.3, initial_omega=0.0)
-    second = b(pl.Revolute, "j2", initial_phi=0.5, initial_omega=0.0)
-    upper, lower = b(pl.MassiveLink, "a", 1.0), b(pl.MassiveLink, "b", 0.8, m=0.5)
-    b.chain(world.frame, first.frame_a, first.frame_b, upper.frame_a, upper.frame_b, second.frame_a, second.frame_b,
-            lower.frame_a)  # fmt: skip
-    angles = [f"{rod}.body.{angle}" for angle in ("phi", "omega") for rod in "ab"]
-    return b.compile(state_selection=mode, prefer_states=angles if mode == "dummy_derivatives" else ())
 
 
 def double_reference(ts, values):
@@ -293,13 +261,8 @@ def energy(solution, bodies, values):
     return total
 
 
-@pytest.mark.parametrize("mode", [pytest.param("auto", marks=pytest.mark.slow), "dummy_derivatives"])
-def test_double_pendulum(mode):
-    system = double_pendulum(mode)
-    if mode == "dummy_derivatives":
-        assert set(system.states) == {"a.body.phi", "a.body.omega", "b.body.phi", "b.body.omega"}
-    ts = np.concatenate([TS, np.linspace(2.5, 20.0, 36)])
-    solution = simulate(system, 20.0, ts=ts, **TIGHT)
+def compare_double_pendulum(solution):
+    """Angles and speeds at TS with Lagrange's equations, and the energy at all times."""
     p, q, u, v = double_reference(TS, RODS.values())
     for name, true in {"j1.phi": p, "j2.phi": q - p, "j1.omega": u, "j2.omega": v - u}.items():
         found = solution[name][: len(TS)]  # later, the motion is chaotic: neighbours part
@@ -307,6 +270,23 @@ def test_double_pendulum(mode):
     total = np.asarray(energy(solution, "ab", RODS))
     # Of what is exchanged; 1e-9 for each of fewer than 5,000 steps.
     np.testing.assert_allclose(total, total[0], rtol=0, atol=5e-6 * GRAVITY * np.ptp(solution["a.body.y"]))
+
+
+LONG = np.concatenate([TS, np.linspace(2.5, 20.0, 36)])
+
+
+def test_double_pendulum():
+    system = double_pendulum("dummy_derivatives")
+    assert set(system.states) == {"a.body.phi", "a.body.omega", "b.body.phi", "b.body.omega"}
+    names = [f"j{k}.{v}" for k in (1, 2) for v in ("phi", "omega")]
+    names += [f"{rod}.body.{v}" for rod in "ab" for v in ("vx", "vy", "omega", "y")]
+    compare_double_pendulum(trajectory(system, LONG, names))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["auto", "dummy_derivatives"])
+def test_runs_of_a_double_pendulum(mode):
+    compare_double_pendulum(simulate(double_pendulum(mode), 20.0, ts=LONG, **TIGHT))
 
 
 def gradients(system, names, values, output, t1):
@@ -353,20 +333,6 @@ BARS = {"crank.m": 1.0, "crank.rx": 0.8, "coupler.m": 0.6, "coupler.rx": 1.9, "r
         "east.x": 2.0, "j1.initial_phi": 1.0, "j1.initial_omega": 5.0}  # fmt: skip
 
 
-@functools.cache
-def four_bar():
-    """A crank that turns fully, its coupler and a rocker, all uniform rods; guesses choose the open position."""
-    b = Bench()
-    west, east = b(pl.World, "west"), b(pl.World, "east", 2.0)
-    crank, coupler = b(pl.MassiveLink, "crank", 0.8), b(pl.MassiveLink, "coupler", 1.9, m=0.6, guess_phi=0.3)
-    rocker = b(pl.MassiveLink, "rocker", 1.5, m=1.5, guess_phi=1.7)
-    pins = [b(pl.Revolute, "j1", initial_phi=1.0, initial_omega=5.0), *(b(pl.Revolute, f"j{k}") for k in (2, 3, 4))]
-    b.chain(west.frame, pins[0].frame_a, pins[0].frame_b, crank.frame_a, crank.frame_b, pins[1].frame_a,
-            pins[1].frame_b, coupler.frame_a, coupler.frame_b, pins[2].frame_a, pins[2].frame_b, rocker.frame_b,
-            east.frame, pins[3].frame_a, pins[3].frame_b, rocker.frame_a)  # fmt: skip
-    return b.compile()
-
-
 def loop(phi, crank, coupler, rocker, ground):
     """The angles of coupler and rocker, and their derivatives by the crank's angle, of an open four-bar loop: two
     circles meet, above the line between their centres."""
@@ -402,6 +368,7 @@ def four_bar_reference(ts, values):
     return integrated(slopes, [start, speed], ts)
 
 
+@pytest.mark.slow
 def test_four_bar_linkage():
     solution = simulate(four_bar(), 2.0, ts=TS, **TIGHT)
     phi, speed = four_bar_reference(TS, BARS.values())
@@ -424,9 +391,9 @@ def test_guesses_choose_the_position_of_a_loop():
     # The mirror image of the open position in the line from the crank's end to the rocker's pin.
     at, swing, *_ = loop(1.0, 0.8, 1.9, 1.5, 2.0)
     line_angle = np.arctan2(-0.8 * np.sin(1.0), 2.0 - 0.8 * np.cos(1.0))
+    observe = jax.jit(lambda system, x: system.observe(names, 0.0, x))
     for system, true in ((four_bar(), [at, swing]), (crossed, [2 * line_angle - at, 2 * line_angle - swing])):
-        found = system.observe(names, 0.0, system.initialize())
-        np.testing.assert_allclose(found, true, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(observe(system, system.initialize()), true, rtol=0, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -457,7 +424,8 @@ def test_slider_crank():
             pins[1].frame_b, coupler.frame_a, coupler.frame_b, pins[2].frame_a, world.frame, guide.frame_a,
             motor.flange, pins[0].flange)  # fmt: skip
     b.join(pins[2].frame_b, slider.frame, guide.frame_b)
-    solution = simulate(b.compile(), 2.0, ts=TS, inputs={"motor.u": lambda t: w * t + 0.5}, **TIGHT)
+    system, inputs = b.compile(), {"motor.u": lambda t: w * t + 0.5}
+    assert not system.states
     phi = w * TS + 0.5
     sine, cosine = np.sin(phi), np.cos(phi)
     root = np.sqrt(long**2 - (r * sine) ** 2)
@@ -466,49 +434,18 @@ def test_slider_crank():
     a = w**2 * (-r * cosine - r**2 * (cosine**2 - sine**2) / root - r**4 * (sine * cosine) ** 2 / root**3)
     expected = {"guide.s": x, "slider.vx": v, "coupler.frame_a.phi": -np.arcsin(r * sine / long),
                 "motor.flange.tau": -m * a * v / w, "slider.frame.fx": m * a}  # fmt: skip
-    for name, true in expected.items():
-        # Nothing is integrated, and blocks are solved to rounding at saved times.
-        np.testing.assert_allclose(solution[name], true, rtol=0, atol=1e-12 * np.abs(true).max(), err_msg=name)
+
+    @jax.jit
+    @jax.vmap
+    def turned(t):
+        return system.observe(list(expected), t, system.initialize(t, inputs=inputs), inputs)
+
+    for (name, true), found in zip(expected.items(), np.asarray(turned(TS)).T, strict=True):
+        # Nothing is integrated, and blocks are solved to rounding.
+        np.testing.assert_allclose(found, true, rtol=0, atol=1e-12 * np.abs(true).max(), err_msg=name)
 
 
 # --- Andrews' squeezing mechanism ----------------------------------------------------------------------------------
-
-
-def squeezing_mechanism(facts):
-    """Seven bodies, ten pins, a spring (Schiehlen 1990; Mazzia & Magherini 2008, II-13, figures 1 and 2)."""
-    b, p = Bench(), SimpleNamespace(**facts["parameters"])
-    beta, theta, gamma, phi, delta, omega, epsilon = facts["initial"]["y0"][:7]
-    at_o, at_a, at_b, at_c = (
-        b(pl.World, n, x, y) for n, x, y in (("O", 0.0, 0.0), ("A", p.xa, p.ya), ("B", p.xb, p.yb), ("C", p.xc, p.yc))
-    )
-    k1, k2, k3, k4, k5, k6, k7 = (
-        b(pl.MassiveLink, f"K{k + 1}", *geometry, g_y=0.0, guess_phi=angle)
-        for k, (geometry, angle) in enumerate([
-            ((p.rr, 0.0, p.m1, p.I1, p.ra, 0.0), beta),
-            ((-p.d, 0.0, p.m2, p.I2, -p.da, 0.0), beta + theta),
-            ((0.0, -p.ss, p.m3, p.I3, p.sb, p.sa), gamma),
-            ((0.0, -p.e, p.m4, p.I4, 0.0, p.ea - p.e), phi + delta),
-            ((p.zt, 0.0, p.m5, p.I5, p.tb, p.ta), delta),
-            ((p.zf, 0.0, p.m6, p.I6, p.zf - p.fa, 0.0), omega + epsilon),
-            ((0.0, -p.u, p.m7, p.I7, p.ub, p.ua), epsilon),
-        ])
-    )  # fmt: skip
-    pins = {}
-    for name, one, other in (
-        ("beta", at_o.frame, k1.frame_a), ("Theta", k1.frame_b, k2.frame_a), ("gamma", at_b.frame, k3.frame_a),
-        ("Phi", k5.frame_b, k4.frame_a), ("delta", at_a.frame, k5.frame_a), ("Omega", k7.frame_b, k6.frame_a),
-        ("epsilon", at_a.frame, k7.frame_a), ("P3", k2.frame_b, k3.frame_b), ("P4", k2.frame_b, k4.frame_b),
-        ("P6", k2.frame_b, k6.frame_b),
-    ):  # fmt: skip
-        # One degree of freedom: an angle and its speed are given; the guesses choose among the positions.
-        given = dict(initial_phi=theta, initial_omega=0.0) if name == "Theta" else {}
-        pins[name] = b(pl.Revolute, name, **given)
-        b.chain(one, pins[name].frame_a, pins[name].frame_b, other)
-    hook, spring = b(pl.Link, "D", p.sd, -p.sc), b(pl.SpringDamper, "spring", p.c0, 0.0, p.l0)
-    torque = b(rot.Torque, "torque")
-    b.chain(k3.frame_a, hook.frame_a, hook.frame_b, spring.frame_b, at_c.frame, spring.frame_a)
-    b.join(torque.flange, pins["beta"].flange)
-    return b.compile()
 
 
 ANGLES = ("beta", "Theta", "gamma", "Phi", "delta", "Omega", "epsilon")
