@@ -7,13 +7,17 @@ whose field is exact: with nonlinear blocks, it is only as good as a stage needs
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import diffrax
 import jax
+import jax.numpy as jnp
 import numpy as np
 from reference_systems import integrated
 
-from jaxonomy_dae import AcausalSystem
+from jaxonomy_dae import AcausalSystem, Solution
+from jaxonomy_dae.system.inputs import read_inputs
 
 ASIDE = 1e-12  # of a run's length: as near to an edge as the field is evaluated, beside its jump
+POINTS = 15  # of Gauss's quadrature in each panel
 
 
 def read(
@@ -25,6 +29,22 @@ def read(
     return dict(zip(names, np.asarray(columns).T, strict=True))
 
 
+def states_at(
+    system: AcausalSystem,
+    ts: np.ndarray,
+    inputs: Mapping[str, Any] | None = None,
+    *,
+    edges: Sequence[float] = (),
+    rtol: float = 1e-10,
+) -> np.ndarray:
+    """States at `ts`, shape (times, states), from the initial one at ts[0], by DOP853 that begins anew at `edges`."""
+    assert not system.carried, "the field of nonlinear blocks is only as good as a stage needs it"
+    start = np.asarray(system.initialize(float(ts[0]), inputs=inputs))
+    field = jax.jit(lambda t, x: system.vector_field(t, x, inputs))
+    aside = ASIDE * (ts[-1] - ts[0])
+    return integrated(lambda t, x: np.asarray(field(t, x)), start, ts, ends=edges, rtol=rtol, aside=aside).T
+
+
 def trajectory(
     system: AcausalSystem,
     ts: np.ndarray,
@@ -34,10 +54,36 @@ def trajectory(
     edges: Sequence[float] = (),
     rtol: float = 1e-10,
 ) -> dict[str, np.ndarray]:
-    """Variables at `ts` from the system's initial state at ts[0], by DOP853 that begins anew at each of `edges`."""
-    assert not system.carried, "the field of nonlinear blocks is only as good as a stage needs it"
-    start = np.asarray(system.initialize(float(ts[0]), inputs=inputs))
-    field = jax.jit(lambda t, x: system.vector_field(t, x, inputs))
-    aside = ASIDE * (ts[-1] - ts[0])
-    states = integrated(lambda t, x: np.asarray(field(t, x)), start, ts, ends=edges, rtol=rtol, aside=aside)
-    return read(system, names, ts, states.T, inputs)
+    """Variables at `ts`, by name."""
+    return read(system, names, ts, states_at(system, ts, inputs, edges=edges, rtol=rtol), inputs)
+
+
+def solution_of(system: AcausalSystem, ts: Any, states: Any, inputs: Mapping[str, Any] | None = None) -> Solution:
+    """A `Solution` with given states, shape (times, states)."""
+    ts, states = jnp.asarray(ts, float), jnp.asarray(states, float)
+    return Solution(ts, states, system, read_inputs(system.plan, states.dtype, inputs), {}, diffrax.RESULTS.successful)
+
+
+def balanced(
+    system: AcausalSystem,
+    end: float,
+    inputs: Mapping[str, Any] | None = None,
+    *,
+    panels: int = 40,
+    rtol: float = 1e-7,
+) -> Solution:
+    """Asserts that what is stored until `end` was supplied and not lost, by Gauss's quadrature of these powers.
+
+    Errors may be `rtol` of the energy that is exchanged. Returns the solution at the quadrature's nodes, with zero in
+    front and `end` behind.
+    """
+    places, weights = np.polynomial.legendre.leggauss(POINTS)
+    half = end / panels / 2
+    nodes = (half * (1 + places) + 2 * half * np.arange(panels)[:, None]).ravel()
+    ts = np.concatenate([[0.0], nodes, [end]])
+    solution = solution_of(system, ts, states_at(system, ts, inputs, rtol=1e-11), inputs)
+    energy, supply, lost = (np.asarray(v()) for v in (solution.energy, solution.supply, solution.dissipation))
+    weights = np.tile(half * weights, panels)
+    work, exchanged = ((weights * f(supply, lost)[1:-1]).sum() for f in (np.subtract, lambda s, d: np.abs(s) + d))
+    np.testing.assert_allclose(energy[-1] - energy[0], work, rtol=0, atol=rtol * exchanged)
+    return solution
