@@ -2,8 +2,9 @@
 
     python -m benchmarks.systems
 
-Runs each system of tests/test_systems.py and tests/test_systems_mechanical.py, and the battery pack of
-tests/test_library_battery.py, with the solver that `simulate` chooses. A system that misses its tolerance ends the run.
+Runs each system of tests/plants/test_systems.py and
+test_systems_mechanical.py, and the battery pack of
+test_library_battery.py, with the solver that `simulate` chooses. A system that misses its tolerance ends the run.
 """
 
 import inspect
@@ -35,7 +36,7 @@ reference to 1e-5. Of the pack, the 2,323 derivatives in both modes are those of
 
 def main() -> None:
     jax.config.update("jax_enable_x64", True)
-    sys.path[:0] = [str(ROOT / folder) for folder in ("tests", "benchmarks", "docs")]
+    sys.path[:0] = [str(ROOT / folder) for folder in ("tests", "tests/plants", "benchmarks", "docs")]
     import test_library_battery
     import test_systems
     import test_systems_mechanical

@@ -1,11 +1,10 @@
 """Every component of the library is checked against something that this package did not compute."""
 
-import importlib
 import pathlib
 
 import numpy as np
 import pytest
-from component_references import CHECKS, Measurement, checks, measured
+from component_references import CHECKS, Measurement, checks, import_checks, measured
 from library_pages import classes_of, domains
 
 from jaxonomy_dae import Component
@@ -17,9 +16,7 @@ COMPONENTS = [cls for domain in domains() for cls in classes_of(domain)]
 
 def declared() -> dict[type[Component], list[str]]:
     """The checks of each component; test files are imported for what they declare."""
-    for path in sorted(HERE.glob("test_*.py")):
-        if "component_references" in path.read_text() and path != pathlib.Path(__file__):
-            importlib.import_module(path.stem)
+    import_checks()
     found: dict[type[Component], list[str]] = {}
     for name, check in CHECKS.items():
         for cls in check.references:

@@ -14,6 +14,7 @@ import numpy as np
 from reference_systems import integrated
 
 from jaxonomy_dae import AcausalSystem, Solution
+from jaxonomy_dae.compiler.pipeline import initial_point
 from jaxonomy_dae.system.inputs import read_inputs
 
 ASIDE = 1e-12  # of a run's length: as near to an edge as the field is evaluated, beside its jump
@@ -37,9 +38,12 @@ def states_at(
     edges: Sequence[float] = (),
     rtol: float = 1e-10,
 ) -> np.ndarray:
-    """States at `ts`, shape (times, states), from the initial one at ts[0], by DOP853 that begins anew at `edges`."""
+    """States at `ts`, shape (times, states), from the declared starts at ts[0] = 0, by DOP853 that begins anew at
+    `edges`."""
     assert not system.carried, "the field of nonlinear blocks is only as good as a stage needs it"
-    start = np.asarray(system.initialize(float(ts[0]), inputs=inputs))
+    plan = system.plan
+    point, *_ = initial_point(plan.flat, plan.variable_map, plan.extended)  # by NumPy: `initialize` compiles its ladder
+    start = point[plan.states]
     field = jax.jit(lambda t, x: system.vector_field(t, x, inputs))
     aside = ASIDE * (ts[-1] - ts[0])
     return integrated(lambda t, x: np.asarray(field(t, x)), start, ts, ends=edges, rtol=rtol, aside=aside).T

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import scipy.integrate
 import scipy.interpolate
-import sympy
 from component_references import checks, measured
 from problems import compiled
 from reference_systems import ReferenceSystem, check_solution, system_of
@@ -17,9 +16,8 @@ from trajectories import trajectory
 
 import jaxonomy_dae.library.electrical as el
 import jaxonomy_dae.library.thermal as th
-from jaxonomy_dae import EqnEnv, ModelError, simulate
+from jaxonomy_dae import EqnEnv, simulate
 from jaxonomy_dae.library.battery import Cell, HeatedCell, HeatedPack, Pack
-from jaxonomy_dae.library.interpolation import interpolated
 from jaxonomy_dae.testing import assert_energy_balance
 
 SOC = np.array([0.0, 0.1, 0.25, 0.5, 0.8, 1.0])
@@ -33,19 +31,6 @@ def curve(values=OCV):
     """The cubic table: Hermite's splines with the slopes of the chords behind."""
     slopes = np.diff(values) / np.diff(SOC)
     return scipy.interpolate.CubicHermiteSpline(SOC, values, np.append(slopes[:1], slopes))
-
-
-@pytest.mark.parametrize("kind", ["linear", "cubic"])
-def test_tables_and_their_integrals(kind):
-    u, names = sympy.Symbol("u"), sympy.symbols("a:6")
-    value, integral = sympy.lambdify([u, names], interpolated(u, SOC, names, kind), "numpy")(
-        at := np.linspace(-0.2, 1.2, 29), OCV
-    )
-    spline = scipy.interpolate.make_interp_spline(SOC, OCV, k=1) if kind == "linear" else curve()
-    # Rounding of a few volts, magnified in the cubic's coefficients by 1/width² and more: widths are 0.1 to 0.3.
-    np.testing.assert_allclose(value, spline(at, extrapolate=True), rtol=0, atol=1e-12)
-    whole = spline.antiderivative()
-    np.testing.assert_allclose(integral, whole(at, extrapolate=True) - whole(0.0), rtol=0, atol=1e-12)
 
 
 CURRENTS = {"full": -3.0, "empty": 2.5, "bare": 0.5}
@@ -78,10 +63,8 @@ def cells():
 def test_cells_at_constant_current():
     """soc is linear in time, and an RC pair answers R·i·(1 − exp(−t/(R·C))); one cell is charged with losses."""
     system, inputs = cells()
-    # The tables have kinks where the states of charge pass 0.8 and 0.25.
-    edges = [360.0, 3600.0 * 2.0 * 0.15 / (0.98 * 2.5)]
     names = [f"{name}.{v}" for name in CURRENTS for v in ("soc", "v")]
-    solution = trajectory(system, TS, names, inputs, edges=edges)
+    solution = trajectory(system, TS, names, inputs)
     for name, i in CURRENTS.items():
         hours, eta, soc0 = {"full": (2.0, 1.0, 0.95), "empty": (2.0, 0.98, 0.1), "bare": (1.5, 1.0, 0.5)}[name]
         soc = soc0 + (eta if i > 0 else 1.0) * i * TS / (3600 * hours)
@@ -386,32 +369,3 @@ def test_a_pack_of_384_cells():
     assert len(system.states) == 4 * 384
     check_solution(pack_of_384)
     compare_modes(system, 4, 1e-6, 300.0)
-
-
-# --- wrong values --------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "make, message",
-    [
-        (lambda ev: Cell(ev, "c", [0, 0.5, 0.4], OCV[:3]), r"'c': soc must increase, but .* \(0\.4\) follows 0\.5"),
-        (lambda ev: Cell(ev, "c", [0.5], [3.7]), r"'c': soc needs a row of at least 2 points; got shape \(1,\)"),
-        (lambda ev: Cell(ev, "c", SOC, OCV[:4]), r"'c': ocv has 4 entries, soc has 6: they must agree"),
-        (lambda ev: Cell(ev, "c", SOC, [3.0, np.nan, *OCV[2:]]), r"'c\.ocv2'"),
-        (lambda ev: Cell(ev, "c", SOC, OCV, kind="spline"), r"'c': kind must be one of linear, cubic; got 'spline'"),
-        (lambda ev: Cell(ev, "c", SOC, OCV, Q=-1.0), r"'c\.Q' must lie in \(0, inf\); got -1"),
-        (lambda ev: Cell(ev, "c", SOC, OCV, R0=0.0), r"'c\.R0' must lie in \(0, inf\); got 0"),
-        (lambda ev: Cell(ev, "c", SOC, OCV, R=[0.1], C=[0.0]), r"'c\.C1' must lie in \(0, inf\); got 0"),
-        (lambda ev: Cell(ev, "c", SOC, OCV, R=[0.1, 0.2], C=[1.0]), r"'c' needs .*got 2 in R, 1 in C and 2 in initial"),
-        (lambda ev: Cell(ev, "c", SOC, OCV, eta=1.1), r"'c\.eta' must lie in \(0, 1\]; got 1\.1"),
-        (lambda ev: HeatedCell(ev, "c", SOC, OCV, T_ref=0.0), r"'c\.T_ref' must lie in \(0, inf\); got 0"),
-        (lambda ev: Pack(ev, "k", 0, 2, SOC, OCV), r"'k': series must be at least 1, an integer; got 0"),
-        (lambda ev: Pack(ev, "k", 3, 2, SOC, OCV, R0=[0.1] * 3), r"'k': R0 has shape \(3,\): .* shape \(3, 2\)"),
-        (lambda ev: Pack(ev, "k", 2, 2, SOC, OCV, Q=-1.0), r"'k\.Q' must lie in"),
-        (lambda ev: Pack(ev, "k", 2, 2, SOC, OCV, Q=[[1.0, 1.0], [1.0, -1.0]]), r"'cell\[1,1\]\.Q' must lie"),
-        (lambda ev: HeatedPack(ev, "k", 2, 2, SOC, OCV, G_neighbour=-1.0), r"'k\.G_neighbour' must lie in"),
-    ],
-)  # fmt: skip
-def test_refused(make, message):
-    with pytest.raises(ModelError, match=message):
-        make(EqnEnv())

@@ -19,7 +19,7 @@ import jaxonomy_dae.library.electrical as el
 import jaxonomy_dae.library.planar as planar
 import jaxonomy_dae.library.rotational as rot
 import jaxonomy_dae.library.translational as line
-from jaxonomy_dae import Component, EqnEnv, ModelError, SimulationError, der, simulate
+from jaxonomy_dae import Component, EqnEnv, SimulationError, der, simulate
 from jaxonomy_dae.library.contacts import DogClutch, HardStop, Rope
 from jaxonomy_dae.modeling import Eq
 from jaxonomy_dae.solvers import BDF, Rodas5P, StoredAdjoint
@@ -76,7 +76,8 @@ SOLVERS = {
 }
 
 
-@pytest.mark.parametrize("solver", ["Tsit5", *(pytest.param(s, marks=pytest.mark.slow) for s in [*SOLVERS][1:])])
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", SOLVERS)
 def test_a_string_by_every_solver(bob, solver):
     end, times = flown(bob, 5.2, solver=SOLVERS[solver])
     # Two events, a pendulum and a parabola at tolerances of 1e-10.
@@ -414,17 +415,3 @@ def test_a_jump_that_is_not_affine_is_refused():
     system = compiled(c1, c2, switch, g, connect=[(c1.p, switch.p), (switch.n, c2.p), (c1.n, c2.n, g.p)])
     with pytest.raises(SimulationError, match="or that no impulse brings about"):
         simulate(system, 1.0, inputs={"s.u": lambda t: t})
-
-
-def test_what_cannot_be_meant():
-    class Wrong(Component):
-        def __init__(self, ev, name, order, **options):
-            super().__init__(ev, name)
-            x, f = self.variable("x", start=1.0, fixed=True), self.variable("f")
-            self.add_equations(Eq(der(x), f))
-            self.complementary(x, f, order=order, **options)
-
-    with pytest.raises(ModelError, match="order says how many times a branch is differentiated, 0, 1 or 2; got 3"):
-        Wrong(EqnEnv(), "w", 3)
-    with pytest.raises(ModelError, match="a restitution is for gaps between positions, order=2; got order=1"):
-        Wrong(EqnEnv(), "w", 1, restitution=0.5)

@@ -14,7 +14,7 @@ from scipy.special import lambertw
 from trajectories import trajectory
 
 import jaxonomy_dae.library.electrical as el
-from jaxonomy_dae import EqnEnv, ModelError, simulate
+from jaxonomy_dae import EqnEnv, simulate
 from jaxonomy_dae.library.rotational import Torque
 from jaxonomy_dae.library.thermal import FixedTemperature, HeatCapacitor, ThermalConductor
 from jaxonomy_dae.testing import assert_energy_balance
@@ -357,17 +357,3 @@ def test_gradients_of_a_circuit():
     reverse = jax.jit(jax.grad(end))(values)
     forward = jax.jit(jax.jacfwd(lambda v: end(v, diffrax.ForwardMode())))(values)
     np.testing.assert_allclose(reverse, forward, rtol=1e-8, atol=1e-8 * np.abs(forward).max())
-
-
-@pytest.mark.parametrize(
-    "make, named",
-    [
-        (lambda ev: el.Diode(ev, "d", Is=-1e-9), r"d\.Is"),
-        (lambda ev: el.MutualInductor(ev, "m", L1=0.0), r"m\.L1"),
-        (lambda ev: el.HeatedResistor(ev, "r", R=-2.0), r"r\.R"),
-        (lambda ev: el.PulseVoltage(ev, "p", period=0.0), r"p\.period"),
-    ],
-)
-def test_wrong_values_are_named(make, named):
-    with pytest.raises(ModelError, match=named):
-        make(EqnEnv())

@@ -14,7 +14,7 @@ from trajectories import trajectory
 
 import jaxonomy_dae.library.rotational as rot
 import jaxonomy_dae.library.translational as line
-from jaxonomy_dae import EqnEnv, ModelError, simulate
+from jaxonomy_dae import EqnEnv, simulate
 from jaxonomy_dae.library.transmissions import LeadScrew, Planetary, RackAndPinion, Wheel
 from jaxonomy_dae.testing import assert_energy_balance
 
@@ -243,17 +243,3 @@ def test_gradients():
     reverse = jax.jit(jax.grad(end))(values)
     forward = jax.jit(jax.jacfwd(lambda v: end(v, diffrax.ForwardMode())))(values)
     np.testing.assert_allclose(reverse, forward, rtol=0, atol=1e-8 * np.abs(forward).max())
-
-
-@pytest.mark.parametrize(
-    "make, named",
-    [
-        (lambda ev: Planetary(ev, "p", 0.0), r"p\.ratio"),
-        (lambda ev: line.Backlash(ev, "b", gap=-1.0), r"b\.gap"),
-        (lambda ev: rot.Friction(ev, "f", smooth=0.0), r"f\.smooth"),
-        (lambda ev: LeadScrew(ev, "s", lead=-0.1), r"s\.lead"),
-    ],
-)
-def test_wrong_values_are_named(make, named):
-    with pytest.raises(ModelError, match=named):
-        make(EqnEnv())

@@ -270,20 +270,3 @@ def test_noise_belongs_to_its_key():
     measured("correlation", np.corrcoef(values.T)[0, 1], 0.0, 4 / np.sqrt(2000), scale=1.0)
     between = np.asarray(read(jnp.array([0.7, 0.725, 0.8])))[:, 0]
     assert between[1] == pytest.approx(0.75 * between[0] + 0.25 * between[2], rel=1e-9)
-
-
-@pytest.mark.parametrize(
-    "make, message",
-    [
-        (lambda ev: sig.Table1D(ev, "t", [0, 2, 1], [0, 1, 2]), r"'t': x must increase, but entry 2 \(1\) follows 2"),
-        (lambda ev: sig.Table1D(ev, "t", [0, 1], [0, 1, 2]), r"'t': values has shape \(3,\), x has \(2,\)"),
-        (lambda ev: sig.Table1D(ev, "t", [0, 1], [0, np.nan]), r"'t': values is not finite at entry 1"),
-        (lambda ev: sig.Table2D(ev, "t", [0, 1], [0, 1], [[1, 2]]), r"'t': values has shape \(1, 2\)"),
-        (lambda ev: sig.TransferFunction(ev, "f", [1, 0], [2]), r"'f': the numerator's degree, 1, is above"),
-        (lambda ev: sig.StateSpace(ev, "s", [[1, 0]], [[1]], [[1]]), r"'s': A has shape \(1, 2\)"),
-        (lambda ev: sig.FirstOrder(ev, "f", T=0.0), r"f\.T"),
-    ],
-)
-def test_wrong_values_are_named(make, message):
-    with pytest.raises(ModelError, match=message):
-        make(EqnEnv())

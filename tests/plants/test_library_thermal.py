@@ -10,7 +10,7 @@ from component_references import checks, measured
 from problems import compiled
 from trajectories import trajectory
 
-from jaxonomy_dae import EqnEnv, ModelError, simulate
+from jaxonomy_dae import EqnEnv, simulate
 from jaxonomy_dae.library.thermal import (
     Convection,
     FixedTemperature,
@@ -187,18 +187,3 @@ def test_a_run_with_temperatures_that_radiation_determines():
     for k, name in enumerate(("body0.T", "body1.T", "frame.T")):
         np.testing.assert_allclose(solution[name], true[k], atol=3e-7)
     np.testing.assert_allclose(solution["left.port_b.T"], [shield_temperature(T) for T in true.T], atol=3e-7)
-
-
-@pytest.mark.parametrize(
-    "make, message",
-    [
-        (lambda ev: Convection(ev, "c", A=-1.0), r"'c\.A' must lie in \[0, inf\); got -1"),
-        (lambda ev: Radiation(ev, "r", eps=1.2), r"'r\.eps' must lie in \[0, 1\]; got 1\.2"),
-        (lambda ev: Wall(ev, "w", [1.0, -2.0], [1.0, 1.0]), r"'w\.R2' must lie in \(0, inf\); got -2"),
-        (lambda ev: Wall(ev, "w", [1.0, 2.0], [1.0]), r"wall 'w' needs .*got 2 in R, 1 in C and 2 in initial_temp"),
-        (lambda ev: Wall(ev, "w", [], []), r"wall 'w' needs .*got 0 in R"),
-    ],
-)
-def test_refused(make, message):
-    with pytest.raises(ModelError, match=message):
-        make(EqnEnv())

@@ -296,6 +296,7 @@ def test_characteristics_of_diodes():
     compare("CharacteristicIdealDiodes")
 
 
+@pytest.mark.slow
 @checks(
     {
         line.ElasticStop: (TOOL, "elastoGap1.v_rel", "elastoGap2.s_rel"),
@@ -333,6 +334,7 @@ def test_a_heating_control():
     assert float(solution.events.ts[0]) == pytest.approx(first, rel=1e-8)
 
 
+@pytest.mark.slow
 @checks(
     {line.ElasticStop: ("SciPy's DOP853 of the law written anew", "mass2.s", "mass2.v")}, origin="some tens of 1e-9"
 )

@@ -77,6 +77,7 @@ def drive_matrices(p):
     return a, np.array([[gain / L, 0.0], [0.0, 1 / J], [1 / p["pi.Ti"], 0.0]])
 
 
+@pytest.mark.slow
 def test_linearized_drive():
     """Poles, and the speed's answer to setpoint and torque: C·(jω − A)⁻¹·B of the equations by hand."""
     _, system = system_of(drive)
@@ -139,6 +140,7 @@ def notch():
 TS_NOTCH = np.linspace(0.0, 0.03, 13)
 
 
+@pytest.mark.slow
 def test_frequency_response_of_the_notch():
     """v/u = R/(R + Z) with 1/Z = s·C + 1/(r + s·L)."""
     _, system = system_of(notch)
@@ -398,15 +400,13 @@ def test_the_house_at_rest():
 SYSTEMS = [drive, notch, wien, rectifier, chua, house]
 
 
-def with_slow(*slow):
-    return [pytest.param(s, marks=pytest.mark.slow) if s in slow else s for s in SYSTEMS]
-
-
-@pytest.mark.parametrize("reference", with_slow(wien, rectifier))
+@pytest.mark.slow
+@pytest.mark.parametrize("reference", SYSTEMS)
 def test_solution(reference):
     check_solution(reference)
 
 
-@pytest.mark.parametrize("reference", with_slow(wien, rectifier, house, chua))
+@pytest.mark.slow
+@pytest.mark.parametrize("reference", SYSTEMS)
 def test_gradient(reference):
     check_gradient(reference)

@@ -433,18 +433,16 @@ TS_ANDREWS = np.linspace(0.0, 0.01, 3)
 SYSTEMS = [
     tanks, lift, quarter_car, planetary, double_pendulum, triple_pendulum, four_bar, slider_crank, andrews,
 ]  # fmt: skip
-LONG = (tanks, double_pendulum, triple_pendulum, four_bar, slider_crank, andrews)
 
 
-def with_slow(*slow):
-    return [pytest.param(s, marks=pytest.mark.slow) if s in slow else s for s in SYSTEMS]
-
-
-@pytest.mark.parametrize("reference", with_slow(*LONG))
+@pytest.mark.parametrize(
+    "reference", [s if s is planetary else pytest.param(s, marks=pytest.mark.slow) for s in SYSTEMS]
+)
 def test_solution(reference):
     check_solution(reference)
 
 
-@pytest.mark.parametrize("reference", with_slow(*LONG, lift, quarter_car))
+@pytest.mark.slow
+@pytest.mark.parametrize("reference", SYSTEMS)
 def test_gradient(reference):
     check_gradient(reference)
