@@ -2,9 +2,8 @@
 
     python -m benchmarks.systems
 
-Runs each system of tests/plants/test_systems.py and
-test_systems_mechanical.py, and the battery pack of
-test_library_battery.py, with the solver that `simulate` chooses. A system that misses its tolerance ends the run.
+Runs each system of test_systems.py and test_systems_mechanical.py, and the battery pack of test_library_battery.py, all
+in tests/plants, with the solver that `simulate` chooses. A system that misses its tolerance ends the run.
 """
 
 import inspect
