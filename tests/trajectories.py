@@ -74,6 +74,7 @@ def balanced(
     inputs: Mapping[str, Any] | None = None,
     *,
     panels: int = 40,
+    edges: Sequence[float] = (),
     rtol: float = 1e-7,
 ) -> Solution:
     """Asserts that what is stored until `end` was supplied and not lost, by Gauss's quadrature of these powers.
@@ -82,12 +83,12 @@ def balanced(
     front and `end` behind.
     """
     places, weights = np.polynomial.legendre.leggauss(POINTS)
-    half = end / panels / 2
-    nodes = (half * (1 + places) + 2 * half * np.arange(panels)[:, None]).ravel()
-    ts = np.concatenate([[0.0], nodes, [end]])
-    solution = solution_of(system, ts, states_at(system, ts, inputs, rtol=1e-11), inputs)
+    knots = np.union1d(np.linspace(0.0, end, panels + 1), edges)
+    half = np.diff(knots)[:, None] / 2
+    ts = np.concatenate([[0.0], (knots[:-1, None] + half * (1 + places)).ravel(), [end]])
+    solution = solution_of(system, ts, states_at(system, ts, inputs, edges=edges, rtol=1e-11), inputs)
     energy, supply, lost = (np.asarray(v()) for v in (solution.energy, solution.supply, solution.dissipation))
-    weights = np.tile(half * weights, panels)
+    weights = (half * weights).ravel()
     work, exchanged = ((weights * f(supply, lost)[1:-1]).sum() for f in (np.subtract, lambda s, d: np.abs(s) + d))
     np.testing.assert_allclose(energy[-1] - energy[0], work, rtol=0, atol=rtol * exchanged)
     return solution

@@ -233,8 +233,6 @@ def test_raw_diffrax(rc):
             diffrax.Dopri5(), {"stepsize_controller": diffrax.StepTo(ts=jnp.linspace(0.0, 2.0, 401))}, id="StepTo"
         ),
         pytest.param(diffrax.Dopri8(), {}, id="Dopri8", marks=pytest.mark.slow),
-        pytest.param(diffrax.Bosh3(), {}, id="Bosh3", marks=pytest.mark.slow),
-        pytest.param(diffrax.Kvaerno3(), {}, id="Kvaerno3", marks=pytest.mark.slow),
     ],
 )
 def test_other_solvers(rc, solver, options):
@@ -250,7 +248,6 @@ def test_other_solvers(rc, solver, options):
         pytest.param(Projected(diffrax.Tsit5()), id="explicit", marks=pytest.mark.slow),
         pytest.param(diffrax.Dopri5(), id="Dopri5", marks=pytest.mark.slow),
         pytest.param(kvaerno5(), id="Kvaerno5", marks=pytest.mark.slow),
-        pytest.param(Projected(kvaerno5()), id="Kvaerno5-explicit", marks=pytest.mark.slow),
     ],
 )
 def test_projected_solvers(plain, solver):

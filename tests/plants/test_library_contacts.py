@@ -67,13 +67,7 @@ def flown(system, v0, **options):
     return jnp.stack([solution["bob.x"][-1], solution["bob.y"][-1]]), solution.events.ts[:2]
 
 
-SOLVERS = {
-    "Tsit5": None,
-    "Diffrax's Tsit5": diffrax.Tsit5(),
-    "Dopri8": diffrax.Dopri8(),
-    "Kvaerno5": diffrax.Kvaerno5(),
-    "Rodas5P": Rodas5P(),
-}
+SOLVERS = {"Tsit5": None, "Kvaerno5": diffrax.Kvaerno5(), "Rodas5P": Rodas5P()}
 
 
 @pytest.mark.slow
@@ -93,11 +87,7 @@ def test_a_string_by_bdf(bob):
     np.testing.assert_allclose(end, AT_1_5, rtol=0, atol=1e-5)
 
 
-ADJOINTS = {
-    "stored": StoredAdjoint(),
-    "recursive": diffrax.RecursiveCheckpointAdjoint(),
-    "forward": diffrax.ForwardMode(),
-}
+ADJOINTS = {"stored": StoredAdjoint(), "forward": diffrax.ForwardMode()}
 
 
 @pytest.mark.slow
@@ -126,9 +116,6 @@ def test_a_batch_of_strings(bob):
     ends = jax.jit(jax.vmap(lambda v: flown(bob, v)[0]))(speeds)
     alone = jax.jit(lambda v: flown(bob, v)[0])
     np.testing.assert_allclose(ends, [alone(v) for v in speeds], atol=1e-9)
-    gradients = jax.jit(jax.vmap(jax.grad(lambda v: flown(bob, v)[0].sum())))(speeds)
-    one = jax.jit(jax.grad(lambda v: flown(bob, v)[0].sum()))
-    np.testing.assert_allclose(gradients, [one(v) for v in speeds], rtol=1e-8, atol=1e-9)
 
 
 def test_the_report_tells_the_index(bob):
@@ -334,7 +321,7 @@ SHAFTS = {"J": (1.0, 2.0, 0.5, 3.0), "w": (10.0, -1.0, 4.0, 0.5)}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("closed", [(1, 1, 1), (1, 0, 1), (0, 1, 1)])
+@pytest.mark.parametrize("closed", [(1, 1, 1), (1, 0, 1)])
 def test_dog_clutches_that_close_at_once(closed):
     """Four shafts; those joined at the start turn with their common momentum, whatever the order."""
     ev = EqnEnv()

@@ -263,7 +263,7 @@ def rectifier():
                 a[k], b[k] = np.array([a[k], b[k]]) - np.linalg.solve(both @ by_nodes, both @ residual)
         return {"c.v": v, "d0.p.v": a, "d1.p.v": b}
 
-    return ReferenceSystem(make, expected, TS_RECTIFIER, "c.v")
+    return ReferenceSystem(make, expected, TS_RECTIFIER, "c.v", stiff=True)
 
 
 TS_RECTIFIER = np.linspace(0.0, 0.025, 11)
@@ -403,10 +403,10 @@ SYSTEMS = [drive, notch, wien, rectifier, chua, house]
 @pytest.mark.slow
 @pytest.mark.parametrize("reference", SYSTEMS)
 def test_solution(reference):
-    check_solution(reference)
+    check_solution(reference, energy=reference in (drive, wien))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("reference", SYSTEMS)
+@pytest.mark.parametrize("reference", [drive, notch, rectifier, house])
 def test_gradient(reference):
-    check_gradient(reference)
+    check_gradient(reference, modes=reference is drive)

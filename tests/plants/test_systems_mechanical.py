@@ -439,10 +439,10 @@ SYSTEMS = [
     "reference", [s if s is planetary else pytest.param(s, marks=pytest.mark.slow) for s in SYSTEMS]
 )
 def test_solution(reference):
-    check_solution(reference)
+    check_solution(reference, energy=reference is four_bar)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("reference", SYSTEMS)
+@pytest.mark.parametrize("reference", [lift, quarter_car, planetary, double_pendulum, four_bar])
 def test_gradient(reference):
-    check_gradient(reference)
+    check_gradient(reference, modes=reference is double_pendulum)
