@@ -280,7 +280,7 @@ def test_projection_may_be_given_by_hand(plain):
 def test_projected_without_a_projection_says_so(plain):
     with pytest.raises(ValueError, match=r"Projected\(solver, system\.project\)"):
         diffrax.diffeqsolve(
-            diffrax.ODETerm(plain.vector_field), Projected(diffrax.Tsit5()), 0.0, 1.0, 0.1, plain.initialize()
+            diffrax.ODETerm(plain.vector_field), Projected(diffrax.Tsit5()), 0.0, 1.0, 0.1, jnp.zeros(4)
         )
     with pytest.raises(ValueError, match="wrapped in Projected already"):
         Projected(Projected(diffrax.Tsit5()))

@@ -344,7 +344,8 @@ def test_accounts_inside_jit_and_batches():
     step = 1e-4  # central differences: their error is of the order of step², and of the tolerance by step
     slope = (lost(0.6 + step) - lost(0.6 - step)) / (2 * step)
     np.testing.assert_allclose(jax.jit(jax.grad(lost))(0.6), slope, rtol=1e-4)
-    batch = eqx.filter_vmap(lambda d: simulate(system.with_parameters({"b.d": d}), 1.0, ts=ts))(jnp.array([0.0, 0.6]))
+    run = eqx.filter_vmap(lambda d: simulate(system.with_parameters({"b.d": d}), 1.0, ts=ts))
+    batch = eqx.filter_jit(run)(jnp.array([0.0, 0.6]))
     assert batch.energy().shape == (2, 2)
     np.testing.assert_allclose(batch.energy()[0, 1], batch.energy()[0, 0], rtol=1e-4)
     with pytest.raises(ModelError, match="this is a batch"):
