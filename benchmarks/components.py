@@ -6,7 +6,6 @@ Runs the tests that declare references (tests/component_references.py), measures
 a test fails, it is named, and the page stays as it was.
 """
 
-import importlib
 import pathlib
 import sys
 import time
@@ -31,13 +30,10 @@ which runs the tests named in the last column. A component without a reference f
 def main() -> None:
     jax.config.update("jax_enable_x64", True)
     sys.path[:0] = [str(ROOT / folder) for folder in ("tests", "benchmarks", "docs")]
-    from component_references import CHECKS, Measurement
+    from component_references import CHECKS, Measurement, import_checks
     from library_pages import classes_of, domains
 
-    for path in sorted((ROOT / "tests").glob("test_library_*.py")):
-        importlib.import_module(path.stem)
-    for name in ("test_events", "test_modelica_examples", "test_pendulum", "test_rotational"):
-        importlib.import_module(name)
+    import_checks()
     found: dict[str, dict[str, Measurement]] = {}
     failed: list[str] = []
     for name, check in CHECKS.items():

@@ -2,8 +2,8 @@
 
     python -m benchmarks.systems
 
-Runs each system of tests/test_systems.py and tests/test_systems_mechanical.py, and the battery pack of
-tests/test_library_battery.py, with the solver that `simulate` chooses. A system that misses its tolerance ends the run.
+Runs each system of test_systems.py and test_systems_mechanical.py, and the battery pack of test_library_battery.py, all
+in tests/plants, with the solver that `simulate` chooses. A system that misses its tolerance ends the run.
 """
 
 import inspect
@@ -24,9 +24,9 @@ stored, supplied and lost, as the components declare it, relative to the largest
 
     python -m benchmarks.systems
 
-The tests of these systems compare their gradients too: of one output by every parameter that can be set, reverse with
-forward mode to 1e-8 of the largest derivative (each in units of its parameter's value), and with differences of the
-reference to 1e-5. Of the pack, the 2,323 derivatives in both modes are those of a shorter run at rtol 1e-6.
+Tests compare gradients of most of these systems too: of one output by every parameter that can be set, with differences
+of the reference to 1e-5 of the largest derivative (each in units of its parameter's value), and of some of them reverse
+with forward mode to 1e-8.
 
 | System | Equations | States | Solver | Error | Energy |
 |---|---|---|---|---|---|
@@ -35,7 +35,7 @@ reference to 1e-5. Of the pack, the 2,323 derivatives in both modes are those of
 
 def main() -> None:
     jax.config.update("jax_enable_x64", True)
-    sys.path[:0] = [str(ROOT / folder) for folder in ("tests", "benchmarks", "docs")]
+    sys.path[:0] = [str(ROOT / folder) for folder in ("tests", "tests/plants", "benchmarks", "docs")]
     import test_library_battery
     import test_systems
     import test_systems_mechanical

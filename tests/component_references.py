@@ -5,6 +5,9 @@ it compares to `measured`. `python -m benchmarks.components` runs these tests an
 """
 
 import functools
+import importlib
+import pathlib
+import sys
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -76,6 +79,16 @@ def checks(
         return run
 
     return declare
+
+
+def import_checks() -> None:
+    """Imports the test files of all rooms that declare references."""
+    here = pathlib.Path(__file__).parent
+    for path in sorted(here.rglob("test_*.py")):
+        if "from component_references import checks" in path.read_text():
+            if str(path.parent) not in sys.path:
+                sys.path.append(str(path.parent))
+            importlib.import_module(path.stem)
 
 
 def measured(label: str, found: Any, true: Any, atol: Any, scale: float | None = None) -> None:

@@ -1,13 +1,11 @@
 """Every component of the library is checked against something that this package did not compute."""
 
 import functools
-import importlib
 import pathlib
-import sys
 
 import numpy as np
 import pytest
-from component_references import CHECKS, Measurement, checks, measured
+from component_references import CHECKS, Measurement, checks, import_checks, measured
 from library_pages import classes_of, domains
 
 from jaxonomy_dae import Component
@@ -19,12 +17,8 @@ COMPONENTS = [cls for domain in domains() for cls in classes_of(domain)]
 
 @functools.cache
 def declared() -> dict[type[Component], list[str]]:
-    """The checks of each component; test files of all rooms are imported for what they declare."""
-    for path in sorted(TESTS.rglob("test_*.py")):
-        if "component_references" in path.read_text() and path != pathlib.Path(__file__):
-            if str(path.parent) not in sys.path:
-                sys.path.append(str(path.parent))
-            importlib.import_module(path.stem)
+    """The checks of each component; test files are imported for what they declare."""
+    import_checks()
     found: dict[type[Component], list[str]] = {}
     for name, check in CHECKS.items():
         for cls in check.references:
@@ -32,9 +26,9 @@ def declared() -> dict[type[Component], list[str]]:
     return found
 
 
-def test_every_component_has_a_reference():
-    without = [f"{cls.__module__}.{cls.__name__}" for cls in COMPONENTS if not declared().get(cls)]
-    assert not without, f"no test declares a reference for {without}: see `checks`"
+@pytest.mark.parametrize("cls", COMPONENTS, ids=lambda cls: f"{cls.__module__.split('.')[2]}.{cls.__name__}")
+def test_every_component_has_a_reference(cls):
+    assert declared().get(cls), f"no test declares a reference for {cls.__module__}.{cls.__name__}: see `checks`"
 
 
 def test_every_reference_is_of_a_component():

@@ -19,7 +19,7 @@ import jaxonomy_dae.library.electrical as el
 import jaxonomy_dae.library.planar as planar
 import jaxonomy_dae.library.rotational as rot
 import jaxonomy_dae.library.translational as line
-from jaxonomy_dae import Component, EqnEnv, ModelError, SimulationError, der, simulate
+from jaxonomy_dae import Component, EqnEnv, SimulationError, der, simulate
 from jaxonomy_dae.library.contacts import DogClutch, HardStop, Rope
 from jaxonomy_dae.modeling import Eq
 from jaxonomy_dae.solvers import BDF, Rodas5P, StoredAdjoint
@@ -67,16 +67,11 @@ def flown(system, v0, **options):
     return jnp.stack([solution["bob.x"][-1], solution["bob.y"][-1]]), solution.events.ts[:2]
 
 
-SOLVERS = {
-    "Tsit5": None,
-    "Diffrax's Tsit5": diffrax.Tsit5(),
-    "Dopri8": diffrax.Dopri8(),
-    "Kvaerno5": diffrax.Kvaerno5(),
-    "Rodas5P": Rodas5P(),
-}
+SOLVERS = {"Tsit5": None, "Kvaerno5": diffrax.Kvaerno5(), "Rodas5P": Rodas5P()}
 
 
-@pytest.mark.parametrize("solver", ["Tsit5", *(pytest.param(s, marks=pytest.mark.slow) for s in [*SOLVERS][1:])])
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", SOLVERS)
 def test_a_string_by_every_solver(bob, solver):
     end, times = flown(bob, 5.2, solver=SOLVERS[solver])
     # Two events, a pendulum and a parabola at tolerances of 1e-10.
@@ -92,18 +87,14 @@ def test_a_string_by_bdf(bob):
     np.testing.assert_allclose(end, AT_1_5, rtol=0, atol=1e-5)
 
 
-ADJOINTS = {
-    "stored": StoredAdjoint(),
-    "recursive": diffrax.RecursiveCheckpointAdjoint(),
-    "forward": diffrax.ForwardMode(),
-}
+ADJOINTS = {"stored": StoredAdjoint(), "forward": diffrax.ForwardMode()}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("adjoint", [*ADJOINTS])
 def test_derivatives_of_a_string(bob, adjoint):
     jacobian = jax.jacfwd if adjoint == "forward" else jax.jacrev
-    found = jacobian(lambda v0: flown(bob, v0, adjoint=ADJOINTS[adjoint])[0])(5.2)
+    found = jax.jit(jacobian(lambda v0: flown(bob, v0, adjoint=ADJOINTS[adjoint])[0]))(5.2)
     np.testing.assert_allclose(found, BY_V0, rtol=1e-8)
 
 
@@ -123,11 +114,7 @@ def test_a_batch_of_strings(bob):
     """Members with no event and with two: each is its own run."""
     speeds = jnp.array([1.0, 3.0, 4.6, 5.0, 5.2, 6.0, 8.0])
     ends = jax.jit(jax.vmap(lambda v: flown(bob, v)[0]))(speeds)
-    alone = jax.jit(lambda v: flown(bob, v)[0])
-    np.testing.assert_allclose(ends, [alone(v) for v in speeds], atol=1e-9)
-    gradients = jax.jit(jax.vmap(jax.grad(lambda v: flown(bob, v)[0].sum())))(speeds)
-    one = jax.jit(jax.grad(lambda v: flown(bob, v)[0].sum()))
-    np.testing.assert_allclose(gradients, [one(v) for v in speeds], rtol=1e-8, atol=1e-9)
+    np.testing.assert_allclose(ends, [flown(bob, v)[0] for v in speeds], atol=1e-9)
 
 
 def test_the_report_tells_the_index(bob):
@@ -188,7 +175,7 @@ def test_a_ball_on_a_stop():
     solution = simulate(system, 3.0, **given)
     measured("height", solution["mass.s"][-1], AT_3, SMOOTH)
     measured("bounces", solution.events.ts[:6], BOUNCES, 1e-10)
-    by = jax.grad(height, (0, 1))(0.8, 1.0)
+    by = jax.jit(jax.grad(height, (0, 1)))(0.8, 1.0)
     measured("by restitution", by[0], BY_RESTITUTION, SMOOTH)
     measured("by height", by[1], BY_HEIGHT, SMOOTH)
 
@@ -235,7 +222,7 @@ def test_a_mass_is_lifted_off_and_set_down():
     # The flight begins where all of x, v and the acceleration are zero.
     np.testing.assert_allclose(solution["mass.s"], np.where(inside, flight(np.asarray(ts)), 0.0), atol=SMOOTH)
     np.testing.assert_allclose(solution["stop.f"], np.where(inside, 0.0, g - a * np.sin(ts)), atol=1e-7)
-    found = jax.jacrev(lambda g: run(g).events.ts[:2])(g)
+    found = jax.jit(jax.jacrev(lambda g: run(g).events.ts[:2]))(g)
     lift_by = 1 / np.sqrt(a**2 - g**2)
     h = 1e-5
     expected = central(lambda g: np.asarray(run(g).events.ts[:2]), g, h)
@@ -259,7 +246,7 @@ def test_a_rope_between_two_carts():
     measured("events", solution.events.ts[:1], [0.5], 1e-10)
     measured("speeds", [solution["first.v"][-1], solution["second.v"][-1]], [1.0, 1.0], SMOOTH)
     # x(2) = 2 + 1.5·3m/(m + 2), its derivative 9/(m + 2)².
-    measured("by mass", jax.grad(lambda m: run(m)["first.s"][-1])(1.0), 1.0, SMOOTH)
+    measured("by mass", jax.jit(jax.grad(lambda m: run(m)["first.s"][-1]))(1.0), 1.0, SMOOTH)
 
 
 @pytest.mark.slow
@@ -278,6 +265,7 @@ def test_equal_masses_exchange_their_speeds():
     np.testing.assert_allclose([solution[f"m{k}.s"][-1] for k in range(3)], [1.0, 2.0, 4.0], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_jerk_lifts_what_rests_on_the_ground():
     """A mass of 2 kg rests on the ground; a rope of 1 m from it to another of 1 kg, shot upwards at 6 m/s from 0.5 m,
     becomes taut. The ground does not pull: both go on with their common momentum."""
@@ -324,7 +312,7 @@ def test_a_dog_clutch():
     later = run(1.0, 2.0)
     measured("later", [later["one.w"][-1], later["two.w"][-1]], [joined + 0.5 + 1.5, joined + 0.5], SMOOTH)
     # (10·J + 1.5 − 2 + 1.5)/(J + 2) by J.
-    by = jax.grad(lambda J: run(J, 1.0)["two.w"][-1])(1.0)
+    by = jax.jit(jax.grad(lambda J: run(J, 1.0)["two.w"][-1]))(1.0)
     measured("by inertia", by, (10 * 3 - (10 + 1.0)) / 9, SMOOTH)
 
 
@@ -332,7 +320,7 @@ SHAFTS = {"J": (1.0, 2.0, 0.5, 3.0), "w": (10.0, -1.0, 4.0, 0.5)}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("closed", [(1, 1, 1), (1, 0, 1), (0, 1, 1)])
+@pytest.mark.parametrize("closed", [(1, 1, 1), (1, 0, 1)])
 def test_dog_clutches_that_close_at_once(closed):
     """Four shafts; those joined at the start turn with their common momentum, whatever the order."""
     ev = EqnEnv()
@@ -370,7 +358,7 @@ def test_two_capacitors_joined():
     measured("voltage", found[:2], expected[:2], SMOOTH)
     measured("discharge", found[2], expected[2], SMOOTH)
     # Volt per farad: some hundreds.
-    by = jax.jacrev(run)(1e-3)
+    by = jax.jit(jax.jacrev(run))(1e-3)
     measured("by C", by, jax.jacfwd(closed_form)(1e-3), 1e-5)
 
 
@@ -413,17 +401,3 @@ def test_a_jump_that_is_not_affine_is_refused():
     system = compiled(c1, c2, switch, g, connect=[(c1.p, switch.p), (switch.n, c2.p), (c1.n, c2.n, g.p)])
     with pytest.raises(SimulationError, match="or that no impulse brings about"):
         simulate(system, 1.0, inputs={"s.u": lambda t: t})
-
-
-def test_what_cannot_be_meant():
-    class Wrong(Component):
-        def __init__(self, ev, name, order, **options):
-            super().__init__(ev, name)
-            x, f = self.variable("x", start=1.0, fixed=True), self.variable("f")
-            self.add_equations(Eq(der(x), f))
-            self.complementary(x, f, order=order, **options)
-
-    with pytest.raises(ModelError, match="order says how many times a branch is differentiated, 0, 1 or 2; got 3"):
-        Wrong(EqnEnv(), "w", 3)
-    with pytest.raises(ModelError, match="a restitution is for gaps between positions, order=2; got order=1"):
-        Wrong(EqnEnv(), "w", 1, restitution=0.5)

@@ -1,49 +1,27 @@
 """Planar mechanics against closed forms, and against SciPy's solution of reduced equations derived by hand."""
 
 import functools
-from types import SimpleNamespace
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
 from component_references import checks, measured
-from problems import GRAVITY, angle_solution, compiled, elliptic_angle
+from planar_models import Bench, double_pendulum, four_bar, squeezing_mechanism
+from problems import GRAVITY, angle_solution, elliptic_angle
 from testset.problem import load
+from trajectories import balanced, trajectory
 
 import jaxonomy_dae.library.planar as pl
 import jaxonomy_dae.library.rotational as rot
 import jaxonomy_dae.library.translational as line
-from jaxonomy_dae import EqnEnv, InitializationError, ModelError, StructuralError, simulate
+from jaxonomy_dae import InitializationError, simulate
 
 TS = np.linspace(0.0, 2.0, 9)
 TIGHT = dict(rtol=1e-9, atol=1e-11)
 # rtol 1e-9 for each of fewer than 500 steps; SciPy's references carry 1e-10 or better.
 MEASURED = 5e-7
-
-
-class Bench:
-    """Components of one model, and the ports joined in it."""
-
-    def __init__(self):
-        self.ev, self.parts, self.joined = EqnEnv(), [], []
-
-    def __call__(self, kind, name, *args, **kwargs):
-        self.parts.append(kind(self.ev, name, *args, **kwargs))
-        return self.parts[-1]
-
-    def join(self, *ends):
-        self.joined.append(ends)
-
-    def chain(self, *ends):
-        """Joins ends in pairs."""
-        for a, b in zip(ends[::2], ends[1::2], strict=True):
-            self.join(a, b)
-
-    def compile(self, **options):
-        return compiled(*self.parts, connect=self.joined, **options)
 
 
 def integrated(slopes, start, ts=TS):
@@ -243,7 +221,8 @@ TURNED = "trigonometry of two arms that turn as prescribed"
 )  # fmt: skip
 def test_components_against_references():
     system, inputs, expected = components()
-    solution = simulate(system, 2.0, ts=TS, inputs=inputs, **TIGHT)
+    solution = trajectory(system, TS, list(expected), inputs)
+    balanced(system, 1.0, inputs)
     for name, true in expected.items():
         measured(name, solution[name], true, MEASURED * np.abs(true).max())
 
@@ -251,19 +230,6 @@ def test_components_against_references():
 # --- double pendulum -----------------------------------------------------------------------------------------------
 
 RODS = {"a.m": 1.0, "a.rx": 1.0, "b.m": 0.5, "b.rx": 0.8, "j1.initial_phi": 0.3, "j2.initial_phi": 0.5}
-
-
-@functools.cache
-def double_pendulum(mode):
-    """Two uniform rods; in the minimal form the states are the angles, which are good everywhere."""
-    b = Bench()
-    world, first = b(pl.World, "world"), b(pl.Revolute, "j1", initial_phi=0.3, initial_omega=0.0)
-    second = b(pl.Revolute, "j2", initial_phi=0.5, initial_omega=0.0)
-    upper, lower = b(pl.MassiveLink, "a", 1.0), b(pl.MassiveLink, "b", 0.8, m=0.5)
-    b.chain(world.frame, first.frame_a, first.frame_b, upper.frame_a, upper.frame_b, second.frame_a, second.frame_b,
-            lower.frame_a)  # fmt: skip
-    angles = [f"{rod}.body.{angle}" for angle in ("phi", "omega") for rod in "ab"]
-    return b.compile(state_selection=mode, prefer_states=angles if mode == "dummy_derivatives" else ())
 
 
 def double_reference(ts, values):
@@ -293,13 +259,8 @@ def energy(solution, bodies, values):
     return total
 
 
-@pytest.mark.parametrize("mode", [pytest.param("auto", marks=pytest.mark.slow), "dummy_derivatives"])
-def test_double_pendulum(mode):
-    system = double_pendulum(mode)
-    if mode == "dummy_derivatives":
-        assert set(system.states) == {"a.body.phi", "a.body.omega", "b.body.phi", "b.body.omega"}
-    ts = np.concatenate([TS, np.linspace(2.5, 20.0, 36)])
-    solution = simulate(system, 20.0, ts=ts, **TIGHT)
+def compare_double_pendulum(solution):
+    """Angles and speeds at TS with Lagrange's equations, and the energy at all times."""
     p, q, u, v = double_reference(TS, RODS.values())
     for name, true in {"j1.phi": p, "j2.phi": q - p, "j1.omega": u, "j2.omega": v - u}.items():
         found = solution[name][: len(TS)]  # later, the motion is chaotic: neighbours part
@@ -309,62 +270,27 @@ def test_double_pendulum(mode):
     np.testing.assert_allclose(total, total[0], rtol=0, atol=5e-6 * GRAVITY * np.ptp(solution["a.body.y"]))
 
 
-def gradients(system, names, values, output, t1):
-    """The derivatives of an output at t1 with respect to parameters, in reverse and in forward mode."""
-
-    def end(v, adjoint=None):
-        changed = system.with_parameters(dict(zip(names, v, strict=True)))
-        solution = simulate(changed, t1, ts=jnp.array([t1]), rtol=1e-9, atol=1e-11, adjoint=adjoint)
-        return solution[output][0]
-
-    at = jnp.array(values)
-    return jax.jit(jax.grad(end))(at), jax.jit(jax.jacfwd(lambda v: end(v, diffrax.ForwardMode())))(at)
+LONG = np.concatenate([TS, np.linspace(2.5, 20.0, 36)])
 
 
-def difference(function, values, step=1e-3):
-    """Central differences, with one extrapolation: the error is of the order of step⁴."""
-    values, out = np.array(list(values), float), []
-    for k in range(len(values)):
-        slopes = []
-        for h in (step, step / 2):
-            move = np.zeros_like(values)
-            move[k] = h
-            slopes.append((function(values + move) - function(values - move)) / (2 * h))
-        out.append((4 * slopes[1] - slopes[0]) / 3)
-    return np.array(out)
+def test_double_pendulum():
+    system = double_pendulum("dummy_derivatives")
+    assert set(system.states) == {"a.body.phi", "a.body.omega", "b.body.phi", "b.body.omega"}
+    names = [f"j{k}.{v}" for k in (1, 2) for v in ("phi", "omega")]
+    names += [f"{rod}.body.{v}" for rod in "ab" for v in ("vx", "vy", "omega", "y")]
+    compare_double_pendulum(trajectory(system, TS, names))
 
 
 @pytest.mark.slow
-def test_gradients_of_a_double_pendulum():
-    reverse, forward = gradients(double_pendulum("dummy_derivatives"), list(RODS), list(RODS.values()), "j2.phi", 1.0)
-    np.testing.assert_allclose(reverse, forward, rtol=1e-8, atol=1e-8 * np.abs(forward).max())
-
-    def reference(values):
-        p, q, _, _ = double_reference(np.array([0.0, 1.0]), values)
-        return (q - p)[-1]
-
-    # The reference is integrated to 1e-11, which the step of 1e-3 makes 1e-8; the truncation is smaller.
-    np.testing.assert_allclose(reverse, difference(reference, RODS.values()), rtol=0, atol=1e-7 * np.abs(forward).max())
+@pytest.mark.parametrize("mode", ["auto", "dummy_derivatives"])
+def test_runs_of_a_double_pendulum(mode):
+    compare_double_pendulum(simulate(double_pendulum(mode), 20.0, ts=LONG, **TIGHT))
 
 
 # --- four-bar linkage ----------------------------------------------------------------------------------------------
 
 BARS = {"crank.m": 1.0, "crank.rx": 0.8, "coupler.m": 0.6, "coupler.rx": 1.9, "rocker.m": 1.5, "rocker.rx": 1.5,
         "east.x": 2.0, "j1.initial_phi": 1.0, "j1.initial_omega": 5.0}  # fmt: skip
-
-
-@functools.cache
-def four_bar():
-    """A crank that turns fully, its coupler and a rocker, all uniform rods; guesses choose the open position."""
-    b = Bench()
-    west, east = b(pl.World, "west"), b(pl.World, "east", 2.0)
-    crank, coupler = b(pl.MassiveLink, "crank", 0.8), b(pl.MassiveLink, "coupler", 1.9, m=0.6, guess_phi=0.3)
-    rocker = b(pl.MassiveLink, "rocker", 1.5, m=1.5, guess_phi=1.7)
-    pins = [b(pl.Revolute, "j1", initial_phi=1.0, initial_omega=5.0), *(b(pl.Revolute, f"j{k}") for k in (2, 3, 4))]
-    b.chain(west.frame, pins[0].frame_a, pins[0].frame_b, crank.frame_a, crank.frame_b, pins[1].frame_a,
-            pins[1].frame_b, coupler.frame_a, coupler.frame_b, pins[2].frame_a, pins[2].frame_b, rocker.frame_b,
-            east.frame, pins[3].frame_a, pins[3].frame_b, rocker.frame_a)  # fmt: skip
-    return b.compile()
 
 
 def loop(phi, crank, coupler, rocker, ground):
@@ -402,6 +328,7 @@ def four_bar_reference(ts, values):
     return integrated(slopes, [start, speed], ts)
 
 
+@pytest.mark.slow
 def test_four_bar_linkage():
     solution = simulate(four_bar(), 2.0, ts=TS, **TIGHT)
     phi, speed = four_bar_reference(TS, BARS.values())
@@ -418,33 +345,22 @@ def test_four_bar_linkage():
     np.testing.assert_allclose(total, total[0], rtol=MEASURED)
 
 
+@pytest.mark.slow
 def test_guesses_choose_the_position_of_a_loop():
     crossed = four_bar().with_parameters({"coupler.body.initial_phi": -1.2, "rocker.body.initial_phi": -2.3})
     names = ["coupler.body.phi", "rocker.body.phi"]
     # The mirror image of the open position in the line from the crank's end to the rocker's pin.
     at, swing, *_ = loop(1.0, 0.8, 1.9, 1.5, 2.0)
     line_angle = np.arctan2(-0.8 * np.sin(1.0), 2.0 - 0.8 * np.cos(1.0))
+    observe = jax.jit(lambda system, x: system.observe(names, 0.0, x))
     for system, true in ((four_bar(), [at, swing]), (crossed, [2 * line_angle - at, 2 * line_angle - swing])):
-        found = system.observe(names, 0.0, system.initialize())
-        np.testing.assert_allclose(found, true, rtol=0, atol=1e-12)
-
-
-@pytest.mark.slow
-def test_gradients_of_a_four_bar_linkage():
-    reverse, forward = gradients(four_bar(), list(BARS), list(BARS.values()), "j4.phi", 0.5)
-    np.testing.assert_allclose(reverse, forward, rtol=1e-8, atol=1e-8 * np.abs(forward).max())
-
-    def reference(values):
-        phi = four_bar_reference(np.array([0.0, 0.5]), values)[0, -1]
-        return loop(phi, values[1], values[3], values[5], values[6])[1]
-
-    # The reference is integrated to 1e-11, which the step of 1e-3 makes 1e-8; the truncation is smaller.
-    np.testing.assert_allclose(reverse, difference(reference, BARS.values()), rtol=0, atol=1e-7 * np.abs(forward).max())
+        np.testing.assert_allclose(observe(system, system.initialize()), true, rtol=0, atol=1e-12)
 
 
 # --- slider-crank --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_slider_crank():
     """A crank turned at a constant speed, a coupler without mass: x = r·cos φ + √(l² − r²·sin²φ) for the slider, and
     the torque on the crank has the power m·x''·x' of its acceleration."""
@@ -474,43 +390,6 @@ def test_slider_crank():
 # --- Andrews' squeezing mechanism ----------------------------------------------------------------------------------
 
 
-def squeezing_mechanism(facts):
-    """Seven bodies, ten pins, a spring (Schiehlen 1990; Mazzia & Magherini 2008, II-13, figures 1 and 2)."""
-    b, p = Bench(), SimpleNamespace(**facts["parameters"])
-    beta, theta, gamma, phi, delta, omega, epsilon = facts["initial"]["y0"][:7]
-    at_o, at_a, at_b, at_c = (
-        b(pl.World, n, x, y) for n, x, y in (("O", 0.0, 0.0), ("A", p.xa, p.ya), ("B", p.xb, p.yb), ("C", p.xc, p.yc))
-    )
-    k1, k2, k3, k4, k5, k6, k7 = (
-        b(pl.MassiveLink, f"K{k + 1}", *geometry, g_y=0.0, guess_phi=angle)
-        for k, (geometry, angle) in enumerate([
-            ((p.rr, 0.0, p.m1, p.I1, p.ra, 0.0), beta),
-            ((-p.d, 0.0, p.m2, p.I2, -p.da, 0.0), beta + theta),
-            ((0.0, -p.ss, p.m3, p.I3, p.sb, p.sa), gamma),
-            ((0.0, -p.e, p.m4, p.I4, 0.0, p.ea - p.e), phi + delta),
-            ((p.zt, 0.0, p.m5, p.I5, p.tb, p.ta), delta),
-            ((p.zf, 0.0, p.m6, p.I6, p.zf - p.fa, 0.0), omega + epsilon),
-            ((0.0, -p.u, p.m7, p.I7, p.ub, p.ua), epsilon),
-        ])
-    )  # fmt: skip
-    pins = {}
-    for name, one, other in (
-        ("beta", at_o.frame, k1.frame_a), ("Theta", k1.frame_b, k2.frame_a), ("gamma", at_b.frame, k3.frame_a),
-        ("Phi", k5.frame_b, k4.frame_a), ("delta", at_a.frame, k5.frame_a), ("Omega", k7.frame_b, k6.frame_a),
-        ("epsilon", at_a.frame, k7.frame_a), ("P3", k2.frame_b, k3.frame_b), ("P4", k2.frame_b, k4.frame_b),
-        ("P6", k2.frame_b, k6.frame_b),
-    ):  # fmt: skip
-        # One degree of freedom: an angle and its speed are given; the guesses choose among the positions.
-        given = dict(initial_phi=theta, initial_omega=0.0) if name == "Theta" else {}
-        pins[name] = b(pl.Revolute, name, **given)
-        b.chain(one, pins[name].frame_a, pins[name].frame_b, other)
-    hook, spring = b(pl.Link, "D", p.sd, -p.sc), b(pl.SpringDamper, "spring", p.c0, 0.0, p.l0)
-    torque = b(rot.Torque, "torque")
-    b.chain(k3.frame_a, hook.frame_a, hook.frame_b, spring.frame_b, at_c.frame, spring.frame_a)
-    b.join(torque.flange, pins["beta"].flange)
-    return b.compile()
-
-
 ANGLES = ("beta", "Theta", "gamma", "Phi", "delta", "Omega", "epsilon")
 
 
@@ -529,44 +408,7 @@ def test_andrews_mechanism_of_bodies_and_pins():
     np.testing.assert_allclose(found[7:], facts["reference"]["y"][7:14], rtol=0, atol=1e-6)
 
 
-# --- what is refused -----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "make, named",
-    [
-        (lambda ev: pl.Body(ev, "b", m=0.0), r"b\.m"),
-        (lambda ev: pl.Body(ev, "b", I=-1.0), r"b\.I"),
-        (lambda ev: pl.MassiveLink(ev, "k", m=-1.0), r"k\.m"),
-        (lambda ev: pl.SpringDamper(ev, "s", c=-1.0), r"s\.c"),
-    ],
-)
-def test_wrong_values_are_named(make, named):
-    with pytest.raises(ModelError, match=named):
-        make(EqnEnv())
-
-
-def test_what_nothing_holds_is_said_once():
-    """It was said once for x and once for y, in terms of levels."""
-    b = Bench()
-    link, pin = b(pl.Link, "link"), b(pl.Revolute, "pin")
-    b.join(link.frame_b, pin.frame_a)
-    with pytest.raises(
-        StructuralError, match="^nothing holds 'link' and 'pin': no body and no world .*Body or a World"
-    ):
-        b.compile()
-
-
-def test_two_worlds_at_one_link():
-    b = Bench()
-    west, east, link = b(pl.World, "west"), b(pl.World, "east", 1.0), b(pl.Link, "link")
-    b.chain(west.frame, link.frame_a, link.frame_b, east.frame)
-    with pytest.raises(
-        StructuralError, match="'west', 'east' and 'link' form a loop.* difference of 'x', 'y' and 'phi'"
-    ):
-        b.compile()
-
-
+@pytest.mark.slow
 def test_two_pins_between_two_bodies():
     """The force along the line between the pins is not determined."""
     b = Bench()

@@ -12,7 +12,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.linalg import expm
 from scipy.optimize import least_squares, minimize
 
-GALLERY = pathlib.Path(__file__).parents[1] / "examples" / "gallery"
+GALLERY = pathlib.Path(__file__).parents[2] / "examples" / "gallery"
 pytestmark = pytest.mark.slow
 
 

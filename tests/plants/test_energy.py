@@ -7,10 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import test_library_electrical as electrical
-import test_library_mechanical as mechanical
-from problems import compiled, damped_oscillation, oscillator, pendulum
+from problems import compiled, damped_oscillation, oscillator
 from sympy import Eq, Symbol
+from trajectories import balanced, solution_of
 
 import jaxonomy_dae.library.electrical as el
 import jaxonomy_dae.library.friction as fr
@@ -23,6 +22,7 @@ from jaxonomy_dae.testing import assert_energy_balance
 
 TIGHT = {"rtol": 1e-9, "atol": 1e-11}
 BALANCED = 1e-7  # a hundred times the tolerance of these runs
+ROUNDING = 1e-13  # of a few operations
 
 
 @functools.cache
@@ -40,19 +40,19 @@ def rlc():
 
 def test_terms_of_an_oscillator():
     """½·M·v² + ½·K·x², lost at D·v², nothing supplied."""
-    ts = np.linspace(0.0, 3.0, 7)
-    solution = simulate(oscillator(), 3.0, ts=ts, **TIGHT)
+    system, ts = oscillator(), np.linspace(0.0, 3.0, 7)
     x, v = damped_oscillation(ts)
-    np.testing.assert_allclose(solution.energy("mass"), v**2, rtol=0, atol=BALANCED)
-    np.testing.assert_allclose(solution.energy("spring"), 2.5 * x**2, rtol=0, atol=BALANCED)
-    np.testing.assert_allclose(solution.energy(), v**2 + 2.5 * x**2, rtol=0, atol=BALANCED)
-    np.testing.assert_allclose(solution.dissipation(), 0.6 * v**2, rtol=0, atol=BALANCED)
+    assert system.states == ["mass.s", "mass.v"]
+    solution = solution_of(system, ts, np.stack([x, v], axis=1))
+    np.testing.assert_allclose(solution.energy("mass"), v**2, rtol=ROUNDING, atol=ROUNDING)
+    np.testing.assert_allclose(solution.energy("spring"), 2.5 * x**2, rtol=ROUNDING, atol=ROUNDING)
+    np.testing.assert_allclose(solution.energy(), v**2 + 2.5 * x**2, rtol=ROUNDING, atol=ROUNDING)
+    np.testing.assert_allclose(solution.dissipation(), 0.6 * v**2, rtol=ROUNDING, atol=ROUNDING)
     np.testing.assert_array_equal(solution.supply(), 0.0)
     np.testing.assert_array_equal(solution.dissipation("mass"), 0.0)
-    assert np.max(np.abs(solution.energy_balance_error())) < BALANCED
-    assert_energy_balance(solution, rtol=BALANCED)
 
 
+@pytest.mark.slow
 def test_a_loose_run_is_off_by_its_own_error():
     """What the saved states lose of ½·M·v² + ½·K·x² against the closed form is what the balance finds."""
     ts = np.linspace(0.0, 6.0, 7)
@@ -64,12 +64,14 @@ def test_a_loose_run_is_off_by_its_own_error():
     energy = float(solution.energy()[0])
     assert 0.5 * energy < scale < 5 * energy
     np.testing.assert_allclose(error * scale, lost, rtol=0, atol=BALANCED * energy)
+    tight = simulate(oscillator(), 6.0, ts=ts, **TIGHT)
+    assert np.max(np.abs(tight.energy_balance_error())) < BALANCED
+    assert_energy_balance(tight, rtol=BALANCED)
 
 
 def test_rlc():
     """The source gives 5 V·q, the capacitor takes half of it in the end, the resistor the rest."""
-    solution = simulate(rlc(), 4.0, ts=jnp.array([0.0, 0.1, 0.5, 2.0, 4.0]), **TIGHT)
-    assert_energy_balance(solution, rtol=BALANCED)
+    solution = balanced(rlc(), 4.0)
     i, v = np.asarray(solution["l.i"]), np.asarray(solution["c.v"])
     np.testing.assert_allclose(solution.energy(), 0.1 * i**2 + 0.05 * v**2, rtol=1e-12)
     np.testing.assert_allclose(solution.supply("source"), 5.0 * i, rtol=1e-12, atol=1e-15)
@@ -85,11 +87,7 @@ def test_a_dc_motor_in_its_parts():
         machine, source, ground, load,
         connect=[(source.p, machine.p), (source.n, machine.n, ground.p), (machine.flange, load.flange)],
     )  # fmt: skip
-    solution = simulate(
-        system, 1.0, ts=jnp.linspace(0.0, 1.0, 5),
-        inputs={"source.u": lambda t: 12.0 * jnp.sin(20.0 * t), "load.tau": -0.05}, **TIGHT,
-    )  # fmt: skip
-    assert_energy_balance(solution, rtol=BALANCED)
+    solution = balanced(system, 1.0, {"source.u": lambda t: 12.0 * jnp.sin(20.0 * t), "load.tau": -0.05})
     i, w = np.asarray(solution["motor.inductor.i"]), np.asarray(solution["motor.rotor.w"])
     np.testing.assert_allclose(solution.dissipation("motor"), 1.2 * i**2 + 2e-3 * w**2, rtol=1e-12)
     np.testing.assert_allclose(solution.supply("load"), -0.05 * w, rtol=1e-12, atol=1e-15)
@@ -107,8 +105,7 @@ def test_heat_goes_to_the_heat_port():
             (source.p, r.p), (source.n, r.n, ground.p), (r.heat, body.heat, skin.port_a), (skin.port_b, room.heat),
         ],
     )  # fmt: skip
-    solution = simulate(system, 20.0, ts=jnp.linspace(0.0, 20.0, 5), **TIGHT)
-    assert_energy_balance(solution, rtol=BALANCED)
+    solution = balanced(system, 20.0)
     np.testing.assert_array_equal(solution.dissipation(), 0.0)
     np.testing.assert_allclose(solution.supply("source"), 25.0, rtol=1e-12)
     np.testing.assert_allclose(
@@ -132,8 +129,7 @@ def test_mechanics_that_is_not_linear():
         ],
     )  # fmt: skip
     inputs = {"shaker.u": lambda t: 0.03 * jnp.sin(9.0 * t)}
-    solution = simulate(system, 1.0, ts=jnp.linspace(0.0, 1.0, 6), inputs=inputs, **TIGHT)
-    assert_energy_balance(solution, rtol=10 * BALANCED)  # creeping friction: |f'| is 250 times the sliding force
+    solution = balanced(system, 1.0, inputs, panels=100)
     speed = 0.27 * np.cos(9.0 * np.asarray(solution.ts))
     np.testing.assert_allclose(
         solution.supply(), -np.asarray(solution["shaker.flange.f"]) * speed, rtol=1e-9, atol=1e-12
@@ -147,34 +143,14 @@ def test_a_speed_that_the_model_does_not_have():
     mass = tr.Mass(ev, "mass", 2.0, initial_position=0.0, initial_velocity=0.0)
     system = compiled(force, spring, mass, connect=[(force.flange, spring.flange_b), (spring.flange_a, mass.flange)])
     inputs = {"force.f": lambda t: 1.5 * jnp.sin(2.0 * t)}
-    solution = simulate(system, 2.0, ts=jnp.linspace(0.0, 2.0, 5), inputs=inputs, **TIGHT)
+    solution = balanced(system, 2.0, inputs)
     t = np.asarray(solution.ts)
     with pytest.raises(ModelError, match="occurs nowhere"):
         solution["der(force.flange.s)"]
     speed = np.asarray(solution["mass.v"]) + 3.0 * np.cos(2.0 * t) / 3.0
     np.testing.assert_allclose(solution.supply(), 1.5 * np.sin(2.0 * t) * speed, rtol=1e-12, atol=1e-15)
-    assert_energy_balance(solution, rtol=BALANCED)
 
 
-@pytest.mark.slow
-def test_redundant_states_balance():
-    solution = simulate(pendulum(), 2.0, ts=jnp.linspace(0.0, 2.0, 5), **TIGHT)
-    np.testing.assert_allclose(solution.energy(), solution.energy()[0], rtol=BALANCED)
-    assert_energy_balance(solution, rtol=BALANCED)
-
-
-@pytest.mark.slow
-def test_an_implicit_block_balances():
-    """A capacitor is discharged through a diode and a resistor."""
-    ev = EqnEnv()
-    c, d = el.Capacitor(ev, "c", 1e-3, initial_voltage=2.0), el.Diode(ev, "d")
-    r, ground = el.Resistor(ev, "r", 10.0), el.Ground(ev, "ground")
-    system = compiled(c, d, r, ground, connect=[(c.p, d.p), (d.n, r.p), (r.n, c.n, ground.p)])
-    assert system.carried
-    assert_energy_balance(simulate(system, 0.02, ts=jnp.linspace(0.0, 0.02, 4), **TIGHT), rtol=BALANCED)
-
-
-@pytest.mark.slow
 def test_hydraulics():
     """A pump's shaft drives fluid from a tank through an orifice into an accumulator, with inertia and compliance."""
     ev = EqnEnv()
@@ -193,45 +169,25 @@ def test_hydraulics():
             (duct.port_b, orifice.port_a), (orifice.port_b, store.fluid, leak.port_a), (leak.port_b, outside.fluid),
         ],
     )  # fmt: skip
-    solution = simulate(system, 0.5, ts=jnp.linspace(0.0, 0.5, 4), inputs={"speed.u": -20.0}, **TIGHT)
-    assert_energy_balance(solution, rtol=BALANCED)
+    balanced(system, 0.5, {"speed.u": -20.0})
 
 
-@pytest.mark.parametrize("n", [1.0, 1.4])
-def test_the_energy_of_an_accumulator(n):
+def test_the_energy_of_an_accumulator():
     """The work of the fluid against the gas, ∫ p0·(V0/(V0 − V))^n dV, by quadrature."""
-    ev = EqnEnv()
-    store, supply = (
-        hy.Accumulator(ev, "store", V0=2.0, p0=3.0, n=n, initial_volume=0.0),
-        hy.MassFlowSource(ev, "supply"),
-    )
-    system = compiled(store, supply, connect=[(store.fluid, supply.fluid)])
-    solution = simulate(system, 1.0, ts=jnp.array([0.0, 1.0]), inputs={"supply.m_flow": 998.2}, **TIGHT)
+    ev, exponents = EqnEnv(), {"isothermal": 1.0, "adiabatic": 1.4}
+    stores = [hy.Accumulator(ev, k, V0=2.0, p0=3.0, n=n, initial_volume=0.0) for k, n in exponents.items()]
+    supplies = [hy.MassFlowSource(ev, f"supply_{k}") for k in exponents]
+    system = compiled(
+        *stores, *supplies, connect=[(a.fluid, b.fluid) for a, b in zip(stores, supplies, strict=True)]
+    )  # fmt: skip
+    assert system.states == [f"{k}.V_fluid" for k in exponents]
+    inputs = {f"supply_{k}.m_flow": 998.2 for k in exponents}
+    solution = solution_of(system, [0.0, 1.0], [[0.0, 0.0], [1.0, 1.0]], inputs)
     places, weights = np.polynomial.legendre.leggauss(20)
-    work = np.sum(weights / 2 * 3.0 * (2.0 / (2.0 - (1 + places) / 2)) ** n)
-    np.testing.assert_allclose(solution.energy()[1] - solution.energy()[0], work, rtol=BALANCED)
-
-
-def test_every_circuit_without_storage():
-    """What all electrical components without storage bring in is lost at the same instant."""
-    system, inputs, _ = electrical.static()
-    solution = simulate(system, 1.0, ts=jnp.array([1.0]), inputs=inputs)
-    lost = float(solution.dissipation()[0])
-    assert lost > 100.0
-    np.testing.assert_allclose(solution.supply()[0], lost, rtol=electrical.ROUNDING)
-
-
-@pytest.mark.slow
-def test_every_electrical_storage():
-    solution = electrical.run(electrical.dynamic()[0])
-    assert_energy_balance(solution, rtol=1e-6)  # the second run is not told the times at which sources jump
-
-
-@pytest.mark.slow
-def test_every_mechanical_component():
-    system, inputs, _ = mechanical.model()
-    solution = simulate(system, 2.0, ts=jnp.array([0.0, 0.5, 2.0]), inputs=inputs, **TIGHT)
-    assert_energy_balance(solution, rtol=BALANCED)
+    for k, n in exponents.items():
+        work = np.sum(weights / 2 * 3.0 * (2.0 / (2.0 - (1 + places) / 2)) ** n)
+        energy = solution.energy(k)
+        np.testing.assert_allclose(energy[1] - energy[0], work, rtol=1e-12)
 
 
 @pytest.mark.slow
@@ -287,33 +243,48 @@ def right(c, m, k, d, x, v):
     c.declare_dissipation("lost")
 
 
-def half_of_the_spring(c, m, k, d, x, v):
-    c.declare_energy(m * v**2 / 2, k * x**2 / 4)
-    c.declare_dissipation(d * v**2)
-
-
-def no_damper(c, m, k, d, x, v):
-    c.declare_energy(m * v**2 / 2, k * x**2 / 2)
-
-
-def wrong_sign(c, m, k, d, x, v):
-    c.declare_energy(m * v**2 / 2, k * x**2 / 2)
-    c.declare_supply(d * v**2)
+def shares(c, m, k, d, x, v):
+    """Declarations that are right for shares of 1, 1 and 0: one program for several ones that are not."""
+    spring, lost, gained = (c.parameter(n, 1.0) for n in ("spring", "lost_share", "gained"))
+    c.declare_energy(m * v**2 / 2, spring * k * x**2 / 2)
+    c.declare_dissipation(lost * d * v**2)
+    c.declare_supply(gained * d * v**2)
 
 
 def test_a_declaration_by_name():
-    solution = simulate(compiled(Block(EqnEnv(), "b", right)), 2.0, ts=jnp.array([0.0, 1.0, 2.0]), **TIGHT)
-    assert_energy_balance(solution, rtol=BALANCED)
+    v = np.array([0.5, -2.0])
+    found = solution_of(compiled(Block(EqnEnv(), "b", right)), [0.0, 1.0], np.stack([0 * v, v], axis=1))
+    np.testing.assert_allclose(found.dissipation("b"), 0.6 * v**2, rtol=ROUNDING)
+    np.testing.assert_allclose(found.energy("b"), v**2, rtol=ROUNDING)
 
 
-@pytest.mark.parametrize("wrong", [half_of_the_spring, no_damper, wrong_sign])
-def test_a_wrong_declaration_is_detected(wrong):
-    solution = simulate(compiled(Block(EqnEnv(), "b", wrong)), 2.0, ts=jnp.array([0.0, 1.0, 2.0]))
+@pytest.fixture(scope="module")
+def block():
+    return compiled(Block(EqnEnv(), "b", shares))
+
+
+@pytest.mark.long("three programs: a run, and two along which powers are integrated")
+@pytest.mark.parametrize(
+    "spring, lost, gained",
+    [
+        pytest.param(1.0, 1.0, 0.0, id="right"),
+        pytest.param(0.5, 1.0, 0.0, id="half of the spring"),
+        pytest.param(1.0, 0.0, 0.0, id="no damper"),
+        pytest.param(1.0, 0.0, 1.0, id="wrong sign"),
+    ],
+)
+def test_a_wrong_declaration_is_detected(block, spring, lost, gained):
+    system = block.with_parameters({"b.spring": spring, "b.lost_share": lost, "b.gained": gained})
+    solution = simulate(system, 2.0, ts=jnp.array([0.0, 1.0, 2.0]), **TIGHT)
+    if (spring, lost, gained) == (1.0, 1.0, 0.0):
+        assert np.max(np.abs(solution.energy_balance_error())) < BALANCED
+        return assert_energy_balance(solution, rtol=BALANCED)
     message = r"the account of energy is off by .* of .* J at t=.*: stored .* J, supplied .* J, lost .* J since t=0"
     with pytest.raises(AssertionError, match=message):
         assert_energy_balance(solution)
 
 
+@pytest.mark.slow
 def test_a_component_that_declares_nothing_is_named():
     class Brake(Component):
         def __init__(self, ev, name):
@@ -339,11 +310,11 @@ def test_what_cannot_be_declared():
         Block(EqnEnv(), "b").declare_energy(1.0)
     with pytest.raises(ModelError, match="symbol 'q' was declared by no component"):
         compiled(Block(EqnEnv(), "b", lambda c, *_: c.declare_energy(Symbol("q") ** 2)))
-    silent = simulate(compiled(Block(EqnEnv(), "b")), 1.0)
+    silent = compiled(Block(EqnEnv(), "b"))
     with pytest.raises(ModelError, match="no component of this model declares energies"):
-        silent.energy()
+        solution_of(silent, [0.0], [[0.7, -0.4]]).energy()
     with pytest.raises(ModelError, match=r"'bb' is not a component: did you mean 'b'"):
-        simulate(compiled(Block(EqnEnv(), "b", right)), 1.0).energy("bb")
+        solution_of(compiled(Block(EqnEnv(), "b", right)), [0.0], [[0.7, -0.4]]).energy("bb")
 
     def jerk(c, m, k, d, x, v):
         c.declare_energy(m * der(der(der(v))))
@@ -351,7 +322,7 @@ def test_what_cannot_be_declared():
     with pytest.raises(
         ModelError, match=r"'b' declares energy in der\(der\(der\(b\.v\)\)\), but the model has neither"
     ):
-        simulate(compiled(Block(EqnEnv(), "b", jerk)), 1.0).energy()
+        solution_of(compiled(Block(EqnEnv(), "b", jerk)), [0.0], [[0.7, -0.4]]).energy()
 
 
 def test_declarations_cost_a_simulation_nothing():
@@ -363,6 +334,7 @@ def test_declarations_cost_a_simulation_nothing():
     assert texts[0] == texts[1]
 
 
+@pytest.mark.slow
 def test_accounts_inside_jit_and_batches():
     system, ts = compiled(Block(EqnEnv(), "b", right)), jnp.array([0.0, 1.0])
 
@@ -372,7 +344,8 @@ def test_accounts_inside_jit_and_batches():
     step = 1e-4  # central differences: their error is of the order of step², and of the tolerance by step
     slope = (lost(0.6 + step) - lost(0.6 - step)) / (2 * step)
     np.testing.assert_allclose(jax.jit(jax.grad(lost))(0.6), slope, rtol=1e-4)
-    batch = eqx.filter_vmap(lambda d: simulate(system.with_parameters({"b.d": d}), 1.0, ts=ts))(jnp.array([0.0, 0.6]))
+    run = eqx.filter_vmap(lambda d: simulate(system.with_parameters({"b.d": d}), 1.0, ts=ts))
+    batch = eqx.filter_jit(run)(jnp.array([0.0, 0.6]))
     assert batch.energy().shape == (2, 2)
     np.testing.assert_allclose(batch.energy()[0, 1], batch.energy()[0, 0], rtol=1e-4)
     with pytest.raises(ModelError, match="this is a batch"):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from problems import compiled, oscillator, pendulum, rc_circuit
 from sympy import Eq
+from trajectories import solution_of
 
 import jaxonomy_dae.library.electrical as el
 import jaxonomy_dae.library.thermal as th
@@ -54,6 +55,28 @@ def radiator():
     )
 
 
+@functools.cache
+def warm():
+    return steady_state(radiator(), inputs={"heater.Q_flow": 100.0})
+
+
+@functools.cache
+def turning():
+    """The motor at 3 V."""
+    return steady_state(motor(), inputs={"source.u": 3.0}, drifting=["motor.rotor.phi"])
+
+
+@functools.cache
+def spring():
+    return linearize(oscillator(), [], ["mass.s"])
+
+
+@functools.cache
+def run():
+    """A run of the oscillator, as it might be."""
+    return solution_of(oscillator(), [0.0, 0.4, 1.1], [[0.7, -0.4], [0.4, -0.9], [-0.1, 0.2]])
+
+
 def radiating(Q, eps=0.8, A=0.5, T0=250.0):
     return (T0**4 + Q / (eps * th.STEFAN_BOLTZMANN * A)) ** 0.25
 
@@ -73,6 +96,7 @@ def rectifier():
 # --- steady states -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_thermal_chain():
     """Five capacities between two temperatures, one of them heated: the temperatures solve a linear system."""
     ev = EqnEnv()
@@ -94,22 +118,27 @@ def test_a_thermal_chain():
     assert point.residual <= 1 and float(point["time"]) == 0.0
 
 
+def temperature(Q, eps):
+    system = radiator().with_parameters({"skin.eps": eps})
+    return steady_state(system, inputs={"heater.Q_flow": Q}, throw=False)["body.T"]
+
+
 def test_derivatives_of_a_steady_state():
-    """T = (T0⁴ + Q/(eps·sigma·A))^¼: first and second derivatives by parameters and inputs, inside jit and vmap."""
-    system = radiator()
+    """T = (T0⁴ + Q/(eps·sigma·A))^¼: derivatives by parameters and inputs, inside jit and vmap."""
+    at = jnp.array([20.0, 100.0, 500.0]), jnp.array([0.8, 0.8, 0.3])
+    found, known = (
+        jax.jit(jax.vmap(jax.value_and_grad(f, (0, 1))))(*at)
+        for f in (temperature, functools.partial(radiating, A=0.5))
+    )
+    np.testing.assert_allclose(found[0], known[0], rtol=ROUNDING)
+    np.testing.assert_allclose(found[1], known[1], rtol=1e-10)  # a division by the slope more
 
-    def temperature(Q, eps):
-        return steady_state(system.with_parameters({"skin.eps": eps}), inputs={"heater.Q_flow": Q})["body.T"]
 
+@pytest.mark.slow
+def test_second_derivatives_of_a_steady_state():
     at = (jnp.array(100.0), jnp.array(0.8))
-    expected = functools.partial(radiating, A=0.5)
-    np.testing.assert_allclose(temperature(*at), expected(*at), rtol=ROUNDING)
-    found, known = (jax.jit(jax.grad(f, (0, 1)))(*at) for f in (temperature, expected))
-    np.testing.assert_allclose(found, known, rtol=1e-10)  # a division by the slope more
-    found, known = (jax.jit(jax.hessian(f, (0, 1)))(*at) for f in (temperature, expected))
+    found, known = (jax.jit(jax.hessian(f, (0, 1)))(*at) for f in (temperature, functools.partial(radiating, A=0.5)))
     np.testing.assert_allclose(found, known, rtol=1e-9)
-    many = jnp.array([20.0, 100.0, 500.0])
-    np.testing.assert_allclose(jax.vmap(temperature, (0, None))(many, at[1]), expected(many, at[1]), rtol=ROUNDING)
 
 
 @pytest.mark.slow
@@ -126,9 +155,10 @@ def test_redundant_states_of_a_pendulum():
     def multiplier(length):
         return steady_state(system.with_parameters({"pend.L": length}))["pend.lam"]
 
-    np.testing.assert_allclose(jax.grad(multiplier)(1.0), -9.81 / 2, rtol=1e-10)  # lam = m·g/(2·L)
+    np.testing.assert_allclose(jax.jit(jax.grad(multiplier))(1.0), -9.81 / 2, rtol=1e-10)  # lam = m·g/(2·L)
 
 
+@pytest.mark.slow
 def test_an_implicit_block():
     point = steady_state(rectifier(), inputs={"source.u": 3.0})
     assert rectifier().carried
@@ -143,11 +173,14 @@ def test_a_free_integrator_is_named():
     message = r"no equilibrium.*der\(motor\.rotor\.phi\) = .*drifting=\['motor\.rotor\.phi'\]"
     with pytest.raises(SteadyStateError, match=message):
         steady_state(motor(), inputs={"source.u": 3.0})
-    point = steady_state(motor(), inputs={"source.u": 3.0}, drifting=["motor.rotor.phi"])
     speed = 3.0 * K / (R * D + K**2)
-    np.testing.assert_allclose(point[["motor.rotor.w", "der(motor.rotor.phi)"]], [speed, speed], rtol=ROUNDING)
+    np.testing.assert_allclose(turning()[["motor.rotor.w", "der(motor.rotor.phi)"]], [speed, speed], rtol=ROUNDING)
     nothing = steady_state(motor(), inputs={"source.u": 3.0}, throw=False)
     assert np.isnan(nothing["motor.rotor.w"])
+
+
+@pytest.mark.slow
+def test_no_equilibrium_inside_jit():
     with pytest.raises(Exception, match="no equilibrium was found"):
         jax.block_until_ready(eqx.filter_jit(lambda u: steady_state(motor(), inputs={"source.u": u}).x)(3.0))
 
@@ -161,6 +194,7 @@ def test_a_common_change_is_named():
         steady_state(system)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("C1, C2, G", [(1.0, 1.0, 1.0), (1e-9, 1e6, 1e-6), (1e-12, 1e12, 1e5)])
 def test_units_decide_nothing(C1, C2, G):
     """A body that hangs by a thousandth of the conductance between the two is held; without it, neither is."""
@@ -181,6 +215,7 @@ def test_units_decide_nothing(C1, C2, G):
             steady_state(system)
 
 
+@pytest.mark.slow
 def test_no_equilibrium():
     class Fleeing(Component):
         """dx/dt = 1 + x² never vanishes."""
@@ -200,26 +235,34 @@ def test_arguments_of_a_steady_state():
         steady_state(motor(), inputs={"source.u": 0.0}, drifting=["motor.resistor.v"])
     with pytest.raises(ModelError, match=r"write drifting=\['motor\.rotor\.phi'\]"):
         steady_state(motor(), inputs={"source.u": 0.0}, drifting="motor.rotor.phi")
-    point = steady_state(oscillator())
-    with pytest.raises(ModelError, match=r"'mass\.y' is not a variable"):
-        point["mass.y"]
+    point = warm()
+    with pytest.raises(ModelError, match=r"'body\.y' is not a variable"):
+        point["body.y"]
     with pytest.raises(ModelError, match=r"by names, point\['m\.x'\]"):
         point[0]
 
 
-def test_a_run_goes_on_from_a_point():
-    point = steady_state(radiator(), inputs={"heater.Q_flow": 100.0})
-    solution = simulate(
-        radiator(), 100.0, ts=jnp.array([100.0]), inputs={"heater.Q_flow": 100.0}, initial=point.start
-    )  # fmt: skip
-    np.testing.assert_allclose(solution["body.T"][0], radiating(100.0), rtol=1e-9)
+def test_a_point_is_shown():
+    point = warm()
+    np.testing.assert_allclose(point["body.T"], radiating(100.0), rtol=ROUNDING)
+    assert point.residual <= 1 and float(point["time"]) == 0.0
     assert set(point.to_dict()) == set(radiator().variables)
     assert repr(point) == f"OperatingPoint(body.T={radiating(100.0):.6g})"
     assert "body.T" in point._repr_html_()
 
 
+@pytest.mark.slow
+def test_a_run_goes_on_from_a_point():
+    solution = simulate(
+        radiator(), 100.0, ts=jnp.array([100.0]), inputs={"heater.Q_flow": 100.0}, initial=warm().start
+    )  # fmt: skip
+    np.testing.assert_allclose(solution["body.T"][0], radiating(100.0), rtol=1e-9)
+
+
+@pytest.mark.slow
 def test_a_batch_of_points():
-    points = eqx.filter_vmap(lambda q: steady_state(radiator(), inputs={"heater.Q_flow": q}))(jnp.array([10.0, 100.0]))
+    rest = eqx.filter_vmap(lambda q: steady_state(radiator(), inputs={"heater.Q_flow": q}))
+    points = eqx.filter_jit(rest)(jnp.array([10.0, 100.0]))
     np.testing.assert_allclose(points["body.T"], [radiating(10.0), radiating(100.0)], rtol=ROUNDING)
     assert points[["body.T", "skin.Q_flow"]].shape == (2, 2) and "shape (2,)" in repr(points)
 
@@ -239,12 +282,12 @@ def test_transfer_function_of_a_dc_motor():
     np.testing.assert_allclose(space.dx0, 0.0, atol=1e-15)
     poles = np.append(np.roots([L * J, L * D + R * J, R * D + K**2]), 0.0)
     np.testing.assert_allclose(np.sort(space.poles().real), np.sort(poles), rtol=1e-9, atol=1e-9)  # 1e-15·|A|·cond
-    around = steady_state(motor(), inputs={"source.u": 3.0}, drifting=["motor.rotor.phi"])
-    same = linearize(motor(), ["source.u"], ["motor.rotor.w"], at=around)
+    same = linearize(motor(), ["source.u"], ["motor.rotor.w", "motor.inductor.i"], at=turning())
     np.testing.assert_allclose(same.A, space.A, rtol=ROUNDING)
     np.testing.assert_allclose([same.u0[0], same.y0[0]], [3.0, 3.0 * K / (R * D + K**2)], rtol=ROUNDING)
 
 
+@pytest.mark.slow
 def test_a_notch_filter():
     """A series resonance behind a resistor: v/u = (1 + L·C·s²)/(1 + R·C·s + L·C·s²), zero at 1/√(L·C)."""
     r, inductance, capacity = 50.0, 2e-3, 5e-7
@@ -272,12 +315,18 @@ def test_poles_and_their_gradient():
         space = linearize(system.with_parameters({"damper.D": damping}), [], ["mass.s"])
         return space.poles()[1]
 
+    @jax.jit
+    def with_slope(damping):
+        parts = lambda d: jnp.stack([pole(d).real, pole(d).imag])  # noqa: E731
+        return parts(damping), jax.jacrev(parts)(damping)
+
     a, w = 0.6 / 4, np.sqrt(2.5 - 0.15**2)
-    np.testing.assert_allclose(pole(0.6), -a + 1j * w, rtol=ROUNDING)
-    slopes = [jax.jit(jax.grad(lambda d, part=part: getattr(pole(d), part)))(0.6) for part in ("real", "imag")]
+    found, slopes = with_slope(0.6)
+    np.testing.assert_allclose(found, [-a, w], rtol=ROUNDING)
     np.testing.assert_allclose(slopes, [-1 / 4, -a / w / 4], rtol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angle", [-np.pi / 2, -1.2], ids=["hanging", "released from -1.2"])
 def test_poles_of_a_pendulum_with_redundant_states(angle):
     """±j·√(g/L), on the tangent of the constraints."""
@@ -289,6 +338,7 @@ def test_poles_of_a_pendulum_with_redundant_states(angle):
     np.testing.assert_allclose(space.C, [[0.0, 0.0], [0.0, 0.0], [1.0, 0.0]], atol=ROUNDING)
 
 
+@pytest.mark.slow
 def test_coordinates_on_constraints():
     system = pendulum()
 
@@ -309,6 +359,7 @@ def test_coordinates_on_constraints():
         linearize(oscillator(), [], [], states=["mass.s"])
 
 
+@pytest.mark.slow
 def test_an_implicit_block_is_eliminated():
     """C·dv/dt = i − v/R_load, with the slope g/(1 + g·R) of i by u − v, where g is the diode's."""
     point = steady_state(rectifier(), inputs={"source.u": 3.0})
@@ -350,8 +401,8 @@ def test_a_state_space_is_shown():
     assert text.startswith("StateSpace(3 states, 1 input, 1 output)") and "B: motor.inductor.i, " in text
     html = space._repr_html_()
     assert "<th>motor.rotor.w</th>" in html and html.count("<table>") == 4
-    batch = eqx.filter_vmap(lambda r: linearize(motor().with_parameters({"motor.R": r}), {"source.u": 0.0}, []))
-    assert repr(batch(jnp.ones(2))).startswith("StateSpace(3 states")
+    batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), space)
+    assert repr(batch).startswith("StateSpace(3 states")
 
 
 def test_to_control():
@@ -365,7 +416,7 @@ def test_to_control():
         rtol=ROUNDING,
     )
     with pytest.raises(ModelError, match=r"needs inputs and outputs: name inputs in linearize"):
-        linearize(oscillator(), [], ["mass.s"]).to_control()
+        spring().to_control()
 
 
 # --- sweeps ------------------------------------------------------------------------------------------------------
@@ -389,7 +440,7 @@ def test_zipped_steady_states():
     eps, area = jnp.array([0.2, 0.5, 0.9]), jnp.array([1.0, 2.0, 0.5])
 
     def both(system):
-        point = steady_state(system, inputs={"heater.Q_flow": 100.0})
+        point = steady_state(system, inputs={"heater.Q_flow": 100.0}, throw=False)
         return {"T": point["body.T"], "x": point.x}
 
     found = sweep(radiator(), {"skin.eps": eps, "skin.A": area}, both, zipped=True)
@@ -398,7 +449,19 @@ def test_zipped_steady_states():
     data = found.to_xarray()
     assert data["T"].dims == ("case",) and data["x"].dims == ("case", "x_0")
     np.testing.assert_array_equal(data.coords["skin.A"], area)
-    slope = jax.grad(lambda e: jnp.sum(sweep(radiator(), {"skin.eps": e}, lambda s: both(s)["T"]).values))(eps)
+
+
+@pytest.mark.slow
+def test_a_sweep_is_differentiated():
+    eps = jnp.array([0.2, 0.5, 0.9])
+
+    def hot(system):
+        return steady_state(system, inputs={"heater.Q_flow": 100.0}, throw=False)["body.T"]
+
+    def total(eps):
+        return jnp.sum(sweep(radiator(), {"skin.eps": eps}, hot).values)
+
+    slope = jax.jit(jax.grad(total))(eps)
     np.testing.assert_allclose(slope, jax.grad(lambda e: jnp.sum(radiating(100.0, e)))(eps), rtol=1e-10)
 
 
@@ -434,8 +497,8 @@ def test_arguments_of_a_sweep():
 
 
 def test_solutions_as_tables():
-    ts = jnp.array([0.0, 0.4, 1.1])
-    solution = simulate(oscillator(), 1.1, ts=ts)
+    solution = run()
+    ts = solution.ts
     frame = solution.to_pandas("mass.s", "spring.f")
     assert list(frame.columns) == ["mass.s", "spring.f"] and frame.index.name == "time"
     np.testing.assert_array_equal(frame.index, ts)
@@ -444,7 +507,7 @@ def test_solutions_as_tables():
     data = solution.to_xarray()
     assert data["mass.v"].dims == ("time",) and data["mass.v"].attrs == {"units": "m/s"}
     np.testing.assert_array_equal(data["mass.v"], solution["mass.v"])
-    batch = eqx.filter_vmap(lambda x: simulate(oscillator(), 1.1, ts=ts, initial={"mass.s": x}))(jnp.ones(2))
+    batch = eqx.filter_vmap(lambda x: solution_of(oscillator(), ts, x))(jnp.ones((2, 3, 2)))
     assert batch.to_xarray("mass.s")["mass.s"].dims == ("batch_0", "time")
     with pytest.raises(ModelError, match="this is a batch of shape"):
         batch.to_pandas()
@@ -452,8 +515,7 @@ def test_solutions_as_tables():
 
 @pytest.mark.parametrize("name", ["pandas", "xarray", "control"])
 def test_missing_packages_name_the_extra(monkeypatch, name):
-    solution = simulate(oscillator(), 1.1, ts=jnp.array([1.1]))
-    space = linearize(oscillator(), [], [])
+    solution, space = run(), spring()
     monkeypatch.setitem(sys.modules, name, None)  # so that importing it raises
     call = {"pandas": solution.to_pandas, "xarray": solution.to_xarray, "control": space.to_control}[name]
     with pytest.raises(ImportError, match=rf"needs .*: pip install 'jaxonomy_dae\[{name}\]'"):

@@ -61,13 +61,14 @@ def test_inside_a_users_module_gradients_reach_everything(rc):
 
 
 def test_serialised_and_read_back(rc, plain, tmp_path):
+    field = jax.jit(lambda system, x: system.vector_field(0.0, x))
     for system in (rc, plain):
         changed = jax.tree.map(lambda leaf: leaf * 1.25, system)
         eqx.tree_serialise_leaves(tmp_path / "system.eqx", changed)
         back = eqx.tree_deserialise_leaves(tmp_path / "system.eqx", system)
         assert eqx.tree_equal(back, changed)
         x = jnp.linspace(0.2, 0.8, len(system.states))
-        np.testing.assert_array_equal(back.vector_field(0.0, x), changed.vector_field(0.0, x))
+        np.testing.assert_array_equal(field(back, x), field(changed, x))
 
 
 def test_tree_at_replaces_parameters_and_networks():
@@ -75,9 +76,11 @@ def test_tree_at_replaces_parameters_and_networks():
     other = mlp(1, 1, seed=1)
     x = jnp.array([0.7])
     changed = eqx.tree_at(lambda s: s.neural["c.law"], system, other)
-    np.testing.assert_allclose(changed.vector_field(0.0, x), other(x), rtol=1e-12)  # rounding
+    field = eqx.filter_jit(lambda system: (system.vector_field(0.0, x), other(x)))
+    np.testing.assert_allclose(*field(changed), rtol=1e-12)  # rounding
     slower = eqx.tree_at(lambda s: s.parameters.values, changed, changed.parameters.values * 3)
-    np.testing.assert_allclose(slower.vector_field(0.0, x), 3 * other(x), rtol=1e-12)
+    found, law = field(slower)
+    np.testing.assert_allclose(found, 3 * np.asarray(law), rtol=1e-12)
 
 
 def test_systems_are_pytrees_of_arrays(rc):
@@ -105,6 +108,7 @@ def learned_decay(network):
     return compiled(LearnedDecay(EqnEnv(), "c", network))
 
 
+@pytest.mark.slow
 def test_vmap_over_an_ensemble_of_parameters(rc):
     resistances = jnp.array([0.5, 1.0, 4.0])
     ensemble = eqx.filter_vmap(lambda r: rc.with_parameters({"r.R": r}))(resistances)
@@ -126,6 +130,7 @@ class Decay(eqx.Module):
         return -self.k * u
 
 
+@pytest.mark.slow
 def test_vmap_over_an_ensemble_of_networks():
     rates = jnp.array([0.3, 1.0, 2.5])
     system = learned_decay(Decay(jnp.array(1.0)))
@@ -135,6 +140,7 @@ def test_vmap_over_an_ensemble_of_networks():
     np.testing.assert_allclose(found, np.exp(-rates[:, None] * TS), rtol=0, atol=1e-7)  # as above
 
 
+@pytest.mark.slow
 def test_vmap_over_release_angles_at_the_charts_singular_points(plain):
     angles = np.array([0.0, np.pi / 2, np.pi, -np.pi / 2, -1.2, 0.5])
     ts = jnp.array([0.4, 0.8, 1.2])
@@ -171,7 +177,7 @@ def test_inputs_may_close_over_what_is_differentiated(ramp_response):
 
 @pytest.mark.slow
 def test_inputs_may_close_over_what_is_batched(ramp_response):
-    found = jax.vmap(ramp_response)(jnp.array([2.0, 3.0]))
+    found = jax.jit(jax.vmap(ramp_response))(jnp.array([2.0, 3.0]))
     np.testing.assert_allclose(found, np.array([2, 3]) * np.exp(-1), rtol=0, atol=3e-6)  # the default tolerance
 
 
@@ -184,6 +190,7 @@ class Driven(Component):
         self.add_equations(Eq(der(x), self.input("u") - x))
 
 
+@pytest.mark.slow
 def test_jvp(rc):
     def voltage(r):
         system = rc.with_parameters({"r.R": r})
@@ -199,34 +206,33 @@ def test_jvp(rc):
 
 
 def test_raw_diffrax(rc):
-    solved = diffrax.diffeqsolve(
-        diffrax.ODETerm(rc.vector_field),
-        diffrax.Tsit5(),
-        0.0,
-        2.0,
-        0.1,
-        rc.initialize(),
-        saveat=diffrax.SaveAt(ts=TS),
-        stepsize_controller=diffrax.PIDController(rtol=1e-9, atol=1e-11),
-    )
-    names = ["c.v", "r.i", "source.i"]
-    found = jax.vmap(lambda t, x: rc.observe(names, t, x))(solved.ts, solved.ys)
+    @jax.jit
+    def solve():
+        solved = diffrax.diffeqsolve(
+            diffrax.ODETerm(rc.vector_field),
+            diffrax.Tsit5(),
+            0.0,
+            2.0,
+            0.1,
+            rc.initialize(),
+            saveat=diffrax.SaveAt(ts=TS),
+            stepsize_controller=diffrax.PIDController(rtol=1e-9, atol=1e-11),
+        )
+        return jax.vmap(lambda t, x: rc.observe(["c.v", "r.i", "source.i"], t, x))(solved.ts, solved.ys)
+
     current = (3.0 - rc_voltage(TS)) / 2.0
-    np.testing.assert_allclose(found, np.stack([rc_voltage(TS), current, -current], axis=1), rtol=0, atol=1e-7)
+    np.testing.assert_allclose(solve(), np.stack([rc_voltage(TS), current, -current], axis=1), rtol=0, atol=1e-7)
 
 
 @pytest.mark.parametrize(
     "solver, options",
     [
-        pytest.param(diffrax.Dopri5(), {}, id="Dopri5"),
-        pytest.param(kvaerno5(), {}, id="Kvaerno5"),
+        pytest.param(kvaerno5(), {}, id="Kvaerno5", marks=pytest.mark.slow),
         # 400 steps of order 4 and h = 0.005: error below 1e-11.
         pytest.param(
             diffrax.Dopri5(), {"stepsize_controller": diffrax.StepTo(ts=jnp.linspace(0.0, 2.0, 401))}, id="StepTo"
         ),
         pytest.param(diffrax.Dopri8(), {}, id="Dopri8", marks=pytest.mark.slow),
-        pytest.param(diffrax.Bosh3(), {}, id="Bosh3", marks=pytest.mark.slow),
-        pytest.param(diffrax.Kvaerno3(), {}, id="Kvaerno3", marks=pytest.mark.slow),
     ],
 )
 def test_other_solvers(rc, solver, options):
@@ -239,10 +245,9 @@ def test_other_solvers(rc, solver, options):
 @pytest.mark.parametrize(
     "solver",
     [
-        pytest.param(Projected(diffrax.Tsit5()), id="explicit"),
+        pytest.param(Projected(diffrax.Tsit5()), id="explicit", marks=pytest.mark.slow),
         pytest.param(diffrax.Dopri5(), id="Dopri5", marks=pytest.mark.slow),
         pytest.param(kvaerno5(), id="Kvaerno5", marks=pytest.mark.slow),
-        pytest.param(Projected(kvaerno5()), id="Kvaerno5-explicit", marks=pytest.mark.slow),
     ],
 )
 def test_projected_solvers(plain, solver):
@@ -275,7 +280,7 @@ def test_projection_may_be_given_by_hand(plain):
 def test_projected_without_a_projection_says_so(plain):
     with pytest.raises(ValueError, match=r"Projected\(solver, system\.project\)"):
         diffrax.diffeqsolve(
-            diffrax.ODETerm(plain.vector_field), Projected(diffrax.Tsit5()), 0.0, 1.0, 0.1, plain.initialize()
+            diffrax.ODETerm(plain.vector_field), Projected(diffrax.Tsit5()), 0.0, 1.0, 0.1, jnp.zeros(4)
         )
     with pytest.raises(ValueError, match="wrapped in Projected already"):
         Projected(Projected(diffrax.Tsit5()))
@@ -323,6 +328,7 @@ def test_nothing_is_traced_again_for_new_values():
     assert traces.count > before  # a new shape; so the count does count
 
 
+@pytest.mark.slow
 def test_inlines_inside_jit():
     traces = Traces()
     system = learned_decay(Counting(jnp.array(1.0), traces))
@@ -345,10 +351,10 @@ def test_a_system_compiled_inside_a_traced_function():
     kept = []
 
     @jax.jit
-    def end(x0):
+    def slope(x0):
         if not kept:
             kept.append(rc_circuit())
-        return simulate(kept[0], 1.0, ts=jnp.array([1.0]), initial={"c.v": x0})["c.v"][0]
+        return kept[0].vector_field(0.0, kept[0].initialize(initial={"c.v": x0}))
 
-    assert float(end(0.5)) == pytest.approx(float(rc_voltage(1.0, v0=0.5)), abs=1e-6)
+    assert float(slope(0.5)[0]) == pytest.approx((3.0 - 0.5) / (2.0 * 0.5), rel=1e-12)
     assert float(kept[0].parameters["r.R"]) == 2.0

@@ -1,21 +1,20 @@
 """Hydraulic and mechanical systems of library components, with the default solver, against closed forms and SciPy."""
 
 import numpy as np
+import planar_models as planar
 import pytest
 import scipy.optimize
-import test_library_planar as planar
 from multibody_reference import GROUND, Mechanism
-from problems import compiled
-from reference_systems import MEASURED, ReferenceSystem, check_gradient, check_solution, driven, integrated, linear
+from problems import GRAVITY, compiled
+from reference_systems import ReferenceSystem, check_gradient, check_solution, driven, integrated, linear
 from testset.problem import load
 
 import jaxonomy_dae.library.hydraulic as hy
 import jaxonomy_dae.library.planar as pl
 import jaxonomy_dae.library.rotational as rot
 import jaxonomy_dae.library.translational as tr
-from jaxonomy_dae import EqnEnv, simulate
+from jaxonomy_dae import EqnEnv
 from jaxonomy_dae.library.transmissions import Planetary
-from jaxonomy_dae.testing import assert_energy_balance
 
 
 def root(dp, small):
@@ -299,13 +298,13 @@ def test_the_reference_of_the_triple_pendulum():
         q, u = y[:3], y[3:]
         between = q[:, None] - q
         mass = coupling * np.cos(between) + np.diag(m * length**2 / 12)
-        force = -(coupling * np.sin(between)) @ u**2 - planar.GRAVITY * m @ arm * np.cos(q)
+        force = -(coupling * np.sin(between)) @ u**2 - GRAVITY * m @ arm * np.cos(q)
         return np.concatenate([u, np.linalg.solve(mass, force)])
 
     true = integrated(slopes, [*start, 0.0, 0.0, 0.0], TS_PENDULUM)
     p = {"world.x": 0.0, "world.y": 0.0, "world.phi": 0.0}
     for k in range(3):
-        p |= {f"r{k}.rx": length[k], f"r{k}.ry": 0.0, f"r{k}.m": m[k], f"r{k}.g_x": 0.0, f"r{k}.g_y": -planar.GRAVITY}
+        p |= {f"r{k}.rx": length[k], f"r{k}.ry": 0.0, f"r{k}.m": m[k], f"r{k}.g_x": 0.0, f"r{k}.g_y": -GRAVITY}
         p |= {f"j{k}.initial_phi": [0.3, 0.5, -0.4][k], f"j{k}.initial_omega": 0.0}
     found = chain(p, ["r0", "r1", "r2"], ["j0", "j1", "j2"])
     # Both are integrated to 1e-12, for each of fewer than 1,000 steps.
@@ -434,25 +433,16 @@ TS_ANDREWS = np.linspace(0.0, 0.01, 3)
 SYSTEMS = [
     tanks, lift, quarter_car, planetary, double_pendulum, triple_pendulum, four_bar, slider_crank, andrews,
 ]  # fmt: skip
-LONG = (tanks, double_pendulum, triple_pendulum, four_bar, slider_crank, andrews)
 
 
-def with_slow(*slow):
-    return [pytest.param(s, marks=pytest.mark.slow) if s in slow else s for s in SYSTEMS]
-
-
-@pytest.mark.parametrize("reference", with_slow(*LONG))
+@pytest.mark.parametrize(
+    "reference", [s if s is planetary else pytest.param(s, marks=pytest.mark.slow) for s in SYSTEMS]
+)
 def test_solution(reference):
-    check_solution(reference)
-
-
-@pytest.mark.parametrize("reference", with_slow(*LONG, lift, quarter_car))
-def test_gradient(reference):
-    check_gradient(reference)
+    check_solution(reference, energy=reference is four_bar)
 
 
 @pytest.mark.slow
-def test_energy_of_planar_components():
-    system, inputs, _ = planar.components()
-    solution = simulate(system, 1.0, ts=TS_PENDULUM, inputs=inputs, **planar.TIGHT)
-    assert_energy_balance(solution, rtol=MEASURED)
+@pytest.mark.parametrize("reference", [lift, quarter_car, planetary, double_pendulum, four_bar])
+def test_gradient(reference):
+    check_gradient(reference, modes=reference is double_pendulum)
