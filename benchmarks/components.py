@@ -30,11 +30,11 @@ which runs the tests named in the last column. A component without a reference f
 
 def main() -> None:
     jax.config.update("jax_enable_x64", True)
-    sys.path[:0] = [str(ROOT / folder) for folder in ("tests", "benchmarks", "docs")]
+    sys.path[:0] = [str(ROOT / folder) for folder in ("tests", "tests/kernels", "tests/plants", "benchmarks", "docs")]
     from component_references import CHECKS, Measurement
     from library_pages import classes_of, domains
 
-    for path in sorted((ROOT / "tests").glob("test_library_*.py")):
+    for path in sorted((ROOT / "tests").rglob("test_library_*.py")):
         importlib.import_module(path.stem)
     for name in ("test_events", "test_modelica_examples", "test_pendulum", "test_rotational"):
         importlib.import_module(name)
