@@ -68,6 +68,7 @@ def mapped():
     return numbers, points, jax.tree.map(np.asarray, jax.jit(jax.vmap(both))(points, numbers))
 
 
+@pytest.mark.long("the map is written out twice in its Jacobian")
 def test_the_derivative_is_the_saltation_matrix():
     """S = R + (f⁺ − R·f⁻)·∇gᵀ/(∇g·f⁻), and the time moves by −∇gᵀ/(∇g·f⁻): Aizerman & Gantmacher (1958)."""
     numbers, points, (values, jacobians) = mapped()

@@ -1,7 +1,7 @@
 """Runs of problems with events written by hand: times, states and gradients against closed forms.
 
-All problems are members of one batch, so that each also shows that it ends as it does alone. What is integrated is
-polynomial or smooth, at rtol = atol = 1e-10: values are right to a few tolerances.
+One compiled gradient runs them all, and one batch. What is integrated is polynomial or smooth, at
+rtol = atol = 1e-10: values are right to a few tolerances.
 """
 
 import functools
@@ -10,6 +10,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from affine_events import CLOCKS, MAX_EVENTS, STATES, Event, affine, run
 from hybrid_references import (
     BOUNCES,
@@ -163,24 +164,27 @@ def stacked():
     return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf, float) for leaf in leaves]), *rows)
 
 
+def value_and_gradient(numbers, t1, ts, weights, weight):
+    def f(numbers, ts):
+        return aim(numbers, t1, ts, weights, weight, diffrax.Tsit5(), StoredAdjoint())
+
+    return jax.value_and_grad(f, argnums=(0, 1), has_aux=True)(numbers, ts)
+
+
 @functools.cache
-def reverse():
-    """All runs and their gradients by all numbers and saved times, in one program."""
-
-    def one(numbers, t1, ts, weights, weight):
-        def f(numbers, ts):
-            return aim(numbers, t1, ts, weights, weight, diffrax.Tsit5(), StoredAdjoint())
-
-        return jax.value_and_grad(f, argnums=(0, 1), has_aux=True)(numbers, ts)
-
-    return jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(*stacked()))
+def compiled_gradient():
+    return jax.jit(value_and_gradient)
 
 
+@functools.cache
 def found(name):
     """(run, gradient by the numbers, gradient by saved times) of a problem."""
-    k = list(PROBLEMS).index(name)
-    (_, ran), (by_numbers, by_ts) = jax.tree.map(lambda leaf: leaf[k], reverse())
-    return ran, by_numbers, by_ts
+    (_, ran), by = compiled_gradient()(*member(stacked(), list(PROBLEMS).index(name)))
+    return jax.tree.map(np.asarray, (ran, *by))
+
+
+def member(tree, k):
+    return jax.tree.map(lambda leaf: leaf[k], tree)
 
 
 def slope(name, event, target, factor):
@@ -189,6 +193,7 @@ def slope(name, event, target, factor):
     return found(name)[1].writes[numbers.place(names, event, target, factor)]
 
 
+@pytest.mark.long("the gradient that all problems share is compiled")
 def test_a_ball():
     ran, by, _ = found("ball")
     assert ran.result == OKAY and ran.count == 6
@@ -208,7 +213,7 @@ def test_saved_at_an_event_is_what_comes_after():
 
 
 def test_more_events_than_there_is_room_for():
-    """The bounces accumulate at 4.06 s: the run ends there with a code of its own, in a batch of others that go on."""
+    """The bounces accumulate at 4.06 s: the run ends there with a code of its own."""
     ran, _, _ = found("too many")
     assert ran.result == TOO_MANY._value and ran.count == MAX_EVENTS + 1
     intervals = np.diff(ran.times)
@@ -299,27 +304,57 @@ def test_what_an_event_writes_is_finite():
     assert np.isfinite(ran.x[stacked()[2][list(PROBLEMS).index("not finite")] < 1, 0]).all()
 
 
-def test_forward_is_reverse_and_alone_is_as_in_a_batch():
-    """Along one direction of all numbers and times, by Diffrax' forward mode, one problem at a time."""
+def assert_as_alone(name, together):
+    ran, *_ = found(name)
+    assert (together.result, together.count) == (ran.result, ran.count)
+    n = min(int(ran.count), 40)  # of what accumulates
+    np.testing.assert_allclose(together.times[:n], ran.times[:n], rtol=1e-11)
+    if ran.result == OKAY:
+        np.testing.assert_allclose(together.x, ran.x, rtol=1e-9, atol=1e-12)
 
-    def f(numbers, ts, t1, weights, weight):
-        return aim(numbers, t1, ts, weights, weight, diffrax.Tsit5(), diffrax.ForwardMode())
 
-    @jax.jit
-    def along(given, direction, rest):
-        return jax.jvp(lambda numbers, ts: f(numbers, ts, *rest), given, direction, has_aux=True)
+@pytest.mark.long("a batch in which every member has other events")
+def test_members_of_a_batch_are_as_alone():
+    def forward(*given):
+        return aim(*given, diffrax.Tsit5(), diffrax.ForwardMode())[1]
 
-    for name in ("ball", "balls on balls", "its period", "thermostat", "growing rate"):
-        k = list(PROBLEMS).index(name)
-        numbers, t1, ts, weights, weight = jax.tree.map(lambda leaf, k=k: leaf[k], stacked())
-        ran, by, by_ts = found(name)
-        rng = np.random.default_rng(k)
-        # Zeros stay: what a problem does not use must not begin to move.
-        direction = jax.tree.map(lambda leaf, rng=rng: rng.normal(size=leaf.shape) * leaf, (numbers, ts))
-        _, moved, alone = along((numbers, ts), direction, (t1, weights, weight))
-        expected = sum(
-            np.sum(a * b) for a, b in zip(jax.tree.leaves((by, by_ts)), jax.tree.leaves(direction), strict=True)
-        )
-        np.testing.assert_allclose(moved, expected, rtol=1e-8)
-        np.testing.assert_allclose(alone.x, ran.x, rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(alone.times[: int(ran.count)], ran.times[: int(ran.count)], rtol=1e-12)
+    batch = jax.tree.map(np.asarray, jax.jit(jax.vmap(forward))(*stacked()))
+    for k, name in enumerate(PROBLEMS):
+        assert_as_alone(name, member(batch, k))
+
+
+@pytest.mark.slow
+def test_forward_is_reverse():
+    """Along one direction of all numbers and times, by Diffrax' forward mode, all problems at once."""
+
+    def along(given, direction):
+        def f(numbers, ts):
+            _, t1, _, weights, weight = given
+            return aim(numbers, t1, ts, weights, weight, diffrax.Tsit5(), diffrax.ForwardMode())
+
+        return jax.jvp(f, (given[0], given[2]), direction, has_aux=True)
+
+    rng, given = np.random.default_rng(0), stacked()
+    # Zeros stay: what a problem does not use must not begin to move.
+    direction = jax.tree.map(lambda leaf: rng.normal(size=leaf.shape) * leaf, (given[0], given[2]))
+    _, moved, batch = jax.tree.map(np.asarray, jax.jit(jax.vmap(along))(given, direction))
+    for k, name in enumerate(PROBLEMS):
+        ran, *by = found(name)
+        assert_as_alone(name, member(batch, k))
+        if ran.result == OKAY:
+            pairs = zip(jax.tree.leaves(tuple(by)), jax.tree.leaves(member(direction, k)), strict=True)
+            expected = sum(np.sum(a * b) for a, b in pairs)
+            np.testing.assert_allclose(moved[k], expected, rtol=1e-8, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_gradients_of_a_batch_are_those_of_its_members():
+    (_, ran), by = jax.tree.map(np.asarray, jax.jit(jax.vmap(value_and_gradient))(*stacked()))
+    for k, name in enumerate(PROBLEMS):
+        alone, *alone_by = found(name)
+        assert ran.result[k] == alone.result
+        if alone.result == OKAY:
+            jax.tree.map(
+                lambda together, one, k=k: np.testing.assert_allclose(together[k], one, rtol=1e-8, atol=1e-9),
+                by, tuple(alone_by),
+            )  # fmt: skip
