@@ -7,6 +7,7 @@ components become such problems.
 """
 
 import functools
+from typing import NamedTuple
 
 import diffrax
 import jax
@@ -18,7 +19,7 @@ from hybrid_models import Ball, Commensurate, Doubling, Gear, SampledPI, Stick, 
 from hybrid_references import BOUNCES, HEIGHT, SIXTH_BY_E, SLOPES, commensurate_counts
 from problems import compiled as joined
 
-from jaxonomy_dae import EqnEnv, ModelError, SimulationError, simulate
+from jaxonomy_dae import AcausalSystem, EqnEnv, ModelError, SimulationError, simulate
 from jaxonomy_dae.library import signal
 from jaxonomy_dae.solvers import BDF, Rodas5P
 
@@ -177,15 +178,15 @@ def test_second_derivatives_are_refused():
 
 # --- many parts, one run ---------------------------------------------------------------------------------------------
 
-VALUES = {
-    "room.P": 10.0, "loop.Kp": 2.0, "loop.Ki": 3.0, "loop.T": 0.1, "block.mu": 3.0, "step.start_time": 0.5,
-    "pulse.period": 0.3, "pulse.width": 0.4, "pulse.start_time": 0.1, "double.a": 1.5,
-}  # fmt: skip
-NAMES = [
-    "room.T", "room.q", "room.on", "loop.x", "loop.u", "block.x", "block.v", "block.mode", "lag.y", "total.y",
-    "clocks.a", "clocks.b", "clocks.slow", "gear.child.n", "gear.other.n", "twice.k", "twice.x", "double.d", "double.y",
-    "h2.y",
-]  # fmt: skip
+
+class Plant(NamedTuple):
+    """Models with events that know nothing of each other, in one system: it, what is changed, and what is looked at."""
+
+    system: AcausalSystem
+    values: dict[str, float]
+    names: list[str]
+
+
 MIDDLES = (np.arange(25) + 0.5) * 0.1
 TIMES = np.unique([
     *MIDDLES, *np.linspace(0.0, 20.0, 41), 0.4, 0.75, 1.0, 1.2, 1.3, 1.5, 1.95, 2.0, 2.2, 2.5, 2.55, 3.0,
@@ -194,51 +195,71 @@ RELAY, LEVEL = 0.5, 0.25  # s of the lag, half the width of the relay
 
 
 @functools.cache
-def parts():
-    """Models with events that know nothing of each other, in one system."""
+def few() -> Plant:
     ev = EqnEnv()
     step, lag = signal.Step(ev, "step", start_time=0.5), signal.FirstOrder(ev, "lag")
+    system = joined(
+        Thermostat(ev, "room"), SampledPI(ev, "loop"), Commensurate(ev, "clocks"), step, lag, connect=[(step.y, lag.u)]
+    )
+    values = {"room.P": 10.0, "loop.Kp": 2.0, "loop.Ki": 3.0, "loop.T": 0.1, "step.start_time": 0.5}
+    names = ["room.T", "room.q", "room.on", "loop.x", "loop.u", "lag.y", "clocks.a", "clocks.b", "clocks.slow"]
+    return Plant(system, values, names)
+
+
+@functools.cache
+def many() -> Plant:
+    ev = EqnEnv()
     pulse = signal.Pulse(ev, "pulse", height=2.0, period=0.3, width=0.4, start_time=0.1)
     total, ramp = signal.Integrator(ev, "total"), signal.Ramp(ev, "ramp", 100.0, 100.0)
     # The second one of two holds in a row is added first.
     second, first = signal.SampleHold(ev, "h2", 0.1), signal.SampleHold(ev, "h1", 0.1)
     rings, back = signal.FirstOrder(ev, "rings", 1.0, RELAY), signal.Gain(ev, "back", -1.0)
     relay = signal.Hysteresis(ev, "relay", -LEVEL, LEVEL, -1.0, 1.0, initially_on=True)
-    return joined(
-        Thermostat(ev, "room"), SampledPI(ev, "loop"), Stick(ev, "block"), Commensurate(ev, "clocks"), Gear(ev, "gear"),
-        Twice(ev, "twice"), Doubling(ev, "double"), step, lag, pulse, total, ramp, second, first, rings, back, relay,
+    system = joined(
+        Stick(ev, "block"), Gear(ev, "gear"), Twice(ev, "twice"), Doubling(ev, "double"), pulse, total, ramp, second,
+        first, rings, back, relay,
         connect=[
-            (step.y, lag.u), (pulse.y, total.u), (ramp.y, first.u), (first.y, second.u), (rings.y, back.u),
-            (back.y, relay.u), (relay.y, rings.u),
+            (pulse.y, total.u), (ramp.y, first.u), (first.y, second.u), (rings.y, back.u), (back.y, relay.u),
+            (relay.y, rings.u),
         ],
     )  # fmt: skip
+    values = {
+        "block.mu": 3.0, "pulse.period": 0.3, "pulse.width": 0.4, "pulse.start_time": 0.1, "double.a": 1.5
+    }  # fmt: skip
+    names = [
+        "block.x", "block.v", "block.mode", "total.y", "gear.child.n", "gear.other.n", "twice.k", "twice.x", "double.d",
+        "double.y", "h2.y",
+    ]  # fmt: skip
+    return Plant(system, values, names)
 
 
 @functools.cache
-def compiled_run():
+def compiled_run(plant):
+    system, values, names = plant()
+
     def run(p):
-        changed = parts().with_parameters(dict(zip(VALUES, p, strict=True)))
+        changed = system.with_parameters(dict(zip(values, p, strict=True)))
         solution = simulate(
-            changed, 20.0, ts=TIMES, adjoint=diffrax.ForwardMode(), throw=False, max_events=500, max_steps=20_000,
-            **TIGHT,
+            changed, 20.0, ts=TIMES, solver=diffrax.Tsit5(), adjoint=diffrax.ForwardMode(), throw=False,
+            max_events=500, max_steps=20_000, **TIGHT,
         )  # fmt: skip
-        values = jnp.stack([solution[name] for name in NAMES])
-        return values, (values, solution.events.ts, solution.events.which)
+        found = jnp.stack([solution[name] for name in names])
+        return found, (found, solution.events.ts, solution.events.which)
 
     return jax.jit(jax.jacfwd(run, has_aux=True))
 
 
 @functools.cache
-def ran(**changed):
+def ran(plant, **changed):
     """(values at TIMES by name, their derivatives by parameters by name, (time, name) of events)."""
-    slopes, (values, ts, which) = jax.tree.map(
-        np.asarray,
-        compiled_run()(jnp.array([*(VALUES | {k.replace("__", "."): v for k, v in changed.items()}).values()])),
-    )
-    all_names = parts().plan.events.names
-    events = [(t, all_names[int(k)]) for t, k in zip(ts, which, strict=True) if k >= 0]
-    by = {name: dict(zip(VALUES, row.T, strict=True)) for name, row in zip(NAMES, slopes, strict=True)}
-    return dict(zip(NAMES, values, strict=True)), by, events
+    system, values, names = plant()
+    given = values | {name.replace("__", "."): value for name, value in changed.items()}
+    result = compiled_run(plant)(jnp.array([*given.values()]))
+    slopes, (rows, ts, which) = jax.tree.map(np.asarray, result)
+    all_names = system.plan.events.names
+    happened = [(t, all_names[int(k)]) for t, k in zip(ts, which, strict=True) if k >= 0]
+    by = {name: dict(zip(values, row.T, strict=True)) for name, row in zip(names, slopes, strict=True)}
+    return dict(zip(names, rows, strict=True)), by, happened
 
 
 def at(*times):
@@ -246,25 +267,25 @@ def at(*times):
     return [int(np.argmin(np.abs(TIMES - t))) for t in times]
 
 
-def events_of(part, **changed):
-    return np.array([t for t, name in ran(**changed)[2] if name.startswith(f"{part}")])
+def events_of(plant, part):
+    return np.array([t for t, name in ran(plant)[2] if name.startswith(part)])
 
 
-@pytest.mark.long("fifteen models in one program")
+@pytest.mark.long("four models in one program")
 def test_a_thermostat():
-    values, by, _ = ran()
+    values, by, _ = ran(few)
     (end,) = at(20.0)
-    assert len(events_of("room: ")) == 35
+    assert len(events_of(few, "room: ")) == 35
     assert values["room.T"][end] == pytest.approx(50.7088714113363, abs=1e-8)
     # Thirty-five switches add their errors up.
     assert by["room.T"]["room.P"][end] == pytest.approx(-3.51092853184108, rel=1e-8)
     np.testing.assert_array_equal(values["room.q"], 10.0 * values["room.on"])
-    reached = TIMES > events_of("room: ")[0]
+    reached = TIMES > events_of(few, "room: ")[0]
     assert (values["room.T"][reached] > 48.9).all() and (values["room.T"] < 51.1).all()
 
 
 def test_a_sampled_controller():
-    values, by, _ = ran()
+    values, by, _ = ran(few)
     k, m = at(3.0, 2.55)
     assert values["loop.x"][k] == pytest.approx(1.01155947251977, abs=1e-9)
     found = [by["loop.x"][name][k] for name in ("loop.Kp", "loop.Ki")]
@@ -272,15 +293,16 @@ def test_a_sampled_controller():
     assert by["loop.x"]["loop.T"][m] == pytest.approx(0.0155033203623, rel=1e-6)
     first, middle, later = values["loop.u"][at(0.0, 0.05, 0.15)]
     assert first == middle == 2.0 != later  # it samples at the start
-    assert len(events_of("loop: ")) == 0
+    assert len(events_of(few, "loop: ")) == 0
 
 
+@pytest.mark.slow
 def test_it_sticks_and_slides():
     """m v' = push − μ from where 4(1 − s²) = 3, s = t − 1, on: s₀ = −1/2, and 2v = s − 4s³/3 + 1/3 is zero again where
     4s³ − 3s − 1 = (s − 1)(2s + 1)² vanishes: at s = 1."""
-    values, by, _ = ran()
+    values, by, _ = ran(many)
     k = at(0.4, 1.0, 2.2)
-    np.testing.assert_allclose(events_of("block: ")[:2], [0.5, 2.0], atol=1e-9)
+    np.testing.assert_allclose(events_of(many, "block: ")[:2], [0.5, 2.0], atol=1e-9)
     np.testing.assert_allclose(values["block.v"][k], [0.0, (1 / 3) / 2, 0.0], atol=1e-9)
     np.testing.assert_array_equal(values["block.mode"][k], [0.0, 1.0, 0.0])
     # x = ∫v over [s₀, s₁]; dx/dμ = ∫ dv/dμ with 2 dv/dμ = −(s − s₀): −(3/2)²/4.
@@ -289,20 +311,20 @@ def test_it_sticks_and_slides():
 
 def test_a_step_by_its_time():
     """x' = u − x with a step of u at t₀: x(2) = 1 − e^{t₀ − 2}. The derivative by t₀ was zero."""
-    values, by, _ = ran()
+    values, by, _ = ran(few)
     (k,) = at(2.0)
     assert values["lag.y"][k] == pytest.approx(1 - np.exp(-1.5), rel=1e-9)
     assert by["lag.y"]["step.start_time"][k] == pytest.approx(-np.exp(-1.5), rel=1e-8)
-    over = ran(step__start_time=-1.0)[0]  # it is over when the run begins
+    over = ran(few, step__start_time=-1.0)[0]  # it is over when the run begins
     assert over["lag.y"][k] == pytest.approx(1 - np.exp(-2.0), rel=1e-9)
     # Outside of a run, the relation is as its sides say.
-    rest = jnp.zeros(len(parts().states))
-    assert float(parts().observe("step.y", 0.4, rest)) == 0.0
-    assert float(parts().observe("step.y", 0.6, rest)) == 1.0
-    own = [name for name in parts().parameters.names if name.startswith(("step.", "lag."))]
+    observed = jax.jit(lambda t: few().system.observe("step.y", t, jnp.zeros(len(few().system.states))))
+    assert (observed(0.4), observed(0.6)) == (0.0, 1.0)
+    own = [name for name in few().system.parameters.names if name.startswith(("step.", "lag."))]
     assert own == ["step.height", "step.offset", "step.start_time", "lag.k", "lag.initial_y", "lag.T"]
 
 
+@pytest.mark.slow
 @checks(
     {signal.Pulse: ("integral of the pulses, and its derivatives by their times", "value", "slopes")},
     origin="rounding of a sum over edges",
@@ -310,60 +332,65 @@ def test_a_step_by_its_time():
 def test_a_pulse_by_its_times():
     """The integral of pulses of width w·T from t₀ on, two of them whole at t = 0.75 and the third up to there:
     2·(2·w·T + t − t₀ − 2T)."""
-    values, by, _ = ran()
+    values, by, _ = ran(many)
     (k,) = at(0.75)
     slopes = [by["total.y"][f"pulse.{name}"][k] for name in ("period", "width", "start_time")]
     measured("value", values["total.y"][k], 2 * (0.24 + 0.05), 1e-12 * 0.58)
     measured("slopes", slopes, [2 * (2 * 0.4 - 2), 2 * 2 * 0.3, -2.0], 1e-12 * 1.2)
-    assert not [name for name in parts().discretes if "pulse" in name] and len(events_of("pulse")) == 0
+    assert not [name for name in many().system.discretes if "pulse" in name] and len(events_of(many, "pulse")) == 0
 
 
 def test_clocks_of_commensurate_periods():
     """What ticks at one instant reads new values, or with pre the ones before the instant, in whatever order it was
     declared."""
-    values, _, _ = ran()
+    values, _, _ = ran(few)
     found = np.stack([values[f"clocks.{name}"][at(*MIDDLES)] for name in ("a", "b", "slow")], axis=1)
     np.testing.assert_array_equal(found, commensurate_counts(len(MIDDLES)))
 
 
+@pytest.mark.slow
 def test_a_discrete_variable_as_the_parameter_of_a_child():
     """The child counts at the rate 2, from 1.25 on at 6; a second instance at its own."""
-    values, _, _ = ran()
+    values, _, _ = ran(many)
     sixth = 1.25 + 0.5 / 6 + np.arange(4) / 6
-    found = events_of("gear")
+    found = events_of(many, "gear")
     np.testing.assert_allclose(found[found < 1.95], np.sort([0.5, 1.0, 1.0, 1.25, *sixth]), atol=1e-12)
     k = at(1.2, 1.3, 1.95)
     np.testing.assert_array_equal(values["gear.child.n"][k], [4, 4, 28])
     np.testing.assert_array_equal(values["gear.other.n"][k], [1, 1, 1])
 
 
+@pytest.mark.slow
 def test_two_events_with_one_condition_both_happen():
     """The reset of the first one kept the second one from happening."""
-    values, _, _ = ran()
+    values, _, _ = ran(many)
     k = at(0.5, 1.5, 2.5)
     np.testing.assert_array_equal(values["twice.k"][k], [0, 1, 2])
     np.testing.assert_allclose(values["twice.x"][k], 0.5, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_discrete_variable_whose_start_is_an_expression():
     """It begins at 2·a, is doubled at t = 1 and t = 2, and y is its integral: 2·a·(1 + 2 + 4/2) at t = 2.5. The start
     must not be computed again after events."""
-    values, by, _ = ran()
+    values, by, _ = ran(many)
     np.testing.assert_allclose(values["double.d"][at(0.5, 1.5, 2.5)], [3, 6, 12])
     (k,) = at(2.5)
     np.testing.assert_allclose([values["double.y"][k], by["double.y"]["double.a"][k]], [15, 10], rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_sampled_blocks_do_not_depend_on_the_order_of_adding():
     """Two holds in a row are transparent to each other at an instant: the second one saw the first one's value of the
     sample before, if it had been added first."""
-    values, _, _ = ran()
+    values, _, _ = ran(many)
     np.testing.assert_allclose(values["h2.y"][at(0.05, 0.15, 0.25, 0.35)], [0.0, 0.1, 0.2, 0.3], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_relay_and_a_lag():
     """τ·y' = u − y with u = ±1 from a relay of −y at ±b: it rings with a period of 2·τ·ln((1 + b)/(1 − b))."""
-    found = events_of("relay")
+    found = events_of(many, "relay")
     first, half = RELAY * np.log(1 / (1 - LEVEL)), RELAY * np.log((1 + LEVEL) / (1 - LEVEL))
     found = found[found < 3.0]
     np.testing.assert_allclose(found, first + half * np.arange(len(found)), atol=1e-8)

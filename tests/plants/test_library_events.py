@@ -65,8 +65,8 @@ def ran(system, t1, ts, names, parameters, inputs=None) -> Run:
     def run(p):
         changed = system.with_parameters(dict(zip(parameters, p, strict=True)))
         solution = simulate(
-            changed, t1, ts=jnp.asarray(ts), inputs=inputs, adjoint=diffrax.ForwardMode(), throw=False, max_events=200,
-            **TIGHT,
+            changed, t1, ts=jnp.asarray(ts), inputs=inputs, solver=diffrax.Tsit5(), adjoint=diffrax.ForwardMode(),
+            throw=False, max_events=200, **TIGHT,
         )  # fmt: skip
         values = jnp.stack([solution[name] for name in names])
         return values, (values, solution.events.ts, solution.events.which)
