@@ -143,6 +143,7 @@ PROBLEMS = {
     **{f"guard {w:g}": (fast_guard(w), 5.0, EVENLY * 5 / 3, [1.0, 0.0], 0.0) for w in RATES},
     "one condition": (two_of_one_condition(), 2.5, EVENLY * 2.5 / 3, [1.0, 0.0], 0.0),
     "growing rate": (growing_rate(), 2.0, EVENLY * 2 / 3, [1.0, 0.0], 0.0),
+    "between ticks": (growing_rate(), 1.75, EVENLY * 1.75 / 3, [1.0, 0.0], 0.0),
     "ending clock": (ending_clock(), 2.0, EVENLY * 2 / 3, [1.0, 0.0], 0.0),
     "not finite": (not_finite(), 2.0, EVENLY * 2 / 3, [1.0, 0.0], 0.0),
 }
@@ -296,6 +297,7 @@ def test_derivatives_by_saved_times():
     ran, _, by_ts = found("growing rate")
     assert ran.q[-1, 0] == 4 and by_ts[-1] == 4.0  # it ends with a tick
     assert not by_ts[:-1].any()
+    np.testing.assert_allclose(found("between ticks")[2][-1], 3.0, rtol=1e-9)
 
 
 def test_what_an_event_writes_is_finite():

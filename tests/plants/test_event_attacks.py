@@ -6,7 +6,6 @@ right to rounding and to the search for events, a few 1e-12.
 
 import functools
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -90,45 +89,6 @@ def test_a_reset_that_hidden_constraints_do_not_admit():
         simulate(at_a_wall().with_parameters({"c.back": 1.0}), 2.0, ts=jnp.array([2.0]), **TIGHT)
 
 
-# --- single ones -----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_a_guard_that_dips_below_zero_between_two_steps():
-    """x = (t − 1)² − depth is below zero for 2·√depth s only, and steps are as long as the run."""
-
-    def write(self, ev):
-        depth = self.parameter("depth", 1e-2)
-        x, v = self.variable("x", start=1 - depth, fixed=True), self.variable("v", start=-2.0, fixed=True)
-        n = self.discrete("n")
-        self.add_equations(Eq(der(x), v), Eq(der(v), 2))
-        self.when(x <= 0, assign(n, pre(n) + 1))
-
-    system = model(write)
-    for depth in (1e-2, 1e-3, 1e-6):
-        solution = simulate(system.with_parameters({"c.depth": depth}), 2.0, ts=jnp.array([2.0]), **TIGHT)
-        np.testing.assert_allclose(events(solution), [1 - np.sqrt(depth)], atol=1e-9)
-
-
-@pytest.mark.slow
-def test_guards_faster_than_the_states():
-    """sin(ωt + 0.1) rises through zero ⌊(5ω + 0.1)/2π⌋ times, and steps are chosen for a state that needs none."""
-
-    def write(self, ev):
-        w, n = self.parameter("w", 50.0), self.discrete("n")
-        clock_hand(self)
-        self.when(sympy.sin(w * ev.t + 0.1) > 0, assign(n, pre(n) + 1))
-
-    system = model(write)
-    count = jax.jit(
-        lambda w: simulate(
-            system.with_parameters({"c.w": w}), 5.0, ts=jnp.array([5.0]), max_events=99, throw=False
-        )["c.n"][-1]
-    )  # fmt: skip
-    for w in np.linspace(30.0, 60.0, 21):
-        assert int(count(w)) == int((5 * w + 0.1) / (2 * np.pi))
-
-
 @pytest.mark.slow
 def test_every_step_with_bdf():
     """x' = 2·on − x, switched at 0.5 and 1.5: first at ln 4, then every ln 3."""
@@ -142,21 +102,6 @@ def test_every_step_with_bdf():
     solution = simulate(model(write), 4.0, solver=BDF(), rtol=1e-8, atol=1e-8)
     np.testing.assert_allclose(events(solution), np.log(4) + np.log(3) * np.arange(3), atol=1e-6)
     assert solution.stats["num_jacobians"] > 0
-
-
-@pytest.mark.slow
-def test_derivatives_by_saved_times():
-    """x' = u, and u grows by one every half second. At the time of an event, a saved value goes along the solution
-    after it; its derivative was zero."""
-
-    def write(self, ev):
-        x, u = self.variable("x", start=0.0, fixed=True), self.discrete("u")
-        self.add_equations(Eq(der(x), u))
-        self.when(self.sampled(0.5, 0.5), assign(u, pre(u) + 1))
-
-    system = model(write)
-    slope = jax.jit(jax.grad(lambda t: simulate(system, 2.0, ts=t[None], throw=False)["c.x"][-1]))
-    np.testing.assert_allclose([slope(t) for t in (0.75, 1.0, 1.25)], [1.0, 2.0, 2.0], rtol=1e-9)
 
 
 # --- a clock with values that may be wrong ---------------------------------------------------------------------------

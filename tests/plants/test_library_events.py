@@ -125,7 +125,7 @@ SWITCHED = np.array([0.3, 0.7, 1.1, 2.0])
 CIRCUIT_TIMES = np.unique([*SMOOTHED, *HALF, *SWITCHED, 1.0])
 
 
-@pytest.mark.long("four circuits in one program")
+@pytest.mark.slow
 def test_a_half_wave_rectifier():
     """i = max(10·sin(2πt), 0)/R, without any state."""
     run = circuits(True)
@@ -136,6 +136,7 @@ def test_a_half_wave_rectifier():
     np.testing.assert_allclose(run.events("d0")[:4], [0.5, 1.0, 1.5, 2.0], atol=1e-11)
 
 
+@pytest.mark.slow
 @checks(
     {el.IdealDiode: ("SciPy's DOP853 from switch to switch", "c.v", "events")},
     origin=ORIGIN,
@@ -154,7 +155,8 @@ def test_a_smoothed_rectifier():
     measured("events", run.events("d"), switched, SMOOTH)
 
 
-@pytest.mark.parametrize("opens", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.slow
+@pytest.mark.parametrize("opens", [False, True])
 @checks(
     {el.TimedSwitch: ("exponential from the switching on, and its derivative by that time", "c.v", "slope")},
     origin=ORIGIN,
@@ -172,6 +174,7 @@ def test_a_timed_switch(opens):
     assert slope[0] == 0
 
 
+@pytest.mark.slow
 @checks({el.Switch: ("currents by Ohm's law, and times by arcsin", "q.y", "events")}, origin=ORIGIN)
 def test_a_switch_that_a_signal_drives():
     """Closed while sin(2πt) > 1/2, from 1/12 to 5/12: 3 A, and 6/(2 + 100) A while it is open."""
@@ -354,7 +357,7 @@ def rubbing():
     return ran(system, 12.0, ts, names, {}, inputs)
 
 
-@pytest.mark.long("stick and slip, and a freewheel, in one program")
+@pytest.mark.slow
 @checks(
     {StickingFriction: ("Den Hartog's closed form of stick and slip", "m.s", "events")},
     origin=ORIGIN,
@@ -369,6 +372,7 @@ def test_stick_and_slip():
     np.testing.assert_array_equal(run.values("f.mode", ts), [0, 1, 1, 0, 1, 1])
 
 
+@pytest.mark.slow
 @checks({OneWayClutch: ("SciPy's DOP853 from switch to switch", "a.w", "b.w", "events")}, origin=ORIGIN)
 def test_a_freewheel():
     """A driven inertia and one that coasts behind a damper, J·w' = sin t and J₂·w' = −d·w while it runs free; SciPy
@@ -405,6 +409,28 @@ def test_a_freewheel():
         measured(name, found.values(name, ts), true, SMOOTH)
     # It pushes one way only, and never runs backwards.
     assert np.min(found.values("c.tau", ts)) > -1e-9 and np.min(found.values("c.w_rel", ts)) > -1e-9
+
+
+@pytest.mark.long("modes that change, with derivatives, from end to end")
+def test_a_clutch_that_locks():
+    """Inertias of 1 and 2 kg·m² at 10 and 0 rad/s, 3 N·m on the first one and a slip torque of 8 N·m between them: they
+    turn together from 10/9 s on, as 19/3 rad/s at t = 3."""
+    ev = EqnEnv()
+    driven = rot.Inertia(ev, "J1", 1.0, initial_angle=0.0, initial_speed=10.0)
+    load = rot.Inertia(ev, "J2", 2.0, initial_angle=0.0, initial_speed=0.0)
+    clutch, torque = Clutch(ev, "c", mu=0.5, fn_max=16.0), rot.Torque(ev, "drive")
+    system = compiled(
+        driven, load, clutch, torque,
+        connect=[
+            (torque.flange, driven.flange_a), (driven.flange_b, clutch.flange_a), (clutch.flange_b, load.flange_a)
+        ],
+    )  # fmt: skip
+    end = np.array([3.0])
+    run = ran(system, 3.0, end, ["J1.w", "J2.w", "J1.phi"], {"c.mu": 0.5}, {"c.u": 1.0, "drive.tau": 3.0})
+    np.testing.assert_allclose(run.events("c"), [10 / 9], rtol=0, atol=SMOOTH)
+    np.testing.assert_allclose([run.values(f"J{k}.w", end)[0] for k in (1, 2)], 19 / 3, rtol=SMOOTH)
+    np.testing.assert_allclose(run.values("J1.phi", end), 18.2037037037037, rtol=SMOOTH)
+    np.testing.assert_allclose(run.slopes("J1.phi", "c.mu", end) / 16.0, -0.617283950617284, rtol=SMOOTH)
 
 
 COUPLED = [
