@@ -48,15 +48,24 @@ CASES = {
 }  # fmt: skip
 
 
+def found(solver=None, batched=False):
+    """(value, gradient) of all cases by one program: one after another, or as one batch."""
+    return _found(solver, batched)
+
+
 @functools.cache
-def found(solver=None):
-    """(value, gradient) of all cases, as one batch: members at rest beside members that move."""
+def _found(solver, batched):
 
     def end(p):
         return solve(p, solver).ys[0, 0]
 
-    values, gradients = jax.jit(jax.vmap(jax.value_and_grad(end)))(np.stack(list(CASES.values())))
-    rows = zip(np.asarray(values), np.asarray(gradients), strict=True)
+    given, gradient = np.stack(list(CASES.values())), jax.value_and_grad(end)
+    if batched:
+        values, gradients = jax.tree.map(np.asarray, jax.jit(jax.vmap(gradient))(given))
+        rows = zip(values, gradients, strict=True)
+    else:
+        alone = jax.jit(gradient)
+        rows = (jax.tree.map(np.asarray, alone(p)) for p in given)
     return {case: (value, dict(zip(NAMES, by, strict=True))) for case, (value, by) in zip(CASES, rows, strict=True)}
 
 
@@ -68,6 +77,17 @@ def found(solver=None):
 def test_by_the_start(solver):
     for case in ("rest", "moves little", "moves"):
         assert abs(found(solver)[case][1]["x0"] - np.cos(OMEGA)) < RESOLVED
+
+
+@pytest.mark.slow
+def test_in_batches():
+    """Members at rest beside members that move."""
+    for case, (value, by) in found(batched=True).items():
+        alone, alone_by = found()[case]
+        np.testing.assert_allclose(value, alone, rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(by["x0"], alone_by["x0"], rtol=0, atol=2 * RESOLVED)
+        if case != "damped":
+            assert abs(by["x0"] - np.cos(OMEGA)) < RESOLVED
 
 
 def test_by_a_force_that_is_zero():

@@ -13,7 +13,7 @@ import scipy.integrate
 import sympy
 from problems import compiled, component
 
-from jaxonomy_dae import ModelError, SimulationError, assign, der, pre, reinit, simulate, terminate
+from jaxonomy_dae import ModelError, SimulationError, assign, der, reinit, simulate, terminate
 from jaxonomy_dae.modeling import Eq
 from jaxonomy_dae.solvers import BDF
 
