@@ -35,8 +35,8 @@ P = jnp.array([1.5, 0.2, 0.1])
 @pytest.mark.parametrize(
     "solver",
     [
-        pytest.param(Tsit5(), id="own"),
-        pytest.param(diffrax.Dopri5(scan_kind="bounded"), id="diffrax", marks=pytest.mark.slow),
+        pytest.param(Tsit5(), id="own", marks=pytest.mark.slow),
+        pytest.param(diffrax.Dopri5(scan_kind="bounded"), id="diffrax"),
     ],
 )
 def test_hessian_of_the_logistic_equation(solver):

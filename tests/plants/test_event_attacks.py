@@ -127,6 +127,7 @@ def run(**parameters):
     return simulate(changed, 2.0, ts=jnp.array([0.5, 1.5, 2.0]), **TIGHT)
 
 
+@pytest.mark.slow
 def test_a_clock_that_ends_the_run():
     solution = run()
     assert solution.events.terminated == "enough"
@@ -135,6 +136,7 @@ def test_a_clock_that_ends_the_run():
     np.testing.assert_allclose(solution["c.d"][:2], [0.0, 2.0], atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parameter, name", [("a", "d"), ("b", "y")])
 def test_values_that_become_not_finite(parameter, name):
     with pytest.raises(SimulationError, match=f"t=1: an event gave 'c.{name}' a value that is not finite"):

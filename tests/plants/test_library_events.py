@@ -514,7 +514,7 @@ def sampling():
     return ran(system, 6.0, np.unique([*MIDDLES, *BEFORE]), names, {}, {"pulse.u": share})
 
 
-@pytest.mark.long("all sampled blocks in one program")
+@pytest.mark.slow
 @checks(
     {
         sig.SampleHold: ("the samples", "hold.y"),
@@ -552,6 +552,7 @@ def test_sampled_blocks():
     np.testing.assert_allclose(found.values("wave.y", ts), np.sin(3 * ts), atol=1e-12)
 
 
+@pytest.mark.slow
 @checks({sig.PulseWidth: ("sum of the shares", "mean.y")}, origin=ORIGIN)
 def test_pulse_width():
     """The share of every period is the input at its beginning, cut to what is possible."""

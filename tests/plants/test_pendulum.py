@@ -27,6 +27,9 @@ TIGHT = dict(rtol=1e-11, atol=1e-12)
 OFTEN = jnp.linspace(0.0, 2.0, 401)  # as many times as full swings are saved at: one program
 
 
+MODES = pytest.mark.parametrize("mode", ["auto", pytest.param("dummy_derivatives", marks=pytest.mark.slow)])
+
+
 def horizontal_drag(vx, vy):
     return -DRAG * vx * abs(vx), 0.0
 
@@ -37,14 +40,14 @@ def with_drag(mode):
     return pendulum(drag_on("vx"), compiler={"state_selection": mode})
 
 
-@pytest.mark.parametrize("mode", ["auto", "dummy_derivatives"])
+@MODES
 def test_truth_of_a_real_force(mode):
     solution = simulate(with_drag(mode), 1.5, ts=jnp.array(HORIZONS), **TIGHT)
     found = np.stack([solution["pend.vx"], solution["pend.x"]], axis=1)
     np.testing.assert_allclose(found, EQUATION, rtol=0, atol=1e-7)  # 7 of the 8 decimals given
 
 
-@pytest.mark.parametrize("mode", ["auto", "dummy_derivatives"])
+@MODES
 @pytest.mark.parametrize("m, L, g", [(1.0, 1.0, 9.81), (0.6, 1.3, 3.7)])
 def test_every_variable_under_a_real_force(mode, m, L, g):
     system = with_drag(mode).with_parameters({"pend.m": m, "pend.L": L, "pend.g_y": -g})
@@ -122,6 +125,7 @@ def test_period_two_does_not_drift(plain):
     np.testing.assert_allclose(solution["pend.y"], 0.0, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_forced_singular_chart_fails_loudly():
     # With (y, vy) as states x = ±√(L² − y²) cannot be followed through the lowest point, which a release from rest
     # reaches after a quarter of the period 4·K(sin²(A/2))·√(L/g), amplitude A = π/2 − 1.2.
