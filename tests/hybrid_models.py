@@ -35,7 +35,7 @@ class Ball(Component):
         self.add_equations(Eq(der(h), v), Eq(der(v), -gravity))
         self.when(h <= 0, reinit(v, -restitution * pre(v)), reinit(h, 0), assign(n, pre(n) + 1))
         if stop is not None:
-            self.when(n >= stop, terminate("bounced enough"))
+            self.when(n >= self.parameter("stop", stop), terminate("bounced enough"))
 
 
 class Thermostat(Component):
@@ -79,3 +79,61 @@ class Stick(Component):
         self.add_equations(Eq(push, force), Eq(der(x), v), Eq(m * der(v), Abs(mode) * (push - mu * mode)))
         self.when(Abs(push) >= mu, assign(mode, sign(push)), on=Eq(mode, 0))
         self.when(mode * v <= 0, assign(mode, 0), reinit(v, 0), on=Eq(Abs(mode), 1))
+
+
+class Commensurate(Component):
+    """Clocks of 0.1, 0.2 and 0.3 s that read each other, the slower ones declared first."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        x = self.variable("x", start=0.0, fixed=True)
+        self.add_equations(Eq(der(x), 1))
+        a, b, c = (self.discrete(n) for n in ("a", "b", "slow"))
+        self.when(self.sampled(0.2), assign(b, 100 * a + pre(b)))
+        self.when(self.sampled(0.1), assign(a, pre(a) + 1))
+        self.when(self.sampled(0.3), assign(c, pre(c) + pre(a) * 1000 + b))
+
+
+class Counting(Component):
+    """Counts how often its integral has grown by one, in steps of its rate."""
+
+    def __init__(self, ev, name, rate=1.0):
+        super().__init__(ev, name)
+        r, n = self.parameter("rate", rate), self.discrete("n")
+        x = self.variable("x", start=0.0, fixed=True)
+        self.add_equations(Eq(der(x), r))
+        self.when(x >= 1, reinit(x, 0), assign(n, pre(n) + r))
+
+
+class Gear(Component):
+    """A discrete variable as the parameter of a child, beside a child with its own."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        gain = self.discrete("gain", start=1.0)
+        self.add(Counting(ev, "child", rate=2 * gain))
+        self.add(Counting(ev, "other"))
+        self.when(ev.t >= 1.25, assign(gain, 3.0))
+
+
+class Twice(Component):
+    """Two events with one condition."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        x = self.variable("x", start=0.0, fixed=True)
+        k = self.discrete("k")
+        self.add_equations(Eq(der(x), 1))
+        self.when(x >= 1, reinit(x, 0))
+        self.when(x >= 1, assign(k, pre(k) + 1))
+
+
+class Doubling(Component):
+    """A discrete variable that begins at 2·a and is doubled once a second, and its integral."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        a, x = self.parameter("a", 1.5), self.variable("x", start=0.0, fixed=True)
+        y, d = self.variable("y", start=0.0, fixed=True), self.discrete("d", start=2 * a)
+        self.add_equations(Eq(der(x), 1), Eq(der(y), d))
+        self.when(x >= 1, reinit(x, 0), assign(d, 2 * pre(d)))

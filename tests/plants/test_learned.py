@@ -3,6 +3,9 @@
 The networks here are known laws, written as functions, so that the solutions have closed forms.
 """
 
+import functools
+
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,6 +17,7 @@ from sympy import Eq
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, Electrical, EqnEnv, NeuralDAEBlock, der, simulate
 from jaxonomy_dae.library.electrical import Capacitor, Ground
+from jaxonomy_dae.library.planar import PlanarPendulum
 
 TS = jnp.linspace(0.0, 2.0, 9)
 T = np.asarray(TS)
@@ -43,19 +47,24 @@ def corrected(*blocks, **options):
 def slopes(system, t=0.0, **at):
     """The vector field by name, at a point given by name."""
     x = jnp.array([at[n.removeprefix("c.")] for n in system.states])
-    return {n.removeprefix("c."): float(v) for n, v in zip(system.states, system.vector_field(t, x), strict=True)}
+    return {n.removeprefix("c."): float(v) for n, v in zip(system.states, field(system, t, x), strict=True)}
+
+
+@eqx.filter_jit
+def field(system, t, x):
+    return system.vector_field(t, x)
 
 
 # --- corrections -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long("all models with networks in one program")
 def test_several_blocks_on_one_target_add_up():
-    system = corrected({"network": lambda u: -u}, {"network": lambda u: -0.5 * u}, {"network": lambda u: 0 * u + 3.0})
-    assert list(system.neural) == ["block0", "block1", "block2"]
-    solution = simulate(system, 2.0, ts=TS, **SOLVE)
-    np.testing.assert_allclose(solution["c.x"], 2.0 - np.exp(-1.5 * T), **CLOSE)
+    solution = together()
+    assert list(plant().neural)[:3] == ["block0", "block1", "block2"]
+    np.testing.assert_allclose(solution["free.x"], 2.0 - np.exp(-1.5 * T), **CLOSE)
     np.testing.assert_allclose(solution["block1[0]"], -0.5 * (2.0 - np.exp(-1.5 * T)), **CLOSE)
-    np.testing.assert_allclose(solution["c.y"], 2.0, **CLOSE)
+    np.testing.assert_allclose(solution["free.y"], 2.0, **CLOSE)
 
 
 @pytest.mark.parametrize("inject", ["equation", "row"])
@@ -96,9 +105,7 @@ def test_inputs_in_the_order_given_with_time_among_them(inject):
 
 
 def test_time_reaches_a_function_with_weights():
-    system = corrected({"network": lambda t, u, theta: theta * jnp.sin(t) + 0 * u, "theta": jnp.array(2.0)})
-    solution = simulate(system, 2.0, ts=TS, **SOLVE)
-    np.testing.assert_allclose(solution["c.x"], 3.0 - 2.0 * np.cos(T), **CLOSE)
+    np.testing.assert_allclose(together()["timed.x"], 3.0 - 2.0 * np.cos(T), **CLOSE)
 
 
 def test_the_order_of_targets_is_the_order_of_outputs():
@@ -122,7 +129,7 @@ def test_targets_inside_other_components(by_name):
     target = "outer.inner.y" if by_name else (outer.inner, "y")
     diagram.add_neural_correction_block(NeuralDAEBlock(lambda u: 3 * u, targets=[target], name="b"))
     system = AcausalCompiler(ev, diagram)()
-    slope = dict(zip(system.states, system.vector_field(0.0, jnp.array([2.0, 2.0])), strict=True))
+    slope = dict(zip(system.states, field(system, 0.0, jnp.array([2.0, 2.0])), strict=True))
     assert float(slope["outer.inner.x"]) == 0.0 and float(slope["outer.inner.y"]) == 6.0
 
 
@@ -134,7 +141,7 @@ def test_a_corrected_position_moves_what_is_attached(mode):
     )  # fmt: skip
     at = {"mass.s": 0.4, "mass.v": -0.3}
     x = jnp.array([at[n] for n in system.states])
-    slope = dict(zip(system.states, system.vector_field(0.0, x), strict=True))
+    slope = dict(zip(system.states, field(system, 0.0, x), strict=True))
     assert float(slope["mass.s"]) == pytest.approx(-0.3 + 0.2, rel=1e-12)
     assert float(slope["mass.v"]) == pytest.approx((-5.0 * 0.4 - 0.6 * (-0.3 + 0.2)) / 2.0, rel=1e-12)
 
@@ -165,21 +172,36 @@ def diode_discharge(t, a=0.4, C=0.5, v0=1.0):
     return -np.log(1 - (1 - np.exp(-v0)) * np.exp(-a * t / C))
 
 
-@pytest.mark.parametrize(
-    "network, gives",
-    [
-        pytest.param(lambda v: 0.4 * jnp.expm1(v), "i", id="explicit"),
-        # The current is found from v = law(i): a nonlinear block around the network.
-        pytest.param(lambda i: jnp.log1p(i / 0.4), "v", id="implicit"),
-    ],
-)
-def test_a_resistor_with_a_learned_law(network, gives):
-    system = discharge(network, gives)
-    solution = simulate(system, 2.0, ts=TS, **SOLVE)
+def explicit_law(v):
+    return 0.4 * jnp.expm1(v)
+
+
+def implicit_law(i):
+    """The current is found from v = law(i): a nonlinear block around the network."""
+    return jnp.log1p(i / 0.4)
+
+
+def test_a_resistor_with_a_learned_law():
+    solution, v = together(), diode_discharge(T)
+    np.testing.assert_allclose(solution["store.v"], v, **CLOSE)
+    np.testing.assert_allclose(solution["leak.i"], 0.4 * np.expm1(v), **CLOSE)
+    np.testing.assert_allclose(solution["leak.law"], solution["leak.i"], **CLOSE)
+
+
+def test_a_law_that_is_solved_for_its_input():
+    system = discharge(implicit_law, "v")
+    states = jnp.array([0.2, 1.0, 2.0])
+    slope = eqx.filter_jit(jax.vmap(lambda v: system.vector_field(0.0, v[None])[0]))(states)
+    np.testing.assert_allclose(slope, -0.4 * np.expm1(np.asarray(states)) / 0.5, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_run_with_a_law_that_is_solved_for_its_input():
+    solution = simulate(discharge(implicit_law, "v"), 2.0, ts=TS, **SOLVE)
     v = diode_discharge(T)
     np.testing.assert_allclose(solution["c.v"], v, **CLOSE)
     np.testing.assert_allclose(solution["r.i"], 0.4 * np.expm1(v), **CLOSE)
-    np.testing.assert_allclose(solution["r.law"], solution["r.v" if gives == "v" else "r.i"], **CLOSE)
+    np.testing.assert_allclose(solution["r.law"], solution["r.v"], **CLOSE)
 
 
 def test_gradients_reach_the_weights_inside_an_algebraic_equation():
@@ -196,26 +218,28 @@ def test_gradients_reach_the_weights_inside_an_algebraic_equation():
     def slope(s):
         return s.vector_field(0.0, jnp.array([1.3]))[0]
 
-    gradient = eqx.filter_grad(slope)(system)
+    gradient = eqx.filter_jit(eqx.filter_grad(slope))(system)
     assert float(gradient.neural["r.law"].k) == pytest.approx(-1.3 / 0.5, rel=1e-12)
 
 
 def test_a_correction_that_depends_on_the_tension():
     """Friction of the link, N = −0.3·lam on vx: the multiplier depends on the force and the force on the multiplier."""
-    system = pendulum(drag_on("vx", network=lambda u: -0.3 * u, inputs=["pend.lam"]))
-    ts = [0.5, 1.0]
-    solution = simulate(system, 1.0, ts=ts, **SOLVE)
+    solution, ts = together(), TS[TS <= 1.0]
 
     def tension(theta, omega):  # 2·lam = ω² − g·sin θ + cos θ·N, solved for lam
         return (omega**2 - GRAVITY * np.sin(theta)) / (2 + 0.3 * np.cos(theta))
 
-    def field(t, state):
+    def angular(t, state):
         theta, omega = state
         return omega, -GRAVITY * np.cos(theta) + 0.3 * tension(theta, omega) * np.sin(theta)
 
-    angle = scipy.integrate.solve_ivp(field, (0.0, 1.0), (RELEASE, 0.0), "DOP853", ts, rtol=1e-12, atol=1e-12).y
-    np.testing.assert_allclose(solution["pend.x"], np.cos(angle[0]), **CLOSE)
-    np.testing.assert_allclose(solution["pend.lam"], tension(*angle), rtol=0, atol=1e-6)  # as in test_pendulum.py
+    angle = scipy.integrate.solve_ivp(
+        angular, (0.0, 1.0), (RELEASE, 0.0), "DOP853", np.asarray(ts), rtol=1e-12, atol=1e-12
+    ).y
+    np.testing.assert_allclose(solution["pend.x"][: len(ts)], np.cos(angle[0]), **CLOSE)
+    np.testing.assert_allclose(
+        solution["pend.lam"][: len(ts)], tension(*angle), rtol=0, atol=1e-6
+    )  # as in test_pendulum.py
 
 
 def test_networks_keep_their_precision():
@@ -226,7 +250,7 @@ def test_networks_keep_their_precision():
     def slope(system):
         return jnp.sum(system.vector_field(0.0, jnp.array([0.3, 0.0])))
 
-    value, gradient = eqx.filter_value_and_grad(slope)(system)
+    value, gradient = eqx.filter_jit(eqx.filter_value_and_grad(slope))(system)
     assert float(value) == pytest.approx(float(mlp(1, 1)(jnp.array([0.3]))[0]), abs=1e-6)  # single precision
     assert value.dtype == jnp.float64
     assert {leaf.dtype for leaf in jax.tree.leaves(gradient.neural)} == {jnp.dtype("float32")}
@@ -253,15 +277,51 @@ class Cam(Component):
 
 @pytest.mark.parametrize("mode", ["auto", pytest.param("dummy_derivatives", marks=pytest.mark.slow)])
 def test_constraints_differentiate_networks_exactly(mode):
-    system = compiled(Cam(EqnEnv(), "cam", jnp.tanh), state_selection=mode)
+    if mode == "auto":
+        solution = together()
+    else:
+        solution = simulate(compiled(Cam(EqnEnv(), "cam", jnp.tanh), state_selection=mode), 2.0, ts=TS, **SOLVE)
     x, u = 0.8 * np.cos(T), -0.8 * np.sin(T)
     y = np.tanh(x)
     slope = 1 - y**2
-    solution = simulate(system, 2.0, ts=TS, **SOLVE)
     np.testing.assert_allclose(solution["cam.x"], x, **CLOSE)
     np.testing.assert_allclose(solution["cam.y"], y, **CLOSE)
     np.testing.assert_allclose(solution["cam.v"], slope * u, **CLOSE)
     np.testing.assert_allclose(solution["cam.f"], 2.0 * (-2 * y * slope * u**2 - slope * x), **CLOSE)
+
+
+# --- one run ---------------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def plant():
+    """Models with networks that know nothing of each other, in one system."""
+    ev = EqnEnv()
+    free, timed, cam = Free(ev, "free"), Free(ev, "timed"), Cam(ev, "cam", jnp.tanh)
+    store, ground = Capacitor(ev, "store", 0.5, initial_voltage=1.0), Ground(ev, "g")
+    leak = LearnedResistor(ev, "leak", explicit_law, "i")
+    bob = PlanarPendulum(ev, "pend", initial_theta=RELEASE)
+    speed = Speedometer(ev)
+
+    def sine(t, u, theta):
+        return theta * jnp.sin(t) + 0 * u
+
+    laws = [lambda u: -u, lambda u: -0.5 * u, lambda u: 0 * u + 3.0]
+    blocks = [NeuralDAEBlock(law, targets=[(free, "x")], name=f"block{k}") for k, law in enumerate(laws)]
+    blocks += [
+        NeuralDAEBlock(sine, jnp.array(2.0), targets=[(timed, "x")], name="sine"),
+        drag_on("vx", network=lambda u: -0.3 * u, inputs=["pend.lam"])(bob),
+        damping(speed, "equation"),
+    ]
+    return compiled(
+        free, timed, cam, store, leak, ground, bob, speed, blocks=blocks,
+        connect=[(store.p, leak.p), (store.n, leak.n, ground.p)],
+    )  # fmt: skip
+
+
+@functools.cache
+def together():
+    return simulate(plant(), 2.0, ts=TS, solver=diffrax.Tsit5(), adjoint=diffrax.ForwardMode(), **SOLVE)
 
 
 class Bead(Component):
@@ -307,14 +367,13 @@ def test_row_injection_leaves_the_constraint_alone():
     row = pendulum(drag_on("vx", network=lambda u: 0 * u + 5.0, inject="row"), compiler=options)
 
     @eqx.filter_jit
-    def start(system):
-        x = system.initialize()
-        return x, system.vector_field(0.0, x), system.observe("pend.lam", 0.0, x)
+    def released(system):
+        return system.vector_field(0.0, at), system.observe("pend.lam", 0.0, at)
 
-    (x, slope, lam), (x_row, slope_row, lam_row) = start(plain), start(row)
+    at = jnp.array([np.cos(RELEASE), 0.0, np.sin(RELEASE)])
+    (slope, lam), (slope_row, lam_row) = released(plain), released(row)
     assert (row.states, row.carried) == (["pend.x", "pend.vx"], ["pend.y"]) == (plain.states, plain.carried)
-    np.testing.assert_allclose(x_row, x, rtol=1e-12)  # rounding, here and below
-    np.testing.assert_allclose((slope_row - slope)[:2], [0.0, 5.0], atol=1e-12)
+    np.testing.assert_allclose((slope_row - slope)[:2], [0.0, 5.0], atol=1e-12)  # rounding, here and below
     assert float(lam_row) == pytest.approx(float(lam), rel=1e-12)
 
 
@@ -328,17 +387,24 @@ class Speedometer(Component):
         self.add_equations(v - 3.6 * der(x), der(v) + 3.6 * 2.0 * x, w + 5 * x)
 
 
-@pytest.mark.parametrize("inject", ["row", "equation"])
+def damping(part, inject):
+    """A correction −v/2 of the rate of v."""
+    law = jnp.array(-0.5)
+    return NeuralDAEBlock(
+        lambda t, u, theta: (theta * u[0])[None], law, targets=[(part, "v")], name="damping", inject=inject
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("inject", [pytest.param("row", marks=pytest.mark.slow), "equation"])
 def test_a_correction_of_a_multiple(inject):
     """A correction −v/2 of the rate of v = 3.6·x' is the damping of x'' + x'/2 + 2·x = 0, in closed form."""
-    ev = EqnEnv()
-    part = Speedometer(ev)
-    drag = NeuralDAEBlock(
-        lambda t, u, theta: (theta * u[0])[None], jnp.array(-0.5), targets=[(part, "v")], name="n", inject=inject
-    )
-    system = compiled(part, blocks=[drag], state_selection="dummy_derivatives")
-    assert len(system.states) == 2
-    solution = simulate(system, 2.0, ts=TS, **SOLVE)
+    if inject == "equation":
+        solution = together()
+    else:
+        part = Speedometer(EqnEnv())
+        system = compiled(part, blocks=[damping(part, inject)], state_selection="dummy_derivatives")
+        assert len(system.states) == 2
+        solution = simulate(system, 2.0, ts=TS, **SOLVE)
     a, w = 0.25, np.sqrt(2.0 - 0.25**2)
     x = np.exp(-a * T) * (np.cos(w * T) + a / w * np.sin(w * T))
     speed = -2.0 / w * np.exp(-a * T) * np.sin(w * T)

@@ -1,0 +1,117 @@
+"""Events as they are declared: what is refused, and what is said of it."""
+
+import pytest
+import sympy
+from problems import compiled, component
+from sympy import Eq
+
+from jaxonomy_dae import (
+    AcausalCompiler,
+    AcausalDiagram,
+    Component,
+    EqnEnv,
+    ModelError,
+    assign,
+    der,
+    pre,
+    reinit,
+)
+from jaxonomy_dae.library import hydraulic as hyd
+from jaxonomy_dae.library import signal as sig
+
+
+def clock_hand(self):
+    """A state that is the time since the last reset."""
+    x = self.variable("x", start=0.0, fixed=True)
+    self.add_equations(Eq(der(x), 1))
+    return x
+
+
+def model(write):
+    return compiled(component(write))
+
+
+def test_one_state_by_two_names():
+    def write(self, ev):
+        x, z = clock_hand(self), self.variable("z")
+        self.add_equations(Eq(z, -2 * x))
+        self.when(x >= 1, reinit(z, 0.0), reinit(x, 0.5))
+
+    with pytest.raises(ModelError, match=r"'c.z' and 'c.x' are one state"):
+        model(write)
+
+
+OUTSIDE = {
+    "an equation": lambda self, d: self.add_equations(Eq(self.variable("y"), pre(d))),
+    "an output": lambda self, d: self.output("y", pre(d)),
+    "the start of a variable": lambda self, d: self.variable("y", start=pre(d)),
+    "the start of a discrete variable": lambda self, d: self.discrete("y", start=pre(d)),
+    "a period": lambda self, d: self.sampled(pre(d)),
+    "a mode": lambda self, d: self.either(Eq(pre(d), 1), self.variable("y"), 0),
+    "a condition": lambda self, d: self.when(self.symbol("x") > pre(d), assign(d, 1)),
+}
+
+
+@pytest.mark.parametrize("where", OUTSIDE)
+def test_pre_is_for_actions(where):
+    def write(self, ev):
+        clock_hand(self)
+        OUTSIDE[where](self, self.discrete("d"))
+
+    with pytest.raises(ModelError, match=r"pre\(d\)"):
+        model(write)
+
+
+@pytest.mark.parametrize(
+    "write",
+    [lambda self, y, d: self.either(Eq(d, 1), y > 1, y), lambda self, y, d: self.complementary(y, Eq(y, 2))],
+    ids=["either", "complementary"],
+)
+def test_branches_that_are_not_expressions(write):
+    with pytest.raises(ModelError, match=r"component 'c': (either|complementary): .*y.* is not an expression"):
+        model(lambda self, ev: write(self, self.variable("y"), self.discrete("d")))
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 2 * sympy.I])
+def test_values_that_are_not_finite_numbers(value):
+    def write(self, ev):
+        self.when(clock_hand(self) >= 1, assign(self.discrete("d"), value))
+
+    with pytest.raises(ModelError, match="finite and real"):
+        component(write)
+
+
+class Loop(Component):
+    """A sampled block without delay: what it samples at once shows in its output."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        u, a = self.input("u"), self.discrete("a")
+        y = self.variable("y")
+        self.add_equations(Eq(y, a))
+        self.when(self.sampled(0.1), assign(a, u + 1))
+
+
+def test_a_sampled_loop_through_equations_is_refused():
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    one, two, total = Loop(ev, "one"), Loop(ev, "two"), sig.Integrator(ev, "total")
+    diagram.add(one, two, total)
+    diagram.connect(one.y, two.u, total.u)
+    diagram.connect(two.y, one.u)
+    with pytest.raises(ModelError, match="need each other's results"):
+        AcausalCompiler(ev, diagram)()
+
+
+def test_what_blocks_refuse():
+    ev = EqnEnv()
+    with pytest.raises(ModelError, match="denominator"):
+        sig.DiscreteTransferFunction(ev, "a", [1.0, 2.0], [1.0])
+    with pytest.raises(ModelError, match="samples"):
+        sig.SampledDelay(ev, "b", 0)
+    with pytest.raises(ModelError, match="period"):
+        sig.SampleHold(ev, "c", period=0.0)
+
+
+def test_a_relief_valve_shuts_below_where_it_opens():
+    with pytest.raises(ModelError, match="'valve': p_close must not be above p_open"):
+        hyd.ReliefValve(EqnEnv(), "valve", p_open=1e6, p_close=4e6)

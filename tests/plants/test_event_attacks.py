@@ -1,0 +1,149 @@
+"""Events as nobody had in mind when they were made, each against an independent computation.
+
+Runs are made at rtol = atol = 1e-10; what is integrated is polynomial unless a test says otherwise, so that values are
+right to rounding and to the search for events, a few 1e-12.
+"""
+
+import functools
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+import sympy
+from problems import compiled, component
+
+from jaxonomy_dae import ModelError, SimulationError, assign, der, reinit, simulate, terminate
+from jaxonomy_dae.modeling import Eq
+from jaxonomy_dae.solvers import BDF
+
+TIGHT = dict(rtol=1e-10, atol=1e-10)
+G = 9.81
+
+
+def events(solution):
+    return np.asarray(solution.events.ts)[: len(solution.events)]
+
+
+def clock_hand(self):
+    """A state that is the time since the last reset."""
+    x = self.variable("x", start=0.0, fixed=True)
+    self.add_equations(Eq(der(x), 1))
+    return x
+
+
+def model(write):
+    return compiled(component(write))
+
+
+# --- a pendulum at a wall --------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def at_a_wall():
+    """Cartesian, so that both speeds are reset on a hidden constraint."""
+
+    def write(self, ev):
+        x, y = self.variable("x", start=1.0, fixed=True), self.variable("y", start=0.0)
+        u, v = self.variable("u", start=0.0, fixed=True), self.variable("v", start=0.0)
+        pull, back = self.variable("pull"), self.parameter("back", -0.9)
+        self.add_equations(
+            Eq(der(x), u), Eq(der(y), v), Eq(der(u), -pull * x), Eq(der(v), -pull * y - G), Eq(x**2 + y**2, 1)
+        )
+        self.when(x <= -0.3, reinit(u, -0.9 * u), reinit(v, back * v))
+
+    return model(write)
+
+
+def by_the_angle(T):
+    """(x at the end, times of impacts) by SciPy."""
+
+    def hit(t, q):
+        return np.sin(q[0]) + 0.3
+
+    hit.terminal, hit.direction = True, -1.0
+    t, q, times = 0.0, [np.pi / 2, 0.0], []
+    while True:
+        run = scipy.integrate.solve_ivp(
+            lambda t, q: [q[1], -G * np.sin(q[0])], (t, T), q, "DOP853", events=hit, rtol=1e-12, atol=1e-13
+        )
+        t, q = run.t[-1], [run.y[0, -1], -0.9 * run.y[1, -1]]
+        if run.status == 0:
+            return np.sin(run.y[0, -1]), times
+        times.append(t)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solver, exact", [(None, 1e-8), (BDF(), 1e-6)])  # errors of BDF add up over its many steps
+def test_a_pendulum_at_a_wall(solver, exact):
+    x, times = by_the_angle(2.0)
+    solution = simulate(at_a_wall(), 2.0, ts=jnp.array([2.0]), solver=solver, **TIGHT)
+    np.testing.assert_allclose(events(solution), times, atol=exact)
+    assert float(solution["c.x"][-1]) == pytest.approx(x, abs=exact)
+
+
+@pytest.mark.slow
+def test_a_reset_that_hidden_constraints_do_not_admit():
+    """Only one of two speeds that the constraint couples: the projection moved both, away from what was asked for."""
+    with pytest.raises(SimulationError, match=r"hidden constraints do not admit.*reinit"):
+        simulate(at_a_wall().with_parameters({"c.back": 1.0}), 2.0, ts=jnp.array([2.0]), **TIGHT)
+
+
+@pytest.mark.slow
+def test_every_step_with_bdf():
+    """x' = 2·on − x, switched at 0.5 and 1.5: first at ln 4, then every ln 3."""
+
+    def write(self, ev):
+        x, on = self.variable("x", start=0.0, fixed=True), self.discrete("on", start=1)
+        self.add_equations(Eq(der(x), 2 * on - x))
+        self.when(x > 1.5, assign(on, 0))
+        self.when(x < 0.5, assign(on, 1))
+
+    solution = simulate(model(write), 4.0, solver=BDF(), rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(events(solution), np.log(4) + np.log(3) * np.arange(3), atol=1e-6)
+    assert solution.stats["num_jacobians"] > 0
+
+
+# --- a clock with values that may be wrong ---------------------------------------------------------------------------
+
+
+@functools.cache
+def clocked():
+    """It writes roots and logarithms of what parameters leave, and ends the run after a while."""
+
+    def write(self, ev):
+        x, y, d = clock_hand(self), self.variable("y", start=0.0, fixed=True), self.discrete("d")
+        T, a, b = (self.parameter(n, v) for n, v in (("T", 1.0), ("a", 5.0), ("b", 5.0)))
+        self.add_equations(Eq(der(y), 0))
+        self.when(x >= 1, assign(d, sympy.sqrt(a - x)))
+        self.when(x >= 1, reinit(y, sympy.log(b - x)))
+        self.when(self.sampled(T, 1.7), terminate("enough"))
+
+    return model(write)
+
+
+def run(**parameters):
+    changed = clocked().with_parameters({f"c.{name}": value for name, value in parameters.items()})
+    return simulate(changed, 2.0, ts=jnp.array([0.5, 1.5, 2.0]), **TIGHT)
+
+
+@pytest.mark.slow
+def test_a_clock_that_ends_the_run():
+    solution = run()
+    assert solution.events.terminated == "enough"
+    np.testing.assert_array_equal(np.isnan(solution["c.x"]), [False, False, True])
+    np.testing.assert_allclose(solution["c.y"][:2], [0.0, np.log(4.0)], atol=1e-12)
+    np.testing.assert_allclose(solution["c.d"][:2], [0.0, 2.0], atol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("parameter, name", [("a", "d"), ("b", "y")])
+def test_values_that_become_not_finite(parameter, name):
+    with pytest.raises(SimulationError, match=f"t=1: an event gave 'c.{name}' a value that is not finite"):
+        run(**{parameter: 0.5})
+
+
+@pytest.mark.parametrize("period", [0.0, -0.5])
+def test_a_period_that_is_not_positive(period):
+    with pytest.raises(ModelError, match=r"sampled\(T.*period must be positive"):
+        run(T=period)
