@@ -223,6 +223,7 @@ def slope_with_rejected_steps(adjoint):
     return jax.jit(jax.value_and_grad(final, has_aux=True))(np.array(1.9))
 
 
+@pytest.mark.slow
 def test_rejected_steps_do_no_harm():
     (value, rejected), by_a = slope_with_rejected_steps(STORED)
     assert int(rejected) > 0
