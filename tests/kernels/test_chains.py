@@ -154,10 +154,8 @@ def check(system, rule, n):
         np.testing.assert_allclose(found, expected, **TIGHT)
 
 
-SLOW_RULES = [pytest.param(rule, marks=pytest.mark.slow) for rule in (look_back, changing, far_back)]
-
-
-@pytest.mark.parametrize("rule", [two_kinds, *SLOW_RULES])
+@pytest.mark.slow
+@pytest.mark.parametrize("rule", [look_back, two_kinds, changing, far_back])
 def test_recursions(rule):
     n = 44
     system = compiled(Recursion(EqnEnv(), "c", n, rule))

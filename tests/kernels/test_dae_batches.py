@@ -97,7 +97,8 @@ FAILING = [
 ]
 
 
-@pytest.mark.parametrize("solver", [pytest.param("bdf", marks=slow), "rodas5p"])
+@slow
+@pytest.mark.parametrize("solver", SOLVERS)
 def test_those_that_fail_leave_the_others_alone(solver):
     """A singular matrix, a pole, not-a-number: three members each, all in one batch."""
     term = DAETerm(

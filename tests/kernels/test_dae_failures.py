@@ -122,7 +122,7 @@ def test_an_inconsistent_start_is_mended():
         "0.375. To mend it 'r', 'q' must move: y0 = jaxonomy_dae.solvers.consistent_start(term, y0), or "
         "system.initialize() for a compiled model"
     )
-    mended = consistent_start(TERM, WRONG)
+    mended = jax.jit(lambda y0: consistent_start(TERM, y0))(WRONG)
     assert mended[0] == 1
     np.testing.assert_allclose(mended[1], GOOD[1], rtol=1e-14)
     assert wrong_with_the_start(TERM, mended, PQR) == ""

@@ -63,7 +63,7 @@ def test_pattern_of_the_semi_explicit_form(model):
         assert len(rows) < 6 * plan.n_state
 
 
-@pytest.mark.parametrize("n", [300, pytest.param(20_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [100, pytest.param(20_000, marks=pytest.mark.slow)])
 def test_ladder_is_tridiagonal(n):
     system = rc_ladder(n)
     found = system.jacobian_pattern

@@ -298,7 +298,8 @@ class Changed:
         return node_voltages(values[: self.n + 1], values[self.n + 1 :])
 
 
-@pytest.mark.parametrize("n", [4, pytest.param(12, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [4, 12])
 def test_parameters_changed_after_compiling(n):
     changed = Changed(n)
     for values, found in zip(changed.cases, jax.jit(jax.vmap(changed.voltages))(changed.cases), strict=True):
