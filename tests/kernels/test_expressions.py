@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
+import pytest
 import sympy
 from test_functions import compiled
 
@@ -43,7 +44,7 @@ def test_size_grows_with_depth_alone():
 
 def test_a_long_equation_differentiated_twice():
     """Nested maps in a constraint of index 3: its curvature along the solution, by power series, is zero."""
-    depth = 20
+    depth = 12
 
     def write(c, t):
         x, y = c.variable("x", start=0.3, fixed=True), c.variable("y", start=0.2)
@@ -71,7 +72,9 @@ def series(value, slope, u):
     return np.array([value, slope * u[1], slope * u[2] - value * u[1] ** 2 / 2])
 
 
-def test_branches_not_taken_are_never_seen():
+@pytest.mark.long("second derivatives of expressions that share nothing")
+@pytest.mark.parametrize("count", [8, pytest.param(20, marks=pytest.mark.slow)])
+def test_branches_not_taken_are_never_seen(count):
     """Random nested branches whose untaken side is not real: first and second derivatives, forward and reverse."""
     rng = np.random.default_rng(0)
     partial = [
@@ -96,7 +99,7 @@ def test_branches_not_taken_are_never_seen():
         return sympy.Piecewise((good + X, X <= 0), (bad * sympy.sqrt(bad), True))
 
     kernels, partials = [], []
-    for k in range(20):
+    for k in range(count):
         kernels.append(Kernel([graph(grown(1 + k % 4, 0))], ["x", "y"]))
         partials.append(Kernel([partial_derivative(graph(grown(2, 0)), "x")], ["x", "y"]))
 
@@ -114,7 +117,7 @@ def test_branches_not_taken_are_never_seen():
     for z in (np.array([-0.7, 0.4]), np.array([0.0, 0.4])):
         forward, reverse, second, of_partials = derivatives(z)
         for one in (forward, second, of_partials):
-            assert np.isfinite(one).all(), np.flatnonzero(~np.isfinite(np.reshape(one, (20, -1))).all(1))
+            assert np.isfinite(one).all(), np.flatnonzero(~np.isfinite(np.reshape(one, (count, -1))).all(1))
         np.testing.assert_allclose(forward, reverse, rtol=1e-13, atol=1e-14)
 
 
@@ -144,6 +147,7 @@ FINITE_EVERYWHERE = {
 }
 
 
+@pytest.mark.long("fourteen functions with two derivatives, forward and in reverse")
 def test_what_is_finite_though_its_parts_overflow():
     """Value, slope and curvature where exp(x) is beyond the largest number, by symbols, forward and in reverse."""
     nodes = [graph(expression) for expression in FINITE_EVERYWHERE.values()]
