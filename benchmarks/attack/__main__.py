@@ -14,7 +14,7 @@ os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {FLAGS}"
 
 import jax  # noqa: E402  (it reads XLA_FLAGS)
 
-FAMILIES = ("resistors", "circuits", "rods", "gears", "thermal", "pipes", "mechanisms", "descriptors")
+FAMILIES = ("resistors", "circuits", "rods", "gears", "thermal", "pipes", "mechanisms", "descriptors", "events", "gradients")
 
 
 def attack(family: str, count: int, seed: int, moving: int = 0, show: int = 5, units: str = ""):
