@@ -5,11 +5,11 @@ from collections.abc import Callable
 
 import numpy as np
 import sympy
-from sympy import And, Piecewise, Symbol
+from sympy import Piecewise, Symbol
 
 from jaxonomy_dae import AcausalDiagram, Component, EqnEnv, assign, der, pre, reinit
 
-from .case import Case, Motion, log_uniform, names, signed
+from .case import Case, Motion, names
 from .hybrid import AMPLIFIED, APART, Clock, Delicate, HybridSystem, Reading, Reference, Rule, T
 
 ALLOWED = 1e-6  # of a variable's size
@@ -184,7 +184,9 @@ def _relation(d: Draft):
 def _timed(d: Draft):
     """A dose at a given time."""
     x, n = d.any(d.states), d.discrete()
-    d.rules.append(Rule(d.uniform(0.2, 0.8) * d.end - T, {x: d.uniform(-0.8, 0.8) * x + d.uniform(-0.5, 0.5), n: n + 1}))
+    d.rules.append(
+        Rule(d.uniform(0.2, 0.8) * d.end - T, {x: d.uniform(-0.8, 0.8) * x + d.uniform(-0.5, 0.5), n: n + 1})
+    )
 
 
 def _mode(d: Draft):

@@ -196,7 +196,9 @@ def _term(rng: np.random.Generator) -> Case:
     ev = EqnEnv()
     part = WithTerm(ev, "c", decay.tolist(), gain, c, w, starts.tolist(), network)
     names = [*(f"c.a{k}" for k in range(n)), "c.k", "c.c", "c.w", *(f"c.s{k}" for k in range(n))]
-    return _learned_case(rng, ev, AcausalDiagram().add(part), solve, p, names, "c.law", ts, f"a learned term of {n} states")
+    return _learned_case(
+        rng, ev, AcausalDiagram().add(part), solve, p, names, "c.law", ts, f"a learned term of {n} states"
+    )
 
 
 def _force(rng: np.random.Generator) -> Case:

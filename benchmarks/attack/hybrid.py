@@ -101,9 +101,7 @@ class Reference:
         self.rates, self.guards, self.slopes = self._compiled(rates), self._compiled(guards), self._compiled(slopes)
         self.single = [self._compiled([g]) for g in guards]
         events = [*system.rules, *system.clocks]
-        self.writes = [
-            (list(e.writes), self._compiled([self._explicit(w) for w in e.writes.values()])) for e in events
-        ]
+        self.writes = [(list(e.writes), self._compiled([self._explicit(w) for w in e.writes.values()])) for e in events]
 
     def _explicit(self, expression: Expr) -> Expr:
         return sympy.sympify(expression).xreplace(self.solved)
@@ -189,9 +187,7 @@ class Reference:
     def _ticked(self, t, x, q, r) -> np.ndarray:
         """The discrete variables after all clocks that tick now; each reads what was before."""
         new, place = q.copy(), {s: k for k, s in enumerate(self.system.discretes)}
-        for clock, (targets, values) in zip(
-            self.system.clocks, self.writes[len(self.system.rules) :], strict=True
-        ):
+        for clock, (targets, values) in zip(self.system.clocks, self.writes[len(self.system.rules) :], strict=True):
             if abs(t / clock.period - round(t / clock.period)) < 1e-9:
                 for s, value in zip(targets, values(t, x, q, r), strict=True):
                     new[place[s]] = value
