@@ -118,7 +118,7 @@ def _base(d: Draft):
         if d.rng.random() < 0.4:
             v = d.state(d.uniform(-1, 1), lambda v: 0)
             x = d.state(d.uniform(-1, 1), lambda x, v=v: v)
-            d.rates[v] = -(w**2).__round__(3) * sympy.sin(x) - 0.1 * decay * v
+            d.rates[v] = -round(w**2, 3) * sympy.sin(x) - 0.1 * decay * v
         else:
             x = d.state(d.uniform(-1, 1), lambda x, decay=decay: -decay * x - (0.5 * x**3 if decay > 1 else 0))
             v = x

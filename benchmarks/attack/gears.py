@@ -25,8 +25,8 @@ class ConstantTorque(Component):
 
 
 def make(seed: int, factors: Mapping[str, float] = UNCHANGED) -> Case:
-    """A train or a tree of 2 to 9 shafts; sometimes a loop of gears, which locks or is one condition too many. `factors`
-    change the values of parts, by name."""
+    """A train or a tree of 2 to 9 shafts; sometimes a loop of gears, which locks or is one condition too many.
+    `factors` change the values of parts, by name."""
     rng = np.random.default_rng([seed, 4])
     ev = EqnEnv()
     net = LinearNetwork(ev)

@@ -196,9 +196,8 @@ def _term(rng: np.random.Generator) -> Case:
     ev = EqnEnv()
     part = WithTerm(ev, "c", decay.tolist(), gain, c, w, starts.tolist(), network)
     names = [*(f"c.a{k}" for k in range(n)), "c.k", "c.c", "c.w", *(f"c.s{k}" for k in range(n))]
-    return _learned_case(
-        rng, ev, AcausalDiagram().add(part), solve, p, names, "c.law", ts, f"a learned term of {n} states"
-    )
+    diagram, note = AcausalDiagram().add(part), f"a learned term of {n} states"
+    return _learned_case(rng, ev, diagram, solve, p, names, "c.law", ts, note)
 
 
 def _force(rng: np.random.Generator) -> Case:
