@@ -19,11 +19,12 @@ endef
 
 pip = $(1)/bin/python -m pip --disable-pip-version-check
 
-.PHONY: help demo test test-all test-floors lint types docs wheel check bench notebook clean
+.PHONY: help demo test test-all test-floors attack lint types docs wheel check bench notebook clean
 
 help:
 	@echo "demo         train the pendulum's drag network (examples/)"
 	@echo "test         quick tests;  test-all: the slow ones too;  test-floors: on the oldest dependencies"
+	@echo "attack       random models for so many minutes: make attack MINUTES=10 [SEED=7] [FAMILY=events]"
 	@echo "check        lint, types, test, docs, wheel: all that must pass"
 	@echo "bench        benchmarks;  notebook: execute the example notebooks in place;  clean: remove products"
 
@@ -51,6 +52,13 @@ test: $(VENV)/.stamp-dev
 
 test-all: $(VENV)/.stamp-dev
 	$(QUICK_COMPILES) $(BIN)/python -m pytest $(IN_PARALLEL) -m "slow or not slow"
+
+# Asked before anything is made.
+$(if $(filter attack,$(MAKECMDGOALS)),$(if $(MINUTES),,$(error how many minutes? make attack MINUTES=10)))
+
+# Draws models of all families in turn, with two processes; prints the seed, which repeats a run, and a table.
+attack: $(VENV)/.stamp-dev
+	$(BIN)/python -m benchmarks.attack --minutes "$(MINUTES)" $(if $(SEED),--seed "$(SEED)") $(if $(FAMILY),--family "$(FAMILY)")
 
 lint: $(VENV)/.stamp-dev
 	$(BIN)/ruff check .
