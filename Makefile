@@ -23,7 +23,8 @@ pip = $(1)/bin/python -m pip --disable-pip-version-check
 
 help:
 	@echo "demo         train the pendulum's drag network (examples/)"
-	@echo "test         quick tests;  test-all: the slow ones too;  test-floors: on the oldest dependencies"
+	@echo "test         quick tests;  test-floors: a share of them on the oldest dependencies"
+	@echo "test-all     the slow ones too;  test-all PART=3/8: the third of eight parts"
 	@echo "attack       random models for so many minutes: make attack MINUTES=10 [SEED=7] [FAMILY=events]"
 	@echo "check        lint, types, test, docs, wheel: all that must pass"
 	@echo "bench        benchmarks;  notebook: execute the example notebooks in place;  clean: remove products"
@@ -45,13 +46,24 @@ demo: $(VENV)/.stamp-demo
 # Most of the time goes into compiling programs that run once. XLA's older code generator takes half of it and makes
 # slower programs; test-floors runs with the one that users have.
 QUICK_COMPILES := XLA_FLAGS="$$XLA_FLAGS --xla_cpu_use_fusion_emitters=false"
-IN_PARALLEL := -n auto --dist loadscope
+IN_PARALLEL := -n auto --dist worksteal
+SLOWEST := --durations=10 --durations-min=1
 
 test: $(VENV)/.stamp-dev
-	$(QUICK_COMPILES) $(BIN)/python -m pytest $(IN_PARALLEL)
+	$(QUICK_COMPILES) $(BIN)/python -m pytest $(IN_PARALLEL) $(SLOWEST)
+
+# `make test-all PART=3/8` runs the third of eight parts that take equally long by tests/durations.json, which
+# `make test-all DURATIONS=1` writes anew.
+PART :=
+part_of = $(word $(1),$(subst /, ,$(PART)))
+part_asked_for = --splits $(call part_of,2) --group $(call part_of,1)
+ALL := -m "slow or not slow" --durations-path tests/durations.json
 
 test-all: $(VENV)/.stamp-dev
-	$(QUICK_COMPILES) $(BIN)/python -m pytest $(IN_PARALLEL) -m "slow or not slow"
+	@if [ -n "$(PART)" ] && ! echo "$(PART)" | grep -Eq '^[1-9][0-9]*/[1-9][0-9]*$$'; then \
+	    echo "PART=$(PART) is not a part: PART=3/8 is the third of eight" >&2; exit 2; fi
+	$(QUICK_COMPILES) $(BIN)/python -m pytest $(IN_PARALLEL) $(SLOWEST) $(ALL) \
+	    $(if $(PART),$(part_asked_for)) $(if $(DURATIONS),--store-durations --clean-durations)
 
 # Asked before anything is made.
 $(if $(filter attack,$(MAKECMDGOALS)),$(if $(MINUTES),,$(error how many minutes? make attack MINUTES=10)))

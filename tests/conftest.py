@@ -1,5 +1,6 @@
 """Settings every test relies on. They must be made before `jaxonomy_dae` is first imported."""
 
+import ctypes
 import gc
 import os
 from pathlib import Path
@@ -21,21 +22,106 @@ jaxtyping.install_import_hook("jaxonomy_dae", "beartype.beartype")
 hypothesis.settings.register_profile("deterministic", derandomize=True, deadline=None, database=None)
 hypothesis.settings.load_profile("deterministic")
 
+LONG = 5.0  # seconds: a test of the default run that takes longer says why
+_notes: list[str] = []  # for the end of the run
+
+
+# --- compiled programs, kept for the next run ------------------------------------------------------------------------
+
+
+def _cache_folder() -> Path:
+    """Where JAX keeps compiled programs: `JAX_COMPILATION_CACHE_DIR`, or in the user's cache directory."""
+    chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    if chosen:
+        return Path(chosen)
+    caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(caches) / "jaxonomy_dae" / "tests"
+
+
+def _keep_compiled_programs() -> None:
+    """A second run reads what XLA made in the first; most of the tests' time goes into that."""
+    folder = _cache_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / f".writable-{os.getpid()}"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        jax.config.update("jax_enable_compilation_cache", False)
+        _notes.append(f"compiled programs are not kept: {folder} cannot be written ({error.strerror})")
+        return
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+_keep_compiled_programs()
+
+
+# --- compiled programs, dropped before they fill the process ---------------------------------------------------------
+
 MAPPINGS, PAGES = Path("/proc/self/maps"), Path("/proc/self/statm")  # on Linux
 MOST_MAPPINGS = 20_000  # a third of what Linux allows by default
-MOST_MEMORY = 4e9  # bytes
+
+
+def _resident() -> float:
+    """Memory of this process, in bytes."""
+    return int(PAGES.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def _share_of_memory() -> float:
+    """What a worker may grow by before it clears: a sixth of the machine, 3.9 GB of 23 GB."""
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 6
+
+
+_after_clearing = 0.0
 
 
 @pytest.fixture(autouse=True)
 def room_for_compiled_programs():
-    """Compiled programs are memory mappings, of which XLA crashes where it gets no more, and memory."""
+    """Compiled programs are memory mappings, of which XLA crashes where it gets no more, and memory.
+
+    Clearing costs half a second and makes the next test compile what it shares with others, and what is freed does not
+    all go back to the system: so memory must have grown since the last time.
+    """
+    global _after_clearing
     yield
     if not MAPPINGS.exists():
         return
-    resident = int(PAGES.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    if resident > MOST_MEMORY or MAPPINGS.read_bytes().count(b"\n") > MOST_MAPPINGS:
+    if _resident() > _after_clearing + _share_of_memory() or MAPPINGS.read_bytes().count(b"\n") > MOST_MAPPINGS:
         jax.clear_caches()
         gc.collect()
+        ctypes.CDLL(None).malloc_trim(0)
+        _after_clearing = _resident()
+
+
+# --- long tests ------------------------------------------------------------------------------------------------------
+
+_unexplained: list[tuple[float, str]] = []
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item, call):
+    report = yield
+    if item.get_closest_marker("long") or item.get_closest_marker("slow"):
+        report.user_properties.append(("long", True))
+    return report
+
+
+def pytest_runtest_logreport(report):
+    """In the process that writes the report, which under pytest-xdist is not the one that ran the test."""
+    if report.duration > LONG and ("long", True) not in report.user_properties:
+        _unexplained.append((report.duration, report.nodeid))
+
+
+def pytest_terminal_summary(terminalreporter):
+    for note in _notes:
+        terminalreporter.write_line(note, yellow=True)
+    for seconds, name in sorted(_unexplained, reverse=True)[:10]:
+        terminalreporter.write_line(f"{seconds:.1f} s, and no @pytest.mark.long(reason) says why: {name}", yellow=True)
+
+
+# --- other units -----------------------------------------------------------------------------------------------------
 
 
 def pytest_addoption(parser):
