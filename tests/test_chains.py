@@ -7,44 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import sympy
 from problems import compiled
+from shared_models import cascade, gain
 
 from jaxonomy_dae import Component, EqnEnv, der
 from jaxonomy_dae.lowering import merge
 from jaxonomy_dae.lowering.program import PlannedLoop, PlannedSparse
 
 TIGHT = dict(rtol=1e-12, atol=1e-13)
-
-
-class Filter(Component):
-    """der(x) = u − x, y = a·law(u) + b·x: a filter whose input reaches its output at once."""
-
-    def __init__(self, ev, name, a, b, law):
-        super().__init__(ev, name)
-        a, b = self.parameter("a", a), self.parameter("b", b)
-        u, y = self.variable("u"), self.variable("y")
-        x = self.variable("x", start=0.1, fixed=True)
-        self.add_equations(der(x) - (u - x), y - a * law(u) - b * x)
-
-
-class Cascade(Component):
-    """n filters in series; the first is fed 1 + sin t."""
-
-    def __init__(self, ev, name, n, law):
-        super().__init__(ev, name)
-        parts = [self.add(Filter(ev, f"f{k}", gain(k), 0.2, law)) for k in range(n)]
-        self.add_equations(parts[0].u - sympy.sin(ev.t) - 1)
-        for before, after in zip(parts, parts[1:], strict=False):
-            self.add_equations(after.u - before.y)
-
-
-def gain(k):
-    return float(0.9 + 0.05 * np.sin(k))
-
-
-def cascade(n, law=lambda u: u):
-    return compiled(Cascade(EqnEnv(), "c", n, law))
 
 
 def cascade_slopes(t, x, a, law):

@@ -4,44 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from problems import compiled, drag_on, mlp, oscillator, pendulum, rc_circuit, rc_ladder
+from problems import rc_ladder
+from shared_models import MODELS
 from test_chains import cascade
-from test_large_blocks import Grid
 
-from jaxonomy_dae import Component, EqnEnv, ModelError, der
+from jaxonomy_dae import ModelError
 from jaxonomy_dae.lowering import pattern
 from jaxonomy_dae.system.evaluate import Refinement
-
-
-class Implicit(Component):
-    """Two algebraic unknowns given implicitly, one by the other, and a state that follows them."""
-
-    def __init__(self, ev, name):
-        super().__init__(ev, name)
-        x, y = self.variable("x", start=0.5, fixed=True), self.variable("y", start=0.2, fixed=True)
-        z, w = self.variable("z", start=0.5), self.variable("w", start=0.3)
-        self.add_equations(der(x) + z, der(y) + w + 2 * y, z + 0.1 * z**3 - x, w + 0.2 * w**5 - z * y)
-
-
-def network_on_a_row():
-    return pendulum(
-        drag_on("vx", network=mlp(1, 1), inject="row"),
-        compiler={"state_selection": "dummy_derivatives", "prefer_states": ["pend.x", "pend.vx"]},
-    )
-
-
-MODELS = {
-    "circuit": rc_circuit,
-    "oscillator": oscillator,
-    "pendulum": pendulum,
-    "pendulum, minimal": lambda: pendulum(compiler={"state_selection": "dummy_derivatives"}),
-    "network": lambda: pendulum(drag_on("vx", "vy", network=mlp(2, 2))),
-    "network on a row": network_on_a_row,
-    "implicit": lambda: compiled(Implicit(EqnEnv(), "c")),
-    "cascade": lambda: cascade(12),
-    "grid": lambda: Grid(6).system(),
-    "nonlinear grid": lambda: Grid(7, cubic=0.5).system(),
-}
 
 
 def covers(found, dense: np.ndarray):

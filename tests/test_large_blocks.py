@@ -6,28 +6,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.sparse as sp
-from problems import compiled
+from shared_models import Grid
 
-from jaxonomy_dae import Component, EqnEnv, ModelError, simulate
-from jaxonomy_dae.library.electrical import Capacitor, Ground, Resistor, VoltageSource
+from jaxonomy_dae import Component, ModelError, simulate
 from jaxonomy_dae.linear import sparse
 from jaxonomy_dae.lowering import schedule
 from jaxonomy_dae.lowering.schedule import SparseStep
 from jaxonomy_dae.modeling import Electrical
 
 needs_klu = pytest.mark.skipif(importlib.util.find_spec("klujax") is None, reason='needs the extra "sparse"')
-
-
-class Varistor(Component):
-    """i = G·(v + a·v³): a conductance that grows with the voltage."""
-
-    def __init__(self, ev, name, G=1.0, a=0.5):
-        super().__init__(ev, name)
-        G, a = self.parameter("G", G), self.parameter("a", a)
-        p, n = self.port("p", Electrical), self.port("n", Electrical)
-        v, i = self.variable("v"), self.variable("i")
-        self.add_equations(v - (p.v - n.v), i - p.i, p.i + n.i, i - G * (v + a * v**3))
 
 
 class LearnedVaristor(Component):
@@ -39,67 +26,6 @@ class LearnedVaristor(Component):
         v, i = self.variable("v"), self.variable("i")
         law = self.learned("law", lambda u: G * (u + a * u**3), inputs=[v])
         self.add_equations(v - (p.v - n.v), i - p.i, p.i + n.i, i - law[0])
-
-
-class Grid:
-    """n × n nodes, neighbours joined by random conductances; a source of 1 V at one corner, 1 Ω to ground at the other,
-    and capacitors at some nodes. `cubic` makes the conductances nonlinear."""
-
-    def __init__(self, n: int, *, capacitors: int = 3, cubic: float = 0.0, law=Varistor, seed: int = 0):
-        rng = np.random.default_rng(seed)
-        number = np.arange(n * n).reshape(n, n)
-        self.edges = np.concatenate(
-            [
-                np.stack([number[1:].ravel(), number[:-1].ravel()]),
-                np.stack([number[:, 1:].ravel(), number[:, :-1].ravel()]),
-            ],
-            axis=1,
-        ).T
-        self.G = rng.uniform(0.5, 2.0, len(self.edges))
-        self.n_nodes, self.cubic, self.law = n * n, cubic, law
-        self.stored = rng.choice(np.arange(1, n * n - 1), capacitors, replace=False)
-        self.v0 = rng.uniform(0.0, 1.0, capacitors)
-
-    def system(self):
-        ev = EqnEnv()
-        source, ground, end = VoltageSource(ev, "source", 1.0), Ground(ev, "ground"), Resistor(ev, "end", 1.0)
-        pins = [[] for _ in range(self.n_nodes)]
-        parts = [source, ground, end]
-        for k, ((a, b), G) in enumerate(zip(self.edges.tolist(), self.G.tolist(), strict=True)):
-            part = self.law(ev, f"r{k}", G, self.cubic) if self.cubic else Resistor(ev, f"r{k}", 1 / G)
-            parts.append(part)
-            pins[a].append(part.p)
-            pins[b].append(part.n)
-        low = [ground.p, source.n, end.n]
-        pins[0].append(source.p)
-        pins[-1].append(end.p)
-        for k, (node, v0) in enumerate(zip(self.stored.tolist(), self.v0.tolist(), strict=True)):
-            part = Capacitor(ev, f"c{k}", 1.0, initial_voltage=v0)
-            parts.append(part)
-            pins[node].append(part.p)
-            low.append(part.n)
-        return compiled(*parts, connect=[low, *pins])
-
-    def reference(self) -> np.ndarray:
-        """The capacitors' currents at the start, by Newton's method on the nodes' balances with a sparse Jacobian."""
-        known = np.concatenate([[0], self.stored])
-        free = np.setdiff1d(np.arange(self.n_nodes), known)
-        v = np.zeros(self.n_nodes)
-        v[known] = [1.0, *self.v0]
-        a, b = self.edges.T
-        difference = sp.coo_array(
-            (np.repeat([1.0, -1.0], len(a)), (np.tile(np.arange(len(a)), 2), np.concatenate([a, b]))),
-            shape=(len(a), self.n_nodes),
-        ).tocsc()
-        drain = np.zeros(self.n_nodes)
-        drain[-1] = 1.0
-        for _ in range(30):
-            u = difference @ v
-            balance = difference.T @ (self.G * (u + self.cubic * u**3)) + drain * v
-            matrix = difference.T @ sp.diags_array(self.G * (1 + 3 * self.cubic * u**2)) @ difference
-            matrix = (matrix + sp.diags_array(drain)).tocsc()[:, free][free]
-            v[free] -= sp.linalg.spsolve(matrix, balance[free])
-        return -balance[self.stored]
 
 
 def currents(system):

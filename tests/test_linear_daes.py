@@ -14,100 +14,14 @@ import hypothesis.strategies as st
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.linalg
-import sympy
 from problems import compiled
-from sympy import Eq
+from shared_models import MIXED, Pencil, written
 
-from jaxonomy_dae import AcausalDiagram, Component, EqnEnv, der, simulate
+from jaxonomy_dae import AcausalDiagram, Component, simulate
 from jaxonomy_dae.compiler.flatten import flatten
 from jaxonomy_dae.compiler.pipeline import compile_flat
 from jaxonomy_dae.lowering.lower import lower
 from jaxonomy_dae.system.report import SystemReport
-
-T = sympy.Symbol("t")
-
-
-@dataclasses.dataclass(frozen=True)
-class Pencil:
-    """A DAE in Weierstrass form and the matrices that mix it; all entries are small integers."""
-
-    j: tuple  # rows of J
-    blocks: tuple  # sizes of the nilpotent blocks
-    g: tuple  # (a, b) of a·sin t + b·t, one for each z
-    left: tuple  # P
-    right: tuple  # Q
-    rows: tuple  # the order in which equations are written
-    columns: tuple  # the order in which variables are declared
-
-    @property
-    def n(self):
-        return len(self.left)
-
-    @property
-    def dynamic(self):
-        return len(self.j)
-
-    @property
-    def nilpotent(self):
-        size = sum(self.blocks)
-        out = np.zeros((size, size), int)
-        start = 0
-        for k in self.blocks:
-            for i in range(start, start + k - 1):
-                out[i, i + 1] = 1
-            start += k
-        return out
-
-    def forcing(self):
-        """g as SymPy expressions in T."""
-        return [a * sympy.sin(T) + b * T for a, b in self.g]
-
-    def solution(self, times, x0):
-        """y and y' at the times, each of shape (times, n)."""
-        z, dz = [], []
-        terms, power, g = [0] * len(self.g), np.eye(len(self.g), dtype=int), self.forcing()
-        for _ in range(max(self.blocks, default=0)):
-            terms = [
-                t - sum(int(p) * e for p, e in zip(row, g, strict=True)) for t, row in zip(terms, power, strict=True)
-            ]
-            g = [sympy.diff(e, T) for e in g]
-            power = power @ self.nilpotent
-        for t in times:
-            z.append([float(sympy.sympify(e).subs(T, t)) for e in terms])
-            dz.append([float(sympy.diff(e, T).subs(T, t)) for e in terms])
-        j = np.array(self.j, float).reshape(self.dynamic, self.dynamic)
-        x = np.array([scipy.linalg.expm(j * t) @ x0 for t in times]).reshape(len(times), self.dynamic)
-        q = np.array(self.right, float)
-        dx = (j @ x.T).T
-        return np.hstack([x, np.array(z).reshape(len(times), -1)]) @ q.T, np.hstack(
-            [dx, np.array(dz).reshape(len(times), -1)]
-        ) @ q.T
-
-
-def written(pencil: Pencil, name="dae", variables=None) -> Component:
-    """The component with the mixed equations; variable k is called variables[k]."""
-    names = variables or [f"y{k}" for k in range(pencil.n)]
-    d = pencil.dynamic
-    unmixed_e = scipy.linalg.block_diag(np.eye(d, dtype=int), pencil.nilpotent).reshape(pencil.n, pencil.n)
-    unmixed_a = scipy.linalg.block_diag(np.array(pencil.j, int).reshape(d, d), np.eye(pencil.n - d, dtype=int))
-    back = sympy.Matrix(pencil.right).inv()
-    e = sympy.Matrix(pencil.left) * sympy.Matrix(unmixed_e.astype(int)) * back
-    a = sympy.Matrix(pencil.left) * sympy.Matrix(unmixed_a.reshape(pencil.n, pencil.n).astype(int)) * back
-    f = sympy.Matrix(pencil.left) * sympy.Matrix([0] * d + pencil.forcing())
-
-    class Mixed(Component):
-        def __init__(self, ev, name):
-            super().__init__(ev, name)
-            for k in pencil.columns:
-                self.variable(names[k])
-            y = [self[n] for n in names]
-            for i in pencil.rows:
-                left = sum(e[i, k] * der(y[k]) for k in range(pencil.n))
-                right = sum(a[i, k] * y[k] for k in range(pencil.n)) + f[i].subs(T, ev.t)
-                self.add_equations(Eq(left, right))
-
-    return Mixed(EqnEnv(), name)
 
 
 @st.composite
@@ -142,15 +56,6 @@ def pencils(draw, mixed=True, largest=4):
         tuple(draw(st.permutations(range(n)))),
         tuple(draw(st.permutations(range(n)))),
     )
-
-
-# Index 2, two modes, mixed by products of unit triangular matrices.
-MIXED = Pencil(
-    ((0, 1), (-1, -1)), (2,), ((1, 1), (1, -1)),
-    ((1, 1, -1, 1), (1, 2, 0, 0), (-1, 0, 3, -1), (1, 0, -1, 4)),
-    ((1, 2, 0, 0), (1, 1, -1, 1), (1, 0, -1, 4), (-1, 0, 3, -1)),
-    (0, 1, 2, 3), (0, 1, 2, 3),
-)  # fmt: skip
 
 
 def plan_of(component: Component):

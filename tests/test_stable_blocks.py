@@ -12,9 +12,9 @@ import mpmath
 import numpy as np
 import pytest
 from attack import circuits
+from shared_models import attenuator, levers
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der
-from jaxonomy_dae.library.electrical import Capacitor, Ground, Resistor, VoltageSource
 from jaxonomy_dae.linear.torn import solve_torn
 from jaxonomy_dae.linear.written_out import solve, solve_dense
 from jaxonomy_dae.structure.tearing import LINKS, Sizes, Tearing, tear
@@ -242,24 +242,6 @@ def test_pivots_do_not_depend_on_the_scale_of_an_equation(n):
 # --- compiled models ----------------------------------------------------------------------------------------------
 
 
-def attenuator(n, rs=1.0, rp=1.0):
-    """n sections of the library's resistors between a source of 1 V and a capacitor at 0 V."""
-    ev, diagram = EqnEnv(), AcausalDiagram()
-    source, ground, end = VoltageSource(ev, "V", v=1.0), Ground(ev, "G"), Capacitor(ev, "C", initial_voltage=0.0)
-    low, at = [source.n, ground.p, end.n], source.p
-    for k in range(n):
-        s, p = Resistor(ev, f"s{k}", R=rs), Resistor(ev, f"p{k}", R=rp)
-        diagram.connect(at, s.p)
-        diagram.connect(s.n, p.p)
-        low.append(p.n)
-        at = s.n
-    last = Resistor(ev, "last", R=rs)
-    diagram.connect(at, last.p)
-    diagram.connect(last.n, end.p)
-    diagram.connect(*low)
-    return AcausalCompiler(ev, diagram)()
-
-
 def node_voltages(rs, rp):
     """Nodal analysis of the attenuator."""
     n = len(rp)
@@ -310,28 +292,6 @@ def test_parameters_changed_after_compiling(n):
 
 
 # --- the choice of states, and projection --------------------------------------------------------------------------
-
-
-class Levers(Component):
-    """Two rigid couplings of three carriages, written in units `u` of length and with equations multiplied by `k`."""
-
-    def __init__(self, ev, name, k=1.0, u=1.0, order=(0, 1)):
-        super().__init__(ev, name)
-        x = [self.variable(f"x{i}", start=s * u, nominal=u) for i, s in enumerate((0.3, 0.6, 1.5))]
-        v = [self.variable(f"v{i}", nominal=u) for i in range(3)]
-        f = [self.variable(f"f{i}", nominal=u) for i in range(2)]
-        self.add_equations(*(der(a) - b for a, b in zip(x, v, strict=True)))
-        self.add_equations(der(v[0]) + x[0] - 2 * f[0], der(v[1]) + f[0] - 5 * f[1], der(v[2]) + f[1])
-        a, b = self.parameter("a", 2.0), self.parameter("b", 2.5)
-        constraints = [k * (a * x[0] - x[1]), k * (2 * b * x[1] - 2 * x[2])]
-        self.add_equations(*(constraints[i] for i in order))
-
-
-def levers(mode, **options):
-    ev = EqnEnv()
-    diagram = AcausalDiagram()
-    diagram.add(Levers(ev, "c", **options))
-    return AcausalCompiler(ev, diagram, state_selection=mode)()
 
 
 RESCALED = ({"k": 1e9}, {"k": 1e-9}, {"k": 1e-12}, {"u": 1e-12}, {"u": 1e9}, {"k": 1e9, "u": 1e-6}, {"order": (1, 0)})
