@@ -10,7 +10,7 @@ import os
 import sys
 import time
 
-from .draws import FAMILIES, PUBLISHED, UNITS, Draw, draws
+from .draws import FAMILIES, NETWORKS, PUBLISHED, UNITS, Draw, draws
 from .outcome import GOOD, HEAD, row
 from .timed import attack
 
@@ -54,12 +54,19 @@ def arguments(given: list[str] | None = None) -> argparse.Namespace:
     """What is asked for. Exits with a message where that cannot be meant."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.attack")
     parser.add_argument("--minutes", type=minutes, help="draw from all families in turn, for so long")
-    parser.add_argument("--family", type=families, default=FAMILIES, help=f"all, or of {', '.join(FAMILIES)}")
+    parser.add_argument("--family", type=families, help=f"all, or of {', '.join(FAMILIES)}")
     parser.add_argument("--seed", type=natural, help="default: from the clock, with --minutes; else 0")
     parser.add_argument("--count", type=natural, default=100, help="models of each family, without --minutes")
     parser.add_argument("--moving", type=natural, default=0, help="integrate every so many-th model too (0: none)")
     parser.add_argument("--units", choices=UNITS, default="", help="rescale the models first")
     out = parser.parse_args(given)
+    if out.family is None or set(out.family) == set(FAMILIES):
+        out.family = NETWORKS if out.units else FAMILIES
+    if out.units and out.minutes is not None:
+        parser.error("with --minutes, every family is rescaled, too: leave --units out")
+    for name in out.family:
+        if out.units and name not in (*NETWORKS, PUBLISHED):
+            parser.error(f"the family '{name}' cannot be rescaled")
     if out.seed is None:
         out.seed = 0 if out.minutes is None else int(time.time()) % 100_000
     if out.minutes is None and not out.count:

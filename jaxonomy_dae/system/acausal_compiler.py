@@ -103,7 +103,7 @@ class AcausalCompiler:
             flat.arrays, plan.digest,
         )  # fmt: skip
         with jax.ensure_compile_time_eval():  # also where it is called while a function is traced
-            values = jnp.asarray(declared.values[:n], dtype=jnp.zeros(()).dtype)
+            values = jnp.asarray(declared.values[:n], dtype=jnp.result_type(float))
         parameters = Parameters(values, None, (), table)
         neural = {name: _own(network) for name, network in flat.networks.items()}
         return AcausalSystem(parameters, neural, plan)

@@ -21,10 +21,11 @@ def test_starts_and_slopes(name, kind):
     compare_starts(compare_verdicts(*outcome(MODELS[name]), kind, 1, shuffled=True))
 
 
-# A kind of units for each model; `make attack` draws the others with random models.
+# A sample, of each kind of model and of units; `make attack` draws random ones.
+SAMPLE = ("circuit", "levers, projected", "pendulum", "network", "orifices", "triangle", "prescribed motion", "squares")
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name, kind", [(name, KINDS[k % len(KINDS)]) for k, name in enumerate(MODELS)])
-def test_starts_and_slopes_of_all(name, kind):
-    pair = compare_verdicts(*outcome(MODELS[name]), kind, seed=0)
-    if pair is not None:
-        compare_starts(pair)
+@pytest.mark.parametrize("name, kind", [(name, KINDS[k % len(KINDS)]) for k, name in enumerate(SAMPLE)])
+def test_starts_and_slopes_of_a_sample(name, kind):
+    compare_starts(compare_verdicts(*outcome(MODELS[name]), kind, seed=0))
