@@ -19,12 +19,13 @@ endef
 
 pip = $(1)/bin/python -m pip --disable-pip-version-check
 
-.PHONY: help demo test test-all test-floors lint types docs wheel check bench notebook clean
+.PHONY: help demo test test-all test-floors attack lint types docs wheel check bench notebook clean
 
 help:
 	@echo "demo         train the pendulum's drag network (examples/)"
 	@echo "test         quick tests;  test-floors: a share of them on the oldest dependencies"
 	@echo "test-all     the slow ones too;  test-all PART=3/8: the third of eight parts"
+	@echo "attack       random models for so many minutes: make attack MINUTES=10 [SEED=7] [FAMILY=events]"
 	@echo "check        lint, types, test, docs, wheel: all that must pass"
 	@echo "bench        benchmarks;  notebook: execute the example notebooks in place;  clean: remove products"
 
@@ -63,6 +64,13 @@ test-all: $(VENV)/.stamp-dev
 	    echo "PART=$(PART) is not a part: PART=3/8 is the third of eight" >&2; exit 2; fi
 	$(QUICK_COMPILES) $(BIN)/python -m pytest $(IN_PARALLEL) $(SLOWEST) $(ALL) \
 	    $(if $(PART),$(part_asked_for)) $(if $(DURATIONS),--store-durations --clean-durations)
+
+# Asked before anything is made.
+$(if $(filter attack,$(MAKECMDGOALS)),$(if $(MINUTES),,$(error how many minutes? make attack MINUTES=10)))
+
+# Draws models of all families in turn, with two processes; prints the seed, which repeats a run, and a table.
+attack: $(VENV)/.stamp-dev
+	$(BIN)/python -m benchmarks.attack --minutes "$(MINUTES)" $(if $(SEED),--seed "$(SEED)") $(if $(FAMILY),--family "$(FAMILY)")
 
 lint: $(VENV)/.stamp-dev
 	$(BIN)/ruff check .

@@ -2,7 +2,7 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -64,6 +64,14 @@ def watched() -> Iterator[list[Compiled]]:
         yield seen
     finally:
         AcausalCompiler.__call__ = plain
+
+
+def outcome(build: Callable[[], AcausalSystem]) -> Compiled:
+    """The compiler of a model, with its system or the error that refuses it."""
+    with watched() as seen:
+        with contextlib.suppress(ModelError):
+            build()
+    return seen[-1]
 
 
 def is_rescalable(compiler: AcausalCompiler) -> bool:

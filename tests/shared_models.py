@@ -352,7 +352,7 @@ def triangle(unit, nominal, y=2.0):
     return compiled(component(write))
 
 
-def scaled_cubic(k, nominal):
+def cubic_of(k, nominal=False):
     """k·(z³ − x) = 0."""
 
     def write(self, _):
@@ -360,20 +360,28 @@ def scaled_cubic(k, nominal):
         z = self.variable("z", start=0.8, **({"nominal": 1.0} if nominal else {}))
         self.add_equations(Eq(der(x), -x), Eq(k * (z**3 - x), 0))
 
-    return compiled(component(write))
+    return write
 
 
-def charge(c0):
+def scaled_cubic(k, nominal):
+    return compiled(component(cubic_of(k, nominal)))
+
+
+def charge_of(c0):
     """A nonlinear capacitor, q = C0·(1 + v²)·v, with q = 2·C0: v = 1."""
 
     def write(self, _):
         q, v = self.variable("q", start=2 * c0, fixed=True), self.variable("v", start=0.3)
         self.add_equations(Eq(c0 * (1 + v**2) * v, q), Eq(der(q), -v * c0 / 1e-6))
 
-    return compiled(component(write))
+    return write
 
 
-def orifices(pascal, flow):
+def charge(c0):
+    return compiled(component(charge_of(c0)))
+
+
+def orifices_of(pascal, flow):
     """Two orifices in series from 200 bar to 1 bar: the pressure between is the mean."""
 
     def write(self, _):
@@ -386,7 +394,11 @@ def orifices(pascal, flow):
             Eq(der(p), -q * 1.4e12 * pascal / flow),
         )
 
-    return compiled(component(write))
+    return write
+
+
+def orifices(pascal, flow):
+    return compiled(component(orifices_of(pascal, flow)))
 
 
 class Twice(Component):

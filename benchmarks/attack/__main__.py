@@ -1,69 +1,111 @@
-"""Counts: `python -m benchmarks.attack --family resistors --count 100 --seed 0`."""
+"""Draws models and counts what becomes of them.
+
+python -m benchmarks.attack --minutes 10 --seed 7                    all families in turn, until the time is spent
+python -m benchmarks.attack --family resistors --count 100           so many models of one family
+"""
 
 import argparse
-import collections
-import importlib
+import math
 import os
+import sys
 import time
+
+from .draws import FAMILIES, NETWORKS, PUBLISHED, UNITS, Draw, draws
+from .outcome import GOOD, HEAD, row
+from .timed import attack
 
 # Every model is run once, so compiling takes most of the time.
 FLAGS = (
     "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
 )
-os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {FLAGS}"
-
-import jax  # noqa: E402  (it reads XLA_FLAGS)
-
-FAMILIES = ("resistors", "circuits", "rods", "gears", "thermal", "pipes", "mechanisms", "descriptors")
 
 
-def attack(family: str, count: int, seed: int, moving: int = 0, show: int = 5, units: str = ""):
-    """Judges `count` models of a family from `seed` on; every `moving`-th is integrated as well. With `units`, the
-    models are written in other units first. Returns the outcomes by seed."""
-    from . import rescaled
-    from .judge import judged
-
-    make = importlib.import_module(f".{family}", __package__).make
-    if units:
-        make = rescaled.family(make, units)
-    outcomes = {}
-    cases = ((s, make(s)) for s in range(seed, seed + count))
-    for s, case, outcome in judged(cases, lambda s: bool(moving) and s % moving == 0):
-        outcomes[s] = outcome
-        if outcome.kind not in ("right", "refused") and show > 0:
-            show -= 1
-            text = outcomes[s].text
-            print(f"  {family} {s} ({case.note}): {outcomes[s].kind}: {text[:400]}", flush=True)
-    return outcomes
+def minutes(text: str) -> float:
+    """A number of minutes."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"how many minutes? a positive number, such as 10; got '{text}'")
+    return value
 
 
-def main():
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--family", default="all", help=f"all, or one of {', '.join(FAMILIES)}")
-    parser.add_argument("--count", type=int, default=100)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--moving", type=int, default=0, help="integrate every so many-th model too (0: none)")
-    parser.add_argument("--show", type=int, default=5, help="how many failures of a family are printed")
-    parser.add_argument("--units", default="", help="rescale: equations, parameters, units or all")
-    given = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    families = FAMILIES if given.family == "all" else given.family.split(",")
-    kinds = ("right", "refused", "untrue", "crashed", "late", "wrong")
-    print(f"{'family':<12}" + "".join(f"{k:>9}" for k in kinds) + "   worst error    ms each   slowest", flush=True)
-    for family in families:
-        start = time.perf_counter()
-        outcomes = attack(family, given.count, given.seed, given.moving, given.show, given.units)
-        seconds = time.perf_counter() - start
-        tally = collections.Counter(o.kind for o in outcomes.values())
-        worst = max((o.error for o in outcomes.values() if o.kind == "right"), default=0.0)
-        row = "".join(f"{tally[k]:>9}" for k in kinds)
-        slowest = max(outcomes, key=lambda s: outcomes[s].seconds)
-        print(
-            f"{family:<12}{row}{worst * 1e-8:>14.1e}{1e3 * seconds / max(1, given.count):>11.0f}"
-            f"   seed {slowest} in {outcomes[slowest].seconds:.1f} s",
-            flush=True,
-        )
+def families(text: str) -> tuple[str, ...]:
+    """Names of families, or all of them."""
+    if text == "all":
+        return FAMILIES
+    names = tuple(text.split(","))
+    for name in names:
+        if name not in (*FAMILIES, PUBLISHED):
+            known = ", ".join((*FAMILIES, PUBLISHED))
+            raise argparse.ArgumentTypeError(f"there is no family '{name}'; there are {known}, and all")
+    return names
+
+
+def natural(text: str) -> int:
+    """A number that seeds a generator, or counts."""
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"a natural number is needed; got '{text}'")
+    return int(text)
+
+
+def arguments(given: list[str] | None = None) -> argparse.Namespace:
+    """What is asked for. Exits with a message where that cannot be meant."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.attack")
+    parser.add_argument("--minutes", type=minutes, help="draw from all families in turn, for so long")
+    parser.add_argument("--family", type=families, help=f"all, or of {', '.join(FAMILIES)}")
+    parser.add_argument("--seed", type=natural, help="default: from the clock, with --minutes; else 0")
+    parser.add_argument("--count", type=natural, default=100, help="models of each family, without --minutes")
+    parser.add_argument("--moving", type=natural, default=0, help="integrate every so many-th model too (0: none)")
+    parser.add_argument("--units", choices=UNITS, default="", help="rescale the models first")
+    out = parser.parse_args(given)
+    if out.family is None or set(out.family) == set(FAMILIES):
+        out.family = NETWORKS if out.units else FAMILIES
+    if out.units and out.minutes is not None:
+        parser.error("with --minutes, every family is rescaled, too: leave --units out")
+    for name in out.family:
+        if out.units and name not in (*NETWORKS, PUBLISHED):
+            parser.error(f"the family '{name}' cannot be rescaled")
+    if out.seed is None:
+        out.seed = 0 if out.minutes is None else int(time.time()) % 100_000
+    if out.minutes is None and not out.count:
+        parser.error("a count of at least 1 is needed")
+    if PUBLISHED in out.family and out.minutes is None and not out.units:
+        parser.error(f"the family '{PUBLISHED}' is its own reference: it needs --units")
+    return out
+
+
+def counted(family: str, given: argparse.Namespace) -> bool:
+    """Judges `count` models from `seed` on, in this process. Returns whether all are right or truly refused."""
+    from .judge import drop_programs
+    from .timed import KEPT
+
+    outcomes = []
+    for k in range(given.count):
+        seed = given.seed + k
+        draw = Draw(family, seed, given.units, bool(given.moving) and seed % given.moving == 0)
+        note, outcome = draw.judged()
+        outcomes.append((seed, outcome))
+        if outcome.kind not in GOOD:
+            print(f"  {outcome.kind}: {draw.row} {seed} ({note}): {outcome.text[:400]}", flush=True)
+        if k % KEPT == KEPT - 1:
+            drop_programs()
+    print(row(draw.row, outcomes), flush=True)
+    return all(outcome.kind in GOOD for _, outcome in outcomes)
+
+
+def main() -> int:
+    given = arguments()
+    # Read by JAX when it starts: here, and in the processes that are started.
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {FLAGS}"
+    os.environ["JAX_ENABLE_X64"] = "1"
+    if given.minutes is not None:
+        print(f"seed {given.seed}, {given.minutes:g} minutes", flush=True)
+        return 0 if attack(draws(given.family, given.seed), given.minutes, lambda text: print(text, flush=True)) else 1
+    print(HEAD, flush=True)
+    return 0 if all([counted(family, given) for family in given.family]) else 1
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -1,7 +1,8 @@
 """What a random model is: a diagram, the values that determine its point, and what must come out."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+import types
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from jaxonomy_dae import AcausalDiagram, Component, EqnEnv
 
 TOLERANCE = 1e-8  # of a quantity's scale
 ROUNDING = 100 * np.finfo(float).eps
+UNCHANGED: Mapping[str, float] = types.MappingProxyType({})  # no part's value is multiplied
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,6 +30,8 @@ class Case:
     - `expected`: true values by variable. `rates`: true time derivatives, for those that are states.
     - `freedom`: how many states there must be; None if the family does not say (or keeps redundant ones).
     - `refusal`: if the model has no unique solution, what the error must say (one of these words); None if it has one.
+    - `motion`: a true trajectory; integrated if asked for, or if the case `always_moves`. `slopes`: derivatives of a
+        functional of it.
     - `may_refuse`: what an error may truly say of a model that has a solution, but asks for more than is promised.
     """
 
@@ -39,6 +43,8 @@ class Case:
     freedom: int | None = None
     refusal: Sequence[str] | None = None
     motion: "Motion | None" = None
+    slopes: "Slopes | None" = None
+    always_moves: bool = False
     t0: float = 0.0
     may_refuse: Sequence[str] = ()
     note: str = ""
@@ -46,13 +52,27 @@ class Case:
 
 @dataclasses.dataclass(frozen=True)
 class Motion:
-    """A true trajectory: `values[name]` at the times `ts`, with the errors allowed at rtol, atol."""
+    """A true trajectory: `values[name]` at the times `ts`, with the errors allowed at rtol, atol. `follow` gives the
+    values for other initial values and times, if the family can."""
 
     ts: np.ndarray
     values: Mapping[str, np.ndarray]
     allowed: Mapping[str, float]
     rtol: float
     atol: float
+    follow: Callable[[Mapping[str, float], np.ndarray], Mapping[str, np.ndarray]] | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Slopes:
+    """The true derivatives of Σ weights[name]·values(name) over the motion's times: by `parameters` and by the values
+    `initial` of the case, by name; by all weights of the networks in `learned`, by their number."""
+
+    weights: Mapping[str, np.ndarray]
+    value: Expected
+    parameters: Mapping[str, Expected]
+    initial: Mapping[str, Expected]
+    learned: Mapping[str, Sequence[Expected]] = dataclasses.field(default_factory=dict)
 
 
 def diagram_of(rng: np.random.Generator, parts: Sequence[Component], nodes: Sequence[Sequence[Any]]) -> AcausalDiagram:

@@ -1,6 +1,8 @@
 """Circuits of resistors, capacitors, inductors and sources, with loops of capacitors and cut sets of inductors (index
 2), against modified nodal analysis."""
 
+from collections.abc import Mapping
+
 import numpy as np
 import sympy
 
@@ -8,7 +10,7 @@ from jaxonomy_dae import Component, EqnEnv
 from jaxonomy_dae.library.electrical import Capacitor, CurrentSource, Ground, Inductor, Resistor, VoltageSource
 from jaxonomy_dae.modeling import Electrical
 
-from .case import Case, log_uniform, names, signed
+from .case import UNCHANGED, Case, log_uniform, names, signed
 from .linear_network import ORDER, LinearNetwork
 
 
@@ -23,8 +25,8 @@ class SineVoltage(Component):
         self.add_equations(v - p.v + n.v, i - p.i, p.i + n.i, v - size * sympy.sin(rate * ev.t + shift))
 
 
-def make(seed: int) -> Case:
-    """A circuit of 2 to 14 nodes around ground."""
+def make(seed: int, factors: Mapping[str, float] = UNCHANGED) -> Case:
+    """A circuit of 2 to 14 nodes around ground. `factors` change the values of parts, by name."""
     rng = np.random.default_rng([seed, 2])
     ev = EqnEnv()
     net = LinearNetwork(ev)
@@ -74,7 +76,7 @@ def make(seed: int) -> Case:
     for (which, a, b), name in zip(edges, label, strict=False):
         if rng.random() < 0.5:
             a, b = b, a
-        x = value()
+        x = value() * factors.get(name, 1.0)
         current: tuple = ({}, {}, 0.0)
         if which == "R":
             part = Resistor(ev, name, x)

@@ -1,5 +1,7 @@
 """Gear trains of inertias, springs, dampers and ideal gears, against the torques at every node."""
 
+from collections.abc import Mapping
+
 import numpy as np
 from sympy import Eq
 
@@ -7,7 +9,7 @@ from jaxonomy_dae import Component, EqnEnv
 from jaxonomy_dae.library.rotational import Damper, FixedAngle, IdealGear, Inertia, Spring
 from jaxonomy_dae.modeling import Rotational
 
-from .case import Case, log_uniform, names, signed
+from .case import UNCHANGED, Case, log_uniform, names, signed
 from .linear_network import LinearNetwork
 
 WORDS = ["determine", "contradict", "singular", "redundant", "follow", "too many", "nothing holds", "connected"]
@@ -22,8 +24,9 @@ class ConstantTorque(Component):
         self.add_equations(Eq(flange.tau, -self.parameter("size", size)))
 
 
-def make(seed: int) -> Case:
-    """A train or a tree of 2 to 9 shafts; sometimes a loop of gears, which locks or is one condition too many."""
+def make(seed: int, factors: Mapping[str, float] = UNCHANGED) -> Case:
+    """A train or a tree of 2 to 9 shafts; sometimes a loop of gears, which locks or is one condition too many.
+    `factors` change the values of parts, by name."""
     rng = np.random.default_rng([seed, 4])
     ev = EqnEnv()
     net = LinearNetwork(ev)
@@ -64,10 +67,10 @@ def make(seed: int) -> Case:
     for (which, a, b), name in zip(edges, label, strict=True):
         if rng.random() < 0.5:
             a, b = b, a
-        k = value()
+        k = value() * factors.get(name, 1.0)
         angle = {phi[b]: 1.0, phi[a]: -1.0}
         if which == "gear":
-            ratio = signed(rng, log_uniform(rng, -1, 1))
+            ratio = signed(rng, log_uniform(rng, -1, 1)) * factors.get(name, 1.0)
             part = IdealGear(ev, name, ratio)
             tau = net.unknown()
             enter(a, {tau: 1.0})

@@ -10,7 +10,7 @@ import scipy.linalg
 from jaxonomy_dae import Component, EqnEnv
 
 from .case import ROUNDING, TOLERANCE, Case, Expected, Motion, diagram_of
-from .linear_dae import LARGE, NoUniqueSolution, flow
+from .linear_dae import LARGE, Flow, NoUniqueSolution, flow
 
 ORDER = 4
 
@@ -94,20 +94,39 @@ class LinearNetwork:
             self.ev, diagram, initial, true(found), true(rates), len(at.free), motion=motion, note=f"{note}, size {n}"
         )
 
-    def _motion(self, at, x, end, largest, found) -> Motion:
-        m = len(at.free)
-        matrix = np.zeros((m + 1, m + 1))
-        matrix[:m, :m], matrix[:m, m] = at.Q[at.free], at.d0[at.free]
-        fastest = max(1e-3, float(np.max(np.abs(np.linalg.eigvals(matrix)), initial=0)))
+    def _motion(self, at: Flow, x: np.ndarray, end: float, largest: Mapping[str, float], found) -> Motion:
+        fastest = max(1e-3, float(np.max(np.abs(np.linalg.eigvals(_generator(at))), initial=0)))
         ts = np.linspace(0.0, 2 * np.pi * end / fastest, 4)[1:]
-        points = np.array([scipy.linalg.expm(matrix * t)[:, :] @ [*x, 1.0] for t in ts])[:, :m]
-        ys = at.y0.astype(float) + points @ at.P.astype(float).T
-        dys = at.d0.astype(float) + points @ at.Q.astype(float).T
-        values, allowed = {}, {}
-        for r in self.readings:
-            if r.name in found:
-                parts = [c * ys[:, k] for k, c in r.values.items()] + [c * dys[:, k] for k, c in r.rates.items()]
-                values[r.name] = sum(parts, np.full(len(ts), r.constant))
-                grown = max((float(np.max(np.abs(part))) for part in parts), default=0.0)
-                allowed[r.name] = 1e-6 * max(largest[r.kind], grown, 1e-6)
-        return Motion(ts, values, allowed, 1e-9, 1e-11)
+        readings = [r for r in self.readings if r.name in found]
+        values, grown = _followed(at, x, ts, readings)
+        allowed = {r.name: 1e-6 * max(largest[r.kind], grown[r.name], 1e-6) for r in readings}
+        unknown = {name: k for k, name in self.start_name.items()}
+
+        def follow(initial: Mapping[str, float], ts: np.ndarray) -> Mapping[str, np.ndarray]:
+            rows = [unknown[name] for name in initial]
+            given = np.array(list(initial.values())) - at.y0[rows].astype(float)
+            return _followed(at, np.linalg.solve(at.P[rows].astype(float), given), ts, readings)[0]
+
+        return Motion(ts, values, allowed, 1e-9, 1e-11, follow)
+
+
+def _generator(at: Flow) -> np.ndarray:
+    """The matrix M of d(x, 1)/dt = M·(x, 1) for the free unknowns x."""
+    m = len(at.free)
+    matrix = np.zeros((m + 1, m + 1))
+    matrix[:m, :m], matrix[:m, m] = at.Q[at.free], at.d0[at.free]
+    return matrix
+
+
+def _followed(at: Flow, x: np.ndarray, ts: np.ndarray, readings: Sequence[Reading]):
+    """The readings at the times, from x at zero; and the largest of the terms that each of them sums."""
+    matrix = _generator(at)
+    points = np.array([scipy.linalg.expm(matrix * t) @ [*x, 1.0] for t in ts])[:, :-1]
+    ys = at.y0.astype(float) + points @ at.P.astype(float).T
+    dys = at.d0.astype(float) + points @ at.Q.astype(float).T
+    values, grown = {}, {}
+    for r in readings:
+        parts = [c * ys[:, k] for k, c in r.values.items()] + [c * dys[:, k] for k, c in r.rates.items()]
+        values[r.name] = sum(parts, np.full(len(ts), r.constant))
+        grown[r.name] = max((float(np.max(np.abs(part))) for part in parts), default=0.0)
+    return values, grown

@@ -1,18 +1,21 @@
 """Masses, springs, dampers and rigid rods along a line (index 3), against the forces at every node."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from jaxonomy_dae import EqnEnv
 from jaxonomy_dae.library.translational import Damper, FixedPosition, Mass, Rod, Spring
 
-from .case import Case, log_uniform, names
+from .case import UNCHANGED, Case, log_uniform, names
 from .linear_network import LinearNetwork
 
 WORDS = ["determine", "contradict", "singular", "redundant", "follow", "too many", "nothing holds", "connected"]
 
 
-def make(seed: int) -> Case:
-    """A chain or a tree with further springs and dampers, of 2 to 9 nodes; some nodes have masses, some are fixed."""
+def make(seed: int, factors: Mapping[str, float] = UNCHANGED) -> Case:
+    """A chain or a tree with further springs and dampers, of 2 to 9 nodes; some nodes have masses, some are fixed.
+    `factors` change the values of parts, by name."""
     rng = np.random.default_rng([seed, 3])
     ev = EqnEnv()
     net = LinearNetwork(ev)
@@ -52,7 +55,7 @@ def make(seed: int) -> Case:
     for (which, a, b), name in zip(edges, label, strict=False):
         if rng.random() < 0.5:
             a, b = b, a
-        k, length = value(), float(rng.uniform(-1, 1))
+        k, length = value() * factors.get(name, 1.0), float(rng.uniform(-1, 1))
         if which == "rod":
             part = Rod(ev, name, length)
             f = net.unknown()
@@ -82,7 +85,7 @@ def make(seed: int) -> Case:
         name = label[len(edges) + node]
         choice = rng.random()
         if choice < heavy:
-            m = value()
+            m = value() * factors.get(name, 1.0)
             part = Mass(ev, name, m)
             inertia[node][v[node]] = m
             net.start_name[x[node]], net.start_name[v[node]] = f"{name}.s", f"{name}.v"

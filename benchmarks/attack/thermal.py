@@ -1,5 +1,7 @@
 """Thermal networks, against the heat flows at every node. Two capacities at one node give index 2."""
 
+from collections.abc import Mapping
+
 import numpy as np
 from sympy import Eq
 
@@ -7,7 +9,7 @@ from jaxonomy_dae import Component, EqnEnv
 from jaxonomy_dae.library.thermal import FixedTemperature, HeatCapacitor, ThermalConductor
 from jaxonomy_dae.modeling import Thermal
 
-from .case import Case, log_uniform, names, signed
+from .case import UNCHANGED, Case, log_uniform, names, signed
 from .linear_network import LinearNetwork
 
 WORDS = [
@@ -32,8 +34,8 @@ class Heater(Component):
         self.add_equations(Eq(heat.Q_flow, -self.parameter("size", size)))
 
 
-def make(seed: int) -> Case:
-    """A tree of 1 to 25 temperatures with further conductors."""
+def make(seed: int, factors: Mapping[str, float] = UNCHANGED) -> Case:
+    """A tree of 1 to 25 temperatures with further conductors. `factors` change the values of parts, by name."""
     rng = np.random.default_rng([seed, 5])
     ev = EqnEnv()
     net = LinearNetwork(ev)
@@ -64,7 +66,7 @@ def make(seed: int) -> Case:
     for (which, a, b), name in zip(kinds, label, strict=False):
         if rng.random() < 0.5:
             a, b = b, a
-        k, ta, tb = value(), temperature[a], temperature[b]
+        k, ta, tb = value() * factors.get(name, 1.0), temperature[a], temperature[b]
         if which == "conductor":
             part = ThermalConductor(ev, name, k)
             for node, sign in ((a, 1.0), (b, -1.0)):

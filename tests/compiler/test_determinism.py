@@ -8,28 +8,10 @@ import subprocess
 import sys
 
 import pytest
-from problems import compiled, drag_on, environment, oscillator, pendulum, rc_circuit
+from problems import drag_on, environment, oscillator, pendulum, rc_circuit
 from recipes import draw_recipe, names_of, outcome
+from shared_models import ladder
 from test_explained_structure import CASES
-
-from jaxonomy_dae import EqnEnv
-from jaxonomy_dae.library.electrical import Capacitor, Ground, Inductor, Resistor, VoltageSource
-
-
-def ladder(names=None, stages=3):
-    """A filter of stages with an inductor, a resistor and two parallel capacitors each."""
-    plain = ["source", "ground", *(f"{kind}{k}" for k in range(stages) for kind in ("l", "r", "c", "d"))]
-    name = dict(zip(plain, names or plain, strict=True))
-    ev = EqnEnv()
-    source, ground = VoltageSource(ev, name["source"], 2.0), Ground(ev, name["ground"])
-    parts, connect, above = [source, ground], [(source.n, ground.p)], source.p
-    for k in range(stages):
-        coil = Inductor(ev, name[f"l{k}"], 0.1 + k)
-        r, c, d = Resistor(ev, name[f"r{k}"], 1.0 + k), Capacitor(ev, name[f"c{k}"], 0.5), Capacitor(ev, name[f"d{k}"])
-        parts += [coil, r, c, d]
-        connect += [(above, coil.p), (coil.n, r.p), (r.n, c.p, d.p), (c.n, d.n, ground.p)]
-        above = r.n
-    return compiled(*parts, connect=connect)
 
 
 def systems():

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from problems import compiled
+from problems import compiled, component
+from shared_models import charge, charge_of, cubic_of, orifices, orifices_of, scaled_cubic, triangle
 from sympy import Abs, Eq, log, sqrt
 
 from jaxonomy_dae import Component, EqnEnv, InitializationError, der
@@ -16,8 +17,8 @@ from jaxonomy_dae import Component, EqnEnv, InitializationError, der
 class Written(Component):
     """A component written by a function."""
 
-    def __init__(self, ev, write, name="c"):
-        super().__init__(ev, name)
+    def __init__(self, ev, write):
+        super().__init__(ev, "c")
         write(self)
 
 
@@ -36,20 +37,6 @@ def _found(system, names):
 
 
 # --- contradictions ----------------------------------------------------------------------------------------------
-
-
-def triangle(unit, nominal, y=2.0):
-    """y = 2x by way of z, beside a pressure of 1e7: x = u, y = 3u contradict each other whatever u."""
-
-    def write(self):
-        size = {"nominal": unit} if nominal else {}
-        p = self.variable("p", start=1e7, fixed=True)
-        x = self.variable("x", start=unit, fixed=True, **size)
-        y_ = self.variable("y", start=y * unit, fixed=True, **size)
-        z = self.variable("z", **size)
-        self.add_equations(Eq(der(p), -p), Eq(x + y_, z), Eq(der(x), -x), Eq(z, self.parameter("k", 3.0) * x))
-
-    return model(write)
 
 
 @pytest.mark.parametrize(
@@ -128,65 +115,16 @@ def test_rows_do_not_depend_on_the_values_they_were_chosen_with():
 # --- the same model in other units -----------------------------------------------------------------------------------
 
 
-def scaled_cubic(k, nominal):
-    return model(cubic_of(k, nominal))
-
-
-def cubic_of(k, nominal=False):
-    """k·(z³ − x) = 0."""
-
-    def write(self):
-        x = self.variable("x", start=0.5, fixed=True)
-        z = self.variable("z", start=0.8, **({"nominal": 1.0} if nominal else {}))
-        self.add_equations(Eq(der(x), -x), Eq(k * (z**3 - x), 0))
-
-    return write
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("k", [1e-12, 1e9])
 def test_a_multiplied_equation(k):
     assert found(scaled_cubic(k, False), "c.z")[0] == pytest.approx(0.5 ** (1 / 3), rel=1e-15)
 
 
-def charge(c0):
-    return model(charge_of(c0))
-
-
-def charge_of(c0):
-    """A nonlinear capacitor, q = C0·(1 + v²)·v, with q = 2·C0: v = 1."""
-
-    def write(self):
-        q, v = self.variable("q", start=2 * c0, fixed=True), self.variable("v", start=0.3)
-        self.add_equations(Eq(c0 * (1 + v**2) * v, q), Eq(der(q), -v * c0 / 1e-6))
-
-    return write
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("c0", [1e-15, 1e-9, 1e6])
 def test_charges_in_any_unit(c0):
     assert found(charge(c0), "c.v")[0] == pytest.approx(1.0, rel=1e-14)
-
-
-def orifices(pascal, flow):
-    return model(orifices_of(pascal, flow))
-
-
-def orifices_of(pascal, flow):
-    """Two orifices in series from 200 bar to 1 bar: the pressure between is the mean."""
-
-    def write(self):
-        a = (0.7e-5 * flow) ** 2 / pascal * 2 / 850.0
-        p = self.variable("p", start=2e7 * pascal, fixed=True)
-        q, pm = self.variable("q"), self.variable("pm", start=1.2e7 * pascal)
-        self.add_equations(
-            Eq(q * Abs(q), a * (p - pm)),
-            Eq(q * Abs(q), a * (pm - 1e5 * pascal)),
-            Eq(der(p), -q * 1.4e12 * pascal / flow),
-        )
-
-    return write
 
 
 @pytest.mark.slow
@@ -197,11 +135,11 @@ def test_orifices_in_series(pascal, flow):
 
 def test_roots_in_many_units():
     """The same beside each other, so that one program finds them all: none tells another what is small."""
-    ev, parts, expected = EqnEnv(), [], {}
+    parts, expected = [], {}
 
     def add(write, variable, root):
         name = f"c{len(parts)}"
-        parts.append(Written(ev, write, name))
+        parts.append(component(write, name))
         expected[f"{name}.{variable}"] = root
 
     for k in (1e-12, 1.0, 1e9):

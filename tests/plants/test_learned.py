@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 import scipy.integrate
 from problems import GRAVITY, RELEASE, compiled, drag_on, mlp, oscillator, pendulum
+from shared_models import discharge
 from sympy import Eq
 
-from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, Electrical, EqnEnv, NeuralDAEBlock, der, simulate
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, NeuralDAEBlock, der, simulate
 from jaxonomy_dae.library.electrical import Capacitor, Ground
 from jaxonomy_dae.library.planar import PlanarPendulum
 
@@ -147,24 +148,6 @@ def test_a_corrected_position_moves_what_is_attached(mode):
 
 
 # --- in algebraic equations --------------------------------------------------------------------------------------
-
-
-class LearnedResistor(Component):
-    """Between two pins: v = network(i), or i = network(v)."""
-
-    def __init__(self, ev, name, network, gives):
-        super().__init__(ev, name)
-        p, n = self.port("p", Electrical), self.port("n", Electrical)
-        v, i = self.variable("v"), self.variable("i")
-        self.add_equations(Eq(v, p.v - n.v), Eq(i, p.i), Eq(p.i + n.i, 0))
-        (law,) = self.learned("law", network, inputs=[i if gives == "v" else v])
-        self.add_equations(Eq(v if gives == "v" else i, law))
-
-
-def discharge(network, gives, v0=1.0, C=0.5):
-    ev = EqnEnv()
-    c, r, g = Capacitor(ev, "c", C, initial_voltage=v0), LearnedResistor(ev, "r", network, gives), Ground(ev, "g")
-    return compiled(c, r, g, connect=[(c.p, r.p), (c.n, r.n, g.p)])
 
 
 def diode_discharge(t, a=0.4, C=0.5, v0=1.0):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 from problems import compiled, damped_oscillation, drag_on, mlp, pendulum, rc_circuit, rc_voltage
+from shared_models import Moved, Squares
 from sympy import Eq, sin, sqrt
 
 from jaxonomy_dae import Component, Electrical, EqnEnv, Translational, der, simulate
@@ -320,17 +321,6 @@ def test_inputs(system, solution, name, u, x):
     np.testing.assert_allclose(solution[f"{name}.y"], 2.0 * u, **CLOSE)
 
 
-class Moved(Component):
-    """A mass whose position is an input: the force follows from differentiating the input twice."""
-
-    def __init__(self, ev, name):
-        super().__init__(ev, name)
-        m = self.parameter("m", 2.0)
-        u = self.input("u")
-        x, v, f = self.variable("x"), self.variable("v"), self.variable("f")
-        self.add_equations(Eq(x, u), Eq(der(x), v), Eq(m * der(v), f))
-
-
 def test_inputs_are_differentiated(solution):
     assert single(Moved(EqnEnv(), "m")).states == []
     found = solution[["moved.x", "moved.v", "moved.f"]]
@@ -377,18 +367,6 @@ class Source(Component):
         super().__init__(ev, name)
         x = self.variable("x", start=0, fixed=True)
         self.add_equations(Eq(der(x), ev.constants["gain"] * sin(ev.t)))
-
-
-class Squares(Component):
-    """der of expressions: der(x²) = −2x², der(x·y) = 0, der(p·z + t) = 0."""
-
-    def __init__(self, ev, name):
-        super().__init__(ev, name)
-        p = self.parameter("p", 4.0)
-        x = self.variable("x", start=2, fixed=True)
-        y = self.variable("y", start=3, fixed=True)
-        z = self.variable("z", start=1, fixed=True)
-        self.add_equations(Eq(der(x**2), -2 * x**2), Eq(der(x * y), 0), Eq(der(p * z + ev.t), 0))
 
 
 class Harmonic(Component):

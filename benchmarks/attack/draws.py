@@ -1,0 +1,61 @@
+"""Which models are drawn, and how one of them is judged."""
+
+import dataclasses
+import importlib
+import itertools
+from collections.abc import Iterator, Sequence
+
+from .outcome import Outcome
+
+NETWORKS = ("resistors", "circuits", "rods", "gears", "thermal", "pipes", "mechanisms", "descriptors")
+FAMILIES = (*NETWORKS, "events", "gradients")
+UNITS = ("equations", "parameters", "units", "all")  # what is rescaled: `benchmarks/rescaling.py`
+PUBLISHED = "published"  # problems that are their own references, in other units
+
+STRIDE = 1_000_000  # between the models of one seed and the next
+MOVING = 4  # every so many-th model of a family is integrated as well
+
+
+@dataclasses.dataclass(frozen=True)
+class Draw:
+    """The model of a family with a seed, in other `units` unless that is empty; integrated as well if `moving`."""
+
+    family: str
+    seed: int
+    units: str = ""
+    moving: bool = False
+
+    @property
+    def row(self) -> str:
+        """The line of the table that counts it."""
+        return f"{self.family}, rescaled" if self.units else self.family
+
+    @property
+    def command(self) -> str:
+        """What shows it again."""
+        units = f" --units {self.units}" if self.units else ""
+        moving = " --moving 1" if self.moving else ""
+        return f"python -m benchmarks.attack --family {self.family}{units} --seed {self.seed} --count 1{moving}"
+
+    def judged(self) -> tuple[str, Outcome]:
+        """What model it is, and what became of it. What goes wrong while it is drawn counts as well."""
+        from . import rescaled  # these import JAX, which the process that only counts does without
+        from .judge import judge
+
+        make = importlib.import_module(f".{self.family}", __package__).make
+        try:
+            case = rescaled.family(make, self.units)(self.seed) if self.units else make(self.seed)
+        except Exception as error:
+            return "", Outcome("crashed", float("inf"), f"when drawn: {type(error).__name__}: {error}", 0.0)
+        return case.note, judge(case, self.moving)
+
+
+def draws(families: Sequence[str], seed: int) -> Iterator[Draw]:
+    """One model of each family after the other, as it is and rescaled, without end."""
+    for r in itertools.count():
+        number = seed * STRIDE + r
+        for k, family in enumerate(families):
+            if family != PUBLISHED:
+                yield Draw(family, number, moving=family in NETWORKS and (r + k) % MOVING == 0)
+            if family in NETWORKS or family == PUBLISHED:
+                yield Draw(family, number, UNITS[(r + k) % len(UNITS)])

@@ -1,0 +1,61 @@
+"""Random models against independent solutions: a sample of what `make attack` draws.
+
+`benchmarks/attack` makes and judges them.
+"""
+
+import subprocess
+import sys
+
+import pytest
+from attack.draws import NETWORKS, Draw
+from attack.outcome import GOOD
+from problems import ROOT
+
+# Seeds of the quick run; those named were wrong or refused once.
+QUICK = {
+    "resistors": (103, 464),
+    "circuits": (4, 8),
+    "rods": (3, 13),
+    "gears": (2, 29),
+    "thermal": (3, 38),
+    "pipes": (11, 84),
+    "mechanisms": (7, 34),
+    "descriptors": (27,),
+    "events": (6, 12),
+}
+
+
+@pytest.mark.parametrize("family, seed", [(f, s) for f, seeds in QUICK.items() for s in seeds])
+def test_a_random_model(family, seed):
+    note, outcome = Draw(family, seed).judged()
+    assert outcome.kind in GOOD, f"({note}): {outcome.kind}: {outcome.text[:1000]}"
+
+
+def judge_apart(*arguments: str) -> list[list[int]]:
+    """The counts, one row a family, in a process of its own, whose XLA optimizes nothing: every program runs once."""
+    command = [sys.executable, "-m", "benchmarks.attack", *arguments]
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 0, f"{run.stdout}\n{run.stderr[-2000:]}"
+    return [[int(n) for n in line[22:76].split()] for line in run.stdout.splitlines()[1:]]
+
+
+@pytest.mark.slow
+def test_some_of_each_family():
+    counts = judge_apart("--count", "3", "--seed", "400", "--moving", "3")
+    assert len(counts) == len(NETWORKS) + 2
+    assert all(right + refused == 3 and not any(others) for right, refused, *others in counts)
+    assert sum(row[0] for row in counts) >= 15  # most models are well posed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("units, seed", [("units", 410), ("all", 411)])
+def test_one_of_each_family_in_other_units(units, seed):
+    counts = judge_apart("--count", "1", "--seed", str(seed), "--units", units)
+    assert len(counts) == len(NETWORKS) and all(right + refused == 1 for right, refused, *_ in counts)
+
+
+@pytest.mark.slow
+def test_right_sides_that_are_zero_but_for_rounding():
+    # Computed once in a solution and once more in its check, by fused multiply-adds only once, they differ by all of
+    # what they are, and the check fails.
+    assert judge_apart("--family", "descriptors", "--seed", "281", "--count", "1") == [[1, 0, 0, 0, 0, 0]]
