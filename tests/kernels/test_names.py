@@ -77,6 +77,7 @@ def test_variables_of_any_sign_start_as_declared(system, found, k):
     assert {n: float(values[n.replace("c", f"c{k}", 1)]) for n in expected} == pytest.approx(expected)
 
 
+@pytest.mark.slow
 def test_solutions_of_any_sign(system):
     solution = simulate(system, 1.0, ts=jnp.array([0.0, 1.0]), adjoint=diffrax.ForwardMode())
     last = solution[system.variables][-1]

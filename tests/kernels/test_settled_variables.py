@@ -83,7 +83,8 @@ def acceleration(pivot, t, position, velocity, p):
     return g - mu * r / MASS
 
 
-@pytest.mark.parametrize("pivot", [Pin, Shaken])
+@pytest.mark.long("accelerations and their derivatives, beside those by hand")
+@pytest.mark.parametrize("pivot", [Shaken, pytest.param(Pin, marks=pytest.mark.slow)])
 def test_what_is_known_is_not_a_state(pivot):
     """Four states for a pin: its place and velocity were integrated, and projected, beside those of the mass."""
     system = hung_from(pivot)

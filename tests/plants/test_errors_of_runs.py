@@ -70,3 +70,10 @@ def test_inputs_that_are_missing():
     for call in (system.initialize, lambda: system.vector_field(0.0, jnp.ones(1))):
         with pytest.raises(ModelError, match=r"input 'c\.u' has no default: connect a signal"):
             call()
+
+
+def test_a_state_of_another_shape():
+    system = rc_circuit()
+    for call in (lambda x: system.observe("c.v", 0.0, x), lambda x: system.vector_field(0.0, x)):
+        with pytest.raises(ModelError, match=r"a state of this system has shape \(1,\); got \(2,\)"):
+            call(jnp.ones(2))

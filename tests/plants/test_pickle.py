@@ -41,7 +41,9 @@ MODELS = {
 }
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize(
+    "name", ["nonlinear", "learned", *(pytest.param(n, marks=pytest.mark.slow) for n in ("circuit", "pendulum"))]
+)
 def test_systems(name):
     system = MODELS[name]()
     traced = []

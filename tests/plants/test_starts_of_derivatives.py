@@ -64,6 +64,15 @@ def solution():
     return simulate(system, ts[-1], ts=ts, rtol=1e-9, atol=1e-12, adjoint=diffrax.ForwardMode())
 
 
+def test_guesses_choose_slopes_at_the_start():
+    ev = EqnEnv()
+    system = compiled(*(Branches(ev, f"c{k}", guess) for k, guess in enumerate(GUESSES)))
+    names = [f"der(c{k}.x)" for k in range(len(GUESSES))]
+    found = jax.jit(lambda: system.observe(names, 0.0, system.initialize()))()
+    np.testing.assert_allclose(found, np.sign(GUESSES), rtol=1e-12)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("k", range(len(GUESSES)), ids=lambda k: str(GUESSES[k]))
 def test_a_guess_chooses_the_slope(solution, k):
     sign = np.sign(GUESSES[k])
@@ -71,6 +80,7 @@ def test_a_guess_chooses_the_slope(solution, k):
     assert float(solution[f"c{k}.x"][1]) == pytest.approx((1 + sign / 2) ** 2, rel=1e-7)  # 100 times the tolerance
 
 
+@pytest.mark.slow
 def test_a_parent_starts_the_derivative_of_a_child(solution):
     assert float(solution["o.inside.x"][-1]) == pytest.approx(2.0, rel=1e-7)  # 2 sin t; a hundred times the tolerance
 
