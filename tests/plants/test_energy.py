@@ -113,6 +113,7 @@ def test_heat_goes_to_the_heat_port():
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_mechanics_that_is_not_linear():
     """A mass on a hardening spring with friction, driven against a stop with play by a moving end."""
     ev = EqnEnv()
@@ -129,7 +130,8 @@ def test_mechanics_that_is_not_linear():
         ],
     )  # fmt: skip
     inputs = {"shaker.u": lambda t: 0.03 * jnp.sin(9.0 * t)}
-    solution = balanced(system, 1.0, inputs, panels=100)
+    solution = simulate(system, 1.0, ts=jnp.linspace(0.0, 1.0, 6), inputs=inputs, **TIGHT)
+    assert_energy_balance(solution, rtol=10 * BALANCED)  # creeping friction: |f'| is 250 times the sliding force
     speed = 0.27 * np.cos(9.0 * np.asarray(solution.ts))
     np.testing.assert_allclose(
         solution.supply(), -np.asarray(solution["shaker.flange.f"]) * speed, rtol=1e-9, atol=1e-12
