@@ -4,14 +4,14 @@ A jitted vector field and a jitted reading of variables cost a third of what a p
 whose field is exact: with nonlinear blocks, it is only as good as a stage needs it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
-from reference_systems import integrated
+from reference_systems import ReferenceSystem, integrated, system_of, values_of
 
 from jaxonomy_dae import AcausalSystem, Solution
 from jaxonomy_dae.compiler.pipeline import initial_point
@@ -92,3 +92,13 @@ def balanced(
     work, exchanged = ((weights * f(supply, lost)[1:-1]).sum() for f in (np.subtract, lambda s, d: np.abs(s) + d))
     np.testing.assert_allclose(energy[-1] - energy[0], work, rtol=0, atol=rtol * exchanged)
     return solution
+
+
+def check_trajectory(reference: Callable[[], ReferenceSystem]) -> None:
+    """The reference beside SciPy's trajectory of the compiled field, as `check_solution` does with a run."""
+    known, system = system_of(reference)
+    expected = known.expected(values_of(system))
+    found = trajectory(system, known.ts, list(expected), known.inputs)
+    for name, true in expected.items():
+        error = np.abs(found[name] - true).max() / np.abs(true).max()
+        assert error <= known.tolerance, f"{name}: off by {error:.3g} of its largest value"

@@ -422,6 +422,7 @@ def test_to_control():
 # --- sweeps ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_grid_of_simulations():
     """v = V·(1 − exp(−t/(R·C))) for every pair of R and C."""
     r, c, ts = np.array([1.0, 2.0, 4.0]), np.array([0.5, 1.5]), np.array([0.0, 0.7, 2.0])

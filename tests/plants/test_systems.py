@@ -14,6 +14,7 @@ from reference_systems import (
     system_of,
     values_of,
 )
+from trajectories import check_trajectory
 
 import jaxonomy_dae.library.electrical as el
 import jaxonomy_dae.library.rotational as rot
@@ -375,6 +376,7 @@ def house_matrices(p):
     return a, b, q
 
 
+@pytest.mark.slow
 def test_the_house_at_rest():
     """The steady state against a linear solve, and poles and answers to the weather of the model linearized there."""
     _, system = system_of(house)
@@ -398,6 +400,10 @@ def test_the_house_at_rest():
 # --- all of them ---------------------------------------------------------------------------------------------------
 
 SYSTEMS = [drive, notch, wien, rectifier, chua, house]
+
+
+def test_the_field_of_the_drive():
+    check_trajectory(drive)
 
 
 @pytest.mark.slow

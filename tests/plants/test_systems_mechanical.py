@@ -8,6 +8,7 @@ from multibody_reference import GROUND, Mechanism
 from problems import GRAVITY, compiled
 from reference_systems import ReferenceSystem, check_gradient, check_solution, driven, integrated, linear
 from testset.problem import load
+from trajectories import check_trajectory
 
 import jaxonomy_dae.library.hydraulic as hy
 import jaxonomy_dae.library.planar as pl
@@ -435,9 +436,12 @@ SYSTEMS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "reference", [s if s is planetary else pytest.param(s, marks=pytest.mark.slow) for s in SYSTEMS]
-)
+def test_the_field_of_the_planetary_drive():
+    check_trajectory(planetary)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reference", SYSTEMS)
 def test_solution(reference):
     check_solution(reference, energy=reference is four_bar)
 
