@@ -411,7 +411,7 @@ def test_a_freewheel():
     assert np.min(found.values("c.tau", ts)) > -1e-9 and np.min(found.values("c.w_rel", ts)) > -1e-9
 
 
-@pytest.mark.long("modes that change, with derivatives, from end to end")
+@pytest.mark.slow
 def test_a_clutch_that_locks():
     """Inertias of 1 and 2 kg·m² at 10 and 0 rad/s, 3 N·m on the first one and a slip torque of 8 N·m between them: they
     turn together from 10/9 s on, as 19/3 rad/s at t = 3."""

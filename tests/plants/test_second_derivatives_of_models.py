@@ -54,6 +54,7 @@ def test_of_a_start(twice):
     np.testing.assert_allclose(jax.jit(twice(x))(10.0), -6 * 2 / 13**3, rtol=1e-12)  # at x = 2
 
 
+@pytest.mark.slow
 def test_of_a_nearest_point():
     """Guesses a and b for a point of the unit circle: the nearest one has the angle atan2(b, a)."""
 
