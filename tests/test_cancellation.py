@@ -12,7 +12,7 @@ from jaxonomy_dae.compiler.select_states import _is_singular
 from jaxonomy_dae.errors import InitializationError, StructuralError
 from jaxonomy_dae.initialization.block_finding import ILL_CONDITIONED
 from jaxonomy_dae.initialization.condition import conditions
-from jaxonomy_dae.model.scaling import geometric_scales
+from jaxonomy_dae.judgement.scaling import geometric_scales
 
 
 class _Written(Component):

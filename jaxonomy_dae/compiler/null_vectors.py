@@ -12,7 +12,7 @@ from fractions import Fraction
 import numpy as np
 
 from ..expressions.node import ONE, ZERO, Node, Number, constant, divide, linear, multiply, scale
-from ..model.scaling import equilibrated, geometric_scales
+from ..judgement.scaling import equilibrated, geometric_scales
 
 DEFICIENT = 1e-11  # singular values below, of an equilibrated matrix, are examined
 CANCELLED = 1e-11  # of the terms: a sum this small is zero

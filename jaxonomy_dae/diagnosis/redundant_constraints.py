@@ -27,7 +27,7 @@ from ..model.extended import Extended
 from ..model.linear_template import LinearTemplate
 from ..model.provenance import Provenance
 from ..model.quantities import QuantityMap
-from ..model.scaling import equilibrated
+from ..judgement.scaling import equilibrated
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, equation_offsets, provenance_of
 from .wording import listed, words
 

@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg
 
-from ..model.scaling import geometric_scales
+from ..judgement.scaling import geometric_scales
 from .block_finding import DENSE_LIMIT, ILL_CONDITIONED
 
 TINY = 1e-300

@@ -23,7 +23,7 @@ from ..model.dependent_parameters import complete
 from ..model.evaluate_numpy import Networks, generic_jacobian, slot_values
 from ..model.natural_sizes import natural_sizes
 from ..model.quantities import ABSENT, declared_scale
-from ..model.scaling import equilibrated, geometric_scales
+from ..judgement.scaling import equilibrated, geometric_scales
 from ..model.tables import ZERO, Start
 from ..structure.matching import match_in_order
 

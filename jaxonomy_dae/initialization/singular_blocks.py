@@ -13,7 +13,7 @@ import numpy as np
 
 from ..lowering.plan import SystemPlan
 from ..lowering.schedule import SparseStep, Step, StepEquation
-from ..model.scaling import geometric_scales
+from ..judgement.scaling import geometric_scales
 from ..model.tables import ZERO
 from .block_finding import DENSE_LIMIT, ILL_CONDITIONED, BlockFinding
 from .block_values import BlockValues, local_slots, slots_of_partials

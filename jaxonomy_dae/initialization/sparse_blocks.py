@@ -5,7 +5,7 @@ import scipy.sparse as sp
 
 from ..lowering.plan import SystemPlan
 from ..lowering.schedule import SparseStep
-from ..model.scaling import equilibrated, geometric_scales
+from ..judgement.scaling import equilibrated, geometric_scales
 from .block_finding import DENSE_LIMIT, ILL_CONDITIONED, BlockFinding
 from .block_values import BlockValues
 from .condition import factored, null_vectors

@@ -7,7 +7,7 @@ import scipy.sparse as sp
 
 from .evaluate_numpy import Networks, residual_and_jacobian
 from .extended import Extended
-from .scaling import equilibrated
+from ..judgement.scaling import equilibrated
 
 
 @np.errstate(all="ignore")  # numbers that overflow end the search
