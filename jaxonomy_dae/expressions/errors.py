@@ -21,8 +21,8 @@ from .node import Node, leaf
 
 ROUNDING = float(np.finfo(float).eps)
 # Numbers that are given come out of computations (a start L·sin(φ), a parameter 0.1 + 0.2, a root that Newton's method
-# found with the kernels of some BLAS): they differ by some roundings from what is meant.
-KNOWN = 8 * ROUNDING
+# found with the kernels of some BLAS): they differ by some roundings from what is meant. Of the sixteen digits, fourteen count.
+KNOWN = 64 * ROUNDING
 
 
 class KernelWithErrors:

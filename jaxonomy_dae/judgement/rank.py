@@ -9,14 +9,16 @@ hold, the matrix is singular as far as anybody can tell. Entries below their err
 
 import dataclasses
 import functools
+from collections.abc import Callable
 
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float
 
-from .scaling import balanced
+from .scaling import balanced, equilibrated
 
 EPS = float(np.finfo(float).eps)
+EASY = 1e8  # a condition number below which scales that cost an iterative solve are not looked for
 ITERATIONS = 20  # of the power method for ρ, whose bound holds whenever it stops
 
 
@@ -78,6 +80,15 @@ def rank_of(matrix: Float[np.ndarray, "m n"], errors: Float[np.ndarray, "m n"]) 
     """Judges a finite matrix; a bound that is not finite says that nothing is known of its entry."""
     size = np.abs(matrix)
     errors = np.maximum(np.where(np.isfinite(errors), errors, size), EPS * size)
-    scaled, r, c = balanced(above_errors(matrix, errors))
+    seen = above_errors(matrix, errors)
+    first = _decomposed(seen, errors, equilibrated)
+    if first.condition < EASY and first.is_regular:
+        return first
+    second = _decomposed(seen, errors, balanced)
+    return first if first.is_regular and not second.condition < first.condition else second
+
+
+def _decomposed(matrix: np.ndarray, errors: np.ndarray, scales: Callable) -> Rank:
+    scaled, r, c = scales(matrix)
     u, s, vt = np.linalg.svd(scaled.toarray())
     return Rank(errors, r, c, u, np.append(s, np.zeros(len(u)))[: len(u)], vt)
