@@ -85,6 +85,7 @@ def select_states(
     merit: Callable[[int], tuple],
     scale: np.ndarray,
     point: Callable[[], tuple[np.ndarray, np.ndarray, Networks]],
+    error_sizes: Callable[[], np.ndarray],
     name: Callable[[int], str],
     equation_name: Callable[[int], str],
     dependent: Callable[[np.ndarray], list[str]],
@@ -97,6 +98,7 @@ def select_states(
     - `merit`: how much a quantity should be a state; larger tuples are kept, ties go to the first quantity.
     - `scale`: the typical size of every quantity.
     - `point`: called only if numbers are needed: all quantities near the initial point, parameters, networks.
+    - `error_sizes`: called with it: the sizes to whose rounding quantities are known.
     - `name`, `equation_name`: of a quantity and of an equation, for messages.
     - `dependent`: called only if constraints depend on each other: which ones, given the settled quantities.
 
@@ -141,7 +143,7 @@ def select_states(
                 values, parameters, networks = point()
                 at = (groups, extended, entries, values)
                 numbers = evaluate(*at, parameters, 0.0, networks)
-                errors = evaluate_errors(*at, KNOWN * (np.abs(values) + scale), parameters, 0.0, networks)
+                errors = evaluate_errors(*at, KNOWN * (np.abs(values) + error_sizes()), parameters, 0.0, networks)
             columns = np.unique(entries.column[members])
             dense, bounds = np.zeros((2, len(rows), len(columns)))
             place = np.searchsorted(rows, entries.row[members]), np.searchsorted(columns, entries.column[members])

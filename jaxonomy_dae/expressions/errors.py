@@ -23,6 +23,11 @@ ROUNDING = float(np.finfo(float).eps)
 # Numbers that are given come out of computations (a start L·sin(φ), a parameter 0.1 + 0.2, a root that Newton's method
 # found with the kernels of some BLAS): they differ by some roundings from what is meant. Of the sixteen digits, fourteen count.
 KNOWN = 64 * ROUNDING
+# The argument of any other function is a number without a unit, in which a step of one is large: an angle of 1e-17 that
+# was computed is zero to rounding.
+WITHOUT_SCALE = frozenset(
+    {"abs", "sign", "floor", "ceiling", "heaviside", "max", "min", "mod", "hypot", "atan2", "log", "loggamma"}
+)
 
 
 class KernelWithErrors:
@@ -71,6 +76,8 @@ def _bound(node: Node, value: Any, inside: list[Any], errors: list[Any]) -> Any:
     if operation not in TABLE:
         return 0.0  # a condition
     slopes = _slopes(operation, len(inside))(inside, "numpy")
+    if operation not in WITHOUT_SCALE:
+        errors = [np.where(e == 0.0, 0.0, np.maximum(e, KNOWN)) for e in errors]
     carried = [_times(np.abs(s), e) for s, e in zip(slopes, errors, strict=True)]
     return sum(carried) + ROUNDING * np.abs(value)
 

@@ -8,8 +8,6 @@ from ..lowering.plan import SystemPlan
 from ..lowering.schedule import Step, StepEquation
 from ..expressions.errors import KNOWN
 from ..model.evaluate_numpy import Networks
-from ..model.quantities import declared_scale
-from ..model.typical_sizes import LIMIT
 
 
 def local_slots(equation: StepEquation) -> list[int]:
@@ -43,9 +41,6 @@ class BlockValues:
         self.quantities = np.append(np.full(plan.extended.quantities.n, np.nan), 0.0)  # ZERO is −1: the last entry
         self.quantities[plan.states] = x[: len(plan.states)]
         self.quantities[plan.carried] = x[len(plan.states) :]
-        known = plan.extended.quantities.n_unknown <= LIMIT
-        size = plan.typical_sizes if known else declared_scale(plan.flat, plan.variable_map, plan.extended)
-        self._size = np.append(size, 0.0)
         self._inputs = inputs
         self._have_inputs = False
 
@@ -79,7 +74,7 @@ class BlockValues:
     @property
     def errors(self) -> np.ndarray:
         """How well quantities are known: a position is one of Newton's method, so to rounding of its typical size."""
-        return KNOWN * (np.abs(self.quantities) + self._size)
+        return KNOWN * (np.abs(self.quantities) + np.append(self.plan.error_sizes, 0.0))
 
     def residual(self, equation: StepEquation) -> np.ndarray:
         slots = self.slots(equation)
