@@ -30,7 +30,7 @@ from ..structure.incidence import Incidence
 from ..structure.matching import maximum_matching
 from ..structure.pantelides import Offsets, reduce_index
 from .combine_equations import combine, graph_of, group_of, near, quantity_label, somewhere, tried
-from .null_vectors import CANCELLED, left_null_vectors, weights_in_parameters
+from .null_vectors import left_null_vectors, weights_in_parameters
 
 LARGEST_BLOCK = 200
 ROUNDS = 100
@@ -38,8 +38,6 @@ TRIALS = 44  # random points, of which STATES are used: the first where the equa
 STATES = 3
 HIGHER = 8  # derivatives that a quantity's size is taken for
 PARAMETERS = 4  # sample values of the parameters
-PERTURBATIONS = 8  # of parameters, by this much:
-SMALL = 2.0**-20
 
 
 def reduce_with_cancellation(
@@ -380,17 +378,11 @@ def zero_pivots(groups, signature: Incidence, offsets: Offsets, column, values) 
         slots = np.flatnonzero(used.any(axis=0))
         if not len(slots) or not all(template.coefficient_is_constant(int(k)) for k in slots):
             continue
-        here = values[group.parameter]
-
-        def total(parameters, template=template, group=group, used=used, slots=slots):
-            point = [np.ones(len(group))] * len(template.slots)
-            given = list(parameters.T), list(group.coefficient.T)
-            partial = template.partial_values(point, *given, 0.0, None, backend="numpy")
-            return sum(used[:, k] * group.factor[:, k] * partial[k] for k in slots.tolist())
-
-        coefficient = total(here)
-        # The terms of a coefficient are seen in how it answers to small relative changes of its parameters.
-        signs = np.random.default_rng(0).choice([-1.0, 1.0], (PERTURBATIONS, here.shape[1]))
-        moved = [np.abs(total(here * (1 + SMALL * s)) - coefficient) / SMALL for s in signs]
-        found.append(equation[used.any(axis=1) & (np.abs(coefficient) <= CANCELLED * np.max(moved, axis=0))])
+        point, exact = [np.ones(len(group))] * len(template.slots), [np.zeros(len(group))] * len(template.slots)
+        given = list(values[group.parameter].T), list(group.coefficient.T), 0.0, None
+        partials = template.partial_values(point, *given, backend="numpy")
+        errors = template.partial_errors(point, exact, *given)
+        coefficient = sum(used[:, k] * group.factor[:, k] * partials[k] for k in slots.tolist())
+        bound = sum(used[:, k] * np.abs(group.factor[:, k]) * errors[k] for k in slots.tolist())
+        found.append(equation[used.any(axis=1) & (np.abs(coefficient) <= bound)])
     return np.concatenate(found) if found else np.zeros(0, np.int64)

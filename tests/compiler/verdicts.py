@@ -2,6 +2,7 @@
 them in NumPy alone. Run as a script, it prints all verdicts, to compare those of other kernels of BLAS."""
 
 import dataclasses
+import json
 import math
 from collections.abc import Callable
 
@@ -15,6 +16,7 @@ from jaxonomy_dae.compiler.flatten import flatten
 from jaxonomy_dae.compiler.pipeline import compile_flat, initial_point
 from jaxonomy_dae.initialization.singular_blocks import examine_blocks
 from jaxonomy_dae.lowering.lower import lower
+from jaxonomy_dae.model.quantities import start_guess
 from jaxonomy_dae.modeling import Eq, der
 
 MODES = ("auto", "dummy_derivatives", "projection")
@@ -30,11 +32,11 @@ class _Loop(Component):
         for k, start in enumerate(starts):
             given = self.parameter(f"start{k}", start)
             q.append(self.variable(f"q{k}", start=given, fixed=k == 0))
-        speed = [self.variable(f"w{k}", start=1.0, fixed=True) if k == 0 else self.variable(f"w{k}") for k in range(len(q))]
-        lam = [self.variable("lx"), self.variable("ly")]
+        speed = [self.variable("w0", start=1.0, fixed=True), *(self.variable(f"w{k}") for k in range(1, len(q)))]
+        multipliers = [self.variable("lx"), self.variable("ly")]
         g = closure(self, *q)
         for k, (position, w) in enumerate(zip(q, speed, strict=True)):
-            force = sum(l * sympy.diff(e, position) for l, e in zip(lam, g, strict=True))
+            force = sum(m * sympy.diff(e, position) for m, e in zip(multipliers, g, strict=True))
             self.add_equations(Eq(der(position), w), Eq((1.0 + 0.1 * k) * der(w), 0.3 - w + force))
         self.add_equations(*(Eq(e, 0) for e in g))
 
@@ -62,8 +64,8 @@ def slider_crank(start, rod_start=0.0, crank_length=0.5, rod_length=1.5):
     place = crank_length * math.cos(start) + rod_length * math.cos(rod_start)
 
     def closure(self, crank, rod, s):
-        r, l = self.parameter("r", crank_length), self.parameter("l", rod_length)
-        return r * cos(crank) + l * cos(rod) - s, r * sin(crank) + l * sin(rod)
+        r, length = self.parameter("r", crank_length), self.parameter("l", rod_length)
+        return r * cos(crank) + length * cos(rod) - s, r * sin(crank) + length * sin(rod)
 
     return loop((start, rod_start, place), closure)
 
@@ -133,20 +135,25 @@ class Model:
 
 
 PI = math.pi
+MINIMAL = ("dummy_derivatives",)
+AUTO = ("auto",)  # without hidden constraints all modes are the same
 MODELS = {
-    **{f"parallelogram at {k} pi": Model(lambda k=k: four_bar(k * PI), "refused") for k in (0, 1, -1, 2, 7)},
-    "parallelogram at 1": Model(lambda: four_bar(1.0), "regular"),
-    "parallelogram upright": Model(lambda: four_bar(PI / 2), "regular"),
-    "two bodies in line": Model(in_line, "refused", ("auto", "dummy_derivatives")),
-    "a kite that is folded": Model(lambda: four_bar(0.0, 0.0, PI, (1.5, 1.0, 0.5, 3.0)), "refused"),
-    **{f"slider-crank at {k} pi / 2": Model(lambda k=k: slider_crank(k * PI / 2), "regular") for k in (0, 2, -6)},
-    "slider-crank of equal bars, upright": Model(lambda: slider_crank(PI / 2, -PI / 2, 0.5, 0.5), "refused"),
-    **{f"pendulum at {k} pi / 2": Model(lambda k=k: pendulum(k * PI / 2), "regular") for k in (0, 1, 2, 3, -1)},
-    **{f"pendulum of {size:g} m": Model(lambda s=size: pendulum(0.3, s), "regular") for size in (1e-12, 1e9)},
-    **{f"lever at {k} pi": Model(lambda k=k: lever(k * PI), "refused", ("auto",)) for k in (0, 1, 2, -3)},
-    **{f"lever at {phi:g}": Model(lambda p=phi: lever(p), "regular", ("auto",)) for phi in (1.0, 1e-6, 1e-9)},
-    **{f"knee at {k} pi / 2": Model(lambda k=k: knee(k * PI / 2), "refused", ("auto",)) for k in (0, 1, 2, 3)},
-    "knee at 1e-9": Model(lambda: knee(1e-9), "regular", ("auto",)),
+    "parallelogram at 0": Model(lambda: four_bar(0.0), "refused"),
+    "parallelogram at pi": Model(lambda: four_bar(PI), "refused", MINIMAL),
+    "parallelogram at 1": Model(lambda: four_bar(1.0), "regular", MINIMAL),
+    "kite that is folded": Model(lambda: four_bar(0.0, 0.0, PI, (1.5, 1.0, 0.5, 3.0)), "refused", MINIMAL),
+    "two bodies in line": Model(in_line, "refused", MINIMAL),
+    "slider-crank at 0": Model(lambda: slider_crank(0.0), "regular", ("auto", "dummy_derivatives")),
+    "slider-crank at -3 pi": Model(lambda: slider_crank(-3 * PI), "regular", MINIMAL),
+    "slider-crank of equal bars, upright": Model(lambda: slider_crank(PI / 2, -PI / 2, 0.5, 0.5), "refused", MINIMAL),
+    "pendulum at pi / 2": Model(lambda: pendulum(PI / 2), "regular"),
+    "pendulum at -pi": Model(lambda: pendulum(-PI), "regular", MINIMAL),
+    "pendulum of 1e-12 m": Model(lambda: pendulum(PI / 2, 1e-12), "regular", MINIMAL),
+    "pendulum of 1e9 m": Model(lambda: pendulum(PI, 1e9), "regular", MINIMAL),
+    **{f"lever at {k} pi": Model(lambda k=k: lever(k * PI), "refused", AUTO) for k in (0, 1, 2, -3)},
+    **{f"lever at {phi:g}": Model(lambda p=phi: lever(p), "regular", AUTO) for phi in (1.0, 1e-6, 1e-9)},
+    **{f"knee at {k} pi / 2": Model(lambda k=k: knee(k * PI / 2), "refused", AUTO) for k in (0, 1, 2, 3)},
+    "knee at 1e-9": Model(lambda: knee(1e-9), "regular", AUTO),
 }
 
 
@@ -172,22 +179,14 @@ def verdict(diagram: AcausalDiagram, mode: str, seed: int | None = None) -> str:
     except StructuralError:
         return "refused"
     values, _, networks = initial_point(flat, plan.variable_map, plan.extended)
+    _, fixed = start_guess(flat, plan.variable_map, len(values))
+    values[list(fixed)] = list(fixed.values())
     x = values[[*plan.states, *plan.carried]]
     x = moved(x, np.ones(len(x), bool), seed)
     found = examine_blocks(plan, parameters, networks.weights, 0.0, x, lambda: np.zeros(0))
     return "refused" if any(finding.singular for finding in found) else "regular"
 
 
-def all_verdicts(seeds: tuple[int | None, ...]) -> dict[str, list[str]]:
-    """Of every model and mode, the different verdicts for some seeds."""
-    return {
-        f"{name}, {mode}": sorted({verdict(model.make(), mode, seed) for seed in seeds})
-        for name, model in MODELS.items()
-        for mode in model.modes
-    }
-
-
 if __name__ == "__main__":
-    import json
-
-    print(json.dumps(all_verdicts((None,))))
+    singular = {name: model for name, model in MODELS.items() if model.expected == "refused"}
+    print(json.dumps({name: verdict(model.make(), model.modes[-1]) for name, model in singular.items()}))
