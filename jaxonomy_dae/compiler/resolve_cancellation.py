@@ -203,9 +203,7 @@ class _Jacobian:
             found |= {quantity_label(v, k): s for k in range(q, q + HIGHER)}
         return found
 
-    def at_natural_size(
-        self, equations: np.ndarray, columns: np.ndarray, trial: int
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def at_natural_size(self, equations: np.ndarray, columns: np.ndarray, trial: int) -> tuple[np.ndarray, np.ndarray]:
         """The matrix at a random point where all terms of the equations are alike: what depends on the point may look
         constant where one term is too small to be seen."""
         groups, order, pairs, size = self._at_natural_sizes(equations)

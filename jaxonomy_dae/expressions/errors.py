@@ -5,8 +5,8 @@ Given bounds of the errors of a graph's leaves, each node gets the bound
     err(f) = Σ |∂f/∂aₖ|·err(aₖ) + u·Σ|terms of f|,    u the unit of rounding,
 
 so that a value below its bound cannot be told from zero: 0.1 + 0.2 − 0.3, or sin(π) with π = 3.14159…. The first order
-is enough where errors are of the size of rounding; products are bounded to all orders, since a factor may be zero. Which
-branch is taken, and between which of its jumps a step is, counts as known.
+is enough where errors are of the size of rounding; products are bounded to all orders, since a factor may be zero.
+Which branch is taken, and between which of its jumps a step is, counts as known.
 """
 
 import functools
@@ -21,7 +21,8 @@ from .node import Node, leaf
 
 ROUNDING = float(np.finfo(float).eps)
 # Numbers that are given come out of computations (a start L·sin(φ), a parameter 0.1 + 0.2, a root that Newton's method
-# found with the kernels of some BLAS): they differ by some roundings from what is meant. Of the sixteen digits, fourteen count.
+# found with the kernels of some BLAS): they differ by some roundings from what is meant, and of sixteen digits fourteen
+# count. Starts are moved by 4 roundings in tests/compiler/test_verdicts.py; the rest is for how mechanisms pass them on.
 KNOWN = 64 * ROUNDING
 # The argument of any other function is a number without a unit, in which a step of one is large: an angle of 1e-17 that
 # was computed is zero to rounding.

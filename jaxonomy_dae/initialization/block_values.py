@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ..expressions.errors import KNOWN
 from ..lowering.plan import SystemPlan
 from ..lowering.schedule import Step, StepEquation
-from ..expressions.errors import KNOWN
 from ..model.evaluate_numpy import Networks
 
 

@@ -18,13 +18,13 @@ import scipy.linalg
 import scipy.sparse as sp
 
 from ..errors import InitializationError
+from ..judgement.rank import above_errors
+from ..judgement.scaling import balanced, equilibrated
 from ..lowering.plan import SystemPlan
 from ..model.dependent_parameters import complete
 from ..model.evaluate_numpy import Networks, generic_jacobian, slot_values
 from ..model.natural_sizes import natural_sizes
 from ..model.quantities import ABSENT, declared_scale
-from ..judgement.rank import above_errors
-from ..judgement.scaling import balanced, equilibrated
 from ..model.tables import ZERO, Start
 from ..structure.matching import match_in_order
 

@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from ..judgement.rank import rank_of
 from ..lowering.plan import SystemPlan
 from ..lowering.schedule import SparseStep, Step, StepEquation
-from ..judgement.rank import rank_of
 from ..model.tables import ZERO
 from .block_finding import DENSE_LIMIT, ILL_CONDITIONED, BlockFinding
 from .block_values import BlockValues, local_slots, slots_of_partials

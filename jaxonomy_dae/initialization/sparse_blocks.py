@@ -3,9 +3,9 @@
 import numpy as np
 import scipy.sparse as sp
 
+from ..judgement.sparse_rank import sparse_rank_of
 from ..lowering.plan import SystemPlan
 from ..lowering.schedule import SparseStep
-from ..judgement.sparse_rank import sparse_rank_of
 from .block_finding import DENSE_LIMIT, ILL_CONDITIONED, BlockFinding
 from .block_values import BlockValues
 

@@ -4,7 +4,7 @@ A is given with bounds N of the errors of its entries. Its rows are independent 
 ρ(N·|R|) < 1 for a right inverse R of A: (A + E)·R = I + E·R, and ρ(E·R) ≤ ρ(N·|R|) for |E| ≤ N. Neither side of this
 changes with the scales of rows and columns (for N = u·|A| it is the condition number u·ρ(|A|·|A⁻¹|), the least that any
 scaling attains: Bauer 1963; Rump 1999), so no choice of scales decides; they only keep digits of R. Where it does not
-hold, the matrix is singular as far as anybody can tell. Entries below their errors are zeros, and scales do not see them.
+hold, the matrix is singular as far as anybody can tell. Entries below their errors are zeros that scales do not see.
 """
 
 import dataclasses

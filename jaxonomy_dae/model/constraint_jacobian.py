@@ -99,9 +99,7 @@ def evaluate_errors(
     networks: Networks,
 ) -> np.ndarray:
     """Bounds of the errors of these numbers, from those of all quantities."""
-    return _gathered(
-        groups, extended, entries, lambda g: partial_errors(g, values, errors, parameters, t, networks)
-    )
+    return _gathered(groups, extended, entries, lambda g: partial_errors(g, values, errors, parameters, t, networks))
 
 
 def _gathered(groups, extended: Extended, entries: ConstraintEntries, of_group: Callable[[ExtendedGroup], np.ndarray]):
