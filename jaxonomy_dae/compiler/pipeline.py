@@ -78,14 +78,15 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Co
         at = ModelAt(flat, alias, variables, groups, extended, settled, values, parameters, 0.0, networks)
         return [str(found) for found in dependent_constraints(at)]
 
+    scale = _scale(flat, variables, extended)
     selection = select_states(
         groups,
         extended,
         mode,
         lambda q: merit[q],
-        _scale(flat, variables, extended),
+        scale,
         point,
-        lambda: error_sizes(flat, variables, extended),
+        lambda: error_sizes(flat, variables, extended, scale),
         lambda q: names[q],
         lambda e: str(provenance_of(groups, int(e))),
         dependent,

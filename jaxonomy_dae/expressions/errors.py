@@ -22,7 +22,7 @@ from .node import Node, leaf
 ROUNDING = float(np.finfo(float).eps)
 # Numbers that are given come out of computations (a start L·sin(φ), a parameter 0.1 + 0.2, a root that Newton's method
 # found with the kernels of some BLAS): they differ by some roundings from what is meant, and of sixteen digits fourteen
-# count. Starts are moved by 4 roundings in tests/compiler/test_verdicts.py; the rest is for how mechanisms pass them on.
+# count. tests/compiler/test_verdicts.py moves starts by 4 roundings; the rest is for how mechanisms pass them on.
 KNOWN = 64 * ROUNDING
 # The argument of any other function is a number without a unit, in which a step of one is large: an angle of 1e-17 that
 # was computed is zero to rounding.

@@ -159,7 +159,7 @@ class SystemPlan:
     @functools.cached_property
     def error_sizes(self) -> np.ndarray:
         """The sizes to whose rounding all quantities are known."""
-        return error_sizes(self.flat, self.variable_map, self.extended)
+        return error_sizes(self.flat, self.variable_map, self.extended, self.typical_sizes)
 
     def quantity_of(self, variable: int) -> tuple[int, float]:
         """(quantity, factor) of a variable; quantity ZERO if it is identically zero."""

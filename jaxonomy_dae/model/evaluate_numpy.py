@@ -87,7 +87,9 @@ def _jacobian(extended: Extended, partials: Sequence[tuple[ExtendedGroup, np.nda
     return sp.coo_array(data, shape=shape).tocsr()
 
 
-def generic_jacobian(extended: Extended, size: np.ndarray, parameter_size: np.ndarray):
+def generic_jacobian(
+    extended: Extended, size: np.ndarray, parameter_size: np.ndarray
+) -> tuple[Any, Any, np.ndarray, np.ndarray]:
     """A sparse Jacobian with respect to all quantities at a generic point, for questions of rank: what depends there
     depends everywhere, or nearly so. Also bounds of the errors of its entries, the point and the parameters.
 

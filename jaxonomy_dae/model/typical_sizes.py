@@ -26,19 +26,20 @@ def unrounded_sizes(flat: FlatModel, variables: QuantityMap, extended: Extended)
     return _balanced(flat, extended, _declared_or_started(flat, variables, extended))
 
 
-def error_sizes(flat: FlatModel, variables: QuantityMap, extended: Extended) -> Float[np.ndarray, " quantities"]:
+def error_sizes(
+    flat: FlatModel, variables: QuantityMap, extended: Extended, typical: Float[np.ndarray, " quantities"]
+) -> Float[np.ndarray, " quantities"]:
     """The sizes to whose rounding quantities are known, where they are near zero: the typical ones, except that a start
     which is rounding itself, as L·sin(π) is, says nothing. Zero where nothing is known."""
     declared = declared_scale(flat, variables, extended)
     if extended.quantities.n_unknown > LIMIT:
         return declared
     started = _declared_or_started(flat, variables, extended)
-    found = _balanced(flat, extended, started)
-    if (np.abs(started) > KNOWN * found.max(initial=0.0))[started != 0.0].all():
-        return found
+    if (np.abs(started) > KNOWN * typical.max(initial=0.0))[started != 0.0].all():
+        return typical
     without = _balanced(flat, extended, declared)
     is_rounding = (np.abs(started) <= KNOWN * without) & (started != 0.0)
-    return _balanced(flat, extended, np.where(is_rounding, declared, started)) if is_rounding.any() else found
+    return _balanced(flat, extended, np.where(is_rounding, declared, started)) if is_rounding.any() else typical
 
 
 def _declared_or_started(flat: FlatModel, variables: QuantityMap, extended: Extended) -> np.ndarray:
