@@ -13,6 +13,8 @@ from pathlib import Path
 import pytest
 from verdicts import MODELS, verdict
 
+import jaxonomy_dae
+
 CASES = [(name, mode) for name, model in MODELS.items() for mode in model.modes]
 
 
@@ -35,7 +37,8 @@ def test_other_roundings_do_not_decide(name, mode):
 def test_the_processor_does_not_decide(kernel):
     """OpenBLAS has kernels for each processor, whose results differ in the last digits; those that this processor does
     not have the instructions for end the process."""
-    environment = os.environ | {"OPENBLAS_CORETYPE": kernel, "JAX_ENABLE_X64": "1"}
+    package = Path(jaxonomy_dae.__file__).parents[1]
+    environment = os.environ | {"OPENBLAS_CORETYPE": kernel, "JAX_ENABLE_X64": "1", "PYTHONPATH": str(package)}
     script = Path(__file__).with_name("verdicts.py")
     done = subprocess.run([sys.executable, str(script)], env=environment, capture_output=True, text=True)
     if done.returncode < 0:
