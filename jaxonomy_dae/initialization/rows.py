@@ -177,7 +177,8 @@ def _generic(plan: SystemPlan, solve_for: tuple[int, ...]) -> _Generic:
     if solve_for:
         jacobian = sp.hstack([jacobian, sp.csr_array(_parameter_columns(plan, point, values, solve_for))], format="csr")
     # Directions that are open must not look closed because of units. Beyond the limit only the pattern is read.
-    scaled, _, columns = (balanced if jacobian.shape[1] <= DENSE_LIMIT else equilibrated)(jacobian)
+    scales = balanced if n + len(solve_for) <= DENSE_LIMIT else equilibrated
+    scaled, _, columns = scales(jacobian)
     return _Generic(scaled, columns, values, solve_for)
 
 

@@ -10,6 +10,7 @@ hold, the matrix is singular as far as anybody can tell. Entries below their err
 import dataclasses
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -27,7 +28,7 @@ def rounding(matrix: np.ndarray) -> np.ndarray:
     return EPS * np.abs(matrix)
 
 
-def above_errors(matrix, errors):
+def above_errors(matrix: Any, errors: Any) -> Any:
     """The matrix, dense or sparse, with zeros in place of the entries that are below their errors."""
     if not sp.issparse(matrix):
         return np.where(np.abs(matrix) > errors, matrix, 0.0)
