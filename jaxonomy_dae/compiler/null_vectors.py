@@ -12,9 +12,9 @@ from fractions import Fraction
 import numpy as np
 
 from ..expressions.node import ONE, ZERO, Node, Number, constant, divide, linear, multiply, scale
-from ..model.scaling import equilibrated, geometric_scales
+from ..judgement.rank import above_errors, rank_of
 
-DEFICIENT = 1e-11  # singular values below, of an equilibrated matrix, are examined
+DEFICIENT = 1e-11  # singular values below, of a matrix with rows and columns scaled, are examined
 CANCELLED = 1e-11  # of the terms: a sum this small is zero
 NOTHING = (1e-8, 1e-13)  # weights below are left out, the larger ones if columns cancel without them
 REFINEMENTS = 2
@@ -28,24 +28,15 @@ def cancels(weights: np.ndarray, matrix: np.ndarray) -> bool:
     return bool((np.abs(terms.sum(axis=0)) <= CANCELLED * np.abs(terms).sum(axis=0)).all())
 
 
-def left_null_vectors(matrix: np.ndarray) -> list[np.ndarray]:
-    """Vectors w with wᵀA = 0, each with an entry 1 where the others have none; fewest entries first."""
-    scaled, rows, _ = equilibrated(matrix)
-    null = _small(scaled.toarray())
-    found = _verified(null, rows, matrix)
-    if len(found) < len(null):  # perhaps for want of better scaling
-        r, c = geometric_scales(matrix)
-        better, rows, _ = equilibrated(r[:, None] * matrix * c)
-        more = _verified(_small(better.toarray()), r * rows, matrix)
-        found = more if len(more) > len(found) else found
+def left_null_vectors(matrix: np.ndarray, errors: np.ndarray) -> list[np.ndarray]:
+    """Vectors w with wᵀA = 0, each with an entry 1 where the others have none; fewest entries first.
+
+    `errors` are bounds of the errors of A's entries.
+    """
+    rank = rank_of(matrix, errors)
+    null = rank.u[:, rank.s <= DEFICIENT * max(rank.s[0], 1e-300)].T
+    found = _verified(null, rank.r, above_errors(matrix, rank.errors))
     return sorted(found, key=lambda w: (np.count_nonzero(w), *np.flatnonzero(w).tolist()))
-
-
-def _small(scaled: np.ndarray) -> np.ndarray:
-    """Left singular vectors of small singular values, as rows."""
-    u, s, _ = np.linalg.svd(scaled, full_matrices=True)
-    s = np.append(s, np.zeros(scaled.shape[0]))[: scaled.shape[0]]
-    return u[:, s <= DEFICIENT * max(s[0], 1e-300)].T.copy()
 
 
 def _verified(null: np.ndarray, rows: np.ndarray, matrix: np.ndarray) -> list[np.ndarray]:
@@ -89,20 +80,22 @@ def rational(value: float) -> Number:
 
 
 def weights_in_parameters(
-    graphs: Sequence[Sequence[Node]], values: Callable[[Sequence[Node]], np.ndarray], unit: int
+    graphs: Sequence[Sequence[Node]],
+    values: Callable[[Sequence[Node]], tuple[np.ndarray, np.ndarray]],
+    unit: int,
 ) -> list[Node] | None:
     """w(p) with w[unit] = 1 and wᵀA(p) = 0, in graphs; None if there is none.
 
     **Arguments:**
 
     - `graphs`: the entries of A, by rows; their leaves are parameters.
-    - `values`: of graphs, at sample parameters: shape (graphs, samples).
+    - `values`: of graphs, at sample parameters, and bounds of their errors: both of shape (graphs, samples).
     """
     m, n = len(graphs), len(graphs[0])
-    numbers = values([g for row in graphs for g in row]).reshape(m, n, -1)
+    numbers, errors = (found.reshape(m, n, -1) for found in values([g for row in graphs for g in row]))
     if not np.isfinite(numbers).all():
         return None
-    samples = [left_null_vectors(numbers[:, :, k]) for k in range(numbers.shape[2])]
+    samples = [left_null_vectors(numbers[:, :, k], errors[:, :, k]) for k in range(numbers.shape[2])]
     if any(len(found) != 1 or found[0][unit] == 0 for found in samples):
         return None
     weights = np.array([found[0] / found[0][unit] for found in samples])
@@ -120,7 +113,7 @@ def _solved(graphs, numbers: np.ndarray, values, unit: int) -> list[Node] | None
     order: list[tuple[int, int]] = []
     free_rows, free_columns = set(range(len(table))), set(range(len(others)))
     while free_columns:
-        current = values([g for row in table for g in row]).reshape(len(table), len(others) + 1, -1)
+        current = values([g for row in table for g in row])[0].reshape(len(table), len(others) + 1, -1)
         candidates = [
             (abs(current[r, c, 0]) / max(size[r, :, 0].max(), 1e-300), -r, -c)
             for r in free_rows
@@ -141,7 +134,7 @@ def _solved(graphs, numbers: np.ndarray, values, unit: int) -> list[Node] | None
             ratio = np.abs(current[k, c] / current[r, c])
             size[k] = size[k] + ratio * size[r]
             row = [linear([(1, a), (-1, multiply(factor, b))]) for a, b in zip(table[k], table[r], strict=True)]
-            updated = values(row)
+            updated, _ = values(row)
             small = (np.abs(updated) <= CANCELLED * size[k]).all(axis=1)
             table[k] = [ZERO if s or j == c else g for j, (g, s) in enumerate(zip(row, small, strict=True))]
     weights: list[Node] = [ZERO] * len(graphs)

@@ -16,7 +16,7 @@ from ..model.extended import Extended
 from ..model.incidence import incidence
 from ..model.quantities import QuantityMap, declared_scale, map_quantities, name_quantities, start_guess
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, locate, provenance_of
-from ..model.typical_sizes import unrounded_sizes
+from ..model.typical_sizes import error_sizes, unrounded_sizes
 from ..structure.pantelides import match_highest
 from .differentiate_equations import differentiate_equations
 from .eliminate_aliases import eliminate_aliases
@@ -78,13 +78,15 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Co
         at = ModelAt(flat, alias, variables, groups, extended, settled, values, parameters, 0.0, networks)
         return [str(found) for found in dependent_constraints(at)]
 
+    scale = _scale(flat, variables, extended)
     selection = select_states(
         groups,
         extended,
         mode,
         lambda q: merit[q],
-        _scale(flat, variables, extended),
+        scale,
         point,
+        lambda: error_sizes(flat, variables, extended, scale),
         lambda q: names[q],
         lambda e: str(provenance_of(groups, int(e))),
         dependent,

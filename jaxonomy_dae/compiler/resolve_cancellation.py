@@ -16,10 +16,10 @@ from scipy.sparse.csgraph import connected_components
 from ..diagnosis.wording import itemised, some
 from ..errors import StructuralError
 from ..expressions.differentiate import partial_derivative
-from ..expressions.kernel import Kernel
+from ..expressions.errors import KNOWN, KernelWithErrors
 from ..expressions.node import Node, constant, number
 from ..expressions.substitute import substitute
-from ..model.evaluate_numpy import Networks, group_values
+from ..model.evaluate_numpy import Networks, group_values, partial_errors
 from ..model.extended import ExtendedGroup
 from ..model.incidence import incidence
 from ..model.natural_sizes import natural_sizes
@@ -30,7 +30,7 @@ from ..structure.incidence import Incidence
 from ..structure.matching import maximum_matching
 from ..structure.pantelides import Offsets, reduce_index
 from .combine_equations import combine, graph_of, group_of, near, quantity_label, somewhere, tried
-from .null_vectors import CANCELLED, left_null_vectors, weights_in_parameters
+from .null_vectors import left_null_vectors, weights_in_parameters
 
 LARGEST_BLOCK = 200
 ROUNDS = 100
@@ -38,8 +38,6 @@ TRIALS = 44  # random points, of which STATES are used: the first where the equa
 STATES = 3
 HIGHER = 8  # derivatives that a quantity's size is taken for
 PARAMETERS = 4  # sample values of the parameters
-PERTURBATIONS = 8  # of parameters, by this much:
-SMALL = 2.0**-20
 
 
 def reduce_with_cancellation(
@@ -122,15 +120,15 @@ class _Jacobian:
         self.column = column
         self.values = values
         self.first = equation_offsets(groups)
-        self._partials: dict[tuple[int, int], np.ndarray] = {}
+        self._partials: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
 
     def place(self, e: int) -> tuple[int, int]:
         """(group, row) of an equation."""
         g = int(np.searchsorted(self.first, e, side="right") - 1)
         return g, e - int(self.first[g])
 
-    def partials(self, g: int, trial: int) -> np.ndarray:
-        """Of all equations of a group, factors included, shape (n, slots)."""
+    def partials(self, g: int, trial: int) -> tuple[np.ndarray, np.ndarray]:
+        """Of all equations of a group, factors included, and bounds of their errors: shape (n, slots) each."""
         if (g, trial) not in self._partials:
             group = self.groups[g]
             point = np.where(group.variable == ZERO, 0.0, group.factor * tried(group.variable, group.order, trial))
@@ -138,12 +136,18 @@ class _Jacobian:
                 slots = range(point.shape[1])
                 any_slopes = [np.ones(len(group)), *(somewhere(group.variable[:, 0], k, trial) for k in slots[1:])]
                 found = tuple(any_slopes)
+                errors = tuple(KNOWN * np.abs(v) for v in found)
             else:
                 p, c = list(self.values[group.parameter].T), list(group.coefficient.T)
                 t = 0.37 + 0.1 * trial
-                found = group.template.partial_values(list(point.T), p, c, t, None, backend="numpy")
-            spread = [np.broadcast_to(np.asarray(v, float), (len(group),)) for v in found]
-            self._partials[g, trial] = np.stack(spread, axis=-1) * group.factor if spread else np.zeros(point.shape)
+                slots = list(point.T)
+                found = group.template.partial_values(slots, p, c, t, None, backend="numpy")
+                errors = group.template.partial_errors(slots, list(KNOWN * np.abs(point.T)), p, c, t, None)
+            if point.shape[1]:
+                values, bounds = _over(found, len(group)).T, _over(errors, len(group)).T
+            else:
+                values = bounds = np.zeros(point.shape)
+            self._partials[g, trial] = values * group.factor, bounds * np.abs(group.factor)
         return self._partials[g, trial]
 
     def hits(self, e: int, columns: np.ndarray) -> list[tuple[int, int]]:
@@ -158,14 +162,16 @@ class _Jacobian:
                 found.append((slot, j))
         return found
 
-    def at(self, equations: np.ndarray, columns: np.ndarray, trial: int) -> np.ndarray:
-        """The matrix at a random point."""
-        dense = np.zeros((len(equations), len(columns)))
+    def at(self, equations: np.ndarray, columns: np.ndarray, trial: int) -> tuple[np.ndarray, np.ndarray]:
+        """The matrix at a random point, and bounds of the errors of its entries."""
+        dense, errors = np.zeros((2, len(equations), len(columns)))
         for k, e in enumerate(equations.tolist()):
             g, i = self.place(e)
+            partials, bounds = self.partials(g, trial)
             for slot, j in self.hits(e, columns):
-                dense[k, j] += self.partials(g, trial)[i, slot]
-        return dense
+                dense[k, j] += partials[i, slot]
+                errors[k, j] += bounds[i, slot]
+        return dense, errors
 
     def _at_natural_sizes(self, equations: np.ndarray) -> tuple[list[ExtendedGroup], list[int], np.ndarray, np.ndarray]:
         """The equations by themselves, in groups; their numbers, in that order; their quantities as (variable, order),
@@ -197,21 +203,24 @@ class _Jacobian:
             found |= {quantity_label(v, k): s for k in range(q, q + HIGHER)}
         return found
 
-    def at_natural_size(self, equations: np.ndarray, columns: np.ndarray, trial: int) -> np.ndarray:
+    def at_natural_size(self, equations: np.ndarray, columns: np.ndarray, trial: int) -> tuple[np.ndarray, np.ndarray]:
         """The matrix at a random point where all terms of the equations are alike: what depends on the point may look
         constant where one term is too small to be seen."""
         groups, order, pairs, size = self._at_natural_sizes(equations)
         point = size * somewhere(pairs[:, 0], pairs[:, 1], trial)
         place = {e: k for k, e in enumerate(equations.tolist())}
-        dense = np.zeros((len(equations), len(columns)))
+        dense, errors = np.zeros((2, len(equations), len(columns)))
         for group in groups:
             if group.template.opaque is not None:
                 return self.at(equations, columns, trial)
-            partials = group_values(group, point, self.values, 0.37 + 0.1 * trial, Networks(()), partials=True)
+            at = self.values, 0.37 + 0.1 * trial, Networks(())
+            partials = group_values(group, point, *at, partials=True)
+            bounds = partial_errors(group, point, KNOWN * np.abs(point), *at)
             for i, e in enumerate(order[int(group.equation[0]) : int(group.equation[-1]) + 1]):
                 for slot, j in self.hits(e, columns):
                     dense[place[e], j] += partials[i, slot]
-        return dense
+                    errors[place[e], j] += bounds[i, slot]
+        return dense, errors
 
     def is_constant(self, equations: np.ndarray, columns: np.ndarray) -> bool:
         """Whether no entry depends on the point."""
@@ -231,25 +240,26 @@ def _combination(jacobian: _Jacobian, equations: np.ndarray, names: Sequence[str
     """
     groups, offsets = jacobian.groups, jacobian.offsets
     columns = offsets.matched_variable[equations]
-    trials, matrices = [], []
+    trials, matrices, errors = [], [], []
     wanted = 1 if jacobian.is_constant(equations, columns) else STATES
     for trial in range(TRIALS):
-        matrix = jacobian.at(equations, columns, trial)
+        matrix, bounds = jacobian.at(equations, columns, trial)
         if not np.isfinite(matrix).all():
             continue  # the equations have no values there
-        if not left_null_vectors(matrix):
+        if not left_null_vectors(matrix, bounds):
             return None
         trials.append(trial)
         matrices.append(matrix)
+        errors.append(bounds)
         if len(trials) == wanted:
             break
     if not trials:
         return None
     if wanted > 1:
         natural = [jacobian.at_natural_size(equations, columns, trial) for trial in trials]
-        if any(np.isfinite(matrix).all() and not left_null_vectors(matrix) for matrix in natural):
+        if any(np.isfinite(matrix).all() and not left_null_vectors(matrix, bounds) for matrix, bounds in natural):
             return None
-    everywhere = left_null_vectors(np.hstack(matrices))
+    everywhere = left_null_vectors(np.hstack(matrices), np.hstack(errors))
     provenance = [provenance_of(groups, int(e)) for e in equations]
     if not everywhere:
         raise StructuralError(_hidden(provenance))
@@ -316,11 +326,17 @@ def _weights(
     labels = sorted(frozenset().union(*(g.leaves for row in rows for g in row)), key=repr)
     samples = np.array([near(values, k) for k in range(PARAMETERS if labels else 1)])
 
-    def evaluate(graphs: Sequence[Node]) -> np.ndarray:
-        found = Kernel(graphs, labels)([samples[:, label[1]] for label in labels], "numpy")
-        return np.stack([np.broadcast_to(np.asarray(v, float), (len(samples),)) for v in found])
+    def evaluate(graphs: Sequence[Node]) -> tuple[np.ndarray, np.ndarray]:
+        columns = [samples[:, label[1]] for label in labels]
+        values, errors = KernelWithErrors(graphs, labels)(columns, [KNOWN * np.abs(column) for column in columns])
+        return _over(values, len(samples)), _over(errors, len(samples))
 
     return weights_in_parameters(rows, evaluate, unit)
+
+
+def _over(values: Sequence, n: int) -> np.ndarray:
+    """Numbers and arrays (n,) as the rows of one array."""
+    return np.stack([np.broadcast_to(np.asarray(v, float), (n,)) for v in values])
 
 
 def _without(groups: tuple[EquationGroup, ...], equations: Sequence[int]) -> tuple[EquationGroup, ...]:
@@ -360,17 +376,11 @@ def zero_pivots(groups, signature: Incidence, offsets: Offsets, column, values) 
         slots = np.flatnonzero(used.any(axis=0))
         if not len(slots) or not all(template.coefficient_is_constant(int(k)) for k in slots):
             continue
-        here = values[group.parameter]
-
-        def total(parameters, template=template, group=group, used=used, slots=slots):
-            point = [np.ones(len(group))] * len(template.slots)
-            given = list(parameters.T), list(group.coefficient.T)
-            partial = template.partial_values(point, *given, 0.0, None, backend="numpy")
-            return sum(used[:, k] * group.factor[:, k] * partial[k] for k in slots.tolist())
-
-        coefficient = total(here)
-        # The terms of a coefficient are seen in how it answers to small relative changes of its parameters.
-        signs = np.random.default_rng(0).choice([-1.0, 1.0], (PERTURBATIONS, here.shape[1]))
-        moved = [np.abs(total(here * (1 + SMALL * s)) - coefficient) / SMALL for s in signs]
-        found.append(equation[used.any(axis=1) & (np.abs(coefficient) <= CANCELLED * np.max(moved, axis=0))])
+        point, exact = [np.ones(len(group))] * len(template.slots), [np.zeros(len(group))] * len(template.slots)
+        given = list(values[group.parameter].T), list(group.coefficient.T), 0.0, None
+        partials = template.partial_values(point, *given, backend="numpy")
+        errors = template.partial_errors(point, exact, *given)
+        coefficient = sum(used[:, k] * group.factor[:, k] * partials[k] for k in slots.tolist())
+        bound = sum(used[:, k] * np.abs(group.factor[:, k]) * errors[k] for k in slots.tolist())
+        found.append(equation[used.any(axis=1) & (np.abs(coefficient) <= bound)])
     return np.concatenate(found) if found else np.zeros(0, np.int64)

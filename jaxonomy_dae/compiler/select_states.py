@@ -16,15 +16,15 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from ..errors import StructuralError
-from ..model.constraint_jacobian import constraint_entries, evaluate, independent_parts
+from ..expressions.errors import KNOWN
+from ..judgement.rank import above_errors, rank_of
+from ..model.constraint_jacobian import constraint_entries, evaluate, evaluate_errors, independent_parts
 from ..model.evaluate_numpy import Networks
 from ..model.extended import Extended
-from ..model.scaling import equilibrated, geometric_scales
 from ..model.tables import ZERO, EquationGroup, equation_offsets
 
 POOR_PIVOT = 0.1  # a preferred pivot may be this much smaller than the best one
 ALIKE = 1e-6  # pivots that differ by less are equal: rounding, and units, do not choose
-SINGULAR = 1e-9  # singular value of an equilibrated matrix
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,6 +85,7 @@ def select_states(
     merit: Callable[[int], tuple],
     scale: np.ndarray,
     point: Callable[[], tuple[np.ndarray, np.ndarray, Networks]],
+    error_sizes: Callable[[], np.ndarray],
     name: Callable[[int], str],
     equation_name: Callable[[int], str],
     dependent: Callable[[np.ndarray], list[str]],
@@ -97,6 +98,7 @@ def select_states(
     - `merit`: how much a quantity should be a state; larger tuples are kept, ties go to the first quantity.
     - `scale`: the typical size of every quantity.
     - `point`: called only if numbers are needed: all quantities near the initial point, parameters, networks.
+    - `error_sizes`: called with it: the sizes to whose rounding quantities are known.
     - `name`, `equation_name`: of a quantity and of an equation, for messages.
     - `dependent`: called only if constraints depend on each other: which ones, given the settled quantities.
 
@@ -139,15 +141,15 @@ def select_states(
                 continue
             if numbers is None:
                 values, parameters, networks = point()
-                numbers = evaluate(groups, extended, entries, values, parameters, 0.0, networks)
+                at = (groups, extended, entries, values)
+                numbers = evaluate(*at, parameters, 0.0, networks)
+                errors = evaluate_errors(*at, KNOWN * (np.abs(values) + error_sizes()), parameters, 0.0, networks)
             columns = np.unique(entries.column[members])
-            dense = np.zeros((len(rows), len(columns)))
-            np.add.at(
-                dense,
-                (np.searchsorted(rows, entries.row[members]), np.searchsorted(columns, entries.column[members])),
-                numbers[members],
-            )
-            chosen, more = _dummy_derivatives(dense, c[rows], columns, quantities, merit, scale, name)
+            dense, bounds = np.zeros((2, len(rows), len(columns)))
+            place = np.searchsorted(rows, entries.row[members]), np.searchsorted(columns, entries.column[members])
+            np.add.at(dense, place, numbers[members])
+            np.add.at(bounds, place, errors[members])
+            chosen, more = _dummy_derivatives(dense, bounds, c[rows], columns, quantities, merit, scale, name)
             if chosen is None:
                 raise StructuralError(_dependence(dependent(np.flatnonzero(settled)), map(equation_name, rows[:6])))
             is_dummy[chosen] = True
@@ -177,7 +179,7 @@ def _dependence(found: list[str], equations: Iterable[str]) -> str:
     )
 
 
-def _dummy_derivatives(dense, c, columns, quantities, merit, scale, name):
+def _dummy_derivatives(dense, errors, c, columns, quantities, merit, scale, name):
     """Mattsson & Söderlind's selection, level by level: the candidate quantities that become dummies, None if rows
     depend on each other; and notes."""
     notes: list[str] = []
@@ -188,8 +190,9 @@ def _dummy_derivatives(dense, c, columns, quantities, merit, scale, name):
         available = available[quantities.highest[columns[available]] >= level]
         # If the (d − level + 1)-th derivative is a dummy, the quantity below it is not a state.
         below = quantities.first[columns[available]] + quantities.highest[columns[available]] - level
-        matrix = dense[np.ix_(rows, available)] * scale[below]
-        picked = _pivots(matrix, [(merit(int(q)), -int(q)) for q in below])
+        inside = np.ix_(rows, available)
+        keys = [(merit(int(q)), -int(q)) for q in below]
+        picked = _pivots(dense[inside] * scale[below], errors[inside] * scale[below], keys)
         if picked is None:
             return None, notes
         by_merit = sorted(range(len(below)), key=lambda k: (merit(int(below[k])), -int(below[k])))
@@ -205,10 +208,11 @@ def _dummy_derivatives(dense, c, columns, quantities, merit, scale, name):
     return chosen, notes
 
 
-def _pivots(matrix: np.ndarray, keys: list[tuple]) -> list[int] | None:
+def _pivots(matrix: np.ndarray, errors: np.ndarray, keys: list[tuple]) -> list[int] | None:
     """As many columns as rows, nonsingular together: the least wanted as states whose pivots are not poor."""
-    if _is_singular(matrix):
+    if not rank_of(matrix, errors).is_regular:
         return None
+    matrix = above_errors(matrix, errors)
     work = matrix / np.abs(matrix).max(axis=1, keepdims=True)
     free_rows = list(range(work.shape[0]))
     free_columns = list(range(work.shape[1]))
@@ -230,19 +234,3 @@ def _pivots(matrix: np.ndarray, keys: list[tuple]) -> list[int] | None:
             factors = work[free_rows, column] / work[row, column]
             work[free_rows] -= np.outer(factors, work[row])
     return sorted(picked)
-
-
-def _is_singular(matrix: np.ndarray) -> bool:
-    """Whether rows depend on each other, in units in which all rows and columns are alike: those of an equation or a
-    variable do not decide."""
-    if matrix.shape[0] > matrix.shape[1]:
-        return True
-    if not _looks_singular(matrix):
-        return False
-    r, c = geometric_scales(matrix)
-    return _looks_singular(r[:, None] * matrix * c)
-
-
-def _looks_singular(matrix: np.ndarray) -> bool:
-    scaled = equilibrated(matrix)[0].toarray()
-    return bool(np.linalg.svd(scaled, compute_uv=False)[-1] <= SINGULAR)

@@ -21,13 +21,13 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
+from ..judgement.scaling import equilibrated
 from ..model.constraint_jacobian import ConstraintEntries, constraint_entries, evaluate, independent_parts
 from ..model.evaluate_numpy import Networks
 from ..model.extended import Extended
 from ..model.linear_template import LinearTemplate
 from ..model.provenance import Provenance
 from ..model.quantities import QuantityMap
-from ..model.scaling import equilibrated
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, equation_offsets, provenance_of
 from .wording import listed, words
 

@@ -19,6 +19,9 @@ class Kernel:
     """A function of the leaves' values, in the order of `labels`, that returns one value for each root.
 
     In NumPy everything is float64: what is not real is not a number, never complex.
+
+    Nodes have places in the order in which they are computed: `leaves` are (place, position of the label), `constants`
+    (place, value), `steps` (place, node, places of its arguments, guard or None), `results` the places of the roots.
     """
 
     def __init__(self, roots: Sequence[Node], labels: Sequence[Hashable]):
@@ -32,9 +35,9 @@ class Kernel:
 
         order = postorder(roots, before)
         place = {n: k for k, n in enumerate(order)}
-        self._leaves = [(place[n], position[n.data]) for n in order if n.operation == "leaf"]
-        self._constants = [(place[n], _constant(n)) for n in order if n.operation in ("constant", "true", "false")]
-        self._steps = [
+        self.leaves = [(place[n], position[n.data]) for n in order if n.operation == "leaf"]
+        self.constants = [(place[n], _constant(n)) for n in order if n.operation in ("constant", "true", "false")]
+        self.steps = [
             (
                 place[n],
                 n,
@@ -46,7 +49,7 @@ class Kernel:
             for n in order
             if n.operation not in ("leaf", "constant", "true", "false")
         ]
-        self._results = [place[r] for r in roots]
+        self.results = [place[r] for r in roots]
         self._compiled: dict[str, list] = {}
 
     def _operations(self, backend: str) -> list:
@@ -54,7 +57,7 @@ class Kernel:
             xp = _BACKENDS[backend]
             self._compiled[backend] = [
                 (k, _operation(node, xp, backend), arguments, guard, _safe(node))
-                for k, node, arguments, guard in self._steps
+                for k, node, arguments, guard in self.steps
             ]
         return self._compiled[backend]
 
@@ -65,22 +68,27 @@ class Kernel:
         return self._run(values, backend)
 
     def _run(self, values: Sequence[Any], backend: str) -> list[Any]:
+        found = self.all_values(values, backend)
+        return [found[r] for r in self.results]
+
+    def all_values(self, values: Sequence[Any], backend: str = "numpy") -> list[Any]:
+        """The values of all nodes, by place."""
         xp = _BACKENDS[backend]
-        found: list[Any] = [None] * (len(self._leaves) + len(self._constants) + len(self._steps))
-        for k, position in self._leaves:
+        found: list[Any] = [None] * (len(self.leaves) + len(self.constants) + len(self.steps))
+        for k, position in self.leaves:
             found[k] = values[position]
-        for k, value in self._constants:
+        for k, value in self.constants:
             found[k] = value
         for k, function, arguments, guard, safe in self._operations(backend):
             inside = [found[a] for a in arguments]
             if guard is not None:
-                active = _active(found, guard)
+                active = is_active(found, guard)
                 inside = [
                     v if s is None or isinstance(v, float) else xp.where(active, v, s)
                     for v, s in zip(inside, safe, strict=True)
                 ]
             found[k] = function(*inside)
-        return [found[r] for r in self._results]
+        return found
 
 
 def _by_digest(literal):
@@ -91,8 +99,8 @@ def _sorted(needed: Any) -> list:
     return sorted(needed, key=lambda part: sorted((c.digest, holds) for c, holds in part))
 
 
-def _active(found: list[Any], guard: list) -> Any:
-    """Whether the node is needed: a union of intersections; of none if it never is."""
+def is_active(found: list[Any], guard: list) -> Any:
+    """Whether a node is needed, given the values of all nodes: a union of intersections; of none if it never is."""
     total: Any = np.bool_(False)
     for part in guard:
         inside: Any = None

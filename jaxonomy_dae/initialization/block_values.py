@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ..expressions.errors import KNOWN
 from ..lowering.plan import SystemPlan
 from ..lowering.schedule import Step, StepEquation
 from ..model.evaluate_numpy import Networks
@@ -16,6 +17,17 @@ def local_slots(equation: StepEquation) -> list[int]:
 def slots_of_partials(equation: StepEquation) -> list[int]:
     """The slots on which the equation's local partial derivatives depend."""
     return sorted(frozenset().union(*(equation.template.slots_of_partial(p) for p in local_slots(equation))))
+
+
+def _in_blocks(step: Step, values: Callable[[StepEquation], np.ndarray]) -> np.ndarray:
+    """Arrays (n, slots) of a step's equations as matrices of its n blocks, shape (n, k, k)."""
+    k = len(step.unknown)
+    out = np.zeros((step.n, k, k))
+    for e, equation in enumerate(step.equations):
+        found = values(equation)
+        for slot in local_slots(equation):
+            out[:, e, equation.slots[slot].local] += found[:, slot]
+    return out
 
 
 class BlockValues:
@@ -50,6 +62,20 @@ class BlockValues:
             out = equation.template.partial_values(slots, p, c, self.t, self.networks, backend="numpy")
             return np.stack([np.broadcast_to(np.asarray(v, float), (n,)) for v in out], axis=-1) * factors
 
+    def partial_errors(self, equation: StepEquation) -> np.ndarray:
+        """Bounds of the errors of these partial derivatives."""
+        factors = np.abs(np.stack([s.factor for s in equation.slots], axis=-1))
+        errors = [np.abs(s.factor) * self.errors[s.quantity] for s in equation.slots]
+        p, c = list(self.parameters[equation.parameter].T), list(equation.coefficient.T)
+        with np.errstate(all="ignore"):
+            out = equation.template.partial_errors(self.slots(equation), errors, p, c, self.t, self.networks)
+            return np.stack([np.broadcast_to(np.asarray(e, float), factors.shape[:1]) for e in out], axis=-1) * factors
+
+    @property
+    def errors(self) -> np.ndarray:
+        """How well quantities are known: a position is one of Newton's method, so to rounding of its typical size."""
+        return KNOWN * (np.abs(self.quantities) + np.append(self.plan.error_sizes, 0.0))
+
     def residual(self, equation: StepEquation) -> np.ndarray:
         slots = self.slots(equation)
         p, c = list(self.parameters[equation.parameter].T), list(equation.coefficient.T)
@@ -59,13 +85,11 @@ class BlockValues:
 
     def jacobian(self, step: Step, parameters: np.ndarray | None = None) -> np.ndarray:
         """Of a step's n blocks, shape (n, k, k)."""
-        k = len(step.unknown)
-        out = np.zeros((step.n, k, k))
-        for e, equation in enumerate(step.equations):
-            values = self.partials(equation, parameters)
-            for slot in local_slots(equation):
-                out[:, e, equation.slots[slot].local] += values[:, slot]
-        return out
+        return _in_blocks(step, lambda equation: self.partials(equation, parameters))
+
+    def jacobian_errors(self, step: Step) -> np.ndarray:
+        """Bounds of the errors of its entries."""
+        return _in_blocks(step, self.partial_errors)
 
     def follow(self, step: Step):
         """What the tearing variables in the state determine."""

@@ -1,100 +1,72 @@
-"""Condition numbers and null vectors, of matrices whose rows and columns are scaled so that units do not matter."""
+"""Condition numbers and null vectors of blocks."""
 
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 import scipy.sparse as sp
-import scipy.sparse.linalg
 
-from ..model.scaling import geometric_scales
+from ..judgement.rank import EASY, Rank, rank_of
+from ..judgement.sparse_rank import sparse_rank_of
 from .block_finding import DENSE_LIMIT, ILL_CONDITIONED
 
 TINY = 1e-300
-PASSES = 5
+
+NullVectors = Callable[[int], np.ndarray]
 
 
-def equilibrated_all(matrix: np.ndarray, passes: int) -> np.ndarray:
-    """Matrices (n, rows, columns) with rows and columns scaled to a largest entry near 1 (Ruiz 2001)."""
-    matrix = matrix / (np.abs(matrix).max(axis=2, keepdims=True, initial=0.0) + TINY)
-    matrix = matrix / (np.abs(matrix).max(axis=1, keepdims=True, initial=0.0) + TINY)
-    for _ in range(passes):
-        rows, columns = np.abs(matrix).max(axis=2, initial=0.0), np.abs(matrix).max(axis=1, initial=0.0)
-        rows, columns = np.sqrt(np.where(rows > 0, rows, 1.0)), np.sqrt(np.where(columns > 0, columns, 1.0))
-        matrix = matrix / rows[:, :, None] / columns[:, None, :]
-    return matrix
+def conditions(matrices: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, NullVectors, NullVectors]:
+    """The condition number of each matrix, rows and columns scaled, infinite for one that cannot be told from a
+    singular one; and functions that give the null vectors of one, left and right.
 
+    **Arguments:**
 
-def conditions(matrices: np.ndarray):
-    """The condition number of each matrix, and functions that give the null vectors of one, left and right."""
+    - `matrices`: shape (n, k, k).
+    - `errors`: bounds of the errors of their entries.
+    """
     n, k, _ = matrices.shape
     if k == 1:
         # A single coefficient has no scale but zero.
-        return np.where(matrices[:, 0, 0] == 0, np.inf, 1.0), lambda b: np.ones((1, 1)), lambda b: np.ones((1, 1))
+        vanishes = np.abs(matrices[:, 0, 0]) <= errors[:, 0, 0]
+        return np.where(vanishes, np.inf, 1.0), lambda b: np.ones((1, 1)), lambda b: np.ones((1, 1))
     finite = np.atleast_1d(np.isfinite(matrices).all(axis=(1, 2)))
     # What is not finite has another cause than rank, and is reported as such.
     matrices = np.where(finite[:, None, None], matrices, np.eye(k))
+    errors = np.where(finite[:, None, None], errors, 0.0)
     if k > DENSE_LIMIT:
-        condition = np.array([_estimate(a) for a in equilibrated_all(matrices, PASSES)])
+        ranks = [sparse_rank_of(sp.csr_array(a), sp.csr_array(e)) for a, e in zip(matrices, errors, strict=True)]
+        condition = np.array([rank.condition if rank.is_regular else np.inf for rank in ranks])
         return condition, lambda b: np.zeros((k, 0)), lambda b: np.zeros((k, 0))
-    scaled = equilibrated_all(matrices, 0)
-    condition = _ratio(np.linalg.svd(scaled, compute_uv=False))
-    if not (condition < ILL_CONDITIONED).all():  # perhaps for want of better scaling
-        scaled = equilibrated_all(matrices, PASSES)
-        condition = _ratio(np.linalg.svd(scaled, compute_uv=False))
-    for b in np.flatnonzero(~(condition < ILL_CONDITIONED)):
-        r, c = geometric_scales(matrices[b])
-        better = equilibrated_all((r[:, None] * matrices[b] * c)[None], PASSES)
-        least = _ratio(np.linalg.svd(better, compute_uv=False))[0]
-        if least < condition[b]:
-            scaled[b], condition[b] = better[0], least
+    condition, is_regular = _at_a_glance(matrices, errors)
+    judged: dict[int, Rank] = {}
 
-    def null(b: int, transposed: bool) -> np.ndarray:
-        u, s, vt = np.linalg.svd(scaled[b])
-        small = s <= max(s[0], 1e-300) / ILL_CONDITIONED
-        return u[:, small] if transposed else vt[small].T
+    def rank(b: int) -> Rank:
+        if b not in judged:
+            judged[b] = rank_of(matrices[b], errors[b])
+        return judged[b]
 
-    return condition, lambda b: null(b, True), lambda b: null(b, False)
+    for b in np.flatnonzero(~(is_regular & (condition < EASY))).tolist():
+        condition[b] = rank(b).condition if rank(b).is_regular else np.inf
+    return condition, lambda b: left_null(rank(b)), lambda b: rank(b).vt[_small(rank(b))].T
 
 
-def _ratio(singular: np.ndarray) -> np.ndarray:
-    """Condition numbers from singular values, shape (n, k)."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(singular[:, -1] > 0, singular[:, 0] / singular[:, -1], np.inf)
+def left_null(rank: Rank) -> np.ndarray:
+    """The left singular vectors of singular values that are none, as columns."""
+    return rank.u[:, _small(rank)]
 
 
-def _estimate(matrix: np.ndarray) -> float:
-    """A lower bound of a large block's condition number, by a sparse factorization (Hager 1984)."""
-    return factored(sp.csc_array(matrix))[1]
+def _small(rank: Rank) -> np.ndarray:
+    least = max(rank.s[0], TINY) / ILL_CONDITIONED
+    return rank.s <= (least if rank.is_regular else max(least, rank.s[-1]))
 
 
-def spectrum(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Left singular vectors and singular values of the equilibrated matrix, one for each row, and its condition."""
-    m = len(matrix)
-    u, s, _ = np.linalg.svd(equilibrated_all(matrix[None], PASSES if m > 1 else 0)[0])
-    s = np.append(s, np.zeros(max(0, m - len(s))))[:m]
-    return u, s, np.inf if s[-1] == 0 else float(s[0] / s[-1])
-
-
-def factored(matrix: Any) -> tuple[Any, float]:
-    """The factors of a sparse matrix, None if it is exactly singular, and an estimate of its condition number."""
-    linalg: Any = scipy.sparse.linalg
-    try:
-        factors = linalg.splu(matrix)
-    except RuntimeError:
-        return None, np.inf
-    inverse = linalg.LinearOperator(matrix.shape, matvec=factors.solve, rmatvec=lambda v: factors.solve(v, trans="T"))
-    return factors, float(linalg.onenormest(matrix) * linalg.onenormest(inverse, t=1))
-
-
-def null_vectors(matrix: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Left and right null vectors of a sparse matrix that is singular, or nearly so, by inverse iteration."""
-    n = matrix.shape[0]
-    linalg: Any = scipy.sparse.linalg
-    shift = 1e-10 * sp.diags_array(1 + np.arange(n) / n)  # regular, whatever the kernel
-    factors = linalg.splu(sp.csc_array(matrix + shift))
-    left = right = np.ones(n) + np.arange(n) / n
-    for _ in range(4):
-        right = factors.solve(right)
-        left = factors.solve(left, trans="T")
-        right, left = right / np.abs(right).max(), left / np.abs(left).max()
-    return left, right
+def _at_a_glance(matrices: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Condition numbers with rows and then columns scaled to a largest entry of 1, and whether these prove that the
+    matrices are regular: most are well-conditioned."""
+    seen = np.where(np.abs(matrices) > errors, matrices, 0.0)
+    rows = np.abs(seen).max(axis=2, keepdims=True, initial=0.0) + TINY
+    columns = np.abs(seen / rows).max(axis=1, keepdims=True, initial=0.0) + TINY
+    s = np.linalg.svd(seen / rows / columns, compute_uv=False)
+    with np.errstate(all="ignore"):
+        condition = np.where(s[:, -1] > 0, s[:, 0] / s[:, -1], np.inf)
+        # No singular value moves by more than the norm of the errors.
+        return condition, np.linalg.norm(errors / rows / columns, axis=(1, 2)) < s[:, -1]

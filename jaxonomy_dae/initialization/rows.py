@@ -18,19 +18,19 @@ import scipy.linalg
 import scipy.sparse as sp
 
 from ..errors import InitializationError
+from ..judgement.rank import above_errors
+from ..judgement.scaling import balanced, equilibrated
 from ..lowering.plan import SystemPlan
 from ..model.dependent_parameters import complete
 from ..model.evaluate_numpy import Networks, generic_jacobian, slot_values
 from ..model.natural_sizes import natural_sizes
 from ..model.quantities import ABSENT, declared_scale
-from ..model.scaling import equilibrated, geometric_scales
 from ..model.tables import ZERO, Start
 from ..structure.matching import match_in_order
 
 DENSE_LIMIT = 600  # quantities up to which ranks are numerical; above, rows are matched with quantities
 OPEN = 1e-7  # a direction less than this along a quantity leaves it determined
 RANK = 1e-11  # pivots smaller than this, of equilibrated equations, are rounding
-EVEN = 1e-2  # a smallest entry above which a matrix is as well scaled as it can be
 
 
 @dataclasses.dataclass(frozen=True)
@@ -172,23 +172,14 @@ def _generic(plan: SystemPlan, solve_for: tuple[int, ...]) -> _Generic:
     if n <= DENSE_LIMIT:  # parameters, as generic numbers, would make some equations stiff beside others
         none = np.zeros(n_parameters)
         size, parameter_size = natural_sizes(extended.groups, extended.n_equations, size, none, by_terms=True)
-    jacobian, point, values = generic_jacobian(extended, size, parameter_size)
-    jacobian = jacobian[:, :n]
+    jacobian, errors, point, values = generic_jacobian(extended, size, parameter_size)
+    jacobian = above_errors(jacobian[:, :n], errors[:, :n])
     if solve_for:
         jacobian = sp.hstack([jacobian, sp.csr_array(_parameter_columns(plan, point, values, solve_for))], format="csr")
-    scaled, columns = _scaled(jacobian)
+    # Directions that are open must not look closed because of units. Beyond the limit only the pattern is read.
+    scales = balanced if n + len(solve_for) <= DENSE_LIMIT else equilibrated
+    scaled, _, columns = scales(jacobian)
     return _Generic(scaled, columns, values, solve_for)
-
-
-def _scaled(jacobian: Any) -> tuple[Any, np.ndarray]:
-    """The Jacobian with rows and columns scaled, and the columns' scales."""
-    scaled, _, columns = equilibrated(jacobian)
-    if scaled.shape[1] > DENSE_LIMIT or not scaled.nnz or np.abs(scaled.data[scaled.data != 0]).min() > EVEN:
-        return scaled, columns
-    # Directions that are open must not look closed because of units.
-    r, c = geometric_scales(jacobian)
-    better, _, more = equilibrated(sp.csr_array(sp.diags_array(r) @ jacobian @ sp.diags_array(c)))
-    return (better, c * more) if _rank(better) >= _rank(scaled) else (scaled, columns)
 
 
 def _pivoted(jacobian: np.ndarray) -> tuple[np.ndarray, int]:
@@ -197,10 +188,6 @@ def _pivoted(jacobian: np.ndarray) -> tuple[np.ndarray, int]:
     q, r, _ = factors
     pivots = np.abs(np.diag(r))
     return q, int((pivots > RANK * max(pivots.max(initial=0.0), 1e-300)).sum())
-
-
-def _rank(jacobian: Any) -> int:
-    return _pivoted(jacobian.toarray())[1]
 
 
 def _parameter_columns(plan: SystemPlan, point, values, solve_for) -> np.ndarray:

@@ -11,13 +11,13 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from ..judgement.rank import rank_of
 from ..lowering.plan import SystemPlan
 from ..lowering.schedule import SparseStep, Step, StepEquation
-from ..model.scaling import geometric_scales
 from ..model.tables import ZERO
 from .block_finding import DENSE_LIMIT, ILL_CONDITIONED, BlockFinding
 from .block_values import BlockValues, local_slots, slots_of_partials
-from .condition import conditions, spectrum
+from .condition import conditions, left_null
 from .sparse_blocks import sparse_finding
 
 
@@ -85,7 +85,6 @@ def examine_blocks(
     if not check.examined and not plan.n_constraints:
         return
     values = BlockValues(plan, parameters, networks, t, x, inputs)
-    eps = np.finfo(float).eps
     for k, step in enumerate(plan.steps):
         if isinstance(step, SparseStep):
             finding = sparse_finding(plan, values, step)
@@ -97,11 +96,9 @@ def examine_blocks(
         if step.carried and (k in check.solved or k in check.examined):
             values.follow(step)
         if k in check.examined:
-            matrices = values.jacobian(step)
-            condition, left, right = conditions(matrices)
-            size = len(step.unknown)
+            condition, left, right = conditions(values.jacobian(step), values.jacobian_errors(step))
             for b in np.flatnonzero(~(condition < limit)):
-                singular = not condition[b] < 1 / (4 * size * eps)
+                singular = not np.isfinite(condition[b])
                 yield _finding(plan, values, step, int(b), float(condition[b]), singular, left(int(b)), right(int(b)))
                 if singular:
                     return
@@ -172,7 +169,8 @@ def _constraints(plan: SystemPlan, values: BlockValues) -> Iterator[BlockFinding
         return
     place = np.full(len(values.quantities), -1)
     place[plan.states] = np.arange(len(plan.states))
-    matrix, texts = np.zeros((m, len(plan.states))), []
+    matrix, errors = np.zeros((2, m, len(plan.states)))
+    texts = []
     row = 0
     for planned in plan.constraints:
         group = planned.group
@@ -183,29 +181,29 @@ def _constraints(plan: SystemPlan, values: BlockValues) -> Iterator[BlockFinding
         p, c = list(values.parameters[group.parameter].T), list(group.coefficient.T)
         with np.errstate(all="ignore"):
             out = group.template.partial_values(slots, p, c, values.t, values.networks, backend="numpy")
-        for k, partial in enumerate(out):
+            of_slots = list(np.abs(group.factor * values.errors[group.quantity]).T)
+            bounds = group.template.partial_errors(slots, of_slots, p, c, values.t, values.networks)
+        for k, (partial, bound) in enumerate(zip(out, bounds, strict=True)):
             partial = np.broadcast_to(np.asarray(partial, float), (len(group),)) * group.factor[:, k]
+            bound = np.broadcast_to(np.asarray(bound, float), (len(group),)) * np.abs(group.factor[:, k])
             where = place[group.quantity[:, k]]
             inside = np.flatnonzero(where >= 0)
             matrix[row + inside, where[inside]] += partial[inside]
+            errors[row + inside, where[inside]] += bound[inside]
         texts += group.equation.tolist()
         row += len(group)
     if not np.isfinite(matrix).all():
         return
-    u, s, condition = spectrum(matrix)
-    if not condition < ILL_CONDITIONED:  # perhaps for want of better scaling
-        r, c = geometric_scales(matrix)
-        better = spectrum(r[:, None] * matrix * c)
-        if better[2] < condition:
-            u, s, condition = better
+    rank = rank_of(matrix, errors)
+    condition = rank.condition if rank.is_regular else np.inf
     if condition < ILL_CONDITIONED:
         return
-    dependent = np.flatnonzero(np.abs(u[:, s <= max(s[0], 1e-300) / ILL_CONDITIONED]).max(axis=1, initial=0.0) > 1e-3)
+    dependent = np.flatnonzero(np.abs(left_null(rank)).max(axis=1, initial=0.0) > 1e-3)
     states = np.flatnonzero(np.abs(matrix[dependent]).max(axis=0, initial=0.0) > 0)
     if not len(states):
         states = np.array(sorted({k for r in dependent for k in plan.constraint_pattern[r]}), np.int64)
     names = tuple(plan.quantity_name[int(plan.states[k])] for k in states)
-    singular = condition >= 1 / (4 * m * np.finfo(float).eps)
+    singular = not rank.is_regular
     at = tuple((name, float(values.quantities[plan.states[k]])) for name, k in zip(names, states, strict=True))
     yield BlockFinding(
         float(condition), singular, m, names, tuple(plan.describe(texts[e]) for e in dependent), at, False

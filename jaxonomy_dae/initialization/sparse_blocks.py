@@ -3,12 +3,11 @@
 import numpy as np
 import scipy.sparse as sp
 
+from ..judgement.sparse_rank import sparse_rank_of
 from ..lowering.plan import SystemPlan
 from ..lowering.schedule import SparseStep
-from ..model.scaling import equilibrated, geometric_scales
 from .block_finding import DENSE_LIMIT, ILL_CONDITIONED, BlockFinding
 from .block_values import BlockValues
-from .condition import factored, null_vectors
 
 
 def sparse_finding(plan: SystemPlan, values: BlockValues, step: SparseStep) -> BlockFinding | None:
@@ -17,45 +16,39 @@ def sparse_finding(plan: SystemPlan, values: BlockValues, step: SparseStep) -> B
     column = np.full(len(values.quantities), -1)  # ZERO is −1: the last entry
     column[step.unknown[0]] = np.arange(n)
     texts = np.concatenate([equation.equation for equation in step.equations])
-    rows, columns, entries = [], [], []
+    rows, columns, entries, bounds = [], [], [], []
     if not step.carried:
         values.quantities[step.unknown[0]] = 0.0
     first = 0
     for equation in step.equations:
-        partials = values.partials(equation)
+        partials, of_partials = values.partials(equation), values.partial_errors(equation)
         for k, slot in enumerate(equation.slots):
             inside = np.flatnonzero(column[slot.quantity] >= 0)
             rows.append(first + inside)
             columns.append(column[slot.quantity[inside]])
             entries.append(partials[inside, k])
+            bounds.append(of_partials[inside, k])
         first += len(equation.equation)
-    matrix = sp.csc_array((np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))), shape=(n, n))
+    place = np.concatenate(rows), np.concatenate(columns)
+    matrix = sp.csc_array((np.concatenate(entries), place), shape=(n, n))
+    errors = sp.csc_array((np.concatenate(bounds), place), shape=(n, n))
     if not np.isfinite(matrix.data).all():
         return None  # what is not finite has another cause than rank
-    scaled, left_scale, right_scale = equilibrated(matrix)
-    factors, condition = factored(sp.csc_array(scaled))
-    if not condition < ILL_CONDITIONED:  # perhaps for want of better scaling
-        r, c = geometric_scales(matrix)
-        better, more_left, more_right = equilibrated(sp.diags_array(r) @ matrix @ sp.diags_array(c))
-        found, least = factored(sp.csc_array(better))
-        if least < condition:
-            scaled, factors, condition = better, found, least
-            left_scale, right_scale = r * more_left, c * more_right
-    scaled = sp.csc_array(scaled)
-    if factors is not None and not step.carried:
+    rank = sparse_rank_of(matrix, errors)
+    if rank.factors is not None and not step.carried:
         residual = np.concatenate([values.residual(e) for e in step.equations])
-        values.quantities[step.unknown[0]] = right_scale * factors.solve(-left_scale * residual)
-    if condition < ILL_CONDITIONED:
+        values.quantities[step.unknown[0]] = rank.c * rank.factors.solve(-rank.r * residual)
+    if rank.is_regular and rank.condition < ILL_CONDITIONED:
         return None
-    left, right = null_vectors(scaled)
+    left, right = rank.null_vectors()
     chosen = np.flatnonzero(np.abs(right) > 1e-3 * np.abs(right).max())
     dependent = np.flatnonzero(np.abs(left) > 1e-3 * np.abs(left).max())
-    left, right = left_scale * left, right_scale * right
+    left, right = rank.r * left, rank.c * right
     names = tuple(plan.quantity_name[int(step.unknown[0][k])] for k in chosen)
     equations = tuple(dict.fromkeys(plan.describe(int(texts[k])) for k in dependent))
-    singular = not condition < 1 / (4 * n * np.finfo(float).eps)
+    singular = not rank.is_regular
     causes = _causes(plan, values, step, column, left, right) if singular else ()
-    return BlockFinding(condition, singular, n, names, equations, causes, bool(causes))
+    return BlockFinding(rank.condition, singular, n, names, equations, causes, bool(causes))
 
 
 def _causes(

@@ -18,7 +18,7 @@ from ..model.opaque import OpaqueFunction
 from ..model.provenance import differentiated
 from ..model.quantities import QuantityMap
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, provenance_of
-from ..model.typical_sizes import typical_sizes
+from ..model.typical_sizes import error_sizes, typical_sizes
 from . import pattern
 from .dummy_blocks import DummyBlocks, dummy_blocks
 from .gather import Gather
@@ -155,6 +155,11 @@ class SystemPlan:
     def typical_sizes(self) -> np.ndarray:
         """Of all quantities: they say where a search begins to look, and what may be rounding."""
         return typical_sizes(self.flat, self.variable_map, self.extended)
+
+    @functools.cached_property
+    def error_sizes(self) -> np.ndarray:
+        """The sizes to whose rounding all quantities are known."""
+        return error_sizes(self.flat, self.variable_map, self.extended, self.typical_sizes)
 
     def quantity_of(self, variable: int) -> tuple[int, float]:
         """(quantity, factor) of a variable; quantity ZERO if it is identically zero."""

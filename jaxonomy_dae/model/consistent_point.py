@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from ..judgement.scaling import equilibrated
 from .evaluate_numpy import Networks, residual_and_jacobian
 from .extended import Extended
-from .scaling import equilibrated
 
 
 @np.errstate(all="ignore")  # numbers that overflow end the search

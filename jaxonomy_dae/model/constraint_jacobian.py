@@ -5,13 +5,14 @@ order of the variable. The constraints fall into independent parts, which share 
 """
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
-from .evaluate_numpy import Networks, group_values
-from .extended import Extended
+from .evaluate_numpy import Networks, group_values, partial_errors
+from .extended import Extended, ExtendedGroup
 from .tables import ZERO, EquationGroup, equation_offsets
 
 
@@ -82,6 +83,27 @@ def evaluate(
     networks: Networks,
 ) -> np.ndarray:
     """The numbers of all entries, from the values of all quantities."""
+    return _gathered(
+        groups, extended, entries, lambda g: group_values(g, values, parameters, t, networks, partials=True)
+    )
+
+
+def evaluate_errors(
+    groups: tuple[EquationGroup, ...],
+    extended: Extended,
+    entries: ConstraintEntries,
+    values: np.ndarray,
+    errors: np.ndarray,
+    parameters: np.ndarray,
+    t: float,
+    networks: Networks,
+) -> np.ndarray:
+    """Bounds of the errors of these numbers, from those of all quantities."""
+    return _gathered(groups, extended, entries, lambda g: partial_errors(g, values, errors, parameters, t, networks))
+
+
+def _gathered(groups, extended: Extended, entries: ConstraintEntries, of_group: Callable[[ExtendedGroup], np.ndarray]):
+    """From arrays (n, slots) of the groups as written, what belongs to the entries."""
     by_base = {}
     first = equation_offsets(groups)
     for group in extended.groups:
@@ -91,6 +113,5 @@ def evaluate(
     numbers = np.empty(len(entries.row))
     for g in np.unique(entries.group):
         here = entries.group == g
-        partials = group_values(by_base[int(g)], values, parameters, t, networks, partials=True)
-        numbers[here] = partials[entries.instance[here], entries.slot[here]]
+        numbers[here] = of_group(by_base[int(g)])[entries.instance[here], entries.slot[here]]
     return numbers

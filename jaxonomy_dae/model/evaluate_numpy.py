@@ -11,6 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float
 
+from ..expressions.errors import KNOWN
 from .extended import Extended, ExtendedGroup
 from .opaque import OpaqueFunction
 from .tables import ZERO
@@ -51,6 +52,15 @@ def group_values(group: ExtendedGroup, values, parameters, t: float, networks: N
     return np.broadcast_to(np.asarray(out, float), (n,))
 
 
+def partial_errors(group: ExtendedGroup, values, errors, parameters, t: float, networks: Networks) -> np.ndarray:
+    """Bounds of the errors of a group's partial derivatives (n, slots), given those of all quantities."""
+    slots = slot_values(group, values)
+    of_slots = [np.abs(e) for e in slot_values(group, errors)]
+    p, c, n = list(parameters[group.parameter].T), list(group.coefficient.T), len(group)
+    out = group.template.partial_errors(slots, of_slots, p, c, t, networks)
+    return np.stack([np.broadcast_to(np.asarray(e, float), (n,)) for e in out], axis=-1) * np.abs(group.factor)
+
+
 def residual_and_jacobian(
     extended: Extended, values, parameters, t: float, networks: Networks
 ) -> tuple[Float[np.ndarray, " equations"], Any]:
@@ -77,9 +87,11 @@ def _jacobian(extended: Extended, partials: Sequence[tuple[ExtendedGroup, np.nda
     return sp.coo_array(data, shape=shape).tocsr()
 
 
-def generic_jacobian(extended: Extended, size: np.ndarray, parameter_size: np.ndarray):
+def generic_jacobian(
+    extended: Extended, size: np.ndarray, parameter_size: np.ndarray
+) -> tuple[Any, Any, np.ndarray, np.ndarray]:
     """A sparse Jacobian with respect to all quantities at a generic point, for questions of rank: what depends there
-    depends everywhere, or nearly so. Also the point and the parameters.
+    depends everywhere, or nearly so. Also bounds of the errors of its entries, the point and the parameters.
 
     It reads nothing but the structure: not the values of parameters, nor the weights of networks. Partial derivatives
     that are not real at the point, and those of networks, are generic numbers.
@@ -90,22 +102,28 @@ def generic_jacobian(extended: Extended, size: np.ndarray, parameter_size: np.nd
     """
     rng = np.random.default_rng(0)
     samples = [(size * generic(rng, size.shape), parameter_size * generic(rng, parameter_size.shape)) for _ in range(2)]
-    partials = []
+    partials, errors = [], []
     for group in extended.groups:
         n, k = group.quantity.shape
         if k == 0:
             continue
         if group.template.opaque is not None:
             partial = generic(rng, (n, k))
+            error = KNOWN * partial
         else:
-            first, second = (
-                group_values(group, point, parameters, 0.5, Networks(()), partials=True)
+            (first, of_first), (second, of_second) = (
+                (
+                    group_values(group, point, parameters, 0.5, Networks(()), partials=True),
+                    partial_errors(group, point, KNOWN * np.abs(point), parameters, 0.5, Networks(())),
+                )
                 for point, parameters in samples
             )
-            partial = np.where(first == 0.0, second, first)  # zero on one branch is not zero on all
+            vanishes = np.abs(first) <= of_first  # zero on one branch is not zero on all
+            partial, error = np.where(vanishes, second, first), np.where(vanishes, of_second, of_first)
             partial = np.where(np.isfinite(partial), partial, generic(rng, (n, k)))
         partials.append((group, partial))
-    return _jacobian(extended, partials), *samples[0]
+        errors.append((group, error))
+    return _jacobian(extended, partials), _jacobian(extended, errors), *samples[0]
 
 
 def generic(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:

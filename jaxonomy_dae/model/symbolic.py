@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..expressions.differentiate import directional_derivative, partial_derivative, raised
+from ..expressions.errors import KNOWN, KernelWithErrors
 from ..expressions.kernel import Kernel
 from ..expressions.node import ONE, ZERO, Node, constant, divide, leaf, linear, scale, split
 from ..expressions.substitute import substitute
@@ -122,6 +123,15 @@ class SymbolicTemplate(AbstractTemplate):
 
     def partial_values(self, slots, parameters, coefficients, t, networks, backend="jax") -> tuple:
         return tuple(self._evaluate("partials", lambda: self.partials, (slots, parameters, coefficients, t), backend))
+
+    @functools.cached_property
+    def _partials_with_errors(self) -> KernelWithErrors:
+        return KernelWithErrors(self.partials, self._labels)
+
+    def partial_errors(self, slots, errors, parameters, coefficients, t, networks) -> tuple:
+        given = [*parameters, *coefficients, t]
+        known = [KNOWN * np.abs(v) for v in given]
+        return tuple(self._partials_with_errors([*slots, *given], [*errors, *known])[1])
 
     def term_values(self, slots, parameters, coefficients, t) -> list:
         if all(self.coefficient_is_number(k) for k in range(len(self.slots))):

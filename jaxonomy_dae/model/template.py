@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from ..expressions.errors import KNOWN
+
 Slot = tuple[int, int]
 
 
@@ -41,6 +43,13 @@ class AbstractTemplate(abc.ABC):
     @abc.abstractmethod
     def partial_values(self, slots, parameters, coefficients, t, networks, backend="jax") -> tuple:
         """The values of ∂(residual)/∂(slot), one for each slot."""
+
+    def partial_errors(self, slots, errors, parameters, coefficients, t, networks) -> tuple:
+        """Bounds of the errors of `partial_values` in NumPy, where `errors` are those of slots, and parameters and
+        coefficients are known to `KNOWN`. Here for partial derivatives that are given numbers, or in which nothing is
+        seen."""
+        found = self.partial_values(slots, parameters, coefficients, t, networks, backend="numpy")
+        return tuple(KNOWN * np.abs(v) for v in found)
 
     def term_values(self, slots, parameters, coefficients, t) -> list:
         """The values of the terms that the residual is a sum of, in NumPy; none where the partial derivatives show them

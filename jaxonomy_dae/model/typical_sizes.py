@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
+from ..expressions.errors import KNOWN
 from .extended import Extended
 from .natural_sizes import natural_sizes
 from .quantities import QuantityMap, declared_scale
@@ -22,6 +23,27 @@ def unrounded_sizes(flat: FlatModel, variables: QuantityMap, extended: Extended)
     """The same, not rounded: rounded, sizes that differ by little may differ by two, and choose other states."""
     if extended.quantities.n_unknown > LIMIT:
         return np.ones(extended.quantities.n)
+    return _balanced(flat, extended, _declared_or_started(flat, variables, extended))
+
+
+def error_sizes(
+    flat: FlatModel, variables: QuantityMap, extended: Extended, typical: Float[np.ndarray, " quantities"]
+) -> Float[np.ndarray, " quantities"]:
+    """The sizes to whose rounding quantities are known, where they are near zero: the typical ones, except that a start
+    which is rounding itself, as L·sin(π) is, says nothing. Zero where nothing is known."""
+    declared = declared_scale(flat, variables, extended)
+    if extended.quantities.n_unknown > LIMIT:
+        return declared
+    started = _declared_or_started(flat, variables, extended)
+    if (np.abs(started) > KNOWN * typical.max(initial=0.0))[started != 0.0].all():
+        return typical
+    without = _balanced(flat, extended, declared)
+    is_rounding = (np.abs(started) <= KNOWN * without) & (started != 0.0)
+    return _balanced(flat, extended, np.where(is_rounding, declared, started)) if is_rounding.any() else typical
+
+
+def _declared_or_started(flat: FlatModel, variables: QuantityMap, extended: Extended) -> np.ndarray:
+    """Nominal values, and else first starts; zero where there is none."""
     size = declared_scale(flat, variables, extended)
     values = flat.variables.start.values(flat.parameters.values)
     for v in np.flatnonzero(flat.variables.start.is_given).tolist():
@@ -29,6 +51,11 @@ def unrounded_sizes(flat: FlatModel, variables: QuantityMap, extended: Extended)
         if quantity >= 0 and size[quantity] == 0.0:
             value = values[v] / factor
             size[quantity] = value if np.isfinite(value) else 0.0
-    size[size == 0.0] = 1.0
-    found, _ = natural_sizes(extended.groups, extended.n_equations, size, flat.parameters.values)
+    return size
+
+
+def _balanced(flat: FlatModel, extended: Extended, size: np.ndarray) -> np.ndarray:
+    """Sizes that make terms alike, where `size` is zero."""
+    start = np.where(size == 0.0, 1.0, size)
+    found, _ = natural_sizes(extended.groups, extended.n_equations, start, flat.parameters.values)
     return 10.0 ** np.clip(np.log10(np.abs(found)), -DECADES, DECADES)

@@ -6,11 +6,11 @@ import sympy
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der
 from jaxonomy_dae.compiler.null_vectors import cancels, left_null_vectors
-from jaxonomy_dae.compiler.select_states import _is_singular
 from jaxonomy_dae.errors import StructuralError
 from jaxonomy_dae.initialization.block_finding import ILL_CONDITIONED
 from jaxonomy_dae.initialization.condition import conditions
-from jaxonomy_dae.model.scaling import geometric_scales
+from jaxonomy_dae.judgement.rank import rank_of, rounding
+from jaxonomy_dae.judgement.scaling import geometric_scales
 
 
 class _Written(Component):
@@ -39,11 +39,11 @@ def _chain(n: int, seed: int, singular: bool) -> tuple[np.ndarray, np.ndarray]:
 def test_units_do_not_decide_a_rank(n, seed):
     regular, _ = _chain(n, seed, singular=False)
     singular, null = _chain(n, seed, singular=True)
-    assert conditions(regular[None])[0][0] < ILL_CONDITIONED
-    assert not conditions(singular[None])[0][0] < ILL_CONDITIONED
-    assert not _is_singular(regular) and _is_singular(singular)
-    assert left_null_vectors(regular) == []
-    (found,) = left_null_vectors(singular)
+    assert conditions(regular[None], rounding(regular)[None])[0][0] < ILL_CONDITIONED
+    assert not conditions(singular[None], rounding(singular)[None])[0][0] < ILL_CONDITIONED
+    assert rank_of(regular, rounding(regular)).is_regular and not rank_of(singular, rounding(singular)).is_regular
+    assert left_null_vectors(regular, rounding(regular)) == []
+    (found,) = left_null_vectors(singular, rounding(singular))
     assert cancels(found, singular)
     np.testing.assert_allclose(found / null, found[0] / null[0], rtol=1e-13)  # some hundred roundings
 

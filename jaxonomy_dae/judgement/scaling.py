@@ -1,4 +1,4 @@
-"""Equilibration: the scaling of a sparse matrix that makes questions of rank independent of units."""
+"""Scales of the rows and columns of a sparse matrix that make its entries alike, whatever their units."""
 
 from typing import Any
 
@@ -13,9 +13,8 @@ LARGEST_EXPONENT = 300.0  # of ten, for a scale
 def geometric_scales(matrix: Any) -> tuple[np.ndarray, np.ndarray]:
     """r and c for which the logarithms of the entries of diag(r)·A·diag(c) are nearest to zero (Curtis & Reid 1972).
 
-    Matrices that differ by scalings of rows and columns alone come out equal, however far apart the scales are. Entries
-    that are rounding errors count as much as others, so this answers whether a matrix that looks singular after
-    `equilibrated` is regular, not the other way round.
+    Matrices that differ by scalings of rows and columns alone come out equal, however far apart the scales are. Small
+    entries count as much as large ones, so entries that are rounding errors must have been left out.
     """
     a: Any = sp.coo_array(matrix)
     a.eliminate_zeros()
@@ -56,3 +55,10 @@ def equilibrated(matrix: Any, passes: int = PASSES) -> tuple[Any, np.ndarray, np
         r, c = r / np.sqrt(rows), c / np.sqrt(columns)
     scaled = sp.csr_array((a.data * r[row_of] * c[column_of], a.indices, a.indptr), shape=a.shape)
     return scaled, r, c
+
+
+def balanced(matrix: Any) -> tuple[Any, np.ndarray, np.ndarray]:
+    """diag(r)·A·diag(c) with the sizes of its entries near 1, the largest of every row and column nearest; r and c."""
+    r, c = geometric_scales(matrix)
+    scaled, more_r, more_c = equilibrated(sp.csr_array(sp.diags_array(r) @ sp.csr_array(matrix) @ sp.diags_array(c)))
+    return scaled, r * more_r, c * more_c

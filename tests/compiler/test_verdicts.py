@@ -1,0 +1,48 @@
+"""Singular or regular: one verdict, on every kernel of BLAS, and with every entry of the start off by some roundings.
+
+A parallelogram in line was accepted or refused by the processor's kernels: entries that were rounding errors were
+scaled to size one.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from verdicts import MODELS, verdict
+
+import jaxonomy_dae
+
+CASES = [(name, mode) for name, model in MODELS.items() for mode in model.modes]
+
+
+@pytest.mark.parametrize("name, mode", CASES)
+def test_roundings_do_not_decide(name, mode):
+    model = MODELS[name]
+    assert {verdict(model.make(), mode, seed) for seed in (None, 0)} == {model.expected}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name, mode", CASES)
+def test_other_roundings_do_not_decide(name, mode):
+    model = MODELS[name]
+    assert {verdict(model.make(), mode, seed) for seed in range(1, 6)} == {model.expected}
+
+
+@pytest.mark.parametrize(
+    "kernel", ["Haswell", "Nehalem", *(pytest.param(name, marks=pytest.mark.slow) for name in ("Zen", "Sandybridge"))]
+)
+def test_the_processor_does_not_decide(kernel):
+    """OpenBLAS has kernels for each processor, whose results differ in the last digits; those that this processor does
+    not have the instructions for end the process."""
+    package = Path(jaxonomy_dae.__file__).parents[1]
+    environment = os.environ | {"OPENBLAS_CORETYPE": kernel, "JAX_ENABLE_X64": "1", "PYTHONPATH": str(package)}
+    script = Path(__file__).with_name("verdicts.py")
+    done = subprocess.run([sys.executable, str(script)], env=environment, capture_output=True, text=True)
+    if done.returncode < 0:
+        pytest.skip(f"this processor does not run OpenBLAS' kernels for {kernel}: signal {-done.returncode}")
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert set(found.values()) == {"refused"} and len(found) > 10
