@@ -18,6 +18,7 @@ from tqdm import tqdm
 from ..adjoint.default import forward_mode
 from ..errors import ModelError
 from ..modeling.interval import Interval
+from ..private_names import with_high_cutoff
 from ..system.system import AcausalSystem
 from .bounds import Unbounded, project
 
@@ -255,7 +256,7 @@ def fit_least_squares(
         solver = optx.LevenbergMarquardt(rtol=rtol, atol=atol)
         if coordinates is not None:
             # Curved coordinates spoil the prediction: by default, only steps predicted to 1 % lengthen the next.
-            solver = eqx.tree_at(lambda s: s.search.high_cutoff, solver, 0.5)
+            solver = with_high_cutoff(solver, 0.5)
         found = optx.least_squares(
             lambda z, extra: function(inside(z), extra), solver, start, (frozen, args), max_steps=steps, throw=False
         )
