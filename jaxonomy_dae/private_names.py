@@ -1,10 +1,10 @@
 """What is taken from JAX, Equinox, Diffrax and Optimistix beyond their public interfaces: all of it passes through this
 file, and nothing of it is reached when the package is imported.
 
-`TRIED` lists the versions on which the tests were run. Other versions may lack a name. `StoredAdjoint` then gives way to
+`TRIED` lists the versions on which the tests were run. Others may lack a name. `StoredAdjoint` then gives way to
 `diffrax.RecursiveCheckpointAdjoint`, with one warning; what only keeps checks out of programs, or makes them smaller or
-faster, is left out. Only functions of time as inputs have no fallback: their programs are compared, and `private` raises
-`MissingName` where one is given.
+faster, is left out. Only functions of time as inputs have no fallback: their programs are compared, and `private`
+raises `MissingName` where one is given.
 
 These things are relied on that have no name of their own, or one that is public:
 

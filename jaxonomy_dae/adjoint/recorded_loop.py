@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from .closure_conversion import Program, any_member, apart, going, read, rows, unless_waiting, written
 from ..private_names import private
+from .closure_conversion import Program, any_member, apart, going, read, rows, unless_waiting, written
 from .packing import Packing
 from .resting import held_back
 from .reverse_step import ReverseStep

@@ -39,8 +39,8 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
 
     Solves with events, dense output or Brownian motion, and those whose state is so large that a record would take more
     than 32 MB, are handed to `diffrax.RecursiveCheckpointAdjoint`; so are all, with a `RuntimeWarning`, where a version
-    of Diffrax, Equinox or JAX lacks a private name that this relies on. As with that, forward mode alone is refused: use
-    `diffrax.ForwardMode()`.
+    of Diffrax, Equinox or JAX lacks a private name that this relies on. As with that, forward mode alone is refused:
+    use `diffrax.ForwardMode()`.
 
     Second derivatives are forward mode over reverse mode: `jax.hessian`, or `jax.jvp` of `jax.grad`. They need a step
     that forward mode can follow, as it can those of this package's solvers. Diffrax's Runge–Kutta methods loop over

@@ -64,7 +64,7 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
     system, t0, t1, ts, inputs, initial = given
     found = initialize(system, t0, inputs, initial)
     if checked:
-        found = check(system, found, t0, inputs, initial, running=True)
+        found = check(system, found, t0, inputs, initial, running=True, throw=True)
     x0, controller = found.x, options.controller
     implicit = is_implicit(options.solver)
     chosen = options.solver if ts is None else right_between_steps(options.solver)

@@ -209,7 +209,9 @@ def _stiff_without_a_run(plan: SystemPlan, duration: float | None) -> str:
     return f"stiff: at the declared start something decays within {1 / fastest_decay(plan):.2g}"
 
 
-def _traced(outcome: Outcome, given: tuple[Any, ...], choice: Choice, checked: bool, bounds: tuple[int, int]) -> Solution:
+def _traced(
+    outcome: Outcome, given: tuple[Any, ...], choice: Choice, checked: bool, bounds: tuple[int, int]
+) -> Solution:
     """The solution where nothing can be looked at: inside jit, grad or vmap."""
     system, inputs, x = given[0], given[4], outcome.x
     if checked:

@@ -15,7 +15,7 @@ from .rodas5p import Rodas5P
 
 BAD_TIMES: Any = diffrax.RESULTS.nonlinear_divergence  # Diffrax has no code of its own for them
 TIMES = (
-    "times do not fit: t0 and t1 must be finite, ts sorted from t0 to t1 and inside, and the times of StepTo increasing "
+    "times do not fit: t0 and t1 must be finite, ts sorted from t0 to t1 and inside, and the times of StepTo must lead "
     "from t0 to t1"
 )
 
@@ -59,8 +59,8 @@ def integrate(
 ) -> Run:  # fmt: skip
     """Integrates, saves what is asked for and the last accepted point, and counts Jacobians.
 
-    Where the times do not fit, no row counts as reached, and the result is `BAD_TIMES`; with `checked`, that is an error
-    while running.
+    Where the times do not fit, no row counts as reached, and the result is `BAD_TIMES`; with `checked`, that is an
+    error while running.
     """
     fits = times_fit(t0, t1, save.ts, controller)
     if checked and fits is not True:

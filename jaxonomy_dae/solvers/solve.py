@@ -65,8 +65,9 @@ def solve_dae(
     - `dtmax`: the longest step.
     - `names`: of the unknowns, in order, for error messages.
     - `throw`: whether to raise if the start is inconsistent or the integration fails. Otherwise `solution.result` has a
-        code, rows that were not reached are NaN, and so are their derivatives. None: outside jit, grad and vmap. Inside,
-        True puts callbacks to the host into the program, which JAX's persistent compilation cache then does not keep.
+        code, rows that were not reached are NaN, and so are their derivatives. None: outside jit, grad and vmap.
+        Inside, True puts callbacks to the host into the program, which JAX's persistent compilation cache then does
+        not keep.
 
     **Returns:**
 
@@ -235,9 +236,17 @@ _compiled = eqx.filter_jit(_solve)
 
 
 def consistent_start(
-    term: DAETerm, y0: Any, *, t0: Any = 0.0, args: Any = None, max_steps: int = 50, names: Sequence[str] | None = None
-) -> Any:
+    term: DAETerm, y0: Any, *, t0: Any = 0.0, args: Any = None, max_steps: int = 50,
+    names: Sequence[str] | None = None, throw: bool | None = None,
+) -> Any:  # fmt: skip
     """A consistent start near y0: what occurs differentiated stays (M y does), the algebraic unknowns are solved for.
+
+    **Arguments:**
+
+    - `term`, `y0`, `t0`, `args`, `names`: as in `solve_dae`.
+    - `max_steps`: bounds the iterations of Newton's method.
+    - `throw`: whether to raise if there is none; otherwise it is not-a-number, and so are its derivatives. None:
+        outside jit, grad and vmap. Inside, True puts a callback to the host into the program.
 
     **Raises:**
 
@@ -251,7 +260,10 @@ def consistent_start(
     y, size = consistent_point(problem, None, t, problem.flat, max_steps)
     eps = float(jnp.finfo(y.dtype).eps)
     failed = ~(size <= math.sqrt(eps))
-    if isinstance(failed, Tracer):
+    traced = isinstance(failed, Tracer)
+    if throw is False or (traced and throw is None):
+        y = not_a_number(y[None], ~failed[None], y0, args, t)[0]
+    elif traced:
         y = eqx.error_if(y, failed, "no consistent start: Newton's method did not converge")
     elif bool(failed):
         moving = np.abs(np.asarray(consistent_shift(problem, None, t, y, problem.flat)))
