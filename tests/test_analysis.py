@@ -148,8 +148,13 @@ def test_a_free_integrator_is_named():
     np.testing.assert_allclose(point[["motor.rotor.w", "der(motor.rotor.phi)"]], [speed, speed], rtol=ROUNDING)
     nothing = steady_state(motor(), inputs={"source.u": 3.0}, throw=False)
     assert np.isnan(nothing["motor.rotor.w"])
+
+    def state(u, throw=None):
+        return steady_state(motor(), inputs={"source.u": u}, throw=throw).x
+
+    assert np.isnan(jax.jit(state)(3.0)).all()
     with pytest.raises(Exception, match="no equilibrium was found"):
-        jax.block_until_ready(eqx.filter_jit(lambda u: steady_state(motor(), inputs={"source.u": u}).x)(3.0))
+        jax.block_until_ready(eqx.filter_jit(state)(3.0, throw=True))
 
 
 def test_a_common_change_is_named():

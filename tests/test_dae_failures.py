@@ -4,6 +4,8 @@ Singularities have closed forms: their times are known. A solver stops short of 
 1e-4 is a hundred times the tolerance of 1e-6.
 """
 
+import functools
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -201,19 +203,21 @@ def test_an_inconsistent_start_is_mended():
 
 
 def test_traced_starts_fail_while_running():
-    @jax.jit
-    def end(z):
-        return solve_dae(TERM, 1.0, (ONE, z)).ys[0]
+    def end(z, throw=None):
+        solution = solve_dae(TERM, 1.0, (ONE, z), throw=throw)
+        return solution.ys[0], diffrax.is_okay(solution.result)
 
+    def start(z, throw=None):
+        term = DAETerm(falling, lambda t, x, z, a: z**2 + x)
+        return consistent_start(term, (ONE, z), throw=throw)[1]
+
+    y, okay = jax.jit(end)(WRONG[1])
+    assert np.isnan(y).all() and not okay
+    assert np.isnan(jax.jit(start)(jnp.array([0.5]))).all()
     with pytest.raises(Exception, match="inconsistent start: see jaxonomy_dae.solvers.consistent_start"):
-        jax.block_until_ready(end(WRONG[1]))
-
-    @jax.jit
-    def start(z):
-        return consistent_start(DAETerm(falling, lambda t, x, z, a: z**2 + x), (ONE, z))[1]
-
+        jax.block_until_ready(jax.jit(functools.partial(end, throw=True))(WRONG[1]))
     with pytest.raises(Exception, match="no consistent start: Newton's method did not converge"):
-        jax.block_until_ready(start(jnp.array([0.5])))
+        jax.block_until_ready(jax.jit(functools.partial(start, throw=True))(jnp.array([0.5])))
 
 
 def test_no_consistent_start():

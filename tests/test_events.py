@@ -155,7 +155,7 @@ def test_accumulation_is_named(ball):
 def test_too_many_events_inside_jit(ball):
     def run(e):
         system = ball.with_parameters({"ball.e": e})
-        return simulate(system, 5.0, ts=jnp.array([5.0]), max_events=20)["ball.h"]
+        return simulate(system, 5.0, ts=jnp.array([5.0]), max_events=20, throw=True)["ball.h"]
 
     with pytest.raises(Exception, match="more than max_events=20 events"):
         jax.block_until_ready(jax.jit(run)(0.8))
