@@ -203,7 +203,7 @@ def _solve(term, t0, t1, y0, ts, args, tolerances, options, checked=False):
         max_steps=max_steps,
         checked=checked,
     )
-    reached = jnp.isfinite(run.ts)
+    reached = jnp.isfinite(run.ts) & check.is_fine
     saved = run.ys if ts is None else _on_constraints(term, args, run.ts, run.ys, y0)
     saved = jax.tree.map(lambda y: not_a_number(y, reached, y0, args), saved)
     failure: Any = diffrax.RESULTS.nonlinear_divergence

@@ -88,3 +88,19 @@ def test_users_jitted_functions_keep_their_checks(checked):
         with pytest.raises(Exception, match="(?s)x left its range|nonlinear solve"):
             jax.block_until_ready(eqx.filter_jit(function)(bad))
         assert "callback" in str(jax.make_jaxpr(function)(0.1))
+
+
+def test_a_check_in_a_dae():
+    """y' = −a·y, and the derivative of y(1) by a; with a = 2 it falls below what is checked."""
+
+    def field(t, y, a):
+        return -a * eqx.error_if(y, y[0] < LEAST, "y left its range")
+
+    def end(a):
+        return solve_dae(DAETerm(field, mass=[1.0]), 1.0, jnp.ones(1), args=a, solver=Rodas5P(), rtol=1e-8).ys[0, 0]
+
+    both = eqx.filter_jit(jax.value_and_grad(end))
+    np.testing.assert_allclose(both(1.0), [np.exp(-1), -np.exp(-1)], rtol=1e-6)
+    for find in (end, both):
+        with pytest.raises(Exception, match="(?s)y left its range"):
+            jax.block_until_ready(find(2.0))
