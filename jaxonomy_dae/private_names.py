@@ -103,7 +103,7 @@ def missing(names: tuple[str, ...]) -> str | None:
         wanted = SHAPES.get(name)
         if wanted is None:
             continue
-        if inspect.isclass(found):
+        if dataclasses.is_dataclass(found):
             lacking = wanted - {field.name for field in dataclasses.fields(found)}
         else:
             lacking = wanted ^ set(inspect.signature(found).parameters)

@@ -77,14 +77,14 @@ class _LateTimes(diffrax.AbstractAdjoint):
     def loop(self, **given: Any) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The loop over the steps, called by `diffrax.diffeqsolve`, with what it makes of `SaveAt(ts=...)`."""
         state, saveat, t0 = given["init_state"], given["saveat"], given["t0"]
-        save, direction = self.save, self.direction
-        assert save.ts is not None
+        ts, direction = self.save.ts, self.direction
+        assert ts is not None
         save = dataclasses.replace(
-            save,
-            ts=(save.ts * direction).astype(t0.dtype),
+            self.save,
+            ts=(ts * direction).astype(t0.dtype),
             fn=lambda t, y, args: self.save.fn(direction * t, y, args),
         )
-        count = len(self.save.ts)
+        count = len(ts)
         shapes = eqx.filter_eval_shape(save.fn, t0, state.y, given["args"])
         saved = dataclasses.replace(
             state.save_state["last"],
