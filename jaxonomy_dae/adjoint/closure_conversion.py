@@ -6,12 +6,11 @@ from typing import Any
 import diffrax
 import equinox as eqx
 import jax
-import jax.core
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Int, PyTree
 
-from .private_names import unvmap_any
+from ..private_names import MissingName, private
 
 
 class Program(eqx.Module):
@@ -46,7 +45,7 @@ class ClosureConverted(eqx.Module):
         leaves, structure = jax.tree.flatten(eqx.filter(args, eqx.is_array))
         if structure != self.inputs:
             raise TypeError(f"a closure-converted function was made for {self.inputs}; got {structure}")
-        return self._combined(jax.core.eval_jaxpr(self.jaxpr, consts, *leaves))
+        return self._combined(private("eval_jaxpr")(self.jaxpr, consts, *leaves))
 
     @property
     def out_struct(self) -> Any:
@@ -122,8 +121,11 @@ def going(state: Any, numbers: dict[str, Any], program: Program) -> Bool[Array, 
 
 
 def any_member(flag: Bool[Array, ""]) -> Bool[Array, ""]:
-    """Whether a flag is set for any member of the batch."""
-    return unvmap_any(flag)
+    """Whether a flag is set for any member of the batch: not batched itself, so that branches stay branches."""
+    try:
+        return private("unvmap_any")(flag)
+    except MissingName:
+        return flag  # as good, but in a batch both branches are computed
 
 
 def inexact(tree: PyTree) -> PyTree:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import diffrax
 
+from ..private_names import has_stored_adjoint
 from .stored_adjoint import StoredAdjoint
 
 _forward: contextvars.ContextVar[bool] = contextvars.ContextVar("forward_mode", default=False)
@@ -23,4 +24,6 @@ def forward_mode() -> Iterator[None]:
 
 def default_adjoint() -> diffrax.AbstractAdjoint:
     """The adjoint to be taken where none is given."""
-    return diffrax.ForwardMode() if _forward.get() else StoredAdjoint()
+    if _forward.get():
+        return diffrax.ForwardMode()
+    return StoredAdjoint() if has_stored_adjoint() else diffrax.RecursiveCheckpointAdjoint()

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from ..private_names import private
 from .closure_conversion import Program, any_member, apart, going, read, rows, unless_waiting, written
 from .packing import Packing
-from .private_names import unvmap_max
 from .resting import held_back
 from .reverse_step import ReverseStep
 from .step_times import StepTimes
@@ -131,7 +131,7 @@ def _(residuals, cotangents, perturbed, numbers, program):
     times = StepTimes(perturbed, numbers, program)
     recorder = _Recorder(numbers, program, times)
     reverse = ReverseStep(cotangents, perturbed, numbers, program, times)
-    chunks, stride, filled = (unvmap_max(v) for v in (chunks, stride, filled))
+    chunks, stride, filled = (private("unvmap_max")(v) for v in (chunks, stride, filled))
     blank = jax.tree.map(jnp.zeros_like, numbers["buffers"])  # saved nowhere: dead code
     start = reverse.start(state, moves)
     packing = Packing(start)

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from ..private_names import FROM_CONTROLLER
 from .closure_conversion import Program, any_member
-from .private_names import use_stepsize_tol
 
 # In units of the state and what tolerances make of zero, |y| + atol/rtol:
 PUSH = 0.03  # what the second run is pushed by; its error is then 33·rtol of it
@@ -251,7 +251,7 @@ def _small(solver: Any, controller: Any) -> Any:
         solver = dataclasses.replace(solver, looped=True)
     finder = getattr(solver, "root_finder", None)
     if finder is not None:
-        open_ = [n for n in ("rtol", "atol", "norm") if getattr(finder, n, None) is use_stepsize_tol]
+        open_ = [n for n in ("rtol", "atol", "norm") if getattr(finder, n, None) is FROM_CONTROLLER]
         values = {name: getattr(controller, name) for name in open_}
         solver = dataclasses.replace(solver, root_finder=dataclasses.replace(finder, **values))
     return solver

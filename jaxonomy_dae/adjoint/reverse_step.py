@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from ..private_names import private
 from .closure_conversion import Program, any_member, inexact, read, unless_waiting
-from .private_names import SaveState
 from .step_times import StepTimes
 
 
@@ -179,9 +179,10 @@ class ReverseStep:
 
 def state_saves(state: Any) -> list[Any]:
     """The parts of Diffrax's state that belong to the parts of `SaveAt`."""
+    kind = private("SaveState")
 
     def is_save(node):
-        return isinstance(node, SaveState)
+        return isinstance(node, kind)
 
     return [node for node in jax.tree.leaves(state.save_state, is_leaf=is_save) if is_save(node)]
 

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
+from ..private_names import clip_floor, private
 from .closure_conversion import Program, inexact
-from .private_names import clip_to_end, prevbefore
 
 
 class StepTimes:
@@ -62,9 +62,7 @@ class StepTimes:
         y1, error, *_ = program.step(numbers["step"], state.tprev, state.tnext, state.y, state.solver_state, jump)
         error = jax.tree.map(lambda e: jnp.where(jnp.isnan(e), jnp.inf, e), error)
         fixed = eqx.filter(state.controller_state[0], eqx.is_inexact_array, inverse=True)
-        floor = numbers["t1"]
-        for _ in range(100):
-            floor = prevbefore(floor)
+        floor = clip_floor(numbers["t1"])
 
         def clock(moving, given):
             tprev, tnext, controlled = moving
@@ -73,7 +71,7 @@ class StepTimes:
                 numbers["adapt"], controller, tprev, tnext, state.y, y1, error, eqx.combine(controlled, fixed)
             )
             tprev = jnp.minimum(tprev, t1)
-            return tprev, clip_to_end(tprev, tnext, t1, floor, keep), inexact(after)
+            return tprev, private("clip_to_end")(tprev, tnext, t1, floor, keep), inexact(after)
 
         at = inexact(_clock(numbers | {"state": state}))
         given = self.seeds()[1]

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from ..private_names import has_stored_adjoint, private
 from .closure_conversion import Program, closure_convert, unless_waiting
-from .private_names import is_sde, while_loop
 from .recorded_loop import solve
 from .resting import Resting, Step
 from .reverse_step import state_saves
@@ -38,31 +38,31 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
     `diffrax.ClipStepSizeController` and `diffrax.StepTo` are complete.
 
     Solves with events, dense output or Brownian motion, and those whose state is so large that a record would take more
-    than 32 MB, are handed to `diffrax.RecursiveCheckpointAdjoint`. As with that, forward mode alone is refused: use
-    `diffrax.ForwardMode()`.
+    than 32 MB, are handed to `diffrax.RecursiveCheckpointAdjoint`; so are all, with a `RuntimeWarning`, where a version
+    of Diffrax, Equinox or JAX lacks a private name that this relies on. As with that, forward mode alone is refused:
+    use `diffrax.ForwardMode()`.
 
     Second derivatives are forward mode over reverse mode: `jax.hessian`, or `jax.jvp` of `jax.grad`. They need a step
     that forward mode can follow, as it can those of this package's solvers. Diffrax's Runge–Kutta methods loop over
     their stages, and forward mode can follow if told to: `diffrax.Dopri5(scan_kind="bounded")`.
     """
 
-    def loop(
-        self, *, args, terms, solver, stepsize_controller, event, saveat, t0, t1, dt0, max_steps, throw, init_state,
-        passed_solver_state, passed_controller_state, progress_meter,
-    ):  # fmt: skip
+    def loop(self, **given: Any) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The loop over the steps, called by `diffrax.diffeqsolve`."""
-        given = dict(
-            args=args, terms=terms, solver=solver, stepsize_controller=stepsize_controller, event=event, saveat=saveat,
-            t0=t0, t1=t1, dt0=dt0, max_steps=max_steps, init_state=init_state, progress_meter=progress_meter,
-        )  # fmt: skip
+        if not has_stored_adjoint():
+            return diffrax.RecursiveCheckpointAdjoint().loop(**given)
+        terms, solver, saveat, max_steps = (given[name] for name in ("terms", "solver", "saveat", "max_steps"))
+        init_state, progress_meter = given["init_state"], given["progress_meter"]
         size = sum(
             leaf.size * leaf.dtype.itemsize
             for leaf in jax.tree.leaves(_arrays((init_state.y, init_state.solver_state)))
         )
         chunk, points = _table(max_steps, size)
-        if event is not None or saveat.dense or is_sde(terms) or size * (chunk + points) > LARGEST_RECORD:
-            passed = dict(passed_solver_state=passed_solver_state, passed_controller_state=passed_controller_state)
-            return diffrax.RecursiveCheckpointAdjoint().loop(**given, throw=throw, **passed)
+        too_large = size * (chunk + points) > LARGEST_RECORD
+        if given["event"] is not None or saveat.dense or _is_random(terms) or too_large:
+            return diffrax.RecursiveCheckpointAdjoint().loop(**given)
+        for name in ("throw", "passed_solver_state", "passed_controller_state"):
+            del given[name]
 
         # Diffrax's own loop, with functions in place of solver and controller that close over nothing.
         init_state = dataclasses.replace(
@@ -103,7 +103,7 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
             final, buffers = solve(numbers | dict(state=start, buffers=buffers, body=consts), program)
             return _with_buffers(final, buffers)
 
-        final_state, stats = self._loop(
+        final_state, stats = private("loop")(
             **given
             | dict(
                 solver=_Solver(functions["step"], numbers["step"], solver, terms),
@@ -122,6 +122,15 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
         return final_state, stats
 
 
+def _is_random(terms: Any) -> bool:
+    """Whether Brownian motion drives the solve."""
+
+    def is_brownian(node: Any) -> bool:
+        return isinstance(node, diffrax.AbstractBrownianPath)
+
+    return any(map(is_brownian, jax.tree.leaves(terms, is_leaf=is_brownian)))
+
+
 def _table(max_steps: int | None, size: int) -> tuple[int, int]:
     """(rows of the record, points kept) for states of `size` bytes: with steps for eight times their product, pieces
     are run again 4.5 times. Small states have more rows, so that most solves need no second run."""
@@ -134,7 +143,7 @@ def _table(max_steps: int | None, size: int) -> tuple[int, int]:
 def _inner_loop(cond_fun, body_fun, start, *, max_steps, buffers, checkpoints):
     """Saving at times within a step."""
     del checkpoints
-    return while_loop(cond_fun, body_fun, start, max_steps=max_steps, buffers=buffers, kind="lax")
+    return private("while_loop")(cond_fun, body_fun, start, max_steps=max_steps, buffers=buffers, kind="lax")
 
 
 def _functions(

@@ -53,7 +53,8 @@ def linearize(
 
     - `ModelError` for unknown names, an input without a value, an input that the model differentiates (its response has
         no state space), and `states` that are not coordinates.
-    - `SteadyStateError` if `at` is left out and there is no equilibrium.
+    - `SteadyStateError` if `at` is left out and there is no equilibrium; inside jit, grad and vmap the state space is
+        then not-a-number.
     """
     check_system(system)
     dtype = system.parameters.values.dtype
@@ -63,8 +64,8 @@ def linearize(
     quantity, factor = system.plan.resolve(outputs)
     _check_inputs(system, names, given, at)
     if at is None:
-        found, t, read = equilibrium_from(system, t, given, None, (), throw=True)
-        at = point_of(system, found, t, read, drifting=(), singular_is_error=False, throw=True)
+        found, t, read = equilibrium_from(system, t, given, None, (), throw=None)
+        at = point_of(system, found, t, read, drifting=(), singular_is_error=False, throw=None)
     if jnp.ndim(at.x) != 1:
         raise ModelError("the operating point is a batch: linearize each with equinox.filter_vmap")
     values = read_inputs(system.plan, dtype, {**by_entry(system.plan, at.inputs), **given})

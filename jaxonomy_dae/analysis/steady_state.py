@@ -12,6 +12,7 @@ from jax.core import Tracer
 from ..diagnosis.wording import some
 from ..errors import ModelError, SteadyStateError, nearest
 from ..initialization.initialize import check, find_initial
+from ..solvers.rows import not_a_number
 from ..system.inputs import read_inputs
 from ..system.system import AcausalSystem
 from .equilibrium import Equilibrium, compiled_search, find_equilibrium, is_open, open_directions, unknowns
@@ -28,7 +29,7 @@ def steady_state(
     inputs: Mapping[str, Any] | None = None,
     initial: Mapping[str, Any] | None = None,
     drifting: Sequence[str] = (),
-    throw: bool = True,
+    throw: bool | None = None,
 ) -> OperatingPoint:
     """The equilibrium of a system: the point at which the derivatives of all states vanish and every equation holds,
     hidden constraints included.
@@ -44,7 +45,9 @@ def steady_state(
         several equilibria, it chooses.
     - `drifting`: states whose derivatives need not vanish, such as the angle of a shaft that turns at a steady speed:
         they keep their values at the start.
-    - `throw`: whether to raise if there is no such point; otherwise its values are not-a-number.
+    - `throw`: whether to raise if there is no such point; otherwise its values are not-a-number, and so are their
+        derivatives. None: outside jit, grad and vmap. Inside, True puts callbacks to the host into the program, which
+        JAX's persistent compilation cache then does not keep.
 
     **Returns:**
 
@@ -66,14 +69,14 @@ def steady_state(
 
 
 def equilibrium_from(
-    system: AcausalSystem, t: Any, inputs: Any, initial: Any, drifting: tuple[int, ...], throw: bool
+    system: AcausalSystem, t: Any, inputs: Any, initial: Any, drifting: tuple[int, ...], throw: bool | None
 ) -> tuple[Equilibrium, Any, dict[str, Any]]:
     """The search from the initial point; the time and the inputs as arrays and as they were read."""
     dtype = system.parameters.values.dtype
     initial = system.plan.one_by_one(initial)
     begin = find_initial(system, t, inputs, initial)
-    if throw:
-        begin = check(system, begin, t, inputs, initial)
+    if throw is not False:
+        begin = check(system, begin, t, inputs, initial, throw=throw)
     inputs, t = read_inputs(system.plan, dtype, inputs), jnp.asarray(t, dtype)
     given = (system, t, begin.x, inputs)
     if not is_traced(given):
@@ -86,16 +89,17 @@ def equilibrium_from(
 
 def point_of(
     system: AcausalSystem, found: Equilibrium, t: Any, inputs: Any, *, drifting: tuple[str, ...],
-    singular_is_error: bool, throw: bool,
+    singular_is_error: bool, throw: bool | None,
 ) -> OperatingPoint:  # fmt: skip
     """The point, if it is one."""
     singular = jnp.array(False)
     if singular_is_error and found.jacobian.shape[1]:
         singular = jnp.any(is_open(open_directions(found)[0]))
     x = found.x
-    if not throw:
-        x = jnp.where(found.holds & ~singular, x, jnp.nan)
-    elif is_traced((found, singular)):
+    traced = is_traced((found, singular))
+    if throw is False or (traced and throw is None):
+        x = not_a_number(x[None], (found.holds & ~singular)[None], system, t, inputs)[0]
+    elif traced:
         x = eqx.error_if(x, ~found.holds, "no equilibrium was found. steady_state outside jit gives the names")
         x = eqx.error_if(
             x, singular, "the equilibrium is singular: some state is undetermined. steady_state outside jit gives names"

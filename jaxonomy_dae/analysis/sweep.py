@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from ..errors import ModelError
+from ..errors import InitializationError, ModelError, SimulationError, SteadyStateError
 from ..optional import optional_module
 from ..simulation.labelled import dataset_of
 from ..simulation.simulate import simulate
@@ -109,8 +109,10 @@ def sweep(
 
     **Raises:**
 
-    - `ModelError` for an unknown parameter, a value out of its bounds, and shapes that do not fit. A run or a search
-        that fails is an Equinox run-time error; with `throw=False` it is not-a-number.
+    - `ModelError` for an unknown parameter, a value out of its bounds, and shapes that do not fit.
+    - What the function raises for the first values that give not-a-number, when called with them outside of programs:
+        `SimulationError`, `SteadyStateError` or `InitializationError`. With `throw=False` in it, and where the sweep is
+        itself inside jit, grad or vmap, it is not-a-number without an error.
     """
     check_system(system)
     columns = {name: _values(system, name, given) for name, given in _named(parameters).items()}
@@ -134,6 +136,7 @@ def sweep(
         rows = tuple(v[places[:, k]] for k, v in enumerate(columns.values()))
         shape = tuple(sizes)
     results = _mapped(function, system, tuple(columns), rows)
+    _raise_first(function, system, columns, rows, results)
     shaped = jax.tree.map(lambda a: jnp.reshape(a, (*shape, *a.shape[1:])) if eqx.is_array(a) else a, results)
     return Sweep(columns, shaped, zipped)
 
@@ -153,6 +156,26 @@ def _mapped(function: Any, system: AcausalSystem, names: tuple[str, ...], rows: 
         return function(system.with_parameters(dict(zip(names, row, strict=True))))
 
     return eqx.filter_vmap(one)(rows)
+
+
+def _raise_first(function: Any, system: AcausalSystem, columns: dict[str, Any], rows: tuple[Any, ...], results: Any):
+    """Raises what the function says of the first row that has a not-a-number, if it says anything."""
+    arrays = [leaf for leaf in jax.tree.leaves((results, rows)) if eqx.is_inexact_array(leaf)]
+    if any(isinstance(leaf, Tracer) for leaf in (*arrays, *jax.tree.leaves(system))):
+        return
+    count = len(rows[0])
+    failed = np.zeros(count, bool)
+    for leaf in arrays:
+        failed |= np.isnan(np.asarray(leaf).reshape(count, -1)).any(axis=1)
+    if not failed.any():
+        return
+    values = {name: np.asarray(row)[int(failed.argmax())] for name, row in zip(columns, rows, strict=True)}
+    try:
+        function(system.with_parameters(values))
+    except (InitializationError, SimulationError, SteadyStateError) as error:
+        where = ", ".join(f"{name} = {np.array2string(value, precision=6)}" for name, value in values.items())
+        text = f"{failed.sum()} of {count} values of the sweep failed, the first at {where}: {error}"
+        raise type(error)(text) from error
 
 
 def _named(parameters: Any) -> Mapping[str, Any]:

@@ -4,6 +4,7 @@ from typing import Any
 
 import diffrax
 
+from ..private_names import rewrapped, unwrapped
 from .problem import AbstractHybridProblem, HybridState
 
 
@@ -24,10 +25,9 @@ class HybridTerm(diffrax.AbstractTerm):
 
 def problem_of(terms: Any) -> AbstractHybridProblem:
     """The problem in the terms that Diffrax hands to a solver or a controller: it wraps a term in its direction."""
-    return terms.problem if isinstance(terms, HybridTerm) else terms.term.problem
+    return unwrapped(terms)[0].problem
 
 
 def bound(terms: Any, q: Any) -> Any:
     """The terms while the discrete values are q."""
-    term = problem_of(terms).term(q)
-    return term if isinstance(terms, HybridTerm) else type(terms)(term, terms.direction)
+    return rewrapped(terms, problem_of(terms).term(q))

@@ -24,6 +24,7 @@ from ..linear.whole import solve_whole
 from ..lowering.gather import Gather, take, times
 from ..lowering.plan import SystemPlan
 from ..model.quantities import declared_scale, quantity_bounds
+from ..solvers.rows import not_a_number
 from ..system.evaluate import Refinement
 from ..system.input_values import input_values
 from ..system.inputs import read_inputs
@@ -501,17 +502,27 @@ _compiled = eqx.filter_jit(initialize)
 
 def check(
     system: Any, found: InitialPoint, t0: Any, inputs: Any, initial: Any, solve_for: tuple[str, ...] = (),
-    running: bool = False,
+    running: bool = False, throw: bool | None = None,
 ) -> InitialPoint:  # fmt: skip
     """The same point; raises an `InitializationError` if it is not consistent, if a block of equations is singular
-    there, or if a parameter solved for is out of its bounds. While a program is `running`, functions of time in
-    `inputs` may hold what is traced."""
+    there, or if a parameter solved for is out of its bounds. With `throw=False`, and where values are traced, it is
+    then not-a-number; traced and with `throw=True` it is an error while running. While a program is `running`,
+    functions of time in `inputs` may hold what is traced."""
     from .report import InitializationReport  # which reads what is defined here
 
     table = system.parameters.table
     low, high = table.bounds[np.array([table.index(n) for n in solve_for], np.int64)].T
     driving = input_values(system.plan, inputs, t0, found.x.dtype) if running else ()
-    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((found, system, t0, driving))):
+    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((found, system, t0, driving)))
+    if traced or throw is False:
+        slack = _slack(found, low, high)
+        outside = jnp.any(~((found.solved >= low - slack) & (found.solved <= high + slack)))
+        if throw is not True:
+            fine = (is_consistent(found) & ~outside)[None]
+            both = jnp.append(found.x, found.solved)[None]
+            n, sources = len(found.x), (system, t0, inputs, initial)
+            both = not_a_number(both, fine, *sources)[0]
+            return found._replace(x=both[:n], solved=both[n:])
         x = eqx.error_if(
             found.x,
             ~is_consistent(found),
@@ -520,8 +531,6 @@ def check(
         )
         if not solve_for:
             return found._replace(x=x)
-        slack = _slack(found, low, high)
-        outside = ~((found.solved >= low - slack) & (found.solved <= high + slack))
         solved = eqx.error_if(found.solved, outside, f"a parameter of {list(solve_for)} is out of its bounds")
         return found._replace(x=x, solved=solved)
     problem = InitializationReport(system, found, t0, inputs, initial, solve_for).problem

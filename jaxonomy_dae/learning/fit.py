@@ -16,8 +16,9 @@ import optimistix as optx
 from tqdm import tqdm
 
 from ..adjoint.default import forward_mode
-from ..errors import ModelError
+from ..errors import InitializationError, ModelError, SimulationError, SteadyStateError
 from ..modeling.interval import Interval
+from ..private_names import with_high_cutoff
 from ..system.system import AcausalSystem
 from .bounds import Unbounded, project
 
@@ -93,6 +94,15 @@ def _check_data(args: tuple) -> None:
             raise ModelError(f"the data are not finite: args{jax.tree_util.keystr(path)} has NaN or infinite entries")
 
 
+def _why(function: Callable[..., Any], model: Any, args: tuple) -> str:
+    """What a run inside a function says of its failure where it is not compiled into a program; or nothing."""
+    try:
+        function(model, *args)
+    except (InitializationError, ModelError, SimulationError, SteadyStateError) as error:
+        return str(error)
+    return ""
+
+
 def fit(
     model: Model,
     loss: Callable[..., Any],
@@ -122,8 +132,8 @@ def fit(
 
     **Returns:**
 
-    A `Fit`. If the loss or its gradient is not finite, the run stops with a `RuntimeWarning`, and the best iterate so
-    far is returned.
+    A `Fit`. If the loss or its gradient is not finite, the run stops with a `RuntimeWarning`, which says why where a
+    simulation inside fails, and the best iterate so far is returned.
 
     **Raises:**
 
@@ -172,17 +182,16 @@ def fit(
                 what = (
                     f"the loss is {number}" if not math.isfinite(number) else "the gradient of the loss is not finite"
                 )
+                why = _why(loss, _merged(eqx.combine(trainable, frozen)), args)
                 if k == 0:
-                    raise ModelError(
-                        f"{what} at the start: simulate the model once with throw=True to see why, and check the data"
-                    )
+                    raise ModelError(f"{what} at the start: {why or 'check the data, and what the loss computes'}")
                 if math.isfinite(number):
                     history.append(number)
                     if number < history[best_step]:
                         best, best_step = trainable, k
                 message = (
-                    f"stopped after {k} updates: {what}. The best iterate, after {best_step} updates, is returned; a "
-                    "smaller learning rate or optax.clip_by_global_norm may help"
+                    f"stopped after {k} updates: {what}{f' ({why})' if why else ''}. The best iterate, after "
+                    f"{best_step} updates, is returned; a smaller learning rate or optax.clip_by_global_norm may help"
                 )
                 warnings.warn(message, RuntimeWarning, stacklevel=2)
                 break
@@ -212,8 +221,7 @@ def fit_least_squares(
 
     Where data are many and weights are few this is worth far more than gradient steps. The Jacobian is found by forward
     mode, so `simulate` and `solve_dae` take `adjoint=diffrax.ForwardMode()` inside unless they are given another one.
-    Give them `throw=False` and a moderate `max_steps`: a trial step may lead where the model cannot be integrated, and
-    is then rejected, not raised.
+    Give them a moderate `max_steps`: a trial step may lead where the model cannot be integrated, and is then rejected.
 
     Declared bounds of parameters hold in every trial: the steps are taken in unbounded coordinates, close to the
     parameters themselves well inside the bounds. An open end is approached, never reached.
@@ -255,7 +263,7 @@ def fit_least_squares(
         solver = optx.LevenbergMarquardt(rtol=rtol, atol=atol)
         if coordinates is not None:
             # Curved coordinates spoil the prediction: by default, only steps predicted to 1 % lengthen the next.
-            solver = eqx.tree_at(lambda s: s.search.high_cutoff, solver, 0.5)
+            solver = with_high_cutoff(solver, 0.5)
         found = optx.least_squares(
             lambda z, extra: function(inside(z), extra), solver, start, (frozen, args), max_steps=steps, throw=False
         )
@@ -277,7 +285,8 @@ def fit_least_squares(
         ) from error
     first, last = (float(c) for c in cost)
     if not math.isfinite(first):
-        raise ModelError("the residuals are not finite at the start: simulate the model once to see why")
+        why = _why(residuals, model, args)
+        raise ModelError(f"the residuals are not finite at the start: {why or 'check the data, and what they compute'}")
     if not last <= first:
         warnings.warn(
             "least squares found no better point; the model is returned unchanged", RuntimeWarning, stacklevel=2

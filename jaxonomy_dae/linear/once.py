@@ -9,7 +9,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.experimental.xla_metadata import set_xla_metadata
+
+from ..private_names import MissingName, private
 
 
 def joined(parts: Sequence[Any]) -> Any:
@@ -59,5 +60,9 @@ def _called(function: Any, parts: Sequence[Any]) -> Any:
     # XLA for GPUs takes a call that stays for a graph of commands.
     if jax.default_backend() != "cpu":
         return function(*parts)
-    with set_xla_metadata(inlineable="false"):
+    try:
+        mark = private("set_xla_metadata")
+    except MissingName:
+        return function(*parts)
+    with mark(inlineable="false"):
         return function(*parts)

@@ -58,13 +58,13 @@ class Outcome(eqx.Module):
         return {name: int(value) for name, value in self.stats.items() if jnp.ndim(value) == 0}
 
 
-def run(given: tuple[Any, ...], options: Options, watch: Watch | None, throw: bool = False) -> Outcome:
-    """Integrates `(system, t0, t1, ts, inputs, initial)`; `watch` is for Tsit5. With `throw`, an inconsistent start is
-    an error while running."""
+def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: bool = False) -> Outcome:
+    """Integrates `(system, t0, t1, ts, inputs, initial)`; `watch` is for Tsit5. With `checked`, an inconsistent start
+    and times that do not fit are errors while running."""
     system, t0, t1, ts, inputs, initial = given
     found = initialize(system, t0, inputs, initial)
-    if throw:
-        found = check(system, found, t0, inputs, initial, running=True)
+    if checked:
+        found = check(system, found, t0, inputs, initial, running=True, throw=True)
     x0, controller = found.x, options.controller
     implicit = is_implicit(options.solver)
     chosen = options.solver if ts is None else right_between_steps(options.solver)
@@ -91,7 +91,7 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, throw: bo
     done = integrate(
         term, solver, t0, t1, dt0, y0, inputs,
         save=save, controller=controller, adjoint=options.adjoint, max_steps=options.max_steps,
-        progress=options.progress, host_checks=throw,
+        progress=options.progress, checked=checked,
     )  # fmt: skip
     saved, x, last = done.ts, done.ys, done.last
     discrete, events, held = None, None, None

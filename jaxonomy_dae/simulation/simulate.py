@@ -54,7 +54,7 @@ def simulate(
     max_events: int = 100,
     save_events: bool | None = None,
     progress: bool = False,
-    throw: bool = True,
+    throw: bool | None = None,
 ) -> Solution:
     """Integrates a system from a consistent initial point.
 
@@ -87,8 +87,10 @@ def simulate(
     - `save_events`: whether `solution.events` also has variables before and after events; None: outside jit, and if
         they take little room.
     - `progress`: shows a progress bar.
-    - `throw`: whether to raise if the integration fails; otherwise see `solution.result`; rows that were not
-        reached are NaN, and so are their derivatives.
+    - `throw`: whether to raise if the start is not consistent or the integration fails. Otherwise `solution.result`
+        has a code, rows that were not reached are NaN, and so are their derivatives. None: outside jit, grad and vmap.
+        Inside, True puts callbacks to the host into the program, which JAX's persistent compilation cache then does
+        not keep.
 
     **Returns:**
 
@@ -99,7 +101,8 @@ def simulate(
 
     **Raises:**
 
-    - `ModelError` for arguments that cannot work; `InitializationError`; `SimulationError`.
+    - `ModelError` for arguments that cannot work; `InitializationError`; `SimulationError`. Inside jit, grad and vmap,
+        with `throw=True`, what depends on values is an Equinox run-time error.
     """
     if isinstance(system, AcausalSystem):  # `check_arguments` says what to do with anything else
         initial = system.plan.one_by_one(initial)
@@ -143,6 +146,11 @@ def simulate(
         solver = SOLVERS[choice.solver]()
     else:
         choice = Choice(type(solver).__name__, "as asked for", final=True)
+
+    def in_program() -> Solution:
+        checked = throw is True
+        return _traced(run(given, options(solver), None, checked), given, choice, checked, (max_steps, max_events))
+
     traced = _is_traced((given, options(solver)))
     switches = not choice.final and stepsize_controller is None
     if traced:
@@ -150,13 +158,13 @@ def simulate(
         if why:
             choice = implicit_choice(system.plan, why)
             solver = SOLVERS[choice.solver]()
-        return _traced(run(given, options(solver), None, throw), given, choice, throw, (max_steps, max_events))
+        return in_program()
     watch = Watch(t1, jnp.asarray(np.divide(scaled_atol(system, atol), rtol), dtype)) if switches else None
     outcome = run_compiled(given, options(solver), watch)
     if _is_traced(outcome):  # a network may close over a traced value, which shows in the outcome only
-        return _traced(run(given, options(solver), None, throw), given, choice, throw, (max_steps, max_events))
+        return in_program()
     counts = outcome.numbers()
-    if throw:
+    if throw is not False:
         check_parameters(system)
         check(system, outcome.found, t0, inputs, initial)
     if switches:
@@ -179,7 +187,7 @@ def simulate(
     solution = Solution(
         saved, x, system, inputs, counts, outcome.result, choice.solver, choice.reason, discrete, outcome.events
     )
-    if throw and not bool(diffrax.is_okay(outcome.result)):
+    if throw is not False and not bool(diffrax.is_okay(outcome.result)):
         first = t0, outcome.found.x
         mode = mode_at_start(system, inputs, *first)
         if mode:
@@ -201,10 +209,12 @@ def _stiff_without_a_run(plan: SystemPlan, duration: float | None) -> str:
     return f"stiff: at the declared start something decays within {1 / fastest_decay(plan):.2g}"
 
 
-def _traced(outcome: Outcome, given: tuple[Any, ...], choice: Choice, throw: bool, bounds: tuple[int, int]) -> Solution:
+def _traced(
+    outcome: Outcome, given: tuple[Any, ...], choice: Choice, checked: bool, bounds: tuple[int, int]
+) -> Solution:
     """The solution where nothing can be looked at: inside jit, grad or vmap."""
     system, inputs, x = given[0], given[4], outcome.x
-    if throw:
+    if checked:
         x = raised(x, outcome.result, system.plan.events is not None, *bounds)
     return Solution(
         outcome.ts, x, system, inputs, outcome.stats, outcome.result, choice.solver, choice.reason, outcome.discrete,

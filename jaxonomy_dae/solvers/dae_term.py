@@ -13,6 +13,7 @@ from jax.flatten_util import ravel_pytree
 
 from ..errors import ModelError
 from ..linear.mass import Mass
+from ..private_names import unwrapped
 
 
 class DAETerm(diffrax.AbstractTerm):
@@ -127,9 +128,7 @@ class FlatProblem:
     """
 
     def __init__(self, terms: Any, y: Any, args: Any):
-        wrapped = hasattr(terms, "direction")
-        self.term = terms.term if wrapped else terms
-        self.direction = terms.direction if wrapped else 1
+        self.term, self.direction = unwrapped(terms)
         self.args = args
         self.terms = terms
         self.flat, self.unravel = ravel_pytree(y)

@@ -4,13 +4,20 @@ import dataclasses
 from typing import Any, NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ..adjoint.host_checks import no_progress_meter, without_host_checks
+from ..adjoint.late_times import diffeqsolve, times_fit
 from .bdf import BDF
 from .projected import Projected
 from .rodas5p import Rodas5P
+
+BAD_TIMES: Any = diffrax.RESULTS.nonlinear_divergence  # Diffrax has no code of its own for them
+TIMES = (
+    "times do not fit: t0 and t1 must be finite, ts sorted from t0 to t1 and inside, and the times of StepTo must lead "
+    "from t0 to t1"
+)
 
 
 class Run(NamedTuple):
@@ -48,29 +55,22 @@ def is_multistep(solver: Any) -> bool:
 def integrate(
     term: Any, solver: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, *,
     save: diffrax.SubSaveAt, controller: Any, adjoint: Any, max_steps: int, progress: bool = False,
-    host_checks: bool = False,
+    checked: bool = False,
 ) -> Run:  # fmt: skip
     """Integrates, saves what is asked for and the last accepted point, and counts Jacobians.
 
-    Diffrax' own checks of the times are left out unless `host_checks`: see `without_host_checks`.
+    Where the times do not fit, no row counts as reached, and the result is `BAD_TIMES`; with `checked`, that is an
+    error while running.
     """
+    fits = times_fit(t0, t1, save.ts, controller)
+    if checked and fits is not True:
+        t1 = eqx.error_if(t1, jnp.logical_not(fits), TIMES)
     counted = isinstance(solver, BDF)
-    with without_host_checks(not host_checks):
-        solved: Any = diffrax.diffeqsolve(
-            term,
-            solver,
-            t0,
-            t1,
-            dt0,
-            y0,
-            args,
-            saveat=diffrax.SaveAt(subs={"out": save, "last": diffrax.SubSaveAt(t1=True)}, solver_state=counted),
-            stepsize_controller=controller,
-            adjoint=adjoint,
-            max_steps=max_steps,
-            throw=False,
-            progress_meter=diffrax.TqdmProgressMeter() if progress else no_progress_meter(),
-        )
+    solved: Any = diffeqsolve(
+        term, solver, t0, t1, dt0, y0, args, save=save, controller=controller, adjoint=adjoint, max_steps=max_steps,
+        throw=False, solver_state=counted,
+        progress_meter=diffrax.TqdmProgressMeter() if progress else diffrax.NoProgressMeter(),
+    )  # fmt: skip
     stats = dict(solved.stats)
     if counted:
         state = solved.solver_state
@@ -80,4 +80,7 @@ def integrate(
     elif is_implicit(solver):
         stats["num_jacobians"] = stats["num_steps"]
     last = jax.tree.map(lambda v: v[0], (solved.ts["last"], solved.ys["last"]))
-    return Run(jax.tree.map(jnp.asarray, solved.ts["out"]), solved.ys["out"], last, stats, solved.result)
+    ts, result = jnp.asarray(solved.ts["out"]), solved.result
+    if fits is not True:
+        ts, result = jnp.where(fits, ts, jnp.inf), diffrax.RESULTS.where(jnp.asarray(fits), result, BAD_TIMES)
+    return Run(ts, solved.ys["out"], last, stats, result)

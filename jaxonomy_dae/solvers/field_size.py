@@ -8,21 +8,27 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-from jax.extend import core
+
+from ..private_names import MissingName, private
 
 LARGE = 400  # operations from which stages are looped over: a pendulum has 150, a double pendulum 1,700
 
 
 def is_large(function: Callable[..., Any], *arguments: Any) -> bool:
     """Whether the traced function has many operations."""
-    return _operations(jax.make_jaxpr(function)(*arguments).jaxpr) > LARGE
+    program = jax.make_jaxpr(function)(*arguments)
+    try:
+        kinds = private("Jaxpr"), private("ClosedJaxpr")
+    except MissingName:
+        return True  # a loop is never wrong
+    return _operations(program.jaxpr, *kinds) > LARGE
 
 
-def _operations(jaxpr: core.Jaxpr) -> int:
-    return sum(1 + sum(map(_operations, _inside(equation.params))) for equation in jaxpr.eqns)
-
-
-def _inside(params: dict[str, Any]) -> list[core.Jaxpr]:
-    leaves = jax.tree.leaves(list(params.values()), is_leaf=lambda v: isinstance(v, core.Jaxpr | core.ClosedJaxpr))
-    found = [v.jaxpr if isinstance(v, core.ClosedJaxpr) else v for v in leaves]
-    return [v for v in found if isinstance(v, core.Jaxpr)]
+def _operations(jaxpr: Any, plain: type, closed: type) -> int:
+    """How many operations, those of programs inside included; `plain` and `closed` are JAX's two classes of them."""
+    total = 0
+    for equation in jaxpr.eqns:
+        leaves = jax.tree.leaves(list(equation.params.values()), is_leaf=lambda v: isinstance(v, plain | closed))
+        inside = [leaf.jaxpr if isinstance(leaf, closed) else leaf for leaf in leaves]
+        total += 1 + sum(_operations(program, plain, closed) for program in inside if isinstance(program, plain))
+    return total

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from ..adjoint.private_names import use_stepsize_tol
 from ..linear.choice import LinearAlgebra
+from ..private_names import FROM_CONTROLLER
 from .dae_term import FlatProblem
 
 CONVERGED = 0.1  # of the local error's tolerance (Brenan, Campbell & Petzold 1996, section 5.2.2)
@@ -20,13 +20,13 @@ STALE = 0.25  # relative change of the leading coefficient that a factorisation 
 class Tolerances(eqx.Module):
     """Tolerances of the iteration: those of the step-size controller, unless given."""
 
-    rtol: Any = use_stepsize_tol
-    atol: Any = use_stepsize_tol
-    norm: Any = use_stepsize_tol
+    rtol: Any = FROM_CONTROLLER
+    atol: Any = FROM_CONTROLLER
+    norm: Any = FROM_CONTROLLER
 
     def values(self, dtype: Any) -> tuple[Any, Any, Callable[[Any], Any]]:
         """(rtol, atol flat, norm)."""
-        if self.rtol is use_stepsize_tol:
+        if self.rtol is FROM_CONTROLLER:
             raise ValueError(
                 "BDF needs tolerances: call it by diffrax.diffeqsolve, or BDF(root_finder=Tolerances(...))"
             )

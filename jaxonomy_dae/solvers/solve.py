@@ -45,7 +45,7 @@ def solve_dae(
     dtmax: Any = None,
     max_steps: int = 16384,
     names: Sequence[str] | None = None,
-    throw: bool = True,
+    throw: bool | None = None,
 ) -> diffrax.Solution:
     """Solves M dy/dt = F(t, y, args), or dx/dt = f, 0 = g, from a consistent start.
 
@@ -64,8 +64,10 @@ def solve_dae(
     - `jump_ts`: times at which F jumps, a number or shape (n,): steps end there and the method starts anew.
     - `dtmax`: the longest step.
     - `names`: of the unknowns, in order, for error messages.
-    - `throw`: whether to raise if the start is inconsistent or the integration fails; otherwise see `solution.result`;
-        rows that were not reached are NaN, and so are their derivatives.
+    - `throw`: whether to raise if the start is inconsistent or the integration fails. Otherwise `solution.result` has a
+        code, rows that were not reached are NaN, and so are their derivatives. None: outside jit, grad and vmap.
+        Inside, True puts callbacks to the host into the program, which JAX's persistent compilation cache then does
+        not keep.
 
     **Returns:**
 
@@ -101,15 +103,15 @@ def solve_dae(
     options = (solver, adjoint or default_adjoint(), stepsize_controller, max_steps)
     arguments = (term, t0, t1, y0, ts, args, (rtol, atol), options)
     traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments))
-    check, solution, last = _solve(*arguments, host_checks=throw) if traced else _compiled(*arguments)
+    check, solution, last = _solve(*arguments, checked=throw is True) if traced else _compiled(*arguments)
     known = list(names) if names is not None else [f"y[{k}]" for k in range(n)]
     outcome = (check, solution.result)
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(outcome)):
-        if throw:
+        if throw is True:
             ys = check.error_if(solution.ys)
             solution = eqx.tree_at(lambda s: s.ys, solution, solution.result.error_if(ys, solution.result != OK))
         return solution
-    if throw:
+    if throw is not False:
         message = explain_start(check, known)
         if message:
             raise InitializationError(message)
@@ -183,7 +185,7 @@ def _rounded_up(value: float) -> float:
     return math.ceil(value / unit) * unit
 
 
-def _solve(term, t0, t1, y0, ts, args, tolerances, options, host_checks=False):
+def _solve(term, t0, t1, y0, ts, args, tolerances, options, checked=False):
     solver, adjoint, controller, max_steps = options
     check: StartCheck = start_check(FlatProblem(term, y0, args), t0, *tolerances)
     save = diffrax.SubSaveAt(t1=True) if ts is None else diffrax.SubSaveAt(ts=ts)
@@ -199,9 +201,9 @@ def _solve(term, t0, t1, y0, ts, args, tolerances, options, host_checks=False):
         controller=controller,
         adjoint=adjoint,
         max_steps=max_steps,
-        host_checks=host_checks,
+        checked=checked,
     )
-    reached = jnp.isfinite(run.ts)
+    reached = jnp.isfinite(run.ts) & check.is_fine
     saved = run.ys if ts is None else _on_constraints(term, args, run.ts, run.ys, y0)
     saved = jax.tree.map(lambda y: not_a_number(y, reached, y0, args), saved)
     failure: Any = diffrax.RESULTS.nonlinear_divergence
@@ -234,9 +236,17 @@ _compiled = eqx.filter_jit(_solve)
 
 
 def consistent_start(
-    term: DAETerm, y0: Any, *, t0: Any = 0.0, args: Any = None, max_steps: int = 50, names: Sequence[str] | None = None
-) -> Any:
+    term: DAETerm, y0: Any, *, t0: Any = 0.0, args: Any = None, max_steps: int = 50,
+    names: Sequence[str] | None = None, throw: bool | None = None,
+) -> Any:  # fmt: skip
     """A consistent start near y0: what occurs differentiated stays (M y does), the algebraic unknowns are solved for.
+
+    **Arguments:**
+
+    - `term`, `y0`, `t0`, `args`, `names`: as in `solve_dae`.
+    - `max_steps`: bounds the iterations of Newton's method.
+    - `throw`: whether to raise if there is none; otherwise it is not-a-number, and so are its derivatives. None:
+        outside jit, grad and vmap. Inside, True puts a callback to the host into the program.
 
     **Raises:**
 
@@ -250,7 +260,10 @@ def consistent_start(
     y, size = consistent_point(problem, None, t, problem.flat, max_steps)
     eps = float(jnp.finfo(y.dtype).eps)
     failed = ~(size <= math.sqrt(eps))
-    if isinstance(failed, Tracer):
+    traced = isinstance(failed, Tracer)
+    if throw is False or (traced and throw is None):
+        y = not_a_number(y[None], ~failed[None], y0, args, t)[0]
+    elif traced:
         y = eqx.error_if(y, failed, "no consistent start: Newton's method did not converge")
     elif bool(failed):
         moving = np.abs(np.asarray(consistent_shift(problem, None, t, y, problem.flat)))

@@ -15,14 +15,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
+
+from ..private_names import private
 
 
 @dataclasses.dataclass(frozen=True)
 class _Program:
     """A traced function without its numbers, compared by what it computes."""
 
-    jaxpr: Jaxpr = dataclasses.field(compare=False)
+    jaxpr: Any = dataclasses.field(compare=False)
     key: Hashable
     hashed: int
 
@@ -39,7 +40,7 @@ class ClosedFunction(eqx.Module):
     def __call__(self, t: Any) -> Any:
         jaxpr = self.program.jaxpr
         time = jnp.asarray(t, jaxpr.invars[0].aval.dtype)  # pyright: ignore[reportAttributeAccessIssue]
-        return jaxpr_as_fun(ClosedJaxpr(jaxpr, self.constants))(time)[0]
+        return private("jaxpr_as_fun")(private("ClosedJaxpr")(jaxpr, self.constants))(time)[0]
 
 
 def closed_function(function: Callable[[Any], Any], dtype: Any) -> ClosedFunction:
@@ -50,10 +51,11 @@ def closed_function(function: Callable[[Any], Any], dtype: Any) -> ClosedFunctio
     return ClosedFunction([_own(c) for c in (*closed.consts, *numbers)], _Program(jaxpr, key, hash(key)))
 
 
-def _with_numbers_lifted(jaxpr: Jaxpr) -> tuple[Jaxpr, list[Any]]:
+def _with_numbers_lifted(jaxpr: Any) -> tuple[Any, list[Any]]:
     """The numbers written in a program become constants, so that other numbers are not another program."""
+    literal = private("Literal")
     atoms = [atom for equation in jaxpr.eqns for atom in equation.invars] + list(jaxpr.outvars)
-    lifted = [atom for atom in atoms if isinstance(atom, Literal) and _is_data(atom)]
+    lifted = [atom for atom in atoms if isinstance(atom, literal) and _is_data(atom)]
     if not lifted:
         return jaxpr, []
     structs = [jax.ShapeDtypeStruct(atom.aval.shape, atom.aval.dtype) for atom in lifted]  # pyright: ignore
@@ -80,12 +82,13 @@ def _is_data(literal: Any) -> bool:
     return jnp.issubdtype(literal.aval.dtype, jnp.inexact) or bool(np.shape(literal.val))
 
 
-def _key_of_jaxpr(jaxpr: Jaxpr) -> Hashable:
+def _key_of_jaxpr(jaxpr: Any) -> Hashable:
     """A hashable value that two jaxprs share only if they compute the same from the same constants."""
     number: dict[Any, int] = {}
+    literal = private("Literal")
 
     def atom(a: Any) -> Hashable:
-        if isinstance(a, Literal):
+        if isinstance(a, literal):
             return "literal", _key(a.val), a.aval.str_short()
         return number.setdefault(a, len(number))
 
@@ -103,9 +106,9 @@ def _key_of_jaxpr(jaxpr: Jaxpr) -> Hashable:
 
 
 def _key(value: Any) -> Hashable:
-    if isinstance(value, ClosedJaxpr):
+    if isinstance(value, private("ClosedJaxpr")):
         return _key_of_jaxpr(value.jaxpr), tuple(_key(c) for c in value.consts)
-    if isinstance(value, Jaxpr):
+    if isinstance(value, private("Jaxpr")):
         return _key_of_jaxpr(value)
     if isinstance(value, tuple | list):
         return type(value).__name__, tuple(_key(v) for v in value)

@@ -311,6 +311,7 @@ class AcausalSystem(eqx.Module):
         initial: Mapping[str, Any] | None = None,
         *,
         solver: Any = None,
+        throw: bool | None = None,
     ) -> Array: ...
 
     @overload
@@ -322,6 +323,7 @@ class AcausalSystem(eqx.Module):
         *,
         solve_for: Sequence[str],
         solver: Any = None,
+        throw: bool | None = None,
     ) -> tuple[Array, "AcausalSystem"]: ...
 
     def initialize(
@@ -332,6 +334,7 @@ class AcausalSystem(eqx.Module):
         *,
         solve_for: Sequence[str] | None = None,
         solver: Any = None,
+        throw: bool | None = None,
     ) -> Any:
         """A consistent state at `t0`: all equations, hidden ones included, and the fixed starts hold.
 
@@ -347,6 +350,9 @@ class AcausalSystem(eqx.Module):
         - `solver`: an Optimistix root finder or least-squares solver, such as
             `optimistix.LevenbergMarquardt(rtol=1e-8, atol=1e-8)`, instead of the ladder of methods. It sees unknowns
             and rows divided by their sizes.
+        - `throw`: whether to raise if there is no such state; otherwise it is not-a-number, and so are its derivatives.
+            None: outside jit, grad and vmap. Inside, True puts callbacks to the host into the program, which JAX's
+            persistent compilation cache then does not keep.
 
         **Returns:**
 
@@ -358,7 +364,8 @@ class AcausalSystem(eqx.Module):
 
         - `InitializationError` if fixed starts contradict the equations, if no consistent point was found, if a block
             of equations is singular there, if the values given are too few or too many for `solve_for`, or if a
-            parameter found is out of its bounds. Inside jit, what depends on values is an Equinox run-time error.
+            parameter found is out of its bounds. Inside jit, with `throw=True`, what depends on values is an Equinox
+            run-time error.
         """
         from ..initialization.given_solver import check_solver
         from ..initialization.initialize import check, find_initial
@@ -368,7 +375,7 @@ class AcausalSystem(eqx.Module):
             check_solver(solver)
         initial = self.plan.one_by_one(initial)
         found = find_initial(self, t0, inputs, initial, names, solver)
-        found = check(self, found, t0, inputs, initial, names)
+        found = check(self, found, t0, inputs, initial, names, throw=throw)
         if solve_for is None:
             return found.x
         table = self.parameters.table

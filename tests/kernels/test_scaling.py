@@ -108,8 +108,13 @@ def test_rows_do_not_depend_on_the_values_they_were_chosen_with():
             InitializationError, match=r"start of c\.x, 1: off by 1.*|c\.x is fixed at 1, but the equations"
         ):
             system.initialize()
+
+    def start(p, throw=None):
+        return first.with_parameters({"c.p": p}).initialize(throw=throw)
+
+    assert np.isnan(jax.jit(start)(1.0)).all() and np.isnan(jax.grad(lambda p: start(p)[0])(1.0))
     with pytest.raises(Exception, match="no consistent initial point"):
-        jax.block_until_ready(jax.jit(lambda p: first.with_parameters({"c.p": p}).initialize())(1.0))
+        jax.block_until_ready(jax.jit(lambda p: start(p, throw=True))(1.0))
 
 
 # --- the same model in other units -----------------------------------------------------------------------------------

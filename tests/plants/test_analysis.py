@@ -181,8 +181,12 @@ def test_a_free_integrator_is_named():
 
 @pytest.mark.slow
 def test_no_equilibrium_inside_jit():
+    def state(u, throw=None):
+        return steady_state(motor(), inputs={"source.u": u}, throw=throw).x
+
+    assert np.isnan(jax.jit(state)(3.0)).all()
     with pytest.raises(Exception, match="no equilibrium was found"):
-        jax.block_until_ready(eqx.filter_jit(lambda u: steady_state(motor(), inputs={"source.u": u}).x)(3.0))
+        jax.block_until_ready(eqx.filter_jit(state)(3.0, throw=True))
 
 
 def test_a_common_change_is_named():

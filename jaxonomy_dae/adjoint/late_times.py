@@ -1,0 +1,145 @@
+"""Solves whose times Diffrax does not check while they run.
+
+Given are the times at which a solve saves, and its first step. `diffrax.diffeqsolve` checks by `equinox.error_if` that
+they fit to the interval, which puts callbacks to the host into the program; one is enough to keep it out of JAX's
+persistent compilation cache and out of `jax.export`. So it is not told of these times: those to save at join where its
+loop over the steps begins, and the first step is the controller's own. `times_fit` makes the same check as a value.
+What a user's functions check stays where it is.
+"""
+
+import dataclasses
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Bool
+
+from ..private_names import FOR_LATE_TIMES, missing
+
+
+def times_fit(t0: Any, t1: Any, ts: Any, controller: Any) -> Bool[Array, ""] | bool:
+    """Whether the times to save, shape (n,) or None, are sorted from t0 to t1 and not outside, and whether those of a
+    `diffrax.StepTo` lead from t0 to t1. A Python bool where nothing is traced."""
+    steps = controller.ts if isinstance(controller, diffrax.StepTo) else None
+    traced = any(isinstance(value, Tracer) for value in (t0, t1, ts, steps))
+    xp: Any = jnp if traced else np
+    if not traced:
+        t0, t1, ts, steps = (None if value is None else np.asarray(value) for value in (t0, t1, ts, steps))
+    sign = xp.where(t0 < t1, 1, -1)
+    fits = xp.isfinite(t0) & xp.isfinite(t1)
+    if ts is not None:
+        inside = (ts * sign >= t0 * sign) & (ts * sign <= t1 * sign)
+        fits = fits & xp.all(inside) & xp.all(xp.diff(ts) * sign >= 0)
+    if steps is not None:
+        fits = fits & (steps[0] == t0) & (steps[-1] == t1) & xp.all(xp.diff(steps) * sign > 0)
+    return fits if traced else bool(fits)
+
+
+def diffeqsolve(
+    term: Any, solver: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, *,
+    save: diffrax.SubSaveAt, controller: Any, adjoint: Any, **options: Any,
+) -> diffrax.Solution:  # fmt: skip
+    """`diffrax.diffeqsolve` without its checks of times, for an interval and times of one dtype.
+
+    **Arguments:** Diffrax', but: `save` says what is to be found in `ts["out"]` and `ys["out"]`; `ts["last"]` and
+    `ys["last"]` are the last accepted point. The first step `dt0`, or None, is positive where t0 < t1.
+    """
+    subs = {"last": diffrax.SubSaveAt(t1=True)}
+    if save.ts is None or missing(FOR_LATE_TIMES) is not None:
+        subs["out"] = save
+    else:
+        adjoint = _LateTimes(adjoint, save, jnp.where(t0 < t1, 1, -1))  # pyright: ignore[reportCallIssue]
+    if dt0 is not None:
+        controller = _FirstStep(controller, dt0)  # pyright: ignore[reportCallIssue]
+    elif isinstance(controller, diffrax.StepTo):
+        controller = _StepTo(controller)  # pyright: ignore[reportCallIssue]
+    return diffrax.diffeqsolve(
+        term, solver, t0, t1, None, y0, args, stepsize_controller=controller, adjoint=adjoint,
+        saveat=diffrax.SaveAt(subs=subs, solver_state=options.pop("solver_state", False)), **options,
+    )  # fmt: skip
+
+
+class _LateTimes(diffrax.AbstractAdjoint):
+    """Another adjoint, whose solves save at times that `diffrax.diffeqsolve` was not told of.
+
+    - `save`: when to save, in the time of the equations.
+    - `direction`: −1 where that runs backwards; Diffrax' loop always goes forwards.
+    """
+
+    adjoint: diffrax.AbstractAdjoint
+    save: diffrax.SubSaveAt
+    direction: Any
+
+    def loop(self, **given: Any) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The loop over the steps, called by `diffrax.diffeqsolve`, with what it makes of `SaveAt(ts=...)`."""
+        state, saveat, t0 = given["init_state"], given["saveat"], given["t0"]
+        ts, direction = self.save.ts, self.direction
+        assert ts is not None
+        save = dataclasses.replace(
+            self.save,
+            ts=(ts * direction).astype(t0.dtype),
+            fn=lambda t, y, args: self.save.fn(direction * t, y, args),
+        )
+        count = len(ts)
+        shapes = eqx.filter_eval_shape(save.fn, t0, state.y, given["args"])
+        saved = dataclasses.replace(
+            state.save_state["last"],
+            ts=jnp.full((count,), jnp.inf, t0.dtype),
+            ys=jax.tree.map(lambda y: jnp.full((count, *y.shape), jnp.inf, y.dtype), shapes),
+        )
+        return self.adjoint.loop(
+            **given
+            | dict(
+                init_state=dataclasses.replace(state, save_state=state.save_state | {"out": saved}),
+                saveat=dataclasses.replace(saveat, subs=saveat.subs | {"out": save}),
+            )
+        )
+
+
+class _FirstStep(diffrax.AbstractAdaptiveStepSizeController):
+    """Another controller with a first step of the size given."""
+
+    controller: Any
+    dt0: Any
+
+    @property
+    def rtol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.controller.rtol
+
+    @property
+    def atol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.controller.atol
+
+    @property
+    def norm(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.controller.norm
+
+    def wrap(self, direction):
+        wrapped = self.controller.wrap(direction)
+        return _FirstStep(wrapped, self.dt0 * direction)  # pyright: ignore[reportCallIssue]
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        return self.controller.init(terms, t0, t1, y0, self.dt0, args, func, error_order)
+
+    def adapt_step_size(self, *given):  # pyright: ignore[reportIncompatibleMethodOverride]
+        return self.controller.adapt_step_size(*given)
+
+
+class _StepTo(diffrax.AbstractStepSizeController):
+    """`diffrax.StepTo` without its checks."""
+
+    controller: diffrax.StepTo
+
+    def wrap(self, direction):
+        turned = diffrax.StepTo(self.controller.ts * direction)
+        return _StepTo(turned)  # pyright: ignore[reportCallIssue]
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        return self.controller.ts[1], 2
+
+    def adapt_step_size(self, *given):  # pyright: ignore[reportIncompatibleMethodOverride]
+        return self.controller.adapt_step_size(*given)
