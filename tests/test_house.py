@@ -8,7 +8,8 @@ import jaxonomy_dae
 
 ROOT = Path(jaxonomy_dae.__file__).parent
 ORDER = [
-    "errors", "optional", "expressions", "units", "modeling", "structure", "linear", "adjoint", "solvers", "hybrid",
+    "errors", "optional", "programs", "expressions", "units", "modeling", "structure", "linear", "adjoint", "solvers",
+    "hybrid",
     "model", "diagnosis", "compiler", "lowering", "system", "initialization", "simulation", "learning", "analysis",
     "plotting", "testing", "library",
 ]  # fmt: skip

@@ -13,6 +13,7 @@ from jax.core import Tracer
 
 from ..errors import ModelError
 from ..optional import optional_module
+from ..programs.cache import compiled
 from ..simulation.labelled import dataset_of
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
@@ -147,7 +148,7 @@ class _Simulation(eqx.Module):
         return simulate(system, **self.options)
 
 
-@eqx.filter_jit
+@compiled
 def _mapped(function: Any, system: AcausalSystem, names: tuple[str, ...], rows: tuple[Any, ...]) -> Any:
     def one(row):
         return function(system.with_parameters(dict(zip(names, row, strict=True))))

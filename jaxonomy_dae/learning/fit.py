@@ -18,6 +18,7 @@ from tqdm import tqdm
 from ..adjoint.default import forward_mode
 from ..errors import ModelError
 from ..modeling.interval import Interval
+from ..programs.cache import compiled
 from ..system.system import AcausalSystem
 from .bounds import Unbounded, project
 
@@ -142,7 +143,7 @@ def fit(
     # Updates make weakly typed leaves strong, which would compile the step again.
     trainable = jax.tree.map(lambda w: jnp.asarray(w, w.dtype) if eqx.is_array(w) else w, trainable)
 
-    @eqx.filter_jit
+    @compiled
     def step(trainable, frozen, state, args):
         def objective(trainable):
             value = loss(_merged(eqx.combine(trainable, frozen)), *args)
@@ -250,7 +251,7 @@ def fit_least_squares(
     def inside(weights):
         return weights if coordinates is None else _with_free(weights, coordinates.values(weights.parameters.free))
 
-    @eqx.filter_jit
+    @compiled
     def run(trainable, start, frozen, args):
         solver = optx.LevenbergMarquardt(rtol=rtol, atol=atol)
         if coordinates is not None:

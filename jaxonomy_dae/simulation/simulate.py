@@ -14,6 +14,8 @@ from ..adjoint.default import default_adjoint
 from ..errors import InitializationError, SimulationError
 from ..initialization.initialize import check
 from ..lowering.plan import SystemPlan
+from ..programs.cache import PROGRAMS
+from ..programs.staging import is_staged
 from ..solvers import BDF, Rodas5P, Tsit5
 from ..solvers.causes import decay_at, is_stiff
 from ..solvers.drive import is_implicit
@@ -94,8 +96,8 @@ def simulate(
 
     A `Solution`: `solution["pend.x"]` has shape `(n,)`.
 
-    Called with plain arrays, it is compiled once for each structure, set of options and shapes. Inside `jax.jit`,
-    `grad` or `vmap` it is traced like any function.
+    Called outside of jit, it is compiled once for each structure, set of options and shapes, and `jax.grad`, `jax.vmap`
+    and `jax.jvp` transform that program. Inside `jax.jit` it is traced like any function.
 
     **Raises:**
 
@@ -150,7 +152,11 @@ def simulate(
         if why:
             choice = implicit_choice(system.plan, why)
             solver = SOLVERS[choice.solver]()
-        return _traced(run(given, options(solver), None, throw), given, choice, throw, (max_steps, max_events))
+        staged = is_staged((given, options(solver)))
+        if staged:
+            PROGRAMS.make_room()
+        outcome = (run if staged else run_compiled)(given, options(solver), None, throw)
+        return _traced(outcome, given, choice, throw, (max_steps, max_events))
     watch = Watch(t1, jnp.asarray(np.divide(scaled_atol(system, atol), rtol), dtype)) if switches else None
     outcome = run_compiled(given, options(solver), watch)
     if _is_traced(outcome):  # a network may close over a traced value, which shows in the outcome only
