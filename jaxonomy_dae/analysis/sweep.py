@@ -1,5 +1,6 @@
 """Sweeps: one function of a system for many values of named parameters, at once."""
 
+import functools
 import itertools
 from collections.abc import Callable, Mapping
 from html import escape
@@ -148,7 +149,7 @@ class _Simulation(eqx.Module):
         return simulate(system, **self.options)
 
 
-@compiled
+@functools.partial(compiled, runs_once=False)
 def _mapped(function: Any, system: AcausalSystem, names: tuple[str, ...], rows: tuple[Any, ...]) -> Any:
     def one(row):
         return function(system.with_parameters(dict(zip(names, row, strict=True))))

@@ -1,6 +1,7 @@
 """Training: gradient descent with Optax, and nonlinear least squares with Optimistix."""
 
 import dataclasses
+import functools
 import html
 import math
 import warnings
@@ -143,7 +144,7 @@ def fit(
     # Updates make weakly typed leaves strong, which would compile the step again.
     trainable = jax.tree.map(lambda w: jnp.asarray(w, w.dtype) if eqx.is_array(w) else w, trainable)
 
-    @compiled
+    @functools.partial(compiled, runs_once=False)
     def step(trainable, frozen, state, args):
         def objective(trainable):
             value = loss(_merged(eqx.combine(trainable, frozen)), *args)
@@ -251,7 +252,7 @@ def fit_least_squares(
     def inside(weights):
         return weights if coordinates is None else _with_free(weights, coordinates.values(weights.parameters.free))
 
-    @compiled
+    @functools.partial(compiled, runs_once=False)
     def run(trainable, start, frozen, args):
         solver = optx.LevenbergMarquardt(rtol=rtol, atol=atol)
         if coordinates is not None:

@@ -18,14 +18,15 @@ import equinox as eqx
 import jax
 from jax.core import Tracer
 
-from .machine import Use, mappings, memory
+from .machine import Use, mappings, memory, return_memory
+from .options import quick
 
 # Of the mappings that Linux allows, and of the memory that this process could have. What is left must hold what is
-# compiled until use is measured next: a gradient takes 800 (two states) to 5,000 mappings (events), a thirteenth.
+# compiled until use is measured next: a gradient takes 800 (two states) to 4,500 mappings (double pendulum), 7 %.
 SHARE = 0.5  # beyond which programs kept here go, the least recently used first
 FULL = 0.75  # beyond which, with none left here to go, JAX's own caches are cleared
-AGAIN = 0.125  # what use must have grown by, after a clearing that was of no use, before the next
-COUNT = 256  # programs kept where the system says nothing; at 16 MB each, 4 GB
+AGAIN = 0.125  # by which use must have grown since something was freed: programs in use must not push each other out
+COUNT = 64  # programs kept where the system says nothing: 4 GB at the 66 MB of the tutorial's
 PART = 4  # one of so many programs goes before use is measured again
 PAUSE = 100  # a measurement takes some 2 µs for each mapping, up to 0.1 s; 1 % of the time may go into it
 
@@ -35,7 +36,7 @@ _P, _T = ParamSpec("_P"), TypeVar("_T")
 class _Program:
     """A function with its static values, and in how many calls it stands now."""
 
-    def __init__(self, function: Callable, structure: Any, static: tuple[Any, ...]):
+    def __init__(self, function: Callable, runs_once: bool, structure: Any, static: tuple[Any, ...]):
         def run(arrays: list[Any]) -> Any:
             rest = iter(arrays)
             leaves = [next(rest) if leaf is _ARRAY else leaf for leaf in static]
@@ -43,12 +44,25 @@ class _Program:
             return function(*args, **kwargs)
 
         run.__name__ = run.__qualname__ = getattr(function, "__name__", "run")  # what profiles and errors show
-        self.run = eqx.filter_jit(run)
         self.calls = 0
+        self._run = eqx.filter_jit(run)
+        self._run_quick = eqx.filter_jit(run, compiler_options=quick()) if runs_once and quick() else self._run
+
+    def __call__(self, arrays: list[Any]) -> Any:
+        # JAX takes compiler options for whole programs only, not for what it differentiates, batches or makes a part of
+        # another program: there the arguments are traced, or the outcome would be.
+        if not _is_traced(arrays):
+            try:
+                return self._run_quick(arrays)
+            except ValueError as error:
+                if "top-level" not in str(error):
+                    raise
+        return self._run(arrays)
 
     def clear(self) -> None:
         """Frees what was compiled, its derivatives by JAX included."""
-        self.run._cached.clear_cache()  # pyright: ignore[reportFunctionMemberAccess]
+        for run in (self._run, self._run_quick):
+            run._cached.clear_cache()  # pyright: ignore[reportFunctionMemberAccess]
 
 
 class _Array:
@@ -68,13 +82,13 @@ class ProgramCache:
         self._programs: OrderedDict[Hashable, _Program] = OrderedDict()
         self._lock = threading.RLock()
         self._next = 0.0  # when use may be measured again, in seconds of `time.perf_counter`
-        self._after_clearing = {"mappings": 0, "memory": 0}
+        self._left: dict[Callable, int] = {mappings: 0, memory: 0}  # what freeing left, of each
         self._warned = False
 
     def __len__(self) -> int:
         return len(self._programs)
 
-    def call(self, function: Callable, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    def call(self, function: Callable, runs_once: bool, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """`function(*args, **kwargs)`, by a program compiled at the first such call."""
         leaves, structure = jax.tree.flatten((args, kwargs))
         arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
@@ -84,11 +98,11 @@ class ProgramCache:
             program = self._programs.get(key)
             if program is None:
                 self.make_room()
-                program = self._programs[key] = _Program(function, structure, static)
+                program = self._programs[key] = _Program(function, runs_once, structure, static)
             self._programs.move_to_end(key)
             program.calls += 1
         try:
-            outcome = program.run(arrays)
+            outcome = program(arrays)
         finally:
             with self._lock:
                 program.calls -= 1
@@ -106,45 +120,41 @@ class ProgramCache:
     def make_room(self) -> None:
         """Lets programs go where they take too much. To be called where a program is about to be compiled."""
         with self._lock:
-            if time.perf_counter() < self._next:
-                return
             start = time.perf_counter()
+            if start < self._next:
+                return
             use = mappings()
             took = time.perf_counter() - start
             if use is None:
                 self._let_go(len(self) - COUNT)
-            elif use.share > SHARE:
+            elif self._is_too_much(mappings, use):
                 self._free_mappings()
-            self._free_memory()
+            if self._is_too_much(memory, memory()):
+                # Arrays of the user's may be what takes it, so half of the programs stay.
+                self._let_go((len(self) + 1) // 2)
+                self._after_freeing(memory)
             self._next = time.perf_counter() + PAUSE * took
 
     def _free_mappings(self) -> None:
-        gc.collect()  # a user's jitted functions that are gone often wait for it
+        gc.collect()  # jitted functions that a user is done with often wait for it
         use = mappings()
         while use is not None and use.share > SHARE and self._let_go(max(len(self) // PART, 1)):
             use = mappings()
-        if use is None or use.share <= FULL or not self._has_grown("mappings", use):
-            return
-        if not self._warned:
-            self._warned = True
-            warnings.warn(_text(use), RuntimeWarning, stacklevel=2)
-        jax.clear_caches()
-        gc.collect()
-        left = mappings()
-        self._after_clearing["mappings"] = 0 if left is None else left.used
+        if use is not None and use.share > FULL:
+            if not self._warned:
+                self._warned = True
+                warnings.warn(_text(use), RuntimeWarning, stacklevel=2)
+            jax.clear_caches()
+        self._after_freeing(mappings)
 
-    def _free_memory(self) -> None:
-        use = memory()
-        if use is None or use.share <= SHARE or not self._has_grown("memory", use):
-            return
-        # Arrays of the user's may be what takes it, so half of the programs stay.
-        self._let_go((len(self) + 1) // 2)
-        gc.collect()
-        left = memory()
-        self._after_clearing["memory"] = 0 if left is None else left.used
+    def _is_too_much(self, measure: Callable[[], Use | None], use: Use | None) -> bool:
+        return use is not None and use.share > SHARE and use.used > self._left[measure] + AGAIN * use.allowed
 
-    def _has_grown(self, what: str, use: Use) -> bool:
-        return use.used - self._after_clearing[what] > AGAIN * use.allowed
+    def _after_freeing(self, measure: Callable[[], Use | None]) -> None:
+        gc.collect()
+        return_memory()
+        use = measure()
+        self._left[measure] = 0 if use is None else use.used
 
     def _let_go(self, count: int) -> int:
         """Lets the least recently used programs go, as many as `count`; those that run now stay. How many went."""
@@ -171,12 +181,15 @@ def _text(use: Use) -> str:
 PROGRAMS = ProgramCache()
 
 
-def compiled(function: Callable[_P, _T]) -> Callable[_P, _T]:
+def compiled(function: Callable[_P, _T], runs_once: bool = True) -> Callable[_P, _T]:
     """The function, compiled at the first call for each structure, static values and shapes, as by
-    `equinox.filter_jit`. Programs are let go if there are more than the machine has room for."""
+    `equinox.filter_jit`. Programs are let go if there are more than the machine has room for.
+
+    `runs_once` says that a program's runs take less time than its compilation does: it is compiled quickly.
+    """
 
     @functools.wraps(function)
     def call(*args: _P.args, **kwargs: _P.kwargs) -> _T:
-        return PROGRAMS.call(function, args, kwargs)
+        return PROGRAMS.call(function, runs_once, args, kwargs)
 
     return call
