@@ -54,7 +54,7 @@ def run(number: int) -> None:
     p = jnp.asarray(system.parameters["c.p"])
     value, slope = loss(p), jax.grad(loss)(p)
     jitted = eqx.filter_jit(jax.value_and_grad(loss))(p)  # what no one frees but jax.clear_caches
-    np.testing.assert_allclose([value, slope], jitted, rtol=1e-9)
+    np.testing.assert_allclose([value, slope], jitted, rtol=1e-5)  # ten times the tolerance of the run
 
 
 def main() -> None:

@@ -30,7 +30,8 @@ COUNT = 64  # programs kept where the system says nothing: 4 GB at the 66 MB of 
 PART = 4  # one of so many programs goes before use is measured again
 PAUSE = 100  # a measurement takes some 2 µs for each mapping, up to 0.1 s; 1 % of the time may go into it
 
-_P, _T = ParamSpec("_P"), TypeVar("_T")
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
 
 
 class _Program:
@@ -46,7 +47,9 @@ class _Program:
         run.__name__ = run.__qualname__ = getattr(function, "__name__", "run")  # what profiles and errors show
         self.calls = 0
         self._run = eqx.filter_jit(run)
-        self._run_quick = eqx.filter_jit(run, compiler_options=quick()) if runs_once and quick() else self._run
+        self._run_quick = self._run
+        if runs_once and quick():
+            self._run_quick = eqx.filter_jit(run, compiler_options=quick())  # pyright: ignore[reportCallIssue]
 
     def __call__(self, arrays: list[Any]) -> Any:
         # JAX takes compiler options for whole programs only, not for what it differentiates, batches or makes a part of
