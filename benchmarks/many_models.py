@@ -59,7 +59,7 @@ def run(number: int) -> None:
 
 def main() -> None:
     jax.config.update("jax_enable_x64", True)
-    count, every = int(os.environ.get("COUNT", 50)), int(os.environ.get("EVERY", 25))
+    count, every = int(os.environ.get("COUNT", 20)), int(os.environ.get("EVERY", 5))
     if "LIMIT" in os.environ:
         machine.ALLOWED = Path(tempfile.mkdtemp()) / "max_map_count"
         machine.ALLOWED.write_text(os.environ["LIMIT"])

@@ -65,17 +65,13 @@ class _Program:
     def clear(self) -> None:
         """Frees what was compiled, its derivatives by JAX included."""
         for run in (self._run, self._run_quick):
-            run._cached.clear_cache()  # pyright: ignore[reportFunctionMemberAccess]
+            cached = getattr(run, "_cached", None)  # the `jax.jit` inside, a private name of Equinox
+            if cached is None:
+                return jax.clear_caches()
+            cached.clear_cache()
 
 
-class _Array:
-    """Stands where an array was."""
-
-    def __repr__(self):
-        return "array"
-
-
-_ARRAY = _Array()
+_ARRAY = object()  # stands where an array was
 
 
 class ProgramCache:

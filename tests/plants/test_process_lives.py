@@ -6,9 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from problems import rc_circuit, rc_voltage
+from problems import compiled, component, rc_circuit, rc_voltage
+from sympy import Eq
 
-from jaxonomy_dae import simulate
+from jaxonomy_dae import der, simulate
 from jaxonomy_dae.programs.cache import PROGRAMS
 
 TS = np.array([0.3, 1.0])
@@ -70,4 +71,27 @@ def test_a_batch_is_compiled_once(compilations):
     assert compilations
     compilations.clear()
     checked([3.0, 4.0])
+    assert not compilations
+
+
+def cubic(self, ev):
+    """y = x³ + x with y fixed at the start."""
+    p = self.parameter("p", 10.0)
+    x, y = self.variable("x"), self.variable("y", start=p, fixed=True)
+    self.add_equations(Eq(der(x), -x), Eq(y, x**3 + x))
+
+
+def test_derivatives_of_a_start(compilations):
+    """x³ + x = p has x' = 1/(3x² + 1), x'' = −6x x'²/(3x² + 1), at x = 2 and 3; in both modes, and batched."""
+    system = compiled(component(cubic))
+
+    def x(p):
+        return system.with_parameters({"c.p": p}).initialize()[0]
+
+    p, root = jnp.array([10.0, 30.0]), np.array([2.0, 3.0])
+    first = 1 / (3 * root**2 + 1)
+    for _ in range(2):
+        compilations.clear()
+        np.testing.assert_allclose(jax.vmap(jax.grad(x))(p), first, rtol=1e-12)
+        np.testing.assert_allclose(jax.hessian(x)(p[0]), -6 * 2 * first[0] ** 3, rtol=1e-12)
     assert not compilations
