@@ -51,10 +51,10 @@ class _Program:
         if runs_once and quick():
             self._run_quick = eqx.filter_jit(run, compiler_options=quick())  # pyright: ignore[reportCallIssue]
 
-    def __call__(self, arrays: list[Any]) -> Any:
+    def __call__(self, arrays: list[Any], traced: bool) -> Any:
         # JAX takes compiler options for whole programs only, not for what it differentiates, batches or makes a part of
         # another program: there the arguments are traced, or the outcome would be.
-        if not _is_traced(arrays):
+        if not traced:
             try:
                 return self._run_quick(arrays)
             except ValueError as error:
@@ -93,6 +93,7 @@ class ProgramCache:
         arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
         static = tuple(_ARRAY if eqx.is_array(leaf) else leaf for leaf in leaves)
         key = function, structure, static, tuple(jax.typeof(a) for a in arrays)
+        traced = _is_traced(arrays)
         with self._lock:
             program = self._programs.get(key)
             if program is None:
@@ -101,11 +102,11 @@ class ProgramCache:
             self._programs.move_to_end(key)
             program.calls += 1
         try:
-            outcome = program(arrays)
+            outcome = program(arrays, traced)
         finally:
             with self._lock:
                 program.calls -= 1
-        if _is_traced(outcome) and not _is_traced(arrays):
+        if not traced and _is_traced(jax.tree.leaves(outcome)):
             # The function closed over a traced value, which is another one at the next call.
             with self._lock:
                 self._programs.pop(key, program).clear()
@@ -163,8 +164,8 @@ class ProgramCache:
         return len(idle)
 
 
-def _is_traced(tree: Any) -> bool:
-    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
+def _is_traced(leaves: list[Any]) -> bool:
+    return any(isinstance(leaf, Tracer) for leaf in leaves)
 
 
 def _text(use: Use) -> str:
