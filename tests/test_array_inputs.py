@@ -117,7 +117,7 @@ def test_gradients_and_batches():
     np.testing.assert_allclose(jnp.einsum("ikj,kj->i", slope, values), last(values), rtol=0, atol=1e-8)
     before = len(PROGRAMS)
     last(values + 1.0)
-    assert integration.run_compiled._cached._cache_size() == before  # pyright: ignore[reportFunctionMemberAccess]
+    assert len(PROGRAMS) == before
     batch = eqx.filter_vmap(last)(jnp.stack([values, 2 * values]))
     np.testing.assert_allclose(batch, [last(values), 2 * last(values)], rtol=0, atol=1e-8)
 
