@@ -9,7 +9,6 @@ Jacobian there carry first and second derivatives, by the implicit function theo
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +20,7 @@ from ..initialization.sizes import Sizes
 from ..linear.least_squares import least_squares
 from ..lowering.plan import SystemPlan
 from ..model.quantities import declared_scale, quantity_bounds
+from ..programs.cache import compiled
 from ..system.system import AcausalSystem
 
 PASSES = 4  # of equilibration
@@ -86,7 +86,7 @@ def find_equilibrium(system: AcausalSystem, t: Any, x0: Any, inputs: Any, drifti
     return Equilibrium(x0.at[free].set(w), remaining[-1], found.limit, found.jacobian, found.unit, holds)
 
 
-compiled_search = eqx.filter_jit(find_equilibrium)
+compiled_search = compiled(find_equilibrium)
 
 
 def open_directions(found: Equilibrium) -> tuple[Float[Array, " k"], Float[Array, "k k"]]:

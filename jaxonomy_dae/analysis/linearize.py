@@ -3,12 +3,13 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ..errors import ModelError, nearest
+from ..programs.cache import compiled
+from ..programs.staging import is_staged
 from ..system.evaluate import Refinement
 from ..system.input_values import by_entry
 from ..system.inputs import read_inputs, value_at
@@ -71,7 +72,7 @@ def linearize(
     values = read_inputs(system.plan, dtype, {**by_entry(system.plan, at.inputs), **given})
     u = jnp.stack([_value_at(system, values, name, at.t) for name in names]) if names else at.x[:0]
     arguments = (system, at.t, at.x, values, u, tuple(names), tuple(quantity.tolist()), tuple(factor.tolist()))
-    parts = _partials(*arguments) if is_traced(arguments) else _compiled(*arguments)
+    parts = _partials(*arguments) if is_staged(arguments) else _compiled(*arguments)
     coordinates = _coordinates(system, parts[1], states)
     return _reduced(system, parts, at.x, u, coordinates, tuple(names), tuple(outputs))
 
@@ -98,7 +99,7 @@ def _partials(
     return everything(x[:n], u), jax.jacfwd(everything, (0, 1))(x[:n], u)
 
 
-_compiled = eqx.filter_jit(_partials)
+_compiled = compiled(_partials)
 
 
 def _reduced(

@@ -5,13 +5,14 @@ from html import escape
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..errors import ModelError
+from ..programs.cache import compiled
+from ..programs.staging import is_staged
 from ..system.system import AcausalSystem
 
 SHOWN = 8
@@ -54,10 +55,7 @@ class OperatingPoint(eqx.Module):
         names = [name] if single else plan.entry_names(name)
         quantity, factor = plan.resolve([n for n in names if n != "time"])
         given = (self.system, self.t, self.x, self.inputs)
-        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(given)):
-            values = _every_quantity(*given)
-        else:
-            values = _compiled(*given)
+        values = _every_quantity(*given) if is_staged(given) else _compiled(*given)
         zero = jnp.asarray(quantity < 0)
         found = iter(jnp.where(zero, 0.0, values[np.maximum(quantity, 0)] * jnp.asarray(factor, self.x.dtype)))
         read = [self.t if n == "time" else next(found) for n in names]
@@ -97,4 +95,4 @@ def _every_quantity(system: AcausalSystem, t: Any, x: Any, inputs: Any) -> Any:
     return system.at(t, inputs).quantities(x, every, np.ones(len(every)))
 
 
-_compiled = eqx.filter_jit(_every_quantity)
+_compiled = compiled(_every_quantity)

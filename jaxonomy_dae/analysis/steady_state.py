@@ -12,6 +12,7 @@ from jax.core import Tracer
 from ..diagnosis.wording import some
 from ..errors import ModelError, SteadyStateError, nearest
 from ..initialization.initialize import check, find_initial
+from ..programs.staging import is_staged
 from ..solvers.rows import not_a_number
 from ..system.inputs import read_inputs
 from ..system.system import AcausalSystem
@@ -79,10 +80,10 @@ def equilibrium_from(
         begin = check(system, begin, t, inputs, initial, throw=throw)
     inputs, t = read_inputs(system.plan, dtype, inputs), jnp.asarray(t, dtype)
     given = (system, t, begin.x, inputs)
-    if not is_traced(given):
+    if not is_staged(given):
         found = compiled_search(*given, drifting)
         # An input's function may close over a traced value, which shows in the outcome only.
-        if not is_traced(found):
+        if not is_staged(found):
             return found, t, inputs
     return find_equilibrium(*given, drifting), t, inputs
 

@@ -1,5 +1,6 @@
 """Sweeps: one function of a system for many values of named parameters, at once."""
 
+import functools
 import itertools
 from collections.abc import Callable, Mapping
 from html import escape
@@ -13,6 +14,7 @@ from jax.core import Tracer
 
 from ..errors import InitializationError, ModelError, SimulationError, SteadyStateError
 from ..optional import optional_module
+from ..programs.cache import compiled
 from ..simulation.labelled import dataset_of
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
@@ -150,7 +152,7 @@ class _Simulation(eqx.Module):
         return simulate(system, **self.options)
 
 
-@eqx.filter_jit
+@functools.partial(compiled, runs_once=False)
 def _mapped(function: Any, system: AcausalSystem, names: tuple[str, ...], rows: tuple[Any, ...]) -> Any:
     def one(row):
         return function(system.with_parameters(dict(zip(names, row, strict=True))))

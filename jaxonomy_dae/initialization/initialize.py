@@ -24,6 +24,8 @@ from ..linear.whole import solve_whole
 from ..lowering.gather import Gather, take, times
 from ..lowering.plan import SystemPlan
 from ..model.quantities import declared_scale, quantity_bounds
+from ..programs.cache import PROGRAMS, compiled
+from ..programs.staging import is_staged
 from ..solvers.rows import not_a_number
 from ..system.evaluate import Refinement
 from ..system.input_values import input_values
@@ -481,7 +483,7 @@ def find_initial(
     solve_for: tuple[str, ...] = (),
     solver: Any = None,
 ) -> InitialPoint:
-    """`initialize`, compiled once for each structure where nothing is traced."""
+    """`initialize`, compiled once for each structure outside of programs that others compile."""
     dtype = system.parameters.values.dtype
     if np.shape(t0) != () or isinstance(t0, Mapping | str):
         raise ModelError(f"t0 must be a time, a number; got {t0!r}. Values at the start go to initial={{...}}")
@@ -489,15 +491,16 @@ def find_initial(
     inputs = read_inputs(system.plan, dtype, inputs)
     initial = {name: jnp.asarray(v, dtype) for name, v in sorted((initial or {}).items())}
     arguments = (system, jnp.asarray(t0, dtype), inputs, initial, solve_for, solver)
-    if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments)):
+    if not is_staged(arguments):
         found = _compiled(*arguments)
         # An input's function may close over a traced value, which shows in the outcome only.
-        if not isinstance(found.x, Tracer):
+        if not is_staged(found.x):
             return found
+    PROGRAMS.make_room()
     return initialize(*arguments)
 
 
-_compiled = eqx.filter_jit(initialize)
+_compiled = compiled(initialize)
 
 
 def check(

@@ -1,6 +1,7 @@
 """Training: gradient descent with Optax, and nonlinear least squares with Optimistix."""
 
 import dataclasses
+import functools
 import html
 import math
 import warnings
@@ -19,6 +20,7 @@ from ..adjoint.default import forward_mode
 from ..errors import InitializationError, ModelError, SimulationError, SteadyStateError
 from ..modeling.interval import Interval
 from ..private_names import with_high_cutoff
+from ..programs.cache import compiled
 from ..system.system import AcausalSystem
 from .bounds import Unbounded, project
 
@@ -152,7 +154,7 @@ def fit(
     # Updates make weakly typed leaves strong, which would compile the step again.
     trainable = jax.tree.map(lambda w: jnp.asarray(w, w.dtype) if eqx.is_array(w) else w, trainable)
 
-    @eqx.filter_jit
+    @functools.partial(compiled, runs_once=False)
     def step(trainable, frozen, state, args):
         def objective(trainable):
             value = loss(_merged(eqx.combine(trainable, frozen)), *args)
@@ -258,7 +260,7 @@ def fit_least_squares(
     def inside(weights):
         return weights if coordinates is None else _with_free(weights, coordinates.values(weights.parameters.free))
 
-    @eqx.filter_jit
+    @functools.partial(compiled, runs_once=False)
     def run(trainable, start, frozen, args):
         solver = optx.LevenbergMarquardt(rtol=rtol, atol=atol)
         if coordinates is not None:

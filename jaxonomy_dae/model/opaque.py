@@ -4,11 +4,11 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..programs.cache import compiled
 from .template import AbstractTemplate, Slot
 
 
@@ -121,7 +121,7 @@ class OpaqueTemplate(AbstractTemplate):
             return jax.jacfwd(lambda s: residual(weights, s, t))(slots)
 
         def over_instances(function):
-            return eqx.filter_jit(lambda weights, slots, t: jax.vmap(lambda s: function(weights, s, t))(slots))
+            return compiled(lambda weights, slots, t: jax.vmap(lambda s: function(weights, s, t))(slots))
 
         return {
             "value": over_instances(value),

@@ -7,16 +7,16 @@ speed of the end of a massless spring, is taken along the vector field.
 from collections.abc import Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
 from ..errors import ModelError, nearest
 from ..lowering.plan import SystemPlan
 from ..model.evaluate_numpy import Networks
 from ..model.tables import ZERO, AccountGroup
+from ..programs.cache import compiled
+from ..programs.staging import is_staged
 from ..system.system import AcausalSystem
 
 
@@ -46,9 +46,7 @@ def chosen_terms(plan: SystemPlan, kind: str, component: str | None) -> np.ndarr
 def account_values(system: AcausalSystem, ts: Any, states: Any, inputs: Any, discrete: Any = None) -> Any:
     """The values of all terms at all times, shape (n, terms); `discrete` holds the discrete values, if there are."""
     given = (system, ts, states, inputs, discrete)
-    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(given)):
-        return _terms(*given)
-    return _compiled(*given)
+    return _terms(*given) if is_staged(given) else _compiled(*given)
 
 
 def _terms(system: AcausalSystem, ts: Any, states: Any, inputs: Any, discrete: Any) -> Any:
@@ -58,7 +56,7 @@ def _terms(system: AcausalSystem, ts: Any, states: Any, inputs: Any, discrete: A
     return jax.vmap(one)(ts, states, discrete)
 
 
-_compiled = eqx.filter_jit(_terms)
+_compiled = compiled(_terms)
 
 
 def _at_one_time(system: AcausalSystem, t: Any, x: Any, inputs: Any) -> Any:

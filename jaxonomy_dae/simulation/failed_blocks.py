@@ -7,7 +7,6 @@ the order in which it is eliminated divides by zero, or because Newton's method 
 
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -15,6 +14,7 @@ from ..initialization.block_finding import BlockFinding
 from ..initialization.singular_blocks import examine_blocks
 from ..lowering.schedule import AnyStep, SparseStep
 from ..model.tables import ZERO
+from ..programs.cache import compiled
 from ..solvers.dae_term import FlatProblem
 from ..solvers.index_one import consistent_slope
 from ..system.input_values import input_values
@@ -60,7 +60,7 @@ def _first_failed(system: AcausalSystem, t: Any, x: Any, inputs: dict[str, Any])
     return None
 
 
-@eqx.filter_jit
+@compiled
 def _quantities(system: AcausalSystem, t: Any, x: Any, inputs: dict[str, Any], chosen: tuple[int, ...]) -> Any:
     return system.at(t, inputs).quantities(x, np.array(chosen), np.ones(len(chosen)))
 

@@ -14,6 +14,7 @@ from ..hybrid.solver import WithEvents
 from ..hybrid.start import start
 from ..hybrid.term import HybridTerm
 from ..initialization.initialize import InitialPoint, check, initialize, is_consistent
+from ..programs.cache import compiled
 from ..solvers.drive import integrate, is_implicit, right_between_steps
 from ..solvers.rows import not_a_number, padded
 from ..solvers.switching import STIFF, Watch
@@ -135,7 +136,7 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
     return Outcome(found._replace(jacobian=None), saved, x, last, done.stats, result, stiff, discrete, events, held)
 
 
-run_compiled = eqx.filter_jit(run)
+run_compiled = compiled(run)
 
 
 def _whole(t: Any, y: Any, args: Any) -> Any:

@@ -14,6 +14,8 @@ from ..adjoint.default import default_adjoint
 from ..errors import InitializationError, SimulationError
 from ..initialization.initialize import check
 from ..lowering.plan import SystemPlan
+from ..programs.cache import PROGRAMS
+from ..programs.staging import is_staged
 from ..solvers import BDF, Rodas5P, Tsit5
 from ..solvers.causes import decay_at, is_stiff
 from ..solvers.drive import is_implicit
@@ -96,8 +98,8 @@ def simulate(
 
     A `Solution`: `solution["pend.x"]` has shape `(n,)`.
 
-    Called with plain arrays, it is compiled once for each structure, set of options and shapes. Inside `jax.jit`,
-    `grad` or `vmap` it is traced like any function.
+    Called outside of jit, it is compiled once for each structure, set of options and shapes, and `jax.grad`, `jax.vmap`
+    and `jax.jvp` transform that program. Inside `jax.jit` it is traced like any function.
 
     **Raises:**
 
@@ -147,9 +149,15 @@ def simulate(
     else:
         choice = Choice(type(solver).__name__, "as asked for", final=True)
 
-    def in_program() -> Solution:
+    def in_program(staged: bool) -> Solution:
         checked = throw is True
-        return _traced(run(given, options(solver), None, checked), given, choice, checked, (max_steps, max_events))
+        if staged:
+            PROGRAMS.make_room()
+            outcome = run(given, options(solver), None, checked)
+        else:  # under `jax.grad` and `jax.vmap` outside of jit, where values are known
+            checked = throw is not False
+            outcome = run_compiled(given, options(solver), None)
+        return _traced(outcome, given, choice, checked, (max_steps, max_events))
 
     traced = _is_traced((given, options(solver)))
     switches = not choice.final and stepsize_controller is None
@@ -158,11 +166,11 @@ def simulate(
         if why:
             choice = implicit_choice(system.plan, why)
             solver = SOLVERS[choice.solver]()
-        return in_program()
+        return in_program(is_staged((given, options(solver))))
     watch = Watch(t1, jnp.asarray(np.divide(scaled_atol(system, atol), rtol), dtype)) if switches else None
     outcome = run_compiled(given, options(solver), watch)
     if _is_traced(outcome):  # a network may close over a traced value, which shows in the outcome only
-        return in_program()
+        return in_program(staged=True)
     counts = outcome.numbers()
     if throw is not False:
         check_parameters(system)

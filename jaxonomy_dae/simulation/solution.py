@@ -14,6 +14,8 @@ from jaxtyping import Array, Float
 
 from ..errors import ModelError
 from ..lowering.gather import times
+from ..programs.cache import compiled
+from ..programs.staging import is_staged
 from ..system.system import AcausalSystem
 from .accounts import account_values, chosen_terms
 from .event_log import EventLog, Events
@@ -78,7 +80,7 @@ class Solution(eqx.Module):
         if column is not None:
             return column
         given = (self.system, self.ts, self.states, self.inputs, self.discrete)
-        if _is_traced(given):
+        if is_staged(given):
             return _observed(*given, quantity, factor)[:, 0]
         return _one(*given, jnp.asarray(quantity[0]), jnp.asarray(factor[0], self.states.dtype))
 
@@ -108,7 +110,7 @@ class Solution(eqx.Module):
             values = jnp.where(quantity < 0, 0.0, self.states[:, inside] * jnp.asarray(factor, self.states.dtype))
         elif not (quantity >= 0).any():
             values = jnp.zeros((*self.ts.shape, len(quantity)), self.states.dtype)
-        elif _is_traced(given):
+        elif is_staged(given):
             values = _observed(*given, quantity, factor)
         else:
             chosen = _everything(*given)[:, quantity] * jnp.asarray(factor, self.states.dtype)
@@ -264,20 +266,20 @@ def _observed(system: AcausalSystem, ts, states, inputs, discrete, quantity: np.
     return jnp.where(quantity < 0, 0.0, jax.vmap(one)(ts, states, discrete))
 
 
-@eqx.filter_jit
+@compiled
 def _everything(system: AcausalSystem, ts, states, inputs, discrete):
     """All quantities at all times, shape (n, quantities)."""
     every = np.arange(system.plan.extended.quantities.n)
     return _observed(system, ts, states, inputs, discrete, every, np.ones(len(every)))
 
 
-@eqx.filter_jit
+@compiled
 def _one(system: AcausalSystem, ts, states, inputs, discrete, quantity, factor):
     """One quantity, chosen while running: compiled once for all names."""
     every = np.arange(system.plan.extended.quantities.n)
     return factor * _observed(system, ts, states, inputs, discrete, every, np.ones(len(every)))[:, quantity]
 
 
-@eqx.filter_jit
+@compiled
 def _constraint_residual(system: AcausalSystem, ts, states, inputs, discrete):
     return jax.vmap(lambda t, x, q: _held(system, q).constraint_residual(t, x, inputs))(ts, states, discrete)

@@ -14,6 +14,8 @@ from jax.flatten_util import ravel_pytree
 
 from ..adjoint.default import default_adjoint
 from ..errors import InitializationError, ModelError, SimulationError
+from ..programs.cache import PROGRAMS, compiled
+from ..programs.staging import is_staged
 from .bdf import BDF
 from .dae_term import DAETerm, FlatProblem
 from .drive import integrate, is_multistep, right_between_steps
@@ -102,12 +104,16 @@ def solve_dae(
     ts = None if ts is None else jnp.asarray(ts, dtype)
     options = (solver, adjoint or default_adjoint(), stepsize_controller, max_steps)
     arguments = (term, t0, t1, y0, ts, args, (rtol, atol), options)
-    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments))
-    check, solution, last = _solve(*arguments, checked=throw is True) if traced else _compiled(*arguments)
+    staged = is_staged(arguments)
+    if staged:
+        PROGRAMS.make_room()
+        check, solution, last = _solve(*arguments, checked=throw is True)
+    else:
+        check, solution, last = _compiled(*arguments)
     known = list(names) if names is not None else [f"y[{k}]" for k in range(n)]
     outcome = (check, solution.result)
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(outcome)):
-        if throw is True:
+        if throw is True or throw is None and not staged:
             ys = check.error_if(solution.ys)
             solution = eqx.tree_at(lambda s: s.ys, solution, solution.result.error_if(ys, solution.result != OK))
         return solution
@@ -232,7 +238,7 @@ def _on_constraints(term: Any, args: Any, ts: Any, ys: Any, y0: Any) -> Any:
     return jax.vmap(one)(ts, ys)
 
 
-_compiled = eqx.filter_jit(_solve)
+_compiled = compiled(_solve)
 
 
 def consistent_start(

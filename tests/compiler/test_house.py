@@ -9,8 +9,8 @@ import jaxonomy_dae
 
 ROOT = Path(jaxonomy_dae.__file__).parent
 ORDER = [
-    "errors", "optional", "private_names", "expressions", "units", "modeling", "structure", "judgement", "linear",
-    "adjoint", "solvers", "hybrid", "model", "diagnosis", "compiler", "lowering", "system", "initialization",
+    "errors", "optional", "private_names", "programs", "expressions", "units", "modeling", "structure", "judgement",
+    "linear", "adjoint", "solvers", "hybrid", "model", "diagnosis", "compiler", "lowering", "system", "initialization",
     "simulation", "learning", "analysis", "plotting", "testing", "library",
 ]  # fmt: skip
 # Methods that hand over to a room above their own, when they are called.
