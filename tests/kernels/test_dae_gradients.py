@@ -131,6 +131,7 @@ def test_published_sensitivities(solver, mode):
     np.testing.assert_allclose(np.asarray(jacobian).T / parameters[:, None], table, rtol=1e-3)
 
 
+@pytest.mark.long("the one gradient by Rodas5P of the default run")
 def test_gradients_through_a_consistent_start():
     """x' = −k·x, z³ + z = x: ∂z(1)/∂x(0) = e^(−k)/(3z² + 1), whatever the guess of z(0), and ∂x(1)/∂k = −x(1)."""
     term = DAETerm(lambda t, x, z, k: -k * x, lambda t, x, z, k: z**3 + z - x)

@@ -124,6 +124,7 @@ def swung(scale, y0):
     return total(solve(scale, y0, STORED, term=term, saveat=diffrax.SaveAt(ts=TS)))
 
 
+@pytest.mark.long("a gradient in a batch, against its closed form")
 def test_batches():
     """y'' = −k²·y: members that take different numbers of steps, some more than the record has rows, others few."""
     term = diffrax.ODETerm(lambda t, y, k: k * jnp.stack([y[1], -y[0]]))
