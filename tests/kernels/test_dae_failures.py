@@ -59,6 +59,7 @@ def solve_chosen(which, solver, y0=(ONE, ONE), **options):
     return solve_dae(CHOSEN, 2.0, y0, ts=TS, solver=solver, names=NAMES, max_steps=1000, args=which, **options)
 
 
+@pytest.mark.long("compiles the program that the tests beside it share")
 @ALSO_RODAS5P
 @pytest.mark.parametrize("end", ENDS)
 def test_an_end_of_the_solution_is_reported(end, solver):

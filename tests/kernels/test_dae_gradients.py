@@ -34,7 +34,6 @@ class Case:
 
 CASES = {
     "robertson": Case(40.0, ("p1", "p2", "p3"), 1e-5),
-    "chemakzo": Case(30.0, ("k1", "k2", "klA", "Ks"), 1e-2),
     "transamp": Case(0.01, ("Ub", "R0", "R5", "beta"), 1.0),
 }
 
@@ -69,8 +68,8 @@ def weighted(name, y):
 @functools.cache
 def gradient(name, solver, mode):
     adjoint = {
-        "reverse": StoredAdjoint(),
-        "recursive": diffrax.RecursiveCheckpointAdjoint(),
+        "reverse": diffrax.RecursiveCheckpointAdjoint(),
+        "stored": StoredAdjoint(),
         "direct": diffrax.DirectAdjoint(),
         "forward": diffrax.ForwardMode(),
     }[mode]
@@ -83,7 +82,7 @@ def gradient(name, solver, mode):
     return np.asarray(jax.jit(differentiate(loss))(np.zeros(len(CASES[name].parameters))))
 
 
-PAIRS = [("robertson", "bdf"), ("robertson", "rodas5p"), ("chemakzo", "rodas5p"), ("transamp", "bdf")]
+PAIRS = [("robertson", "bdf"), ("robertson", "rodas5p"), ("transamp", "bdf")]
 
 
 @slow
@@ -114,7 +113,7 @@ def test_reverse_is_the_difference(name, solver):
 
 
 @slow
-@pytest.mark.parametrize("solver, adjoint", [("bdf", "direct"), ("bdf", "recursive"), ("rodas5p", "recursive")])
+@pytest.mark.parametrize("solver, adjoint", [("bdf", "direct"), ("bdf", "stored"), ("rodas5p", "stored")])
 def test_other_adjoints_agree(solver, adjoint):
     found = gradient("robertson", solver, adjoint)
     np.testing.assert_allclose(found, gradient("robertson", solver, "forward"), rtol=1e-8)
@@ -132,6 +131,7 @@ def test_published_sensitivities(solver, mode):
     np.testing.assert_allclose(np.asarray(jacobian).T / parameters[:, None], table, rtol=1e-3)
 
 
+@pytest.mark.long("the one gradient by Rodas5P of the default run")
 def test_gradients_through_a_consistent_start():
     """x' = −k·x, z³ + z = x: ∂z(1)/∂x(0) = e^(−k)/(3z² + 1), whatever the guess of z(0), and ∂x(1)/∂k = −x(1)."""
     term = DAETerm(lambda t, x, z, k: -k * x, lambda t, x, z, k: z**3 + z - x)

@@ -135,7 +135,7 @@ def slow(*values):
 
 @pytest.mark.parametrize(
     "problem, direction",
-    [("semi-explicit", 1), slow("semi-explicit", -1), slow("full singular mass", -1), slow("full regular mass", -1)]
+    [("semi-explicit", 1), slow("semi-explicit", -1), slow("full singular mass", -1)]
     + [slow(problem, 1) for problem in PROBLEMS if problem != "semi-explicit"],
 )
 def test_rodas5p(problem, direction):
@@ -145,14 +145,16 @@ def test_rodas5p(problem, direction):
     assert (between > 3.8).all(), between
 
 
-@pytest.mark.parametrize("order", [slow(1), slow(2), slow(3), slow(4), 5])
-@pytest.mark.parametrize("direction", [1, slow(-1)])
+@pytest.mark.parametrize(
+    "direction, order", [(1, 5), *(slow(1, order) for order in (1, 2, 3, 4)), slow(-1, 2), slow(-1, 5)]
+)
 def test_bdf(order, direction):
     close_to(slopes("semi-explicit", order, direction=direction), order)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("problem", list(PROBLEMS))
-@pytest.mark.parametrize("order", [3, 5])
+@pytest.mark.parametrize(
+    "problem, order", [*((problem, 5) for problem in PROBLEMS), ("full singular mass", 3), ("ordinary", 3)]
+)
 def test_bdf_of_every_form(problem, order):
     close_to(slopes(problem, order), order)

@@ -208,6 +208,7 @@ def test_one_tearing_variable_costs_no_digits(n):
             assert (np.abs(found - x) <= 20 * n * np.finfo(float).eps * change).all()
 
 
+@pytest.mark.slow
 def test_batches_members_of_which_need_different_pivots():
     n = 4
     ones, b = ladder_block(np.ones(n + 1), np.ones(n))

@@ -200,12 +200,8 @@ def test_a_member_that_fails_is_not_a_number(ts):
 # --- published problems --------------------------------------------------------------------------------------------
 
 
-# The others are circuits and pendulums like these.
-NOTHING_SAID = ["robertson", "chemakzo", "transamp", "sundials_heat2d", "sundials_slcrank", "msl_cauer", "andrews"]
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("name", NOTHING_SAID)
+@pytest.mark.parametrize("name", PROBLEMS)
 def test_published_problems_with_nothing_said(name):
     """All within 50·rtol, as test_testset.py asks of every solver, and errors fall with the tolerance."""
     problem = PROBLEMS[name]

@@ -152,6 +152,7 @@ def driven_reference(v):
     return x(1.0) + 2 * x(2.0)
 
 
+@pytest.mark.long("one gradient by everything that a run depends on")
 def test_parameters_initial_values_and_inputs_against_the_closed_form(driven):
     value, reverse = driven[1]()
     expected, slopes = jax.jit(jax.value_and_grad(driven_reference))(VALUES)
