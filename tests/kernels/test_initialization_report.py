@@ -195,7 +195,7 @@ def test_no_report_inside_jit():
 # --- parameters solved for ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.long("a gradient of a start with a parameter solved for")
+@pytest.mark.slow
 def test_the_rest_length_that_balances_a_load():
     """K·(x − L) = −F at rest: L = x + F/K, and dL/dK = −F/K²."""
     ev = EqnEnv()
