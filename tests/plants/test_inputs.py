@@ -199,7 +199,7 @@ def sampled():
         "interpolation": straight,
         "evaluate": straight.evaluate,
     }
-    smooth = {n: lambda t, f=jax.jit(p.evaluate): float(f(t)) for n, p in paths.items()}
+    smooth = {n: jax.jit(p.evaluate) for n, p in paths.items()}
     expected = {
         "held": PULSED,
         "linear": convolved(lambda t: np.interp(t, times["linear"], values), breaks=times["linear"][1:-1]),
