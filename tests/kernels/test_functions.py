@@ -44,22 +44,22 @@ def explicit():
     return compiled(write, state_selection="dummy_derivatives", prefer_states=names)
 
 
+def at_points(system, kinds):
+    """Variables of these kinds for every function, as a function of all x."""
+    names = [f"c.{kind}{k}" for kind in kinds for k in range(len(NAMES))]
+    index = np.array([[system.states.index(f"c.{n}{k}") for k in range(len(NAMES))] for n in ("x", "v")])
+
+    def at(x):
+        state = jnp.zeros(len(system.states)).at[index[0]].set(x).at[index[1]].set(SPEED)
+        return system.observe(names, 0.0, state).reshape(len(kinds), -1)
+
+    return at
+
+
 @pytest.fixture(scope="module")
 def found(explicit):
-    """y, y', y″ for every function, and the curvature differentiated once more by x, forward and in reverse."""
-    names = [[f"c.{kind}{k}" for k in range(len(NAMES))] for kind in "ysc"]
-    index = np.array([[explicit.states.index(f"c.{n}{k}") for k in range(len(NAMES))] for n in ("x", "v")])
-
-    @jax.jit
-    def computed(x, v):
-        def at(x):
-            state = jnp.zeros(len(explicit.states)).at[index[0]].set(x).at[index[1]].set(v)
-            return explicit.observe(sum(names, []), 0.0, state).reshape(3, -1)
-
-        value, forward = jax.jvp(lambda x: at(x), (x,), (jnp.ones_like(x),))
-        return value, forward[2], jax.grad(lambda x: at(x)[2].sum())(x)
-
-    return [np.asarray(part) for part in computed(POINTS, np.full(len(POINTS), SPEED))]
+    """y, y' and y″ for every function."""
+    return np.asarray(jax.jit(at_points(explicit, "ysc"))(POINTS))
 
 
 def reference(order):
@@ -76,14 +76,17 @@ def reference(order):
 @pytest.mark.long("59 functions in one program, with its derivatives")
 @pytest.mark.parametrize("order", [0, 1, 2])
 def test_value_and_derivatives_in_time(found, order):
-    values, expected = found[0][order], reference(order)
+    values, expected = found[order], reference(order)
     wrong = [n for n, a, b in zip(NAMES, values, expected, strict=True) if not abs(a - b) <= 1e-10 * max(1.0, abs(b))]
     assert not wrong, [(n, values[NAMES.index(n)], expected[NAMES.index(n)]) for n in wrong]
 
 
-def test_reverse_is_forward(found):
+@pytest.mark.slow
+def test_reverse_is_forward(explicit):
     """The curvature, whose equation was differentiated twice, differentiated once more."""
-    _, forward, reverse = found
+    at = at_points(explicit, "c")
+    both = jax.jit(lambda x: (jax.jvp(at, (x,), (jnp.ones_like(x),))[1][0], jax.grad(lambda x: at(x).sum())(x)))
+    forward, reverse = map(np.asarray, both(POINTS))
     with mp.workdps(40):
         third = []
         for _, f, point in FUNCTIONS.values():

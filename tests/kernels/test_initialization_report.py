@@ -115,6 +115,7 @@ def texts():
 EXPECTED = [MOVED, AGREEING, CONTRADICTION, OFF_THE_CIRCLE, SHORT, MASSLESS, TOO_FEW, TOO_MANY]
 
 
+@pytest.mark.long("eight models, each with a start and a diagnosis of its own")
 def test_texts():
     for found, expected in zip(texts(), EXPECTED, strict=True):
         assert found == expected
@@ -195,7 +196,7 @@ def test_no_report_inside_jit():
 # --- parameters solved for ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.long("a gradient of a start with a parameter solved for")
+@pytest.mark.slow
 def test_the_rest_length_that_balances_a_load():
     """K·(x − L) = −F at rest: L = x + F/K, and dL/dK = −F/K²."""
     ev = EqnEnv()
@@ -300,6 +301,7 @@ def test_names_to_solve_for_are_checked():
 # --- singular blocks ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_singular_blocks_are_never_integrated():
     with pytest.raises(InitializationError, match=r"r1\.R = 0, r2\.R = 0"):
         simulate(divider(0.0, 0.0), 1.0)

@@ -227,6 +227,7 @@ def test_the_nearest_point_in_other_units(unit):
     np.testing.assert_allclose(found(system, "c.x", "c.y"), [0.6 * unit, 0.8 * unit], rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_guesses_at_which_blocks_are_singular_are_stepped_off():
     """q·|q| = x is singular at the guess 0, for which the start of x is not blamed; √r + r = y has no slope there."""
 
@@ -274,6 +275,7 @@ def test_flows_without_guesses():
 # --- bounds --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_bounds_keep_the_search_where_logarithms_are_real():
     """ln z + z = x: Newton's step from 100 lands at −3.6, where there is no logarithm."""
 

@@ -245,8 +245,8 @@ def test_frames_preferences_and_chains_of_one(gates):
     for n in (1, 3):
         ev, diagram = EqnEnv(), AcausalDiagram()
         network = jax.tree_util.Partial(times, jnp.array(0.5))
-        gates = diagram.add_array(ev, "gate", Gated, n, network)
-        diagram.connect(gates[:-1].x, gates[1:].u)
+        chain = diagram.add_array(ev, "gate", Gated, n, network)
+        diagram.connect(chain[:-1].x, chain[1:].u)
         system = AcausalCompiler(ev, diagram, prefer_states=["gate.x"])()
         assert list(system.states) == [f"gate[{k}].x" for k in range(n)]
         assert "gate.limit" in system.parameters and "gate.u" not in system.parameters

@@ -1,5 +1,6 @@
 """Numbers that are written in equations: many instances with numbers of their own share one template."""
 
+import functools
 import random
 
 import diffrax
@@ -43,7 +44,7 @@ def test_one_template_for_many_numbers(fallen):
     assert templates(compiled(Falling)) == 2  # one for all, and one for 1.0·sin x
     for k, c in enumerate(GAINS):
         true = 2 * np.arctan(np.tan(0.75) * np.exp(-c))
-        np.testing.assert_allclose(fallen[0][f"f{k}.x"], true, rtol=1e-7)  # a hundred times the run's rtol
+        np.testing.assert_allclose(fallen[f"f{k}.x"], true, rtol=1e-7)  # a hundred times the run's rtol
 
 
 def test_few_numbers_stay_in_their_templates():
@@ -63,47 +64,51 @@ class Thrown(Component):
         self.either(on > c, Eq(y, x), Eq(y, c * sympy.cos(x)))
 
 
-@pytest.fixture(scope="module")
-def fallen():
-    """f0, … fall and c0, … are thrown: the last values by name, and the derivatives of c4.x by c4.p, of f3.x by its
-    start."""
+@functools.cache
+def falling_and_thrown():
+    """f0, … fall and c0, … are thrown."""
     ev, diagram = EqnEnv(), AcausalDiagram()
     for k, gain in enumerate(GAINS):
         diagram.add(Falling(ev, f"f{k}", gain.item()), Thrown(ev, f"c{k}", gain.item()))
-    system = AcausalCompiler(ev, diagram)()
+    return AcausalCompiler(ev, diagram)()
+
+
+def last(system, names, adjoint=FORWARD, **options):
+    solution = simulate(system, 1.0, ts=jnp.array([1.0]), rtol=1e-9, atol=1e-11, adjoint=adjoint, **options)
+    return solution[names][0]
+
+
+@pytest.fixture(scope="module")
+def fallen():
+    """The last values by name."""
     names = [f"{n[0]}{k}.{n[1]}" for k in range(N) for n in ("fx", "cx", "cy")]
-
-    @jax.jit
-    def last(p, start):
-        def run(p, start):
-            changed, initial = system.with_parameters({"c4.p": p}), {"f3.x": start}
-            solution = simulate(changed, 1.0, ts=jnp.array([1.0]), initial=initial, rtol=1e-9, atol=1e-11)
-            values = solution[names][0]
-            return values[names.index("c4.x")] + values[names.index("f3.x")], values
-
-        slopes, values = jax.grad(run, argnums=(0, 1), has_aux=True)(p, start)
-        return values, slopes
-
-    values, slopes = last(1.0 + GAINS[4], 1.5)
-    return dict(zip(names, np.asarray(values), strict=True)), [float(s) for s in slopes], str(system.report)
+    return dict(zip(names, np.asarray(last(falling_and_thrown(), names)), strict=True))
 
 
-@pytest.mark.long("the program of a run and its gradient, for all tests of this file that read them")
 def test_numbers_beside_parameters_and_modes(fallen):
-    values, _, report = fallen
+    report = str(falling_and_thrown().report)
     for k, c in enumerate(GAINS):
         x = 1 / np.sqrt(1 + 2 / (c * (1 + c)))
-        np.testing.assert_allclose(values[f"c{k}.x"], x, rtol=1e-7)
-        np.testing.assert_allclose(values[f"c{k}.y"], x if 3 > c else c * np.cos(x), rtol=1e-7)
+        np.testing.assert_allclose(fallen[f"c{k}.x"], x, rtol=1e-7)
+        np.testing.assert_allclose(fallen[f"c{k}.y"], x if 3 > c else c * np.cos(x), rtol=1e-7)
         assert f"c{k}: " in report
 
 
+@pytest.mark.slow
 def test_gradients_through_them(fallen):
-    values, (by_parameter, by_start), _ = fallen
+    system = falling_and_thrown()
+
+    @jax.jit
+    @functools.partial(jax.grad, argnums=(0, 1))
+    def slopes(p, start):
+        changed = system.with_parameters({"c4.p": p})
+        return last(changed, ["c4.x", "f3.x"], None, initial={"f3.x": start}).sum()
+
     c, p = GAINS[4], 1.0 + GAINS[4]
+    by_parameter, by_start = slopes(p, 1.5)
     np.testing.assert_allclose(by_parameter, (1 + 2 / (c * p)) ** -1.5 / (c * p**2), rtol=1e-6)
     # dx/dx₀ = sin x / sin x₀
-    np.testing.assert_allclose(by_start, np.sin(values["f3.x"]) / np.sin(1.5), rtol=1e-6)
+    np.testing.assert_allclose(by_start, np.sin(fallen["f3.x"]) / np.sin(1.5), rtol=1e-6)
 
 
 class Cubic(Component):
@@ -159,7 +164,7 @@ class Pendulum(Component):
         )
 
 
-@pytest.mark.long("a run of twelve pendulums, projected")
+@pytest.mark.slow
 def test_constraints_with_numbers():
     system = compiled(Pendulum)
     assert templates(system) == 7  # x' and y' share one; two forces and the rod, and the same for a length of 1.0
@@ -203,6 +208,7 @@ def test_weights_that_are_numbers(monkeypatch):
     np.testing.assert_allclose(together, alone, rtol=1e-6, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_single_precision():
     with jax.enable_x64(False):
         solution = simulate(compiled(Falling), 1.0, ts=jnp.array([1.0]), adjoint=FORWARD)
