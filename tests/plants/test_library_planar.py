@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
+from bench import Bench
 from component_references import checks, measured
-from planar_models import Bench, double_pendulum, four_bar, squeezing_mechanism
+from planar_models import double_pendulum, four_bar, squeezing_mechanism
 from problems import GRAVITY, angle_solution, elliptic_angle
 from testset.problem import load
 from trajectories import balanced, trajectory
