@@ -18,6 +18,7 @@ import jaxonomy_dae.library.planar as pl
 import jaxonomy_dae.library.rotational as rot
 import jaxonomy_dae.library.translational as line
 from jaxonomy_dae import InitializationError, simulate
+from jaxonomy_dae.testing import assert_energy_balance
 
 TS = np.linspace(0.0, 2.0, 9)
 TIGHT = dict(rtol=1e-9, atol=1e-11)
