@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.interpolate
 import sympy
-from planar_models import Bench
+from bench import Bench
 from problems import compiled
 
 import jaxonomy_dae.library.electrical as el

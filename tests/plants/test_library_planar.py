@@ -7,16 +7,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
+from bench import Bench
 from component_references import checks, measured
-from planar_models import Bench, double_pendulum, four_bar, squeezing_mechanism
+from planar_models import double_pendulum, four_bar, squeezing_mechanism
 from problems import GRAVITY, angle_solution, elliptic_angle
 from testset.problem import load
-from trajectories import balanced, trajectory
+from trajectories import trajectory
 
 import jaxonomy_dae.library.planar as pl
 import jaxonomy_dae.library.rotational as rot
 import jaxonomy_dae.library.translational as line
 from jaxonomy_dae import InitializationError, simulate
+from jaxonomy_dae.testing import assert_energy_balance
 
 TS = np.linspace(0.0, 2.0, 9)
 TIGHT = dict(rtol=1e-9, atol=1e-11)
@@ -221,10 +223,17 @@ TURNED = "trigonometry of two arms that turn as prescribed"
 )  # fmt: skip
 def test_components_against_references():
     system, inputs, expected = components()
-    solution = trajectory(system, TS, list(expected), inputs)
-    balanced(system, 1.0, inputs)
+    solution = simulate(system, 2.0, ts=TS, inputs=inputs, **TIGHT)
     for name, true in expected.items():
         measured(name, solution[name], true, MEASURED * np.abs(true).max())
+
+
+@pytest.mark.slow
+def test_energy_of_components():
+    system, inputs, _ = components()
+    # As many times as above: the same program.
+    solution = simulate(system, 1.0, ts=np.linspace(0.0, 1.0, len(TS)), inputs=inputs, **TIGHT)
+    assert_energy_balance(solution, rtol=1e-7)  # a hundred times the tolerance
 
 
 # --- double pendulum -----------------------------------------------------------------------------------------------

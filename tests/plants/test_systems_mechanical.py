@@ -4,6 +4,7 @@ import numpy as np
 import planar_models as planar
 import pytest
 import scipy.optimize
+from bench import Bench
 from multibody_reference import GROUND, Mechanism
 from problems import GRAVITY, compiled
 from reference_systems import ReferenceSystem, check_gradient, check_solution, driven, integrated, linear
@@ -270,7 +271,7 @@ def triple_pendulum():
     """Three uniform rods on pins, from rest."""
 
     def make():
-        b = planar.Bench()
+        b = Bench()
         end = b(pl.World, "world").frame
         for k, (angle, length, mass) in enumerate([(0.3, 1.0, 1.0), (0.5, 0.8, 0.5), (-0.4, 0.6, 0.7)], 1):
             pin = b(pl.Revolute, f"j{k}", initial_phi=angle, initial_omega=0.0)
@@ -346,7 +347,7 @@ def slider_crank():
     integrate."""
 
     def make():
-        b = planar.Bench()
+        b = Bench()
         world, slider, motor = b(pl.World, "world"), b(pl.Body, "slider", 2.5), b(rot.AngleSource, "motor")
         crank, coupler = b(pl.Link, "crank", 0.4), b(pl.Link, "coupler", 1.1)
         pins = [b(pl.Revolute, "drive"), b(pl.Revolute, "elbow"), b(pl.Revolute, "wrist", guess_phi=0.2)]
