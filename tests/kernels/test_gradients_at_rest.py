@@ -69,6 +69,7 @@ def _found(solver, batched):
     return {case: (value, dict(zip(NAMES, by, strict=True))) for case, (value, by) in zip(CASES, rows, strict=True)}
 
 
+@pytest.mark.long("the gradient that all cases share is compiled")
 @pytest.mark.parametrize(
     "solver",
     [None, *(pytest.param(s, marks=pytest.mark.slow) for s in (diffrax.Tsit5(), diffrax.Dopri5()))],
@@ -152,7 +153,8 @@ def implicit(solver):
     return eqx.filter_jit(jax.grad(end))
 
 
-@pytest.mark.parametrize("solver", [Rodas5P(), pytest.param(BDF(), marks=pytest.mark.slow)], ids=["Rodas5P", "BDF"])
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [Rodas5P(), BDF()], ids=["Rodas5P", "BDF"])
 def test_implicit_methods_and_motion_that_tolerances_do_not_see(solver):
     """The run would take a few long steps."""
     for x0 in (0.0, 1e-13, 1e-10):
