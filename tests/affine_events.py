@@ -91,8 +91,11 @@ def affine(
             place, ticking = ticking, ticking + 1
             clocks[:, place] = event.clock
         else:
-            k = ENDING if event.ends else IMMEDIATE if event.immediate else ordinary
-            ordinary += k == ordinary
+            if event.ends or event.immediate:
+                k = ENDING if event.ends else IMMEDIATE
+            else:
+                k, ordinary = ordinary, ordinary + 1
+                assert k < ORDINARY
             guards[k], waves[k], place = row(event.guard), event.wave, CLOCKS + k
         for target, numbers in event.writes.items():
             writes[place, names.targets.index(target)] = row(numbers)
@@ -144,10 +147,8 @@ class Ran(NamedTuple):
     result: Any
 
 
-def run(
-    numbers: Numbers, t1: Any, ts: Any, solver: Any, adjoint: Any, *, tolerance: float = 1e-10, max_steps: int = 2000
-) -> Ran:
-    """From 0 to t1; no host callbacks, jit it."""
+def run(numbers: Numbers, t1: Any, ts: Any, solver: Any, adjoint: Any) -> Ran:
+    """From 0 to t1, at rtol = atol = 1e-10; no host callbacks, jit it."""
     numbers = jax.tree.map(jnp.asarray, numbers)
     t0, t1 = jnp.zeros(()), jnp.asarray(t1)
     problem = Affine(numbers, 32.0 * jnp.finfo(t1.dtype).eps * t1)
@@ -155,8 +156,8 @@ def run(
         HybridTerm(problem), WithEvents(solver, MAX_EVENTS), t0, t1, 0.01 * t1,
         start(problem, t0, numbers.x, numbers.q, None, MAX_EVENTS, False), None,
         save=diffrax.SubSaveAt(ts=ts, fn=lambda t, y, args: (y.x, y.q)),
-        controller=EventControl(diffrax.PIDController(rtol=tolerance, atol=tolerance)),
-        adjoint=adjoint, max_steps=max_steps,
+        controller=EventControl(diffrax.PIDController(rtol=1e-10, atol=1e-10)),
+        adjoint=adjoint, max_steps=2000,
     )  # fmt: skip
     _, last = done.last
     return Ran(*done.ys, last.x, last.times, last.count, done.result._value)

@@ -1,5 +1,6 @@
 """Training of plain modules: the best iterate is kept, nothing is compiled twice, and what goes wrong is said."""
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ from problems import rc_circuit
 
 from jaxonomy_dae import ModelError
 from jaxonomy_dae.learning import fit, fit_least_squares
+from jaxonomy_dae.solvers import StoredAdjoint
 
 
 class Bowl(eqx.Module):
@@ -103,6 +105,17 @@ def test_least_squares_on_a_plain_module():
     result = fit_least_squares(bowl(), lambda m, d: jnp.stack([m.x, m.y**2]) - d, args=(data,))
     assert float(result.model.x) == pytest.approx(1.0) and abs(float(result.model.y)) == pytest.approx(2.0)
     assert result.message.startswith("converged")
+
+
+def test_residuals_that_cannot_be_differentiated_forwards():
+    def residuals(model):
+        term, saveat = diffrax.ODETerm(lambda t, y, rate: -rate * y), diffrax.SaveAt(ts=jnp.array([0.5, 1.0]))
+        return diffrax.diffeqsolve(
+            term, diffrax.Tsit5(), 0.0, 1.0, 0.1, 1.0, model.x, saveat=saveat, adjoint=StoredAdjoint(), throw=False
+        ).ys
+
+    with pytest.raises(ModelError, match="cannot be differentiated forwards.*ForwardMode"):
+        fit_least_squares(bowl(), residuals)
 
 
 def test_least_squares_says_that_its_steps_were_used_up():

@@ -1,6 +1,6 @@
 """Runs of problems with events written by hand: times, states and gradients against closed forms.
 
-One compiled gradient runs them all, and one batch. What is integrated is polynomial or smooth, at
+One compiled gradient runs them all; slow tests run them as one batch. What is integrated is polynomial or smooth, at
 rtol = atol = 1e-10: values are right to a few tolerances.
 """
 
@@ -315,7 +315,7 @@ def assert_as_alone(name, together):
         np.testing.assert_allclose(together.x, ran.x, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.long("a batch in which every member has other events")
+@pytest.mark.slow
 def test_members_of_a_batch_are_as_alone():
     def forward(*given):
         return aim(*given, diffrax.Tsit5(), diffrax.ForwardMode())[1]

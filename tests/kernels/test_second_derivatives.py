@@ -32,10 +32,11 @@ def logistic_exact(p):
 P = jnp.array([1.5, 0.2, 0.1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solver",
     [
-        pytest.param(Tsit5(), id="own", marks=pytest.mark.slow),
+        pytest.param(Tsit5(), id="own"),
         pytest.param(diffrax.Dopri5(scan_kind="bounded"), id="diffrax"),
     ],
 )

@@ -42,6 +42,7 @@ def with_drag(mode):
     return pendulum(drag_on("vx"), compiler={"state_selection": mode})
 
 
+@pytest.mark.long("the model is compiled, and a run of it")
 @MODES
 def test_truth_of_a_real_force(mode):
     solution = simulate(with_drag(mode), 1.5, ts=jnp.array(HORIZONS), **SMALL)
