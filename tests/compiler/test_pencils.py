@@ -21,7 +21,7 @@ def plan_of(component: Component):
     return lower(compile_flat(flatten(diagram), "auto", ()))
 
 
-EXAMPLES = pytest.mark.parametrize("examples", [5, pytest.param(60, marks=pytest.mark.slow)])
+EXAMPLES = pytest.mark.parametrize("examples", [5, pytest.param(25, marks=pytest.mark.slow)])
 
 
 @EXAMPLES

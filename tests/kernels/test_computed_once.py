@@ -43,7 +43,7 @@ QUICK = [("cpu", 5), ("elsewhere", 3)]
             pytest.param(b, m, marks=pytest.mark.slow)
             for b in BACKENDS
             for m in range(1, 8)
-            if (b, m) not in (*QUICK, ("elsewhere", 7))
+            if (b, m) not in (*QUICK, ("elsewhere", 6), ("elsewhere", 7))
         ),
     ],
     indirect=["backend"],

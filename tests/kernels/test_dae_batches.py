@@ -46,8 +46,7 @@ def alone(name, solver):
 @slow
 @pytest.mark.parametrize(
     "name, solver, n",
-    [(name, solver, 20) for name in CASES for solver in SOLVERS]
-    + [("robertson", "bdf", 1000), ("transamp", "rodas5p", 1000)],
+    [("robertson", "bdf", 20), ("transamp", "rodas5p", 20), ("robertson", "bdf", 1000), ("transamp", "rodas5p", 1000)],
 )
 def test_a_batch_is_the_loop(name, solver, n):
     factors = np.random.default_rng(0).uniform(0.8, 1.25, (n, len(CASES[name][1])))

@@ -82,7 +82,7 @@ def gradient(name, solver, mode):
     return np.asarray(jax.jit(differentiate(loss))(np.zeros(len(CASES[name].parameters))))
 
 
-PAIRS = [("robertson", "bdf"), ("robertson", "rodas5p"), ("transamp", "bdf")]
+PAIRS = [("robertson", "bdf"), ("robertson", "rodas5p")]
 
 
 @slow
@@ -106,7 +106,7 @@ def differences(name):
 
 
 @slow
-@pytest.mark.parametrize("name, solver", PAIRS)
+@pytest.mark.parametrize("name, solver", [*PAIRS, ("transamp", "bdf")])
 def test_reverse_is_the_difference(name, solver):
     found = gradient(name, solver, "reverse")
     np.testing.assert_allclose(found, differences(name), rtol=1e-5, atol=1e-5 * np.abs(found).max())

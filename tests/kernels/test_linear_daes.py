@@ -59,7 +59,7 @@ def test_the_start_of_a_mixed_pencil():
 
 
 @pytest.mark.slow
-@hypothesis.settings(max_examples=15, suppress_health_check=list(hypothesis.HealthCheck))
+@hypothesis.settings(max_examples=6, suppress_health_check=list(hypothesis.HealthCheck))
 @hypothesis.given(pencils(largest=5))
 def test_points_of_many_mixed_pencils(pencil):
     hypothesis.assume(pencil.dynamic or any(any(pair) for pair in pencil.g))  # something that is not always zero

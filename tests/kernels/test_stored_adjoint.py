@@ -78,7 +78,7 @@ SAVED = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("saved", ["t1", "parts"])
+@pytest.mark.parametrize("saved", ["parts"])
 def test_what_is_saved(saved):
     both(lambda args, y0, adjoint: total(solve(args, y0, adjoint, saveat=SAVED[saved])), ARGS, Y0, argnums=(0, 1))
 

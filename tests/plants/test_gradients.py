@@ -68,6 +68,7 @@ def gradients(request):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("gradients", ["auto"], indirect=True, scope="module")
 @pytest.mark.parametrize("name", TRAINED)
 def test_reverse_equals_forward(gradients, name):
     reverse, forward = (g[gradients.where[name]] for g in (gradients.reverse(MODERATE), gradients.forward))

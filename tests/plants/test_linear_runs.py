@@ -11,12 +11,11 @@ from jaxonomy_dae import simulate
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_trajectories_in_any_order_under_any_name(seed):
-    rng = np.random.default_rng(seed)
+def test_trajectories_in_any_order_under_any_name():
+    rng = np.random.default_rng(0)
     rows, columns = (tuple(rng.permutation(MIXED.n).tolist()) for _ in range(2))
     shuffled = dataclasses.replace(MIXED, rows=rows, columns=columns)
-    names = [f"{'zyxw'[k]}{seed}" for k in range(MIXED.n)]
+    names = [f"{'zyxw'[k]}0" for k in range(MIXED.n)]
     system = compiled(written(shuffled, "other", names))
     ts = np.array([0.5, 1.0, 2.0])
     start = MIXED.solution([0.0], np.array([1.0, -0.5]))[0][0]
