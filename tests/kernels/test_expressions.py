@@ -44,7 +44,7 @@ def test_size_grows_with_depth_alone():
 
 def test_a_long_equation_differentiated_twice():
     """Nested maps in a constraint of index 3: its curvature along the solution, by power series, is zero."""
-    depth = 12
+    depth = 8
 
     def write(c, t):
         x, y = c.variable("x", start=0.3, fixed=True), c.variable("y", start=0.2)

@@ -53,7 +53,7 @@ def convolved(u, end=10.0, breaks=()):
     """x(end) of `Lag` for an input u(t), by quadrature between its breaks."""
     ends = [0.0, *breaks, end]
     return sum(
-        scipy.integrate.quad(lambda s: 3 * np.exp(-0.1 * (end - s)) * u(s), a, b, epsabs=1e-13, epsrel=1e-13)[0]
+        scipy.integrate.quad(lambda s: 3 * np.exp(-0.1 * (end - s)) * float(u(s)), a, b, epsabs=1e-13, epsrel=1e-13)[0]
         for a, b in zip(ends, ends[1:], strict=False)
     )
 
