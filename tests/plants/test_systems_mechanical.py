@@ -441,7 +441,7 @@ def test_the_field_of_the_planetary_drive():
     check_trajectory(planetary)
 
 
-# Of the others, test_library_planar has runs.
+# test_library_planar runs the double pendulum and Andrews' mechanism; benchmarks.systems runs all.
 @pytest.mark.slow
 @pytest.mark.parametrize("reference", [tanks, lift, quarter_car, planetary, four_bar, slider_crank])
 def test_solution(reference):
