@@ -67,7 +67,7 @@ def flown(system, v0, **options):
     return jnp.stack([solution["bob.x"][-1], solution["bob.y"][-1]]), solution.events.ts[:2]
 
 
-SOLVERS = {"Tsit5": None, "Kvaerno5": diffrax.Kvaerno5(), "Rodas5P": Rodas5P()}
+SOLVERS = {"Tsit5": None, "Rodas5P": Rodas5P()}
 
 
 @pytest.mark.slow

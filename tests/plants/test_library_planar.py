@@ -366,36 +366,6 @@ def test_guesses_choose_the_position_of_a_loop():
         np.testing.assert_allclose(observe(system, system.initialize()), true, rtol=0, atol=1e-12)
 
 
-# --- slider-crank --------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_slider_crank():
-    """A crank turned at a constant speed, a coupler without mass: x = r·cos φ + √(l² − r²·sin²φ) for the slider, and
-    the torque on the crank has the power m·x''·x' of its acceleration."""
-    b, r, long, m, w = Bench(), 0.4, 1.1, 2.5, 3.0
-    world, slider = b(pl.World, "world"), b(pl.Body, "slider", m, g_y=0.0)
-    crank, coupler = b(pl.Link, "crank", r), b(pl.Link, "coupler", long)
-    pins = [b(pl.Revolute, "drive"), b(pl.Revolute, "elbow"), b(pl.Revolute, "wrist", guess_phi=0.2)]
-    guide, motor = b(pl.Prismatic, "guide", guess_s=1.4), b(rot.AngleSource, "motor")
-    b.chain(world.frame, pins[0].frame_a, pins[0].frame_b, crank.frame_a, crank.frame_b, pins[1].frame_a,
-            pins[1].frame_b, coupler.frame_a, coupler.frame_b, pins[2].frame_a, world.frame, guide.frame_a,
-            motor.flange, pins[0].flange)  # fmt: skip
-    b.join(pins[2].frame_b, slider.frame, guide.frame_b)
-    solution = simulate(b.compile(), 2.0, ts=TS, inputs={"motor.u": lambda t: w * t + 0.5}, **TIGHT)
-    phi = w * TS + 0.5
-    sine, cosine = np.sin(phi), np.cos(phi)
-    root = np.sqrt(long**2 - (r * sine) ** 2)
-    x = r * cosine + root
-    v = w * (-r * sine - r**2 * sine * cosine / root)
-    a = w**2 * (-r * cosine - r**2 * (cosine**2 - sine**2) / root - r**4 * (sine * cosine) ** 2 / root**3)
-    expected = {"guide.s": x, "slider.vx": v, "coupler.frame_a.phi": -np.arcsin(r * sine / long),
-                "motor.flange.tau": -m * a * v / w, "slider.frame.fx": m * a}  # fmt: skip
-    for name, true in expected.items():
-        # Nothing is integrated, and blocks are solved to rounding at saved times.
-        np.testing.assert_allclose(solution[name], true, rtol=0, atol=1e-12 * np.abs(true).max(), err_msg=name)
-
-
 # --- Andrews' squeezing mechanism ----------------------------------------------------------------------------------
 
 
