@@ -94,6 +94,10 @@ wheel: $(VENV)/.stamp-dev
 
 check: lint types test docs wheel
 
+# Every dependency, extras included, is used by one of these.
+ON_FLOORS := tests/kernels tests/compiler tests/plants/test_composition.py tests/plants/test_solution.py \
+    tests/plants/test_analysis.py tests/plants/test_converters.py
+
 # The lowest versions that pyproject.toml admits, on the oldest Python where there is a choice.
 $(FLOORS)/.stamp: pyproject.toml
 	rm -rf $(FLOORS)
@@ -105,7 +109,7 @@ $(FLOORS)/.stamp: pyproject.toml
 test-floors: $(FLOORS)/.stamp
 	@$(FLOORS)/bin/python -c 'import jax, diffrax, equinox, optimistix, lineax, optax, sympy, scipy, jaxtyping'
 	@$(FLOORS)/bin/uv pip freeze -q --python $(FLOORS)/bin/python --exclude-editable
-	$(FLOORS)/bin/python -m pytest $(IN_PARALLEL)
+	$(FLOORS)/bin/python -m pytest $(IN_PARALLEL) $(ON_FLOORS)
 
 bench: $(VENV)/.stamp-dev
 	@set -e; for f in benchmarks/[!_]*.py; do echo "== $$f"; $(BIN)/python "$$f"; done
