@@ -1,8 +1,8 @@
 """Deliberate faults, one for each room of the package, and the tests that must notice them.
 
 `python -m benchmarks.faults` copies the package and its tests to a temporary folder, puts in one fault after the other
-and runs the tests named beside it until the first failure. A fault that passes is a hole in the tests, and is printed as
-such; the exit status says whether there is one. Names of rooms choose among them: `python -m benchmarks.faults linear`.
+and runs the tests named beside it until the first failure. A fault that passes is a hole in the tests: it is printed as
+such, and the exit status is 1. Names of rooms choose among them: `python -m benchmarks.faults linear`.
 """
 
 import dataclasses

@@ -266,8 +266,7 @@ def test_a_valve_opening_and_its_bounds():
         return system.initialize(initial=initial, solve_for=["tank.u"])[1].parameters["tank.u"]
 
     assert float(opening(4.0)) == pytest.approx(0.3, rel=1e-12)
-    with pytest.raises(Exception, match="out of its bounds"):
-        jax.block_until_ready(opening(0.09))
+    assert np.isnan(opening(0.09))
 
 
 @pytest.mark.slow

@@ -83,6 +83,7 @@ KINDS = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.long("two runs with inputs of every kind")
 @pytest.mark.parametrize("shape", [(3,), pytest.param((5, 8), marks=pytest.mark.slow)], ids=str)
 def test_an_array_of_inputs_is_its_entries(shape):
@@ -137,7 +138,7 @@ def test_gradients_and_batches():
     np.testing.assert_allclose(batch, [one, 2 * one], rtol=0, atol=1e-8)  # linear, from rest
     before = len(PROGRAMS)
     last(values + 1.0)
-    assert integration.run_compiled._cached._cache_size() == before  # pyright: ignore[reportFunctionMemberAccess]
+    assert len(PROGRAMS) == before
 
 
 class Gate(Lag):
@@ -242,6 +243,7 @@ def test_bad_input(given, message):
         run(lags(3), given)
 
 
+@pytest.mark.slow
 def test_the_entry_that_is_not_finite_is_named():
     bad = lambda t: jnp.where((t > 1.0) & (jnp.arange(3) == 2), jnp.nan, 1.0)  # noqa: E731
     with pytest.raises(Exception, match=r"input 'lag\[2\].u' is nan at t=1"):

@@ -83,6 +83,7 @@ def solution(system):
     return simulate(system, t1=2.0, ts=jnp.array([0.0, 1.0, 2.0]), rtol=RTOL, atol=ATOL)
 
 
+@pytest.mark.slow
 def test_a_ladder_with_values_for_each(system, solution):
     voltages = solution["cell.c.v"]
     assert voltages.shape == (3, 6)
@@ -225,6 +226,7 @@ def gates():
     return system, simulate(system, t1=3.0, ts=jnp.array([0.5, 3.0]), rtol=RTOL, atol=ATOL)
 
 
+@pytest.mark.slow
 @pytest.mark.long("a run with events, whose program is large")
 def test_networks_events_and_inputs_in_arrays(gates):
     """x reaches its limit at 2·log(1 + limit/2), from x' = 1 + x/2."""

@@ -8,7 +8,8 @@ import pytest
 from problems import compiled, component, mlp, rc_circuit
 from sympy import Eq
 
-from jaxonomy_dae import InitializationError, ModelError, SimulationError, der, simulate
+from jaxonomy_dae import EqnEnv, InitializationError, ModelError, SimulationError, der, simulate
+from jaxonomy_dae.library import electrical as el
 
 
 def test_non_finite_parameters_and_weights_are_named():
@@ -75,3 +76,11 @@ def test_a_state_of_another_shape():
     for call in (lambda x: system.observe("c.v", 0.0, x), lambda x: system.vector_field(0.0, x)):
         with pytest.raises(ModelError, match=r"a state of this system has shape \(1,\); got \(2,\)"):
             call(jnp.ones(2))
+
+
+def test_a_signal_that_nothing_drives():
+    ev = EqnEnv()
+    source, r, ground = el.SignalVoltage(ev, "source"), el.Resistor(ev, "r"), el.Ground(ev, "ground")
+    system = compiled(source, r, ground, connect=[(source.p, r.p), (r.n, source.n, ground.p)])
+    with pytest.raises(ModelError, match=r"input 'source\.u' has no default: connect a signal to it, or give it with"):
+        simulate(system, 1.0)

@@ -271,6 +271,7 @@ def events_of(plant, part):
     return np.array([t for t, name in ran(plant)[2] if name.startswith(part)])
 
 
+@pytest.mark.slow
 @pytest.mark.long("four models in one program")
 def test_a_thermostat():
     values, by, _ = ran(few)

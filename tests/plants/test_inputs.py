@@ -131,6 +131,7 @@ def test_what_changed_is_read_again(lags, monkeypatch):
     np.testing.assert_allclose(first["array.y"], 1.0)  # a solution keeps what was simulated
 
 
+@pytest.mark.slow
 def test_what_a_branch_reads_is_read_again(lag):
     """Numbers inside control flow are part of the traced program, not of its operands."""
     for value in (1.0, 2.0):
@@ -199,7 +200,7 @@ def sampled():
         "interpolation": straight,
         "evaluate": straight.evaluate,
     }
-    smooth = {n: jax.jit(p.evaluate) for n, p in paths.items()}
+    smooth = {n: jax.jit(lambda t, path=p: path.evaluate(t)) for n, p in paths.items()}
     expected = {
         "held": PULSED,
         "linear": convolved(lambda t: np.interp(t, times["linear"], values), breaks=times["linear"][1:-1]),

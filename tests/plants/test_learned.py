@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 from problems import GRAVITY, RELEASE, compiled, drag_on, mlp, oscillator, pendulum
-from shared_models import discharge
+from shared_models import LearnedResistor, discharge
 from sympy import Eq
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, NeuralDAEBlock, der, simulate

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import scipy.integrate
 import scipy.signal
-from bridges import GOFF, RON, bridge_by_brute_force
 from component_references import checks, measured
+from diode_bridges import GOFF, RON, bridge_by_brute_force
 from problems import compiled
 
 import jaxonomy_dae.library.electrical as el

@@ -40,6 +40,7 @@ class Falling(Component):
         self.add_equations(Eq(der(x), -c * sympy.sin(x)))
 
 
+@pytest.mark.slow
 def test_one_template_for_many_numbers(fallen):
     assert templates(compiled(Falling)) == 2  # one for all, and one for 1.0·sin x
     for k, c in enumerate(GAINS):

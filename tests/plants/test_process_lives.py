@@ -81,6 +81,7 @@ def cubic(self, ev):
     self.add_equations(Eq(der(x), -x), Eq(y, x**3 + x))
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_start(compilations):
     """x³ + x = p has x' = 1/(3x² + 1), x'' = −6x x'²/(3x² + 1), at x = 2 and 3; in both modes, and batched."""
     system = compiled(component(cubic))

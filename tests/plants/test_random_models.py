@@ -137,6 +137,7 @@ def several(strategy):
     return st.lists(strategy, min_size=6, max_size=6)
 
 
+@pytest.mark.slow
 @pytest.mark.long("three programs, of six circuits each")
 @hypothesis.settings(max_examples=3, suppress_health_check=list(hypothesis.HealthCheck))
 @hypothesis.given(several(circuits()), st.integers(0, 100))

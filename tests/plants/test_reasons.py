@@ -47,6 +47,7 @@ def test_a_fit_says_why_it_stopped(blowup):
         fit(outside, loss, optax.sgd(2.0), 4, train="c.p", progress=False)
 
 
+@pytest.mark.slow
 def test_least_squares_say_why_they_cannot_begin(blowup):
     with pytest.raises(ModelError, match=f"not finite at the start: .*{ESCAPE}"):
         fit_least_squares(blowup.with_parameters({"c.p": 1.5}), read, train="c.p")

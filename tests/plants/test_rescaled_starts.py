@@ -16,7 +16,9 @@ def test_verdicts_and_states_with_networks(name, kind):
     compare_verdicts(*outcome(MODELS[name]), kind, seed=0)
 
 
-@pytest.mark.parametrize("name, kind", [("implicit", "all"), ("contradiction", "units")])
+@pytest.mark.parametrize(
+    "name, kind", [pytest.param("implicit", "all", marks=pytest.mark.slow), ("contradiction", "units")]
+)
 def test_starts_and_slopes(name, kind):
     compare_starts(compare_verdicts(*outcome(MODELS[name]), kind, 1, shuffled=True))
 
