@@ -43,9 +43,10 @@ $(VENV)/.stamp-dev: pyproject.toml | $(BIN)/python
 demo: $(VENV)/.stamp-demo
 	$(BIN)/python examples/neural_dae_pendulum_drag.py
 
-# Most of the time goes into compiling programs that run once. XLA's older code generator takes half of it and makes
-# slower programs; test-floors runs with the one that users have.
-QUICK_COMPILES := XLA_FLAGS="$$XLA_FLAGS --xla_cpu_use_fusion_emitters=false"
+# Most of the time goes into compiling programs that run once. XLA's older code generator takes half of it, and without
+# optimization a third less again; the programs are slower. test-floors compiles as users do.
+QUICK_COMPILES := XLA_FLAGS="$$XLA_FLAGS --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 \
+    --xla_llvm_disable_expensive_passes=true"
 IN_PARALLEL := -n auto --dist worksteal
 SLOWEST := --durations=10 --durations-min=1
 

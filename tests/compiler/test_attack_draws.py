@@ -1,6 +1,7 @@
 """What `make attack` is asked for, which models it draws, and the reference of models with events."""
 
 import itertools
+import os
 import subprocess
 
 import numpy as np
@@ -33,7 +34,8 @@ def test_what_cannot_be_meant(capsys, given, said):
 
 @pytest.mark.parametrize("given", [[], ["MINUTES="]])
 def test_no_time_is_given(given):
-    run = subprocess.run(["make", "-n", "attack", *given], cwd=ROOT, capture_output=True, text=True)
+    outside = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}
+    run = subprocess.run(["make", "-n", "attack", *given], cwd=ROOT, env=outside, capture_output=True, text=True)
     assert run.returncode and "how many minutes? make attack MINUTES=10" in run.stderr and not run.stdout
 
 

@@ -119,6 +119,7 @@ def test_the_model_differentiates_them(n):
     np.testing.assert_allclose(found["left[2].x"], rest, rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.long("a reverse-mode gradient of a run, and a batch of runs")
 def test_gradients_and_batches():
     """x(2) of lags that are driven by samples is linear in them: x = ∂x/∂u·u, each by its own samples alone."""
@@ -157,6 +158,7 @@ def gates():
     return AcausalCompiler(ev, diagram)()
 
 
+@pytest.mark.slow
 @pytest.mark.long("a run with events")
 def test_among_several_names(gates):
     """An array's name stands for its entries in lists, and gives its shape alone."""

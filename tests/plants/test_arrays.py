@@ -241,6 +241,7 @@ def test_networks_events_and_inputs_in_arrays(gates):
     np.testing.assert_array_equal(again.parameters["gate.limit"], LIMIT)
 
 
+@pytest.mark.slow
 def test_frames_preferences_and_chains_of_one(gates):
     """Names of arrays in `to_pandas`, `prefer_states` and `in`; slices that are empty; ports by index."""
     pytest.importorskip("pandas")

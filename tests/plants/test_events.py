@@ -285,6 +285,7 @@ def test_a_thermostat():
     assert (values["room.T"][reached] > 48.9).all() and (values["room.T"] < 51.1).all()
 
 
+@pytest.mark.slow
 def test_a_sampled_controller():
     values, by, _ = ran(few)
     k, m = at(3.0, 2.55)

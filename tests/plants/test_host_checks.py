@@ -71,6 +71,7 @@ def test_times_that_do_not_fit(decay):
             jax.block_until_ready(loud(times))
 
 
+@pytest.mark.slow
 def test_prescribed_steps_and_time_that_runs_backwards():
     """y' = −2·y from t = 1 back to 0; and the derivative by the time at which it is saved."""
     term = DAETerm(lambda t, y, a: -a * y, mass=[1.0])

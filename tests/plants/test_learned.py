@@ -59,6 +59,7 @@ def field(system, t, x):
 # --- corrections -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.long("all models with networks in one program")
 def test_several_blocks_on_one_target_add_up():
     solution = together()

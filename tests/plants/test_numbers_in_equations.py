@@ -86,6 +86,7 @@ def fallen():
     return dict(zip(names, np.asarray(last(falling_and_thrown(), names)), strict=True))
 
 
+@pytest.mark.slow
 def test_numbers_beside_parameters_and_modes(fallen):
     report = str(falling_and_thrown().report)
     for k, c in enumerate(GAINS):
