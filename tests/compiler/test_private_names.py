@@ -115,7 +115,7 @@ print(len(texts), texts[0])
 """
 
 
-@pytest.mark.parametrize("what", GONE)
+@pytest.mark.parametrize("what", ["every name", pytest.param("another argument", marks=pytest.mark.slow)])
 def test_a_missing_name(what):
     """The package is imported, simulates and differentiates, by another adjoint, and says so once."""
     count, _, text = run(PROGRAM.format(names=private_names.NAMES, gone=GONE[what])).strip().partition(" ")

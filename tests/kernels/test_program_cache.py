@@ -90,6 +90,7 @@ def test_programs_in_use_do_not_push_each_other_out(limited):
     assert len(traced) <= 4
 
 
+@pytest.mark.slow
 def test_a_program_that_runs_is_kept(limited):
     """A function compiles others while it is traced, more than there is room for."""
     programs, _ = limited

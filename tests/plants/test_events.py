@@ -311,6 +311,7 @@ def test_it_sticks_and_slides():
     assert by["block.x"]["block.mu"][k[-1]] == pytest.approx(-((3 / 2) ** 2) / 4, rel=1e-8)
 
 
+@pytest.mark.slow
 def test_a_step_by_its_time():
     """x' = u − x with a step of u at t₀: x(2) = 1 − e^{t₀ − 2}. The derivative by t₀ was zero."""
     values, by, _ = ran(few)
