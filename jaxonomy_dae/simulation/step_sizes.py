@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from ..errors import ModelError
 from ..solvers.drive import is_implicit
 from ..solvers.solve import step_control
-from ..solvers.step_control import UNSEEN
+from ..solvers.step_control import UNSEEN, ConstantLengths
 from ..system.inputs import StepEnds
 from ..system.system import AcausalSystem
 
@@ -41,7 +41,8 @@ def clipped(controller: Any, jump_ts: Any, ends: StepEnds) -> Any:
     if not jumps and not ends.kinks:
         return controller
     joined = [jnp.concatenate(ts) if ts else None for ts in (jumps, ends.kinks)]
-    return diffrax.ClipStepSizeController(controller, step_ts=joined[1], jump_ts=joined[0])
+    lengths = ConstantLengths(controller)  # pyright: ignore[reportCallIssue]
+    return diffrax.ClipStepSizeController(lengths, step_ts=joined[1], jump_ts=joined[0])
 
 
 def first_step(system: AcausalSystem, t0: Any, t1: Any, x0: Any, inputs: Any, order: Any, controller: Any) -> Any:

@@ -124,3 +124,40 @@ class StepControl(diffrax.AbstractAdaptiveStepSizeController):
         result = diffrax.RESULTS.where(failed, diffrax.RESULTS.dt_min_reached, diffrax.RESULTS.successful)
         dt = jax.lax.stop_gradient(dt)
         return keep, start, start + dt, False, ~keep, result
+
+
+class ConstantLengths(diffrax.AbstractAdaptiveStepSizeController):
+    """The step sizes of another controller, as constants of differentiation.
+
+    A step that is cut short at a time that was given, as of a sample, moves its end with that time. Where the next
+    step is a multiple of it, all later ones stretch with it: after a remainder of 1e-5 of a step by 1e5, each times
+    its own local error. So lengths count as constants, as for `StepControl`, and later steps move as a whole.
+    """
+
+    controller: Any
+
+    @property
+    def rtol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.controller.rtol
+
+    @property
+    def atol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.controller.atol
+
+    @property
+    def norm(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.controller.norm
+
+    def wrap(self, direction):
+        return ConstantLengths(self.controller.wrap(direction))  # pyright: ignore[reportCallIssue]
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        """The end of the first step, and the state of the controller."""
+        return self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+
+    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
+        """Whether the step is kept, and the next one."""
+        keep, start, end, jump, state, result = self.controller.adapt_step_size(
+            t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
+        )
+        return keep, start, start + jax.lax.stop_gradient(end - start), jump, state, result
