@@ -78,5 +78,6 @@ FUNCTIONS = {
     "factorial": (sympy.factorial, mp.factorial, 1.8),
     "digamma": (sympy.digamma, mp.digamma, 1.8),
     "beta": (lambda x: sympy.beta(x, 2.5), lambda x: mp.beta(x, 2.5), 1.8),
+    "beta below zero": (lambda x: sympy.beta(x - 2.2, 2), lambda x: mp.beta(x - 2.2, 2), 1.8),
     "besseli": (lambda x: sympy.besseli(0, x), lambda x: mp.besseli(0, x), 0.8),
 }

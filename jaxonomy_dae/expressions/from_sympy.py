@@ -156,9 +156,11 @@ def _factorial(u: Node) -> Node:
 
 
 def _beta(a: Node, b: Node | None = None) -> Node:
+    """Γ(a)·Γ(b)/Γ(a + b), by logarithms so that large arguments do not overflow; signs apart."""
     b = a if b is None else b
-    logs = [(1, apply("loggamma", a)), (1, apply("loggamma", b)), (-1, apply("loggamma", add(a, b)))]
-    return apply("exp", linear(logs))
+    powers = ((1, a), (1, b), (-1, add(a, b)))
+    size = apply("exp", linear([(power, apply("logabsgamma", u)) for power, u in powers]))
+    return multiply(*(apply("gammasign", u) for _, u in powers), size)
 
 
 def _frac(u: Node) -> Node:

@@ -117,6 +117,11 @@ def _hypot(xp):
     return function
 
 
+def _log_gamma(gammaln, xp):
+    """log Γ(x), not a number for x < 0, where SymPy's is complex and `gammaln` returns log|Γ(x)|."""
+    return lambda x: xp.where(x >= 0, gammaln(xp.where(x >= 0, x, 1.0)), xp.nan)
+
+
 def _logistic(xp):
     """1/(1 + exp(−x)), with all derivatives finite and digits kept on both sides."""
 
@@ -204,7 +209,23 @@ _rows = [
         sympy.gamma,
         1.0,
     ),
-    _unary("loggamma", ssp.gammaln, jsp.gammaln, lambda u: polygamma(0, u), sympy.loggamma, 1.0),
+    _unary(
+        "loggamma",
+        _log_gamma(ssp.gammaln, np),
+        _log_gamma(jsp.gammaln, jnp),
+        lambda u: polygamma(0, u),
+        sympy.loggamma,
+        1.0,
+    ),
+    _unary(
+        "logabsgamma",
+        ssp.gammaln,
+        jsp.gammaln,
+        lambda u: polygamma(0, u),
+        lambda u: sympy.log(sympy.Abs(sympy.gamma(u))),
+        1.0,
+    ),
+    Function("gammasign", ssp.gammasgn, jsp.gammasgn, _zero, lambda u: sympy.sign(sympy.gamma(u))),
     _unary("besseli0", ssp.i0, _bessel_i(0), lambda u: apply("besseli1", u), lambda u: sympy.besseli(0, u), 0.0),
     _unary(
         "besseli1",
