@@ -32,6 +32,7 @@ from jaxonomy_dae.library.electrical import Ground, Resistor
 from jaxonomy_dae.library.planar import PlanarPendulum
 from jaxonomy_dae.library.translational import Mass, Spring
 from jaxonomy_dae.modeling import Eq as our_eq
+from jaxonomy_dae.optional import optional_module
 
 
 def dense(inputs, outputs):
@@ -450,3 +451,8 @@ def test_bounds_hold_later_too():
 def test_a_start_time_is_a_number(t0):
     with pytest.raises(ModelError, match=r"t0 must be a time, a number; got .* Values at the start go to initial="):
         pendulum().initialize(t0)
+
+
+def test_a_package_that_is_missing():
+    with pytest.raises(ImportError, match=r"plans need planes: pip install 'jaxonomy_dae\[flight\]'"):
+        optional_module("no_such_planes", "flight", "plans need planes")
