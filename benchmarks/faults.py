@@ -57,8 +57,8 @@ FAULTS = [
     ),
     Fault(
         "structure/pantelides.py",
-        "end = pointer[e + 1]",
-        "end = pointer[e + 1] - 1",
+        "return Offsets(np.array(c_list, np.int64),",
+        "return Offsets(1 + np.array(c_list, np.int64),",
         "tests/compiler/test_structure.py tests/compiler/test_index_reduction.py",
     ),
     Fault(

@@ -11,6 +11,8 @@ from problems import rc_circuit
 
 from jaxonomy_dae import ModelError
 from jaxonomy_dae.learning import fit, fit_least_squares
+from jaxonomy_dae.learning.bounds import Unbounded
+from jaxonomy_dae.modeling.interval import Interval
 from jaxonomy_dae.solvers import StoredAdjoint
 
 
@@ -164,3 +166,19 @@ def test_least_squares_says_that_its_steps_were_used_up():
 def test_wrong_use(call, message):
     with pytest.raises(ModelError, match=message):
         call()
+
+
+def test_unbounded_coordinates():
+    """They begin where the parameters are, and lead to no value outside, whatever their own."""
+    intervals = [
+        Interval(), Interval(low=1.0), Interval(high=3.0), Interval(low=1.0, open_low=True),
+        Interval(high=3.0, open_high=True), Interval(0.5, 4.0), Interval(0.5, 4.0, open_low=True, open_high=True),
+    ]  # fmt: skip
+    coordinates = Unbounded(jnp.full(len(intervals), 2.0), intervals)
+    values = jax.jit(jax.vmap(coordinates.values))
+    moved = np.array([0.0, 1e-3, -1.0, 5.0, -30.0, 1e3])[:, None]
+    found = np.asarray(values(coordinates.start + moved))
+    np.testing.assert_allclose(found[0], 2.0, rtol=1e-14)
+    for k, interval in enumerate(intervals):
+        assert all(float(v) in interval for v in found[:, k]), interval
+        assert found[1, k] != found[0, k]
