@@ -19,6 +19,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool
 
 from ..private_names import FOR_LATE_TIMES, missing
+from .wrapped_control import WrappedControl
 
 
 def times_fit(t0: Any, t1: Any, ts: Any, controller: Any) -> Bool[Array, ""] | bool:
@@ -100,23 +101,10 @@ class _LateTimes(diffrax.AbstractAdjoint):
         )
 
 
-class _FirstStep(diffrax.AbstractAdaptiveStepSizeController):
+class _FirstStep(WrappedControl):
     """Another controller with a first step of the size given."""
 
-    controller: Any
     dt0: Any
-
-    @property
-    def rtol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.controller.rtol
-
-    @property
-    def atol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.controller.atol
-
-    @property
-    def norm(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.controller.norm
 
     def wrap(self, direction):
         wrapped = self.controller.wrap(direction)

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..private_names import FROM_CONTROLLER
 from .closure_conversion import Program, any_member
+from .wrapped_control import WrappedControl
 
 # In units of the state and what tolerances make of zero, |y| + atol/rtol:
 PUSH = 0.03  # what the second run is pushed by; its error is then 33·rtol of it
@@ -181,25 +182,12 @@ def held_back(
     return dataclasses.replace(new, tnext=end), end < new.tnext, pushed
 
 
-class HeldBack(diffrax.AbstractAdaptiveStepSizeController):
+class HeldBack(WrappedControl):
     """The step sizes of another controller, held back where the state rests, as `StoredAdjoint` does by itself: for
     derivatives by other adjoints."""
 
-    controller: Any
     terms: Any
     solver: Any
-
-    @property
-    def rtol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.controller.rtol
-
-    @property
-    def atol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.controller.atol
-
-    @property
-    def norm(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.controller.norm
 
     def wrap(self, direction):
         return HeldBack(self.controller.wrap(direction), self.terms, self.solver)  # pyright: ignore[reportCallIssue]

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from ..adjoint.wrapped_control import WrappedControl
 from .problem import HybridState
 from .term import bound
 
@@ -14,23 +15,9 @@ ENDED: Any = diffrax.RESULTS.event_occurred  # Diffrax asks the controller last,
 GROWTH = 1e3  # of the step after one that an event made short
 
 
-class EventControl(diffrax.AbstractAdaptiveStepSizeController):
+class EventControl(WrappedControl):
     """The step sizes of another controller, but steps end at events: one in which an event was found is tried again up
     to there, and none goes beyond the next tick of a clock."""
-
-    controller: Any
-
-    @property
-    def rtol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.controller.rtol
-
-    @property
-    def atol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.controller.atol
-
-    @property
-    def norm(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.controller.norm
 
     def wrap(self, direction):
         return EventControl(self.controller.wrap(direction))  # pyright: ignore[reportCallIssue]

@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import optimistix as optx
 
+from ..adjoint.wrapped_control import WrappedControl
+
 SAFETY = 0.9
 UNSEEN = 1e3  # tolerances: the first step resolves smaller motion, too, which the error of a step would not see
 # A solver that chooses its own step sizes writes them into its error estimate, whose norm e a controller reads back:
@@ -126,27 +128,13 @@ class StepControl(diffrax.AbstractAdaptiveStepSizeController):
         return keep, start, start + dt, False, ~keep, result
 
 
-class ConstantLengths(diffrax.AbstractAdaptiveStepSizeController):
+class ConstantLengths(WrappedControl):
     """The step sizes of another controller, as constants of differentiation.
 
     A step that is cut short at a time that was given, as of a sample, moves its end with that time. Where the next
     step is a multiple of it, all later ones stretch with it: after a remainder of 1e-5 of a step by 1e5, each times
     its own local error. So lengths count as constants, as for `StepControl`, and later steps move as a whole.
     """
-
-    controller: Any
-
-    @property
-    def rtol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.controller.rtol
-
-    @property
-    def atol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.controller.atol
-
-    @property
-    def norm(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.controller.norm
 
     def wrap(self, direction):
         return ConstantLengths(self.controller.wrap(direction))  # pyright: ignore[reportCallIssue]

@@ -91,6 +91,7 @@ def test_prescribed_steps_and_time_that_runs_backwards():
     np.testing.assert_allclose(slope, -2 * np.exp(1.0), rtol=1e-5)
 
 
+@pytest.mark.long("two processes")
 def test_a_second_process_finds_its_programs_in_the_cache(tmp_path):
     code = (
         "import jax, diffrax\n"

@@ -1,0 +1,23 @@
+"""What controllers that change another one's step sizes have in common."""
+
+from typing import Any
+
+import diffrax
+
+
+class WrappedControl(diffrax.AbstractAdaptiveStepSizeController):
+    """A step-size controller around another, whose tolerances and norm solvers see."""
+
+    controller: Any
+
+    @property
+    def rtol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.controller.rtol
+
+    @property
+    def atol(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.controller.atol
+
+    @property
+    def norm(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.controller.norm
