@@ -9,14 +9,15 @@ import hypothesis
 import jax
 import jaxtyping
 import pytest
+from type_checks import modules_with_shapes
 
 os.environ["MPLBACKEND"] = "Agg"
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
-# Shapes and types in signatures are checked here, and only here: users pay nothing for them.
-jaxtyping.install_import_hook("jaxonomy_dae", "type_checks.checked")
+# Shapes and dtypes in signatures are checked here, and only here: users pay nothing for them.
+jaxtyping.install_import_hook(modules_with_shapes(), "type_checks.checked")
 
 # The same examples in every run, and no deadline: the first call of a jitted function compiles it.
 hypothesis.settings.register_profile("deterministic", derandomize=True, deadline=None, database=None)

@@ -66,7 +66,7 @@ def reduce_with_cancellation(
         offsets = reduce_index(signature, least, highest)
         jacobian = _Jacobian(groups, offsets, column, values)
         replaced, added, combined = [], [], []
-        for equations in _blocks_of_several(signature, offsets):
+        for equations in _blocks_that_may_cancel(groups, signature, offsets, column):
             found = _combination(jacobian, equations, names)
             if found is not None:
                 combined = [provenance_of(groups, int(e)) for e in equations]
@@ -74,7 +74,8 @@ def reduce_with_cancellation(
                 added.append(found[1])
         if not added:
             return groups, signature, offsets, tuple(notes)
-        notes += [f"highest derivatives cancel in a {group.provenance[0]}" for group in added]
+        sources = [group.provenance[0] for group in added]
+        notes += [f"highest derivatives cancel in {'a ' if source.sources else ''}{source}" for source in sources]
         groups = (*_without(groups, replaced), *added)
         signature, highest = incidence(groups, column, n_unknown), None
         if (maximum_matching(signature.pointer, signature.variable, n_unknown) < 0).any():
@@ -101,14 +102,33 @@ def _blocks(signature: Incidence, offsets: Offsets) -> tuple[np.ndarray, np.ndar
     return label, np.bincount(label)[label]
 
 
-def _blocks_of_several(signature: Incidence, offsets: Offsets) -> list[np.ndarray]:
-    """The equations of each diagonal block that has more than one, up to a size."""
+def _blocks_that_may_cancel(
+    groups: Sequence[EquationGroup], signature: Incidence, offsets: Offsets, column: np.ndarray
+) -> list[np.ndarray]:
+    """The equations of each diagonal block, up to a size, that has more than one or whose equation has more than one
+    term in what it determines."""
     label, _ = _blocks(signature, offsets)
     sizes = np.bincount(label)
     order = np.argsort(label, kind="stable")
     start = np.concatenate([[0], np.cumsum(sizes)])
-    chosen = np.flatnonzero((sizes > 1) & (sizes <= LARGEST_BLOCK)).tolist()
+    several = sizes > 1
+    several[label[_meeting(groups, offsets, column)]] = True
+    chosen = np.flatnonzero(several & (sizes <= LARGEST_BLOCK)).tolist()
     return [np.sort(order[start[b] : start[b + 1]]) for b in chosen]
+
+
+def _meeting(groups: Sequence[EquationGroup], offsets: Offsets, column: np.ndarray) -> np.ndarray:
+    """The equations in which the highest derivative that is matched to them stands in several slots, as u′ in
+    u′ − v = f where v has been found to be u′."""
+    first = equation_offsets(groups)
+    found = [np.zeros(0, np.int64)]
+    for g, start in zip(groups, first, strict=False):
+        own = start + np.arange(len(g))
+        matched = offsets.matched_variable[own, None]
+        there = (g.variable != ZERO) & (column[g.variable] == matched)
+        highest = there & (g.order + offsets.equation[own, None] == offsets.variable[matched])
+        found.append(own[highest.sum(axis=1) > 1])
+    return np.concatenate(found)
 
 
 class _Jacobian:
@@ -285,7 +305,8 @@ def _combination(jacobian: _Jacobian, equations: np.ndarray, names: Sequence[str
         raise StructuralError(_hidden(sources))
     if not any(label[0] == "quantity" for label in combined.leaves):
         raise StructuralError(_dependent(sources))
-    return int(equations[used[unit]]), group_of(combined, combination(sources))
+    origin = combination(sources) if len(sources) > 1 else sources[0]
+    return int(equations[used[unit]]), group_of(combined, origin)
 
 
 def _for_values(values: np.ndarray, names: Sequence[str], concerned: list[int]) -> str:
@@ -322,6 +343,8 @@ def _weights(
                     point[TIME_LABEL] = constant(0.37 + 0.1 * trial)
                 row.append(substitute(graph, point) if point else graph)
     kept = [j for j in range(len(rows[0])) if any(number(row[j]) != 0 for row in rows)]
+    if not kept:  # of one equation, in which they cancel by themselves
+        return [constant(1)]
     rows = [[row[j] for j in kept] for row in rows]
     labels = sorted(frozenset().union(*(g.leaves for row in rows for g in row)), key=repr)
     samples = np.array([near(values, k) for k in range(PARAMETERS if labels else 1)])

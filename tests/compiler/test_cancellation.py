@@ -96,3 +96,33 @@ def test_a_sum_over_equal_variables_that_rounding_leaves(factor):
         _compiled("abcuv", lambda a, b, c, u, v, t: (*equations(a, b, c, u, v, t), u + v - sympy.cos(t)))
     system = _compiled("abcuv", lambda a, b, c, u, v, t: (*equations(a, b, c, u, v, t), der(a) + a))
     assert sorted(system.states) == ["d.a", "d.v"]
+
+
+@pytest.mark.parametrize("force", [lambda t, y: t, lambda t, y: sympy.sin(t) * y, lambda t, y: sympy.exp(y)])
+def test_terms_of_one_quantity_that_cancel(force):
+    """v = y\' and y\' = v + y + f, however f is written, determine y by y + f = 0: y has no freedom. An equation of the
+    same shape in which nothing meets determines z\'."""
+
+    def equations(v, y, w, z, t):
+        return der(y) - v, der(y) - v - y - force(t, y), der(z) - w - z - force(t, z), w - sympy.cos(t)
+
+    system = _compiled("vywz", equations)
+    assert system.report.degrees_of_freedom == 1 and "d.z" in system.states
+    (note,) = [n for n in system.report.notes if "cancel" in n]
+    assert note.startswith("highest derivatives cancel in d: 0 = ")
+
+
+def test_terms_of_one_quantity_that_cancel_for_some_parameters():
+    class Scaled(Component):
+        def __init__(self, ev, p):
+            super().__init__(ev, "d")
+            v, y, p = self.variable("v"), self.variable("y"), self.parameter("p", p)
+            self.add_equations(der(y) - v, p * der(y) - v - sympy.sin(y))
+
+    def compiled(p):
+        ev = EqnEnv()
+        return AcausalCompiler(ev, AcausalDiagram().add(Scaled(ev, p)))()
+
+    assert compiled(2.0).states == ["d.y"]
+    with pytest.raises(StructuralError, match="singular for d.p = 1, though not in general"):
+        compiled(1.0)
