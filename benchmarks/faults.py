@@ -143,7 +143,7 @@ FAULTS = [
         "plotting.py",
         "(ts <= time.max() + slack)",
         "(ts >= time.max() + slack)",
-        "tests/plants/test_solution.py tests/plants/test_events.py",
+        "tests/plants/test_events.py",
     ),
     Fault(
         "testing.py",

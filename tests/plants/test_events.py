@@ -10,6 +10,7 @@ import functools
 from typing import NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -108,6 +109,21 @@ def test_what_a_solution_says_of_events(bounced):
     np.testing.assert_array_equal(bounced["ball.n"], np.searchsorted(BOUNCES, EVENLY))
     assert "ball.n" in bounced and bounced.to_dict()["ball.n"].shape == (31,)
     assert "when(h <= 0)" in repr(events)
+
+
+def test_events_outside_of_the_saved_times_are_not_drawn(bounced):
+    plt = pytest.importorskip("matplotlib.pyplot")
+    first, last = 3, 9  # between two of six bounces
+    rows = eqx.tree_at(
+        lambda s: (s.ts, s.states, s.discrete),
+        bounced,
+        (bounced.ts[first:last], bounced.states[first:last], bounced.discrete[first:last]),
+    )
+    inside = [float(t) for t in BOUNCES if EVENLY[first] <= t <= EVENLY[last - 1]]
+    assert 0 < len(inside) < 6
+    (marks,) = rows.plot("ball.h").collections
+    np.testing.assert_allclose([at[0, 0] for at in marks.get_segments()], inside, rtol=0, atol=1e-10)
+    plt.close("all")
 
 
 def test_both_sides_of_an_event(bounced):
