@@ -66,7 +66,7 @@ def reduce_with_cancellation(
         offsets = reduce_index(signature, least, highest)
         jacobian = _Jacobian(groups, offsets, column, values)
         replaced, added, combined = [], [], []
-        for equations in _blocks_that_may_cancel(groups, signature, offsets, column):
+        for equations in _blocks_that_may_cancel(signature, jacobian):
             found = _combination(jacobian, equations, names)
             if found is not None:
                 combined = [provenance_of(groups, int(e)) for e in equations]
@@ -102,32 +102,36 @@ def _blocks(signature: Incidence, offsets: Offsets) -> tuple[np.ndarray, np.ndar
     return label, np.bincount(label)[label]
 
 
-def _blocks_that_may_cancel(
-    groups: Sequence[EquationGroup], signature: Incidence, offsets: Offsets, column: np.ndarray
-) -> list[np.ndarray]:
-    """The equations of each diagonal block, up to a size, that has more than one or whose equation has more than one
-    term in what it determines."""
-    label, _ = _blocks(signature, offsets)
+def _blocks_that_may_cancel(signature: Incidence, jacobian: "_Jacobian") -> list[np.ndarray]:
+    """The equations of each diagonal block, up to a size, that has more than one or in whose equation the terms of what
+    it determines cancel."""
+    label, _ = _blocks(signature, jacobian.offsets)
     sizes = np.bincount(label)
     order = np.argsort(label, kind="stable")
     start = np.concatenate([[0], np.cumsum(sizes)])
     several = sizes > 1
-    several[label[_meeting(groups, offsets, column)]] = True
+    several[label[_cancelled_alone(jacobian)]] = True
     chosen = np.flatnonzero(several & (sizes <= LARGEST_BLOCK)).tolist()
     return [np.sort(order[start[b] : start[b + 1]]) for b in chosen]
 
 
-def _meeting(groups: Sequence[EquationGroup], offsets: Offsets, column: np.ndarray) -> np.ndarray:
-    """The equations in which the highest derivative that is matched to them stands in several slots, as u′ in
-    u′ − v = f where v has been found to be u′."""
-    first = equation_offsets(groups)
+def _cancelled_alone(jacobian: "_Jacobian") -> np.ndarray:
+    """The equations in which the highest derivative that is matched to them stands in several slots that cancel at a
+    random point, as u′ in u′ − v = f where v has been found to be u′."""
+    offsets, column = jacobian.offsets, jacobian.column
     found = [np.zeros(0, np.int64)]
-    for g, start in zip(groups, first, strict=False):
-        own = start + np.arange(len(g))
+    for g, group in enumerate(jacobian.groups):
+        own = np.arange(jacobian.first[g], jacobian.first[g + 1])
         matched = offsets.matched_variable[own, None]
-        there = (g.variable != ZERO) & (column[g.variable] == matched)
-        highest = there & (g.order + offsets.equation[own, None] == offsets.variable[matched])
-        found.append(own[highest.sum(axis=1) > 1])
+        there = (group.variable != ZERO) & (column[group.variable] == matched)
+        highest = there & (group.order + offsets.equation[own, None] == offsets.variable[matched])
+        several = highest.sum(axis=1) > 1
+        if not several.any():
+            continue
+        partials, errors = jacobian.partials(g, 0)
+        total, bound = (highest * partials).sum(axis=1), (highest * errors).sum(axis=1)
+        # What has no value at this point is asked at others.
+        found.append(own[several & ~(np.abs(total) > bound)])
     return np.concatenate(found)
 
 
@@ -299,6 +303,8 @@ def _combination(jacobian: _Jacobian, equations: np.ndarray, names: Sequence[str
     if found is None:
         here = [jacobian.place(e) for e in equations[used].tolist()]
         concerned = dict.fromkeys(p for g, i in here for p in groups[g].parameter[i].tolist())
+        if not concerned:  # numbers alone, which cancel to rounding
+            raise StructuralError(_hidden(sources))
         raise StructuralError("\n".join([_for_values(jacobian.values, names, list(concerned)), *itemised(sources)]))
     combined = combine(written, found, top, jacobian.values, lambda: jacobian.natural(equations[used]))
     if combined is None:

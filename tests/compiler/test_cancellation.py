@@ -100,8 +100,8 @@ def test_a_sum_over_equal_variables_that_rounding_leaves(factor):
 
 @pytest.mark.parametrize("force", [lambda t, y: t, lambda t, y: sympy.sin(t) * y, lambda t, y: sympy.exp(y)])
 def test_terms_of_one_quantity_that_cancel(force):
-    """v = y\' and y\' = v + y + f, however f is written, determine y by y + f = 0: y has no freedom. An equation of the
-    same shape in which nothing meets determines z\'."""
+    """v = y' and y' = v + y + f, however f is written, determine y by y + f = 0: y has no freedom. An equation of the
+    same shape in which nothing meets determines z'."""
 
     def equations(v, y, w, z, t):
         return der(y) - v, der(y) - v - y - force(t, y), der(z) - w - z - force(t, z), w - sympy.cos(t)
