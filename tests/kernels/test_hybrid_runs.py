@@ -359,6 +359,6 @@ def test_gradients_of_a_batch_are_those_of_its_members():
         atol = 1e-9 * max([1.0, *(0.01 / np.sqrt(d) for d in DEPTHS if name == f"dip {d:g}")])
         if alone.result == OKAY:
             jax.tree.map(
-                lambda together, one, k=k, atol=atol: np.testing.assert_allclose(together[k], one, rtol=1e-8, atol=atol),
+                lambda together, one, k=k, a=atol: np.testing.assert_allclose(together[k], one, rtol=1e-8, atol=a),
                 by, tuple(alone_by),
             )  # fmt: skip
