@@ -355,7 +355,7 @@ def test_gradients_of_a_batch_are_those_of_its_members():
     for k, name in enumerate(PROBLEMS):
         alone, *alone_by = found(name)
         assert ran.result[k] == alone.result
-        # A dip of depth d falls through zero at a rate of 2·√d, and rounding moves its time by as much as that is small.
+        # A dip of depth d falls through zero at a rate of 2·√d: the smaller it is, the more rounding moves its time.
         atol = 1e-9 * max([1.0, *(0.01 / np.sqrt(d) for d in DEPTHS if name == f"dip {d:g}")])
         if alone.result == OKAY:
             jax.tree.map(
