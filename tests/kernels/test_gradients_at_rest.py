@@ -158,7 +158,7 @@ def implicit(solver):
     "solver",
     [
         pytest.param(Rodas5P(), id="Rodas5P"),
-        # At rest it sees no error and takes orders up to 5, while the pushed run that chooses its steps has orders of its
+        # At rest it sees no error and takes orders up to 5, while the pushed run that chooses steps has orders of its
         # own. Not strict, for with other roundings it is right by chance.
         pytest.param(
             BDF(),
