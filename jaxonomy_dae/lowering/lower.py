@@ -18,6 +18,7 @@ from .gather import Gather
 from .plan import ConstraintGroup, InputTable, PlannedRow, SystemPlan
 from .plan_events import plan_events
 from .plan_held import plan_held
+from .plan_waves import plan_waves
 from .program import Layout, Program, plan
 from .schedule import AnyStep, SparseStep, Step, build_schedule
 
@@ -83,9 +84,11 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
         lambda q: program(_needed(steps, q, n)),
     )
     held = plan_held(flat.held, variable_map, lambda q: program(_needed(steps, q, n)))
+    watched = [] if events is None else [_of(variable_map, events.table.guard[events.n_clocks :])[0]]
     row_inputs = [_of(variable_map, row.inputs) for row in flat.rows]
     following = state_order + 1
     rates = carried + 1 if _rates_hold(flat, variable_map, extended, for_residuals, carried) else carried[:0]
+    watched += [q for q, _ in row_inputs]
     derivative = program(_needed(steps, np.concatenate([following, rates, *(q for q, _ in row_inputs)]), n))
     rows = tuple(
         _plan_row(row, inputs, variable_map, state_order, derivative.layout)
@@ -140,6 +143,7 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
         linear_solver,
         events,
         held,
+        plan_waves(_needed(steps, np.concatenate([following, rates, constraint_slots, *watched]), n)),
     )
 
 

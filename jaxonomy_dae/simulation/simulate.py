@@ -82,8 +82,10 @@ def simulate(
     - `stepsize_controller`: instead of the controller made from the tolerances.
     - `jump_ts`: times at which functions given as inputs jump, a number or shape `(n,)`: steps end there and the method
         starts anew.
-    - `dtmax`: the longest step. Derivatives by the amplitude of an input at which this is zero need one, if the input
-        is faster than what it acts on: nothing shows such a motion to the step control.
+    - `dtmax`: the longest step. None: a quarter of the shortest period of sin(ωt + φ) in equations on which states
+        depend, where ω is an expression in parameters, and long steps end at its zeros and extremes; `jnp.inf` leaves
+        that out. Inputs that are functions do not tell their periods: derivatives by the amplitude of one, where this
+        is zero, need a longest step if the input is faster than what it acts on.
     - `max_steps`: bounds the steps taken, beside those that end at samples; with `ts=None` as many rows are reserved.
     - `max_events`: bounds the events of conditions; `solution.events` has room for as many.
     - `save_events`: whether `solution.events` also has variables before and after events; None: outside jit, and if

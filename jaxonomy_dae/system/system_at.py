@@ -341,6 +341,21 @@ class SystemAt:
         periods, offsets = zip(*clocks, strict=True)
         return jnp.stack([value(start) for start in periods]), jnp.stack([value(start) for start in offsets])
 
+    def waves(self) -> tuple[Any, Any]:
+        """Angular frequencies and phases of what drives the model, shape (waves,) each; NaN for phases that move."""
+        frequencies, phases = [], []
+        for group in self.plan.waves:
+            n = len(group.parameter)
+            given = [self.parameters[column] for column in group.parameter.T], list(group.coefficient.T)
+
+            def values(template, n=n, given=given):
+                found = jnp.asarray(template.residual([], *given, self.t, None), self.dtype)
+                return jnp.broadcast_to(found, (n,))
+
+            frequencies.append(values(group.frequency))
+            phases.append(jnp.full((n,), jnp.nan, self.dtype) if group.phase is None else values(group.phase))
+        return jnp.concatenate(frequencies), jnp.concatenate(phases)
+
     def _events(self) -> EventPlan:
         if self.plan.events is None:
             raise ModelError("this system has no events")
