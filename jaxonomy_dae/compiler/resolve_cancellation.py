@@ -316,7 +316,9 @@ def _combination(
         concerned = list(dict.fromkeys(p for g, i in here for p in groups[g].parameter[i].tolist()))
         if not concerned:  # numbers alone, which cancel to rounding
             raise StructuralError(_hidden(sources))
-        raise StructuralError("\n".join([_for_values(jacobian, equations, names, concerned, discrete), *itemised(sources)]))
+        raise StructuralError(
+            "\n".join([_for_values(jacobian, equations, names, concerned, discrete), *itemised(sources)])
+        )
     combined = combine(written, found, top, jacobian.values, lambda: jacobian.natural(equations[used]))
     if combined is None:
         raise StructuralError(_hidden(sources))
@@ -343,8 +345,8 @@ def _for_values(
         mend = "Change the parameters"
     return (
         f"these equations are singular for {given or 'the given parameter values'}, though not in general"
-        f"{f', in the mode {mode}' if mode else ''}. {mend}, or state the constraint that follows as an equation of its "
-        "own:"
+        f"{f', in the mode {mode}' if mode else ''}. {mend}, or state the constraint that follows as an equation of "
+        "its own:"
     )
 
 

@@ -84,7 +84,7 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
         lambda q: program(_needed(steps, q, n)),
     )
     held = plan_held(flat.held, variable_map, lambda q: program(_needed(steps, q, n)))
-    watched = [] if events is None else [_of(variable_map, events.table.guard[events.n_clocks :])[0]]
+    watched = [] if events is None else [variable_map.quantity[events.table.guard[events.n_clocks :]]]
     row_inputs = [_of(variable_map, row.inputs) for row in flat.rows]
     following = state_order + 1
     rates = carried + 1 if _rates_hold(flat, variable_map, extended, for_residuals, carried) else carried[:0]
