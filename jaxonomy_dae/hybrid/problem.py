@@ -75,14 +75,14 @@ class AbstractHybridProblem(eqx.Module):
 class HybridState(eqx.Module):
     """What is integrated: the state `x`, the discrete values `q`, and the bookkeeping of events.
 
-    - `armed`: 1.0 for guards that have been positive since their event.
-    - `size`, `span`: how large the guards, and how long the steps, have been of late.
+    - `armed`: on which side of zero the guards are: `side.ABOVE`, `side.RESTS` or `side.BELOW`.
+    - `size`: how large the guards have been so far; `span`: how long the steps have been of late.
     - `request`: where the step that was tried should have ended, or infinity.
     - `ticks`, `due`: how often each clock has ticked, and when it does next.
     - `count`, `times`, `which`, `rate`: how many events there were, and of the first ones the time, the number of the
         event and how fast its guard fell.
     - `before`, `after`: (x, q) at the times of the first events, on both sides; no rows if they are not asked for.
-    - `ended`: 1.0 once an event has ended the run.
+    - `ended`: 1.0 once an event has ended the run; `stuck`: 1.0 once one happens again and again at one instant.
     """
 
     x: Float[Array, " n"]
@@ -98,6 +98,7 @@ class HybridState(eqx.Module):
     which: Float[Array, " events"]
     rate: Float[Array, " events"]
     ended: Float[Array, ""]
+    stuck: Float[Array, ""]
     before: Float[Array, "rows m"]
     after: Float[Array, "rows m"]
 

@@ -8,6 +8,7 @@ from jax import lax
 
 from .event_map import Arrival, handle
 from .problem import AbstractHybridProblem, HybridState
+from .side import ABOVE, BELOW, RESTS
 
 
 def start(
@@ -28,11 +29,12 @@ def start(
     if g:
         value, rate = problem.rates(t0, x0, q0, args, problem.slope(t0, x0, q0, args))
         holding = jnp.where(value == 0, rate < 0, value < 0)
-        armed, size = (~holding).astype(dtype), jnp.abs(value)
+        size = jnp.abs(value)
+        armed = jnp.where(holding, BELOW, jnp.where(value == 0, RESTS, ABOVE)).astype(dtype)
     rows = jnp.full((logged if sides else 0, len(x0) + len(q0)), jnp.nan, dtype)
     state = HybridState(
         x0, q0, armed, size, nothing, jnp.asarray(jnp.inf, dtype), ticks, lax.stop_gradient(problem.due(ticks)),
-        nothing, infinite, jnp.full_like(infinite, -1.0), jnp.zeros_like(infinite), nothing, rows, rows,
+        nothing, infinite, jnp.full_like(infinite, -1.0), jnp.zeros_like(infinite), nothing, nothing, rows, rows,
     )  # fmt: skip
     at_once = np.array(problem.immediate[c:], bool)
     if not c and not at_once.any():
