@@ -67,6 +67,7 @@ def event_table(model: ModelNumbers) -> EventTable:
         tuple(next((a.message for a in w.actions if isinstance(a, Terminate)), None) for w in whens),
         tuple(when.noted for when in whens),
         tuple(when.revocable for when in whens),
+        tuple(when.relation for when in whens),
         tuple(when.immediate for when in whens),
         event,
         state,

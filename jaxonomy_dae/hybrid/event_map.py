@@ -80,6 +80,7 @@ def handle(
     c, g = problem.n_clocks, problem.n_guards
     noted = jnp.asarray(problem.noted)
     ends = jnp.asarray(problem.ends).astype(t.dtype)
+    relations = jnp.asarray(problem.relations)
 
     def one(instant: Instant) -> Instant:
         state, q, before = instant.state, instant.state.q, instant.slope
@@ -131,6 +132,8 @@ def handle(
             _noted(state.rate, row, lax.stop_gradient(rate)),
             jnp.maximum(state.ended, ends[event]),
             jnp.any(stuck).astype(t.dtype),
+            state.turns + relations[event].astype(t.dtype),
+            jnp.where(relations[event], event.astype(t.dtype), state.turned),
             _noted(state.before, row, jnp.concatenate([reached, q])),
             _noted(state.after, row, jnp.concatenate([x, new])),
         )

@@ -25,6 +25,7 @@ class AbstractHybridProblem(eqx.Module):
     immediate: eqx.AbstractVar[tuple[bool, ...]]  # which happen at the initial time, if their conditions hold there
     noted: eqx.AbstractVar[tuple[bool, ...]]  # which are counted and listed
     revocable: eqx.AbstractVar[tuple[bool, ...]]  # which another event may undo before they happen
+    relations: eqx.AbstractVar[tuple[bool, ...]]  # which say what a relation is, from the initial time on
     resolution: eqx.AbstractVar[Any]  # a time that is nothing beside the run, but more than rounding
 
     @abc.abstractmethod
@@ -48,6 +49,12 @@ class AbstractHybridProblem(eqx.Module):
         self, t: Any, x: Float[Array, " n"], q: Float[Array, " q"], previous: Float[Array, " q"], event: Any, args: Any
     ) -> tuple[Float[Array, " n"], Float[Array, " q"]]:
         """(x, q) after an event, consistent; `previous` are the discrete values before the instant."""
+
+    @abc.abstractmethod
+    def settled(
+        self, t: Any, x: Float[Array, " n"], q: Float[Array, " q"], events: Bool[Array, " events"], args: Any
+    ) -> Float[Array, " q"]:
+        """q after several events that assign discrete values, each by what was before all of them."""
 
     @abc.abstractmethod
     def clocks(self) -> tuple[Float[Array, " clocks"], Float[Array, " clocks"]]:
@@ -83,6 +90,7 @@ class HybridState(eqx.Module):
         event and how fast its guard fell.
     - `before`, `after`: (x, q) at the times of the first events, on both sides; no rows if they are not asked for.
     - `ended`: 1.0 once an event has ended the run; `stuck`: 1.0 once one happens again and again at one instant.
+    - `turns`, `turned`: how often relations have turned without time going on, and which one did last.
     """
 
     x: Float[Array, " n"]
@@ -99,6 +107,8 @@ class HybridState(eqx.Module):
     rate: Float[Array, " events"]
     ended: Float[Array, ""]
     stuck: Float[Array, ""]
+    turns: Float[Array, ""]
+    turned: Float[Array, ""]
     before: Float[Array, "rows m"]
     after: Float[Array, "rows m"]
 

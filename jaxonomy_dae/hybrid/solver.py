@@ -25,6 +25,9 @@ LOOKS = np.array([0.0, 0.13, 0.31, 0.5, 0.67, 0.86, 1.0])
 FITTED = [0, 3, 6]
 BEND = 0.1
 FORGOTTEN = 0.8  # what a step leaves of how long steps have been: next to events they are short
+# How often relations may turn while time does not go on, beside so often for each. Beyond, they turn back and forth.
+SLIDES, TURNS = 64, 4
+MOVED = 1e3  # times the resolution: a step so long goes on
 
 TOO_MANY: Any = diffrax.RESULTS.max_steps_rejected  # events
 STUCK: Any = diffrax.RESULTS.stagnation  # an event happens again and again at one instant
@@ -139,8 +142,9 @@ class WithEvents(diffrax.AbstractWrappedSolver):
         )
         dense = _Dense(solver.interpolation_cls, info)
         request, armed, arrival = _looked_at(problem, dense, t0, t1, y0, x1, args)
-        changed = x1, armed, arrival.size, arrival.span, jnp.full_like(t1, jnp.inf)
-        state = eqx.tree_at(lambda y: (y.x, y.armed, y.size, y.span, y.request), y0, changed)
+        turns = jnp.where(t1 - t0 > MOVED * problem.resolution, jnp.zeros_like(y0.turns), y0.turns)
+        changed = x1, armed, arrival.size, arrival.span, jnp.full_like(t1, jnp.inf), turns
+        state = eqx.tree_at(lambda y: (y.x, y.armed, y.size, y.span, y.request, y.turns), y0, changed)
         fired = jnp.any(arrival.due)
 
         def events(state):
@@ -153,7 +157,8 @@ class WithEvents(diffrax.AbstractWrappedSolver):
         finite = jnp.all(jnp.isfinite(y1.x)) & jnp.all(jnp.isfinite(y1.q))
         result = diffrax.RESULTS.where(fired & ~finite & jnp.all(jnp.isfinite(x1)), NOT_FINITE, result)
         result = diffrax.RESULTS.where(y1.count > self.max_events, TOO_MANY, result)
-        result = diffrax.RESULTS.where((y1.stuck > 0) & (y1.ended == 0), STUCK, result)
+        slides = y1.turns > SLIDES + TURNS * sum(problem.relations)
+        result = diffrax.RESULTS.where(((y1.stuck > 0) | slides) & (y1.ended == 0), STUCK, result)
         return y1, y_error, dense_info, (inner_state, fired), result
 
 

@@ -6,9 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from ..adjoint.resting import still
 from .event_map import Arrival, handle
 from .problem import AbstractHybridProblem, HybridState
 from .side import ABOVE, BELOW, RESTS
+
+ROUNDS = 4  # relations within relations
 
 
 def start(
@@ -27,19 +30,44 @@ def start(
     armed = size = rate = jnp.zeros((0,), dtype)
     holding = jnp.zeros((0,), bool)
     if g:
-        value, rate = problem.rates(t0, x0, q0, args, problem.slope(t0, x0, q0, args))
-        holding = jnp.where(value == 0, rate < 0, value < 0)
+        q0 = _with_relations(problem, t0, x0, q0, args)
+        rate, holding, value = _conditions(problem, t0, x0, q0, args)
         size = jnp.abs(value)
         armed = jnp.where(holding, BELOW, jnp.where(value == 0, RESTS, ABOVE)).astype(dtype)
     rows = jnp.full((logged if sides else 0, len(x0) + len(q0)), jnp.nan, dtype)
     state = HybridState(
         x0, q0, armed, size, nothing, jnp.asarray(jnp.inf, dtype), ticks, lax.stop_gradient(problem.due(ticks)),
-        nothing, infinite, jnp.full_like(infinite, -1.0), jnp.zeros_like(infinite), nothing, nothing, rows, rows,
+        nothing, infinite, jnp.full_like(infinite, -1.0), jnp.zeros_like(infinite), nothing, nothing, nothing,
+        nothing - 1.0, rows, rows,
     )  # fmt: skip
-    at_once = np.array(problem.immediate[c:], bool)
+    at_once = np.array(problem.immediate[c:], bool) & ~np.array(problem.relations[c:], bool)
     if not c and not at_once.any():
         return state
     due_conditions = holding & at_once
     due = jnp.concatenate([state.due <= t0 + tolerance, due_conditions])
     arrival = Arrival(jnp.zeros_like(x0), rate, due, jnp.zeros((g,), bool), size, tolerance, tolerance)
     return handle(problem, t0, state, arrival, args, at_start=True)[0]
+
+
+def _conditions(problem: AbstractHybridProblem, t0: Any, x0: Any, q0: Any, args: Any) -> tuple[Any, Any, Any]:
+    """How fast guards change at the initial time, which conditions hold, and the guards. One at zero is as it will be
+    at once."""
+    value, rate = problem.rates(t0, x0, q0, args, problem.slope(t0, x0, q0, args))
+    return rate, jnp.where(value == 0, rate < 0, value < 0), value
+
+
+def _with_relations(problem: AbstractHybridProblem, t0: Any, x0: Any, q0: Any, args: Any) -> Any:
+    """The discrete values when all relations are what their sides say. They do not move with parameters."""
+    c = problem.n_clocks
+    relations = np.array(problem.relations, bool)
+    if not relations.any():
+        return q0
+    problem, t0, x0, begin, args = still((problem, t0, x0, q0, args))
+
+    def once(_: Any, q: Any) -> Any:
+        _, holding, _ = _conditions(problem, t0, x0, q, args)
+        events = jnp.concatenate([jnp.zeros((c,), bool), holding]) & relations
+        return problem.settled(t0, x0, q, events, args)
+
+    found = lax.fori_loop(0, ROUNDS, once, begin)
+    return jnp.where(found == begin, q0, found)

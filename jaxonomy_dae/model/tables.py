@@ -201,6 +201,7 @@ class EventTable:
     message: tuple[str | None, ...]  # with which an event ends the run
     noted: tuple[bool, ...]  # whether an event is listed; others only say that equations change
     revocable: tuple[bool, ...]  # whether another event at the same instant may undo it before it happens
+    relation: tuple[bool, ...]  # whether an event says what a relation is, from the initial time on
     immediate: tuple[bool, ...]  # whether an event happens at the initial time, if its condition holds there
     event: np.ndarray  # (actions,)
     state: np.ndarray  # (actions,): the variable that starts anew, or −1
@@ -213,7 +214,7 @@ class EventTable:
 
 
 _NONE = np.zeros(0, np.int64)
-NO_EVENTS = EventTable((), _NONE, (), (), (), (), (), _NONE, _NONE, _NONE, _NONE, np.zeros(0))
+NO_EVENTS = EventTable((), _NONE, (), (), (), (), (), (), _NONE, _NONE, _NONE, _NONE, np.zeros(0))
 
 
 @dataclasses.dataclass(frozen=True)

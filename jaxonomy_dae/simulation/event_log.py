@@ -24,6 +24,8 @@ class EventLog(eqx.Module):
     which: Float[Array, "*batch events"]
     transversality: Float[Array, "*batch events"]
     count: Float[Array, "*batch"]
+    turns: Float[Array, "*batch"]
+    turned: Float[Array, "*batch"]
     before: Float[Array, "*batch rows m"]
     after: Float[Array, "*batch rows m"]
 
@@ -36,7 +38,7 @@ class EventLog(eqx.Module):
     @classmethod
     def of(cls, state: HybridState) -> "EventLog":
         """The log in the last state of a run."""
-        frozen = jax.lax.stop_gradient((state.which, jnp.abs(state.rate), state.count))
+        frozen = jax.lax.stop_gradient((state.which, jnp.abs(state.rate), state.count, state.turns, state.turned))
         return cls(state.times, *frozen, state.before, state.after)
 
 

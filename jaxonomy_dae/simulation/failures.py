@@ -35,7 +35,11 @@ def raised(x: Any, result: Any, has_events: bool, max_steps: int, max_events: in
     """x, or an error while running: for traced runs, of which no more than a code is known."""
     codes = diffrax.RESULTS
     lost = "nonlinear blocks have no solution there, or the start is not consistent"
-    many = f"more than max_events={max_events} events" if has_events else "too many rejected steps"
+    many = (
+        f"more than max_events={max_events} events, or relations that turn back at once"
+        if has_events
+        else "too many rejected steps"
+    )
     texts = [
         (codes.max_steps_reached, f"max_steps={max_steps} was reached"),
         (codes.dt_min_reached, "no step was short enough to be accepted"),
@@ -75,7 +79,7 @@ def explain(
             ", or began a mode whose constraint is far from what it asks for, or that no impulse brings about"
             if system.plan.held is not None
             else ", or left states that the hidden constraints do not admit: let it write, with reinit(...), all that "
-            "jumps"
+            "jumps" + _of_kinks(system)
             if system.is_constrained
             else ", or began a mode in which equations are singular, as where ideal switches and diodes short-circuit "
             "a source or a capacitor: give those a resistance, Ron=1e-5"
@@ -184,6 +188,30 @@ def _accumulation(times: np.ndarray) -> str:
         return ""
     end = times[-1] + apart[-1] * ratios[-1] / (1 - ratios[-1])
     return f"the times between them shrink, each to {ratios[-1]:.3g} of the one before, and accumulate at t={end:.6g}"
+
+
+def _of_kinks(system: AcausalSystem) -> str:
+    """What to write if it was a relation that turned."""
+    found = system.report.relations
+    if not found:
+        return ""
+    shown = ", ".join(found[:SHOWN])
+    return (
+        f". If it is a constraint that has a kink where a relation turns ({shown}), speeds jump there: round the kink, "
+        "or say with self.complementary what pushes"
+    )
+
+
+def _sliding(system: AcausalSystem, event: int, t: float) -> str:
+    """Which relation turns again and again at one instant."""
+    table: Any = system.plan.events
+    where, _, condition = table.names[event].partition(": when(")
+    return (
+        f"the integration stopped at t={t:.6g}: the solution stays where '{condition[:-1]}' of component '{where}' "
+        "turns. On either side of it the equations lead back, at once. Say what holds there: with self.either and a "
+        "mode, as a brake that sticks has one; or let the conditions for turning forth and back lie apart "
+        "(hysteresis), with self.when; or round the kink, for instance tanh(x/small) instead of sign(x)"
+    )
 
 
 def _bad_input(plan: SystemPlan, inputs: dict[str, Any], t0: float, t: float, t1: float) -> str:

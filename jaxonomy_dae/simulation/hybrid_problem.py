@@ -36,6 +36,7 @@ class SystemProblem(AbstractHybridProblem):
     immediate: tuple[bool, ...] = eqx.field(static=True)
     noted: tuple[bool, ...] = eqx.field(static=True)
     revocable: tuple[bool, ...] = eqx.field(static=True)
+    relations: tuple[bool, ...] = eqx.field(static=True)
 
     def term(self, q):
         return term_of(self.system.holding(q), self.implicit)
@@ -67,6 +68,13 @@ class SystemProblem(AbstractHybridProblem):
             return self.admitted(t, x, q, args), q
         x, q, done = self.struck(t, x, before, q, args)
         return jnp.where(done, self.admitted(t, x, q, args), jnp.nan), q
+
+    def settled(self, t, x, q, events, args):
+        table: Any = self.system.plan.events.table
+        assigns = table.discrete >= 0
+        values = self.system.around_event(t, q, q, args).event_values(x)[assigns]
+        place = table.discrete[assigns]
+        return q.at[place].add(jnp.where(events[table.event[assigns]], values - q[place], 0.0))
 
     def struck(self, t: Any, x: Any, before: Any, q: Any, args: Any) -> tuple[Any, Any, Any]:
         """(x, q) after the impulses of the constraints that begin to hold with q, or that q asks for; and whether they
@@ -132,6 +140,7 @@ def problem_for(
         n_clocks=events.n_clocks, n_guards=len(events) - events.n_clocks, ends=ends, immediate=events.table.immediate,
         noted=events.table.noted,
         revocable=events.table.revocable,
+        relations=events.table.relation,
     )  # fmt: skip
 
 

@@ -18,6 +18,13 @@ def condition_events(flat: FlatModel) -> list[str]:
     return [f"{flat.events.text[e]}: {_actions(flat, e)}" for e in _noted(flat.events) if e >= len(flat.events.clocks)]
 
 
+def relation_events(flat: FlatModel) -> list[str]:
+    """The relations in equations whose changes are events."""
+    table = flat.events
+    found = (text.partition(": when(") for text, is_one in zip(table.text, table.relation, strict=True) if is_one)
+    return list(dict.fromkeys(f"{where}: {condition[:-1]}" for where, _, condition in found))
+
+
 def clock_events(flat: FlatModel, values: np.ndarray) -> list[str]:
     """The sampled events, with their periods and offsets."""
     out = []
