@@ -21,6 +21,11 @@ class Smooth(sympy.Function):
     def _sympystr(self, printer: Any) -> str:
         return f"smooth({printer._print(self.args[0])})"
 
+    def _printed_inside(self, printer: Any) -> str:
+        return printer._print(self.args[0])
+
+    _pythoncode = _numpycode = _mpmathcode = _printed_inside  # for sympy.lambdify
+
 
 def marked(u: Node) -> Node:
     """The node of an expression that is marked."""

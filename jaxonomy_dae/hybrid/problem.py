@@ -58,12 +58,13 @@ class AbstractHybridProblem(eqx.Module):
 
     @abc.abstractmethod
     def clocks(self) -> tuple[Float[Array, " clocks"], Float[Array, " clocks"]]:
-        """Periods and offsets of the sampled events."""
+        """Periods and offsets of the sampled events; of one that happens once, the period is infinite."""
 
     def due(self, ticks: Float[Array, " clocks"]) -> Float[Array, " clocks"]:
         """When each sampled event happens next, after so many ticks."""
         period, offset = self.clocks()
-        return offset + ticks * period
+        ticks = jax.lax.stop_gradient(ticks)
+        return offset + jnp.where(ticks == 0, 0.0, ticks * period)
 
     def slope(self, t: Any, x: Any, q: Any, args: Any) -> Float[Array, " n"]:
         """dx/dt, a constant of first derivatives."""

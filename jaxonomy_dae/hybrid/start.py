@@ -26,11 +26,17 @@ def start(
     nothing, infinite = jnp.zeros((), dtype), jnp.full((logged,), jnp.inf, dtype)
     period, offset = (lax.stop_gradient(v) for v in problem.clocks())
     tolerance = problem.resolution
-    ticks = jnp.maximum(jnp.ceil((t0 - tolerance - offset) / period), 0.0)
+    passed = t0 - tolerance - offset
+    ticks = jnp.where(jnp.isinf(period), (passed > 0).astype(dtype), jnp.ceil(passed / period))
+    relations = np.array(problem.relations, bool)
+    ticks = jnp.where(relations[:c], ticks, jnp.maximum(ticks, 0.0))  # relations have turned at all times
     armed = size = rate = jnp.zeros((0,), dtype)
     holding = jnp.zeros((0,), bool)
+    if relations.any():
+        due = problem.due(ticks) <= t0 + tolerance
+        q0 = _with_relations(problem, t0, x0, q0, due, args)
+        ticks = ticks + lax.stop_gradient(due & relations[:c])
     if g:
-        q0 = _with_relations(problem, t0, x0, q0, args)
         rate, holding, value = _conditions(problem, t0, x0, q0, args)
         size = jnp.abs(value)
         armed = jnp.where(holding, BELOW, jnp.where(value == 0, RESTS, ABOVE)).astype(dtype)
@@ -40,8 +46,8 @@ def start(
         nothing, infinite, jnp.full_like(infinite, -1.0), jnp.zeros_like(infinite), nothing, nothing, nothing,
         nothing - 1.0, rows, rows,
     )  # fmt: skip
-    at_once = np.array(problem.immediate[c:], bool) & ~np.array(problem.relations[c:], bool)
-    if not c and not at_once.any():
+    at_once = np.array(problem.immediate[c:], bool) & ~relations[c:]
+    if relations[:c].all() and not at_once.any():
         return state
     due_conditions = holding & at_once
     due = jnp.concatenate([state.due <= t0 + tolerance, due_conditions])
@@ -56,18 +62,22 @@ def _conditions(problem: AbstractHybridProblem, t0: Any, x0: Any, q0: Any, args:
     return rate, jnp.where(value == 0, rate < 0, value < 0), value
 
 
-def _with_relations(problem: AbstractHybridProblem, t0: Any, x0: Any, q0: Any, args: Any) -> Any:
-    """The discrete values when all relations are what their sides say. They do not move with parameters."""
-    c = problem.n_clocks
+def _with_relations(problem: AbstractHybridProblem, t0: Any, x0: Any, q0: Any, due: Any, args: Any) -> Any:
+    """The discrete values when all relations are what their sides say, or, if their clocks are `due`, what these write.
+    They do not move with parameters."""
+    c, g = problem.n_clocks, problem.n_guards
     relations = np.array(problem.relations, bool)
-    if not relations.any():
-        return q0
-    problem, t0, x0, begin, args = still((problem, t0, x0, q0, args))
+    problem, t0, x0, begin, due, args = still((problem, t0, x0, q0, due, args))
+
+    def settled(q: Any, clocks: Any, holding: Any) -> Any:
+        return problem.settled(t0, x0, q, jnp.concatenate([clocks, holding]) & relations, args)
 
     def once(_: Any, q: Any) -> Any:
-        _, holding, _ = _conditions(problem, t0, x0, q, args)
-        events = jnp.concatenate([jnp.zeros((c,), bool), holding]) & relations
-        return problem.settled(t0, x0, q, events, args)
+        return settled(q, jnp.zeros((c,), bool), _conditions(problem, t0, x0, q, args)[1])
 
-    found = lax.fori_loop(0, ROUNDS, once, begin)
+    found, none = begin, jnp.zeros((g,), bool)
+    if relations[:c].any():
+        found = lax.fori_loop(0, 2, lambda k, q: settled(q, due | (k == 0), none), found)
+    if relations[c:].any():
+        found = lax.fori_loop(0, ROUNDS, once, found)
     return jnp.where(found == begin, q0, found)

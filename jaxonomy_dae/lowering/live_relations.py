@@ -142,5 +142,5 @@ def _without(table: EventTable, gone: np.ndarray) -> EventTable:
     return EventTable(
         of(table.text), table.guard[kept], of(table.clocks), of(table.message), of(table.noted), of(table.revocable),
         of(table.relation), of(table.immediate), number_of[table.event[rows]], table.state[rows], table.discrete[rows],
-        table.value[rows], table.constant[rows],
+        table.value[rows], table.constant[rows], table.left_alone,
     )  # fmt: skip

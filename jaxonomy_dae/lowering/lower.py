@@ -253,9 +253,10 @@ def _digest(
         e.discrete,
         e.value,
         e.constant,
+        e.left_alone,
         flat.parameters.discrete,
     )
-    feed(*((start.template.key, start.parameters) for clock in e.clocks for start in clock))
+    feed(*((s.template.key, s.parameters) if s else "once" for clock in e.clocks for s in clock))
     h = flat.held
     feed(h.text, h.active, h.impulse, h.force, h.closed, h.level, h.owner, flat.parameters.n_relations)
     if linear_solver is not None:

@@ -197,7 +197,7 @@ class EventTable:
 
     text: tuple[str, ...]  # of each event
     guard: np.ndarray  # (events,): the variable that falls through zero; −1 for sampled ones
-    clocks: tuple[tuple[Start, Start], ...]  # period and offset of the sampled ones
+    clocks: tuple[tuple[Start | None, Start], ...]  # period and offset of the sampled ones; some happen once
     message: tuple[str | None, ...]  # with which an event ends the run
     noted: tuple[bool, ...]  # whether an event is listed; others only say that equations change
     revocable: tuple[bool, ...]  # whether another event at the same instant may undo it before it happens
@@ -208,6 +208,7 @@ class EventTable:
     discrete: np.ndarray  # (actions,): the place among the discrete variables of the one assigned, or −1
     value: np.ndarray  # (actions,): the variable that has the value, or −1 for …
     constant: np.ndarray  # (actions,): … a number
+    left_alone: tuple[str, ...] = ()  # the parts of equations with relations that are no events
 
     def __len__(self):
         return len(self.text)

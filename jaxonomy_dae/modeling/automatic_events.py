@@ -18,6 +18,7 @@ from ..expressions.from_sympy import UnsupportedExpression, parts_of, symbols_of
 from ..expressions.smooth import Smooth
 from .events import LIVE, guard_of
 from .symbols import RelationSymbol, TimeSymbol, VariableSymbol
+from .timed_relations import Edges, edges_of, in_relations_of_time, relations_in, whole_edges
 
 ROUNDING = (sympy.floor, sympy.ceiling, sympy.frac, sympy.Mod)
 KINKED = (sympy.Max, sympy.Min, sympy.Abs, sympy.sign, sympy.Heaviside, *ROUNDING)
@@ -72,7 +73,76 @@ class Stepping:
         return (float(LIVE), 0.0)
 
 
-Watched = Turning | Stepping
+@dataclasses.dataclass(frozen=True)
+class Timed:
+    """A relation that turns at times known beforehand; the hidden discrete variable `number` is what it is."""
+
+    number: int
+    condition: Any
+    edges: Edges
+
+    @property
+    def starts(self) -> tuple[float, ...]:
+        """Of its hidden discrete variables."""
+        return (float(LIVE),)
+
+
+@dataclasses.dataclass(frozen=True)
+class TimedSteps:
+    """The whole part of an argument that changes at times known beforehand; numbers as those of `Stepping`."""
+
+    number: int
+    argument: Any
+    edges: Edges
+
+    @property
+    def starts(self) -> tuple[float, ...]:
+        """Of its hidden discrete variables."""
+        return (float(LIVE), 0.0)
+
+
+Watched = Turning | Stepping | Timed | TimedSteps
+
+
+class Splitting:
+    """Takes from conditions the relations that turn at known times, each once; numbers follow from `first`."""
+
+    def __init__(self, first: int):
+        self.next = first
+        self.timed: dict[Any, Timed] = {}
+
+    def split(self, condition: Any) -> tuple[Any, Any]:
+        """(the condition as equations have it, as guards do) with what these relations are as discrete variables."""
+        simple = in_relations_of_time(condition)
+        found = [r for r in relations_in(simple) if self._is_timed(r)]
+        if not found:
+            return condition, condition
+        numbers = {r: self.timed[r].number for r in found}
+        known: dict[Any, Any] = {r: sympy.Eq(RelationSymbol(n), 1) for r, n in numbers.items()}
+        return _replaced(simple, {r: turned(n, r) for r, n in numbers.items()}), _replaced(simple, known)
+
+    def _is_timed(self, relation: Any) -> bool:
+        if relation not in self.timed:
+            edges = edges_of(relation)
+            if edges is None:
+                return False
+            self.timed[relation] = Timed(self.next, relation, edges)
+            self.next += 1
+        return True
+
+
+def _replaced(condition: Any, forms: dict[Any, Any]) -> Any:
+    """A condition with other forms of some relations in it."""
+    if condition in forms:
+        return forms[condition]
+    if isinstance(condition, sympy.And | sympy.Or | sympy.Not):
+        return condition.func(*(_replaced(part, forms) for part in condition.args))
+    return condition
+
+
+def is_watched(condition: Any) -> bool:
+    """Whether a condition changes otherwise than by events."""
+    return any(_moves(s) for s in symbols_of(condition))
 
 
 def turned(number: int, condition: Any) -> Any:
@@ -87,6 +157,7 @@ def turned(number: int, condition: Any) -> Any:
 def with_events(residuals: tuple[sympy.Expr, ...], first: int) -> tuple[tuple[sympy.Expr, ...], tuple[Watched, ...]]:
     """Equations whose relations are discrete variables, numbered from `first`; and what sets these. Equations of what
     events read stay as they are."""
+    residuals = tuple(r if _is_hidden(r) else _with_marks(r) for r in residuals)
     order = _inside_out([r for r in residuals if not _is_hidden(r)])
     varying = _varying(order)
     if not any(isinstance(e, (sympy.Piecewise, *KINKED)) and e in varying for e in order):
@@ -98,10 +169,13 @@ class _Rewriting:
     """The new form of all parts of equations, inner ones first."""
 
     def __init__(self, residuals: tuple[sympy.Expr, ...], order: list[Any], varying: set[Any], first: int):
-        self.residuals, self.order, self.varying, self.next = residuals, order, varying, first
+        self.residuals, self.order, self.varying = residuals, order, varying
+        self.numbers = Splitting(first)
         inside = set(order)
         self.needed = _needed_where([r for r in residuals if r in inside], order)
         self.new: dict[Any, Any] = {}
+        self.old: dict[Any, Any] = {}  # the other way round
+        self.timed_steps: list[TimedSteps] = []
         self.conditions: dict[Any, Any] = {}
         self.found: list[tuple[type, int, Any, list[Any]]] = []  # the last: where it stands
         self.places: dict[Any, list[Any]] = {}  # of a condition, the same list
@@ -109,13 +183,16 @@ class _Rewriting:
     def done(self) -> tuple[tuple[sympy.Expr, ...], tuple[Watched, ...]]:
         for e in self.order:
             self.new[e] = self._written(e)
+            self.old[self.new[e]] = e
 
         def holding(places: list[Any]) -> Any:
             where = functools.reduce(union, (self.needed[e] for e in places))
             return _holding(where, self.conditions.__getitem__)
 
         watched = tuple(kind(number, what, holding(places)) for kind, number, what, places in self.found)
-        return tuple(self.new.get(r, r) for r in self.residuals), watched
+        timed = (*self.numbers.timed.values(), *self.timed_steps)
+        in_order = tuple(sorted((*watched, *timed), key=lambda w: w.number))
+        return tuple(self.new.get(r, r) for r in self.residuals), in_order
 
     def _written(self, e: Any) -> Any:
         if isinstance(e, sympy.Piecewise):
@@ -162,17 +239,37 @@ class _Rewriting:
         return back if written_so is sympy.false else sympy.Piecewise((live, written_so), (back, True), evaluate=False)
 
     def _turning(self, places: list[Any], condition: Any) -> Any:
-        """A condition as a discrete variable."""
-        found = turned(self.next, condition)
-        self.found.append((Turning, self.next, condition, places))
-        self.next += 1
-        return found
+        """A condition as discrete variables."""
+        live, guarded = self.numbers.split(self._as_written(condition))
+        if not is_watched(guarded):
+            return live
+        # What is known of time is so in the guard; equations that are looked at outside of runs have all as it is.
+        number = self._numbers(1)
+        self.found.append((Turning, number, _replaced(guarded, {self._as_written(condition): condition}), places))
+        return turned(number, condition)
+
+    def _as_written(self, condition: Any) -> Any:
+        """A relation of parts that have been given new forms, with the old ones."""
+        if not isinstance(condition, sympy.core.relational.Relational):
+            return condition
+        sides = [self.old.get(side, side) for side in condition.args]
+        return condition.func(*sides, evaluate=False)
+
+    def _numbers(self, count: int) -> int:
+        """The first of so many numbers of hidden discrete variables."""
+        first = self.numbers.next
+        self.numbers.next += count
+        return first
 
     def _stepping(self, e: Any, argument: Any) -> Any:
         """The whole part of an argument in the expression e, as a discrete variable."""
-        live, whole = RelationSymbol(self.next), RelationSymbol(self.next + 1)
-        self.found.append((Stepping, self.next, argument, [e]))
-        self.next += 2
+        number = self._numbers(2)
+        live, whole = RelationSymbol(number), RelationSymbol(number + 1)
+        edges = whole_edges(argument)
+        if edges is None:
+            self.found.append((Stepping, number, argument, [e]))
+        else:
+            self.timed_steps.append(TimedSteps(number, argument, edges))
         unknown: Any = sympy.Eq(live, LIVE)
         return sympy.Piecewise((sympy.floor(argument), unknown), (whole, True), evaluate=False)
 
@@ -240,6 +337,56 @@ _FORMS: dict[Any, Callable[..., Any]] = {
     sympy.frac: lambda turn, step, u: u - step(u),
     sympy.Mod: lambda turn, step, a, b: a - b * step(a / b),
 }
+
+
+def relations_left_alone(residual: sympy.Expr) -> tuple[Any, ...]:
+    """The parts of an equation that change with relations which are no events: it is smooth there, or said to be."""
+    if _is_hidden(residual):
+        return ()
+    order = _inside_out([_with_marks(residual)])
+    found = [e.args[0] for e in order if isinstance(e, Smooth)]
+    return tuple(e for e in found if any(isinstance(p, (sympy.Piecewise, *KINKED)) for p in _varying(_inside_out([e]))))
+
+
+@functools.lru_cache(maxsize=4096)
+def _with_marks(residual: sympy.Expr) -> sympy.Expr:
+    """An equation in which those parts are marked as smooth whose branches meet with the same value and slope, as those
+    of q·|q|."""
+    order = _inside_out([residual])
+    varying = _varying(order)
+    kinks = [e for e in order if e in varying and isinstance(e, (sympy.Piecewise, *KINKED))]
+    marks = {}
+    for e in kinks:
+        alone = not any(inner in kinks for inner in _inside_out([e]) if inner is not e)
+        parts = _two_branches(e) if alone else None
+        if parts is not None and _meet_smoothly(residual.xreplace({e: parts[0]}) - residual.xreplace({e: parts[1]}), parts[2]):
+            marks[e] = Smooth(e)
+    return residual.xreplace(marks)
+
+
+def _two_branches(e: Any) -> tuple[Any, Any, Any] | None:
+    """Two branches, and what is zero where one goes over into the other; None for what has others."""
+    if isinstance(e, sympy.Abs):
+        return e.args[0], -e.args[0], e.args[0]
+    if isinstance(e, sympy.sign | sympy.Heaviside):
+        return sympy.Integer(1), sympy.Integer(-1 if isinstance(e, sympy.sign) else 0), e.args[0]
+    if isinstance(e, sympy.Max | sympy.Min) and len(e.args) == 2:
+        return *e.args, e.args[0] - e.args[1]
+    if isinstance(e, sympy.Piecewise) and len(e.args) == 2:
+        (first, condition), (second, otherwise) = e.args
+        if otherwise == True and isinstance(condition, sympy.core.relational._Inequality):  # noqa: E712
+            return first, second, condition.lhs - condition.rhs
+    return None
+
+
+def _meet_smoothly(difference: Any, surface: Any) -> bool:
+    """Whether a difference and its slope vanish where a surface does, in a variable that says where this is."""
+    for v in sorted((s for s in symbols_of(surface) if isinstance(s, VariableSymbol)), key=str):
+        slope = sympy.diff(surface, v)
+        if slope.is_number and slope.is_nonzero:
+            place = {v: v - surface / slope}
+            return all(sympy.expand(d.xreplace(place)) == 0 for d in (difference, sympy.diff(difference, v)))
+    return False
 
 
 def _is_hidden(residual: sympy.Expr) -> bool:

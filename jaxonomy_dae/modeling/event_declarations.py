@@ -110,7 +110,7 @@ class EventDeclarations:
                 )
         number = len(self.events)
         clock = condition if isinstance(condition, Sampled) else None
-        guard, shown = None, f"sampled({getattr(clock, 'period', '')})"
+        guard, shown = None, text or f"sampled({getattr(clock, 'period', '')})"
         if clock is None:
             shown = text or (str(condition) if on is None else f"{condition}, on={on}")
             expression = guard_of(condition, where)

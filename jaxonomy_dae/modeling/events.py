@@ -41,9 +41,9 @@ Action: TypeAlias = Reinit | Assign | Terminate
 
 @dataclasses.dataclass(frozen=True)
 class Sampled:
-    """A condition that becomes true at offset, offset + period, …"""
+    """A condition that becomes true at offset, offset + period, …; without a period, once."""
 
-    period: sympy.Expr
+    period: sympy.Expr | None
     offset: sympy.Expr
 
 

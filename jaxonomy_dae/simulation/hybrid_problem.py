@@ -73,8 +73,11 @@ class SystemProblem(AbstractHybridProblem):
         table: Any = self.system.plan.events.table
         assigns = table.discrete >= 0
         values = self.system.around_event(t, q, q, args).event_values(x)[assigns]
-        place = table.discrete[assigns]
-        return q.at[place].add(jnp.where(events[table.event[assigns]], values - q[place], 0.0))
+        # More than one event may write a value, but then the same.
+        new = jnp.full_like(q, -jnp.inf).at[table.discrete[assigns]].max(
+            jnp.where(events[table.event[assigns]], values, -jnp.inf)
+        )
+        return jnp.where(new > -jnp.inf, new, q)
 
     def struck(self, t: Any, x: Any, before: Any, q: Any, args: Any) -> tuple[Any, Any, Any]:
         """(x, q) after the impulses of the constraints that begin to hold with q, or that q asks for; and whether they

@@ -78,5 +78,7 @@ def _actions(flat: FlatModel, event: int) -> str:
     return ", ".join([*out, *([f"terminate({message!r})"] if message is not None else [])])
 
 
-def _number(start: Start, values: np.ndarray) -> float:
+def _number(start: Start | None, values: np.ndarray) -> float:
+    if start is None:
+        return float("inf")
     return float(start.template.residual([], [*values[list(start.parameters)]], [], 0.0, None, backend="numpy"))

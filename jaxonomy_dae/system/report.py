@@ -21,8 +21,9 @@ class SystemReport(Sections):
     Attributes count and name: `n_equations`, `n_unknowns`, `n_aliases`, `index` (structural, of the model as written),
     `differentiated` (pairs of an equation's text and how often), `states`, `algebraics`, `carried`, `constraints`,
     `blocks` (of more than one equation, or nonlinear), `notes`. Of a model with events also `discretes` (with their
-    starts), `events` of conditions, `relations` that are events, `clocks`, `modes` (equations that change with discrete
-    variables) and `index_changes` (the constraints that come and go with them, and the index while they hold).
+    starts), `events` of conditions, `relations` that are events, `left_alone` (those that are not), `clocks`, `modes`
+    (equations that change with discrete variables) and `index_changes` (the constraints that come and go with them, and
+    the index while they hold).
 
     `values` are those of all parameters, as they were declared if not given: starts and periods depend on them.
     """
@@ -132,6 +133,11 @@ class SystemReport(Sections):
         return relation_events(self._plan.flat)
 
     @property
+    def left_alone(self) -> list[str]:
+        """The parts of equations whose relations are no events: they are smooth there, or said to be."""
+        return list(self._plan.flat.events.left_alone)
+
+    @property
     def clocks(self) -> list[str]:
         """The sampled events, their periods and offsets, and what they do."""
         return clock_events(self._plan.flat, self._values)
@@ -177,6 +183,7 @@ class SystemReport(Sections):
             (counted(len(events), "event"), events),
             (counted(len(clocks), "clock"), clocks),
             ("relations at which steps end", self.relations),
+            ("relations at which they do not", self.left_alone),
             ("equations that change with a mode", self.modes),
             ("constraints that come and go", self.index_changes),
             ("hidden constraints, projected onto", self.constraints),

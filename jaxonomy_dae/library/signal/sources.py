@@ -6,7 +6,7 @@ import numpy as np
 from sympy import Max, Min
 
 from ...errors import ModelError
-from ...modeling import NONNEGATIVE, POSITIVE, Component, EqnEnv, Value, smooth
+from ...modeling import NONNEGATIVE, POSITIVE, Component, EqnEnv, Value
 from ..laws import sine
 from ..steps import pulse, step
 
@@ -45,7 +45,7 @@ class Ramp(Component):
         h, o = self.parameter("height", height), self.parameter("offset", offset)
         length = self.parameter("duration", duration, unit="s", bounds=POSITIVE)
         t0 = self.parameter("start_time", start_time, unit="s")
-        self.output("y", o + h * smooth(Min(Max((ev.t - t0) / length, 0), 1)))
+        self.output("y", o + h * Min(Max((ev.t - t0) / length, 0), 1))
 
 
 class Sine(Component):
