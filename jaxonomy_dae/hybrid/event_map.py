@@ -35,6 +35,8 @@ AHEAD = 1e-3
 # Steps within which a guard leaves the band about zero that is really pulled out of it: rounding in the forces on what
 # is at rest takes longer.
 SINKING = 4.0
+# How often relations may turn while time does not go on, beside so often for each. Beyond, they turn back and forth.
+SLIDES, TURNS = 64, 4
 
 
 class Instant(eqx.Module):
@@ -112,11 +114,14 @@ def handle(
         ticks = state.ticks + one_hot(event, c).astype(state.ticks.dtype)
         logged = (~is_clock & noted[event] & (not at_start)) | (ends[event] > 0)
         row = jnp.where(logged, state.count.astype(int), state.times.shape[0] + 1)
-        moved = jnp.any(x != reached)
+        moved = jnp.any(x != reached) & ~relations[event]
         approach = jnp.where(instant.caused[k] | at_start, 0.0, rate) if g else rate
         after, slow, armed, left, caused, stuck = _following(
             problem, t, x, new, instant, event, arrival, delay, moved, approach, args
         )
+        turns = state.turns + relations[event].astype(t.dtype)
+        slides = relations[event] & (turns > SLIDES + TURNS * sum(problem.relations))
+        again = jnp.where(slides, event, jnp.where(jnp.any(stuck), c + jnp.argmax(stuck), -1)) if g else jnp.array(-1)
         # What is too fast to be followed back, as a current that a blocked diode stops, has that value at once.
         back = delay - (1.0 - slow) * lax.stop_gradient(delay)
         state = HybridState(
@@ -133,9 +138,8 @@ def handle(
             _noted(state.which, row, event),
             _noted(state.rate, row, lax.stop_gradient(rate)),
             jnp.maximum(state.ended, ends[event]),
-            jnp.any(stuck).astype(t.dtype),
-            state.turns + relations[event].astype(t.dtype),
-            jnp.where(relations[event], event.astype(t.dtype), state.turned),
+            again.astype(t.dtype),
+            turns,
             _noted(state.before, row, jnp.concatenate([reached, q])),
             _noted(state.after, row, jnp.concatenate([x, new])),
         )
@@ -185,6 +189,7 @@ def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, dela
     instant = still(instant)
     here = event - c == jnp.arange(g)
     rested = here & (instant.state.armed == RESTS)
+    turns_back = jnp.asarray(problem.opposite)[jnp.clip(event - c, 0, g - 1)] == jnp.arange(g)
     band = rounding(arrival.size)
     ahead = AHEAD * arrival.span
 
@@ -228,7 +233,7 @@ def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, dela
     flat = is_flat(value, rate)
     falling = jnp.where(flat, 0.5 * (rate + rate_ahead), rate)
     true = jnp.where(zero, falling * arrival.span < -band, value < 0)
-    was_armed = (instant.state.armed > 0) & ~here
+    was_armed = ((instant.state.armed > 0) & ~here) | (turns_back & (event >= c))
     # What this event made true happens next. What was to happen does so, though a state starts anew: unless what was
     # assigned makes its condition false, or it is revocable and undone.
     stands = left[c:] & ~np.array(problem.revocable[c:], bool) & reached

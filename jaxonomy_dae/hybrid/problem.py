@@ -26,6 +26,7 @@ class AbstractHybridProblem(eqx.Module):
     noted: eqx.AbstractVar[tuple[bool, ...]]  # which are counted and listed
     revocable: eqx.AbstractVar[tuple[bool, ...]]  # which another event may undo before they happen
     relations: eqx.AbstractVar[tuple[bool, ...]]  # which say what a relation is, from the initial time on
+    opposite: eqx.AbstractVar[tuple[int, ...]]  # of each guard: the one that falls where its relation turns back, or −1
     resolution: eqx.AbstractVar[Any]  # a time that is nothing beside the run, but more than rounding
 
     @abc.abstractmethod
@@ -90,8 +91,9 @@ class HybridState(eqx.Module):
     - `count`, `times`, `which`, `rate`: how many events there were, and of the first ones the time, the number of the
         event and how fast its guard fell.
     - `before`, `after`: (x, q) at the times of the first events, on both sides; no rows if they are not asked for.
-    - `ended`: 1.0 once an event has ended the run; `stuck`: 1.0 once one happens again and again at one instant.
-    - `turns`, `turned`: how often relations have turned without time going on, and which one did last.
+    - `ended`: 1.0 once an event has ended the run; `stuck`: the number of one that happens again and again at one
+        instant, else −1.
+    - `turns`: how often relations have turned without time going on.
     """
 
     x: Float[Array, " n"]
@@ -109,7 +111,6 @@ class HybridState(eqx.Module):
     ended: Float[Array, ""]
     stuck: Float[Array, ""]
     turns: Float[Array, ""]
-    turned: Float[Array, ""]
     before: Float[Array, "rows m"]
     after: Float[Array, "rows m"]
 

@@ -7,6 +7,10 @@ leaving zero on the wrong side. What is zero is so up to rounding only, so that 
     ABOVE   falls where it reaches zero,
     RESTS   inside the band, falls where it leaves the band below, is above once it leaves the band above,
     BELOW   does not fall; is above once it leaves the band above.
+
+A relation has two guards, each the other's negative, for it turns both ways. Where one of them falls the other one is
+at zero, and would be so within the band only: it is armed by the fall of the first, and falls at once if the equations
+lead back.
 """
 
 from typing import Any

@@ -25,8 +25,6 @@ LOOKS = np.array([0.0, 0.13, 0.31, 0.5, 0.67, 0.86, 1.0])
 FITTED = [0, 3, 6]
 BEND = 0.1
 FORGOTTEN = 0.8  # what a step leaves of how long steps have been: next to events they are short
-# How often relations may turn while time does not go on, beside so often for each. Beyond, they turn back and forth.
-SLIDES, TURNS = 64, 4
 MOVED = 1e3  # times the resolution: a step so long goes on
 
 TOO_MANY: Any = diffrax.RESULTS.max_steps_rejected  # events
@@ -157,8 +155,7 @@ class WithEvents(diffrax.AbstractWrappedSolver):
         finite = jnp.all(jnp.isfinite(y1.x)) & jnp.all(jnp.isfinite(y1.q))
         result = diffrax.RESULTS.where(fired & ~finite & jnp.all(jnp.isfinite(x1)), NOT_FINITE, result)
         result = diffrax.RESULTS.where(y1.count > self.max_events, TOO_MANY, result)
-        slides = y1.turns > SLIDES + TURNS * sum(problem.relations)
-        result = diffrax.RESULTS.where(((y1.stuck > 0) | slides) & (y1.ended == 0), STUCK, result)
+        result = diffrax.RESULTS.where((y1.stuck >= 0) & (y1.ended == 0), STUCK, result)
         return y1, y_error, dense_info, (inner_state, fired), result
 
 

@@ -43,8 +43,8 @@ def start(
     rows = jnp.full((logged if sides else 0, len(x0) + len(q0)), jnp.nan, dtype)
     state = HybridState(
         x0, q0, armed, size, nothing, jnp.asarray(jnp.inf, dtype), ticks, lax.stop_gradient(problem.due(ticks)),
-        nothing, infinite, jnp.full_like(infinite, -1.0), jnp.zeros_like(infinite), nothing, nothing, nothing,
-        nothing - 1.0, rows, rows,
+        nothing, infinite, jnp.full_like(infinite, -1.0), jnp.zeros_like(infinite), nothing, nothing - 1.0, nothing,
+        rows, rows,
     )  # fmt: skip
     at_once = np.array(problem.immediate[c:], bool) & ~relations[c:]
     if relations[:c].all() and not at_once.any():

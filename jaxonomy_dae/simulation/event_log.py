@@ -24,8 +24,7 @@ class EventLog(eqx.Module):
     which: Float[Array, "*batch events"]
     transversality: Float[Array, "*batch events"]
     count: Float[Array, "*batch"]
-    turns: Float[Array, "*batch"]
-    turned: Float[Array, "*batch"]
+    stuck: Float[Array, "*batch"]
     before: Float[Array, "*batch rows m"]
     after: Float[Array, "*batch rows m"]
 
@@ -33,12 +32,12 @@ class EventLog(eqx.Module):
     def empty(cls, batch: tuple[int, ...], m: int, dtype: Any) -> "EventLog":
         """The log of runs of a model without events."""
         none, rows = jnp.zeros((*batch, 0), dtype), jnp.zeros((*batch, 0, m), dtype)
-        return cls(none, none, none, jnp.zeros(batch, dtype), rows, rows)
+        return cls(none, none, none, jnp.zeros(batch, dtype), jnp.full(batch, -1.0, dtype), rows, rows)
 
     @classmethod
     def of(cls, state: HybridState) -> "EventLog":
         """The log in the last state of a run."""
-        frozen = jax.lax.stop_gradient((state.which, jnp.abs(state.rate), state.count, state.turns, state.turned))
+        frozen = jax.lax.stop_gradient((state.which, jnp.abs(state.rate), state.count, state.stuck))
         return cls(state.times, *frozen, state.before, state.after)
 
 

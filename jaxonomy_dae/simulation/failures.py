@@ -35,16 +35,12 @@ def raised(x: Any, result: Any, has_events: bool, max_steps: int, max_events: in
     """x, or an error while running: for traced runs, of which no more than a code is known."""
     codes = diffrax.RESULTS
     lost = "nonlinear blocks have no solution there, or the start is not consistent"
-    many = (
-        f"more than max_events={max_events} events, or relations that turn back at once"
-        if has_events
-        else "too many rejected steps"
-    )
+    many = f"more than max_events={max_events} events" if has_events else "too many rejected steps"
     texts = [
         (codes.max_steps_reached, f"max_steps={max_steps} was reached"),
         (codes.dt_min_reached, "no step was short enough to be accepted"),
         (TOO_MANY, many),
-        (STUCK, "an event happens again and again at one instant"),
+        (STUCK, "an event happens, or a relation turns, again and again at one instant"),
         (SINGULAR_CHOICE, "the states have become a singular choice"),
         (codes.nonlinear_divergence, f"{lost}, or an event wrote a value that is not finite" if has_events else lost),
     ]
@@ -63,16 +59,18 @@ def explain(
     t1: Any,
     implicit: bool,
     max_steps: int,
+    max_events: int,
     rtol: Any,
     atol: Any,
 ) -> str:
     """Why the integration from `first` to t1 stopped at its last accepted point (t, x), and what to do."""
     system, inputs = solution.system, solution.inputs
     (t0, _), (t, x) = first, last
-    if solution.event_log is not None and solution.result == TOO_MANY:
-        return _too_many_events(solution.events, float(t))
-    if solution.event_log is not None and solution.result == STUCK:
-        return _stuck(solution.events, float(t))
+    log = solution.event_log
+    if log is not None and solution.result == TOO_MANY:
+        return _too_many_events(solution.events, max_events, float(t))
+    if log is not None and solution.result == STUCK:
+        return _stuck(solution, int(log.stuck), float(t))
     written = _written_not_finite(system, x)
     if written:
         return f"the integration stopped at t={float(t):g}: an event gave {written} a value that is not finite" + (
@@ -142,14 +140,14 @@ def _written_not_finite(system: AcausalSystem, x: Any) -> str:
     return ", ".join(repr(name) for name, value in pairs if not np.isfinite(value))
 
 
-def _too_many_events(events: Events, t: float) -> str:
+def _too_many_events(events: Events, max_events: int, t: float) -> str:
     """Which event happens again and again, and towards which time."""
     which = np.asarray(events.which, int)
     counts = np.bincount(which[which >= 0], minlength=len(events.all_names))
     most = int(np.argmax(counts))
     times = np.asarray(events.ts)[which == most]
     text = (
-        f"more than max_events={len(which)} events by t={t:.6g}, {counts[most]} of them '{events.all_names[most]}'. "
+        f"more than max_events={max_events} events by t={t:.6g}, {counts[most]} of them '{events.all_names[most]}'. "
         "Give a larger max_events if they are meant"
     )
     accumulate = _accumulation(times)
@@ -164,12 +162,14 @@ def _too_many_events(events: Events, t: float) -> str:
     return f"{text}."
 
 
-def _stuck(events: Events, t: float) -> str:
-    """Which event happens again and again at one instant, and how it came to that."""
-    which = np.asarray(events.which, int)
-    last = int(which[which >= 0][-1])
-    text = f"the integration stopped at t={t:.6g}: '{events.all_names[last]}' would happen again and again there"
-    accumulate = _accumulation(np.asarray(events.ts)[which == last][:-1])  # the last one may have begun at rest
+def _stuck(solution: Solution, event: int, t: float) -> str:
+    """How it came that an event happens, or a relation turns, again and again at one instant."""
+    table: Any = solution.system.plan.events
+    if table.table.relation[event]:
+        return _sliding(table.names[event], t)
+    text = f"the integration stopped at t={t:.6g}: '{table.names[event]}' would happen again and again there"
+    times = np.asarray(solution.events.ts)[np.asarray(solution.events.which, int) == event]
+    accumulate = _accumulation(times[:-1])  # the last one may have begun at rest
     if accumulate:
         return f"{text}: {accumulate}. {REST}"
     return (
@@ -202,10 +202,9 @@ def _of_kinks(system: AcausalSystem) -> str:
     )
 
 
-def _sliding(system: AcausalSystem, event: int, t: float) -> str:
-    """Which relation turns again and again at one instant."""
-    table: Any = system.plan.events
-    where, _, condition = table.names[event].partition(": when(")
+def _sliding(name: str, t: float) -> str:
+    """What to write instead of a relation that turns again and again at one instant."""
+    where, _, condition = name.partition(": when(")
     return (
         f"the integration stopped at t={t:.6g}: the solution stays where '{condition[:-1]}' of component '{where}' "
         "turns. On either side of it the equations lead back, at once. Say what holds there: with self.either and a "

@@ -6,9 +6,11 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from ..hybrid.control import EventControl
 from ..hybrid.problem import AbstractHybridProblem
+from ..model.tables import EventTable
 from ..solvers.switching import Watch
 from ..system.system import AcausalSystem
 from ..system.system_at import SystemAt
@@ -37,6 +39,7 @@ class SystemProblem(AbstractHybridProblem):
     noted: tuple[bool, ...] = eqx.field(static=True)
     revocable: tuple[bool, ...] = eqx.field(static=True)
     relations: tuple[bool, ...] = eqx.field(static=True)
+    opposite: tuple[int, ...] = eqx.field(static=True)
 
     def term(self, q):
         return term_of(self.system.holding(q), self.implicit)
@@ -144,7 +147,23 @@ def problem_for(
         noted=events.table.noted,
         revocable=events.table.revocable,
         relations=events.table.relation,
+        opposite=_opposite(events.table, events.n_clocks),
     )  # fmt: skip
+
+
+def _opposite(table: EventTable, n_clocks: int) -> tuple[int, ...]:
+    """Of each guard that says what a relation is, the guard that says the opposite of the same discrete value; −1 for
+    others."""
+    opposite = np.full(len(table) - n_clocks, -1)
+    other: dict[int, int] = {}
+    for event, discrete in zip(table.event.tolist(), table.discrete.tolist(), strict=True):
+        if not table.relation[event] or event < n_clocks:
+            continue
+        guard = event - n_clocks
+        if discrete in other:
+            opposite[[guard, other[discrete]]] = other[discrete], guard
+        other[discrete] = guard
+    return tuple(opposite.tolist())
 
 
 def with_event_control(controller: Any) -> Any:

@@ -209,7 +209,7 @@ def simulate(
             raise InitializationError(mode)
         if outcome.held is not None:
             solution = eqx.tree_at(lambda s: s.system, solution, system.holding(outcome.held))
-        text = explain(solution, first, outcome.last, t1, is_implicit(solver), max_steps, rtol, atol)
+        text = explain(solution, first, outcome.last, t1, is_implicit(solver), max_steps, most_events, rtol, atol)
         raise SimulationError(text)
     return solution
 
