@@ -35,7 +35,7 @@ def start(
     if relations.any():
         due = problem.due(ticks) <= t0 + tolerance
         q0 = _with_relations(problem, t0, x0, q0, due, args)
-        ticks = ticks + lax.stop_gradient(due & relations[:c])
+        ticks = ticks + (due & relations[:c]).astype(dtype)
     if g:
         rate, holding, value = _conditions(problem, t0, x0, q0, args)
         size = jnp.abs(value)

@@ -370,7 +370,9 @@ def test_nothing_falls_through_a_floor():
             np.testing.assert_array_equal(finite, ts < end)
             assert (ran.x[finite, 0] >= floor * ts[finite] - 1e-9).all()
             n = min(6, int(ran.count))
-            np.testing.assert_allclose(ran.times[:n], bounces[:n], rtol=1e-9)
+            # A height that is right to 1e-10 gives times that are right to that by the speed.
+            allowed = 1e-9 + 1e-10 / (np.sqrt(floor**2 + 2 * G) * e ** np.arange(n))
+            assert (np.abs(ran.times[:n] - bounces[:n]) <= allowed).all()
 
 
 def accumulating(e, floor):
