@@ -11,7 +11,7 @@ from jax import lax
 
 from ..adjoint.closure_conversion import any_member
 from ..adjoint.resting import still
-from .event_map import CLOSE, Arrival, handle
+from .event_map import AHEAD, CLOSE, Arrival, handle
 from .problem import HybridState
 from .search import first_crossing
 from .side import ABOVE, BELOW, RESTS, rounding
@@ -195,7 +195,9 @@ def _looked_at(problem, dense, t0, t1, y0: HybridState, x1, args):
     def at_end():
         before = slope()
         _, rate = problem.rates(t1, x1, q, args, before)
-        return before, (rate < 0) & (jnp.abs(last) <= -rate * window)
+        # A step that was to end at zero does so up to rounding in what the guard is the difference of.
+        rounded = jnp.minimum(band, -rate * (AHEAD * span))
+        return before, (rate < 0) & (jnp.abs(last) <= jnp.maximum(-rate * window, rounded))
 
     short = h <= 4 * problem.resolution
     doubtful = jnp.any(armed[-1] & (last <= CLOSE * size)) | jnp.any(ticking) | short
