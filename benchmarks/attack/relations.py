@@ -1,5 +1,5 @@
 """Models with one to six relations of time and state inside their equations, against SciPy's DOP853 stopped and started
-anew wherever one turns; derivatives against extrapolated differences of that.
+anew wherever one turns, at the default tolerances; every other model its derivatives against extrapolated differences.
 
 Relations stand in rates, in series of blocks, in implicit laws and in arrays of components. Each law is drawn twice: as
 it is `written` in a model, and `solved`, with a symbol r that is 1 or 0 in the place of each relation.
@@ -125,7 +125,8 @@ def _signal(d: Draft) -> Law:
         size = sympy.sqrt(3 * k)
         root = 2 / size * sympy.sinh(sympy.asinh(1.5 * size * mixed) / 3)
         return d.reading(lambda y: y + k * y**3 - mixed, root)
-    root = sign(mixed) * (sympy.sqrt(1 + 4 * k * Abs(mixed)) - 1) / (2 * k)  # y + k·y·|y| = u: smooth where it turns
+    # y + k·y·|y| = u, smooth where it turns. Placeholders are not known to be real: |u| is √u².
+    root = 2 * mixed / (1 + sympy.sqrt(1 + 4 * k * sympy.sqrt(mixed**2)))
     return d.reading(lambda y: y + k * y * Abs(y) - mixed, root)
 
 
@@ -295,12 +296,12 @@ def make(seed: int) -> Case:
         if not 1 <= len(d.relations) + len(d.cells.get("a", ())) <= MOST:
             continue
         try:
-            return _case(rng, d)
+            return _case(rng, d, bool(seed % 2))
         except Delicate:
             continue
 
 
-def _case(rng: np.random.Generator, d: Draft) -> Case:
+def _case(rng: np.random.Generator, d: Draft, differentiated: bool) -> Case:
     ts = np.sort(rng.uniform(0.05, 1.0, 10)) * d.end
     ts[-1] = d.end
     instants, found = _solved(d, d.values, ts)
@@ -320,10 +321,9 @@ def _case(rng: np.random.Generator, d: Draft) -> Case:
     if d.cells:
         diagram.add_array(ev, "cell", Cell, len(d.cells["a"]), **{k: np.array(v) for k, v in d.cells.items()})
     called = {s: s.name if s.name.startswith("cell[") else f"sys.{s.name}" for s in found}
-    motion = Motion(
-        ts, {called[s]: v for s, v in found.items()}, {called[s]: TRAJECTORY * size[s] for s in found}, 1e-6, 1e-8
-    )
-    slopes = _slopes(rng, d, ts, found, called, len(instants))
+    values, allowed = {called[s]: v for s, v in found.items()}, {called[s]: TRAJECTORY * size[s] for s in found}
+    motion = Motion(ts, values, allowed, *((1e-9, 1e-11) if differentiated else (1e-6, 1e-8)))
+    slopes = _slopes(rng, d, ts, found, called, len(instants)) if differentiated else None
     count = len(d.relations) + len(d.cells.get("a", ()))
     note = f"{len(system.states)} states, {count} relations, {len(instants) - 1} instants"
     return Case(ev, diagram, {}, {}, motion=motion, slopes=slopes, always_moves=True, note=note)
@@ -356,4 +356,4 @@ def _slopes(rng, d: Draft, ts, found, called, instants: int) -> Slopes | None:
     size = max(terms, *(abs(v) * sizes[p] for p, v in by.items()))
     true = {f"sys.{p.name}": Expected(v, DERIVATIVE * size / sizes[p]) for p, v in by.items()}
     shown = {called[s]: w for s, w in weights.items()}
-    return Slopes(shown, Expected(value, DERIVATIVE * size), true, {}, rtol=1e-9, atol=1e-11)
+    return Slopes(shown, Expected(value, DERIVATIVE * size), true, {})
