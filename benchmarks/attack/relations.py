@@ -19,6 +19,7 @@ from .case import Case, Expected, Motion, Slopes, names
 from .hybrid import APART, Delicate, HybridSystem, Reference, T
 
 MOST = 6  # relations
+SMALL = 3  # states and relations of what is differentiated: three programs are compiled, in 30 s
 TRAJECTORY = 50e-6  # of a variable's size, at the default tolerances: fifty times rtol
 DERIVATIVE = 1e-6  # of the largest derivative, each multiplied by the size of its parameter
 STEP = 5e-4  # relative; the error of extrapolated differences is of its fourth power
@@ -293,10 +294,13 @@ def make(seed: int) -> Case:
     rng = np.random.default_rng([seed, 12])
     while True:
         d = _draw(rng)
-        if not 1 <= len(d.relations) + len(d.cells.get("a", ())) <= MOST:
+        cells, differentiated = len(d.cells.get("a", ())), bool(seed % 2)
+        if not 1 <= len(d.relations) + cells <= (SMALL if differentiated else MOST):
+            continue
+        if differentiated and len(d.states) + cells > SMALL:
             continue
         try:
-            return _case(rng, d, bool(seed % 2))
+            return _case(rng, d, differentiated)
         except Delicate:
             continue
 
