@@ -359,7 +359,10 @@ def _with_marks(residual: sympy.Expr) -> sympy.Expr:
     for e in kinks:
         alone = not any(inner in kinks for inner in _inside_out([e]) if inner is not e)
         parts = _two_branches(e) if alone else None
-        if parts is not None and _meet_smoothly(residual.xreplace({e: parts[0]}) - residual.xreplace({e: parts[1]}), parts[2]):
+        if parts is None:
+            continue
+        one, other, where = parts
+        if _meet_smoothly(residual.xreplace({e: one}) - residual.xreplace({e: other}), where):
             marks[e] = Smooth(e)
     return residual.xreplace(marks)
 

@@ -77,8 +77,10 @@ class SystemProblem(AbstractHybridProblem):
         assigns = table.discrete >= 0
         values = self.system.around_event(t, q, q, args).event_values(x)[assigns]
         # More than one event may write a value, but then the same.
-        new = jnp.full_like(q, -jnp.inf).at[table.discrete[assigns]].max(
-            jnp.where(events[table.event[assigns]], values, -jnp.inf)
+        new = (
+            jnp.full_like(q, -jnp.inf)
+            .at[table.discrete[assigns]]
+            .max(jnp.where(events[table.event[assigns]], values, -jnp.inf))
         )
         return jnp.where(new > -jnp.inf, new, q)
 
