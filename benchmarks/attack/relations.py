@@ -53,9 +53,9 @@ class Cell(Component):
 
     def __init__(self, ev: EqnEnv, name: str, a: float, b: float, level: float, w: float):
         super().__init__(ev, name)
-        a, b, level, w = (self.parameter(n, v) for n, v in dict(a=a, b=b, level=level, w=w).items())
+        decay, slope, kink, pace = (self.parameter(n, v) for n, v in dict(a=a, b=b, level=level, w=w).items())
         x = self.variable("x", start=0.1, fixed=True)
-        self.add_equations(der(x) + a * x - b * Max(x - level, 0) - sin(w * ev.t))
+        self.add_equations(der(x) + decay * x - slope * Max(x - kink, 0) - sin(pace * ev.t))
 
 
 @dataclasses.dataclass
@@ -257,14 +257,14 @@ def _reference(d: Draft, values: Mapping[Symbol, float]) -> tuple[HybridSystem, 
     """The system that SciPy solves, with these values of the parameters; and what the readings are."""
     number = {p: Float(v, 17) for p, v in values.items()}
     rates = {x: law.solved.xreplace(number) for x, law in d.rates.items()}
-    relations = {r: g.xreplace(number) for r, g in d.relations.items()}
+    relations: dict[Symbol, Any] = {r: g.xreplace(number) for r, g in d.relations.items()}
     states = dict(d.states)
     for k in range(len(d.cells.get("a", ()))):
         a, b, level, w = (d.cells[n][k] for n in ("a", "b", "level", "w"))
         x, r = Symbol(f"cell[{k}].x"), Symbol(f"cell[{k}]")
         states[x], relations[r] = 0.1, x - level
         rates[x] = -a * x + b * r * (x - level) + sin(w * T)
-    readings = {y: solved.xreplace(number) for y, solved in d.readings.items()}
+    readings: dict[Symbol, Any] = {y: solved.xreplace(number) for y, solved in d.readings.items()}
     return HybridSystem(states, {}, relations, rates, {}, [], []), readings
 
 
@@ -275,7 +275,8 @@ def _solved(d: Draft, values: Mapping[Symbol, float], ts: np.ndarray, starts=Non
     run = reference.run(d.end, starts)
     found = reference.read(run, ts)
     begins = np.array([begin for begin, *_ in run.segments])
-    evaluate = reference._compiled([*readings.values(), *(u.xreplace(values) for u, *_ in d.bounds)])
+    bounded: list[Any] = [u.xreplace(values) for u, *_ in d.bounds]
+    evaluate = reference._compiled([*readings.values(), *bounded])
     rows = []
     for t in np.concatenate([ts, np.linspace(0.0, d.end, 200)]):
         _, sol, q, r = run.segments[int(np.searchsorted(begins, t, side="right")) - 1]
