@@ -66,16 +66,13 @@ class Motion:
 @dataclasses.dataclass(frozen=True)
 class Slopes:
     """The true derivatives of Σ weights[name]·values(name) over the motion's times: by `parameters` and by the values
-    `initial` of the case, by name; by all weights of the networks in `learned`, by their number. At tolerances of their
-    own, if given: the motion is then compared at its own."""
+    `initial` of the case, by name; by all weights of the networks in `learned`, by their number."""
 
     weights: Mapping[str, np.ndarray]
     value: Expected
     parameters: Mapping[str, Expected]
     initial: Mapping[str, Expected]
     learned: Mapping[str, Sequence[Expected]] = dataclasses.field(default_factory=dict)
-    rtol: float | None = None
-    atol: float | None = None
 
 
 def diagram_of(rng: np.random.Generator, parts: Sequence[Component], nodes: Sequence[Sequence[Any]]) -> AcausalDiagram:

@@ -75,10 +75,7 @@ def _judge(case: Case, moving: bool, start: float) -> Outcome:
         system = AcausalCompiler(case.ev, case.diagram)()
         offs = [_at_the_start(system, case)] if case.expected or case.refusal is not None else []
         if case.motion is not None and (moving or case.always_moves):
-            if case.slopes is None or case.slopes.rtol is not None:
-                offs.append(_moved(system, case))
-            if case.slopes is not None:
-                offs.append(_differentiated(system, case))
+            offs.append(_moved(system, case) if case.slopes is None else _differentiated(system, case))
     except (ModelError, InitializationError, SimulationError) as error:
         text = f"{type(error).__name__}: {error}"
         is_true = any(re.search(word, text) for word in (*(case.refusal or ()), *case.may_refuse))
@@ -144,8 +141,6 @@ def _differentiated(system, case: Case) -> tuple[float, str]:
     direction in which every part counts as much as its error is allowed."""
     motion, slopes = case.motion, case.slopes
     assert motion is not None and slopes is not None
-    rtol = motion.rtol if slopes.rtol is None else slopes.rtol
-    atol = motion.atol if slopes.atol is None else slopes.atol
     trainable, frozen = system.partition(*slopes.learned)
     arrays, static = eqx.partition(frozen, eqx.is_array)
     given = (
@@ -160,7 +155,7 @@ def _differentiated(system, case: Case) -> tuple[float, str]:
         whole = eqx.combine(trainable, arrays, static).with_parameters(parameters)
         solution = simulate(
             whole, float(motion.ts[-1]), ts=motion.ts, initial={**case.initial, **initial}, adjoint=adjoint,
-            solver=diffrax.Tsit5(), rtol=rtol, atol=atol,
+            solver=diffrax.Tsit5(), rtol=motion.rtol, atol=motion.atol,
         )  # fmt: skip
         return sum(jnp.vdot(jnp.asarray(w), solution[name]) for name, w in slopes.weights.items())
 

@@ -200,7 +200,7 @@ def _statements(component: Component, unit_of: UnitOf) -> Iterator[Statement]:
     for when in component.events:
         if isinstance(when.clock, Sampled) and when.noted:
             for what, value in (("period", when.clock.period), ("offset", when.clock.offset)):
-                if _symbolic(value) is not None:
+                if value is not None and _symbolic(value) is not None:
                     yield _given(f"the {what} of {when.text} = {shortened(value)}", f"a {what}", value, SECOND)
     for account in component.accounts:
         text = f"the {account.kind} {shortened(account.expression)}"

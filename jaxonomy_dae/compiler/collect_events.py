@@ -39,9 +39,7 @@ def event_table(model: ModelNumbers) -> EventTable:
             known[key] = model.parameter(i, path)
         return int(known[key][row])
 
-    def in_parameters(i: Instances, row: int, expression: Any) -> Start | None:
-        if expression is None:
-            return None
+    def in_parameters(i: Instances, row: int, expression: Any) -> Start:
         symbols: list[Any] = sorted(expression.free_symbols, key=lambda s: parameter(i, s.path, row))
         graph = read_expression(expression, model.paths[i.number[row]])
         return Start(canonical(graph, (), symbols), tuple(parameter(i, s.path, row) for s in symbols))
@@ -68,7 +66,8 @@ def event_table(model: ModelNumbers) -> EventTable:
     return EventTable(
         tuple(f"{model.paths[k]}: when({when.text})" for k, *_, when in found),
         np.array([-1 if w.guard is None else variable(i, w.guard, row) for _, _, i, row, w in found], np.int64),
-        tuple((in_parameters(i, row, w.clock.period), in_parameters(i, row, w.clock.offset))
+        tuple((None if w.clock.period is None else in_parameters(i, row, w.clock.period),
+               in_parameters(i, row, w.clock.offset))
               for _, _, i, row, w in found if w.clock is not None),
         tuple(next((a.message for a in w.actions if isinstance(a, Terminate)), None) for w in whens),
         tuple(when.noted for when in whens),

@@ -62,13 +62,14 @@ def _compared(
     guard = guard[guard != ZERO]
     parameters, quantities = [own], [guard]
     for step in steps:
-        if not isinstance(step, Step) or len(step.unknown) > 1:
+        if not isinstance(step, Step) or len(step.unknown) != 1:
             continue
-        here = np.isin(step.unknown[0], guard)
+        (unknown,) = step.unknown
+        here = np.isin(unknown, guard)
         if not here.any():
             continue
-        place = np.full(max(int(guard.max()), int(step.unknown[0].max())) + 1, -1, np.int64)
-        place[step.unknown[0]] = np.arange(step.n)
+        place = np.full(max(int(guard.max()), int(unknown.max())) + 1, -1, np.int64)
+        place[unknown] = np.arange(step.n)
         found = place[guard]
         for slot in step.equations[0].slots:
             parameters.append(own[found >= 0])

@@ -361,10 +361,12 @@ def _with_marks(residual: sympy.Expr) -> sympy.Expr:
         parts = _two_branches(e) if alone else None
         if parts is None:
             continue
-        above, below, surface = parts
-        if _meet_smoothly(residual.xreplace({e: above}) - residual.xreplace({e: below}), surface):
+        one, other, where = parts
+        whole: Any = residual
+        if _meet_smoothly(whole.xreplace({e: one}) - whole.xreplace({e: other}), where):
             marks[e] = Smooth(e)
-    return residual.xreplace(marks)
+    out: Any = residual.xreplace(marks)
+    return out
 
 
 def _two_branches(e: Any) -> tuple[Any, Any, Any] | None:
@@ -374,11 +376,13 @@ def _two_branches(e: Any) -> tuple[Any, Any, Any] | None:
     if isinstance(e, sympy.sign | sympy.Heaviside):
         return sympy.Integer(1), sympy.Integer(-1 if isinstance(e, sympy.sign) else 0), e.args[0]
     if isinstance(e, sympy.Max | sympy.Min) and len(e.args) == 2:
-        return *e.args, e.args[0] - e.args[1]
+        a, b = _untyped(e)
+        return a, b, a - b
     if isinstance(e, sympy.Piecewise) and len(e.args) == 2:
-        (first, condition), (second, otherwise) = e.args
+        (first, condition), (second, otherwise) = _pairs(e)
         if otherwise == True and isinstance(condition, sympy.core.relational._Inequality):  # noqa: E712
-            return first, second, condition.lhs - condition.rhs
+            left, right = _untyped(condition)
+            return first, second, left - right
     return None
 
 
@@ -413,11 +417,21 @@ def _inside_out(roots: Sequence[Any]) -> list[Any]:
     return out
 
 
+def _untyped(e: Any) -> tuple[Any, ...]:
+    """The arguments of an expression, which SymPy declares as less than they are."""
+    return e.args
+
+
+def _pairs(e: Any) -> tuple[tuple[Any, Any], ...]:
+    """The branches of a `Piecewise` with their conditions."""
+    return e.args
+
+
 def _arguments(e: Any) -> list[Any]:
     if isinstance(e, Smooth):
         return []
     if isinstance(e, sympy.Piecewise):
-        return [branch for branch, _ in e.args]
+        return [branch for branch, _ in _pairs(e)]
     try:
         return list(parts_of(e))
     except UnsupportedExpression:  # refused when the equation is read
@@ -428,7 +442,7 @@ def _varying(order: list[Any]) -> set[Any]:
     """The parts that are not the same at all times."""
     out: set[Any] = set()
     for e in order:
-        conditions = (c for _, c in e.args) if isinstance(e, sympy.Piecewise) else ()
+        conditions = (c for _, c in _pairs(e)) if isinstance(e, sympy.Piecewise) else ()
         if _moves(e) or any(a in out for a in _arguments(e)) or any(_varies(c) for c in conditions):
             out.add(e)
     return out
@@ -463,7 +477,7 @@ def _needed_where(roots: Sequence[Any], order: list[Any]) -> dict[Any, Needed]:
             for a in _arguments(e):
                 needed[a] = union(needed[a], here)
             continue
-        for branch, condition in e.args:
+        for branch, condition in _pairs(e):
             taken = here
             if condition is not sympy.true:
                 taken, here = within(here, (condition, True)), within(here, (condition, False))

@@ -42,7 +42,8 @@ def edges_of(relation: Any) -> Edges | None:
     if isinstance(head, TimeSymbol):
         return Edges(((Sampled(None, level), _after(truth)),), _nonzero(slope))
     if isinstance(head, sympy.sin | sympy.cos):
-        angle = head.args[0] + (sympy.pi / 2 if isinstance(head, sympy.cos) else 0)
+        inside: Any = head.args[0]
+        angle = inside + (sympy.pi / 2 if isinstance(head, sympy.cos) else 0)
         frequency, instant = _affine(angle)
         if frequency is None:
             return None
@@ -106,11 +107,16 @@ def relations_in(condition: Any) -> list[Any]:
     return [condition] if isinstance(condition, sympy.core.relational.Relational) else []
 
 
+def _sides(relation: Any) -> tuple[Any, Any]:
+    return relation.args
+
+
 def _in_time(relation: Any) -> tuple[Any, Any, Any] | None:
     """(slope, head, level) of an ordering between head and level, multiplied by the slope."""
     if not isinstance(relation, _ORDERED) or not _in_parameters(relation):
         return None
-    found = _with_one_head(relation.lhs - relation.rhs)
+    left, right = _sides(relation)
+    found = _with_one_head(left - right)
     if found is None or found[1] is None:
         return None
     slope, head, rest = found

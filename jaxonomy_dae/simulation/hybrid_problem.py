@@ -73,7 +73,8 @@ class SystemProblem(AbstractHybridProblem):
         return jnp.where(done, self.admitted(t, x, q, args), jnp.nan), q
 
     def settled(self, t, x, q, events, args):
-        table: Any = self.system.plan.events.table
+        events_of: Any = self.system.plan.events
+        table = events_of.table
         assigns = table.discrete >= 0
         values = self.system.around_event(t, q, q, args).event_values(x)[assigns]
         # More than one event may write a value, but then the same.
