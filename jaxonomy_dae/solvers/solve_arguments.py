@@ -24,7 +24,8 @@ def check_finite(**numbers: Any) -> None:
 
 def check_longest_step(dtmax: Any) -> None:
     """Refuses a longest step that is not positive."""
-    if dtmax is None or isinstance(dtmax, Tracer) or (not isinstance(dtmax, str) and np.all(dtmax == np.inf)):
+    unbounded = dtmax is None or isinstance(dtmax, Tracer) or (np.shape(dtmax) == () and dtmax == np.inf)
+    if unbounded:
         return
     check_finite(dtmax=dtmax)
     if not dtmax > 0:
