@@ -27,6 +27,7 @@ from jaxonomy_dae import (
 from jaxonomy_dae.modeling import Eq
 
 TIGHT = {"rtol": 1e-10, "atol": 1e-12}
+pytestmark = pytest.mark.long("a run with events, and often its gradient, is compiled for each law")
 
 
 class Oscillator(Component):
