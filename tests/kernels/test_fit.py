@@ -11,7 +11,7 @@ from problems import rc_circuit
 
 from jaxonomy_dae import ModelError
 from jaxonomy_dae.learning import fit, fit_least_squares
-from jaxonomy_dae.learning.bounds import Unbounded
+from jaxonomy_dae.system.bounds import Unbounded
 from jaxonomy_dae.modeling.interval import Interval
 from jaxonomy_dae.solvers import StoredAdjoint
 
