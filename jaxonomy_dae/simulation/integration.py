@@ -68,7 +68,9 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
     admitted = are_admitted(system, inputs)
     system = system.merged()  # so that bounds are looked at once, and not whenever equations are
     if checked:
-        system = eqx.tree_at(lambda s: s.parameters.values, system, eqx.error_if(system.parameters.values, ~admitted, TEXT))
+        system = eqx.tree_at(
+            lambda s: s.parameters.values, system, eqx.error_if(system.parameters.values, ~admitted, TEXT)
+        )
     found = initialize(system, t0, inputs, initial)
     if checked:
         found = check(system, found, t0, inputs, initial, running=True, throw=True)

@@ -40,6 +40,7 @@ def gradient(system):
     return jax.jit(jax.vmap(of_k))
 
 
+@pytest.mark.long("a batch of gradients")
 def test_values_out_of_bounds_are_not_a_number(gradient):
     """k = −3 gave exp(3) inside jit; k = 5 puts the parameter computed from it out of its bounds. One member of a batch
     with NaN made all wait for max_steps rejected steps, and was called `max_steps_reached`."""
@@ -66,7 +67,7 @@ def test_what_a_loss_leaves_out_does_not_reach_its_gradient(system):
 def test_however_values_arrive(system):
     """By `partition`, as in a loop of a user's own with Optax, and put among the leaves by hand."""
     trainable, frozen = system.partition("c.k")
-    updated = optax.apply_updates(trainable, jax.tree.map(lambda leaf: leaf - 3.0, trainable))
+    updated = optax.apply_updates(trainable, jax.tree.map(lambda leaf: jnp.full_like(leaf, -3.0), trainable))
     combined = eqx.combine(updated, frozen)
     by_hand = eqx.tree_at(lambda s: s.parameters.values, system, system.parameters.values - 3.0)
     run = eqx.filter_jit(end)
@@ -86,12 +87,12 @@ def test_an_input_that_stops_being_finite(system):
 
 
 def test_a_loop_of_a_users_own_in_free_numbers(system):
-    """k = 3.5 found by Optax from data, by steps that would leave [0, 10] if they were taken in k."""
+    """k = 0.2 found by Optax from data, by steps that would leave [0, 10] if they were taken in k."""
     optimizer = optax.adam(0.3)
 
     @jax.jit
     def step(free, state):
-        value, slope = jax.value_and_grad(lambda f: (end(system.constrain(f), 0.0)[0] - jnp.exp(-3.5)) ** 2)(free)
+        value, slope = jax.value_and_grad(lambda f: (end(system.constrain(f), 0.0)[0] - jnp.exp(-0.2)) ** 2)(free)
         with jax.numpy_dtype_promotion("standard"):
             updates, state = optimizer.update(slope, state, free)
         return optax.apply_updates(free, updates), state, value
@@ -103,4 +104,4 @@ def test_a_loop_of_a_users_own_in_free_numbers(system):
         free, state, _ = step(free, state)
         seen.append(float(system.constrain(free).parameters["c.k"]))
     assert max(np.abs(np.diff(seen))) > 0.1 and 0.0 < min(seen) and max(seen) < 10.0
-    assert seen[-1] == pytest.approx(3.5, abs=1e-2)
+    assert seen[-1] == pytest.approx(0.2, abs=1e-2)
