@@ -128,7 +128,7 @@ FAULTS = [
         "tests/plants/test_energy.py",
     ),
     Fault(
-        "learning/bounds.py",
+        "system/bounds.py",
         "return i.low + distance if low else i.high - distance",
         "return i.low + distance if low else i.high + distance",
         "tests/kernels/test_fit.py",

@@ -21,8 +21,8 @@ from ..errors import InitializationError, ModelError, SimulationError, SteadySta
 from ..modeling.interval import Interval
 from ..private_names import with_high_cutoff
 from ..programs.cache import compiled
+from ..system.bounds import Unbounded, project
 from ..system.system import AcausalSystem
-from .bounds import Unbounded, project
 
 Model = TypeVar("Model", bound=eqx.Module)
 
@@ -85,7 +85,7 @@ def _with_free(trainable: Any, values: Any) -> Any:
 
 
 def _check_dependents(model: Any) -> None:
-    problem = model.parameters.dependent_problem if isinstance(model, AcausalSystem) else None
+    problem = model.parameters.problem if isinstance(model, AcausalSystem) else None
     if problem is not None:
         warnings.warn(f"{problem}. Bound the parameters it depends on, too", RuntimeWarning, stacklevel=3)
 

@@ -110,12 +110,11 @@ def _check_interval(t0, t1, ts):
 
 
 def check_parameters(system: AcausalSystem):
-    """Raises a `ModelError` that names a parameter or network that is not finite."""
-    values = np.asarray(system.parameters.array)
-    bad = np.flatnonzero(~np.isfinite(values))
-    if len(bad):
-        name = system.parameters.names[bad[0]]
-        raise ModelError(f"parameter '{name}' is not finite: {values[bad[0]]}. Set it with system.with_parameters")
+    """Raises a `ModelError` that names a parameter that is not finite or out of its bounds, or a network with a weight
+    that is not finite."""
+    problem = system.parameters.problem
+    if problem is not None:
+        raise ModelError(problem)
     for name, network in system.neural.items():
         for leaf in jax.tree.leaves(eqx.filter(network, eqx.is_inexact_array)):
             if not np.isfinite(np.asarray(leaf)).all():

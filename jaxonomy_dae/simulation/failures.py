@@ -13,6 +13,7 @@ from ..solvers.choice_guard import SINGULAR_CHOICE
 from ..solvers.failures import SHOWN, explain_failure, how_it_stopped
 from ..system.inputs import value_at
 from ..system.system import AcausalSystem
+from .admitted import NOT_ADMITTED, TEXT
 from .event_log import Events
 from .failed_blocks import failed_block
 from .hybrid_problem import CONSISTENT, RESTART
@@ -41,6 +42,7 @@ def raised(x: Any, result: Any, has_events: bool, max_steps: int, max_events: in
         (codes.dt_min_reached, "no step was short enough to be accepted"),
         (TOO_MANY, many),
         (STUCK, "an event happens, or a relation turns, again and again at one instant"),
+        (NOT_ADMITTED, TEXT),
         (SINGULAR_CHOICE, "the states have become a singular choice"),
         (codes.nonlinear_divergence, f"{lost}, or an event wrote a value that is not finite" if has_events else lost),
     ]

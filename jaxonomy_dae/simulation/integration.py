@@ -18,6 +18,7 @@ from ..programs.cache import compiled
 from ..solvers.drive import integrate, is_implicit, right_between_steps
 from ..solvers.rows import not_a_number, padded
 from ..solvers.switching import STIFF, Watch
+from .admitted import NOT_ADMITTED, TEXT, are_admitted, inputs_are_finite
 from .event_log import EventLog
 from .hybrid_problem import problem_for, with_event_control
 from .preparation import largest_tolerance, prepared, term_of
@@ -64,6 +65,12 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
     """Integrates `(system, t0, t1, ts, inputs, initial)`; `watch` is for Tsit5. With `checked`, an inconsistent start
     and times that do not fit are errors while running."""
     system, t0, t1, ts, inputs, initial = given
+    admitted = are_admitted(system, inputs)
+    system = system.merged()  # so that bounds are looked at once, and not whenever equations are
+    if checked:
+        system = eqx.tree_at(
+            lambda s: s.parameters.values, system, eqx.error_if(system.parameters.values, ~admitted, TEXT)
+        )
     found = initialize(system, t0, inputs, initial)
     if checked:
         found = check(system, found, t0, inputs, initial, running=True, throw=True)
@@ -93,7 +100,7 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
     done = integrate(
         term, solver, t0, t1, dt0, y0, inputs,
         save=save, controller=controller, adjoint=options.adjoint, max_steps=options.max_steps,
-        progress=options.progress, checked=checked,
+        progress=options.progress, checked=checked, goes_on=admitted,
     )  # fmt: skip
     saved, x, last = done.ts, done.ys, done.last
     discrete, events, held = None, None, None
@@ -127,10 +134,13 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
         filled = filled | okay
     else:
         saved = ts
+    consistent = consistent & admitted
     x = not_a_number(x, filled & consistent, x0, system, inputs)
     failure: Any = diffrax.RESULTS.nonlinear_divergence
     result = diffrax.RESULTS.where(okay | ~diffrax.is_okay(done.result), done.result, failure)
     result = diffrax.RESULTS.where(consistent, result, failure)
+    looked_at = diffrax.is_okay(result) | inputs_are_finite(inputs, last[0], t1)
+    result = diffrax.RESULTS.where(admitted & looked_at, result, NOT_ADMITTED)
     stiff = consistent & (done.result == STIFF) if watch is not None else jnp.array(False)
     if discrete is not None:
         discrete = jnp.where((filled & consistent)[:, None], discrete, jnp.nan)

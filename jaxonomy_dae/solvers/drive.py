@@ -55,17 +55,20 @@ def is_multistep(solver: Any) -> bool:
 def integrate(
     term: Any, solver: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, *,
     save: diffrax.SubSaveAt, controller: Any, adjoint: Any, max_steps: int, progress: bool = False,
-    checked: bool = False,
+    checked: bool = False, goes_on: Any = True,
 ) -> Run:  # fmt: skip
     """Integrates, saves what is asked for and the last accepted point, and counts Jacobians.
 
     Where the times do not fit, no row counts as reached, and the result is `BAD_TIMES`; with `checked`, that is an
-    error while running.
+    error while running. Where `goes_on` is false, no step is taken: with numbers that are not finite, all steps would be
+    rejected, up to `max_steps`, and the others of a batch would wait.
     """
     fits = times_fit(t0, t1, save.ts, controller)
     if checked and fits is not True:
         t1 = eqx.error_if(t1, jnp.logical_not(fits), TIMES)
     counted = isinstance(solver, BDF)
+    if goes_on is not True:
+        t1 = jnp.where(goes_on, t1, t0)
     solved: Any = diffeqsolve(
         term, solver, t0, t1, dt0, y0, args, save=save, controller=controller, adjoint=adjoint, max_steps=max_steps,
         throw=False, solver_state=counted,

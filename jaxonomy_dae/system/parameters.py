@@ -3,14 +3,14 @@
 import dataclasses
 import functools
 import html
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..errors import ModelError, nearest
 from ..model.array_names import ArrayNames
@@ -18,6 +18,7 @@ from ..model.dependent_parameters import complete
 from ..model.tables import DependentParameters
 from ..modeling.interval import Interval, closed_ends
 from ..modeling.real_number import real_number
+from .bounds import Ends
 from .sections import HTML_SHOWN, SHOWN
 
 
@@ -95,12 +96,41 @@ class ParameterNames:
         """The least and the greatest admissible value of each parameter."""
         return closed_ends(self.intervals)
 
+    @functools.cached_property
+    def ends(self) -> Ends:
+        """The bounds of each parameter, shape (n,)."""
+        return Ends.of(self.intervals)
+
+    def chosen(self, names: Iterable[str]) -> dict[str, np.ndarray]:
+        """The indices of parameters that can be set, by their names and those of arrays, in the arrays' shapes.
+
+        **Raises:**
+
+        - `ModelError` for an unknown name, one that is computed from others, and one that is given twice.
+        """
+        seen: set[int] = set()
+        out = {}
+        for name in names:
+            entries = self.entries(name)
+            if entries is None:
+                entries = np.array(self.index(name))
+            members = entries.ravel().tolist()
+            if not seen.isdisjoint(members):
+                twice = self.names[min(seen.intersection(members))]
+                raise ModelError(f"parameter '{twice}' is given twice, by its own name and as part of an array")
+            seen.update(members)
+            for k in members:
+                self.settable(self.names[k])
+            out[name] = entries
+        return out
+
 
 class Parameters(eqx.Module):
     """All parameters of a system: `parameters["pend.m"]`; `parameters.array` has shape `(len(parameters),)`.
 
     `free` holds the values of parameters that `AcausalSystem.partition` took apart to be trained; they override the
-    entries of `values` at `free_index`. In a batch of systems, shapes get its axes in front.
+    entries of `values` at `free_index`. Those that lie out of their bounds are read as not-a-number. In a batch of
+    systems, shapes get its axes in front.
     """
 
     values: Float[Array, "*batch n"]
@@ -115,7 +145,8 @@ class Parameters(eqx.Module):
             return self.table.complete(self.values)
         batch = jnp.broadcast_shapes(self.values.shape[:-1], self.free.shape[:-1])
         values = jnp.broadcast_to(self.values, (*batch, self.values.shape[-1]))
-        return self.table.complete(values.at[..., np.array(self.free_index)].set(self.free))
+        chosen = np.array(self.free_index)
+        return self.table.complete(values.at[..., chosen].set(_inside(self.free, self.table.ends.take(chosen))))
 
     @property
     def known(self) -> Float[np.ndarray, " n"] | None:
@@ -190,48 +221,63 @@ class Parameters(eqx.Module):
         **Raises:**
 
         - `ModelError` for an unknown name, a parameter that is an expression in others, or a value of the wrong shape,
-            that is not a finite real number, or is out of the bounds.
+            that is not a finite real number, or is out of the bounds. Traced values out of their bounds become
+            not-a-number.
         """
         if not isinstance(new, Mapping):
             raise ModelError(f"parameters are given by names, {{'m.k': 2.0}}; got {type(new).__name__}")
         array = self.array
         batch = array.shape[:-1]
-        seen: set[int] = set()
-        for name, value in new.items():
-            entries = self.table.entries(name)
-            chosen = {self.table.index(name)} if entries is None else set(entries.ravel().tolist())
-            if seen & chosen:
-                twice = self.table.names[min(seen & chosen)]
-                raise ModelError(f"parameter '{twice}' is given twice, by its own name and as part of an array")
-            seen |= chosen
-            if entries is not None:
+        for name, entries in self.table.chosen(new).items():
+            value = new[name]
+            if entries.ndim:
                 value = np.asarray(value) if isinstance(value, list | tuple) else value
-                checked = jnp.asarray(self._checked_array(name, entries, value, batch), array.dtype)
-                array = array.at[..., entries].set(checked)
-                continue
-            k = self.table.settable(name)
-            array = array.at[..., k].set(jnp.asarray(self._checked(k, value, batch), array.dtype))
+                value = self._checked_array(name, entries, value, batch)
+            else:
+                value = self._checked(int(entries), value, batch)
+            value = jnp.asarray(value, array.dtype)
+            if isinstance(value, Tracer):
+                value = _inside(value, self.table.ends.take(entries))
+            array = array.at[..., entries].set(value)
         array = self.table.complete(array)
+        if isinstance(array, Tracer):
+            chosen = np.array(list(self.table.expressions), np.int64)
+            ends = self.table.ends.take(chosen)
+            array = array if ends.are_none else array.at[..., chosen].set(_inside(array[..., chosen], ends))
         changed = Parameters(array, None, (), self.table)
-        problem = changed.dependent_problem
+        problem = changed.problem
         if problem is not None:
             raise ModelError(problem)
         return changed
 
     @property
-    def dependent_problem(self) -> str | None:
-        """What is wrong with a parameter that is computed from others: not finite, or out of its bounds."""
-        array = self.array
-        chosen = np.array(list(self.table.expressions), np.int64)
-        if not len(chosen) or isinstance(array, Tracer):
+    def are_admitted(self) -> Bool[Array, "*batch"]:
+        """Whether all values are finite and within their bounds."""
+        return jnp.all(self.table.ends.admit(self.array), axis=-1)
+
+    @property
+    def problem(self) -> str | None:
+        """The first parameter that is not finite or out of its bounds, in words; None if all are right, and of values
+        that are not known."""
+        parts = [self.values, self.free] if self.free_index else [self.values]
+        if not all(_is_array(part) and not isinstance(part, Tracer) for part in parts):
             return None
-        values = np.asarray(array)[..., chosen]
-        low, high = self.table.bounds[chosen].T
-        wrong = ~(np.isfinite(values) & (values >= low) & (values <= high)).reshape(-1, len(chosen)).all(axis=0)
-        for k in chosen[wrong].tolist():
-            name, text, interval = self.table.names[k], self.table.expressions[k], self.table.intervals[k]
-            return f"parameter '{name}' is {text} and must lie in {interval}; got {_text(array[..., k])}"
-        return None
+        values = np.array(self.values)
+        if self.free_index:  # as they are given, not as they are read
+            values = np.array(np.broadcast_to(values, (*np.shape(self.free)[:-1], values.shape[-1])))
+            values[..., list(self.free_index)] = self.free
+        values = self.table.complete(values)
+        right = self.table.ends.admit(values)
+        if right.all():
+            return None
+        k = int(np.argmin(right.reshape(-1, right.shape[-1]).all(axis=0)))
+        name, text, interval = self.table.names[k], self.table.expressions.get(k), self.table.intervals[k]
+        found = _text(values[..., k])
+        if text is not None:
+            return f"parameter '{name}' is {text} and must lie in {interval}; got {found}"
+        if not np.isfinite(values[..., k]).all():
+            return f"parameter '{name}' is not finite: {found}. Set it with system.with_parameters"
+        return f"parameter '{name}' must lie in {interval}; got {found}. Set it with system.with_parameters"
 
     def _checked(self, k: int, value: Any, batch: tuple[int, ...]) -> Any:
         name = self.table.names[k]
@@ -257,8 +303,6 @@ class Parameters(eqx.Module):
 
     def _checked_array(self, name: str, entries: np.ndarray, value: Any, batch: tuple[int, ...]) -> Any:
         """The values of an array of parameters: a number for all of them, or an array of their shape."""
-        for k in entries.ravel().tolist():
-            self.table.settable(self.table.names[k])
         shape, where = np.shape(value), f"parameter '{name}'"
         if isinstance(value, str) or shape not in ((), entries.shape, (*batch, *entries.shape)):
             found = repr(value) if isinstance(value, str) else f"shape {shape}"
@@ -313,6 +357,12 @@ class Parameters(eqx.Module):
         shown = [f"{name}={apart.get(k) or _text(array[..., k])}" for k, name in enumerate(self.table.names[:SHOWN])]
         batch = f"batch of shape {array.shape[:-1]}: " if array.ndim > 1 else ""
         return f"Parameters({batch}{_some(shown, len(self))})"
+
+
+def _inside(values: Any, ends: Ends) -> Any:
+    """The values, with not-a-number for those out of their bounds, and so for the derivatives of what reads them."""
+    # A sum: where the result does not count, its cotangent is zero, and derivatives by other values are not touched.
+    return values if ends.are_none else values + jnp.where(ends.admit(values), 0.0, jnp.nan)
 
 
 def _is_array(leaf: Any) -> bool:

@@ -18,6 +18,7 @@ from ..lowering.gather import SCALARS
 from ..lowering.plan import SystemPlan
 from ..model.dependent_parameters import complete
 from ..model.pickling import functions_by_name, named_functions
+from .bounds import constrained, unconstrained
 from .evaluate import Refinement
 from .input_values import missing_input
 from .inputs import read_inputs
@@ -110,28 +111,93 @@ class AcausalSystem(eqx.Module):
 
         **Raises:**
 
-        - `ModelError` for unknown names, values that are not finite or out of bounds.
+        - `ModelError` for unknown names, values that are not finite or out of bounds. Inside jit, grad and vmap, where
+            values are not known, those become not-a-number, and so does all that is computed with them: see `simulate`.
         """
         return eqx.tree_at(lambda s: s.parameters, self, self.parameters.replaced(values))
+
+    def unconstrain(self, *names: str) -> dict[str, Any]:
+        """Parameters as free numbers z, to be trained by steps that know no bounds:
+
+            z = log(x − low),  z = −log(high − x),  z = log((x − low)/(high − x)),  z = x
+
+        for a lower, an upper, two and no bounds. `constrain` turns them back. The numbers are a pytree for Optax:
+
+            free = system.unconstrain("pend.m", "drag")
+            loss = lambda free: jnp.sum(simulate(system.constrain(free), 1.0, ts=ts)["pend.x"] ** 2)
+
+        **Arguments:**
+
+        - `names`: of parameters, of arrays of them, and of networks, whose weights are taken as they are.
+
+        **Returns:**
+
+        By name, the free numbers, in the shapes of the parameters; of a network, its inexact arrays.
+
+        **Raises:**
+
+        - `ModelError` for a name that is neither, for a parameter that is computed from others, and for a value that
+            lies on a bound, to which no number belongs (inside jit, an infinite one).
+        """
+        table = self.parameters.table
+        chosen = table.chosen(self._parameters_among(names))
+        out: dict[str, Any] = {n: eqx.filter(self.neural[n], eqx.is_inexact_array) for n in names if n in self.neural}
+        for name, entries in chosen.items():
+            z = out[name] = unconstrained(self.parameters[name], table.ends.take(entries))
+            if not isinstance(z, Tracer) and not np.isfinite(z).all():
+                places = np.broadcast_to(entries, np.shape(z))[~np.isfinite(z)]
+                one, interval = table.names[places[0]], table.intervals[places[0]]
+                raise ModelError(
+                    f"parameter '{one}' lies on the end of its bounds {interval}, or outside, where no free number "
+                    "belongs to it: start inside, with system.with_parameters, or train by fit or fit_least_squares, "
+                    "which can leave an end and reach it"
+                )
+        return {name: out[name] for name in names}
+
+    def constrain(self, free: Mapping[str, Any]) -> "AcausalSystem":
+        """The system whose parameters are within their bounds what `free`, from `unconstrain`, says: any free number
+        belongs to a value inside, be it traced or not. What it does not name stays as it is.
+
+        **Raises:**
+
+        - `ModelError` for a name that is neither a parameter nor a network, and for wrong shapes.
+        """
+        table = self.parameters.table
+        dtype = self.parameters.values.dtype
+        chosen = table.chosen(self._parameters_among(tuple(free)))
+        values = {name: constrained(jnp.asarray(free[name], dtype), table.ends.take(k)) for name, k in chosen.items()}
+        system = self.with_parameters(values)
+        networks = {n: eqx.combine(free[n], self.neural[n]) for n in free if n in self.neural}
+        return eqx.tree_at(lambda s: s.neural, system, self.neural | networks) if networks else system
+
+    def _parameters_among(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Those names that are not of networks.
+
+        **Raises:**
+
+        - `ModelError` for a name that is neither a network nor a parameter.
+        """
+        chosen = tuple(n for n in dict.fromkeys(names) if n not in self.neural)
+        for name in chosen:
+            if name not in self.parameters:
+                raise ModelError(
+                    f"'{name}' is neither a network nor a parameter: "
+                    + nearest(name, [*self.neural, *self.parameters.names])
+                )
+        return chosen
 
     def partition(self, *names: str) -> tuple["AcausalSystem", "AcausalSystem"]:
         """Separates what is trained: `(trainable, frozen)`, to be joined again by `equinox.combine`.
 
-        `names` are networks (`"drag"`) and parameters (`"pend.m"`).
+        `names` are networks (`"drag"`) and parameters (`"pend.m"`). Parameters are trained as they are: what a step
+        leads out of its bounds becomes not-a-number. `unconstrain` gives numbers that have no bounds.
 
         **Raises:**
 
         - `ModelError` for a name that is neither.
         """
         chosen_networks = {n for n in names if n in self.neural}
-        chosen_parameters = tuple(n for n in dict.fromkeys(names) if n not in self.neural)
-        known = set(self.parameters.names)
-        for name in chosen_parameters:
-            if name not in known and self.parameters.table.entries(name) is None:
-                raise ModelError(
-                    f"'{name}' is neither a network nor a parameter: "
-                    + nearest(name, [*self.neural, *self.parameters.names])
-                )
+        chosen_parameters = self._parameters_among(names)
         system = eqx.tree_at(lambda s: s.parameters, self, self.parameters.freed(chosen_parameters))
         wanted = jax.tree.map(lambda _: False, system)
         if chosen_parameters:

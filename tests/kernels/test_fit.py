@@ -11,9 +11,9 @@ from problems import rc_circuit
 
 from jaxonomy_dae import ModelError
 from jaxonomy_dae.learning import fit, fit_least_squares
-from jaxonomy_dae.learning.bounds import Unbounded
 from jaxonomy_dae.modeling.interval import Interval
 from jaxonomy_dae.solvers import StoredAdjoint
+from jaxonomy_dae.system.bounds import Unbounded
 
 
 class Bowl(eqx.Module):
