@@ -5,10 +5,8 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Float
 
 from ..errors import InitializationError, ModelError, SimulationError, nearest
@@ -21,10 +19,11 @@ from .data import Data, Stacked, stack
 from .estimate import Estimate
 from .experiment import Experiment, Unknown
 from .first_order import adam_steps
+from .holdout import holdout_score
 from .identifiability import Identifiability, identifiability
 from .least_squares import Minimum, minimise
 from .objective import Objective
-from .program import Layout, predict, weights_of
+from .program import Layout, predict, weights_of, with_values
 
 
 class Problem:
@@ -329,9 +328,7 @@ class Problem:
 
     def _score(self, objective: Objective, found: Minimum) -> float:
         """The root mean square of the residuals of experiments that are held out, in units of the noise."""
-        from .holdout import holdout_residuals
-
-        return holdout_residuals(objective, found)[1]
+        return holdout_score(objective, found)
 
     def _why(self, objective: Objective) -> str:
         """The first reason for which a run from the start fails."""
@@ -349,8 +346,6 @@ class Problem:
 
     def run(self, objective: Objective, z: Float[np.ndarray, " p"], experiment: int, ts: Any = None) -> Any:
         """An ordinary simulation of one experiment at a point."""
-        from .program import with_values
-
         layout, s = self._layout, objective.stacked
         shared, own = objective.numbers(objective.coordinates.natural(z))
         system, _, starts = with_values(self.system, self.observers, layout, shared)
