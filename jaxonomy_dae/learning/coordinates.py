@@ -41,6 +41,7 @@ class Coordinates:
     fixed: Bool[np.ndarray, " p"]
     n_shared: int
     n_own: int  # of each experiment
+    experiments: int
 
     def __len__(self) -> int:
         return len(self.names)
@@ -80,7 +81,7 @@ class Coordinates:
 
     def split(self, natural: Float[np.ndarray, " p"]) -> tuple[np.ndarray, np.ndarray]:
         """What all experiments share, and what each has to itself, shape (experiments, own)."""
-        return natural[: self.n_shared], natural[self.n_shared :].reshape(-1, self.n_own)
+        return natural[: self.n_shared], natural[self.n_shared :].reshape(self.experiments, self.n_own)
 
     def members(self, name: str) -> Bool[np.ndarray, " p"]:
         """Which coordinates a name stands for: its own, or all of a group."""
@@ -154,7 +155,7 @@ def coordinates(system: AcausalSystem, observers: dict[str, Any], layout: Layout
     start, low, high, spread = numbers
     return Coordinates(
         names, unit, group, np.array(is_weight), np.array(log), start, low, high, spread, np.array(fixed), n_shared,
-        len(layout.own),
+        len(layout.own), len(stacked.labels),
     )  # fmt: skip
 
 

@@ -73,6 +73,7 @@ Reweigh = Callable[[np.ndarray, Evaluation, Weights, Factors, np.ndarray], tuple
 
 def minimise(
     evaluate: Callable[[Float[np.ndarray, " p"]], Evaluation | None],
+    residual: Callable[[Float[np.ndarray, " p"]], Float[np.ndarray, " m"] | None],
     start: Float[np.ndarray, " p"],
     bounds: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]],
     weights: Callable[[Float[np.ndarray, " p"], Evaluation], Weights],
@@ -83,7 +84,8 @@ def minimise(
 
     **Arguments:**
 
-    - `evaluate`: residuals and Jacobian at a point; None where they cannot be found, so that a trial is rejected.
+    - `evaluate`, `residual`: residuals and Jacobian, and residuals alone, at a point; None where they cannot be found,
+        so that a trial is rejected. Trials that fail are dear: without the Jacobian, a hundred times less.
     - `weights`: the first weights, from the start.
     - `reweigh`: `(z, found, weights, factors, free)` to better weights, and whether they have settled; called once for
         each factorization, for the next step.
@@ -113,7 +115,7 @@ def minimise(
             break
         if k == steps:
             break
-        better, tried, damping = _better(evaluate, z, found, scheme, (r, jacobian, factors, free), bounds, damping)
+        better, tried, damping = _better(evaluate, residual, z, found, scheme, (r, jacobian, factors, free), bounds, damping)
         count += tried
         if better is None:
             idle += 1
@@ -124,6 +126,8 @@ def minimise(
             z, found, new_cost = better
             if cost - new_cost > GAIN * cost:
                 idle = 0
+            elif damping > 1:  # the columns have norm one: damping alone kept the step short
+                pass
             elif settled:
                 converged, message = True, f"converged after {k + 1} steps: the last gained nothing"
                 scheme = following if reweigh is not None else scheme
@@ -147,7 +151,7 @@ def _offset(factors: Factors, cost: float, rows: int) -> float:
     return float(np.sqrt((explained / determined) / (rest / freedom)))
 
 
-def _better(evaluate, z, found, scheme, linear, bounds, damping):
+def _better(evaluate, residual, z, found, scheme, linear, bounds, damping):
     """A point of less cost, as (z, evaluation, cost), or None; how many were tried; and the next damping."""
     r, jacobian, factors, free = linear
     cost = 0.5 * float(r @ r)
@@ -158,9 +162,10 @@ def _better(evaluate, z, found, scheme, linear, bounds, damping):
         if np.array_equal(new, z):
             return None, trial, damping
         promised = cost - 0.5 * float(np.sum((r + jacobian @ (new - z)) ** 2))
-        at_new = evaluate(new)
-        new_cost = np.inf if at_new is None else scheme.cost(new, at_new.residual)
-        if new_cost < cost:
+        tried = residual(new)
+        new_cost = np.inf if tried is None else scheme.cost(new, tried)
+        at_new = evaluate(new) if new_cost < cost else None
+        if at_new is not None:
             ratio = (cost - new_cost) / max(promised, np.finfo(float).tiny)
             if ratio > 0.7:
                 damping /= 5

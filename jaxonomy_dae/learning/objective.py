@@ -9,6 +9,7 @@ import functools
 import math
 from typing import Any
 
+import diffrax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -19,7 +20,7 @@ from .data import Stacked
 from .evidence import Evidence
 from .experiment import Unknown
 from .least_squares import Evaluation, Weights
-from .program import Conditions, Layout, predict_and_differentiate
+from .program import Conditions, Layout, predict, predict_and_differentiate
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,7 +103,6 @@ class Objective:
         """(shared, own) natural values as the program takes them."""
         dtype = self.system.parameters.values.dtype
         shared, own = self.coordinates.split(natural)
-        own = own.reshape(len(self.stacked.labels), self.coordinates.n_own)
         return jnp.asarray(shared, dtype), jnp.asarray(own, dtype)
 
     def predicted(self, z: Float[np.ndarray, " p"]) -> Predicted:
@@ -120,6 +120,14 @@ class Objective:
         if not (np.isfinite(residual).all() and np.isfinite(jacobian).all()):
             return None
         return Evaluation(residual, jacobian)
+
+    def residual(self, z: Float[np.ndarray, " f"]) -> Float[np.ndarray, " m"] | None:
+        """Residuals alone; None where a run that counts fails."""
+        shared, own = self.numbers(self.coordinates.natural(self.full(z)))
+        forwards = diffrax.ForwardMode()
+        outputs = predict(self.system, self.observers, self.layout, forwards, shared, own, self.conditions)
+        found = np.asarray(outputs, np.float64)[self.rows] - self.stacked.values[self.rows]
+        return found if np.isfinite(found).all() else None
 
     # --- weights -----------------------------------------------------------------------------------------------
 

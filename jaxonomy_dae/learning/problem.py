@@ -320,7 +320,7 @@ class Problem:
             if adam and share == shares[0]:
                 point = adam_steps(here, point, adam, rate)
             reweigh = None if here.evidence.is_idle else here.evidence.reweigh
-            found = minimise(here.evaluate, point, here.bounds, here.weights, reweigh, steps)
+            found = minimise(here.evaluate, here.residual, point, here.bounds, here.weights, reweigh, steps)
             if found is None:
                 return None
             point = found.z

@@ -43,7 +43,7 @@ def profile(estimate: "Estimate", position: int, level: float) -> tuple[float, f
             found = at.evaluate(np.zeros(0))
             cost = np.inf if found is None else weights.cost(np.zeros(0), found.residual)
         else:
-            reached = minimise(at.evaluate, warm[0], at.bounds, lambda *_: weights)
+            reached = minimise(at.evaluate, at.residual, warm[0], at.bounds, lambda *_: weights)
             cost = np.inf if reached is None else reached.cost
             if reached is not None:
                 warm[0] = reached.z
