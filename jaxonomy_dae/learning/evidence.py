@@ -74,7 +74,7 @@ class Evidence:
             new = known / max(float(np.sum((z - weights.mean)[group] ** 2)), np.finfo(float).tiny)
             changes.append(abs(np.log(new / old)))
             precision[group] = new
-        return dataclasses.replace(weights, row=row, precision=precision), max(changes) <= SETTLED
+        return dataclasses.replace(weights, row=row, precision=precision), bool(max(changes) <= SETTLED)
 
 
 def _rms(values: np.ndarray) -> float:

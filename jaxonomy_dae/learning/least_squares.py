@@ -5,7 +5,8 @@ are kept by projection: a coordinate that lies on one, and would be pushed out, 
 the scaling by columns, Madsen, Nielsen & Tingleff 2004 for the damping, Bertsekas 1982 for the active set).
 
 It stops where the remaining step is a thousandth of the confidence region's radius, which the residuals themselves set
-(the relative offset of Bates & Watts 1981), or where a step gains nothing.
+(the relative offset of Bates & Watts 1981); or where, along a curved valley of which the data tell next to nothing,
+steps in a row each lower the cost by less than a thousandth of the residuals' variance for each coordinate.
 """
 
 import dataclasses
@@ -20,7 +21,7 @@ from .factors import Factors
 OFFSET = 1e-3  # Bates & Watts 1981, Technometrics 23:179
 GAIN = 1e-9  # relative decrease of the sum of squares below which it is the integration's noise: rtol² is less
 TRIALS = 12  # dampings tried from one point: the last is 6¹² times the first
-PATIENCE = 3  # steps without gain while weights settle
+PATIENCE = 3  # steps in a row without gain
 
 
 class Evaluation(NamedTuple):
@@ -119,21 +120,16 @@ def minimise(
         count += tried
         if better is None:
             idle += 1
-            if reweigh is None or settled or idle > PATIENCE:
+            if settled or idle > PATIENCE:
                 converged, message = True, f"converged after {k} steps: no step gains more"
                 break
         else:
             z, found, new_cost = better
-            if cost - new_cost > GAIN * cost:
+            gain, freedom = cost - new_cost, len(r) - len(z)
+            noticed = OFFSET * len(z) * cost / freedom if freedom > 0 else 0.0
+            if gain > max(noticed, GAIN * cost):
                 idle = 0
-            elif damping > 1:  # the columns have norm one: damping alone kept the step short
-                pass
-            elif settled:
-                converged, message = True, f"converged after {k + 1} steps: the last gained nothing"
-                scheme = following if reweigh is not None else scheme
-                history.append(scheme.cost(z, found.residual))
-                break
-            else:
+            elif damping <= 1:  # the columns have norm one: beyond, damping alone keeps steps short
                 idle += 1
         scheme = following
     return Minimum(z, found, scheme, scheme.cost(z, found.residual), history, count, converged, message)

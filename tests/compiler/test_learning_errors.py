@@ -22,7 +22,7 @@ class Tank(Component):
         u = self.input("u")
         level = self.variable("level", start=1.0, fixed=True, unit="m")
         outflow = self.variable("outflow")
-        loss = self.learned("loss", eqx.nn.MLP(1, 1, 2, 1, jnp.tanh, key=jax.random.key(0)), inputs=[level])
+        (loss,) = self.learned("loss", eqx.nn.MLP(1, 1, 2, 1, jnp.tanh, key=jax.random.key(0)), inputs=[level])
         self.add_equations(Eq(der(level), u - outflow + loss), Eq(outflow, k * level**2))
 
 
