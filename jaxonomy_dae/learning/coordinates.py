@@ -2,7 +2,8 @@
 
     [trained parameters | weights of networks and sensor laws | shared starts | own starts, experiment by experiment]
 
-Parameters that must be positive are on a logarithmic scale, so a step multiplies them; all others are as they are.
+Parameters that must be positive are on a logarithmic scale, so a step multiplies them; others, and starts, are measured
+by their size, so that 1 is a change that would be natural in any unit. Weights are as they are.
 """
 
 import dataclasses
@@ -34,10 +35,11 @@ class Coordinates:
     group: tuple[str, ...]  # the name by which it is trained, frozen and regularized
     is_weight: Bool[np.ndarray, " p"]
     log: Bool[np.ndarray, " p"]
+    size: Float[np.ndarray, " p"]  # in which the coordinate is measured; 1 for logarithms and weights
     start: Float[np.ndarray, " p"]
     low: Float[np.ndarray, " p"]
     high: Float[np.ndarray, " p"]
-    spread: Float[np.ndarray, " p"]  # of the prior of a start; infinite where there is none
+    spread: Float[np.ndarray, " p"]  # of the prior of a start, on the coordinates' scale; infinite where there is none
     fixed: Bool[np.ndarray, " p"]
     n_shared: int
     n_own: int  # of each experiment
@@ -54,7 +56,7 @@ class Coordinates:
     @property
     def z_bounds(self) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
         """Bounds on the coordinates' scale."""
-        low, high = np.array(self.low), np.array(self.high)
+        low, high = self.low / self.size, self.high / self.size
         with np.errstate(divide="ignore"):
             low[self.log] = np.log(np.maximum(low[self.log], 0.0))
             high[self.log] = np.log(high[self.log])
@@ -64,7 +66,7 @@ class Coordinates:
 
     def scaled(self, natural: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
         """Natural values on the coordinates' scale."""
-        out = np.array(natural, float)
+        out = np.asarray(natural, float) / self.size
         out[self.log] = np.log(out[self.log])
         return out
 
@@ -73,11 +75,15 @@ class Coordinates:
         out = np.array(z, float)
         with np.errstate(over="ignore"):
             out[self.log] = np.exp(out[self.log])
-        return np.clip(out, self.low, self.high)
+        return np.clip(out * self.size, self.low, self.high)
+
+    def natural_at(self, position: int, z: float) -> float:
+        """The value that one coordinate stands for, bounds aside."""
+        return float(np.exp(z)) if self.log[position] else float(z * self.size[position])
 
     def slope(self, z: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
         """d(natural value)/d(coordinate)."""
-        return np.where(self.log, self.natural(z), 1.0)
+        return np.where(self.log, self.natural(z), self.size)
 
     def split(self, natural: Float[np.ndarray, " p"]) -> tuple[np.ndarray, np.ndarray]:
         """What all experiments share, and what each has to itself, shape (experiments, own)."""
@@ -136,11 +142,13 @@ def coordinates(system: AcausalSystem, observers: dict[str, Any], layout: Layout
     ends = closed_ends([table.intervals[k] for k in index])
     for k, (low, high) in zip(index, ends, strict=True):
         name, interval, value = table.names[k], table.intervals[k], float(system.parameters[table.names[k]])
-        rows.append((name, table.units[k], name, False, is_positive(interval), value, low, high, math.inf, False))
+        log = is_positive(interval)
+        size = 1.0 if log else abs(value) or 1.0
+        rows.append((name, table.units[k], name, False, log, size, value, low, high, math.inf, False))
     for name in layout.modules:
         module = system.neural[name] if name in system.neural else observers[name]
         for one, value in _named_weights(name, module):
-            rows.append((one, "", name, True, False, value, -math.inf, math.inf, math.inf, False))
+            rows.append((one, "", name, True, False, 1.0, value, -math.inf, math.inf, math.inf, False))
     n_plain = len(rows)
     units = dict(zip(table.names, table.units, strict=True))
     units |= dict(zip(system.plan.flat.variables.names, system.plan.flat.variables.unit, strict=True))
@@ -150,11 +158,11 @@ def coordinates(system: AcausalSystem, observers: dict[str, Any], layout: Layout
     for k, label in enumerate(stacked.labels):
         for name in layout.own:
             rows.append(_start(f"{name}, {label}", units, name, stacked.starts[name][k], table))
-    names, unit, group, is_weight, log, start, low, high, spread, fixed = zip(*rows, strict=True)
-    numbers = (np.array(column, float) for column in (start, low, high, spread))
-    start, low, high, spread = numbers
+    names, unit, group, is_weight, log, size, start, low, high, spread, fixed = zip(*rows, strict=True)
+    numbers = (np.array(column, float) for column in (size, start, low, high, spread))
+    size, start, low, high, spread = numbers
     return Coordinates(
-        names, unit, group, np.array(is_weight), np.array(log), start, low, high, spread, np.array(fixed), n_shared,
+        names, unit, group, np.array(is_weight), np.array(log), size, start, low, high, spread, np.array(fixed), n_shared,
         len(layout.own), len(stacked.labels),
     )  # fmt: skip
 
@@ -187,6 +195,6 @@ def _start(label: str, units: dict[str, str], name: str, given: Any, table: Any)
     known = not isinstance(given, Unknown)
     guess = float(given if known else given.guess)
     spread = math.inf if known or given.spread is None else float(given.spread)
-    if log and math.isfinite(spread):
-        spread /= guess  # of the logarithm
-    return (label, units.get(name, ""), name, False, log, guess, low, high, spread, known)
+    size = 1.0 if log else spread if math.isfinite(spread) else abs(guess) or 1.0
+    spread /= guess if log else size
+    return (label, units.get(name, ""), name, False, log, size, guess, low, high, spread, known)

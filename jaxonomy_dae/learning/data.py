@@ -177,7 +177,7 @@ def _inputs(data: Data, plan: SystemPlan) -> tuple[dict[str, Any], tuple[tuple[s
 def _samples(name: str, source: Any, one: Experiment, label: str) -> tuple[np.ndarray, np.ndarray, str | None]:
     """(times, values, kind) of an input; a constant is of any kind."""
     end = float(one.times[-1])
-    if np.ndim(source) == 0 and not callable(source) and not isinstance(source, str):
+    if isinstance(source, int | float | np.number):
         return np.array([one.t0, end]), np.full(2, float(source)), None
     if not isinstance(source, tuple | list) or len(source) not in (2, 3):
         raise ModelError(

@@ -92,7 +92,7 @@ class Estimate:
         z, (low, high) = self.minimum.z, self.objective.bounds
         residual, jacobian = self.minimum.weights.applied(z, self.minimum.found)
         moves = ~((z <= low) | (z >= high))
-        factors = Factors.of(residual, jacobian[:, moves])
+        factors = Factors.of(residual, jacobian[:, moves], self._noise)
         return factors, np.flatnonzero(self.objective.free)[moves]
 
     @property
@@ -188,18 +188,19 @@ class Estimate:
         c, factor = self.objective.coordinates, self._quantile(level)
         low, high = c.z_bounds
         moved, rows = set(np.flatnonzero(self.objective.free)), []
-        scale = np.where(c.log, 1.0, np.maximum(np.maximum(np.abs(self.point), np.abs(c.z_start)), 1e-300))
-        for k in np.flatnonzero(~c.is_weight | np.array(["[" not in n.split(c.group[i])[-1] for i, n in enumerate(c.names)])):
+        scalars = np.array([not name.endswith("]") for name in c.names])  # such as a sensor law's gain
+        for k in np.flatnonzero(~c.is_weight | scalars).tolist():
             z, spread, note = self.point[k], self.spread[k], ""
             ends = z - factor * spread, z + factor * spread
             if k not in moved:
                 note = "frozen" if c.fixed[k] else "held out: fitted to this experiment alone"
             elif z <= low[k] or z >= high[k]:
                 note = f"bound reached: {c.natural(self.point)[k]:g}"
-            elif spread >= scale[k]:
+            elif spread >= 1:
                 note = "not determined"
-            natural = [float(np.exp(e)) if c.log[k] else float(e) for e in ends] if np.isfinite(spread) else (-np.inf, np.inf)
-            inside = np.clip(natural, c.low[k], c.high[k]) if np.isfinite(spread) else natural
+            inside = (-np.inf, np.inf)
+            if np.isfinite(spread):
+                inside = np.clip([c.natural_at(k, e) for e in ends], c.low[k], c.high[k])
             value = float(c.natural(self.point)[k])
             rows.append(Row(c.names[k], value, float(inside[0]), float(inside[1]), c.units[k], note))
         return Table(tuple(rows), level)

@@ -20,10 +20,12 @@ class Factors:
     projected: Float[np.ndarray, " k"]
 
     @classmethod
-    def of(cls, residual: Float[np.ndarray, " m"], jacobian: Float[np.ndarray, "m p"]) -> "Factors":
-        """Factorizes a Jacobian."""
+    def of(cls, residual: Float[np.ndarray, " m"], jacobian: Float[np.ndarray, "m p"], noise: float) -> "Factors":
+        """Factorizes a Jacobian whose columns are known to `noise`, relative to the largest: smaller ones are not blown
+        up to its size."""
         scale = np.linalg.norm(jacobian, axis=0)
-        scale[scale == 0] = 1.0  # of what nothing depends on: its singular value is zero
+        scale = np.maximum(scale, noise * scale.max(initial=0.0))
+        scale[scale == 0] = 1.0
         triangle = scipy.linalg.qr(np.column_stack([jacobian / scale, residual]), mode="r", check_finite=False)[0]
         triangle = triangle[: jacobian.shape[1] + 1]
         left, singular, right = scipy.linalg.svd(triangle[:, :-1], full_matrices=False, check_finite=False)
@@ -34,10 +36,10 @@ class Factors:
         much each, p columns move no singular value by more than noise·√p (Weyl)."""
         return int(np.sum(self.singular > noise * np.sqrt(len(self.scale))))
 
-    def step(self, damping: float) -> Float[np.ndarray, " p"]:
-        """The Levenberg–Marquardt step: the least of |r + J d|² + damping·|scale·d|²."""
-        gain = self.singular / np.maximum(self.singular**2 + damping, np.finfo(float).tiny)
-        return -(self.right @ (gain * self.projected)) / self.scale
+    def step(self, damping: float, rank: int) -> Float[np.ndarray, " p"]:
+        """The Levenberg–Marquardt step: the least of |r + J d|² + damping·|scale·d|², among directions of this rank."""
+        gain = self.singular[:rank] / (self.singular[:rank] ** 2 + damping)
+        return -(self.right[:, :rank] @ (gain * self.projected[:rank])) / self.scale
 
     def root(self, rank: int) -> Float[np.ndarray, "p r"]:
         """A, with the covariance A Aᵀ = (JᵀJ)⁻¹ on the directions that are determined."""

@@ -66,9 +66,7 @@ class Identifiability:
 def natural_scale(objective: Objective, z: Float[np.ndarray, " f"]) -> Float[np.ndarray, " f"]:
     """What each free coordinate would naturally be unsure of."""
     c, free = objective.coordinates, objective.free
-    size = np.maximum(np.abs(z), np.abs(c.z_start[free]))
-    scale = np.where(c.log[free], 1.0, np.where(size > 0, size, 1.0))
-    return np.where(np.isfinite(c.spread[free]), c.spread[free], scale)
+    return np.where(c.is_weight[free] & (z != 0), np.abs(z), 1.0)
 
 
 def identifiability(
@@ -84,10 +82,11 @@ def identifiability(
     scaled = jacobian * scale
     singular, right = np.linalg.svd(scaled, full_matrices=False)[1:]
     columns = np.linalg.norm(scaled, axis=0)
-    directions = [Direction({names[k]: 1.0}, np.inf) for k in np.flatnonzero((columns == 0) & ~weight)]
     floor = noise * np.sqrt(len(names)) * columns.max(initial=0.0)
+    silent = columns <= floor  # the error of the largest column
+    directions = [Direction({names[k]: 1.0}, np.inf) for k in np.flatnonzero(silent & ~weight)]
     for value, vector in zip(singular, right, strict=True):
-        parts = np.where(weight | (columns == 0), 0.0, vector)
+        parts = np.where(weight | silent, 0.0, vector)
         if value > 1.0 or np.sum(parts**2) < 0.5:  # directions among weights are what a prior is for
             continue
         chosen = np.flatnonzero(np.abs(parts) > 0.1 * np.abs(parts).max())
@@ -118,7 +117,7 @@ def identifiability(
 
 def _spread(r: np.ndarray, jacobian: np.ndarray, chosen: Bool[np.ndarray, " f"], noise: float) -> np.ndarray:
     """Standard deviations of the chosen coordinates, infinite for those that have a part in what is not determined."""
-    return spreads(Factors.of(r, jacobian[:, chosen]), noise)
+    return spreads(Factors.of(r, jacobian[:, chosen], noise), noise)
 
 
 def spreads(factors: Factors, noise: float) -> Float[np.ndarray, " p"]:

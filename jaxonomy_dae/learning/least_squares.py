@@ -80,6 +80,7 @@ def minimise(
     weights: Callable[[Float[np.ndarray, " p"], Evaluation], Weights],
     reweigh: Reweigh | None = None,
     steps: int = 200,
+    noise: float = float(np.sqrt(np.finfo(float).eps)),
 ) -> Minimum | None:
     """Descends from a start.
 
@@ -90,6 +91,8 @@ def minimise(
     - `weights`: the first weights, from the start.
     - `reweigh`: `(z, found, weights, factors, free)` to better weights, and whether they have settled; called once for
         each factorization, for the next step.
+
+    - `noise`: the relative error of the Jacobian: directions within it are not followed.
 
     **Returns:**
 
@@ -109,14 +112,14 @@ def minimise(
         history.append(cost)
         gradient = jacobian.T @ r
         free = ~(((z <= low) & (gradient > 0)) | ((z >= high) & (gradient < 0)))
-        factors = Factors.of(r, jacobian[:, free])
+        factors = Factors.of(r, jacobian[:, free], noise)
         following, settled = (scheme, True) if reweigh is None else reweigh(z, found, scheme, factors, free)
-        if settled and (_offset(factors, cost, len(r)) <= OFFSET or idle >= PATIENCE):
+        if settled and (_offset(factors, cost, len(r), noise) <= OFFSET or idle >= PATIENCE):
             converged, message = True, f"converged after {k} steps"
             break
         if k == steps:
             break
-        better, tried, damping = _better(evaluate, residual, z, found, scheme, (r, jacobian, factors, free), bounds, damping)
+        better, tried, damping = _better(evaluate, residual, z, found, scheme, (r, jacobian, factors, free), bounds, damping, noise)
         count += tried
         if better is None:
             idle += 1
@@ -135,9 +138,9 @@ def minimise(
     return Minimum(z, found, scheme, scheme.cost(z, found.residual), history, count, converged, message)
 
 
-def _offset(factors: Factors, cost: float, rows: int) -> float:
+def _offset(factors: Factors, cost: float, rows: int, noise: float) -> float:
     """The remaining step in radii of the confidence region; infinite where there are no degrees of freedom."""
-    determined = factors.rank(np.finfo(float).eps * rows)
+    determined = factors.rank(noise)
     explained = float(np.sum(factors.projected[:determined] ** 2))
     if explained == 0:
         return 0.0
@@ -147,13 +150,13 @@ def _offset(factors: Factors, cost: float, rows: int) -> float:
     return float(np.sqrt((explained / determined) / (rest / freedom)))
 
 
-def _better(evaluate, residual, z, found, scheme, linear, bounds, damping):
+def _better(evaluate, residual, z, found, scheme, linear, bounds, damping, noise):
     """A point of less cost, as (z, evaluation, cost), or None; how many were tried; and the next damping."""
     r, jacobian, factors, free = linear
     cost = 0.5 * float(r @ r)
     for trial in range(TRIALS):
         step = np.zeros_like(z)
-        step[free] = factors.step(damping)
+        step[free] = factors.step(damping, factors.rank(noise))
         new = np.clip(z + step, *bounds)
         if np.array_equal(new, z):
             return None, trial, damping

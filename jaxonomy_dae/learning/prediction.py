@@ -4,6 +4,7 @@ import dataclasses
 from typing import TYPE_CHECKING, Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -44,11 +45,11 @@ def prediction(estimate: "Estimate", names: list[str], ts: Any, experiment: int 
     layout = dataclasses.replace(objective.layout, outputs=tuple(names))
     one = Objective(
         objective.system, objective.observers, layout,
-        dataclasses.replace(s, times=np.tile(times, (len(s.labels), 1))),
-        objective.coordinates, {}, objective.counted,
+        s, objective.coordinates, {}, objective.counted,
     )  # fmt: skip
     shared, own = one.numbers(one.coordinates.natural(estimate.point))
     conditions = jax.tree.map(lambda a: a[k][None], one.conditions)
+    conditions = dataclasses.replace(conditions, times=jnp.asarray(times[None], conditions.times.dtype))
     found = predict_and_differentiate(one.system, one.observers, layout, shared, own[k][None], conditions)
     alone = Predicted(*(np.asarray(a, np.float64) for a in found))
     n, j = len(times), len(names)

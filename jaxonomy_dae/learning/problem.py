@@ -300,7 +300,7 @@ class Problem:
         rng, points = np.random.default_rng(seed), [first]
         bounded = np.isfinite(low) & np.isfinite(high)
         for _ in range(count - 1):
-            width = np.where(c.log[free], 1.0, np.where(c.is_weight[free], 0.0, np.abs(first)))
+            width = np.where(c.log[free], 1.0, np.where(c.is_weight[free], 0.0, 1.0))
             width = np.where(np.isfinite(c.spread[free]), c.spread[free], width)
             for name in dict.fromkeys(c.group):
                 chosen = np.array([g == name for g in c.group])[free] & c.is_weight[free]
@@ -320,7 +320,7 @@ class Problem:
             if adam and share == shares[0]:
                 point = adam_steps(here, point, adam, rate)
             reweigh = None if here.evidence.is_idle else here.evidence.reweigh
-            found = minimise(here.evaluate, here.residual, point, here.bounds, here.weights, reweigh, steps)
+            found = minimise(here.evaluate, here.residual, point, here.bounds, here.weights, reweigh, steps, self._options["rtol"])
             if found is None:
                 return None
             point = found.z

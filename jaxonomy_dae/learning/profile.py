@@ -36,14 +36,14 @@ def profile(estimate: "Estimate", position: int, level: float) -> tuple[float, f
         """How much more than allowed the cost is, with everything else fitted."""
         start = np.array(c.start)
         start[free] = c.natural(estimate.point)[free]
-        start[position] = np.exp(z) if c.log[position] else z
+        start[position] = c.natural_at(position, z)
         at = dataclasses.replace(objective, coordinates=dataclasses.replace(c, start=start, fixed=held))
         own_cost = 0.5 * prior * (z - mean) ** 2
         if not len(others):
             found = at.evaluate(np.zeros(0))
             cost = np.inf if found is None else weights.cost(np.zeros(0), found.residual)
         else:
-            reached = minimise(at.evaluate, at.residual, warm[0], at.bounds, lambda *_: weights)
+            reached = minimise(at.evaluate, at.residual, warm[0], at.bounds, lambda *_: weights, noise=estimate._noise)
             cost = np.inf if reached is None else reached.cost
             if reached is not None:
                 warm[0] = reached.z
@@ -53,7 +53,7 @@ def profile(estimate: "Estimate", position: int, level: float) -> tuple[float, f
     ends = []
     for sign, bound in zip((-1, 1), (b[position] for b in c.z_bounds), strict=True):
         warm[0] = minimum.z[others]
-        step = spread if np.isfinite(spread) and spread > 0 else max(abs(centre), 1.0)
+        step = spread if np.isfinite(spread) and spread > 0 else 1.0
         inner, z, end = centre, centre, sign * np.inf
         for _ in range(FURTHEST):
             z = centre + sign * 2 * step
@@ -65,5 +65,5 @@ def profile(estimate: "Estimate", position: int, level: float) -> tuple[float, f
                 end = bound
                 break
             inner, step = z, 2 * step
-        ends.append(float(np.exp(end)) if c.log[position] else float(end))
+        ends.append(c.natural_at(position, end))
     return ends[0], ends[1]

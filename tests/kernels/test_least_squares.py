@@ -47,7 +47,7 @@ def test_linear_problem_is_solved_in_a_few_steps_whatever_its_units(line):
 
 def test_covariance_is_that_of_linear_regression(line):
     design, y = line
-    factors = Factors.of(y, design)
+    factors = Factors.of(y, design, 1e-12)
     root = factors.root(factors.rank(1e-12))
     np.testing.assert_allclose(root @ root.T, np.linalg.inv(design.T @ design), rtol=1e-9)
     np.testing.assert_allclose(spreads(factors, 1e-12) ** 2, np.diag(np.linalg.inv(design.T @ design)), rtol=1e-9)
@@ -89,9 +89,9 @@ def test_a_start_that_fails_is_told():
 
 def test_a_direction_without_information_has_an_infinite_spread():
     design = np.array([[1.0, 1.0, 0.0], [2.0, 2.0, 0.0], [3.0, 3.0, 0.0], [0.0, 0.0, 0.0]])
-    assert np.isinf(spreads(Factors.of(np.zeros(4), design), 1e-8)).all()
+    assert np.isinf(spreads(Factors.of(np.zeros(4), design, 1e-8), 1e-8)).all()
     design[3, 2] = 2.0
-    np.testing.assert_allclose(spreads(Factors.of(np.zeros(4), design), 1e-8), [np.inf, np.inf, 0.5])
+    np.testing.assert_allclose(spreads(Factors.of(np.zeros(4), design, 1e-8), 1e-8), [np.inf, np.inf, 0.5])
 
 
 def evidence_for(m, p, sigma_known):

@@ -108,7 +108,7 @@ def test_a_second_fit_compiles_nothing(problem, fit):
 
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
-        other = problem.fit(data(7), freeze={"pend.m": 2.0}, start={"pend.L": 1.2}, bounds={"pend.L": (0.5, 1.05)})
+        other = problem.fit(data(7), freeze={"pend.m": 2.0}, start={"pend.L": 0.9}, bounds={"pend.L": (0.5, 1.05)})
     finally:
         jax.monitoring.clear_event_listeners()
     assert len(PROGRAMS) == count and not compiled
@@ -136,11 +136,11 @@ def test_public_residuals_are_those_that_were_minimised(problem, fit):
 
 
 def test_a_band_has_the_slope_and_spread_of_the_law(fit):
-    grid = np.stack([np.linspace(-2, 2, 5), np.zeros(5)], axis=1)
+    grid = np.stack([np.linspace(-20, 20, 5), np.zeros(5)], axis=1)
     band = fit.band("drag", grid)
     np.testing.assert_allclose(band.mean, -fit.values["drag[0]"] * grid[:, 0], rtol=1e-10)
     np.testing.assert_allclose(band.spread, fit.spread[2] * np.abs(grid[:, 0]), rtol=1e-6, atol=1e-12)
-    assert band.explored.shape == (2, 2) and band.inside.tolist() == [False, True, True, True, False]
+    assert band.explored.shape == (2, 2) and band.inside.tolist() == [False, False, True, False, False]
 
 
 def test_bands_of_variables_that_were_not_measured(fit):
