@@ -1,6 +1,6 @@
 """The demo's pendulum: a drag law learned from noisy positions, over seeds of noise and of weights.
 
-    python benchmarks/learning/pendulum.py [noise seeds] [weight seeds]
+python benchmarks/learning/pendulum.py [noise seeds] [weight seeds]
 """
 
 import sys
@@ -10,12 +10,11 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 import neural_dae_pendulum_drag as demo  # noqa: E402
 
-from jaxonomy_dae import learning, simulate  # noqa: E402
+from jaxonomy_dae import learning  # noqa: E402
 
 GRID = np.linspace(0.0, 5.4, 200)
 

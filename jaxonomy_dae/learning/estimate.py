@@ -257,7 +257,9 @@ class Estimate:
         - `ts`: times, increasing, from its start on; default: its own.
         - `experiment`: its place or name.
         """
-        return prediction(self, [names] if isinstance(names, str) else list(names), ts, experiment, self._quantile(level))
+        return prediction(
+            self, [names] if isinstance(names, str) else list(names), ts, experiment, self._quantile(level)
+        )
 
     @functools.cached_property
     def rms(self) -> dict[str, dict[str, float]]:

@@ -4,7 +4,7 @@ import csv
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -201,7 +201,7 @@ def _without_zone(stamp: Any) -> Any:
     if isinstance(stamp, str):
         stamp = datetime.fromisoformat(stamp)
     if getattr(stamp, "tzinfo", None) is not None:
-        stamp = stamp.astimezone(timezone.utc).replace(tzinfo=None)
+        stamp = stamp.astimezone(UTC).replace(tzinfo=None)
     return stamp
 
 

@@ -8,7 +8,9 @@ from .objective import Objective
 DECAY = (0.9, 0.999)  # of the means of gradients and of their squares (Kingma & Ba 2015)
 
 
-def adam_steps(objective: Objective, start: Float[np.ndarray, " f"], steps: int, rate: float) -> Float[np.ndarray, " f"]:
+def adam_steps(
+    objective: Objective, start: Float[np.ndarray, " f"], steps: int, rate: float
+) -> Float[np.ndarray, " f"]:
     """The point of least cost among so many steps of Adam on the scale of the coordinates, kept inside the bounds.
     Weights of noise and priors are those of the start."""
     z = np.clip(start, *objective.bounds)

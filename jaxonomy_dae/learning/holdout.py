@@ -26,7 +26,14 @@ def with_own_starts(objective: Objective, found: Minimum) -> Float[np.ndarray, "
     )
     if not alone.free.any() or not len(alone.rows[0]):
         return full
-    best = minimise(alone.evaluate, alone.residual, full[alone.free], alone.bounds, alone.weights, noise=dict(objective.layout.options)["rtol"])
+    best = minimise(
+        alone.evaluate,
+        alone.residual,
+        full[alone.free],
+        alone.bounds,
+        alone.weights,
+        noise=dict(objective.layout.options)["rtol"],
+    )
     return full if best is None else alone.full(best.z)
 
 

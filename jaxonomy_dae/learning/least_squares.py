@@ -119,7 +119,9 @@ def minimise(
             break
         if k == steps:
             break
-        better, tried, damping = _better(evaluate, residual, z, found, scheme, (r, jacobian, factors, free), bounds, damping, noise)
+        better, tried, damping = _better(
+            evaluate, residual, z, found, scheme, (r, jacobian, factors, free), bounds, damping, noise
+        )
         count += tried
         if better is None:
             idle += 1

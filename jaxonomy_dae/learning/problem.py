@@ -291,7 +291,11 @@ class Problem:
             values = dict(start)
         c = coordinates(system, self.observers, self._layout, stacked)
         c = c.bounded(dict(bounds or {})).changed(values, fixed=False)
-        held = dict(freeze) if isinstance(freeze, Mapping) else dict.fromkeys([freeze] if isinstance(freeze, str) else freeze)
+        held = (
+            dict(freeze)
+            if isinstance(freeze, Mapping)
+            else dict.fromkeys([freeze] if isinstance(freeze, str) else freeze)
+        )
         return c.changed(held, fixed=True)
 
     def _points(self, objective: Objective, count: int, seed: int) -> list[np.ndarray]:
@@ -320,7 +324,9 @@ class Problem:
             if adam and share == shares[0]:
                 point = adam_steps(here, point, adam, rate)
             reweigh = None if here.evidence.is_idle else here.evidence.reweigh
-            found = minimise(here.evaluate, here.residual, point, here.bounds, here.weights, reweigh, steps, self._options["rtol"])
+            found = minimise(
+                here.evaluate, here.residual, point, here.bounds, here.weights, reweigh, steps, self._options["rtol"]
+            )
             if found is None:
                 return None
             point = found.z

@@ -45,7 +45,10 @@ def record(data=None, **given):
         (dict(times=[1.0, np.nan, 2.0]), r"times\[1\] is nan"),
         (dict(t0=2.0), "starts at t0=2, the times reach from 1 to 3"),
         (dict(data={"tank.level": [1.0, 2.0]}), r"'tank.level' need a row for each of the 3 times; got shape \(2,\)"),
-        (dict(data={"tank.level": [1.0, np.inf, 2.0]}), r"'tank.level': entry \[1\] is inf; NaN marks a missing sample"),
+        (
+            dict(data={"tank.level": [1.0, np.inf, 2.0]}),
+            r"'tank.level': entry \[1\] is inf; NaN marks a missing sample",
+        ),
         (dict(sigma=0.0), "sigma of 'tank.level' is a standard deviation > 0"),
         (dict(sigma={"tank.levle": 1.0}), "there are no data of 'tank.levle': did you mean 'tank.level'"),
         (dict(weight=-1.0), "weight is a number ≥ 0; got -1"),
@@ -122,7 +125,9 @@ def test_spread_and_guess_of_an_unknown():
 
 def test_csv_with_missing_cells_and_dates(tmp_path):
     path = tmp_path / "record.csv"
-    path.write_text("time,T,P\n2020-01-01 00:00:00+00:00,1.5,2\n2020-01-01 01:00:00+00:00,,3\n2020-01-01 02:00:00+00:00,4,5\n")
+    path.write_text(
+        "time,T,P\n2020-01-01 00:00:00+00:00,1.5,2\n2020-01-01 01:00:00+00:00,,3\n2020-01-01 02:00:00+00:00,4,5\n"
+    )
     one = Experiment.from_csv(path, {"room.T": "T"}, time="time", inputs={"heater.Q": ("P", "held")}, sigma=0.1)
     np.testing.assert_array_equal(one.times, [0.0, 3600.0, 7200.0])
     np.testing.assert_array_equal(one.data["room.T"], [1.5, np.nan, 4.0])

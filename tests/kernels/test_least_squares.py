@@ -97,7 +97,9 @@ def test_a_direction_without_information_has_an_infinite_spread():
 def evidence_for(m, p, sigma_known):
     everything = np.ones(p, bool)
     noise = np.full(m, -1 if sigma_known else 0)
-    return Evidence(noise, () if sigma_known else ("y",), np.zeros(0 if sigma_known else 1) + 1e-12, np.ones(m), (everything,))
+    return Evidence(
+        noise, () if sigma_known else ("y",), np.zeros(0 if sigma_known else 1) + 1e-12, np.ones(m), (everything,)
+    )
 
 
 @pytest.mark.parametrize("sigma_known", [True, False])
@@ -122,7 +124,9 @@ def test_evidence_is_greatest_where_that_of_bayesian_linear_regression_is(sigma_
     def weights(z, found):
         return evidence.first(Weights(np.full(m, 1 / sigma), np.full(p, 1.0), np.zeros(p)), found)
 
-    found = solve(lambda z: design @ z - y, lambda z: design, np.full(p, 0.1), weights=weights, reweigh=evidence.reweigh)
+    found = solve(
+        lambda z: design @ z - y, lambda z: design, np.full(p, 0.1), weights=weights, reweigh=evidence.reweigh
+    )
     # The last change of a precision is below 1 %, and such a fixed-point iteration shrinks its error by a third a step.
     np.testing.assert_allclose(np.log(found.weights.precision[0]), best[0], atol=0.03)
     if not sigma_known:

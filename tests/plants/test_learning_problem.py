@@ -87,7 +87,7 @@ def test_values_are_those_of_the_truth(fit):
 def test_what_the_data_do_not_tell_is_named(fit):
     """Positions alone say nothing of the mass: the drag is per mass."""
     row = fit.table()["pend.m"]
-    assert (row.value, row.note) == (1.0, "not determined") and np.isinf(row.high)
+    assert row.note == "not determined" and np.isinf(row.high) and abs(row.value - 1.0) < 1e-3
     assert fit.table()["pend.L"].note == "" and "known" in repr(fit.identifiability())
     assert "nothing measured depends on 'pend.m'" in repr(fit.identifiability())
 
@@ -128,6 +128,7 @@ def test_profile_likelihood_agrees_with_linear_intervals_where_the_model_is_almo
     np.testing.assert_allclose([low, high], [row.low, row.high], atol=0.1 * (row.high - row.low))
 
 
+@pytest.mark.slow
 def test_public_residuals_are_those_that_were_minimised(problem, fit):
     found = problem.residuals(fit.system, starts=fit.starts)
     expected = fit.residuals["experiment 0"]["pend.y"]
@@ -135,6 +136,7 @@ def test_public_residuals_are_those_that_were_minimised(problem, fit):
     np.testing.assert_array_equal(found["experiment 0"]["pend.x"][3:6], 0.0)
 
 
+@pytest.mark.slow
 def test_a_band_has_the_slope_and_spread_of_the_law(fit):
     grid = np.stack([np.linspace(-20, 20, 5), np.zeros(5)], axis=1)
     band = fit.band("drag", grid)
@@ -143,6 +145,7 @@ def test_a_band_has_the_slope_and_spread_of_the_law(fit):
     assert band.explored.shape == (2, 2) and band.inside.tolist() == [False, False, True, False, False]
 
 
+@pytest.mark.slow
 def test_bands_of_variables_that_were_not_measured(fit):
     found = fit.predict(["pend.vx", "pend.x"], ts=[0.5, 1.0])
     step = 1e-4
