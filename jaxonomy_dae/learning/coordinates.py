@@ -162,8 +162,8 @@ def coordinates(system: AcausalSystem, observers: dict[str, Any], layout: Layout
     numbers = (np.array(column, float) for column in (size, start, low, high, spread))
     size, start, low, high, spread = numbers
     return Coordinates(
-        names, unit, group, np.array(is_weight), np.array(log), size, start, low, high, spread, np.array(fixed), n_shared,
-        len(layout.own), len(stacked.labels),
+        names, unit, group, np.array(is_weight), np.array(log), size, start, low, high, spread, np.array(fixed),
+        n_shared, len(layout.own), len(stacked.labels),
     )  # fmt: skip
 
 

@@ -38,7 +38,8 @@ class Data:
         return len(self.experiments)
 
     def __repr__(self):
-        return f"Data({', '.join(f'{label}: {len(e.times)} times' for label, e in zip(self.labels, self.experiments))})"
+        counts = (f"{label}: {len(e.times)} times" for label, e in zip(self.labels, self.experiments, strict=True))
+        return f"Data({', '.join(counts)})"
 
 
 @dataclasses.dataclass(frozen=True)
