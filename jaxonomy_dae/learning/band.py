@@ -35,7 +35,7 @@ class Band:
     def inside(self) -> np.ndarray:
         """Which grid points lie within what was explored, shape `(n,)`."""
         points = self.grid.reshape(len(self.grid), -1)
-        return ((points >= self.explored[:, 0]) & (points <= self.explored[:, 1])).all(axis=1)
+        return np.all((points >= self.explored[:, 0]) & (points <= self.explored[:, 1]), axis=1)
 
 
 def band(

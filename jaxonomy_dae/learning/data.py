@@ -123,7 +123,9 @@ def _columns(
     one: Experiment, plan: SystemPlan, derived: tuple[str, ...], label: str
 ) -> tuple[dict[str, np.ndarray], dict[str, float]]:
     """The samples and noise levels of an experiment, those of arrays by their entries."""
-    column, sigma = {}, {}
+    column: dict[str, np.ndarray] = {}
+    sigma: dict[str, float] = {}
+    sigmas: Any = one.sigma  # by name, once it has been read
     for name, values in one.data.items():
         entries = None if name in derived else plan.entries(name)
         if entries is None:
@@ -142,7 +144,7 @@ def _columns(
         for j, entry in enumerate(names):
             if entry in column:
                 raise ModelError(f"{label}: data of '{entry}' are given twice, by its own name and as part of an array")
-            column[entry], sigma[entry] = flat[:, j], one.sigma[name]  # pyright: ignore[reportIndexIssue]
+            column[entry], sigma[entry] = flat[:, j], sigmas[name]
     return column, sigma
 
 
@@ -154,7 +156,8 @@ def _inputs(data: Data, plan: SystemPlan) -> tuple[dict[str, Any], tuple[tuple[s
         if name not in plan.inputs.place:
             raise ModelError(f"'{name}' is not an input of this system: " + nearest(name, plan.inputs.names))
         default = plan.inputs.defaults[plan.inputs.place[name]]
-        given, kind, owner = [], None, ""
+        given: list[tuple[np.ndarray, np.ndarray]] = []
+        kind, owner = None, ""
         for label, one in zip(data.labels, data.experiments, strict=True):
             if name not in one.inputs and default is None:
                 raise ModelError(f"{label} does not give input '{name}', as others do: give it there too")

@@ -91,7 +91,7 @@ class Experiment:
             value = by_name.get(name, ESTIMATE)
             if isinstance(value, str) and value == ESTIMATE:
                 out[name] = math.nan
-            elif _is_finite(value) and value > 0:
+            elif not isinstance(value, str) and _is_finite(value) and value > 0:
                 out[name] = float(value)
             else:
                 raise ModelError(f"sigma of '{name}' is a standard deviation > 0, or 'estimate'; got {value!r}")

@@ -26,8 +26,8 @@ class Factors:
         scale = np.linalg.norm(jacobian, axis=0)
         scale = np.maximum(scale, noise * scale.max(initial=0.0))
         scale[scale == 0] = 1.0
-        triangle = scipy.linalg.qr(np.column_stack([jacobian / scale, residual]), mode="r", check_finite=False)[0]
-        triangle = triangle[: jacobian.shape[1] + 1]
+        columns = np.column_stack([jacobian / scale, residual])
+        triangle = np.asarray(scipy.linalg.qr(columns, mode="r", check_finite=False)[0])[: columns.shape[1]]
         left, singular, right = scipy.linalg.svd(triangle[:, :-1], full_matrices=False, check_finite=False)
         return cls(singular, right.T, scale, left.T @ triangle[:, -1])
 

@@ -59,7 +59,7 @@ def profile(estimate: "Estimate", position: int, level: float) -> tuple[float, f
             z = centre + sign * 2 * step
             z = max(z, bound) if sign < 0 else min(z, bound)
             if excess(z) > 0:
-                end = scipy.optimize.brentq(excess, inner, z, xtol=1e-3 * step)
+                end = float(scipy.optimize.brentq(excess, inner, z, xtol=1e-3 * step))  # pyright: ignore[reportArgumentType]
                 break
             if z == bound:
                 end = bound
