@@ -69,8 +69,8 @@ def main(noises, nets):
             error, angle, covered = scored(found, true)
             print(
                 f"noise {seed} net {net}: law {100 * error:.2f} %, factor {without / angle:,.0f}",
-                f"covered {covered:.3f}, γ {found.effective['drag']:.1f}, χ²/n {found.chi2 / 400:.3f}, {took[0]:.2f} s, {took[1]:.2f} s CPU",
-                f"{found.minimum.evaluations} evaluations, {found.message}",
+                f"covered {covered:.3f}, γ {found.effective['drag']:.1f}, χ²/n {found.chi2 / 400:.3f}",
+                f"{took[0]:.2f} s, {took[1]:.2f} s CPU, {found.minimum.evaluations} evaluations, {found.message}",
                 sep=", ",
                 flush=True,
             )
