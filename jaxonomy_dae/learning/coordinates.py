@@ -138,10 +138,11 @@ class Coordinates:
 def coordinates(system: AcausalSystem, observers: dict[str, Any], layout: Layout, stacked: Stacked) -> Coordinates:
     """The coordinates of a problem, which start at the values of its system and at the guesses of unknown starts."""
     table, rows = system.parameters.table, []
+    numbers = np.array(system.parameters.array) if system.parameters.known is None else system.parameters.known
     index = [table.index(name) for name in layout.parameters]
     ends = closed_ends([table.intervals[k] for k in index])
     for k, (low, high) in zip(index, ends, strict=True):
-        name, interval, value = table.names[k], table.intervals[k], float(system.parameters[table.names[k]])
+        name, interval, value = table.names[k], table.intervals[k], float(numbers[k])
         log = is_positive(interval)
         size = 1.0 if log else abs(value) or 1.0
         rows.append((name, table.units[k], name, False, log, size, value, low, high, math.inf, False))
@@ -159,8 +160,8 @@ def coordinates(system: AcausalSystem, observers: dict[str, Any], layout: Layout
         for name in layout.own:
             rows.append(_start(f"{name}, {label}", units, name, stacked.starts[name][k], table))
     names, unit, group, is_weight, log, size, start, low, high, spread, fixed = zip(*rows, strict=True)
-    numbers = (np.array(column, float) for column in (size, start, low, high, spread))
-    size, start, low, high, spread = numbers
+    columns = (np.array(column, float) for column in (size, start, low, high, spread))
+    size, start, low, high, spread = columns
     return Coordinates(
         names, unit, group, np.array(is_weight), np.array(log), size, start, low, high, spread, np.array(fixed),
         n_shared, len(layout.own), len(stacked.labels),
