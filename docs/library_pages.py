@@ -93,12 +93,12 @@ def as_written() -> Iterator[tuple[list[Any], list[Any]]]:
         on: Any,
         immediate: bool,
         noted: bool = True,
-        revocable: bool = False,
-        text: str | None = None,
+        *rest: Any,
+        **more: Any,
     ) -> None:
         if noted:
             events.append((self, condition, actions, on))
-        event(self, condition, actions, on, immediate, noted, revocable, text)
+        event(self, condition, actions, on, immediate, noted, *rest, **more)
 
     def noted_either(self: Component, condition: Any, then: Any, otherwise: Any, order: int, pushes: Any) -> Any:
         so_far = len(equations)

@@ -30,6 +30,7 @@ from .modeling import assign as assign
 from .modeling import der as der
 from .modeling import pre as pre
 from .modeling import reinit as reinit
+from .modeling import smooth as smooth
 from .modeling import terminate as terminate
 from .simulation.simulate import simulate as simulate
 from .simulation.solution import Solution as Solution

@@ -22,7 +22,8 @@ from jaxonomy_dae.solvers.drive import integrate
 
 STATES, DISCRETES, CLOCKS = 4, 4, 3
 ORDINARY, ENDING, IMMEDIATE = 3, 3, 4  # how many guards have no property; the places of the two that have one
-GUARDS = 5
+RELATION = 5  # the first of two guards of one relation, the second one of what is opposite
+GUARDS = 7
 EVENTS = CLOCKS + GUARDS
 NEVER = 1e9  # s: the period and the offset of a clock that does not tick
 MAX_EVENTS = 64
@@ -63,8 +64,21 @@ class Event(NamedTuple):
     immediate: bool = False
 
 
+class Relation(NamedTuple):
+    """Two guards, each the other's negative: what it writes where the guard falls, and where it rises."""
+
+    falls: Mapping[str, Row]
+    rises: Mapping[str, Row]
+    guard: Row
+
+
 def affine(
-    rates: Mapping[str, Row], events: Sequence[Event], *, at: Row | None = None, discrete: Row | None = None
+    rates: Mapping[str, Row],
+    events: Sequence[Event],
+    *,
+    at: Row | None = None,
+    discrete: Row | None = None,
+    relation: Relation | None = None,
 ) -> tuple[Numbers, Names]:
     """A problem from rates of states by name, events in order, and what is not zero at the start."""
     states, q = list(rates), list(discrete or {})
@@ -99,6 +113,11 @@ def affine(
             guards[k], waves[k], place = row(event.guard), event.wave, CLOCKS + k
         for target, numbers in event.writes.items():
             writes[place, names.targets.index(target)] = row(numbers)
+    if relation is not None:
+        for k, sign, wrote in ((RELATION, 1, relation.falls), (RELATION + 1, -1, relation.rises)):
+            guards[k] = sign * row(relation.guard)
+            for target, numbers in wrote.items():
+                writes[CLOCKS + k, names.targets.index(target)] = row(numbers)
     x = row(at or {})[:STATES]
     start_q = row(discrete or {})[STATES : STATES + DISCRETES]
     slopes = np.stack([row(rates.get(name, {})) for name in x_names])
@@ -112,8 +131,12 @@ class Affine(AbstractHybridProblem):
     n_guards: int = eqx.field(static=True, default=GUARDS)
     ends: tuple[bool, ...] = eqx.field(static=True, default=tuple(k == CLOCKS + ENDING for k in range(EVENTS)))
     immediate: tuple[bool, ...] = eqx.field(static=True, default=tuple(k == CLOCKS + IMMEDIATE for k in range(EVENTS)))
-    noted: tuple[bool, ...] = eqx.field(static=True, default=(False,) * CLOCKS + (True,) * GUARDS)
-    revocable: tuple[bool, ...] = eqx.field(static=True, default=(False,) * EVENTS)
+    noted: tuple[bool, ...] = eqx.field(
+        static=True, default=(False,) * CLOCKS + (True,) * RELATION + (False,) * (GUARDS - RELATION)
+    )
+    revocable: tuple[bool, ...] = eqx.field(static=True, default=tuple(k >= CLOCKS + RELATION for k in range(EVENTS)))
+    relations: tuple[bool, ...] = eqx.field(static=True, default=tuple(k >= CLOCKS + RELATION for k in range(EVENTS)))
+    opposite: tuple[int, ...] = eqx.field(static=True, default=(-1,) * RELATION + (RELATION + 1, RELATION))
 
     def term(self, q):
         return diffrax.ODETerm(lambda t, x, args: self.field(t, x, q, args))
@@ -131,6 +154,11 @@ class Affine(AbstractHybridProblem):
     def written(self, t, x, q, previous, event, args):
         new = self.numbers.writes[event] @ jnp.concatenate([x, q, previous, jnp.ones((1,))])
         return new[:STATES], new[STATES:]
+
+    def settled(self, t, x, q, events, args):
+        new = (self.numbers.writes @ jnp.concatenate([x, q, q, jnp.ones((1,))]))[:, STATES:]
+        changes = jnp.where(events[:, None], new - q, 0.0)
+        return q + jnp.sum(changes, axis=0)  # of a relation, one event only is true
 
     def clocks(self):
         return self.numbers.clocks[0], self.numbers.clocks[1]

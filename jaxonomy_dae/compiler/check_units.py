@@ -170,7 +170,7 @@ def _statements(component: Component, unit_of: UnitOf) -> Iterator[Statement]:
     }
     # A relation that is an event stands in an equation, too.
     unseen = {name for when in component.events if not when.noted for name in (when.guard, *when.values)}
-    for equation in component.equations:
+    for equation in (component.as_written.get(e, e) for e in component.equations):
         # What events compute are hidden variables, each with an equation of its own.
         event = None
         if guards or writes:
@@ -198,9 +198,9 @@ def _statements(component: Component, unit_of: UnitOf) -> Iterator[Statement]:
         if value is not None:
             yield _given(f"'{name}' = {shortened(value)}", name, value, unit_of(("parameter of", name)))
     for when in component.events:
-        if isinstance(when.clock, Sampled):
+        if isinstance(when.clock, Sampled) and when.noted:
             for what, value in (("period", when.clock.period), ("offset", when.clock.offset)):
-                if _symbolic(value) is not None:
+                if value is not None and _symbolic(value) is not None:
                     yield _given(f"the {what} of {when.text} = {shortened(value)}", f"a {what}", value, SECOND)
     for account in component.accounts:
         text = f"the {account.kind} {shortened(account.expression)}"

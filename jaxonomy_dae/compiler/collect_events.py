@@ -1,11 +1,14 @@
 """The events of all components, as one table."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
 
+from ..expressions.to_sympy import shortened
 from ..model.symbolic import canonical
 from ..model.tables import NO_EVENTS, EventTable, HeldTable, Start
+from ..modeling.automatic_events import relations_left_alone
 from ..modeling.events import Assign, Terminate, When
 from .number_model import Instances, ModelNumbers
 from .read_equations import read_expression
@@ -17,8 +20,9 @@ def event_table(model: ModelNumbers) -> EventTable:
     for i in model.instances:
         for n, when in enumerate(i.component.events):
             found.extend((k, n, i, row, when) for row, k in enumerate(i.number.tolist()))
+    left_alone = _left_alone(model)
     if not found:
-        return NO_EVENTS
+        return dataclasses.replace(NO_EVENTS, left_alone=left_alone)
     found.sort(key=lambda entry: (entry[4].clock is None, entry[0], entry[1]))
     place = {int(p): i for i, p in enumerate(model.discrete)}
     known: dict[tuple[int, str, bool], np.ndarray] = {}
@@ -62,18 +66,31 @@ def event_table(model: ModelNumbers) -> EventTable:
     return EventTable(
         tuple(f"{model.paths[k]}: when({when.text})" for k, *_, when in found),
         np.array([-1 if w.guard is None else variable(i, w.guard, row) for _, _, i, row, w in found], np.int64),
-        tuple((in_parameters(i, row, w.clock.period), in_parameters(i, row, w.clock.offset))
+        tuple((None if w.clock.period is None else in_parameters(i, row, w.clock.period),
+               in_parameters(i, row, w.clock.offset))
               for _, _, i, row, w in found if w.clock is not None),
         tuple(next((a.message for a in w.actions if isinstance(a, Terminate)), None) for w in whens),
         tuple(when.noted for when in whens),
         tuple(when.revocable for when in whens),
+        tuple(when.relation for when in whens),
         tuple(when.immediate for when in whens),
         event,
         state,
         discrete,
         value,
         np.array(columns[4], float),
+        left_alone,
     )  # fmt: skip
+
+
+def _left_alone(model: ModelNumbers) -> tuple[str, ...]:
+    """The parts of equations whose relations are no events."""
+    found: list[tuple[int, str]] = []
+    for i in model.instances:
+        written = (i.component.as_written.get(e, e) for e in i.component.equations)
+        texts = [shortened(part) for equation in written for part in relations_left_alone(equation)]
+        found += [(k, text) for k in (i.number.tolist() if texts else ()) for text in texts]
+    return tuple(f"{model.paths[k]}: {text}" for k, text in sorted(dict.fromkeys(found)))
 
 
 def held_table(model: ModelNumbers) -> HeldTable:

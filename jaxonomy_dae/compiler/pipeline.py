@@ -56,8 +56,9 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Co
     check_structure(flat, groups, alias, signature, unknown, matching)
     started = check_equal_starts(flat, groups, alias)
     groups, signature, offsets, notes = reduce_with_cancellation(
-        groups, signature, column, least[unknown], matching, flat.parameters.values, flat.parameters.names
-    )
+        groups, signature, column, least[unknown], matching,
+        flat.parameters.values, flat.parameters.names, flat.parameters.discrete,
+    )  # fmt: skip
     zero = zero_pivots(groups, signature, offsets, column, flat.parameters.values)
     if len(zero):
         raise StructuralError(_zero_pivot(flat, groups, int(zero[0])))

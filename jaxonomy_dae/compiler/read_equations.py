@@ -41,7 +41,8 @@ def add_components(model: ModelNumbers, builder: GroupBuilder):
             before = [isinstance(p, PreviousSymbol) for p in parameters]
             parameter_ids[:, before] = model.previous[parameter_ids[:, before]]
             order = np.tile([v.order for v in variables], (len(number), 1))
-            provenance = Provenances.made(Written(f"0 = {shortened(residual)}", model.paths), number, True)
+            shown = parts[0].component.as_written.get(residual, residual)
+            provenance = Provenances.made(Written(f"0 = {shortened(shown)}", model.paths), number, True)
             if coefficients is None:
                 template: AbstractTemplate = canonical(graph, variables, parameters)
                 numbers = np.zeros((len(number), 0))

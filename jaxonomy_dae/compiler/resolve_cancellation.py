@@ -13,7 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
-from ..diagnosis.wording import itemised, some
+from ..diagnosis.wording import alternatives, itemised, some
 from ..errors import StructuralError
 from ..expressions.differentiate import partial_derivative
 from ..expressions.errors import KNOWN, KernelWithErrors
@@ -48,12 +48,13 @@ def reduce_with_cancellation(
     matching: np.ndarray,
     values: np.ndarray,
     names: Sequence[str],
+    discrete: np.ndarray,
 ) -> tuple[tuple[EquationGroup, ...], Incidence, Offsets, tuple[str, ...]]:
     """Index reduction, repeated until no diagonal block with constant coefficients is singular.
 
     `signature` is the incidence of the equations, `matching` what `match_highest` finds in it; `values` and `names` are
-    those of parameters. Returns the equations, changed where something cancelled, their incidence and offsets, and
-    notes.
+    those of parameters, of which those in `discrete` are discrete variables. Returns the equations, changed where
+    something cancelled, their incidence and offsets, and notes.
 
     **Raises:**
 
@@ -67,7 +68,7 @@ def reduce_with_cancellation(
         jacobian = _Jacobian(groups, offsets, column, values)
         replaced, added, combined = [], [], []
         for equations in _blocks_that_may_cancel(signature, jacobian):
-            found = _combination(jacobian, equations, names)
+            found = _combination(jacobian, equations, names, discrete)
             if found is not None:
                 combined = [provenance_of(groups, int(e)) for e in equations]
                 replaced.append(found[0])
@@ -246,6 +247,14 @@ class _Jacobian:
                     errors[place[e], j] += bounds[i, slot]
         return dense, errors
 
+    def is_regular_with(self, equations: np.ndarray, parameter: int) -> bool:
+        """Whether a block would be regular if a parameter that is zero were not."""
+        values = self.values.copy()
+        values[parameter] = 0.37
+        changed = _Jacobian(self.groups, self.offsets, self.column, values)
+        matrix, bounds = changed.at(equations, self.offsets.matched_variable[equations], 0)
+        return bool(np.isfinite(matrix).all()) and not left_null_vectors(matrix, bounds)
+
     def is_constant(self, equations: np.ndarray, columns: np.ndarray) -> bool:
         """Whether no entry depends on the point."""
         return all(
@@ -255,7 +264,9 @@ class _Jacobian:
         )
 
 
-def _combination(jacobian: _Jacobian, equations: np.ndarray, names: Sequence[str]) -> tuple[int, EquationGroup] | None:
+def _combination(
+    jacobian: _Jacobian, equations: np.ndarray, names: Sequence[str], discrete: np.ndarray
+) -> tuple[int, EquationGroup] | None:
     """For a block that is singular wherever the model is: an equation of it, and what replaces that equation.
 
     **Raises:**
@@ -302,10 +313,12 @@ def _combination(jacobian: _Jacobian, equations: np.ndarray, names: Sequence[str
     found = _weights(written, top, unit, jacobian.values, trials)
     if found is None:
         here = [jacobian.place(e) for e in equations[used].tolist()]
-        concerned = dict.fromkeys(p for g, i in here for p in groups[g].parameter[i].tolist())
+        concerned = list(dict.fromkeys(p for g, i in here for p in groups[g].parameter[i].tolist()))
         if not concerned:  # numbers alone, which cancel to rounding
             raise StructuralError(_hidden(sources))
-        raise StructuralError("\n".join([_for_values(jacobian.values, names, list(concerned)), *itemised(sources)]))
+        raise StructuralError(
+            "\n".join([_for_values(jacobian, equations, names, concerned, discrete), *itemised(sources)])
+        )
     combined = combine(written, found, top, jacobian.values, lambda: jacobian.natural(equations[used]))
     if combined is None:
         raise StructuralError(_hidden(sources))
@@ -315,13 +328,25 @@ def _combination(jacobian: _Jacobian, equations: np.ndarray, names: Sequence[str
     return int(equations[used[unit]]), group_of(combined, origin)
 
 
-def _for_values(values: np.ndarray, names: Sequence[str], concerned: list[int]) -> str:
-    """The message for equations that are singular with these parameters: zeros, where there are, else all."""
-    shown = [p for p in concerned if values[p] == 0.0] or concerned
+def _for_values(
+    jacobian: _Jacobian, equations: np.ndarray, names: Sequence[str], concerned: list[int], discrete: np.ndarray
+) -> str:
+    """The message for equations that are singular with these parameters: zeros, where there are, else all; in a mode,
+    where there are discrete variables among them."""
+    values = jacobian.values
+    modes = [p for p in concerned if p in discrete]
+    shown = [p for p in concerned if values[p] == 0.0 and p not in modes] or [p for p in concerned if p not in modes]
     given = some([f"{names[p]} = {values[p]:g}" for p in shown])
+    mode = some([f"{names[p]} = {values[p]:g}" for p in modes if not names[p].startswith(":")])
+    mends = [p for p in shown if values[p] == 0.0 and jacobian.is_regular_with(equations, p)]
+    if mends:
+        mend = f"Give a value other than zero to {alternatives([names[p] for p in mends])}"
+    else:
+        mend = "Change the parameters"
     return (
-        f"these equations are singular for {given or 'the given parameter values'}, though not in general. Change the "
-        "parameters, or state the constraint that follows as an equation of its own:"
+        f"these equations are singular for {given or 'the given parameter values'}, though not in general"
+        f"{f', in the mode {mode}' if mode else ''}. {mend}, or state the constraint that follows as an equation of "
+        "its own:"
     )
 
 

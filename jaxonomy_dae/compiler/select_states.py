@@ -24,6 +24,7 @@ from ..model.extended import Extended
 from ..model.tables import ZERO, EquationGroup, equation_offsets
 
 POOR_PIVOT = 0.1  # a preferred pivot may be this much smaller than the best one
+POORER_PIVOT = 1e-3  # so much smaller if the better ones would all be of preferred states
 ALIKE = 1e-6  # pivots that differ by less are equal: rounding, and units, do not choose
 
 
@@ -225,7 +226,10 @@ def _pivots(matrix: np.ndarray, errors: np.ndarray, keys: list[tuple]) -> list[i
         best = best_of_column.max()
         if not best > 0:
             return None
-        good = [k for k in range(len(free_columns)) if best_of_column[k] >= POOR_PIVOT * best]
+        good = np.flatnonzero(best_of_column >= POOR_PIVOT * best).tolist()
+        if all(_is_preferred(keys[free_columns[k]]) for k in good):
+            poorer = np.flatnonzero(best_of_column >= POORER_PIVOT * best).tolist()
+            good = [k for k in poorer if not _is_preferred(keys[free_columns[k]])] or good
         k = min(good, key=lambda k: keys[free_columns[k]])
         column = free_columns.pop(k)
         row = free_rows.pop(int(np.argmax(sub[:, k] >= (1 - ALIKE) * best_of_column[k])))
@@ -234,3 +238,8 @@ def _pivots(matrix: np.ndarray, errors: np.ndarray, keys: list[tuple]) -> list[i
             factors = work[free_rows, column] / work[row, column]
             work[free_rows] -= np.outer(factors, work[row])
     return sorted(picked)
+
+
+def _is_preferred(key: tuple) -> bool:
+    (preference, *_), _ = key
+    return preference > 0

@@ -96,6 +96,11 @@ def some(names: Sequence[str], shown: int = SHOWN) -> str:
     return ", ".join(names[:shown]) + (", …" if len(names) > shown else "")
 
 
+def alternatives(names: Sequence[str]) -> str:
+    """a, b or c."""
+    return ", ".join(names[:-1]) + (" or " if names[:-1] else "") + names[-1]
+
+
 def counted(n: int, what: str) -> str:
     """1 equation, 2 equations."""
     return f"{n} {what}{'' if n == 1 else 's'}"

@@ -5,12 +5,12 @@ a number, and so may its derivative, which a product with zero does not remove. 
 its place, so that values and derivatives of any order, forward and reverse, never see it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 
 from .functions import TABLE
 from .node import Node, postorder
 
-Literal = tuple[Node, bool]
+Literal = tuple[Hashable, bool]
 Needed = frozenset[frozenset[Literal]]  # a union of intersections of conditions and their negations
 
 ALWAYS: Needed = frozenset([frozenset()])
@@ -39,21 +39,23 @@ def needed_where(roots: Sequence[Node]) -> dict[Node, Needed]:
         here = needed[node]
         if node.operation == "select":
             condition, yes, no = node.arguments
-            needed[condition] = _union(needed[condition], here)
-            needed[yes] = _union(needed[yes], _within(here, (condition, True)))
-            needed[no] = _union(needed[no], _within(here, (condition, False)))
+            needed[condition] = union(needed[condition], here)
+            needed[yes] = union(needed[yes], within(here, (condition, True)))
+            needed[no] = union(needed[no], within(here, (condition, False)))
         else:
             for argument in node.arguments:
-                needed[argument] = _union(needed[argument], here)
+                needed[argument] = union(needed[argument], here)
     return needed
 
 
-def _within(needed: Needed, literal: Literal) -> Needed:
+def within(needed: Needed, literal: Literal) -> Needed:
+    """What is needed there, where a condition holds, or does not, as well."""
     opposite = (literal[0], not literal[1])
     return frozenset(parts | {literal} for parts in needed if opposite not in parts)
 
 
-def _union(a: Needed, b: Needed) -> Needed:
+def union(a: Needed, b: Needed) -> Needed:
+    """What is needed in either case."""
     if a is b or not b:
         return a
     return _shortened(a | b) if a else b

@@ -4,6 +4,7 @@ from collections.abc import Hashable, Mapping
 
 from .functions import TABLE, apply
 from .node import ONE, ZERO, Node, leaf, linear, multiply, postorder, power, scale, select
+from .smooth import marked
 
 
 def directional_derivative(node: Node, direction: Mapping[Hashable, Node]) -> Node:
@@ -39,6 +40,8 @@ def _slope(n: Node, inner: list[Node]) -> Node:
     if operation == "select":
         condition, _, _ = n.arguments
         return select(condition, inner[1], inner[2])
+    if operation == "smooth":
+        return marked(inner[0])
     if operation == "power":
         base, exponent = n.arguments
         terms = []

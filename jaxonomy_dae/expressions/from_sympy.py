@@ -26,6 +26,7 @@ from .node import (
     power,
     select,
 )
+from .smooth import Smooth, marked
 from .without_overflow import logarithm, logarithm_of_one_plus, product, raised
 
 
@@ -55,8 +56,9 @@ def symbols_of(expression: Any) -> set[sympy.Symbol]:
     return {a for a in atoms_of(expression) if isinstance(a, sympy.Symbol)}
 
 
-def read(expression: Any, label: Callable[[Any], Hashable]) -> Node:
-    """The graph of a SymPy expression; a symbol becomes the leaf `label(symbol)`.
+def read(expression: Any, label: Callable[[Any], Hashable], marks: bool = False) -> Node:
+    """The graph of a SymPy expression; a symbol becomes the leaf `label(symbol)`. What is marked as smooth is so in the
+    graph only if `marks` are asked for.
 
     **Raises:**
 
@@ -68,16 +70,27 @@ def read(expression: Any, label: Callable[[Any], Hashable]) -> Node:
         e, finished = stack.pop()
         if id(e) in known:
             continue
-        inside = _inside(e)
+        inside = parts_of(e)
         if finished or not inside:
-            known[id(e)] = leaf(label(e)) if isinstance(e, sympy.Symbol) else _read(e, [known[id(a)] for a in inside])
+            if isinstance(e, sympy.Symbol):
+                known[id(e)] = leaf(label(e))
+            elif isinstance(e, Smooth):
+                known[id(e)] = marked(known[id(inside[0])]) if marks else known[id(inside[0])]
+            else:
+                known[id(e)] = _read(e, [known[id(a)] for a in inside])
         else:
             stack.append((e, True))
             stack.extend((a, False) for a in inside if id(a) not in known)
     return known[id(expression)]
 
 
-def _inside(e: Any) -> Sequence[Any]:
+def parts_of(e: Any) -> Sequence[Any]:
+    """The expressions that a SymPy expression is made of.
+
+    **Raises:**
+
+    - `UnsupportedExpression` for integrals and the like, which have no value at a point.
+    """
     if isinstance(e, sympy.Piecewise):
         return [part for pair in e.args for part in pair.args]
     if isinstance(e, sympy.Integral | sympy.Sum | sympy.Product | sympy.Derivative | sympy.Subs):

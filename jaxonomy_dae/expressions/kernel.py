@@ -30,7 +30,7 @@ class Kernel:
         guard = {n: needed[n] for n in needed if needed[n] != ALWAYS and is_partial(n)}
 
         def before(node: Node):
-            conditions = {c for part in guard.get(node, ()) for c, _ in part}
+            conditions: set[Any] = {c for part in guard.get(node, ()) for c, _ in part}
             return (*node.arguments, *sorted(conditions, key=lambda c: c.digest))
 
         order = postorder(roots, before)

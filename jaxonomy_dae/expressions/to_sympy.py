@@ -8,6 +8,7 @@ import sympy
 
 from .functions import TABLE
 from .node import Node, Number, postorder
+from .smooth import Smooth
 
 
 def write(node: Node, symbol: Callable[[Hashable], Any]) -> Any:
@@ -38,6 +39,7 @@ def _write(n: Node, inside: list[Any]) -> Any:
 
 _OPERATIONS: dict[str, Callable[..., Any]] = {
     "power": sympy.Pow,
+    "smooth": Smooth,
     "select": lambda c, a, b: sympy.Piecewise((a, c), (b, True)),
     "true": lambda: sympy.true,
     "false": lambda: sympy.false,

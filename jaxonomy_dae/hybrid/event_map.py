@@ -10,6 +10,8 @@ second derivative is not that of the flow, and is refused. A clock ticks at τ =
 parameters, in the same manner.
 """
 
+import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -22,21 +24,25 @@ from ..adjoint.closure_conversion import any_member, written
 from ..adjoint.resting import still
 from .first_order import constant_once
 from .problem import AbstractHybridProblem, HybridState, one_hot
+from .side import ABOVE, BELOW, RESTS, rounding
 
 CONDITIONS_AT_ONE_INSTANT = 32  # more than these take another step, of no length to speak of
-SMALL = 1e-12  # of a guard's size in the step before: counts as zero
-REACHED = 1e-9  # of that size: counts as zero at an instant that the guard has reached
-CLOSE = 0.01  # of that size: what is farther away is not at zero, however fast it is
-FLAT = 1e-9  # of that size, over a step: a change so small may be one of rates alone
-ROUNDING = 1e-12  # of that size, over a step: counts as no change
+CLOSE = 0.01  # of a guard's size: what is farther away is not at zero, however fast it is
 STEADY = 0.1  # of a slope: a change during the delay that leaves it worth following back
-AHEAD = 1e-3  # of a step: how far ahead a guard that is flat at zero is looked at
+# Of a step: how far ahead the rate of a guard at zero is looked at, for the sign of its second derivative. That is
+# found up to a part AHEAD, and rounding in it is 1/AHEAD times that of rates.
+AHEAD = 1e-3
+# Steps within which a guard leaves the band about zero that is really pulled out of it: rounding in the forces on what
+# is at rest takes longer.
+SINKING = 4.0
+# How often relations may turn while time does not go on, beside so often for each. Beyond, they turn back and forth.
+SLIDES, TURNS = 64, 4
 
 
 class Instant(eqx.Module):
     """An instant while it is handled: the events that are left, which of them were made true by another event, the
-    delay δ of the last one, the discrete values before the instant, dx/dt after the last event, and the state before
-    the instant."""
+    delay δ of the last one, the discrete values before the instant, dx/dt after the last event, the state before
+    the instant, and which guards an event has left at zero, about to fall."""
 
     state: HybridState
     left: Any
@@ -45,6 +51,7 @@ class Instant(eqx.Module):
     previous: Any
     slope: Any
     arrived: Any
+    stuck: Any
 
 
 class Arrival(NamedTuple):
@@ -54,7 +61,7 @@ class Arrival(NamedTuple):
     - `rate`: how fast the guards change, shape (guards,); at the initial time only.
     - `due`: which events happen, shape (clocks + guards,).
     - `jumped`: which guards jumped over zero, so that their events do not move in time, shape (guards,).
-    - `size`: of the guards of late, shape (guards,).
+    - `size`: of the guards so far, shape (guards,).
     - `window`: the time within which a guard counts as having reached zero; `span`: how long steps have been of late.
     """
 
@@ -77,6 +84,7 @@ def handle(
     c, g = problem.n_clocks, problem.n_guards
     noted = jnp.asarray(problem.noted)
     ends = jnp.asarray(problem.ends).astype(t.dtype)
+    relations = jnp.asarray(problem.relations)
 
     def one(instant: Instant) -> Instant:
         state, q, before = instant.state, instant.state.q, instant.slope
@@ -106,7 +114,14 @@ def handle(
         ticks = state.ticks + one_hot(event, c).astype(state.ticks.dtype)
         logged = (~is_clock & noted[event] & (not at_start)) | (ends[event] > 0)
         row = jnp.where(logged, state.count.astype(int), state.times.shape[0] + 1)
-        after, slow, armed, left, caused = _following(problem, t, x, new, instant, event, arrival, delay, args)
+        moved = jnp.any(x != reached) & ~relations[event]
+        approach = jnp.where(instant.caused[k] | at_start, 0.0, rate) if g else rate
+        after, slow, armed, left, caused, stuck = _following(
+            problem, t, x, new, instant, event, arrival, delay, moved, approach, args
+        )
+        turns = state.turns + relations[event].astype(t.dtype)
+        slides = relations[event] & (turns > SLIDES + TURNS * sum(problem.relations))
+        again = jnp.where(slides, event, jnp.where(jnp.any(stuck), c + jnp.argmax(stuck), -1)) if g else jnp.array(-1)
         # What is too fast to be followed back, as a current that a blocked diode stops, has that value at once.
         back = delay - (1.0 - slow) * lax.stop_gradient(delay)
         state = HybridState(
@@ -123,24 +138,35 @@ def handle(
             _noted(state.which, row, event),
             _noted(state.rate, row, lax.stop_gradient(rate)),
             jnp.maximum(state.ended, ends[event]),
+            again.astype(t.dtype),
+            turns,
             _noted(state.before, row, jnp.concatenate([reached, q])),
             _noted(state.after, row, jnp.concatenate([x, new])),
         )
         # Clocks that tick together read what was before all of them.
         previous = jnp.where(jnp.any(left[:c]), instant.previous, new) if c else new
-        return Instant(state, left, caused, delay, previous, after, instant.arrived)
+        return Instant(state, left, caused, delay, previous, after, instant.arrived, stuck)
 
-    def step(instant: Instant, _: None) -> tuple[Instant, None]:
-        going = jnp.any(instant.left)
+    def while_any_is_left(step: Callable[[Instant], Instant], times: int) -> Callable[[Instant], Instant]:
+        def once(instant: Instant, _: None) -> tuple[Instant, None]:
+            going = jnp.any(instant.left)
 
-        def go(instant: Instant) -> Instant:
-            return jax.tree.map(lambda a, b: jnp.where(going, a, b), one(instant), instant)
+            def go(instant: Instant) -> Instant:
+                return jax.tree.map(lambda a, b: jnp.where(going, a, b), step(instant), instant)
 
-        return lax.cond(any_member(going), go, lambda instant: instant, instant), None
+            return lax.cond(any_member(going), go, lambda instant: instant, instant), None
 
-    start = Instant(state, arrival.due, arrival.jumped, jnp.zeros_like(t), state.q, arrival.slope, state.x)
+        return lambda instant: lax.scan(once, instant, length=times)[0]
+
+    none = jnp.zeros((g,), bool)
+    start = Instant(state, arrival.due, arrival.jumped, jnp.zeros_like(t), state.q, arrival.slope, state.x, none)
     length = c + min(2 * g, CONDITIONS_AT_ONE_INSTANT)
-    instant, _ = lax.scan(step, start, length=length)
+    # Of a thousand clocks, few tick at once: loops in a loop pass over the others in √1000 steps.
+    inner = max(math.isqrt(length), min(length, CONDITIONS_AT_ONE_INSTANT))
+    handled = while_any_is_left(one, inner)
+    if length > inner:
+        handled = while_any_is_left(handled, -(-length // inner))
+    instant = handled(start)
     return instant.state, instant.slope
 
 
@@ -149,17 +175,22 @@ def _noted(rows: Any, row: Any, value: Any) -> Any:
     return rows.at[row].set(value.astype(rows.dtype), mode="drop") if rows.shape[0] else rows
 
 
-def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, delay, args):
+def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, delay, moved, approach, args):
     """(dx/dt, in which states it hardly changes during the delay, armed guards, events left, which guards an event made
-    true) after an event, not differentiated."""
+    true, which are stuck) after an event, not differentiated.
+
+    `moved` says whether it wrote states, `approach` how fast its guard fell before, or zero.
+    """
     c, g = problem.n_clocks, problem.n_guards
     left = instant.left & ~one_hot(event, c + g)
     if not g:
-        return problem.slope(t, x, q, args), jnp.ones_like(x), instant.state.armed, left, instant.caused
+        return problem.slope(t, x, q, args), jnp.ones_like(x), instant.state.armed, left, instant.caused, instant.stuck
     problem, t, x, q, delay, args = still(constant_once((problem, t, x, q, delay, args)))
     instant = still(instant)
     here = event - c == jnp.arange(g)
-    rounding = jnp.where(left[c:], REACHED, SMALL) * arrival.size
+    rested = here & (instant.state.armed == RESTS)
+    turns_back = jnp.asarray(problem.opposite)[jnp.clip(event - c, 0, g - 1)] == jnp.arange(g)
+    band = rounding(arrival.size)
     ahead = AHEAD * arrival.span
 
     def within(rate):
@@ -167,10 +198,11 @@ def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, dela
         return jnp.minimum(jnp.abs(rate) * arrival.window, CLOSE * arrival.size)
 
     def is_zero(value, rate):
-        return jnp.abs(value) <= jnp.maximum(rounding, within(rate))
+        return jnp.abs(value) <= jnp.maximum(band, within(rate))
 
     def is_flat(value, rate):
-        return is_zero(value, rate) & (jnp.abs(rate) * arrival.span <= FLAT * arrival.size)
+        """Whether its rate may not take it out of the band: it is too small for that, or was too small before."""
+        return is_zero(value, rate) & ((jnp.abs(rate) * ahead <= band) | rested)
 
     # Slopes, guards and their rates after the event, with what was before it, before the delay, and, where a guard is
     # flat, a little ahead: in a loop, for XLA compiles the equations as often as they are written.
@@ -178,7 +210,7 @@ def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, dela
         k, slopes, values, rates = carry
         slope = slopes[0]
         places = jnp.stack([x, instant.arrived, x - slope * delay, x + slope * ahead])
-        time = jnp.where(k == 3, t + ahead, t)
+        time = t + jnp.stack([delay, jnp.zeros_like(t), jnp.zeros_like(t), ahead])[k]
         own = problem.slope(time, places[k], q, args)
         slopes = written(slopes, k, own)
         value, rate = problem.rates(time, places[k], q, args, jnp.where((k == 0) | (k == 3), own, slope))
@@ -193,17 +225,33 @@ def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, dela
     _, (slope, _, earlier, _), values, rates = lax.while_loop(unfinished, look, begin)
     slow = (jnp.abs(earlier - slope) <= STEADY * jnp.abs(slope)).astype(x.dtype)
     (value, at_arrival, _, _), (rate, rate_there, _, rate_ahead) = values, rates
+    reached = at_arrival <= jnp.maximum(band, within(rate_there))
+    # What was to happen is at zero if it is not farther from it than it was when the instant began.
+    zero = is_zero(value, rate) | (left[c:] & reached & (jnp.abs(value) <= jnp.abs(at_arrival)))
     # A force that keeps a contact closed leaves a guard of the open contact at zero without a slope: what it does next
     # decides. One that seems to fall by rounding alone is waited for: if it does fall, the next step finds it.
-    falling = jnp.where(is_flat(value, rate), 0.5 * (rate + rate_ahead), rate)
-    zero = is_zero(value, rate)
-    true = jnp.where(zero, falling * arrival.span < -ROUNDING * arrival.size, value < 0)
-    was_armed = (instant.state.armed > 0.5) & ~here
+    flat = is_flat(value, rate)
+    falling = jnp.where(flat, 0.5 * (rate + rate_ahead), rate)
+    true = jnp.where(zero, falling * arrival.span < -band, value < 0)
+    was_armed = ((instant.state.armed > 0) & ~here) | (turns_back & (event >= c))
     # What this event made true happens next. What was to happen does so, though a state starts anew: unless what was
     # assigned makes its condition false, or it is revocable and undone.
-    reached = at_arrival <= jnp.maximum(SMALL * arrival.size, within(rate_there))
     stands = left[c:] & ~np.array(problem.revocable[c:], bool) & reached
     caused = ((was_armed & true) | stands) & ~zero
     next_ones = ((was_armed | left[c:]) & true & ~here) | stands
-    armed = jnp.where(true, next_ones, True)
-    return slope, slow, armed.astype(instant.state.armed.dtype), jnp.concatenate([left[:c], next_ones]), caused
+    side = jnp.where(zero, jnp.where(was_armed | (falling * arrival.span > band), RESTS, BELOW), ABOVE)
+    side = jnp.where(true, jnp.where(next_ones, ABOVE, BELOW), side)
+    # The guard of the event itself, if it is left at zero: by how much of its speed it falls on, or has turned. Less
+    # than the root of eps has stopped it: a speed beside others of which it is the difference has no more digits.
+    slowest = jnp.sqrt(jnp.finfo(x.dtype).eps) * jnp.abs(approach)
+    own = jnp.where(jnp.where(moved, rate >= -slowest, rate > slowest), RESTS, BELOW)
+    side = jnp.where(here & zero, own, side)
+    # One that was stopped, or turned, by what the event wrote, but is pulled back before it has left the band: the
+    # event would happen again and again at one instant.
+    pull = jnp.maximum(rate - rate_ahead, 0.0) / ahead
+    rise = jnp.maximum(rate, 0.0)
+    sinks = pull * (SINKING * arrival.span) >= rise + jnp.sqrt(rise**2 + 4 * pull * band)
+    held = flat & (pull > 0) & (rise**2 <= 4 * pull * band) & sinks  # it would rise to twice the band
+    stuck = ((here & moved & (side == RESTS)) | instant.stuck) & held
+    side = side.astype(instant.state.armed.dtype)
+    return slope, slow, side, jnp.concatenate([left[:c], next_ones]), caused, stuck

@@ -39,7 +39,7 @@ def _refused(primals, tangents):
     if not isinstance(tangent, SymbolicZero):
         raise ModelError(
             "second derivatives through events are not computed: the map of an event is exact to first order. Take "
-            "differences of gradients"
+            "differences of gradients; or, if the events are relations in equations, leave these alone with smooth(...)"
         )
     return value, jnp.zeros_like(value)
 

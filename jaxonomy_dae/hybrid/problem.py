@@ -25,6 +25,8 @@ class AbstractHybridProblem(eqx.Module):
     immediate: eqx.AbstractVar[tuple[bool, ...]]  # which happen at the initial time, if their conditions hold there
     noted: eqx.AbstractVar[tuple[bool, ...]]  # which are counted and listed
     revocable: eqx.AbstractVar[tuple[bool, ...]]  # which another event may undo before they happen
+    relations: eqx.AbstractVar[tuple[bool, ...]]  # which say what a relation is, from the initial time on
+    opposite: eqx.AbstractVar[tuple[int, ...]]  # of each guard: the one that falls where its relation turns back, or −1
     resolution: eqx.AbstractVar[Any]  # a time that is nothing beside the run, but more than rounding
 
     @abc.abstractmethod
@@ -50,13 +52,20 @@ class AbstractHybridProblem(eqx.Module):
         """(x, q) after an event, consistent; `previous` are the discrete values before the instant."""
 
     @abc.abstractmethod
+    def settled(
+        self, t: Any, x: Float[Array, " n"], q: Float[Array, " q"], events: Bool[Array, " events"], args: Any
+    ) -> Float[Array, " q"]:
+        """q after several events that assign discrete values, each by what was before all of them."""
+
+    @abc.abstractmethod
     def clocks(self) -> tuple[Float[Array, " clocks"], Float[Array, " clocks"]]:
-        """Periods and offsets of the sampled events."""
+        """Periods and offsets of the sampled events; of one that happens once, the period is infinite."""
 
     def due(self, ticks: Float[Array, " clocks"]) -> Float[Array, " clocks"]:
         """When each sampled event happens next, after so many ticks."""
         period, offset = self.clocks()
-        return offset + ticks * period
+        ticks = jax.lax.stop_gradient(ticks)
+        return offset + jnp.where(ticks == 0, 0.0, ticks * period)
 
     def slope(self, t: Any, x: Any, q: Any, args: Any) -> Float[Array, " n"]:
         """dx/dt, a constant of first derivatives."""
@@ -75,14 +84,16 @@ class AbstractHybridProblem(eqx.Module):
 class HybridState(eqx.Module):
     """What is integrated: the state `x`, the discrete values `q`, and the bookkeeping of events.
 
-    - `armed`: 1.0 for guards that have been positive since their event.
-    - `size`, `span`: how large the guards, and how long the steps, have been of late.
+    - `armed`: on which side of zero the guards are: `side.ABOVE`, `side.RESTS` or `side.BELOW`.
+    - `size`: how large the guards have been so far; `span`: how long the steps have been of late.
     - `request`: where the step that was tried should have ended, or infinity.
     - `ticks`, `due`: how often each clock has ticked, and when it does next.
     - `count`, `times`, `which`, `rate`: how many events there were, and of the first ones the time, the number of the
         event and how fast its guard fell.
     - `before`, `after`: (x, q) at the times of the first events, on both sides; no rows if they are not asked for.
-    - `ended`: 1.0 once an event has ended the run.
+    - `ended`: 1.0 once an event has ended the run; `stuck`: the number of one that happens again and again at one
+        instant, else −1.
+    - `turns`: how often relations have turned without time going on.
     """
 
     x: Float[Array, " n"]
@@ -98,6 +109,8 @@ class HybridState(eqx.Module):
     which: Float[Array, " events"]
     rate: Float[Array, " events"]
     ended: Float[Array, ""]
+    stuck: Float[Array, ""]
+    turns: Float[Array, ""]
     before: Float[Array, "rows m"]
     after: Float[Array, "rows m"]
 

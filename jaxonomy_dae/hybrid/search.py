@@ -16,7 +16,10 @@ def first_crossing(
     """The first zero of the guards that are `falling`, positive at `low` and not so at `high`.
 
     The Illinois variant of regula falsi (Dowell & Jarratt 1971) on the guard that comes first by linear interpolation;
-    bisection now and then, and while the bracket begins where a guard is zero because its event has just been.
+    bisection now and then, while the bracket begins where a guard is nearly zero because its event has just been, and
+    while it ends where one is exactly zero, for it may have been so for long. Of a guard that stays at zero, as
+    max(1 − t, 0) does, the last time at which it is positive is returned: there it still has the rate at which it
+    falls.
     """
     one = jnp.array(1, jnp.int32)
     eps = jnp.finfo(jnp.result_type(high)).eps
@@ -33,7 +36,8 @@ def first_crossing(
         width = high - low
         t = jnp.clip(estimate(low, high, at_low, at_high), low + 1e-13 * width, high - 1e-13 * width)
         begins_at_zero = (low == start) & jnp.any(falling & (at_high <= 0) & (at_low <= 1e-6 * jnp.abs(at_high)))
-        t = jnp.where((k % BISECT_EVERY == BISECT_EVERY - 1) | begins_at_zero, 0.5 * (low + high), t)
+        ends_at_zero = jnp.any(falling & (at_high == 0))
+        t = jnp.where((k % BISECT_EVERY == BISECT_EVERY - 1) | begins_at_zero | ends_at_zero, 0.5 * (low + high), t)
         value = guards(t)
         hit = jnp.any(falling & (value <= 0))
         again = jnp.where(hit, side == 1, side == -1)
@@ -56,5 +60,5 @@ def first_crossing(
 
     zero = jnp.zeros_like(one)
     carry = (low, high, jnp.maximum(at_low, 0.0), at_high, zero, high, high - low, zero)
-    *_, last, _, _ = lax.while_loop(unfinished, body, carry)
-    return last
+    low, high, _, _, _, last, _, _ = lax.while_loop(unfinished, body, carry)
+    return jnp.where(high - low <= 2 * floor, low, last)

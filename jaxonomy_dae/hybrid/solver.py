@@ -11,9 +11,10 @@ from jax import lax
 
 from ..adjoint.closure_conversion import any_member
 from ..adjoint.resting import still
-from .event_map import REACHED, Arrival, handle
+from .event_map import AHEAD, CLOSE, Arrival, handle
 from .problem import HybridState
 from .search import first_crossing
+from .side import ABOVE, BELOW, RESTS, rounding
 from .term import bound, problem_of
 
 WINDOW = 1e-6  # of a step: a guard that reaches zero so close to its end counts as having done so
@@ -23,11 +24,11 @@ WINDOW = 1e-6  # of a step: a guard that reaches zero so close to its end counts
 LOOKS = np.array([0.0, 0.13, 0.31, 0.5, 0.67, 0.86, 1.0])
 FITTED = [0, 3, 6]
 BEND = 0.1
-DEPTH = 1e-9  # of a guard's size: what a parabola must reach below zero, beside what it leaves in doubt
-FORGOTTEN = 0.8  # what a step leaves of how large guards were, and how long steps: next to events they are short
-NEARLY = 0.01  # of a guard's size in the step: beyond that it is not at zero at its end
+FORGOTTEN = 0.8  # what a step leaves of how long steps have been: next to events they are short
+MOVED = 1e3  # times the resolution: a step so long goes on
 
 TOO_MANY: Any = diffrax.RESULTS.max_steps_rejected  # events
+STUCK: Any = diffrax.RESULTS.stagnation  # an event happens again and again at one instant
 NOT_FINITE: Any = diffrax.RESULTS.nonlinear_divergence  # what an event wrote
 
 
@@ -139,8 +140,9 @@ class WithEvents(diffrax.AbstractWrappedSolver):
         )
         dense = _Dense(solver.interpolation_cls, info)
         request, armed, arrival = _looked_at(problem, dense, t0, t1, y0, x1, args)
-        changed = x1, armed, arrival.size, arrival.span, jnp.full_like(t1, jnp.inf)
-        state = eqx.tree_at(lambda y: (y.x, y.armed, y.size, y.span, y.request), y0, changed)
+        turns = jnp.where(t1 - t0 > MOVED * problem.resolution, jnp.zeros_like(y0.turns), y0.turns)
+        changed = x1, armed, arrival.size, arrival.span, jnp.full_like(t1, jnp.inf), turns
+        state = eqx.tree_at(lambda y: (y.x, y.armed, y.size, y.span, y.request, y.turns), y0, changed)
         fired = jnp.any(arrival.due)
 
         def events(state):
@@ -153,11 +155,12 @@ class WithEvents(diffrax.AbstractWrappedSolver):
         finite = jnp.all(jnp.isfinite(y1.x)) & jnp.all(jnp.isfinite(y1.q))
         result = diffrax.RESULTS.where(fired & ~finite & jnp.all(jnp.isfinite(x1)), NOT_FINITE, result)
         result = diffrax.RESULTS.where(y1.count > self.max_events, TOO_MANY, result)
+        result = diffrax.RESULTS.where((y1.stuck >= 0) & (y1.ended == 0), STUCK, result)
         return y1, y_error, dense_info, (inner_state, fired), result
 
 
 def _looked_at(problem, dense, t0, t1, y0: HybridState, x1, args):
-    """(the end of the step to take instead, or infinity; which guards are armed at its end; what it meets there), not
+    """(the end of the step to take instead, or infinity; on which side guards are at its end; what it meets there), not
     differentiated."""
     problem, dense, t0, t1, y0, x1, args = still((problem, dense, t0, t1, y0, x1, args))
     h, q, g = t1 - t0, y0.q, problem.n_guards
@@ -173,20 +176,18 @@ def _looked_at(problem, dense, t0, t1, y0: HybridState, x1, args):
         before = lax.cond(any_member(jnp.any(ticking)), slope, lambda: jnp.zeros_like(x1))
         return jnp.full_like(t1, jnp.inf), y0.armed, Arrival(before, y0.size, ticking, none, y0.size, window, span)
 
-    def guards(t):
-        return problem.guards(t, dense(t0, t1, t), q, args) - zero
-
     times = jnp.append(t0 + h * jnp.asarray(LOOKS[:-1], t1.dtype), t1)
     states = jnp.concatenate([jax.vmap(lambda t: dense(t0, t1, t))(times[:-1]), x1[None]])
     values = jax.vmap(lambda t, x: problem.guards(t, x, q, args))(times, states)
-    # One that an event left at zero may begin below it, by rounding: then that is its zero.
-    by_rounding = (y0.armed > 0.5) & (values[0] >= -REACHED * y0.size)
-    zero = jnp.where(by_rounding, jnp.minimum(values[0], 0.0), 0.0)
-    values = values - zero
     size = jnp.max(jnp.abs(values), axis=0)
-    # A guard that was positive anywhere before is armed.
-    positive = jnp.concatenate([(y0.armed > 0.5)[None], values[1:] > 0])
-    armed = lax.associative_scan(jnp.logical_or, positive)
+    largest = jnp.maximum(size, y0.size)
+    band = rounding(largest)
+    # What has left the band above zero anywhere before is above, and armed, as is what rests.
+    rises = jnp.concatenate([(y0.armed == ABOVE)[None], values[1:] > band])
+    above = lax.associative_scan(jnp.logical_or, rises)
+    armed = above | (y0.armed == RESTS)
+    raised = jnp.where((y0.armed == RESTS) & ~above, band, 0.0)  # what rests falls where it leaves the band
+    values = values + raised
     # One may also reach zero and stay.
     crossed = armed[:-1] & ((values[1:] < 0) | ((values[1:] == 0) & (values[:-1] > 0)))
     last = values[-1]
@@ -194,14 +195,16 @@ def _looked_at(problem, dense, t0, t1, y0: HybridState, x1, args):
     def at_end():
         before = slope()
         _, rate = problem.rates(t1, x1, q, args, before)
-        return before, (rate < 0) & (jnp.abs(last) <= -rate * window)
+        # A step that was to end at zero does so up to rounding in what the guard is the difference of.
+        rounded = jnp.minimum(band, -rate * (AHEAD * span))
+        return before, (rate < 0) & (jnp.abs(last) <= jnp.maximum(-rate * window, rounded))
 
     short = h <= 4 * problem.resolution
-    doubtful = jnp.any(armed[-1] & (last <= NEARLY * size)) | jnp.any(ticking) | short
+    doubtful = jnp.any(armed[-1] & (last <= CLOSE * size)) | jnp.any(ticking) | short
     before, near = lax.cond(any_member(doubtful), at_end, lambda: (jnp.zeros_like(x1), jnp.zeros((g,), bool)))
     near = near & armed[-1]
     off = jnp.max(jnp.abs(jnp.asarray(_OFF_PARABOLA, values.dtype) @ values), axis=0)
-    bent = jnp.any(off > BEND * size)
+    bent = jnp.any(off > jnp.maximum(BEND * size, band))
     long = h > 1e3 * jnp.maximum(WINDOW * h, problem.resolution)
     bent = bent & long
     # In a step too short to be parted, what has crossed has jumped.
@@ -212,18 +215,23 @@ def _looked_at(problem, dense, t0, t1, y0: HybridState, x1, args):
 
     def located():
         place = jnp.argmax(jnp.any(crossed, axis=1))
+
+        def guards(t):
+            return problem.guards(t, dense(t0, t1, t), q, args) + raised[place + 1]
+
         return first_crossing(
             guards, crossed[place], times[place], times[place + 1], values[place], values[place + 1], inside
         )
 
     where = lax.cond(any_member(inside), located, lambda: t1)
     where = jnp.maximum(where, t0 + 2 * problem.resolution)
-    dip = jnp.where(long, _dip(values, armed, jnp.any(crossed, axis=0), 2 * off - DEPTH * size), jnp.inf)
+    dip = jnp.where(long, _dip(values, armed, jnp.any(crossed, axis=0), 2 * off - band), jnp.inf)
     request = jnp.minimum(jnp.where(inside, where, jnp.inf), t0 + dip * h)
     request = jnp.where(bent, t0 + 0.5 * h, request)
     due = jnp.concatenate([ticking, near]) & ~jnp.isfinite(request)
-    arrival = Arrival(before, y0.size, due, jumped, jnp.maximum(size, FORGOTTEN * y0.size), window, span)
-    return request, armed[-1].astype(y0.armed.dtype), arrival
+    arrival = Arrival(before, y0.size, due, jumped, largest, window, span)
+    side = jnp.where(above[-1], ABOVE, jnp.where(armed[-1], RESTS, BELOW))
+    return request, side.astype(y0.armed.dtype), arrival
 
 
 def _dip(values, armed, crossed, doubt):

@@ -6,8 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from ..adjoint.resting import still
 from .event_map import Arrival, handle
 from .problem import AbstractHybridProblem, HybridState
+from .side import ABOVE, BELOW, RESTS
+
+ROUNDS = 4  # relations within relations
 
 
 def start(
@@ -22,22 +26,58 @@ def start(
     nothing, infinite = jnp.zeros((), dtype), jnp.full((logged,), jnp.inf, dtype)
     period, offset = (lax.stop_gradient(v) for v in problem.clocks())
     tolerance = problem.resolution
-    ticks = jnp.maximum(jnp.ceil((t0 - tolerance - offset) / period), 0.0)
+    passed = t0 - tolerance - offset
+    ticks = jnp.where(jnp.isinf(period), (passed > 0).astype(dtype), jnp.ceil(passed / period))
+    relations = np.array(problem.relations, bool)
+    ticks = jnp.where(relations[:c], ticks, jnp.maximum(ticks, 0.0))  # relations have turned at all times
     armed = size = rate = jnp.zeros((0,), dtype)
     holding = jnp.zeros((0,), bool)
+    if relations.any():
+        due = problem.due(ticks) <= t0 + tolerance
+        q0 = _with_relations(problem, t0, x0, q0, due, args)
+        ticks = ticks + (due & relations[:c]).astype(dtype)
     if g:
-        value, rate = problem.rates(t0, x0, q0, args, problem.slope(t0, x0, q0, args))
-        holding = jnp.where(value == 0, rate < 0, value < 0)
-        armed, size = (~holding).astype(dtype), jnp.abs(value)
+        rate, holding, value = _conditions(problem, t0, x0, q0, args)
+        size = jnp.abs(value)
+        armed = jnp.where(holding, BELOW, jnp.where(value == 0, RESTS, ABOVE)).astype(dtype)
     rows = jnp.full((logged if sides else 0, len(x0) + len(q0)), jnp.nan, dtype)
     state = HybridState(
         x0, q0, armed, size, nothing, jnp.asarray(jnp.inf, dtype), ticks, lax.stop_gradient(problem.due(ticks)),
-        nothing, infinite, jnp.full_like(infinite, -1.0), jnp.zeros_like(infinite), nothing, rows, rows,
+        nothing, infinite, jnp.full_like(infinite, -1.0), jnp.zeros_like(infinite), nothing, nothing - 1.0, nothing,
+        rows, rows,
     )  # fmt: skip
-    at_once = np.array(problem.immediate[c:], bool)
-    if not c and not at_once.any():
+    at_once = np.array(problem.immediate[c:], bool) & ~relations[c:]
+    if relations[:c].all() and not at_once.any():
         return state
     due_conditions = holding & at_once
     due = jnp.concatenate([state.due <= t0 + tolerance, due_conditions])
     arrival = Arrival(jnp.zeros_like(x0), rate, due, jnp.zeros((g,), bool), size, tolerance, tolerance)
     return handle(problem, t0, state, arrival, args, at_start=True)[0]
+
+
+def _conditions(problem: AbstractHybridProblem, t0: Any, x0: Any, q0: Any, args: Any) -> tuple[Any, Any, Any]:
+    """How fast guards change at the initial time, which conditions hold, and the guards. One at zero is as it will be
+    at once."""
+    value, rate = problem.rates(t0, x0, q0, args, problem.slope(t0, x0, q0, args))
+    return rate, jnp.where(value == 0, rate < 0, value < 0), value
+
+
+def _with_relations(problem: AbstractHybridProblem, t0: Any, x0: Any, q0: Any, due: Any, args: Any) -> Any:
+    """The discrete values when all relations are what their sides say, or, if their clocks are `due`, what these write.
+    They do not move with parameters."""
+    c, g = problem.n_clocks, problem.n_guards
+    relations = np.array(problem.relations, bool)
+    problem, t0, x0, begin, due, args = still((problem, t0, x0, q0, due, args))
+
+    def settled(q: Any, clocks: Any, holding: Any) -> Any:
+        return problem.settled(t0, x0, q, jnp.concatenate([clocks, holding]) & relations, args)
+
+    def once(_: Any, q: Any) -> Any:
+        return settled(q, jnp.zeros((c,), bool), _conditions(problem, t0, x0, q, args)[1])
+
+    found, none = begin, jnp.zeros((g,), bool)
+    if relations[:c].any():
+        found = lax.fori_loop(0, 2, lambda k, q: settled(q, due | (k == 0), none), found)
+    if relations[c:].any():
+        found = lax.fori_loop(0, ROUNDS, once, found)
+    return jnp.where(found == begin, q0, found)

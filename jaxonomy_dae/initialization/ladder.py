@@ -171,7 +171,7 @@ def _climb(
     def evaluate(state: Machine) -> Machine:
         x = state.points[0, :n]
         value, jacobian = linearized(x)
-        probing, probe, unit = probed(state, value, jacobian, sizes)
+        probing, probe, unit = probed(state, value, jacobian, sizes, ~hard)
         size, noise = row_sizes(jacobian, x, sizes, unit)
         size = size + sizes.data
         reached = jnp.all(jnp.abs(value) <= close * size)

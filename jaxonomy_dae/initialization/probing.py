@@ -18,9 +18,12 @@ SIZED = -1.0 - len(PROBES)  # what `Scalars.begun` is when sizes have been found
 
 
 def probed(
-    state: Machine, value: Float[Array, " m"], jacobian: Float[Array, "m n"], sizes: Sizes
+    state: Machine, value: Float[Array, " m"], jacobian: Float[Array, "m n"], sizes: Sizes, soft: Any
 ) -> tuple[Any, Machine, Float[Array, " n"]]:
-    """Whether the sizes of unknowns are still being found; the next state if so; and the sizes."""
+    """Whether the sizes of unknowns are still being found; the next state if so; and the sizes.
+
+    What is left of a row that is `soft`, a guess, is how far the trial point is from it: not a size.
+    """
     dtype, n = value.dtype, jacobian.shape[1]
     where, one = jnp.where, jnp.ones((), dtype)
     begun, (trial, base, *others, stored) = state.scalars[3], state.points
@@ -33,7 +36,7 @@ def probed(
     growth = jnp.log(where(comparable, before / slopes, one)) / float(np.log(PROBES[0] / PROBES[1]))
     power = 1 + jnp.clip(growth, 0, 8)
     known_slopes = where(first, jacobian, where(flat[None, :] & ~last, jacobian, state.jacobian))
-    implied = column_sizes(value, known_slopes / power, sizes, power)
+    implied = column_sizes(where(soft, 0 * one, value), known_slopes / power, sizes, power)
     unit = where(first | last, implied, stored[:n])
     distance = where(first, PROBES[0], where(last, 0.0, PROBES[1]))
     trial = base + distance * jnp.append(where(flat, one, 0 * one), 0 * one)

@@ -26,6 +26,7 @@ from ..modeling import (
     Thermal,
     Value,
     der,
+    smooth,
 )
 from .arguments import count, increasing, row
 from .electrical.two_pin import TwoPin
@@ -83,7 +84,7 @@ class _Cell(TwoPin):
         start = self.parameter("initial_soc", initial_soc, unit="1")
         z = self.variable("soc", start=start, fixed=True, unit="1")
         voltage, current = self._two_pins()
-        reacting = current - (1 - efficiency) * Max(current, 0)
+        reacting = current - (1 - efficiency) * smooth(Max(current, 0))
         self.add_equations(Eq(charge * der(z), reacting))
         overpotentials, heat = sympy.Integer(0), sympy.Integer(0)
         for k, (resistance, capacity, start) in enumerate(zip(R, C, starts, strict=True), start=1):

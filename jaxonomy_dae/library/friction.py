@@ -9,7 +9,19 @@ from typing import Any
 
 from sympy import Abs, And, Max, Ne, Piecewise, sign
 
-from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Rotational, Translational, Value, assign, der
+from ..modeling import (
+    NONNEGATIVE,
+    POSITIVE,
+    Component,
+    Eq,
+    EqnEnv,
+    Rotational,
+    Translational,
+    Value,
+    assign,
+    der,
+    smooth,
+)
 from .arguments import in_order
 
 STANDSTILL = 1e-6  # m/s or rad/s
@@ -71,7 +83,7 @@ class Clutch(Component):
             Eq(w, der(phi)),
             Eq(b.tau, tau),
             Eq(a.tau + b.tau, 0),
-            Eq(slipping, coefficient * geometry * largest * Max(u, 0)),
+            Eq(slipping, coefficient * geometry * largest * smooth(Max(u, 0))),
         )
         stick_slip(self, w, tau, slipping, ratio * slipping, pressed=u)
         self.declare_dissipation(tau * w)
@@ -92,7 +104,7 @@ class Brake(Component):
         u = self.input("u", unit="1")
         w = self.variable("w", unit="rad/s")
         slipping = self.variable("slipping", unit="N*m")
-        self.add_equations(Eq(w, der(flange.phi)), Eq(slipping, coefficient * geometry * largest * Max(u, 0)))
+        self.add_equations(Eq(w, der(flange.phi)), Eq(slipping, coefficient * geometry * largest * smooth(Max(u, 0))))
         stick_slip(self, w, flange.tau, slipping, ratio * slipping, pressed=u)
         self.declare_dissipation(flange.tau * w)
 
@@ -143,7 +155,7 @@ class OneWayClutch(Component):
             Eq(w, der(b.phi - a.phi)),
             Eq(b.tau, -tau),
             Eq(a.tau + b.tau, 0),
-            Eq(slipping, coefficient * geometry * largest * Max(u, 0)),
+            Eq(slipping, coefficient * geometry * largest * smooth(Max(u, 0))),
         )
         self.either(Eq(locked, 1), der(w), tau + slipping)
         self.when(w <= 0, assign(locked, 1), on=Eq(locked, 0), at_start=True)

@@ -12,6 +12,7 @@ import numpy as np
 from sympy import Max, Min
 
 from ..errors import ModelError
+from ..modeling import smooth
 
 KINDS = ("linear", "cubic")
 
@@ -44,7 +45,7 @@ def _interpolated(u: Any, x: tuple[float, ...], values: tuple[Any, ...], kind: s
         value += slope * inside + 2 * bend * inside**2 - bend / width * inside**3
         integral += slope * inside**2 / 2 + 2 * bend * inside**3 / 3 - bend / width * inside**4 / 4 + rise * beyond
         before = chord
-    return value, integral
+    return smooth(value), smooth(integral)
 
 
 def known_kind(kind: str, name: str) -> str:

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from sympy import Piecewise, floor
+from sympy import Piecewise, frac
 
 from ..modeling import Component
 
@@ -15,6 +15,4 @@ def step(component: Component, start_time: Any) -> Any:
 def pulse(component: Component, period: Any, width: Any, start_time: Any) -> Any:
     """1 in the first part `width` of every `period` from `start_time` on, else 0."""
     cycle = (component.ev.t - start_time) / period
-    up, down = component.sampled(period, start_time), component.sampled(period, start_time + width * period)
-    edges = (up, Piecewise((1, width > 0), (0, True)), down, Piecewise((0, width < 1), (1, True)))
-    return Piecewise((1, component.relation((cycle >= 0) & (cycle - floor(cycle) < width), edges)), (0, True))
+    return Piecewise((1, component.relation((cycle >= 0) & (frac(cycle) < width))), (0, True))

@@ -13,7 +13,7 @@ import numpy as np
 import sympy
 
 from ..errors import ModelError
-from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Thermal, Value, der
+from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Thermal, Value, der, smooth
 from .arguments import row
 
 STEFAN_BOLTZMANN = 5.670374419e-8  # W/(m²·K⁴), CODATA 2018
@@ -84,7 +84,7 @@ class Radiation(_TwoPort):
         sigma = self.parameter("sigma", STEFAN_BOLTZMANN, unit="W/(m2*K4)", bounds=POSITIVE)
         _, flow = self._two_ports()
         # Continued below zero so that it still rises there: the search for a start finds no negative temperatures.
-        a, b = (T**3 * sympy.Abs(T) for T in (self.port_a.T, self.port_b.T))
+        a, b = (T**3 * smooth(sympy.Abs(T)) for T in (self.port_a.T, self.port_b.T))
         self.add_equations(Eq(flow, emissivity * sigma * area * (a - b)))
 
 

@@ -1,5 +1,6 @@
 """Lowering: the compiler's tables become the static plan of an `AcausalSystem`."""
 
+import dataclasses
 import hashlib
 from collections.abc import Sequence
 from typing import Any
@@ -15,9 +16,11 @@ from ..model.quantities import QuantityMap, quantity_scale
 from ..model.tables import ZERO, FlatModel, RowInjection
 from .entry_sizes import EntrySizes
 from .gather import Gather
+from .live_relations import without_live_relations
 from .plan import ConstraintGroup, InputTable, PlannedRow, SystemPlan
 from .plan_events import plan_events
 from .plan_held import plan_held
+from .plan_waves import plan_waves
 from .program import Layout, Program, plan
 from .schedule import AnyStep, SparseStep, Step, build_schedule
 
@@ -46,6 +49,8 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
     for step in steps:
         if isinstance(step, SparseStep) and linear_solver is None:
             check_solvable(step.n)
+    flat, left_alone = without_live_relations(flat, variable_map, steps)
+    selection = dataclasses.replace(selection, notes=(*selection.notes, *left_alone))
     carried = [quantities for step in steps for quantities in step.guessed]
     carried = np.concatenate(carried) if carried else np.zeros(0, np.int64)
     input_quantities = np.arange(quantities.n_unknown, n)
@@ -83,9 +88,11 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
         lambda q: program(_needed(steps, q, n)),
     )
     held = plan_held(flat.held, variable_map, lambda q: program(_needed(steps, q, n)))
+    watched = [] if events is None else [variable_map.quantity[events.table.guard[events.n_clocks :]]]
     row_inputs = [_of(variable_map, row.inputs) for row in flat.rows]
     following = state_order + 1
     rates = carried + 1 if _rates_hold(flat, variable_map, extended, for_residuals, carried) else carried[:0]
+    watched += [q for q, _ in row_inputs]
     derivative = program(_needed(steps, np.concatenate([following, rates, *(q for q, _ in row_inputs)]), n))
     rows = tuple(
         _plan_row(row, inputs, variable_map, state_order, derivative.layout)
@@ -140,6 +147,7 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
         linear_solver,
         events,
         held,
+        plan_waves(_needed(steps, np.concatenate([following, rates, constraint_slots, *watched]), n)),
     )
 
 
@@ -242,15 +250,17 @@ def _digest(
         e.message,
         e.noted,
         e.revocable,
+        e.relation,
         e.immediate,
         e.event,
         e.state,
         e.discrete,
         e.value,
         e.constant,
+        e.left_alone,
         flat.parameters.discrete,
     )
-    feed(*((start.template.key, start.parameters) for clock in e.clocks for start in clock))
+    feed(*((s.template.key, s.parameters) if s else "once" for clock in e.clocks for s in clock))
     h = flat.held
     feed(h.text, h.active, h.impulse, h.force, h.closed, h.level, h.owner, flat.parameters.n_relations)
     if linear_solver is not None:

@@ -24,6 +24,7 @@ from .dummy_blocks import DummyBlocks, dummy_blocks
 from .gather import Gather
 from .plan_events import EventPlan
 from .plan_held import HeldPlan
+from .plan_waves import WaveGroup
 from .program import Program
 from .schedule import TORN, AnyStep
 
@@ -102,6 +103,7 @@ class SystemPlan:
     linear_solver: lx.AbstractLinearSolver | None  # of blocks that stay whole
     events: EventPlan | None
     held: HeldPlan | None  # constraints that come and go with modes
+    waves: tuple[WaveGroup, ...]  # that states, conditions and constraints depend on
 
     def __eq__(self, other):
         if not isinstance(other, SystemPlan) or self.digest != other.digest:

@@ -146,7 +146,8 @@ def _in_order(table: EventTable, reads: list[set[int]]) -> EventTable:
     return dataclasses.replace(
         table, text=moved(table.text), guard=table.guard[everything], clocks=tuple(table.clocks[e] for e in order),
         message=moved(table.message), noted=moved(table.noted), revocable=moved(table.revocable),
-        immediate=moved(table.immediate), event=place[table.event] if len(table.event) else table.event,
+        relation=moved(table.relation), immediate=moved(table.immediate),
+        event=place[table.event] if len(table.event) else table.event,
     )  # fmt: skip
 
 

@@ -118,9 +118,11 @@ def generic_jacobian(
                 )
                 for point, parameters in samples
             )
-            vanishes = np.abs(first) <= of_first  # zero on one branch is not zero on all
-            partial, error = np.where(vanishes, second, first), np.where(vanishes, of_second, of_first)
+            # Zero on one branch is not zero on all; and what is not real at one point may be so at the other.
+            other = (np.abs(first) <= of_first) | ~np.isfinite(first)
+            partial, error = np.where(other, second, first), np.where(other, of_second, of_first)
             partial = np.where(np.isfinite(partial), partial, generic(rng, (n, k)))
+            error = np.where(np.isfinite(error), error, KNOWN * np.abs(partial))
         partials.append((group, partial))
         errors.append((group, error))
     return _jacobian(extended, partials), _jacobian(extended, errors), *samples[0]

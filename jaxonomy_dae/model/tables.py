@@ -197,23 +197,25 @@ class EventTable:
 
     text: tuple[str, ...]  # of each event
     guard: np.ndarray  # (events,): the variable that falls through zero; −1 for sampled ones
-    clocks: tuple[tuple[Start, Start], ...]  # period and offset of the sampled ones
+    clocks: tuple[tuple[Start | None, Start], ...]  # period and offset of the sampled ones; some happen once
     message: tuple[str | None, ...]  # with which an event ends the run
     noted: tuple[bool, ...]  # whether an event is listed; others only say that equations change
     revocable: tuple[bool, ...]  # whether another event at the same instant may undo it before it happens
+    relation: tuple[bool, ...]  # whether an event says what a relation is, from the initial time on
     immediate: tuple[bool, ...]  # whether an event happens at the initial time, if its condition holds there
     event: np.ndarray  # (actions,)
     state: np.ndarray  # (actions,): the variable that starts anew, or −1
     discrete: np.ndarray  # (actions,): the place among the discrete variables of the one assigned, or −1
     value: np.ndarray  # (actions,): the variable that has the value, or −1 for …
     constant: np.ndarray  # (actions,): … a number
+    left_alone: tuple[str, ...] = ()  # the parts of equations with relations that are no events
 
     def __len__(self):
         return len(self.text)
 
 
 _NONE = np.zeros(0, np.int64)
-NO_EVENTS = EventTable((), _NONE, (), (), (), (), (), _NONE, _NONE, _NONE, _NONE, np.zeros(0))
+NO_EVENTS = EventTable((), _NONE, (), (), (), (), (), (), _NONE, _NONE, _NONE, _NONE, np.zeros(0))
 
 
 @dataclasses.dataclass(frozen=True)

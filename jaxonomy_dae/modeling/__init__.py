@@ -1,5 +1,6 @@
 """What a user writes: environment, symbols, ports, components, diagrams, learned terms."""
 
+from .automatic_events import smooth as smooth
 from .component import Component as Component
 from .declarations import Value as Value
 from .diagram import AcausalDiagram as AcausalDiagram

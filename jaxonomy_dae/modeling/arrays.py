@@ -284,7 +284,7 @@ def _give_values(
         read += [p.value for p in component.parameters.values() if isinstance(p.value, sympy.Expr)]
         read += [account.expression for account in component.accounts]
         read += [part for when in component.events if isinstance(when.clock, Sampled)
-                 for part in (when.clock.period, when.clock.offset)]  # fmt: skip
+                 for part in (when.clock.period, when.clock.offset) if part is not None]  # fmt: skip
         used_here = set().union(*(expression.free_symbols for expression in read))
         unused -= {str(s).rpartition(":")[2] for s in used_here & set(symbols)}
         for parameter in list(component.parameters.values()):

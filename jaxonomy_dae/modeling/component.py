@@ -63,6 +63,7 @@ class Component(ModeDeclarations, metaclass=Construction):
         self.signals: list[Signal] = []
         self.events: list[When] = []
         self.relations: list[float] = []
+        self.as_written: dict[sympy.Expr, sympy.Expr] = {}
         self.held_branches: list[Held] = []
         self.accounts: list[Account] = []
         self._sealed = False
@@ -547,7 +548,7 @@ class Component(ModeDeclarations, metaclass=Construction):
 
 _BASE_ATTRIBUTES = (
     *"ev name parent parameters variables ports children equations".split(),
-    *"learned_terms connections signals events relations held_branches accounts _sealed".split(),
+    *"learned_terms connections signals events relations as_written held_branches accounts _sealed".split(),
 )
 
 

@@ -16,6 +16,8 @@ class Construction(type):
         try:
             outside: tuple[Any, ...] = tuple(map(seen_from_child, args))
             component = super().__call__(*outside, **{k: seen_from_child(v) for k, v in kwargs.items()})
+            if "_sealed" in component.__dict__:
+                component._with_events()
         except (TypeError, SympifyError) as error:
             hint = _hint(error, cls.__name__)
             if hint is None:

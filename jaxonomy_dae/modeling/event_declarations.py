@@ -5,9 +5,10 @@ from typing import Any
 import sympy
 
 from ..errors import ModelError
+from ..expressions.from_sympy import symbols_of
 from .environment import EqnEnv
 from .events import Action, Assign, Reinit, Sampled, Terminate, When, guard_of, relation_in_discretes, while_on
-from .symbols import DiscreteSymbol, PreviousSymbol, VariableSymbol
+from .symbols import DiscreteSymbol, PreviousSymbol, RelationSymbol, VariableSymbol
 
 
 class EventDeclarations:
@@ -95,7 +96,7 @@ class EventDeclarations:
 
     def _event(
         self, condition: Any, actions: tuple[Action, ...], on: Any, immediate: bool, noted: bool = True,
-        revocable: bool = False, text: str | None = None,
+        revocable: bool = False, text: str | None = None, relation: bool = False, watched: Any = sympy.true,
     ) -> None:  # fmt: skip
         if self._sealed:
             raise ModelError(f"component '{self.path}' is complete: declare its events inside __init__ of its class")
@@ -109,24 +110,25 @@ class EventDeclarations:
                 )
         number = len(self.events)
         clock = condition if isinstance(condition, Sampled) else None
-        guard, shown = None, f"sampled({getattr(clock, 'period', '')})"
+        guard, shown = None, text or f"sampled({getattr(clock, 'period', '')})"
         if clock is None:
             shown = text or (str(condition) if on is None else f"{condition}, on={on}")
             expression = guard_of(condition, where)
             if on is not None:
                 expression = while_on(expression, relation_in_discretes(on, f"{where}, on"))
-            if not any(isinstance(s, VariableSymbol | DiscreteSymbol) for s in expression.free_symbols) and not any(
-                s is self.ev.t for s in expression.free_symbols
-            ):
+            expression = while_on(expression, watched)
+            symbols = symbols_of(expression)
+            changing = (VariableSymbol, DiscreteSymbol, RelationSymbol)
+            if not any(isinstance(s, changing) or s is self.ev.t for s in symbols):
                 raise ModelError(f"{where}({condition}): the condition contains no variable: it never changes")
-            past = [s for s in expression.free_symbols if isinstance(s, PreviousSymbol)]
+            past = [s for s in symbols if isinstance(s, PreviousSymbol)]
             if past:
                 raise ModelError(f"{where}({condition}): a condition is on the present: write {past[0].path}")
             guard = self._hidden(f":when[{number}]", expression)
         elif on is not None:
             raise ModelError(f"{where}: on= is for conditions on variables; a sampled event always happens")
         values = self._values(actions, number, where)
-        self.events.append(When(shown, guard, clock, tuple(actions), values, immediate, noted, revocable))
+        self.events.append(When(shown, guard, clock, tuple(actions), values, immediate, noted, revocable, relation))
 
     def _hidden(self, name: str, expression: sympy.Expr) -> str:
         """Declares a variable that equals an expression, and is not shown."""

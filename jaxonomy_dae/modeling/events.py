@@ -7,6 +7,7 @@ import sympy
 from sympy.logic.boolalg import BooleanAtom, BooleanFunction, to_nnf
 
 from ..errors import ModelError
+from ..expressions.from_sympy import symbols_of
 from .symbols import DiscreteSymbol, ParameterSymbol, PreviousSymbol, RelationSymbol, TimeSymbol, VariableSymbol
 
 LIVE = 2  # a relation that is as its sides say
@@ -40,9 +41,9 @@ Action: TypeAlias = Reinit | Assign | Terminate
 
 @dataclasses.dataclass(frozen=True)
 class Sampled:
-    """A condition that becomes true at offset, offset + period, …"""
+    """A condition that becomes true at offset, offset + period, …; without a period, once."""
 
-    period: sympy.Expr
+    period: sympy.Expr | None
     offset: sympy.Expr
 
 
@@ -52,7 +53,8 @@ class When:
     becomes true, `clock` the period and the offset of a sampled one. `values` are the names of the hidden variables, or
     the numbers, that the actions write; `text` is what the user wrote. One that is `immediate` happens at the initial
     time, too, if its condition holds there; one that is not `noted` only says that equations change. One that is
-    `revocable` does not happen if another event at the same instant has made its condition false again."""
+    `revocable` does not happen if another event at the same instant has made its condition false again. A `relation`
+    says what a hidden discrete variable is, from the initial time on."""
 
     text: str
     guard: str | None
@@ -62,6 +64,7 @@ class When:
     immediate: bool = False
     noted: bool = True
     revocable: bool = False
+    relation: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -165,7 +168,7 @@ def guard_of(condition: Any, where: str) -> sympy.Expr:
 
 def while_on(guard: sympy.Expr, condition: Any) -> sympy.Expr:
     """A guard that is there only while a condition in discrete variables holds."""
-    return sympy.Piecewise((guard, condition), (1, True))
+    return guard if condition is sympy.true else sympy.Piecewise((guard, condition), (1, True), evaluate=False)
 
 
 def relation_in_discretes(mode: Any, where: str) -> Any:
@@ -184,7 +187,7 @@ def relation_in_discretes(mode: Any, where: str) -> Any:
 
 def _is_discrete(condition: Any) -> bool:
     """Whether nothing in a relation changes between events."""
-    symbols = condition.free_symbols
+    symbols = symbols_of(condition)
     return isinstance(condition, sympy.core.relational.Relational | BooleanFunction) and not any(
         isinstance(s, VariableSymbol | TimeSymbol) for s in symbols
     )

@@ -1,23 +1,21 @@
-"""How a component declares equations that change: branches, complementary pairs, relations."""
+"""How a component declares equations that change: branches and complementary pairs."""
 
 from typing import Any
 
 import sympy
-from sympy.logic.boolalg import BooleanAtom
 
 from ..errors import ModelError
 from .equations import zero_of
-from .event_declarations import EventDeclarations
-from .events import LIVE, Assign, Held, Sampled, relation_in_discretes
+from .events import Assign, Held, relation_in_discretes
+from .relation_declarations import RelationDeclarations
 from .symbols import DiscreteSymbol, RelationSymbol, der
 
 HIGHEST = 2  # the most often that a branch may have to be differentiated: what holds positions back
 
 
-class ModeDeclarations(EventDeclarations):
+class ModeDeclarations(RelationDeclarations):
     """The part of `Component` that concerns equations of which events choose one."""
 
-    relations: list[float]  # the starts of discrete variables that are not shown
     held_branches: list[Held]
 
     def either(self, mode: Any, then: Any, otherwise: Any, order: int = 0) -> None:
@@ -109,42 +107,6 @@ class ModeDeclarations(EventDeclarations):
         low: Any = sympy.Ne(lifted, 1)
         self._event(gap >= clearance, (Assign(lifted, yes),), sympy.And(open_, low), True, noted=False)
         return active
-
-    def relation(self, condition: Any, edges: tuple[Sampled, Any, Sampled, Any] | None = None) -> Any:
-        """A condition for `Piecewise` whose changes are events: steps end where it turns, on either side equations see
-        it as it is there, and derivatives know that the time of the change moves.
-
-        ```python
-        self.output("y", Piecewise((h, self.relation(ev.t >= start)), (0, True)))
-        ```
-
-        **Arguments:**
-
-        - `condition`: as in `when`, without clocks.
-        - `edges`: for a condition that turns periodically, `(up, 1, down, 0)`: two clocks, and what the condition
-            becomes when they tick, expressions in parameters. It is then not watched otherwise.
-
-        **Raises:**
-
-        - `ModelError` for what is not a condition.
-        """
-        if isinstance(condition, BooleanAtom | bool):
-            return condition
-        known = self._hidden_discrete(float(LIVE))
-        live = None if edges is None else sympy.Eq(known, LIVE)
-        for holds, value in ((condition, 1), (sympy.Not(condition), 0)):
-            self._event(holds, (Assign(known, sympy.Integer(value)),), live, True, noted=False, revocable=True)
-        if edges is not None:
-            for clock, value in (edges[:2], edges[2:]):
-                self._event(clock, (Assign(known, sympy.sympify(value)),), None, False, noted=False)
-        holds: Any = sympy.Eq(known, 1)
-        unknown: Any = sympy.Eq(known, LIVE)
-        return sympy.Or(holds, sympy.And(unknown, condition))
-
-    def _hidden_discrete(self, start: float) -> RelationSymbol:
-        """Declares a discrete variable that is not shown."""
-        self.relations.append(start)
-        return RelationSymbol(len(self.relations) - 1)
 
     def _either(
         self, condition: Any, then: Any, otherwise: Any, order: int, pushes: DiscreteSymbol | None

@@ -242,7 +242,7 @@ def der(expression: Any) -> Any:
                 "Use the symbols that `self.variable(...)` and `self.parameter(...)` return."
             )
     try:
-        slope = directional_derivative(read(expression, symbol_label), raised(moved, TIME_LABEL))
+        slope = directional_derivative(read(expression, symbol_label, marks=True), raised(moved, TIME_LABEL))
     except UnsupportedExpression as error:
         raise ModelError(f"der({shortened(expression)}): {error}") from None
     return write(slope, symbols.__getitem__)

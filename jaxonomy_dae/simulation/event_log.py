@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ..errors import ModelError
 from ..hybrid.problem import HybridState
@@ -24,28 +24,37 @@ class EventLog(eqx.Module):
     which: Float[Array, "*batch events"]
     transversality: Float[Array, "*batch events"]
     count: Float[Array, "*batch"]
+    stuck: Float[Array, "*batch"]
     before: Float[Array, "*batch rows m"]
     after: Float[Array, "*batch rows m"]
 
     @classmethod
+    def empty(cls, batch: tuple[int, ...], m: int, dtype: Any) -> "EventLog":
+        """The log of runs of a model without events."""
+        none, rows = jnp.zeros((*batch, 0), dtype), jnp.zeros((*batch, 0, m), dtype)
+        return cls(none, none, none, jnp.zeros(batch, dtype), jnp.full(batch, -1.0, dtype), rows, rows)
+
+    @classmethod
     def of(cls, state: HybridState) -> "EventLog":
         """The log in the last state of a run."""
-        frozen = jax.lax.stop_gradient((state.which, jnp.abs(state.rate), state.count))
+        frozen = jax.lax.stop_gradient((state.which, jnp.abs(state.rate), state.count, state.stuck))
         return cls(state.times, *frozen, state.before, state.after)
 
 
 class Events:
     """`solution.events`: the events of conditions in the order in which they happened. Sampled ones and those at the
-    initial time are listed only if they end the run.
+    initial time are listed only if they end the run. Empty if the model has no events.
 
-    - `ts`: the times, shape `(max_events,)`, infinite beyond the last event; differentiable.
+    - `ts`: the times, shape `(room,)`, infinite beyond the last event; differentiable. There is room for `max_events`;
+        if that is not given, for all events outside jit, grad and vmap, and for the first 100 inside.
     - `which`: the number of each event among `all_names`, −1 where there was none.
     - `names`: what happened, in order: the conditions as they were written.
     - `transversality`: how fast the condition was reached, in its units per second. An event whose transversality is
         near zero only grazes its condition, and its time hardly has a derivative.
-    - `before`, `after`: variables on both sides, `solution.events.before["ball.v"]` has shape `(max_events,)`, NaN
+    - `before`, `after`: variables on both sides, `solution.events.before["ball.v"]` has shape `(room,)`, NaN
         beyond the last event; differentiable, along with the time of the event.
-    - `count`: how many there were; outside jit also `len(solution.events)`.
+    - `count`: how many there were, those without room included: an int, inside jit and of a batch an array; outside jit
+        also `len(solution.events)`.
     - `terminated`: with what `terminate(...)` ended the run, or None.
     """
 
@@ -66,12 +75,14 @@ class Events:
         return self._log.transversality
 
     @property
-    def count(self) -> Array:
-        return self._log.count
+    def count(self) -> int | Int[Array, "*batch"]:
+        count = self._log.count
+        one = not isinstance(count, Tracer) and not count.ndim
+        return int(count) if one else count.astype(int)
 
     @property
     def all_names(self) -> Sequence[str]:
-        return self._table.names
+        return () if self._table is None else self._table.names
 
     @property
     def names(self) -> list[str]:
@@ -99,7 +110,7 @@ class Events:
         return int(self.count)
 
     def __repr__(self):
-        if isinstance(self.count, Tracer) or self.count.ndim:
+        if not isinstance(self.count, int):
             return f"Events(ts of shape {self.ts.shape})"
         rows = [f"  {t:.9g}  {name}" for t, name in zip(np.asarray(self.ts)[:SHOWN], self.names, strict=False)]
         more = [f"  … and {len(self) - SHOWN} more"] if len(self) > SHOWN else []
@@ -114,7 +125,7 @@ class Side:
 
     def __getitem__(self, name: str) -> Array:
         system, ts, rows, inputs = self._given
-        if not rows.shape[-2]:
+        if ts.shape[-1] and not rows.shape[-2]:
             raise ModelError(
                 "states on both sides of events were not kept, which costs memory in a large model or inside jit: "
                 "give simulate(..., save_events=True)"
@@ -126,6 +137,8 @@ class Side:
             each = jnp.stack([self[one] for one in array[0]], axis=-1)
             return each.reshape(*each.shape[:-1], *array[1])
         quantity, factor = system.plan.resolve([name])
+        if not ts.shape[-1]:
+            return ts
         if rows.ndim > 2:
             return eqx.filter_vmap(_observed, in_axes=(eqx.if_array(0), 0, 0, eqx.if_array(0), None, None))(
                 system, ts, rows, inputs, quantity, factor

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from ..hybrid.solver import TOO_MANY
+from ..hybrid.solver import STUCK, TOO_MANY
 from ..lowering.plan import SystemPlan
 from ..solvers.choice_guard import SINGULAR_CHOICE
 from ..solvers.failures import SHOWN, explain_failure, how_it_stopped
@@ -24,6 +24,10 @@ from .step_sizes import scaled_atol
 NEARLY = 1e-2  # of the first determinant: a singular choice explains a failure so close to it
 SHRINKING = 0.98  # intervals between events that become this much shorter each time accumulate
 CHATTERING = 1e-6  # events closer than this part of the time that has passed
+REST = (
+    "Say how the model rests: a mode in which it stays (complementary(…, rest_speed=…), contacts.HardStop; a discrete "
+    "variable that the event assigns and the equations read), or when(…, terminate(…)) before"
+)
 PROBES = 64  # times at which inputs are looked at
 
 
@@ -36,6 +40,7 @@ def raised(x: Any, result: Any, has_events: bool, max_steps: int, max_events: in
         (codes.max_steps_reached, f"max_steps={max_steps} was reached"),
         (codes.dt_min_reached, "no step was short enough to be accepted"),
         (TOO_MANY, many),
+        (STUCK, "an event happens, or a relation turns, again and again at one instant"),
         (SINGULAR_CHOICE, "the states have become a singular choice"),
         (codes.nonlinear_divergence, f"{lost}, or an event wrote a value that is not finite" if has_events else lost),
     ]
@@ -54,21 +59,25 @@ def explain(
     t1: Any,
     implicit: bool,
     max_steps: int,
+    max_events: int,
     rtol: Any,
     atol: Any,
 ) -> str:
     """Why the integration from `first` to t1 stopped at its last accepted point (t, x), and what to do."""
     system, inputs = solution.system, solution.inputs
     (t0, _), (t, x) = first, last
-    if solution.result == TOO_MANY and solution.event_log is not None:
-        return _too_many_events(solution.events, float(t))
+    log = solution.event_log
+    if log is not None and solution.result == TOO_MANY:
+        return _too_many_events(solution.events, max_events, float(t))
+    if log is not None and solution.result == STUCK:
+        return _stuck(solution, int(log.stuck), float(t))
     written = _written_not_finite(system, x)
     if written:
         return f"the integration stopped at t={float(t):g}: an event gave {written} a value that is not finite" + (
             ", or began a mode whose constraint is far from what it asks for, or that no impulse brings about"
             if system.plan.held is not None
             else ", or left states that the hidden constraints do not admit: let it write, with reinit(...), all that "
-            "jumps"
+            "jumps" + _of_kinks(system)
             if system.is_constrained
             else ", or began a mode in which equations are singular, as where ideal switches and diodes short-circuit "
             "a source or a capacitor: give those a resistance, Ron=1e-5"
@@ -131,30 +140,77 @@ def _written_not_finite(system: AcausalSystem, x: Any) -> str:
     return ", ".join(repr(name) for name, value in pairs if not np.isfinite(value))
 
 
-def _too_many_events(events: Events, t: float) -> str:
+def _too_many_events(events: Events, max_events: int, t: float) -> str:
     """Which event happens again and again, and towards which time."""
     which = np.asarray(events.which, int)
     counts = np.bincount(which[which >= 0], minlength=len(events.all_names))
     most = int(np.argmax(counts))
     times = np.asarray(events.ts)[which == most]
     text = (
-        f"more than {len(which)} events by t={t:.6g}, {counts[most]} of them '{events.all_names[most]}'. Give a larger "
-        "max_events if they are meant"
+        f"more than max_events={max_events} events by t={t:.6g}, {counts[most]} of them '{events.all_names[most]}'. "
+        "Give a larger max_events if they are meant"
     )
+    accumulate = _accumulation(times)
+    if accumulate:
+        return f"{text}; but {accumulate}. {REST}"
     apart = np.diff(times[-8:])
-    ratios = apart[1:] / apart[:-1] if len(apart) > 2 and (apart[:-1] > 0).all() else np.ones(1)
-    if ratios.max() < SHRINKING:
-        end = times[-1] + apart[-1] * ratios[-1] / (1 - ratios[-1])
-        return (
-            f"{text}; but the times between them shrink, each to {ratios[-1]:.3g} of the one before, and accumulate at "
-            f"t={end:.6g}. Let the model come to rest before: when(…, terminate(…)), or a mode in which it stays"
-        )
     if len(apart) and apart[-1] < CHATTERING * max(abs(t), apart.max()):
         return (
             f"{text}; but they follow each other at once: the event undoes what made it happen. Let the conditions "
             "for switching on and off lie apart (hysteresis), or smooth the relation"
         )
     return f"{text}."
+
+
+def _stuck(solution: Solution, event: int, t: float) -> str:
+    """How it came that an event happens, or a relation turns, again and again at one instant."""
+    table: Any = solution.system.plan.events
+    if table.table.relation[event]:
+        return _sliding(table.names[event], t)
+    text = f"the integration stopped at t={t:.6g}: '{table.names[event]}' would happen again and again there"
+    times = np.asarray(solution.events.ts)[np.asarray(solution.events.which, int) == event]
+    accumulate = _accumulation(times[:-1])  # the last one may have begun at rest
+    if accumulate:
+        return f"{text}: {accumulate}. {REST}"
+    return (
+        f"{text}: what it writes leaves its condition on the verge of being true, and the equations make it true at "
+        f"once. {REST}"
+    )
+
+
+def _accumulation(times: np.ndarray) -> str:
+    """How the times of an event shrink, and towards which time; nothing if they do not."""
+    apart = np.diff(times[-8:])
+    if len(apart) < 2 or (apart[:-1] <= 0).any():
+        return ""
+    ratios = apart[1:] / apart[:-1]
+    if ratios.max() >= SHRINKING:
+        return ""
+    end = times[-1] + apart[-1] * ratios[-1] / (1 - ratios[-1])
+    return f"the times between them shrink, each to {ratios[-1]:.3g} of the one before, and accumulate at t={end:.6g}"
+
+
+def _of_kinks(system: AcausalSystem) -> str:
+    """What to write if it was a relation that turned."""
+    found = system.report.relations
+    if not found:
+        return ""
+    shown = ", ".join(found[:SHOWN])
+    return (
+        f". If it is a constraint that has a kink where a relation turns ({shown}), speeds jump there: round the kink, "
+        "or say with self.complementary what pushes"
+    )
+
+
+def _sliding(name: str, t: float) -> str:
+    """What to write instead of a relation that turns again and again at one instant."""
+    where, _, condition = name.partition(": when(")
+    return (
+        f"the integration stopped at t={t:.6g}: the solution stays where '{condition[:-1]}' of component '{where}' "
+        "turns. On either side of it the equations lead back, at once. Say what holds there: with self.either and a "
+        "mode, as a brake that sticks has one; or let the conditions for turning forth and back lie apart "
+        "(hysteresis), with self.when; or round the kink, for instance tanh(x/small) instead of sign(x)"
+    )
 
 
 def _bad_input(plan: SystemPlan, inputs: dict[str, Any], t0: float, t: float, t1: float) -> str:

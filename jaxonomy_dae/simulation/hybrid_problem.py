@@ -6,9 +6,11 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from ..hybrid.control import EventControl
 from ..hybrid.problem import AbstractHybridProblem
+from ..model.tables import EventTable
 from ..solvers.switching import Watch
 from ..system.system import AcausalSystem
 from ..system.system_at import SystemAt
@@ -36,6 +38,8 @@ class SystemProblem(AbstractHybridProblem):
     immediate: tuple[bool, ...] = eqx.field(static=True)
     noted: tuple[bool, ...] = eqx.field(static=True)
     revocable: tuple[bool, ...] = eqx.field(static=True)
+    relations: tuple[bool, ...] = eqx.field(static=True)
+    opposite: tuple[int, ...] = eqx.field(static=True)
 
     def term(self, q):
         return term_of(self.system.holding(q), self.implicit)
@@ -67,6 +71,19 @@ class SystemProblem(AbstractHybridProblem):
             return self.admitted(t, x, q, args), q
         x, q, done = self.struck(t, x, before, q, args)
         return jnp.where(done, self.admitted(t, x, q, args), jnp.nan), q
+
+    def settled(self, t, x, q, events, args):
+        events_of: Any = self.system.plan.events
+        table = events_of.table
+        assigns = table.discrete >= 0
+        values = self.system.around_event(t, q, q, args).event_values(x)[assigns]
+        # More than one event may write a value, but then the same.
+        new = (
+            jnp.full_like(q, -jnp.inf)
+            .at[table.discrete[assigns]]
+            .max(jnp.where(events[table.event[assigns]], values, -jnp.inf))
+        )
+        return jnp.where(new > -jnp.inf, new, q)
 
     def struck(self, t: Any, x: Any, before: Any, q: Any, args: Any) -> tuple[Any, Any, Any]:
         """(x, q) after the impulses of the constraints that begin to hold with q, or that q asks for; and whether they
@@ -132,7 +149,24 @@ def problem_for(
         n_clocks=events.n_clocks, n_guards=len(events) - events.n_clocks, ends=ends, immediate=events.table.immediate,
         noted=events.table.noted,
         revocable=events.table.revocable,
+        relations=events.table.relation,
+        opposite=_opposite(events.table, events.n_clocks),
     )  # fmt: skip
+
+
+def _opposite(table: EventTable, n_clocks: int) -> tuple[int, ...]:
+    """Of each guard that says what a relation is, the guard that says the opposite of the same discrete value; −1 for
+    others."""
+    opposite = np.full(len(table) - n_clocks, -1)
+    other: dict[int, int] = {}
+    for event, discrete in zip(table.event.tolist(), table.discrete.tolist(), strict=True):
+        if not table.relation[event] or event < n_clocks:
+            continue
+        guard = event - n_clocks
+        if discrete in other:
+            opposite[[guard, other[discrete]]] = other[discrete], guard
+        other[discrete] = guard
+    return tuple(opposite.tolist())
 
 
 def with_event_control(controller: Any) -> Any:

@@ -35,6 +35,7 @@ class Options(eqx.Module):
     max_steps: int = eqx.field(static=True)
     progress: bool = eqx.field(static=True)
     max_events: int = eqx.field(static=True, default=0)
+    room: int = eqx.field(static=True, default=0)  # for so many events in the log
     save_events: bool = eqx.field(static=True, default=False)
 
 
@@ -82,7 +83,7 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
         if system.plan.held is not None:
             admitted = jnp.all(jnp.isfinite(problem.admitted(t0, x0, system.discrete_values, inputs)))
             consistent = consistent & admitted
-        y0 = start(problem, t0, x0, system.discrete_values, inputs, options.max_events, options.save_events)
+        y0 = start(problem, t0, x0, system.discrete_values, inputs, options.room, options.save_events)
         term, solver = HybridTerm(problem), WithEvents(chosen, options.max_events)
         controller = with_event_control(controller)
         saved_of = _state_and_discrete

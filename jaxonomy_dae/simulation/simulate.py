@@ -34,6 +34,8 @@ from .solution import Solution
 from .step_sizes import clipped, controller_for, scaled_atol
 
 FEW_NUMBERS = 20_000  # on one side of all events
+ROOM = 100  # events that are listed, at first
+MOST_EVENTS = 2**7 * ROOM  # of a run, if the user does not say: with a few steps each, near the default max_steps
 SOLVERS = {"Tsit5": Tsit5, "Rodas5P": Rodas5P, "BDF": BDF}
 
 
@@ -53,7 +55,7 @@ def simulate(
     jump_ts: Any = None,
     dtmax: Any = None,
     max_steps: int = 16384,
-    max_events: int = 100,
+    max_events: int | None = None,
     save_events: bool | None = None,
     progress: bool = False,
     throw: bool | None = None,
@@ -82,10 +84,14 @@ def simulate(
     - `stepsize_controller`: instead of the controller made from the tolerances.
     - `jump_ts`: times at which functions given as inputs jump, a number or shape `(n,)`: steps end there and the method
         starts anew.
-    - `dtmax`: the longest step. Derivatives by the amplitude of an input at which this is zero need one, if the input
-        is faster than what it acts on: nothing shows such a motion to the step control.
+    - `dtmax`: the longest step. None: a quarter of the shortest period of sin(ωt + φ) in equations on which states
+        depend, where ω is an expression in parameters, and long steps end at its zeros and extremes; `jnp.inf` leaves
+        that out. Inputs that are functions do not tell their periods: derivatives by the amplitude of one, where this
+        is zero, need a longest step if the input is faster than what it acts on.
     - `max_steps`: bounds the steps taken, beside those that end at samples; with `ts=None` as many rows are reserved.
-    - `max_events`: bounds the events of conditions; `solution.events` has room for as many.
+    - `max_events`: bounds the events of conditions; `solution.events` has room for as many. None: 12,800 of them, and
+        as much room as is needed outside jit, grad and vmap, where a run with more than 100 is made again with room for
+        twice as many, four times, and so on; inside, the first 100 are listed.
     - `save_events`: whether `solution.events` also has variables before and after events; None: outside jit, and if
         they take little room.
     - `progress`: shows a progress bar.
@@ -128,19 +134,19 @@ def simulate(
         if not _is_traced((t0, t1, ts)):
             ts = jnp.asarray(np.clip(ts, t0, t1), dtype)  # `check_arguments` lets rounding pass, Diffrax does not
     given = (system, t0, t1, ts, inputs, initial)
+    most_events = MOST_EVENTS if max_events is None else max_events
+    sides_possible = not _is_traced((given, adjoint, stepsize_controller))
 
-    sides = save_events
-    if sides is None:
-        few = max_events * (system.plan.n_state + len(system.discretes)) <= FEW_NUMBERS
-        sides = few and not _is_traced((given, adjoint, stepsize_controller))
-
-    def options(solver: Any) -> Options:
+    def options(solver: Any, room: int = ROOM) -> Options:
+        room = room if max_events is None else max_events
+        few = room * (system.plan.n_state + len(system.discretes)) <= FEW_NUMBERS
+        sides = few and sides_possible if save_events is None else save_events
         control = stepsize_controller
         if control is None:
             control = controller_for(system, solver, rtol, atol, dtmax)
         return Options(
             solver, adjoint if adjoint is not None else default_adjoint(), clipped(control, jump_ts, ends),
-            max_steps + ends.count, progress, max_events, sides,
+            max_steps + ends.count, progress, most_events, room, sides,
         )  # fmt: skip
 
     if solver is None:
@@ -157,7 +163,7 @@ def simulate(
         else:  # under `jax.grad` and `jax.vmap` outside of jit, where values are known
             checked = throw is not False
             outcome = run_compiled(given, options(solver), None)
-        return _traced(outcome, given, choice, checked, (max_steps, max_events))
+        return _traced(outcome, given, choice, checked, (max_steps, most_events))
 
     traced = _is_traced((given, options(solver)))
     switches = not choice.final and stepsize_controller is None
@@ -188,6 +194,9 @@ def simulate(
             before = {"num_explicit_steps": counts["num_steps"], "stiff_from": float(outcome.last[0])}
             outcome = run_compiled(given, options(solver), None)
             counts = outcome.numbers() | before
+    if outcome.events is not None and max_events is None and outcome.events.count > ROOM:
+        doublings = int(np.ceil(np.log2(float(outcome.events.count) / ROOM)))
+        outcome = run_compiled(given, options(solver, ROOM * 2**doublings), None)
     saved, x, discrete = outcome.ts, outcome.x, outcome.discrete
     if ts is None:
         taken = counts["num_accepted_steps"] + 1
@@ -202,7 +211,7 @@ def simulate(
             raise InitializationError(mode)
         if outcome.held is not None:
             solution = eqx.tree_at(lambda s: s.system, solution, system.holding(outcome.held))
-        text = explain(solution, first, outcome.last, t1, is_implicit(solver), max_steps, rtol, atol)
+        text = explain(solution, first, outcome.last, t1, is_implicit(solver), max_steps, most_events, rtol, atol)
         raise SimulationError(text)
     return solution
 

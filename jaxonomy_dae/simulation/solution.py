@@ -125,14 +125,11 @@ class Solution(eqx.Module):
     @property
     def events(self) -> Events:
         """The events of conditions: `.ts`, `.names`, `.before["m.x"]`, `.after["m.x"]`, `.transversality`.
-
-        **Raises:**
-
-        - `ModelError` if the model has no events.
-        """
-        if self.event_log is None:
-            raise ModelError("this model has no events: declare them with self.when(...)")
-        return Events(self.event_log, self.system, self.inputs)
+        Empty if the model has none."""
+        log = self.event_log
+        if log is None:
+            log = EventLog.empty(self.ts.shape[:-1], self.states.shape[-1], self.states.dtype)
+        return Events(log, self.system, self.inputs)
 
     @property
     def stats(self) -> dict[str, Any]:

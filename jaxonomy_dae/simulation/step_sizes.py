@@ -13,6 +13,8 @@ from ..solvers.solve import step_control
 from ..solvers.step_control import UNSEEN, ConstantLengths
 from ..system.inputs import StepEnds
 from ..system.system import AcausalSystem
+from ..system.system_at import SystemAt
+from .wave_control import WaveControl
 
 
 def scaled_atol(system: AcausalSystem, atol: Any) -> Any:
@@ -24,11 +26,17 @@ def scaled_atol(system: AcausalSystem, atol: Any) -> Any:
 
 
 def controller_for(system: AcausalSystem, solver: Any, rtol: Any, atol: Any, dtmax: Any) -> Any:
-    """The controller for tolerances: absolute ones in units of the nominal values."""
+    """The controller for tolerances: absolute ones in units of the nominal values. If the user does not bound steps,
+    the waves do by which the model is driven."""
     atol = scaled_atol(system, atol)
     if is_implicit(solver):
-        return step_control(solver, rtol, atol, dtmax=dtmax)
-    return diffrax.PIDController(rtol=rtol, atol=atol, dtmax=dtmax)
+        controller: Any = step_control(solver, rtol, atol, dtmax=dtmax)
+    else:
+        controller = diffrax.PIDController(rtol=rtol, atol=atol, dtmax=dtmax)
+    if dtmax is not None or not system.plan.waves:
+        return controller
+    at = SystemAt(system.plan, system.numbers, (), 0.0, {})
+    return WaveControl(controller, *at.waves())  # pyright: ignore[reportCallIssue]
 
 
 def clipped(controller: Any, jump_ts: Any, ends: StepEnds) -> Any:

@@ -24,7 +24,7 @@ def check_finite(**numbers: Any) -> None:
 
 def check_longest_step(dtmax: Any) -> None:
     """Refuses a longest step that is not positive."""
-    if dtmax is None or isinstance(dtmax, Tracer):
+    if dtmax is None or isinstance(dtmax, Tracer) or (np.shape(dtmax) == () and dtmax == np.inf):
         return
     check_finite(dtmax=dtmax)
     if not dtmax > 0:

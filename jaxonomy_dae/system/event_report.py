@@ -18,6 +18,13 @@ def condition_events(flat: FlatModel) -> list[str]:
     return [f"{flat.events.text[e]}: {_actions(flat, e)}" for e in _noted(flat.events) if e >= len(flat.events.clocks)]
 
 
+def relation_events(flat: FlatModel) -> list[str]:
+    """The relations in equations whose changes are events."""
+    table = flat.events
+    found = (text.partition(": when(") for text, is_one in zip(table.text, table.relation, strict=True) if is_one)
+    return list(dict.fromkeys(f"{where}: {condition[:-1]}" for where, _, condition in found))
+
+
 def clock_events(flat: FlatModel, values: np.ndarray) -> list[str]:
     """The sampled events, with their periods and offsets."""
     out = []
@@ -71,5 +78,7 @@ def _actions(flat: FlatModel, event: int) -> str:
     return ", ".join([*out, *([f"terminate({message!r})"] if message is not None else [])])
 
 
-def _number(start: Start, values: np.ndarray) -> float:
+def _number(start: Start | None, values: np.ndarray) -> float:
+    if start is None:
+        return float("inf")
     return float(start.template.residual([], [*values[list(start.parameters)]], [], 0.0, None, backend="numpy"))

@@ -10,7 +10,7 @@ from ..lowering.schedule import SparseStep
 from ..model.incidence import incidence
 from ..model.tables import provenance_of
 from ..structure.pantelides import Offsets, reduce_index
-from .event_report import clock_events, condition_events, discrete_starts, mode_equations
+from .event_report import clock_events, condition_events, discrete_starts, mode_equations, relation_events
 from .sections import Sections, some
 from .solver_choice import solver_choice
 
@@ -21,8 +21,9 @@ class SystemReport(Sections):
     Attributes count and name: `n_equations`, `n_unknowns`, `n_aliases`, `index` (structural, of the model as written),
     `differentiated` (pairs of an equation's text and how often), `states`, `algebraics`, `carried`, `constraints`,
     `blocks` (of more than one equation, or nonlinear), `notes`. Of a model with events also `discretes` (with their
-    starts), `events` of conditions, `clocks`, `modes` (equations that change with discrete variables) and
-    `index_changes` (the constraints that come and go with them, and the index while they hold).
+    starts), `events` of conditions, `relations` that are events, `left_alone` (those that are not), `clocks`, `modes`
+    (equations that change with discrete variables) and `index_changes` (the constraints that come and go with them, and
+    the index while they hold).
 
     `values` are those of all parameters, as they were declared if not given: starts and periods depend on them.
     """
@@ -123,8 +124,18 @@ class SystemReport(Sections):
 
     @property
     def events(self) -> list[str]:
-        """The events of conditions, and what they do. What only marks the jump of a source is left out."""
+        """The events of conditions, and what they do. Relations in equations are listed apart."""
         return condition_events(self._plan.flat)
+
+    @property
+    def relations(self) -> list[str]:
+        """The relations in equations, and the jumps of sources, at which steps end. `smooth(...)` leaves one alone."""
+        return relation_events(self._plan.flat)
+
+    @property
+    def left_alone(self) -> list[str]:
+        """The parts of equations whose relations are no events: they are smooth there, or said to be."""
+        return list(self._plan.flat.events.left_alone)
 
     @property
     def clocks(self) -> list[str]:
@@ -171,6 +182,8 @@ class SystemReport(Sections):
             (counted(len(discretes), "discrete variable"), [some(discretes)]),
             (counted(len(events), "event"), events),
             (counted(len(clocks), "clock"), clocks),
+            ("relations at which steps end", self.relations),
+            ("relations at which they do not", self.left_alone),
             ("equations that change with a mode", self.modes),
             ("constraints that come and go", self.index_changes),
             ("hidden constraints, projected onto", self.constraints),

@@ -4,6 +4,7 @@ All functions take the static plan, the flat parameters, the networks, time, the
 systems are traced on scalars, which XLA fuses into a few kernels; large ones on arrays.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -20,6 +21,7 @@ from ..lowering.plan_events import EventPlan
 from ..lowering.plan_held import HeldPlan
 from ..lowering.program import Program
 from ..model.evaluate_numpy import Networks
+from ..model.tables import Start
 from ..solvers.field_size import is_large
 from .evaluate import Evaluation, Refinement, newton
 from .input_values import input_values
@@ -329,17 +331,39 @@ class SystemAt:
         return jnp.where(events.table.value < 0, jnp.asarray(events.table.constant, self.dtype), read)
 
     def clocks(self) -> tuple[Any, Any]:
-        """Periods and offsets of sampled events, shape (clocks,) each."""
-
-        def value(start):
-            numbers = [self.parameters[p] for p in start.parameters]
-            return jnp.asarray(start.template.residual([], numbers, [], self.t, None), self.dtype)
-
+        """Periods and offsets of sampled events, shape (clocks,) each; infinite periods of those that happen once."""
         clocks = self._events().table.clocks
-        if not clocks:
-            return jnp.zeros((0,), self.dtype), jnp.zeros((0,), self.dtype)
-        periods, offsets = zip(*clocks, strict=True)
-        return jnp.stack([value(start) for start in periods]), jnp.stack([value(start) for start in offsets])
+        periods, offsets = zip(*clocks, strict=True) if clocks else ((), ())
+        return self._computed(periods), self._computed(offsets)
+
+    def _computed(self, starts: Sequence[Start | None]) -> Any:
+        """Expressions in parameters, those that are alike at once; infinity for None."""
+        values = jnp.full((len(starts),), jnp.inf, self.dtype)
+        alike: dict[Any, list[int]] = {}
+        for k, start in enumerate(starts):
+            if start is not None:
+                alike.setdefault(start.template, []).append(k)
+        for template, places in alike.items():
+            rows = np.array([starts[k].parameters for k in places], np.int64)  # pyright: ignore[reportOptionalMemberAccess]
+            numbers = [take(self.parameters, column) for column in rows.T]
+            new = template.residual([], numbers, [], self.t, None)
+            values = values.at[np.array(places)].set(jnp.broadcast_to(jnp.asarray(new, self.dtype), (len(places),)))
+        return values
+
+    def waves(self) -> tuple[Any, Any]:
+        """Angular frequencies and phases of what drives the model, shape (waves,) each; NaN for phases that move."""
+        frequencies, phases = [], []
+        for group in self.plan.waves:
+            n = len(group.parameter)
+            given = [self.parameters[column] for column in group.parameter.T], list(group.coefficient.T)
+
+            def values(template, n=n, given=given):
+                found = jnp.asarray(template.residual([], *given, self.t, None), self.dtype)
+                return jnp.broadcast_to(found, (n,))
+
+            frequencies.append(values(group.frequency))
+            phases.append(jnp.full((n,), jnp.nan, self.dtype) if group.phase is None else values(group.phase))
+        return jnp.concatenate(frequencies), jnp.concatenate(phases)
 
     def _events(self) -> EventPlan:
         if self.plan.events is None:

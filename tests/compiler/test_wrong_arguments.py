@@ -239,6 +239,21 @@ def port_of_another_domain():
     return compiled(shaft, body, connect=[(shaft.flange_a, body.frame)])
 
 
+def boost():
+    """Where both the switch and the diode block, the inductor's current has no way."""
+    ev = EqnEnv()
+    v, g, coil = el.VoltageSource(ev, "v", 12.0), el.Ground(ev, "g"), el.Inductor(ev, "L", 1e-4, initial_current=0.0)
+    switch, diode = el.Switch(ev, "switch"), el.IdealDiode(ev, "diode")
+    c, r = el.Capacitor(ev, "C", 47e-6, initial_voltage=12.0), el.Resistor(ev, "R", 20.0)
+    off = sig.Constant(ev, "off", 0.0)
+    return compiled(
+        off, connect=[
+            (v.p, coil.p), (coil.n, switch.p, diode.p), (diode.n, c.p, r.p), (v.n, switch.n, c.n, r.n, g.p),
+            (off.y, switch.u),
+        ],
+    )  # fmt: skip
+
+
 def port_for_a_signal():
     ev = EqnEnv()
     r, gain = el.Resistor(ev, "r"), sig.Gain(ev, "gain")
@@ -248,15 +263,25 @@ def port_for_a_signal():
 @pytest.mark.parametrize(
     "build, parts",
     [
-        (lambda: series(0.0, 0.0), ("singular for r.R = 0, q.R = 0, though not in general. Change the parameters",)),
+        (
+            lambda: series(0.0, 0.0),
+            ("singular for r.R = 0, q.R = 0, though not in general. Give a value other than zero to r.R or q.R, or",),
+        ),
         (lambda: coupled(1.0), ("singular for coils.L1 = 1", "coils.M = 1", "coils.L2 = 1", "Change the parameters")),
+        (
+            boost,
+            (
+                "in the mode switch.closed = 0, diode.active = 0",
+                "Give a value other than zero to switch.Goff or diode.Goff",
+            ),
+        ),
         (
             port_of_another_domain,
             ("shaft.flange_a: Rotational port", "body.frame: Planar port", "a connection joins ports of one domain"),
         ),
         (port_for_a_signal, ("connect joins ports, or a variable and inputs; got both: 'r.p', 'gain.u'",)),
     ],
-    ids=["two zero resistances", "perfectly coupled coils", "domains", "port and signal"],
+    ids=["two zero resistances", "perfectly coupled coils", "boost converter", "domains", "port and signal"],
 )
 def test_models(build, parts):
     with pytest.raises(ModelError) as caught:

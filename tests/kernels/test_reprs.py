@@ -171,9 +171,11 @@ def test_a_report_lists_events():
     assert "every 0.25 s" in printed[0][0] and "every 0.1 s" in printed[0][1]
 
 
-def test_jumps_of_sources_are_not_events_of_a_report():
-    report = str(compiled(signal.Pulse(EqnEnv(), "pulse")).report)
-    assert not any(word in report for word in ("event", "clock", "discrete", "mode", "relation"))
+def test_jumps_of_sources_are_relations_of_a_report():
+    report = compiled(signal.Pulse(EqnEnv(), "pulse")).report
+    assert not any(word in str(report) for word in ("event", "clock", "discrete", "mode"))
+    assert len(report.relations) == 2 and all(text.startswith("pulse: ") for text in report.relations)
+    assert "relations at which steps end:\n    pulse: " in str(report)
 
 
 def test_a_report_without_events(rc):

@@ -198,7 +198,7 @@ def test_sweeps(gates):
     T = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 0.5]])
     options = {"t1": 2.0, "ts": TS, **TIGHT}
     each, every = sweep(gates, {"gate.T": T}, **options), sweep(gates, {"gate.T": T[:, 0]}, **options)
-    exact = -np.expm1(-T[None, :, None] / T[:, None, :])
+    exact = -np.expm1(-TS[None, :, None] / T[:, None, :])
     np.testing.assert_allclose(each["gate.x"], exact, rtol=0, atol=1e-8)
     np.testing.assert_allclose(every["gate.x"], exact[..., :1].repeat(2, -1), rtol=0, atol=1e-8)
     np.testing.assert_array_equal(sweep(gates, {"gate.T": T}, lambda s: s.parameters["gate.T"]).values, T)

@@ -147,3 +147,59 @@ def test_values_that_become_not_finite(parameter, name):
 def test_a_period_that_is_not_positive(period):
     with pytest.raises(ModelError, match=r"sampled\(T.*period must be positive"):
         run(T=period)
+
+
+# --- floors, quantities that stay at zero, many events ---------------------------------------------------------------
+
+
+@functools.cache
+def dropped():
+    """A ball that is let go at 1, resets to the floor, and keeps a part of its speed."""
+
+    def write(self, ev):
+        h, v = self.variable("h", start=1.0, fixed=True), self.variable("v", start=0.0, fixed=True)
+        self.add_equations(Eq(der(h), v), Eq(der(v), -G))
+        self.when(h <= 0, reinit(v, -self.parameter("e", 0.5) * v), reinit(h, 0))
+
+    return model(write)
+
+
+@pytest.mark.parametrize("e, why", [(0.0, "the equations make it true at once"), (0.5, "accumulate at t=1.35457")])
+def test_a_ball_does_not_fall_through_the_floor(e, why):
+    """Bounces accumulate at √(2h/g)·(1 + e)/(1 − e)."""
+    with pytest.raises(SimulationError, match=rf"'c: when\(h <= 0\)' would happen again and again there.*{why}"):
+        simulate(dropped().with_parameters({"c.e": e}), 5.0, ts=jnp.array([5.0]))
+
+
+@pytest.mark.parametrize("left", ["a corner", "a ramp"])
+def test_a_quantity_that_stays_at_zero_is_there_once(left):
+    def write(self, ev):
+        n = self.discrete("n", start=0)
+        clock_hand(self)
+        ramp = sympy.Min(sympy.Max(ev.t / 1.5, 0), 1)
+        self.when((sympy.Max(1.5 - ev.t, 0) if left == "a corner" else 1 - ramp) <= 0, assign(n, n + 1))
+
+    solution = simulate(model(write), 4.0, ts=jnp.array([1.4, 1.6, 4.0]), **TIGHT)
+    np.testing.assert_allclose(events(solution), [1.5], atol=1e-9)
+    np.testing.assert_array_equal(solution["c.n"], [0, 1, 1])
+
+
+def test_more_than_a_hundred_events_are_listed():
+    """x' = 150, back to 0 at 1."""
+
+    def write(self, ev):
+        x = self.variable("x", start=0.0, fixed=True)
+        self.add_equations(Eq(der(x), 150))
+        self.when(x >= 1, reinit(x, 0))
+
+    solution = simulate(model(write), 1.002, ts=jnp.array([1.002]))
+    assert type(solution.events.count) is int and solution.events.count == len(solution.events) == 150
+    np.testing.assert_allclose(events(solution), np.arange(1, 151) / 150, rtol=1e-7)
+    assert len(solution.events.names) == 150
+
+
+def test_events_of_a_model_without_any():
+    solution = simulate(model(lambda self, ev: clock_hand(self)), 1.0)
+    assert len(solution.events) == solution.events.count == 0
+    assert solution.events.names == [] and solution.events.ts.shape == (0,)
+    assert solution.events.before["c.x"].shape == (0,)

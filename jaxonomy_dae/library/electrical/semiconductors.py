@@ -2,7 +2,7 @@
 
 from sympy import Min, exp
 
-from ...modeling import POSITIVE, Eq, EqnEnv, Value
+from ...modeling import POSITIVE, Eq, EqnEnv, Value, smooth
 from .two_pin import TwoPin
 
 LARGEST_EXPONENT = 40.0
@@ -23,6 +23,6 @@ class Diode(TwoPin):
         leak = self.parameter("R", R, unit="Ohm", bounds=POSITIVE)
         voltage, current = self._two_pins()
         x = voltage / thermal
-        below = Min(x, LARGEST_EXPONENT)
+        below = smooth(Min(x, LARGEST_EXPONENT))
         self.add_equations(Eq(current, saturation * (exp(below) * (1 + x - below) - 1) + voltage / leak))
         self.declare_dissipation(voltage * current)

@@ -6,7 +6,7 @@ import numpy as np
 from sympy import Max, Min
 
 from ...errors import ModelError
-from ...modeling import NONNEGATIVE, Component, EqnEnv, Value
+from ...modeling import NONNEGATIVE, Component, EqnEnv, Value, smooth
 from ..arguments import count, in_order, row
 
 
@@ -48,7 +48,7 @@ class Saturation(Component):
         super().__init__(ev, name)
         least, most = self.parameter("low", low), self.parameter("high", high)
         in_order(self, "low", "high")
-        self.output("y", Min(Max(self.input("u"), least), most))
+        self.output("y", smooth(Min(Max(self.input("u"), least), most)))
 
 
 class DeadZone(Component):
@@ -58,4 +58,4 @@ class DeadZone(Component):
         super().__init__(ev, name)
         half = self.parameter("width", width, bounds=NONNEGATIVE)
         u = self.input("u")
-        self.output("y", u - Min(Max(u, -half), half))
+        self.output("y", u - smooth(Min(Max(u, -half), half)))

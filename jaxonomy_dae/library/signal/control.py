@@ -2,7 +2,7 @@
 
 from sympy import Expr, Max, Min, S, Symbol
 
-from ...modeling import POSITIVE, Component, Eq, EqnEnv, Value, der
+from ...modeling import POSITIVE, Component, Eq, EqnEnv, Value, der, smooth
 from ..arguments import in_order
 
 
@@ -48,7 +48,7 @@ def _limited(component: Component, v: Symbol, low: Value | None, high: Value | N
         limited = Min(limited, component.parameter("high", high))
     if low is not None and high is not None:
         in_order(component, "low", "high")
-    return limited * S.One
+    return smooth(limited) * S.One
 
 
 class PID(Component):

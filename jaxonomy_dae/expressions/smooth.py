@@ -1,0 +1,32 @@
+"""A mark on expressions whose relations are no events."""
+
+from typing import Any
+
+import sympy
+
+from .node import Node, make, number
+
+
+class Smooth(sympy.Function):
+    """Equals its argument."""
+
+    nargs = 1
+
+    def fdiff(self, argindex=1):
+        return sympy.Integer(1)
+
+    def _eval_is_extended_real(self):
+        return self.args[0].is_extended_real
+
+    def _sympystr(self, printer: Any) -> str:
+        return f"smooth({printer._print(self.args[0])})"
+
+    def _printed_inside(self, printer: Any) -> str:
+        return printer._print(self.args[0])
+
+    _pythoncode = _numpycode = _mpmathcode = _printed_inside  # for sympy.lambdify
+
+
+def marked(u: Node) -> Node:
+    """The node of an expression that is marked."""
+    return u if number(u) is not None or u.operation in ("leaf", "smooth") else make("smooth", (u,))

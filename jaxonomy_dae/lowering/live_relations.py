@@ -1,0 +1,147 @@
+"""Relations that are no events after all: those that nonlinear equations need as they are.
+
+A relation that is an event keeps its value until a step ends where it turns; a stage of that step that lies beyond goes
+on with the branch before. Where this branch stands in nonlinear equations that determine what the relation compares, it
+may have no solution there: of k·q·|q| = Δp, the branch k·q² = Δp has none for Δp < 0. Such relations are looked at
+whenever the equations are. Where the branches are linear they have solutions, and relations stay events.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..expressions.node import FALSE, Node, leaf, number, postorder
+from ..expressions.substitute import rebuilt
+from ..model.quantities import QuantityMap
+from ..model.symbolic import SymbolicTemplate, parameter_label, template_of
+from ..model.tables import ZERO, EventTable, FlatModel
+from ..model.template import AbstractTemplate
+from ..modeling.events import LIVE
+from .schedule import AnyStep, SparseStep, Step, StepEquation
+
+
+def without_live_relations(
+    flat: FlatModel, variables: QuantityMap, steps: Sequence[AnyStep]
+) -> tuple[FlatModel, tuple[str, ...]]:
+    """The model without the events of such relations, and notes about them."""
+    table = flat.events
+    relation = np.array(table.relation, bool)
+    if not relation.any():
+        return flat, ()
+    rows = relation[table.event] & (table.discrete >= 0)
+    live = np.zeros(len(flat.parameters), bool)
+    compared = _compared(table, flat.parameters.discrete[table.discrete], rows, variables, steps)
+    for step in steps:
+        if step.carried:
+            live[_needed_as_they_are(step, *compared)] = True
+    if not live.any():
+        return flat, ()
+    assigned = np.where(table.discrete >= 0, flat.parameters.discrete[table.discrete], -1)
+    gone = np.zeros(len(table), bool)
+    count = -1
+    while gone.sum() > count:  # an event may write two, as those of a whole part do
+        count = gone.sum()
+        gone[table.event[live[assigned] & (assigned >= 0)]] = True
+        live[assigned[gone[table.event] & (assigned >= 0)]] = True
+    texts = dict.fromkeys(table.text[e] for e in np.flatnonzero(gone & relation).tolist())
+    notes = tuple(
+        f"{where}: '{condition[:-1]}' is no event: nonlinear equations that it stands in determine what it compares"
+        for where, _, condition in (text.partition(": when(") for text in texts)
+    )
+    return dataclasses.replace(flat, events=_without(table, gone)), notes
+
+
+def _compared(
+    table: EventTable, parameter: np.ndarray, rows: np.ndarray, variables: QuantityMap, steps: Sequence[AnyStep]
+) -> tuple[np.ndarray, np.ndarray]:
+    """(parameter, quantity) of each relation and of all that it compares."""
+    rows = rows & (table.guard[table.event] >= 0)
+    guard = variables.quantity[table.guard[table.event[rows]]]
+    own = parameter[rows][guard != ZERO]
+    guard = guard[guard != ZERO]
+    parameters, quantities = [own], [guard]
+    for step in steps:
+        if not isinstance(step, Step) or len(step.unknown) != 1:
+            continue
+        (unknown,) = step.unknown
+        here = np.isin(unknown, guard)
+        if not here.any():
+            continue
+        place = np.full(max(int(guard.max()), int(unknown.max())) + 1, -1, np.int64)
+        place[unknown] = np.arange(step.n)
+        found = place[guard]
+        for slot in step.equations[0].slots:
+            parameters.append(own[found >= 0])
+            quantities.append(slot.quantity[found[found >= 0]])
+    parameters, quantities = np.concatenate(parameters), np.concatenate(quantities)
+    return parameters[quantities != ZERO], quantities[quantities != ZERO]
+
+
+def _needed_as_they_are(step: AnyStep, parameters: np.ndarray, quantities: np.ndarray) -> np.ndarray:
+    """The relations that a nonlinear step's equations need as they are."""
+    relations = np.unique(parameters)
+    if not any(np.isin(e.parameter, relations).any() for e in step.equations) or _is_affine(step, relations):
+        return np.zeros(0, np.int64)
+    pairs = {*zip(parameters.tolist(), quantities.tolist(), strict=True)}
+    found: set[int] = set()
+    for equation in step.equations:
+        for column in equation.parameter.T:
+            for row in np.flatnonzero(np.isin(column, relations)).tolist():
+                p = int(column[row])
+                if p not in found and any((p, q) in pairs for q in _own(step, equation, row)):
+                    found.add(p)
+    return np.array(sorted(found), np.int64)
+
+
+def _own(step: AnyStep, equation: StepEquation, row: int) -> list[int]:
+    """The unknowns among which those of an equation's block are."""
+    if isinstance(step, Step):
+        return [int(unknown[row]) for unknown in step.unknown]
+    read = np.array([slot.quantity[row] for slot in equation.slots])
+    return read[np.isin(read, step.unknown[0])].tolist()
+
+
+def _is_affine(step: AnyStep, relations: np.ndarray) -> bool:
+    """Whether a step's equations are affine in its unknowns once relations are known."""
+    unknown = np.unique(np.concatenate(step.unknown))
+    for equation in step.equations:
+        columns = tuple(np.flatnonzero(np.isin(equation.parameter, relations).any(axis=0)).tolist())
+        template = _with_known(equation.template, columns)
+        if isinstance(step, SparseStep):
+            masks = np.unique(np.stack([np.isin(s.quantity, unknown) for s in equation.slots], axis=1), axis=0)
+        else:
+            masks = np.array([[s.local >= 0 for s in equation.slots]])
+        if not all(template.is_affine_in(np.flatnonzero(mask).tolist()) for mask in masks):
+            return False
+    return True
+
+
+def _with_known(template: AbstractTemplate, columns: tuple[int, ...]) -> AbstractTemplate:
+    """The template where relations are not to be found out; these parameters say what they are."""
+    if not columns or not isinstance(template, SymbolicTemplate):
+        return template
+    relations = {leaf(parameter_label(k)) for k in columns}
+    known: dict[Node, Node] = {}
+    for n in postorder([template.graph]):
+        asks = n.operation == "equal" and not relations.isdisjoint(n.arguments)
+        if asks and any(number(a) == LIVE for a in n.arguments):
+            known[n] = FALSE
+        else:
+            known[n] = rebuilt(n, [known[a] for a in n.arguments]) if n.arguments else n
+    return template_of(known[template.graph], template.slots, template.n_parameters, template.n_coefficients)
+
+
+def _without(table: EventTable, gone: np.ndarray) -> EventTable:
+    """The table without some events."""
+    kept, rows = ~gone, ~gone[table.event]
+
+    def of(column: Sequence) -> tuple:
+        return tuple(e for e, stays in zip(column, kept, strict=False) if stays)
+
+    number_of = np.cumsum(kept) - 1
+    return EventTable(
+        of(table.text), table.guard[kept], of(table.clocks), of(table.message), of(table.noted), of(table.revocable),
+        of(table.relation), of(table.immediate), number_of[table.event[rows]], table.state[rows], table.discrete[rows],
+        table.value[rows], table.constant[rows], table.left_alone,
+    )  # fmt: skip

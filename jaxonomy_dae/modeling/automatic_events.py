@@ -1,0 +1,485 @@
+"""Relations in equations whose changes are events, found and written as such.
+
+`Piecewise`, `Max`, `Min`, `Abs`, `sign`, `Heaviside`, `floor`, `ceiling`, `frac` and `Mod` of what changes in time
+become branches on discrete variables, which are as the relation says until an event has set them. What stands in
+`smooth(...)` is left alone.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import sympy
+
+from ..errors import ModelError
+from ..expressions.branches import ALWAYS, NEVER, Needed, union, within
+from ..expressions.from_sympy import UnsupportedExpression, parts_of, symbols_of
+from ..expressions.smooth import Smooth
+from .events import LIVE, guard_of
+from .symbols import RelationSymbol, TimeSymbol, VariableSymbol
+from .timed_relations import Edges, edges_of, in_relations_of_time, relations_in, whole_edges
+
+ROUNDING = (sympy.floor, sympy.ceiling, sympy.frac, sympy.Mod)
+KINKED = (sympy.Max, sympy.Min, sympy.Abs, sympy.sign, sympy.Heaviside, *ROUNDING)
+
+
+def smooth(expression: Any) -> Any:
+    """The same expression, in which relations are not events: for kinks that matter less than the steps they cost, and
+    for branches that agree where they meet, as a series near a point and a formula elsewhere.
+
+    ```python
+    self.add_equations(Eq(q, smooth(Max(u, 0)) * k))
+    ```
+
+    The solver then takes small steps across kinks, and derivatives do not see that a jump moves in time.
+
+    **Raises:**
+
+    - `ModelError` for what is not an expression.
+    """
+    found = sympy.sympify(expression)
+    if isinstance(expression, str) or not isinstance(found, sympy.Expr):
+        raise ModelError(f"smooth takes an expression; got {expression!r}: write smooth(Max(u, 0)), for instance")
+    return found if found.is_number or isinstance(found, sympy.Symbol) else Smooth(found)
+
+
+@dataclasses.dataclass(frozen=True)
+class Turning:
+    """A condition that turns while `watched`; the hidden discrete variable `number` is what it is: 1, 0, or LIVE."""
+
+    number: int
+    condition: Any
+    watched: Any
+
+    @property
+    def starts(self) -> tuple[float, ...]:
+        """Of its hidden discrete variables."""
+        return (float(LIVE),)
+
+
+@dataclasses.dataclass(frozen=True)
+class Stepping:
+    """The whole part of an argument while `watched`: the hidden discrete variable `number` is LIVE until an event has
+    set the next one to it."""
+
+    number: int
+    argument: Any
+    watched: Any
+
+    @property
+    def starts(self) -> tuple[float, ...]:
+        """Of its hidden discrete variables."""
+        return (float(LIVE), 0.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Timed:
+    """A relation that turns at times known beforehand; the hidden discrete variable `number` is what it is."""
+
+    number: int
+    condition: Any
+    edges: Edges
+
+    @property
+    def starts(self) -> tuple[float, ...]:
+        """Of its hidden discrete variables."""
+        return (float(LIVE),)
+
+
+@dataclasses.dataclass(frozen=True)
+class TimedSteps:
+    """The whole part of an argument that changes at times known beforehand; numbers as those of `Stepping`."""
+
+    number: int
+    argument: Any
+    edges: Edges
+
+    @property
+    def starts(self) -> tuple[float, ...]:
+        """Of its hidden discrete variables."""
+        return (float(LIVE), 0.0)
+
+
+Watched = Turning | Stepping | Timed | TimedSteps
+
+
+class Splitting:
+    """Takes from conditions the relations that turn at known times, each once; numbers follow from `first`."""
+
+    def __init__(self, first: int):
+        self.next = first
+        self.timed: dict[Any, Timed] = {}
+
+    def split(self, condition: Any) -> tuple[Any, Any]:
+        """(the condition as equations have it, as guards do) with what these relations are as discrete variables."""
+        simple = in_relations_of_time(condition)
+        found = [r for r in relations_in(simple) if self._is_timed(r)]
+        if not found:
+            return condition, condition
+        numbers = {r: self.timed[r].number for r in found}
+        known: dict[Any, Any] = {r: sympy.Eq(RelationSymbol(n), 1) for r, n in numbers.items()}
+        return _replaced(simple, {r: turned(n, r) for r, n in numbers.items()}), _replaced(simple, known)
+
+    def _is_timed(self, relation: Any) -> bool:
+        if relation not in self.timed:
+            edges = edges_of(relation)
+            if edges is None:
+                return False
+            self.timed[relation] = Timed(self.next, relation, edges)
+            self.next += 1
+        return True
+
+
+def _replaced(condition: Any, forms: dict[Any, Any]) -> Any:
+    """A condition with other forms of some relations in it."""
+    if condition in forms:
+        return forms[condition]
+    if isinstance(condition, sympy.And | sympy.Or | sympy.Not):
+        return condition.func(*(_replaced(part, forms) for part in condition.args))
+    return condition
+
+
+def is_watched(condition: Any) -> bool:
+    """Whether a condition changes otherwise than by events."""
+    return any(_moves(s) for s in symbols_of(condition))
+
+
+def turned(number: int, condition: Any) -> Any:
+    """A condition as the hidden discrete variable has it."""
+    known = RelationSymbol(number)
+    holds: Any = sympy.Eq(known, 1)
+    unknown: Any = sympy.Eq(known, LIVE)
+    return sympy.Or(holds, sympy.And(unknown, condition))
+
+
+@functools.lru_cache(maxsize=4096)  # large models write the same few equations
+def with_events(residuals: tuple[sympy.Expr, ...], first: int) -> tuple[tuple[sympy.Expr, ...], tuple[Watched, ...]]:
+    """Equations whose relations are discrete variables, numbered from `first`; and what sets these. Equations of what
+    events read stay as they are."""
+    residuals = tuple(r if _is_hidden(r) else _with_marks(r) for r in residuals)
+    order = _inside_out([r for r in residuals if not _is_hidden(r)])
+    varying = _varying(order)
+    if not any(isinstance(e, (sympy.Piecewise, *KINKED)) and e in varying for e in order):
+        return residuals, ()
+    return _Rewriting(residuals, order, varying, first).done()
+
+
+class _Rewriting:
+    """The new form of all parts of equations, inner ones first."""
+
+    def __init__(self, residuals: tuple[sympy.Expr, ...], order: list[Any], varying: set[Any], first: int):
+        self.residuals, self.order, self.varying = residuals, order, varying
+        self.numbers = Splitting(first)
+        inside = set(order)
+        self.needed = _needed_where([r for r in residuals if r in inside], order)
+        self.new: dict[Any, Any] = {}
+        self.old: dict[Any, Any] = {}  # the other way round
+        self.timed_steps: list[TimedSteps] = []
+        self.conditions: dict[Any, Any] = {}
+        self.found: list[tuple[type, int, Any, list[Any]]] = []  # the last: where it stands
+        self.places: dict[Any, list[Any]] = {}  # of a condition, the same list
+
+    def done(self) -> tuple[tuple[sympy.Expr, ...], tuple[Watched, ...]]:
+        for e in self.order:
+            self.new[e] = self._written(e)
+            self.old[self.new[e]] = e
+
+        def holding(places: list[Any]) -> Any:
+            where = functools.reduce(union, (self.needed[e] for e in places))
+            return _holding(where, self.conditions.__getitem__)
+
+        watched = tuple(kind(number, what, holding(places)) for kind, number, what, places in self.found)
+        timed = (*self.numbers.timed.values(), *self.timed_steps)
+        in_order = tuple(sorted((*watched, *timed), key=lambda w: w.number))
+        return tuple(self.new.get(r, r) for r in self.residuals), in_order
+
+    def _written(self, e: Any) -> Any:
+        if isinstance(e, sympy.Piecewise):
+            return self._piecewise(e)
+        if not e.args or isinstance(e, Smooth):
+            return e
+        inside = [self.new[a] for a in e.args]
+        if _has_an_end(e):
+            inside[0] = self._within_domain(e, inside[0])
+        if isinstance(e, KINKED) and e in self.varying:
+            return _FORMS[type(e)](functools.partial(self._turning, [e]), functools.partial(self._stepping, e), *inside)
+        if all(new is old for new, old in zip(inside, e.args, strict=True)):
+            return e
+        return e.func(*inside)
+
+    def _piecewise(self, e: Any) -> Any:
+        pairs = []
+        for branch, condition in e.args:
+            if condition not in self.conditions:
+                self.places[condition] = [e]
+                self.conditions[condition] = (
+                    self._turning(self.places[condition], condition) if _can_turn(condition) else condition
+                )
+            else:
+                self.places[condition].append(e)
+            pairs.append((self.new[branch], self.conditions[condition]))
+        return sympy.Piecewise(*pairs, evaluate=False)
+
+    def _within_domain(self, e: Any, argument: Any) -> Any:
+        """The argument of a root or the like where a branch is kept beyond its end, and the function may have no value:
+        brought back, unless it has none as the equations were written either."""
+        live = e.args[0]
+        turns = any(_can_turn(c) for part in self.needed[e] for c, _ in part)
+        if argument is live and not (turns and live in self.varying):
+            return argument
+        low, high = _DOMAINS.get(type(e), (0, None))
+        mirrored, outside = (-argument if low == 0 else sympy.Integer(low)), sympy.Lt(live, low)
+        back: Any = argument
+        if high is not None:
+            outside = sympy.Or(outside, sympy.Gt(live, high))
+            back = sympy.Piecewise((back, sympy.Le(argument, high, evaluate=False)), (high, True), evaluate=False)
+        back = sympy.Piecewise((back, sympy.Ge(argument, low, evaluate=False)), (mirrored, True), evaluate=False)
+        written_so = sympy.And(_holding(self.needed[e], lambda c: c), outside)
+        return back if written_so is sympy.false else sympy.Piecewise((live, written_so), (back, True), evaluate=False)
+
+    def _turning(self, places: list[Any], condition: Any) -> Any:
+        """A condition as discrete variables."""
+        live, guarded = self.numbers.split(self._as_written(condition))
+        if not is_watched(guarded):
+            return live
+        # What is known of time is so in the guard; equations that are looked at outside of runs have all as it is.
+        number = self._numbers(1)
+        self.found.append((Turning, number, _replaced(guarded, {self._as_written(condition): condition}), places))
+        return turned(number, condition)
+
+    def _as_written(self, condition: Any) -> Any:
+        """A relation of parts that have been given new forms, with the old ones."""
+        if not isinstance(condition, sympy.core.relational.Relational):
+            return condition
+        sides = [self.old.get(side, side) for side in condition.args]
+        return condition.func(*sides, evaluate=False)
+
+    def _numbers(self, count: int) -> int:
+        """The first of so many numbers of hidden discrete variables."""
+        first = self.numbers.next
+        self.numbers.next += count
+        return first
+
+    def _stepping(self, e: Any, argument: Any) -> Any:
+        """The whole part of an argument in the expression e, as a discrete variable."""
+        number = self._numbers(2)
+        live, whole = RelationSymbol(number), RelationSymbol(number + 1)
+        edges = whole_edges(argument)
+        if edges is None:
+            self.found.append((Stepping, number, argument, [e]))
+        else:
+            self.timed_steps.append(TimedSteps(number, argument, edges))
+        unknown: Any = sympy.Eq(live, LIVE)
+        return sympy.Piecewise((sympy.floor(argument), unknown), (whole, True), evaluate=False)
+
+
+def _holding(needed: Needed, form: Callable[[Any], Any]) -> Any:
+    """The condition under which a part is needed, with conditions in some form."""
+    if needed == ALWAYS:
+        return sympy.true
+    parts: list[Any] = [sympy.And(*(form(c) if holds else sympy.Not(form(c)) for c, holds in part)) for part in needed]
+    return sympy.Or(*parts)
+
+
+_DOMAINS: dict[Any, tuple[Any, Any]] = {sympy.asin: (-1, 1), sympy.acos: (-1, 1)}
+
+
+def _has_an_end(e: Any) -> bool:
+    """Whether a function of its first argument has values on a part of the numbers only: others are nonnegative."""
+    return isinstance(e, (sympy.log, sympy.asin, sympy.acos)) or (isinstance(e, sympy.Pow) and not e.exp.is_integer)
+
+
+Turn = Callable[[Any], Any]
+
+
+def _larger(turn: Turn, _: Turn, *arguments: Any) -> Any:
+    return functools.reduce(lambda a, b: _chosen(turn, a, b, sympy.Ge), arguments)
+
+
+def _smaller(turn: Turn, _: Turn, *arguments: Any) -> Any:
+    return functools.reduce(lambda a, b: _chosen(turn, a, b, sympy.Le), arguments)
+
+
+def _chosen(turn: Turn, a: Any, b: Any, relation: Any) -> Any:
+    if a.is_number:
+        a, b = b, a
+    condition = relation(a, b, evaluate=False)
+    return sympy.Piecewise((a, turn(condition) if _varies(condition) else condition), (b, True), evaluate=False)
+
+
+def _absolute(turn: Turn, _: Turn, u: Any) -> Any:
+    return sympy.Piecewise((u, turn(sympy.Ge(u, 0, evaluate=False))), (-u, True), evaluate=False)
+
+
+def _by_sign(turn: Turn, u: Any, above: Any, at_zero: Any, below: Any) -> Any:
+    """Branches for u > 0, u = 0 and u < 0: at zero a solution may stay."""
+    positive, negative = (turn(relation(u, 0, evaluate=False)) for relation in (sympy.Gt, sympy.Lt))
+    return sympy.Piecewise((above, positive), (below, negative), (at_zero, True), evaluate=False)
+
+
+def _sign(turn: Turn, _: Turn, u: Any) -> Any:
+    return _by_sign(turn, u, sympy.Integer(1), sympy.Integer(0), sympy.Integer(-1))
+
+
+def _heaviside(turn: Turn, _: Turn, u: Any, at_zero: Any) -> Any:
+    return _by_sign(turn, u, sympy.Integer(1), at_zero, sympy.Integer(0))
+
+
+_FORMS: dict[Any, Callable[..., Any]] = {
+    sympy.Max: _larger,
+    sympy.Min: _smaller,
+    sympy.Abs: _absolute,
+    sympy.sign: _sign,
+    sympy.Heaviside: _heaviside,
+    sympy.floor: lambda turn, step, u: step(u),
+    sympy.ceiling: lambda turn, step, u: -step(-u),
+    sympy.frac: lambda turn, step, u: u - step(u),
+    sympy.Mod: lambda turn, step, a, b: a - b * step(a / b),
+}
+
+
+def relations_left_alone(residual: sympy.Expr) -> tuple[Any, ...]:
+    """The parts of an equation that change with relations which are no events: it is smooth there, or said to be."""
+    if _is_hidden(residual):
+        return ()
+    order = _inside_out([_with_marks(residual)])
+    found = [e.args[0] for e in order if isinstance(e, Smooth)]
+    return tuple(e for e in found if any(isinstance(p, (sympy.Piecewise, *KINKED)) for p in _varying(_inside_out([e]))))
+
+
+@functools.lru_cache(maxsize=4096)
+def _with_marks(residual: sympy.Expr) -> sympy.Expr:
+    """An equation in which those parts are marked as smooth whose branches meet with the same value and slope, as those
+    of q·|q|."""
+    order = _inside_out([residual])
+    varying = _varying(order)
+    kinks = [e for e in order if e in varying and isinstance(e, (sympy.Piecewise, *KINKED))]
+    marks = {}
+    for e in kinks:
+        alone = not any(inner in kinks for inner in _inside_out([e]) if inner is not e)
+        parts = _two_branches(e) if alone else None
+        if parts is None:
+            continue
+        one, other, where = parts
+        whole: Any = residual
+        if _meet_smoothly(whole.xreplace({e: one}) - whole.xreplace({e: other}), where):
+            marks[e] = Smooth(e)
+    out: Any = residual.xreplace(marks)
+    return out
+
+
+def _two_branches(e: Any) -> tuple[Any, Any, Any] | None:
+    """Two branches, and what is zero where one goes over into the other; None for what has others."""
+    if isinstance(e, sympy.Abs):
+        return e.args[0], -e.args[0], e.args[0]
+    if isinstance(e, sympy.sign | sympy.Heaviside):
+        return sympy.Integer(1), sympy.Integer(-1 if isinstance(e, sympy.sign) else 0), e.args[0]
+    if isinstance(e, sympy.Max | sympy.Min) and len(e.args) == 2:
+        a, b = _untyped(e)
+        return a, b, a - b
+    if isinstance(e, sympy.Piecewise) and len(e.args) == 2:
+        (first, condition), (second, otherwise) = _pairs(e)
+        if otherwise == True and isinstance(condition, sympy.core.relational._Inequality):  # noqa: E712
+            left, right = _untyped(condition)
+            return first, second, left - right
+    return None
+
+
+def _meet_smoothly(difference: Any, surface: Any) -> bool:
+    """Whether a difference and its slope vanish where a surface does, in a variable that says where this is."""
+    for v in sorted((s for s in symbols_of(surface) if isinstance(s, VariableSymbol)), key=str):
+        slope = sympy.diff(surface, v)
+        if slope.is_number and slope.is_nonzero:
+            place = {v: v - surface / slope}
+            return all(sympy.expand(d.xreplace(place)) == 0 for d in (difference, sympy.diff(difference, v)))
+    return False
+
+
+def _is_hidden(residual: sympy.Expr) -> bool:
+    """Whether an equation determines a variable that is not shown."""
+    return any(isinstance(s, VariableSymbol) and s.path.startswith(":") for s in symbols_of(residual))
+
+
+def _inside_out(roots: Sequence[Any]) -> list[Any]:
+    """The parts of expressions, each once and inner ones first; not those of conditions, nor what is smooth."""
+    seen: set[Any] = set()
+    out: list[Any] = []
+    stack = [(e, False) for e in reversed(roots)]
+    while stack:
+        e, finished = stack.pop()
+        if finished:
+            out.append(e)
+        elif e not in seen:
+            seen.add(e)
+            stack.append((e, True))
+            stack.extend((a, False) for a in reversed(_arguments(e)) if a not in seen)
+    return out
+
+
+def _untyped(e: Any) -> tuple[Any, ...]:
+    """The arguments of an expression, which SymPy declares as less than they are."""
+    return e.args
+
+
+def _pairs(e: Any) -> tuple[tuple[Any, Any], ...]:
+    """The branches of a `Piecewise` with their conditions."""
+    return e.args
+
+
+def _arguments(e: Any) -> list[Any]:
+    if isinstance(e, Smooth):
+        return []
+    if isinstance(e, sympy.Piecewise):
+        return [branch for branch, _ in _pairs(e)]
+    try:
+        return list(parts_of(e))
+    except UnsupportedExpression:  # refused when the equation is read
+        return []
+
+
+def _varying(order: list[Any]) -> set[Any]:
+    """The parts that are not the same at all times."""
+    out: set[Any] = set()
+    for e in order:
+        conditions = (c for _, c in _pairs(e)) if isinstance(e, sympy.Piecewise) else ()
+        if _moves(e) or any(a in out for a in _arguments(e)) or any(_varies(c) for c in conditions):
+            out.add(e)
+    return out
+
+
+def _moves(symbol: Any) -> bool:
+    return isinstance(symbol, VariableSymbol | TimeSymbol)
+
+
+def _varies(condition: Any) -> bool:
+    return any(_moves(s) for s in symbols_of(condition))
+
+
+def _can_turn(condition: Any) -> bool:
+    """Whether a condition that was written changes at instants that can be found."""
+    if not _varies(condition) or any(isinstance(s, RelationSymbol) for s in symbols_of(condition)):
+        return False  # constant between events; or an event already
+    try:
+        for c in (condition, sympy.Not(condition)):
+            guard_of(c, "")
+    except ModelError:
+        return False
+    return True
+
+
+def _needed_where(roots: Sequence[Any], order: list[Any]) -> dict[Any, Needed]:
+    """The conditions under which the value of each part reaches an equation."""
+    needed: dict[Any, Needed] = {e: NEVER for e in order} | {root: ALWAYS for root in roots}
+    for e in reversed(order):
+        here = needed[e]
+        if not isinstance(e, sympy.Piecewise):
+            for a in _arguments(e):
+                needed[a] = union(needed[a], here)
+            continue
+        for branch, condition in _pairs(e):
+            taken = here
+            if condition is not sympy.true:
+                taken, here = within(here, (condition, True)), within(here, (condition, False))
+            needed[branch] = union(needed[branch], taken)
+    return needed

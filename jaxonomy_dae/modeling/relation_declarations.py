@@ -1,0 +1,123 @@
+"""Relations in a component's equations whose changes are events: declared, or found when the component is complete."""
+
+from collections.abc import Callable
+from typing import Any
+
+import sympy
+from sympy.logic.boolalg import BooleanAtom
+
+from ..expressions.to_sympy import shortened
+from .automatic_events import Splitting, Stepping, Timed, TimedSteps, Turning, is_watched, turned, with_events
+from .event_declarations import EventDeclarations
+from .events import LIVE, Assign, Sampled
+from .symbols import PreviousSymbol, RelationSymbol
+
+
+class RelationDeclarations(EventDeclarations):
+    """The part of `Component` that concerns relations."""
+
+    relations: list[float]  # the starts of discrete variables that are not shown
+    as_written: dict[sympy.Expr, sympy.Expr]  # of equations in which relations are events
+
+    def relation(self, condition: Any) -> Any:
+        """A condition for `Piecewise` whose changes are events: steps end where it turns, on either side equations see
+        it as it is there, and derivatives know that the time of the change moves. Conditions in `Piecewise` become such
+        by themselves; this one can be given to several equations.
+
+        ```python
+        self.output("y", Piecewise((h, self.relation(ev.t >= start)), (0, True)))
+        ```
+
+        **Arguments:**
+
+        - `condition`: as in `when`, without clocks.
+
+        **Raises:**
+
+        - `ModelError` for what is not a condition.
+        """
+        if isinstance(condition, BooleanAtom | bool):
+            return condition
+        numbers = Splitting(len(self.relations))
+        live, guarded = numbers.split(condition)
+        for each in numbers.timed.values():
+            self.relations.extend(each.starts)
+            self._ticks(each)
+        if numbers.timed and not is_watched(guarded):
+            return live
+        known = self._hidden_discrete(float(LIVE))
+        self._turns(Turning(known.number, guarded, sympy.true))
+        return turned(known.number, condition)
+
+    def _hidden_discrete(self, start: float) -> RelationSymbol:
+        """Declares a discrete variable that is not shown."""
+        self.relations.append(start)
+        return RelationSymbol(len(self.relations) - 1)
+
+    def _with_events(self) -> None:
+        """Makes events of the relations in all equations that were written."""
+        new, watched = with_events(tuple(self.equations), len(self.relations))
+        if not watched:
+            return
+        self.as_written = {n: e for n, e in zip(new, self.equations, strict=True) if n is not e}
+        self.equations[:] = new
+        for each in watched:
+            self.relations.extend(each.starts)
+        for each in watched:
+            _DECLARED[type(each)](self, each)
+
+    def _turns(self, relation: Turning) -> None:
+        known, condition = RelationSymbol(relation.number), relation.condition
+        for holds, value in ((condition, 1), (sympy.Not(condition), 0)):
+            self._relation_event(holds, shortened(condition), relation.watched, Assign(known, sympy.Integer(value)))
+
+    def _ticks(self, relation: Timed) -> None:
+        """Clocks of a relation of time. At the initial time it is as its sides say, unless a clock ticks there."""
+        known, condition, edges = RelationSymbol(relation.number), relation.condition, relation.edges
+        unknown: Any = sympy.Eq(PreviousSymbol(known.path), LIVE)
+        as_it_is = sympy.Piecewise((1, condition), (0, True))
+        for clock, after in edges.clocks:
+            value = _unless(sympy.Or(unknown, sympy.Not(edges.turns)), as_it_is, after)
+            self._relation_clock(clock, shortened(condition), Assign(known, value))
+
+    def _ticks_of_steps(self, whole: TimedSteps) -> None:
+        """Clocks of a whole part of time, which is halfway to the next number from the one that it has at a tick."""
+        live, known = RelationSymbol(whole.number), RelationSymbol(whole.number + 1)
+        unknown: Any = sympy.Eq(PreviousSymbol(live.path), LIVE)
+        now = sympy.floor(whole.argument)
+        for clock, rises in whole.edges.clocks:
+            after = sympy.floor(whole.argument + rises - sympy.Rational(1, 2))
+            value = _unless(sympy.Or(unknown, sympy.Not(whole.edges.turns)), now, after)
+            self._relation_clock(clock, shortened(now), Assign(live, sympy.Integer(0)), Assign(known, value))
+
+    def _relation_clock(self, clock: Sampled, text: str, *actions: Assign) -> None:
+        self._event(clock, actions, None, False, False, False, text, True)
+
+    def _steps(self, whole: Stepping) -> None:
+        """Events of a whole part. One may leave more than one number behind at an instant, where the argument jumps."""
+        live, known = RelationSymbol(whole.number), RelationSymbol(whole.number + 1)
+        before, now = PreviousSymbol(known.path), sympy.floor(whole.argument)
+        unknown: Any = sympy.Eq(live, LIVE)
+        found: Any = sympy.Ne(live, LIVE)
+        text, watched = shortened(now), whole.watched
+        self._relation_event(unknown, text, watched, Assign(live, sympy.Integer(0)), Assign(known, now))
+        for condition, value in (
+            (sympy.Ge(whole.argument, known + 1, evaluate=False), sympy.Max(before + 1, now)),
+            (sympy.Lt(whole.argument, known, evaluate=False), sympy.Min(before - 1, now)),
+        ):
+            self._relation_event(condition, text, sympy.And(found, watched), Assign(known, value))
+
+    def _relation_event(self, condition: Any, text: str, watched: Any, *actions: Assign) -> None:
+        self._event(condition, actions, None, True, False, True, text, True, watched)
+
+
+def _unless(condition: Any, otherwise: Any, value: Any) -> Any:
+    return sympy.Piecewise((otherwise, condition), (value, True), evaluate=False)
+
+
+_DECLARED: dict[type, Callable[[Any, Any], None]] = {
+    Turning: RelationDeclarations._turns,
+    Stepping: RelationDeclarations._steps,
+    Timed: RelationDeclarations._ticks,
+    TimedSteps: RelationDeclarations._ticks_of_steps,
+}

@@ -1,0 +1,184 @@
+"""Relations between expressions in time and parameters: when they turn is known beforehand, and needs no search.
+
+Recognised are a + b·F > c and the like, where F is time, or sin, cos, Mod or frac of p + q·t; and Max, Min and Abs of
+such. Others are found while running, as those of variables are.
+"""
+
+import dataclasses
+from typing import Any
+
+import sympy
+
+from ..expressions.from_sympy import symbols_of
+from .events import Sampled
+from .symbols import DiscreteSymbol, ParameterSymbol, PreviousSymbol, RelationSymbol, TimeSymbol
+
+NEVER_AGAIN = sympy.Float(1e300)  # s: a period that no run lasts, for what parameters stop
+_ORDERED = (sympy.StrictGreaterThan, sympy.GreaterThan, sympy.StrictLessThan, sympy.LessThan)
+_OPPOSITE = {
+    sympy.StrictGreaterThan: sympy.StrictLessThan,
+    sympy.GreaterThan: sympy.LessThan,
+    sympy.StrictLessThan: sympy.StrictGreaterThan,
+    sympy.LessThan: sympy.GreaterThan,
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Edges:
+    """When a relation turns: with each tick of each clock; it then is 1 or 0, an expression in parameters, while
+    `turns`, a condition on parameters, holds. Otherwise it never does."""
+
+    clocks: tuple[tuple[Sampled, Any], ...]
+    turns: Any
+
+
+def edges_of(relation: Any) -> Edges | None:
+    """When a relation turns; None if it is not recognised, or changes with more than time."""
+    found = _in_time(relation)
+    if found is None:
+        return None
+    slope, head, level = found
+    truth = slope if isinstance(relation, sympy.StrictGreaterThan | sympy.GreaterThan) else -slope
+    if isinstance(head, TimeSymbol):
+        return Edges(((Sampled(None, level), _after(truth)),), _nonzero(slope))
+    if isinstance(head, sympy.sin | sympy.cos):
+        inside: Any = head.args[0]
+        angle = inside + (sympy.pi / 2 if isinstance(head, sympy.cos) else 0)
+        frequency, instant = _affine(angle)
+        if frequency is None:
+            return None
+        crosses = sympy.And(level > -1, level < 1)
+        first = sympy.asin(_where(crosses, level))
+        period, places = 2 * sympy.pi, ((first, 1), (sympy.pi - first, -1))
+    else:
+        argument, period = head.args if isinstance(head, sympy.Mod) else (head.args[0], sympy.Integer(1))
+        if symbols_of(period) and not _in_parameters(period):
+            return None
+        frequency, instant = _affine(argument)
+        if frequency is None:
+            return None
+        crosses = sympy.And(level / period > 0, level / period < 1)
+        places = ((sympy.Integer(0), -1), (level, 1))
+    every = _where(_nonzero(frequency), sympy.Abs(period / frequency), NEVER_AGAIN)
+    clocks = tuple(
+        (Sampled(every, _quotient(place - instant, frequency)), _after(direction * truth * frequency))
+        for place, direction in places
+    )
+    return Edges(clocks, sympy.And(crosses, _nonzero(slope), _nonzero(frequency)))
+
+
+def whole_edges(argument: Any) -> Edges | None:
+    """When the whole part of an expression changes, and, instead of a truth, by how much: up by 1 or down by 0."""
+    if not _in_parameters(argument):
+        return None
+    slope, at_zero = _affine(argument)
+    if slope is None:
+        return None
+    every = _where(_nonzero(slope), 1 / sympy.Abs(slope), NEVER_AGAIN)
+    return Edges(((Sampled(every, _quotient(-at_zero, slope)), _after(slope)),), _nonzero(slope))
+
+
+def in_relations_of_time(condition: Any) -> Any:
+    """A condition in which relations of Max, Min and Abs of time are such of what these choose from."""
+    if isinstance(condition, sympy.And | sympy.Or | sympy.Not):
+        return condition.func(*map(in_relations_of_time, condition.args))
+    found = _in_time(condition)
+    if found is None:
+        return condition
+    slope, head, level = found
+    if not isinstance(head, sympy.Max | sympy.Min | sympy.Abs) or not slope.is_number:
+        return condition
+    order: Any = type(condition) if slope > 0 else _OPPOSITE[type(condition)]
+    above = issubclass(order, sympy.StrictGreaterThan | sympy.GreaterThan)
+    if isinstance(head, sympy.Abs):
+        inside = head.args[0]
+        parts = [order(inside, level), _OPPOSITE[order](inside, -level)]
+        together = sympy.Or if above else sympy.And
+    else:
+        parts = [order(part, level) for part in head.args]
+        together = sympy.Or if above == isinstance(head, sympy.Max) else sympy.And
+    return together(*map(in_relations_of_time, parts))
+
+
+def relations_in(condition: Any) -> list[Any]:
+    """The relations that a condition is made of."""
+    if isinstance(condition, sympy.And | sympy.Or | sympy.Not):
+        return list(dict.fromkeys(r for part in condition.args for r in relations_in(part)))
+    return [condition] if isinstance(condition, sympy.core.relational.Relational) else []
+
+
+def _sides(relation: Any) -> tuple[Any, Any]:
+    return relation.args
+
+
+def _in_time(relation: Any) -> tuple[Any, Any, Any] | None:
+    """(slope, head, level) of an ordering between head and level, multiplied by the slope."""
+    if not isinstance(relation, _ORDERED) or not _in_parameters(relation):
+        return None
+    left, right = _sides(relation)
+    found = _with_one_head(left - right)
+    if found is None or found[1] is None:
+        return None
+    slope, head, rest = found
+    return slope, head, _quotient(-rest, slope)
+
+
+def _with_one_head(e: Any) -> tuple[Any, Any, Any] | None:
+    """(slope, head, rest) of an expression slope·head + rest whose slope and rest do not change in time. No head
+    stands for none."""
+    if not _changes(e):
+        return sympy.Integer(0), None, e
+    if isinstance(e, TimeSymbol | sympy.sin | sympy.cos | sympy.Mod | sympy.frac | sympy.Max | sympy.Min | sympy.Abs):
+        return sympy.Integer(1), e, sympy.Integer(0)
+    if isinstance(e, sympy.Add):
+        parts = [_with_one_head(a) for a in e.args]
+        heads = {part[1] for part in parts if part is not None} - {None}
+        if None in parts or len(heads) != 1:
+            return None
+        slopes, _, rests = zip(*parts, strict=True)  # pyright: ignore[reportArgumentType]
+        return sympy.Add(*slopes), heads.pop(), sympy.Add(*rests)
+    if isinstance(e, sympy.Mul):
+        constant = [a for a in e.args if not _changes(a)]
+        changing = [a for a in e.args if _changes(a)]
+        inner = _with_one_head(changing[0]) if len(changing) == 1 else None
+        return None if inner is None else (inner[0] * sympy.Mul(*constant), inner[1], inner[2] * sympy.Mul(*constant))
+    return None
+
+
+def _affine(e: Any) -> tuple[Any, Any]:
+    """(slope, value at zero) of an expression that is affine in time; None, None for others."""
+    found = _with_one_head(e)
+    if found is None or not isinstance(found[1], TimeSymbol):
+        return None, None
+    return found[0], found[2]
+
+
+def _changes(e: Any) -> bool:
+    return any(isinstance(s, TimeSymbol) for s in symbols_of(e))
+
+
+def _in_parameters(e: Any) -> bool:
+    """Whether an expression changes with time alone."""
+    changing = DiscreteSymbol | RelationSymbol | PreviousSymbol
+    return all(
+        isinstance(s, TimeSymbol) or (isinstance(s, ParameterSymbol) and not isinstance(s, changing))
+        for s in symbols_of(e)
+    )
+
+
+def _after(direction: Any) -> Any:
+    """1 if what passes zero rises, 0 if it falls."""
+    return sympy.Piecewise((1, direction > 0), (0, True))
+
+
+def _nonzero(e: Any) -> Any:
+    return sympy.Ne(e, 0)
+
+
+def _where(condition: Any, e: Any, otherwise: Any = 0) -> Any:
+    return sympy.Piecewise((e, condition), (otherwise, True))
+
+
+def _quotient(a: Any, b: Any) -> Any:
+    """a/b; zero where b is."""
+    return a / b if b.is_number else _where(_nonzero(b), a / b)

@@ -1,0 +1,65 @@
+"""Step sizes that see the waves by which a model is driven.
+
+While what a wave drives is idle, as a rectifier whose diodes block, nothing limits steps: they grow over whole
+periods, and what happens within goes without a trace in any error estimate. So steps are at most a quarter of the
+fastest period, and where they are long, they end at the zeros and extremes of the waves: what answers to a wave at all
+answers when the wave is largest.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from ..adjoint.wrapped_control import WrappedControl
+
+QUARTER = 0.5 * jnp.pi  # of a turn, radians
+# Of a quarter: shorter steps look at a wave 16 times in a period, and are left alone, because an implicit solver pays
+# for every change of its step size.
+SHORT = 0.25
+HERE = 1e-6  # of a quarter: a step that ends at an extreme, or so close to it, leads to the next one
+
+
+class WaveControl(WrappedControl):
+    """The step sizes of another controller, bounded by a quarter of the shortest period of waves, and long steps end
+    where sin(ωt + φ) of one is zero, one or minus one. Times are constants of differentiation, as step sizes are.
+
+    **Arguments:**
+
+    - `controller`: another one.
+    - `frequency`: ω of the waves, rad/s, shape (waves,).
+    - `phase`: φ of the waves, rad, shape (waves,); NaN for one whose phase moves, by which steps are only bounded.
+    """
+
+    controller: Any
+    frequency: Float[Array, " waves"]
+    phase: Float[Array, " waves"]
+
+    def wrap(self, direction):
+        return WaveControl(self.controller.wrap(direction), self.frequency, self.phase)  # pyright: ignore[reportCallIssue]
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        """The end of the first step, and the state of the controller."""
+        end, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        return self._end(t0, end), state
+
+    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
+        """Whether the step is kept, and the next one."""
+        keep, start, end, jump, state, result = self.controller.adapt_step_size(
+            t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
+        )
+        return keep, start, self._end(start, end), jump, state, result
+
+    def _end(self, start: Any, end: Any) -> Any:
+        """Where a step from `start` ends that another controller would end at `end`."""
+        begin, step, frequency, phase = lax.stop_gradient((start, end - start, self.frequency, self.phase))
+        quarter = QUARTER / jnp.abs(frequency)  # infinite for what does not turn
+        bounded = jnp.minimum(step, jnp.min(quarter))
+        turned = (frequency * begin + phase) * jnp.sign(frequency) / QUARTER
+        ahead = (jnp.floor(turned + HERE) + 1 - turned) * quarter
+        ahead = jnp.min(jnp.where((bounded > SHORT * quarter) & jnp.isfinite(ahead), ahead, jnp.inf))
+        # Two even steps where one would leave a remainder.
+        length = jnp.where(bounded < (1 - HERE) * ahead, jnp.minimum(bounded, 0.5 * ahead), ahead)
+        length = jnp.where(bounded > 0.5 * ahead, length, bounded)
+        return jnp.where(length < step, start + length.astype(begin.dtype), end)
