@@ -1,0 +1,118 @@
+"""A learned law with its spread, and where the data explored it."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ..errors import ModelError, nearest
+from ..model.opaque import OpaqueTemplate
+from ..programs.cache import compiled
+from .program import weights_of, with_weights
+
+if TYPE_CHECKING:
+    from .estimate import Estimate
+
+
+@dataclasses.dataclass(frozen=True)
+class Band:
+    """A law at the points of a `grid`: `mean`, the standard deviation `spread`, the band from `low` to `high`, shape
+    `(n,)`; `explored`: from the least to the greatest value that the experiments saw, for each input, shape
+    `(inputs, 2)`."""
+
+    grid: Float[np.ndarray, "n *inputs"]
+    mean: Float[np.ndarray, " n"]
+    spread: Float[np.ndarray, " n"]
+    low: Float[np.ndarray, " n"]
+    high: Float[np.ndarray, " n"]
+    explored: Float[np.ndarray, "inputs 2"]
+
+    @property
+    def inside(self) -> np.ndarray:
+        """Which grid points lie within what was explored, shape `(n,)`."""
+        points = self.grid.reshape(len(self.grid), -1)
+        return np.all((points >= self.explored[:, 0]) & (points <= self.explored[:, 1]), axis=1)
+
+
+def band(
+    estimate: "Estimate", name: str, grid: Any, law: Callable | None, along: Any, factor: float
+) -> Band:  # fmt: skip
+    """The band of a network's or sensor law's values, linearized around its weights."""
+    objective = estimate.objective
+    if name not in objective.layout.modules:
+        raise ModelError(f"'{name}' was not trained: " + nearest(name, objective.layout.modules))
+    module = estimate.system.neural[name] if name in estimate.system.neural else estimate.observers[name]
+    dtype = objective.system.parameters.values.dtype
+    points = np.asarray(grid, float)
+    template = _template(estimate, name)
+    if law is None:
+        law = _first_output if template is None or template.function is None else _FirstOutput(template.function)
+    called = points if law not in (_first_output,) or points.ndim == 2 else points[:, None]
+    if isinstance(law, _FirstOutput) and points.ndim == 1:
+        called = points[:, None]
+    flat = jnp.concatenate([jnp.ravel(leaf).astype(dtype) for leaf in weights_of(module)])
+    mean, slope = (np.asarray(a, float) for a in _law_and_slope(module, law, flat, jnp.asarray(called, dtype)))
+    columns = np.array([g == name for g in objective.coordinates.group]) & objective.coordinates.is_weight
+    spread = np.linalg.norm(slope @ estimate.root[columns], axis=1)
+    explored = _explored(estimate, name, along, template)
+    return Band(points, mean, spread, mean - factor * spread, mean + factor * spread, explored)
+
+
+def _first_output(network: Any, u: Any) -> Any:
+    return jnp.ravel(network(u))[0]
+
+
+@dataclasses.dataclass(frozen=True)
+class _FirstOutput:
+    """Of a network that is a function of time, inputs and weights."""
+
+    function: Callable
+
+    def __call__(self, theta: Any, u: Any) -> Any:
+        return jnp.ravel(self.function(jnp.zeros((), u.dtype), u, theta))[0]
+
+
+@compiled
+def _law_and_slope(module: Any, law: Callable, flat: Any, points: Any) -> tuple[Any, Any]:
+    """The law at each point, shape (n,), and its derivatives by the weights, shape (n, weights)."""
+
+    def value(flat, u):
+        return jnp.asarray(law(with_weights(module, flat), u)).reshape(())
+
+    return jax.vmap(jax.value_and_grad(value), in_axes=(None, 0))(flat, points)
+
+
+def _template(estimate: "Estimate", name: str) -> Any:
+    """How the equations call a network; None for a sensor law."""
+    for group in estimate.system.plan.flat.groups:
+        if isinstance(group.template, OpaqueTemplate) and group.template.opaque.name == name:
+            return group.template.opaque
+    return None
+
+
+def _explored(estimate: "Estimate", name: str, along: Any, template: Any) -> np.ndarray:
+    """The least and the greatest of each input over the experiments that were fitted."""
+    flat = estimate.system.plan.flat
+    if along is None:
+        names = [
+            [flat.variables.names[v] for v in row[1:]]
+            for group in flat.groups
+            if isinstance(group.template, OpaqueTemplate) and group.template.opaque.name == name
+            for row in group.variable
+        ]
+        if not names:
+            return np.zeros((0, 2))
+    else:
+        names = [[along]]
+    found = []
+    for k in np.flatnonzero(estimate.objective.counted):
+        solution = estimate.problem.run(estimate.objective, estimate.point, int(k))
+        for row in names:
+            columns = [solution[v] if isinstance(v, str) else v(solution) for v in row]
+            found.append(np.stack([np.asarray(c, float) for c in columns], axis=1))
+    seen = np.concatenate(found)
+    return np.stack([seen.min(axis=0), seen.max(axis=0)], axis=1)

@@ -1,0 +1,201 @@
+"""One vector of coordinates for all that is estimated.
+
+    [trained parameters | weights of networks and sensor laws | shared starts | own starts, experiment by experiment]
+
+Parameters that must be positive are on a logarithmic scale, so a step multiplies them; others, and starts, are measured
+by their size, so that 1 is a change that would be natural in any unit. Weights are as they are.
+"""
+
+import dataclasses
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..errors import ModelError, nearest
+from ..modeling.interval import Interval, closed_ends
+from ..system.system import AcausalSystem
+from .data import Stacked
+from .experiment import Unknown
+from .program import Layout
+
+
+@dataclasses.dataclass(frozen=True)
+class Coordinates:
+    """What each coordinate is, by position; `p` of them.
+
+    `start`, `low` and `high` are natural values; `z` in signatures is on the scale of the coordinates.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    group: tuple[str, ...]  # the name by which it is trained, frozen and regularized
+    is_weight: Bool[np.ndarray, " p"]
+    log: Bool[np.ndarray, " p"]
+    size: Float[np.ndarray, " p"]  # in which the coordinate is measured; 1 for logarithms and weights
+    start: Float[np.ndarray, " p"]
+    low: Float[np.ndarray, " p"]
+    high: Float[np.ndarray, " p"]
+    spread: Float[np.ndarray, " p"]  # of the prior of a start, on the coordinates' scale; infinite where there is none
+    fixed: Bool[np.ndarray, " p"]
+    n_shared: int
+    n_own: int  # of each experiment
+    experiments: int
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def z_start(self) -> Float[np.ndarray, " p"]:
+        """The start on the coordinates' scale, inside the bounds."""
+        return self.scaled(np.clip(self.start, self.low, self.high))
+
+    @property
+    def z_bounds(self) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+        """Bounds on the coordinates' scale."""
+        low, high = self.low / self.size, self.high / self.size
+        with np.errstate(divide="ignore"):
+            low[self.log] = np.log(np.maximum(low[self.log], 0.0))
+            high[self.log] = np.log(high[self.log])
+        # An open bound at zero is the least number above it, where nothing can be computed: no step goes so far.
+        low[self.log & (self.low < np.finfo(float).tiny)] = -math.inf
+        return low, high
+
+    def scaled(self, natural: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
+        """Natural values on the coordinates' scale."""
+        out = np.asarray(natural, float) / self.size
+        out[self.log] = np.log(out[self.log])
+        return out
+
+    def natural(self, z: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
+        """The values that coordinates stand for, inside the bounds."""
+        out = np.array(z, float)
+        with np.errstate(over="ignore"):
+            out[self.log] = np.exp(out[self.log])
+        return np.clip(out * self.size, self.low, self.high)
+
+    def natural_at(self, position: int, z: float) -> float:
+        """The value that one coordinate stands for, bounds aside."""
+        return float(np.exp(z)) if self.log[position] else float(z * self.size[position])
+
+    def slope(self, z: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
+        """d(natural value)/d(coordinate)."""
+        return np.where(self.log, self.natural(z), self.size)
+
+    def split(self, natural: Float[np.ndarray, " p"]) -> tuple[np.ndarray, np.ndarray]:
+        """What all experiments share, and what each has to itself, shape (experiments, own)."""
+        return natural[: self.n_shared], natural[self.n_shared :].reshape(self.experiments, self.n_own)
+
+    def members(self, name: str) -> Bool[np.ndarray, " p"]:
+        """Which coordinates a name stands for: its own, or all of a group."""
+        return np.array([name in (own, group) for own, group in zip(self.names, self.group, strict=True)], bool)
+
+    def changed(self, values: dict[str, Any], fixed: bool) -> "Coordinates":
+        """Other starts by names, which stay `fixed` or are only where the search begins."""
+        start, held = np.array(self.start), np.array(self.fixed)
+        for name, value in values.items():
+            chosen = self._known(name)
+            if value is not None:
+                if np.ndim(value) or isinstance(value, str) or not np.isfinite(value) or self.is_weight[chosen].any():
+                    raise ModelError(f"'{name}' needs a finite number; got {value!r}")
+                outside = (value < self.low[chosen]) | (value > self.high[chosen])
+                if outside.any():
+                    low, high = self.low[chosen][0], self.high[chosen][0]
+                    raise ModelError(f"'{name}' must lie in [{low:g}, {high:g}]; got {value:g}")
+                start[chosen] = value
+            if fixed:
+                held |= chosen
+        return dataclasses.replace(self, start=start, fixed=held)
+
+    def bounded(self, bounds: dict[str, Any]) -> "Coordinates":
+        """Narrower bounds by names, pairs of natural values."""
+        low, high = np.array(self.low), np.array(self.high)
+        for name, given in bounds.items():
+            chosen = self._known(name)
+            try:
+                new_low, new_high = (float(end) for end in given)
+            except (TypeError, ValueError):
+                raise ModelError(f"bounds of '{name}' are a pair (low, high); got {given!r}") from None
+            if not new_low <= new_high or new_low < low[chosen].min() or new_high > high[chosen].max():
+                raise ModelError(
+                    f"bounds of '{name}' must lie within those declared, [{low[chosen].min():g}, "
+                    f"{high[chosen].max():g}]; got [{new_low:g}, {new_high:g}]"
+                )
+            low[chosen], high[chosen] = new_low, new_high
+        return dataclasses.replace(self, low=low, high=high)
+
+    def _known(self, name: str) -> Bool[np.ndarray, " p"]:
+        chosen = self.members(name)
+        if not chosen.any():
+            known = dict.fromkeys(self.group)
+            raise ModelError(f"'{name}' is not estimated in this problem: " + nearest(name, known))
+        return chosen
+
+
+def coordinates(system: AcausalSystem, observers: dict[str, Any], layout: Layout, stacked: Stacked) -> Coordinates:
+    """The coordinates of a problem, which start at the values of its system and at the guesses of unknown starts."""
+    table, rows = system.parameters.table, []
+    numbers = np.array(system.parameters.array) if system.parameters.known is None else system.parameters.known
+    index = [table.index(name) for name in layout.parameters]
+    ends = closed_ends([table.intervals[k] for k in index])
+    for k, (low, high) in zip(index, ends, strict=True):
+        name, interval, value = table.names[k], table.intervals[k], float(numbers[k])
+        log = is_positive(interval)
+        size = 1.0 if log else abs(value) or 1.0
+        rows.append((name, table.units[k], name, False, log, size, value, low, high, math.inf, False))
+    for name in layout.modules:
+        module = system.neural[name] if name in system.neural else observers[name]
+        for one, value in _named_weights(name, module):
+            rows.append((one, "", name, True, False, 1.0, value, -math.inf, math.inf, math.inf, False))
+    n_plain = len(rows)
+    units = dict(zip(table.names, table.units, strict=True))
+    units |= dict(zip(system.plan.flat.variables.names, system.plan.flat.variables.unit, strict=True))
+    for name in layout.shared:
+        rows.append(_start(f"{name} at the start", units, name, stacked.starts[name][0], table))
+    n_shared = n_plain + len(layout.shared)
+    for k, label in enumerate(stacked.labels):
+        for name in layout.own:
+            rows.append(_start(f"{name}, {label}", units, name, stacked.starts[name][k], table))
+    names, unit, group, is_weight, log, size, start, low, high, spread, fixed = zip(*rows, strict=True)
+    columns = (np.array(column, float) for column in (size, start, low, high, spread))
+    size, start, low, high, spread = columns
+    return Coordinates(
+        names, unit, group, np.array(is_weight), np.array(log), size, start, low, high, spread, np.array(fixed),
+        n_shared, len(layout.own), len(stacked.labels),
+    )  # fmt: skip
+
+
+def is_positive(interval: Interval) -> bool:
+    """Whether all values are above zero, so that they can be on a logarithmic scale. Zero itself, where it is
+    admissible, is infinitely far away on it."""
+    return interval.low > 0 or (interval.low == 0 and interval.open_low)
+
+
+def _named_weights(name: str, module: Any) -> list[tuple[str, float]]:
+    """The numbers of a module, named by the place of their array in it."""
+    found = []
+    for path, leaf in jax.tree_util.tree_leaves_with_path(module):
+        if eqx.is_inexact_array(leaf):
+            own = name + jax.tree_util.keystr(path)
+            flat = np.ravel(np.asarray(leaf, float))
+            labels = [own] if leaf.ndim == 0 else [f"{own}[{k}]" for k in range(len(flat))]
+            found.extend(zip(labels, flat.tolist(), strict=True))
+    return found
+
+
+def _start(label: str, units: dict[str, str], name: str, given: Any, table: Any) -> tuple[Any, ...]:
+    low, high = -math.inf, math.inf
+    log = False
+    if name in table.names:
+        interval = table.intervals[table.index(name)]
+        low, high = closed_ends([interval])[0]
+        log = is_positive(interval)
+    known = not isinstance(given, Unknown)
+    guess = float(given if known else given.guess)
+    spread = math.inf if known or given.spread is None else float(given.spread)
+    size = 1.0 if log else spread if math.isfinite(spread) else abs(guess) or 1.0
+    spread /= guess if log else size
+    return (label, units.get(name, ""), name, False, log, size, guess, low, high, spread, known)

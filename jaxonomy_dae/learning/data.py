@@ -1,0 +1,244 @@
+"""Experiments of different lengths, inputs and sampling, as arrays of one shape."""
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..errors import ModelError, nearest
+from ..lowering.plan import SystemPlan
+from ..system.inputs import KINDS
+from .experiment import Experiment, Unknown
+
+
+class Data:
+    """Experiments that are fitted together.
+
+    They may differ in length, sampling and in what was measured; of inputs and starts, each must name what the others
+    do.
+    """
+
+    def __init__(self, *experiments: Experiment):
+        for k, one in enumerate(experiments):
+            if not isinstance(one, Experiment):
+                raise ModelError(f"Data takes Experiments; its argument {k} is a {type(one).__name__}")
+        if not experiments:
+            raise ModelError("Data needs at least one Experiment")
+        if all(one.holdout for one in experiments):
+            raise ModelError("every experiment is held out: there is nothing to fit")
+        self.experiments = experiments
+        self.labels = [one.name or f"experiment {k}" for k, one in enumerate(experiments)]
+        doubled = [label for k, label in enumerate(self.labels) if label in self.labels[:k]]
+        if doubled:
+            raise ModelError(f"two experiments are named '{doubled[0]}'")
+
+    def __len__(self) -> int:
+        return len(self.experiments)
+
+    def __repr__(self):
+        counts = (f"{label}: {len(e.times)} times" for label, e in zip(self.labels, self.experiments, strict=True))
+        return f"Data({', '.join(counts)})"
+
+
+@dataclasses.dataclass(frozen=True)
+class Stacked:
+    """Data for one program: e experiments, padded to n times, of k outputs.
+
+    Padded times repeat the last, so nothing is integrated beyond it.
+    """
+
+    outputs: tuple[str, ...]
+    times: Float[np.ndarray, "e n"]
+    t0: Float[np.ndarray, " e"]
+    values: Float[np.ndarray, "e n k"]
+    observed: Bool[np.ndarray, "e n k"]
+    sigma: Float[np.ndarray, "e k"]  # NaN: to be estimated
+    weight: Float[np.ndarray, " e"]
+    holdout: Bool[np.ndarray, " e"]
+    inputs: dict[str, tuple[Float[np.ndarray, "e m"], Float[np.ndarray, "e m"]]]
+    kinds: tuple[tuple[str, str], ...]  # of inputs
+    starts: dict[str, tuple[Any, ...]]  # a number or an Unknown for each experiment
+    labels: tuple[str, ...]
+    counts: tuple[int, ...]  # of times
+
+    def until(self, share: float) -> "Stacked":
+        """The same shapes, with this share of each experiment's time."""
+        if share >= 1:
+            return self
+        ends = self.t0 + share * (self.times[:, -1] - self.t0)
+        inside = self.times <= ends[:, None]
+        times = np.minimum(self.times, ends[:, None])
+        return dataclasses.replace(self, times=times, observed=self.observed & inside[:, :, None])
+
+
+def stack(data: Data, plan: SystemPlan, derived: tuple[str, ...], starts: dict[str, Any]) -> Stacked:
+    """The data of a system whose `derived` outputs are computed from its variables; `starts` are for experiments that
+    do not name them."""
+    experiments = data.experiments
+    outputs: dict[str, None] = {}
+    columns: list[dict[str, np.ndarray]] = []
+    sigmas: list[dict[str, float]] = []
+    for label, one in zip(data.labels, experiments, strict=True):
+        column, sigma = _columns(one, plan, derived, label)
+        columns.append(column)
+        sigmas.append(sigma)
+        outputs |= dict.fromkeys(column)
+    n = max(len(one.times) for one in experiments)
+    shape = (len(experiments), n, len(outputs))
+    values = np.full(shape, math.nan)
+    for k, (one, column) in enumerate(zip(experiments, columns, strict=True)):
+        for j, name in enumerate(outputs):
+            if name in column:
+                values[k, : len(one.times), j] = column[name]
+    observed = np.isfinite(values)
+    training = ~np.array([one.holdout for one in experiments])
+    if not observed[training].any():
+        raise ModelError("all samples are missing: the data are NaN throughout")
+    times = np.stack([_padded(one.times, n) for one in experiments])
+    inputs, kinds = _inputs(data, plan)
+    return Stacked(
+        outputs=tuple(outputs),
+        times=times,
+        t0=np.array([one.t0 for one in experiments], float),
+        values=np.where(observed, values, 0.0),
+        observed=observed,
+        sigma=np.array([[s.get(name, math.nan) for name in outputs] for s in sigmas]),
+        weight=np.array([one.weight for one in experiments], float),
+        holdout=~training,
+        inputs=inputs,
+        kinds=kinds,
+        starts=_starts(data, starts),
+        labels=tuple(data.labels),
+        counts=tuple(len(one.times) for one in experiments),
+    )
+
+
+def _padded(array: np.ndarray, n: int) -> np.ndarray:
+    return np.concatenate([array, np.full(n - len(array), array[-1])])
+
+
+def _columns(
+    one: Experiment, plan: SystemPlan, derived: tuple[str, ...], label: str
+) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+    """The samples and noise levels of an experiment, those of arrays by their entries."""
+    column: dict[str, np.ndarray] = {}
+    sigma: dict[str, float] = {}
+    sigmas: Any = one.sigma  # by name, once it has been read
+    for name, values in one.data.items():
+        entries = None if name in derived else plan.entries(name)
+        if entries is None:
+            if name not in derived and name not in plan.variable_index:
+                known = [*derived, *plan.visible_variables]
+                raise ModelError(f"{label}: data of '{name}', which is not a variable: " + nearest(name, known))
+            if values.ndim != 1:
+                raise ModelError(f"{label}: data of '{name}' must have shape (n,); got {values.shape}")
+            names, shape = [name], ()
+        else:
+            names, shape = entries
+        if values.shape[1:] != shape:
+            wanted = ", ".join(["n", *map(str, shape)])
+            raise ModelError(f"{label}: data of '{name}' must have shape ({wanted}); got {values.shape}")
+        flat = values.reshape(len(values), -1)
+        for j, entry in enumerate(names):
+            if entry in column:
+                raise ModelError(f"{label}: data of '{entry}' are given twice, by its own name and as part of an array")
+            column[entry], sigma[entry] = flat[:, j], sigmas[name]
+    return column, sigma
+
+
+def _inputs(data: Data, plan: SystemPlan) -> tuple[dict[str, Any], tuple[tuple[str, str], ...]]:
+    """Samples of every input, padded beyond their ends to the same number, and how each is interpolated."""
+    names = dict.fromkeys(name for one in data.experiments for name in one.inputs)
+    found, kinds = {}, []
+    for name in names:
+        if name not in plan.inputs.place:
+            raise ModelError(f"'{name}' is not an input of this system: " + nearest(name, plan.inputs.names))
+        default = plan.inputs.defaults[plan.inputs.place[name]]
+        given: list[tuple[np.ndarray, np.ndarray]] = []
+        kind, owner = None, ""
+        for label, one in zip(data.labels, data.experiments, strict=True):
+            if name not in one.inputs and default is None:
+                raise ModelError(f"{label} does not give input '{name}', as others do: give it there too")
+            source = one.inputs.get(name, default)
+            times, values, own = _samples(name, source, one, label)
+            if own is not None and kind is not None and own != kind:
+                raise ModelError(
+                    f"input '{name}' is '{kind}' in {owner} and '{own}' in {label}: one program reads one kind. Give "
+                    "the same in all"
+                )
+            if own is not None:
+                kind, owner = own, label
+            given.append((times, values))
+        m = max(len(times) for times, _ in given)
+        padded = [_beyond(times, m) for times, _ in given]
+        found[name] = np.stack(padded), np.stack([_padded(values, m) for _, values in given])
+        kinds.append((name, kind or "held"))
+    return found, tuple(kinds)
+
+
+def _samples(name: str, source: Any, one: Experiment, label: str) -> tuple[np.ndarray, np.ndarray, str | None]:
+    """(times, values, kind) of an input; a constant is of any kind."""
+    end = float(one.times[-1])
+    if isinstance(source, int | float | np.number):
+        return np.array([one.t0, end]), np.full(2, float(source)), None
+    if not isinstance(source, tuple | list) or len(source) not in (2, 3):
+        raise ModelError(
+            f"{label}: input '{name}' is a number or samples, (times, values) or (times, values, 'held'); got "
+            f"{type(source).__name__}"
+        )
+    kind = source[2] if len(source) == 3 else "linear"
+    if kind not in KINDS:
+        raise ModelError(f"{label}: input '{name}': samples are 'linear', 'cubic' or 'held'; got {kind!r}")
+    times, values = np.asarray(source[0], float), np.asarray(source[1], float)
+    if times.ndim != 1 or times.shape != values.shape or len(times) < 2:
+        raise ModelError(
+            f"{label}: input '{name}' needs a value for each of at least two times; got shapes {times.shape} and "
+            f"{values.shape}"
+        )
+    for what, array in (("times", times), ("values", values)):
+        bad = np.flatnonzero(~np.isfinite(array))
+        if len(bad):
+            raise ModelError(f"{label}: input '{name}': {what}[{bad[0]}] is {array[bad[0]]}; leave the sample out")
+    back = np.flatnonzero(np.diff(times) <= 0)
+    if len(back):
+        k = int(back[0])
+        raise ModelError(
+            f"{label}: input '{name}': times must increase; times[{k}]={times[k]:g} is followed by {times[k + 1]:g}"
+        )
+    slack = 1e-6 * (end - one.t0)
+    if times[0] > one.t0 + slack or (times[-1] < end - slack and kind != "held"):
+        raise ModelError(
+            f"{label}: the samples of input '{name}' reach from {times[0]:g} to {times[-1]:g}, the experiment from "
+            f"{one.t0:g} to {end:g}: give samples for all of it"
+        )
+    return times, values, kind
+
+
+def _beyond(times: np.ndarray, m: int) -> np.ndarray:
+    """Times continued to m of them, in steps like the last."""
+    step = times[-1] - times[-2]
+    return np.concatenate([times, times[-1] + step * np.arange(1, m - len(times) + 1)])
+
+
+def _starts(data: Data, given: dict[str, Any]) -> dict[str, tuple[Any, ...]]:
+    """The start of each name in each experiment."""
+    names = dict.fromkeys([*given, *(name for one in data.experiments for name in one.initial)])
+    out = {}
+    for name in names:
+        values = []
+        for label, one in zip(data.labels, data.experiments, strict=True):
+            value = one.initial.get(name, given.get(name))
+            if value is None:
+                raise ModelError(f"{label} does not say how '{name}' starts, as others do: add it to its initial=")
+            if not isinstance(value, Unknown):
+                if np.ndim(value) or isinstance(value, str) or not np.isfinite(value):
+                    raise ModelError(f"{label}: '{name}' starts at a finite number or Unknown(guess); got {value!r}")
+                value = float(value)
+            values.append(value)
+        shared = {v.shared for v in values if isinstance(v, Unknown)}
+        if len(shared) == 2 or (True in shared and not all(isinstance(v, Unknown) for v in values)):
+            raise ModelError(f"the start of '{name}' is shared in some experiments only: share it in all or in none")
+        out[name] = tuple(values)
+    return out

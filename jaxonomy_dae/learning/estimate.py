@@ -1,0 +1,283 @@
+"""What a fit returns: values, how well they are known, and what follows from them."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.stats
+from jaxtyping import Float
+
+from ..errors import ModelError, nearest
+from ..system.system import AcausalSystem
+from .band import Band, band
+from .factors import Factors
+from .holdout import holdout_score, with_own_starts
+from .identifiability import Identifiability, identifiability, spreads
+from .least_squares import Minimum
+from .objective import Objective
+from .prediction import Prediction, prediction
+from .profile import profile
+from .program import with_values
+from .table import Row, Table
+from .whiteness import Whiteness, whiteness
+
+if TYPE_CHECKING:
+    from .problem import Problem
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Estimate:
+    """The outcome of `Problem.fit`.
+
+    - `system`: with the values found; `observers`: the sensor laws, with theirs.
+    - `minimum`: where the descent ended: its `history`, `converged`, `message`, and weighted with `minimum.weights` its
+        residuals and Jacobian.
+    - `point`: all coordinates there, as `objective.coordinates` names them.
+    """
+
+    problem: "Problem"
+    objective: Objective
+    minimum: Minimum
+    point: Float[np.ndarray, " p"]
+    system: AcausalSystem
+    observers: dict[str, Any]
+
+    @classmethod
+    def of(cls, problem: "Problem", objective: Objective, minimum: Minimum) -> "Estimate":
+        """The estimate at a minimum."""
+        point = with_own_starts(objective, minimum)
+        shared, _ = objective.numbers(objective.coordinates.natural(point))
+        system, observers, _ = with_values(objective.system, objective.observers, objective.layout, shared)
+        return cls(problem, objective, minimum, point, system, observers)
+
+    def __repr__(self):
+        score = f", held out {self.holdout_score:.3g} σ" if self.objective.stacked.holdout.any() else ""
+        return f"Estimate({self.message}: χ² {self.chi2:.4g} of {self.freedom:.1f} degrees of freedom{score})"
+
+    # --- values ------------------------------------------------------------------------------------------------
+
+    @property
+    def message(self) -> str:
+        """Why the descent ended."""
+        return self.minimum.message
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Parameters, starts and weights by name."""
+        c = self.objective.coordinates
+        return dict(zip(c.names, c.natural(self.point).tolist(), strict=True))
+
+    @property
+    def starts(self) -> dict[str, Any]:
+        """Unknown starts as found: a number if shared, else shape `(experiments,)`."""
+        layout, (shared, own) = self.objective.layout, self.objective.coordinates.split(
+            self.objective.coordinates.natural(self.point)
+        )  # fmt: skip
+        first = len(shared) - len(layout.shared)
+        found: dict[str, Any] = {name: float(shared[first + k]) for k, name in enumerate(layout.shared)}
+        return found | {name: own[:, k] for k, name in enumerate(layout.own)}
+
+    @property
+    def sigma(self) -> dict[str, float]:
+        """Noise levels that were estimated, by name."""
+        return self.objective.evidence.sigma(self.minimum.weights)
+
+    # --- uncertainty -------------------------------------------------------------------------------------------
+
+    @functools.cached_property
+    def _linear(self) -> tuple[Factors, np.ndarray]:
+        """Factors of the columns that can move, and which of all coordinates these are: not frozen, not on a bound."""
+        z, (low, high) = self.minimum.z, self.objective.bounds
+        residual, jacobian = self.minimum.weights.applied(z, self.minimum.found)
+        moves = ~((z <= low) | (z >= high))
+        factors = Factors.of(residual, jacobian[:, moves], self._noise)
+        return factors, np.flatnonzero(self.objective.free)[moves]
+
+    @property
+    def _noise(self) -> float:
+        return dict(self.objective.layout.options)["rtol"]
+
+    @functools.cached_property
+    def root(self) -> Float[np.ndarray, "p r"]:
+        """A, with the covariance A Aᵀ of all coordinates, as far as the data and priors determine them."""
+        factors, chosen = self._linear
+        small = factors.root(factors.rank(self._noise))
+        out = np.zeros((len(self.point), small.shape[1]))
+        out[chosen] = small
+        return out
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "p p"]:
+        """Of all coordinates, on their scale (`objective.coordinates.log` says which are logarithms)."""
+        return self.root @ self.root.T
+
+    @property
+    def correlation(self) -> Float[np.ndarray, "p p"]:
+        """Of all coordinates; zero for those that cannot move."""
+        spread = np.linalg.norm(self.root, axis=1)
+        scale = np.where(spread > 0, spread, 1.0)
+        return self.covariance / np.outer(scale, scale)
+
+    @functools.cached_property
+    def spread(self) -> Float[np.ndarray, " p"]:
+        """Standard deviations on the coordinates' scale: 0 for what cannot move, infinite where not determined."""
+        factors, chosen = self._linear
+        out = np.zeros(len(self.point))
+        out[chosen] = spreads(factors, self._noise)
+        return out
+
+    @property
+    def jacobian(self) -> Float[np.ndarray, "m f"]:
+        """Of the residuals in units of the noise, by the coordinates that were searched."""
+        return self.minimum.weights.row[:, None] * self.minimum.found.jacobian
+
+    @property
+    def residuals(self) -> dict[str, dict[str, np.ndarray]]:
+        """Predictions less data by experiment and name, where there are samples, in units of the noise."""
+        s = self.objective.stacked
+        scaled = self.minimum.weights.row * self.minimum.found.residual
+        experiment, _, output = self.objective.rows
+        found: dict[str, dict[str, np.ndarray]] = {}
+        for k, label in enumerate(s.labels):
+            for j, name in enumerate(s.outputs):
+                chosen = (experiment == k) & (output == j)
+                if chosen.any():
+                    found.setdefault(label, {})[name] = scaled[chosen]
+        return found
+
+    @functools.cached_property
+    def freedom(self) -> float:
+        """Degrees of freedom: samples less the effective number of coordinates (the sum of leverages)."""
+        root = self.root[self.objective.free]
+        return len(self.minimum.found.residual) - float(np.sum((self.jacobian @ root) ** 2))
+
+    @property
+    def chi2(self) -> float:
+        """The sum of squared residuals in units of the noise; about `freedom` if model and noise levels are right."""
+        return float(np.sum((self.minimum.weights.row * self.minimum.found.residual) ** 2))
+
+    @property
+    def effective(self) -> dict[str, float]:
+        """How many weights of each network the data determine."""
+        c, out = self.objective.coordinates, {}
+        precision = np.zeros(len(c))
+        precision[self.objective.free] = self.minimum.weights.precision
+        variance = np.sum(self.root**2, axis=1)
+        for name in dict.fromkeys(g for g, w in zip(c.group, c.is_weight, strict=True) if w):
+            chosen = np.array([g == name for g in c.group])
+            out[name] = float(np.sum(1 - precision[chosen] * variance[chosen]))
+        return out
+
+    @property
+    def whiteness(self) -> dict[str, dict[str, Whiteness]]:
+        """Whether residuals look like noise, by experiment and name. Where they do not, intervals are too narrow."""
+        return {label: {n: whiteness(r) for n, r in by.items()} for label, by in self.residuals.items()}
+
+    def _quantile(self, level: float) -> float:
+        """Of the normal distribution, or where noise was estimated, of Student's."""
+        upper = 0.5 * (1 + level)
+        if self.objective.evidence.labels:
+            return float(scipy.stats.t.ppf(upper, max(self.freedom, 1.0)))
+        return float(scipy.stats.norm.ppf(upper))
+
+    def table(self, level: float = 0.95) -> Table:
+        """Parameters and starts with linear intervals, on the coordinates' scale, so those of positive parameters are
+        positive; and what reached a bound, is not determined, or was frozen."""
+        c, factor = self.objective.coordinates, self._quantile(level)
+        low, high = c.z_bounds
+        moved, rows = set(np.flatnonzero(self.objective.free)), []
+        scalars = np.array([not name.endswith("]") for name in c.names])  # such as a sensor law's gain
+        for k in np.flatnonzero(~c.is_weight | scalars).tolist():
+            z, spread, note = self.point[k], self.spread[k], ""
+            ends = z - factor * spread, z + factor * spread
+            if k not in moved:
+                note = "frozen" if c.fixed[k] else "held out: fitted to this experiment alone"
+            elif z <= low[k] or z >= high[k]:
+                note = f"bound reached: {c.natural(self.point)[k]:g}"
+            elif spread >= 1:
+                note = "not determined"
+            inside = (-np.inf, np.inf)
+            if np.isfinite(spread):
+                inside = np.clip([c.natural_at(k, e) for e in ends], c.low[k], c.high[k])
+            value = float(c.natural(self.point)[k])
+            rows.append(Row(c.names[k], value, float(inside[0]), float(inside[1]), c.units[k], note))
+        return Table(tuple(rows), level)
+
+    def identifiability(self) -> Identifiability:
+        """What the data tell at the values found."""
+        m = self.minimum
+        return identifiability(self.objective, m.weights, m.found, m.z, self._noise)
+
+    def profile(self, names: Sequence[str] | str, level: float = 0.95) -> dict[str, tuple[float, float]]:
+        """Intervals by profile likelihood: the values between which the cost, with everything else fitted anew, stays
+        within half the quantile of χ² of the least. They need no linearization; infinite ends are not determined.
+
+        Noise levels and precisions stay as found.
+        """
+        chosen = [names] if isinstance(names, str) else list(names)
+        return {name: profile(self, self._position(name), level) for name in chosen}
+
+    def _position(self, name: str) -> int:
+        c = self.objective.coordinates
+        found = [k for k in np.flatnonzero(self.objective.free) if c.names[k] == name]
+        if not found:
+            raise ModelError(f"'{name}' was not estimated: " + nearest(name, np.array(c.names)[self.objective.free]))
+        return int(found[0])
+
+    # --- what follows ------------------------------------------------------------------------------------------
+
+    def band(
+        self,
+        name: str,
+        grid: Any,
+        law: Callable[[Any, Any], Any] | None = None,
+        along: str | Callable[[Any], Any] | None = None,
+        level: float = 0.95,
+    ) -> Band:
+        """A learned law over a grid, with its spread and the region that the experiments explored.
+
+        **Arguments:**
+
+        - `name`: of a network or sensor law that was trained.
+        - `grid`: shape `(n,)`, or `(n, inputs)`.
+        - `law`: `law(network, u)` at one grid point, a number; default: the network's first output.
+        - `along`: what is explored: a variable's name, or a function of a solution; default: the network's inputs.
+        """
+        return band(self, name, grid, law, along, self._quantile(level))
+
+    def predict(
+        self, names: str | Sequence[str], ts: Any = None, experiment: int | str = 0, level: float = 0.95
+    ) -> Prediction:
+        """Any variables under the conditions of an experiment, measured or not, with bands.
+
+        **Arguments:**
+
+        - `ts`: times, increasing, from its start on; default: its own.
+        - `experiment`: its place or name.
+        """
+        return prediction(
+            self, [names] if isinstance(names, str) else list(names), ts, experiment, self._quantile(level)
+        )
+
+    @functools.cached_property
+    def rms(self) -> dict[str, dict[str, float]]:
+        """Root mean square errors by experiment and name, in the variables' units, those held out included."""
+        s = self.objective.stacked
+        outputs = self.objective.predicted(self.point).outputs
+        found: dict[str, dict[str, float]] = {}
+        for k, label in enumerate(s.labels):
+            for j, name in enumerate(s.outputs):
+                seen = s.observed[k, :, j]
+                if seen.any():
+                    error = (outputs[k, :, j] - s.values[k, :, j])[seen]
+                    found.setdefault(label, {})[name] = float(np.sqrt(np.mean(error**2)))
+        return found
+
+    @functools.cached_property
+    def holdout_score(self) -> float:
+        """The root mean square of residuals of experiments held out, in units of the noise; NaN if there are none."""
+        if not self.objective.stacked.holdout.any():
+            return float("nan")
+        return holdout_score(self.objective, self.minimum)

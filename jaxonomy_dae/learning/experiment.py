@@ -1,0 +1,213 @@
+"""Experiments: what was measured, how well, and under which conditions."""
+
+import csv
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from ..errors import ModelError, nearest
+
+ESTIMATE = "estimate"
+
+
+@dataclasses.dataclass(frozen=True)
+class Unknown:
+    """A start that is estimated.
+
+    - `guess`: where the search begins.
+    - `spread`: the standard deviation of a normal prior around the guess; None: nothing is known beforehand.
+    - `shared`: whether all experiments have the same value, or each its own.
+    """
+
+    guess: float
+    spread: float | None = None
+    shared: bool = False
+
+    def __post_init__(self):
+        if not _is_finite(self.guess):
+            raise ModelError(f"Unknown needs a finite guess; got {self.guess!r}")
+        if self.spread is not None and not (_is_finite(self.spread) and self.spread > 0):
+            raise ModelError(f"Unknown: spread is a standard deviation > 0, or None; got {self.spread!r}")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Experiment:
+    """One record.
+
+    - `times`: when it was sampled, increasing, shape `(n,)`.
+    - `data`: by the variables' names, shape `(n,)`, or `(n, *shape)` for the name of an array; NaN where there is no
+        sample.
+    - `sigma`: standard deviations of the noise, by name or one number for all, in the variables' units; or
+        `"estimate"`: found from the residuals, one for each name, the same in all experiments.
+    - `inputs`: by name, `(times, values)`, or with `"held"` or `"cubic"` as a third entry, or a constant.
+    - `initial`: values at `t0` by variables' names, known (numbers) or `Unknown`. A parameter's name gives this
+        experiment its own value of it.
+    - `weight`: how often the record counts.
+    - `holdout`: kept out of the fit, and used to score it. Of its own it keeps unknown starts alone, which are fitted
+        to it with everything else held.
+    - `t0`: the time at which it starts.
+    - `name`: what reports call it.
+
+    **Raises:**
+
+    - `ModelError` for times that do not increase or lie before `t0`, for shapes that do not fit, and for data that are
+        infinite, by variable and index.
+    """
+
+    times: Any
+    data: Mapping[str, Any]
+    sigma: Mapping[str, Any] | float | str = ESTIMATE
+    inputs: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    initial: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    weight: float = 1.0
+    holdout: bool = False
+    t0: float = 0.0
+    name: str = ""
+
+    def __post_init__(self):
+        object.__setattr__(self, "times", _times(self.times, self.t0))
+        if not isinstance(self.data, Mapping) or not self.data:
+            raise ModelError(f"data is a dictionary by variables' names, {{'m.x': values}}; got {self.data!r}")
+        count = len(self.times)
+        object.__setattr__(self, "data", {name: _samples(name, v, count) for name, v in self.data.items()})
+        object.__setattr__(self, "sigma", self._sigmas())
+        if not (_is_finite(self.weight) and self.weight >= 0):
+            raise ModelError(f"weight is a number ≥ 0; got {self.weight!r}")
+
+    def _sigmas(self) -> dict[str, float]:
+        """The standard deviation for each name; NaN where it is to be estimated."""
+        given = self.sigma
+        if isinstance(given, Mapping):
+            unknown = [name for name in given if name not in self.data]
+            if unknown:
+                raise ModelError(f"sigma: there are no data of '{unknown[0]}': " + nearest(unknown[0], self.data))
+        by_name = given if isinstance(given, Mapping) else dict.fromkeys(self.data, given)
+        out = {}
+        for name in self.data:
+            value = by_name.get(name, ESTIMATE)
+            if isinstance(value, str) and value == ESTIMATE:
+                out[name] = math.nan
+            elif not isinstance(value, str) and _is_finite(value) and value > 0:
+                out[name] = float(value)
+            else:
+                raise ModelError(f"sigma of '{name}' is a standard deviation > 0, or 'estimate'; got {value!r}")
+        return out
+
+    @classmethod
+    def from_frame(
+        cls,
+        frame: Any,
+        data: Sequence[str] | Mapping[str, str],
+        *,
+        time: str | None = None,
+        inputs: Mapping[str, Any] | None = None,
+        **others: Any,
+    ) -> "Experiment":
+        """A record from a data frame of pandas, or anything that has columns by name.
+
+        **Arguments:**
+
+        - `data`: columns by variables' names, `{"room.T": "Ti"}`, or a list if the columns have these names.
+        - `time`: the column of times, in seconds or as dates; None: the index. Dates count in seconds from the first.
+        - `inputs`: columns by inputs' names, `{"heater.Q": ("Ph", "held")}`; other inputs as in `Experiment`.
+        - `others`: as in `Experiment`.
+        """
+        columns = data if isinstance(data, Mapping) else {name: name for name in data}
+        times = _seconds(frame.index if time is None else _column(frame, time))
+        given = {}
+        for name, source in (inputs or {}).items():
+            parts = (source,) if isinstance(source, str) else source
+            if isinstance(parts, tuple | list) and isinstance(parts[0], str):
+                given[name] = (times, np.asarray(_column(frame, parts[0]), float), *parts[1:])
+            else:
+                given[name] = source
+        values = {name: np.asarray(_column(frame, column), float) for name, column in columns.items()}
+        return cls(times, values, inputs=given, **others)
+
+    @classmethod
+    def from_csv(cls, path: Any, data: Sequence[str] | Mapping[str, str], *, time: str, **others: Any) -> "Experiment":
+        """A record from a text file with commas, whose first line names the columns; empty cells are missing samples.
+        Dates are understood. `data`, `inputs` and `others` as in `from_frame`."""
+        with open(path, newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+        if not rows:
+            raise ModelError(f"{path}: there are no rows below the first line")
+        table = {key: _cells([row[key] for row in rows]) for key in rows[0]}
+        return cls.from_frame(table, data, time=time, **others)
+
+
+def _is_finite(value: Any) -> bool:
+    return isinstance(value, int | float | np.integer | np.floating) and math.isfinite(value)
+
+
+def _times(given: Any, t0: float) -> np.ndarray:
+    times = np.asarray(given)
+    if times.ndim != 1 or not len(times) or times.dtype.kind not in "iuf":
+        raise ModelError(f"times are numbers of shape (n,), n ≥ 1; got {times.dtype} of shape {times.shape}")
+    times = times.astype(float)
+    bad = np.flatnonzero(~np.isfinite(times))
+    if len(bad):
+        raise ModelError(f"times[{bad[0]}] is {times[bad[0]]}: every row needs a time")
+    back = np.flatnonzero(np.diff(times) <= 0)
+    if len(back):
+        k = int(back[0])
+        raise ModelError(f"times must increase; times[{k}]={times[k]:g} is followed by times[{k + 1}]={times[k + 1]:g}")
+    if not _is_finite(t0) or times[0] < t0 or times[-1] <= t0:
+        raise ModelError(
+            f"times lie outside of the experiment: it starts at t0={t0:g}, the times reach from {times[0]:g} to "
+            f"{times[-1]:g}. Give t0={times[0]:g}, or leave earlier rows out"
+        )
+    return times
+
+
+def _samples(name: str, given: Any, count: int) -> np.ndarray:
+    values = np.asarray(given)
+    if values.dtype.kind not in "biuf":
+        raise ModelError(f"data of '{name}' must be real numbers; got {values.dtype}")
+    if values.ndim == 0 or values.shape[0] != count:
+        raise ModelError(f"data of '{name}' need a row for each of the {count} times; got shape {values.shape}")
+    values = values.astype(float)
+    bad = np.argwhere(np.isinf(values))
+    if len(bad):
+        where = ", ".join(map(str, bad[0]))
+        raise ModelError(f"data of '{name}': entry [{where}] is {values[tuple(bad[0])]}; NaN marks a missing sample")
+    return values
+
+
+def _column(frame: Any, name: str) -> Any:
+    known = list(getattr(frame, "columns", frame))
+    if name not in known:
+        raise ModelError(f"there is no column '{name}': " + nearest(name, [str(k) for k in known]))
+    return frame[name]
+
+
+def _seconds(column: Any) -> np.ndarray:
+    values = np.asarray(column)
+    if values.dtype.kind not in "biuf":  # dates, with or without a zone
+        try:
+            stamps = np.array([np.datetime64(_without_zone(v), "us") for v in column])
+        except (TypeError, ValueError) as error:
+            raise ModelError(f"times must be numbers or dates; got {column[0]!r}") from error
+        return (stamps - stamps[0]) / np.timedelta64(1, "s")
+    return values.astype(float)
+
+
+def _without_zone(stamp: Any) -> Any:
+    """A date in universal time, which NumPy has no zones for."""
+    if isinstance(stamp, str):
+        stamp = datetime.fromisoformat(stamp)
+    if getattr(stamp, "tzinfo", None) is not None:
+        stamp = stamp.astimezone(UTC).replace(tzinfo=None)
+    return stamp
+
+
+def _cells(texts: list[str]) -> Any:
+    """Numbers where all cells are numbers or empty; the texts themselves otherwise."""
+    try:
+        return np.array([float(t) if t and t.strip() else math.nan for t in texts])
+    except ValueError:
+        return texts

@@ -1,0 +1,128 @@
+"""What data can tell: the Fisher information, scaled, and what is not determined, in words.
+
+Each coordinate is measured by what it would be natural to be unsure of: a parameter on a logarithmic scale by a factor
+of e, another by its own size, a start by its spread. A direction is not determined if the data leave it as unsure as
+that, or more.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from .factors import Factors
+from .least_squares import Evaluation, Weights
+from .objective import Objective
+
+
+@dataclasses.dataclass(frozen=True)
+class Direction:
+    """A combination of coordinates that the data do not determine: `parts` of each, of length one together, and its
+    `spread` on the natural scale; infinite if the data do not depend on it."""
+
+    parts: dict[str, float]
+    spread: float
+
+    def __str__(self):
+        names = list(self.parts)
+        known = "nothing measured depends on" if np.isinf(self.spread) else f"known to {self.spread:.2g} only:"
+        if len(names) == 1:
+            return f"{known} '{names[0]}'"
+        mixed = ", ".join(f"{part:+.2f} '{name}'" for name, part in self.parts.items())
+        return f"{known} the combination {mixed}: only others of them can be told"
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Identifiability:
+    """The report, to be printed.
+
+    - `spectrum`: eigenvalues of the scaled Fisher information, the greatest first; 1/√ of each is the standard
+        deviation of its direction, relative to what is natural.
+    - `directions`: those not determined.
+    - `alone`, `together`: standard deviations of parameters and starts, on the coordinates' scale, if all else were
+        known, and as it is.
+    - `confounded`: for each, the other name whose knowledge would help most, and to which standard deviation.
+    """
+
+    spectrum: Float[np.ndarray, " k"]
+    directions: tuple[Direction, ...]
+    alone: dict[str, float]
+    together: dict[str, float]
+    confounded: dict[str, tuple[str, float]]
+
+    def __repr__(self):
+        low, high = self.spectrum.min(initial=np.inf), self.spectrum.max(initial=0.0)
+        lines = [f"Fisher information: eigenvalues from {high:.3g} down to {low:.3g}"]
+        lines += [f"not determined: {direction}" for direction in self.directions]
+        for name, together in self.together.items():
+            text = f"{name}: {self.alone[name]:.3g} if all else were known, {together:.3g} together"
+            if name in self.confounded:
+                other, helped = self.confounded[name]
+                text += f" ({helped:.3g} if '{other}' were known)"
+            lines.append(text)
+        return "\n".join(lines)
+
+
+def natural_scale(objective: Objective, z: Float[np.ndarray, " f"]) -> Float[np.ndarray, " f"]:
+    """What each free coordinate would naturally be unsure of."""
+    c, free = objective.coordinates, objective.free
+    return np.where(c.is_weight[free] & (z != 0), np.abs(z), 1.0)
+
+
+def identifiability(
+    objective: Objective, weights: Weights, found: Evaluation, z: Float[np.ndarray, " f"], noise: float
+) -> Identifiability:
+    """The report at a point; `noise` is the relative error of the Jacobian's columns, the tolerance of integration."""
+    c, free = objective.coordinates, objective.free
+    names = np.array(c.names)[free]
+    groups = np.array(c.group)[free]
+    weight = c.is_weight[free]
+    scale = natural_scale(objective, z)
+    r, jacobian = weights.applied(z, found)
+    scaled = jacobian * scale
+    singular, right = np.linalg.svd(scaled, full_matrices=False)[1:]
+    columns = np.linalg.norm(scaled, axis=0)
+    floor = noise * np.sqrt(len(names)) * columns.max(initial=0.0)
+    silent = columns <= floor  # the error of the largest column
+    directions = [Direction({names[k]: 1.0}, np.inf) for k in np.flatnonzero(silent & ~weight)]
+    for value, vector in zip(singular, right, strict=True):
+        parts = np.where(weight | silent, 0.0, vector)
+        if value > 1.0 or np.sum(parts**2) < 0.5:  # directions among weights are what a prior is for
+            continue
+        chosen = np.flatnonzero(np.abs(parts) > 0.1 * np.abs(parts).max())
+        spread = np.inf if value <= floor else 1 / value
+        directions.append(Direction({names[k]: float(parts[k]) for k in chosen}, spread))
+    alone, together, confounded = {}, {}, {}
+    plain = np.flatnonzero(~weight)
+    full = _spread(r, jacobian, np.ones(len(z), bool), noise)
+    norms = np.linalg.norm(jacobian, axis=0)
+    for k in plain:
+        alone[names[k]] = float(1 / norms[k]) if norms[k] > 0 else np.inf
+        together[names[k]] = float(full[k])
+    best: dict[str, tuple[str, float]] = {}
+    for other in dict.fromkeys([*names[plain], *groups[weight]]):
+        without = (names != other) & ~(weight & (groups == other))
+        if not without.any():
+            continue
+        spread = np.full(len(z), np.inf)
+        spread[without] = _spread(r, jacobian, without, noise)
+        for k in plain:
+            if names[k] != other and spread[k] < best.get(names[k], ("", np.inf))[1]:
+                best[names[k]] = other, float(spread[k])
+    for name, (other, value) in best.items():
+        if value < together[name] / 2:  # more than half of its uncertainty is the other's
+            confounded[name] = other, value
+    return Identifiability(singular**2, tuple(directions), alone, together, confounded)
+
+
+def _spread(r: np.ndarray, jacobian: np.ndarray, chosen: Bool[np.ndarray, " f"], noise: float) -> np.ndarray:
+    """Standard deviations of the chosen coordinates, infinite for those that have a part in what is not determined."""
+    return spreads(Factors.of(r, jacobian[:, chosen], noise), noise)
+
+
+def spreads(factors: Factors, noise: float) -> Float[np.ndarray, " p"]:
+    """Standard deviations of coordinates; infinite for those that have a part in a direction not determined."""
+    rank = factors.rank(noise)
+    found = np.sqrt(np.sum(factors.root(rank) ** 2, axis=1))
+    inside = np.sum(factors.right[:, :rank] ** 2, axis=1)
+    return np.where(inside < 1 - noise, np.inf, found)

@@ -1,0 +1,179 @@
+"""Residuals and their Jacobian in the coordinates that are free, from one program.
+
+Rows are the samples that count: those observed in experiments that are fitted. Coordinates that are frozen have their
+columns left out, so another set of frozen ones is the same program.
+"""
+
+import dataclasses
+import functools
+import math
+from typing import Any
+
+import diffrax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ..system.system import AcausalSystem
+from .coordinates import Coordinates
+from .data import Stacked
+from .evidence import Evidence
+from .experiment import Unknown
+from .least_squares import Evaluation, Weights
+from .program import Conditions, Layout, predict, predict_and_differentiate
+
+
+@dataclasses.dataclass(frozen=True)
+class Predicted:
+    """What the program returns, in NumPy: natural outputs of e experiments, and their derivatives by natural values."""
+
+    outputs: Float[np.ndarray, "e n k"]
+    by_shared: Float[np.ndarray, "e n k s"]
+    by_own: Float[np.ndarray, "e n k o"]
+
+    def jacobian(self, rows: tuple[np.ndarray, ...]) -> Float[np.ndarray, "m p"]:
+        """The Jacobian of chosen samples, (experiments, times, outputs), with the columns of `Coordinates`."""
+        shared, own = self.by_shared[rows], self.by_own[rows]
+        m, n_own, experiments = len(own), own.shape[-1], len(self.outputs)
+        columns = np.zeros((m, experiments, n_own))
+        columns[np.arange(m), rows[0]] = own
+        return np.concatenate([shared, columns.reshape(m, experiments * n_own)], axis=1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Objective:
+    """What is minimised: a system with what stands around it, data, coordinates, and which experiments count."""
+
+    system: AcausalSystem
+    observers: dict[str, Any]
+    layout: Layout
+    stacked: Stacked
+    coordinates: Coordinates
+    penalties: dict[str, Any]  # "evidence" or a precision, by the name of a group
+    counted: Bool[np.ndarray, " e"]
+
+    def until(self, share: float) -> "Objective":
+        """The same with a share of each experiment's time."""
+        return dataclasses.replace(self, stacked=self.stacked.until(share))
+
+    @functools.cached_property
+    def rows(self) -> tuple[Int[np.ndarray, " m"], ...]:
+        """(experiments, times, outputs) of the samples that count."""
+        heavy = self.counted & (self.stacked.weight > 0)
+        return np.nonzero(self.stacked.observed & heavy[:, None, None])
+
+    @functools.cached_property
+    def free(self) -> Bool[np.ndarray, " p"]:
+        """The coordinates that are searched: not frozen, and not of an experiment that does not count."""
+        c = self.coordinates
+        owner = np.repeat(np.arange(len(self.counted)), c.n_own)
+        counts = np.concatenate([np.ones(c.n_shared, bool), self.counted[owner]])
+        return ~c.fixed & counts
+
+    @functools.cached_property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Of the free coordinates."""
+        low, high = self.coordinates.z_bounds
+        return low[self.free], high[self.free]
+
+    @functools.cached_property
+    def conditions(self) -> Conditions:
+        """What the program is told, as arrays of the system's dtype."""
+        s, dtype = self.stacked, self.system.parameters.values.dtype
+
+        def number(value: Any) -> float:
+            return float(value.guess if isinstance(value, Unknown) else value)
+
+        known = [[number(s.starts[name][k]) for name in self.layout.known] for k in range(len(s.labels))]
+        inputs = {n: (jnp.asarray(t, dtype), jnp.asarray(v, dtype)) for n, (t, v) in s.inputs.items()}
+        return Conditions(
+            jnp.asarray(s.times, dtype),
+            jnp.asarray(s.t0, dtype),
+            jnp.asarray(np.array(known, float).reshape(len(s.labels), len(self.layout.known)), dtype),
+            inputs,
+        )
+
+    def full(self, z: Float[np.ndarray, " f"]) -> Float[np.ndarray, " p"]:
+        """All coordinates, those that are not searched at their starts."""
+        out = self.coordinates.z_start
+        out[self.free] = z
+        return out
+
+    def numbers(self, natural: Float[np.ndarray, " p"]) -> tuple[Any, Any]:
+        """(shared, own) natural values as the program takes them."""
+        dtype = self.system.parameters.values.dtype
+        shared, own = self.coordinates.split(natural)
+        return jnp.asarray(shared, dtype), jnp.asarray(own, dtype)
+
+    def predicted(self, z: Float[np.ndarray, " p"]) -> Predicted:
+        """Everything at a point, by the program."""
+        shared, own = self.numbers(self.coordinates.natural(z))
+        found = predict_and_differentiate(self.system, self.observers, self.layout, shared, own, self.conditions)
+        return Predicted(*(np.asarray(a, np.float64) for a in found))
+
+    def evaluate(self, z: Float[np.ndarray, " f"]) -> Evaluation | None:
+        """Residuals and Jacobian of the free coordinates; None where a run that counts fails."""
+        full = self.full(z)
+        found = self.predicted(full)
+        residual = found.outputs[self.rows] - self.stacked.values[self.rows]
+        jacobian = (found.jacobian(self.rows) * self.coordinates.slope(full))[:, self.free]
+        if not (np.isfinite(residual).all() and np.isfinite(jacobian).all()):
+            return None
+        return Evaluation(residual, jacobian)
+
+    def residual(self, z: Float[np.ndarray, " f"]) -> Float[np.ndarray, " m"] | None:
+        """Residuals alone; None where a run that counts fails."""
+        shared, own = self.numbers(self.coordinates.natural(self.full(z)))
+        forwards = diffrax.ForwardMode()
+        outputs = predict(self.system, self.observers, self.layout, forwards, shared, own, self.conditions)
+        found = np.asarray(outputs, np.float64)[self.rows] - self.stacked.values[self.rows]
+        return found if np.isfinite(found).all() else None
+
+    # --- weights -----------------------------------------------------------------------------------------------
+
+    @functools.cached_property
+    def evidence(self) -> Evidence:
+        """Which noise levels and precisions are to be found."""
+        s, (experiment, _, output) = self.stacked, self.rows
+        unknown = np.isnan(s.sigma[experiment, output])
+        chosen = np.unique(output[unknown])
+        noise = np.where(unknown, np.searchsorted(chosen, output), -1)
+        values = s.values[self.rows]
+        sizes = [np.max(np.abs(values[noise == k]), initial=0.0) for k in range(len(chosen))]
+        floor = np.maximum(np.array(sizes) * np.finfo(self.system.parameters.values.dtype).eps, np.finfo(float).tiny)
+        groups = [self._group(name) for name, given in self.penalties.items() if given == "evidence"]
+        return Evidence(
+            noise,
+            tuple(s.outputs[k] for k in chosen),
+            floor,
+            np.sqrt(s.weight[experiment]),
+            tuple(group for group in groups if group.any()),
+        )
+
+    def weights(self, z: Float[np.ndarray, " f"], found: Evaluation) -> Weights:
+        """The first weights: noise levels that are known or as large as the residuals, and priors."""
+        s, c, (experiment, _, output) = self.stacked, self.coordinates, self.rows
+        sigma = s.sigma[experiment, output]
+        row = np.sqrt(s.weight[experiment]) / np.where(np.isnan(sigma), 1.0, sigma)
+        spread = c.spread[self.free]
+        precision = np.where(np.isfinite(spread), 1 / np.where(np.isfinite(spread), spread, 1.0) ** 2, 0.0)
+        mean = np.where(precision > 0, c.z_start[self.free], 0.0)
+        for name, given in self.penalties.items():
+            group = self._group(name)
+            if group.any() and given is not None:
+                # All weights determined, to begin with; weights that are all zero are taken to be of order one.
+                size = float(np.sum(z[group] ** 2))
+                first = group.sum() / size if size > 0 else 1.0
+                precision[group] = first if given == "evidence" else float(given)
+        return self.evidence.first(Weights(row, precision, mean), found)
+
+    def _group(self, name: str) -> Bool[np.ndarray, " f"]:
+        chosen = np.array([name == group for group in self.coordinates.group], bool)
+        return chosen[self.free]
+
+    def with_noise(self, sigma: dict[str, float]) -> "Objective":
+        """The same with these noise levels in place of those to be estimated."""
+        s = self.stacked
+        row = np.array([sigma.get(name, math.nan) for name in s.outputs])
+        known = np.where(np.isnan(s.sigma), row, s.sigma)
+        return dataclasses.replace(self, stacked=dataclasses.replace(s, sigma=known))

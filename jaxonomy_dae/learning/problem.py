@@ -1,0 +1,402 @@
+"""A problem: a system, data of experiments, and what is to be learned from them."""
+
+import dataclasses
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ..errors import InitializationError, ModelError, SimulationError, nearest
+from ..lowering.plan import SystemPlan
+from ..model.tables import ZERO
+from ..simulation.simulate import simulate
+from ..system.system import AcausalSystem
+from .coordinates import Coordinates, coordinates
+from .data import Data, Stacked, stack
+from .estimate import Estimate
+from .experiment import Experiment, Unknown
+from .first_order import adam_steps
+from .holdout import holdout_score
+from .identifiability import Identifiability, identifiability
+from .least_squares import Minimum, minimise
+from .objective import Objective
+from .program import Layout, predict, weights_of, with_values
+
+
+class Problem:
+    """Parameters, networks, sensor laws and starts of a system, to be learned from experiments.
+
+    The program behind it is compiled once, at the first fit: other data of the same shapes, noise levels, starts,
+    bounds, frozen values and weights of priors are arguments of it.
+
+    **Arguments:**
+
+    - `system`: from an `AcausalCompiler`. The search begins at its parameters and weights.
+    - `data`: `Data`, or one `Experiment`.
+    - `train`: names of parameters (also of arrays of them), of networks, and of sensor laws in `observe`; default: all
+        networks. Parameters that must be positive are searched on a logarithmic scale; declared bounds hold.
+    - `starts`: `Unknown(...)` or numbers by variables' names, for experiments that do not name them in `initial`.
+    - `regularize`: of the weights of networks and sensor laws, by name: `"evidence"`, a normal prior whose precision
+        the data choose; a number, its precision; None, no prior. Default: `"evidence"` for networks, None for sensor
+        laws.
+    - `observe`: derived outputs by name, `{"gauge.y": law}`, with `law(solution)` of shape `(n,)`: a function, or an
+        Equinox module whose weights may be trained.
+    - `rtol`, `atol`, `max_steps`, and others in `options`: as in `simulate`.
+
+    **Raises:**
+
+    - `ModelError` for names that do not exist, for a trainable without numbers, for a parameter that nothing in the
+        model reads, for an unknown start of an algebraic variable, and for data that do not fit.
+    """
+
+    def __init__(
+        self,
+        system: AcausalSystem,
+        data: Data | Experiment,
+        train: Sequence[str] | str | None = None,
+        *,
+        starts: Mapping[str, Any] | None = None,
+        regularize: Mapping[str, Any] | str | float | None = "evidence",
+        observe: Mapping[str, Any] | None = None,
+        rtol: float = 1e-6,
+        atol: float = 1e-8,
+        max_steps: int = 4096,
+        **options: Any,
+    ):
+        if not isinstance(system, AcausalSystem):
+            raise ModelError(f"Problem needs an AcausalSystem (call the AcausalCompiler); got {type(system).__name__}")
+        self.system = system
+        self.observers = dict(observe or {})
+        for name, law in self.observers.items():
+            if not callable(law):
+                raise ModelError(f"observe: '{name}' needs a function of a solution; got {law!r}")
+            if name in system.neural or name in system.plan.variable_index:
+                raise ModelError(f"observe: '{name}' is the name of a network or variable: choose another")
+        self.data = data if isinstance(data, Data) else Data(data)
+        self.starts = dict(starts or {})
+        self._options = {"rtol": rtol, "atol": atol, "max_steps": max_steps, **options}
+        self._train = self._names(train)
+        self._stacked = self._stack(self.data)
+        self._layout = self._laid_out(self._stacked)
+        self.penalties = self._penalties(regularize)
+
+    # --- set-up ------------------------------------------------------------------------------------------------
+
+    def _names(self, train: Sequence[str] | str | None) -> tuple[list[str], list[str]]:
+        """(parameters one by one, modules) to be trained."""
+        chosen = list(self.system.neural) if train is None else [train] if isinstance(train, str) else list(train)
+        table, parameters, modules = self.system.parameters.table, [], []
+        for name in dict.fromkeys(chosen):
+            if name in self.system.neural or name in self.observers:
+                module = self.system.neural[name] if name in self.system.neural else self.observers[name]
+                if not weights_of(module):
+                    raise ModelError(f"train: '{name}' has no numbers to be trained")
+                modules.append(name)
+            elif name in self.system.parameters:
+                for one in table.one_by_one(name):
+                    table.settable(one)
+                    parameters.append(one)
+            else:
+                known = [*self.system.neural, *self.observers, *table.names]
+                raise ModelError(
+                    f"train: '{name}' is neither a parameter, a network nor a sensor law: " + nearest(name, known)
+                )
+        read = _read_parameters(self.system.plan)
+        for name in parameters:
+            if table.index(name) not in read:
+                raise ModelError(
+                    f"train: nothing in the model reads parameter '{name}', so no data can determine it: leave it out"
+                )
+        return list(dict.fromkeys(parameters)), modules
+
+    def _stack(self, data: Data | Experiment) -> Stacked:
+        stacked = stack(
+            data if isinstance(data, Data) else Data(data), self.system.plan, tuple(self.observers), self.starts
+        )
+        unused = [name for name in self.observers if name not in stacked.outputs]
+        if unused and unused[0] in self._train[1]:
+            raise ModelError(f"train: there are no data of '{unused[0]}' to train its sensor law with")
+        return stacked
+
+    def _laid_out(self, stacked: Stacked) -> Layout:
+        parameters, modules = self._train
+        shared, own, known = [], [], []
+        for name, values in stacked.starts.items():
+            unknown = [v for v in values if isinstance(v, Unknown)]
+            self._check_start(name, bool(unknown))
+            kind = known if not unknown else shared if unknown[0].shared else own
+            kind.append(name)
+        if not parameters and not modules and not shared and not own:
+            raise ModelError(
+                "nothing is to be learned: name parameters, networks or sensor laws in train=, or make a start Unknown"
+            )
+        return Layout(
+            stacked.outputs, tuple(parameters), tuple(modules), tuple(shared), tuple(own), tuple(known), stacked.kinds,
+            tuple(self._options.items()),
+        )  # fmt: skip
+
+    def _check_start(self, name: str, is_unknown: bool) -> None:
+        plan, table = self.system.plan, self.system.parameters.table
+        if name in table.names:
+            table.settable(name)
+            if name in self._train[0]:
+                raise ModelError(f"'{name}' is trained, and each experiment's own as well: leave one of them out")
+            return
+        if name not in plan.variable_index:
+            known = [*plan.visible_variables, *table.names]
+            raise ModelError(f"the start of '{name}' is not that of a variable: " + nearest(name, known))
+        if is_unknown:
+            quantity = int(plan.resolve([name])[0][0])
+            quantities = plan.extended.quantities
+            if quantity == ZERO or quantities.highest[quantities.owner[quantity]] <= quantities.order[quantity]:
+                raise ModelError(
+                    f"'{name}' is algebraic: its start follows from the others and cannot be unknown. Starts of "
+                    + ", ".join(repr(s) for s in self.system.states[:8])
+                    + " can"
+                )
+
+    def _penalties(self, given: Mapping[str, Any] | str | float | None) -> dict[str, Any]:
+        modules = self._train[1]
+        if not isinstance(given, Mapping):
+            given = {name: given for name in modules if name in self.system.neural}
+        for name, value in given.items():
+            if name not in modules:
+                raise ModelError(f"regularize: '{name}' is no network that is trained: " + nearest(name, modules))
+            number = isinstance(value, int | float) and not isinstance(value, bool)
+            if not (value is None or value == "evidence" or (number and value >= 0 and math.isfinite(value))):
+                raise ModelError(f"regularize: '{name}' takes 'evidence', a precision ≥ 0 or None; got {value!r}")
+        return {name: given.get(name) for name in modules}
+
+    # --- residuals ---------------------------------------------------------------------------------------------
+
+    def residuals(
+        self,
+        model: AcausalSystem | None = None,
+        *,
+        starts: Mapping[str, Any] | None = None,
+        observe: Mapping[str, Any] | None = None,
+        adjoint: Any = None,
+    ) -> dict[str, dict[str, Any]]:
+        """Predictions less data by experiment and name, in units of the noise where it is known, zero where there is
+        no sample: for losses of one's own, inside jit and grad too.
+
+        **Arguments:**
+
+        - `model`: a system like the problem's, such as `equinox.combine(trainable, frozen)`; default: the problem's.
+        - `starts`: unknown starts by names, scalars if shared, else shape `(experiments,)`; default: their guesses.
+        - `observe`: sensor laws by name, in place of the problem's.
+        - `adjoint`: as in `simulate`; `diffrax.ForwardMode()` for Jacobians.
+
+        **Returns:**
+
+        `{experiment: {name: array of shape (n,)}}`; NaN where a run fails.
+        """
+        layout, s = self._layout, self._stacked
+        model = self.system if model is None else model.merged()
+        objective = self._objective(s, coordinates(self.system, self.observers, layout, s))
+        shared, own = objective.numbers(objective.coordinates.start)
+        shared = shared[len(shared) - len(layout.shared) :]
+        for name, value in (starts or {}).items():
+            value = jnp.asarray(value, shared.dtype)
+            if name in layout.shared:
+                shared = shared.at[layout.shared.index(name)].set(value)
+            elif name in layout.own:
+                own = own.at[:, layout.own.index(name)].set(value)
+            else:
+                raise ModelError(f"the start of '{name}' is not unknown: " + nearest(name, layout.shared + layout.own))
+        plain = dataclasses.replace(layout, parameters=(), modules=())
+        observers = self.observers | dict(observe or {})
+        outputs = predict(model, observers, plain, adjoint, shared, own, objective.conditions)
+        sigma = np.where(np.isnan(s.sigma), 1.0, s.sigma)
+        scaled = jnp.where(s.observed, (outputs - s.values) / sigma[:, None, :], 0.0)
+        return {
+            label: {name: scaled[k, :count, j] for j, name in enumerate(s.outputs) if s.observed[k, :, j].any()}
+            for k, (label, count) in enumerate(zip(s.labels, s.counts, strict=True))
+        }
+
+    def _objective(self, stacked: Stacked, c: Coordinates) -> Objective:
+        return Objective(self.system, self.observers, self._layout, stacked, c, self.penalties, ~stacked.holdout)
+
+    # --- fitting -----------------------------------------------------------------------------------------------
+
+    def fit(
+        self,
+        data: Data | Experiment | None = None,
+        *,
+        freeze: Mapping[str, float] | Iterable[str] = (),
+        start: "Mapping[str, float] | AcausalSystem | None" = None,
+        bounds: Mapping[str, tuple[float, float]] | None = None,
+        starts: int = 1,
+        seed: int = 0,
+        adam: int = 0,
+        learning_rate: float = 0.02,
+        horizons: Sequence[float] = (1.0,),
+        steps: int = 200,
+    ) -> Estimate:
+        """The most probable values: least squares in units of the noise, with the priors that were given.
+
+        **Arguments:**
+
+        - `data`: other data than the problem's. If they have the same shapes and unknown starts, nothing is compiled.
+        - `freeze`: parameters, starts and networks that stay as they are, or `{name: value}`.
+        - `start`: where the search begins, values by name; or a system, such as that of an earlier estimate.
+        - `bounds`: narrower than those declared, by name.
+        - `starts`: from how many points; all but the first are drawn around it by `seed`: parameters within a factor of
+            e or their bounds, starts by their spread, networks with weights of the same sizes. The best is the one of
+            the least score on experiments that are held out, or else of the least cost.
+        - `adam`: so many gradient steps at first, with `learning_rate` on the scale of the coordinates.
+        - `horizons`: shares of the time that are fitted one after the other, such as `(0.25, 0.5, 1)`: what diverges
+            over the whole time is caught early.
+        - `steps`: how many steps of least squares at most.
+
+        **Raises:**
+
+        - `ModelError` for names, values and shapes that do not fit.
+        - `SimulationError` if no start can be simulated, with the reason of the first.
+        """
+        stacked = self._stacked if data is None else self._stack(data)
+        if stacked is not self._stacked and self._laid_out(stacked) != self._layout:
+            raise ModelError(
+                "these data name other outputs, inputs or unknown starts than the problem's: make a Problem of them"
+            )
+        c = self._coordinates(stacked, freeze, start, bounds)
+        objective = self._objective(stacked, c)
+        if not objective.free.any():
+            raise ModelError("everything is frozen: there is nothing to fit")
+        shares = [float(share) for share in horizons]
+        if not shares or shares[-1] != 1.0 or any(not 0 < share <= 1 for share in shares):
+            raise ModelError(f"horizons are shares in (0, 1], the last of them 1; got {tuple(horizons)}")
+        best: tuple[float, Minimum, Objective] | None = None
+        for point in self._points(objective, starts, seed):
+            found = self._descend(objective, point, shares, steps, adam, learning_rate)
+            if found is None:
+                continue
+            score = self._score(objective, found) if stacked.holdout.any() else found.cost
+            if best is None or score < best[0]:
+                best = score, found, objective
+        if best is None:
+            raise SimulationError(self._why(objective))
+        return Estimate.of(self, best[2], best[1])
+
+    def _coordinates(self, stacked: Stacked, freeze: Any, start: Any, bounds: Any) -> Coordinates:
+        system, values = self.system, {}
+        if isinstance(start, AcausalSystem):
+            system = start.merged()
+            if system.plan != self.system.plan:
+                raise ModelError("start is a system of another model: give one of the same, or values by names")
+        elif start is not None:
+            values = dict(start)
+        c = coordinates(system, self.observers, self._layout, stacked)
+        c = c.bounded(dict(bounds or {})).changed(values, fixed=False)
+        held = (
+            dict(freeze)
+            if isinstance(freeze, Mapping)
+            else dict.fromkeys([freeze] if isinstance(freeze, str) else freeze)
+        )
+        return c.changed(held, fixed=True)
+
+    def _points(self, objective: Objective, count: int, seed: int) -> list[np.ndarray]:
+        c, (low, high) = objective.coordinates, objective.bounds
+        first, free = c.z_start[objective.free], objective.free
+        rng, points = np.random.default_rng(seed), [first]
+        bounded = np.isfinite(low) & np.isfinite(high)
+        for _ in range(count - 1):
+            width = np.where(c.log[free], 1.0, np.where(c.is_weight[free], 0.0, 1.0))
+            width = np.where(np.isfinite(c.spread[free]), c.spread[free], width)
+            for name in dict.fromkeys(c.group):
+                chosen = np.array([g == name for g in c.group])[free] & c.is_weight[free]
+                width[chosen] = np.sqrt(np.mean(first[chosen] ** 2)) if chosen.any() else 0.0
+            centre = np.where(c.is_weight[free], 0.0, first)
+            drawn = centre + width * rng.standard_normal(len(first))
+            inside = low + (high - low) * rng.uniform(size=len(first)) if bounded.any() else drawn
+            points.append(np.clip(np.where(bounded, inside, drawn), low, high))
+        return points
+
+    def _descend(
+        self, objective: Objective, point: np.ndarray, shares: list[float], steps: int, adam: int, rate: float
+    ) -> Minimum | None:
+        found = None
+        for share in shares:
+            here = objective.until(share)
+            if adam and share == shares[0]:
+                point = adam_steps(here, point, adam, rate)
+            reweigh = None if here.evidence.is_idle else here.evidence.reweigh
+            found = minimise(
+                here.evaluate, here.residual, point, here.bounds, here.weights, reweigh, steps, self._options["rtol"]
+            )
+            if found is None:
+                return None
+            point = found.z
+        return found
+
+    def _score(self, objective: Objective, found: Minimum) -> float:
+        """The root mean square of the residuals of experiments that are held out, in units of the noise."""
+        return holdout_score(objective, found)
+
+    def _why(self, objective: Objective) -> str:
+        """The first reason for which a run from the start fails."""
+        c, s = objective.coordinates, objective.stacked
+        shared, own = objective.numbers(c.natural(c.z_start))
+        outputs = np.asarray(objective.predicted(c.z_start).outputs)
+        failed = [k for k in range(len(s.labels)) if not np.isfinite(outputs[k][s.observed[k]]).all()]
+        k = failed[0] if failed else 0
+        try:
+            self.run(objective, c.z_start, k)
+        except (InitializationError, ModelError, SimulationError) as error:
+            return f"no start can be simulated; from the first, {s.labels[k]} fails: {error}"
+        what = "its predictions are not finite" if failed else "their derivatives are not finite"
+        return f"no start can be simulated; from the first, {s.labels[k]}: {what}"
+
+    def run(self, objective: Objective, z: Float[np.ndarray, " p"], experiment: int, ts: Any = None) -> Any:
+        """An ordinary simulation of one experiment at a point."""
+        layout, s = self._layout, objective.stacked
+        shared, own = objective.numbers(objective.coordinates.natural(z))
+        system, _, starts = with_values(self.system, self.observers, layout, shared)
+        initial = dict(zip(layout.shared, starts, strict=True))
+        initial |= dict(zip(layout.own, own[experiment], strict=True))
+        initial |= dict(zip(layout.known, objective.conditions.known[experiment], strict=True))
+        given = {name: float(v) for name, v in initial.items() if name in system.parameters}
+        system = system.with_parameters(given) if given else system
+        initial = {name: v for name, v in initial.items() if name not in given}
+        inputs = {n: (t[experiment], v[experiment], dict(s.kinds)[n]) for n, (t, v) in s.inputs.items()}
+        end = s.counts[experiment]
+        times = s.times[experiment, :end] if ts is None else ts
+        t1 = max(float(times[-1]), np.nextafter(s.t0[experiment], math.inf))
+        return simulate(
+            system, t1, t0=s.t0[experiment], ts=times, inputs=inputs or None, initial=initial or None, **self._options
+        )
+
+    # --- before a fit ------------------------------------------------------------------------------------------
+
+    def identifiability(
+        self, *, freeze: Mapping[str, float] | Iterable[str] = (), start: Any = None
+    ) -> Identifiability:
+        """What the data could tell at the nominal values: the Fisher information, before any fit.
+
+        Noise levels that are to be estimated are taken as large as the residuals are at the start.
+        """
+        objective = self._objective(self._stacked, self._coordinates(self._stacked, freeze, start, None))
+        z = objective.coordinates.z_start[objective.free]
+        found = objective.evaluate(z)
+        if found is None:
+            raise SimulationError(self._why(objective))
+        return identifiability(objective, objective.weights(z, found), found, z, self._options["rtol"])
+
+
+def _read_parameters(plan: SystemPlan) -> set[int]:
+    """The parameters that some equation, start, event or other parameter reads."""
+    flat = plan.flat
+    found: set[int] = set()
+    for group in flat.groups:
+        found.update(group.parameter.ravel().tolist())
+    for group in flat.variables.start.groups:
+        found.update(group.parameter.ravel().tolist())
+    for group in flat.parameters.dependents:
+        found.update(group.parameter.ravel().tolist())
+    for clock in flat.events.clocks:
+        for part in clock:
+            found.update(part.parameters)
+    return found

@@ -1,0 +1,147 @@
+"""The compiled program behind a problem: predictions of all experiments, and their Jacobian.
+
+It is given natural values: those of trained parameters, of weights, of starts. Everything that may change from fit to
+fit (data, noise, inputs, times, starts, what is frozen, bounds, scales) is an argument of it, or is applied to what it
+returns. What it depends on is a `Layout`, in which names and shapes alone count.
+
+The Jacobian is found forwards, one experiment at a time, so its cost is linear in the number of experiments whose
+starts are their own.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..programs.cache import compiled
+from ..simulation.simulate import simulate
+from ..system.system import AcausalSystem
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """Which numbers a program is given, and which it returns: names alone."""
+
+    outputs: tuple[str, ...]
+    parameters: tuple[str, ...]  # trained, one number each
+    modules: tuple[str, ...]  # networks and sensor laws whose weights are trained
+    shared: tuple[str, ...]  # starts that all experiments share
+    own: tuple[str, ...]  # starts that are each experiment's own
+    known: tuple[str, ...]  # starts that are given
+    kinds: tuple[tuple[str, str], ...]  # of inputs
+    options: tuple[tuple[str, Any], ...]  # of `simulate`
+
+    @property
+    def n_own(self) -> int:
+        """How many numbers each experiment has to itself."""
+        return len(self.own)
+
+
+class Conditions(eqx.Module):
+    """What one program run is told of e experiments."""
+
+    times: Float[Array, "e n"]
+    t0: Float[Array, " e"]
+    known: Float[Array, "e known"]
+    inputs: dict[str, tuple[Float[Array, "e _"], Float[Array, "e _"]]]
+
+
+def weights_of(module: Any) -> list[Any]:
+    """The arrays of a network or sensor law that are trained."""
+    return jax.tree.leaves(eqx.filter(module, eqx.is_inexact_array))
+
+
+def with_weights(module: Any, numbers: Any) -> Any:
+    """A module whose trained arrays are read, one after the other, from an array of shape (count,)."""
+    leaves, structure = jax.tree.flatten(eqx.filter(module, eqx.is_inexact_array))
+    new, place = [], 0
+    for leaf in leaves:
+        size = math.prod(leaf.shape)
+        new.append(numbers[place : place + size].reshape(leaf.shape).astype(leaf.dtype))
+        place += size
+    return eqx.combine(jax.tree.unflatten(structure, new), module)
+
+
+def with_values(system: AcausalSystem, observers: dict[str, Any], layout: Layout, shared: Any) -> tuple[Any, Any, Any]:
+    """(system, observers, shared starts) with the shared numbers in their places."""
+    n = len(layout.parameters)
+    if n:
+        system = system.with_parameters({name: shared[k] for k, name in enumerate(layout.parameters)})
+    for name in layout.modules:
+        module = system.neural[name] if name in system.neural else observers[name]
+        size = sum(math.prod(leaf.shape) for leaf in weights_of(module))
+        changed = with_weights(module, shared[n : n + size])
+        n += size
+        if name in system.neural:
+            system = eqx.tree_at(lambda s, name=name: s.neural[name], system, changed)
+        else:
+            observers = {**observers, name: changed}
+    return system, observers, shared[n:]
+
+
+def _one(
+    system: AcausalSystem, observers: dict[str, Any], layout: Layout, adjoint: Any, shared: Any, own: Any, c: Conditions
+) -> Float[Array, "n k"]:
+    """The outputs of one experiment."""
+    system, observers, starts = with_values(system, observers, layout, shared)
+    initial = dict(zip(layout.shared, starts, strict=True))
+    initial |= dict(zip(layout.own, own, strict=True))
+    initial |= dict(zip(layout.known, c.known, strict=True))
+    own_parameters = {name: v for name, v in initial.items() if name in system.parameters}
+    if own_parameters:
+        system = system.with_parameters(own_parameters)
+        initial = {name: v for name, v in initial.items() if name not in own_parameters}
+    kinds = dict(layout.kinds)
+    solution = simulate(
+        system, c.times[-1], t0=c.t0, ts=c.times, initial=initial or None, adjoint=adjoint, throw=False,
+        inputs={name: (*samples, kinds[name]) for name, samples in c.inputs.items()}, **dict(layout.options),
+    )  # fmt: skip
+    variables = [name for name in layout.outputs if name not in observers]
+    read = dict(zip(variables, solution[variables].T, strict=True)) if variables else {}
+    derived = {name: observers[name](solution) for name in layout.outputs if name in observers}
+    return jnp.stack([read[n] if n in read else jnp.asarray(derived[n], c.times.dtype) for n in layout.outputs], axis=1)
+
+
+def _each(function: Callable, shared: Any, own: Any, conditions: Conditions) -> Any:
+    """`function(shared, own, conditions)` of each experiment; a single one is not made a batch, which costs compile
+    time."""
+    if own.shape[0] == 1:
+        found = function(shared, own[0], jax.tree.map(lambda a: a[0], conditions))
+        return jax.tree.map(lambda a: a[None], found)
+    return jax.vmap(function, in_axes=(None, 0, 0))(shared, own, conditions)
+
+
+@compiled
+def predict(
+    system: AcausalSystem, observers: dict[str, Any], layout: Layout, adjoint: Any, shared: Any, own: Any,
+    conditions: Conditions,
+) -> Float[Array, "e n k"]:  # fmt: skip
+    """The outputs of all experiments; NaN where a run failed."""
+
+    def one(shared, own, c):
+        return _one(system, observers, layout, adjoint, shared, own, c)
+
+    return _each(one, shared, own, conditions)
+
+
+@compiled
+def predict_and_differentiate(
+    system: AcausalSystem, observers: dict[str, Any], layout: Layout, shared: Any, own: Any, conditions: Conditions
+) -> tuple[Float[Array, "e n k"], Float[Array, "e n k s"], Float[Array, "e n k o"]]:
+    """The outputs of all experiments, and their derivatives by the shared numbers and by each experiment's own."""
+
+    def one(shared, own, c):
+        found = _one(system, observers, layout, diffrax.ForwardMode(), shared, own, c)
+        return found, found
+
+    def with_slopes(shared, own, c):
+        (by_shared, by_own), found = jax.jacfwd(one, argnums=(0, 1), has_aux=True)(shared, own, c)
+        return found, by_shared, by_own
+
+    return _each(with_slopes, shared, own, conditions)

@@ -1,0 +1,136 @@
+"""What experiments and problems refuse, and with which words. Nothing is simulated."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv
+from jaxonomy_dae.errors import ModelError
+from jaxonomy_dae.learning import Data, Experiment, Problem, Unknown
+from jaxonomy_dae.modeling import Component, Eq, der
+
+TIMES = np.array([1.0, 2.0, 3.0])
+
+
+class Tank(Component):
+    def __init__(self, ev, name="tank"):
+        super().__init__(ev, name)
+        k = self.parameter("k", 0.5, unit="1/s")
+        self.parameter("idle", 1.0)
+        u = self.input("u")
+        level = self.variable("level", start=1.0, fixed=True, unit="m")
+        outflow = self.variable("outflow")
+        (loss,) = self.learned("loss", eqx.nn.MLP(1, 1, 2, 1, jnp.tanh, key=jax.random.key(0)), inputs=[level])
+        self.add_equations(Eq(der(level), u - outflow + loss), Eq(outflow, k * level**2))
+
+
+@pytest.fixture(scope="module")
+def system():
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    diagram.add(Tank(ev))
+    return AcausalCompiler(ev, diagram)()
+
+
+def record(data=None, **given):
+    given = {"inputs": {"tank.u": 0.0}} | given
+    return Experiment(TIMES, {"tank.level": TIMES} if data is None else data, **given)
+
+
+@pytest.mark.parametrize(
+    "given, words",
+    [
+        (dict(times=[1.0, 3.0, 2.0]), r"times\[1\]=3 is followed by times\[2\]=2"),
+        (dict(times=[1.0, np.nan, 2.0]), r"times\[1\] is nan"),
+        (dict(t0=2.0), "starts at t0=2, the times reach from 1 to 3"),
+        (dict(data={"tank.level": [1.0, 2.0]}), r"'tank.level' need a row for each of the 3 times; got shape \(2,\)"),
+        (
+            dict(data={"tank.level": [1.0, np.inf, 2.0]}),
+            r"'tank.level': entry \[1\] is inf; NaN marks a missing sample",
+        ),
+        (dict(sigma=0.0), "sigma of 'tank.level' is a standard deviation > 0"),
+        (dict(sigma={"tank.levle": 1.0}), "there are no data of 'tank.levle': did you mean 'tank.level'"),
+        (dict(weight=-1.0), "weight is a number ≥ 0; got -1"),
+    ],
+)
+def test_experiment(given, words):
+    with pytest.raises(ModelError, match=words):
+        Experiment(**({"times": TIMES, "data": {"tank.level": TIMES}} | given))
+
+
+@pytest.mark.parametrize(
+    "experiments, given, words",
+    [
+        ([record({"tank.levl": TIMES})], {}, "'tank.levl', which is not a variable: did you mean 'tank.level'"),
+        ([record({"tank.level": np.ones((3, 2))})], {}, r"'tank.level' must have shape \(n,\); got \(3, 2\)"),
+        ([record({"tank.level": np.full(3, np.nan)})], {}, "all samples are missing"),
+        ([record(inputs={"tank.v": 0.0})], {}, "'tank.v' is not an input of this system: did you mean 'tank.u'"),
+        ([record(inputs={"tank.u": (TIMES, TIMES)})], {}, "reach from 1 to 3, the experiment from 0 to 3"),
+        ([record(inputs={"tank.u": ([0, 5, 4], TIMES)})], {}, "times must increase"),
+        ([record(inputs={"tank.u": ([0, 2, 4], [0, np.nan, 1])})], {}, r"input 'tank.u': values\[1\] is nan"),
+        ([record(), record(inputs={})], {}, "experiment 1 does not give input 'tank.u'"),
+        (
+            [record(inputs={"tank.u": ([0, 3], [0, 1], kind)}) for kind in ("held", "linear")],
+            {},
+            "'held' in experiment 0 and 'linear' in experiment 1",
+        ),
+        ([record(holdout=True)], {}, "every experiment is held out"),
+        ([record(name="a"), record(name="a")], {}, "two experiments are named 'a'"),
+        ([record()], dict(train=["tank.kk"]), "'tank.kk' is neither a parameter, a network nor a sensor law"),
+        ([record()], dict(train=[]), "nothing is to be learned"),
+        ([record()], dict(train=["tank.idle"]), "nothing in the model reads parameter 'tank.idle'"),
+        ([record()], dict(train=["y"], observe={"y": lambda s: s["tank.level"]}), "'y' has no numbers to be trained"),
+        ([record()], dict(starts={"tank.outflow": Unknown(1.0)}), "'tank.outflow' is algebraic: .*'tank.level'"),
+        ([record()], dict(starts={"tank.lvl": Unknown(1.0)}), "'tank.lvl' is not that of a variable"),
+        ([record()], dict(starts={"tank.level": "high"}), "'tank.level' starts at a finite number or Unknown"),
+        ([record(), record(initial={"tank.level": 1.0})], {}, "experiment 0 does not say how 'tank.level' starts"),
+        (
+            [record(initial={"tank.level": Unknown(1.0, shared=k)}) for k in (True, False)],
+            {},
+            "'tank.level' is shared in some experiments only",
+        ),
+        ([record()], dict(regularize={"tank.los": 1.0}), "'tank.los' is no network that is trained"),
+        ([record()], dict(regularize={"tank.loss": -1.0}), "takes 'evidence', a precision ≥ 0 or None; got -1"),
+    ],
+)
+def test_problem(system, experiments, given, words):
+    with pytest.raises(ModelError, match=words):
+        Problem(system, Data(*experiments), **given)
+
+
+@pytest.mark.parametrize(
+    "given, words",
+    [
+        (dict(freeze=["tank.c"]), "'tank.c' is not estimated in this problem: did you mean 'tank.k'"),
+        (dict(freeze=["tank.k"]), "everything is frozen"),
+        (dict(start={"tank.k": np.nan}), "'tank.k' needs a finite number"),
+        (dict(bounds={"tank.k": (2.0, 1.0)}), r"bounds of 'tank.k' must lie within"),
+        (dict(horizons=(0.5,)), "horizons are shares"),
+        (dict(data=record({"tank.outflow": TIMES})), "name other outputs"),
+    ],
+)
+def test_fit(system, given, words):
+    problem = Problem(system, record(), train=["tank.k"])
+    with pytest.raises(ModelError, match=words):
+        problem.fit(**given)
+
+
+def test_spread_and_guess_of_an_unknown():
+    with pytest.raises(ModelError, match="finite guess; got nan"):
+        Unknown(np.nan)
+    with pytest.raises(ModelError, match="standard deviation > 0"):
+        Unknown(1.0, spread=0.0)
+
+
+def test_csv_with_missing_cells_and_dates(tmp_path):
+    path = tmp_path / "record.csv"
+    path.write_text(
+        "time,T,P\n2020-01-01 00:00:00+00:00,1.5,2\n2020-01-01 01:00:00+00:00,,3\n2020-01-01 02:00:00+00:00,4,5\n"
+    )
+    one = Experiment.from_csv(path, {"room.T": "T"}, time="time", inputs={"heater.Q": ("P", "held")}, sigma=0.1)
+    np.testing.assert_array_equal(one.times, [0.0, 3600.0, 7200.0])
+    np.testing.assert_array_equal(one.data["room.T"], [1.5, np.nan, 4.0])
+    np.testing.assert_array_equal(one.inputs["heater.Q"][1], [2.0, 3.0, 5.0])
+    with pytest.raises(ModelError, match="no column 'S': known names: 'time', 'T', 'P'"):
+        Experiment.from_csv(path, {"room.T": "S"}, time="time")

@@ -1,0 +1,141 @@
+"""Levenberg–Marquardt, evidence and intervals on models that have closed forms."""
+
+import numpy as np
+import pytest
+import scipy.optimize
+
+from jaxonomy_dae.learning.evidence import Evidence
+from jaxonomy_dae.learning.factors import Factors
+from jaxonomy_dae.learning.identifiability import spreads
+from jaxonomy_dae.learning.least_squares import Evaluation, Weights, minimise
+from jaxonomy_dae.learning.whiteness import whiteness
+
+FREE = -np.inf, np.inf
+
+
+def solve(function, jacobian, start, low=FREE[0], high=FREE[1], weights=None, reweigh=None, steps=200):
+    start = np.asarray(start, float)
+    bounds = np.broadcast_to(low, start.shape).astype(float), np.broadcast_to(high, start.shape).astype(float)
+    count = [0]
+
+    def evaluate(z):
+        count[0] += 1
+        return Evaluation(function(z), jacobian(z))
+
+    def plain(z, found):
+        return Weights(np.ones(len(found.residual)), np.zeros(len(z)), np.zeros(len(z)))
+
+    return minimise(evaluate, function, start, bounds, weights or plain, reweigh, steps)
+
+
+@pytest.fixture
+def line():
+    rng = np.random.default_rng(3)
+    design = rng.standard_normal((40, 3)) * np.array([1.0, 1e3, 1e-4])
+    truth = np.array([1.0, 2e-3, -5e4])
+    return design, design @ truth + 0.1 * rng.standard_normal(40)
+
+
+def test_linear_problem_is_solved_in_a_few_steps_whatever_its_units(line):
+    design, y = line
+    found = solve(lambda z: design @ z - y, lambda z: design, np.zeros(3))
+    expected = np.linalg.lstsq(design, y)[0]
+    deviation = np.sqrt(np.diag(np.linalg.inv(design.T @ design)) * np.sum((design @ expected - y) ** 2) / 37)
+    assert found.converged and len(found.history) <= 5
+    np.testing.assert_array_less(np.abs(found.z - expected), 2e-3 * deviation)
+
+
+def test_covariance_is_that_of_linear_regression(line):
+    design, y = line
+    factors = Factors.of(y, design, 1e-12)
+    root = factors.root(factors.rank(1e-12))
+    np.testing.assert_allclose(root @ root.T, np.linalg.inv(design.T @ design), rtol=1e-9)
+    np.testing.assert_allclose(spreads(factors, 1e-12) ** 2, np.diag(np.linalg.inv(design.T @ design)), rtol=1e-9)
+
+
+def test_bounds_hold_and_the_rest_is_the_least_among_them(line):
+    design, y = line
+    high = np.array([0.5, np.inf, np.inf])
+    found = solve(lambda z: design @ z - y, lambda z: design, np.zeros(3), high=high)
+    expected = scipy.optimize.lsq_linear(design, y, (np.full(3, -np.inf), high), tol=1e-14).x
+    assert found.z[0] == 0.5
+    np.testing.assert_allclose(found.z, expected, rtol=2e-3)
+
+
+def test_rosenbrock_is_followed_to_its_end():
+    found = solve(
+        lambda z: np.array([10 * (z[1] - z[0] ** 2), 1 - z[0]]),
+        lambda z: np.array([[-20 * z[0], 10.0], [-1.0, 0.0]]),
+        [-1.2, 1.0],
+    )
+    np.testing.assert_allclose(found.z, 1.0, atol=1e-8)
+
+
+def test_trials_that_fail_are_rejected():
+    """−log z is not defined where a full step leads."""
+    found = minimise(
+        lambda z: Evaluation(np.log(z), np.diag(1 / z)),
+        lambda z: np.log(z) if z[0] > 0 else None,
+        np.array([8.0]), (np.array([-np.inf]), np.array([np.inf])),
+        lambda z, e: Weights(np.ones(1), np.zeros(1), np.zeros(1)),
+    )  # fmt: skip
+    assert found is not None
+    np.testing.assert_allclose(found.z, 1.0, rtol=1e-6)
+
+
+def test_a_start_that_fails_is_told():
+    assert minimise(lambda z: None, lambda z: None, np.zeros(1), (np.zeros(1), np.ones(1)), lambda z, e: None) is None
+
+
+def test_a_direction_without_information_has_an_infinite_spread():
+    design = np.array([[1.0, 1.0, 0.0], [2.0, 2.0, 0.0], [3.0, 3.0, 0.0], [0.0, 0.0, 0.0]])
+    assert np.isinf(spreads(Factors.of(np.zeros(4), design, 1e-8), 1e-8)).all()
+    design[3, 2] = 2.0
+    np.testing.assert_allclose(spreads(Factors.of(np.zeros(4), design, 1e-8), 1e-8), [np.inf, np.inf, 0.5])
+
+
+def evidence_for(m, p, sigma_known):
+    everything = np.ones(p, bool)
+    noise = np.full(m, -1 if sigma_known else 0)
+    return Evidence(
+        noise, () if sigma_known else ("y",), np.zeros(0 if sigma_known else 1) + 1e-12, np.ones(m), (everything,)
+    )
+
+
+@pytest.mark.parametrize("sigma_known", [True, False])
+def test_evidence_is_greatest_where_that_of_bayesian_linear_regression_is(sigma_known):
+    """The log evidence of y = X w + noise in closed form, maximised by SciPy."""
+    rng = np.random.default_rng(0)
+    m, p, sigma = 60, 12, 0.3
+    design = rng.standard_normal((m, p)) * np.linspace(0.02, 1.0, p)
+    y = design @ (0.5 * rng.standard_normal(p)) + sigma * rng.standard_normal(m)
+
+    def negative_log_evidence(logs):
+        noise = sigma if sigma_known else np.exp(logs[1])
+        covariance = noise**2 * np.eye(m) + design @ design.T / np.exp(logs[0])
+        return 0.5 * (np.linalg.slogdet(covariance)[1] + y @ np.linalg.solve(covariance, y))
+
+    best = scipy.optimize.minimize(
+        negative_log_evidence, np.zeros(1 if sigma_known else 2), method="Nelder-Mead",
+        options={"xatol": 1e-8, "fatol": 1e-12, "maxiter": 4000},
+    ).x  # fmt: skip
+    evidence = evidence_for(m, p, sigma_known)
+
+    def weights(z, found):
+        return evidence.first(Weights(np.full(m, 1 / sigma), np.full(p, 1.0), np.zeros(p)), found)
+
+    found = solve(
+        lambda z: design @ z - y, lambda z: design, np.full(p, 0.1), weights=weights, reweigh=evidence.reweigh
+    )
+    # The last change of a precision is below 1 %, and such a fixed-point iteration shrinks its error by a third a step.
+    np.testing.assert_allclose(np.log(found.weights.precision[0]), best[0], atol=0.03)
+    if not sigma_known:
+        np.testing.assert_allclose(np.log(evidence.sigma(found.weights)["y"]), best[1], atol=0.03)
+
+
+def test_whiteness_tells_noise_from_what_is_left_over():
+    rng = np.random.default_rng(1)
+    noise = rng.standard_normal(400)
+    assert whiteness(noise + np.sin(np.linspace(0, 6, 400))).probability < 1e-6
+    probabilities = [whiteness(rng.standard_normal(200)).probability for _ in range(400)]
+    assert abs(np.mean(np.array(probabilities) < 0.1) - 0.1) < 0.06  # four standard deviations of the share

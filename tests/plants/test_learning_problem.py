@@ -1,0 +1,162 @@
+"""Fits of a pendulum with drag, through its constraint: one program for all of this file's main problem.
+
+The truth comes from the angle's equation, integrated by SciPy.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, NeuralDAEBlock
+from jaxonomy_dae.errors import SimulationError
+from jaxonomy_dae.learning import Data, Experiment, Problem, Unknown
+from jaxonomy_dae.library.planar import PlanarPendulum
+from jaxonomy_dae.programs.cache import PROGRAMS
+
+LENGTH, DRAG, SIGMA = 1.1, 0.3, 2e-3
+RELEASE = "pend.initial_theta"
+
+
+def drag(t, v, theta):
+    return -theta[0] * v
+
+
+def positions(times, release):
+    """The bob's (x, y), with a drag proportional to its velocity."""
+
+    def field(t, s):
+        return [s[1], -9.81 / LENGTH * np.cos(s[0]) - DRAG * s[1]]
+
+    run = scipy.integrate.solve_ivp(field, (0, times[-1]), [release, 0.0], t_eval=times, rtol=1e-10, atol=1e-12)
+    return LENGTH * np.cos(run.y[0]), LENGTH * np.sin(run.y[0])
+
+
+def record(seed, count, release, **others):
+    """Samples of both positions, a few of which are missing."""
+    times = np.linspace(0.0, 0.04 * count, count + 1)[1:]
+    rng = np.random.default_rng(seed)
+    x, y = (p + SIGMA * rng.standard_normal(count) for p in positions(times, release))
+    x[3:6] = np.nan
+    return Experiment(times, {"pend.x": x, "pend.y": y}, **{"sigma": SIGMA, "initial": {RELEASE: release}} | others)
+
+
+def data(seed):
+    unknown = {RELEASE: Unknown(-0.9)}
+    return Data(
+        record(seed, 50, -1.0, initial=unknown),
+        record(seed + 1, 30, -0.4, initial={RELEASE: Unknown(-0.5)}, sigma="estimate"),
+        record(seed + 2, 40, -0.7, initial=unknown, holdout=True, name="kept"),
+    )
+
+
+@pytest.fixture(scope="module")
+def system():
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    bob = PlanarPendulum(ev, name="pend", m=1.0, L=1.0, initial_theta=-1.0)
+    diagram.add(bob)
+    block = NeuralDAEBlock(drag, jnp.array([0.1]), targets=[(bob, "vx"), (bob, "vy")], name="drag")
+    diagram.add_neural_correction_block(block)
+    return AcausalCompiler(ev, diagram)()
+
+
+@pytest.fixture(scope="module")
+def problem(system):
+    return Problem(system, data(0), train=["pend.L", "pend.m", "drag"], regularize=None)
+
+
+@pytest.fixture(scope="module")
+def fit(problem):
+    return problem.fit()
+
+
+@pytest.mark.long("compiles the residuals and their Jacobian by 4 numbers and a start")
+def test_values_are_those_of_the_truth(fit):
+    assert fit.minimum.converged
+    deviation = fit.spread[[0, 2]]
+    found = np.array([fit.values["pend.L"], fit.values["drag[0]"]])
+    np.testing.assert_array_less(np.abs(found - [LENGTH, DRAG]), 4 * deviation * [LENGTH, 1])
+    assert (deviation < [2e-3, 1e-2]).all()
+    np.testing.assert_allclose(fit.starts[RELEASE], [-1.0, -0.4, -0.7], atol=5e-3)
+    np.testing.assert_allclose(list(fit.sigma.values()), SIGMA, rtol=0.35)
+    assert 0.6 < fit.chi2 / fit.freedom < 1.5
+    assert fit.whiteness["experiment 0"]["pend.x"].probability > 1e-3
+
+
+def test_what_the_data_do_not_tell_is_named(fit):
+    """Positions alone say nothing of the mass: the drag is per mass."""
+    row = fit.table()["pend.m"]
+    assert row.note == "not determined" and np.isinf(row.high) and abs(row.value - 1.0) < 1e-3
+    assert fit.table()["pend.L"].note == "" and "known" in repr(fit.identifiability())
+    assert "nothing measured depends on 'pend.m'" in repr(fit.identifiability())
+
+
+def test_experiments_held_out_are_scored_and_keep_their_start(fit):
+    assert 0.7 < fit.holdout_score < 1.4
+    assert fit.rms["kept"]["pend.x"] < 1.5 * SIGMA
+    assert "kept" not in fit.residuals
+    assert "held out" in fit.table()[f"{RELEASE}, kept"].note
+
+
+def test_a_second_fit_compiles_nothing(problem, fit):
+    count, compiled = len(PROGRAMS), []
+
+    def listen(event, *_, **__):
+        if "compile" in event:
+            compiled.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        other = problem.fit(data(7), freeze={"pend.m": 2.0}, start={"pend.L": 0.9}, bounds={"pend.L": (0.5, 1.05)})
+    finally:
+        jax.monitoring.clear_event_listeners()
+    assert len(PROGRAMS) == count and not compiled
+    assert other.values["pend.L"] == 1.05 and other.table()["pend.L"].note == "bound reached: 1.05"
+    assert other.values["pend.m"] == 2.0 and other.table()["pend.m"].note == "frozen"
+
+
+def test_growing_horizons_and_gradient_steps_end_at_the_same_point(problem, fit):
+    again = problem.fit(adam=5, horizons=(0.3, 1.0), starts=2, freeze=["pend.m"])
+    deviation = fit.spread[2]
+    assert abs(again.values["drag[0]"] - fit.values["drag[0]"]) < 0.05 * deviation
+
+
+def test_profile_likelihood_agrees_with_linear_intervals_where_the_model_is_almost_linear(fit):
+    low, high = fit.profile("pend.L")["pend.L"]
+    row = fit.table()["pend.L"]
+    np.testing.assert_allclose([low, high], [row.low, row.high], atol=0.1 * (row.high - row.low))
+
+
+@pytest.mark.slow
+def test_public_residuals_are_those_that_were_minimised(problem, fit):
+    found = problem.residuals(fit.system, starts=fit.starts)
+    expected = fit.residuals["experiment 0"]["pend.y"]
+    np.testing.assert_allclose(found["experiment 0"]["pend.y"], expected, atol=1e-6)
+    np.testing.assert_array_equal(found["experiment 0"]["pend.x"][3:6], 0.0)
+
+
+@pytest.mark.slow
+def test_a_band_has_the_slope_and_spread_of_the_law(fit):
+    grid = np.stack([np.linspace(-20, 20, 5), np.zeros(5)], axis=1)
+    band = fit.band("drag", grid)
+    np.testing.assert_allclose(band.mean, -fit.values["drag[0]"] * grid[:, 0], rtol=1e-10)
+    np.testing.assert_allclose(band.spread, fit.spread[2] * np.abs(grid[:, 0]), rtol=1e-6, atol=1e-12)
+    assert band.explored.shape == (2, 2) and band.inside.tolist() == [False, False, True, False, False]
+
+
+@pytest.mark.slow
+def test_bands_of_variables_that_were_not_measured(fit):
+    found = fit.predict(["pend.vx", "pend.x"], ts=[0.5, 1.0])
+    step = 1e-4
+    other = fit.problem.run(fit.objective, fit.point + np.eye(len(fit.point))[2] * step, 0, ts=np.array([0.5, 1.0]))
+    plain = fit.problem.run(fit.objective, fit.point, 0, ts=np.array([0.5, 1.0]))
+    np.testing.assert_allclose(found.mean["pend.vx"], plain["pend.vx"], rtol=1e-6)
+    slope = (other["pend.vx"] - plain["pend.vx"]) / step
+    assert (found.spread["pend.vx"] < 1.0).all() and (np.abs(slope) > 0).all()
+    assert (found.low["pend.vx"] < found.mean["pend.vx"]).all()
+
+
+def test_runs_that_all_fail_say_why(problem):
+    with pytest.raises(SimulationError, match="no start can be simulated; from the first, experiment 0"):
+        problem.fit(start={"pend.L": 1e-300})
