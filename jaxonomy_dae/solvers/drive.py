@@ -60,8 +60,8 @@ def integrate(
     """Integrates, saves what is asked for and the last accepted point, and counts Jacobians.
 
     Where the times do not fit, no row counts as reached, and the result is `BAD_TIMES`; with `checked`, that is an
-    error while running. Where `goes_on` is false, no step is taken: with numbers that are not finite, all steps would be
-    rejected, up to `max_steps`, and the others of a batch would wait.
+    error while running. Where `goes_on` is false, no step is taken: with numbers that are not finite, all steps would
+    be rejected, up to `max_steps`, and the others of a batch would wait.
     """
     fits = times_fit(t0, t1, save.ts, controller)
     if checked and fits is not True:
