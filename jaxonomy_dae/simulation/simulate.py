@@ -98,8 +98,8 @@ def simulate(
     - `throw`: whether to raise if the start is not consistent or the integration fails. Otherwise `solution.result`
         has a code, rows that were not reached are NaN, and so are their derivatives; `RESULTS.nonfinite` stands for
         parameters out of their bounds, and for parameters, weights and inputs that are not finite. None: outside jit,
-        grad and vmap. Inside, True puts callbacks to the host into the program, which JAX's persistent compilation cache then does
-        not keep.
+        grad and vmap. Inside, True puts callbacks to the host into the program, which JAX's persistent compilation
+        cache then does not keep.
 
     **Returns:**
 
