@@ -18,6 +18,12 @@ from ..modeling.symbols import TIME_LABEL
 from .null_vectors import CANCELLED
 
 POINTS = 4
+FAR = 64  # points at which a cancellation must hold, too, …
+# … over these powers of ten of quantities and of parameters given: to where branches of conditions turn.
+REACH, REACH_OF_PARAMETERS = 5.0, 2.0
+# Of the terms: what is left of them where they clearly do not cancel. Far from one, weights lose digits; a branch that
+# is another one leaves a part of order one.
+CLEARLY = 1e-3
 NEARER = 6  # how often sample points come nearer to zero
 
 
@@ -37,12 +43,15 @@ def tried(variable: Any, order: Any, trial: int) -> Any:
     return somewhere(variable, order, trial) * 10.0 ** (-3 * (trial // 4))
 
 
-def near(values: np.ndarray, trial: int) -> np.ndarray:
-    """Other parameter values of the same signs; those given for trial 0."""
+def near(values: np.ndarray, trial: int, kept: np.ndarray) -> np.ndarray:
+    """Other parameter values of the same signs; those given for trial 0, and of those in `kept`, discrete variables:
+    numbers that say which branch holds."""
     if trial == 0:
         return values
     factor = 0.25 + np.abs(somewhere(np.arange(len(values)), 3, trial))
-    return np.where(values == 0, factor, values * factor)
+    moved = np.where(values == 0, factor, values * factor)
+    moved[kept] = values[kept]
+    return moved
 
 
 def graph_of(group: EquationGroup, i: int, times: int) -> Node | None:
@@ -73,17 +82,20 @@ class Samples:
     """Values of graphs at random points: quantities near ±1, or if graphs have no values there, near their natural
     sizes or nearer to zero; parameters near those given."""
 
-    def __init__(self, graphs: Sequence[Node], values: np.ndarray, natural: Callable[[], Mapping[Hashable, float]]):
+    def __init__(
+        self, graphs: Sequence[Node], values: np.ndarray, kept: np.ndarray,
+        natural: Callable[[], Mapping[Hashable, float]],
+    ):  # fmt: skip
         labels = sorted(frozenset().union(*(g.leaves for g in graphs)), key=repr)
         self._labels = labels
+        self._parameters = [near(values, trial, kept) for trial in range(POINTS)]
         sizes: Mapping[Hashable, float] = {}
         best, most = [], -1
         for k in range(NEARER + 1):
             factor = 0.1 ** max(k - 1, 0)
             unit = [factor * sizes.get(label, 1.0) for label in labels]
             self._points = [
-                [self._value(label, values, p, u) for label, u in zip(labels, unit, strict=True)]
-                for p in range(3 * POINTS)
+                [self._value(label, p, u) for label, u in zip(labels, unit, strict=True)] for p in range(3 * POINTS)
             ]
             with_values = int(np.isfinite(self(graphs)).all(axis=0).sum())
             if with_values > most:
@@ -93,11 +105,10 @@ class Samples:
             sizes = sizes or natural()
         self._points = best
 
-    @staticmethod
-    def _value(label, values: np.ndarray, trial: int, size: float) -> float:
+    def _value(self, label, trial: int, size: float) -> float:
         if label[0] == "quantity":
             return size * float(somewhere(label[1], label[2], trial))
-        return 0.37 + 0.1 * trial if label == TIME_LABEL else float(near(values, trial // 3)[label[1]])
+        return 0.37 + 0.1 * trial if label == TIME_LABEL else float(self._parameters[trial // 3][label[1]])
 
     def __call__(self, graphs: Sequence[Node]) -> np.ndarray:
         """Shape (graphs, points)."""
@@ -113,18 +124,19 @@ def combine(
     weights: Sequence[Node],
     gone: Sequence[Hashable],
     values: np.ndarray,
+    kept: np.ndarray,
     natural: Callable[[], Mapping[Hashable, float]],
 ) -> Node | None:
     """Σ weight·equation without the quantities that cancel; None if those in `gone` do not.
 
-    `values` are those of the parameters; `natural` gives sizes of quantities at which the equations have values.
+    `values` are those of the parameters, of which those in `kept` stay; `natural` gives sizes of quantities at which the equations have values.
     """
     terms = [multiply(w, e) for w, e in zip(weights, equations, strict=True)]
     total = linear((1, t) for t in terms)
     quantities = sorted(
         (label for label in frozenset().union(*(e.leaves for e in equations)) if label[0] == "quantity"), key=repr
     )
-    samples = Samples([*equations, *weights], values, natural)
+    samples = Samples([*equations, *weights], values, kept, natural)
     cancelled = []
     for label in quantities:
         slopes = samples([multiply(w, partial_derivative(e, label)) for w, e in zip(weights, equations, strict=True)])
@@ -146,6 +158,42 @@ def combine(
         if finite.any() and same[finite].all():
             return rest
     return None
+
+
+@np.errstate(all="ignore")
+def cancels_elsewhere(
+    equations: Sequence[Node], weights: Sequence[Node], gone: Sequence[Hashable], values: np.ndarray, kept: np.ndarray,
+    of_parameters: bool,
+) -> bool:  # fmt: skip
+    """Whether what cancels near the points that were tried does so at quantities of other sizes and signs, or
+    `of_parameters`: a condition may choose another branch there. Points without values say nothing.
+
+    Parameters in `kept`, discrete variables, are as they are given.
+    """
+    rng = np.random.default_rng(0)
+    slopes = [
+        [multiply(w, partial_derivative(e, label)) for w, e in zip(weights, equations, strict=True)] for label in gone
+    ]
+    graphs = [g for row in slopes for g in row]
+    labels = sorted(frozenset().union(*(g.leaves for g in graphs)), key=repr)
+    if not any(label[0] == "quantity" or label == TIME_LABEL or of_parameters for label in labels):
+        return True
+    columns = []
+    for label in labels:
+        sign, power = rng.choice([-1.0, 1.0], FAR), rng.uniform(-1.0, 1.0, FAR)
+        if label == TIME_LABEL:
+            columns.append(10.0 ** (REACH * power))
+        elif label[0] == "quantity":
+            columns.append(sign * 10.0 ** (REACH * power))
+        elif not of_parameters or label[1] in kept:
+            columns.append(np.full(FAR, values[label[1]]))
+        else:
+            columns.append(sign * 10.0 ** (REACH_OF_PARAMETERS * power) * (abs(values[label[1]]) or 1.0))
+    found = Kernel(graphs, labels)(columns, "numpy")
+    terms = np.stack([np.broadcast_to(np.asarray(v, float), (FAR,)) for v in found])
+    terms = terms.reshape(len(slopes), len(equations), FAR)
+    left, size = np.abs(terms.sum(axis=1)), np.abs(terms).sum(axis=1)
+    return not (np.isfinite(size).all(axis=0) & (left > CLEARLY * size)).any()
 
 
 def group_of(graph: Node, provenance: Provenance) -> EquationGroup:

@@ -29,7 +29,7 @@ from ..modeling.symbols import TIME_LABEL
 from ..structure.incidence import Incidence
 from ..structure.matching import maximum_matching
 from ..structure.pantelides import Offsets, reduce_index
-from .combine_equations import combine, graph_of, group_of, near, quantity_label, somewhere, tried
+from .combine_equations import cancels_elsewhere, combine, graph_of, group_of, near, quantity_label, somewhere, tried
 from .null_vectors import left_null_vectors, weights_in_parameters
 
 LARGEST_BLOCK = 200
@@ -310,7 +310,7 @@ def _combination(
     sources = [provenance[k] for k in used]
     unit = int(np.flatnonzero(c == c.min())[0])
     top = _highest(jacobian, columns, int(c.min()))
-    found = _weights(written, top, unit, jacobian.values, trials)
+    found = _weights(written, top, unit, jacobian.values, discrete, trials)
     if found is None:
         here = [jacobian.place(e) for e in equations[used].tolist()]
         concerned = list(dict.fromkeys(p for g, i in here for p in groups[g].parameter[i].tolist()))
@@ -319,7 +319,13 @@ def _combination(
         raise StructuralError(
             "\n".join([_for_values(jacobian, equations, names, concerned, discrete), *itemised(sources)])
         )
-    combined = combine(written, found, top, jacobian.values, lambda: jacobian.natural(equations[used]))
+    if not cancels_elsewhere(written, found, top, jacobian.values, discrete, of_parameters=False):
+        return None  # regular in general: singular where a condition says so
+    if not cancels_elsewhere(written, found, top, jacobian.values, discrete, of_parameters=True):
+        concerned = sorted({label[1] for e in written for label in e.leaves if label[0] == "of model"})
+        message = _for_values(jacobian, equations, names, concerned, discrete)
+        raise StructuralError("\n".join([message, *itemised(sources)]))
+    combined = combine(written, found, top, jacobian.values, discrete, lambda: jacobian.natural(equations[used]))
     if combined is None:
         raise StructuralError(_hidden(sources))
     if not any(label[0] == "quantity" for label in combined.leaves):
@@ -337,7 +343,7 @@ def _for_values(
     modes = [p for p in concerned if p in discrete]
     shown = [p for p in concerned if values[p] == 0.0 and p not in modes] or [p for p in concerned if p not in modes]
     given = some([f"{names[p]} = {values[p]:g}" for p in shown])
-    mode = some([f"{names[p]} = {values[p]:g}" for p in modes if not names[p].startswith(":")])
+    mode = some([f"{names[p]} = {values[p]:g}" for p in modes if " " not in names[p]])  # hidden ones
     mends = [p for p in shown if values[p] == 0.0 and jacobian.is_regular_with(equations, p)]
     if mends:
         mend = f"Give a value other than zero to {alternatives([names[p] for p in mends])}"
@@ -357,7 +363,7 @@ def _highest(jacobian: _Jacobian, columns: np.ndarray, lowest: int) -> list:
 
 
 def _weights(
-    written: Sequence[Node], top: Sequence, unit: int, values: np.ndarray, trials: Sequence[int]
+    written: Sequence[Node], top: Sequence, unit: int, values: np.ndarray, discrete: np.ndarray, trials: Sequence[int]
 ) -> list[Node] | None:
     """Weights in parameters with which the quantities `top` cancel in the equations; the one at `unit` is 1."""
     entries = [[partial_derivative(e, label) for label in top] for e in written]
@@ -378,7 +384,7 @@ def _weights(
         return [constant(1)]
     rows = [[row[j] for j in kept] for row in rows]
     labels = sorted(frozenset().union(*(g.leaves for row in rows for g in row)), key=repr)
-    samples = np.array([near(values, k) for k in range(PARAMETERS if labels else 1)])
+    samples = np.array([near(values, k, discrete) for k in range(PARAMETERS if labels else 1)])
 
     def evaluate(graphs: Sequence[Node]) -> tuple[np.ndarray, np.ndarray]:
         columns = [samples[:, label[1]] for label in labels]

@@ -126,3 +126,63 @@ def test_terms_of_one_quantity_that_cancel_for_some_parameters():
     assert compiled(2.0).states == ["d.y"]
     with pytest.raises(StructuralError, match="singular for d.p = 1, though not in general"):
         compiled(1.0)
+
+
+# --- branches ------------------------------------------------------------------------------------------------------
+
+
+class _Branching(Component):
+    """x' + y' = 1 and x' + c·y' = 3 − y/2 + sin(t), where c is 1 up to x = 1000 and not beyond."""
+
+    def __init__(self, ev, coefficient):
+        super().__init__(ev, "d")
+        x = self.variable("x", start=2000.0, fixed=True, nominal=2000.0)
+        y = self.variable("y", start=1.0, fixed=True)
+        self.add_equations(
+            sympy.Eq(der(x) + der(y), 1),
+            sympy.Eq(der(x) + coefficient(x) * der(y), 3 - y / 2 + sympy.sin(ev.t)),
+        )
+
+
+@pytest.mark.parametrize(
+    "coefficient",
+    [
+        lambda x: sympy.Piecewise((2, x > 1000), (1, True)),
+        lambda x: 1 + sympy.Max(0, x - 1000) / 1000,
+        lambda x: 1 + sympy.Heaviside(x - 1000),
+    ],
+    ids=["Piecewise", "Max", "Heaviside"],
+)
+def test_what_cancels_on_one_branch_only_stays(coefficient):
+    """The second equation was replaced by 0 = 2 − y/2 + sin(t), which holds below x = 1000 only."""
+    ev = EqnEnv()
+    system = AcausalCompiler(ev, AcausalDiagram().add(_Branching(ev, coefficient)))()
+    assert sorted(system.states) == ["d.x", "d.y"] and not any("cancel" in note for note in system.report.notes)
+
+
+@pytest.mark.parametrize(
+    ("coefficient", "p"),
+    [
+        (lambda p: sympy.Min(p, 10), 1.0),
+        (lambda p: sympy.Abs(p), 2.0),
+        (lambda p: sympy.Max(p, -3), 1.0),
+        (lambda p: sympy.Piecewise((p, p < 5), (2 * p, True)), 1.0),
+    ],
+    ids=["Min", "Abs", "Max", "Piecewise"],
+)
+def test_what_cancels_for_some_parameters_only_is_refused(coefficient, p):
+    """`with_parameters` to the other side of a branch gave numbers that break the equations."""
+
+    class Switched(Component):
+        def __init__(self, ev):
+            super().__init__(ev, "d")
+            x, y = self.variable("x", start=1.0, fixed=True), self.variable("y")
+            q = self.parameter("p", p)
+            self.add_equations(
+                sympy.Eq(der(x) + q * der(y), -x),
+                sympy.Eq(der(x) + coefficient(q) * der(y), -x - y + sympy.sin(ev.t)),
+            )
+
+    ev = EqnEnv()
+    with pytest.raises(StructuralError, match=f"singular for d.p = {p:g}, though not in general"):
+        AcausalCompiler(ev, AcausalDiagram().add(Switched(ev)))()

@@ -106,7 +106,7 @@ LAWS = {  # the law as it is written, surfaces, and the law where these have cer
     ),
     "time": (lambda x, v, p, t: sign(sin(3 * t) - p), [wave], lambda s: lambda x, v, p, t: s[0]),
 }
-QUICK = ("jump", "abs", "root in a branch")
+QUICK = ("jump",)
 
 
 @pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in LAWS])
@@ -140,7 +140,7 @@ def sawtooth(p, end=2.0):
 
 
 @pytest.mark.parametrize(
-    "name", ["mod", *(pytest.param(n, marks=pytest.mark.slow) for n in ("floor", "ceiling", "frac"))]
+    "name", ["floor", *(pytest.param(n, marks=pytest.mark.slow) for n in ("mod", "ceiling", "frac"))]
 )
 def test_whole_parts(name):
     law, value, slope = STAIRS[name]
@@ -258,7 +258,8 @@ NONLINEAR = {
 }
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n != "in a block")) for n in NONLINEAR])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NONLINEAR)
 def test_relations_that_nonlinear_equations_need_as_they_are(name):
     """Beyond q = 0 the branch before may have no solution: k·q² = Δp for Δp < 0. In one equation q·|q| is seen to be
     smooth; in a block, |q| stands alone. Steps over its kinks are right to 1e-7 at rtol 1e-9; so are derivatives to
@@ -280,6 +281,7 @@ def test_relations_that_nonlinear_equations_need_as_they_are(name):
     assert float(slope) == pytest.approx(expected, rel=1e-3, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_relations_between_linear_branches_are_events_in_blocks_too():
     """A valve that lets ten times as much through in one direction, behind a resistance."""
 
@@ -309,6 +311,7 @@ EMPTYING = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EMPTYING)
 def test_a_root_that_ends_where_a_relation_turns(name):
     """A tank runs empty: x' = −√x, x = (1 − t/2)², and stays so. Near the end the root is as steep as can be."""
@@ -332,9 +335,7 @@ ENDING = {  # laws without a value beyond where a relation turns
 }
 
 
-@pytest.mark.parametrize(
-    "name", [n if n == "a root of a jump" else pytest.param(n, marks=pytest.mark.slow) for n in ENDING]
-)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) for n in ENDING])
 def test_branches_without_a_value_beyond_their_end(name):
     """Against SciPy with the law as it is written, whose small steps across a jump are right to 1e-5."""
     law = ENDING[name]
@@ -355,6 +356,7 @@ def test_a_root_without_a_value_is_told_in_a_branch_too():
         simulate(system, 3.0)
 
 
+@pytest.mark.slow
 def test_many_relations_turn_at_once():
     """A hundred equal ones, and a hundred that turn at times of their own."""
 
@@ -372,6 +374,7 @@ def test_many_relations_turn_at_once():
     np.testing.assert_allclose(found, (1 - at) ** 2 / 2, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_batches_and_points():
     """Members of a batch turn at times of their own; points of rest and linearizations see the relation as it is."""
     system = oscillator(lambda x, v, p, t: Piecewise((1, x < p), (-v, True)))

@@ -86,7 +86,7 @@ def test_an_input_that_stops_being_finite(system):
     assert np.isnan(x) and result == diffrax.RESULTS.nonfinite and fine == diffrax.RESULTS.successful
 
 
-@pytest.mark.long("two hundred steps of a loop")
+@pytest.mark.slow
 def test_a_loop_of_a_users_own_in_free_numbers(system):
     """k = 0.2 found by Optax from data, by steps that would leave [0, 10] if they were taken in k."""
     optimizer = optax.adam(0.3)

@@ -51,6 +51,9 @@ def data(seed):
     )
 
 
+pytestmark = pytest.mark.slow  # the residuals and their Jacobian compile for 25 s
+
+
 @pytest.fixture(scope="module")
 def system():
     ev, diagram = EqnEnv(), AcausalDiagram()
@@ -71,7 +74,6 @@ def fit(problem):
     return problem.fit()
 
 
-@pytest.mark.long("compiles the residuals and their Jacobian by 4 numbers and a start")
 def test_values_are_those_of_the_truth(fit):
     assert fit.minimum.converged
     deviation = fit.spread[[0, 2]]
@@ -128,7 +130,6 @@ def test_profile_likelihood_agrees_with_linear_intervals_where_the_model_is_almo
     np.testing.assert_allclose([low, high], [row.low, row.high], atol=0.1 * (row.high - row.low))
 
 
-@pytest.mark.slow
 def test_public_residuals_are_those_that_were_minimised(problem, fit):
     found = problem.residuals(fit.system, starts=fit.starts)
     expected = fit.residuals["experiment 0"]["pend.y"]
@@ -136,7 +137,6 @@ def test_public_residuals_are_those_that_were_minimised(problem, fit):
     np.testing.assert_array_equal(found["experiment 0"]["pend.x"][3:6], 0.0)
 
 
-@pytest.mark.slow
 def test_a_band_has_the_slope_and_spread_of_the_law(fit):
     grid = np.stack([np.linspace(-20, 20, 5), np.zeros(5)], axis=1)
     band = fit.band("drag", grid)
@@ -145,7 +145,6 @@ def test_a_band_has_the_slope_and_spread_of_the_law(fit):
     assert band.explored.shape == (2, 2) and band.inside.tolist() == [False, False, True, False, False]
 
 
-@pytest.mark.slow
 def test_bands_of_variables_that_were_not_measured(fit):
     found = fit.predict(["pend.vx", "pend.x"], ts=[0.5, 1.0])
     step = 1e-4
