@@ -398,5 +398,5 @@ def _read_parameters(plan: SystemPlan) -> set[int]:
         found.update(group.parameter.ravel().tolist())
     for clock in flat.events.clocks:
         for part in clock:
-            found.update(part.parameters)
+            found.update(() if part is None else part.parameters)
     return found

@@ -264,8 +264,9 @@ class Parameters(eqx.Module):
             return None
         values = np.array(self.values)
         if self.free_index:  # as they are given, not as they are read
-            values = np.array(np.broadcast_to(values, (*np.shape(self.free)[:-1], values.shape[-1])))
-            values[..., list(self.free_index)] = self.free
+            free = np.asarray(parts[1], float)
+            values = np.array(np.broadcast_to(values, (*free.shape[:-1], values.shape[-1])))
+            values[..., list(self.free_index)] = free
         values = self.table.complete(values)
         right = self.table.ends.admit(values)
         if right.all():
