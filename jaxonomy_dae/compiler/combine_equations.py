@@ -129,8 +129,8 @@ def combine(
 ) -> Node | None:
     """Σ weight·equation without the quantities that cancel; None if those in `gone` do not.
 
-    `values` are those of the parameters, of which those in `kept` stay; `natural` gives sizes of quantities at which the
-    equations have values.
+    `values` are those of the parameters, of which those in `kept` stay; `natural` gives sizes of quantities at which
+    the equations have values.
     """
     terms = [multiply(w, e) for w, e in zip(weights, equations, strict=True)]
     total = linear((1, t) for t in terms)
