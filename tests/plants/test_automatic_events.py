@@ -211,6 +211,7 @@ def test_relations_of_parameters_and_events_alone_are_not_watched():
     assert float(simulate(system, 1.0, **TIGHT)["c.x"][-1]) == pytest.approx(np.exp(-2), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_solution_that_stays_where_a_relation_turns():
     class Stuck(Component):
         def __init__(self, ev, name):
@@ -388,6 +389,7 @@ def test_batches_and_points():
     assert float(steady_state(damped)["c.x"]) == pytest.approx(0.2, abs=1e-9)  # −x + 2(0.3 − x) = 0
 
 
+@pytest.mark.slow
 def test_second_derivatives_are_refused_and_possible_when_smooth():
     def second(system):
         def final(p):
