@@ -119,7 +119,7 @@ FAULTS = [
         "initialization/stages.py",
         "q[:n].T @ -residual",
         "q[:n].T @ residual",
-        "tests/kernels/test_stages.py",
+        "tests/kernels/test_starts_in_stages.py",
     ),
     Fault(
         "simulation/energy_balance.py",
