@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from ..expressions.differentiate import partial_derivative
+from ..expressions.errors import KernelWithErrors
 from ..expressions.kernel import Kernel
 from ..expressions.node import ZERO as ZERO_NODE
 from ..expressions.node import Node, constant, leaf, linear, multiply, scale
@@ -21,8 +22,8 @@ POINTS = 4
 FAR = 64  # points at which a cancellation must hold, too, …
 # … over these powers of ten of quantities and of parameters given: to where branches of conditions turn.
 REACH, REACH_OF_PARAMETERS = 5.0, 2.0
-# Of the terms: what is left of them where they clearly do not cancel. Far from one, weights lose digits; a branch that
-# is another one leaves a part of order one.
+# Of the terms: what is left of them where they clearly do not cancel, beyond the errors of their evaluation. Weights
+# and coefficients are numbers that cancel to rounding; a branch that is another one leaves a part of order one.
 CLEARLY = 1e-3
 NEARER = 6  # how often sample points come nearer to zero
 
@@ -190,11 +191,13 @@ def cancels_elsewhere(
             columns.append(np.full(FAR, values[label[1]]))
         else:
             columns.append(sign * 10.0 ** (REACH_OF_PARAMETERS * power) * (abs(values[label[1]]) or 1.0))
-    found = Kernel(graphs, labels)(columns, "numpy")
-    terms = np.stack([np.broadcast_to(np.asarray(v, float), (FAR,)) for v in found])
-    terms = terms.reshape(len(slopes), len(equations), FAR)
-    left, size = np.abs(terms.sum(axis=1)), np.abs(terms).sum(axis=1)
-    return not (np.isfinite(size).all(axis=0) & (left > CLEARLY * size)).any()
+    # Points are exact, but far out 1 + x⁴ − x⁴ is zero: what evaluation loses says nothing either.
+    terms, errors = (
+        np.stack([np.broadcast_to(np.asarray(v, float), (FAR,)) for v in found]).reshape(len(gone), len(equations), FAR)
+        for found in KernelWithErrors(graphs, labels)(columns, [np.zeros(FAR)] * len(columns))
+    )
+    left, size, lost = np.abs(terms.sum(axis=1)), np.abs(terms).sum(axis=1), errors.sum(axis=1)
+    return not (np.isfinite(size + lost).all(axis=0) & (left > CLEARLY * size + lost)).any()
 
 
 def group_of(graph: Node, provenance: Provenance) -> EquationGroup:

@@ -19,6 +19,7 @@ QUARTER = 0.5 * jnp.pi  # of a turn, radians
 # for every change of its step size.
 SHORT = 0.25
 HERE = 1e-6  # of a quarter: a step that ends at an extreme, or so close to it, leads to the next one
+ROUNDINGS = 16  # of the angle: as far from an extreme as times are known, where many periods have passed
 
 
 class WaveControl(WrappedControl):
@@ -57,9 +58,10 @@ class WaveControl(WrappedControl):
         quarter = QUARTER / jnp.abs(frequency)  # infinite for what does not turn
         bounded = jnp.minimum(step, jnp.min(quarter))
         turned = (frequency * begin + phase) * jnp.sign(frequency) / QUARTER
-        ahead = (jnp.floor(turned + HERE) + 1 - turned) * quarter
+        here = HERE + ROUNDINGS * jnp.finfo(begin.dtype).eps * jnp.max(jnp.abs(frequency * begin)) / QUARTER
+        ahead = (jnp.floor(turned + here) + 1 - turned) * quarter
         ahead = jnp.min(jnp.where((bounded > SHORT * quarter) & jnp.isfinite(ahead), ahead, jnp.inf))
         # Two even steps where one would leave a remainder.
-        length = jnp.where(bounded < (1 - HERE) * ahead, jnp.minimum(bounded, 0.5 * ahead), ahead)
+        length = jnp.where(bounded < (1 - here) * ahead, jnp.minimum(bounded, 0.5 * ahead), ahead)
         length = jnp.where(bounded > 0.5 * ahead, length, bounded)
         return jnp.where(length < step, start + length.astype(begin.dtype), end)

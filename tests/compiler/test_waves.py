@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from sympy import Eq, cos, sin
 
-from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, assign, der, pre
 from jaxonomy_dae.library import electrical as el
 
 
@@ -78,8 +78,6 @@ def test_the_frequency_of_a_constraint_and_of_a_condition():
         n = self.discrete("n", start=0)
         y = self.variable("y", start=1.0, fixed=True)
         self.add_equations(Eq(x, sin(4 * self.ev.t)), Eq(der(x), v), Eq(der(y), v))
-        from jaxonomy_dae import assign, pre
-
         self.when(y - 3 * cos(9 * self.ev.t) <= 0, assign(n, pre(n) + 1))
 
     assert {w for w, _ in waves(compiled(write))} == {4.0, 9.0}

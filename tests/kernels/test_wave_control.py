@@ -72,6 +72,13 @@ def test_a_phase_that_moves_bounds_steps(t0):
     np.testing.assert_allclose(np.diff(found), np.pi / 8, rtol=1e-9)
 
 
+@pytest.mark.parametrize("t0", [0.0, 1e6, 1e9])
+def test_after_many_periods_every_step_goes_on(t0):
+    """250 Hz, also at a time that is known to 1e-4 of a quarter only."""
+    steps = np.diff(ends(9.0, [500 * np.pi], [0.3], 50, t0))
+    np.testing.assert_allclose(steps, 1e-3, rtol=0, atol=1e-8 + 8 * np.spacing(t0))
+
+
 def test_what_does_not_turn_bounds_nothing():
     np.testing.assert_array_equal(ends(9.0, [0.0, 0.0], [0.0, np.nan], 3), [9.0, 18.0, 27.0])
 
