@@ -151,6 +151,7 @@ def test_without_counts_of_mappings_programs_are_counted(monkeypatch):
     assert len(programs) == 4  # three, and the one that was made
 
 
+@pytest.mark.slow
 def test_half_of_the_programs_go_where_memory_is_short(monkeypatch):
     monkeypatch.setattr(cache, "PAUSE", 0)
     monkeypatch.setattr(cache, "mappings", lambda: Use(0, 100))
@@ -167,6 +168,7 @@ def test_half_of_the_programs_go_where_memory_is_short(monkeypatch):
     assert len(programs) == 3
 
 
+@pytest.mark.slow
 @on_linux
 def test_a_process_near_the_limit_is_told_once_and_all_is_let_go(monkeypatch, tmp_path):
     """A user's own programs take what is allowed."""

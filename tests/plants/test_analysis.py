@@ -410,6 +410,7 @@ def test_a_state_space_is_shown():
     assert repr(batch).startswith("StateSpace(3 states")
 
 
+@pytest.mark.slow
 def test_to_control():
     space = linearize(motor(), {"source.u": 0.0}, ["motor.rotor.w"])
     theirs = space.to_control()
@@ -442,6 +443,7 @@ def test_a_grid_of_simulations():
     assert "(3, 2)" in found._repr_html_()
 
 
+@pytest.mark.slow
 def test_zipped_steady_states():
     eps, area = jnp.array([0.2, 0.5, 0.9]), jnp.array([1.0, 2.0, 0.5])
 

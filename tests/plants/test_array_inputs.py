@@ -175,6 +175,7 @@ def test_among_several_names(gates):
     np.testing.assert_array_equal(events.after["gate.seen"][:2], [[1.0, 0.0], [1.0, 1.0]])
 
 
+@pytest.mark.slow
 def test_points_and_linearizations(gates):
     u = np.array([2.0, 3.0])
     point = steady_state(gates, inputs={"gate.u": u})
@@ -210,6 +211,7 @@ def test_sweeps(gates):
         sweep(gates, {"gate.T": np.ones((1, 3))}, **options)
 
 
+@pytest.mark.slow
 def test_data_sets_have_the_dimensions_of_arrays():
     pytest.importorskip("xarray")
     data = run(lags((2, 3)), {"lag.u": 1.0}, adjoint=diffrax.ForwardMode()).to_xarray(

@@ -139,6 +139,7 @@ def sawtooth(p, end=2.0):
     return n * p / 2 + rest**2 / (2 * p)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["floor", *(pytest.param(n, marks=pytest.mark.slow) for n in ("mod", "ceiling", "frac"))]
 )
@@ -166,6 +167,7 @@ def test_whole_parts(name):
     assert float(gradient) == pytest.approx(slope, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_smooth_leaves_a_relation_alone():
     system = oscillator(lambda x, v, p, t: smooth(3 * Max(x - p, 0)))
     assert system.plan.events is None
@@ -351,6 +353,7 @@ def test_branches_without_a_value_beyond_their_end(name):
     assert float(simulate(system, 3.0, **TIGHT)["c.x"][-1]) == pytest.approx(expected, abs=2e-5)
 
 
+@pytest.mark.slow
 def test_a_root_without_a_value_is_told_in_a_branch_too():
     system = oscillator(lambda x, v, p, t: Piecewise((sympy.sqrt(0.1 - x), x > p), (0, True)))
     with pytest.raises(SimulationError, match="not finite"):

@@ -64,6 +64,7 @@ def test_what_a_loss_leaves_out_does_not_reach_its_gradient(system):
     assert float(loss(-3.0)) == -6.0
 
 
+@pytest.mark.slow
 def test_however_values_arrive(system):
     """By `partition`, as in a loop of a user's own with Optax, and put among the leaves by hand."""
     trainable, frozen = system.partition("c.k")

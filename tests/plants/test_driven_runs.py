@@ -48,6 +48,7 @@ def system():
     return rectifier()
 
 
+@pytest.mark.slow
 @pytest.mark.long("a stiff run of ten periods, and SciPy's with 5,000 steps")
 def test_a_rectifier():
     found = simulate(system(), 10.0, ts=TS)

@@ -172,7 +172,7 @@ def test_a_ball_does_not_fall_through_the_floor(e, why):
         simulate(dropped().with_parameters({"c.e": e}), 5.0, ts=jnp.array([5.0]))
 
 
-@pytest.mark.parametrize("left", ["a corner", "a ramp"])
+@pytest.mark.parametrize("left", [pytest.param("a corner", marks=pytest.mark.slow), "a ramp"])
 def test_a_quantity_that_stays_at_zero_is_there_once(left):
     def write(self, ev):
         n = self.discrete("n", start=0)

@@ -359,6 +359,7 @@ def test_a_pulse_by_its_times():
     assert not [name for name in many().system.discretes if "pulse" in name] and len(events_of(many, "pulse")) == 0
 
 
+@pytest.mark.slow
 def test_clocks_of_commensurate_periods():
     """What ticks at one instant reads new values, or with pre the ones before the instant, in whatever order it was
     declared."""

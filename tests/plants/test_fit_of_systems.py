@@ -67,6 +67,7 @@ def test_by_default_a_systems_networks_are_trained():
 # --- least squares ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_least_squares_recovers_parameters():
     """By forward mode, which it chooses itself."""
     system = rc_circuit(R=3.0, C=0.5)

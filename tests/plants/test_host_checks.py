@@ -31,6 +31,7 @@ def decay():
     return AcausalCompiler(ev, diagram)()
 
 
+@pytest.mark.slow
 def test_a_simulation_is_exported(decay):
     def final(k):
         return simulate(decay.with_parameters({"c.k": k}), 1.0, ts=TS)["c.x"]
@@ -91,6 +92,7 @@ def test_prescribed_steps_and_time_that_runs_backwards():
     np.testing.assert_allclose(slope, -2 * np.exp(1.0), rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.long("two processes")
 def test_a_second_process_finds_its_programs_in_the_cache(tmp_path):
     code = (

@@ -101,6 +101,7 @@ def lags():
     return compiled(*(Lag(ev, name) for name in READERS))
 
 
+@pytest.mark.slow
 @pytest.mark.long("what is read again must be read in each way alone")
 def test_what_changed_is_read_again(lags, monkeypatch):
     """Globals, attributes and arrays: each changes by itself, so that no other makes the program be traced again."""
@@ -215,6 +216,7 @@ def sampled():
     return solution, expected | {"evaluate": expected["interpolation"]}
 
 
+@pytest.mark.slow
 @pytest.mark.long("the program of all kinds of samples, and quadrature")
 @pytest.mark.parametrize("name", ["held", "linear", "cubic", "path", "interpolation", "evaluate"])
 def test_short_pulses_and_narrow_peaks_are_seen(sampled, name):

@@ -106,6 +106,7 @@ def test_inputs_in_the_order_given_with_time_among_them(inject):
     assert slopes(system, t=0.5, x=0.25, y=2.0) == {"x": 2.0 + 5.0 + 25.0, "y": 0.0}
 
 
+@pytest.mark.slow
 def test_time_reaches_a_function_with_weights():
     np.testing.assert_allclose(together()["timed.x"], 3.0 - 2.0 * np.cos(T), **CLOSE)
 

@@ -45,6 +45,7 @@ def slope(x0=0.0, **options):
     return float(jax.jit(by(lambda x0: end(x0, **options)))(x0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "adjoint",
     [

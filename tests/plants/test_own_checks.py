@@ -67,7 +67,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", [pytest.param(c, marks=pytest.mark.slow if c == "root" else ()) for c in CASES])
 def test_a_check_in_a_compiled_model(checked, case):
     message, t1, initial, inputs = CASES[case]
 
@@ -90,6 +90,7 @@ def test_users_jitted_functions_keep_their_checks(checked):
         assert "callback" in str(jax.make_jaxpr(function)(0.1))
 
 
+@pytest.mark.slow
 def test_a_check_in_a_dae():
     """y' = −a·y, and the derivative of y(1) by a; with a = 2 it falls below what is checked."""
 

@@ -49,6 +49,7 @@ def compilations():
     active.clear()
 
 
+@pytest.mark.slow
 def test_a_gradient_is_compiled_once(compilations):
     """Each operation was compiled by itself, loops anew at every call: 4.2 s a call, and 346 memory mappings."""
     np.testing.assert_allclose(jax.grad(total)(jnp.array(2.0)), slope(2.0), rtol=1e-5)

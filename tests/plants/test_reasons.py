@@ -38,6 +38,7 @@ def loss(system):
     return -jnp.sum(read(system))  # least where the run fails
 
 
+@pytest.mark.slow
 def test_a_fit_says_why_it_stopped(blowup):
     with pytest.warns(RuntimeWarning, match=f"stopped after 1 updates: the loss is nan.*{ESCAPE}.*best iterate"):
         found = fit(blowup, loss, optax.sgd(2.0), 4, train="c.p", progress=False)

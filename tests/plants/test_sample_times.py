@@ -39,6 +39,7 @@ def by_times():
     return jax.jit(jax.grad(end))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rtol", "allowed"), [(1e-8, 1e-5), (1e-10, 1e-6), (1e-12, 1e-7)])
 def test_gradients_by_sample_times(by_times, rtol, allowed):
     """A step that a sample cuts short is a small remainder. The next step is its multiple, and differentiated as such,

@@ -36,6 +36,7 @@ def released(system, theta, L=1.0):
     return system.with_parameters({"pend.initial_theta": theta, "pend.L": L})
 
 
+@pytest.mark.slow
 @pytest.mark.long("a run for each way to end it")
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_right_or_refused(minimal, solver):
