@@ -1,4 +1,4 @@
-"""Figures of solutions, with Matplotlib (extra `plot`)."""
+"""Figures of solutions, structures and frequency responses, with Matplotlib (extra `plot`)."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -8,6 +8,7 @@ from .errors import ModelError
 from .optional import optional_module
 
 if TYPE_CHECKING:
+    from .analysis.frequency import FrequencyResponse
     from .simulation.solution import Solution
     from .system.system import AcausalSystem
 
@@ -177,6 +178,63 @@ def structure(system: "AcausalSystem", ax: Any = None) -> Any:
         ax.set_xlabel(f"{n} unknowns")
         ax.set_ylabel(f"{n} equations")
     return ax
+
+
+def bode(response: "FrequencyResponse", *pairs: tuple[str, str], axes: Any = None) -> Any:
+    """Draws magnitudes and phases over the angular frequency, and returns the two axes."""
+    plt = _pyplot()
+    pairs = _pairs_of(response, pairs)
+    if axes is None:
+        _, axes = plt.subplots(2, 1, sharex=True, figsize=(7.0, 5.0), layout="constrained")
+    elif np.shape(axes) != (2,):
+        raise ModelError(f"a Bode plot needs two axes, for magnitude and phase; got shape {np.shape(axes)}")
+    upper, lower = axes
+    order = np.argsort(np.asarray(response.omega))
+    omega = np.asarray(response.omega)[order]
+    for pair in pairs:
+        values = np.asarray(response[pair])[order]
+        with np.errstate(divide="ignore"):  # −∞ dB, a gap in the line
+            upper.semilogx(omega, 20.0 * np.log10(np.abs(values)), label=_arrow(pair), linewidth=1.6)
+        lower.semilogx(omega, np.degrees(np.unwrap(np.angle(values))), label=_arrow(pair), linewidth=1.6)
+    upper.set_ylabel("magnitude [dB]")
+    lower.set_ylabel("phase [°]")
+    lower.set_xlabel("angular frequency [rad/s]")
+    for ax in (upper, lower):
+        ax.grid(True, which="both", alpha=0.3)
+    upper.legend()
+    return axes
+
+
+def nyquist(response: "FrequencyResponse", *pairs: tuple[str, str], ax: Any = None) -> Any:
+    """Draws responses in the complex plane, those of negative frequencies dashed, with the point −1, and returns the
+    axes."""
+    plt = _pyplot()
+    pairs = _pairs_of(response, pairs)
+    if ax is None:
+        _, ax = plt.subplots(figsize=(5.0, 5.0), layout="constrained")
+    order = np.argsort(np.asarray(response.omega))
+    for pair in pairs:
+        values = np.asarray(response[pair])[order]
+        (line,) = ax.plot(values.real, values.imag, label=_arrow(pair), linewidth=1.6)
+        ax.plot(values.real, -values.imag, "--", color=line.get_color(), linewidth=1.0)
+    ax.plot([-1.0], [0.0], "+", color="C3", markersize=9)
+    ax.set_xlabel("real part")
+    ax.set_ylabel("imaginary part")
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.grid(True, alpha=0.3)
+    ax.legend()
+    return ax
+
+
+def _pairs_of(response: "FrequencyResponse", pairs: tuple[tuple[str, str], ...]) -> tuple[tuple[str, str], ...]:
+    """What is drawn: by default every output by every input, of which there must be one response each."""
+    if np.ndim(response.omega) != 1:
+        raise ModelError(f"one response is drawn at a time; this is a batch, omega has shape {response.omega.shape}")
+    return pairs or tuple((out, to) for to in response.inputs for out in response.outputs)
+
+
+def _arrow(pair: tuple[str, str]) -> str:
+    return f"{pair[1]} → {pair[0]}"
 
 
 def _equation_label(plan: Any, equation: int) -> str:

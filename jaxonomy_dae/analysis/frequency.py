@@ -42,6 +42,38 @@ class FrequencyResponse(eqx.Module):
             places.append(known.index(name))
         return self.values[..., places[0], places[1]]
 
+    def bode(self, *pairs: tuple[str, str], axes: Any = None) -> Any:
+        """Draws magnitudes (dB) and phases (degrees, unwrapped) over ω.
+
+        **Arguments:**
+
+        - `pairs`: `(output, input)` each; default: all.
+        - `axes`: two Matplotlib axes to draw into, for magnitude and phase; new ones by default.
+
+        **Returns:**
+
+        The two axes.
+        """
+        from ..plotting import bode
+
+        return bode(self, *pairs, axes=axes)
+
+    def nyquist(self, *pairs: tuple[str, str], ax: Any = None) -> Any:
+        """Draws responses in the complex plane, those at −ω dashed, with the point −1.
+
+        **Arguments:**
+
+        - `pairs`: `(output, input)` each; default: all.
+        - `ax`: Matplotlib axes to draw into; new ones by default.
+
+        **Returns:**
+
+        The axes.
+        """
+        from ..plotting import nyquist
+
+        return nyquist(self, *pairs, ax=ax)
+
     def __repr__(self):
         pairs = f"{counted(len(self.outputs), 'output')} to {counted(len(self.inputs), 'input')}"
         return f"FrequencyResponse({pairs} at {self.omega.shape[-1]} frequencies)"

@@ -14,7 +14,7 @@ ORDER = [
     "simulation", "learning", "analysis", "plotting", "testing", "library",
 ]  # fmt: skip
 # Methods that hand over to a room above their own, when they are called.
-DEFERRED = {("system", "initialization"), ("simulation", "plotting")}
+DEFERRED = {("system", "initialization"), ("simulation", "plotting"), ("analysis", "plotting")}
 
 
 @functools.cache
