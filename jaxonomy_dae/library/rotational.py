@@ -128,7 +128,7 @@ class SpringDamper(_Compliant):
 class NonlinearSpring(_Compliant):
     """A spring that hardens (or softens) with the cube: tau = c·e + c3·e³ with e = phi_rel − phi_rel0 (Duffing 1918).
 
-    `c` in N*m/rad, `c3` in N*m/rad3.
+    `c` in `N*m/rad`, `c3` in `N*m/rad3`.
     """
 
     def __init__(self, ev: EqnEnv, name: str, c: Value = 1.0, c3: Value = 0.0, phi_rel0: Value = 0.0):
@@ -146,7 +146,7 @@ class Backlash(_Compliant):
     """Play between two parts: nothing is transmitted while |phi_rel| < gap/2; beyond, tau = c·δ + d·dδ/dt with the
     penetration δ, whose corners are rounded over `smooth` (radian).
 
-    `gap` ≥ 0 in radian, `c` ≥ 0 in N*m/rad, `d` ≥ 0 in N*m*s/rad.
+    `gap` ≥ 0 in radian, `c` ≥ 0 in `N*m/rad`, `d` ≥ 0 in `N*m*s/rad`.
     """
 
     def __init__(
@@ -176,7 +176,7 @@ class Friction(_Compliant):
     tau = [sliding + (breakaway − sliding)·exp(−(w_rel/stribeck_speed)²)]·tanh(w_rel/smooth) + viscous·w_rel
     (Armstrong-Hélouvry, Dupont & Canudas de Wit 1994, Automatica 30:1083).
 
-    `sliding`, `breakaway` ≥ 0 in newton metre, `viscous` ≥ 0 in N*m*s/rad, `stribeck_speed`, `smooth` > 0 in
+    `sliding`, `breakaway` ≥ 0 in newton metre, `viscous` ≥ 0 in `N*m*s/rad`, `stribeck_speed`, `smooth` > 0 in
     radian per second. It does not stick: under a torque below `breakaway` parts creep at a speed below `smooth`.
     """
 

@@ -131,7 +131,7 @@ class Backlash(_Compliant):
     """Play between two parts: nothing is transmitted while |s_rel| < gap/2; beyond, f = K·δ + D·dδ/dt with the
     penetration δ, whose corners are rounded over `smooth` (metre).
 
-    `gap` ≥ 0 in metre, `K` ≥ 0 in N/m, `D` ≥ 0 in N*s/m.
+    `gap` ≥ 0 in metre, `K` ≥ 0 in N/m, `D` ≥ 0 in `N*s/m`.
     """
 
     def __init__(
@@ -188,7 +188,7 @@ class Friction(_Compliant):
     f = [sliding + (breakaway − sliding)·exp(−(v/stribeck_speed)²)]·tanh(v/smooth) + viscous·v
     (Armstrong-Hélouvry, Dupont & Canudas de Wit 1994, Automatica 30:1083).
 
-    `sliding`, `breakaway` ≥ 0 in newton, `viscous` ≥ 0 in N*s/m, `stribeck_speed`, `smooth` > 0 in
+    `sliding`, `breakaway` ≥ 0 in newton, `viscous` ≥ 0 in `N*s/m`, `stribeck_speed`, `smooth` > 0 in
     metre per second. It does not stick: under a force below `breakaway` parts creep at a speed below `smooth`.
     """
 
