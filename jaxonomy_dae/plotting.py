@@ -215,8 +215,9 @@ def nyquist(response: "FrequencyResponse", *pairs: tuple[str, str], ax: Any = No
     order = np.argsort(np.asarray(response.omega))
     for pair in pairs:
         values = np.asarray(response[pair])[order]
-        (line,) = ax.plot(values.real, values.imag, label=_arrow(pair), linewidth=1.6)
-        ax.plot(values.real, -values.imag, "--", color=line.get_color(), linewidth=1.0)
+        real, imaginary = np.real(values), np.imag(values)
+        (line,) = ax.plot(real, imaginary, label=_arrow(pair), linewidth=1.6)
+        ax.plot(real, -imaginary, "--", color=line.get_color(), linewidth=1.0)
     ax.plot([-1.0], [0.0], "+", color="C3", markersize=9)
     ax.set_xlabel("real part")
     ax.set_ylabel("imaginary part")

@@ -54,6 +54,7 @@ def test_values_out_of_bounds_are_not_a_number(gradient):
     assert np.array_equal(np.asarray(steps) == 0, bad)
 
 
+@pytest.mark.slow
 def test_what_a_loss_leaves_out_does_not_reach_its_gradient(system):
     @jax.jit
     @jax.grad

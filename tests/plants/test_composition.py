@@ -170,6 +170,7 @@ def ramp_response():
     return last
 
 
+@pytest.mark.slow
 def test_inputs_may_close_over_what_is_differentiated(ramp_response):
     # The first error estimates are exactly zero: no gradient may flow through the size of the first step.
     assert float(jax.jit(jax.grad(ramp_response))(2.0)) == pytest.approx(np.exp(-1), abs=1e-6)  # the default tolerance

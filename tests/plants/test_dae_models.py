@@ -223,6 +223,7 @@ TS = np.linspace(0.0, 6.0, 13)
 ALSO_BDF = pytest.mark.parametrize("solver", [None, pytest.param(BDF(), marks=slow)], ids=["default", "bdf"])
 
 
+@pytest.mark.slow
 @pytest.mark.long("compiles the program that the tests beside it share")
 @ALSO_BDF
 def test_a_model_reports_its_turning_point(folded, solver):

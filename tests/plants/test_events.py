@@ -66,6 +66,7 @@ def assert_right(found, by, solver=""):
     np.testing.assert_allclose(by[2][2], -np.sqrt(9.81 / 2), rtol=LOOSE.get(solver, 1e-9))
 
 
+@pytest.mark.slow
 @pytest.mark.long("the gradient of a model with events, as users get it by default")
 def test_a_ball():
     gradient = jax.jit(jax.grad(of_a_ball, has_aux=True))

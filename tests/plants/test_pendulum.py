@@ -69,6 +69,7 @@ def plain():
     return pendulum()
 
 
+@pytest.mark.slow
 def test_full_swings_pass_both_charts_singular_points(plain):
     ts = np.linspace(0.0, 20.0, 401)
     system = plain.with_parameters({"pend.initial_theta": np.pi / 6})

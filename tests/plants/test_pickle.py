@@ -79,6 +79,7 @@ def test_solutions():
         assert copied.stats == solution.stats and copied.result == solution.result
 
 
+@pytest.mark.slow
 def test_another_process_reads_it(tmp_path: pathlib.Path):
     system = compiled(Bent(EqnEnv(), "c")).with_parameters({"c.a": 9.0})
     (tmp_path / "system.pickle").write_bytes(pickle.dumps(system))

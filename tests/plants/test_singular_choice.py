@@ -124,6 +124,7 @@ class Steep(Component):
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wanted", [["c.x", "c.vx"], ["c.y", "c.vy"]])
 def test_a_preference_is_followed_where_sizes_differ(wanted):
     """The constraint's slopes are 40 and 1. Against x with the force along the constraint in closed form, by SciPy at
