@@ -92,7 +92,9 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Co
         lambda e: str(provenance_of(groups, int(e))),
         dependent,
     )
-    selection = dataclasses.replace(selection, notes=(*_loose_ports(flat), *starts, *notes, *selection.notes))
+    left_out = _not_followed(flat, variables, prefer_states, selection.states)
+    more = (*_loose_ports(flat), *starts, *notes, *left_out, *selection.notes)
+    selection = dataclasses.replace(selection, notes=more)
     known = np.zeros(extended.quantities.n, bool)
     known[selection.states] = True
     known[extended.quantities.n_unknown :] = True
@@ -147,6 +149,18 @@ def _preferred(flat: FlatModel, variables: QuantityMap, names: Sequence[str]) ->
         if q >= 0:
             out.setdefault(q, len(full) - k)
     return out
+
+
+def _not_followed(flat: FlatModel, variables: QuantityMap, names: Sequence[str], states: np.ndarray) -> tuple[str, ...]:
+    """A note on what was asked for as a state and is none, for others were better pivots, or no equation
+    differentiates it."""
+    index = {n: k for k, n in enumerate(flat.variables.names)}
+    full = [n for name in names for n in _entries(flat, name)]
+    left = [n for n in full if variables[index[n]][0] not in states]
+    if not left:
+        return ()
+    is_none, it = ("is no state", "it") if len(left) == 1 else ("are no states", "them")
+    return (f"prefer_states: {listed(left, 12)} {is_none}: the states determine {it}",)
 
 
 def _entries(flat: FlatModel, name: str) -> list[str]:

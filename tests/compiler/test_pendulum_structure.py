@@ -34,6 +34,13 @@ def test_a_singular_choice_of_states_is_vetoed(theta, good, bad):
     assert f"pend.v{bad} was preferred" in notes and "nearly singular" in notes
 
 
+def test_what_is_preferred_and_no_state_is_said():
+    """Coordinates of which the constraint leaves one, and what no equation differentiates."""
+    states, notes = minimal(RELEASE, "pend.x", "pend.vx", "pend.y", "pend.lam")
+    assert states == {"x", "vx"}
+    assert notes == "prefer_states: 'pend.y' and 'pend.lam' are no states: the states determine them"
+
+
 def test_the_references_agree():
     ts = np.linspace(0.1, 20.0, 50)
     angle = elliptic_angle(np.pi / 6, ts)
