@@ -181,7 +181,14 @@ def structure(system: "AcausalSystem", ax: Any = None) -> Any:
 
 
 def bode(response: "FrequencyResponse", *pairs: tuple[str, str], axes: Any = None) -> Any:
-    """Draws magnitudes and phases over the angular frequency, and returns the two axes."""
+    """Draws magnitudes (dB) and phases (degrees, unwrapped) over the angular frequency; returns the two axes.
+
+    **Arguments:**
+
+    - `response`: as `frequency_response` returns it.
+    - `pairs`: `(output, input)` each; default: all.
+    - `axes`: two Matplotlib axes to draw into, for magnitude and phase; new ones by default.
+    """
     plt = _pyplot()
     pairs = _pairs_of(response, pairs)
     if axes is None:
@@ -206,8 +213,14 @@ def bode(response: "FrequencyResponse", *pairs: tuple[str, str], axes: Any = Non
 
 
 def nyquist(response: "FrequencyResponse", *pairs: tuple[str, str], ax: Any = None) -> Any:
-    """Draws responses in the complex plane, those of negative frequencies dashed, with the point −1, and returns the
-    axes."""
+    """Draws responses in the complex plane, those of negative frequencies dashed, with the point −1; returns the axes.
+
+    **Arguments:**
+
+    - `response`: as `frequency_response` returns it.
+    - `pairs`: `(output, input)` each; default: all.
+    - `ax`: Matplotlib axes to draw into; new ones by default.
+    """
     plt = _pyplot()
     pairs = _pairs_of(response, pairs)
     if ax is None:
