@@ -156,11 +156,12 @@ def _not_followed(flat: FlatModel, variables: QuantityMap, names: Sequence[str],
     differentiates it."""
     index = {n: k for k, n in enumerate(flat.variables.names)}
     full = [n for name in names for n in _entries(flat, name)]
-    left = [n for n in full if variables[index[n]][0] not in states]
+    chosen = set(states.tolist())
+    left = [n for n in full if variables[index[n]][0] not in chosen]
     if not left:
         return ()
     is_none, it = ("is no state", "it") if len(left) == 1 else ("are no states", "them")
-    return (f"prefer_states: {listed(left, 12)} {is_none}: the states determine {it}",)
+    return (f"prefer_states: {listed(left, 12)} {is_none}: the states and inputs determine {it}",)
 
 
 def _entries(flat: FlatModel, name: str) -> list[str]:

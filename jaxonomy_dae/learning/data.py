@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from ..errors import ModelError, nearest
 from ..lowering.plan import SystemPlan
 from ..system.inputs import KINDS
-from .experiment import Experiment, Unknown
+from .experiment import Experiment, Unknown, check_increasing
 
 
 class Data:
@@ -201,12 +201,7 @@ def _samples(name: str, source: Any, one: Experiment, label: str) -> tuple[np.nd
         bad = np.flatnonzero(~np.isfinite(array))
         if len(bad):
             raise ModelError(f"{label}: input '{name}': {what}[{bad[0]}] is {array[bad[0]]}; leave the sample out")
-    back = np.flatnonzero(np.diff(times) <= 0)
-    if len(back):
-        k = int(back[0])
-        raise ModelError(
-            f"{label}: input '{name}': times must increase; times[{k}]={times[k]:g} is followed by {times[k + 1]:g}"
-        )
+    check_increasing(times, f"{label}: input '{name}': ")
     slack = 1e-6 * (end - one.t0)
     if times[0] > one.t0 + slack or (times[-1] < end - slack and kind != "held"):
         raise ModelError(

@@ -144,6 +144,16 @@ def _is_finite(value: Any) -> bool:
     return isinstance(value, int | float | np.integer | np.floating) and math.isfinite(value)
 
 
+def check_increasing(times: np.ndarray, where: str = "") -> None:
+    """Refuses times, shape (n,), of which one does not come after the one before; `where` begins the message."""
+    back = np.flatnonzero(np.diff(times) <= 0)
+    if len(back):
+        k = int(back[0])
+        raise ModelError(
+            f"{where}times must increase; times[{k}]={times[k]:g} is followed by times[{k + 1}]={times[k + 1]:g}"
+        )
+
+
 def _times(given: Any, t0: float) -> np.ndarray:
     times = np.asarray(given)
     if times.ndim != 1 or not len(times) or times.dtype.kind not in "iuf":
@@ -152,10 +162,7 @@ def _times(given: Any, t0: float) -> np.ndarray:
     bad = np.flatnonzero(~np.isfinite(times))
     if len(bad):
         raise ModelError(f"times[{bad[0]}] is {times[bad[0]]}: every row needs a time")
-    back = np.flatnonzero(np.diff(times) <= 0)
-    if len(back):
-        k = int(back[0])
-        raise ModelError(f"times must increase; times[{k}]={times[k]:g} is followed by times[{k + 1}]={times[k + 1]:g}")
+    check_increasing(times)
     if not _is_finite(t0) or times[0] < t0 or times[-1] <= t0:
         raise ModelError(
             f"times lie outside of the experiment: it starts at t0={t0:g}, the times reach from {times[0]:g} to "

@@ -38,7 +38,7 @@ def test_what_is_preferred_and_no_state_is_said():
     """Coordinates of which the constraint leaves one, and what no equation differentiates."""
     states, notes = minimal(RELEASE, "pend.x", "pend.vx", "pend.y", "pend.lam")
     assert states == {"x", "vx"}
-    assert notes == "prefer_states: 'pend.y' and 'pend.lam' are no states: the states determine them"
+    assert notes == "prefer_states: 'pend.y' and 'pend.lam' are no states: the states and inputs determine them"
 
 
 def test_the_references_agree():
