@@ -9,8 +9,9 @@ from ..expressions.differentiate import partial_derivative
 from ..expressions.errors import KernelWithErrors
 from ..expressions.kernel import Kernel
 from ..expressions.node import ZERO as ZERO_NODE
-from ..expressions.node import Node, constant, leaf, linear, multiply, scale
+from ..expressions.node import Node, constant, leaf, linear, multiply, number, scale, split
 from ..expressions.substitute import substitute
+from ..expressions.terms import terms as multiplied_out
 from ..model.linear_template import LinearTemplate
 from ..model.provenance import Provenance, Provenances
 from ..model.symbolic import SymbolicTemplate, number_label, parameter_label, slot_label, template_of
@@ -130,6 +131,9 @@ def combine(
 ) -> Node | None:
     """Σ weight·equation without the quantities that cancel; None if those in `gone` do not.
 
+    What cancels is a term: 1e-6·x³ stays, though near x = 1 nothing of it is seen beside 1e6·x − 1e6·x. What remains of
+    a quantity in other terms cancels if it cannot be told from rounding errors wherever it has a value.
+
     `values` are those of the parameters, of which those in `kept` stay; `natural` gives sizes of quantities at which
     the equations have values.
     """
@@ -138,8 +142,9 @@ def combine(
     quantities = sorted(
         (label for label in frozenset().union(*(e.leaves for e in equations)) if label[0] == "quantity"), key=repr
     )
+    without = _sum_of_terms(terms)
     samples = Samples([*equations, *weights], values, kept, natural)
-    cancelled = []
+    cancelled, stays = [], False
     for label in quantities:
         slopes = samples([multiply(w, partial_derivative(e, label)) for w, e in zip(weights, equations, strict=True)])
         finite = np.isfinite(slopes).all(axis=0)
@@ -148,7 +153,11 @@ def combine(
         # Where there are values at some points only, slopes of zero may be what underflowed.
         seen = finite.all() or (size[finite] > 0).any()
         if finite.any() and seen and small[finite].all():
-            cancelled.append(label)
+            if label not in without.leaves or label in gone or _is_rounding(without, label, values, kept):
+                cancelled.append(label)
+            else:
+                stays = True
+    total = without if stays else total
     if not set(gone) <= set(cancelled) | (set(gone) - set(quantities)):
         return None
     before = samples(terms)
@@ -162,24 +171,32 @@ def combine(
     return None
 
 
-@np.errstate(all="ignore")
-def cancels_elsewhere(
-    equations: Sequence[Node], weights: Sequence[Node], gone: Sequence[Hashable], values: np.ndarray, kept: np.ndarray,
-    of_parameters: bool,
-) -> bool:  # fmt: skip
-    """Whether what cancels near the points that were tried does so at quantities of other sizes and signs, or
-    `of_parameters`: a condition may choose another branch there. Points without values say nothing.
+def _sum_of_terms(parts: Sequence[Node]) -> Node:
+    """The sum of parts, multiplied out, without terms of which rounding alone is left."""
+    collected: dict[Node, list[Any]] = {}
+    for c, rest in (split(t) for part in parts for t in multiplied_out(part)):
+        collected.setdefault(rest, []).append(c)
+    sums = {rest: (sum(found), sum(map(abs, found))) for rest, found in collected.items()}
+    return linear((c, rest) for rest, (c, size) in sums.items() if abs(c) > CANCELLED * size)
 
-    Parameters in `kept`, discrete variables, are as they are given.
-    """
+
+def _is_rounding(graph: Node, label: Hashable, values: np.ndarray, kept: np.ndarray) -> bool:
+    """Whether a graph's slope in a quantity is a rounding error wherever it has a value other than zero."""
+    slope = _sum_of_terms([partial_derivative(graph, label)])
+    labels = sorted(slope.leaves, key=repr)
+    columns = _far_points(labels, values, kept, of_parameters=True)
+    (value,), (bound,) = KernelWithErrors([slope], labels)(columns, [np.zeros(FAR)] * len(columns))
+    value, bound = (np.broadcast_to(np.asarray(v, float), (FAR,)) for v in (value, bound))
+    says = np.isfinite(value + bound) & (bound > 0)
+    return number(slope) == 0 or bool(says.any() and (np.abs(value) <= bound)[says].all())
+
+
+def _far_points(
+    labels: Sequence[Hashable], values: np.ndarray, kept: np.ndarray, of_parameters: bool
+) -> list[np.ndarray]:
+    """Values of quantities of all sizes and signs, FAR of each; and of parameters, those given or, with
+    `of_parameters`, others, but for those in `kept`."""
     rng = np.random.default_rng(0)
-    slopes = [
-        [multiply(w, partial_derivative(e, label)) for w, e in zip(weights, equations, strict=True)] for label in gone
-    ]
-    graphs = [g for row in slopes for g in row]
-    labels = sorted(frozenset().union(*(g.leaves for g in graphs)), key=repr)
-    if not any(label[0] == "quantity" or label == TIME_LABEL or of_parameters for label in labels):
-        return True
     columns = []
     for label in labels:
         sign, power = rng.choice([-1.0, 1.0], FAR), rng.uniform(-1.0, 1.0, FAR)
@@ -191,6 +208,27 @@ def cancels_elsewhere(
             columns.append(np.full(FAR, values[label[1]]))
         else:
             columns.append(sign * 10.0 ** (REACH_OF_PARAMETERS * power) * (abs(values[label[1]]) or 1.0))
+    return columns
+
+
+@np.errstate(all="ignore")
+def cancels_elsewhere(
+    equations: Sequence[Node], weights: Sequence[Node], gone: Sequence[Hashable], values: np.ndarray, kept: np.ndarray,
+    of_parameters: bool,
+) -> bool:  # fmt: skip
+    """Whether what cancels near the points that were tried does so at quantities of other sizes and signs, or
+    `of_parameters`: a condition may choose another branch there. Points without values say nothing.
+
+    Parameters in `kept`, discrete variables, are as they are given.
+    """
+    slopes = [
+        [multiply(w, partial_derivative(e, label)) for w, e in zip(weights, equations, strict=True)] for label in gone
+    ]
+    graphs = [g for row in slopes for g in row]
+    labels = sorted(frozenset().union(*(g.leaves for g in graphs)), key=repr)
+    if not any(label[0] == "quantity" or label == TIME_LABEL or of_parameters for label in labels):
+        return True
+    columns = _far_points(labels, values, kept, of_parameters)
     # Points are exact, but far out 1 + x⁴ − x⁴ is zero: what evaluation loses says nothing either.
     terms, errors = (
         np.stack([np.broadcast_to(np.asarray(v, float), (FAR,)) for v in found]).reshape(len(gone), len(equations), FAR)

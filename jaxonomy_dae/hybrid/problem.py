@@ -27,6 +27,7 @@ class AbstractHybridProblem(eqx.Module):
     revocable: eqx.AbstractVar[tuple[bool, ...]]  # which another event may undo before they happen
     relations: eqx.AbstractVar[tuple[bool, ...]]  # which say what a relation is, from the initial time on
     opposite: eqx.AbstractVar[tuple[int, ...]]  # of each guard: the one that falls where its relation turns back, or −1
+    only_kinks: eqx.AbstractVar[bool]  # whether all events are relations at which dx/dt and guards do not jump
     resolution: eqx.AbstractVar[Any]  # a time that is nothing beside the run, but more than rounding
 
     @abc.abstractmethod

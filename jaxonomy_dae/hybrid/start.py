@@ -30,15 +30,12 @@ def start(
     ticks = jnp.where(jnp.isinf(period), (passed > 0).astype(dtype), jnp.ceil(passed / period))
     relations = np.array(problem.relations, bool)
     ticks = jnp.where(relations[:c], ticks, jnp.maximum(ticks, 0.0))  # relations have turned at all times
-    armed = size = rate = jnp.zeros((0,), dtype)
-    holding = jnp.zeros((0,), bool)
-    if relations.any():
-        due = problem.due(ticks) <= t0 + tolerance
-        q0 = _with_relations(problem, t0, x0, q0, due, args)
-        ticks = ticks + (due & relations[:c]).astype(dtype)
+    due = problem.due(ticks) <= t0 + tolerance
+    q0, rate, value = _settled(problem, t0, x0, q0, due, args)
+    ticks = ticks + (due & relations[:c]).astype(dtype)
+    holding, size = _holds(value, rate), jnp.abs(value)
+    armed = jnp.zeros((0,), dtype)
     if g:
-        rate, holding, value = _conditions(problem, t0, x0, q0, args)
-        size = jnp.abs(value)
         armed = jnp.where(holding, BELOW, jnp.where(value == 0, RESTS, ABOVE)).astype(dtype)
     rows = jnp.full((logged if sides else 0, len(x0) + len(q0)), jnp.nan, dtype)
     state = HybridState(
@@ -55,29 +52,34 @@ def start(
     return handle(problem, t0, state, arrival, args, at_start=True)[0]
 
 
-def _conditions(problem: AbstractHybridProblem, t0: Any, x0: Any, q0: Any, args: Any) -> tuple[Any, Any, Any]:
-    """How fast guards change at the initial time, which conditions hold, and the guards. One at zero is as it will be
-    at once."""
-    value, rate = problem.rates(t0, x0, q0, args, problem.slope(t0, x0, q0, args))
-    return rate, jnp.where(value == 0, rate < 0, value < 0), value
+def _holds(value: Any, rate: Any) -> Any:
+    """Which conditions hold. One at zero is as it will be at once."""
+    return jnp.where(value == 0, rate < 0, value < 0)
 
 
-def _with_relations(problem: AbstractHybridProblem, t0: Any, x0: Any, q0: Any, due: Any, args: Any) -> Any:
-    """The discrete values when all relations are what their sides say, or, if their clocks are `due`, what these write.
-    They do not move with parameters."""
+def _settled(problem: AbstractHybridProblem, t0: Any, x0: Any, q0: Any, due: Any, args: Any) -> tuple[Any, Any, Any]:
+    """(q, how fast guards change, the guards) at the initial time, when all relations are what their sides say, or, if
+    their clocks are `due`, what these write. They do not move with parameters."""
     c, g = problem.n_clocks, problem.n_guards
     relations = np.array(problem.relations, bool)
-    problem, t0, x0, begin, due, args = still((problem, t0, x0, q0, due, args))
+    given = still((problem, t0, x0, q0, due, args))
+    problem, t0, x0, begin, due, args = given
 
-    def settled(q: Any, clocks: Any, holding: Any) -> Any:
+    def written(q: Any, clocks: Any, holding: Any) -> Any:
         return problem.settled(t0, x0, q, jnp.concatenate([clocks, holding]) & relations, args)
 
-    def once(_: Any, q: Any) -> Any:
-        return settled(q, jnp.zeros((c,), bool), _conditions(problem, t0, x0, q, args)[1])
+    def once(k: Any, carry: Any) -> Any:
+        """Relations as they were found before, and what guards are with them."""
+        q, rate, value = carry
+        q = jnp.where(k > 0, written(q, jnp.zeros((c,), bool), _holds(value, rate)), q)
+        value, rate = problem.rates(t0, x0, q, args, problem.slope(t0, x0, q, args))
+        return q, rate, value
 
     found, none = begin, jnp.zeros((g,), bool)
     if relations[:c].any():
-        found = lax.fori_loop(0, 2, lambda k, q: settled(q, due | (k == 0), none), found)
-    if relations[c:].any():
-        found = lax.fori_loop(0, ROUNDS, once, found)
-    return jnp.where(found == begin, q0, found)
+        found = lax.fori_loop(0, 2, lambda k, q: written(q, due | (k == 0), none), found)
+    rate = value = jnp.zeros((g,), x0.dtype)
+    if g:  # in a loop, for XLA compiles the equations as often as they are written
+        rounds = ROUNDS if relations[c:].any() else 0
+        found, rate, value = lax.fori_loop(0, rounds + 1, once, (found, rate, value))
+    return jnp.where(found == begin, q0, found), rate, value

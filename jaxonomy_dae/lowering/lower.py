@@ -83,8 +83,8 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
         variable_map,
         state_order,
         quantity_name,
+        extended,
         steps,
-        n,
         lambda q: program(_needed(steps, q, n)),
     )
     held = plan_held(flat.held, variable_map, lambda q: program(_needed(steps, q, n)))
@@ -251,6 +251,7 @@ def _digest(
         e.noted,
         e.revocable,
         e.relation,
+        e.kink,
         e.immediate,
         e.event,
         e.state,

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ..errors import ModelError
+from ..model.extended import Extended
 from ..model.quantities import QuantityMap
 from ..model.tables import ZERO, DependentParameters, EventTable, FlatModel
 from .gather import Gather
@@ -33,6 +34,7 @@ class EventPlan:
     discrete: np.ndarray  # the parameters that are discrete variables, hidden ones last
     n_visible: int  # how many of them were declared
     dependents: tuple[DependentParameters, ...]  # the parameters that follow them
+    only_kinks: bool  # whether no event changes values of states or slopes
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -48,12 +50,12 @@ def plan_events(
     variables: QuantityMap,
     states: np.ndarray,
     names: Sequence[str],
+    extended: Extended,
     steps: Sequence[AnyStep],
-    n: int,
     program: Callable[[np.ndarray], Program],
 ) -> EventPlan | None:
-    """Plans the events of a model; `steps` determine its `n` quantities, and `program` makes the program
-    that computes chosen ones. None if it has no events.
+    """Plans the events of a model; `steps` determine its quantities, and `program` makes the program that computes
+    chosen ones. None if it has no events.
 
     **Raises:**
 
@@ -62,7 +64,7 @@ def plan_events(
     table = flat.events
     if not len(table):
         return None
-    table = _in_order(table, _reads(flat, variables, steps, n))
+    table = _in_order(table, _reads(flat, variables, steps, extended.quantities.n))
     n_clocks = len(table.clocks)
     guards, guard = read_variables(variables, table.guard[n_clocks:], program)
     values, value = read_variables(variables, table.value, program)
@@ -87,8 +89,14 @@ def plan_events(
                 )
     return EventPlan(
         table, n_clocks, guards, guard, values, value, place, factor, flat.parameters.discrete,
-        len(flat.parameters.discrete) - flat.parameters.n_relations, _following(flat)
+        len(flat.parameters.discrete) - flat.parameters.n_relations, _following(flat),
+        all(table.kink) and _only_as_written(flat.parameters.discrete, extended),
     )  # fmt: skip
+
+
+def _only_as_written(parameters: np.ndarray, extended: Extended) -> bool:
+    """Whether parameters stand in no equation that is differentiated: where |x| only bends, its derivative jumps."""
+    return not any(group.level and np.isin(group.parameter, parameters).any() for group in extended.groups)
 
 
 def _reads(flat: FlatModel, variables: QuantityMap, steps: Sequence[AnyStep], n: int) -> list[set[int]]:
@@ -146,7 +154,7 @@ def _in_order(table: EventTable, reads: list[set[int]]) -> EventTable:
     return dataclasses.replace(
         table, text=moved(table.text), guard=table.guard[everything], clocks=tuple(table.clocks[e] for e in order),
         message=moved(table.message), noted=moved(table.noted), revocable=moved(table.revocable),
-        relation=moved(table.relation), immediate=moved(table.immediate),
+        relation=moved(table.relation), kink=moved(table.kink), immediate=moved(table.immediate),
         event=place[table.event] if len(table.event) else table.event,
     )  # fmt: skip
 

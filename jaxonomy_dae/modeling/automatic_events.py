@@ -46,11 +46,13 @@ def smooth(expression: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Turning:
-    """A condition that turns while `watched`; the hidden discrete variable `number` is what it is: 1, 0, or LIVE."""
+    """A condition that turns while `watched`; the hidden discrete variable `number` is what it is: 1, 0, or LIVE. It is
+    a `kink` if both branches have the same value where it turns."""
 
     number: int
     condition: Any
     watched: Any
+    kink: bool = False
 
     @property
     def starts(self) -> tuple[float, ...]:
@@ -185,14 +187,17 @@ class _Rewriting:
             self.new[e] = self._written(e)
             self.old[self.new[e]] = e
 
-        def holding(places: list[Any]) -> Any:
-            where = functools.reduce(union, (self.needed[e] for e in places))
-            return _holding(where, self.conditions.__getitem__)
-
-        watched = tuple(kind(number, what, holding(places)) for kind, number, what, places in self.found)
+        watched = tuple(self._watched(*each) for each in self.found)
         timed = (*self.numbers.timed.values(), *self.timed_steps)
         in_order = tuple(sorted((*watched, *timed), key=lambda w: w.number))
         return tuple(self.new.get(r, r) for r in self.residuals), in_order
+
+    def _watched(self, kind: Any, number: int, what: Any, places: list[Any]) -> Any:
+        where = _holding(functools.reduce(union, (self.needed[e] for e in places)), self.conditions.__getitem__)
+        if kind is Stepping:
+            return Stepping(number, what, where)
+        # What is looked at only at times may have turned before.
+        return Turning(number, what, where, where is sympy.true and all(map(_is_continuous, places)))
 
     def _written(self, e: Any) -> Any:
         if isinstance(e, sympy.Piecewise):
@@ -386,13 +391,26 @@ def _two_branches(e: Any) -> tuple[Any, Any, Any] | None:
     return None
 
 
+def _is_continuous(e: Any) -> bool:
+    """Whether a part with relations has the same value on both sides of each."""
+    if isinstance(e, sympy.Max | sympy.Min | sympy.Abs):
+        return True
+    parts = _two_branches(e)
+    return parts is not None and _vanish_on(parts[2], lambda _: (parts[0] - parts[1],))
+
+
 def _meet_smoothly(difference: Any, surface: Any) -> bool:
-    """Whether a difference and its slope vanish where a surface does, in a variable that says where this is."""
+    """Whether a difference and its slope vanish where a surface does."""
+    return _vanish_on(surface, lambda v: (difference, sympy.diff(difference, v)))
+
+
+def _vanish_on(surface: Any, expressions_in: Callable[[Any], tuple[Any, ...]]) -> bool:
+    """Whether expressions vanish where a surface does, in a variable that says where this is; False if none does."""
     for v in sorted((s for s in symbols_of(surface) if isinstance(s, VariableSymbol)), key=str):
         slope = sympy.diff(surface, v)
         if slope.is_number and slope.is_nonzero:
             place = {v: v - surface / slope}
-            return all(sympy.expand(d.xreplace(place)) == 0 for d in (difference, sympy.diff(difference, v)))
+            return all(sympy.expand(d.xreplace(place)) == 0 for d in expressions_in(v))
     return False
 
 

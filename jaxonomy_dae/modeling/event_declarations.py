@@ -97,6 +97,7 @@ class EventDeclarations:
     def _event(
         self, condition: Any, actions: tuple[Action, ...], on: Any, immediate: bool, noted: bool = True,
         revocable: bool = False, text: str | None = None, relation: bool = False, watched: Any = sympy.true,
+        kink: bool = False,
     ) -> None:  # fmt: skip
         if self._sealed:
             raise ModelError(f"component '{self.path}' is complete: declare its events inside __init__ of its class")
@@ -128,7 +129,9 @@ class EventDeclarations:
         elif on is not None:
             raise ModelError(f"{where}: on= is for conditions on variables; a sampled event always happens")
         values = self._values(actions, number, where)
-        self.events.append(When(shown, guard, clock, tuple(actions), values, immediate, noted, revocable, relation))
+        self.events.append(
+            When(shown, guard, clock, tuple(actions), values, immediate, noted, revocable, relation, kink)
+        )
 
     def _hidden(self, name: str, expression: sympy.Expr) -> str:
         """Declares a variable that equals an expression, and is not shown."""

@@ -54,7 +54,8 @@ class When:
     the numbers, that the actions write; `text` is what the user wrote. One that is `immediate` happens at the initial
     time, too, if its condition holds there; one that is not `noted` only says that equations change. One that is
     `revocable` does not happen if another event at the same instant has made its condition false again. A `relation`
-    says what a hidden discrete variable is, from the initial time on."""
+    says what a hidden discrete variable is, from the initial time on; it is a `kink` if equations go on with the same
+    values where it turns."""
 
     text: str
     guard: str | None
@@ -65,6 +66,7 @@ class When:
     noted: bool = True
     revocable: bool = False
     relation: bool = False
+    kink: bool = False
 
 
 @dataclasses.dataclass(frozen=True)

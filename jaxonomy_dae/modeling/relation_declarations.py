@@ -69,7 +69,8 @@ class RelationDeclarations(EventDeclarations):
     def _turns(self, relation: Turning) -> None:
         known, condition = RelationSymbol(relation.number), relation.condition
         for holds, value in ((condition, 1), (sympy.Not(condition), 0)):
-            self._relation_event(holds, shortened(condition), relation.watched, Assign(known, sympy.Integer(value)))
+            action = Assign(known, sympy.Integer(value))
+            self._relation_event(holds, shortened(condition), relation.watched, action, kink=relation.kink)
 
     def _ticks(self, relation: Timed) -> None:
         """Clocks of a relation of time. At the initial time it is as its sides say, unless a clock ticks there."""
@@ -107,8 +108,8 @@ class RelationDeclarations(EventDeclarations):
         ):
             self._relation_event(condition, text, sympy.And(found, watched), Assign(known, value))
 
-    def _relation_event(self, condition: Any, text: str, watched: Any, *actions: Assign) -> None:
-        self._event(condition, actions, None, True, False, True, text, True, watched)
+    def _relation_event(self, condition: Any, text: str, watched: Any, *actions: Assign, kink: bool = False) -> None:
+        self._event(condition, actions, None, True, False, True, text, True, watched, kink)
 
 
 def _unless(condition: Any, otherwise: Any, value: Any) -> Any:

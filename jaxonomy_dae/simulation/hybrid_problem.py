@@ -40,6 +40,7 @@ class SystemProblem(AbstractHybridProblem):
     revocable: tuple[bool, ...] = eqx.field(static=True)
     relations: tuple[bool, ...] = eqx.field(static=True)
     opposite: tuple[int, ...] = eqx.field(static=True)
+    only_kinks: bool = eqx.field(static=True)
 
     def term(self, q):
         return term_of(self.system.holding(q), self.implicit)
@@ -151,6 +152,7 @@ def problem_for(
         revocable=events.table.revocable,
         relations=events.table.relation,
         opposite=_opposite(events.table, events.n_clocks),
+        only_kinks=events.only_kinks,
     )  # fmt: skip
 
 

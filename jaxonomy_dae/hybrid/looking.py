@@ -1,0 +1,167 @@
+"""What a step meets: guards looked at together at a few places, and where the first one falls through zero."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from ..adjoint.closure_conversion import any_member
+from ..adjoint.resting import still
+from .event_map import AHEAD, CLOSE, Arrival
+from .problem import AbstractHybridProblem, HybridState
+from .search import first_crossing
+from .side import ABOVE, BELOW, RESTS, rounding
+
+WINDOW = 1e-6  # of a step: a guard that reaches zero so close to its end counts as having done so
+# Where guards are looked at, as parts of a step; and how far, as a part of its size, a guard may be from the parabola
+# through its values at the first, the middle and the last of these. One that bends more may cross zero unseen, and the
+# step is taken in halves.
+LOOKS = np.array([0.0, 0.13, 0.31, 0.5, 0.67, 0.86, 1.0])
+FITTED = [0, 3, 6]
+BEND = 0.1
+FORGOTTEN = 0.8  # what a step leaves of how long steps have been: next to events they are short
+
+
+def _off_parabola() -> np.ndarray:
+    """The distances of the values at LOOKS from the parabola through the first, the middle and the last."""
+    others = [k for k in range(len(LOOKS)) if k not in FITTED]
+    out = np.eye(len(LOOKS))[others]
+    out[:, FITTED] = -np.vander(LOOKS[others], 3) @ np.linalg.inv(np.vander(LOOKS[FITTED], 3))
+    return out
+
+
+_OFF_PARABOLA = _off_parabola()
+# Barycentric weights (Berrut & Trefethen 2004), and the derivative at the end of the polynomial through all values.
+_WEIGHTS = np.array([1 / np.prod([a - b for b in LOOKS if b != a]) for a in LOOKS])
+_DIVIDED = _WEIGHTS[:-1] / _WEIGHTS[-1] / (1.0 - LOOKS[:-1])
+_RATE_AT_END = np.append(_DIVIDED, -_DIVIDED.sum())
+
+
+def _between(place: Any, values: Any) -> Any:
+    """The polynomial through the values at LOOKS, at another place."""
+    weights = jnp.asarray(_WEIGHTS, values.dtype) / (place - jnp.asarray(LOOKS, values.dtype))
+    return weights @ values / jnp.sum(weights)
+
+
+class Met(NamedTuple):
+    """What a step meets, not differentiated.
+
+    - `request`: the end of the step to take instead, or infinity.
+    - `armed`: on which side guards are at its end, shape (guards,); `values`: and what they are there.
+    - `arrival`: what happens there.
+    """
+
+    request: Any
+    armed: Any
+    values: Any
+    arrival: Arrival
+
+
+def looked_at(
+    problem: AbstractHybridProblem, dense: Callable[[Any, Any, Any], Any], t0: Any, t1: Any, y0: HybridState, x1: Any,
+    args: Any,
+) -> Met:  # fmt: skip
+    """What a step from y0 to x1 meets, of which `dense(t0, t1, t)` are the states.
+
+    Where equations go on with the same values, at kinks, time may be known less well than where states jump: guards
+    between the places where they are looked at are on the polynomial through their values there, and so is their rate
+    at the end. A jump is located, and its rate known, by the equations.
+    """
+    problem, dense, t0, t1, y0, x1, args = still((problem, dense, t0, t1, y0, x1, args))
+    h, q, g = t1 - t0, y0.q, problem.n_guards
+    span = jnp.maximum(h, FORGOTTEN * y0.span)
+    window = jnp.maximum(WINDOW * span, problem.resolution)
+    ticking = y0.due <= t1 + 0.25 * problem.resolution
+
+    def slope():
+        return problem.slope(t1, x1, q, args)
+
+    if not g:
+        none = jnp.zeros((0,), bool)
+        before = lax.cond(any_member(jnp.any(ticking)), slope, lambda: jnp.zeros_like(x1))
+        arrival = Arrival(before, y0.size, ticking, none, y0.size, window, span)
+        return Met(jnp.full_like(t1, jnp.inf), y0.armed, y0.size, arrival)
+
+    times = jnp.append(t0 + h * jnp.asarray(LOOKS[:-1], t1.dtype), t1)
+    states = jnp.concatenate([jax.vmap(lambda t: dense(t0, t1, t))(times[:-1]), x1[None]])
+    values = jax.vmap(lambda t, x: problem.guards(t, x, q, args))(times, states)
+    size = jnp.max(jnp.abs(values), axis=0)
+    largest = jnp.maximum(size, y0.size)
+    band = rounding(largest)
+    # What has left the band above zero anywhere before is above, and armed, as is what rests.
+    rises = jnp.concatenate([(y0.armed == ABOVE)[None], values[1:] > band])
+    above = lax.associative_scan(jnp.logical_or, rises)
+    armed = above | (y0.armed == RESTS)
+    raised = jnp.where((y0.armed == RESTS) & ~above, band, 0.0)  # what rests falls where it leaves the band
+    values = values + raised
+    # One may also reach zero and stay.
+    crossed = armed[:-1] & ((values[1:] < 0) | ((values[1:] == 0) & (values[:-1] > 0)))
+    last = values[-1]
+
+    def reaches_zero(rate):
+        # A step that was to end at zero does so up to rounding in what the guard is the difference of.
+        rounded = jnp.minimum(band, -rate * (AHEAD * span))
+        return (rate < 0) & (jnp.abs(last) <= jnp.maximum(-rate * window, rounded))
+
+    def at_end():
+        before = slope()
+        return before, reaches_zero(problem.rates(t1, x1, q, args, before)[1])
+
+    short = h <= 4 * problem.resolution
+    if problem.only_kinks:
+        before, near = jnp.zeros_like(x1), reaches_zero(jnp.asarray(_RATE_AT_END, values.dtype) @ values / h)
+    else:
+        doubtful = jnp.any(armed[-1] & (last <= CLOSE * size)) | jnp.any(ticking) | short
+        before, near = lax.cond(any_member(doubtful), at_end, lambda: (jnp.zeros_like(x1), jnp.zeros((g,), bool)))
+    near = near & armed[-1]
+    off = jnp.max(jnp.abs(jnp.asarray(_OFF_PARABOLA, values.dtype) @ values), axis=0)
+    bent = jnp.any(off > jnp.maximum(BEND * size, band))
+    long = h > 1e3 * jnp.maximum(WINDOW * h, problem.resolution)
+    bent = bent & long
+    # In a step too short to be parted, what has crossed has jumped.
+    jumped = jnp.any(crossed, axis=0) & ~near & short
+    near = near | jumped
+    within = jnp.any(crossed[:-1], axis=0) & ~short
+    inside = jnp.any(within | (crossed[-1] & ~near))
+
+    def located():
+        place = jnp.argmax(jnp.any(crossed, axis=1))
+
+        def guards(t):
+            if problem.only_kinks:
+                return _between((t - t0) / h, values - raised) + raised[place + 1]
+            return problem.guards(t, dense(t0, t1, t), q, args) + raised[place + 1]
+
+        return first_crossing(
+            guards, crossed[place], times[place], times[place + 1], values[place], values[place + 1], inside
+        )
+
+    where = lax.cond(any_member(inside), located, lambda: t1)
+    where = jnp.maximum(where, t0 + 2 * problem.resolution)
+    dip = jnp.where(long, _dip(values, armed, jnp.any(crossed, axis=0), 2 * off - band), jnp.inf)
+    request = jnp.minimum(jnp.where(inside, where, jnp.inf), t0 + dip * h)
+    request = jnp.where(bent, t0 + 0.5 * h, request)
+    due = jnp.concatenate([ticking, near]) & ~jnp.isfinite(request)
+    arrival = Arrival(before, y0.size, due, jumped, largest, window, span)
+    side = jnp.where(above[-1], ABOVE, jnp.where(armed[-1], RESTS, BELOW))
+    return Met(request, side.astype(y0.armed.dtype), last - raised[-1], arrival)
+
+
+def _dip(values, armed, crossed, doubt):
+    """Where, as a part of the step, a guard that is positive wherever it was looked at is lowest by the parabola
+    through its values at the ends and in the middle, if it may be negative there; or infinity. The step is taken up to
+    there, and so on until what the parabola leaves in `doubt` is decided."""
+    left, middle, right = values[jnp.array(FITTED)]
+    bend = 2 * (left - 2 * middle + right)
+    slope = 4 * middle - 3 * left - right
+    curved = bend > 0
+    bend = jnp.where(curved, bend, 1.0)
+    place = -0.5 * slope / bend
+    before = jnp.sum(jnp.asarray(LOOKS, values.dtype)[:, None] <= place, axis=0) - 1
+    was_armed = jnp.take_along_axis(armed, jnp.clip(before, 0, len(LOOKS) - 1)[None], axis=0)[0]
+    lowest = left + 0.5 * slope * place
+    dips = curved & was_armed & ~crossed & (1e-3 < place) & (place < 1) & (lowest < doubt)
+    return jnp.min(jnp.where(dips, place, jnp.inf))
