@@ -124,24 +124,16 @@ def handle(
         again = jnp.where(slides, event, jnp.where(jnp.any(stuck), c + jnp.argmax(stuck), -1)) if g else jnp.array(-1)
         # What is too fast to be followed back, as a current that a blocked diode stops, has that value at once.
         back = delay - (1.0 - slow) * lax.stop_gradient(delay)
-        state = HybridState(
-            x - after * back,
-            new,
-            armed,
-            state.size,
-            state.span,
-            state.request,
-            ticks,
-            lax.stop_gradient(problem.due(ticks)),
-            state.count + logged.astype(state.count.dtype),
-            _noted(state.times, row, time),
-            _noted(state.which, row, event),
-            _noted(state.rate, row, lax.stop_gradient(rate)),
-            jnp.maximum(state.ended, ends[event]),
-            again.astype(t.dtype),
-            turns,
-            _noted(state.before, row, jnp.concatenate([reached, q])),
-            _noted(state.after, row, jnp.concatenate([x, new])),
+        state = state.noted(row, time, event, rate, jnp.concatenate([reached, q]), jnp.concatenate([x, new])).but(
+            x=x - after * back,
+            q=new,
+            armed=armed,
+            ticks=ticks,
+            due=lax.stop_gradient(problem.due(ticks)),
+            count=state.count + logged.astype(state.count.dtype),
+            ended=jnp.maximum(state.ended, ends[event]),
+            stuck=again.astype(t.dtype),
+            turns=turns,
         )
         # Clocks that tick together read what was before all of them.
         previous = jnp.where(jnp.any(left[:c]), instant.previous, new) if c else new
@@ -168,11 +160,6 @@ def handle(
         handled = while_any_is_left(handled, -(-length // inner))
     instant = handled(start)
     return instant.state, instant.slope
-
-
-def _noted(rows: Any, row: Any, value: Any) -> Any:
-    """Rows with one of them written; nothing is if there is no such row."""
-    return rows.at[row].set(value.astype(rows.dtype), mode="drop") if rows.shape[0] else rows
 
 
 def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, delay, moved, approach, args):

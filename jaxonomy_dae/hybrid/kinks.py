@@ -6,7 +6,6 @@ other guard has jumped, and what is left of the event is that its relation is kn
 
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -28,4 +27,4 @@ def turned(problem: AbstractHybridProblem, t: Any, state: HybridState, values: A
     turns = state.turns + jnp.sum(due).astype(state.turns.dtype)
     slides = jnp.any(due) & (turns > SLIDES + TURNS * len(opposite))
     stuck = jnp.where(slides, problem.n_clocks + jnp.argmax(due), -1).astype(state.stuck.dtype)
-    return eqx.tree_at(lambda y: (y.q, y.armed, y.turns, y.stuck), state, (q, armed, turns, stuck))
+    return state.but(q=q, armed=armed, turns=turns, stuck=stuck)

@@ -76,18 +76,42 @@ def looked_at(
     window = jnp.maximum(WINDOW * span, problem.resolution)
     ticking = y0.due <= t1 + 0.25 * problem.resolution
 
-    def slope():
-        return problem.slope(t1, x1, q, args)
-
     if not g:
         none = jnp.zeros((0,), bool)
-        before = lax.cond(any_member(jnp.any(ticking)), slope, lambda: jnp.zeros_like(x1))
+        before = lax.cond(
+            any_member(jnp.any(ticking)), lambda: problem.slope(t1, x1, q, args), lambda: jnp.zeros_like(x1)
+        )
         arrival = Arrival(before, y0.size, ticking, none, y0.size, window, span)
         return Met(jnp.full_like(t1, jnp.inf), y0.armed, y0.size, arrival)
 
     times = jnp.append(t0 + h * jnp.asarray(LOOKS[:-1], t1.dtype), t1)
     states = jnp.concatenate([jax.vmap(lambda t: dense(t0, t1, t))(times[:-1]), x1[None]])
     values = jax.vmap(lambda t, x: problem.guards(t, x, q, args))(times, states)
+    size = jnp.abs(values)
+    largest = jnp.maximum(jnp.max(size, axis=0), y0.size)
+    off = jnp.max(jnp.abs(jnp.asarray(_OFF_PARABOLA, values.dtype) @ values), axis=0)
+    # Nothing is met where all guards are farther from zero than they move, whatever they do between: of most steps.
+    moves = jnp.max(values, axis=0) - jnp.min(values, axis=0)
+    side = jnp.where(values[-1] > 0, ABOVE, BELOW)
+    far = jnp.min(size, axis=0) > moves + 2 * off + rounding(largest)
+    quiet = jnp.all(far & (side == y0.armed)) & ~jnp.any(ticking)
+
+    def nothing():
+        due, jumped = jnp.zeros((problem.n_clocks + g,), bool), jnp.zeros((g,), bool)
+        arrival = Arrival(jnp.zeros_like(x1), y0.size, due, jumped, largest, window, span)
+        return Met(jnp.full_like(t1, jnp.inf), y0.armed, values[-1], arrival)
+
+    def something():
+        return _met(problem, dense, t0, t1, y0, x1, args, times, values, off, ticking)
+
+    return lax.cond(any_member(~quiet), something, nothing)
+
+
+def _met(problem, dense, t0, t1, y0: HybridState, x1, args, times, values, off, ticking) -> Met:
+    """What a step meets, given guards at the places where they are looked at."""
+    h, q, g = t1 - t0, y0.q, problem.n_guards
+    span = jnp.maximum(h, FORGOTTEN * y0.span)
+    window = jnp.maximum(WINDOW * span, problem.resolution)
     size = jnp.max(jnp.abs(values), axis=0)
     largest = jnp.maximum(size, y0.size)
     band = rounding(largest)
@@ -107,7 +131,7 @@ def looked_at(
         return (rate < 0) & (jnp.abs(last) <= jnp.maximum(-rate * window, rounded))
 
     def at_end():
-        before = slope()
+        before = problem.slope(t1, x1, q, args)
         return before, reaches_zero(problem.rates(t1, x1, q, args, before)[1])
 
     short = h <= 4 * problem.resolution
@@ -117,7 +141,6 @@ def looked_at(
         doubtful = jnp.any(armed[-1] & (last <= CLOSE * size)) | jnp.any(ticking) | short
         before, near = lax.cond(any_member(doubtful), at_end, lambda: (jnp.zeros_like(x1), jnp.zeros((g,), bool)))
     near = near & armed[-1]
-    off = jnp.max(jnp.abs(jnp.asarray(_OFF_PARABOLA, values.dtype) @ values), axis=0)
     bent = jnp.any(off > jnp.maximum(BEND * size, band))
     long = h > 1e3 * jnp.maximum(WINDOW * h, problem.resolution)
     bent = bent & long

@@ -1,12 +1,14 @@
 """What a model with events gives to the solver that watches over it."""
 
 import abc
+import dataclasses
 from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from .first_order import constant_once
@@ -65,7 +67,7 @@ class AbstractHybridProblem(eqx.Module):
     def due(self, ticks: Float[Array, " clocks"]) -> Float[Array, " clocks"]:
         """When each sampled event happens next, after so many ticks."""
         period, offset = self.clocks()
-        ticks = jax.lax.stop_gradient(ticks)
+        ticks = lax.stop_gradient(ticks)
         return offset + jnp.where(ticks == 0, 0.0, ticks * period)
 
     def slope(self, t: Any, x: Any, q: Any, args: Any) -> Float[Array, " n"]:
@@ -83,37 +85,78 @@ class AbstractHybridProblem(eqx.Module):
 
 
 class HybridState(eqx.Module):
-    """What is integrated: the state `x`, the discrete values `q`, and the bookkeeping of events.
+    """What is integrated: the state `x`, the discrete values `q`, and the bookkeeping of events, in few arrays: what
+    carries a state from step to step is written for each.
 
-    - `armed`: on which side of zero the guards are: `side.ABOVE`, `side.RESTS` or `side.BELOW`.
-    - `size`: how large the guards have been so far; `span`: how long the steps have been of late.
-    - `request`: where the step that was tried should have ended, or infinity.
+    - `armed`: on which side of zero the guards are: `side.ABOVE`, `side.RESTS` or `side.BELOW`; `size`: how large they
+        have been so far.
     - `ticks`, `due`: how often each clock has ticked, and when it does next.
+    - `span`: how long the steps have been of late; `request`: where the step that was tried should have ended, or
+        infinity.
+    - `ended`: 1.0 once an event has ended the run; `stuck`: the number of one that happens again and again at one
+        instant, else −1; `turns`: how often relations have turned without time going on.
     - `count`, `times`, `which`, `rate`: how many events there were, and of the first ones the time, the number of the
         event and how fast its guard fell.
     - `before`, `after`: (x, q) at the times of the first events, on both sides; no rows if they are not asked for.
-    - `ended`: 1.0 once an event has ended the run; `stuck`: the number of one that happens again and again at one
-        instant, else −1.
-    - `turns`: how often relations have turned without time going on.
     """
 
     x: Float[Array, " n"]
     q: Float[Array, " q"]
-    armed: Float[Array, " guards"]
-    size: Float[Array, " guards"]
-    span: Float[Array, ""]
-    request: Float[Array, ""]
-    ticks: Float[Array, " clocks"]
-    due: Float[Array, " clocks"]
-    count: Float[Array, ""]
-    times: Float[Array, " events"]
-    which: Float[Array, " events"]
-    rate: Float[Array, " events"]
-    ended: Float[Array, ""]
-    stuck: Float[Array, ""]
-    turns: Float[Array, ""]
-    before: Float[Array, "rows m"]
-    after: Float[Array, "rows m"]
+    of_guards: Float[Array, "2 guards"]
+    of_clocks: Float[Array, "2 clocks"]
+    of_run: Float[Array, "6"]
+    log: Float[Array, "3 events"]
+    sides: Float[Array, "2 rows m"]
+
+    @classmethod
+    def of(cls, x: Any, q: Any, **parts: Any) -> "HybridState":
+        """A state of all its parts."""
+        return cls(x, q, *(jnp.stack([parts[name] for name in names]) for names in _PARTS.values()))
+
+    def but(self, **changes: Any) -> "HybridState":
+        """The same with other parts."""
+        whole = {name: changes.pop(name) for name in ("x", "q") if name in changes}
+        for field, names in _PARTS.items():
+            if not changes.keys().isdisjoint(names):
+                parts = zip(names, getattr(self, field), strict=True)
+                whole[field] = jnp.stack([changes.pop(name, old) for name, old in parts])
+        assert not changes
+        return dataclasses.replace(self, **whole)
+
+    def noted(self, row: Any, time: Any, event: Any, rate: Any, before: Any, after: Any) -> "HybridState":
+        """The same with an event in a row of the log; nothing is if there is no such row."""
+        log, sides = self.log, self.sides
+        if log.shape[1]:
+            column = jnp.stack([time, event.astype(time.dtype), lax.stop_gradient(rate)])
+            log = log.at[:, row].set(column, mode="drop")
+        if sides.shape[1]:
+            sides = sides.at[:, row].set(jnp.stack([before, after]), mode="drop")
+        return dataclasses.replace(self, log=log, sides=sides)
+
+    armed = property(lambda self: self.of_guards[..., 0, :])
+    size = property(lambda self: self.of_guards[..., 1, :])
+    ticks = property(lambda self: self.of_clocks[..., 0, :])
+    due = property(lambda self: self.of_clocks[..., 1, :])
+    span = property(lambda self: self.of_run[..., 0])
+    request = property(lambda self: self.of_run[..., 1])
+    ended = property(lambda self: self.of_run[..., 2])
+    stuck = property(lambda self: self.of_run[..., 3])
+    turns = property(lambda self: self.of_run[..., 4])
+    count = property(lambda self: self.of_run[..., 5])
+    times = property(lambda self: self.log[..., 0, :])
+    which = property(lambda self: self.log[..., 1, :])
+    rate = property(lambda self: self.log[..., 2, :])
+    before = property(lambda self: self.sides[..., 0, :, :])
+    after = property(lambda self: self.sides[..., 1, :, :])
+
+
+_PARTS = {
+    "of_guards": ("armed", "size"),
+    "of_clocks": ("ticks", "due"),
+    "of_run": ("span", "request", "ended", "stuck", "turns", "count"),
+    "log": ("times", "which", "rate"),
+    "sides": ("before", "after"),
+}
 
 
 def one_hot(index: Any, n: int) -> Bool[Array, " n"]:

@@ -37,11 +37,11 @@ class HybridInterpolation(diffrax.AbstractLocalInterpolation):
     def evaluate(self, t0, t1=None, left=True):
         if t1 is not None:
             return jax.tree.map(jnp.subtract, self.evaluate(t1), self.evaluate(t0))
-        before = eqx.tree_at(lambda y: y.x, self.y0, self.inner(self.t0, self.t1, t0))
         # Times within rounding of the event are those of the event; one that moves goes along the solution after it.
         at_end = self.fired & (t0 >= self.t1 - self.resolution)
-        after = eqx.tree_at(lambda y: y.x, self.y1, self.y1.x + self.slope * (t0 - lax.stop_gradient(self.t1)))
-        return jax.tree.map(lambda a, b: jnp.where(at_end, a, b), after, before)
+        after = self.y1.x + self.slope * (t0 - lax.stop_gradient(self.t1))
+        x = jnp.where(at_end, after, self.inner(self.t0, self.t1, t0))
+        return self.y1.but(x=x, q=jnp.where(at_end, self.y1.q, self.y0.q))
 
 
 class _Dense(eqx.Module):
@@ -120,8 +120,7 @@ class WithEvents(diffrax.AbstractWrappedSolver):
         dense = _Dense(solver.interpolation_cls, info)
         request, armed, values, arrival = looked_at(problem, dense, t0, t1, y0, x1, args)
         turns = jnp.where(t1 - t0 > MOVED * problem.resolution, jnp.zeros_like(y0.turns), y0.turns)
-        changed = x1, armed, arrival.size, arrival.span, jnp.full_like(t1, jnp.inf), turns
-        state = eqx.tree_at(lambda y: (y.x, y.armed, y.size, y.span, y.request, y.turns), y0, changed)
+        state = y0.but(x=x1, armed=armed, size=arrival.size, span=arrival.span, request=request, turns=turns)
         fired = jnp.any(arrival.due)
 
         def events(state):
@@ -133,7 +132,6 @@ class WithEvents(diffrax.AbstractWrappedSolver):
             y1, slope = lax.cond(any_member(fired), events, lambda state: (state, jnp.zeros_like(x1)), state)
             y1 = jax.tree.map(lambda a, b: jnp.where(fired, a, b), y1, state)
         dense_info = dict(inner=dense, y0=y0, y1=y1, fired=fired, slope=slope, resolution=problem.resolution)
-        y1 = eqx.tree_at(lambda y: y.request, y1, request)
         finite = jnp.all(jnp.isfinite(y1.x)) & jnp.all(jnp.isfinite(y1.q))
         result = diffrax.RESULTS.where(fired & ~finite & jnp.all(jnp.isfinite(x1)), NOT_FINITE, result)
         result = diffrax.RESULTS.where(y1.count > self.max_events, TOO_MANY, result)

@@ -38,10 +38,10 @@ def start(
     if g:
         armed = jnp.where(holding, BELOW, jnp.where(value == 0, RESTS, ABOVE)).astype(dtype)
     rows = jnp.full((logged if sides else 0, len(x0) + len(q0)), jnp.nan, dtype)
-    state = HybridState(
-        x0, q0, armed, size, nothing, jnp.asarray(jnp.inf, dtype), ticks, lax.stop_gradient(problem.due(ticks)),
-        nothing, infinite, jnp.full_like(infinite, -1.0), jnp.zeros_like(infinite), nothing, nothing - 1.0, nothing,
-        rows, rows,
+    state = HybridState.of(
+        x0, q0, armed=armed, size=size, ticks=ticks, due=lax.stop_gradient(problem.due(ticks)), span=nothing,
+        request=jnp.full_like(t0, jnp.inf), ended=nothing, stuck=nothing - 1.0, turns=nothing, count=nothing,
+        times=infinite, which=jnp.full_like(infinite, -1.0), rate=jnp.zeros_like(infinite), before=rows, after=rows,
     )  # fmt: skip
     at_once = np.array(problem.immediate[c:], bool) & ~relations[c:]
     if relations[:c].all() and not at_once.any():
@@ -68,11 +68,17 @@ def _settled(problem: AbstractHybridProblem, t0: Any, x0: Any, q0: Any, due: Any
     def written(q: Any, clocks: Any, holding: Any) -> Any:
         return problem.settled(t0, x0, q, jnp.concatenate([clocks, holding]) & relations, args)
 
+    def looked_at(q: Any) -> tuple[Any, Any]:
+        if problem.only_kinks:  # which of two that are opposite holds at zero does not matter
+            first = np.arange(g) < np.array(problem.opposite)
+            return problem.guards(t0, x0, q, args), jnp.where(first, -1.0, 1.0).astype(x0.dtype)
+        return problem.rates(t0, x0, q, args, problem.slope(t0, x0, q, args))
+
     def once(k: Any, carry: Any) -> Any:
         """Relations as they were found before, and what guards are with them."""
         q, rate, value = carry
         q = jnp.where(k > 0, written(q, jnp.zeros((c,), bool), _holds(value, rate)), q)
-        value, rate = problem.rates(t0, x0, q, args, problem.slope(t0, x0, q, args))
+        value, rate = looked_at(q)
         return q, rate, value
 
     found, none = begin, jnp.zeros((g,), bool)

@@ -41,6 +41,11 @@ class EventPlan:
         """What the user wrote, for every event."""
         return self.table.text
 
+    @property
+    def are_listed(self) -> bool:
+        """Whether any of them is listed."""
+        return any(self.table.noted[self.n_clocks :]) or any(message is not None for message in self.table.message)
+
     def __len__(self) -> int:
         return len(self.table)
 

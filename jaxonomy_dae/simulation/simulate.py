@@ -91,7 +91,8 @@ def simulate(
     - `max_steps`: bounds the steps taken, beside those that end at samples; with `ts=None` as many rows are reserved.
     - `max_events`: bounds the events of conditions; `solution.events` has room for as many. None: 12,800 of them, and
         as much room as is needed outside jit, grad and vmap, where a run with more than 100 is made again with room for
-        twice as many, four times, and so on; inside, the first 100 are listed.
+        twice as many, four times, and so on; inside, the first 100 are listed. Relations in
+        equations are not.
     - `save_events`: whether `solution.events` also has variables before and after events; None: outside jit, and if
         they take little room.
     - `progress`: shows a progress bar.
@@ -139,7 +140,9 @@ def simulate(
     sides_possible = not _is_traced((given, adjoint, stepsize_controller))
 
     def options(solver: Any, room: int = ROOM) -> Options:
-        room = room if max_events is None else max_events
+        events = system.plan.events
+        listed = room if max_events is None else max_events
+        room = listed if events is not None and events.are_listed else 0
         few = room * (system.plan.n_state + len(system.discretes)) <= FEW_NUMBERS
         sides = few and sides_possible if save_events is None else save_events
         control = stepsize_controller

@@ -39,12 +39,9 @@ class Tsit5(diffrax.Tsit5):
         tableau = self.tableau
         control = terms.contr(t0, t1)
         slope, count = solver_state  # pyright: ignore[reportGeneralTypeIssues]
-        if made_jump is not False:
-            slope = jax.lax.cond(made_jump, lambda _: terms.vf(t0, y0, args), lambda s: s, slope)
-        first = terms.prod(slope, control)
         looped = is_large(lambda t, y: terms.vf(t, y, args), t0, y0) if self.looped is None else self.looped
         stages = self._looped if looped else self._written_out
-        before, y1, slope, k = stages(terms, t0, t1, y0, args, control, first)
+        before, y1, slope, k = stages(terms, t0, t1, y0, args, control, slope, made_jump)
         y_error = _combine(tableau.b_error, k)
         result = diffrax.RESULTS.successful
         if self.watch is not None:
@@ -52,35 +49,45 @@ class Tsit5(diffrax.Tsit5):
             result = self.watch.result(count)
         return y1, y_error, dict(y0=y0, y1=y1, k=jnp.stack(k)), (slope, count), result
 
-    def _written_out(self, terms, t0, t1, y0, args, control, first):
-        """The points of the last two stages, the last slope, and all increments."""
+    def _written_out(self, terms, t0, t1, y0, args, control, slope, made_jump):
+        """The points of the last two stages, the last slope, and all increments; `slope` is that of the step before."""
         tableau = self.tableau
-        k, points, slope = [first], [y0], None
+        if made_jump is not False:
+            slope = jax.lax.cond(made_jump, lambda _: terms.vf(t0, y0, args), lambda s: s, slope)
+        k, points = [terms.prod(slope, control)], [y0]
         for a, c in zip(tableau.a_lower, tableau.c, strict=True):
             points.append(y0 + _combine(a, k))
             slope = terms.vf(t0 + float(c) * (t1 - t0), points[-1], args)
             k.append(terms.prod(slope, control))
         return points[-2], points[-1], slope, k
 
-    def _looped(self, terms, t0, t1, y0, args, control, first):
-        """The same."""
+    def _looped(self, terms, t0, t1, y0, args, control, slope, made_jump):
+        """The same. After a jump, the loop begins one stage earlier: XLA compiles the field once."""
         tableau = self.tableau
-        n = len(tableau.c)
-        weights = np.zeros((n, n + 1))
-        for row, a in zip(weights, tableau.a_lower, strict=True):
+        n, last = len(tableau.c), slope
+        weights = np.zeros((n + 1, n + 1))
+        for row, a in zip(weights[1:], tableau.a_lower, strict=True):
             row[: len(a)] = a
+        nodes = np.concatenate([[0.0], tableau.c])
 
         def stage(carry, here):
             k, _, _ = carry
             row, c, i = here
             y = y0 + jnp.tensordot(row, k, 1)
-            slope = terms.vf(t0 + c * (t1 - t0), y, args)
+
+            def field():
+                return terms.vf(t0 + c * (t1 - t0), y, args)
+
+            slope = field() if made_jump is False else jax.lax.cond((i > 0) | made_jump, field, lambda: last)
             return (k.at[i].set(terms.prod(slope, control)), y, slope), None
 
-        nodes = jnp.asarray(tableau.c, jnp.asarray(t1 - t0).dtype)
-        given = jnp.asarray(weights, y0.dtype), nodes, np.arange(1, n + 1)
-        k = jnp.zeros((n + 1, *y0.shape), y0.dtype).at[0].set(first)
-        (k, y1, slope), _ = jax.lax.scan(stage, (k, y0, jnp.zeros_like(first)), given)
+        first = 1 if made_jump is False else 0
+        rows = jnp.asarray(weights, y0.dtype), jnp.asarray(nodes, jnp.asarray(t1 - t0).dtype), np.arange(n + 1)
+        k = jnp.zeros((n + 1, *y0.shape), y0.dtype)
+        if made_jump is False:
+            k = k.at[0].set(terms.prod(slope, control))
+        given = jax.tree.map(lambda v: v[first:], rows)
+        (k, y1, slope), _ = jax.lax.scan(stage, (k, y0, jnp.zeros_like(slope)), given)
         before = y0 + jnp.tensordot(jnp.asarray(weights[-2], y0.dtype), k, 1)
         return before, y1, slope, list(k)
 

@@ -250,7 +250,9 @@ class AcausalSystem(eqx.Module):
         if events is None or not len(events.discrete):
             return self
         n, chosen = events.n_visible, events.discrete[: events.n_visible]
-        array = complete(events.dependents, self.parameters.array.at[chosen].set(values[:n]))
+        array = self.parameters.array
+        if n:
+            array = complete(events.dependents, array.at[chosen].set(values[:n]))
         # A start that is an expression holds at the start alone.
         parameters = Parameters(array, None, (), self.parameters.table.given(chosen))
         return AcausalSystem(parameters, self.neural, self.plan, values[n:])
