@@ -191,9 +191,7 @@ def _is_rounding(graph: Node, label: Hashable, values: np.ndarray, kept: np.ndar
     return number(slope) == 0 or bool(says.any() and (np.abs(value) <= bound)[says].all())
 
 
-def _far_points(
-    labels: Sequence[Hashable], values: np.ndarray, kept: np.ndarray, of_parameters: bool
-) -> list[np.ndarray]:
+def _far_points(labels: Sequence[Any], values: np.ndarray, kept: np.ndarray, of_parameters: bool) -> list[np.ndarray]:
     """Values of quantities of all sizes and signs, FAR of each; and of parameters, those given or, with
     `of_parameters`, others, but for those in `kept`."""
     rng = np.random.default_rng(0)

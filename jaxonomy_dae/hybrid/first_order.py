@@ -30,8 +30,25 @@ def _(primals, tangents):
 
 
 @jax.custom_jvp
+def differentiable_once(value):
+    """The same array, with its first derivatives; whoever differentiates these again is told that they cannot."""
+    return value
+
+
+@differentiable_once.defjvp
+def _(primals, tangents):
+    (value,), (tangent,) = primals, tangents
+    return differentiable_once(value), tangent * _one(value)
+
+
+@jax.custom_jvp
 def _not_again(value):
     return value
+
+
+@jax.custom_jvp
+def _one(value):
+    return jnp.ones_like(value)
 
 
 def _refused(primals, tangents):
@@ -44,4 +61,9 @@ def _refused(primals, tangents):
     return value, jnp.zeros_like(value)
 
 
+def _refused_one(primals, tangents):
+    return _refused((jnp.ones_like(primals[0]),), tangents)
+
+
 _not_again.defjvp(_refused, symbolic_zeros=True)
+_one.defjvp(_refused_one, symbolic_zeros=True)

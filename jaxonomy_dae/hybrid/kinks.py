@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .event_map import SLIDES, TURNS
+from .first_order import differentiable_once
 from .problem import AbstractHybridProblem, HybridState
 from .side import ABOVE, BELOW, RESTS, rounding
 
@@ -27,4 +28,5 @@ def turned(problem: AbstractHybridProblem, t: Any, state: HybridState, values: A
     turns = state.turns + jnp.sum(due).astype(state.turns.dtype)
     slides = jnp.any(due) & (turns > SLIDES + TURNS * len(opposite))
     stuck = jnp.where(slides, problem.n_clocks + jnp.argmax(due), -1).astype(state.stuck.dtype)
-    return state.but(q=q, armed=armed, turns=turns, stuck=stuck)
+    # The time at which it turns moves, which second derivatives would see.
+    return state.but(x=differentiable_once(state.x), q=q, armed=armed, turns=turns, stuck=stuck)
