@@ -213,8 +213,9 @@ def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, dela
     slow = (jnp.abs(earlier - slope) <= STEADY * jnp.abs(slope)).astype(x.dtype)
     (value, at_arrival, _, _), (rate, rate_there, _, rate_ahead) = values, rates
     reached = at_arrival <= jnp.maximum(band, within(rate_there))
-    # What was to happen is at zero if it is not farther from it than it was when the instant began.
-    zero = is_zero(value, rate) | (left[c:] & reached & (jnp.abs(value) <= jnp.abs(at_arrival)))
+    # What was to happen is at zero if it is not farther from it than it was when the instant began; unless it jumped.
+    arrived = left[c:] & ~instant.caused & reached
+    zero = is_zero(value, rate) | (arrived & (jnp.abs(value) <= jnp.abs(at_arrival)))
     # A force that keeps a contact closed leaves a guard of the open contact at zero without a slope: what it does next
     # decides. One that seems to fall by rounding alone is waited for: if it does fall, the next step finds it.
     flat = is_flat(value, rate)
@@ -224,7 +225,7 @@ def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, dela
     # What this event made true happens next. What was to happen does so, though a state starts anew: unless what was
     # assigned makes its condition false, or it is revocable and undone.
     stands = left[c:] & ~np.array(problem.revocable[c:], bool) & reached
-    caused = ((was_armed & true) | stands) & ~zero
+    caused = (((was_armed | (left[c:] & instant.caused)) & true) | stands) & ~zero
     next_ones = ((was_armed | left[c:]) & true & ~here) | stands
     side = jnp.where(zero, jnp.where(was_armed | (falling * arrival.span > band), RESTS, BELOW), ABOVE)
     side = jnp.where(true, jnp.where(next_ones, ABOVE, BELOW), side)

@@ -48,7 +48,8 @@ def start(
         return state
     due_conditions = holding & at_once
     due = jnp.concatenate([state.due <= t0 + tolerance, due_conditions])
-    arrival = Arrival(jnp.zeros_like(x0), rate, due, jnp.zeros((g,), bool), size, tolerance, tolerance)
+    # What holds at the start need not be near zero.
+    arrival = Arrival(jnp.zeros_like(x0), rate, due, due_conditions, size, tolerance, tolerance)
     return handle(problem, t0, state, arrival, args, at_start=True)[0]
 
 

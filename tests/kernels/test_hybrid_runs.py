@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from affine_events import CLOCKS, MAX_EVENTS, STATES, Event, Relation, affine, run
+from affine_events import CLOCKS, GUARDS, MAX_EVENTS, RELATION, STATES, Affine, Event, Relation, affine, run
 from hybrid_references import (
     BOUNCES,
     HEAVY,
@@ -26,6 +26,7 @@ from hybrid_references import (
 
 from jaxonomy_dae.hybrid.control import ENDED
 from jaxonomy_dae.hybrid.solver import NOT_FINITE, STUCK, TOO_MANY
+from jaxonomy_dae.hybrid.start import start
 from jaxonomy_dae.solvers import StoredAdjoint
 
 SAVED = 60
@@ -225,6 +226,19 @@ def slope(name, event, target, factor):
 
 
 @pytest.mark.long("the gradient that all problems share is compiled")
+def test_what_holds_at_the_start_happens_unless_undone():
+    """Three conditions hold at the start. The first event leaves the second one's true, though its guard does not fall,
+    and makes the third one's false: of two diodes of a bridge, one did not conduct."""
+    events = [Event({"a": {"1": 1.0}}, {"1": -3.0}), Event({"b": {"1": 1.0}}, {"1": -3.0, "a": -3.0}),
+              Event({"c": {"1": 1.0}}, {"1": -3.0, "a": 6.0})]  # fmt: skip
+    numbers, _ = affine({"x": {}}, events, discrete={"a": 0.0, "b": 0.0, "c": 0.0})
+    numbers = jax.tree.map(jnp.asarray, numbers)
+    everything = (False,) * CLOCKS + (True,) * RELATION + (False,) * (GUARDS - RELATION)
+    problem = Affine(numbers, 1e-14, immediate=everything, revocable=everything)
+    begun = jax.jit(lambda x, q: start(problem, jnp.zeros(()), x, q, None, 0, False))(numbers.x, numbers.q)
+    assert begun.q[:3].tolist() == [1.0, 1.0, 0.0] and begun.stuck == -1
+
+
 def test_a_ball():
     ran, by, _ = found("ball")
     assert ran.result == OKAY and ran.count == 6
