@@ -136,6 +136,8 @@ class Affine(AbstractHybridProblem):
     )
     revocable: tuple[bool, ...] = eqx.field(static=True, default=tuple(k >= CLOCKS + RELATION for k in range(EVENTS)))
     relations: tuple[bool, ...] = eqx.field(static=True, default=tuple(k >= CLOCKS + RELATION for k in range(EVENTS)))
+    choices: tuple[int, ...] = eqx.field(static=True, default=())
+    choice_guards: tuple[int, ...] = eqx.field(static=True, default=())
     only_kinks: bool = eqx.field(static=True, default=False)
     opposite: tuple[int, ...] = eqx.field(static=True, default=(-1,) * RELATION + (RELATION + 1, RELATION))
 

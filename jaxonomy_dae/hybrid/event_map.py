@@ -10,6 +10,7 @@ second derivative is not that of the flow, and is refused. A clock ticks at τ =
 parameters, in the same manner.
 """
 
+import itertools
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -37,6 +38,7 @@ AHEAD = 1e-3
 SINKING = 4.0
 # How often relations may turn while time does not go on, beside so often for each. Beyond, they turn back and forth.
 SLIDES, TURNS = 64, 4
+ALTERNATIVES = 128  # modes that are tried where equations are singular: one of 127 diodes, or any two of 15
 
 
 class Instant(eqx.Module):
@@ -116,7 +118,7 @@ def handle(
         row = jnp.where(logged, state.count.astype(int), state.times.shape[0] + 1)
         moved = jnp.any(x != reached) & ~relations[event]
         approach = jnp.where(instant.caused[k] | at_start, 0.0, rate) if g else rate
-        after, slow, armed, left, caused, stuck = _following(
+        new, after, slow, armed, left, caused, stuck = _following(
             problem, t, x, new, instant, event, arrival, delay, moved, approach, args
         )
         turns = state.turns + relations[event].astype(t.dtype)
@@ -163,15 +165,20 @@ def handle(
 
 
 def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, delay, moved, approach, args):
-    """(dx/dt, in which states it hardly changes during the delay, armed guards, events left, which guards an event made
-    true, which are stuck) after an event, not differentiated.
+    """(q, dx/dt, in which states it hardly changes during the delay, armed guards, events left, which guards an event
+    made true, which are stuck) after an event, not differentiated but for q.
+
+    Where the equations are singular with q, as where a switch closes onto a diode that conducts, modes that are chosen
+    by their conditions change along with it: to the first ones of `_alternatives` that hold.
 
     `moved` says whether it wrote states, `approach` how fast its guard fell before, or zero.
     """
     c, g = problem.n_clocks, problem.n_guards
     left = instant.left & ~one_hot(event, c + g)
     if not g:
-        return problem.slope(t, x, q, args), jnp.ones_like(x), instant.state.armed, left, instant.caused, instant.stuck
+        slope = problem.slope(t, x, q, args)
+        return q, slope, jnp.ones_like(x), instant.state.armed, left, instant.caused, instant.stuck
+    written_q = q
     problem, t, x, q, delay, args = still(constant_once((problem, t, x, q, delay, args)))
     instant = still(instant)
     here = event - c == jnp.arange(g)
@@ -191,25 +198,39 @@ def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, dela
         """Whether its rate may not take it out of the band: it is too small for that, or was too small before."""
         return is_zero(value, rate) & ((jnp.abs(rate) * ahead <= band) | rested)
 
+    others = jnp.asarray(_alternatives(problem.choices, len(q)))
+    conditions = np.array(problem.choice_guards, int)
+
+    def in_mode(m):
+        return jnp.where(others[m], 1.0 - q, q)
+
     # Slopes, guards and their rates after the event, with what was before it, before the delay, and, where a guard is
     # flat, a little ahead: in a loop, for XLA compiles the equations as often as they are written.
     def look(carry):
-        k, slopes, values, rates = carry
-        slope = slopes[0]
+        k, m, slopes, values, rates = carry
+        slope, now = slopes[0], in_mode(m)
         places = jnp.stack([x, instant.arrived, x - slope * delay, x + slope * ahead])
         time = t + jnp.stack([delay, jnp.zeros_like(t), jnp.zeros_like(t), ahead])[k]
-        own = problem.slope(time, places[k], q, args)
+        own = problem.slope(time, places[k], now, args)
         slopes = written(slopes, k, own)
-        value, rate = problem.rates(time, places[k], q, args, jnp.where((k == 0) | (k == 3), own, slope))
-        return k + 1, slopes, written(values, k, value), written(rates, k, rate)
+        value, rate = problem.rates(time, places[k], now, args, jnp.where((k == 0) | (k == 3), own, slope))
+        carry = slopes, written(values, k, value), written(rates, k, rate)
+        if not problem.choices:
+            return k + 1, m, *carry
+        held = (value >= 0) | is_zero(value, rate)
+        holds = jnp.all(jnp.isfinite(own)) & jnp.all(jnp.isfinite(value)) & ((m == 0) | jnp.all(held[conditions]))
+        goes_on = holds | (k > 0) | (m == len(others) - 1)
+        return k + goes_on, m + ~goes_on, *carry
 
     def unfinished(carry):
-        k, _, values, rates = carry
+        k, _, _, values, rates = carry
         return (k < 3) | ((k == 3) & jnp.any(is_flat(values[0], rates[0])))
 
-    rows = jnp.zeros((4, g), x.dtype)
-    begin = jnp.array(0), jnp.zeros((4, *x.shape), x.dtype), rows, rows
-    _, (slope, _, earlier, _), values, rates = lax.while_loop(unfinished, look, begin)
+    rows, none = jnp.zeros((4, g), x.dtype), jnp.array(0)
+    begin = none, none, jnp.zeros((4, *x.shape), x.dtype), rows, rows
+    _, mode, (slope, _, earlier, _), values, rates = lax.while_loop(unfinished, look, begin)
+    if problem.choices:
+        written_q = jnp.where(others[mode], 1.0 - q, written_q)
     slow = (jnp.abs(earlier - slope) <= STEADY * jnp.abs(slope)).astype(x.dtype)
     (value, at_arrival, _, _), (rate, rate_there, _, rate_ahead) = values, rates
     reached = at_arrival <= jnp.maximum(band, within(rate_there))
@@ -227,7 +248,8 @@ def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, dela
     stands = left[c:] & ~np.array(problem.revocable[c:], bool) & reached
     caused = (((was_armed | (left[c:] & instant.caused)) & true) | stands) & ~zero
     next_ones = ((was_armed | left[c:]) & true & ~here) | stands
-    side = jnp.where(zero, jnp.where(was_armed | (falling * arrival.span > band), RESTS, BELOW), ABOVE)
+    rests = was_armed | left[c:] | (falling * arrival.span > band)  # what was undone may happen later
+    side = jnp.where(zero, jnp.where(rests, RESTS, BELOW), ABOVE)
     side = jnp.where(true, jnp.where(next_ones, ABOVE, BELOW), side)
     # The guard of the event itself, if it is left at zero: by how much of its speed it falls on, or has turned. Less
     # than the root of eps has stopped it: a speed beside others of which it is the difference has no more digits.
@@ -242,4 +264,14 @@ def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, dela
     held = flat & (pull > 0) & (rise**2 <= 4 * pull * band) & sinks  # it would rise to twice the band
     stuck = ((here & moved & (side == RESTS)) | instant.stuck) & held
     side = side.astype(instant.state.armed.dtype)
-    return slope, slow, side, jnp.concatenate([left[:c], next_ones]), caused, stuck
+    return written_q, slope, slow, side, jnp.concatenate([left[:c], next_ones]), caused, stuck
+
+
+def _alternatives(choices: tuple[int, ...], n: int) -> np.ndarray:
+    """Which of `n` discrete values change, shape (modes, n): first none, then one of the choices, then two; at last
+    none again, which stands for what has not been found."""
+    sets = [(), *((k,) for k in choices), *itertools.combinations(choices, 2)][:ALTERNATIVES]
+    rows = np.zeros((len(sets) + 1, n), bool)
+    for row, chosen in zip(rows, sets, strict=False):
+        row[list(chosen)] = True
+    return rows

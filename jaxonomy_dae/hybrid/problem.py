@@ -29,6 +29,8 @@ class AbstractHybridProblem(eqx.Module):
     revocable: eqx.AbstractVar[tuple[bool, ...]]  # which another event may undo before they happen
     relations: eqx.AbstractVar[tuple[bool, ...]]  # which say what a relation is, from the initial time on
     opposite: eqx.AbstractVar[tuple[int, ...]]  # of each guard: the one that falls where its relation turns back, or −1
+    choices: eqx.AbstractVar[tuple[int, ...]]  # discrete values, 0 or 1, that their conditions choose, …
+    choice_guards: eqx.AbstractVar[tuple[int, ...]]  # … which hold while these guards are not negative
     only_kinks: eqx.AbstractVar[bool]  # whether all events are relations at which dx/dt and guards do not jump
     resolution: eqx.AbstractVar[Any]  # a time that is nothing beside the run, but more than rounding
 

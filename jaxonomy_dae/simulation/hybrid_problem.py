@@ -40,6 +40,8 @@ class SystemProblem(AbstractHybridProblem):
     revocable: tuple[bool, ...] = eqx.field(static=True)
     relations: tuple[bool, ...] = eqx.field(static=True)
     opposite: tuple[int, ...] = eqx.field(static=True)
+    choices: tuple[int, ...] = eqx.field(static=True)
+    choice_guards: tuple[int, ...] = eqx.field(static=True)
     only_kinks: bool = eqx.field(static=True)
 
     def term(self, q):
@@ -144,6 +146,7 @@ def problem_for(
     largest = jax.lax.stop_gradient(jnp.maximum(jnp.maximum(jnp.abs(t0), jnp.abs(t1)), t1 - t0))
     events: Any = system.plan.events
     ends = tuple(message is not None for message in events.table.message)
+    choices, choice_guards = ((), ()) if system.plan.held is not None else _choices(events.table, events.n_clocks)
     return SystemProblem(
         system=system, watch=watch, tolerance=tolerance, implicit=implicit,
         resolution=RESOLUTION * jnp.finfo(t1.dtype).eps * largest,
@@ -152,8 +155,17 @@ def problem_for(
         revocable=events.table.revocable,
         relations=events.table.relation,
         opposite=_opposite(events.table, events.n_clocks),
+        choices=choices,
+        choice_guards=choice_guards,
         only_kinks=events.only_kinks,
     )  # fmt: skip
+
+
+def _choices(table: EventTable, n_clocks: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """The discrete values that `complementary` chooses, and the guards that do so."""
+    chooses = np.array(table.revocable, bool) & ~np.array(table.relation, bool)
+    rows = chooses[table.event] & (table.discrete >= 0) & (table.event >= n_clocks)
+    return tuple(np.unique(table.discrete[rows]).tolist()), tuple(np.unique(table.event[rows] - n_clocks).tolist())
 
 
 def _opposite(table: EventTable, n_clocks: int) -> tuple[int, ...]:
