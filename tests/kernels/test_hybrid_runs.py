@@ -227,7 +227,6 @@ def slope(name, event, target, factor):
     return found(name)[1].writes[numbers.place(names, event, target, factor)]
 
 
-@pytest.mark.long("the gradient that all problems share is compiled")
 @eqx.filter_jit
 def begun(numbers):
     """The state after the initial time, where all conditions happen that hold there and are not undone."""
@@ -255,6 +254,7 @@ def test_what_is_undone_at_zero_may_happen_later():
     assert state.q[:2].tolist() == [1.0, 0.0] and state.armed[1] == RESTS
 
 
+@pytest.mark.long("the gradient that all problems share is compiled")
 def test_a_ball():
     ran, by, _ = found("ball")
     assert ran.result == OKAY and ran.count == 6
