@@ -8,6 +8,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from .event_map import SLIDES, TURNS
 from .first_order import differentiable_once
@@ -16,17 +17,27 @@ from .side import ABOVE, BELOW, RESTS, rounding
 
 
 def turned(problem: AbstractHybridProblem, t: Any, state: HybridState, values: Any, due: Any, args: Any) -> HybridState:
-    """The state after the relations that are `due` have turned, at guards with these values.
+    """The state after the events that are `due`, at guards with these values: clocks tick, relations have turned.
 
     The guard of a relation falls, and the one of its opposite is armed: it rises, or rests at zero.
     """
-    opposite = np.array(problem.opposite)
+    opposite, c = np.array(problem.opposite, int), problem.n_clocks
+    ticks = state.ticks + due[:c].astype(state.ticks.dtype)
+    q = problem.settled(t, state.x, state.q, due, args)
+    events, due = due, due[c:]
     risen = jnp.where(-values > rounding(state.size), ABOVE, RESTS)
     armed = jnp.where(due[opposite], risen[opposite], state.armed)
     armed = jnp.where(due, BELOW, armed).astype(state.armed.dtype)
-    q = problem.settled(t, state.x, state.q, due, args)
     turns = state.turns + jnp.sum(due).astype(state.turns.dtype)
     slides = jnp.any(due) & (turns > SLIDES + TURNS * len(opposite))
-    stuck = jnp.where(slides, problem.n_clocks + jnp.argmax(due), -1).astype(state.stuck.dtype)
+    stuck = jnp.where(slides, jnp.argmax(events), -1).astype(state.stuck.dtype)
     # The time at which it turns moves, which second derivatives would see.
-    return state.but(x=differentiable_once(state.x), q=q, armed=armed, turns=turns, stuck=stuck)
+    return state.but(
+        x=differentiable_once(state.x),
+        q=q,
+        armed=armed,
+        ticks=ticks,
+        due=lax.stop_gradient(problem.due(ticks)),
+        turns=turns,
+        stuck=stuck,
+    )

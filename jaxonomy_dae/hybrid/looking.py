@@ -78,9 +78,9 @@ def looked_at(
 
     if not g:
         none = jnp.zeros((0,), bool)
-        before = lax.cond(
-            any_member(jnp.any(ticking)), lambda: problem.slope(t1, x1, q, args), lambda: jnp.zeros_like(x1)
-        )
+        before = jnp.zeros_like(x1)
+        if not problem.only_kinks:
+            before = lax.cond(any_member(jnp.any(ticking)), lambda: problem.slope(t1, x1, q, args), lambda: before)
         arrival = Arrival(before, y0.size, ticking, none, y0.size, window, span)
         return Met(jnp.full_like(t1, jnp.inf), y0.armed, y0.size, arrival)
 

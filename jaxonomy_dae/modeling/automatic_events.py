@@ -77,11 +77,13 @@ class Stepping:
 
 @dataclasses.dataclass(frozen=True)
 class Timed:
-    """A relation that turns at times known beforehand; the hidden discrete variable `number` is what it is."""
+    """A relation that turns at times known beforehand; the hidden discrete variable `number` is what it is. It is a
+    `kink` as those of `Turning`."""
 
     number: int
     condition: Any
     edges: Edges
+    kink: bool = False
 
     @property
     def starts(self) -> tuple[float, ...]:
@@ -181,6 +183,7 @@ class _Rewriting:
         self.conditions: dict[Any, Any] = {}
         self.found: list[tuple[type, int, Any, list[Any]]] = []  # the last: where it stands
         self.places: dict[Any, list[Any]] = {}  # of a condition, the same list
+        self.timed_places: dict[Any, list[list[Any]]] = {}  # of a relation of time, of all conditions that it is in
 
     def done(self) -> tuple[tuple[sympy.Expr, ...], tuple[Watched, ...]]:
         for e in self.order:
@@ -188,7 +191,11 @@ class _Rewriting:
             self.old[self.new[e]] = e
 
         watched = tuple(self._watched(*each) for each in self.found)
-        timed = (*self.numbers.timed.values(), *self.timed_steps)
+        turning = (
+            dataclasses.replace(each, kink=all(_is_continuous(e) for places in self.timed_places[r] for e in places))
+            for r, each in self.numbers.timed.items()
+        )
+        timed = (*turning, *self.timed_steps)
         in_order = tuple(sorted((*watched, *timed), key=lambda w: w.number))
         return tuple(self.new.get(r, r) for r in self.residuals), in_order
 
@@ -246,6 +253,8 @@ class _Rewriting:
     def _turning(self, places: list[Any], condition: Any) -> Any:
         """A condition as discrete variables."""
         live, guarded = self.numbers.split(self._as_written(condition))
+        for r in relations_in(in_relations_of_time(self._as_written(condition))):
+            self.timed_places.setdefault(r, []).append(places)
         if not is_watched(guarded):
             return live
         # What is known of time is so in the guard; equations that are looked at outside of runs have all as it is.
@@ -396,7 +405,11 @@ def _is_continuous(e: Any) -> bool:
     if isinstance(e, sympy.Max | sympy.Min | sympy.Abs):
         return True
     parts = _two_branches(e)
-    return parts is not None and _vanish_on(parts[2], lambda _: (parts[0] - parts[1],))
+    if parts is None:
+        return False
+    clock = {s: sympy.Dummy() for s in symbols_of(parts[2]) if isinstance(s, TimeSymbol)}  # to be solved for
+    one, other, where = (part.xreplace(clock) for part in parts)
+    return _vanish_on(where, lambda _: (one - other,))
 
 
 def _meet_smoothly(difference: Any, surface: Any) -> bool:
@@ -406,7 +419,7 @@ def _meet_smoothly(difference: Any, surface: Any) -> bool:
 
 def _vanish_on(surface: Any, expressions_in: Callable[[Any], tuple[Any, ...]]) -> bool:
     """Whether expressions vanish where a surface does, in a variable that says where this is; False if none does."""
-    for v in sorted((s for s in symbols_of(surface) if isinstance(s, VariableSymbol)), key=str):
+    for v in sorted((s for s in symbols_of(surface) if isinstance(s, VariableSymbol | sympy.Dummy)), key=str):
         slope = sympy.diff(surface, v)
         if slope.is_number and slope.is_nonzero:
             place = {v: v - surface / slope}

@@ -79,7 +79,7 @@ class RelationDeclarations(EventDeclarations):
         as_it_is = sympy.Piecewise((1, condition), (0, True))
         for clock, after in edges.clocks:
             value = _unless(sympy.Or(unknown, sympy.Not(edges.turns)), as_it_is, after)
-            self._relation_clock(clock, shortened(condition), Assign(known, value))
+            self._relation_clock(clock, shortened(condition), Assign(known, value), kink=relation.kink)
 
     def _ticks_of_steps(self, whole: TimedSteps) -> None:
         """Clocks of a whole part of time, which is halfway to the next number from the one that it has at a tick."""
@@ -91,8 +91,8 @@ class RelationDeclarations(EventDeclarations):
             value = _unless(sympy.Or(unknown, sympy.Not(whole.edges.turns)), now, after)
             self._relation_clock(clock, shortened(now), Assign(live, sympy.Integer(0)), Assign(known, value))
 
-    def _relation_clock(self, clock: Sampled, text: str, *actions: Assign) -> None:
-        self._event(clock, actions, None, False, False, False, text, True)
+    def _relation_clock(self, clock: Sampled, text: str, *actions: Assign, kink: bool = False) -> None:
+        self._event(clock, actions, None, False, False, False, text, True, kink=kink)
 
     def _steps(self, whole: Stepping) -> None:
         """Events of a whole part. One may leave more than one number behind at an instant, where the argument jumps."""
