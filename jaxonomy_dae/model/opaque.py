@@ -43,8 +43,10 @@ class OpaqueFunction:
         floating = [d for d in dtypes if jnp.issubdtype(d, jnp.floating)]
         dtype = floating[0] if floating else u.dtype
         inside = u.astype(dtype)
-        calls_itself = self.function is None or isinstance(weights, AbstractReplacement)
-        out = weights(inside) if calls_itself else self.function(jnp.asarray(t, dtype), inside, weights)
+        if self.function is None or isinstance(weights, AbstractReplacement):
+            out = weights(inside)
+        else:
+            out = self.function(jnp.asarray(t, dtype), inside, weights)
         return out.astype(u.dtype)
 
     def derivatives(self, weights, order: int, t, inputs: list[list]):
