@@ -162,7 +162,7 @@ def _rounded(expression: Any) -> Any:
 
 
 def discover(
-    estimate: "Estimate", name: str, library: Library, width: int, most: int
+    estimate: "Estimate", name: str, library: Any, width: int, most: int
 ) -> Discovery:  # fmt: skip
     """As `Estimate.discover`."""
     where = f"discover('{name}')"

@@ -17,7 +17,6 @@ from .factors import Factors
 from .holdout import holdout_score, with_own_starts
 from .identifiability import Identifiability, identifiability, spreads
 from .least_squares import Minimum
-from .libraries import Library
 from .objective import Objective
 from .prediction import Prediction, prediction
 from .profile import profile
@@ -263,7 +262,7 @@ class Estimate:
             self, [names] if isinstance(names, str) else list(names), ts, experiment, self._quantile(level)
         )
 
-    def discover(self, name: str, terms: Library, *, width: int = 3, most: int = 3) -> Discovery:
+    def discover(self, name: str, terms: Any, *, width: int = 3, most: int = 3) -> Discovery:
         """Closed forms in a network's place: combinations of terms, refitted through the model on the data, with all
         else that is estimated, and compared by BIC.
 

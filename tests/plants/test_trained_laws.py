@@ -1,4 +1,4 @@
-"""Every kind of law is learned from noisy records, with a prior whose precision the data choose: one model, one program."""
+"""Every kind of law is learned from noisy records, with a prior whose precision the data choose: one model for all."""
 
 import jax
 import numpy as np
@@ -23,8 +23,8 @@ from jaxonomy_dae.learning import (
 )
 
 KEYS = iter(jax.random.split(jax.random.key(4), 9))
-SMALL = {"width": 4, "depth": 1}
-NOISE = 1e-3
+SMALL = {"width": 6, "depth": 1}
+NOISE = 1e-2
 TIMES = np.linspace(0.0, 3.0, 61)[1:]
 
 # By law: the network, its states and their starts; x' = law(x) but where said below. Truths are of other forms than the
@@ -36,7 +36,7 @@ ZOO = {
     "port": (PortHamiltonian(2, key=next(KEYS), **SMALL), {"f": 1.0, "g": 0.0}),
     "conservative": (Conservative(1, key=next(KEYS), **SMALL), {"h": 1.0, "i": 0.0}),  # h' = i, i' = law(h)
     "odd": (Odd(key=next(KEYS), **SMALL), {"j": 1.5}),
-    "monotone": (Monotone(1, 1, False, key=next(KEYS), width=4), {"k": 2.0}),
+    "monotone": (Monotone(1, 1, False, key=next(KEYS), width=6), {"k": 2.0}),
     "bounded": (Bounded(-2.0, 0.0, key=next(KEYS), **SMALL), {"m": 2.0}),
     "positive": (Positive(key=next(KEYS), **SMALL), {"n": 0.1}),
 }
@@ -72,8 +72,8 @@ def test_every_law_is_learned_from_noise():
     rng = np.random.default_rng(0)
     data = {f"z.{n}": x + NOISE * rng.standard_normal(len(TIMES)) for n, x in zip(names, clean, strict=True)}
     fit = Problem(compiled(Zoo(EqnEnv())), Experiment(TIMES, data, sigma=NOISE)).fit(adam=100)
-    assert fit.minimum.converged and 0.9 < fit.chi2 / fit.freedom < 1.1
-    assert all(1 <= fit.effective[f"z.{name}"] <= 9 for name in ZOO)
+    assert fit.minimum.converged and 0.85 < fit.chi2 / fit.freedom < 1.15
+    assert all(1 <= fit.effective[f"z.{name}"] <= 20 for name in ZOO)  # of 4 to 60 weights
     predicted = fit.predict([f"z.{n}" for n in names])
     for name, x in zip(names, clean, strict=True):
         error = predicted.mean[f"z.{name}"] - x
