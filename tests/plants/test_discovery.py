@@ -16,7 +16,7 @@ from problems import compiled
 from sympy import Eq
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, ModelError, NeuralDAEBlock, der, simulate
-from jaxonomy_dae.learning import Experiment, IsotropicPassive, Problem, Unknown, powers, terms
+from jaxonomy_dae.learning import Experiment, IsotropicPassive, Passive, Problem, Unknown, powers, terms
 from jaxonomy_dae.library.planar import PlanarPendulum
 from jaxonomy_dae.programs.cache import PROGRAMS
 
@@ -27,18 +27,18 @@ pytestmark = pytest.mark.slow  # two residuals with their Jacobians compile for 
 
 
 @functools.cache
-def true(drag=DRAG):
+def true(drag=DRAG, friction=0.0):
     """The angle of the pendulum and its rate at the sample times."""
 
     def field(t, s):
-        return [s[1], -9.81 * np.cos(s[0]) - drag * abs(s[1]) * s[1]]
+        return [s[1], -9.81 * np.cos(s[0]) - (drag * abs(s[1]) + friction) * s[1]]
 
     return scipy.integrate.solve_ivp(field, (0, 6), [RELEASE, 0.0], "DOP853", TIMES, rtol=1e-12, atol=1e-12).y
 
 
-def record(seed, noise=1e-3):
+def record(seed, noise=1e-3, **laws):
     rng = np.random.default_rng(seed)
-    theta = true()[0]
+    theta = true(**laws)[0]
     columns = {"pend.x": np.cos(theta), "pend.y": np.sin(theta)}
     return Experiment(TIMES, {n: c + noise * rng.standard_normal(200) for n, c in columns.items()}, sigma=noise)
 
@@ -109,6 +109,14 @@ def test_twenty_seeds(problem, fit):
     assert len(PROGRAMS) == count
 
 
+def test_two_terms(problem, fit):
+    again = problem.fit(record(5, drag=0.4, friction=0.1), start=fit.system)
+    found = again.discover("drag", powers(4))
+    assert found.chosen.terms == ("[vx, vy]", "[vx, vy]*|[vx, vy]|")
+    low, high = np.array([[row.low, row.high] for row in found.chosen.coefficients(0.999)]).T
+    assert (low < [-0.1, -0.4]).all() and (high > [-0.1, -0.4]).all() and (high - low < 0.01).all()
+
+
 def test_a_library_that_lacks_the_term_is_said_to(fit):
     found = fit.discover("drag", terms(("vx", "vy")))
     assert len(found.candidates) == 1 and found.lack_of_fit < 1e-10
@@ -163,6 +171,31 @@ def test_a_function_with_weights_with_unknown_start_noise_and_gain(inject):
     frozen = Problem(system, experiment, train=["c.gain", "law"], regularize=None).fit(freeze={"c.gain": 1.3})
     held = frozen.discover("law", powers(2)).estimate
     assert held.values["c.gain"] == 1.3 and held.table()["c.gain"].note == "frozen"
+
+
+class Sinking(Component):
+    """x' = −law(x), x at the start of its own."""
+
+    def __init__(self, ev, name, start):
+        super().__init__(ev, name)
+        x = self.variable("x", start=self.parameter("x0", start), fixed=True)
+        (f,) = self.learned("law", Passive(key=jax.random.key(3)), [x], kind=Passive)
+        self.add_equations(Eq(der(x), f))
+
+
+def test_one_law_of_an_array_of_components():
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    diagram.add_array(ev, "tank", Sinking, 3, np.array([0.5, 1.0, 2.0]))
+    system = AcausalCompiler(ev, diagram)()
+    times = np.linspace(0.0, 4.0, 81)[1:]
+    rng = np.random.default_rng(1)
+    x = 1 / (1 / np.array([0.5, 1.0, 2.0]) + RATE * times[:, None])
+    data = {f"tank[{k}].x": x[:, k] + 1e-3 * rng.standard_normal(80) for k in range(3)}
+    fit = Problem(system, Experiment(times, data, sigma=1e-3)).fit(adam=40)
+    found = fit.discover("tank.law", powers(3))
+    assert found.chosen.terms == ("x*|x|",) and abs(float(found.law.coefficients[0]) + RATE) < 5e-3
+    x = sympy.Symbol("x", real=True)
+    assert found.equations[0].rhs == float(found.law.coefficients[0]) * x * abs(x)
 
 
 def test_wrong_names(fit):
