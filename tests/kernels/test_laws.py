@@ -100,7 +100,8 @@ def test_isotropic_passive():
     np.testing.assert_allclose(law(v), -law.rate(jnp.asarray(1.5)) * v, rtol=1e-14)
 
 
-@pytest.mark.parametrize("states", [pytest.param(0, marks=pytest.mark.slow), 2])
+@pytest.mark.slow
+@pytest.mark.parametrize("states", [0, 2])
 def test_dissipation(states):
     sizes = (1.0, 0.1, 20.0, *[5.0] * states)
     laws = drawn(lambda key: Dissipation(3, states, key=key, inputs=sizes, power=0.5))
@@ -121,6 +122,7 @@ def test_dissipation(states):
     assert (np.abs(f - expected) <= 1e-11 * size[..., 0]).all()
 
 
+@pytest.mark.slow
 def test_port_hamiltonian_never_gains_energy():
     laws, u = drawn(lambda key: PortHamiltonian(3, key=key, inputs=(1.0, 2.0, 0.5), energy=3.0, time=0.1)), points(3)
 
@@ -214,10 +216,7 @@ LAWS = {
 }
 
 
-QUICK = ("isotropic", "positive", "bounded")  # those that have a root or a case at rest
-
-
-@pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in LAWS])
+@pytest.mark.parametrize("name", [n if n == "isotropic" else pytest.param(n, marks=pytest.mark.slow) for n in LAWS])
 def test_twice_differentiable_at_rest(name):
     law = LAWS[name](1.0)
 
@@ -241,6 +240,7 @@ def test_twice_differentiable_at_rest(name):
 PER_INPUT = ("passive", "isotropic", "dissipation", "conservative")  # their outputs are power or energy per input
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LAWS)
 def test_other_units(name):
     """Inputs in millimetre per second instead of metre per second, the same weights: the same law."""
