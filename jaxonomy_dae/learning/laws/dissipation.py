@@ -15,12 +15,13 @@ from .structure import dissipation, interconnection, response
 
 class Dissipation(AbstractPassive):
     """f(e, x) = (J(x) − R(x)) e, linear in the efforts e, with R(x) symmetric and positive semidefinite and J(x) skew
-    (van der Schaft & Jeltsema 2014, Port-Hamiltonian systems theory, eq. 2.28).
+    (van der Schaft & Jeltsema 2014, Port-Hamiltonian systems theory).
 
-    Efforts are velocities, voltages, temperatures, …; f are the forces, currents, … that answer, counted so that f·e is
-    the power that comes in. From the numbers W(x) of a tanh network, R = L D Lᵀ with L unit lower triangular and
+    Efforts are velocities, voltages, pressures, …; f are the forces, currents, flows, … that answer, counted so that
+    f·e is the power that comes in. From the numbers W(x) of a tanh network, R = L D Lᵀ with L unit lower triangular and
     D = diag(softplus(…)) ≥ 0, and J = U − Uᵀ. So eᵀ R e = Σ D (Lᵀ e)² ≥ 0 and eᵀ J e = 0, and f·e = −eᵀ R e ≤ 0
-    whatever the weights. All positive definite R and all skew J are of this form. In rounded numbers f·e ≤ ε |f| |e|.
+    whatever the weights. All positive definite R and all skew J are of this form. In rounded numbers, f·e
+    exceeds zero by no more than the rounding of the products that it is summed of.
 
     **Arguments:**
 

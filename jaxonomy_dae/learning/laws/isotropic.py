@@ -43,9 +43,9 @@ class IsotropicPassive(AbstractPassive):
         self.inputs = typical(inputs, "IsotropicPassive: inputs")
         self.power = typical(power, "IsotropicPassive: power")
 
-    def rate(self, speed: Float[Array, ""]) -> Float[Array, ""]:
+    def rate(self, speed: Any) -> Float[Array, ""]:
         """k at a speed |v|, in units of N per v."""
-        scaled = speed / self.inputs
+        scaled = jnp.asarray(speed) / self.inputs
         rounded = scaled**2 / (jnp.sqrt(scaled**2 + REST**2) + REST)  # √(s² + δ²) − δ without cancellation
         return self._rate(rounded)
 

@@ -17,9 +17,9 @@ class Monotone(eqx.Module):
 
     Hidden layers are h ← tanh(W h + b), and the outputs V h + S u + b with the inputs u: all of W, V and S are squares
     of what is trained, so they are ≥ 0. Sums with such weights, tanh, and what is composed of them, do not fall where
-    their arguments rise; so ∂f/∂u ≥ 0 for all weights. With one hidden layer, all continuous monotone functions of one
-    variable are approximated on an interval (steps that add up); of several variables, `depth` 3 is enough (Daniels &
-    Velikova 2010, IEEE Trans. Neural Networks 21:906).
+    their arguments rise; so ∂f/∂u ≥ 0 for all weights. All continuous monotone functions of k variables are
+    approximated on a bounded region with k hidden layers (Daniels & Velikova 2010, IEEE Trans. Neural Networks 21:906);
+    of one variable with one, whose steps add up.
 
     **Arguments:**
 

@@ -31,8 +31,8 @@ class Passive(AbstractPassive):
     Passive because N·v = vᵀ J v − vᵀ R v = −vᵀ R v ≤ 0: a skew J has vᵀ J v = 0, and R = L D Lᵀ with D ≥ 0 has
     vᵀ R v = Σ D (Lᵀ v)² ≥ 0 (`Dissipation` says more). Where v ≠ 0, every passive law is of this form:
     R = −(N·v) v vᵀ/|v|⁴ and J = (w vᵀ − v wᵀ)/|v|² with w = N + R v, which is orthogonal to v. At v = 0, N = 0, as for
-    every continuous passive law. In rounded numbers N·v ≤ ε |N| |v| with ε some units in the last place; with one
-    output it is exact.
+    every continuous passive law. In rounded numbers, N·v exceeds zero by no more than the rounding of the products that
+    it is summed of; with one output, not at all.
 
     **Arguments:**
 
