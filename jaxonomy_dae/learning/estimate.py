@@ -167,7 +167,7 @@ class Estimate:
         precision[self.objective.free] = self.minimum.weights.precision
         variance = np.sum(self.root**2, axis=1)
         for name in dict.fromkeys(g for g, w in zip(c.group, c.is_weight, strict=True) if w):
-            chosen = np.array([g == name for g in c.group])
+            chosen = np.array([g == name for g in c.group]) & self.objective.free  # what is frozen is not determined
             out[name] = float(np.sum(1 - precision[chosen] * variance[chosen]))
         return out
 

@@ -194,6 +194,7 @@ def test_one_law_of_an_array_of_components():
     fit = Problem(system, Experiment(times, data, sigma=1e-3)).fit(adam=40)
     found = fit.discover("tank.law", powers(3))
     assert found.chosen.terms == ("x*|x|",) and abs(float(found.law.coefficients[0]) + RATE) < 5e-3
+    assert abs(found.estimate.effective["tank.law"] - 1) < 1e-6
     x = sympy.Symbol("x", real=True)
     assert found.equations[0].rhs == float(found.law.coefficients[0]) * x * abs(x)
 
