@@ -1,7 +1,9 @@
 """Training compiled systems, and any Equinox module around them."""
 
 from .band import Band as Band
+from .closed_form import ClosedForm as ClosedForm
 from .data import Data as Data
+from .discovery import Discovery as Discovery
 from .estimate import Estimate as Estimate
 from .experiment import Experiment as Experiment
 from .experiment import Unknown as Unknown
@@ -9,6 +11,18 @@ from .fit import Fit as Fit
 from .fit import fit as fit
 from .fit import fit_least_squares as fit_least_squares
 from .identifiability import Identifiability as Identifiability
+from .laws import AbstractPassive as AbstractPassive
+from .laws import Bounded as Bounded
+from .laws import Conservative as Conservative
+from .laws import Dissipation as Dissipation
+from .laws import IsotropicPassive as IsotropicPassive
+from .laws import Monotone as Monotone
+from .laws import Odd as Odd
+from .laws import Passive as Passive
+from .laws import PortHamiltonian as PortHamiltonian
+from .laws import Positive as Positive
+from .libraries import powers as powers
+from .libraries import terms as terms
 from .prediction import Prediction as Prediction
 from .problem import Problem as Problem
 from .table import Table as Table

@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import ModelError, nearest
-from ..model.opaque import OpaqueTemplate
+from ..model.opaque import OpaqueFunction
 from ..programs.cache import compiled
+from .blocks import Block, block_of, inputs_seen
 from .program import weights_of, with_weights
 
 if TYPE_CHECKING:
@@ -48,17 +49,16 @@ def band(
     module = estimate.system.neural[name] if name in estimate.system.neural else estimate.observers[name]
     dtype = objective.system.parameters.values.dtype
     points = np.asarray(grid, float)
-    template = _template(estimate, name)
+    block = block_of(estimate.system.plan, name)
+    called = points
     if law is None:
-        law = _first_output if template is None or template.function is None else _FirstOutput(template.function)
-    called = points if law not in (_first_output,) or points.ndim == 2 else points[:, None]
-    if isinstance(law, _FirstOutput) and points.ndim == 1:
-        called = points[:, None]
+        law = _first_output if block is None else _FirstOutput(block.opaque)
+        called = points[:, None] if points.ndim == 1 else points
     flat = jnp.concatenate([jnp.ravel(leaf).astype(dtype) for leaf in weights_of(module)])
     mean, slope = (np.asarray(a, float) for a in _law_and_slope(module, law, flat, jnp.asarray(called, dtype)))
     columns = np.array([g == name for g in objective.coordinates.group]) & objective.coordinates.is_weight
     spread = np.linalg.norm(slope @ estimate.root[columns], axis=1)
-    explored = _explored(estimate, name, along, template)
+    explored = _explored(estimate, along, block)
     return Band(points, mean, spread, mean - factor * spread, mean + factor * spread, explored)
 
 
@@ -68,12 +68,13 @@ def _first_output(network: Any, u: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class _FirstOutput:
-    """Of a network that is a function of time, inputs and weights."""
+    """Of a network as the equations call it."""
 
-    function: Callable
+    opaque: OpaqueFunction
 
-    def __call__(self, theta: Any, u: Any) -> Any:
-        return jnp.ravel(self.function(jnp.zeros((), u.dtype), u, theta))[0]
+    def __call__(self, weights: Any, u: Any) -> Any:
+        times = [u[j] for j in self.opaque.time_positions]
+        return self.opaque(weights, times[0] if times else jnp.zeros((), u.dtype), u)[0]
 
 
 @compiled
@@ -86,33 +87,17 @@ def _law_and_slope(module: Any, law: Callable, flat: Any, points: Any) -> tuple[
     return jax.vmap(jax.value_and_grad(value), in_axes=(None, 0))(flat, points)
 
 
-def _template(estimate: "Estimate", name: str) -> Any:
-    """How the equations call a network; None for a sensor law."""
-    for group in estimate.system.plan.flat.groups:
-        if isinstance(group.template, OpaqueTemplate) and group.template.opaque.name == name:
-            return group.template.opaque
-    return None
-
-
-def _explored(estimate: "Estimate", name: str, along: Any, template: Any) -> np.ndarray:
+def _explored(estimate: "Estimate", along: Any, block: Block | None) -> np.ndarray:
     """The least and the greatest of each input over the experiments that were fitted."""
-    flat = estimate.system.plan.flat
     if along is None:
-        names = [
-            [flat.variables.names[v] for v in row[1:]]
-            for group in flat.groups
-            if isinstance(group.template, OpaqueTemplate) and group.template.opaque.name == name
-            for row in group.variable
-        ]
-        if not names:
+        if block is None:
             return np.zeros((0, 2))
+        seen = inputs_seen(estimate, block)
     else:
-        names = [[along]]
-    found = []
-    for k in np.flatnonzero(estimate.objective.counted):
-        solution = estimate.problem.run(estimate.objective, estimate.point, int(k))
-        for row in names:
-            columns = [solution[v] if isinstance(v, str) else v(solution) for v in row]
-            found.append(np.stack([np.asarray(c, float) for c in columns], axis=1))
-    seen = np.concatenate(found)
+        runs = (
+            estimate.problem.run(estimate.objective, estimate.point, int(k))
+            for k in np.flatnonzero(estimate.objective.counted)
+        )
+        columns = [np.asarray(run[along] if isinstance(along, str) else along(run), float) for run in runs]
+        seen = np.concatenate(columns)[:, None]
     return np.stack([seen.min(axis=0), seen.max(axis=0)], axis=1)

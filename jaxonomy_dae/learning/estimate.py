@@ -12,6 +12,7 @@ from jaxtyping import Float
 from ..errors import ModelError, nearest
 from ..system.system import AcausalSystem
 from .band import Band, band
+from .discovery import Discovery, discover
 from .factors import Factors
 from .holdout import holdout_score, with_own_starts
 from .identifiability import Identifiability, identifiability, spreads
@@ -166,7 +167,7 @@ class Estimate:
         precision[self.objective.free] = self.minimum.weights.precision
         variance = np.sum(self.root**2, axis=1)
         for name in dict.fromkeys(g for g, w in zip(c.group, c.is_weight, strict=True) if w):
-            chosen = np.array([g == name for g in c.group])
+            chosen = np.array([g == name for g in c.group]) & self.objective.free  # what is frozen is not determined
             out[name] = float(np.sum(1 - precision[chosen] * variance[chosen]))
         return out
 
@@ -260,6 +261,30 @@ class Estimate:
         return prediction(
             self, [names] if isinstance(names, str) else list(names), ts, experiment, self._quantile(level)
         )
+
+    def discover(self, name: str, terms: Any, *, width: int = 3, most: int = 3) -> Discovery:
+        """Closed forms in a network's place: combinations of terms, refitted through the model on the data, with all
+        else that is estimated, and compared by BIC.
+
+        ```python
+        law = fit.discover("drag", learning.powers(4))
+        print(law)
+        closed = law.system
+        ```
+
+        **Arguments:**
+
+        - `name`: of a network that was trained, by `learned` or as a `NeuralDAEBlock`.
+        - `terms`: `learning.powers(4)`, `learning.terms("v*Abs(v)", "tanh(v/0.1)")`, or both, joined by +.
+        - `width`: how many forms of each number of terms are carried on to the next.
+        - `most`: how many terms a form has at most.
+
+        **Raises:**
+
+        - `ModelError` for names, and for terms that do not fit the block.
+        - `SimulationError` if no closed form can be simulated.
+        """
+        return discover(self, name, terms, width, most)
 
     @functools.cached_property
     def rms(self) -> dict[str, dict[str, float]]:

@@ -1,10 +1,12 @@
 """A problem: a system, data of experiments, and what is to be learned from them."""
 
+import copy
 import dataclasses
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -368,6 +370,14 @@ class Problem:
         return simulate(
             system, t1, t0=s.t0[experiment], ts=times, inputs=inputs or None, initial=initial or None, **self._options
         )
+
+    def with_law(self, name: str, law: Any, system: AcausalSystem, stacked: Stacked) -> "Problem":
+        """The same problem with another law in a network's place, without a prior, in a system that is otherwise as
+        given."""
+        other = copy.copy(self)
+        other.system = eqx.tree_at(lambda s: s.neural, system, system.neural | {name: law})
+        other._stacked, other.penalties = stacked, self.penalties | {name: None}
+        return other
 
     # --- before a fit ------------------------------------------------------------------------------------------
 

@@ -1,15 +1,26 @@
 """Functions that SymPy never sees: networks, tables, any JAX function, in equations y − N(u) = 0."""
 
+import abc
 import functools
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ..programs.cache import compiled
 from .template import AbstractTemplate, Slot
+
+
+class AbstractReplacement(eqx.Module):
+    """A law in the place of a network, `law(u) -> (outputs,)`: it is called itself, also where a plain function of
+    weights stood."""
+
+    @abc.abstractmethod
+    def __call__(self, u: Any) -> Any:
+        """The law at its inputs, those that are time included."""
 
 
 class OpaqueFunction:
@@ -32,7 +43,10 @@ class OpaqueFunction:
         floating = [d for d in dtypes if jnp.issubdtype(d, jnp.floating)]
         dtype = floating[0] if floating else u.dtype
         inside = u.astype(dtype)
-        out = weights(inside) if self.function is None else self.function(jnp.asarray(t, dtype), inside, weights)
+        if self.function is None or isinstance(weights, AbstractReplacement):
+            out = weights(inside)
+        else:
+            out = self.function(jnp.asarray(t, dtype), inside, weights)
         return out.astype(u.dtype)
 
     def derivatives(self, weights, order: int, t, inputs: list[list]):

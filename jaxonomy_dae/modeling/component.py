@@ -17,6 +17,7 @@ from .equations import residual_of
 from .events import Held, When
 from .functions import of_scalars
 from .interval import Interval, as_interval
+from .kinds import check_kind
 from .mode_declarations import ModeDeclarations
 from .names import check_name
 from .ports import Domain, Port
@@ -353,7 +354,12 @@ class Component(ModeDeclarations, metaclass=Construction):
         return port
 
     def learned(
-        self, name: str, network: Any, inputs: Sequence[Any], outputs: int | None = None
+        self,
+        name: str,
+        network: Any,
+        inputs: Sequence[Any],
+        outputs: int | None = None,
+        kind: type | tuple[type, ...] | None = None,
     ) -> tuple[VariableSymbol, ...]:
         """Puts a network into the equations: its outputs are variables, one symbol each.
 
@@ -364,6 +370,8 @@ class Component(ModeDeclarations, metaclass=Construction):
         - `network`: a callable pytree, `network(u) -> (outputs,)`, such as an `equinox.nn.MLP`.
         - `inputs`: symbols of variables (or `ev.t`); `u` has shape `(len(inputs),)`, in this order.
         - `outputs`: how many outputs; found by tracing the network when left out.
+        - `kind`: the class that the network must be of, or several, for a component whose physics relies on it:
+            `kind=jaxonomy_dae.learning.AbstractPassive` admits only laws that bring no energy in.
 
         **Returns:**
 
@@ -372,8 +380,10 @@ class Component(ModeDeclarations, metaclass=Construction):
 
         **Raises:**
 
-        - `ModelError` if the network does not take `(len(inputs),)` or does not return a vector.
+        - `ModelError` if the network does not take `(len(inputs),)`, does not return a vector, or is of another kind.
         """
+        if kind is not None:
+            check_kind(network, kind, f"learned term '{self.path}.{name}'")
         return self._opaque("learned term", name, network, inputs, outputs)
 
     def function(

@@ -1,0 +1,53 @@
+"""Forces that have a potential."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from .network import count, divided, multiplied, sizes, tanh_network, typical
+
+
+class Conservative(eqx.Module):
+    """F(x) = −∇V(x), with the potential V from a tanh network.
+
+    What F does along a path is V at its beginning less V at its end, whichever way the path goes: around a closed path
+    it does no work, because F is a gradient (its Jacobian, minus the Hessian of V, is symmetric). And V is bounded:
+    |V| ≤ 2 · energy · Σ|weights of the last layer|, for |tanh| ≤ 1 and V(0) = 0, so no path whatever draws more from
+    it.
+
+    **Arguments:**
+
+    - `size`: how many entries x and F have.
+    - `key`: for the weights. `width`, `depth`: of the hidden layers; depth ≥ 1.
+    - `inputs`: what x typically is, one number or one for each. `energy`: what V typically is (joule for forces and
+        positions in SI units).
+
+    **Raises:**
+
+    - `ModelError` for counts and sizes that are not positive.
+    """
+
+    network: eqx.nn.MLP
+    size: int = eqx.field(static=True)
+    inputs: tuple[float, ...] = eqx.field(static=True)
+    energy: float = eqx.field(static=True)
+
+    def __init__(self, size: int, *, key: PRNGKeyArray, width: int = 8, depth: int = 2,
+                 inputs: Any = 1.0, energy: Any = 1.0):  # fmt: skip
+        self.size = count(size, "Conservative: size")
+        depth = count(depth, "Conservative: depth")
+        self.network = tanh_network(size, 1, count(width, "Conservative: width"), depth, key)
+        self.inputs = sizes(inputs, size, "Conservative: inputs")
+        self.energy = typical(energy, "Conservative: energy")
+
+    def potential(self, x: Float[Array, " size"]) -> Float[Array, ""]:
+        """V(x), zero at x = 0."""
+        scaled = divided(x, self.inputs)
+        return (self.network(scaled)[0] - self.network(jnp.zeros_like(scaled))[0]) * self.energy
+
+    def __call__(self, u: Float[Array, " size"]) -> Float[Array, " size"]:
+        slope = jax.grad(lambda scaled: self.network(scaled)[0])(divided(u, self.inputs))
+        return multiplied(slope, tuple(-self.energy / s for s in self.inputs))

@@ -1,0 +1,62 @@
+"""The network inside a law, and the sizes that it is measured in.
+
+Networks see and return numbers of order one; a law multiplies by what its inputs and outputs typically are. These sizes
+are settings, no weights: no training moves them.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from ...errors import ModelError
+
+
+def tanh_network(inputs: int, outputs: int, width: int, depth: int, key: PRNGKeyArray) -> eqx.nn.MLP:
+    """inputs → width → … → outputs with `depth` hidden layers of tanh: smooth, and bounded for given weights."""
+    return eqx.nn.MLP(inputs, outputs, width, depth, jnp.tanh, key=key)
+
+
+def sizes(given: Any, count: int, what: str) -> tuple[float, ...]:
+    """What is typical for each of `count` values, from one number or one for each.
+
+    **Raises:**
+
+    - `ModelError` for another count, and for sizes that are not positive.
+    """
+    try:
+        values = np.asarray(given, float)
+    except (TypeError, ValueError):
+        values = np.zeros(0)
+    if values.shape not in ((), (count,)) or not (np.isfinite(values) & (values > 0)).all():
+        raise ModelError(f"{what} is a typical size > 0, or one for each of {count}; got {given!r}")
+    return tuple(np.broadcast_to(values, (count,)).tolist())
+
+
+def typical(given: Any, what: str) -> float:
+    """One typical size."""
+    return sizes(given, 1, what)[0]
+
+
+def count(given: Any, what: str, least: int = 1) -> int:
+    """A number of inputs, outputs or neurons.
+
+    **Raises:**
+
+    - `ModelError` for what is not a whole number, or less than `least`.
+    """
+    if isinstance(given, bool) or not isinstance(given, int) or given < least:
+        raise ModelError(f"{what} is a whole number ≥ {least}; got {given!r}")
+    return given
+
+
+def divided(u: Float[Array, "*batch n"], by: tuple[float, ...]) -> Float[Array, "*batch n"]:
+    """Values in units of their typical sizes."""
+    return u / jnp.asarray(by, u.dtype)
+
+
+def multiplied(y: Float[Array, "*batch n"], by: tuple[float, ...]) -> Float[Array, "*batch n"]:
+    """Values from those in units of their typical sizes."""
+    return y * jnp.asarray(by, y.dtype)

@@ -1,0 +1,45 @@
+"""Laws whose values are above zero."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from .network import count, divided, multiplied, sizes, tanh_network
+
+
+class Positive(eqx.Module):
+    """f(u) > 0 for all u and all weights: f = (g + √(g² + 4))/2 of a tanh network g (Barron 2021, arXiv:2112.11687).
+
+    Because √(g² + 4) > |g|; in rounded numbers, because a negative g is taken by 2/(√(g² + 4) − g), a quotient of
+    positive numbers. Where an exponential or softplus would underflow to zero, this falls as 1/|g| only.
+
+    **Arguments:**
+
+    - `in_size`, `out_size`: how many inputs and outputs there are.
+    - `key`: for the weights. `width`, `depth`: of the hidden layers.
+    - `inputs`, `outputs`: what they typically are, one number or one for each, in their units.
+
+    **Raises:**
+
+    - `ModelError` for counts and sizes that are not positive.
+    """
+
+    network: eqx.nn.MLP
+    inputs: tuple[float, ...] = eqx.field(static=True)
+    outputs: tuple[float, ...] = eqx.field(static=True)
+
+    def __init__(self, in_size: int = 1, out_size: int = 1, *, key: PRNGKeyArray, width: int = 8, depth: int = 2,
+                 inputs: Any = 1.0, outputs: Any = 1.0):  # fmt: skip
+        in_size, out_size = count(in_size, "Positive: in_size"), count(out_size, "Positive: out_size")
+        self.network = tanh_network(in_size, out_size, count(width, "Positive: width"), depth, key)
+        self.inputs = sizes(inputs, in_size, "Positive: inputs")
+        self.outputs = sizes(outputs, out_size, "Positive: outputs")
+
+    def __call__(self, u: Float[Array, " inputs"]) -> Float[Array, " outputs"]:
+        g = self.network(divided(u, self.inputs))
+        root = jnp.sqrt(g**2 + 4)
+        above = g >= 0
+        # Each branch is given what it is meant for, so that the other's derivative is finite too.
+        return multiplied(jnp.where(above, (g + root) / 2, 2 / (root - jnp.where(above, 0, g))), self.outputs)

@@ -1,0 +1,155 @@
+"""Libraries: which terms are tried, before it is known of which inputs."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import sympy
+
+from ..errors import ModelError, nearest
+from ..expressions.from_sympy import UnsupportedExpression, read, symbols_of
+from ..modeling.functions import of_scalars
+from ..modeling.neural import count_outputs
+from .term import AbstractTerm, OfFunction, Power, Written, local_name
+
+
+@dataclasses.dataclass(frozen=True)
+class Library:
+    """Terms before it is known of which inputs. `powers(3) + terms("tanh(v/0.1)")` joins libraries."""
+
+    entries: tuple[Any, ...]
+
+    def __add__(self, other: "Library") -> "Library":
+        if not isinstance(other, Library):
+            return NotImplemented
+        return Library(self.entries + other.entries)
+
+    def of(self, inputs: tuple[str, ...], outputs: int, where: str) -> tuple[AbstractTerm, ...]:
+        """The terms of a block with inputs of these names and so many outputs; the same term counts once.
+
+        **Raises:**
+
+        - `ModelError` for symbols that are no inputs, for expressions that cannot be evaluated, and for other counts of
+            outputs.
+        """
+        found = [term for entry in self.entries for term in entry(inputs, outputs, where)]
+        return tuple(dict.fromkeys(found))
+
+
+def powers(highest: int) -> Library:
+    """The terms v, v|v|, v|v|², …, v|v|^(highest−1): what friction and drag are made of.
+
+    For a block of several inputs and as many outputs, v is the vector of its inputs and |v| its length, and each term
+    has one coefficient.
+
+    **Raises:**
+
+    - `ModelError` if `highest` is not a whole number ≥ 1; when used, for blocks with other counts of outputs.
+    """
+    if isinstance(highest, bool) or not isinstance(highest, int) or highest < 1:
+        raise ModelError(f"powers(highest) takes a whole number ≥ 1; got {highest!r}")
+    return Library((_Powers(highest),))
+
+
+def terms(*expressions: Any, **functions: Callable[..., Any]) -> Library:
+    """Terms as one writes them.
+
+    **Arguments:**
+
+    - `expressions`: SymPy expressions or texts, `"v*Abs(v)"`, `"tanh(v/0.1)"`, in the names of the block's inputs, full
+        (SymPy symbols) or without their component; a block of one input takes any one symbol. For a block of several
+        outputs, a tuple of one for each is one term; a single expression is one term for each output, each with
+        its own coefficient.
+    - `functions`: JAX functions by name, `plateau=lambda v: jnp.tanh(v / 0.1)`, called with a scalar for each input;
+        they return a scalar, as a single expression, or one value for each output.
+
+    **Raises:**
+
+    - `ModelError` for what is neither; when used, for symbols that are no inputs.
+    """
+    entries: list[Any] = []
+    for given in expressions:
+        parts = given if isinstance(given, tuple | list) else (given,)
+        if not all(isinstance(p, str | sympy.Expr | int | float) for p in parts):
+            raise ModelError(
+                f"terms takes SymPy expressions, texts, or functions by name (drag=lambda v: …); got {given!r}"
+            )
+        entries.append(_Expressions(tuple(parts), isinstance(given, tuple | list)))
+    for name, function in functions.items():
+        if not callable(function):
+            raise ModelError(f"terms: '{name}' needs a function of the block's inputs; got {function!r}")
+        entries.append(_Function(name, function))
+    if not entries:
+        raise ModelError('terms needs at least one expression or function: terms("v", "v*Abs(v)")')
+    return Library(tuple(entries))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Powers:
+    highest: int
+
+    def __call__(self, inputs: tuple[str, ...], outputs: int, where: str) -> list[AbstractTerm]:
+        if len(inputs) != outputs:
+            raise ModelError(
+                f"{where}: powers are for blocks with an output for each input; it has {len(inputs)} inputs and "
+                f"{outputs} outputs: name terms of your own, learning.terms(…)"
+            )
+        return [Power(k, inputs) for k in range(1, self.highest + 1)]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Expressions:
+    parts: tuple[Any, ...]
+    is_vector: bool
+
+    def __call__(self, inputs: tuple[str, ...], outputs: int, where: str) -> list[AbstractTerm]:
+        symbols = tuple(sympy.Symbol(f"u{k}", real=True) for k in range(len(inputs)))
+        written = tuple(self._read(part, inputs, symbols, where) for part in self.parts)
+        texts = [str(part) for part in self.parts]
+        if self.is_vector and len(written) != outputs:
+            raise ModelError(f"{where}: term {self.parts} has {len(written)} entries, but the block {outputs} outputs")
+        if self.is_vector or outputs == 1:
+            label = texts[0] if outputs == 1 else f"[{', '.join(texts)}]"
+            return [Written(label, symbols, written)]
+        zero = sympy.Integer(0)
+        rows = [tuple(written[0] if k == j else zero for k in range(outputs)) for j in range(outputs)]
+        return [Written(f"{texts[0]} in output {j}", symbols, row) for j, row in enumerate(rows)]
+
+    def _read(self, part: Any, inputs: tuple[str, ...], symbols: tuple[sympy.Symbol, ...], where: str) -> sympy.Expr:
+        """An expression in the symbols of the inputs."""
+        local = [local_name(name) for name in inputs]
+        known = {n: s for n, s, count in zip(local, symbols, map(local.count, local), strict=True) if count == 1}
+        known |= dict(zip(inputs, symbols, strict=True))
+        try:
+            expression = sympy.sympify(part, locals=dict(known))  # pyright: ignore[reportCallIssue]
+        except (sympy.SympifyError, SyntaxError, TypeError, AttributeError) as error:
+            raise ModelError(f"{where}: term {part!r} is no expression that SymPy reads") from error
+        found = sorted((s for s in symbols_of(expression) if s not in symbols), key=str)
+        other = {s: known[s.name] for s in found if s.name in known}
+        strange = [s for s in found if s not in other]
+        if len(inputs) == 1 and len(strange) == 1 and not other and not set(symbols) & symbols_of(expression):
+            other[strange.pop()] = symbols[0]
+        if strange:
+            raise ModelError(
+                f"{where}: '{strange[0]}' in term '{part}' is no input of the block: " + nearest(str(strange[0]), known)
+            )
+        expression = expression.subs(other, simultaneous=True)
+        try:
+            read(expression, lambda s: s)
+        except UnsupportedExpression as error:
+            raise ModelError(f"{where}: term '{part}': {error}") from None
+        return expression
+
+
+@dataclasses.dataclass(frozen=True)
+class _Function:
+    name: str
+    function: Callable[..., Any]
+
+    def __call__(self, inputs: tuple[str, ...], outputs: int, where: str) -> list[AbstractTerm]:
+        found = count_outputs(of_scalars(self.function), len(inputs), f"{where}: term '{self.name}'", noun="function")
+        if found not in (1, outputs):
+            raise ModelError(f"{where}: term '{self.name}' returns {found} values, but the block has {outputs} outputs")
+        if found == outputs:
+            return [OfFunction(self.name, self.function, outputs, None)]
+        return [OfFunction(self.name, self.function, outputs, j) for j in range(outputs)]

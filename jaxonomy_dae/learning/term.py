@@ -1,0 +1,126 @@
+"""Terms: functions of a block's inputs, of which a closed form is a combination.
+
+Terms are records that compare by what they say, so that two libraries that say the same share one compiled program.
+"""
+
+import abc
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+import sympy
+from jaxtyping import Array, Float
+
+from ..expressions.from_sympy import read
+from ..expressions.kernel import Kernel
+
+
+class AbstractTerm(abc.ABC):
+    """φ(u), of shape `(outputs,)`, for inputs u of shape `(inputs,)`."""
+
+    @property
+    @abc.abstractmethod
+    def name(self) -> str:
+        """What reports call it."""
+
+    @abc.abstractmethod
+    def __call__(self, u: Float[Array, " inputs"]) -> Float[Array, " outputs"]:
+        """The values."""
+
+    @abc.abstractmethod
+    def expressions(self, symbols: tuple[sympy.Symbol, ...]) -> tuple[sympy.Expr, ...]:
+        """The term of each output, in symbols of the inputs."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Power(AbstractTerm):
+    """|u|^(k−1) u: of one input its k-th power with its sign, of several a vector along them of length |u|^k."""
+
+    exponent: int
+    inputs: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """Such as `v`, `v*|v|`, `v*|v|^2`; of several inputs in brackets, as a vector."""
+        u = local_name(self.inputs[0]) if len(self.inputs) == 1 else f"[{', '.join(map(local_name, self.inputs))}]"
+        tail = {1: "", 2: f"*|{u}|"}.get(self.exponent, f"*|{u}|^{self.exponent - 1}")
+        return u + tail
+
+    def __call__(self, u: Float[Array, " inputs"]) -> Float[Array, " inputs"]:
+        if self.exponent == 1:
+            return u
+        # Even powers of the length are polynomials; of odd ones, the root's derivative at rest is left out, as it is
+        # multiplied by zero.
+        square = jnp.sum(u**2)
+        half, odd = divmod(self.exponent - 1, 2)
+        away = square > 0
+        length = jnp.where(away, jnp.sqrt(jnp.where(away, square, 1.0)), 0.0)
+        return square**half * (length if odd else 1.0) * u
+
+    def expressions(self, symbols: tuple[sympy.Symbol, ...]) -> tuple[sympy.Expr, ...]:
+        """In symbols of real numbers."""
+        length = sympy.Abs(symbols[0]) if len(symbols) == 1 else sympy.sqrt(sympy.Add(*(s**2 for s in symbols)))
+        return tuple(s * length ** (self.exponent - 1) for s in symbols)
+
+
+@dataclasses.dataclass(frozen=True)
+class Written(AbstractTerm):
+    """Expressions for each output, in symbols for the inputs."""
+
+    label: str
+    symbols: tuple[sympy.Symbol, ...]
+    written: tuple[sympy.Expr, ...]
+
+    @property
+    def name(self) -> str:
+        """As it was written."""
+        return self.label
+
+    def __call__(self, u: Float[Array, " inputs"]) -> Float[Array, " outputs"]:
+        values = _kernel(self.symbols, self.written)(list(u))
+        return jnp.stack([jnp.asarray(v, u.dtype) for v in values])
+
+    def expressions(self, symbols: tuple[sympy.Symbol, ...]) -> tuple[sympy.Expr, ...]:
+        """The same in other symbols."""
+        other = dict(zip(self.symbols, symbols, strict=True))
+        written: tuple[Any, ...] = self.written  # SymPy says of nothing what it becomes
+        return tuple(e.xreplace(other) for e in written)
+
+
+@dataclasses.dataclass(frozen=True)
+class OfFunction(AbstractTerm):
+    """A function of scalars, `function(x, y, …)`, for one of several outputs or for all."""
+
+    label: str
+    function: Callable[..., Any]
+    outputs: int
+    output: int | None  # None: for all
+
+    @property
+    def name(self) -> str:
+        """Its own, with the output that it is for where there are several."""
+        return self.label if self.output is None else f"{self.label}[{self.output}]"
+
+    def __call__(self, u: Float[Array, " inputs"]) -> Float[Array, " outputs"]:
+        value = jnp.atleast_1d(jnp.asarray(self.function(*u), u.dtype))
+        return value if self.output is None else jnp.zeros(self.outputs, u.dtype).at[self.output].set(value[0])
+
+    def expressions(self, symbols: tuple[sympy.Symbol, ...]) -> tuple[sympy.Expr, ...]:
+        """As an undefined function of SymPy's."""
+        if self.output is not None:
+            whole = sympy.Function(self.label)(*symbols)
+            return tuple(whole if k == self.output else sympy.Integer(0) for k in range(self.outputs))
+        names = [self.label] if self.outputs == 1 else [f"{self.label}{k}" for k in range(self.outputs)]
+        return tuple(sympy.Function(name)(*symbols) for name in names)
+
+
+@functools.lru_cache(maxsize=256)
+def _kernel(symbols: tuple[sympy.Symbol, ...], written: tuple[sympy.Expr, ...]) -> Kernel:
+    return Kernel([read(e, lambda s: s) for e in written], symbols)
+
+
+def local_name(name: str) -> str:
+    """A variable's name in its component."""
+    return name.rpartition(".")[2]
