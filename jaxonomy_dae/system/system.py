@@ -240,7 +240,9 @@ class AcausalSystem(eqx.Module):
             if not table.n_relations:
                 return array
             hidden = jnp.asarray(table.values[table.n_declared : table.n_declared + table.n_relations], array.dtype)
-            return jnp.concatenate([array, jnp.broadcast_to(hidden, (*array.shape[:-1], len(hidden)))], axis=-1)
+            hidden = jnp.broadcast_to(hidden, (*array.shape[:-1], len(hidden)))
+            shown = array[..., table.discrete[: len(table.discrete) - table.n_relations]]
+            return jnp.concatenate([array, hidden, shown, hidden], axis=-1)
         values = self.discrete_values
         return jnp.concatenate([array, values[..., events.n_visible :], values], axis=-1)
 

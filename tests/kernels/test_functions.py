@@ -240,3 +240,16 @@ def test_a_negative_base_is_not_a_number():
     m, q = map(float, jax.jit(lambda: system.observe(["c.m", "c.q"], 0.0, system.initialize()))())
     assert abs(q - 0.1 * (200 - m) ** 0.6) < 1e-9
     assert abs(q - 0.1 * (m - 1) ** 0.5) < 1e-9
+
+
+def test_a_whole_part_in_a_nonlinear_block():
+    """It is no event there, and none is left; what its events would have written still stands in the program."""
+
+    def write(c, t):
+        x, z = c.variable("x", start=2.5, fixed=True), c.variable("z", start=0.0)
+        c.add_equations(Eq(der(x), -x), Eq(z + z**3, sympy.floor(x + 0.01 * z) + c.parameter("p", 0.1)))
+
+    system = compiled(write)
+    assert system.plan.events is None
+    z = float(system.observe(["c.z"], 0.0, system.initialize())[0])
+    assert z + z**3 == pytest.approx(2.1, rel=1e-12)
