@@ -9,6 +9,7 @@ from .fit import Fit as Fit
 from .fit import fit as fit
 from .fit import fit_least_squares as fit_least_squares
 from .identifiability import Identifiability as Identifiability
+from .multiple_shooting import Shooting as Shooting
 from .prediction import Prediction as Prediction
 from .problem import Problem as Problem
 from .table import Table as Table

@@ -97,7 +97,7 @@ class Estimate:
 
     @property
     def _noise(self) -> float:
-        return dict(self.objective.layout.options)["rtol"]
+        return self.minimum.noise
 
     @functools.cached_property
     def root(self) -> Float[np.ndarray, "p r"]:

@@ -21,9 +21,13 @@ from .experiment import Experiment, Unknown
 from .first_order import adam_steps
 from .holdout import holdout_score
 from .identifiability import Identifiability, identifiability
-from .least_squares import Minimum, minimise
+from .least_squares import Minimum, Weights, minimise
+from .multiple_shooting import Shooting, shoot
 from .objective import Objective
 from .program import Layout, predict, weights_of, with_values
+
+METHODS = ("single", "growing")
+GROWING = tuple(k / 10 for k in range(1, 11))  # shares of the time
 
 
 class Problem:
@@ -44,6 +48,8 @@ class Problem:
         laws.
     - `observe`: derived outputs by name, `{"gauge.y": law}`, with `law(solution)` of shape `(n,)`: a function, or an
         Equinox module whose weights may be trained.
+    - `method`: `"single"`, each experiment is one run; `"growing"`, the same with growing `horizons`; or
+        `Shooting(...)`, multiple shooting, for what diverges.
     - `rtol`, `atol`, `max_steps`, and others in `options`: as in `simulate`.
 
     **Raises:**
@@ -61,6 +67,7 @@ class Problem:
         starts: Mapping[str, Any] | None = None,
         regularize: Mapping[str, Any] | str | float | None = "evidence",
         observe: Mapping[str, Any] | None = None,
+        method: str | Shooting = "single",
         rtol: float = 1e-6,
         atol: float = 1e-8,
         max_steps: int = 4096,
@@ -82,6 +89,7 @@ class Problem:
         self._stacked = self._stack(self.data)
         self._layout = self._laid_out(self._stacked)
         self.penalties = self._penalties(regularize)
+        self.method = self._method(method)
 
     # --- set-up ------------------------------------------------------------------------------------------------
 
@@ -170,6 +178,22 @@ class Problem:
                 raise ModelError(f"regularize: '{name}' takes 'evidence', a precision ≥ 0 or None; got {value!r}")
         return {name: given.get(name) for name in modules}
 
+    def _method(self, given: Any) -> str | Shooting:
+        if given not in METHODS and not isinstance(given, Shooting):
+            raise ModelError(f"method is 'single', 'growing' or Shooting(nodes=30); got {given!r}")
+        plan = self.system.plan
+        if isinstance(given, Shooting) and self.system.discretes:
+            raise ModelError(
+                f"method: '{self.system.discretes[0]}' is a discrete variable, which the nodes of multiple shooting do "
+                "not carry from segment to segment: use method='growing'"
+            )
+        if isinstance(given, Shooting) and plan.held is not None:
+            raise ModelError(
+                "method: constraints of this model come and go with its modes, so that the nodes of multiple shooting "
+                "have no fixed number of degrees of freedom: use method='growing'"
+            )
+        return given
+
     # --- residuals ---------------------------------------------------------------------------------------------
 
     def residuals(
@@ -233,7 +257,7 @@ class Problem:
         seed: int = 0,
         adam: int = 0,
         learning_rate: float = 0.02,
-        horizons: Sequence[float] = (1.0,),
+        horizons: Sequence[float] | None = None,
         steps: int = 200,
     ) -> Estimate:
         """The most probable values: least squares in units of the noise, with the priors that were given.
@@ -249,7 +273,7 @@ class Problem:
             the least score on experiments that are held out, or else of the least cost.
         - `adam`: so many gradient steps at first, with `learning_rate` on the scale of the coordinates.
         - `horizons`: shares of the time that are fitted one after the other, such as `(0.25, 0.5, 1)`: what diverges
-            over the whole time is caught early.
+            over the whole time is caught early. None: all of it, or with `method="growing"`, ten of them.
         - `steps`: how many steps of least squares at most.
 
         **Raises:**
@@ -266,6 +290,10 @@ class Problem:
         objective = self._objective(stacked, c)
         if not objective.free.any():
             raise ModelError("everything is frozen: there is nothing to fit")
+        if isinstance(self.method, Shooting) and (adam or horizons is not None):
+            raise ModelError("adam and horizons belong to single shooting: leave them out, or use method='single'")
+        if horizons is None:
+            horizons = GROWING if self.method == "growing" else (1.0,)
         shares = [float(share) for share in horizons]
         if not shares or shares[-1] != 1.0 or any(not 0 < share <= 1 for share in shares):
             raise ModelError(f"horizons are shares in (0, 1], the last of them 1; got {tuple(horizons)}")
@@ -318,6 +346,8 @@ class Problem:
     def _descend(
         self, objective: Objective, point: np.ndarray, shares: list[float], steps: int, adam: int, rate: float
     ) -> Minimum | None:
+        if isinstance(self.method, Shooting):
+            return shoot(objective, self.method, point, steps, self._options["rtol"])
         found = None
         for share in shares:
             here = objective.until(share)
@@ -331,6 +361,19 @@ class Problem:
                 return None
             point = found.z
         return found
+
+    def reach(self, objective: Objective, start: np.ndarray, weights: Weights) -> Minimum | None:
+        """The minimum next to a start, with weights that stay as they are."""
+        rtol = self._options["rtol"]
+        if isinstance(self.method, Shooting):
+            return shoot(objective, self.method, start, 200, rtol, weights)
+        if not len(start):
+            found = objective.evaluate(start)
+            if found is None:
+                return None
+            cost = weights.cost(start, found.residual)
+            return Minimum(start, found, weights, cost, [cost], 1, True, "nothing is searched", rtol)
+        return minimise(objective.evaluate, objective.residual, start, objective.bounds, lambda *_: weights, noise=rtol)
 
     def _score(self, objective: Objective, found: Minimum) -> float:
         """The root mean square of the residuals of experiments that are held out, in units of the noise."""
