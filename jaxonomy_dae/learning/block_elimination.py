@@ -19,25 +19,33 @@ from jaxtyping import Float
 
 @dataclasses.dataclass(frozen=True)
 class Blocks:
-    """Rows of e experiments with N segments of m samples, states of g entries and nodes of d degrees of freedom, and q
-    numbers common to the segments of an experiment."""
+    """Rows of e experiments with N = M + 1 segments of m samples, states of g entries, nodes of d degrees of freedom,
+    and q numbers common to the segments of an experiment."""
 
     residual: Float[np.ndarray, "e N m"]  # r
     by_node: Float[np.ndarray, "e N m d"]  # J
     by_common: Float[np.ndarray, "e N m q"]  # P
-    gap: Float[np.ndarray, "e N-1 g"]  # c
-    leave: Float[np.ndarray, "e N-1 g d"]  # L
-    arrive: Float[np.ndarray, "e N-1 g d"]  # E
-    gap_by_common: Float[np.ndarray, "e N-1 g q"]  # B
+    gap: Float[np.ndarray, "e M g"]  # c
+    leave: Float[np.ndarray, "e M g d"]  # L
+    arrive: Float[np.ndarray, "e M g d"]  # E
+    gap_by_common: Float[np.ndarray, "e M g q"]  # B
     first: Float[np.ndarray, "e d q"]  # G
 
-    def weighted(self, row: Float[np.ndarray, "e N m"], continuity: float, shift: Float[np.ndarray, "e N-1 g"]):
+    def weighted(self, row: Float[np.ndarray, "e N m"], continuity: float, shift: Float[np.ndarray, "e M g"]):
         """Rows of data times their weights, and of continuity times one weight, with its residuals shifted."""
         return Blocks(
             row * self.residual, row[..., None] * self.by_node, row[..., None] * self.by_common,
             continuity * self.gap + shift, continuity * self.leave, continuity * self.arrive,
             continuity * self.gap_by_common, self.first,
         )  # fmt: skip
+
+    @property
+    def local(self) -> Float[np.ndarray, "e r q"]:
+        """What common numbers do to the rows of each segment alone, nodes held."""
+        data = np.array(self.by_common)
+        data[:, 0] += self.by_node[:, 0] @ self.first
+        e, q = len(data), data.shape[-1]
+        return np.concatenate([data.reshape(e, -1, q), self.gap_by_common.reshape(e, -1, q)], axis=1)
 
     @property
     def sizes(self) -> Float[np.ndarray, "e N d"]:
@@ -55,7 +63,7 @@ class Eliminated(NamedTuple):
     residual: Float[np.ndarray, "e r"]
     kept: list[Float[np.ndarray, "e d _"]]  # rows [δₖ | δₖ₊₁ | π | residual] for nodes 1, 2, …
 
-    def nodes(self, common: Float[np.ndarray, "e q"]) -> Float[np.ndarray, "e N-1 d"]:
+    def nodes(self, common: Float[np.ndarray, "e q"]) -> Float[np.ndarray, "e M d"]:
         """The moves of the nodes but the first that belong to π."""
         experiments, q = common.shape
         moves: list[np.ndarray] = []
@@ -118,8 +126,8 @@ def _triangle(rows: Float[np.ndarray, "e r c"]) -> Float[np.ndarray, "e s c"]:
 
 
 def linear(
-    b: Blocks, common: Float[np.ndarray, "e q"], nodes: Float[np.ndarray, "e N-1 d"]
-) -> tuple[Float[np.ndarray, "e N m"], Float[np.ndarray, "e N-1 g"]]:
+    b: Blocks, common: Float[np.ndarray, "e q"], nodes: Float[np.ndarray, "e M d"]
+) -> tuple[Float[np.ndarray, "e N m"], Float[np.ndarray, "e M g"]]:
     """The rows of data and of continuity after a move."""
     first = np.einsum("edq,eq->ed", b.first, common)[:, None]
     moves = np.concatenate([first, nodes], axis=1) if nodes.shape[1] else first

@@ -24,7 +24,7 @@ from .node_guesses import node_guesses, sizes
 from .objective import Objective
 from .segments import Point, Segments
 
-WEIGHTS = 10.0 ** np.arange(1, 6)  # of gaps in units of the states' ranges: at first a tenth costs one σ
+WEIGHTS = (10.0, 1e2, 1e3, 1e4, 1e5)  # of gaps in units of the states' ranges: at first a tenth costs one σ
 FEW = 10  # steps at each weight but the last
 SETTLED = 0.01  # relative decrease of the cost by a step, below which the weight grows
 CLOSED = 0.1  # gaps that count as none, in units of the integration's relative tolerance
@@ -56,7 +56,7 @@ class ShootingMinimum(Minimum):
 
     nodes: Float[np.ndarray, "e N"]
     states: Float[np.ndarray, "e N n"]
-    gaps: Float[np.ndarray, "e N-1 g"]
+    gaps: Float[np.ndarray, "e M g"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Merit:
     segments: Segments
     weights: Weights
     continuity: float
-    multiplier: Float[np.ndarray, "e N-1 g"]
+    multiplier: Float[np.ndarray, "e M g"]
 
     def cost(self, point: Point) -> float:
         """½ Σ |rows|²."""
@@ -102,6 +102,7 @@ class Descent:
     segments: Segments
     size: Float[np.ndarray, " n"]
     bounds: tuple[Float[np.ndarray, " f"], Float[np.ndarray, " f"]]
+    tolerance: float
     damping: float = 1e-3
     evaluations: int = 1
 
@@ -129,7 +130,9 @@ class Descent:
             self.damping *= 6
         return None
 
-    def _trial(self, merit: Merit, point: Point, blocks: Blocks, size: np.ndarray) -> tuple[np.ndarray, ...] | None:
+    def _trial(
+        self, merit: Merit, point: Point, blocks: Blocks, size: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, float] | None:
         """(coordinates, states at the nodes, cost that the linear rows promise) of a damped step."""
         segments, (low, high), z = self.segments, self.bounds, point.z
         left = eliminate(blocks, np.sqrt(self.damping) * size)
@@ -140,8 +143,12 @@ class Descent:
         moves = ~(((z <= low) & (gradient > 0)) | ((z >= high) & (gradient < 0)))
         step = np.zeros_like(z)
         if moves.any():
-            factors = Factors.of(residual, rows[:, moves], ROUNDED)
-            step[moves] = factors.step(self.damping, factors.rank(ROUNDED))
+            # Directions that no segment shows beyond the integration's error are not followed.
+            alone = segments.spread_out(blocks.local)[:, moves]
+            alone = np.concatenate([alone, prior[:, moves]])
+            seen = Factors.of(np.zeros(len(alone)), alone, self.tolerance).directions(self.tolerance)
+            factors = Factors.of(residual, rows[:, moves] @ seen, ROUNDED)
+            step[moves] = seen @ factors.step(self.damping, factors.rank(ROUNDED))
         new = np.clip(z + step, low, high)
         common = segments.common(new - z)
         nodes = left.nodes(common)
@@ -152,7 +159,7 @@ class Descent:
         states = np.array(point.states)
         if nodes.shape[1]:
             states[:, 1:] += np.einsum("eknd,ekd->ekn", point.bases[:, 1:], nodes)
-        return new, states, promised  # pyright: ignore[reportReturnType]
+        return new, states, promised
 
 
 def shoot(
@@ -184,7 +191,7 @@ def shoot(
     point = segments.evaluate(z, states, size)
     if point is None:
         return None
-    descent = Descent(segments, size, objective.bounds)
+    descent = Descent(segments, size, objective.bounds, tolerance)
     evidence = objective.evidence
     if weights is None:
         weights = objective.weights(z, segments.evaluation(point))
@@ -203,12 +210,12 @@ def shoot(
             point, gain = found
             if gain < SETTLED * cost:
                 break
-        merit, _, _ = _reweighed(merit, point, evidence)
+        merit, _, _ = _reweighed(merit, point, evidence, tolerance)
     merit = merit.heavier(WEIGHTS[-1])
     converged, message = False, f"stopped after {steps} steps, not yet converged; steps= allows more"
     idle = 0
     for k in range(steps + 1):
-        merit, settled, remaining = _reweighed(merit, point, evidence)
+        merit, settled, remaining = _reweighed(merit, point, evidence, tolerance)
         widest = float(np.abs(point.blocks.gap).max(initial=0.0))
         cost = merit.cost(point)
         history.append(cost)
@@ -227,13 +234,22 @@ def shoot(
             break
         merit = merit.updated(point)
     found = segments.evaluation(point)
+    noise = _noise(merit, point, merit.weights.applied(point.z, found).jacobian, tolerance)
     return ShootingMinimum(
         point.z, found, merit.weights, merit.weights.cost(point.z, found.residual), history, descent.evaluations,
-        converged, message, ROUNDED, segments.nodes[:, :-1], point.states, point.blocks.gap,
+        converged, message, noise, segments.nodes[:, :-1], point.states, point.blocks.gap,
     )  # fmt: skip
 
 
-def _reweighed(merit: Merit, point: Point, evidence: Evidence | None) -> tuple[Merit, bool, float]:
+def _noise(merit: Merit, point: Point, jacobian: Float[np.ndarray, "m f"], tolerance: float) -> float:
+    """The relative error of a Jacobian without nodes: a segment's is known to the tolerance, and what amplifies it does
+    so by factors that are known as well."""
+    alone = np.linalg.norm(merit.segments.spread_out(merit.blocks(point.blocks).local), axis=0).max(initial=0.0)
+    largest = np.linalg.norm(jacobian, axis=0).max(initial=0.0)
+    return float(np.clip(tolerance * alone / largest if largest > 0 else tolerance, ROUNDED, tolerance))
+
+
+def _reweighed(merit: Merit, point: Point, evidence: Evidence | None, tolerance: float) -> tuple[Merit, bool, float]:
     """The merit with better noise levels and priors, whether these have settled, and the remaining step in radii of the
     confidence region, were continuity to hold."""
     z, (low, high) = point.z, merit.segments.objective.bounds
@@ -241,8 +257,9 @@ def _reweighed(merit: Merit, point: Point, evidence: Evidence | None) -> tuple[M
     residual, jacobian = merit.weights.applied(z, found)
     gradient = jacobian.T @ residual
     moves = ~(((z <= low) & (gradient > 0)) | ((z >= high) & (gradient < 0)))
-    factors = Factors.of(residual, jacobian[:, moves], ROUNDED)
-    remaining = offset(factors, 0.5 * float(residual @ residual), len(residual), ROUNDED)
+    noise = _noise(merit, point, jacobian, tolerance)
+    factors = Factors.of(residual, jacobian[:, moves], noise)
+    remaining = offset(factors, 0.5 * float(residual @ residual), len(residual), noise)
     if evidence is None or evidence.is_idle:
         return merit, True, remaining
     weights, settled = evidence.reweigh(z, found, merit.weights, factors, moves)

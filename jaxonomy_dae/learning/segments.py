@@ -13,7 +13,7 @@ from .block_elimination import Blocks, condensed
 from .least_squares import Evaluation
 from .objective import Objective
 from .program import Conditions
-from .shooting_program import first_states, on_constraints, run_segments
+from .shooting_program import Cut, first_states, on_constraints, run_segments
 
 ITERATIONS = 8  # Gauss–Newton steps onto the constraints
 
@@ -41,7 +41,7 @@ class Segments:
         return np.unique(self.objective.rows[0])
 
     @functools.cached_property
-    def nodes(self) -> Float[np.ndarray, "e N+1"]:
+    def nodes(self) -> Float[np.ndarray, "e _"]:
         """The times at which segments begin, and the last time."""
         s = self.objective.stacked
         first, last = s.t0[self.experiments, None], s.times[self.experiments, -1:]
@@ -76,14 +76,12 @@ class Segments:
         return self._placed[1]
 
     @functools.cached_property
-    def conditions(self) -> Conditions:
-        """What the programs are told; times and beginnings are those of the segments."""
+    def cut(self) -> Cut:
+        """What the programs are told."""
         c, dtype = self.objective.conditions, self.objective.system.parameters.values.dtype
         chosen = self.experiments
         inputs = {n: (t[chosen], v[chosen]) for n, (t, v) in c.inputs.items()}
-        return Conditions(
-            jnp.asarray(self._placed[0], dtype), jnp.asarray(self.nodes[:, :-1], dtype), c.known[chosen], inputs
-        )
+        return Cut(jnp.asarray(self._placed[0], dtype), jnp.asarray(self.nodes[:, :-1], dtype), c.known[chosen], inputs)
 
     @functools.cached_property
     def columns(self) -> tuple[Int[np.ndarray, "e q"], Bool[np.ndarray, "e q"]]:
@@ -101,7 +99,7 @@ class Segments:
         place, searched = self.columns
         return np.where(searched, z[place] if len(z) else 0.0, 0.0)
 
-    def spread_out(self, rows: Float[np.ndarray, "e r q"]) -> Float[np.ndarray, "e*r f"]:
+    def spread_out(self, rows: Float[np.ndarray, "e r q"]) -> Float[np.ndarray, "rows f"]:
         """Rows by experiment with the columns of all coordinates that are searched."""
         place, searched = self.columns
         out = np.zeros((*rows.shape[:2], int(self.objective.free.sum())))
@@ -139,12 +137,13 @@ class Segments:
 
     def first(self, z: Float[np.ndarray, " f"]) -> tuple[np.ndarray, np.ndarray] | None:
         """The states at which experiments start, shape (e, n), and their derivatives, shape (e, n, q)."""
-        o, c = self.objective, self.conditions
+        o, c = self.objective, self.cut
         shared, own = self._numbers(z)
         start = Conditions(c.times[:, 0], c.t0[:, 0], c.known, c.inputs)
         found = first_states(o.system, o.observers, o.layout, shared, own, start)
         x, by_shared, by_own = (np.asarray(a, np.float64) for a in found)
-        slope = np.concatenate([by_shared, by_own], axis=-1) * self._slopes(z)[:, None]
+        with np.errstate(invalid="ignore", over="ignore"):
+            slope = np.concatenate([by_shared, by_own], axis=-1) * self._slopes(z)[:, None]
         return (x, slope) if np.isfinite(x).all() and np.isfinite(slope).all() else None
 
     def evaluate(
@@ -169,7 +168,8 @@ class Segments:
             found = np.asarray(getattr(slopes, name), np.float64)
             out = np.zeros((*found.shape[:-1], q.shape[1]))
             out[..., list(self.moving)] = found[..., :count]
-            return out * q.reshape(e, *(1,) * (found.ndim - 2), -1)
+            with np.errstate(invalid="ignore", over="ignore"):
+                return out * q.reshape(e, *(1,) * (found.ndim - 2), -1)
 
         def node(name: str) -> np.ndarray:
             return np.asarray(getattr(slopes, name), np.float64)[..., count:]
@@ -212,9 +212,7 @@ class Segments:
         if not np.isfinite(states).all() or not np.isfinite(directions).all():
             return None
         x, bases = jnp.asarray(states, shared.dtype), jnp.asarray(directions, shared.dtype)
-        return directions, run_segments(
-            o.system, o.observers, o.layout, self.moving, shared, own, x, bases, self.conditions
-        )
+        return directions, run_segments(o.system, o.observers, o.layout, self.moving, shared, own, x, bases, self.cut)
 
     def ends(self, z: Float[np.ndarray, " f"], states: Float[np.ndarray, "e N n"]) -> Float[np.ndarray, "e N n"]:
         """Where segments end that begin at these states; NaN where a run fails."""
@@ -230,7 +228,7 @@ class Segments:
             return states, np.broadcast_to(np.diag(size), (*states.shape, n))
         found = on_constraints(
             o.system, o.observers, o.layout, ITERATIONS, shared, own, jnp.asarray(states, shared.dtype),
-            self.conditions,
+            self.cut,
         )  # fmt: skip
         states, slope = (np.asarray(a, np.float64) for a in found)
         if not np.isfinite(slope).all():

@@ -16,6 +16,16 @@ from ..system.system import AcausalSystem
 from .program import Conditions, Layout, outputs_of, placed, with_kinds
 
 
+class Cut(eqx.Module):
+    """What programs are told of e experiments, each in N segments: l times from the start of a segment to its end, its
+    start, known starts, and inputs over the whole time."""
+
+    times: Float[Array, "e N l"]
+    t0: Float[Array, "e N"]
+    known: Float[Array, "e known"]
+    inputs: dict[str, tuple[Float[Array, "e _"], Float[Array, "e _"]]]
+
+
 class Ran(eqx.Module):
     """What segments gave: outputs at l times, and the consistent states of n entries at both ends."""
 
@@ -45,10 +55,10 @@ def first_states(
 @compiled
 def on_constraints(
     system: AcausalSystem, observers: dict[str, Any], layout: Layout, iterations: int, shared: Any, own: Any,
-    states: Any, conditions: Conditions,
+    states: Any, cut: Cut,
 ) -> tuple[Float[Array, "e N n"], Float[Array, "e N n f"]]:  # fmt: skip
     """The states at the nodes moved onto the constraints, and the derivatives there of this projection by the f
-    differential states. `conditions.t0` has shape (e, N)."""
+    differential states."""
     f = len(system.plan.states)
 
     def one(shared, own, x, t, c):
@@ -61,19 +71,17 @@ def on_constraints(
     def each(own, states, c):
         return jax.vmap(lambda x, t: one(shared, own, x, t, c))(states, c.t0)
 
-    return jax.vmap(each)(own, states, conditions)
+    return jax.vmap(each)(own, states, cut)
 
 
 @compiled
 def run_segments(
     system: AcausalSystem, observers: dict[str, Any], layout: Layout, moving: tuple[int, ...], shared: Any, own: Any,
-    states: Any, bases: Any, conditions: Conditions,
+    states: Any, bases: Any, cut: Cut,
 ) -> tuple[Ran, Ran]:  # fmt: skip
     """All segments, from states at the nodes; and their derivatives, in a last axis, by numbers common to segments, at
-    the places `moving` in [shared | own], and by the coefficients of `bases`, shape (e, N, n, d), in which nodes move.
-
-    `conditions.times` has shape (e, N, l), from the start of a segment to its end.
-    """
+    the places `moving` in [shared | own], and by the coefficients of `bases`, shape (e, N, n, d), along which nodes
+    move."""
     count, places = len(moving), np.array(moving, int)
 
     def one(moved, shared, own, x, basis, times, t0, c):
@@ -96,4 +104,4 @@ def run_segments(
     def each(own, states, bases, c):
         return jax.vmap(lambda x, b, times, t0: with_slopes(own, x, b, times, t0, c))(states, bases, c.times, c.t0)
 
-    return jax.vmap(each)(own, states, bases, conditions)
+    return jax.vmap(each)(own, states, bases, cut)

@@ -37,7 +37,7 @@ def same_outcome(one, other):
             np.testing.assert_allclose(other.residuals[label][name], residual, atol=5e-3)
 
 
-# --- a constrained model: two experiments of different lengths, missing samples, a noise level that is estimated --------
+# --- a constrained model ----------------------------------------------------------------------------------------------
 
 
 def drag(t, v, theta):
@@ -88,7 +88,7 @@ def test_a_constrained_model(pendulum):
     assert shot.holdout_score == pytest.approx(single.holdout_score, rel=1e-4)
 
 
-# --- an input, a network, a sensor law, starts that are shared and own -------------------------------------------------
+# --- an input, a network, a sensor law, starts that are shared and own ------------------------------------------------
 
 
 class Driven(Component):
