@@ -75,6 +75,14 @@ def growth(times=TIMES, step=1e-9):
     return np.abs(change).max() / step
 
 
+def deviations(fit):
+    """How far the parameters found are from the truth, in standard deviations that the fit gives."""
+    c = fit.objective.coordinates
+    place = [c.names.index(name) for name in TRUTH]
+    truth = c.scaled(np.array([TRUTH.get(name, value) for name, value in fit.values.items()]))
+    return ((fit.point - truth) / fit.spread)[place]
+
+
 def main(seeds, methods):
     print(f"a disturbance grows by {growth():.2g}")
     start = time.perf_counter()
@@ -87,9 +95,7 @@ def main(seeds, methods):
             start, cpu = time.perf_counter(), time.process_time()
             fit = problem.fit(record(seed))
             took = time.perf_counter() - start, time.process_time() - cpu
-            place = [fit.objective.coordinates.names.index(name) for name in TRUTH]
-            z = fit.objective.coordinates.scaled(_natural(fit))
-            off = (z - fit.point)[place] / fit.spread[place]
+            off = deviations(fit)
             good = bool(fit.chi2 < 1.3 * fit.freedom and (np.abs(off) < 4).all())
             found.append(good)
             values = ", ".join(f"{fit.values[name]:.5f}" for name in TRUTH)
@@ -102,11 +108,6 @@ def main(seeds, methods):
                 flush=True,
             )
         print(f"{method}: {sum(found)} of {len(found)}", flush=True)
-
-
-def _natural(fit):
-    """The values found, with the truth in place of the parameters that were searched."""
-    return np.array([TRUTH.get(name, value) for name, value in fit.values.items()])
 
 
 if __name__ == "__main__":

@@ -24,8 +24,10 @@ from .node_guesses import node_guesses, sizes
 from .objective import Objective
 from .segments import Point, Segments
 
-WEIGHTS = (10.0, 1e2, 1e3, 1e4, 1e5)  # of gaps in units of the states' ranges: at first a tenth costs one σ
-FEW = 10  # steps at each weight but the last
+WEIGHTS = (10.0, 1e2, 1e3)  # of gaps in units of the states' ranges: at first a tenth costs one σ
+HEAVIEST = 1e7  # in the end, if multipliers alone do not close them
+SHRINK = 0.25  # of gaps from one set of multipliers to the next, as in LANCELOT (Conn, Gould & Toint 1992)
+FEW = 10  # steps at each of these weights
 SETTLED = 0.01  # relative decrease of the cost by a step, below which the weight grows
 CLOSED = 0.1  # gaps that count as none, in units of the integration's relative tolerance
 ROUNDED = 1e-12  # relative rounding errors of a segment's Jacobian, of some thousand operations
@@ -199,7 +201,7 @@ def shoot(
         evidence = None
     merit = Merit(segments, weights, WEIGHTS[0], np.zeros_like(point.blocks.gap))
     history = []
-    for continuity in WEIGHTS[:-1]:
+    for continuity in WEIGHTS:
         merit = merit.heavier(continuity)
         for _ in range(FEW):
             cost = merit.cost(point)
@@ -211,28 +213,31 @@ def shoot(
             if gain < SETTLED * cost:
                 break
         merit, _, _ = _reweighed(merit, point, evidence, tolerance)
-    merit = merit.heavier(WEIGHTS[-1])
     converged, message = False, f"stopped after {steps} steps, not yet converged; steps= allows more"
-    idle = 0
+    idle, before = 0, np.inf
     for k in range(steps + 1):
-        merit, settled, remaining = _reweighed(merit, point, evidence, tolerance)
+        history.append(merit.cost(point))
         widest = float(np.abs(point.blocks.gap).max(initial=0.0))
-        cost = merit.cost(point)
-        history.append(cost)
-        if settled and widest <= CLOSED * tolerance and (remaining <= OFFSET or idle >= PATIENCE):
-            converged, message = True, f"converged after {len(history) - 1} steps"
-            break
-        if k == steps:
-            break
-        found = descent.step(merit, point)
         gain = 0.0
+        found = descent.step(merit, point) if k < steps else None
         if found is not None:
             point, gain = found
-        idle = 0 if gain > GAIN * cost else idle + 1
-        if idle > 2 * PATIENCE:
+        left = 0.5 * merit.continuity**2 * float(np.sum(point.blocks.gap**2))
+        idle = 0 if gain > max(GAIN * history[-1], OFFSET * len(point.z)) else idle + 1
+        if gain > left and not idle and k < steps:
+            continue
+        merit, settled, remaining = _reweighed(merit, point, evidence, tolerance)
+        widest = float(np.abs(point.blocks.gap).max(initial=0.0))
+        if settled and widest <= CLOSED * tolerance and (remaining <= OFFSET or idle > PATIENCE):
+            converged, message = True, f"converged after {len(history)} steps"
+            break
+        if idle > 3 * PATIENCE:
             message = f"stopped after {len(history)} steps: none gains more, and gaps of {widest:.2g} are left"
             break
         merit = merit.updated(point)
+        if widest > SHRINK * before and merit.continuity < HEAVIEST:
+            merit = merit.heavier(10 * merit.continuity)
+        before = widest
     found = segments.evaluation(point)
     noise = _noise(merit, point, merit.weights.applied(point.z, found).jacobian, tolerance)
     return ShootingMinimum(

@@ -74,10 +74,10 @@ def test_a_constrained_model(pendulum):
     release = "pend.initial_theta"
     data = learning.Data(
         swing(0, 50, -1.0, initial={release: learning.Unknown(-0.9)}),
-        swing(1, 30, -0.4, initial={release: learning.Unknown(-0.5)}, sigma="estimate"),
+        swing(1, 30, -0.4, initial={release: learning.Unknown(-0.5)}),
         swing(2, 40, -0.7, initial={release: learning.Unknown(-0.9)}, holdout=True, name="kept"),
     )
-    given = dict(train=["pend.L", "pend.m", "drag"], regularize=None)
+    given = dict(train=["pend.L", "pend.m", "drag"], regularize=None, rtol=1e-9, atol=1e-11)
     single = learning.Problem(pendulum, data, **given).fit()
     shot = learning.Problem(pendulum, data, method=learning.Shooting(nodes=4), **given).fit()
     same_outcome(single, shot)
@@ -165,9 +165,8 @@ def test_a_double_pendulum_over_twelve_seconds():
     for seed in (1, 2, 3):
         fit = problem.fit(double_pendulum.record(seed))
         assert fit.minimum.converged and 0.8 < fit.chi2 / fit.freedom < 1.2
-        for name, value in truth.items():
-            place = fit.objective.coordinates.names.index(name)
-            assert abs(np.log(fit.values[name] / value)) < 4 * fit.spread[place] < 0.02
+        assert (np.abs(double_pendulum.deviations(fit)) < 4).all()
+        np.testing.assert_allclose([fit.values[name] for name in truth], list(truth.values()), rtol=0.01)
         table = fit.table()
         assert all(table[name].note == "" for name in truth)
     single = learning.Problem(system, double_pendulum.record(1), train=list(truth)).fit()
