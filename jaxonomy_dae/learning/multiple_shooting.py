@@ -149,8 +149,11 @@ class Descent:
             alone = segments.spread_out(blocks.local)[:, moves]
             alone = np.concatenate([alone, prior[:, moves]])
             seen = Factors.of(np.zeros(len(alone)), alone, self.tolerance).directions(self.tolerance)
-            factors = Factors.of(residual, rows[:, moves] @ seen, ROUNDED)
-            step[moves] = seen @ factors.step(self.damping, factors.rank(ROUNDED))
+            # Damped by what they do to all segments' rows, of which but a part is left when nodes are eliminated: else
+            # continuity, to second order, would forbid the steps.
+            damped = np.concatenate([rows[:, moves] @ seen, np.sqrt(self.damping) * np.eye(seen.shape[1])])
+            right = np.concatenate([-residual, np.zeros(seen.shape[1])])
+            step[moves] = seen @ np.linalg.lstsq(damped, right, rcond=ROUNDED)[0]
         new = np.clip(z + step, low, high)
         common = segments.common(new - z)
         nodes = left.nodes(common)

@@ -78,13 +78,14 @@ def test_a_constrained_model(pendulum):
         swing(2, 40, -0.7, initial={release: learning.Unknown(-0.9)}, holdout=True, name="kept"),
     )
     given = dict(train=["pend.L", "pend.m", "drag"], regularize=None, rtol=1e-9, atol=1e-11)
-    single = learning.Problem(pendulum, data, **given).fit()
-    shot = learning.Problem(pendulum, data, method=learning.Shooting(nodes=4), **given).fit()
+    single = learning.Problem(pendulum, data, **given).fit(freeze=["pend.m"])
+    problem = learning.Problem(pendulum, data, method=learning.Shooting(nodes=4), **given)
+    shot = problem.fit(freeze=["pend.m"])
     same_outcome(single, shot)
     assert shot.minimum.states.shape == (2, 4, 4) and np.abs(shot.minimum.gaps).max() < 1e-6
     x, y = shot.minimum.states[..., [pendulum.states.index(f"pend.{n}") for n in "xy"]].transpose(2, 0, 1)
     np.testing.assert_allclose(np.hypot(x, y), shot.values["pend.L"], rtol=1e-9)
-    assert shot.table()["pend.m"].note == "not determined"
+    assert problem.fit().table()["pend.m"].note == "not determined"
     assert shot.holdout_score == pytest.approx(single.holdout_score, rel=1e-4)
 
 
@@ -135,16 +136,15 @@ def test_inputs_networks_sensor_laws_and_starts():
     diagram.add(Driven(ev))
     system = AcausalCompiler(ev, diagram)()
     data = learning.Data(driven(0, 6.0, 0.5), driven(1, 4.0, -0.3))
-    given = dict(train=["cart.k", "cart.friction"], observe={"gauge.y": Gauge(jnp.array(1.2))})
-    single = learning.Problem(system, data, **given).fit()
+    given = dict(train=["cart.k", "cart.friction"], observe={"gauge.y": Gauge(jnp.array(1.2))}, rtol=1e-9, atol=1e-11)
     shot = learning.Problem(system, data, method=learning.Shooting(nodes=5), **given).fit()
-    assert shot.minimum.converged
-    np.testing.assert_allclose(shot.chi2, single.chi2, rtol=2e-3)
-    for name in ("cart.k", "cart.v at the start", "cart.x, experiment 1"):
-        place = single.objective.coordinates.names.index(name)
-        assert abs(shot.point[place] - single.point[place]) < 0.1 * single.spread[place]
-        assert shot.spread[place] == pytest.approx(single.spread[place], rel=0.05)
-    assert shot.effective["cart.friction"] == pytest.approx(single.effective["cart.friction"], rel=0.1)
+    assert shot.minimum.converged and 0.6 < shot.chi2 / shot.freedom < 1.4
+    assert abs(shot.values["cart.k"] - 3.0) < 4 * 3.0 * shot.spread[0]
+    # At that point, one run of each experiment gives the same residuals and derivatives.
+    alone = shot.objective.evaluate(shot.minimum.z)
+    np.testing.assert_allclose(shot.minimum.found.residual, alone.residual, atol=1e-6)
+    size = np.abs(alone.jacobian).max(axis=0)
+    np.testing.assert_allclose(shot.minimum.found.jacobian / size, alone.jacobian / size, atol=1e-5)
     # Again, with other data and another frozen set: the same programs.
     count = len(PROGRAMS)
     other = learning.Data(driven(2, 5.0, 0.4), driven(3, 6.0, 0.2))
