@@ -13,4 +13,7 @@ from .multiple_shooting import Shooting as Shooting
 from .prediction import Prediction as Prediction
 from .problem import Problem as Problem
 from .table import Table as Table
+from .training import GradientSteps as GradientSteps
+from .training import Training as Training
+from .training import Update as Update
 from .whiteness import Whiteness as Whiteness

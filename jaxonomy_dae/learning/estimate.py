@@ -21,6 +21,7 @@ from .prediction import Prediction, prediction
 from .profile import profile
 from .program import with_values
 from .table import Row, Table
+from .training import Training
 from .whiteness import Whiteness, whiteness
 
 if TYPE_CHECKING:
@@ -35,6 +36,7 @@ class Estimate:
     - `minimum`: where the descent ended: its `history`, `converged`, `message`, and weighted with `minimum.weights` its
         residuals and Jacobian.
     - `point`: all coordinates there, as `objective.coordinates` names them.
+    - `training`: what came before least squares, with `first=`.
     """
 
     problem: "Problem"
@@ -43,14 +45,17 @@ class Estimate:
     point: Float[np.ndarray, " p"]
     system: AcausalSystem
     observers: dict[str, Any]
+    training: Training | None = None
 
     @classmethod
-    def of(cls, problem: "Problem", objective: Objective, minimum: Minimum) -> "Estimate":
+    def of(
+        cls, problem: "Problem", objective: Objective, minimum: Minimum, training: Training | None = None
+    ) -> "Estimate":
         """The estimate at a minimum."""
-        point = with_own_starts(objective, minimum)
+        point = with_own_starts(objective, minimum.z, minimum.weights)
         shared, _ = objective.numbers(objective.coordinates.natural(point))
         system, observers, _ = with_values(objective.system, objective.observers, objective.layout, shared)
-        return cls(problem, objective, minimum, point, system, observers)
+        return cls(problem, objective, minimum, point, system, observers, training)
 
     def __repr__(self):
         score = f", held out {self.holdout_score:.3g} σ" if self.objective.stacked.holdout.any() else ""
@@ -280,4 +285,4 @@ class Estimate:
         """The root mean square of residuals of experiments held out, in units of the noise; NaN if there are none."""
         if not self.objective.stacked.holdout.any():
             return float("nan")
-        return holdout_score(self.objective, self.minimum)
+        return holdout_score(self.objective, self.minimum.z, self.minimum.weights)

@@ -25,6 +25,7 @@ from .least_squares import Minimum, Weights, minimise
 from .multiple_shooting import Shooting, shoot
 from .objective import Objective
 from .program import Layout, predict, weights_of, with_values
+from .training import GradientSteps, Training, train
 
 METHODS = ("single", "growing")
 GROWING = tuple(k / 10 for k in range(1, 11))  # shares of the time
@@ -251,8 +252,9 @@ class Problem:
         data: Data | Experiment | None = None,
         *,
         freeze: Mapping[str, float] | Iterable[str] = (),
-        start: "Mapping[str, float] | AcausalSystem | None" = None,
+        start: "Mapping[str, float] | AcausalSystem | Training | None" = None,
         bounds: Mapping[str, tuple[float, float]] | None = None,
+        first: GradientSteps | None = None,
         starts: int = 1,
         seed: int = 0,
         adam: int = 0,
@@ -266,8 +268,10 @@ class Problem:
 
         - `data`: other data than the problem's. If they have the same shapes and unknown starts, nothing is compiled.
         - `freeze`: parameters, starts and networks that stay as they are, or `{name: value}`.
-        - `start`: where the search begins, values by name; or a system, such as that of an earlier estimate.
+        - `start`: where the search begins, values by name; or a system, such as that of an earlier estimate; or what
+            `train` returned.
         - `bounds`: narrower than those declared, by name.
+        - `first`: steps of an optimizer of Optax before those of least squares; `estimate.training` is their history.
         - `starts`: from how many points; all but the first are drawn around it by `seed`: parameters within a factor of
             e or their bounds, starts by their spread, networks with weights of the same sizes. The best is the one of
             the least score on experiments that are held out, or else of the least cost.
@@ -281,15 +285,11 @@ class Problem:
         - `ModelError` for names, values and shapes that do not fit.
         - `SimulationError` if no start can be simulated, with the reason of the first.
         """
-        stacked = self._stacked if data is None else self._stack(data)
-        if stacked is not self._stacked and self._laid_out(stacked) != self._layout:
-            raise ModelError(
-                "these data name other outputs, inputs or unknown starts than the problem's: make a Problem of them"
-            )
-        c = self._coordinates(stacked, freeze, start, bounds)
-        objective = self._objective(stacked, c)
-        if not objective.free.any():
-            raise ModelError("everything is frozen: there is nothing to fit")
+        objective = self._prepared(data, freeze, start, bounds)
+        stacked = objective.stacked
+        if first is not None and (adam or (starts > 1 and first.checkpoint is not None)):
+            other = "adam=" if adam else "a checkpoint with several starts"
+            raise ModelError(f"first= does not go with {other}: leave one of them out")
         if isinstance(self.method, Shooting) and (adam or horizons is not None):
             raise ModelError("adam and horizons belong to single shooting: leave them out, or use method='single'")
         if horizons is None:
@@ -297,17 +297,56 @@ class Problem:
         shares = [float(share) for share in horizons]
         if not shares or shares[-1] != 1.0 or any(not 0 < share <= 1 for share in shares):
             raise ModelError(f"horizons are shares in (0, 1], the last of them 1; got {tuple(horizons)}")
-        best: tuple[float, Minimum, Objective] | None = None
+        best: tuple[float, Minimum, Training | None] | None = None
         for point in self._points(objective, starts, seed):
+            training = None
+            if first is not None:
+                training = train(self, objective, point, first)
+                point = training.z
             found = self._descend(objective, point, shares, steps, adam, learning_rate)
             if found is None:
                 continue
-            score = self._score(objective, found) if stacked.holdout.any() else found.cost
+            score = holdout_score(objective, found.z, found.weights) if stacked.holdout.any() else found.cost
             if best is None or score < best[0]:
-                best = score, found, objective
+                best = score, found, training
         if best is None:
-            raise SimulationError(self._why(objective))
-        return Estimate.of(self, best[2], best[1])
+            raise self.not_simulated(objective)
+        return Estimate.of(self, objective, best[1], best[2])
+
+    def train(
+        self,
+        how: GradientSteps,
+        data: Data | Experiment | None = None,
+        *,
+        freeze: Mapping[str, float] | Iterable[str] = (),
+        start: "Mapping[str, float] | AcausalSystem | Training | None" = None,
+        bounds: Mapping[str, tuple[float, float]] | None = None,
+    ) -> Training:
+        """Gradient steps alone, on the cost that `fit` minimises; arguments as there.
+
+        Noise levels that are to be estimated, and precisions of weights, stay what they are at the beginning. Go on
+        with `fit(start=training)`, which finds them.
+        """
+        if not isinstance(how, GradientSteps):
+            raise ModelError(f"train takes learning.GradientSteps(optax.adam(0.02), steps=200); got {how!r}")
+        objective = self._prepared(data, freeze, start, bounds)
+        return train(self, objective, objective.coordinates.z_start[objective.free], how)
+
+    def _prepared(self, data: Any, freeze: Any, start: Any, bounds: Any) -> Objective:
+        """What is minimised, from the arguments of `fit`."""
+        stacked = self._stacked if data is None else self._stack(data)
+        if stacked is not self._stacked and self._laid_out(stacked) != self._layout:
+            raise ModelError(
+                "these data name other outputs, inputs or unknown starts than the problem's: make a Problem of them"
+            )
+        objective = self._objective(stacked, self._coordinates(stacked, freeze, start, bounds))
+        if not objective.free.any():
+            raise ModelError("everything is frozen: there is nothing to fit")
+        return objective
+
+    def not_simulated(self, objective: Objective) -> SimulationError:
+        """The error where no start can be simulated."""
+        return SimulationError(self._why(objective))
 
     def _coordinates(self, stacked: Stacked, freeze: Any, start: Any, bounds: Any) -> Coordinates:
         system, values = self.system, {}
@@ -315,9 +354,16 @@ class Problem:
             system = start.merged()
             if system.plan != self.system.plan:
                 raise ModelError("start is a system of another model: give one of the same, or values by names")
-        elif start is not None:
+        elif start is not None and not isinstance(start, Training):
             values = dict(start)
         c = coordinates(system, self.observers, self._layout, stacked)
+        if isinstance(start, Training):
+            known = start.objective.coordinates
+            if known.names != c.names:
+                raise ModelError(
+                    "start is a training of other unknowns or experiments: train this problem, or give names"
+                )
+            c = dataclasses.replace(c, start=known.natural(start.objective.full(start.z)))
         c = c.bounded(dict(bounds or {})).changed(values, fixed=False)
         held = (
             dict(freeze)
@@ -374,10 +420,6 @@ class Problem:
             cost = weights.cost(start, found.residual)
             return Minimum(start, found, weights, cost, [cost], 1, True, "nothing is searched", rtol)
         return minimise(objective.evaluate, objective.residual, start, objective.bounds, lambda *_: weights, noise=rtol)
-
-    def _score(self, objective: Objective, found: Minimum) -> float:
-        """The root mean square of the residuals of experiments that are held out, in units of the noise."""
-        return holdout_score(objective, found)
 
     def _why(self, objective: Objective) -> str:
         """The first reason for which a run from the start fails."""
