@@ -269,14 +269,18 @@ class Estimate:
     @functools.cached_property
     def rms(self) -> dict[str, dict[str, float]]:
         """Root mean square errors by experiment and name, in the variables' units, those held out included."""
-        s = self.objective.stacked
-        outputs = self.objective.predicted(self.point).outputs
+        s, rows = self.objective.stacked, self.objective.rows
+        errors = np.full(s.values.shape, np.nan)
+        errors[rows] = self.minimum.found.residual
+        if not np.isin(np.arange(len(s.labels)), rows[0]).all():
+            free_runs = self.objective.predicted(self.point).outputs - s.values
+            errors = np.where(np.isnan(errors), free_runs, errors)
         found: dict[str, dict[str, float]] = {}
         for k, label in enumerate(s.labels):
             for j, name in enumerate(s.outputs):
                 seen = s.observed[k, :, j]
                 if seen.any():
-                    error = (outputs[k, :, j] - s.values[k, :, j])[seen]
+                    error = errors[k, :, j][seen]
                     found.setdefault(label, {})[name] = float(np.sqrt(np.mean(error**2)))
         return found
 

@@ -176,6 +176,7 @@ def test_a_double_pendulum_over_twelve_seconds():
 # --- starting at a whole state ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_from_a_state(pendulum):
     """Where the first half ends the second one begins: on the constraints, with the same derivatives."""
     ts = jnp.linspace(0.0, 2.0, 5)
