@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -247,6 +248,7 @@ def _facts(objective: Objective, plan: GradientSteps, optimizer: Any) -> dict[st
         "set of unknowns": json.dumps(
             [list(c.names), fingerprint(searched), sorted(map(str, objective.penalties.items()))]
         ),
+        "set of values": fingerprint(eqx.filter((objective.system, objective.observers), eqx.is_array)),
         "set of data": fingerprint(data),
         "optimizer": str(jax.tree.structure(optimizer)),
         "batch": plan.batch,

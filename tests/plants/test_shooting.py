@@ -85,6 +85,8 @@ def test_a_constrained_model(pendulum):
     assert shot.minimum.states.shape == (2, 4, 4) and np.abs(shot.minimum.gaps).max() < 1e-6
     x, y = shot.minimum.states[..., [pendulum.states.index(f"pend.{n}") for n in "xy"]].transpose(2, 0, 1)
     np.testing.assert_allclose(np.hypot(x, y), shot.values["pend.L"], rtol=1e-9)
+    row = shot.table()["pend.L"]
+    np.testing.assert_allclose(shot.profile("pend.L")["pend.L"], [row.low, row.high], atol=0.1 * (row.high - row.low))
     assert problem.fit().table()["pend.m"].note == "not determined"
     assert shot.holdout_score == pytest.approx(single.holdout_score, rel=1e-4)
 
