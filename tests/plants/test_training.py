@@ -139,7 +139,7 @@ def test_checkpoints_of_other_work_are_refused(tmp_path):
     problem().train(how(steps=3, checkpoint=file))
     with pytest.raises(ModelError, match="is of another set of data"):
         problem().train(how(checkpoint=file), learning.Data(*(record(4 - e) for e in range(5))))
-    changed = problem().system.with_parameters({"d.g": 0.6})
+    changed = problem().system.with_parameters({"d.k": 1.1})
     with pytest.raises(ModelError, match="is of another set of values"):
         learning.Problem(changed, problem().data, train=["d.k", "d.g"]).train(how(checkpoint=file))
     with pytest.raises(ModelError, match=r"is of another batch \(2 there, 3 here\)"):
