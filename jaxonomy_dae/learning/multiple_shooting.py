@@ -35,7 +35,7 @@ ROUNDED = 1e-12  # relative rounding errors of a segment's Jacobian, of some tho
 
 @dataclasses.dataclass(frozen=True)
 class Shooting:
-    """Multiple shooting, for `Problem(method=...)`.
+    """Multiple shooting (Bock 1981), for `Problem(method=...)`.
 
     - `nodes`: into how many segments each experiment's time is cut. Over a segment, the model should not amplify
         errors by much more than ten.
@@ -179,7 +179,7 @@ def shoot(
 
     **Arguments:**
 
-    - `steps`: how many at most with all gaps weighted fully; a few come before.
+    - `steps`: how many at most with multipliers; a few come before, while the weight of gaps grows.
     - `tolerance`: of the integration, relative.
     - `weights`: of data and priors, if they are to stay as they are.
 
@@ -220,7 +220,6 @@ def shoot(
     idle, before = 0, np.inf
     for k in range(steps + 1):
         history.append(merit.cost(point))
-        widest = float(np.abs(point.blocks.gap).max(initial=0.0))
         gain = 0.0
         found = descent.step(merit, point) if k < steps else None
         if found is not None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 
-from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, learning, simulate
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, NeuralDAEBlock, learning, simulate
 from jaxonomy_dae.library.planar import PlanarPendulum
 from jaxonomy_dae.modeling import Component, Eq, der
 from jaxonomy_dae.programs.cache import PROGRAMS
@@ -58,8 +58,6 @@ def swing(seed, count, release, **others):
 
 @pytest.fixture(scope="module")
 def pendulum():
-    from jaxonomy_dae import NeuralDAEBlock
-
     ev, diagram = EqnEnv(), AcausalDiagram()
     bob = PlanarPendulum(ev, name="pend", m=1.0, L=1.0, initial_theta=-1.0)
     diagram.add(bob)
