@@ -23,7 +23,11 @@ from .laws import PortHamiltonian as PortHamiltonian
 from .laws import Positive as Positive
 from .libraries import powers as powers
 from .libraries import terms as terms
+from .multiple_shooting import Shooting as Shooting
 from .prediction import Prediction as Prediction
 from .problem import Problem as Problem
 from .table import Table as Table
+from .training import GradientSteps as GradientSteps
+from .training import Training as Training
+from .training import Update as Update
 from .whiteness import Whiteness as Whiteness

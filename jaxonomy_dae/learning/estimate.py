@@ -22,6 +22,7 @@ from .prediction import Prediction, prediction
 from .profile import profile
 from .program import with_values
 from .table import Row, Table
+from .training import Training
 from .whiteness import Whiteness, whiteness
 
 if TYPE_CHECKING:
@@ -36,6 +37,7 @@ class Estimate:
     - `minimum`: where the descent ended: its `history`, `converged`, `message`, and weighted with `minimum.weights` its
         residuals and Jacobian.
     - `point`: all coordinates there, as `objective.coordinates` names them.
+    - `training`: what came before least squares, with `first=`.
     """
 
     problem: "Problem"
@@ -44,14 +46,17 @@ class Estimate:
     point: Float[np.ndarray, " p"]
     system: AcausalSystem
     observers: dict[str, Any]
+    training: Training | None = None
 
     @classmethod
-    def of(cls, problem: "Problem", objective: Objective, minimum: Minimum) -> "Estimate":
+    def of(
+        cls, problem: "Problem", objective: Objective, minimum: Minimum, training: Training | None = None
+    ) -> "Estimate":
         """The estimate at a minimum."""
-        point = with_own_starts(objective, minimum)
+        point = with_own_starts(objective, minimum.z, minimum.weights)
         shared, _ = objective.numbers(objective.coordinates.natural(point))
         system, observers, _ = with_values(objective.system, objective.observers, objective.layout, shared)
-        return cls(problem, objective, minimum, point, system, observers)
+        return cls(problem, objective, minimum, point, system, observers, training)
 
     def __repr__(self):
         score = f", held out {self.holdout_score:.3g} σ" if self.objective.stacked.holdout.any() else ""
@@ -98,7 +103,7 @@ class Estimate:
 
     @property
     def _noise(self) -> float:
-        return dict(self.objective.layout.options)["rtol"]
+        return self.minimum.noise
 
     @functools.cached_property
     def root(self) -> Float[np.ndarray, "p r"]:
@@ -289,14 +294,18 @@ class Estimate:
     @functools.cached_property
     def rms(self) -> dict[str, dict[str, float]]:
         """Root mean square errors by experiment and name, in the variables' units, those held out included."""
-        s = self.objective.stacked
-        outputs = self.objective.predicted(self.point).outputs
+        s, rows = self.objective.stacked, self.objective.rows
+        errors = np.full(s.values.shape, np.nan)
+        errors[rows] = self.minimum.found.residual
+        if not np.isin(np.arange(len(s.labels)), rows[0]).all():
+            free_runs = self.objective.predicted(self.point).outputs - s.values
+            errors = np.where(np.isnan(errors), free_runs, errors)
         found: dict[str, dict[str, float]] = {}
         for k, label in enumerate(s.labels):
             for j, name in enumerate(s.outputs):
                 seen = s.observed[k, :, j]
                 if seen.any():
-                    error = (outputs[k, :, j] - s.values[k, :, j])[seen]
+                    error = errors[k, :, j][seen]
                     found.setdefault(label, {})[name] = float(np.sqrt(np.mean(error**2)))
         return found
 
@@ -305,4 +314,4 @@ class Estimate:
         """The root mean square of residuals of experiments held out, in units of the noise; NaN if there are none."""
         if not self.objective.stacked.holdout.any():
             return float("nan")
-        return holdout_score(self.objective, self.minimum)
+        return holdout_score(self.objective, self.minimum.z, self.minimum.weights)

@@ -41,6 +41,10 @@ class Factors:
         gain = self.singular[:rank] / (self.singular[:rank] ** 2 + damping)
         return -(self.right[:, :rank] @ (gain * self.projected[:rank])) / self.scale
 
+    def directions(self, noise: float) -> Float[np.ndarray, "p r"]:
+        """Those that have a singular value beyond the noise."""
+        return self.right[:, : self.rank(noise)] / self.scale[:, None]
+
     def root(self, rank: int) -> Float[np.ndarray, "p r"]:
         """A, with the covariance A Aᵀ = (JᵀJ)⁻¹ on the directions that are determined."""
         return self.right[:, :rank] / self.singular[:rank] / self.scale[:, None]

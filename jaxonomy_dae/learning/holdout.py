@@ -6,21 +6,21 @@ import numpy as np
 from jaxtyping import Float
 
 from .coordinates import Coordinates
-from .least_squares import Minimum, minimise
+from .least_squares import Weights, minimise
 from .objective import Objective
 
 
-def with_own_starts(objective: Objective, found: Minimum) -> Float[np.ndarray, " p"]:
+def with_own_starts(objective: Objective, z: Float[np.ndarray, " f"], weights: Weights) -> Float[np.ndarray, " p"]:
     """All coordinates after a fit. The unknown starts of experiments that were held out are fitted to these with all
     else fixed: that is what they alone can tell, and all that is taken from them."""
-    full = objective.full(found.z)
+    full = objective.full(z)
     held = objective.stacked.holdout
     if not held.any() or not objective.coordinates.n_own:
         return full
     c = _at(objective.coordinates, full)
     fixed = np.array(c.fixed)
     fixed[: c.n_shared] = True
-    sigma = objective.evidence.sigma(found.weights)
+    sigma = objective.evidence.sigma(weights)
     alone = dataclasses.replace(
         objective.with_noise(sigma), coordinates=dataclasses.replace(c, fixed=fixed), counted=held, penalties={}
     )
@@ -37,12 +37,12 @@ def with_own_starts(objective: Objective, found: Minimum) -> Float[np.ndarray, "
     return full if best is None else alone.full(best.z)
 
 
-def holdout_score(objective: Objective, found: Minimum) -> float:
+def holdout_score(objective: Objective, z: Float[np.ndarray, " f"], weights: Weights) -> float:
     """The root mean square of the residuals of experiments that are held out, in units of the noise; infinite where a
     run fails."""
-    s = objective.with_noise(objective.evidence.sigma(found.weights)).stacked
+    s = objective.with_noise(objective.evidence.sigma(weights)).stacked
     rows = np.nonzero(s.observed & s.holdout[:, None, None])
-    outputs = objective.predicted(with_own_starts(objective, found)).outputs
+    outputs = objective.predicted(with_own_starts(objective, z, weights)).outputs
     sigma = np.where(np.isnan(s.sigma), 1.0, s.sigma)[rows[0], rows[2]]
     residual = (outputs[rows] - s.values[rows]) / sigma
     return float(np.sqrt(np.mean(residual**2))) if np.isfinite(residual).all() else np.inf

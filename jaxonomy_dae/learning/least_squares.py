@@ -67,6 +67,7 @@ class Minimum:
     evaluations: int
     converged: bool
     message: str
+    noise: float  # relative error of the Jacobian: directions within it count as not determined
 
 
 Reweigh = Callable[[np.ndarray, Evaluation, Weights, Factors, np.ndarray], tuple[Weights, bool]]
@@ -114,7 +115,7 @@ def minimise(
         free = ~(((z <= low) & (gradient > 0)) | ((z >= high) & (gradient < 0)))
         factors = Factors.of(r, jacobian[:, free], noise)
         following, settled = (scheme, True) if reweigh is None else reweigh(z, found, scheme, factors, free)
-        if settled and (_offset(factors, cost, len(r), noise) <= OFFSET or idle >= PATIENCE):
+        if settled and (offset(factors, cost, len(r), noise) <= OFFSET or idle >= PATIENCE):
             converged, message = True, f"converged after {k} steps"
             break
         if k == steps:
@@ -137,10 +138,10 @@ def minimise(
             elif damping <= 1:  # the columns have norm one: beyond, damping alone keeps steps short
                 idle += 1
         scheme = following
-    return Minimum(z, found, scheme, scheme.cost(z, found.residual), history, count, converged, message)
+    return Minimum(z, found, scheme, scheme.cost(z, found.residual), history, count, converged, message, noise)
 
 
-def _offset(factors: Factors, cost: float, rows: int, noise: float) -> float:
+def offset(factors: Factors, cost: float, rows: int, noise: float) -> float:
     """The remaining step in radii of the confidence region; infinite where there are no degrees of freedom."""
     determined = factors.rank(noise)
     explained = float(np.sum(factors.projected[:determined] ** 2))

@@ -23,9 +23,14 @@ from .experiment import Experiment, Unknown
 from .first_order import adam_steps
 from .holdout import holdout_score
 from .identifiability import Identifiability, identifiability
-from .least_squares import Minimum, minimise
+from .least_squares import Minimum, Weights, minimise
+from .multiple_shooting import Shooting, shoot
 from .objective import Objective
 from .program import Layout, predict, weights_of, with_values
+from .training import GradientSteps, Training, train
+
+METHODS = ("single", "growing")
+GROWING = tuple(k / 10 for k in range(1, 11))  # shares of the time
 
 
 class Problem:
@@ -46,6 +51,8 @@ class Problem:
         laws.
     - `observe`: derived outputs by name, `{"gauge.y": law}`, with `law(solution)` of shape `(n,)`: a function, or an
         Equinox module whose weights may be trained.
+    - `method`: `"single"`, each experiment is one run; `"growing"`, the same with growing `horizons`; or
+        `Shooting(...)`, multiple shooting, for what diverges.
     - `rtol`, `atol`, `max_steps`, and others in `options`: as in `simulate`.
 
     **Raises:**
@@ -63,6 +70,7 @@ class Problem:
         starts: Mapping[str, Any] | None = None,
         regularize: Mapping[str, Any] | str | float | None = "evidence",
         observe: Mapping[str, Any] | None = None,
+        method: str | Shooting = "single",
         rtol: float = 1e-6,
         atol: float = 1e-8,
         max_steps: int = 4096,
@@ -84,6 +92,7 @@ class Problem:
         self._stacked = self._stack(self.data)
         self._layout = self._laid_out(self._stacked)
         self.penalties = self._penalties(regularize)
+        self.method = self._method(method)
 
     # --- set-up ------------------------------------------------------------------------------------------------
 
@@ -172,6 +181,22 @@ class Problem:
                 raise ModelError(f"regularize: '{name}' takes 'evidence', a precision ≥ 0 or None; got {value!r}")
         return {name: given.get(name) for name in modules}
 
+    def _method(self, given: Any) -> str | Shooting:
+        if given not in METHODS and not isinstance(given, Shooting):
+            raise ModelError(f"method is 'single', 'growing' or Shooting(nodes=30); got {given!r}")
+        plan = self.system.plan
+        if isinstance(given, Shooting) and self.system.discretes:
+            raise ModelError(
+                f"method: '{self.system.discretes[0]}' is a discrete variable, which the nodes of multiple shooting do "
+                "not carry from segment to segment: use method='growing'"
+            )
+        if isinstance(given, Shooting) and plan.held is not None:
+            raise ModelError(
+                "method: constraints of this model come and go with its modes, so that the nodes of multiple shooting "
+                "have no fixed number of degrees of freedom: use method='growing'"
+            )
+        return given
+
     # --- residuals ---------------------------------------------------------------------------------------------
 
     def residuals(
@@ -229,13 +254,14 @@ class Problem:
         data: Data | Experiment | None = None,
         *,
         freeze: Mapping[str, float] | Iterable[str] = (),
-        start: "Mapping[str, float] | AcausalSystem | None" = None,
+        start: "Mapping[str, float] | AcausalSystem | Training | None" = None,
         bounds: Mapping[str, tuple[float, float]] | None = None,
+        first: GradientSteps | None = None,
         starts: int = 1,
         seed: int = 0,
         adam: int = 0,
         learning_rate: float = 0.02,
-        horizons: Sequence[float] = (1.0,),
+        horizons: Sequence[float] | None = None,
         steps: int = 200,
     ) -> Estimate:
         """The most probable values: least squares in units of the noise, with the priors that were given.
@@ -244,14 +270,16 @@ class Problem:
 
         - `data`: other data than the problem's. If they have the same shapes and unknown starts, nothing is compiled.
         - `freeze`: parameters, starts and networks that stay as they are, or `{name: value}`.
-        - `start`: where the search begins, values by name; or a system, such as that of an earlier estimate.
+        - `start`: where the search begins, values by name; or a system, such as that of an earlier estimate; or what
+            `train` returned.
         - `bounds`: narrower than those declared, by name.
+        - `first`: steps of an optimizer of Optax before those of least squares; `estimate.training` is their history.
         - `starts`: from how many points; all but the first are drawn around it by `seed`: parameters within a factor of
             e or their bounds, starts by their spread, networks with weights of the same sizes. The best is the one of
             the least score on experiments that are held out, or else of the least cost.
         - `adam`: so many gradient steps at first, with `learning_rate` on the scale of the coordinates.
         - `horizons`: shares of the time that are fitted one after the other, such as `(0.25, 0.5, 1)`: what diverges
-            over the whole time is caught early.
+            over the whole time is caught early. None: all of it, or with `method="growing"`, ten of them.
         - `steps`: how many steps of least squares at most.
 
         **Raises:**
@@ -259,29 +287,68 @@ class Problem:
         - `ModelError` for names, values and shapes that do not fit.
         - `SimulationError` if no start can be simulated, with the reason of the first.
         """
+        objective = self._prepared(data, freeze, start, bounds)
+        stacked = objective.stacked
+        if first is not None and (adam or (starts > 1 and first.checkpoint is not None)):
+            other = "adam=" if adam else "a checkpoint with several starts"
+            raise ModelError(f"first= does not go with {other}: leave one of them out")
+        if isinstance(self.method, Shooting) and (adam or horizons is not None):
+            raise ModelError("adam and horizons belong to single shooting: leave them out, or use method='single'")
+        if horizons is None:
+            horizons = GROWING if self.method == "growing" else (1.0,)
+        shares = [float(share) for share in horizons]
+        if not shares or shares[-1] != 1.0 or any(not 0 < share <= 1 for share in shares):
+            raise ModelError(f"horizons are shares in (0, 1], the last of them 1; got {tuple(horizons)}")
+        best: tuple[float, Minimum, Training | None] | None = None
+        for point in self._points(objective, starts, seed):
+            training = None
+            if first is not None:
+                training = train(self, objective, point, first)
+                point = training.z
+            found = self._descend(objective, point, shares, steps, adam, learning_rate)
+            if found is None:
+                continue
+            score = holdout_score(objective, found.z, found.weights) if stacked.holdout.any() else found.cost
+            if best is None or score < best[0]:
+                best = score, found, training
+        if best is None:
+            raise self.not_simulated(objective)
+        return Estimate.of(self, objective, best[1], best[2])
+
+    def train(
+        self,
+        how: GradientSteps,
+        data: Data | Experiment | None = None,
+        *,
+        freeze: Mapping[str, float] | Iterable[str] = (),
+        start: "Mapping[str, float] | AcausalSystem | Training | None" = None,
+        bounds: Mapping[str, tuple[float, float]] | None = None,
+    ) -> Training:
+        """Gradient steps alone, on the cost that `fit` minimises; arguments as there.
+
+        Noise levels that are to be estimated, and precisions of weights, stay what they are at the beginning. Go on
+        with `fit(start=training)`, which finds them.
+        """
+        if not isinstance(how, GradientSteps):
+            raise ModelError(f"train takes learning.GradientSteps(optax.adam(0.02), steps=200); got {how!r}")
+        objective = self._prepared(data, freeze, start, bounds)
+        return train(self, objective, objective.coordinates.z_start[objective.free], how)
+
+    def _prepared(self, data: Any, freeze: Any, start: Any, bounds: Any) -> Objective:
+        """What is minimised, from the arguments of `fit`."""
         stacked = self._stacked if data is None else self._stack(data)
         if stacked is not self._stacked and self._laid_out(stacked) != self._layout:
             raise ModelError(
                 "these data name other outputs, inputs or unknown starts than the problem's: make a Problem of them"
             )
-        c = self._coordinates(stacked, freeze, start, bounds)
-        objective = self._objective(stacked, c)
+        objective = self._objective(stacked, self._coordinates(stacked, freeze, start, bounds))
         if not objective.free.any():
             raise ModelError("everything is frozen: there is nothing to fit")
-        shares = [float(share) for share in horizons]
-        if not shares or shares[-1] != 1.0 or any(not 0 < share <= 1 for share in shares):
-            raise ModelError(f"horizons are shares in (0, 1], the last of them 1; got {tuple(horizons)}")
-        best: tuple[float, Minimum, Objective] | None = None
-        for point in self._points(objective, starts, seed):
-            found = self._descend(objective, point, shares, steps, adam, learning_rate)
-            if found is None:
-                continue
-            score = self._score(objective, found) if stacked.holdout.any() else found.cost
-            if best is None or score < best[0]:
-                best = score, found, objective
-        if best is None:
-            raise SimulationError(self._why(objective))
-        return Estimate.of(self, best[2], best[1])
+        return objective
+
+    def not_simulated(self, objective: Objective) -> SimulationError:
+        """The error where no start can be simulated."""
+        return SimulationError(self._why(objective))
 
     def _coordinates(self, stacked: Stacked, freeze: Any, start: Any, bounds: Any) -> Coordinates:
         system, values = self.system, {}
@@ -289,9 +356,16 @@ class Problem:
             system = start.merged()
             if system.plan != self.system.plan:
                 raise ModelError("start is a system of another model: give one of the same, or values by names")
-        elif start is not None:
+        elif start is not None and not isinstance(start, Training):
             values = dict(start)
         c = coordinates(system, self.observers, self._layout, stacked)
+        if isinstance(start, Training):
+            known = start.objective.coordinates
+            if known.names != c.names:
+                raise ModelError(
+                    "start is a training of other unknowns or experiments: train this problem, or give names"
+                )
+            c = dataclasses.replace(c, start=known.natural(start.objective.full(start.z)))
         c = c.bounded(dict(bounds or {})).changed(values, fixed=False)
         held = (
             dict(freeze)
@@ -320,6 +394,8 @@ class Problem:
     def _descend(
         self, objective: Objective, point: np.ndarray, shares: list[float], steps: int, adam: int, rate: float
     ) -> Minimum | None:
+        if isinstance(self.method, Shooting):
+            return shoot(objective, self.method, point, steps, self._options["rtol"])
         found = None
         for share in shares:
             here = objective.until(share)
@@ -334,9 +410,18 @@ class Problem:
             point = found.z
         return found
 
-    def _score(self, objective: Objective, found: Minimum) -> float:
-        """The root mean square of the residuals of experiments that are held out, in units of the noise."""
-        return holdout_score(objective, found)
+    def reach(self, objective: Objective, start: np.ndarray, weights: Weights) -> Minimum | None:
+        """The minimum next to a start, with weights that stay as they are."""
+        rtol = self._options["rtol"]
+        if isinstance(self.method, Shooting):
+            return shoot(objective, self.method, start, 200, rtol, weights)
+        if not len(start):
+            found = objective.evaluate(start)
+            if found is None:
+                return None
+            cost = weights.cost(start, found.residual)
+            return Minimum(start, found, weights, cost, [cost], 1, True, "nothing is searched", rtol)
+        return minimise(objective.evaluate, objective.residual, start, objective.bounds, lambda *_: weights, noise=rtol)
 
     def _why(self, objective: Objective) -> str:
         """The first reason for which a run from the start fails."""

@@ -7,8 +7,6 @@ import numpy as np
 import scipy.optimize
 import scipy.stats
 
-from .least_squares import minimise
-
 if TYPE_CHECKING:
     from .estimate import Estimate
 
@@ -39,14 +37,10 @@ def profile(estimate: "Estimate", position: int, level: float) -> tuple[float, f
         start[position] = c.natural_at(position, z)
         at = dataclasses.replace(objective, coordinates=dataclasses.replace(c, start=start, fixed=held))
         own_cost = 0.5 * prior * (z - mean) ** 2
-        if not len(others):
-            found = at.evaluate(np.zeros(0))
-            cost = np.inf if found is None else weights.cost(np.zeros(0), found.residual)
-        else:
-            reached = minimise(at.evaluate, at.residual, warm[0], at.bounds, lambda *_: weights, noise=estimate._noise)
-            cost = np.inf if reached is None else reached.cost
-            if reached is not None:
-                warm[0] = reached.z
+        reached = estimate.problem.reach(at, warm[0], weights)
+        cost = np.inf if reached is None else reached.cost
+        if reached is not None:
+            warm[0] = reached.z
         return min(cost + own_cost - best, 1e6) - allowed
 
     centre, spread = float(estimate.point[position]), float(estimate.spread[position])

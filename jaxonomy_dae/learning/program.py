@@ -85,27 +85,45 @@ def with_values(system: AcausalSystem, observers: dict[str, Any], layout: Layout
     return system, observers, shared[n:]
 
 
-def _one(
-    system: AcausalSystem, observers: dict[str, Any], layout: Layout, adjoint: Any, shared: Any, own: Any, c: Conditions
-) -> Float[Array, "n k"]:
-    """The outputs of one experiment."""
+def placed(
+    system: AcausalSystem, observers: dict[str, Any], layout: Layout, shared: Any, own: Any, known: Any
+) -> tuple[AcausalSystem, dict[str, Any], dict[str, Any]]:
+    """(system, observers, starts by variables' names) of one experiment, with its own parameters in their places."""
     system, observers, starts = with_values(system, observers, layout, shared)
     initial = dict(zip(layout.shared, starts, strict=True))
     initial |= dict(zip(layout.own, own, strict=True))
-    initial |= dict(zip(layout.known, c.known, strict=True))
+    initial |= dict(zip(layout.known, known, strict=True))
     own_parameters = {name: v for name, v in initial.items() if name in system.parameters}
     if own_parameters:
         system = system.with_parameters(own_parameters)
         initial = {name: v for name, v in initial.items() if name not in own_parameters}
-    kinds = dict(layout.kinds)
+    return system, observers, initial
+
+
+def _one(
+    system: AcausalSystem, observers: dict[str, Any], layout: Layout, adjoint: Any, shared: Any, own: Any, c: Conditions
+) -> Float[Array, "n k"]:
+    """The outputs of one experiment."""
+    system, observers, initial = placed(system, observers, layout, shared, own, c.known)
     solution = simulate(
         system, c.times[-1], t0=c.t0, ts=c.times, initial=initial or None, adjoint=adjoint, throw=False,
-        inputs={name: (*samples, kinds[name]) for name, samples in c.inputs.items()}, **dict(layout.options),
+        inputs=with_kinds(c.inputs, layout), **dict(layout.options),
     )  # fmt: skip
+    return outputs_of(solution, observers, layout, c.times.dtype)
+
+
+def with_kinds(inputs: dict[str, Any], layout: Layout) -> dict[str, Any]:
+    """Samples of inputs as `simulate` takes them."""
+    kinds = dict(layout.kinds)
+    return {name: (*samples, kinds[name]) for name, samples in inputs.items()}
+
+
+def outputs_of(solution: Any, observers: dict[str, Any], layout: Layout, dtype: Any) -> Float[Array, "n k"]:
+    """The outputs of a run."""
     variables = [name for name in layout.outputs if name not in observers]
     read = dict(zip(variables, solution[variables].T, strict=True)) if variables else {}
     derived = {name: observers[name](solution) for name in layout.outputs if name in observers}
-    return jnp.stack([read[n] if n in read else jnp.asarray(derived[n], c.times.dtype) for n in layout.outputs], axis=1)
+    return jnp.stack([read[n] if n in read else jnp.asarray(derived[n], dtype) for n in layout.outputs], axis=1)
 
 
 def _each(function: Callable, shared: Any, own: Any, conditions: Conditions) -> Any:

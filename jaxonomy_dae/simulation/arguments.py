@@ -14,6 +14,7 @@ from ..initialization.initial_values import check_initial
 from ..solvers.solve_arguments import check_finite, check_longest_step
 from ..system.system import AcausalSystem
 from ..system.system_at import SystemAt
+from .from_state import check_shape
 
 MOST_ROOM = 4 * 2**30  # bytes that saved steps may reserve
 
@@ -54,7 +55,10 @@ def check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_contr
         )
     check_longest_step(dtmax)
     _check_interval(t0, t1, ts)
-    check_initial(system, initial)
+    if hasattr(initial, "ndim"):
+        check_shape(system, initial)
+    else:
+        check_initial(system, initial)
     _check_periods(system)
 
 

@@ -1,5 +1,6 @@
 """One run of a compiled system: a consistent start, the integration, and saved states on the constraints."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import diffrax
@@ -20,6 +21,7 @@ from ..solvers.rows import not_a_number, padded
 from ..solvers.switching import STIFF, Watch
 from .admitted import NOT_ADMITTED, TEXT, are_admitted, inputs_are_finite
 from .event_log import EventLog
+from .from_state import from_state
 from .hybrid_problem import problem_for, with_event_control
 from .preparation import largest_tolerance, prepared, term_of
 from .step_sizes import first_step
@@ -71,7 +73,8 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
         system = eqx.tree_at(
             lambda s: s.parameters.values, system, eqx.error_if(system.parameters.values, ~admitted, TEXT)
         )
-    found = initialize(system, t0, inputs, initial)
+    by_names = isinstance(initial, Mapping)
+    found = initialize(system, t0, inputs, initial) if by_names else from_state(system, t0, inputs, initial)
     if checked:
         found = check(system, found, t0, inputs, initial, running=True, throw=True)
     x0, controller = found.x, options.controller

@@ -28,6 +28,7 @@ from ..system.stiffness import fastest_decay
 from ..system.system import AcausalSystem
 from .arguments import check_arguments, check_parameters
 from .failures import explain, mode_at_start, raised
+from .from_state import check_state
 from .integration import Options, Outcome, run, run_compiled
 from .preparation import term_of
 from .solution import Solution
@@ -49,7 +50,7 @@ def simulate(
     rtol: Any = None,
     atol: Any = None,
     inputs: Mapping[str, Any] | None = None,
-    initial: Mapping[str, Any] | None = None,
+    initial: Mapping[str, Any] | Any = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
     jump_ts: Any = None,
@@ -78,7 +79,9 @@ def simulate(
     - `inputs`: by the inputs' names: constants; samples `(times, values)`, interpolated linearly, or with `"cubic"` or
         `"held"` as a third entry; `diffrax.LinearInterpolation` and `diffrax.CubicInterpolation`; functions of time.
         Steps end at the times of samples. What a function reads from its surroundings is read at this call.
-    - `initial`: values at `t0` by variables' names, which outrank the starts declared in components.
+    - `initial`: values at `t0` by variables' names, which outrank the starts declared in components. Or a whole state,
+        shape `(n_state,)`, such as a row of `solution.states`: it is moved onto the constraints, and declared starts
+        are not looked at.
     - `adjoint`: how to differentiate; default `solvers.StoredAdjoint()`. `diffrax.ForwardMode()` for forward-mode
         differentiation (`jax.jvp`, `jax.jacfwd`).
     - `stepsize_controller`: instead of the controller made from the tolerances.
@@ -115,7 +118,8 @@ def simulate(
         with `throw=True`, what depends on values is an Equinox run-time error.
     """
     if isinstance(system, AcausalSystem):  # `check_arguments` says what to do with anything else
-        initial = system.plan.one_by_one(initial)
+        if initial is None or isinstance(initial, Mapping):
+            initial = system.plan.one_by_one(initial)
     check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_controller, dtmax, max_steps)
     dtype = system.parameters.values.dtype
     inputs = read_inputs(system.plan, dtype, inputs)
@@ -128,7 +132,10 @@ def simulate(
     dtmax = None if dtmax is None else jnp.asarray(dtmax, dtype)
     jump_ts = None if jump_ts is None else jump_times(jump_ts, dtype)
     # Numbers become arrays, so that another value is not another program.
-    initial = {name: jnp.asarray(v, dtype) for name, v in sorted((initial or {}).items())}
+    if initial is None or isinstance(initial, Mapping):
+        initial = {name: jnp.asarray(v, dtype) for name, v in sorted((initial or {}).items())}
+    else:
+        initial = jnp.asarray(initial, dtype)
     duration = None if _is_traced((t0, t1)) else float(t1) - float(t0)
     t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
     if ts is not None:
@@ -184,7 +191,10 @@ def simulate(
     counts = outcome.numbers()
     if throw is not False:
         check_parameters(system)
-        check(system, outcome.found, t0, inputs, initial)
+        if isinstance(initial, Mapping):
+            check(system, outcome.found, t0, inputs, initial)
+        else:
+            check_state(outcome.found)
     if switches:
         stiff = bool(outcome.is_stiff)
         if outcome.result == diffrax.RESULTS.max_steps_reached:

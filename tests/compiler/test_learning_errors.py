@@ -4,11 +4,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
+from hybrid_models import Doubling
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv
 from jaxonomy_dae.errors import ModelError
-from jaxonomy_dae.learning import Data, Experiment, Problem, Unknown
+from jaxonomy_dae.learning import Data, Experiment, GradientSteps, Problem, Shooting, Unknown
 from jaxonomy_dae.modeling import Component, Eq, der
 
 TIMES = np.array([1.0, 2.0, 3.0])
@@ -134,3 +136,34 @@ def test_csv_with_missing_cells_and_dates(tmp_path):
     np.testing.assert_array_equal(one.inputs["heater.Q"][1], [2.0, 3.0, 5.0])
     with pytest.raises(ModelError, match="no column 'S': known names: 'time', 'T', 'P'"):
         Experiment.from_csv(path, {"room.T": "S"}, time="time")
+
+
+@pytest.mark.parametrize(
+    "make, words",
+    [
+        (lambda: Shooting(nodes=0), "nodes is a number of segments ≥ 1; got 0"),
+        (lambda: Shooting(nodes=True), "nodes is a number of segments ≥ 1; got True"),
+        (lambda: GradientSteps(optax.sgd(0.1), -1), "steps is a whole number ≥ 0; got -1"),
+        (lambda: GradientSteps(optax.sgd(0.1), 5, batch=0), "batch is a whole number ≥ 1; got 0"),
+        (lambda: GradientSteps(optax.sgd(0.1), 5, horizons=(1.0, 0.5)), "the last of them 1"),
+    ],
+)
+def test_methods(make, words):
+    with pytest.raises(ModelError, match=words):
+        make()
+
+
+def test_methods_of_a_problem(system):
+    with pytest.raises(ModelError, match="method is 'single', 'growing' or Shooting"):
+        Problem(system, record(), train=["tank.k"], method="double")
+    problem = Problem(system, record(), train=["tank.k"], method=Shooting(nodes=3))
+    with pytest.raises(ModelError, match="adam and horizons belong to single shooting"):
+        problem.fit(horizons=(0.5, 1.0))
+    with pytest.raises(ModelError, match="first= does not go with adam="):
+        problem.fit(first=GradientSteps(optax.sgd(0.1), 5), adam=3)
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    diagram.add(Doubling(ev, "d"))
+    with pytest.raises(ModelError, match="'d.d' is a discrete variable, which the nodes"):
+        Problem(
+            AcausalCompiler(ev, diagram)(), Experiment(TIMES, {"d.y": TIMES}), train=["d.a"], method=Shooting(nodes=3)
+        )

@@ -1,0 +1,71 @@
+"""The cost of some experiments and its gradient, by the program of least squares: the gradient is Jᵀr."""
+
+import dataclasses
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from .least_squares import Weights
+from .objective import Objective
+from .program import predict_and_differentiate
+
+
+@dataclasses.dataclass(frozen=True)
+class Batches:
+    """An objective whose cost is looked at by so many experiments at a time; None: by all that count."""
+
+    objective: Objective
+    size: int | None
+    seed: int
+
+    @property
+    def counted(self) -> Int[np.ndarray, " e"]:
+        """The experiments that count."""
+        return np.unique(self.objective.rows[0])
+
+    def chosen(self, step: int) -> Int[np.ndarray, " b"] | None:
+        """The experiments of one step, a pure function of the seed and the step: every experiment comes once before any
+        comes again, but for the few left over where the size does not divide their number. None: all."""
+        counted = self.counted
+        if self.size is None:
+            return None
+        size = min(self.size, len(counted))
+        rounds = len(counted) // size
+        order = np.random.default_rng([self.seed, step // rounds]).permutation(counted)
+        place = step % rounds * size
+        return np.sort(order[place : place + size])
+
+    def cost_and_gradient(
+        self, z: Float[np.ndarray, " f"], weights: Weights, chosen: Int[np.ndarray, " b"] | None
+    ) -> tuple[float, Float[np.ndarray, " f"]] | None:
+        """½ Σ (weighted residuals)² of the chosen experiments for each of their samples, with the priors' part for each
+        sample of all; None where a run fails."""
+        o = self.objective
+        full = o.full(z)
+        shared, own = o.numbers(o.coordinates.natural(full))
+        experiment, index, output = o.rows
+        row, place, conditions = weights.row, experiment, o.conditions
+        if chosen is not None:
+            inside = np.isin(experiment, chosen)
+            row, experiment, index, output = row[inside], experiment[inside], index[inside], output[inside]
+            place = np.searchsorted(chosen, experiment)
+            own = own[chosen]
+            conditions = jax.tree.map(lambda a: a[chosen], conditions)
+        if not len(row):
+            return 0.0, np.zeros_like(z)
+        found = predict_and_differentiate(o.system, o.observers, o.layout, shared, own, conditions)
+        outputs, by_shared, by_own = (np.asarray(a, np.float64) for a in found)
+        at = place, index, output
+        residual = row * (outputs[at] - o.stacked.values[experiment, index, output])
+        c = o.coordinates
+        gradient = np.zeros(len(c))
+        gradient[: c.n_shared] = by_shared[at].T @ (row * residual)
+        if c.n_own:
+            each = np.zeros((c.experiments, c.n_own))
+            np.add.at(each, experiment, (row * residual)[:, None] * by_own[at])
+            gradient[c.n_shared :] = each.ravel()
+        pull = weights.precision * (z - weights.mean)
+        cost = 0.5 * float(residual @ residual) / len(row) + 0.5 * float(pull @ (z - weights.mean)) / len(weights.row)
+        slope = (gradient * c.slope(full))[o.free] / len(row) + pull / len(weights.row)
+        return (cost, slope) if np.isfinite(cost) and np.isfinite(slope).all() else None

@@ -1,0 +1,273 @@
+"""Multiple shooting: the states at the nodes of each experiment are unknowns beside the parameters, and continuity is a
+constraint (Bock 1981, 1987; van Domselaar & Hemker 1975).
+
+Where trajectories diverge, a run over the whole time depends on parameters so strongly that least squares sees nothing
+but local minima. Over a segment the dependence is mild, and the data keep the nodes near the truth.
+
+Continuity is brought about by an augmented Lagrangian (Hestenes 1969, Powell 1969): residuals of least squares
+w·c + u for the gaps c, with a weight w that grows, and multipliers u that then make the gaps vanish at a finite weight.
+So every step is one of Levenberg and Marquardt, on rows that `block_elimination` reduces. At the end, continuity holds,
+and the Jacobian in which nodes are eliminated is that of single shooting: the optimum and its covariance are the same.
+"""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from ..errors import ModelError
+from .block_elimination import Blocks, eliminate, linear
+from .evidence import Evidence
+from .factors import Factors
+from .least_squares import GAIN, OFFSET, PATIENCE, TRIALS, Minimum, Weights, offset
+from .node_guesses import node_guesses, sizes
+from .objective import Objective
+from .segments import Point, Segments
+
+WEIGHTS = (10.0, 1e2, 1e3)  # of gaps in units of the states' ranges: at first a tenth costs one σ
+HEAVIEST = 1e7  # in the end, if multipliers alone do not close them
+SHRINK = 0.25  # of gaps from one set of multipliers to the next, as in LANCELOT (Conn, Gould & Toint 1992)
+FEW = 10  # steps at each of these weights
+SETTLED = 0.01  # relative decrease of the cost by a step, below which the weight grows
+CLOSED = 0.1  # gaps that count as none, in units of the integration's relative tolerance
+ROUNDED = 1e-12  # relative rounding errors of a segment's Jacobian, of some thousand operations
+
+
+@dataclasses.dataclass(frozen=True)
+class Shooting:
+    """Multiple shooting (Bock 1981), for `Problem(method=...)`.
+
+    - `nodes`: into how many segments each experiment's time is cut. Over a segment, the model should not amplify
+        errors by much more than ten.
+
+    The differential states at the nodes are unknowns; they begin at smoothed samples where they, or their integrals,
+    were measured. For models with hidden constraints, nodes move along these.
+    """
+
+    nodes: int = 30
+
+    def __post_init__(self):
+        if not isinstance(self.nodes, int) or isinstance(self.nodes, bool) or self.nodes < 1:
+            raise ModelError(f"Shooting: nodes is a number of segments ≥ 1; got {self.nodes!r}")
+
+
+@dataclasses.dataclass(frozen=True)
+class ShootingMinimum(Minimum):
+    """Where multiple shooting ended: also the times at which the segments of e experiments begin, the states there, and
+    the gaps between segments, in units of the states' ranges."""
+
+    nodes: Float[np.ndarray, "e N"]
+    states: Float[np.ndarray, "e N n"]
+    gaps: Float[np.ndarray, "e M g"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Merit:
+    """The augmented Lagrangian: weights of data and priors, the weight of continuity, and its multipliers."""
+
+    segments: Segments
+    weights: Weights
+    continuity: float
+    multiplier: Float[np.ndarray, "e M g"]
+
+    def cost(self, point: Point) -> float:
+        """½ Σ |rows|²."""
+        b = self.blocks(point.blocks)
+        prior = np.sum(self.weights.precision * (point.z - self.weights.mean) ** 2)
+        return 0.5 * float(np.sum(b.residual**2) + np.sum(b.gap**2) + prior)
+
+    def blocks(self, blocks: Blocks) -> Blocks:
+        """Weighted rows."""
+        return blocks.weighted(self.segments.by_sample(self.weights.row), self.continuity, self.multiplier)
+
+    def prior(self, z: Float[np.ndarray, " f"]) -> tuple[Float[np.ndarray, "r f"], Float[np.ndarray, " r"]]:
+        """The rows of priors, and their residuals."""
+        root = np.sqrt(self.weights.precision)
+        chosen = np.flatnonzero(root)
+        return np.diag(root)[chosen], (root * (z - self.weights.mean))[chosen]
+
+    def heavier(self, continuity: float) -> "Merit":
+        """The same Lagrange multipliers with a larger weight."""
+        return dataclasses.replace(
+            self, continuity=continuity, multiplier=self.multiplier * (self.continuity / continuity)
+        )
+
+    def updated(self, point: Point) -> "Merit":
+        """Multipliers that make this point stationary, if it is a minimum."""
+        return dataclasses.replace(self, multiplier=self.multiplier + self.continuity * point.blocks.gap)
+
+
+@dataclasses.dataclass
+class Descent:
+    """Steps of Levenberg and Marquardt."""
+
+    segments: Segments
+    size: Float[np.ndarray, " n"]
+    bounds: tuple[Float[np.ndarray, " f"], Float[np.ndarray, " f"]]
+    tolerance: float
+    damping: float = 1e-3
+    evaluations: int = 1
+
+    def step(self, merit: Merit, point: Point) -> tuple[Point, float] | None:
+        """A point of less cost, and by how much; None if none was found."""
+        blocks, cost = merit.blocks(point.blocks), merit.cost(point)
+        size = blocks.sizes
+        size = np.maximum(size, ROUNDED * size.max(initial=0.0))
+        for _ in range(TRIALS):
+            trial = self._trial(merit, point, blocks, size)
+            if trial is None:
+                return None
+            z, states, promised = trial
+            new = self.segments.evaluate(z, states, self.size)
+            self.evaluations += 1
+            gain = -np.inf if new is None else cost - merit.cost(new)
+            if new is not None and gain > 0:
+                ratio = gain / max(cost - promised, np.finfo(float).tiny)
+                if ratio > 0.7:
+                    self.damping /= 5
+                elif ratio < 0.3:
+                    self.damping *= 3
+                self.damping = max(self.damping, 1e-12)
+                return new, gain
+            self.damping *= 6
+        return None
+
+    def _trial(
+        self, merit: Merit, point: Point, blocks: Blocks, size: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, float] | None:
+        """(coordinates, states at the nodes, cost that the linear rows promise) of a damped step."""
+        segments, (low, high), z = self.segments, self.bounds, point.z
+        left = eliminate(blocks, np.sqrt(self.damping) * size)
+        prior, off = merit.prior(z)
+        rows = np.concatenate([segments.spread_out(left.rows), prior])
+        residual = np.concatenate([left.residual.ravel(), off])
+        gradient = rows.T @ residual
+        moves = ~(((z <= low) & (gradient > 0)) | ((z >= high) & (gradient < 0)))
+        step = np.zeros_like(z)
+        if moves.any():
+            # Directions that no segment shows beyond the integration's error are not followed.
+            alone = segments.spread_out(blocks.local)[:, moves]
+            alone = np.concatenate([alone, prior[:, moves]])
+            seen = Factors.of(np.zeros(len(alone)), alone, self.tolerance).directions(self.tolerance)
+            # Damped by what they do to all segments' rows, of which but a part is left when nodes are eliminated: else
+            # continuity, to second order, would forbid the steps.
+            damped = np.concatenate([rows[:, moves] @ seen, np.sqrt(self.damping) * np.eye(seen.shape[1])])
+            right = np.concatenate([-residual, np.zeros(seen.shape[1])])
+            step[moves] = seen @ np.linalg.lstsq(damped, right, rcond=ROUNDED)[0]
+        new = np.clip(z + step, low, high)
+        common = segments.common(new - z)
+        nodes = left.nodes(common)
+        if np.array_equal(new, z) and not np.any(nodes):
+            return None
+        data, gap = linear(blocks, common, nodes)
+        promised = 0.5 * float(np.sum(data**2) + np.sum(gap**2) + np.sum((off + prior @ (new - z)) ** 2))
+        states = np.array(point.states)
+        if nodes.shape[1]:
+            states[:, 1:] += np.einsum("eknd,ekd->ekn", point.bases[:, 1:], nodes)
+        return new, states, promised
+
+
+def shoot(
+    objective: Objective,
+    shooting: Shooting,
+    start: Float[np.ndarray, " f"],
+    steps: int,
+    tolerance: float,
+    weights: Weights | None = None,
+) -> ShootingMinimum | None:
+    """Descends from a start by multiple shooting.
+
+    **Arguments:**
+
+    - `steps`: how many at most with multipliers; a few come before, while the weight of gaps grows.
+    - `tolerance`: of the integration, relative.
+    - `weights`: of data and priors, if they are to stay as they are.
+
+    **Returns:**
+
+    The point; None if the segments cannot be run from the start.
+    """
+    segments = Segments(objective, shooting.nodes)
+    z = np.clip(start, *objective.bounds)
+    states = node_guesses(segments, z)
+    if states is None:
+        return None
+    size = sizes(states)
+    point = segments.evaluate(z, states, size)
+    if point is None:
+        return None
+    descent = Descent(segments, size, objective.bounds, tolerance)
+    evidence = objective.evidence
+    if weights is None:
+        weights = objective.weights(z, segments.evaluation(point))
+    else:
+        evidence = None
+    merit = Merit(segments, weights, WEIGHTS[0], np.zeros_like(point.blocks.gap))
+    history = []
+    for continuity in WEIGHTS:
+        merit = merit.heavier(continuity)
+        for _ in range(FEW):
+            cost = merit.cost(point)
+            history.append(cost)
+            found = descent.step(merit, point)
+            if found is None:
+                break
+            point, gain = found
+            if gain < SETTLED * cost:
+                break
+        merit, _, _ = _reweighed(merit, point, evidence, tolerance)
+    converged, message = False, f"stopped after {steps} steps, not yet converged; steps= allows more"
+    idle, before = 0, np.inf
+    for k in range(steps + 1):
+        history.append(merit.cost(point))
+        gain = 0.0
+        found = descent.step(merit, point) if k < steps else None
+        if found is not None:
+            point, gain = found
+        left = 0.5 * merit.continuity**2 * float(np.sum(point.blocks.gap**2))
+        idle = 0 if gain > max(GAIN * history[-1], OFFSET * len(point.z)) else idle + 1
+        if gain > left and not idle and k < steps:
+            continue
+        merit, settled, remaining = _reweighed(merit, point, evidence, tolerance)
+        widest = float(np.abs(point.blocks.gap).max(initial=0.0))
+        if settled and widest <= CLOSED * tolerance and (remaining <= OFFSET or idle > PATIENCE):
+            converged, message = True, f"converged after {len(history)} steps"
+            break
+        if idle > 3 * PATIENCE:
+            message = f"stopped after {len(history)} steps: none gains more, and gaps of {widest:.2g} are left"
+            break
+        merit = merit.updated(point)
+        if widest > SHRINK * before and merit.continuity < HEAVIEST:
+            merit = merit.heavier(10 * merit.continuity)
+        before = widest
+    found = segments.evaluation(point)
+    noise = _noise(merit, point, merit.weights.applied(point.z, found).jacobian, tolerance)
+    return ShootingMinimum(
+        point.z, found, merit.weights, merit.weights.cost(point.z, found.residual), history, descent.evaluations,
+        converged, message, noise, segments.nodes[:, :-1], point.states, point.blocks.gap,
+    )  # fmt: skip
+
+
+def _noise(merit: Merit, point: Point, jacobian: Float[np.ndarray, "m f"], tolerance: float) -> float:
+    """The relative error of a Jacobian without nodes: a segment's is known to the tolerance, and what amplifies it does
+    so by factors that are known as well."""
+    alone = np.linalg.norm(merit.segments.spread_out(merit.blocks(point.blocks).local), axis=0).max(initial=0.0)
+    largest = np.linalg.norm(jacobian, axis=0).max(initial=0.0)
+    return float(np.clip(tolerance * alone / largest if largest > 0 else tolerance, ROUNDED, tolerance))
+
+
+def _reweighed(merit: Merit, point: Point, evidence: Evidence | None, tolerance: float) -> tuple[Merit, bool, float]:
+    """The merit with better noise levels and priors, whether these have settled, and the remaining step in radii of the
+    confidence region, were continuity to hold."""
+    z, (low, high) = point.z, merit.segments.objective.bounds
+    found = merit.segments.evaluation(point)
+    residual, jacobian = merit.weights.applied(z, found)
+    gradient = jacobian.T @ residual
+    moves = ~(((z <= low) & (gradient > 0)) | ((z >= high) & (gradient < 0)))
+    noise = _noise(merit, point, jacobian, tolerance)
+    factors = Factors.of(residual, jacobian[:, moves], noise)
+    remaining = offset(factors, 0.5 * float(residual @ residual), len(residual), noise)
+    if evidence is None or evidence.is_idle:
+        return merit, True, remaining
+    weights, settled = evidence.reweigh(z, found, merit.weights, factors, moves)
+    return dataclasses.replace(merit, weights=weights), settled, remaining

@@ -1,0 +1,107 @@
+"""The compiled programs of multiple shooting: all segments of all experiments at once, as one batch, with derivatives
+by what they share, by what each experiment has to itself, and by the states at their nodes."""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..programs.cache import compiled
+from ..simulation.simulate import simulate
+from ..system.system import AcausalSystem
+from .program import Conditions, Layout, outputs_of, placed, with_kinds
+
+
+class Cut(eqx.Module):
+    """What programs are told of e experiments, each in N segments: l times from the start of a segment to its end, its
+    start, known starts, and inputs over the whole time."""
+
+    times: Float[Array, "e N l"]
+    t0: Float[Array, "e N"]
+    known: Float[Array, "e known"]
+    inputs: dict[str, tuple[Float[Array, "e _"], Float[Array, "e _"]]]
+
+
+class Ran(eqx.Module):
+    """What segments gave: outputs at l times, and the consistent states of n entries at both ends."""
+
+    outputs: Float[Array, "*batch l k"]
+    start: Float[Array, "*batch n"]
+    end: Float[Array, "*batch n"]
+
+
+@compiled
+def first_states(
+    system: AcausalSystem, observers: dict[str, Any], layout: Layout, shared: Any, own: Any, conditions: Conditions
+) -> tuple[Float[Array, "e n"], Float[Array, "e n s"], Float[Array, "e n o"]]:
+    """The states at which experiments start, and their derivatives by the shared numbers and by each one's own."""
+
+    def one(shared, own, c):
+        here, _, initial = placed(system, observers, layout, shared, own, c.known)
+        found = here.initialize(c.t0, with_kinds(c.inputs, layout) or None, initial or None, throw=False)
+        return found, found
+
+    def with_slopes(shared, own, c):
+        (by_shared, by_own), found = jax.jacfwd(one, argnums=(0, 1), has_aux=True)(shared, own, c)
+        return found, by_shared, by_own
+
+    return jax.vmap(with_slopes, in_axes=(None, 0, 0))(shared, own, conditions)
+
+
+@compiled
+def on_constraints(
+    system: AcausalSystem, observers: dict[str, Any], layout: Layout, iterations: int, shared: Any, own: Any,
+    states: Any, cut: Cut,
+) -> tuple[Float[Array, "e N n"], Float[Array, "e N n f"]]:  # fmt: skip
+    """The states at the nodes moved onto the constraints, and the derivatives there of this projection by the f
+    differential states."""
+    f = len(system.plan.states)
+
+    def one(shared, own, x, t, c):
+        here, _, _ = placed(system, observers, layout, shared, own, c.known)
+        inputs = with_kinds(c.inputs, layout) or None
+        x = here.project(t, x, inputs, iterations=iterations)
+        slope = jax.jacfwd(lambda first: here.project(t, jnp.concatenate([first, x[f:]]), inputs))(x[:f])
+        return x, slope
+
+    def each(own, states, c):
+        return jax.vmap(lambda x, t: one(shared, own, x, t, c))(states, c.t0)
+
+    return jax.vmap(each)(own, states, cut)
+
+
+@compiled
+def run_segments(
+    system: AcausalSystem, observers: dict[str, Any], layout: Layout, moving: tuple[int, ...], shared: Any, own: Any,
+    states: Any, bases: Any, cut: Cut,
+) -> tuple[Ran, Ran]:  # fmt: skip
+    """All segments, from states at the nodes; and their derivatives, in a last axis, by numbers common to segments, at
+    the places `moving` in [shared | own], and by the coefficients of `bases`, shape (e, N, n, d), along which nodes
+    move."""
+    count, places = len(moving), np.array(moving, int)
+
+    def one(moved, shared, own, x, basis, times, t0, c):
+        both = jnp.concatenate([shared, own]).at[places].set(moved[:count])
+        shared, own = both[: len(shared)], both[len(shared) :]
+        delta = moved[count:]
+        here, laws, _ = placed(system, observers, layout, shared, own, c.known)
+        solution = simulate(
+            here, times[-1], t0=t0, ts=times, initial=x + basis @ delta, adjoint=diffrax.ForwardMode(), throw=False,
+            inputs=with_kinds(c.inputs, layout), **dict(layout.options),
+        )  # fmt: skip
+        found = Ran(outputs_of(solution, laws, layout, times.dtype), solution.states[0], solution.states[-1])
+        return found, found
+
+    def with_slopes(own, x, basis, times, t0, c):
+        moved = jnp.concatenate([jnp.concatenate([shared, own])[places], jnp.zeros(basis.shape[-1:], basis.dtype)])
+        slopes, found = jax.jacfwd(one, has_aux=True)(moved, shared, own, x, basis, times, t0, c)
+        return found, slopes
+
+    def each(own, states, bases, c):
+        return jax.vmap(lambda x, b, times, t0: with_slopes(own, x, b, times, t0, c))(states, bases, c.times, c.t0)
+
+    return jax.vmap(each)(own, states, bases, cut)

@@ -1,0 +1,279 @@
+"""Steps of an Optax optimizer on the cost of a problem, by the compiled program of least squares."""
+
+import dataclasses
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Float
+
+from ..errors import ModelError
+from ..optional import optional_module
+from .checkpoint import fingerprint, read_facts, read_state, save
+from .gradient import Batches
+from .holdout import holdout_score
+from .least_squares import Evaluation, Weights
+from .objective import Objective
+
+if TYPE_CHECKING:
+    from .problem import Problem
+
+
+@dataclasses.dataclass(frozen=True)
+class GradientSteps:
+    """How to train by gradients, for `Problem.train(...)` and `Problem.fit(first=...)`.
+
+    - `optimizer`: of Optax, such as `optax.adam(0.02)` with a number or a schedule, or
+        `optax.chain(optax.clip_by_global_norm(1.0), optax.adam(0.02))`. It moves the coordinates: logarithms of
+        positive parameters, other numbers in units of their size.
+    - `steps`: how many updates.
+    - `batch`: how many experiments each step looks at; None: all, by the program that least squares uses. Experiments
+        are drawn by `seed`; a batch is another program, compiled once.
+    - `horizons`: shares of the time, each for an equal part of the steps.
+    - `patience`: with experiments held out, training ends after so many steps without a better score of these.
+    - `callback`: called after each step with an `Update`; what returns True ends the training.
+    - `checkpoint`: a file. Where it exists, training goes on from it, and ends as if it had not been interrupted, bit
+        for bit; it is written every `every` steps and at the end. The file tells the model, the data and these
+        settings; that the optimizer has the same rates is for the caller to see to.
+    - `every`: after how many steps the held-out experiments are scored, at the whole horizon, and checkpoints written.
+    """
+
+    optimizer: optax.GradientTransformation
+    steps: int
+    batch: int | None = None
+    horizons: Sequence[float] = (1.0,)
+    patience: int | None = None
+    callback: Callable[["Update"], Any] | None = None
+    checkpoint: Any = None
+    every: int = 20
+    seed: int = 0
+
+    def __post_init__(self):
+        if not isinstance(self.optimizer, optax.GradientTransformation):
+            raise ModelError(f"optimizer must be one of Optax, such as optax.adam(0.02); got {self.optimizer!r}")
+        numbers = {"steps": 0, "batch": 1, "patience": 1, "every": 1}
+        for name, least in numbers.items():
+            value = getattr(self, name)
+            if value is None and name in ("batch", "patience"):
+                continue
+            if not isinstance(value, int) or isinstance(value, bool) or value < least:
+                raise ModelError(f"GradientSteps: {name} is a whole number ≥ {least}; got {value!r}")
+        shares = tuple(float(share) for share in self.horizons)
+        if not shares or shares[-1] != 1.0 or any(not 0 < share <= 1 for share in shares):
+            raise ModelError(f"horizons are shares in (0, 1], the last of them 1; got {self.horizons!r}")
+        object.__setattr__(self, "horizons", shares)
+
+    def share(self, step: int) -> float:
+        """The horizon of a step."""
+        return self.horizons[min(step * len(self.horizons) // max(self.steps, 1), len(self.horizons) - 1)]
+
+
+@dataclasses.dataclass(frozen=True)
+class Update:
+    """What a callback is told after `step` updates: the `loss` before the last one, for each sample; the latest `score`
+    of experiments held out, NaN if there is none; and `values` by name."""
+
+    step: int
+    loss: float
+    score: float
+    values: dict[str, float]
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Training:
+    """The outcome of `Problem.train`.
+
+    - `z`: the best point, of the coordinates that are searched: that of the best score of experiments held out, or else
+        of the least loss at the whole horizon, or with batches, whose losses cannot be compared, the last one.
+    - `history`: the loss at each step, ½ (residual/σ)² for each sample.
+    - `scores`: `(steps, score)` of experiments held out.
+    - `step`: after how many updates the best point was reached.
+    """
+
+    objective: Objective
+    z: Float[np.ndarray, " f"]
+    history: Float[np.ndarray, " steps"]
+    scores: tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]
+    step: int
+    message: str
+
+    def __repr__(self):
+        return f"Training({self.message}: the best point is that after {self.step})"
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Parameters, starts and weights by name, at the best point."""
+        return values_at(self.objective, self.z)
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draws the history, and the scores of experiments held out; returns Matplotlib axes."""
+        plt = optional_module("matplotlib.pyplot", "plot", "plotting needs Matplotlib")
+        if ax is None:
+            _, ax = plt.subplots(figsize=(7.0, 3.5), layout="constrained")
+        ax.semilogy(np.arange(len(self.history)), np.sqrt(2 * self.history), label="fitted")
+        if len(self.scores[0]):
+            ax.semilogy(*self.scores, "o-", markersize=3, label="held out")
+        ax.axvline(self.step, color="0.7", linewidth=0.8)
+        ax.set_xlabel("updates")
+        ax.set_ylabel("root mean square residual [σ]")
+        ax.legend()
+        return ax
+
+
+def values_at(objective: Objective, z: Float[np.ndarray, " f"]) -> dict[str, float]:
+    """Values by name."""
+    c = objective.coordinates
+    return dict(zip(c.names, c.natural(objective.full(z)).tolist(), strict=True))
+
+
+@dataclasses.dataclass
+class State:
+    """All that training goes on from."""
+
+    z: Float[np.ndarray, " f"]
+    best: Float[np.ndarray, " f"]
+    optimizer: Any
+    weights: Weights
+    history: list[float]
+    scored: list[int]
+    scores: list[float]
+    best_step: int = 0
+    best_value: float = np.inf
+
+    @property
+    def step(self) -> int:
+        """How many updates were taken."""
+        return len(self.history)
+
+    def arrays(self) -> Any:
+        """What a checkpoint keeps."""
+        w = self.weights
+        return [
+            self.z, self.best, self.optimizer, w.row, w.precision, w.mean, np.array(self.history, float),
+            np.array(self.scored, int), np.array(self.scores, float), np.array(self.best_step),
+            np.array(self.best_value),
+        ]  # fmt: skip
+
+
+def train(problem: "Problem", objective: Objective, start: Float[np.ndarray, " f"], plan: GradientSteps) -> Training:
+    """Trains from a point."""
+    held_out = bool(objective.stacked.holdout.any())
+    if plan.patience is not None and not held_out:
+        raise ModelError("patience needs experiments that are held out: Experiment(..., holdout=True)")
+    low, high = objective.bounds
+    stages = {share: Batches(objective.until(share), plan.batch, plan.seed) for share in plan.horizons}
+    z = np.clip(start, low, high)
+    weights = _weights(stages[plan.share(0)], z)
+    if weights is None:
+        raise problem.not_simulated(objective)
+    with jax.numpy_dtype_promotion("standard"):
+        optimizer = plan.optimizer.init(jnp.asarray(z))
+    state = State(z, z, optimizer, weights, [], [], [])
+    facts = _facts(objective, plan, optimizer)
+    if plan.checkpoint is not None and Path(plan.checkpoint).exists():
+        state = _resumed(plan, facts, state, stages)
+    message, stopped = "", False
+    while state.step < plan.steps and not stopped:
+        if plan.patience is not None and state.scores and state.step - state.best_step >= plan.patience:
+            message = f"ended after {state.step} updates: {plan.patience} without a better score"
+            break
+        following = plan.share(state.step)
+        batches = stages[following]
+        if state.step and following != plan.share(state.step - 1):
+            weights = _weights(batches, state.z)
+            if weights is None:
+                message = f"stopped after {state.step} updates: a run over {following:g} of the time fails"
+                break
+            state.weights = weights
+        found = batches.cost_and_gradient(state.z, state.weights, batches.chosen(state.step))
+        if found is None:
+            message = f"stopped after {state.step} updates, where a run fails: a smaller rate or clipping may help"
+            break
+        loss, gradient = found
+        if not held_out and plan.batch is None and following == 1.0 and loss < state.best_value:
+            state.best, state.best_value, state.best_step = state.z, loss, state.step
+        with jax.numpy_dtype_promotion("standard"):
+            updates, state.optimizer = plan.optimizer.update(
+                jnp.asarray(gradient), state.optimizer, jnp.asarray(state.z)
+            )
+        state.z = np.clip(state.z + np.asarray(updates, np.float64), low, high)
+        state.history.append(loss)
+        due = state.step % plan.every == 0
+        if due and held_out and following == 1.0:
+            score = holdout_score(objective, state.z, state.weights)
+            state.scored.append(state.step)
+            state.scores.append(score)
+            if score < state.best_value:
+                state.best, state.best_value, state.best_step = state.z, score, state.step
+        if plan.callback is not None:
+            score = state.scores[-1] if state.scores else float("nan")
+            if plan.callback(Update(state.step, loss, score, values_at(objective, state.z))) is True:
+                message, stopped = f"ended by the callback after {state.step} updates", True
+        if plan.checkpoint is not None and (due or stopped or state.step == plan.steps):
+            save(plan.checkpoint, facts | _counts(state), state.arrays())
+    last = not np.isfinite(state.best_value)  # nothing to choose by
+    if not held_out and plan.batch is None and state.step == plan.steps:
+        # The last point has not been looked at yet.
+        found = stages[1.0].cost_and_gradient(state.z, state.weights, None)
+        last = found is not None and found[0] < state.best_value
+    if last:
+        state.best, state.best_step = state.z, state.step
+    return Training(
+        objective, state.best, np.array(state.history), (np.array(state.scored, float), np.array(state.scores)),
+        state.best_step, message or f"all {state.step} updates were taken",
+    )  # fmt: skip
+
+
+def _weights(batches: Batches, z: Float[np.ndarray, " f"]) -> Weights | None:
+    """Noise levels that are known or as large as residuals are, and priors; at the beginning of a horizon."""
+    o = batches.objective
+    known = not o.evidence.labels
+    found = Evaluation(np.zeros(0), np.zeros((0, len(z)))) if known else o.evaluate(z)
+    return None if found is None else o.weights(z, found)
+
+
+def _facts(objective: Objective, plan: GradientSteps, optimizer: Any) -> dict[str, Any]:
+    """What must be the same for a checkpoint to fit."""
+    s, c = objective.stacked, objective.coordinates
+    data = [s.times, s.t0, s.values, s.observed, s.sigma, s.weight, s.holdout, dict(s.inputs), repr(s.starts)]
+    searched = [np.array(objective.free), c.low, c.high, c.start[~objective.free], c.size]
+    return {
+        "model": objective.system.plan.digest,
+        "set of unknowns": json.dumps(
+            [list(c.names), fingerprint(searched), sorted(map(str, objective.penalties.items()))]
+        ),
+        "set of values": fingerprint(eqx.filter((objective.system, objective.observers), eqx.is_array)),
+        "set of data": fingerprint(data),
+        "optimizer": str(jax.tree.structure(optimizer)),
+        "batch": plan.batch,
+        "seed": plan.seed,
+        "every": plan.every,
+        "horizons": [[share, plan.steps] for share in plan.horizons] if len(plan.horizons) > 1 else [],
+    }
+
+
+def _counts(state: State) -> dict[str, Any]:
+    return {"taken": len(state.history), "scored": len(state.scores), "rows": len(state.weights.row)}
+
+
+def _resumed(plan: GradientSteps, facts: dict[str, Any], like: State, stages: dict[float, Batches]) -> State:
+    """The state in a checkpoint."""
+    counts = read_facts(plan.checkpoint, facts)
+    taken, scored, rows = (int(counts[name]) for name in ("taken", "scored", "rows"))
+    shape = dataclasses.replace(
+        like, history=[0.0] * taken, scored=[0] * scored, scores=[0.0] * scored,
+        weights=dataclasses.replace(like.weights, row=np.zeros(rows)),
+    )  # fmt: skip
+    z, best, optimizer, row, precision, mean, history, at, scores, best_step, best_value = read_state(
+        plan.checkpoint, shape.arrays()
+    )
+    return State(
+        z, best, optimizer, Weights(row, precision, mean), history.tolist(), at.tolist(), scores.tolist(),
+        int(best_step), float(best_value),
+    )  # fmt: skip

@@ -1,0 +1,62 @@
+"""A run that begins at a whole state, such as where another one ended."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from ..errors import InitializationError, ModelError
+from ..initialization.initialize import InitialPoint, is_consistent
+from ..system.system import AcausalSystem
+
+ITERATIONS = 8  # Gauss–Newton steps onto the constraints, which converge quadratically
+
+
+def from_state(system: AcausalSystem, t0: Any, inputs: Any, x: Float[Array, " n"]) -> InitialPoint:
+    """The consistent point next to a state. The search for it is kept out of differentiation; a last step carries first
+    derivatives, by the state and by parameters, which are those of the projection where it arrived."""
+    limit = jnp.sqrt(jnp.finfo(x.dtype).eps) * (jnp.abs(x) + jnp.asarray(_typical(system), x.dtype))
+    nothing = jnp.zeros((), jnp.int32)
+    if not system.is_constrained:
+        return InitialPoint(x, x[:0], jnp.zeros_like(x), limit, jnp.zeros_like(x), nothing, nothing, None)
+    frozen = jax.lax.stop_gradient
+    still, driving = (
+        jax.tree.map(lambda leaf: frozen(leaf) if eqx.is_inexact_array(leaf) else leaf, tree)
+        for tree in (system, inputs)
+    )
+    near = still.project(frozen(t0), frozen(x), driving, iterations=ITERATIONS)
+    moved = system.project(t0, near + (x - frozen(x)), inputs, iterations=1)
+    return InitialPoint(moved, x[:0], frozen(moved - near), limit, jnp.zeros_like(x), nothing, nothing, None)
+
+
+def _typical(system: AcausalSystem) -> np.ndarray:
+    plan = system.plan
+    return plan.typical_sizes[np.concatenate([plan.states, plan.carried])]
+
+
+def check_shape(system: AcausalSystem, initial: Any) -> None:
+    """Raises a `ModelError` if an array cannot be a state of this system."""
+    n = system.plan.n_state
+    if jnp.shape(initial) != (n,):
+        raise ModelError(
+            f"initial: a whole state of this system has shape ({n},); got shape {jnp.shape(initial)}. Single values go "
+            "by names, initial={'m.x': 1.0}"
+        )
+    if not jnp.issubdtype(jnp.result_type(initial), jnp.number) or jnp.iscomplexobj(initial):
+        raise ModelError(f"initial: a state consists of real numbers; got {jnp.result_type(initial)}")
+    if not isinstance(initial, Tracer) and not np.isfinite(np.asarray(initial, float)).all():
+        k = int(np.flatnonzero(~np.isfinite(np.asarray(initial, float)))[0])
+        raise ModelError(f"initial: entry {k} of the state is {float(initial[k])}; entries must be finite")
+
+
+def check_state(found: InitialPoint) -> None:
+    """Raises an `InitializationError` where a state was not moved onto the constraints."""
+    if not is_consistent(found):
+        raise InitializationError(
+            "no state that satisfies the constraints was found near the one given: give a row of solution.states of "
+            "the same model, or values by names, initial={'m.x': 1.0}"
+        )
