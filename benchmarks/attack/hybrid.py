@@ -120,10 +120,15 @@ class Reference:
         t, x = 0.0, np.array(list(system.states.values()) if starts is None else starts, float)
         q = np.array(list(system.discretes.values()), float)
         r = np.zeros(len(system.relations))
-        values = np.array(self.guards(t, x, q, r))
-        if np.any(np.abs(values) < NEAR):
-            raise Delicate("a condition is zero at the start")
-        r = (values[rules:] > 0).astype(float)
+        for _ in range(len(r) + 1):  # a relation may compare what another one chooses
+            values = np.array(self.guards(t, x, q, r))
+            if np.any(np.abs(values) < NEAR):
+                raise Delicate("a condition is zero at the start")
+            before, r = r, (values[rules:] > 0).astype(float)
+            if np.array_equal(before, r):
+                break
+        else:
+            raise Delicate("relations that lead back at the start")
         holds = self._true(values[:rules], q)
         segments, instants = [], [0.0]
         ticks = sorted({k * c.period for c in system.clocks for k in range(int(end / c.period) + 1)})
