@@ -111,8 +111,8 @@ FAULTS = [
     ),
     Fault(
         "system/parameters.py",
-        "values <= high)",
-        "values <= low)",
+        "numbers <= high)\n        if not right.all():",
+        "numbers <= low)\n        if not right.all():",
         "tests/compiler tests/kernels/test_parameter_expressions.py",
     ),
     Fault(

@@ -220,7 +220,7 @@ def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, dela
         held = (value >= 0) | is_zero(value, rate)
         holds = jnp.all(jnp.isfinite(own)) & jnp.all(jnp.isfinite(value)) & ((m == 0) | jnp.all(held[conditions]))
         goes_on = holds | (k > 0) | (m == len(others) - 1)
-        return k + goes_on, m + ~goes_on, *carry
+        return k + goes_on.astype(k.dtype), m + (~goes_on).astype(m.dtype), *carry
 
     def unfinished(carry):
         k, _, _, values, rates = carry
