@@ -11,7 +11,7 @@ import pytest
 import scipy.integrate
 from problems import compiled
 
-from jaxonomy_dae import EqnEnv, SimulationError, simulate
+from jaxonomy_dae import EqnEnv, simulate
 from jaxonomy_dae.library import electrical as el
 from jaxonomy_dae.library import signal
 
@@ -124,13 +124,12 @@ def test_its_gradients(adjoint):
 
 @pytest.mark.slow
 def test_a_boost_converter():
-    """With ideal parts the switch closes on a diode that conducts, and short-circuits the tank; their resistance, 1e-5,
-    changes voltages by 4 A·1e-5 Ω beside 30 V."""
-    solution = simulate(boost(1e-9, 1e-5), 10 * PERIOD, ts=jnp.array([10 * PERIOD]), max_events=100, **TIGHT)
+    """The switch closes on a diode that conducts, and ideal parts would short-circuit the tank: the diode blocks at
+    that instant. A resistance of 1e-5 changes voltages by 4 A·1e-5 Ω beside 30 V."""
     (_, voltage), _ = ideal_boost(10)
-    np.testing.assert_allclose(solution["tank.v"][-1], voltage, rtol=1e-5)
-    with pytest.raises(SimulationError, match="short-circuit a source or a capacitor: give those a resistance, Ron="):
-        simulate(boost(1e-9, 0.0), 2 * PERIOD)
+    for resistance, rtol in ((1e-5, 1e-5), (0.0, 1e-7)):
+        run = simulate(boost(1e-9, resistance), 10 * PERIOD, ts=jnp.array([10 * PERIOD]), max_events=100, **TIGHT)
+        np.testing.assert_allclose(run["tank.v"][-1], voltage, rtol=rtol)
 
 
 @pytest.mark.slow
