@@ -201,14 +201,14 @@ def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, dela
     others = jnp.asarray(_alternatives(problem.choices, len(q)))
     conditions = np.array(problem.choice_guards, int)
 
-    def in_mode(m):
-        return jnp.where(others[m], 1.0 - q, q)
+    def in_mode(m, q):
+        return jnp.where(others[m], 1.0 - q, q) if problem.choices else q
 
     # Slopes, guards and their rates after the event, with what was before it, before the delay, and, where a guard is
     # flat, a little ahead: in a loop, for XLA compiles the equations as often as they are written.
     def look(carry):
         k, m, slopes, values, rates = carry
-        slope, now = slopes[0], in_mode(m)
+        slope, now = slopes[0], in_mode(m, q)
         places = jnp.stack([x, instant.arrived, x - slope * delay, x + slope * ahead])
         time = t + jnp.stack([delay, jnp.zeros_like(t), jnp.zeros_like(t), ahead])[k]
         own = problem.slope(time, places[k], now, args)
@@ -229,8 +229,7 @@ def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, dela
     rows, none = jnp.zeros((4, g), x.dtype), jnp.array(0)
     begin = none, none, jnp.zeros((4, *x.shape), x.dtype), rows, rows
     _, mode, (slope, _, earlier, _), values, rates = lax.while_loop(unfinished, look, begin)
-    if problem.choices:
-        written_q = jnp.where(others[mode], 1.0 - q, written_q)
+    written_q = in_mode(mode, written_q)
     slow = (jnp.abs(earlier - slope) <= STEADY * jnp.abs(slope)).astype(x.dtype)
     (value, at_arrival, _, _), (rate, rate_there, _, rate_ahead) = values, rates
     reached = at_arrival <= jnp.maximum(band, within(rate_there))

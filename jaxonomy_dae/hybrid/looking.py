@@ -76,13 +76,13 @@ def looked_at(
     window = jnp.maximum(WINDOW * span, problem.resolution)
     ticking = y0.due <= t1 + 0.25 * problem.resolution
 
+    never, none, zero = jnp.full_like(t1, jnp.inf), jnp.zeros((g,), bool), jnp.zeros_like(x1)
+
     if not g:
-        none = jnp.zeros((0,), bool)
-        before = jnp.zeros_like(x1)
+        before = zero
         if not problem.only_kinks:
-            before = lax.cond(any_member(jnp.any(ticking)), lambda: problem.slope(t1, x1, q, args), lambda: before)
-        arrival = Arrival(before, y0.size, ticking, none, y0.size, window, span)
-        return Met(jnp.full_like(t1, jnp.inf), y0.armed, y0.size, arrival)
+            before = lax.cond(any_member(jnp.any(ticking)), lambda: problem.slope(t1, x1, q, args), lambda: zero)
+        return Met(never, y0.armed, y0.size, Arrival(before, y0.size, ticking, none, y0.size, window, span))
 
     times = jnp.append(t0 + h * jnp.asarray(LOOKS[:-1], t1.dtype), t1)
     states = jnp.concatenate([jax.vmap(lambda t: dense(t0, t1, t))(times[:-1]), x1[None]])
@@ -90,31 +90,27 @@ def looked_at(
     size = jnp.abs(values)
     largest = jnp.maximum(jnp.max(size, axis=0), y0.size)
     off = jnp.max(jnp.abs(jnp.asarray(_OFF_PARABOLA, values.dtype) @ values), axis=0)
-    # Nothing is met where all guards are farther from zero than they move, whatever they do between: of most steps.
+    # Of most steps: nothing is met where all guards are farther from zero than they were seen to move.
     moves = jnp.max(values, axis=0) - jnp.min(values, axis=0)
     side = jnp.where(values[-1] > 0, ABOVE, BELOW)
     far = jnp.min(size, axis=0) > moves + 2 * off + rounding(largest)
     quiet = jnp.all(far & (side == y0.armed)) & ~jnp.any(ticking)
 
-    def nothing():
-        due, jumped = jnp.zeros((problem.n_clocks + g,), bool), jnp.zeros((g,), bool)
-        arrival = Arrival(jnp.zeros_like(x1), y0.size, due, jumped, largest, window, span)
-        return Met(jnp.full_like(t1, jnp.inf), y0.armed, values[-1], arrival)
+    due = jnp.concatenate([ticking, none])
+    clocks = Met(never, y0.armed, values[-1], Arrival(zero, y0.size, due, none, largest, window, span))
 
     def something():
-        return _met(problem, dense, t0, t1, y0, x1, args, times, values, off, ticking)
+        return _met(problem, dense, t0, t1, y0, x1, args, times, values, off, clocks)
 
-    return lax.cond(any_member(~quiet), something, nothing)
+    return lax.cond(any_member(~quiet), something, lambda: clocks)
 
 
-def _met(problem, dense, t0, t1, y0: HybridState, x1, args, times, values, off, ticking) -> Met:
-    """What a step meets, given guards at the places where they are looked at."""
-    h, q, g = t1 - t0, y0.q, problem.n_guards
-    span = jnp.maximum(h, FORGOTTEN * y0.span)
-    window = jnp.maximum(WINDOW * span, problem.resolution)
+def _met(problem, dense, t0, t1, y0: HybridState, x1, args, times, values, off, clocks: Met) -> Met:
+    """What a step meets, given guards at the places where they are looked at, and what it meets of clocks alone."""
+    h, q, g, arrival = t1 - t0, y0.q, problem.n_guards, clocks.arrival
+    span, window, ticking = arrival.span, arrival.window, arrival.due[: problem.n_clocks]
     size = jnp.max(jnp.abs(values), axis=0)
-    largest = jnp.maximum(size, y0.size)
-    band = rounding(largest)
+    band = rounding(arrival.size)
     # What has left the band above zero anywhere before is above, and armed, as is what rests.
     rises = jnp.concatenate([(y0.armed == ABOVE)[None], values[1:] > band])
     above = lax.associative_scan(jnp.logical_or, rises)
@@ -168,7 +164,7 @@ def _met(problem, dense, t0, t1, y0: HybridState, x1, args, times, values, off, 
     request = jnp.minimum(jnp.where(inside, where, jnp.inf), t0 + dip * h)
     request = jnp.where(bent, t0 + 0.5 * h, request)
     due = jnp.concatenate([ticking, near]) & ~jnp.isfinite(request)
-    arrival = Arrival(before, y0.size, due, jumped, largest, window, span)
+    arrival = arrival._replace(slope=before, due=due, jumped=jumped)
     side = jnp.where(above[-1], ABOVE, jnp.where(armed[-1], RESTS, BELOW))
     return Met(request, side.astype(y0.armed.dtype), last - raised[-1], arrival)
 

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
+from swinging import compiled_pendulum, record
 
-from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, NeuralDAEBlock, learning, simulate
-from jaxonomy_dae.library.planar import PlanarPendulum
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, learning, simulate
 from jaxonomy_dae.modeling import Component, Eq, der
 from jaxonomy_dae.programs.cache import PROGRAMS
 
@@ -40,30 +40,9 @@ def same_outcome(one, other):
 # --- a constrained model ----------------------------------------------------------------------------------------------
 
 
-def drag(t, v, theta):
-    return -theta[0] * v
-
-
-def swing(seed, count, release, **others):
-    def field(t, s):
-        return [s[1], -9.81 / 1.1 * np.cos(s[0]) - 0.3 * s[1]]
-
-    times = np.linspace(0.0, 0.04 * count, count + 1)[1:]
-    angle = scipy.integrate.solve_ivp(field, (0, times[-1]), [release, 0.0], t_eval=times, rtol=1e-10, atol=1e-12).y[0]
-    rng = np.random.default_rng(seed)
-    x, y = (1.1 * f(angle) + 2e-3 * rng.standard_normal(count) for f in (np.cos, np.sin))
-    x[3:6] = np.nan
-    return learning.Experiment(times, {"pend.x": x, "pend.y": y}, **{"sigma": 2e-3} | others)
-
-
 @pytest.fixture(scope="module")
 def pendulum():
-    ev, diagram = EqnEnv(), AcausalDiagram()
-    bob = PlanarPendulum(ev, name="pend", m=1.0, L=1.0, initial_theta=-1.0)
-    diagram.add(bob)
-    block = NeuralDAEBlock(drag, jnp.array([0.1]), targets=[(bob, "vx"), (bob, "vy")], name="drag")
-    diagram.add_neural_correction_block(block)
-    return AcausalCompiler(ev, diagram)()
+    return compiled_pendulum()
 
 
 @pytest.mark.slow
@@ -71,9 +50,9 @@ def test_a_constrained_model(pendulum):
     """The nodes move along x² + y² = L², and L changes: four states with two degrees of freedom."""
     release = "pend.initial_theta"
     data = learning.Data(
-        swing(0, 50, -1.0, initial={release: learning.Unknown(-0.9)}),
-        swing(1, 30, -0.4, initial={release: learning.Unknown(-0.5)}),
-        swing(2, 40, -0.7, initial={release: learning.Unknown(-0.9)}, holdout=True, name="kept"),
+        record(0, 50, -1.0, initial={release: learning.Unknown(-0.9)}),
+        record(1, 30, -0.4, initial={release: learning.Unknown(-0.5)}),
+        record(2, 40, -0.7, initial={release: learning.Unknown(-0.9)}, holdout=True, name="kept"),
     )
     given = dict(train=["pend.L", "pend.m", "drag"], regularize=None, rtol=1e-9, atol=1e-11)
     single = learning.Problem(pendulum, data, **given).fit(freeze=["pend.m"])
