@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ..diagnosis.unused_parameters import unused_parameters
 from ..errors import InitializationError, ModelError, SimulationError, nearest
-from ..lowering.plan import SystemPlan
 from ..model.tables import ZERO
 from ..simulation.simulate import simulate
 from ..system.system import AcausalSystem
@@ -115,9 +115,9 @@ class Problem:
                 raise ModelError(
                     f"train: '{name}' is neither a parameter, a network nor a sensor law: " + nearest(name, known)
                 )
-        read = _read_parameters(self.system.plan)
+        unused = unused_parameters(self.system.plan.flat)
         for name in parameters:
-            if table.index(name) not in read:
+            if table.index(name) in unused:
                 raise ModelError(
                     f"train: nothing in the model reads parameter '{name}', so no data can determine it: leave it out"
                 )
@@ -479,19 +479,3 @@ class Problem:
         if found is None:
             raise SimulationError(self._why(objective))
         return identifiability(objective, objective.weights(z, found), found, z, self._options["rtol"])
-
-
-def _read_parameters(plan: SystemPlan) -> set[int]:
-    """The parameters that some equation, start, event or other parameter reads."""
-    flat = plan.flat
-    found: set[int] = set()
-    for group in flat.groups:
-        found.update(group.parameter.ravel().tolist())
-    for group in flat.variables.start.groups:
-        found.update(group.parameter.ravel().tolist())
-    for group in flat.parameters.dependents:
-        found.update(group.parameter.ravel().tolist())
-    for clock in flat.events.clocks:
-        for part in clock:
-            found.update(() if part is None else part.parameters)
-    return found
