@@ -201,7 +201,6 @@ class Train:
                     )
                 elif modes["play", k] == side:
                     out.append((beyond, lambda t, y, k=k: modes.__setitem__(("play", k), 0)))
-        assert n
         return out
 
     def _press(self, key, t: float, y: np.ndarray, modes: dict) -> None:
