@@ -15,7 +15,7 @@ from ..errors import InitializationError, SimulationError
 from ..initialization.initialize import check
 from ..lowering.plan import SystemPlan
 from ..programs.cache import PROGRAMS
-from ..programs.staging import is_staged
+from ..programs.staging import is_forwards, is_staged
 from ..solvers import BDF, Rodas5P, Tsit5
 from ..solvers.causes import decay_at, is_stiff
 from ..solvers.drive import is_implicit
@@ -82,8 +82,8 @@ def simulate(
     - `initial`: values at `t0` by variables' names, which outrank the starts declared in components. Or a whole state,
         shape `(n_state,)`, such as a row of `solution.states`: it is moved onto the constraints, and declared starts
         are not looked at.
-    - `adjoint`: how to differentiate; default `solvers.StoredAdjoint()`. `diffrax.ForwardMode()` for forward-mode
-        differentiation (`jax.jvp`, `jax.jacfwd`).
+    - `adjoint`: how to differentiate; default `solvers.StoredAdjoint()`, and `diffrax.ForwardMode()` under `jax.jvp`
+        and `jax.jacfwd`; name the latter for a function that is jitted before it is differentiated.
     - `stepsize_controller`: instead of the controller made from the tolerances.
     - `jump_ts`: times at which functions given as inputs jump, a number or shape `(n,)`: steps end there and the method
         starts anew.
@@ -155,8 +155,9 @@ def simulate(
         control = stepsize_controller
         if control is None:
             control = controller_for(system, solver, rtol, atol, dtmax)
+        chosen = default_adjoint(is_forwards(given)) if adjoint is None else adjoint
         return Options(
-            solver, adjoint if adjoint is not None else default_adjoint(), clipped(control, jump_ts, ends),
+            solver, chosen, clipped(control, jump_ts, ends),
             max_steps + ends.count, progress, most_events, room, sides,
         )  # fmt: skip
 
