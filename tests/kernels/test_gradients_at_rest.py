@@ -186,15 +186,7 @@ def implicit(solver):
     "solver",
     [
         pytest.param(Rodas5P(), id="Rodas5P"),
-        # At rest it sees no error and takes orders up to 5, while the pushed run that chooses steps has orders of its
-        # own. Not strict, for with other roundings it is right by chance.
-        pytest.param(
-            BDF(),
-            id="BDF",
-            marks=pytest.mark.xfail(
-                reason="0.95 for 0.408 without XLA's optimization, off by 8e-6 with it", strict=False
-            ),
-        ),
+        pytest.param(BDF(), id="BDF"),
     ],
 )
 def test_implicit_methods_and_motion_that_tolerances_do_not_see(solver):
