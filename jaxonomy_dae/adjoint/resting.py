@@ -242,7 +242,7 @@ class HeldBack(WrappedControl):
         """As the other controller's."""
         end, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         resting = self._resting(y0, args, t1 - t0)
-        return jnp.minimum(end, resting.first_end(t0, end, y0)), (state, t1 - t0, resting.begin(t0, y0))
+        return _no_later(t0, end, resting.first_end(t0, end, y0)), (state, t1 - t0, resting.begin(t0, y0))
 
     def adapt_step_size(self, t0, t1, y0, y1, args, y_error, error_order, controller_state):
         """Whether the step is kept, and the next one."""
@@ -252,8 +252,13 @@ class HeldBack(WrappedControl):
         )
         after = jax.tree.map(lambda a, b: jnp.where(keep, b, a), y0, y1)
         step = Step(t0, t1, y0, after, keep, jump, start, end)
-        end, pushed = self._resting(y0, args, span).restrained(step, pushed)
-        return keep, start, end, jump, (state, span, pushed), result
+        allowed, pushed = self._resting(y0, args, span).restrained(step, pushed)
+        return keep, start, _no_later(start, end, allowed), jump, (state, span, pushed), result
+
+
+def _no_later(start: Any, end: Any, allowed: Any) -> Any:
+    """The end of a step, which moves with the times that it follows from; or what is allowed, as a length."""
+    return jnp.where(allowed < end, start + still(allowed - start), end)
 
 
 def _shortened(start: Any, end: Any) -> Any:
