@@ -81,7 +81,7 @@ def ensemble(
     networks: Mapping[str, Sequence[Any]] | None = None,
     **options: Any,
 ) -> Ensemble:
-    """Fits from several seeds of the networks' weights, by the one program that a single fit compiles.
+    """Fits from several seeds of the networks' weights, one after the other by the program that a single fit compiles.
 
     The band of one fit is linearized around one minimum. Other weights may explain the data as well and say something
     else where these are silent; members that disagree show it (Lakshminarayanan, Pritzel & Blundell 2017, NeurIPS 30).
@@ -105,6 +105,8 @@ def ensemble(
         raise ModelError(
             "start does not go with an ensemble, whose members begin elsewhere; give networks={name: [...]}"
         )
+    # Not in one vmap: on two cores, the Jacobian of eight pendulums with 97 weights takes 0.74 s there, where eight by
+    # themselves take 0.20 s, and the program compiles for as long as that of a single one again.
     estimates, reason = [], None
     for system in _starts(problem, modules, members, seed, networks):
         try:

@@ -31,7 +31,7 @@ def grid_of_axes(axes: Any, rows: int, columns: int, what: str) -> np.ndarray:
     """Axes of shape (rows, columns): those given, or new ones that share their times."""
     if axes is None:
         plt = optional_module("matplotlib.pyplot", "plot", "plotting needs Matplotlib")
-        size = (min(3.2 * columns + 3.0, 14.0), 2.0 * rows + 0.9)
+        size = (min(3.2 * columns + 3.0, 14.0), 2.3 * rows + 0.9)
         return plt.subplots(rows, columns, figsize=size, sharex="col", squeeze=False, layout="constrained")[1]
     found = np.asarray(axes, object)
     if found.size != rows * columns:

@@ -75,6 +75,7 @@ def at_samples(estimate: "Estimate") -> tuple[Float[np.ndarray, "e n k"], Float[
     c, found = estimate.objective.coordinates, estimate.objective.predicted(estimate.point)
     scale = c.slope(estimate.point)
     shared = scale[: c.n_shared, None] * estimate.root[: c.n_shared]
-    own = (scale[c.n_shared :, None] * estimate.root[c.n_shared :]).reshape(c.experiments, c.n_own, -1)
+    own = scale[c.n_shared :, None] * estimate.root[c.n_shared :]
+    own = own.reshape(c.experiments, c.n_own, estimate.root.shape[1])
     moves = found.by_shared @ shared + np.einsum("enko,eor->enkr", found.by_own, own)
     return found.outputs, np.linalg.norm(moves, axis=-1)
