@@ -308,3 +308,53 @@ def test_through_the_bounce():
     law = jax.vmap(names["learned"].neural["ball.law"])(speeds[:, None])[:, 0]
     np.testing.assert_allclose(law, names["truth"](speeds), rtol=0, atol=0.03)  # the noise over falls of 0.2 m
     assert np.abs(names["hit"] - names["wanted"]).max() < 0.1
+
+
+def test_next_experiment():
+    names = names_after("next_experiment")
+    times, sigma, unknown = names["times"], names["SIGMA"], names["UNKNOWN"]
+
+    def run(values, volts, at):
+        """Speed and current by SciPy, J·w' = k·i − d·w − c·tanh(w/0.2), R = 1, the voltage held from each time on."""
+        J, k, d, c = values
+        w, found, ends = 0.0, [], [*at[1:], times[-1]] if at[-1] < times[-1] else at[1:]
+        for start, end, u in zip(at, ends, volts, strict=False):
+            inside = times[(times > start + 1e-12) & (times <= end + 1e-12)]
+            field = lambda t, y, u=u: (k * (u - k * y) - d * y - c * np.tanh(y / 0.2)) / J  # noqa: E731
+            part = solve_ivp(field, (start, end), [w], "LSODA", [*inside, end], rtol=1e-10, atol=1e-12).y[0]
+            found += [(y, u - k * y) for y in part[:-1]]
+            w = part[-1]
+        return np.array(found)
+
+    def slopes(values, volts, at, measured):
+        """By the logarithms of the values, in units of the noise; differences are truncated at 1e-8."""
+        columns = [j for j, name in enumerate(("drive.w", "drive.i")) if name in measured]
+        size = np.array([sigma[n] for n in ("drive.w", "drive.i")])
+        moved = [run(values * np.exp(s * e), volts, at) / size for e in np.eye(4) for s in (1e-4, -1e-4)]
+        return np.stack([(a - b)[:, columns].ravel() / 2e-4 for a, b in zip(moved[::2], moved[1::2], strict=True)], 1)
+
+    # What each candidate would tell, at the values of the first fit, which SciPy's runs confirm.
+    guess = np.array([names["fit"].values[n] for n in unknown])
+    first = slopes(guess, [12.0], [0.0], ["drive.w"])
+    known = first.T @ first + np.eye(4)
+
+    def gain(known, j):
+        return 0.5 * (np.linalg.slogdet(known + j.T @ j)[1] - np.linalg.slogdet(known)[1])
+
+    for k, (u, measured) in enumerate(names["options"].values()):
+        j = slopes(guess, u[1][:-1], list(u[0][:-1]), measured)
+        np.testing.assert_allclose(names["advice"].gain[k], gain(known, j), rtol=0, atol=0.02)
+    assert names["advice"].best == int(np.argmax(names["advice"].gain))
+
+    # The second fit: as far from the truth as its intervals allow, which are those of SciPy's slopes.
+    true = np.array([*names["TRUE"].values()])
+    found = np.array([names["again"].values[n] for n in unknown])
+    u, measured = names["u"], names["names"]
+    j = np.concatenate([slopes(found, [12.0], [0.0], ["drive.w"]), slopes(found, u[1][:-1], list(u[0][:-1]), measured)])
+    deviation = np.sqrt(np.diag(np.linalg.inv(j.T @ j)))
+    np.testing.assert_allclose([names["kept"][n] for n in unknown], deviation, rtol=1e-2)
+    assert (np.abs(np.log(found / true)) < 4 * deviation).all()
+
+    # The design is no worse than the best of a grid, and better than its start.
+    assert names["found"].gain > names["gains"].max() - 2e-3
+    assert names["found"].gain > names["found"].history[0] + 0.05
