@@ -132,6 +132,27 @@ def test_an_unknown_start_has_to_be_determined_too():
         np.testing.assert_allclose(advice.gain[k], 0.5 * np.log1p(left), rtol=1e-5)
 
 
+def test_a_start_that_all_share_is_learned_from_any():
+    """x(0) = 2·z with z of unit spread, and frozen names tell nothing: the same information as with `a`, by NumPy."""
+    shared = {"d.x": Unknown(A, shared=True)}
+    p = problem(train=["d.k"], initial=shared)
+    gains = [next_experiment(p, [plan(1.0, initial=i)], names=["d.x"]).gain[0] for i in (shared, {"d.x": A})]
+    data = slopes(np.array([0.4, 2.0]))
+    known = data.T @ data + np.eye(2)
+    for k, columns in enumerate(([0, 1], [0])):  # the second starts at a value that is known
+        s = slopes(np.array([1.0])) * np.isin([0, 1], columns)
+        told = np.log(np.sqrt(np.linalg.inv(known)[1, 1] / np.linalg.inv(known + s.T @ s)[1, 1]))
+        np.testing.assert_allclose(gains[k], told, rtol=1e-4)
+    with pytest.raises(ModelError, match="candidates share the unknown start of 'd.x'"):
+        next_experiment(problem(train=["d.k"]), [plan(1.0, initial=shared)])
+    fit = problem(times=(0.2, 0.9, 1.9)).fit(freeze={"d.a": A})
+    advice = next_experiment(fit, [plan(1.0)])
+    known = np.sum(slopes(np.array([0.2, 0.9, 1.9]))[:, 0] ** 2) + 1
+    np.testing.assert_allclose(advice.gain, 0.5 * np.log1p(slopes(1.0)[0] ** 2 / known), rtol=1e-4)
+    with pytest.raises(ModelError, match="names: 'd.a' is not estimated"):
+        next_experiment(fit, [plan(1.0)], names="d.a")
+
+
 def test_an_estimate_advises_by_its_own_values():
     fit = problem(times=(0.2, 0.9, 1.9, 3.0)).fit(start={"d.k": 0.5})
     times = np.linspace(0.1, 4.0, 14)
