@@ -320,10 +320,11 @@ def test_next_experiment():
         J, k, d, c = values
         w, found, ends = 0.0, [], [*at[1:], times[-1]] if at[-1] < times[-1] else at[1:]
         for start, end, u in zip(at, ends, volts, strict=False):
-            inside = times[(times > start + 1e-12) & (times <= end + 1e-12)]
+            inside = np.minimum(times[(times > start + 1e-9) & (times <= end + 1e-9)], end)
             field = lambda t, y, u=u: (k * (u - k * y) - d * y - c * np.tanh(y / 0.2)) / J  # noqa: E731
-            part = solve_ivp(field, (start, end), [w], "LSODA", [*inside, end], rtol=1e-10, atol=1e-12).y[0]
-            found += [(y, u - k * y) for y in part[:-1]]
+            points = np.unique([*inside, end])
+            part = solve_ivp(field, (start, end), [w], "LSODA", points, rtol=1e-10, atol=1e-12).y[0]
+            found += [(y, u - k * y) for y in part[: len(inside)]]
             w = part[-1]
         return np.array(found)
 
