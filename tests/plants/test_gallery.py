@@ -436,3 +436,42 @@ def test_battery_pulses():
     assert fit.whiteness["3 A"]["cell.v"].probability < 1e-6
     slope = np.diff(names["band"].mean)
     assert (slope > 0).all()
+
+
+def test_sticking_friction():
+    names = names_after("sticking_friction")
+    times, k = names["times"], 50.0
+
+    def level(v):
+        return 3.0 + 2.0 * np.exp(-((v / 0.1) ** 2)) + 1.5 * abs(v)
+
+    def positions(V):
+        """The block sticks until the spring pulls with 5.5 N, and slides until its speed is zero again."""
+        t, s, found = 0.0, 0.0, []
+        while len(found) < len(times):
+            breaks = (5.5 / k + s) / V
+            found += [s] * int(np.sum((times > t + 1e-12) & (times <= breaks)))
+            if breaks >= times[-1]:
+                break
+
+            def stops(t, y, breaks=breaks):
+                return y[1] if t > breaks + 1e-6 else 1.0
+
+            stops.terminal, stops.direction = True, -1
+            inside = times[times > breaks]
+            slide = solve_ivp(
+                lambda t, y: [y[1], k * (V * t - y[0]) - level(y[1])], (breaks, times[-1] + 1), [s, 0.0], "LSODA",
+                inside, events=stops, rtol=1e-10, atol=1e-13,
+            )  # fmt: skip
+            found += slide.y[0].tolist()
+            if not len(slide.t_events[0]):
+                break
+            t, s = slide.t_events[0][0], slide.y_events[0][0][0]
+        return np.array(found[: len(times)])
+
+    for speed, run in names["runs"].items():
+        np.testing.assert_allclose(run["block.s"], positions(speed), rtol=0, atol=1e-6)
+    fit = names["fit"]
+    assert abs(fit.chi2 / fit.freedom - 1) < 4 * np.sqrt(2 / fit.freedom) and names["error"] < 0.01
+    row = fit.table()["block.more"]
+    assert abs(row.value - names["MORE"]) < 2 * (row.high - row.low)
