@@ -293,8 +293,8 @@ class Estimate:
         return discover(self, name, terms, width, most)
 
     def plot(self, names: str | Sequence[str] | None = None, *, axes: Any = None, level: float = 0.95) -> Any:
-        """Draws samples and fitted runs with their bands: rows of axes for names, columns for experiments (the first
-        four of them); returns Matplotlib axes."""
+        """Draws samples, and fitted runs with their bands at the times of the samples: rows of axes for names, columns
+        for experiments (the first four of them); returns Matplotlib axes."""
         return plot_runs(self, names, axes, level)
 
     def plot_residuals(self, *, axes: Any = None) -> Any:

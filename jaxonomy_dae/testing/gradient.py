@@ -91,13 +91,13 @@ def assert_gradient(
             f"derivative, where {rtol:g} is to be told: nothing can be said. Tighten the tolerances of the run inside, "
             "or allow a larger rtol"
         )
+    looked_at = f"each of {x.size}" if x.size <= EACH else f"{len(moves)} random directions of {x.size}"
     apart = np.abs(backwards - forwards) / scale, np.abs(backwards - differences) / scale
     worst = np.maximum(*apart)
     k = int(np.argmax(worst))
     return Certificate(
         "derivatives backwards, forwards and by differences agree",
-        f"{len(moves)} {'numbers' if labels[0] != 'direction 0' else 'random directions'} of {x.size}, relative to the "
-        f"largest derivative, {scale:.4g}",
+        f"{looked_at} numbers, relative to the largest derivative, {scale:.4g}",
         float(worst[k]),
         rtol,
         f"along {labels[k]}: {backwards[k]:.8g} backwards, {forwards[k]:.8g} forwards, {differences[k]:.8g} by "
