@@ -177,9 +177,9 @@ def next_experiment(
         reason of the first.
     """
     known = known_of(source, names, alone)
-    plans: list[Planned] = list(candidates)
+    plans: list[Planned] = [] if isinstance(candidates, Planned) else list(candidates)
     if not plans or not all(isinstance(one, Planned) for one in plans):
-        raise ModelError("candidates are learning.Planned(times, {'m.x': sigma}, ...), at least one of them")
+        raise ModelError("candidates are a list of learning.Planned(times, {'m.x': sigma}, ...), at least one")
     if isinstance(count, bool) or not isinstance(count, int) or count < 1:
         raise ModelError(f"count is a whole number ≥ 1; got {count!r}")
     labels, gained = informations(known, plans)

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
@@ -48,11 +49,13 @@ def assert_gradient(
 
     - `AssertionError` with the largest deviation and where it is; if differences are too coarse to tell; if values or
         derivatives are not finite.
-    - `ModelError` for an `at` without numbers, and for an `f` that cannot be differentiated forwards.
+    - `ModelError` inside jit, for an `at` without numbers, and for an `f` that cannot be differentiated forwards.
     """
     at = jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, float) else leaf, at)
     moving, rest = eqx.partition(at, eqx.is_inexact_array)
     x, unravel = ravel_pytree(moving)
+    if isinstance(x, Tracer):
+        raise ModelError("assert_gradient needs numbers: call it outside jit, grad and vmap")
     if not x.size:
         raise ModelError("assert_gradient: there are no floating-point numbers in `at` to differentiate by")
 
@@ -91,13 +94,15 @@ def assert_gradient(
             f"derivative, where {rtol:g} is to be told: nothing can be said. Tighten the tolerances of the run inside, "
             "or allow a larger rtol"
         )
-    looked_at = f"each of {x.size}" if x.size <= EACH else f"{len(moves)} random directions of {x.size}"
+    looked_at = f"{len(moves)} random directions of {x.size} numbers"
+    if x.size <= EACH:
+        looked_at = f"each of {x.size} numbers" if x.size > 1 else "1 number"
     apart = np.abs(backwards - forwards) / scale, np.abs(backwards - differences) / scale
     worst = np.maximum(*apart)
     k = int(np.argmax(worst))
     return Certificate(
         "derivatives backwards, forwards and by differences agree",
-        f"{looked_at} numbers, relative to the largest derivative, {scale:.4g}",
+        f"{looked_at}, relative to the largest derivative, {scale:.4g}",
         float(worst[k]),
         rtol,
         f"along {labels[k]}: {backwards[k]:.8g} backwards, {forwards[k]:.8g} forwards, {differences[k]:.8g} by "

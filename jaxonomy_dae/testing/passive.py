@@ -103,6 +103,8 @@ def _typical(law: Any, size: int | None, inputs: Any) -> tuple[np.ndarray, int]:
     if own is not None and size is not None and size != own:
         raise ModelError(f"assert_passive: this law has size {own}; leave size={size} out")
     size = own if size is None else size
+    if size is not None and (isinstance(size, bool) or not isinstance(size, int) or size < 1):
+        raise ModelError(f"assert_passive: size is a whole number ≥ 1; got {size!r}")
     given = getattr(law, "inputs", None) if inputs is None and own is not None else inputs
     if given is None and own is not None:
         given = 1.0
@@ -116,7 +118,7 @@ def _typical(law: Any, size: int | None, inputs: Any) -> tuple[np.ndarray, int]:
         )
     values = np.asarray(given, float)
     values = np.broadcast_to(values, (size,)) if values.ndim == 0 else values
-    if values.ndim != 1 or len(values) < size or not (np.isfinite(values) & (values > 0)).all() or size < 1:
+    if values.ndim != 1 or len(values) < size or not (np.isfinite(values) & (values > 0)).all():
         raise ModelError(f"assert_passive: inputs are typical sizes > 0, at least {size} of them; got {given!r}")
     return values, size
 
@@ -138,14 +140,14 @@ def _share(law: Any, u: Array, size: int) -> Array:
     v = jax.grad(law.energy)(u) if isinstance(law, PortHamiltonian) else u[:size]
     terms = law(u) * v
     total = jnp.sum(jnp.abs(terms))
-    return jnp.where(total > 0, jnp.sum(terms) / jnp.where(total > 0, total, 1.0), 0.0)
+    return jnp.where(total == 0, 0.0, jnp.sum(terms) / jnp.where(total == 0, 1.0, total))  # NaN stays
 
 
 def _rate(law: Any, u: Array, size: int) -> Array:
     """N·v/|v|²."""
     v = jax.grad(law.energy)(u) if isinstance(law, PortHamiltonian) else u[:size]
     square = jnp.sum(v**2)
-    return jnp.where(square > 0, jnp.sum(law(u) * v) / jnp.where(square > 0, square, 1.0), 0.0)
+    return jnp.where(square == 0, 0.0, jnp.sum(law(u) * v) / jnp.where(square == 0, 1.0, square))
 
 
 def _drawn(arrays: Any, rng: np.random.Generator) -> Any:

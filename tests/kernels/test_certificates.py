@@ -60,6 +60,8 @@ def test_what_cannot_be_told_is_no_pass():
         assert_gradient(lambda x: jnp.sqrt(x), 0.0)
     with pytest.raises(ModelError, match="no floating-point numbers"):
         assert_gradient(lambda x: x, 3)
+    with pytest.raises(ModelError, match="outside jit, grad and vmap"):
+        jax.jit(lambda x: assert_gradient(jnp.sin, x).error)(0.5)
     with pytest.raises(ModelError, match="must return floating-point numbers"):
         assert_gradient(lambda x: jnp.sum(x > 0), jnp.ones(2))
 
@@ -84,6 +86,8 @@ def test_callables_are_sampled_and_climbed():
     assert_passive(lambda u: -u[:1] * jnp.exp(-u[1]), 1, inputs=[1.0, 0.2])
     with pytest.raises(AssertionError, match="no finite value at u = "):
         assert_passive(lambda u: -u[:1] * jnp.exp(-u[1]), 1, inputs=[1.0, 2.0])
+    with pytest.raises(AssertionError, match="no finite value at u = "):
+        assert_passive(lambda v: v * jnp.nan, 1)
     turned = jnp.array([[-1.0, 5.0], [-5.0, -1.0]])
     assert_passive(lambda v: turned @ v, 2)
     with pytest.raises(AssertionError, match=r"failed: the law brings no energy in(?s:.*)at u = "):
@@ -107,6 +111,8 @@ def test_passivity_needs_to_know_the_inputs():
         assert_passive(LAWS[0], 3)
     with pytest.raises(ModelError, match="typical sizes > 0"):
         assert_passive(lambda v: -v, 2, inputs=[1.0])
+    with pytest.raises(ModelError, match="size is a whole number"):
+        assert_passive(lambda v: -v, 0)
     plain = eqx.nn.MLP(2, 2, 8, 2, jnp.tanh, key=jax.random.key(0))
     with pytest.raises(AssertionError):
         assert_passive(plain, 2)

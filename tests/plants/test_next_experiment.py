@@ -2,6 +2,7 @@
 
 import functools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -189,7 +190,7 @@ def test_before_the_first_bounce_nothing_is_told_of_the_restitution():
 
 def test_bad_candidates():
     p = problem()
-    with pytest.raises(ModelError, match="at least one of them"):
+    with pytest.raises(ModelError, match="a list of learning.Planned"):
         next_experiment(p, [])
     with pytest.raises(ModelError, match="'d.z', which is not a variable"):
         next_experiment(p, [Planned([1.0], {"d.z": 1.0})])
@@ -203,6 +204,23 @@ def test_bad_candidates():
         design_experiment(p, lambda q: plan(q[0]), [1.0], [(0.0, np.inf)])
     with pytest.raises(ModelError, match="must lie inside the bounds"):
         design_experiment(p, lambda q: plan(q[0]), [9.0], [(0.1, 5.0)])
+
+
+class Gauge(eqx.Module):
+    gain: jax.Array
+
+    def __call__(self, solution):
+        return self.gain * solution["d.x"]
+
+
+def test_what_a_sensor_law_would_show():
+    """Twice the signal with twice the noise tells the same."""
+    times = np.array([0.4, 2.0])
+    record = Experiment(times, {"gauge.y": 2 * A * np.exp(-K * times)}, sigma=2 * SIGMA)
+    p = Problem(system(), record, train=["d.k"], observe={"gauge.y": Gauge(jnp.array(2.0))}, rtol=1e-9, atol=1e-11)
+    advice = next_experiment(p, [Planned([1.4], {"gauge.y": 2 * SIGMA}), plan(1.4)])
+    known = np.sum(slopes(times)[:, 0] ** 2) + 1
+    np.testing.assert_allclose(advice.gain, 0.5 * np.log1p(slopes(1.4)[0] ** 2 / known), rtol=1e-5)
 
 
 def test_candidates_whose_runs_fail_are_said():
