@@ -71,7 +71,7 @@ FAULTS = [
         "linear/inverse.py",
         "left_side=True, lower=False) * unit[..., None, :]",
         "left_side=True, lower=False)",
-        "tests/kernels/test_written_out.py tests/kernels/test_stable_blocks.py tests/kernels/test_large_blocks.py",
+        "tests/kernels/test_computed_once.py tests/kernels/test_stable_blocks.py tests/kernels/test_large_blocks.py",
     ),
     Fault(
         "adjoint/reverse_step.py",

@@ -108,7 +108,7 @@ def horizontal(correction: Correction) -> Correction:
     return force
 
 
-def quadratic_drag(v: Float[Array, "2 *b"], weights) -> Float[Array, "2 *b"]:
+def quadratic_drag(v: Float[Array, " 2 *b"], weights) -> Float[Array, " 2 *b"]:
     """Drag on both velocities, $-c |v| v$."""
     del weights
     # `where` keeps the derivative of the norm finite at rest.
@@ -143,7 +143,7 @@ def velocity_weights(seed: int = 0) -> VelocityNetwork:
     )
 
 
-def velocity_network(v: Float[Array, "2 *b"], weights: VelocityNetwork) -> Float[Array, "2 *b"]:
+def velocity_network(v: Float[Array, " 2 *b"], weights: VelocityNetwork) -> Float[Array, " 2 *b"]:
     """A force per mass learned from the velocity: `(vx, vy)` to `(ax, ay)`."""
     expand = (...,) + (None,) * (v.ndim - 1)
 
@@ -211,7 +211,7 @@ class ProjectedUnrolledTsit5(ProjectedTsit5, UnrolledTsit5):
     """`ProjectedTsit5` with `UnrolledTsit5`'s stages."""
 
 
-def project(state: Float[Array, "4 *b"], length: ArrayLike = 1.0) -> Float[Array, "4 *b"]:
+def project(state: Float[Array, " 4 *b"], length: ArrayLike = 1.0) -> Float[Array, " 4 *b"]:
     """The nearest point of the circle, and the velocity's part along its tangent."""
     x, y, vx, vy = state
     scale = length / jnp.sqrt(x * x + y * y)
@@ -613,7 +613,7 @@ def _solve(field, y0, args, ts, save, solver, rtol, atol, adjoint, max_steps) ->
     )
 
 
-def _worst_rms(error: Float[Array, "state *b"]) -> Float[Array, ""]:
+def _worst_rms(error: Float[Array, " state *b"]) -> Float[Array, ""]:
     # No gradient flows through step sizes, so none is needed at zero.
     return jnp.sqrt(jnp.max(jnp.mean(error**2, axis=0)))
 

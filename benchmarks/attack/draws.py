@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from .outcome import Outcome
 
 NETWORKS = ("resistors", "circuits", "rods", "gears", "thermal", "pipes", "mechanisms", "descriptors")
-FAMILIES = (*NETWORKS, "events", "relations", "converters", "drives", "gradients")
+FAMILIES = (*NETWORKS, "events", "relations", "converters", "drives", "shafts", "gradients")
 UNITS = ("equations", "parameters", "units", "all")  # what is rescaled: `benchmarks/rescaling.py`
 PUBLISHED = "published"  # problems that are their own references, in other units
 

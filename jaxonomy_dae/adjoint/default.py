@@ -22,8 +22,8 @@ def forward_mode() -> Iterator[None]:
         _forward.reset(token)
 
 
-def default_adjoint() -> diffrax.AbstractAdjoint:
-    """The adjoint to be taken where none is given."""
-    if _forward.get():
+def default_adjoint(forwards: bool) -> diffrax.AbstractAdjoint:
+    """The adjoint to be taken where none is given; `forwards`: whether forward mode alone is at work."""
+    if forwards or _forward.get():
         return diffrax.ForwardMode()
     return StoredAdjoint() if has_stored_adjoint() else diffrax.RecursiveCheckpointAdjoint()

@@ -43,8 +43,12 @@ class _Recorder:
 
     def __init__(self, numbers: dict[str, Any], program: Program, times: StepTimes):
         self.numbers, self.program, self.times = numbers, program, times
-        state = numbers["state"]
-        carry = self._taken_apart(state, jnp.full_like(state.tprev, -jnp.inf), times.start(), numbers["pushed"])
+        state, moves = numbers["state"], times.start()
+        held = numbers["first"] < state.tnext
+        state = dataclasses.replace(state, tnext=jnp.where(held, numbers["first"], state.tnext))
+        if times.count:
+            moves = moves[0], jnp.where(held, moves[0], moves[1]), *moves[2:]
+        carry = self._taken_apart(state, jnp.full_like(state.tprev, -jnp.inf), moves, numbers["pushed"])
         self.row, self.rest = (Packing(part) for part in carry)
         self.start = self.pack(carry)
 

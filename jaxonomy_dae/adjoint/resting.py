@@ -1,8 +1,9 @@
-"""Steps of a run that is differentiated, while its state rests.
+"""Steps of a run that is differentiated, while some of its state rests.
 
-The error of a step is that of the state. Where the state rests, or moves less than tolerances see, it is zero whatever
-the step; but the derivative of the solution, which is the motion after a small push, needs steps that resolve this
-motion. So there a second run is taken along that was given such a push, and steps are not longer than it allows.
+The error of a step is that of the state. Where a component rests, its error is zero whatever the step; but the
+derivative of the solution, which is the motion after a small push, needs steps that resolve this motion. So while any
+component rests, whatever else moves, a second run is taken along in which those that rest were given such a push, and
+steps are not longer than it allows.
 """
 
 import dataclasses
@@ -20,16 +21,16 @@ from .closure_conversion import Program, any_member
 from .wrapped_control import WrappedControl
 
 # In units of the state and what tolerances make of zero, |y| + atol/rtol:
-PUSH = 0.03  # what the second run is pushed by; its error is then 33·rtol of it
-MOTION = 0.01  # a state rests that would move by less in all the time
-STILL = 1e-3  # of the tolerance: so does one that moves by less during a step
-GROWTH = 1.8  # of steps, from which on it is looked whether the state rests
-SETTLING = 3  # tiny steps after a push, which is to fulfil what Newton solves at the end of a step
+PUSH = 0.03  # what rests is pushed by in the second run, whose error is then 33·rtol of it
+MOTION = 0.01  # a component rests that would move by less in all the time
+TINY = 1e-6  # of a step: the first one where something rests at the start, since what moves is no measure, and …
+SETTLING = 3  # … those after a push, which is to fulfil what Newton solves at the end of a step
 TRIES = 50  # to find a step that the second run allows; it is given up after as many
 
 
 class Pushed(eqx.Module):
-    """The second run: where it stands, whether it exists; and how it would go on after the step to take next.
+    """The second run: where it stands, whether it exists, what was pushed in it and rests still; and how it would go on
+    after the step to take next.
 
     `given_up` is set where no step was short enough for it, so that it limits nothing any more.
     """
@@ -38,6 +39,7 @@ class Pushed(eqx.Module):
     solver_state: Any
     fresh: Bool[Array, ""]
     exists: Bool[Array, ""]
+    resting: Bool[Array, " n"]
     given_up: Bool[Array, ""]
     next_y: Float[Array, " n"]
     next_state: Any
@@ -86,43 +88,62 @@ class Resting(eqx.Module):
         terms, solver, x, _ = resting._between_events(y, y)
         shapes = jax.eval_shape(lambda: solver.init(terms, t, t, x, resting.args))
         state = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-        no = jnp.array(False)
-        return Pushed(x, state, no, no, no, x, state, jnp.full_like(jnp.asarray(t), jnp.inf))
+        no, none = jnp.array(False), jnp.zeros(x.shape, bool)
+        return Pushed(x, state, no, no, none, no, x, state, jnp.full_like(jnp.asarray(t), jnp.inf))
+
+    def first_end(self, t: Any, end: Any, y: Any) -> Any:
+        """The end of the first step, which was chosen by what moves: a second run begins after a step only."""
+        resting, t, end, y = still((self, t, end, y))
+        terms, solver, x, _ = resting._between_events(y, y)
+        rests = resting._rests(solver.func(terms, t, x, resting.args), x)
+        return jnp.where(jnp.any(rests), _shortened(t, end), end)
 
     def restrained(self, step: Step, pushed: Pushed) -> tuple[Array, Pushed]:
         """The end of the next step, and the second run where that begins."""
         resting, step, pushed = still((self, step, pushed))
-        grows = step.end - step.start > GROWTH * (step.t1 - step.t0)
-        look = jnp.where(step.accepted, pushed.exists | grows, pushed.exists) & ~pushed.given_up
+        x0, x1, h = _moving(step.y0), _moving(step.y1), step.t1 - step.t0
+        rests = resting._rests((x1 - x0) / jnp.where(h > 0, h, 1.0), x1)
+        rests = jnp.where(step.accepted, rests, pushed.resting)
+        look = jnp.any(rests) & (step.accepted | pushed.exists) & ~pushed.given_up
+        without = eqx.tree_at(lambda p: p.exists, pushed, pushed.exists & ~step.accepted)
         return lax.cond(
             any_member(look),
             lambda *given: resting._looked(*given),
-            lambda _, step, pushed: (step.end, pushed),
+            lambda look, rests, step, pushed, without: (step.end, without),
             look,
+            rests,
             step,
             pushed,
+            without,
         )
 
-    def _looked(self, look: Bool[Array, ""], step: Step, pushed: Pushed) -> tuple[Array, Pushed]:
+    def _looked(
+        self, look: Bool[Array, ""], rests: Bool[Array, " n"], step: Step, pushed: Pushed, without: Pushed
+    ) -> tuple[Array, Pushed]:
         terms, solver, x, changed = self._between_events(step.y0, step.y1)
-        rests = jnp.where(step.accepted, self._rests(_moving(step.y0), x, step.t1 - step.t0), pushed.exists) & look
         on, new = step.accepted & pushed.exists, step.accepted & ~pushed.exists
+        # What comes to rest later is pushed with what else has by then: solvers with a history begin anew after a push,
+        # and in a large model that settles one component after the other comes to rest.
+        later, still_resting = rests & ~pushed.resting, rests & pushed.resting
+        again = on & jnp.any(later) & (jnp.all(rests) | (jnp.sum(later) >= jnp.sum(still_resting)))
+        push = jnp.where(new, rests, later & again)
         k = jnp.arange(x.size, dtype=x.dtype)
         pattern = jnp.where(jnp.sin(12.9898 * k + 1.0) > 0, 1.0, -1.0) * (1.0 + 0.5 * jnp.sin(78.233 * k))
-        y = jnp.where(on, pushed.next_y, jnp.where(new, x + PUSH * self._scale(x) * pattern, pushed.y))
+        y = jnp.where(on, pushed.next_y, jnp.where(new, x, pushed.y))
+        y = y + jnp.where(push, PUSH * self._scale(x) * pattern, 0.0)
         state = jax.tree.map(lambda a, b: jnp.where(on, a, b), pushed.next_state, pushed.solver_state)
-        fresh = jnp.where(on, step.jump | changed, new | pushed.fresh)
+        fresh = jnp.where(on, step.jump | changed | again, new | pushed.fresh)
         longest = jnp.where(on, pushed.allowed, jnp.inf)
         start, end = step.start, jnp.minimum(step.end, step.start + longest)
         order = solver.error_order(terms)
-        idle = y, pushed.next_y, pushed.next_state, end, jnp.full_like(end, jnp.inf), ~rests, jnp.array(0)
+        idle = y, pushed.next_y, pushed.next_state, end, jnp.full_like(end, jnp.inf), ~look, jnp.array(0)
 
         def attempt(found):
             """With a step up to `end`; and if that was too long, what would do. The first ones from a fresh push are as
             good as none, and put it where the constraints and algebraic equations hold."""
             y, _, _, end, _, done, tries = found
             settles = fresh & (tries < SETTLING)
-            planned, end = end, jnp.where(settles, start + 1e-6 * (end - start), end)
+            planned, end = end, jnp.where(settles, _shortened(start, end), end)
             y1, error, _, state1, result = solver.step(terms, start, end, y, self.args, state, fresh)
             _, controlled = self.controller.init(terms, start, end, y, end - start, self.args, None, order)
             keep, _, following, *_ = self.controller.adapt_step_size(
@@ -141,19 +162,17 @@ class Resting(eqx.Module):
             lambda found: any_member(~found[5] & (found[6] < TRIES)), attempt, jax.tree.map(jnp.asarray, idle)
         )
         y, next_y, next_state, end, allowed, done, _ = found
-        exists = rests & done
-        given_up = pushed.given_up | (rests & ~done)
-        after = Pushed(y, state, fresh, exists, given_up, next_y, next_state, allowed)
-        kept = eqx.tree_at(lambda p: p.exists, pushed, pushed.exists & ~look)
-        after = jax.tree.map(lambda a, b: jnp.where(exists, a, b), after, kept)
+        exists = look & done
+        resting = jnp.where(new | again, rests, still_resting)
+        given_up = pushed.given_up | (look & ~done)
+        after = Pushed(y, state, fresh, exists, resting, given_up, next_y, next_state, allowed)
+        after = jax.tree.map(lambda a, b: jnp.where(exists, a, b), after, without)
         after = eqx.tree_at(lambda p: p.given_up, after, given_up)
         return jnp.where(exists, end, step.end), after
 
-    def _rests(self, x0: Array, x1: Array, h: Array) -> Bool[Array, ""]:
-        moved = jnp.abs(x1 - x0)
-        rtol, atol = self._tolerances(x1)
-        slowly = moved * (self.span / jnp.where(h > 0, h, 1.0)) <= MOTION * self._scale(x1)
-        return jnp.all(slowly | (moved <= STILL * (atol + rtol * jnp.abs(x1))))
+    def _rests(self, slope: Array, x: Array) -> Bool[Array, " n"]:
+        """Which components rest."""
+        return jnp.abs(slope) * self.span <= MOTION * self._scale(x)
 
     def _scale(self, x: Array) -> Array:
         rtol, atol = self._tolerances(x)
@@ -200,7 +219,8 @@ class HeldBack(WrappedControl):
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         """As the other controller's."""
         end, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
-        return end, (state, t1 - t0, self._resting(y0, args, t1 - t0).begin(t0, y0))
+        resting = self._resting(y0, args, t1 - t0)
+        return jnp.minimum(end, resting.first_end(t0, end, y0)), (state, t1 - t0, resting.begin(t0, y0))
 
     def adapt_step_size(self, t0, t1, y0, y1, args, y_error, error_order, controller_state):
         """Whether the step is kept, and the next one."""
@@ -212,6 +232,12 @@ class HeldBack(WrappedControl):
         step = Step(t0, t1, y0, after, keep, jump, start, end)
         end, pushed = self._resting(y0, args, span).restrained(step, pushed)
         return keep, start, end, jump, (state, span, pushed), result
+
+
+def _shortened(start: Any, end: Any) -> Any:
+    """The end of a step that is as good as none, but moves time."""
+    shortest = 16 * jnp.finfo(start.dtype).eps * jnp.abs(start)
+    return jnp.minimum(end, start + jnp.maximum(TINY * (end - start), shortest))
 
 
 def still(tree: Any) -> Any:

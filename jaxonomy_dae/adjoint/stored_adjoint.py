@@ -29,9 +29,10 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
     Griewank & Walther 2008, Evaluating Derivatives, chapter 12). Memory hardly grows with `max_steps`, and
     without differentiation nothing is recorded.
 
-    Where the state rests, its error is zero, and steps would grow without limit; the derivative, which is the motion
-    after a small push, would not be resolved. There, a run that is differentiated takes along a second one that was
-    given such a push, and its steps are not longer than that one's error allows.
+    Where a component of the state rests, its error is zero, and steps would grow without limit; the derivative, which
+    is the motion after a small push, would not be resolved. While any rests, whatever else moves, a run that is
+    differentiated takes along a second one that was given such a push, and its steps are not longer than that one's
+    error allows.
 
     Rejected steps take no part, so what is not finite in them does no harm. Step sizes count as constant, except where
     they follow from the times given: derivatives with respect to `t0`, `t1`, `dt0`, `SaveAt(ts=...)` and the times of
@@ -187,9 +188,9 @@ def _functions(
 
     at_ts, at_steps = [save_ts(part) for part in parts], [save_step(part) for part in parts]
     rest, pushed = none, ()
-    resting = Resting.of(terms, solver, stepsize_controller, s.y, args, t1 - s.tprev)
+    resting, first = Resting.of(terms, solver, stepsize_controller, s.y, args, t1 - s.tprev), s.tnext
     if resting is not None:
-        pushed = resting.begin(s.tprev, s.y)
+        pushed, first = resting.begin(s.tprev, s.y), resting.first_end(s.tprev, s.tnext, s.y)
         tried = Step(s.tprev, s.tnext, s.y, s.y, jnp.array(False), made_jump, s.tprev, s.tnext)
         rest = closure_convert(lambda *given: resting.restrained(*given), tried, pushed)
     functions = dict(
@@ -198,7 +199,8 @@ def _functions(
         save_ts=tuple(f for f, _ in at_ts), save_steps=tuple(f for f, _ in at_steps),
     )  # fmt: skip
     numbers = dict(
-        rest=rest[1], pushed=pushed, step=step[1], adapt=adapted[1], controller=controller, t1=jnp.asarray(t1),
+        rest=rest[1], pushed=pushed, first=lax.stop_gradient(first), step=step[1], adapt=adapted[1],
+        controller=controller, t1=jnp.asarray(t1),
         ts=tuple(part.ts for part in parts),
         save_ts=tuple(c for _, c in at_ts), save_steps=tuple(c for _, c in at_steps),
     )  # fmt: skip

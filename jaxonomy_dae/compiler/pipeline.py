@@ -6,8 +6,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..diagnosis.redundant_constraints import ModelAt, dependent_constraints
-from ..diagnosis.starts import check_equal_starts, dependent_starts
+from ..diagnosis.starts import check_equal_starts, dependent_starts, note_several_guesses
 from ..diagnosis.structure import check_structure
+from ..diagnosis.unused_parameters import note_unused
 from ..diagnosis.wording import itemised, listed
 from ..errors import ModelError, StructuralError, nearest
 from ..model.consistent_point import consistent_point
@@ -66,7 +67,7 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Co
     column[inputs] = len(unknown) + np.arange(len(inputs))
     extended = differentiate_equations(groups, offsets, column, is_input, least, len(unknown))
     variables = map_quantities(alias, extended.quantities)
-    starts = (*started, *dependent_starts(flat, variables, extended))
+    starts = (*started, *dependent_starts(flat, variables, extended), *note_several_guesses(flat, variables))
     names = name_quantities(flat, variables, extended.quantities)
     preferred = _preferred(flat, variables, prefer_states)
     merit = _merit(flat, variables, extended, preferred)
@@ -93,7 +94,7 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Co
         dependent,
     )
     left_out = _not_followed(flat, variables, prefer_states, selection.states)
-    more = (*_loose_ports(flat), *starts, *notes, *left_out, *selection.notes)
+    more = (*_loose_ports(flat), *note_unused(flat), *starts, *notes, *left_out, *selection.notes)
     selection = dataclasses.replace(selection, notes=more)
     known = np.zeros(extended.quantities.n, bool)
     known[selection.states] = True

@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import StructuralError
 from ..model.extended import Extended
 from ..model.linear_template import LinearTemplate
-from ..model.quantities import QuantityMap
+from ..model.quantities import QuantityMap, leading_starts
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel
 from ..structure.dulmage_mendelsohn import dulmage_mendelsohn
 from ..structure.incidence import Incidence, compress
@@ -105,6 +105,27 @@ def _check_linear(flat: FlatModel, groups, numbers: dict[tuple[int, int], tuple[
                 f"the fixed starts of {listed(names)} contradict the equation {group.provenance[k]}. Free one of them "
                 "(fixed=False), or give values that agree."
             )
+
+
+def note_several_guesses(flat: FlatModel, variables: QuantityMap) -> tuple[str, ...]:
+    """Notes on guesses of one quantity that differ: one of them counts, and the user should know which."""
+    table = flat.variables
+    v = np.flatnonzero(table.start.is_given & (variables.quantity >= 0))
+    value = table.start.values(flat.parameters.values)[v] / variables.factor[v]
+    of: dict[int, list[int]] = {}
+    for k, q in enumerate(variables.quantity[v].tolist()):
+        of.setdefault(q, []).append(k)
+    leading = set(leading_starts(flat, variables).tolist())
+    notes = []
+    for places in of.values():
+        if len(places) < 2 or table.fixed[v[places]].any():
+            continue
+        first = next(k for k in places if int(v[k]) in leading)
+        others = [k for k in places if not _equal(float(value[k]), float(value[first]))]
+        if others:
+            guesses = [f"{table.names[v[k]]} = {value[k] * variables.factor[v[k]]:g}" for k in (first, *others)]
+            notes.append(f"guesses for one quantity differ, {listed(guesses)}: the first is taken")
+    return tuple(notes)
 
 
 def dependent_starts(flat: FlatModel, variables: QuantityMap, extended: Extended) -> tuple[str, ...]:

@@ -24,7 +24,7 @@ from ..lowering.plan import SystemPlan
 from ..model.dependent_parameters import complete
 from ..model.evaluate_numpy import Networks, generic_jacobian, slot_values
 from ..model.natural_sizes import natural_sizes
-from ..model.quantities import ABSENT, declared_scale
+from ..model.quantities import ABSENT, declared_scale, leading_starts
 from ..model.tables import ZERO, Start
 from ..structure.matching import match_in_order
 
@@ -131,7 +131,7 @@ def initial_rows(plan: SystemPlan, names: tuple[str, ...], solve_for: tuple[int,
 
 
 def _declared(plan: SystemPlan, names: tuple[str, ...]) -> tuple[list[Row], list[Row], dict[int, Row]]:
-    """Values given, fixed starts they leave, and the first start of each quantity."""
+    """Values given, fixed starts they leave, and the start of each quantity that counts."""
     variables = plan.flat.variables
     overrides = [
         Row(name, int(q), float(s), None, k)
@@ -139,6 +139,7 @@ def _declared(plan: SystemPlan, names: tuple[str, ...]) -> tuple[list[Row], list
     ]
     overridden = {r.quantity for r in overrides}
     is_zero = variables.start.is_number & (variables.start.values(plan.flat.parameters.values) == 0.0)
+    leading = set(leading_starts(plan.flat, plan.variable_map).tolist())
     started: dict[int, Row] = {}
     fixed: list[Row] = []
     for v in np.flatnonzero(variables.start.is_given).tolist():
@@ -150,8 +151,8 @@ def _declared(plan: SystemPlan, names: tuple[str, ...]) -> tuple[list[Row], list
         row = Row(variables.names[v], quantity, factor, variables.start[v])
         if variables.fixed[v] and quantity not in overridden:
             fixed.append(row)
-        started.setdefault(quantity, row)
-    started |= {r.quantity: r for r in reversed(fixed)}
+        if v in leading:
+            started[quantity] = row
     return overrides, fixed, started
 
 

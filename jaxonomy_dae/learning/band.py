@@ -26,7 +26,7 @@ class Band:
     `(n,)`; `explored`: from the least to the greatest value that the experiments saw, for each input, shape
     `(inputs, 2)`; `between`: of an ensemble, the standard deviation of its members, part of the `spread`."""
 
-    grid: Float[np.ndarray, "n *inputs"]
+    grid: Float[np.ndarray, " n *inputs"]
     mean: Float[np.ndarray, " n"]
     spread: Float[np.ndarray, " n"]
     low: Float[np.ndarray, " n"]

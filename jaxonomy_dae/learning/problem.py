@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ..diagnosis.unused_parameters import unused_parameters
 from ..errors import InitializationError, ModelError, SimulationError, nearest
-from ..lowering.plan import SystemPlan
 from ..model.tables import ZERO
 from ..simulation.simulate import simulate
 from ..system.system import AcausalSystem
@@ -115,9 +115,9 @@ class Problem:
                 raise ModelError(
                     f"train: '{name}' is neither a parameter, a network nor a sensor law: " + nearest(name, known)
                 )
-        read = _read_parameters(self.system.plan)
+        unused = unused_parameters(self.system.plan.flat)
         for name in parameters:
-            if table.index(name) not in read:
+            if table.index(name) in unused:
                 raise ModelError(
                     f"train: nothing in the model reads parameter '{name}', so no data can determine it: leave it out"
                 )
@@ -496,19 +496,3 @@ class Problem:
         """Other experiments of the same system with what is trained, for a program of their own."""
         stacked = stack(Data(*experiments), self.system.plan, tuple(self.observers), self.starts)
         return self._laid_out(stacked), stacked
-
-
-def _read_parameters(plan: SystemPlan) -> set[int]:
-    """The parameters that some equation, start, event or other parameter reads."""
-    flat = plan.flat
-    found: set[int] = set()
-    for group in flat.groups:
-        found.update(group.parameter.ravel().tolist())
-    for group in flat.variables.start.groups:
-        found.update(group.parameter.ravel().tolist())
-    for group in flat.parameters.dependents:
-        found.update(group.parameter.ravel().tolist())
-    for clock in flat.events.clocks:
-        for part in clock:
-            found.update(() if part is None else part.parameters)
-    return found

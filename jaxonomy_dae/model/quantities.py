@@ -72,10 +72,25 @@ def quantity_bounds(flat: FlatModel, variables: QuantityMap, extended: Extended)
     return np.stack([low, high], axis=-1)
 
 
+def leading_starts(flat: FlatModel, variables: QuantityMap) -> Int[np.ndarray, " variables"]:
+    """The variables whose starts count, one for each quantity that has any.
+
+    A fixed start goes before a guess. Of guesses it is the one that is larger at the declared values, and the positive
+    one of two that differ in sign: zero is what is written where nothing is known, and a rule by place or by name would
+    let these decide which branch a model starts on.
+    """
+    v = np.flatnonzero(flat.variables.start.is_given & (variables.quantity >= 0))
+    value = flat.variables.start.values(flat.parameters.values)[v] / variables.factor[v]
+    order = np.lexsort((-v, value, np.abs(value), flat.variables.fixed[v]))
+    last = np.full(int(variables.quantity.max(initial=-1)) + 1, -1)
+    last[variables.quantity[v[order]]] = v[order]
+    return last[last >= 0]
+
+
 def start_guess(flat: FlatModel, variables: QuantityMap, n: int) -> tuple[np.ndarray, dict[int, float]]:
     """The declared starts of all n quantities (zero where there is none), and those that are fixed."""
     guess = np.zeros(n)
-    chosen = np.flatnonzero(flat.variables.start.is_given & (variables.quantity >= 0))
+    chosen = leading_starts(flat, variables)
     q, fixed = variables.quantity[chosen], flat.variables.fixed[chosen]
     value = flat.variables.start.values(flat.parameters.values)[chosen] / variables.factor[chosen]
     guess[q] = value

@@ -1,5 +1,7 @@
-"""Whether what is computed now becomes part of a program that somebody else compiles."""
+"""What tracers tell: whether what is computed now becomes part of a program that somebody else compiles, and how it
+will be differentiated."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -13,16 +15,27 @@ def is_staged(tree: Any) -> bool:
     run each operation by itself: compiling a loop anew at every call. There a compiled program is called, which
     JAX differentiates or batches as a whole.
     """
-    return any(isinstance(_inside(leaf), Tracer) for leaf in jax.tree.leaves(tree))
+    return any(isinstance(innermost, Tracer) for leaf in jax.tree.leaves(tree) for *_, innermost in [_layers(leaf)])
 
 
-def _inside(leaf: Any) -> Any:
-    """What differentiation and batching wrapped; a tracer of any other kind is left as it is."""
+def is_forwards(tree: Any) -> bool:
+    """Whether `jax.jvp` or `jax.jacfwd` is at work on a leaf, and no reverse mode.
+
+    `jax.jit(jax.jacfwd(f))` is known for what it is; inside `jax.jacfwd(jax.jit(f))` it cannot be seen.
+    """
+    kinds = [{type(layer).__name__ for layer in _layers(leaf)} for leaf in jax.tree.leaves(tree)]
+    return any("JVPTracer" in found for found in kinds) and not any("LinearizeTracer" in found for found in kinds)
+
+
+def _layers(leaf: Any) -> Iterator[Any]:
+    """A leaf, and what differentiation and batching wrapped in it, one in the other; a tracer of any other kind is the
+    last."""
+    yield leaf
     while isinstance(leaf, Tracer):
         if hasattr(leaf, "primal"):  # JVPTracer, LinearizeTracer
             leaf = leaf.primal  # pyright: ignore[reportAttributeAccessIssue]
         elif hasattr(leaf, "batch_dim"):  # BatchTracer
             leaf = leaf.val  # pyright: ignore[reportAttributeAccessIssue]
         else:
-            return leaf
-    return leaf
+            return
+        yield leaf

@@ -15,7 +15,7 @@ from ..errors import InitializationError, SimulationError
 from ..initialization.initialize import check
 from ..lowering.plan import SystemPlan
 from ..programs.cache import PROGRAMS
-from ..programs.staging import is_staged
+from ..programs.staging import is_forwards, is_staged
 from ..solvers import BDF, Rodas5P, Tsit5
 from ..solvers.causes import decay_at, is_stiff
 from ..solvers.drive import is_implicit
@@ -23,7 +23,7 @@ from ..solvers.solve import check_tolerances, default_tolerances
 from ..solvers.solve_arguments import jump_times
 from ..solvers.switching import BOUNDARY, MANY, Watch
 from ..system.inputs import check_range, read_inputs, step_ends
-from ..system.solver_choice import Choice, implicit_choice, is_known_stiff, note_stiffness, solver_choice
+from ..system.solver_choice import Choice, implicit_choice, solver_choice
 from ..system.stiffness import fastest_decay
 from ..system.system import AcausalSystem
 from .arguments import check_arguments, check_parameters
@@ -71,9 +71,9 @@ def simulate(
         shapes are fixed, there are then `max_steps + 1` rows, and those beyond the last step repeat it.
     - `solver`: any Diffrax solver for ordinary differential equations, or `solvers.BDF`, `solvers.Rodas5P` for stiff
         systems and those with nonlinear blocks. None chooses, and `solution.stats` says what and why: explicit steps,
-        and where stability limits them, the run is made with Rodas5P or BDF. Inside jit, grad and vmap, the choice is
-        that of the last run of this system outside, or else follows from eigenvalues at the declared start. Systems
-        with hidden constraints are projected onto them after every step and at every saved time.
+        and where stability limits them, the run is made with Rodas5P or BDF. Inside jit, grad and vmap, the choice
+        follows from eigenvalues at the declared start. Systems with hidden constraints are projected onto them after
+        every step and at every saved time.
     - `rtol`, `atol`: tolerances of the local error, by default 1e-6 and 1e-8 (1e-4 and 1e-6 in single precision);
         `atol` is multiplied by the states' nominal values.
     - `inputs`: by the inputs' names: constants; samples `(times, values)`, interpolated linearly, or with `"cubic"` or
@@ -82,8 +82,8 @@ def simulate(
     - `initial`: values at `t0` by variables' names, which outrank the starts declared in components. Or a whole state,
         shape `(n_state,)`, such as a row of `solution.states`: it is moved onto the constraints, and declared starts
         are not looked at.
-    - `adjoint`: how to differentiate; default `solvers.StoredAdjoint()`. `diffrax.ForwardMode()` for forward-mode
-        differentiation (`jax.jvp`, `jax.jacfwd`).
+    - `adjoint`: how to differentiate; default `solvers.StoredAdjoint()`, and `diffrax.ForwardMode()` under `jax.jvp`
+        and `jax.jacfwd`; name the latter for a function that is jitted before it is differentiated.
     - `stepsize_controller`: instead of the controller made from the tolerances.
     - `jump_ts`: times at which functions given as inputs jump, a number or shape `(n,)`: steps end there and the method
         starts anew.
@@ -155,8 +155,9 @@ def simulate(
         control = stepsize_controller
         if control is None:
             control = controller_for(system, solver, rtol, atol, dtmax)
+        chosen = default_adjoint(is_forwards(given)) if adjoint is None else adjoint
         return Options(
-            solver, adjoint if adjoint is not None else default_adjoint(), clipped(control, jump_ts, ends),
+            solver, chosen, clipped(control, jump_ts, ends),
             max_steps + ends.count, progress, most_events, room, sides,
         )  # fmt: skip
 
@@ -200,7 +201,6 @@ def simulate(
         if outcome.result == diffrax.RESULTS.max_steps_reached:
             decay = decay_at(term_of(system, implicit=False), inputs, *outcome.last)
             stiff = is_stiff(decay, float(t1 - outcome.last[0]), max_steps)
-        note_stiffness(system.plan, stiff)
         if stiff:
             found = f"stiff: stability limits explicit steps from t={float(outcome.last[0]):.3g} on"
             choice = implicit_choice(system.plan, found)
@@ -231,10 +231,8 @@ def simulate(
 
 
 def _stiff_without_a_run(plan: SystemPlan, duration: float | None) -> str:
-    """Why a system counts as stiff where it cannot be tried first, inside jit; or nothing."""
-    found = is_known_stiff(plan)
-    if found is not None:
-        return "an earlier run of this system was stiff" if found else ""
+    """Why a system counts as stiff where it cannot be tried first, inside jit; or nothing. What runs outside of jit
+    found is not asked: the result would depend on what the process did before."""
     if duration is None or fastest_decay(plan) * duration <= BOUNDARY * MANY:
         return ""
     return f"stiff: at the declared start something decays within {1 / fastest_decay(plan):.2g}"

@@ -15,7 +15,7 @@ from jax.flatten_util import ravel_pytree
 from ..adjoint.default import default_adjoint
 from ..errors import InitializationError, ModelError, SimulationError
 from ..programs.cache import PROGRAMS, compiled
-from ..programs.staging import is_staged
+from ..programs.staging import is_forwards, is_staged
 from .bdf import BDF
 from .dae_term import DAETerm, FlatProblem
 from .drive import integrate, is_multistep, right_between_steps
@@ -61,7 +61,8 @@ def solve_dae(
     - `rtol`, `atol`: of the local error, by default 1e-6 and 1e-8 (1e-4 and 1e-6 in single precision); `atol` may look
         like y.
     - `args`: handed to the functions; gradients flow to it.
-    - `adjoint`: how to differentiate; default `StoredAdjoint()`.
+    - `adjoint`: how to differentiate; default `StoredAdjoint()`, and `diffrax.ForwardMode()` under `jax.jvp` and
+        `jax.jacfwd`; name the latter for a function that is jitted before it is differentiated.
     - `stepsize_controller`, `max_steps`: of Diffrax.
     - `jump_ts`: times at which F jumps, a number or shape (n,): steps end there and the method starts anew.
     - `dtmax`: the longest step.
@@ -102,7 +103,9 @@ def solve_dae(
         raise ModelError(BACKSOLVE)
     t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
     ts = None if ts is None else jnp.asarray(ts, dtype)
-    options = (solver, adjoint or default_adjoint(), stepsize_controller, max_steps)
+    if adjoint is None:
+        adjoint = default_adjoint(is_forwards((term, t0, t1, y0, ts, args)))
+    options = (solver, adjoint, stepsize_controller, max_steps)
     arguments = (term, t0, t1, y0, ts, args, (rtol, atol), options)
     staged = is_staged(arguments)
     if staged:

@@ -31,7 +31,7 @@ class Held(eqx.Module):
     """Samples held until the next one; where they jump, the new value counts."""
 
     ts: Float[Array, " n"]
-    ys: Float[Array, "n *shape"]
+    ys: Float[Array, " n *shape"]
 
     def evaluate(self, t: Any) -> Any:
         """The last sample at or before t."""

@@ -1,14 +1,9 @@
-"""Which solver suits a compiled system: by what the compiler knows, and by what earlier runs found."""
+"""Which solver suits a compiled system, by what the compiler knows."""
 
-from collections import OrderedDict
 from typing import NamedTuple
 
 from ..lowering.plan import SystemPlan
 from ..solvers.solve import SMALL
-
-REMEMBERED = 256  # systems whose stiffness is kept in mind
-
-_stiffness: OrderedDict[str, bool] = OrderedDict()
 
 
 class Choice(NamedTuple):
@@ -37,16 +32,3 @@ def implicit_choice(plan: SystemPlan, why: str) -> Choice:
     if plan.n_state <= SMALL:
         return Choice("Rodas5P", why, True)
     return Choice("BDF", f"{why}; cheaper for {plan.n_state} unknowns", True)
-
-
-def note_stiffness(plan: SystemPlan, stiff: bool):
-    """Keeps in mind what a run found, for calls inside jit, where nothing can be found out before compiling."""
-    _stiffness[plan.digest] = stiff
-    _stiffness.move_to_end(plan.digest)
-    if len(_stiffness) > REMEMBERED:
-        _stiffness.popitem(last=False)
-
-
-def is_known_stiff(plan: SystemPlan) -> bool | None:
-    """Whether stability limited explicit steps in the last run; None if there was none."""
-    return _stiffness.get(plan.digest)

@@ -104,7 +104,7 @@ with warnings.catch_warnings(record=True) as caught:
     ev, diagram = EqnEnv(), AcausalDiagram()
     diagram.add(Decay(ev, "c"))
     system = AcausalCompiler(ev, diagram)()
-    for adjoint in (None, StoredAdjoint()):
+    for adjoint in {adjoints}:
         def end(k):
             changed = system.with_parameters({{"c.k": k}})
             return simulate(changed, 1.0, ts=jnp.array([1.0]), rtol=1e-8, adjoint=adjoint)["c.x"][0]
@@ -115,9 +115,18 @@ print(len(texts), texts[0])
 """
 
 
-@pytest.mark.parametrize("what", ["every name", pytest.param("another argument", marks=pytest.mark.slow)])
-def test_a_missing_name(what):
+@pytest.mark.parametrize(
+    "what, adjoints",
+    [
+        pytest.param("every name", "(None,)", marks=pytest.mark.long("another process, which compiles a gradient")),
+        pytest.param("every name", "(StoredAdjoint(),)", marks=pytest.mark.slow),
+        pytest.param("another argument", "(None, StoredAdjoint())", marks=pytest.mark.slow),
+    ],
+)
+def test_a_missing_name(what, adjoints):
     """The package is imported, simulates and differentiates, by another adjoint, and says so once."""
-    count, _, text = run(PROGRAM.format(names=private_names.NAMES, gone=GONE[what])).strip().partition(" ")
+    count, _, text = (
+        run(PROGRAM.format(names=private_names.NAMES, gone=GONE[what], adjoints=adjoints)).strip().partition(" ")
+    )
     assert count == "1" and "diffrax 0." in text
     assert "RecursiveCheckpointAdjoint instead of StoredAdjoint" in text and "tried:" in text

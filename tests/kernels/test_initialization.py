@@ -160,7 +160,7 @@ def test_contradicting_starts_across_a_connection():
     system = compiled(a, b, r, g, connect=[(a.p, b.p, r.p), (a.n, b.n, r.n, g.p)])
     with pytest.raises(
         InitializationError,
-        match=r"(?s)start of b\.v, 2: off by 1.*b\.v and a\.v are fixed at 2 and 1.*values that agree",
+        match=r"(?s)start of a\.v, 1: off by 1.*b\.v and a\.v are fixed at 2 and 1.*values that agree",
     ):
         system.initialize()
     # New values that agree mend it: nothing is wrong with the model.

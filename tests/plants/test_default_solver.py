@@ -11,7 +11,6 @@ from testset import PROBLEMS
 
 from jaxonomy_dae import Component, EqnEnv, der, simulate
 from jaxonomy_dae.solvers import Rodas5P
-from jaxonomy_dae.system import solver_choice
 
 TS = np.array([0.5, 4.0, 10.0])
 
@@ -30,12 +29,6 @@ class Followers(Component):
 @pytest.fixture(scope="module")
 def stiff():
     return compiled(Followers(EqnEnv(), "f", 1, 1e6))
-
-
-@pytest.fixture
-def forgotten():
-    """What earlier runs found is forgotten."""
-    solver_choice._stiffness.clear()
 
 
 def test_a_stiff_model_is_finished(stiff):
@@ -75,8 +68,8 @@ def test_many_unknowns_take_bdf():
     np.testing.assert_allclose(solution["f.x39"], np.cos(1.3 * np.asarray(TS)), rtol=0, atol=1e-4)
 
 
-@pytest.mark.slow
-def test_stiffness_that_comes_later():
+@pytest.fixture(scope="module")
+def later():
     """x' = −10^t·(x − cos t) − sin t: stiff from t = 3 on."""
 
     class Later(Component):
@@ -85,7 +78,12 @@ def test_stiffness_that_comes_later():
             x = self.variable("x", start=1.0, fixed=True)
             self.add_equations(Eq(der(x), -(10**ev.t) * (x - sympy.cos(ev.t)) - sympy.sin(ev.t)))
 
-    solution = simulate(compiled(Later(EqnEnv(), "c")), 7.0, ts=np.array([7.0]))
+    return compiled(Later(EqnEnv(), "c"))
+
+
+@pytest.mark.slow
+def test_stiffness_that_comes_later(later):
+    solution = simulate(later, 7.0, ts=np.array([7.0]))
     assert solution.stats["solver"] == "Rodas5P" and 2 < solution.stats["stiff_from"] < 5
     np.testing.assert_allclose(solution["c.x"], np.cos(7.0), rtol=0, atol=1e-5)
 
@@ -93,11 +91,7 @@ def test_stiffness_that_comes_later():
 # --- inside jit, grad and vmap -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("before", ["never run", "run"])
-def test_the_choice_inside_transformations(before, stiff, forgotten):
-    if before == "run":
-        simulate(stiff, 10.0, ts=TS)
-
+def test_the_choice_inside_transformations(stiff):
     def last(w):
         solution = simulate(stiff.with_parameters({"f.w": w}), 10.0, ts=TS)
         found.append((solution.stats["solver"], solution.stats["reason"]))
@@ -106,8 +100,21 @@ def test_the_choice_inside_transformations(before, stiff, forgotten):
     found = []
     jax.eval_shape(last, 1.3)
     solver, reason = found[0]
-    assert solver == "Rodas5P"
-    assert ("an earlier run" if before == "run" else "stiff: at the declared start") in reason
+    assert solver == "Rodas5P" and "stiff: at the declared start" in reason
+
+
+@pytest.mark.slow
+def test_what_ran_before_changes_no_choice(later):
+    """A run outside finds that this model becomes stiff; inside jit it is what it would be in a new process."""
+
+    def choice():
+        found = []
+        jax.eval_shape(lambda x0: found.append(simulate(later, 7.0, initial={"c.x": x0}).stats["solver"]), 1.0)
+        return found
+
+    first = choice()
+    assert simulate(later, 7.0, ts=np.array([7.0])).stats["solver"] == "Rodas5P"
+    assert choice() == first == ["Tsit5"]
 
 
 @pytest.mark.slow

@@ -1,0 +1,354 @@
+"""Shafts in a row with elastic couplings, sharp backlash, clutches and a brake, turned and pressed by tables of time,
+against SciPy's DOP853 stopped and started anew wherever a mode changes."""
+
+import itertools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.integrate import solve_ivp
+from sympy import Piecewise
+
+from jaxonomy_dae import AcausalDiagram, Component, EqnEnv, Rotational, der
+from jaxonomy_dae.library import rotational, signal
+from jaxonomy_dae.library.friction import Brake, Clutch
+from jaxonomy_dae.modeling import Eq
+
+from .case import Case, Motion, diagram_of, log_uniform, names
+from .drives import CLOSE, MOST, TIGHT, TRAJECTORY, Delicate
+
+STUCK, FREE = 0, 2  # modes of friction, beside 1 and -1
+
+
+class Play(Component):
+    """Backlash with corners: tau = c·(phi_rel ∓ gap/2) + d·w_rel beyond the gap, 0 within it."""
+
+    def __init__(self, ev: EqnEnv, name: str, gap: float, c: float, d: float):
+        super().__init__(ev, name)
+        gap_, c_, d_ = self.parameter("gap", gap), self.parameter("c", c), self.parameter("d", d)
+        a, b = self.port("flange_a", Rotational), self.port("flange_b", Rotational)
+        phi, w, tau = self.variable("phi_rel"), self.variable("w_rel"), self.variable("tau")
+        law = Piecewise(
+            (c_ * (phi - gap_ / 2) + d_ * w, phi > gap_ / 2),
+            (c_ * (phi + gap_ / 2) + d_ * w, phi < -gap_ / 2),
+            (0, True),
+        )
+        self.add_equations(Eq(phi, b.phi - a.phi), Eq(w, der(phi)), Eq(b.tau, tau), Eq(a.tau + b.tau, 0), Eq(tau, law))
+
+
+class Table(Component):
+    """y, linear between points in time and constant beyond them, as one writes it."""
+
+    def __init__(self, ev: EqnEnv, name: str, ts: Sequence[float], values: Sequence[float]):
+        super().__init__(ev, name)
+        pieces: list[Any] = [(values[0], ev.t < ts[0])]
+        for k in range(len(ts) - 1):
+            slope = (values[k + 1] - values[k]) / (ts[k + 1] - ts[k])
+            pieces.append((values[k] + slope * (ev.t - ts[k]), ev.t < ts[k + 1]))
+        self.output("y", Piecewise(*pieces, (values[-1], True)))
+
+
+class Now(Component):
+    """y = t."""
+
+    def __init__(self, ev: EqnEnv, name: str):
+        super().__init__(ev, name)
+        self.output("y", ev.t)
+
+
+class Train:
+    """Shafts in a row. `springs`: (c, d) by the number of the shaft behind, 0 for one to the ground; `plays`:
+    (gap, c, d); `frictions`: (torque of full pressure, peak, table of pressure) between a shaft and the one before it,
+    or the ground for `brake`."""
+
+    def __init__(self, rng: np.random.Generator):
+        n = int(rng.integers(1, 5))
+        self.end = float(rng.uniform(1, 4))
+        self.inertias = [log_uniform(rng, -0.5, 0.5) for _ in range(n)]
+        self.springs, self.plays, self.frictions = {}, {}, {}
+        for k in range(n):
+            if rng.random() < 0.5:
+                self.springs[k] = (log_uniform(rng, 0, 2), log_uniform(rng, -2, 0))
+            if k and rng.random() < 0.4:
+                self.plays[k] = (log_uniform(rng, -1.5, -0.3), log_uniform(rng, 1, 3), log_uniform(rng, -1, 0.5))
+            if k and rng.random() < 0.6:
+                self.frictions[k] = self._friction(rng)
+        self.brake = int(rng.integers(n)) if rng.random() < 0.5 or not (self.frictions or self.plays) else None
+        if self.brake is not None:
+            self.frictions["brake"] = self._friction(rng)
+        self.torque = self._table(rng, -4, 4)
+        self.starts = [(0.0, float(rng.normal()) * 2) for _ in range(n)]
+        if n > 1 and rng.random() < 0.3:  # these turn together at the start
+            self.starts[1] = self.starts[0]
+        self.corners = sorted(
+            {
+                t
+                for ts, _ in [self.torque, *(table for _, _, table in self.frictions.values())]
+                for t in ts
+                if t < self.end
+            }
+        )
+
+    def _table(self, rng: np.random.Generator, low: float, high: float) -> tuple[list[float], list[float]]:
+        count = int(rng.integers(2, 6))
+        ts = np.sort(rng.uniform(0.05, 0.95, count)) * self.end
+        while np.diff(ts).min() < 0.02:
+            ts = np.sort(rng.uniform(0.05, 0.95, count)) * self.end
+        return ts.tolist(), rng.uniform(low, high, count).tolist()
+
+    def _friction(self, rng: np.random.Generator) -> tuple[float, float, tuple[list[float], list[float]]]:
+        peak = float(rng.choice([1.0, rng.uniform(1, 1.5)]))
+        return log_uniform(rng, -0.3, 0.8), peak, self._table(rng, -0.5 if rng.random() < 0.5 else 0.1, 1.5)
+
+    def ends(self, key) -> tuple[int | None, int]:
+        """The shafts that a friction presses together; None is the ground."""
+        if key == "brake":
+            assert self.brake is not None
+            return None, self.brake
+        return key - 1, key
+
+    def relative(self, key, y: np.ndarray) -> float:
+        a, b = self.ends(key)
+        n = len(self.inertias)
+        return y[n + b] - (0.0 if a is None else y[n + a])
+
+    def pressure(self, key, t: float) -> float:
+        return float(np.interp(t, *self.frictions[key][2]))
+
+    def limit(self, key, t: float) -> float:
+        return self.frictions[key][0] * max(self.pressure(key, t), 0.0)
+
+    def moments(self, t: float, y: np.ndarray, modes: dict) -> tuple[np.ndarray, dict]:
+        """Accelerations, and the torques of what sticks."""
+        n = len(self.inertias)
+        phi, w = y[:n], y[n:]
+        out = np.zeros(n)
+        out[-1] += np.interp(t, *self.torque)
+
+        def between(k: int, tau: float) -> None:
+            out[k] -= tau
+            if k:
+                out[k - 1] += tau
+
+        for k, (c, d) in self.springs.items():
+            between(k, c * (phi[k] - (phi[k - 1] if k else 0.0)) + d * (w[k] - (w[k - 1] if k else 0.0)))
+        for k, (gap, c, d) in self.plays.items():
+            side = modes["play", k]
+            if side:
+                between(k, c * (phi[k] - phi[k - 1] - side * gap / 2) + d * (w[k] - w[k - 1]))
+        stuck = [key for key in self.frictions if modes[key] == STUCK]
+        rows = np.zeros((len(stuck), n))
+        for key in self.frictions:
+            a, b = self.ends(key)
+            if modes[key] in (1, -1):
+                tau = modes[key] * self.limit(key, t)
+                out[b] -= tau
+                if a is not None:
+                    out[a] += tau
+            elif modes[key] == STUCK:
+                rows[stuck.index(key), b] = 1.0
+                if a is not None:
+                    rows[stuck.index(key), a] = -1.0
+        inverse = 1 / np.array(self.inertias)
+        held = np.linalg.solve((rows * inverse) @ rows.T, rows @ (inverse * out)) if stuck else np.zeros(0)
+        return inverse * (out - rows.T @ held), dict(zip(stuck, held, strict=True))
+
+    def slopes(self, t: float, y: np.ndarray, modes: dict) -> np.ndarray:
+        return np.concatenate([y[len(self.inertias) :], self.moments(t, y, modes)[0]])
+
+    def guards(self, modes: dict) -> list[tuple[Callable, Callable]]:
+        """(guard, what changes when it falls through zero) of all that may happen."""
+        out = []
+        for key, (_, peak, _) in self.frictions.items():
+            mode = modes[key]
+
+            def become(t, y, key=key, value=FREE):
+                modes[key] = value
+
+            if mode == FREE:
+                out.append(
+                    (lambda t, y, key=key: -self.pressure(key, t), lambda t, y, key=key: self._press(key, t, y, modes))
+                )
+                continue
+            out.append((lambda t, y, key=key: self.pressure(key, t), become))
+            if mode == STUCK:
+                for sign in (1, -1):
+                    out.append(
+                        (
+                            lambda t, y, key=key, sign=sign, most=peak: (
+                                most * self.limit(key, t) - sign * self.moments(t, y, modes)[1].get(key, 0.0)
+                            ),
+                            lambda t, y, b=become, sign=sign: b(t, y, value=sign),
+                        )
+                    )
+            else:
+                out.append(
+                    (lambda t, y, key=key, mode=mode: mode * self.relative(key, y),
+                     lambda t, y, key=key: self._stick(key, t, y, modes))
+                )  # fmt: skip
+        for k, (gap, _, _) in self.plays.items():
+            for side in (1, -1):
+
+                def beyond(t, y, k=k, side=side, gap=gap):
+                    return side * (y[k] - y[k - 1]) - gap / 2
+
+                if modes["play", k] == 0:
+                    out.append(
+                        (
+                            lambda t, y, f=beyond: -f(t, y),
+                            lambda t, y, k=k, side=side: modes.__setitem__(("play", k), side),
+                        )
+                    )
+                elif modes["play", k] == side:
+                    out.append((beyond, lambda t, y, k=k: modes.__setitem__(("play", k), 0)))
+        return out
+
+    def _press(self, key, t: float, y: np.ndarray, modes: dict) -> None:
+        w = self.relative(key, y)
+        if abs(w) < 1e-4:
+            raise Delicate("pressed at standstill")
+        modes[key] = int(np.sign(w))
+
+    def _stick(self, key, t: float, y: np.ndarray, modes: dict) -> None:
+        a, b = self.ends(key)
+        n = len(self.inertias)
+        y[n + b] = 0.0 if a is None else y[n + a]
+        modes[key] = STUCK
+        self.hold(key, t, y, modes)
+
+    def hold(self, key, t: float, y: np.ndarray, modes: dict) -> None:
+        """What sticks slides on if its torque is too large."""
+        most, torque = self.frictions[key][1] * self.limit(key, t), self.moments(t, y, modes)[1][key]
+        if abs(abs(torque) - most) < CLOSE:
+            raise Delicate("at the verge of sliding")
+        if abs(torque) > most:
+            modes[key] = int(np.sign(torque))
+
+    def begun(self) -> tuple[np.ndarray, dict]:
+        y = np.array([p for p, _ in self.starts] + [w for _, w in self.starts])
+        modes: dict[Any, Any] = {("play", k): 0 for k in self.plays}
+        for key in self.frictions:
+            modes[key] = FREE if self.pressure(key, 0.0) <= 0 else int(np.sign(self.relative(key, y)))
+        for key in [key for key in self.frictions if modes[key] == STUCK]:
+            self.hold(key, 0.0, y, modes)
+        self.settled(0.0, y, modes)
+        return y, modes
+
+    def settled(self, t: float, y: np.ndarray, modes: dict) -> None:
+        for key, torque in self.moments(t, y, modes)[1].items():
+            if abs(torque) > self.frictions[key][1] * self.limit(key, t) - CLOSE:
+                raise Delicate("one change makes another")
+
+    def run(self, ts: np.ndarray) -> np.ndarray:
+        n = len(self.inertias)
+        y, modes = self.begun()
+        out, t = np.zeros((len(ts), 2 * n)), 0.0
+        bounds = itertools.chain(self.corners, [self.end])
+        edge, changes = next(bounds), 0
+        while t < self.end:
+            pairs = self.guards(modes)
+            events = []
+            for guard, _ in pairs:
+
+                def event(t, y, guard=guard):
+                    return guard(t, y)
+
+                event.terminal, event.direction = True, -1  # pyright: ignore[reportFunctionMemberAccess]
+                events.append(event)
+            frozen = dict(modes)
+            found = solve_ivp(
+                lambda t, y, frozen=frozen: self.slopes(t, y, frozen), (t, edge), y, method="DOP853", events=events,
+                dense_output=True, max_step=0.02, **TIGHT,
+            )  # fmt: skip
+            inside = (ts >= t) & (ts <= found.t[-1])
+            if inside.any():
+                out[inside] = found.sol(ts[inside]).T
+            t, y = float(found.t[-1]), found.y[:, -1].copy()
+            hit = [k for k, times in enumerate(found.t_events) if len(times)]
+            for k in hit:
+                pairs[k][1](t, y)
+            changes += len(hit)
+            if changes > MOST or len(hit) > 1:
+                raise Delicate("many changes, or two at once")
+            if hit:
+                self.settled(t, y, modes)
+            elif t < self.end:
+                edge = next(bounds)
+        self.changes = changes
+        return out
+
+
+def make(seed: int) -> Case:
+    """Shafts over some seconds."""
+    rng = np.random.default_rng([seed, 41])
+    while True:
+        train = Train(rng)
+        ts = np.sort(rng.uniform(0.1, 1.0, 6)) * train.end
+        try:
+            values = train.run(ts)
+        except Delicate:
+            continue
+        if np.isfinite(values).all() and train.changes:
+            return _case(rng, train, ts, values)
+
+
+def _source(
+    rng: np.random.Generator, ev: EqnEnv, label: Any, table: tuple[list[float], list[float]]
+) -> tuple[Any, list, list]:
+    """A port, the parts behind it, and their connections: a table as a component of its own or from the library."""
+    ts, values = table
+    if rng.random() < 0.6:
+        part = Table(ev, next(label), ts, values)
+        return part.y, [part], []
+    now = Now(ev, next(label))
+    xs, ys = [-1.0, *ts, 100.0], [values[0], *values, values[-1]]
+    part = signal.Table1D(ev, next(label), xs, ys)
+    return part.y, [now, part], [[now.y, part.u]]
+
+
+def _case(rng: np.random.Generator, train: Train, ts: np.ndarray, values: np.ndarray) -> Case:
+    ev, n = EqnEnv(), len(train.inertias)
+    label = iter(names(rng, 8 * n + 12))
+    ground = rotational.FixedAngle(ev, next(label))
+    shafts = [rotational.Inertia(ev, next(label), J, *at) for J, at in zip(train.inertias, train.starts, strict=True)]
+    parts: list[Any] = [ground, *shafts]
+    floor, at, wires = [ground.flange], [[s.flange_a] for s in shafts], []
+    between: list[tuple[int, Any]] = [
+        (k, rotational.SpringDamper(ev, next(label), *own)) for k, own in train.springs.items()
+    ]
+    between += [(k, Play(ev, next(label), *own)) for k, own in train.plays.items()]
+    for key, (full, peak, table) in train.frictions.items():
+        mu = float(rng.uniform(0.2, 0.9))
+        part: Any = (Brake if key == "brake" else Clutch)(ev, next(label), mu, full / mu, 1.0, peak)
+        port, behind, more = _source(rng, ev, label, table)
+        parts += behind
+        wires += [*more, [port, part.u]]
+        if key == "brake":
+            parts.append(part)
+            at[train.ends(key)[1]].append(part.flange)
+        else:
+            between.append((key, part))
+    for k, part in between:
+        parts.append(part)
+        (at[k - 1] if k else floor).append(part.flange_a)
+        at[k].append(part.flange_b)
+    torque = rotational.Torque(ev, next(label))
+    port, behind, more = _source(rng, ev, label, train.torque)
+    parts += [torque, *behind]
+    wires += [*more, [port, torque.tau]]
+    at[-1].append(torque.flange)
+    which = [f"{s.name}.{x}" for x in ("phi", "w") for s in shafts]
+    sizes = [max(np.abs(values[:, :n]).max(), 0.1)] * n + [max(np.abs(values[:, n:]).max(), 0.1)] * n
+    motion = Motion(
+        ts, dict(zip(which, values.T, strict=True)),
+        {name: TRAJECTORY * size for name, size in zip(which, sizes, strict=True)}, rtol=1e-6, atol=1e-9,
+    )  # fmt: skip
+    if len(floor) == 1:
+        parts.remove(ground)
+        floor = []
+    diagram: AcausalDiagram = diagram_of(rng, parts, [floor, *at, *wires])
+    return Case(
+        ev, diagram, {}, {}, motion=motion, always_moves=True,
+        note=f"{n} shafts, {len(train.frictions)} clutches and brakes, {len(train.plays)} plays, "
+        f"{train.changes} changes",
+    )  # fmt: skip
