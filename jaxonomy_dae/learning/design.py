@@ -62,7 +62,7 @@ class Advice:
     def __repr__(self):
         names = list(self.before)[:4]
         header = ["", "gain [nat]", *(f"spread of {name}" for name in names)]
-        rows = [["(now)", "", *(f"{self.before[name]:.3g}" for name in names)]]
+        rows = [["(now)", "", *(f"{self.before[name]:.3g}" for name in names)]] if names else []
         for k in np.argsort(np.where(np.isnan(self.gain), np.inf, -self.gain), kind="stable").tolist():
             mark = "* " if k in self.chosen else "  "
             told = "its run fails" if np.isnan(self.gain[k]) else f"{self.gain[k]:.3f}"
