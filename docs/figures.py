@@ -88,8 +88,9 @@ def pendulum() -> None:
     true = study.angle_equation(study.HIGH_RELEASE, lambda v: -study.DRAG * study.speed(v) * v, study.SAMPLES)
     noise = study.NOISE * jax.random.normal(jax.random.key(1), (len(study.SAMPLES), 2))
     data = np.asarray(study.positions(true) + noise)
-    systems = study.train_on_positions(data)
-    runs = {name: study.follow(systems[name], study.SAMPLES) for name in ("no drag", "learned")}
+    fit = study.train_on_positions(data)
+    systems = {"no drag": study.without_drag(fit.system), "learned": fit.system}
+    runs = {name: study.follow(system, study.SAMPLES) for name, system in systems.items()}
     grid = np.linspace(0.0, float(np.hypot(true["pend.vx"], true["pend.vy"]).max()), 100)
     laws = {"grid": grid, "truth": study.DRAG * grid**2, "learned": study.law_of(systems["learned"], grid)}
     for kind, inks in INKS.items():

@@ -166,7 +166,7 @@ LOOKS = {
     "no drag": dict(color="0.55", linewidth=1.2),
     "truth": dict(color="C3", linewidth=2.2),
     "learned": dict(color="C0", linewidth=1.6, linestyle="--"),
-    "after Adam": dict(color="C1", linewidth=1.4, linestyle="-."),
+    "closed form": dict(color="C1", linewidth=1.4, linestyle="-."),
     "samples": dict(color="k", linestyle="none", marker="o", markersize=4.5, markerfacecolor="none"),
     "tutorial": dict(color="C3", linestyle="none", marker="o", markersize=9, markerfacecolor="none"),
     "least": dict(color="0.4", linewidth=1.0, linestyle=":"),
@@ -450,6 +450,7 @@ class Drag(eqx.Module):
     Still air knows no direction but the velocity's: one function of the speed says it all, and each swing teaches it
     for both components. It leaves no force along the link, which positions could not reveal, for the tension would
     cancel it. And k > 0 whatever the weights: no guess on the way can feed energy in and blow the simulation up.
+    (`learning.IsotropicPassive` is such a law too; this one shows that any Equinox module will do.)
     """
 
     network: eqx.nn.MLP
@@ -468,19 +469,8 @@ def positions(solution):
     return jnp.stack([solution["pend.x"], solution["pend.y"]], axis=1)
 
 
-def misfit(system, ts, data, **options):
-    """Predicted less measured positions, in units of the noise."""
-    solution = simulate(system, ts[-1], ts=ts, rtol=1e-7, atol=1e-9, **options)
-    return (positions(solution) - data) / NOISE
-
-
-def mean_square(system, ts, data):
-    return jnp.mean((NOISE * misfit(system, ts, data)) ** 2)
-
-
-def residuals(system, ts, data):
-    # A trial step may go anywhere: it may fail (and is then rejected), but should not take long.
-    return misfit(system, ts, data, adjoint=diffrax.ForwardMode(), max_steps=500, throw=False)
+def speed_of(solution):
+    return jnp.hypot(solution["pend.vx"], solution["pend.vy"])
 
 
 def part_b():
@@ -491,37 +481,57 @@ def part_b():
         f"\n  Data: {len(SAMPLES)} samples of (x, y) over {DURATION:g} s with noise of {1e3 * NOISE:g} mm, from the "
         "model with one angle."
     )
-    compare(train_on_positions(data), true, data)
+    fit = train_on_positions(data)
+    band = band_of(fit)
+    start = time.perf_counter()
+    found = fit.discover("drag", learning.powers(4))
+    print(
+        f"\n  A closed form in the network's place, refitted to the samples, in {time.perf_counter() - start:.1f} s:\n"
+    )
+    print("\n".join("    " + line for line in str(found).splitlines()))
+    compare({"no drag": without_drag(fit.system), "learned": fit.system, "closed form": found.system}, band, true, data)
 
 
 def train_on_positions(data):
-    """The models on the way: without drag, at first, and after either way of training.
+    """The fit of the network to positions, shape (samples, 2).
 
     With k > 0 even the first guess is a damped swing, near enough for a fit over the whole time at once; a model that
-    can go astray over several swings would be fitted to a short window first.
+    can go astray over several swings would be fitted to a short window first (`horizons=`).
     """
     model = pendulum(HIGH_RELEASE, Drag(jax.random.key(0)))
+    data = np.asarray(data)
+    record = learning.Experiment(SAMPLES, {"pend.x": data[:, 0], "pend.y": data[:, 1]}, sigma=NOISE)
     start = time.perf_counter()
-    adam = learning.fit(model, mean_square, optax.adam(0.02), 40, args=(SAMPLES, data), progress=False)
-    middle = time.perf_counter()
-    final = learning.fit_least_squares(adam.model, residuals, args=(SAMPLES, data), steps=40)
-    end = time.perf_counter()
-    weights = sum(leaf.size for leaf in jax.tree.leaves(eqx.filter(model.neural["drag"], eqx.is_inexact_array)))
+    fit = learning.Problem(model, record, train="drag").fit(adam=40)
     print(
         f"\n  States chosen by the compiler: {', '.join(model.states)}.\n"
-        f"  {weights} weights; {len(adam.history) - 1} updates of Adam in {middle - start:.1f} s, then "
-        f"{final.best_step} steps of least squares in {end - middle:.1f} s, compilation included."
+        f"  {len(fit.point)} weights, of which the data determine {fit.effective['drag']:.1f}; 40 gradient steps, then "
+        f"{len(fit.minimum.history) - 1} of least squares,\n"
+        f"  in {time.perf_counter() - start:.1f} s, compilation included. {fit}"
     )
-    # Far below zero, the last bias makes k vanish.
-    ideal = eqx.tree_at(lambda s: s.neural["drag"].network.layers[-1].bias, model, jnp.array([-1e3]))
-    return {"no drag": ideal, "initial network": model, "after Adam": adam.model, "learned": final.model}
+    return fit
 
 
-def compare(systems, true, data):
+def without_drag(system):
+    """The same model with a drag that vanishes: the last bias is far below zero."""
+    return eqx.tree_at(lambda s: s.neural["drag"].network.layers[-1].bias, system, jnp.array([-1e3]))
+
+
+def band_of(fit):
+    """The learned deceleration over the speed, with its 95 % band and what the bob explored."""
+    return fit.band("drag", np.linspace(0.0, 5.5, 200), lambda law, s: law.rate(s) * s, along=speed_of)
+
+
+def law_of(system, grid):
+    """The deceleration at each speed."""
+    v = jnp.stack([jnp.asarray(grid), jnp.zeros(len(grid))], axis=1)
+    return -np.asarray(jax.vmap(system.neural["drag"])(v))[:, 0]
+
+
+def compare(systems, band, true, data):
     runs = {name: follow(system, SAMPLES) for name, system in systems.items()}
-    speeds = np.hypot(np.asarray(true["pend.vx"]), np.asarray(true["pend.vy"]))
-    low, high = np.percentile(speeds, [1, 99])
-    grid = np.linspace(0.0, 1.25 * speeds.max(), 200)
+    low, high = np.percentile(np.hypot(np.asarray(true["pend.vx"]), np.asarray(true["pend.vy"])), [1, 99])
+    grid = band.grid
     laws = {name: law_of(system, grid) for name, system in systems.items()}
     inside, law = (grid >= low) & (grid <= high), DRAG * grid**2
     errors = {name: rms(angle(run) - angle(true)) for name, run in runs.items()}
@@ -532,7 +542,7 @@ def compare(systems, true, data):
             [
                 name,
                 errors[name],
-                errors["no drag"] / errors[name],
+                f"{errors['no drag'] / errors[name]:,.0f}",
                 f"{100 * rms((laws[name] - law)[inside]) / rms(law[inside]):.2f}",
                 largest(tension(run) - tension(true)),
                 f"{rms(positions(run) - data) / NOISE:.3f}",
@@ -540,14 +550,13 @@ def compare(systems, true, data):
             for name, run in runs.items()
         ],
     )
-    print("  Neither velocities nor forces were measured; at a misfit of 1 the data have nothing more to tell.")
+    covered = ((band.low <= law) & (law <= band.high))[inside].mean()
+    print(
+        f"  The band of the network has the true law at {100 * covered:.0f} % of these speeds. Neither velocities nor "
+        "forces were measured;\n  at a misfit of 1 the data have nothing more to tell."
+    )
     draw_swings(runs, true, data)
-    draw_law(grid, laws, law, (low, high))
-
-
-def law_of(system, grid):
-    """The learned deceleration at each speed."""
-    return np.asarray(jax.vmap(system.neural["drag"].rate)(jnp.asarray(grid))) * grid
+    draw_law(band, laws, law)
 
 
 def draw_swings(runs, true, data):
@@ -559,7 +568,7 @@ def draw_swings(runs, true, data):
     pulls = {k: (SAMPLES, tension(run)) for k, run in shown.items()}
     distances = {
         k: (SAMPLES, np.linalg.norm(np.asarray(positions(runs[k]) - positions(true)), axis=1))
-        for k in ("no drag", "after Adam", "learned")
+        for k in ("no drag", "learned", "closed form")
     }
     draw(axes[0], angles, None, "angle [rad]", "Swing")
     draw(axes[1], pulls, None, "pull [N]", "The link's pull, never measured")
@@ -568,13 +577,18 @@ def draw_swings(runs, true, data):
     save(figure, "b1_swings")
 
 
-def draw_law(grid, laws, law, band):
+def draw_law(band, laws, law):
     figure, (left, right) = plt.subplots(1, 2, figsize=(12, 4.2), layout="constrained")
-    shown = {"truth": law, "after Adam": laws["after Adam"], "learned": laws["learned"]}
-    errors = {k: (grid, np.abs(v - law)) for k, v in shown.items() if k != "truth"}
-    curves = {k: (grid, v) for k, v in shown.items()}
-    draw(left, curves, "speed [m/s]", "deceleration [m/s²]", "Law of drag", band=band)
-    draw(right, errors, "speed [m/s]", "error [m/s²]", "Its error", log=True, band=band)
+    half, explored = band.high - band.mean, tuple(band.explored[0])
+    shown = {"truth": law, "learned": laws["learned"], "closed form": laws["closed form"]}
+    errors = {k: (band.grid, np.abs(v - law)) for k, v in shown.items() if k != "truth"}
+    left.fill_between(band.grid, band.low, band.high, color="C0", alpha=0.25, linewidth=0)
+    draw(left, {k: (band.grid, v) for k, v in shown.items()}, "speed [m/s]", "deceleration [m/s²]", "Law of drag",
+         band=explored)  # fmt: skip
+    left.set_ylim(-0.5, 1.1 * law.max())
+    right.fill_between(band.grid, 1e-6, half, color="C0", alpha=0.2, linewidth=0, label="95 % band")
+    draw(right, errors, "speed [m/s]", "error [m/s²]", "Its error", log=True, band=explored)
+    right.set_ylim(1e-5, 10)
     save(figure, "b2_law")
 
 

@@ -132,6 +132,37 @@ def _mark_events(solution: "Solution", ax: Any) -> bool:
     return bool(groups)
 
 
+def phase(solution: "Solution", x: str, y: str, ax: Any = None) -> Any:
+    """Draws one variable over another, with a dot at the start; returns the axes. Of a batch, each member has a line.
+
+    **Arguments:**
+
+    - `x`, `y`: names of variables, of no arrays.
+    - `ax`: Matplotlib axes to draw into, so that several solutions make one portrait; new ones by default.
+    """
+    plt = _pyplot()
+    columns = []
+    for name in (x, y):
+        values = np.asarray(solution[name], float)
+        if values.ndim != np.ndim(solution.ts):
+            raise ModelError(
+                f"a phase portrait takes single variables; '{name}' is an array of {_entries(solution, name)[:3]}"
+            )
+        columns.append(values.reshape(-1, values.shape[-1]))
+    if ax is None:
+        _, ax = plt.subplots(figsize=(4.6, 4.4), layout="constrained")
+    flat = solution.system.plan.flat
+    units = dict(zip(flat.variables.names, flat.variables.unit, strict=True))
+    for across, up in zip(*columns, strict=True):
+        (line,) = ax.plot(across, up, linewidth=1.4)
+        ax.plot(across[:1], up[:1], "o", color=line.get_color(), markersize=5)
+    for name, put in ((x, ax.set_xlabel), (y, ax.set_ylabel)):
+        unit = units.get(name, "")
+        put(f"{name} [{unit}]" if unit and unit != "1" else name)
+    ax.grid(True, alpha=0.3)
+    return ax
+
+
 def structure(system: "AcausalSystem", ax: Any = None) -> Any:
     """Draws the incidence matrix in block lower triangular order, and returns the axes.
 

@@ -3,7 +3,13 @@
 from .band import Band as Band
 from .closed_form import ClosedForm as ClosedForm
 from .data import Data as Data
+from .design import Advice as Advice
+from .design import next_experiment as next_experiment
+from .design_search import Design as Design
+from .design_search import design_experiment as design_experiment
 from .discovery import Discovery as Discovery
+from .ensemble import Ensemble as Ensemble
+from .ensemble import ensemble as ensemble
 from .estimate import Estimate as Estimate
 from .experiment import Experiment as Experiment
 from .experiment import Unknown as Unknown
@@ -24,6 +30,7 @@ from .laws import Positive as Positive
 from .libraries import powers as powers
 from .libraries import terms as terms
 from .multiple_shooting import Shooting as Shooting
+from .planned import Planned as Planned
 from .prediction import Prediction as Prediction
 from .problem import Problem as Problem
 from .table import Table as Table

@@ -13,6 +13,7 @@ from ..errors import ModelError, nearest
 from ..model.opaque import OpaqueFunction
 from ..programs.cache import compiled
 from .blocks import Block, block_of, inputs_seen
+from .figures import plot_band
 from .program import weights_of, with_weights
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 class Band:
     """A law at the points of a `grid`: `mean`, the standard deviation `spread`, the band from `low` to `high`, shape
     `(n,)`; `explored`: from the least to the greatest value that the experiments saw, for each input, shape
-    `(inputs, 2)`."""
+    `(inputs, 2)`; `between`: of an ensemble, the standard deviation of its members, part of the `spread`."""
 
     grid: Float[np.ndarray, " n *inputs"]
     mean: Float[np.ndarray, " n"]
@@ -31,12 +32,20 @@ class Band:
     low: Float[np.ndarray, " n"]
     high: Float[np.ndarray, " n"]
     explored: Float[np.ndarray, "inputs 2"]
+    between: Float[np.ndarray, " n"] | None = None
 
     @property
     def inside(self) -> np.ndarray:
         """Which grid points lie within what was explored, shape `(n,)`."""
         points = self.grid.reshape(len(self.grid), -1)
         return np.all((points >= self.explored[:, 0]) & (points <= self.explored[:, 1]), axis=1)
+
+    def plot(self, ax: Any = None, *, truth: Any = None, label: str = "learned") -> Any:
+        """Draws the law with its band and the region explored; returns Matplotlib axes.
+
+        - `truth`: a law to compare with, if one is known: a function of the grid, or values, shape `(n,)`.
+        """
+        return plot_band(self, ax, truth, label)
 
 
 def band(

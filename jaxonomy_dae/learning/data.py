@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from ..errors import ModelError, nearest
 from ..lowering.plan import SystemPlan
 from ..system.inputs import KINDS
 from .experiment import Experiment, Unknown, check_increasing
+from .figures import plot_data
 
 
 class Data:
@@ -40,6 +42,10 @@ class Data:
     def __repr__(self):
         counts = (f"{label}: {len(e.times)} times" for label, e in zip(self.labels, self.experiments, strict=True))
         return f"Data({', '.join(counts)})"
+
+    def plot(self, names: str | Sequence[str] | None = None, *, axes: Any = None) -> Any:
+        """Draws the records over time, one row of axes for each name; returns Matplotlib axes."""
+        return plot_data(self, names, axes)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,11 +14,12 @@ from ..system.system import AcausalSystem
 from .band import Band, band
 from .discovery import Discovery, discover
 from .factors import Factors
+from .figures import plot_correlations, plot_history, plot_residuals, plot_runs
 from .holdout import holdout_score, with_own_starts
 from .identifiability import Identifiability, identifiability, spreads
 from .least_squares import Minimum
 from .objective import Objective
-from .prediction import Prediction, prediction
+from .prediction import Prediction, at_samples, prediction
 from .profile import profile
 from .program import with_values
 from .table import Row, Table
@@ -290,6 +291,28 @@ class Estimate:
         - `SimulationError` if no closed form can be simulated.
         """
         return discover(self, name, terms, width, most)
+
+    def plot(self, names: str | Sequence[str] | None = None, *, axes: Any = None, level: float = 0.95) -> Any:
+        """Draws samples, and fitted runs with their bands at the times of the samples: rows of axes for names, columns
+        for experiments (the first four of them); returns Matplotlib axes."""
+        return plot_runs(self, names, axes, level)
+
+    def plot_residuals(self, *, axes: Any = None) -> Any:
+        """Draws residuals in units of the noise over time, and their autocorrelation; returns Matplotlib axes."""
+        return plot_residuals(self, axes)
+
+    def plot_history(self, ax: Any = None) -> Any:
+        """Draws how the misfit came down; returns Matplotlib axes."""
+        return plot_history(self, ax)
+
+    def plot_correlations(self, ax: Any = None) -> Any:
+        """Draws the correlations of parameters and starts; returns Matplotlib axes."""
+        return plot_correlations(self, ax)
+
+    @functools.cached_property
+    def at_samples(self) -> tuple[Float[np.ndarray, "e n k"], Float[np.ndarray, "e n k"]]:
+        """All outputs at the times of the samples, as `objective.stacked` has them, and their standard deviations."""
+        return at_samples(self)
 
     @functools.cached_property
     def rms(self) -> dict[str, dict[str, float]]:

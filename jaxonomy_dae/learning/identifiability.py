@@ -6,11 +6,13 @@ that, or more.
 """
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from .factors import Factors
+from .figures import plot_spectrum
 from .least_squares import Evaluation, Weights
 from .objective import Objective
 
@@ -61,6 +63,10 @@ class Identifiability:
                 text += f" ({helped:.3g} if '{other}' were known)"
             lines.append(text)
         return "\n".join(lines)
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draws the eigenvalues of the scaled Fisher information; returns Matplotlib axes."""
+        return plot_spectrum(self, ax)
 
 
 def natural_scale(objective: Objective, z: Float[np.ndarray, " f"]) -> Float[np.ndarray, " f"]:

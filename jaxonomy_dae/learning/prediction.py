@@ -1,6 +1,7 @@
 """Predictions of any variable, with bands."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -9,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import ModelError, nearest
+from .figures import plot_prediction
 from .objective import Objective, Predicted
 from .program import predict_and_differentiate
 
@@ -26,6 +28,10 @@ class Prediction:
     spread: dict[str, np.ndarray]
     low: dict[str, np.ndarray]
     high: dict[str, np.ndarray]
+
+    def plot(self, names: str | Sequence[str] | None = None, *, axes: Any = None) -> Any:
+        """Draws variables with their bands, one below the other; returns Matplotlib axes."""
+        return plot_prediction(self, names, axes)
 
 
 def prediction(estimate: "Estimate", names: list[str], ts: Any, experiment: int | str, factor: float) -> Prediction:
@@ -62,3 +68,14 @@ def prediction(estimate: "Estimate", names: list[str], ts: Any, experiment: int 
     mean = alone.outputs[0]
     by = [dict(zip(names, a.T, strict=True)) for a in (mean, spread, mean - factor * spread, mean + factor * spread)]
     return Prediction(times, *by)
+
+
+def at_samples(estimate: "Estimate") -> tuple[Float[np.ndarray, "e n k"], Float[np.ndarray, "e n k"]]:
+    """All outputs at the samples' times, by the program of the fit, and their standard deviations."""
+    c, found = estimate.objective.coordinates, estimate.objective.predicted(estimate.point)
+    scale = c.slope(estimate.point)
+    shared = scale[: c.n_shared, None] * estimate.root[: c.n_shared]
+    own = scale[c.n_shared :, None] * estimate.root[c.n_shared :]
+    own = own.reshape(c.experiments, c.n_own, estimate.root.shape[1])
+    moves = found.by_shared @ shared + np.einsum("enko,eor->enkr", found.by_own, own)
+    return found.outputs, np.linalg.norm(moves, axis=-1)

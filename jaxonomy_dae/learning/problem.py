@@ -23,7 +23,7 @@ from .experiment import Experiment, Unknown
 from .first_order import adam_steps
 from .holdout import holdout_score
 from .identifiability import Identifiability, identifiability
-from .least_squares import Minimum, Weights, minimise
+from .least_squares import Evaluation, Minimum, Weights, minimise
 from .multiple_shooting import Shooting, shoot
 from .objective import Objective
 from .program import Layout, predict, weights_of, with_values
@@ -473,9 +473,26 @@ class Problem:
 
         Noise levels that are to be estimated are taken as large as the residuals are at the start.
         """
+        objective, weights, found, z = self.nominal(freeze, start)
+        return identifiability(objective, weights, found, z, self._options["rtol"])
+
+    def nominal(
+        self, freeze: Mapping[str, float] | Iterable[str] = (), start: Any = None
+    ) -> tuple[Objective, Weights, Evaluation, Float[np.ndarray, " f"]]:
+        """Where a search would begin: the objective, first weights, residuals with their Jacobian, and coordinates."""
         objective = self._objective(self._stacked, self._coordinates(self._stacked, freeze, start, None))
         z = objective.coordinates.z_start[objective.free]
         found = objective.evaluate(z)
         if found is None:
-            raise SimulationError(self._why(objective))
-        return identifiability(objective, objective.weights(z, found), found, z, self._options["rtol"])
+            raise self.not_simulated(objective)
+        return objective, objective.weights(z, found), found, z
+
+    @property
+    def trained(self) -> tuple[list[str], list[str]]:
+        """Names of parameters, one by one, and of networks and sensor laws that are trained."""
+        return self._train
+
+    def laid_out(self, experiments: Sequence[Experiment]) -> tuple[Layout, Stacked]:
+        """Other experiments of the same system with what is trained, for a program of their own."""
+        stacked = stack(Data(*experiments), self.system.plan, tuple(self.observers), self.starts)
+        return self._laid_out(stacked), stacked

@@ -3,6 +3,10 @@
 import dataclasses
 import html
 import math
+from collections.abc import Mapping
+from typing import Any
+
+from .figures import plot_table
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,6 +45,11 @@ class Table:
         cells = self._cells()
         widths = [max(len(line[k]) for line in cells) for k in range(5)]
         return "\n".join("  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in cells)
+
+    def plot(self, ax: Any = None, *, true: Mapping[str, float] | None = None) -> Any:
+        """Draws the intervals relative to the values, with crosses at `true` values by name, where these are known;
+        returns Matplotlib axes."""
+        return plot_table(self, ax, true)
 
     def _repr_html_(self) -> str:
         rows = ("".join(f"<td>{html.escape(c)}</td>" for c in line) for line in self._cells())

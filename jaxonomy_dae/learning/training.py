@@ -14,8 +14,8 @@ import optax
 from jaxtyping import Float
 
 from ..errors import ModelError
-from ..optional import optional_module
 from .checkpoint import fingerprint, read_facts, read_state, save
+from .figures import new_axes
 from .gradient import Batches
 from .holdout import holdout_score
 from .least_squares import Evaluation, Weights
@@ -113,9 +113,7 @@ class Training:
 
     def plot(self, ax: Any = None) -> Any:
         """Draws the history, and the scores of experiments held out; returns Matplotlib axes."""
-        plt = optional_module("matplotlib.pyplot", "plot", "plotting needs Matplotlib")
-        if ax is None:
-            _, ax = plt.subplots(figsize=(7.0, 3.5), layout="constrained")
+        ax = new_axes(ax)
         ax.semilogy(np.arange(len(self.history)), np.sqrt(2 * self.history), label="fitted")
         if len(self.scores[0]):
             ax.semilogy(*self.scores, "o-", markersize=3, label="held out")

@@ -215,6 +215,12 @@ class Solution(eqx.Module):
 
         return plot_solution(self, *names, ax=ax, events=events)
 
+    def plot_phase(self, x: str, y: str, ax: Any = None) -> Any:
+        """Draws variable `y` over variable `x`, with a dot at the start; returns the Matplotlib axes."""
+        from ..plotting import phase
+
+        return phase(self, x, y, ax)
+
     def __repr__(self):
         return f"Solution({self.ts.shape[-1]} times, {len(self.system.variables)} variables)"
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import os
 import pathlib
 
 import jax
@@ -10,7 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 from scipy.linalg import expm
-from scipy.optimize import least_squares, minimize
+from scipy.optimize import brentq, least_squares, minimize
 
 GALLERY = pathlib.Path(__file__).parents[2] / "examples" / "gallery"
 pytestmark = pytest.mark.slow
@@ -308,3 +309,169 @@ def test_through_the_bounce():
     law = jax.vmap(names["learned"].neural["ball.law"])(speeds[:, None])[:, 0]
     np.testing.assert_allclose(law, names["truth"](speeds), rtol=0, atol=0.03)  # the noise over falls of 0.2 m
     assert np.abs(names["hit"] - names["wanted"]).max() < 0.1
+
+
+def test_next_experiment():
+    names = names_after("next_experiment")
+    times, sigma, unknown = names["times"], names["SIGMA"], names["UNKNOWN"]
+
+    def run(values, volts, at):
+        """Speed and current by SciPy, J·w' = k·i − d·w − c·tanh(w/0.2), R = 1, the voltage held from each time on."""
+        J, k, d, c = values
+        w, found, ends = 0.0, [], [*at[1:], times[-1]] if at[-1] < times[-1] else at[1:]
+        for start, end, u in zip(at, ends, volts, strict=False):
+            inside = np.minimum(times[(times > start + 1e-9) & (times <= end + 1e-9)], end)
+            field = lambda t, y, u=u: (k * (u - k * y) - d * y - c * np.tanh(y / 0.2)) / J  # noqa: E731
+            points = np.unique([*inside, end])
+            part = solve_ivp(field, (start, end), [w], "LSODA", points, rtol=1e-10, atol=1e-12).y[0]
+            found += [(y, u - k * y) for y in part[: len(inside)]]
+            w = part[-1]
+        return np.array(found)
+
+    def slopes(values, volts, at, measured):
+        """By the logarithms of the values, in units of the noise; differences are truncated at 1e-8."""
+        columns = [j for j, name in enumerate(("drive.w", "drive.i")) if name in measured]
+        size = np.array([sigma[n] for n in ("drive.w", "drive.i")])
+        moved = [run(values * np.exp(s * e), volts, at) / size for e in np.eye(4) for s in (1e-4, -1e-4)]
+        return np.stack([(a - b)[:, columns].ravel() / 2e-4 for a, b in zip(moved[::2], moved[1::2], strict=True)], 1)
+
+    # What each candidate would tell, at the values of the first fit, which SciPy's runs confirm.
+    guess = np.array([names["fit"].values[n] for n in unknown])
+    first = slopes(guess, [12.0], [0.0], ["drive.w"])
+    known = first.T @ first + np.eye(4)
+
+    def gain(known, j):
+        return 0.5 * (np.linalg.slogdet(known + j.T @ j)[1] - np.linalg.slogdet(known)[1])
+
+    for k, (u, measured) in enumerate(names["options"].values()):
+        j = slopes(guess, u[1][:-1], list(u[0][:-1]), measured)
+        np.testing.assert_allclose(names["advice"].gain[k], gain(known, j), rtol=0, atol=0.02)
+    assert names["advice"].best == int(np.argmax(names["advice"].gain))
+
+    # The second fit: as far from the truth as its intervals allow, which are those of SciPy's slopes.
+    true = np.array([*names["TRUE"].values()])
+    found = np.array([names["again"].values[n] for n in unknown])
+    u, measured = names["u"], names["names"]
+    j = np.concatenate([slopes(found, [12.0], [0.0], ["drive.w"]), slopes(found, u[1][:-1], list(u[0][:-1]), measured)])
+    deviation = np.sqrt(np.diag(np.linalg.inv(j.T @ j)))
+    np.testing.assert_allclose([names["kept"][n] for n in unknown], deviation, rtol=1e-2)
+    assert (np.abs(np.log(found / true)) < 4 * deviation).all()
+
+    # The design is no worse than the best of a grid, and better than its start.
+    assert names["found"].gain > names["gains"].max() - 2e-3
+    assert names["found"].gain > names["found"].history[0] + 0.05
+
+
+def test_clogged_filter():
+    names = names_after("clogged_filter")
+    rho, g, ambient = 998.2, 9.80665, 101325.0
+
+    def flow(level, V):
+        """Filter and valve in a row: the drop over the valve for which both let the same through."""
+        head, share = rho * g * level, 0.2 + 0.75 * np.exp(-V / 0.35)
+
+        def through_valve(dp):
+            return 3e-4 * 0.6 * np.sqrt(2 * rho) * dp / (dp**2 + 100.0**2) ** 0.25
+
+        def apart(dp):
+            m = through_valve(dp)
+            return m * np.sqrt(m**2 + 1e-6) - 2 * rho * (0.6 * 4e-4 * share) ** 2 * (head - dp)
+
+        dp = brentq(apart, 0.0, head, xtol=1e-10, rtol=1e-14)
+        return through_valve(dp), ambient + dp
+
+    ts, (switches, pumped, _) = names["ts"], names["inputs"]["pump.m_flow"]
+    y, levels = np.array([1.0, 0.0]), []
+    for start, end, pump in zip(switches, switches[1:], pumped, strict=False):
+
+        def field(t, y, pump=pump):
+            m = flow(*y)[0]
+            return (pump - m) / (rho * 0.25), m / rho
+
+        inside = ts[(ts > start + 1e-9) & (ts <= end + 1e-9)]
+        states = solve_ivp(field, (start, end), y, "LSODA", inside, rtol=1e-10, atol=1e-12).y
+        levels += states.T.tolist()
+        y = states[:, -1]  # every interval ends with a reading
+    levels = np.array(levels)
+    np.testing.assert_allclose(names["true"]["tank.level"], levels[:, 0], rtol=0, atol=1e-6)
+    pressures = [flow(*state)[1] for state in levels[::30]]
+    np.testing.assert_allclose(names["true"]["filter.port_b.p"][::30], pressures, rtol=1e-6)
+    # The misfit is that of noise, the opening within 0.3 %, and the law the one that made the record.
+    fit = names["fit"]
+    assert abs(fit.chi2 / fit.freedom - 1) < 3 * np.sqrt(2 / 300) and names["error"] < 3e-3
+    found = names["found"].chosen
+    assert found.terms == ("1", "exp(-V/0.35)")
+    assert (np.abs(np.asarray(found.law.coefficients) - [0.2, 0.75]) < 4 * found.spread).all()
+
+
+def test_battery_pulses():
+    """The record is measured: what can be checked is that the model is solved as written, and what the note says."""
+    folder = os.environ.get("JAXONOMY_DAE_DATA", "")
+    if not (folder and (pathlib.Path(folder) / "battery" / "multipulse_hppc.xlsx").is_file()):
+        pytest.skip("JAXONOMY_DAE_DATA names no folder with battery/multipulse_hppc.xlsx; the notebook downloads it")
+    names = names_after("battery_pulses")
+
+    def voltage(values, one, E):
+        """Exactly, for a current that is linear between its samples."""
+        times, i = one.inputs["cell.i"]
+        R0, R1, C1, R2, C2, C3 = (values[f"cell.{n}"] for n in ("R0", "R1", "C1", "R2", "C2", "C3"))
+        v = np.zeros((2, len(times)))
+        q = np.concatenate([[0.0], np.cumsum(np.diff(times) * (i[1:] + i[:-1]) / 2)])
+        for row, (R, tau) in enumerate(((R1, R1 * C1), (R2, R2 * C2))):
+            for k, h in enumerate(np.diff(times)):
+                a, b = R * i[k], R * (i[k + 1] - i[k]) / h  # v → a + b·s − b·tau
+                v[row, k + 1] = a + b * h - b * tau + (v[row, k] - a + b * tau) * np.exp(-h / tau)
+        return (E - R0 * i - v.sum(axis=0) - q / C3)[1:]
+
+    fit = names["fit"]
+    for k, one in enumerate((names["small"], names["large"])):
+        exact = voltage(fit.values, one, fit.starts["cell.E"][k])
+        # A run at rtol 1e-6 errs by 1e-6 of 60 mV a step, and of such by no more than some 1e-6 V.
+        np.testing.assert_allclose(fit.at_samples[0][k, : len(one.times), 0], exact, rtol=0, atol=2e-5)
+        error = np.sqrt(np.nanmean((exact - one.data["cell.v"]) ** 2))
+        np.testing.assert_allclose(fit.rms[("3 A", "6 A")[k]]["cell.v"], error, rtol=0.05)
+    assert fit.rms["3 A"]["cell.v"] < 1e-4 and fit.rms["6 A"]["cell.v"] > 10 * fit.rms["3 A"]["cell.v"]
+    for pulse in ("3 A", "6 A"):
+        assert names["learned"].rms[pulse]["cell.v"] < 0.6 * names["linear"].rms[pulse]["cell.v"]
+    assert fit.whiteness["3 A"]["cell.v"].probability < 1e-6
+    slope = np.diff(names["band"].mean)
+    assert (slope > 0).all()
+
+
+def test_sticking_friction():
+    names = names_after("sticking_friction")
+    times, k = names["times"], 50.0
+
+    def level(v):
+        return 3.0 + 2.0 * np.exp(-((v / 0.1) ** 2)) + 1.5 * abs(v)
+
+    def positions(V):
+        """The block sticks until the spring pulls with 5.5 N, and slides until its speed is zero again."""
+        t, s, found = 0.0, 0.0, []
+        while len(found) < len(times):
+            breaks = (5.5 / k + s) / V
+            found += [s] * int(np.sum((times > t + 1e-12) & (times <= breaks)))
+            if breaks >= times[-1]:
+                break
+
+            def stops(t, y, breaks=breaks):
+                return y[1] if t > breaks + 1e-6 else 1.0
+
+            stops.terminal, stops.direction = True, -1
+            inside = times[times > breaks]
+            slide = solve_ivp(
+                lambda t, y: [y[1], k * (V * t - y[0]) - level(y[1])], (breaks, times[-1] + 1), [s, 0.0], "LSODA",
+                inside, events=stops, rtol=1e-10, atol=1e-13,
+            )  # fmt: skip
+            found += slide.y[0].tolist()
+            if not len(slide.t_events[0]):
+                break
+            t, s = slide.t_events[0][0], slide.y_events[0][0][0]
+        return np.array(found[: len(times)])
+
+    for speed, run in names["runs"].items():
+        np.testing.assert_allclose(run["block.s"], positions(speed), rtol=0, atol=1e-6)
+    fit = names["fit"]
+    assert abs(fit.chi2 / fit.freedom - 1) < 4 * np.sqrt(2 / fit.freedom) and names["error"] < 0.01
+    row = fit.table()["block.more"]
+    assert abs(row.value - names["MORE"]) < 2 * (row.high - row.low)

@@ -1,0 +1,307 @@
+"""Which experiment tells most: the Fisher information after it.
+
+With the information H at hand (priors included) and M that of a candidate, linearized around the values at hand, the
+experiment is expected to tell
+
+    ½ ln det(H + M) − ½ ln det H
+
+nats about what is estimated (Lindley 1956, Annals of Mathematical Statistics 27:986): the greatest is the D-optimal
+choice (Atkinson & Donev 1992, Optimum Experimental Designs, §10). For some names alone, det of their own block of the
+inverse takes the place of det H (Ds-optimality, ibid. §10.3), so that what is known of others counts only as far as it
+helps.
+
+What is not known at all is taken to be known to its natural scale: a positive parameter to a factor of e, another to
+its own size, an unknown start to its spread. So directions that nothing determines yet have a finite worth (Chaloner
+& Verdinelli 1995, Statistical Science 10:273).
+"""
+
+import copy
+import dataclasses
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..errors import InitializationError, ModelError, SimulationError, nearest
+from .coordinates import coordinates
+from .data import Stacked
+from .estimate import Estimate
+from .identifiability import natural_scale
+from .objective import Objective
+from .planned import Planned
+from .program import Layout, predict_and_differentiate
+
+if TYPE_CHECKING:
+    from .problem import Problem
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Advice:
+    """Candidates compared, to be printed.
+
+    - `labels`: of the candidates.
+    - `gain`: what each is expected to tell, in nats; ln 2 = 0.69 halves the spread of one parameter. NaN where its run
+        fails.
+    - `chosen`: the best, by position; if several were asked for, each next one given those before it.
+    - `before`: standard deviations of parameters and shared starts as they are known now, by name, on the coordinates'
+        scale (relative, for positive parameters); `after`: with each candidate, shape `(candidates,)`.
+    """
+
+    labels: tuple[str, ...]
+    gain: Float[np.ndarray, " c"]
+    chosen: tuple[int, ...]
+    before: dict[str, float]
+    after: dict[str, Float[np.ndarray, " c"]]
+
+    @property
+    def best(self) -> int:
+        """The position of the one that tells most."""
+        return self.chosen[0]
+
+    def __repr__(self):
+        names = list(self.before)[:4]
+        header = ["", "gain [nat]", *(f"spread of {name}" for name in names)]
+        rows = [["(now)", "", *(f"{self.before[name]:.3g}" for name in names)]] if names else []
+        for k in np.argsort(np.where(np.isnan(self.gain), np.inf, -self.gain), kind="stable").tolist():
+            mark = "* " if k in self.chosen else "  "
+            told = "its run fails" if np.isnan(self.gain[k]) else f"{self.gain[k]:.3f}"
+            rows.append([mark + self.labels[k], told, *(f"{self.after[name][k]:.3g}" for name in names)])
+        widths = [max(len(row[k]) for row in [header, *rows]) for k in range(len(header))]
+        lines = ["  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip() for row in [header, *rows]]
+        if len(self.chosen) > 1:
+            lines.append("in this order: " + ", ".join(self.labels[k] for k in self.chosen))
+        return "\n".join(lines)
+
+
+@dataclasses.dataclass(frozen=True)
+class Known:
+    """The information at hand of what experiments share, and how it is measured.
+
+    `scale` is d(natural value)/d(coordinate); `chosen` are the coordinates about which experiments are to tell.
+    """
+
+    problem: "Problem"
+    objective: Objective
+    natural: Float[np.ndarray, " p"]  # values of all coordinates
+    information: Float[np.ndarray, "s s"]
+    free: Bool[np.ndarray, " shared"]
+    scale: Float[np.ndarray, " shared"]
+    chosen: Bool[np.ndarray, " s"]
+
+    def worth(self, information: Float[np.ndarray, "s s"]) -> float:
+        """ln det of the information, or of what it says of the chosen coordinates."""
+        whole = _log_det(information)
+        return whole if self.chosen.all() else whole - _log_det(information[np.ix_(~self.chosen, ~self.chosen)])
+
+    def spreads(self, information: Float[np.ndarray, "s s"]) -> dict[str, float]:
+        """Standard deviations of what is not a weight, by name."""
+        c = self.objective.coordinates
+        size = np.sqrt(np.diag(information))
+        variance = np.diag(np.linalg.inv(information / np.outer(size, size))) / size**2
+        names = np.array(c.names[: c.n_shared])[self.free]
+        plain = ~c.is_weight[: c.n_shared][self.free]
+        return {n: float(v) for n, v in zip(names[plain], np.sqrt(variance[plain]), strict=True)}
+
+
+def known_of(source: "Problem | Estimate", names: Any, alone: bool) -> Known:
+    """What a problem knows at its nominal values, or an estimate at its own."""
+    if isinstance(source, Estimate):
+        problem, objective = source.problem, source.objective
+        weights, found, z = source.minimum.weights, source.minimum.found, source.minimum.z
+    else:
+        problem = source
+        objective, weights, found, z = source.nominal()
+    c, free = objective.coordinates, objective.free
+    shared = free[: c.n_shared]
+    if not shared.any():
+        raise ModelError("only starts of single experiments are unknown: no other experiment can tell about these")
+    prior = np.where(weights.precision > 0, weights.precision, 1 / natural_scale(objective, z) ** 2)
+    count = int(shared.sum())
+    information = np.diag(prior[:count])
+    if not alone:
+        jacobian = weights.row[:, None] * found.jacobian
+        whole = jacobian.T @ jacobian + np.diag(prior)
+        information = _without(whole, count)
+    natural = c.natural(objective.full(z))
+    scale = c.slope(objective.full(z))[: c.n_shared]
+    return Known(problem, objective, natural, information, shared, scale, _chosen(objective, shared, names))
+
+
+def _chosen(objective: Objective, shared: Bool[np.ndarray, " shared"], names: Any) -> Bool[np.ndarray, " s"]:
+    c = objective.coordinates
+    if names is None:
+        return np.ones(int(shared.sum()), bool)
+    chosen = np.zeros(len(c), bool)
+    for name in [names] if isinstance(names, str) else names:
+        members = c.members(name) & np.concatenate([shared, np.zeros(len(c) - c.n_shared, bool)])
+        if not members.any():
+            known = [n for n, ok in zip(c.group[: c.n_shared], shared, strict=True) if ok]
+            raise ModelError(f"names: '{name}' is not estimated from all experiments: " + nearest(name, known))
+        chosen |= members
+    return chosen[: c.n_shared][shared]
+
+
+def next_experiment(
+    source: "Problem | Estimate",
+    candidates: Sequence[Planned],
+    names: Sequence[str] | str | None = None,
+    *,
+    count: int = 1,
+    alone: bool = False,
+) -> Advice:
+    """Which of some experiments would tell most about what is estimated.
+
+    ```python
+    plans = [learning.Planned(ts, {"pend.x": 1e-3}, initial={"pend.initial_theta": a}) for a in (-1.2, 0.0, 0.5)]
+    print(learning.next_experiment(fit, plans, names=["drag"]))
+    ```
+
+    All candidates are one compiled program, shorter ones padded; events in the model are differentiated through.
+
+    **Arguments:**
+
+    - `source`: an estimate, whose values and data count; or a problem, with its nominal values, before any fit.
+    - `candidates`: what could be done: times, inputs, starts, and what would be measured.
+    - `names`: of parameters, networks and shared starts about which to learn; default: all.
+    - `count`: how many experiments to choose; the same may be chosen again.
+    - `alone`: as if no data were at hand.
+
+    **Returns:**
+
+    `Advice`. Its gains hold for the values at hand: a design is as good as the guess of what it is designed for.
+
+    **Raises:**
+
+    - `ModelError` for names and candidates that do not fit; `SimulationError` if every candidate's run fails, with the
+        reason of the first.
+    """
+    known = known_of(source, names, alone)
+    plans: list[Planned] = [] if isinstance(candidates, Planned) else list(candidates)
+    if not plans or not all(isinstance(one, Planned) for one in plans):
+        raise ModelError("candidates are a list of learning.Planned(times, {'m.x': sigma}, ...), at least one")
+    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
+        raise ModelError(f"count is a whole number ≥ 1; got {count!r}")
+    labels, gained = informations(known, plans)
+    fails = np.array([not np.isfinite(m).all() for m in gained])
+    if fails.all():
+        raise SimulationError(_why(known, plans))
+    chosen, now, gains = [], known.information, None
+    for _ in range(count):
+        worth = np.array([np.nan if f else known.worth(now + m) for f, m in zip(fails, gained, strict=True)])
+        here = 0.5 * (worth - known.worth(now))
+        gains = here if gains is None else gains
+        chosen.append(int(np.nanargmax(here)))
+        now = now + gained[chosen[-1]]
+    assert gains is not None
+    before = known.spreads(known.information)
+    each = [
+        dict.fromkeys(before, np.nan) if f else known.spreads(known.information + m)
+        for f, m in zip(fails, gained, strict=True)
+    ]
+    after = {name: np.array([one[name] for one in each]) for name in before}
+    return Advice(labels, gains, tuple(chosen), before, after)
+
+
+def informations(known: Known, plans: list[Planned]) -> tuple[tuple[str, ...], Float[np.ndarray, "c s s"]]:
+    """Labels, and the information of each planned experiment on what is shared and free; NaN where its run fails."""
+    layout, stacked, shared, own = _placed(known, plans)
+    conditions = _objective(known, layout, stacked).conditions
+    o = known.objective
+    found = predict_and_differentiate(o.system, o.observers, layout, shared, own, conditions)
+    outputs, by_shared, by_own = (np.asarray(a, np.float64) for a in found)
+    column = _columns(known, layout)
+    starts = _start_scales(stacked, layout)
+    out = np.full((len(plans), *known.information.shape), np.nan)
+    for k in range(len(plans)):
+        seen = stacked.observed[k]
+        row = np.sqrt(stacked.weight[k]) / np.broadcast_to(stacked.sigma[k], seen.shape)[seen]
+        a = np.zeros((len(row), len(known.free)))
+        a[:, column] = by_shared[k][seen]
+        a = (row[:, None] * a * known.scale)[:, known.free]
+        if not np.isfinite(a).all() or not np.isfinite(outputs[k][seen]).all():
+            continue
+        b = row[:, None] * by_own[k][seen] * starts[k]
+        own_free = ~np.array([_is_known(stacked, name, k) for name in layout.own], bool)
+        joint = np.concatenate([a, b[:, own_free]], axis=1)
+        whole = joint.T @ joint
+        n = a.shape[1]
+        whole[np.arange(n, len(whole)), np.arange(n, len(whole))] += 1.0  # own starts: their spread is the unit
+        out[k] = _without(whole, n)
+    return stacked.labels, out
+
+
+def _placed(known: Known, plans: list[Planned]) -> tuple[Layout, Stacked, Any, Any]:
+    """Layout, data, and the numbers that the program is told."""
+    problem, o = known.problem, known.objective
+    layout, stacked = problem.laid_out([one.experiment(o.system.plan) for one in plans])
+    base = o.layout
+    missing = [name for name in layout.shared if name not in base.shared]
+    if missing:
+        raise ModelError(
+            f"candidates share the unknown start of '{missing[0]}', and the experiments at hand do not: leave "
+            "shared=True out"
+        )
+    at = _objective(known, layout, stacked)
+    own = at.coordinates.split(at.coordinates.start)[1]
+    return layout, stacked, *at.numbers(np.concatenate([known.natural[_columns(known, layout)], own.ravel()]))
+
+
+def _objective(known: Known, layout: Layout, stacked: Stacked) -> Objective:
+    o = known.objective
+    c = coordinates(o.system, o.observers, layout, stacked)
+    return Objective(o.system, o.observers, layout, stacked, c, {}, np.ones(len(stacked.labels), bool))
+
+
+def _columns(known: Known, layout: Layout) -> np.ndarray:
+    """Where the shared numbers of a layout stand among those at hand."""
+    base, c = known.objective.layout, known.objective.coordinates
+    plain = c.n_shared - len(base.shared)
+    return np.array([*range(plain), *(plain + base.shared.index(name) for name in layout.shared)], int)
+
+
+def _is_known(stacked: Stacked, name: str, k: int) -> bool:
+    return isinstance(stacked.starts[name][k], float)
+
+
+def _start_scales(stacked: Stacked, layout: Layout) -> np.ndarray:
+    """What each own start is unsure of: its spread, or its own size; shape (candidates, own)."""
+
+    def scale(given: Any) -> float:
+        if isinstance(given, float):
+            return 1.0
+        return float(given.spread) if given.spread is not None else abs(float(given.guess)) or 1.0
+
+    rows = [[scale(stacked.starts[name][k]) for name in layout.own] for k in range(len(stacked.labels))]
+    return np.array(rows, float).reshape(len(stacked.labels), len(layout.own))
+
+
+def _without(information: Float[np.ndarray, "p p"], count: int) -> Float[np.ndarray, "s s"]:
+    """What is said of the first coordinates, whatever the others are (a Schur complement)."""
+    first, cross, rest = information[:count, :count], information[:count, count:], information[count:, count:]
+    if not len(rest):
+        return first
+    size = np.sqrt(np.diag(rest))
+    cross = cross / size
+    found = first - cross @ np.linalg.solve(rest / np.outer(size, size), cross.T)
+    return (found + found.T) / 2
+
+
+def _log_det(information: Float[np.ndarray, "s s"]) -> float:
+    size = np.sqrt(np.diag(information))
+    sign, value = np.linalg.slogdet(information / np.outer(size, size))
+    return float(value + 2 * np.sum(np.log(size))) if sign > 0 else -np.inf
+
+
+def _why(known: Known, plans: list[Planned]) -> str:
+    """The reason for which the first candidate's run fails."""
+    layout, stacked, shared, own = _placed(known, plans)
+    at = _objective(known, layout, stacked)
+    point = np.concatenate([np.asarray(shared, float), np.asarray(own, float).ravel()])
+    other = copy.copy(known.problem)
+    other._layout = layout
+    try:
+        other.run(at, at.coordinates.scaled(point), 0)
+    except (InitializationError, ModelError, SimulationError) as error:
+        return f"no candidate can be simulated; the first, {stacked.labels[0]}, fails: {error}"
+    return f"no candidate can be simulated; the first, {stacked.labels[0]}: its predictions are not finite"

@@ -1,0 +1,47 @@
+"""What a check found."""
+
+import dataclasses
+import math
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Certificate:
+    """What was checked, to be printed.
+
+    - `claim`: what holds.
+    - `checked`: on what, and how often.
+    - `error`: the largest error found, and `allowed`, how large it may be.
+    - `where`: the place of the largest error.
+    - `notes`: what else there is to know.
+    """
+
+    claim: str
+    checked: str
+    error: float
+    allowed: float
+    where: str
+    notes: tuple[str, ...] = ()
+
+    @property
+    def holds(self) -> bool:
+        """Whether the error is as small as is allowed."""
+        return math.isfinite(self.error) and self.error <= self.allowed
+
+    def __repr__(self):
+        lines = [
+            f"{'passed' if self.holds else 'failed'}: {self.claim}",
+            f"  checked: {self.checked}",
+            f"  largest error: {self.error:.3g} ({self.allowed:.3g} is allowed){self.where and ', ' + self.where}",
+        ]
+        return "\n".join([*lines, *(f"  {note}" for note in self.notes)])
+
+    def asserted(self) -> "Certificate":
+        """Itself, if it holds.
+
+        **Raises:**
+
+        - `AssertionError` with the text of the certificate.
+        """
+        if not self.holds:
+            raise AssertionError(repr(self))
+        return self

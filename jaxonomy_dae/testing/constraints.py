@@ -1,0 +1,78 @@
+"""Whether saved states lie on the constraints of their model."""
+
+import jax
+import numpy as np
+from jax.core import Tracer
+
+from ..errors import ModelError
+from ..programs.cache import compiled
+from ..simulation.solution import Solution
+from .certificate import Certificate
+
+
+def assert_constraints(solution: Solution, rtol: float = 1e-6, atol: float = 1e-8) -> Certificate:
+    """Asserts that the saved states satisfy all constraints of the model, the hidden ones included.
+
+    Residuals of constraints have all kinds of units, and say little by themselves. What is measured here is how far a
+    state would have to be moved to satisfy them: a Gauss–Newton step of least norm onto the hidden constraints, and of
+    unknowns of nonlinear blocks the step to their root (`AcausalSystem.project`). No variable may have to move by more
+    than `atol·nominal + rtol·size`, with its nominal value and the largest size that it has in the solution.
+
+    **Arguments:**
+
+    - `solution`: of a run that reached all its saved times.
+    - `rtol`, `atol`: relative to the variables' sizes, and to their nominal values.
+
+    **Returns:**
+
+    A `Certificate`; its error counts in units of what is allowed.
+
+    **Raises:**
+
+    - `AssertionError` with the variable that would have to move furthest, when, by how much, and the constraints.
+    - `ModelError` for a batch, inside jit, and for rows that were not reached.
+    """
+    system = solution.system
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(solution)):
+        raise ModelError("assert_constraints needs numbers: call it outside jit, grad and vmap")
+    if solution.ts.ndim != 1:
+        raise ModelError(f"assert_constraints takes one solution; this is a batch of shape {solution.ts.shape[:-1]}")
+    states = np.asarray(solution.states, float)
+    missed = ~np.isfinite(states).all(axis=1)
+    if missed.any():
+        k = int(np.argmax(missed))
+        raise ModelError(
+            f"row {k} of the solution, t={float(solution.ts[k]):.6g}, was not reached: the run failed, see its result"
+        )
+    claim = "the saved states satisfy the constraints of the model"
+    names = [*system.states, *system.carried]
+    constraints = system.report.constraints
+    if not system.is_constrained or not len(states):
+        return Certificate(claim, "nothing: the model has no hidden constraints", 0.0, 1.0, "")
+    moves = np.abs(np.asarray(_moves(system, solution.ts, solution.states, solution.inputs, solution.discrete), float))
+    allowed = atol * np.asarray(system.plan.nominal, float) + rtol * np.abs(states).max(axis=0)
+    error = np.where(np.isfinite(moves), moves / allowed, np.inf)
+    row, column = np.unravel_index(np.argmax(error), error.shape)
+    found = [f"hidden constraint: {text}" for text in constraints[:4]]
+    found += [f"and {len(constraints) - 4} more"] * (len(constraints) > 4)
+    what = f"{len(constraints)} hidden constraints" if len(constraints) != 1 else "1 hidden constraint"
+    what += f" and {len(system.carried)} unknowns of nonlinear blocks" if len(system.carried) else ""
+    return Certificate(
+        claim,
+        f"{what} at {len(states)} saved times, by how far states would have to move",
+        float(error[row, column]),
+        1.0,
+        f"'{names[column]}' at t={float(solution.ts[row]):.6g}, which would move by {moves[row, column]:.3g}",
+        tuple(found),
+    ).asserted()
+
+
+@compiled
+def _moves(system, ts, states, inputs, discrete):
+    """By how much each state is moved onto the constraints, shape (n, states)."""
+
+    def one(t, x, values):
+        here = system if values is None else system.holding(values)
+        return here.project(t, x, inputs) - x
+
+    return jax.vmap(one)(ts, states, discrete)
