@@ -1,0 +1,121 @@
+"""What is minimised where equations have errors: one-step predictions in the place of runs."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from .evidence import Evidence
+from .experiment import Unknown
+from .filter_program import Told, Track, predict_ahead, track
+from .filtering import Structure
+from .least_squares import Evaluation, Minimum, Weights
+from .likelihood import Likelihood, score
+from .objective import Objective, Predicted
+
+
+@dataclasses.dataclass(frozen=True)
+class AheadObjective(Objective):
+    """Least squares of errors of predictions one step ahead, with a constant gain."""
+
+    structure: Structure
+
+    @functools.cached_property
+    def told(self) -> Told:
+        """What the programs are told, as arrays of the system's dtype."""
+        s, c, dtype = self.stacked, self.conditions, self.system.parameters.values.dtype
+        table = set(self.system.parameters.table.names)
+
+        def spread(name: str, value: Any) -> float:
+            given = isinstance(value, Unknown) and name not in table
+            return float(value.spread or 0.0) if given else 0.0
+
+        spreads = [[spread(name, s.starts[name][k]) for name in self.layout.known] for k in range(len(s.labels))]
+        estimated = np.isin(np.arange(len(s.outputs)), self.structure.sigma)
+        sigma = np.where(np.isnan(s.sigma) & ~estimated, 1.0, s.sigma)
+        return Told(
+            c.times, c.t0, c.known, c.inputs, jnp.asarray(s.values, dtype), jnp.asarray(s.observed),
+            jnp.asarray(sigma, dtype), jnp.asarray(np.array(spreads, float).reshape(c.known.shape), dtype),
+        )  # fmt: skip
+
+    def track(self, z: Float[np.ndarray, " p"]) -> Track:
+        """All that the filter finds, of all experiments."""
+        shared, own = self.numbers(self.coordinates.natural(z))
+        return track(self.system, self.observers, self.layout, self.structure, shared, own, self.told)
+
+    def _ahead(self, z: Float[np.ndarray, " p"]) -> tuple[Predicted, Predicted]:
+        """Predictions and their variances with derivatives."""
+        shared, own = self.numbers(self.coordinates.natural(z))
+        found = predict_ahead(self.system, self.observers, self.layout, self.structure, shared, own, self.told)
+        first, second = ([np.asarray(pair[k], np.float64) for pair in found] for k in (0, 1))
+        return Predicted(*first), Predicted(*second)
+
+    def predicted(self, z: Float[np.ndarray, " p"]) -> Predicted:
+        """Predictions one step ahead."""
+        return self._ahead(z)[0]
+
+    def residual(self, z: Float[np.ndarray, " f"]) -> Float[np.ndarray, " m"] | None:
+        """Errors of predictions alone; None where a run that counts fails."""
+        found = np.asarray(self.track(self.full(z)).predicted, np.float64)[self.rows] - self.stacked.values[self.rows]
+        return found if np.isfinite(found).all() else None
+
+
+@dataclasses.dataclass(frozen=True)
+class FilterObjective(AheadObjective):
+    """The likelihood of an extended Kalman filter."""
+
+    def evaluate(self, z: Float[np.ndarray, " f"]) -> Evaluation | None:
+        """Errors of predictions and their variances, with Jacobians; None where a run that counts fails."""
+        full = self.full(z)
+        predicted, variance = self._ahead(full)
+        slope = self.coordinates.slope(full)
+        s = variance.outputs[self.rows]
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            logs = (variance.jacobian(self.rows) / s[:, None] * slope)[:, self.free]
+            jacobian = (predicted.jacobian(self.rows) * slope)[:, self.free]
+        residual = predicted.outputs[self.rows] - self.stacked.values[self.rows]
+        found = Evaluation(residual, jacobian, s, logs)
+        return found if all(np.isfinite(a).all() for a in (*found, np.log(np.maximum(s, 0.0)))) else None
+
+    def weights(self, z: Float[np.ndarray, " f"], found: Evaluation) -> Weights:
+        """Weights by the variances at this point, and priors."""
+        base = super().weights(z, found)
+        assert found.variance is not None
+        share = np.sqrt(self.stacked.weight[self.rows[0]])
+        return Likelihood(share / np.sqrt(found.variance), base.precision, base.mean, share)
+
+    @functools.cached_property
+    def evidence(self) -> Evidence:
+        """Which precisions are to be found; noise levels are coordinates."""
+        share = np.sqrt(self.stacked.weight[self.rows[0]])
+        groups = [self._group(name) for name, given in self.penalties.items() if given == "evidence"]
+        chosen = tuple(group for group in groups if group.any())
+        return Evidence(np.full(len(share), -1), (), np.zeros(0), share, chosen)
+
+    def lowest(
+        self, start: Float[np.ndarray, " f"], steps: int = 200, weights: Weights | None = None
+    ) -> Minimum | None:
+        """As of `Objective`, by scoring."""
+        if weights is None:
+            reweigh = None if self.evidence.is_idle else self.evidence.reweigh
+            return score(self.evaluate, start, self.bounds, self.weights, reweigh, steps, self.tolerance)
+
+        def held(z, found):
+            return dataclasses.replace(self.weights(z, found), precision=weights.precision, mean=weights.mean)
+
+        return score(self.evaluate, start, self.bounds, held, None, steps, self.tolerance)
+
+    def sigma(self, z: Float[np.ndarray, " f"], weights: Weights) -> dict[str, float]:
+        """Noise levels that were estimated."""
+        natural = dict(zip(self.coordinates.names, self.coordinates.natural(self.full(z)), strict=True))
+        names = (self.stacked.outputs[j] for j in self.structure.sigma)
+        return {name: float(natural[f"sigma of {name}"]) for name in names}
+
+    def scored(self, full: Float[np.ndarray, " p"], sigma: dict[str, float], rows: tuple[np.ndarray, ...]) -> float:
+        """The root mean square of standardized innovations."""
+        predicted, variance = self._ahead(full)
+        scaled = (predicted.outputs[rows] - self.stacked.values[rows]) / np.sqrt(variance.outputs[rows])
+        return float(np.sqrt(np.mean(scaled**2))) if np.isfinite(scaled).all() else np.inf

@@ -1,0 +1,352 @@
+"""The compiled programs of filters: samples one after the other, from each to the next by the system's own
+integration.
+
+Of a filter, a state x and the covariance P of its f differential entries; between samples
+
+    x ← φ(x),    P ← Φ P Φᵀ + Q,    Φ = ∂φ/∂x,    Q = ∫ exp(A s) σσᵀ exp(A s)ᵀ ds,
+
+with φ the flow, by `simulate`, and Φ its derivative. Q depends on A = ∂f/∂x along the way. Noise that is gathered at s
+is carried on from there, so that a Jacobian at time τ acts on a share τ/h of it: to second order, the constant matrix
+that does the same is A(0)/3 + 2 A(h)/3. At samples, outputs correct the state one by one, linearized where all of them
+were predicted, which is the same as at once; a missing sample corrects nothing. Where constraints make states
+redundant, noise and covariance are kept in their tangent space by the derivative of the projection.
+"""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ..programs.cache import compiled
+from ..simulation.simulate import simulate
+from ..simulation.solution import Solution
+from ..system.evaluate import Refinement
+from ..system.inputs import read_inputs
+from ..system.system import AcausalSystem
+from .diffusion import gathered_noise
+from .filtering import Structure
+from .program import Layout, each, outputs_of, placed, with_kinds
+
+ITERATIONS = 4  # Gauss–Newton steps onto the constraints after a correction, which converge quadratically
+
+
+class Told(eqx.Module):
+    """What programs are told of e experiments at n times: samples and which there are, noise levels (NaN where they are
+    coordinates), known starts, and the standard deviations of their priors."""
+
+    times: Float[Array, "e n"]
+    t0: Float[Array, " e"]
+    known: Float[Array, "e known"]
+    inputs: dict[str, tuple[Float[Array, "e _"], Float[Array, "e _"]]]
+    values: Float[Array, "e n k"]
+    observed: Bool[Array, "e n k"]
+    sigma: Float[Array, "e k"]
+    spread: Float[Array, "e known"]
+
+
+class Track(NamedTuple):
+    """What a filter found: at each time, the outputs predicted from all samples before, their innovations' variances
+    (those of one output given the outputs before it), and of states and covariances, those predicted and those
+    corrected by the samples; Φ from the time before; discrete values."""
+
+    predicted: Float[Array, "*e n k"]
+    variance: Float[Array, "*e n k"]
+    before: Float[Array, "*e n x"]
+    p_before: Float[Array, "*e n f f"]
+    after: Float[Array, "*e n x"]
+    p_after: Float[Array, "*e n f f"]
+    flow: Float[Array, "*e n f f"]
+    discrete: Any
+
+
+class Model(NamedTuple):
+    """One experiment's system with all numbers in their places: `here`, sensor laws, initial values by name, inputs;
+    and what the method adds: intensities of diffusion, shape (f, f), noise levels, shape (k,), and K, shape (f, k)."""
+
+    here: AcausalSystem
+    laws: dict[str, Any]
+    initial: dict[str, Any]
+    inputs: dict[str, Any]
+    diffusion: Float[Array, "f f"]
+    sigma: Float[Array, " k"]
+    gain: Float[Array, "f k"]
+
+
+def _model(
+    system: AcausalSystem, observers: Any, layout: Layout, structure: Structure, shared: Any, own: Any, told: Told
+) -> Model:
+    here, laws, initial = placed(system, observers, layout, shared, own, told.known)
+    end = len(shared) - len(layout.shared)
+    extra = iter(shared[end - len(layout.extra) : end])
+    f, k = len(system.plan.states), len(layout.outputs)
+    diffusion = jnp.zeros(f, shared.dtype)
+    for place, factor in structure.noise:
+        diffusion = diffusion.at[place].set((next(extra) / factor) ** 2)
+    sigma = told.sigma
+    for j in structure.sigma:
+        sigma = sigma.at[j].set(jnp.where(jnp.isnan(sigma[j]), next(extra), sigma[j]))
+    gain = jnp.zeros((f, k), shared.dtype)
+    for place, j, factor in structure.gain:
+        gain = gain.at[place, j].set(next(extra) / factor)
+    inputs = with_kinds(told.inputs, layout)
+    return Model(here, laws, initial, inputs, jnp.diag(diffusion), sigma, gain)
+
+
+def _start(
+    system: AcausalSystem, observers: Any, layout: Layout, structure: Structure, shared: Any, own: Any, told: Told
+) -> tuple[Any, Any]:
+    """The state at the start and the covariance that the priors of known starts give it."""
+    f = len(system.plan.states)
+
+    def at(known):
+        here, _, initial = placed(system, observers, layout, shared, own, known)
+        found = here.initialize(told.t0, with_kinds(told.inputs, layout) or None, initial or None, throw=False)
+        return found, found
+
+    if not structure.is_filter or not layout.known:
+        return at(told.known)[0], jnp.zeros((f, f), shared.dtype)
+    slopes, found = jax.jacfwd(at, has_aux=True)(told.known)
+    root = slopes[:f] * told.spread
+    return found, root @ root.T
+
+
+def _run(m: Model, layout: Layout, t0: Any, t1: Any, x: Any) -> tuple[Any, Any]:
+    """(state, discrete values) at t1 of a run from a state at t0; padded times repeat, and runs of no length are made
+    of next to none."""
+    least = 1e-12 * (1.0 + jnp.abs(t0))
+    t1 = jnp.where(t1 > t0, t1, t0 + least)
+    solution = simulate(
+        m.here, t1, t0=t0, ts=t1[None], initial=x, adjoint=diffrax.ForwardMode(), throw=False, inputs=m.inputs,
+        **dict(layout.options),
+    )  # fmt: skip
+    return solution.states[-1], None if solution.discrete is None else solution.discrete[-1]
+
+
+def _held(m: Model, discrete: Any) -> AcausalSystem:
+    return m.here if discrete is None else m.here.holding(discrete)
+
+
+def _jacobian(m: Model, t: Any, x: Any, discrete: Any) -> Float[Array, "f f"]:
+    """∂f/∂x of the differential states, algebraic unknowns following them."""
+    plan = m.here.plan
+    f = len(plan.states)
+    here = _held(m, discrete).at(t, m.inputs)
+
+    def slopes(first):
+        state = here.split(jnp.concatenate([first, x[f:]]))
+        if len(plan.carried):
+            state = here.refined(state, Refinement.ROOT)
+        return here.semi_explicit(here.join(state))[:f]
+
+    return jax.jacfwd(slopes)(x[:f])
+
+
+def _tangent(m: Model, t: Any, x: Any, discrete: Any) -> Float[Array, "f f"] | None:
+    """The derivative of the projection onto hidden constraints; None if there are none."""
+    plan = m.here.plan
+    f = len(plan.states)
+    if not plan.n_projected:
+        return None
+    here = _held(m, discrete)
+    return jax.jacfwd(lambda first: here.project(t, jnp.concatenate([first, x[f:]]), m.inputs)[:f])(x[:f])
+
+
+def _read(m: Model, layout: Layout, t: Any, x: Any, discrete: Any) -> tuple[Float[Array, " k"], Float[Array, "k f"]]:
+    """Outputs at a state, and their derivatives by its differential entries."""
+    f = len(m.here.plan.states)
+    inputs = read_inputs(m.here.plan, x.dtype, m.inputs)
+    here = _held(m, discrete)
+
+    def outputs(first):
+        full = jnp.concatenate([first, x[f:]])
+        full = here.project(t, full, m.inputs) if m.here.is_constrained else full
+        values = None if discrete is None else discrete[None]
+        solution = Solution(t[None], full[None], m.here, inputs, {}, diffrax.RESULTS.successful, discrete=values)
+        found = outputs_of(solution, m.laws, layout, x.dtype)[0]
+        return found, found
+
+    slopes, found = jax.jacfwd(outputs, has_aux=True)(x[:f])
+    return found, slopes
+
+
+def _forward(
+    m: Model, layout: Layout, substeps: int, t0: Any, t1: Any, x: Any, p: Any
+) -> tuple[Any, Any, Any, Any]:  # fmt: skip
+    """State, covariance and Φ at t1, and discrete values there, from those at t0."""
+    f = len(m.here.plan.states)
+
+    def part(carry, ends):
+        x, p, through = carry
+        start, stop = ends
+
+        def flow(first):
+            found, discrete = _run(m, layout, start, stop, jnp.concatenate([first, x[f:]]))
+            return found[:f], (found, discrete)
+
+        here = None if m.here.plan.events is None else _run(m, layout, start, start, x)[1]
+        a, tangent = _jacobian(m, start, x, here), _tangent(m, start, x, here)
+        g = m.diffusion if tangent is None else tangent @ m.diffusion @ tangent.T
+        phi, (x, discrete) = jax.jacfwd(flow, has_aux=True)(x[:f])
+        a = a / 3 + 2 / 3 * _jacobian(m, stop, x, discrete)
+        q = gathered_noise(a, g, stop - start)
+        tangent = _tangent(m, stop, x, discrete)
+        q = q if tangent is None else tangent @ q @ tangent.T
+        return (x, phi @ p @ phi.T + q, phi @ through), discrete
+
+    first = (x, p, jnp.eye(f, dtype=x.dtype))
+    if substeps == 1:
+        (x, p, through), discrete = part(first, (t0, t1))
+        return x, p, through, discrete
+    ends = t0 + (t1 - t0) * jnp.asarray(np.arange(substeps + 1) / substeps, x.dtype)
+    (x, p, through), discrete = jax.lax.scan(part, first, (ends[:-1], ends[1:]))
+    return x, p, through, None if discrete is None else discrete[-1]
+
+
+def _corrected(x: Any, p: Any, row: tuple[Any, ...]) -> tuple[Any, Any, Any]:
+    """(state less the prediction, covariance, variances) after the outputs of one time, taken one by one (Joseph's
+    form, in which rounding leaves the covariance positive)."""
+    eye = jnp.eye(len(p), dtype=p.dtype)
+
+    def one(carry, given):
+        d, p = carry
+        y, predicted, slope, seen, sigma = given
+        across = p @ slope
+        s = slope @ across + sigma**2
+        gain = jnp.where(seen, across / s, 0.0)
+        d = d + gain * (y - predicted - slope @ d)
+        rest = eye - jnp.outer(gain, slope)
+        return (d, rest @ p @ rest.T + jnp.outer(gain, gain) * sigma**2), (s, predicted + slope @ carry[0])
+
+    (d, p), (variance, predicted) = jax.lax.scan(one, (jnp.zeros_like(x[: len(p)]), p), row)
+    return d, p, (variance, predicted)
+
+
+def _moved(m: Model, t: Any, x: Any, d: Any, p: Any, discrete: Any) -> tuple[Any, Any]:
+    """The state moved by a correction of its differential entries, onto the constraints, and the covariance there."""
+    f = len(d)
+    x = jnp.concatenate([x[:f] + d, x[f:]])
+    if not m.here.is_constrained:
+        return x, p
+    x = _held(m, discrete).project(t, x, m.inputs, iterations=ITERATIONS)
+    tangent = _tangent(m, t, x, discrete)
+    return x, p if tangent is None else tangent @ p @ tangent.T
+
+
+def _track(
+    system: AcausalSystem, observers: Any, layout: Layout, structure: Structure, shared: Any, own: Any, told: Told
+) -> Track:
+    """One experiment."""
+    m = _model(system, observers, layout, structure, shared, own, told)
+    x0, p0 = _start(system, observers, layout, structure, shared, own, told)
+    f = len(system.plan.states)
+    nothing = jnp.zeros((f, f), x0.dtype)
+
+    def step(carry, row):
+        t0, x, p = carry
+        t, y, seen = row
+        if structure.is_filter:
+            x, p, phi, discrete = _forward(m, layout, structure.substeps, t0, t, x, p)
+            read, slopes = _read(m, layout, t, x, discrete)
+            d, corrected, (variance, predicted) = _corrected(x, p, (y, read, slopes, seen, m.sigma))
+        else:
+            x, discrete = _run(m, layout, t0, t, x)
+            phi, corrected = nothing, p
+            predicted = _read_values(m, layout, t, x, discrete)
+            variance = jnp.ones_like(predicted)
+            d = m.gain @ jnp.where(seen, y - predicted, 0.0)
+        after, p_after = _moved(m, t, x, d, corrected, discrete)
+        out = Track(predicted, variance, x, p, after, p_after, phi, discrete)
+        return (t, after, p_after), out
+
+    return jax.lax.scan(step, (told.t0, x0, p0), (told.times, told.values, told.observed))[1]
+
+
+def _read_values(m: Model, layout: Layout, t: Any, x: Any, discrete: Any) -> Float[Array, " k"]:
+    inputs = read_inputs(m.here.plan, x.dtype, m.inputs)
+    values = None if discrete is None else discrete[None]
+    solution = Solution(t[None], x[None], m.here, inputs, {}, diffrax.RESULTS.successful, discrete=values)
+    return outputs_of(solution, m.laws, layout, x.dtype)[0]
+
+
+@compiled
+def track(
+    system: AcausalSystem, observers: dict[str, Any], layout: Layout, structure: Structure, shared: Any, own: Any,
+    told: Told,
+) -> Track:  # fmt: skip
+    """All that a filter finds, of all experiments; NaN from where a run failed."""
+    return each(lambda s, o, c: _track(system, observers, layout, structure, s, o, c), shared, own, told)
+
+
+@compiled
+def predict_ahead(
+    system: AcausalSystem, observers: dict[str, Any], layout: Layout, structure: Structure, shared: Any, own: Any,
+    told: Told,
+) -> tuple[Any, Any, Any]:  # fmt: skip
+    """(predictions, variances), each of shape (e, n, k), and their derivatives by the shared numbers, shape
+    (e, n, k, s), and by each experiment's own."""
+
+    def one(shared, own, c):
+        found = _track(system, observers, layout, structure, shared, own, c)
+        return found[:2], found[:2]
+
+    def with_slopes(shared, own, c):
+        (by_shared, by_own), found = _pairs(jax.jacfwd(one, argnums=(0, 1), has_aux=True)(shared, own, c))
+        return found, by_shared, by_own
+
+    return each(with_slopes, shared, own, told)
+
+
+def _pairs(found: Any) -> Any:
+    """Derivatives of (predictions, variances) by (shared, own), turned to (shared, own) of (predictions,
+    variances)."""
+    slopes, values = found
+    return ((slopes[0][0], slopes[1][0]), (slopes[0][1], slopes[1][1])), values
+
+
+@compiled
+def read_states(
+    system: AcausalSystem, observers: dict[str, Any], layout: Layout, shared: Any, own: Any, told: Told, x: Any, p: Any,
+    discrete: Any,
+) -> tuple[Float[Array, "e n k"], Float[Array, "e n k"]]:  # fmt: skip
+    """The outputs of states at n times, and their standard deviations, of covariances P."""
+
+    def one(shared, own, told, x, p, discrete):
+        m = _model(system, observers, layout, Structure(), shared, own, told)
+
+        def at(t, x, p, q):
+            found, slopes = _read(m, layout, t, x, q)
+            return found, jnp.sqrt(jnp.maximum(jnp.sum((slopes @ p) * slopes, axis=1), 0.0))
+
+        return jax.vmap(at)(told.times, x, p, discrete)
+
+    return jax.vmap(one, in_axes=(None, 0, 0, 0, 0, 0))(shared, own, told, x, p, discrete)
+
+
+@compiled
+def go_on(
+    system: AcausalSystem, observers: dict[str, Any], layout: Layout, structure: Structure, steps: int, shared: Any,
+    own: Any, told: Told, x: Any, p: Any,
+) -> tuple[Any, Any, Any]:  # fmt: skip
+    """States, covariances and discrete values `steps` times further on, of the first n − steps times of one experiment,
+    with nothing measured on the way."""
+    m = _model(system, observers, layout, structure, shared, own, told)
+    n = len(told.times)
+    ahead = jnp.asarray(np.arange(n - steps)[:, None] + np.arange(steps + 1))
+
+    def one(times, x, p):
+        def step(carry, ends):
+            x, p = carry
+            if structure.is_filter:
+                x, p, _, discrete = _forward(m, layout, structure.substeps, *ends, x, p)
+            else:
+                x, discrete = _run(m, layout, *ends, x)
+            return (x, p), discrete
+
+        (x, p), discrete = jax.lax.scan(step, (x, p), (times[:-1], times[1:]))
+        return x, p, None if discrete is None else discrete[-1]
+
+    return jax.vmap(one)(told.times[ahead], x[: n - steps], p[: n - steps])
