@@ -37,9 +37,28 @@ class AheadObjective(Objective):
         estimated = np.isin(np.arange(len(s.outputs)), self.structure.sigma)
         sigma = np.where(np.isnan(s.sigma) & ~estimated, 1.0, s.sigma)
         return Told(
-            c.times, c.t0, c.known, c.inputs, jnp.asarray(s.values, dtype), jnp.asarray(s.observed),
+            c.times, c.t0, c.known, self._windows, jnp.asarray(s.values, dtype), jnp.asarray(s.observed),
             jnp.asarray(sigma, dtype), jnp.asarray(np.array(spreads, float).reshape(c.known.shape), dtype),
         )  # fmt: skip
+
+    @property
+    def _windows(self) -> dict[str, Any]:
+        """Of each input, its samples around the time between each row and the one before, of shape (e, n, w)."""
+        s, dtype, kinds = self.stacked, self.system.parameters.values.dtype, dict(self.stacked.kinds)
+        before = np.concatenate([s.t0[:, None], s.times[:, :-1]], axis=1)
+        found = {}
+        for name, (times, values) in s.inputs.items():
+            if kinds[name] == "cubic":  # whose slopes follow from all samples
+                first, width = np.zeros(before.shape, int), times.shape[1]
+            else:
+                first = np.stack([np.searchsorted(*a, side="right") - 1 for a in zip(times, before, strict=True)])
+                last = np.stack([np.searchsorted(*a) for a in zip(times, s.times, strict=True)])
+                width = min(max(int((last - first).max()) + 1, 2), times.shape[1])
+                first = np.clip(first, 0, times.shape[1] - width)
+            place = first[..., None] + np.arange(width)
+            rows = np.arange(len(times))[:, None, None]
+            found[name] = (jnp.asarray(times[rows, place], dtype), jnp.asarray(values[rows, place], dtype))
+        return found
 
     def track(self, z: Float[np.ndarray, " p"]) -> Track:
         """All that the filter finds, of all experiments."""

@@ -36,12 +36,13 @@ ITERATIONS = 4  # Gauss–Newton steps onto the constraints after a correction, 
 
 class Told(eqx.Module):
     """What programs are told of e experiments at n times: samples and which there are, noise levels (NaN where they are
-    coordinates), known starts, and the standard deviations of their priors."""
+    coordinates), known starts, and the standard deviations of their priors; and of each input, the w samples around the
+    time between each row and the one before: integration looks at all that it is given."""
 
     times: Float[Array, "e n"]
     t0: Float[Array, " e"]
     known: Float[Array, "e known"]
-    inputs: dict[str, tuple[Float[Array, "e _"], Float[Array, "e _"]]]
+    inputs: dict[str, tuple[Float[Array, "e n w"], Float[Array, "e n w"]]]
     values: Float[Array, "e n k"]
     observed: Bool[Array, "e n k"]
     sigma: Float[Array, "e k"]
@@ -92,8 +93,7 @@ def _model(
     gain = jnp.zeros((f, k), shared.dtype)
     for place, j, factor in structure.gain:
         gain = gain.at[place, j].set(next(extra) / factor)
-    inputs = with_kinds(told.inputs, layout)
-    return Model(here, laws, initial, inputs, jnp.diag(diffusion), sigma, gain)
+    return Model(here, laws, initial, {}, jnp.diag(diffusion), sigma, gain)
 
 
 def _start(
@@ -101,10 +101,11 @@ def _start(
 ) -> tuple[Any, Any]:
     """The state at the start and the covariance that the priors of known starts give it."""
     f = len(system.plan.states)
+    inputs = with_kinds(jax.tree.map(lambda a: a[0], told.inputs), layout)
 
     def at(known):
         here, _, initial = placed(system, observers, layout, shared, own, known)
-        found = here.initialize(told.t0, with_kinds(told.inputs, layout) or None, initial or None, throw=False)
+        found = here.initialize(told.t0, inputs or None, initial or None, throw=False)
         return found, found
 
     if not structure.is_filter or not layout.known:
@@ -240,14 +241,15 @@ def _track(
     system: AcausalSystem, observers: Any, layout: Layout, structure: Structure, shared: Any, own: Any, told: Told
 ) -> Track:
     """One experiment."""
-    m = _model(system, observers, layout, structure, shared, own, told)
+    model = _model(system, observers, layout, structure, shared, own, told)
     x0, p0 = _start(system, observers, layout, structure, shared, own, told)
     f = len(system.plan.states)
     nothing = jnp.zeros((f, f), x0.dtype)
 
     def step(carry, row):
         t0, x, p = carry
-        t, y, seen = row
+        t, y, seen, inputs = row
+        m = model._replace(inputs=with_kinds(inputs, layout))
         if structure.is_filter:
             x, p, phi, discrete = _forward(m, layout, structure.substeps, t0, t, x, p)
             read, slopes = _read(m, layout, t, x, discrete)
@@ -262,7 +264,7 @@ def _track(
         out = Track(predicted, variance, x, p, after, p_after, phi, discrete)
         return (t, after, p_after), out
 
-    return jax.lax.scan(step, (told.t0, x0, p0), (told.times, told.values, told.observed))[1]
+    return jax.lax.scan(step, (told.t0, x0, p0), (told.times, told.values, told.observed, told.inputs))[1]
 
 
 def _read_values(m: Model, layout: Layout, t: Any, x: Any, discrete: Any) -> Float[Array, " k"]:
@@ -315,13 +317,14 @@ def read_states(
     """The outputs of states at n times, and their standard deviations, of covariances P."""
 
     def one(shared, own, told, x, p, discrete):
-        m = _model(system, observers, layout, Structure(), shared, own, told)
+        model = _model(system, observers, layout, Structure(), shared, own, told)
 
-        def at(t, x, p, q):
+        def at(t, inputs, x, p, q):
+            m = model._replace(inputs=with_kinds(inputs, layout))
             found, slopes = _read(m, layout, t, x, q)
             return found, jnp.sqrt(jnp.maximum(jnp.sum((slopes @ p) * slopes, axis=1), 0.0))
 
-        return jax.vmap(at)(told.times, x, p, discrete)
+        return jax.vmap(at)(told.times, told.inputs, x, p, discrete)
 
     return jax.vmap(one, in_axes=(None, 0, 0, 0, 0, 0))(shared, own, told, x, p, discrete)
 
@@ -333,20 +336,23 @@ def go_on(
 ) -> tuple[Any, Any, Any]:  # fmt: skip
     """States, covariances and discrete values `steps` times further on, of the first n − steps times of one experiment,
     with nothing measured on the way."""
-    m = _model(system, observers, layout, structure, shared, own, told)
+    model = _model(system, observers, layout, structure, shared, own, told)
     n = len(told.times)
     ahead = jnp.asarray(np.arange(n - steps)[:, None] + np.arange(steps + 1))
 
-    def one(times, x, p):
-        def step(carry, ends):
+    def one(times, inputs, x, p):
+        def step(carry, row):
             x, p = carry
+            *ends, inputs = row
+            m = model._replace(inputs=with_kinds(inputs, layout))
             if structure.is_filter:
                 x, p, _, discrete = _forward(m, layout, structure.substeps, *ends, x, p)
             else:
                 x, discrete = _run(m, layout, *ends, x)
             return (x, p), discrete
 
-        (x, p), discrete = jax.lax.scan(step, (x, p), (times[:-1], times[1:]))
+        (x, p), discrete = jax.lax.scan(step, (x, p), (times[:-1], times[1:], inputs))
         return x, p, None if discrete is None else discrete[-1]
 
-    return jax.vmap(one)(told.times[ahead], x[: n - steps], p[: n - steps])
+    inputs = jax.tree.map(lambda a: a[ahead[:, 1:]], told.inputs)
+    return jax.vmap(one)(told.times[ahead], inputs, x[: n - steps], p[: n - steps])

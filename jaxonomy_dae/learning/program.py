@@ -127,7 +127,7 @@ def outputs_of(solution: Any, observers: dict[str, Any], layout: Layout, dtype: 
     return jnp.stack([read[n] if n in read else jnp.asarray(derived[n], dtype) for n in layout.outputs], axis=1)
 
 
-def each(function: Callable, shared: Any, own: Any, conditions: Conditions) -> Any:
+def each(function: Callable, shared: Any, own: Any, conditions: Any) -> Any:
     """`function(shared, own, conditions)` of each experiment; a single one is not made a batch, which costs compile
     time."""
     if own.shape[0] == 1:
