@@ -25,7 +25,8 @@ from ..programs.cache import compiled
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
 from ..system.evaluate import Refinement
-from ..system.inputs import read_inputs
+from ..system.input_values import by_entry
+from ..system.inputs import read_inputs, value_at
 from ..system.system import AcausalSystem
 from .diffusion import gathered_noise
 from .filtering import Structure
@@ -66,13 +67,15 @@ class Track(NamedTuple):
 
 class Model(NamedTuple):
     """One experiment's system with all numbers in their places: `here`, sensor laws, initial values by name, inputs;
-    and what the method adds: intensities of diffusion, shape (f, f), noise levels, shape (k,), and K, shape (f, k)."""
+    and what the method adds: intensities of diffusion, shape (f, f), and of noise of inputs, noise levels, shape (k,),
+    and K, shape (f, k)."""
 
     here: AcausalSystem
     laws: dict[str, Any]
     initial: dict[str, Any]
     inputs: dict[str, Any]
     diffusion: Float[Array, "f f"]
+    driven: dict[str, Any]
     sigma: Float[Array, " k"]
     gain: Float[Array, "f k"]
 
@@ -84,16 +87,19 @@ def _model(
     end = len(shared) - len(layout.shared)
     extra = iter(shared[end - len(layout.extra) : end])
     f, k = len(system.plan.states), len(layout.outputs)
-    diffusion = jnp.zeros(f, shared.dtype)
+    diffusion, driven = jnp.zeros(f, shared.dtype), {}
     for place, factor in structure.noise:
-        diffusion = diffusion.at[place].set((next(extra) / factor) ** 2)
+        if isinstance(place, str):
+            driven[place] = next(extra)
+        else:
+            diffusion = diffusion.at[place].set((next(extra) / factor) ** 2)
     sigma = told.sigma
     for j in structure.sigma:
         sigma = sigma.at[j].set(jnp.where(jnp.isnan(sigma[j]), next(extra), sigma[j]))
     gain = jnp.zeros((f, k), shared.dtype)
     for place, j, factor in structure.gain:
         gain = gain.at[place, j].set(next(extra) / factor)
-    return Model(here, laws, initial, {}, jnp.diag(diffusion), sigma, gain)
+    return Model(here, laws, initial, {}, jnp.diag(diffusion), driven, sigma, gain)
 
 
 def _start(
@@ -146,6 +152,32 @@ def _jacobian(m: Model, t: Any, x: Any, discrete: Any) -> Float[Array, "f f"]:
     return jax.jacfwd(slopes)(x[:f])
 
 
+def _intensity(m: Model, t: Any, x: Any, discrete: Any) -> Float[Array, "f f"]:
+    """σσᵀ at a state, that of noise of inputs included; kept in the tangent space of the constraints."""
+    plan = m.here.plan
+    f, tangent = len(plan.states), _tangent(m, t, x, discrete)
+    g = m.diffusion if tangent is None else tangent @ m.diffusion @ tangent.T
+    if not m.driven:
+        return g
+    system, sources = _held(m, discrete), by_entry(plan, read_inputs(plan, x.dtype, m.inputs))
+    names = list(m.driven)
+    at = jnp.stack([jnp.asarray(_input_at(plan, sources, name, t), x.dtype) for name in names])
+
+    def slopes(values):
+        here = system.at(t, {**sources, **dict(zip(names, values, strict=True))})
+        state = here.split(x)
+        if len(plan.carried):
+            state = here.refined(state, Refinement.ROOT)
+        return here.semi_explicit(here.join(state))[:f]
+
+    b = jax.jacfwd(slopes)(at) * jnp.stack([m.driven[name] for name in names])
+    return g + b @ b.T
+
+
+def _input_at(plan: Any, sources: dict[str, Any], name: str, t: Any) -> Any:
+    return value_at(sources.get(name, plan.inputs.defaults[plan.inputs.place[name]]), t)
+
+
 def _tangent(m: Model, t: Any, x: Any, discrete: Any) -> Float[Array, "f f"] | None:
     """The derivative of the projection onto hidden constraints; None if there are none."""
     plan = m.here.plan
@@ -189,10 +221,10 @@ def _forward(
             return found[:f], (found, discrete)
 
         here = None if m.here.plan.events is None else _run(m, layout, start, start, x)[1]
-        a, tangent = _jacobian(m, start, x, here), _tangent(m, start, x, here)
-        g = m.diffusion if tangent is None else tangent @ m.diffusion @ tangent.T
+        a, g = _jacobian(m, start, x, here), _intensity(m, start, x, here)
         phi, (x, discrete) = jax.jacfwd(flow, has_aux=True)(x[:f])
         a = a / 3 + 2 / 3 * _jacobian(m, stop, x, discrete)
+        g = (g + _intensity(m, stop, x, discrete)) / 2
         q = gathered_noise(a, g, stop - start)
         tangent = _tangent(m, stop, x, discrete)
         q = q if tangent is None else tangent @ q @ tangent.T

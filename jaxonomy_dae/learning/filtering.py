@@ -24,15 +24,16 @@ HIDDEN = 0.1  # guessed noise of a state that was not measured, relative to meas
 class Filter:
     """Process noise, for `Problem(method=...)`: the equations hold up to white noise,
 
-        dx = f(x, u, t) dt + σ dw,    y = h(x, u, t) + e,
+        dx = f(x, u + ν, t) dt + σ dw,    y = h(x, u, t) + e,
 
     and the likelihood is that of the one-step prediction errors of a continuous-discrete extended Kalman filter
     (Jazwinski 1970, section 8.3; Kristensen, Madsen & Jørgensen 2004, Automatica 40:225, equations 8 to 17). For linear
     models it is exact.
 
-    - `noise`: σ by names of states, in the state's unit per √second: a number, `"estimate"`, or `Unknown(guess)`,
-        which is estimated, with `spread` the relative standard deviation of a prior. One entry or name of an array
-        stands for each of its entries.
+    - `noise`: by names of states, σ in the state's unit per √second; by names of inputs, the intensity of white noise ν
+        that is added to the input, in the input's unit times √second: a force on a mechanism, whose constraints then
+        hold exactly. Each a number, `"estimate"`, or `Unknown(guess)`, which is estimated, with `spread` the relative
+        standard deviation of a prior. The name of an array stands for each of its entries.
     - `substeps`: into how many parts the time between samples is cut. The flow and its derivatives are exact at any
         distance; the noise that is gathered on the way is integrated with a Jacobian that is constant over each part.
 
@@ -99,13 +100,14 @@ def _check(what: str, value: Any, positive: bool) -> None:
 class Structure:
     """What a program is built from.
 
-    - `noise`: the place in the state array of each diffusion intensity, and the factor of the variable named.
+    - `noise`: of each intensity, the place in the state array and the factor of the variable named; or the name of an
+        input, and 1.
     - `sigma`: the outputs whose noise level is a coordinate.
     - `gain`: (place in the state array, output, factor) of each entry of a constant gain.
     - `substeps`: how many parts the time between samples has.
     """
 
-    noise: tuple[tuple[int, float], ...] = ()
+    noise: tuple[tuple[int | str, float], ...] = ()
     sigma: tuple[int, ...] = ()
     gain: tuple[tuple[int, int, float], ...] = ()
     substeps: int = 1
@@ -153,7 +155,14 @@ def structure_and_extras(
     noise = _noise(method, system)
     guesses = _intensities(system, stacked, [place for _, _, place, _ in noise])
     extras = [
-        _extra(f"noise of {name}", _per_root(units.get(name, "")), value, guesses[place] * abs(factor), 1.0, log=True)
+        _extra(
+            f"noise of {name}",
+            _noise_unit(place, units.get(name, "")),
+            value,
+            guesses[place] * abs(factor),
+            1.0,
+            log=True,
+        )
         for name, value, place, factor in noise
     ]
     unknown = np.isnan(stacked.sigma) & stacked.observed.any(axis=1)
@@ -186,12 +195,13 @@ def check_model(method: Filter | Innovations, system: AcausalSystem) -> None:
         )
 
 
-def _noise(method: Filter, system: AcausalSystem) -> list[tuple[str, Any, int, float]]:
+def _noise(method: Filter, system: AcausalSystem) -> list[tuple[str, Any, int | str, float]]:
     """(name, value, place, factor) of each intensity, those of arrays by their entries."""
-    found: list[tuple[str, Any, int, float]] = []
+    found: list[tuple[str, Any, int | str, float]] = []
     for name, value in method.noise.items():
         for one in system.plan.entry_names([name]):
-            place, factor = _state(system, one, "Filter: noise")
+            is_input = one in system.plan.inputs.place
+            place, factor = (one, 1.0) if is_input else _state(system, one, "Filter: noise")
             double = [other for other, _, p, _ in found if p == place]
             if double:
                 raise ModelError(f"Filter: noise of '{one}' is given twice, also as that of '{double[0]}'")
@@ -238,7 +248,9 @@ def _extra(name: str, unit: str, value: Any, guess: float, size: float, *, log: 
     return Extra(name, unit, log, size, guess, low, high, spread, known)
 
 
-def _per_root(unit: str) -> str:
+def _noise_unit(place: int | str, unit: str) -> str:
+    if isinstance(place, str):
+        return f"{unit}*s^0.5" if unit else "s^0.5"
     return f"{unit}/s^0.5" if unit else "1/s^0.5"
 
 
@@ -261,9 +273,11 @@ def _size(stacked: Stacked, j: int) -> float:
     return float(np.max(np.abs(stacked.values[:, :, j]), initial=0.0)) or 1.0
 
 
-def _intensities(system: AcausalSystem, stacked: Stacked, places: list[int]) -> dict[int, float]:
-    """Guesses of intensities: half of what a measured state changes by per √time, and for others, a part of it."""
-    plan, found = system.plan, {}
+def _intensities(system: AcausalSystem, stacked: Stacked, places: list[int | str]) -> dict[int | str, float]:
+    """Guesses of intensities: half of what a measured state changes by per √time, and for others, a part of it; of an
+    input, a part of its size."""
+    plan = system.plan
+    found: dict[int | str, float] = {}
     nominal = np.asarray(plan.nominal, float)
     for j, name in enumerate(stacked.outputs):
         if name not in plan.variable_index:
@@ -272,5 +286,12 @@ def _intensities(system: AcausalSystem, stacked: Stacked, places: list[int]) -> 
         for place in np.flatnonzero(plan.states == quantity[0]).tolist():
             found[place] = 0.5 * _increments(stacked, j)[1] / abs(float(factor[0]))
     span = float(np.max(stacked.times[:, -1] - stacked.t0))
-    typical = np.mean([found[p] / nominal[p] for p in found]) if found else HIDDEN / np.sqrt(span)
-    return {p: found.get(p, HIDDEN * float(typical * nominal[p])) for p in places}
+    known = [found[p] / nominal[p] for p in found]
+    typical = float(np.mean(known)) if known else HIDDEN / math.sqrt(span)
+    for place in places:
+        if isinstance(place, str):
+            size = float(np.max(np.abs(stacked.inputs[place][1]), initial=0.0)) if place in stacked.inputs else 0.0
+            found[place] = HIDDEN * (size or 1.0) * math.sqrt(span / stacked.times.shape[1])
+        elif place not in found:
+            found[place] = HIDDEN * typical * float(nominal[place])
+    return found

@@ -217,7 +217,7 @@ class Drift(Component):
         self.add_equations(Eq(der(x), (centre - x) / tau))
 
 
-def drift(seed, n=150, tau=2.0, centre=1.0, noise=0.6, sigma=0.15):
+def drift(seed, n=400, tau=2.0, centre=1.0, noise=0.6, sigma=0.15):
     """Samples by the exact transition, with gaps, from the stationary distribution."""
     rng = np.random.default_rng(seed)
     times = np.cumsum(rng.uniform(0.1, 0.6, n))
@@ -231,7 +231,8 @@ def drift(seed, n=150, tau=2.0, centre=1.0, noise=0.6, sigma=0.15):
 
 @pytest.mark.slow
 def test_intervals_cover_the_truth_of_a_process_of_ornstein_and_uhlenbeck():
-    """Two parameters, intensity and sensor noise of 60 records, all by one program; the likelihood in closed form."""
+    """Two parameters, intensity and sensor noise of 50 records, all by one program; the likelihood in closed form.
+    (Of 150 samples, 89 % of intervals cover: that is too few for the distribution of estimates to be normal.)"""
     system = compiled(Drift)
     method = learning.Filter({"ou.x": "estimate"})
     problem = learning.Problem(system, drift(0), train=["ou.tau", "ou.m"], method=method, rtol=1e-10, atol=1e-12)
@@ -249,7 +250,7 @@ def test_intervals_cover_the_truth_of_a_process_of_ornstein_and_uhlenbeck():
     np.testing.assert_allclose(objective.weights(z, found).cost(z, found.residual), cost, rtol=1e-9)
     truth = {"ou.tau": 2.0, "ou.m": 1.0, "noise of ou.x": 0.6, "sigma of ou.x": 0.15}
     inside, steps = [], []
-    for seed in range(60):
+    for seed in range(50):
         fit = problem.fit(drift(seed))
         table = fit.table()
         inside.append([table[name].low <= value <= table[name].high for name, value in truth.items()])
