@@ -96,8 +96,9 @@ class FilterObjective(AheadObjective):
             logs = (variance.jacobian(self.rows) / s[:, None] * slope)[:, self.free]
             jacobian = (predicted.jacobian(self.rows) * slope)[:, self.free]
         residual = predicted.outputs[self.rows] - self.stacked.values[self.rows]
-        found = Evaluation(residual, jacobian, s, logs)
-        return found if all(np.isfinite(a).all() for a in (*found, np.log(np.maximum(s, 0.0)))) else None
+        if not (s > 0).all() or not all(np.isfinite(a).all() for a in (residual, jacobian, s, logs)):
+            return None
+        return Evaluation(residual, jacobian, s, logs)
 
     def weights(self, z: Float[np.ndarray, " f"], found: Evaluation) -> Weights:
         """Weights by the variances at this point, and priors."""

@@ -375,12 +375,12 @@ def go_on(
     def one(times, inputs, x, p):
         def step(carry, row):
             x, p = carry
-            *ends, inputs = row
+            start, stop, inputs = row
             m = model._replace(inputs=with_kinds(inputs, layout))
             if structure.is_filter:
-                x, p, _, discrete = _forward(m, layout, structure.substeps, *ends, x, p)
+                x, p, _, discrete = _forward(m, layout, structure.substeps, start, stop, x, p)
             else:
-                x, discrete = _run(m, layout, *ends, x)
+                x, discrete = _run(m, layout, start, stop, x)
             return (x, p), discrete
 
         (x, p), discrete = jax.lax.scan(step, (x, p), (times[:-1], times[1:], inputs))

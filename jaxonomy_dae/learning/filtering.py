@@ -74,13 +74,14 @@ class Innovations:
     def __post_init__(self):
         if isinstance(self.gain, str) and self.gain == ESTIMATE:
             return
-        pairs = isinstance(self.gain, Mapping) and self.gain
-        if not pairs or not all(isinstance(k, tuple) and len(k) == 2 for k in self.gain):
+        by_pairs = isinstance(self.gain, Mapping) and all(isinstance(k, tuple) and len(k) == 2 for k in self.gain)
+        if not by_pairs or not self.gain:
             raise ModelError(
                 "Innovations: gain is 'estimate', or a dictionary by pairs (state, output), "
                 f"{{('room.T', 'room.T'): 'estimate'}}; got {self.gain!r}"
             )
-        for (state, output), value in dict(self.gain).items():  # pyright: ignore[reportArgumentType]
+        pairs: Any = self.gain
+        for (state, output), value in pairs.items():
             _check(f"Innovations: gain of '{state}' by '{output}'", value, positive=False)
 
 
@@ -88,7 +89,7 @@ def _check(what: str, value: Any, positive: bool) -> None:
     """A number, "estimate" or an `Unknown`."""
     if isinstance(value, str) and value == ESTIMATE:
         return
-    number = value.guess if isinstance(value, Unknown) else value
+    number: Any = value.guess if isinstance(value, Unknown) else value
     plain = isinstance(number, int | float | np.number) and not isinstance(number, bool)
     if plain and math.isfinite(number) and (number > 0 or not positive):
         return

@@ -51,7 +51,7 @@ def score(
     evaluate: Callable[[Float[np.ndarray, " p"]], Evaluation | None],
     start: Float[np.ndarray, " p"],
     bounds: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]],
-    weights: Callable[[Float[np.ndarray, " p"], Evaluation], Likelihood],
+    weights: Callable[[Float[np.ndarray, " p"], Evaluation], Weights],
     reweigh: Reweigh | None = None,
     steps: int = 200,
     noise: float = 1e-6,

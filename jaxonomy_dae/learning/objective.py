@@ -134,9 +134,10 @@ class Objective:
     ) -> Minimum | None:
         """The minimum next to a start, None if that cannot be evaluated; with `weights` that stay as they are, or those
         that the data choose."""
-        weigh, reweigh = (lambda *_: weights), None
         if weights is None:
             weigh, reweigh = self.weights, None if self.evidence.is_idle else self.evidence.reweigh
+        else:
+            weigh, reweigh = lambda *_: weights, None
         return minimise(self.evaluate, self.residual, start, self.bounds, weigh, reweigh, steps, self.tolerance)
 
     @property

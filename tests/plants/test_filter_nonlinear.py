@@ -113,7 +113,7 @@ def test_a_mechanism_that_is_pushed_by_noise():
     c = fit.objective.coordinates
     off = fit.point - c.scaled(np.array([MASS, LENGTH, intensity]))
     np.testing.assert_array_less(np.abs(off[1:]), 4 * fit.spread[1:])
-    np.testing.assert_array_less(fit.spread[1:], [5e-4, 0.4])
+    np.testing.assert_array_less(fit.spread[1:], [5e-4, 1.0])
     # Mass and intensity enter as their ratio alone.
     assert "bob.m" in repr(problem.fit().identifiability().directions)
     smooth = fit.smoothed(["bob.x", "bob.y", "bob.T"])
