@@ -1,4 +1,4 @@
-"""The noise that a linear system gathers over a time."""
+"""The flow of a linear system over a time, and the noise that it gathers."""
 
 from typing import Any
 
@@ -10,10 +10,12 @@ SMALL = 0.25  # of ‖A h‖, where the series begins
 TERMS = 12  # of the series, which leave a remainder below rounding there: (2·¼)¹³/14! = 1e-15
 
 
-def gathered_noise(a: Float[Array, "f f"], g: Float[Array, "f f"], h: Any) -> Float[Array, "f f"]:
-    """∫₀ʰ exp(A s) G exp(A s)ᵀ ds, for symmetric G.
+def linear_flow(
+    a: Float[Array, "f f"], g: Float[Array, "f f"], h: Any
+) -> tuple[Float[Array, "f f"], Float[Array, "f f"]]:
+    """exp(A h) − I, and ∫₀ʰ exp(A s) G exp(A s)ᵀ ds for symmetric G.
 
-    By a series over a short time, which is then doubled,
+    By series over a short time, which is then doubled,
 
         Q(2h) = Q(h) + Φ Q(h) Φᵀ,    Φ(2h) − I = 2 (Φ − I) + (Φ − I)².
 
@@ -36,4 +38,16 @@ def gathered_noise(a: Float[Array, "f f"], g: Float[Array, "f f"], h: Any) -> Fl
         across = moved @ noise
         return 2 * moved + moved @ moved, 2 * noise + across + across.T + across @ moved.T
 
-    return jax.lax.fori_loop(0, doublings.astype(jnp.int32), double, (moved, noise))[1]
+    return jax.lax.fori_loop(0, doublings.astype(jnp.int32), double, (moved, noise))
+
+
+def affine_flow(
+    a: Float[Array, "f f"], first: Float[Array, " f"], rate: Float[Array, " f"], g: Float[Array, "f f"], h: Any
+) -> tuple[Float[Array, " f"], Float[Array, "f f"], Float[Array, "f f"]]:
+    """What δ' = A δ + `first` + s·`rate` leads to from zero in a time h, with exp(A h) and the noise gathered: the
+    exponential of the matrix of (δ, 1, s)."""
+    f = len(a)
+    columns = jnp.concatenate([a, first[:, None], rate[:, None]], axis=1)
+    big = jnp.zeros((f + 2, f + 2), a.dtype).at[:f].set(columns).at[f + 1, f].set(1.0)
+    moved, noise = linear_flow(big, jnp.zeros_like(big).at[:f, :f].set(g), h)
+    return moved[:f, f], jnp.eye(f, dtype=a.dtype) + moved[:f, :f], noise[:f, :f]

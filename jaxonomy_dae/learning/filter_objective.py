@@ -39,7 +39,27 @@ class AheadObjective(Objective):
         return Told(
             c.times, c.t0, c.known, self._windows, jnp.asarray(s.values, dtype), jnp.asarray(s.observed),
             jnp.asarray(sigma, dtype), jnp.asarray(np.array(spreads, float).reshape(c.known.shape), dtype),
+            jnp.asarray(self._ends, dtype),
         )  # fmt: skip
+
+    @property
+    def _ends(self) -> Float[np.ndarray, "e n m"]:
+        """The ends of the parts of the time before each row in which no input has a kink or jump; parts that a row does
+        not need have no length."""
+        s = self.stacked
+        before = np.concatenate([s.t0[:, None], s.times[:, :-1]], axis=1)
+        inside = []
+        for k in range(len(before)):
+            knots = np.unique(np.concatenate([[], *(times[k] for times, _ in s.inputs.values())]))
+            inside.append([knots[(knots > a) & (knots < b)] for a, b in zip(before[k], s.times[k], strict=True)])
+        most = max(len(row) for rows in inside for row in rows) if self.structure.is_linear else 0
+        ends = np.repeat(s.times[:, :, None], most + 2, axis=2)
+        ends[:, :, 0] = before
+        if most:
+            for k, rows in enumerate(inside):
+                for n, row in enumerate(rows):
+                    ends[k, n, 1 : 1 + len(row)] = row
+        return ends
 
     @property
     def _windows(self) -> dict[str, Any]:

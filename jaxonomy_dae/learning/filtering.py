@@ -15,6 +15,7 @@ from ..errors import ModelError, nearest
 from ..system.system import AcausalSystem
 from .data import Stacked
 from .experiment import ESTIMATE, Unknown
+from .linear_models import is_linear
 
 FAR = 1e6  # how far, as a factor, a level may move from its guess: beyond, it counts as none, or as a bad guess
 HIDDEN = 0.1  # guessed noise of a state that was not measured, relative to measured ones, each in units of its size
@@ -106,12 +107,14 @@ class Structure:
     - `sigma`: the outputs whose noise level is a coordinate.
     - `gain`: (place in the state array, output, factor) of each entry of a constant gain.
     - `substeps`: how many parts the time between samples has.
+    - `is_linear`: whether the flow is a matrix exponential.
     """
 
     noise: tuple[tuple[int | str, float], ...] = ()
     sigma: tuple[int, ...] = ()
     gain: tuple[tuple[int, int, float], ...] = ()
     substeps: int = 1
+    is_linear: bool = False
 
     @property
     def is_filter(self) -> bool:
@@ -143,6 +146,7 @@ def structure_and_extras(
 
     - `ModelError` for names that are not those of differential states or outputs.
     """
+    linear = is_linear(system) and "cubic" not in dict(stacked.kinds).values()
     units = dict(zip(system.plan.flat.variables.names, system.plan.flat.variables.unit, strict=True))
     if isinstance(method, Innovations):
         gains = _gains(method, system, stacked)
@@ -152,7 +156,7 @@ def structure_and_extras(
         for name, value, place, output, factor in gains:
             size = abs(float(nominal[place]) * factor) / size_of[output]
             extras.append(_extra(name, "", value, 0.0, size, log=False))
-        return Structure(gain=tuple((p, j, f) for _, _, p, j, f in gains)), tuple(extras)
+        return Structure(gain=tuple((p, j, f) for _, _, p, j, f in gains), is_linear=linear), tuple(extras)
     noise = _noise(method, system)
     guesses = _intensities(system, stacked, [place for _, _, place, _ in noise])
     extras = [
@@ -173,7 +177,7 @@ def structure_and_extras(
         guess = 0.5 * _increments(stacked, j)[0]
         extras.append(_extra(f"sigma of {name}", units.get(name, ""), ESTIMATE, guess, 1.0, log=True))
     places = tuple((place, factor) for _, _, place, factor in noise)
-    return Structure(noise=places, sigma=estimated, substeps=method.substeps), tuple(extras)
+    return Structure(noise=places, sigma=estimated, substeps=method.substeps, is_linear=linear), tuple(extras)
 
 
 def check_model(method: Filter | Innovations, system: AcausalSystem) -> None:

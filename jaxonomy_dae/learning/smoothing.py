@@ -87,10 +87,9 @@ def _numbers(objective: AheadObjective, point: Any, k: int, rows: slice) -> tupl
     """(shared, own, what programs are told) of one experiment, at some of its times."""
     shared, own = objective.numbers(objective.coordinates.natural(point))
     told = jax.tree.map(lambda a: a[k][None], objective.told)
-    times, values, observed, inputs = jax.tree.map(
-        lambda a: a[:, rows], (told.times, told.values, told.observed, told.inputs)
-    )
-    told = dataclasses.replace(told, times=times, values=values, observed=observed, inputs=inputs)
+    names = ("times", "ends", "values", "observed", "inputs")
+    chosen = {name: jax.tree.map(lambda a: a[:, rows], getattr(told, name)) for name in names}
+    told = dataclasses.replace(told, **chosen)
     return shared, own[k][None], told
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from kalman import discretized
 
-from jaxonomy_dae.learning.diffusion import gathered_noise
+from jaxonomy_dae.learning.diffusion import linear_flow
 
 
 @pytest.mark.parametrize("n, h", [(1, 0.3), (3, 0.7), (4, 5.0)])
@@ -21,7 +21,7 @@ def test_against_van_loan(n, h):
 def test_stiff_and_unstable_scalars():
     """g (e^{2ah} − 1)/(2a), also where e^{−ah} would overflow; and its derivative by a."""
     for a in (-1e6, -3.0, 0.0, 2.0):
-        found, slope = jax.jvp(lambda a: gathered_noise(a[None, None], jnp.eye(1), 1.5)[0, 0], (a,), (1.0,))
+        found, slope = jax.jvp(lambda a: linear_flow(a[None, None], jnp.eye(1), 1.5)[0, 0], (a,), (1.0,))
         expected = np.expm1(3 * a) / (2 * a) if a else 1.5
         np.testing.assert_allclose(found, expected, rtol=1e-12)
         derivative = (3 * np.exp(3 * a) - 2 * expected) / (2 * a) if a else 1.5**2
@@ -29,4 +29,4 @@ def test_stiff_and_unstable_scalars():
 
 
 def test_no_time_gathers_nothing():
-    np.testing.assert_array_equal(gathered_noise(jnp.eye(2), jnp.eye(2), jnp.zeros(())), np.zeros((2, 2)))
+    np.testing.assert_array_equal(linear_flow(jnp.eye(2), jnp.eye(2), jnp.zeros(())), np.zeros((2, 2)))
