@@ -18,6 +18,7 @@ from jaxtyping import Float
 from .factors import Factors
 from .least_squares import OFFSET, PATIENCE, TRIALS, Evaluation, Minimum, Reweigh, Rows, Weights
 
+LONGEST = 1.0  # change of a coordinate by one step: far from the optimum, the expected information is not the curvature
 GAIN = 1e-7  # decrease of the negative logarithm of the likelihood that is not noticed
 
 
@@ -88,6 +89,7 @@ def score(
         for _ in range(TRIALS):
             step = np.zeros_like(z)
             step[free] = factors.step(damping, rank)
+            step /= max(1.0, float(np.abs(step).max(initial=0.0)) / LONGEST)
             new = np.clip(z + step, low, high)
             if np.array_equal(new, z):
                 break
