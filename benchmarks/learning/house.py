@@ -21,6 +21,7 @@ import numpy as np
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, learning
 from jaxonomy_dae.modeling import POSITIVE, Component, Eq, der
 
+SENSOR = 0.0125 / np.sqrt(12)  # °C: the record has steps of 0.0125
 AHEAD, SPLITS = 120, (312, 432, 552)
 VALUES = {"Ci": 40.0, "Ce": 400.0, "Ch": 5.0, "Rie": 0.1, "Rea": 1.0, "Ria": 2.0, "Rih": 0.05}
 NAMES = [f"house.{k}" for k in VALUES]
@@ -92,8 +93,7 @@ def whole(columns, split, sigma, daily):
 def validate(columns, method, gain=None):
     """Errors of predictions, split by split; what is known in the end."""
     names = NAMES if gain is None else [*NAMES, "house.gain"]
-    # The sensor has steps of 0.0125 °C; what runs deviate by is another matter.
-    sigma = "estimate" if method == "single" else 0.0125 / np.sqrt(12)
+    sigma = "estimate" if method == "single" else SENSOR
     first = whole(columns, SPLITS[0], sigma, gain is not None)
     problem = learning.Problem(compiled(gain), first, train=names, method=method)
     errors = []

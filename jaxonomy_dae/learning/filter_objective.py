@@ -139,14 +139,15 @@ class FilterObjective(AheadObjective):
         self, start: Float[np.ndarray, " f"], steps: int = 200, weights: Weights | None = None
     ) -> Minimum | None:
         """As of `Objective`, by scoring."""
+        given = self.evaluate, start, self.bounds, self.coordinates.log[self.free]
         if weights is None:
             reweigh = None if self.evidence.is_idle else self.evidence.reweigh
-            return score(self.evaluate, start, self.bounds, self.weights, reweigh, steps, self.tolerance)
+            return score(*given, self.weights, reweigh, steps, self.tolerance)
 
         def held(z, found):
             return dataclasses.replace(self.weights(z, found), precision=weights.precision, mean=weights.mean)
 
-        return score(self.evaluate, start, self.bounds, held, None, steps, self.tolerance)
+        return score(*given, held, None, steps, self.tolerance)
 
     def sigma(self, z: Float[np.ndarray, " f"], weights: Weights) -> dict[str, float]:
         """Noise levels that were estimated."""

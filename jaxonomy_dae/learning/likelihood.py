@@ -13,13 +13,14 @@ import dataclasses
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from .factors import Factors
 from .least_squares import OFFSET, PATIENCE, TRIALS, Evaluation, Minimum, Reweigh, Rows, Weights
 
-LONGEST = 1.0  # change of a coordinate by one step: far from the optimum, the expected information is not the curvature
-GAIN = 1e-7  # decrease of the negative logarithm of the likelihood that is not noticed
+LONGEST = (
+    2.0  # change of a coordinate by one step, a factor of 7: far away, the expected information is not the curvature
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,12 +53,14 @@ def score(
     evaluate: Callable[[Float[np.ndarray, " p"]], Evaluation | None],
     start: Float[np.ndarray, " p"],
     bounds: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]],
+    limited: Bool[np.ndarray, " p"],
     weights: Callable[[Float[np.ndarray, " p"], Evaluation], Weights],
     reweigh: Reweigh | None = None,
     steps: int = 200,
     noise: float = 1e-6,
 ) -> Minimum | None:
-    """Descends from a start; arguments as of `least_squares.minimise`.
+    """Descends from a start; arguments as of `least_squares.minimise`, and which coordinates are logarithms, of which a
+    step is `limited`.
 
     It stops where the remaining step is a thousandth of the confidence region's radius: gᵀF⁻¹g ≤ 10⁻⁶ for each
     coordinate, with the gradient g and the Fisher information F; or where steps in a row gain nothing.
@@ -89,7 +92,7 @@ def score(
         for _ in range(TRIALS):
             step = np.zeros_like(z)
             step[free] = factors.step(damping, rank)
-            step /= max(1.0, float(np.abs(step).max(initial=0.0)) / LONGEST)
+            step[limited] = np.clip(step[limited], -LONGEST, LONGEST)
             new = np.clip(z + step, low, high)
             if np.array_equal(new, z):
                 break
@@ -101,10 +104,14 @@ def score(
                 gain = cost - trial.cost(new, tried.residual)
             if tried is not None and gain > 0:
                 promised = 0.5 * float(np.sum(r**2) - np.sum((r + jacobian @ (new - z)) ** 2))
-                ratio = gain / max(promised, np.finfo(float).tiny)
+                ratio = gain / max(promised, np.finfo(float).eps * max(1.0, abs(cost)))
                 damping = max(damping / 5 if ratio > 0.7 else damping * 3 if ratio < 0.3 else damping, 1e-12)
                 better = new, tried, trial
-                idle = 0 if gain > GAIN * max(1.0, abs(cost) * noise) else idle + 1
+                # ½ is what each coordinate takes off by fitting noise.
+                if gain > OFFSET * 0.5 * len(z):
+                    idle = 0
+                elif damping <= 1:  # the columns have norm one: beyond, damping alone keeps steps short
+                    idle += 1
                 break
             damping *= 6
         if better is None:

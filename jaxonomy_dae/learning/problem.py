@@ -414,7 +414,9 @@ class Problem:
         c, (low, high) = objective.coordinates, objective.bounds
         first, free = c.z_start[objective.free], objective.free
         rng, points = np.random.default_rng(seed), [first]
-        bounded = np.isfinite(low) & np.isfinite(high)
+        # The bounds of what comes with a method are as far away as can be.
+        bounded = np.isfinite(low) & np.isfinite(high) & ~np.isin(np.array(c.names)[free], self._layout.extra)
+        least, most = np.where(bounded, low, 0.0), np.where(bounded, high, 0.0)
         for _ in range(count - 1):
             width = np.where(c.log[free], 1.0, np.where(c.is_weight[free], 0.0, 1.0))
             width = np.where(np.isfinite(c.spread[free]), c.spread[free], width)
@@ -423,7 +425,7 @@ class Problem:
                 width[chosen] = np.sqrt(np.mean(first[chosen] ** 2)) if chosen.any() else 0.0
             centre = np.where(c.is_weight[free], 0.0, first)
             drawn = centre + width * rng.standard_normal(len(first))
-            inside = low + (high - low) * rng.uniform(size=len(first)) if bounded.any() else drawn
+            inside = least + (most - least) * rng.uniform(size=len(first)) if bounded.any() else drawn
             points.append(np.clip(np.where(bounded, inside, drawn), low, high))
         return points
 
