@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float
 from .factors import Factors
 from .least_squares import OFFSET, PATIENCE, TRIALS, Evaluation, Minimum, Reweigh, Rows, Weights
 
+GAIN = 1e-5  # decrease of −ln L for each coordinate that is not noticed: that of a step of 0.004 standard deviations
 LONGEST = (
     2.0  # change of a coordinate by one step, a factor of 7: far away, the expected information is not the curvature
 )
@@ -107,8 +108,7 @@ def score(
                 ratio = gain / max(promised, np.finfo(float).eps * max(1.0, abs(cost)))
                 damping = max(damping / 5 if ratio > 0.7 else damping * 3 if ratio < 0.3 else damping, 1e-12)
                 better = new, tried, trial
-                # ½ is what each coordinate takes off by fitting noise.
-                if gain > OFFSET * 0.5 * len(z):
+                if gain > GAIN * len(z):
                     idle = 0
                 elif damping <= 1:  # the columns have norm one: beyond, damping alone keeps steps short
                     idle += 1
