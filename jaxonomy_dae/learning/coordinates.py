@@ -81,7 +81,8 @@ class Coordinates:
 
     def natural_at(self, position: int, z: float) -> float:
         """The value that one coordinate stands for, bounds aside."""
-        return float(np.exp(z)) if self.log[position] else float(z * self.size[position])
+        with np.errstate(over="ignore"):
+            return float(np.exp(z)) if self.log[position] else float(z * self.size[position])
 
     def slope(self, z: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
         """d(natural value)/d(coordinate)."""
