@@ -101,10 +101,10 @@ def record(kind):
     for k in range(20):
         inside = times[(times > grid[k]) & (times <= grid[k + 1])]
         run = scipy.integrate.solve_ivp(
-            lambda t, x, k=k: kind.field(x, u[k], kind.truth), (grid[k], grid[k + 1]), x,
-            t_eval=np.append(inside, grid[k + 1]), rtol=1e-9, atol=1e-11,
+            lambda t, x, k=k: kind.field(x, u[k], kind.truth), (grid[k], grid[k + 1]), x, "DOP853", rtol=1e-11,
+            atol=1e-13, dense_output=True,
         )  # fmt: skip
-        out.append(run.y[:, : len(inside)])
+        out.append(run.sol(inside))
         x = run.y[:, -1]
     # A sample at a jump has the new input.
     return times, (grid, u), kind.measured(np.concatenate(out, axis=1), u[place], kind.truth)
