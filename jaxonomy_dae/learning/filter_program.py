@@ -9,8 +9,8 @@ with φ the flow, by `simulate`, and Φ its derivative. Q depends on A = ∂f/�
 is carried on from there, so that a Jacobian at time τ acts on a share τ/h of it: to second order, the constant matrix
 that does the same is A(0)/3 + 2 A(h)/3. At samples, outputs correct the state one by one, linearized where all of them
 were predicted, which is the same as at once; a missing sample corrects nothing. Of linear models, φ is a matrix
-exponential, twenty times faster than runs. Where constraints make states
-redundant, noise and covariance are kept in their tangent space by the derivative of the projection.
+exponential, fifteen times faster than runs. Where constraints make states redundant, noise and covariance are kept in
+their tangent space by the derivative of the projection.
 """
 
 from typing import Any, NamedTuple
@@ -129,8 +129,8 @@ def _run(m: Model, layout: Layout, t0: Any, t1: Any, x: Any) -> tuple[Any, Any]:
     least = 1e-12 * (1.0 + jnp.abs(t0))
     t1 = jnp.where(t1 > t0, t1, t0 + least)
     solution = simulate(
-        m.here, t1, t0=t0, ts=t1[None], initial=x, adjoint=diffrax.ForwardMode(), throw=False, inputs=m.inputs,
-        **dict(layout.options),
+        m.here, t1, t0=t0, ts=t1[None], initial=x, adjoint=diffrax.ForwardMode(), throw=False,
+        inputs=m.inputs, **dict(layout.options),
     )  # fmt: skip
     return solution.states[-1], None if solution.discrete is None else solution.discrete[-1]
 
@@ -139,11 +139,11 @@ def _held(m: Model, discrete: Any) -> AcausalSystem:
     return m.here if discrete is None else m.here.holding(discrete)
 
 
-def _jacobian(m: Model, t: Any, x: Any, discrete: Any) -> Float[Array, "f f"]:
+def _jacobian(m: Model, t: Any, x: Any) -> Float[Array, "f f"]:
     """∂f/∂x of the differential states, algebraic unknowns following them."""
     plan = m.here.plan
     f = len(plan.states)
-    here = _held(m, discrete).at(t, m.inputs)
+    here = m.here.at(t, m.inputs)
 
     def slopes(first):
         state = here.split(jnp.concatenate([first, x[f:]]))
@@ -154,19 +154,19 @@ def _jacobian(m: Model, t: Any, x: Any, discrete: Any) -> Float[Array, "f f"]:
     return jax.jacfwd(slopes)(x[:f])
 
 
-def _intensity(m: Model, t: Any, x: Any, discrete: Any) -> Float[Array, "f f"]:
+def _intensity(m: Model, t: Any, x: Any) -> Float[Array, "f f"]:
     """σσᵀ at a state, that of noise of inputs included; kept in the tangent space of the constraints."""
     plan = m.here.plan
-    f, tangent = len(plan.states), _tangent(m, t, x, discrete)
+    f, tangent = len(plan.states), _tangent(m, t, x, None)
     g = m.diffusion if tangent is None else tangent @ m.diffusion @ tangent.T
     if not m.driven:
         return g
-    system, sources = _held(m, discrete), by_entry(plan, read_inputs(plan, x.dtype, m.inputs))
+    sources = by_entry(plan, read_inputs(plan, x.dtype, m.inputs))
     names = list(m.driven)
     at = jnp.stack([jnp.asarray(_input_at(plan, sources, name, t), x.dtype) for name in names])
 
     def slopes(values):
-        here = system.at(t, {**sources, **dict(zip(names, values, strict=True))})
+        here = m.here.at(t, {**sources, **dict(zip(names, values, strict=True))})
         state = here.split(x)
         if len(plan.carried):
             state = here.refined(state, Refinement.ROOT)
@@ -208,10 +208,8 @@ def _read(m: Model, layout: Layout, t: Any, x: Any, discrete: Any) -> tuple[Floa
     return found, slopes
 
 
-def _forward(
-    m: Model, layout: Layout, substeps: int, t0: Any, t1: Any, x: Any, p: Any
-) -> tuple[Any, Any, Any, Any]:  # fmt: skip
-    """State, covariance and Φ at t1, and discrete values there, from those at t0."""
+def _forward(m: Model, layout: Layout, substeps: int, t0: Any, t1: Any, x: Any, p: Any) -> tuple[Any, Any, Any]:
+    """State, covariance and Φ at t1, from those at t0."""
     f = len(m.here.plan.states)
 
     def part(carry, ends):
@@ -219,29 +217,27 @@ def _forward(
         start, stop = ends
 
         def flow(first):
-            found, discrete = _run(m, layout, start, stop, jnp.concatenate([first, x[f:]]))
-            return found[:f], (found, discrete)
+            found, _ = _run(m, layout, start, stop, jnp.concatenate([first, x[f:]]))
+            return found[:f], found
 
-        here = None if m.here.plan.events is None else _run(m, layout, start, start, x)[1]
-        a, g = _jacobian(m, start, x, here), _intensity(m, start, x, here)
-        phi, (x, discrete) = jax.jacfwd(flow, has_aux=True)(x[:f])
-        a = a / 3 + 2 / 3 * _jacobian(m, stop, x, discrete)
-        g = (g + _intensity(m, stop, x, discrete)) / 2
+        first, g = _jacobian(m, start, x), _intensity(m, start, x)
+        phi, x = jax.jacfwd(flow, has_aux=True)(x[:f])
+        a = first / 3 + 2 / 3 * _jacobian(m, stop, x)
+        g = (g + _intensity(m, stop, x)) / 2
         q = linear_flow(a, g, stop - start)[1]
-        tangent = _tangent(m, stop, x, discrete)
+        tangent = _tangent(m, stop, x, None)
         q = q if tangent is None else tangent @ q @ tangent.T
-        return (x, phi @ p @ phi.T + q, phi @ through), discrete
+        return (x, phi @ p @ phi.T + q, phi @ through), None
 
     first = (x, p, jnp.eye(f, dtype=x.dtype))
     if substeps == 1:
-        (x, p, through), discrete = part(first, (t0, t1))
-        return x, p, through, discrete
+        return part(first, (t0, t1))[0]
     ends = t0 + (t1 - t0) * jnp.asarray(np.arange(substeps + 1) / substeps, x.dtype)
-    (x, p, through), discrete = jax.lax.scan(part, first, (ends[:-1], ends[1:]))
-    return x, p, through, None if discrete is None else discrete[-1]
+    ends = ends.at[-1].set(t1)  # not beyond it by rounding
+    return jax.lax.scan(part, first, (ends[:-1], ends[1:]))[0]
 
 
-def _forward_linear(m: Model, ends: Float[Array, " m"], x: Any, p: Any) -> tuple[Any, Any, Any, None]:
+def _forward_linear(m: Model, ends: Float[Array, " m"], x: Any, p: Any) -> tuple[Any, Any, Any]:
     """The same of a linear model, part by part, in each of which inputs are linear in time."""
     f = len(x)
 
@@ -252,7 +248,7 @@ def _forward_linear(m: Model, ends: Float[Array, " m"], x: Any, p: Any) -> tuple
         x, p, through = carry
         start, h = ends[0], ends[1] - ends[0]
         early = start + h / 4  # inside, where jumps at the ends do not show
-        a, g, one = jax.jacfwd(slopes, argnums=1)(early, x), _intensity(m, early, x, None), slopes(early, x)
+        a, g, one = jax.jacfwd(slopes, argnums=1)(early, x), _intensity(m, early, x), slopes(early, x)
         rate = jnp.where(h > 0, (slopes(start + 3 * h / 4, x) - one) / jnp.where(h > 0, h / 2, 1.0), 0.0)
         moved, phi, q = affine_flow(a, one - rate * h / 4, rate, g, h)
         return (x + moved, phi @ p @ phi.T + q, phi @ through), None
@@ -260,8 +256,8 @@ def _forward_linear(m: Model, ends: Float[Array, " m"], x: Any, p: Any) -> tuple
     first = (x, p, jnp.eye(f, dtype=x.dtype))
     pairs = jnp.stack([ends[:-1], ends[1:]], axis=1)
     if len(pairs) == 1:
-        return (*part(first, pairs[0])[0], None)
-    return (*jax.lax.scan(part, first, pairs)[0], None)
+        return part(first, pairs[0])[0]
+    return jax.lax.scan(part, first, pairs)[0]
 
 
 def _corrected(x: Any, p: Any, row: tuple[Any, ...]) -> tuple[Any, Any, Any]:
@@ -306,11 +302,11 @@ def _track(
     def step(carry, row):
         t0, x, p = carry
         t, ends, y, seen, inputs = row
-        m = model._replace(inputs=with_kinds(inputs, layout))
+        m, discrete = model._replace(inputs=with_kinds(inputs, layout)), None
         if structure.is_linear:
-            x, p, phi, discrete = _forward_linear(m, ends, x, p)
+            x, p, phi = _forward_linear(m, ends, x, p)
         elif structure.is_filter:
-            x, p, phi, discrete = _forward(m, layout, structure.substeps, t0, t, x, p)
+            x, p, phi = _forward(m, layout, structure.substeps, t0, t, x, p)
         else:
             (x, discrete), phi = _run(m, layout, t0, t, x), nothing
         if structure.is_filter:
@@ -405,11 +401,11 @@ def go_on(
         def step(carry, row):
             x, p = carry
             start, stop, ends, inputs = row
-            m = model._replace(inputs=with_kinds(inputs, layout))
+            m, discrete = model._replace(inputs=with_kinds(inputs, layout)), None
             if structure.is_linear:
-                x, p, _, discrete = _forward_linear(m, ends, x, p)
+                x, p, _ = _forward_linear(m, ends, x, p)
             elif structure.is_filter:
-                x, p, _, discrete = _forward(m, layout, structure.substeps, start, stop, x, p)
+                x, p, _ = _forward(m, layout, structure.substeps, start, stop, x, p)
             else:
                 x, discrete = _run(m, layout, start, stop, x)
             return (x, p), discrete

@@ -193,6 +193,11 @@ def check_model(method: Filter | Innovations, system: AcausalSystem) -> None:
             f"{what}: constraints of this model come and go with its modes, and its degrees of freedom with them: use "
             "method='single' or 'growing'"
         )
+    if isinstance(method, Filter) and plan.events is not None:
+        raise ModelError(
+            f"Filter: relations or events of this model ({plan.events.names[0]}) would need second derivatives through "
+            "events, which are not computed: leave relations that only bend alone with smooth(...), or use Innovations"
+        )
     if plan.events is not None and (plan.events.state >= 0).any():
         raise ModelError(
             f"{what}: events of this model write states ({plan.events.names[0]}), and a correction may carry a state "

@@ -1,4 +1,4 @@
-"""The extended filter: through constraints, nonlinear blocks and kinks, against filters in minimal coordinates whose
+"""The extended filter: through constraints and nonlinear blocks, against filters in minimal coordinates whose
 moments SciPy integrates."""
 
 import numpy as np
@@ -7,6 +7,7 @@ import scipy.integrate
 from sympy import Max, cos, sin
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, learning
+from jaxonomy_dae.errors import ModelError
 from jaxonomy_dae.modeling import POSITIVE, Component, Eq, der
 
 pytestmark = pytest.mark.slow
@@ -183,26 +184,33 @@ class Overflowing(Component):
         self.add_equations(Eq(der(x), u - x - k * Max(x - 1, 0)))
 
 
-def test_kinks_are_passed_with_their_derivatives():
-    """Next to no noise: the variance is that of the start, carried through max(x − 1, 0) in closed form."""
-    times = np.array([0.3, 0.9, 1.5])
-    u, spread, sigma = 3.0, 0.01, 1e3
-    kink = np.log(3 / 2)  # where 3 (1 − e^{−t}) = 1
+def test_kinks():
+    """Predictions one step ahead pass them: from each sample on in closed form, with derivatives against differences. A
+    filter, whose likelihood would need second derivatives through them, refuses."""
+    times, u, y = np.array([0.3, 0.9, 1.5]), 3.0, np.array([0.5, 1.3, 1.2])
 
-    def state(t):
-        return 3 * (1 - np.exp(-t)) if t < kink else 7 / 5 + (1 - 7 / 5) * np.exp(-5 * (t - kink))
+    def after(x, h):
+        """From below, through 1, towards 7/5."""
+        if x >= 1:
+            return 7 / 5 + (x - 7 / 5) * np.exp(-5 * h)
+        kink = np.log((u - x) / (u - 1))
+        return u + (x - u) * np.exp(-h) if h < kink else after(1.0, h - kink)
 
-    def flow(t):
-        return np.exp(-t) if t < kink else np.exp(-kink) * np.exp(-5 * (t - kink))
-
+    expected, x, now = [], 0.0, 0.0
+    for t, sample in zip(times, y, strict=True):
+        x, now = after(x, t - now), t
+        expected.append(x)
+        x += 0.4 * (sample - x)
     system = compiled(Overflowing)
-    one = learning.Experiment(
-        times, {"tank.x": [0.5, 1.0, 1.2]}, sigma=sigma, inputs={"tank.u": u},
-        initial={"tank.x": learning.Unknown(0.0, spread=spread)},
-    )  # fmt: skip
-    method = learning.Filter({"tank.x": 1e-9})
-    problem = learning.Problem(system, one, train=["tank.k"], method=method, rtol=1e-10, atol=1e-12)
+    one = learning.Experiment(times, {"tank.x": y}, sigma=0.1, inputs={"tank.u": u})
+    method = learning.Innovations({("tank.x", "tank.x"): learning.Unknown(0.4)})
+    problem = learning.Problem(system, one, train=["tank.k"], method=method, rtol=1e-9, atol=1e-11)
     objective = problem._objective(problem._stacked, problem._coordinates(problem._stacked, (), None, None))
-    track = objective.track(objective.coordinates.z_start)
-    np.testing.assert_allclose(track.before[0, :, 0], [state(t) for t in times], rtol=1e-6)
-    np.testing.assert_allclose(track.p_before[0, :, 0, 0], [(spread * flow(t)) ** 2 for t in times], rtol=1e-6)
+    z = objective.coordinates.z_start
+    found = objective.evaluate(z)
+    np.testing.assert_allclose(found.residual, expected - y, atol=1e-6)
+    for k, e in enumerate(1e-4 * np.eye(2)):
+        slope = (objective.evaluate(z + e).residual - objective.evaluate(z - e).residual) / 2e-4
+        np.testing.assert_allclose(found.jacobian[:, k], slope, atol=1e-6)
+    with pytest.raises(ModelError, match="Filter: relations or events of this model .* smooth"):
+        learning.Problem(system, one, train=["tank.k"], method=learning.Filter({"tank.x": 0.1}))
