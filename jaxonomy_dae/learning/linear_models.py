@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 
 from ..system.system import AcausalSystem
 
@@ -20,7 +19,7 @@ def is_linear(system: AcausalSystem) -> bool:
     if plan.events is not None or plan.n_projected or len(plan.carried):
         return False
     names = plan.inputs.names
-    t, x, u = jnp.zeros((), dtype), jnp.zeros(plan.n_state, dtype), jnp.zeros(len(names), dtype)
+    t, x, u = (jax.ShapeDtypeStruct(shape, dtype) for shape in ((), (plan.n_state,), (len(names),)))
 
     def slopes(t, x, u):
         return system.at(t, dict(zip(names, u, strict=True))).semi_explicit(x)
