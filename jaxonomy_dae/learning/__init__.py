@@ -13,6 +13,8 @@ from .ensemble import ensemble as ensemble
 from .estimate import Estimate as Estimate
 from .experiment import Experiment as Experiment
 from .experiment import Unknown as Unknown
+from .filtering import Filter as Filter
+from .filtering import Innovations as Innovations
 from .fit import Fit as Fit
 from .fit import fit as fit
 from .fit import fit_least_squares as fit_least_squares

@@ -1,6 +1,7 @@
 """One vector of coordinates for all that is estimated.
 
-    [trained parameters | weights of networks and sensor laws | shared starts | own starts, experiment by experiment]
+    [trained parameters | weights of networks and sensor laws | what comes with a method, such as levels of noise
+        | shared starts | own starts, experiment by experiment]
 
 Parameters that must be positive are on a logarithmic scale, so a step multiplies them; others, and starts, are measured
 by their size, so that 1 is a change that would be natural in any unit. Weights are as they are.
@@ -20,6 +21,7 @@ from ..modeling.interval import Interval, closed_ends
 from ..system.system import AcausalSystem
 from .data import Stacked
 from .experiment import Unknown
+from .filtering import Extra
 from .program import Layout
 
 
@@ -136,8 +138,11 @@ class Coordinates:
         return chosen
 
 
-def coordinates(system: AcausalSystem, observers: dict[str, Any], layout: Layout, stacked: Stacked) -> Coordinates:
-    """The coordinates of a problem, which start at the values of its system and at the guesses of unknown starts."""
+def coordinates(
+    system: AcausalSystem, observers: dict[str, Any], layout: Layout, stacked: Stacked, extras: tuple[Extra, ...] = ()
+) -> Coordinates:
+    """The coordinates of a problem, which start at the values of its system and at the guesses of unknown starts;
+    `extras` come with its method."""
     table, rows = system.parameters.table, []
     numbers = np.array(system.parameters.array) if system.parameters.known is None else system.parameters.known
     index = [table.index(name) for name in layout.parameters]
@@ -151,6 +156,8 @@ def coordinates(system: AcausalSystem, observers: dict[str, Any], layout: Layout
         module = system.neural[name] if name in system.neural else observers[name]
         for one, value in _named_weights(name, module):
             rows.append((one, "", name, True, False, 1.0, value, -math.inf, math.inf, math.inf, False))
+    for e in extras:
+        rows.append((e.name, e.unit, e.name, False, e.log, e.size, e.guess, e.low, e.high, e.spread, e.fixed))
     n_plain = len(rows)
     units = dict(zip(table.names, table.units, strict=True))
     units |= dict(zip(system.plan.flat.variables.names, system.plan.flat.variables.unit, strict=True))

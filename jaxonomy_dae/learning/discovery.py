@@ -201,8 +201,8 @@ def discover(
 
 def criterion(fitted: "Estimate", terms: int) -> float:
     """Schwarz's criterion; what all candidates have in common, such as other parameters, is left out."""
-    row = fitted.minimum.weights.row
-    return 2 * fitted.minimum.cost - 2 * float(np.sum(np.log(row))) + terms * float(np.log(len(row)))
+    weights = fitted.minimum.weights
+    return 2 * fitted.minimum.cost - 2 * weights.log_rows + terms * float(np.log(len(weights.row)))
 
 
 def _lack_of_fit(network: "Estimate", closed: "Estimate", name: str) -> float:

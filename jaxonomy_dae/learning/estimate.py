@@ -18,10 +18,12 @@ from .figures import plot_correlations, plot_history, plot_residuals, plot_runs
 from .holdout import holdout_score, with_own_starts
 from .identifiability import Identifiability, identifiability, spreads
 from .least_squares import Minimum
+from .likelihood import Likelihood
 from .objective import Objective
 from .prediction import Prediction, at_samples, prediction
 from .profile import profile
 from .program import with_values
+from .smoothing import followed
 from .table import Row, Table
 from .training import Training
 from .whiteness import Whiteness, whiteness
@@ -89,7 +91,7 @@ class Estimate:
     @property
     def sigma(self) -> dict[str, float]:
         """Noise levels that were estimated, by name."""
-        return self.objective.evidence.sigma(self.minimum.weights)
+        return self.objective.sigma(self.minimum.z, self.minimum.weights)
 
     # --- uncertainty -------------------------------------------------------------------------------------------
 
@@ -268,6 +270,40 @@ class Estimate:
             self, [names] if isinstance(names, str) else list(names), ts, experiment, self._quantile(level)
         )
 
+    def filtered(self, names: str | Sequence[str], experiment: int | str = 0, level: float = 0.95) -> Prediction:
+        """Any variables at the times of an experiment, from its samples up to each of them, with bands of the states'
+        covariance, to which the parameters' uncertainty is not added; of `method=Filter(...)`.
+
+        Where nothing was measured, these are predictions: with NaN in the last hours, a forecast of those.
+        """
+        return self._followed(names, experiment, "filtered", 1, level)
+
+    def smoothed(self, names: str | Sequence[str], experiment: int | str = 0, level: float = 0.95) -> Prediction:
+        """The same from all samples of the experiment, later ones included (Rauch, Tung & Striebel 1965)."""
+        return self._followed(names, experiment, "smoothed", 1, level)
+
+    def ahead(
+        self, names: str | Sequence[str], steps: int = 1, experiment: int | str = 0, level: float = 0.95
+    ) -> Prediction:
+        """The same predicted from samples that are at least `steps` rows old, NaN in the first `steps` rows if there
+        are more than one; of `method=Innovations(...)` too, without bands."""
+        return self._followed(names, experiment, "ahead", steps, level)
+
+    def _followed(self, names: str | Sequence[str], experiment: int | str, how: str, steps: int, level: float) -> Any:
+        chosen = [names] if isinstance(names, str) else list(names)
+        return followed(self, chosen, experiment, how, steps, self._quantile(level))
+
+    @property
+    def log_likelihood(self) -> float:
+        """ln L of the samples that were fitted, without priors: of models with p coordinates and n samples, that of the
+        least 2p − 2 ln L (Akaike) or p ln n − 2 ln L (Schwarz) is to be preferred."""
+        weights, residual = self.minimum.weights, self.minimum.found.residual
+        count = self.objective.stacked.weight[self.objective.rows[0]]
+        none = np.zeros_like(self.minimum.z)
+        cost = dataclasses.replace(weights, precision=none, mean=none).cost(self.minimum.z, residual)
+        logs = 0.0 if isinstance(weights, Likelihood) else float(np.sum(count * np.log(weights.row / np.sqrt(count))))
+        return logs - cost - 0.5 * float(np.sum(count) * np.log(2 * np.pi))
+
     def discover(self, name: str, terms: Any, *, width: int = 3, most: int = 3) -> Discovery:
         """Closed forms in a network's place: combinations of terms, refitted through the model on the data, with all
         else that is estimated, and compared by BIC.
@@ -316,7 +352,8 @@ class Estimate:
 
     @functools.cached_property
     def rms(self) -> dict[str, dict[str, float]]:
-        """Root mean square errors by experiment and name, in the variables' units, those held out included."""
+        """Root mean square errors by experiment and name, in the variables' units, those held out included: of runs, or
+        with `Filter` and `Innovations`, of predictions one step ahead."""
         s, rows = self.objective.stacked, self.objective.rows
         errors = np.full(s.values.shape, np.nan)
         errors[rows] = self.minimum.found.residual

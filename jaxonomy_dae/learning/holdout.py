@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .coordinates import Coordinates
-from .least_squares import Weights, minimise
+from .least_squares import Weights
 from .objective import Objective
 
 
@@ -20,32 +20,22 @@ def with_own_starts(objective: Objective, z: Float[np.ndarray, " f"], weights: W
     c = _at(objective.coordinates, full)
     fixed = np.array(c.fixed)
     fixed[: c.n_shared] = True
-    sigma = objective.evidence.sigma(weights)
+    sigma = objective.sigma(z, weights)
     alone = dataclasses.replace(
         objective.with_noise(sigma), coordinates=dataclasses.replace(c, fixed=fixed), counted=held, penalties={}
     )
     if not alone.free.any() or not len(alone.rows[0]):
         return full
-    best = minimise(
-        alone.evaluate,
-        alone.residual,
-        full[alone.free],
-        alone.bounds,
-        alone.weights,
-        noise=dict(objective.layout.options)["rtol"],
-    )
+    best = alone.lowest(full[alone.free])
     return full if best is None else alone.full(best.z)
 
 
 def holdout_score(objective: Objective, z: Float[np.ndarray, " f"], weights: Weights) -> float:
     """The root mean square of the residuals of experiments that are held out, in units of the noise; infinite where a
     run fails."""
-    s = objective.with_noise(objective.evidence.sigma(weights)).stacked
+    s = objective.stacked
     rows = np.nonzero(s.observed & s.holdout[:, None, None])
-    outputs = objective.predicted(with_own_starts(objective, z, weights)).outputs
-    sigma = np.where(np.isnan(s.sigma), 1.0, s.sigma)[rows[0], rows[2]]
-    residual = (outputs[rows] - s.values[rows]) / sigma
-    return float(np.sqrt(np.mean(residual**2))) if np.isfinite(residual).all() else np.inf
+    return objective.scored(with_own_starts(objective, z, weights), objective.sigma(z, weights), rows)
 
 
 def _at(c: Coordinates, full: Float[np.ndarray, " p"]) -> Coordinates:

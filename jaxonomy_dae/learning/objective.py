@@ -19,7 +19,7 @@ from .coordinates import Coordinates
 from .data import Stacked
 from .evidence import Evidence
 from .experiment import Unknown
-from .least_squares import Evaluation, Weights
+from .least_squares import Evaluation, Minimum, Weights, minimise
 from .program import Conditions, Layout, predict, predict_and_differentiate
 
 
@@ -128,6 +128,33 @@ class Objective:
         outputs = predict(self.system, self.observers, self.layout, forwards, shared, own, self.conditions)
         found = np.asarray(outputs, np.float64)[self.rows] - self.stacked.values[self.rows]
         return found if np.isfinite(found).all() else None
+
+    def lowest(
+        self, start: Float[np.ndarray, " f"], steps: int = 200, weights: Weights | None = None
+    ) -> Minimum | None:
+        """The minimum next to a start, None if that cannot be evaluated; with `weights` that stay as they are, or those
+        that the data choose."""
+        if weights is None:
+            weigh, reweigh = self.weights, None if self.evidence.is_idle else self.evidence.reweigh
+        else:
+            weigh, reweigh = lambda *_: weights, None
+        return minimise(self.evaluate, self.residual, start, self.bounds, weigh, reweigh, steps, self.tolerance)
+
+    @property
+    def tolerance(self) -> float:
+        """Of the integration, relative: that of Jacobians."""
+        return float(dict(self.layout.options)["rtol"])
+
+    def sigma(self, z: Float[np.ndarray, " f"], weights: Weights) -> dict[str, float]:
+        """Noise levels that were estimated, by name, at a minimum."""
+        return self.evidence.sigma(weights)
+
+    def scored(self, full: Float[np.ndarray, " p"], sigma: dict[str, float], rows: tuple[np.ndarray, ...]) -> float:
+        """The root mean square of residuals of chosen samples, in units of the noise; infinite where a run fails."""
+        s = self.with_noise(sigma).stacked
+        level = np.where(np.isnan(s.sigma), 1.0, s.sigma)[rows[0], rows[2]]
+        residual = (self.predicted(full).outputs[rows] - s.values[rows]) / level
+        return float(np.sqrt(np.mean(residual**2))) if np.isfinite(residual).all() else np.inf
 
     # --- weights -----------------------------------------------------------------------------------------------
 

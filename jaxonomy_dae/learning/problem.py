@@ -20,10 +20,12 @@ from .coordinates import Coordinates, coordinates
 from .data import Data, Stacked, stack
 from .estimate import Estimate
 from .experiment import Experiment, Unknown
+from .filter_objective import AheadObjective, FilterObjective
+from .filtering import Extra, Filter, Innovations, Structure, check_model, structure_and_extras
 from .first_order import adam_steps
 from .holdout import holdout_score
 from .identifiability import Identifiability, identifiability
-from .least_squares import Evaluation, Minimum, Weights, minimise
+from .least_squares import Evaluation, Minimum, Weights
 from .multiple_shooting import Shooting, shoot
 from .objective import Objective
 from .program import Layout, predict, weights_of, with_values
@@ -51,8 +53,9 @@ class Problem:
         laws.
     - `observe`: derived outputs by name, `{"gauge.y": law}`, with `law(solution)` of shape `(n,)`: a function, or an
         Equinox module whose weights may be trained.
-    - `method`: `"single"`, each experiment is one run; `"growing"`, the same with growing `horizons`; or
-        `Shooting(...)`, multiple shooting, for what diverges.
+    - `method`: `"single"`, each experiment is one run; `"growing"`, the same with growing `horizons`;
+        `Shooting(...)`, multiple shooting, for what diverges; or for equations with errors, `Filter(...)`, the
+        likelihood of a Kalman filter, or `Innovations(...)`, predictions one step ahead.
     - `rtol`, `atol`, `max_steps`, and others in `options`: as in `simulate`.
 
     **Raises:**
@@ -70,7 +73,7 @@ class Problem:
         starts: Mapping[str, Any] | None = None,
         regularize: Mapping[str, Any] | str | float | None = "evidence",
         observe: Mapping[str, Any] | None = None,
-        method: str | Shooting = "single",
+        method: str | Shooting | Filter | Innovations = "single",
         rtol: float = 1e-6,
         atol: float = 1e-8,
         max_steps: int = 4096,
@@ -89,10 +92,10 @@ class Problem:
         self.starts = dict(starts or {})
         self._options = {"rtol": rtol, "atol": atol, "max_steps": max_steps, **options}
         self._train = self._names(train)
+        self.method = self._method(method)
         self._stacked = self._stack(self.data)
         self._layout = self._laid_out(self._stacked)
         self.penalties = self._penalties(regularize)
-        self.method = self._method(method)
 
     # --- set-up ------------------------------------------------------------------------------------------------
 
@@ -134,20 +137,32 @@ class Problem:
 
     def _laid_out(self, stacked: Stacked) -> Layout:
         parameters, modules = self._train
+        _, extras = self._errors(stacked)
         shared, own, known = [], [], []
         for name, values in stacked.starts.items():
             unknown = [v for v in values if isinstance(v, Unknown)]
             self._check_start(name, bool(unknown))
-            kind = known if not unknown else shared if unknown[0].shared else own
+            kind = known if not unknown or self._is_marginal(name, unknown) else shared if unknown[0].shared else own
             kind.append(name)
-        if not parameters and not modules and not shared and not own:
+        if not parameters and not modules and not shared and not own and all(e.fixed for e in extras):
             raise ModelError(
                 "nothing is to be learned: name parameters, networks or sensor laws in train=, or make a start Unknown"
             )
         return Layout(
             stacked.outputs, tuple(parameters), tuple(modules), tuple(shared), tuple(own), tuple(known), stacked.kinds,
-            tuple(self._options.items()),
+            tuple(self._options.items()), tuple(e.name for e in extras),
         )  # fmt: skip
+
+    def _errors(self, stacked: Stacked) -> tuple[Structure, tuple[Extra, ...]]:
+        """What the method adds to the program, and its coordinates."""
+        if isinstance(self.method, Filter | Innovations):
+            return structure_and_extras(self.method, self.system, stacked)
+        return Structure(), ()
+
+    def _is_marginal(self, name: str, unknown: list[Unknown]) -> bool:
+        """Whether the prior of a start is that of a filter, which needs no search."""
+        own = all(u.spread is not None and not u.shared for u in unknown)
+        return isinstance(self.method, Filter) and own and name not in self.system.parameters.table.names
 
     def _check_start(self, name: str, is_unknown: bool) -> None:
         plan, table = self.system.plan, self.system.parameters.table
@@ -181,9 +196,15 @@ class Problem:
                 raise ModelError(f"regularize: '{name}' takes 'evidence', a precision ≥ 0 or None; got {value!r}")
         return {name: given.get(name) for name in modules}
 
-    def _method(self, given: Any) -> str | Shooting:
+    def _method(self, given: Any) -> str | Shooting | Filter | Innovations:
+        if isinstance(given, Filter | Innovations):
+            check_model(given, self.system)
+            return given
         if given not in METHODS and not isinstance(given, Shooting):
-            raise ModelError(f"method is 'single', 'growing' or Shooting(nodes=30); got {given!r}")
+            raise ModelError(
+                "method is 'single', 'growing' or Shooting(nodes=30), Filter(noise={'room.T': 'estimate'}) or "
+                f"Innovations(); got {given!r}"
+            )
         plan = self.system.plan
         if isinstance(given, Shooting) and self.system.discretes:
             raise ModelError(
@@ -223,7 +244,7 @@ class Problem:
         """
         layout, s = self._layout, self._stacked
         model = self.system if model is None else model.merged()
-        objective = self._objective(s, coordinates(self.system, self.observers, layout, s))
+        objective = self._objective(s, coordinates(self.system, self.observers, layout, s, self._errors(s)[1]))
         shared, own = objective.numbers(objective.coordinates.start)
         shared = shared[len(shared) - len(layout.shared) :]
         for name, value in (starts or {}).items():
@@ -234,7 +255,7 @@ class Problem:
                 own = own.at[:, layout.own.index(name)].set(value)
             else:
                 raise ModelError(f"the start of '{name}' is not unknown: " + nearest(name, layout.shared + layout.own))
-        plain = dataclasses.replace(layout, parameters=(), modules=())
+        plain = dataclasses.replace(layout, parameters=(), modules=(), extra=())
         observers = self.observers | dict(observe or {})
         outputs = predict(model, observers, plain, adjoint, shared, own, objective.conditions)
         sigma = np.where(np.isnan(s.sigma), 1.0, s.sigma)
@@ -245,7 +266,11 @@ class Problem:
         }
 
     def _objective(self, stacked: Stacked, c: Coordinates) -> Objective:
-        return Objective(self.system, self.observers, self._layout, stacked, c, self.penalties, ~stacked.holdout)
+        given = (self.system, self.observers, self._layout, stacked, c, self.penalties, ~stacked.holdout)
+        if not isinstance(self.method, Filter | Innovations):
+            return Objective(*given)
+        kind = FilterObjective if isinstance(self.method, Filter) else AheadObjective
+        return kind(*given, self._errors(stacked)[0])
 
     # --- fitting -----------------------------------------------------------------------------------------------
 
@@ -276,7 +301,7 @@ class Problem:
         - `first`: steps of an optimizer of Optax before those of least squares; `estimate.training` is their history.
         - `starts`: from how many points; all but the first are drawn around it by `seed`: parameters within a factor of
             e or their bounds, starts by their spread, networks with weights of the same sizes. The best is the one of
-            the least score on experiments that are held out, or else of the least cost.
+            the least score on experiments that are held out, or else, and for a `Filter`, of the least cost.
         - `adam`: so many gradient steps at first, with `learning_rate` on the scale of the coordinates.
         - `horizons`: shares of the time that are fitted one after the other, such as `(0.25, 0.5, 1)`: what diverges
             over the whole time is caught early. None: all of it, or with `method="growing"`, ten of them.
@@ -292,8 +317,7 @@ class Problem:
         if first is not None and (adam or (starts > 1 and first.checkpoint is not None)):
             other = "adam=" if adam else "a checkpoint with several starts"
             raise ModelError(f"first= does not go with {other}: leave one of them out")
-        if isinstance(self.method, Shooting) and (adam or horizons is not None):
-            raise ModelError("adam and horizons belong to single shooting: leave them out, or use method='single'")
+        self._check_steps(adam, horizons, first)
         if horizons is None:
             horizons = GROWING if self.method == "growing" else (1.0,)
         shares = [float(share) for share in horizons]
@@ -308,7 +332,8 @@ class Problem:
             found = self._descend(objective, point, shares, steps, adam, learning_rate)
             if found is None:
                 continue
-            score = holdout_score(objective, found.z, found.weights) if stacked.holdout.any() else found.cost
+            by_cost = isinstance(self.method, Filter) or not stacked.holdout.any()
+            score = found.cost if by_cost else holdout_score(objective, found.z, found.weights)
             if best is None or score < best[0]:
                 best = score, found, training
         if best is None:
@@ -331,6 +356,7 @@ class Problem:
         """
         if not isinstance(how, GradientSteps):
             raise ModelError(f"train takes learning.GradientSteps(optax.adam(0.02), steps=200); got {how!r}")
+        self._check_steps(0, None, how)
         objective = self._prepared(data, freeze, start, bounds)
         return train(self, objective, objective.coordinates.z_start[objective.free], how)
 
@@ -346,6 +372,16 @@ class Problem:
             raise ModelError("everything is frozen: there is nothing to fit")
         return objective
 
+    def _check_steps(self, adam: int, horizons: Any, first: Any) -> None:
+        """Raises a `ModelError` for steps that the method does not take."""
+        if isinstance(self.method, Shooting) and (adam or horizons is not None):
+            raise ModelError("adam and horizons belong to single shooting: leave them out, or use method='single'")
+        if isinstance(self.method, Filter | Innovations) and (adam or first is not None):
+            raise ModelError(
+                f"gradient steps are those of runs, not of {type(self.method).__name__}: train with method='single' "
+                "first, and give fit(start=training.values)"
+            )
+
     def not_simulated(self, objective: Objective) -> SimulationError:
         """The error where no start can be simulated."""
         return SimulationError(self._why(objective))
@@ -358,7 +394,7 @@ class Problem:
                 raise ModelError("start is a system of another model: give one of the same, or values by names")
         elif start is not None and not isinstance(start, Training):
             values = dict(start)
-        c = coordinates(system, self.observers, self._layout, stacked)
+        c = coordinates(system, self.observers, self._layout, stacked, self._errors(stacked)[1])
         if isinstance(start, Training):
             known = start.objective.coordinates
             if known.names != c.names:
@@ -378,7 +414,9 @@ class Problem:
         c, (low, high) = objective.coordinates, objective.bounds
         first, free = c.z_start[objective.free], objective.free
         rng, points = np.random.default_rng(seed), [first]
-        bounded = np.isfinite(low) & np.isfinite(high)
+        # The bounds of what comes with a method are as far away as can be.
+        bounded = np.isfinite(low) & np.isfinite(high) & ~np.isin(np.array(c.names)[free], self._layout.extra)
+        least, most = np.where(bounded, low, 0.0), np.where(bounded, high, 0.0)
         for _ in range(count - 1):
             width = np.where(c.log[free], 1.0, np.where(c.is_weight[free], 0.0, 1.0))
             width = np.where(np.isfinite(c.spread[free]), c.spread[free], width)
@@ -387,7 +425,7 @@ class Problem:
                 width[chosen] = np.sqrt(np.mean(first[chosen] ** 2)) if chosen.any() else 0.0
             centre = np.where(c.is_weight[free], 0.0, first)
             drawn = centre + width * rng.standard_normal(len(first))
-            inside = low + (high - low) * rng.uniform(size=len(first)) if bounded.any() else drawn
+            inside = least + (most - least) * rng.uniform(size=len(first)) if bounded.any() else drawn
             points.append(np.clip(np.where(bounded, inside, drawn), low, high))
         return points
 
@@ -401,10 +439,7 @@ class Problem:
             here = objective.until(share)
             if adam and share == shares[0]:
                 point = adam_steps(here, point, adam, rate)
-            reweigh = None if here.evidence.is_idle else here.evidence.reweigh
-            found = minimise(
-                here.evaluate, here.residual, point, here.bounds, here.weights, reweigh, steps, self._options["rtol"]
-            )
+            found = here.lowest(point, steps)
             if found is None:
                 return None
             point = found.z
@@ -421,7 +456,7 @@ class Problem:
                 return None
             cost = weights.cost(start, found.residual)
             return Minimum(start, found, weights, cost, [cost], 1, True, "nothing is searched", rtol)
-        return minimise(objective.evaluate, objective.residual, start, objective.bounds, lambda *_: weights, noise=rtol)
+        return objective.lowest(start, weights=weights)
 
     def _why(self, objective: Objective) -> str:
         """The first reason for which a run from the start fails."""

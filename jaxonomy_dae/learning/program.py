@@ -36,6 +36,7 @@ class Layout:
     known: tuple[str, ...]  # starts that are given
     kinds: tuple[tuple[str, str], ...]  # of inputs
     options: tuple[tuple[str, Any], ...]  # of `simulate`
+    extra: tuple[str, ...] = ()  # coordinates that come with a method, before the shared starts
 
     @property
     def n_own(self) -> int:
@@ -82,7 +83,7 @@ def with_values(system: AcausalSystem, observers: dict[str, Any], layout: Layout
             system = eqx.tree_at(lambda s, name=name: s.neural[name], system, changed)
         else:
             observers = {**observers, name: changed}
-    return system, observers, shared[n:]
+    return system, observers, shared[n + len(layout.extra) :]
 
 
 def placed(
@@ -126,7 +127,7 @@ def outputs_of(solution: Any, observers: dict[str, Any], layout: Layout, dtype: 
     return jnp.stack([read[n] if n in read else jnp.asarray(derived[n], dtype) for n in layout.outputs], axis=1)
 
 
-def _each(function: Callable, shared: Any, own: Any, conditions: Conditions) -> Any:
+def each(function: Callable, shared: Any, own: Any, conditions: Any) -> Any:
     """`function(shared, own, conditions)` of each experiment; a single one is not made a batch, which costs compile
     time."""
     if own.shape[0] == 1:
@@ -145,7 +146,7 @@ def predict(
     def one(shared, own, c):
         return _one(system, observers, layout, adjoint, shared, own, c)
 
-    return _each(one, shared, own, conditions)
+    return each(one, shared, own, conditions)
 
 
 @compiled
@@ -162,4 +163,4 @@ def predict_and_differentiate(
         (by_shared, by_own), found = jax.jacfwd(one, argnums=(0, 1), has_aux=True)(shared, own, c)
         return found, by_shared, by_own
 
-    return _each(with_slopes, shared, own, conditions)
+    return each(with_slopes, shared, own, conditions)

@@ -10,7 +10,7 @@ from hybrid_models import Doubling
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv
 from jaxonomy_dae.errors import ModelError
-from jaxonomy_dae.learning import Data, Experiment, GradientSteps, Problem, Shooting, Unknown
+from jaxonomy_dae.learning import Data, Experiment, Filter, GradientSteps, Innovations, Problem, Shooting, Unknown
 from jaxonomy_dae.modeling import Component, Eq, der
 
 TIMES = np.array([1.0, 2.0, 3.0])
@@ -146,6 +146,13 @@ def test_csv_with_missing_cells_and_dates(tmp_path):
         (lambda: GradientSteps(optax.sgd(0.1), -1), "steps is a whole number ≥ 0; got -1"),
         (lambda: GradientSteps(optax.sgd(0.1), 5, batch=0), "batch is a whole number ≥ 1; got 0"),
         (lambda: GradientSteps(optax.sgd(0.1), 5, horizons=(1.0, 0.5)), "the last of them 1"),
+        (lambda: Filter({}), "noise is a dictionary by names of states"),
+        (lambda: Filter({"tank.level": 0.0}), "noise of 'tank.level' is a number > 0, 'estimate' or Unknown"),
+        (lambda: Filter({"tank.level": "guess"}), "noise of 'tank.level' is a number > 0, 'estimate' or .*'guess'"),
+        (lambda: Filter({"tank.level": 1.0}, substeps=0), "substeps is a whole number ≥ 1; got 0"),
+        (lambda: Innovations("all"), "gain is 'estimate', or a dictionary by pairs"),
+        (lambda: Innovations({"tank.level": 0.1}), r"a dictionary by pairs \(state, output\)"),
+        (lambda: Innovations({("a", "b"): np.nan}), "gain of 'a' by 'b' is a finite number, 'estimate' or Unknown"),
     ],
 )
 def test_methods(make, words):
@@ -167,3 +174,35 @@ def test_methods_of_a_problem(system):
         Problem(
             AcausalCompiler(ev, diagram)(), Experiment(TIMES, {"d.y": TIMES}), train=["d.a"], method=Shooting(nodes=3)
         )
+
+
+@pytest.mark.parametrize(
+    "method, words",
+    [
+        (Filter({"tank.lvl": 0.1}), "noise: 'tank.lvl' is not a variable: did you mean 'tank.level'"),
+        (Filter({"tank.outflow": 0.1}), "'tank.outflow' is not a differential state .*; these are: 'tank.level'"),
+        (Filter({"tank.level": 0.1, "tank.k": 0.1}), "noise: 'tank.k' is not a variable"),
+        (Innovations({("tank.level", "tank.flow"): 0.1}), "there are no data of 'tank.flow'"),
+        (Innovations({("tank.outflow", "tank.level"): 0.1}), "'tank.outflow' is not a differential state"),
+    ],
+)
+def test_names_of_errors_in_equations(system, method, words):
+    with pytest.raises(ModelError, match=words):
+        Problem(system, record(), train=["tank.k"], method=method)
+
+
+def test_what_filters_do_not_do(system):
+    problem = Problem(system, record(), train=["tank.k"], method=Filter({"tank.level": "estimate", "tank.u": 0.1}))
+    names = problem._coordinates(problem._stacked, (), None, None).names
+    assert names == ("tank.k", "noise of tank.level", "noise of tank.u", "sigma of tank.level")
+    for given in (dict(adam=3), dict(first=GradientSteps(optax.sgd(0.1), 5))):
+        with pytest.raises(ModelError, match="gradient steps are those of runs, not of Filter"):
+            problem.fit(**given)
+    with pytest.raises(ModelError, match="gradient steps are those of runs"):
+        problem.train(GradientSteps(optax.sgd(0.1), 5))
+    with pytest.raises(ModelError, match="name other outputs"):  # a noise level that is known now
+        problem.fit(record(sigma=0.1))
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    diagram.add(Doubling(ev, "d"))
+    with pytest.raises(ModelError, match="Innovations: 'd.d' is a discrete variable"):
+        Problem(AcausalCompiler(ev, diagram)(), Experiment(TIMES, {"d.y": TIMES}), train=["d.a"], method=Innovations())

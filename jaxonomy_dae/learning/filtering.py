@@ -1,0 +1,307 @@
+"""Errors in the equations, for `Problem(method=...)`: process noise, or what was measured fed back.
+
+A settings object is turned into what the program is built from (`Structure`, names and places alone) and into the
+coordinates that come with it (`Extra`, with guesses that the data suggest).
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ..errors import ModelError, nearest
+from ..system.system import AcausalSystem
+from .data import Stacked
+from .experiment import ESTIMATE, Unknown
+from .linear_models import is_linear
+
+FAR = 1e6  # how far, as a factor, a level may move from its guess: beyond, it counts as none, or as a bad guess
+HIDDEN = 0.1  # guessed noise of a state that was not measured, relative to measured ones, each in units of its size
+
+
+@dataclasses.dataclass(frozen=True)
+class Filter:
+    """Process noise, for `Problem(method=...)`: the equations hold up to white noise,
+
+        dx = f(x, u + ν, t) dt + σ dw,    y = h(x, u, t) + e,
+
+    and the likelihood is that of the one-step prediction errors of a continuous-discrete extended Kalman filter
+    (Jazwinski 1970, section 8.3; Kristensen, Madsen & Jørgensen 2004, Automatica 40:225, equations 8 to 17). For linear
+    models it is exact.
+
+    - `noise`: by names of states, σ in the state's unit per √second; by names of inputs, the intensity of white noise ν
+        that is added to the input, in the input's unit times √second: a force on a mechanism, whose constraints then
+        hold exactly. Each a number, `"estimate"`, or `Unknown(guess)`, which is estimated, with `spread` the relative
+        standard deviation of a prior. The name of an array stands for each of its entries.
+    - `substeps`: into how many parts the time between samples is cut. The flow and its derivatives are exact at any
+        distance; the noise that is gathered on the way is integrated with a Jacobian that is constant over each part.
+
+    Starts that are `Unknown(guess, spread)` have the normal prior of Kalman's filter, and are not searched; those
+    without a spread are estimated. Noise levels of measurements that are to be estimated are coordinates too.
+    """
+
+    noise: Mapping[str, Any]
+    substeps: int = 1
+
+    def __post_init__(self):
+        if not isinstance(self.noise, Mapping) or not self.noise:
+            raise ModelError(
+                f"Filter: noise is a dictionary by names of states, {{'room.T': 0.05}}; got {self.noise!r}"
+            )
+        for name, value in self.noise.items():
+            _check(f"Filter: noise of '{name}'", value, positive=True)
+        if not isinstance(self.substeps, int) or isinstance(self.substeps, bool) or self.substeps < 1:
+            raise ModelError(f"Filter: substeps is a whole number ≥ 1; got {self.substeps!r}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Innovations:
+    """Predictions one step ahead, for `Problem(method=...)`: each sample moves the states by a constant gain K times
+    what it deviates from its prediction (the prediction-error form; Ljung 1999, System Identification, section 4.3),
+
+        x ← x + K (y − ŷ),
+
+    and the sum of squared prediction errors is least. It is less than a filter, whose gain follows from noise levels,
+    but needs no covariance, and its cost for each step is that of simulation.
+
+    - `gain`: `"estimate"`, of every differential state by every output; or by pairs of names (state, output), a number,
+        `"estimate"` or `Unknown(guess, spread)`; other entries of K are zero.
+    """
+
+    gain: Mapping[tuple[str, str], Any] | str = ESTIMATE
+
+    def __post_init__(self):
+        if isinstance(self.gain, str) and self.gain == ESTIMATE:
+            return
+        by_pairs = isinstance(self.gain, Mapping) and all(isinstance(k, tuple) and len(k) == 2 for k in self.gain)
+        if not by_pairs or not self.gain:
+            raise ModelError(
+                "Innovations: gain is 'estimate', or a dictionary by pairs (state, output), "
+                f"{{('room.T', 'room.T'): 'estimate'}}; got {self.gain!r}"
+            )
+        pairs: Any = self.gain
+        for (state, output), value in pairs.items():
+            _check(f"Innovations: gain of '{state}' by '{output}'", value, positive=False)
+
+
+def _check(what: str, value: Any, positive: bool) -> None:
+    """A number, "estimate" or an `Unknown`."""
+    if isinstance(value, str) and value == ESTIMATE:
+        return
+    number: Any = value.guess if isinstance(value, Unknown) else value
+    plain = isinstance(number, int | float | np.number) and not isinstance(number, bool)
+    if plain and math.isfinite(number) and (number > 0 or not positive):
+        return
+    needed = "a number > 0" if positive else "a finite number"
+    raise ModelError(f"{what} is {needed}, 'estimate' or Unknown(guess); got {value!r}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Structure:
+    """What a program is built from.
+
+    - `noise`: of each intensity, the place in the state array and the factor of the variable named; or the name of an
+        input, and 1.
+    - `sigma`: the outputs whose noise level is a coordinate.
+    - `gain`: (place in the state array, output, factor) of each entry of a constant gain.
+    - `substeps`: how many parts the time between samples has.
+    - `is_linear`: whether the flow is a matrix exponential.
+    """
+
+    noise: tuple[tuple[int | str, float], ...] = ()
+    sigma: tuple[int, ...] = ()
+    gain: tuple[tuple[int, int, float], ...] = ()
+    substeps: int = 1
+    is_linear: bool = False
+
+    @property
+    def is_filter(self) -> bool:
+        """Whether a covariance is propagated."""
+        return bool(self.noise)
+
+
+@dataclasses.dataclass(frozen=True)
+class Extra:
+    """A coordinate that comes with a method; `spread` is that of its prior, on the coordinate's scale."""
+
+    name: str
+    unit: str
+    log: bool
+    size: float
+    guess: float
+    low: float
+    high: float
+    spread: float
+    fixed: bool
+
+
+def structure_and_extras(
+    method: Filter | Innovations, system: AcausalSystem, stacked: Stacked
+) -> tuple[Structure, tuple[Extra, ...]]:
+    """What the program is built from, and the coordinates.
+
+    **Raises:**
+
+    - `ModelError` for names that are not those of differential states or outputs.
+    """
+    linear = is_linear(system) and "cubic" not in dict(stacked.kinds).values()
+    units = dict(zip(system.plan.flat.variables.names, system.plan.flat.variables.unit, strict=True))
+    if isinstance(method, Innovations):
+        gains = _gains(method, system, stacked)
+        nominal = system.plan.nominal
+        size_of = {j: _size(stacked, j) for j in range(len(stacked.outputs))}
+        extras = []
+        for name, value, place, output, factor in gains:
+            size = abs(float(nominal[place]) * factor) / size_of[output]
+            extras.append(_extra(name, "", value, 0.0, size, log=False))
+        return Structure(gain=tuple((p, j, f) for _, _, p, j, f in gains), is_linear=linear), tuple(extras)
+    noise = _noise(method, system)
+    guesses = _intensities(system, stacked, [place for _, _, place, _ in noise])
+    extras = [
+        _extra(
+            f"noise of {name}",
+            _noise_unit(place, units.get(name, "")),
+            value,
+            guesses[place] * abs(factor),
+            1.0,
+            log=True,
+        )
+        for name, value, place, factor in noise
+    ]
+    unknown = np.isnan(stacked.sigma) & stacked.observed.any(axis=1)
+    estimated = tuple(np.flatnonzero(unknown.any(axis=0)).tolist())
+    for j in estimated:
+        name = stacked.outputs[j]
+        guess = 0.5 * _increments(stacked, j)[0]
+        extras.append(_extra(f"sigma of {name}", units.get(name, ""), ESTIMATE, guess, 1.0, log=True))
+    places = tuple((place, factor) for _, _, place, factor in noise)
+    return Structure(noise=places, sigma=estimated, substeps=method.substeps, is_linear=linear), tuple(extras)
+
+
+def check_model(method: Filter | Innovations, system: AcausalSystem) -> None:
+    """Raises a `ModelError` for models that cannot be followed sample by sample."""
+    what, plan = type(method).__name__, system.plan
+    if system.discretes:
+        raise ModelError(
+            f"{what}: '{system.discretes[0]}' is a discrete variable, which is not normal and which no measurement "
+            "corrects: use method='single' or 'growing'"
+        )
+    if plan.held is not None:
+        raise ModelError(
+            f"{what}: constraints of this model come and go with its modes, and its degrees of freedom with them: use "
+            "method='single' or 'growing'"
+        )
+    if isinstance(method, Filter) and plan.events is not None:
+        raise ModelError(
+            f"Filter: relations or events of this model ({plan.events.names[0]}) would need second derivatives through "
+            "events, which are not computed: leave relations that only bend alone with smooth(...), or use Innovations"
+        )
+    if plan.events is not None and (plan.events.state >= 0).any():
+        raise ModelError(
+            f"{what}: events of this model write states ({plan.events.names[0]}), and a correction may carry a state "
+            "past the event: use method='single' or 'growing'"
+        )
+
+
+def _noise(method: Filter, system: AcausalSystem) -> list[tuple[str, Any, int | str, float]]:
+    """(name, value, place, factor) of each intensity, those of arrays by their entries."""
+    found: list[tuple[str, Any, int | str, float]] = []
+    for name, value in method.noise.items():
+        for one in system.plan.entry_names([name]):
+            is_input = one in system.plan.inputs.place
+            place, factor = (one, 1.0) if is_input else _state(system, one, "Filter: noise")
+            double = [other for other, _, p, _ in found if p == place]
+            if double:
+                raise ModelError(f"Filter: noise of '{one}' is given twice, also as that of '{double[0]}'")
+            found.append((one, value, place, factor))
+    return found
+
+
+def _gains(method: Innovations, system: AcausalSystem, stacked: Stacked) -> list[tuple[str, Any, int, int, float]]:
+    """(name, value, place, output, factor) of each entry of K."""
+    given = method.gain
+    if isinstance(given, str):
+        given = {(state, output): ESTIMATE for state in system.states for output in stacked.outputs}
+    found = []
+    for (state, output), value in given.items():
+        place, factor = _state(system, state, "Innovations: gain")
+        if output not in stacked.outputs:
+            raise ModelError(f"Innovations: there are no data of '{output}': " + nearest(output, stacked.outputs))
+        found.append((f"gain of {state} by {output}", value, place, stacked.outputs.index(output), factor))
+    return found
+
+
+def _state(system: AcausalSystem, name: str, what: str) -> tuple[int, float]:
+    """The place of a variable in the state array, and its factor."""
+    plan = system.plan
+    if name not in plan.variable_index:
+        raise ModelError(f"{what}: '{name}' is not a variable: " + nearest(name, system.states))
+    quantity, factor = plan.resolve([name])
+    place = np.flatnonzero(plan.states == quantity[0])
+    if not len(place):
+        known = ", ".join(repr(s) for s in system.states[:8])
+        raise ModelError(f"{what}: '{name}' is not a differential state of the compiled system; these are: {known}")
+    return int(place[0]), float(factor[0])
+
+
+def _extra(name: str, unit: str, value: Any, guess: float, size: float, *, log: bool) -> Extra:
+    known = not isinstance(value, Unknown | str)
+    spread = math.inf
+    if isinstance(value, Unknown):
+        guess = float(value.guess)
+        spread = math.inf if value.spread is None else float(value.spread) / (1.0 if log else size)
+    elif known:
+        guess = float(value)
+    low, high = (guess / FAR, guess * FAR) if log else (-math.inf, math.inf)
+    return Extra(name, unit, log, size, guess, low, high, spread, known)
+
+
+def _noise_unit(place: int | str, unit: str) -> str:
+    if isinstance(place, str):
+        return f"{unit}*s^0.5" if unit else "s^0.5"
+    return f"{unit}/s^0.5" if unit else "1/s^0.5"
+
+
+def _increments(stacked: Stacked, j: int) -> tuple[float, float]:
+    """The root mean squares of what an output changes by from sample to sample, and of that per √time."""
+    steps, rates = [], []
+    for k in np.flatnonzero(~stacked.holdout):
+        seen = stacked.observed[k, :, j]
+        change, dt = np.diff(stacked.values[k, seen, j]), np.diff(stacked.times[k, seen])
+        steps.append(change)
+        rates.append(change / np.sqrt(dt))
+    step, rate = np.concatenate(steps), np.concatenate(rates)
+    least = 1e-3 * _size(stacked, j)
+    if not len(step):
+        return least, least
+    return max(float(np.sqrt(np.mean(step**2))), least), max(float(np.sqrt(np.mean(rate**2))), least)
+
+
+def _size(stacked: Stacked, j: int) -> float:
+    return float(np.max(np.abs(stacked.values[:, :, j]), initial=0.0)) or 1.0
+
+
+def _intensities(system: AcausalSystem, stacked: Stacked, places: list[int | str]) -> dict[int | str, float]:
+    """Guesses of intensities: half of what a measured state changes by per √time, and for others, a part of it; of an
+    input, a part of its size."""
+    plan = system.plan
+    found: dict[int | str, float] = {}
+    nominal = np.asarray(plan.nominal, float)
+    for j, name in enumerate(stacked.outputs):
+        if name not in plan.variable_index:
+            continue
+        quantity, factor = plan.resolve([name])
+        for place in np.flatnonzero(plan.states == quantity[0]).tolist():
+            found[place] = 0.5 * _increments(stacked, j)[1] / abs(float(factor[0]))
+    span = float(np.max(stacked.times[:, -1] - stacked.t0))
+    known = [found[p] / nominal[p] for p in found]
+    typical = float(np.mean(known)) if known else HIDDEN / math.sqrt(span)
+    for place in places:
+        if isinstance(place, str):
+            size = float(np.max(np.abs(stacked.inputs[place][1]), initial=0.0)) if place in stacked.inputs else 0.0
+            found[place] = HIDDEN * (size or 1.0) * math.sqrt(span / stacked.times.shape[1])
+        elif place not in found:
+            found[place] = HIDDEN * typical * float(nominal[place])
+    return found

@@ -1,0 +1,117 @@
+"""What samples tell of states: filtered, smoothed, and predicted some steps ahead."""
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ..errors import ModelError, nearest
+from .filter_objective import AheadObjective, FilterObjective
+from .filter_program import Track, go_on, read_states
+from .prediction import Prediction
+
+if TYPE_CHECKING:
+    from .estimate import Estimate
+
+SINGULAR = 1e-12  # eigenvalues of a scaled covariance, relative to the largest, that count as none
+
+
+def followed(
+    estimate: "Estimate", names: list[str], experiment: int | str, how: str, steps: int, factor: float
+) -> Prediction:
+    """Variables of an experiment: `"filtered"`, `"smoothed"` or `"ahead"` by a number of steps."""
+    objective = estimate.objective
+    kinds = (FilterObjective,) if how != "ahead" else (AheadObjective,)
+    if not isinstance(objective, AheadObjective) or not isinstance(objective, kinds):
+        needed = "learning.Filter" if how != "ahead" else "learning.Filter or learning.Innovations"
+        raise ModelError(f"{how} variables are those of Problem(method={needed}(...))")
+    s, plan = objective.stacked, objective.system.plan
+    k = s.labels.index(experiment) if experiment in s.labels else experiment
+    if not isinstance(k, int) or not -len(s.labels) <= k < len(s.labels):
+        raise ModelError(f"there is no experiment {experiment!r}: " + nearest(str(experiment), s.labels))
+    count = s.counts[k]
+    if not isinstance(steps, int) or isinstance(steps, bool) or not 1 <= steps <= count:
+        raise ModelError(f"steps is a whole number from 1 to the {count} samples of this experiment; got {steps!r}")
+    names = [n for name in names for n in ([name] if name in objective.observers else plan.entry_names([name]))]
+    for name in names:
+        if name not in objective.observers:
+            plan.resolve([name])
+    found = jax.tree.map(lambda a: a[k, :count], objective.track(estimate.point))
+    first = 0
+    if how == "filtered":
+        x, p, q = found.after, found.p_after, found.discrete
+    elif how == "smoothed":
+        x, p = smooth(found, len(plan.states))
+        q = found.discrete
+    elif steps == 1:
+        x, p, q = found.before, found.p_before, found.discrete
+    else:
+        x, p, q = _further(objective, estimate.point, k, count, found, steps)
+        first = steps
+    mean, spread = _read(objective, estimate.point, k, slice(first, count), names, x, p, q)
+    times = s.times[k, :count]
+    if first:  # nothing was predicted so far ahead of the first ones
+        missing = np.full((first, len(names)), np.nan)
+        mean, spread = np.concatenate([missing, mean]), np.concatenate([missing, spread])
+    if not isinstance(objective, FilterObjective):
+        spread = np.full_like(spread, np.nan)
+    by = [dict(zip(names, a.T, strict=True)) for a in (mean, spread, mean - factor * spread, mean + factor * spread)]
+    return Prediction(times, *by)
+
+
+def smooth(found: Track, f: int) -> tuple[Float[np.ndarray, "n x"], Float[np.ndarray, "n f f"]]:
+    """States and covariances from all samples, those after each time too (Rauch, Tung & Striebel 1965, AIAA J. 3:1445),
+    of one experiment with f differential states."""
+    before, p_before, after, p_after, flow = (
+        np.asarray(a, np.float64) for a in (found.before, found.p_before, found.after, found.p_after, found.flow)
+    )
+    x, p = np.array(after), np.array(p_after)
+    for t in range(len(x) - 2, -1, -1):
+        gain = p_after[t] @ flow[t + 1].T @ _inverse(p_before[t + 1])
+        x[t, :f] += gain @ (x[t + 1] - before[t + 1])[:f]
+        p[t] += gain @ (p[t + 1] - p_before[t + 1]) @ gain.T
+    return x, p
+
+
+def _inverse(p: Float[np.ndarray, "f f"]) -> Float[np.ndarray, "f f"]:
+    """Of a covariance, on the directions in which there is any."""
+    size = np.sqrt(np.maximum(np.diag(p), 0.0))
+    size = np.where(size > 0, size, 1.0)
+    return np.linalg.pinv(p / np.outer(size, size), rcond=SINGULAR, hermitian=True) / np.outer(size, size)
+
+
+def _numbers(objective: AheadObjective, point: Any, k: int, rows: slice) -> tuple[Any, Any, Any]:
+    """(shared, own, what programs are told) of one experiment, at some of its times."""
+    shared, own = objective.numbers(objective.coordinates.natural(point))
+    told = jax.tree.map(lambda a: a[k][None], objective.told)
+    names = ("times", "ends", "values", "observed", "inputs")
+    chosen = {name: jax.tree.map(lambda a: a[:, rows], getattr(told, name)) for name in names}
+    told = dataclasses.replace(told, **chosen)
+    return shared, own[k][None], told
+
+
+def _further(
+    objective: AheadObjective, point: Any, k: int, count: int, found: Track, steps: int
+) -> tuple[Any, Any, Any]:
+    """States, covariances and discrete values that follow `steps` samples after the filtered ones."""
+    shared, own, told = _numbers(objective, point, k, slice(0, count))
+    told = jax.tree.map(lambda a: a[0], told)
+    first = found.after, found.p_after
+    return go_on(
+        objective.system, objective.observers, objective.layout, objective.structure, steps, shared, own[0], told,
+        *first,
+    )  # fmt: skip
+
+
+def _read(
+    objective: AheadObjective, point: Any, k: int, rows: slice, names: list[str], x: Any, p: Any, q: Any
+) -> tuple[np.ndarray, np.ndarray]:
+    shared, own, told = _numbers(objective, point, k, rows)
+    layout = dataclasses.replace(objective.layout, outputs=tuple(names))
+    batch = jax.tree.map(lambda a: jnp.asarray(a, told.times.dtype)[None], (x, p, q))
+    found = read_states(objective.system, objective.observers, layout, shared, own, told, *batch)
+    mean, spread = (np.asarray(a[0], np.float64) for a in found)
+    return mean, spread
