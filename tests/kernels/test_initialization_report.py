@@ -61,7 +61,7 @@ redundant, as they follow from others:
 
 CONTRADICTION = """\
 no consistent initial point was found; what does not hold, worst first:
-  start of b.v, 2: off by 1
+  start of a.v, 1: off by 1
 b.v and a.v are fixed at 2 and 1, which contradict each other: free one start (fixed=False), or give values that \
 agree."""
 
