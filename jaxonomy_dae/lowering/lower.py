@@ -12,7 +12,7 @@ from ..compiler.pipeline import CompiledModel
 from ..compiler.select_states import StateSelection
 from ..linear.sparse import check_solvable
 from ..model.extended import Extended, ExtendedGroup
-from ..model.quantities import QuantityMap, quantity_scale
+from ..model.quantities import QuantityMap, leading_starts, quantity_scale
 from ..model.tables import ZERO, FlatModel, RowInjection
 from .entry_sizes import EntrySizes
 from .gather import Gather
@@ -117,7 +117,7 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
     opaque |= {r.opaque.index: r.opaque for r in flat.rows}
     functions = tuple(opaque[k].function if k in opaque else None for k in range(len(flat.networks)))
     return SystemPlan(
-        _digest(flat, mode, selection, state_order, extended, steps, linear_solver),
+        _digest(flat, variable_map, mode, selection, state_order, extended, steps, linear_solver),
         flat,
         model.alias,
         variable_map,
@@ -214,6 +214,7 @@ def _plan_row(row: RowInjection, inputs, variables: QuantityMap, states, layout:
 
 def _digest(
     flat: FlatModel,
+    variables: QuantityMap,
     mode: str,
     selection: StateSelection,
     states: np.ndarray,
@@ -267,6 +268,7 @@ def _digest(
     if linear_solver is not None:
         feed(repr(linear_solver))
     feed(states, selection.constraints, selection.dummies, extended.base, extended.level)
+    feed(leading_starts(flat, variables))  # depend on the values of parameters
     for step in steps:
         # How a block is torn depends on the values of the parameters.
         if len(step.unknown) > 1 or isinstance(step, SparseStep):

@@ -216,3 +216,21 @@ def test_inputs_and_time_enter():
     inputs = {"c.u": lambda t: 5 * t}
     found = jax.jit(lambda t: system.observe(["c.x", "c.y"], t, system.initialize(t, inputs), inputs))(2.0)
     np.testing.assert_allclose(found, [9.0, 1.0], rtol=1e-12)
+
+
+class TwoBranches(Component):
+    """a = −2·b with a² = 4 + z, which has two solutions; a guess of each."""
+
+    def __init__(self, ev, name, first, second):
+        super().__init__(ev, name)
+        a, b = (self.variable(n, start=self.parameter(f"{n}0", g)) for n, g in (("a", first), ("b", second)))
+        z = self.variable("z", start=0.0, fixed=True)
+        self.add_equations(Eq(a, -2 * b), Eq(a**2, 4 + z), Eq(der(z), 1))
+
+
+def test_guesses_that_differ():
+    """The one that says more counts; not a model of the same structure that came before, with other values."""
+    for first, second, expected in ((0.0, 1.5, -2.0), (3.0, 0.0, 2.0), (0.0, -1.5, 2.0), (0.0, 1.5, -2.0)):
+        system = compiled(TwoBranches(EqnEnv(), "c", first, second))
+        found = system.observe(["c.a"], 0.0, system.initialize())
+        assert float(found[0]) == pytest.approx(expected)
