@@ -24,7 +24,8 @@ from .wrapped_control import WrappedControl
 # In units of the state and what tolerances make of zero, |y| + atol/rtol:
 PUSH = 0.03  # what rests is pushed by in the second run, whose error is then 33·rtol of it
 MOTION = 0.01  # a component rests that would move by less in all the time
-TINY = 1e-6  # of a step: the first one where something rests at the start, since what moves is no measure, and …
+RESOLVED = 0.1  # of the inverse rate of what rests at the start is the first step at most
+TINY = 1e-6  # of a step are …
 SETTLING = 3  # … those after a push, which is to fulfil what Newton solves at the end of a step
 HIGHEST = np.int32(99)  # more than any order
 TRIES = 50  # to find a step that the second run allows; it is given up after as many
@@ -95,11 +96,17 @@ class Resting(eqx.Module):
         return Pushed(x, state, no, no, none, no, x, state, jnp.full_like(jnp.asarray(t), jnp.inf), jnp.array(HIGHEST))
 
     def first_end(self, t: Any, end: Any, y: Any) -> Any:
-        """The end of the first step, which was chosen by what moves: a second run begins after a step only."""
+        """The end of the first step, which was chosen by what moves: a second run begins after a step only. It is not
+        longer than what would resolve rates as large as the slopes after a push."""
         resting, t, end, y = still((self, t, end, y))
         terms, solver, x, _ = resting._between_events(y, y)
-        rests = resting._rests(solver.func(terms, t, x, resting.args), x)
-        return jnp.where(jnp.any(rests), _shortened(t, end), end)
+        slope, scale = solver.func(terms, t, x, resting.args), resting._scale(x)
+        rests = resting._rests(slope, x)
+        pushed = solver.func(terms, t, x + jnp.where(rests, PUSH * scale * _pattern(x), 0.0), resting.args)
+        rate = jnp.max(jnp.abs(pushed - slope) / scale) / PUSH
+        resolved = jnp.minimum(end, t + RESOLVED / jnp.where(rate > 0, rate, 1.0))
+        first = jnp.where(jnp.isfinite(rate), jnp.where(rate > 0, resolved, end), t)
+        return jnp.where(jnp.any(rests), jnp.maximum(first, _shortened(t, end)), end)
 
     def restrained(self, step: Step, pushed: Pushed) -> tuple[Array, Pushed]:
         """The end of the next step, and the second run where that begins."""
@@ -107,7 +114,7 @@ class Resting(eqx.Module):
         x0, x1, h = _moving(step.y0), _moving(step.y1), step.t1 - step.t0
         rests = resting._rests((x1 - x0) / jnp.where(h > 0, h, 1.0), x1)
         rests = jnp.where(step.accepted, rests, pushed.resting)
-        look = jnp.any(rests) & (step.accepted | pushed.exists) & ~pushed.given_up
+        look = jnp.any(rests) & (step.accepted | pushed.exists) & ~pushed.given_up & (step.end > step.start)
         without = eqx.tree_at(lambda p: p.exists, pushed, pushed.exists & ~step.accepted)
         return lax.cond(
             any_member(look),
@@ -130,10 +137,8 @@ class Resting(eqx.Module):
         later, still_resting = rests & ~pushed.resting, rests & pushed.resting
         again = on & jnp.any(later) & (jnp.all(rests) | (jnp.sum(later) >= jnp.sum(still_resting)))
         push = jnp.where(new, rests, later & again)
-        k = jnp.arange(x.size, dtype=x.dtype)
-        pattern = jnp.where(jnp.sin(12.9898 * k + 1.0) > 0, 1.0, -1.0) * (1.0 + 0.5 * jnp.sin(78.233 * k))
         y = jnp.where(on, pushed.next_y, jnp.where(new, x, pushed.y))
-        y = y + jnp.where(push, PUSH * self._scale(x) * pattern, 0.0)
+        y = y + jnp.where(push, PUSH * self._scale(x) * _pattern(x), 0.0)
         state = jax.tree.map(lambda a, b: jnp.where(on, a, b), pushed.next_state, pushed.solver_state)
         fresh = jnp.where(on, step.jump | changed | again, new | pushed.fresh)
         longest = jnp.where(on, pushed.allowed, jnp.inf)
@@ -254,6 +259,12 @@ class HeldBack(WrappedControl):
         step = Step(t0, t1, y0, after, keep, jump, start, end)
         allowed, pushed = self._resting(y0, args, span).restrained(step, pushed)
         return keep, start, _no_later(start, end, allowed), jump, (state, span, pushed), result
+
+
+def _pattern(x: Array) -> Array:
+    """Of what size, and to which side, each component is pushed: no symmetric motion, and none that stays."""
+    k = jnp.arange(x.size, dtype=x.dtype)
+    return jnp.where(jnp.sin(12.9898 * k + 1.0) > 0, 1.0, -1.0) * (1.0 + 0.5 * jnp.sin(78.233 * k))
 
 
 def _no_later(start: Any, end: Any, allowed: Any) -> Any:

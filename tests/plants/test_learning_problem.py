@@ -99,7 +99,8 @@ def test_profile_likelihood_agrees_with_linear_intervals_where_the_model_is_almo
 def test_public_residuals_are_those_that_were_minimised(problem, fit):
     found = problem.residuals(fit.system, starts=fit.starts)
     expected = fit.residuals["experiment 0"]["pend.y"]
-    np.testing.assert_allclose(found["experiment 0"]["pend.y"], expected, atol=1e-6)
+    # Runs that are differentiated take shorter steps where something rests: both are right to ten times rtol, in σ.
+    np.testing.assert_allclose(found["experiment 0"]["pend.y"], expected, rtol=0, atol=1e-5 / SIGMA)
     np.testing.assert_array_equal(found["experiment 0"]["pend.x"][3:6], 0.0)
 
 
