@@ -1,27 +1,19 @@
 """Masses in a row with springs, dry friction that sticks and elastic stops, moved by ramps or a sine, against SciPy's
 DOP853 stopped and started anew wherever a mode changes."""
 
-import itertools
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.integrate import solve_ivp
 
 from jaxonomy_dae import EqnEnv
 from jaxonomy_dae.library import signal, translational
 from jaxonomy_dae.library.friction import StickingFriction
 
 from .case import Case, Motion, diagram_of, log_uniform, names
+from .pieces import CLOSE, Delicate, in_pieces
 
 TRAJECTORY = 50e-6  # of a variable's size, at the default tolerances: fifty times rtol
-CLOSE = 1e-7  # of the forces: what is so near to its limit is decided by rounding
-MOST = 200  # changes of mode
-TIGHT: dict[str, Any] = {"rtol": 1e-11, "atol": 1e-13}
-
-
-class Delicate(Exception):
-    """What the reference cannot decide to all digits."""
 
 
 class Row:
@@ -143,37 +135,7 @@ class Row:
         modes |= {("stop", k): None for k in self.stops}
         if any(y[k] < length + 1e-3 for k, (_, _, length) in self.stops.items()):
             raise Delicate("begins within a stop")
-        out, t = np.zeros((len(ts), 2 * n)), 0.0
-        bounds = itertools.chain(self.corners, [self.end])
-        edge, changes = next(bounds), 0
-        while t < self.end:
-            pairs = self.guards(modes)
-            events = []
-            for guard, _ in pairs:
-
-                def event(t, y, guard=guard):
-                    return guard(t, y)
-
-                event.terminal, event.direction = True, -1  # pyright: ignore[reportFunctionMemberAccess]
-                events.append(event)
-            frozen = dict(modes)
-            found = solve_ivp(
-                lambda t, y, frozen=frozen: self.slopes(t, y, frozen), (t, edge), y, method="DOP853", events=events,
-                dense_output=True, max_step=0.02, **TIGHT,
-            )  # fmt: skip
-            inside = (ts >= t) & (ts <= found.t[-1])
-            if inside.any():
-                out[inside] = found.sol(ts[inside]).T
-            t, y = float(found.t[-1]), found.y[:, -1].copy()
-            hit = [k for k, times in enumerate(found.t_events) if len(times)]
-            for k in hit:
-                pairs[k][1](t, y)
-            changes += len(hit)
-            if changes > MOST or len(hit) > 1:
-                raise Delicate("many changes, or two at once")
-            if not hit and t < self.end:
-                edge = next(bounds)
-        return out
+        return in_pieces(self.slopes, self.guards, y, modes, ts, self.corners, self.end)[0]
 
 
 def make(seed: int) -> Case:

@@ -1,12 +1,10 @@
 """Shafts in a row with elastic couplings, sharp backlash, clutches and a brake, turned and pressed by tables of time,
 against SciPy's DOP853 stopped and started anew wherever a mode changes."""
 
-import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.integrate import solve_ivp
 from sympy import Piecewise
 
 from jaxonomy_dae import AcausalDiagram, Component, EqnEnv, Rotational, der
@@ -15,7 +13,8 @@ from jaxonomy_dae.library.friction import Brake, Clutch
 from jaxonomy_dae.modeling import Eq
 
 from .case import Case, Motion, diagram_of, log_uniform, names
-from .drives import CLOSE, MOST, TIGHT, TRAJECTORY, Delicate
+from .drives import TRAJECTORY
+from .pieces import CLOSE, Delicate, in_pieces
 
 STUCK, FREE = 0, 2  # modes of friction, beside 1 and -1
 
@@ -240,41 +239,10 @@ class Train:
                 raise Delicate("one change makes another")
 
     def run(self, ts: np.ndarray) -> np.ndarray:
-        n = len(self.inertias)
         y, modes = self.begun()
-        out, t = np.zeros((len(ts), 2 * n)), 0.0
-        bounds = itertools.chain(self.corners, [self.end])
-        edge, changes = next(bounds), 0
-        while t < self.end:
-            pairs = self.guards(modes)
-            events = []
-            for guard, _ in pairs:
-
-                def event(t, y, guard=guard):
-                    return guard(t, y)
-
-                event.terminal, event.direction = True, -1  # pyright: ignore[reportFunctionMemberAccess]
-                events.append(event)
-            frozen = dict(modes)
-            found = solve_ivp(
-                lambda t, y, frozen=frozen: self.slopes(t, y, frozen), (t, edge), y, method="DOP853", events=events,
-                dense_output=True, max_step=0.02, **TIGHT,
-            )  # fmt: skip
-            inside = (ts >= t) & (ts <= found.t[-1])
-            if inside.any():
-                out[inside] = found.sol(ts[inside]).T
-            t, y = float(found.t[-1]), found.y[:, -1].copy()
-            hit = [k for k, times in enumerate(found.t_events) if len(times)]
-            for k in hit:
-                pairs[k][1](t, y)
-            changes += len(hit)
-            if changes > MOST or len(hit) > 1:
-                raise Delicate("many changes, or two at once")
-            if hit:
-                self.settled(t, y, modes)
-            elif t < self.end:
-                edge = next(bounds)
-        self.changes = changes
+        out, self.changes = in_pieces(
+            self.slopes, self.guards, y, modes, ts, self.corners, self.end, changed=self.settled
+        )
         return out
 
 

@@ -13,9 +13,8 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from ..private_names import FROM_CONTROLLER
 from .closure_conversion import Program, any_member
@@ -27,7 +26,6 @@ MOTION = 0.01  # a component rests that would move by less in all the time
 RESOLVED = 0.1  # of the inverse rate of what rests at the start is the first step at most
 TINY = 1e-6  # of a step are …
 SETTLING = 3  # … those after a push, which is to fulfil what Newton solves at the end of a step
-HIGHEST = np.int32(99)  # more than any order
 TRIES = 50  # to find a step that the second run allows; it is given up after as many
 
 
@@ -47,7 +45,6 @@ class Pushed(eqx.Module):
     next_y: Float[Array, " n"]
     next_state: Any
     allowed: Float[Array, ""]  # how long the step after the next one may be
-    order: Int[Array, ""]  # of its step, where orders are chosen
 
 
 class Step(eqx.Module):
@@ -93,7 +90,7 @@ class Resting(eqx.Module):
         shapes = jax.eval_shape(lambda: solver.init(terms, t, t, x, resting.args))
         state = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
         no, none = jnp.array(False), jnp.zeros(x.shape, bool)
-        return Pushed(x, state, no, no, none, no, x, state, jnp.full_like(jnp.asarray(t), jnp.inf), jnp.array(HIGHEST))
+        return Pushed(x, state, no, no, none, no, x, state, jnp.full_like(jnp.asarray(t), jnp.inf))
 
     def first_end(self, t: Any, end: Any, y: Any) -> Any:
         """The end of the first step, which was chosen by what moves: a second run begins after a step only. It is not
@@ -173,9 +170,7 @@ class Resting(eqx.Module):
         exists = look & done
         resting = jnp.where(new | again, rests, still_resting)
         given_up = pushed.given_up | (look & ~done)
-        orders = [node.order for node in _that_choose(state)]
-        order = jnp.where(fresh, 1, orders[0]).astype(HIGHEST.dtype) if orders else jnp.array(HIGHEST)
-        after = Pushed(y, state, fresh, exists, resting, given_up, next_y, next_state, allowed, order)
+        after = Pushed(y, state, fresh, exists, resting, given_up, next_y, next_state, allowed)
         after = jax.tree.map(lambda a, b: jnp.where(exists, a, b), after, without)
         after = eqx.tree_at(lambda p: p.given_up, after, given_up)
         return jnp.where(exists, end, step.end), after
@@ -208,24 +203,7 @@ def held_back(
     jump = new.made_jump if program.jumps else False  # some versions of JAX make an array of a constant
     step = Step(state.tprev, state.tnext, state.y, new.y, accepted, jump, new.tprev, new.tnext)
     end, pushed = program.rest(numbers["rest"], step, pushed)
-    solver_state = _at_most(new.solver_state, jnp.where(pushed.exists, pushed.order, HIGHEST))
-    return dataclasses.replace(new, tnext=end, solver_state=solver_state), end < new.tnext, pushed
-
-
-def _at_most(state: Any, order: Int[Array, ""]) -> Any:
-    """A solver's state, its next step of an order that is not higher. A method that chooses orders by the error of what
-    rests, which is zero, takes high ones, whose steps may be unstable for the motion that the second run resolves."""
-
-    return jax.tree.map(lambda node: node.at_most(order) if _chooses(node) else node, state, is_leaf=_chooses)
-
-
-def _that_choose(state: Any) -> list[Any]:
-    """The parts of a solver's state that hold an order."""
-    return [node for node in jax.tree.leaves(state, is_leaf=_chooses) if _chooses(node)]
-
-
-def _chooses(node: Any) -> bool:
-    return hasattr(node, "at_most")
+    return dataclasses.replace(new, tnext=end), end < new.tnext, pushed
 
 
 class HeldBack(WrappedControl):

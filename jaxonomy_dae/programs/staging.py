@@ -15,7 +15,7 @@ def is_staged(tree: Any) -> bool:
     run each operation by itself: compiling a loop anew at every call. There a compiled program is called, which
     JAX differentiates or batches as a whole.
     """
-    return any(isinstance(innermost, Tracer) for leaf in jax.tree.leaves(tree) for *_, innermost in [_layers(leaf)])
+    return any(isinstance([*_layers(leaf)][-1], Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def is_forwards(tree: Any) -> bool:

@@ -1,6 +1,5 @@
 """BDF: variable order, variable step, fixed leading coefficient."""
 
-import dataclasses
 from typing import Any, ClassVar
 
 import diffrax
@@ -59,10 +58,6 @@ class _State(eqx.Module):
     contraction: Float[Array, ""]  # ρ/(1−ρ) of the last Newton iterations
     counts: Int[Array, "2"]  # Jacobians (and factorisations), Newton iterations
     largest: Any  # of the determinants measured, each; None if there are none
-
-    def at_most(self, order: Int[Array, ""]) -> "_State":
-        """The same, the step to come of an order that is not higher."""
-        return dataclasses.replace(self, order=jnp.minimum(self.order, order.astype(self.order.dtype)))
 
 
 class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
