@@ -13,6 +13,7 @@ These things are relied on that have no name of their own, or one that is public
 - that Diffrax fills the controller's tolerances into the root finder of a solver, be it wrapped: `FROM_CONTROLLER`;
 - that Diffrax lengthens a step to the end of the interval from 100 floating-point numbers before it: `clip_floor`;
 - the names of the fields of Optimistix' Levenberg–Marquardt method: `with_high_cutoff`;
+- the classes `JVPTracer` and `LinearizeTracer` of JAX by name, and what tracers wrap: `programs/staging.py`;
 - that XLA for CPUs does not take a call apart that is marked `inlineable="false"`: `linear/once.py`.
 """
 
