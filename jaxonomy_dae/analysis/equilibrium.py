@@ -58,20 +58,29 @@ def find_equilibrium(system: AcausalSystem, t: Any, x0: Any, inputs: Any, drifti
 
     frozen = tuple(frozen_inputs(given) for given in (system, t, inputs))
     start = x0[free]
+    everywhere = np.concatenate([plan.states, plan.carried]).astype(np.int64)
+    scale = jnp.asarray(declared_scale(plan.flat, plan.variable_map, plan.extended)[everywhere], x0.dtype)
+
+    def magnitude(w):
+        still, t, inputs = frozen
+        x = x0.at[free].set(w)
+        here, reach = still.at(t, inputs), jnp.maximum(jnp.abs(x), scale)
+        slopes = here.slope_magnitudes(x, reach)
+        rows = [slopes, here.carried_magnitudes(x, reach)] if len(plan.carried) else [slopes]
+        return jnp.concatenate([jnp.concatenate(rows)[free], here.constraint_magnitudes(x, reach)])
+
     m = len(free) + plan.n_constraints
     if not len(free):
         rest = residual(start, system, t, inputs)
         empty = jnp.zeros((m, 0), x0.dtype)
         return Equilibrium(x0, rest, jnp.zeros_like(rest), empty, start, jnp.all(rest == 0))
-    entries = np.concatenate([plan.states, plan.carried]).astype(np.int64)[free]
-    nominal = jnp.asarray(declared_scale(plan.flat, plan.variable_map, plan.extended)[entries], x0.dtype)
+    entries, nominal = everywhere[free], scale[free]
+    typical = jax.lax.stop_gradient(system.typical_sizes[entries])
     zero = jnp.zeros((m,), x0.dtype)
     sizes = Sizes(nominal, jnp.maximum(jnp.abs(start), nominal), zero, zero)
     core = np.arange(m) if m == len(free) else None
     bounds = quantity_bounds(plan.flat, plan.variable_map, plan.extended)[entries]
-    found = find_root(
-        lambda w: residual(w, *frozen), m, start, sizes, core, bounds=bounds, typical=plan.typical_sizes[entries]
-    )
+    found = find_root(lambda w: residual(w, *frozen), m, start, sizes, core, None, bounds, typical, magnitude)
     found = jax.lax.stop_gradient(found)
     # Where nothing was found, there is nothing to differentiate, and the others of a batch must not notice.
     good = found.method < FAILED

@@ -88,7 +88,7 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Co
         lambda q: merit[q],
         scale,
         point,
-        lambda: error_sizes(flat, variables, extended, scale),
+        lambda: error_sizes(flat, variables, extended, flat.parameters.values),
         lambda q: names[q],
         lambda e: str(provenance_of(groups, int(e))),
         dependent,

@@ -15,26 +15,36 @@ read off a graph: they are the edges of trees of equal variables, with what u de
 
 import collections
 import dataclasses
+import functools
 from collections.abc import Sequence
 
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
-from ..judgement.scaling import equilibrated
-from ..model.constraint_jacobian import ConstraintEntries, constraint_entries, evaluate, independent_parts
+from ..expressions.errors import KNOWN
+from ..judgement.rank import above_errors
+from ..judgement.scaling import balanced
+from ..model.constraint_jacobian import (
+    ConstraintEntries,
+    constraint_entries,
+    evaluate,
+    evaluate_along,
+    evaluate_errors,
+    independent_parts,
+)
 from ..model.evaluate_numpy import Networks
 from ..model.extended import Extended
 from ..model.linear_template import LinearTemplate
 from ..model.provenance import Provenance
 from ..model.quantities import QuantityMap
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, equation_offsets, provenance_of
+from ..model.typical_sizes import error_sizes
 from .wording import listed, words
 
 LARGEST = 600  # constraints of a part that is examined
 DEPENDENT = 1e-7  # a singular value of the equilibrated Jacobian: roots of second order are found to half of the digits
 ALWAYS = 1e-12  # the same where it is constant: no point that is found decides
-STEP = 1e-4  # relative, of differences that tell the cases apart: their error is its square
 UNCHANGED = 1e-5  # relative
 MECHANICAL = ("Planar", "Translational", "Rotational")
 SHOWN = 12  # names
@@ -55,6 +65,11 @@ class ModelAt:
     parameters: np.ndarray
     t: float
     networks: Networks
+
+    @functools.cached_property
+    def error_sizes(self) -> np.ndarray:
+        """The sizes to whose rounding all quantities are known."""
+        return error_sizes(self.flat, self.variables, self.extended, self.parameters)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,17 +127,20 @@ def _of_part(model: ModelAt, entries: ConstraintEntries, rows: np.ndarray) -> li
         return []  # constraints of several orders: their Jacobian is no derivative by one set of quantities
     position = quantities.first[columns] + quantities.highest[columns] - c[rows[0]]
 
-    def jacobian(values: np.ndarray) -> np.ndarray:
+    def matrix_of(numbers: np.ndarray) -> np.ndarray:
         matrix = np.zeros((len(rows), len(columns)))
-        numbers = evaluate(model.groups, model.extended, entries, values, model.parameters, model.t, model.networks)
         np.add.at(matrix, place, numbers)
         return matrix
 
+    where = (model.groups, model.extended, entries, model.values)
+    rest = (model.parameters, model.t, model.networks)
     with np.errstate(all="ignore"):
-        at = jacobian(model.values)
+        at = matrix_of(evaluate(*where, *rest))
+        bounds = matrix_of(evaluate_errors(*where, KNOWN * (np.abs(model.values) + model.error_sizes), *rest))
     if not np.isfinite(at).all():
         return []
-    scaled, row_scale, column_scale = equilibrated(at)
+    at = above_errors(at, bounds)  # sin(1e-17) is zero, and no scale may make it one
+    scaled, row_scale, column_scale = balanced(at)
     u, s, vt = np.linalg.svd(scaled.toarray())
     small = ALWAYS if entries.constant.all() else DEPENDENT
     rank = int((s > small * max(s[0], 1e-300)).sum())
@@ -132,12 +150,11 @@ def _of_part(model: ModelAt, entries: ConstraintEntries, rows: np.ndarray) -> li
     changed = np.zeros((left.shape[1], right.shape[1], right.shape[1]))
     size = np.zeros_like(changed)
     for k in range(right.shape[1]):
-        move = column_scale * right[:, k]
-        step = STEP * (np.abs(model.values[position] / column_scale).max(initial=0.0) or 1.0)
-        ahead, behind = model.values.copy(), model.values.copy()
-        ahead[position] += step * move
-        behind[position] -= step * move
-        slope = row_scale[:, None] * (jacobian(ahead) - jacobian(behind)) / (2 * step) * column_scale
+        move = np.zeros_like(model.values)
+        move[position] = column_scale * right[:, k]
+        with np.errstate(all="ignore"):
+            slope = row_scale[:, None] * matrix_of(evaluate_along(*where, move, *rest)) * column_scale
+        slope = np.where(np.isfinite(slope), slope, 0.0)
         changed[:, k] = left.T @ slope @ right
         size[:, k] = np.abs(left.T) @ np.abs(slope) @ np.abs(right)
     kept, still = _unchanged(changed.reshape(len(changed), -1), float(size.max(initial=0.0)))

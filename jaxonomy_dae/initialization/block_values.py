@@ -1,5 +1,6 @@
 """Values and Jacobians of blocks at a point, in NumPy."""
 
+import functools
 from collections.abc import Callable
 
 import numpy as np
@@ -8,6 +9,7 @@ from ..expressions.errors import KNOWN
 from ..lowering.plan import SystemPlan
 from ..lowering.schedule import Step, StepEquation
 from ..model.evaluate_numpy import Networks
+from ..model.typical_sizes import error_sizes
 
 
 def local_slots(equation: StepEquation) -> list[int]:
@@ -74,7 +76,8 @@ class BlockValues:
     @property
     def errors(self) -> np.ndarray:
         """How well quantities are known: a position is one of Newton's method, so to rounding of its typical size."""
-        return KNOWN * (np.abs(self.quantities) + np.append(self.plan.error_sizes, 0.0))
+        known = _error_sizes(self.plan, np.asarray(self.parameters, float).tobytes())
+        return KNOWN * (np.abs(self.quantities) + np.append(known, 0.0))
 
     def residual(self, equation: StepEquation) -> np.ndarray:
         slots = self.slots(equation)
@@ -113,3 +116,9 @@ class BlockValues:
             found = np.full(residual.shape, np.nan)
         for u, quantities in enumerate(step.unknown):
             self.quantities[quantities] = found[:, u]
+
+
+@functools.lru_cache(maxsize=64)
+def _error_sizes(plan: SystemPlan, parameters: bytes) -> np.ndarray:
+    """The sizes to whose rounding all quantities are known."""
+    return error_sizes(plan.flat, plan.variable_map, plan.extended, np.frombuffer(parameters))

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from ..errors import ModelError
 from ..linear.least_squares import least_squares
 from .ladder import FAILED, GIVEN, Found
-from .sizes import Sizes, column_sizes, row_sizes, soft_weight, tolerance
+from .sizes import Sizes, column_sizes, row_sizes, soft_weight, tolerance, weighed
 
 MAX_STEPS = 1000
 
@@ -33,6 +33,7 @@ def find_root_with(
     sizes: Sizes,
     soft: Bool[np.ndarray, " m"],
     square: bool,
+    magnitude: Callable[[Any], Any],
 ) -> Found:
     """Solves F(x) = 0 in units of the unknowns, every row divided by the size of its terms; one Newton step sharpens
     what the solver's tolerances leave.
@@ -41,6 +42,7 @@ def find_root_with(
 
     - `square`: whether all rows, soft ones included, are as many as the unknowns and independent; else soft rows are
         weighed down, and a least-squares solver is needed.
+    - `magnitude`: how large the terms of each row are, as for `find_root`.
     """
 
     def linearized(x):
@@ -62,8 +64,8 @@ def find_root_with(
     sharper = x - unit * least_squares(weight[:, None] * jacobian * unit[None, :], weight * value)
     x = jnp.where(jnp.all(jnp.isfinite(sharper)), sharper, x)
     value, jacobian = linearized(x)
-    size, noise = row_sizes(jacobian, x, sizes, unit)
-    limit = tolerance(dtype) * (size + sizes.data) + noise
+    size, noise = row_sizes(weighed(jacobian), x, sizes, unit, magnitude(x))
+    limit = tolerance(dtype) * size + noise
     holds = jnp.all((jnp.abs(value) <= limit) | jnp.asarray(soft & (not square)))
     method = jnp.where(holds, GIVEN, FAILED).astype(jnp.int32)
     return Found(x, jacobian, limit, unit, method, jnp.asarray(found.stats["num_steps"], jnp.int32))

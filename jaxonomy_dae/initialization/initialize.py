@@ -78,7 +78,7 @@ def initialize(
     n = plan.n_state
     x0 = _values(rows.guess, given, parameters) * jnp.asarray(_units(rows.guess), point.dtype)
     target = _values(rows.kept, given, parameters)
-    starts = _reader(plan, rows.kept)
+    starts, sizes_of_starts = _reader(plan, rows.kept)
     if rows.direct:
         nothing = jnp.zeros((), jnp.int32)
         residual = starts(point, x0) - target
@@ -90,7 +90,7 @@ def initialize(
         if len(unknown):
             parameters = table.complete(parameters.at[unknown].set(w[n:]))
             target = _values(rows.kept, given, parameters)
-        here = SystemAt(plan, parameters, point.networks, t0, inputs)
+        here = SystemAt(plan, parameters, point.networks, t0, inputs, point.typical)
         state = here.split(w[:n])
         parts = [here.constraint_vector(state)]
         if len(plan.carried):
@@ -100,6 +100,21 @@ def initialize(
 
     frozen = jax.lax.stop_gradient
     settings = (frozen(parameters), frozen_inputs(inputs), frozen(target))
+    nominal = jnp.asarray(declared_scale(plan.flat, plan.variable_map, plan.extended), point.dtype)
+    nominal = nominal[np.concatenate([plan.states, plan.carried]).astype(np.int64)]
+
+    def magnitude(w):
+        parameters, inputs, _ = settings
+        if len(unknown):
+            parameters = table.complete(parameters.at[unknown].set(w[n:]))
+        here = SystemAt(plan, parameters, point.networks, t0, inputs, point.typical)
+        x = w[:n]
+        reach = jnp.maximum(jnp.abs(x), nominal)
+        parts = [here.constraint_magnitudes(x, reach)]
+        if len(plan.carried):
+            parts.append(here.carried_magnitudes(x, reach))
+        return jnp.concatenate([*parts, sizes_of_starts(here, x, reach)])
+
     start = frozen(jnp.append(x0, parameters[unknown]) if len(unknown) else x0)
     sizes = frozen(_sizes(plan, rows, given, parameters, start))
     m = n_equations + len(rows.kept)
@@ -112,7 +127,7 @@ def initialize(
     read = [n_equations + k for k, row in enumerate(rows.kept) if row.quantity not in state]
     excused = None
     if read and rows.redundant and not rows.n_soft:
-        excused = frozen(_rounding(residual, settings, start, sizes, _typical_of_rows(plan, rows, n_equations, read)))
+        excused = frozen(_rounding(residual, settings, start, sizes, _typical_of_rows(point, rows, n_equations, read)))
 
     def function(w):
         value = residual(w, *settings)
@@ -124,8 +139,8 @@ def initialize(
     if sparse is not None:
         alone = np.append(np.ones(n_equations, bool), rows.independent)
         return _large_point(
-            lambda w, moving: residual(w, *moving), settings, (parameters, inputs, target), start, sizes, sparse,
-            core, np.flatnonzero(alone & ~is_soft), np.flatnonzero(is_soft), bounds, full,
+            lambda w, moving: residual(w, *moving), magnitude, settings, (parameters, inputs, target), start, sizes,
+            sparse, core, np.flatnonzero(alone & ~is_soft), np.flatnonzero(is_soft), bounds, full,
         )  # fmt: skip
     staged = None if len(unknown) else stages(plan, rows)
     declared = start
@@ -133,10 +148,11 @@ def initialize(
         start = frozen(solve_in_stages(function, start, sizes, *staged))
     if solver is None:
         entries = np.concatenate([plan.states, plan.carried]).astype(np.int64)
-        typical = np.append(plan.typical_sizes[entries], np.ones(len(unknown)))
-        found = find_root(function, m, start, sizes, core, is_soft, bounds, typical)
+        typical = jnp.append(point.typical[entries], jnp.ones((len(unknown),), point.dtype))
+        found = find_root(function, m, start, sizes, core, is_soft, bounds, typical, magnitude)
     else:
-        found = find_root_with(solver, function, start, sizes, is_soft, core is not None or not rows.n_soft)
+        square = core is not None or not rows.n_soft
+        found = find_root_with(solver, function, start, sizes, is_soft, square, magnitude)
     if staged is not None:
         found = found._replace(method=jnp.where((found.method == 0) & jnp.any(start != declared), STAGED, found.method))
     found = frozen(found)
@@ -179,8 +195,8 @@ def initialize(
 
 
 def _large_point(
-    residual: Callable[[Any, Any], Any], settings, moving, start, sizes: Sizes, sparse: SparseRows, core, hard, soft,
-    bounds, full,
+    residual: Callable[[Any, Any], Any], magnitude: Callable[[Any], Any], settings, moving, start, sizes: Sizes,
+    sparse: SparseRows, core, hard, soft, bounds, full,
 ) -> InitialPoint:  # fmt: skip
     """The point of a large sparse model: the ladder is climbed only where sparse Newton steps do not arrive, and what
     carries the derivative is sparse unless guesses cannot all hold."""
@@ -191,10 +207,10 @@ def _large_point(
     def function(w):
         return residual(w, settings)
 
-    near = frozen(sparse_newton(function, start, sizes, sparse, bounds))
+    near = frozen(sparse_newton(function, start, sizes, sparse, bounds, magnitude))
 
     def climb(state):
-        found = find_root(function, m, start, sizes, core, is_soft, bounds)
+        found = find_root(function, m, start, sizes, core, is_soft, bounds, magnitude=magnitude)
         return found.x, found.limit, found.method, found.evaluations, jnp.array(False)
 
     # A loop, not a branch: what it closes over must stay out of batches.
@@ -221,18 +237,17 @@ def _large_point(
     return InitialPoint(w, w[:0], remaining, jnp.where(is_soft, jnp.inf, limit), full, method, evaluations, None)
 
 
-def _typical_of_rows(plan: SystemPlan, rows: InitialRows, first: int, read: list[int]) -> np.ndarray:
+def _typical_of_rows(point: SystemAt, rows: InitialRows, first: int, read: list[int]) -> Any:
     """Typical sizes of what the rows at `read` compare, shape (m,), zero for others; the rows of starts begin at
     `first`."""
-    out = np.zeros(first + len(rows.kept))
-    typical = plan.typical_sizes
-    for k in read:
-        row = rows.kept[k - first]
-        out[k] = abs(row.factor) * typical[row.quantity] if row.quantity >= 0 else 0.0
-    return out
+    compared = [(k, rows.kept[k - first]) for k in read if rows.kept[k - first].quantity >= 0]
+    place = np.array([k for k, _ in compared], np.int64)
+    quantity = np.array([row.quantity for _, row in compared], np.int64)
+    factor = jnp.asarray([abs(row.factor) for _, row in compared], point.dtype)
+    return jnp.zeros((first + len(rows.kept),), point.dtype).at[place].set(factor * point.typical[quantity])
 
 
-def _rounding(residual: Callable[..., Any], settings, start: Any, sizes: Sizes, typical: np.ndarray) -> Any:
+def _rounding(residual: Callable[..., Any], settings, start: Any, sizes: Sizes, typical: Any) -> Any:
     """Rows that are rounding errors and nothing else, among those of variables outside of the state, whose `typical`
     sizes are given: they hold at the start, and neither it nor rounded parameters move them by more. Returns what
     rounding may leave of each, shape (m,), zero for other rows.
@@ -257,8 +272,8 @@ def _rounding(residual: Callable[..., Any], settings, start: Any, sizes: Sizes, 
     moved = jax.vmap(lambda v, p: jax.jvp(rows, (start, parameters), (v, p))[1])(*along)
     slope, terms = (jnp.max(jnp.abs(m), axis=0) for m in jnp.split(moved, 2))
     eps = float(jnp.finfo(dtype).eps)
-    noise = NOISE * eps * terms + CANCELLED * eps * jnp.asarray(typical, dtype)
-    return jnp.where(jnp.asarray(typical > 0) & (jnp.abs(value) <= noise) & (slope <= noise), noise, 0)
+    noise = NOISE * eps * terms + CANCELLED * eps * typical
+    return jnp.where((typical > 0) & (jnp.abs(value) <= noise) & (slope <= noise), noise, 0)
 
 
 def _nearest_point(
@@ -330,7 +345,7 @@ def _with_velocities(sizes: Sizes, x: Any, plan: SystemPlan, here: SystemAt) -> 
     if not pairs:
         return sizes
     position, velocity = np.array(pairs).T
-    unit = jnp.asarray(plan.typical_sizes[plan.states[position]], x.dtype)
+    unit = here.typical[plan.states[position]]
     acceleration = jnp.abs(here.semi_explicit(x)[velocity]) / unit
     fastest = jnp.max(jnp.where(jnp.isfinite(acceleration), acceleration, 0))
     largest = jnp.max(sizes.known[position] / unit)
@@ -384,11 +399,13 @@ def independent_rows(plan: SystemPlan, rows: InitialRows, n: int) -> np.ndarray 
 
 
 def _reader(plan: SystemPlan, kept: tuple[Row, ...]):
-    """The values of the rows' variables as a function of the point and the state array."""
+    """The values of the rows' variables as a function of the point and the state array, and their magnitudes, given
+    those of the array as well."""
     quantity = np.array([r.quantity for r in kept], np.int64)
     factor = np.array([r.factor for r in kept], float)
     place = {int(q): k for k, q in enumerate((*plan.states, *plan.carried))}
     in_state = all(int(q) in place for q in quantity)
+    program = plan.reading(quantity)
 
     def starts(here: SystemAt, x):
         if not len(quantity):
@@ -396,11 +413,16 @@ def _reader(plan: SystemPlan, kept: tuple[Row, ...]):
         if in_state:
             where = np.array([place[int(q)] for q in quantity])
             return times(jnp.asarray(factor, here.dtype) if (factor != 1).any() else 1.0, take(x, where))
-        evaluation = here.run(plan.everything, here.split(x), Refinement.NONE)
-        gather: Gather = plan.everything.layout.gather(quantity, factor)
+        evaluation = here.run(program, here.split(x), Refinement.NONE)
+        gather: Gather = program.layout.gather(quantity, factor)
         return jnp.broadcast_to(jnp.asarray(evaluation.read(gather), here.dtype), (len(quantity),))
 
-    return starts
+    def sizes(here: SystemAt, x, reach):
+        if not len(quantity):
+            return jnp.zeros((0,), here.dtype)
+        return jnp.abs(starts(here, x)) if in_state else here.magnitudes(x, reach, quantity, factor)
+
+    return starts, sizes
 
 
 def frozen_inputs(inputs: Any) -> Any:

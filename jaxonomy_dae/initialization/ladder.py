@@ -13,7 +13,7 @@ Each rung starts at the given point, and only if the one before failed:
 Where unknowns have no guess, zero stands for one, and there slopes may vanish, as of q·|q|: no rung leads away. So, if
 all have failed, the ladder is climbed again with those unknowns at their sizes, then with every other one negative.
 
-Units decide nothing: unknowns are measured by their sizes, rows by the sizes of their terms, Σ |∂F/∂x|·|x|.
+Units decide nothing: unknowns are measured by their sizes, rows by the sizes of their terms.
 
 All rungs are states of one machine, the body of a single loop: one residual, one Jacobian and one QR factorization are
 traced and compiled, whichever rung is at work. Under `vmap` each member is on its own rung.
@@ -29,7 +29,7 @@ from jaxtyping import Array, Bool, Float
 
 from .machine import Machine, Scalars
 from .probing import SIZED, probed
-from .sizes import NOISE, Sizes, column_sizes, row_sizes, soft_weight, tolerance
+from .sizes import NOISE, Sizes, column_sizes, row_sizes, soft_weight, tolerance, weighed
 
 METHODS = (
     "the start was consistent",
@@ -85,7 +85,8 @@ def find_root(
     core: np.ndarray | None,
     soft: Bool[np.ndarray, " m"] | None = None,
     bounds: Float[np.ndarray, "n 2"] | None = None,
-    typical: Float[np.ndarray, " n"] | None = None,
+    typical: Float[Array, " n"] | None = None,
+    magnitude: Callable[[Any], Any] | None = None,
 ) -> Found:
     """Climbs the ladder.
 
@@ -99,13 +100,21 @@ def find_root(
         outnumber what they can choose, and the nearest point is looked for at once.
     - `bounds`: of the unknowns; no iterate leaves them.
     - `typical`: sizes of the unknowns where nothing is known, as powers of two: the search is in units of these.
+    - `magnitude`: how large the terms of each row are, beside which it counts as zero; not finite where that is not
+        known. There, or without it, Σ |∂F/∂x|·|x| stands for it.
     """
-    if typical is None or (typical == 1.0).all():
-        return _climb(function, m, start, sizes, core, soft, bounds, in_units=False)
-    unit = jnp.asarray(typical, start.dtype)
+    limits = None
+    if bounds is not None and np.isfinite(bounds).any():
+        limits = jnp.asarray(bounds[:, 0], start.dtype), jnp.asarray(bounds[:, 1], start.dtype)
+    if typical is None:
+        return _climb(function, m, start, sizes, core, soft, limits, magnitude, np.zeros((), bool))
+    unit = jax.lax.stop_gradient(typical)
     measured = sizes._replace(nominal=sizes.nominal / unit, known=sizes.known / unit)
-    limits = None if bounds is None else bounds / typical[:, None]
-    found = _climb(lambda y: function(y * unit), m, start / unit, measured, core, soft, limits, in_units=True)
+    limits = None if limits is None else (limits[0] / unit, limits[1] / unit)
+    terms = None if magnitude is None else lambda y: magnitude(y * unit)
+    found = _climb(
+        lambda y: function(y * unit), m, start / unit, measured, core, soft, limits, terms, jnp.any(unit != 1)
+    )
     return found._replace(x=found.x * unit, jacobian=found.jacobian / unit, unit=found.unit * unit)
 
 
@@ -116,8 +125,9 @@ def _climb(
     sizes: Sizes,
     core: np.ndarray | None,
     soft: Bool[np.ndarray, " m"] | None,
-    bounds: Float[np.ndarray, "n 2"] | None,
-    in_units: bool,
+    limits: tuple[Any, Any] | None,
+    magnitude: Callable[[Any], Any] | None,
+    in_units: Any,
 ) -> Found:
     """`in_units`: whether unknowns are measured in typical sizes; otherwise slopes at the start show their sizes."""
     dtype, n = start.dtype, start.shape[0]
@@ -130,9 +140,8 @@ def _climb(
     nearest_first = has_soft and core is None
     alternating = (-1.0) ** np.arange(n + 1)
     first_rung = _NEAREST if nearest_first else _NEWTON
-    limits = np.array(bounds, float) if bounds is not None and np.isfinite(bounds).any() else None
     if limits is not None:
-        low, high = jnp.asarray(limits.T, dtype)
+        low, high = limits
         start = _inside(start, low, high, sizes.known)
     origin = jnp.append(start, 0 * one)
     along = np.append(np.zeros(n), 1.0)  # the direction of s
@@ -168,21 +177,24 @@ def _climb(
         # What a function of the user's closes over may be differentiated elsewhere: not in here.
         return jax.lax.stop_gradient((value, jacobian))
 
+    def sizes_of_rows(jacobian, x, unit) -> tuple[Any, Any]:
+        return row_sizes(weighed(jacobian), x, sizes, unit, None if magnitude is None else magnitude(x))
+
     def evaluate(state: Machine) -> Machine:
         x = state.points[0, :n]
         value, jacobian = linearized(x)
         probing, probe, unit = probed(state, value, jacobian, sizes, ~hard)
-        size, noise = row_sizes(jacobian, x, sizes, unit)
-        size = size + sizes.data
+        size, noise = sizes_of_rows(jacobian, x, unit)
         reached = jnp.all(jnp.abs(value) <= close * size)
         # Soft rows pull at the others until the last step, which carries the derivative, sets these right.
         pulled = where(hard, 0.1 * float(np.sqrt(enough)) * size, jnp.inf)
         allowed = where(is_nearest(state.scalars[0]), pulled, enough * size) if has_soft else enough * size
         holds = jnp.all(jnp.abs(value) <= allowed + noise)
-        ahead = advance(state, value, jacobian * unit[None, :], jnp.append(unit, one), reached, holds)
+        limit = enough * size + noise
+        ahead = advance(state, value, jacobian * unit[None, :], jnp.append(unit, one), reached, holds, limit)
         return jax.tree.map(lambda a, b: where(probing, a, b), probe, ahead)
 
-    def advance(state: Machine, value, jacobian, unit, reached, holds) -> Machine:
+    def advance(state: Machine, value, jacobian, unit, reached, holds, limit) -> Machine:
         s = Scalars(*state.scalars)
         phase, fresh, arc = s.phase, s.fresh > 0, s.size
         trial, base, best, last_tangent, beginning, _ = state.points
@@ -209,7 +221,7 @@ def _climb(
         ratio = (s.square - square) / where(s.gain > 0, s.gain, one)
         falls = where(marquardt, ratio > 0, jnp.sqrt(square) < (1 - DECREASE * s.size) * jnp.sqrt(s.square))
         accepted = stop | (finite & (fresh | tracking | nearest | falls))
-        value = where(accepted, value, state.rows[0])
+        value, limit = where(accepted, value, state.rows[0]), where(accepted, limit, state.rows[3])
         jacobian = where(accepted, jacobian, state.jacobian)
         here = where(accepted, trial, base)
         square = where(accepted, square, s.square)
@@ -313,7 +325,7 @@ def _climb(
                 above == _MARQUARDT, bounded(beginning + 1e-3 * unit * generic * (1 - along), restart), restart
             )
         climb_begins = AGAIN + 2 - climb
-        elsewhere = generic * (one if in_units else unit) * where(climb > 1, jnp.asarray(alternating, dtype), one)
+        elsewhere = generic * where(in_units, one, unit) * where(climb > 1, jnp.asarray(alternating, dtype), one)
         restart = where(climbs_again, bounded(where(unguessed, elsewhere, origin), origin), restart)
         above = where(climbs_again, first_rung, above)
         scalars = packed(
@@ -343,27 +355,30 @@ def _climb(
             beginning,
             unit,
         ])  # fmt: skip
-        return Machine(scalars, points, jnp.stack([value, first, w]), jacobian)
+        return Machine(scalars, points, jnp.stack([value, first, w, limit]), jacobian)
 
     # A start that holds, as most do, needs no rung: in a batch of such starts the loop does not run at all.
     value, jacobian = linearized(start)
     unit = column_sizes(value, jacobian, sizes)
-    size, _ = row_sizes(jacobian, start, sizes, unit)
-    stays = jnp.all(jnp.abs(value) <= close * (size + sizes.data)) & jnp.all(jnp.isfinite(jacobian))
+    size, noise = sizes_of_rows(jacobian, start, unit)
+    stays = jnp.all(jnp.abs(value) <= close * size) & jnp.all(jnp.isfinite(jacobian))
     stays &= jnp.all((sizes.known > 0) | jnp.any(jacobian != 0, axis=0))
     begin = Scalars(
         where(stays, _DONE, first_rung), where(stays, 0, FAILED), 1.0, 0.0, 0, where(stays, 1, 0), 1.0, 1.0, 0.0, 0.0,
         0.0, 1.0, 0,
     )  # fmt: skip
     points = jnp.stack([origin, origin, origin, along, origin, jnp.append(where(stays, unit, one), one)])
-    state = Machine(packed(*begin), points, jnp.ones((3, m), dtype), jacobian * unit[None, :])
+    one_each = jnp.ones((m,), dtype)
+    rows = jnp.stack([one_each, one_each, one_each, enough * size + noise])
+    state = Machine(packed(*begin), points, rows, jacobian * unit[None, :])
     state = jax.lax.while_loop(lambda s: s.scalars[0] < _DONE, evaluate, state)
     s = Scalars(*state.scalars)
     found = where(s.phase == _DONE, state.points[1], state.points[2])[:n]
     unit = state.points[5, :n]
     jacobian = state.jacobian / unit[None, :]
-    size, noise = row_sizes(jacobian, found, sizes, unit)
-    limit = enough * (size + sizes.data) + noise
+    # Where nothing was found, the best point met is not the one at which the last rung ended.
+    size, noise = row_sizes(weighed(jacobian), found, sizes, unit)
+    limit = where(s.phase == _DONE, state.rows[3], jnp.minimum(state.rows[3], enough * size + noise))
     return Found(found, jacobian, limit, unit, s.method.astype(jnp.int32), s.evaluations.astype(jnp.int32))
 
 

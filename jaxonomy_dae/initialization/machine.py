@@ -8,7 +8,7 @@ class Machine(NamedTuple):
 
     scalars: Any  # see Scalars
     points: Any  # trial, base (the last one accepted), best, the tangent, where rungs start, and the units
-    rows: Any  # F at the base, F at the start, and the weight of each equation
+    rows: Any  # F at the base, F at the start, the weight of each equation, and what counts as zero at the base
     jacobian: Any  # at the base, columns scaled
 
 

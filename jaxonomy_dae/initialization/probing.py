@@ -44,5 +44,5 @@ def probed(
     points = jnp.stack([trial, base, *others, jnp.append(kept, one)])
     counted = jnp.asarray(np.eye(len(Scalars._fields))[[3, 5]], dtype)
     scalars = state.scalars - counted[0] + counted[1]
-    rows = jnp.stack([value, value, state.rows[2]])
+    rows = jnp.stack([value, value, *state.rows[2:]])
     return probing, Machine(scalars, points, rows, known_slopes), unit

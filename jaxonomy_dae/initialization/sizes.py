@@ -1,5 +1,6 @@
 """What measures unknowns and rows of initialization: so that units decide nothing."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -7,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 NOISE = 8.0  # rounding errors of a row, in units of eps
+DIGIT = 0.1  # of its terms: a row of which not one digit is known
 
 
 class Sizes(NamedTuple):
@@ -28,12 +30,31 @@ def soft_weight(dtype: Any) -> float:
     return float(np.sqrt(0.1 * tolerance(dtype)))
 
 
-def row_sizes(jacobian: Any, x: Any, sizes: Sizes, unit: Any) -> tuple[Any, Any]:
-    """The size of each row's terms, and the rounding that the sizes of unknowns alone let expect."""
-    size = jnp.maximum(jnp.abs(x), sizes.nominal)
-    magnitude = jnp.where(jnp.isfinite(jacobian), jnp.abs(jacobian), 0)
-    eps = float(jnp.finfo(jacobian.dtype).eps)
-    return magnitude @ size, NOISE * eps * (magnitude @ jnp.maximum(unit, size) + sizes.data)
+Weigh = Callable[[Any], Any]
+
+
+def weighed(jacobian: Any) -> Weigh:
+    """Σ |∂F/∂x|·v of each row as a function of v, for a dense Jacobian."""
+    slopes = jnp.where(jnp.isfinite(jacobian), jnp.abs(jacobian), 0)
+    return lambda v: slopes @ v
+
+
+def row_sizes(weigh: Weigh, x: Any, sizes: Sizes, unit: Any, terms: Any = None) -> tuple[Any, Any]:
+    """The size of each row's terms, and the rounding that the sizes of unknowns alone let expect.
+
+    **Arguments:**
+
+    - `weigh`: Σ |∂F/∂x|·v of each row, as a function of v.
+    - `terms`: the magnitude of each row; where it is not known (infinite or not-a-number), and if nothing is given,
+        slopes stand for it.
+    """
+    eps = float(jnp.finfo(x.dtype).eps)
+    reach = jnp.maximum(jnp.abs(x), sizes.nominal)
+    size = weigh(reach) if terms is None else jnp.where(jnp.isfinite(terms), terms, weigh(reach))
+    size = size + sizes.data
+    noise = NOISE * eps * (weigh(jnp.maximum(unit, reach)) + sizes.data)
+    # sin(10¹⁷) is not known to any digit: rounding of its argument excuses nothing.
+    return size, jnp.where(eps * weigh(jnp.abs(x)) > DIGIT * size, 0, noise)
 
 
 def column_sizes(value: Any, jacobian: Any, sizes: Sizes, power: Any = None) -> Any:

@@ -21,7 +21,7 @@ from ..lowering.plan import SystemPlan
 from ..lowering.schedule import SparseStep
 from .ladder import DECREASE, METHODS, NEWTON_LIMIT, SHORTEST
 from .rows import InitialRows
-from .sizes import NOISE, Sizes, tolerance
+from .sizes import Sizes, row_sizes, tolerance
 
 
 class SparseRows(NamedTuple):
@@ -84,8 +84,10 @@ def sparse_newton(
     sizes: Sizes,
     rows: SparseRows,
     bounds: Float[np.ndarray, "n 2"],
+    magnitude: Callable[[Any], Any],
 ) -> SparseFound:
-    """Newton's method from `start`, steps halved until the residual falls and no bound is crossed."""
+    """Newton's method from `start`, steps halved until the residual falls and no bound is crossed; `magnitude` says how
+    large the terms of each row are, as for `find_root`."""
     dtype = start.dtype
     eps, enough = float(jnp.finfo(dtype).eps), tolerance(dtype)
     close = min(1e3 * eps, 0.1 * enough)
@@ -96,15 +98,15 @@ def sparse_newton(
 
     def evaluate(x):
         value, values = jax.lax.stop_gradient((function(x), jacobian(x)))
-        magnitude = jnp.where(jnp.isfinite(values), jnp.abs(values), 0)
-        reach = jnp.maximum(jnp.abs(x), sizes.nominal)
-        size = rows.pattern.multiply(magnitude, reach) + sizes.data
-        noise = NOISE * eps * (rows.pattern.multiply(magnitude, jnp.maximum(unit, reach)) + sizes.data)
-        return value, values, size, noise
+        return value, values, *sizes_of_rows(x, values)
+
+    def sizes_of_rows(x, values):
+        slopes = jnp.where(jnp.isfinite(values), jnp.abs(values), 0)
+        return row_sizes(lambda v: rows.pattern.multiply(slopes, v), x, sizes, unit, magnitude(x))
 
     def largest(values):
-        magnitude = jnp.abs(values) * unit[rows.pattern.cols]
-        found = jnp.zeros(rows.pattern.n_rows, dtype).at[rows.pattern.rows].max(magnitude)
+        moved = jnp.abs(values) * unit[rows.pattern.cols]
+        found = jnp.zeros(rows.pattern.n_rows, dtype).at[rows.pattern.rows].max(moved)
         return 1 / jnp.where((found > 0) & (found < jnp.inf), found, 1)
 
     def merit_of(value, weight):
@@ -141,9 +143,7 @@ def sparse_newton(
     step = newton_step(value, values)
     state = (start, value, values, step, merit_of(value, weight), jnp.ones((), dtype), jnp.ones((), jnp.int32), done)
     x, value, values, *_, evaluations, _ = jax.lax.while_loop(going, body, state)
-    magnitude = jnp.abs(values)
-    reach = jnp.maximum(jnp.abs(x), sizes.nominal)
-    noise = NOISE * eps * (rows.pattern.multiply(magnitude, jnp.maximum(unit, reach)) + sizes.data)
-    limit = enough * (rows.pattern.multiply(magnitude, reach) + sizes.data) + noise
+    size, noise = sizes_of_rows(x, values)
+    limit = enough * size + noise
     method = jnp.where(evaluations > 1, METHODS.index("Newton"), 0).astype(jnp.int32)
     return SparseFound(x, limit, jnp.all(jnp.abs(value) <= limit), method, evaluations)

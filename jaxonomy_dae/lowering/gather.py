@@ -87,6 +87,9 @@ class Gather:
         return take(joined(parts), start[self.chunk] + np.maximum(self.offset, 0))
 
 
+NOTHING = Gather(*(np.zeros(0, np.int64),) * 3)
+
+
 def _is_scalar(chunk: Chunk) -> bool:
     return not isinstance(chunk, tuple) and jnp.ndim(chunk) == 0
 

@@ -15,27 +15,14 @@ from ..model.extended import Extended, ExtendedGroup
 from ..model.quantities import QuantityMap, leading_starts, quantity_scale
 from ..model.tables import ZERO, FlatModel, RowInjection
 from .entry_sizes import EntrySizes
-from .gather import Gather
+from .gather import NOTHING
 from .live_relations import without_live_relations
 from .plan import ConstraintGroup, InputTable, PlannedRow, SystemPlan
 from .plan_events import plan_events
 from .plan_held import plan_held
 from .plan_waves import plan_waves
 from .program import Layout, Program, plan
-from .schedule import AnyStep, SparseStep, Step, build_schedule
-
-
-def _needed(steps: Sequence[AnyStep], targets: np.ndarray, n: int) -> tuple[AnyStep, ...]:
-    """The steps on which the target quantities depend, in order."""
-    wanted = np.zeros(n, bool)
-    wanted[targets[targets != ZERO]] = True
-    kept = []
-    for step in reversed(steps):
-        if any(wanted[q].any() for q in step.unknown):
-            kept.append(step)
-            needs = step.needs()
-            wanted[needs[needs != ZERO]] = True
-    return tuple(reversed(kept))
+from .schedule import AnyStep, SparseStep, Step, build_schedule, needed
 
 
 def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = None) -> SystemPlan:
@@ -60,13 +47,13 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
 
     nonlinear = [s for s in steps if s.carried]
     residual_needs = np.concatenate([np.zeros(0, np.int64), *(s.needs() for s in nonlinear)])
-    upstream = _needed(steps, residual_needs, n)
+    upstream = needed(steps, residual_needs, n)
     keep = {id(s) for s in (*upstream, *nonlinear)}
     for_residuals = [s for s in steps if id(s) in keep]
     carried_residuals = program(for_residuals)
 
     constraint_groups, constraint_slots, constraint_pattern = _constraints(extended, selection, state_order)
-    constraint_program = program(_needed(steps, constraint_slots, n))
+    constraint_program = program(needed(steps, constraint_slots, n))
     planned_constraints = tuple(
         ConstraintGroup(
             g,
@@ -77,7 +64,6 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
         for g in constraint_groups
     )
 
-    everything = program(steps)
     events = plan_events(
         flat,
         variable_map,
@@ -85,15 +71,15 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
         quantity_name,
         extended,
         steps,
-        lambda q: program(_needed(steps, q, n)),
+        lambda q: program(needed(steps, q, n)),
     )
-    held = plan_held(flat.held, variable_map, lambda q: program(_needed(steps, q, n)))
+    held = plan_held(flat.held, variable_map, lambda q: program(needed(steps, q, n)))
     watched = [] if events is None else [variable_map.quantity[events.table.guard[events.n_clocks :]]]
     row_inputs = [_of(variable_map, row.inputs) for row in flat.rows]
     following = state_order + 1
     rates = carried + 1 if _rates_hold(flat, variable_map, extended, for_residuals, carried) else carried[:0]
     watched += [q for q, _ in row_inputs]
-    derivative = program(_needed(steps, np.concatenate([following, rates, *(q for q, _ in row_inputs)]), n))
+    derivative = program(needed(steps, np.concatenate([following, rates, *(q for q, _ in row_inputs)]), n))
     rows = tuple(
         _plan_row(row, inputs, variable_map, state_order, derivative.layout)
         for row, inputs in zip(flat.rows, row_inputs, strict=True)
@@ -116,38 +102,38 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
     opaque = {g.template.opaque.index: g.template.opaque for g in extended.groups if g.template.opaque is not None}
     opaque |= {r.opaque.index: r.opaque for r in flat.rows}
     functions = tuple(opaque[k].function if k in opaque else None for k in range(len(flat.networks)))
+    waves = plan_waves(needed(steps, np.concatenate([following, rates, constraint_slots, *watched]), n))
     return SystemPlan(
-        _digest(flat, variable_map, mode, selection, state_order, extended, steps, linear_solver),
-        flat,
-        model.alias,
-        variable_map,
-        groups,
-        extended,
-        selection,
-        steps,
-        blocks,
-        mode,
-        {name: k for k, name in enumerate(variables.names)},
-        quantity_name,
-        state_order,
-        carried,
-        quantity_scale(flat, variable_map, extended)[in_state],
-        inputs,
-        derivative,
-        derivative.layout.gather(following) if len(following) else Gather(*(np.zeros(0, np.int64),) * 3),
-        derivative.layout.gather(rates) if len(rates) else None,
-        everything,
-        carried_residuals,
-        constraint_program,
-        planned_constraints,
-        constraint_pattern,
-        rows,
-        tuple(flat.networks),
-        functions,
-        linear_solver,
-        events,
-        held,
-        plan_waves(_needed(steps, np.concatenate([following, rates, constraint_slots, *watched]), n)),
+        digest=_digest(flat, variable_map, mode, selection, state_order, extended, steps, linear_solver),
+        flat=flat,
+        alias=model.alias,
+        variable_map=variable_map,
+        groups=groups,
+        extended=extended,
+        selection=selection,
+        steps=steps,
+        blocks=blocks,
+        mode=mode,
+        variable_index={name: k for k, name in enumerate(variables.names)},
+        quantity_name=quantity_name,
+        states=state_order,
+        carried=carried,
+        nominal=quantity_scale(flat, variable_map, extended)[in_state],
+        inputs=inputs,
+        derivative=derivative,
+        next_derivative=derivative.layout.gather(following) if len(following) else NOTHING,
+        carried_rates=derivative.layout.gather(rates) if len(rates) else None,
+        carried_residuals=carried_residuals,
+        constraint_program=constraint_program,
+        constraints=planned_constraints,
+        constraint_pattern=constraint_pattern,
+        rows=rows,
+        network_names=tuple(flat.networks),
+        functions=functions,
+        linear_solver=linear_solver,
+        events=events,
+        held=held,
+        waves=waves,
     )
 
 

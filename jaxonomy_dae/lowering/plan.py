@@ -18,15 +18,14 @@ from ..model.opaque import OpaqueFunction
 from ..model.provenance import differentiated
 from ..model.quantities import QuantityMap
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, provenance_of
-from ..model.typical_sizes import error_sizes, typical_sizes
 from . import pattern
 from .dummy_blocks import DummyBlocks, dummy_blocks
 from .gather import Gather
 from .plan_events import EventPlan
 from .plan_held import HeldPlan
 from .plan_waves import WaveGroup
-from .program import Program
-from .schedule import TORN, AnyStep
+from .program import Program, plan
+from .schedule import TORN, AnyStep, needed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,7 +91,6 @@ class SystemPlan:
     derivative: Program
     next_derivative: Gather
     carried_rates: Gather | None  # where the model itself has the derivatives of all `carried`
-    everything: Program
     carried_residuals: Program
     constraint_program: Program
     constraints: tuple[ConstraintGroup, ...]
@@ -153,15 +151,9 @@ class SystemPlan:
         """The nonlinear blocks whose unknowns were dropped from the candidates for states."""
         return dummy_blocks(self.steps, self.selection.dummies) if len(self.carried) else ()
 
-    @functools.cached_property
-    def typical_sizes(self) -> np.ndarray:
-        """Of all quantities: they say where a search begins to look, and what may be rounding."""
-        return typical_sizes(self.flat, self.variable_map, self.extended)
-
-    @functools.cached_property
-    def error_sizes(self) -> np.ndarray:
-        """The sizes to whose rounding all quantities are known."""
-        return error_sizes(self.flat, self.variable_map, self.extended, self.typical_sizes)
+    def reading(self, quantities: np.ndarray) -> Program:
+        """The program that computes these quantities and nothing else."""
+        return _reading(self, tuple(np.unique(quantities).tolist()))
 
     def quantity_of(self, variable: int) -> tuple[int, float]:
         """(quantity, factor) of a variable; quantity ZERO if it is identically zero."""
@@ -240,3 +232,11 @@ class SystemPlan:
             quantity.append(q if q == ZERO else q + order)
             factor.append(s)
         return np.array(quantity, np.int64), np.array(factor, float)
+
+
+@functools.lru_cache(maxsize=256)
+def _reading(system: SystemPlan, quantities: tuple[int, ...]) -> Program:
+    steps = needed(system.steps, np.array(quantities, np.int64), system.extended.quantities.n)
+    inputs = np.arange(system.extended.quantities.n_unknown, system.extended.quantities.n)
+    n = system.extended.quantities.n
+    return plan(steps, system.states, inputs, n, system.carried, system.linear_solver)

@@ -10,7 +10,7 @@ from ..errors import ModelError
 from ..model.extended import Extended
 from ..model.quantities import QuantityMap
 from ..model.tables import ZERO, DependentParameters, EventTable, FlatModel
-from .gather import Gather
+from .gather import NOTHING, Gather
 from .program import Program
 from .schedule import AnyStep, Step
 
@@ -171,7 +171,7 @@ def read_variables(
     quantity = np.where(chosen < 0, ZERO, variables.quantity[chosen])
     made = program(quantity)
     if not len(chosen):
-        return made, Gather(*(np.zeros(0, np.int64),) * 3)
+        return made, NOTHING
     return made, made.layout.gather(quantity, np.where(chosen < 0, 1.0, variables.factor[chosen]))
 
 

@@ -7,11 +7,13 @@ whole: their equations are grouped by template, and their matrix is sparse.
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
 from ..compiler.order_blocks import Blocks
 from ..model.extended import Extended, ExtendedGroup
+from ..model.tables import ZERO
 from ..model.template import AbstractTemplate
 from ..structure.tearing import Sizes, Tearing, tear
 from .entry_sizes import EntrySizes
@@ -119,6 +121,19 @@ class SparseStep(AbstractStep):
 
 
 AnyStep = Step | SparseStep
+
+
+def needed(steps: Sequence[AnyStep], targets: np.ndarray, n: int) -> tuple[AnyStep, ...]:
+    """The steps on which the target quantities depend, in order."""
+    wanted = np.zeros(n, bool)
+    wanted[targets[targets != ZERO]] = True
+    kept = []
+    for step in reversed(steps):
+        if any(wanted[q].any() for q in step.unknown):
+            kept.append(step)
+            needs = step.needs()
+            wanted[needs[needs != ZERO]] = True
+    return tuple(reversed(kept))
 
 
 def build_schedule(extended: Extended, blocks: Blocks, entry_sizes: EntrySizes) -> tuple[AnyStep, ...]:

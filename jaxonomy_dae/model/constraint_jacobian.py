@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
-from .evaluate_numpy import Networks, group_values, partial_errors
+from .evaluate_numpy import Networks, group_values, partial_errors, partials_along
 from .extended import Extended, ExtendedGroup
 from .tables import ZERO, EquationGroup, equation_offsets
 
@@ -86,6 +86,20 @@ def evaluate(
     return _gathered(
         groups, extended, entries, lambda g: group_values(g, values, parameters, t, networks, partials=True)
     )
+
+
+def evaluate_along(
+    groups: tuple[EquationGroup, ...],
+    extended: Extended,
+    entries: ConstraintEntries,
+    values: np.ndarray,
+    move: np.ndarray,
+    parameters: np.ndarray,
+    t: float,
+    networks: Networks,
+) -> np.ndarray:
+    """How these numbers change where all quantities move by `move`."""
+    return _gathered(groups, extended, entries, lambda g: partials_along(g, values, move, parameters, t, networks))
 
 
 def evaluate_errors(

@@ -52,6 +52,26 @@ def group_values(group: ExtendedGroup, values, parameters, t: float, networks: N
     return np.broadcast_to(np.asarray(out, float), (n,))
 
 
+def partials_along(group: ExtendedGroup, values, move, parameters, t: float, networks: Networks) -> np.ndarray:
+    """The derivatives of a group's partial derivatives, (n, slots), where all quantities move by `move`: what moves so
+    makes them the partial derivatives of the residual's time derivative."""
+    template = group.template.derivative
+    place = {slot: k for k, slot in enumerate(group.template.slots)}
+    at, moved = slot_values(group, values), slot_values(group, move)
+    p, c, n = list(parameters[group.parameter].T), list(group.coefficient.T), len(group)
+
+    def partials(moved: Sequence[np.ndarray]) -> tuple:
+        slots = [at[place[s]] if s in place else moved[place[s[0], s[1] - 1]] for s in template.slots]
+        return template.partial_values(slots, p, c, t, networks, backend="numpy")
+
+    still = partials([np.zeros(n)] * len(moved))  # what changes with time alone
+    out = np.zeros((n, len(place)))
+    for slot, moving, resting in zip(template.slots, partials(moved), still, strict=True):
+        if slot in place:
+            out[:, place[slot]] = np.asarray(moving, float) - np.asarray(resting, float)
+    return out * group.factor
+
+
 def partial_errors(group: ExtendedGroup, values, errors, parameters, t: float, networks: Networks) -> np.ndarray:
     """Bounds of the errors of a group's partial derivatives (n, slots), given those of all quantities."""
     slots = slot_values(group, values)

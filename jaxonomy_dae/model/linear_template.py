@@ -51,6 +51,9 @@ class LinearTemplate(AbstractTemplate):
             total = total + scaled(c, s)
         return total
 
+    def magnitude(self, sizes, slots, parameters, coefficients, t, networks, backend="jax"):
+        return self.residual(sizes, parameters, [abs(c) for c in coefficients], t, networks, backend)
+
     def partial_values(self, slots, parameters, coefficients, t, networks, backend="jax"):
         return tuple(coefficients)
 

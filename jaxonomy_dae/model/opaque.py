@@ -158,6 +158,9 @@ class OpaqueTemplate(AbstractTemplate):
         like = jnp.asarray(slots[0], dtype=None if hasattr(slots[0], "dtype") else jnp.asarray(t).dtype)
         return like - self._function(slots[1:], t, networks, like)
 
+    def magnitude(self, sizes, slots, parameters, coefficients, t, networks, backend="jax"):
+        return sizes[0] + abs(slots[0] - self.residual(slots, parameters, coefficients, t, networks, backend))
+
     def solve(self, position, slots, parameters, coefficients, t, networks, backend="jax"):
         if position != 0:
             raise AssertionError("a function is solved for its outputs only")

@@ -12,6 +12,7 @@ import numpy as np
 from ..expressions.differentiate import directional_derivative, partial_derivative, raised
 from ..expressions.errors import KNOWN, KernelWithErrors
 from ..expressions.kernel import Kernel
+from ..expressions.magnitude import magnitude
 from ..expressions.node import ONE, ZERO, Node, constant, divide, leaf, linear, scale, split
 from ..expressions.substitute import substitute
 from ..expressions.terms import terms
@@ -21,6 +22,11 @@ from .template import AbstractTemplate, Slot
 
 def slot_label(slot: Slot) -> Hashable:
     return ("slot", *slot)
+
+
+def size_label(label: Hashable) -> Hashable | None:
+    """The label of the magnitude of a slot, given the slot's; None for other leaves, which are as large as they are."""
+    return ("size", *label[1:]) if isinstance(label, tuple) and label[0] == "slot" else None
 
 
 def parameter_label(k: int) -> Hashable:
@@ -112,10 +118,7 @@ class SymbolicTemplate(AbstractTemplate):
         if key not in self._kernels:
             self._kernels[key] = Kernel(graphs(), self._labels)
         slots, parameters, coefficients, t = arguments
-        arrays = [v for v in (*slots, *parameters) if isinstance(v, jax.Array)]
-        if arrays:
-            dtype = arrays[0].dtype
-            coefficients = [c if np.ndim(c) == 0 else jnp.asarray(c, dtype) for c in coefficients]
+        coefficients = _in_dtype(coefficients, [*slots, *parameters])
         return self._kernels[key]([*slots, *parameters, *coefficients, t], backend)
 
     def residual(self, slots, parameters, coefficients, t, networks, backend="jax") -> Any:
@@ -123,6 +126,13 @@ class SymbolicTemplate(AbstractTemplate):
 
     def partial_values(self, slots, parameters, coefficients, t, networks, backend="jax") -> tuple:
         return tuple(self._evaluate("partials", lambda: self.partials, (slots, parameters, coefficients, t), backend))
+
+    def magnitude(self, sizes, slots, parameters, coefficients, t, networks, backend="jax") -> Any:
+        if "magnitude" not in self._kernels:
+            sizes_of = [size_label(slot_label(s)) for s in self.slots]
+            self._kernels["magnitude"] = Kernel([magnitude(self.graph, size_label)], [*self._labels, *sizes_of])
+        coefficients = _in_dtype(coefficients, [*slots, *parameters])
+        return self._kernels["magnitude"]([*slots, *parameters, *coefficients, t, *sizes], backend)[0]
 
     @functools.cached_property
     def _partials_with_errors(self) -> KernelWithErrors:
@@ -144,6 +154,12 @@ class SymbolicTemplate(AbstractTemplate):
             return [scale(-1, divide(rest, self.partials[position]))]
 
         return self._evaluate(("solve", position), solved, (slots, parameters, coefficients, t), backend)[0]
+
+
+def _in_dtype(coefficients: Sequence[Any], values: Sequence[Any]) -> Sequence[Any]:
+    """Coefficients that differ by instance, in the dtype of traced values."""
+    arrays = [v for v in values if isinstance(v, jax.Array)]
+    return [c if np.ndim(c) == 0 else jnp.asarray(c, arrays[0].dtype) for c in coefficients] if arrays else coefficients
 
 
 @functools.lru_cache(maxsize=4096)

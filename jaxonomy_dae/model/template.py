@@ -44,6 +44,10 @@ class AbstractTemplate(abc.ABC):
     def partial_values(self, slots, parameters, coefficients, t, networks, backend="jax") -> tuple:
         """The values of ∂(residual)/∂(slot), one for each slot."""
 
+    @abc.abstractmethod
+    def magnitude(self, sizes, slots, parameters, coefficients, t, networks, backend="jax") -> Any:
+        """How large the residual's terms are (see `expressions.magnitude`); `sizes` are the magnitudes of slots."""
+
     def partial_errors(self, slots, errors, parameters, coefficients, t, networks) -> tuple:
         """Bounds of the errors of `partial_values` in NumPy, where `errors` are those of slots, and parameters and
         coefficients are known to `KNOWN`. Here for partial derivatives that are given numbers, or in which nothing is

@@ -16,36 +16,47 @@ DECADES = 30  # that they may span: single precision has 38
 def typical_sizes(flat: FlatModel, variables: QuantityMap, extended: Extended) -> Float[np.ndarray, " quantities"]:
     """Of all quantities, at the parameter values the model was compiled with; powers of two, by which numbers are
     multiplied without rounding."""
-    return 2.0 ** np.round(np.log2(unrounded_sizes(flat, variables, extended)))
+    return _rounded(unrounded_sizes(flat, variables, extended))
+
+
+def _rounded(sizes: Float[np.ndarray, " quantities"]) -> Float[np.ndarray, " quantities"]:
+    return 2.0 ** np.round(np.log2(sizes))
 
 
 def unrounded_sizes(flat: FlatModel, variables: QuantityMap, extended: Extended) -> Float[np.ndarray, " quantities"]:
     """The same, not rounded: rounded, sizes that differ by little may differ by two, and choose other states."""
     if extended.quantities.n_unknown > LIMIT:
         return np.ones(extended.quantities.n)
-    return _balanced(flat, extended, _declared_or_started(flat, variables, extended))
+    parameters = flat.parameters.values
+    return _balanced(extended, parameters, _declared_or_started(flat, variables, extended, parameters))
 
 
 def error_sizes(
-    flat: FlatModel, variables: QuantityMap, extended: Extended, typical: Float[np.ndarray, " quantities"]
+    flat: FlatModel, variables: QuantityMap, extended: Extended, parameters: Float[np.ndarray, " parameters"]
 ) -> Float[np.ndarray, " quantities"]:
-    """The sizes to whose rounding quantities are known, where they are near zero: the typical ones, except that a start
-    which is rounding itself, as L·sin(π) is, says nothing. Zero where nothing is known."""
+    """The sizes to whose rounding quantities are known, where they are near zero, at these values of the parameters:
+    the typical ones, except that a start which is rounding itself, as L·sin(π) is, says nothing. Zero where nothing is
+    known."""
     declared = declared_scale(flat, variables, extended)
     if extended.quantities.n_unknown > LIMIT:
         return declared
-    started = _declared_or_started(flat, variables, extended)
+    started = _declared_or_started(flat, variables, extended, parameters)
+    typical = _balanced(extended, parameters, started)
     if (np.abs(started) > KNOWN * typical.max(initial=0.0))[started != 0.0].all():
-        return typical
-    without = _balanced(flat, extended, declared)
+        return _rounded(typical)
+    without = _balanced(extended, parameters, declared)
     is_rounding = (np.abs(started) <= KNOWN * without) & (started != 0.0)
-    return _balanced(flat, extended, np.where(is_rounding, declared, started)) if is_rounding.any() else typical
+    if not is_rounding.any():
+        return _rounded(typical)
+    return _balanced(extended, parameters, np.where(is_rounding, declared, started))
 
 
-def _declared_or_started(flat: FlatModel, variables: QuantityMap, extended: Extended) -> np.ndarray:
+def _declared_or_started(
+    flat: FlatModel, variables: QuantityMap, extended: Extended, parameters: np.ndarray
+) -> np.ndarray:
     """Nominal values, and else first starts; zero where there is none."""
     size = declared_scale(flat, variables, extended)
-    values = flat.variables.start.values(flat.parameters.values)
+    values = flat.variables.start.values(parameters)
     for v in np.flatnonzero(flat.variables.start.is_given).tolist():
         quantity, factor = variables[v]
         if quantity >= 0 and size[quantity] == 0.0:
@@ -54,8 +65,8 @@ def _declared_or_started(flat: FlatModel, variables: QuantityMap, extended: Exte
     return size
 
 
-def _balanced(flat: FlatModel, extended: Extended, size: np.ndarray) -> np.ndarray:
+def _balanced(extended: Extended, parameters: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Sizes that make terms alike, where `size` is zero."""
     start = np.where(size == 0.0, 1.0, size)
-    found, _ = natural_sizes(extended.groups, extended.n_equations, start, flat.parameters.values)
+    found, _ = natural_sizes(extended.groups, extended.n_equations, start, parameters)
     return 10.0 ** np.clip(np.log10(np.abs(found)), -DECADES, DECADES)

@@ -65,7 +65,7 @@ def check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_contr
 def _check_periods(system: AcausalSystem):
     if system.plan.events is None or not system.plan.events.n_clocks:
         return
-    periods = _concrete(SystemAt(system.plan, system.numbers, (), 0.0, {}).clocks()[0])
+    periods = _concrete(SystemAt(system.plan, system.numbers, (), 0.0, {}, system.typical_sizes).clocks()[0])
     if periods is None:
         return
     bad = np.flatnonzero(~(periods > 0))

@@ -47,7 +47,8 @@ def failed_block(system: AcausalSystem, first: Point, last: Point, t1: Any, inpu
 def _first_failed(system: AcausalSystem, t: Any, x: Any, inputs: dict[str, Any]) -> AnyStep | None:
     """The first step of two and more equations, or a nonlinear one, that has no value."""
     plan = system.plan
-    computed = np.flatnonzero(plan.everything.layout.chunk != -2)
+    known = np.arange(plan.extended.quantities.n_unknown, plan.extended.quantities.n)
+    computed = np.concatenate([plan.states, *(q for step in plan.steps for q in step.unknown), known])
     values = np.full(plan.extended.quantities.n + 1, np.nan)
     values[computed] = _quantities(system, t, jnp.asarray(x), inputs, tuple(computed.tolist()))
     values[ZERO] = 0.0

@@ -117,7 +117,7 @@ def mode_at_start(system: AcausalSystem, inputs: dict[str, Any], t0: Any, x0: An
         return ""
     active, levels = map(np.asarray, system.at(t0, inputs).held(x0))
     projected = np.asarray(system.project(t0, x0, inputs, iterations=RESTART))
-    n, typical = len(system.plan.states), system.plan.typical_sizes[system.plan.states]
+    n, typical = len(system.plan.states), np.asarray(system.typical_sizes)[system.plan.states]
     moved = np.abs(projected - np.asarray(x0))[:n] / (np.abs(np.asarray(x0))[:n] + typical)
     if (moved <= CONSISTENT).all():
         return ""

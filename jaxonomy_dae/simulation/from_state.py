@@ -19,7 +19,7 @@ ITERATIONS = 8  # Gauss–Newton steps onto the constraints, which converge quad
 def from_state(system: AcausalSystem, t0: Any, inputs: Any, x: Float[Array, " n"]) -> InitialPoint:
     """The consistent point next to a state. The search for it is kept out of differentiation; a last step carries first
     derivatives, by the state and by parameters, which are those of the projection where it arrived."""
-    limit = jnp.sqrt(jnp.finfo(x.dtype).eps) * (jnp.abs(x) + jnp.asarray(_typical(system), x.dtype))
+    limit = jnp.sqrt(jnp.finfo(x.dtype).eps) * (jnp.abs(x) + _typical(system))
     nothing = jnp.zeros((), jnp.int32)
     if not system.is_constrained:
         return InitialPoint(x, x[:0], jnp.zeros_like(x), limit, jnp.zeros_like(x), nothing, nothing, None)
@@ -33,9 +33,9 @@ def from_state(system: AcausalSystem, t0: Any, inputs: Any, x: Float[Array, " n"
     return InitialPoint(moved, x[:0], frozen(moved - near), limit, jnp.zeros_like(x), nothing, nothing, None)
 
 
-def _typical(system: AcausalSystem) -> np.ndarray:
+def _typical(system: AcausalSystem) -> Any:
     plan = system.plan
-    return plan.typical_sizes[np.concatenate([plan.states, plan.carried])]
+    return jax.lax.stop_gradient(system.typical_sizes[np.concatenate([plan.states, plan.carried])])
 
 
 def check_shape(system: AcausalSystem, initial: Any) -> None:

@@ -57,7 +57,7 @@ class SystemProblem(AbstractHybridProblem):
         return self.system.holding(q).at(t, args).guards(x)
 
     def clocks(self):
-        return SystemAt(self.system.plan, self.system.numbers, (), 0.0, {}).clocks()
+        return SystemAt(self.system.plan, self.system.numbers, (), 0.0, {}, self.system.typical_sizes).clocks()
 
     def written(self, t, x, q, previous, event, args):
         events: Any = self.system.plan.events
@@ -133,8 +133,8 @@ class SystemProblem(AbstractHybridProblem):
         if not self.system.is_constrained:
             return x
         projected = self.system.holding(q).project(t, x, args, iterations=RESTART)
-        n, typical = len(plan.states), plan.typical_sizes[plan.states]
-        allowed = CONSISTENT * (jnp.abs(x[:n]) + jnp.asarray(typical, x.dtype))
+        n, typical = len(plan.states), self.system.typical_sizes[plan.states]
+        allowed = CONSISTENT * (jnp.abs(x[:n]) + jax.lax.stop_gradient(typical))
         consistent = jnp.all(jnp.abs(projected[:n] - x[:n]) <= allowed)
         return jnp.where(consistent, projected, jnp.nan)
 

@@ -35,7 +35,7 @@ def controller_for(system: AcausalSystem, solver: Any, rtol: Any, atol: Any, dtm
         controller = diffrax.PIDController(rtol=rtol, atol=atol, dtmax=dtmax)
     if dtmax is not None or not system.plan.waves:
         return controller
-    at = SystemAt(system.plan, system.numbers, (), 0.0, {})
+    at = SystemAt(system.plan, system.numbers, (), 0.0, {}, system.typical_sizes)
     return WaveControl(controller, *at.waves())  # pyright: ignore[reportCallIssue]
 
 

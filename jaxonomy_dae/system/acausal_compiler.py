@@ -14,6 +14,7 @@ from ..compiler.pipeline import compile_flat
 from ..errors import ModelError
 from ..linear.choice import check_linear_solver
 from ..lowering.lower import lower
+from ..model.typical_sizes import typical_sizes
 from ..modeling.diagram import AcausalDiagram
 from ..modeling.environment import EqnEnv
 from ..modeling.neural import as_weights
@@ -94,7 +95,8 @@ class AcausalCompiler:
         flat = flatten(self.diagram)
         if self.check_units:
             check_units_of(self.diagram)
-        plan = lower(compile_flat(flat, self.state_selection, self.prefer_states), self.linear_solver)
+        model = compile_flat(flat, self.state_selection, self.prefer_states)
+        plan = lower(model, self.linear_solver)
         self._report = SystemReport(plan)
         declared = flat.parameters
         n = declared.n_declared
@@ -104,9 +106,10 @@ class AcausalCompiler:
         )  # fmt: skip
         with jax.ensure_compile_time_eval():  # also where it is called while a function is traced
             values = jnp.asarray(declared.values[:n], dtype=jnp.result_type(float))
+            sizes = jnp.asarray(typical_sizes(model.flat, model.variables, model.extended), dtype=values.dtype)
         parameters = Parameters(values, None, (), table)
         neural = {name: _own(network) for name, network in flat.networks.items()}
-        return AcausalSystem(parameters, neural, plan)
+        return AcausalSystem(parameters, neural, sizes, plan)
 
 
 def _own(network: Any) -> Any:

@@ -5,10 +5,10 @@ The traced program grows with the number of steps, not of the equations in them.
 Nonlinear blocks are solved from the values their unknowns have in the state array. What is returned fulfils their
 equations,
 
-    |r| ≤ c Σ |∂r/∂s| |s| + c' eps Σ |∂r/∂s| + c'' Σ |∂r/∂s| δs      over all that stands in an equation,
+    |r| ≤ c Σ|terms of r| + c' eps Σ |∂r/∂s| size(s) + c'' Σ |∂r/∂s| δs      over all that stands in an equation,
 
-where δs is what rounding may have left in what was eliminated; or is not-a-number: an iteration that diverged, cycles,
-or rests where |r| is smallest but not zero.
+where size(s) is what a slot usually is, beside which zero is judged, and δs is what rounding may have left in what was
+eliminated; or is not-a-number: an iteration that diverged, cycles, or rests where |r| is smallest but not zero.
 """
 
 import copy
@@ -16,7 +16,7 @@ import enum
 import functools
 import operator
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -29,13 +29,15 @@ from ..lowering.gather import FEW, Chunk, Gather, entries, take, times
 from ..lowering.program import PlannedEquation, PlannedLoop, PlannedSparse, PlannedStep, Program
 from ..model.evaluate_numpy import Networks
 from ..model.linear_template import LinearTemplate, scaled
+from ..model.tables import ZERO
 
 UNROLLED_REPETITIONS = 4  # of a loop, written out in each of its iterations
 LONG_SUM = 16  # linear equations with more terms are one gather and one sum
 NEWTON_STEPS = 60  # to the root of a nonlinear block, at most; a double root takes 27
 ROUGH = 1e-2  # residual of an equation relative to its terms, where one Newton correction is made
 NOISE = 8.0  # times what rounding may have left in an equation
-ROUNDING = 1e2  # in units of eps, of terms that are 1: what constants within an equation may leave
+ZERO_WITHIN = 1e2  # in units of eps and of its typical size: what cannot be told from zero. A double root at zero is
+# approached by half the way in each step, 46 of the 60 to here
 
 
 class Refinement(enum.Enum):
@@ -49,7 +51,9 @@ class Refinement(enum.Enum):
 class Evaluation:
     """One pass over a program's steps at one point."""
 
-    def __init__(self, state: Chunk, inputs: Chunk, parameters: Any, t: Any, networks: Networks):
+    def __init__(self, state: Chunk, inputs: Chunk, parameters: Any, t: Any, networks: Networks, typical: Any):
+        """`typical` are the sizes of all quantities, by which nonlinear blocks are judged."""
+        self.typical = typical
         self.chunks: list[Chunk] = [state, inputs]
         self.parameters = parameters
         self._scalars: list[Any] | None = None
@@ -64,7 +68,7 @@ class Evaluation:
         chunks, parameters, t, weights = jax.tree.map(
             lambda leaf: jax.lax.stop_gradient(leaf) if isinstance(leaf, jax.Array) else leaf, parts
         )
-        other = Evaluation((), (), parameters, t, Networks(weights))
+        other = Evaluation((), (), parameters, t, Networks(weights), self.typical)
         other.chunks = chunks
         return other
 
@@ -197,10 +201,31 @@ class Evaluation:
         noise = self._noise(planned, local)
         verdicts = []
         for e in planned.step.tearing.residuals:
-            residual, slots, partials = self._terms(planned.equations[e], local)
-            left = [p * n for p, n in zip(partials, self._of_slots(planned.equations[e], noise), strict=False)]
-            verdicts.append(is_small(residual, slots, partials, tolerated, left))
+            equation = planned.equations[e]
+            residual, slots, partials = self._terms(equation, local)
+            terms = self._magnitude(equation, local)
+            noise_of = self._of_slots(equation, noise)
+            verdicts.append(is_small(residual, terms, partials, self._typical(equation), tolerated, noise_of))
         return functools.reduce(jnp.logical_and, verdicts)
+
+    def _magnitude(self, planned: PlannedEquation, local: list[Any]) -> Any:
+        """How large the terms of an equation are, not differentiated."""
+        arguments: Any = self._still_arguments(planned, local)
+        return planned.equation.template.magnitude([jnp.abs(s) for s in arguments[0]], *arguments)
+
+    def _typical(self, planned: PlannedEquation) -> list[Any]:
+        """The typical sizes of an equation's slots; the constant zero has none."""
+        out = []
+        for slot in planned.equation.slots:
+            size = jnp.abs(jnp.asarray(slot.factor, self.dtype)) * self.typical[slot.quantity]
+            size = jnp.where(slot.quantity == ZERO, 0, size)
+            out.append(size[0] if len(slot.quantity) == 1 else size)
+        return out
+
+    def _still_arguments(self, planned: PlannedEquation, local: list[Any]):
+        """The arguments of an equation's template, not differentiated."""
+        slots, parameters, *rest = self._arguments(planned, local)
+        return *jax.lax.stop_gradient((slots, parameters)), *rest
 
     def _noise(self, planned: PlannedStep, local: list[Any]) -> list[Any]:
         """What rounding may have left in each unknown that follows from others (a running error analysis, Wilkinson
@@ -212,7 +237,7 @@ class Evaluation:
             _, slots, partials = self._terms(equation, local)
             places = [s.local for s in equation.equation.slots]
             before = self._of_slots(equation, noise)
-            slope, total = 0.0, 0.0
+            slope, total = 0.0, eps * self._magnitude(equation, local)
             for place, factor, s, p, n in zip(places, equation.factors, slots, partials, before, strict=False):
                 if place == u:
                     slope = slope + _scaled(factor, p, self.dtype)
@@ -227,15 +252,14 @@ class Evaluation:
         return [0.0 if s.local < 0 else _scaled(abs(f), noise[s.local], self.dtype) for s, f in pairs]
 
     def _terms(self, planned: PlannedEquation, local: list[Any]) -> tuple[Any, list[Any], Sequence[Any]]:
-        """An equation's residual, slots and partial derivatives, not differentiated. Of a network's output, y − N(u),
-        those of y and N(u)."""
+        """An equation's residual, slots and partial derivatives, not differentiated; of a network's output, y − N(u),
+        those of y alone."""
         template = planned.equation.template
-        slots, parameters, *rest = self._arguments(planned, local)
-        slots, parameters = jax.lax.stop_gradient((slots, parameters))
-        arguments: Any = (slots, parameters, *rest)
+        arguments: Any = self._still_arguments(planned, local)
+        slots = arguments[0]
         residual = template.residual(*arguments)
         if template.opaque is not None:
-            return residual, [slots[0], slots[0] - residual], (1.0, 1.0)
+            return residual, slots[:1], (1.0,)
         return residual, slots, template.partial_values(*arguments)
 
     def _loop(self, planned: PlannedLoop) -> list[Any]:
@@ -248,7 +272,7 @@ class Evaluation:
 
         def repetition(carried, given):
             outside, parameters = given
-            inner = Evaluation(carried, outside, parameters, self.t, Networks(self.networks.weights))
+            inner = Evaluation(carried, outside, parameters, self.t, Networks(self.networks.weights), self.typical)
             for step in planned.body:
                 inner.chunks.extend(inner._step(step, Refinement.NONE))
             if planned.following is not None:
@@ -289,24 +313,30 @@ class Evaluation:
     def _whole_corrected(self, planned: PlannedSparse, u: Any) -> Any:
         """The unknowns of large blocks after one Newton step, which is exact if the equations are affine."""
         equations = self._whole(planned, u)
-        residual = jnp.concatenate([r for r, _, _ in equations])
+        residual = jnp.concatenate([r for r, _ in equations])
+        matrix, checked = self._entries(planned, equations), planned.guess is None
+        return u - solve_whole(planned.pattern, matrix, residual, checked=checked, solver=planned.linear_solver)
+
+    def _entries(self, planned: PlannedSparse, equations: list[tuple[Any, Sequence[Any]]]) -> Any:
+        """The entries of the matrix of large blocks, from the residuals and partial derivatives of their equations."""
         values = [
             _scaled(factor, take(self._filled(partials[k], r.shape), instances), self.dtype)
-            for (r, _, partials), entries in zip(equations, planned.entries, strict=True)
+            for (r, partials), entries in zip(equations, planned.entries, strict=True)
             for k, instances, factor in entries
         ]
-        checked = planned.guess is None
-        matrix = jnp.concatenate(values)
-        return u - solve_whole(planned.pattern, matrix, residual, checked=checked, solver=planned.linear_solver)
+        return jnp.concatenate(values)
 
     def _whole_holds(self, planned: PlannedSparse, u: Any, tolerated: float) -> Any:
         """Whether all equations of large blocks hold."""
-        return functools.reduce(
-            lambda holds, equation: holds & jnp.all(is_small(*equation, tolerated)), self._whole(planned, u), True
-        )
+        there = self._beside(u)
+        holds = jnp.asarray(True)
+        for equation, (residual, partials) in zip(planned.equations, self._whole(planned, u), strict=True):
+            terms = there._magnitude(equation, [])
+            holds &= jnp.all(is_small(residual, terms, partials, self._typical(equation), tolerated))
+        return holds
 
-    def _whole(self, planned: PlannedSparse, u: Any) -> list[tuple[Any, list[Any], Sequence[Any]]]:
-        """The residuals, slots and partial derivatives of a sparse step's equations at its unknowns u."""
+    def _whole(self, planned: PlannedSparse, u: Any) -> list[tuple[Any, Sequence[Any]]]:
+        """The residuals and partial derivatives of a sparse step's equations at its unknowns u."""
         there = self._beside(u)
         out = []
         for equation in planned.equations:
@@ -323,10 +353,10 @@ class Evaluation:
                 partials: Sequence[Any] = [_slope(residual, slots, k) for k in range(len(slots))]
             else:
                 partials = template.partial_values(slots, *rest)
-            out.append((residual(*slots), slots, partials))
+            out.append((residual(*slots), partials))
         return out
 
-    def _beside(self, u: Any) -> "Evaluation":
+    def _beside(self, u: Any) -> Self:
         """The same with one more chunk."""
         there = copy.copy(self)
         there.chunks = [*self.chunks, u]
@@ -383,14 +413,26 @@ def rounding(dtype: Any) -> float:
 
 
 def is_small(
-    residual: Any, slots: Sequence[Any], partials: Sequence[Any], tolerated: float, noise: Sequence[Any] = ()
+    residual: Any,
+    terms: Any,
+    partials: Sequence[Any],
+    typical: Sequence[Any],
+    tolerated: float,
+    noise: Sequence[Any] = (),
 ) -> Any:
-    """Whether a residual is small beside its terms, |∂r/∂s|·|s| each, or beside the `noise` in them."""
+    """Whether a residual is small beside its terms, or beside the rounding of what it is computed from.
+
+    **Arguments:**
+
+    - `terms`: how large its terms are.
+    - `partials`, `typical`, `noise`: its partial derivatives by slots; the typical sizes of these; and what rounding
+        may have left in them beyond their own.
+    """
     eps = float(jnp.finfo(jnp.result_type(residual)).eps)
-    floor = ROUNDING * eps / tolerated
-    terms = [abs(p) * (jnp.abs(s) + floor) for p, s in zip(partials, slots, strict=True)]
-    allowed = tolerated * functools.reduce(jnp.add, terms)
-    allowed = functools.reduce(jnp.add, [NOISE * jnp.abs(n) for n in noise], allowed)
+    allowed = tolerated * terms
+    for k, (partial, size) in enumerate(zip(partials, typical, strict=False)):  # of a network, its output alone
+        left = ZERO_WITHIN * eps * size
+        allowed = allowed + jnp.abs(partial) * (left + NOISE * noise[k] if noise else left)
     # Where a slope is infinite, as that of a root at zero, the equation holds exactly or not at all.
     return (jnp.abs(residual) <= allowed) & ((allowed < jnp.inf) | (residual == 0))
 

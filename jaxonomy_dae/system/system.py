@@ -32,10 +32,14 @@ class AcausalSystem(eqx.Module):
     - `parameters`: a flat array with names, `system.parameters["pend.m"]`.
     - `neural`: the networks by name, `system.neural["drag"]`.
     - `states`, `algebraics`, `variables`: names.
+    - `typical_sizes`: how large each quantity of the equations usually is, a power of two, as declared (`nominal`) or
+        as starts and equations say at the parameter values that the model was compiled with: where searches begin to
+        look, and beside what zero is judged. Nothing is differentiated by them.
     """
 
     parameters: Parameters
     neural: dict[str, Any]
+    typical_sizes: Float[Array, " quantities"]
     plan: SystemPlan = eqx.field(static=True)
     modes: Float[Array, "*batch relations"] | None = None  # hidden discrete variables, within a run
 
@@ -77,7 +81,7 @@ class AcausalSystem(eqx.Module):
         return SystemReport(self.plan, self.parameters.known)
 
     def __reduce__(self):
-        return _unpickled, (self.parameters, functions_by_name(self.neural), self.plan)
+        return _unpickled, (self.parameters, functions_by_name(self.neural), self.typical_sizes, self.plan)
 
     def __repr__(self):
         plan = self.plan
@@ -226,7 +230,7 @@ class AcausalSystem(eqx.Module):
                 f"inputs={{'{missing}': function_of_time}}"
             )
         networks = tuple(self.neural[n] for n in self.plan.network_names)
-        return SystemAt(self.plan, self.numbers, networks, t, args)
+        return SystemAt(self.plan, self.numbers, networks, t, args, self.typical_sizes)
 
     @property
     def numbers(self) -> Float[Array, " m"]:
@@ -257,14 +261,14 @@ class AcausalSystem(eqx.Module):
             array = complete(events.dependents, array.at[chosen].set(values[:n]))
         # A start that is an expression holds at the start alone.
         parameters = Parameters(array, None, (), self.parameters.table.given(chosen))
-        return AcausalSystem(parameters, self.neural, self.plan, values[n:])
+        return AcausalSystem(parameters, self.neural, self.typical_sizes, self.plan, values[n:])
 
     def around_event(self, t: Any, values: Any, previous: Any, args: Any = None) -> SystemAt:
         """`at`, with discrete variables that have these values and had others before the event at hand."""
         held = self.holding(values)
         point = held.at(t, args)
         numbers = point.parameters.at[-len(previous) :].set(previous) if len(previous) else point.parameters
-        return SystemAt(self.plan, numbers, point.networks, t, point.inputs)
+        return SystemAt(self.plan, numbers, point.networks, t, point.inputs, self.typical_sizes)
 
     @property
     def discrete_values(self) -> Float[Array, " q"]:
@@ -492,5 +496,5 @@ class AcausalSystem(eqx.Module):
         return names
 
 
-def _unpickled(parameters: Parameters, neural: Any, plan: SystemPlan) -> AcausalSystem:
-    return AcausalSystem(parameters, named_functions(neural), plan)
+def _unpickled(parameters: Parameters, neural: Any, typical_sizes: Any, plan: SystemPlan) -> AcausalSystem:
+    return AcausalSystem(parameters, named_functions(neural), typical_sizes, plan)

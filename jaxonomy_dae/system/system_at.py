@@ -25,13 +25,16 @@ from ..model.tables import Start
 from ..solvers.field_size import is_large
 from .evaluate import Evaluation, Refinement, newton
 from .input_values import input_values
+from .measured import Measured
 
 
 class SystemAt:
     """A system at one time and state, ready to be evaluated."""
 
-    def __init__(self, plan: SystemPlan, parameters: Any, networks: tuple, t: Any, inputs: Any):
+    def __init__(self, plan: SystemPlan, parameters: Any, networks: tuple, t: Any, inputs: Any, typical: Any):
+        """`typical` are the sizes of all quantities, shape (quantities,)."""
         self.plan = plan
+        self.typical = jax.lax.stop_gradient(typical)
         self.parameters = parameters
         self.dtype = parameters.dtype
         self.networks = networks
@@ -58,7 +61,8 @@ class SystemAt:
         """Evaluates a program."""
         t = self.t if t is None else t
         inputs = input_values(self.plan, self.inputs, t, self.dtype)
-        return Evaluation(state, inputs, self.parameters, t, Networks(self.networks)).run(program, refine)
+        networks = Networks(self.networks)
+        return Evaluation(state, inputs, self.parameters, t, networks, self.typical).run(program, refine)
 
     # --- vector field ------------------------------------------------------------------------------------------
 
@@ -208,22 +212,64 @@ class SystemAt:
         return [self._constraint(evaluation, group) for group in self.plan.constraints]
 
     def _constraint(self, evaluation: Evaluation, planned: ConstraintGroup) -> Any:
+        value = planned.group.template.residual(*self._constraint_arguments(evaluation, planned))
+        n = len(planned.group)
+        return jnp.broadcast_to(jnp.asarray(value, self.dtype), () if n == 1 else (n,))
+
+    def _constraint_arguments(self, evaluation: Evaluation, planned: ConstraintGroup):
+        """What a constraint's template reads."""
         group = planned.group
         slots = [evaluation.read(g) for g in planned.slots]
-        n = len(group)
-        if n == 1:
+        if len(group) == 1:
             parameters = [evaluation.parameter(int(k)) for k in group.parameter[0]]
             coefficients: list[Any] = [float(c) for c in group.coefficient[0]]
         else:
             parameters = [take(self.parameters, column) for column in group.parameter.T]
             coefficients = list(group.coefficient.T)
-        value = group.template.residual(slots, parameters, coefficients, self.t, evaluation.networks)
-        return jnp.broadcast_to(jnp.asarray(value, self.dtype), () if n == 1 else (n,))
+        return slots, parameters, coefficients, self.t, evaluation.networks
 
     def constraint_vector(self, state: Any) -> Any:
         """All hidden constraints' residuals, shape (n_constraints,)."""
         values = [jnp.reshape(v, (-1,)) for v in self.constraints(state)]
         return jnp.concatenate(values) if values else jnp.zeros((0,), self.dtype)
+
+    # --- magnitudes --------------------------------------------------------------------------------------------
+
+    # How large the terms are of which something is computed, where `sizes` are those of the state's entries, shape
+    # (n_state,), |x| at least. Not differentiated.
+
+    def _measured(self, program: Program, x: Any, sizes: Any) -> Measured:
+        inputs = input_values(self.plan, self.inputs, self.t, self.dtype)
+        networks = Networks(self.networks)
+        state, sizes = self.split(x), self.split(sizes)
+        return Measured(state, sizes, inputs, self.parameters, self.t, networks, self.typical).run(program)
+
+    def constraint_magnitudes(self, x: Any, sizes: Any) -> Any:
+        """Of the hidden constraints, shape (n_constraints,)."""
+        evaluation = self._measured(self.plan.constraint_program, x, sizes)
+        found = []
+        for planned in self.plan.constraints:
+            sizes = [evaluation.size(g) for g in planned.slots]
+            value = planned.group.template.magnitude(sizes, *self._constraint_arguments(evaluation, planned))
+            found.append(jnp.broadcast_to(jnp.asarray(value, self.dtype), (len(planned.group),)))
+        return jnp.concatenate(found) if found else jnp.zeros((0,), self.dtype)
+
+    def carried_magnitudes(self, x: Any, sizes: Any) -> Any:
+        """Of the residuals of nonlinear blocks, shape (carried,)."""
+        found = self._measured(self.plan.carried_residuals, x, sizes).carried_magnitudes
+        return jnp.concatenate([jnp.reshape(v, (-1,)) for v in found]) if found else jnp.zeros((0,), self.dtype)
+
+    def magnitudes(self, x: Any, sizes: Any, quantity: np.ndarray, factor: np.ndarray) -> Any:
+        """Of quantities with factors, shape (len(quantity),); infinite or not-a-number where it is not known."""
+        program = self.plan.reading(quantity)
+        found = self._measured(program, x, sizes).size(program.layout.gather(quantity, factor))
+        return jnp.broadcast_to(jnp.asarray(found, self.dtype), (len(quantity),))
+
+    def slope_magnitudes(self, x: Any, sizes: Any) -> Any:
+        """Of the states' slopes, shape (states,); infinite or not-a-number where it is not known."""
+        plan = self.plan
+        found = self._measured(plan.derivative, x, sizes).size(plan.next_derivative)
+        return jnp.broadcast_to(jnp.asarray(found, self.dtype), (len(plan.states),))
 
     def held(self, x: Any) -> tuple[Any, Any]:
         """Of the constraints that come and go with modes: 1.0 where one holds, 0.0 otherwise, shape (held,), and all
@@ -380,8 +426,8 @@ class SystemAt:
 
     def quantities(self, x: Any, quantity: np.ndarray, factor: np.ndarray) -> Any:
         """The values of quantities with factors, shape (len(quantity),)."""
-        evaluation = self.run(self.plan.everything, self.split(x), Refinement.ROOT)
-        return self._filled(evaluation, self.plan.everything.layout.gather(quantity, factor))
+        program = self.plan.reading(quantity)
+        return self._filled(self.run(program, self.split(x), Refinement.ROOT), program.layout.gather(quantity, factor))
 
 
 def _sum(terms: list[Any], zero: Any) -> Any:

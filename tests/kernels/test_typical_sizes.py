@@ -32,10 +32,10 @@ SIZES = [(1e5, 1e-3), (2e7, 1e-4), (1.0, 1.0), (1e-9, 1e6)]
 
 @pytest.mark.parametrize(("pressure", "flow"), SIZES)
 def test_sizes_come_from_data(pressure, flow):
-    plan = compiled(Branches(EqnEnv(), "b", pressure, flow)).plan
+    system = compiled(Branches(EqnEnv(), "b", pressure, flow))
     for name, size in (("b.middle", pressure), ("b.q", flow)):
-        quantity = plan.resolve([name])[0][0]
-        assert 0.1 < plan.typical_sizes[quantity] / size < 10
+        quantity = system.plan.resolve([name])[0][0]
+        assert 0.1 < system.typical_sizes[quantity] / size < 10
 
 
 @pytest.mark.parametrize(
