@@ -146,7 +146,8 @@ def combine(
     samples = Samples([*equations, *weights], values, kept, natural)
     cancelled, stays = [], False
     for label in quantities:
-        slopes = samples([multiply(w, partial_derivative(e, label)) for w, e in zip(weights, equations, strict=True)])
+        inside = [(w, e) for w, e in zip(weights, equations, strict=True) if label in e.leaves]
+        slopes = samples([multiply(w, partial_derivative(e, label)) for w, e in inside])
         finite = np.isfinite(slopes).all(axis=0)
         size = np.abs(slopes).sum(axis=0)
         small = np.abs(slopes.sum(axis=0)) <= CANCELLED * size
@@ -236,9 +237,28 @@ def cancels_elsewhere(
     return not (np.isfinite(size + lost).all(axis=0) & (left > CLEARLY * size + lost)).any()
 
 
+def _coefficients(graph: Node) -> dict[Hashable, float] | None:
+    """The coefficients of a linear form in quantities, by their labels; None if it is another expression."""
+    is_linear = graph.operation == "sum" and graph.data[0] == 0
+    if not is_linear or not all(a.operation == "leaf" and a.data[0] == "quantity" for a in graph.arguments):
+        return None
+    return {a.data: float(c) for a, c in zip(graph.arguments, graph.data[1], strict=True)}
+
+
 def group_of(graph: Node, provenance: Provenance) -> EquationGroup:
     """A group of one equation."""
     quantities = sorted(label[1:] for label in graph.leaves if label[0] == "quantity")
+    coefficients = _coefficients(graph)
+    if coefficients is not None:
+        return EquationGroup(
+            LinearTemplate(len(quantities)),
+            np.array([[v for v, _ in quantities]], np.int64),
+            np.array([[o for _, o in quantities]], np.int64),
+            np.ones((1, len(quantities))),
+            np.zeros((1, 0), np.int64),
+            np.array([[coefficients[quantity_label(*q)] for q in quantities]]),
+            Provenances.of([provenance]),
+        )
     parameters = sorted(label[1] for label in graph.leaves if label[0] == "of model")
     replaced = {quantity_label(*q): leaf(slot_label((k, 0))) for k, q in enumerate(quantities)}
     replaced |= {("of model", p): leaf(parameter_label(k)) for k, p in enumerate(parameters)}

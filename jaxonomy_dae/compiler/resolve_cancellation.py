@@ -8,6 +8,7 @@ one of lowest cᵢ, and index reduction starts again: the linear combination met
 """
 
 from collections.abc import Hashable, Sequence
+from fractions import Fraction
 
 import numpy as np
 import scipy.sparse as sp
@@ -30,9 +31,10 @@ from ..structure.incidence import Incidence
 from ..structure.matching import maximum_matching
 from ..structure.pantelides import Offsets, reduce_index
 from .combine_equations import cancels_elsewhere, combine, graph_of, group_of, near, quantity_label, somewhere, tried
-from .null_vectors import left_null_vectors, weights_in_parameters
+from .exact_null_vectors import Row, sparsest_null_vector
+from .null_vectors import left_null_vectors, rational, weights_in_parameters
 
-LARGEST_BLOCK = 200
+LARGEST_BLOCK = 200  # equations of a block whose entries are not all simple numbers
 ROUNDS = 100
 TRIALS = 44  # random points, of which STATES are used: the first where the equations have values
 STATES = 3
@@ -104,15 +106,15 @@ def _blocks(signature: Incidence, offsets: Offsets) -> tuple[np.ndarray, np.ndar
 
 
 def _blocks_that_may_cancel(signature: Incidence, jacobian: "_Jacobian") -> list[np.ndarray]:
-    """The equations of each diagonal block, up to a size, that has more than one or in whose equation the terms of what
-    it determines cancel."""
+    """The equations of each diagonal block that has more than one or in whose equation the terms of what it determines
+    cancel."""
     label, _ = _blocks(signature, jacobian.offsets)
     sizes = np.bincount(label)
     order = np.argsort(label, kind="stable")
     start = np.concatenate([[0], np.cumsum(sizes)])
     several = sizes > 1
     several[label[_cancelled_alone(jacobian)]] = True
-    chosen = np.flatnonzero(several & (sizes <= LARGEST_BLOCK)).tolist()
+    chosen = np.flatnonzero(several).tolist()
     return [np.sort(order[start[b] : start[b + 1]]) for b in chosen]
 
 
@@ -255,6 +257,29 @@ class _Jacobian:
         matrix, bounds = changed.at(equations, self.offsets.matched_variable[equations], 0)
         return bool(np.isfinite(matrix).all()) and not left_null_vectors(matrix, bounds)
 
+    def fractions(self, equations: np.ndarray, columns: np.ndarray) -> list[Row] | None:
+        """The rows of the matrix, if all its entries are simple numbers; `equations` are sorted."""
+        where = np.full(len(self.offsets.variable), -1)
+        where[columns] = np.arange(len(columns))
+        rows: list[Row] = [{} for _ in equations]
+        group_of_each = np.searchsorted(self.first, equations, side="right") - 1
+        for g in np.unique(group_of_each).tolist():
+            places = np.flatnonzero(group_of_each == g)
+            group = self.groups[g].take((equations[places] - self.first[g]).tolist())
+            column = np.where(group.variable == ZERO, -1, self.column[group.variable])
+            highest = self.offsets.variable[column] == group.order + self.offsets.equation[equations[places], None]
+            used = (column >= 0) & (where[column] >= 0) & highest
+            numbers = group.template.numbers(group.coefficient) * group.factor
+            if np.isnan(numbers[used]).any():
+                return None
+            for i, slot in zip(*np.nonzero(used), strict=True):
+                value = rational(float(numbers[i, slot]))
+                if isinstance(value, float):
+                    return None
+                row, j = rows[places[i]], int(where[column[i, slot]])
+                row[j] = row.get(j, Fraction(0)) + value
+        return [{j: value for j, value in row.items() if value} for row in rows]
+
     def is_constant(self, equations: np.ndarray, columns: np.ndarray) -> bool:
         """Whether no entry depends on the point."""
         return all(
@@ -273,8 +298,34 @@ def _combination(
 
     - `StructuralError` if it is singular for the given parameter values alone, or in a way that depends on the point.
     """
-    groups, offsets = jacobian.groups, jacobian.offsets
-    columns = offsets.matched_variable[equations]
+    columns = jacobian.offsets.matched_variable[equations]
+    exact = jacobian.fractions(equations, columns)
+    if exact is not None:
+        weights = sparsest_null_vector(exact)
+        return None if weights is None else _exact_combination(jacobian, equations, columns, weights)
+    return (
+        _sampled_combination(jacobian, equations, columns, names, discrete) if len(equations) <= LARGEST_BLOCK else None
+    )
+
+
+def _exact_combination(
+    jacobian: _Jacobian, equations: np.ndarray, columns: np.ndarray, weights: Row
+) -> tuple[int, EquationGroup]:
+    """An equation of a block, and the combination of equations with these weights that replaces it."""
+    used = np.array(sorted(weights), np.int64)
+    sources = [provenance_of(jacobian.groups, int(e)) for e in equations[used]]
+    written, unit, top = _written(jacobian, equations, columns, used)
+    if written is None:
+        raise StructuralError(_hidden(sources))
+    chosen: list[Node] = [constant(weights[int(k)] / weights[int(used[unit])]) for k in used]
+    return _replacement(jacobian, equations, used, written, chosen, unit, top, sources, np.zeros(0, np.int64))
+
+
+def _sampled_combination(
+    jacobian: _Jacobian, equations: np.ndarray, columns: np.ndarray, names: Sequence[str], discrete: np.ndarray
+) -> tuple[int, EquationGroup] | None:
+    """The same where entries are functions, or numbers that cancel to rounding."""
+    groups = jacobian.groups
     trials, matrices, errors = [], [], []
     wanted = 1 if jacobian.is_constant(equations, columns) else STATES
     for trial in range(TRIALS):
@@ -299,17 +350,10 @@ def _combination(
     if not everywhere:
         raise StructuralError(_hidden(provenance))
     used = np.flatnonzero(everywhere[0])
-    c = offsets.equation[equations[used]]
-    written = []
-    for e, k in zip(equations[used].tolist(), (c - c.min()).tolist(), strict=True):
-        g, i = jacobian.place(e)
-        graph = graph_of(groups[g], i, k)
-        if graph is None:
-            raise StructuralError(_hidden(provenance))
-        written.append(graph)
+    written, unit, top = _written(jacobian, equations, columns, used)
+    if written is None:
+        raise StructuralError(_hidden(provenance))
     sources = [provenance[k] for k in used]
-    unit = int(np.flatnonzero(c == c.min())[0])
-    top = _highest(jacobian, columns, int(c.min()))
     found = _weights(written, top, unit, jacobian.values, discrete, trials)
     if found is None:
         here = [jacobian.place(e) for e in equations[used].tolist()]
@@ -325,7 +369,29 @@ def _combination(
         concerned = sorted({label[1] for e in written for label in e.leaves if label[0] == "of model"})
         message = _for_values(jacobian, equations, names, concerned, discrete)
         raise StructuralError("\n".join([message, *itemised(sources)]))
-    combined = combine(written, found, top, jacobian.values, discrete, lambda: jacobian.natural(equations[used]))
+    return _replacement(jacobian, equations, used, written, found, unit, top, sources, discrete)
+
+
+def _written(
+    jacobian: _Jacobian, equations: np.ndarray, columns: np.ndarray, used: np.ndarray
+) -> tuple[list[Node] | None, int, list]:
+    """The equations at `used`, differentiated so that the same derivatives are their highest, None if one of them is a
+    function that is evaluated in JAX only; the place of one that is not differentiated; and what cancels."""
+    c = jacobian.offsets.equation[equations[used]]
+    written = []
+    for e, k in zip(equations[used].tolist(), (c - c.min()).tolist(), strict=True):
+        g, i = jacobian.place(e)
+        written.append(graph_of(jacobian.groups[g], i, k))
+    unit, top = int(np.flatnonzero(c == c.min())[0]), _highest(jacobian, columns, int(c.min()))
+    return (None if any(graph is None for graph in written) else written), unit, top
+
+
+def _replacement(
+    jacobian: _Jacobian, equations: np.ndarray, used: np.ndarray, written: Sequence[Node], weights: Sequence[Node],
+    unit: int, top: list, sources: list[Provenance], discrete: np.ndarray,
+) -> tuple[int, EquationGroup]:  # fmt: skip
+    """The equation at `unit`, and Σ weight·equation in its place, in which the quantities `top` are gone."""
+    combined = combine(written, weights, top, jacobian.values, discrete, lambda: jacobian.natural(equations[used]))
     if combined is None:
         raise StructuralError(_hidden(sources))
     if not any(label[0] == "quantity" for label in combined.leaves):

@@ -14,13 +14,13 @@ def directional_derivative(node: Node, direction: Mapping[Hashable, Node]) -> No
     """
     moving = frozenset(direction)
     slope: dict[Node, Node] = {}
-    for n in postorder([node]):
-        if n.leaves.isdisjoint(moving):
-            slope[n] = ZERO
-        elif n.operation == "leaf":
+    if node.leaves.isdisjoint(moving):
+        return ZERO
+    for n in postorder([node], lambda n: [a for a in n.arguments if not a.leaves.isdisjoint(moving)]):
+        if n.operation == "leaf":
             slope[n] = direction[n.data]
         else:
-            slope[n] = _slope(n, [slope[a] for a in n.arguments])
+            slope[n] = _slope(n, [slope.get(a, ZERO) for a in n.arguments])
     return slope[node]
 
 

@@ -1,0 +1,65 @@
+"""Left null vectors of sparse matrices of fractions, by elimination without rounding.
+
+Coefficients of highest derivatives are mostly small numbers, ±1 in connections and differences. There nothing needs to
+be judged: a row that becomes empty is a combination of others, whatever the size of the block. Rows and columns with
+few entries are eliminated first (Markowitz 1957), so a ring or a chain takes as many operations as it has equations.
+"""
+
+import heapq
+from collections.abc import Sequence
+from fractions import Fraction
+
+Row = dict[int, Fraction]
+
+
+def sparsest_null_vector(rows: Sequence[Row]) -> Row | None:
+    """w ≠ 0 with Σ wᵢ·rowᵢ = 0, by number of the row: of those that the elimination finds, the one with the fewest
+    entries, the first of several. None if the rows are independent."""
+    empty, operations = _eliminated([dict(row) for row in rows])
+    found = [_combination(row, operations) for row in empty]
+    return min(found, key=lambda w: (len(w), sorted(w)), default=None)
+
+
+def _eliminated(rows: list[Row]) -> tuple[list[int], list[tuple[int, int, Fraction]]]:
+    """The rows that become empty; and the operations row −= factor·pivot, as (row, pivot, factor), in order."""
+    members: dict[int, set[int]] = {}
+    for i, row in enumerate(rows):
+        for c in row:
+            members.setdefault(c, set()).add(i)
+    shortest = [(len(row), i) for i, row in enumerate(rows)]
+    heapq.heapify(shortest)
+    empty, operations, done = [], [], [False] * len(rows)
+    while shortest:
+        length, i = heapq.heappop(shortest)
+        if done[i] or length != len(rows[i]):
+            continue  # it has changed since
+        done[i] = True
+        pivot = rows[i]
+        if not pivot:
+            empty.append(i)
+            continue
+        column = min(pivot, key=lambda c: (len(members[c]), c))
+        for c in pivot:
+            members[c].discard(i)
+        for k in sorted(members[column]):
+            factor = rows[k][column] / pivot[column]
+            operations.append((k, i, factor))
+            for c, value in pivot.items():
+                left = rows[k].get(c, 0) - factor * value
+                if left:
+                    rows[k][c] = Fraction(left)
+                    members[c].add(k)
+                else:
+                    rows[k].pop(c, None)
+                    members[c].discard(k)
+            heapq.heappush(shortest, (len(rows[k]), k))
+    return sorted(empty), operations
+
+
+def _combination(row: int, operations: Sequence[tuple[int, int, Fraction]]) -> Row:
+    """What a row is made of: the operations undone, the last one first."""
+    weights: Row = {row: Fraction(1)}
+    for k, i, factor in reversed(operations):
+        if k in weights:
+            weights[i] = weights.get(i, Fraction(0)) - factor * weights[k]
+    return {i: w for i, w in weights.items() if w}
