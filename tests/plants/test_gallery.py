@@ -95,7 +95,10 @@ def test_battery_pack():
         slope = (pack_voltage(names, resistances + move) - pack_voltage(names, resistances - move)) / 2e-4
         np.testing.assert_allclose(found, slope, rtol=1e-3, atol=5e-4)
     # The misfit of 160 measurements with their true noise is 1, give or take sqrt(2/160) = 0.11.
-    assert abs(names["fit"].best_loss - 1) < 0.33
+    assert abs(names["misfit"] - 1) < 0.33
+    # Six intervals of 95 %: four deviations either way.
+    for row, true in zip(names["rows"], names["true"].ravel(), strict=True):
+        assert abs(row.value - true) < 2 * (row.high - row.low)
     np.testing.assert_allclose(names["found"], names["true"], rtol=0, atol=1e-3)
 
 
@@ -156,7 +159,7 @@ def test_circuit():
     # The fit. Its response is that of chain matrices; 73 degrees of freedom have 1 ± sqrt(2/73) = 0.17, and three of
     # these are 0.5. Values are as far from the truth as the noise allows: four deviations, by differences of matrices.
     f, sigma, found = np.asarray(names["measured_at"]), names["SIGMA"], names["found"]
-    np.testing.assert_allclose(names["readings"](names["fit"].model), decibel(ladder(found, f)), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(names["readings"](names["fitted"]), decibel(ladder(found, f)), rtol=0, atol=1e-9)
     assert abs(names["chi2"] - 1) < 0.5
     slopes = [
         (decibel(ladder(found * (1 + move), f)) - decibel(ladder(found * (1 - move), f))).ravel() / 2e-5
@@ -177,7 +180,7 @@ def test_circuit():
 
     best = least_squares(away, np.zeros(3), xtol=1e-12, ftol=1e-12, gtol=1e-12)
     # Differences of 1e-8 have slopes good to 1e-6 or so, and the fit ends at changes of 1e-8.
-    np.testing.assert_allclose(names["design"].logarithms, best.x, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(names["design"], best.x, rtol=0, atol=1e-5)
     np.testing.assert_allclose(names["after"], np.abs(best.fun).max(), rtol=1e-3)
     assert names["after"] < 0.1 * names["before"]
 
@@ -257,7 +260,7 @@ def test_house():
         return ReferenceHouse(*values).unheated(weather, sun, plan, 3600.0, [weather[0], 0.0, 0.0, 4e3])
 
     true = np.array([*names["TRUE"].values()])
-    found = np.array([names["fit"].model.parameters[name] for name in names["TRUE"]])
+    found = np.array([names["standing"].parameters[name] for name in names["TRUE"]])
     for values in (found, true):
         system = names["unheated"].with_parameters(dict(zip(names["TRUE"], values, strict=True)))
         np.testing.assert_allclose(names["indoors"](system), indoors(values), rtol=0, atol=3e-3)
@@ -304,7 +307,8 @@ def test_through_the_bounce():
     # The runs have rtol 1e-10, the difference a step of 1e-5.
     np.testing.assert_allclose(names["slope"], names["difference"], rtol=1e-4)
     # 184 heights with their true noise: 1, give or take sqrt(2/184) = 0.1.
-    assert abs(names["fit"].best_loss - 1) < 0.3
+    fit = names["fit"]
+    assert abs(fit.chi2 / fit.freedom - 1) < 3 * np.sqrt(2 / fit.freedom)
     speeds = names["seen"]
     law = jax.vmap(names["learned"].neural["ball.law"])(speeds[:, None])[:, 0]
     np.testing.assert_allclose(law, names["truth"](speeds), rtol=0, atol=0.03)  # the noise over falls of 0.2 m
