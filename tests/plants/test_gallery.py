@@ -8,6 +8,7 @@ import pathlib
 import jax
 import numpy as np
 import pytest
+from kalman import held, negative_log_likelihood
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 from scipy.linalg import expm
@@ -39,6 +40,13 @@ def names_after(notebook):
             if cell["cell_type"] == "code":
                 exec(compile("".join(cell["source"]), f"{notebook}, cell {k}", "exec"), names)
     return names
+
+
+def measured(name):
+    """Skips the test where a record is missing."""
+    folder = os.environ.get("JAXONOMY_DAE_DATA", "")
+    if not (folder and (pathlib.Path(folder) / name).is_file()):
+        pytest.skip(f"JAXONOMY_DAE_DATA names no folder with {name}; the notebook downloads it")
 
 
 def test_every_notebook_is_stored_with_its_outputs():
@@ -410,9 +418,7 @@ def test_clogged_filter():
 
 def test_battery_pulses():
     """The record is measured: what can be checked is that the model is solved as written, and what the note says."""
-    folder = os.environ.get("JAXONOMY_DAE_DATA", "")
-    if not (folder and (pathlib.Path(folder) / "battery" / "multipulse_hppc.xlsx").is_file()):
-        pytest.skip("JAXONOMY_DAE_DATA names no folder with battery/multipulse_hppc.xlsx; the notebook downloads it")
+    measured("battery/multipulse_hppc.xlsx")
     names = names_after("battery_pulses")
 
     def voltage(values, one, E):
@@ -479,3 +485,88 @@ def test_sticking_friction():
     assert abs(fit.chi2 / fit.freedom - 1) < 4 * np.sqrt(2 / fit.freedom) and names["error"] < 0.01
     row = fit.table()["block.more"]
     assert abs(row.value - names["MORE"]) < 2 * (row.high - row.low)
+
+
+def test_overflowing_tanks():
+    """The runs are those of SciPy, and the note's words hold."""
+    measured("tanks/estimation.csv")
+    names = names_after("overflowing_tanks")
+    times, pump, rim = names["times"], names["pump"], 10.0
+
+    def levels(fit, factor):
+        v = {k.removeprefix("tanks."): value for k, value in fit.values.items()}
+        y, found = np.array([fit.starts["tanks.h1"][0], fit.starts["tanks.h2"][0]]), []
+
+        def slope(t, h, u):
+            root, over = np.sqrt(np.maximum(h, 1e-4)), 0.5 * np.maximum(h - rim, 0)
+            q1 = v["a1"] * root[0] + v["b1"] * h[0]
+            q2 = (v["a2"] * root[1] + v["b2"] * h[1]) * factor(h[1])
+            return np.array([v["p"] * u - q1 - over[0], v["r"] * (q1 + v["s"] * over[0]) - q2 - over[1]])
+
+        for k, u in enumerate(pump[:-1]):  # Runge and Kutta's steps of 0.2 s: kinks cost their square, and h⁴
+            for _ in range(20):
+                h, dt = y, (times[k + 1] - times[k]) / 20
+                k1 = slope(0, h, u)
+                k2 = slope(0, h + dt / 2 * k1, u)
+                k3 = slope(0, h + dt / 2 * k2, u)
+                k4 = slope(0, h + dt * k3, u)
+                y = h + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            found.append(y[1])
+        return np.array(found)
+
+    net = names["learned"].system.neural["tanks.law"].net
+    (w1, b1), (w2, b2) = ((np.asarray(layer.weight), np.asarray(layer.bias)) for layer in net.layers)
+
+    def factor(h):
+        return 1 + float((w2 @ np.tanh(w1[:, 0] * (h / 5 - 1) + b1) + b2)[0])
+
+    # 1,023 intervals at rtol 1e-6, some 1e-5 V each, most of which is forgotten within minutes.
+    np.testing.assert_allclose(names["run"], levels(names["plain"], lambda h: 1.0), rtol=0, atol=2e-3)
+    np.testing.assert_allclose(names["better"], levels(names["learned"], factor), rtol=0, atol=2e-3)
+    assert names["told"].correlation > 0.9
+    assert names["error"] > 0.5 and names["corrected"] < 0.3
+
+
+def test_measured_house():
+    """Runs and likelihood are those of matrix exponentials and of a Kalman filter in NumPy."""
+    measured("house/train.csv")
+    names = names_after("measured_house")
+    hours, inside, kept = names["hours"], names["inside"], names["KEPT"]
+    inputs = np.stack([names["outside"], names["power"]])
+    slopes = np.diff(inputs, axis=1, append=inputs[:, -1:]).T
+
+    def matrix(v):
+        """Of air, walls, radiators, and the two inputs, whose slopes are held from hour to hour."""
+        Ci, Ce, Ch, Rie, Rea, Ria, Rih = (v[name] for name in names["PARAMETERS"])
+        a = np.zeros((5, 5))
+        a[0, :4] = np.array([-1 / Rie - 1 / Ria - 1 / Rih, 1 / Rie, 1 / Rih, 1 / Ria]) / Ci
+        a[1, :4] = np.array([1 / Rie, -1 / Rie - 1 / Rea, 0, 1 / Rea]) / Ce
+        a[2] = np.array([1 / Rih, 0, -1 / Rih, 0, 1]) / Ch
+        return a
+
+    def by_slopes(u):
+        return np.array([0, 0, 0, *u])
+
+    runs, fit = names["runs"], names["fit"]
+    a = matrix(runs.values)
+    x, found = np.array([*(runs.starts[f"house.{k}"][0] for k in ("Ti", "Te", "Th")), *inputs[:, 0]]), []
+    for u in slopes[:-1]:
+        x = expm(a) @ x + held(a, by_slopes(u), 1.0)
+        found.append(x[0])
+    np.testing.assert_allclose(names["run"].mean["house.Ti"], found, rtol=0, atol=1e-3)  # 671 hours at rtol 1e-6
+
+    v = fit.values
+    noise = np.diag([v["noise of house.Ti"] ** 2, v["noise of house.Te"] ** 2, 0, 0, 0])
+    x, p = np.array([*np.full(3, inside[0]), *inputs[:, 0]]), np.diag([0.04, 9, 9, 0, 0])
+    readings = np.where(hours[1:] < kept, inside[1:], np.nan)[:, None]
+    cost = negative_log_likelihood(
+        matrix(v), by_slopes, noise, np.eye(5)[:1], lambda u: np.zeros(1), np.full(1, names["STEP"] / np.sqrt(12)),
+        x, p, hours[1:], slopes, readings,
+    )  # fmt: skip
+    count = np.isfinite(readings).sum()
+    np.testing.assert_allclose(fit.log_likelihood, -cost - 0.5 * count * np.log(2 * np.pi), rtol=1e-5)
+
+    assert names["error"](names["forecast"]) < 0.4 < names["error"](names["run"])
+    assert fit.log_likelihood > runs.log_likelihood + 100
+    assert min(names["widths"]) > 1
+    assert abs(fit.whiteness["house"]["house.Ti"].correlation) < 0.5 < runs.whiteness["house"]["house.Ti"].correlation
