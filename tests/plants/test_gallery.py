@@ -568,5 +568,5 @@ def test_measured_house():
 
     assert names["error"](names["forecast"]) < 0.4 < names["error"](names["run"])
     assert fit.log_likelihood > runs.log_likelihood + 100
-    assert min(names["widths"]) > 1
+    assert "house.Rie" in names["apart"] and names["rms"]["on"] > 1.5 * names["rms"]["off"]
     assert abs(fit.whiteness["house"]["house.Ti"].correlation) < 0.5 < runs.whiteness["house"]["house.Ti"].correlation
