@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import html
 import math
+import numbers
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, Generic, TypeVar
@@ -13,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jax.core import Tracer
 from tqdm import tqdm
 
 from ..errors import InitializationError, ModelError, SimulationError, SteadyStateError
@@ -89,11 +91,17 @@ def minimize(
 
     **Raises:**
 
-    - `ModelError` if the loss is not a scalar or not finite at the start, if arrays in `args` are not finite, or if
-        nothing is to be trained.
+    - `ModelError` if the loss is not a real scalar or not finite at the start, if arrays in `args` are not finite, if
+        nothing is to be trained, and inside jit, grad and vmap.
     """
-    if not isinstance(steps, int) or isinstance(steps, bool) or steps < 0:
+    if not isinstance(steps, numbers.Integral) or isinstance(steps, bool) or steps < 0:
         raise ModelError(f"steps must be a number of updates ≥ 0; got {steps!r}")
+    if not callable(loss):
+        raise ModelError(f"loss is a function of the model, loss(model, *args); got {loss!r}")
+    if not isinstance(args, tuple):
+        raise ModelError(f"args is a tuple of further arguments, args=(data,); got {type(args).__name__}")
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((model, args))):
+        raise ModelError("minimize takes its steps in Python: call it outside jit, grad and vmap")
     if not isinstance(optimizer, optax.GradientTransformation):
         raise ModelError(f"optimizer must be one of Optax, such as optax.adam(0.02); got {optimizer!r}")
     trainable, frozen = _split(model, train)
@@ -108,8 +116,11 @@ def minimize(
     def step(trainable, frozen, state, args):
         def objective(trainable):
             value = loss(_merged(eqx.combine(trainable, frozen)), *args)
-            if jnp.shape(value) != ():
-                raise ModelError(f"the loss must return a scalar; got shape {jnp.shape(value)}")
+            is_array = isinstance(value, jax.Array | np.ndarray)
+            is_real = jnp.issubdtype(value.dtype, jnp.floating) if is_array else isinstance(value, float)
+            if not is_real or jnp.shape(value) != ():
+                found = f"shape {value.shape} of {value.dtype}" if is_array else repr(value)
+                raise ModelError(f"the loss must return a real scalar; got {found}")
             return value
 
         value, gradient = eqx.filter_value_and_grad(objective)(trainable)

@@ -108,7 +108,21 @@ def test_progress_is_shown(capsys):
         ),
         (
             lambda: minimize(bowl(), lambda m: jnp.stack([m.x, m.y]), optax.sgd(1.0), 1, progress=False),
-            r"scalar; got shape \(2,\)",
+            r"real scalar; got shape \(2,\) of float64",
+        ),
+        (lambda: minimize(bowl(), lambda m: None, optax.sgd(1.0), 1, progress=False), "real scalar; got None"),
+        (
+            lambda: minimize(bowl(), lambda m: jnp.array(1), optax.sgd(1.0), 1, progress=False),
+            r"real scalar; got shape \(\) of int64",
+        ),
+        (lambda: minimize(bowl(), 3.0, optax.sgd(1.0), 1, progress=False), r"loss\(model, \*args\); got 3.0"),
+        (
+            lambda: minimize(bowl(), distance, optax.sgd(1.0), 1, args=jnp.ones(1), progress=False),
+            r"args is a tuple .*, args=\(data,\); got ",
+        ),
+        (
+            lambda: jax.jit(lambda x: minimize(bowl(x), lambda m: m.x, optax.sgd(1.0), 1, progress=False))(1.0),
+            "outside jit, grad and vmap",
         ),
         (lambda: minimize(bowl(), lambda m: m.x, optax.sgd(1.0), -1, progress=False), r"updates ≥ 0; got -1"),
         (lambda: minimize(bowl(), lambda m: m.x, optax.sgd(1.0), True, progress=False), r"updates ≥ 0; got True"),
