@@ -129,9 +129,9 @@ FAULTS = [
     ),
     Fault(
         "system/bounds.py",
-        "return i.low + distance if low else i.high - distance",
-        "return i.low + distance if low else i.high + distance",
-        "tests/kernels/test_fit.py",
+        "up, down = low + jnp.exp(distance), high - jnp.exp(-distance)",
+        "up, down = low + jnp.exp(distance), high + jnp.exp(-distance)",
+        "tests/kernels/test_bounded_coordinates.py",
     ),
     Fault(
         "analysis/state_space.py",

@@ -139,7 +139,7 @@ def cold():
 def fit():
     system = build("row", "dummy_derivatives")
     truth = jnp.array([[-1.03427, 0.02632], [-0.03996, -0.29260], [0.84903, -0.02937]])  # as the tutorial prints it
-    outcome = learning.fit(system, tutorial_loss, optax.adam(0.02), 25, args=(truth,), progress=False)
+    outcome = learning.minimize(system, tutorial_loss, optax.adam(0.02), 25, args=(truth,), progress=False)
     print(f"best loss {outcome.best_loss:.6e} after {outcome.best_step} steps")
 
 

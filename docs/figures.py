@@ -126,11 +126,10 @@ def tutorial() -> None:
     opened = {"pi.setpoint": 333.15, "room.T": (n["opened"], n["room_T"])}
     controlled = n["simulate"](n["controlled"], 1800.0, ts=ts, inputs=opened)["block.T"] - 273.15
     trained, before = (
-        n["simulate"](s, 1800.0, ts=ts, inputs=n["inputs"])["block.T"] - 273.15
-        for s in (n["trained"].model, n["model"])
+        n["simulate"](s, 1800.0, ts=ts, inputs=n["inputs"])["block.T"] - 273.15 for s in (n["fit"].system, n["model"])
     )
     u = np.linspace(0.0, 45.0, 91)
-    learned = np.array([float(n["law"](np.array([x]))[0]) for x in u])
+    band = n["fit"].band("loss.law", u)
     reached = np.asarray(n["measured"]) - 293.15
     for kind, (ink, faint, blue, orange) in INKS.items():
         figure, axes = plt.subplots(1, 3, figsize=(10, 2.9), layout="constrained")
@@ -138,12 +137,13 @@ def tutorial() -> None:
         held.axhline(60.0, color=orange, lw=1, ls=":")
         held.plot(ts / 60, controlled, color=blue, lw=1.8)
         held.set(xlabel="time [min]", ylabel="temperature [°C]")
-        record.plot(np.asarray(n["record"]) / 60, np.asarray(n["measured"]) - 273.15, "o", color=orange, ms=3.4, mew=0)
+        record.plot(np.asarray(n["moments"]) / 60, np.asarray(n["measured"]) - 273.15, "o", color=orange, ms=3.4, mew=0)
         record.plot(ts / 60, before, color=faint, lw=1.2)
         record.plot(ts / 60, trained, color=blue, lw=1.6)
         record.set(xlabel="time [min]", ylabel="temperature [°C]")
         law.plot(u, n["true_law"](u), color=orange, lw=5, alpha=0.45, solid_capstyle="round")
-        law.plot(u, learned, color=blue, lw=1.8)
+        law.fill_between(u, band.low, band.high, color=blue, alpha=0.3, lw=0)
+        law.plot(u, band.mean, color=blue, lw=1.8)
         law.plot(reached, np.zeros_like(reached), "|", color=orange, ms=7, clip_on=False)
         law.set(xlabel="difference in temperature [K]", ylabel="heat flow [W]", xlim=(0, 45), ylim=(0, None))
         dress(axes, ("Under control", "The record, and the model", "The law"), ink, faint)

@@ -12,7 +12,6 @@ These things are relied on that have no name of their own, or one that is public
 - the wrapper that Diffrax puts around a term to turn time around: `unwrapped` and `rewrapped`;
 - that Diffrax fills the controller's tolerances into the root finder of a solver, be it wrapped: `FROM_CONTROLLER`;
 - that Diffrax lengthens a step to the end of the interval from 100 floating-point numbers before it: `clip_floor`;
-- the names of the fields of Optimistix' Levenberg–Marquardt method: `with_high_cutoff`;
 - the classes `JVPTracer` and `LinearizeTracer` of JAX by name, and what tracers wrap: `programs/staging.py`;
 - that XLA for CPUs does not take a call apart that is marked `inlineable="false"`: `linear/once.py`.
 """
@@ -163,11 +162,3 @@ def clip_floor(t1: Any) -> Any:
     for _ in range(100):
         t1 = private("prevbefore")(t1)
     return t1
-
-
-def with_high_cutoff(solver: Any, ratio: float) -> Any:
-    """Optimistix' Levenberg–Marquardt method, whose steps become longer after one that kept this part of what was
-    predicted; as it is, if it has no such number."""
-    if not hasattr(getattr(solver, "search", None), "high_cutoff"):
-        return solver
-    return eqx.tree_at(lambda s: s.search.high_cutoff, solver, ratio)

@@ -1,4 +1,4 @@
-"""Training compiled systems, and any Equinox module around them."""
+"""Learning what a compiled system lacks, from records, or by any loss."""
 
 from .band import Band as Band
 from .closed_form import ClosedForm as ClosedForm
@@ -15,9 +15,6 @@ from .experiment import Experiment as Experiment
 from .experiment import Unknown as Unknown
 from .filtering import Filter as Filter
 from .filtering import Innovations as Innovations
-from .fit import Fit as Fit
-from .fit import fit as fit
-from .fit import fit_least_squares as fit_least_squares
 from .identifiability import Identifiability as Identifiability
 from .laws import AbstractPassive as AbstractPassive
 from .laws import Bounded as Bounded
@@ -31,6 +28,8 @@ from .laws import PortHamiltonian as PortHamiltonian
 from .laws import Positive as Positive
 from .libraries import powers as powers
 from .libraries import terms as terms
+from .minimize import Minimized as Minimized
+from .minimize import minimize as minimize
 from .multiple_shooting import Shooting as Shooting
 from .planned import Planned as Planned
 from .prediction import Prediction as Prediction

@@ -1,17 +1,11 @@
 """Values inside bounds: projections onto intervals, and coordinates in which there are no bounds.
 
-Each parameter has an `Interval`. The gradient steps of `fit` are projected onto it. Whoever takes steps that know no
-bounds works in unbounded coordinates z instead. There are two kinds, since they serve two kinds of steps:
-
-- `constrained` and `unconstrained`, for gradient steps in loops of users: a logarithm of the distance from one bound,
-  the logit between two. They depend on the bounds alone, so that z means the same wherever it is read.
-- `Unbounded`, for Gauss–Newton steps, which want x(z) to be nearly linear: close to x = z + constant well inside, with
-  the bounds, closed ends included, as its range (closed ends as in MINUIT, James & Roos 1975; open ends by hyperbolas
-  that approach them). They depend on where the search starts.
+Each parameter has an `Interval`. The gradient steps of `minimize` are projected onto it. Loops of users, whose steps
+know no bounds, work in unbounded coordinates z instead, by `constrained` and `unconstrained`: a logarithm of the
+distance from one bound, the logit between two. They depend on the bounds alone, so that z means the same wherever it
+is read.
 """
 
-import dataclasses
-import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -20,10 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..modeling.interval import Interval, closed_ends
+from ..modeling.interval import Interval
 
 KEPT = 0.1  # of the distance to an open end, at least, after one update
-INSIDE = 1e-4  # how far a start on a closed end is moved inside, relative to its scale: x(z) is stationary on the end
 
 
 def project(
@@ -42,55 +35,6 @@ def project(
         limit = jnp.where(opened, bound + jnp.asarray(KEPT, new.dtype) * (old - jnp.where(opened, bound, old)), bound)
         new = jnp.maximum(new, limit) if sign < 0 else jnp.minimum(new, limit)
     return new
-
-
-@dataclasses.dataclass(frozen=True)
-class _Coordinate:
-    """One parameter's x(z); z is measured in the unit of x."""
-
-    interval: Interval
-    scale: float
-
-    def value(self, z):
-        i, s = self.interval, self.scale
-        low, high = math.isfinite(i.low), math.isfinite(i.high)
-        if not (low or high):
-            return z
-        if low and high:
-            middle, half = 0.5 * (i.low + i.high), 0.5 * (i.high - i.low)
-            if i.low == i.high:
-                return 0 * z + i.low
-            u = z / half
-            if i.open_low or i.open_high:
-                return middle + half * u / jnp.sqrt(1 + u * u)
-            return middle + half * jnp.sin(u)
-        if high:
-            z = -z
-        if i.open_low or i.open_high:
-            wide = jnp.sqrt(z * z + 4 * s * s) + jnp.where(z > 0, z, -z)
-            distance = jnp.where(z > 0, wide / 2, 2 * s * s / wide)
-        else:
-            distance = jnp.sqrt(z * z + s * s) - s
-        return i.low + distance if low else i.high - distance
-
-    def start(self, x: float) -> float:
-        """z for which x(z) = x, or a point just inside for an x on a closed end."""
-        i, s = self.interval, self.scale
-        low, high = math.isfinite(i.low), math.isfinite(i.high)
-        if not (low or high) or i.low == i.high:
-            return x
-        if low and high:
-            half = 0.5 * (i.high - i.low)
-            u = (x - 0.5 * (i.low + i.high)) / half
-            u = min(max(u, INSIDE - 1), 1 - INSIDE) if not (i.open_low or i.open_high) else u
-            return half * (u / math.sqrt((1 - u) * (1 + u)) if i.open_low or i.open_high else math.asin(u))
-        distance = x - i.low if low else i.high - x
-        if i.open_low or i.open_high:
-            z = distance - s * s / distance
-        else:
-            distance = max(distance, INSIDE * s)
-            z = math.sqrt(distance * (distance + 2 * s))
-        return z if low else -z
 
 
 class Ends(NamedTuple):
@@ -157,24 +101,3 @@ def unconstrained(x: Float[Array, "*n"], ends: Ends) -> Float[Array, "*n"]:
     below = jnp.where(has_high, jnp.asarray(np.where(has_high, ends.high, 0), x.dtype) - x, 1)
     bounded = jnp.log(above) - jnp.log(below)
     return jnp.where(has_low | has_high | is_point, bounded, x)
-
-
-class Unbounded:
-    """Unbounded coordinates for the parameters x, shape (k,)."""
-
-    def __init__(self, x: Float[Array, " k"], intervals: Sequence[Interval]):
-        values = np.asarray(x, np.float64)
-        ends = [i.low if math.isfinite(i.low) else i.high for i in intervals]
-        scales = [abs(v - e) or abs(v) or 1.0 if math.isfinite(e) else 1.0 for v, e in zip(values, ends, strict=True)]
-        self._coordinates = [_Coordinate(i, float(s)) for i, s in zip(intervals, scales, strict=True)]
-        self._ends = closed_ends(intervals, x.dtype)
-        starts = [c.start(float(v)) for c, v in zip(self._coordinates, values, strict=True)]
-        self.start: Float[Array, " k"] = jnp.asarray(starts, x.dtype)
-
-    def values(self, z: Float[Array, " k"]) -> Float[Array, " k"]:
-        """The parameters at z, inside their bounds."""
-        if not self._coordinates:
-            return z
-        x = jnp.stack([c.value(z[k]) for k, c in enumerate(self._coordinates)]).astype(z.dtype)
-        low, high = (jnp.asarray(end, z.dtype) for end in self._ends.T)
-        return x + jax.lax.stop_gradient(jnp.clip(x, low, high) - x)  # rounding must not leave the bounds

@@ -153,8 +153,8 @@ class AcausalSystem(eqx.Module):
                 one, interval = table.names[places[0]], table.intervals[places[0]]
                 raise ModelError(
                     f"parameter '{one}' lies on the end of its bounds {interval}, or outside, where no free number "
-                    "belongs to it: start inside, with system.with_parameters, or train by fit or fit_least_squares, "
-                    "which can leave an end and reach it"
+                    "belongs to it: start inside, with system.with_parameters, or let learning.Problem or "
+                    "learning.minimize train it, which can leave an end and reach it"
                 )
         return {name: out[name] for name in names}
 

@@ -23,7 +23,7 @@ import jaxonomy_dae.library.signal as sig
 import jaxonomy_dae.library.thermal as th
 import jaxonomy_dae.library.translational as tr
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, ModelError, NeuralDAEBlock, simulate
-from jaxonomy_dae.learning import fit
+from jaxonomy_dae.learning import minimize
 from jaxonomy_dae.library.electrical import Ground, Resistor
 from jaxonomy_dae.library.transmissions import LeadScrew
 
@@ -139,7 +139,7 @@ WRONG_TYPES = [
      lambda: component(lambda s, ev: s.function("f", jnp.sin, s.variable("x")))),
     (r"'c\.x': bounds are a pair", lambda: component(lambda s, ev: s.variable("x", bounds=("0", "1")))),
     (r"neural block's name cannot contain '\['", lambda: pendulum(drag_on("vx", name="a[0]"))),
-    (r"optimizer must be one of Optax.*got 'adam'", lambda: fit(rc_circuit(), lambda s: 0.0, "adam", 1, train=["r.R"])),
+    (r"optimizer must be one of Optax.*got 'adam'", lambda: minimize(rc_circuit(), lambda s: 0.0, "adam", 1)),
     (r"'c\.x': fixed is True or False; got 'no'", lambda: component(lambda s, ev: s.variable("x", 1.0, fixed="no"))),
     (r"parameter 'c\.k': unit is a text such as 'kg'; got 1",
      lambda: component(lambda s, ev: s.parameter("k", 1.0, 1))),

@@ -23,7 +23,7 @@ from jaxonomy_dae import (
     reinit,
     terminate,
 )
-from jaxonomy_dae.learning import fit
+from jaxonomy_dae.learning import minimize
 from jaxonomy_dae.library import signal
 from jaxonomy_dae.modeling import Eq
 
@@ -111,9 +111,9 @@ def test_tables_in_notebooks():
     Cells(system._repr_html_().replace("<br>", ""))
 
 
-def test_a_fit_in_one_line(rc):
-    result = fit(rc, lambda s: s.parameters["r.R"] ** 2, optax.sgd(0.25), 2, train="r.R", progress=False)
-    assert repr(result) == "Fit(loss 4 → 0.25, best after 2 steps: all 2 steps were taken)"
+def test_what_was_minimized_in_one_line(rc):
+    result = minimize(rc, lambda s: s.parameters["r.R"] ** 2, optax.sgd(0.25), 2, train="r.R", progress=False)
+    assert repr(result) == "Minimized(loss 4 → 0.25, best after 2 steps: all 2 steps were taken)"
     assert "0.25" in result._repr_html_()
 
 

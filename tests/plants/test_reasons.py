@@ -9,7 +9,7 @@ from problems import compiled
 from sympy import Eq
 
 from jaxonomy_dae import Component, EqnEnv, ModelError, SimulationError, der, simulate, sweep
-from jaxonomy_dae.learning import fit, fit_least_squares
+from jaxonomy_dae.learning import minimize
 
 TS = jnp.array([0.5, 1.0])
 ESCAPE = r"'c\.x' is .* infinite near t="
@@ -39,19 +39,13 @@ def loss(system):
 
 
 @pytest.mark.slow
-def test_a_fit_says_why_it_stopped(blowup):
+def test_steps_say_why_they_stopped(blowup):
     with pytest.warns(RuntimeWarning, match=f"stopped after 1 updates: the loss is nan.*{ESCAPE}.*best iterate"):
-        found = fit(blowup, loss, optax.sgd(2.0), 4, train="c.p", progress=False)
+        found = minimize(blowup, loss, optax.sgd(2.0), 4, train="c.p", progress=False)
     assert found.best_step == 0
     outside = blowup.with_parameters({"c.p": 1.5})
     with pytest.raises(ModelError, match=f"the loss is nan at the start: .*{ESCAPE}"):
-        fit(outside, loss, optax.sgd(2.0), 4, train="c.p", progress=False)
-
-
-@pytest.mark.slow
-def test_least_squares_say_why_they_cannot_begin(blowup):
-    with pytest.raises(ModelError, match=f"not finite at the start: .*{ESCAPE}"):
-        fit_least_squares(blowup.with_parameters({"c.p": 1.5}), read, train="c.p")
+        minimize(outside, loss, optax.sgd(2.0), 4, train="c.p", progress=False)
 
 
 def test_a_sweep_says_where_and_why(blowup):

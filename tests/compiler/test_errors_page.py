@@ -1,0 +1,56 @@
+"""Every text in the page of errors is one that the package says."""
+
+import ast
+import functools
+import pathlib
+import re
+
+import pytest
+
+import jaxonomy_dae
+
+DOCS = pathlib.Path(__file__).parents[2] / "docs"
+GAP = "…"
+
+
+def text_of(node: ast.AST) -> str | None:
+    """A text as it is written, with `…` for what is filled in."""
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return re.sub(r"\{\w*\}", GAP, node.value)
+    if isinstance(node, ast.JoinedStr):
+        return "".join(str(v.value) if isinstance(v, ast.Constant) else GAP for v in node.values)
+    return None
+
+
+@functools.cache
+def said() -> str:
+    """All texts of the package but docstrings, a line each."""
+    lines = []
+    for path in pathlib.Path(jaxonomy_dae.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(node, ast.Expr):  # a docstring's parent
+                lines += [t for child in ast.iter_child_nodes(node) if (t := text_of(child)) is not None]
+    return "\n".join(lines)
+
+
+def rows() -> list[tuple[str, str, str]]:
+    """(text, meaning, mend) of all tables."""
+    found = []
+    for line in (DOCS / "errors.md").read_text().splitlines():
+        cells = [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
+        if len(cells) == 3 and cells[0] not in ("text", "---"):
+            found.append(tuple(cells))
+    return found
+
+
+def test_there_are_rows():
+    assert len(rows()) > 50
+    assert not [row for row in rows() if not all(row)], "a cell is empty"
+    texts = [row[0] for row in rows()]
+    assert len(texts) == len({*texts})
+
+
+@pytest.mark.parametrize("text", [row[0] for row in rows()])
+def test_the_package_says_it(text):
+    assert re.fullmatch("`[^`]{12,}`", text), "one text in backticks, long enough to be told from others"
+    assert text[1:-1] in said(), text

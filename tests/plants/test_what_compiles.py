@@ -1,0 +1,100 @@
+"""What compiles again, as the page on saving and caching says."""
+
+import pickle
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from problems import compiled
+from sympy import Eq
+
+from jaxonomy_dae import Component, EqnEnv, der, simulate
+from jaxonomy_dae.programs.cache import PROGRAMS
+
+pytestmark = pytest.mark.slow  # a dozen programs
+TS = jnp.linspace(0.0, 2.0, 5)
+
+
+class Lag(Component):
+    """x' = k (u − x)."""
+
+    def __init__(self, ev, name, k=1.0):
+        super().__init__(ev, name)
+        k, u = self.parameter("k", k), self.input("u")
+        x = self.variable("x", start=0.0, fixed=True)
+        self.add_equations(Eq(der(x), k * (u - x)))
+
+
+def lag(k=1.0):
+    return compiled(Lag(EqnEnv(), "c", k))
+
+
+def run(system, t1=2.0, u=1.0, **given):
+    return simulate(system, t1, **({"ts": TS, "inputs": {"c.u": u}, "solver": diffrax.Tsit5()} | given))
+
+
+def samples(n, factor=1.0, *kind):
+    return (jnp.linspace(0.0, 2.0, n), factor * jnp.ones(n), *kind)
+
+
+def sine(a):
+    return lambda t: a * jnp.sin(t)
+
+
+SYSTEM = lag()
+# (what was run before, what nothing is compiled for then)
+SAME = [
+    (dict(), dict(system=SYSTEM.with_parameters({"c.k": 3.0}))),
+    (dict(), dict(rtol=1e-9, atol=1e-11)),
+    (dict(), dict(t1=3.0, ts=jnp.linspace(0.0, 3.0, 5))),
+    (dict(), dict(u=2.0)),
+    (dict(initial={"c.x": 0.3}), dict(initial={"c.x": 0.4})),
+    (dict(u=samples(9)), dict(u=samples(9, 2.0))),
+    (dict(u=sine(1.0)), dict(u=sine(2.0))),
+    (dict(), dict(system=lag(5.0))),
+    (dict(), dict(system=pickle.loads(pickle.dumps(SYSTEM)))),
+]
+OTHER = [
+    (dict(), dict(ts=jnp.linspace(0.0, 2.0, 6))),
+    (dict(u=samples(9)), dict(u=samples(12))),
+    (dict(u=samples(9)), dict(u=samples(9, 1.0, "held"))),
+    (dict(), dict(initial={"c.x": 0.3})),
+    (dict(), dict(max_steps=5000)),
+    (dict(), dict(dtmax=0.1)),
+    (dict(), dict(solver=diffrax.Dopri5())),
+]
+
+
+def compiled_for(first, then):
+    """How many programs the second call adds to those of the first."""
+    PROGRAMS.clear()
+    run(**({"system": SYSTEM} | first))
+    count = len(PROGRAMS)
+    found = run(**({"system": SYSTEM} | then))
+    assert np.isfinite(np.asarray(found["c.x"])).all()
+    return len(PROGRAMS) - count
+
+
+@pytest.mark.parametrize("first, then", SAME)
+def test_nothing(first, then):
+    assert compiled_for(first, then) == 0
+
+
+@pytest.mark.parametrize("first, then", OTHER)
+def test_again(first, then):
+    assert compiled_for(first, then) == 1
+
+
+def test_a_jitted_function_takes_systems():
+    traced = []
+
+    @jax.jit
+    def end(system):
+        traced.append(None)
+        return run(system)["c.x"][-1]
+
+    for k, system in ((1.0, SYSTEM), (5.0, lag(5.0)), (2.0, SYSTEM.with_parameters({"c.k": 2.0}))):
+        assert float(end(system)) == pytest.approx(1 - np.exp(-2 * k), abs=1e-5)  # rtol 1e-6
+    assert len(traced) == 1
