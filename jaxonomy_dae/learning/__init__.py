@@ -33,6 +33,7 @@ from .libraries import powers as powers
 from .libraries import terms as terms
 from .multiple_shooting import Shooting as Shooting
 from .planned import Planned as Planned
+from .posterior import Posterior as Posterior
 from .prediction import Prediction as Prediction
 from .problem import Problem as Problem
 from .table import Table as Table

@@ -31,7 +31,7 @@ from ..system.inputs import read_inputs, value_at
 from ..system.system import AcausalSystem
 from .diffusion import affine_flow, linear_flow
 from .filtering import Structure
-from .program import Layout, each, outputs_of, placed, with_kinds
+from .program import Layout, Weighted, each, outputs_of, placed, with_kinds
 
 ITERATIONS = 4  # Gauss–Newton steps onto the constraints after a correction, which converge quadratically
 
@@ -329,6 +329,20 @@ def _read_values(m: Model, layout: Layout, t: Any, x: Any, discrete: Any) -> Flo
     values = None if discrete is None else discrete[None]
     solution = Solution(t[None], x[None], m.here, inputs, {}, diffrax.RESULTS.successful, discrete=values)
     return outputs_of(solution, m.laws, layout, x.dtype)[0]
+
+
+def misfit_ahead(
+    system: AcausalSystem, observers: dict[str, Any], layout: Layout, structure: Structure, shared: Any, own: Any,
+    c: Weighted,
+) -> Float[Array, " k"]:  # fmt: skip
+    """Of one experiment and each output, the sum of squared weighted errors of predictions, or of a filter,
+    Σ w (r²/s + ln s) of innovations r and their variances s."""
+    found = _track(system, observers, layout, structure, shared, own, c.told)
+    seen, residual = c.row > 0, found.predicted - c.values
+    if not structure.is_filter:
+        return jnp.sum(jnp.where(seen, c.row * residual, 0.0) ** 2, axis=0)
+    s = jnp.where(seen, found.variance, 1.0)
+    return jnp.sum(jnp.where(seen, c.row**2 * (residual**2 / s + jnp.log(s)), 0.0), axis=0)
 
 
 @compiled

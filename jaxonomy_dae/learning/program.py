@@ -53,6 +53,15 @@ class Conditions(eqx.Module):
     inputs: dict[str, tuple[Float[Array, "e _"], Float[Array, "e _"]]]
 
 
+class Weighted(eqx.Module):
+    """What a program is told of e experiments, with their samples, and the square roots of how much each counts: √w/σ,
+    or √w where the noise level is estimated or follows from the model; zero where there is no sample."""
+
+    told: Any
+    values: Float[Array, "e n k"]
+    row: Float[Array, "e n k"]
+
+
 def weights_of(module: Any) -> list[Any]:
     """The arrays of a network or sensor law that are trained."""
     return jax.tree.leaves(eqx.filter(module, eqx.is_inexact_array))
@@ -101,7 +110,7 @@ def placed(
     return system, observers, initial
 
 
-def _one(
+def run_one(
     system: AcausalSystem, observers: dict[str, Any], layout: Layout, adjoint: Any, shared: Any, own: Any, c: Conditions
 ) -> Float[Array, "n k"]:
     """The outputs of one experiment."""
@@ -111,6 +120,14 @@ def _one(
         inputs=with_kinds(c.inputs, layout), **dict(layout.options),
     )  # fmt: skip
     return outputs_of(solution, observers, layout, c.times.dtype)
+
+
+def misfit(
+    system: AcausalSystem, observers: dict[str, Any], layout: Layout, adjoint: Any, shared: Any, own: Any, c: Weighted
+) -> Float[Array, " k"]:
+    """The sum of squared weighted residuals of each output in a run of one experiment; NaN where it fails."""
+    outputs = run_one(system, observers, layout, adjoint, shared, own, c.told)
+    return jnp.sum(jnp.where(c.row > 0, c.row * (outputs - c.values), 0.0) ** 2, axis=0)
 
 
 def with_kinds(inputs: dict[str, Any], layout: Layout) -> dict[str, Any]:
@@ -144,7 +161,7 @@ def predict(
     """The outputs of all experiments; NaN where a run failed."""
 
     def one(shared, own, c):
-        return _one(system, observers, layout, adjoint, shared, own, c)
+        return run_one(system, observers, layout, adjoint, shared, own, c)
 
     return each(one, shared, own, conditions)
 
@@ -156,7 +173,7 @@ def predict_and_differentiate(
     """The outputs of all experiments, and their derivatives by the shared numbers and by each experiment's own."""
 
     def one(shared, own, c):
-        found = _one(system, observers, layout, diffrax.ForwardMode(), shared, own, c)
+        found = run_one(system, observers, layout, diffrax.ForwardMode(), shared, own, c)
         return found, found
 
     def with_slopes(shared, own, c):
