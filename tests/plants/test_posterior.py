@@ -13,9 +13,8 @@ from kalman import negative_log_likelihood
 from problems import compiled
 
 from jaxonomy_dae import EqnEnv, ModelError
-from jaxonomy_dae.learning import Data, Experiment, Filter, Problem, Unknown
+from jaxonomy_dae.learning import Data, Experiment, Filter, Problem, Unknown, objective
 from jaxonomy_dae.learning import density as densities
-from jaxonomy_dae.learning import objective
 from jaxonomy_dae.modeling import POSITIVE, Component, Eq, der
 from jaxonomy_dae.programs.cache import PROGRAMS
 
