@@ -25,9 +25,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..errors import ModelError
 from ..programs.cache import compiled
+from .devices import each
 from .factors import Factors
 from .objective import Misfit, Objective
-from .program import Layout, Weighted, each
+from .program import Layout, Weighted
 
 if TYPE_CHECKING:
     from .estimate import Estimate
@@ -118,7 +119,7 @@ def density(program: Program, posed: Posed, u: Float[Array, " u"]) -> Float[Arra
         return found, (by_shared, by_own)
 
     def all_squares(shared, own):
-        return each(one, shared, own, posed.told)[0]
+        return each(one, program.layout.mesh, shared, own, posed.told)[0]
 
     squares = jax.custom_vjp(all_squares)
 
@@ -126,7 +127,7 @@ def density(program: Program, posed: Posed, u: Float[Array, " u"]) -> Float[Arra
         by_shared, by_own = slopes
         return jnp.einsum("ek,eks->s", out, by_shared), jnp.einsum("ek,eko->eo", out, by_own)
 
-    squares.defvjp(lambda shared, own: each(with_slopes, shared, own, posed.told), backwards)
+    squares.defvjp(lambda shared, own: each(with_slopes, program.layout.mesh, shared, own, posed.told), backwards)
     if program.backwards:
         squares = all_squares
 

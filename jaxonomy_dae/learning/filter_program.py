@@ -29,9 +29,10 @@ from ..system.evaluate import Refinement
 from ..system.input_values import by_entry
 from ..system.inputs import read_inputs, value_at
 from ..system.system import AcausalSystem
+from .devices import each
 from .diffusion import affine_flow, linear_flow
 from .filtering import Structure
-from .program import Layout, Weighted, each, outputs_of, placed, with_kinds
+from .program import Layout, Weighted, outputs_of, placed, with_kinds
 
 ITERATIONS = 4  # Gauss–Newton steps onto the constraints after a correction, which converge quadratically
 
@@ -351,7 +352,7 @@ def track(
     told: Told,
 ) -> Track:  # fmt: skip
     """All that a filter finds, of all experiments; NaN from where a run failed."""
-    return each(lambda s, o, c: _track(system, observers, layout, structure, s, o, c), shared, own, told)
+    return each(lambda s, o, c: _track(system, observers, layout, structure, s, o, c), layout.mesh, shared, own, told)
 
 
 @compiled
@@ -370,7 +371,7 @@ def predict_ahead(
         (by_shared, by_own), found = _pairs(jax.jacfwd(one, argnums=(0, 1), has_aux=True)(shared, own, c))
         return found, by_shared, by_own
 
-    return each(with_slopes, shared, own, told)
+    return each(with_slopes, layout.mesh, shared, own, told)
 
 
 def _pairs(found: Any) -> Any:

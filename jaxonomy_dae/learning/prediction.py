@@ -50,7 +50,7 @@ def under(
     times = s.times[k, : s.counts[k]] if ts is None else np.asarray(ts, float)
     if times.ndim != 1 or not len(times) or (np.diff(times) < 0).any() or times[0] < s.t0[k] or times[-1] <= s.t0[k]:
         raise ModelError(f"ts must be increasing times, of shape (n,), that start at {s.t0[k]:g} or later")
-    layout = dataclasses.replace(objective.layout, outputs=tuple(names))
+    layout = dataclasses.replace(objective.layout, outputs=tuple(names), mesh=None)
     one = Objective(
         objective.system, objective.observers, layout,
         s, objective.coordinates, {}, objective.counted,

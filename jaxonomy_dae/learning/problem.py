@@ -9,6 +9,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 from jaxtyping import Float
 
 from ..diagnosis.unused_parameters import unused_parameters
@@ -18,6 +19,7 @@ from ..simulation.simulate import simulate
 from ..system.system import AcausalSystem
 from .coordinates import Coordinates, coordinates
 from .data import Data, Stacked, stack
+from .devices import check_mesh
 from .estimate import Estimate
 from .experiment import Experiment, Unknown
 from .filter_objective import AheadObjective, FilterObjective
@@ -57,6 +59,8 @@ class Problem:
         `Shooting(...)`, multiple shooting, for what diverges; or for equations with errors, `Filter(...)`, the
         likelihood of a Kalman filter, or `Innovations(...)`, predictions one step ahead.
     - `rtol`, `atol`, `max_steps`, and others in `options`: as in `simulate`.
+    - `mesh`: devices among which the experiments are divided, `jax.make_mesh((jax.device_count(),), ("experiments",))`;
+        of several processes too, each of which runs the same program with the same data (`jax.distributed`).
 
     **Raises:**
 
@@ -77,6 +81,7 @@ class Problem:
         rtol: float = 1e-6,
         atol: float = 1e-8,
         max_steps: int = 4096,
+        mesh: Mesh | None = None,
         **options: Any,
     ):
         if not isinstance(system, AcausalSystem):
@@ -91,6 +96,7 @@ class Problem:
         self.data = data if isinstance(data, Data) else Data(data)
         self.starts = dict(starts or {})
         self._options = {"rtol": rtol, "atol": atol, "max_steps": max_steps, **options}
+        self._mesh = check_mesh(mesh)
         self._train = self._names(train)
         self.method = self._method(method)
         self._stacked = self._stack(self.data)
@@ -150,7 +156,7 @@ class Problem:
             )
         return Layout(
             stacked.outputs, tuple(parameters), tuple(modules), tuple(shared), tuple(own), tuple(known), stacked.kinds,
-            tuple(self._options.items()), tuple(e.name for e in extras),
+            tuple(self._options.items()), tuple(e.name for e in extras), self._mesh,
         )  # fmt: skip
 
     def _errors(self, stacked: Stacked) -> tuple[Structure, tuple[Extra, ...]]:

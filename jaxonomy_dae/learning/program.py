@@ -10,18 +10,19 @@ starts are their own.
 
 import dataclasses
 import math
-from collections.abc import Callable
 from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
 from ..programs.cache import compiled
 from ..simulation.simulate import simulate
 from ..system.system import AcausalSystem
+from .devices import each
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,6 +38,7 @@ class Layout:
     kinds: tuple[tuple[str, str], ...]  # of inputs
     options: tuple[tuple[str, Any], ...]  # of `simulate`
     extra: tuple[str, ...] = ()  # coordinates that come with a method, before the shared starts
+    mesh: Mesh | None = None  # the devices that share the experiments
 
     @property
     def n_own(self) -> int:
@@ -144,15 +146,6 @@ def outputs_of(solution: Any, observers: dict[str, Any], layout: Layout, dtype: 
     return jnp.stack([read[n] if n in read else jnp.asarray(derived[n], dtype) for n in layout.outputs], axis=1)
 
 
-def each(function: Callable, shared: Any, own: Any, conditions: Any) -> Any:
-    """`function(shared, own, conditions)` of each experiment; a single one is not made a batch, which costs compile
-    time."""
-    if own.shape[0] == 1:
-        found = function(shared, own[0], jax.tree.map(lambda a: a[0], conditions))
-        return jax.tree.map(lambda a: a[None], found)
-    return jax.vmap(function, in_axes=(None, 0, 0))(shared, own, conditions)
-
-
 @compiled
 def predict(
     system: AcausalSystem, observers: dict[str, Any], layout: Layout, adjoint: Any, shared: Any, own: Any,
@@ -163,7 +156,7 @@ def predict(
     def one(shared, own, c):
         return run_one(system, observers, layout, adjoint, shared, own, c)
 
-    return each(one, shared, own, conditions)
+    return each(one, layout.mesh, shared, own, conditions)
 
 
 @compiled
@@ -180,4 +173,4 @@ def predict_and_differentiate(
         (by_shared, by_own), found = jax.jacfwd(one, argnums=(0, 1), has_aux=True)(shared, own, c)
         return found, by_shared, by_own
 
-    return each(with_slopes, shared, own, conditions)
+    return each(with_slopes, layout.mesh, shared, own, conditions)
