@@ -65,7 +65,8 @@ class NeuralDAEBlock:
 
     **Raises:**
 
-    - `ModelError` if targets or inputs are malformed, the network is not of the kind, or the network's output does not have one entry for each target.
+    - `ModelError` if targets or inputs are malformed, the network is not of the kind, or its output does not have one
+        entry for each target.
     """
 
     def __init__(
