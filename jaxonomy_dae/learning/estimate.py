@@ -12,12 +12,12 @@ from jaxtyping import Float
 from ..errors import ModelError, nearest
 from ..system.system import AcausalSystem
 from .band import Band, band, explored
+from .descent import Minimum
 from .discovery import Discovery, discover
 from .factors import Factors
 from .figures import plot_correlations, plot_history, plot_residuals, plot_runs
 from .holdout import holdout_score, with_own_starts
 from .identifiability import Identifiability, identifiability, spreads
-from .least_squares import Minimum
 from .likelihood import Likelihood
 from .objective import Objective
 from .prediction import Prediction, at_samples, prediction

@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from .descent import Minimum
+from .evaluation import Evaluation, Weights
 from .evidence import Evidence
 from .experiment import Unknown
 from .filter_program import Told, Track, misfit_ahead, predict_ahead, track
 from .filtering import Structure
-from .least_squares import Evaluation, Minimum, Weights
 from .likelihood import Likelihood, score
 from .objective import Misfit, Objective, Predicted
 from .program import Weighted

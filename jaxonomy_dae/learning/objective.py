@@ -18,9 +18,11 @@ from jaxtyping import Bool, Float, Int
 from ..system.system import AcausalSystem
 from .coordinates import Coordinates
 from .data import Stacked
+from .descent import Minimum
+from .evaluation import Evaluation, Weights
 from .evidence import Evidence
 from .experiment import Unknown
-from .least_squares import Evaluation, Minimum, Weights, minimise
+from .least_squares import minimise
 from .program import Conditions, Layout, Weighted, misfit, predict, predict_and_differentiate
 
 
@@ -41,6 +43,7 @@ class Predicted:
         return np.concatenate([shared, columns.reshape(m, experiments * n_own)], axis=1)
 
 
+FEW = 8  # columns up to which residuals alone cost almost as much as with their Jacobian, and a program of their own
 MANY = 40  # numbers of one experiment beyond which a gradient backwards costs less: of 97, 6 ms where forwards it is 14
 
 
@@ -168,7 +171,9 @@ class Objective:
             weigh, reweigh = self.weights, None if self.evidence.is_idle else self.evidence.reweigh
         else:
             weigh, reweigh = lambda *_: weights, None
-        return minimise(self.evaluate, self.residual, start, self.bounds, weigh, reweigh, steps, self.tolerance)
+        columns = self.coordinates.n_shared + self.coordinates.n_own  # of the program, whatever is frozen
+        alone = self.residual if columns > FEW else None
+        return minimise(self.evaluate, alone, start, self.bounds, weigh, reweigh, steps, self.tolerance)
 
     @property
     def tolerance(self) -> float:

@@ -19,15 +19,16 @@ from ..simulation.simulate import simulate
 from ..system.system import AcausalSystem
 from .coordinates import Coordinates, coordinates
 from .data import Data, Stacked, stack
+from .descent import Minimum
 from .devices import check_mesh
 from .estimate import Estimate
+from .evaluation import Evaluation, Weights
 from .experiment import Experiment, Unknown
 from .filter_objective import AheadObjective, FilterObjective
 from .filtering import Extra, Filter, Innovations, Structure, check_model, structure_and_extras
 from .first_order import adam_steps
 from .holdout import holdout_score
 from .identifiability import Identifiability, identifiability
-from .least_squares import Evaluation, Minimum, Weights
 from .multiple_shooting import Shooting, shoot
 from .objective import Objective
 from .program import Layout, predict, weights_of, with_values

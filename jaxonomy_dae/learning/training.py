@@ -15,10 +15,10 @@ from jaxtyping import Float
 
 from ..errors import ModelError
 from .checkpoint import fingerprint, read_facts, read_state, save
+from .evaluation import Evaluation, Weights
 from .figures import new_axes
 from .gradient import Batches
 from .holdout import holdout_score
-from .least_squares import Evaluation, Weights
 from .objective import Objective
 
 if TYPE_CHECKING:
