@@ -12,7 +12,8 @@ from .descent import Minimum
 from .evaluation import Evaluation, Weights
 from .evidence import Evidence
 from .experiment import Unknown
-from .filter_program import Told, Track, misfit_ahead, predict_ahead, track
+from .filter_program import Track, misfit_ahead, predict_ahead, track
+from .filter_steps import Told
 from .filtering import Structure
 from .likelihood import Likelihood, score
 from .objective import Misfit, Objective, Predicted
