@@ -15,8 +15,8 @@ from pathlib import Path
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
+from silent import silent_network
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, learning
 from jaxonomy_dae.modeling import POSITIVE, Component, Eq, der
@@ -53,8 +53,7 @@ class Gain(eqx.Module):
     net: eqx.nn.MLP
 
     def __init__(self):
-        net = eqx.nn.MLP(2, 1, 6, 1, jnp.tanh, key=jax.random.key(0))
-        self.net = eqx.tree_at(lambda n: n.layers[-1], net, jax.tree.map(jnp.zeros_like, net.layers[-1]))
+        self.net = silent_network(2)
 
     def __call__(self, u):
         return 20.0 * self.net(u)

@@ -32,6 +32,7 @@ from .minimize import Minimized as Minimized
 from .minimize import minimize as minimize
 from .multiple_shooting import Shooting as Shooting
 from .planned import Planned as Planned
+from .posterior import Posterior as Posterior
 from .prediction import Prediction as Prediction
 from .problem import Problem as Problem
 from .table import Table as Table

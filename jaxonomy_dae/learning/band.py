@@ -12,7 +12,7 @@ from jaxtyping import Float
 from ..errors import ModelError, nearest
 from ..model.opaque import OpaqueFunction
 from ..programs.cache import compiled
-from .blocks import Block, block_of, inputs_seen
+from .blocks import block_of, inputs_seen
 from .figures import plot_band
 from .program import weights_of, with_weights
 
@@ -53,22 +53,27 @@ def band(
 ) -> Band:  # fmt: skip
     """The band of a network's or sensor law's values, linearized around its weights."""
     objective = estimate.objective
+    module, law, points = law_of(estimate, name, grid, law)
+    flat = jnp.concatenate([jnp.ravel(leaf).astype(points.dtype) for leaf in weights_of(module)])
+    mean, slope = (np.asarray(a, float) for a in _law_and_slope(module, law, flat, points))
+    columns = np.array([g == name for g in objective.coordinates.group]) & objective.coordinates.is_weight
+    spread = np.linalg.norm(slope @ estimate.root[columns], axis=1)
+    ends = explored(estimate, name, along)
+    return Band(np.asarray(grid, float), mean, spread, mean - factor * spread, mean + factor * spread, ends)
+
+
+def law_of(estimate: "Estimate", name: str, grid: Any, law: Callable | None) -> tuple[Any, Callable, Any]:
+    """(module, law of it at one point, points) of a network or sensor law that was trained."""
+    objective = estimate.objective
     if name not in objective.layout.modules:
         raise ModelError(f"'{name}' was not trained: " + nearest(name, objective.layout.modules))
     module = estimate.system.neural[name] if name in estimate.system.neural else estimate.observers[name]
-    dtype = objective.system.parameters.values.dtype
     points = np.asarray(grid, float)
     block = block_of(estimate.system.plan, name)
-    called = points
     if law is None:
         law = _first_output if block is None else _FirstOutput(block.opaque)
-        called = points[:, None] if points.ndim == 1 else points
-    flat = jnp.concatenate([jnp.ravel(leaf).astype(dtype) for leaf in weights_of(module)])
-    mean, slope = (np.asarray(a, float) for a in _law_and_slope(module, law, flat, jnp.asarray(called, dtype)))
-    columns = np.array([g == name for g in objective.coordinates.group]) & objective.coordinates.is_weight
-    spread = np.linalg.norm(slope @ estimate.root[columns], axis=1)
-    explored = _explored(estimate, along, block)
-    return Band(points, mean, spread, mean - factor * spread, mean + factor * spread, explored)
+        points = points if block is None or points.ndim > 1 else points[:, None]
+    return module, law, jnp.asarray(points, objective.system.parameters.values.dtype)
 
 
 def _first_output(network: Any, u: Any) -> Any:
@@ -96,8 +101,19 @@ def _law_and_slope(module: Any, law: Callable, flat: Any, points: Any) -> tuple[
     return jax.vmap(jax.value_and_grad(value), in_axes=(None, 0))(flat, points)
 
 
-def _explored(estimate: "Estimate", along: Any, block: Block | None) -> np.ndarray:
-    """The least and the greatest of each input over the experiments that were fitted."""
+@compiled
+def law_values(module: Any, law: Callable, flat: Any, points: Any) -> Any:
+    """The law at each of n points for each of d sets of weights, shape (d, n)."""
+
+    def value(flat, u):
+        return jnp.asarray(law(with_weights(module, flat), u)).reshape(())
+
+    return jax.vmap(lambda flat: jax.vmap(value, in_axes=(None, 0))(flat, points))(flat)
+
+
+def explored(estimate: "Estimate", name: str, along: Any) -> np.ndarray:
+    """The least and the greatest of each input of a law over the experiments that were fitted."""
+    block = block_of(estimate.system.plan, name)
     if along is None:
         if block is None:
             return np.zeros((0, 2))

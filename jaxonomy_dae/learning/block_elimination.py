@@ -16,6 +16,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..programs.threads import one_thread
+
 
 @dataclasses.dataclass(frozen=True)
 class Blocks:
@@ -122,7 +124,8 @@ def eliminate(b: Blocks, damping: Float[np.ndarray, "e N d"]) -> Eliminated:
 
 def _triangle(rows: Float[np.ndarray, "e r c"]) -> Float[np.ndarray, "e s c"]:
     """R of Q R."""
-    return np.asarray(np.linalg.qr(rows, mode="r"))
+    with one_thread(rows.size * rows.shape[-1]):
+        return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
 def linear(

@@ -11,13 +11,13 @@ from jaxtyping import Float
 
 from ..errors import ModelError, nearest
 from ..system.system import AcausalSystem
-from .band import Band, band
+from .band import Band, band, explored
+from .descent import Minimum
 from .discovery import Discovery, discover
 from .factors import Factors
 from .figures import plot_correlations, plot_history, plot_residuals, plot_runs
 from .holdout import holdout_score, with_own_starts
 from .identifiability import Identifiability, identifiability, spreads
-from .least_squares import Minimum
 from .likelihood import Likelihood
 from .objective import Objective
 from .prediction import Prediction, at_samples, prediction
@@ -29,6 +29,7 @@ from .training import Training
 from .whiteness import Whiteness, whiteness
 
 if TYPE_CHECKING:
+    from .posterior import Posterior
     from .problem import Problem
 
 
@@ -269,6 +270,38 @@ class Estimate:
         return prediction(
             self, [names] if isinstance(names, str) else list(names), ts, experiment, self._quantile(level)
         )
+
+    def explored(self, name: str, along: str | Callable[[Any], Any] | None = None) -> Float[np.ndarray, "inputs 2"]:
+        """From the least to the greatest value that the experiments saw of each input of a learned law, or of what
+        `along` names."""
+        return explored(self, name, along)
+
+    def sample(self, draws: int = 500, *, chains: int = 4, warmup: int = 150, seed: int = 0) -> "Posterior":
+        """Samples of the posterior, of the density whose maximum the fit found, where intervals from a linearization do
+        not do: by the No-U-Turn sampler (Hoffman & Gelman 2014), extra `bayes`.
+
+        Coordinates, bounds and priors are those of the fit; noise levels that are estimated are sampled too. Precisions
+        of weights that the data chose stay as found. Steps are scaled by the linearized covariance. Each gradient costs
+        as much as a Jacobian of the fit, and a draw of parameters takes some three to seven of them; networks of many
+        weights take hundreds, and their chains may not come together.
+
+        **Arguments:**
+
+        - `draws`: of each chain.
+        - `chains`: each begins elsewhere around the estimate; whether they agree says whether draws are enough.
+        - `warmup`: steps before these, in which the length of steps is found.
+        - `seed`: of all random numbers.
+
+        **Raises:**
+
+        - `ModelError` where the density has no finite integral, with the names of what neither data, priors nor bounds
+            determine.
+        - `SimulationError` if runs fail all around the estimate.
+        - `ImportError` without BlackJAX.
+        """
+        from .posterior import sample
+
+        return sample(self, draws, chains, warmup, seed)
 
     def filtered(self, names: str | Sequence[str], experiment: int | str = 0, level: float = 0.95) -> Prediction:
         """Any variables at the times of an experiment, from its samples up to each of them, with bands of the states'

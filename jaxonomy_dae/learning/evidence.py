@@ -15,8 +15,8 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool, Int
 
+from .evaluation import Evaluation, Weights
 from .factors import Factors
-from .least_squares import Evaluation, Weights
 
 SETTLED = 0.01  # relative change of a precision or noise level, which changes no interval by as much
 

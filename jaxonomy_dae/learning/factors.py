@@ -9,6 +9,8 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Float
 
+from ..programs.threads import one_thread
+
 
 @dataclasses.dataclass(frozen=True)
 class Factors:
@@ -27,8 +29,9 @@ class Factors:
         scale = np.maximum(scale, noise * scale.max(initial=0.0))
         scale[scale == 0] = 1.0
         columns = np.column_stack([jacobian / scale, residual])
-        triangle = np.asarray(scipy.linalg.qr(columns, mode="r", check_finite=False)[0])[: columns.shape[1]]
-        left, singular, right = scipy.linalg.svd(triangle[:, :-1], full_matrices=False, check_finite=False)
+        with one_thread(columns.shape[0] * columns.shape[1] ** 2):
+            triangle = np.asarray(scipy.linalg.qr(columns, mode="r", check_finite=False)[0])[: columns.shape[1]]
+            left, singular, right = scipy.linalg.svd(triangle[:, :-1], full_matrices=False, check_finite=False)
         return cls(singular, right.T, scale, left.T @ triangle[:, -1])
 
     def rank(self, noise: float) -> int:

@@ -8,13 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from .descent import Minimum
+from .evaluation import Evaluation, Weights
 from .evidence import Evidence
 from .experiment import Unknown
-from .filter_program import Told, Track, predict_ahead, track
+from .filter_program import Track, misfit_ahead, predict_ahead, track
+from .filter_steps import Told
 from .filtering import Structure
-from .least_squares import Evaluation, Minimum, Weights
 from .likelihood import Likelihood, score
-from .objective import Objective, Predicted
+from .objective import Misfit, Objective, Predicted
+from .program import Weighted
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,6 +83,11 @@ class AheadObjective(Objective):
             found[name] = (jnp.asarray(times[rows, place], dtype), jnp.asarray(values[rows, place], dtype))
         return found
 
+    @property
+    def misfit(self) -> Misfit:
+        """As of `Objective`, of predictions one step ahead."""
+        return Misfit(misfit_ahead, self.structure, self.weighted(self.told))
+
     def track(self, z: Float[np.ndarray, " p"]) -> Track:
         """All that the filter finds, of all experiments."""
         shared, own = self.numbers(self.coordinates.natural(z))
@@ -119,6 +127,12 @@ class FilterObjective(AheadObjective):
         if not (s > 0).all() or not all(np.isfinite(a).all() for a in (residual, jacobian, s, logs)):
             return None
         return Evaluation(residual, jacobian, s, logs)
+
+    def weighted(self, told: Any) -> Weighted:
+        """As of `Objective`; the model says how large innovations should be."""
+        plain = super().weighted(told)
+        share = jnp.asarray(np.sqrt(self.stacked.weight), plain.row.dtype)[:, None, None]
+        return dataclasses.replace(plain, row=jnp.where(plain.row > 0, share, 0.0))
 
     def weights(self, z: Float[np.ndarray, " f"], found: Evaluation) -> Weights:
         """Weights by the variances at this point, and priors."""

@@ -1,55 +1,19 @@
 """The compiled programs of filters: samples one after the other, from each to the next by the system's own
-integration.
-
-Of a filter, a state x and the covariance P of its f differential entries; between samples
-
-    x ← φ(x),    P ← Φ P Φᵀ + Q,    Φ = ∂φ/∂x,    Q = ∫ exp(A s) σσᵀ exp(A s)ᵀ ds,
-
-with φ the flow, by `simulate`, and Φ its derivative. Q depends on A = ∂f/∂x along the way. Noise that is gathered at s
-is carried on from there, so that a Jacobian at time τ acts on a share τ/h of it: to second order, the constant matrix
-that does the same is A(0)/3 + 2 A(h)/3. At samples, outputs correct the state one by one, linearized where all of them
-were predicted, which is the same as at once; a missing sample corrects nothing. Of linear models, φ is a matrix
-exponential, fifteen times faster than runs. Where constraints make states redundant, noise and covariance are kept in
-their tangent space by the derivative of the projection.
-"""
+integration."""
 
 from typing import Any, NamedTuple
 
-import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from ..programs.cache import compiled
-from ..simulation.simulate import simulate
-from ..simulation.solution import Solution
-from ..system.evaluate import Refinement
-from ..system.input_values import by_entry
-from ..system.inputs import read_inputs, value_at
 from ..system.system import AcausalSystem
-from .diffusion import affine_flow, linear_flow
+from .devices import each
+from .filter_steps import Told, corrected_by, model_of, moved_by, onwards, read, read_values, start_of
 from .filtering import Structure
-from .program import Layout, each, outputs_of, placed, with_kinds
-
-ITERATIONS = 4  # Gauss–Newton steps onto the constraints after a correction, which converge quadratically
-
-
-class Told(eqx.Module):
-    """What programs are told of e experiments at n times: samples and which there are, noise levels (NaN where they are
-    coordinates), known starts, and the standard deviations of their priors; and of each input, the w samples around the
-    time between each row and the one before: integration looks at all that it is given."""
-
-    times: Float[Array, "e n"]
-    t0: Float[Array, " e"]
-    known: Float[Array, "e known"]
-    inputs: dict[str, tuple[Float[Array, "e n w"], Float[Array, "e n w"]]]
-    values: Float[Array, "e n k"]
-    observed: Bool[Array, "e n k"]
-    sigma: Float[Array, "e k"]
-    spread: Float[Array, "e known"]
-    ends: Float[Array, "e n m"]  # of the m − 1 parts of the time before each row in which no input has a kink or jump
+from .program import Layout, Weighted, with_kinds
 
 
 class Track(NamedTuple):
@@ -67,268 +31,45 @@ class Track(NamedTuple):
     discrete: Any
 
 
-class Model(NamedTuple):
-    """One experiment's system with all numbers in their places: `here`, sensor laws, initial values by name, inputs;
-    and what the method adds: intensities of diffusion, shape (f, f), and of noise of inputs, noise levels, shape (k,),
-    and K, shape (f, k)."""
-
-    here: AcausalSystem
-    laws: dict[str, Any]
-    initial: dict[str, Any]
-    inputs: dict[str, Any]
-    diffusion: Float[Array, "f f"]
-    driven: dict[str, Any]
-    sigma: Float[Array, " k"]
-    gain: Float[Array, "f k"]
-
-
-def _model(
-    system: AcausalSystem, observers: Any, layout: Layout, structure: Structure, shared: Any, own: Any, told: Told
-) -> Model:
-    here, laws, initial = placed(system, observers, layout, shared, own, told.known)
-    end = len(shared) - len(layout.shared)
-    extra = iter(shared[end - len(layout.extra) : end])
-    f, k = len(system.plan.states), len(layout.outputs)
-    diffusion, driven = jnp.zeros(f, shared.dtype), {}
-    for place, factor in structure.noise:
-        if isinstance(place, str):
-            driven[place] = next(extra)
-        else:
-            diffusion = diffusion.at[place].set((next(extra) / factor) ** 2)
-    sigma = told.sigma
-    for j in structure.sigma:
-        sigma = sigma.at[j].set(jnp.where(jnp.isnan(sigma[j]), next(extra), sigma[j]))
-    gain = jnp.zeros((f, k), shared.dtype)
-    for place, j, factor in structure.gain:
-        gain = gain.at[place, j].set(next(extra) / factor)
-    return Model(here, laws, initial, {}, jnp.diag(diffusion), driven, sigma, gain)
-
-
-def _start(
-    system: AcausalSystem, observers: Any, layout: Layout, structure: Structure, shared: Any, own: Any, told: Told
-) -> tuple[Any, Any]:
-    """The state at the start and the covariance that the priors of known starts give it."""
-    f = len(system.plan.states)
-    inputs = with_kinds(jax.tree.map(lambda a: a[0], told.inputs), layout)
-
-    def at(known):
-        here, _, initial = placed(system, observers, layout, shared, own, known)
-        found = here.initialize(told.t0, inputs or None, initial or None, throw=False)
-        return found, found
-
-    if not structure.is_filter or not layout.known:
-        return at(told.known)[0], jnp.zeros((f, f), shared.dtype)
-    slopes, found = jax.jacfwd(at, has_aux=True)(told.known)
-    root = slopes[:f] * told.spread
-    return found, root @ root.T
-
-
-def _run(m: Model, layout: Layout, t0: Any, t1: Any, x: Any) -> tuple[Any, Any]:
-    """(state, discrete values) at t1 of a run from a state at t0; padded times repeat, and runs of no length are made
-    of next to none."""
-    least = 1e-12 * (1.0 + jnp.abs(t0))
-    t1 = jnp.where(t1 > t0, t1, t0 + least)
-    solution = simulate(
-        m.here, t1, t0=t0, ts=t1[None], initial=x, adjoint=diffrax.ForwardMode(), throw=False,
-        inputs=m.inputs, **dict(layout.options),
-    )  # fmt: skip
-    return solution.states[-1], None if solution.discrete is None else solution.discrete[-1]
-
-
-def _held(m: Model, discrete: Any) -> AcausalSystem:
-    return m.here if discrete is None else m.here.holding(discrete)
-
-
-def _jacobian(m: Model, t: Any, x: Any) -> Float[Array, "f f"]:
-    """∂f/∂x of the differential states, algebraic unknowns following them."""
-    plan = m.here.plan
-    f = len(plan.states)
-    here = m.here.at(t, m.inputs)
-
-    def slopes(first):
-        state = here.split(jnp.concatenate([first, x[f:]]))
-        if len(plan.carried):
-            state = here.refined(state, Refinement.ROOT)
-        return here.semi_explicit(here.join(state))[:f]
-
-    return jax.jacfwd(slopes)(x[:f])
-
-
-def _intensity(m: Model, t: Any, x: Any) -> Float[Array, "f f"]:
-    """σσᵀ at a state, that of noise of inputs included; kept in the tangent space of the constraints."""
-    plan = m.here.plan
-    f, tangent = len(plan.states), _tangent(m, t, x, None)
-    g = m.diffusion if tangent is None else tangent @ m.diffusion @ tangent.T
-    if not m.driven:
-        return g
-    sources = by_entry(plan, read_inputs(plan, x.dtype, m.inputs))
-    names = list(m.driven)
-    at = jnp.stack([jnp.asarray(_input_at(plan, sources, name, t), x.dtype) for name in names])
-
-    def slopes(values):
-        here = m.here.at(t, {**sources, **dict(zip(names, values, strict=True))})
-        state = here.split(x)
-        if len(plan.carried):
-            state = here.refined(state, Refinement.ROOT)
-        return here.semi_explicit(here.join(state))[:f]
-
-    b = jax.jacfwd(slopes)(at) * jnp.stack([m.driven[name] for name in names])
-    return g + b @ b.T
-
-
-def _input_at(plan: Any, sources: dict[str, Any], name: str, t: Any) -> Any:
-    return value_at(sources.get(name, plan.inputs.defaults[plan.inputs.place[name]]), t)
-
-
-def _tangent(m: Model, t: Any, x: Any, discrete: Any) -> Float[Array, "f f"] | None:
-    """The derivative of the projection onto hidden constraints; None if there are none."""
-    plan = m.here.plan
-    f = len(plan.states)
-    if not plan.n_projected:
-        return None
-    here = _held(m, discrete)
-    return jax.jacfwd(lambda first: here.project(t, jnp.concatenate([first, x[f:]]), m.inputs)[:f])(x[:f])
-
-
-def _read(m: Model, layout: Layout, t: Any, x: Any, discrete: Any) -> tuple[Float[Array, " k"], Float[Array, "k f"]]:
-    """Outputs at a state, and their derivatives by its differential entries."""
-    f = len(m.here.plan.states)
-    inputs = read_inputs(m.here.plan, x.dtype, m.inputs)
-    here = _held(m, discrete)
-
-    def outputs(first):
-        full = jnp.concatenate([first, x[f:]])
-        full = here.project(t, full, m.inputs) if m.here.is_constrained else full
-        values = None if discrete is None else discrete[None]
-        solution = Solution(t[None], full[None], m.here, inputs, {}, diffrax.RESULTS.successful, discrete=values)
-        found = outputs_of(solution, m.laws, layout, x.dtype)[0]
-        return found, found
-
-    slopes, found = jax.jacfwd(outputs, has_aux=True)(x[:f])
-    return found, slopes
-
-
-def _forward(m: Model, layout: Layout, substeps: int, t0: Any, t1: Any, x: Any, p: Any) -> tuple[Any, Any, Any]:
-    """State, covariance and Φ at t1, from those at t0."""
-    f = len(m.here.plan.states)
-
-    def part(carry, ends):
-        x, p, through = carry
-        start, stop = ends
-
-        def flow(first):
-            found, _ = _run(m, layout, start, stop, jnp.concatenate([first, x[f:]]))
-            return found[:f], found
-
-        first, g = _jacobian(m, start, x), _intensity(m, start, x)
-        phi, x = jax.jacfwd(flow, has_aux=True)(x[:f])
-        a = first / 3 + 2 / 3 * _jacobian(m, stop, x)
-        g = (g + _intensity(m, stop, x)) / 2
-        q = linear_flow(a, g, stop - start)[1]
-        tangent = _tangent(m, stop, x, None)
-        q = q if tangent is None else tangent @ q @ tangent.T
-        return (x, phi @ p @ phi.T + q, phi @ through), None
-
-    first = (x, p, jnp.eye(f, dtype=x.dtype))
-    if substeps == 1:
-        return part(first, (t0, t1))[0]
-    ends = t0 + (t1 - t0) * jnp.asarray(np.arange(substeps + 1) / substeps, x.dtype)
-    ends = ends.at[-1].set(t1)  # not beyond it by rounding
-    return jax.lax.scan(part, first, (ends[:-1], ends[1:]))[0]
-
-
-def _forward_linear(m: Model, ends: Float[Array, " m"], x: Any, p: Any) -> tuple[Any, Any, Any]:
-    """The same of a linear model, part by part, in each of which inputs are linear in time."""
-    f = len(x)
-
-    def slopes(t, x):
-        return m.here.at(t, m.inputs).semi_explicit(x)
-
-    def part(carry, ends):
-        x, p, through = carry
-        start, h = ends[0], ends[1] - ends[0]
-        early = start + h / 4  # inside, where jumps at the ends do not show
-        a, g, one = jax.jacfwd(slopes, argnums=1)(early, x), _intensity(m, early, x), slopes(early, x)
-        rate = jnp.where(h > 0, (slopes(start + 3 * h / 4, x) - one) / jnp.where(h > 0, h / 2, 1.0), 0.0)
-        moved, phi, q = affine_flow(a, one - rate * h / 4, rate, g, h)
-        return (x + moved, phi @ p @ phi.T + q, phi @ through), None
-
-    first = (x, p, jnp.eye(f, dtype=x.dtype))
-    pairs = jnp.stack([ends[:-1], ends[1:]], axis=1)
-    if len(pairs) == 1:
-        return part(first, pairs[0])[0]
-    return jax.lax.scan(part, first, pairs)[0]
-
-
-def _corrected(x: Any, p: Any, row: tuple[Any, ...]) -> tuple[Any, Any, Any]:
-    """(state less the prediction, covariance, variances) after the outputs of one time, taken one by one (Joseph's
-    form, in which rounding leaves the covariance positive)."""
-    eye = jnp.eye(len(p), dtype=p.dtype)
-
-    def one(carry, given):
-        d, p = carry
-        y, predicted, slope, seen, sigma = given
-        across = p @ slope
-        s = slope @ across + sigma**2
-        gain = jnp.where(seen, across / s, 0.0)
-        d = d + gain * (y - predicted - slope @ d)
-        rest = eye - jnp.outer(gain, slope)
-        return (d, rest @ p @ rest.T + jnp.outer(gain, gain) * sigma**2), (s, predicted + slope @ carry[0])
-
-    (d, p), (variance, predicted) = jax.lax.scan(one, (jnp.zeros_like(x[: len(p)]), p), row)
-    return d, p, (variance, predicted)
-
-
-def _moved(m: Model, t: Any, x: Any, d: Any, p: Any, discrete: Any) -> tuple[Any, Any]:
-    """The state moved by a correction of its differential entries, onto the constraints, and the covariance there."""
-    f = len(d)
-    x = jnp.concatenate([x[:f] + d, x[f:]])
-    if not m.here.is_constrained:
-        return x, p
-    x = _held(m, discrete).project(t, x, m.inputs, iterations=ITERATIONS)
-    tangent = _tangent(m, t, x, discrete)
-    return x, p if tangent is None else tangent @ p @ tangent.T
-
-
 def _track(
     system: AcausalSystem, observers: Any, layout: Layout, structure: Structure, shared: Any, own: Any, told: Told
 ) -> Track:
     """One experiment."""
-    model = _model(system, observers, layout, structure, shared, own, told)
-    x0, p0 = _start(system, observers, layout, structure, shared, own, told)
-    f = len(system.plan.states)
-    nothing = jnp.zeros((f, f), x0.dtype)
+    model = model_of(system, observers, layout, structure, shared, own, told)
 
     def step(carry, row):
-        t0, x, p = carry
         t, ends, y, seen, inputs = row
-        m, discrete = model._replace(inputs=with_kinds(inputs, layout)), None
-        if structure.is_linear:
-            x, p, phi = _forward_linear(m, ends, x, p)
-        elif structure.is_filter:
-            x, p, phi = _forward(m, layout, structure.substeps, t0, t, x, p)
-        else:
-            (x, discrete), phi = _run(m, layout, t0, t, x), nothing
+        m = model._replace(inputs=with_kinds(inputs, layout))
+        x, p, phi, discrete = onwards(m, layout, structure, ends, *carry)
         if structure.is_filter:
-            read, slopes = _read(m, layout, t, x, discrete)
-            d, corrected, (variance, predicted) = _corrected(x, p, (y, read, slopes, seen, m.sigma))
+            outputs, slopes = read(m, layout, t, x, discrete)
+            d, corrected, (variance, predicted) = corrected_by(x, p, (y, outputs, slopes, seen, m.sigma))
         else:
             corrected = p
-            predicted = _read_values(m, layout, t, x, discrete)
+            predicted = read_values(m, layout, t, x, discrete)
             variance = jnp.ones_like(predicted)
             d = m.gain @ jnp.where(seen, y - predicted, 0.0)
-        after, p_after = _moved(m, t, x, d, corrected, discrete)
+        after, p_after = moved_by(m, t, x, d, corrected, discrete)
         out = Track(predicted, variance, x, p, after, p_after, phi, discrete)
-        return (t, after, p_after), out
+        return (after, p_after), out
 
-    return jax.lax.scan(step, (told.t0, x0, p0), (told.times, told.ends, told.values, told.observed, told.inputs))[1]
+    start = start_of(system, observers, layout, structure, shared, own, told)
+    rows = told.times, told.ends, told.values, told.observed, told.inputs
+    return jax.lax.scan(step, start, rows)[1]
 
 
-def _read_values(m: Model, layout: Layout, t: Any, x: Any, discrete: Any) -> Float[Array, " k"]:
-    inputs = read_inputs(m.here.plan, x.dtype, m.inputs)
-    values = None if discrete is None else discrete[None]
-    solution = Solution(t[None], x[None], m.here, inputs, {}, diffrax.RESULTS.successful, discrete=values)
-    return outputs_of(solution, m.laws, layout, x.dtype)[0]
+def misfit_ahead(
+    system: AcausalSystem, observers: dict[str, Any], layout: Layout, structure: Structure, shared: Any, own: Any,
+    c: Weighted,
+) -> Float[Array, " k"]:  # fmt: skip
+    """Of one experiment and each output, the sum of squared weighted errors of predictions, or of a filter,
+    Σ w (r²/s + ln s) of innovations r and their variances s."""
+    found = _track(system, observers, layout, structure, shared, own, c.told)
+    seen, residual = c.row > 0, found.predicted - c.values
+    if not structure.is_filter:
+        return jnp.sum(jnp.where(seen, c.row * residual, 0.0) ** 2, axis=0)
+    s = jnp.where(seen, found.variance, 1.0)
+    return jnp.sum(jnp.where(seen, c.row**2 * (residual**2 / s + jnp.log(s)), 0.0), axis=0)
 
 
 @compiled
@@ -337,7 +78,7 @@ def track(
     told: Told,
 ) -> Track:  # fmt: skip
     """All that a filter finds, of all experiments; NaN from where a run failed."""
-    return each(lambda s, o, c: _track(system, observers, layout, structure, s, o, c), shared, own, told)
+    return each(lambda s, o, c: _track(system, observers, layout, structure, s, o, c), layout.mesh, shared, own, told)
 
 
 @compiled
@@ -356,7 +97,7 @@ def predict_ahead(
         (by_shared, by_own), found = _pairs(jax.jacfwd(one, argnums=(0, 1), has_aux=True)(shared, own, c))
         return found, by_shared, by_own
 
-    return each(with_slopes, shared, own, told)
+    return each(with_slopes, layout.mesh, shared, own, told)
 
 
 def _pairs(found: Any) -> Any:
@@ -374,11 +115,11 @@ def read_states(
     """The outputs of states at n times, and their standard deviations, of covariances P."""
 
     def one(shared, own, told, x, p, discrete):
-        model = _model(system, observers, layout, Structure(), shared, own, told)
+        model = model_of(system, observers, layout, Structure(), shared, own, told)
 
         def at(t, inputs, x, p, q):
             m = model._replace(inputs=with_kinds(inputs, layout))
-            found, slopes = _read(m, layout, t, x, q)
+            found, slopes = read(m, layout, t, x, q)
             return found, jnp.sqrt(jnp.maximum(jnp.sum((slopes @ p) * slopes, axis=1), 0.0))
 
         return jax.vmap(at)(told.times, told.inputs, x, p, discrete)
@@ -393,25 +134,19 @@ def go_on(
 ) -> tuple[Any, Any, Any]:  # fmt: skip
     """States, covariances and discrete values `steps` times further on, of the first n − steps times of one experiment,
     with nothing measured on the way."""
-    model = _model(system, observers, layout, structure, shared, own, told)
+    model = model_of(system, observers, layout, structure, shared, own, told)
     n = len(told.times)
-    ahead = jnp.asarray(np.arange(n - steps)[:, None] + np.arange(steps + 1))
+    ahead = jnp.asarray(np.arange(n - steps)[:, None] + np.arange(1, steps + 1))
 
-    def one(times, ends, inputs, x, p):
+    def one(ends, inputs, x, p):
         def step(carry, row):
-            x, p = carry
-            start, stop, ends, inputs = row
-            m, discrete = model._replace(inputs=with_kinds(inputs, layout)), None
-            if structure.is_linear:
-                x, p, _ = _forward_linear(m, ends, x, p)
-            elif structure.is_filter:
-                x, p, _ = _forward(m, layout, structure.substeps, start, stop, x, p)
-            else:
-                x, discrete = _run(m, layout, start, stop, x)
+            ends, inputs = row
+            m = model._replace(inputs=with_kinds(inputs, layout))
+            x, p, _, discrete = onwards(m, layout, structure, ends, *carry)
             return (x, p), discrete
 
-        (x, p), discrete = jax.lax.scan(step, (x, p), (times[:-1], times[1:], ends, inputs))
+        (x, p), discrete = jax.lax.scan(step, (x, p), (ends, inputs))
         return x, p, None if discrete is None else discrete[-1]
 
-    inputs = jax.tree.map(lambda a: a[ahead[:, 1:]], told.inputs)
-    return jax.vmap(one)(told.times[ahead], told.ends[ahead[:, 1:]], inputs, x[: n - steps], p[: n - steps])
+    inputs = jax.tree.map(lambda a: a[ahead], told.inputs)
+    return jax.vmap(one)(told.ends[ahead], inputs, x[: n - steps], p[: n - steps])

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from .least_squares import Weights
+from .evaluation import Weights
 from .objective import Objective
 from .program import predict_and_differentiate
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .coordinates import Coordinates
-from .least_squares import Weights
+from .evaluation import Weights
 from .objective import Objective
 
 

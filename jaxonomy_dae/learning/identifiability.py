@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from .evaluation import Evaluation, Weights
 from .factors import Factors
 from .figures import plot_spectrum
-from .least_squares import Evaluation, Weights
 from .objective import Objective
 
 

@@ -15,8 +15,9 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Bool, Float
 
+from .descent import AbstractMerit, Minimum, Reached, Reweigh, descend
+from .evaluation import Evaluation, Rows, Weights
 from .factors import Factors
-from .least_squares import OFFSET, PATIENCE, TRIALS, Evaluation, Minimum, Reweigh, Rows, Weights
 
 GAIN = 1e-5  # decrease of −ln L for each coordinate that is not noticed: that of a step of 0.004 standard deviations
 LONGEST = (
@@ -50,6 +51,49 @@ class Likelihood(Weights):
         return super().cost(z, residual) - float(np.sum(self.share**2 * np.log(self.row / self.share)))
 
 
+@dataclasses.dataclass(frozen=True)
+class Scoring(AbstractMerit):
+    """A likelihood, of which every point has weights of its own; fields as of `score`."""
+
+    evaluation: Callable[[np.ndarray], Evaluation | None]
+    limited: Bool[np.ndarray, " p"]
+    at: Callable[[np.ndarray, Evaluation], Weights]
+
+    def evaluate(self, z: Float[np.ndarray, " p"]) -> Evaluation | None:
+        """As it is given."""
+        return self.evaluation(z)
+
+    def weights(self, z: Float[np.ndarray, " p"], found: Evaluation) -> Weights:
+        """As they are given."""
+        return self.at(z, found)
+
+    def reach(self, z: Float[np.ndarray, " p"], weights: Weights, below: float) -> Reached | None:
+        """By the likelihood there, with the priors at hand."""
+        found = self.evaluation(z)
+        if found is None:
+            return None
+        here = dataclasses.replace(self.at(z, found), precision=weights.precision, mean=weights.mean)
+        cost = here.cost(z, found.residual)
+        return Reached(z, found, here, cost) if cost < below else None
+
+    def left(self, factors: Factors, cost: float, rows: int, noise: float) -> float:
+        """√(gᵀF⁻¹g) for each coordinate that is determined."""
+        rank = factors.rank(noise)
+        return float(np.sqrt(np.mean(factors.projected[:rank] ** 2))) if rank else 0.0
+
+    def unnoticed(self, cost: float, rows: int, columns: int) -> float:
+        """A small part of a likelihood ratio that would mean something."""
+        return GAIN * columns
+
+    def next_weights(self, here: Weights, better: Weights) -> Weights:
+        """Those of the point, with better precisions."""
+        return dataclasses.replace(here, precision=better.precision)
+
+    def shortened(self, step: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
+        """Logarithms change by no more than `LONGEST`."""
+        return np.where(self.limited, np.clip(step, -LONGEST, LONGEST), step)
+
+
 def score(
     evaluate: Callable[[Float[np.ndarray, " p"]], Evaluation | None],
     start: Float[np.ndarray, " p"],
@@ -60,66 +104,10 @@ def score(
     steps: int = 200,
     noise: float = 1e-6,
 ) -> Minimum | None:
-    """Descends from a start; arguments as of `least_squares.minimise`, and which coordinates are logarithms, of which a
-    step is `limited`.
+    """Descends from a start; as `descend`. `weights` are those of a point, and a step of the coordinates that are
+    logarithms is `limited`.
 
     It stops where the remaining step is a thousandth of the confidence region's radius: gᵀF⁻¹g ≤ 10⁻⁶ for each
     coordinate, with the gradient g and the Fisher information F; or where steps in a row gain nothing.
     """
-    low, high = bounds
-    z = np.clip(start, low, high)
-    found = evaluate(z)
-    if found is None:
-        return None
-    scheme = weights(z, found)
-    damping, history, count, idle = 1e-3, [], 1, 0
-    converged, message = False, f"stopped after {steps} steps, not yet converged; steps= allows more"
-    for k in range(steps + 1):
-        cost = scheme.cost(z, found.residual)
-        history.append(cost)
-        r, jacobian = scheme.applied(z, found)
-        gradient = jacobian.T @ r
-        free = ~(((z <= low) & (gradient > 0)) | ((z >= high) & (gradient < 0)))
-        factors = Factors.of(r, jacobian[:, free], noise)
-        rank = factors.rank(noise)
-        left = float(np.sqrt(np.mean(factors.projected[:rank] ** 2))) if rank else 0.0
-        following, settled = (scheme, True) if reweigh is None else reweigh(z, found, scheme, factors, free)
-        if settled and (left <= OFFSET or idle >= PATIENCE):
-            converged, message = True, f"converged after {k} steps"
-            break
-        if k == steps:
-            break
-        better = None
-        for _ in range(TRIALS):
-            step = np.zeros_like(z)
-            step[free] = factors.step(damping, rank)
-            step[limited] = np.clip(step[limited], -LONGEST, LONGEST)
-            new = np.clip(z + step, low, high)
-            if np.array_equal(new, z):
-                break
-            tried = evaluate(new)
-            count += 1
-            gain = -np.inf
-            if tried is not None:
-                trial = dataclasses.replace(weights(new, tried), precision=scheme.precision, mean=scheme.mean)
-                gain = cost - trial.cost(new, tried.residual)
-            if tried is not None and gain > 0:
-                promised = 0.5 * float(np.sum(r**2) - np.sum((r + jacobian @ (new - z)) ** 2))
-                ratio = gain / max(promised, np.finfo(float).eps * max(1.0, abs(cost)))
-                damping = max(damping / 5 if ratio > 0.7 else damping * 3 if ratio < 0.3 else damping, 1e-12)
-                better = new, tried, trial
-                if gain > GAIN * len(z):
-                    idle = 0
-                elif damping <= 1:  # the columns have norm one: beyond, damping alone keeps steps short
-                    idle += 1
-                break
-            damping *= 6
-        if better is None:
-            idle += 1
-            if settled or idle > PATIENCE:
-                converged, message = True, f"converged after {k} steps: no step gains more"
-                break
-        else:
-            z, found, scheme = better
-        scheme = dataclasses.replace(scheme, precision=following.precision)
-    return Minimum(z, found, scheme, scheme.cost(z, found.residual), history, count, converged, message, noise)
+    return descend(Scoring(evaluate, limited, weights), start, bounds, reweigh, steps, noise)

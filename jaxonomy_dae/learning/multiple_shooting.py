@@ -17,9 +17,11 @@ from jaxtyping import Float
 
 from ..errors import ModelError
 from .block_elimination import Blocks, eliminate, linear
+from .descent import OFFSET, PATIENCE, TRIALS, Minimum
+from .evaluation import Weights
 from .evidence import Evidence
 from .factors import Factors
-from .least_squares import GAIN, OFFSET, PATIENCE, TRIALS, Minimum, Weights, offset
+from .least_squares import GAIN, offset
 from .node_guesses import node_guesses, sizes
 from .objective import Objective
 from .segments import Point, Segments

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from ..errors import ModelError, nearest
 from .figures import plot_prediction
 from .objective import Objective, Predicted
-from .program import predict_and_differentiate
+from .program import Conditions, predict_and_differentiate
 
 if TYPE_CHECKING:
     from .estimate import Estimate
@@ -34,8 +34,10 @@ class Prediction:
         return plot_prediction(self, names, axes)
 
 
-def prediction(estimate: "Estimate", names: list[str], ts: Any, experiment: int | str, factor: float) -> Prediction:
-    """Predictions under the conditions of an experiment, linearized around the estimate."""
+def under(
+    estimate: "Estimate", names: list[str], ts: Any, experiment: int | str
+) -> tuple[Objective, int, list[str], Conditions]:
+    """(objective whose outputs are the variables named, the experiment's place, these names, its conditions)."""
     objective = estimate.objective
     s, plan = objective.stacked, objective.system.plan
     k = s.labels.index(experiment) if experiment in s.labels else experiment
@@ -48,20 +50,26 @@ def prediction(estimate: "Estimate", names: list[str], ts: Any, experiment: int 
     times = s.times[k, : s.counts[k]] if ts is None else np.asarray(ts, float)
     if times.ndim != 1 or not len(times) or (np.diff(times) < 0).any() or times[0] < s.t0[k] or times[-1] <= s.t0[k]:
         raise ModelError(f"ts must be increasing times, of shape (n,), that start at {s.t0[k]:g} or later")
-    layout = dataclasses.replace(objective.layout, outputs=tuple(names))
+    layout = dataclasses.replace(objective.layout, outputs=tuple(names), mesh=None)
     one = Objective(
         objective.system, objective.observers, layout,
         s, objective.coordinates, {}, objective.counted,
     )  # fmt: skip
-    shared, own = one.numbers(one.coordinates.natural(estimate.point))
     conditions = jax.tree.map(lambda a: a[k][None], one.conditions)
     conditions = dataclasses.replace(conditions, times=jnp.asarray(times[None], conditions.times.dtype))
-    found = predict_and_differentiate(one.system, one.observers, layout, shared, own[k][None], conditions)
+    return one, k % len(s.labels), names, conditions
+
+
+def prediction(estimate: "Estimate", names: list[str], ts: Any, experiment: int | str, factor: float) -> Prediction:
+    """Predictions under the conditions of an experiment, linearized around the estimate."""
+    one, k, names, conditions = under(estimate, names, ts, experiment)
+    c, times = one.coordinates, np.asarray(conditions.times[0], np.float64)
+    shared, own = one.numbers(c.natural(estimate.point))
+    found = predict_and_differentiate(one.system, one.observers, one.layout, shared, own[k][None], conditions)
     alone = Predicted(*(np.asarray(a, np.float64) for a in found))
     n, j = len(times), len(names)
     rows = tuple(a.ravel() for a in np.meshgrid([0], np.arange(n), np.arange(j), indexing="ij"))
-    c = objective.coordinates
-    place = c.n_shared + (k % len(s.labels)) * c.n_own
+    place = c.n_shared + k * c.n_own
     columns = np.concatenate([np.arange(c.n_shared), place + np.arange(c.n_own)])
     slope = alone.jacobian(rows) * c.slope(estimate.point)[columns]
     spread = np.linalg.norm(slope @ estimate.root[columns], axis=1).reshape(n, j)

@@ -2,36 +2,37 @@
 
 import copy
 import dataclasses
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 from jaxtyping import Float
 
-from ..diagnosis.unused_parameters import unused_parameters
-from ..errors import InitializationError, ModelError, SimulationError, nearest
-from ..model.tables import ZERO
-from ..simulation.simulate import simulate
+from ..errors import ModelError, SimulationError, nearest
 from ..system.system import AcausalSystem
+from .asked import check_start, checked_method, names_to_train, penalties
 from .coordinates import Coordinates, coordinates
 from .data import Data, Stacked, stack
+from .descent import Minimum
+from .devices import check_mesh
 from .estimate import Estimate
+from .evaluation import Evaluation, Weights
 from .experiment import Experiment, Unknown
 from .filter_objective import AheadObjective, FilterObjective
-from .filtering import Extra, Filter, Innovations, Structure, check_model, structure_and_extras
+from .filtering import Extra, Filter, Innovations, Structure, structure_and_extras
 from .first_order import adam_steps
 from .holdout import holdout_score
 from .identifiability import Identifiability, identifiability
-from .least_squares import Evaluation, Minimum, Weights
 from .multiple_shooting import Shooting, shoot
 from .objective import Objective
-from .program import Layout, predict, weights_of, with_values
+from .program import Layout, predict
+from .runs import run, why_not
+from .starting_points import starting_points
 from .training import GradientSteps, Training, train
 
-METHODS = ("single", "growing")
 GROWING = tuple(k / 10 for k in range(1, 11))  # shares of the time
 
 
@@ -57,6 +58,8 @@ class Problem:
         `Shooting(...)`, multiple shooting, for what diverges; or for equations with errors, `Filter(...)`, the
         likelihood of a Kalman filter, or `Innovations(...)`, predictions one step ahead.
     - `rtol`, `atol`, `max_steps`, and others in `options`: as in `simulate`.
+    - `mesh`: devices among which the experiments are divided, `jax.make_mesh((jax.device_count(),), ("experiments",))`;
+        of several processes too, each of which runs the same program with the same data (`jax.distributed`).
 
     **Raises:**
 
@@ -77,6 +80,7 @@ class Problem:
         rtol: float = 1e-6,
         atol: float = 1e-8,
         max_steps: int = 4096,
+        mesh: Mesh | None = None,
         **options: Any,
     ):
         if not isinstance(system, AcausalSystem):
@@ -91,40 +95,14 @@ class Problem:
         self.data = data if isinstance(data, Data) else Data(data)
         self.starts = dict(starts or {})
         self._options = {"rtol": rtol, "atol": atol, "max_steps": max_steps, **options}
-        self._train = self._names(train)
-        self.method = self._method(method)
+        self._mesh = check_mesh(mesh)
+        self._train = names_to_train(system, self.observers, train)
+        self.method = checked_method(system, method)
         self._stacked = self._stack(self.data)
         self._layout = self._laid_out(self._stacked)
-        self.penalties = self._penalties(regularize)
+        self.penalties = penalties(system, self._train[1], regularize)
 
     # --- set-up ------------------------------------------------------------------------------------------------
-
-    def _names(self, train: Sequence[str] | str | None) -> tuple[list[str], list[str]]:
-        """(parameters one by one, modules) to be trained."""
-        chosen = list(self.system.neural) if train is None else [train] if isinstance(train, str) else list(train)
-        table, parameters, modules = self.system.parameters.table, [], []
-        for name in dict.fromkeys(chosen):
-            if name in self.system.neural or name in self.observers:
-                module = self.system.neural[name] if name in self.system.neural else self.observers[name]
-                if not weights_of(module):
-                    raise ModelError(f"train: '{name}' has no numbers to be trained")
-                modules.append(name)
-            elif name in self.system.parameters:
-                for one in table.one_by_one(name):
-                    table.settable(one)
-                    parameters.append(one)
-            else:
-                known = [*self.system.neural, *self.observers, *table.names]
-                raise ModelError(
-                    f"train: '{name}' is neither a parameter, a network nor a sensor law: " + nearest(name, known)
-                )
-        unused = unused_parameters(self.system.plan.flat)
-        for name in parameters:
-            if table.index(name) in unused:
-                raise ModelError(
-                    f"train: nothing in the model reads parameter '{name}', so no data can determine it: leave it out"
-                )
-        return list(dict.fromkeys(parameters)), modules
 
     def _stack(self, data: Data | Experiment) -> Stacked:
         stacked = stack(
@@ -141,7 +119,7 @@ class Problem:
         shared, own, known = [], [], []
         for name, values in stacked.starts.items():
             unknown = [v for v in values if isinstance(v, Unknown)]
-            self._check_start(name, bool(unknown))
+            check_start(self.system, self._train[0], name, bool(unknown))
             kind = known if not unknown or self._is_marginal(name, unknown) else shared if unknown[0].shared else own
             kind.append(name)
         if not parameters and not modules and not shared and not own and all(e.fixed for e in extras):
@@ -150,7 +128,7 @@ class Problem:
             )
         return Layout(
             stacked.outputs, tuple(parameters), tuple(modules), tuple(shared), tuple(own), tuple(known), stacked.kinds,
-            tuple(self._options.items()), tuple(e.name for e in extras),
+            tuple(self._options.items()), tuple(e.name for e in extras), self._mesh,
         )  # fmt: skip
 
     def _errors(self, stacked: Stacked) -> tuple[Structure, tuple[Extra, ...]]:
@@ -163,60 +141,6 @@ class Problem:
         """Whether the prior of a start is that of a filter, which needs no search."""
         own = all(u.spread is not None and not u.shared for u in unknown)
         return isinstance(self.method, Filter) and own and name not in self.system.parameters.table.names
-
-    def _check_start(self, name: str, is_unknown: bool) -> None:
-        plan, table = self.system.plan, self.system.parameters.table
-        if name in table.names:
-            table.settable(name)
-            if name in self._train[0]:
-                raise ModelError(f"'{name}' is trained, and each experiment's own as well: leave one of them out")
-            return
-        if name not in plan.variable_index:
-            known = [*plan.visible_variables, *table.names]
-            raise ModelError(f"the start of '{name}' is not that of a variable: " + nearest(name, known))
-        if is_unknown:
-            quantity = int(plan.resolve([name])[0][0])
-            quantities = plan.extended.quantities
-            if quantity == ZERO or quantities.highest[quantities.owner[quantity]] <= quantities.order[quantity]:
-                raise ModelError(
-                    f"'{name}' is algebraic: its start follows from the others and cannot be unknown. Starts of "
-                    + ", ".join(repr(s) for s in self.system.states[:8])
-                    + " can"
-                )
-
-    def _penalties(self, given: Mapping[str, Any] | str | float | None) -> dict[str, Any]:
-        modules = self._train[1]
-        if not isinstance(given, Mapping):
-            given = {name: given for name in modules if name in self.system.neural}
-        for name, value in given.items():
-            if name not in modules:
-                raise ModelError(f"regularize: '{name}' is no network that is trained: " + nearest(name, modules))
-            number = isinstance(value, int | float) and not isinstance(value, bool)
-            if not (value is None or value == "evidence" or (number and value >= 0 and math.isfinite(value))):
-                raise ModelError(f"regularize: '{name}' takes 'evidence', a precision ≥ 0 or None; got {value!r}")
-        return {name: given.get(name) for name in modules}
-
-    def _method(self, given: Any) -> str | Shooting | Filter | Innovations:
-        if isinstance(given, Filter | Innovations):
-            check_model(given, self.system)
-            return given
-        if given not in METHODS and not isinstance(given, Shooting):
-            raise ModelError(
-                "method is 'single', 'growing' or Shooting(nodes=30), Filter(noise={'room.T': 'estimate'}) or "
-                f"Innovations(); got {given!r}"
-            )
-        plan = self.system.plan
-        if isinstance(given, Shooting) and self.system.discretes:
-            raise ModelError(
-                f"method: '{self.system.discretes[0]}' is a discrete variable, which the nodes of multiple shooting do "
-                "not carry from segment to segment: use method='growing'"
-            )
-        if isinstance(given, Shooting) and plan.held is not None:
-            raise ModelError(
-                "method: constraints of this model come and go with its modes, so that the nodes of multiple shooting "
-                "have no fixed number of degrees of freedom: use method='growing'"
-            )
-        return given
 
     # --- residuals ---------------------------------------------------------------------------------------------
 
@@ -324,7 +248,7 @@ class Problem:
         if not shares or shares[-1] != 1.0 or any(not 0 < share <= 1 for share in shares):
             raise ModelError(f"horizons are shares in (0, 1], the last of them 1; got {tuple(horizons)}")
         best: tuple[float, Minimum, Training | None] | None = None
-        for point in self._points(objective, starts, seed):
+        for point in starting_points(objective, starts, seed):
             training = None
             if first is not None:
                 training = train(self, objective, point, first)
@@ -384,7 +308,7 @@ class Problem:
 
     def not_simulated(self, objective: Objective) -> SimulationError:
         """The error where no start can be simulated."""
-        return SimulationError(self._why(objective))
+        return SimulationError(why_not(objective))
 
     def _coordinates(self, stacked: Stacked, freeze: Any, start: Any, bounds: Any) -> Coordinates:
         system, values = self.system, {}
@@ -409,25 +333,6 @@ class Problem:
             else dict.fromkeys([freeze] if isinstance(freeze, str) else freeze)
         )
         return c.changed(held, fixed=True)
-
-    def _points(self, objective: Objective, count: int, seed: int) -> list[np.ndarray]:
-        c, (low, high) = objective.coordinates, objective.bounds
-        first, free = c.z_start[objective.free], objective.free
-        rng, points = np.random.default_rng(seed), [first]
-        # The bounds of what comes with a method are as far away as can be.
-        bounded = np.isfinite(low) & np.isfinite(high) & ~np.isin(np.array(c.names)[free], self._layout.extra)
-        least, most = np.where(bounded, low, 0.0), np.where(bounded, high, 0.0)
-        for _ in range(count - 1):
-            width = np.where(c.log[free], 1.0, np.where(c.is_weight[free], 0.0, 1.0))
-            width = np.where(np.isfinite(c.spread[free]), c.spread[free], width)
-            for name in dict.fromkeys(c.group):
-                chosen = np.array([g == name for g in c.group])[free] & c.is_weight[free]
-                width[chosen] = np.sqrt(np.mean(first[chosen] ** 2)) if chosen.any() else 0.0
-            centre = np.where(c.is_weight[free], 0.0, first)
-            drawn = centre + width * rng.standard_normal(len(first))
-            inside = least + (most - least) * rng.uniform(size=len(first)) if bounded.any() else drawn
-            points.append(np.clip(np.where(bounded, inside, drawn), low, high))
-        return points
 
     def _descend(
         self, objective: Objective, point: np.ndarray, shares: list[float], steps: int, adam: int, rate: float
@@ -458,38 +363,9 @@ class Problem:
             return Minimum(start, found, weights, cost, [cost], 1, True, "nothing is searched", rtol)
         return objective.lowest(start, weights=weights)
 
-    def _why(self, objective: Objective) -> str:
-        """The first reason for which a run from the start fails."""
-        c, s = objective.coordinates, objective.stacked
-        shared, own = objective.numbers(c.natural(c.z_start))
-        outputs = np.asarray(objective.predicted(c.z_start).outputs)
-        failed = [k for k in range(len(s.labels)) if not np.isfinite(outputs[k][s.observed[k]]).all()]
-        k = failed[0] if failed else 0
-        try:
-            self.run(objective, c.z_start, k)
-        except (InitializationError, ModelError, SimulationError) as error:
-            return f"no start can be simulated; from the first, {s.labels[k]} fails: {error}"
-        what = "its predictions are not finite" if failed else "their derivatives are not finite"
-        return f"no start can be simulated; from the first, {s.labels[k]}: {what}"
-
     def run(self, objective: Objective, z: Float[np.ndarray, " p"], experiment: int, ts: Any = None) -> Any:
         """An ordinary simulation of one experiment at a point."""
-        layout, s = self._layout, objective.stacked
-        shared, own = objective.numbers(objective.coordinates.natural(z))
-        system, _, starts = with_values(self.system, self.observers, layout, shared)
-        initial = dict(zip(layout.shared, starts, strict=True))
-        initial |= dict(zip(layout.own, own[experiment], strict=True))
-        initial |= dict(zip(layout.known, objective.conditions.known[experiment], strict=True))
-        given = {name: float(v) for name, v in initial.items() if name in system.parameters}
-        system = system.with_parameters(given) if given else system
-        initial = {name: v for name, v in initial.items() if name not in given}
-        inputs = {n: (t[experiment], v[experiment], dict(s.kinds)[n]) for n, (t, v) in s.inputs.items()}
-        end = s.counts[experiment]
-        times = s.times[experiment, :end] if ts is None else ts
-        t1 = max(float(times[-1]), np.nextafter(s.t0[experiment], math.inf))
-        return simulate(
-            system, t1, t0=s.t0[experiment], ts=times, inputs=inputs or None, initial=initial or None, **self._options
-        )
+        return run(objective, z, experiment, ts)
 
     def with_law(self, name: str, law: Any, system: AcausalSystem, stacked: Stacked) -> "Problem":
         """The same problem with another law in a network's place, without a prior, in a system that is otherwise as

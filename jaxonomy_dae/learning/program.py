@@ -10,18 +10,19 @@ starts are their own.
 
 import dataclasses
 import math
-from collections.abc import Callable
 from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
 from ..programs.cache import compiled
 from ..simulation.simulate import simulate
 from ..system.system import AcausalSystem
+from .devices import each
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,6 +38,7 @@ class Layout:
     kinds: tuple[tuple[str, str], ...]  # of inputs
     options: tuple[tuple[str, Any], ...]  # of `simulate`
     extra: tuple[str, ...] = ()  # coordinates that come with a method, before the shared starts
+    mesh: Mesh | None = None  # the devices that share the experiments
 
     @property
     def n_own(self) -> int:
@@ -51,6 +53,15 @@ class Conditions(eqx.Module):
     t0: Float[Array, " e"]
     known: Float[Array, "e known"]
     inputs: dict[str, tuple[Float[Array, "e _"], Float[Array, "e _"]]]
+
+
+class Weighted(eqx.Module):
+    """What a program is told of e experiments, with their samples, and the square roots of how much each counts: √w/σ,
+    or √w where the noise level is estimated or follows from the model; zero where there is no sample."""
+
+    told: Any
+    values: Float[Array, "e n k"]
+    row: Float[Array, "e n k"]
 
 
 def weights_of(module: Any) -> list[Any]:
@@ -101,7 +112,7 @@ def placed(
     return system, observers, initial
 
 
-def _one(
+def run_one(
     system: AcausalSystem, observers: dict[str, Any], layout: Layout, adjoint: Any, shared: Any, own: Any, c: Conditions
 ) -> Float[Array, "n k"]:
     """The outputs of one experiment."""
@@ -111,6 +122,14 @@ def _one(
         inputs=with_kinds(c.inputs, layout), **dict(layout.options),
     )  # fmt: skip
     return outputs_of(solution, observers, layout, c.times.dtype)
+
+
+def misfit(
+    system: AcausalSystem, observers: dict[str, Any], layout: Layout, adjoint: Any, shared: Any, own: Any, c: Weighted
+) -> Float[Array, " k"]:
+    """The sum of squared weighted residuals of each output in a run of one experiment; NaN where it fails."""
+    outputs = run_one(system, observers, layout, adjoint, shared, own, c.told)
+    return jnp.sum(jnp.where(c.row > 0, c.row * (outputs - c.values), 0.0) ** 2, axis=0)
 
 
 def with_kinds(inputs: dict[str, Any], layout: Layout) -> dict[str, Any]:
@@ -127,15 +146,6 @@ def outputs_of(solution: Any, observers: dict[str, Any], layout: Layout, dtype: 
     return jnp.stack([read[n] if n in read else jnp.asarray(derived[n], dtype) for n in layout.outputs], axis=1)
 
 
-def each(function: Callable, shared: Any, own: Any, conditions: Any) -> Any:
-    """`function(shared, own, conditions)` of each experiment; a single one is not made a batch, which costs compile
-    time."""
-    if own.shape[0] == 1:
-        found = function(shared, own[0], jax.tree.map(lambda a: a[0], conditions))
-        return jax.tree.map(lambda a: a[None], found)
-    return jax.vmap(function, in_axes=(None, 0, 0))(shared, own, conditions)
-
-
 @compiled
 def predict(
     system: AcausalSystem, observers: dict[str, Any], layout: Layout, adjoint: Any, shared: Any, own: Any,
@@ -144,9 +154,9 @@ def predict(
     """The outputs of all experiments; NaN where a run failed."""
 
     def one(shared, own, c):
-        return _one(system, observers, layout, adjoint, shared, own, c)
+        return run_one(system, observers, layout, adjoint, shared, own, c)
 
-    return each(one, shared, own, conditions)
+    return each(one, layout.mesh, shared, own, conditions)
 
 
 @compiled
@@ -156,11 +166,11 @@ def predict_and_differentiate(
     """The outputs of all experiments, and their derivatives by the shared numbers and by each experiment's own."""
 
     def one(shared, own, c):
-        found = _one(system, observers, layout, diffrax.ForwardMode(), shared, own, c)
+        found = run_one(system, observers, layout, diffrax.ForwardMode(), shared, own, c)
         return found, found
 
     def with_slopes(shared, own, c):
         (by_shared, by_own), found = jax.jacfwd(one, argnums=(0, 1), has_aux=True)(shared, own, c)
         return found, by_shared, by_own
 
-    return each(with_slopes, shared, own, conditions)
+    return each(with_slopes, layout.mesh, shared, own, conditions)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .block_elimination import Blocks, condensed
-from .least_squares import Evaluation
+from .evaluation import Evaluation
 from .objective import Objective
 from .program import Conditions
 from .shooting_program import Cut, first_states, on_constraints, run_segments

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from ..programs.cache import compiled
 from ..simulation.simulate import simulate
 from ..system.system import AcausalSystem
+from .devices import each
 from .program import Conditions, Layout, outputs_of, placed, with_kinds
 
 
@@ -49,7 +50,7 @@ def first_states(
         (by_shared, by_own), found = jax.jacfwd(one, argnums=(0, 1), has_aux=True)(shared, own, c)
         return found, by_shared, by_own
 
-    return jax.vmap(with_slopes, in_axes=(None, 0, 0))(shared, own, conditions)
+    return each(with_slopes, layout.mesh, shared, own, conditions)
 
 
 @compiled
@@ -68,10 +69,11 @@ def on_constraints(
         slope = jax.jacfwd(lambda first: here.project(t, jnp.concatenate([first, x[f:]]), inputs))(x[:f])
         return x, slope
 
-    def each(own, states, c):
+    def nodes(shared, own, told):
+        states, c = told
         return jax.vmap(lambda x, t: one(shared, own, x, t, c))(states, c.t0)
 
-    return jax.vmap(each)(own, states, cut)
+    return each(nodes, layout.mesh, shared, own, (states, cut))
 
 
 @compiled
@@ -96,12 +98,17 @@ def run_segments(
         found = Ran(outputs_of(solution, laws, layout, times.dtype), solution.states[0], solution.states[-1])
         return found, found
 
-    def with_slopes(own, x, basis, times, t0, c):
+    def with_slopes(shared, own, x, basis, times, t0, c):
         moved = jnp.concatenate([jnp.concatenate([shared, own])[places], jnp.zeros(basis.shape[-1:], basis.dtype)])
         slopes, found = jax.jacfwd(one, has_aux=True)(moved, shared, own, x, basis, times, t0, c)
         return found, slopes
 
-    def each(own, states, bases, c):
-        return jax.vmap(lambda x, b, times, t0: with_slopes(own, x, b, times, t0, c))(states, bases, c.times, c.t0)
+    def segments(shared, own, told):
+        states, bases, c = told
 
-    return jax.vmap(each)(own, states, bases, cut)
+        def segment(x, basis, times, t0):
+            return with_slopes(shared, own, x, basis, times, t0, c)
+
+        return jax.vmap(segment)(states, bases, c.times, c.t0)
+
+    return each(segments, layout.mesh, shared, own, (states, bases, cut))

@@ -15,10 +15,10 @@ from jaxtyping import Float
 
 from ..errors import ModelError
 from .checkpoint import fingerprint, read_facts, read_state, save
+from .evaluation import Evaluation, Weights
 from .figures import new_axes
 from .gradient import Batches
 from .holdout import holdout_score
-from .least_squares import Evaluation, Weights
 from .objective import Objective
 
 if TYPE_CHECKING:
@@ -177,6 +177,7 @@ def train(problem: "Problem", objective: Objective, start: Float[np.ndarray, " f
     if plan.checkpoint is not None and Path(plan.checkpoint).exists():
         state = _resumed(plan, facts, state, stages)
     message, stopped = "", False
+    writes = objective.layout.mesh is None or jax.process_index() == 0  # one process of all that train together
     while state.step < plan.steps and not stopped:
         if plan.patience is not None and state.scores and state.step - state.best_step >= plan.patience:
             message = f"ended after {state.step} updates: {plan.patience} without a better score"
@@ -213,7 +214,7 @@ def train(problem: "Problem", objective: Objective, start: Float[np.ndarray, " f
             score = state.scores[-1] if state.scores else float("nan")
             if plan.callback(Update(state.step, loss, score, values_at(objective, state.z))) is True:
                 message, stopped = f"ended by the callback after {state.step} updates", True
-        if plan.checkpoint is not None and (due or stopped or state.step == plan.steps):
+        if plan.checkpoint is not None and writes and (due or stopped or state.step == plan.steps):
             save(plan.checkpoint, facts | _counts(state), state.arrays())
     last = not np.isfinite(state.best_value)  # nothing to choose by
     if not held_out and plan.batch is None and state.step == plan.steps:

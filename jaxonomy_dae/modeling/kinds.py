@@ -21,6 +21,6 @@ def check_kind(network: Any, kind: Any, where: str) -> None:
     promise = " ".join((kinds[0].__doc__ or "").split("\n\n")[0].split())
     found = network.__name__ if isinstance(network, type) else type(network).__name__
     raise ModelError(
-        f"{where}: the component takes a law of kind {names} only; got {found}, which promises nothing of it."
+        f"{where}: only a law of kind {names} may stand here; got {found}, which promises nothing of it."
         + (f" {kinds[0].__name__}: {promise}" if promise else "")
     )

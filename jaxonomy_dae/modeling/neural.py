@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from ..errors import ModelError
 from .component import Component
+from .kinds import check_kind
 from .names import check_name
 from .untraceable import why_untraceable
 
@@ -58,10 +59,14 @@ class NeuralDAEBlock:
         hidden constraints and multipliers respond. `"row"` adds the correction to the finished right-hand side of the
         target's row instead, and the constraints never see it; the target must then be a state, and the
         system compiled with `state_selection="dummy_derivatives"`.
+    - `kind`: the class that `network` must be of, such as `learning.AbstractPassive`, or a tuple of them, as in
+        `Component.learned`: for functions that build a model around a network they are given. What a kind promises, it
+        promises of the network's own inputs and outputs.
 
     **Raises:**
 
-    - `ModelError` if targets or inputs are malformed, or the network's output does not have one entry for each target.
+    - `ModelError` if targets or inputs are malformed, the network is not of the kind, or its output does not have one
+        entry for each target.
     """
 
     def __init__(
@@ -73,11 +78,14 @@ class NeuralDAEBlock:
         inputs: Sequence[Any] | None = None,
         name: str,
         inject: Literal["equation", "row"] = "equation",
+        kind: Any = None,
     ):
         where = f"neural block '{name}'"
         check_name(name, "neural block")
         if not callable(network):
             raise ModelError(f"{where}: the network must be callable; got {network!r}")
+        if kind is not None:
+            check_kind(network, kind, where)
         if inject not in ("equation", "row"):
             raise ModelError(f"{where}: inject is 'equation' or 'row'; got {inject!r}")
         if isinstance(targets, str) or not targets:

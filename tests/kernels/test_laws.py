@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxonomy_dae import Component, EqnEnv, ModelError
+from jaxonomy_dae import Component, EqnEnv, ModelError, NeuralDAEBlock
 from jaxonomy_dae.learning import (
     AbstractPassive,
     Bounded,
@@ -278,9 +278,16 @@ def test_a_slot_takes_laws_of_its_kind(law):
 @pytest.mark.parametrize("law, found", [(Odd(key=KEY), "Odd"), (jnp.tanh, "PjitFunction"), (Passive, "Passive")])
 def test_a_slot_refuses_others(law, found):
     with pytest.raises(
-        ModelError, match=rf"'slide\.friction'.*kind AbstractPassive only; got {found}.*N\(v, …\)·v ≤ 0"
+        ModelError, match=rf"'slide\.friction'.*kind AbstractPassive may stand here; got {found}.*N\(v, …\)·v ≤ 0"
     ):
         Slide(EqnEnv(), law)
+
+
+def test_a_block_refuses_others():
+    targets = ["slide.v"]
+    assert NeuralDAEBlock(Passive(key=KEY), targets=targets, name="drag", kind=AbstractPassive).targets
+    with pytest.raises(ModelError, match="neural block 'drag': only a law of kind AbstractPassive or Odd may.*got MLP"):
+        NeuralDAEBlock(eqx.nn.MLP(1, 1, 2, 1, key=KEY), targets=targets, name="drag", kind=(AbstractPassive, Odd))
 
 
 def test_a_kind_is_a_class():

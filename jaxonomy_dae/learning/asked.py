@@ -1,0 +1,104 @@
+"""What a problem asks for, checked against its system: every refusal names what there is instead."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ..diagnosis.unused_parameters import unused_parameters
+from ..errors import ModelError, nearest
+from ..model.tables import ZERO
+from ..system.system import AcausalSystem
+from .filtering import Filter, Innovations, check_model
+from .multiple_shooting import Shooting
+from .program import weights_of
+
+METHODS = ("single", "growing")
+
+
+def names_to_train(
+    system: AcausalSystem, observers: dict[str, Any], train: Sequence[str] | str | None
+) -> tuple[list[str], list[str]]:
+    """(parameters one by one, modules) to be trained."""
+    chosen = list(system.neural) if train is None else [train] if isinstance(train, str) else list(train)
+    table, parameters, modules = system.parameters.table, [], []
+    for name in dict.fromkeys(chosen):
+        if name in system.neural or name in observers:
+            module = system.neural[name] if name in system.neural else observers[name]
+            if not weights_of(module):
+                raise ModelError(f"train: '{name}' has no numbers to be trained")
+            modules.append(name)
+        elif name in system.parameters:
+            for one in table.one_by_one(name):
+                table.settable(one)
+                parameters.append(one)
+        else:
+            known = [*system.neural, *observers, *table.names]
+            raise ModelError(
+                f"train: '{name}' is neither a parameter, a network nor a sensor law: " + nearest(name, known)
+            )
+    unused = unused_parameters(system.plan.flat)
+    for name in parameters:
+        if table.index(name) in unused:
+            raise ModelError(
+                f"train: nothing in the model reads parameter '{name}', so no data can determine it: leave it out"
+            )
+    return list(dict.fromkeys(parameters)), modules
+
+
+def check_start(system: AcausalSystem, trained: Sequence[str], name: str, is_unknown: bool) -> None:
+    """Refuses a start that does not exist, or cannot be unknown; `trained` parameters are those of all experiments."""
+    plan, table = system.plan, system.parameters.table
+    if name in table.names:
+        table.settable(name)
+        if name in trained:
+            raise ModelError(f"'{name}' is trained, and each experiment's own as well: leave one of them out")
+        return
+    if name not in plan.variable_index:
+        known = [*plan.visible_variables, *table.names]
+        raise ModelError(f"the start of '{name}' is not that of a variable: " + nearest(name, known))
+    if is_unknown:
+        quantity = int(plan.resolve([name])[0][0])
+        quantities = plan.extended.quantities
+        if quantity == ZERO or quantities.highest[quantities.owner[quantity]] <= quantities.order[quantity]:
+            raise ModelError(
+                f"'{name}' is algebraic: its start follows from the others and cannot be unknown. Starts of "
+                + ", ".join(repr(s) for s in system.states[:8])
+                + " can"
+            )
+
+
+def penalties(system: AcausalSystem, modules: Sequence[str], given: Any) -> dict[str, Any]:
+    """How the weights of each module that is trained are regularized: "evidence", a precision, or None."""
+    if not isinstance(given, Mapping):
+        given = {name: given for name in modules if name in system.neural}
+    for name, value in given.items():
+        if name not in modules:
+            raise ModelError(f"regularize: '{name}' is no network that is trained: " + nearest(name, modules))
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not (value is None or value == "evidence" or (number and value >= 0 and math.isfinite(value))):
+            raise ModelError(f"regularize: '{name}' takes 'evidence', a precision ≥ 0 or None; got {value!r}")
+    return {name: given.get(name) for name in modules}
+
+
+def checked_method(system: AcausalSystem, given: Any) -> str | Shooting | Filter | Innovations:
+    """The method, if it is one and goes with the model."""
+    if isinstance(given, Filter | Innovations):
+        check_model(given, system)
+        return given
+    if given not in METHODS and not isinstance(given, Shooting):
+        raise ModelError(
+            "method is 'single', 'growing' or Shooting(nodes=30), Filter(noise={'room.T': 'estimate'}) or "
+            f"Innovations(); got {given!r}"
+        )
+    plan = system.plan
+    if isinstance(given, Shooting) and system.discretes:
+        raise ModelError(
+            f"method: '{system.discretes[0]}' is a discrete variable, which the nodes of multiple shooting do "
+            "not carry from segment to segment: use method='growing'"
+        )
+    if isinstance(given, Shooting) and plan.held is not None:
+        raise ModelError(
+            "method: constraints of this model come and go with its modes, so that the nodes of multiple shooting "
+            "have no fixed number of degrees of freedom: use method='growing'"
+        )
+    return given

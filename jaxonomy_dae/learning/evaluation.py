@@ -1,0 +1,53 @@
+"""Residuals at a point, and how much each of them counts."""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+
+class Evaluation(NamedTuple):
+    """Residuals as they are, not weighted, and their Jacobian; and where the model says how large they should be, their
+    variance and the derivatives of its logarithm."""
+
+    residual: Float[np.ndarray, " m"]
+    jacobian: Float[np.ndarray, "m p"]
+    variance: Float[np.ndarray, " m"] | None = None
+    log_slope: Float[np.ndarray, "m p"] | None = None
+
+
+class Rows(NamedTuple):
+    """Weighted residuals and Jacobian, with those of priors."""
+
+    residual: Float[np.ndarray, " r"]
+    jacobian: Float[np.ndarray, "r p"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Weights:
+    """How much each residual and each prior counts."""
+
+    row: Float[np.ndarray, " m"]  # 1/σ
+    precision: Float[np.ndarray, " p"]  # of the normal prior of each coordinate; 0 where there is none
+    mean: Float[np.ndarray, " p"]
+
+    @property
+    def log_rows(self) -> float:
+        """Σ ln (1/σ), which is not in the cost."""
+        return float(np.sum(np.log(self.row)))
+
+    def applied(self, z: Float[np.ndarray, " p"], found: Evaluation) -> Rows:
+        """Weighted residuals and Jacobian, with a row for each prior."""
+        chosen = np.flatnonzero(self.precision)
+        root = np.sqrt(self.precision[chosen])
+        prior = np.zeros((len(chosen), len(z)))
+        prior[np.arange(len(chosen)), chosen] = root
+        return Rows(
+            np.concatenate([self.row * found.residual, root * (z - self.mean)[chosen]]),
+            np.concatenate([self.row[:, None] * found.jacobian, prior]),
+        )
+
+    def cost(self, z: Float[np.ndarray, " p"], residual: Float[np.ndarray, " m"]) -> float:
+        """½ |W r|² + ½ Σ precision·(z − mean)²."""
+        return 0.5 * float(np.sum((self.row * residual) ** 2) + np.sum(self.precision * (z - self.mean) ** 2))

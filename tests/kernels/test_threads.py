@@ -1,0 +1,30 @@
+"""Factorizations by one thread."""
+
+import contextlib
+import importlib.util
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+from jaxonomy_dae.programs import threads
+
+
+def test_large_work_and_installations_without_the_library_change_nothing(monkeypatch):
+    assert isinstance(threads.one_thread(2 * threads.LARGE), contextlib.nullcontext)
+    monkeypatch.setattr(threads, "_controller", lambda: None)
+    assert isinstance(threads.one_thread(1.0), contextlib.nullcontext)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("threadpoolctl") is None, reason="needs threadpoolctl")
+def test_threads_are_as_many_as_before_afterwards():
+    def counts():
+        return [lib["num_threads"] for lib in threads._controller().info() if lib["user_api"] == "blas"]
+
+    scipy.linalg.qr(np.eye(3))
+    before = counts()
+    assert before
+    with pytest.raises(ZeroDivisionError), threads.one_thread(1.0):
+        assert counts() == [1] * len(before)
+        raise ZeroDivisionError
+    assert counts() == before
