@@ -33,7 +33,7 @@ QUICK = {
     ],
 )
 def test_a_random_model(family, seed):
-    note, outcome = Draw(family, seed).judged()
+    note, (outcome,) = Draw(family, seed).judged()
     assert outcome.kind in GOOD, f"({note}): {outcome.kind}: {outcome.text[:1000]}"
 
 
