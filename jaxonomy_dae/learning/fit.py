@@ -17,6 +17,8 @@ import optimistix as optx
 from tqdm import tqdm
 
 from ..adjoint.default import forward_mode
+from ..diagnosis.unused_parameters import unused_parameters
+from ..diagnosis.wording import listed
 from ..errors import InitializationError, ModelError, SimulationError, SteadyStateError
 from ..modeling.interval import Interval
 from ..private_names import with_high_cutoff
@@ -64,8 +66,24 @@ def split(model: Any, train: Any) -> tuple[Any, Any]:
                 raise ModelError("this system has no networks: say what to train, train=['component.parameter', …]")
         if isinstance(train, str):
             train = (train,)
-        return model.partition(*train)
+        trainable, frozen = model.partition(*train)
+        _warn_of_unused(trainable)
+        return trainable, frozen
     return eqx.partition(model, eqx.is_inexact_array if train is None else train)
+
+
+def _warn_of_unused(trainable: AcausalSystem) -> None:
+    """A loss may read such a parameter itself, so this is no error."""
+    table = trainable.parameters.table
+    free = trainable.parameters.free_index if trainable.parameters.free is not None else ()
+    unused = [table.names[k] for k in unused_parameters(trainable.plan.flat) if k in free]
+    if unused:
+        warnings.warn(
+            f"train: nothing in the model reads {listed(unused, 12)}, so no trajectory depends on it: was the number "
+            "used in an equation, instead of what self.parameter(...) returns?",
+            RuntimeWarning,
+            stacklevel=4,
+        )
 
 
 def _merged(model: Any) -> Any:
@@ -135,7 +153,8 @@ def fit(
     **Returns:**
 
     A `Fit`. If the loss or its gradient is not finite, the run stops with a `RuntimeWarning`, which says why where a
-    simulation inside fails, and the best iterate so far is returned.
+    simulation inside fails, and the best iterate so far is returned. Another one names trained parameters that nothing
+    in the model reads.
 
     **Raises:**
 
@@ -238,7 +257,8 @@ def fit_least_squares(
     **Returns:**
 
     A `Fit` whose `history` has the first and the last value of ½ Σ residuals². Its `message` says whether
-    the steps sufficed. If no better point was found, a `RuntimeWarning` says so.
+    the steps sufficed. If no better point was found, a `RuntimeWarning` says so; another one names trained parameters
+    that nothing in the model reads.
 
     **Raises:**
 

@@ -64,6 +64,30 @@ def test_by_default_a_systems_networks_are_trained():
     assert result.history[-1] < result.history[0]
 
 
+class Forgotten(Component):
+    """der(x) = −k·x with the number in the place of the parameter."""
+
+    def __init__(self, ev, name, k=2.0):
+        super().__init__(ev, name)
+        self.parameter("k", k)
+        x = self.variable("x", start=1.0, fixed=True)
+        self.add_equations(Eq(der(x), -k * x))
+
+
+@pytest.mark.parametrize("how", ["gradient", "least squares"])
+def test_training_what_nothing_reads_warns(how):
+    system = compiled(Forgotten(EqnEnv(), "c"))
+
+    def residual(system):
+        return system.vector_field(0.0, jnp.array([1.0])) + 1.0
+
+    with pytest.warns(RuntimeWarning, match=r"nothing in the model reads 'c\.k'.*instead of what self\.parameter"):
+        if how == "gradient":
+            fit(system, lambda s: jnp.sum(residual(s) ** 2), optax.sgd(0.1), 1, train=["c.k"], progress=False)
+        else:
+            fit_least_squares(system, residual, train=["c.k"])
+
+
 # --- least squares ------------------------------------------------------------------------------------------------
 
 
