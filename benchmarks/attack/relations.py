@@ -6,6 +6,7 @@ Relations stand in rates, in series of blocks, in implicit laws and in arrays of
 it is `written` in a model, and `solved`, with a symbol r that is 1 or 0 in the place of each relation.
 """
 
+import copy
 import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -62,6 +63,9 @@ class Cell(Component):
         self.add_equations(der(x) + decay * x - slope * Max(x - kink, 0) - sin(pace * ev.t))
 
 
+SHARED = ("rng", "label", "end")
+
+
 @dataclasses.dataclass
 class Draft:
     """A model while it is drawn; `label` gives a name that is not taken."""
@@ -78,6 +82,11 @@ class Draft:
     bounds: list[tuple[Expr, float, float]] = dataclasses.field(default_factory=list)  # within which a law is as solved
     cells: dict[str, list[float]] = dataclasses.field(default_factory=dict)
     ranges: dict[Symbol, tuple[float, float]] = dataclasses.field(default_factory=dict)  # of parameters
+
+    def copy(self) -> "Draft":
+        """The same, to be drawn on with by itself."""
+        own = {f.name: copy.copy(getattr(self, f.name)) for f in dataclasses.fields(self) if f.name not in SHARED}
+        return dataclasses.replace(self, **own)
 
     def any(self, choices):
         choices = list(choices)
@@ -236,8 +245,8 @@ def _cells(rng: np.random.Generator, n: int) -> dict[str, list[float]]:
 LAWS = (_of_time, lambda d: _of_state(d, _signal(d)), lambda d: _of_state(d, _signal(d)), _stairs, _implicit, _series)
 
 
-def _draw(rng: np.random.Generator, many: bool) -> Draft:
-    label = iter(names(rng, 200))
+def _draw(rng: np.random.Generator, laws: int) -> Draft:
+    label = iter(names(rng, 400))
     d = Draft(rng, round(float(rng.uniform(2, 6)), 3), lambda: next(label))
     for _ in range(int(rng.integers(1, 4))):
         x, decay = d.state(), d.number(0.3, 1.5)
@@ -248,12 +257,36 @@ def _draw(rng: np.random.Generator, many: bool) -> Draft:
             d.push(x, Law(v, v))
         drive = d.number(0.5, 1.2) * sin(d.number(0.5, 3.0) * T + d.number(0, 6))
         d.push(x, Law(drive, drive))
-    for _ in range(int(rng.integers(3, 10) if many else rng.integers(1, 4))):
-        law = d.any(LAWS)(d)
-        gain = d.number(-0.8, 0.8)
-        d.push(d.any(d.states), Law(gain * law.written, gain * law.solved))
+    for _ in range(laws):
+        _add(d)
     if rng.random() < 0.25:
-        d.cells = _cells(rng, int(rng.integers(2, 6 if many else 4)))
+        d.cells = _cells(rng, int(rng.integers(2, 4)))
+    return d
+
+
+def _add(d: Draft) -> None:
+    """One more law in the rate of a state."""
+    law = d.any(LAWS)(d)
+    gain = d.number(-0.8, 0.8)
+    d.push(d.any(d.states), Law(gain * law.written, gain * law.solved))
+
+
+def _grown(rng: np.random.Generator) -> Draft:
+    """More relations than MOST, one law after the other: of many at once, two nearly always turn at one instant.
+    Raises `Delicate` where the first one is."""
+    most = int(rng.integers(MOST + 1, MANY + 1))
+    d = _draw(rng, 1)
+    _course(rng, d, 1)
+    for _ in range(2 * MANY):
+        more = d.copy()
+        _add(more)
+        if len(more.relations) + len(more.cells.get("a", ())) > most:
+            break
+        try:
+            _course(rng, more, 1)
+        except Delicate:
+            continue
+        d = more
     return d
 
 
@@ -299,7 +332,10 @@ def make(seed: int, variants: int = 0) -> Case:
     rng = np.random.default_rng([seed, 12])
     differentiated, many = bool(seed % 2), seed % 6 == 0
     while True:
-        d = _draw(rng, many)
+        try:
+            d = _grown(rng) if many else _draw(rng, int(rng.integers(1, 4)))
+        except Delicate:
+            continue
         cells, most = len(d.cells.get("a", ())), SMALL if differentiated else MANY if many else MOST
         if not (MOST if many else 0) < len(d.relations) + cells <= most:
             continue

@@ -313,14 +313,14 @@ def _course(rng: np.random.Generator, train: Train) -> tuple[np.ndarray, Any]:
 
 
 def _source(written: bool, ev: EqnEnv, label: Any, table: tuple[list[float], list[float]]) -> tuple[Any, list, list]:
-    """A port, the parts behind it, and their connections: a table as a component of its own or from the library."""
+    """A port, the parts behind it, and their connections: a table as equations of its own or from the library."""
     ts, values = table
     if written:
         part = Table(ev, next(label), ts, values)
         return part.y, [part], []
     now = Now(ev, next(label))
     xs, ys = [-1.0, *ts, 100.0], [values[0], *values, values[-1]]
-    part = signal.Table1D(ev, next(label), xs, ys)
+    part = signal.Table1D(ev, next(label), xs, ys, events=True)
     return part.y, [now, part], [[now.y, part.u]]
 
 

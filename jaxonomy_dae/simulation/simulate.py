@@ -199,7 +199,8 @@ def simulate(
     if switches:
         stiff = bool(outcome.is_stiff)
         if outcome.result == diffrax.RESULTS.max_steps_reached:
-            decay = decay_at(term_of(system, implicit=False), inputs, *outcome.last)
+            there = system if outcome.held is None else system.holding(outcome.held)
+            decay = decay_at(term_of(there, implicit=False), inputs, *outcome.last)
             stiff = is_stiff(decay, float(t1 - outcome.last[0]), max_steps)
         if stiff:
             found = f"stiff: stability limits explicit steps from t={float(outcome.last[0]):.3g} on"
