@@ -10,7 +10,7 @@ import os
 import sys
 import time
 
-from .draws import FAMILIES, NETWORKS, PUBLISHED, UNITS, Draw, draws
+from .draws import FAMILIES, NETWORKS, PUBLISHED, SWITCHING, UNITS, Draw, draws
 from .outcome import GOOD, HEAD, row
 from .timed import attack
 
@@ -58,6 +58,11 @@ def arguments(given: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--seed", type=natural, help="default: from the clock, with --minutes; else 0")
     parser.add_argument("--count", type=natural, default=100, help="models of each family, without --minutes")
     parser.add_argument("--moving", type=natural, default=0, help="integrate every so many-th model too (0: none)")
+    parser.add_argument(
+        "--variants", type=natural, default=0,
+        help=f"of each model, so many with other numbers, by the same programs: {', '.join(SWITCHING)}",
+    )  # fmt: skip
+    parser.add_argument("--refusals", action="store_true", help="show what is refused, too")
     parser.add_argument("--units", choices=UNITS, default="", help="rescale the models first")
     out = parser.parse_args(given)
     if out.family is None or set(out.family) == set(FAMILIES):
@@ -65,6 +70,8 @@ def arguments(given: list[str] | None = None) -> argparse.Namespace:
     if out.units and out.minutes is not None:
         parser.error("with --minutes, every family is rescaled, too: leave --units out")
     for name in out.family:
+        if out.variants and (name not in SWITCHING or out.minutes is not None):
+            parser.error(f"--variants is for {', '.join(SWITCHING)}, without --minutes")
         if out.units and name not in (*NETWORKS, PUBLISHED):
             parser.error(f"the family '{name}' cannot be rescaled")
     if out.seed is None:
@@ -81,18 +88,25 @@ def counted(family: str, given: argparse.Namespace) -> bool:
     from .judge import drop_programs
     from .timed import KEPT
 
-    outcomes = []
+    outcomes, others = [], []
     for k in range(given.count):
         seed = given.seed + k
-        draw = Draw(family, seed, given.units, bool(given.moving) and seed % given.moving == 0)
-        note, outcome = draw.judged()
-        outcomes.append((seed, outcome))
-        if outcome.kind not in GOOD:
-            print(f"  {outcome.kind}: {draw.row} {seed} ({note}): {outcome.text[:400]}", flush=True)
+        draw = Draw(family, seed, given.units, bool(given.moving) and seed % given.moving == 0, given.variants)
+        note, found = draw.judged()
+        outcomes.append((seed, found[0]))
+        others += [(seed, outcome) for outcome in found[1:]]
+        for j, outcome in enumerate(found):
+            if outcome.kind not in GOOD:
+                which = f", variant {j}" if j else ""
+                print(f"  {outcome.kind}: {draw.row} {seed}{which} ({note}): {outcome.text[:400]}", flush=True)
+            elif given.refusals and outcome.kind == "refused":
+                print(f"  refused: {draw.row} {seed} ({note}): {outcome.text[:400]}", flush=True)
         if k % KEPT == KEPT - 1:
             drop_programs()
     print(row(draw.row, outcomes), flush=True)
-    return all(outcome.kind in GOOD for _, outcome in outcomes)
+    if others:
+        print(row(f"{draw.row}, variants", others), flush=True)
+    return all(outcome.kind in GOOD for _, outcome in [*outcomes, *others])
 
 
 def main() -> int:

@@ -33,6 +33,7 @@ class Case:
     - `motion`: a true trajectory; integrated if asked for, or if the case `always_moves`. `slopes`: derivatives of a
         functional of it.
     - `may_refuse`: what an error may truly say of a model that has a solution, but asks for more than is promised.
+    - `variants`: the same equations with other numbers, for `with_parameters`.
     """
 
     ev: EqnEnv
@@ -47,6 +48,7 @@ class Case:
     always_moves: bool = False
     t0: float = 0.0
     may_refuse: Sequence[str] = ()
+    variants: "Sequence[Variant]" = ()
     note: str = ""
 
 
@@ -66,13 +68,41 @@ class Motion:
 @dataclasses.dataclass(frozen=True)
 class Slopes:
     """The true derivatives of Σ weights[name]·values(name) over the motion's times: by `parameters` and by the values
-    `initial` of the case, by name; by all weights of the networks in `learned`, by their number."""
+    `initial` of the case, by name; by all weights of the networks in `learned`, by their number. Taken in reverse mode,
+    and `forward` as well."""
 
     weights: Mapping[str, np.ndarray]
     value: Expected
     parameters: Mapping[str, Expected]
     initial: Mapping[str, Expected]
     learned: Mapping[str, Sequence[Expected]] = dataclasses.field(default_factory=dict)
+    forward: bool = True
+
+
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """Other numbers for the equations of a case: parameters by name, what is given at the start, and what comes out,
+    with as many times and the same names as in the case."""
+
+    parameters: Mapping[str, float]
+    initial: Mapping[str, float]
+    motion: Motion
+    slopes: "Slopes | None" = None
+
+
+def numbers_of(parts: Sequence[Component]) -> dict[str, float]:
+    """The parameters of components by name, without starts of discrete variables and what follows from others."""
+    return {
+        f"{part.name}.{p.name}": float(p.value)
+        for part in parts
+        for p in part.parameters.values()
+        if not p.is_discrete and isinstance(p.value, int | float)
+    }
+
+
+def varied(rng: np.random.Generator, value: float) -> float:
+    """The value multiplied by 10 to the power of ±1/4 at most."""
+    return value * log_uniform(rng, -0.25, 0.25)
 
 
 def diagram_of(rng: np.random.Generator, parts: Sequence[Component], nodes: Sequence[Sequence[Any]]) -> AcausalDiagram:

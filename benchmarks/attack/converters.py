@@ -15,13 +15,14 @@ from scipy.linalg import expm
 from jaxonomy_dae import EqnEnv
 from jaxonomy_dae.library import electrical, signal
 
-from .case import Case, Motion, diagram_of, log_uniform, names
+from .case import Case, Motion, Variant, diagram_of, log_uniform, names, numbers_of, varied
 
 TRAJECTORY = 50e-6  # of a variable's size, at the default tolerances: fifty times rtol
 GRID = 400  # points of the shortest period at which diodes are looked at
 ZERO = 1e-9  # of a margin's size
 SINGULAR = 1e-15  # smallest singular value of an equilibrated matrix beside the largest
 STATES = ("C", "L")
+TRIED = 20  # other numbers, until the reference can decide what happens
 
 
 class Delicate(Exception):
@@ -235,28 +236,86 @@ def _converter(rng: np.random.Generator, leak: bool) -> tuple[list[Element], flo
     return [source, *middle, Element("C", 3, 0, (capacity,)), Element("R", 3, 0, (load,))], period
 
 
-def make(seed: int) -> Case:
+def _other(rng: np.random.Generator, e: Element, clock: float) -> Element:
+    """The element with other numbers; what is zero stays so, and clocks go slower by one factor."""
+    numbers = tuple(varied(rng, v) for v in e.numbers)
+    if e.kind == "V":
+        numbers = (*numbers[:2], e.numbers[2] / clock, e.numbers[3] and float(rng.uniform(-3, 3)))
+    if e.kind == "S":
+        numbers = (*numbers[:2], e.numbers[2] * clock, float(rng.uniform(0.25, 0.75)))
+    return dataclasses.replace(e, numbers=numbers)
+
+
+def make(seed: int, variants: int = 0) -> Case:
     """A rectifier or a converter over some periods; one in four without leaks, where that has a solution."""
     rng = np.random.default_rng([seed, 31])
     for attempt in itertools.count():
         leak = bool(rng.random() < 0.75) or attempt > 3
         is_rectifier = rng.random() < 0.5
         elements, period = (_rectifier if is_rectifier else _converter)(rng, leak)
-        circuit = Circuit(elements)
-        starts = {k: 0.1 * float(rng.normal()) for k in circuit.states if elements[k].kind == "C"}
-        starts |= {k: 0.0 for k in circuit.states if elements[k].kind == "L"}
-        ts = np.sort(rng.uniform(0.2, 1.0, 6)) * period * (4 if is_rectifier else 8)
-        try:
-            values = circuit.run(starts, ts, period / GRID)
-        except Delicate:
-            continue
-        if np.isfinite(values).all():
-            return _case(rng, circuit, starts, ts, values)
-    raise AssertionError
+        found = _course(rng, Circuit(elements), period, is_rectifier)
+        if found is not None:
+            break
+    ev, diagram, _, label = _built([seed, 32], elements)
+    others: list[Variant] = []
+    for k in range(TRIED * variants):
+        if len(others) == variants:
+            break
+        numbers = np.random.default_rng([seed, 31, k])
+        clock = varied(numbers, 1.0)
+        circuit = Circuit([_other(numbers, e, clock) for e in elements])
+        course = _course(numbers, circuit, period * clock, is_rectifier)
+        if course is not None:
+            _, _, again, _ = _built([seed, 32], circuit.elements)
+            motion, starts = _motion(circuit, label, *course)
+            others.append(Variant(numbers_of(again), starts, motion))
+    circuit = Circuit(elements)
+    motion, starts = _motion(circuit, label, *found)
+    leaks = sorted({e.numbers[1] for e in elements if e.kind in "DS"})
+    return Case(
+        ev, diagram, starts, {}, motion=motion, always_moves=True, may_refuse=("Goff",) if 0.0 in leaks else (),
+        variants=others, note=f"{len(circuit.diodes)} diodes, {len(circuit.switches)} switches, leaks {leaks}",
+    )  # fmt: skip
 
 
-def _case(rng: np.random.Generator, circuit: Circuit, starts: dict[int, float], ts: np.ndarray, values: Any) -> Case:
-    ev, elements = EqnEnv(), circuit.elements
+def _course(rng: np.random.Generator, circuit: Circuit, period: float, is_rectifier: bool) -> Any:
+    """Starts, times and values; None if the reference cannot decide."""
+    kinds = {k: circuit.elements[k].kind for k in circuit.states}
+    starts = {k: 0.1 * float(rng.normal()) for k in circuit.states if kinds[k] == "C"}
+    starts |= {k: 0.0 for k in circuit.states if kinds[k] == "L"}
+    ts = np.sort(rng.uniform(0.2, 1.0, 6)) * period * (4 if is_rectifier else 8)
+    try:
+        values = circuit.run(starts, ts, period / GRID)
+    except Delicate:
+        return None
+    return (starts, ts, values) if np.isfinite(values).all() else None
+
+
+def _which(circuit: Circuit, label: list[str]) -> dict[int, str]:
+    """The names of the states by element."""
+    return {k: f"{label[k]}.{'v' if circuit.elements[k].kind == 'C' else 'i'}" for k in circuit.states}
+
+
+def _motion(
+    circuit: Circuit, label: list[str], starts: dict[int, float], ts: np.ndarray, values: Any
+) -> tuple[Motion, dict[str, float]]:
+    """The trajectory with what it may be off by, and the starts by name."""
+    elements, which = circuit.elements, _which(circuit, label)
+    rows = {which[k]: values[:, place] for place, k in enumerate(circuit.states)}
+    # A current that a diode keeps at zero has the size of those that flow elsewhere.
+    sizes = {kind: max((np.abs(rows[which[k]]).max() for k in which if elements[k].kind == kind), default=0.0)
+             for kind in STATES}  # fmt: skip
+    volts = max(sizes["C"], *(sum(map(abs, elements[k].numbers[:2])) for k in circuit.sources))
+    resistance = max(e.numbers[0] for e in elements if e.kind == "R")
+    least = {"C": volts, "L": max(sizes["L"], volts / resistance)}
+    motion = Motion(ts, rows, {which[k]: TRAJECTORY * least[elements[k].kind] for k in which}, rtol=1e-6, atol=1e-9)
+    return motion, {which[k]: v for k, v in starts.items()}
+
+
+def _built(seed: list[int], elements: list[Element]) -> tuple[EqnEnv, Any, list[Any], list[str]]:
+    """The model, its parts, and their names by element."""
+    rng = np.random.default_rng(seed)
+    ev, circuit = EqnEnv(), Circuit(elements)
     label = names(rng, len(elements) + 1 + len(circuit.switches))
     ground = electrical.Ground(ev, label[-1])
     parts: list[Any] = [ground]
@@ -281,18 +340,4 @@ def _case(rng: np.random.Generator, circuit: Circuit, starts: dict[int, float], 
         parts.append(part)
         nodes[e.a].append(part.p)
         nodes[e.b].append(part.n)
-    which = {k: f"{label[k]}.{'v' if elements[k].kind == 'C' else 'i'}" for k in circuit.states}
-    rows = {which[k]: values[:, place] for place, k in enumerate(circuit.states)}
-    # A current that a diode keeps at zero has the size of those that flow elsewhere.
-    sizes = {kind: max((np.abs(rows[which[k]]).max() for k in which if elements[k].kind == kind), default=0.0)
-             for kind in STATES}  # fmt: skip
-    volts = max(sizes["C"], *(sum(map(abs, elements[k].numbers[:2])) for k in circuit.sources))
-    resistance = max(e.numbers[0] for e in elements if e.kind == "R")
-    least = {"C": volts, "L": max(sizes["L"], volts / resistance)}
-    motion = Motion(ts, rows, {which[k]: TRAJECTORY * least[elements[k].kind] for k in which}, rtol=1e-6, atol=1e-9)
-    leaks = sorted({e.numbers[1] for e in elements if e.kind in "DS"})
-    return Case(
-        ev, diagram_of(rng, parts, [*nodes, *wires]), {which[k]: v for k, v in starts.items()}, {}, motion=motion,
-        always_moves=True, may_refuse=("Goff",) if 0.0 in leaks else (),
-        note=f"{len(circuit.diodes)} diodes, {len(circuit.switches)} switches, leaks {leaks}",
-    )  # fmt: skip
+    return ev, diagram_of(rng, parts, [*nodes, *wires]), parts, label

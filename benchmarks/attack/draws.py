@@ -8,7 +8,8 @@ from collections.abc import Iterator, Sequence
 from .outcome import Outcome
 
 NETWORKS = ("resistors", "circuits", "rods", "gears", "thermal", "pipes", "mechanisms", "descriptors")
-FAMILIES = (*NETWORKS, "events", "relations", "converters", "drives", "shafts", "gradients")
+SWITCHING = ("relations", "converters", "drives", "shafts")  # families with variants of their parameters
+FAMILIES = (*NETWORKS, "events", *SWITCHING, "gradients")
 UNITS = ("equations", "parameters", "units", "all")  # what is rescaled: `benchmarks/rescaling.py`
 PUBLISHED = "published"  # problems that are their own references, in other units
 
@@ -18,12 +19,14 @@ MOVING = 4  # every so many-th model of a family is integrated as well
 
 @dataclasses.dataclass(frozen=True)
 class Draw:
-    """The model of a family with a seed, in other `units` unless that is empty; integrated as well if `moving`."""
+    """The model of a family with a seed, in other `units` unless that is empty; integrated as well if `moving`; with so
+    many `variants`."""
 
     family: str
     seed: int
     units: str = ""
     moving: bool = False
+    variants: int = 0
 
     @property
     def row(self) -> str:
@@ -34,19 +37,23 @@ class Draw:
     def command(self) -> str:
         """What shows it again."""
         units = f" --units {self.units}" if self.units else ""
-        moving = " --moving 1" if self.moving else ""
-        return f"python -m benchmarks.attack --family {self.family}{units} --seed {self.seed} --count 1{moving}"
+        more = " --moving 1" if self.moving else ""
+        more += f" --variants {self.variants}" if self.variants else ""
+        return f"python -m benchmarks.attack --family {self.family}{units} --seed {self.seed} --count 1{more}"
 
-    def judged(self) -> tuple[str, Outcome]:
-        """What model it is, and what became of it. What goes wrong while it is drawn counts as well."""
+    def judged(self) -> tuple[str, list[Outcome]]:
+        """What model it is, and what became of it and of its variants. What goes wrong while it is drawn counts as
+        well."""
         from . import rescaled  # these import JAX, which the process that only counts does without
         from .judge import judge
 
         make = importlib.import_module(f".{self.family}", __package__).make
         try:
-            case = rescaled.family(make, self.units)(self.seed) if self.units else make(self.seed)
+            if self.units:
+                make = rescaled.family(make, self.units)
+            case = make(self.seed, variants=self.variants) if self.variants else make(self.seed)
         except Exception as error:
-            return "", Outcome("crashed", float("inf"), f"when drawn: {type(error).__name__}: {error}", 0.0)
+            return "", [Outcome("crashed", float("inf"), f"when drawn: {type(error).__name__}: {error}", 0.0)]
         return case.note, judge(case, self.moving)
 
 

@@ -1,6 +1,7 @@
 """Masses in a row with springs, dry friction that sticks and elastic stops, moved by ramps or a sine, against SciPy's
 DOP853 stopped and started anew wherever a mode changes."""
 
+import copy
 from collections.abc import Callable
 from typing import Any
 
@@ -10,10 +11,11 @@ from jaxonomy_dae import EqnEnv
 from jaxonomy_dae.library import signal, translational
 from jaxonomy_dae.library.friction import StickingFriction
 
-from .case import Case, Motion, diagram_of, log_uniform, names
+from .case import Case, Motion, Variant, diagram_of, log_uniform, names, numbers_of, varied
 from .pieces import CLOSE, Delicate, in_pieces
 
 TRAJECTORY = 50e-6  # of a variable's size, at the default tolerances: fifty times rtol
+TRIED = 20  # other numbers, until the reference can decide what happens
 
 
 class Row:
@@ -45,7 +47,25 @@ class Row:
                 )
         else:
             self.sine = log_uniform(rng, 0, 1), log_uniform(rng, -0.5, 0.5), float(rng.uniform(-3, 3))
+        self._turn()
+
+    def _turn(self) -> None:
         self.corners = sorted(t for _, d, s in self.ramps for t in (s, s + d) if t < self.end)
+
+    def other(self, rng: np.random.Generator) -> "Row":
+        """The same parts with other numbers."""
+        out = copy.copy(self)
+        out.masses = [varied(rng, m) for m in self.masses]
+        out.springs = [(varied(rng, k), varied(rng, d), length) for k, d, length in self.springs]
+        out.starts = [(0.3 * float(rng.normal()), float(rng.normal())) for _ in self.starts]
+        out.friction = [own and (f * own[0], f * own[1]) for own in self.friction if (f := varied(rng, 1.0))]
+        out.stops = {k: (varied(rng, K), varied(rng, d), varied(rng, at)) for k, (K, d, at) in self.stops.items()}
+        out.ramps = [(varied(rng, h), varied(rng, d), varied(rng, start)) for h, d, start in self.ramps]
+        if self.sine:
+            amplitude, f, _ = self.sine
+            out.sine = varied(rng, amplitude), varied(rng, f), float(rng.uniform(-3, 3))
+        out._turn()
+        return out
 
     def force(self, t: float) -> float:
         if self.sine:
@@ -138,21 +158,53 @@ class Row:
         return in_pieces(self.slopes, self.guards, y, modes, ts, self.corners, self.end)[0]
 
 
-def make(seed: int) -> Case:
+def make(seed: int, variants: int = 0) -> Case:
     """A drive over some seconds."""
     rng = np.random.default_rng([seed, 37])
     while True:
         row = Row(rng)
-        ts = np.sort(rng.uniform(0.1, 1.0, 6)) * row.end
-        try:
-            values = row.run(ts)
-        except Delicate:
-            continue
-        if np.isfinite(values).all():
-            return _case(rng, row, ts, values)
+        ts, values = _course(rng, row)
+        if values is not None:
+            break
+    ev, diagram, parts, which = _built([seed, 38], row)
+    others: list[Variant] = []
+    for k in range(TRIED * variants):
+        if len(others) == variants:
+            break
+        numbers = np.random.default_rng([seed, 37, k])
+        other = row.other(numbers)
+        then, found = _course(numbers, other)
+        if found is not None:
+            _, _, again, _ = _built([seed, 38], other)
+            others.append(Variant(numbers_of(again), {}, motion_of(which, then, found)))
+    return Case(
+        ev, diagram, {}, {}, motion=motion_of(which, ts, values), always_moves=True, variants=others,
+        note=f"{len(row.masses)} masses, {sum(own is not None for own in row.friction)} stick, {len(row.stops)} stops, "
+        f"{'a sine' if row.sine else 'ramps'}",
+    )  # fmt: skip
 
 
-def _case(rng: np.random.Generator, row: Row, ts: np.ndarray, values: np.ndarray) -> Case:
+def _course(rng: np.random.Generator, row: Row) -> tuple[np.ndarray, Any]:
+    """Times and values there; None if the reference cannot decide."""
+    ts = np.sort(rng.uniform(0.1, 1.0, 6)) * row.end
+    try:
+        values = row.run(ts)
+    except Delicate:
+        return ts, None
+    return ts, values if np.isfinite(values).all() else None
+
+
+def motion_of(which: list[str], ts: np.ndarray, values: np.ndarray) -> Motion:
+    """By positions, then speeds."""
+    n = len(which) // 2
+    sizes = [max(np.abs(values[:, :n]).max(), 0.1)] * n + [max(np.abs(values[:, n:]).max(), 0.1)] * n
+    allowed = {name: TRAJECTORY * size for name, size in zip(which, sizes, strict=True)}
+    return Motion(ts, dict(zip(which, values.T, strict=True)), allowed, rtol=1e-6, atol=1e-9)
+
+
+def _built(seed: list[int], row: Row) -> tuple[EqnEnv, Any, list[Any], list[str]]:
+    """The model, its parts, and the names of positions and speeds."""
+    rng = np.random.default_rng(seed)
     ev, n = EqnEnv(), len(row.masses)
     label = iter(names(rng, 4 * n + 8))
     ground = translational.FixedPosition(ev, next(label))
@@ -183,13 +235,4 @@ def _case(rng: np.random.Generator, row: Row, ts: np.ndarray, values: np.ndarray
         drive, wires = [one, two, both], [[one.y, both.u1], [two.y, both.u2], [both.y, force.f]]
     parts += [force, *drive]
     which = [f"{m.name}.{x}" for x in "sv" for m in masses]
-    sizes = [max(np.abs(values[:, :n]).max(), 0.1)] * n + [max(np.abs(values[:, n:]).max(), 0.1)] * n
-    motion = Motion(
-        ts, dict(zip(which, values.T, strict=True)),
-        {name: TRAJECTORY * size for name, size in zip(which, sizes, strict=True)}, rtol=1e-6, atol=1e-9,
-    )  # fmt: skip
-    return Case(
-        ev, diagram_of(rng, parts, [floor, *at, *wires]), {}, {}, motion=motion, always_moves=True,
-        note=f"{n} masses, {sum(own is not None for own in row.friction)} stick, {len(row.stops)} stops, "
-        f"{'a sine' if row.sine else 'ramps'}",
-    )  # fmt: skip
+    return ev, diagram_of(rng, parts, [floor, *at, *wires]), parts, which

@@ -9,6 +9,7 @@ agree: such a system is `Delicate`, and not judged.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -24,6 +25,8 @@ APART = 0.01  # between two instants
 CROSSING = 0.05  # a condition's rate, at least
 NEAR = 1e-3  # a condition that comes so close and turns back may have been reached
 MOST = 40  # instants
+LARGE = 1e3  # a state
+EVALUATIONS = 3_000  # of the rates between two instants
 AMPLIFIED = 100.0  # what a change of the starts may grow by
 
 
@@ -172,8 +175,15 @@ class Reference:
 
             event.terminal, event.direction = True, direction[k]
             watched.append((k, event))
+        evaluations = itertools.count()
+
+        def rates(t, x):
+            if not np.all(np.abs(x) < LARGE) or next(evaluations) > EVALUATIONS:
+                raise Delicate("it grows without bounds, or is stiff")
+            return self.rates(t, x, q, r)
+
         solution = scipy.integrate.solve_ivp(
-            lambda t, x: self.rates(t, x, q, r), (t, stop), x, events=[e for _, e in watched], dense_output=True,
+            rates, (t, stop), x, events=[e for _, e in watched], dense_output=True,
             max_step=max((stop - t) / 5, 1e-3), **TIGHT,
         )  # fmt: skip
         if solution.status < 0 or not np.all(np.abs(solution.y[:, -1]) < 1e2):

@@ -10,7 +10,8 @@ from scipy.integrate import solve_ivp
 CLOSE = 1e-7  # of the forces: what is so near to its limit is decided by rounding
 MOST = 200  # changes of mode
 TIGHT: dict[str, Any] = {"rtol": 1e-11, "atol": 1e-13}
-LONGEST = 0.02  # s: a step, so that no guard falls and rises again within one
+LONGEST = 0.02  # s: a step, so that a guard seldom falls and rises again within one
+MISSED = 1e-9  # what a guard may be below zero by while its mode holds
 
 
 class Delicate(Exception):
@@ -36,7 +37,7 @@ def in_pieces(
     - `corners`: times at which slopes are not smooth.
     - `changed`: called after a change.
 
-    **Raises:** `Delicate` where two modes change at once, or many.
+    **Raises:** `Delicate` where two modes change at once, or many, or where SciPy has missed one.
     """
     out, t, changes = np.zeros((len(ts), len(y))), 0.0, 0
     bounds = itertools.chain(corners, [end])
@@ -55,6 +56,9 @@ def in_pieces(
             lambda t, y, frozen=frozen: slopes(t, y, frozen), (t, edge), y, method="DOP853", events=events,
             dense_output=True, max_step=LONGEST, **TIGHT,
         )  # fmt: skip
+        looks = np.concatenate([found.t[1:-1], (found.t[1:] + found.t[:-1]) / 2])
+        if any(guard(at, found.sol(at)) < -MISSED for at in looks for guard, _ in pairs):
+            raise Delicate("a guard fell and rose within a step, or in the first step after a change")
         inside = (ts >= t) & (ts <= found.t[-1])
         if inside.any():
             out[inside] = found.sol(ts[inside]).T

@@ -1,10 +1,12 @@
-"""Models with one to six relations of time and state inside their equations, against SciPy's DOP853 stopped and started
-anew wherever one turns, at the default tolerances; every other model its derivatives against extrapolated differences.
+"""Models with one to twenty relations of time and state inside their equations, against SciPy's DOP853 stopped and
+started anew wherever one turns, at the default tolerances; every other model its derivatives against extrapolated
+differences.
 
 Relations stand in rates, in series of blocks, in implicit laws and in arrays of components. Each law is drawn twice: as
 it is `written` in a model, and `solved`, with a symbol r that is 1 or 0 in the place of each relation.
 """
 
+import copy
 import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -15,16 +17,19 @@ from sympy import Abs, And, Expr, Float, Heaviside, Max, Min, Mod, Piecewise, Sy
 
 from jaxonomy_dae import AcausalDiagram, Component, EqnEnv, der
 
-from .case import Case, Expected, Motion, Slopes, names
+from .case import Case, Expected, Motion, Slopes, Variant, names
 from .hybrid import APART, Delicate, HybridSystem, Reference, T
 
 MOST = 6  # relations
-SMALL = 3  # states and relations of what is differentiated: three programs are compiled, in 30 s
+MANY = 20  # relations of every sixth model
+SMALL = 3  # states and relations of what is differentiated
+TRIED = 30  # other numbers, until the reference can decide what happens
 TRAJECTORY = 50e-6  # of a variable's size, at the default tolerances: fifty times rtol
 DERIVATIVE = 1e-6  # of the largest derivative, each multiplied by the size of its parameter
 STEP = 5e-4  # relative; the error of extrapolated differences is of its fourth power
 GROWN = 10.0  # what a change of the starts may grow by: more is not within fifty tolerances
 NUDGE = 1e-6
+COUNT = 8  # times
 
 
 class Law(NamedTuple):
@@ -58,6 +63,9 @@ class Cell(Component):
         self.add_equations(der(x) + decay * x - slope * Max(x - kink, 0) - sin(pace * ev.t))
 
 
+SHARED = ("rng", "label", "end")
+
+
 @dataclasses.dataclass
 class Draft:
     """A model while it is drawn; `label` gives a name that is not taken."""
@@ -73,6 +81,12 @@ class Draft:
     relations: dict[Symbol, Expr] = dataclasses.field(default_factory=dict)
     bounds: list[tuple[Expr, float, float]] = dataclasses.field(default_factory=list)  # within which a law is as solved
     cells: dict[str, list[float]] = dataclasses.field(default_factory=dict)
+    ranges: dict[Symbol, tuple[float, float]] = dataclasses.field(default_factory=dict)  # of parameters
+
+    def copy(self) -> "Draft":
+        """The same, to be drawn on with by itself."""
+        own = {f.name: copy.copy(getattr(self, f.name)) for f in dataclasses.fields(self) if f.name not in SHARED}
+        return dataclasses.replace(self, **own)
 
     def any(self, choices):
         choices = list(choices)
@@ -84,7 +98,7 @@ class Draft:
         if self.rng.random() < 0.3:
             return Float(value)
         p = Symbol(self.label())
-        self.values[p] = value
+        self.values[p], self.ranges[p] = value, (low, high)
         return p
 
     def above(self, u: Any) -> Symbol:
@@ -220,20 +234,19 @@ def _series(d: Draft) -> Law:
     return d.reading(lambda z: z - second.written, second.solved)
 
 
-def _array(d: Draft) -> None:
-    """Two or three cells."""
-    n = int(d.rng.integers(2, 4))
-    d.cells = {
-        k: np.round(d.rng.uniform(low, high, n), 3).tolist()
-        for k, (low, high) in dict(a=(0.5, 1.5), b=(-1.5, 0.4), level=(0.1, 0.5), w=(0.8, 3.0)).items()
-    }
+CELLS = dict(a=(0.5, 1.5), b=(-1.5, 0.4), level=(0.1, 0.5), w=(0.8, 3.0))
+
+
+def _cells(rng: np.random.Generator, n: int) -> dict[str, list[float]]:
+    """What is in an array of n cells."""
+    return {k: np.round(rng.uniform(low, high, n), 3).tolist() for k, (low, high) in CELLS.items()}
 
 
 LAWS = (_of_time, lambda d: _of_state(d, _signal(d)), lambda d: _of_state(d, _signal(d)), _stairs, _implicit, _series)
 
 
-def _draw(rng: np.random.Generator) -> Draft:
-    label = iter(names(rng, 80))
+def _draw(rng: np.random.Generator, laws: int) -> Draft:
+    label = iter(names(rng, 400))
     d = Draft(rng, round(float(rng.uniform(2, 6)), 3), lambda: next(label))
     for _ in range(int(rng.integers(1, 4))):
         x, decay = d.state(), d.number(0.3, 1.5)
@@ -244,12 +257,36 @@ def _draw(rng: np.random.Generator) -> Draft:
             d.push(x, Law(v, v))
         drive = d.number(0.5, 1.2) * sin(d.number(0.5, 3.0) * T + d.number(0, 6))
         d.push(x, Law(drive, drive))
-    for _ in range(int(rng.integers(1, 4))):
-        law = d.any(LAWS)(d)
-        gain = d.number(-0.8, 0.8)
-        d.push(d.any(d.states), Law(gain * law.written, gain * law.solved))
+    for _ in range(laws):
+        _add(d)
     if rng.random() < 0.25:
-        _array(d)
+        d.cells = _cells(rng, int(rng.integers(2, 4)))
+    return d
+
+
+def _add(d: Draft) -> None:
+    """One more law in the rate of a state."""
+    law = d.any(LAWS)(d)
+    gain = d.number(-0.8, 0.8)
+    d.push(d.any(d.states), Law(gain * law.written, gain * law.solved))
+
+
+def _grown(rng: np.random.Generator) -> Draft:
+    """More relations than MOST, one law after the other: of many at once, two nearly always turn at one instant.
+    Raises `Delicate` where the first one is."""
+    most = int(rng.integers(MOST + 1, MANY + 1))
+    d = _draw(rng, 1)
+    _course(rng, d, 1)
+    for _ in range(2 * MANY):
+        more = d.copy()
+        _add(more)
+        if len(more.relations) + len(more.cells.get("a", ())) > most:
+            break
+        try:
+            _course(rng, more, 1)
+        except Delicate:
+            continue
+        d = more
     return d
 
 
@@ -290,30 +327,45 @@ def _solved(d: Draft, values: Mapping[Symbol, float], ts: np.ndarray, starts=Non
     return run.instants, found
 
 
-def make(seed: int) -> Case:
-    """One to six relations; what two methods need not agree about is drawn again."""
+def make(seed: int, variants: int = 0) -> Case:
+    """One to six relations, or up to twenty; what two methods need not agree about is drawn again."""
     rng = np.random.default_rng([seed, 12])
+    differentiated, many = bool(seed % 2), seed % 6 == 0
     while True:
-        d = _draw(rng)
-        cells, differentiated = len(d.cells.get("a", ())), bool(seed % 2)
-        if not 1 <= len(d.relations) + cells <= (SMALL if differentiated else MOST):
+        try:
+            d = _grown(rng) if many else _draw(rng, int(rng.integers(1, 4)))
+        except Delicate:
+            continue
+        cells, most = len(d.cells.get("a", ())), SMALL if differentiated else MANY if many else MOST
+        if not (MOST if many else 0) < len(d.relations) + cells <= most:
             continue
         if differentiated and len(d.states) + cells > SMALL:
             continue
         try:
-            return _case(rng, d, differentiated)
+            return _case(rng, d, differentiated, [seed, 12], variants)
         except Delicate:
             continue
 
 
-def _case(rng: np.random.Generator, d: Draft, differentiated: bool) -> Case:
-    ts = np.sort(rng.uniform(0.05, 1.0, 10)) * d.end
-    ts[-1] = d.end
-    instants, found = _solved(d, d.values, ts)
-    if len(instants) < 2:
-        raise Delicate("nothing turns")
-    keep = np.array([min(abs(t - s) for s in instants) > 0.5 * APART * d.end for t in ts])
-    ts, found = ts[keep], {s: v[keep] for s, v in found.items()}
+class Course(NamedTuple):
+    """What a draft does: the number of its instants, and values and sizes of its variables at times."""
+
+    instants: int
+    ts: np.ndarray
+    found: dict[Symbol, np.ndarray]
+    size: dict[Symbol, float]
+
+
+def _course(rng: np.random.Generator, d: Draft, count: int) -> Course:
+    """At so many random times, none of them an instant. Raises `Delicate`."""
+    instants, _ = _solved(d, d.values, np.array([d.end]))
+    ts = []
+    while len(ts) < count:
+        t = float(rng.uniform(0.05, 1.0)) * d.end if ts else d.end
+        if not ts or min(abs(t - s) for s in instants) > 0.5 * APART * d.end:
+            ts.append(t)
+    ts = np.sort(ts)
+    _, found = _solved(d, d.values, ts)
     system, _ = _reference(d, d.values)
     starts = np.array(list(system.states.values()))
     again, other = _solved(d, d.values, ts, starts + NUDGE * rng.choice([-1.0, 1.0], len(starts)))
@@ -321,44 +373,85 @@ def _case(rng: np.random.Generator, d: Draft, differentiated: bool) -> Case:
     grown = max(float(np.max(np.abs(found[s] - other[s]))) / size[s] for s in found) / NUDGE
     if len(again) != len(instants) or not grown <= GROWN:
         raise Delicate("chaotic")
+    return Course(len(instants), ts, found, size)
+
+
+def _other(rng: np.random.Generator, d: Draft) -> Draft:
+    """The draft with other numbers."""
+    values = {p: round(float(rng.uniform(*d.ranges[p])), 3) for p in d.values}
+    states = {x: round(float(rng.uniform(-1, 1)), 3) for x in d.states}
+    return dataclasses.replace(d, values=values, states=states, cells=_cells(rng, len(d.cells["a"])) if d.cells else {})
+
+
+def _called(s: Symbol) -> str:
+    return s.name if s.name.startswith("cell[") else f"sys.{s.name}"
+
+
+def _motion(course: Course, differentiated: bool) -> Motion:
+    values = {_called(s): v for s, v in course.found.items()}
+    allowed = {_called(s): TRAJECTORY * size for s, size in course.size.items()}
+    return Motion(course.ts, values, allowed, *((1e-9, 1e-11) if differentiated else (1e-6, 1e-8)))
+
+
+def _case(rng: np.random.Generator, d: Draft, differentiated: bool, seed: list[int], variants: int) -> Case:
+    course = _course(rng, d, COUNT)
+    if course.instants < 2:
+        raise Delicate("nothing turns")
     ev, diagram = EqnEnv(), AcausalDiagram()
     diagram.add(Written(ev, "sys", d, rng.permutation(len(d.states) + len(d.equations))))
     if d.cells:
         diagram.add_array(ev, "cell", Cell, len(d.cells["a"]), **{k: np.array(v) for k, v in d.cells.items()})
-    called = {s: s.name if s.name.startswith("cell[") else f"sys.{s.name}" for s in found}
-    values, allowed = {called[s]: v for s, v in found.items()}, {called[s]: TRAJECTORY * size[s] for s in found}
-    motion = Motion(ts, values, allowed, *((1e-9, 1e-11) if differentiated else (1e-6, 1e-8)))
-    slopes = _slopes(rng, d, ts, found, called, len(instants)) if differentiated else None
+    shown = [list(course.found)[k] for k in rng.permutation(len(course.found))[:3]]
+    weights = {s: rng.choice([-1.0, 1.0], COUNT) * rng.uniform(0.3, 1.0, COUNT) for s in shown}
+    by = [list(d.values)[k] for k in rng.permutation(len(d.values))[:4]]
+    differentiated = differentiated and bool(by)
+    slopes = _slopes(d, course, weights, by, seed[0] % 3 == 0) if differentiated else None
+    others: list[Variant] = []
+    for k in range(TRIED * variants):
+        if len(others) == variants:
+            break
+        numbers = np.random.default_rng([*seed, k])
+        other = _other(numbers, d)
+        try:
+            then = _course(numbers, other, COUNT)
+            derivatives = _slopes(other, then, weights, by, False) if differentiated else None
+        except Delicate:
+            continue
+        parameters = {_called(p): v for p, v in other.values.items()}
+        parameters |= {f"cell[{k}].{n}": v for n, vs in other.cells.items() for k, v in enumerate(vs)}
+        initial = {_called(x): v for x, v in other.states.items()}
+        others.append(Variant(parameters, initial, _motion(then, differentiated), derivatives))
     count = len(d.relations) + len(d.cells.get("a", ()))
-    note = f"{len(system.states)} states, {count} relations, {len(instants) - 1} instants"
-    return Case(ev, diagram, {}, {}, motion=motion, slopes=slopes, always_moves=True, note=note)
+    note = f"{len(d.states) + len(d.cells.get('a', ()))} states, {count} relations, {course.instants - 1} instants"
+    initial = {_called(x): v for x, v in d.states.items()}
+    return Case(
+        ev, diagram, initial, {}, motion=_motion(course, differentiated), slopes=slopes, always_moves=True,
+        variants=others, note=note,
+    )  # fmt: skip
 
 
-def _slopes(rng, d: Draft, ts, found, called, instants: int) -> Slopes | None:
-    """Derivatives of a random sum of values at the times, by up to four parameters."""
-    chosen = [list(found)[k] for k in rng.permutation(len(found))[:3]]
-    weights = {s: rng.choice([-1.0, 1.0], len(ts)) * rng.uniform(0.3, 1.0, len(ts)) for s in chosen}
+def _slopes(d: Draft, course: Course, weights: Mapping[Symbol, np.ndarray], by: list[Symbol], forward: bool) -> Slopes:
+    """Derivatives by parameters of the weighted sum of values at the times. Raises `Delicate`."""
 
     def along(values: Mapping[Symbol, float]) -> float:
-        number, at = _solved(d, values, ts)
-        if len(number) != instants:
+        number, at = _solved(d, values, course.ts)
+        if len(number) != course.instants:
             raise Delicate("other instants after a small change")
         return float(sum(np.sum(w * at[s]) for s, w in weights.items()))
 
-    by = {}
-    for p in [list(d.values)[k] for k in rng.permutation(len(d.values))[:4]]:
+    found = {}
+    for p in by:
         h = STEP * max(abs(d.values[p]), 0.1)
         wide, narrow = (
             (along({**d.values, p: d.values[p] + s}) - along({**d.values, p: d.values[p] - s})) / (2 * s)
             for s in (h, h / 2)
         )
-        by[p] = (4 * narrow - wide) / 3
-    if not by:
-        return None
+        found[p] = (4 * narrow - wide) / 3
     sizes = {p: max(abs(d.values[p]), 0.1) for p in by}
     value = along(d.values)
-    terms = sum(float(np.sum(np.abs(w * found[s]))) for s, w in weights.items())
-    size = max(terms, *(abs(v) * sizes[p] for p, v in by.items()))
-    true = {f"sys.{p.name}": Expected(v, DERIVATIVE * size / sizes[p]) for p, v in by.items()}
-    shown = {called[s]: w for s, w in weights.items()}
-    return Slopes(shown, Expected(value, DERIVATIVE * size), true, {})
+    terms = sum(float(np.sum(np.abs(w * course.found[s]))) for s, w in weights.items())
+    size = max(terms, *(abs(v) * sizes[p] for p, v in found.items()))
+    true = {_called(p): Expected(v, DERIVATIVE * size / sizes[p]) for p, v in found.items()}
+    return Slopes(
+        {_called(s): w for s, w in weights.items()}, Expected(value, DERIVATIVE * size), true, {}, forward=forward
+    )

@@ -1,6 +1,7 @@
 """Shafts in a row with elastic couplings, sharp backlash, clutches and a brake, turned and pressed by tables of time,
 against SciPy's DOP853 stopped and started anew wherever a mode changes."""
 
+import copy
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -12,8 +13,8 @@ from jaxonomy_dae.library import rotational, signal
 from jaxonomy_dae.library.friction import Brake, Clutch
 from jaxonomy_dae.modeling import Eq
 
-from .case import Case, Motion, diagram_of, log_uniform, names
-from .drives import TRAJECTORY
+from .case import Case, Variant, diagram_of, log_uniform, names, numbers_of, varied
+from .drives import TRIED, motion_of
 from .pieces import CLOSE, Delicate, in_pieces
 
 STUCK, FREE = 0, 2  # modes of friction, beside 1 and -1
@@ -38,8 +39,10 @@ class Play(Component):
 class Table(Component):
     """y, linear between points in time and constant beyond them, as one writes it."""
 
-    def __init__(self, ev: EqnEnv, name: str, ts: Sequence[float], values: Sequence[float]):
+    def __init__(self, ev: EqnEnv, name: str, times: Sequence[float], heights: Sequence[float]):
         super().__init__(ev, name)
+        ts = [self.parameter(f"t{k}", t) for k, t in enumerate(times)]
+        values = [self.parameter(f"y{k}", y) for k, y in enumerate(heights)]
         pieces: list[Any] = [(values[0], ev.t < ts[0])]
         for k in range(len(ts) - 1):
             slope = (values[k + 1] - values[k]) / (ts[k + 1] - ts[k])
@@ -77,8 +80,14 @@ class Train:
             self.frictions["brake"] = self._friction(rng)
         self.torque = self._table(rng, -4, 4)
         self.starts = [(0.0, float(rng.normal()) * 2) for _ in range(n)]
-        if n > 1 and rng.random() < 0.3:  # these turn together at the start
+        self.together = n > 1 and rng.random() < 0.3  # two at the start
+        if self.together:
             self.starts[1] = self.starts[0]
+        # Tables written as equations, whose numbers are parameters; the others are from the library.
+        self.written = {key for key in ("torque", *self.frictions) if rng.random() < 0.6}
+        self._turn()
+
+    def _turn(self) -> None:
         self.corners = sorted(
             {
                 t
@@ -87,6 +96,27 @@ class Train:
                 if t < self.end
             }
         )
+
+    def other(self, rng: np.random.Generator) -> "Train":
+        """The same parts with other numbers, tables of the library excepted."""
+        out = copy.copy(self)
+        out.inertias = [varied(rng, J) for J in self.inertias]
+        out.springs = {k: (varied(rng, c), varied(rng, d)) for k, (c, d) in self.springs.items()}
+        out.plays = {k: (varied(rng, gap), varied(rng, c), varied(rng, d)) for k, (gap, c, d) in self.plays.items()}
+
+        def table(key, old: tuple[list[float], list[float]]) -> tuple[list[float], list[float]]:
+            stretch = rng.uniform(0.7, 1.0)
+            return ([t * stretch for t in old[0]], [varied(rng, y) for y in old[1]]) if key in self.written else old
+
+        out.frictions = {
+            key: (varied(rng, full), peak, table(key, old)) for key, (full, peak, old) in self.frictions.items()
+        }
+        out.torque = table("torque", self.torque)
+        out.starts = [(0.0, float(rng.normal()) * 2) for _ in self.starts]
+        if self.together:
+            out.starts[1] = out.starts[0]
+        out._turn()
+        return out
 
     def _table(self, rng: np.random.Generator, low: float, high: float) -> tuple[list[float], list[float]]:
         count = int(rng.integers(2, 6))
@@ -246,35 +276,57 @@ class Train:
         return out
 
 
-def make(seed: int) -> Case:
+def make(seed: int, variants: int = 0) -> Case:
     """Shafts over some seconds."""
     rng = np.random.default_rng([seed, 41])
     while True:
         train = Train(rng)
-        ts = np.sort(rng.uniform(0.1, 1.0, 6)) * train.end
-        try:
-            values = train.run(ts)
-        except Delicate:
-            continue
-        if np.isfinite(values).all() and train.changes:
-            return _case(rng, train, ts, values)
+        ts, values = _course(rng, train)
+        if values is not None and train.changes:
+            break
+    ev, diagram, _, which = _built([seed, 42], train)
+    changes, others = train.changes, []
+    for k in range(TRIED * variants):
+        if len(others) == variants:
+            break
+        numbers = np.random.default_rng([seed, 41, k])
+        other = train.other(numbers)
+        then, found = _course(numbers, other)
+        if found is not None:
+            _, _, again, _ = _built([seed, 42], other)
+            others.append(Variant(numbers_of(again), {}, motion_of(which, then, found)))
+    return Case(
+        ev, diagram, {}, {}, motion=motion_of(which, ts, values), always_moves=True, variants=others,
+        note=f"{len(train.inertias)} shafts, {len(train.frictions)} clutches and brakes, {len(train.plays)} plays, "
+        f"{changes} changes",
+    )  # fmt: skip
 
 
-def _source(
-    rng: np.random.Generator, ev: EqnEnv, label: Any, table: tuple[list[float], list[float]]
-) -> tuple[Any, list, list]:
-    """A port, the parts behind it, and their connections: a table as a component of its own or from the library."""
+def _course(rng: np.random.Generator, train: Train) -> tuple[np.ndarray, Any]:
+    """Times and values there; None if the reference cannot decide."""
+    ts = np.sort(rng.uniform(0.1, 1.0, 6)) * train.end
+    try:
+        values = train.run(ts)
+    except Delicate:
+        return ts, None
+    return ts, values if np.isfinite(values).all() else None
+
+
+def _source(written: bool, ev: EqnEnv, label: Any, table: tuple[list[float], list[float]]) -> tuple[Any, list, list]:
+    """A port, the parts behind it, and their connections: a table as equations of its own or from the library."""
     ts, values = table
-    if rng.random() < 0.6:
+    if written:
         part = Table(ev, next(label), ts, values)
         return part.y, [part], []
     now = Now(ev, next(label))
     xs, ys = [-1.0, *ts, 100.0], [values[0], *values, values[-1]]
-    part = signal.Table1D(ev, next(label), xs, ys)
+    part = signal.Table1D(ev, next(label), xs, ys, events=True)
     return part.y, [now, part], [[now.y, part.u]]
 
 
-def _case(rng: np.random.Generator, train: Train, ts: np.ndarray, values: np.ndarray) -> Case:
+def _built(seed: list[int], train: Train) -> tuple[EqnEnv, AcausalDiagram, list[Any], list[str]]:
+    """The model, its parts, and the names of angles and speeds."""
+    rng = np.random.default_rng(seed)
     ev, n = EqnEnv(), len(train.inertias)
     label = iter(names(rng, 8 * n + 12))
     ground = rotational.FixedAngle(ev, next(label))
@@ -288,7 +340,7 @@ def _case(rng: np.random.Generator, train: Train, ts: np.ndarray, values: np.nda
     for key, (full, peak, table) in train.frictions.items():
         mu = float(rng.uniform(0.2, 0.9))
         part: Any = (Brake if key == "brake" else Clutch)(ev, next(label), mu, full / mu, 1.0, peak)
-        port, behind, more = _source(rng, ev, label, table)
+        port, behind, more = _source(key in train.written, ev, label, table)
         parts += behind
         wires += [*more, [port, part.u]]
         if key == "brake":
@@ -301,22 +353,12 @@ def _case(rng: np.random.Generator, train: Train, ts: np.ndarray, values: np.nda
         (at[k - 1] if k else floor).append(part.flange_a)
         at[k].append(part.flange_b)
     torque = rotational.Torque(ev, next(label))
-    port, behind, more = _source(rng, ev, label, train.torque)
+    port, behind, more = _source("torque" in train.written, ev, label, train.torque)
     parts += [torque, *behind]
     wires += [*more, [port, torque.tau]]
     at[-1].append(torque.flange)
     which = [f"{s.name}.{x}" for x in ("phi", "w") for s in shafts]
-    sizes = [max(np.abs(values[:, :n]).max(), 0.1)] * n + [max(np.abs(values[:, n:]).max(), 0.1)] * n
-    motion = Motion(
-        ts, dict(zip(which, values.T, strict=True)),
-        {name: TRAJECTORY * size for name, size in zip(which, sizes, strict=True)}, rtol=1e-6, atol=1e-9,
-    )  # fmt: skip
     if len(floor) == 1:
         parts.remove(ground)
         floor = []
-    diagram: AcausalDiagram = diagram_of(rng, parts, [floor, *at, *wires])
-    return Case(
-        ev, diagram, {}, {}, motion=motion, always_moves=True,
-        note=f"{n} shafts, {len(train.frictions)} clutches and brakes, {len(train.plays)} plays, "
-        f"{train.changes} changes",
-    )  # fmt: skip
+    return ev, diagram_of(rng, parts, [floor, *at, *wires]), parts, which

@@ -53,7 +53,8 @@ class Worker:
     def judged(self, draw: Draw) -> tuple[str, Outcome]:
         try:
             self.connection.send(draw)
-            return self.connection.recv()
+            note, outcomes = self.connection.recv()
+            return note, outcomes[0]
         except (EOFError, ConnectionError):
             self.process.join()
             code = self.process.exitcode

@@ -17,6 +17,8 @@ import optax
 from jax.core import Tracer
 from tqdm import tqdm
 
+from ..diagnosis.unused_parameters import unused_parameters
+from ..diagnosis.wording import listed
 from ..errors import InitializationError, ModelError, SimulationError, SteadyStateError
 from ..modeling.interval import Interval
 from ..programs.cache import compiled
@@ -87,7 +89,8 @@ def minimize(
     **Returns:**
 
     A `Minimized`. If the loss or its gradient is not finite, the steps stop with a `RuntimeWarning`, which says why
-    where a simulation inside fails, and the best iterate so far is returned.
+    where a simulation inside fails, and the best iterate so far is returned. Another one names trained parameters
+    that nothing in the model reads.
 
     **Raises:**
 
@@ -172,8 +175,24 @@ def _split(model: Any, train: Any) -> tuple[Any, Any]:
         names = tuple(model.neural) if train is None else (train,) if isinstance(train, str) else tuple(train)
         if train is None and not names:
             raise ModelError("this system has no networks: say what to train, train=['component.parameter', …]")
-        return model.partition(*names)
+        trainable, frozen = model.partition(*names)
+        _warn_of_unused(trainable)
+        return trainable, frozen
     return eqx.partition(model, eqx.is_inexact_array if train is None else train)
+
+
+def _warn_of_unused(trainable: AcausalSystem) -> None:
+    """A loss may read such a parameter itself, so this is no error."""
+    table = trainable.parameters.table
+    free = trainable.parameters.free_index if trainable.parameters.free is not None else ()
+    unused = [table.names[k] for k in unused_parameters(trainable.plan.flat) if k in free]
+    if unused:
+        warnings.warn(
+            f"train: nothing in the model reads {listed(unused, 12)}, so no trajectory depends on it: was the number "
+            "used in an equation, instead of what self.parameter(...) returns?",
+            RuntimeWarning,
+            stacklevel=4,
+        )
 
 
 def _merged(model: Any) -> Any:

@@ -6,7 +6,8 @@ for it. What is returned fulfils every equation to rounding,
 
     |A x − b| ≤ c eps (|A| |x| + |b|)    or    |A x − b| ≤ c' eps max|x|  in the scaled system,
 
-or is not-a-number (Skeel 1980, Math. Comp. 35:817; Higham 2002, chapters 7 and 12).
+and is determined by the equations, so that rounding in them does not change its first digit; or is not-a-number
+(Skeel 1980, Math. Comp. 35:817; Higham 2002, chapters 7 and 12).
 """
 
 from typing import Any
@@ -20,13 +21,14 @@ from jaxtyping import Array, Float
 from ..errors import ModelError
 from .once import once
 from .operator import SparseLinearOperator
-from .sparse import DENSE, SparsePattern, available, check_solvable, is_double, solve_sparse
+from .sparse import DENSE, ULPS, SparsePattern, available, check_solvable, is_double, solve_sparse
 
 LAPACK = 48  # unknowns up to which dense elimination is faster than KLU, which takes 40 µs to begin
 GOOD = 2.0**10  # residual in units of eps times the terms of an equation, above which a solution of KLU is refined
 REFINEMENTS = 2  # of a solution by KLU, at most
 MORE_REFINEMENTS = 10  # the same, of a solution by an iterative method
 TOLERATED = 2.0**20  # the same, above which a solution is refused: 2e-10 in double precision
+UNDETERMINED = 2.0**-4  # of the largest unknown: what changes so by rounding is not known to its first digit
 TOLERATED_NORM = 2.0**8  # in units of eps times the largest unknown of the scaled system, for each √n
 
 
@@ -65,6 +67,8 @@ def solve_whole(
     else:
         solve, most = _lapack(pattern, frozen) if dense else _klu(pattern, frozen), REFINEMENTS
 
+    rounding = np.random.default_rng(0).uniform(-1, 1, n)  # signs alone may cancel in sums
+
     def solution(b: Any, transpose: bool) -> Any:
         (b,) = once([b])  # solved and checked with the same digits, be they nothing but rounding
         eps, tiny = float(jnp.finfo(b.dtype).eps), float(jnp.finfo(b.dtype).tiny)
@@ -92,6 +96,10 @@ def solve_whole(
         missing, size = residual(x)
         allowed = jnp.maximum(TOLERATED * size, TOLERATED_NORM * np.sqrt(n) * jnp.max(jnp.abs(x)))
         holds = jnp.all(jnp.abs(missing) <= eps * allowed + TOLERATED / eps * tiny)
+        if solver is None:
+            # Of singular equations that agree, any of many solutions: this one changes with the equations' last digits.
+            change = solve((1 if dense else ULPS) * eps * jnp.asarray(rounding, b.dtype) * size, transpose)
+            holds = holds & (jnp.max(jnp.abs(change)) <= UNDETERMINED * jnp.max(jnp.abs(x)))
         return jnp.where(holds, x, jnp.nan)
 
     found = jax.lax.custom_linear_solve(

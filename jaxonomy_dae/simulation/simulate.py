@@ -46,13 +46,13 @@ def simulate(
     *,
     t0: Any = 0.0,
     ts: Any = None,
-    solver: diffrax.AbstractSolver | None = None,
+    solver: diffrax.AbstractSolver[Any] | None = None,
     rtol: Any = None,
     atol: Any = None,
     inputs: Mapping[str, Any] | None = None,
     initial: Mapping[str, Any] | Any = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
-    stepsize_controller: diffrax.AbstractStepSizeController | None = None,
+    stepsize_controller: diffrax.AbstractStepSizeController[Any, Any] | None = None,
     jump_ts: Any = None,
     dtmax: Any = None,
     max_steps: int = 16384,
@@ -199,7 +199,8 @@ def simulate(
     if switches:
         stiff = bool(outcome.is_stiff)
         if outcome.result == diffrax.RESULTS.max_steps_reached:
-            decay = decay_at(term_of(system, implicit=False), inputs, *outcome.last)
+            there = system if outcome.held is None else system.holding(outcome.held)
+            decay = decay_at(term_of(there, implicit=False), inputs, *outcome.last)
             stiff = is_stiff(decay, float(t1 - outcome.last[0]), max_steps)
         if stiff:
             found = f"stiff: stability limits explicit steps from t={float(outcome.last[0]):.3g} on"

@@ -11,7 +11,7 @@ from ..model.incidence import incidence
 from ..model.tables import provenance_of
 from ..structure.pantelides import Offsets, reduce_index
 from .event_report import clock_events, condition_events, discrete_starts, mode_equations, relation_events
-from .sections import Sections, some
+from .sections import Sections, folded, some
 from .solver_choice import solver_choice
 
 
@@ -176,9 +176,9 @@ class SystemReport(Sections):
         discretes, events, clocks = self.discretes, self.events, self.clocks
         sections = [
             ("differentiated", [f"{n}× {text}" for text, n in self.differentiated]),
-            (counted(len(self.states), "state"), [some(self.states)]),
-            ("algebraic unknowns in the state array", [some(self.carried)]),
-            (counted(len(self.algebraics), "algebraic variable"), [some(self.algebraics)]),
+            (counted(len(self.states), "state"), [some(folded(self.states))]),
+            ("algebraic unknowns in the state array", [some(folded(self.carried))]),
+            (counted(len(self.algebraics), "algebraic variable"), [some(folded(self.algebraics))]),
             (counted(len(discretes), "discrete variable"), [some(discretes)]),
             (counted(len(events), "event"), events),
             (counted(len(clocks), "clock"), clocks),

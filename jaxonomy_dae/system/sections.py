@@ -2,6 +2,8 @@
 
 import abc
 import html
+import math
+import re
 from collections.abc import Sequence
 
 SHOWN = 12
@@ -40,3 +42,23 @@ class Sections(abc.ABC):
 def some(names: Sequence[str]) -> str:
     """Names, and of long lists how many there are."""
     return ", ".join(names[:SHOWN]) + (f", … ({len(names)} in all)" if len(names) > SHOWN else "")
+
+
+def folded(names: Sequence[str]) -> list[str]:
+    """The names in order, those that differ in whole ranges of indices as one: `cell[0…49].v`."""
+    alike: dict[str, list[str]] = {}
+    for name in names:
+        alike.setdefault(_INDEX.sub("[]", name), []).append(name)
+    return [name for group in alike.values() for name in _as_one(group)]
+
+
+def _as_one(names: list[str]) -> list[str]:
+    places = [tuple(map(int, re.findall(r"\d+", " ".join(_INDEX.findall(name))))) for name in names]
+    ranges = [range(min(column), max(column) + 1) for column in zip(*places, strict=True)]
+    if len(names) < 2 or len(set(places)) != math.prod(map(len, ranges)) or len(set(places)) != len(names):
+        return names
+    written = iter(f"{r[0]}…{r[-1]}" if len(r) > 1 else str(r[0]) for r in ranges)
+    return [_INDEX.sub(lambda found: re.sub(r"\d+", lambda _: next(written), found[0]), names[0])]
+
+
+_INDEX = re.compile(r"\[\d+(?:, ?\d+)*\]")

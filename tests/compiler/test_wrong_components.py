@@ -73,6 +73,7 @@ def test_thermal(make, message):
         (lambda ev: sig.Table1D(ev, "t", [0, 2, 1], [0, 1, 2]), r"'t': x must increase, but entry 2 \(1\) follows 2"),
         (lambda ev: sig.Table1D(ev, "t", [0, 1], [0, 1, 2]), r"'t': values has shape \(3,\), x has \(2,\)"),
         (lambda ev: sig.Table1D(ev, "t", [0, 1], [0, np.nan]), r"'t': values is not finite at entry 1"),
+        (lambda ev: sig.Table1D(ev, "t", [0, 1], [0, 1], kind="cubic", events=True), "'t': a cubic table has no kinks"),
         (lambda ev: sig.Table2D(ev, "t", [0, 1], [0, 1], [[1, 2]]), r"'t': values has shape \(1, 2\)"),
         (lambda ev: sig.TransferFunction(ev, "f", [1, 0], [2]), r"'f': the numerator's degree, 1, is above"),
         (lambda ev: sig.StateSpace(ev, "s", [[1, 0]], [[1]], [[1]]), r"'s': A has shape \(1, 2\)"),

@@ -9,7 +9,7 @@ from problems import compiled, damped_oscillation, oscillator
 from sympy import Eq
 from testset import PROBLEMS
 
-from jaxonomy_dae import Component, EqnEnv, der, simulate
+from jaxonomy_dae import Component, EqnEnv, assign, der, simulate
 from jaxonomy_dae.solvers import Rodas5P
 
 TS = np.array([0.5, 4.0, 10.0])
@@ -53,6 +53,26 @@ def test_fast_decay_before_a_short_end_stays_explicit(stiff):
     """Explicit steps are limited here too, but few: another solver would cost more to compile."""
     solution = simulate(stiff.with_parameters({"f.k": 1e3}), 1.0, ts=TS / 10)
     assert solution.stats["solver"] == "Tsit5" and 250 < solution.stats["num_steps"] < 1000
+
+
+class Stiffening(Component):
+    """The follower above, with k = 1 up to t = 1/2 and 2e4 from then on."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        w, mode = self.parameter("w", 1.3), self.discrete("mode", start=0)
+        x, k = self.variable("x", start=1.0, fixed=True), sympy.Piecewise((1.0, Eq(mode, 0)), (2e4, True))
+        self.add_equations(Eq(der(x), -k * (x - sympy.cos(w * ev.t)) - w * sympy.sin(w * ev.t)))
+        self.when(ev.t >= 0.5, assign(mode, 1))
+
+
+@pytest.mark.slow
+def test_steps_used_up_in_a_stiff_mode():
+    """Explicit steps, 2000/3.3 of them, are too few to be given up early, and more than allowed: eigenvalues decide, in
+    the mode in which steps ran out."""
+    solution = simulate(compiled(Stiffening(EqnEnv(), "f")), 0.6, ts=TS[:1] / 2.5 + 0.4, max_steps=300)
+    np.testing.assert_allclose(solution["f.x"], np.cos(1.3 * 0.6), rtol=0, atol=1e-5)
+    assert solution.stats["solver"] == "Rodas5P" and solution.stats["num_explicit_steps"] == 300
 
 
 def test_asked_for_solvers_are_not_replaced(stiff):

@@ -13,14 +13,50 @@ import scipy.special
 from component_references import checks, measured
 from problems import compiled
 from scipy.linalg import expm
+from sympy import Eq
 from trajectories import trajectory
 
 import jaxonomy_dae.library.signal as sig
-from jaxonomy_dae import EqnEnv, InitializationError, ModelError, simulate
+from jaxonomy_dae import Component, EqnEnv, InitializationError, ModelError, der, simulate
 
 ROUNDING = 1e-12  # of blocks without memory
 X, VALUES = np.array([0.0, 1.0, 1.5, 3.0]), np.array([1.0, -1.0, 2.0, 0.5])
 GRID = np.random.default_rng(0).normal(size=(4, 3))
+
+
+class Reader(Component):
+    """x' = y, what is read at place·t of a table."""
+
+    def __init__(self, ev, name, pace):
+        super().__init__(ev, name)
+        pace = self.parameter("pace", pace)
+        x, y = self.variable("x", start=0.0, fixed=True), self.input("y")
+        self.output("u", pace * ev.t)
+        self.add_equations(Eq(der(x), y))
+
+
+@pytest.mark.parametrize(
+    "differentiated",
+    [
+        pytest.param(False, marks=pytest.mark.long("a program with events")),
+        pytest.param(True, marks=pytest.mark.slow),
+    ],
+)
+def test_a_table_whose_kinks_are_events(differentiated):
+    """x(t) = (F(p·t) − F(0))/p with F the integral of the table, and dx/dp = (y(p·t)·t − x)/p: at the default
+    tolerances to rounding, as steps see one line at a time."""
+    ev, pace, end = EqnEnv(), 1.3, 2.5
+    table, reader = sig.Table1D(ev, "table", X, VALUES, events=True), Reader(ev, "reader", pace)
+    system = compiled(table, reader, connect=[(reader.u, table.u), (table.y, reader.y)])
+
+    def reached(pace):
+        return simulate(system.with_parameters({"reader.pace": pace}), end, ts=jnp.array([end]))["reader.x"][0]
+
+    found = jax.value_and_grad(reached)(pace) if differentiated else [reached(pace)]
+    line = scipy.interpolate.interp1d(X, VALUES, fill_value="extrapolate")
+    places = np.unique(np.append(X[X < pace * end], pace * end))
+    x = scipy.integrate.trapezoid(line(places), places) / pace
+    np.testing.assert_allclose(found, [x, (line(pace * end) * end - x) / pace][: len(found)], rtol=1e-12)
 
 
 @checks(

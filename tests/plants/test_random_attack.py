@@ -7,7 +7,7 @@ import subprocess
 import sys
 
 import pytest
-from attack.draws import NETWORKS, Draw
+from attack.draws import FAMILIES, NETWORKS, Draw
 from attack.outcome import GOOD
 from problems import ROOT
 
@@ -33,7 +33,7 @@ QUICK = {
     ],
 )
 def test_a_random_model(family, seed):
-    note, outcome = Draw(family, seed).judged()
+    note, (outcome,) = Draw(family, seed).judged()
     assert outcome.kind in GOOD, f"({note}): {outcome.kind}: {outcome.text[:1000]}"
 
 
@@ -48,9 +48,15 @@ def judge_apart(*arguments: str) -> list[list[int]]:
 @pytest.mark.slow
 def test_some_of_each_family():
     counts = judge_apart("--count", "3", "--seed", "400", "--moving", "3")
-    assert len(counts) == len(NETWORKS) + 2
+    assert len(counts) == len(FAMILIES)
     assert all(right + refused == 3 and not any(others) for right, refused, *others in counts)
     assert sum(row[0] for row in counts) >= 15  # most models are well posed
+
+
+@pytest.mark.slow
+def test_variants_of_a_model_are_run_by_its_program():
+    counts = judge_apart("--family", "drives", "--seed", "2001", "--count", "1", "--variants", "5")
+    assert counts == [[1, 0, 0, 0, 0, 0], [5, 0, 0, 0, 0, 0]]
 
 
 @pytest.mark.slow

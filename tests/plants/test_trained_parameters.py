@@ -54,6 +54,26 @@ class Power(eqx.Module):
         return self.k * u**self.n
 
 
+class Forgotten(Component):
+    """der(x) = −k·x with the number in the place of the parameter."""
+
+    def __init__(self, ev, name, k=2.0):
+        super().__init__(ev, name)
+        self.parameter("k", k)
+        x = self.variable("x", start=1.0, fixed=True)
+        self.add_equations(Eq(der(x), -k * x))
+
+
+def test_training_what_nothing_reads_warns():
+    system = compiled(Forgotten(EqnEnv(), "c"))
+
+    def loss(system):
+        return jnp.sum((system.vector_field(0.0, jnp.array([1.0])) + 1.0) ** 2)
+
+    with pytest.warns(RuntimeWarning, match=r"nothing in the model reads 'c\.k'.*instead of what self\.parameter"):
+        minimize(system, loss, optax.sgd(0.1), 1, train=["c.k"], progress=False)
+
+
 def test_by_default_a_systems_networks_are_trained():
     system = compiled(Decay(EqnEnv(), "c", Power(jnp.array(0.8), jnp.array(1.0))))
 

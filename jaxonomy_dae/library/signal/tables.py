@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.interpolate import RegularGridInterpolator
 from jaxtyping import Array, Float
+from sympy import floor
 
 from ...errors import ModelError
-from ...modeling import Component, EqnEnv
-from ..arguments import finite, increasing
+from ...modeling import Component, Eq, EqnEnv
+from ..arguments import finite, increasing, yes_or_no
 from ..interpolation import known_kind
 
 
@@ -28,6 +29,28 @@ class _Curve(eqx.Module):
         if self.kind == "linear":
             return diffrax.LinearInterpolation(x, self.y).evaluate(u)
         return diffrax.CubicInterpolation(x, diffrax.backward_hermite_coefficients(x, self.y)).evaluate(u)
+
+
+class _Place(eqx.Module):
+    """The number of the piece that a point is on, and how far along it is: increasing, whole at the grid points."""
+
+    x: np.ndarray = eqx.field(converter=np.asarray)
+
+    def __call__(self, u):
+        x = jnp.asarray(self.x, u.dtype)
+        return jnp.interp(u, x, jnp.arange(len(self.x), dtype=u.dtype), left="extrapolate", right="extrapolate")
+
+
+class _Piece(eqx.Module):
+    """A line through two neighbouring points, by the number of the first."""
+
+    x: np.ndarray = eqx.field(converter=np.asarray)
+    y: Float[Array, " n"]
+
+    def __call__(self, u, piece):
+        k = jnp.clip(piece, 0, len(self.x) - 2).astype(int)
+        x = jnp.asarray(self.x, self.y.dtype)
+        return self.y[k] + (self.y[k + 1] - self.y[k]) / (x[k + 1] - x[k]) * (u - x[k])
 
 
 class _Surface(eqx.Module):
@@ -50,19 +73,33 @@ class Table1D(Component):
     - `x`: increasing, shape (n,), n ≥ 2. `values`: shape (n,).
     - `kind`: 'linear', or 'cubic': Hermite splines with backward differences, once differentiable (Morrill et al. 2022,
         arXiv:2106.11028). Outside of the points the last piece goes on.
+    - `events`: whether steps end where `u` passes a point of a linear table: the solver then sees one line at a time.
+        Worth it for tables of time and where points are far apart. Without, a run is off by what step sizes leave of
+        each kink: some tens of tolerances, hundreds in the worst cases.
 
     **Raises:**
 
-    - `ModelError` if the points are not increasing, not finite, or their numbers disagree.
+    - `ModelError` if the points are not increasing, not finite, or their numbers disagree, or if events are asked for
+        of a cubic table, which has no kinks.
     """
 
-    def __init__(self, ev: EqnEnv, name: str, x: Any, values: Any, kind: str = "linear"):
+    def __init__(self, ev: EqnEnv, name: str, x: Any, values: Any, kind: str = "linear", events: bool = False):
         super().__init__(ev, name)
         points, found = increasing(x, name, "x"), finite(values, name, "values")
         if found.shape != points.shape:
             raise ModelError(f"'{name}': values has shape {found.shape}, x has {points.shape}: they must agree")
         known_kind(kind, name)
-        (value,) = self.function("table", _Curve(points, jnp.asarray(found, float), kind), inputs=[self.input("u")])
+        u, y = self.input("u"), jnp.asarray(found, float)
+        if not yes_or_no(events, name, "events"):
+            (value,) = self.function("table", _Curve(points, y, kind), inputs=[u])
+        elif kind == "linear":
+            # The whole part of the place is what is an event: two guards, however many points there are.
+            (place,) = self.function("place", _Place(points), inputs=[u])
+            piece = self.variable("piece", unit="1")
+            self.add_equations(Eq(piece, floor(place)))
+            (value,) = self.function("table", _Piece(points, y), inputs=[u, piece])
+        else:
+            raise ModelError(f"'{name}': a cubic table has no kinks that could be events: leave events=True out")
         self.output("y", value)
 
 
