@@ -57,6 +57,7 @@ class Evaluation:
         self.chunks: list[Chunk] = [state, inputs]
         self.parameters = parameters
         self._scalars: list[Any] | None = None
+        self._sizes: list[Any] | None = None
         self.dtype = parameters.dtype
         self.t = t
         self.networks = networks
@@ -215,12 +216,23 @@ class Evaluation:
 
     def _typical(self, planned: PlannedEquation) -> list[Any]:
         """The typical sizes of an equation's slots; the constant zero has none."""
-        out = []
+        out: list[Any] = []
         for slot in planned.equation.slots:
-            size = jnp.abs(jnp.asarray(slot.factor, self.dtype)) * self.typical[slot.quantity]
-            size = jnp.where(slot.quantity == ZERO, 0, size)
-            out.append(size[0] if len(slot.quantity) == 1 else size)
+            if len(slot.quantity) == 1:
+                k, factor = int(slot.quantity[0]), abs(float(slot.factor[0]))
+                out.append(0.0 if k == ZERO else times(factor, self._typical_entry(k)))
+            else:
+                factors = np.where(slot.quantity == ZERO, 0.0, np.abs(slot.factor))
+                out.append(jnp.asarray(factors, self.dtype) * take(self.typical, np.maximum(slot.quantity, 0)))
         return out
+
+    def _typical_entry(self, k: int) -> Any:
+        """The typical size of a quantity, a scalar."""
+        if self.typical.shape[0] > FEW:
+            return self.typical[k]
+        if self._sizes is None:
+            self._sizes = entries(self.typical)
+        return self._sizes[k]
 
     def _still_arguments(self, planned: PlannedEquation, local: list[Any]):
         """The arguments of an equation's template, not differentiated."""
@@ -429,12 +441,22 @@ def is_small(
         may have left in them beyond their own.
     """
     eps = float(jnp.finfo(jnp.result_type(residual)).eps)
-    allowed = tolerated * terms
-    for k, (partial, size) in enumerate(zip(partials, typical, strict=False)):  # of a network, its output alone
-        left = ZERO_WITHIN * eps * size
-        allowed = allowed + jnp.abs(partial) * (left + NOISE * noise[k] if noise else left)
+    pairs = list(zip(partials, typical, strict=False))  # of a network, its output alone
+    floor = _weighed([(p, s) for p, s in pairs if not _is_nothing(s)])
+    left = _weighed([(p, n) for p, n in zip(partials, noise, strict=False) if not _is_nothing(n)])
+    allowed = tolerated * terms + ZERO_WITHIN * eps * floor + NOISE * left
     # Where a slope is infinite, as that of a root at zero, the equation holds exactly or not at all.
     return (jnp.abs(residual) <= allowed) & ((allowed < jnp.inf) | (residual == 0))
+
+
+def _weighed(pairs: Sequence[tuple[Any, Any]]) -> Any:
+    """Σ |a|·b."""
+    return functools.reduce(operator.add, [abs(a) * b for a, b in pairs], 0.0)
+
+
+def _is_nothing(value: Any) -> bool:
+    """Whether a value is the number zero, known as such."""
+    return isinstance(value, float) and value == 0.0
 
 
 def find_root(
