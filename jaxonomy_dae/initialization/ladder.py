@@ -178,7 +178,9 @@ def _climb(
         return jax.lax.stop_gradient((value, jacobian))
 
     def sizes_of_rows(jacobian, x, unit) -> tuple[Any, Any]:
-        return row_sizes(weighed(jacobian), x, sizes, unit, None if magnitude is None else magnitude(x))
+        # What it closes over may be differentiated, as what the function does.
+        terms = None if magnitude is None else jax.lax.stop_gradient(magnitude(x))
+        return row_sizes(weighed(jacobian), x, sizes, unit, terms)
 
     def evaluate(state: Machine) -> Machine:
         x = state.points[0, :n]

@@ -27,8 +27,11 @@ class Measured(Evaluation):
         self, state: Chunk, sizes: Chunk, inputs: Chunk, parameters: Any, t: Any, networks: Networks, typical: Any
     ):
         """`sizes` are the magnitudes of the state's entries."""
-        state, sizes, inputs, parameters, t = jax.lax.stop_gradient((state, sizes, inputs, parameters, t))
-        super().__init__(state, inputs, parameters, t, networks, typical)
+        given = (state, sizes, inputs, parameters, t, networks.weights)
+        state, sizes, inputs, parameters, t, weights = jax.tree.map(
+            lambda leaf: jax.lax.stop_gradient(leaf) if isinstance(leaf, jax.Array) else leaf, given
+        )
+        super().__init__(state, inputs, parameters, t, Networks(weights), typical)
         self.magnitudes: list[Chunk] = [sizes, jax.tree.map(jnp.abs, inputs)]
         self.carried_magnitudes: list[Any] = []
 

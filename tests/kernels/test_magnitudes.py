@@ -1,5 +1,6 @@
 """How large the terms of equations are: beside what zero is judged, whatever the units and however far away."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -100,3 +101,31 @@ def test_models_of_one_structure_keep_their_sizes(first):
     for system, K, c in order if first == 0 else order[::-1]:
         exact = 2 * c / (1 + np.sqrt(1 + 4 * c / K))
         assert float(observe(system, jnp.array([c, 0.0]))) == pytest.approx(exact, rel=1e-12)
+
+
+class Cubic(eqx.Module):
+    """u ↦ k·u³."""
+
+    k: jax.Array
+
+    def __call__(self, u):
+        return self.k * u**3
+
+
+def test_forward_derivatives_by_the_weights_of_a_law_in_a_block():
+    """Magnitudes read networks, too: not differentiated. z + k·z³ = 2 at k = 1: dz/dk = −z³/(1 + 3·z²) at z = 1."""
+
+    def write(self, ev):
+        a, z = self.variable("a", start=0.0, fixed=True), self.variable("z", start=0.5)
+        (law,) = self.learned("law", Cubic(jnp.array(1.0)), inputs=[z])
+        self.add_equations(Eq(der(a), z), Eq(z + law, 2))
+
+    system = compiled(component(write))
+
+    def start(k):
+        changed = eqx.tree_at(lambda s: s.neural["c.law"].k, system, k)
+        return changed.observe("c.z", 0.0, changed.initialize())
+
+    value, slope = jax.jit(lambda k: jax.jvp(start, (k,), (jnp.ones(()),)))(jnp.array(1.0))
+    assert float(value) == pytest.approx(1.0, rel=1e-12)
+    assert float(slope) == pytest.approx(-0.25, rel=1e-12)
