@@ -1,6 +1,7 @@
 """What a random model is: a diagram, the values that determine its point, and what must come out."""
 
 import dataclasses
+import itertools
 import types
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -9,6 +10,7 @@ import numpy as np
 
 from jaxonomy_dae import AcausalDiagram, Component, EqnEnv
 
+TRIED = 30  # other numbers for each variant, until the reference can decide what happens
 TOLERANCE = 1e-8  # of a quantity's scale
 ROUNDING = 100 * np.finfo(float).eps
 UNCHANGED: Mapping[str, float] = types.MappingProxyType({})  # no part's value is multiplied
@@ -103,6 +105,12 @@ def numbers_of(parts: Sequence[Component]) -> dict[str, float]:
 def varied(rng: np.random.Generator, value: float) -> float:
     """The value multiplied by 10 to the power of ±1/4 at most."""
     return value * log_uniform(rng, -0.25, 0.25)
+
+
+def drawn(count: int, seed: Sequence[int], draw: Callable[[np.random.Generator], Variant | None]) -> list[Variant]:
+    """So many variants of a case, or as many as a limited number of trials gives."""
+    found = (draw(np.random.default_rng([*seed, k])) for k in range(TRIED * count))
+    return list(itertools.islice((v for v in found if v is not None), count))
 
 
 def diagram_of(rng: np.random.Generator, parts: Sequence[Component], nodes: Sequence[Sequence[Any]]) -> AcausalDiagram:

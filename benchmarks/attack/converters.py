@@ -15,14 +15,13 @@ from scipy.linalg import expm
 from jaxonomy_dae import EqnEnv
 from jaxonomy_dae.library import electrical, signal
 
-from .case import Case, Motion, Variant, diagram_of, log_uniform, names, numbers_of, varied
+from .case import Case, Motion, Variant, diagram_of, drawn, log_uniform, names, numbers_of, varied
 
 TRAJECTORY = 50e-6  # of a variable's size, at the default tolerances: fifty times rtol
 GRID = 400  # points of the shortest period at which diodes are looked at
 ZERO = 1e-9  # of a margin's size
 SINGULAR = 1e-15  # smallest singular value of an equilibrated matrix beside the largest
 STATES = ("C", "L")
-TRIED = 20  # other numbers, until the reference can decide what happens
 
 
 class Delicate(Exception):
@@ -257,24 +256,23 @@ def make(seed: int, variants: int = 0) -> Case:
         if found is not None:
             break
     ev, diagram, _, label = _built([seed, 32], elements)
-    others: list[Variant] = []
-    for k in range(TRIED * variants):
-        if len(others) == variants:
-            break
-        numbers = np.random.default_rng([seed, 31, k])
+
+    def variant(numbers: np.random.Generator) -> Variant | None:
         clock = varied(numbers, 1.0)
         circuit = Circuit([_other(numbers, e, clock) for e in elements])
         course = _course(numbers, circuit, period * clock, is_rectifier)
-        if course is not None:
-            _, _, again, _ = _built([seed, 32], circuit.elements)
-            motion, starts = _motion(circuit, label, *course)
-            others.append(Variant(numbers_of(again), starts, motion))
+        if course is None:
+            return None
+        motion, starts = _motion(circuit, label, *course)
+        return Variant(numbers_of(_built([seed, 32], circuit.elements)[2]), starts, motion)
+
     circuit = Circuit(elements)
     motion, starts = _motion(circuit, label, *found)
     leaks = sorted({e.numbers[1] for e in elements if e.kind in "DS"})
     return Case(
         ev, diagram, starts, {}, motion=motion, always_moves=True, may_refuse=("Goff",) if 0.0 in leaks else (),
-        variants=others, note=f"{len(circuit.diodes)} diodes, {len(circuit.switches)} switches, leaks {leaks}",
+        variants=drawn(variants, [seed, 31], variant),
+        note=f"{len(circuit.diodes)} diodes, {len(circuit.switches)} switches, leaks {leaks}",
     )  # fmt: skip
 
 

@@ -11,11 +11,10 @@ from jaxonomy_dae import EqnEnv
 from jaxonomy_dae.library import signal, translational
 from jaxonomy_dae.library.friction import StickingFriction
 
-from .case import Case, Motion, Variant, diagram_of, log_uniform, names, numbers_of, varied
-from .pieces import CLOSE, Delicate, in_pieces
+from .case import Case, Motion, Variant, diagram_of, drawn, log_uniform, names, numbers_of, varied
+from .pieces import CLOSE, Delicate, course_of, in_pieces
 
 TRAJECTORY = 50e-6  # of a variable's size, at the default tolerances: fifty times rtol
-TRIED = 20  # other numbers, until the reference can decide what happens
 
 
 class Row:
@@ -163,35 +162,24 @@ def make(seed: int, variants: int = 0) -> Case:
     rng = np.random.default_rng([seed, 37])
     while True:
         row = Row(rng)
-        ts, values = _course(rng, row)
+        ts, values = course_of(rng, row)
         if values is not None:
             break
     ev, diagram, parts, which = _built([seed, 38], row)
-    others: list[Variant] = []
-    for k in range(TRIED * variants):
-        if len(others) == variants:
-            break
-        numbers = np.random.default_rng([seed, 37, k])
+
+    def variant(numbers: np.random.Generator) -> Variant | None:
         other = row.other(numbers)
-        then, found = _course(numbers, other)
-        if found is not None:
-            _, _, again, _ = _built([seed, 38], other)
-            others.append(Variant(numbers_of(again), {}, motion_of(which, then, found)))
+        then, found = course_of(numbers, other)
+        if found is None:
+            return None
+        return Variant(numbers_of(_built([seed, 38], other)[2]), {}, motion_of(which, then, found))
+
     return Case(
-        ev, diagram, {}, {}, motion=motion_of(which, ts, values), always_moves=True, variants=others,
+        ev, diagram, {}, {}, motion=motion_of(which, ts, values), always_moves=True,
+        variants=drawn(variants, [seed, 37], variant),
         note=f"{len(row.masses)} masses, {sum(own is not None for own in row.friction)} stick, {len(row.stops)} stops, "
         f"{'a sine' if row.sine else 'ramps'}",
     )  # fmt: skip
-
-
-def _course(rng: np.random.Generator, row: Row) -> tuple[np.ndarray, Any]:
-    """Times and values there; None if the reference cannot decide."""
-    ts = np.sort(rng.uniform(0.1, 1.0, 6)) * row.end
-    try:
-        values = row.run(ts)
-    except Delicate:
-        return ts, None
-    return ts, values if np.isfinite(values).all() else None
 
 
 def motion_of(which: list[str], ts: np.ndarray, values: np.ndarray) -> Motion:

@@ -18,6 +18,16 @@ class Delicate(Exception):
     """What the reference cannot decide to all digits."""
 
 
+def course_of(rng: np.random.Generator, model: Any) -> tuple[np.ndarray, Any]:
+    """Times until the end of a reference, `model.run(times)`, and its values there; None if it cannot decide."""
+    ts = np.sort(rng.uniform(0.1, 1.0, 6)) * model.end
+    try:
+        values = model.run(ts)
+    except Delicate:
+        return ts, None
+    return ts, values if np.isfinite(values).all() else None
+
+
 def in_pieces(
     slopes: Callable[[float, np.ndarray, dict], np.ndarray],
     guards: Callable[[dict], Sequence[tuple[Callable, Callable]]],

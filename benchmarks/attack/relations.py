@@ -17,13 +17,12 @@ from sympy import Abs, And, Expr, Float, Heaviside, Max, Min, Mod, Piecewise, Sy
 
 from jaxonomy_dae import AcausalDiagram, Component, EqnEnv, der
 
-from .case import Case, Expected, Motion, Slopes, Variant, names
+from .case import Case, Expected, Motion, Slopes, Variant, drawn, names
 from .hybrid import APART, Delicate, HybridSystem, Reference, T
 
 MOST = 6  # relations
 MANY = 20  # relations of every sixth model
 SMALL = 3  # states and relations of what is differentiated
-TRIED = 30  # other numbers, until the reference can decide what happens
 TRAJECTORY = 50e-6  # of a variable's size, at the default tolerances: fifty times rtol
 DERIVATIVE = 1e-6  # of the largest derivative, each multiplied by the size of its parameter
 STEP = 5e-4  # relative; the error of extrapolated differences is of its fourth power
@@ -406,27 +405,25 @@ def _case(rng: np.random.Generator, d: Draft, differentiated: bool, seed: list[i
     by = [list(d.values)[k] for k in rng.permutation(len(d.values))[:4]]
     differentiated = differentiated and bool(by)
     slopes = _slopes(d, course, weights, by, seed[0] % 3 == 0) if differentiated else None
-    others: list[Variant] = []
-    for k in range(TRIED * variants):
-        if len(others) == variants:
-            break
-        numbers = np.random.default_rng([*seed, k])
+
+    def variant(numbers: np.random.Generator) -> Variant | None:
         other = _other(numbers, d)
         try:
             then = _course(numbers, other, COUNT)
             derivatives = _slopes(other, then, weights, by, False) if differentiated else None
         except Delicate:
-            continue
+            return None
         parameters = {_called(p): v for p, v in other.values.items()}
         parameters |= {f"cell[{k}].{n}": v for n, vs in other.cells.items() for k, v in enumerate(vs)}
         initial = {_called(x): v for x, v in other.states.items()}
-        others.append(Variant(parameters, initial, _motion(then, differentiated), derivatives))
+        return Variant(parameters, initial, _motion(then, differentiated), derivatives)
+
     count = len(d.relations) + len(d.cells.get("a", ()))
     note = f"{len(d.states) + len(d.cells.get('a', ()))} states, {count} relations, {course.instants - 1} instants"
     initial = {_called(x): v for x, v in d.states.items()}
     return Case(
         ev, diagram, initial, {}, motion=_motion(course, differentiated), slopes=slopes, always_moves=True,
-        variants=others, note=note,
+        variants=drawn(variants, seed, variant), note=note,
     )  # fmt: skip
 
 

@@ -13,9 +13,9 @@ from jaxonomy_dae.library import rotational, signal
 from jaxonomy_dae.library.friction import Brake, Clutch
 from jaxonomy_dae.modeling import Eq
 
-from .case import Case, Variant, diagram_of, log_uniform, names, numbers_of, varied
-from .drives import TRIED, motion_of
-from .pieces import CLOSE, Delicate, in_pieces
+from .case import Case, Variant, diagram_of, drawn, log_uniform, names, numbers_of, varied
+from .drives import motion_of
+from .pieces import CLOSE, Delicate, course_of, in_pieces
 
 STUCK, FREE = 0, 2  # modes of friction, beside 1 and -1
 
@@ -281,35 +281,25 @@ def make(seed: int, variants: int = 0) -> Case:
     rng = np.random.default_rng([seed, 41])
     while True:
         train = Train(rng)
-        ts, values = _course(rng, train)
+        ts, values = course_of(rng, train)
         if values is not None and train.changes:
             break
     ev, diagram, _, which = _built([seed, 42], train)
-    changes, others = train.changes, []
-    for k in range(TRIED * variants):
-        if len(others) == variants:
-            break
-        numbers = np.random.default_rng([seed, 41, k])
+    changes = train.changes
+
+    def variant(numbers: np.random.Generator) -> Variant | None:
         other = train.other(numbers)
-        then, found = _course(numbers, other)
-        if found is not None:
-            _, _, again, _ = _built([seed, 42], other)
-            others.append(Variant(numbers_of(again), {}, motion_of(which, then, found)))
+        then, found = course_of(numbers, other)
+        if found is None:
+            return None
+        return Variant(numbers_of(_built([seed, 42], other)[2]), {}, motion_of(which, then, found))
+
     return Case(
-        ev, diagram, {}, {}, motion=motion_of(which, ts, values), always_moves=True, variants=others,
+        ev, diagram, {}, {}, motion=motion_of(which, ts, values), always_moves=True,
+        variants=drawn(variants, [seed, 41], variant),
         note=f"{len(train.inertias)} shafts, {len(train.frictions)} clutches and brakes, {len(train.plays)} plays, "
         f"{changes} changes",
     )  # fmt: skip
-
-
-def _course(rng: np.random.Generator, train: Train) -> tuple[np.ndarray, Any]:
-    """Times and values there; None if the reference cannot decide."""
-    ts = np.sort(rng.uniform(0.1, 1.0, 6)) * train.end
-    try:
-        values = train.run(ts)
-    except Delicate:
-        return ts, None
-    return ts, values if np.isfinite(values).all() else None
 
 
 def _source(written: bool, ev: EqnEnv, label: Any, table: tuple[list[float], list[float]]) -> tuple[Any, list, list]:

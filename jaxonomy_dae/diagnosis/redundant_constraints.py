@@ -154,7 +154,8 @@ def _of_part(model: ModelAt, entries: ConstraintEntries, rows: np.ndarray) -> li
         move[position] = column_scale * right[:, k]
         with np.errstate(all="ignore"):
             slope = row_scale[:, None] * matrix_of(evaluate_along(*where, move, *rest)) * column_scale
-        slope = np.where(np.isfinite(slope), slope, 0.0)
+        if not np.isfinite(slope).all():
+            return []
         changed[:, k] = left.T @ slope @ right
         size[:, k] = np.abs(left.T) @ np.abs(slope) @ np.abs(right)
     kept, still = _unchanged(changed.reshape(len(changed), -1), float(size.max(initial=0.0)))

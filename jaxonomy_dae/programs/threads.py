@@ -7,24 +7,18 @@ fit of 97 weights that was two thirds of the time and more.
 
 import contextlib
 import functools
-import importlib
-from typing import Any
+
+from threadpoolctl import ThreadpoolController
 
 LARGE = 3e8  # multiplications beyond which threads are worth it, some 0.1 s of one
 
 
 def one_thread(multiplications: float) -> contextlib.AbstractContextManager:
-    """Within it, BLAS and LAPACK use one thread for work of this size; as many as ever where it is large, or without
-    `threadpoolctl`, whose absence changes nothing but the time."""
-    controller = None if multiplications > LARGE else _controller()
-    return contextlib.nullcontext() if controller is None else controller.limit(limits=1, user_api="blas")
+    """Within it, BLAS and LAPACK use one thread for work of this size; as many as ever where it is large."""
+    return contextlib.nullcontext() if multiplications > LARGE else _controller().limit(limits=1, user_api="blas")
 
 
 @functools.cache
-def _controller() -> Any:
+def _controller() -> ThreadpoolController:
     """Of the libraries that are loaded; looking for them takes milliseconds."""
-    try:
-        threadpoolctl = importlib.import_module("threadpoolctl")
-    except ImportError:
-        return None
-    return threadpoolctl.ThreadpoolController()
+    return ThreadpoolController()

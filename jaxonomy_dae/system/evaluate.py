@@ -56,8 +56,7 @@ class Evaluation:
         self.typical = typical
         self.chunks: list[Chunk] = [state, inputs]
         self.parameters = parameters
-        self._scalars: list[Any] | None = None
-        self._sizes: list[Any] | None = None
+        self._scalars: dict[str, list[Any]] = {}
         self.dtype = parameters.dtype
         self.t = t
         self.networks = networks
@@ -86,11 +85,16 @@ class Evaluation:
 
     def parameter(self, k: int) -> Any:
         """A parameter, a scalar."""
-        if self.parameters.shape[0] > FEW:
-            return self.parameters[k]
-        if self._scalars is None:
-            self._scalars = entries(self.parameters)
-        return self._scalars[k]
+        return self._entry("parameters", k)
+
+    def _entry(self, name: str, k: int) -> Any:
+        """An entry of the parameters or of the typical sizes, a scalar."""
+        array = getattr(self, name)
+        if array.shape[0] > FEW:
+            return array[k]
+        if name not in self._scalars:
+            self._scalars[name] = entries(array)
+        return self._scalars[name][k]
 
     def read(self, gather: Gather) -> Any:
         """Gathered values: a scalar, or an array."""
@@ -102,7 +106,7 @@ class Evaluation:
             if isinstance(source, Gather):
                 slots.append(self.read(source))
             else:
-                slots.append(_scaled(factor, local[-1 - source], self.dtype))
+                slots.append(scaled_by(factor, local[-1 - source], self.dtype))
         equation = planned.equation
         n = equation.parameter.shape[0]
         if n == 1:
@@ -127,16 +131,16 @@ class Evaluation:
         is_long = isinstance(equation.template, LinearTemplate) and len(outside) >= LONG_SUM
         if is_long and all(isinstance(planned.sources[k], Gather) for k in outside):
             weights = -equation.coefficient[:, outside] / equation.coefficient[:, [positions[0]]]
-            return _scaled(1 / planned.factors[positions[0]], self._long_sum(planned, outside, weights), self.dtype)
+            return scaled_by(1 / planned.factors[positions[0]], self._long_sum(planned, outside, weights), self.dtype)
         local = list(local)
         local[unknown] = 0.0
         arguments = self._arguments(planned, local)
         if len(positions) == 1:
             value = equation.template.solve(positions[0], *arguments)
-            return _scaled(1 / planned.factors[positions[0]], value, self.dtype)
+            return scaled_by(1 / planned.factors[positions[0]], value, self.dtype)
         rest = equation.template.residual(*arguments)
         partials = equation.template.partial_values(*arguments)
-        slope = sum(_scaled(planned.factors[k], partials[k], self.dtype) for k in positions)
+        slope = sum(scaled_by(planned.factors[k], partials[k], self.dtype) for k in positions)
         return -rest / slope
 
     def _long_sum(self, planned: PlannedEquation, positions: Sequence[int], weights: np.ndarray) -> Any:
@@ -220,19 +224,11 @@ class Evaluation:
         for slot in planned.equation.slots:
             if len(slot.quantity) == 1:
                 k, factor = int(slot.quantity[0]), abs(float(slot.factor[0]))
-                out.append(0.0 if k == ZERO else times(factor, self._typical_entry(k)))
+                out.append(0.0 if k == ZERO else times(factor, self._entry("typical", k)))
             else:
                 factors = np.where(slot.quantity == ZERO, 0.0, np.abs(slot.factor))
                 out.append(jnp.asarray(factors, self.dtype) * take(self.typical, np.maximum(slot.quantity, 0)))
         return out
-
-    def _typical_entry(self, k: int) -> Any:
-        """The typical size of a quantity, a scalar."""
-        if self.typical.shape[0] > FEW:
-            return self.typical[k]
-        if self._sizes is None:
-            self._sizes = entries(self.typical)
-        return self._sizes[k]
 
     def _still_arguments(self, planned: PlannedEquation, local: list[Any]):
         """The arguments of an equation's template, not differentiated."""
@@ -252,7 +248,7 @@ class Evaluation:
             slope, total = 0.0, eps * self._magnitude(equation, local)
             for place, factor, s, p, n in zip(places, equation.factors, slots, partials, before, strict=False):
                 if place == u:
-                    slope = slope + _scaled(factor, p, self.dtype)
+                    slope = slope + scaled_by(factor, p, self.dtype)
                 else:
                     total = total + jnp.abs(p) * (eps * jnp.abs(s) + n)
             noise[u] = total / jnp.abs(slope)
@@ -261,7 +257,7 @@ class Evaluation:
     def _of_slots(self, planned: PlannedEquation, noise: list[Any]) -> list[Any]:
         """The noise of an equation's slots."""
         pairs = zip(planned.equation.slots, planned.factors, strict=True)
-        return [0.0 if s.local < 0 else _scaled(abs(f), noise[s.local], self.dtype) for s, f in pairs]
+        return [0.0 if s.local < 0 else scaled_by(abs(f), noise[s.local], self.dtype) for s, f in pairs]
 
     def _terms(self, planned: PlannedEquation, local: list[Any]) -> tuple[Any, list[Any], Sequence[Any]]:
         """An equation's residual, slots and partial derivatives, not differentiated; of a network's output, y − N(u),
@@ -332,7 +328,7 @@ class Evaluation:
     def _entries(self, planned: PlannedSparse, equations: list[tuple[Any, Sequence[Any]]]) -> Any:
         """The entries of the matrix of large blocks, from the residuals and partial derivatives of their equations."""
         values = [
-            _scaled(factor, take(self._filled(partials[k], r.shape), instances), self.dtype)
+            scaled_by(factor, take(self._filled(partials[k], r.shape), instances), self.dtype)
             for (r, partials), entries in zip(equations, planned.entries, strict=True)
             for k, instances, factor in entries
         ]
@@ -405,7 +401,7 @@ class Evaluation:
             rest = template.residual(*arguments)
             # A network's output stands alone, its inputs are outside.
             partials = {inside[0]: 1.0} if template.opaque is not None else template.partial_values(*arguments)
-        return rest, [(equation.slots[k].local, _scaled(planned.factors[k], partials[k], self.dtype)) for k in inside]
+        return rest, [(equation.slots[k].local, scaled_by(planned.factors[k], partials[k], self.dtype)) for k in inside]
 
     def _constant(self, value: Any) -> Any:
         return value if isinstance(value, float) else jnp.asarray(value, self.dtype)
@@ -505,5 +501,5 @@ def newton(residuals: Callable[[list[Any]], list[Any]], z: list[Any]) -> list[An
     return list(stacked - jnp.moveaxis(step, -1, 0))
 
 
-def _scaled(factor: Any, value: Any, dtype) -> Any:
+def scaled_by(factor: Any, value: Any, dtype) -> Any:
     return times(factor if isinstance(factor, float) else jnp.asarray(factor, dtype), value)

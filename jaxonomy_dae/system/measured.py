@@ -16,7 +16,7 @@ from ..linear.whole import solve_whole
 from ..lowering.gather import Chunk, Gather
 from ..lowering.program import PlannedEquation, PlannedLoop, PlannedSparse, PlannedStep, Program
 from ..model.evaluate_numpy import Networks
-from .evaluate import Evaluation, Refinement
+from .evaluate import Evaluation, Refinement, scaled_by
 
 
 class Measured(Evaluation):
@@ -58,7 +58,9 @@ class Measured(Evaluation):
     def sizes_of_slots(self, planned: PlannedEquation, local: list[Any]) -> list[Any]:
         """The magnitudes of an equation's slots, given those of local unknowns."""
         pairs = zip(planned.sources, planned.factors, strict=True)
-        return [self.size(s) if isinstance(s, Gather) else jnp.abs(jnp.asarray(f)) * local[-1 - s] for s, f in pairs]
+        return [
+            self.size(s) if isinstance(s, Gather) else scaled_by(np.abs(f), local[-1 - s], self.dtype) for s, f in pairs
+        ]
 
     def _terms_of(self, planned: PlannedEquation, values: list[Any], sizes: list[Any]) -> Any:
         """The magnitude of an equation."""
@@ -90,7 +92,7 @@ class Measured(Evaluation):
             return 1.0
         partials = template.partial_values(*self._arguments(planned, values))
         here = [k for k, s in enumerate(planned.equation.slots) if s.local == unknown]
-        return jnp.abs(sum(jnp.asarray(planned.factors[k] * partials[k], self.dtype) for k in here))
+        return jnp.abs(sum(scaled_by(planned.factors[k], partials[k], self.dtype) for k in here))
 
     def _block_magnitudes(self, planned: PlannedStep, values: list[Any], shape: tuple[int, ...]) -> list[Any]:
         sizes = [jnp.abs(v) for v in values]
