@@ -49,6 +49,9 @@ def random_factors(rng: np.random.Generator, model: FlatModel, kind: str) -> Fac
     assert kind in (*KINDS, "none"), kind
     equation = factors(model.n_equations, kind != "none")
     parameter = factors(len(model.parameters), kind not in ("equations", "none"))
+    # Discrete variables number modes: they are compared with whole numbers, and have no unit.
+    parameter[model.parameters.discrete] = 1.0
+    parameter[model.parameters.n_declared :] = 1.0
     if kind == "units":
         units = sorted(set(model.variables.unit))
         of_unit = dict(zip(units, factors(len(units)), strict=True))
