@@ -285,6 +285,6 @@ def _arrow(pair: tuple[str, str]) -> str:
 def _equation_label(plan: Any, equation: int) -> str:
     from .model.tables import provenance_of
 
-    text = str(provenance_of(plan.groups, int(plan.extended.base[equation]))).replace("0 = ", "")
+    text = str(provenance_of(plan.model.groups, int(plan.extended.base[equation]))).replace("0 = ", "")
     text = text if len(text) <= 40 else text[:39] + "…"
     return text + "\u2032" * int(plan.extended.level[equation])

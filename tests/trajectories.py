@@ -43,10 +43,7 @@ def states_at(
     assert not system.carried, "the field of nonlinear blocks is only as good as a stage needs it"
     assert not system.plan.n_constraints, "inputs at the start move redundant states, and a run projects them"
     plan = system.plan
-    point = initial_point(
-        plan.flat, plan.variable_map, plan.extended
-    ).values  # by NumPy: `initialize` compiles its ladder
-    start = point[plan.states]
+    start = initial_point(plan.model).values[plan.states]  # by NumPy: `initialize` compiles its ladder
     field = jax.jit(lambda t, x: system.vector_field(t, x, inputs))
     aside = ASIDE * (ts[-1] - ts[0])
     return integrated(lambda t, x: np.asarray(field(t, x)), start, ts, ends=edges, rtol=rtol, aside=aside).T

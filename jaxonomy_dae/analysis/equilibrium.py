@@ -19,7 +19,7 @@ from ..initialization.ladder import FAILED, find_root
 from ..initialization.sizes import Sizes
 from ..linear.least_squares import least_squares
 from ..lowering.plan import SystemPlan
-from ..model.quantities import declared_scale, quantity_bounds
+from ..model.declared import declared_scale, quantity_bounds
 from ..programs.cache import compiled
 from ..system.system import AcausalSystem
 
@@ -59,7 +59,7 @@ def find_equilibrium(system: AcausalSystem, t: Any, x0: Any, inputs: Any, drifti
     frozen = tuple(frozen_inputs(given) for given in (system, t, inputs))
     start = x0[free]
     everywhere = np.concatenate([plan.states, plan.carried]).astype(np.int64)
-    scale = jnp.asarray(declared_scale(plan.flat, plan.variable_map, plan.extended)[everywhere], x0.dtype)
+    scale = jnp.asarray(declared_scale(plan.model)[everywhere], x0.dtype)
 
     def magnitude(w):
         still, t, inputs = frozen
@@ -79,7 +79,7 @@ def find_equilibrium(system: AcausalSystem, t: Any, x0: Any, inputs: Any, drifti
     zero = jnp.zeros((m,), x0.dtype)
     sizes = Sizes(nominal, jnp.maximum(jnp.abs(start), nominal), zero, zero)
     core = np.arange(m) if m == len(free) else None
-    bounds = quantity_bounds(plan.flat, plan.variable_map, plan.extended)[entries]
+    bounds = quantity_bounds(plan.model)[entries]
     found = find_root(lambda w: residual(w, *frozen), m, start, sizes, core, None, bounds, typical, magnitude)
     found = jax.lax.stop_gradient(found)
     # Where nothing was found, there is nothing to differentiate, and the others of a batch must not notice.

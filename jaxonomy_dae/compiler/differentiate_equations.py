@@ -5,34 +5,22 @@ import numpy as np
 from ..model.extended import Extended, ExtendedGroup, Quantities
 from ..model.tables import ZERO, EquationGroup
 from ..structure.pantelides import Offsets
+from .number_columns import Columns
 
 
-def differentiate_equations(
-    groups: tuple[EquationGroup, ...],
-    offsets: Offsets,
-    column: np.ndarray,
-    is_input: np.ndarray,
-    least: np.ndarray,
-    n_unknown: int,
-) -> Extended:
-    """Builds the extended system; column[v] numbers root variables, unknowns first, then inputs, least[v] is the lowest
-    order that root variable v must have."""
-    n_columns = int(column.max(initial=-1)) + 1
-    variable = np.full(n_columns, -1, np.int64)
-    present = np.flatnonzero(column >= 0)
-    variable[column[present]] = present
-    highest = np.zeros(n_columns, np.int64)
-    highest[:n_unknown] = offsets.variable
-    highest[n_unknown:] = least[variable[n_unknown:]]
+def differentiate_equations(groups: tuple[EquationGroup, ...], offsets: Offsets, columns: Columns) -> Extended:
+    """Builds the extended system; inputs have derivatives as high as equations and variables need them."""
+    column, n_unknown = columns.with_inputs, columns.n_unknown
+    highest = np.concatenate([offsets.variable, columns.least[n_unknown:]])
     first_equation = 0
     for group in groups:
         c = offsets.equation[first_equation : first_equation + len(group)]
         first_equation += len(group)
-        known = (group.variable != ZERO) & is_input[group.variable]
+        known = (group.variable != ZERO) & columns.is_input[group.variable]
         reached = (group.order + c[:, None])[known]
         np.maximum.at(highest, column[group.variable[known]], reached)
     first = np.concatenate([[0], np.cumsum(highest + 1)]).astype(np.int64)
-    quantities = Quantities(column, variable, n_unknown, highest, first)
+    quantities = Quantities(column, columns.variable, n_unknown, highest, first)
 
     c = offsets.equation
     first_extended = np.concatenate([[0], np.cumsum(c + 1)]).astype(np.int64)

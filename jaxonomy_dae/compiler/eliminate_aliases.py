@@ -54,7 +54,7 @@ class _Classes:
 
     @classmethod
     def alone(cls, v: VariableTable, differentiated: np.ndarray) -> "_Classes":
-        """Each variable for itself."""
+        """Every variable as its own root."""
         n = len(v)
         # The better root: an input, then what is differentiated, fixed, started, no port variable; then the first.
         better = np.lexsort((-np.arange(n), ~v.is_port, v.start.is_given, v.fixed, differentiated, v.is_input))
@@ -64,7 +64,7 @@ class _Classes:
         return cls(np.arange(n), zeros, np.ones(n), zeros.copy(), np.zeros((n, 2)), merit, v.is_input)
 
     def link(self, old: np.ndarray, root: np.ndarray, order: np.ndarray, factor: np.ndarray, products: np.ndarray):
-        """Former roots become factor·(root)^(order)."""
+        """Makes former roots factor·(root)^(order), and all variables that had them, too."""
         n = len(self.root)
         to = np.arange(n + 1)  # the last place is ZERO's
         more, times, count = np.zeros(n + 1, np.int64), np.ones(n + 1), np.zeros(n + 1, np.int64)

@@ -10,8 +10,12 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
-from ..model.extended import Extended
+from ..diagnosis.wording import itemised
+from ..errors import StructuralError
+from ..model.reduced import ReducedModel
+from ..model.tables import provenance_of
 from ..structure.matching import maximum_matching
+from .select_states import StateSelection
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,16 +35,21 @@ class Blocks:
         return len(self.level)
 
 
-def order_blocks(extended: Extended, known: np.ndarray, removed: np.ndarray) -> Blocks | np.ndarray:
-    """Orders the equations that are not in `removed` for the quantities that are not `known`.
+def order_blocks(model: ReducedModel, selection: StateSelection) -> Blocks:
+    """Orders the equations that are no constraints for the quantities that are neither states nor inputs.
 
-    Returns the blocks; or, if no perfect matching exists, the extended equations that were left unmatched.
+    **Raises:**
+
+    - `StructuralError` if equations are left with nothing to determine.
     """
+    extended = model.extended
+    known = np.zeros(extended.quantities.n, bool)
+    known[selection.states] = True
     unknown_id = np.full(extended.quantities.n, -1, np.int64)
     unknowns = np.flatnonzero(~known[: extended.quantities.n_unknown])
     unknown_id[unknowns] = np.arange(len(unknowns))
     kept = np.ones(extended.n_equations, bool)
-    kept[removed] = False
+    kept[selection.constraints] = False
     equations = np.flatnonzero(kept)
     wanted = unknown_id >= 0
     pointer, columns = extended.incidence(wanted)
@@ -53,7 +62,7 @@ def order_blocks(extended: Extended, known: np.ndarray, removed: np.ndarray) -> 
     pointer = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))]).astype(np.int64)
     matched = maximum_matching(pointer, columns, len(unknowns))
     if (matched < 0).any() or n != len(unknowns):
-        return equations[matched < 0]
+        raise StructuralError(_nothing_left(model, equations[matched < 0]))
 
     # Equation i depends on the equation that is matched with each of its other unknowns.
     equation_of = np.empty(n, np.int64)
@@ -72,6 +81,18 @@ def order_blocks(extended: Extended, known: np.ndarray, removed: np.ndarray) -> 
     sizes = np.bincount(rank[label], minlength=n_blocks)
     pointer = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
     return Blocks(pointer, equations[sorting], unknowns[matched[sorting]], level[block_order])
+
+
+def _nothing_left(model: ReducedModel, equations: np.ndarray) -> str:
+    """The text of an error about extended equations that no unknown is left for."""
+    left = [provenance_of(model.groups, int(model.extended.base[e])) for e in equations]
+    return "\n".join(
+        [
+            "after index reduction nothing is left for these equations to determine: they follow from the others, or "
+            "contradict them. Remove or change one of:",
+            *itemised(left),
+        ]
+    )
 
 
 def _levels(block: np.ndarray, needs: np.ndarray, n_blocks: int) -> np.ndarray:

@@ -11,8 +11,6 @@ from collections.abc import Hashable, Sequence
 from fractions import Fraction
 
 import numpy as np
-import scipy.sparse as sp
-from scipy.sparse.csgraph import connected_components
 
 from ..diagnosis.wording import alternatives, itemised, some
 from ..errors import StructuralError
@@ -25,14 +23,16 @@ from ..model.group import Group, Point
 from ..model.incidence import incidence
 from ..model.natural_sizes import natural_sizes
 from ..model.provenance import Provenance, combination
-from ..model.tables import ZERO, EquationGroup, equation_offsets, provenance_of
+from ..model.tables import ZERO, EquationGroup, ParameterTable, equation_offsets, provenance_of
 from ..modeling.symbols import TIME_LABEL
+from ..structure.diagonal_blocks import diagonal_blocks
 from ..structure.incidence import Incidence
 from ..structure.matching import maximum_matching
 from ..structure.pantelides import Offsets, reduce_index
 from .combine_equations import cancels_elsewhere, combine, graph_of, group_of, near, quantity_label, somewhere, tried
 from .exact_null_vectors import Row, sparsest_null_vector
 from .null_vectors import left_null_vectors, rational, weights_in_parameters
+from .number_columns import Columns
 
 LARGEST_BLOCK = 200  # equations of a block whose entries are not all simple numbers
 ROUNDS = 100
@@ -45,18 +45,14 @@ PARAMETERS = 4  # sample values of the parameters
 def reduce_with_cancellation(
     groups: tuple[EquationGroup, ...],
     signature: Incidence,
-    column: np.ndarray,
-    least: np.ndarray,
+    columns: Columns,
     matching: np.ndarray,
-    values: np.ndarray,
-    names: Sequence[str],
-    discrete: np.ndarray,
+    parameters: ParameterTable,
 ) -> tuple[tuple[EquationGroup, ...], Incidence, Offsets, tuple[str, ...]]:
     """Index reduction, repeated until no diagonal block with constant coefficients is singular.
 
-    `signature` is the incidence of the equations, `matching` what `match_highest` finds in it; `values` and `names` are
-    those of parameters, of which those in `discrete` are discrete variables. Returns the equations, changed where
-    something cancelled, their incidence and offsets, and notes.
+    `signature` is the incidence of the equations, `matching` what `match_highest` finds in it. Returns the
+    equations, changed where something cancelled, their incidence and offsets, and notes.
 
     **Raises:**
 
@@ -66,11 +62,11 @@ def reduce_with_cancellation(
     n_unknown = signature.n_variables
     highest: np.ndarray | None = matching
     for _ in range(ROUNDS):
-        offsets = reduce_index(signature, least, highest)
-        jacobian = _Jacobian(groups, offsets, column, values)
+        offsets = reduce_index(signature, columns.least_of_unknown, highest)
+        jacobian = _Jacobian(groups, offsets, columns.number, parameters.values)
         replaced, added, combined = [], [], []
         for equations in _blocks_that_may_cancel(signature, jacobian):
-            found = _combination(jacobian, equations, names, discrete)
+            found = _combination(jacobian, equations, parameters.names, parameters.discrete)
             if found is not None:
                 combined = [provenance_of(groups, int(e)) for e in equations]
                 replaced.append(found[0])
@@ -80,7 +76,7 @@ def reduce_with_cancellation(
         sources = [group.provenance[0] for group in added]
         notes += [f"highest derivatives cancel in {'a ' if source.sources else ''}{source}" for source in sources]
         groups = (*_without(groups, replaced), *added)
-        signature, highest = incidence(groups, column, n_unknown), None
+        signature, highest = incidence(groups, columns.number, n_unknown), None
         if (maximum_matching(signature.pointer, signature.variable, n_unknown) < 0).any():
             raise StructuralError(_dependent(combined))
     raise StructuralError(_dependent(combined))
@@ -92,23 +88,10 @@ def _dependent(equations: list[Provenance]) -> str:
     return "\n".join(lines + itemised(equations))
 
 
-def _blocks(signature: Incidence, offsets: Offsets) -> tuple[np.ndarray, np.ndarray]:
-    """The diagonal block of every equation in the system Jacobian, and how many equations that block has."""
-    rows, n = signature.rows, signature.n_equations
-    active = signature.order + offsets.equation[rows] == offsets.variable[signature.variable]
-    owner = np.empty(signature.n_variables, np.int64)
-    owner[offsets.matched_variable] = np.arange(n)
-    follow = (rows[active], owner[signature.variable[active]])
-    _, label = connected_components(
-        sp.coo_array((np.ones(len(follow[0])), follow), shape=(n, n)), directed=True, connection="strong"
-    )
-    return label, np.bincount(label)[label]
-
-
 def _blocks_that_may_cancel(signature: Incidence, jacobian: "_Jacobian") -> list[np.ndarray]:
     """The equations of each diagonal block that has more than one or in whose equation the terms of what it determines
     cancel."""
-    label, _ = _blocks(signature, jacobian.offsets)
+    label, _ = diagonal_blocks(signature, jacobian.offsets)
     sizes = np.bincount(label)
     order = np.argsort(label, kind="stable")
     start = np.concatenate([[0], np.cumsum(sizes)])
@@ -191,7 +174,7 @@ class _Jacobian:
         return found
 
     def at(self, equations: np.ndarray, columns: np.ndarray, trial: int) -> tuple[np.ndarray, np.ndarray]:
-        """The matrix at a random point, and bounds of the errors of its entries."""
+        """Returns (the matrix, bounds of the errors of its entries) at a trial's random point."""
         dense, errors = np.zeros((2, len(equations), len(columns)))
         for k, e in enumerate(equations.tolist()):
             g, i = self.place(e)
@@ -202,8 +185,8 @@ class _Jacobian:
         return dense, errors
 
     def _at_natural_sizes(self, equations: np.ndarray) -> tuple[list[ExtendedGroup], list[int], np.ndarray, np.ndarray]:
-        """The equations by themselves, in groups; their numbers, in that order; their quantities as (variable, order),
-        and sizes of these at which all terms are alike, whatever the units."""
+        """Regroups `equations`. Returns (groups, equation numbers in group order, quantities as (variable, order) of
+        shape (q, 2), sizes of shape (q,)); the sizes balance the terms of each equation."""
         rows: dict[int, list[int]] = {}
         for e in equations.tolist():
             g, i = self.place(e)
@@ -232,8 +215,9 @@ class _Jacobian:
         return found
 
     def at_natural_size(self, equations: np.ndarray, columns: np.ndarray, trial: int) -> tuple[np.ndarray, np.ndarray]:
-        """The matrix at a random point where all terms of the equations are alike: what depends on the point may look
-        constant where one term is too small to be seen."""
+        """Returns (the matrix, bounds of its errors) at a random point where all terms of the equations are alike.
+        Elsewhere, an entry that depends on the point may look constant, because one of its terms is too small to be
+        seen."""
         groups, order, pairs, size = self._at_natural_sizes(equations)
         at = Point.of(size * somewhere(pairs[:, 0], pairs[:, 1], trial), self.values, 0.37 + 0.1 * trial)
         place = {e: k for k, e in enumerate(equations.tolist())}
@@ -480,31 +464,3 @@ def _hidden(equations: list[Provenance]) -> str:
         "or state the constraint that they hide as an equation of its own:"
     ]
     return "\n".join(lines + itemised(equations))
-
-
-def zero_pivots(groups, signature: Incidence, offsets: Offsets, column, values) -> np.ndarray:
-    """Equations that alone determine a quantity, whose coefficient is zero for the given parameter values, to rounding
-    of its terms."""
-    count = _blocks(signature, offsets)[1]
-    first = equation_offsets(groups)
-    found = []
-    for g, group in enumerate(groups):
-        template = group.template
-        if not template.n_parameters or not len(group):
-            continue
-        equation = np.arange(first[g], first[g + 1])
-        alone = count[equation] == 1
-        wanted = offsets.matched_variable[equation]
-        used = (group.variable != ZERO) & alone[:, None]
-        used &= column[group.variable] == wanted[:, None]
-        used &= group.order + offsets.equation[equation][:, None] == offsets.variable[wanted][:, None]
-        slots = np.flatnonzero(used.any(axis=0))
-        if not len(slots) or not all(template.coefficient_is_constant(int(k)) for k in slots):
-            continue
-        reads = np.zeros(group.variable.shape, np.int64)  # whatever the slots are: these entries are constant
-        own = Group(template, equation, reads, group.factor, group.parameter, group.coefficient)
-        at = Point.of(np.ones(1), values, 0.0)
-        coefficient = (used * own.partials(at))[:, slots].sum(axis=1)
-        bound = (used * own.partial_errors(at, np.zeros(2)))[:, slots].sum(axis=1)
-        found.append(equation[used.any(axis=1) & (np.abs(coefficient) <= bound)])
-    return np.concatenate(found) if found else np.zeros(0, np.int64)

@@ -11,17 +11,23 @@ motion) is set apart first: it is known and not a state.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Sequence
 
 import numpy as np
 
+from ..diagnosis.redundant_constraints import ModelAt, dependent_constraints
 from ..errors import StructuralError
 from ..expressions.errors import KNOWN
 from ..judgement.rank import above_errors, rank_of
+from ..model.consistent_point import initial_point
 from ..model.constraint_jacobian import constraint_entries, evaluate, evaluate_errors, independent_parts
+from ..model.declared import declared_scale
 from ..model.extended import Extended
 from ..model.group import Point
+from ..model.reduced import ReducedModel
 from ..model.tables import ZERO, EquationGroup, equation_offsets
+from ..model.typical_sizes import error_sizes, unrounded_sizes
+from .preferences import Merit
 
 POOR_PIVOT = 0.1  # a preferred pivot may be this much smaller than the best one
 POORER_PIVOT = 1e-3  # so much smaller if the better ones would all be of preferred states
@@ -79,34 +85,19 @@ def _settled(groups: tuple[EquationGroup, ...], extended: Extended, c: np.ndarra
     return found_rows, found_columns
 
 
-def select_states(
-    groups: tuple[EquationGroup, ...],
-    extended: Extended,
-    mode: str,
-    merit: Callable[[int], tuple],
-    scale: np.ndarray,
-    point: Callable[[], Point],
-    error_sizes: Callable[[], np.ndarray],
-    name: Callable[[int], str],
-    equation_name: Callable[[int], str],
-    dependent: Callable[[np.ndarray], list[str]],
-) -> StateSelection:
+def select_states(model: ReducedModel, mode: str, merit: Sequence[Merit]) -> StateSelection:
     """Selects states.
 
     **Arguments:**
 
     - `mode`: "auto", "dummy_derivatives" or "projection".
-    - `merit`: how much a quantity should be a state; larger tuples are kept, ties go to the first quantity.
-    - `scale`: the typical size of every quantity.
-    - `point`: called only if numbers are needed: all quantities near the initial point, parameters, networks.
-    - `error_sizes`: called with it: the sizes to whose rounding quantities are known.
-    - `name`, `equation_name`: of a quantity and of an equation, for messages.
-    - `dependent`: called only if constraints depend on each other: which ones, given the settled quantities.
+    - `merit`: how much each quantity should be a state; ties go to the first quantity.
 
     **Raises:**
 
     - `StructuralError` if hidden constraints depend on each other at the initial point.
     """
+    groups, extended = model.groups, model.extended
     quantities = extended.quantities
     unknown = quantities.n_unknown
     order, owner = quantities.order[:unknown], quantities.owner[:unknown]
@@ -125,34 +116,34 @@ def select_states(
         is_dummy = settled & candidate
         entries = entries.take(~alone[entries.row] & ~np.isin(entries.column, columns))
         notes += [
-            f"{name(int(q))} was preferred as a state, but equations without states determine it"
-            for q in np.flatnonzero(is_dummy)
-            if merit(int(q))[0] > 0
+            f"{model.names[q]} was preferred as a state, but equations without states determine it"
+            for q in np.flatnonzero(is_dummy).tolist()
+            if merit[q][0] > 0
         ]
     constrained = np.flatnonzero((c > 0) & ~alone)
 
     if len(constrained):
         shape = (len(c), quantities.n_unknown_columns)
         parts = independent_parts(entries, constrained, shape)
-        numbers = None
+        at = None
         for rows, members in parts:
             constant = entries.constant[members].all()
             if mode == "projection" or (mode == "auto" and not constant):
                 projected[rows] = True
                 continue
-            if numbers is None:
-                at = point()
+            if at is None:
+                at, scale = initial_point(model), _scale(model)
                 numbers = evaluate(groups, extended, entries, at)
-                known = KNOWN * (np.abs(at.values[:-1]) + error_sizes())
+                known = KNOWN * (np.abs(at.values[:-1]) + error_sizes(model, at.parameters))
                 errors = evaluate_errors(groups, extended, entries, at, known)
             columns = np.unique(entries.column[members])
             dense, bounds = np.zeros((2, len(rows), len(columns)))
             place = np.searchsorted(rows, entries.row[members]), np.searchsorted(columns, entries.column[members])
             np.add.at(dense, place, numbers[members])
             np.add.at(bounds, place, errors[members])
-            chosen, more = _dummy_derivatives(dense, bounds, c[rows], columns, quantities, merit, scale, name)
+            chosen, more = _dummy_derivatives(model, dense, bounds, c[rows], columns, merit, scale)
             if chosen is None:
-                raise StructuralError(_dependence(dependent(np.flatnonzero(settled)), map(equation_name, rows[:6])))
+                raise StructuralError(_dependence(model, np.flatnonzero(settled), at, rows))
             is_dummy[chosen] = True
             notes.extend(more)
 
@@ -169,10 +160,19 @@ def select_states(
     )
 
 
-def _dependence(found: list[str], equations: Iterable[str]) -> str:
-    """The text of an error about constraints that depend on each other."""
+def _scale(model: ReducedModel) -> np.ndarray:
+    """The sizes by which variables are compared as states: as declared, or what their equations imply. They are not
+    rounded, for rounding could turn a small difference into a factor of two."""
+    declared = declared_scale(model)
+    return np.where(declared == 0.0, unrounded_sizes(model), declared)
+
+
+def _dependence(model: ReducedModel, settled: np.ndarray, at: Point, rows: np.ndarray) -> str:
+    """The text of an error about constraints, the equations `rows`, that depend on each other at a point."""
+    found = [str(one) for one in dependent_constraints(ModelAt(model, settled, at))]
     if found:
         return "\n".join(found)
+    equations = [model.text(int(e)) for e in rows[:6]]
     return (
         f"the constraints {'; '.join(equations)} do not determine as many variables as there are constraints at the "
         "initial point: one of them follows from the others, or the start values are at a singular position. Remove "
@@ -180,9 +180,10 @@ def _dependence(found: list[str], equations: Iterable[str]) -> str:
     )
 
 
-def _dummy_derivatives(dense, errors, c, columns, quantities, merit, scale, name):
+def _dummy_derivatives(model: ReducedModel, dense, errors, c, columns, merit: Sequence[Merit], scale):
     """Mattsson & Söderlind's selection, level by level: the candidate quantities that become dummies, None if rows
     depend on each other; and notes."""
+    quantities = model.extended.quantities
     notes: list[str] = []
     chosen: list[int] = []
     available = np.arange(len(columns))
@@ -192,16 +193,16 @@ def _dummy_derivatives(dense, errors, c, columns, quantities, merit, scale, name
         # If the (d − level + 1)-th derivative is a dummy, the quantity below it is not a state.
         below = quantities.first[columns[available]] + quantities.highest[columns[available]] - level
         inside = np.ix_(rows, available)
-        keys = [(merit(int(q)), -int(q)) for q in below]
+        keys = [(merit[q], -q) for q in below.tolist()]
         picked = _pivots(dense[inside] * scale[below], errors[inside] * scale[below], keys)
         if picked is None:
             return None, notes
-        by_merit = sorted(range(len(below)), key=lambda k: (merit(int(below[k])), -int(below[k])))
+        by_merit = sorted(range(len(below)), key=keys.__getitem__)
         wanted = set(by_merit[: len(picked)])
         for k in picked:
-            if k not in wanted and merit(int(below[k]))[0] > 0:
+            if k not in wanted and _is_preferred(keys[k]):
                 notes.append(
-                    f"{name(int(below[k]))} was preferred as a state, but the constraints have to determine it: any "
+                    f"{model.names[below[k]]} was preferred as a state, but the constraints have to determine it: any "
                     "other choice is nearly singular at the initial point"
                 )
         chosen.extend(int(below[k]) for k in picked)

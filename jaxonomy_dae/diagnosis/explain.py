@@ -26,7 +26,8 @@ class Explainer:
         self.number = {name: k for k, name in enumerate(flat.components)}
 
     def behind(self, rows: list[int]) -> tuple[np.ndarray, np.ndarray]:
-        """The equations, with those that determine their known variables; and all variables in them."""
+        """Returns (the equations `rows` with those that determine their known variables, all variables in them),
+        reduced to the smallest set of equations that depend on each other."""
         seen, todo, variables = set(rows), list(rows), set()
         while todo:
             row = todo.pop()
@@ -58,7 +59,8 @@ class Explainer:
         return rows, np.unique(np.concatenate(kept)) if kept else variables[:0]
 
     def kind(self, rows: np.ndarray, variables: np.ndarray) -> str:
-        """'across' or 'through' if it is that at ports of one domain what components determine, else 'mixed'."""
+        """'across' or 'through', if these equations determine quantities of that kind at ports of one domain; else
+        'mixed'."""
         table = self.flat.variables
         at_ports = variables[table.port[variables] >= 0]
         domains = {self.flat.ports.domains[p] for p in table.port[at_ports].tolist()}

@@ -33,12 +33,11 @@ from ..model.constraint_jacobian import (
     evaluate_errors,
     independent_parts,
 )
-from ..model.extended import Extended
 from ..model.group import Group, Point
 from ..model.linear_template import LinearTemplate
 from ..model.provenance import Provenance
-from ..model.quantities import QuantityMap
-from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, equation_offsets, provenance_of
+from ..model.reduced import ReducedModel
+from ..model.tables import ZERO, AliasTable, FlatModel, equation_offsets, provenance_of
 from ..model.typical_sizes import error_sizes
 from .wording import listed, words
 
@@ -53,20 +52,16 @@ YIELDS = "or replace one by a part that yields, such as a spring"
 
 @dataclasses.dataclass(frozen=True)
 class ModelAt:
-    """A compiled model, and the values of all its quantities at a point."""
+    """A model, and the values of all its quantities at a point."""
 
-    flat: FlatModel
-    alias: AliasTable
-    variables: QuantityMap
-    groups: tuple[EquationGroup, ...]
-    extended: Extended
+    model: ReducedModel
     settled: np.ndarray  # quantities that equations determine without any state
     point: Point
 
     @functools.cached_property
     def error_sizes(self) -> np.ndarray:
         """The sizes to whose rounding all quantities are known."""
-        return error_sizes(self.flat, self.variables, self.extended, self.point.parameters)
+        return error_sizes(self.model, self.point.parameters)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,46 +91,46 @@ class DependentConstraints:
         )
 
 
-def dependent_constraints(model: ModelAt) -> list[DependentConstraints]:
+def dependent_constraints(at: ModelAt) -> list[DependentConstraints]:
     """The constraints that depend on each other at the point, redundant ones first."""
-    entries, parts = _parts(model)
+    entries, parts = _parts(at)
     found = []
     for rows, members in parts:
         if len(rows) <= LARGEST:
-            found += _of_part(model, entries.take(members), rows)
+            found += _of_part(at, entries.take(members), rows)
     return sorted(found, key=lambda f: not f.is_redundant)
 
 
-def _parts(model: ModelAt) -> tuple[ConstraintEntries, list[tuple[np.ndarray, np.ndarray]]]:
-    quantities = model.extended.quantities
-    entries = constraint_entries(model.groups, model.extended)
-    entries = entries.take(~np.isin(entries.column, quantities.owner[model.settled]))
-    n_rows = equation_offsets(model.groups)[-1]
+def _parts(at: ModelAt) -> tuple[ConstraintEntries, list[tuple[np.ndarray, np.ndarray]]]:
+    quantities = at.model.extended.quantities
+    entries = constraint_entries(at.model.groups, at.model.extended)
+    entries = entries.take(~np.isin(entries.column, quantities.owner[at.settled]))
+    n_rows = equation_offsets(at.model.groups)[-1]
     shape = (int(n_rows), quantities.n_unknown_columns)
     return entries, independent_parts(entries, np.unique(entries.row), shape)
 
 
-def _of_part(model: ModelAt, entries: ConstraintEntries, rows: np.ndarray) -> list[DependentConstraints]:
+def _of_part(at: ModelAt, entries: ConstraintEntries, rows: np.ndarray) -> list[DependentConstraints]:
     columns = np.unique(entries.column)
     place = (np.searchsorted(rows, entries.row), np.searchsorted(columns, entries.column))
-    quantities = model.extended.quantities
-    c = np.bincount(model.extended.base) - 1
+    quantities = at.model.extended.quantities
+    c = np.bincount(at.model.extended.base) - 1
     if len(np.unique(c[rows])) > 1:
         return []  # constraints of several orders: their Jacobian is no derivative by one set of quantities
     position = quantities.first[columns] + quantities.highest[columns] - c[rows[0]]
 
     def matrix_of(numbers: np.ndarray) -> np.ndarray:
-        matrix = np.zeros((len(rows), len(columns)))
-        np.add.at(matrix, place, numbers)
-        return matrix
+        dense = np.zeros((len(rows), len(columns)))
+        np.add.at(dense, place, numbers)
+        return dense
 
-    where = model.groups, model.extended, entries, model.point
-    at = matrix_of(evaluate(*where))
-    bounds = matrix_of(evaluate_errors(*where, KNOWN * (np.abs(model.point.values[:-1]) + model.error_sizes)))
-    if not np.isfinite(at).all():
+    where = at.model.groups, at.model.extended, entries, at.point
+    matrix = matrix_of(evaluate(*where))
+    bounds = matrix_of(evaluate_errors(*where, KNOWN * (np.abs(at.point.values[:-1]) + at.error_sizes)))
+    if not np.isfinite(matrix).all():
         return []
-    at = above_errors(at, bounds)  # sin(1e-17) is zero, and no scale may make it one
-    scaled, row_scale, column_scale = balanced(at)
+    matrix = above_errors(matrix, bounds)  # sin(1e-17) is zero, and no scale may make it one
+    scaled, row_scale, column_scale = balanced(matrix)
     u, s, vt = np.linalg.svd(scaled.toarray())
     small = ALWAYS if entries.constant.all() else DEPENDENT
     rank = int((s > small * max(s[0], 1e-300)).sum())
@@ -145,7 +140,7 @@ def _of_part(model: ModelAt, entries: ConstraintEntries, rows: np.ndarray) -> li
     changed = np.zeros((left.shape[1], right.shape[1], right.shape[1]))
     size = np.zeros_like(changed)
     for k in range(right.shape[1]):
-        move = np.zeros(model.extended.quantities.n)
+        move = np.zeros(at.model.extended.quantities.n)
         move[position] = column_scale * right[:, k]
         slope = row_scale[:, None] * matrix_of(evaluate_along(*where, move)) * column_scale
         if not np.isfinite(slope).all():
@@ -155,10 +150,10 @@ def _of_part(model: ModelAt, entries: ConstraintEntries, rows: np.ndarray) -> li
     kept, still = _unchanged(changed.reshape(len(changed), -1), float(size.max(initial=0.0)))
     found = []
     for basis, is_redundant in ((left @ still, True), (left @ kept, False)):
-        for support in _connected(basis, at):
+        for support in _connected(basis, matrix):
             count = int(np.linalg.matrix_rank(basis[support], tol=1e-6))
             weight = row_scale[support, None] * basis[support]
-            names, forces = _behind(model, rows[support], weight)
+            names, forces = _behind(at, rows[support], weight)
             if names:
                 found.append(DependentConstraints(names, count, is_redundant, forces))
     return found
@@ -187,21 +182,21 @@ def _connected(basis: np.ndarray, matrix: np.ndarray) -> list[np.ndarray]:
 # --- who wrote them ----------------------------------------------------------------------------------------------
 
 
-def _behind(model: ModelAt, equations: np.ndarray, weight: np.ndarray) -> tuple[tuple[str, ...], str]:
+def _behind(at: ModelAt, equations: np.ndarray, weight: np.ndarray) -> tuple[tuple[str, ...], str]:
     """The components that a combination of equations goes through, and what their ports call forces.
 
     `weight` has a column for each of the combinations.
     """
-    flat = model.flat
+    flat = at.model.flat
     wanted: dict[tuple[str, str], list[np.ndarray]] = {}
     names: set[str] = set()
     for equation, w in zip(equations.tolist(), weight, strict=True):
-        source = provenance_of(model.groups, equation)
+        source = provenance_of(at.model.groups, equation)
         for one in source.sources or (source,):
             wanted.setdefault((one.component, one.statement), []).append(w)
             names.add(one.component)
-    demand = _demands(model, wanted)
-    names |= _ties(flat, model.alias, demand)
+    demand = _demands(at, wanted)
+    names |= _ties(flat, at.model.alias, demand)
     ports = np.unique(flat.variables.port[list(demand)]) if demand else np.zeros(0, np.int64)
     domains = {flat.ports.domains[p] for p in ports.tolist() if p >= 0}
     mechanical = not domains or domains & {*MECHANICAL}
@@ -222,14 +217,14 @@ def _composites(components: list[str]) -> tuple[str, ...]:
     return tuple(found) if len(found) > 1 else tuple(components)
 
 
-def _demands(model: ModelAt, wanted: dict[tuple[str, str], list[np.ndarray]]) -> dict[int, np.ndarray]:
+def _demands(at: ModelAt, wanted: dict[tuple[str, str], list[np.ndarray]]) -> dict[int, np.ndarray]:
     """Σ weight·∂(equation)/∂(variable) of every variable as written, where it is not zero."""
-    quantity, factor = model.variables.quantity, model.variables.factor
-    padded = model.point.values
+    quantity, factor = at.model.variables.quantity, at.model.variables.factor
+    padded = at.point.values
     values = np.where(quantity >= ZERO, padded[np.maximum(quantity, ZERO)], np.nan) * factor
-    at = model.point.at(values)  # by variables, as equations are written
+    there = at.point.at(values)  # by variables, as equations are written
     out: dict[int, np.ndarray] = {}
-    for group in model.flat.groups:
+    for group in at.model.flat.groups:
         for i, source in enumerate(group.provenance):
             for w in wanted.get((source.component, source.statement), ())[:1]:
                 row = slice(i, i + 1)
@@ -240,7 +235,7 @@ def _demands(model: ModelAt, wanted: dict[tuple[str, str], list[np.ndarray]]) ->
                     group.factor[row],
                     group.parameter[row],
                     group.coefficient[row],
-                ).partials(at)
+                ).partials(there)
                 for v, slope in zip(group.variable[i].tolist(), slopes[0].tolist(), strict=True):
                     if v != ZERO:
                         out[v] = out.get(v, 0.0) + slope * w
@@ -309,15 +304,15 @@ def _named(flat: FlatModel, names: set[str]) -> tuple[str, ...]:
     return _composites([c for c in components if not _only_holds(flat, c)] or components)
 
 
-def no_freedom(model: ModelAt) -> list[tuple[str, ...]]:
+def no_freedom(at: ModelAt) -> list[tuple[str, ...]]:
     """Components of parts in which there are as many constraints as variables they restrict."""
-    entries, parts = _parts(model)
+    entries, parts = _parts(at)
     found = []
     for rows, members in parts:
         inside = entries.take(members)
         if len(rows) == len(np.unique(inside.column)) and not inside.constant.all():
-            equations = [provenance_of(model.groups, r) for r in rows.tolist()]
-            found.append(behind(model.flat, model.alias, equations))
+            equations = [provenance_of(at.model.groups, r) for r in rows.tolist()]
+            found.append(behind(at.model.flat, at.model.alias, equations))
     return found
 
 

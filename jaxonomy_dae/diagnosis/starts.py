@@ -8,9 +8,9 @@ numbers) is an error here; what must agree is noted in the report.
 import numpy as np
 
 from ..errors import StructuralError
-from ..model.extended import Extended
+from ..model.declared import leading_starts
 from ..model.linear_template import LinearTemplate
-from ..model.quantities import QuantityMap, leading_starts
+from ..model.reduced import ReducedModel
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel
 from ..structure.dulmage_mendelsohn import dulmage_mendelsohn
 from ..structure.incidence import Incidence, compress
@@ -107,15 +107,15 @@ def _check_linear(flat: FlatModel, groups, numbers: dict[tuple[int, int], tuple[
             )
 
 
-def note_several_guesses(flat: FlatModel, variables: QuantityMap) -> tuple[str, ...]:
+def note_several_guesses(model: ReducedModel) -> tuple[str, ...]:
     """Notes on guesses of one quantity that differ: one of them counts, and the user should know which."""
-    table = flat.variables
+    variables, table = model.variables, model.flat.variables
     v = np.flatnonzero(table.start.is_given & (variables.quantity >= 0))
-    value = table.start.values(flat.parameters.values)[v] / variables.factor[v]
+    value = table.start.values(model.flat.parameters.values)[v] / variables.factor[v]
     of: dict[int, list[int]] = {}
     for k, q in enumerate(variables.quantity[v].tolist()):
         of.setdefault(q, []).append(k)
-    leading = set(leading_starts(flat, variables).tolist())
+    leading = set(leading_starts(model).tolist())
     notes = []
     for places in of.values():
         if len(places) < 2 or table.fixed[v[places]].any():
@@ -128,16 +128,16 @@ def note_several_guesses(flat: FlatModel, variables: QuantityMap) -> tuple[str, 
     return tuple(notes)
 
 
-def dependent_starts(flat: FlatModel, variables: QuantityMap, extended: Extended) -> tuple[str, ...]:
+def dependent_starts(model: ReducedModel) -> tuple[str, ...]:
     """Notes on fixed starts that outnumber what they can choose: they must agree.
 
     The fixed starts join the extended system as equations; they depend on each other where its Dulmage–Mendelsohn
     decomposition is over-determined.
     """
-    quantities = extended.quantities
+    flat, extended, quantities = model.flat, model.extended, model.extended.quantities
     pins: dict[int, int] = {}
     for v in np.flatnonzero(flat.variables.fixed).tolist():
-        q, _ = variables[v]
+        q, _ = model.variables[v]
         if 0 <= q < quantities.n_unknown:
             pins.setdefault(q, v)
     pinned = np.array(list(pins), np.int64)

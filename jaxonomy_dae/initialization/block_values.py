@@ -107,4 +107,4 @@ class BlockValues:
 @functools.lru_cache(maxsize=64)
 def _error_sizes(plan: SystemPlan, parameters: bytes) -> np.ndarray:
     """The sizes to whose rounding all quantities are known."""
-    return error_sizes(plan.flat, plan.variable_map, plan.extended, np.frombuffer(parameters))
+    return error_sizes(plan.model, np.frombuffer(parameters))

@@ -7,9 +7,9 @@ import numpy as np
 from ..diagnosis.redundant_constraints import ModelAt
 from ..lowering.plan import SystemPlan
 from ..model.consistent_point import consistent_point
+from ..model.declared import start_guess
 from ..model.group import Point
 from ..model.networks import Networks
-from ..model.quantities import start_guess
 
 LARGEST = 1500  # unknown quantities: up to there, positions that are not states are found by dense algebra
 
@@ -26,11 +26,10 @@ def constraints_at(
     quantities = plan.extended.quantities
     if not plan.extended.level.any() or quantities.n_unknown > LARGEST or not np.isfinite(x).all():
         return None
-    guess, _ = start_guess(plan.flat, plan.variable_map, quantities.n)
+    guess, _ = start_guess(plan.model)
     pins = dict(zip([*plan.states.tolist(), *plan.carried.tolist()], x.tolist(), strict=True))
     guess[list(pins)] = list(pins.values())
     if quantities.n > quantities.n_unknown:
         guess[quantities.n_unknown :] = inputs()
     found = consistent_point(plan.extended, Point.of(guess, parameters, t, Networks(networks)), list(pins.items()))
-    settled = plan.selection.settled
-    return ModelAt(plan.flat, plan.alias, plan.variable_map, plan.groups, plan.extended, settled, found)
+    return ModelAt(plan.model, plan.selection.settled, found)

@@ -23,7 +23,7 @@ from ..linear.sparse import sparse_jacobian
 from ..linear.whole import solve_whole
 from ..lowering.gather import Gather, take, times
 from ..lowering.plan import SystemPlan
-from ..model.quantities import declared_scale, quantity_bounds
+from ..model.declared import declared_scale, quantity_bounds
 from ..programs.cache import PROGRAMS, compiled
 from ..programs.staging import is_staged
 from ..solvers.rows import not_a_number
@@ -66,7 +66,8 @@ def initialize(
     solve_for: tuple[str, ...] = (),
     solver: Any = None,
 ) -> InitialPoint:
-    """A pure function, to be used inside jit. Nothing is raised but for wrong names or counts: see `check`."""
+    """Finds a consistent point; a pure function, to be used inside jit. Raises errors for wrong names and counts only:
+    see `check`."""
     plan: SystemPlan = system.plan
     names = tuple(initial or ())
     table = system.parameters.table
@@ -100,7 +101,7 @@ def initialize(
 
     frozen = jax.lax.stop_gradient
     settings = (frozen(parameters), frozen_inputs(inputs), frozen(target))
-    nominal = jnp.asarray(declared_scale(plan.flat, plan.variable_map, plan.extended), point.dtype)
+    nominal = jnp.asarray(declared_scale(plan.model), point.dtype)
     nominal = nominal[np.concatenate([plan.states, plan.carried]).astype(np.int64)]
 
     def magnitude(w):
@@ -248,12 +249,13 @@ def _typical_of_rows(point: SystemAt, rows: InitialRows, first: int, read: list[
 
 
 def _rounding(residual: Callable[..., Any], settings, start: Any, sizes: Sizes, typical: Any) -> Any:
-    """Rows that are rounding errors and nothing else, among those of variables outside of the state, whose `typical`
-    sizes are given: they hold at the start, and neither it nor rounded parameters move them by more. Returns what
-    rounding may leave of each, shape (m,), zero for other rows.
+    """Finds rows of variables outside of the state that are rounding errors and nothing else, given these variables'
+    `typical` sizes: rows that hold at the start, where neither the start nor rounded parameters move them by more.
+    Returns the residual that rounding may leave of each, shape (m,), zero for other rows.
 
     A variable that is zero because its terms cancel depends on the state by rounding errors. In units of these, other
-    rows would give way to it."""
+    rows would give way to it.
+    """
     parameters, inputs, target = settings
     dtype = start.dtype
 
@@ -327,9 +329,7 @@ def _sizes(plan: SystemPlan, rows: InitialRows, given: list, parameters: Any, st
     dtype, n = parameters.dtype, plan.n_state
     more = start.shape[0] - n
     entries = np.concatenate([plan.states, plan.carried])
-    nominal = jnp.asarray(
-        np.append(declared_scale(plan.flat, plan.variable_map, plan.extended)[entries], np.zeros(more)), dtype
-    )
+    nominal = jnp.asarray(np.append(declared_scale(plan.model)[entries], np.zeros(more)), dtype)
     target, guess = _data_sizes(plan, rows, given, parameters)
     known = jnp.maximum(jnp.maximum(jnp.append(guess, jnp.zeros(more, dtype)), jnp.abs(start)), nominal)
     data = jnp.concatenate([jnp.zeros((plan.n_constraints + len(plan.carried),), dtype), target])
@@ -386,7 +386,7 @@ def _bounds(system: Any, plan: SystemPlan, unknown: np.ndarray) -> np.ndarray:
     """The bounds of the unknowns, shape (n, 2): those of parameters are checked afterwards."""
     entries = np.concatenate([plan.states, plan.carried])
     free = np.tile([-np.inf, np.inf], (len(unknown), 1))
-    return np.concatenate([quantity_bounds(plan.flat, plan.variable_map, plan.extended)[entries], free])
+    return np.concatenate([quantity_bounds(plan.model)[entries], free])
 
 
 def independent_rows(plan: SystemPlan, rows: InitialRows, n: int) -> np.ndarray | None:

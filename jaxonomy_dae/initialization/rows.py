@@ -21,11 +21,12 @@ from ..errors import InitializationError
 from ..judgement.rank import above_errors
 from ..judgement.scaling import balanced, equilibrated
 from ..lowering.plan import SystemPlan
+from ..model.declared import declared_scale, leading_starts
 from ..model.dependent_parameters import complete
 from ..model.jacobian import generic_jacobian
 from ..model.natural_sizes import natural_sizes
 from ..model.networks import Networks
-from ..model.quantities import ABSENT, declared_scale, leading_starts
+from ..model.quantities import ABSENT
 from ..model.tables import ZERO, Start
 from ..structure.matching import match_in_order
 
@@ -140,7 +141,7 @@ def _declared(plan: SystemPlan, names: tuple[str, ...]) -> tuple[list[Row], list
     ]
     overridden = {r.quantity for r in overrides}
     is_zero = variables.start.is_number & (variables.start.values(plan.flat.parameters.values) == 0.0)
-    leading = set(leading_starts(plan.flat, plan.variable_map).tolist())
+    leading = set(leading_starts(plan.model).tolist())
     started: dict[int, Row] = {}
     fixed: list[Row] = []
     for v in np.flatnonzero(variables.start.is_given).tolist():
@@ -162,7 +163,7 @@ def _generic(plan: SystemPlan, solve_for: tuple[int, ...]) -> _Generic:
     """Reads no values of parameters and no starts, which equal plans need not share."""
     extended = plan.extended
     n = extended.quantities.n_unknown
-    size = declared_scale(plan.flat, plan.variable_map, extended)
+    size = declared_scale(plan.model)
     size[size == 0.0] = 1.0
     n_parameters = len(plan.flat.parameters)
     parameter_size = np.ones(n_parameters)

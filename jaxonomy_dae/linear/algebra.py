@@ -73,11 +73,11 @@ class Dense(eqx.Module):
         return lx.MatrixLinearOperator(matrix)
 
     def blank(self, n: int, dtype: Any) -> Any:
-        """Something that looks like a matrix."""
+        """Zeros of a matrix's shape."""
         return jnp.zeros((n, n), dtype)
 
     def empty(self, n: int, dtype: Any) -> Any:
-        """Something that looks like a factorisation."""
+        """Zeros in the shapes of a factorisation."""
         square = jnp.zeros((n, n), dtype)
         return (square, jnp.zeros((n,), jnp.int32)) if n > EXPLICIT_INVERSE else square
 
@@ -154,11 +154,11 @@ class Sparse(eqx.Module):
         return SparseLinearOperator(matrix, _with_diagonal(self.pattern))
 
     def blank(self, n: int, dtype: Any) -> Any:
-        """Something that looks like a matrix."""
+        """Zeros of a matrix's shape."""
         return jnp.zeros((len(self.pattern) + n,), dtype)
 
     def empty(self, n: int, dtype: Any) -> Any:
-        """Something that looks like what `factor` returns."""
+        """Zeros in the shapes of what `factor` returns."""
         return self.blank(n, dtype)
 
     def apply(self, factor: Any, matrix: Any, b: Any) -> Any:

@@ -32,7 +32,7 @@ class _State(eqx.Module):
 
 
 class _AbstractDirect(lx.AbstractLinearSolver[_State]):
-    """Between vectors; a subclass says what is kept of a matrix, and how it is used."""
+    """A Lineax solver between vectors. A subclass says what is kept of a matrix, and how it is used."""
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> _State:
         del options

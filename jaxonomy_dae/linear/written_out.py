@@ -25,7 +25,7 @@ def solve(matrix: Sequence[Sequence[Any]], right: Sequence[Any], *, positive: bo
 
 
 def inverse(matrix: Sequence[Sequence[Any]]) -> list[list[Any]]:
-    """A⁻¹, in the same way."""
+    """A⁻¹, by elimination written out, as in `solve`."""
     n = len(matrix)
     one = jnp.ones_like(matrix[0][0])
     return solve_many(matrix, [[one if r == c else 0.0 * one for c in range(n)] for r in range(n)])

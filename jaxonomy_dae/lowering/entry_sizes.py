@@ -2,11 +2,10 @@
 
 import numpy as np
 
-from ..model.extended import Extended
+from ..model.declared import quantity_scale, start_guess
 from ..model.group import Point
 from ..model.networks import Networks
-from ..model.quantities import QuantityMap, quantity_scale, start_guess
-from ..model.tables import FlatModel
+from ..model.reduced import ReducedModel
 
 
 class EntrySizes:
@@ -16,12 +15,12 @@ class EntrySizes:
     one does not count as zero. What is not finite there counts as the largest entry of its equation.
     """
 
-    def __init__(self, flat: FlatModel, variables: QuantityMap, extended: Extended):
-        self.extended = extended
-        guess, _ = start_guess(flat, variables, extended.quantities.n)
-        networks = Networks(tuple(flat.networks.values()))
-        points = (guess, guess + quantity_scale(flat, variables, extended))
-        self.points = [Point.of(values, flat.parameters.values, 0.0, networks) for values in points]
+    def __init__(self, model: ReducedModel):
+        self.extended = model.extended
+        guess, _ = start_guess(model)
+        networks = Networks(tuple(model.flat.networks.values()))
+        points = (guess, guess + quantity_scale(model))
+        self.points = [Point.of(values, model.flat.parameters.values, 0.0, networks) for values in points]
         self._groups: dict[int, np.ndarray] = {}
 
     def of(self, group: int, slot: int) -> np.ndarray:

@@ -24,7 +24,8 @@ from .schedule import AnyStep, SparseStep, Step, StepEquation
 def without_live_relations(
     flat: FlatModel, variables: QuantityMap, steps: Sequence[AnyStep]
 ) -> tuple[FlatModel, tuple[str, ...]]:
-    """The model without the events of such relations, and notes about them."""
+    """Returns (the model without the events of relations that nonlinear equations need as they are, notes about
+    them)."""
     table = flat.events
     relation = np.array(table.relation, bool)
     if not relation.any():

@@ -11,8 +11,10 @@ import numpy as np
 from ..compiler.pipeline import CompiledModel
 from ..compiler.select_states import StateSelection
 from ..linear.sparse import check_solvable
+from ..model.declared import leading_starts, quantity_scale
 from ..model.extended import Extended
-from ..model.quantities import QuantityMap, leading_starts, quantity_scale
+from ..model.quantities import QuantityMap
+from ..model.reduced import ReducedModel
 from ..model.tables import ZERO, FlatModel, RowInjection
 from .entry_sizes import EntrySizes
 from .gather import NOTHING
@@ -27,16 +29,17 @@ from .schedule import AnyStep, SparseStep, Step, build_schedule, needed
 
 def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = None) -> SystemPlan:
     """Builds the plan; `linear_solver` is for blocks that stay whole."""
-    flat, variable_map, groups, extended = model.flat, model.variables, model.groups, model.extended
-    selection, blocks, mode, quantity_name = model.selection, model.blocks, model.mode, list(model.quantity_name)
+    reduced, selection = model.reduced, model.selection
+    variable_map, extended = reduced.variables, reduced.extended
     state_order = selection.states  # as they lie in the state array
     quantities = extended.quantities
     n = quantities.n
-    steps = build_schedule(extended, blocks, EntrySizes(flat, variable_map, extended))
+    steps = build_schedule(extended, model.blocks, EntrySizes(reduced))
     for step in steps:
         if isinstance(step, SparseStep) and linear_solver is None:
             check_solvable(step.n)
-    flat, left_alone = without_live_relations(flat, variable_map, steps)
+    flat, left_alone = without_live_relations(reduced.flat, variable_map, steps)
+    reduced = dataclasses.replace(reduced, flat=flat)
     selection = dataclasses.replace(selection, notes=(*selection.notes, *left_alone))
     carried = [quantities for step in steps for quantities in step.guessed]
     carried = np.concatenate(carried) if carried else np.zeros(0, np.int64)
@@ -68,7 +71,7 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
         flat,
         variable_map,
         state_order,
-        quantity_name,
+        reduced.names,
         extended,
         steps,
         lambda q: program(needed(steps, q, n)),
@@ -104,21 +107,15 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
     functions = tuple(opaque[k].function if k in opaque else None for k in range(len(flat.networks)))
     waves = plan_waves(needed(steps, np.concatenate([following, rates, constraint_slots, *watched]), n))
     return SystemPlan(
-        digest=_digest(flat, variable_map, mode, selection, state_order, extended, steps, linear_solver),
-        flat=flat,
-        alias=model.alias,
-        variable_map=variable_map,
-        groups=groups,
-        extended=extended,
+        digest=_digest(reduced, model.mode, selection, state_order, steps, linear_solver),
+        model=reduced,
         selection=selection,
         steps=steps,
-        blocks=blocks,
-        mode=mode,
-        variable_index={name: k for k, name in enumerate(variables.names)},
-        quantity_name=quantity_name,
+        blocks=model.blocks,
+        mode=model.mode,
         states=state_order,
         carried=carried,
-        nominal=quantity_scale(flat, variable_map, extended)[in_state],
+        nominal=quantity_scale(reduced)[in_state],
         inputs=inputs,
         derivative=derivative,
         next_derivative=derivative.layout.gather(following) if len(following) else NOTHING,
@@ -190,12 +187,10 @@ def _plan_row(row: RowInjection, inputs, variables: QuantityMap, states, layout:
 
 
 def _digest(
-    flat: FlatModel,
-    variables: QuantityMap,
+    model: ReducedModel,
     mode: str,
     selection: StateSelection,
     states: np.ndarray,
-    extended: Extended,
     steps: Sequence[AnyStep],
     linear_solver: Any,
 ) -> str:
@@ -207,6 +202,7 @@ def _digest(
             hasher.update(part.tobytes() if isinstance(part, np.ndarray) else repr(part).encode())
             hasher.update(b"|")
 
+    flat, extended = model.flat, model.extended
     v = flat.variables
     feed(flat.name, mode, v.names, v.is_input, v.fixed, v.nominal, v.bounds, v.default, flat.parameters.names)
     for s in v.start.groups:
@@ -245,7 +241,7 @@ def _digest(
     if linear_solver is not None:
         feed(repr(linear_solver))
     feed(states, selection.constraints, selection.dummies, extended.base, extended.level)
-    feed(leading_starts(flat, variables))  # depend on the values of parameters
+    feed(leading_starts(model))  # depend on the values of parameters
     for step in steps:
         # How a block is torn depends on the values of the parameters.
         if len(step.unknown) > 1 or isinstance(step, SparseStep):

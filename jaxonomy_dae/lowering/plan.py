@@ -17,7 +17,8 @@ from ..model.extended import Extended, ExtendedGroup
 from ..model.opaque import OpaqueFunction
 from ..model.provenance import differentiated
 from ..model.quantities import QuantityMap
-from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, provenance_of
+from ..model.reduced import ReducedModel
+from ..model.tables import ZERO, FlatModel, provenance_of
 from . import pattern
 from .dummy_blocks import DummyBlocks, dummy_blocks
 from .gather import Gather
@@ -72,18 +73,12 @@ class SystemPlan:
     """All that is static about a compiled system; compared and hashed by its digest."""
 
     digest: str
-    flat: FlatModel
-    alias: AliasTable
-    variable_map: QuantityMap
-    groups: tuple[EquationGroup, ...]
-    extended: Extended
+    model: ReducedModel
     selection: StateSelection
     steps: tuple[AnyStep, ...]
     blocks: Blocks
     mode: str
 
-    variable_index: dict[str, int]
-    quantity_name: list[str]
     states: np.ndarray  # quantities in the state array …
     carried: np.ndarray  # … followed by the tearing variables of nonlinear blocks
     nominal: np.ndarray  # of the state array
@@ -110,6 +105,31 @@ class SystemPlan:
 
     def __hash__(self):
         return hash(self.digest)
+
+    @property
+    def flat(self) -> FlatModel:
+        """The model as flattened."""
+        return self.model.flat
+
+    @property
+    def variable_map(self) -> QuantityMap:
+        """Which quantity each variable is."""
+        return self.model.variables
+
+    @property
+    def extended(self) -> Extended:
+        """The equations with their derivatives."""
+        return self.model.extended
+
+    @property
+    def quantity_name(self) -> tuple[str, ...]:
+        """A user's name for every quantity."""
+        return self.model.names
+
+    @functools.cached_property
+    def variable_index(self) -> dict[str, int]:
+        """The number of every variable by name."""
+        return {name: k for k, name in enumerate(self.flat.variables.names)}
 
     @property
     def n_state(self) -> int:
@@ -162,7 +182,7 @@ class SystemPlan:
     def describe(self, equation: int) -> str:
         """The text of an extended equation."""
         base, level = int(self.extended.base[equation]), int(self.extended.level[equation])
-        return differentiated(provenance_of(self.groups, base), level)
+        return differentiated(provenance_of(self.model.groups, base), level)
 
     @property
     def visible_variables(self) -> list[str]:

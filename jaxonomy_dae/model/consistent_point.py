@@ -6,19 +6,20 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..judgement.scaling import equilibrated
+from .declared import start_guess
 from .extended import Extended
 from .group import Point
 from .jacobian import residual_and_jacobian
 from .networks import Networks
-from .quantities import QuantityMap, start_guess
-from .tables import FlatModel
+from .reduced import ReducedModel
 
 
-def initial_point(flat: FlatModel, variables: QuantityMap, extended: Extended) -> Point:
+def initial_point(model: ReducedModel) -> Point:
     """All quantities near the declared starts, consistent where possible."""
-    guess, pins = start_guess(flat, variables, extended.quantities.n)
-    networks = Networks(tuple(flat.networks.values()))
-    return consistent_point(extended, Point.of(guess, flat.parameters.values, 0.0, networks), list(pins.items()))
+    guess, pins = start_guess(model)
+    networks = Networks(tuple(model.flat.networks.values()))
+    at = Point.of(guess, model.flat.parameters.values, 0.0, networks)
+    return consistent_point(model.extended, at, list(pins.items()))
 
 
 @np.errstate(all="ignore")  # numbers that overflow end the search

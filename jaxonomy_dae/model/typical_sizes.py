@@ -4,43 +4,41 @@ import numpy as np
 from jaxtyping import Float
 
 from ..expressions.errors import KNOWN
+from .declared import declared_scale
 from .extended import Extended
 from .natural_sizes import natural_sizes
-from .quantities import QuantityMap, declared_scale
-from .tables import FlatModel
+from .reduced import ReducedModel
 
 LIMIT = 600  # quantities up to which sizes are looked for
 DECADES = 30  # that they may span: single precision has 38
 
 
-def typical_sizes(flat: FlatModel, variables: QuantityMap, extended: Extended) -> Float[np.ndarray, " quantities"]:
+def typical_sizes(model: ReducedModel) -> Float[np.ndarray, " quantities"]:
     """Of all quantities, at the parameter values the model was compiled with; powers of two, by which numbers are
     multiplied without rounding."""
-    return _rounded(unrounded_sizes(flat, variables, extended))
+    return _rounded(unrounded_sizes(model))
 
 
 def _rounded(sizes: Float[np.ndarray, " quantities"]) -> Float[np.ndarray, " quantities"]:
     return 2.0 ** np.round(np.log2(sizes))
 
 
-def unrounded_sizes(flat: FlatModel, variables: QuantityMap, extended: Extended) -> Float[np.ndarray, " quantities"]:
+def unrounded_sizes(model: ReducedModel) -> Float[np.ndarray, " quantities"]:
     """The same, not rounded: rounded, sizes that differ by little may differ by two, and choose other states."""
-    if extended.quantities.n_unknown > LIMIT:
-        return np.ones(extended.quantities.n)
-    parameters = flat.parameters.values
-    return _balanced(extended, parameters, _declared_or_started(flat, variables, extended, parameters))
+    if model.extended.quantities.n_unknown > LIMIT:
+        return np.ones(model.extended.quantities.n)
+    parameters = model.flat.parameters.values
+    return _balanced(model.extended, parameters, _declared_or_started(model, parameters))
 
 
-def error_sizes(
-    flat: FlatModel, variables: QuantityMap, extended: Extended, parameters: Float[np.ndarray, " parameters"]
-) -> Float[np.ndarray, " quantities"]:
+def error_sizes(model: ReducedModel, parameters: Float[np.ndarray, " parameters"]) -> Float[np.ndarray, " quantities"]:
     """The sizes to whose rounding quantities are known, where they are near zero, at these values of the parameters:
     the typical ones, except that a start which is rounding itself, as L·sin(π) is, says nothing. Zero where nothing is
     known."""
-    declared = declared_scale(flat, variables, extended)
+    extended, declared = model.extended, declared_scale(model)
     if extended.quantities.n_unknown > LIMIT:
         return declared
-    started = _declared_or_started(flat, variables, extended, parameters)
+    started = _declared_or_started(model, parameters)
     typical = _balanced(extended, parameters, started)
     if (np.abs(started) > KNOWN * typical.max(initial=0.0))[started != 0.0].all():
         return _rounded(typical)
@@ -51,14 +49,12 @@ def error_sizes(
     return _balanced(extended, parameters, np.where(is_rounding, declared, started))
 
 
-def _declared_or_started(
-    flat: FlatModel, variables: QuantityMap, extended: Extended, parameters: np.ndarray
-) -> np.ndarray:
+def _declared_or_started(model: ReducedModel, parameters: np.ndarray) -> np.ndarray:
     """Nominal values, and else first starts; zero where there is none."""
-    size = declared_scale(flat, variables, extended)
-    values = flat.variables.start.values(parameters)
-    for v in np.flatnonzero(flat.variables.start.is_given).tolist():
-        quantity, factor = variables[v]
+    size, starts = declared_scale(model), model.flat.variables.start
+    values = starts.values(parameters)
+    for v in np.flatnonzero(starts.is_given).tolist():
+        quantity, factor = model.variables[v]
         if quantity >= 0 and size[quantity] == 0.0:
             value = values[v] / factor
             size[quantity] = value if np.isfinite(value) else 0.0

@@ -34,7 +34,7 @@ class SystemReport(Sections):
         self._values = flat.parameters.values if values is None else values
         self.n_equations = flat.n_equations
         self.n_unknowns = len(flat.variables) - int(flat.variables.is_input.sum())
-        self.n_aliases = len(plan.alias.eliminated)
+        self.n_aliases = len(plan.model.alias.eliminated)
         self.state_selection = plan.mode
         self.notes = list(plan.selection.notes)
 
@@ -156,7 +156,8 @@ class SystemReport(Sections):
 
     def _contents(self) -> tuple[list[str], list[tuple[str, list[str]]]]:
         plan = self._plan
-        flat, n_remaining = plan.flat, sum(len(g) for g in plan.groups)
+        flat, groups = plan.flat, plan.model.groups
+        n_remaining, n_shapes = sum(map(len, groups)), len({g.template.key for g in groups})
         counts = [
             counted(self.n_equations, "equation"),
             counted(self.n_unknowns, "unknown"),
@@ -167,7 +168,7 @@ class SystemReport(Sections):
         head = [
             ", ".join(counts),
             f"{self.n_aliases} alias{'' if self.n_aliases == 1 else 'es'} eliminated, "
-            f"{counted(n_remaining, 'equation')} of {counted(len({g.template.key for g in plan.groups}), 'shape')} "
+            f"{counted(n_remaining, 'equation')} of {counted(n_shapes, 'shape')} "
             f"remain{'s' if n_remaining == 1 else ''}",
             f"structural index {self.index}, {counted(self.degrees_of_freedom, 'degree')} of freedom",
         ]

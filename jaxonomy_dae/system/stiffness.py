@@ -30,7 +30,7 @@ def _fastest_decay(plan: SystemPlan) -> float:
     n = quantities.n_unknown
     if not 0 < n <= LARGE:
         return 0.0
-    at = initial_point(plan.flat, plan.variable_map, plan.extended)
+    at = initial_point(plan.model)
     matrix = residual_and_jacobian(plan.extended, at)[1].toarray()[:, :n]
     if not np.isfinite(matrix).all():
         return 0.0

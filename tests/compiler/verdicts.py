@@ -17,7 +17,7 @@ from jaxonomy_dae.compiler.pipeline import compile_flat
 from jaxonomy_dae.initialization.singular_blocks import examine_blocks
 from jaxonomy_dae.lowering.lower import lower
 from jaxonomy_dae.model.consistent_point import initial_point
-from jaxonomy_dae.model.quantities import start_guess
+from jaxonomy_dae.model.declared import start_guess
 from jaxonomy_dae.modeling import Eq, der
 
 MODES = ("auto", "dummy_derivatives", "projection")
@@ -179,9 +179,9 @@ def verdict(diagram: AcausalDiagram, mode: str, seed: int | None = None) -> str:
         plan = lower(compile_flat(flat, mode, ()))
     except StructuralError:
         return "refused"
-    at = initial_point(flat, plan.variable_map, plan.extended)
+    at = initial_point(plan.model)
     values = at.values[:-1].copy()
-    _, fixed = start_guess(flat, plan.variable_map, len(values))
+    _, fixed = start_guess(plan.model)
     values[list(fixed)] = list(fixed.values())
     x = values[[*plan.states, *plan.carried]]
     x = moved(x, np.ones(len(x), bool), seed)
