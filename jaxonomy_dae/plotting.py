@@ -99,7 +99,7 @@ def _steps(solution: "Solution", name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _seen(solution: "Solution") -> np.ndarray:
-    """Which of the noted events lie within the saved times."""
+    """True for the noted events that lie within the saved times, shape (events,)."""
     ts, time = np.asarray(solution.events.ts), np.asarray(solution.ts)
     time = time[np.isfinite(time)]
     if not time.size:
@@ -272,7 +272,7 @@ def nyquist(response: "FrequencyResponse", *pairs: tuple[str, str], ax: Any = No
 
 
 def _pairs_of(response: "FrequencyResponse", pairs: tuple[tuple[str, str], ...]) -> tuple[tuple[str, str], ...]:
-    """What is drawn: by default every output by every input, of which there must be one response each."""
+    """The pairs (output, input) to draw: those given, else all. A batch of responses is refused."""
     if np.ndim(response.omega) != 1:
         raise ModelError(f"one response is drawn at a time; this is a batch, omega has shape {response.omega.shape}")
     return pairs or tuple((out, to) for to in response.inputs for out in response.outputs)

@@ -49,7 +49,7 @@ class ClosureConverted(eqx.Module):
 
     @property
     def out_struct(self) -> Any:
-        """What it returns: shapes and dtypes, and values where they are static."""
+        """The structure of the function's result: shapes and dtypes, and values where they are static."""
         return self._combined(list(self.outputs[1]))
 
     def _combined(self, leaves: Any) -> Any:
@@ -115,13 +115,14 @@ def _(size, batched, active, new, old):
 
 
 def going(state: Any, numbers: dict[str, Any], program: Program) -> Bool[Array, ""]:
-    """Whether a solve takes another step."""
+    """True while a solve has steps left to take."""
     on = (state.tprev < numbers["t1"]) & diffrax.is_successful(state.result)
     return on if program.max_steps is None else on & (state.num_steps < program.max_steps)
 
 
 def any_member(flag: Bool[Array, ""]) -> Bool[Array, ""]:
-    """Whether a flag is set for any member of the batch: not batched itself, so that branches stay branches."""
+    """True if a flag is set for any member of a batch. The result is not batched, so that `lax.cond` does not become a
+    select that computes both branches."""
     try:
         return private("unvmap_any")(flag)
     except MissingName:

@@ -23,7 +23,7 @@ from .wrapped_control import WrappedControl
 
 
 def times_fit(t0: Any, t1: Any, ts: Any, controller: Any) -> Bool[Array, ""] | bool:
-    """Whether the times to save, shape (n,) or None, are sorted from t0 to t1 and not outside, and whether those of a
+    """True if the times to save, shape (n,) or None, are sorted and lie between t0 and t1, and if those of a
     `diffrax.StepTo` lead from t0 to t1. A Python bool where nothing is traced."""
     steps = controller.ts if isinstance(controller, diffrax.StepTo) else None
     traced = any(isinstance(value, Tracer) for value in (t0, t1, ts, steps))
@@ -65,7 +65,7 @@ def diffeqsolve(
 
 
 class _LateTimes(diffrax.AbstractAdjoint):
-    """Another adjoint, whose solves save at times that `diffrax.diffeqsolve` was not told of.
+    """Wraps an adjoint so that its solves save at times that `diffrax.diffeqsolve` was not given.
 
     - `save`: when to save, in the time of the equations.
     - `direction`: −1 where that runs backwards; Diffrax' loop always goes forwards.
@@ -102,7 +102,7 @@ class _LateTimes(diffrax.AbstractAdjoint):
 
 
 class _FirstStep(WrappedControl):
-    """Another controller with a first step of the size given."""
+    """Wraps a controller so that its first step has the size `dt0`."""
 
     dt0: Any
 

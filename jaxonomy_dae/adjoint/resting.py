@@ -62,7 +62,8 @@ class Step(eqx.Module):
 
 
 class Resting(eqx.Module):
-    """What is needed to take a second run along. `restrained` changes the end of the next step."""
+    """The equations, solver and controller of the second run, in which components at rest are pushed a little so that
+    steps resolve their motion. `restrained` changes the end of the next step."""
 
     terms: Any
     solver: Any
@@ -144,8 +145,9 @@ class Resting(eqx.Module):
         idle = y, pushed.next_y, pushed.next_state, end, jnp.full_like(end, jnp.inf), ~look, jnp.array(0)
 
         def attempt(found):
-            """With a step up to `end`; and if that was too long, what would do. The first ones from a fresh push are as
-            good as none, and put it where the constraints and algebraic equations hold."""
+            """One try of a step up to `end`; if it is too long, proposes a shorter end. The first tries after a fresh
+            push are not counted as steps: they only put the state where the constraints and algebraic equations
+            hold."""
             y, _, _, end, _, done, tries = found
             settles = fresh & (tries < SETTLING)
             planned, end = end, jnp.where(settles, _shortened(start, end), end)
@@ -176,7 +178,8 @@ class Resting(eqx.Module):
         return jnp.where(exists, end, step.end), after
 
     def _rests(self, slope: Array, x: Array) -> Bool[Array, " n"]:
-        """Which components rest."""
+        """True for components at rest, shape (n,): at this slope they would move by less than `MOTION` of their scale
+        over the whole run."""
         return jnp.abs(slope) * self.span <= MOTION * self._scale(x)
 
     def _scale(self, x: Array) -> Array:
@@ -222,13 +225,13 @@ class HeldBack(WrappedControl):
         return found
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        """As the other controller's."""
+        """As `controller.init`, with the first step no longer than the second run allows."""
         end, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         resting = self._resting(y0, args, t1 - t0)
         return _no_later(t0, end, resting.first_end(t0, end, y0)), (state, t1 - t0, resting.begin(t0, y0))
 
     def adapt_step_size(self, t0, t1, y0, y1, args, y_error, error_order, controller_state):
-        """Whether the step is kept, and the next one."""
+        """As `controller.adapt_step_size`, with the next step no longer than the second run allows."""
         state, span, pushed = controller_state
         keep, start, end, jump, state, result = self.controller.adapt_step_size(
             t0, t1, y0, y1, args, y_error, error_order, state
@@ -240,7 +243,8 @@ class HeldBack(WrappedControl):
 
 
 def _pattern(x: Array) -> Array:
-    """Of what size, and to which side, each component is pushed: no symmetric motion, and none that stays."""
+    """The relative size (0.5 to 1.5) and sign of the push to each component, shape (n,). It is irregular, so that the
+    motion it excites is neither symmetric nor a new state of rest."""
     k = jnp.arange(x.size, dtype=x.dtype)
     return jnp.where(jnp.sin(12.9898 * k + 1.0) > 0, 1.0, -1.0) * (1.0 + 0.5 * jnp.sin(78.233 * k))
 
@@ -257,7 +261,7 @@ def _shortened(start: Any, end: Any) -> Any:
 
 
 def still(tree: Any) -> Any:
-    """The same, not differentiated."""
+    """The tree with all arrays constant under differentiation."""
     return jax.tree.map(lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, tree)
 
 

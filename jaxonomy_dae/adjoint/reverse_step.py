@@ -120,7 +120,7 @@ class ReverseStep:
         return carry
 
     def _saved_times(self, carry, i, row, kept, dense, fixed, dense_ct, ends_ct):
-        """What was saved at times within the step, the last one first."""
+        """Pulls back the cotangents of all values saved at times within the step, the last one first."""
         ts, (consts, others) = self.numbers["ts"][i], self.consts["save_ts"][i]
 
         def inside(index):

@@ -53,8 +53,8 @@ class StepTimes:
     def after(
         self, state: Any, moves: PyTree[Float[Array, "seeds ..."]], held: Bool[Array, ""]
     ) -> PyTree[Float[Array, "seeds ..."]]:
-        """The same after the step that a state is about to attempt; the next step keeps its length if it is held
-        back."""
+        """The tangents `moves` of (start, end, controller state), advanced over the step that `state` is about to
+        attempt. Where `held`, a flag, is set, the end of the next step moves with its start: it keeps its length."""
         if not self.count:
             return ()
         program, numbers = self.program, self.numbers
@@ -80,7 +80,7 @@ class StepTimes:
 
 
 def _clock(tree: dict[str, Any]) -> Any:
-    """What the ends of steps depend on."""
+    """The quantities on which the ends of steps depend: (start, end, controller state), and (t1, controller)."""
     state = tree["state"]
     moving = state.tprev, state.tnext, state.controller_state[0]
     return moving, (tree["t1"], tree["controller"])

@@ -124,7 +124,7 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
 
 
 def _is_random(terms: Any) -> bool:
-    """Whether Brownian motion drives the solve."""
+    """True if Brownian motion drives the solve."""
 
     def is_brownian(node: Any) -> bool:
         return isinstance(node, diffrax.AbstractBrownianPath)
@@ -208,7 +208,7 @@ def _functions(
 
 
 class _Solver:
-    """What Diffrax's loop asks of a solver."""
+    """The part of a solver's interface that Diffrax's loop calls."""
 
     def __init__(self, step, consts, solver, terms):
         self.function, self.consts, self.interpolation_cls = step, consts, solver.interpolation_cls
@@ -222,7 +222,8 @@ class _Solver:
 
 
 class _Controller:
-    """What Diffrax's loop asks of a controller, but no step is accepted where a member of a batch waits."""
+    """The part of a controller's interface that Diffrax's loop calls. No step is accepted for a member of a batch that
+    waits."""
 
     def __init__(self, adapt, consts, controller):
         self.function, self.consts, self.controller = adapt, consts, controller

@@ -28,8 +28,14 @@ SINGULAR = 1e2  # in units of eps and of the number of unknowns: a singular valu
 
 
 class Equilibrium(NamedTuple):
-    """What the search found: `x` of shape (n_state,), the residual of each row and the largest that counts as rounding,
-    the rows' Jacobian with respect to the unknowns, their sizes, and whether all rows hold."""
+    """The result of the search for an equilibrium.
+
+    - `x`: the state array, shape (n_state,).
+    - `residual`, `limit`: the residual of each row, and the largest one that counts as rounding.
+    - `jacobian`: the rows' derivatives with respect to the unknowns, shape (rows, unknowns).
+    - `unit`: the sizes of the unknowns, shape (unknowns,).
+    - `holds`: True if all rows hold.
+    """
 
     x: Float[Array, " n"]
     residual: Float[Array, " m"]
@@ -114,5 +120,5 @@ def open_directions(found: Equilibrium) -> tuple[Float[Array, " k"], Float[Array
 
 
 def is_open(values: Float[Array, " k"]) -> Bool[Array, " k"]:
-    """Which of the directions nothing determines."""
+    """True for directions that nothing determines: their singular values are zero up to rounding."""
     return values <= SINGULAR * values.shape[0] * float(jnp.finfo(values.dtype).eps)

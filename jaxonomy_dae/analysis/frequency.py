@@ -14,7 +14,7 @@ from .operating_point import OperatingPoint
 
 
 class FrequencyResponse(eqx.Module):
-    """How outputs answer sinusoidal inputs: `response["load.w", "source.u"]` is complex, shape `(k,)`.
+    """The response of outputs to sinusoidal inputs: `response["load.w", "source.u"]` is complex, shape `(k,)`.
 
     - `omega`: angular frequencies (rad/s), shape `(k,)`.
     - `values`: shape `(k, outputs, inputs)`: the magnitude is the ratio of amplitudes, the angle the phase.
@@ -88,7 +88,7 @@ def frequency_response(
     at: OperatingPoint | None = None,
     t: Any = 0.0,
 ) -> FrequencyResponse:
-    """How outputs answer small sinusoids at inputs, around an operating point.
+    """The response of outputs to small sinusoids at inputs, around an operating point.
 
     **Arguments:**
 

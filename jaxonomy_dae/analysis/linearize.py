@@ -120,7 +120,8 @@ def _reduced(
 
 
 def _coordinates(system: AcausalSystem, jacobians: Any, wanted: Sequence[str] | None) -> Coordinates:
-    """Which states are coordinates: those asked for, or a choice by the values of the constraints' Jacobian."""
+    """Chooses the states that serve as coordinates on the hidden constraints: those in `wanted`, else by the values of
+    the constraints' Jacobian at the point."""
     n, c = len(system.states), system.plan.n_constraints
     h_x = jacobians[1][0]
     if not c:

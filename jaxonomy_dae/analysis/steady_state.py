@@ -114,7 +114,7 @@ def point_of(
 
 
 def is_traced(tree: Any) -> bool:
-    """Whether values cannot be looked at."""
+    """True if a leaf is a tracer, whose value cannot be read."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 

@@ -43,7 +43,7 @@ class Sweep(eqx.Module):
         return sizes[:1] if self.zipped else sizes
 
     def __getitem__(self, key: Any) -> Any:
-        """What the function returned, by its keys: `sweep["c.v"]`."""
+        """The array that the function returned under `key`: `sweep["c.v"]`."""
         return self.values[key]
 
     def to_xarray(self) -> Any:

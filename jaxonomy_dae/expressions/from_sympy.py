@@ -31,7 +31,7 @@ from .without_overflow import logarithm, logarithm_of_one_plus, product, raised
 
 
 class UnsupportedExpression(Exception):
-    """What an expression contains that cannot be evaluated: a sentence."""
+    """An expression contains a part that cannot be evaluated. The message is a sentence that names it."""
 
 
 def atoms_of(expression: Any) -> set:

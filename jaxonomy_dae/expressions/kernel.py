@@ -100,7 +100,8 @@ def _sorted(needed: Any) -> list:
 
 
 def is_active(found: list[Any], guard: list) -> Any:
-    """Whether a node is needed, given the values of all nodes: a union of intersections; of none if it never is."""
+    """True if a node is needed, given the values `found` of all nodes. `guard` is a union of intersections of literals
+    (node number, truth); an empty one means that the node is never needed."""
     total: Any = np.bool_(False)
     for part in guard:
         inside: Any = None
@@ -189,7 +190,8 @@ def _sum(start: Any, coefficients: Sequence[Any]) -> _Operation:
 
 
 def _is_nought(value: Any) -> bool:
-    """Whether a value is the number zero when a program is traced: an unknown whose share is taken out."""
+    """True if a value is the Python number 0.0 when a program is traced: an unknown whose share in the sum is left
+    out."""
     return isinstance(value, float) and bool(value == 0.0)
 
 

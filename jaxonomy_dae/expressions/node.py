@@ -269,7 +269,8 @@ def compare(operation: str, a: Node, b: Node) -> Node:
 
 
 def postorder(roots: Iterable[Node], before: Callable[[Node], Iterable[Node]] = lambda n: n.arguments) -> list[Node]:
-    """All nodes below the roots, each after those that `before` names."""
+    """All nodes reachable from the roots, each once, after the nodes that `before` returns for it (by default its
+    arguments)."""
     seen: set[Node] = set()
     out: list[Node] = []
     for root in roots:

@@ -29,7 +29,8 @@ class EventControl(WrappedControl):
         return jnp.minimum(end, _due(y0)), (state, jnp.full_like(jnp.asarray(t0), jnp.inf))
 
     def adapt_step_size(self, t0, t1, y0, y1, args, y_error, error_order, controller_state):
-        """Whether the step is kept, and the next one."""
+        """Accepts or rejects the step and proposes the next one; see `diffrax.AbstractStepSizeController`. A step in
+        which an event was found early is rejected and retried up to it, and steps end where a clock ticks."""
         inner, wished = controller_state
         keep, start, end, jump, new, result = self.controller.adapt_step_size(
             t0, t1, y0.x, y1.x, args, y_error, error_order, inner

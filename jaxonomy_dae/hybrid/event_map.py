@@ -57,13 +57,13 @@ class Instant(eqx.Module):
 
 
 class Arrival(NamedTuple):
-    """What a step meets at its end, not differentiated.
+    """The events due at the end of a step, not differentiated.
 
     - `slope`: dx/dt there, before any event.
     - `rate`: how fast the guards change, shape (guards,); at the initial time only.
     - `due`: which events happen, shape (clocks + guards,).
     - `jumped`: which guards jumped over zero, so that their events do not move in time, shape (guards,).
-    - `size`: of the guards so far, shape (guards,).
+    - `size`: the largest magnitude of each guard so far, shape (guards,).
     - `window`: the time within which a guard counts as having reached zero; `span`: how long steps have been of late.
     """
 
@@ -188,14 +188,16 @@ def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, dela
     ahead = AHEAD * arrival.span
 
     def within(rate):
-        """How far from zero a guard may be that reaches it, or has left it, within the window."""
+        """The largest distance from zero at which a guard with this rate reaches zero, or has left it, within the
+        window."""
         return jnp.minimum(jnp.abs(rate) * arrival.window, CLOSE * arrival.size)
 
     def is_zero(value, rate):
         return jnp.abs(value) <= jnp.maximum(band, within(rate))
 
     def is_flat(value, rate):
-        """Whether its rate may not take it out of the band: it is too small for that, or was too small before."""
+        """True for guards at zero whose rate may not take them out of the rounding band: the rate is too small, or was
+        so before."""
         return is_zero(value, rate) & ((jnp.abs(rate) * ahead <= band) | rested)
 
     others = jnp.asarray(_alternatives(problem.choices, len(q)))
@@ -267,8 +269,9 @@ def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, dela
 
 
 def _alternatives(choices: tuple[int, ...], n: int) -> np.ndarray:
-    """Which of `n` discrete values change, shape (modes, n): first none, then one of the choices, then two; at last
-    none again, which stands for what has not been found."""
+    """Sets of discrete values to flip in turn while a consistent mode is sought, shape (sets + 1, n): none, each of
+    `choices`, each pair of them (at most `ALTERNATIVES` sets). The last row is none again: it stands for "not
+    found"."""
     sets = [(), *((k,) for k in choices), *itertools.combinations(choices, 2)][:ALTERNATIVES]
     rows = np.zeros((len(sets) + 1, n), bool)
     for row, chosen in zip(rows, sets, strict=False):

@@ -47,11 +47,12 @@ def _between(place: Any, values: Any) -> Any:
 
 
 class Met(NamedTuple):
-    """What a step meets, not differentiated.
+    """The result of looking for events in a step, not differentiated.
 
-    - `request`: the end of the step to take instead, or infinity.
-    - `armed`: on which side guards are at its end, shape (guards,); `values`: and what they are there.
-    - `arrival`: what happens there.
+    - `request`: the end of the shorter step to take instead; infinity to keep this one.
+    - `armed`: the side of zero on which each guard is at the end of the step, shape (guards,); `values`: their values
+        there.
+    - `arrival`: the events due at the end of the step.
     """
 
     request: Any
@@ -64,7 +65,7 @@ def looked_at(
     problem: AbstractHybridProblem, dense: Callable[[Any, Any, Any], Any], t0: Any, t1: Any, y0: HybridState, x1: Any,
     args: Any,
 ) -> Met:  # fmt: skip
-    """What a step from y0 to x1 meets, of which `dense(t0, t1, t)` are the states.
+    """Looks for events in the step from y0 to x1, whose states are `dense(t0, t1, t)`.
 
     Where equations go on with the same values, at kinks, time may be known less well than where states jump: guards
     between the places where they are looked at are on the polynomial through their values there, and so is their rate
@@ -106,7 +107,8 @@ def looked_at(
 
 
 def _met(problem, dense, t0, t1, y0: HybridState, x1, args, times, values, off, clocks: Met) -> Met:
-    """What a step meets, given guards at the places where they are looked at, and what it meets of clocks alone."""
+    """Looks for events in a step, given the guards' `values` at `times`, shape (looks, guards), `off`, their distance
+    from a parabola, shape (guards,), and the result `clocks` for sampled events alone."""
     h, q, g, arrival = t1 - t0, y0.q, problem.n_guards, clocks.arrival
     span, window, ticking = arrival.span, arrival.window, arrival.due[: problem.n_clocks]
     size = jnp.max(jnp.abs(values), axis=0)
@@ -170,9 +172,9 @@ def _met(problem, dense, t0, t1, y0: HybridState, x1, args, times, values, off, 
 
 
 def _dip(values, armed, crossed, doubt):
-    """Where, as a part of the step, a guard that is positive wherever it was looked at is lowest by the parabola
-    through its values at the ends and in the middle, if it may be negative there; or infinity. The step is taken up to
-    there, and so on until what the parabola leaves in `doubt` is decided."""
+    """The place (a fraction of the step) where a guard that is positive at all looks has the minimum of the parabola
+    through its values at both ends and in the middle, if that minimum is below `doubt`; infinity otherwise. The caller
+    ends the step there and looks again, until the minimum is decided."""
     left, middle, right = values[jnp.array(FITTED)]
     bend = 2 * (left - 2 * middle + right)
     slope = 4 * middle - 3 * left - right

@@ -67,7 +67,7 @@ class AbstractHybridProblem(eqx.Module):
         """Periods and offsets of the sampled events; of one that happens once, the period is infinite."""
 
     def due(self, ticks: Float[Array, " clocks"]) -> Float[Array, " clocks"]:
-        """When each sampled event happens next, after so many ticks."""
+        """The time of the next tick of each clock, given the number of ticks so far."""
         period, offset = self.clocks()
         ticks = lax.stop_gradient(ticks)
         return offset + jnp.where(ticks == 0, 0.0, ticks * period)
@@ -87,8 +87,8 @@ class AbstractHybridProblem(eqx.Module):
 
 
 class HybridState(eqx.Module):
-    """What is integrated: the state `x`, the discrete values `q`, and the bookkeeping of events, in few arrays: what
-    carries a state from step to step is written for each.
+    """The state that is integrated: the continuous state `x`, the discrete values `q`, and the bookkeeping of events.
+    The latter is packed into few arrays: XLA compiles the passing on of the state from step to step for each array.
 
     - `armed`: on which side of zero the guards are: `side.ABOVE`, `side.RESTS` or `side.BELOW`; `size`: how large they
         have been so far.
@@ -116,7 +116,7 @@ class HybridState(eqx.Module):
         return cls(x, q, *(jnp.stack([parts[name] for name in names]) for names in _PARTS.values()))
 
     def but(self, **changes: Any) -> "HybridState":
-        """The same with other parts."""
+        """A copy with the named parts replaced."""
         whole = {name: changes.pop(name) for name in ("x", "q") if name in changes}
         for field, names in _PARTS.items():
             if not changes.keys().isdisjoint(names):
@@ -126,7 +126,7 @@ class HybridState(eqx.Module):
         return dataclasses.replace(self, **whole)
 
     def noted(self, row: Any, time: Any, event: Any, rate: Any, before: Any, after: Any) -> "HybridState":
-        """The same with an event in a row of the log; nothing is if there is no such row."""
+        """A copy with an event written to column `row` of the log; unchanged if there is no such column."""
         log, sides = self.log, self.sides
         if log.shape[1]:
             column = jnp.stack([time, event.astype(time.dtype), lax.stop_gradient(rate)])

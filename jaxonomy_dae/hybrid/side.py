@@ -26,5 +26,5 @@ BAND = 4096.0
 
 
 def rounding(size: Any) -> Any:
-    """How far from zero a guard of this size is by rounding alone."""
+    """The distance from zero that rounding alone can give a guard of this size."""
     return BAND * jnp.finfo(size.dtype).eps * size

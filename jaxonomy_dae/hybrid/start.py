@@ -54,7 +54,8 @@ def start(
 
 
 def _holds(value: Any, rate: Any) -> Any:
-    """Which conditions hold. One at zero is as it will be at once."""
+    """True for conditions that hold at the start. A guard at zero is judged by its rate: the condition holds if the
+    guard is falling."""
     return jnp.where(value == 0, rate < 0, value < 0)
 
 

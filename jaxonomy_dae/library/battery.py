@@ -235,7 +235,8 @@ class _Pack(Component):
     """Rows of cells in parallel, one after the other in series, from `p` to `n`."""
 
     def _each(self, what: str, value: Any, shape: tuple[int, int], unit: str, bounds: Interval) -> Any:
-        """What the cells are given: a parameter of the pack where there is one value for all, else an array."""
+        """Declares one quantity of the cells: a parameter of the pack where one value holds for all cells, else one
+        value per cell."""
         if not np.ndim(value):
             return self.parameter(what, value, unit=unit, bounds=bounds)
         if np.shape(value) != shape:

@@ -69,7 +69,7 @@ class ComponentArray:
 
     @property
     def size(self) -> int:
-        """How many instances the whole array has."""
+        """The number of instances in the whole array."""
         return math.prod(self.shape)
 
     def label(self, number: int) -> str:
@@ -259,7 +259,7 @@ def _is_array(value: Any) -> TypeGuard[np.ndarray | jax.Array]:
 
 
 def _kind_of(value: Any) -> str:
-    """What is in an array, in a word."""
+    """The kind of entries in a NumPy array, in words, for an error message."""
     kinds = {"c": "complex numbers", "U": "texts", "S": "texts"}
     if value.dtype == object:
         return f"entries of type {type(value.flat[0]).__name__}" if value.size else "no numbers"

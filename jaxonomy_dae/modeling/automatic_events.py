@@ -25,8 +25,8 @@ KINKED = (sympy.Max, sympy.Min, sympy.Abs, sympy.sign, sympy.Heaviside, *ROUNDIN
 
 
 def smooth(expression: Any) -> Any:
-    """The same expression, in which relations are not events: for kinks that matter less than the steps they cost, and
-    for branches that agree where they meet, as a series near a point and a formula elsewhere.
+    """Marks an expression so that its relations do not become events: for kinks that matter less than the steps they
+    cost, and for branches that agree where they meet, as a series near a point and a formula elsewhere.
 
     ```python
     self.add_equations(Eq(q, smooth(Max(u, 0)) * k))
@@ -56,7 +56,7 @@ class Turning:
 
     @property
     def starts(self) -> tuple[float, ...]:
-        """Of its hidden discrete variables."""
+        """The initial values of its hidden discrete variables."""
         return (float(LIVE),)
 
 
@@ -71,7 +71,7 @@ class Stepping:
 
     @property
     def starts(self) -> tuple[float, ...]:
-        """Of its hidden discrete variables."""
+        """The initial values of its hidden discrete variables."""
         return (float(LIVE), 0.0)
 
 
@@ -87,7 +87,7 @@ class Timed:
 
     @property
     def starts(self) -> tuple[float, ...]:
-        """Of its hidden discrete variables."""
+        """The initial values of its hidden discrete variables."""
         return (float(LIVE),)
 
 
@@ -101,7 +101,7 @@ class TimedSteps:
 
     @property
     def starts(self) -> tuple[float, ...]:
-        """Of its hidden discrete variables."""
+        """The initial values of its hidden discrete variables."""
         return (float(LIVE), 0.0)
 
 
@@ -145,7 +145,7 @@ def _replaced(condition: Any, forms: dict[Any, Any]) -> Any:
 
 
 def is_watched(condition: Any) -> bool:
-    """Whether a condition changes otherwise than by events."""
+    """True if the truth of a condition can change between events: some symbol in it moves."""
     return any(_moves(s) for s in symbols_of(condition))
 
 
@@ -300,7 +300,8 @@ _DOMAINS: dict[Any, tuple[Any, Any]] = {sympy.asin: (-1, 1), sympy.acos: (-1, 1)
 
 
 def _has_an_end(e: Any) -> bool:
-    """Whether a function of its first argument has values on a part of the numbers only: others are nonnegative."""
+    """True for functions that are defined on a part of the real numbers only: log, asin and acos of their argument, and
+    powers with an exponent that is not an integer."""
     return isinstance(e, (sympy.log, sympy.asin, sympy.acos)) or (isinstance(e, sympy.Pow) and not e.exp.is_integer)
 
 
@@ -384,7 +385,8 @@ def _with_marks(residual: sympy.Expr) -> sympy.Expr:
 
 
 def _two_branches(e: Any) -> tuple[Any, Any, Any] | None:
-    """Two branches, and what is zero where one goes over into the other; None for what has others."""
+    """Splits an expression with one relation into (first branch, second branch, difference that is zero where they
+    meet); None for other expressions."""
     if isinstance(e, sympy.Abs):
         return e.args[0], -e.args[0], e.args[0]
     if isinstance(e, sympy.sign | sympy.Heaviside):
@@ -401,7 +403,7 @@ def _two_branches(e: Any) -> tuple[Any, Any, Any] | None:
 
 
 def _is_continuous(e: Any) -> bool:
-    """Whether a part with relations has the same value on both sides of each."""
+    """True if the expression has the same value on both sides of its relation, as Max, Min and Abs have."""
     if isinstance(e, sympy.Max | sympy.Min | sympy.Abs):
         return True
     parts = _two_branches(e)
@@ -413,12 +415,13 @@ def _is_continuous(e: Any) -> bool:
 
 
 def _meet_smoothly(difference: Any, surface: Any) -> bool:
-    """Whether a difference and its slope vanish where a surface does."""
+    """True if `difference` and its derivative vanish wherever `surface` does."""
     return _vanish_on(surface, lambda v: (difference, sympy.diff(difference, v)))
 
 
 def _vanish_on(surface: Any, expressions_in: Callable[[Any], tuple[Any, ...]]) -> bool:
-    """Whether expressions vanish where a surface does, in a variable that says where this is; False if none does."""
+    """True if all expressions vanish wherever `surface` is zero. The surface is solved for a variable `v` that it
+    contains linearly, and `expressions_in(v)` is evaluated there; False if there is no such variable."""
     for v in sorted((s for s in symbols_of(surface) if isinstance(s, VariableSymbol | sympy.Dummy)), key=str):
         slope = sympy.diff(surface, v)
         if slope.is_number and slope.is_nonzero:
@@ -428,7 +431,7 @@ def _vanish_on(surface: Any, expressions_in: Callable[[Any], tuple[Any, ...]]) -
 
 
 def _is_hidden(residual: sympy.Expr) -> bool:
-    """Whether an equation determines a variable that is not shown."""
+    """True if the residual contains a variable that the compiler added, whose path begins with a colon."""
     return any(isinstance(s, VariableSymbol) and s.path.startswith(":") for s in symbols_of(residual))
 
 
@@ -488,7 +491,8 @@ def _varies(condition: Any) -> bool:
 
 
 def _can_turn(condition: Any) -> bool:
-    """Whether a condition that was written changes at instants that can be found."""
+    """True if a condition can become an event: it varies between events, contains no event's relation yet, and a guard
+    can be made both of it and of its negation."""
     if not _varies(condition) or any(isinstance(s, RelationSymbol) for s in symbols_of(condition)):
         return False  # constant between events; or an event already
     try:

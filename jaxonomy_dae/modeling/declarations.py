@@ -18,7 +18,7 @@ Value: TypeAlias = float | int | sympy.Expr  # a number, or an expression in par
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class EachValue:
-    """What the instances of an array have, in their order."""
+    """One value for each instance of an array, in the order of the instances."""
 
     values: np.ndarray
     prototype: "Component"  # of the array
@@ -36,7 +36,7 @@ class Parameter:
     is_discrete: bool = False
 
     def with_value(self, value: float | sympy.Expr | EachValue) -> "Parameter":
-        """The same declaration with another value."""
+        """A copy of the declaration with another value."""
         return dataclasses.replace(self, value=value)
 
 

@@ -140,7 +140,8 @@ class EventDeclarations:
         return name
 
     def _values(self, actions: tuple[Action, ...], number: int, where: str) -> tuple:
-        """What the actions write, as numbers and names of hidden variables."""
+        """The values that the actions of an event write: for each action a number, the name of a hidden variable that
+        is declared here for its expression, or None for `terminate`."""
         new: dict[Any, sympy.Expr] = {}
         targets: list[Any] = []
         for action in actions:

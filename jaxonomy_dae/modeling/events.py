@@ -188,7 +188,8 @@ def relation_in_discretes(mode: Any, where: str) -> Any:
 
 
 def _is_discrete(condition: Any) -> bool:
-    """Whether nothing in a relation changes between events."""
+    """True for a relation, or a combination of relations, that contains neither variables nor time: it can change at
+    events only."""
     symbols = symbols_of(condition)
     return isinstance(condition, sympy.core.relational.Relational | BooleanFunction) and not any(
         isinstance(s, VariableSymbol | TimeSymbol) for s in symbols

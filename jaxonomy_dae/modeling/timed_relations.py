@@ -25,15 +25,15 @@ _OPPOSITE = {
 
 @dataclasses.dataclass(frozen=True)
 class Edges:
-    """When a relation turns: with each tick of each clock; it then is 1 or 0, an expression in parameters, while
-    `turns`, a condition on parameters, holds. Otherwise it never does."""
+    """The instants at which a relation turns. At each tick of a clock the relation becomes the expression beside that
+    clock (1 or 0, in parameters), provided that `turns`, a condition on parameters, holds; otherwise it never turns."""
 
     clocks: tuple[tuple[Sampled, Any], ...]
     turns: Any
 
 
 def edges_of(relation: Any) -> Edges | None:
-    """When a relation turns; None if it is not recognised, or changes with more than time."""
+    """The clocks at which a relation turns; None if its form is not recognised, or it depends on more than time."""
     found = _in_time(relation)
     if found is None:
         return None
@@ -68,7 +68,8 @@ def edges_of(relation: Any) -> Edges | None:
 
 
 def whole_edges(argument: Any) -> Edges | None:
-    """When the whole part of an expression changes, and, instead of a truth, by how much: up by 1 or down by 0."""
+    """The clocks at which floor(argument) changes. Instead of a truth, each clock has the direction: 1 for up by one, 0
+    for down."""
     if not _in_parameters(argument):
         return None
     slope, at_zero = _affine(argument)
@@ -158,7 +159,8 @@ def _changes(e: Any) -> bool:
 
 
 def _in_parameters(e: Any) -> bool:
-    """Whether an expression changes with time alone."""
+    """True if an expression contains only time and parameters: no discrete variables, relations or values from before
+    an event."""
     changing = DiscreteSymbol | RelationSymbol | PreviousSymbol
     return all(
         isinstance(s, TimeSymbol) or (isinstance(s, ParameterSymbol) and not isinstance(s, changing))

@@ -25,14 +25,15 @@ AHEAD = np.concatenate([[0.0], 10.0 ** np.linspace(-15, 0, 64)])
 
 
 def are_admitted(system: AcausalSystem, inputs: dict[str, Any]) -> Bool[Array, ""]:
-    """Whether parameters, weights, constants and samples are finite, and parameters within their bounds."""
+    """True if parameters, weights, constants and samples are finite, and parameters are within their bounds."""
     data = [source for source in inputs.values() if not isinstance(source, ClosedFunction)]
     leaves = jax.tree.leaves(eqx.filter((system.neural, data), eqx.is_inexact_array))
     return jnp.stack([system.parameters.are_admitted, *(jnp.isfinite(leaf).all() for leaf in leaves)]).all()
 
 
 def inputs_are_finite(inputs: dict[str, Any], t: Any, t1: Any) -> Bool[Array, ""]:
-    """Whether functions of time are finite at the time t at which a run stopped, and ahead of it."""
+    """True if inputs given as functions are finite at the time t at which a run stopped, and at a few instants between
+    t and t1."""
     functions = [source for source in inputs.values() if isinstance(source, ClosedFunction)]
     if not functions:
         return jnp.array(True)

@@ -18,7 +18,7 @@ SHOWN = 12
 
 
 class EventLog(eqx.Module):
-    """What a run noted of its events, one row for each, as far as there is room."""
+    """The events of a run, one row each, up to the log's capacity; `count` counts those beyond it, too."""
 
     ts: Float[Array, "*batch events"]
     which: Float[Array, "*batch events"]

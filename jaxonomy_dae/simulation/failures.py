@@ -65,7 +65,8 @@ def explain(
     rtol: Any,
     atol: Any,
 ) -> str:
-    """Why the integration from `first` to t1 stopped at its last accepted point (t, x), and what to do."""
+    """The reason, in a sentence, why the integration from `first` to t1 stopped at its last accepted point `last` = (t,
+    x), and the smallest mend."""
     system, inputs = solution.system, solution.inputs
     (t0, _), (t, x) = first, last
     log = solution.event_log
@@ -143,7 +144,7 @@ def _written_not_finite(system: AcausalSystem, x: Any) -> str:
 
 
 def _too_many_events(events: Events, max_events: int, t: float) -> str:
-    """Which event happens again and again, and towards which time."""
+    """Names the most frequent event, and the time at which its instants accumulate, if they do."""
     which = np.asarray(events.which, int)
     counts = np.bincount(which[which >= 0], minlength=len(events.all_names))
     most = int(np.argmax(counts))
@@ -165,7 +166,7 @@ def _too_many_events(events: Events, max_events: int, t: float) -> str:
 
 
 def _stuck(solution: Solution, event: int, t: float) -> str:
-    """How it came that an event happens, or a relation turns, again and again at one instant."""
+    """Says why event number `event` happens, or its relation turns, again and again at the instant t."""
     table: Any = solution.system.plan.events
     if table.table.relation[event]:
         return _sliding(table.names[event], t)
@@ -181,7 +182,8 @@ def _stuck(solution: Solution, event: int, t: float) -> str:
 
 
 def _accumulation(times: np.ndarray) -> str:
-    """How the times of an event shrink, and towards which time; nothing if they do not."""
+    """Says by which factor the times between an event's instants shrink, and where they accumulate; "" if they do not
+    shrink."""
     apart = np.diff(times[-8:])
     if len(apart) < 2 or (apart[:-1] <= 0).any():
         return ""
@@ -193,7 +195,8 @@ def _accumulation(times: np.ndarray) -> str:
 
 
 def _of_kinks(system: AcausalSystem) -> str:
-    """What to write if it was a relation that turned."""
+    """Advice for models with relations, in case one of them turned where a constraint has a kink; "" without
+    relations."""
     found = system.report.relations
     if not found:
         return ""
@@ -205,7 +208,7 @@ def _of_kinks(system: AcausalSystem) -> str:
 
 
 def _sliding(name: str, t: float) -> str:
-    """What to write instead of a relation that turns again and again at one instant."""
+    """Explains a relation that turns again and again at the instant t, and what to write instead."""
     where, _, condition = name.partition(": when(")
     return (
         f"the integration stopped at t={t:.6g}: the solution stays where '{condition[:-1]}' of component '{where}' "
@@ -234,7 +237,8 @@ def _bad_input(plan: SystemPlan, inputs: dict[str, Any], t0: float, t: float, t1
 
 
 def _singular_choice(solution: Solution, first: tuple[Any, Any], t: Any, x: Any) -> str:
-    """What the states do not determine at a point, if that is where and why the run ended."""
+    """Names the quantities that the chosen states no longer determine at (t, x), if a singular choice of states ended
+    the run; "" otherwise."""
     system, inputs = solution.system, solution.inputs
     plan = system.plan
     if not plan.dummy_blocks:

@@ -169,8 +169,8 @@ def _choices(table: EventTable, n_clocks: int) -> tuple[tuple[int, ...], tuple[i
 
 
 def _opposite(table: EventTable, n_clocks: int) -> tuple[int, ...]:
-    """Of each guard that says what a relation is, the guard that says the opposite of the same discrete value; −1 for
-    others."""
+    """For each guard of a relation, the number of the guard that sets the same discrete value the other way; −1 for
+    other guards."""
     opposite = np.full(len(table) - n_clocks, -1)
     other: dict[int, int] = {}
     for event, discrete in zip(table.event.tolist(), table.discrete.tolist(), strict=True):

@@ -30,7 +30,7 @@ SAVED_ITERATIONS = 3
 
 
 class Options(eqx.Module):
-    """How to integrate."""
+    """Options of a run: solver, adjoint, controller and limits."""
 
     solver: Any
     adjoint: Any
@@ -43,9 +43,14 @@ class Options(eqx.Module):
 
 
 class Outcome(eqx.Module):
-    """What a run gave: the initial point, saved times and states, the last accepted point (t, x), counts, a result
-    code, whether it was given up because stability limits explicit steps; and of a system with events, the discrete
-    values at the saved times and the events."""
+    """The raw result of a run.
+
+    - `found`: the initial point.
+    - `ts`, `x`: the saved times and states; `last`: the last accepted point (t, x).
+    - `stats`, `result`: counts of steps, and Diffrax's result code.
+    - `is_stiff`: True if the run was given up because stability, not accuracy, limits explicit steps.
+    - `discrete`, `events`: with events, the discrete values at the saved times, and the log.
+    """
 
     found: InitialPoint
     ts: Any

@@ -232,8 +232,8 @@ def simulate(
 
 
 def _stiff_without_a_run(plan: SystemPlan, duration: float | None) -> str:
-    """Why a system counts as stiff where it cannot be tried first, inside jit; or nothing. What runs outside of jit
-    found is not asked: the result would depend on what the process did before."""
+    """The reason to count a system as stiff where an explicit solver cannot be tried first, inside jit; "" if it is
+    not. Runs outside of jit leave no trace for this: the result would depend on what the process did before."""
     if duration is None or fastest_decay(plan) * duration <= BOUNDARY * MANY:
         return ""
     return f"stiff: at the declared start something decays within {1 / fastest_decay(plan):.2g}"

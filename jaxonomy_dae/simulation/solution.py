@@ -133,7 +133,7 @@ class Solution(eqx.Module):
 
     @property
     def stats(self) -> dict[str, Any]:
-        """What the integration took: numbers of steps, the solver and the reason for it."""
+        """The counts of steps, the solver's name, and the reason for choosing it."""
         return {**self.counts, "solver": self.solver, "reason": self.reason}
 
     def __contains__(self, name: str) -> bool:
@@ -247,7 +247,8 @@ def _is_traced(tree: Any) -> bool:
 
 
 def _places(system: AcausalSystem, quantity: np.ndarray) -> np.ndarray | None:
-    """Where in the state array quantities are, of which some may be zero; None if one is not there."""
+    """The places of quantities in the state array; −1 in `quantity` stands for zero and gets any place. None if one is
+    not part of the state array."""
     plan = system.plan
     place = np.full(plan.extended.quantities.n + 1, -1)  # the last entry stands for zero
     place[np.concatenate([plan.states, plan.carried])] = np.arange(plan.n_state)

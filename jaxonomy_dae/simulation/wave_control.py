@@ -46,14 +46,15 @@ class WaveControl(WrappedControl):
         return self._end(t0, end), state
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
-        """Whether the step is kept, and the next one."""
+        """Lets the wrapped controller accept or reject the step, and shortens the next one by `_end`."""
         keep, start, end, jump, state, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
         )
         return keep, start, self._end(start, end), jump, state, result
 
     def _end(self, start: Any, end: Any) -> Any:
-        """Where a step from `start` ends that another controller would end at `end`."""
+        """The end of a step that the wrapped controller would take from `start` to `end`, moved forwards so that steps
+        end where a wave has turned by whole quarters."""
         begin, step, frequency, phase = lax.stop_gradient((start, end - start, self.frequency, self.phase))
         quarter = QUARTER / jnp.abs(frequency)  # infinite for what does not turn
         bounded = jnp.minimum(step, jnp.min(quarter))

@@ -42,7 +42,7 @@ class BDFInterpolation(diffrax.AbstractLocalInterpolation):
 
 
 class _State(eqx.Module):
-    """What a step needs of those before it; names as in Brenan, Campbell & Petzold (1996)."""
+    """History of the integration that the next step reads; names as in Brenan, Campbell & Petzold (1996)."""
 
     phi: Float[Array, "rows n"]  # scaled divided differences
     psi: Float[Array, " rows"]  # sums of past step sizes
@@ -148,7 +148,7 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         )  # fmt: skip
 
     def step(self, terms, t0, t1, y0, args, solver_state: _State, made_jump):
-        """One step, with error estimate and dense output."""
+        """One step with its error estimate and dense output; see `diffrax.AbstractSolver.step`."""
         problem = FlatProblem(terms, y0, args)
         y = problem.flat
         linear = choose(self.linear_solver, y.shape[0], problem.pattern, problem.mass)

@@ -51,7 +51,8 @@ def first_bad_row(problem: FlatProblem, right: np.ndarray, names: Sequence[str])
 def _end_of_domain(
     problem: FlatProblem, here: np.ndarray, t: Any, y: Any, t1: Any, names: Sequence[str]
 ) -> str:  # fmt: skip
-    """Whether the equations have no value just beyond the point."""
+    """Says which row of the equations is not finite a short way beyond the point, along the slope `here`; "" if none
+    is."""
     right = jax.jit(problem.right)
     span = float(t1 - t)
     for part in NEAR:
@@ -67,7 +68,8 @@ def _end_of_domain(
 
 
 def _jump(slope: Slope, here: np.ndarray, t: Any, y: Any, weight: np.ndarray, names: Sequence[str]) -> str:
-    """Whether slopes jump across the point, in the direction of motion, as under sign(x) at x = 0."""
+    """Says which derivative jumps across the point in the direction of motion, as under sign(x) at x = 0; "" if none
+    does."""
     size = np.asarray(weight) / np.maximum(np.abs(here), np.finfo(here.dtype).tiny)
     h = float(np.min(size))  # in which the fastest unknown moves by its tolerance
     gaps = []
@@ -90,7 +92,7 @@ def _jump(slope: Slope, here: np.ndarray, t: Any, y: Any, weight: np.ndarray, na
 
 
 def _escape(here: np.ndarray, y: Any, t: float, t1: float, weight: np.ndarray, names: Sequence[str]) -> str:
-    """Whether an unknown grows so fast that it is infinite before the end."""
+    """Says which unknown grows so fast that it becomes infinite before t1; "" if none does."""
     value = np.asarray(y)
     growing = value * here > 0
     rest = np.where(growing, np.abs(value) / np.maximum(np.abs(here), np.finfo(here.dtype).tiny), np.inf)
@@ -119,7 +121,8 @@ def _decay(slope: Slope, t: Any, y: Any) -> float:
 
 
 def is_stiff(decay: float, duration: float, steps: int) -> bool:
-    """Whether decay alone demands more explicit steps than there were."""
+    """True if stability limits explicit steps, not accuracy: the fastest decay (1/s) times the duration (s) is more
+    than 0.3 for each step taken."""
     return decay * duration > 0.3 * steps
 
 

@@ -141,7 +141,7 @@ class FlatProblem:
             self.pattern = None
 
     def frozen(self) -> "FlatProblem":
-        """The same without derivatives."""
+        """A copy in which all arrays are constant under differentiation."""
         parts = self.terms, self.like, self.args
         return FlatProblem(*jax.tree.map(lambda v: jax.lax.stop_gradient(v) if eqx.is_array(v) else v, parts))
 

@@ -21,7 +21,8 @@ TIMES = (
 
 
 class Run(NamedTuple):
-    """What an integration returns: saved times and values, the last accepted point (t, y), counts, a result code."""
+    """The raw result of an integration: saved times and values, the last accepted point (t, y), counts, a result
+    code."""
 
     ts: Any
     ys: Any
@@ -36,7 +37,7 @@ def inner(solver: Any) -> Any:
 
 
 def is_implicit(solver: Any) -> bool:
-    """Whether the solver takes differential-algebraic equations."""
+    """True if the solver, or the one it wraps, takes differential-algebraic equations."""
     return isinstance(inner(solver), BDF | Rodas5P)
 
 
@@ -48,7 +49,7 @@ def right_between_steps(solver: Any) -> Any:
 
 
 def is_multistep(solver: Any) -> bool:
-    """Whether the solver chooses step sizes itself."""
+    """True if the solver, or the one it wraps, chooses its step sizes itself."""
     return isinstance(inner(solver), BDF)
 
 

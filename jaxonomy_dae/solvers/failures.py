@@ -25,8 +25,14 @@ INDEX = (
 
 
 class StartCheck(eqx.Module):
-    """What `explain_start` reads: the residual of the algebraic equations and what rounding may leave of it, the step
-    that would mend it in units of the tolerance, and the matrix that is regular if the index is 1 (or None)."""
+    """The numbers by which a start is judged; read by `explain_start`.
+
+    - `right`: F at the start, shape (n,).
+    - `residual`, `rounding`: the residual of the algebraic equations, and the part of it that rounding may leave, shape
+        (n,).
+    - `shift`: the step that would make them hold, in units of the tolerance, shape (n,).
+    - `matrix`: the matrix that is regular if the index is 1, shape (n, n), or None.
+    """
 
     right: Any
     residual: Any
@@ -36,11 +42,11 @@ class StartCheck(eqx.Module):
 
     @property
     def is_fine(self) -> Any:
-        """Whether the equations are finite at the start and the algebraic ones hold."""
+        """True if the equations are finite at the start and the algebraic ones hold to the tolerance."""
         return jnp.all(jnp.isfinite(self.right)) & (jnp.max(jnp.abs(self.shift), initial=0.0) <= 1)
 
     def error_if(self, ys: Any) -> Any:
-        """For traced starts: an error while running."""
+        """Adds run-time errors to `ys` for a start that is traced and turns out to be bad."""
         ys = eqx.error_if(ys, ~jnp.all(jnp.isfinite(self.right)), "the equations are not finite at the start")
         return eqx.error_if(ys, ~self.is_fine, "inconsistent start: see jaxonomy_dae.solvers.consistent_start")
 
@@ -69,7 +75,7 @@ def _flat(atol: Any, like: Any) -> Any:
 
 
 def explain_start(check: StartCheck, names: Sequence[str]) -> str:
-    """What is wrong with a start, or nothing."""
+    """The reason, in a sentence, why a start cannot be used; "" if it can."""
     right = np.asarray(check.right)
     if not np.isfinite(right).all():
         rows = np.flatnonzero(~np.isfinite(right))[:SHOWN]
@@ -123,7 +129,8 @@ def explain_failure(
     term: Any, args: Any, t: Any, y: Any, names: Sequence[str], *,
     result: Any, t0: Any, t1: Any, max_steps: int, rtol: Any, atol: Any, explicit: bool = False,
 ) -> str:  # fmt: skip
-    """Why an integration stopped at the last accepted point (t, y), and what to write."""
+    """The reason, in a sentence, why an integration stopped at the last accepted point (t, y), and what to write
+    instead."""
     problem = FlatProblem(term, y, args)
     flat, time = problem.flat, jnp.asarray(t)
     many = result == diffrax.RESULTS.max_steps_reached

@@ -152,7 +152,7 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
         return problem.unravel(consistent_slope(problem, self.linear_solver, t0, problem.flat))
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        """One step, with error estimate and dense output."""
+        """One step with its error estimate and dense output; see `diffrax.AbstractSolver.step`."""
         problem = FlatProblem(terms, y0, args)
         mass, y = problem.mass, problem.flat
         dtype = y.dtype
@@ -197,7 +197,7 @@ def _written_out(stage: Callable[[Row, Any], Any], rows: Sequence[Row], first: F
 def _in_a_loop(
     stage: Callable[[Row, Any], Any], rows: Sequence[Row], first: Float[Array, " n"], time_dtype: Any
 ) -> Any:
-    """The same, shape (1 + rows, n)."""
+    """The stages computed in a loop, shape (max(8, 1 + rows), n): the field is compiled once."""
 
     def body(stages, given):
         place, *row = given

@@ -99,7 +99,7 @@ class StepControl(diffrax.AbstractAdaptiveStepSizeController):
         return jax.lax.stop_gradient(jnp.minimum(h, 0.1 * interval).astype(interval.dtype))
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
-        """Whether the step is kept, and the next one."""
+        """Accepts or rejects the step and proposes the next one; see `diffrax.AbstractStepSizeController`."""
         rejected = controller_state
         t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
 
@@ -144,7 +144,7 @@ class ConstantLengths(WrappedControl):
         return self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
-        """Whether the step is kept, and the next one."""
+        """As `controller.adapt_step_size`; the length of the next step is constant under differentiation."""
         keep, start, end, jump, state, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
         )

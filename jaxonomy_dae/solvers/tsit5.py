@@ -35,7 +35,7 @@ class Tsit5(diffrax.Tsit5):
         return terms.vf(t0, y0, args), None if self.watch is None else self.watch.start()
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):  # pyright: ignore[reportIncompatibleMethodOverride]
-        """One step, with error estimate and dense output."""
+        """One step with its error estimate and dense output; see `diffrax.AbstractSolver.step`."""
         tableau = self.tableau
         control = terms.contr(t0, t1)
         slope, count = solver_state  # pyright: ignore[reportGeneralTypeIssues]
@@ -62,7 +62,8 @@ class Tsit5(diffrax.Tsit5):
         return points[-2], points[-1], slope, k
 
     def _looped(self, terms, t0, t1, y0, args, control, slope, made_jump):
-        """The same. After a jump, the loop begins one stage earlier: XLA compiles the field once."""
+        """The stages computed in a loop, so that XLA compiles the field once; returns as `_written_out`. After a jump
+        the loop begins one stage earlier, since the last slope of the step before is no longer that of the state."""
         tableau = self.tableau
         n, last = len(tableau.c), slope
         weights = np.zeros((n + 1, n + 1))

@@ -153,7 +153,7 @@ def _difference(value: Callable[[float], float]) -> tuple[float, float]:
 
 
 def _extrapolated(value: Callable[[float], float], step: float) -> tuple[float, float]:
-    """From central differences at shrinking steps."""
+    """(derivative, estimate of its error) by Richardson extrapolation of central differences at shrinking steps."""
     while not np.isfinite(value(step) - value(-step)):
         step /= 10
         if step < 1e-9:

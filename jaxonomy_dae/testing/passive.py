@@ -96,7 +96,7 @@ def assert_passive(
 
 
 def _typical(law: Any, size: int | None, inputs: Any) -> tuple[np.ndarray, int]:
-    """What inputs typically are, shape (inputs,), and how many of them are efforts."""
+    """(typical sizes of the law's inputs, shape (inputs,), and the number of efforts among them)."""
     own = getattr(law, "size", None) if isinstance(law, AbstractPassive | PortHamiltonian) else None
     if not callable(law):
         raise ModelError(f"assert_passive takes a law, a function of its inputs; got {law!r}")
@@ -151,7 +151,7 @@ def _rate(law: Any, u: Array, size: int) -> Array:
 
 
 def _drawn(arrays: Any, rng: np.random.Generator) -> Any:
-    """Other weights, each array normal with a tenth to ten times its present size."""
+    """Random weights in place of `arrays`: each array normal, 0.1 to 10 times as large as at present."""
     factor = 10.0 ** rng.uniform(-1, 1)
 
     def other(leaf: Any) -> Any:

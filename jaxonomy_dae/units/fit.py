@@ -39,8 +39,12 @@ ONE_UNIT = {
 
 @dataclasses.dataclass(frozen=True)
 class Measured:
-    """What is known of a value: its unit; the numbers in front of it, which may convert units; whether it is a number
-    and nothing else; and whether temperatures with a zero of their own count as differences in it."""
+    """The unit of a value, with what else decides whether it fits.
+
+    - `number`: the product of plain numbers in front of it, which may convert units.
+    - `is_constant`: it is a number and nothing else.
+    - `is_loose`: temperatures with a zero of their own count as differences in it.
+    """
 
     unit: Unit
     number: float = 1.0
@@ -58,24 +62,25 @@ class Term:
 
 
 def misfits_of_equation(graph: Node, unit_of: UnitOf) -> list[str]:
-    """Of 0 = graph; branches of an equation are equations."""
+    """Unit mismatches in the equation 0 = graph. Branches of an equation are equations themselves."""
     return _Walk(unit_of).run(graph, ("select",), is_zero=True)
 
 
 def misfits_of_condition(graph: Node, unit_of: UnitOf) -> list[str]:
-    """Of a guard, which falls through zero where a condition becomes true: relations joined by min, max, branches."""
+    """Unit mismatches in a guard, which falls through zero where its condition becomes true: relations joined by min,
+    max and branches."""
     return _Walk(unit_of).run(graph, ("select", "min", "max"), is_zero=True)
 
 
 def misfits_of_value(graph: Node, unit_of: UnitOf, expected: Unit | None, name: str) -> list[str]:
-    """Of an expression that gives what is called `name` its value."""
+    """Unit mismatches in `name = expression`; `expected` is the unit of the left side."""
     target = leaf(("value", name))
     walk = _Walk(lambda label: expected if label == target.data else unit_of(label))
     return walk.run(linear([(1, target), (-1, graph)]), (), is_zero=True)
 
 
 def misfit_of_units(named: Sequence[tuple[str, Unit | None]]) -> str | None:
-    """Of values that are equal: what is wrong with their units."""
+    """The first mismatch between the units of equal quantities, in a sentence; None if they agree."""
     known = [(name, unit) for name, unit in named if unit is not None]
     for (a, first), (b, second) in zip(known, known[1:], strict=False):
         if first.dimension != second.dimension:
@@ -277,8 +282,8 @@ def _common_scale(values: Sequence[Measured]) -> float | None:
 
 
 def _fits(value: Measured, scale: float) -> bool:
-    """Whether a value counts in units of this factor: by its unit, or because the number in front of it converts it,
-    alone or together with a plain factor such as 1/2."""
+    """True if a value can be read in units of factor `scale`: its unit has that factor, or the number in front of it
+    converts it, alone or with a plain factor such as 1/2."""
     if is_close(value.unit.scale, scale):
         return True
     rest = value.number * scale / value.unit.scale
@@ -291,7 +296,8 @@ def _is_plain(number: float) -> bool:
 
 
 def _conversion(a: Unit, b: Unit) -> str:
-    """What one of the coarser unit is in the other one."""
+    """The conversion between two units, in words: how much one of the coarser unit is in the other, or where the zero
+    of a temperature scale lies."""
     if is_close(a.scale, b.scale):
         own = a if a.zero else b
         return f"0 {own} is {own.zero:.6g} K"
@@ -305,7 +311,7 @@ def _text(node: Node, coefficient: Number = 1) -> str:
 
 
 def name_of(label: Any) -> str:
-    """How a leaf is called: labels are ("variable", path, order), or (kind, name), or ("time",)."""
+    """The name of a leaf, given its label ("variable", path, order), (kind, name) or ("time",)."""
     if label[0] == "variable":
         return "der(" * label[2] + label[1] + ")" * label[2]
     return label[-1]
