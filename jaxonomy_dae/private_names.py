@@ -74,7 +74,7 @@ FOR_LATE_TIMES = ("SaveState", "State")
 
 
 class MissingName(RuntimeError):
-    """A library has no longer what is taken from it."""
+    """A library no longer has a private name that this package uses."""
 
 
 def private(name: str) -> Any:

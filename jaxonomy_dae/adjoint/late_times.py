@@ -76,7 +76,7 @@ class _LateTimes(diffrax.AbstractAdjoint):
     direction: Any
 
     def loop(self, **given: Any) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """The loop over the steps, called by `diffrax.diffeqsolve`, with what it makes of `SaveAt(ts=...)`."""
+        """The loop over the steps, as `diffrax.diffeqsolve` calls it; buffers and times of `SaveAt` are put in here."""
         state, saveat, t0 = given["init_state"], given["saveat"], given["t0"]
         ts, direction = self.save.ts, self.direction
         assert ts is not None
@@ -118,7 +118,7 @@ class _FirstStep(WrappedControl):
 
 
 class _StepTo(diffrax.AbstractStepSizeController):
-    """`diffrax.StepTo` without its checks."""
+    """`diffrax.StepTo` without the run-time checks of its times."""
 
     controller: diffrax.StepTo
 

@@ -18,7 +18,7 @@ from .step_times import StepTimes
 
 @eqx.filter_custom_vjp
 def solve(numbers: dict[str, Any], program: Program) -> tuple[Any, Any]:
-    """Steps until the end: the final `(state, buffers)`.
+    """Takes steps until the end and returns the final `(state, buffers)`.
 
     `numbers` holds every array that the solve depends on: `state` and `buffers` to start from, `t1`, the `controller`'s
     own, the times `ts` of each part of `SaveAt`, and by the names of `program`'s functions what these close over.
@@ -35,7 +35,7 @@ def solve(numbers: dict[str, Any], program: Program) -> tuple[Any, Any]:
 
 
 class _Recorder:
-    """Attempts steps, and keeps what those since the last multiple of `chunk` started from, as far as accepted.
+    """Attempts steps and records what each accepted one started from, since the last multiple of `chunk`.
 
     Loops carry `(row, rest)`, both packed: what a row of the record holds, and the rest of Diffrax's state. Rows count
     the same for all members of a batch, and each says which members accepted it; a row that none did is written over.
@@ -61,7 +61,7 @@ class _Recorder:
         return self.row.pack(carry[0]), self.rest.pack(carry[1])
 
     def unpack(self, packed):
-        """(state, end of the last accepted step, derivatives of the times, second run at rest)."""
+        """Returns (state, end of the last accepted step, derivatives of the times, second run of `resting`)."""
         row, (state, moves, pushed) = self.row.unpack(packed[0]), self.rest.unpack(packed[1])
         last, first_moves = row.pop("last"), row.pop("moves")
         return dataclasses.replace(state, **row), last, (*first_moves, *moves), pushed
@@ -73,7 +73,8 @@ class _Recorder:
         return rows((self.start[0], jnp.array(False)), self.program.chunk)
 
     def run(self, packed, buffers, record, count, first):
-        """At most `count` attempted steps: (carry, buffers, record, rows filled). The record is written over."""
+        """Attempts at most `count` steps. Returns (carry, buffers, record, rows filled); the rows of `record` are
+        overwritten."""
 
         def attempt(loop):
             packed, buffers, _ = loop

@@ -30,10 +30,13 @@ TRIES = 50  # to find a step that the second run allows; it is given up after as
 
 
 class Pushed(eqx.Module):
-    """The second run: where it stands, whether it exists, what was pushed in it and rests still; and how it would go on
-    after the step to take next.
+    """The state of the second run.
 
-    `given_up` is set where no step was short enough for it, so that it limits nothing any more.
+    - `y`, `solver_state`: where it stands; `fresh`: no step has been taken since the last push.
+    - `exists`: whether there is one; `given_up`: no step was short enough for it, so that it limits nothing any more.
+    - `resting`: the components that were pushed and are still at rest in the first run, shape (n,).
+    - `next_y`, `next_state`, `allowed`: where it stands after the step to take next, and how long the step after that
+        may be.
     """
 
     y: Float[Array, " n"]
@@ -48,8 +51,12 @@ class Pushed(eqx.Module):
 
 
 class Step(eqx.Module):
-    """An attempted step from (t0, y0) to t1, where y1 is the state after it: y0 if it was rejected; whether the field
-    jumps there; and the step to take next, from `start` to `end`."""
+    """An attempted step of the first run.
+
+    - `t0`, `y0`, `t1`, `y1`: its ends; y1 is y0 if the step was rejected.
+    - `accepted`, `jump`: whether it was accepted, and whether the field jumps at its end.
+    - `start`, `end`: the step to take next.
+    """
 
     t0: Any
     t1: Any
@@ -73,8 +80,8 @@ class Resting(eqx.Module):
 
     @staticmethod
     def of(terms: Any, solver: Any, controller: Any, y: Any, args: Any, span: Any) -> "Resting | None":
-        """None where steps are prescribed or have no error estimate, and for a state that is not one array (beside
-        what events keep)."""
+        """Prepares a second run. None where steps are prescribed or have no error estimate, and for a state that is not
+        one array (apart from what events keep beside it)."""
         base = _innermost(controller)
         rtol, x = getattr(base, "rtol", None), _moving(y)
         is_array = isinstance(x, jax.Array) and x.ndim == 1 and x.size > 0
@@ -85,7 +92,7 @@ class Resting(eqx.Module):
         return Resting(terms, _small(solver, base), base, args, span)
 
     def begin(self, t: Any, y: Any) -> Pushed:
-        """No second run yet."""
+        """The initial value of the second run's state: it does not exist yet."""
         resting, y = still((self, y))
         terms, solver, x, _ = resting._between_events(y, y)
         shapes = jax.eval_shape(lambda: solver.init(terms, t, t, x, resting.args))
@@ -94,8 +101,8 @@ class Resting(eqx.Module):
         return Pushed(x, state, no, no, none, no, x, state, jnp.full_like(jnp.asarray(t), jnp.inf))
 
     def first_end(self, t: Any, end: Any, y: Any) -> Any:
-        """The end of the first step, which was chosen by what moves: a second run begins after a step only. It is not
-        longer than what would resolve rates as large as the slopes after a push."""
+        """The end of the first step, made earlier where a component rests. A second run begins after a step only, so
+        the first step must not exceed `RESOLVED` divided by the rate at which slopes answer to a push."""
         resting, t, end, y = still((self, t, end, y))
         terms, solver, x, _ = resting._between_events(y, y)
         slope, scale = solver.func(terms, t, x, resting.args), resting._scale(x)
@@ -107,7 +114,8 @@ class Resting(eqx.Module):
         return jnp.where(jnp.any(rests), jnp.maximum(first, _shortened(t, end)), end)
 
     def restrained(self, step: Step, pushed: Pushed) -> tuple[Array, Pushed]:
-        """The end of the next step, and the second run where that begins."""
+        """Returns (the end of the next step, the second run's state after `step`); begins a second run where a
+        component has come to rest."""
         resting, step, pushed = still((self, step, pushed))
         x0, x1, h = _moving(step.y0), _moving(step.y1), step.t1 - step.t0
         rests = resting._rests((x1 - x0) / jnp.where(h > 0, h, 1.0), x1)
@@ -190,7 +198,7 @@ class Resting(eqx.Module):
         return jnp.asarray(self.controller.rtol, x.dtype), jnp.asarray(self.controller.atol, x.dtype)
 
     def _between_events(self, y0: Any, y1: Any) -> tuple[Any, Any, Any, Any]:
-        """(terms, solver, state) after a step, and whether an event changed them."""
+        """Returns (terms, solver, state, whether an event changed them) after a step from y0 to y1."""
         if isinstance(y1, jax.Array):
             return self.terms, self.solver, y1, False
         return self.solver.between_events(self.terms, y0, y1)
@@ -199,8 +207,8 @@ class Resting(eqx.Module):
 def held_back(
     state: Any, new: Any, accepted: Bool[Array, ""], pushed: Any, numbers: dict[str, Any], program: Program
 ) -> tuple[Any, Bool[Array, ""], Any]:
-    """Diffrax's state after an attempted step, its next step shortened where y rests; whether it was; and the second
-    run."""
+    """Returns (Diffrax's state `new` with its next step shortened where components rest, whether it was shortened, the
+    second run's state)."""
     if program.rest is None:
         return new, jnp.array(False), pushed
     jump = new.made_jump if program.jumps else False  # some versions of JAX make an array of a constant
@@ -210,8 +218,8 @@ def held_back(
 
 
 class HeldBack(WrappedControl):
-    """The step sizes of another controller, held back where the state rests, as `StoredAdjoint` does by itself: for
-    derivatives by other adjoints."""
+    """Wraps a controller so that it resolves derivatives of components at rest, for adjoints other than
+    `StoredAdjoint`, which does so by itself."""
 
     terms: Any
     solver: Any
@@ -250,12 +258,13 @@ def _pattern(x: Array) -> Array:
 
 
 def _no_later(start: Any, end: Any, allowed: Any) -> Any:
-    """The end of a step, which moves with the times that it follows from; or what is allowed, as a length."""
+    """The end of a step, no later than `allowed`. An end taken from `allowed` moves with `start` under differentiation:
+    the length of the step is constant."""
     return jnp.where(allowed < end, start + still(allowed - start), end)
 
 
 def _shortened(start: Any, end: Any) -> Any:
-    """The end of a step that is as good as none, but moves time."""
+    """The end of a step so short that it changes nothing, but long enough to advance time."""
     shortest = 16 * jnp.finfo(start.dtype).eps * jnp.abs(start)
     return jnp.minimum(end, start + jnp.maximum(TINY * (end - start), shortest))
 
@@ -266,7 +275,7 @@ def still(tree: Any) -> Any:
 
 
 def _moving(y: Any) -> Any:
-    """The state: y, or `y.x` where events keep more beside it."""
+    """The array that is integrated: y itself, or `y.x` of a state with events."""
     return y if isinstance(y, jax.Array) else getattr(y, "x", y)
 
 
@@ -277,8 +286,8 @@ def _inner(solver: Any) -> Any:
 
 
 def _small(solver: Any, controller: Any) -> Any:
-    """The solver, its stages in a loop if it can: what is rarely run shall compile fast. Where its iterations have the
-    controller's tolerances, these are filled in, as Diffrax does before a run."""
+    """A copy of the solver that compiles quickly: stages in a loop where supported, and Newton tolerances taken from
+    the controller (as `diffeqsolve` does)."""
     if isinstance(solver, diffrax.AbstractWrappedSolver):
         return dataclasses.replace(solver, solver=_small(solver.solver, controller))
     if hasattr(solver, "looped"):

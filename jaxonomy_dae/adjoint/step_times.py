@@ -39,7 +39,7 @@ class StepTimes:
         return jax.tree.unflatten(self.structure, out)
 
     def split(self, total: Float[Array, " seeds"]) -> PyTree:
-        """The seeds' cotangents where they belong, None elsewhere."""
+        """The cotangents of the seeds in the structure of `_clock`; None for leaves that are not differentiated."""
         out, row = [], 0
         for wanted, leaf in zip(self.wanted, self.leaves, strict=True):
             out.append(total[row : row + leaf.size].reshape(leaf.shape).astype(leaf.dtype) if wanted else None)

@@ -133,8 +133,8 @@ def _is_random(terms: Any) -> bool:
 
 
 def _table(max_steps: int | None, size: int) -> tuple[int, int]:
-    """(rows of the record, points kept) for states of `size` bytes: with steps for eight times their product, pieces
-    are run again 4.5 times. Small states have more rows, so that most solves need no second run."""
+    """Returns (rows of the record, points kept) for states of `size` bytes. With steps for eight times their product,
+    pieces are run again 4.5 times. Small states have more rows, so that most solves need no second run."""
     chunk = min(max(ROOMY_RECORD // max(size, 1), 64), 256)
     if max_steps is not None:
         chunk = max(chunk, math.isqrt(max_steps // 4))
@@ -142,7 +142,7 @@ def _table(max_steps: int | None, size: int) -> tuple[int, int]:
 
 
 def _inner_loop(cond_fun, body_fun, start, *, max_steps, buffers, checkpoints):
-    """Saving at times within a step."""
+    """The loop that saves at times within a step, not differentiated by itself."""
     del checkpoints
     return private("while_loop")(cond_fun, body_fun, start, max_steps=max_steps, buffers=buffers, kind="lax")
 
@@ -150,7 +150,7 @@ def _inner_loop(cond_fun, body_fun, start, *, max_steps, buffers, checkpoints):
 def _functions(
     *, args, terms, solver, stepsize_controller, saveat, t1, init_state, **_
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The functions of `Program` but for its body, and the arrays they close over."""
+    """Returns (the functions of `Program` except its body, the arrays they close over)."""
     s = init_state
     controller, others = eqx.partition(stepsize_controller, eqx.is_inexact_array)
     order = solver.error_order(terms)

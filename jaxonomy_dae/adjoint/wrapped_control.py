@@ -6,7 +6,7 @@ import diffrax
 
 
 class WrappedControl(diffrax.AbstractAdaptiveStepSizeController):
-    """A step-size controller around another, whose tolerances and norm solvers see."""
+    """A step-size controller around another one. Solvers see the tolerances and norm of the inner controller."""
 
     controller: Any
 

@@ -105,8 +105,8 @@ compiled_search = compiled(find_equilibrium)
 
 
 def open_directions(found: Equilibrium) -> tuple[Float[Array, " k"], Float[Array, "k k"]]:
-    """Singular values of the Jacobian in its own units, relative to the largest, and the directions that belong to
-    them, as rows: unknowns in units of their scales. Not differentiated."""
+    """Returns (singular values of the Jacobian in its own units, relative to the largest; the right singular vectors,
+    as rows, in units of the unknowns' scales). Not differentiated."""
     m, k = found.jacobian.shape
     matrix = jax.lax.stop_gradient(found.jacobian * found.unit[None, :])
     for sweep in range(PASSES):  # the first one takes scales of rows and columns away, the others balance (Ruiz 2001)

@@ -106,8 +106,8 @@ def _reduced(
     system: AcausalSystem, parts: Any, x: Any, u: Any, coordinates: Coordinates, names: tuple[str, ...],
     outputs: tuple[str, ...],
 ) -> StateSpace:  # fmt: skip
-    """The state space on the tangent of the constraints: ∂h/∂d·δd + ∂h/∂q·δq = 0 gives the dependent states d from the
-    coordinates q. Inputs that hidden constraints contain are differentiated, and have been refused."""
+    """The state space on the tangent of the constraints: dependent states d follow from coordinates q by ∂h/∂d·δd +
+    ∂h/∂q·δq = 0. Inputs that hidden constraints contain would be differentiated; they have been refused before."""
     (slopes, _, y), ((f_x, f_u), (h_x, _), (y_x, y_u)) = parts
     kept, dependent, rows = coordinates
     states = tuple(system.states[k] for k in kept)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Complex, Float
 from ..diagnosis.wording import counted
 from ..errors import ModelError
 from ..optional import optional_module
-from .frequency import FrequencyResponse
+from .response import FrequencyResponse
 
 SHOWN = 6  # rows and columns of matrices that are printed
 

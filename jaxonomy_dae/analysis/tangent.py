@@ -14,7 +14,8 @@ SINGULAR = 1e-10  # a pivot, relative to the first, that is rounding
 
 
 class Coordinates(NamedTuple):
-    """The states that are coordinates, those that follow from them, and the constraints that say how."""
+    """A choice of coordinates on the constraints: the states kept, the states that follow from them, and the
+    constraints that determine these."""
 
     kept: np.ndarray
     dependent: np.ndarray

@@ -85,7 +85,7 @@ def read(expression: Any, label: Callable[[Any], Hashable], marks: bool = False)
 
 
 def parts_of(e: Any) -> Sequence[Any]:
-    """The expressions that a SymPy expression is made of.
+    """The expressions from which a SymPy expression is computed.
 
     **Raises:**
 

@@ -65,7 +65,7 @@ def make(operation: str, arguments: tuple[Node, ...] = (), data: Any = None) -> 
 
 
 def _restored(rows: tuple) -> Node:
-    """The last of nodes listed as (operation, positions of arguments, data)."""
+    """Rebuilds a pickled node, the last of `rows` = (operation, positions of arguments, data)."""
     nodes: list[Node] = []
     for operation, positions, data in rows:
         nodes.append(make(operation, tuple(nodes[k] for k in positions), data))

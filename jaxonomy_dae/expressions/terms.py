@@ -6,7 +6,7 @@ MOST = 64  # terms that a product is multiplied out to
 
 
 def terms(node: Node) -> list[Node]:
-    """Nodes whose sum is the node. What functions have inside is not looked at."""
+    """Nodes whose sum is `node`. Arguments of functions are not taken apart."""
     factor, rest = split(node)
     if rest.operation == "sum":
         start, factors = rest.data

@@ -16,15 +16,15 @@ GROWTH = 1e3  # of the step after one that an event made short
 
 
 class EventControl(WrappedControl):
-    """The step sizes of another controller, but steps end at events: one in which an event was found is tried again up
-    to there, and none goes beyond the next tick of a clock."""
+    """Wraps a controller so that steps end at events: a step in which an event was found is retried up to it, and no
+    step goes beyond the next tick of a clock."""
 
     def wrap(self, direction):
         return EventControl(self.controller.wrap(direction))  # pyright: ignore[reportCallIssue]
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        """The end of the first step; and the state of the controller, with how long a step would have been that an
-        event made shorter."""
+        """Returns (the end of the first step, (the wrapped controller's state, the length that a step shortened by an
+        event would have had: infinity, for none has been yet))."""
         end, state = self.controller.init(bound(terms, y0.q), t0, t1, y0.x, dt0, args, func, error_order)
         return jnp.minimum(end, _due(y0)), (state, jnp.full_like(jnp.asarray(t0), jnp.inf))
 

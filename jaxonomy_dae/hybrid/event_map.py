@@ -42,9 +42,17 @@ ALTERNATIVES = 128  # modes that are tried where equations are singular: one of 
 
 
 class Instant(eqx.Module):
-    """An instant while it is handled: the events that are left, which of them were made true by another event, the
-    delay δ of the last one, the discrete values before the instant, dx/dt after the last event, the state before
-    the instant, and which guards an event has left at zero, about to fall."""
+    """The state of the loop over the events of one instant.
+
+    - `state`: the state after the events so far.
+    - `left`: the events still to happen, shape (clocks + guards,).
+    - `caused`: the guards that another event of this instant made fall, shape (guards,).
+    - `delay`: δ of the last event (second).
+    - `previous`: the discrete values before the instant.
+    - `slope`: dx/dt after the last event.
+    - `arrived`: the continuous state before the instant.
+    - `stuck`: the guards that an event has left at zero, about to fall again, shape (guards,).
+    """
 
     state: HybridState
     left: Any
@@ -79,7 +87,7 @@ class Arrival(NamedTuple):
 def handle(
     problem: AbstractHybridProblem, t: Any, state: HybridState, arrival: Arrival, args: Any, at_start: bool = False
 ) -> tuple[HybridState, Any]:
-    """The state after all events of an instant, and dx/dt there.
+    """Returns (the state after all events of an instant, dx/dt there).
 
     At the initial time, `at_start`, events do not move with parameters, and are logged only if they end the run.
     """
@@ -165,13 +173,14 @@ def handle(
 
 
 def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, delay, moved, approach, args):
-    """(q, dx/dt, in which states it hardly changes during the delay, armed guards, events left, which guards an event
-    made true, which are stuck) after an event, not differentiated but for q.
+    """The situation after an event.
 
-    Where the equations are singular with q, as where a switch closes onto a diode that conducts, modes that are chosen
-    by their conditions change along with it: to the first ones of `_alternatives` that hold.
+    `moved` says whether the event wrote states, `approach` how fast its guard fell before, or zero. Where the equations
+    are singular with q, as where a switch closes onto a diode that conducts, modes that are chosen by their conditions
+    change along with it: to the first ones of `_alternatives` that hold.
 
-    `moved` says whether it wrote states, `approach` how fast its guard fell before, or zero.
+    Returns (q, dx/dt, the states whose slope hardly changes during the delay, the sides of the guards, events left,
+    guards that an event made true, guards that are stuck); only q is differentiated.
     """
     c, g = problem.n_clocks, problem.n_guards
     left = instant.left & ~one_hot(event, c + g)

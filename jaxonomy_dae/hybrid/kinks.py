@@ -17,7 +17,8 @@ from .side import ABOVE, BELOW, RESTS, rounding
 
 
 def turned(problem: AbstractHybridProblem, t: Any, state: HybridState, values: Any, due: Any, args: Any) -> HybridState:
-    """The state after the events that are `due`, at guards with these values: clocks tick, relations have turned.
+    """The state after the events that are `due`, given the guards' `values`: clocks have ticked and relations have
+    turned.
 
     The guard of a relation falls, and the one of its opposite is armed: it rises, or rests at zero.
     """

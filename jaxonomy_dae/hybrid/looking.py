@@ -26,7 +26,8 @@ FORGOTTEN = 0.8  # what a step leaves of how long steps have been: next to event
 
 
 def _off_parabola() -> np.ndarray:
-    """The distances of the values at LOOKS from the parabola through the first, the middle and the last."""
+    """A matrix, shape (looks − 3, looks): the distances of values at LOOKS from the parabola through the first, the
+    middle and the last of them."""
     others = [k for k in range(len(LOOKS)) if k not in FITTED]
     out = np.eye(len(LOOKS))[others]
     out[:, FITTED] = -np.vander(LOOKS[others], 3) @ np.linalg.inv(np.vander(LOOKS[FITTED], 3))
@@ -41,7 +42,7 @@ _RATE_AT_END = np.append(_DIVIDED, -_DIVIDED.sum())
 
 
 def _between(place: Any, values: Any) -> Any:
-    """The polynomial through the values at LOOKS, at another place."""
+    """Evaluates the polynomial through `values` at LOOKS, shape (looks, guards), at `place`, a fraction of the step."""
     weights = jnp.asarray(_WEIGHTS, values.dtype) / (place - jnp.asarray(LOOKS, values.dtype))
     return weights @ values / jnp.sum(weights)
 

@@ -36,11 +36,11 @@ class AbstractHybridProblem(eqx.Module):
 
     @abc.abstractmethod
     def term(self, q: Float[Array, " q"]) -> diffrax.AbstractTerm:
-        """The term while the discrete values are q."""
+        """The term of the equations that hold with the discrete values q."""
 
     @abc.abstractmethod
     def prepared(self, solver: diffrax.AbstractSolver, q: Float[Array, " q"]) -> diffrax.AbstractSolver:
-        """The solver for that term."""
+        """The solver, prepared for the equations that hold with the discrete values q."""
 
     @abc.abstractmethod
     def field(self, t: Any, x: Float[Array, " n"], q: Float[Array, " q"], args: Any) -> Float[Array, " n"]:
@@ -60,11 +60,11 @@ class AbstractHybridProblem(eqx.Module):
     def settled(
         self, t: Any, x: Float[Array, " n"], q: Float[Array, " q"], events: Bool[Array, " events"], args: Any
     ) -> Float[Array, " q"]:
-        """q after several events that assign discrete values, each by what was before all of them."""
+        """q after several events that assign discrete values. Each reads the values from before all of them."""
 
     @abc.abstractmethod
     def clocks(self) -> tuple[Float[Array, " clocks"], Float[Array, " clocks"]]:
-        """Periods and offsets of the sampled events; of one that happens once, the period is infinite."""
+        """Periods and offsets of the sampled events; the period is infinite for one that happens once."""
 
     def due(self, ticks: Float[Array, " clocks"]) -> Float[Array, " clocks"]:
         """The time of the next tick of each clock, given the number of ticks so far."""
@@ -73,15 +73,14 @@ class AbstractHybridProblem(eqx.Module):
         return offset + jnp.where(ticks == 0, 0.0, ticks * period)
 
     def slope(self, t: Any, x: Any, q: Any, args: Any) -> Float[Array, " n"]:
-        """dx/dt, a constant of first derivatives."""
+        """dx/dt, constant under a first derivative."""
         frozen, *point = constant_once((self, t, x, q, args))
         return frozen.field(*point)
 
     def rates(
         self, t: Any, x: Any, q: Any, args: Any, slope: Any
     ) -> tuple[Float[Array, " guards"], Float[Array, " guards"]]:
-        """The guards' values, and how fast they change where x does with this slope: constants of first
-        derivatives."""
+        """Returns (the guards' values, their rates of change along `slope`), both constant under a first derivative."""
         frozen, t, x, q, args = constant_once((self, t, x, q, args))
         return jax.jvp(lambda t, x: frozen.guards(t, x, q, args), (t, x), (jnp.ones_like(t), slope))
 

@@ -23,7 +23,8 @@ NOT_FINITE: Any = diffrax.RESULTS.nonlinear_divergence  # what an event wrote
 
 
 class HybridInterpolation(diffrax.AbstractLocalInterpolation):
-    """Within a step, x of the inner solver's dense output; at its end, what events made of it."""
+    """Dense output of a step: x by the inner solver's dense output within the step, by the state after the events at
+    its end."""
 
     t0: Any
     t1: Any
@@ -55,7 +56,7 @@ class _Dense(eqx.Module):
 
 
 class WithEvents(diffrax.AbstractWrappedSolver):
-    """Takes the steps of a solver, and ends one where an event happens.
+    """Wraps a solver so that steps end where an event happens.
 
     - `solver`: the problem prepares it for the discrete values at hand.
     - `max_events`: more of them end the run with `TOO_MANY`.
@@ -101,7 +102,7 @@ class WithEvents(diffrax.AbstractWrappedSolver):
         return self.solver.func(terms, t0, y0, args)
 
     def between_events(self, terms, y0, y1):
-        """(terms, solver, state) after a step from y0 to y1, and whether an event at its end changed them."""
+        """Returns (terms, solver, state, whether an event at its end changed them) after a step from y0 to y1."""
         solver = problem_of(terms).prepared(self.solver, y1.q)
         return bound(terms, y1.q), solver, y1.x, jnp.any(y0.q != y1.q)
 

@@ -60,8 +60,8 @@ def _holds(value: Any, rate: Any) -> Any:
 
 
 def _settled(problem: AbstractHybridProblem, t0: Any, x0: Any, q0: Any, due: Any, args: Any) -> tuple[Any, Any, Any]:
-    """(q, how fast guards change, the guards) at the initial time, when all relations are what their sides say, or, if
-    their clocks are `due`, what these write. They do not move with parameters."""
+    """Settles the relations at the initial time: each gets the truth of its sides, or, if its clock is `due`, what that
+    writes. Returns (q, rates of the guards, values of the guards); q does not move with parameters."""
     c, g = problem.n_clocks, problem.n_guards
     relations = np.array(problem.relations, bool)
     given = still((problem, t0, x0, q0, due, args))
@@ -77,7 +77,7 @@ def _settled(problem: AbstractHybridProblem, t0: Any, x0: Any, q0: Any, due: Any
         return problem.rates(t0, x0, q, args, problem.slope(t0, x0, q, args))
 
     def once(k: Any, carry: Any) -> Any:
-        """Relations as they were found before, and what guards are with them."""
+        """One round: relations are set by the guards of the round before, and the guards are evaluated again."""
         q, rate, value = carry
         q = jnp.where(k > 0, written(q, jnp.zeros((c,), bool), _holds(value, rate)), q)
         value, rate = looked_at(q)

@@ -9,7 +9,8 @@ from .problem import AbstractHybridProblem, HybridState
 
 
 class HybridTerm(diffrax.AbstractTerm):
-    """Stands for the equations; a solver asks it for those that hold while the discrete values are q."""
+    """The term of a problem with events. It takes no steps itself: `bound` gives the term for the discrete values at
+    hand."""
 
     problem: AbstractHybridProblem
 
@@ -24,10 +25,11 @@ class HybridTerm(diffrax.AbstractTerm):
 
 
 def problem_of(terms: Any) -> AbstractHybridProblem:
-    """The problem in the terms that Diffrax hands to a solver or a controller: it wraps a term in its direction."""
+    """The problem inside the terms that Diffrax hands to a solver or a controller, which may be wrapped in a direction
+    of time."""
     return unwrapped(terms)[0].problem
 
 
 def bound(terms: Any, q: Any) -> Any:
-    """The terms while the discrete values are q."""
+    """The terms of the equations that hold with the discrete values q."""
     return rewrapped(terms, problem_of(terms).term(q))

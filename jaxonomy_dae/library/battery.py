@@ -39,7 +39,7 @@ EFFICIENCY = Interval(0.0, 1.0, open_low=True)
 
 
 class _Circuit(NamedTuple):
-    """What the terminal voltage and the heat are made of."""
+    """Expressions of a cell's equivalent circuit, of which the terminal voltage and the heat are made."""
 
     voltage: Any
     current: Any

@@ -203,7 +203,7 @@ def make_array(ev: "EqnEnv", name: str, kind: type, shape: Any, args: tuple, kwa
 
 
 def _regular(value: Any) -> Any:
-    """A list, or None if its parts differ in length."""
+    """The list itself; None if its parts differ in length."""
     try:
         np.shape(value)
     except ValueError:
@@ -222,7 +222,8 @@ def _sizes(shape: Any, where: str) -> tuple[int, ...]:
 
 
 def _each(value: Any, name: str, shape: tuple[int, ...], array: str, values: dict[str, np.ndarray]) -> Any:
-    """An argument as the prototype gets it: a symbol in place of an array, which goes to `values`."""
+    """An argument as the prototype gets it. In place of an array it gets a symbol, and the array is added to
+    `values`."""
     where = f"array '{array}'"
     if isinstance(value, Tracer):
         raise ModelError(

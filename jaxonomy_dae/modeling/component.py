@@ -20,6 +20,7 @@ from .interval import Interval, as_interval
 from .kinds import check_kind
 from .mode_declarations import ModeDeclarations
 from .names import check_name
+from .networks import count_outputs
 from .ports import Domain, Port
 from .real_number import real_number
 from .symbols import DiscreteSymbol, ParameterSymbol, PreviousSymbol, TimeSymbol, VariableSymbol
@@ -417,8 +418,6 @@ class Component(ModeDeclarations, metaclass=Construction):
 
     def _opaque(self, what: str, name: str, network: Any, inputs: Sequence[Any], outputs: int | None):
         self._claim(name, what)
-        from .neural import count_outputs
-
         where = f"{what} '{self.name}.{name}'"
         if not callable(network):
             raise ModelError(f"{where}: the {_noun(what)} must be callable; got {network!r}")

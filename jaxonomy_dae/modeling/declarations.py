@@ -1,16 +1,13 @@
 """What a component declares: parameters, variables, learned terms."""
 
 import dataclasses
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import sympy
 
 from .interval import Interval
 from .symbols import TimeSymbol, VariableSymbol
-
-if TYPE_CHECKING:
-    from .component import Component
 
 START = ":start"  # ends the name of what is declared by the start of a derivative
 Value: TypeAlias = float | int | sympy.Expr  # a number, or an expression in parameters
@@ -21,7 +18,7 @@ class EachValue:
     """One value for each instance of an array, in the order of the instances."""
 
     values: np.ndarray
-    prototype: "Component"  # of the array
+    prototype: object  # the component that stands for all of the array; it is only compared by `is`
 
 
 @dataclasses.dataclass(frozen=True)

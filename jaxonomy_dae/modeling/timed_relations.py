@@ -80,7 +80,7 @@ def whole_edges(argument: Any) -> Edges | None:
 
 
 def in_relations_of_time(condition: Any) -> Any:
-    """A condition in which relations of Max, Min and Abs of time are such of what these choose from."""
+    """The condition with relations of Max, Min and Abs of time replaced by relations of their arguments."""
     if isinstance(condition, sympy.And | sympy.Or | sympy.Not):
         return condition.func(*map(in_relations_of_time, condition.args))
     found = _in_time(condition)
@@ -113,7 +113,8 @@ def _sides(relation: Any) -> tuple[Any, Any]:
 
 
 def _in_time(relation: Any) -> tuple[Any, Any, Any] | None:
-    """(slope, head, level) of an ordering between head and level, multiplied by the slope."""
+    """Writes a relation as slope·(head − level), ordered against zero, where only the head changes with time. Returns
+    (slope, head, level), or None."""
     if not isinstance(relation, _ORDERED) or not _in_parameters(relation):
         return None
     left, right = _sides(relation)
@@ -125,8 +126,8 @@ def _in_time(relation: Any) -> tuple[Any, Any, Any] | None:
 
 
 def _with_one_head(e: Any) -> tuple[Any, Any, Any] | None:
-    """(slope, head, rest) of an expression slope·head + rest whose slope and rest do not change in time. No head
-    stands for none."""
+    """Writes an expression as slope·head + rest, where slope and rest do not change with time. Returns (slope, head,
+    rest), with head None if nothing does; None if there are several heads."""
     if not _changes(e):
         return sympy.Integer(0), None, e
     if isinstance(e, TimeSymbol | sympy.sin | sympy.cos | sympy.Mod | sympy.frac | sympy.Max | sympy.Min | sympy.Abs):
@@ -147,7 +148,7 @@ def _with_one_head(e: Any) -> tuple[Any, Any, Any] | None:
 
 
 def _affine(e: Any) -> tuple[Any, Any]:
-    """(slope, value at zero) of an expression that is affine in time; None, None for others."""
+    """Writes an expression as slope·t + value. Returns (slope, value), or (None, None) if it is not affine in time."""
     found = _with_one_head(e)
     if found is None or not isinstance(found[1], TimeSymbol):
         return None, None
@@ -169,7 +170,7 @@ def _in_parameters(e: Any) -> bool:
 
 
 def _after(direction: Any) -> Any:
-    """1 if what passes zero rises, 0 if it falls."""
+    """1 if a quantity that passes zero with this slope rises, 0 if it falls."""
     return sympy.Piecewise((1, direction > 0), (0, True))
 
 
@@ -182,5 +183,5 @@ def _where(condition: Any, e: Any, otherwise: Any = 0) -> Any:
 
 
 def _quotient(a: Any, b: Any) -> Any:
-    """a/b; zero where b is."""
+    """a/b, or 0 where b is 0."""
     return a / b if b.is_number else _where(_nonzero(b), a / b)

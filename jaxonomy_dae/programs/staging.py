@@ -28,8 +28,8 @@ def is_forwards(tree: Any) -> bool:
 
 
 def _layers(leaf: Any) -> Iterator[Any]:
-    """A leaf, and what differentiation and batching wrapped in it, one in the other; a tracer of any other kind is the
-    last."""
+    """The leaf and the tracers inside it, from the outside in, as far as differentiation and batching have wrapped it;
+    a tracer of another kind is the last."""
     yield leaf
     while isinstance(leaf, Tracer):
         if hasattr(leaf, "primal"):  # JVPTracer, LinearizeTracer

@@ -27,10 +27,7 @@ Point = tuple[Any, Any]
 
 
 def failed_block(system: AcausalSystem, first: Point, last: Point, t1: Any, inputs: dict[str, Any]) -> str:
-    """A sentence on the block that fails at the last accepted point (t, x) or just beyond it, or nothing.
-
-    - `first`: the point where the run began: what was ill-conditioned there did not end it.
-    """
+    """A sentence on the block that fails at the last accepted point (t, x) or just beyond it; "" if none does."""
     t, x = last
     failed = _first_failed(system, t, x, inputs)
     if failed is not None:
@@ -45,7 +42,7 @@ def failed_block(system: AcausalSystem, first: Point, last: Point, t1: Any, inpu
 
 
 def _first_failed(system: AcausalSystem, t: Any, x: Any, inputs: dict[str, Any]) -> AnyStep | None:
-    """The first step of two and more equations, or a nonlinear one, that has no value."""
+    """The first step that has no value, among nonlinear ones and those of two or more equations."""
     plan = system.plan
     known = np.arange(plan.extended.quantities.n_unknown, plan.extended.quantities.n)
     computed = np.concatenate([plan.states, *(q for step in plan.steps for q in step.unknown), known])
@@ -67,7 +64,7 @@ def _quantities(system: AcausalSystem, t: Any, x: Any, inputs: dict[str, Any], c
 
 
 def _findings(system: AcausalSystem, t: Any, x: Any, inputs: dict[str, Any]) -> list[BlockFinding]:
-    """The blocks that are singular, or nearly so."""
+    """Sentences on the blocks that are singular, or nearly so."""
     plan, parameters = system.plan, system.numbers
 
     def values():
@@ -123,7 +120,7 @@ def _no_root(system: AcausalSystem, step: AnyStep, x: Any, what: str) -> str:
 
 
 def _just_beyond(system: AcausalSystem, t: Any, x: Any, t1: Any, inputs: dict[str, Any]) -> str:
-    """The nonlinear block that loses its root just beyond a point, from which its unknowns are solved for."""
+    """Names the nonlinear block that loses its root a short way beyond the point."""
     plan = system.plan
     problem = FlatProblem(term_of(system, implicit=True), x, inputs)
     slope = np.asarray(consistent_slope(problem, None, jnp.asarray(t), jnp.asarray(x))).copy()

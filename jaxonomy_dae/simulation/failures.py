@@ -33,7 +33,7 @@ PROBES = 64  # times at which inputs are looked at
 
 
 def raised(x: Any, result: Any, has_events: bool, max_steps: int, max_events: int) -> Any:
-    """x, or an error while running: for traced runs, of which no more than a code is known."""
+    """x, with a run-time error if the run failed: in traced runs only a code is known."""
     codes = diffrax.RESULTS
     lost = "nonlinear blocks have no solution there, or the start is not consistent"
     many = f"more than max_events={max_events} events" if has_events else "too many rejected steps"
@@ -77,7 +77,8 @@ def explain(
     written = _written_not_finite(system, x)
     if written:
         return f"the integration stopped at t={float(t):g}: an event gave {written} a value that is not finite" + (
-            ", or began a mode whose constraint is far from what it asks for, or that no impulse brings about"
+            ", or it entered a mode whose constraint does not hold at that instant (its gap or speed is not zero), or "
+            "which no impulse can enforce. Check the event's condition, or reset the states with reinit(...)"
             if system.plan.held is not None
             else ", or left states that the hidden constraints do not admit: let it write, with reinit(...), all that "
             "jumps" + _of_kinks(system)
@@ -112,7 +113,7 @@ def explain(
 
 
 def mode_at_start(system: AcausalSystem, inputs: dict[str, Any], t0: Any, x0: Any) -> str:
-    """The constraints that do not hold although a run begins in their modes; or nothing."""
+    """The constraints that do not hold although a run begins in their modes, in a sentence; "" if all hold."""
     held = system.plan.held
     if held is None:
         return ""
@@ -134,7 +135,7 @@ def mode_at_start(system: AcausalSystem, inputs: dict[str, Any], t0: Any, x0: An
 
 
 def _written_not_finite(system: AcausalSystem, x: Any) -> str:
-    """The discrete variables and states that are not finite after an event; or nothing."""
+    """The names of discrete variables and states that are not finite after an event; "" if all are."""
     if system.plan.events is None:
         return ""
     names = system.discretes
@@ -219,7 +220,7 @@ def _sliding(name: str, t: float) -> str:
 
 
 def _bad_input(plan: SystemPlan, inputs: dict[str, Any], t0: float, t: float, t1: float) -> str:
-    """The input that is not finite at the last accepted point or beyond it, if one is."""
+    """The input that is not finite at the last accepted point or beyond it; "" if there is none."""
     near = t + (t1 - t) * np.concatenate([[0.0], 10.0 ** np.linspace(-15, 0, PROBES)])
     for name, value in inputs.items():
         for s in near if callable(value) else near[:1]:

@@ -17,8 +17,8 @@ ITERATIONS = 8  # Gauss–Newton steps onto the constraints, which converge quad
 
 
 def from_state(system: AcausalSystem, t0: Any, inputs: Any, x: Float[Array, " n"]) -> InitialPoint:
-    """The consistent point next to a state. The search for it is kept out of differentiation; a last step carries first
-    derivatives, by the state and by parameters, which are those of the projection where it arrived."""
+    """The consistent point next to a state. The search is not differentiated; a last step carries first derivatives by
+    the state and by parameters, which are those of the projection at the point found."""
     limit = jnp.sqrt(jnp.finfo(x.dtype).eps) * (jnp.abs(x) + _typical(system))
     nothing = jnp.zeros((), jnp.int32)
     if not system.is_constrained:

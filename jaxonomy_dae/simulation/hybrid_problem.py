@@ -89,12 +89,12 @@ class SystemProblem(AbstractHybridProblem):
         return jnp.where(new > -jnp.inf, new, q)
 
     def struck(self, t: Any, x: Any, before: Any, q: Any, args: Any) -> tuple[Any, Any, Any]:
-        """(x, q) after the impulses of the constraints that begin to hold with q, or that q asks for; and whether they
-        do what they should.
+        """Applies the impulses of the constraints that begin to hold with q, or that q asks for. Returns (x, q, whether
+        the impulses do what they should).
 
-        An equation e' + κ·e = 0 takes the place of e' = 0. States along ∂f/∂κ at κ = 0 are those after the impulse
-        that takes e away: exact where e is affine in what jumps (speeds; charges of linear capacitors). What is closed
-        and only pushes lets go if its impulse would be negative (Moreau 1988).
+        An equation e' + κ·e = 0 takes the place of e' = 0. States along ∂f/∂κ at κ = 0 are those after the impulse that
+        takes e away: exact where e is affine in what jumps (speeds; charges of linear capacitors). What is closed and
+        only pushes lets go if its impulse would be negative (Moreau 1988).
         """
         plan: Any = self.system.plan
         held, n = plan.held, len(plan.states)
@@ -128,7 +128,7 @@ class SystemProblem(AbstractHybridProblem):
         return after, q, jnp.all(done | (strength == 0)) & ~wrong
 
     def admitted(self, t: Any, x: Any, q: Any, args: Any) -> Any:
-        """The state on the constraints that hold with q; not-a-number if it is not near them."""
+        """The state projected onto the constraints that hold with q; NaN if it is not near them."""
         plan = self.system.plan
         if not self.system.is_constrained:
             return x
@@ -162,7 +162,7 @@ def problem_for(
 
 
 def _choices(table: EventTable, n_clocks: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """The discrete values that `complementary` chooses, and the guards that do so."""
+    """Returns (the discrete values that `complementary` chooses, the guards that choose them)."""
     chooses = np.array(table.revocable, bool) & ~np.array(table.relation, bool)
     rows = chooses[table.event] & (table.discrete >= 0) & (table.event >= n_clocks)
     return tuple(np.unique(table.discrete[rows]).tolist()), tuple(np.unique(table.event[rows] - n_clocks).tolist())
@@ -184,7 +184,8 @@ def _opposite(table: EventTable, n_clocks: int) -> tuple[int, ...]:
 
 
 def with_event_control(controller: Any) -> Any:
-    """The controller whose steps end at events; what clips steps at jumps of inputs stays outside."""
+    """Wraps the controller so that steps end at events. A controller that clips steps at jumps of inputs stays
+    outermost."""
     if isinstance(controller, diffrax.ClipStepSizeController):
         return eqx.tree_at(lambda c: c.controller, controller, with_event_control(controller.controller))
     return EventControl(controller)  # pyright: ignore[reportCallIssue]

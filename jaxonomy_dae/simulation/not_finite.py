@@ -13,8 +13,8 @@ ANY = 0.5  # in place of what the equation is to determine
 
 
 def equation_not_finite(system: AcausalSystem, inputs: Any, t: Any, x: Any) -> str:
-    """The first equation, in the order of solution, that reads finite values and is not finite itself, with what it
-    reads; nothing if there is none."""
+    """Names the first equation, in the order of solution, that reads finite values and is not finite itself, with what
+    it reads; "" if there is none."""
     plan = system.plan
     every = np.arange(plan.extended.quantities.n)
     found = system.at(t, inputs).quantities(x, every, np.ones(len(every)))

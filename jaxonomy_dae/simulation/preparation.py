@@ -16,7 +16,7 @@ from ..system.system import AcausalSystem
 
 
 def term_of(system: AcausalSystem, implicit: bool) -> diffrax.AbstractTerm:
-    """The system as Diffrax sees it: explicit, or differential-algebraic."""
+    """The system as a Diffrax term: an ODE, or with `implicit` a differential-algebraic equation."""
     if not implicit:
         return diffrax.ODETerm(system.vector_field)
     plan = system.plan
@@ -25,7 +25,7 @@ def term_of(system: AcausalSystem, implicit: bool) -> diffrax.AbstractTerm:
 
 
 def prepared(system: AcausalSystem, solver: Any, implicit: bool, watch: Watch | None, atol: Any) -> Any:
-    """The solver with what the system fills in: projections, what to watch."""
+    """The solver with what the system supplies filled in: projections and the determinants to watch."""
     if isinstance(solver, Tsit5) and watch is not None:
         solver = Tsit5(looped=solver.looped, watch=watch)
     # A minimal set of states may become a singular choice on the way.
@@ -55,5 +55,5 @@ def largest_tolerance(system: AcausalSystem, controller: Any) -> Any:
 
 
 def _unchanged(t: Any, x: Any, args: Any) -> Any:
-    """The projection of an implicit solver that has no constraint left: it solves nonlinear blocks itself."""
+    """The projection for an implicit solver of a system without constraints: it solves nonlinear blocks itself."""
     return x

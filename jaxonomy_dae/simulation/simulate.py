@@ -242,7 +242,7 @@ def _stiff_without_a_run(plan: SystemPlan, duration: float | None) -> str:
 def _traced(
     outcome: Outcome, given: tuple[Any, ...], choice: Choice, checked: bool, bounds: tuple[int, int]
 ) -> Solution:
-    """The solution where nothing can be looked at: inside jit, grad or vmap."""
+    """The solution where values cannot be read: inside jit, grad or vmap."""
     system, inputs, x = given[0], given[4], outcome.x
     if checked:
         x = raised(x, outcome.result, system.plan.events is not None, *bounds)

@@ -85,7 +85,7 @@ class Solution(eqx.Module):
         return _one(*given, jnp.asarray(quantity[0]), jnp.asarray(factor[0], self.states.dtype))
 
     def _state(self, quantity: int, factor: float) -> Any:
-        """The values of what is zero, or in the state array; None for all else."""
+        """The values of quantities that are zero or part of the state array; None for others."""
         if quantity < 0:
             return jnp.zeros(self.ts.shape, self.states.dtype)
         plan = self.system.plan
@@ -238,7 +238,7 @@ class Solution(eqx.Module):
 
 
 def _each(batch: Solution, read: Callable[[Solution], Any]) -> Any:
-    """Reads every solution of a batch."""
+    """Reads every solution of a batch, by mapping over the batch axes."""
     return eqx.filter_vmap(read)(batch)
 
 
@@ -279,7 +279,7 @@ def _everything(system: AcausalSystem, ts, states, inputs, discrete):
 
 @compiled
 def _one(system: AcausalSystem, ts, states, inputs, discrete, quantity, factor):
-    """One quantity, chosen while running: compiled once for all names."""
+    """The values of one quantity, shape (n,). Its number is traced, so that one program serves all names."""
     every = np.arange(system.plan.extended.quantities.n)
     return factor * _observed(system, ts, states, inputs, discrete, every, np.ones(len(every)))[:, quantity]
 

@@ -26,8 +26,8 @@ def scaled_atol(system: AcausalSystem, atol: Any) -> Any:
 
 
 def controller_for(system: AcausalSystem, solver: Any, rtol: Any, atol: Any, dtmax: Any) -> Any:
-    """The controller for tolerances: absolute ones in units of the nominal values. If the user does not bound steps,
-    the waves do by which the model is driven."""
+    """The step-size controller for these tolerances, the absolute ones in units of the nominal values. If the user
+    gives no longest step, it is bounded by the period of the waves that drive the model."""
     atol = scaled_atol(system, atol)
     if is_implicit(solver):
         controller: Any = step_control(solver, rtol, atol, dtmax=dtmax)
@@ -40,7 +40,7 @@ def controller_for(system: AcausalSystem, solver: Any, rtol: Any, atol: Any, dtm
 
 
 def clipped(controller: Any, jump_ts: Any, ends: StepEnds) -> Any:
-    """The controller with steps that end at jumps and kinks; times that the user prescribes stay as they are."""
+    """Wraps the controller so that steps end at jumps and kinks; steps prescribed by the user stay as they are."""
     if isinstance(controller, diffrax.StepTo):
         if jump_ts is not None:
             raise ModelError("jump_ts and StepTo both say where steps end: list the jumps in StepTo(ts=...)")

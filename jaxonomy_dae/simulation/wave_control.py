@@ -23,15 +23,8 @@ ROUNDINGS = 16  # of the angle: as far from an extreme as times are known, where
 
 
 class WaveControl(WrappedControl):
-    """The step sizes of another controller, bounded by a quarter of the shortest period of waves, and long steps end
-    where sin(ωt + φ) of one is zero, one or minus one. Times are constants of differentiation, as step sizes are.
-
-    **Arguments:**
-
-    - `controller`: another one.
-    - `frequency`: ω of the waves, rad/s, shape (waves,).
-    - `phase`: φ of the waves, rad, shape (waves,); NaN for one whose phase moves, by which steps are only bounded.
-    """
+    """Wraps a controller for inputs that are waves sin(ωt + φ): steps are at most a quarter of the shortest period, and
+    long steps end where a wave is zero, one or minus one. Times are constants of differentiation, as step sizes are."""
 
     controller: Any
     frequency: Float[Array, " waves"]

@@ -19,12 +19,8 @@ Slope = Callable[[Any, Any], Float[Array, " n"]]
 def cause_of(
     problem: FlatProblem, t: Any, y: Any, t1: Any, weight: np.ndarray, names: Sequence[str], steps: int, explicit: bool
 ) -> str:
-    """A sentence on what stops an integration at its last accepted point (t, y), and what to write; or nothing.
-
-    - `weight`: the tolerance of every unknown there.
-    - `steps`: that were allowed.
-    - `explicit`: whether the solver was.
-    """
+    """A sentence on the cause that stops an integration at its last accepted point (t, y), and what to write instead;
+    "" if none is recognised."""
 
     @jax.jit
     def slope(t, y):
@@ -42,7 +38,7 @@ def cause_of(
 
 
 def first_bad_row(problem: FlatProblem, right: np.ndarray, names: Sequence[str]) -> str:
-    """The first row that is not finite, by the unknown whose derivative it gives, if it gives one."""
+    """Names the first row that is not finite, by the unknown whose derivative it gives, if there is one."""
     k = int(np.flatnonzero(~np.isfinite(right))[0])
     own = problem.mass.is_diagonal and problem.mass.array[k] != 0
     return f"the derivative of '{names[k]}' (row {k} of F)" if own else f"row {k} of F"

@@ -22,7 +22,8 @@ REFUSED = 0.5  # of the nearest: a step that goes further is not accepted, so th
 
 
 class Verdict(eqx.Module):
-    """On a step: whether it may be kept, whether the run goes on if it is, and the largest determinants so far."""
+    """The judgement of a step: whether it may be kept, whether the run goes on if it is, and the largest determinants
+    so far."""
 
     allowed: Bool[Array, ""]
     goes_on: Bool[Array, ""]

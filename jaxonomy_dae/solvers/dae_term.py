@@ -56,7 +56,7 @@ class DAETerm(diffrax.AbstractTerm):
         self.mass = mass if mass is None or isinstance(mass, Mass) else Mass(mass)
 
     def vf(self, t, y, args):
-        """F(t, y), or (f, g), as it looks like y."""
+        """F(t, y), or (f, g), in the structure of y."""
         return ravel_pytree(y)[1](self.right(t, y, args))
 
     def contr(self, t0, t1, **kwargs):
@@ -86,7 +86,7 @@ class DAETerm(diffrax.AbstractTerm):
         return jnp.concatenate([ravel_pytree(f)[0], found])
 
     def mass_of(self, y: Any) -> Mass:
-        """M for a solution that looks like y."""
+        """The mass matrix M for a solution in the structure of y."""
         if self.mass is None:
             if not (isinstance(y, tuple) and len(y) == 2):
                 raise ModelError(f"the solution of DAETerm(f, g) is a pair (x, z); got {jax.tree.structure(y)}")
@@ -122,10 +122,7 @@ def _check_like(name: str, found: Any, expected: Any):
 
 
 class FlatProblem:
-    """A term seen by our solvers: M dy/dt = F(t, y) for a flat y, in the direction of integration.
-
-    Diffrax hands over its own wrapper, which turns time around where t1 < t0.
-    """
+    """A term as solvers use it: M dy/dt = F(t, y) for a flat y, in the direction of integration."""
 
     def __init__(self, terms: Any, y: Any, args: Any):
         self.term, self.direction = unwrapped(terms)

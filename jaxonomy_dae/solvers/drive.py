@@ -42,7 +42,7 @@ def is_implicit(solver: Any) -> bool:
 
 
 def right_between_steps(solver: Any) -> Any:
-    """The solver with an error test that covers its dense output, where values within steps are saved."""
+    """The solver with an error test that covers its dense output, if values are saved within steps."""
     if isinstance(solver, Projected):
         return dataclasses.replace(solver, solver=right_between_steps(solver.solver))
     return dataclasses.replace(solver, dense_errors=True) if isinstance(solver, Rodas5P) else solver
@@ -58,12 +58,7 @@ def integrate(
     save: diffrax.SubSaveAt, controller: Any, adjoint: Any, max_steps: int, progress: bool = False,
     checked: bool = False, goes_on: Any = True,
 ) -> Run:  # fmt: skip
-    """Integrates, saves what is asked for and the last accepted point, and counts Jacobians.
-
-    Where the times do not fit, no row counts as reached, and the result is `BAD_TIMES`; with `checked`, that is an
-    error while running. Where `goes_on` is false, no step is taken: with numbers that are not finite, all steps would
-    be rejected, up to `max_steps`, and the others of a batch would wait.
-    """
+    """Integrates; returns the values asked for, the last accepted point, and counts, Jacobians included."""
     fits = times_fit(t0, t1, save.ts, controller)
     if checked and fits is not True:
         t1 = eqx.error_if(t1, jnp.logical_not(fits), TIMES)

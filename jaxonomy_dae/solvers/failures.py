@@ -52,7 +52,7 @@ class StartCheck(eqx.Module):
 
 
 def start_check(problem: FlatProblem, t: Any, rtol: Any, atol: Any) -> StartCheck:
-    """Evaluates the equations at the start."""
+    """Evaluates the equations at the start, for `explain_start`."""
     problem_y = jax.lax.stop_gradient(problem.flat)
     if not problem.mass.is_singular:
         empty = jnp.zeros((0,), problem_y.dtype)
@@ -105,7 +105,7 @@ def explain_start(check: StartCheck, names: Sequence[str]) -> str:
 
 
 def null_names(matrix: np.ndarray, names: Sequence[str]) -> str:
-    """The unknowns that a singular matrix leaves undetermined, by name; nothing if it is regular."""
+    """The names of unknowns that a singular matrix leaves undetermined; "" if it is regular."""
     if not np.isfinite(matrix).all():
         return ""
     rows = np.abs(matrix).max(axis=1)

@@ -134,7 +134,7 @@ def solve_dae(
 
 
 def _inexact(leaf: Any) -> Any:
-    """An array of floating-point numbers; integers become the default kind."""
+    """The array in floating point; integers become the default type."""
     array = jnp.asarray(leaf)
     return array if jnp.issubdtype(array.dtype, jnp.inexact) else array.astype(jnp.result_type(float))
 
@@ -189,7 +189,7 @@ def check_tolerances(rtol: Any, atol: Any, dtype: Any):
 
 
 def _rounded_up(value: float) -> float:
-    """The next number of one digit."""
+    """The next number above with one significant digit."""
     unit = 10.0 ** math.floor(math.log10(value))
     return math.ceil(value / unit) * unit
 

@@ -19,7 +19,7 @@ UNSEEN = 1e3  # tolerances: the first step resolves smaller motion, too, which t
 
 
 def encoded(factor: Any, keep: Any) -> Any:
-    """The norm of an error estimate that asks for a step size changed by a factor."""
+    """The error norm by which a multistep solver asks the controller to change the step size by a factor."""
     smaller = keep & (factor < 1)
     return jnp.where(smaller, SAFETY + (1 - SAFETY) * factor, SAFETY / factor)
 
@@ -32,7 +32,7 @@ def decoded(norm: Any) -> Any:
 
 
 def tolerance_like(atol: Any, y: Any) -> Any:
-    """An absolute tolerance for every leaf of y: one number for all, or what looks like y."""
+    """An absolute tolerance for every leaf of y, from one number for all or a tree like y."""
     if jax.tree.structure(atol) == jax.tree.structure(y):
         return atol
     return jax.tree.map(lambda _: atol, y)
@@ -129,12 +129,7 @@ class StepControl(diffrax.AbstractAdaptiveStepSizeController):
 
 
 class ConstantLengths(WrappedControl):
-    """The step sizes of another controller, as constants of differentiation.
-
-    A step that is cut short at a time that was given, as of a sample, moves its end with that time. Where the next
-    step is a multiple of it, all later ones stretch with it: after a remainder of 1e-5 of a step by 1e5, each times
-    its own local error. So lengths count as constants, as for `StepControl`, and later steps move as a whole.
-    """
+    """Wraps a controller so that its step sizes are constant under differentiation."""
 
     def wrap(self, direction):
         return ConstantLengths(self.controller.wrap(direction))  # pyright: ignore[reportCallIssue]

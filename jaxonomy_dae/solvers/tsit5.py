@@ -31,7 +31,8 @@ class Tsit5(diffrax.Tsit5):
     watch: Watch | None = None
 
     def init(self, terms, t0, t1, y0, args):  # pyright: ignore[reportIncompatibleMethodOverride]
-        """The slope at the start: first same as last; and what `watch` counts."""
+        """Returns (the slope at the start, since the last stage of a step is the first of the next one; the count of
+        `watch`)."""
         return terms.vf(t0, y0, args), None if self.watch is None else self.watch.start()
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -50,7 +51,8 @@ class Tsit5(diffrax.Tsit5):
         return y1, y_error, dict(y0=y0, y1=y1, k=jnp.stack(k)), (slope, count), result
 
     def _written_out(self, terms, t0, t1, y0, args, control, slope, made_jump):
-        """The points of the last two stages, the last slope, and all increments; `slope` is that of the step before."""
+        """The stages written out. Returns (the points of the last two stages, the slope at the last, all increments);
+        `slope` is the last slope of the step before."""
         tableau = self.tableau
         if made_jump is not False:
             slope = jax.lax.cond(made_jump, lambda _: terms.vf(t0, y0, args), lambda s: s, slope)

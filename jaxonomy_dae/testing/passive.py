@@ -136,7 +136,7 @@ def _samples(rng: np.random.Generator, count: int, typical: np.ndarray) -> np.nd
 
 
 def _share(law: Any, u: Array, size: int) -> Array:
-    """The power that comes in, as a share of Σ |N_i v_i|; zero where there is none at all."""
+    """The power that comes in, as a share of Σ |N_i v_i|; zero if no power flows at all."""
     v = jax.grad(law.energy)(u) if isinstance(law, PortHamiltonian) else u[:size]
     terms = law(u) * v
     total = jnp.sum(jnp.abs(terms))
@@ -162,7 +162,7 @@ def _drawn(arrays: Any, rng: np.random.Generator) -> Any:
 
 
 def _climb(slope: Callable, start: np.ndarray, dtype: Any) -> np.ndarray:
-    """A local maximum of the rate, followed in units of where it starts."""
+    """Follows the rate to a local maximum, from a start point and in units of it."""
     unit = np.where(start != 0, np.abs(start), np.abs(start).max() or 1.0)
     size = abs(float(slope(jnp.asarray(start / unit, dtype), jnp.asarray(unit, dtype))[0])) or 1.0
 

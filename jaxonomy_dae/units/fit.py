@@ -54,7 +54,7 @@ class Measured:
 
 @dataclasses.dataclass(frozen=True)
 class Term:
-    """coefficient·value, and how messages call it."""
+    """A term coefficient·value of a sum, with its name in messages."""
 
     name: Callable[[], str]
     value: Measured | None
@@ -91,7 +91,7 @@ def misfit_of_units(named: Sequence[tuple[str, Unit | None]]) -> str | None:
 
 
 class _Walk:
-    """The units of all nodes below a root."""
+    """Walks through a graph, finds the units of all nodes, and notes what does not fit."""
 
     def __init__(self, unit_of: UnitOf):
         self.unit_of = unit_of
@@ -275,7 +275,7 @@ def _most_common(items: Sequence[Any]) -> Any:
 
 
 def _common_scale(values: Sequence[Measured]) -> float | None:
-    """The factor of a unit in which all values may be meant."""
+    """The factor of a unit in which all values may be read; None if there is none."""
     candidates = [v.unit.scale for v in values]
     candidates += [v.unit.scale / v.number for v in values if v.number]
     return next((s for s in candidates if all(_fits(v, s) for v in values)), None)
