@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Int, PyTree
 from ..private_names import MissingName, private
 
 
-class Program(eqx.Module):
+class SolveProgram(eqx.Module):
     """The functions of a solve as closure-converted ones: the arrays that they close over are passed to them."""
 
     step: Any  # (tprev, tnext, y, solver_state, made_jump) -> what the solver's `step` returns
@@ -115,7 +115,7 @@ def _(size, batched, active, new, old):
     return out, jax.tree.map(lambda _: True, out)
 
 
-def going(state: Any, numbers: dict[str, Any], program: Program) -> Bool[Array, ""]:
+def going(state: Any, numbers: dict[str, Any], program: SolveProgram) -> Bool[Array, ""]:
     """True while a solve has steps left to take."""
     on = (state.tprev < numbers["t1"]) & diffrax.is_successful(state.result)
     return on if program.max_steps is None else on & (state.num_steps < program.max_steps)

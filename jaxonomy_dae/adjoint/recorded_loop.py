@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from ..private_names import private
-from .closure_conversion import Program, any_member, apart, going, read, rows, unless_waiting, written
+from .closure_conversion import SolveProgram, any_member, apart, going, read, rows, unless_waiting, written
 from .packing import Packing
 from .resting import held_back
 from .reverse_step import ReverseStep
@@ -17,7 +17,7 @@ from .step_times import StepTimes
 
 
 @eqx.filter_custom_vjp
-def solve(numbers: dict[str, Any], program: Program) -> tuple[Any, Any]:
+def solve(numbers: dict[str, Any], program: SolveProgram) -> tuple[Any, Any]:
     """Takes steps until the end and returns the final `(state, buffers)`.
 
     `numbers` holds every array that the solve depends on: `state` and `buffers` to start from, `t1`, the `controller`'s
@@ -41,7 +41,7 @@ class _Recorder:
     the same for all members of a batch, and each says which members accepted it; a row that none did is written over.
     """
 
-    def __init__(self, numbers: dict[str, Any], program: Program, times: StepTimes):
+    def __init__(self, numbers: dict[str, Any], program: SolveProgram, times: StepTimes):
         self.numbers, self.program, self.times = numbers, program, times
         state, moves = numbers["state"], times.start()
         held = numbers["first"] < state.tnext
@@ -111,6 +111,8 @@ def _(perturbed, numbers, program):
     def advance(loop):
         carry, buffers, chunks, stride, kept, record, _ = loop
 
+        # When all points are in use, every other one is given up and the stride doubles: their number stays bounded
+        # however long the solve is.
         def thin():
             return jax.tree.map(lambda a: a.at[: points // 2].set(a[:points:2]), kept), 2 * stride
 
@@ -136,6 +138,7 @@ def _(residuals, cotangents, perturbed, numbers, program):
     times = StepTimes(perturbed, numbers, program)
     recorder = _Recorder(numbers, program, times)
     reverse = ReverseStep(cotangents, perturbed, numbers, program, times)
+    # In a batch, all members go back over as many rows as the longest solve has.
     chunks, stride, filled = (private("unvmap_max")(v) for v in (chunks, stride, filled))
     blank = jax.tree.map(jnp.zeros_like, numbers["buffers"])  # saved nowhere: dead code
     start = reverse.start(state, moves)

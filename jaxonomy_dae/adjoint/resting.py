@@ -17,16 +17,23 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..private_names import FROM_CONTROLLER
-from .closure_conversion import Program, any_member
+from .closure_conversion import SolveProgram, any_member
 from .wrapped_control import WrappedControl
 
-# In units of the state and what tolerances make of zero, |y| + atol/rtol:
-PUSH = 0.03  # what rests is pushed by in the second run, whose error is then 33·rtol of it
-MOTION = 0.01  # a component rests that would move by less in all the time
-RESOLVED = 0.1  # of the inverse rate of what rests at the start is the first step at most
-TINY = 1e-6  # of a step are …
-SETTLING = 3  # … those after a push, which is to fulfil what Newton solves at the end of a step
-TRIES = 50  # to find a step that the second run allows; it is given up after as many
+# PUSH and MOTION are parts of a component's scale, |y| + atol/rtol: its size, and what tolerances make of zero.
+# Components at rest are pushed by PUSH in the second run. A push of this size stands for an infinitesimal one; the
+# error of a step, rtol of the scale, is 33·rtol of it, and this is what derivatives are resolved to
+# (test_gradients_at_rest.py::test_beside_each_other).
+PUSH = 0.03
+MOTION = 0.01  # a component rests if its slope would move it by less over the whole run
+# The first step is at most this part of the inverse rate at which slopes answer to a push: it was chosen by what moves,
+# and may be longer than the whole motion of what rests (test_gradients_at_rest.py::test_the_first_step).
+RESOLVED = 0.1
+# The first SETTLING attempts after a push are TINY of a step: Newton's method at their ends puts the pushed state where
+# algebraic equations and constraints hold.
+TINY = 1e-6
+SETTLING = 3
+TRIES = 50  # of finding a step that the second run allows: each shortens it at least by half, fifty of them to rounding
 
 
 class Pushed(eqx.Module):
@@ -50,7 +57,7 @@ class Pushed(eqx.Module):
     allowed: Float[Array, ""]  # how long the step after the next one may be
 
 
-class Step(eqx.Module):
+class AttemptedStep(eqx.Module):
     """An attempted step of the first run.
 
     - `t0`, `y0`, `t1`, `y1`: its ends; y1 is y0 if the step was rejected.
@@ -113,7 +120,7 @@ class Resting(eqx.Module):
         first = jnp.where(jnp.isfinite(rate), jnp.where(rate > 0, resolved, end), t)
         return jnp.where(jnp.any(rests), jnp.maximum(first, _shortened(t, end)), end)
 
-    def restrained(self, step: Step, pushed: Pushed) -> tuple[Array, Pushed]:
+    def restrained(self, step: AttemptedStep, pushed: Pushed) -> tuple[Array, Pushed]:
         """Returns (the end of the next step, the second run's state after `step`); begins a second run where a
         component has come to rest."""
         resting, step, pushed = still((self, step, pushed))
@@ -134,7 +141,7 @@ class Resting(eqx.Module):
         )
 
     def _looked(
-        self, look: Bool[Array, ""], rests: Bool[Array, " n"], step: Step, pushed: Pushed, without: Pushed
+        self, look: Bool[Array, ""], rests: Bool[Array, " n"], step: AttemptedStep, pushed: Pushed, without: Pushed
     ) -> tuple[Array, Pushed]:
         terms, solver, x, changed = self._between_events(step.y0, step.y1)
         on, new = step.accepted & pushed.exists, step.accepted & ~pushed.exists
@@ -166,6 +173,7 @@ class Resting(eqx.Module):
             )
             keep = keep & jnp.all(jnp.isfinite(y1)) & diffrax.is_okay(result)
             shorter = jnp.where(jnp.isfinite(following), jnp.clip(following - start, 0.0, 0.5 * (end - start)), 0.0)
+            # Not less than a tenth: an error that is not finite says nothing about how much shorter would do.
             shorter = jnp.maximum(shorter, 0.1 * (end - start))
             settled = settles & jnp.all(jnp.isfinite(y1))
             keep = keep & ~settles
@@ -205,14 +213,14 @@ class Resting(eqx.Module):
 
 
 def held_back(
-    state: Any, new: Any, accepted: Bool[Array, ""], pushed: Any, numbers: dict[str, Any], program: Program
+    state: Any, new: Any, accepted: Bool[Array, ""], pushed: Any, numbers: dict[str, Any], program: SolveProgram
 ) -> tuple[Any, Bool[Array, ""], Any]:
     """Returns (Diffrax's state `new` with its next step shortened where components rest, whether it was shortened, the
     second run's state)."""
     if program.rest is None:
         return new, jnp.array(False), pushed
     jump = new.made_jump if program.jumps else False  # some versions of JAX make an array of a constant
-    step = Step(state.tprev, state.tnext, state.y, new.y, accepted, jump, new.tprev, new.tnext)
+    step = AttemptedStep(state.tprev, state.tnext, state.y, new.y, accepted, jump, new.tprev, new.tnext)
     end, pushed = program.rest(numbers["rest"], step, pushed)
     return dataclasses.replace(new, tnext=end), end < new.tnext, pushed
 
@@ -245,7 +253,7 @@ class HeldBack(WrappedControl):
             t0, t1, y0, y1, args, y_error, error_order, state
         )
         after = jax.tree.map(lambda a, b: jnp.where(keep, b, a), y0, y1)
-        step = Step(t0, t1, y0, after, keep, jump, start, end)
+        step = AttemptedStep(t0, t1, y0, after, keep, jump, start, end)
         allowed, pushed = self._resting(y0, args, span).restrained(step, pushed)
         return keep, start, _no_later(start, end, allowed), jump, (state, span, pushed), result
 

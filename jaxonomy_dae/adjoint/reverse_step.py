@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from ..private_names import private
-from .closure_conversion import Program, any_member, inexact, read, unless_waiting
+from .closure_conversion import SolveProgram, any_member, inexact, read, unless_waiting
 from .step_times import StepTimes
 
 
@@ -17,7 +17,7 @@ class ReverseStep:
     """Takes the derivative of one accepted step after another, backwards. Its carry holds the cotangents gathered so
     far and the position in the saved rows."""
 
-    def __init__(self, cotangents: Any, perturbed: Any, numbers: Any, program: Program, times: StepTimes):
+    def __init__(self, cotangents: Any, perturbed: Any, numbers: Any, program: SolveProgram, times: StepTimes):
         self.numbers, self.program, self.times = numbers, program, times
         self.state_cotangent, self.saved = cotangents
         self.timed = times.count > 0

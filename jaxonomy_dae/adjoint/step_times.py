@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ..private_names import clip_floor, private
-from .closure_conversion import Program, inexact
+from .closure_conversion import SolveProgram, inexact
 
 
 class StepTimes:
@@ -19,7 +19,7 @@ class StepTimes:
     controller's own times, as far as they are differentiated. Mostly there are none.
     """
 
-    def __init__(self, perturbed: dict[str, Any], numbers: dict[str, Any], program: Program):
+    def __init__(self, perturbed: dict[str, Any], numbers: dict[str, Any], program: SolveProgram):
         self.numbers, self.program = numbers, program
         clock = _clock(numbers)
         self.leaves, self.structure = jax.tree.flatten(inexact(clock))

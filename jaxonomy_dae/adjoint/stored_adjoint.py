@@ -11,13 +11,15 @@ import jax.numpy as jnp
 from jax import lax
 
 from ..private_names import has_stored_adjoint, private
-from .closure_conversion import Program, closure_convert, unless_waiting
+from .closure_conversion import SolveProgram, closure_convert, unless_waiting
 from .recorded_loop import solve
-from .resting import Resting, Step
+from .resting import AttemptedStep, Resting
 from .reverse_step import state_saves
 
-LARGEST_RECORD = 2**25  # bytes; above, storing steps is no longer cheap
-ROOMY_RECORD = 2**20  # bytes of a record that may have more rows than are needed
+LARGEST_RECORD = 2**25  # bytes; a solve whose record would be larger is left to `RecursiveCheckpointAdjoint`
+# Bytes of a record that may have more than 64 rows: with 256 rows, states of up to 4 kB. Most solves then fit into the
+# record, and no step is taken twice.
+ROOMY_RECORD = 2**20
 
 
 class StoredAdjoint(diffrax.AbstractAdjoint):
@@ -98,7 +100,7 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
             start = _without_buffers(start)
             flag = jnp.array(True)
             converted, consts = closure_convert(body, start, buffers, flag, flag)
-            program = Program(
+            program = SolveProgram(
                 **functions, body=converted, max_steps=max_steps, chunk=chunk, points=points,
             )  # fmt: skip
             final, buffers = solve(numbers | dict(state=start, buffers=buffers, body=consts), program)
@@ -150,7 +152,7 @@ def _inner_loop(cond_fun, body_fun, start, *, max_steps, buffers, checkpoints):
 def _functions(
     *, args, terms, solver, stepsize_controller, saveat, t1, init_state, **_
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Returns (the functions of `Program` except its body, the arrays they close over)."""
+    """Returns (the functions of `SolveProgram` except its body, the arrays they close over)."""
     s = init_state
     controller, others = eqx.partition(stepsize_controller, eqx.is_inexact_array)
     order = solver.error_order(terms)
@@ -191,7 +193,7 @@ def _functions(
     resting, first = Resting.of(terms, solver, stepsize_controller, s.y, args, t1 - s.tprev), s.tnext
     if resting is not None:
         pushed, first = resting.begin(s.tprev, s.y), resting.first_end(s.tprev, s.tnext, s.y)
-        tried = Step(s.tprev, s.tnext, s.y, s.y, jnp.array(False), made_jump, s.tprev, s.tnext)
+        tried = AttemptedStep(s.tprev, s.tnext, s.y, s.y, jnp.array(False), made_jump, s.tprev, s.tnext)
         rest = closure_convert(lambda *given: resting.restrained(*given), tried, pushed)
     functions = dict(
         rest=rest[0], step=step[0], adapt=adapted[0], jumps=made_jump is not False,

@@ -23,8 +23,10 @@ from ..model.quantities import declared_scale, quantity_bounds
 from ..programs.cache import compiled
 from ..system.system import AcausalSystem
 
-PASSES = 4  # of equilibration
-SINGULAR = 1e2  # in units of eps and of the number of unknowns: a singular value that is rounding
+PASSES = 4  # of equilibration: the first one takes scales away, the others balance
+# A singular value below SINGULAR·n·eps of the largest one is rounding. n·eps alone is the usual measure for a matrix
+# with exact entries (NumPy's matrix_rank).
+SINGULAR = 1e2
 
 
 class Equilibrium(NamedTuple):

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 ALIKE = 0.5  # of the largest pivot: what counts as equally good, so that rounding decides nothing
-SINGULAR = 1e-10  # a pivot, relative to the first, that is rounding
+SINGULAR = 1e-10  # a pivot, relative to the first one, that counts as rounding: the constraint repeats others
 
 
 class Coordinates(NamedTuple):

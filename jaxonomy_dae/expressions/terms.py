@@ -2,7 +2,7 @@
 
 from .node import Node, constant, multiply, power, scale, split
 
-MOST = 64  # terms that a product is multiplied out to
+MOST = 64  # terms that a product is multiplied out to: their number is a product of the factors' numbers of terms
 
 
 def terms(node: Node) -> list[Node]:

@@ -12,7 +12,9 @@ from .problem import HybridState
 from .term import bound
 
 ENDED: Any = diffrax.RESULTS.event_occurred  # Diffrax asks the controller last, so that it must say so
-GROWTH = 1e3  # of the step after one that an event made short
+# By how much the step after one that an event made short may be longer than it, up to the length that was planned
+# before. Controllers allow a factor of 8 to 10 a step, and would need several steps to get there after each event.
+GROWTH = 1e3
 
 
 class EventControl(WrappedControl):
@@ -50,6 +52,7 @@ class EventControl(WrappedControl):
         wished = jnp.where(cut & ~early, h, wished)
         end = jnp.where(cut, due, end)
         result = diffrax.RESULTS.where(kept & (y1.ended > 0), ENDED, result)
+        # A step that is retried for an event leaves the wrapped controller as it was.
         new = jax.tree.map(lambda a, b: jnp.where(early, b, a), new, inner)
         return kept, start, end, jump, (new, lax.stop_gradient(wished)), result
 

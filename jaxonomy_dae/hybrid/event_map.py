@@ -27,9 +27,14 @@ from .first_order import constant_once
 from .problem import AbstractHybridProblem, HybridState, one_hot
 from .side import ABOVE, BELOW, RESTS, rounding
 
-CONDITIONS_AT_ONE_INSTANT = 32  # more than these take another step, of no length to speak of
-CLOSE = 0.01  # of a guard's size: what is farther away is not at zero, however fast it is
-STEADY = 0.1  # of a slope: a change during the delay that leaves it worth following back
+CONDITIONS_AT_ONE_INSTANT = 32  # if more events are due, the rest happen in another step, which is as good as none
+# A guard farther from zero than this part of its recent maximum has not reached zero, however fast it moves: with stiff
+# dynamics behind an event, a guard may be about to cross its whole range within `window`.
+CLOSE = 0.01
+# After an event the state is followed back along its new slope over the delay δ, so that the step ends at a constant
+# time. A state whose slope changes by more than this part during δ is not: it is faster than δ, and the way back is
+# wrong.
+STEADY = 0.1
 # Of a step: how far ahead the rate of a guard at zero is looked at, for the sign of its second derivative. That is
 # found up to a part AHEAD, and rounding in it is 1/AHEAD times that of rates.
 AHEAD = 1e-3

@@ -15,14 +15,19 @@ from .problem import AbstractHybridProblem, HybridState
 from .search import first_crossing
 from .side import ABOVE, BELOW, RESTS, rounding
 
-WINDOW = 1e-6  # of a step: a guard that reaches zero so close to its end counts as having done so
+# Part of a step: a guard that would reach zero so soon after its end counts as having reached it. A step that is
+# retried up to a crossing has other errors than the step in which the crossing was located, so that it ends a little
+# off.
+WINDOW = 1e-6
 # Where guards are looked at, as parts of a step; and how far, as a part of its size, a guard may be from the parabola
 # through its values at the first, the middle and the last of these. One that bends more may cross zero unseen, and the
 # step is taken in halves.
 LOOKS = np.array([0.0, 0.13, 0.31, 0.5, 0.67, 0.86, 1.0])
 FITTED = [0, 3, 6]
 BEND = 0.1
-FORGOTTEN = 0.8  # what a step leaves of how long steps have been: next to events they are short
+# Steps next to events are short, and what counts as "at the same time" is measured by how long steps have been of late:
+# each step leaves this part of that length.
+FORGOTTEN = 0.8
 
 
 def _off_parabola() -> np.ndarray:

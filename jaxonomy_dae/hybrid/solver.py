@@ -15,7 +15,7 @@ from .looking import looked_at
 from .problem import HybridState
 from .term import bound, problem_of
 
-MOVED = 1e3  # times the resolution: a step so long goes on
+MOVED = 1e3  # times the resolution: with a longer step time has gone on, and turns at one instant are counted anew
 
 TOO_MANY: Any = diffrax.RESULTS.max_steps_rejected  # events
 STUCK: Any = diffrax.RESULTS.stagnation  # an event happens again and again at one instant
@@ -45,7 +45,7 @@ class HybridInterpolation(diffrax.AbstractLocalInterpolation):
         return self.y1.but(x=x, q=jnp.where(at_end, self.y1.q, self.y0.q))
 
 
-class _Dense(eqx.Module):
+class _DenseOutput(eqx.Module):
     """The inner solver's dense output."""
 
     interpolation: Any = eqx.field(static=True)
@@ -118,7 +118,7 @@ class WithEvents(diffrax.AbstractWrappedSolver):
         x1, y_error, info, inner_state, result = solver.step(
             bound(terms, y0.q), t0, t1, y0.x, args, inner_state, made_jump
         )
-        dense = _Dense(solver.interpolation_cls, info)
+        dense = _DenseOutput(solver.interpolation_cls, info)
         request, armed, values, arrival = looked_at(problem, dense, t0, t1, y0, x1, args)
         turns = jnp.where(t1 - t0 > MOVED * problem.resolution, jnp.zeros_like(y0.turns), y0.turns)
         state = y0.but(x=x1, armed=armed, size=arrival.size, span=arrival.span, request=request, turns=turns)

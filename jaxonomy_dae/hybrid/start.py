@@ -11,7 +11,7 @@ from .event_map import Arrival, handle
 from .problem import AbstractHybridProblem, HybridState
 from .side import ABOVE, BELOW, RESTS
 
-ROUNDS = 4  # relations within relations
+ROUNDS = 4  # each settles relations that depend on those settled before: a relation within a relation takes two
 
 
 def start(

@@ -14,7 +14,7 @@ from .construction import Construction
 from .declarations import START, Account, Learned, Parameter, Variable, full_name
 from .environment import EqnEnv
 from .equations import residual_of
-from .events import Held, When
+from .events import HeldBranch, When
 from .functions import of_scalars
 from .interval import Interval, as_interval
 from .kinds import check_kind
@@ -66,7 +66,7 @@ class Component(ModeDeclarations, metaclass=Construction):
         self.events: list[When] = []
         self.relations: list[float] = []
         self.as_written: dict[sympy.Expr, sympy.Expr] = {}
-        self.held_branches: list[Held] = []
+        self.held_branches: list[HeldBranch] = []
         self.accounts: list[Account] = []
         self._sealed = False
 

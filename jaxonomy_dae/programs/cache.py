@@ -34,7 +34,7 @@ _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
 
-class _Program:
+class _CompiledFunction:
     """A compiled function for certain static values; `calls` counts the calls that have not returned yet."""
 
     def __init__(self, function: Callable, runs_once: bool, structure: Any, static: tuple[Any, ...]):
@@ -78,7 +78,7 @@ class ProgramCache:
     """Programs by function, structure, static values, shapes and dtypes; the most recently used is the last."""
 
     def __init__(self):
-        self._programs: OrderedDict[Hashable, _Program] = OrderedDict()
+        self._programs: OrderedDict[Hashable, _CompiledFunction] = OrderedDict()
         self._lock = threading.RLock()
         self._next = 0.0  # when use may be measured again, in seconds of `time.perf_counter`
         self._left: dict[Callable, int] = {mappings: 0, memory: 0}  # what freeing left, of each
@@ -98,7 +98,7 @@ class ProgramCache:
             program = self._programs.get(key)
             if program is None:
                 self.make_room()
-                program = self._programs[key] = _Program(function, runs_once, structure, static)
+                program = self._programs[key] = _CompiledFunction(function, runs_once, structure, static)
             self._programs.move_to_end(key)
             program.calls += 1
         try:

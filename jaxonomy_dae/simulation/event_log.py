@@ -14,7 +14,7 @@ from ..errors import ModelError
 from ..hybrid.problem import HybridState
 from ..system.system import AcausalSystem
 
-SHOWN = 12
+SHOWN = 12  # events in the text of a log
 
 
 class EventLog(eqx.Module):

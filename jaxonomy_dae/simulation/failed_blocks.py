@@ -21,7 +21,7 @@ from ..system.input_values import input_values
 from ..system.system import AcausalSystem
 from .preparation import term_of
 
-SHOWN = 4
+SHOWN = 4  # names and equations of each kind in an error
 NEAR = 10.0 ** np.arange(-15, -5)  # parts of the interval
 Point = tuple[Any, Any]
 

@@ -22,9 +22,13 @@ from .preparation import term_of
 from .solution import Solution
 from .step_sizes import scaled_atol
 
-NEARLY = 1e-2  # of the first determinant: a singular choice explains a failure so close to it
-SHRINKING = 0.98  # intervals between events that become this much shorter each time accumulate
-CHATTERING = 1e-6  # events closer than this part of the time that has passed
+# A run that failed for another reason (steps too short, too many) is explained by a singular choice of states if a
+# determinant has fallen to this part of its first value.
+NEARLY = 1e-2
+# Times between events that shrink at least by this factor each accumulate: a ball whose speed is multiplied by e at
+# each bounce bounces at intervals that shrink by e.
+SHRINKING = 0.98
+CHATTERING = 1e-6  # of the time that has passed: events that follow each other faster undo each other
 REST = (
     "Say how the model rests: a mode in which it stays (complementary(…, rest_speed=…), contacts.HardStop; a discrete "
     "variable that the event assigns and the equations read), or when(…, terminate(…)) before"

@@ -13,7 +13,7 @@ from ..errors import InitializationError, ModelError
 from ..initialization.initialize import InitialPoint, is_consistent
 from ..system.system import AcausalSystem
 
-ITERATIONS = 8  # Gauss–Newton steps onto the constraints, which converge quadratically
+ITERATIONS = 8  # Gauss–Newton steps onto the constraints; they converge quadratically, from 0.1 in four to rounding
 
 
 def from_state(system: AcausalSystem, t0: Any, inputs: Any, x: Float[Array, " n"]) -> InitialPoint:

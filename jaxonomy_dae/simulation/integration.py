@@ -26,6 +26,8 @@ from .hybrid_problem import problem_for, with_event_control
 from .preparation import largest_tolerance, prepared, term_of
 from .step_sizes import first_step
 
+# Gauss–Newton steps by which saved states are moved onto the constraints. Dense output starts them within some
+# tolerances of a constraint, and each step squares that distance.
 SAVED_ITERATIONS = 3
 
 
@@ -88,6 +90,7 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
     tolerance = largest_tolerance(system, controller)
     solver = prepared(system, chosen, implicit, watch, tolerance)
     term = term_of(system, implicit)
+    # With an implicit solver the controller chooses the first step itself: `dt0=None`.
     own_start = implicit and not isinstance(controller, diffrax.StepTo)
     dt0 = None if own_start else first_step(system, t0, t1, x0, inputs, solver.order(term), controller)
     y0: Any = x0

@@ -8,8 +8,8 @@ from ..lowering.schedule import StepEquation
 from ..model.evaluate_numpy import Networks
 from ..system.system import AcausalSystem
 
-SHOWN = 4
-ANY = 0.5  # in place of what the equation is to determine
+SHOWN = 4  # variables with their values in an error
+ANY = 0.5  # the value given to the unknown of an equation that is only asked whether it is finite
 
 
 def equation_not_finite(system: AcausalSystem, inputs: Any, t: Any, x: Any) -> str:

@@ -34,8 +34,8 @@ from .preparation import term_of
 from .solution import Solution
 from .step_sizes import clipped, controller_for, scaled_atol
 
-FEW_NUMBERS = 20_000  # on one side of all events
-ROOM = 100  # events that are listed, at first
+FEW_NUMBERS = 20_000  # on one side of all events: up to so many, states before and after events are kept (160 kB)
+ROOM = 100  # events that the log of a first run has room for; a run with more is made again with room for all
 MOST_EVENTS = 2**7 * ROOM  # of a run, if the user does not say: with a few steps each, near the default max_steps
 SOLVERS = {"Tsit5": Tsit5, "Rodas5P": Rodas5P, "BDF": BDF}
 

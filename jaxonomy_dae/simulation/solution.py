@@ -21,7 +21,7 @@ from .accounts import account_values, chosen_terms
 from .event_log import EventLog, Events
 from .labelled import data_frame, data_set
 
-SHOWN = 8
+SHOWN = 8  # states that notebooks list
 
 
 class Solution(eqx.Module):

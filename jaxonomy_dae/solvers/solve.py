@@ -26,6 +26,8 @@ from .rows import not_a_number
 from .solve_arguments import check_longest_step, check_times, jump_times, tolerance_of
 from .step_control import StepControl
 
+# Newton steps by which algebraic unknowns are solved for at saved times. Dense output starts them within some
+# tolerances of the root, and each step squares that error.
 SAVED_ITERATIONS = 4
 SMALL = 30  # up to this many unknowns a factorisation costs less than the steps that a multistep method saves
 
@@ -179,6 +181,7 @@ def check_tolerances(rtol: Any, atol: Any, dtype: Any):
     if isinstance(rtol, Tracer):
         return
     eps = float(jnp.finfo(dtype).eps)
+    # A step adds rounding errors of some eps to its result, which no step size brings down.
     if float(rtol) < 10 * eps:
         least = f"rtol ≥ {_rounded_up(10 * eps):.0e}."
         mend = f"Use {least}"

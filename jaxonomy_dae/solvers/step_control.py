@@ -11,8 +11,10 @@ import optimistix as optx
 
 from ..adjoint.wrapped_control import WrappedControl
 
-SAFETY = 0.9
-UNSEEN = 1e3  # tolerances: the first step resolves smaller motion, too, which the error of a step would not see
+SAFETY = 0.9  # of the step that would just meet the tolerance (Hairer, Nørsett & Wanner 1993, II.4)
+# In tolerances: the first step is chosen as if everything moved by as much in the problem's own time. Motion below the
+# tolerance, at rest or nearly so, is then resolved, too; its derivatives may be asked for, though no error shows it.
+UNSEEN = 1e3
 # A solver that chooses its own step sizes writes them into its error estimate, whose norm e a controller reads back:
 # e = SAFETY/φ for a growth or a rejection by the factor φ (what the ordinary formula for order 1 makes of it too), and
 # e = SAFETY + (1 − SAFETY)·φ for a step that is kept though the next shall be smaller.
@@ -82,6 +84,8 @@ class StepControl(diffrax.AbstractAdaptiveStepSizeController):
         def size(v):
             return self.norm(jax.tree.map(lambda a, y, atol: a / (atol + jnp.abs(y) * self.rtol), v, y0, atol))
 
+        # After Hairer, Nørsett & Wanner (1993), II.4: a first guess by |y|/|y'|, an Euler step of that size, and from
+        # the change of the slope the size at which the error term is 0.01 of the tolerance.
         tiny = jnp.finfo(interval.dtype).tiny
         slope = func(terms, t0, y0, args)
         d0, d1 = size(y0), size(slope)
@@ -121,6 +125,7 @@ class StepControl(diffrax.AbstractAdaptiveStepSizeController):
         if self.dtmax is not None:
             dt = jnp.minimum(dt, self.dtmax)
         start = jnp.where(keep, t1, t0)
+        # A step of a few spacings of floating-point numbers cannot be shortened in a useful way.
         least = 4 * jnp.finfo(t1.dtype).eps * jnp.abs(start)
         failed = ~keep & ((dt <= least) | (dt == 0))
         result = diffrax.RESULTS.where(failed, diffrax.RESULTS.dt_min_reached, diffrax.RESULTS.successful)

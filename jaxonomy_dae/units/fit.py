@@ -22,7 +22,7 @@ from .unit import NUMBER, Unit, interval, is_close, product
 UnitOf = Callable[[Hashable], Unit | None]
 
 TIME = frozenset([("time",)])  # the leaves of functions of time
-LARGEST_PLAIN = 4
+LARGEST_PLAIN = 4  # whole numbers up to this one, and their quotients, do not convert units: 1/2, 4/3
 KEEP_UNIT = ("abs", "max", "min", "hypot", "mod")
 TO_NUMBER = ("sign", "heaviside")
 RATIO = "atan2"
@@ -38,7 +38,7 @@ ONE_UNIT = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Measured:
+class UnitOfValue:
     """The unit of a value, with what else decides whether it fits.
 
     - `number`: the product of plain numbers in front of it, which may convert units.
@@ -57,7 +57,7 @@ class Term:
     """A term coefficient·value of a sum, with its name in messages."""
 
     name: Callable[[], str]
-    value: Measured | None
+    value: UnitOfValue | None
     coefficient: float = 1.0
 
 
@@ -95,7 +95,7 @@ class _Walk:
 
     def __init__(self, unit_of: UnitOf):
         self.unit_of = unit_of
-        self.known: dict[Node, Measured | None] = {}
+        self.known: dict[Node, UnitOfValue | None] = {}
         self.found: list[str] = []
 
     def run(self, root: Node, open_above: tuple[str, ...], is_zero: bool) -> list[str]:
@@ -113,17 +113,17 @@ class _Walk:
             self.known[node] = None if node in joints else self._measure(node, is_zero and node in tops)
         return self.found
 
-    def _measure(self, node: Node, is_zero: bool) -> Measured | None:
+    def _measure(self, node: Node, is_zero: bool) -> UnitOfValue | None:
         operation = node.operation
         inside = [self.known[a] for a in node.arguments]
         if operation == "leaf":
             unit = self.unit_of(node.data)
-            return None if unit is None else Measured(unit)
+            return None if unit is None else UnitOfValue(unit)
         if node.leaves == TIME:
             return None
         if operation == "constant":
             value = float(node.data)
-            return Measured(NUMBER, value, is_constant=True) if value and math.isfinite(value) else None
+            return UnitOfValue(NUMBER, value, is_constant=True) if value and math.isfinite(value) else None
         if operation == "sum":
             start, coefficients = node.data
             terms = [
@@ -131,14 +131,14 @@ class _Walk:
                 for c, a, known in zip(coefficients, node.arguments, inside, strict=True)
             ]
             if start:
-                terms.append(Term(lambda: str(start), Measured(NUMBER, is_constant=True), float(start)))
+                terms.append(Term(lambda: str(start), UnitOfValue(NUMBER, is_constant=True), float(start)))
             return self.agree(terms, ONE_UNIT["sum"], is_zero)
         if operation == "product":
             return self._product(node, inside, [Fraction(e).limit_denominator(10**6) for e in node.data])
         if operation == "power":
             self._needs_number(node.arguments[1], "an exponent is a number")
             self._needs_number(node.arguments[0], "what is raised to an exponent that is not constant is a number")
-            return None if inside[0] is None else Measured(NUMBER)
+            return None if inside[0] is None else UnitOfValue(NUMBER)
         if operation in CONDITIONS:
             return None
         if operation in COMPARISONS:
@@ -153,14 +153,14 @@ class _Walk:
             return self._same(node.arguments, inside, f"arguments of {operation} need one unit")
         if operation == RATIO:
             self._same(node.arguments, inside, f"arguments of {operation} need one unit")
-            return Measured(NUMBER)
+            return UnitOfValue(NUMBER)
         if operation not in TO_NUMBER:
             for argument in node.arguments:
                 self._needs_number(argument, f"{operation} takes a number (or an angle in rad)")
-        return Measured(NUMBER)
+        return UnitOfValue(NUMBER)
 
-    def _product(self, node: Node, inside: Iterable[Measured | None], powers: list[Fraction]) -> Measured | None:
-        factors: list[tuple[Measured, Fraction]] = []
+    def _product(self, node: Node, inside: Iterable[UnitOfValue | None], powers: list[Fraction]) -> UnitOfValue | None:
+        factors: list[tuple[UnitOfValue, Fraction]] = []
         known = True
         for argument, value, power in zip(node.arguments, inside, powers, strict=True):
             if value is None:
@@ -177,7 +177,7 @@ class _Walk:
             return None
         number = math.prod(abs(v.number) ** float(p) for v, p in factors)
         is_loose = any(v.is_loose or v.unit.zero for v, _ in factors)
-        return Measured(product((v.unit, p) for v, p in factors), number, is_loose=is_loose)
+        return UnitOfValue(product((v.unit, p) for v, p in factors), number, is_loose=is_loose)
 
     def _needs_number(self, node: Node, rule: str) -> None:
         value = self.known[node]
@@ -190,7 +190,7 @@ class _Walk:
                 f"{rule}, but '{_text(node)}' is in {value.unit} (1 {value.unit} is {value.unit.scale:.6g})"
             )
 
-    def _same(self, nodes: Sequence[Node], values: Iterable[Measured | None], rule: str) -> Measured | None:
+    def _same(self, nodes: Sequence[Node], values: Iterable[UnitOfValue | None], rule: str) -> UnitOfValue | None:
         values = list(values)
         points = {v.unit for v in values if v is not None and v.unit.zero}
         terms = [Term(lambda a=a: _text(a), v) for a, v in zip(nodes, values, strict=True)]
@@ -204,7 +204,7 @@ class _Walk:
         found = self.agree(terms, rule, is_zero=False)
         return found if not points or found is None else dataclasses.replace(found, unit=next(iter(points)))
 
-    def agree(self, terms: Sequence[Term], rule: str, is_zero: bool) -> Measured | None:
+    def agree(self, terms: Sequence[Term], rule: str, is_zero: bool) -> UnitOfValue | None:
         """The unit of a sum of terms, which may be zero; where they do not fit, a sentence is noted."""
         known = [(t, t.value) for t in terms if t.value is not None]
         if not known:
@@ -240,7 +240,7 @@ class _Walk:
             if not v.is_constant
         ]
         if not values:
-            return Measured(NUMBER, is_constant=True) if all_known else None
+            return UnitOfValue(NUMBER, is_constant=True) if all_known else None
         dimensions = [v.unit.dimension for _, v in values]
         if any(d != dimensions[0] for d in dimensions):
             self._note(rule, values, _most_common(dimensions), lambda v: v.unit.dimension)
@@ -254,10 +254,10 @@ class _Walk:
         has_one = all(is_close(n, numbers[0]) for n in numbers) and not any(v.is_constant for _, v in known)
         number = numbers[0] if has_one else 1.0
         is_loose = any(v.is_loose for _, v in values)
-        return Measured(Unit(dimensions[0], common, zero, text), number, is_loose=is_loose)
+        return UnitOfValue(Unit(dimensions[0], common, zero, text), number, is_loose=is_loose)
 
     def _note(
-        self, rule: str, values: list[tuple[Term, Measured]], usual: Any, aspect: Callable[[Measured], Any]
+        self, rule: str, values: list[tuple[Term, UnitOfValue]], usual: Any, aspect: Callable[[UnitOfValue], Any]
     ) -> None:
         """Notes that an aspect of the values, which is `usual` for most of them, is not the same for all."""
         named = sorted(((t.name(), v) for t, v in values), key=lambda row: (len(row[0]), row[0]))
@@ -274,14 +274,14 @@ def _most_common(items: Sequence[Any]) -> Any:
     return max(items, key=lambda item: (items.count(item), -items.index(item)))
 
 
-def _common_scale(values: Sequence[Measured]) -> float | None:
+def _common_scale(values: Sequence[UnitOfValue]) -> float | None:
     """The factor of a unit in which all values may be read; None if there is none."""
     candidates = [v.unit.scale for v in values]
     candidates += [v.unit.scale / v.number for v in values if v.number]
     return next((s for s in candidates if all(_fits(v, s) for v in values)), None)
 
 
-def _fits(value: Measured, scale: float) -> bool:
+def _fits(value: UnitOfValue, scale: float) -> bool:
     """True if a value can be read in units of factor `scale`: its unit has that factor, or the number in front of it
     converts it, alone or with a plain factor such as 1/2."""
     if is_close(value.unit.scale, scale):
