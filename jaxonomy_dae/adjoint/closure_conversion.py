@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Int, PyTree
 
+from ..aliases import Args
 from ..private_names import MissingName, private
 
 
@@ -41,7 +42,7 @@ class ClosureConverted(eqx.Module):
     outputs: Any = eqx.field(static=True)  # (structure of the arrays it returns, their shapes and dtypes)
     static: Any = eqx.field(static=True)  # what it returns beside arrays: (leaves, structure)
 
-    def __call__(self, consts: Any, *args: Any) -> Any:
+    def __call__(self, consts: Any, *args: Args) -> Any:
         leaves, structure = jax.tree.flatten(eqx.filter(args, eqx.is_array))
         if structure != self.inputs:
             raise TypeError(f"a closure-converted function was made for {self.inputs}; got {structure}")
@@ -57,7 +58,7 @@ class ClosureConverted(eqx.Module):
         return eqx.combine(jax.tree.unflatten(self.outputs[0], leaves), jax.tree.unflatten(structure, others))
 
 
-def closure_convert(function: Any, *args: Any) -> tuple[ClosureConverted, list[Any]]:
+def closure_convert(function: Any, *args: Args) -> tuple[ClosureConverted, list[Any]]:
     """Returns (`function` as a `ClosureConverted`, the list of arrays that it closed over). Arguments may be arrays or
     `jax.ShapeDtypeStruct`s."""
     dynamic, static = eqx.partition(args, lambda leaf: eqx.is_array(leaf) or isinstance(leaf, jax.ShapeDtypeStruct))

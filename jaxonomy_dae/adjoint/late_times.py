@@ -18,11 +18,12 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool
 
+from ..aliases import Args, Controller, Solver, State, Terms, Time
 from ..private_names import FOR_LATE_TIMES, missing
 from .wrapped_control import WrappedControl
 
 
-def times_fit(t0: Any, t1: Any, ts: Any, controller: Any) -> Bool[Array, ""] | bool:
+def times_fit(t0: Time, t1: Time, ts: Any, controller: Controller) -> Bool[Array, ""] | bool:
     """True if the times to save, shape (n,) or None, are sorted and lie between t0 and t1, and if those of a
     `diffrax.StepTo` lead from t0 to t1. A Python bool where nothing is traced."""
     steps = controller.ts if isinstance(controller, diffrax.StepTo) else None
@@ -41,8 +42,8 @@ def times_fit(t0: Any, t1: Any, ts: Any, controller: Any) -> Bool[Array, ""] | b
 
 
 def diffeqsolve(
-    term: Any, solver: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, *,
-    save: diffrax.SubSaveAt, controller: Any, adjoint: Any, **options: Any,
+    term: Terms, solver: Solver, t0: Time, t1: Time, dt0: Time, y0: State, args: Args, *,
+    save: diffrax.SubSaveAt, controller: Controller, adjoint: Any, **options: Any,
 ) -> diffrax.Solution:  # fmt: skip
     """`diffrax.diffeqsolve` without its checks of times, for an interval and times of one dtype.
 
@@ -104,7 +105,7 @@ class _LateTimes(diffrax.AbstractAdjoint):
 class _FirstStep(WrappedControl):
     """Wraps a controller so that its first step has the size `dt0`."""
 
-    dt0: Any
+    dt0: Time
 
     def wrap(self, direction):
         wrapped = self.controller.wrap(direction)

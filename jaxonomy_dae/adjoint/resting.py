@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from ..aliases import Args, Controller, Solver, State, Terms, Time
 from ..private_names import FROM_CONTROLLER
 from .closure_conversion import SolveProgram, any_member
 from .wrapped_control import WrappedControl
@@ -65,28 +66,28 @@ class AttemptedStep(eqx.Module):
     - `start`, `end`: the step to take next.
     """
 
-    t0: Any
-    t1: Any
-    y0: Any
-    y1: Any
+    t0: Time
+    t1: Time
+    y0: State
+    y1: State
     accepted: Any
     jump: Any
-    start: Any
-    end: Any
+    start: Time
+    end: Time
 
 
 class Resting(eqx.Module):
     """The equations, solver and controller of the second run, in which components at rest are pushed a little so that
     steps resolve their motion. `restrained` changes the end of the next step."""
 
-    terms: Any
-    solver: Any
-    controller: Any
-    args: Any
-    span: Any
+    terms: Terms
+    solver: Solver
+    controller: Controller
+    args: Args
+    span: Time
 
     @staticmethod
-    def of(terms: Any, solver: Any, controller: Any, y: Any, args: Any, span: Any) -> "Resting | None":
+    def of(terms: Terms, solver: Solver, controller: Controller, y: State, args: Args, span: Time) -> "Resting | None":
         """Prepares a second run. None where steps are prescribed or have no error estimate, and for a state that is not
         one array (apart from what events keep beside it)."""
         base = _innermost(controller)
@@ -98,7 +99,7 @@ class Resting(eqx.Module):
             return None
         return Resting(terms, _small(solver, base), base, args, span)
 
-    def begin(self, t: Any, y: Any) -> Pushed:
+    def begin(self, t: Time, y: State) -> Pushed:
         """The initial value of the second run's state: it does not exist yet."""
         resting, y = still((self, y))
         terms, solver, x, _ = resting._between_events(y, y)
@@ -107,7 +108,7 @@ class Resting(eqx.Module):
         no, none = jnp.array(False), jnp.zeros(x.shape, bool)
         return Pushed(x, state, no, no, none, no, x, state, jnp.full_like(jnp.asarray(t), jnp.inf))
 
-    def first_end(self, t: Any, end: Any, y: Any) -> Any:
+    def first_end(self, t: Time, end: Time, y: State) -> Any:
         """The end of the first step, made earlier where a component rests. A second run begins after a step only, so
         the first step must not exceed `RESOLVED` divided by the rate at which slopes answer to a push."""
         resting, t, end, y = still((self, t, end, y))
@@ -205,7 +206,7 @@ class Resting(eqx.Module):
     def _tolerances(self, x: Array) -> tuple[Array, Array]:
         return jnp.asarray(self.controller.rtol, x.dtype), jnp.asarray(self.controller.atol, x.dtype)
 
-    def _between_events(self, y0: Any, y1: Any) -> tuple[Any, Any, Any, Any]:
+    def _between_events(self, y0: State, y1: State) -> tuple[Any, Any, Any, Any]:
         """Returns (terms, solver, state, whether an event changed them) after a step from y0 to y1."""
         if isinstance(y1, jax.Array):
             return self.terms, self.solver, y1, False
@@ -229,8 +230,8 @@ class HeldBack(WrappedControl):
     """Wraps a controller so that it resolves derivatives of components at rest, for adjoints other than
     `StoredAdjoint`, which does so by itself."""
 
-    terms: Any
-    solver: Any
+    terms: Terms
+    solver: Solver
 
     def wrap(self, direction):
         return HeldBack(self.controller.wrap(direction), self.terms, self.solver)  # pyright: ignore[reportCallIssue]
@@ -265,13 +266,13 @@ def _pattern(x: Array) -> Array:
     return jnp.where(jnp.sin(12.9898 * k + 1.0) > 0, 1.0, -1.0) * (1.0 + 0.5 * jnp.sin(78.233 * k))
 
 
-def _no_later(start: Any, end: Any, allowed: Any) -> Any:
+def _no_later(start: Time, end: Time, allowed: Time) -> Any:
     """The end of a step, no later than `allowed`. An end taken from `allowed` moves with `start` under differentiation:
     the length of the step is constant."""
     return jnp.where(allowed < end, start + still(allowed - start), end)
 
 
-def _shortened(start: Any, end: Any) -> Any:
+def _shortened(start: Time, end: Time) -> Any:
     """The end of a step so short that it changes nothing, but long enough to advance time."""
     shortest = 16 * jnp.finfo(start.dtype).eps * jnp.abs(start)
     return jnp.minimum(end, start + jnp.maximum(TINY * (end - start), shortest))
@@ -282,18 +283,18 @@ def still(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, tree)
 
 
-def _moving(y: Any) -> Any:
+def _moving(y: State) -> Any:
     """The array that is integrated: y itself, or `y.x` of a state with events."""
     return y if isinstance(y, jax.Array) else getattr(y, "x", y)
 
 
-def _inner(solver: Any) -> Any:
+def _inner(solver: Solver) -> Any:
     while isinstance(solver, diffrax.AbstractWrappedSolver):
         solver = solver.solver
     return solver
 
 
-def _small(solver: Any, controller: Any) -> Any:
+def _small(solver: Solver, controller: Controller) -> Any:
     """A copy of the solver that compiles quickly: stages in a loop where supported, and Newton tolerances taken from
     the controller (as `diffeqsolve` does)."""
     if isinstance(solver, diffrax.AbstractWrappedSolver):
@@ -308,7 +309,7 @@ def _small(solver: Any, controller: Any) -> Any:
     return solver
 
 
-def _innermost(controller: Any) -> Any:
+def _innermost(controller: Controller) -> Any:
     while hasattr(controller, "controller"):
         controller = controller.controller
     return controller

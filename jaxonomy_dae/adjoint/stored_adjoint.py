@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from ..aliases import Terms
 from ..private_names import has_stored_adjoint, private
 from .closure_conversion import SolveProgram, closure_convert, unless_waiting
 from .recorded_loop import solve
@@ -125,7 +126,7 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
         return final_state, stats
 
 
-def _is_random(terms: Any) -> bool:
+def _is_random(terms: Terms) -> bool:
     """True if Brownian motion drives the solve."""
 
     def is_brownian(node: Any) -> bool:

@@ -23,6 +23,7 @@ from jax import lax
 
 from ..adjoint.closure_conversion import any_member, written
 from ..adjoint.resting import still
+from ..aliases import Args, Time
 from .first_order import constant_once
 from .problem import AbstractHybridProblem, HybridState, one_hot
 from .side import ABOVE, BELOW, RESTS, rounding
@@ -62,7 +63,7 @@ class Instant(eqx.Module):
     state: HybridState
     left: Any
     caused: Any
-    delay: Any
+    delay: Time
     previous: Any
     slope: Any
     arrived: Any
@@ -85,12 +86,12 @@ class Arrival(NamedTuple):
     due: Any
     jumped: Any
     size: Any
-    window: Any
-    span: Any
+    window: Time
+    span: Time
 
 
 def handle(
-    problem: AbstractHybridProblem, t: Any, state: HybridState, arrival: Arrival, args: Any, at_start: bool = False
+    problem: AbstractHybridProblem, t: Time, state: HybridState, arrival: Arrival, args: Args, at_start: bool = False
 ) -> tuple[HybridState, Any]:
     """Returns (the state after all events of an instant, dx/dt there).
 

@@ -10,13 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from ..aliases import Args, Time
 from .event_map import SLIDES, TURNS
 from .first_order import differentiable_once
 from .problem import AbstractHybridProblem, HybridState
 from .side import ABOVE, BELOW, RESTS, rounding
 
 
-def turned(problem: AbstractHybridProblem, t: Any, state: HybridState, values: Any, due: Any, args: Any) -> HybridState:
+def turned(
+    problem: AbstractHybridProblem, t: Time, state: HybridState, values: Any, due: Any, args: Args
+) -> HybridState:
     """The state after the events that are `due`, given the guards' `values`: clocks have ticked and relations have
     turned.
 

@@ -10,6 +10,7 @@ from jax import lax
 
 from ..adjoint.closure_conversion import any_member
 from ..adjoint.resting import still
+from ..aliases import Args, State, Time
 from .event_map import AHEAD, CLOSE, Arrival
 from .problem import AbstractHybridProblem, HybridState
 from .search import first_crossing
@@ -68,8 +69,8 @@ class Met(NamedTuple):
 
 
 def looked_at(
-    problem: AbstractHybridProblem, dense: Callable[[Any, Any, Any], Any], t0: Any, t1: Any, y0: HybridState, x1: Any,
-    args: Any,
+    problem: AbstractHybridProblem, dense: Callable[[Time, Time, Time], State], t0: Time, t1: Time, y0: HybridState,
+    x1: State, args: Args,
 ) -> Met:  # fmt: skip
     """Looks for events in the step from y0 to x1, whose states are `dense(t0, t1, t)`.
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from ..aliases import Args, State, Time
 from .first_order import constant_once
 
 
@@ -43,22 +44,28 @@ class AbstractHybridProblem(eqx.Module):
         """The solver, prepared for the equations that hold with the discrete values q."""
 
     @abc.abstractmethod
-    def field(self, t: Any, x: Float[Array, " n"], q: Float[Array, " q"], args: Any) -> Float[Array, " n"]:
+    def field(self, t: Time, x: Float[Array, " n"], q: Float[Array, " q"], args: Args) -> Float[Array, " n"]:
         """dx/dt."""
 
     @abc.abstractmethod
-    def guards(self, t: Any, x: Float[Array, " n"], q: Float[Array, " q"], args: Any) -> Float[Array, " guards"]:
+    def guards(self, t: Time, x: Float[Array, " n"], q: Float[Array, " q"], args: Args) -> Float[Array, " guards"]:
         """The guards' values."""
 
     @abc.abstractmethod
     def written(
-        self, t: Any, x: Float[Array, " n"], q: Float[Array, " q"], previous: Float[Array, " q"], event: Any, args: Any
+        self,
+        t: Time,
+        x: Float[Array, " n"],
+        q: Float[Array, " q"],
+        previous: Float[Array, " q"],
+        event: Any,
+        args: Args,
     ) -> tuple[Float[Array, " n"], Float[Array, " q"]]:
         """(x, q) after an event, consistent; `previous` are the discrete values before the instant."""
 
     @abc.abstractmethod
     def settled(
-        self, t: Any, x: Float[Array, " n"], q: Float[Array, " q"], events: Bool[Array, " events"], args: Any
+        self, t: Time, x: Float[Array, " n"], q: Float[Array, " q"], events: Bool[Array, " events"], args: Args
     ) -> Float[Array, " q"]:
         """q after several events that assign discrete values. Each reads the values from before all of them."""
 
@@ -72,13 +79,13 @@ class AbstractHybridProblem(eqx.Module):
         ticks = lax.stop_gradient(ticks)
         return offset + jnp.where(ticks == 0, 0.0, ticks * period)
 
-    def slope(self, t: Any, x: Any, q: Any, args: Any) -> Float[Array, " n"]:
+    def slope(self, t: Time, x: State, q: Any, args: Args) -> Float[Array, " n"]:
         """dx/dt, constant under a first derivative."""
         frozen, *point = constant_once((self, t, x, q, args))
         return frozen.field(*point)
 
     def rates(
-        self, t: Any, x: Any, q: Any, args: Any, slope: Any
+        self, t: Time, x: State, q: Any, args: Args, slope: Any
     ) -> tuple[Float[Array, " guards"], Float[Array, " guards"]]:
         """Returns (the guards' values, their rates of change along `slope`), both constant under a first derivative."""
         frozen, t, x, q, args = constant_once((self, t, x, q, args))
@@ -110,7 +117,7 @@ class HybridState(eqx.Module):
     sides: Float[Array, "2 rows m"]
 
     @classmethod
-    def of(cls, x: Any, q: Any, **parts: Any) -> "HybridState":
+    def of(cls, x: State, q: Any, **parts: Any) -> "HybridState":
         """A state of all its parts."""
         return cls(x, q, *(jnp.stack([parts[name] for name in names]) for names in _PARTS.values()))
 
@@ -124,7 +131,7 @@ class HybridState(eqx.Module):
         assert not changes
         return dataclasses.replace(self, **whole)
 
-    def noted(self, row: Any, time: Any, event: Any, rate: Any, before: Any, after: Any) -> "HybridState":
+    def noted(self, row: Any, time: Time, event: Any, rate: Any, before: Any, after: Any) -> "HybridState":
         """A copy with an event written to column `row` of the log; unchanged if there is no such column."""
         log, sides = self.log, self.sides
         if log.shape[1]:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from ..adjoint.closure_conversion import any_member
+from ..aliases import Time
 from .event_map import handle
 from .kinks import turned
 from .looking import looked_at
@@ -26,14 +27,14 @@ class HybridInterpolation(diffrax.AbstractLocalInterpolation):
     """Dense output of a step: x by the inner solver's dense output within the step, by the state after the events at
     its end."""
 
-    t0: Any
-    t1: Any
+    t0: Time
+    t1: Time
     inner: Any
     y0: HybridState
     y1: HybridState
     fired: Any
     slope: Any
-    resolution: Any
+    resolution: Time
 
     def evaluate(self, t0, t1=None, left=True):
         if t1 is not None:
@@ -51,7 +52,7 @@ class _DenseOutput(eqx.Module):
     interpolation: Any = eqx.field(static=True)
     info: Any
 
-    def __call__(self, t0: Any, t1: Any, t: Any) -> Any:
+    def __call__(self, t0: Time, t1: Time, t: Time) -> Any:
         return self.interpolation(t0=t0, t1=t1, **self.info).evaluate(t)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from jax import lax
 
 from ..adjoint.resting import still
+from ..aliases import Args, State, Time
 from .event_map import Arrival, handle
 from .problem import AbstractHybridProblem, HybridState
 from .side import ABOVE, BELOW, RESTS
@@ -15,7 +16,7 @@ ROUNDS = 4  # each settles relations that depend on those settled before: a rela
 
 
 def start(
-    problem: AbstractHybridProblem, t0: Any, x0: Any, q0: Any, args: Any, logged: int, sides: bool
+    problem: AbstractHybridProblem, t0: Time, x0: State, q0: Any, args: Args, logged: int, sides: bool
 ) -> HybridState:
     """The state at the initial time, after the clocks that tick there, and after the events that are immediate.
 
@@ -59,7 +60,9 @@ def _holds(value: Any, rate: Any) -> Any:
     return jnp.where(value == 0, rate < 0, value < 0)
 
 
-def _settled(problem: AbstractHybridProblem, t0: Any, x0: Any, q0: Any, due: Any, args: Any) -> tuple[Any, Any, Any]:
+def _settled(
+    problem: AbstractHybridProblem, t0: Time, x0: State, q0: Any, due: Any, args: Args
+) -> tuple[Any, Any, Any]:
     """Settles the relations at the initial time: each gets the truth of its sides, or, if its clock is `due`, what that
     writes. Returns (q, rates of the guards, values of the guards); q does not move with parameters."""
     c, g = problem.n_clocks, problem.n_guards

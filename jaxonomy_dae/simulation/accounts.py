@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..aliases import State, Time
 from ..errors import ModelError, nearest
 from ..lowering.plan import SystemPlan
 from ..model.evaluate_numpy import Networks
@@ -54,7 +55,7 @@ def _terms(system: AcausalSystem, ts: Any, states: Any, inputs: Any, discrete: A
 _compiled = compiled(_terms)
 
 
-def _at_one_time(system: AcausalSystem, t: Any, x: Any, inputs: Any) -> Any:
+def _at_one_time(system: AcausalSystem, t: Time, x: State, inputs: Any) -> Any:
     plan = system.plan
     every = np.arange(plan.extended.quantities.n)
 

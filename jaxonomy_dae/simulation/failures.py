@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from ..aliases import Inputs, Result, State, Time, Tolerance
 from ..hybrid.solver import STUCK, TOO_MANY
 from ..lowering.plan import SystemPlan
 from ..solvers.choice_guard import SINGULAR_CHOICE
@@ -36,7 +37,7 @@ REST = (
 PROBES = 64  # times at which inputs are looked at
 
 
-def raised(x: Any, result: Any, has_events: bool, max_steps: int, max_events: int) -> Any:
+def raised(x: State, result: Result, has_events: bool, max_steps: int, max_events: int) -> Any:
     """x, with a run-time error if the run failed: in traced runs only a code is known."""
     codes = diffrax.RESULTS
     lost = "nonlinear blocks have no solution there, or the start is not consistent"
@@ -62,12 +63,12 @@ def explain(
     solution: Solution,
     first: tuple[Any, Any],
     last: tuple[Any, Any],
-    t1: Any,
+    t1: Time,
     implicit: bool,
     max_steps: int,
     max_events: int,
-    rtol: Any,
-    atol: Any,
+    rtol: Tolerance,
+    atol: Tolerance,
 ) -> str:
     """The reason, in a sentence, why the integration from `first` to t1 stopped at its last accepted point `last` = (t,
     x), and the smallest mend."""
@@ -116,7 +117,7 @@ def explain(
     )  # fmt: skip
 
 
-def mode_at_start(system: AcausalSystem, inputs: dict[str, Any], t0: Any, x0: Any) -> str:
+def mode_at_start(system: AcausalSystem, inputs: Inputs, t0: Time, x0: State) -> str:
     """The constraints that do not hold although a run begins in their modes, in a sentence; "" if all hold."""
     held = system.plan.held
     if held is None:
@@ -138,7 +139,7 @@ def mode_at_start(system: AcausalSystem, inputs: dict[str, Any], t0: Any, x0: An
     )
 
 
-def _written_not_finite(system: AcausalSystem, x: Any) -> str:
+def _written_not_finite(system: AcausalSystem, x: State) -> str:
     """The names of discrete variables and states that are not finite after an event; "" if all are."""
     if system.plan.events is None:
         return ""
@@ -223,7 +224,7 @@ def _sliding(name: str, t: float) -> str:
     )
 
 
-def _bad_input(plan: SystemPlan, inputs: dict[str, Any], t0: float, t: float, t1: float) -> str:
+def _bad_input(plan: SystemPlan, inputs: Inputs, t0: float, t: float, t1: float) -> str:
     """The input that is not finite at the last accepted point or beyond it; "" if there is none."""
     near = t + (t1 - t) * np.concatenate([[0.0], 10.0 ** np.linspace(-15, 0, PROBES)])
     for name, value in inputs.items():
@@ -241,7 +242,7 @@ def _bad_input(plan: SystemPlan, inputs: dict[str, Any], t0: float, t: float, t1
     return ""
 
 
-def _singular_choice(solution: Solution, first: tuple[Any, Any], t: Any, x: Any) -> str:
+def _singular_choice(solution: Solution, first: tuple[Any, Any], t: Time, x: State) -> str:
     """Names the quantities that the chosen states no longer determine at (t, x), if a singular choice of states ended
     the run; "" otherwise."""
     system, inputs = solution.system, solution.inputs

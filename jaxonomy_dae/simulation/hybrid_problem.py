@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..aliases import Args, Controller, State, Time, Tolerance
 from ..hybrid.control import EventControl
 from ..hybrid.problem import AbstractHybridProblem
 from ..model.tables import EventTable
@@ -38,8 +39,8 @@ class SystemProblem(AbstractHybridProblem):
 
     system: AcausalSystem
     watch: Watch | None
-    tolerance: Any
-    resolution: Any
+    tolerance: Tolerance
+    resolution: Time
     implicit: bool = eqx.field(static=True)
     n_clocks: int = eqx.field(static=True)
     n_guards: int = eqx.field(static=True)
@@ -97,7 +98,7 @@ class SystemProblem(AbstractHybridProblem):
         )
         return jnp.where(new > -jnp.inf, new, q)
 
-    def struck(self, t: Any, x: Any, before: Any, q: Any, args: Any) -> tuple[Any, Any, Any]:
+    def struck(self, t: Time, x: State, before: Any, q: Any, args: Args) -> tuple[Any, Any, Any]:
         """Applies the impulses of the constraints that begin to hold with q, or that q asks for. Returns (x, q, whether
         the impulses do what they should).
 
@@ -136,7 +137,7 @@ class SystemProblem(AbstractHybridProblem):
         done = jnp.abs(left - (1 - strength) * e) <= LEFT * jnp.abs(strength * e)
         return after, q, jnp.all(done | (strength == 0)) & ~wrong
 
-    def admitted(self, t: Any, x: Any, q: Any, args: Any) -> Any:
+    def admitted(self, t: Time, x: State, q: Any, args: Args) -> Any:
         """The state projected onto the constraints that hold with q; NaN if it is not near them."""
         plan = self.system.plan
         if not self.system.is_constrained:
@@ -149,7 +150,7 @@ class SystemProblem(AbstractHybridProblem):
 
 
 def problem_for(
-    system: AcausalSystem, t0: Any, t1: Any, implicit: bool, watch: Watch | None, tolerance: Any
+    system: AcausalSystem, t0: Time, t1: Time, implicit: bool, watch: Watch | None, tolerance: Tolerance
 ) -> SystemProblem:
     """The problem of a system that has events, to be run from t0 to t1."""
     largest = jax.lax.stop_gradient(jnp.maximum(jnp.maximum(jnp.abs(t0), jnp.abs(t1)), t1 - t0))
@@ -192,7 +193,7 @@ def _opposite(table: EventTable, n_clocks: int) -> tuple[int, ...]:
     return tuple(opposite.tolist())
 
 
-def with_event_control(controller: Any) -> Any:
+def with_event_control(controller: Controller) -> Any:
     """Wraps the controller so that steps end at events. A controller that clips steps at jumps of inputs stays
     outermost."""
     if isinstance(controller, diffrax.ClipStepSizeController):

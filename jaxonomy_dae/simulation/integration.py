@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from ..adjoint.resting import HeldBack, Resting
 from ..adjoint.stored_adjoint import StoredAdjoint
+from ..aliases import Args, Controller, Result, Solver, State, Time
 from ..hybrid.problem import HybridState
 from ..hybrid.solver import WithEvents
 from ..hybrid.start import start
@@ -34,9 +35,9 @@ SAVED_ITERATIONS = 3
 class Options(eqx.Module):
     """Options of a run: solver, adjoint, controller and limits."""
 
-    solver: Any
+    solver: Solver
     adjoint: Any
-    controller: Any
+    controller: Controller
     max_steps: int = eqx.field(static=True)
     progress: bool = eqx.field(static=True)
     max_events: int = eqx.field(static=True, default=0)
@@ -56,10 +57,10 @@ class Outcome(eqx.Module):
 
     found: InitialPoint
     ts: Any
-    x: Any
+    x: State
     last: tuple[Any, Any]
     stats: dict[str, Any]
-    result: Any
+    result: Result
     is_stiff: Any
     discrete: Any = None
     events: EventLog | None = None
@@ -161,9 +162,9 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
 run_compiled = compiled(run)
 
 
-def _whole(t: Any, y: Any, args: Any) -> Any:
+def _whole(t: Time, y: State, args: Args) -> Any:
     return y
 
 
-def _state_and_discrete(t: Any, y: HybridState, args: Any) -> Any:
+def _state_and_discrete(t: Time, y: HybridState, args: Args) -> Any:
     return y.x, y.q

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from ..aliases import State, Time
 from ..lowering.schedule import StepEquation
 from ..model.evaluate_numpy import Networks
 from ..system.system import AcausalSystem
@@ -12,7 +13,7 @@ SHOWN = 4  # variables with their values in an error
 ANY = 0.5  # the value given to the unknown of an equation that is only asked whether it is finite
 
 
-def equation_not_finite(system: AcausalSystem, inputs: Any, t: Any, x: Any) -> str:
+def equation_not_finite(system: AcausalSystem, inputs: Any, t: Time, x: State) -> str:
     """Names the first equation, in the order of solution, that reads finite values and is not finite itself, with what
     it reads; "" if there is none."""
     plan = system.plan

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from ..aliases import Controller, Solver, State, Time, Tolerance
 from ..errors import ModelError
 from ..solvers.drive import is_implicit
 from ..solvers.solve import step_control
@@ -17,7 +18,7 @@ from ..system.system_at import SystemAt
 from .wave_control import WaveControl
 
 
-def scaled_atol(system: AcausalSystem, atol: Any) -> Any:
+def scaled_atol(system: AcausalSystem, atol: Tolerance) -> Any:
     """The absolute tolerance in units of the nominal values of the states."""
     nominal = system.plan.nominal
     if len(nominal) and (nominal != 1).any():
@@ -25,7 +26,7 @@ def scaled_atol(system: AcausalSystem, atol: Any) -> Any:
     return atol
 
 
-def controller_for(system: AcausalSystem, solver: Any, rtol: Any, atol: Any, dtmax: Any) -> Any:
+def controller_for(system: AcausalSystem, solver: Solver, rtol: Tolerance, atol: Tolerance, dtmax: Time) -> Any:
     """The step-size controller for these tolerances, the absolute ones in units of the nominal values. If the user
     gives no longest step, it is bounded by the period of the waves that drive the model."""
     atol = scaled_atol(system, atol)
@@ -39,7 +40,7 @@ def controller_for(system: AcausalSystem, solver: Any, rtol: Any, atol: Any, dtm
     return WaveControl(controller, *at.waves())  # pyright: ignore[reportCallIssue]
 
 
-def clipped(controller: Any, jump_ts: Any, ends: StepEnds) -> Any:
+def clipped(controller: Controller, jump_ts: Any, ends: StepEnds) -> Any:
     """Wraps the controller so that steps end at jumps and kinks; steps prescribed by the user stay as they are."""
     if isinstance(controller, diffrax.StepTo):
         if jump_ts is not None:
@@ -53,7 +54,9 @@ def clipped(controller: Any, jump_ts: Any, ends: StepEnds) -> Any:
     return diffrax.ClipStepSizeController(lengths, step_ts=joined[1], jump_ts=joined[0])
 
 
-def first_step(system: AcausalSystem, t0: Any, t1: Any, x0: Any, inputs: Any, order: Any, controller: Any) -> Any:
+def first_step(
+    system: AcausalSystem, t0: Time, t1: Time, x0: State, inputs: Any, order: Any, controller: Controller
+) -> Any:
     """The size of the first step (Hairer, Nørsett & Wanner 1993, II.4), kept out of differentiation."""
     if isinstance(controller, diffrax.StepTo) or not x0.shape[0]:
         return None if isinstance(controller, diffrax.StepTo) else t1 - t0

@@ -13,6 +13,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..adjoint.wrapped_control import WrappedControl
+from ..aliases import Controller, Time
 
 QUARTER = 0.5 * jnp.pi  # of a turn, radians
 # Of a quarter: shorter steps look at a wave 16 times in a period, and are left alone, because an implicit solver pays
@@ -26,7 +27,7 @@ class WaveControl(WrappedControl):
     """Wraps a controller for inputs that are waves sin(ωt + φ): steps are at most a quarter of the shortest period, and
     long steps end where a wave is zero, one or minus one. Times are constants of differentiation, as step sizes are."""
 
-    controller: Any
+    controller: Controller
     frequency: Float[Array, " waves"]
     phase: Float[Array, " waves"]
 
@@ -45,7 +46,7 @@ class WaveControl(WrappedControl):
         )
         return keep, start, self._end(start, end), jump, state, result
 
-    def _end(self, start: Any, end: Any) -> Any:
+    def _end(self, start: Time, end: Time) -> Any:
         """The end of a step that the wrapped controller would take from `start` to `end`, moved forwards so that steps
         end where a wave has turned by whole quarters."""
         begin, step, frequency, phase = lax.stop_gradient((start, end - start, self.frequency, self.phase))

@@ -10,6 +10,7 @@ import lineax as lx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
+from ..aliases import State, Time
 from ..linear.choice import choose
 from .bdf_coefficients import Coefficients, coefficients, interpolate
 from .choice_guard import ChoiceGuard
@@ -26,14 +27,14 @@ CAUTION = 4.0  # local errors are kept this much below the tolerance: those of a
 class BDFInterpolation(diffrax.AbstractLocalInterpolation):
     """The polynomial that the method itself integrates, of the step's order."""
 
-    t0: Any
-    t1: Any
-    y0: Any
+    t0: Time
+    t1: Time
+    y0: State
     phi: Any
     psi: Any
     order: Any
 
-    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> Any:
+    def evaluate(self, t0: Time, t1: Time = None, left: bool = True) -> Any:
         """The solution at t0, or its increment from t0 to t1."""
         if t1 is not None:
             return jax.tree.map(jnp.subtract, self.evaluate(t1), self.evaluate(t0))
@@ -266,7 +267,7 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         return problem.unravel(y1), problem.unravel(y_error), dense, new_state, result
 
 
-def ravel_like(y: Any) -> Float[Array, " n"]:
+def ravel_like(y: State) -> Float[Array, " n"]:
     """A solution as one vector."""
     return ravel_pytree(y)[0]
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..aliases import Args, State, Terms, Time
 from .dae_term import FlatProblem
 from .index_one import consistent_slope
 
@@ -17,7 +18,14 @@ Slope = Callable[[Any, Any], Float[Array, " n"]]
 
 
 def cause_of(
-    problem: FlatProblem, t: Any, y: Any, t1: Any, weight: np.ndarray, names: Sequence[str], steps: int, explicit: bool
+    problem: FlatProblem,
+    t: Time,
+    y: State,
+    t1: Time,
+    weight: np.ndarray,
+    names: Sequence[str],
+    steps: int,
+    explicit: bool,
 ) -> str:
     """A sentence on the cause that stops an integration at its last accepted point (t, y), and what to write instead;
     "" if none is recognised."""
@@ -45,7 +53,7 @@ def first_bad_row(problem: FlatProblem, right: np.ndarray, names: Sequence[str])
 
 
 def _end_of_domain(
-    problem: FlatProblem, here: np.ndarray, t: Any, y: Any, t1: Any, names: Sequence[str]
+    problem: FlatProblem, here: np.ndarray, t: Time, y: State, t1: Time, names: Sequence[str]
 ) -> str:  # fmt: skip
     """Says which row of the equations is not finite a short way beyond the point, along the slope `here`; "" if none
     is."""
@@ -63,7 +71,7 @@ def _end_of_domain(
     return ""
 
 
-def _jump(slope: Slope, here: np.ndarray, t: Any, y: Any, weight: np.ndarray, names: Sequence[str]) -> str:
+def _jump(slope: Slope, here: np.ndarray, t: Time, y: State, weight: np.ndarray, names: Sequence[str]) -> str:
     """Says which derivative jumps across the point in the direction of motion, as under sign(x) at x = 0; "" if none
     does."""
     size = np.asarray(weight) / np.maximum(np.abs(here), np.finfo(here.dtype).tiny)
@@ -87,7 +95,7 @@ def _jump(slope: Slope, here: np.ndarray, t: Any, y: Any, weight: np.ndarray, na
     )
 
 
-def _escape(here: np.ndarray, y: Any, t: float, t1: float, weight: np.ndarray, names: Sequence[str]) -> str:
+def _escape(here: np.ndarray, y: State, t: float, t1: float, weight: np.ndarray, names: Sequence[str]) -> str:
     """Says which unknown grows so fast that it becomes infinite before t1; "" if none does."""
     value = np.asarray(y)
     growing = value * here > 0
@@ -103,13 +111,13 @@ def _escape(here: np.ndarray, y: Any, t: float, t1: float, weight: np.ndarray, n
     )
 
 
-def decay_at(term: Any, args: Any, t: Any, y: Any) -> float:
+def decay_at(term: Terms, args: Args, t: Time, y: State) -> float:
     """The largest −Re λ of the eigenvalues at a point; 0 if there is none, or there are many unknowns."""
     problem = FlatProblem(term, y, args)
     return _decay(lambda t, y: consistent_slope(problem, None, t, y), t, problem.flat)
 
 
-def _decay(slope: Slope, t: Any, y: Any) -> float:
+def _decay(slope: Slope, t: Time, y: State) -> float:
     if not 0 < y.shape[0] <= LARGE:
         return 0.0
     matrix = np.asarray(jax.jit(jax.jacfwd(lambda v: slope(t, v)))(y))
@@ -122,7 +130,7 @@ def is_stiff(decay: float, duration: float, steps: int) -> bool:
     return decay * duration > 0.3 * steps
 
 
-def _stiffness(slope: Slope, t: Any, y: Any, t1: Any, steps: int) -> str:
+def _stiffness(slope: Slope, t: Time, y: State, t1: Time, steps: int) -> str:
     decay = _decay(slope, t, y)
     if not is_stiff(decay, float(t1 - t), steps):
         return ""

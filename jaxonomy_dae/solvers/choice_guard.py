@@ -13,6 +13,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ..aliases import Args, State, Time, Tolerance
+
 Determinants = Float[Array, " blocks"]
 
 SINGULAR_CHOICE: Any = diffrax.RESULTS.singular
@@ -44,9 +46,9 @@ class ChoiceGuard(eqx.Module):
     """
 
     measure: Callable[[Any, Any, Any], Determinants]
-    atol: Any
+    atol: Tolerance
 
-    def judge(self, largest: Determinants, t: Any, y: Any, args: Any) -> Verdict:
+    def judge(self, largest: Determinants, t: Time, y: State, args: Args) -> Verdict:
         """Judges a step by its end."""
         found = self.measure(t, y, args)
         along, size = jnp.sign(largest) * found, jnp.abs(largest)

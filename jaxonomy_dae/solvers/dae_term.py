@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from ..aliases import Args, State, Terms, Time
 from ..errors import ModelError
 from ..linear.mass import Mass
 from ..private_names import unwrapped
@@ -68,7 +69,7 @@ class DAETerm(diffrax.AbstractTerm):
             "Use jaxonomy_dae.solvers.BDF() or jaxonomy_dae.solvers.Rodas5P()"
         )
 
-    def right(self, t: Any, y: Any, args: Any) -> Any:
+    def right(self, t: Time, y: State, args: Args) -> Any:
         """F(t, y), flat, shape (n,)."""
         if self.constraint is None:
             out = self.field(t, y, args)
@@ -85,7 +86,7 @@ class DAETerm(diffrax.AbstractTerm):
             )
         return jnp.concatenate([ravel_pytree(f)[0], found])
 
-    def mass_of(self, y: Any) -> Mass:
+    def mass_of(self, y: State) -> Mass:
         """The mass matrix M for a solution in the structure of y."""
         if self.mass is None:
             if not (isinstance(y, tuple) and len(y) == 2):
@@ -124,7 +125,7 @@ def _check_like(name: str, found: Any, expected: Any):
 class FlatProblem:
     """A term as solvers use it: M dy/dt = F(t, y) for a flat y, in the direction of integration."""
 
-    def __init__(self, terms: Any, y: Any, args: Any):
+    def __init__(self, terms: Terms, y: State, args: Args):
         self.term, self.direction = unwrapped(terms)
         self.args = args
         self.terms = terms
@@ -142,7 +143,7 @@ class FlatProblem:
         parts = self.terms, self.like, self.args
         return FlatProblem(*jax.tree.map(lambda v: jax.lax.stop_gradient(v) if eqx.is_array(v) else v, parts))
 
-    def right(self, t: Any, flat: Any) -> Any:
+    def right(self, t: Time, flat: Any) -> Any:
         """F, shape (n,)."""
         y = self.unravel(flat)
         sign = jnp.asarray(self.direction, flat.dtype)

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..aliases import Args, Result, State, Terms, Time, Tolerance
 from .causes import cause_of, first_bad_row
 from .dae_term import FlatProblem
 from .index_one import algebraic_part, consistent_slope, index_matrix
@@ -51,7 +52,7 @@ class StartCheck(eqx.Module):
         return eqx.error_if(ys, ~self.is_fine, "inconsistent start: see jaxonomy_dae.solvers.consistent_start")
 
 
-def start_check(problem: FlatProblem, t: Any, rtol: Any, atol: Any) -> StartCheck:
+def start_check(problem: FlatProblem, t: Time, rtol: Tolerance, atol: Tolerance) -> StartCheck:
     """Evaluates the equations at the start, for `explain_start`."""
     problem_y = jax.lax.stop_gradient(problem.flat)
     if not problem.mass.is_singular:
@@ -68,7 +69,7 @@ def start_check(problem: FlatProblem, t: Any, rtol: Any, atol: Any) -> StartChec
     return jax.lax.stop_gradient(StartCheck(right, residual, rounding, shift, looked_at))
 
 
-def _flat(atol: Any, like: Any) -> Any:
+def _flat(atol: Tolerance, like: Any) -> Any:
     parts = [jnp.ravel(jnp.asarray(leaf, like.dtype)) for leaf in jax.tree.leaves(atol)]
     joined = jnp.concatenate(parts)
     return joined if joined.shape == like.shape else joined[0]
@@ -118,7 +119,7 @@ def null_names(matrix: np.ndarray, names: Sequence[str]) -> str:
     return ", ".join(f"'{names[k]}'" for k in np.argsort(-null)[:SHOWN] if null[k] > 1e-3)
 
 
-def how_it_stopped(result: Any, t: Any, max_steps: int) -> str:
+def how_it_stopped(result: Result, t: Time, max_steps: int) -> str:
     """The first sentence of an explanation."""
     many = result == diffrax.RESULTS.max_steps_reached
     reason = f"max_steps={max_steps} was reached" if many else "no step was short enough to be accepted"
@@ -126,8 +127,8 @@ def how_it_stopped(result: Any, t: Any, max_steps: int) -> str:
 
 
 def explain_failure(
-    term: Any, args: Any, t: Any, y: Any, names: Sequence[str], *,
-    result: Any, t0: Any, t1: Any, max_steps: int, rtol: Any, atol: Any, explicit: bool = False,
+    term: Terms, args: Args, t: Time, y: State, names: Sequence[str], *,
+    result: Result, t0: Time, t1: Time, max_steps: int, rtol: Tolerance, atol: Tolerance, explicit: bool = False,
 ) -> str:  # fmt: skip
     """The reason, in a sentence, why an integration stopped at the last accepted point (t, y), and what to write
     instead."""

@@ -11,6 +11,7 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..aliases import State, Time
 from ..linear.choice import choose
 from .dae_term import FlatProblem
 from .field_size import is_large
@@ -87,13 +88,13 @@ STAGES = _stages()
 class Rodas5PInterpolation(diffrax.AbstractLocalInterpolation):
     """The method's own dense output, of order 4 (Steinebach 2023, eq. 11)."""
 
-    t0: Any
-    t1: Any
-    y0: Any
-    y1: Any
+    t0: Time
+    t1: Time
+    y0: State
+    y1: State
     k: Any
 
-    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> Any:
+    def evaluate(self, t0: Time, t1: Time = None, left: bool = True) -> Any:
         """The solution at t0, or its increment from t0 to t1."""
         if t1 is not None:
             return jax.tree.map(jnp.subtract, self.evaluate(t1), self.evaluate(t0))

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import optimistix as optx
 
 from ..adjoint.wrapped_control import WrappedControl
+from ..aliases import State, Tolerance
 
 SAFETY = 0.9  # of the step that would just meet the tolerance (Hairer, Nørsett & Wanner 1993, II.4)
 # In tolerances: the first step is chosen as if everything moved by as much in the problem's own time. Motion below the
@@ -33,7 +34,7 @@ def decoded(norm: Any) -> Any:
     return jnp.where(jnp.abs(factor - 1) < 1e-5, 1.0, factor)
 
 
-def tolerance_like(atol: Any, y: Any) -> Any:
+def tolerance_like(atol: Tolerance, y: State) -> Any:
     """An absolute tolerance for every leaf of y, from one number for all or a tree like y."""
     if jax.tree.structure(atol) == jax.tree.structure(y):
         return atol
@@ -56,8 +57,8 @@ class StepControl(diffrax.AbstractAdaptiveStepSizeController):
     - `dtmax`: the longest step.
     """
 
-    rtol: Any
-    atol: Any
+    rtol: Tolerance
+    atol: Tolerance
     norm: Callable[[Any], Any] = optx.rms_norm
     steered: bool = eqx.field(static=True, default=False)
     dtmax: Any = None

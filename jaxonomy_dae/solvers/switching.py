@@ -14,6 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from ..aliases import Time
+
 STIFF: Any = diffrax.RESULTS.nonlinear_divergence  # no other meaning where nothing implicit is solved
 BOUNDARY = 0.9 * 3.5  # of Tsit5's stability region along the negative real axis is at −3.5
 PATIENCE = 15  # limited steps in a row, as in Hairer's DOPRI5: a transient that passes is not stiffness
@@ -39,8 +41,8 @@ class Watch(eqx.Module):
     def after(
         self,
         count: Int[Array, ""],
-        t0: Any,
-        t1: Any,
+        t0: Time,
+        t1: Time,
         y: tuple[Float[Array, " n"], Float[Array, " n"]],
         k: tuple[Float[Array, " n"], Float[Array, " n"]],
     ) -> Int[Array, ""]:
