@@ -44,6 +44,7 @@ class _Recorder:
     def __init__(self, numbers: dict[str, Any], program: SolveProgram, times: StepTimes):
         self.numbers, self.program, self.times = numbers, program, times
         state, moves = numbers["state"], times.start()
+        # The first step may have been made shorter for what rests; its end then moves with its start.
         held = numbers["first"] < state.tnext
         state = dataclasses.replace(state, tnext=jnp.where(held, numbers["first"], state.tnext))
         if times.count:
@@ -85,6 +86,7 @@ class _Recorder:
             accepted = active & (new.num_accepted_steps > state.num_accepted_steps)
             new, held, pushed = held_back(state, new, accepted, pushed, self.numbers, self.program)
             after = new, jnp.where(accepted, state.tnext, last), self.times.after(state, moves, held), pushed
+            # Members of a batch that have finished keep what they have, while the others go on.
             after = unless_waiting(active, after, carry)
             return self.pack(self._taken_apart(*after)), buffers, accepted
 
@@ -92,6 +94,7 @@ class _Recorder:
             packed, buffers, k, record, filled = loop
             before = packed[0]
             packed, buffers, accepted = apart(k < count, attempt, (packed, buffers, jnp.array(False)))
+            # A new chunk is recorded over the last one: only the rows of one chunk are held at a time.
             filled = jnp.where(k % self.program.chunk == 0, 0, filled)
             record = written(record, filled, (before, accepted))
             return packed, buffers, k + 1, record, filled + any_member(accepted).astype(filled.dtype)
@@ -162,6 +165,7 @@ def _(residuals, cotangents, perturbed, numbers, program):
             return k - 1, apart(k > 0, backwards, packed, read(record, k - 1))
 
         _, packed = lax.while_loop(lambda inner: inner[0] > 0, one, (filled, packed))
+        # The chunk before is taken once more, from the nearest point kept, to fill the record with its rows.
         record, filled = lax.cond(q > 0, again, lambda _, *same: same, q - 1, record, filled)
         return q - 1, record, filled, packed
 

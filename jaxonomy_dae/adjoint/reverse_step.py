@@ -79,6 +79,7 @@ class ReverseStep:
             return y1, inexact(state1), dense if dense_wanted else ()
 
         consts = self.consts["step"][0]
+        # Where no time is differentiated, the ends of the step are constants, and their cotangents are not compiled.
         if self.timed:
             (y1, _, dense), pull = jax.vjp(forward, row["y"], moving, ends, consts)
         else:

@@ -70,6 +70,7 @@ class StepTimes:
             keep, tprev, tnext, _, after, _ = program.adapt(
                 numbers["adapt"], controller, tprev, tnext, state.y, y1, error, eqx.combine(controlled, fixed)
             )
+            # As Diffrax' loop does after the controller.
             tprev = jnp.minimum(tprev, t1)
             return tprev, private("clip_to_end")(tprev, tnext, t1, floor, keep), inexact(after)
 

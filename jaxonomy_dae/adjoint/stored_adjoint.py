@@ -65,6 +65,7 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
         too_large = size * (chunk + points) > LARGEST_RECORD
         if given["event"] is not None or saveat.dense or _is_random(terms) or too_large:
             return diffrax.RecursiveCheckpointAdjoint().loop(**given)
+        # Diffrax' inner loop does not take these.
         for name in ("throw", "passed_solver_state", "passed_controller_state"):
             del given[name]
 
@@ -173,6 +174,7 @@ def _functions(
 
     made_jump = s.made_jump
     step, adapted = convert_both(made_jump)
+    # A controller that may report jumps makes `made_jump` an array: both functions are converted for that.
     if made_jump is False and adapted[0].out_struct[3] is not False:
         made_jump = jnp.array(False)
         step, adapted = convert_both(made_jump)

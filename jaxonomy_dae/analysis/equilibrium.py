@@ -86,6 +86,7 @@ def find_equilibrium(system: AcausalSystem, t: Any, x0: Any, inputs: Any, drifti
     typical = jax.lax.stop_gradient(system.typical_sizes[entries])
     zero = jnp.zeros((m,), x0.dtype)
     sizes = Sizes(nominal, jnp.maximum(jnp.abs(start), nominal), zero, zero)
+    # With more rows than unknowns there is no square system for the homotopy to follow.
     core = np.arange(m) if m == len(free) else None
     bounds = quantity_bounds(plan.flat, plan.variable_map, plan.extended)[entries]
     found = find_root(lambda w: residual(w, *frozen), m, start, sizes, core, None, bounds, typical, magnitude)

@@ -35,6 +35,7 @@ def choose_coordinates(jacobian: Float[np.ndarray, "c n"]) -> Coordinates:
         if largest <= SINGULAR:
             break
         alike = np.argwhere(size >= ALIKE * largest)
+        # The last column, and in it the first row: a choice that rounding does not change.
         row, column = alike[np.lexsort((alike[:, 0], -alike[:, 1]))[0]]
         rows.append(int(row))
         columns.append(int(column))

@@ -82,6 +82,8 @@ class Kernel:
         for k, function, arguments, guard, safe in self._operations(backend):
             inside = [found[a] for a in arguments]
             if guard is not None:
+                # Arguments of a function that is not needed here are replaced by safe ones, so that neither it nor its
+                # derivatives are infinite: zero times infinity would be left of it in gradients.
                 active = is_active(found, guard)
                 inside = [
                     v if s is None or isinstance(v, float) else xp.where(active, v, s)

@@ -169,6 +169,7 @@ def handle(
     none = jnp.zeros((g,), bool)
     start = Instant(state, arrival.due, arrival.jumped, jnp.zeros_like(t), state.q, arrival.slope, state.x, none)
     length = c + min(2 * g, CONDITIONS_AT_ONE_INSTANT)
+    # Loops of fixed length, whose bodies are skipped where nothing is left: reverse mode cannot go back over a `while`.
     # Of a thousand clocks, few tick at once: loops in a loop pass over the others in √1000 steps.
     inner = max(math.isqrt(length), min(length, CONDITIONS_AT_ONE_INSTANT))
     handled = while_any_is_left(one, inner)

@@ -82,6 +82,7 @@ def looked_at(
     h, q, g = t1 - t0, y0.q, problem.n_guards
     span = jnp.maximum(h, FORGOTTEN * y0.span)
     window = jnp.maximum(WINDOW * span, problem.resolution)
+    # The controller lets steps end at ticks, up to rounding.
     ticking = y0.due <= t1 + 0.25 * problem.resolution
 
     never, none, zero = jnp.full_like(t1, jnp.inf), jnp.zeros((g,), bool), jnp.zeros_like(x1)
@@ -139,6 +140,7 @@ def _met(problem, dense, t0, t1, y0: HybridState, x1, args, times, values, off, 
         before = problem.slope(t1, x1, q, args)
         return before, reaches_zero(problem.rates(t1, x1, q, args, before)[1])
 
+    # A step that cannot be parted any further: its parts would not be told from its ends.
     short = h <= 4 * problem.resolution
     if problem.only_kinks:
         before, near = jnp.zeros_like(x1), reaches_zero(jnp.asarray(_RATE_AT_END, values.dtype) @ values / h)
@@ -168,6 +170,7 @@ def _met(problem, dense, t0, t1, y0: HybridState, x1, args, times, values, off, 
         )
 
     where = lax.cond(any_member(inside), located, lambda: t1)
+    # A retried step must be long enough for time to go on.
     where = jnp.maximum(where, t0 + 2 * problem.resolution)
     dip = jnp.where(long, _dip(values, armed, jnp.any(crossed, axis=0), 2 * off - band), jnp.inf)
     request = jnp.minimum(jnp.where(inside, where, jnp.inf), t0 + dip * h)

@@ -132,6 +132,7 @@ class WithEvents(diffrax.AbstractWrappedSolver):
             y1, slope = turned(problem, t1, state, values, arrival.due, args), jnp.zeros_like(x1)
         else:
             y1, slope = lax.cond(any_member(fired), events, lambda state: (state, jnp.zeros_like(x1)), state)
+            # The branch is taken if any member of a batch has an event; the others keep their states.
             y1 = jax.tree.map(lambda a, b: jnp.where(fired, a, b), y1, state)
         dense_info = dict(inner=dense, y0=y0, y1=y1, fired=fired, slope=slope, resolution=problem.resolution)
         finite = jnp.all(jnp.isfinite(y1.x)) & jnp.all(jnp.isfinite(y1.q))

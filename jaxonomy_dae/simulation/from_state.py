@@ -30,6 +30,7 @@ def from_state(system: AcausalSystem, t0: Time, inputs: Any, x: Float[Array, " n
         for tree in (system, inputs)
     )
     near = still.project(frozen(t0), frozen(x), driving, iterations=ITERATIONS)
+    # near has the value of the search and, by x − frozen(x), the derivative of x: the last step carries it over.
     moved = system.project(t0, near + (x - frozen(x)), inputs, iterations=1)
     return InitialPoint(moved, x[:0], frozen(moved - near), limit, jnp.zeros_like(x), nothing, nothing, None)
 

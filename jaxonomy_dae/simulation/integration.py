@@ -124,6 +124,8 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
     filled = jnp.isfinite(saved)
     okay = diffrax.is_okay(done.result)
     if system.is_constrained:
+        # Rows that were not reached are projected at the start, so that their derivatives are finite, and left out
+        # below.
         safe, times = jnp.where(filled[:, None], x, x0), jnp.where(filled, saved, t0)
 
         def projected_onto(t, y, q):
@@ -146,6 +148,8 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
         filled = filled | okay
     else:
         saved = ts
+    # What is not a number here has derivatives that are not, so that a loss over failed rows cannot seem to have a
+    # gradient.
     consistent = consistent & admitted
     x = not_a_number(x, filled & consistent, x0, system, inputs)
     failure: Any = diffrax.RESULTS.nonlinear_divergence

@@ -70,6 +70,7 @@ def first_step(
     def size(v):
         return jnp.sqrt(jnp.mean((v / scale) ** 2))
 
+    # Hairer's limits: below them |y| or |y'| tells no size, and the probe is a fixed small step.
     tiny = 1e-5
 
     def probe(f0):
@@ -91,6 +92,7 @@ def first_step(
     power = 1.0 / ((order or 1) + 1)
     h1 = jnp.where(largest <= 1e-15, jnp.maximum(1e-6, h0 * 1e-3), (0.01 / jnp.maximum(largest, 1e-15)) ** power)
     h = jnp.minimum(jnp.minimum(100 * h0, h1), t1 - t0)
+    # Where slopes are small beside how fast they change, the run begins nearly at rest: the step resolves that change.
     h = jnp.where(d1**2 < UNSEEN * d2, jnp.minimum(h, 0.1 * d1 / jnp.maximum(d2, 1e-15)), h)
     h = jnp.where(jnp.isfinite(h) & (h > 0), h, 1e-6 * (t1 - t0))
     return jax.lax.stop_gradient(h)  # inputs may close over what is differentiated

@@ -259,6 +259,7 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
             solved.factor, solved.factor_cj, still(cj), solved.contraction,
             state.counts + jnp.stack([solved.factorisations, solved.iterations]), largest,
         )  # fmt: skip
+        # The controller divides the error by the same scale, which must be finite where y1 is not.
         value = jnp.where(jnp.isfinite(y1), y1, y)
         scale = atol + jnp.maximum(jnp.abs(y), jnp.abs(value)) * rtol
         y_error = encoded(factor, accepted) * still(jnp.broadcast_to(scale, y.shape))

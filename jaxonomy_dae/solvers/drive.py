@@ -64,6 +64,7 @@ def integrate(
     if checked and fits is not True:
         t1 = eqx.error_if(t1, jnp.logical_not(fits), TIMES)
     counted = isinstance(solver, BDF)
+    # An interval of length zero: the loop over the steps ends before the first one.
     if goes_on is not True:
         t1 = jnp.where(goes_on, t1, t0)
     solved: Any = diffeqsolve(

@@ -104,6 +104,8 @@ def consistent_point(
 
         size = length(d)
 
+        # The restricted monotonicity test (Deuflhard 2004, section 3.3): the next step must be shorter by a quarter of
+        # the part of this one that is taken.
         def falls(fraction):
             return (size <= SURE) | (length(step(v + fraction * d)) <= (1 - fraction / 4) * size)
 

@@ -236,6 +236,8 @@ def _on_constraints(term: Any, args: Any, ts: Any, ys: Any, y0: Any) -> Any:
         if not problem.mass.is_singular:
             return y
         filled = jnp.all(jnp.isfinite(problem.flat))
+        # Rows that were not reached are solved for at the start, so that their derivatives are finite, and left out
+        # after.
         safe = jnp.where(filled, problem.flat, ravel_pytree(y0)[0])
         moved, _ = consistent_point(problem, None, jnp.where(filled, t, 0), safe, SAVED_ITERATIONS)
         kept = filled & jnp.all(jnp.isfinite(moved))
