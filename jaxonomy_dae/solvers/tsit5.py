@@ -64,8 +64,9 @@ class Tsit5(diffrax.Tsit5):
         return points[-2], points[-1], slope, k
 
     def _looped(self, terms, t0, t1, y0, args, control, slope, made_jump):
-        """The stages computed in a loop, so that XLA compiles the field once; returns as `_written_out`. After a jump
-        the loop begins one stage earlier, since the last slope of the step before is no longer that of the state."""
+        """The stages computed in a loop, so that XLA compiles the field once; returns as `_written_out`. Where the
+        field may have jumped, the loop begins one stage earlier: the last slope of the step before may no longer be
+        that of the state."""
         tableau = self.tableau
         n, last = len(tableau.c), slope
         weights = np.zeros((n + 1, n + 1))
