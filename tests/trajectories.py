@@ -14,7 +14,7 @@ import numpy as np
 from reference_systems import ReferenceSystem, integrated, system_of, values_of
 
 from jaxonomy_dae import AcausalSystem, Solution
-from jaxonomy_dae.compiler.pipeline import initial_point
+from jaxonomy_dae.model.consistent_point import initial_point
 from jaxonomy_dae.system.inputs import read_inputs
 
 ASIDE = 1e-12  # of a run's length: as near to an edge as the field is evaluated, beside its jump
@@ -43,7 +43,9 @@ def states_at(
     assert not system.carried, "the field of nonlinear blocks is only as good as a stage needs it"
     assert not system.plan.n_constraints, "inputs at the start move redundant states, and a run projects them"
     plan = system.plan
-    point, *_ = initial_point(plan.flat, plan.variable_map, plan.extended)  # by NumPy: `initialize` compiles its ladder
+    point = initial_point(
+        plan.flat, plan.variable_map, plan.extended
+    ).values  # by NumPy: `initialize` compiles its ladder
     start = point[plan.states]
     field = jax.jit(lambda t, x: system.vector_field(t, x, inputs))
     aside = ASIDE * (ts[-1] - ts[0])

@@ -57,12 +57,12 @@ def differentiate_equations(
                 ExtendedGroup(
                     template,
                     first_extended[first_equation + rows] + k,
-                    first_equation + rows,
-                    k,
                     quantity,
                     np.where(zero, 0, s),
                     group.parameter[rows],
                     group.coefficient[rows],
+                    first_equation + rows,
+                    k,
                 )
             )
             k += 1

@@ -11,11 +11,11 @@ from ..diagnosis.structure import check_structure
 from ..diagnosis.unused_parameters import note_unused
 from ..diagnosis.wording import itemised, listed
 from ..errors import ModelError, StructuralError, nearest
-from ..model.consistent_point import consistent_point
-from ..model.evaluate_numpy import Networks
+from ..model.consistent_point import initial_point
 from ..model.extended import Extended
+from ..model.group import Point
 from ..model.incidence import incidence
-from ..model.quantities import QuantityMap, declared_scale, map_quantities, name_quantities, start_guess
+from ..model.quantities import QuantityMap, declared_scale, map_quantities, name_quantities
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, locate, provenance_of
 from ..model.typical_sizes import error_sizes, unrounded_sizes
 from ..structure.pantelides import match_highest
@@ -72,13 +72,12 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Co
     preferred = _preferred(flat, variables, prefer_states)
     merit = _merit(flat, variables, extended, preferred)
 
-    def point():
+    def point() -> Point:
         return initial_point(flat, variables, extended)
 
     def dependent(settled: np.ndarray) -> list[str]:
-        values, parameters, networks = point()
-        at = ModelAt(flat, alias, variables, groups, extended, settled, values, parameters, 0.0, networks)
-        return [str(found) for found in dependent_constraints(at)]
+        model = ModelAt(flat, alias, variables, groups, extended, settled, point())
+        return [str(found) for found in dependent_constraints(model)]
 
     scale = _scale(flat, variables, extended)
     selection = select_states(
@@ -180,15 +179,6 @@ def _merit(flat: FlatModel, variables: QuantityMap, extended: Extended, preferre
     started[variables.quantity[chosen]] = 1
     fixed[variables.quantity[chosen & flat.variables.fixed]] = 1
     return [(preferred.get(q, 0), f, s) for q, (f, s) in enumerate(zip(fixed.tolist(), started.tolist(), strict=True))]
-
-
-def initial_point(flat: FlatModel, variables: QuantityMap, extended: Extended):
-    """All quantities near the declared starts, consistent where possible; parameters; networks."""
-    values = flat.parameters.values
-    networks = Networks(tuple(flat.networks.values()))
-    guess, pins = start_guess(flat, variables, extended.quantities.n)
-    point = consistent_point(extended, guess, list(pins.items()), values, 0.0, networks)
-    return point, values, networks
 
 
 def _check_row_targets(flat: FlatModel, variables: QuantityMap, selection: StateSelection, names: list[str], mode: str):

@@ -20,8 +20,8 @@ from ..expressions.differentiate import partial_derivative
 from ..expressions.errors import KNOWN, KernelWithErrors
 from ..expressions.node import Node, constant, number
 from ..expressions.substitute import substitute
-from ..model.evaluate_numpy import Networks, group_values, partial_errors
 from ..model.extended import ExtendedGroup
+from ..model.group import Group, Point
 from ..model.incidence import incidence
 from ..model.natural_sizes import natural_sizes
 from ..model.provenance import Provenance, combination
@@ -158,23 +158,24 @@ class _Jacobian:
         """Of all equations of a group, factors included, and bounds of their errors: shape (n, slots) each."""
         if (g, trial) not in self._partials:
             group = self.groups[g]
-            point = np.where(group.variable == ZERO, 0.0, group.factor * tried(group.variable, group.order, trial))
+            point = np.where(group.variable == ZERO, 0.0, tried(group.variable, group.order, trial))
+            slots = point.shape[1]
             if group.template.opaque is not None:  # any function
-                slots = range(point.shape[1])
-                any_slopes = [np.ones(len(group)), *(somewhere(group.variable[:, 0], k, trial) for k in slots[1:])]
-                found = tuple(any_slopes)
-                errors = tuple(KNOWN * np.abs(v) for v in found)
+                slopes = [np.ones(len(group)), *(somewhere(group.variable[:, 0], k, trial) for k in range(1, slots))]
+                values = np.stack(slopes, axis=-1) * group.factor
+                found = values, KNOWN * np.abs(values)
             else:
-                p, c = list(self.values[group.parameter].T), list(group.coefficient.T)
-                t = 0.37 + 0.1 * trial
-                slots = list(point.T)
-                found = group.template.partial_values(slots, p, c, t, None, backend="numpy")
-                errors = group.template.partial_errors(slots, list(KNOWN * np.abs(point.T)), p, c, t, None)
-            if point.shape[1]:
-                values, bounds = _over(found, len(group)).T, _over(errors, len(group)).T
-            else:
-                values = bounds = np.zeros(point.shape)
-            self._partials[g, trial] = values * group.factor, bounds * np.abs(group.factor)
+                at = Point.of(point.ravel(), self.values, 0.37 + 0.1 * trial)
+                own = Group(
+                    group.template,
+                    np.arange(len(group)),
+                    np.arange(point.size).reshape(point.shape),
+                    group.factor,
+                    group.parameter,
+                    group.coefficient,
+                )
+                found = own.partials(at), own.partial_errors(at, KNOWN * np.abs(at.values))
+            self._partials[g, trial] = found
         return self._partials[g, trial]
 
     def hits(self, e: int, columns: np.ndarray) -> list[tuple[int, int]]:
@@ -217,7 +218,7 @@ class _Jacobian:
             own = len(order) + np.arange(len(chosen))
             order += [int(self.first[g]) + i for i in chosen]
             groups.append(
-                ExtendedGroup(group.template, own, own, 0, quantity, group.factor, group.parameter, group.coefficient)
+                ExtendedGroup(group.template, own, quantity, group.factor, group.parameter, group.coefficient, own, 0)
             )
         size, _ = natural_sizes(groups, len(order), np.ones(len(number)), self.values, by_terms=True)
         return groups, order, np.array(list(number), np.int64).reshape(-1, 2), np.abs(size)
@@ -234,15 +235,13 @@ class _Jacobian:
         """The matrix at a random point where all terms of the equations are alike: what depends on the point may look
         constant where one term is too small to be seen."""
         groups, order, pairs, size = self._at_natural_sizes(equations)
-        point = size * somewhere(pairs[:, 0], pairs[:, 1], trial)
+        at = Point.of(size * somewhere(pairs[:, 0], pairs[:, 1], trial), self.values, 0.37 + 0.1 * trial)
         place = {e: k for k, e in enumerate(equations.tolist())}
         dense, errors = np.zeros((2, len(equations), len(columns)))
         for group in groups:
             if group.template.opaque is not None:
                 return self.at(equations, columns, trial)
-            at = self.values, 0.37 + 0.1 * trial, Networks(())
-            partials = group_values(group, point, *at, partials=True)
-            bounds = partial_errors(group, point, KNOWN * np.abs(point), *at)
+            partials, bounds = group.partials(at), group.partial_errors(at, KNOWN * np.abs(at.values))
             for i, e in enumerate(order[int(group.equation[0]) : int(group.equation[-1]) + 1]):
                 for slot, j in self.hits(e, columns):
                     dense[place[e], j] += partials[i, slot]
@@ -502,11 +501,10 @@ def zero_pivots(groups, signature: Incidence, offsets: Offsets, column, values) 
         slots = np.flatnonzero(used.any(axis=0))
         if not len(slots) or not all(template.coefficient_is_constant(int(k)) for k in slots):
             continue
-        point, exact = [np.ones(len(group))] * len(template.slots), [np.zeros(len(group))] * len(template.slots)
-        given = list(values[group.parameter].T), list(group.coefficient.T), 0.0, None
-        partials = template.partial_values(point, *given, backend="numpy")
-        errors = template.partial_errors(point, exact, *given)
-        coefficient = sum(used[:, k] * group.factor[:, k] * partials[k] for k in slots.tolist())
-        bound = sum(used[:, k] * np.abs(group.factor[:, k]) * errors[k] for k in slots.tolist())
+        reads = np.zeros(group.variable.shape, np.int64)  # whatever the slots are: these entries are constant
+        own = Group(template, equation, reads, group.factor, group.parameter, group.coefficient)
+        at = Point.of(np.ones(1), values, 0.0)
+        coefficient = (used * own.partials(at))[:, slots].sum(axis=1)
+        bound = (used * own.partial_errors(at, np.zeros(2)))[:, slots].sum(axis=1)
         found.append(equation[used.any(axis=1) & (np.abs(coefficient) <= bound)])
     return np.concatenate(found) if found else np.zeros(0, np.int64)

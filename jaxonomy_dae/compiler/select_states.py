@@ -19,8 +19,8 @@ from ..errors import StructuralError
 from ..expressions.errors import KNOWN
 from ..judgement.rank import above_errors, rank_of
 from ..model.constraint_jacobian import constraint_entries, evaluate, evaluate_errors, independent_parts
-from ..model.evaluate_numpy import Networks
 from ..model.extended import Extended
+from ..model.group import Point
 from ..model.tables import ZERO, EquationGroup, equation_offsets
 
 POOR_PIVOT = 0.1  # a preferred pivot may be this much smaller than the best one
@@ -85,7 +85,7 @@ def select_states(
     mode: str,
     merit: Callable[[int], tuple],
     scale: np.ndarray,
-    point: Callable[[], tuple[np.ndarray, np.ndarray, Networks]],
+    point: Callable[[], Point],
     error_sizes: Callable[[], np.ndarray],
     name: Callable[[int], str],
     equation_name: Callable[[int], str],
@@ -141,10 +141,10 @@ def select_states(
                 projected[rows] = True
                 continue
             if numbers is None:
-                values, parameters, networks = point()
-                at = (groups, extended, entries, values)
-                numbers = evaluate(*at, parameters, 0.0, networks)
-                errors = evaluate_errors(*at, KNOWN * (np.abs(values) + error_sizes()), parameters, 0.0, networks)
+                at = point()
+                numbers = evaluate(groups, extended, entries, at)
+                known = KNOWN * (np.abs(at.values[:-1]) + error_sizes())
+                errors = evaluate_errors(groups, extended, entries, at, known)
             columns = np.unique(entries.column[members])
             dense, bounds = np.zeros((2, len(rows), len(columns)))
             place = np.searchsorted(rows, entries.row[members]), np.searchsorted(columns, entries.column[members])

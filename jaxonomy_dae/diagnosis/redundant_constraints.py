@@ -33,8 +33,8 @@ from ..model.constraint_jacobian import (
     evaluate_errors,
     independent_parts,
 )
-from ..model.evaluate_numpy import Networks
 from ..model.extended import Extended
+from ..model.group import Group, Point
 from ..model.linear_template import LinearTemplate
 from ..model.provenance import Provenance
 from ..model.quantities import QuantityMap
@@ -61,15 +61,12 @@ class ModelAt:
     groups: tuple[EquationGroup, ...]
     extended: Extended
     settled: np.ndarray  # quantities that equations determine without any state
-    values: np.ndarray
-    parameters: np.ndarray
-    t: float
-    networks: Networks
+    point: Point
 
     @functools.cached_property
     def error_sizes(self) -> np.ndarray:
         """The sizes to whose rounding all quantities are known."""
-        return error_sizes(self.flat, self.variables, self.extended, self.parameters)
+        return error_sizes(self.flat, self.variables, self.extended, self.point.parameters)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,11 +129,9 @@ def _of_part(model: ModelAt, entries: ConstraintEntries, rows: np.ndarray) -> li
         np.add.at(matrix, place, numbers)
         return matrix
 
-    where = (model.groups, model.extended, entries, model.values)
-    rest = (model.parameters, model.t, model.networks)
-    with np.errstate(all="ignore"):
-        at = matrix_of(evaluate(*where, *rest))
-        bounds = matrix_of(evaluate_errors(*where, KNOWN * (np.abs(model.values) + model.error_sizes), *rest))
+    where = model.groups, model.extended, entries, model.point
+    at = matrix_of(evaluate(*where))
+    bounds = matrix_of(evaluate_errors(*where, KNOWN * (np.abs(model.point.values[:-1]) + model.error_sizes)))
     if not np.isfinite(at).all():
         return []
     at = above_errors(at, bounds)  # sin(1e-17) is zero, and no scale may make it one
@@ -150,10 +145,9 @@ def _of_part(model: ModelAt, entries: ConstraintEntries, rows: np.ndarray) -> li
     changed = np.zeros((left.shape[1], right.shape[1], right.shape[1]))
     size = np.zeros_like(changed)
     for k in range(right.shape[1]):
-        move = np.zeros_like(model.values)
+        move = np.zeros(model.extended.quantities.n)
         move[position] = column_scale * right[:, k]
-        with np.errstate(all="ignore"):
-            slope = row_scale[:, None] * matrix_of(evaluate_along(*where, move, *rest)) * column_scale
+        slope = row_scale[:, None] * matrix_of(evaluate_along(*where, move)) * column_scale
         if not np.isfinite(slope).all():
             return []
         changed[:, k] = left.T @ slope @ right
@@ -231,20 +225,24 @@ def _composites(components: list[str]) -> tuple[str, ...]:
 def _demands(model: ModelAt, wanted: dict[tuple[str, str], list[np.ndarray]]) -> dict[int, np.ndarray]:
     """Σ weight·∂(equation)/∂(variable) of every variable as written, where it is not zero."""
     quantity, factor = model.variables.quantity, model.variables.factor
-    padded = np.append(model.values, 0.0)
+    padded = model.point.values
     values = np.where(quantity >= ZERO, padded[np.maximum(quantity, ZERO)], np.nan) * factor
+    at = model.point.at(values)  # by variables, as equations are written
     out: dict[int, np.ndarray] = {}
     for group in model.flat.groups:
         for i, source in enumerate(group.provenance):
             for w in wanted.get((source.component, source.statement), ())[:1]:
-                one = group.take([i])
-                slots = list((one.factor * np.append(values, 0.0)[one.variable]).T)
-                arguments = list(model.parameters[one.parameter].T), list(one.coefficient.T), model.t, model.networks
-                partials = one.template.partial_values(slots, *arguments, backend="numpy")
-                for k, partial in enumerate(partials):
-                    v = int(one.variable[0, k])
+                row = slice(i, i + 1)
+                slopes = Group(
+                    group.template,
+                    np.arange(1),
+                    group.variable[row],
+                    group.factor[row],
+                    group.parameter[row],
+                    group.coefficient[row],
+                ).partials(at)
+                for v, slope in zip(group.variable[i].tolist(), slopes[0].tolist(), strict=True):
                     if v != ZERO:
-                        slope = float(np.ravel(np.asarray(partial, float))[0]) * float(one.factor[0, k])
                         out[v] = out.get(v, 0.0) + slope * w
     return {v: d for v, d in out.items() if np.isfinite(d).all() and np.abs(d).max() > 0}
 

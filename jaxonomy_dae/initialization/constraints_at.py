@@ -7,7 +7,8 @@ import numpy as np
 from ..diagnosis.redundant_constraints import ModelAt
 from ..lowering.plan import SystemPlan
 from ..model.consistent_point import consistent_point
-from ..model.evaluate_numpy import Networks
+from ..model.group import Point
+from ..model.networks import Networks
 from ..model.quantities import start_guess
 
 LARGEST = 1500  # unknown quantities: up to there, positions that are not states are found by dense algebra
@@ -30,9 +31,6 @@ def constraints_at(
     guess[list(pins)] = list(pins.values())
     if quantities.n > quantities.n_unknown:
         guess[quantities.n_unknown :] = inputs()
-    evaluated = Networks(networks)
-    values = consistent_point(plan.extended, guess, list(pins.items()), parameters, t, evaluated)
-    return ModelAt(
-        plan.flat, plan.alias, plan.variable_map, plan.groups, plan.extended, plan.selection.settled, values,
-        parameters, t, evaluated,
-    )  # fmt: skip
+    found = consistent_point(plan.extended, Point.of(guess, parameters, t, Networks(networks)), list(pins.items()))
+    settled = plan.selection.settled
+    return ModelAt(plan.flat, plan.alias, plan.variable_map, plan.groups, plan.extended, settled, found)

@@ -176,8 +176,8 @@ class InitializationReport(Sections):
                 whole = isinstance(step, SparseStep)
                 for equation in step.equations if whole else [step.equations[e] for e in step.tearing.residuals]:
                     for b in range(len(equation.equation)):
-                        slots = np.array([s.quantity[b] for s in equation.slots])
-                        out.append((plan.describe(int(equation.equation[b])), self._names(slots)))
+                        names = self._names(equation.quantity[b])
+                        out.append((plan.describe(int(equation.equation[b])), names))
         return out + starts
 
     def _names(self, quantities: np.ndarray) -> tuple[str, ...]:

@@ -22,8 +22,9 @@ from ..judgement.rank import above_errors
 from ..judgement.scaling import balanced, equilibrated
 from ..lowering.plan import SystemPlan
 from ..model.dependent_parameters import complete
-from ..model.evaluate_numpy import Networks, generic_jacobian, slot_values
+from ..model.jacobian import generic_jacobian
 from ..model.natural_sizes import natural_sizes
+from ..model.networks import Networks
 from ..model.quantities import ABSENT, declared_scale, leading_starts
 from ..model.tables import ZERO, Start
 from ..structure.matching import match_in_order
@@ -158,15 +159,10 @@ def _declared(plan: SystemPlan, names: tuple[str, ...]) -> tuple[list[Row], list
 
 @functools.lru_cache(maxsize=64)
 def _generic(plan: SystemPlan, solve_for: tuple[int, ...]) -> _Generic:
+    """Reads no values of parameters and no starts, which equal plans need not share."""
     extended = plan.extended
     n = extended.quantities.n_unknown
     size = declared_scale(plan.flat, plan.variable_map, extended)
-    starts = plan.flat.variables.start
-    values = starts.values(plan.flat.parameters.values)
-    for v in np.flatnonzero(starts.is_number).tolist():
-        quantity, factor = plan.quantity_of(v)
-        if quantity >= 0 and size[quantity] == 0.0:
-            size[quantity] = values[v] / factor
     size[size == 0.0] = 1.0
     n_parameters = len(plan.flat.parameters)
     parameter_size = np.ones(n_parameters)
@@ -205,7 +201,7 @@ def _parameter_columns(plan: SystemPlan, point, values, solve_for) -> np.ndarray
                 hit = along[j][group.parameter]
                 if group.template.opaque is not None or not hit.any():
                     continue
-                slots = [jnp.asarray(s) for s in slot_values(group, point)]
+                slots = [jnp.asarray(s) for s in group.slots(np.append(point, 0.0))]
                 given = [jnp.asarray(p) for p in values[group.parameter].T]
                 coefficients = [jnp.asarray(c) for c in group.coefficient.T]
 

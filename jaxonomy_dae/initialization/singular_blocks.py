@@ -16,7 +16,7 @@ from ..lowering.plan import SystemPlan
 from ..lowering.schedule import SparseStep, Step, StepEquation
 from ..model.tables import ZERO
 from .block_finding import DENSE_LIMIT, ILL_CONDITIONED, BlockFinding
-from .block_values import BlockValues, local_slots, slots_of_partials
+from .block_values import BlockValues, slots_of_partials
 from .condition import conditions, left_null
 from .sparse_blocks import sparse_finding
 
@@ -43,8 +43,8 @@ def _plan_check(plan: SystemPlan) -> _Check:
         examined.add(k)
         for equation in step.equations:
             for slot in slots_of_partials(equation):
-                source = equation.slots[slot]
-                wanted[source.quantity[source.quantity != ZERO]] = True
+                source = equation.quantity[:, slot]
+                wanted[source[source != ZERO]] = True
     settled = plan.selection.settled
     for planned in plan.constraints:
         wanted[settled[np.isin(settled, planned.group.quantity)]] = True
@@ -59,7 +59,7 @@ def _plan_check(plan: SystemPlan) -> _Check:
 
 def _never_vanishes(equation: StepEquation) -> bool:
     """Whether the equation's only local unknown has a coefficient that is a nonzero number."""
-    positions = local_slots(equation)
+    positions = equation.inside
     return len(positions) == 1 and equation.template.coefficient_is_number(positions[0])
 
 
@@ -147,7 +147,7 @@ def _causes(plan: SystemPlan, values: BlockValues, step: Step, b: int, left, rig
         return tuple(zero)
     moved: list[tuple[str, float]] = []
     touched: list[tuple[str, float]] = []  # where it is of the second order
-    sources = {int(e.slots[s].quantity[b]) for e in step.equations for s in slots_of_partials(e)} - {ZERO}
+    sources = {int(e.quantity[b, s]) for e in step.equations for s in slots_of_partials(e)} - {ZERO}
     for q in sorted(sources):
         kept = values.quantities[q]
         values.quantities[q] = kept + 1e-3 * (abs(kept) or 1.0)
@@ -167,29 +167,19 @@ def _constraints(plan: SystemPlan, values: BlockValues) -> Iterator[BlockFinding
     m = plan.n_constraints
     if not m or plan.constraint_pattern is None or m > DENSE_LIMIT:
         return
-    place = np.full(len(values.quantities), -1)
+    place = np.full(len(values.quantities), -1)  # ZERO is −1: the last entry
     place[plan.states] = np.arange(len(plan.states))
     matrix, errors = np.zeros((2, m, len(plan.states)))
     texts = []
     row = 0
     for planned in plan.constraints:
         group = planned.group
-        padded = np.append(values.quantities[:-1], 0.0)
-        slots = list((group.factor * padded[group.quantity]).T)
-        if np.isnan(slots).any() or group.template.opaque is not None:
+        if np.isnan(values.quantities[group.quantity]).any() or group.template.opaque is not None:
             return
-        p, c = list(values.parameters[group.parameter].T), list(group.coefficient.T)
-        with np.errstate(all="ignore"):
-            out = group.template.partial_values(slots, p, c, values.t, values.networks, backend="numpy")
-            of_slots = list(np.abs(group.factor * values.errors[group.quantity]).T)
-            bounds = group.template.partial_errors(slots, of_slots, p, c, values.t, values.networks)
-        for k, (partial, bound) in enumerate(zip(out, bounds, strict=True)):
-            partial = np.broadcast_to(np.asarray(partial, float), (len(group),)) * group.factor[:, k]
-            bound = np.broadcast_to(np.asarray(bound, float), (len(group),)) * np.abs(group.factor[:, k])
-            where = place[group.quantity[:, k]]
-            inside = np.flatnonzero(where >= 0)
-            matrix[row + inside, where[inside]] += partial[inside]
-            errors[row + inside, where[inside]] += bound[inside]
+        instance, slot = np.nonzero(place[group.quantity] >= 0)
+        entries = row + instance, place[group.quantity[instance, slot]]
+        np.add.at(matrix, entries, group.partials(values.point)[instance, slot])
+        np.add.at(errors, entries, group.partial_errors(values.point, values.errors)[instance, slot])
         texts += group.equation.tolist()
         row += len(group)
     if not np.isfinite(matrix).all():

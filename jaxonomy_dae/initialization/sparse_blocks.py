@@ -22,12 +22,11 @@ def sparse_finding(plan: SystemPlan, values: BlockValues, step: SparseStep) -> B
     first = 0
     for equation in step.equations:
         partials, of_partials = values.partials(equation), values.partial_errors(equation)
-        for k, slot in enumerate(equation.slots):
-            inside = np.flatnonzero(column[slot.quantity] >= 0)
-            rows.append(first + inside)
-            columns.append(column[slot.quantity[inside]])
-            entries.append(partials[inside, k])
-            bounds.append(of_partials[inside, k])
+        instance, slot = np.nonzero(column[equation.quantity] >= 0)
+        rows.append(first + instance)
+        columns.append(column[equation.quantity[instance, slot]])
+        entries.append(partials[instance, slot])
+        bounds.append(of_partials[instance, slot])
         first += len(equation.equation)
     place = np.concatenate(rows), np.concatenate(columns)
     matrix = sp.csc_array((np.concatenate(entries), place), shape=(n, n))
@@ -60,8 +59,8 @@ def _causes(
     for equation in step.equations:
         u = left[first : first + len(equation.equation)]
         first += len(u)
-        columns = [column[slot.quantity] for slot in equation.slots]
-        v = np.stack([np.where(c >= 0, right[c], 0.0) for c in columns], axis=-1)
+        places = column[equation.quantity]
+        v = np.where(places >= 0, right[places], 0.0)
         before = values.partials(equation)
         for j in range(equation.parameter.shape[1]):
             p = equation.parameter[:, j]

@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from ..model.evaluate_numpy import Networks, group_values
 from ..model.extended import Extended
+from ..model.group import Point
+from ..model.networks import Networks
 from ..model.quantities import QuantityMap, quantity_scale, start_guess
 from ..model.tables import FlatModel
 
@@ -17,10 +18,10 @@ class EntrySizes:
 
     def __init__(self, flat: FlatModel, variables: QuantityMap, extended: Extended):
         self.extended = extended
-        self.parameters = flat.parameters.values
         guess, _ = start_guess(flat, variables, extended.quantities.n)
-        self.points = (guess, guess + quantity_scale(flat, variables, extended))
-        self.networks = Networks(tuple(flat.networks.values()))
+        networks = Networks(tuple(flat.networks.values()))
+        points = (guess, guess + quantity_scale(flat, variables, extended))
+        self.points = [Point.of(values, flat.parameters.values, 0.0, networks) for values in points]
         self._groups: dict[int, np.ndarray] = {}
 
     def of(self, group: int, slot: int) -> np.ndarray:
@@ -37,10 +38,6 @@ class EntrySizes:
         chosen = self.extended.groups[group]
         if chosen.template.opaque is not None:
             return np.ones(chosen.quantity.shape)
-        found = [
-            np.abs(group_values(chosen, point, self.parameters, 0.0, self.networks, partials=True))
-            for point in self.points
-        ]
-        size = np.fmax(*found)
+        size = np.fmax(*(np.abs(chosen.partials(point)) for point in self.points))
         largest = np.where(np.isfinite(size), size, 0.0).max(axis=1, keepdims=True, initial=0.0)
         return np.where(np.isfinite(size), size, np.where(largest > 0, largest, 1.0))

@@ -71,9 +71,9 @@ def _compared(
         place = np.full(max(int(guard.max()), int(unknown.max())) + 1, -1, np.int64)
         place[unknown] = np.arange(step.n)
         found = place[guard]
-        for slot in step.equations[0].slots:
+        for quantity in step.equations[0].quantity.T:
             parameters.append(own[found >= 0])
-            quantities.append(slot.quantity[found[found >= 0]])
+            quantities.append(quantity[found[found >= 0]])
     parameters, quantities = np.concatenate(parameters), np.concatenate(quantities)
     return parameters[quantities != ZERO], quantities[quantities != ZERO]
 
@@ -98,7 +98,7 @@ def _own(step: AnyStep, equation: StepEquation, row: int) -> list[int]:
     """The unknowns among which those of an equation's block are."""
     if isinstance(step, Step):
         return [int(unknown[row]) for unknown in step.unknown]
-    read = np.array([slot.quantity[row] for slot in equation.slots])
+    read = equation.quantity[row]
     return read[np.isin(read, step.unknown[0])].tolist()
 
 
@@ -109,9 +109,9 @@ def _is_affine(step: AnyStep, relations: np.ndarray) -> bool:
         columns = tuple(np.flatnonzero(np.isin(equation.parameter, relations).any(axis=0)).tolist())
         template = _with_known(equation.template, columns)
         if isinstance(step, SparseStep):
-            masks = np.unique(np.stack([np.isin(s.quantity, unknown) for s in equation.slots], axis=1), axis=0)
+            masks = np.unique(np.isin(equation.quantity, unknown), axis=0)
         else:
-            masks = np.array([[s.local >= 0 for s in equation.slots]])
+            masks = np.array([[u >= 0 for u in equation.local]])
         if not all(template.is_affine_in(np.flatnonzero(mask).tolist()) for mask in masks):
             return False
     return True

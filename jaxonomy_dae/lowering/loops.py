@@ -76,8 +76,8 @@ def _shape(step: AnyStep, number: int) -> tuple:
         tuple(
             (
                 e.template.key,
-                tuple(s.local for s in e.slots),
-                tuple(s.factor.tobytes() + (s.quantity == ZERO).tobytes() for s in e.slots),
+                e.local,
+                e.factor.tobytes() + (e.quantity == ZERO).tobytes(),
                 e.coefficient.tobytes(),
             )
             for e in step.equations
@@ -93,8 +93,7 @@ def _run_lengths(true: np.ndarray) -> np.ndarray:
 
 
 def _reads(step: Step) -> np.ndarray:
-    outside = [s.quantity for e in step.equations for s in e.slots if s.local < 0]
-    return np.concatenate(outside) if outside else np.zeros(0, np.int64)
+    return np.concatenate([e.outside.T.ravel() for e in step.equations])
 
 
 def _loop(steps: Sequence[AnyStep], start: int, period: int, count: int, source: np.ndarray) -> Loop | None:

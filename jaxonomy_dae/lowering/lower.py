@@ -11,7 +11,7 @@ import numpy as np
 from ..compiler.pipeline import CompiledModel
 from ..compiler.select_states import StateSelection
 from ..linear.sparse import check_solvable
-from ..model.extended import Extended, ExtendedGroup
+from ..model.extended import Extended
 from ..model.quantities import QuantityMap, leading_starts, quantity_scale
 from ..model.tables import ZERO, FlatModel, RowInjection
 from .entry_sizes import EntrySizes
@@ -162,16 +162,7 @@ def _constraints(extended: Extended, selection: StateSelection, states: np.ndarr
         rows = np.flatnonzero(wanted[group.equation])
         if not len(rows):
             continue
-        taken = ExtendedGroup(
-            group.template,
-            group.equation[rows],
-            group.base[rows],
-            group.level,
-            group.quantity[rows],
-            group.factor[rows],
-            group.parameter[rows],
-            group.coefficient[rows],
-        )
+        taken = group.take(rows)
         groups.append(taken)
         slots.append(taken.quantity.ravel())
         for row in taken.quantity.tolist():

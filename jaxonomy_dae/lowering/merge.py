@@ -12,7 +12,7 @@ import numpy as np
 
 from ..linear import sparse
 from .loops import Loop
-from .schedule import AnyStep, SlotSource, SparseStep, Step, StepEquation
+from .schedule import AnyStep, SparseStep, Step, StepEquation
 
 MANY = 150  # thin steps in a row that are worth merging: written out they cost XLA seconds
 LEAST = 50  # steps in one merged system
@@ -60,8 +60,7 @@ def _merged(run: Sequence[Step], n_quantities: int, without_package: int) -> lis
 
 def _is_affine(equation: StepEquation, inside: np.ndarray) -> bool:
     """Whether all instances are affine, jointly, in the slots that are inside."""
-    masks = np.stack([inside[s.quantity] for s in equation.slots], axis=1)
-    distinct = np.unique(masks, axis=0)
+    distinct = np.unique(inside[equation.quantity], axis=0)
     return all(equation.template.is_affine_in([int(k) for k in np.flatnonzero(mask)]) for mask in distinct)
 
 
@@ -77,13 +76,7 @@ def _one(steps: Sequence[Step]) -> SparseStep:
 
 
 def _joined(equations: Sequence[StepEquation]) -> StepEquation:
-    first = equations[0]
-    slots = tuple(
-        SlotSource(-1, np.concatenate([s.quantity for s in same]), np.concatenate([s.factor for s in same]))
-        for same in zip(*(e.slots for e in equations), strict=True)
-    )
-    return StepEquation(
-        first.template,
-        slots,
-        *(np.concatenate([getattr(e, f) for e in equations]) for f in ("parameter", "coefficient", "equation")),
-    )
+    columns = ("equation", "quantity", "factor", "parameter", "coefficient")
+    joined = (np.concatenate([getattr(e, column) for e in equations]) for column in columns)
+    template = equations[0].template
+    return StepEquation(template, *joined, local=(-1,) * len(template.slots))

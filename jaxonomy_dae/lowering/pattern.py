@@ -94,8 +94,8 @@ class Dependencies:
         if isinstance(step, SparseStep):
             return self._add_sparse(step)
         n = step.n
-        sources = [s.quantity for e in step.equations for s in e.slots if s.local < 0]
-        quantity = np.concatenate(sources) if sources else np.zeros(0, np.int64)
+        sources = np.concatenate([e.outside.T for e in step.equations])
+        quantity = sources.ravel()
         owner = np.tile(np.arange(n), len(sources))
         if not step.carried or self.refined:
             self._store(self.union(owner, quantity, n), step.unknown)
@@ -109,10 +109,10 @@ class Dependencies:
             self.segment[quantities], self.row[quantities] = 0, place
 
     def _add_sparse(self, step: SparseStep):
-        sources = [s.quantity for e in step.equations for s in e.slots]
-        quantity = np.concatenate(sources)
+        quantity = np.concatenate([e.quantity.T.ravel() for e in step.equations])
         if not step.carried or self.refined:
-            owners = [block for e, block in zip(step.equations, step.equation_block, strict=True) for _ in e.slots]
+            pairs = zip(step.equations, step.equation_block, strict=True)
+            owners = [np.tile(block, len(e.local)) for e, block in pairs]
             own = np.zeros(len(self.segment), bool)
             own[step.unknown[0]] = True
             outside = ~own[quantity]
@@ -124,7 +124,7 @@ class Dependencies:
         first, owners = 0, []
         for equation in step.equations:
             n = len(equation.equation)
-            owners.append(np.tile(first + np.arange(n), len(equation.slots)))
+            owners.append(np.tile(first + np.arange(n), len(equation.local)))
             first += n
         self.residuals.append(self.union(np.concatenate(owners), quantity, step.n))
 

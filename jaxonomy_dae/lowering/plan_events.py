@@ -128,10 +128,8 @@ def _parameters_behind(quantities: np.ndarray, steps: Sequence[AnyStep], n: int)
         for equation in step.equations:
             rows = hit if isinstance(step, Step) else slice(None)  # of a large block, all equations
             found.update(np.unique(equation.parameter[rows]).tolist())
-            for slot in equation.slots:
-                if slot.local < 0:
-                    quantity = slot.quantity[rows]
-                    wanted[quantity[quantity != ZERO]] = True
+            quantity = equation.outside[rows]
+            wanted[quantity[quantity != ZERO]] = True
     return found
 
 

@@ -135,11 +135,10 @@ def plan(
 
 
 def _plan_equation(equation: StepEquation, layout: Layout) -> PlannedEquation:
-    read = [s for s in equation.slots if s.local < 0]
-    rows = layout.gathers(np.array([s.quantity for s in read]), np.array([s.factor for s in read])) if read else []
-    gathers = iter(rows)
-    sources = [-1 - s.local if s.local >= 0 else next(gathers) for s in equation.slots]
-    return PlannedEquation(equation, tuple(sources), tuple(_uniform(s.factor) for s in equation.slots))
+    outside = [k for k, u in enumerate(equation.local) if u < 0]
+    gathers = iter(layout.gathers(equation.quantity[:, outside].T, equation.factor[:, outside].T) if outside else ())
+    sources = tuple(-1 - u if u >= 0 else next(gathers) for u in equation.local)
+    return PlannedEquation(equation, sources, tuple(_uniform(factor) for factor in equation.factor.T))
 
 
 def _plan_loop(loop: Loop, layout: Layout) -> PlannedLoop:
@@ -175,20 +174,19 @@ def _plan_loop(loop: Loop, layout: Layout) -> PlannedLoop:
         equations = []
         for equation in step.equations:
             sources: list[Gather | int] = []
-            for slot in equation.slots:
-                if slot.local >= 0:
-                    sources.append(-1 - slot.local)
+            for local, factor in zip(equation.local, equation.factor.T, strict=True):
+                if local >= 0:
+                    sources.append(-1 - local)
                     continue
                 here = slice(read, read + step.n)
-                sources.append(Gather(chunk[here], offset[here], np.where(slot.factor == 0, 1.0, slot.factor)))
+                sources.append(Gather(chunk[here], offset[here], np.where(factor == 0, 1.0, factor)))
                 read += step.n
             size = equation.parameter.size
             numbers = parameter + np.arange(size).reshape(equation.parameter.shape)
             parameter += size
             renumbered = dataclasses.replace(equation, parameter=numbers)
-            equations.append(
-                PlannedEquation(renumbered, tuple(sources), tuple(_uniform(s.factor) for s in equation.slots))
-            )
+            factors = tuple(_uniform(factor) for factor in equation.factor.T)
+            equations.append(PlannedEquation(renumbered, tuple(sources), factors))
         body.append(PlannedStep(step, tuple(equations), ()))
     return PlannedLoop(
         loop.count,
@@ -209,15 +207,15 @@ def _plan_sparse(step: SparseStep, layout: Layout, place: np.ndarray, linear_sol
     equations, entries, rows, cols = [], [], [], []
     first = 0
     for equation in step.equations:
-        sources = tuple(layout.gather(slot.quantity, slot.factor) for slot in equation.slots)
+        sources = tuple(layout.gathers(equation.quantity.T, equation.factor.T))
         equations.append(PlannedEquation(equation, sources, (1.0,) * len(sources)))
         here = []
-        for k, slot in enumerate(equation.slots):
-            instances = np.flatnonzero(local[slot.quantity] >= 0)
+        for k, quantity in enumerate(equation.quantity.T):
+            instances = np.flatnonzero(local[quantity] >= 0)
             if len(instances):
-                here.append((k, instances, _uniform(slot.factor[instances])))
+                here.append((k, instances, _uniform(equation.factor[instances, k])))
                 rows.append(first + instances)
-                cols.append(local[slot.quantity[instances]])
+                cols.append(local[quantity[instances]])
         entries.append(tuple(here))
         first += len(equation.equation)
     pattern = SparsePattern(np.concatenate(rows), np.concatenate(cols), step.n)

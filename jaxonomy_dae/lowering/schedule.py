@@ -13,8 +13,8 @@ import numpy as np
 
 from ..compiler.order_blocks import Blocks
 from ..model.extended import Extended, ExtendedGroup
+from ..model.group import Group
 from ..model.tables import ZERO
-from ..model.template import AbstractTemplate
 from ..structure.tearing import Sizes, Tearing, tear
 from .entry_sizes import EntrySizes
 
@@ -28,23 +28,20 @@ WRITTEN_OUT = {True: 20, False: 200}  # by whether the block is linear
 
 
 @dataclasses.dataclass(frozen=True)
-class SlotSource:
-    """Where a slot's value comes from, over the step's n blocks: a local unknown, or quantities known before."""
+class StepEquation(Group):
+    """One equation of each of a step's n blocks."""
 
-    local: int  # −1: from outside
-    quantity: np.ndarray
-    factor: np.ndarray
+    local: tuple[int, ...]  # the local unknown in each slot; −1: quantities from outside
 
+    @property
+    def outside(self) -> np.ndarray:
+        """The quantities that are known before, shape (n, slots from outside)."""
+        return self.quantity[:, [u < 0 for u in self.local]]
 
-@dataclasses.dataclass(frozen=True)
-class StepEquation:
-    """One equation of a step."""
-
-    template: AbstractTemplate
-    slots: tuple[SlotSource, ...]
-    parameter: np.ndarray  # (n, parameters)
-    coefficient: np.ndarray  # (n, coefficients)
-    equation: np.ndarray  # extended equations (n,)
+    @property
+    def inside(self) -> list[int]:
+        """The slots of local unknowns."""
+        return [k for k, u in enumerate(self.local) if u >= 0]
 
 
 class AbstractStep:
@@ -85,8 +82,7 @@ class Step(AbstractStep):
 
     def needs(self) -> np.ndarray:
         """The quantities that must be known before."""
-        outside = [s.quantity for e in self.equations for s in e.slots if s.local < 0]
-        return np.unique(np.concatenate(outside)) if outside else np.zeros(0, np.int64)
+        return np.unique(np.concatenate([e.outside.ravel() for e in self.equations]))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,7 +112,7 @@ class SparseStep(AbstractStep):
 
     def needs(self) -> np.ndarray:
         """The quantities that must be known before."""
-        read = np.unique(np.concatenate([s.quantity for e in self.equations for s in e.slots]))
+        read = np.unique(np.concatenate([e.quantity.ravel() for e in self.equations]))
         return np.setdiff1d(read, self.unknown[0], assume_unique=True)
 
 
@@ -192,11 +188,15 @@ def _single_steps(group: ExtendedGroup, g: int, row_of, blocks: Blocks, places, 
 
 
 def _equation(group: ExtendedGroup, rows: np.ndarray, local: dict[int, int]) -> StepEquation:
-    slots = tuple(
-        SlotSource(local.get(k, -1), group.quantity[rows, k], group.factor[rows, k])
-        for k in range(group.quantity.shape[1])
+    return StepEquation(
+        group.template,
+        group.equation[rows],
+        group.quantity[rows],
+        group.factor[rows],
+        group.parameter[rows],
+        group.coefficient[rows],
+        tuple(local.get(k, -1) for k in range(group.quantity.shape[1])),
     )
-    return StepEquation(group.template, slots, group.parameter[rows], group.coefficient[rows], group.equation[rows])
 
 
 def _block_detail(extended: Extended, blocks: Blocks, b: int, group_of, row_of):

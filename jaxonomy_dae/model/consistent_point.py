@@ -6,24 +6,27 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..judgement.scaling import equilibrated
-from .evaluate_numpy import Networks, residual_and_jacobian
 from .extended import Extended
+from .group import Point
+from .jacobian import residual_and_jacobian
+from .networks import Networks
+from .quantities import QuantityMap, start_guess
+from .tables import FlatModel
+
+
+def initial_point(flat: FlatModel, variables: QuantityMap, extended: Extended) -> Point:
+    """All quantities near the declared starts, consistent where possible."""
+    guess, pins = start_guess(flat, variables, extended.quantities.n)
+    networks = Networks(tuple(flat.networks.values()))
+    return consistent_point(extended, Point.of(guess, flat.parameters.values, 0.0, networks), list(pins.items()))
 
 
 @np.errstate(all="ignore")  # numbers that overflow end the search
-def consistent_point(
-    extended: Extended,
-    guess: np.ndarray,
-    fixed: list[tuple[int, float]],
-    parameters: np.ndarray,
-    t: float,
-    networks: Networks,
-    iterations: int = 60,
-) -> np.ndarray:
+def consistent_point(extended: Extended, guess: Point, fixed: list[tuple[int, float]], iterations: int = 60) -> Point:
     """A point near `guess` where the equations and the fixed starts hold: damped Gauss–Newton steps of least norm, in
     units in which all rows and columns of the Jacobian are alike.
 
-    Returns the values of all quantities; inputs stay as in `guess`.
+    Inputs stay as in `guess`.
     """
     n = extended.quantities.n_unknown
     pins = np.array([q for q, _ in fixed], np.int64)
@@ -31,10 +34,10 @@ def consistent_point(
     pin_rows = sp.coo_array(
         (np.ones(len(pins)), (np.arange(len(pins)), pins)), shape=(len(pins), extended.quantities.n)
     )
-    values = guess.copy()
+    values = guess.values[:-1].copy()
 
     def evaluate(values):
-        r, jacobian = residual_and_jacobian(extended, values, parameters, t, networks)
+        r, jacobian = residual_and_jacobian(extended, guess.at(values))
         return np.concatenate([r, values[pins] - targets]), jacobian
 
     r, jacobian = evaluate(values)
@@ -62,7 +65,7 @@ def consistent_point(
         if not accepted:
             break
         values, r, jacobian = trial, r_trial, jacobian_trial
-    return values
+    return guess.at(values)
 
 
 def _least_norm(matrix: Any, right: np.ndarray) -> np.ndarray:

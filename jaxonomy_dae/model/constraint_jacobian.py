@@ -11,8 +11,8 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
-from .evaluate_numpy import Networks, group_values, partial_errors, partials_along
 from .extended import Extended, ExtendedGroup
+from .group import Point
 from .tables import ZERO, EquationGroup, equation_offsets
 
 
@@ -74,46 +74,26 @@ def independent_parts(entries: ConstraintEntries, constrained: np.ndarray, shape
 
 
 def evaluate(
-    groups: tuple[EquationGroup, ...],
-    extended: Extended,
-    entries: ConstraintEntries,
-    values: np.ndarray,
-    parameters: np.ndarray,
-    t: float,
-    networks: Networks,
+    groups: tuple[EquationGroup, ...], extended: Extended, entries: ConstraintEntries, at: Point
 ) -> np.ndarray:
-    """The numbers of all entries, from the values of all quantities."""
-    return _gathered(
-        groups, extended, entries, lambda g: group_values(g, values, parameters, t, networks, partials=True)
-    )
+    """The numbers of all entries."""
+    return _gathered(groups, extended, entries, lambda g: g.partials(at))
 
 
 def evaluate_along(
-    groups: tuple[EquationGroup, ...],
-    extended: Extended,
-    entries: ConstraintEntries,
-    values: np.ndarray,
-    move: np.ndarray,
-    parameters: np.ndarray,
-    t: float,
-    networks: Networks,
+    groups: tuple[EquationGroup, ...], extended: Extended, entries: ConstraintEntries, at: Point, move: np.ndarray
 ) -> np.ndarray:
     """How these numbers change where all quantities move by `move`."""
-    return _gathered(groups, extended, entries, lambda g: partials_along(g, values, move, parameters, t, networks))
+    padded = np.append(move, 0.0)
+    return _gathered(groups, extended, entries, lambda g: g.partials_along(at, padded))
 
 
 def evaluate_errors(
-    groups: tuple[EquationGroup, ...],
-    extended: Extended,
-    entries: ConstraintEntries,
-    values: np.ndarray,
-    errors: np.ndarray,
-    parameters: np.ndarray,
-    t: float,
-    networks: Networks,
+    groups: tuple[EquationGroup, ...], extended: Extended, entries: ConstraintEntries, at: Point, errors: np.ndarray
 ) -> np.ndarray:
     """Bounds of the errors of these numbers, from those of all quantities."""
-    return _gathered(groups, extended, entries, lambda g: partial_errors(g, values, errors, parameters, t, networks))
+    padded = np.append(errors, 0.0)
+    return _gathered(groups, extended, entries, lambda g: g.partial_errors(at, padded))
 
 
 def _gathered(groups, extended: Extended, entries: ConstraintEntries, of_group: Callable[[ExtendedGroup], np.ndarray]):

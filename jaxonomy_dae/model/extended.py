@@ -10,8 +10,8 @@ import dataclasses
 import numpy as np
 
 from ..structure.incidence import compress
+from .group import Group
 from .tables import ZERO
-from .template import AbstractTemplate
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,20 +45,24 @@ class Quantities:
 
 
 @dataclasses.dataclass(frozen=True)
-class ExtendedGroup:
-    """Instances of one template at one level of differentiation; slots are quantities (ZERO: constant zero)."""
+class ExtendedGroup(Group):
+    """Instances of one template at one level of differentiation."""
 
-    template: AbstractTemplate
-    equation: np.ndarray  # extended equation numbers (n,)
     base: np.ndarray  # the equation as written that each comes from (n,)
     level: int
-    quantity: np.ndarray  # (n, slots)
-    factor: np.ndarray
-    parameter: np.ndarray
-    coefficient: np.ndarray
 
-    def __len__(self):
-        return len(self.equation)
+    def take(self, rows: np.ndarray) -> "ExtendedGroup":
+        """The instances of these rows."""
+        return ExtendedGroup(
+            self.template,
+            self.equation[rows],
+            self.quantity[rows],
+            self.factor[rows],
+            self.parameter[rows],
+            self.coefficient[rows],
+            self.base[rows],
+            self.level,
+        )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,8 +8,9 @@ import scipy.sparse as sp
 import scipy.sparse.linalg
 from jaxtyping import Float
 
-from .evaluate_numpy import Networks, generic, group_values, slot_values
 from .extended import ExtendedGroup
+from .group import Point
+from .jacobian import generic
 from .tables import ZERO
 
 ROUNDS = 3
@@ -92,12 +93,12 @@ def _moved(size: np.ndarray, decades: np.ndarray) -> np.ndarray:
 def _constants(groups: Sequence[ExtendedGroup], parameters: np.ndarray) -> _Seen:
     """|F_e| where all quantities are zero; none that reads a parameter without a value."""
     values, equations = [np.zeros(0)], [np.zeros(0, np.int64)]
-    nothing = np.zeros(1 + max((int(g.quantity.max(initial=-1)) for g in groups), default=0))
+    quantities = 1 + max((int(g.quantity.max(initial=-1)) for g in groups), default=0)
+    nothing = Point.of(np.zeros(quantities), parameters, 0.5)
     for group in groups:
         if group.template.opaque is not None:
             continue
-        with np.errstate(all="ignore"):
-            there = np.abs(group_values(group, nothing, parameters, 0.5, Networks(()), partials=False))
+        there = np.abs(group.residual(nothing))
         used = (there > 0) & np.isfinite(there) & (parameters[group.parameter] != 0.0).all(axis=1)
         values.append(np.log10(there[used]))
         equations.append(group.equation[used])
@@ -105,7 +106,7 @@ def _constants(groups: Sequence[ExtendedGroup], parameters: np.ndarray) -> _Seen
     return _Seen(np.concatenate(values), np.concatenate(equations), none, none)
 
 
-_Sizes = Callable[[ExtendedGroup, np.ndarray, np.ndarray], np.ndarray]
+_Sizes = Callable[[ExtendedGroup, Point], np.ndarray]
 
 
 def _seen(
@@ -126,7 +127,7 @@ def _seen(
     for group in groups:
         if group.quantity.shape[1] == 0 or group.template.opaque is not None:
             continue
-        size = sizes(group, point, parameters)
+        size = sizes(group, Point.of(point, parameters, 0.5))
         used = (size > 0) & np.isfinite(size)
         if by_columns:
             used &= group.quantity != ZERO
@@ -148,7 +149,7 @@ def _seen(
             for j in range(ids.shape[1]):
                 moved = vector.copy()
                 moved[ids[:, j]] *= 1 + STEP
-                after = sizes(group, *((moved, parameters) if vector is point else (point, moved)))
+                after = sizes(group, Point.of(*((moved, parameters) if vector is point else (point, moved)), 0.5))
                 with np.errstate(all="ignore"):
                     power = np.log(after / size) / np.log1p(STEP)
                 hit = used & np.isfinite(power) & (np.abs(power) > 1e-6) & (ids[:, j] != ZERO)[:, None]
@@ -163,13 +164,9 @@ def _joined(powers: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> tuple[np
     return np.concatenate([none, *places]), np.concatenate([none, *arguments]), np.concatenate([np.zeros(0), *values])
 
 
-def _entries(group: ExtendedGroup, point: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-    with np.errstate(all="ignore"):
-        return np.abs(group_values(group, point, parameters, 0.5, Networks(()), partials=True))
+def _entries(group: ExtendedGroup, at: Point) -> np.ndarray:
+    return np.abs(group.partials(at))
 
 
-def _terms(group: ExtendedGroup, point: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-    slots, p, c = slot_values(group, point), list(parameters[group.parameter].T), list(group.coefficient.T)
-    with np.errstate(all="ignore"):
-        found = group.template.term_values(slots, p, c, 0.5)
-    return np.abs(np.array([np.broadcast_to(v, (len(group),)) for v in found], float).reshape(-1, len(group)).T)
+def _terms(group: ExtendedGroup, at: Point) -> np.ndarray:
+    return np.abs(group.terms(at))

@@ -14,7 +14,7 @@ import numpy as np
 from ..aliases import State, Time
 from ..errors import ModelError, nearest
 from ..lowering.plan import SystemPlan
-from ..model.evaluate_numpy import Networks
+from ..model.networks import Networks
 from ..model.tables import ZERO, AccountGroup
 from ..programs.cache import compiled
 from ..programs.staging import is_staged

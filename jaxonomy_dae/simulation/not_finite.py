@@ -6,7 +6,8 @@ import numpy as np
 
 from ..aliases import State, Time
 from ..lowering.schedule import StepEquation
-from ..model.evaluate_numpy import Networks
+from ..model.group import Point
+from ..model.networks import Networks
 from ..system.system import AcausalSystem
 
 SHOWN = 4  # variables with their values in an error
@@ -23,17 +24,13 @@ def equation_not_finite(system: AcausalSystem, inputs: Any, t: Time, x: State) -
     finite = np.isfinite(values)
     parameters = np.asarray(system.numbers, float)
     networks = Networks(tuple(system.neural[n] for n in plan.network_names))
+    at = Point(np.where(finite, values, ANY), parameters, float(t), networks)
     for step in plan.steps:
         own = np.zeros(len(values), bool)
         own[np.concatenate(step.unknown)] = True
         for equation in step.equations:
-            reads = np.stack([s.quantity for s in equation.slots], axis=-1)
-            slots = [s.factor * np.where(finite[s.quantity], values[s.quantity], ANY) for s in equation.slots]
-            p, c = list(parameters[equation.parameter].T), list(equation.coefficient.T)
-            with np.errstate(all="ignore"):
-                residual = equation.template.residual(slots, p, c, float(t), networks, backend="numpy")
-            wrong = ~np.isfinite(np.broadcast_to(np.asarray(residual, float), (len(reads),)))
-            wrong &= (finite[reads] | own[reads]).all(axis=1)
+            known = (finite | own)[equation.quantity].all(axis=1)
+            wrong = ~np.isfinite(equation.residual(at)) & known
             if wrong.any():
                 return _text(system, equation, int(np.argmax(wrong)), values, finite, parameters)
     return ""
@@ -41,7 +38,7 @@ def equation_not_finite(system: AcausalSystem, inputs: Any, t: Time, x: State) -
 
 def _text(system: AcausalSystem, equation: StepEquation, place: int, values, finite, parameters) -> str:
     plan = system.plan
-    read = dict.fromkeys(int(s.quantity[place]) for s in equation.slots)
+    read = dict.fromkeys(equation.quantity[place].tolist())
     given = {plan.quantity_name[q]: values[q] for q in read if q >= 0 and finite[q]}
     given |= {plan.flat.parameters.names[p]: parameters[p] for p in equation.parameter[place].tolist()}
     shown = ", ".join(f"'{name}' = {value:.6g}" for name, value in list(given.items())[:SHOWN])

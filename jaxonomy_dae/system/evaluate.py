@@ -27,8 +27,8 @@ from ..linear.whole import solve_whole
 from ..linear.written_out import UNROLLED, solve, solve_dense
 from ..lowering.gather import FEW, Chunk, Gather, entries, take, times
 from ..lowering.program import PlannedEquation, PlannedLoop, PlannedSparse, PlannedStep, Program
-from ..model.evaluate_numpy import Networks
 from ..model.linear_template import LinearTemplate, scaled
+from ..model.networks import Networks
 from ..model.tables import ZERO
 
 UNROLLED_REPETITIONS = 4  # of a loop, written out in each of its iterations
@@ -126,8 +126,8 @@ class Evaluation:
     def _solved(self, planned: PlannedEquation, unknown: int, local: list[Any]) -> Any:
         """The local unknown for which the equation, affine in it, holds."""
         equation = planned.equation
-        positions = [k for k, s in enumerate(equation.slots) if s.local == unknown]
-        outside = [k for k in range(len(equation.slots)) if k != positions[0]]
+        positions = [k for k, u in enumerate(equation.local) if u == unknown]
+        outside = [k for k in range(len(equation.local)) if k != positions[0]]
         is_long = isinstance(equation.template, LinearTemplate) and len(outside) >= LONG_SUM
         if is_long and all(isinstance(planned.sources[k], Gather) for k in outside):
             weights = -equation.coefficient[:, outside] / equation.coefficient[:, [positions[0]]]
@@ -221,13 +221,13 @@ class Evaluation:
     def _typical(self, planned: PlannedEquation) -> list[Any]:
         """The typical sizes of an equation's slots; the constant zero has none."""
         out: list[Any] = []
-        for slot in planned.equation.slots:
-            if len(slot.quantity) == 1:
-                k, factor = int(slot.quantity[0]), abs(float(slot.factor[0]))
-                out.append(0.0 if k == ZERO else times(factor, self._entry("typical", k)))
+        for quantity, factor in zip(planned.equation.quantity.T, planned.equation.factor.T, strict=True):
+            if len(quantity) == 1:
+                k = int(quantity[0])
+                out.append(0.0 if k == ZERO else times(abs(float(factor[0])), self._entry("typical", k)))
             else:
-                factors = np.where(slot.quantity == ZERO, 0.0, np.abs(slot.factor))
-                out.append(jnp.asarray(factors, self.dtype) * take(self.typical, np.maximum(slot.quantity, 0)))
+                factors = np.where(quantity == ZERO, 0.0, np.abs(factor))
+                out.append(jnp.asarray(factors, self.dtype) * take(self.typical, np.maximum(quantity, 0)))
         return out
 
     def _still_arguments(self, planned: PlannedEquation, local: list[Any]):
@@ -243,7 +243,7 @@ class Evaluation:
         for e, u in planned.step.tearing.sequence:
             equation = planned.equations[e]
             _, slots, partials = self._terms(equation, local)
-            places = [s.local for s in equation.equation.slots]
+            places = equation.equation.local
             before = self._of_slots(equation, noise)
             slope, total = 0.0, eps * self._magnitude(equation, local)
             for place, factor, s, p, n in zip(places, equation.factors, slots, partials, before, strict=False):
@@ -256,8 +256,8 @@ class Evaluation:
 
     def _of_slots(self, planned: PlannedEquation, noise: list[Any]) -> list[Any]:
         """The noise of an equation's slots."""
-        pairs = zip(planned.equation.slots, planned.factors, strict=True)
-        return [0.0 if s.local < 0 else scaled_by(abs(f), noise[s.local], self.dtype) for s, f in pairs]
+        pairs = zip(planned.equation.local, planned.factors, strict=True)
+        return [0.0 if u < 0 else scaled_by(abs(f), noise[u], self.dtype) for u, f in pairs]
 
     def _terms(self, planned: PlannedEquation, local: list[Any]) -> tuple[Any, list[Any], Sequence[Any]]:
         """An equation's residual, slots and partial derivatives, not differentiated; of a network's output, y − N(u),
@@ -386,11 +386,11 @@ class Evaluation:
         """The residual where all local unknowns are zero, and its slopes as (local unknown, slope)."""
         equation = planned.equation
         template = equation.template
-        inside = [k for k, s in enumerate(equation.slots) if s.local >= 0]
+        inside = equation.inside
         arguments = self._arguments(planned, blank)
         if isinstance(template, LinearTemplate):
             coefficients = arguments[2]
-            outside = [k for k in range(len(equation.slots)) if k not in inside]
+            outside = [k for k in range(len(equation.local)) if k not in inside]
             partials: Any = {k: self._constant(coefficients[k]) for k in inside}
             if len(outside) > LONG_SUM:
                 rest = self._long_sum(planned, outside, equation.coefficient[:, outside])
@@ -401,7 +401,7 @@ class Evaluation:
             rest = template.residual(*arguments)
             # A network's output stands alone, its inputs are outside.
             partials = {inside[0]: 1.0} if template.opaque is not None else template.partial_values(*arguments)
-        return rest, [(equation.slots[k].local, scaled_by(planned.factors[k], partials[k], self.dtype)) for k in inside]
+        return rest, [(equation.local[k], scaled_by(planned.factors[k], partials[k], self.dtype)) for k in inside]
 
     def _constant(self, value: Any) -> Any:
         return value if isinstance(value, float) else jnp.asarray(value, self.dtype)

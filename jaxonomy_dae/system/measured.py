@@ -15,7 +15,7 @@ from ..linear.torn import solve_torn
 from ..linear.whole import solve_whole
 from ..lowering.gather import Chunk, Gather
 from ..lowering.program import PlannedEquation, PlannedLoop, PlannedSparse, PlannedStep, Program
-from ..model.evaluate_numpy import Networks
+from ..model.networks import Networks
 from .evaluate import Evaluation, Refinement, scaled_by
 
 
@@ -91,7 +91,7 @@ class Measured(Evaluation):
         if template.opaque is not None:
             return 1.0
         partials = template.partial_values(*self._arguments(planned, values))
-        here = [k for k, s in enumerate(planned.equation.slots) if s.local == unknown]
+        here = [k for k, u in enumerate(planned.equation.local) if u == unknown]
         return jnp.abs(sum(scaled_by(planned.factors[k], partials[k], self.dtype) for k in here))
 
     def _block_magnitudes(self, planned: PlannedStep, values: list[Any], shape: tuple[int, ...]) -> list[Any]:

@@ -7,9 +7,9 @@ are those of the system, whatever its index and its states.
 
 import numpy as np
 
-from ..compiler.pipeline import initial_point
 from ..lowering.plan import SystemPlan
-from ..model.evaluate_numpy import residual_and_jacobian
+from ..model.consistent_point import initial_point
+from ..model.jacobian import residual_and_jacobian
 
 LARGE = 300  # quantities up to which it is found
 RANK = 1e-10
@@ -30,8 +30,8 @@ def _fastest_decay(plan: SystemPlan) -> float:
     n = quantities.n_unknown
     if not 0 < n <= LARGE:
         return 0.0
-    point, values, networks = initial_point(plan.flat, plan.variable_map, plan.extended)
-    matrix = residual_and_jacobian(plan.extended, point, values, 0.0, networks)[1].toarray()[:, :n]
+    at = initial_point(plan.flat, plan.variable_map, plan.extended)
+    matrix = residual_and_jacobian(plan.extended, at)[1].toarray()[:, :n]
     if not np.isfinite(matrix).all():
         return 0.0
     rows = np.maximum(np.abs(matrix).max(axis=1, initial=0.0), 1e-300)[:, None]

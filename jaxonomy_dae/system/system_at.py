@@ -20,7 +20,7 @@ from ..lowering.plan import ConstraintGroup, PlannedRow, SystemPlan
 from ..lowering.plan_events import EventPlan
 from ..lowering.plan_held import HeldPlan
 from ..lowering.program import Program
-from ..model.evaluate_numpy import Networks
+from ..model.networks import Networks
 from ..model.tables import Start
 from ..solvers.field_size import is_large
 from .evaluate import Evaluation, Refinement, newton

@@ -13,9 +13,10 @@ from sympy import cos, sin
 import jaxonomy_dae.library.planar as pl
 from jaxonomy_dae import AcausalDiagram, Component, EqnEnv, StructuralError
 from jaxonomy_dae.compiler.flatten import flatten
-from jaxonomy_dae.compiler.pipeline import compile_flat, initial_point
+from jaxonomy_dae.compiler.pipeline import compile_flat
 from jaxonomy_dae.initialization.singular_blocks import examine_blocks
 from jaxonomy_dae.lowering.lower import lower
+from jaxonomy_dae.model.consistent_point import initial_point
 from jaxonomy_dae.model.quantities import start_guess
 from jaxonomy_dae.modeling import Eq, der
 
@@ -178,12 +179,13 @@ def verdict(diagram: AcausalDiagram, mode: str, seed: int | None = None) -> str:
         plan = lower(compile_flat(flat, mode, ()))
     except StructuralError:
         return "refused"
-    values, _, networks = initial_point(flat, plan.variable_map, plan.extended)
+    at = initial_point(flat, plan.variable_map, plan.extended)
+    values = at.values[:-1].copy()
     _, fixed = start_guess(flat, plan.variable_map, len(values))
     values[list(fixed)] = list(fixed.values())
     x = values[[*plan.states, *plan.carried]]
     x = moved(x, np.ones(len(x), bool), seed)
-    found = examine_blocks(plan, parameters, networks.weights, 0.0, x, lambda: np.zeros(0))
+    found = examine_blocks(plan, parameters, at.networks.weights, 0.0, x, lambda: np.zeros(0))
     return "refused" if any(finding.singular for finding in found) else "regular"
 
 
