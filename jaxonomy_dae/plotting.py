@@ -1,16 +1,13 @@
 """Figures of solutions, structures and frequency responses, with Matplotlib (extra `plot`)."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from .errors import ModelError
 from .optional import optional_module
-
-if TYPE_CHECKING:
-    from .analysis.frequency import FrequencyResponse
-    from .simulation.solution import Solution
-    from .system.system import AcausalSystem
+from .simulation.by_name import ByName
+from .system.system import AcausalSystem
 
 SEPARATE = 12  # entries of an array that get a colour each
 NAMED = 40  # up to this many unknowns, rows and columns are labelled
@@ -20,11 +17,35 @@ TICK = 0.04  # of the height of the axes
 ROUNDING = 1e-6  # of the time that is drawn
 
 
+@runtime_checkable
+class Response(Protocol):
+    """A `FrequencyResponse`, as its figures read it: by pairs (output, input)."""
+
+    @property
+    def omega(self) -> Any:
+        """Angular frequencies (rad/s), shape (k,)."""
+        ...
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+        ...
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs."""
+        ...
+
+    def __getitem__(self, pair: Any) -> Any:
+        """The complex response of one output to one input, shape (k,)."""
+        ...
+
+
 def _pyplot() -> Any:
     return optional_module("matplotlib.pyplot", "plot", "plotting needs Matplotlib")
 
 
-def plot_solution(solution: "Solution", *names: str, ax: Any = None, events: bool = True) -> Any:
+def plot_solution(solution: ByName, *names: str, ax: Any = None, events: bool = True) -> Any:
     """Draws variables over time, discrete ones as steps, and returns the axes.
 
     **Arguments:**
@@ -72,21 +93,21 @@ def plot_solution(solution: "Solution", *names: str, ax: Any = None, events: boo
     return ax
 
 
-def _entries(solution: "Solution", name: str) -> list[str]:
+def _entries(solution: ByName, name: str) -> list[str]:
     """The names of the entries of an array, or the one name of a variable."""
     entries = solution.system.plan.entries(name)
     return [name] if entries is None else entries[0]
 
 
-def _lines(solution: "Solution", name: str) -> list[str]:
+def _lines(solution: ByName, name: str) -> list[str]:
     """The names under which a variable, or an array of variables, is drawn."""
     entries = _entries(solution, name)
     return [name] if len(entries) > SEPARATE else entries
 
 
-def _steps(solution: "Solution", name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Times and values of a discrete variable: the saved ones, and what it was given by events between them, as far as
-    that was kept."""
+def _steps(solution: ByName, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Returns (times, values) of a discrete variable: at the saved times, and after events between them as far as these
+    were kept."""
     time, values = np.asarray(solution.ts), np.asarray(solution[name])
     log = solution.event_log
     if log is None or not log.after.shape[-2]:
@@ -98,8 +119,8 @@ def _steps(solution: "Solution", name: str) -> tuple[np.ndarray, np.ndarray]:
     return every[order], np.concatenate([written, values])[order]
 
 
-def _seen(solution: "Solution") -> np.ndarray:
-    """Which of the noted events lie within the saved times."""
+def _seen(solution: ByName) -> np.ndarray:
+    """True for the noted events that lie within the saved times, shape (events,)."""
     ts, time = np.asarray(solution.events.ts), np.asarray(solution.ts)
     time = time[np.isfinite(time)]
     if not time.size:
@@ -108,8 +129,8 @@ def _seen(solution: "Solution") -> np.ndarray:
     return (ts >= time.min() - slack) & (ts <= time.max() + slack)
 
 
-def _mark_events(solution: "Solution", ax: Any) -> bool:
-    """Marks the events within the saved times; whether there are any."""
+def _mark_events(solution: ByName, ax: Any) -> bool:
+    """Marks the events within the saved times; returns True if there are any."""
     log = solution.event_log
     if log is None or solution.ts.ndim > 1:  # of a batch, each member has events of its own
         return False
@@ -132,7 +153,7 @@ def _mark_events(solution: "Solution", ax: Any) -> bool:
     return bool(groups)
 
 
-def phase(solution: "Solution", x: str, y: str, ax: Any = None) -> Any:
+def phase(solution: ByName, x: str, y: str, ax: Any = None) -> Any:
     """Draws one variable over another, with a dot at the start; returns the axes. Of a batch, each member has a line.
 
     **Arguments:**
@@ -163,7 +184,7 @@ def phase(solution: "Solution", x: str, y: str, ax: Any = None) -> Any:
     return ax
 
 
-def structure(system: "AcausalSystem", ax: Any = None) -> Any:
+def structure(system: AcausalSystem, ax: Any = None) -> Any:
     """Draws the incidence matrix in block lower triangular order, and returns the axes.
 
     Rows are equations, columns the unknowns they are solved for; a dot says that the equation contains the unknown.
@@ -211,7 +232,7 @@ def structure(system: "AcausalSystem", ax: Any = None) -> Any:
     return ax
 
 
-def bode(response: "FrequencyResponse", *pairs: tuple[str, str], axes: Any = None) -> Any:
+def bode(response: Response, *pairs: tuple[str, str], axes: Any = None) -> Any:
     """Draws magnitudes (dB) and phases (degrees, unwrapped) over the angular frequency; returns the two axes.
 
     **Arguments:**
@@ -243,7 +264,7 @@ def bode(response: "FrequencyResponse", *pairs: tuple[str, str], axes: Any = Non
     return axes
 
 
-def nyquist(response: "FrequencyResponse", *pairs: tuple[str, str], ax: Any = None) -> Any:
+def nyquist(response: Response, *pairs: tuple[str, str], ax: Any = None) -> Any:
     """Draws responses in the complex plane, those of negative frequencies dashed, with the point −1; returns the axes.
 
     **Arguments:**
@@ -271,8 +292,8 @@ def nyquist(response: "FrequencyResponse", *pairs: tuple[str, str], ax: Any = No
     return ax
 
 
-def _pairs_of(response: "FrequencyResponse", pairs: tuple[tuple[str, str], ...]) -> tuple[tuple[str, str], ...]:
-    """What is drawn: by default every output by every input, of which there must be one response each."""
+def _pairs_of(response: Response, pairs: tuple[tuple[str, str], ...]) -> tuple[tuple[str, str], ...]:
+    """The pairs (output, input) to draw: those given, else all. A batch of responses is refused."""
     if np.ndim(response.omega) != 1:
         raise ModelError(f"one response is drawn at a time; this is a batch, omega has shape {response.omega.shape}")
     return pairs or tuple((out, to) for to in response.inputs for out in response.outputs)

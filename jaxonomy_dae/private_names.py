@@ -74,7 +74,7 @@ FOR_LATE_TIMES = ("SaveState", "State")
 
 
 class MissingName(RuntimeError):
-    """A library has no longer what is taken from it."""
+    """A library no longer has a private name that this package uses."""
 
 
 def private(name: str) -> Any:
@@ -93,7 +93,8 @@ def private(name: str) -> Any:
 
 
 def missing(names: tuple[str, ...]) -> str | None:
-    """What one of the names lacks, in words, or None. The names of `AbstractAdjoint.loop`'s arguments count, too."""
+    """The first of the names that the installed versions lack or define otherwise, in words; None if all fit. The
+    argument names of `AbstractAdjoint.loop` are checked, too."""
     for name in names:
         path = NAMES[name]
         try:
@@ -117,7 +118,7 @@ def missing(names: tuple[str, ...]) -> str | None:
 
 
 def has_stored_adjoint() -> bool:
-    """Whether `StoredAdjoint` finds what it needs; warns once if not."""
+    """True if the private names that `StoredAdjoint` needs exist; warns once if not."""
     lacking = missing(FOR_STORED_ADJOINT)
     if lacking is not None:
         _warn_once(
@@ -143,7 +144,7 @@ def unwrapped(terms: Any) -> tuple[Any, Any]:
 
 
 def rewrapped(terms: Any, term: Any) -> Any:
-    """Another term in the direction of time of `terms`."""
+    """Wraps `term` in the same direction of time as `terms`."""
     return type(terms)(term, terms.direction) if hasattr(terms, "direction") else term
 
 

@@ -10,11 +10,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Int, PyTree
 
+from ..aliases import Args
 from ..private_names import MissingName, private
 
 
-class Program(eqx.Module):
-    """The functions of a solve, without the arrays they close over."""
+class SolveProgram(eqx.Module):
+    """The functions of a solve as closure-converted ones: the arrays that they close over are passed to them."""
 
     step: Any  # (tprev, tnext, y, solver_state, made_jump) -> what the solver's `step` returns
     adapt: Any  # (controller, tprev, tnext, y, y1, y_error, controller_state) -> what its `adapt_step_size` returns
@@ -41,7 +42,7 @@ class ClosureConverted(eqx.Module):
     outputs: Any = eqx.field(static=True)  # (structure of the arrays it returns, their shapes and dtypes)
     static: Any = eqx.field(static=True)  # what it returns beside arrays: (leaves, structure)
 
-    def __call__(self, consts: Any, *args: Any) -> Any:
+    def __call__(self, consts: Any, *args: Args) -> Any:
         leaves, structure = jax.tree.flatten(eqx.filter(args, eqx.is_array))
         if structure != self.inputs:
             raise TypeError(f"a closure-converted function was made for {self.inputs}; got {structure}")
@@ -49,7 +50,7 @@ class ClosureConverted(eqx.Module):
 
     @property
     def out_struct(self) -> Any:
-        """What it returns: shapes and dtypes, and values where they are static."""
+        """The structure of the function's result: shapes and dtypes, and values where they are static."""
         return self._combined(list(self.outputs[1]))
 
     def _combined(self, leaves: Any) -> Any:
@@ -57,8 +58,9 @@ class ClosureConverted(eqx.Module):
         return eqx.combine(jax.tree.unflatten(self.outputs[0], leaves), jax.tree.unflatten(structure, others))
 
 
-def closure_convert(function: Any, *args: Any) -> tuple[ClosureConverted, list[Any]]:
-    """(the function without the arrays it closes over, those arrays). Shapes and dtypes will do for arguments."""
+def closure_convert(function: Any, *args: Args) -> tuple[ClosureConverted, list[Any]]:
+    """Returns (`function` as a `ClosureConverted`, the list of arrays that it closed over). Arguments may be arrays or
+    `jax.ShapeDtypeStruct`s."""
     dynamic, static = eqx.partition(args, lambda leaf: eqx.is_array(leaf) or isinstance(leaf, jax.ShapeDtypeStruct))
     leaves, structure = jax.tree.flatten(dynamic)
     found: list[Any] = []
@@ -79,7 +81,7 @@ def closure_convert(function: Any, *args: Any) -> tuple[ClosureConverted, list[A
 
 @jax.custom_jvp
 def unless_waiting(active: Bool[Array, ""], new: PyTree, old: PyTree) -> PyTree:
-    """`new`; in a batch, whose members wait for the slowest one, `old` where a member is not active any more."""
+    """Returns `new`; but `old` for a member of a batch that is no longer active and waits for the slowest one."""
     return _unless_waiting(active, new, old)
 
 
@@ -114,14 +116,15 @@ def _(size, batched, active, new, old):
     return out, jax.tree.map(lambda _: True, out)
 
 
-def going(state: Any, numbers: dict[str, Any], program: Program) -> Bool[Array, ""]:
-    """Whether a solve takes another step."""
+def going(state: Any, numbers: dict[str, Any], program: SolveProgram) -> Bool[Array, ""]:
+    """True while a solve has steps left to take."""
     on = (state.tprev < numbers["t1"]) & diffrax.is_successful(state.result)
     return on if program.max_steps is None else on & (state.num_steps < program.max_steps)
 
 
 def any_member(flag: Bool[Array, ""]) -> Bool[Array, ""]:
-    """Whether a flag is set for any member of the batch: not batched itself, so that branches stay branches."""
+    """True if a flag is set for any member of a batch. The result is not batched, so that `lax.cond` does not become a
+    select that computes both branches."""
     try:
         return private("unvmap_any")(flag)
     except MissingName:
@@ -129,30 +132,30 @@ def any_member(flag: Bool[Array, ""]) -> Bool[Array, ""]:
 
 
 def inexact(tree: PyTree) -> PyTree:
-    """The leaves that can have derivatives."""
+    """The tree's floating-point and complex arrays; None in place of other leaves."""
     return eqx.filter(tree, eqx.is_inexact_array)
 
 
 def rows(tree: PyTree, count: int) -> PyTree:
-    """A zero table with `count` rows like `tree`."""
+    """A table of zeros with `count` rows, each of which has the structure and shapes of `tree`."""
     return jax.tree.map(lambda leaf: jnp.zeros((count, *jnp.shape(leaf)), jnp.result_type(leaf)), tree)
 
 
 def written(table: PyTree, index: Int[Array, ""], row: PyTree) -> PyTree:
-    """The table with a row set."""
+    """The table with row number `index` replaced."""
     return jax.tree.map(lambda a, b: lax.dynamic_update_index_in_dim(a, b, index, 0), table, row)
 
 
 def read(table: PyTree, index: Int[Array, ""]) -> PyTree:
-    """A row of the table."""
+    """Row number `index` of the table."""
     return jax.tree.map(lambda a: lax.dynamic_index_in_dim(a, index, 0, keepdims=False), table)
 
 
 def apart(true: Bool[Array, ""], function: Any, carry: PyTree, *args: PyTree) -> PyTree:
-    """`function(carry, *args)`, which looks like the carry, as a computation of its own.
+    """Returns `function(carry, *args)`, which has the structure of `carry`, compiled as a computation of its own.
 
     XLA on CPU runs a computation in plain order if none of its arrays is larger than 512 bytes, and as a graph of tasks
-    otherwise, which costs small operations several times over. So they stay apart from tables. `true` must not be
-    known to be so when this is compiled.
+    otherwise, which costs small operations several times over. So small computations are kept apart from large tables.
+    `true` must be traced, not constant, or XLA folds the branch away.
     """
     return lax.cond(true, function, lambda carry, *args: carry, carry, *args)

@@ -14,7 +14,8 @@ _forward: contextvars.ContextVar[bool] = contextvars.ContextVar("forward_mode", 
 
 @contextlib.contextmanager
 def forward_mode() -> Iterator[None]:
-    """Inside, what is traced will be differentiated forwards, so the default adjoint is `diffrax.ForwardMode`."""
+    """A context in which functions are traced for forward-mode differentiation: the default adjoint is
+    `diffrax.ForwardMode`."""
     token = _forward.set(True)
     try:
         yield
@@ -23,7 +24,7 @@ def forward_mode() -> Iterator[None]:
 
 
 def default_adjoint(forwards: bool) -> diffrax.AbstractAdjoint:
-    """The adjoint to be taken where none is given; `forwards`: whether forward mode alone is at work."""
+    """The adjoint where the user gives none. `forwards` is true if forward mode alone differentiates the arguments."""
     if forwards or _forward.get():
         return diffrax.ForwardMode()
     return StoredAdjoint() if has_stored_adjoint() else diffrax.RecursiveCheckpointAdjoint()

@@ -18,12 +18,13 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool
 
+from ..aliases import Args, Controller, Solver, State, Terms, Time
 from ..private_names import FOR_LATE_TIMES, missing
 from .wrapped_control import WrappedControl
 
 
-def times_fit(t0: Any, t1: Any, ts: Any, controller: Any) -> Bool[Array, ""] | bool:
-    """Whether the times to save, shape (n,) or None, are sorted from t0 to t1 and not outside, and whether those of a
+def times_fit(t0: Time, t1: Time, ts: Any, controller: Controller) -> Bool[Array, ""] | bool:
+    """True if the times to save, shape (n,) or None, are sorted and lie between t0 and t1, and if those of a
     `diffrax.StepTo` lead from t0 to t1. A Python bool where nothing is traced."""
     steps = controller.ts if isinstance(controller, diffrax.StepTo) else None
     traced = any(isinstance(value, Tracer) for value in (t0, t1, ts, steps))
@@ -41,8 +42,8 @@ def times_fit(t0: Any, t1: Any, ts: Any, controller: Any) -> Bool[Array, ""] | b
 
 
 def diffeqsolve(
-    term: Any, solver: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, *,
-    save: diffrax.SubSaveAt, controller: Any, adjoint: Any, **options: Any,
+    term: Terms, solver: Solver, t0: Time, t1: Time, dt0: Time, y0: State, args: Args, *,
+    save: diffrax.SubSaveAt, controller: Controller, adjoint: Any, **options: Any,
 ) -> diffrax.Solution:  # fmt: skip
     """`diffrax.diffeqsolve` without its checks of times, for an interval and times of one dtype.
 
@@ -65,7 +66,7 @@ def diffeqsolve(
 
 
 class _LateTimes(diffrax.AbstractAdjoint):
-    """Another adjoint, whose solves save at times that `diffrax.diffeqsolve` was not told of.
+    """Wraps an adjoint so that its solves save at times that `diffrax.diffeqsolve` was not given.
 
     - `save`: when to save, in the time of the equations.
     - `direction`: −1 where that runs backwards; Diffrax' loop always goes forwards.
@@ -76,7 +77,7 @@ class _LateTimes(diffrax.AbstractAdjoint):
     direction: Any
 
     def loop(self, **given: Any) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """The loop over the steps, called by `diffrax.diffeqsolve`, with what it makes of `SaveAt(ts=...)`."""
+        """The loop over the steps, as `diffrax.diffeqsolve` calls it; buffers and times of `SaveAt` are put in here."""
         state, saveat, t0 = given["init_state"], given["saveat"], given["t0"]
         ts, direction = self.save.ts, self.direction
         assert ts is not None
@@ -102,9 +103,9 @@ class _LateTimes(diffrax.AbstractAdjoint):
 
 
 class _FirstStep(WrappedControl):
-    """Another controller with a first step of the size given."""
+    """Wraps a controller so that its first step has the size `dt0`."""
 
-    dt0: Any
+    dt0: Time
 
     def wrap(self, direction):
         wrapped = self.controller.wrap(direction)
@@ -118,7 +119,7 @@ class _FirstStep(WrappedControl):
 
 
 class _StepTo(diffrax.AbstractStepSizeController):
-    """`diffrax.StepTo` without its checks."""
+    """`diffrax.StepTo` without the run-time checks of its times."""
 
     controller: diffrax.StepTo
 

@@ -11,7 +11,8 @@ LARGEST = 512  # bytes, see `apart`
 
 
 class Packing:
-    """How the leaves of a tree go into vectors of at most 512 bytes, each of one dtype; larger leaves stay alone.
+    """A plan for packing the leaves of a tree into vectors of at most 512 bytes, each of one dtype; larger leaves stay
+    alone.
 
     Every array that a loop carries costs XLA on CPU some copies an iteration, whatever its size.
     """
@@ -32,7 +33,7 @@ class Packing:
             unfilled[dtype] = place, filled + size
 
     def pack(self, tree: PyTree) -> list[Shaped[Array, "..."]]:
-        """The vectors."""
+        """Packs the leaves of a tree into the vectors."""
         leaves = jax.tree.leaves(tree)
         return [
             leaves[inside[0]] if len(inside) == 1 else jnp.concatenate([jnp.ravel(leaves[i]) for i in inside])
@@ -40,7 +41,7 @@ class Packing:
         ]
 
     def unpack(self, vectors: list[Shaped[Array, "..."]]) -> PyTree:
-        """The tree."""
+        """Rebuilds the tree from its vectors."""
         leaves: list[Any] = [None] * len(self.shapes)
         for inside, vector in zip(self.members, vectors, strict=True):
             start = 0

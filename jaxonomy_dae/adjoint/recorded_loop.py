@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from ..private_names import private
-from .closure_conversion import Program, any_member, apart, going, read, rows, unless_waiting, written
+from .closure_conversion import SolveProgram, any_member, apart, going, read, rows, unless_waiting, written
 from .packing import Packing
 from .resting import held_back
 from .reverse_step import ReverseStep
@@ -17,8 +17,8 @@ from .step_times import StepTimes
 
 
 @eqx.filter_custom_vjp
-def solve(numbers: dict[str, Any], program: Program) -> tuple[Any, Any]:
-    """Steps until the end: the final `(state, buffers)`.
+def solve(numbers: dict[str, Any], program: SolveProgram) -> tuple[Any, Any]:
+    """Takes steps until the end and returns the final `(state, buffers)`.
 
     `numbers` holds every array that the solve depends on: `state` and `buffers` to start from, `t1`, the `controller`'s
     own, the times `ts` of each part of `SaveAt`, and by the names of `program`'s functions what these close over.
@@ -35,15 +35,16 @@ def solve(numbers: dict[str, Any], program: Program) -> tuple[Any, Any]:
 
 
 class _Recorder:
-    """Attempts steps, and keeps what those since the last multiple of `chunk` started from, as far as accepted.
+    """Attempts steps and records what each accepted one started from, since the last multiple of `chunk`.
 
     Loops carry `(row, rest)`, both packed: what a row of the record holds, and the rest of Diffrax's state. Rows count
     the same for all members of a batch, and each says which members accepted it; a row that none did is written over.
     """
 
-    def __init__(self, numbers: dict[str, Any], program: Program, times: StepTimes):
+    def __init__(self, numbers: dict[str, Any], program: SolveProgram, times: StepTimes):
         self.numbers, self.program, self.times = numbers, program, times
         state, moves = numbers["state"], times.start()
+        # The first step may have been made shorter for what rests; its end then moves with its start.
         held = numbers["first"] < state.tnext
         state = dataclasses.replace(state, tnext=jnp.where(held, numbers["first"], state.tnext))
         if times.count:
@@ -61,7 +62,7 @@ class _Recorder:
         return self.row.pack(carry[0]), self.rest.pack(carry[1])
 
     def unpack(self, packed):
-        """(state, end of the last accepted step, derivatives of the times, second run at rest)."""
+        """Returns (state, end of the last accepted step, derivatives of the times, second run of `resting`)."""
         row, (state, moves, pushed) = self.row.unpack(packed[0]), self.rest.unpack(packed[1])
         last, first_moves = row.pop("last"), row.pop("moves")
         return dataclasses.replace(state, **row), last, (*first_moves, *moves), pushed
@@ -73,7 +74,8 @@ class _Recorder:
         return rows((self.start[0], jnp.array(False)), self.program.chunk)
 
     def run(self, packed, buffers, record, count, first):
-        """At most `count` attempted steps: (carry, buffers, record, rows filled). The record is written over."""
+        """Attempts at most `count` steps. Returns (carry, buffers, record, rows filled); the rows of `record` are
+        overwritten."""
 
         def attempt(loop):
             packed, buffers, _ = loop
@@ -84,6 +86,7 @@ class _Recorder:
             accepted = active & (new.num_accepted_steps > state.num_accepted_steps)
             new, held, pushed = held_back(state, new, accepted, pushed, self.numbers, self.program)
             after = new, jnp.where(accepted, state.tnext, last), self.times.after(state, moves, held), pushed
+            # Members of a batch that have finished keep what they have, while the others go on.
             after = unless_waiting(active, after, carry)
             return self.pack(self._taken_apart(*after)), buffers, accepted
 
@@ -91,6 +94,7 @@ class _Recorder:
             packed, buffers, k, record, filled = loop
             before = packed[0]
             packed, buffers, accepted = apart(k < count, attempt, (packed, buffers, jnp.array(False)))
+            # A new chunk is recorded over the last one: only the rows of one chunk are held at a time.
             filled = jnp.where(k % self.program.chunk == 0, 0, filled)
             record = written(record, filled, (before, accepted))
             return packed, buffers, k + 1, record, filled + any_member(accepted).astype(filled.dtype)
@@ -110,6 +114,8 @@ def _(perturbed, numbers, program):
     def advance(loop):
         carry, buffers, chunks, stride, kept, record, _ = loop
 
+        # When all points are in use, every other one is given up and the stride doubles: their number stays bounded
+        # however long the solve is.
         def thin():
             return jax.tree.map(lambda a: a.at[: points // 2].set(a[:points:2]), kept), 2 * stride
 
@@ -135,6 +141,7 @@ def _(residuals, cotangents, perturbed, numbers, program):
     times = StepTimes(perturbed, numbers, program)
     recorder = _Recorder(numbers, program, times)
     reverse = ReverseStep(cotangents, perturbed, numbers, program, times)
+    # In a batch, all members go back over as many rows as the longest solve has.
     chunks, stride, filled = (private("unvmap_max")(v) for v in (chunks, stride, filled))
     blank = jax.tree.map(jnp.zeros_like, numbers["buffers"])  # saved nowhere: dead code
     start = reverse.start(state, moves)
@@ -158,6 +165,7 @@ def _(residuals, cotangents, perturbed, numbers, program):
             return k - 1, apart(k > 0, backwards, packed, read(record, k - 1))
 
         _, packed = lax.while_loop(lambda inner: inner[0] > 0, one, (filled, packed))
+        # The chunk before is taken once more, from the nearest point kept, to fill the record with its rows.
         record, filled = lax.cond(q > 0, again, lambda _, *same: same, q - 1, record, filled)
         return q - 1, record, filled, packed
 

@@ -16,24 +16,35 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from ..aliases import Args, Controller, Solver, State, Terms, Time
 from ..private_names import FROM_CONTROLLER
-from .closure_conversion import Program, any_member
+from .closure_conversion import SolveProgram, any_member
 from .wrapped_control import WrappedControl
 
-# In units of the state and what tolerances make of zero, |y| + atol/rtol:
-PUSH = 0.03  # what rests is pushed by in the second run, whose error is then 33·rtol of it
-MOTION = 0.01  # a component rests that would move by less in all the time
-RESOLVED = 0.1  # of the inverse rate of what rests at the start is the first step at most
-TINY = 1e-6  # of a step are …
-SETTLING = 3  # … those after a push, which is to fulfil what Newton solves at the end of a step
-TRIES = 50  # to find a step that the second run allows; it is given up after as many
+# PUSH and MOTION are parts of a component's scale, |y| + atol/rtol: its size, and what tolerances make of zero.
+# Components at rest are pushed by PUSH in the second run. A push of this size stands for an infinitesimal one; the
+# error of a step, rtol of the scale, is 33·rtol of it, and this is what derivatives are resolved to
+# (test_gradients_at_rest.py::test_beside_each_other).
+PUSH = 0.03
+MOTION = 0.01  # a component rests if its slope would move it by less over the whole run
+# The first step is at most this part of the inverse rate at which slopes answer to a push: it was chosen by what moves,
+# and may be longer than the whole motion of what rests (test_gradients_at_rest.py::test_the_first_step).
+RESOLVED = 0.1
+# The first SETTLING attempts after a push are TINY of a step: Newton's method at their ends puts the pushed state where
+# algebraic equations and constraints hold.
+TINY = 1e-6
+SETTLING = 3
+TRIES = 50  # of finding a step that the second run allows: each shortens it at least by half, fifty of them to rounding
 
 
 class Pushed(eqx.Module):
-    """The second run: where it stands, whether it exists, what was pushed in it and rests still; and how it would go on
-    after the step to take next.
+    """The state of the second run.
 
-    `given_up` is set where no step was short enough for it, so that it limits nothing any more.
+    - `y`, `solver_state`: where it stands; `fresh`: no step has been taken since the last push.
+    - `exists`: whether there is one; `given_up`: no step was short enough for it, so that it limits nothing any more.
+    - `resting`: the components that were pushed and are still at rest in the first run, shape (n,).
+    - `next_y`, `next_state`, `allowed`: where it stands after the step to take next, and how long the step after that
+        may be.
     """
 
     y: Float[Array, " n"]
@@ -47,33 +58,38 @@ class Pushed(eqx.Module):
     allowed: Float[Array, ""]  # how long the step after the next one may be
 
 
-class Step(eqx.Module):
-    """An attempted step from (t0, y0) to t1, where y1 is the state after it: y0 if it was rejected; whether the field
-    jumps there; and the step to take next, from `start` to `end`."""
+class AttemptedStep(eqx.Module):
+    """An attempted step of the first run.
 
-    t0: Any
-    t1: Any
-    y0: Any
-    y1: Any
+    - `t0`, `y0`, `t1`, `y1`: its ends; y1 is y0 if the step was rejected.
+    - `accepted`, `jump`: whether it was accepted, and whether the field jumps at its end.
+    - `start`, `end`: the step to take next.
+    """
+
+    t0: Time
+    t1: Time
+    y0: State
+    y1: State
     accepted: Any
     jump: Any
-    start: Any
-    end: Any
+    start: Time
+    end: Time
 
 
 class Resting(eqx.Module):
-    """What is needed to take a second run along. `restrained` changes the end of the next step."""
+    """The equations, solver and controller of the second run, in which components at rest are pushed a little so that
+    steps resolve their motion. `restrained` changes the end of the next step."""
 
-    terms: Any
-    solver: Any
-    controller: Any
-    args: Any
-    span: Any
+    terms: Terms
+    solver: Solver
+    controller: Controller
+    args: Args
+    span: Time
 
     @staticmethod
-    def of(terms: Any, solver: Any, controller: Any, y: Any, args: Any, span: Any) -> "Resting | None":
-        """None where steps are prescribed or have no error estimate, and for a state that is not one array (beside
-        what events keep)."""
+    def of(terms: Terms, solver: Solver, controller: Controller, y: State, args: Args, span: Time) -> "Resting | None":
+        """Prepares a second run. None where steps are prescribed or have no error estimate, and for a state that is not
+        one array (apart from what events keep beside it)."""
         base = _innermost(controller)
         rtol, x = getattr(base, "rtol", None), _moving(y)
         is_array = isinstance(x, jax.Array) and x.ndim == 1 and x.size > 0
@@ -83,8 +99,8 @@ class Resting(eqx.Module):
             return None
         return Resting(terms, _small(solver, base), base, args, span)
 
-    def begin(self, t: Any, y: Any) -> Pushed:
-        """No second run yet."""
+    def begin(self, t: Time, y: State) -> Pushed:
+        """The initial value of the second run's state: it does not exist yet."""
         resting, y = still((self, y))
         terms, solver, x, _ = resting._between_events(y, y)
         shapes = jax.eval_shape(lambda: solver.init(terms, t, t, x, resting.args))
@@ -92,9 +108,9 @@ class Resting(eqx.Module):
         no, none = jnp.array(False), jnp.zeros(x.shape, bool)
         return Pushed(x, state, no, no, none, no, x, state, jnp.full_like(jnp.asarray(t), jnp.inf))
 
-    def first_end(self, t: Any, end: Any, y: Any) -> Any:
-        """The end of the first step, which was chosen by what moves: a second run begins after a step only. It is not
-        longer than what would resolve rates as large as the slopes after a push."""
+    def first_end(self, t: Time, end: Time, y: State) -> Any:
+        """The end of the first step, made earlier where a component rests. A second run begins after a step only, so
+        the first step must not exceed `RESOLVED` divided by the rate at which slopes answer to a push."""
         resting, t, end, y = still((self, t, end, y))
         terms, solver, x, _ = resting._between_events(y, y)
         slope, scale = solver.func(terms, t, x, resting.args), resting._scale(x)
@@ -105,8 +121,9 @@ class Resting(eqx.Module):
         first = jnp.where(jnp.isfinite(rate), jnp.where(rate > 0, resolved, end), t)
         return jnp.where(jnp.any(rests), jnp.maximum(first, _shortened(t, end)), end)
 
-    def restrained(self, step: Step, pushed: Pushed) -> tuple[Array, Pushed]:
-        """The end of the next step, and the second run where that begins."""
+    def restrained(self, step: AttemptedStep, pushed: Pushed) -> tuple[Array, Pushed]:
+        """Returns (the end of the next step, the second run's state after `step`); begins a second run where a
+        component has come to rest."""
         resting, step, pushed = still((self, step, pushed))
         x0, x1, h = _moving(step.y0), _moving(step.y1), step.t1 - step.t0
         rests = resting._rests((x1 - x0) / jnp.where(h > 0, h, 1.0), x1)
@@ -125,7 +142,7 @@ class Resting(eqx.Module):
         )
 
     def _looked(
-        self, look: Bool[Array, ""], rests: Bool[Array, " n"], step: Step, pushed: Pushed, without: Pushed
+        self, look: Bool[Array, ""], rests: Bool[Array, " n"], step: AttemptedStep, pushed: Pushed, without: Pushed
     ) -> tuple[Array, Pushed]:
         terms, solver, x, changed = self._between_events(step.y0, step.y1)
         on, new = step.accepted & pushed.exists, step.accepted & ~pushed.exists
@@ -144,8 +161,9 @@ class Resting(eqx.Module):
         idle = y, pushed.next_y, pushed.next_state, end, jnp.full_like(end, jnp.inf), ~look, jnp.array(0)
 
         def attempt(found):
-            """With a step up to `end`; and if that was too long, what would do. The first ones from a fresh push are as
-            good as none, and put it where the constraints and algebraic equations hold."""
+            """One try of a step up to `end`; if it is too long, proposes a shorter end. The first tries after a fresh
+            push are not counted as steps: they only put the state where the constraints and algebraic equations
+            hold."""
             y, _, _, end, _, done, tries = found
             settles = fresh & (tries < SETTLING)
             planned, end = end, jnp.where(settles, _shortened(start, end), end)
@@ -156,6 +174,7 @@ class Resting(eqx.Module):
             )
             keep = keep & jnp.all(jnp.isfinite(y1)) & diffrax.is_okay(result)
             shorter = jnp.where(jnp.isfinite(following), jnp.clip(following - start, 0.0, 0.5 * (end - start)), 0.0)
+            # Not less than a tenth: an error that is not finite says nothing about how much shorter would do.
             shorter = jnp.maximum(shorter, 0.1 * (end - start))
             settled = settles & jnp.all(jnp.isfinite(y1))
             keep = keep & ~settles
@@ -176,7 +195,8 @@ class Resting(eqx.Module):
         return jnp.where(exists, end, step.end), after
 
     def _rests(self, slope: Array, x: Array) -> Bool[Array, " n"]:
-        """Which components rest."""
+        """True for components at rest, shape (n,): at this slope they would move by less than `MOTION` of their scale
+        over the whole run."""
         return jnp.abs(slope) * self.span <= MOTION * self._scale(x)
 
     def _scale(self, x: Array) -> Array:
@@ -186,32 +206,32 @@ class Resting(eqx.Module):
     def _tolerances(self, x: Array) -> tuple[Array, Array]:
         return jnp.asarray(self.controller.rtol, x.dtype), jnp.asarray(self.controller.atol, x.dtype)
 
-    def _between_events(self, y0: Any, y1: Any) -> tuple[Any, Any, Any, Any]:
-        """(terms, solver, state) after a step, and whether an event changed them."""
+    def _between_events(self, y0: State, y1: State) -> tuple[Any, Any, Any, Any]:
+        """Returns (terms, solver, state, whether an event changed them) after a step from y0 to y1."""
         if isinstance(y1, jax.Array):
             return self.terms, self.solver, y1, False
         return self.solver.between_events(self.terms, y0, y1)
 
 
 def held_back(
-    state: Any, new: Any, accepted: Bool[Array, ""], pushed: Any, numbers: dict[str, Any], program: Program
+    state: Any, new: Any, accepted: Bool[Array, ""], pushed: Any, numbers: dict[str, Any], program: SolveProgram
 ) -> tuple[Any, Bool[Array, ""], Any]:
-    """Diffrax's state after an attempted step, its next step shortened where y rests; whether it was; and the second
-    run."""
+    """Returns (Diffrax's state `new` with its next step shortened where components rest, whether it was shortened, the
+    second run's state)."""
     if program.rest is None:
         return new, jnp.array(False), pushed
     jump = new.made_jump if program.jumps else False  # some versions of JAX make an array of a constant
-    step = Step(state.tprev, state.tnext, state.y, new.y, accepted, jump, new.tprev, new.tnext)
+    step = AttemptedStep(state.tprev, state.tnext, state.y, new.y, accepted, jump, new.tprev, new.tnext)
     end, pushed = program.rest(numbers["rest"], step, pushed)
     return dataclasses.replace(new, tnext=end), end < new.tnext, pushed
 
 
 class HeldBack(WrappedControl):
-    """The step sizes of another controller, held back where the state rests, as `StoredAdjoint` does by itself: for
-    derivatives by other adjoints."""
+    """Wraps a controller so that it resolves derivatives of components at rest, for adjoints other than
+    `StoredAdjoint`, which does so by itself."""
 
-    terms: Any
-    solver: Any
+    terms: Terms
+    solver: Solver
 
     def wrap(self, direction):
         return HeldBack(self.controller.wrap(direction), self.terms, self.solver)  # pyright: ignore[reportCallIssue]
@@ -222,59 +242,61 @@ class HeldBack(WrappedControl):
         return found
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        """As the other controller's."""
+        """As `controller.init`, with the first step no longer than the second run allows."""
         end, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
         resting = self._resting(y0, args, t1 - t0)
         return _no_later(t0, end, resting.first_end(t0, end, y0)), (state, t1 - t0, resting.begin(t0, y0))
 
     def adapt_step_size(self, t0, t1, y0, y1, args, y_error, error_order, controller_state):
-        """Whether the step is kept, and the next one."""
+        """As `controller.adapt_step_size`, with the next step no longer than the second run allows."""
         state, span, pushed = controller_state
         keep, start, end, jump, state, result = self.controller.adapt_step_size(
             t0, t1, y0, y1, args, y_error, error_order, state
         )
         after = jax.tree.map(lambda a, b: jnp.where(keep, b, a), y0, y1)
-        step = Step(t0, t1, y0, after, keep, jump, start, end)
+        step = AttemptedStep(t0, t1, y0, after, keep, jump, start, end)
         allowed, pushed = self._resting(y0, args, span).restrained(step, pushed)
         return keep, start, _no_later(start, end, allowed), jump, (state, span, pushed), result
 
 
 def _pattern(x: Array) -> Array:
-    """Of what size, and to which side, each component is pushed: no symmetric motion, and none that stays."""
+    """The relative size (0.5 to 1.5) and sign of the push to each component, shape (n,). It is irregular, so that the
+    motion it excites is neither symmetric nor a new state of rest."""
     k = jnp.arange(x.size, dtype=x.dtype)
     return jnp.where(jnp.sin(12.9898 * k + 1.0) > 0, 1.0, -1.0) * (1.0 + 0.5 * jnp.sin(78.233 * k))
 
 
-def _no_later(start: Any, end: Any, allowed: Any) -> Any:
-    """The end of a step, which moves with the times that it follows from; or what is allowed, as a length."""
+def _no_later(start: Time, end: Time, allowed: Time) -> Any:
+    """The end of a step, no later than `allowed`. An end taken from `allowed` moves with `start` under differentiation:
+    the length of the step is constant."""
     return jnp.where(allowed < end, start + still(allowed - start), end)
 
 
-def _shortened(start: Any, end: Any) -> Any:
-    """The end of a step that is as good as none, but moves time."""
+def _shortened(start: Time, end: Time) -> Any:
+    """The end of a step so short that it changes nothing, but long enough to advance time."""
     shortest = 16 * jnp.finfo(start.dtype).eps * jnp.abs(start)
     return jnp.minimum(end, start + jnp.maximum(TINY * (end - start), shortest))
 
 
 def still(tree: Any) -> Any:
-    """The same, not differentiated."""
+    """The tree with all arrays constant under differentiation."""
     return jax.tree.map(lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, tree)
 
 
-def _moving(y: Any) -> Any:
-    """The state: y, or `y.x` where events keep more beside it."""
+def _moving(y: State) -> Any:
+    """The array that is integrated: y itself, or `y.x` of a state with events."""
     return y if isinstance(y, jax.Array) else getattr(y, "x", y)
 
 
-def _inner(solver: Any) -> Any:
+def _inner(solver: Solver) -> Any:
     while isinstance(solver, diffrax.AbstractWrappedSolver):
         solver = solver.solver
     return solver
 
 
-def _small(solver: Any, controller: Any) -> Any:
-    """The solver, its stages in a loop if it can: what is rarely run shall compile fast. Where its iterations have the
-    controller's tolerances, these are filled in, as Diffrax does before a run."""
+def _small(solver: Solver, controller: Controller) -> Any:
+    """A copy of the solver that compiles quickly: stages in a loop where supported, and Newton tolerances taken from
+    the controller (as `diffeqsolve` does)."""
     if isinstance(solver, diffrax.AbstractWrappedSolver):
         return dataclasses.replace(solver, solver=_small(solver.solver, controller))
     if hasattr(solver, "looped"):
@@ -287,7 +309,7 @@ def _small(solver: Any, controller: Any) -> Any:
     return solver
 
 
-def _innermost(controller: Any) -> Any:
+def _innermost(controller: Controller) -> Any:
     while hasattr(controller, "controller"):
         controller = controller.controller
     return controller

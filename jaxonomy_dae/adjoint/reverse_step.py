@@ -9,14 +9,15 @@ import jax.numpy as jnp
 from jax import lax
 
 from ..private_names import private
-from .closure_conversion import Program, any_member, inexact, read, unless_waiting
+from .closure_conversion import SolveProgram, any_member, inexact, read, unless_waiting
 from .step_times import StepTimes
 
 
 class ReverseStep:
-    """The carry of the reverse loop holds the cotangents gathered so far, and where in the saved rows it stands."""
+    """Takes the derivative of one accepted step after another, backwards. Its carry holds the cotangents gathered so
+    far and the position in the saved rows."""
 
-    def __init__(self, cotangents: Any, perturbed: Any, numbers: Any, program: Program, times: StepTimes):
+    def __init__(self, cotangents: Any, perturbed: Any, numbers: Any, program: SolveProgram, times: StepTimes):
         self.numbers, self.program, self.times = numbers, program, times
         self.state_cotangent, self.saved = cotangents
         self.timed = times.count > 0
@@ -38,7 +39,7 @@ class ReverseStep:
         self.saved = [_full(ct, like) for ct, like in zip(self.saved, numbers["buffers"], strict=True)]
 
     def start(self, state: Any, moves: Any) -> dict[str, Any]:
-        """The carry at the end of the solve."""
+        """The carry of the reverse loop at the end of the solve."""
         given = self.state_cotangent
         seeds = jnp.zeros((self.times.count,), state.tprev.dtype)
         if self.timed:
@@ -60,7 +61,8 @@ class ReverseStep:
         )
 
     def step(self, carry: dict[str, Any], row: dict[str, Any], kept: Any) -> dict[str, Any]:
-        """Over one row of the record."""
+        """Pulls the carry back over one row of the record; `kept` is true for members of a batch that accepted this
+        step."""
         before = dict(carry)
         moving, still = eqx.partition(row["solver_state"], eqx.is_inexact_array)
         ends = (row["tprev"], row["tnext"])
@@ -77,6 +79,7 @@ class ReverseStep:
             return y1, inexact(state1), dense if dense_wanted else ()
 
         consts = self.consts["step"][0]
+        # Where no time is differentiated, the ends of the step are constants, and their cotangents are not compiled.
         if self.timed:
             (y1, _, dense), pull = jax.vjp(forward, row["y"], moving, ends, consts)
         else:
@@ -100,7 +103,7 @@ class ReverseStep:
         return unless_waiting(kept, carry, before)
 
     def _saved_step(self, carry, i, kept, y1):
-        """The state saved at the end of the step."""
+        """Pulls back the cotangents of the values saved at the end of the step."""
         here = kept & (carry["accepted"] % self.program.every[i] == 0)
         at = carry["row"][i] - 1
         t, move = carry["after"]
@@ -120,7 +123,7 @@ class ReverseStep:
         return carry
 
     def _saved_times(self, carry, i, row, kept, dense, fixed, dense_ct, ends_ct):
-        """What was saved at times within the step, the last one first."""
+        """Pulls back the cotangents of all values saved at times within the step, the last one first."""
         ts, (consts, others) = self.numbers["ts"][i], self.consts["save_ts"][i]
 
         def inside(index):
@@ -159,7 +162,7 @@ class ReverseStep:
         return carry, dense_ct, ends_ct
 
     def finish(self, carry: dict[str, Any]) -> dict[str, Any]:
-        """The cotangents of `numbers`."""
+        """The cotangents of `numbers`, from the carry at the start of the solve."""
         out = jax.tree.map(lambda _: None, inexact(self.numbers))
         (tprev, tnext, controller_state), (t1, controller) = self.times.split(carry["seeds"])
         state = dataclasses.replace(
@@ -178,7 +181,7 @@ class ReverseStep:
 
 
 def state_saves(state: Any) -> list[Any]:
-    """The parts of Diffrax's state that belong to the parts of `SaveAt`."""
+    """The `SaveState`s in Diffrax's state, one for each part of `SaveAt`."""
     kind = private("SaveState")
 
     def is_save(node):
@@ -188,7 +191,7 @@ def state_saves(state: Any) -> list[Any]:
 
 
 def _full(cotangent, like):
-    """Cotangents with zeros where there are none."""
+    """The cotangent with zeros in place of None, in the shapes of `like`."""
 
     def one(c, v):
         return jnp.zeros(v.shape, v.dtype) if c is None and v is not None else c

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ..private_names import clip_floor, private
-from .closure_conversion import Program, inexact
+from .closure_conversion import SolveProgram, inexact
 
 
 class StepTimes:
@@ -19,7 +19,7 @@ class StepTimes:
     controller's own times, as far as they are differentiated. Mostly there are none.
     """
 
-    def __init__(self, perturbed: dict[str, Any], numbers: dict[str, Any], program: Program):
+    def __init__(self, perturbed: dict[str, Any], numbers: dict[str, Any], program: SolveProgram):
         self.numbers, self.program = numbers, program
         clock = _clock(numbers)
         self.leaves, self.structure = jax.tree.flatten(inexact(clock))
@@ -39,7 +39,7 @@ class StepTimes:
         return jax.tree.unflatten(self.structure, out)
 
     def split(self, total: Float[Array, " seeds"]) -> PyTree:
-        """The seeds' cotangents where they belong, None elsewhere."""
+        """The cotangents of the seeds in the structure of `_clock`; None for leaves that are not differentiated."""
         out, row = [], 0
         for wanted, leaf in zip(self.wanted, self.leaves, strict=True):
             out.append(total[row : row + leaf.size].reshape(leaf.shape).astype(leaf.dtype) if wanted else None)
@@ -53,8 +53,8 @@ class StepTimes:
     def after(
         self, state: Any, moves: PyTree[Float[Array, "seeds ..."]], held: Bool[Array, ""]
     ) -> PyTree[Float[Array, "seeds ..."]]:
-        """The same after the step that a state is about to attempt; the next step keeps its length if it is held
-        back."""
+        """The tangents `moves` of (start, end, controller state), advanced over the step that `state` is about to
+        attempt. Where `held`, a flag, is set, the end of the next step moves with its start: it keeps its length."""
         if not self.count:
             return ()
         program, numbers = self.program, self.numbers
@@ -70,6 +70,7 @@ class StepTimes:
             keep, tprev, tnext, _, after, _ = program.adapt(
                 numbers["adapt"], controller, tprev, tnext, state.y, y1, error, eqx.combine(controlled, fixed)
             )
+            # As Diffrax' loop does after the controller.
             tprev = jnp.minimum(tprev, t1)
             return tprev, private("clip_to_end")(tprev, tnext, t1, floor, keep), inexact(after)
 
@@ -80,7 +81,7 @@ class StepTimes:
 
 
 def _clock(tree: dict[str, Any]) -> Any:
-    """What the ends of steps depend on."""
+    """The quantities on which the ends of steps depend: (start, end, controller state), and (t1, controller)."""
     state = tree["state"]
     moving = state.tprev, state.tnext, state.controller_state[0]
     return moving, (tree["t1"], tree["controller"])

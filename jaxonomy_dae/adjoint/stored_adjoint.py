@@ -10,14 +10,17 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from ..aliases import Terms
 from ..private_names import has_stored_adjoint, private
-from .closure_conversion import Program, closure_convert, unless_waiting
+from .closure_conversion import SolveProgram, closure_convert, unless_waiting
 from .recorded_loop import solve
-from .resting import Resting, Step
+from .resting import AttemptedStep, Resting
 from .reverse_step import state_saves
 
-LARGEST_RECORD = 2**25  # bytes; above, storing steps is no longer cheap
-ROOMY_RECORD = 2**20  # bytes of a record that may have more rows than are needed
+LARGEST_RECORD = 2**25  # bytes; a solve whose record would be larger is left to `RecursiveCheckpointAdjoint`
+# Bytes of a record that may have more than 64 rows: with 256 rows, states of up to 4 kB. Most solves then fit into the
+# record, and no step is taken twice.
+ROOMY_RECORD = 2**20
 
 
 class StoredAdjoint(diffrax.AbstractAdjoint):
@@ -62,6 +65,7 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
         too_large = size * (chunk + points) > LARGEST_RECORD
         if given["event"] is not None or saveat.dense or _is_random(terms) or too_large:
             return diffrax.RecursiveCheckpointAdjoint().loop(**given)
+        # Diffrax' inner loop does not take these.
         for name in ("throw", "passed_solver_state", "passed_controller_state"):
             del given[name]
 
@@ -98,7 +102,7 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
             start = _without_buffers(start)
             flag = jnp.array(True)
             converted, consts = closure_convert(body, start, buffers, flag, flag)
-            program = Program(
+            program = SolveProgram(
                 **functions, body=converted, max_steps=max_steps, chunk=chunk, points=points,
             )  # fmt: skip
             final, buffers = solve(numbers | dict(state=start, buffers=buffers, body=consts), program)
@@ -123,8 +127,8 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
         return final_state, stats
 
 
-def _is_random(terms: Any) -> bool:
-    """Whether Brownian motion drives the solve."""
+def _is_random(terms: Terms) -> bool:
+    """True if Brownian motion drives the solve."""
 
     def is_brownian(node: Any) -> bool:
         return isinstance(node, diffrax.AbstractBrownianPath)
@@ -133,8 +137,8 @@ def _is_random(terms: Any) -> bool:
 
 
 def _table(max_steps: int | None, size: int) -> tuple[int, int]:
-    """(rows of the record, points kept) for states of `size` bytes: with steps for eight times their product, pieces
-    are run again 4.5 times. Small states have more rows, so that most solves need no second run."""
+    """Returns (rows of the record, points kept) for states of `size` bytes. With steps for eight times their product,
+    pieces are run again 4.5 times. Small states have more rows, so that most solves need no second run."""
     chunk = min(max(ROOMY_RECORD // max(size, 1), 64), 256)
     if max_steps is not None:
         chunk = max(chunk, math.isqrt(max_steps // 4))
@@ -142,7 +146,7 @@ def _table(max_steps: int | None, size: int) -> tuple[int, int]:
 
 
 def _inner_loop(cond_fun, body_fun, start, *, max_steps, buffers, checkpoints):
-    """Saving at times within a step."""
+    """The loop that saves at times within a step, not differentiated by itself."""
     del checkpoints
     return private("while_loop")(cond_fun, body_fun, start, max_steps=max_steps, buffers=buffers, kind="lax")
 
@@ -150,7 +154,7 @@ def _inner_loop(cond_fun, body_fun, start, *, max_steps, buffers, checkpoints):
 def _functions(
     *, args, terms, solver, stepsize_controller, saveat, t1, init_state, **_
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The functions of `Program` but for its body, and the arrays they close over."""
+    """Returns (the functions of `SolveProgram` except its body, the arrays they close over)."""
     s = init_state
     controller, others = eqx.partition(stepsize_controller, eqx.is_inexact_array)
     order = solver.error_order(terms)
@@ -170,6 +174,7 @@ def _functions(
 
     made_jump = s.made_jump
     step, adapted = convert_both(made_jump)
+    # A controller that may report jumps makes `made_jump` an array: both functions are converted for that.
     if made_jump is False and adapted[0].out_struct[3] is not False:
         made_jump = jnp.array(False)
         step, adapted = convert_both(made_jump)
@@ -191,7 +196,7 @@ def _functions(
     resting, first = Resting.of(terms, solver, stepsize_controller, s.y, args, t1 - s.tprev), s.tnext
     if resting is not None:
         pushed, first = resting.begin(s.tprev, s.y), resting.first_end(s.tprev, s.tnext, s.y)
-        tried = Step(s.tprev, s.tnext, s.y, s.y, jnp.array(False), made_jump, s.tprev, s.tnext)
+        tried = AttemptedStep(s.tprev, s.tnext, s.y, s.y, jnp.array(False), made_jump, s.tprev, s.tnext)
         rest = closure_convert(lambda *given: resting.restrained(*given), tried, pushed)
     functions = dict(
         rest=rest[0], step=step[0], adapt=adapted[0], jumps=made_jump is not False,
@@ -208,7 +213,7 @@ def _functions(
 
 
 class _Solver:
-    """What Diffrax's loop asks of a solver."""
+    """The part of a solver's interface that Diffrax's loop calls."""
 
     def __init__(self, step, consts, solver, terms):
         self.function, self.consts, self.interpolation_cls = step, consts, solver.interpolation_cls
@@ -222,7 +227,8 @@ class _Solver:
 
 
 class _Controller:
-    """What Diffrax's loop asks of a controller, but no step is accepted where a member of a batch waits."""
+    """The part of a controller's interface that Diffrax's loop calls. No step is accepted for a member of a batch that
+    waits."""
 
     def __init__(self, adapt, consts, controller):
         self.function, self.consts, self.controller = adapt, consts, controller

@@ -1,14 +1,14 @@
 """What controllers that change another one's step sizes have in common."""
 
-from typing import Any
-
 import diffrax
+
+from ..aliases import Controller
 
 
 class WrappedControl(diffrax.AbstractAdaptiveStepSizeController):
-    """A step-size controller around another, whose tolerances and norm solvers see."""
+    """A step-size controller around another one. Solvers see the tolerances and norm of the inner controller."""
 
-    controller: Any
+    controller: Controller
 
     @property
     def rtol(self):  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -23,13 +23,21 @@ from ..model.declared import declared_scale, quantity_bounds
 from ..programs.cache import compiled
 from ..system.system import AcausalSystem
 
-PASSES = 4  # of equilibration
-SINGULAR = 1e2  # in units of eps and of the number of unknowns: a singular value that is rounding
+PASSES = 4  # of equilibration: the first one takes scales away, the others balance
+# A singular value below SINGULAR·n·eps of the largest one is rounding. n·eps alone is the usual measure for a matrix
+# with exact entries (NumPy's matrix_rank).
+SINGULAR = 1e2
 
 
 class Equilibrium(NamedTuple):
-    """What the search found: `x` of shape (n_state,), the residual of each row and the largest that counts as rounding,
-    the rows' Jacobian with respect to the unknowns, their sizes, and whether all rows hold."""
+    """The result of the search for an equilibrium.
+
+    - `x`: the state array, shape (n_state,).
+    - `residual`, `limit`: the residual of each row, and the largest one that counts as rounding.
+    - `jacobian`: the rows' derivatives with respect to the unknowns, shape (rows, unknowns).
+    - `unit`: the sizes of the unknowns, shape (unknowns,).
+    - `holds`: True if all rows hold.
+    """
 
     x: Float[Array, " n"]
     residual: Float[Array, " m"]
@@ -78,6 +86,7 @@ def find_equilibrium(system: AcausalSystem, t: Any, x0: Any, inputs: Any, drifti
     typical = jax.lax.stop_gradient(system.typical_sizes[entries])
     zero = jnp.zeros((m,), x0.dtype)
     sizes = Sizes(nominal, jnp.maximum(jnp.abs(start), nominal), zero, zero)
+    # With more rows than unknowns there is no square system for the homotopy to follow.
     core = np.arange(m) if m == len(free) else None
     bounds = quantity_bounds(plan.model)[entries]
     found = find_root(lambda w: residual(w, *frozen), m, start, sizes, core, None, bounds, typical, magnitude)
@@ -99,8 +108,8 @@ compiled_search = compiled(find_equilibrium)
 
 
 def open_directions(found: Equilibrium) -> tuple[Float[Array, " k"], Float[Array, "k k"]]:
-    """Singular values of the Jacobian in its own units, relative to the largest, and the directions that belong to
-    them, as rows: unknowns in units of their scales. Not differentiated."""
+    """Returns (singular values of the Jacobian in its own units, relative to the largest; the right singular vectors,
+    as rows, in units of the unknowns' scales). Not differentiated."""
     m, k = found.jacobian.shape
     matrix = jax.lax.stop_gradient(found.jacobian * found.unit[None, :])
     for sweep in range(PASSES):  # the first one takes scales of rows and columns away, the others balance (Ruiz 2001)
@@ -114,5 +123,5 @@ def open_directions(found: Equilibrium) -> tuple[Float[Array, " k"], Float[Array
 
 
 def is_open(values: Float[Array, " k"]) -> Bool[Array, " k"]:
-    """Which of the directions nothing determines."""
+    """True for directions that nothing determines: their singular values are zero up to rounding."""
     return values <= SINGULAR * values.shape[0] * float(jnp.finfo(values.dtype).eps)

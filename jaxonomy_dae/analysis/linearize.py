@@ -106,8 +106,8 @@ def _reduced(
     system: AcausalSystem, parts: Any, x: Any, u: Any, coordinates: Coordinates, names: tuple[str, ...],
     outputs: tuple[str, ...],
 ) -> StateSpace:  # fmt: skip
-    """The state space on the tangent of the constraints: ∂h/∂d·δd + ∂h/∂q·δq = 0 gives the dependent states d from the
-    coordinates q. Inputs that hidden constraints contain are differentiated, and have been refused."""
+    """The state space on the tangent of the constraints: dependent states d follow from coordinates q by ∂h/∂d·δd +
+    ∂h/∂q·δq = 0. Inputs that hidden constraints contain would be differentiated; they have been refused before."""
     (slopes, _, y), ((f_x, f_u), (h_x, _), (y_x, y_u)) = parts
     kept, dependent, rows = coordinates
     states = tuple(system.states[k] for k in kept)
@@ -120,7 +120,8 @@ def _reduced(
 
 
 def _coordinates(system: AcausalSystem, jacobians: Any, wanted: Sequence[str] | None) -> Coordinates:
-    """Which states are coordinates: those asked for, or a choice by the values of the constraints' Jacobian."""
+    """Chooses the states that serve as coordinates on the hidden constraints: those in `wanted`, else by the values of
+    the constraints' Jacobian at the point."""
     n, c = len(system.states), system.plan.n_constraints
     h_x = jacobians[1][0]
     if not c:

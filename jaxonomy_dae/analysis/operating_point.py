@@ -15,7 +15,7 @@ from ..programs.cache import compiled
 from ..programs.staging import is_staged
 from ..system.system import AcausalSystem
 
-SHOWN = 8
+SHOWN = 8  # states in the text of a point
 
 
 class OperatingPoint(eqx.Module):

@@ -13,7 +13,7 @@ from jaxtyping import Array, Complex, Float
 from ..diagnosis.wording import counted
 from ..errors import ModelError
 from ..optional import optional_module
-from .frequency import FrequencyResponse
+from .response import FrequencyResponse
 
 SHOWN = 6  # rows and columns of matrices that are printed
 
@@ -69,8 +69,8 @@ class StateSpace(eqx.Module):
         return FrequencyResponse(omega, jax.vmap(at)(omega), self.inputs, self.outputs)
 
     def to_control(self) -> Any:
-        """The same as a `control.StateSpace` of python-control (extra `control`), names included; its signals are the
-        deviations from `x0`, `u0` and `y0`. Dots in names become underscores, since python-control joins names by
+        """This system as a `control.StateSpace` of python-control (extra `control`), names included; its signals are
+        the deviations from `x0`, `u0` and `y0`. Dots in names become underscores, since python-control joins names by
         dots.
 
         **Raises:**

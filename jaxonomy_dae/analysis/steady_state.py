@@ -19,7 +19,7 @@ from ..system.system import AcausalSystem
 from .equilibrium import Equilibrium, compiled_search, find_equilibrium, is_open, open_directions, unknowns
 from .operating_point import OperatingPoint
 
-WORST = 4
+WORST = 4  # equations, or directions, that an error names
 IN_DIRECTION = 0.1  # of its largest entry: what else belongs to a direction that nothing determines
 
 
@@ -114,7 +114,7 @@ def point_of(
 
 
 def is_traced(tree: Any) -> bool:
-    """Whether values cannot be looked at."""
+    """True if a leaf is a tracer, whose value cannot be read."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 

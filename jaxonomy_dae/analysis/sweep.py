@@ -43,7 +43,7 @@ class Sweep(eqx.Module):
         return sizes[:1] if self.zipped else sizes
 
     def __getitem__(self, key: Any) -> Any:
-        """What the function returned, by its keys: `sweep["c.v"]`."""
+        """The array that the function returned under `key`: `sweep["c.v"]`."""
         return self.values[key]
 
     def to_xarray(self) -> Any:
@@ -161,7 +161,8 @@ def _mapped(function: Any, system: AcausalSystem, names: tuple[str, ...], rows: 
 
 
 def _raise_first(function: Any, system: AcausalSystem, columns: dict[str, Any], rows: tuple[Any, ...], results: Any):
-    """Raises what the function says of the first row that has a not-a-number, if it says anything."""
+    """Runs the function by itself for the first row that contains NaN, so that it raises its error; adds which row it
+    was."""
     arrays = [leaf for leaf in jax.tree.leaves((results, rows)) if eqx.is_inexact_array(leaf)]
     if any(isinstance(leaf, Tracer) for leaf in (*arrays, *jax.tree.leaves(system))):
         return
@@ -187,7 +188,7 @@ def _named(parameters: Any) -> Mapping[str, Any]:
 
 
 def _values(system: AcausalSystem, name: str, given: Any) -> Any:
-    """The values of one parameter, or of an array of them, within their bounds."""
+    """Checks the values of one parameter, or of an array of them, against their bounds."""
     table = system.parameters.table
     entries = table.entries(name)
     shape = () if entries is None else entries.shape

@@ -10,11 +10,12 @@ import numpy as np
 from jaxtyping import Float
 
 ALIKE = 0.5  # of the largest pivot: what counts as equally good, so that rounding decides nothing
-SINGULAR = 1e-10  # a pivot, relative to the first, that is rounding
+SINGULAR = 1e-10  # a pivot, relative to the first one, that counts as rounding: the constraint repeats others
 
 
 class Coordinates(NamedTuple):
-    """The states that are coordinates, those that follow from them, and the constraints that say how."""
+    """A choice of coordinates on the constraints: the states kept, the states that follow from them, and the
+    constraints that determine these."""
 
     kept: np.ndarray
     dependent: np.ndarray
@@ -34,6 +35,7 @@ def choose_coordinates(jacobian: Float[np.ndarray, "c n"]) -> Coordinates:
         if largest <= SINGULAR:
             break
         alike = np.argwhere(size >= ALIKE * largest)
+        # The last column, and in it the first row: a choice that rounding does not change.
         row, column = alike[np.lexsort((alike[:, 0], -alike[:, 1]))[0]]
         rows.append(int(row))
         columns.append(int(column))

@@ -19,7 +19,7 @@ LARGEST = 32  # intersections, above which a node counts as always needed
 
 
 def is_partial(node: Node) -> bool:
-    """Whether the node or its derivatives are infinite, or not a number, for some arguments."""
+    """True if the node, or one of its derivatives, can be infinite or NaN for some finite arguments."""
     if node.operation == "product":
         return any(not isinstance(e, int) or e < 0 for e in node.data)
     if node.operation == "power":
@@ -49,20 +49,22 @@ def needed_where(roots: Sequence[Node]) -> dict[Node, Needed]:
 
 
 def within(needed: Needed, literal: Literal) -> Needed:
-    """What is needed there, where a condition holds, or does not, as well."""
+    """Restricts `needed` to the case that `literal` (condition, truth) holds: each intersection gets it added, and
+    those that contain its opposite are dropped."""
     opposite = (literal[0], not literal[1])
     return frozenset(parts | {literal} for parts in needed if opposite not in parts)
 
 
 def union(a: Needed, b: Needed) -> Needed:
-    """What is needed in either case."""
+    """The union of two sets of intersections, shortened where both are non-empty."""
     if a is b or not b:
         return a
     return _shortened(a | b) if a else b
 
 
 def _shortened(needed: Needed) -> Needed:
-    """The same union with fewer intersections: c ∧ p or ¬c ∧ p is p, and p or p ∧ q is p."""
+    """Removes redundant intersections from a union: (c ∧ p) ∨ (¬c ∧ p) becomes p, and p ∨ (p ∧ q) becomes p. A union of
+    more than `LARGEST` intersections becomes `ALWAYS`."""
     parts = set(needed)
     changed = True
     while changed and len(parts) > 1:

@@ -98,7 +98,7 @@ def _product(exponents: Sequence[Any], value: Any, bases: list[Any], errors: lis
 
 
 def _times(slope: Any, error: Any) -> Any:
-    """slope·error, where what is exact stays so whatever the slope."""
+    """slope·error, which is zero for an exact value (error 0) even if the slope is infinite."""
     return np.where(error == 0.0, 0.0, slope * error)
 
 

@@ -31,7 +31,7 @@ from .without_overflow import logarithm, logarithm_of_one_plus, product, raised
 
 
 class UnsupportedExpression(Exception):
-    """What an expression contains that cannot be evaluated: a sentence."""
+    """An expression contains a part that cannot be evaluated. The message is a sentence that names it."""
 
 
 def atoms_of(expression: Any) -> set:
@@ -85,7 +85,7 @@ def read(expression: Any, label: Callable[[Any], Hashable], marks: bool = False)
 
 
 def parts_of(e: Any) -> Sequence[Any]:
-    """The expressions that a SymPy expression is made of.
+    """The expressions from which a SymPy expression is computed.
 
     **Raises:**
 

@@ -82,6 +82,8 @@ class Kernel:
         for k, function, arguments, guard, safe in self._operations(backend):
             inside = [found[a] for a in arguments]
             if guard is not None:
+                # Arguments of a function that is not needed here are replaced by safe ones, so that neither it nor its
+                # derivatives are infinite: zero times infinity would be left of it in gradients.
                 active = is_active(found, guard)
                 inside = [
                     v if s is None or isinstance(v, float) else xp.where(active, v, s)
@@ -100,7 +102,8 @@ def _sorted(needed: Any) -> list:
 
 
 def is_active(found: list[Any], guard: list) -> Any:
-    """Whether a node is needed, given the values of all nodes: a union of intersections; of none if it never is."""
+    """True if a node is needed, given the values `found` of all nodes. `guard` is a union of intersections of literals
+    (node number, truth); an empty one means that the node is never needed."""
     total: Any = np.bool_(False)
     for part in guard:
         inside: Any = None
@@ -189,7 +192,8 @@ def _sum(start: Any, coefficients: Sequence[Any]) -> _Operation:
 
 
 def _is_nought(value: Any) -> bool:
-    """Whether a value is the number zero when a program is traced: an unknown whose share is taken out."""
+    """True if a value is the Python number 0.0 when a program is traced: an unknown whose share in the sum is left
+    out."""
     return isinstance(value, float) and bool(value == 0.0)
 
 

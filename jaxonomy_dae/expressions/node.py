@@ -65,7 +65,7 @@ def make(operation: str, arguments: tuple[Node, ...] = (), data: Any = None) -> 
 
 
 def _restored(rows: tuple) -> Node:
-    """The last of nodes listed as (operation, positions of arguments, data)."""
+    """Rebuilds a pickled node, the last of `rows` = (operation, positions of arguments, data)."""
     nodes: list[Node] = []
     for operation, positions, data in rows:
         nodes.append(make(operation, tuple(nodes[k] for k in positions), data))
@@ -269,7 +269,8 @@ def compare(operation: str, a: Node, b: Node) -> Node:
 
 
 def postorder(roots: Iterable[Node], before: Callable[[Node], Iterable[Node]] = lambda n: n.arguments) -> list[Node]:
-    """All nodes below the roots, each after those that `before` names."""
+    """All nodes reachable from the roots, each once, after the nodes that `before` returns for it (by default its
+    arguments)."""
     seen: set[Node] = set()
     out: list[Node] = []
     for root in roots:

@@ -8,7 +8,7 @@ from .node import Node, make, number
 
 
 class Smooth(sympy.Function):
-    """Equals its argument."""
+    """A SymPy function that equals its argument; it marks the argument as smooth."""
 
     nargs = 1
 
@@ -28,5 +28,5 @@ class Smooth(sympy.Function):
 
 
 def marked(u: Node) -> Node:
-    """The node of an expression that is marked."""
+    """The node with a mark of smoothness."""
     return u if number(u) is not None or u.operation in ("leaf", "smooth") else make("smooth", (u,))

@@ -2,11 +2,11 @@
 
 from .node import Node, constant, multiply, power, scale, split
 
-MOST = 64  # terms that a product is multiplied out to
+MOST = 64  # terms that a product is multiplied out to: their number is a product of the factors' numbers of terms
 
 
 def terms(node: Node) -> list[Node]:
-    """Nodes whose sum is the node. What functions have inside is not looked at."""
+    """Nodes whose sum is `node`. Arguments of functions are not taken apart."""
     factor, rest = split(node)
     if rest.operation == "sum":
         start, factors = rest.data

@@ -12,24 +12,28 @@ from .problem import HybridState
 from .term import bound
 
 ENDED: Any = diffrax.RESULTS.event_occurred  # Diffrax asks the controller last, so that it must say so
-GROWTH = 1e3  # of the step after one that an event made short
+# By how much the step after one that an event made short may be longer than it, up to the length that was planned
+# before. Controllers allow a factor of 8 to 10 a step, and would need several steps to get there after each event.
+# Set by hand: test_hybrid_runs.py and test_event_map.py pass with ten times it and a tenth.
+GROWTH = 1e3
 
 
 class EventControl(WrappedControl):
-    """The step sizes of another controller, but steps end at events: one in which an event was found is tried again up
-    to there, and none goes beyond the next tick of a clock."""
+    """Wraps a controller so that steps end at events: a step in which an event was found is retried up to it, and no
+    step goes beyond the next tick of a clock."""
 
     def wrap(self, direction):
         return EventControl(self.controller.wrap(direction))  # pyright: ignore[reportCallIssue]
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        """The end of the first step; and the state of the controller, with how long a step would have been that an
-        event made shorter."""
+        """Returns (the end of the first step, (the wrapped controller's state, the length that a step shortened by an
+        event would have had: infinity, for none has been yet))."""
         end, state = self.controller.init(bound(terms, y0.q), t0, t1, y0.x, dt0, args, func, error_order)
         return jnp.minimum(end, _due(y0)), (state, jnp.full_like(jnp.asarray(t0), jnp.inf))
 
     def adapt_step_size(self, t0, t1, y0, y1, args, y_error, error_order, controller_state):
-        """Whether the step is kept, and the next one."""
+        """Accepts or rejects the step and proposes the next one; see `diffrax.AbstractStepSizeController`. A step in
+        which an event was found early is rejected and retried up to it, and steps end where a clock ticks."""
         inner, wished = controller_state
         keep, start, end, jump, new, result = self.controller.adapt_step_size(
             t0, t1, y0.x, y1.x, args, y_error, error_order, inner
@@ -49,6 +53,7 @@ class EventControl(WrappedControl):
         wished = jnp.where(cut & ~early, h, wished)
         end = jnp.where(cut, due, end)
         result = diffrax.RESULTS.where(kept & (y1.ended > 0), ENDED, result)
+        # A step that is retried for an event leaves the wrapped controller as it was.
         new = jax.tree.map(lambda a, b: jnp.where(early, b, a), new, inner)
         return kept, start, end, jump, (new, lax.stop_gradient(wished)), result
 

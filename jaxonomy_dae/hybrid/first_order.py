@@ -11,7 +11,7 @@ from ..errors import ModelError
 
 
 def constant_once(tree: Any) -> Any:
-    """The same, a constant for first derivatives; whoever differentiates these again is told that they cannot.
+    """The tree with its inexact arrays constant under a first derivative. A second derivative raises an error.
 
     The map of an event takes slopes as constants. Its first derivative is exact, its second one is not.
     """
@@ -31,7 +31,7 @@ def _(primals, tangents):
 
 @jax.custom_jvp
 def differentiable_once(value):
-    """The same array, with its first derivatives; whoever differentiates these again is told that they cannot."""
+    """Returns the array. Its first derivative is taken as usual; a second derivative raises an error."""
     return value
 
 

@@ -10,14 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from ..aliases import Args, Time
 from .event_map import SLIDES, TURNS
 from .first_order import differentiable_once
 from .problem import AbstractHybridProblem, HybridState
 from .side import ABOVE, BELOW, RESTS, rounding
 
 
-def turned(problem: AbstractHybridProblem, t: Any, state: HybridState, values: Any, due: Any, args: Any) -> HybridState:
-    """The state after the events that are `due`, at guards with these values: clocks tick, relations have turned.
+def turned(
+    problem: AbstractHybridProblem, t: Time, state: HybridState, values: Any, due: Any, args: Args
+) -> HybridState:
+    """The state after the events that are `due`, given the guards' `values`: clocks have ticked and relations have
+    turned.
 
     The guard of a relation falls, and the one of its opposite is armed: it rises, or rests at zero.
     """

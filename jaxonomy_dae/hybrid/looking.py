@@ -10,23 +10,31 @@ from jax import lax
 
 from ..adjoint.closure_conversion import any_member
 from ..adjoint.resting import still
+from ..aliases import Args, State, Time
 from .event_map import AHEAD, CLOSE, Arrival
 from .problem import AbstractHybridProblem, HybridState
 from .search import first_crossing
 from .side import ABOVE, BELOW, RESTS, rounding
 
-WINDOW = 1e-6  # of a step: a guard that reaches zero so close to its end counts as having done so
+# Part of a step: a guard that would reach zero so soon after its end counts as having reached it. A step that is
+# retried up to a crossing has other errors than the step in which the crossing was located, so that it ends a little
+# off. Set by hand: test_hybrid_runs.py and test_event_map.py pass with ten times it and a tenth.
+WINDOW = 1e-6
 # Where guards are looked at, as parts of a step; and how far, as a part of its size, a guard may be from the parabola
 # through its values at the first, the middle and the last of these. One that bends more may cross zero unseen, and the
-# step is taken in halves.
+# step is taken in halves. With ten times BEND, test_hybrid_runs.py::test_guards_faster_than_the_states fails; a tenth
+# passes.
 LOOKS = np.array([0.0, 0.13, 0.31, 0.5, 0.67, 0.86, 1.0])
 FITTED = [0, 3, 6]
 BEND = 0.1
-FORGOTTEN = 0.8  # what a step leaves of how long steps have been: next to events they are short
+# Steps next to events are short, and what counts as "at the same time" is measured by how long steps have been of late:
+# each step leaves this part of that length.
+FORGOTTEN = 0.8
 
 
 def _off_parabola() -> np.ndarray:
-    """The distances of the values at LOOKS from the parabola through the first, the middle and the last."""
+    """A matrix, shape (looks − 3, looks): the distances of values at LOOKS from the parabola through the first, the
+    middle and the last of them."""
     others = [k for k in range(len(LOOKS)) if k not in FITTED]
     out = np.eye(len(LOOKS))[others]
     out[:, FITTED] = -np.vander(LOOKS[others], 3) @ np.linalg.inv(np.vander(LOOKS[FITTED], 3))
@@ -41,17 +49,18 @@ _RATE_AT_END = np.append(_DIVIDED, -_DIVIDED.sum())
 
 
 def _between(place: Any, values: Any) -> Any:
-    """The polynomial through the values at LOOKS, at another place."""
+    """Evaluates the polynomial through `values` at LOOKS, shape (looks, guards), at `place`, a fraction of the step."""
     weights = jnp.asarray(_WEIGHTS, values.dtype) / (place - jnp.asarray(LOOKS, values.dtype))
     return weights @ values / jnp.sum(weights)
 
 
 class Met(NamedTuple):
-    """What a step meets, not differentiated.
+    """The result of looking for events in a step, not differentiated.
 
-    - `request`: the end of the step to take instead, or infinity.
-    - `armed`: on which side guards are at its end, shape (guards,); `values`: and what they are there.
-    - `arrival`: what happens there.
+    - `request`: the end of the shorter step to take instead; infinity to keep this one.
+    - `armed`: the side of zero on which each guard is at the end of the step, shape (guards,); `values`: their values
+        there.
+    - `arrival`: the events due at the end of the step.
     """
 
     request: Any
@@ -61,10 +70,10 @@ class Met(NamedTuple):
 
 
 def looked_at(
-    problem: AbstractHybridProblem, dense: Callable[[Any, Any, Any], Any], t0: Any, t1: Any, y0: HybridState, x1: Any,
-    args: Any,
+    problem: AbstractHybridProblem, dense: Callable[[Time, Time, Time], State], t0: Time, t1: Time, y0: HybridState,
+    x1: State, args: Args,
 ) -> Met:  # fmt: skip
-    """What a step from y0 to x1 meets, of which `dense(t0, t1, t)` are the states.
+    """Looks for events in the step from y0 to x1, whose states are `dense(t0, t1, t)`.
 
     Where equations go on with the same values, at kinks, time may be known less well than where states jump: guards
     between the places where they are looked at are on the polynomial through their values there, and so is their rate
@@ -74,6 +83,7 @@ def looked_at(
     h, q, g = t1 - t0, y0.q, problem.n_guards
     span = jnp.maximum(h, FORGOTTEN * y0.span)
     window = jnp.maximum(WINDOW * span, problem.resolution)
+    # The controller lets steps end at ticks, up to rounding.
     ticking = y0.due <= t1 + 0.25 * problem.resolution
 
     never, none, zero = jnp.full_like(t1, jnp.inf), jnp.zeros((g,), bool), jnp.zeros_like(x1)
@@ -106,7 +116,8 @@ def looked_at(
 
 
 def _met(problem, dense, t0, t1, y0: HybridState, x1, args, times, values, off, clocks: Met) -> Met:
-    """What a step meets, given guards at the places where they are looked at, and what it meets of clocks alone."""
+    """Looks for events in a step, given the guards' `values` at `times`, shape (looks, guards), `off`, their distance
+    from a parabola, shape (guards,), and the result `clocks` for sampled events alone."""
     h, q, g, arrival = t1 - t0, y0.q, problem.n_guards, clocks.arrival
     span, window, ticking = arrival.span, arrival.window, arrival.due[: problem.n_clocks]
     size = jnp.max(jnp.abs(values), axis=0)
@@ -130,6 +141,7 @@ def _met(problem, dense, t0, t1, y0: HybridState, x1, args, times, values, off, 
         before = problem.slope(t1, x1, q, args)
         return before, reaches_zero(problem.rates(t1, x1, q, args, before)[1])
 
+    # A step that cannot be parted any further: its parts would not be told from its ends.
     short = h <= 4 * problem.resolution
     if problem.only_kinks:
         before, near = jnp.zeros_like(x1), reaches_zero(jnp.asarray(_RATE_AT_END, values.dtype) @ values / h)
@@ -159,6 +171,7 @@ def _met(problem, dense, t0, t1, y0: HybridState, x1, args, times, values, off, 
         )
 
     where = lax.cond(any_member(inside), located, lambda: t1)
+    # A retried step must be long enough for time to go on.
     where = jnp.maximum(where, t0 + 2 * problem.resolution)
     dip = jnp.where(long, _dip(values, armed, jnp.any(crossed, axis=0), 2 * off - band), jnp.inf)
     request = jnp.minimum(jnp.where(inside, where, jnp.inf), t0 + dip * h)
@@ -170,9 +183,9 @@ def _met(problem, dense, t0, t1, y0: HybridState, x1, args, times, values, off, 
 
 
 def _dip(values, armed, crossed, doubt):
-    """Where, as a part of the step, a guard that is positive wherever it was looked at is lowest by the parabola
-    through its values at the ends and in the middle, if it may be negative there; or infinity. The step is taken up to
-    there, and so on until what the parabola leaves in `doubt` is decided."""
+    """The place (a fraction of the step) where a guard that is positive at all looks has the minimum of the parabola
+    through its values at both ends and in the middle, if that minimum is below `doubt`; infinity otherwise. The caller
+    ends the step there and looks again, until the minimum is decided."""
     left, middle, right = values[jnp.array(FITTED)]
     bend = 2 * (left - 2 * middle + right)
     slope = 4 * middle - 3 * left - right

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from ..aliases import Args, State, Time
 from .first_order import constant_once
 
 
@@ -36,59 +37,64 @@ class AbstractHybridProblem(eqx.Module):
 
     @abc.abstractmethod
     def term(self, q: Float[Array, " q"]) -> diffrax.AbstractTerm:
-        """The term while the discrete values are q."""
+        """The term of the equations that hold with the discrete values q."""
 
     @abc.abstractmethod
     def prepared(self, solver: diffrax.AbstractSolver, q: Float[Array, " q"]) -> diffrax.AbstractSolver:
-        """The solver for that term."""
+        """The solver, prepared for the equations that hold with the discrete values q."""
 
     @abc.abstractmethod
-    def field(self, t: Any, x: Float[Array, " n"], q: Float[Array, " q"], args: Any) -> Float[Array, " n"]:
+    def field(self, t: Time, x: Float[Array, " n"], q: Float[Array, " q"], args: Args) -> Float[Array, " n"]:
         """dx/dt."""
 
     @abc.abstractmethod
-    def guards(self, t: Any, x: Float[Array, " n"], q: Float[Array, " q"], args: Any) -> Float[Array, " guards"]:
+    def guards(self, t: Time, x: Float[Array, " n"], q: Float[Array, " q"], args: Args) -> Float[Array, " guards"]:
         """The guards' values."""
 
     @abc.abstractmethod
     def written(
-        self, t: Any, x: Float[Array, " n"], q: Float[Array, " q"], previous: Float[Array, " q"], event: Any, args: Any
+        self,
+        t: Time,
+        x: Float[Array, " n"],
+        q: Float[Array, " q"],
+        previous: Float[Array, " q"],
+        event: Any,
+        args: Args,
     ) -> tuple[Float[Array, " n"], Float[Array, " q"]]:
         """(x, q) after an event, consistent; `previous` are the discrete values before the instant."""
 
     @abc.abstractmethod
     def settled(
-        self, t: Any, x: Float[Array, " n"], q: Float[Array, " q"], events: Bool[Array, " events"], args: Any
+        self, t: Time, x: Float[Array, " n"], q: Float[Array, " q"], events: Bool[Array, " events"], args: Args
     ) -> Float[Array, " q"]:
-        """q after several events that assign discrete values, each by what was before all of them."""
+        """q after several events that assign discrete values. Each reads the values from before all of them."""
 
     @abc.abstractmethod
     def clocks(self) -> tuple[Float[Array, " clocks"], Float[Array, " clocks"]]:
-        """Periods and offsets of the sampled events; of one that happens once, the period is infinite."""
+        """Periods and offsets of the sampled events; the period is infinite for one that happens once."""
 
     def due(self, ticks: Float[Array, " clocks"]) -> Float[Array, " clocks"]:
-        """When each sampled event happens next, after so many ticks."""
+        """The time of the next tick of each clock, given the number of ticks so far."""
         period, offset = self.clocks()
         ticks = lax.stop_gradient(ticks)
         return offset + jnp.where(ticks == 0, 0.0, ticks * period)
 
-    def slope(self, t: Any, x: Any, q: Any, args: Any) -> Float[Array, " n"]:
-        """dx/dt, a constant of first derivatives."""
+    def slope(self, t: Time, x: State, q: Any, args: Args) -> Float[Array, " n"]:
+        """dx/dt, constant under a first derivative."""
         frozen, *point = constant_once((self, t, x, q, args))
         return frozen.field(*point)
 
     def rates(
-        self, t: Any, x: Any, q: Any, args: Any, slope: Any
+        self, t: Time, x: State, q: Any, args: Args, slope: Any
     ) -> tuple[Float[Array, " guards"], Float[Array, " guards"]]:
-        """The guards' values, and how fast they change where x does with this slope: constants of first
-        derivatives."""
+        """Returns (the guards' values, their rates of change along `slope`), both constant under a first derivative."""
         frozen, t, x, q, args = constant_once((self, t, x, q, args))
         return jax.jvp(lambda t, x: frozen.guards(t, x, q, args), (t, x), (jnp.ones_like(t), slope))
 
 
 class HybridState(eqx.Module):
-    """What is integrated: the state `x`, the discrete values `q`, and the bookkeeping of events, in few arrays: what
-    carries a state from step to step is written for each.
+    """The state that is integrated: the continuous state `x`, the discrete values `q`, and the bookkeeping of events.
+    The latter is packed into few arrays: XLA compiles the passing on of the state from step to step for each array.
 
     - `armed`: on which side of zero the guards are: `side.ABOVE`, `side.RESTS` or `side.BELOW`; `size`: how large they
         have been so far.
@@ -111,12 +117,12 @@ class HybridState(eqx.Module):
     sides: Float[Array, "2 rows m"]
 
     @classmethod
-    def of(cls, x: Any, q: Any, **parts: Any) -> "HybridState":
+    def of(cls, x: State, q: Any, **parts: Any) -> "HybridState":
         """A state of all its parts."""
         return cls(x, q, *(jnp.stack([parts[name] for name in names]) for names in _PARTS.values()))
 
     def but(self, **changes: Any) -> "HybridState":
-        """The same with other parts."""
+        """A copy with the named parts replaced."""
         whole = {name: changes.pop(name) for name in ("x", "q") if name in changes}
         for field, names in _PARTS.items():
             if not changes.keys().isdisjoint(names):
@@ -125,8 +131,8 @@ class HybridState(eqx.Module):
         assert not changes
         return dataclasses.replace(self, **whole)
 
-    def noted(self, row: Any, time: Any, event: Any, rate: Any, before: Any, after: Any) -> "HybridState":
-        """The same with an event in a row of the log; nothing is if there is no such row."""
+    def noted(self, row: Any, time: Time, event: Any, rate: Any, before: Any, after: Any) -> "HybridState":
+        """A copy with an event written to column `row` of the log; unchanged if there is no such column."""
         log, sides = self.log, self.sides
         if log.shape[1]:
             column = jnp.stack([time, event.astype(time.dtype), lax.stop_gradient(rate)])

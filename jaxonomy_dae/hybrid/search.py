@@ -6,7 +6,9 @@ from typing import Any
 import jax.numpy as jnp
 from jax import lax
 
+# Were every iteration a bisection, 44 would shorten the bracket to 1e-13 of it, below which the search ends.
 ITERATIONS = 48
+# Regula falsi creeps where a guard meets zero flatly: bisection now and then bounds the number of iterations.
 BISECT_EVERY = 6
 
 
@@ -33,8 +35,11 @@ def first_crossing(
 
     def body(carry):
         low, high, at_low, at_high, side, last, _, k = carry
+        # Strictly inside the bracket, so that each evaluation makes it shorter.
         width = high - low
         t = jnp.clip(estimate(low, high, at_low, at_high), low + 1e-13 * width, high - 1e-13 * width)
+        # Behind the last event the guard is nearly zero at `low`, and interpolation would stay there: bisection takes
+        # 15 evaluations instead of 37.
         begins_at_zero = (low == start) & jnp.any(falling & (at_high <= 0) & (at_low <= 1e-6 * jnp.abs(at_high)))
         ends_at_zero = jnp.any(falling & (at_high == 0))
         t = jnp.where((k % BISECT_EVERY == BISECT_EVERY - 1) | begins_at_zero | ends_at_zero, 0.5 * (low + high), t)

@@ -17,14 +17,14 @@ from typing import Any
 
 import jax.numpy as jnp
 
-ABOVE, RESTS, BELOW = 1.0, 0.5, 0.0
+ABOVE, RESTS, BELOW = 1.0, 0.5, 0.0  # numbers, to be part of the integrated state; what is positive is armed
 
 # Of the largest value that a guard has had, in spacings of floating-point numbers: the half-width of the band. Rounding
 # errors of a guard in the states, and of the states themselves, add up to some hundreds of them in the models of the
-# tests.
+# tests. With a tenth, test_hybrid_runs.py::test_nothing_falls_through_a_floor fails; ten times it passes.
 BAND = 4096.0
 
 
 def rounding(size: Any) -> Any:
-    """How far from zero a guard of this size is by rounding alone."""
+    """The distance from zero that rounding alone can give a guard of this size."""
     return BAND * jnp.finfo(size.dtype).eps * size

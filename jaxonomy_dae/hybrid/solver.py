@@ -9,13 +9,14 @@ import jax.numpy as jnp
 from jax import lax
 
 from ..adjoint.closure_conversion import any_member
+from ..aliases import Time
 from .event_map import handle
 from .kinks import turned
 from .looking import looked_at
 from .problem import HybridState
 from .term import bound, problem_of
 
-MOVED = 1e3  # times the resolution: a step so long goes on
+MOVED = 1e3  # times the resolution: with a longer step time has gone on, and turns at one instant are counted anew
 
 TOO_MANY: Any = diffrax.RESULTS.max_steps_rejected  # events
 STUCK: Any = diffrax.RESULTS.stagnation  # an event happens again and again at one instant
@@ -23,16 +24,17 @@ NOT_FINITE: Any = diffrax.RESULTS.nonlinear_divergence  # what an event wrote
 
 
 class HybridInterpolation(diffrax.AbstractLocalInterpolation):
-    """Within a step, x of the inner solver's dense output; at its end, what events made of it."""
+    """Dense output of a step: x by the inner solver's dense output within the step, by the state after the events at
+    its end."""
 
-    t0: Any
-    t1: Any
+    t0: Time
+    t1: Time
     inner: Any
     y0: HybridState
     y1: HybridState
     fired: Any
     slope: Any
-    resolution: Any
+    resolution: Time
 
     def evaluate(self, t0, t1=None, left=True):
         if t1 is not None:
@@ -44,18 +46,18 @@ class HybridInterpolation(diffrax.AbstractLocalInterpolation):
         return self.y1.but(x=x, q=jnp.where(at_end, self.y1.q, self.y0.q))
 
 
-class _Dense(eqx.Module):
+class _DenseOutput(eqx.Module):
     """The inner solver's dense output."""
 
     interpolation: Any = eqx.field(static=True)
     info: Any
 
-    def __call__(self, t0: Any, t1: Any, t: Any) -> Any:
+    def __call__(self, t0: Time, t1: Time, t: Time) -> Any:
         return self.interpolation(t0=t0, t1=t1, **self.info).evaluate(t)
 
 
 class WithEvents(diffrax.AbstractWrappedSolver):
-    """Takes the steps of a solver, and ends one where an event happens.
+    """Wraps a solver so that steps end where an event happens.
 
     - `solver`: the problem prepares it for the discrete values at hand.
     - `max_events`: more of them end the run with `TOO_MANY`.
@@ -73,17 +75,17 @@ class WithEvents(diffrax.AbstractWrappedSolver):
 
     @property
     def scan_kind(self):
-        """How the wrapped solver loops over its stages."""
+        """The wrapped solver's kind of loop over its stages (`diffrax.AbstractRungeKutta.scan_kind`)."""
         return self.solver.scan_kind  # pyright: ignore[reportAttributeAccessIssue]
 
     @property
     def root_finder(self):
-        """How the wrapped solver finds roots."""
+        """The wrapped solver's root finder; Diffrax reads it to fill in tolerances."""
         return self.solver.root_finder  # pyright: ignore[reportAttributeAccessIssue]
 
     @property
     def root_find_max_steps(self):
-        """How long the wrapped solver looks for roots."""
+        """The wrapped solver's limit on the iterations of its root finder."""
         return self.solver.root_find_max_steps  # pyright: ignore[reportAttributeAccessIssue]
 
     def order(self, terms):
@@ -101,7 +103,7 @@ class WithEvents(diffrax.AbstractWrappedSolver):
         return self.solver.func(terms, t0, y0, args)
 
     def between_events(self, terms, y0, y1):
-        """(terms, solver, state) after a step from y0 to y1, and whether an event at its end changed them."""
+        """Returns (terms, solver, state, whether an event at its end changed them) after a step from y0 to y1."""
         solver = problem_of(terms).prepared(self.solver, y1.q)
         return bound(terms, y1.q), solver, y1.x, jnp.any(y0.q != y1.q)
 
@@ -117,7 +119,7 @@ class WithEvents(diffrax.AbstractWrappedSolver):
         x1, y_error, info, inner_state, result = solver.step(
             bound(terms, y0.q), t0, t1, y0.x, args, inner_state, made_jump
         )
-        dense = _Dense(solver.interpolation_cls, info)
+        dense = _DenseOutput(solver.interpolation_cls, info)
         request, armed, values, arrival = looked_at(problem, dense, t0, t1, y0, x1, args)
         turns = jnp.where(t1 - t0 > MOVED * problem.resolution, jnp.zeros_like(y0.turns), y0.turns)
         state = y0.but(x=x1, armed=armed, size=arrival.size, span=arrival.span, request=request, turns=turns)
@@ -130,6 +132,7 @@ class WithEvents(diffrax.AbstractWrappedSolver):
             y1, slope = turned(problem, t1, state, values, arrival.due, args), jnp.zeros_like(x1)
         else:
             y1, slope = lax.cond(any_member(fired), events, lambda state: (state, jnp.zeros_like(x1)), state)
+            # The branch is taken if any member of a batch has an event; the others keep their states.
             y1 = jax.tree.map(lambda a, b: jnp.where(fired, a, b), y1, state)
         dense_info = dict(inner=dense, y0=y0, y1=y1, fired=fired, slope=slope, resolution=problem.resolution)
         finite = jnp.all(jnp.isfinite(y1.x)) & jnp.all(jnp.isfinite(y1.q))

@@ -7,15 +7,16 @@ import numpy as np
 from jax import lax
 
 from ..adjoint.resting import still
+from ..aliases import Args, State, Time
 from .event_map import Arrival, handle
 from .problem import AbstractHybridProblem, HybridState
 from .side import ABOVE, BELOW, RESTS
 
-ROUNDS = 4  # relations within relations
+ROUNDS = 4  # each settles relations that depend on those settled before: a relation within a relation takes two
 
 
 def start(
-    problem: AbstractHybridProblem, t0: Any, x0: Any, q0: Any, args: Any, logged: int, sides: bool
+    problem: AbstractHybridProblem, t0: Time, x0: State, q0: Any, args: Args, logged: int, sides: bool
 ) -> HybridState:
     """The state at the initial time, after the clocks that tick there, and after the events that are immediate.
 
@@ -54,13 +55,16 @@ def start(
 
 
 def _holds(value: Any, rate: Any) -> Any:
-    """Which conditions hold. One at zero is as it will be at once."""
+    """True for conditions that hold at the start. A guard at zero is judged by its rate: the condition holds if the
+    guard is falling."""
     return jnp.where(value == 0, rate < 0, value < 0)
 
 
-def _settled(problem: AbstractHybridProblem, t0: Any, x0: Any, q0: Any, due: Any, args: Any) -> tuple[Any, Any, Any]:
-    """(q, how fast guards change, the guards) at the initial time, when all relations are what their sides say, or, if
-    their clocks are `due`, what these write. They do not move with parameters."""
+def _settled(
+    problem: AbstractHybridProblem, t0: Time, x0: State, q0: Any, due: Any, args: Args
+) -> tuple[Any, Any, Any]:
+    """Settles the relations at the initial time: each gets the truth of its sides, or, if its clock is `due`, what that
+    writes. Returns (q, rates of the guards, values of the guards); q does not move with parameters."""
     c, g = problem.n_clocks, problem.n_guards
     relations = np.array(problem.relations, bool)
     given = still((problem, t0, x0, q0, due, args))
@@ -76,7 +80,7 @@ def _settled(problem: AbstractHybridProblem, t0: Any, x0: Any, q0: Any, due: Any
         return problem.rates(t0, x0, q, args, problem.slope(t0, x0, q, args))
 
     def once(k: Any, carry: Any) -> Any:
-        """Relations as they were found before, and what guards are with them."""
+        """One round: relations are set by the guards of the round before, and the guards are evaluated again."""
         q, rate, value = carry
         q = jnp.where(k > 0, written(q, jnp.zeros((c,), bool), _holds(value, rate)), q)
         value, rate = looked_at(q)

@@ -4,30 +4,33 @@ from typing import Any
 
 import diffrax
 
+from ..aliases import Args, Terms, Time
 from ..private_names import rewrapped, unwrapped
 from .problem import AbstractHybridProblem, HybridState
 
 
 class HybridTerm(diffrax.AbstractTerm):
-    """Stands for the equations; a solver asks it for those that hold while the discrete values are q."""
+    """The term of a problem with events. It takes no steps itself: `bound` gives the term for the discrete values at
+    hand."""
 
     problem: AbstractHybridProblem
 
-    def vf(self, t: Any, y: HybridState, args: Any) -> Any:
+    def vf(self, t: Time, y: HybridState, args: Args) -> Any:
         return self.problem.field(t, y.x, y.q, args)
 
-    def contr(self, t0: Any, t1: Any, **kwargs: Any) -> Any:
+    def contr(self, t0: Time, t1: Time, **kwargs: Any) -> Any:
         return t1 - t0
 
     def prod(self, vf: Any, control: Any) -> Any:
         raise NotImplementedError("a solver for events takes steps by the term of the discrete values at hand")
 
 
-def problem_of(terms: Any) -> AbstractHybridProblem:
-    """The problem in the terms that Diffrax hands to a solver or a controller: it wraps a term in its direction."""
+def problem_of(terms: Terms) -> AbstractHybridProblem:
+    """The problem inside the terms that Diffrax hands to a solver or a controller, which may be wrapped in a direction
+    of time."""
     return unwrapped(terms)[0].problem
 
 
-def bound(terms: Any, q: Any) -> Any:
-    """The terms while the discrete values are q."""
+def bound(terms: Terms, q: Any) -> Any:
+    """The terms of the equations that hold with the discrete values q."""
     return rewrapped(terms, problem_of(terms).term(q))

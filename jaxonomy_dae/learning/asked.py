@@ -68,7 +68,7 @@ def check_start(system: AcausalSystem, trained: Sequence[str], name: str, is_unk
 
 
 def penalties(system: AcausalSystem, modules: Sequence[str], given: Any) -> dict[str, Any]:
-    """How the weights of each module that is trained are regularized: "evidence", a precision, or None."""
+    """The regularization of each trained module's weights: "evidence", a precision, or None."""
     if not isinstance(given, Mapping):
         given = {name: given for name in modules if name in system.neural}
     for name, value in given.items():

@@ -36,7 +36,7 @@ class Band:
 
     @property
     def inside(self) -> np.ndarray:
-        """Which grid points lie within what was explored, shape `(n,)`."""
+        """True for grid points within the explored region, shape `(n,)`."""
         points = self.grid.reshape(len(self.grid), -1)
         return np.all((points >= self.explored[:, 0]) & (points <= self.explored[:, 1]), axis=1)
 
@@ -82,7 +82,7 @@ def _first_output(network: Any, u: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class _FirstOutput:
-    """Of a network as the equations call it."""
+    """The law of a network's first output, called as the equations call the network."""
 
     opaque: OpaqueFunction
 

@@ -43,7 +43,7 @@ class Blocks:
 
     @property
     def local(self) -> Float[np.ndarray, "e r q"]:
-        """What common numbers do to the rows of each segment alone, nodes held."""
+        """The derivatives of each segment's rows by the common numbers, with nodes held."""
         data = np.array(self.by_common)
         data[:, 0] += self.by_node[:, 0] @ self.first
         e, q = len(data), data.shape[-1]
@@ -59,14 +59,14 @@ class Blocks:
 
 
 class Eliminated(NamedTuple):
-    """What is left of the rows when all nodes are eliminated, and how these follow."""
+    """The rows that are left when all nodes are eliminated, and the rows from which the nodes follow."""
 
     rows: Float[np.ndarray, "e r q"]
     residual: Float[np.ndarray, "e r"]
     kept: list[Float[np.ndarray, "e d _"]]  # rows [δₖ | δₖ₊₁ | π | residual] for nodes 1, 2, …
 
     def nodes(self, common: Float[np.ndarray, "e q"]) -> Float[np.ndarray, "e M d"]:
-        """The moves of the nodes but the first that belong to π."""
+        """The moves of all nodes but the first that follow from moves `common` of the numbers π, shape (e, q)."""
         experiments, q = common.shape
         moves: list[np.ndarray] = []
         for rows in reversed(self.kept):

@@ -60,7 +60,7 @@ def _with_time(row: list[str], opaque: OpaqueFunction) -> tuple[str, ...]:
 
 
 def inputs_seen(estimate: "Estimate", block: Block) -> Float[np.ndarray, "n inputs"]:
-    """What the block was given in the experiments that were fitted, at their sample times."""
+    """The inputs of a block in the experiments that were fitted, at their sample times."""
     found = []
     for k in np.flatnonzero(estimate.objective.counted):
         solution = estimate.problem.run(estimate.objective, estimate.point, int(k))

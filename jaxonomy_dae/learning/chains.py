@@ -58,7 +58,8 @@ def chain(
 
 
 def begin(program: Program, posed: Posed, rng: np.random.Generator) -> tuple[Float[Array, " u"], Any, Any]:
-    """Where a chain begins, with ln p and its gradient: drawn around the centre, wider than the linearized density."""
+    """The start of a chain, drawn around the centre, wider than the linearized density. Returns (point, ln p, its
+    gradient)."""
     u = APART * rng.standard_normal(len(posed.centre))
     for _ in range(HALVINGS):
         point = jnp.asarray(u, posed.centre.dtype)

@@ -30,7 +30,7 @@ class ClosedForm(AbstractReplacement):
         return jnp.asarray(total)
 
     def chosen(self) -> "ClosedForm":
-        """The same law without the terms that are absent."""
+        """A copy without the terms that are absent."""
         kept = np.flatnonzero(np.asarray(self.present))
         return ClosedForm(self.coefficients[kept], self.present[kept], tuple(self.terms[k] for k in kept))
 

@@ -27,7 +27,7 @@ from .program import Layout
 
 @dataclasses.dataclass(frozen=True)
 class Coordinates:
-    """What each coordinate is, by position; `p` of them.
+    """The `p` coordinates of a search, described by position.
 
     `start`, `low` and `high` are natural values; `z` in signatures is on the scale of the coordinates.
     """
@@ -89,15 +89,15 @@ class Coordinates:
         return np.where(self.log, self.natural(z), self.size)
 
     def split(self, natural: Float[np.ndarray, " p"]) -> tuple[np.ndarray, np.ndarray]:
-        """What all experiments share, and what each has to itself, shape (experiments, own)."""
+        """Returns (the values that all experiments share, those of each experiment's own, shape (experiments, own))."""
         return natural[: self.n_shared], natural[self.n_shared :].reshape(self.experiments, self.n_own)
 
     def members(self, name: str) -> Bool[np.ndarray, " p"]:
-        """Which coordinates a name stands for: its own, or all of a group."""
+        """True for the coordinates that a name stands for: the one of this name, or all of a group, shape (p,)."""
         return np.array([name in (own, group) for own, group in zip(self.names, self.group, strict=True)], bool)
 
     def changed(self, values: dict[str, Any], fixed: bool) -> "Coordinates":
-        """Other starts by names, which stay `fixed` or are only where the search begins."""
+        """A copy with other starts, by name. They stay `fixed`, or are only where the search begins."""
         start, held = np.array(self.start), np.array(self.fixed)
         for name, value in values.items():
             chosen = self._known(name)
@@ -177,8 +177,8 @@ def coordinates(
 
 
 def is_positive(interval: Interval) -> bool:
-    """Whether all values are above zero, so that they can be on a logarithmic scale. Zero itself, where it is
-    admissible, is infinitely far away on it."""
+    """True if all values are above zero, so that a logarithmic scale can be used. Zero itself, where it is admissible,
+    is infinitely far away on it."""
     return interval.low > 0 or (interval.low == 0 and interval.open_low)
 
 

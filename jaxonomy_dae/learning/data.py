@@ -70,7 +70,7 @@ class Stacked:
     counts: tuple[int, ...]  # of times
 
     def until(self, share: float) -> "Stacked":
-        """The same shapes, with this share of each experiment's time."""
+        """A copy of the same shapes in which only this share of each experiment's time counts."""
         if share >= 1:
             return self
         ends = self.t0 + share * (self.times[:, -1] - self.t0)

@@ -64,7 +64,7 @@ class Posed(eqx.Module):
 
 
 class Program(NamedTuple):
-    """What a program is built from."""
+    """The static and dynamic parts from which the density's program is built."""
 
     system: Any
     observers: dict[str, Any]

@@ -24,7 +24,7 @@ OFFSET = 1e-3  # of the confidence region's radius, what may be left to go (Bate
 
 @dataclasses.dataclass(frozen=True)
 class Minimum:
-    """Where a descent ended."""
+    """The end of a descent."""
 
     z: Float[np.ndarray, " p"]
     found: Evaluation
@@ -50,7 +50,7 @@ class Reached(NamedTuple):
 
 
 class AbstractMerit(abc.ABC):
-    """What is descended on."""
+    """The function that a descent decreases."""
 
     @abc.abstractmethod
     def evaluate(self, z: Float[np.ndarray, " p"]) -> Evaluation | None:
@@ -74,7 +74,8 @@ class AbstractMerit(abc.ABC):
 
     @abc.abstractmethod
     def next_weights(self, here: Weights, better: Weights) -> Weights:
-        """Those for the next step: `here` are those at its point, and `better` those that were found with this step."""
+        """The weights for the next step: `here` are those at the current point, `better` those found with the last
+        step."""
 
     def shortened(self, step: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
         """A step, no longer than the linearization goes."""

@@ -105,7 +105,7 @@ class Known:
 
 
 def known_of(source: "Problem | Estimate", names: Any, alone: bool) -> Known:
-    """What a problem knows at its nominal values, or an estimate at its own."""
+    """The information of a problem at its nominal values, or of an estimate at its own."""
     if isinstance(source, Estimate):
         problem, objective = source.problem, source.objective
         weights, found, z = source.minimum.weights, source.minimum.found, source.minimum.z
@@ -150,7 +150,7 @@ def next_experiment(
     count: int = 1,
     alone: bool = False,
 ) -> Advice:
-    """Which of some experiments would tell most about what is estimated.
+    """Chooses, among some experiments, those that would tell most about what is estimated.
 
     ```python
     plans = [learning.Planned(ts, {"pend.x": 1e-3}, initial={"pend.initial_theta": a}) for a in (-1.2, 0.0, 0.5)]
@@ -254,7 +254,7 @@ def _objective(known: Known, layout: Layout, stacked: Stacked) -> Objective:
 
 
 def _columns(known: Known, layout: Layout) -> np.ndarray:
-    """Where the shared numbers of a layout stand among those at hand."""
+    """The places of a layout's shared numbers among those of the estimate at hand."""
     base, c = known.objective.layout, known.objective.coordinates
     plain = c.n_shared - len(base.shared)
     return np.array([*range(plain), *(plain + base.shared.index(name) for name in layout.shared)], int)
@@ -265,7 +265,7 @@ def _is_known(stacked: Stacked, name: str, k: int) -> bool:
 
 
 def _start_scales(stacked: Stacked, layout: Layout) -> np.ndarray:
-    """What each own start is unsure of: its spread, or its own size; shape (candidates, own)."""
+    """The uncertainty of each own start before any data: its spread, or its own size; shape (candidates, own)."""
 
     def scale(given: Any) -> float:
         if isinstance(given, float):
@@ -277,7 +277,7 @@ def _start_scales(stacked: Stacked, layout: Layout) -> np.ndarray:
 
 
 def _without(information: Float[np.ndarray, "p p"], count: int) -> Float[np.ndarray, "s s"]:
-    """What is said of the first coordinates, whatever the others are (a Schur complement)."""
+    """The information on the first `count` coordinates with the others unknown (a Schur complement)."""
     first, cross, rest = information[:count, :count], information[:count, count:], information[count:, count:]
     if not len(rest):
         return first

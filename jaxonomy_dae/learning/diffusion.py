@@ -44,8 +44,8 @@ def linear_flow(
 def affine_flow(
     a: Float[Array, "f f"], first: Float[Array, " f"], rate: Float[Array, " f"], g: Float[Array, "f f"], h: Any
 ) -> tuple[Float[Array, " f"], Float[Array, "f f"], Float[Array, "f f"]]:
-    """What δ' = A δ + `first` + s·`rate` leads to from zero in a time h, with exp(A h) and the noise gathered: the
-    exponential of the matrix of (δ, 1, s)."""
+    """Integrates δ' = A δ + `first` + s·`rate` from zero over a time h, by the exponential of the matrix of (δ, 1, s).
+    Returns (δ, exp(A h), the covariance of the noise gathered)."""
     f = len(a)
     columns = jnp.concatenate([a, first[:, None], rate[:, None]], axis=1)
     big = jnp.zeros((f + 2, f + 2), a.dtype).at[:f].set(columns).at[f + 1, f].set(1.0)

@@ -164,7 +164,7 @@ def _rounded(expression: Any) -> Any:
 def discover(
     estimate: "Estimate", name: str, library: Any, width: int, most: int
 ) -> Discovery:  # fmt: skip
-    """As `Estimate.discover`."""
+    """Implements `Estimate.discover`."""
     where = f"discover('{name}')"
     modules = [n for n in estimate.objective.layout.modules if n in estimate.system.neural]
     if name not in modules:
@@ -259,7 +259,7 @@ def _values_and_features(
 
 
 def _labels(name: str, positions: Any) -> list[str]:
-    """What coordinates call the coefficients."""
+    """The names of the coefficients' coordinates."""
     return [f"{name}.coefficients[{k}]" for k in positions]
 
 

@@ -155,7 +155,7 @@ def _with(system: AcausalSystem, networks: dict[str, Any]) -> AcausalSystem:
 
 
 def _drawn(network: Any, rng: np.random.Generator) -> Any:
-    """The same network with other weights, each array normal and of the size that it has."""
+    """A copy of the network with random weights, each array normal and of the size that it has."""
     arrays, rest = eqx.partition(network, eqx.is_inexact_array)
 
     def other(leaf: Any) -> Any:

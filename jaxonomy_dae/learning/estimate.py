@@ -120,12 +120,13 @@ class Estimate:
 
     @property
     def covariance(self) -> Float[np.ndarray, "p p"]:
-        """Of all coordinates, on their scale (`objective.coordinates.log` says which are logarithms)."""
+        """The covariance of all coordinates, on their scale (`objective.coordinates.log` says which are logarithms),
+        shape (p, p)."""
         return self.root @ self.root.T
 
     @property
     def correlation(self) -> Float[np.ndarray, "p p"]:
-        """Of all coordinates; zero for those that cannot move."""
+        """The correlations of all coordinates, shape (p, p); zero for those that cannot move."""
         spread = np.linalg.norm(self.root, axis=1)
         scale = np.where(spread > 0, spread, 1.0)
         return self.covariance / np.outer(scale, scale)
@@ -140,7 +141,7 @@ class Estimate:
 
     @property
     def jacobian(self) -> Float[np.ndarray, "m f"]:
-        """Of the residuals in units of the noise, by the coordinates that were searched."""
+        """The derivatives of the residuals, in units of the noise, by the coordinates that were searched."""
         return self.minimum.weights.row[:, None] * self.minimum.found.jacobian
 
     @property
@@ -170,7 +171,7 @@ class Estimate:
 
     @property
     def effective(self) -> dict[str, float]:
-        """How many weights of each network the data determine."""
+        """The number of weights of each network that the data determine."""
         c, out = self.objective.coordinates, {}
         precision = np.zeros(len(c))
         precision[self.objective.free] = self.minimum.weights.precision
@@ -182,11 +183,12 @@ class Estimate:
 
     @property
     def whiteness(self) -> dict[str, dict[str, Whiteness]]:
-        """Whether residuals look like noise, by experiment and name. Where they do not, intervals are too narrow."""
+        """Tests of whether residuals look like noise, by experiment and name. Where they do not, intervals are too
+        narrow."""
         return {label: {n: whiteness(r) for n, r in by.items()} for label, by in self.residuals.items()}
 
     def _quantile(self, level: float) -> float:
-        """Of the normal distribution, or where noise was estimated, of Student's."""
+        """The quantile of the normal distribution, or where noise was estimated, of Student's."""
         upper = 0.5 * (1 + level)
         if self.objective.evidence.labels:
             return float(scipy.stats.t.ppf(upper, max(self.freedom, 1.0)))
@@ -216,7 +218,7 @@ class Estimate:
         return Table(tuple(rows), level)
 
     def identifiability(self) -> Identifiability:
-        """What the data tell at the values found."""
+        """The directions that the data determine, at the values found."""
         m = self.minimum
         return identifiability(self.objective, m.weights, m.found, m.z, self._noise)
 
@@ -312,14 +314,14 @@ class Estimate:
         return self._followed(names, experiment, "filtered", 1, level)
 
     def smoothed(self, names: str | Sequence[str], experiment: int | str = 0, level: float = 0.95) -> Prediction:
-        """The same from all samples of the experiment, later ones included (Rauch, Tung & Striebel 1965)."""
+        """As `filtered`, from all samples of the experiment, later ones included (Rauch, Tung & Striebel 1965)."""
         return self._followed(names, experiment, "smoothed", 1, level)
 
     def ahead(
         self, names: str | Sequence[str], steps: int = 1, experiment: int | str = 0, level: float = 0.95
     ) -> Prediction:
-        """The same predicted from samples that are at least `steps` rows old, NaN in the first `steps` rows if there
-        are more than one; of `method=Innovations(...)` too, without bands."""
+        """As `filtered`, from samples that are at least `steps` rows old, NaN in the first `steps` rows if there are
+        more than one; of `method=Innovations(...)` too, without bands."""
         return self._followed(names, experiment, "ahead", steps, level)
 
     def _followed(self, names: str | Sequence[str], experiment: int | str, how: str, steps: int, level: float) -> Any:

@@ -26,7 +26,7 @@ class Rows(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Weights:
-    """How much each residual and each prior counts."""
+    """The weights of residuals and priors in the cost."""
 
     row: Float[np.ndarray, " m"]  # 1/σ
     precision: Float[np.ndarray, " p"]  # of the normal prior of each coordinate; 0 where there is none
@@ -34,7 +34,7 @@ class Weights:
 
     @property
     def log_rows(self) -> float:
-        """Σ ln (1/σ), which is not in the cost."""
+        """Σ ln (1/σ), which the cost does not contain."""
         return float(np.sum(np.log(self.row)))
 
     def applied(self, z: Float[np.ndarray, " p"], found: Evaluation) -> Rows:

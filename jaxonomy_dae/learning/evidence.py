@@ -23,7 +23,8 @@ SETTLED = 0.01  # relative change of a precision or noise level, which changes n
 
 @dataclasses.dataclass(frozen=True)
 class Evidence:
-    """What is to be found: noise levels of groups of residuals, precisions of groups of coordinates."""
+    """The quantities that the evidence determines: noise levels of groups of residuals, precisions of groups of
+    coordinates."""
 
     noise: Int[np.ndarray, " m"]  # the group of each residual; −1: its noise level is known
     labels: tuple[str, ...]  # of these groups
@@ -33,7 +34,7 @@ class Evidence:
 
     @property
     def is_idle(self) -> bool:
-        """Whether there is nothing to be found."""
+        """True if there is nothing to determine."""
         return not self.labels and not self.groups
 
     def sigma(self, weights: Weights) -> dict[str, float]:

@@ -35,7 +35,7 @@ class Factors:
         return cls(singular, right.T, scale, left.T @ triangle[:, -1])
 
     def rank(self, noise: float) -> int:
-        """How many singular values are not within the `noise` of the columns, relative to their norms: perturbed by as
+        """The number of singular values beyond the `noise` of the columns, relative to their norms: perturbed by as
         much each, p columns move no singular value by more than noise·√p (Weyl)."""
         return int(np.sum(self.singular > noise * np.sqrt(len(self.scale))))
 
@@ -45,7 +45,7 @@ class Factors:
         return -(self.right[:, :rank] @ (gain * self.projected[:rank])) / self.scale
 
     def directions(self, noise: float) -> Float[np.ndarray, "p r"]:
-        """Those that have a singular value beyond the noise."""
+        """The directions whose singular values are beyond the noise, shape (p, rank)."""
         return self.right[:, : self.rank(noise)] / self.scale[:, None]
 
     def root(self, rank: int) -> Float[np.ndarray, "p r"]:

@@ -144,7 +144,7 @@ def plot_residuals(estimate: "Estimate", axes: Any) -> np.ndarray:
 
 
 def plot_history(estimate: "Estimate", ax: Any) -> Any:
-    """How the misfit came down, step by step."""
+    """Draws how the misfit came down, step by step; returns the axes."""
     ax = new_axes(ax)
     history = np.array(estimate.minimum.history, float)
     ax.semilogy(np.sqrt(2 * history / len(estimate.minimum.weights.row)), ".-")

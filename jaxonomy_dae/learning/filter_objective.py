@@ -28,7 +28,7 @@ class AheadObjective(Objective):
 
     @functools.cached_property
     def told(self) -> Told:
-        """What the programs are told, as arrays of the system's dtype."""
+        """The data for the programs, as arrays of the system's dtype."""
         s, c, dtype = self.stacked, self.conditions, self.system.parameters.values.dtype
         table = set(self.system.parameters.table.names)
 
@@ -66,7 +66,7 @@ class AheadObjective(Objective):
 
     @property
     def _windows(self) -> dict[str, Any]:
-        """Of each input, its samples around the time between each row and the one before, of shape (e, n, w)."""
+        """For each input, its samples around the time between each row and the one before, of shape (e, n, w)."""
         s, dtype, kinds = self.stacked, self.system.parameters.values.dtype, dict(self.stacked.kinds)
         before = np.concatenate([s.t0[:, None], s.times[:, :-1]], axis=1)
         found = {}
@@ -85,7 +85,7 @@ class AheadObjective(Objective):
 
     @property
     def misfit(self) -> Misfit:
-        """As of `Objective`, of predictions one step ahead."""
+        """As `Objective.misfit`, for predictions one step ahead."""
         return Misfit(misfit_ahead, self.structure, self.weighted(self.told))
 
     def track(self, z: Float[np.ndarray, " p"]) -> Track:
@@ -129,7 +129,7 @@ class FilterObjective(AheadObjective):
         return Evaluation(residual, jacobian, s, logs)
 
     def weighted(self, told: Any) -> Weighted:
-        """As of `Objective`; the model says how large innovations should be."""
+        """As `Objective.weighted`; the model says how large innovations should be."""
         plain = super().weighted(told)
         share = jnp.asarray(np.sqrt(self.stacked.weight), plain.row.dtype)[:, None, None]
         return dataclasses.replace(plain, row=jnp.where(plain.row > 0, share, 0.0))
@@ -143,7 +143,7 @@ class FilterObjective(AheadObjective):
 
     @functools.cached_property
     def evidence(self) -> Evidence:
-        """Which precisions are to be found; noise levels are coordinates."""
+        """As `Objective.evidence`, for precisions alone: noise levels are coordinates."""
         share = np.sqrt(self.stacked.weight[self.rows[0]])
         groups = [self._group(name) for name, given in self.penalties.items() if given == "evidence"]
         chosen = tuple(group for group in groups if group.any())
@@ -152,7 +152,7 @@ class FilterObjective(AheadObjective):
     def lowest(
         self, start: Float[np.ndarray, " f"], steps: int = 200, weights: Weights | None = None
     ) -> Minimum | None:
-        """As of `Objective`, by scoring."""
+        """As `Objective.lowest`, by scoring."""
         given = self.evaluate, start, self.bounds, self.coordinates.log[self.free]
         if weights is None:
             reweigh = None if self.evidence.is_idle else self.evidence.reweigh

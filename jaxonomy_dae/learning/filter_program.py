@@ -17,9 +17,14 @@ from .program import Layout, Weighted, with_kinds
 
 
 class Track(NamedTuple):
-    """What a filter found: at each time, the outputs predicted from all samples before, their innovations' variances
-    (those of one output given the outputs before it), and of states and covariances, those predicted and those
-    corrected by the samples; Φ from the time before; discrete values."""
+    """The results of a filter at each time.
+
+    - `predicted`, `variance`: the outputs predicted from all samples before, and the variances of their innovations
+        (those of one output given the outputs before it).
+    - `before`, `p_before`, `after`, `p_after`: states and covariances, as predicted, and as corrected by the samples.
+    - `flow`: Φ from the time before.
+    - `discrete`: the discrete values.
+    """
 
     predicted: Float[Array, "*e n k"]
     variance: Float[Array, "*e n k"]
@@ -34,7 +39,7 @@ class Track(NamedTuple):
 def _track(
     system: AcausalSystem, observers: Any, layout: Layout, structure: Structure, shared: Any, own: Any, told: Told
 ) -> Track:
-    """One experiment."""
+    """Runs the filter over one experiment."""
     model = model_of(system, observers, layout, structure, shared, own, told)
 
     def step(carry, row):
@@ -62,8 +67,8 @@ def misfit_ahead(
     system: AcausalSystem, observers: dict[str, Any], layout: Layout, structure: Structure, shared: Any, own: Any,
     c: Weighted,
 ) -> Float[Array, " k"]:  # fmt: skip
-    """Of one experiment and each output, the sum of squared weighted errors of predictions, or of a filter,
-    Σ w (r²/s + ln s) of innovations r and their variances s."""
+    """For one experiment and each output, the sum of squared weighted errors of predictions, or of a filter, Σ w (r²/s
+    + ln s) of innovations r and their variances s."""
     found = _track(system, observers, layout, structure, shared, own, c.told)
     seen, residual = c.row > 0, found.predicted - c.values
     if not structure.is_filter:

@@ -35,7 +35,7 @@ ITERATIONS = 4  # Gauss–Newton steps onto the constraints after a correction, 
 
 
 class Told(eqx.Module):
-    """What programs are told of e experiments at n times: samples and which there are, noise levels (NaN where they are
+    """The data for programs of e experiments at n times: samples and which there are, noise levels (NaN where they are
     coordinates), known starts, and the standard deviations of their priors; and of each input, the w samples around the
     time between each row and the one before: integration looks at all that it is given."""
 
@@ -221,7 +221,7 @@ def _forward(m: Model, layout: Layout, substeps: int, t0: Any, t1: Any, x: Any, 
 
 
 def _forward_linear(m: Model, ends: Float[Array, " m"], x: Any, p: Any) -> tuple[Any, Any, Any]:
-    """The same of a linear model, part by part, in each of which inputs are linear in time."""
+    """As `_forward`, for a linear model, part by part; in each part, inputs are linear in time."""
     f = len(x)
 
     def slopes(t, x):

@@ -100,7 +100,7 @@ def _check(what: str, value: Any, positive: bool) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Structure:
-    """What a program is built from.
+    """The static choices from which a filter's program is built.
 
     - `noise`: of each intensity, the place in the state array and the factor of the variable named; or the name of an
         input, and 1.
@@ -118,7 +118,7 @@ class Structure:
 
     @property
     def is_filter(self) -> bool:
-        """Whether a covariance is propagated."""
+        """True if a covariance is propagated."""
         return bool(self.noise)
 
 
@@ -140,7 +140,7 @@ class Extra:
 def structure_and_extras(
     method: Filter | Innovations, system: AcausalSystem, stacked: Stacked
 ) -> tuple[Structure, tuple[Extra, ...]]:
-    """What the program is built from, and the coordinates.
+    """Returns (the static choices of the program, its coordinates beside those of the problem).
 
     **Raises:**
 

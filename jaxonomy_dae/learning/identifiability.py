@@ -70,7 +70,7 @@ class Identifiability:
 
 
 def natural_scale(objective: Objective, z: Float[np.ndarray, " f"]) -> Float[np.ndarray, " f"]:
-    """What each free coordinate would naturally be unsure of."""
+    """The uncertainty of each free coordinate that counts as complete, shape (f,): one, and a weight's own size."""
     c, free = objective.coordinates, objective.free
     return np.where(c.is_weight[free] & (z != 0), np.abs(z), 1.0)
 

@@ -22,18 +22,18 @@ GAIN = 1e-9  # relative decrease of the sum of squares below which it is the int
 
 @dataclasses.dataclass(frozen=True)
 class SumOfSquares(AbstractMerit):
-    """With weights that a step does not change; fields as of `minimise`."""
+    """A sum of squares with weights that a step does not change; fields as the arguments of `minimise`."""
 
     evaluation: Callable[[np.ndarray], Evaluation | None]
     residual: Callable[[np.ndarray], np.ndarray | None] | None
     first: Callable[[np.ndarray, Evaluation], Weights]
 
     def evaluate(self, z: Float[np.ndarray, " p"]) -> Evaluation | None:
-        """As it is given."""
+        """Calls the function that was given."""
         return self.evaluation(z)
 
     def weights(self, z: Float[np.ndarray, " p"], found: Evaluation) -> Weights:
-        """As they are given."""
+        """Calls the function that was given."""
         return self.first(z, found)
 
     def reach(self, z: Float[np.ndarray, " p"], weights: Weights, below: float) -> Reached | None:

@@ -20,20 +20,20 @@ from .evaluation import Evaluation, Rows, Weights
 from .factors import Factors
 
 GAIN = 1e-5  # decrease of −ln L for each coordinate that is not noticed: that of a step of 0.004 standard deviations
-LONGEST = (
-    2.0  # change of a coordinate by one step, a factor of 7: far away, the expected information is not the curvature
-)
+# Change of a coordinate by one step, a factor of 7 on a logarithmic scale: far away, the expected information is not
+# the curvature.
+LONGEST = 2.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Likelihood(Weights):
-    """How much each innovation counts: `row` is √(w/s), with `share` √w for the weight w of its experiment."""
+    """The weights of innovations: `row` is √(w/s), with `share` √w for the weight w of its experiment."""
 
     share: Float[np.ndarray, " m"]
 
     @property
     def log_rows(self) -> float:
-        """Nothing, since the cost has the logarithms of noise levels in it."""
+        """Zero, since the cost contains the logarithms of noise levels."""
         return 0.0
 
     def applied(self, z: Float[np.ndarray, " p"], found: Evaluation) -> Rows:
@@ -60,11 +60,11 @@ class Scoring(AbstractMerit):
     at: Callable[[np.ndarray, Evaluation], Weights]
 
     def evaluate(self, z: Float[np.ndarray, " p"]) -> Evaluation | None:
-        """As it is given."""
+        """Calls the function that was given."""
         return self.evaluation(z)
 
     def weights(self, z: Float[np.ndarray, " p"], found: Evaluation) -> Weights:
-        """As they are given."""
+        """Calls the function that was given."""
         return self.at(z, found)
 
     def reach(self, z: Float[np.ndarray, " p"], weights: Weights, below: float) -> Reached | None:
@@ -86,7 +86,7 @@ class Scoring(AbstractMerit):
         return GAIN * columns
 
     def next_weights(self, here: Weights, better: Weights) -> Weights:
-        """Those of the point, with better precisions."""
+        """The weights at the current point, with better precisions."""
         return dataclasses.replace(here, precision=better.precision)
 
     def shortened(self, step: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:

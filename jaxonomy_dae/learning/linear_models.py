@@ -13,8 +13,8 @@ from ..system.system import AcausalSystem
 
 
 def is_linear(system: AcausalSystem) -> bool:
-    """Whether slopes are A x + B u + c. False for models with events, hidden constraints and nonlinear blocks, which
-    are not looked into."""
+    """True if slopes are A x + B u + c. Models with events, hidden constraints or nonlinear blocks are not examined:
+    False."""
     plan, dtype = system.plan, system.parameters.values.dtype
     if plan.events is not None or plan.n_projected or len(plan.carried):
         return False
@@ -31,8 +31,8 @@ def is_linear(system: AcausalSystem) -> bool:
 
 
 def _reaches(function: Callable, arguments: tuple[Any, ...]) -> list[bool]:
-    """Which arguments the outcome may depend on: those from which operations lead to it. What an operation with others
-    inside is given counts as used."""
+    """True for the arguments on which the result may depend: those from which operations lead to it. All inputs of an
+    operation with inner programs count as used."""
     jaxpr = jax.make_jaxpr(function)(*arguments).jaxpr
     needed = {id(v) for v in jaxpr.outvars}
     for equation in reversed(jaxpr.eqns):

@@ -224,7 +224,7 @@ def _what(loss: float) -> str:
 
 
 def _why(loss: Callable[..., Any], model: Any, args: tuple) -> str:
-    """What a run inside the loss says of its failure where it is not compiled into a program; or nothing."""
+    """The text of the error that a run inside the loss raises outside a compiled program; "" if it raises none."""
     try:
         loss(model, *args)
     except (InitializationError, ModelError, SimulationError, SteadyStateError) as error:

@@ -55,7 +55,7 @@ class Shooting:
 
 @dataclasses.dataclass(frozen=True)
 class ShootingMinimum(Minimum):
-    """Where multiple shooting ended: also the times at which the segments of e experiments begin, the states there, and
+    """The end of multiple shooting: also the times at which the segments of e experiments begin, the states there, and
     the gaps between segments, in units of the states' ranges."""
 
     nodes: Float[np.ndarray, "e N"]
@@ -89,7 +89,7 @@ class Merit:
         return np.diag(root)[chosen], (root * (z - self.weights.mean))[chosen]
 
     def heavier(self, continuity: float) -> "Merit":
-        """The same Lagrange multipliers with a larger weight."""
+        """A copy with a larger weight `continuity` and the same Lagrange multipliers."""
         return dataclasses.replace(
             self, continuity=continuity, multiplier=self.multiplier * (self.continuity / continuity)
         )

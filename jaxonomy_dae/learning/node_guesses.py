@@ -92,7 +92,8 @@ def node_guesses(segments: Segments, z: Float[np.ndarray, " f"]) -> Float[np.nda
 
 
 def sizes(states: Float[np.ndarray, "e N n"]) -> Float[np.ndarray, " n"]:
-    """What each state's gaps are measured by: its range over the nodes, or where it does not move, its value."""
+    """The unit in which each state's gaps are measured: its range over the nodes, or where it does not move, its
+    value."""
     spread = states.max(axis=(0, 1)) - states.min(axis=(0, 1))
     largest = np.abs(states).max(axis=(0, 1))
     size = np.maximum(spread, 1e-3 * largest)

@@ -28,7 +28,8 @@ from .program import Conditions, Layout, Weighted, misfit, predict, predict_and_
 
 @dataclasses.dataclass(frozen=True)
 class Predicted:
-    """What the program returns, in NumPy: natural outputs of e experiments, and their derivatives by natural values."""
+    """The results of the program, in NumPy: natural outputs of e experiments, and their derivatives by natural
+    values."""
 
     outputs: Float[np.ndarray, "e n k"]
     by_shared: Float[np.ndarray, "e n k s"]
@@ -60,7 +61,8 @@ class Misfit(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Objective:
-    """What is minimised: a system with what stands around it, data, coordinates, and which experiments count."""
+    """The function that a fit minimises: a system with what stands around it, data, coordinates, and which experiments
+    count."""
 
     system: AcausalSystem
     observers: dict[str, Any]
@@ -71,7 +73,7 @@ class Objective:
     counted: Bool[np.ndarray, " e"]
 
     def until(self, share: float) -> "Objective":
-        """The same with a share of each experiment's time."""
+        """A copy with a share of each experiment's time."""
         return dataclasses.replace(self, stacked=self.stacked.until(share))
 
     @functools.cached_property
@@ -90,13 +92,13 @@ class Objective:
 
     @functools.cached_property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Of the free coordinates."""
+        """(lower, upper) bounds of the free coordinates, shape (f,) each."""
         low, high = self.coordinates.z_bounds
         return low[self.free], high[self.free]
 
     @functools.cached_property
     def conditions(self) -> Conditions:
-        """What the program is told, as arrays of the system's dtype."""
+        """The conditions of all experiments, for the programs, as arrays of the system's dtype."""
         s, dtype = self.stacked, self.system.parameters.values.dtype
 
         def number(value: Any) -> float:
@@ -119,7 +121,7 @@ class Objective:
         return Misfit(misfit, adjoint, self.weighted(self.conditions), backwards)
 
     def weighted(self, told: Any) -> Weighted:
-        """What a program is told, with samples and their weights."""
+        """The conditions `told` with samples and their weights, for the programs."""
         s, dtype = self.stacked, self.system.parameters.values.dtype
         level = np.where(np.isnan(s.sigma), 1.0, s.sigma)
         row = np.zeros(s.values.shape)
@@ -177,7 +179,7 @@ class Objective:
 
     @property
     def tolerance(self) -> float:
-        """Of the integration, relative: that of Jacobians."""
+        """The relative tolerance of the integration, and so of Jacobians."""
         return float(dict(self.layout.options)["rtol"])
 
     def sigma(self, z: Float[np.ndarray, " f"], weights: Weights) -> dict[str, float]:
@@ -195,7 +197,7 @@ class Objective:
 
     @functools.cached_property
     def evidence(self) -> Evidence:
-        """Which noise levels and precisions are to be found."""
+        """The noise levels and precisions that the evidence determines."""
         s, (experiment, _, output) = self.stacked, self.rows
         unknown = np.isnan(s.sigma[experiment, output])
         chosen = np.unique(output[unknown])
@@ -234,7 +236,7 @@ class Objective:
         return chosen[self.free]
 
     def with_noise(self, sigma: dict[str, float]) -> "Objective":
-        """The same with these noise levels in place of those to be estimated."""
+        """A copy with these noise levels in place of those to be estimated."""
         s = self.stacked
         row = np.array([sigma.get(name, math.nan) for name in s.outputs])
         known = np.where(np.isnan(s.sigma), row, s.sigma)

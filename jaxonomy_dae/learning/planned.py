@@ -40,7 +40,7 @@ class Planned:
                 raise ModelError(f"measure: '{name}' needs a standard deviation > 0; got {sigma!r}")
 
     def experiment(self, plan: SystemPlan) -> Experiment:
-        """As a record of zeros, of which only the times count."""
+        """An experiment whose record is zero; only its times count."""
         count = len(np.atleast_1d(np.asarray(self.times)))
         data = {}
         for name in self.measure:

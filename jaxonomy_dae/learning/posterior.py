@@ -64,7 +64,7 @@ class Posterior:
 
     @functools.cached_property
     def names(self) -> tuple[str, ...]:
-        """What was sampled."""
+        """The names of the sampled quantities."""
         c, free = self.estimate.objective.coordinates, self.estimate.objective.free
         return (*np.array(c.names)[free].tolist(), *(f"sigma of {name}" for name in self.sigma))
 
@@ -91,7 +91,7 @@ class Posterior:
 
     @property
     def mixed(self) -> bool:
-        """Whether the draws can be relied on: chains agree, there are enough, and no trajectory went astray."""
+        """True if the draws can be relied on: chains agree, there are enough, and no trajectory went astray."""
         return not self._complaints
 
     @functools.cached_property

@@ -132,13 +132,13 @@ class Problem:
         )  # fmt: skip
 
     def _errors(self, stacked: Stacked) -> tuple[Structure, tuple[Extra, ...]]:
-        """What the method adds to the program, and its coordinates."""
+        """The static choices that the method adds to the program, and its coordinates."""
         if isinstance(self.method, Filter | Innovations):
             return structure_and_extras(self.method, self.system, stacked)
         return Structure(), ()
 
     def _is_marginal(self, name: str, unknown: list[Unknown]) -> bool:
-        """Whether the prior of a start is that of a filter, which needs no search."""
+        """True if the prior of a start is that of a filter, which needs no search."""
         own = all(u.spread is not None and not u.shared for u in unknown)
         return isinstance(self.method, Filter) and own and name not in self.system.parameters.table.names
 
@@ -285,7 +285,7 @@ class Problem:
         return train(self, objective, objective.coordinates.z_start[objective.free], how)
 
     def _prepared(self, data: Any, freeze: Any, start: Any, bounds: Any) -> Objective:
-        """What is minimised, from the arguments of `fit`."""
+        """The objective, from the arguments of `fit`."""
         stacked = self._stacked if data is None else self._stack(data)
         if stacked is not self._stacked and self._laid_out(stacked) != self._layout:
             raise ModelError(
@@ -368,8 +368,7 @@ class Problem:
         return run(objective, z, experiment, ts)
 
     def with_law(self, name: str, law: Any, system: AcausalSystem, stacked: Stacked) -> "Problem":
-        """The same problem with another law in a network's place, without a prior, in a system that is otherwise as
-        given."""
+        """A copy with another law in a network's place, without a prior, in the system given."""
         other = copy.copy(self)
         other.system = eqx.tree_at(lambda s: s.neural, system, system.neural | {name: law})
         other._stacked, other.penalties = stacked, self.penalties | {name: None}
@@ -380,7 +379,7 @@ class Problem:
     def identifiability(
         self, *, freeze: Mapping[str, float] | Iterable[str] = (), start: Any = None
     ) -> Identifiability:
-        """What the data could tell at the nominal values: the Fisher information, before any fit.
+        """The directions that the data could determine at the nominal values: the Fisher information, before any fit.
 
         Noise levels that are to be estimated are taken as large as the residuals are at the start.
         """
@@ -390,7 +389,8 @@ class Problem:
     def nominal(
         self, freeze: Mapping[str, float] | Iterable[str] = (), start: Any = None
     ) -> tuple[Objective, Weights, Evaluation, Float[np.ndarray, " f"]]:
-        """Where a search would begin: the objective, first weights, residuals with their Jacobian, and coordinates."""
+        """The start of a search. Returns (objective, first weights, residuals with their Jacobian, free
+        coordinates)."""
         objective = self._objective(self._stacked, self._coordinates(self._stacked, freeze, start, None))
         z = objective.coordinates.z_start[objective.free]
         found = objective.evaluate(z)
@@ -404,6 +404,6 @@ class Problem:
         return self._train
 
     def laid_out(self, experiments: Sequence[Experiment]) -> tuple[Layout, Stacked]:
-        """Other experiments of the same system with what is trained, for a program of their own."""
+        """The layout and the stacked data of other experiments of the same system, for a program of their own."""
         stacked = stack(Data(*experiments), self.system.plan, tuple(self.observers), self.starts)
         return self._laid_out(stacked), stacked

@@ -31,7 +31,8 @@ def profile(estimate: "Estimate", position: int, level: float) -> tuple[float, f
     warm = [minimum.z[others]]
 
     def excess(z: float) -> float:
-        """How much more than allowed the cost is, with everything else fitted."""
+        """By how much the cost exceeds the allowed one when the coordinate is held at z and everything else is
+        fitted."""
         start = np.array(c.start)
         start[free] = c.natural(estimate.point)[free]
         start[position] = c.natural_at(position, z)

@@ -27,7 +27,7 @@ from .devices import each
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """Which numbers a program is given, and which it returns: names alone."""
+    """The names of the numbers that a program is given, and of those that it returns."""
 
     outputs: tuple[str, ...]
     parameters: tuple[str, ...]  # trained, one number each
@@ -42,12 +42,12 @@ class Layout:
 
     @property
     def n_own(self) -> int:
-        """How many numbers each experiment has to itself."""
+        """The number of values that each experiment has of its own."""
         return len(self.own)
 
 
 class Conditions(eqx.Module):
-    """What one program run is told of e experiments."""
+    """The conditions of e experiments, for one run of a program."""
 
     times: Float[Array, "e n"]
     t0: Float[Array, " e"]
@@ -56,7 +56,7 @@ class Conditions(eqx.Module):
 
 
 class Weighted(eqx.Module):
-    """What a program is told of e experiments, with their samples, and the square roots of how much each counts: √w/σ,
+    """The conditions of e experiments, `told`, with samples `values` and the square roots `row` of their weights: √w/σ,
     or √w where the noise level is estimated or follows from the model; zero where there is no sample."""
 
     told: Any

@@ -37,7 +37,7 @@ class Segments:
 
     @functools.cached_property
     def experiments(self) -> Int[np.ndarray, " e"]:
-        """Those that count."""
+        """The experiments that count."""
         return np.unique(self.objective.rows[0])
 
     @functools.cached_property
@@ -77,7 +77,7 @@ class Segments:
 
     @functools.cached_property
     def cut(self) -> Cut:
-        """What the programs are told."""
+        """The conditions of all segments, for the programs."""
         c, dtype = self.objective.conditions, self.objective.system.parameters.values.dtype
         chosen = self.experiments
         inputs = {n: (t[chosen], v[chosen]) for n, (t, v) in c.inputs.items()}
@@ -85,8 +85,8 @@ class Segments:
 
     @functools.cached_property
     def columns(self) -> tuple[Int[np.ndarray, "e q"], Bool[np.ndarray, "e q"]]:
-        """Where the q numbers common to an experiment's segments, shared and its own, stand among the coordinates that
-        are searched, and which of them do."""
+        """For the q numbers common to an experiment's segments, shared and its own: (their places among the coordinates
+        that are searched, which of them are searched)."""
         c, free = self.objective.coordinates, self.objective.free
         own = c.n_shared + self.experiments[:, None] * c.n_own + np.arange(c.n_own)
         shared = np.broadcast_to(np.arange(c.n_shared), (len(own), c.n_shared))
@@ -109,7 +109,8 @@ class Segments:
 
     @functools.cached_property
     def moving(self) -> tuple[int, ...]:
-        """Which of the numbers common to segments act on all of them: starts of variables act on the first alone."""
+        """The numbers common to segments that act on all of them: starts of variables act on the first segment
+        alone."""
         layout, table = self.objective.layout, self.objective.system.parameters.table
         first, names = self.objective.coordinates.n_shared, set(table.names)
         plain = first - len(layout.shared)
@@ -215,7 +216,7 @@ class Segments:
         return directions, run_segments(o.system, o.observers, o.layout, self.moving, shared, own, x, bases, self.cut)
 
     def ends(self, z: Float[np.ndarray, " f"], states: Float[np.ndarray, "e N n"]) -> Float[np.ndarray, "e N n"]:
-        """Where segments end that begin at these states; NaN where a run fails."""
+        """The states at the ends of segments that begin at `states`; NaN where a run fails."""
         found = self._run(z, states, np.ones(states.shape[-1]))
         return np.full_like(states, np.nan) if found is None else np.asarray(found[1][0].end, np.float64)
 

@@ -18,8 +18,8 @@ from .program import Conditions, Layout, outputs_of, placed, with_kinds
 
 
 class Cut(eqx.Module):
-    """What programs are told of e experiments, each in N segments: l times from the start of a segment to its end, its
-    start, known starts, and inputs over the whole time."""
+    """The conditions of e experiments, each in N segments: l times from the start of a segment to its end, its start,
+    known starts, and inputs over the whole time."""
 
     times: Float[Array, "e N l"]
     t0: Float[Array, "e N"]
@@ -28,7 +28,7 @@ class Cut(eqx.Module):
 
 
 class Ran(eqx.Module):
-    """What segments gave: outputs at l times, and the consistent states of n entries at both ends."""
+    """The results of segments: outputs at l times, and the consistent states of n entries at both ends."""
 
     outputs: Float[Array, "*batch l k"]
     start: Float[Array, "*batch n"]

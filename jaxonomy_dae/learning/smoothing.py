@@ -77,7 +77,7 @@ def smooth(found: Track, f: int) -> tuple[Float[np.ndarray, "n x"], Float[np.nda
 
 
 def _inverse(p: Float[np.ndarray, "f f"]) -> Float[np.ndarray, "f f"]:
-    """Of a covariance, on the directions in which there is any."""
+    """The inverse of a covariance on the directions in which there is any."""
     size = np.sqrt(np.maximum(np.diag(p), 0.0))
     size = np.where(size > 0, size, 1.0)
     return np.linalg.pinv(p / np.outer(size, size), rcond=SINGULAR, hermitian=True) / np.outer(size, size)

@@ -23,7 +23,7 @@ class AbstractTerm(abc.ABC):
     @property
     @abc.abstractmethod
     def name(self) -> str:
-        """What reports call it."""
+        """The name of the term in reports."""
 
     @abc.abstractmethod
     def __call__(self, u: Float[Array, " inputs"]) -> Float[Array, " outputs"]:
@@ -75,7 +75,7 @@ class Written(AbstractTerm):
 
     @property
     def name(self) -> str:
-        """As it was written."""
+        """The text as the user wrote it."""
         return self.label
 
     def __call__(self, u: Float[Array, " inputs"]) -> Float[Array, " outputs"]:
@@ -83,7 +83,7 @@ class Written(AbstractTerm):
         return jnp.stack([jnp.asarray(v, u.dtype) for v in values])
 
     def expressions(self, symbols: tuple[sympy.Symbol, ...]) -> tuple[sympy.Expr, ...]:
-        """The same in other symbols."""
+        """The expressions with other symbols in place of the term's own."""
         other = dict(zip(self.symbols, symbols, strict=True))
         written: tuple[Any, ...] = self.written  # SymPy says of nothing what it becomes
         return tuple(e.xreplace(other) for e in written)
@@ -108,7 +108,7 @@ class OfFunction(AbstractTerm):
         return value if self.output is None else jnp.zeros(self.outputs, u.dtype).at[self.output].set(value[0])
 
     def expressions(self, symbols: tuple[sympy.Symbol, ...]) -> tuple[sympy.Expr, ...]:
-        """As an undefined function of SymPy's."""
+        """The term as an undefined function of SymPy."""
         if self.output is not None:
             whole = sympy.Function(self.label)(*symbols)
             return tuple(whole if k == self.output else sympy.Integer(0) for k in range(self.outputs))

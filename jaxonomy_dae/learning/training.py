@@ -76,8 +76,8 @@ class GradientSteps:
 
 @dataclasses.dataclass(frozen=True)
 class Update:
-    """What a callback is told after `step` updates: the `loss` before the last one, for each sample; the latest `score`
-    of experiments held out, NaN if there is none; and `values` by name."""
+    """The argument of a callback after `step` updates: the `loss` before the last one, for each sample; the latest
+    `score` of experiments held out, NaN if there is none; and `values` by name."""
 
     step: int
     loss: float
@@ -146,11 +146,11 @@ class State:
 
     @property
     def step(self) -> int:
-        """How many updates were taken."""
+        """The number of updates that were taken."""
         return len(self.history)
 
     def arrays(self) -> Any:
-        """What a checkpoint keeps."""
+        """The arrays that a checkpoint keeps."""
         w = self.weights
         return [
             self.z, self.best, self.optimizer, w.row, w.precision, w.mean, np.array(self.history, float),
@@ -238,7 +238,7 @@ def _weights(batches: Batches, z: Float[np.ndarray, " f"]) -> Weights | None:
 
 
 def _facts(objective: Objective, plan: GradientSteps, optimizer: Any) -> dict[str, Any]:
-    """What must be the same for a checkpoint to fit."""
+    """The facts that must agree for a checkpoint to fit, by name."""
     s, c = objective.stacked, objective.coordinates
     data = [s.times, s.t0, s.values, s.observed, s.sigma, s.weight, s.holdout, dict(s.inputs), repr(s.starts)]
     searched = [np.array(objective.free), c.low, c.high, c.start[~objective.free], c.size]

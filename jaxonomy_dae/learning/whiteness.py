@@ -9,8 +9,8 @@ from jaxtyping import Float
 
 @dataclasses.dataclass(frozen=True)
 class Whiteness:
-    """Of one output of one experiment: the correlation of neighbouring residuals, and the probability that white noise
-    would show as much over all lags looked at (Ljung & Box 1978)."""
+    """The test of one output of one experiment: the correlation of neighbouring residuals, and the probability that
+    white noise would show as much over all lags looked at (Ljung & Box 1978)."""
 
     correlation: float
     probability: float

@@ -39,7 +39,7 @@ EFFICIENCY = Interval(0.0, 1.0, open_low=True)
 
 
 class _Circuit(NamedTuple):
-    """What the terminal voltage and the heat are made of."""
+    """Expressions of a cell's equivalent circuit, of which the terminal voltage and the heat are made."""
 
     voltage: Any
     current: Any
@@ -235,7 +235,8 @@ class _Pack(Component):
     """Rows of cells in parallel, one after the other in series, from `p` to `n`."""
 
     def _each(self, what: str, value: Any, shape: tuple[int, int], unit: str, bounds: Interval) -> Any:
-        """What the cells are given: a parameter of the pack where there is one value for all, else an array."""
+        """Declares one quantity of the cells: a parameter of the pack where one value holds for all cells, else one
+        value per cell."""
         if not np.ndim(value):
             return self.parameter(what, value, unit=unit, bounds=bounds)
         if np.shape(value) != shape:

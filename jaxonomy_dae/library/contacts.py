@@ -6,8 +6,12 @@ Contacts").
 from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Rotational, Translational, Value, assign, der
 from .arguments import yes_or_no
 
-CLEARANCE = 1e-9  # metre
-REST_SPEED = 1e-3  # metre per second
+# Metre: by how much parts may overlap just after they have let go. Far below the sizes of mechanisms, and far above the
+# rounding of a length of one metre, 2e-16.
+CLEARANCE = 1e-9
+# Metre per second: parts that meet more slowly stay together. Without this, the bounces of a ball accumulate,
+# infinitely many in a finite time.
+REST_SPEED = 1e-3
 
 
 class HardStop(Component):

@@ -24,7 +24,7 @@ from ..modeling import (
 )
 from .arguments import in_order
 
-STANDSTILL = 1e-6  # m/s or rad/s
+STANDSTILL = 1e-6  # m/s or rad/s: slower parts that are pressed together stick at once
 
 
 def stick_slip(

@@ -6,8 +6,8 @@ from sympy import asinh, exp, pi, sin, sqrt, tanh
 
 
 def penetration(s: Any, gap: Any, smooth: Any) -> tuple[Any, Any]:
-    """How far `s` is beyond ±gap/2, and the derivative of that with respect to `s`: a dead zone whose corners are
-    rounded over the length `smooth`."""
+    """A dead zone: (distance of `s` beyond ±gap/2, its derivative by `s`), with corners rounded over the length
+    `smooth`."""
     above, below = s - gap / 2, -s - gap / 2
     root_above, root_below = sqrt(above**2 + smooth**2), sqrt(below**2 + smooth**2)
     depth = (above + root_above - below - root_below) / 2

@@ -69,7 +69,7 @@ class ComponentArray:
 
     @property
     def size(self) -> int:
-        """How many instances the whole array has."""
+        """The number of instances in the whole array."""
         return math.prod(self.shape)
 
     def label(self, number: int) -> str:
@@ -203,7 +203,7 @@ def make_array(ev: "EqnEnv", name: str, kind: type, shape: Any, args: tuple, kwa
 
 
 def _regular(value: Any) -> Any:
-    """A list, or None if its parts differ in length."""
+    """The list itself; None if its parts differ in length."""
     try:
         np.shape(value)
     except ValueError:
@@ -222,7 +222,8 @@ def _sizes(shape: Any, where: str) -> tuple[int, ...]:
 
 
 def _each(value: Any, name: str, shape: tuple[int, ...], array: str, values: dict[str, np.ndarray]) -> Any:
-    """An argument as the prototype gets it: a symbol in place of an array, which goes to `values`."""
+    """An argument as the prototype gets it. In place of an array it gets a symbol, and the array is added to
+    `values`."""
     where = f"array '{array}'"
     if isinstance(value, Tracer):
         raise ModelError(
@@ -259,7 +260,7 @@ def _is_array(value: Any) -> TypeGuard[np.ndarray | jax.Array]:
 
 
 def _kind_of(value: Any) -> str:
-    """What is in an array, in a word."""
+    """The kind of entries in a NumPy array, in words, for an error message."""
     kinds = {"c": "complex numbers", "U": "texts", "S": "texts"}
     if value.dtype == object:
         return f"entries of type {type(value.flat[0]).__name__}" if value.size else "no numbers"

@@ -25,8 +25,8 @@ KINKED = (sympy.Max, sympy.Min, sympy.Abs, sympy.sign, sympy.Heaviside, *ROUNDIN
 
 
 def smooth(expression: Any) -> Any:
-    """The same expression, in which relations are not events: for kinks that matter less than the steps they cost, and
-    for branches that agree where they meet, as a series near a point and a formula elsewhere.
+    """Marks an expression so that its relations do not become events: for kinks that matter less than the steps they
+    cost, and for branches that agree where they meet, as a series near a point and a formula elsewhere.
 
     ```python
     self.add_equations(Eq(q, smooth(Max(u, 0)) * k))
@@ -46,8 +46,8 @@ def smooth(expression: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Turning:
-    """A condition that turns while `watched`; the hidden discrete variable `number` is what it is: 1, 0, or LIVE. It is
-    a `kink` if both branches have the same value where it turns."""
+    """A condition whose truth becomes the hidden discrete variable `number`: 1, 0, or LIVE (decided by its sides). It
+    turns while `watched` holds, and is a `kink` if both branches have the same value where it turns."""
 
     number: int
     condition: Any
@@ -56,14 +56,14 @@ class Turning:
 
     @property
     def starts(self) -> tuple[float, ...]:
-        """Of its hidden discrete variables."""
+        """The initial values of its hidden discrete variables."""
         return (float(LIVE),)
 
 
 @dataclasses.dataclass(frozen=True)
 class Stepping:
-    """The whole part of an argument while `watched`: the hidden discrete variable `number` is LIVE until an event has
-    set the next one to it."""
+    """The whole part of an argument as a hidden discrete variable: `number` is LIVE until an event has set variable
+    `number` + 1 to the whole part. It changes while `watched` holds."""
 
     number: int
     argument: Any
@@ -71,14 +71,14 @@ class Stepping:
 
     @property
     def starts(self) -> tuple[float, ...]:
-        """Of its hidden discrete variables."""
+        """The initial values of its hidden discrete variables."""
         return (float(LIVE), 0.0)
 
 
 @dataclasses.dataclass(frozen=True)
 class Timed:
-    """A relation that turns at times known beforehand; the hidden discrete variable `number` is what it is. It is a
-    `kink` as those of `Turning`."""
+    """A relation that turns at times known beforehand; its truth is the hidden discrete variable `number`. It is a
+    `kink` if both branches have the same value where it turns."""
 
     number: int
     condition: Any
@@ -87,13 +87,14 @@ class Timed:
 
     @property
     def starts(self) -> tuple[float, ...]:
-        """Of its hidden discrete variables."""
+        """The initial values of its hidden discrete variables."""
         return (float(LIVE),)
 
 
 @dataclasses.dataclass(frozen=True)
 class TimedSteps:
-    """The whole part of an argument that changes at times known beforehand; numbers as those of `Stepping`."""
+    """The whole part of an argument that changes at times known beforehand; its variables are numbered as those of
+    `Stepping`."""
 
     number: int
     argument: Any
@@ -101,7 +102,7 @@ class TimedSteps:
 
     @property
     def starts(self) -> tuple[float, ...]:
-        """Of its hidden discrete variables."""
+        """The initial values of its hidden discrete variables."""
         return (float(LIVE), 0.0)
 
 
@@ -109,14 +110,16 @@ Watched = Turning | Stepping | Timed | TimedSteps
 
 
 class Splitting:
-    """Takes from conditions the relations that turn at known times, each once; numbers follow from `first`."""
+    """Replaces the relations in conditions that turn at known times by hidden discrete variables, each relation once.
+    Numbers count from `first`."""
 
     def __init__(self, first: int):
         self.next = first
         self.timed: dict[Any, Timed] = {}
 
     def split(self, condition: Any) -> tuple[Any, Any]:
-        """(the condition as equations have it, as guards do) with what these relations are as discrete variables."""
+        """Returns (the condition for equations, the condition for guards), with relations that turn at known times
+        replaced by hidden discrete variables."""
         simple = in_relations_of_time(condition)
         found = [r for r in relations_in(simple) if self._is_timed(r)]
         if not found:
@@ -136,7 +139,7 @@ class Splitting:
 
 
 def _replaced(condition: Any, forms: dict[Any, Any]) -> Any:
-    """A condition with other forms of some relations in it."""
+    """The condition with relations replaced by other expressions."""
     if condition in forms:
         return forms[condition]
     if isinstance(condition, sympy.And | sympy.Or | sympy.Not):
@@ -145,12 +148,12 @@ def _replaced(condition: Any, forms: dict[Any, Any]) -> Any:
 
 
 def is_watched(condition: Any) -> bool:
-    """Whether a condition changes otherwise than by events."""
+    """True if the truth of a condition can change between events: some symbol in it moves."""
     return any(_moves(s) for s in symbols_of(condition))
 
 
 def turned(number: int, condition: Any) -> Any:
-    """A condition as the hidden discrete variable has it."""
+    """The condition in terms of the hidden discrete variable that holds its truth."""
     known = RelationSymbol(number)
     holds: Any = sympy.Eq(known, 1)
     unknown: Any = sympy.Eq(known, LIVE)
@@ -159,8 +162,8 @@ def turned(number: int, condition: Any) -> Any:
 
 @functools.lru_cache(maxsize=4096)  # large models write the same few equations
 def with_events(residuals: tuple[sympy.Expr, ...], first: int) -> tuple[tuple[sympy.Expr, ...], tuple[Watched, ...]]:
-    """Equations whose relations are discrete variables, numbered from `first`; and what sets these. Equations of what
-    events read stay as they are."""
+    """Replaces relations in equations by hidden discrete variables, numbered from `first`. Returns (equations, the
+    events that set the variables). Equations that events read stay as they are."""
     residuals = tuple(r if _is_hidden(r) else _with_marks(r) for r in residuals)
     order = _inside_out([r for r in residuals if not _is_hidden(r)])
     varying = _varying(order)
@@ -170,7 +173,7 @@ def with_events(residuals: tuple[sympy.Expr, ...], first: int) -> tuple[tuple[sy
 
 
 class _Rewriting:
-    """The new form of all parts of equations, inner ones first."""
+    """Rewrites all parts of equations, inner ones first, and keeps their new forms."""
 
     def __init__(self, residuals: tuple[sympy.Expr, ...], order: list[Any], varying: set[Any], first: int):
         self.residuals, self.order, self.varying = residuals, order, varying
@@ -251,7 +254,7 @@ class _Rewriting:
         return back if written_so is sympy.false else sympy.Piecewise((live, written_so), (back, True), evaluate=False)
 
     def _turning(self, places: list[Any], condition: Any) -> Any:
-        """A condition as discrete variables."""
+        """The condition in terms of hidden discrete variables. Those that it needs are noted, to be declared later."""
         live, guarded = self.numbers.split(self._as_written(condition))
         for r in relations_in(in_relations_of_time(self._as_written(condition))):
             self.timed_places.setdefault(r, []).append(places)
@@ -263,7 +266,7 @@ class _Rewriting:
         return turned(number, condition)
 
     def _as_written(self, condition: Any) -> Any:
-        """A relation of parts that have been given new forms, with the old ones."""
+        """A relation with its sides in their original forms."""
         if not isinstance(condition, sympy.core.relational.Relational):
             return condition
         sides = [self.old.get(side, side) for side in condition.args]
@@ -300,7 +303,8 @@ _DOMAINS: dict[Any, tuple[Any, Any]] = {sympy.asin: (-1, 1), sympy.acos: (-1, 1)
 
 
 def _has_an_end(e: Any) -> bool:
-    """Whether a function of its first argument has values on a part of the numbers only: others are nonnegative."""
+    """True for functions that are defined on a part of the real numbers only: log, asin and acos of their argument, and
+    powers with an exponent that is not an integer."""
     return isinstance(e, (sympy.log, sympy.asin, sympy.acos)) or (isinstance(e, sympy.Pow) and not e.exp.is_integer)
 
 
@@ -354,7 +358,8 @@ _FORMS: dict[Any, Callable[..., Any]] = {
 
 
 def relations_left_alone(residual: sympy.Expr) -> tuple[Any, ...]:
-    """The parts of an equation that change with relations which are no events: it is smooth there, or said to be."""
+    """The parts of an equation that change with relations which do not become events: it is smooth there, or was
+    declared to be."""
     if _is_hidden(residual):
         return ()
     order = _inside_out([_with_marks(residual)])
@@ -364,7 +369,7 @@ def relations_left_alone(residual: sympy.Expr) -> tuple[Any, ...]:
 
 @functools.lru_cache(maxsize=4096)
 def _with_marks(residual: sympy.Expr) -> sympy.Expr:
-    """An equation in which those parts are marked as smooth whose branches meet with the same value and slope, as those
+    """The equation with marks of smoothness on those parts whose branches meet with the same value and slope, as those
     of q·|q|."""
     order = _inside_out([residual])
     varying = _varying(order)
@@ -384,7 +389,8 @@ def _with_marks(residual: sympy.Expr) -> sympy.Expr:
 
 
 def _two_branches(e: Any) -> tuple[Any, Any, Any] | None:
-    """Two branches, and what is zero where one goes over into the other; None for what has others."""
+    """Splits an expression with one relation into (first branch, second branch, difference that is zero where they
+    meet); None for other expressions."""
     if isinstance(e, sympy.Abs):
         return e.args[0], -e.args[0], e.args[0]
     if isinstance(e, sympy.sign | sympy.Heaviside):
@@ -401,7 +407,7 @@ def _two_branches(e: Any) -> tuple[Any, Any, Any] | None:
 
 
 def _is_continuous(e: Any) -> bool:
-    """Whether a part with relations has the same value on both sides of each."""
+    """True if the expression has the same value on both sides of its relation, as Max, Min and Abs have."""
     if isinstance(e, sympy.Max | sympy.Min | sympy.Abs):
         return True
     parts = _two_branches(e)
@@ -413,12 +419,13 @@ def _is_continuous(e: Any) -> bool:
 
 
 def _meet_smoothly(difference: Any, surface: Any) -> bool:
-    """Whether a difference and its slope vanish where a surface does."""
+    """True if `difference` and its derivative vanish wherever `surface` does."""
     return _vanish_on(surface, lambda v: (difference, sympy.diff(difference, v)))
 
 
 def _vanish_on(surface: Any, expressions_in: Callable[[Any], tuple[Any, ...]]) -> bool:
-    """Whether expressions vanish where a surface does, in a variable that says where this is; False if none does."""
+    """True if all expressions vanish wherever `surface` is zero. The surface is solved for a variable `v` that it
+    contains linearly, and `expressions_in(v)` is evaluated there; False if there is no such variable."""
     for v in sorted((s for s in symbols_of(surface) if isinstance(s, VariableSymbol | sympy.Dummy)), key=str):
         slope = sympy.diff(surface, v)
         if slope.is_number and slope.is_nonzero:
@@ -428,12 +435,13 @@ def _vanish_on(surface: Any, expressions_in: Callable[[Any], tuple[Any, ...]]) -
 
 
 def _is_hidden(residual: sympy.Expr) -> bool:
-    """Whether an equation determines a variable that is not shown."""
+    """True if the residual contains a variable that the compiler added, whose path begins with a colon."""
     return any(isinstance(s, VariableSymbol) and s.path.startswith(":") for s in symbols_of(residual))
 
 
 def _inside_out(roots: Sequence[Any]) -> list[Any]:
-    """The parts of expressions, each once and inner ones first; not those of conditions, nor what is smooth."""
+    """The parts of expressions, each once, inner ones first. Parts of conditions, and parts marked as smooth, are left
+    out."""
     seen: set[Any] = set()
     out: list[Any] = []
     stack = [(e, False) for e in reversed(roots)]
@@ -449,7 +457,7 @@ def _inside_out(roots: Sequence[Any]) -> list[Any]:
 
 
 def _untyped(e: Any) -> tuple[Any, ...]:
-    """The arguments of an expression, which SymPy declares as less than they are."""
+    """The arguments of an expression. SymPy's stubs declare them with a narrower type."""
     return e.args
 
 
@@ -470,7 +478,7 @@ def _arguments(e: Any) -> list[Any]:
 
 
 def _varying(order: list[Any]) -> set[Any]:
-    """The parts that are not the same at all times."""
+    """The parts of an expression whose value can change with time."""
     out: set[Any] = set()
     for e in order:
         conditions = (c for _, c in _pairs(e)) if isinstance(e, sympy.Piecewise) else ()
@@ -488,7 +496,8 @@ def _varies(condition: Any) -> bool:
 
 
 def _can_turn(condition: Any) -> bool:
-    """Whether a condition that was written changes at instants that can be found."""
+    """True if a condition can become an event: it varies between events, contains no event's relation yet, and a guard
+    can be made both of it and of its negation."""
     if not _varies(condition) or any(isinstance(s, RelationSymbol) for s in symbols_of(condition)):
         return False  # constant between events; or an event already
     try:

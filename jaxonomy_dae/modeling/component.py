@@ -14,12 +14,13 @@ from .construction import Construction
 from .declarations import START, Account, Learned, Parameter, Variable, full_name
 from .environment import EqnEnv
 from .equations import residual_of
-from .events import Held, When
+from .events import HeldBranch, When
 from .functions import of_scalars
 from .interval import Interval, as_interval
 from .kinds import check_kind
 from .mode_declarations import ModeDeclarations
 from .names import check_name
+from .networks import count_outputs
 from .ports import Domain, Port
 from .real_number import real_number
 from .symbols import DiscreteSymbol, ParameterSymbol, PreviousSymbol, TimeSymbol, VariableSymbol
@@ -65,7 +66,7 @@ class Component(ModeDeclarations, metaclass=Construction):
         self.events: list[When] = []
         self.relations: list[float] = []
         self.as_written: dict[sympy.Expr, sympy.Expr] = {}
-        self.held_branches: list[Held] = []
+        self.held_branches: list[HeldBranch] = []
         self.accounts: list[Account] = []
         self._sealed = False
 
@@ -417,8 +418,6 @@ class Component(ModeDeclarations, metaclass=Construction):
 
     def _opaque(self, what: str, name: str, network: Any, inputs: Sequence[Any], outputs: int | None):
         self._claim(name, what)
-        from .neural import count_outputs
-
         where = f"{what} '{self.name}.{name}'"
         if not callable(network):
             raise ModelError(f"{where}: the {_noun(what)} must be callable; got {network!r}")

@@ -35,7 +35,8 @@ _HOW_TO_BEGIN = "its __init__ must begin with super().__init__(ev, name)"
 
 
 def _hint(raised: Exception, name: str) -> str | None:
-    """What was probably meant, for slips that raise errors which do not say so."""
+    """The probable mistake behind an error that does not name it, raised while the component `name` was built; None if
+    it is not recognised."""
     error = str(raised)
     if isinstance(raised, SympifyError):
         return f"what stands in an equation is made of symbols and numbers. {SHADOWED}"

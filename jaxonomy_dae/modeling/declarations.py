@@ -1,7 +1,7 @@
 """What a component declares: parameters, variables, learned terms."""
 
 import dataclasses
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import sympy
@@ -9,19 +9,16 @@ import sympy
 from .interval import Interval
 from .symbols import TimeSymbol, VariableSymbol
 
-if TYPE_CHECKING:
-    from .component import Component
-
 START = ":start"  # ends the name of what is declared by the start of a derivative
 Value: TypeAlias = float | int | sympy.Expr  # a number, or an expression in parameters
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class EachValue:
-    """What the instances of an array have, in their order."""
+    """One value for each instance of an array, in the order of the instances."""
 
     values: np.ndarray
-    prototype: "Component"  # of the array
+    prototype: object  # the component that stands for all of the array; it is only compared by `is`
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +33,7 @@ class Parameter:
     is_discrete: bool = False
 
     def with_value(self, value: float | sympy.Expr | EachValue) -> "Parameter":
-        """The same declaration with another value."""
+        """A copy of the declaration with another value."""
         return dataclasses.replace(self, value=value)
 
 

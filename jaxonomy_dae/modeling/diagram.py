@@ -9,6 +9,7 @@ from .connections import Connection, Signal, resolve_ends
 from .environment import EqnEnv
 from .names import check_name
 from .neural import NeuralDAEBlock
+from .owner import Owner
 from .ports import Port
 
 
@@ -133,7 +134,9 @@ def _described(wrong: Any) -> str:
     return type(wrong).__name__
 
 
-def _top(component: Component) -> Component:
+def _top(component: Owner) -> Component:
+    """The outermost component that contains this one."""
     while component.parent is not None:
         component = component.parent
+    assert isinstance(component, Component)
     return component

@@ -11,7 +11,7 @@ from .symbols import PreviousSymbol, VariableSymbol
 
 
 def zero_of(equation: Any) -> Any:
-    """What is zero, of an equation or an expression."""
+    """Left side minus right side of an equation; an expression is returned as it is."""
     if isinstance(equation, sympy.Eq):
         return equation.lhs - equation.rhs  # pyright: ignore[reportOperatorIssue]
     return sympy.sympify(equation)
@@ -19,7 +19,13 @@ def zero_of(equation: Any) -> Any:
 
 @functools.lru_cache(maxsize=4096)
 def residual_of(equation: Any) -> sympy.Expr:
-    """What must be zero for an equation to hold."""
+    """Left side minus right side of an equation of a component.
+
+    **Raises:**
+
+    - `ModelError` for what is not an equation between real numbers, contains no variable, or contains a value from
+        before an event.
+    """
     if isinstance(equation, bool | sympy.logic.boolalg.BooleanAtom):
         raise ModelError(
             "an equation is always True and says nothing (`a == b` compares symbols; write `Eq(a, b)`)"

@@ -140,7 +140,8 @@ class EventDeclarations:
         return name
 
     def _values(self, actions: tuple[Action, ...], number: int, where: str) -> tuple:
-        """What the actions write, as numbers and names of hidden variables."""
+        """The values that the actions of an event write: for each action a number, the name of a hidden variable that
+        is declared here for its expression, or None for `terminate`."""
         new: dict[Any, sympy.Expr] = {}
         targets: list[Any] = []
         for action in actions:
@@ -170,7 +171,8 @@ class EventDeclarations:
 
 
 def _with_new_values(value: Any, new: dict, above: tuple, where: str) -> Any:
-    """A value in which discrete variables that the same event assigns are what they are assigned."""
+    """Substitutes the new values of discrete variables that the same event assigns. `above` are the symbols being
+    substituted: a circle among them is refused."""
     read = sorted((s for s in value.free_symbols if s in new), key=str)
     for symbol in read:
         if symbol in above:

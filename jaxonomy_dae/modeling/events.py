@@ -70,7 +70,7 @@ class When:
 
 
 @dataclasses.dataclass(frozen=True)
-class Held:
+class HeldBranch:
     """A branch of `either` that is differentiated: the names of the hidden variables that are it and its derivatives
     below the highest, all zero while the branch holds, and of the one that is 1 while it does and 0 otherwise; and the
     discrete variable by which an event lets an impulse act. One that only pushes also has the hidden variable of its
@@ -188,7 +188,8 @@ def relation_in_discretes(mode: Any, where: str) -> Any:
 
 
 def _is_discrete(condition: Any) -> bool:
-    """Whether nothing in a relation changes between events."""
+    """True for a relation, or a combination of relations, that contains neither variables nor time: it can change at
+    events only."""
     symbols = symbols_of(condition)
     return isinstance(condition, sympy.core.relational.Relational | BooleanFunction) and not any(
         isinstance(s, VariableSymbol | TimeSymbol) for s in symbols

@@ -6,7 +6,7 @@ import sympy
 
 from ..errors import ModelError
 from .equations import zero_of
-from .events import Assign, Held, relation_in_discretes
+from .events import Assign, HeldBranch, relation_in_discretes
 from .relation_declarations import RelationDeclarations
 from .symbols import DiscreteSymbol, RelationSymbol, der
 
@@ -16,7 +16,7 @@ HIGHEST = 2  # the most often that a branch may have to be differentiated: what 
 class ModeDeclarations(RelationDeclarations):
     """The part of `Component` that concerns equations of which events choose one."""
 
-    held_branches: list[Held]
+    held_branches: list[HeldBranch]
 
     def either(self, mode: Any, then: Any, otherwise: Any, order: int = 0) -> None:
         """Adds an equation with two branches: `then` is zero while the mode holds, `otherwise` is zero while it does
@@ -131,7 +131,7 @@ class ModeDeclarations(RelationDeclarations):
         acts = sympy.Or(condition, asked)
         self.add_equations(sympy.Piecewise((top + impulse * zero[-1], acts), (otherwise, True)))
         self.held_branches.append(
-            Held(
+            HeldBranch(
                 f"{then} = 0 while {condition}",
                 tuple(self._hidden(f":held[{number},{k}]", level) for k, level in enumerate(zero)),
                 self._hidden(f":held[{number}]", sympy.Piecewise((1, condition), (0, True))),

@@ -5,10 +5,8 @@ positive into the component.
 """
 
 import dataclasses
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from .component import Component
+from .owner import Owner
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +44,7 @@ Hydraulic = Domain("Hydraulic", across=(("p", "Pa"),), through=(("m_flow", "kg/s
 class Port:
     """A port of a component; its variables are attributes: `self.p.v`, `self.p.i`."""
 
-    def __init__(self, component: "Component", name: str, domain: Domain):
+    def __init__(self, component: Owner, name: str, domain: Domain):
         self.component = component
         self.name = name
         self.domain = domain

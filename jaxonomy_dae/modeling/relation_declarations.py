@@ -55,7 +55,7 @@ class RelationDeclarations(EventDeclarations):
         return RelationSymbol(len(self.relations) - 1)
 
     def _with_events(self) -> None:
-        """Makes events of the relations in all equations that were written."""
+        """Turns the relations in all equations written so far into events."""
         new, watched = with_events(tuple(self.equations), len(self.relations))
         if not watched:
             return

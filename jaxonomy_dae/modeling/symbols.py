@@ -92,7 +92,7 @@ class DiscreteSymbol(ParameterSymbol):
 
 
 class RelationSymbol(ParameterSymbol):
-    """Whether a relation of a component counts as true, 1, or as false, 0; 2 where it is as its sides say."""
+    """The truth of a relation of a component: 1 for true, 0 for false, 2 for "as its sides say"."""
 
     __slots__ = ("number",)
     number: int

@@ -25,15 +25,15 @@ _OPPOSITE = {
 
 @dataclasses.dataclass(frozen=True)
 class Edges:
-    """When a relation turns: with each tick of each clock; it then is 1 or 0, an expression in parameters, while
-    `turns`, a condition on parameters, holds. Otherwise it never does."""
+    """The instants at which a relation turns. At each tick of a clock the relation becomes the expression beside that
+    clock (1 or 0, in parameters), provided that `turns`, a condition on parameters, holds; otherwise it never turns."""
 
     clocks: tuple[tuple[Sampled, Any], ...]
     turns: Any
 
 
 def edges_of(relation: Any) -> Edges | None:
-    """When a relation turns; None if it is not recognised, or changes with more than time."""
+    """The clocks at which a relation turns; None if its form is not recognised, or it depends on more than time."""
     found = _in_time(relation)
     if found is None:
         return None
@@ -68,7 +68,8 @@ def edges_of(relation: Any) -> Edges | None:
 
 
 def whole_edges(argument: Any) -> Edges | None:
-    """When the whole part of an expression changes, and, instead of a truth, by how much: up by 1 or down by 0."""
+    """The clocks at which floor(argument) changes. Instead of a truth, each clock has the direction: 1 for up by one, 0
+    for down."""
     if not _in_parameters(argument):
         return None
     slope, at_zero = _affine(argument)
@@ -79,7 +80,7 @@ def whole_edges(argument: Any) -> Edges | None:
 
 
 def in_relations_of_time(condition: Any) -> Any:
-    """A condition in which relations of Max, Min and Abs of time are such of what these choose from."""
+    """The condition with relations of Max, Min and Abs of time replaced by relations of their arguments."""
     if isinstance(condition, sympy.And | sympy.Or | sympy.Not):
         return condition.func(*map(in_relations_of_time, condition.args))
     found = _in_time(condition)
@@ -112,7 +113,8 @@ def _sides(relation: Any) -> tuple[Any, Any]:
 
 
 def _in_time(relation: Any) -> tuple[Any, Any, Any] | None:
-    """(slope, head, level) of an ordering between head and level, multiplied by the slope."""
+    """Writes a relation as slope·(head − level), ordered against zero, where only the head changes with time. Returns
+    (slope, head, level), or None."""
     if not isinstance(relation, _ORDERED) or not _in_parameters(relation):
         return None
     left, right = _sides(relation)
@@ -124,8 +126,8 @@ def _in_time(relation: Any) -> tuple[Any, Any, Any] | None:
 
 
 def _with_one_head(e: Any) -> tuple[Any, Any, Any] | None:
-    """(slope, head, rest) of an expression slope·head + rest whose slope and rest do not change in time. No head
-    stands for none."""
+    """Writes an expression as slope·head + rest, where slope and rest do not change with time. Returns (slope, head,
+    rest), with head None if nothing does; None if there are several heads."""
     if not _changes(e):
         return sympy.Integer(0), None, e
     if isinstance(e, TimeSymbol | sympy.sin | sympy.cos | sympy.Mod | sympy.frac | sympy.Max | sympy.Min | sympy.Abs):
@@ -146,7 +148,7 @@ def _with_one_head(e: Any) -> tuple[Any, Any, Any] | None:
 
 
 def _affine(e: Any) -> tuple[Any, Any]:
-    """(slope, value at zero) of an expression that is affine in time; None, None for others."""
+    """Writes an expression as slope·t + value. Returns (slope, value), or (None, None) if it is not affine in time."""
     found = _with_one_head(e)
     if found is None or not isinstance(found[1], TimeSymbol):
         return None, None
@@ -158,7 +160,8 @@ def _changes(e: Any) -> bool:
 
 
 def _in_parameters(e: Any) -> bool:
-    """Whether an expression changes with time alone."""
+    """True if an expression contains only time and parameters: no discrete variables, relations or values from before
+    an event."""
     changing = DiscreteSymbol | RelationSymbol | PreviousSymbol
     return all(
         isinstance(s, TimeSymbol) or (isinstance(s, ParameterSymbol) and not isinstance(s, changing))
@@ -167,7 +170,7 @@ def _in_parameters(e: Any) -> bool:
 
 
 def _after(direction: Any) -> Any:
-    """1 if what passes zero rises, 0 if it falls."""
+    """1 if a quantity that passes zero with this slope rises, 0 if it falls."""
     return sympy.Piecewise((1, direction > 0), (0, True))
 
 
@@ -180,5 +183,5 @@ def _where(condition: Any, e: Any, otherwise: Any = 0) -> Any:
 
 
 def _quotient(a: Any, b: Any) -> Any:
-    """a/b; zero where b is."""
+    """a/b, or 0 where b is 0."""
     return a / b if b.is_number else _where(_nonzero(b), a / b)

@@ -4,17 +4,17 @@ import jax
 
 
 def uses_numpy(error: Exception) -> bool:
-    """Whether JAX raised the error because a function computes with NumPy or math."""
+    """True if JAX raised the error because the function computes with NumPy or math."""
     numbers_wanted = jax.errors.TracerArrayConversionError | jax.errors.ConcretizationTypeError
     return isinstance(error, numbers_wanted) and not isinstance(error, jax.errors.TracerBoolConversionError)
 
 
 def why_untraceable(error: Exception, of: str, example: str) -> str:
-    """What a function did that raised this error when JAX called it: the rest of a sentence about the function.
+    """The rest of the sentence "the function …": the mistake that made JAX raise this error.
 
     **Arguments:**
 
-    - `of`: what the function depends on, such as "the time"; `example` is how it is written, such as "t".
+    - `of`: the function's argument in words, such as "the time"; `example` is how it is written, such as "t".
     """
     if isinstance(error, jax.errors.TracerBoolConversionError):
         return f"decides by {of} with a Python `if`, `and` or `min`: use jnp.where({example} < …, a, b)"

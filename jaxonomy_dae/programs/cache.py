@@ -34,8 +34,8 @@ _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
 
-class _Program:
-    """A function with its static values, and in how many calls it stands now."""
+class _CompiledFunction:
+    """A compiled function for certain static values; `calls` counts the calls that have not returned yet."""
 
     def __init__(self, function: Callable, runs_once: bool, structure: Any, static: tuple[Any, ...]):
         def run(arrays: list[Any]) -> Any:
@@ -63,7 +63,7 @@ class _Program:
         return self._run(arrays)
 
     def clear(self) -> None:
-        """Frees what was compiled, its derivatives by JAX included."""
+        """Frees the compiled program, its derivatives by JAX included."""
         for run in (self._run, self._run_quick):
             cached = getattr(run, "_cached", None)  # the `jax.jit` inside, a private name of Equinox
             if cached is None:
@@ -78,7 +78,7 @@ class ProgramCache:
     """Programs by function, structure, static values, shapes and dtypes; the most recently used is the last."""
 
     def __init__(self):
-        self._programs: OrderedDict[Hashable, _Program] = OrderedDict()
+        self._programs: OrderedDict[Hashable, _CompiledFunction] = OrderedDict()
         self._lock = threading.RLock()
         self._next = 0.0  # when use may be measured again, in seconds of `time.perf_counter`
         self._left: dict[Callable, int] = {mappings: 0, memory: 0}  # what freeing left, of each
@@ -88,7 +88,7 @@ class ProgramCache:
         return len(self._programs)
 
     def call(self, function: Callable, runs_once: bool, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """`function(*args, **kwargs)`, by a program compiled at the first such call."""
+        """Calls `function(*args, **kwargs)` through the program compiled at the first call of this kind."""
         leaves, structure = jax.tree.flatten((args, kwargs))
         arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
         static = tuple(_ARRAY if eqx.is_array(leaf) else leaf for leaf in leaves)
@@ -98,7 +98,7 @@ class ProgramCache:
             program = self._programs.get(key)
             if program is None:
                 self.make_room()
-                program = self._programs[key] = _Program(function, runs_once, structure, static)
+                program = self._programs[key] = _CompiledFunction(function, runs_once, structure, static)
             self._programs.move_to_end(key)
             program.calls += 1
         try:
@@ -113,12 +113,12 @@ class ProgramCache:
         return outcome
 
     def clear(self) -> None:
-        """Lets all programs go that are not running."""
+        """Drops all programs that are not running."""
         with self._lock:
             self._let_go(len(self))
 
     def make_room(self) -> None:
-        """Lets programs go where they take too much. To be called where a program is about to be compiled."""
+        """Drops programs if they use too much of the machine. Called before a program is compiled."""
         with self._lock:
             start = time.perf_counter()
             if start < self._next:
@@ -157,7 +157,7 @@ class ProgramCache:
         self._left[measure] = 0 if use is None else use.used
 
     def _let_go(self, count: int) -> int:
-        """Lets the least recently used programs go, as many as `count`; those that run now stay. How many went."""
+        """Drops the `count` least recently used programs that are not running; returns how many were dropped."""
         idle = [key for key, program in self._programs.items() if not program.calls][: max(count, 0)]
         for key in idle:
             self._programs.pop(key).clear()

@@ -15,7 +15,7 @@ GROUP = Path("/sys/fs/cgroup")  # the limits of a container
 
 
 class Use(NamedTuple):
-    """How much of something is used, and how much there is."""
+    """An amount in use and the amount allowed."""
 
     used: int
     allowed: int

@@ -9,17 +9,17 @@ from jax.core import Tracer
 
 
 def is_staged(tree: Any) -> bool:
-    """Whether a leaf has no value yet: inside `jax.jit`, loops, `jax.make_jaxpr`.
+    """True if a leaf has no value yet: inside `jax.jit`, loops, `jax.make_jaxpr`.
 
     Under `jax.grad`, `jax.jvp` and `jax.vmap` alone, outside of jit, leaves are tracers around arrays, and JAX would
-    run each operation by itself: compiling a loop anew at every call. There a compiled program is called, which
-    JAX differentiates or batches as a whole.
+    run each operation by itself: compiling a loop anew at every call. There a compiled program is called, which JAX
+    differentiates or batches as a whole.
     """
     return any(isinstance([*_layers(leaf)][-1], Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def is_forwards(tree: Any) -> bool:
-    """Whether `jax.jvp` or `jax.jacfwd` is at work on a leaf, and no reverse mode.
+    """True if `jax.jvp` or `jax.jacfwd` is at work on a leaf, and no reverse mode.
 
     `jax.jit(jax.jacfwd(f))` is known for what it is; inside `jax.jacfwd(jax.jit(f))` it cannot be seen.
     """
@@ -28,8 +28,8 @@ def is_forwards(tree: Any) -> bool:
 
 
 def _layers(leaf: Any) -> Iterator[Any]:
-    """A leaf, and what differentiation and batching wrapped in it, one in the other; a tracer of any other kind is the
-    last."""
+    """The leaf and the tracers inside it, from the outside in, as far as differentiation and batching have wrapped it;
+    a tracer of another kind is the last."""
     yield leaf
     while isinstance(leaf, Tracer):
         if hasattr(leaf, "primal"):  # JVPTracer, LinearizeTracer

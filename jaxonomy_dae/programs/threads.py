@@ -20,5 +20,5 @@ def one_thread(multiplications: float) -> contextlib.AbstractContextManager:
 
 @functools.cache
 def _controller() -> ThreadpoolController:
-    """Of the libraries that are loaded; looking for them takes milliseconds."""
+    """The thread-pool controller of the libraries that are loaded, made once: the search takes milliseconds."""
     return ThreadpoolController()

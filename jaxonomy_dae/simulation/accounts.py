@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..aliases import State, Time
 from ..errors import ModelError, nearest
 from ..lowering.plan import SystemPlan
 from ..model.networks import Networks
@@ -21,12 +22,7 @@ from ..system.system import AcausalSystem
 
 
 def chosen_terms(plan: SystemPlan, kind: str, component: str | None) -> np.ndarray:
-    """The numbers of the terms of one kind, of a component and what it contains.
-
-    **Raises:**
-
-    - `ModelError` for an unknown component, and if the model declares nothing.
-    """
+    """The numbers of the declared terms of one kind that belong to a component, or to what it contains."""
     accounts, names = plan.flat.accounts, plan.flat.components
     if not accounts:
         raise ModelError(
@@ -59,7 +55,7 @@ def _terms(system: AcausalSystem, ts: Any, states: Any, inputs: Any, discrete: A
 _compiled = compiled(_terms)
 
 
-def _at_one_time(system: AcausalSystem, t: Any, x: Any, inputs: Any) -> Any:
+def _at_one_time(system: AcausalSystem, t: Time, x: State, inputs: Any) -> Any:
     plan = system.plan
     every = np.arange(plan.extended.quantities.n)
 
@@ -84,7 +80,8 @@ def _at_one_time(system: AcausalSystem, t: Any, x: Any, inputs: Any) -> Any:
 
 
 def _slots(plan: SystemPlan, group: AccountGroup) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Quantities and factors of the slots, shape (n, slots), and where a further derivative is to be taken."""
+    """Returns (quantities, factors, flags), each of shape (n, slots); a flag is set where a derivative beyond those in
+    the table must be taken."""
     table = plan.extended.quantities
     quantity = np.zeros(group.variable.shape, np.int64)
     factor, missing = np.zeros(group.variable.shape), np.zeros(group.variable.shape, bool)
@@ -110,7 +107,7 @@ def _too_high(plan: SystemPlan, group: AccountGroup, variable: int, order: int) 
 
 
 def silent_components(plan: SystemPlan) -> Sequence[str]:
-    """Components with ports that declare nothing, nor do those that they contain."""
+    """Components with ports that declare no energy or power, and contain none that does."""
     names, ports = plan.flat.components, plan.flat.ports
     declared = {names[int(k)] for group in plan.flat.accounts for k in group.component}
     has_port = [names[int(k)] for k in dict.fromkeys(ports.owner.tolist())]

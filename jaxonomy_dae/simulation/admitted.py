@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
+from ..aliases import Inputs, Time
 from ..system.closed_function import ClosedFunction
 from ..system.inputs import value_at
 from ..system.system import AcausalSystem
@@ -24,15 +25,16 @@ TEXT = "a parameter, a weight or an input is not finite, or a parameter is out o
 AHEAD = np.concatenate([[0.0], 10.0 ** np.linspace(-15, 0, 64)])
 
 
-def are_admitted(system: AcausalSystem, inputs: dict[str, Any]) -> Bool[Array, ""]:
-    """Whether parameters, weights, constants and samples are finite, and parameters within their bounds."""
+def are_admitted(system: AcausalSystem, inputs: Inputs) -> Bool[Array, ""]:
+    """True if parameters, weights, constants and samples are finite, and parameters are within their bounds."""
     data = [source for source in inputs.values() if not isinstance(source, ClosedFunction)]
     leaves = jax.tree.leaves(eqx.filter((system.neural, data), eqx.is_inexact_array))
     return jnp.stack([system.parameters.are_admitted, *(jnp.isfinite(leaf).all() for leaf in leaves)]).all()
 
 
-def inputs_are_finite(inputs: dict[str, Any], t: Any, t1: Any) -> Bool[Array, ""]:
-    """Whether functions of time are finite at the time t at which a run stopped, and ahead of it."""
+def inputs_are_finite(inputs: Inputs, t: Time, t1: Time) -> Bool[Array, ""]:
+    """True if inputs given as functions are finite at the time t at which a run stopped, and at a few instants between
+    t and t1."""
     functions = [source for source in inputs.values() if isinstance(source, ClosedFunction)]
     if not functions:
         return jnp.array(True)

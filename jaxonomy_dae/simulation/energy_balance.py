@@ -17,8 +17,8 @@ POINTS = 4  # Gauss points between neighbouring knots: exact for polynomials up 
 
 
 class EnergyBalance(NamedTuple):
-    """At the saved times, shape (n,): the change of what is stored, what was supplied and what was lost since the first
-    of them (joule), and the error of the balance relative to `scale` (joule)."""
+    """The account of energy at the saved times, shape (n,): the change of what is stored, what was supplied and what
+    was lost since the first of them (joule), and the error of the balance relative to `scale` (joule)."""
 
     stored: Float[Array, " n"]
     supplied: Float[Array, " n"]

@@ -14,11 +14,11 @@ from ..errors import ModelError
 from ..hybrid.problem import HybridState
 from ..system.system import AcausalSystem
 
-SHOWN = 12
+SHOWN = 12  # events in the text of a log
 
 
 class EventLog(eqx.Module):
-    """What a run noted of its events, one row for each, as far as there is room."""
+    """The events of a run, one row each, up to the log's capacity; `count` counts those beyond it, too."""
 
     ts: Float[Array, "*batch events"]
     which: Float[Array, "*batch events"]

@@ -10,6 +10,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from ..aliases import Inputs, State, Time
 from ..initialization.block_finding import BlockFinding
 from ..initialization.singular_blocks import examine_blocks
 from ..lowering.schedule import AnyStep, SparseStep
@@ -21,16 +22,13 @@ from ..system.input_values import input_values
 from ..system.system import AcausalSystem
 from .preparation import term_of
 
-SHOWN = 4
+SHOWN = 4  # names and equations of each kind in an error
 NEAR = 10.0 ** np.arange(-15, -5)  # parts of the interval
 Point = tuple[Any, Any]
 
 
-def failed_block(system: AcausalSystem, first: Point, last: Point, t1: Any, inputs: dict[str, Any]) -> str:
-    """A sentence on the block that fails at the last accepted point (t, x) or just beyond it, or nothing.
-
-    - `first`: the point where the run began: what was ill-conditioned there did not end it.
-    """
+def failed_block(system: AcausalSystem, first: Point, last: Point, t1: Time, inputs: Inputs) -> str:
+    """A sentence on the block that fails at the last accepted point (t, x) or just beyond it; "" if none does."""
     t, x = last
     failed = _first_failed(system, t, x, inputs)
     if failed is not None:
@@ -44,8 +42,8 @@ def failed_block(system: AcausalSystem, first: Point, last: Point, t1: Any, inpu
     return _just_beyond(system, t, x, t1, inputs) if len(system.plan.carried) else ""
 
 
-def _first_failed(system: AcausalSystem, t: Any, x: Any, inputs: dict[str, Any]) -> AnyStep | None:
-    """The first step of two and more equations, or a nonlinear one, that has no value."""
+def _first_failed(system: AcausalSystem, t: Time, x: State, inputs: Inputs) -> AnyStep | None:
+    """The first step that has no value, among nonlinear ones and those of two or more equations."""
     plan = system.plan
     known = np.arange(plan.extended.quantities.n_unknown, plan.extended.quantities.n)
     computed = np.concatenate([plan.states, *(q for step in plan.steps for q in step.unknown), known])
@@ -62,12 +60,12 @@ def _first_failed(system: AcausalSystem, t: Any, x: Any, inputs: dict[str, Any])
 
 
 @compiled
-def _quantities(system: AcausalSystem, t: Any, x: Any, inputs: dict[str, Any], chosen: tuple[int, ...]) -> Any:
+def _quantities(system: AcausalSystem, t: Time, x: State, inputs: Inputs, chosen: tuple[int, ...]) -> Any:
     return system.at(t, inputs).quantities(x, np.array(chosen), np.ones(len(chosen)))
 
 
-def _findings(system: AcausalSystem, t: Any, x: Any, inputs: dict[str, Any]) -> list[BlockFinding]:
-    """The blocks that are singular, or nearly so."""
+def _findings(system: AcausalSystem, t: Time, x: State, inputs: Inputs) -> list[BlockFinding]:
+    """Sentences on the blocks that are singular, or nearly so."""
     plan, parameters = system.plan, system.numbers
 
     def values():
@@ -77,7 +75,7 @@ def _findings(system: AcausalSystem, t: Any, x: Any, inputs: dict[str, Any]) -> 
     return list(examine_blocks(plan, np.asarray(parameters, float), networks, float(t), np.asarray(x), values))
 
 
-def _why(system: AcausalSystem, step: AnyStep, t: Any, x: Any, inputs: dict[str, Any], place: str) -> str:
+def _why(system: AcausalSystem, step: AnyStep, t: Time, x: State, inputs: Inputs, place: str) -> str:
     plan = system.plan
     names = [plan.quantity_name[q] for q in np.concatenate(step.unknown).tolist()]
     for block in _findings(system, t, x, inputs):
@@ -108,7 +106,7 @@ def _singular(block: BlockFinding, place: str) -> str:
     return f"{one} {nearly} {place}{f', with {causes}' if causes else ''}:{texts}\n"
 
 
-def _no_root(system: AcausalSystem, step: AnyStep, x: Any, what: str) -> str:
+def _no_root(system: AcausalSystem, step: AnyStep, x: State, what: str) -> str:
     plan = system.plan
     place = {int(q): k for k, q in enumerate((*plan.states, *plan.carried))}
     guessed = np.concatenate(step.guessed).tolist()
@@ -122,8 +120,8 @@ def _no_root(system: AcausalSystem, step: AnyStep, x: Any, what: str) -> str:
     )
 
 
-def _just_beyond(system: AcausalSystem, t: Any, x: Any, t1: Any, inputs: dict[str, Any]) -> str:
-    """The nonlinear block that loses its root just beyond a point, from which its unknowns are solved for."""
+def _just_beyond(system: AcausalSystem, t: Time, x: State, t1: Time, inputs: Inputs) -> str:
+    """Names the nonlinear block that loses its root a short way beyond the point."""
     plan = system.plan
     problem = FlatProblem(term_of(system, implicit=True), x, inputs)
     slope = np.asarray(consistent_slope(problem, None, jnp.asarray(t), jnp.asarray(x))).copy()

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from ..aliases import Inputs, Result, State, Time, Tolerance
 from ..hybrid.solver import STUCK, TOO_MANY
 from ..lowering.plan import SystemPlan
 from ..solvers.choice_guard import SINGULAR_CHOICE
@@ -22,9 +23,13 @@ from .preparation import term_of
 from .solution import Solution
 from .step_sizes import scaled_atol
 
-NEARLY = 1e-2  # of the first determinant: a singular choice explains a failure so close to it
-SHRINKING = 0.98  # intervals between events that become this much shorter each time accumulate
-CHATTERING = 1e-6  # events closer than this part of the time that has passed
+# A run that failed for another reason (steps too short, too many) is explained by a singular choice of states if a
+# determinant has fallen to this part of its first value.
+NEARLY = 1e-2
+# Times between events that shrink at least by this factor each accumulate: a ball whose speed is multiplied by e at
+# each bounce bounces at intervals that shrink by e.
+SHRINKING = 0.98
+CHATTERING = 1e-6  # of the time that has passed: events that follow each other faster undo each other
 REST = (
     "Say how the model rests: a mode in which it stays (complementary(…, rest_speed=…), contacts.HardStop; a discrete "
     "variable that the event assigns and the equations read), or when(…, terminate(…)) before"
@@ -32,8 +37,8 @@ REST = (
 PROBES = 64  # times at which inputs are looked at
 
 
-def raised(x: Any, result: Any, has_events: bool, max_steps: int, max_events: int) -> Any:
-    """x, or an error while running: for traced runs, of which no more than a code is known."""
+def raised(x: State, result: Result, has_events: bool, max_steps: int, max_events: int) -> Any:
+    """x, with a run-time error if the run failed: in traced runs only a code is known."""
     codes = diffrax.RESULTS
     lost = "nonlinear blocks have no solution there, or the start is not consistent"
     many = f"more than max_events={max_events} events" if has_events else "too many rejected steps"
@@ -58,14 +63,15 @@ def explain(
     solution: Solution,
     first: tuple[Any, Any],
     last: tuple[Any, Any],
-    t1: Any,
+    t1: Time,
     implicit: bool,
     max_steps: int,
     max_events: int,
-    rtol: Any,
-    atol: Any,
+    rtol: Tolerance,
+    atol: Tolerance,
 ) -> str:
-    """Why the integration from `first` to t1 stopped at its last accepted point (t, x), and what to do."""
+    """The reason, in a sentence, why the integration from `first` to t1 stopped at its last accepted point `last` = (t,
+    x), and the smallest mend."""
     system, inputs = solution.system, solution.inputs
     (t0, _), (t, x) = first, last
     log = solution.event_log
@@ -76,7 +82,8 @@ def explain(
     written = _written_not_finite(system, x)
     if written:
         return f"the integration stopped at t={float(t):g}: an event gave {written} a value that is not finite" + (
-            ", or began a mode whose constraint is far from what it asks for, or that no impulse brings about"
+            ", or it entered a mode whose constraint does not hold at that instant (its gap or speed is not zero), or "
+            "which no impulse can enforce. Check the event's condition, or reset the states with reinit(...)"
             if system.plan.held is not None
             else ", or left states that the hidden constraints do not admit: let it write, with reinit(...), all that "
             "jumps" + _of_kinks(system)
@@ -110,8 +117,8 @@ def explain(
     )  # fmt: skip
 
 
-def mode_at_start(system: AcausalSystem, inputs: dict[str, Any], t0: Any, x0: Any) -> str:
-    """The constraints that do not hold although a run begins in their modes; or nothing."""
+def mode_at_start(system: AcausalSystem, inputs: Inputs, t0: Time, x0: State) -> str:
+    """The constraints that do not hold although a run begins in their modes, in a sentence; "" if all hold."""
     held = system.plan.held
     if held is None:
         return ""
@@ -132,8 +139,8 @@ def mode_at_start(system: AcausalSystem, inputs: dict[str, Any], t0: Any, x0: An
     )
 
 
-def _written_not_finite(system: AcausalSystem, x: Any) -> str:
-    """The discrete variables and states that are not finite after an event; or nothing."""
+def _written_not_finite(system: AcausalSystem, x: State) -> str:
+    """The names of discrete variables and states that are not finite after an event; "" if all are."""
     if system.plan.events is None:
         return ""
     names = system.discretes
@@ -143,7 +150,7 @@ def _written_not_finite(system: AcausalSystem, x: Any) -> str:
 
 
 def _too_many_events(events: Events, max_events: int, t: float) -> str:
-    """Which event happens again and again, and towards which time."""
+    """Names the most frequent event, and the time at which its instants accumulate, if they do."""
     which = np.asarray(events.which, int)
     counts = np.bincount(which[which >= 0], minlength=len(events.all_names))
     most = int(np.argmax(counts))
@@ -165,7 +172,7 @@ def _too_many_events(events: Events, max_events: int, t: float) -> str:
 
 
 def _stuck(solution: Solution, event: int, t: float) -> str:
-    """How it came that an event happens, or a relation turns, again and again at one instant."""
+    """Says why event number `event` happens, or its relation turns, again and again at the instant t."""
     table: Any = solution.system.plan.events
     if table.table.relation[event]:
         return _sliding(table.names[event], t)
@@ -181,7 +188,8 @@ def _stuck(solution: Solution, event: int, t: float) -> str:
 
 
 def _accumulation(times: np.ndarray) -> str:
-    """How the times of an event shrink, and towards which time; nothing if they do not."""
+    """Says by which factor the times between an event's instants shrink, and where they accumulate; "" if they do not
+    shrink."""
     apart = np.diff(times[-8:])
     if len(apart) < 2 or (apart[:-1] <= 0).any():
         return ""
@@ -193,7 +201,8 @@ def _accumulation(times: np.ndarray) -> str:
 
 
 def _of_kinks(system: AcausalSystem) -> str:
-    """What to write if it was a relation that turned."""
+    """Advice for models with relations, in case one of them turned where a constraint has a kink; "" without
+    relations."""
     found = system.report.relations
     if not found:
         return ""
@@ -205,7 +214,7 @@ def _of_kinks(system: AcausalSystem) -> str:
 
 
 def _sliding(name: str, t: float) -> str:
-    """What to write instead of a relation that turns again and again at one instant."""
+    """Explains a relation that turns again and again at the instant t, and what to write instead."""
     where, _, condition = name.partition(": when(")
     return (
         f"the integration stopped at t={t:.6g}: the solution stays where '{condition[:-1]}' of component '{where}' "
@@ -215,8 +224,8 @@ def _sliding(name: str, t: float) -> str:
     )
 
 
-def _bad_input(plan: SystemPlan, inputs: dict[str, Any], t0: float, t: float, t1: float) -> str:
-    """The input that is not finite at the last accepted point or beyond it, if one is."""
+def _bad_input(plan: SystemPlan, inputs: Inputs, t0: float, t: float, t1: float) -> str:
+    """The input that is not finite at the last accepted point or beyond it; "" if there is none."""
     near = t + (t1 - t) * np.concatenate([[0.0], 10.0 ** np.linspace(-15, 0, PROBES)])
     for name, value in inputs.items():
         for s in near if callable(value) else near[:1]:
@@ -233,8 +242,9 @@ def _bad_input(plan: SystemPlan, inputs: dict[str, Any], t0: float, t: float, t1
     return ""
 
 
-def _singular_choice(solution: Solution, first: tuple[Any, Any], t: Any, x: Any) -> str:
-    """What the states do not determine at a point, if that is where and why the run ended."""
+def _singular_choice(solution: Solution, first: tuple[Any, Any], t: Time, x: State) -> str:
+    """Names the quantities that the chosen states no longer determine at (t, x), if a singular choice of states ended
+    the run; "" otherwise."""
     system, inputs = solution.system, solution.inputs
     plan = system.plan
     if not plan.dummy_blocks:

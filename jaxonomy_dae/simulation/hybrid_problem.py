@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..aliases import Args, Controller, State, Time, Tolerance
 from ..hybrid.control import EventControl
 from ..hybrid.problem import AbstractHybridProblem
 from ..model.tables import EventTable
@@ -16,12 +17,21 @@ from ..system.system import AcausalSystem
 from ..system.system_at import SystemAt
 from .preparation import prepared, term_of
 
-RESOLUTION = 32.0  # times the spacing of floating-point numbers at the largest time of a run
-CONSISTENT = 1e-4  # of a state's size: what projection may change of what an event writes and leaves
-RESTART = 8  # Gauss–Newton steps onto the constraints after an event
-LEFT = 1e-6  # of what an impulse takes away: what may be left of it
-PULL = 1e-9  # of the largest impulse: what counts as none
-TRIES = 3  # how often what would have to pull lets go, before a jump is given up
+# Times that differ by less are one instant: so many spacings of floating-point numbers at the largest time of a run.
+RESOLUTION = 32.0
+# Part of each state's size by which the projection onto the constraints may move what an event wrote and left. If it
+# moves more, the event asked for what the constraints do not admit, and the projection would decide what was meant
+# (test_event_attacks.py::test_a_reset_that_hidden_constraints_do_not_admit).
+CONSISTENT = 1e-4
+RESTART = 8  # Gauss–Newton steps onto the constraints after an event; from 1e-4 they lead to 1e-8 and to rounding
+# Part of the speed (or charge) that an impulse takes away that may be left of it. The impulse is found by one linear
+# step, exact if the jump is affine; more left than this shows that it is not
+# (test_library_contacts.py::test_a_jump_that_is_not_affine_is_refused).
+LEFT = 1e-6
+PULL = 1e-9  # of the largest impulse: contacts that pull by less do so by rounding alone, and are not released
+# Contacts are released at most this many times while one impact is resolved. If an impulse would still have to pull,
+# the event fails.
+TRIES = 3
 
 
 class SystemProblem(AbstractHybridProblem):
@@ -29,8 +39,8 @@ class SystemProblem(AbstractHybridProblem):
 
     system: AcausalSystem
     watch: Watch | None
-    tolerance: Any
-    resolution: Any
+    tolerance: Tolerance
+    resolution: Time
     implicit: bool = eqx.field(static=True)
     n_clocks: int = eqx.field(static=True)
     n_guards: int = eqx.field(static=True)
@@ -88,13 +98,13 @@ class SystemProblem(AbstractHybridProblem):
         )
         return jnp.where(new > -jnp.inf, new, q)
 
-    def struck(self, t: Any, x: Any, before: Any, q: Any, args: Any) -> tuple[Any, Any, Any]:
-        """(x, q) after the impulses of the constraints that begin to hold with q, or that q asks for; and whether they
-        do what they should.
+    def struck(self, t: Time, x: State, before: Any, q: Any, args: Args) -> tuple[Any, Any, Any]:
+        """Applies the impulses of the constraints that begin to hold with q, or that q asks for. Returns (x, q, whether
+        the impulses do what they should).
 
-        An equation e' + κ·e = 0 takes the place of e' = 0. States along ∂f/∂κ at κ = 0 are those after the impulse
-        that takes e away: exact where e is affine in what jumps (speeds; charges of linear capacitors). What is closed
-        and only pushes lets go if its impulse would be negative (Moreau 1988).
+        An equation e' + κ·e = 0 takes the place of e' = 0. States along ∂f/∂κ at κ = 0 are those after the impulse that
+        takes e away: exact where e is affine in what jumps (speeds; charges of linear capacitors). What is closed and
+        only pushes lets go if its impulse would be negative (Moreau 1988).
         """
         plan: Any = self.system.plan
         held, n = plan.held, len(plan.states)
@@ -127,8 +137,8 @@ class SystemProblem(AbstractHybridProblem):
         done = jnp.abs(left - (1 - strength) * e) <= LEFT * jnp.abs(strength * e)
         return after, q, jnp.all(done | (strength == 0)) & ~wrong
 
-    def admitted(self, t: Any, x: Any, q: Any, args: Any) -> Any:
-        """The state on the constraints that hold with q; not-a-number if it is not near them."""
+    def admitted(self, t: Time, x: State, q: Any, args: Args) -> Any:
+        """The state projected onto the constraints that hold with q; NaN if it is not near them."""
         plan = self.system.plan
         if not self.system.is_constrained:
             return x
@@ -140,7 +150,7 @@ class SystemProblem(AbstractHybridProblem):
 
 
 def problem_for(
-    system: AcausalSystem, t0: Any, t1: Any, implicit: bool, watch: Watch | None, tolerance: Any
+    system: AcausalSystem, t0: Time, t1: Time, implicit: bool, watch: Watch | None, tolerance: Tolerance
 ) -> SystemProblem:
     """The problem of a system that has events, to be run from t0 to t1."""
     largest = jax.lax.stop_gradient(jnp.maximum(jnp.maximum(jnp.abs(t0), jnp.abs(t1)), t1 - t0))
@@ -162,15 +172,15 @@ def problem_for(
 
 
 def _choices(table: EventTable, n_clocks: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """The discrete values that `complementary` chooses, and the guards that do so."""
+    """Returns (the discrete values that `complementary` chooses, the guards that choose them)."""
     chooses = np.array(table.revocable, bool) & ~np.array(table.relation, bool)
     rows = chooses[table.event] & (table.discrete >= 0) & (table.event >= n_clocks)
     return tuple(np.unique(table.discrete[rows]).tolist()), tuple(np.unique(table.event[rows] - n_clocks).tolist())
 
 
 def _opposite(table: EventTable, n_clocks: int) -> tuple[int, ...]:
-    """Of each guard that says what a relation is, the guard that says the opposite of the same discrete value; −1 for
-    others."""
+    """For each guard of a relation, the number of the guard that sets the same discrete value the other way; −1 for
+    other guards."""
     opposite = np.full(len(table) - n_clocks, -1)
     other: dict[int, int] = {}
     for event, discrete in zip(table.event.tolist(), table.discrete.tolist(), strict=True):
@@ -183,8 +193,9 @@ def _opposite(table: EventTable, n_clocks: int) -> tuple[int, ...]:
     return tuple(opposite.tolist())
 
 
-def with_event_control(controller: Any) -> Any:
-    """The controller whose steps end at events; what clips steps at jumps of inputs stays outside."""
+def with_event_control(controller: Controller) -> Any:
+    """Wraps the controller so that steps end at events. A controller that clips steps at jumps of inputs stays
+    outermost."""
     if isinstance(controller, diffrax.ClipStepSizeController):
         return eqx.tree_at(lambda c: c.controller, controller, with_event_control(controller.controller))
     return EventControl(controller)  # pyright: ignore[reportCallIssue]

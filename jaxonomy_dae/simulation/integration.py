@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from ..adjoint.resting import HeldBack, Resting
 from ..adjoint.stored_adjoint import StoredAdjoint
+from ..aliases import Args, Controller, Result, Solver, State, Time
 from ..hybrid.problem import HybridState
 from ..hybrid.solver import WithEvents
 from ..hybrid.start import start
@@ -26,15 +27,17 @@ from .hybrid_problem import problem_for, with_event_control
 from .preparation import largest_tolerance, prepared, term_of
 from .step_sizes import first_step
 
+# Gauss–Newton steps by which saved states are moved onto the constraints. Dense output starts them within some
+# tolerances of a constraint, and each step squares that distance.
 SAVED_ITERATIONS = 3
 
 
 class Options(eqx.Module):
-    """How to integrate."""
+    """Options of a run: solver, adjoint, controller and limits."""
 
-    solver: Any
+    solver: Solver
     adjoint: Any
-    controller: Any
+    controller: Controller
     max_steps: int = eqx.field(static=True)
     progress: bool = eqx.field(static=True)
     max_events: int = eqx.field(static=True, default=0)
@@ -43,16 +46,21 @@ class Options(eqx.Module):
 
 
 class Outcome(eqx.Module):
-    """What a run gave: the initial point, saved times and states, the last accepted point (t, x), counts, a result
-    code, whether it was given up because stability limits explicit steps; and of a system with events, the discrete
-    values at the saved times and the events."""
+    """The raw result of a run.
+
+    - `found`: the initial point.
+    - `ts`, `x`: the saved times and states; `last`: the last accepted point (t, x).
+    - `stats`, `result`: counts of steps, and Diffrax's result code.
+    - `is_stiff`: True if the run was given up because stability, not accuracy, limits explicit steps.
+    - `discrete`, `events`: with events, the discrete values at the saved times, and the log.
+    """
 
     found: InitialPoint
     ts: Any
-    x: Any
+    x: State
     last: tuple[Any, Any]
     stats: dict[str, Any]
-    result: Any
+    result: Result
     is_stiff: Any
     discrete: Any = None
     events: EventLog | None = None
@@ -83,6 +91,7 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
     tolerance = largest_tolerance(system, controller)
     solver = prepared(system, chosen, implicit, watch, tolerance)
     term = term_of(system, implicit)
+    # With an implicit solver the controller chooses the first step itself: `dt0=None`.
     own_start = implicit and not isinstance(controller, diffrax.StepTo)
     dt0 = None if own_start else first_step(system, t0, t1, x0, inputs, solver.order(term), controller)
     y0: Any = x0
@@ -115,6 +124,8 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
     filled = jnp.isfinite(saved)
     okay = diffrax.is_okay(done.result)
     if system.is_constrained:
+        # Rows that were not reached are projected at the start, so that their derivatives are finite, and left out
+        # below.
         safe, times = jnp.where(filled[:, None], x, x0), jnp.where(filled, saved, t0)
 
         def projected_onto(t, y, q):
@@ -137,6 +148,8 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
         filled = filled | okay
     else:
         saved = ts
+    # What is not a number here has derivatives that are not, so that a loss over failed rows cannot seem to have a
+    # gradient.
     consistent = consistent & admitted
     x = not_a_number(x, filled & consistent, x0, system, inputs)
     failure: Any = diffrax.RESULTS.nonlinear_divergence
@@ -153,9 +166,9 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
 run_compiled = compiled(run)
 
 
-def _whole(t: Any, y: Any, args: Any) -> Any:
+def _whole(t: Time, y: State, args: Args) -> Any:
     return y
 
 
-def _state_and_discrete(t: Any, y: HybridState, args: Any) -> Any:
+def _state_and_discrete(t: Time, y: HybridState, args: Args) -> Any:
     return y.x, y.q

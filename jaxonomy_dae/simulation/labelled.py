@@ -1,18 +1,16 @@
 """Solutions as tables of other libraries: a data frame of pandas, a data set of xarray."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ..errors import ModelError
 from ..model.array_names import inner_name
 from ..optional import optional_module
-
-if TYPE_CHECKING:
-    from .solution import Solution
+from .by_name import ByName
 
 
-def data_frame(solution: "Solution", names: tuple[str, ...]) -> Any:
+def data_frame(solution: ByName, names: tuple[str, ...]) -> Any:
     """A `pandas.DataFrame`: one column for each variable, indexed by time."""
     pandas = optional_module("pandas", "pandas", "to_pandas needs pandas")
     if solution.ts.ndim != 1:
@@ -24,7 +22,7 @@ def data_frame(solution: "Solution", names: tuple[str, ...]) -> Any:
     return pandas.DataFrame(np.asarray(solution[chosen]), index=index, columns=chosen)
 
 
-def data_set(solution: "Solution", names: tuple[str, ...]) -> Any:
+def data_set(solution: ByName, names: tuple[str, ...]) -> Any:
     """An `xarray.Dataset`: variables over `time`; a batch adds the dimensions `batch_0`, `batch_1`, …"""
     xarray = optional_module("xarray", "xarray", "to_xarray needs xarray")
     dims = tuple(f"batch_{k}" for k in range(solution.ts.ndim - 1))
@@ -35,7 +33,7 @@ def data_set(solution: "Solution", names: tuple[str, ...]) -> Any:
 
 
 def dataset_of(
-    xarray: Any, solution: "Solution", dims: tuple[str, ...], coordinates: dict[str, Any], names: tuple[str, ...] = ()
+    xarray: Any, solution: ByName, dims: tuple[str, ...], coordinates: dict[str, Any], names: tuple[str, ...] = ()
 ) -> Any:
     """The variables of a solution, or of a batch that has the dimensions `dims`, with their units. An array that is
     named is one variable, with a dimension for each that it has."""

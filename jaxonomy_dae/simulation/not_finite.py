@@ -4,18 +4,19 @@ from typing import Any
 
 import numpy as np
 
+from ..aliases import State, Time
 from ..lowering.schedule import StepEquation
 from ..model.group import Point
 from ..model.networks import Networks
 from ..system.system import AcausalSystem
 
-SHOWN = 4
-ANY = 0.5  # in place of what the equation is to determine
+SHOWN = 4  # variables with their values in an error
+ANY = 0.5  # the value given to the unknown of an equation that is only asked whether it is finite
 
 
-def equation_not_finite(system: AcausalSystem, inputs: Any, t: Any, x: Any) -> str:
-    """The first equation, in the order of solution, that reads finite values and is not finite itself, with what it
-    reads; nothing if there is none."""
+def equation_not_finite(system: AcausalSystem, inputs: Any, t: Time, x: State) -> str:
+    """Names the first equation, in the order of solution, that reads finite values and is not finite itself, with what
+    it reads; "" if there is none."""
     plan = system.plan
     every = np.arange(plan.extended.quantities.n)
     found = system.at(t, inputs).quantities(x, every, np.ones(len(every)))

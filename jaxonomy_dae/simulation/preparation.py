@@ -7,6 +7,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 
+from ..aliases import Args, Controller, Solver, State, Time, Tolerance
 from ..linear.choice import SPARSE_FROM
 from ..solvers import BDF, DAETerm, Tsit5
 from ..solvers.choice_guard import ChoiceGuard
@@ -16,7 +17,7 @@ from ..system.system import AcausalSystem
 
 
 def term_of(system: AcausalSystem, implicit: bool) -> diffrax.AbstractTerm:
-    """The system as Diffrax sees it: explicit, or differential-algebraic."""
+    """The system as a Diffrax term: an ODE, or with `implicit` a differential-algebraic equation."""
     if not implicit:
         return diffrax.ODETerm(system.vector_field)
     plan = system.plan
@@ -24,8 +25,8 @@ def term_of(system: AcausalSystem, implicit: bool) -> diffrax.AbstractTerm:
     return DAETerm(field, mass=system.mass, pattern=plan.dae_pattern if plan.n_state >= SPARSE_FROM else None)
 
 
-def prepared(system: AcausalSystem, solver: Any, implicit: bool, watch: Watch | None, atol: Any) -> Any:
-    """The solver with what the system fills in: projections, what to watch."""
+def prepared(system: AcausalSystem, solver: Solver, implicit: bool, watch: Watch | None, atol: Tolerance) -> Any:
+    """The solver with what the system supplies filled in: projections and the determinants to watch."""
     if isinstance(solver, Tsit5) and watch is not None:
         solver = Tsit5(looped=solver.looped, watch=watch)
     # A minimal set of states may become a singular choice on the way.
@@ -45,7 +46,7 @@ def prepared(system: AcausalSystem, solver: Any, implicit: bool, watch: Watch | 
     return solver
 
 
-def largest_tolerance(system: AcausalSystem, controller: Any) -> Any:
+def largest_tolerance(system: AcausalSystem, controller: Controller) -> Any:
     """The largest absolute tolerance in units of the nominal values; zero for steps of prescribed sizes."""
     while isinstance(controller, diffrax.ClipStepSizeController):
         controller = controller.controller
@@ -54,6 +55,6 @@ def largest_tolerance(system: AcausalSystem, controller: Any) -> Any:
     )
 
 
-def _unchanged(t: Any, x: Any, args: Any) -> Any:
-    """The projection of an implicit solver that has no constraint left: it solves nonlinear blocks itself."""
+def _unchanged(t: Time, x: State, args: Args) -> Any:
+    """The projection for an implicit solver of a system without constraints: it solves nonlinear blocks itself."""
     return x

@@ -34,8 +34,8 @@ from .preparation import term_of
 from .solution import Solution
 from .step_sizes import clipped, controller_for, scaled_atol
 
-FEW_NUMBERS = 20_000  # on one side of all events
-ROOM = 100  # events that are listed, at first
+FEW_NUMBERS = 20_000  # on one side of all events: up to so many, states before and after events are kept (160 kB)
+ROOM = 100  # events that the log of a first run has room for; a run with more is made again with room for all
 MOST_EVENTS = 2**7 * ROOM  # of a run, if the user does not say: with a few steps each, near the default max_steps
 SOLVERS = {"Tsit5": Tsit5, "Rodas5P": Rodas5P, "BDF": BDF}
 
@@ -232,8 +232,8 @@ def simulate(
 
 
 def _stiff_without_a_run(plan: SystemPlan, duration: float | None) -> str:
-    """Why a system counts as stiff where it cannot be tried first, inside jit; or nothing. What runs outside of jit
-    found is not asked: the result would depend on what the process did before."""
+    """The reason to count a system as stiff where an explicit solver cannot be tried first, inside jit; "" if it is
+    not. Runs outside of jit leave no trace for this: the result would depend on what the process did before."""
     if duration is None or fastest_decay(plan) * duration <= BOUNDARY * MANY:
         return ""
     return f"stiff: at the declared start something decays within {1 / fastest_decay(plan):.2g}"
@@ -242,7 +242,7 @@ def _stiff_without_a_run(plan: SystemPlan, duration: float | None) -> str:
 def _traced(
     outcome: Outcome, given: tuple[Any, ...], choice: Choice, checked: bool, bounds: tuple[int, int]
 ) -> Solution:
-    """The solution where nothing can be looked at: inside jit, grad or vmap."""
+    """The solution where values cannot be read: inside jit, grad or vmap."""
     system, inputs, x = given[0], given[4], outcome.x
     if checked:
         x = raised(x, outcome.result, system.plan.events is not None, *bounds)

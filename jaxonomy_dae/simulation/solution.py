@@ -21,7 +21,7 @@ from .accounts import account_values, chosen_terms
 from .event_log import EventLog, Events
 from .labelled import data_frame, data_set
 
-SHOWN = 8
+SHOWN = 8  # states that notebooks list
 
 
 class Solution(eqx.Module):
@@ -85,7 +85,7 @@ class Solution(eqx.Module):
         return _one(*given, jnp.asarray(quantity[0]), jnp.asarray(factor[0], self.states.dtype))
 
     def _state(self, quantity: int, factor: float) -> Any:
-        """The values of what is zero, or in the state array; None for all else."""
+        """The values of quantities that are zero or part of the state array; None for others."""
         if quantity < 0:
             return jnp.zeros(self.ts.shape, self.states.dtype)
         plan = self.system.plan
@@ -133,7 +133,7 @@ class Solution(eqx.Module):
 
     @property
     def stats(self) -> dict[str, Any]:
-        """What the integration took: numbers of steps, the solver and the reason for it."""
+        """The counts of steps, the solver's name, and the reason for choosing it."""
         return {**self.counts, "solver": self.solver, "reason": self.reason}
 
     def __contains__(self, name: str) -> bool:
@@ -238,7 +238,7 @@ class Solution(eqx.Module):
 
 
 def _each(batch: Solution, read: Callable[[Solution], Any]) -> Any:
-    """Reads every solution of a batch."""
+    """Reads every solution of a batch, by mapping over the batch axes."""
     return eqx.filter_vmap(read)(batch)
 
 
@@ -247,7 +247,8 @@ def _is_traced(tree: Any) -> bool:
 
 
 def _places(system: AcausalSystem, quantity: np.ndarray) -> np.ndarray | None:
-    """Where in the state array quantities are, of which some may be zero; None if one is not there."""
+    """The places of quantities in the state array; −1 in `quantity` stands for zero and gets any place. None if one is
+    not part of the state array."""
     plan = system.plan
     place = np.full(plan.extended.quantities.n + 1, -1)  # the last entry stands for zero
     place[np.concatenate([plan.states, plan.carried])] = np.arange(plan.n_state)
@@ -278,7 +279,7 @@ def _everything(system: AcausalSystem, ts, states, inputs, discrete):
 
 @compiled
 def _one(system: AcausalSystem, ts, states, inputs, discrete, quantity, factor):
-    """One quantity, chosen while running: compiled once for all names."""
+    """The values of one quantity, shape (n,). Its number is traced, so that one program serves all names."""
     every = np.arange(system.plan.extended.quantities.n)
     return factor * _observed(system, ts, states, inputs, discrete, every, np.ones(len(every)))[:, quantity]
 

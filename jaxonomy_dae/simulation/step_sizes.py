@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from ..aliases import Controller, Solver, State, Time, Tolerance
 from ..errors import ModelError
 from ..solvers.drive import is_implicit
 from ..solvers.solve import step_control
@@ -17,7 +18,7 @@ from ..system.system_at import SystemAt
 from .wave_control import WaveControl
 
 
-def scaled_atol(system: AcausalSystem, atol: Any) -> Any:
+def scaled_atol(system: AcausalSystem, atol: Tolerance) -> Any:
     """The absolute tolerance in units of the nominal values of the states."""
     nominal = system.plan.nominal
     if len(nominal) and (nominal != 1).any():
@@ -25,9 +26,9 @@ def scaled_atol(system: AcausalSystem, atol: Any) -> Any:
     return atol
 
 
-def controller_for(system: AcausalSystem, solver: Any, rtol: Any, atol: Any, dtmax: Any) -> Any:
-    """The controller for tolerances: absolute ones in units of the nominal values. If the user does not bound steps,
-    the waves do by which the model is driven."""
+def controller_for(system: AcausalSystem, solver: Solver, rtol: Tolerance, atol: Tolerance, dtmax: Time) -> Any:
+    """The step-size controller for these tolerances, the absolute ones in units of the nominal values. If the user
+    gives no longest step, it is bounded by the period of the waves that drive the model."""
     atol = scaled_atol(system, atol)
     if is_implicit(solver):
         controller: Any = step_control(solver, rtol, atol, dtmax=dtmax)
@@ -39,8 +40,8 @@ def controller_for(system: AcausalSystem, solver: Any, rtol: Any, atol: Any, dtm
     return WaveControl(controller, *at.waves())  # pyright: ignore[reportCallIssue]
 
 
-def clipped(controller: Any, jump_ts: Any, ends: StepEnds) -> Any:
-    """The controller with steps that end at jumps and kinks; times that the user prescribes stay as they are."""
+def clipped(controller: Controller, jump_ts: Any, ends: StepEnds) -> Any:
+    """Wraps the controller so that steps end at jumps and kinks; steps prescribed by the user stay as they are."""
     if isinstance(controller, diffrax.StepTo):
         if jump_ts is not None:
             raise ModelError("jump_ts and StepTo both say where steps end: list the jumps in StepTo(ts=...)")
@@ -53,7 +54,9 @@ def clipped(controller: Any, jump_ts: Any, ends: StepEnds) -> Any:
     return diffrax.ClipStepSizeController(lengths, step_ts=joined[1], jump_ts=joined[0])
 
 
-def first_step(system: AcausalSystem, t0: Any, t1: Any, x0: Any, inputs: Any, order: Any, controller: Any) -> Any:
+def first_step(
+    system: AcausalSystem, t0: Time, t1: Time, x0: State, inputs: Any, order: Any, controller: Controller
+) -> Any:
     """The size of the first step (Hairer, Nørsett & Wanner 1993, II.4), kept out of differentiation."""
     if isinstance(controller, diffrax.StepTo) or not x0.shape[0]:
         return None if isinstance(controller, diffrax.StepTo) else t1 - t0
@@ -67,6 +70,7 @@ def first_step(system: AcausalSystem, t0: Any, t1: Any, x0: Any, inputs: Any, or
     def size(v):
         return jnp.sqrt(jnp.mean((v / scale) ** 2))
 
+    # Hairer's limits: below them |y| or |y'| tells no size, and the probe is a fixed small step.
     tiny = 1e-5
 
     def probe(f0):
@@ -88,6 +92,7 @@ def first_step(system: AcausalSystem, t0: Any, t1: Any, x0: Any, inputs: Any, or
     power = 1.0 / ((order or 1) + 1)
     h1 = jnp.where(largest <= 1e-15, jnp.maximum(1e-6, h0 * 1e-3), (0.01 / jnp.maximum(largest, 1e-15)) ** power)
     h = jnp.minimum(jnp.minimum(100 * h0, h1), t1 - t0)
+    # Where slopes are small beside how fast they change, the run begins nearly at rest: the step resolves that change.
     h = jnp.where(d1**2 < UNSEEN * d2, jnp.minimum(h, 0.1 * d1 / jnp.maximum(d2, 1e-15)), h)
     h = jnp.where(jnp.isfinite(h) & (h > 0), h, 1e-6 * (t1 - t0))
     return jax.lax.stop_gradient(h)  # inputs may close over what is differentiated

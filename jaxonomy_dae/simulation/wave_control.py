@@ -13,6 +13,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..adjoint.wrapped_control import WrappedControl
+from ..aliases import Controller, Time
 
 QUARTER = 0.5 * jnp.pi  # of a turn, radians
 # Of a quarter: shorter steps look at a wave 16 times in a period, and are left alone, because an implicit solver pays
@@ -23,17 +24,10 @@ ROUNDINGS = 16  # of the angle: as far from an extreme as times are known, where
 
 
 class WaveControl(WrappedControl):
-    """The step sizes of another controller, bounded by a quarter of the shortest period of waves, and long steps end
-    where sin(ωt + φ) of one is zero, one or minus one. Times are constants of differentiation, as step sizes are.
+    """Wraps a controller for inputs that are waves sin(ωt + φ): steps are at most a quarter of the shortest period, and
+    long steps end where a wave is zero, one or minus one. Times are constants of differentiation, as step sizes are."""
 
-    **Arguments:**
-
-    - `controller`: another one.
-    - `frequency`: ω of the waves, rad/s, shape (waves,).
-    - `phase`: φ of the waves, rad, shape (waves,); NaN for one whose phase moves, by which steps are only bounded.
-    """
-
-    controller: Any
+    controller: Controller
     frequency: Float[Array, " waves"]
     phase: Float[Array, " waves"]
 
@@ -46,14 +40,15 @@ class WaveControl(WrappedControl):
         return self._end(t0, end), state
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
-        """Whether the step is kept, and the next one."""
+        """Lets the wrapped controller accept or reject the step, and shortens the next one by `_end`."""
         keep, start, end, jump, state, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
         )
         return keep, start, self._end(start, end), jump, state, result
 
-    def _end(self, start: Any, end: Any) -> Any:
-        """Where a step from `start` ends that another controller would end at `end`."""
+    def _end(self, start: Time, end: Time) -> Any:
+        """The end of a step that the wrapped controller would take from `start` to `end`, moved forwards so that steps
+        end where a wave has turned by whole quarters."""
         begin, step, frequency, phase = lax.stop_gradient((start, end - start, self.frequency, self.phase))
         quarter = QUARTER / jnp.abs(frequency)  # infinite for what does not turn
         bounded = jnp.minimum(step, jnp.min(quarter))

@@ -10,6 +10,7 @@ import lineax as lx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
+from ..aliases import State, Time
 from ..linear.choice import choose
 from .bdf_coefficients import Coefficients, coefficients, interpolate
 from .choice_guard import ChoiceGuard
@@ -26,14 +27,14 @@ CAUTION = 4.0  # local errors are kept this much below the tolerance: those of a
 class BDFInterpolation(diffrax.AbstractLocalInterpolation):
     """The polynomial that the method itself integrates, of the step's order."""
 
-    t0: Any
-    t1: Any
-    y0: Any
+    t0: Time
+    t1: Time
+    y0: State
     phi: Any
     psi: Any
     order: Any
 
-    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> Any:
+    def evaluate(self, t0: Time, t1: Time = None, left: bool = True) -> Any:
         """The solution at t0, or its increment from t0 to t1."""
         if t1 is not None:
             return jax.tree.map(jnp.subtract, self.evaluate(t1), self.evaluate(t0))
@@ -41,8 +42,8 @@ class BDFInterpolation(diffrax.AbstractLocalInterpolation):
         return jax.tree.map(lambda phi: jnp.tensordot(weight.astype(phi.dtype), phi, axes=1), self.phi)
 
 
-class _State(eqx.Module):
-    """What a step needs of those before it; names as in Brenan, Campbell & Petzold (1996)."""
+class _History(eqx.Module):
+    """History of the integration that the next step reads; names as in Brenan, Campbell & Petzold (1996)."""
 
     phi: Float[Array, "rows n"]  # scaled divided differences
     psi: Float[Array, " rows"]  # sums of past step sizes
@@ -135,20 +136,20 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
     def _measured(self, t, y, args):
         return None if self.guard is None else self.guard.measure(t, y, args)
 
-    def _fresh(self, y, slope, h, factor, counts, largest) -> _State:
+    def _fresh(self, y, slope, h, factor, counts, largest) -> _History:
         """The history of order 1 with one derivative known."""
         h = jnp.asarray(h)
         one, zero = jnp.array(1, jnp.int32), jnp.array(0, jnp.int32)
         phi = jnp.zeros((ROWS, y.shape[0]), y.dtype).at[0].set(y).at[1].set(h.astype(y.dtype) * slope)
         still = jax.lax.stop_gradient(h)
-        return _State(
+        return _History(
             phi, h * jnp.arange(1, ROWS + 1, dtype=h.dtype), one, zero, zero, jnp.zeros_like(still), still,
             jnp.array(True), factor, jnp.zeros_like(still), jnp.zeros_like(still), jnp.full((), 20.0, h.dtype), counts,
             largest,
         )  # fmt: skip
 
-    def step(self, terms, t0, t1, y0, args, solver_state: _State, made_jump):
-        """One step, with error estimate and dense output."""
+    def step(self, terms, t0, t1, y0, args, solver_state: _History, made_jump):
+        """One step with its error estimate and dense output; see `diffrax.AbstractSolver.step`."""
         problem = FlatProblem(terms, y0, args)
         y = problem.flat
         linear = choose(self.linear_solver, y.shape[0], problem.pattern, problem.mass)
@@ -166,7 +167,8 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         rtol, atol, norm = self.root_finder.values(y.dtype)
         weight = jax.lax.stop_gradient(CAUTION / (atol + rtol * jnp.abs(y)))
 
-        # After rejections the step is shorter than it was planned to be, and the next orders count for less.
+        # After rejections the step is shorter than it was planned to be. As in IDA, the attempt after the third
+        # rejection is made with order 1: by then the step is at most 0.9·0.25·0.25 = 0.056 of what was planned.
         ratio = jax.lax.stop_gradient(h) / state.planned
         retried = ratio < 0.95
         order = jnp.where(retried & (ratio < 0.07) & (not self.fixed_order), 1, state.order)
@@ -197,6 +199,8 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         phi_, e_ = still(phi), still(e)
         k = order
 
+        # Algebraic unknowns left out of the error test are those of `algebraic_errors=False`: they are solved for, and
+        # have no error of their own at the ends of steps.
         def size(v):
             return norm(weight * (v if count_all else problem.mass.differential_part(v)))
 
@@ -215,12 +219,15 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         kf = k.astype(y.dtype)
         total, total_1, total_2 = (kf + 1) * err, kf * err_1, (kf - 1) * err_2
         fall = jnp.where(k > 2, jnp.maximum(total_1, total_2) <= total, (k == 2) & (total_1 <= 0.5 * total))
-        fall = fall & (total > 0)  # where nothing moves, derivatives need a high order
+        # Where nothing moves all estimates are zero. The order then rises all the same: the run may be differentiated,
+        # and the motion after a small push, which the derivative is, needs a high order.
+        fall = fall & (total > 0)
         accepted = solved.converged & allowed & (c.test.astype(y.dtype) * e_norm < 1.0)
 
         same = jnp.abs(still(h) - state.last_step) <= 1e-6 * state.last_step
         steady = jnp.where(same & (k == state.last_order), state.steady, 0)
         steady = jnp.minimum(steady + 1, state.last_order + 2)
+        # At first, order and size rise with every step until an estimate says that a lower order would do.
         starting = starting & ~fall & (k < self.max_order)
         err_up = size(e_ - row(k + 1)) / (kf + 2)
         total_up = (kf + 2) * err_up
@@ -236,6 +243,8 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
             estimate = err
         next_order = jnp.where(starting, jnp.where(first, k, k + 1), k + change).astype(jnp.int32)
         next_order = jnp.clip(next_order, 1, self.max_order)
+        # IDA's rule: the step stays, so that its factorisation does, unless it may double or must shrink. The estimate
+        # is doubled for safety, and 1e-4 keeps the quotient finite where nothing moves.
         wish = (2 * estimate + 1e-4) ** (-1 / (next_order.astype(y.dtype) + 1))
         factor = jnp.where(wish >= 2, 2.0, jnp.where(wish <= 1, jnp.clip(wish, 0.5, 0.9), 1.0))
         factor = jnp.where(starting, jnp.where(first, 1.0, 2.0), factor)
@@ -245,11 +254,12 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
 
         updated = _advance(phi, e, k, self.max_order)
         h_ = still(h)
-        new_state = _State(
+        new_state = _History(
             updated, c.psi, next_order, k, steady.astype(jnp.int32), h_, h_ * factor.astype(h_.dtype), starting,
             solved.factor, solved.factor_cj, still(cj), solved.contraction,
             state.counts + jnp.stack([solved.factorisations, solved.iterations]), largest,
         )  # fmt: skip
+        # The controller divides the error by the same scale, which must be finite where y1 is not.
         value = jnp.where(jnp.isfinite(y1), y1, y)
         scale = atol + jnp.maximum(jnp.abs(y), jnp.abs(value)) * rtol
         y_error = encoded(factor, accepted) * still(jnp.broadcast_to(scale, y.shape))
@@ -258,7 +268,7 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         return problem.unravel(y1), problem.unravel(y_error), dense, new_state, result
 
 
-def ravel_like(y: Any) -> Float[Array, " n"]:
+def ravel_like(y: State) -> Float[Array, " n"]:
     """A solution as one vector."""
     return ravel_pytree(y)[0]
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 
 
 class Coefficients(NamedTuple):
-    """What a step of size h and order k multiplies differences with."""
+    """The factors by which a step of size h and order k multiplies divided differences."""
 
     psi: Float[Array, " rows"]  # ψ_i(n+1): sums of the last i + 1 step sizes
     beta: Float[Array, " rows"]  # φ*_i = β_i φ_i

@@ -8,23 +8,27 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..aliases import Args, State, Terms, Time
 from .dae_term import FlatProblem
 from .index_one import consistent_slope
 
-LARGE = 300  # unknowns up to which eigenvalues are looked at
+LARGE = 300  # unknowns up to which eigenvalues are looked at: they cost n³, some 0.1 s at 300
 NEAR = 10.0 ** np.arange(-15, -5)  # parts of the interval
 Slope = Callable[[Any, Any], Float[Array, " n"]]
 
 
 def cause_of(
-    problem: FlatProblem, t: Any, y: Any, t1: Any, weight: np.ndarray, names: Sequence[str], steps: int, explicit: bool
+    problem: FlatProblem,
+    t: Time,
+    y: State,
+    t1: Time,
+    weight: np.ndarray,
+    names: Sequence[str],
+    steps: int,
+    explicit: bool,
 ) -> str:
-    """A sentence on what stops an integration at its last accepted point (t, y), and what to write; or nothing.
-
-    - `weight`: the tolerance of every unknown there.
-    - `steps`: that were allowed.
-    - `explicit`: whether the solver was.
-    """
+    """A sentence on the cause that stops an integration at its last accepted point (t, y), and what to write instead;
+    "" if none is recognised."""
 
     @jax.jit
     def slope(t, y):
@@ -42,16 +46,17 @@ def cause_of(
 
 
 def first_bad_row(problem: FlatProblem, right: np.ndarray, names: Sequence[str]) -> str:
-    """The first row that is not finite, by the unknown whose derivative it gives, if it gives one."""
+    """Names the first row that is not finite, by the unknown whose derivative it gives, if there is one."""
     k = int(np.flatnonzero(~np.isfinite(right))[0])
     own = problem.mass.is_diagonal and problem.mass.array[k] != 0
     return f"the derivative of '{names[k]}' (row {k} of F)" if own else f"row {k} of F"
 
 
 def _end_of_domain(
-    problem: FlatProblem, here: np.ndarray, t: Any, y: Any, t1: Any, names: Sequence[str]
+    problem: FlatProblem, here: np.ndarray, t: Time, y: State, t1: Time, names: Sequence[str]
 ) -> str:  # fmt: skip
-    """Whether the equations have no value just beyond the point."""
+    """Says which row of the equations is not finite a short way beyond the point, along the slope `here`; "" if none
+    is."""
     right = jax.jit(problem.right)
     span = float(t1 - t)
     for part in NEAR:
@@ -66,8 +71,9 @@ def _end_of_domain(
     return ""
 
 
-def _jump(slope: Slope, here: np.ndarray, t: Any, y: Any, weight: np.ndarray, names: Sequence[str]) -> str:
-    """Whether slopes jump across the point, in the direction of motion, as under sign(x) at x = 0."""
+def _jump(slope: Slope, here: np.ndarray, t: Time, y: State, weight: np.ndarray, names: Sequence[str]) -> str:
+    """Says which derivative jumps across the point in the direction of motion, as under sign(x) at x = 0; "" if none
+    does."""
     size = np.asarray(weight) / np.maximum(np.abs(here), np.finfo(here.dtype).tiny)
     h = float(np.min(size))  # in which the fastest unknown moves by its tolerance
     gaps = []
@@ -89,8 +95,8 @@ def _jump(slope: Slope, here: np.ndarray, t: Any, y: Any, weight: np.ndarray, na
     )
 
 
-def _escape(here: np.ndarray, y: Any, t: float, t1: float, weight: np.ndarray, names: Sequence[str]) -> str:
-    """Whether an unknown grows so fast that it is infinite before the end."""
+def _escape(here: np.ndarray, y: State, t: float, t1: float, weight: np.ndarray, names: Sequence[str]) -> str:
+    """Says which unknown grows so fast that it becomes infinite before t1; "" if none does."""
     value = np.asarray(y)
     growing = value * here > 0
     rest = np.where(growing, np.abs(value) / np.maximum(np.abs(here), np.finfo(here.dtype).tiny), np.inf)
@@ -105,13 +111,13 @@ def _escape(here: np.ndarray, y: Any, t: float, t1: float, weight: np.ndarray, n
     )
 
 
-def decay_at(term: Any, args: Any, t: Any, y: Any) -> float:
+def decay_at(term: Terms, args: Args, t: Time, y: State) -> float:
     """The largest −Re λ of the eigenvalues at a point; 0 if there is none, or there are many unknowns."""
     problem = FlatProblem(term, y, args)
     return _decay(lambda t, y: consistent_slope(problem, None, t, y), t, problem.flat)
 
 
-def _decay(slope: Slope, t: Any, y: Any) -> float:
+def _decay(slope: Slope, t: Time, y: State) -> float:
     if not 0 < y.shape[0] <= LARGE:
         return 0.0
     matrix = np.asarray(jax.jit(jax.jacfwd(lambda v: slope(t, v)))(y))
@@ -119,11 +125,12 @@ def _decay(slope: Slope, t: Any, y: Any) -> float:
 
 
 def is_stiff(decay: float, duration: float, steps: int) -> bool:
-    """Whether decay alone demands more explicit steps than there were."""
+    """True if stability limits explicit steps, not accuracy: the fastest decay (1/s) times the duration (s) is more
+    than 0.3 for each step taken."""
     return decay * duration > 0.3 * steps
 
 
-def _stiffness(slope: Slope, t: Any, y: Any, t1: Any, steps: int) -> str:
+def _stiffness(slope: Slope, t: Time, y: State, t1: Time, steps: int) -> str:
     decay = _decay(slope, t, y)
     if not is_stiff(decay, float(t1 - t), steps):
         return ""

@@ -13,16 +13,21 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ..aliases import Args, State, Time, Tolerance
+
 Determinants = Float[Array, " blocks"]
 
 SINGULAR_CHOICE: Any = diffrax.RESULTS.singular
-NEAREST = 1e-4  # of the largest determinant so far
+# Of the largest determinant so far: the determinant is as near to zero as z is to the branch point, and an error of
+# 1e-8 in x, the default tolerance, is one of 1e-4 in z (see above).
+NEAREST = 1e-4
 IN_DOUBT = 30.0  # absolute tolerances: a variable this close to the branch point may have passed it
 REFUSED = 0.5  # of the nearest: a step that goes further is not accepted, so that the end is found from one side
 
 
 class Verdict(eqx.Module):
-    """On a step: whether it may be kept, whether the run goes on if it is, and the largest determinants so far."""
+    """The judgement of a step: whether it may be kept, whether the run goes on if it is, and the largest determinants
+    so far."""
 
     allowed: Bool[Array, ""]
     goes_on: Bool[Array, ""]
@@ -41,9 +46,9 @@ class ChoiceGuard(eqx.Module):
     """
 
     measure: Callable[[Any, Any, Any], Determinants]
-    atol: Any
+    atol: Tolerance
 
-    def judge(self, largest: Determinants, t: Any, y: Any, args: Any) -> Verdict:
+    def judge(self, largest: Determinants, t: Time, y: State, args: Args) -> Verdict:
         """Judges a step by its end."""
         found = self.measure(t, y, args)
         along, size = jnp.sign(largest) * found, jnp.abs(largest)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from ..aliases import Args, State, Terms, Time
 from ..errors import ModelError
 from ..linear.mass import Mass
 from ..private_names import unwrapped
@@ -56,7 +57,7 @@ class DAETerm(diffrax.AbstractTerm):
         self.mass = mass if mass is None or isinstance(mass, Mass) else Mass(mass)
 
     def vf(self, t, y, args):
-        """F(t, y), or (f, g), as it looks like y."""
+        """F(t, y), or (f, g), in the structure of y."""
         return ravel_pytree(y)[1](self.right(t, y, args))
 
     def contr(self, t0, t1, **kwargs):
@@ -68,7 +69,7 @@ class DAETerm(diffrax.AbstractTerm):
             "Use jaxonomy_dae.solvers.BDF() or jaxonomy_dae.solvers.Rodas5P()"
         )
 
-    def right(self, t: Any, y: Any, args: Any) -> Any:
+    def right(self, t: Time, y: State, args: Args) -> Any:
         """F(t, y), flat, shape (n,)."""
         if self.constraint is None:
             out = self.field(t, y, args)
@@ -85,8 +86,8 @@ class DAETerm(diffrax.AbstractTerm):
             )
         return jnp.concatenate([ravel_pytree(f)[0], found])
 
-    def mass_of(self, y: Any) -> Mass:
-        """M for a solution that looks like y."""
+    def mass_of(self, y: State) -> Mass:
+        """The mass matrix M for a solution in the structure of y."""
         if self.mass is None:
             if not (isinstance(y, tuple) and len(y) == 2):
                 raise ModelError(f"the solution of DAETerm(f, g) is a pair (x, z); got {jax.tree.structure(y)}")
@@ -122,12 +123,9 @@ def _check_like(name: str, found: Any, expected: Any):
 
 
 class FlatProblem:
-    """A term seen by our solvers: M dy/dt = F(t, y) for a flat y, in the direction of integration.
+    """A term as solvers use it: M dy/dt = F(t, y) for a flat y, in the direction of integration."""
 
-    Diffrax hands over its own wrapper, which turns time around where t1 < t0.
-    """
-
-    def __init__(self, terms: Any, y: Any, args: Any):
+    def __init__(self, terms: Terms, y: State, args: Args):
         self.term, self.direction = unwrapped(terms)
         self.args = args
         self.terms = terms
@@ -141,11 +139,11 @@ class FlatProblem:
             self.pattern = None
 
     def frozen(self) -> "FlatProblem":
-        """The same without derivatives."""
+        """A copy in which all arrays are constant under differentiation."""
         parts = self.terms, self.like, self.args
         return FlatProblem(*jax.tree.map(lambda v: jax.lax.stop_gradient(v) if eqx.is_array(v) else v, parts))
 
-    def right(self, t: Any, flat: Any) -> Any:
+    def right(self, t: Time, flat: Any) -> Any:
         """F, shape (n,)."""
         y = self.unravel(flat)
         sign = jnp.asarray(self.direction, flat.dtype)

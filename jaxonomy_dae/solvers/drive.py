@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from ..adjoint.late_times import diffeqsolve, times_fit
+from ..aliases import Args, Controller, Result, Solver, State, Terms, Time
 from .bdf import BDF
 from .projected import Projected
 from .rodas5p import Rodas5P
@@ -21,52 +22,49 @@ TIMES = (
 
 
 class Run(NamedTuple):
-    """What an integration returns: saved times and values, the last accepted point (t, y), counts, a result code."""
+    """The raw result of an integration: saved times and values, the last accepted point (t, y), counts, a result
+    code."""
 
     ts: Any
     ys: Any
     last: tuple[Any, Any]
     stats: dict[str, Any]
-    result: Any
+    result: Result
 
 
-def inner(solver: Any) -> Any:
+def inner(solver: Solver) -> Any:
     """The solver without the projection around it."""
     return solver.solver if isinstance(solver, Projected) else solver
 
 
-def is_implicit(solver: Any) -> bool:
-    """Whether the solver takes differential-algebraic equations."""
+def is_implicit(solver: Solver) -> bool:
+    """True if the solver, or the one it wraps, takes differential-algebraic equations."""
     return isinstance(inner(solver), BDF | Rodas5P)
 
 
-def right_between_steps(solver: Any) -> Any:
-    """The solver with an error test that covers its dense output, where values within steps are saved."""
+def right_between_steps(solver: Solver) -> Any:
+    """The solver with an error test that covers its dense output, if values are saved within steps."""
     if isinstance(solver, Projected):
         return dataclasses.replace(solver, solver=right_between_steps(solver.solver))
     return dataclasses.replace(solver, dense_errors=True) if isinstance(solver, Rodas5P) else solver
 
 
-def is_multistep(solver: Any) -> bool:
-    """Whether the solver chooses step sizes itself."""
+def is_multistep(solver: Solver) -> bool:
+    """True if the solver, or the one it wraps, chooses its step sizes itself."""
     return isinstance(inner(solver), BDF)
 
 
 def integrate(
-    term: Any, solver: Any, t0: Any, t1: Any, dt0: Any, y0: Any, args: Any, *,
-    save: diffrax.SubSaveAt, controller: Any, adjoint: Any, max_steps: int, progress: bool = False,
+    term: Terms, solver: Solver, t0: Time, t1: Time, dt0: Time, y0: State, args: Args, *,
+    save: diffrax.SubSaveAt, controller: Controller, adjoint: Any, max_steps: int, progress: bool = False,
     checked: bool = False, goes_on: Any = True,
 ) -> Run:  # fmt: skip
-    """Integrates, saves what is asked for and the last accepted point, and counts Jacobians.
-
-    Where the times do not fit, no row counts as reached, and the result is `BAD_TIMES`; with `checked`, that is an
-    error while running. Where `goes_on` is false, no step is taken: with numbers that are not finite, all steps would
-    be rejected, up to `max_steps`, and the others of a batch would wait.
-    """
+    """Integrates; returns the values asked for, the last accepted point, and counts, Jacobians included."""
     fits = times_fit(t0, t1, save.ts, controller)
     if checked and fits is not True:
         t1 = eqx.error_if(t1, jnp.logical_not(fits), TIMES)
     counted = isinstance(solver, BDF)
+    # An interval of length zero: the loop over the steps ends before the first one.
     if goes_on is not True:
         t1 = jnp.where(goes_on, t1, t0)
     solved: Any = diffeqsolve(

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..aliases import Args, Result, State, Terms, Time, Tolerance
 from .causes import cause_of, first_bad_row
 from .dae_term import FlatProblem
 from .index_one import algebraic_part, consistent_slope, index_matrix
@@ -25,8 +26,14 @@ INDEX = (
 
 
 class StartCheck(eqx.Module):
-    """What `explain_start` reads: the residual of the algebraic equations and what rounding may leave of it, the step
-    that would mend it in units of the tolerance, and the matrix that is regular if the index is 1 (or None)."""
+    """The numbers by which a start is judged; read by `explain_start`.
+
+    - `right`: F at the start, shape (n,).
+    - `residual`, `rounding`: the residual of the algebraic equations, and the part of it that rounding may leave, shape
+        (n,).
+    - `shift`: the step that would make them hold, in units of the tolerance, shape (n,).
+    - `matrix`: the matrix that is regular if the index is 1, shape (n, n), or None.
+    """
 
     right: Any
     residual: Any
@@ -36,17 +43,17 @@ class StartCheck(eqx.Module):
 
     @property
     def is_fine(self) -> Any:
-        """Whether the equations are finite at the start and the algebraic ones hold."""
+        """True if the equations are finite at the start and the algebraic ones hold to the tolerance."""
         return jnp.all(jnp.isfinite(self.right)) & (jnp.max(jnp.abs(self.shift), initial=0.0) <= 1)
 
     def error_if(self, ys: Any) -> Any:
-        """For traced starts: an error while running."""
+        """Adds run-time errors to `ys` for a start that is traced and turns out to be bad."""
         ys = eqx.error_if(ys, ~jnp.all(jnp.isfinite(self.right)), "the equations are not finite at the start")
         return eqx.error_if(ys, ~self.is_fine, "inconsistent start: see jaxonomy_dae.solvers.consistent_start")
 
 
-def start_check(problem: FlatProblem, t: Any, rtol: Any, atol: Any) -> StartCheck:
-    """Evaluates the equations at the start."""
+def start_check(problem: FlatProblem, t: Time, rtol: Tolerance, atol: Tolerance) -> StartCheck:
+    """Evaluates the equations at the start, for `explain_start`."""
     problem_y = jax.lax.stop_gradient(problem.flat)
     if not problem.mass.is_singular:
         empty = jnp.zeros((0,), problem_y.dtype)
@@ -62,14 +69,14 @@ def start_check(problem: FlatProblem, t: Any, rtol: Any, atol: Any) -> StartChec
     return jax.lax.stop_gradient(StartCheck(right, residual, rounding, shift, looked_at))
 
 
-def _flat(atol: Any, like: Any) -> Any:
+def _flat(atol: Tolerance, like: Any) -> Any:
     parts = [jnp.ravel(jnp.asarray(leaf, like.dtype)) for leaf in jax.tree.leaves(atol)]
     joined = jnp.concatenate(parts)
     return joined if joined.shape == like.shape else joined[0]
 
 
 def explain_start(check: StartCheck, names: Sequence[str]) -> str:
-    """What is wrong with a start, or nothing."""
+    """The reason, in a sentence, why a start cannot be used; "" if it can."""
     right = np.asarray(check.right)
     if not np.isfinite(right).all():
         rows = np.flatnonzero(~np.isfinite(right))[:SHOWN]
@@ -99,7 +106,7 @@ def explain_start(check: StartCheck, names: Sequence[str]) -> str:
 
 
 def null_names(matrix: np.ndarray, names: Sequence[str]) -> str:
-    """The unknowns that a singular matrix leaves undetermined, by name; nothing if it is regular."""
+    """The names of unknowns that a singular matrix leaves undetermined; "" if it is regular."""
     if not np.isfinite(matrix).all():
         return ""
     rows = np.abs(matrix).max(axis=1)
@@ -112,7 +119,7 @@ def null_names(matrix: np.ndarray, names: Sequence[str]) -> str:
     return ", ".join(f"'{names[k]}'" for k in np.argsort(-null)[:SHOWN] if null[k] > 1e-3)
 
 
-def how_it_stopped(result: Any, t: Any, max_steps: int) -> str:
+def how_it_stopped(result: Result, t: Time, max_steps: int) -> str:
     """The first sentence of an explanation."""
     many = result == diffrax.RESULTS.max_steps_reached
     reason = f"max_steps={max_steps} was reached" if many else "no step was short enough to be accepted"
@@ -120,10 +127,11 @@ def how_it_stopped(result: Any, t: Any, max_steps: int) -> str:
 
 
 def explain_failure(
-    term: Any, args: Any, t: Any, y: Any, names: Sequence[str], *,
-    result: Any, t0: Any, t1: Any, max_steps: int, rtol: Any, atol: Any, explicit: bool = False,
+    term: Terms, args: Args, t: Time, y: State, names: Sequence[str], *,
+    result: Result, t0: Time, t1: Time, max_steps: int, rtol: Tolerance, atol: Tolerance, explicit: bool = False,
 ) -> str:  # fmt: skip
-    """Why an integration stopped at the last accepted point (t, y), and what to write."""
+    """The reason, in a sentence, why an integration stopped at the last accepted point (t, y), and what to write
+    instead."""
     problem = FlatProblem(term, y, args)
     flat, time = problem.flat, jnp.asarray(t)
     many = result == diffrax.RESULTS.max_steps_reached

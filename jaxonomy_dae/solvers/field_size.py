@@ -15,7 +15,7 @@ LARGE = 400  # operations from which stages are looped over: a pendulum has 150,
 
 
 def is_large(function: Callable[..., Any], *arguments: Any) -> bool:
-    """Whether the traced function has many operations."""
+    """True if the traced function has more than `LARGE` operations."""
     program = jax.make_jaxpr(function)(*arguments)
     try:
         kinds = private("Jaxpr"), private("ClosedJaxpr")
@@ -25,7 +25,8 @@ def is_large(function: Callable[..., Any], *arguments: Any) -> bool:
 
 
 def _operations(jaxpr: Any, plain: type, closed: type) -> int:
-    """How many operations, those of programs inside included; `plain` and `closed` are JAX's two classes of them."""
+    """The number of operations in a jaxpr, those of inner programs included; `plain` and `closed` are JAX's two classes
+    of them."""
     total = 0
     for equation in jaxpr.eqns:
         leaves = jax.tree.leaves(list(equation.params.values()), is_leaf=lambda v: isinstance(v, plain | closed))

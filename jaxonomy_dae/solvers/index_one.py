@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 from ..linear.choice import LinearAlgebra, choose
 from .dae_term import FlatProblem
 
-SHORTEST = 1e-6  # of a Newton step
+SHORTEST = 1e-6  # of a Newton step: if not even this part brings the next one down, there is no way on from here
 SURE = 1e-6  # steps so small are taken whole: rounding, not curvature, decides how long the next one is
 
 
@@ -104,6 +104,8 @@ def consistent_point(
 
         size = length(d)
 
+        # The restricted monotonicity test (Deuflhard 2004, section 3.3): the next step must be shorter by a quarter of
+        # the part of this one that is taken.
         def falls(fraction):
             return (size <= SURE) | (length(step(v + fraction * d)) <= (1 - fraction / 4) * size)
 
@@ -117,6 +119,8 @@ def consistent_point(
     begin = (y_still, jnp.asarray(jnp.inf, y.dtype), jnp.ones((), y.dtype), 0)
     found, size, *_ = jax.lax.while_loop(going, body, begin)
     found = y + frozen(found - y_still)
+    # The search above is not differentiated. From its root, one Newton step has the first derivative of the implicit
+    # function, and a second one the second derivative.
     step = _newton_step(problem, linear, t, found, y)
     for _ in range(2):
         found = found + step(found)

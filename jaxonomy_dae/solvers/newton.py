@@ -13,6 +13,7 @@ from ..private_names import FROM_CONTROLLER
 from .dae_term import FlatProblem
 
 CONVERGED = 0.1  # of the local error's tolerance (Brenan, Campbell & Petzold 1996, section 5.2.2)
+# The following, and the numbers in `attempt`, are those of IDA (Hindmarsh et al. 2005, ACM TOMS 31:363).
 DIVERGED = 0.9  # contraction rate above which an iteration is given up
 STALE = 0.25  # relative change of the leading coefficient that a factorisation survives
 
@@ -91,7 +92,10 @@ def implicit_step(
             renew, _, factor, factor_cj, contraction, made, iterations = carry
             factor, factor_cj = jax.lax.cond(renew, fresh, lambda: (factor, factor_cj))
             changed = renew | (cj != last_cj)
+            # ρ/(1−ρ) is not known before the second iteration. A pessimistic guess makes sure of two iterations, unless
+            # the first change is far below the tolerance: 20 for a new factorisation, 100 for one of another c_j.
             contraction = jnp.where(renew, 20.0, jnp.where(changed, 100.0, contraction))
+            # An old factorisation belongs to another c_j, which this factor makes up for (section 5.2.2).
             scale = (2 / (1 + cj / factor_cj)).astype(dtype)
 
             def iterate(inner):
@@ -131,6 +135,8 @@ def implicit_step(
             done, out = attempt((renew, None, factor, factor_cj, contraction, made, iterations))
             return jnp.array(True), done, out, renew
 
+        # Twice at most: with the factorisation at hand, and if that fails, with one made at the prediction. A second
+        # failure there is one of the step size, which the error test shortens.
         def unfinished(carry):
             _, done, _, was_fresh = carry
             return ~done & ~was_fresh

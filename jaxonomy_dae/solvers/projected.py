@@ -57,17 +57,17 @@ class Projected(_Wrapped):
 
     @property
     def scan_kind(self):
-        """How the wrapped solver loops over its stages."""
+        """The wrapped solver's kind of loop over its stages (`diffrax.AbstractRungeKutta.scan_kind`)."""
         return self.solver.scan_kind  # pyright: ignore[reportAttributeAccessIssue]
 
     @property
     def root_finder(self):
-        """How the wrapped solver finds roots."""
+        """The wrapped solver's root finder; Diffrax reads it to fill in tolerances."""
         return self.solver.root_finder  # pyright: ignore[reportAttributeAccessIssue]
 
     @property
     def root_find_max_steps(self):
-        """How long the wrapped solver looks for roots."""
+        """The wrapped solver's limit on the iterations of its root finder."""
         return self.solver.root_find_max_steps  # pyright: ignore[reportAttributeAccessIssue]
 
     def order(self, terms):

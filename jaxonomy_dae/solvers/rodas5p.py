@@ -11,6 +11,7 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..aliases import State, Time
 from ..linear.choice import choose
 from .dae_term import FlatProblem
 from .field_size import is_large
@@ -61,7 +62,7 @@ H = np.array(
 DEFECT_AT = 0.4  # the part of a step at which dense output is compared with the equations
 
 
-class Row(NamedTuple):
+class Stage(NamedTuple):
     """A stage solves (M/(γh) − J) k = F(t + node·h, y + Σ a·k) + M Σ c·k / h + d·h·∂F/∂t, k the stages before it."""
 
     a: Any
@@ -71,29 +72,29 @@ class Row(NamedTuple):
     moves: bool = True  # whether d is not zero
 
 
-def _rows() -> tuple[Row, ...]:
+def _stages() -> tuple[Stage, ...]:
     """The stages after the first, and the defect of the dense output, which has the form of a stage."""
     last = np.append(A[7, :7], 1.0)  # y1 = y + Σ last·k
     u = DEFECT_AT
     value = u * last + u * (1 - u) * (H[0] + u * (H[1] + u * H[2]))
     rate = last + (1 - 2 * u) * H[0] + (2 * u - 3 * u**2) * H[1] + (3 * u**2 - 4 * u**3) * H[2]
-    stages = [Row(A[i], C[i], float(D[i]), float(NODES[i]), bool(D[i])) for i in range(1, 8)]
-    return (*stages, Row(value, -rate, 0.0, u, False))
+    stages = [Stage(A[i], C[i], float(D[i]), float(NODES[i]), bool(D[i])) for i in range(1, 8)]
+    return (*stages, Stage(value, -rate, 0.0, u, False))
 
 
-ROWS = _rows()
+STAGES = _stages()
 
 
 class Rodas5PInterpolation(diffrax.AbstractLocalInterpolation):
     """The method's own dense output, of order 4 (Steinebach 2023, eq. 11)."""
 
-    t0: Any
-    t1: Any
-    y0: Any
-    y1: Any
+    t0: Time
+    t1: Time
+    y0: State
+    y1: State
     k: Any
 
-    def evaluate(self, t0: Any, t1: Any = None, left: bool = True) -> Any:
+    def evaluate(self, t0: Time, t1: Time = None, left: bool = True) -> Any:
         """The solution at t0, or its increment from t0 to t1."""
         if t1 is not None:
             return jax.tree.map(jnp.subtract, self.evaluate(t1), self.evaluate(t0))
@@ -152,7 +153,7 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
         return problem.unravel(consistent_slope(problem, self.linear_solver, t0, problem.flat))
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        """One step, with error estimate and dense output."""
+        """One step with its error estimate and dense output; see `diffrax.AbstractSolver.step`."""
         problem = FlatProblem(terms, y0, args)
         mass, y = problem.mass, problem.flat
         dtype = y.dtype
@@ -168,13 +169,13 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
         matrix = linear.combine(mass, inverse / GAMMA, jacobian)
         factor = linear.factor(matrix)
 
-        def stage(row: Row, stages: Any) -> Any:
+        def stage(row: Stage, stages: Any) -> Any:
             right = problem.right(t0 + row.node * h_time, y + _combine(row.a, stages))
             b = right + mass.times(inverse * _combine(row.c, stages))
             return linear.solve(factor, matrix, b + (row.d * h) * slope if row.moves else b)
 
         first = linear.solve(factor, matrix, right + (float(D[0]) * h) * slope)
-        rows = ROWS if self.dense_errors else ROWS[:-1]
+        rows = STAGES if self.dense_errors else STAGES[:-1]
         looped = is_large(problem.right, t0, y) if self.looped is None else self.looped
         stages = _in_a_loop(stage, rows, first, h_time.dtype) if looped else _written_out(stage, rows, first)
         y1 = y + _combine(A[7], stages) + stages[7]
@@ -187,7 +188,7 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
         return problem.unravel(y1), problem.unravel(error), dense, None, diffrax.RESULTS.successful
 
 
-def _written_out(stage: Callable[[Row, Any], Any], rows: Sequence[Row], first: Float[Array, " n"]) -> list[Any]:
+def _written_out(stage: Callable[[Stage, Any], Any], rows: Sequence[Stage], first: Float[Array, " n"]) -> list[Any]:
     stages = [first]
     for row in rows:
         stages.append(stage(row, stages))
@@ -195,13 +196,13 @@ def _written_out(stage: Callable[[Row, Any], Any], rows: Sequence[Row], first: F
 
 
 def _in_a_loop(
-    stage: Callable[[Row, Any], Any], rows: Sequence[Row], first: Float[Array, " n"], time_dtype: Any
+    stage: Callable[[Stage, Any], Any], rows: Sequence[Stage], first: Float[Array, " n"], time_dtype: Any
 ) -> Any:
-    """The same, shape (1 + rows, n)."""
+    """The stages computed in a loop, shape (max(8, 1 + rows), n): the field is compiled once."""
 
     def body(stages, given):
         place, *row = given
-        return stages.at[place].set(stage(Row(*row), stages[:8])), None
+        return stages.at[place].set(stage(Stage(*row), stages[:8])), None
 
     kinds = dict(a=first.dtype, c=first.dtype, d=first.dtype, node=time_dtype)
     tables = (jnp.asarray([getattr(row, name) for row in rows], kind) for name, kind in kinds.items())

@@ -11,13 +11,13 @@ from jaxtyping import Array, Bool, Float
 def padded(
     ts: Float[Array, " n"], x: Float[Array, "n x"], steps: Any
 ) -> tuple[Float[Array, " n"], Float[Array, "n x"]]:
-    """Rows beyond the steps taken repeat the last one, so that `[-1]` is the end, its derivatives included."""
+    """Replaces the rows beyond the steps taken by the last row, so that `[-1]` is the end, its derivatives included."""
     filled = jnp.arange(ts.shape[0]) <= steps
     return jnp.where(filled, ts, ts[steps]), jnp.where(filled[:, None], x, x[steps])
 
 
 def not_a_number(x: Float[Array, "n x"], reached: Bool[Array, " n"], *sources: Any) -> Float[Array, "n x"]:
-    """NaN in the rows that were not reached, and in the derivatives of these rows with respect to `sources`.
+    """Sets the rows that were not reached to NaN, and the derivatives of these rows with respect to `sources`, too.
 
     Where such a row does not count (its cotangent is zero), as after `jnp.where(okay, loss, 0)`, derivatives are not
     touched.

@@ -26,6 +26,8 @@ from .rows import not_a_number
 from .solve_arguments import check_longest_step, check_times, jump_times, tolerance_of
 from .step_control import StepControl
 
+# Newton steps by which algebraic unknowns are solved for at saved times. Dense output starts them within some
+# tolerances of the root, and each step squares that error.
 SAVED_ITERATIONS = 4
 SMALL = 30  # up to this many unknowns a factorisation costs less than the steps that a multistep method saves
 
@@ -134,7 +136,7 @@ def solve_dae(
 
 
 def _inexact(leaf: Any) -> Any:
-    """An array of floating-point numbers; integers become the default kind."""
+    """The array in floating point; integers become the default type."""
     array = jnp.asarray(leaf)
     return array if jnp.issubdtype(array.dtype, jnp.inexact) else array.astype(jnp.result_type(float))
 
@@ -179,6 +181,7 @@ def check_tolerances(rtol: Any, atol: Any, dtype: Any):
     if isinstance(rtol, Tracer):
         return
     eps = float(jnp.finfo(dtype).eps)
+    # A step adds rounding errors of some eps to its result, which no step size brings down.
     if float(rtol) < 10 * eps:
         least = f"rtol ≥ {_rounded_up(10 * eps):.0e}."
         mend = f"Use {least}"
@@ -189,7 +192,7 @@ def check_tolerances(rtol: Any, atol: Any, dtype: Any):
 
 
 def _rounded_up(value: float) -> float:
-    """The next number of one digit."""
+    """The next number above with one significant digit."""
     unit = 10.0 ** math.floor(math.log10(value))
     return math.ceil(value / unit) * unit
 
@@ -233,6 +236,8 @@ def _on_constraints(term: Any, args: Any, ts: Any, ys: Any, y0: Any) -> Any:
         if not problem.mass.is_singular:
             return y
         filled = jnp.all(jnp.isfinite(problem.flat))
+        # Rows that were not reached are solved for at the start, so that their derivatives are finite, and left out
+        # after.
         safe = jnp.where(filled, problem.flat, ravel_pytree(y0)[0])
         moved, _ = consistent_point(problem, None, jnp.where(filled, t, 0), safe, SAVED_ITERATIONS)
         kept = filled & jnp.all(jnp.isfinite(moved))

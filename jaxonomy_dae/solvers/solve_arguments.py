@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from ..aliases import State, Time, Tolerance
 from ..errors import ModelError
 
 
@@ -22,7 +23,7 @@ def check_finite(**numbers: Any) -> None:
             raise ModelError(f"{name} must be a finite number; got {value}")
 
 
-def check_longest_step(dtmax: Any) -> None:
+def check_longest_step(dtmax: Time) -> None:
     """Refuses a longest step that is not positive."""
     if dtmax is None or isinstance(dtmax, Tracer) or (np.shape(dtmax) == () and dtmax == np.inf):
         return
@@ -31,7 +32,7 @@ def check_longest_step(dtmax: Any) -> None:
         raise ModelError(f"dtmax must be positive; got {dtmax}")
 
 
-def check_times(t0: Any, t1: Any, ts: Any):
+def check_times(t0: Time, t1: Time, ts: Any):
     """Refuses ends that are not finite, and times to save that are not between them, in order."""
     check_finite(t0=t0, t1=t1)
     if ts is None:
@@ -49,7 +50,7 @@ def check_times(t0: Any, t1: Any, ts: Any):
         raise ModelError("ts must be sorted in the direction of integration")
 
 
-def tolerance_of(atol: Any, y: Any) -> Any:
+def tolerance_of(atol: Tolerance, y: State) -> Any:
     """An absolute tolerance as one number, or with the structure and shapes of y."""
     leaves = jax.tree.leaves(atol)
     if len(leaves) == 1 and np.shape(leaves[0]) == ():

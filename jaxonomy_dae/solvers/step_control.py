@@ -10,16 +10,19 @@ import jax.numpy as jnp
 import optimistix as optx
 
 from ..adjoint.wrapped_control import WrappedControl
+from ..aliases import State, Tolerance
 
-SAFETY = 0.9
-UNSEEN = 1e3  # tolerances: the first step resolves smaller motion, too, which the error of a step would not see
+SAFETY = 0.9  # of the step that would just meet the tolerance (Hairer, Nørsett & Wanner 1993, II.4)
+# In tolerances: the first step is chosen as if everything moved by as much in the problem's own time. Motion below the
+# tolerance, at rest or nearly so, is then resolved, too; its derivatives may be asked for, though no error shows it.
+UNSEEN = 1e3
 # A solver that chooses its own step sizes writes them into its error estimate, whose norm e a controller reads back:
 # e = SAFETY/φ for a growth or a rejection by the factor φ (what the ordinary formula for order 1 makes of it too), and
 # e = SAFETY + (1 − SAFETY)·φ for a step that is kept though the next shall be smaller.
 
 
 def encoded(factor: Any, keep: Any) -> Any:
-    """The norm of an error estimate that asks for a step size changed by a factor."""
+    """The error norm by which a multistep solver asks the controller to change the step size by a factor."""
     smaller = keep & (factor < 1)
     return jnp.where(smaller, SAFETY + (1 - SAFETY) * factor, SAFETY / factor)
 
@@ -31,8 +34,8 @@ def decoded(norm: Any) -> Any:
     return jnp.where(jnp.abs(factor - 1) < 1e-5, 1.0, factor)
 
 
-def tolerance_like(atol: Any, y: Any) -> Any:
-    """An absolute tolerance for every leaf of y: one number for all, or what looks like y."""
+def tolerance_like(atol: Tolerance, y: State) -> Any:
+    """An absolute tolerance for every leaf of y, from one number for all or a tree like y."""
     if jax.tree.structure(atol) == jax.tree.structure(y):
         return atol
     return jax.tree.map(lambda _: atol, y)
@@ -54,8 +57,8 @@ class StepControl(diffrax.AbstractAdaptiveStepSizeController):
     - `dtmax`: the longest step.
     """
 
-    rtol: Any
-    atol: Any
+    rtol: Tolerance
+    atol: Tolerance
     norm: Callable[[Any], Any] = optx.rms_norm
     steered: bool = eqx.field(static=True, default=False)
     dtmax: Any = None
@@ -82,6 +85,8 @@ class StepControl(diffrax.AbstractAdaptiveStepSizeController):
         def size(v):
             return self.norm(jax.tree.map(lambda a, y, atol: a / (atol + jnp.abs(y) * self.rtol), v, y0, atol))
 
+        # After Hairer, Nørsett & Wanner (1993), II.4: a first guess by |y|/|y'|, an Euler step of that size, and from
+        # the change of the slope the size at which the error term is 0.01 of the tolerance.
         tiny = jnp.finfo(interval.dtype).tiny
         slope = func(terms, t0, y0, args)
         d0, d1 = size(y0), size(slope)
@@ -99,7 +104,7 @@ class StepControl(diffrax.AbstractAdaptiveStepSizeController):
         return jax.lax.stop_gradient(jnp.minimum(h, 0.1 * interval).astype(interval.dtype))
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
-        """Whether the step is kept, and the next one."""
+        """Accepts or rejects the step and proposes the next one; see `diffrax.AbstractStepSizeController`."""
         rejected = controller_state
         t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
 
@@ -121,6 +126,7 @@ class StepControl(diffrax.AbstractAdaptiveStepSizeController):
         if self.dtmax is not None:
             dt = jnp.minimum(dt, self.dtmax)
         start = jnp.where(keep, t1, t0)
+        # A step of a few spacings of floating-point numbers cannot be shortened in a useful way.
         least = 4 * jnp.finfo(t1.dtype).eps * jnp.abs(start)
         failed = ~keep & ((dt <= least) | (dt == 0))
         result = diffrax.RESULTS.where(failed, diffrax.RESULTS.dt_min_reached, diffrax.RESULTS.successful)
@@ -129,12 +135,7 @@ class StepControl(diffrax.AbstractAdaptiveStepSizeController):
 
 
 class ConstantLengths(WrappedControl):
-    """The step sizes of another controller, as constants of differentiation.
-
-    A step that is cut short at a time that was given, as of a sample, moves its end with that time. Where the next
-    step is a multiple of it, all later ones stretch with it: after a remainder of 1e-5 of a step by 1e5, each times
-    its own local error. So lengths count as constants, as for `StepControl`, and later steps move as a whole.
-    """
+    """Wraps a controller so that its step sizes are constant under differentiation."""
 
     def wrap(self, direction):
         return ConstantLengths(self.controller.wrap(direction))  # pyright: ignore[reportCallIssue]
@@ -144,7 +145,7 @@ class ConstantLengths(WrappedControl):
         return self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
-        """Whether the step is kept, and the next one."""
+        """As `controller.adapt_step_size`; the length of the next step is constant under differentiation."""
         keep, start, end, jump, state, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
         )

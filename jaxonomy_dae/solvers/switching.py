@@ -14,10 +14,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from ..aliases import Time
+
 STIFF: Any = diffrax.RESULTS.nonlinear_divergence  # no other meaning where nothing implicit is solved
 BOUNDARY = 0.9 * 3.5  # of Tsit5's stability region along the negative real axis is at −3.5
-PATIENCE = 15  # limited steps in a row
-MANY = 2000  # steps of that size still to be taken: fewer cost less than compiling another solver
+PATIENCE = 15  # limited steps in a row, as in Hairer's DOPRI5: a transient that passes is not stiffness
+# Steps of that size still to be taken: fewer cost less than compiling another solver
+# (test_default_solver.py::test_fast_decay_before_a_short_end_stays_explicit).
+MANY = 2000
 
 
 class Watch(eqx.Module):
@@ -37,8 +41,8 @@ class Watch(eqx.Module):
     def after(
         self,
         count: Int[Array, ""],
-        t0: Any,
-        t1: Any,
+        t0: Time,
+        t1: Time,
         y: tuple[Float[Array, " n"], Float[Array, " n"]],
         k: tuple[Float[Array, " n"], Float[Array, " n"]],
     ) -> Int[Array, ""]:
@@ -47,6 +51,7 @@ class Watch(eqx.Module):
         # One sum, not one for each norm: small steps cost what the kernels in them are.
         excess = jnp.sum(((k[1] - k[0]) ** 2 - BOUNDARY**2 * (y[1] - y[0]) ** 2) / weight**2)
         limited = (excess > 0) & (self.end - t1 > MANY * (t1 - t0))
+        # A step that is not limited takes two back, so that steps near the boundary, which alternate, do not add up.
         return jax.lax.stop_gradient(jnp.where(limited, count + 1, jnp.maximum(count - 2, 0)))
 
     def result(self, count: Int[Array, ""]) -> Any:

@@ -31,11 +31,12 @@ class Tsit5(diffrax.Tsit5):
     watch: Watch | None = None
 
     def init(self, terms, t0, t1, y0, args):  # pyright: ignore[reportIncompatibleMethodOverride]
-        """The slope at the start: first same as last; and what `watch` counts."""
+        """Returns (the slope at the start, since the last stage of a step is the first of the next one; the count of
+        `watch`)."""
         return terms.vf(t0, y0, args), None if self.watch is None else self.watch.start()
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):  # pyright: ignore[reportIncompatibleMethodOverride]
-        """One step, with error estimate and dense output."""
+        """One step with its error estimate and dense output; see `diffrax.AbstractSolver.step`."""
         tableau = self.tableau
         control = terms.contr(t0, t1)
         slope, count = solver_state  # pyright: ignore[reportGeneralTypeIssues]
@@ -50,7 +51,8 @@ class Tsit5(diffrax.Tsit5):
         return y1, y_error, dict(y0=y0, y1=y1, k=jnp.stack(k)), (slope, count), result
 
     def _written_out(self, terms, t0, t1, y0, args, control, slope, made_jump):
-        """The points of the last two stages, the last slope, and all increments; `slope` is that of the step before."""
+        """The stages written out. Returns (the points of the last two stages, the slope at the last, all increments);
+        `slope` is the last slope of the step before."""
         tableau = self.tableau
         if made_jump is not False:
             slope = jax.lax.cond(made_jump, lambda _: terms.vf(t0, y0, args), lambda s: s, slope)
@@ -62,7 +64,9 @@ class Tsit5(diffrax.Tsit5):
         return points[-2], points[-1], slope, k
 
     def _looped(self, terms, t0, t1, y0, args, control, slope, made_jump):
-        """The same. After a jump, the loop begins one stage earlier: XLA compiles the field once."""
+        """The stages computed in a loop, so that XLA compiles the field once; returns as `_written_out`. Where the
+        field may have jumped, the loop begins one stage earlier: the last slope of the step before may no longer be
+        that of the state."""
         tableau = self.tableau
         n, last = len(tableau.c), slope
         weights = np.zeros((n + 1, n + 1))

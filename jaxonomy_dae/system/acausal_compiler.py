@@ -17,7 +17,7 @@ from ..lowering.lower import lower
 from ..model.typical_sizes import typical_sizes
 from ..modeling.diagram import AcausalDiagram
 from ..modeling.environment import EqnEnv
-from ..modeling.neural import as_weights
+from ..modeling.networks import as_weights
 from .parameters import ParameterNames, Parameters
 from .report import SystemReport
 from .system import AcausalSystem

@@ -6,13 +6,13 @@ import math
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Certificate:
-    """What was checked, to be printed.
+    """The result of a check, to be printed.
 
     - `claim`: what holds.
     - `checked`: on what, and how often.
     - `error`: the largest error found, and `allowed`, how large it may be.
     - `where`: the place of the largest error.
-    - `notes`: what else there is to know.
+    - `notes`: further remarks.
     """
 
     claim: str
@@ -24,7 +24,7 @@ class Certificate:
 
     @property
     def holds(self) -> bool:
-        """Whether the error is as small as is allowed."""
+        """True if the error is finite and within the allowed one."""
         return math.isfinite(self.error) and self.error <= self.allowed
 
     def __repr__(self):
@@ -36,7 +36,7 @@ class Certificate:
         return "\n".join([*lines, *(f"  {note}" for note in self.notes)])
 
     def asserted(self) -> "Certificate":
-        """Itself, if it holds.
+        """Returns itself if it holds.
 
         **Raises:**
 

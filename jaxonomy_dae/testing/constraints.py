@@ -69,7 +69,7 @@ def assert_constraints(solution: Solution, rtol: float = 1e-6, atol: float = 1e-
 
 @compiled
 def _moves(system, ts, states, inputs, discrete):
-    """By how much each state is moved onto the constraints, shape (n, states)."""
+    """The distance by which projection onto the constraints moves each state, shape (n, states)."""
 
     def one(t, x, values):
         here = system if values is None else system.holding(values)

@@ -115,7 +115,8 @@ def assert_gradient(
 
 
 def _directions(moving: Any, x: np.ndarray, count: int, rng: np.random.Generator) -> tuple[np.ndarray, list[str]]:
-    """Directions, shape (k, n), in units of sizes: of each number its own, or where that is zero, its array's."""
+    """Returns (directions, shape (k, n), their names). Entries have the size of each number, or where that is zero, of
+    its array."""
     sizes, names = [], []
     for path, leaf in jax.tree_util.tree_leaves_with_path(moving):
         flat = np.abs(np.ravel(np.asarray(leaf, float)))
@@ -146,14 +147,14 @@ def _forwards(value: Callable, x: Array, moves: np.ndarray) -> np.ndarray:
 
 
 def _difference(value: Callable[[float], float]) -> tuple[float, float]:
-    """The derivative at zero, and an estimate of its error: two extrapolations from steps that have nothing in common,
-    for of a function with noise, one alone finds by chance what seems to agree."""
+    """Returns (derivative at zero, estimate of its error), from two extrapolations with unrelated steps: for a function
+    with noise, a single one finds, by chance, steps that seem to agree."""
     (one, error), (other, its) = (_extrapolated(value, first) for first in FIRST)
     return one if error <= its else other, max(error, its, abs(one - other))
 
 
 def _extrapolated(value: Callable[[float], float], step: float) -> tuple[float, float]:
-    """From central differences at shrinking steps."""
+    """(derivative, estimate of its error) by Richardson extrapolation of central differences at shrinking steps."""
     while not np.isfinite(value(step) - value(-step)):
         step /= 10
         if step < 1e-9:

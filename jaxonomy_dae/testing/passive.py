@@ -96,7 +96,7 @@ def assert_passive(
 
 
 def _typical(law: Any, size: int | None, inputs: Any) -> tuple[np.ndarray, int]:
-    """What inputs typically are, shape (inputs,), and how many of them are efforts."""
+    """(typical sizes of the law's inputs, shape (inputs,), and the number of efforts among them)."""
     own = getattr(law, "size", None) if isinstance(law, AbstractPassive | PortHamiltonian) else None
     if not callable(law):
         raise ModelError(f"assert_passive takes a law, a function of its inputs; got {law!r}")
@@ -136,7 +136,7 @@ def _samples(rng: np.random.Generator, count: int, typical: np.ndarray) -> np.nd
 
 
 def _share(law: Any, u: Array, size: int) -> Array:
-    """The power that comes in, as a share of Σ |N_i v_i|; zero where there is none at all."""
+    """The power that comes in, as a share of Σ |N_i v_i|; zero if no power flows at all."""
     v = jax.grad(law.energy)(u) if isinstance(law, PortHamiltonian) else u[:size]
     terms = law(u) * v
     total = jnp.sum(jnp.abs(terms))
@@ -151,7 +151,7 @@ def _rate(law: Any, u: Array, size: int) -> Array:
 
 
 def _drawn(arrays: Any, rng: np.random.Generator) -> Any:
-    """Other weights, each array normal with a tenth to ten times its present size."""
+    """Random weights in place of `arrays`: each array normal, 0.1 to 10 times as large as at present."""
     factor = 10.0 ** rng.uniform(-1, 1)
 
     def other(leaf: Any) -> Any:
@@ -162,7 +162,7 @@ def _drawn(arrays: Any, rng: np.random.Generator) -> Any:
 
 
 def _climb(slope: Callable, start: np.ndarray, dtype: Any) -> np.ndarray:
-    """A local maximum of the rate, followed in units of where it starts."""
+    """Follows the rate to a local maximum, from a start point and in units of it."""
     unit = np.where(start != 0, np.abs(start), np.abs(start).max() or 1.0)
     size = abs(float(slope(jnp.asarray(start / unit, dtype), jnp.asarray(unit, dtype))[0])) or 1.0
 

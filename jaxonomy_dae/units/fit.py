@@ -22,7 +22,7 @@ from .unit import NUMBER, Unit, interval, is_close, product
 UnitOf = Callable[[Hashable], Unit | None]
 
 TIME = frozenset([("time",)])  # the leaves of functions of time
-LARGEST_PLAIN = 4
+LARGEST_PLAIN = 4  # whole numbers up to this one, and their quotients, do not convert units: 1/2, 4/3
 KEEP_UNIT = ("abs", "max", "min", "hypot", "mod")
 TO_NUMBER = ("sign", "heaviside")
 RATIO = "atan2"
@@ -38,9 +38,13 @@ ONE_UNIT = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Measured:
-    """What is known of a value: its unit; the numbers in front of it, which may convert units; whether it is a number
-    and nothing else; and whether temperatures with a zero of their own count as differences in it."""
+class UnitOfValue:
+    """The unit of a value, with what else decides whether it fits.
+
+    - `number`: the product of plain numbers in front of it, which may convert units.
+    - `is_constant`: it is a number and nothing else.
+    - `is_loose`: temperatures with a zero of their own count as differences in it.
+    """
 
     unit: Unit
     number: float = 1.0
@@ -50,32 +54,33 @@ class Measured:
 
 @dataclasses.dataclass(frozen=True)
 class Term:
-    """coefficient·value, and how messages call it."""
+    """A term coefficient·value of a sum, with its name in messages."""
 
     name: Callable[[], str]
-    value: Measured | None
+    value: UnitOfValue | None
     coefficient: float = 1.0
 
 
 def misfits_of_equation(graph: Node, unit_of: UnitOf) -> list[str]:
-    """Of 0 = graph; branches of an equation are equations."""
+    """Unit mismatches in the equation 0 = graph. Branches of an equation are equations themselves."""
     return _Walk(unit_of).run(graph, ("select",), is_zero=True)
 
 
 def misfits_of_condition(graph: Node, unit_of: UnitOf) -> list[str]:
-    """Of a guard, which falls through zero where a condition becomes true: relations joined by min, max, branches."""
+    """Unit mismatches in a guard, which falls through zero where its condition becomes true: relations joined by min,
+    max and branches."""
     return _Walk(unit_of).run(graph, ("select", "min", "max"), is_zero=True)
 
 
 def misfits_of_value(graph: Node, unit_of: UnitOf, expected: Unit | None, name: str) -> list[str]:
-    """Of an expression that gives what is called `name` its value."""
+    """Unit mismatches in `name = expression`; `expected` is the unit of the left side."""
     target = leaf(("value", name))
     walk = _Walk(lambda label: expected if label == target.data else unit_of(label))
     return walk.run(linear([(1, target), (-1, graph)]), (), is_zero=True)
 
 
 def misfit_of_units(named: Sequence[tuple[str, Unit | None]]) -> str | None:
-    """Of values that are equal: what is wrong with their units."""
+    """The first mismatch between the units of equal quantities, in a sentence; None if they agree."""
     known = [(name, unit) for name, unit in named if unit is not None]
     for (a, first), (b, second) in zip(known, known[1:], strict=False):
         if first.dimension != second.dimension:
@@ -86,11 +91,11 @@ def misfit_of_units(named: Sequence[tuple[str, Unit | None]]) -> str | None:
 
 
 class _Walk:
-    """The units of all nodes below a root."""
+    """Walks through a graph, finds the units of all nodes, and notes what does not fit."""
 
     def __init__(self, unit_of: UnitOf):
         self.unit_of = unit_of
-        self.known: dict[Node, Measured | None] = {}
+        self.known: dict[Node, UnitOfValue | None] = {}
         self.found: list[str] = []
 
     def run(self, root: Node, open_above: tuple[str, ...], is_zero: bool) -> list[str]:
@@ -108,17 +113,17 @@ class _Walk:
             self.known[node] = None if node in joints else self._measure(node, is_zero and node in tops)
         return self.found
 
-    def _measure(self, node: Node, is_zero: bool) -> Measured | None:
+    def _measure(self, node: Node, is_zero: bool) -> UnitOfValue | None:
         operation = node.operation
         inside = [self.known[a] for a in node.arguments]
         if operation == "leaf":
             unit = self.unit_of(node.data)
-            return None if unit is None else Measured(unit)
+            return None if unit is None else UnitOfValue(unit)
         if node.leaves == TIME:
             return None
         if operation == "constant":
             value = float(node.data)
-            return Measured(NUMBER, value, is_constant=True) if value and math.isfinite(value) else None
+            return UnitOfValue(NUMBER, value, is_constant=True) if value and math.isfinite(value) else None
         if operation == "sum":
             start, coefficients = node.data
             terms = [
@@ -126,14 +131,14 @@ class _Walk:
                 for c, a, known in zip(coefficients, node.arguments, inside, strict=True)
             ]
             if start:
-                terms.append(Term(lambda: str(start), Measured(NUMBER, is_constant=True), float(start)))
+                terms.append(Term(lambda: str(start), UnitOfValue(NUMBER, is_constant=True), float(start)))
             return self.agree(terms, ONE_UNIT["sum"], is_zero)
         if operation == "product":
             return self._product(node, inside, [Fraction(e).limit_denominator(10**6) for e in node.data])
         if operation == "power":
             self._needs_number(node.arguments[1], "an exponent is a number")
             self._needs_number(node.arguments[0], "what is raised to an exponent that is not constant is a number")
-            return None if inside[0] is None else Measured(NUMBER)
+            return None if inside[0] is None else UnitOfValue(NUMBER)
         if operation in CONDITIONS:
             return None
         if operation in COMPARISONS:
@@ -148,14 +153,14 @@ class _Walk:
             return self._same(node.arguments, inside, f"arguments of {operation} need one unit")
         if operation == RATIO:
             self._same(node.arguments, inside, f"arguments of {operation} need one unit")
-            return Measured(NUMBER)
+            return UnitOfValue(NUMBER)
         if operation not in TO_NUMBER:
             for argument in node.arguments:
                 self._needs_number(argument, f"{operation} takes a number (or an angle in rad)")
-        return Measured(NUMBER)
+        return UnitOfValue(NUMBER)
 
-    def _product(self, node: Node, inside: Iterable[Measured | None], powers: list[Fraction]) -> Measured | None:
-        factors: list[tuple[Measured, Fraction]] = []
+    def _product(self, node: Node, inside: Iterable[UnitOfValue | None], powers: list[Fraction]) -> UnitOfValue | None:
+        factors: list[tuple[UnitOfValue, Fraction]] = []
         known = True
         for argument, value, power in zip(node.arguments, inside, powers, strict=True):
             if value is None:
@@ -172,7 +177,7 @@ class _Walk:
             return None
         number = math.prod(abs(v.number) ** float(p) for v, p in factors)
         is_loose = any(v.is_loose or v.unit.zero for v, _ in factors)
-        return Measured(product((v.unit, p) for v, p in factors), number, is_loose=is_loose)
+        return UnitOfValue(product((v.unit, p) for v, p in factors), number, is_loose=is_loose)
 
     def _needs_number(self, node: Node, rule: str) -> None:
         value = self.known[node]
@@ -185,7 +190,7 @@ class _Walk:
                 f"{rule}, but '{_text(node)}' is in {value.unit} (1 {value.unit} is {value.unit.scale:.6g})"
             )
 
-    def _same(self, nodes: Sequence[Node], values: Iterable[Measured | None], rule: str) -> Measured | None:
+    def _same(self, nodes: Sequence[Node], values: Iterable[UnitOfValue | None], rule: str) -> UnitOfValue | None:
         values = list(values)
         points = {v.unit for v in values if v is not None and v.unit.zero}
         terms = [Term(lambda a=a: _text(a), v) for a, v in zip(nodes, values, strict=True)]
@@ -199,7 +204,7 @@ class _Walk:
         found = self.agree(terms, rule, is_zero=False)
         return found if not points or found is None else dataclasses.replace(found, unit=next(iter(points)))
 
-    def agree(self, terms: Sequence[Term], rule: str, is_zero: bool) -> Measured | None:
+    def agree(self, terms: Sequence[Term], rule: str, is_zero: bool) -> UnitOfValue | None:
         """The unit of a sum of terms, which may be zero; where they do not fit, a sentence is noted."""
         known = [(t, t.value) for t in terms if t.value is not None]
         if not known:
@@ -235,7 +240,7 @@ class _Walk:
             if not v.is_constant
         ]
         if not values:
-            return Measured(NUMBER, is_constant=True) if all_known else None
+            return UnitOfValue(NUMBER, is_constant=True) if all_known else None
         dimensions = [v.unit.dimension for _, v in values]
         if any(d != dimensions[0] for d in dimensions):
             self._note(rule, values, _most_common(dimensions), lambda v: v.unit.dimension)
@@ -249,10 +254,10 @@ class _Walk:
         has_one = all(is_close(n, numbers[0]) for n in numbers) and not any(v.is_constant for _, v in known)
         number = numbers[0] if has_one else 1.0
         is_loose = any(v.is_loose for _, v in values)
-        return Measured(Unit(dimensions[0], common, zero, text), number, is_loose=is_loose)
+        return UnitOfValue(Unit(dimensions[0], common, zero, text), number, is_loose=is_loose)
 
     def _note(
-        self, rule: str, values: list[tuple[Term, Measured]], usual: Any, aspect: Callable[[Measured], Any]
+        self, rule: str, values: list[tuple[Term, UnitOfValue]], usual: Any, aspect: Callable[[UnitOfValue], Any]
     ) -> None:
         """Notes that an aspect of the values, which is `usual` for most of them, is not the same for all."""
         named = sorted(((t.name(), v) for t, v in values), key=lambda row: (len(row[0]), row[0]))
@@ -269,16 +274,16 @@ def _most_common(items: Sequence[Any]) -> Any:
     return max(items, key=lambda item: (items.count(item), -items.index(item)))
 
 
-def _common_scale(values: Sequence[Measured]) -> float | None:
-    """The factor of a unit in which all values may be meant."""
+def _common_scale(values: Sequence[UnitOfValue]) -> float | None:
+    """The factor of a unit in which all values may be read; None if there is none."""
     candidates = [v.unit.scale for v in values]
     candidates += [v.unit.scale / v.number for v in values if v.number]
     return next((s for s in candidates if all(_fits(v, s) for v in values)), None)
 
 
-def _fits(value: Measured, scale: float) -> bool:
-    """Whether a value counts in units of this factor: by its unit, or because the number in front of it converts it,
-    alone or together with a plain factor such as 1/2."""
+def _fits(value: UnitOfValue, scale: float) -> bool:
+    """True if a value can be read in units of factor `scale`: its unit has that factor, or the number in front of it
+    converts it, alone or with a plain factor such as 1/2."""
     if is_close(value.unit.scale, scale):
         return True
     rest = value.number * scale / value.unit.scale
@@ -291,7 +296,8 @@ def _is_plain(number: float) -> bool:
 
 
 def _conversion(a: Unit, b: Unit) -> str:
-    """What one of the coarser unit is in the other one."""
+    """The conversion between two units, in words: how much one of the coarser unit is in the other, or where the zero
+    of a temperature scale lies."""
     if is_close(a.scale, b.scale):
         own = a if a.zero else b
         return f"0 {own} is {own.zero:.6g} K"
@@ -305,7 +311,7 @@ def _text(node: Node, coefficient: Number = 1) -> str:
 
 
 def name_of(label: Any) -> str:
-    """How a leaf is called: labels are ("variable", path, order), or (kind, name), or ("time",)."""
+    """The name of a leaf, given its label ("variable", path, order), (kind, name) or ("time",)."""
     if label[0] == "variable":
         return "der(" * label[2] + label[1] + ")" * label[2]
     return label[-1]

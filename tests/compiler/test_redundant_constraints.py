@@ -13,7 +13,7 @@ from jaxonomy_dae.modeling import Eq, der
 
 
 def test_a_door_on_two_hinges():
-    """It was said once for x and once for y."""
+    """Regression: the fault was reported twice, for x and for y."""
     b = Linkage()
     wall, door = b(pl.World, "wall"), b(pl.MassiveLink, "door")
     b.pin("top", wall.frame, door.frame_a, initial_phi=0.3, initial_omega=0.0)

@@ -151,7 +151,7 @@ def test_planar(make, named):
 
 
 def test_what_nothing_holds_is_said_once():
-    """It was said once for x and once for y, in terms of levels."""
+    """Regression: the fault was reported twice, for x and for y, in terms of levels."""
     b = Bench()
     link, pin = b(pl.Link, "link"), b(pl.Revolute, "pin")
     b.join(link.frame_b, pin.frame_a)

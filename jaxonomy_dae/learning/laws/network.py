@@ -20,7 +20,7 @@ def tanh_network(inputs: int, outputs: int, width: int, depth: int, key: PRNGKey
 
 
 def sizes(given: Any, count: int, what: str) -> tuple[float, ...]:
-    """What is typical for each of `count` values, from one number or one for each.
+    """The typical sizes of `count` values, from one number for all or one for each.
 
     **Raises:**
 

@@ -5,6 +5,8 @@ from sympy import Min, exp
 from ...modeling import POSITIVE, Eq, EqnEnv, Value, smooth
 from .two_pin import TwoPin
 
+# exp(40) is 2.4e17, with the default Is a current of 2e8 A: the diode has long been destroyed, and the straight line
+# that goes on from there cannot overflow.
 LARGEST_EXPONENT = 40.0
 
 

@@ -50,7 +50,8 @@ class TimedSwitch(TwoPin):
 
 
 def _knee(v: sympy.Expr, i: sympy.Expr, on: sympy.Expr, off: sympy.Expr, knee: sympy.Expr) -> tuple:
-    """What is zero while a diode conducts, and what is zero while it blocks; neither is negative."""
+    """Two expressions, never negative, of which one is zero: the first while the diode conducts, the second while it
+    blocks."""
     return knee + on * (i - off * knee) - v, i - off * v
 
 
