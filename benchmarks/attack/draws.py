@@ -9,7 +9,14 @@ from .outcome import Outcome
 
 NETWORKS = ("resistors", "circuits", "rods", "gears", "thermal", "pipes", "mechanisms", "descriptors")
 SWITCHING = ("relations", "converters", "drives", "shafts")  # families with variants of their parameters
-OWN = ("singular", "rings")  # families that say themselves what is right, by `judged(seed)`
+OWN = (
+    "singular",
+    "rings",
+    "switches",
+    "blocks",
+    "pairs",
+    "idle",
+)  # they say themselves what is right, by `judged(seed)`
 FAMILIES = (*NETWORKS, "events", *SWITCHING, "gradients", *OWN)
 UNITS = ("equations", "parameters", "units", "all")  # what is rescaled: `benchmarks/rescaling.py`
 PUBLISHED = "published"  # problems that are their own references, in other units
