@@ -18,7 +18,7 @@ import numpy as np
 import sympy
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, AcausalSystem, Component, EqnEnv, der
-from jaxonomy_dae.errors import InitializationError
+from jaxonomy_dae.errors import InitializationError, ModelError
 from jaxonomy_dae.modeling import Eq
 
 from .judge import CHEAP
@@ -83,21 +83,26 @@ def judged(seed: int) -> tuple[str, list[Outcome]]:
     programs: dict[Any, Any] = {}
     outcomes = []
     base: AcausalSystem | None = None
-    for k in range(VARIANTS):
+    for _ in range(VARIANTS):
         alike = rng.random() < 0.5
         units = 10.0 ** (np.full(n, rng.uniform(-18, 12)) if alike else rng.uniform(-18, 12, n))
         rows, guess = 10.0 ** rng.uniform(-15, 15, n), root * rng.uniform(0.8, 1.2, n)
         systems: list[tuple[str, AcausalSystem]] = []
         for declared in (False, True):
             part = Block(EqnEnv(), "c", forms, a, root, units, rows, declared, guess)
-            fresh = AcausalCompiler(part.ev, AcausalDiagram().add(part))()
-            systems.append((f"compiled, nominal {'' if declared else 'not '}declared", fresh))
-        base = base or systems[0][1]
+            which = f"compiled, nominal {'' if declared else 'not '}declared"
+            try:
+                systems.append((which, AcausalCompiler(part.ev, AcausalDiagram().add(part))()))
+            except ModelError as error:
+                outcomes.append(Outcome("untrue", math.inf, f"{which}, units {units.tolist()}: {error}", 0.0))
+        base = base or (systems[0][1] if systems else None)
+        if base is None:
+            continue
         given = {
             f"c.{name}{i}": float(v[i]) for name, v in (("u", units), ("g", guess), ("row", rows)) for i in range(n)
         }
         systems.append(("with_parameters", base.with_parameters(given)))
-        for which, system in systems if k else systems[:2]:
+        for which, system in systems:
             start = time.process_time()
             kind, error, text = _judged(system, units, lambda y: left_over(a, forms, values, y), rng, programs)
             text = f"{which}, units {', '.join(f'{u:.1e}' for u in units)}: {text}"

@@ -5,7 +5,7 @@ from jaxtyping import Float
 
 from ..expressions.errors import KNOWN
 from .extended import Extended
-from .natural_sizes import natural_sizes
+from .natural_sizes import are_told, natural_sizes
 from .quantities import QuantityMap, declared_scale
 from .tables import FlatModel
 
@@ -13,10 +13,12 @@ LIMIT = 600  # quantities up to which sizes are looked for
 DECADES = 30  # that they may span: single precision has 38
 
 
-def typical_sizes(flat: FlatModel, variables: QuantityMap, extended: Extended) -> Float[np.ndarray, " quantities"]:
-    """Of all quantities, at the parameter values the model was compiled with; powers of two, by which numbers are
-    multiplied without rounding."""
-    return _rounded(unrounded_sizes(flat, variables, extended))
+def typical_sizes(
+    flat: FlatModel, variables: QuantityMap, extended: Extended, parameters: Float[np.ndarray, " parameters"]
+) -> Float[np.ndarray, " quantities"]:
+    """Of all quantities, at these values of the parameters; powers of two, by which numbers are multiplied without
+    rounding."""
+    return _rounded(_unrounded(flat, variables, extended, parameters))
 
 
 def _rounded(sizes: Float[np.ndarray, " quantities"]) -> Float[np.ndarray, " quantities"]:
@@ -24,10 +26,14 @@ def _rounded(sizes: Float[np.ndarray, " quantities"]) -> Float[np.ndarray, " qua
 
 
 def unrounded_sizes(flat: FlatModel, variables: QuantityMap, extended: Extended) -> Float[np.ndarray, " quantities"]:
-    """The same, not rounded: rounded, sizes that differ by little may differ by two, and choose other states."""
+    """Typical sizes at the parameter values the model was compiled with, before rounding to powers of two. State
+    selection compares sizes, and rounding could turn a small difference into a factor of two."""
+    return _unrounded(flat, variables, extended, flat.parameters.values)
+
+
+def _unrounded(flat: FlatModel, variables: QuantityMap, extended: Extended, parameters: np.ndarray) -> np.ndarray:
     if extended.quantities.n_unknown > LIMIT:
         return np.ones(extended.quantities.n)
-    parameters = flat.parameters.values
     return _balanced(extended, parameters, _declared_or_started(flat, variables, extended, parameters))
 
 
@@ -46,6 +52,7 @@ def error_sizes(
         return _rounded(typical)
     without = _balanced(extended, parameters, declared)
     is_rounding = (np.abs(started) <= KNOWN * without) & (started != 0.0)
+    is_rounding &= are_told(extended.groups, extended.quantities.n, parameters)
     if not is_rounding.any():
         return _rounded(typical)
     return _balanced(extended, parameters, np.where(is_rounding, declared, started))
