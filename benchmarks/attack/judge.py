@@ -68,6 +68,23 @@ def judge(case: Case, moving: bool = False, seconds: int = 60) -> list[Outcome]:
     return outcomes
 
 
+def timed(judged: Callable[[], tuple[str, list[Outcome]]], seconds: int = 60) -> tuple[str, list[Outcome]]:
+    """What a family says that judges its own models; 'late' after so many seconds of processor time, 'crashed' by an
+    error."""
+    start = time.process_time()
+    before = signal.signal(signal.SIGVTALRM, _expired)
+    signal.setitimer(signal.ITIMER_VIRTUAL, seconds)
+    try:
+        return judged()
+    except TooLong:
+        return "", [Outcome("late", np.inf, f"stopped after {seconds} s", time.process_time() - start)]
+    except Exception as error:
+        return "", [Outcome("crashed", np.inf, f"{type(error).__name__}: {error}", time.process_time() - start)]
+    finally:
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0)
+        signal.signal(signal.SIGVTALRM, before)
+
+
 def _timed(offs: Callable[[], list[tuple[float, str]]], case: Case, seconds: int) -> Outcome:
     before = signal.signal(signal.SIGVTALRM, _expired)
     signal.setitimer(signal.ITIMER_VIRTUAL, seconds)

@@ -89,23 +89,24 @@ class Samples:
         natural: Callable[[], Mapping[Hashable, float]],
     ):  # fmt: skip
         labels = sorted(frozenset().union(*(g.leaves for g in graphs)), key=repr)
-        self._labels = labels
+        self._place = {label: k for k, label in enumerate(labels)}
         self._parameters = [near(values, trial, kept) for trial in range(POINTS)]
         sizes: Mapping[Hashable, float] = {}
         best, most = [], -1
         for k in range(NEARER + 1):
             factor = 0.1 ** max(k - 1, 0)
             unit = [factor * sizes.get(label, 1.0) for label in labels]
-            self._points = [
-                [self._value(label, p, u) for label, u in zip(labels, unit, strict=True)] for p in range(3 * POINTS)
+            self._columns = [
+                np.array([self._value(label, p, u) for p in range(3 * POINTS)])
+                for label, u in zip(labels, unit, strict=True)
             ]
             with_values = int(np.isfinite(self(graphs)).all(axis=0).sum())
             if with_values > most:
-                best, most = self._points, with_values
-            if with_values == len(self._points):
+                best, most = self._columns, with_values
+            if with_values == 3 * POINTS:
                 break
             sizes = sizes or natural()
-        self._points = best
+        self._columns = best
 
     def _value(self, label, trial: int, size: float) -> float:
         if label[0] == "quantity":
@@ -114,10 +115,10 @@ class Samples:
 
     def __call__(self, graphs: Sequence[Node]) -> np.ndarray:
         """Shape (graphs, points)."""
-        columns = list(np.array(self._points).T) if self._labels else []
-        n = len(self._points)
-        found = Kernel(graphs, self._labels)(columns, "numpy")
-        return np.stack([np.broadcast_to(np.asarray(v, float), (n,)) for v in found])
+        # Those of these graphs alone: a combination of n equations is asked about each of its n quantities.
+        labels = sorted(frozenset().union(*(g.leaves for g in graphs)), key=self._place.__getitem__)
+        found = Kernel(graphs, labels)([self._columns[self._place[label]] for label in labels], "numpy")
+        return np.stack([np.broadcast_to(np.asarray(v, float), (3 * POINTS,)) for v in found])
 
 
 @np.errstate(all="ignore")  # points where equations overflow are left out
@@ -144,9 +145,13 @@ def combine(
     )
     without = _sum_of_terms(terms)
     samples = Samples([*equations, *weights], values, kept, natural)
+    occurs: dict[Hashable, list[tuple[Node, Node]]] = {}
+    for w, e in zip(weights, equations, strict=True):
+        for label in e.leaves:
+            occurs.setdefault(label, []).append((w, e))
     cancelled, stays = [], False
     for label in quantities:
-        inside = [(w, e) for w, e in zip(weights, equations, strict=True) if label in e.leaves]
+        inside = occurs[label]
         slopes = samples([multiply(w, partial_derivative(e, label)) for w, e in inside])
         finite = np.isfinite(slopes).all(axis=0)
         size = np.abs(slopes).sum(axis=0)

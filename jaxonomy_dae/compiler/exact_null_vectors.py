@@ -1,26 +1,31 @@
-"""Left null vectors of sparse matrices of fractions, by elimination without rounding.
+"""Left null vectors of sparse matrices of fractions, or of numbers with their roundings, by elimination.
 
 Coefficients of highest derivatives are mostly small numbers, ±1 in connections and differences. There nothing needs to
 be judged: a row that becomes empty is a combination of others, whatever the size of the block. Rows and columns with
 few entries are eliminated first (Markowitz 1957), so a ring or a chain takes as many operations as it has equations.
+In other units, coefficients are rounded: a number that may be zero is left out.
 """
 
 import heapq
 from collections.abc import Sequence
 from fractions import Fraction
+from typing import Any
 
-Row = dict[int, Fraction]
+from .rounded import Rounded
+
+Field = Fraction | Rounded
+Row = dict[int, Any]  # of numbers of one field: Any, as no type says that two are of the same
 
 
-def sparsest_null_vector(rows: Sequence[Row]) -> Row | None:
+def sparsest_null_vector(rows: Sequence[Row], one: Field = Fraction(1)) -> Row | None:
     """w ≠ 0 with Σ wᵢ·rowᵢ = 0, by number of the row: of those that the elimination finds, the one with the fewest
-    entries, the first of several. None if the rows are independent."""
+    entries, the first of several. None if the rows are independent. `one` is that of the numbers' field."""
     empty, operations = _eliminated([dict(row) for row in rows])
-    found = [_combination(row, operations) for row in empty]
+    found = [_combination(row, operations, one) for row in empty]
     return min(found, key=lambda w: (len(w), sorted(w)), default=None)
 
 
-def _eliminated(rows: list[Row]) -> tuple[list[int], list[tuple[int, int, Fraction]]]:
+def _eliminated(rows: list[Row]) -> tuple[list[int], list[tuple[int, int, Any]]]:
     """The rows that become empty; and the operations row −= factor·pivot, as (row, pivot, factor), in order."""
     members: dict[int, set[int]] = {}
     for i, row in enumerate(rows):
@@ -45,9 +50,10 @@ def _eliminated(rows: list[Row]) -> tuple[list[int], list[tuple[int, int, Fracti
             factor = rows[k][column] / pivot[column]
             operations.append((k, i, factor))
             for c, value in pivot.items():
-                left = rows[k].get(c, 0) - factor * value
-                if left:
-                    rows[k][c] = Fraction(left)
+                change = factor * value
+                left = rows[k][c] - change if c in rows[k] else -change
+                if left and c != column:
+                    rows[k][c] = left
                     members[c].add(k)
                 else:
                     rows[k].pop(c, None)
@@ -56,10 +62,11 @@ def _eliminated(rows: list[Row]) -> tuple[list[int], list[tuple[int, int, Fracti
     return sorted(empty), operations
 
 
-def _combination(row: int, operations: Sequence[tuple[int, int, Fraction]]) -> Row:
+def _combination(row: int, operations: Sequence[tuple[int, int, Any]], one: Field) -> Row:
     """What a row is made of: the operations undone, the last one first."""
-    weights: Row = {row: Fraction(1)}
+    weights: Row = {row: one}
     for k, i, factor in reversed(operations):
         if k in weights:
-            weights[i] = weights.get(i, Fraction(0)) - factor * weights[k]
+            change = factor * weights[k]
+            weights[i] = weights[i] - change if i in weights else -change
     return {i: w for i, w in weights.items() if w}

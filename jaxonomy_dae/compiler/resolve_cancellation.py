@@ -7,7 +7,8 @@ or a function of the parameters, the equation Σ wᵢ Fᵢ^(cᵢ − c_min), in 
 one of lowest cᵢ, and index reduction starts again: the linear combination method of Tan, Nedialkov & Pryce (2017).
 """
 
-from collections.abc import Hashable, Sequence
+import math
+from collections.abc import Callable, Hashable, Sequence
 from fractions import Fraction
 
 import numpy as np
@@ -31,10 +32,11 @@ from ..structure.matching import maximum_matching
 from ..structure.pantelides import Offsets, reduce_index
 from .combine_equations import cancels_elsewhere, combine, graph_of, group_of, near, quantity_label, somewhere, tried
 from .exact_null_vectors import Row, sparsest_null_vector
-from .null_vectors import left_null_vectors, rational, weights_in_parameters
+from .null_vectors import CANCELLED, left_null_vectors, rational, weights_in_parameters
 from .number_columns import Columns
+from .rounded import Rounded, rounded
 
-LARGEST_BLOCK = 200  # equations of a block whose entries are not all simple numbers
+LARGEST_BLOCK = 200  # equations of a block that is sampled: those of larger ones have numbers, or are left
 ROUNDS = 100
 TRIALS = 44  # random points, of which STATES are used: the first where the equations have values
 STATES = 3
@@ -240,8 +242,11 @@ class _Jacobian:
         matrix, bounds = changed.at(equations, self.offsets.matched_variable[equations], 0)
         return bool(np.isfinite(matrix).all()) and not left_null_vectors(matrix, bounds)
 
-    def fractions(self, equations: np.ndarray, columns: np.ndarray) -> list[Row] | None:
-        """The rows of the matrix, if all its entries are simple numbers; `equations` are sorted."""
+    def rows(
+        self, equations: np.ndarray, columns: np.ndarray, as_number: Callable[[float], Fraction | Rounded | None]
+    ) -> list[Row] | None:
+        """The rows of the matrix, if all its entries are numbers that `as_number` has something for; `equations` are
+        sorted."""
         where = np.full(len(self.offsets.variable), -1)
         where[columns] = np.arange(len(columns))
         rows: list[Row] = [{} for _ in equations]
@@ -256,11 +261,11 @@ class _Jacobian:
             if np.isnan(numbers[used]).any():
                 return None
             for i, slot in zip(*np.nonzero(used), strict=True):
-                value = rational(float(numbers[i, slot]))
-                if isinstance(value, float):
+                value = as_number(float(numbers[i, slot]))
+                if value is None:
                     return None
                 row, j = rows[places[i]], int(where[column[i, slot]])
-                row[j] = row.get(j, Fraction(0)) + value
+                row[j] = row[j] + value if j in row else value
         return [{j: value for j, value in row.items() if value} for row in rows]
 
     def is_constant(self, equations: np.ndarray, columns: np.ndarray) -> bool:
@@ -282,16 +287,37 @@ def _combination(
     - `StructuralError` if it is singular for the given parameter values alone, or in a way that depends on the point.
     """
     columns = jacobian.offsets.matched_variable[equations]
-    exact = jacobian.fractions(equations, columns)
+    exact = jacobian.rows(equations, columns, _simple)
     if exact is not None:
         weights = sparsest_null_vector(exact)
-        return None if weights is None else _exact_combination(jacobian, equations, columns, weights)
-    return (
-        _sampled_combination(jacobian, equations, columns, names, discrete) if len(equations) <= LARGEST_BLOCK else None
-    )
+        return None if weights is None else _numeric_combination(jacobian, equations, columns, weights)
+    if len(equations) <= LARGEST_BLOCK:
+        return _sampled_combination(jacobian, equations, columns, names, discrete)
+    numbers = jacobian.rows(equations, columns, rounded)
+    if numbers is None:
+        return None
+    weights = sparsest_null_vector(numbers, rounded(1.0))
+    if weights is None or not _cancels(weights, numbers):
+        return None
+    return _numeric_combination(jacobian, equations, columns, {i: w.value for i, w in weights.items()})
 
 
-def _exact_combination(
+def _simple(value: float) -> Fraction | None:
+    found = rational(value)
+    return found if isinstance(found, Fraction) else None
+
+
+def _cancels(weights: Row, rows: Sequence[Row]) -> bool:
+    """Whether every column of Σ weight·row is a rounding error: an elimination that lost all digits shows no
+    combination."""
+    terms: dict[int, list[float]] = {}
+    for i, weight in weights.items():
+        for c, entry in rows[i].items():
+            terms.setdefault(c, []).append(weight.value * entry.value)
+    return all(abs(math.fsum(found)) <= CANCELLED * sum(map(abs, found)) for found in terms.values())
+
+
+def _numeric_combination(
     jacobian: _Jacobian, equations: np.ndarray, columns: np.ndarray, weights: Row
 ) -> tuple[int, EquationGroup]:
     """An equation of a block, and the combination of equations with these weights that replaces it."""

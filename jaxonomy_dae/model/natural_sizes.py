@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from .extended import ExtendedGroup
 from .group import Point
@@ -81,6 +81,15 @@ def natural_sizes(
         if np.abs(found[: n + n_parameters]).max(initial=0.0) < 0.3:
             break
     return quantity, parameter
+
+
+def are_told(groups: Sequence[ExtendedGroup], n: int, parameters: Float[np.ndarray, " p"]) -> Bool[np.ndarray, " n"]:
+    """Whether an equation says something of the size of each quantity: whether it has a slope in it near 1. Of
+    exp(x/u) for a small u it has none, so that x's size stays 1 though nothing says so."""
+    entries = _seen(groups, np.ones(n), np.where(parameters == 0.0, 1.0, parameters), _entries, by_columns=True)
+    out = np.zeros(n, bool)
+    out[entries.by_quantity[1]] = True
+    return out
 
 
 def _moved(size: np.ndarray, decades: np.ndarray) -> np.ndarray:

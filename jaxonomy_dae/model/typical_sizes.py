@@ -6,17 +6,19 @@ from jaxtyping import Float
 from ..expressions.errors import KNOWN
 from .declared import declared_scale
 from .extended import Extended
-from .natural_sizes import natural_sizes
+from .natural_sizes import are_told, natural_sizes
 from .reduced import ReducedModel
 
 LIMIT = 600  # quantities up to which sizes are looked for
 DECADES = 30  # that they may span: single precision has 38
 
 
-def typical_sizes(model: ReducedModel) -> Float[np.ndarray, " quantities"]:
-    """Of all quantities, at the parameter values the model was compiled with; powers of two, by which numbers are
-    multiplied without rounding."""
-    return _rounded(unrounded_sizes(model))
+def typical_sizes(
+    model: ReducedModel, parameters: Float[np.ndarray, " parameters"]
+) -> Float[np.ndarray, " quantities"]:
+    """Of all quantities, at these values of the parameters; powers of two, by which numbers are multiplied without
+    rounding."""
+    return _rounded(_unrounded(model, parameters))
 
 
 def _rounded(sizes: Float[np.ndarray, " quantities"]) -> Float[np.ndarray, " quantities"]:
@@ -24,10 +26,14 @@ def _rounded(sizes: Float[np.ndarray, " quantities"]) -> Float[np.ndarray, " qua
 
 
 def unrounded_sizes(model: ReducedModel) -> Float[np.ndarray, " quantities"]:
-    """The same, not rounded: rounded, sizes that differ by little may differ by two, and choose other states."""
+    """Typical sizes at the parameter values the model was compiled with, before rounding to powers of two. State
+    selection compares sizes, and rounding could turn a small difference into a factor of two."""
+    return _unrounded(model, model.flat.parameters.values)
+
+
+def _unrounded(model: ReducedModel, parameters: np.ndarray) -> np.ndarray:
     if model.extended.quantities.n_unknown > LIMIT:
         return np.ones(model.extended.quantities.n)
-    parameters = model.flat.parameters.values
     return _balanced(model.extended, parameters, _declared_or_started(model, parameters))
 
 
@@ -44,6 +50,7 @@ def error_sizes(model: ReducedModel, parameters: Float[np.ndarray, " parameters"
         return _rounded(typical)
     without = _balanced(extended, parameters, declared)
     is_rounding = (np.abs(started) <= KNOWN * without) & (started != 0.0)
+    is_rounding &= are_told(extended.groups, extended.quantities.n, parameters)
     if not is_rounding.any():
         return _rounded(typical)
     return _balanced(extended, parameters, np.where(is_rounding, declared, started))

@@ -106,7 +106,7 @@ class AcausalCompiler:
         )  # fmt: skip
         with jax.ensure_compile_time_eval():  # also where it is called while a function is traced
             values = jnp.asarray(declared.values[:n], dtype=jnp.result_type(float))
-            sizes = jnp.asarray(typical_sizes(model.reduced), dtype=values.dtype)
+            sizes = jnp.asarray(typical_sizes(model.reduced, declared.values), dtype=values.dtype)
         parameters = Parameters(values, None, (), table)
         neural = {name: _own(network) for name, network in flat.networks.items()}
         return AcausalSystem(parameters, neural, sizes, plan)

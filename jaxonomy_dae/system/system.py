@@ -18,6 +18,7 @@ from ..lowering.gather import SCALARS
 from ..lowering.plan import SystemPlan
 from ..model.dependent_parameters import complete
 from ..model.pickling import functions_by_name, named_functions
+from ..model.typical_sizes import typical_sizes
 from .bounds import constrained, unconstrained
 from .evaluate import Refinement
 from .input_values import missing_input
@@ -33,8 +34,9 @@ class AcausalSystem(eqx.Module):
     - `neural`: the networks by name, `system.neural["drag"]`.
     - `states`, `algebraics`, `variables`: names.
     - `typical_sizes`: how large each quantity of the equations usually is, a power of two, as declared (`nominal`) or
-        as starts and equations say at the parameter values that the model was compiled with: where searches begin to
-        look, and beside what zero is judged. Nothing is differentiated by them.
+        as starts and equations say at the values of the parameters (inside jit, grad and vmap, where these are not
+        known, at those that the system has outside): where searches begin to look, and beside what zero is judged.
+        Nothing is differentiated by them.
     """
 
     parameters: Parameters
@@ -118,7 +120,19 @@ class AcausalSystem(eqx.Module):
         - `ModelError` for unknown names, values that are not finite or out of bounds. Inside jit, grad and vmap, where
             values are not known, those become not-a-number, and so does all that is computed with them: see `simulate`.
         """
-        return eqx.tree_at(lambda s: s.parameters, self, self.parameters.replaced(values))
+        changed = self.parameters.replaced(values)
+        return eqx.tree_at(lambda s: (s.parameters, s.typical_sizes), self, (changed, self._sizes_at(changed)))
+
+    def _sizes_at(self, parameters: Parameters) -> Float[Array, " quantities"]:
+        """Typical sizes at other parameter values; the present ones where these are not known, or a batch."""
+        known, plan = parameters.known, self.plan
+        if known is None or isinstance(self.typical_sizes, Tracer):
+            return self.typical_sizes
+        values = plan.flat.parameters.values.copy()
+        values[: len(known)] = known
+        sizes = typical_sizes(plan.model, values)
+        with jax.ensure_compile_time_eval():
+            return jnp.asarray(sizes, self.typical_sizes.dtype)
 
     def unconstrain(self, *names: str) -> dict[str, Any]:
         """Parameters as free numbers z, to be trained by steps that know no bounds:

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 from problems import compiled
-from sympy import Abs, Eq, sign, sqrt
+from sympy import Abs, Eq, exp, sign, sqrt
 
 from jaxonomy_dae import Component, EqnEnv, der
 
@@ -36,6 +36,54 @@ def test_sizes_come_from_data(pressure, flow):
     for name, size in (("b.middle", pressure), ("b.q", flow)):
         quantity = system.plan.resolve([name])[0][0]
         assert 0.1 < system.typical_sizes[quantity] / size < 10
+
+
+@pytest.mark.parametrize(("pressure", "flow"), [SIZES[1], SIZES[3]])
+def test_they_follow_the_parameters(pressure, flow):
+    """They were those of the values that a model was compiled with, whatever it was given."""
+    system, other = compiled(Branches(EqnEnv(), "b", *SIZES[2])), compiled(Branches(EqnEnv(), "b", pressure, flow))
+    given = {name: other.parameters[name] for name in other.parameters}
+    np.testing.assert_array_equal(system.with_parameters(given).typical_sizes, other.typical_sizes)
+    back = system.with_parameters(given).with_parameters(dict(system.parameters.items()))
+    np.testing.assert_array_equal(back.typical_sizes, system.typical_sizes)
+
+
+class Bound(Component):
+    """(x/u)² + x/u = c, of a decaying c."""
+
+    def __init__(self, ev, name, unit):
+        super().__init__(ev, name)
+        u = self.parameter("u", unit)
+        x, c = self.variable("x", start=0.7 * u), self.variable("c", start=1.0, fixed=True)
+        self.add_equations(Eq(der(c), -c), Eq((x / u) ** 2 + x / u, c))
+
+
+def test_blocks_in_other_units_than_they_were_compiled_with():
+    """A block was called solved that was off by 10 %."""
+    system = compiled(Bound(EqnEnv(), "b", 1.0))
+    read = jax.jit(lambda s, z: s.observe("b.x", 0.0, z))
+    for unit in (1e-18, 1e-9, 1e12):
+        changed = system.with_parameters({"b.u": unit})
+        for guess in (0.0, 0.4 * unit, 10 * unit):
+            found = float(read(changed, np.array([1.0, guess])))
+            assert found / unit == pytest.approx((np.sqrt(5) - 1) / 2, rel=1e-12)
+
+
+@pytest.mark.parametrize("unit", [1e-18, 1.0])
+def test_a_start_is_no_rounding_error_where_nothing_else_tells_a_size(unit):
+    """exp(x/u) − 2 = 0 has no slope near x = 1, so x = 1e-16 was taken for a rounding error of 1, and its equation for
+    singular."""
+
+    class Logarithm(Component):
+        def __init__(self, ev, name):
+            super().__init__(ev, name)
+            u = self.parameter("u", unit)
+            x, c = self.variable("x", start=0.5 * u), self.variable("c", start=1.0, fixed=True)
+            self.add_equations(Eq(der(c), -c), Eq(exp(x / u), 2 * c))
+
+    system = compiled(Logarithm(EqnEnv(), "b"))
+    x = system.initialize()
+    assert float(system.observe("b.x", 0.0, x)) / unit == pytest.approx(np.log(2), rel=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,46 @@
+"""Numbers that are known to their roundings.
+
+A coefficient in a unit is rounded, and so is what becomes of it in an elimination. With the bound of its error beside
+it, a number says whether it is zero: 1e-3·3.6·x − 0.0036·x is, and 1e-15·x beside 1e9·y is not.
+"""
+
+import dataclasses
+
+EPS = 2.0**-52
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Rounded:
+    """A value and a bound of its error; false where it may be zero."""
+
+    value: float
+    error: float
+
+    def __bool__(self) -> bool:
+        return abs(self.value) > self.error
+
+    def __neg__(self) -> "Rounded":
+        return Rounded(-self.value, self.error)
+
+    def __add__(self, other: "Rounded") -> "Rounded":
+        value = self.value + other.value
+        return Rounded(value, self.error + other.error + EPS * abs(value))
+
+    def __sub__(self, other: "Rounded") -> "Rounded":
+        return self + -other
+
+    def __mul__(self, other: "Rounded") -> "Rounded":
+        value = self.value * other.value
+        error = abs(self.value) * other.error + abs(other.value) * self.error + self.error * other.error
+        return Rounded(value, error + EPS * abs(value))
+
+    def __truediv__(self, other: "Rounded") -> "Rounded":
+        """By a number that is not zero."""
+        value = self.value / other.value
+        least = abs(other.value) - other.error
+        return Rounded(value, (self.error + abs(value) * other.error) / least + EPS * abs(value))
+
+
+def rounded(value: float) -> Rounded:
+    """A number that is given: off by one rounding."""
+    return Rounded(value, EPS * abs(value))
