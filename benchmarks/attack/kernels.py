@@ -31,22 +31,24 @@ class Verdict:
 def verdict(diagram, mode: str = "auto") -> Verdict:
     """What the compiler, or else the examination of blocks at the start, says of a model; in NumPy alone."""
     from jaxonomy_dae.compiler.flatten import flatten
-    from jaxonomy_dae.compiler.pipeline import compile_flat, initial_point
+    from jaxonomy_dae.compiler.pipeline import compile_flat
     from jaxonomy_dae.errors import ModelError
     from jaxonomy_dae.initialization.singular_blocks import examine_blocks
     from jaxonomy_dae.lowering.lower import lower
-    from jaxonomy_dae.model.quantities import start_guess
+    from jaxonomy_dae.model.consistent_point import initial_point
+    from jaxonomy_dae.model.declared import start_guess
 
     flat = flatten(diagram)
     try:
         plan = lower(compile_flat(flat, mode, ()))
     except ModelError as error:
         return Verdict(None, f"{type(error).__name__}: {error}")
-    values, parameters, networks = initial_point(flat, plan.variable_map, plan.extended)
-    _, fixed = start_guess(flat, plan.variable_map, len(values))
+    at = initial_point(plan.model)
+    values = at.values[:-1].copy()
+    _, fixed = start_guess(plan.model)
     values[list(fixed)] = list(fixed.values())
     x = values[[*plan.states, *plan.carried]]
-    for finding in examine_blocks(plan, parameters, networks.weights, 0.0, x, lambda: np.zeros(0)):
+    for finding in examine_blocks(plan, at.parameters, at.networks.weights, 0.0, x, lambda: np.zeros(0)):
         if finding.singular:
             return Verdict(None, "InitializationError: a block is singular at the start")
     return Verdict(len(plan.states))

@@ -234,13 +234,14 @@ class _Jacobian:
                     errors[place[e], j] += bounds[i, slot]
         return dense, errors
 
-    def is_regular_with(self, equations: np.ndarray, parameter: int) -> bool:
-        """Whether a block would be regular if a parameter that is zero were not."""
+    def deficiency(self, equations: np.ndarray, parameter: int | None = None) -> float:
+        """How many equations of a block are redundant, or would be if a parameter that is zero were not."""
         values = self.values.copy()
-        values[parameter] = 0.37
+        if parameter is not None:
+            values[parameter] = 0.37
         changed = _Jacobian(self.groups, self.offsets, self.column, values)
         matrix, bounds = changed.at(equations, self.offsets.matched_variable[equations], 0)
-        return bool(np.isfinite(matrix).all()) and not left_null_vectors(matrix, bounds)
+        return len(left_null_vectors(matrix, bounds)) if np.isfinite(matrix).all() else np.inf
 
     def rows(
         self, equations: np.ndarray, columns: np.ndarray, as_number: Callable[[float], Fraction | Rounded | None]
@@ -419,8 +420,11 @@ def _for_values(
     shown = [p for p in concerned if values[p] == 0.0 and p not in modes] or [p for p in concerned if p not in modes]
     given = some([f"{names[p]} = {values[p]:g}" for p in shown])
     mode = some([f"{names[p]} = {values[p]:g}" for p in modes if " " not in names[p]])  # hidden ones
-    mends = [p for p in shown if values[p] == 0.0 and jacobian.is_regular_with(equations, p)]
-    if mends:
+    # Where a block is singular more than once, no value alone makes it regular: then those that take it nearest.
+    left = {p: jacobian.deficiency(equations, p) for p in shown if values[p] == 0.0}
+    least = min(left.values(), default=np.inf)
+    if least < jacobian.deficiency(equations):
+        mends = [p for p, count in left.items() if count == least]
         mend = f"Give a value other than zero to {alternatives([names[p] for p in mends])}"
     else:
         mend = "Change the parameters"

@@ -233,6 +233,15 @@ def coupled(mutual):
     return compiled(coils, r, q, ground, connect=joined)
 
 
+def ring():
+    """Four diodes in a ring, with a source across: two nodes that only blocking diodes hold."""
+    ev = EqnEnv()
+    a, b, c, d = (el.IdealDiode(ev, n) for n in "abcd")
+    source, load, ground = el.SineVoltage(ev, "source", 10.0, 50.0), el.Resistor(ev, "load"), el.Ground(ev, "ground")
+    joints = [(a.n, b.p), (b.n, c.p, load.p), (c.n, d.p), (d.n, a.p, source.n, ground.p), (source.p, load.n)]
+    return compiled(a, b, c, d, source, load, ground, connect=joints)
+
+
 def port_of_another_domain():
     ev = EqnEnv()
     shaft, body = rot.Inertia(ev, "shaft"), pl.Body(ev, "body")
@@ -275,13 +284,21 @@ def port_for_a_signal():
                 "Give a value other than zero to switch.Goff or diode.Goff",
             ),
         ),
+        (ring, ("in the mode a.active = 0, b.active = 0", "Give a value other than zero to a.Goff or b.Goff, or")),
         (
             port_of_another_domain,
             ("shaft.flange_a: Rotational port", "body.frame: Planar port", "a connection joins ports of one domain"),
         ),
         (port_for_a_signal, ("connect joins ports, or a variable and inputs; got both: 'r.p', 'gain.u'",)),
     ],
-    ids=["two zero resistances", "perfectly coupled coils", "boost converter", "domains", "port and signal"],
+    ids=[
+        "zero resistances",
+        "perfectly coupled coils",
+        "boost converter",
+        "ring of diodes",
+        "domains",
+        "port and signal",
+    ],
 )
 def test_models(build, parts):
     with pytest.raises(ModelError) as caught:
