@@ -9,7 +9,6 @@ import numpy as np
 from ..diagnosis.redundant_constraints import DependentConstraints, ModelAt, dependent_constraints, no_freedom
 from ..diagnosis.wording import listed
 from ..lowering.plan import SystemPlan
-from ..lowering.schedule import SparseStep
 from ..model.tables import ZERO
 from ..system.input_values import input_values
 from ..system.sections import SHOWN, Sections, some
@@ -173,8 +172,7 @@ class InitializationReport(Sections):
                 out.append((plan.describe(int(e)), self._names(q)))
         for step in plan.steps:
             if step.carried:
-                whole = isinstance(step, SparseStep)
-                for equation in step.equations if whole else [step.equations[e] for e in step.tearing.residuals]:
+                for equation in step.left:
                     for b in range(len(equation.equation)):
                         names = self._names(equation.quantity[b])
                         out.append((plan.describe(int(equation.equation[b])), names))

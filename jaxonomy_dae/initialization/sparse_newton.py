@@ -18,7 +18,6 @@ from ..linear.choice import SPARSE_DENSITY, SPARSE_FROM
 from ..linear.sparse import SparsePattern, available, is_double, sparse_jacobian
 from ..linear.whole import solve_whole
 from ..lowering.plan import SystemPlan
-from ..lowering.schedule import SparseStep
 from .ladder import DECREASE, METHODS, NEWTON_LIMIT, SHORTEST
 from .rows import InitialRows
 from .sizes import Sizes, row_sizes, tolerance
@@ -50,7 +49,7 @@ def sparse_rows(plan: SystemPlan, rows: InitialRows) -> SparseRows | None:
     """The pattern of the rows; None if dense algebra will do, or must."""
     n, equations = plan.n_state, plan.n_constraints + len(plan.carried)
     core = np.append(np.ones(equations, bool), rows.independent).nonzero()[0]
-    if rows.n_soft and any(isinstance(step, SparseStep) and step.linear for step in plan.steps):
+    if rows.n_soft and any(step.whole and step.linear for step in plan.steps):
         return None  # the nearest point to guesses is a branch, and batches cannot have sparse solves in one
     if n < SPARSE_FROM or len(core) != n or not (is_double() and available()):
         return None

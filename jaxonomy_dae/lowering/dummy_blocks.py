@@ -1,11 +1,11 @@
 """Where a minimal set of states determines the other variables through nonlinear equations."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from .schedule import AnyStep, Step
+from .schedule import AnyStep
 
 
 class DummyBlocks(NamedTuple):
@@ -27,19 +27,6 @@ def dummy_blocks(steps: Sequence[AnyStep], dummies: np.ndarray) -> tuple[DummyBl
             continue
         holds = np.isin(np.concatenate(step.unknown), dummies)
         if holds.any():
-            found.extend(_blocks_of(step, start, holds))
+            found.extend(DummyBlocks(start + rows, start + columns) for rows, columns in step.blocks_of(holds))
         start += sum(len(quantities) for quantities in step.guessed)
     return tuple(found)
-
-
-def _blocks_of(step: AnyStep, start: int, holds: np.ndarray) -> Iterator[DummyBlocks]:
-    if isinstance(step, Step):
-        # Residuals and unknowns lie one after the other, each for all instances.
-        places = start + np.arange(len(step.torn) * step.n).reshape(-1, step.n).T
-        places = places[holds.reshape(-1, step.n).any(axis=0)]
-        yield DummyBlocks(places, places)
-        return
-    equation_block = np.concatenate(step.equation_block)
-    for block in np.unique(step.block[holds]):
-        rows, columns = np.flatnonzero(equation_block == block), np.flatnonzero(step.block == block)
-        yield DummyBlocks(start + rows[None], start + columns[None])

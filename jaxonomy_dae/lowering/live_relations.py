@@ -18,7 +18,7 @@ from ..model.symbolic import SymbolicTemplate, parameter_label, template_of
 from ..model.tables import ZERO, EventTable, FlatModel
 from ..model.template import AbstractTemplate
 from ..modeling.events import LIVE
-from .schedule import AnyStep, SparseStep, Step, StepEquation
+from .schedule import AnyStep, Step
 
 
 def without_live_relations(
@@ -90,30 +90,17 @@ def _needed_as_they_are(step: AnyStep, parameters: np.ndarray, quantities: np.nd
         for column in equation.parameter.T:
             for row in np.flatnonzero(np.isin(column, relations)).tolist():
                 p = int(column[row])
-                if p not in found and any((p, q) in pairs for q in _own(step, equation, row)):
+                if p not in found and any((p, q) in pairs for q in step.own(equation, row)):
                     found.add(p)
     return np.array(sorted(found), np.int64)
 
 
-def _own(step: AnyStep, equation: StepEquation, row: int) -> list[int]:
-    """The unknowns among which those of an equation's block are."""
-    if isinstance(step, Step):
-        return [int(unknown[row]) for unknown in step.unknown]
-    read = equation.quantity[row]
-    return read[np.isin(read, step.unknown[0])].tolist()
-
-
 def _is_affine(step: AnyStep, relations: np.ndarray) -> bool:
     """Whether a step's equations are affine in its unknowns once relations are known."""
-    unknown = np.unique(np.concatenate(step.unknown))
     for equation in step.equations:
         columns = tuple(np.flatnonzero(np.isin(equation.parameter, relations).any(axis=0)).tolist())
         template = _with_known(equation.template, columns)
-        if isinstance(step, SparseStep):
-            masks = np.unique(np.isin(equation.quantity, unknown), axis=0)
-        else:
-            masks = np.array([[u >= 0 for u in equation.local]])
-        if not all(template.is_affine_in(np.flatnonzero(mask).tolist()) for mask in masks):
+        if not all(template.is_affine_in(np.flatnonzero(place).tolist()) for place in step.places(equation)):
             return False
     return True
 

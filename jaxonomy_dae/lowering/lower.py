@@ -24,7 +24,7 @@ from .plan_events import plan_events
 from .plan_held import plan_held
 from .plan_waves import plan_waves
 from .program import Layout, Program, plan
-from .schedule import AnyStep, SparseStep, Step, build_schedule, needed
+from .schedule import AnyStep, build_schedule, needed
 
 
 def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = None) -> SystemPlan:
@@ -36,7 +36,7 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
     n = quantities.n
     steps = build_schedule(extended, model.blocks, EntrySizes(reduced))
     for step in steps:
-        if isinstance(step, SparseStep) and linear_solver is None:
+        if step.whole and linear_solver is None:
             check_solvable(step.n)
     flat, left_alone = without_live_relations(reduced.flat, variable_map, steps)
     reduced = dataclasses.replace(reduced, flat=flat)
@@ -244,6 +244,6 @@ def _digest(
     feed(leading_starts(model))  # depend on the values of parameters
     for step in steps:
         # How a block is torn depends on the values of the parameters.
-        if len(step.unknown) > 1 or isinstance(step, SparseStep):
-            feed(step.tearing if isinstance(step, Step) else "whole", *step.unknown)
+        if len(step.unknown) > 1 or step.whole:
+            feed(step.elimination, *step.unknown)
     return hasher.hexdigest()

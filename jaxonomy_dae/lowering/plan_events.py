@@ -12,7 +12,7 @@ from ..model.quantities import QuantityMap
 from ..model.tables import ZERO, DependentParameters, EventTable, FlatModel
 from .gather import NOTHING, Gather
 from .program import Program
-from .schedule import AnyStep, Step
+from .schedule import AnyStep
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,11 +122,7 @@ def _parameters_behind(quantities: np.ndarray, steps: Sequence[AnyStep], n: int)
     wanted[quantities[quantities != ZERO]] = True
     found: set[int] = set()
     for step in reversed(steps):
-        hit = np.any([wanted[unknown] for unknown in step.unknown], axis=0)
-        if not hit.any():
-            continue
-        for equation in step.equations:
-            rows = hit if isinstance(step, Step) else slice(None)  # of a large block, all equations
+        for equation, rows in step.behind(wanted):
             found.update(np.unique(equation.parameter[rows]).tolist())
             quantity = equation.outside[rows]
             wanted[quantity[quantity != ZERO]] = True

@@ -4,6 +4,7 @@ Chunk 0 is the state (an array, or a tuple of scalars for small systems), chunk 
 appends one chunk for each of its local unknowns, a sparse step one for all, a loop one for each unknown of its body.
 """
 
+import abc
 import dataclasses
 from collections.abc import Sequence
 from typing import Any
@@ -49,17 +50,44 @@ class PlannedEquation:
     factors: tuple[Any, ...]  # of local slots
 
 
+class AbstractEvaluation(abc.ABC):
+    """What evaluates the steps of a program."""
+
+    @abc.abstractmethod
+    def step(self, planned: "PlannedStep", refine: Any) -> list[Any]:
+        """The unknowns of blocks that are written out, a chunk for each local one."""
+
+    @abc.abstractmethod
+    def sparse_step(self, planned: "PlannedSparse", refine: Any) -> list[Any]:
+        """The unknowns of large blocks, one chunk."""
+
+    @abc.abstractmethod
+    def loop(self, planned: "PlannedLoop") -> list[Any]:
+        """The unknowns of all repetitions, a chunk for each unknown of the body."""
+
+
+class AbstractPlanned(abc.ABC):
+    """A part of a program that computes one chunk after the other."""
+
+    @abc.abstractmethod
+    def evaluate(self, evaluation: AbstractEvaluation, refine: Any) -> list[Any]:
+        """The chunks it computes."""
+
+
 @dataclasses.dataclass(frozen=True)
-class PlannedStep:
+class PlannedStep(AbstractPlanned):
     """A step with its gathers planned; `guess` reads its tearing variables from the state if they are carried."""
 
     step: Step
     equations: tuple[PlannedEquation, ...]
     guess: tuple[Gather, ...]
 
+    def evaluate(self, evaluation: AbstractEvaluation, refine: Any) -> list[Any]:
+        return evaluation.step(self, refine)
+
 
 @dataclasses.dataclass(frozen=True)
-class PlannedSparse:
+class PlannedSparse(AbstractPlanned):
     """A sparse step: its equations read its own unknowns as a chunk that follows all others. `entries` lists, for each
     equation, (slot, instances, factors) of the slots that are unknowns; in this order their partial derivatives are the
     values of the matrix at the places of `pattern`."""
@@ -71,9 +99,12 @@ class PlannedSparse:
     guess: Gather | None
     linear_solver: lx.AbstractLinearSolver | None
 
+    def evaluate(self, evaluation: AbstractEvaluation, refine: Any) -> list[Any]:
+        return evaluation.sparse_step(self, refine)
+
 
 @dataclasses.dataclass(frozen=True)
-class PlannedLoop:
+class PlannedLoop(AbstractPlanned):
     """A loop over the repetitions of a few steps.
 
     Within it, chunk 0 are the values carried over from the repetitions before, chunk 1 what each repetition reads from
@@ -87,12 +118,15 @@ class PlannedLoop:
     outside: Gather | None  # (count · number,)
     parameters: np.ndarray  # (count, number)
 
+    def evaluate(self, evaluation: AbstractEvaluation, refine: Any) -> list[Any]:
+        return evaluation.loop(self)
+
 
 @dataclasses.dataclass(frozen=True)
 class Program:
     """Planned steps and the layout of all they compute."""
 
-    steps: tuple[PlannedStep | PlannedSparse | PlannedLoop, ...]
+    steps: tuple[AbstractPlanned, ...]
     layout: Layout
 
 

@@ -6,8 +6,10 @@ for its unknown. Small simultaneous blocks are torn, their equations written out
 whole: their equations are grouped by template, and their matrix is sparse.
 """
 
+import abc
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -44,20 +46,75 @@ class StepEquation(Group):
         return [k for k, u in enumerate(self.local) if u >= 0]
 
 
-class AbstractStep:
-    """What steps share, whose blocks are written out or sparse."""
+class AbstractStep(abc.ABC):
+    """Blocks that are solved at once: written out, or whole with a sparse matrix."""
 
+    level: int
+    equations: tuple[StepEquation, ...]
     unknown: tuple[np.ndarray, ...]
     linear: bool
+    whole: ClassVar[bool]  # whether one factorization of a sparse matrix solves it
 
     @property
     def n(self) -> int:
+        """How many unknowns each array of `unknown` has."""
         return len(self.unknown[0])
+
+    @property
+    @abc.abstractmethod
+    def elimination(self) -> Any:
+        """How it is solved, with a `repr` that differs where that does."""
+
+    @property
+    def simultaneous(self) -> bool:
+        """Whether it takes more to solve it than one division."""
+        return self.whole or len(self.unknown) > 1 or not self.linear
 
     @property
     def carried(self) -> bool:
         """Whether unknowns are part of the state array, to be refined by Newton's method."""
         return not self.linear
+
+    @property
+    @abc.abstractmethod
+    def torn(self) -> list[np.ndarray]:
+        """The quantities of the tearing variables."""
+
+    @property
+    @abc.abstractmethod
+    def guessed(self) -> list[np.ndarray]:
+        """The quantities that lie in the state array."""
+
+    @property
+    @abc.abstractmethod
+    def left(self) -> tuple[StepEquation, ...]:
+        """The equations that have residuals where the unknowns in the state array are guesses."""
+
+    @abc.abstractmethod
+    def needs(self) -> np.ndarray:
+        """The quantities that must be known before."""
+
+    @abc.abstractmethod
+    def behind(self, wanted: np.ndarray) -> list[tuple[StepEquation, np.ndarray]]:
+        """The equations, and rows of them, that determine the quantities where `wanted` is true."""
+
+    @abc.abstractmethod
+    def own(self, equation: StepEquation, row: int) -> list[int]:
+        """The unknowns among which those of an equation's block are."""
+
+    @abc.abstractmethod
+    def places(self, equation: StepEquation) -> np.ndarray:
+        """Which slots hold unknowns of the step, shape (k, slots), each of k patterns once."""
+
+    @abc.abstractmethod
+    def blocks_of(self, holds: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """The blocks that have an unknown where `holds`, over all unknowns one array after the other, is true: the
+        places of their residuals among all that are `left`, and of their unknowns among all that are `guessed`, shapes
+        (blocks, m). The step is nonlinear."""
+
+    @abc.abstractmethod
+    def listed(self) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+        """The blocks, alike ones once: (how many, the quantities of the unknowns, those of them that are torn)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,20 +126,45 @@ class Step(AbstractStep):
     unknown: tuple[np.ndarray, ...]
     tearing: Tearing
     linear: bool
+    whole = False
+
+    @property
+    def elimination(self) -> Tearing:
+        return self.tearing
 
     @property
     def torn(self) -> list[np.ndarray]:
-        """The quantities of the tearing variables."""
         return [self.unknown[u] for u in self.tearing.tearing]
 
     @property
     def guessed(self) -> list[np.ndarray]:
-        """The quantities that lie in the state array."""
         return self.torn if self.carried else []
 
+    @property
+    def left(self) -> tuple[StepEquation, ...]:
+        return tuple(self.equations[e] for e in self.tearing.residuals)
+
     def needs(self) -> np.ndarray:
-        """The quantities that must be known before."""
         return np.unique(np.concatenate([e.outside.ravel() for e in self.equations]))
+
+    def behind(self, wanted: np.ndarray) -> list[tuple[StepEquation, np.ndarray]]:
+        rows = np.flatnonzero(np.any([wanted[unknown] for unknown in self.unknown], axis=0))
+        return [(equation, rows) for equation in self.equations] if len(rows) else []
+
+    def own(self, equation: StepEquation, row: int) -> list[int]:
+        return [int(unknown[row]) for unknown in self.unknown]
+
+    def places(self, equation: StepEquation) -> np.ndarray:
+        return np.array([[u >= 0 for u in equation.local]])
+
+    def blocks_of(self, holds: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        # Residuals and unknowns lie one after the other, each for all instances.
+        places = np.arange(len(self.torn) * self.n).reshape(-1, self.n).T
+        places = places[holds.reshape(-1, self.n).any(axis=0)]
+        yield places, places
+
+    def listed(self) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+        yield self.n, np.array([u[0] for u in self.unknown]), np.array([u[0] for u in self.torn], np.int64)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,19 +181,46 @@ class SparseStep(AbstractStep):
     block: np.ndarray  # of every unknown, the number of its block
     equation_block: tuple[np.ndarray, ...]  # of every equation
     linear: bool
+    whole = True
+
+    @property
+    def elimination(self) -> str:
+        return "whole"
 
     @property
     def torn(self) -> list[np.ndarray]:
-        """None: nothing is torn."""
         return []
 
     @property
     def guessed(self) -> list[np.ndarray]:
-        """The quantities that lie in the state array."""
         return list(self.unknown) if self.carried else []
 
+    @property
+    def left(self) -> tuple[StepEquation, ...]:
+        return self.equations
+
+    def behind(self, wanted: np.ndarray) -> list[tuple[StepEquation, np.ndarray]]:
+        if not wanted[self.unknown[0]].any():
+            return []
+        return [(equation, np.arange(len(equation))) for equation in self.equations]
+
+    def own(self, equation: StepEquation, row: int) -> list[int]:
+        read = equation.quantity[row]
+        return read[np.isin(read, self.unknown[0])].tolist()
+
+    def places(self, equation: StepEquation) -> np.ndarray:
+        return np.unique(np.isin(equation.quantity, self.unknown[0]), axis=0)
+
+    def blocks_of(self, holds: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        equation_block = np.concatenate(self.equation_block)
+        for block in np.unique(self.block[holds]):
+            yield np.flatnonzero(equation_block == block)[None], np.flatnonzero(self.block == block)[None]
+
+    def listed(self) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+        for block in range(int(self.block.max()) + 1):
+            yield 1, self.unknown[0][self.block == block], np.zeros(0, np.int64)
+
     def needs(self) -> np.ndarray:
-        """The quantities that must be known before."""
         read = np.unique(np.concatenate([e.quantity.ravel() for e in self.equations]))
         return np.setdiff1d(read, self.unknown[0], assume_unique=True)
 

@@ -13,7 +13,7 @@ import numpy as np
 from ..aliases import Inputs, State, Time
 from ..initialization.block_finding import BlockFinding
 from ..initialization.singular_blocks import examine_blocks
-from ..lowering.schedule import AnyStep, SparseStep
+from ..lowering.schedule import AnyStep
 from ..model.tables import ZERO
 from ..programs.cache import compiled
 from ..solvers.dae_term import FlatProblem
@@ -55,7 +55,7 @@ def _first_failed(system: AcausalSystem, t: Time, x: State, inputs: Inputs) -> A
             continue
         if not np.isfinite(values[step.needs()]).all():
             return None
-        return step if len(step.unknown) > 1 or isinstance(step, SparseStep) or not step.linear else None
+        return step if step.simultaneous else None
     return None
 
 
@@ -83,7 +83,7 @@ def _why(system: AcausalSystem, step: AnyStep, t: Time, x: State, inputs: Inputs
             return _singular(block, place)
     if not step.linear:
         return _no_root(system, step, x, f"has no solution {place}")
-    if isinstance(step, SparseStep) and plan.linear_solver is not None:
+    if step.whole and plan.linear_solver is not None:
         return (
             f"The block of equations for {_some(names)} was not solved {place}, though it is not singular: "
             f"linear_solver={plan.linear_solver} did not converge. Let it take more steps (of GMRES, a larger restart "

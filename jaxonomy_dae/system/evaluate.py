@@ -26,7 +26,14 @@ from ..linear.torn import solve_torn
 from ..linear.whole import solve_whole
 from ..linear.written_out import UNROLLED, solve, solve_dense
 from ..lowering.gather import FEW, Chunk, Gather, entries, take, times
-from ..lowering.program import PlannedEquation, PlannedLoop, PlannedSparse, PlannedStep, Program
+from ..lowering.program import (
+    AbstractEvaluation,
+    PlannedEquation,
+    PlannedLoop,
+    PlannedSparse,
+    PlannedStep,
+    Program,
+)
 from ..model.linear_template import LinearTemplate, scaled
 from ..model.networks import Networks
 from ..model.tables import ZERO
@@ -48,7 +55,7 @@ class Refinement(enum.Enum):
     ROOT = "root"  # Newton's method until the equations hold to rounding
 
 
-class Evaluation:
+class Evaluation(AbstractEvaluation):
     """One pass over a program's steps at one point."""
 
     def __init__(self, state: Chunk, inputs: Chunk, parameters: Any, t: Any, networks: Networks, typical: Any):
@@ -75,12 +82,7 @@ class Evaluation:
     def run(self, program: Program, refine: Refinement):
         """Evaluates all steps."""
         for planned in program.steps:
-            if isinstance(planned, PlannedLoop):
-                self.chunks.extend(self._loop(planned))
-            elif isinstance(planned, PlannedSparse):
-                self.chunks.append(self._sparse_step(planned, refine))
-            else:
-                self.chunks.extend(self._step(planned, refine))
+            self.chunks.extend(planned.evaluate(self, refine))
         return self
 
     def parameter(self, k: int) -> Any:
@@ -153,7 +155,7 @@ class Evaluation:
         total = jnp.sum(values * jnp.asarray(weights.T, self.dtype), axis=0)
         return total[0] if n == 1 else total
 
-    def _step(self, planned: PlannedStep, refine: Refinement) -> list[Any]:
+    def step(self, planned: PlannedStep, refine: Refinement) -> list[Any]:
         step = planned.step
         shape = () if step.n == 1 else (step.n,)
         if not step.tearing.tearing:
@@ -270,7 +272,7 @@ class Evaluation:
             return residual, slots[:1], (1.0,)
         return residual, slots, template.partial_values(*arguments)
 
-    def _loop(self, planned: PlannedLoop) -> list[Any]:
+    def loop(self, planned: PlannedLoop) -> list[Any]:
         """The unknowns of all repetitions, each of shape (count · n,)."""
 
         def read(gather: Gather | None) -> Any:
@@ -282,7 +284,7 @@ class Evaluation:
             outside, parameters = given
             inner = Evaluation(carried, outside, parameters, self.t, Networks(self.networks.weights), self.typical)
             for step in planned.body:
-                inner.chunks.extend(inner._step(step, Refinement.NONE))
+                inner.chunks.extend(inner.step(step, Refinement.NONE))
             if planned.following is not None:
                 carried = self._filled(inner.read(planned.following), carried.shape)
             return carried, tuple(inner.chunks[2:])
@@ -293,7 +295,10 @@ class Evaluation:
         _, chunks = jax.lax.scan(repetition, read(planned.first), given, unroll=UNROLLED_REPETITIONS)
         return [jnp.reshape(c, (-1,)) for c in chunks]
 
-    def _sparse_step(self, planned: PlannedSparse, refine: Refinement) -> Any:
+    def sparse_step(self, planned: PlannedSparse, refine: Refinement) -> list[Any]:
+        return [self._whole_unknowns(planned, refine)]
+
+    def _whole_unknowns(self, planned: PlannedSparse, refine: Refinement) -> Any:
         """The unknowns of large blocks, shape (n,)."""
         if planned.guess is None:
             return self._whole_corrected(planned, jnp.zeros(planned.step.n, self.dtype))

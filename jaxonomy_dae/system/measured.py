@@ -14,7 +14,7 @@ import numpy as np
 from ..linear.torn import solve_torn
 from ..linear.whole import solve_whole
 from ..lowering.gather import Chunk, Gather
-from ..lowering.program import PlannedEquation, PlannedLoop, PlannedSparse, PlannedStep, Program
+from ..lowering.program import PlannedEquation, PlannedLoop, PlannedSparse, PlannedStep
 from ..model.networks import Networks
 from .evaluate import Evaluation, Refinement, scaled_by
 
@@ -35,21 +35,20 @@ class Measured(Evaluation):
         self.magnitudes: list[Chunk] = [sizes, jax.tree.map(jnp.abs, inputs)]
         self.carried_magnitudes: list[Any] = []
 
-    def run(self, program: Program, refine: Refinement = Refinement.NONE):
-        """Evaluates all steps."""
-        for planned in program.steps:
-            if isinstance(planned, PlannedLoop):
-                chunks = self._loop(planned)
-                sizes = [jnp.full_like(c, jnp.inf) for c in chunks]
-            elif isinstance(planned, PlannedSparse):
-                chunks = [self._sparse_step(planned, refine)]
-                sizes = self._sparse_magnitudes(planned, chunks[0])
-            else:
-                chunks = self._step(planned, refine)
-                sizes = self._step_magnitudes(planned, chunks)
-            self.chunks.extend(chunks)
-            self.magnitudes.extend(sizes)
-        return self
+    def step(self, planned: PlannedStep, refine: Refinement) -> list[Any]:
+        chunks = super().step(planned, refine)
+        self.magnitudes.extend(self._step_magnitudes(planned, chunks))
+        return chunks
+
+    def sparse_step(self, planned: PlannedSparse, refine: Refinement) -> list[Any]:
+        chunks = super().sparse_step(planned, refine)
+        self.magnitudes.extend(self._sparse_magnitudes(planned, chunks[0]))
+        return chunks
+
+    def loop(self, planned: PlannedLoop) -> list[Any]:
+        chunks = super().loop(planned)
+        self.magnitudes.extend(jnp.full_like(c, jnp.inf) for c in chunks)
+        return chunks
 
     def size(self, gather: Gather) -> Any:
         """The magnitudes of gathered values: a scalar, or an array."""

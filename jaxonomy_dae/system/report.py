@@ -6,7 +6,6 @@ import numpy as np
 
 from ..diagnosis.wording import counted
 from ..lowering.plan import SystemPlan
-from ..lowering.schedule import SparseStep
 from ..model.incidence import incidence
 from ..model.tables import provenance_of
 from ..structure.pantelides import Offsets, reduce_index
@@ -102,19 +101,12 @@ class SystemReport(Sections):
         plan = self._plan
         out = []
         for step in plan.steps:
-            if isinstance(step, SparseStep):
-                kind = "linear" if step.linear else "nonlinear"
-                for block in range(int(step.block.max()) + 1):
-                    names = [plan.quantity_name[q] for q in step.unknown[0][step.block == block]]
-                    out.append(f"{kind} block of {len(names)}: {some(names)}; solved whole, sparse")
-                continue
-            if len(step.unknown) == 1 and step.linear:
-                continue
-            names = [plan.quantity_name[u[0]] for u in step.unknown]
-            torn = [names[u] for u in step.tearing.tearing]
             kind = "linear" if step.linear else "nonlinear"
-            times = f"{step.n} × " if step.n > 1 else ""
-            out.append(f"{times}{kind} block of {len(names)}: {some(names)}; torn at {some(torn)}")
+            for count, unknown, torn in step.listed() if step.simultaneous else ():
+                times = f"{count} × " if count > 1 else ""
+                names, torn = ([plan.quantity_name[q] for q in chosen.tolist()] for chosen in (unknown, torn))
+                how = "solved whole, sparse" if step.whole else f"torn at {some(torn)}"
+                out.append(f"{times}{kind} block of {len(names)}: {some(names)}; {how}")
         return out
 
     @property

@@ -242,7 +242,9 @@ class SystemAt:
         inputs = input_values(self.plan, self.inputs, self.t, self.dtype)
         networks = Networks(self.networks)
         state, sizes = self.split(x), self.split(sizes)
-        return Measured(state, sizes, inputs, self.parameters, self.t, networks, self.typical).run(program)
+        return Measured(state, sizes, inputs, self.parameters, self.t, networks, self.typical).run(
+            program, Refinement.NONE
+        )
 
     def constraint_magnitudes(self, x: Any, sizes: Any) -> Any:
         """Of the hidden constraints, shape (n_constraints,)."""
