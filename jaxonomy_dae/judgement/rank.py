@@ -73,7 +73,7 @@ class Rank:
 
     @property
     def is_regular(self) -> bool:
-        """Whether the rows are independent."""
+        """True if the rows are independent."""
         return self.uncertainty < 1
 
 

@@ -104,7 +104,7 @@ def _own(step: AnyStep, equation: StepEquation, row: int) -> list[int]:
 
 
 def _is_affine(step: AnyStep, relations: np.ndarray) -> bool:
-    """Whether a step's equations are affine in its unknowns once relations are known."""
+    """True if a step's equations are affine in its unknowns once relations are known."""
     unknown = np.unique(np.concatenate(step.unknown))
     for equation in step.equations:
         columns = tuple(np.flatnonzero(np.isin(equation.parameter, relations).any(axis=0)).tolist())
