@@ -9,7 +9,10 @@ ILL_CONDITIONED = 1e12
 @dataclasses.dataclass(frozen=True)
 class BlockFinding:
     """A block that is singular, or nearly so: the variables it leaves open, the equations that depend on each other,
-    and the parameters and variables that make it so, with their values."""
+    and the parameters and variables that make it so, with their values.
+
+    `undecided`: it is regular as its numbers stand, and singular within their errors, so that nobody can tell.
+    """
 
     condition: float
     singular: bool
@@ -18,3 +21,4 @@ class BlockFinding:
     equations: tuple[str, ...]
     causes: tuple[tuple[str, float], ...]
     causes_are_parameters: bool
+    undecided: bool = False

@@ -300,13 +300,10 @@ class InitializationReport(Sections):
 
     def _singular(self, block: BlockFinding) -> str:
         dependent = self._dependent
+        what = f"they do not determine {some(block.variables)}"
         if any(found.is_redundant or len(found.components) > 1 for found in dependent):
-            return "\n".join(
-                [
-                    f"the equations are singular at the initial point: they do not determine {some(block.variables)}",
-                    *(str(found) for found in dependent[:SHOWN]),
-                ]
-            )
+            lines = [f"the equations are singular at the initial point: {what}"]
+            return "\n".join([*lines, *(str(found) for found in dependent[:SHOWN])])
         causes = ", ".join(f"{n} = {v:.6g}" for n, v in block.causes[:6])
         at = f" with {causes}" if causes else ""
         if block.causes_are_parameters:
@@ -315,11 +312,17 @@ class InitializationReport(Sections):
         else:
             mend = "Start elsewhere, with `initial={...}` or other parameters"
         lines = [
-            f"the equations are singular at the initial point{at}: they do not determine {some(block.variables)}",
+            f"the equations are singular at the initial point{at}: {what}",
             *(f"  {text}" for text in block.equations[:SHOWN]),
         ]
         if len(block.equations) > SHOWN:
             lines.append(f"  … and {len(block.equations) - SHOWN} more")
+        if block.undecided:
+            lines.append(
+                "Numbers cannot decide it: the coefficients are not zero, but smaller than the rounding errors of what "
+                "they are computed from. Either the point is singular, or it is nearer to a singular one than this "
+                "precision resolves."
+            )
         lines.append(f"{mend}, or remove from the model what has become superfluous.")
         return "\n".join(lines)
 

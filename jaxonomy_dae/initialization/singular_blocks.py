@@ -11,7 +11,8 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from ..judgement.rank import rank_of
+from ..expressions.errors import KNOWN
+from ..judgement.rank import is_undecided, rank_of
 from ..lowering.plan import SystemPlan
 from ..lowering.schedule import SparseStep, Step, StepEquation
 from ..model.tables import ZERO
@@ -118,13 +119,15 @@ def _finding(
     equations = tuple(dict.fromkeys(texts[e] for e in dependent)) or tuple(dict.fromkeys(texts))
     causes = _causes(plan, values, step, b, left, right) if singular or left.shape[1] else ()
     parameters = bool(causes) and causes[0][0] in plan.flat.parameters.names
-    return BlockFinding(condition, singular, len(names), variables, equations, causes, parameters)
+    undecided = singular and len(names) <= DENSE_LIMIT and is_undecided(values.jacobian(step)[b])
+    return BlockFinding(condition, singular, len(names), variables, equations, causes, parameters, undecided)
 
 
 def _causes(plan: SystemPlan, values: BlockValues, step: Step, b: int, left, right) -> tuple[tuple[str, float], ...]:
     """The parameters, or else the variables, a change of which makes the block regular: those for which uᵀ·∂J·v ≠ 0 for
-    null vectors u and v."""
+    null vectors u and v, beyond the errors of J: a multiple of what is zero but for rounding is no cause."""
     before = values.jacobian(step)[b]
+    errors = np.abs(left).T @ values.jacobian_errors(step)[b] @ np.abs(right)
 
     def matters(after: np.ndarray, anyhow: bool = False) -> bool:
         change = after - before
@@ -133,7 +136,10 @@ def _causes(plan: SystemPlan, values: BlockValues, step: Step, b: int, left, rig
         scale = np.abs(change).max(initial=0.0)
         if scale == 0.0:
             return False
-        return anyhow or not left.shape[1] or bool(np.abs(left.T @ (change / scale) @ right).max() > 1e-9)
+        if anyhow or not left.shape[1]:
+            return True
+        along = np.abs(left.T @ (change / scale) @ right)
+        return bool(((along > 1e-9) & (along * scale > errors)).any())
 
     found: list[tuple[str, float]] = []
     for p in sorted({int(p) for e in step.equations for p in e.parameter[b]}):
@@ -147,10 +153,11 @@ def _causes(plan: SystemPlan, values: BlockValues, step: Step, b: int, left, rig
         return tuple(zero)
     moved: list[tuple[str, float]] = []
     touched: list[tuple[str, float]] = []  # where it is of the second order
+    sizes = values.errors / KNOWN  # a step along 1e-16 rad alone would show nothing
     sources = {int(e.quantity[b, s]) for e in step.equations for s in slots_of_partials(e)} - {ZERO}
     for q in sorted(sources):
         kept = values.quantities[q]
-        values.quantities[q] = kept + 1e-3 * (abs(kept) or 1.0)
+        values.quantities[q] = kept + 1e-3 * (sizes[q] or 1.0)
         after = values.jacobian(step)[b]
         values.quantities[q] = kept
         name = plan.quantity_name[q]

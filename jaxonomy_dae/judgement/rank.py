@@ -77,6 +77,11 @@ class Rank:
         return self.uncertainty < 1
 
 
+def is_undecided(matrix: Float[np.ndarray, "m n"]) -> bool:
+    """Whether a matrix that is singular within its errors would be regular if its entries were exact."""
+    return rank_of(matrix, rounding(matrix)).is_regular
+
+
 def rank_of(matrix: Float[np.ndarray, "m n"], errors: Float[np.ndarray, "m n"]) -> Rank:
     """Judges a finite matrix; a bound that is not finite says that nothing is known of its entry."""
     size = np.abs(matrix)

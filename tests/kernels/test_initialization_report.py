@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 from problems import FreeMass, compiled, environment, oscillator, pendulum, rc_circuit
-from sympy import Eq
+from sympy import Eq, cos, sin
 
 from jaxonomy_dae import Component, EqnEnv, InitializationError, ModelError, der, simulate
 from jaxonomy_dae.library.electrical import Capacitor, Ground, Resistor, VoltageSource
@@ -388,6 +388,28 @@ def test_an_ill_conditioned_block_is_a_note():
     assert not system.with_parameters({"c.e": 1e-9}).initialization_report().notes
     with pytest.raises(InitializationError, match=r"c\.e = 0.*do not determine der\(c\.x\), c\.v"):
         system.with_parameters({"c.e": 0.0}).initialize()
+
+
+class Lever(Component):
+    """A force that carries the torque of a weight on a lever at the angle phi."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        arm = self.parameter("arm", 0.3)
+        phi, force = self.variable("phi", start=1.0, fixed=True), self.variable("force")
+        self.add_equations(Eq(der(phi), 1.0), Eq(arm * sin(phi) * force, 2 + cos(phi)))
+
+
+@pytest.mark.parametrize(("phi", "undecided"), [(0.0, False), (np.pi, True), (1e-16, True)])
+def test_a_coefficient_below_its_rounding_error(phi, undecided):
+    """sin(π) is 1.2e-16 in floating point: not zero, and of no known sign. Both readings are said, and what makes it
+    so: the angle, not the arm, which scales what is nothing but a rounding error."""
+    system = compiled(Lever(EqnEnv(), "lever"))
+    with pytest.raises(InitializationError, match="singular.*do not determine lever.force") as error:
+        system.initialize(initial={"lever.phi": phi})
+    text = str(error.value)
+    assert f"with lever.phi = {phi:.6g}" in text and "arm =" not in text and "Start elsewhere" in text
+    assert ("Either the point is singular, or it is nearer to a singular one" in text) == undecided
 
 
 @pytest.mark.slow
