@@ -78,7 +78,8 @@ class Rank:
 
 
 def is_undecided(matrix: Float[np.ndarray, "m n"]) -> bool:
-    """Whether a matrix that is singular within its errors would be regular if its entries were exact."""
+    """True if a matrix that is singular within its errors would be regular if its entries were exact to one
+    rounding."""
     return rank_of(matrix, rounding(matrix)).is_regular
 
 
