@@ -11,7 +11,8 @@ from jax.core import Tracer
 
 from ..diagnosis.wording import some
 from ..errors import ModelError, SteadyStateError, nearest
-from ..initialization.initialize import check, find_initial
+from ..initialization.check import check
+from ..initialization.initialize import find_initial
 from ..programs.staging import is_staged
 from ..solvers.rows import not_a_number
 from ..system.inputs import read_inputs

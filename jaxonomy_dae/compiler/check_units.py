@@ -26,7 +26,7 @@ from ..units.unit import JOULE, SECOND, WATT, Unit, rate
 from .number_model import RELATION, Instances, ModelNumbers
 from .read_equations import read_expression
 
-SHOWN = 12
+SHOWN = 12  # mismatches that an error lists
 UnitOf = Callable[[Hashable], Unit | None]
 ACCOUNTS = {"energy": JOULE, "dissipation": WATT, "supply": WATT}
 

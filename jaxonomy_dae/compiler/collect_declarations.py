@@ -162,7 +162,7 @@ def parameter_table(model: ModelNumbers) -> ParameterTable:
 
 
 def _place_in(value: EachValue, i: Instances) -> np.ndarray:
-    """Which component of the array that was given the values each instance belongs to."""
+    """For each instance, the position of its value in `value.values`, shape (instances,)."""
     rows, at = np.arange(len(i)), i
     while at.component is not value.prototype:
         assert at.parent is not None

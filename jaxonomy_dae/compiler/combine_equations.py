@@ -19,7 +19,7 @@ from ..model.tables import ZERO, EquationGroup
 from ..modeling.symbols import TIME_LABEL
 from .null_vectors import CANCELLED
 
-POINTS = 4
+POINTS = 4  # sample values of the parameters, the first of them those given (see `near`)
 FAR = 64  # points at which a cancellation must hold, too, …
 # … over these powers of ten of quantities and of parameters given: to where branches of conditions turn.
 REACH, REACH_OF_PARAMETERS = 5.0, 2.0
@@ -41,13 +41,14 @@ def somewhere(variable: Any, order: Any, trial: int) -> Any:
 
 
 def tried(variable: Any, order: Any, trial: int) -> Any:
-    """The same for the first trials, then ever nearer to zero: what overflows near one has a value at last."""
+    """Sample values for a trial: O(1) for the first four trials, then 1e-3 times smaller every four, so that
+    expressions that overflow near 1 become finite."""
     return somewhere(variable, order, trial) * 10.0 ** (-3 * (trial // 4))
 
 
 def near(values: np.ndarray, trial: int, kept: np.ndarray) -> np.ndarray:
-    """Other parameter values of the same signs; those given for trial 0, and of those in `kept`, discrete variables:
-    numbers that say which branch holds."""
+    """Sample values of parameters, of the same signs as `values`: those given for trial 0. Entries in `kept`, discrete
+    variables, stay as given: they say which branch holds."""
     if trial == 0:
         return values
     factor = 0.25 + np.abs(somewhere(np.arange(len(values)), 3, trial))
@@ -187,7 +188,8 @@ def _sum_of_terms(parts: Sequence[Node]) -> Node:
 
 
 def _is_rounding(graph: Node, label: Hashable, values: np.ndarray, kept: np.ndarray) -> bool:
-    """Whether a graph's slope in a quantity is a rounding error wherever it has a value other than zero."""
+    """True if a graph's slope in a quantity is a rounding error at all sampled points at which it has a value other
+    than zero."""
     slope = _sum_of_terms([partial_derivative(graph, label)])
     labels = sorted(slope.leaves, key=repr)
     columns = _far_points(labels, values, kept, of_parameters=True)
@@ -220,8 +222,9 @@ def cancels_elsewhere(
     equations: Sequence[Node], weights: Sequence[Node], gone: Sequence[Hashable], values: np.ndarray, kept: np.ndarray,
     of_parameters: bool,
 ) -> bool:  # fmt: skip
-    """Whether what cancels near the points that were tried does so at quantities of other sizes and signs, or
-    `of_parameters`: a condition may choose another branch there. Points without values say nothing.
+    """True if a combination that cancels near the points that were tried cancels at quantities of other sizes and
+    signs, too, or with `of_parameters`, at other parameters: a condition may choose another branch there. Points
+    without values say nothing.
 
     Parameters in `kept`, discrete variables, are as they are given.
     """

@@ -155,7 +155,7 @@ def _canonical(terms: _Terms, classes: _Classes) -> _Terms:
 
 
 def _starts(terms: _Terms, n_rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Of each row: how many terms it has, and the first one's place."""
+    """For each row, the number of its terms and the place of the first one."""
     count = np.bincount(terms.row, minlength=n_rows)
     return count, np.cumsum(count) - count
 

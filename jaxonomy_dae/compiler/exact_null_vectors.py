@@ -63,7 +63,7 @@ def _eliminated(rows: list[Row]) -> tuple[list[int], list[tuple[int, int, Any]]]
 
 
 def _combination(row: int, operations: Sequence[tuple[int, int, Any]], one: Field) -> Row:
-    """What a row is made of: the operations undone, the last one first."""
+    """The weights of the original rows in a reduced row: undoes `operations`, the last one first."""
     weights: Row = {row: one}
     for k, i, factor in reversed(operations):
         if k in weights:

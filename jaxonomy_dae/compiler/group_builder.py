@@ -12,7 +12,7 @@ from ..model.template import AbstractTemplate
 
 
 @dataclasses.dataclass
-class _Rows:
+class _CollectedRows:
     """A group under construction."""
 
     template: AbstractTemplate
@@ -27,11 +27,11 @@ class GroupBuilder:
     """Collects equation rows by template."""
 
     def __init__(self):
-        self._rows: dict[str, _Rows] = {}
+        self._rows: dict[str, _CollectedRows] = {}
 
     def add(self, template: AbstractTemplate, variable, order, parameter, coefficient, provenance: Provenances):
         """Adds n instances: arrays of shape (n, slots), (n, slots), (n, parameters), (n, coefficients)."""
-        rows = self._rows.setdefault(template.key, _Rows(template))
+        rows = self._rows.setdefault(template.key, _CollectedRows(template))
         n = len(provenance)
         rows.variable.append(np.asarray(variable, np.int64).reshape(n, -1))
         rows.order.append(np.asarray(order, np.int64).reshape(n, -1))

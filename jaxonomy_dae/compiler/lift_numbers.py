@@ -21,7 +21,7 @@ KEPT = (-1, 0, 1)  # numbers that belong to a shape
 _ANY = leaf(("number", "any"))
 
 
-class Rows(NamedTuple):
+class TemplateRows(NamedTuple):
     """Equations of one template: arrays of shape (n, slots), (n, slots), (n, parameters), (n, coefficients)."""
 
     template: AbstractTemplate
@@ -32,8 +32,9 @@ class Rows(NamedTuple):
     provenance: Provenances
 
 
-def lifted(rows: Sequence[Rows]) -> list[Rows]:
-    """The same, in order."""
+def lifted(rows: Sequence[TemplateRows]) -> list[TemplateRows]:
+    """The rows in the same order, with numbers taken out of templates that differ in numbers only, if there are more
+    than `MANY` of them."""
     out = list(rows)
     symbolic = [(k, r.template) for k, r in enumerate(rows) if isinstance(r.template, SymbolicTemplate)]
     if len({template.key for _, template in symbolic}) <= MANY:

@@ -18,12 +18,12 @@ DEFICIENT = 1e-11  # singular values below, of a matrix with rows and columns sc
 CANCELLED = 1e-11  # of the terms: a sum this small is zero
 NOTHING = (1e-8, 1e-13)  # weights below are left out, the larger ones if columns cancel without them
 REFINEMENTS = 2
-LARGEST_DENOMINATOR = 1000
+LARGEST_DENOMINATOR = 1000  # of a fraction that a computed weight is taken for
 SIMPLE = 1_000_000  # numerator times denominator: beyond, fractions come as near to any number by chance
 
 
 def cancels(weights: np.ndarray, matrix: np.ndarray) -> bool:
-    """Whether wᵀA = 0, to rounding of the terms of every column."""
+    """True if wᵀA = 0, to rounding of the terms of every column."""
     terms = weights[:, None] * matrix
     return bool((np.abs(terms.sum(axis=0)) <= CANCELLED * np.abs(terms).sum(axis=0)).all())
 
@@ -59,7 +59,8 @@ def _verified(null: np.ndarray, rows: np.ndarray, matrix: np.ndarray) -> list[np
 
 
 def _refined(w: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """The same to rounding: a combination is combined again with others, and what is left of what cancels grows."""
+    """Refines w to working precision. Combined equations are combined again, and each time the error left in w is
+    amplified."""
     used = np.flatnonzero(w)
     better = w.copy()
     for _ in range(REFINEMENTS):

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -43,12 +43,12 @@ class Instances:
 
 
 def _own(c: Component) -> tuple[int, ...]:
-    """How many components, variables, parameters, relations and ports a component is and has."""
+    """The numbers of components, variables, parameters, relations and ports that a component itself is and has."""
     return 1, len(c.variables), len(c.parameters), len(c.relations), len(c.ports)
 
 
 def _child(entry: Any) -> tuple[Component, ComponentArray | None]:
-    return (entry.prototype, entry) if isinstance(entry, ComponentArray) else (entry, None)
+    return (cast(Component, entry.prototype), entry) if isinstance(entry, ComponentArray) else (entry, None)
 
 
 class ModelNumbers:
@@ -77,7 +77,8 @@ class ModelNumbers:
         self.previous[self.discrete] = len(self.previous) + np.arange(len(self.discrete))
 
     def _counted(self) -> dict[int, np.ndarray]:
-        """Of each component object, by id: how many of everything one instance of it is and has inside."""
+        """For each component object, by id, the numbers (as of `_own`) of everything that one instance of it is and has
+        inside."""
         order: list[Component] = []
         waiting = [_child(c)[0] for c in self.top.values()]
         while waiting:
@@ -92,7 +93,7 @@ class ModelNumbers:
 
     @staticmethod
     def _sizes(children: dict[str, Any], counts: dict[int, np.ndarray]) -> list[np.ndarray]:
-        """Of each child or array: how many of everything it is and has inside."""
+        """For each child or array, the numbers of everything that it is and has inside."""
         found = [_child(entry) for entry in children.values()]
         return [counts[id(child)] * (array.size if array else 1) for child, array in found]
 
@@ -280,7 +281,7 @@ class Members:
 
 
 def array_names(model: ModelNumbers) -> ArrayNames:
-    """What names without indices mean."""
+    """The meaning of names without indices: the entries of arrays that they stand for."""
     entries = {}
     for i in model.instances:
         if not i.shape:

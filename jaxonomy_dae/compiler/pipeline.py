@@ -25,7 +25,7 @@ from .select_states import StateSelection, select_states
 
 @dataclasses.dataclass(frozen=True)
 class CompiledModel:
-    """What the passes found, in the order they found it."""
+    """The results of the passes, in the order in which they were found."""
 
     reduced: ReducedModel
     selection: StateSelection

@@ -13,7 +13,7 @@ Merit = tuple[int, int, int]  # how strongly it was asked for, whether it is fix
 
 
 def merits(model: ReducedModel, prefer_states: Sequence[str]) -> list[Merit]:
-    """How much each quantity should be a state; larger tuples are kept.
+    """For each quantity, how much it should be a state; of quantities that compete, those with larger tuples are kept.
 
     **Raises:**
 
@@ -37,8 +37,8 @@ def merits(model: ReducedModel, prefer_states: Sequence[str]) -> list[Merit]:
 
 
 def note_not_followed(model: ReducedModel, prefer_states: Sequence[str], states: np.ndarray) -> tuple[str, ...]:
-    """A note on what was asked for as a state and is none, for others were better pivots, or no equation
-    differentiates it."""
+    """Notes on names in `prefer_states` that did not become states: the states and inputs determine them, for others
+    were better pivots, or no equation differentiates them."""
     index = {name: k for k, name in enumerate(model.flat.variables.names)}
     chosen = set(states.tolist())
     left = [n for n in _entries(model.flat, prefer_states) if model.variables[index[n]][0] not in chosen]

@@ -14,7 +14,7 @@ from ..model.symbolic import canonical, linear_coefficients
 from ..model.template import AbstractTemplate
 from ..modeling.symbols import ParameterSymbol, PreviousSymbol, TimeSymbol, VariableSymbol, symbol_label
 from .group_builder import GroupBuilder
-from .lift_numbers import Rows, lifted
+from .lift_numbers import TemplateRows, lifted
 from .number_model import Instances, Members, ModelNumbers
 
 
@@ -29,7 +29,7 @@ def add_components(model: ModelNumbers, builder: GroupBuilder):
                     read_once[id(residual)] = read_expression(residual, model.path(i))
             graphs = tuple(read_once[id(r)] for r in c.equations)
             by_shape.setdefault((graphs, tuple(c.variables), tuple(c.parameters)), []).append(i)
-    rows: list[Rows] = []
+    rows: list[TemplateRows] = []
     for (graphs, _, _), parts in by_shape.items():
         members = Members(model, parts)
         number = members.number
@@ -50,7 +50,7 @@ def add_components(model: ModelNumbers, builder: GroupBuilder):
                 template = LinearTemplate(len(variables))
                 numbers = np.tile(coefficients, (len(number), 1))
                 parameter_ids = np.zeros((len(number), 0))
-            rows.append(Rows(template, ids, order, parameter_ids, numbers, provenance))
+            rows.append(TemplateRows(template, ids, order, parameter_ids, numbers, provenance))
     for row in lifted(rows):
         builder.add(*row)
 

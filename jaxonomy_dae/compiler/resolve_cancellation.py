@@ -140,7 +140,8 @@ class _Jacobian:
         return g, e - int(self.first[g])
 
     def partials(self, g: int, trial: int) -> tuple[np.ndarray, np.ndarray]:
-        """Of all equations of a group, factors included, and bounds of their errors: shape (n, slots) each."""
+        """The partial derivatives of all equations of group g at a trial's sample point, factors included, and bounds
+        of their errors: shape (n, slots) each."""
         if (g, trial) not in self._partials:
             group = self.groups[g]
             point = np.where(group.variable == ZERO, 0.0, tried(group.variable, group.order, trial))
@@ -235,7 +236,8 @@ class _Jacobian:
         return dense, errors
 
     def deficiency(self, equations: np.ndarray, parameter: int | None = None) -> float:
-        """How many equations of a block are redundant, or would be if a parameter that is zero were not."""
+        """The number of redundant equations of a block at a sample point; with `parameter`, if that parameter, which is
+        zero, were not. Infinite where the equations have no values."""
         values = self.values.copy()
         if parameter is not None:
             values[parameter] = 0.37
@@ -270,7 +272,7 @@ class _Jacobian:
         return [{j: value for j, value in row.items() if value} for row in rows]
 
     def is_constant(self, equations: np.ndarray, columns: np.ndarray) -> bool:
-        """Whether no entry depends on the point."""
+        """True if no entry of the block depends on the point."""
         return all(
             self.groups[self.place(e)[0]].template.coefficient_is_constant(slot)
             for e in equations.tolist()
@@ -309,7 +311,7 @@ def _simple(value: float) -> Fraction | None:
 
 
 def _cancels(weights: Row, rows: Sequence[Row]) -> bool:
-    """Whether every column of Σ weight·row is a rounding error: an elimination that lost all digits shows no
+    """True if every column of Σ weight·row is a rounding error. An elimination that lost all digits shows no
     combination."""
     terms: dict[int, list[float]] = {}
     for i, weight in weights.items():
@@ -334,7 +336,8 @@ def _numeric_combination(
 def _sampled_combination(
     jacobian: _Jacobian, equations: np.ndarray, columns: np.ndarray, names: Sequence[str], discrete: np.ndarray
 ) -> tuple[int, EquationGroup] | None:
-    """The same where entries are functions, or numbers that cancel to rounding."""
+    """An equation of a block and the combination that replaces it, found from values at random points: for entries that
+    are functions, or numbers that cancel to rounding. None if the block is regular at one of them."""
     groups = jacobian.groups
     trials, matrices, errors = [], [], []
     wanted = 1 if jacobian.is_constant(equations, columns) else STATES

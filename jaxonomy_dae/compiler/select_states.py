@@ -211,7 +211,8 @@ def _dummy_derivatives(model: ReducedModel, dense, errors, c, columns, merit: Se
 
 
 def _pivots(matrix: np.ndarray, errors: np.ndarray, keys: list[tuple]) -> list[int] | None:
-    """As many columns as rows, nonsingular together: the least wanted as states whose pivots are not poor."""
+    """Chooses as many columns as rows that are nonsingular together: those least wanted as states (by `keys`) whose
+    pivots are not poor. None if the matrix is singular."""
     if not rank_of(matrix, errors).is_regular:
         return None
     matrix = above_errors(matrix, errors)

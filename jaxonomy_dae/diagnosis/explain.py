@@ -40,7 +40,8 @@ class Explainer:
         return self._smallest(np.array(sorted(seen), np.int64), np.array(sorted(variables), np.int64))
 
     def _smallest(self, rows: np.ndarray, variables: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Those equations that depend on each other: the support of the left null vector, other entries drawn."""
+        """Reduces equations that depend on each other to the smallest such set: the support of the left null vector.
+        Entries that are not numbers are drawn at random."""
         if not 1 < len(rows) <= LARGEST:
             return rows, variables
         matrix = np.zeros((len(rows), len(variables)))
@@ -85,7 +86,7 @@ class Explainer:
         return [c for c in self.flat.components if c in found]  # connections and networks are none
 
     def quantity(self, variables) -> str:
-        """What the port variables among these are called at their ports."""
+        """The name that the first port variable among these has at its port."""
         table = self.flat.variables
         return table.names[variables[table.port[variables] >= 0][0]].rsplit(".", 1)[1]
 
@@ -95,7 +96,7 @@ class Explainer:
         return tuple(self.components(rows)), tuple(ports[ports >= 0].tolist())
 
     def once_too_often(self, rows, variables, kind: str, quantities: Sequence[str]) -> str:
-        """That components determine the same thing twice, which has these names at their ports."""
+        """The sentence that several components determine one quantity, in the port's words."""
         table = self.flat.variables
         at_ports = variables[table.port[variables] >= 0]
         names = self.components(rows)
@@ -120,7 +121,7 @@ class Explainer:
         )
 
     def _flows(self, rows, at_ports, word: DomainWords) -> str:
-        """That a flow is fixed twice: by sources in series, at a node, or by a source and a loose port."""
+        """The sentence that a flow is fixed twice: by sources in series, at a node, or by a source and a loose port."""
         alone = [r for r in rows.tolist() if self.start[r + 1] - self.start[r] == 1]
         names = self.components(alone) or self.components(rows)
         loose = [self.flat.ports.names[p] for p in at_ports.tolist() if self.flat.ports.is_loose[p]]
@@ -140,7 +141,7 @@ class Explainer:
         )
 
     def sources(self, rows, groups, alias: AliasTable) -> str:
-        """That the flows between two parts of the model are all fixed; empty if none is."""
+        """The sentence that the flows between two parts of the model are all fixed; "" if none is."""
         flat = self.flat
         known = set()
         roots: dict[int, int] = {}

@@ -33,7 +33,12 @@ FINDINGS = 4  # of each kind
 
 @dataclasses.dataclass(frozen=True)
 class Findings:
-    """What was recognised: sentences that speak of ports, and, of what no sentence fits, equations with unknowns."""
+    """Recognised faults.
+
+    - `texts`: sentences that speak of ports.
+    - `equations`: sets of equations that no sentence fits, with the fewer variables that they contain.
+    - `more`: the number of equations too many that were found beside those.
+    """
 
     texts: list[str]
     equations: list[tuple[np.ndarray, np.ndarray]]  # equations as written, and the fewer variables they contain
@@ -41,7 +46,7 @@ class Findings:
 
 
 def recognise(flat: FlatModel, groups: tuple[EquationGroup, ...], alias: AliasTable) -> Findings:
-    """What is certainly wrong with a model; `groups` and `alias` are those after alias elimination."""
+    """Finds faults that are certain whatever the values are; `groups` and `alias` are those after alias elimination."""
     entries = entries_of(flat.groups, ~flat.variables.is_input)
     determined_by, twice = _known(entries, len(flat.variables))
     say = Explainer(flat, entries, determined_by)
@@ -272,7 +277,8 @@ def _islands(flat: FlatModel, groups, alias: AliasTable, members: np.ndarray) ->
 
 
 def _invariant(group: EquationGroup, weight: np.ndarray) -> np.ndarray:
-    """Whether the residual of each instance stays the same when its slots move by weight·(a function of time)."""
+    """True for instances whose residual stays the same when their slots move by weight·(a function of time), shape
+    (instances,)."""
     out = ~(weight != 0).any(axis=1)
     rest = np.flatnonzero(~out)
     if not len(rest):

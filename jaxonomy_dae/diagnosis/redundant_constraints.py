@@ -317,8 +317,8 @@ def no_freedom(at: ModelAt) -> list[tuple[str, ...]]:
 
 
 def too_many(flat: FlatModel, alias: AliasTable, equations: Sequence[Provenance], variables: np.ndarray) -> str:
-    """What to say of mechanical constraints that are more than the positions they determine; empty if they are
-    something else.
+    """The sentence on mechanical constraints that are more than the positions they determine; "" if they are something
+    else.
 
     `variables` are those that the equations determine, and their aliases.
     """

@@ -18,7 +18,7 @@ from .recognise import recognise
 from .redundant_constraints import too_many
 from .wording import counted, itemised, listed
 
-PARTS = 4
+PARTS = 4  # faults that an error explains
 
 
 def check_structure(
@@ -133,7 +133,7 @@ def _with_multiples(
 
 
 def _repeated(flat: FlatModel, empty: list[Provenance]) -> list[str]:
-    """What to say of equations in which alias elimination has left no variable."""
+    """Sentences on equations in which alias elimination has left no variable."""
     column = np.cumsum(~flat.variables.is_input) - 1
     column[flat.variables.is_input] = -1
     unknown = np.flatnonzero(~flat.variables.is_input)
@@ -187,7 +187,7 @@ def _too_few(flat: FlatModel, n_equations: int, variables: np.ndarray, concerned
 
 
 def _only_through(flat: FlatModel, concerned: np.ndarray) -> bool:
-    """Whether these variables are flows at ports: what constraints that are too many leave open."""
+    """True if these variables are flows at ports: redundant constraints leave flows open."""
     at_ports = concerned & (flat.variables.port >= 0)
     return bool(at_ports.any() and not flat.variables.is_across[at_ports].any())
 

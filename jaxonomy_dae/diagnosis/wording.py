@@ -6,12 +6,13 @@ from collections.abc import Iterable, Sequence
 
 from ..model.provenance import Provenance
 
-SHOWN = 6
+SHOWN = 6  # names, or equations, of a list in a sentence
 
 
 @dataclasses.dataclass(frozen=True)
 class DomainWords:
-    """How errors speak of one domain: its across and through quantities, what carries a level, what mends a loop."""
+    """The words in which errors speak of one domain: its across and through quantities, components that carry a level,
+    those that mend a loop."""
 
     across: str
     between: str  # what a difference of two across quantities is called

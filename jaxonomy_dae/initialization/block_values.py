@@ -67,7 +67,8 @@ class BlockValues:
 
     @property
     def errors(self) -> np.ndarray:
-        """How well quantities are known: a position is one of Newton's method, so to rounding of its typical size."""
+        """Bounds of the errors of quantities: they are found by Newton's method, so to rounding of themselves and of
+        their typical sizes."""
         known = _error_sizes(self.plan, np.asarray(self.parameters, float).tobytes())
         return KNOWN * (np.abs(self.quantities) + np.append(known, 0.0))
 
@@ -76,7 +77,7 @@ class BlockValues:
         return equation.residual(self._at(equation))
 
     def jacobian(self, step: Step, parameters: np.ndarray | None = None) -> np.ndarray:
-        """The Jacobians of a step's n blocks, shape (n, k, k)."""
+        """The Jacobian of each of the step's n blocks, shape (n, k, k)."""
         return _in_blocks(step, lambda equation: self.partials(equation, parameters))
 
     def jacobian_errors(self, step: Step) -> np.ndarray:
@@ -84,7 +85,7 @@ class BlockValues:
         return _in_blocks(step, self.partial_errors)
 
     def follow(self, step: Step):
-        """Computes the unknowns of a step that follow from its tearing variables, which are known."""
+        """Computes the unknowns that follow from the tearing variables in the state."""
         for e, u in step.tearing.sequence:
             equation = step.equations[e]
             (slot,) = [k for k in equation.inside if equation.local[k] == u]

@@ -9,7 +9,7 @@ from ..judgement.rank import EASY, Rank, rank_of
 from ..judgement.sparse_rank import sparse_rank_of
 from .block_finding import DENSE_LIMIT, ILL_CONDITIONED
 
-TINY = 1e-300
+TINY = 1e-300  # takes the place of zero in denominators
 
 NullVectors = Callable[[int], np.ndarray]
 

@@ -14,7 +14,7 @@ from ..linear.least_squares import least_squares
 from .ladder import FAILED, GIVEN, Found
 from .sizes import Sizes, column_sizes, row_sizes, soft_weight, tolerance, weighed
 
-MAX_STEPS = 1000
+MAX_STEPS = 1000  # of a solver of the user's, some of which take many cheap steps
 
 
 def check_solver(solver: Any):

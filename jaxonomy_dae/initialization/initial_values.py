@@ -8,10 +8,9 @@ import numpy as np
 from jax.core import Tracer
 
 from ..errors import ModelError
-from ..system.system import AcausalSystem
 
 
-def check_initial(system: AcausalSystem, initial: Any) -> None:
+def check_initial(system: Any, initial: Any) -> None:
     """Raises a `ModelError` that names a value of `initial={...}` which cannot be meant."""
     if initial is None:
         return

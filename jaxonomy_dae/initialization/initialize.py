@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from ..errors import InitializationError, ModelError
+from ..errors import ModelError
 from ..linear.least_squares import least_squares
 from ..linear.sparse import sparse_jacobian
 from ..linear.whole import solve_whole
@@ -26,15 +26,13 @@ from ..lowering.plan import SystemPlan
 from ..model.declared import declared_scale, quantity_bounds
 from ..programs.cache import PROGRAMS, compiled
 from ..programs.staging import is_staged
-from ..solvers.rows import not_a_number
 from ..system.evaluate import Refinement
-from ..system.input_values import input_values
 from ..system.inputs import read_inputs
 from ..system.system_at import SystemAt
 from .given_solver import find_root_with
 from .initial_values import check_initial
 from .ladder import FAILED, STAGED, find_root
-from .rows import InitialRows, Row, initial_rows
+from .rows import InitialRows, StartRow, initial_rows
 from .sizes import NOISE, Sizes, tolerance
 from .sparse_newton import SparseRows, sparse_newton, sparse_rows
 from .stages import solve_in_stages, stages
@@ -44,9 +42,14 @@ CANCELLED = 1e3  # rounding errors of what is zero because its terms cancel, in 
 
 
 class InitialPoint(NamedTuple):
-    """What the search found: `x` of shape (n_state,), `solved` the parameters solved for, the residual of every row,
-    the largest that counts as rounding and the value the row should have had (zero for equations), an index into
-    `METHODS`, the number of evaluations, and the Jacobian of the rows with respect to (x, solved)."""
+    """The result of the search for a consistent point.
+
+    - `x`: the state array, shape (n_state,); `solved`: the parameters solved for.
+    - `residual`, `limit`, `target`: of each row, the residual, the largest that counts as rounding, and the value the
+        row should have had (zero for equations).
+    - `method`: an index into `METHODS`; `evaluations`: their number.
+    - `jacobian`: that of the rows with respect to (x, solved).
+    """
 
     x: Any
     solved: Any
@@ -325,7 +328,7 @@ def _twice(step: Callable[[Any], tuple[Any, Any]], w: Any) -> tuple[Any, Any]:
 
 
 def _sizes(plan: SystemPlan, rows: InitialRows, given: list, parameters: Any, start: Any) -> Sizes:
-    """What is known of the sizes of unknowns and of starts."""
+    """The known sizes of unknowns and of starts."""
     dtype, n = parameters.dtype, plan.n_state
     more = start.shape[0] - n
     entries = np.concatenate([plan.states, plan.carried])
@@ -337,9 +340,9 @@ def _sizes(plan: SystemPlan, rows: InitialRows, given: list, parameters: Any, st
 
 
 def _with_velocities(sizes: Sizes, x: Any, plan: SystemPlan, here: SystemAt) -> Sizes:
-    """Redundant velocities that are all rounding errors have no size by which the others could be judged: positions
-    and a frequency give one. All that moves tells the frequency ω, by |x'| = ω|x| and |x''| = ω²|x|, each position in
-    units of its typical size."""
+    """Sizes in which each velocity has at least ω·(known size of its position): redundant velocities that are all
+    rounding errors would have none by which others could be judged. The frequency ω follows from all that moves, by
+    |x'| = ω|x| and |x''| = ω²|x|, each position in units of its typical size."""
     owner, place = plan.extended.quantities.owner, {int(q): k for k, q in enumerate(plan.states)}
     pairs = [(k, place[q + 1]) for q, k in place.items() if q + 1 in place and owner[q] == owner[q + 1]]
     if not pairs:
@@ -390,7 +393,8 @@ def _bounds(system: Any, plan: SystemPlan, unknown: np.ndarray) -> np.ndarray:
 
 
 def independent_rows(plan: SystemPlan, rows: InitialRows, n: int) -> np.ndarray | None:
-    """As many rows as unknowns, none of which follows from others; None if guesses outnumber what is open."""
+    """The places of as many rows as unknowns, none of which follows from others; None if guesses outnumber what is
+    open."""
     if rows.n_soft and not all(rows.independent[-rows.n_soft :]):
         return None
     equations = plan.n_constraints + len(plan.carried)
@@ -398,7 +402,7 @@ def independent_rows(plan: SystemPlan, rows: InitialRows, n: int) -> np.ndarray 
     return core if len(core) == n else None
 
 
-def _reader(plan: SystemPlan, kept: tuple[Row, ...]):
+def _reader(plan: SystemPlan, kept: tuple[StartRow, ...]):
     """The values of the rows' variables as a function of the point and the state array, and their magnitudes, given
     those of the array as well."""
     quantity = np.array([r.quantity for r in kept], np.int64)
@@ -430,12 +434,12 @@ def frozen_inputs(inputs: Any) -> Any:
     return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, inputs)
 
 
-def _units(rows: tuple[Row | None, ...]) -> np.ndarray:
-    """What one unit of each row's variable is in units of its quantity."""
+def _units(rows: tuple[StartRow | None, ...]) -> np.ndarray:
+    """The factors from a unit of each row's variable to its quantity."""
     return np.array([1.0 if row is None else 1.0 / (row.factor or 1.0) for row in rows])
 
 
-def _values(rows: tuple[Row | None, ...], given: list, parameters: Any, sizes: bool = False) -> Any:
+def _values(rows: tuple[StartRow | None, ...], given: list, parameters: Any, sizes: bool = False) -> Any:
     """The values of start rows, shape (rows,): one vectorised kernel for each distinct start expression. Or the sizes
     of their terms, Σ |∂(value)/∂(parameter)|·|parameter|, which rounding is relative to."""
     members: dict[str, list[int]] = {}
@@ -482,19 +486,13 @@ def _term_sizes(kernel: Callable[[list], Any], values: list, template: Any) -> A
 
 
 def is_consistent(found: InitialPoint) -> Any:
-    """Whether all rows hold, to rounding."""
+    """True if all rows hold, to rounding."""
     # What is not traced is compared by NumPy: each operation by itself would be a program to compile.
     parts: Any = (found.residual, found.limit, found.x, found.solved)
     traced = any(isinstance(part, Tracer) for part in parts)
     xp: Any = jnp if traced else np
     residual, limit, x, solved = parts if traced else map(np.asarray, parts)
     return xp.all(xp.abs(residual) <= limit) & xp.all(xp.isfinite(xp.append(x, solved)))
-
-
-def _slack(found: InitialPoint, low: np.ndarray, high: np.ndarray) -> Any:
-    """By how much rounding may put parameters solved for out of their bounds."""
-    bounds = np.maximum(np.where(np.isfinite(low), np.abs(low), 0), np.where(np.isfinite(high), np.abs(high), 0))
-    return tolerance(found.x.dtype) * jnp.maximum(jnp.abs(found.solved), jnp.asarray(bounds, found.x.dtype))
 
 
 def find_initial(
@@ -523,53 +521,3 @@ def find_initial(
 
 
 _compiled = compiled(initialize)
-
-
-def check(
-    system: Any, found: InitialPoint, t0: Any, inputs: Any, initial: Any, solve_for: tuple[str, ...] = (),
-    running: bool = False, throw: bool | None = None,
-) -> InitialPoint:  # fmt: skip
-    """The same point; raises an `InitializationError` if it is not consistent, if a block of equations is singular
-    there, or if a parameter solved for is out of its bounds. With `throw=False`, and where values are traced, it is
-    then not-a-number; traced and with `throw=True` it is an error while running. While a program is `running`,
-    functions of time in `inputs` may hold what is traced."""
-    from .report import InitializationReport  # which reads what is defined here
-
-    table = system.parameters.table
-    low, high = table.bounds[np.array([table.index(n) for n in solve_for], np.int64)].T
-    driving = input_values(system.plan, inputs, t0, found.x.dtype) if running else ()
-    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((found, system, t0, driving)))
-    if traced or throw is False:
-        slack = _slack(found, low, high)
-        outside = jnp.any(~((found.solved >= low - slack) & (found.solved <= high + slack)))
-        if throw is not True:
-            fine = (is_consistent(found) & ~outside)[None]
-            both = jnp.append(found.x, found.solved)[None]
-            n, sources = len(found.x), (system, t0, inputs, initial)
-            both = not_a_number(both, fine, *sources)[0]
-            return found._replace(x=both[:n], solved=both[n:])
-        x = eqx.error_if(
-            found.x,
-            ~is_consistent(found),
-            "no consistent initial point: fixed starts contradict the equations, or the search failed. "
-            "system.initialization_report() outside jit gives the names",
-        )
-        if not solve_for:
-            return found._replace(x=x)
-        solved = eqx.error_if(found.solved, outside, f"a parameter of {list(solve_for)} is out of its bounds")
-        return found._replace(x=x, solved=solved)
-    problem = InitializationReport(system, found, t0, inputs, initial, solve_for).problem
-    if problem is not None:
-        raise InitializationError(problem)
-    if not solve_for:
-        return found
-    solved = np.asarray(found.solved)
-    slack = np.asarray(_slack(found, low, high))
-    for name, value, a, b, off in zip(solve_for, solved, low, high, slack, strict=True):
-        if not a - off <= value <= b + off:
-            raise InitializationError(
-                f"solve_for: the values given need {name} = {value:.6g}, which is out of its bounds [{a:g}, {b:g}]. "
-                "Give other values in initial={...}, or start the search elsewhere with "
-                f"system.with_parameters({{'{name}': guess}})"
-            )
-    return found

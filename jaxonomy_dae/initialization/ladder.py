@@ -48,19 +48,24 @@ FAILED = len(METHODS) - 1
 
 # Evaluations each rung may take.
 NEWTON_LIMIT, MARQUARDT_LIMIT, HOMOTOPY_LIMIT, NEAREST_LIMIT = 60, 100, 200, 200
-SHORTEST = 1e-4  # of a Newton step
-DECREASE = 1e-4  # Armijo's constant
-FIRST_DAMPING = 1e-3  # rows have a largest entry of 1 at the start
-FIRST_ARC, SHORTEST_ARC = 0.1, 1e-8
+SHORTEST = 1e-4  # of a Newton step: where not even this part lowers |F|, the rung has failed
+# Armijo's constant: the part of the decrease by the linear model that is asked for (Dennis & Schnabel 1983, section
+# 6.3).
+DECREASE = 1e-4
+FIRST_DAMPING = 1e-3  # τ of Nielsen (1999), who multiplies it by the largest entry: rows have one of 1 at the start
+FIRST_ARC, SHORTEST_ARC = 0.1, 1e-8  # of the curve, in units of the unknowns' sizes
 CORRECTIONS = 4  # of a predicted point on the curve
-SMALLEST_COSINE = 0.8  # between the tangents of neighbouring points on the curve
+SMALLEST_COSINE = 0.8  # between the tangents of neighbouring points: after a sharper turn it may be another curve
 STEPS_OFF = 8  # points tried around a start where F or its Jacobian is not finite
-FLAT = 1e-3  # a row whose slopes are less than this, times its value, is measured by that
-TO_BOUND = 0.9  # of the way to a bound that a step would cross
+# Rows whose largest slope is below FLAT·|value| are scaled by |value| instead: such slopes do not tell the row's size.
+FLAT = 1e-3
+# A step that would cross a bound goes this part of the way to it: at the bound itself a root or logarithm may have no
+# slope.
+TO_BOUND = 0.9
 SETTLED = 1e-2  # steps of this times √eps end the search for the nearest point
 
 AGAIN = SIZED - 1  # what `Scalars.begun` is at the start of the second climb, and one less for each further one
-CLIMBS = 3
+CLIMBS = 3  # from the start; then with unknowns without a guess at their sizes; then with every other one negative
 
 _NEWTON, _MARQUARDT, _TRACK, _LAND, _POLISH, _NEAREST, _DONE, _FAILED = range(8)
 
@@ -129,7 +134,8 @@ def _climb(
     magnitude: Callable[[Any], Any] | None,
     in_units: Any,
 ) -> Found:
-    """`in_units`: whether unknowns are measured in typical sizes; otherwise slopes at the start show their sizes."""
+    """Climbs the ladder in the units that `find_root` has chosen. `in_units` is true where unknowns are measured in
+    typical sizes; otherwise slopes at the start show their sizes."""
     dtype, n = start.dtype, start.shape[0]
     eps = float(jnp.finfo(dtype).eps)
     close, enough = min(1e3 * eps, 0.1 * tolerance(dtype)), tolerance(dtype)
@@ -385,7 +391,7 @@ def _climb(
 
 
 def _inside(x: Any, low: Any, high: Any, known: Any) -> Any:
-    """A point within bounds, and off them."""
+    """The point moved off its bounds, into the interval."""
     size = jnp.maximum(known, jnp.abs(x))
     width = jnp.where(jnp.isfinite(high - low), high - low, jnp.where(size > 0, size, 1))
     margin = 1e-3 * width

@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 
 class Machine(NamedTuple):
-    """Points are (x, s). Packed into few arrays: XLA compiles a kernel for each."""
+    """The state of the ladder. Points are (x, s). It is packed into few arrays: XLA compiles a kernel for each."""
 
     scalars: Any  # see Scalars
     points: Any  # trial, base (the last one accepted), best, the tangent, where rungs start, and the units

@@ -13,6 +13,8 @@ from jaxtyping import Array, Float
 from .machine import Machine, Scalars
 from .sizes import Sizes, column_sizes
 
+# Distances from the start at which slopes are compared: a slope that grows as the p-th power differs by 16^p between
+# them.
 PROBES = (1.0, 1.0 / 16)
 SIZED = -1.0 - len(PROBES)  # what `Scalars.begun` is when sizes have been found
 
@@ -20,9 +22,10 @@ SIZED = -1.0 - len(PROBES)  # what `Scalars.begun` is when sizes have been found
 def probed(
     state: Machine, value: Float[Array, " m"], jacobian: Float[Array, "m n"], sizes: Sizes, soft: Any
 ) -> tuple[Any, Machine, Float[Array, " n"]]:
-    """Whether the sizes of unknowns are still being found; the next state if so; and the sizes.
+    """Finds the sizes of unknowns by trial steps. Returns (whether sizes are still being found, the next state if so,
+    the sizes).
 
-    What is left of a row that is `soft`, a guess, is how far the trial point is from it: not a size.
+    The residual of a `soft` row, a guess, is the distance of the trial point from it: it tells no size.
     """
     dtype, n = value.dtype, jacobian.shape[1]
     where, one = jnp.where, jnp.ones((), dtype)

@@ -16,11 +16,11 @@ from .block_finding import ILL_CONDITIONED, BlockFinding
 from .constraints_at import constraints_at
 from .initialize import InitialPoint, is_consistent
 from .ladder import FAILED, METHODS, NEAREST
-from .rows import Row, initial_rows, supports
+from .rows import StartRow, initial_rows, supports
 from .singular_blocks import examine_blocks
 from .sizes import tolerance
 
-WORST = 5
+WORST = 5  # rows that do not hold, in a text
 SUSPICIOUS = 1e7  # the condition number from which on constraints are asked whether they are redundant
 CONDITION_LIMIT = 500  # unknowns up to which the condition of the initial equations is computed
 
@@ -47,7 +47,7 @@ class Redundant(NamedTuple):
 
 
 class Residual(NamedTuple):
-    """What does not hold: an equation or a start, the variables in it, and by how much."""
+    """An equation or a start that does not hold, the variables in it, and by how much."""
 
     text: str
     variables: tuple[str, ...]
@@ -56,7 +56,7 @@ class Residual(NamedTuple):
 
 
 class InitializationReport(Sections):
-    """What initialization did; `print(report)` shows it.
+    """A report of initialization; `print(report)` shows it.
 
     - `consistent`: whether a point was found at which everything holds.
     - `method`: the rung of the ladder that found it, `evaluations` how many residuals it took.
@@ -94,7 +94,7 @@ class InitializationReport(Sections):
 
     @property
     def _promoted(self) -> int:
-        """How many of the rows kept, the last ones, are guesses."""
+        """The number of guesses among the rows kept; they are the last ones."""
         return self._rows.n_soft
 
     @functools.cached_property
@@ -130,7 +130,7 @@ class InitializationReport(Sections):
         place = {id(r): k for k, r in enumerate(rows.kept)}
         position = {(r.name, r.given): k for k, r in enumerate(rows.kept)}
 
-        def value(row: Row) -> tuple[str, float]:
+        def value(row: StartRow) -> tuple[str, float]:
             k = place.get(id(row), position[row.name, row.given])
             return row.name, float(self._target[k])
 
@@ -284,9 +284,9 @@ class InitializationReport(Sections):
         lines += [_contradiction(r) for r in contradictions[:4]]
         if self._constraints is not None:
             lines += [
-                f"the constraints of {listed(names, 12)} leave no degree of freedom: they are as many as what they "
-                "restrict. If something should move freely there, one of them holds what others hold already: take it "
-                "out, or let it yield."
+                f"the constraints of {listed(names, 12)} leave no degree of freedom: there are as many of them as "
+                "variables. If the mechanism should move, one of them repeats others: remove it, or replace it by a "
+                "compliant part such as a spring."
                 for names in no_freedom(self._constraints)
             ]
         if not contradictions:

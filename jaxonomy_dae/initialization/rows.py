@@ -36,7 +36,7 @@ RANK = 1e-11  # pivots smaller than this, of equilibrated equations, are roundin
 
 
 @dataclasses.dataclass(frozen=True)
-class Row:
+class StartRow:
     """One start: factor·quantity equals a start expression or the caller's value `given`."""
 
     name: str
@@ -48,10 +48,10 @@ class Row:
 
 @dataclasses.dataclass(frozen=True)
 class InitialRows:
-    """What determines the initial point."""
+    """The rows that determine the initial point."""
 
-    guess: tuple[Row | None, ...]  # for each entry of the state array, where its first value comes from
-    kept: tuple[Row, ...]  # rows that must hold, then the guesses
+    guess: tuple[StartRow | None, ...]  # for each entry of the state array, where its first value comes from
+    kept: tuple[StartRow, ...]  # rows that must hold, then the guesses
     n_soft: int  # how many of the rows kept, the last ones, are guesses
     independent: tuple[bool, ...]  # of the rows kept, those that no row before determines
     direct: bool  # every kept row is a state and nothing else constrains the states
@@ -72,10 +72,10 @@ class _Generic:
 
     @property
     def n(self) -> int:
-        """How many columns are quantities."""
+        """The number of columns that are quantities."""
         return self.jacobian.shape[1] - len(self.solve_for)
 
-    def row(self, row: Row) -> np.ndarray:
+    def row(self, row: StartRow) -> np.ndarray:
         """The gradient of a start row, scaled."""
         out = np.zeros(self.jacobian.shape[1])
         if row.quantity != ZERO:
@@ -85,12 +85,12 @@ class _Generic:
         out *= self.columns
         return out / max(np.abs(out).max(initial=0.0), 1e-300)
 
-    def pattern(self, row: Row) -> list[int]:
+    def pattern(self, row: StartRow) -> list[int]:
         """The columns on which a start row depends."""
         places = [] if row.quantity == ZERO else [row.quantity]
         return places + [self.n + self.solve_for.index(parameter) for parameter, _ in self._slopes(row)]
 
-    def _slopes(self, row: Row) -> list[tuple[int, float]]:
+    def _slopes(self, row: StartRow) -> list[tuple[int, float]]:
         start = row.start
         if start is None or row.given >= 0 or not set(start.parameters) & set(self.solve_for):
             return []
@@ -132,25 +132,25 @@ def initial_rows(plan: SystemPlan, names: tuple[str, ...], solve_for: tuple[int,
     return ranked(plan, generic, overrides, fixed, guess)
 
 
-def _declared(plan: SystemPlan, names: tuple[str, ...]) -> tuple[list[Row], list[Row], dict[int, Row]]:
+def _declared(plan: SystemPlan, names: tuple[str, ...]) -> tuple[list[StartRow], list[StartRow], dict[int, StartRow]]:
     """Values given, fixed starts they leave, and the start of each quantity that counts."""
     variables = plan.flat.variables
     overrides = [
-        Row(name, int(q), float(s), None, k)
+        StartRow(name, int(q), float(s), None, k)
         for k, (name, q, s) in enumerate(zip(names, *plan.resolve(names), strict=True))
     ]
     overridden = {r.quantity for r in overrides}
     is_zero = variables.start.is_number & (variables.start.values(plan.flat.parameters.values) == 0.0)
     leading = set(leading_starts(plan.model).tolist())
-    started: dict[int, Row] = {}
-    fixed: list[Row] = []
+    started: dict[int, StartRow] = {}
+    fixed: list[StartRow] = []
     for v in np.flatnonzero(variables.start.is_given).tolist():
         quantity, factor = plan.quantity_of(v)
         if quantity == ABSENT:
             continue
         if quantity == ZERO and not (variables.fixed[v] and not is_zero[v]):
             continue  # zero as it should be; any other fixed start must turn out to be zero
-        row = Row(variables.names[v], quantity, factor, variables.start[v])
+        row = StartRow(variables.names[v], quantity, factor, variables.start[v])
         if variables.fixed[v] and quantity not in overridden:
             fixed.append(row)
         if v in leading:
@@ -216,13 +216,13 @@ def _parameter_columns(plan: SystemPlan, point, values, solve_for) -> np.ndarray
     return np.where(np.isfinite(out), out, 1.0)
 
 
-def _candidates(plan: SystemPlan, guess) -> list[tuple[Row, bool]]:
+def _candidates(plan: SystemPlan, guess) -> list[tuple[StartRow, bool]]:
     """Guesses in the order in which they are taken, and whether each is a declared guess of a state: what a user
     declares before zeros, states before algebraic unknowns."""
     entries = [int(q) for q in (*plan.states, *plan.carried)]
     n = len(plan.states)
     ranked = sorted(range(len(entries)), key=lambda k: (guess[k] is None, k >= n, k))
-    rows = [guess[k] or Row(plan.quantity_name[entries[k]], entries[k], 1.0, None) for k in ranked]
+    rows = [guess[k] or StartRow(plan.quantity_name[entries[k]], entries[k], 1.0, None) for k in ranked]
     return [(row, guess[k] is not None and k < n) for row, k in zip(rows, ranked, strict=True)]
 
 
@@ -234,11 +234,11 @@ class _Directions:
         self.free = q[:, rank:]
 
     def open(self, gradient: np.ndarray) -> bool:
-        """Whether a row of this gradient is not determined yet."""
+        """True if a row of this gradient is not determined yet."""
         return bool(np.linalg.norm(gradient @ self.free) >= OPEN)
 
     def close(self, gradient: np.ndarray) -> bool:
-        """Whether a row of this gradient closes a direction; closes it."""
+        """Closes the direction of a row's gradient; returns False if the row is determined already."""
         along = gradient @ self.free
         size = np.linalg.norm(along)
         if not size >= OPEN:
@@ -269,7 +269,7 @@ def _by_rank(plan: SystemPlan, generic: _Generic, overrides, fixed, guess) -> In
     candidates = _candidates(plan, guess)
     gradients = [generic.row(dataclasses.replace(row, start=None)) for row, _ in candidates]
     undecided = [directions.open(gradient) for gradient in gradients]
-    soft: list[tuple[Row, bool]] = []
+    soft: list[tuple[StartRow, bool]] = []
     for (row, is_declared), gradient, is_open in zip(candidates, gradients, undecided, strict=True):
         if not is_open:
             continue
@@ -282,8 +282,8 @@ def _by_rank(plan: SystemPlan, generic: _Generic, overrides, fixed, guess) -> In
 
 
 def _by_matching(plan: SystemPlan, generic: _Generic, overrides, fixed, guess) -> InitialRows:
-    """The same for many quantities: a row is independent if it can be matched with a quantity beside the equations and
-    the rows before it."""
+    """The choice of rows for many quantities: a row is independent if it can be matched with a quantity beside the
+    equations and the rows before it."""
     rows = [*overrides, *fixed, *(row for row, _ in _candidates(plan, guess))]
     hard = len(overrides) + len(fixed)
     n_equations = generic.jacobian.shape[0]
@@ -306,7 +306,9 @@ def _by_matching(plan: SystemPlan, generic: _Generic, overrides, fixed, guess) -
     return _chosen(guess, kept, independent, soft, redundant, (), dropped, plan)
 
 
-def _chosen(guess, kept: list[Row], independent: list[bool], soft, redundant, settled, dropped, plan) -> InitialRows:
+def _chosen(
+    guess, kept: list[StartRow], independent: list[bool], soft, redundant, settled, dropped, plan
+) -> InitialRows:
     alone = (*independent, *(closes for _, closes in soft))
     names = tuple(plan.quantity_name[row.quantity] for row, _ in soft)
     rows = (*kept, *(row for row, _ in soft))
@@ -316,7 +318,9 @@ def _chosen(guess, kept: list[Row], independent: list[bool], soft, redundant, se
 # --- what follows from what ----------------------------------------------------------------------------------------
 
 
-def supports(plan: SystemPlan, names: tuple[str, ...], solve_for: tuple[int, ...] = ()) -> dict[int, tuple[Row, ...]]:
+def supports(
+    plan: SystemPlan, names: tuple[str, ...], solve_for: tuple[int, ...] = ()
+) -> dict[int, tuple[StartRow, ...]]:
     """For each redundant row, by its place among the rows kept, the other rows it follows from together with the
     equations."""
     rows = initial_rows(plan, names, solve_for)
@@ -330,7 +334,7 @@ def supports(plan: SystemPlan, names: tuple[str, ...], solve_for: tuple[int, ...
     return {k: _support(generic, rows.kept[k], base)[0] for k in rows.redundant}
 
 
-def _support(generic: _Generic, row: Row, base: list[Row]) -> tuple[tuple[Row, ...], np.ndarray]:
+def _support(generic: _Generic, row: StartRow, base: list[StartRow]) -> tuple[tuple[StartRow, ...], np.ndarray]:
     """The rows of `base`, and the equations, of which a row is a combination."""
     matrix = np.concatenate([generic.jacobian.toarray(), *(generic.row(r)[None, :] for r in base)])
     weight = np.abs(np.linalg.lstsq(matrix.T, generic.row(row), rcond=1e-12)[0])
@@ -339,7 +343,9 @@ def _support(generic: _Generic, row: Row, base: list[Row]) -> tuple[tuple[Row, .
     return tuple(r for r, u in zip(base, used[n:], strict=True) if u), np.flatnonzero(used[:n])
 
 
-def _check_count(plan: SystemPlan, generic: _Generic, directions: _Directions, redundant: list[Row], kept: list[Row]):
+def _check_count(
+    plan: SystemPlan, generic: _Generic, directions: _Directions, redundant: list[StartRow], kept: list[StartRow]
+):
     """Raises if the values given do not determine the parameters that are solved for, or determine one twice."""
     table = plan.flat.parameters
     wanted = [table.names[p] for p in generic.solve_for]

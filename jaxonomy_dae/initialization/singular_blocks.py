@@ -24,7 +24,7 @@ from .sparse_blocks import sparse_finding
 
 @dataclasses.dataclass(frozen=True)
 class _Check:
-    """What is static: the steps to examine, and the steps to solve so that they can be."""
+    """The static part of a check: the steps to examine, and the steps to solve before."""
 
     examined: frozenset[int]
     solved: frozenset[int]
@@ -59,7 +59,7 @@ def _plan_check(plan: SystemPlan) -> _Check:
 
 
 def _never_vanishes(equation: StepEquation) -> bool:
-    """Whether the equation's only local unknown has a coefficient that is a nonzero number."""
+    """True if the equation's only local unknown has a coefficient that is a nonzero number."""
     positions = equation.inside
     return len(positions) == 1 and equation.template.coefficient_is_number(positions[0])
 

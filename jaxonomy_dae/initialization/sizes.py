@@ -12,7 +12,7 @@ DIGIT = 0.1  # of its terms: a row of which not one digit is known
 
 
 class Sizes(NamedTuple):
-    """What measures unknowns and rows: zero where nothing is known."""
+    """The units of unknowns and rows; zero where nothing is known."""
 
     nominal: Float[Array, " n"]  # declared sizes of unknowns
     known: Float[Array, " n"]  # sizes of unknowns by their declarations, starts and guesses

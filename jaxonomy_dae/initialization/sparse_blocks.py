@@ -11,7 +11,7 @@ from .block_values import BlockValues
 
 
 def sparse_finding(plan: SystemPlan, values: BlockValues, step: SparseStep) -> BlockFinding | None:
-    """What is wrong with a sparse block, whose unknowns are solved for on the way if it is linear."""
+    """Examines a sparse block: returns its fault, or None. If it is linear, its unknowns are solved for on the way."""
     n = step.n
     column = np.full(len(values.quantities), -1)  # ZERO is −1: the last entry
     column[step.unknown[0]] = np.arange(n)

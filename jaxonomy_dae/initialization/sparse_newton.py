@@ -24,8 +24,8 @@ from .sizes import Sizes, row_sizes, tolerance
 
 
 class SparseRows(NamedTuple):
-    """Where the entries of the Jacobian of all rows lie; as many rows as unknowns, none of which follows from others;
-    and their entries, as a square pattern."""
+    """The sparse Jacobian of all rows: its pattern; `core`, as many rows as unknowns, none of which follows from
+    others; and the entries of these, as a square pattern."""
 
     pattern: SparsePattern
     core: Int[np.ndarray, " n"]

@@ -73,12 +73,13 @@ class Rank:
 
     @property
     def is_regular(self) -> bool:
-        """Whether the rows are independent."""
+        """True if the rows are independent."""
         return self.uncertainty < 1
 
 
 def is_undecided(matrix: Float[np.ndarray, "m n"]) -> bool:
-    """Whether a matrix that is singular within its errors would be regular if its entries were exact."""
+    """True if a matrix that is singular within its errors would be regular if its entries were exact to one
+    rounding."""
     return rank_of(matrix, rounding(matrix)).is_regular
 
 

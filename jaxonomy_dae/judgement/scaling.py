@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg
 
-PASSES = 10
+PASSES = 10  # each halves, in logarithms, how far the largest entries are from one (Ruiz 2001): a thousandth is left
 LARGEST_EXPONENT = 300.0  # of ten, for a scale
 
 

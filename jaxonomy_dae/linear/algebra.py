@@ -58,7 +58,7 @@ class Dense(eqx.Module):
         return matrix
 
     def factor(self, matrix: Any) -> Any:
-        """What solves need."""
+        """The factors that solves need: an explicit inverse of small matrices, LU factors of larger ones."""
         n = matrix.shape[0]
         if n <= UNROLLED_INVERSE:
             rows = [[matrix[i, j] for j in range(n)] for i in range(n)]

@@ -22,7 +22,7 @@ from .written_out import solve as solve_written_out
 
 
 class _State(eqx.Module):
-    """What solves need, and between which structures they go."""
+    """The arrays that solves need, and the structures between which they go."""
 
     arrays: Any
     domain: Any  # something that looks like the solution
@@ -50,7 +50,7 @@ class _AbstractDirect(lx.AbstractLinearSolver[_State]):
 
     @abc.abstractmethod
     def _kept(self, operator: lx.AbstractLinearOperator) -> tuple[Any, SparsePattern | None]:
-        """What solves need of a matrix: arrays, and the pattern of a sparse one."""
+        """The arrays of a matrix that solves need, and the pattern if it is sparse."""
 
     @abc.abstractmethod
     def _solved(self, state: _State, b: Float[Array, " n"]) -> Float[Array, " n"]:

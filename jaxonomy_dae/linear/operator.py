@@ -64,7 +64,7 @@ def _band(operator: SparseLinearOperator, offset: int) -> Float[Array, " size"]:
 
 
 def _lies(operator: SparseLinearOperator, lowest: int, highest: int) -> bool:
-    """Whether all places have column − row between two numbers."""
+    """True if all places have a column − row between two numbers."""
     offsets = operator.pattern.cols - operator.pattern.rows
     return bool(((lowest <= offsets) & (offsets <= highest)).all())
 

@@ -34,7 +34,7 @@ COLORING_WORK = 20_000_000  # pairs of entries in one row, above which colours a
 
 
 class SparsePattern:
-    """Where the entries of a matrix lie: static, compared and hashed by a digest.
+    """The places of a matrix's entries: static, compared and hashed by a digest.
 
     **Arguments:**
 
@@ -112,7 +112,7 @@ class SparsePattern:
 
     @property
     def n_colors(self) -> int:
-        """How many directional derivatives a Jacobian of this pattern takes."""
+        """The number of directional derivatives that a Jacobian of this pattern takes."""
         return int(self.colors.max(initial=-1)) + 1
 
     @property
@@ -157,7 +157,7 @@ class MissingSparseSolver(ImportError):
 
 
 def is_double() -> bool:
-    """Whether JAX is in 64-bit mode."""
+    """True if JAX is in 64-bit mode."""
     return jnp.result_type(float) == jnp.float64
 
 
@@ -179,7 +179,7 @@ def klu() -> Any:
 
 
 def available() -> bool:
-    """Whether the package for sparse solves is installed."""
+    """True if the package for sparse solves is installed."""
     try:
         klu()
     except MissingSparseSolver:

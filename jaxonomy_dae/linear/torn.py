@@ -137,7 +137,7 @@ class _Elimination:
         return jnp.broadcast_to(jnp.asarray(value, self.like.dtype), self.like.shape)
 
     def _links(self) -> int:
-        """How many links there are at most from a tearing variable to an unknown of the sequence.
+        """The largest number of links from a tearing variable to an unknown of the sequence.
 
         An equation with plain numbers only, which do not enlarge what is known, is not a link.
         """
@@ -280,7 +280,7 @@ class _Elimination:
 
     @property
     def corrections(self) -> int:
-        """How many are made."""
+        """The number of corrections of a solution."""
         return CORRECTIONS if self.chained else 1
 
     def _verified(self, x: list[Any], b: Sequence[Any], rows: list[list[tuple[int, Any]]], places) -> list[Any]:
@@ -290,16 +290,16 @@ class _Elimination:
         return [jnp.where(holds, v, jnp.nan) for v in x]
 
     def _right(self, b: Sequence[Any]) -> list[Any]:
-        """Right-hand sides of which a solution and its residuals read the same digits: computed twice, what is zero
-        but for rounding differs by all of it."""
+        """Right-hand sides, computed once. If XLA recomputed them for the check, one that is zero up to rounding could
+        fail its own check."""
         return list(b) if self.exact else once(b)
 
     def _once(self, values: list[Any]) -> list[Any]:
-        """The same, computed once where many expressions follow."""
+        """The values, computed once if many expressions read them."""
         return values if self.exact else once(values, self.in_batches_only)
 
     def _hold(self, x: list[Any], b: Sequence[Any], rows: list[list[tuple[int, Any]]], places) -> Any:
-        """Whether the equations at `places` hold to rounding."""
+        """True if the equations at `places` hold to rounding."""
         dtype = x[0].dtype
         eps, tiny = float(jnp.finfo(dtype).eps), float(jnp.finfo(dtype).tiny)
         norm = None
@@ -326,7 +326,7 @@ class _Elimination:
 
 
 def _others(row: list[tuple[int, Any]], own: int, places: Container[int]) -> bool:
-    """Whether a row has entries at some of the places, other than its own."""
+    """True if a row has entries at some of the places, other than its own."""
     return any(v in places and v != own for v, _ in row)
 
 

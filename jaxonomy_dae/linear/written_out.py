@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-UNROLLED = 6
+UNROLLED = 6  # unknowns up to which an elimination is written out rather than left to LAPACK
 # By how much a pivot must be larger than the one above it. XLA computes a comparison anew in every fused loop that
 # reads it, with other roundings: were equal pivots compared as they are, some loops would exchange rows, others not.
 LARGER = 1.0873

@@ -30,7 +30,7 @@ class EntrySizes:
         return self._groups[group][:, slot]
 
     def is_number(self, group: int, slot: int) -> bool:
-        """Whether the entry depends on nothing, parameters included."""
+        """True if the entry depends on nothing, parameters included."""
         return self.extended.groups[group].template.coefficient_is_number(slot)
 
     def _evaluated(self, group: int) -> np.ndarray:

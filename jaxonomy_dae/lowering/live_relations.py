@@ -96,7 +96,7 @@ def _needed_as_they_are(step: AnyStep, parameters: np.ndarray, quantities: np.nd
 
 
 def _is_affine(step: AnyStep, relations: np.ndarray) -> bool:
-    """Whether a step's equations are affine in its unknowns once relations are known."""
+    """True if a step's equations are affine in its unknowns once relations are known."""
     for equation in step.equations:
         columns = tuple(np.flatnonzero(np.isin(equation.parameter, relations).any(axis=0)).tolist())
         template = _with_known(equation.template, columns)

@@ -67,7 +67,7 @@ def find_loops(steps: Sequence[AnyStep], n_quantities: int) -> list[AnyStep | Lo
 
 
 def _shape(step: AnyStep, number: int) -> tuple:
-    """What must be equal for two steps to be repetitions of each other."""
+    """A key that is equal for steps that are repetitions of each other."""
     if not isinstance(step, Step) or step.carried:
         return (number,)
     return (
@@ -86,7 +86,7 @@ def _shape(step: AnyStep, number: int) -> tuple:
 
 
 def _run_lengths(true: np.ndarray) -> np.ndarray:
-    """How many entries from each on are true without a break."""
+    """For each entry, the number of entries from it on that are true without a break."""
     n = len(true)
     last = np.where(true, n, np.arange(n))
     return np.minimum.accumulate(last[::-1])[::-1] - np.arange(n)

@@ -137,7 +137,7 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
 def _rates_hold(
     flat: FlatModel, variables: QuantityMap, extended: Extended, residuals: Sequence[AnyStep], carried: np.ndarray
 ) -> bool:
-    """Whether the derivatives of all carried unknowns are quantities of the model, untouched by row injection."""
+    """True if the derivatives of all carried unknowns are quantities of the model, untouched by row injection."""
     quantities = extended.quantities
     if not len(carried) or not (quantities.order[carried] < quantities.highest[quantities.owner[carried]]).all():
         return False

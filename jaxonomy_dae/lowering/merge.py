@@ -59,7 +59,7 @@ def _merged(run: Sequence[Step], n_quantities: int, without_package: int) -> lis
 
 
 def _is_affine(equation: StepEquation, inside: np.ndarray) -> bool:
-    """Whether all instances are affine, jointly, in the slots that are inside."""
+    """True if all instances are affine, jointly, in the slots that are `inside`."""
     distinct = np.unique(inside[equation.quantity], axis=0)
     return all(equation.template.is_affine_in([int(k) for k in np.flatnonzero(mask)]) for mask in distinct)
 

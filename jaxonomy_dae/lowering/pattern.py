@@ -8,17 +8,47 @@ model.
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
 from ..linear.sparse import SparsePattern
+from ..model.extended import Extended
 from .schedule import AnyStep, SparseStep
 
-if TYPE_CHECKING:
-    from .plan import SystemPlan
-
 LIMIT = 30_000_000  # entries of rows, above which the pattern counts as dense
+
+
+class InjectedRow(Protocol):
+    """A correction of finished rows: the rows, and the quantities that it reads."""
+
+    @property
+    def rows(self) -> tuple[int, ...]: ...
+
+    @property
+    def quantities(self) -> np.ndarray: ...
+
+
+class Scheduled(Protocol):
+    """The part of a `SystemPlan` that its pattern follows from; the plan keeps the pattern, and imports this module."""
+
+    @property
+    def extended(self) -> Extended: ...
+
+    @property
+    def states(self) -> np.ndarray: ...
+
+    @property
+    def carried(self) -> np.ndarray: ...
+
+    @property
+    def n_state(self) -> int: ...
+
+    @property
+    def steps(self) -> tuple[AnyStep, ...]: ...
+
+    @property
+    def rows(self) -> Sequence[InjectedRow]: ...
 
 
 class TooDense(Exception):
@@ -26,7 +56,7 @@ class TooDense(Exception):
 
 
 @dataclasses.dataclass(frozen=True)
-class Rows:
+class ColumnSets:
     """Sets of columns: row r is columns[pointer[r]:pointer[r + 1]]."""
 
     pointer: np.ndarray
@@ -37,7 +67,7 @@ class Dependencies:
     """The rows of all quantities computed so far. `refined` tells whether the tearing variables of nonlinear blocks are
     solved for (and depend on what their block reads) or read from the state array."""
 
-    def __init__(self, plan: "SystemPlan", refined: bool):
+    def __init__(self, plan: Scheduled, refined: bool):
         n = plan.extended.quantities.n
         self.width = plan.n_state
         self.refined = refined
@@ -45,13 +75,15 @@ class Dependencies:
         self.place[plan.carried] = len(plan.states) + np.arange(len(plan.carried))
         self.segment = np.full(n + 1, -1, np.int64)  # the last entry is the constant zero
         self.row = np.zeros(n + 1, np.int64)
-        self.segments: list[Rows] = []
+        self.segments: list[ColumnSets] = []
         self.entries = 0
-        self.residuals: list[Rows] = []  # of nonlinear blocks, in the order of the state array's algebraic unknowns
-        single = Rows(np.arange(self.width + 1), np.arange(self.width, dtype=np.int32))
+        self.residuals: list[
+            ColumnSets
+        ] = []  # of nonlinear blocks, in the order of the state array's algebraic unknowns
+        single = ColumnSets(np.arange(self.width + 1), np.arange(self.width, dtype=np.int32))
         self._store(single, [plan.states])
 
-    def _store(self, rows: Rows, quantities: Sequence[np.ndarray]):
+    def _store(self, rows: ColumnSets, quantities: Sequence[np.ndarray]):
         self.entries += len(rows.columns)
         if self.entries > LIMIT:
             raise TooDense
@@ -60,7 +92,7 @@ class Dependencies:
             self.segment[quantity] = len(self.segments) - 1
             self.row[quantity] = np.arange(len(quantity))
 
-    def union(self, owner: np.ndarray, quantity: np.ndarray, n: int, own: Sequence[np.ndarray] = ()) -> Rows:
+    def union(self, owner: np.ndarray, quantity: np.ndarray, n: int, own: Sequence[np.ndarray] = ()) -> ColumnSets:
         """n rows: row owner[k] contains the row of quantity[k]; `own` lists further columns, one for each row."""
         segment = self.segment[quantity]
         owners, columns = [], []
@@ -80,12 +112,12 @@ class Dependencies:
             columns.append(np.asarray(column, np.int32))
             owners.append(np.arange(n))
         if not columns:
-            return Rows(np.zeros(n + 1, np.int64), np.zeros(0, np.int32))
+            return ColumnSets(np.zeros(n + 1, np.int64), np.zeros(0, np.int32))
         key = np.unique(np.concatenate(owners) * np.int64(self.width) + np.concatenate(columns))
         counts = np.bincount(key // self.width, minlength=n)
-        return Rows(np.concatenate([[0], np.cumsum(counts)]), (key % self.width).astype(np.int32))
+        return ColumnSets(np.concatenate([[0], np.cumsum(counts)]), (key % self.width).astype(np.int32))
 
-    def of(self, quantity: np.ndarray) -> Rows:
+    def of(self, quantity: np.ndarray) -> ColumnSets:
         """The rows of quantities."""
         return self.union(np.arange(len(quantity)), quantity, len(quantity))
 
@@ -129,7 +161,7 @@ class Dependencies:
         self.residuals.append(self.union(np.concatenate(owners), quantity, step.n))
 
 
-def entries(rows: Sequence[Rows]) -> tuple[np.ndarray, np.ndarray]:
+def entries(rows: Sequence[ColumnSets]) -> tuple[np.ndarray, np.ndarray]:
     """(rows, columns) of all entries, the rows numbered through."""
     first, out = 0, []
     for part in rows:
@@ -147,7 +179,7 @@ def unique_entries(rows: np.ndarray, columns: np.ndarray, width: int) -> tuple[n
     return key // max(1, width), key % max(1, width)
 
 
-def field_pattern(plan: "SystemPlan") -> SparsePattern | None:
+def field_pattern(plan: Scheduled) -> SparsePattern | None:
     """The pattern of the vector field's Jacobian, shape (n_state, n_state), at a consistent state; None if dense."""
     try:
         dependencies = Dependencies(plan, refined=True)
@@ -160,7 +192,7 @@ def field_pattern(plan: "SystemPlan") -> SparsePattern | None:
     return SparsePattern(rows, columns, plan.n_state)
 
 
-def dae_pattern(plan: "SystemPlan") -> SparsePattern | None:
+def dae_pattern(plan: Scheduled) -> SparsePattern | None:
     """The pattern of the Jacobian of [f(t, x, z); g(t, x, z)] with respect to the state array [x, z]: the states'
     derivatives with z as it stands in the array, then the residuals of nonlinear blocks. None if dense."""
     try:
@@ -171,7 +203,7 @@ def dae_pattern(plan: "SystemPlan") -> SparsePattern | None:
     return SparsePattern(*entries([slopes, *dependencies.residuals]), plan.n_state)
 
 
-def field_rows(dependencies: Dependencies, plan: "SystemPlan") -> Rows:
+def field_rows(dependencies: Dependencies, plan: Scheduled) -> ColumnSets:
     """The rows of the states' derivatives."""
     for step in plan.steps:
         dependencies.add(step)
@@ -185,11 +217,11 @@ def field_rows(dependencies: Dependencies, plan: "SystemPlan") -> Rows:
         columns = np.concatenate([columns, np.tile(read, len(row.rows))])
     places, columns = unique_entries(places, columns, dependencies.width)
     counts = np.bincount(places, minlength=len(plan.states))
-    return Rows(np.concatenate([[0], np.cumsum(counts)]), columns.astype(np.int32))
+    return ColumnSets(np.concatenate([[0], np.cumsum(counts)]), columns.astype(np.int32))
 
 
 def rate_entries(
-    dependencies: Dependencies, slopes: Rows, carried: np.ndarray, n_states: int
+    dependencies: Dependencies, slopes: ColumnSets, carried: np.ndarray, n_states: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """The entries of the derivatives of the algebraic unknowns: dz/dt = −(∂g/∂z)⁻¹(∂g/∂t + ∂g/∂x·dx/dt) depends on the
     states its block reads, and on what their derivatives depend on."""

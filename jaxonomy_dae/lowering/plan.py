@@ -50,7 +50,7 @@ class PlannedRow:
 
 @dataclasses.dataclass(frozen=True)
 class InputTable:
-    """Which inputs the model has, and which variables they are; quantities are derivatives of an order of an input."""
+    """The model's inputs, and the variables that they are; quantities are derivatives of an order of an input."""
 
     names: list[str]
     defaults: list[float | None]
@@ -60,11 +60,11 @@ class InputTable:
 
     @functools.cached_property
     def place(self) -> dict[str, int]:
-        """Where an input stands in `names`."""
+        """The position of each input in `names`."""
         return {name: k for k, name in enumerate(self.names)}
 
     def highest(self, places: np.ndarray) -> int:
-        """How often the model differentiates one of these inputs."""
+        """The highest order to which the model differentiates one of these inputs."""
         return int(np.max(self.order[np.isin(self.owner, places)], initial=0))
 
 
@@ -141,25 +141,27 @@ class SystemPlan:
 
     @property
     def n_projected(self) -> int:
-        """How many residuals states are projected onto: the hidden constraints, and those that modes bring."""
+        """The number of residuals onto which states are projected: the hidden constraints, and those that modes
+        bring."""
         return self.n_constraints + (0 if self.held is None else len(self.held.table.level))
 
     @functools.cached_property
     def jacobian_pattern(self) -> SparsePattern | None:
-        """Where ∂(vector field)/∂(state) can be nonzero at a consistent state, shape (n_state, n_state); None if it has
-        too many places to list."""
+        """The places of ∂(vector field)/∂(state) that can be nonzero at a consistent state, shape (n_state, n_state);
+        None if it has too many places to list."""
         return pattern.field_pattern(self)
 
     @functools.cached_property
     def dae_pattern(self) -> SparsePattern | None:
-        """Where the Jacobian of [f(t, x, z); g(t, x, z)] with respect to the state array [x, z] can be nonzero: the
-        states' derivatives with z read from the array, not refined, then the residuals of the nonlinear blocks. Sorted
-        by row, each place once; None if there are too many to list."""
+        """The places that can be nonzero in the Jacobian of [f(t, x, z); g(t, x, z)] with respect to the state array
+        [x, z]: the states' derivatives with z read from the array, not refined, then the residuals of the nonlinear
+        blocks. Sorted by row, each place once; None if there are too many to list."""
         return pattern.dae_pattern(self)
 
     @functools.cached_property
     def carried_pattern(self) -> SparsePattern | None:
-        """Where ∂g/∂z can be nonzero, if there are so many algebraic unknowns z that it matters."""
+        """The places of ∂g/∂z that can be nonzero, if there are so many algebraic unknowns z that it matters; else
+        None."""
         if len(self.carried) <= TORN or self.dae_pattern is None:
             return None
         n, found = len(self.states), self.dae_pattern
@@ -191,7 +193,7 @@ class SystemPlan:
         return [n for n, is_internal in zip(table.names, table.is_internal.tolist(), strict=True) if not is_internal]
 
     def is_visible(self, quantity: int) -> bool:
-        """Whether a quantity equals a variable that a user may read, or is a derivative of one."""
+        """True if a quantity equals a variable that a user may read, or is a derivative of one."""
         quantities, table = self.extended.quantities, self.flat.variables
         lowest = int(quantities.first[quantities.owner[quantity]])
         return bool(np.isin(self.variable_map.quantity[~table.is_internal], (quantity, lowest)).any())
@@ -221,8 +223,8 @@ class SystemPlan:
         return one_by_one(self.flat.arrays, self.flat.variables.names, initial)
 
     def input_places(self, name: Any) -> np.ndarray | None:
-        """Where in the table of inputs one stands, of shape (), or those of an array in its shape; None if the name is
-        neither."""
+        """The position of an input in the table, shape (), or of the inputs of an array in its shape; None if the name
+        is neither."""
         table = self.inputs
         if name in table.place:
             return np.array(table.place[name])

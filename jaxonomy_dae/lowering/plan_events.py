@@ -38,12 +38,12 @@ class EventPlan:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What the user wrote, for every event."""
+        """The text that the user wrote, for every event."""
         return self.table.text
 
     @property
     def are_listed(self) -> bool:
-        """Whether any of them is listed."""
+        """True if any of them is listed."""
         return any(self.table.noted[self.n_clocks :]) or any(message is not None for message in self.table.message)
 
     def __len__(self) -> int:
@@ -100,7 +100,7 @@ def plan_events(
 
 
 def _only_as_written(parameters: np.ndarray, extended: Extended) -> bool:
-    """Whether parameters stand in no equation that is differentiated: where |x| only bends, its derivative jumps."""
+    """True if parameters stand in no equation that is differentiated: where |x| only bends, its derivative jumps."""
     return not any(group.level and np.isin(group.parameter, parameters).any() for group in extended.groups)
 
 

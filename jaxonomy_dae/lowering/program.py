@@ -22,18 +22,18 @@ from .schedule import AnyStep, SparseStep, Step, StepEquation
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """Where every quantity lies: chunk −1 is the constant zero, −2 not computed."""
+    """The place of every quantity among the chunks: chunk −1 is the constant zero, −2 not computed."""
 
     chunk: np.ndarray
     offset: np.ndarray
 
     def gather(self, quantity: np.ndarray, factor: np.ndarray | None = None) -> Gather:
-        """Where to read quantities, shape (n,), each times its factor."""
+        """A plan to read quantities, shape (n,), each times its factor."""
         factor = np.ones(len(quantity)) if factor is None else factor
         return self.gathers(quantity[None], factor[None])[0]
 
     def gathers(self, quantity: np.ndarray, factor: np.ndarray) -> list[Gather]:
-        """Where to read each row of quantities, shape (rows, n), with factors of that shape."""
+        """Plans to read each row of quantities, shape (rows, n), with factors of that shape."""
         zero = quantity == ZERO
         chunk, offset = np.full_like(quantity, -1), np.zeros_like(quantity)
         chunk[~zero], offset[~zero] = self.chunk[quantity[~zero]], self.offset[quantity[~zero]]

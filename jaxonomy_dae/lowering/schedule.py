@@ -17,7 +17,7 @@ from ..compiler.order_blocks import Blocks
 from ..model.extended import Extended, ExtendedGroup
 from ..model.group import Group
 from ..model.tables import ZERO
-from ..structure.tearing import Sizes, Tearing, tear
+from ..structure.tearing import BlockSizes, Tearing, tear
 from .entry_sizes import EntrySizes
 
 # A block stays whole, its matrix sparse, if it has more tearing variables than TORN: dense elimination then takes more
@@ -72,7 +72,7 @@ class AbstractStep(abc.ABC):
 
     @property
     def carried(self) -> bool:
-        """Whether unknowns are part of the state array, to be refined by Newton's method."""
+        """True if the unknowns are part of the state array, to be refined by Newton's method."""
         return not self.linear
 
     @property
@@ -349,7 +349,7 @@ def _block_step(
             if len(where) == 1 and template.coefficient_never_vanishes(where[0]):
                 safe.add(u)
         solvable.append(frozenset(safe))
-    torn = tear(contains, solvable, Sizes(entries, frozenset(numbers)))
+    torn = tear(contains, solvable, BlockSizes(entries, frozenset(numbers)))
     if len(torn.tearing) > TORN:
         return linear
     equations = []

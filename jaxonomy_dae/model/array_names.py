@@ -70,7 +70,7 @@ class ArrayNames:
 
 
 def _index(entry: ArrayEntry, path: list[str]) -> tuple[int | slice, ...] | None:
-    """What the indices that a path has choose; None if they are not indices of its arrays."""
+    """The index that the brackets in a path stand for; None if they are not indices of its arrays."""
     dimensions = dict(entry.levels)
     index: list[int | slice] = []
     for level, piece in enumerate(path):
@@ -86,7 +86,7 @@ def _index(entry: ArrayEntry, path: list[str]) -> tuple[int | slice, ...] | None
 
 
 def inner_name(name: str) -> tuple[int, str]:
-    """How often `der(…)` stands around a name, and the name inside."""
+    """Returns (how often `der(…)` stands around a name, the name inside)."""
     order = 0
     while name.startswith("der(") and name.endswith(")"):
         order, name = order + 1, name[4:-1]
@@ -129,7 +129,7 @@ def one_by_one(arrays: ArrayNames, names: list[str], initial: Any) -> Any:
 
 
 def wrong_shape(name: str, shape: tuple[int, ...], value: Any) -> str:
-    """What an array of variables takes, and what it was given."""
+    """The sentence that a value does not have the shape of an array of variables."""
     found = regular_shape(value)
     got = "rows of different lengths" if found is None else f"shape {found}"
     return f"'{name}' is an array of shape {shape}: give a number or an array of that shape; got {got}"

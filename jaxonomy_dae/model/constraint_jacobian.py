@@ -83,7 +83,7 @@ def evaluate(
 def evaluate_along(
     groups: tuple[EquationGroup, ...], extended: Extended, entries: ConstraintEntries, at: Point, move: np.ndarray
 ) -> np.ndarray:
-    """How these numbers change where all quantities move by `move`."""
+    """The rate of change of these numbers where all quantities move by `move`."""
     padded = np.append(move, 0.0)
     return _gathered(groups, extended, entries, lambda g: g.partials_along(at, padded))
 

@@ -26,7 +26,7 @@ class Quantities:
 
     @property
     def n_unknown(self) -> int:
-        """How many quantities are not inputs."""
+        """The number of quantities that are not inputs."""
         return int(self.first[self.n_unknown_columns])
 
     @property

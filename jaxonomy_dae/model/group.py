@@ -30,7 +30,7 @@ class Point:
         return cls(np.append(values, 0.0), parameters, t, Networks(()) if networks is None else networks)
 
     def at(self, values: np.ndarray) -> "Point":
-        """The same parameters, time and networks with other values of the quantities, (quantities,)."""
+        """A copy with other values of the quantities, (quantities,)."""
         return dataclasses.replace(self, values=np.append(values, 0.0))
 
 
@@ -49,7 +49,7 @@ class Group:
         return len(self.equation)
 
     def slots(self, values: np.ndarray) -> list[np.ndarray]:
-        """What stands in each slot, (n,), where the quantities have values of shape (quantities + 1,)."""
+        """The values of each slot, (n,), where the quantities have values of shape (quantities + 1,)."""
         return list((self.factor * values[self.quantity]).T)
 
     def numbers(self, at: Point) -> tuple[list[np.ndarray], list[np.ndarray]]:

@@ -13,7 +13,7 @@ from .group import Point
 from .jacobian import generic
 from .tables import ZERO
 
-ROUNDS = 3
+ROUNDS = 3  # of least squares: entries depend on sizes, and are evaluated anew at those that the last round found
 STEP = 1e-3  # of the logarithm of an argument
 FARTHEST = 100.0  # decades from one that a size may be looked for
 STEEPEST = 8.0  # power that an entry is taken for
@@ -84,7 +84,7 @@ def natural_sizes(
 
 
 def are_told(groups: Sequence[ExtendedGroup], n: int, parameters: Float[np.ndarray, " p"]) -> Bool[np.ndarray, " n"]:
-    """Whether an equation says something of the size of each quantity: whether it has a slope in it near 1. Of
+    """True for quantities of whose size an equation says something, shape (n,): it has a slope in them near 1. Of
     exp(x/u) for a small u it has none, so that x's size stays 1 though nothing says so."""
     entries = _seen(groups, np.ones(n), np.where(parameters == 0.0, 1.0, parameters), _entries, by_columns=True)
     out = np.zeros(n, bool)
@@ -125,8 +125,8 @@ def _seen(
     sizes: _Sizes,
     by_columns: bool = False,
 ) -> _Seen:
-    """What groups have at a generic point of these sizes. Where it belongs to a quantity, `by_columns`, it is
-    multiplied by the quantity's size."""
+    """Evaluates `sizes` of the groups at a generic point. With `by_columns`, entries are multiplied by the sizes of the
+    quantities to which they belong."""
     rng = np.random.default_rng(1)
     point, parameters = quantity * generic(rng, quantity.shape), parameter * generic(rng, parameter.shape)
     logarithms: list[np.ndarray] = [np.zeros(0)]

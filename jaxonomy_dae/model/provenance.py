@@ -21,7 +21,7 @@ class Provenance(NamedTuple):
 
     @property
     def is_written(self) -> bool:
-        """Whether a component or a network wrote the equation."""
+        """True if a component or a network wrote the equation."""
         return bool(self.component)
 
     def __str__(self):
@@ -45,19 +45,19 @@ class Provenances(Sequence[Provenance]):
 
     @classmethod
     def of(cls, entries: Sequence[Provenance]) -> "Provenances":
-        """Those of a list."""
+        """The provenances of a list."""
         entries = list(entries)
         written = np.array([p.is_written for p in entries], bool)
         return cls((entries.__getitem__,) * 2, (False, True), written.astype(np.int64), np.arange(len(entries)))
 
     @classmethod
     def made(cls, source: "Source", items: np.ndarray, is_written: bool) -> "Provenances":
-        """Those that one function makes of numbers."""
+        """The provenances that a function makes of numbers."""
         return cls((source,), (is_written,), np.zeros(len(items), np.int64), np.asarray(items, np.int64))
 
     @classmethod
     def joined(cls, parts: Sequence["Provenances"]) -> "Provenances":
-        """Those of several groups, one after the other."""
+        """The provenances of several groups, one after the other."""
         if len(parts) == 1:
             return parts[0]
         places: dict[tuple[int, bool], int] = {}
@@ -75,12 +75,12 @@ class Provenances(Sequence[Provenance]):
         return cls(sources, written, np.concatenate(source) if parts else item, item)
 
     def take(self, rows: np.ndarray) -> "Provenances":
-        """Those of some rows."""
+        """The provenances of some rows."""
         return Provenances(self._sources, self._written, self._source[rows], self._item[rows])
 
     @property
     def is_written(self) -> np.ndarray:
-        """Of each, whether a component or a network wrote the equation."""
+        """True for equations that a component or a network wrote."""
         return np.array(self._written, bool)[self._source]
 
     def __len__(self):

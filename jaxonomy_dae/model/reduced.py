@@ -10,7 +10,7 @@ from .tables import AliasTable, EquationGroup, FlatModel, provenance_of
 
 @dataclasses.dataclass(frozen=True)
 class ReducedModel:
-    """What was written, what is left of it, and the quantities it is left in."""
+    """A flattened model with the equations that are left of it, and the quantities that they are left in."""
 
     flat: FlatModel
     alias: AliasTable

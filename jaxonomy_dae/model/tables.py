@@ -18,7 +18,7 @@ from .provenance import Provenance, Provenances
 from .symbolic import SymbolicTemplate
 from .template import AbstractTemplate
 
-ZERO = -1
+ZERO = -1  # stands for a variable, or quantity, that is identically zero
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,12 +49,12 @@ class Starts(Sequence[Start | None]):
 
     @property
     def is_given(self) -> np.ndarray:
-        """Whether each has a start."""
+        """True for variables that have a start."""
         return self._place[:, 0] >= 0
 
     @property
     def is_number(self) -> np.ndarray:
-        """Whether each has a start that no parameter changes."""
+        """True for variables that have a start which no parameter changes."""
         number = [group.parameter.shape[1] == 0 for group in self.groups]
         return np.array([*number, False], bool)[self._place[:, 0]]
 
@@ -67,7 +67,7 @@ class Starts(Sequence[Start | None]):
         return out
 
     def padded(self, extra: int) -> "Starts":
-        """The same with more variables, which have none."""
+        """A copy with `extra` more variables, which have no start."""
         return Starts(len(self) + extra, self.groups)
 
     def __len__(self):
@@ -88,7 +88,7 @@ class Starts(Sequence[Start | None]):
 
 @dataclasses.dataclass(frozen=True)
 class VariableTable:
-    """What the user declared of each variable, by id."""
+    """The declarations of all variables, by id."""
 
     names: list[str]
     is_input: np.ndarray
@@ -119,7 +119,7 @@ class PortTable:
     has_inside: np.ndarray
 
     def count(self, component: int) -> int:
-        """How many ports a component has."""
+        """The number of ports of a component."""
         return int((self.owner == component).sum())
 
 
@@ -134,7 +134,7 @@ class DependentParameters:
 
 @dataclasses.dataclass(frozen=True)
 class ParameterTable:
-    """What the user declared of each parameter, by id."""
+    """The declarations of all parameters, by id."""
 
     names: list[str]
     values: np.ndarray
@@ -150,7 +150,7 @@ class ParameterTable:
 
     @property
     def n_declared(self) -> int:
-        """How many were declared."""
+        """The number of parameters that were declared."""
         return len(self.names) - len(self.discrete) - self.n_relations
 
 
@@ -306,6 +306,6 @@ def locate(groups: tuple[EquationGroup, ...], equation: int) -> tuple[EquationGr
 
 
 def provenance_of(groups: tuple[EquationGroup, ...], equation: int) -> Provenance:
-    """Where an equation comes from."""
+    """The provenance of an equation."""
     group, place = locate(groups, equation)
     return group.provenance[place]

@@ -46,7 +46,7 @@ class AbstractTemplate(abc.ABC):
 
     @abc.abstractmethod
     def magnitude(self, sizes, slots, parameters, coefficients, t, networks, backend="jax") -> Any:
-        """How large the residual's terms are (see `expressions.magnitude`); `sizes` are the magnitudes of slots."""
+        """The magnitude of the residual's terms (see `expressions.magnitude`); `sizes` are the magnitudes of slots."""
 
     def partial_errors(self, slots, errors, parameters, coefficients, t, networks) -> tuple:
         """Bounds of the errors of `partial_values` in NumPy, where `errors` are those of slots, and parameters and
@@ -71,15 +71,15 @@ class AbstractTemplate(abc.ABC):
 
     @abc.abstractmethod
     def coefficient_is_constant(self, position: int) -> bool:
-        """Whether ∂(residual)/∂(slot) depends on parameters and numbers only."""
+        """True if ∂(residual)/∂(slot) depends on parameters and numbers only."""
 
     @abc.abstractmethod
     def coefficient_is_number(self, position: int) -> bool:
-        """Whether ∂(residual)/∂(slot) is a number other than zero."""
+        """True if ∂(residual)/∂(slot) is a number other than zero."""
 
     @abc.abstractmethod
     def coefficient_never_vanishes(self, position: int) -> bool:
-        """Whether ∂(residual)/∂(slot) is a nonzero number or a product of parameters, safe to divide by."""
+        """True if ∂(residual)/∂(slot) is a nonzero number or a product of parameters, safe to divide by."""
 
     @abc.abstractmethod
     def numbers(self, coefficients: np.ndarray) -> np.ndarray:
@@ -87,10 +87,10 @@ class AbstractTemplate(abc.ABC):
 
     @abc.abstractmethod
     def is_unmoved(self, direction: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-        """Whether Σ direction·∂(residual)/∂(slot) is zero wherever the slots are; `direction` are integers of shape
-        (n, slots), the result has shape (n,)."""
+        """True if Σ direction·∂(residual)/∂(slot) is zero wherever the slots are; `direction` are integers of shape (n,
+        slots), the result has shape (n,)."""
 
     def is_affine_in(self, positions: Sequence[int]) -> bool:
-        """Whether the residual is affine, jointly, in the slots at these positions."""
+        """True if the residual is affine, jointly, in the slots at these positions."""
         chosen = frozenset(positions)
         return all(self.slots_of_partial(k).isdisjoint(chosen) for k in positions)

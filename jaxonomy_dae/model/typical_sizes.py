@@ -16,8 +16,8 @@ DECADES = 30  # that they may span: single precision has 38
 def typical_sizes(
     model: ReducedModel, parameters: Float[np.ndarray, " parameters"]
 ) -> Float[np.ndarray, " quantities"]:
-    """Of all quantities, at these values of the parameters; powers of two, by which numbers are multiplied without
-    rounding."""
+    """The typical sizes of all quantities, at the parameter values the model was compiled with; powers of two, by which
+    numbers are multiplied without rounding."""
     return _rounded(_unrounded(model, parameters))
 
 
@@ -26,8 +26,8 @@ def _rounded(sizes: Float[np.ndarray, " quantities"]) -> Float[np.ndarray, " qua
 
 
 def unrounded_sizes(model: ReducedModel) -> Float[np.ndarray, " quantities"]:
-    """Typical sizes at the parameter values the model was compiled with, before rounding to powers of two. State
-    selection compares sizes, and rounding could turn a small difference into a factor of two."""
+    """As `typical_sizes` before rounding to powers of two. State selection compares sizes, and rounding could turn a
+    small difference into a factor of two."""
     return _unrounded(model, model.flat.parameters.values)
 
 

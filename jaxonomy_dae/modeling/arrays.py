@@ -4,7 +4,7 @@ import inspect
 import math
 import operator
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, TypeGuard
+from typing import Any, Protocol, TypeGuard
 
 import jax
 import numpy as np
@@ -13,14 +13,33 @@ from jax.core import Tracer
 
 from ..errors import ModelError
 from .construction import Construction
-from .declarations import EachValue
-from .events import Sampled
+from .declarations import Account, EachValue, Parameter, Variable
+from .environment import EqnEnv
+from .events import Sampled, When
 from .ports import Port
 from .symbols import ParameterSymbol, VariableSymbol
 
-if TYPE_CHECKING:
-    from .component import Component
-    from .environment import EqnEnv
+
+class Prototype(Protocol):
+    """A component, as arrays of it see it. Components make arrays, and so import this module."""
+
+    ev: EqnEnv
+    name: str
+    parent: Any  # the component that contains it, or None
+    parameters: dict[str, Parameter]
+    variables: dict[str, Variable]
+    ports: dict[str, Port]
+    children: dict[str, Any]  # components and arrays of them
+    equations: list[sympy.Expr]
+    accounts: list[Account]
+    events: list[When]
+
+    @property
+    def path(self) -> str: ...
+
+    def outside_path(self) -> str: ...
+
+    def symbol(self, name: str) -> sympy.Symbol: ...
 
 
 class ComponentArray:
@@ -33,7 +52,7 @@ class ComponentArray:
 
     def __init__(
         self,
-        prototype: "Component",
+        prototype: Prototype,
         shape: tuple[int, ...],
         arguments: dict[str, str | None] | None = None,
         numbers: np.ndarray | None = None,
@@ -44,7 +63,7 @@ class ComponentArray:
         self.shape = shape  # of the whole array
         self.arguments = arguments or {}  # with one value an instance: the parameter of the prototype that has them
         self.numbers = np.arange(math.prod(shape)).reshape(shape) if numbers is None else numbers  # of those chosen
-        self.inner: Component = inner or prototype  # the prototype, or a component inside it
+        self.inner: Prototype = inner or prototype  # the prototype, or a component inside it
         self.above = above  # the path of the one instance that contains the array, if it was reached through that
 
     @property
@@ -58,12 +77,12 @@ class ComponentArray:
         return self.prototype.path
 
     @property
-    def ev(self) -> "EqnEnv":
+    def ev(self) -> EqnEnv:
         """The environment of its components."""
         return self.prototype.ev
 
     @property
-    def parent(self) -> "Component | None":
+    def parent(self) -> Prototype | None:
         """The component that has it."""
         return self.prototype.parent
 
@@ -86,7 +105,7 @@ class ComponentArray:
             above = "" if self.parent is None else self.parent.outside_path()
         return f"{above}{self.name}{self.label(number)}.{inside}"
 
-    def _chosen(self, numbers: np.ndarray, inner: "Component") -> "ComponentArray":
+    def _chosen(self, numbers: np.ndarray, inner: Prototype) -> "ComponentArray":
         return ComponentArray(self.prototype, self.shape, self.arguments, numbers, inner, self.above)
 
     def __getitem__(self, index: Any) -> Any:
@@ -174,7 +193,7 @@ class PortArray:
         return f"{self.chosen.path}.{self.port.name} ({' × '.join(map(str, numbers.shape))})"
 
 
-def make_array(ev: "EqnEnv", name: str, kind: type, shape: Any, args: tuple, kwargs: dict[str, Any]) -> ComponentArray:
+def make_array(ev: EqnEnv, name: str, kind: type, shape: Any, args: tuple, kwargs: dict[str, Any]) -> ComponentArray:
     """An array of components `kind(ev, name, *args, **kwargs)`; arrays among the arguments hold one value for each.
 
     **Raises:**
@@ -267,9 +286,7 @@ def _kind_of(value: Any) -> str:
     return kinds.get(value.dtype.kind, f"entries of type {value.dtype}")
 
 
-def _give_values(
-    prototype: "Component", values: dict[str, np.ndarray], shape: tuple[int, ...]
-) -> dict[str, str | None]:
+def _give_values(prototype: Prototype, values: dict[str, np.ndarray], shape: tuple[int, ...]) -> dict[str, str | None]:
     """Gives parameters of the prototype, and of what is inside it, the values of the instances; returns the parameter
     of the prototype that has those of each argument."""
     if not values:

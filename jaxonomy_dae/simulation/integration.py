@@ -15,7 +15,8 @@ from ..hybrid.problem import HybridState
 from ..hybrid.solver import WithEvents
 from ..hybrid.start import start
 from ..hybrid.term import HybridTerm
-from ..initialization.initialize import InitialPoint, check, initialize, is_consistent
+from ..initialization.check import check
+from ..initialization.initialize import InitialPoint, initialize, is_consistent
 from ..programs.cache import compiled
 from ..solvers.drive import integrate, is_implicit, right_between_steps
 from ..solvers.rows import not_a_number, padded

@@ -12,7 +12,7 @@ from jax.core import Tracer
 
 from ..adjoint.default import default_adjoint
 from ..errors import InitializationError, SimulationError
-from ..initialization.initialize import check
+from ..initialization.check import check
 from ..lowering.plan import SystemPlan
 from ..programs.cache import PROGRAMS
 from ..programs.staging import is_forwards, is_staged

@@ -40,7 +40,8 @@ def dulmage_mendelsohn(pattern: Incidence, matched: np.ndarray):
 
 
 def _reach(tail: np.ndarray, head: np.ndarray, start: np.ndarray, n: int) -> np.ndarray:
-    """Which of n nodes can be reached from `start` along the arcs: a search from one node put before them all."""
+    """True for the nodes that can be reached from `start` along the arcs, shape (n,): a search from one node put before
+    them all."""
     arcs = (np.concatenate([tail, np.full(len(start), n)]), np.concatenate([head, start]))
     graph = sp.coo_array((np.ones(len(arcs[0])), arcs), shape=(n + 1, n + 1)).tocsr()
     reached = sp.csgraph.breadth_first_order(graph, n, return_predecessors=False)

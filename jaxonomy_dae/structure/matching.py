@@ -24,8 +24,8 @@ def maximum_matching(pointer: np.ndarray, columns: np.ndarray, n_columns: int) -
 
 
 def match_in_order(pointer: np.ndarray, columns: np.ndarray, n_columns: int, first: int) -> np.ndarray:
-    """The same with priorities: as many of the `first` rows as possible, then each later row, in order, that can be
-    matched beside all before it."""
+    """A matching with priorities: as many of the `first` rows as possible, then each later row, in order, that can be
+    matched beside all before it. Returns the column of each row, −1 if unmatched."""
     row_match = np.full(len(pointer) - 1, -1)
     row_match[:first] = maximum_matching(pointer[: first + 1], columns[: pointer[first]], n_columns)
     matched = row_match >= 0

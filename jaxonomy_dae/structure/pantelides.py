@@ -19,7 +19,12 @@ from .matching import maximum_matching
 
 @dataclasses.dataclass(frozen=True)
 class Offsets:
-    """How often each equation is differentiated, the highest order of each variable, and their matching."""
+    """The offsets of equations and variables.
+
+    - `equation`: how often each equation is differentiated.
+    - `variable`: the highest order of each variable.
+    - `matched_variable`: the variable whose highest derivative each equation determines.
+    """
 
     equation: np.ndarray  # c
     variable: np.ndarray  # d

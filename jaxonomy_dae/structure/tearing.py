@@ -18,7 +18,7 @@ import numpy as np
 
 GROWTH = 100.0  # of an error in a tearing variable, in equilibrated units
 LINKS = 1  # in rows whose growth depends on parameters or the state: they may change after the choice was made
-EQUILIBRATIONS = 4
+EQUILIBRATIONS = 4  # passes: entries need only be alike to a factor that is small beside GROWTH
 
 
 class Tearing(NamedTuple):
@@ -30,7 +30,7 @@ class Tearing(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Sizes:
+class BlockSizes:
     """The sizes of the entries of blocks of one pattern, by (equation, unknown), over the blocks: shape (blocks,).
 
     Those in `numbers` are plain numbers, the same in all blocks and for all parameters.
@@ -39,7 +39,7 @@ class Sizes:
     entries: Mapping[tuple[int, int], np.ndarray]
     numbers: frozenset[tuple[int, int]]
 
-    def equilibrated(self) -> "Sizes":
+    def equilibrated(self) -> "BlockSizes":
         """Rows and columns scaled to a largest entry near 1 (Ruiz 2001)."""
         places = list(self.entries)
         size = np.stack([self.entries[place] for place in places])
@@ -50,13 +50,13 @@ class Sizes:
                 largest = np.zeros((int(index.max()) + 1, size.shape[1]))
                 np.maximum.at(largest, index, size)
                 size = size / np.where(largest > 0, largest, 1.0)[index] ** power
-        return Sizes(dict(zip(places, size, strict=True)), self.numbers)
+        return BlockSizes(dict(zip(places, size, strict=True)), self.numbers)
 
 
 class _Growth:
-    """How much larger than the tearing variables the unknowns of a sequence can be, and how many links away."""
+    """Bounds of the unknowns of a sequence relative to the tearing variables, and the number of links between them."""
 
-    def __init__(self, sizes: Sizes):
+    def __init__(self, sizes: BlockSizes):
         self.raw, self.scaled = sizes.entries, sizes.equilibrated().entries
         self.numbers = sizes.numbers
         blocks = next(iter(self.raw.values())).shape
@@ -65,7 +65,7 @@ class _Growth:
         self.links: dict[int, int] = {}
 
     def allows(self, e: int, u: int, known: Iterable[int]) -> bool:
-        """Whether equation e may give the unknown u; keeps what follows if so."""
+        """True if equation e may give the unknown u; its growth and links are then kept."""
         pivot = self.scaled[e, u]
         total, links = 0.0 * self.one, 0
         for v in known:
@@ -83,7 +83,9 @@ class _Growth:
         return not (fixed and (self.raw[e, v] <= self.raw[e, u]).all())
 
 
-def tear(contains: Sequence[frozenset[int]], solvable: Sequence[frozenset[int]], sizes: Sizes | None = None) -> Tearing:
+def tear(
+    contains: Sequence[frozenset[int]], solvable: Sequence[frozenset[int]], sizes: BlockSizes | None = None
+) -> Tearing:
     """Tears one block, or blocks of one pattern; with `sizes`, growth is bounded."""
     n = len(contains)
     growing = None if sizes is None else _Growth(sizes)

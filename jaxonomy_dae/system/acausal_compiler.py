@@ -86,7 +86,7 @@ class AcausalCompiler:
 
     @property
     def report(self) -> SystemReport:
-        """What the last call did."""
+        """The report of the last call."""
         if self._report is None:
             raise ModelError("nothing has been compiled yet: call the compiler first")
         return self._report

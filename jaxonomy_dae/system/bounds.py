@@ -47,22 +47,22 @@ class Ends(NamedTuple):
 
     @classmethod
     def of(cls, intervals: Sequence[Interval]) -> "Ends":
-        """Those of a list of intervals, shape (n,)."""
+        """The ends of a list of intervals, shape (n,)."""
         columns = zip(*((i.low, i.high, i.open_low, i.open_high) for i in intervals), strict=True)
         return cls(*map(np.array, columns)) if len(intervals) else cls(*np.zeros((2, 0)), *np.zeros((2, 0), bool))
 
     def take(self, chosen: np.ndarray) -> "Ends":
-        """Those at indices, in their shape."""
+        """The ends at indices, in their shape."""
         return Ends(*(end[chosen] for end in self))
 
     @property
     def are_none(self) -> bool:
-        """Whether all numbers are inside of all."""
+        """True if no interval excludes a finite number."""
         return not (np.isfinite(self.low) | np.isfinite(self.high)).any()
 
     def admit(self, x: Any) -> Any:
-        """Whether each of the values x, NumPy's or JAX', with the intervals' shape as trailing axes, is a finite number
-        inside."""
+        """True for values x (NumPy's or JAX', with the intervals' shape as trailing axes) that are finite and inside
+        the intervals."""
         xp: Any = np if isinstance(x, np.ndarray) else jnp
         low, high = (xp.asarray(end, x.dtype) for end in (self.low, self.high))
         above = (x > low) | ((x == low) & ~self.open_low)

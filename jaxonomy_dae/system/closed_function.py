@@ -20,7 +20,7 @@ from ..private_names import private
 
 
 @dataclasses.dataclass(frozen=True)
-class _Program:
+class _TracedFunction:
     """A traced function without its numbers, compared by what it computes."""
 
     jaxpr: Any = dataclasses.field(compare=False)
@@ -35,7 +35,7 @@ class ClosedFunction(eqx.Module):
     """A function of time that closes over nothing: `program` reads `constants`, the numbers written in it included."""
 
     constants: list[Any]
-    program: _Program = eqx.field(static=True)
+    program: _TracedFunction = eqx.field(static=True)
 
     def __call__(self, t: Any) -> Any:
         jaxpr = self.program.jaxpr
@@ -48,7 +48,7 @@ def closed_function(function: Callable[[Any], Any], dtype: Any) -> ClosedFunctio
     closed = jax.make_jaxpr(function)(jax.ShapeDtypeStruct((), dtype))
     jaxpr, numbers = _with_numbers_lifted(closed.jaxpr)
     key = _key_of_jaxpr(jaxpr)
-    return ClosedFunction([_own(c) for c in (*closed.consts, *numbers)], _Program(jaxpr, key, hash(key)))
+    return ClosedFunction([_own(c) for c in (*closed.consts, *numbers)], _TracedFunction(jaxpr, key, hash(key)))
 
 
 def _with_numbers_lifted(jaxpr: Any) -> tuple[Any, list[Any]]:
@@ -78,7 +78,7 @@ def _own(value: Any) -> Any:
 
 
 def _is_data(literal: Any) -> bool:
-    """Whether a literal is data rather than part of the program, as indices are."""
+    """True if a literal is data rather than part of the program, as indices are."""
     return jnp.issubdtype(literal.aval.dtype, jnp.inexact) or bool(np.shape(literal.val))
 
 
@@ -127,7 +127,7 @@ def _key(value: Any) -> Hashable:
 
 
 class _Same:
-    """Compares by identity, and keeps what it compares alive."""
+    """Wraps an object so that it is compared by identity, and kept alive while it is compared."""
 
     def __init__(self, value: Any):
         self.value = value

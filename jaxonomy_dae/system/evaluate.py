@@ -48,7 +48,7 @@ ZERO_WITHIN = 1e2  # in units of eps and of its typical size: what cannot be tol
 
 
 class Refinement(enum.Enum):
-    """What is done about the unknowns of nonlinear blocks before they are used."""
+    """The treatment of the unknowns of nonlinear blocks before they are used."""
 
     NONE = "none"  # they are read from the state as they are
     ONCE = "once"  # one Newton correction, for states that are nearly right
@@ -70,7 +70,7 @@ class Evaluation(AbstractEvaluation):
         self.residuals: list[Any] = []  # of carried steps, if nothing is refined
 
     def frozen(self) -> "Evaluation":
-        """The same without derivatives."""
+        """A copy in which all arrays are constant under differentiation."""
         parts = self.chunks, self.parameters, self.t, self.networks.weights
         chunks, parameters, t, weights = jax.tree.map(
             lambda leaf: jax.lax.stop_gradient(leaf) if isinstance(leaf, jax.Array) else leaf, parts
@@ -197,14 +197,14 @@ class Evaluation(AbstractEvaluation):
         return local
 
     def _residuals(self, planned: PlannedStep, z: list[Any]) -> list[Any]:
-        """Of the equations that the tearing variables must fulfil."""
+        """The residuals of the equations that the tearing variables must fulfil."""
         local = self._follow(planned, z)
         like = z[0]
         equations = [planned.equations[e] for e in planned.step.tearing.residuals]
         return [self._filled(self._residual(equation, local), like.shape) for equation in equations]
 
     def _holds(self, planned: PlannedStep, local: list[Any], tolerated: float) -> Any:
-        """Whether these equations hold, for each of the step's blocks."""
+        """True for each of the step's blocks whose residual equations hold."""
         noise = self._noise(planned, local)
         verdicts = []
         for e in planned.step.tearing.residuals:
@@ -216,7 +216,7 @@ class Evaluation(AbstractEvaluation):
         return functools.reduce(jnp.logical_and, verdicts)
 
     def _magnitude(self, planned: PlannedEquation, local: list[Any]) -> Any:
-        """How large the terms of an equation are, not differentiated."""
+        """The magnitude of an equation's terms, not differentiated."""
         arguments: Any = self._still_arguments(planned, local)
         return planned.equation.template.magnitude([jnp.abs(s) for s in arguments[0]], *arguments)
 
@@ -238,8 +238,8 @@ class Evaluation(AbstractEvaluation):
         return *jax.lax.stop_gradient((slots, parameters)), *rest
 
     def _noise(self, planned: PlannedStep, local: list[Any]) -> list[Any]:
-        """What rounding may have left in each unknown that follows from others (a running error analysis, Wilkinson
-        1963): a difference of pressures is not known to its own digits, but to theirs."""
+        """The part that rounding may have left in each unknown that follows from others (a running error analysis,
+        Wilkinson 1963): a difference of pressures is not known to its own digits, but to theirs."""
         noise: list[Any] = [0.0] * len(local)
         eps = float(jnp.finfo(self.dtype).eps)
         for e, u in planned.step.tearing.sequence:
@@ -340,7 +340,7 @@ class Evaluation(AbstractEvaluation):
         return jnp.concatenate(values)
 
     def _whole_holds(self, planned: PlannedSparse, u: Any, tolerated: float) -> Any:
-        """Whether all equations of large blocks hold."""
+        """True if all equations of large blocks hold."""
         there = self._beside(u)
         holds = jnp.asarray(True)
         for equation, (residual, partials) in zip(planned.equations, self._whole(planned, u), strict=True):
@@ -370,7 +370,7 @@ class Evaluation(AbstractEvaluation):
         return out
 
     def _beside(self, u: Any) -> Self:
-        """The same with one more chunk."""
+        """A copy with one more chunk."""
         there = copy.copy(self)
         there.chunks = [*self.chunks, u]
         return there
@@ -433,7 +433,7 @@ def is_small(
     tolerated: float,
     noise: Sequence[Any] = (),
 ) -> Any:
-    """Whether a residual is small beside its terms, or beside the rounding of what it is computed from.
+    """True if a residual is small beside its terms, or beside the rounding of what it is computed from.
 
     **Arguments:**
 
@@ -456,7 +456,7 @@ def _weighed(pairs: Sequence[tuple[Any, Any]]) -> Any:
 
 
 def _is_nothing(value: Any) -> bool:
-    """Whether a value is the number zero, known as such."""
+    """True if a value is the Python number 0.0, known while a program is traced."""
     return isinstance(value, float) and value == 0.0
 
 

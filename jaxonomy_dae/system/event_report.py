@@ -63,8 +63,8 @@ def _noted(table: EventTable) -> list[int]:
 
 
 def _actions(flat: FlatModel, event: int) -> str:
-    """What an event does, in the words in which it is declared; values that are not numbers are left out, and what is
-    not shown."""
+    """The actions of an event, in the words in which they are declared; values that are not numbers are left out, and
+    so are hidden variables."""
     table = flat.events
     out = []
     for row in np.flatnonzero(table.event == event).tolist():

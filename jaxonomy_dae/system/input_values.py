@@ -22,7 +22,7 @@ def missing_input(plan: SystemPlan, inputs: Mapping[str, Any]) -> str | None:
 
 
 def by_entry(plan: SystemPlan, inputs: Mapping[str, Any]) -> dict[str, Any]:
-    """What `read_inputs` returned, with an entry for each input of an array."""
+    """The inputs that `read_inputs` returned, with an entry for each input of an array."""
     found = {}
     for name, source in inputs.items():
         places = plan.input_places(name)

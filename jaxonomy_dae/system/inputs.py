@@ -27,7 +27,7 @@ KINDS = ("linear", "cubic", "held")
 EXAMPLE = "inputs={'m.u': (times, values)}, or (times, values, 'held') or 'cubic'"
 
 
-class Held(eqx.Module):
+class HeldPath(eqx.Module):
     """Samples held until the next one; where they jump, the new value counts."""
 
     ts: Float[Array, " n"]
@@ -38,7 +38,7 @@ class Held(eqx.Module):
         return self.ys[jnp.clip(jnp.searchsorted(self.ts, t, side="right") - 1, 0, len(self.ts) - 1)]
 
 
-class Sampled(eqx.Module):
+class SampledInput(eqx.Module):
     """An interpolated input. Its derivatives up to order `smoothness` are continuous: 0 for linear interpolation, 1 for
     cubic, −1 for samples that are held."""
 
@@ -92,8 +92,8 @@ def read_inputs(plan: SystemPlan, dtype: Any, inputs: Mapping[str, Any] | None) 
 
 
 def _read(name: str, value: Any, dtype: Any, shape: tuple[int, ...]) -> Any:
-    """What was given for an input, or for an array of inputs of this shape."""
-    if isinstance(value, Sampled | ClosedFunction | Entry):
+    """Reads the value given for an input, or for an array of inputs of this shape."""
+    if isinstance(value, SampledInput | ClosedFunction | Entry):
         return value
     if isinstance(value, diffrax.LinearInterpolation | diffrax.CubicInterpolation):
         return _interpolation(name, value, shape)
@@ -177,7 +177,7 @@ def _function(name: str, function: Callable[[Any], Any], dtype: Any, allowed: tu
 # --- samples -------------------------------------------------------------------------------------------------------
 
 
-def _samples(name: str, given: tuple[Any, ...] | list[Any], dtype: Any, shape: tuple[int, ...]) -> Sampled:
+def _samples(name: str, given: tuple[Any, ...] | list[Any], dtype: Any, shape: tuple[int, ...]) -> SampledInput:
     kind = given[2] if len(given) == 3 else "linear"
     if kind not in KINDS:
         raise ModelError(f"input '{name}': samples are 'linear', 'cubic' or 'held'; got {kind!r}")
@@ -193,10 +193,10 @@ def _samples(name: str, given: tuple[Any, ...] | list[Any], dtype: Any, shape: t
         raise ModelError(f"input '{name}': {kind} samples are at least {least}; got {times.shape[0]}")
     _check_times(name, times)
     if kind == "held":
-        return Sampled(Held(times, values), -1)
+        return SampledInput(HeldPath(times, values), -1)
     if kind == "linear":
-        return Sampled(diffrax.LinearInterpolation(times, values), 0)
-    return Sampled(diffrax.CubicInterpolation(times, diffrax.backward_hermite_coefficients(times, values)), 1)
+        return SampledInput(diffrax.LinearInterpolation(times, values), 0)
+    return SampledInput(diffrax.CubicInterpolation(times, diffrax.backward_hermite_coefficients(times, values)), 1)
 
 
 def _column(name: str, which: str, values: Any, dtype: Any, shape: tuple[int, ...] = ()) -> Any:
@@ -229,7 +229,7 @@ def _check_times(name: str, times: Any):
         )
 
 
-def _interpolation(name: str, path: Any, shape: tuple[int, ...]) -> Sampled:
+def _interpolation(name: str, path: Any, shape: tuple[int, ...]) -> SampledInput:
     out = jax.eval_shape(path.evaluate, jax.ShapeDtypeStruct((), path.ts.dtype))
     if getattr(out, "shape", None) not in ((), shape):
         shapes = [leaf.shape for leaf in jax.tree.leaves(out)]
@@ -242,7 +242,7 @@ def _interpolation(name: str, path: Any, shape: tuple[int, ...]) -> Sampled:
                 "with diffrax.linear_interpolation"
             )
     _check_times(name, path.ts)
-    return Sampled(path, 0 if isinstance(path, diffrax.LinearInterpolation) else 1)
+    return SampledInput(path, 0 if isinstance(path, diffrax.LinearInterpolation) else 1)
 
 
 def check_range(inputs: Mapping[str, Any], t0: Any, t1: Any):
@@ -250,7 +250,7 @@ def check_range(inputs: Mapping[str, Any], t0: Any, t1: Any):
     if isinstance(t0, Tracer) or isinstance(t1, Tracer):
         return
     for name, value in inputs.items():
-        if not isinstance(value, Sampled) or isinstance(value.path.ts, Tracer):
+        if not isinstance(value, SampledInput) or isinstance(value.path.ts, Tracer):
             continue
         first, last = float(value.path.ts[0]), float(value.path.ts[-1])
         slack = 1e-6 * (float(t1) - float(t0))
@@ -269,12 +269,12 @@ class StepEnds(NamedTuple):
 
     @property
     def count(self) -> int:
-        """How many there are."""
+        """The number of instants."""
         return sum(len(ts) for ts in (*self.jumps, *self.kinks))
 
 
 def step_ends(plan: SystemPlan, inputs: Mapping[str, Any]) -> StepEnds:
-    """Where the samples of inputs, or the derivatives of them that the model reads, have kinks and jumps.
+    """The times at which samples of inputs, or the derivatives of them that the model reads, have kinks and jumps.
 
     **Raises:**
 
@@ -282,7 +282,7 @@ def step_ends(plan: SystemPlan, inputs: Mapping[str, Any]) -> StepEnds:
     """
     ends = StepEnds([], [])
     for name, value in inputs.items():
-        if not isinstance(value, Sampled):
+        if not isinstance(value, SampledInput):
             continue
         places = plan.input_places(name)
         highest = 0 if places is None else plan.inputs.highest(places)

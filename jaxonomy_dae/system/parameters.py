@@ -64,7 +64,7 @@ class ParameterNames:
         return k
 
     def _roots(self, k: int) -> list[int]:
-        """What a dependent parameter is computed from in the end."""
+        """The settable parameters from which a dependent one is computed in the end."""
         found, waiting = set(), [k]
         while waiting:
             k = waiting.pop()
@@ -79,7 +79,7 @@ class ParameterNames:
         return complete(self.dependents, array)
 
     def given(self, chosen: np.ndarray) -> "ParameterNames":
-        """The same table, in which these parameters are given even where they were computed from others."""
+        """A copy of the table in which these parameters are given even where they were computed from others."""
         if not any(int(k) in self.expressions for k in chosen):
             return self
         dependents = tuple(
@@ -204,11 +204,11 @@ class Parameters(eqx.Module):
         return [(name, array[..., k]) for k, name in enumerate(self.table.names)]
 
     def merged(self) -> "Parameters":
-        """The same values with nothing set apart."""
+        """The values with nothing set apart."""
         return Parameters(self.array, None, (), self.table)
 
     def freed(self, names: tuple[str, ...]) -> "Parameters":
-        """The same values with the named ones set apart in `free`."""
+        """The values with the named ones set apart in `free`."""
         index = tuple(dict.fromkeys(self.table.settable(n) for name in names for n in self.table.one_by_one(name)))
         if not index:
             return self.merged()
@@ -216,7 +216,7 @@ class Parameters(eqx.Module):
         return Parameters(array, array[..., np.array(index)], index, self.table)
 
     def replaced(self, new: Mapping[str, Any]) -> "Parameters":
-        """The same table with new values, which may be tracers; a batch takes one value for all or one for each.
+        """The parameters with new values, which may be tracers; a batch takes one value for all or one for each.
 
         **Raises:**
 
@@ -252,7 +252,7 @@ class Parameters(eqx.Module):
 
     @property
     def are_admitted(self) -> Bool[Array, "*batch"]:
-        """Whether all values are finite and within their bounds."""
+        """True if all values are finite and within their bounds."""
         return jnp.all(self.table.ends.admit(self.array), axis=-1)
 
     @property

@@ -15,7 +15,7 @@ from .solver_choice import solver_choice
 
 
 class SystemReport(Sections):
-    """What the compiler did; `print(report)` shows it.
+    """A report of the compiler; `print(report)` shows it.
 
     Attributes count and name: `n_equations`, `n_unknowns`, `n_aliases`, `index` (structural, of the model as written),
     `differentiated` (pairs of an equation's text and how often), `states`, `algebraics`, `carried`, `constraints`,
@@ -57,7 +57,7 @@ class SystemReport(Sections):
 
     @property
     def degrees_of_freedom(self) -> int:
-        """How many initial values can be chosen."""
+        """The number of initial values that can be chosen."""
         extended = self._plan.extended
         quantities = extended.quantities
         return int(quantities.highest[: quantities.n_unknown_columns].sum() - extended.level.astype(bool).sum())

@@ -6,8 +6,8 @@ import math
 import re
 from collections.abc import Sequence
 
-SHOWN = 12
-HTML_SHOWN = 200
+SHOWN = 12  # entries of a section in a text
+HTML_SHOWN = 200  # and in a notebook, where sections fold
 
 
 class Sections(abc.ABC):
@@ -28,7 +28,7 @@ class Sections(abc.ABC):
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        """The same for a notebook: sections that fold."""
+        """The report for a notebook: sections that fold."""
         head, sections = self._contents()
         out = [f"<p>{'<br>'.join(html.escape(line) for line in head)}</p>"]
         for title, entries in sections:
@@ -40,7 +40,7 @@ class Sections(abc.ABC):
 
 
 def some(names: Sequence[str]) -> str:
-    """Names, and of long lists how many there are."""
+    """Names in a list; of long lists the first ones, and how many there are."""
     return ", ".join(names[:SHOWN]) + (f", … ({len(names)} in all)" if len(names) > SHOWN else "")
 
 

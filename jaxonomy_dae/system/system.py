@@ -77,7 +77,7 @@ class AcausalSystem(eqx.Module):
 
     @property
     def report(self):
-        """What the compiler did, to be printed."""
+        """The report of the compiler, to be printed."""
         from .report import SystemReport
 
         return SystemReport(self.plan, self.parameters.known)
@@ -189,7 +189,7 @@ class AcausalSystem(eqx.Module):
         return eqx.tree_at(lambda s: s.neural, system, self.neural | networks) if networks else system
 
     def _parameters_among(self, names: Sequence[str]) -> tuple[str, ...]:
-        """Those names that are not of networks.
+        """The names that are not of networks.
 
         **Raises:**
 
@@ -229,7 +229,7 @@ class AcausalSystem(eqx.Module):
         return eqx.partition(system, wanted)
 
     def merged(self) -> "AcausalSystem":
-        """The same system with nothing set apart by `partition`."""
+        """This system with nothing set apart by `partition`."""
         return eqx.tree_at(lambda s: s.parameters, self, self.parameters.merged())
 
     # --- computing ---------------------------------------------------------------------------------------------
@@ -248,8 +248,8 @@ class AcausalSystem(eqx.Module):
 
     @property
     def numbers(self) -> Float[Array, " m"]:
-        """What equations read of parameters: all that were declared, then the hidden discrete variables, then all
-        discrete variables as before an event."""
+        """The parameter values that equations read, shape (m,): all that were declared, then the hidden discrete
+        variables, then all discrete variables as before an event."""
         array = self.parameters.array
         events = self.plan.events
         if events is None or not len(events.discrete):
@@ -322,8 +322,8 @@ class AcausalSystem(eqx.Module):
 
     @property
     def jacobian_pattern(self) -> SparsePattern | None:
-        """Where the Jacobian of the vector field can have entries: `.rows` and `.cols`, sorted by row. None if it is so
-        large and dense that its places are not worth listing."""
+        """The places at which the Jacobian of the vector field can have entries: `.rows` and `.cols`, sorted by row.
+        None if it is so large and dense that its places are not worth listing."""
         return self.plan.jacobian_pattern
 
     def jacobian(self, t: Any, x: Float[Array, " n"], args: Any = None) -> SparseMatrix:
@@ -363,7 +363,7 @@ class AcausalSystem(eqx.Module):
 
     @property
     def is_constrained(self) -> bool:
-        """Whether a state must satisfy hidden constraints, or carries unknowns of nonlinear blocks."""
+        """True if a state must satisfy hidden constraints, or carries unknowns of nonlinear blocks."""
         return bool(self.plan.n_projected or len(self.plan.carried))
 
     def constraint_residual(self, t: Any, x: Float[Array, " n"], args: Any = None) -> Float[Array, " m"]:
@@ -455,8 +455,9 @@ class AcausalSystem(eqx.Module):
             parameter found is out of its bounds. Inside jit, with `throw=True`, what depends on values is an Equinox
             run-time error.
         """
+        from ..initialization.check import check
         from ..initialization.given_solver import check_solver
-        from ..initialization.initialize import check, find_initial
+        from ..initialization.initialize import find_initial
 
         names = self._names_to_solve_for(solve_for)
         if solver is not None:
@@ -482,8 +483,9 @@ class AcausalSystem(eqx.Module):
         *,
         solve_for: Sequence[str] = (),
     ):
-        """What `initialize` does with the same arguments, to be printed: which starts hold, which were guesses and how
-        far each moved, which are redundant or contradict each other, what does not hold, which method succeeded.
+        """A report of what `initialize` does with the same arguments, to be printed: which starts hold, which were
+        guesses and how far each moved, which are redundant or contradict each other, what does not hold, which method
+        succeeded.
 
         **Raises:**
 

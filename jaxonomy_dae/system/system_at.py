@@ -42,10 +42,7 @@ class SystemAt:
         self.t = jnp.asarray(t, self.dtype)
 
     def split(self, x: Any) -> Any:
-        """The state as a tuple of scalars if it is small.
-
-        **Raises:** `ModelError` for another shape.
-        """
+        """The state as a tuple of scalars, if it has up to `SCALARS` entries; else as an array."""
         if jnp.shape(x) != (self.plan.n_state,):
             raise ModelError(f"a state of this system has shape ({self.plan.n_state},); got {jnp.shape(x)}")
         return tuple(entries(x)) if self.plan.n_state <= SCALARS else x
@@ -177,7 +174,7 @@ class SystemAt:
         return jnp.concatenate([b[:, 0, 0] if b.shape[-1] == 1 else jnp.linalg.det(b) for b in found])
 
     def _only_determinant(self, state: tuple) -> Any:
-        """The same of a single equation, on scalars, which XLA fuses."""
+        """As `dummy_determinants` for a single equation, on scalars, which XLA fuses."""
         _, push = jax.linearize(lambda *x: self._carried(self.t, x)[0], *state)
         one, zero = jnp.ones((), self.dtype), jnp.zeros((), self.dtype)
         gradient = [
@@ -196,7 +193,7 @@ class SystemAt:
         return self._appended(state[: len(plan.states)], evaluation, gather)
 
     def _appended(self, first: Any, evaluation: Evaluation, gather: Gather) -> Any:
-        """What was computed, appended to scalars (a list or a tuple) or to an array."""
+        """The values that were computed, appended to scalars (a list or a tuple) or to an array."""
         n = len(gather.chunk)
         if isinstance(first, list | tuple):
             return type(first)(
@@ -217,7 +214,7 @@ class SystemAt:
         return jnp.broadcast_to(jnp.asarray(value, self.dtype), () if n == 1 else (n,))
 
     def _constraint_arguments(self, evaluation: Evaluation, planned: ConstraintGroup):
-        """What a constraint's template reads."""
+        """The arguments of a constraint group's template."""
         group = planned.group
         slots = [evaluation.read(g) for g in planned.slots]
         if len(group) == 1:
@@ -247,7 +244,7 @@ class SystemAt:
         )
 
     def constraint_magnitudes(self, x: Any, sizes: Any) -> Any:
-        """Of the hidden constraints, shape (n_constraints,)."""
+        """The magnitudes of the hidden constraints' terms, shape (n_constraints,)."""
         evaluation = self._measured(self.plan.constraint_program, x, sizes)
         found = []
         for planned in self.plan.constraints:
@@ -257,32 +254,33 @@ class SystemAt:
         return jnp.concatenate(found) if found else jnp.zeros((0,), self.dtype)
 
     def carried_magnitudes(self, x: Any, sizes: Any) -> Any:
-        """Of the residuals of nonlinear blocks, shape (carried,)."""
+        """The magnitudes of the terms of nonlinear blocks, shape (carried,)."""
         found = self._measured(self.plan.carried_residuals, x, sizes).carried_magnitudes
         return jnp.concatenate([jnp.reshape(v, (-1,)) for v in found]) if found else jnp.zeros((0,), self.dtype)
 
     def magnitudes(self, x: Any, sizes: Any, quantity: np.ndarray, factor: np.ndarray) -> Any:
-        """Of quantities with factors, shape (len(quantity),); infinite or not-a-number where it is not known."""
+        """The magnitudes of quantities with factors, shape (len(quantity),); infinite or not-a-number where it is not
+        known."""
         program = self.plan.reading(quantity)
         found = self._measured(program, x, sizes).size(program.layout.gather(quantity, factor))
         return jnp.broadcast_to(jnp.asarray(found, self.dtype), (len(quantity),))
 
     def slope_magnitudes(self, x: Any, sizes: Any) -> Any:
-        """Of the states' slopes, shape (states,); infinite or not-a-number where it is not known."""
+        """The magnitudes of the states' slopes, shape (states,); infinite or not-a-number where it is not known."""
         plan = self.plan
         found = self._measured(plan.derivative, x, sizes).size(plan.next_derivative)
         return jnp.broadcast_to(jnp.asarray(found, self.dtype), (len(plan.states),))
 
     def held(self, x: Any) -> tuple[Any, Any]:
-        """Of the constraints that come and go with modes: 1.0 where one holds, 0.0 otherwise, shape (held,), and all
-        levels, shape (levels,), which are zero while it does."""
+        """For the constraints that come and go with modes: (1.0 where one holds, 0.0 otherwise, shape (held,); all
+        levels, shape (levels,), which are zero while it does)."""
         plan = self._held()
         state = self.split(x)
         active = self._filled(self.run(plan.active_program, state, Refinement.NONE), plan.active)
         return active, self._filled(self.run(plan.level_program, state, Refinement.ONCE), plan.level)
 
     def held_forces(self, x: Any) -> Any:
-        """What those that only push exert, shape (held,), zero for all others."""
+        """The forces of the constraints that only push, shape (held,), zero for all others."""
         plan = self._held()
         return self._filled(self.run(plan.force_program, self.split(x), Refinement.ONCE), plan.force)
 
@@ -373,7 +371,7 @@ class SystemAt:
         return self._filled(evaluation, events.guard)
 
     def event_values(self, x: Any) -> Any:
-        """What the actions of all events would write, shape (actions,)."""
+        """The values that the actions of all events would write, shape (actions,)."""
         events = self._events()
         read = self._filled(self.run(events.values, self.split(x), Refinement.ROOT), events.value)
         return jnp.where(events.table.value < 0, jnp.asarray(events.table.constant, self.dtype), read)

@@ -19,11 +19,6 @@ DEFERRED = {("system", "initialization"), ("simulation", "plotting"), ("analysis
 # Imports inside a function, or for types alone, that close a circle of modules; and why they are there. Patterns stand
 # for several modules.
 CLOSING = {
-    ("lowering/pattern", "lowering/plan"): "types of the plan that caches the patterns",
-    ("modeling/arrays", "modeling/component"): "types of the prototype; components make arrays",
-    ("system/system", "initialization/initialize"): "AcausalSystem.initialize",
-    ("system/system", "initialization/report"): "AcausalSystem.initialization_report",
-    ("initialization/initialize", "initialization/report"): "the text of an error is the report's",
     ("simulation/solution", "simulation/energy_balance"): "the balance of a solution is that of a second run",
     ("learning/*", "learning/estimate"): "an estimate's methods call the modules that read it",
     ("learning/*", "learning/problem"): "a problem makes the estimates that know it",

@@ -18,7 +18,7 @@ from shared_models import attenuator, levers
 from jaxonomy_dae import AcausalCompiler, Component, EqnEnv, der
 from jaxonomy_dae.linear.torn import solve_torn
 from jaxonomy_dae.linear.written_out import solve, solve_dense
-from jaxonomy_dae.structure.tearing import LINKS, Sizes, Tearing, tear
+from jaxonomy_dae.structure.tearing import LINKS, BlockSizes, Tearing, tear
 
 # --- the solver of torn blocks ------------------------------------------------------------------------------------
 
@@ -44,7 +44,7 @@ def torn(a, numbers, bounded=True):
     """The tearing that a compiler chooses for the values in `a`; `numbers` tells which entries are not parameters."""
     contains = [frozenset(np.flatnonzero(row).tolist()) for row in a]
     places = [(e, u) for e, row in enumerate(contains) for u in sorted(row)]
-    sizes = Sizes({p: np.abs(a[p])[None] for p in places}, frozenset(p for p in places if numbers[p]))
+    sizes = BlockSizes({p: np.abs(a[p])[None] for p in places}, frozenset(p for p in places if numbers[p]))
     return tear(contains, contains, sizes if bounded else None)
 
 
