@@ -36,7 +36,10 @@ class Point:
 
 @dataclasses.dataclass(frozen=True)
 class Group:
-    """n instances of one template: slot k of instance i is factor[i, k]·quantity[i, k]."""
+    """n instances of one template: slot k of instance i is factor[i, k]·quantity[i, k].
+
+    Numbers that are not finite are returned without a warning: those who ask for them name the equation.
+    """
 
     template: AbstractTemplate
     equation: np.ndarray  # (n,): the numbers of the equations
@@ -56,23 +59,25 @@ class Group:
         """The parameters and the coefficients of the template, each (n,)."""
         return list(at.parameters[self.parameter].T), list(self.coefficient.T)
 
+    @np.errstate(all="ignore")
     def residual(self, at: Point) -> Float[np.ndarray, " n"]:
         """The residuals."""
-        with np.errstate(all="ignore"):
-            out = self.template.residual(self.slots(at.values), *self.numbers(at), at.t, at.networks, backend="numpy")
+        out = self.template.residual(self.slots(at.values), *self.numbers(at), at.t, at.networks, backend="numpy")
         return np.broadcast_to(np.asarray(out, float), (len(self),))
 
+    @np.errstate(all="ignore")
     def partials(self, at: Point) -> Float[np.ndarray, "n slots"]:
         """∂(residual)/∂(quantity), by slots."""
         return self._stacked(self._of_slots(self.slots(at.values), at)) * self.factor
 
+    @np.errstate(all="ignore")
     def partial_errors(self, at: Point, errors: np.ndarray) -> Float[np.ndarray, "n slots"]:
         """Bounds of the errors of these partial derivatives, given those of all quantities, (quantities + 1,)."""
         of_slots = [np.abs(e) for e in self.slots(errors)]
-        with np.errstate(all="ignore"):
-            out = self.template.partial_errors(self.slots(at.values), of_slots, *self.numbers(at), at.t, at.networks)
+        out = self.template.partial_errors(self.slots(at.values), of_slots, *self.numbers(at), at.t, at.networks)
         return self._stacked(out) * np.abs(self.factor)
 
+    @np.errstate(all="ignore")
     def partials_along(self, at: Point, move: np.ndarray) -> Float[np.ndarray, "n slots"]:
         """The derivatives of these partial derivatives where all quantities move by `move`, (quantities + 1,): what
         moves so makes them the partial derivatives of the residual's time derivative."""
@@ -81,8 +86,7 @@ class Group:
 
         def partials(moved: Sequence[np.ndarray]) -> tuple:
             slots = [there[place[s]] if s in place else moved[place[s[0], s[1] - 1]] for s in derivative.slots]
-            with np.errstate(all="ignore"):
-                return derivative.partial_values(slots, *self.numbers(at), at.t, at.networks, backend="numpy")
+            return derivative.partial_values(slots, *self.numbers(at), at.t, at.networks, backend="numpy")
 
         moving = partials(self.slots(move))
         still = partials([np.zeros(len(self))] * len(there))  # what changes with time alone
@@ -92,23 +96,20 @@ class Group:
                 out[:, place[slot]] = np.asarray(a, float) - np.asarray(b, float)
         return out * self.factor
 
+    @np.errstate(all="ignore")
     def terms(self, at: Point) -> Float[np.ndarray, "n terms"]:
         """The terms that the residuals are sums of; none where partial derivatives show them all."""
-        with np.errstate(all="ignore"):
-            found = self.template.term_values(self.slots(at.values), *self.numbers(at), at.t)
+        found = self.template.term_values(self.slots(at.values), *self.numbers(at), at.t)
         return np.array([np.broadcast_to(v, (len(self),)) for v in found], float).reshape(-1, len(self)).T
 
+    @np.errstate(all="ignore")
     def solved(self, slot: int, at: Point) -> Float[np.ndarray, " n"]:
         """The quantities in a slot for which the residuals, affine in it, are zero."""
-        with np.errstate(all="ignore"):
-            out = self.template.solve(
-                slot, self.slots(at.values), *self.numbers(at), at.t, at.networks, backend="numpy"
-            )
-            return np.broadcast_to(np.asarray(out, float), (len(self),)) / self.factor[:, slot]
+        out = self.template.solve(slot, self.slots(at.values), *self.numbers(at), at.t, at.networks, backend="numpy")
+        return np.broadcast_to(np.asarray(out, float), (len(self),)) / self.factor[:, slot]
 
     def _of_slots(self, slots: list[np.ndarray], at: Point) -> Sequence[Any]:
-        with np.errstate(all="ignore"):
-            return self.template.partial_values(slots, *self.numbers(at), at.t, at.networks, backend="numpy")
+        return self.template.partial_values(slots, *self.numbers(at), at.t, at.networks, backend="numpy")
 
     def _stacked(self, by_slot: Sequence[Any]) -> np.ndarray:
         columns = [np.broadcast_to(np.asarray(v, float), (len(self),)) for v in by_slot]

@@ -123,7 +123,7 @@ class AcausalSystem(eqx.Module):
         changed = self.parameters.replaced(values)
         return eqx.tree_at(lambda s: (s.parameters, s.typical_sizes), self, (changed, self._sizes_at(changed)))
 
-    def _sizes_at(self, parameters: Parameters) -> Float[Array, " quantities"]:
+    def _sizes_at(self, parameters: Parameters) -> Float[Array, "*batch quantities"]:
         """Typical sizes at other parameter values; the present ones where these are not known, or a batch."""
         known, plan = parameters.known, self.plan
         if known is None or isinstance(self.typical_sizes, Tracer):
