@@ -59,8 +59,9 @@ def judge_apart(*arguments: str) -> list[list[int]]:
 
 @pytest.mark.slow
 def test_some_of_each_family():
-    counts = judge_apart("--count", "3", "--seed", "400", "--moving", "3")
-    assert len(counts) == len(FAMILIES)
+    families = [name for name in FAMILIES if name not in OWN]
+    counts = judge_apart("--family", ",".join(families), "--count", "3", "--seed", "400", "--moving", "3")
+    assert len(counts) == len(families)
     assert all(right + refused == 3 and not any(others) for right, refused, *others in counts)
     assert sum(row[0] for row in counts) >= 15  # most models are well posed
 
