@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-# Diffrax has no code of its own for this. `breakdown` is none of ours otherwise; `nonlinear_divergence` is what an event
-# that writes a value that is not finite ends with, too, and such a run was made once more with an implicit solver.
+# Diffrax has no code of its own for this. `breakdown` means nothing else here; an event that writes a value that is not
+# finite ends with `nonlinear_divergence`, too, and its run was made once more with an implicit solver.
 STIFF: Any = diffrax.RESULTS.breakdown
 BOUNDARY = 0.9 * 3.5  # of Tsit5's stability region along the negative real axis is at −3.5
 PATIENCE = 15  # limited steps in a row
