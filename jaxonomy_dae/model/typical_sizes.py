@@ -9,7 +9,7 @@ from .natural_sizes import are_told, natural_sizes
 from .quantities import QuantityMap, declared_scale
 from .tables import FlatModel
 
-LIMIT = 600  # quantities up to which sizes are looked for
+LIMIT = 600  # quantities up to which sizes are looked for; beyond, those that are not declared are 1
 DECADES = 30  # that they may span: single precision has 38
 
 
@@ -33,7 +33,8 @@ def unrounded_sizes(flat: FlatModel, variables: QuantityMap, extended: Extended)
 
 def _unrounded(flat: FlatModel, variables: QuantityMap, extended: Extended, parameters: np.ndarray) -> np.ndarray:
     if extended.quantities.n_unknown > LIMIT:
-        return np.ones(extended.quantities.n)
+        declared = declared_scale(flat, variables, extended)
+        return np.where(declared == 0.0, 1.0, np.abs(declared))
     return _balanced(extended, parameters, _declared_or_started(flat, variables, extended, parameters))
 
 
