@@ -11,6 +11,7 @@ import hashlib
 import importlib
 import json
 import os
+import resource
 import subprocess
 import sys
 import time
@@ -101,6 +102,9 @@ def _digits() -> str:
 
 def main() -> None:
     family = importlib.import_module(f".{sys.argv[1]}", __package__)
+    # The limit of processor time of one model, which a process that judges models has, is not that of all.
+    _, hard = resource.getrlimit(resource.RLIMIT_CPU)
+    resource.setrlimit(resource.RLIMIT_CPU, (hard, hard))
     print(_digits(), flush=True)
     for line in sys.stdin:
         start = time.process_time()

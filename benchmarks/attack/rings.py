@@ -60,7 +60,9 @@ def skeleton(rng: np.random.Generator, n: int) -> Skeleton:
     """A graph on n nodes: paths or trees, each closed to a ring, grounded or twisted; and rungs with unknowns of their
     own."""
     parts = 1 if n < 20 or rng.random() < 0.6 else int(rng.integers(2, 5))
-    cuts = [0, *sorted(rng.choice(np.arange(2, n - 1), parts - 1, replace=False).tolist()), n] if parts > 1 else [0, n]
+    cuts = (
+        [0, *sorted(rng.choice(np.arange(2, n - 1, 2), parts - 1, replace=False).tolist()), n] if parts > 1 else [0, n]
+    )
     path = rng.random() < 0.6
     e: list[dict[int, int]] = []
     left, right, kinds = [], [], []

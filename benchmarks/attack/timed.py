@@ -46,7 +46,8 @@ class Worker:
     def _start(self) -> None:
         context = multiprocessing.get_context("spawn")
         self.connection, inside = context.Pipe()
-        self.process = context.Process(target=serve, args=(inside,), daemon=True)
+        # Some families start processes of their own, which daemons must not; this one ends with its connection.
+        self.process = context.Process(target=serve, args=(inside,))
         self.process.start()
         inside.close()
 
@@ -54,7 +55,7 @@ class Worker:
         try:
             self.connection.send(draw)
             note, outcomes = self.connection.recv()
-            return note, outcomes[0]
+            return note, next((o for o in outcomes if o.kind not in GOOD), outcomes[0])
         except (EOFError, ConnectionError):
             self.process.join()
             code = self.process.exitcode
@@ -77,15 +78,17 @@ def attack(draws: Iterator[Draw], minutes: float, tell: Callable[[str], None]) -
 
     def work() -> None:
         worker = Worker()
-        while time.monotonic() < end:
-            with lock:
-                draw = next(draws)
-            note, outcome = worker.judged(draw)
-            with lock:
-                outcomes[draw.row].append((draw.seed, outcome))
-                if outcome.kind not in GOOD:
-                    tell(f"{outcome.kind}: {draw.row} ({note}): {outcome.text[:600]}\n    {draw.command}")
-        worker.stop()
+        try:
+            while time.monotonic() < end:
+                with lock:
+                    draw = next(draws)
+                note, outcome = worker.judged(draw)
+                with lock:
+                    outcomes[draw.row].append((draw.seed, outcome))
+                    if outcome.kind not in GOOD:
+                        tell(f"{outcome.kind}: {draw.row} ({note}): {outcome.text[:600]}\n    {draw.command}")
+        finally:
+            worker.stop()
 
     threads = [threading.Thread(target=work) for _ in range(PROCESSES)]
     for thread in threads:

@@ -1,9 +1,17 @@
 """Dense least squares that also answers where a matrix leaves directions open."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+
+
+def ridge(dtype: Any) -> float:
+    """What directions that a matrix leaves open are held by, beside rows of size one: far below the rounding of what
+    only such directions feel. A solution in directions of the size σ is off by up to (ridge/σ)² of itself."""
+    return float(jnp.finfo(dtype).eps) ** 0.75
 
 
 def least_squares(matrix: Float[Array, "m n"], right: Float[Array, " m"]) -> Float[Array, " n"]:
@@ -13,8 +21,7 @@ def least_squares(matrix: Float[Array, "m n"], right: Float[Array, " m"]) -> Flo
     largest = jnp.max(jnp.abs(matrix), axis=1, initial=0.0)
     empty = largest < float(jnp.finfo(matrix.dtype).tiny)
     scale = jnp.where(empty, 0, 1 / jnp.where(empty, 1, largest))
-    # Rows that only open directions feel: what they take from the others is far below rounding.
-    ridge = float(jnp.finfo(matrix.dtype).eps) ** 0.75
-    stacked = jnp.concatenate([scale[:, None] * matrix, jnp.asarray(ridge * np.eye(n), matrix.dtype)])
+    held = jnp.asarray(ridge(matrix.dtype) * np.eye(n), matrix.dtype)
+    stacked = jnp.concatenate([scale[:, None] * matrix, held])
     q, r = jnp.linalg.qr(jax.lax.stop_gradient(stacked))
     return jax.scipy.linalg.solve_triangular(r, q[:m].T @ (scale * right))

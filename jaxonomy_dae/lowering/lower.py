@@ -205,6 +205,7 @@ def _digest(
     flat, extended = model.flat, model.extended
     v = flat.variables
     feed(flat.name, mode, v.names, v.is_input, v.fixed, v.nominal, v.bounds, v.default, flat.parameters.names)
+    feed(v.unit)  # guesses of one unit are measured by the largest of them
     for s in v.start.groups:
         feed(s.template.key, s.variable, s.parameter)
     for d in flat.parameters.dependents:

@@ -9,7 +9,7 @@ from .extended import Extended
 from .natural_sizes import are_told, natural_sizes
 from .reduced import ReducedModel
 
-LIMIT = 600  # quantities up to which sizes are looked for
+LIMIT = 600  # quantities up to which sizes are looked for; beyond, those that are not declared are 1
 DECADES = 30  # that they may span: single precision has 38
 
 
@@ -33,7 +33,8 @@ def unrounded_sizes(model: ReducedModel) -> Float[np.ndarray, " quantities"]:
 
 def _unrounded(model: ReducedModel, parameters: np.ndarray) -> np.ndarray:
     if model.extended.quantities.n_unknown > LIMIT:
-        return np.ones(model.extended.quantities.n)
+        declared = declared_scale(model)
+        return np.where(declared == 0.0, 1.0, np.abs(declared))
     return _balanced(model.extended, parameters, _declared_or_started(model, parameters))
 
 

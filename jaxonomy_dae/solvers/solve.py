@@ -13,6 +13,8 @@ from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 
 from ..adjoint.default import default_adjoint
+from ..adjoint.resting import HeldBack, Resting
+from ..adjoint.stored_adjoint import StoredAdjoint
 from ..errors import InitializationError, ModelError, SimulationError
 from ..programs.cache import PROGRAMS, compiled
 from ..programs.staging import is_forwards, is_staged
@@ -201,9 +203,13 @@ def _solve(term, t0, t1, y0, ts, args, tolerances, options, checked=False):
     solver, adjoint, controller, max_steps = options
     check: StartCheck = start_check(FlatProblem(term, y0, args), t0, *tolerances)
     save = diffrax.SubSaveAt(t1=True) if ts is None else diffrax.SubSaveAt(ts=ts)
+    solver = solver if ts is None else right_between_steps(solver)
+    # `StoredAdjoint` does so by itself, where it is differentiated.
+    if not isinstance(adjoint, StoredAdjoint) and Resting.of(term, solver, controller, y0, args, t1 - t0):
+        controller = HeldBack(controller, term, solver)  # pyright: ignore[reportCallIssue]
     run = integrate(
         term,
-        solver if ts is None else right_between_steps(solver),
+        solver,
         t0,
         t1,
         None,

@@ -121,7 +121,9 @@ class AcausalSystem(eqx.Module):
             values are not known, those become not-a-number, and so does all that is computed with them: see `simulate`.
         """
         changed = self.parameters.replaced(values)
-        return eqx.tree_at(lambda s: (s.parameters, s.typical_sizes), self, (changed, self._sizes_at(changed)))
+        system, sizes = eqx.tree_at(lambda s: s.parameters, self, changed), self._sizes_at(changed)
+        # Of one that holds some leaves only, as `partition` makes it, sizes may be None, which `tree_at` does not take.
+        return system if sizes is self.typical_sizes else eqx.tree_at(lambda s: s.typical_sizes, system, sizes)
 
     def _sizes_at(self, parameters: Parameters) -> Float[Array, "*batch quantities"]:
         """Typical sizes at other parameter values; the present ones where these are not known, or a batch."""

@@ -213,3 +213,19 @@ def test_what_cancels_for_some_parameters_only_is_refused(coefficient, p):
     ev = EqnEnv()
     with pytest.raises(StructuralError, match=f"singular for d.p = {p:g}, though not in general"):
         AcausalCompiler(ev, AcausalDiagram().add(Switched(ev)))()
+
+
+def test_rates_that_a_switch_couples_are_refused():
+    """Compiled with the switch on, an equation was replaced by y1 + y2 = 0, which `with_parameters` kept when it was
+    off."""
+
+    class Coupled(Component):
+        def __init__(self, ev):
+            super().__init__(ev, "d")
+            on, y1, y2 = self.parameter("coupled", 1.0), self.variable("y1"), self.variable("y2")
+            rate = sympy.Piecewise((der(y1) - der(y2), on > 0.5), (der(y1), True))
+            self.add_equations(sympy.Eq(rate, -y1), sympy.Eq(der(y2) - der(y1), -y2))
+
+    ev = EqnEnv()
+    with pytest.raises(StructuralError, match="singular for d.coupled = 1, though not in general"):
+        AcausalCompiler(ev, AcausalDiagram().add(Coupled(ev)))()

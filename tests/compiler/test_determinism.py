@@ -13,6 +13,8 @@ from recipes import draw_recipe, names_of, outcome
 from shared_models import ladder
 from test_explained_structure import CASES
 
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der
+
 
 def systems():
     """One system for each kind of lowering: projected, minimal with a row injection, linear blocks, plain."""
@@ -161,3 +163,25 @@ def test_names_order_nothing():
 def test_equal_circuits_of_different_values_have_one_structure():
     assert rc_circuit(R=1.0).plan == rc_circuit(R=2.0).plan
     assert rc_circuit().plan != ladder(stages=1).plan
+
+
+def _with(**given):
+    """Two states and a relation between them, whose guesses cannot all hold."""
+
+    class Part(Component):
+        def __init__(self, ev, name):
+            super().__init__(ev, name)
+            x, y = self.variable("x", start=1.0, **given), self.variable("y", start=2.0, unit="m")
+            z = self.variable("z", start=0.5, fixed=True)
+            self.add_equations(der(x) + x, der(y) + y, z - x - y)
+
+    ev = EqnEnv()
+    return AcausalCompiler(ev, AcausalDiagram().add(Part(ev, "c")))()
+
+
+def test_what_is_read_of_a_plan_tells_plans_apart():
+    """Guesses of one unit are measured by the largest of them: of two models in one process that differed in `unit=`
+    alone, the second one started where the first one would have."""
+    plans = [_with(unit="m").plan, _with(unit="km").plan, _with(unit="m", nominal=10.0).plan]
+    assert len(set(plans)) == len({plan.digest for plan in plans}) == 3
+    assert _with(unit="m").plan == plans[0]

@@ -461,3 +461,31 @@ def test_a_hanging_load_in_equilibrium():
     _, found = system.initialize(initial=initial, solve_for=["s1.length", "s2.length"])
     assert float(found.parameters["s1.length"]) == pytest.approx(1.0, rel=1e-12)
     assert float(found.parameters["s2.length"]) == pytest.approx(2.0, rel=1e-12)
+
+
+class _NearlyTheSame(Component):
+    """u = x + y and v = x + (1 + e)·y, given at the start: ∂y/∂v = 1/e."""
+
+    def __init__(self, ev, name, e):
+        super().__init__(ev, name)
+        x, y = self.variable("x"), self.variable("y")
+        u = self.variable("u", start=1.0, fixed=True)
+        v = self.variable("v", start=self.parameter("v0", 1 + e), fixed=True)
+        e = self.parameter("e", e)
+        self.add_equations(Eq(der(x), -x), Eq(der(y), -y), Eq(u, x + y), Eq(v, x + (1 + e) * y))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("e", [1e-8, 1e-10, 1e-11])
+def test_gradients_of_nearly_redundant_starts_say_so_before_they_lose_digits(e):
+    """At e = 1e-11 they were off by 1.4 % without a word."""
+    system = compiled(_NearlyTheSame(EqnEnv(), "c", e))
+
+    def start(v0):
+        return system.with_parameters({"c.v0": v0}).initialize(throw=False)
+
+    at = system.states.index("c.y")
+    off = abs(float(jax.jit(jax.jacfwd(start))(1 + e)[at]) * e - 1)
+    said = [note for note in system.initialization_report().notes if "ill-conditioned" in note]
+    assert said or off < 1e-4
+    assert e < 1e-9 or not said

@@ -95,3 +95,19 @@ def test_starts_rest_on_them(pressure, flow):
     # p0 − m = k q², q² = c² (m + p0) with k c² = 1: m = 0, q = c √p0.
     found = jax.jit(lambda: system.observe(["b.middle", "b.q"], 0.0, system.initialize()))()
     np.testing.assert_allclose(found, [0.0, flow], rtol=1e-9, atol=1e-9 * pressure)
+
+
+@pytest.mark.parametrize("n", [20, 700])
+def test_declared_sizes_hold_in_models_of_any_size(n):
+    """Of more than 600 unknowns all sizes were 1, so that states of 1e-6 might leave their constraints by all of
+    themselves at an event."""
+
+    class Chain(Component):
+        def __init__(self, ev, name):
+            super().__init__(ev, name)
+            x = self.vector("x", n, nominal=1e-6, start=0.0)
+            self.add_equations(*(Eq(der(a), -a) for a in x))
+
+    system = compiled(Chain(EqnEnv(), "c"))
+    quantities, _ = system.plan.resolve([f"c.x[{k}]" for k in range(n)])
+    assert (np.abs(np.log2(np.asarray(system.typical_sizes)[quantities] / 1e-6)) <= 1).all()

@@ -1,14 +1,15 @@
 """Programs hold no callback that would say why a run failed: whoever called them outside of jit says it."""
 
+import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
 from problems import compiled
-from sympy import Eq
+from sympy import Eq, log
 
-from jaxonomy_dae import Component, EqnEnv, ModelError, SimulationError, der, simulate, sweep
+from jaxonomy_dae import Component, EqnEnv, ModelError, SimulationError, assign, der, pre, simulate, sweep
 from jaxonomy_dae.learning import minimize
 
 TS = jnp.array([0.5, 1.0])
@@ -60,3 +61,19 @@ def test_a_sweep_says_where_and_why(blowup):
     np.testing.assert_allclose(quiet[0], exact[0], rtol=1e-4)
     assert np.isnan(np.asarray(quiet)[1:, 1]).all()
     eqx.filter_jit(lambda v: sweep(blowup, {"c.p": v}, read).values)(values["c.p"])  # inside a program: no error
+
+
+@pytest.mark.long("a run with an event is compiled")
+def test_an_event_that_writes_no_number_is_not_stiffness():
+    """Both ended with one code, so the run was made once more with an implicit solver, and called stiff."""
+
+    class Decay(Component):
+        def __init__(self, ev, name):
+            super().__init__(ev, name)
+            x, n = self.variable("x", start=1.0, fixed=True), self.discrete("n", start=0)
+            self.add_equations(Eq(der(x), -x))
+            self.when(x <= 0.5, assign(n, log(pre(n) - 1)))
+
+    solution = simulate(compiled(Decay(EqnEnv(), "d")), 2.0, throw=False)
+    assert solution.stats["solver"] == "Tsit5" and solution.stats["reason"].startswith("explicit")
+    assert solution.result != diffrax.RESULTS.successful
