@@ -209,6 +209,19 @@ def test_a_thermostat_with_one_level():
         simulate(model(write), 5.0, ts=jnp.array([5.0]))
 
 
+@pytest.mark.slow
+def test_modes_that_contradict_the_other_equations():
+    """u ≥ 0, v ≥ 0, u·v = 0 and u + v = 1 − x: no solution once x is above 1."""
+
+    def write(self, ev):
+        x, u, v = self.variable("x", start=0.0, fixed=True), self.variable("u"), self.variable("v")
+        self.complementary(u, v)
+        self.add_equations(Eq(der(x), 1), Eq(u + v, 1 - x))
+
+    with pytest.raises(SimulationError, match=r"t=1: no mode is consistent there, 'c: when\(.* are true in turn"):
+        simulate(model(write), 3.0, ts=jnp.array([3.0]))
+
+
 @pytest.mark.parametrize("left", [pytest.param("a corner", marks=pytest.mark.slow), "a ramp"])
 def test_a_quantity_that_stays_at_zero_is_there_once(left):
     def write(self, ev):
