@@ -183,8 +183,8 @@ def _stuck(solution: Solution, event: int, t: float, instant: float) -> str:
     if len(names) > 1 and all(revocable[k] for k in range(len(table.names)) if k == event or often[k]):
         return (
             f"the integration stopped at t={t:.6g}: no mode is consistent there, {listed(names)} are true in turn. "
-            "What complementary(…) asks for contradicts the other equations: give what drives a current against a diode "
-            "that blocks, or pulls at what can only push, another way (a small conductance, a spring)"
+            "What complementary(…) asks for contradicts the other equations: give what drives a current against a "
+            "diode that blocks, or pulls at what can only push, another way (a small conductance, a spring)"
         )
     if len(names) > 1:
         return (
