@@ -4,8 +4,7 @@
 
 Of each, at default arguments: seconds of tracing and of XLA, lines of StableHLO, and a run, for the values at one saved
 time, and with the gradient of their sum by all parameters. The trees take turns, each model in a process of its own; of
-all turns the least is shown. Seconds are of the processor, all threads together; those of a run are of the clock, the
-least of several runs.
+all turns the least is shown. Seconds are of the processor, all threads together: other work beside matters little.
 """
 
 import argparse
@@ -33,6 +32,7 @@ from jaxonomy_dae.modeling import Thermal
 from .switching import bank, ladder
 
 HERE = Path(__file__).resolve().parent.parent
+RUNS = 10  # together: the clock of the processor is coarse
 STATES = 20  # of a model, at most, in the sum
 
 
@@ -122,7 +122,7 @@ def spent(function: Callable[[], Any]) -> tuple[float, Any]:
     return time.process_time() - begin, out
 
 
-def measured(name: str) -> dict[str, float]:
+def measured(name: str, kinds: tuple[str, ...]) -> dict[str, float]:
     """What one model costs with the package that is imported."""
     make, t1, options = MODELS[name]
     found = {}
@@ -132,23 +132,25 @@ def measured(name: str) -> dict[str, float]:
         solution = simulate(system, t1, ts=jnp.array([t1]), max_steps=100_000, throw=False, **options)
         return sum(jnp.sum(solution[n]) for n in system.states[:STATES])
 
-    for kind, function in (("value", end), ("gradient", eqx.filter_value_and_grad(end))):
+    functions = {"value": end, "gradient": eqx.filter_value_and_grad(end)}
+    for kind in kinds:
+        function = functions[kind]
         found[f"{kind} trace"], lowered = spent(lambda f=function: eqx.filter_jit(f).lower(system))
         found[f"{kind} lines"] = lowered.as_text().count("\n")
         found[f"{kind} XLA"], compiled = spent(lowered.compile)
-        times = []
-        for _ in range(6):
-            begin = time.perf_counter()
-            jax.block_until_ready(eqx.filter(compiled(system), eqx.is_array))
-            times.append(time.perf_counter() - begin)
-        found[f"{kind} run"] = min(times[1:])
+        jax.block_until_ready(eqx.filter(compiled(system), eqx.is_array))
+        rounds = []
+        for _ in range(5):
+            seconds, _ = spent(lambda c=compiled: [jax.block_until_ready(c(system)) for _ in range(RUNS)])
+            rounds.append(seconds / RUNS)
+        found[f"{kind} run"] = min(rounds)
     return found
 
 
-def turn(tree: Path, name: str) -> dict[str, float]:
+def turn(tree: Path, name: str, values: bool) -> dict[str, float]:
     """What one model costs with the package in `tree`."""
     environment = os.environ | {"PYTHONPATH": f"{tree}{os.pathsep}{HERE}"}
-    command = [sys.executable, "-m", "benchmarks.ordinary", "--one", name]
+    command = [sys.executable, "-m", "benchmarks.ordinary", "--one", name, *(["--values"] if values else [])]
     # From outside of both trees: the directory in which Python starts comes before what PYTHONPATH names.
     done = subprocess.run(command, env=environment, cwd=os.sep, capture_output=True, text=True)
     if done.returncode:
@@ -156,19 +158,18 @@ def turn(tree: Path, name: str) -> dict[str, float]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-COLUMNS = ("trace", "XLA", "lines", "run")
-
-
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--beside", type=Path, help="the root of an older tree")
     parser.add_argument("--models", default=";".join(MODELS), help="names, between semicolons; all by default")
     parser.add_argument("--repeat", type=int, default=3, help="turns of each tree")
+    parser.add_argument("--values", action="store_true", help="leave gradients out")
     parser.add_argument("--one", help=argparse.SUPPRESS)
     given = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
+    kinds = ("value",) if given.values else ("value", "gradient")
     if given.one:
-        print(json.dumps(measured(given.one)))
+        print(json.dumps(measured(given.one, kinds)))
         return
     trees = {"now": HERE} if given.beside is None else {"before": given.beside.resolve(), "now": HERE}
     head = "".join(f"{c:>9}" for c in ("trace s", "XLA s", "lines", "run ms"))
@@ -177,13 +178,13 @@ def main():
         turns: dict[str, list[dict[str, float]]] = {which: [] for which in trees}
         for _ in range(given.repeat):
             for which, tree in trees.items():
-                turns[which].append(turn(tree, name))
+                turns[which].append(turn(tree, name, given.values))
         for which, found in turns.items():
             least = {key: min(one[key] for one in found) for key in found[0]}
             cells = [
                 f"{least[f'{kind} trace']:9.2f}{least[f'{kind} XLA']:9.2f}{least[f'{kind} lines']:9.0f}"
                 f"{1e3 * least[f'{kind} run']:9.3f}"
-                for kind in ("value", "gradient")
+                for kind in kinds
             ]
             print(f"{name:<22}{which:<8}{least['build']:8.2f}" + "   ".join(cells), flush=True)
 
