@@ -46,7 +46,8 @@ AHEAD = 1e-3
 # is at rest takes longer. With a tenth, test_hybrid_runs.py::test_nothing_falls_through_a_floor fails; ten times it
 # passes.
 SINKING = 4.0
-# How often relations may turn while time does not go on, beside so often for each. Beyond, they turn back and forth.
+# How often guards may fall while time does not go on, beside so often for each. Beyond, relations turn back and forth,
+# or conditions make each other true without end.
 SLIDES, TURNS = 64, 4
 ALTERNATIVES = 128  # modes that are tried where equations are singular: one of 127 diodes, or any two of 15
 
@@ -114,11 +115,16 @@ def handle(
         is_clock = event < c
         k = jnp.clip(event - c, 0, max(g - 1, 0))
         delay = rate = jnp.zeros_like(t)
+        rose = jnp.zeros((g,), bool)
         if at_start and g:
             rate = arrival.rate[k]
         elif g:
             values = problem.guards(t, state.x, q, args)
-            rate = problem.rates(t, state.x, q, args, before)[1][k]
+            value, rates = problem.rates(t, state.x, q, args, before)
+            rate = rates[k]
+            # What has just risen to zero would be above it but for this event: it falls if the event turns it back. A
+            # relation has an opposite, which falls then.
+            rose = (state.armed == BELOW) & _is_zero(value, rates, arrival) & (rates > 0) & ~relations[c:]
             crossing = -values[k] / jnp.where(rate == 0, 1.0, rate)
             # Where another event has made the guard slow, rounding is all that is left of its value.
             frozen = lax.stop_gradient(crossing)
@@ -137,10 +143,10 @@ def handle(
         moved = jnp.any(x != reached) & ~relations[event]
         approach = jnp.where(instant.caused[k] | at_start, 0.0, rate) if g else rate
         new, after, slow, armed, left, caused, stuck = _following(
-            problem, t, x, new, instant, event, arrival, delay, moved, approach, args
+            problem, t, x, new, instant, event, arrival, delay, moved, approach, rose, args
         )
-        turns = state.turns + relations[event].astype(t.dtype)
-        slides = relations[event] & (turns > SLIDES + TURNS * sum(problem.relations))
+        turns = state.turns + (~is_clock).astype(t.dtype)
+        slides = ~is_clock & (turns > SLIDES + TURNS * g)
         again = jnp.where(slides, event, jnp.where(jnp.any(stuck), c + jnp.argmax(stuck), -1)) if g else jnp.array(-1)
         # What is too fast to be followed back, as a current that a blocked diode stops, has that value at once.
         back = delay - (1.0 - slow) * lax.stop_gradient(delay)
@@ -183,15 +189,26 @@ def handle(
     return instant.state, instant.slope
 
 
-def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, delay, moved, approach, args):
+def _within(rate: Any, arrival: Arrival) -> Any:
+    """The largest distance from zero at which a guard with this rate reaches zero, or has left it, within the window."""
+    return jnp.minimum(jnp.abs(rate) * arrival.window, CLOSE * arrival.size)
+
+
+def _is_zero(value: Any, rate: Any, arrival: Arrival) -> Any:
+    """True for guards that are at zero, or reach it or have left it within the window."""
+    return jnp.abs(value) <= jnp.maximum(rounding(arrival.size), _within(rate, arrival))
+
+
+def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, delay, moved, approach, rose, args):
     """The situation after an event.
 
     `moved` says whether the event wrote states, `approach` how fast its guard fell before, or zero. Where the equations
     are singular with q, as where a switch closes onto a diode that conducts, modes that are chosen by their conditions
     change along with it: to the first ones of `_alternatives` that hold.
 
-    Returns (q, dx/dt, the states whose slope hardly changes during the delay, the sides of the guards, events left,
-    guards that an event made true, guards that are stuck); only q is differentiated.
+    `rose` says which guards had risen to zero before the event. Returns (q, dx/dt, the states whose slope hardly changes
+    during the delay, the sides of the guards, events left, guards that an event made true, guards that are stuck); only
+    q is differentiated.
     """
     c, g = problem.n_clocks, problem.n_guards
     left = instant.left & ~one_hot(event, c + g)
@@ -207,18 +224,10 @@ def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, dela
     band = rounding(arrival.size)
     ahead = AHEAD * arrival.span
 
-    def within(rate):
-        """The largest distance from zero at which a guard with this rate reaches zero, or has left it, within the
-        window."""
-        return jnp.minimum(jnp.abs(rate) * arrival.window, CLOSE * arrival.size)
-
-    def is_zero(value, rate):
-        return jnp.abs(value) <= jnp.maximum(band, within(rate))
-
     def is_flat(value, rate):
         """True for guards at zero whose rate may not take them out of the rounding band: the rate is too small, or was
         so before."""
-        return is_zero(value, rate) & ((jnp.abs(rate) * ahead <= band) | rested)
+        return _is_zero(value, rate, arrival) & ((jnp.abs(rate) * ahead <= band) | rested)
 
     others = jnp.asarray(_alternatives(problem.choices, len(q)))
     conditions = np.array(problem.choice_guards, int)
@@ -239,7 +248,7 @@ def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, dela
         carry = slopes, written(values, k, value), written(rates, k, rate)
         if not problem.choices:
             return k + 1, m, *carry
-        held = (value >= 0) | is_zero(value, rate)
+        held = (value >= 0) | _is_zero(value, rate, arrival)
         holds = jnp.all(jnp.isfinite(own)) & jnp.all(jnp.isfinite(value)) & ((m == 0) | jnp.all(held[conditions]))
         goes_on = holds | (k > 0) | (m == len(others) - 1)
         return k + goes_on.astype(k.dtype), m + (~goes_on).astype(m.dtype), *carry
@@ -254,16 +263,17 @@ def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, dela
     written_q = in_mode(mode, written_q)
     slow = (jnp.abs(earlier - slope) <= STEADY * jnp.abs(slope)).astype(x.dtype)
     (value, at_arrival, _, _), (rate, rate_there, _, rate_ahead) = values, rates
-    reached = at_arrival <= jnp.maximum(band, within(rate_there))
+    reached = at_arrival <= jnp.maximum(band, _within(rate_there, arrival))
     # What was to happen is at zero if it is not farther from it than it was when the instant began; unless it jumped.
     arrived = left[c:] & ~instant.caused & reached
-    zero = is_zero(value, rate) | (arrived & (jnp.abs(value) <= jnp.abs(at_arrival)))
+    zero = _is_zero(value, rate, arrival) | (arrived & (jnp.abs(value) <= jnp.abs(at_arrival)))
+    zero = zero | (here & _is_zero(value + band, rate, arrival))  # one that rested falls where it leaves the band
     # A force that keeps a contact closed leaves a guard of the open contact at zero without a slope: what it does next
     # decides. One that seems to fall by rounding alone is waited for: if it does fall, the next step finds it.
     flat = is_flat(value, rate)
     falling = jnp.where(flat, 0.5 * (rate + rate_ahead), rate)
     true = jnp.where(zero, falling * arrival.span < -band, value < 0)
-    was_armed = ((instant.state.armed > 0) & ~here) | (turns_back & (event >= c))
+    was_armed = ((instant.state.armed > 0) & ~here) | (turns_back & (event >= c)) | (rose & ~here)
     # What this event made true happens next. What was to happen does so, though a state starts anew: unless what was
     # assigned makes its condition false, or it is revocable and undone.
     stands = left[c:] & ~np.array(problem.revocable[c:], bool) & reached

@@ -128,8 +128,9 @@ def _met(problem, dense, t0, t1, y0: HybridState, x1, args, times, values, off, 
     armed = above | (y0.armed == RESTS)
     raised = jnp.where((y0.armed == RESTS) & ~above, band, 0.0)  # what rests falls where it leaves the band
     values = values + raised
-    # One may also reach zero and stay.
-    crossed = armed[:-1] & ((values[1:] < 0) | ((values[1:] == 0) & (values[:-1] > 0)))
+    # One may also reach zero and stay; and what rests may begin below the band, by rounding, and rise.
+    below = (values[1:] < 0) & (above[:-1] | (values[1:] < values[:-1]))
+    crossed = armed[:-1] & (below | ((values[1:] == 0) & (values[:-1] > 0)))
     last = values[-1]
 
     def reaches_zero(rate):

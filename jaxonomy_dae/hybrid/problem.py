@@ -102,7 +102,7 @@ class HybridState(eqx.Module):
     - `span`: how long the steps have been of late; `request`: where the step that was tried should have ended, or
         infinity.
     - `ended`: 1.0 once an event has ended the run; `stuck`: the number of one that happens again and again at one
-        instant, else −1; `turns`: how often relations have turned without time going on.
+        instant, else −1; `turns`: how often guards have fallen without time going on.
     - `count`, `times`, `which`, `rate`: how many events there were, and of the first ones the time, the number of the
         event and how fast its guard fell.
     - `before`, `after`: (x, q) at the times of the first events, on both sides; no rows if they are not asked for.

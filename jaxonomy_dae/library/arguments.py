@@ -40,10 +40,10 @@ def increasing(values: Any, name: str, what: str) -> np.ndarray:
         raise ModelError(f"'{name}': {what} needs a row of at least 2 points; got shape {found.shape}")
     if not (np.diff(found) > 0).all():
         place = int(np.argmin(np.diff(found) > 0))
-        raise ModelError(
-            f"'{name}': {what} must increase, but entry {place + 1} ({found[place + 1]:g}) follows {found[place]:g}: "
-            "sort it"
-        )
+        twice = found[place + 1] == found[place]
+        mend = "part the two points a little, or write a jump as a Piecewise or a Step" if twice else "sort it"
+        found_there = f"entry {place + 1} ({found[place + 1]:g}) follows {found[place]:g}"
+        raise ModelError(f"'{name}': {what} must increase, but {found_there}: {mend}")
     return found
 
 

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..aliases import Inputs, Result, State, Time, Tolerance
-from ..hybrid.solver import STUCK, TOO_MANY
+from ..diagnosis.wording import listed
+from ..hybrid.solver import MOVED, STUCK, TOO_MANY
 from ..lowering.plan import SystemPlan
 from ..solvers.choice_guard import SINGULAR_CHOICE
 from ..solvers.failures import SHOWN, explain_failure, how_it_stopped
@@ -17,7 +18,7 @@ from ..system.system import AcausalSystem
 from .admitted import NOT_ADMITTED, TEXT
 from .event_log import Events
 from .failed_blocks import failed_block
-from .hybrid_problem import CONSISTENT, RESTART
+from .hybrid_problem import CONSISTENT, RESTART, resolution
 from .not_finite import equation_not_finite
 from .preparation import term_of
 from .solution import Solution
@@ -78,7 +79,7 @@ def explain(
     if log is not None and solution.result == TOO_MANY:
         return _too_many_events(solution.events, max_events, float(t))
     if log is not None and solution.result == STUCK:
-        return _stuck(solution, int(log.stuck), float(t))
+        return _stuck(solution, int(log.stuck), float(t), MOVED * float(resolution(t0, t1)))
     written = _written_not_finite(system, x)
     if written:
         return f"the integration stopped at t={float(t):g}: an event gave {written} a value that is not finite" + (
@@ -171,16 +172,32 @@ def _too_many_events(events: Events, max_events: int, t: float) -> str:
     return f"{text}."
 
 
-def _stuck(solution: Solution, event: int, t: float) -> str:
-    """Says why event number `event` happens, or its relation turns, again and again at the instant t."""
+def _stuck(solution: Solution, event: int, t: float, instant: float) -> str:
+    """Says why event number `event` happens, or its relation turns, again and again at the instant t, of that length."""
     table: Any = solution.system.plan.events
     if table.table.relation[event]:
         return _sliding(table.names[event], t)
-    text = f"the integration stopped at t={t:.6g}: '{table.names[event]}' would happen again and again there"
-    times = np.asarray(solution.events.ts)[np.asarray(solution.events.which, int) == event]
-    accumulate = _accumulation(times[:-1])  # the last one may have begun at rest
+    times, which = np.asarray(solution.events.ts), np.asarray(solution.events.which, int)
+    # Where events accumulate, the last ones follow each other as rounding has it.
+    lately = times > t - instant
+    often = np.bincount(which[lately & (which >= 0)], minlength=len(table.names)) > 1
+    names = [name for k, name in enumerate(table.names) if k == event or often[k]]
+    text = f"the integration stopped at t={t:.6g}: {listed(names)} would happen again and again there"
+    accumulate = _accumulation(times[(which == event) & ~lately])
     if accumulate:
         return f"{text}: {accumulate}. {REST}"
+    revocable = np.array(table.table.revocable, bool)
+    if len(names) > 1 and all(revocable[k] for k in range(len(table.names)) if k == event or often[k]):
+        return (
+            f"the integration stopped at t={t:.6g}: no mode is consistent there, {listed(names)} are true in turn. "
+            "What complementary(…) asks for contradicts the other equations: give what drives a current against a "
+            "diode that blocks, or pulls at what can only push, another way (a small conductance, a spring)"
+        )
+    if len(names) > 1:
+        return (
+            f"{text}: what one of them writes makes the other one's condition true at once. Let the conditions for "
+            f"switching on and off lie apart (hysteresis). {REST}"
+        )
     return (
         f"{text}: what it writes leaves its condition on the verge of being true, and the equations make it true at "
         f"once. {REST}"

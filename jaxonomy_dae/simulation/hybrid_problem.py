@@ -149,17 +149,22 @@ class SystemProblem(AbstractHybridProblem):
         return jnp.where(consistent, projected, jnp.nan)
 
 
+def resolution(t0: Any, t1: Any) -> Any:
+    """A time that is nothing beside a run from t0 to t1, but more than rounding."""
+    largest = jax.lax.stop_gradient(jnp.maximum(jnp.maximum(jnp.abs(t0), jnp.abs(t1)), t1 - t0))
+    return RESOLUTION * jnp.finfo(largest.dtype).eps * largest
+
+
 def problem_for(
     system: AcausalSystem, t0: Time, t1: Time, implicit: bool, watch: Watch | None, tolerance: Tolerance
 ) -> SystemProblem:
     """The problem of a system that has events, to be run from t0 to t1."""
-    largest = jax.lax.stop_gradient(jnp.maximum(jnp.maximum(jnp.abs(t0), jnp.abs(t1)), t1 - t0))
     events: Any = system.plan.events
     ends = tuple(message is not None for message in events.table.message)
     choices, choice_guards = ((), ()) if system.plan.held is not None else _choices(events.table, events.n_clocks)
     return SystemProblem(
         system=system, watch=watch, tolerance=tolerance, implicit=implicit,
-        resolution=RESOLUTION * jnp.finfo(t1.dtype).eps * largest,
+        resolution=resolution(t0, t1),
         n_clocks=events.n_clocks, n_guards=len(events) - events.n_clocks, ends=ends, immediate=events.table.immediate,
         noted=events.table.noted,
         revocable=events.table.revocable,

@@ -85,7 +85,11 @@ REFUSED = [
     (lambda ev: battery.Pack(ev, "k", 2, 2, SOC, OCV, C="1"), "'k': C is a row of values, such as [1.0, 2.0]; got '1'"),
     (lambda ev: battery.Pack(ev, "k", 2, 2, SOC, [3, 4, 5]), "'k': ocv has 3 entries, soc has 2: they must agree"),
     (lambda ev: battery.Pack(ev, "k", 2, 2, [1, 0], OCV), "'k': soc must increase, but entry 1 (0) follows 1: sort it"),
-    (lambda ev: sig.Table1D(ev, "t", [0, 1, 1], [0, 1, 2]), "'t': x must increase, but entry 2 (1) follows 1: sort it"),
+    (
+        lambda ev: sig.Table1D(ev, "t", [0, 1, 1], [0, 1, 2]),
+        "'t': x must increase, but entry 2 (1) follows 1: part the two points a little, or write a jump as a Piecewise "
+        "or a Step",
+    ),
     (
         lambda ev: sig.Table1D(ev, "t", ["a", "b"], [0, 1]),
         "'t': x must be numbers, in rows of one length; got ['a', 'b']",

@@ -415,8 +415,10 @@ def accumulating(e, floor):
 
 def assert_as_alone(name, together):
     ran, *_ = found(name)
-    assert (together.result, together.count) == (ran.result, ran.count)
-    n = min(int(ran.count), 4 if name.startswith("dropped") else 40)  # of what accumulates
+    accumulates = name.startswith("dropped")
+    # Which bounce is the first one that rounding hides, 1e-12 high, hangs on the steps, and so on the program.
+    assert together.result == ran.result and abs(together.count - ran.count) <= accumulates
+    n = min(int(ran.count), 4 if accumulates else 40)
     np.testing.assert_allclose(together.times[:n], ran.times[:n], rtol=1e-11)
     if ran.result == OKAY:
         np.testing.assert_allclose(together.x, ran.x, rtol=1e-9, atol=1e-12)

@@ -172,6 +172,56 @@ def test_a_ball_does_not_fall_through_the_floor(e, why):
         simulate(dropped().with_parameters({"c.e": e}), 5.0, ts=jnp.array([5.0]))
 
 
+@pytest.mark.slow
+def test_two_tanks_and_one_tap():
+    """1.8 flows into the tank that is empty, and 1 out of each: they take turns at 10 − 9·0.8ᵏ, until both are empty
+    (the water tanks of Johansson, Egerstedt, Lygeros and Sastry 1999, Systems and Control Letters 38)."""
+
+    def write(self, ev):
+        a, b = self.variable("a", start=1.0, fixed=True), self.variable("b", start=1.0, fixed=True)
+        first = self.discrete("first", start=1)
+        self.add_equations(Eq(der(a), 1.8 * first - 1), Eq(der(b), 1.8 * (1 - first) - 1))
+        self.when(a <= 0, assign(first, 1))
+        self.when(b <= 0, assign(first, 0))
+
+    tanks = model(write)
+    solution = simulate(tanks, 9.99, ts=jnp.array([9.99]), **TIGHT)
+    turns = 10 - 9 * 0.8 ** np.arange(31)
+    np.testing.assert_allclose(events(solution), turns, atol=1e-9)
+    np.testing.assert_allclose(solution["c.a"] + solution["c.b"], 0.002, atol=1e-9)
+    both = r"t=10: 'c: when\(a <= 0\)' and 'c: when\(b <= 0\)' would happen again and again there.*accumulate at t=10"
+    with pytest.raises(SimulationError, match=both):
+        simulate(tanks, 30.0, ts=jnp.array([30.0]))
+
+
+@pytest.mark.long("a run is compiled")
+def test_a_thermostat_with_one_level():
+    """Where an event turns back what has just risen to zero, it falls: conditions that make each other true."""
+
+    def write(self, ev):
+        x, on = self.variable("x", start=0.0, fixed=True), self.discrete("on", start=1)
+        self.add_equations(Eq(der(x), on - 0.5))
+        self.when(x > 1, assign(on, 0))
+        self.when(x < 1, assign(on, 1))
+
+    message = r"t=2: 'c: when\(x > 1\)' and 'c: when\(x < 1\)' would happen again and again.*hysteresis"
+    with pytest.raises(SimulationError, match=message):
+        simulate(model(write), 5.0, ts=jnp.array([5.0]))
+
+
+@pytest.mark.slow
+def test_modes_that_contradict_the_other_equations():
+    """u ≥ 0, v ≥ 0, u·v = 0 and u + v = 1 − x: no solution once x is above 1."""
+
+    def write(self, ev):
+        x, u, v = self.variable("x", start=0.0, fixed=True), self.variable("u"), self.variable("v")
+        self.complementary(u, v)
+        self.add_equations(Eq(der(x), 1), Eq(u + v, 1 - x))
+
+    with pytest.raises(SimulationError, match=r"t=1: no mode is consistent there, 'c: when\(.* are true in turn"):
+        simulate(model(write), 3.0, ts=jnp.array([3.0]))
+
+
 @pytest.mark.parametrize("left", [pytest.param("a corner", marks=pytest.mark.slow), "a ramp"])
 def test_a_quantity_that_stays_at_zero_is_there_once(left):
     def write(self, ev):
