@@ -487,6 +487,45 @@ def test_sticking_friction():
     assert abs(row.value - names["MORE"]) < 2 * (row.high - row.low)
 
 
+def test_slider_crank():
+    names = names_after("slider_crank")
+    r, rod, J, m, g = 0.05, 0.15, 6e-3, 1.0, 9.81
+
+    def mu(v):
+        return -np.tanh(v / 0.05) * (0.10 + 0.08 * np.exp(-((v / 0.25) ** 2)) + 0.05 * abs(v))
+
+    def turn(phi, w, press):
+        """The crank's acceleration and (S, N, f); x = r·cos φ + √(l² − r²·sin² φ)."""
+        s, c = np.sin(phi), np.cos(phi)
+        root = np.sqrt(rod**2 - (r * s) ** 2)
+        slope = -r * s - r**2 * s * c / root
+        bend = -r * c - r**2 * (c**2 - s**2) / root - r**4 * (s * c) ** 2 / root**3
+        along, across, friction = root / rod, -r * s / rod, mu(slope * w)
+        lever = r * (c * across - s * along)
+        # J·a = lever·S; m·(slope·a + bend·w²) = f − along·S; N = m·g + press + across·S; f = μ·N
+        a, S = np.linalg.solve(
+            [[J, -lever], [m * slope, along - friction * across]], [0.0, friction * (m * g + press) - m * bend * w**2]
+        )
+        N = m * g + press + across * S
+        return a, (S, N, friction * N)
+
+    for name, (end, press) in names["ENDS"].items():
+        run = names["runs"][name]
+        field = lambda t, y, press=press: (y[1], turn(*y, press)[0])  # noqa: E731
+        y = solve_ivp(field, (0, end), [0.5, 20.0], "DOP853", np.asarray(run.ts), rtol=1e-12, atol=1e-12).y
+        np.testing.assert_allclose(run["crank.phi"], y[0], rtol=0, atol=1e-7)  # 600 steps at rtol 1e-10 of 30 rad
+        forces = np.array([turn(*state, press)[1] for state in y.T])
+        for k, force in enumerate(("crank.S", "crank.N", "crank.f")):
+            np.testing.assert_allclose(run[force], forces[:, k], rtol=0, atol=1e-5)
+    fit = names["fit"]
+    assert abs(fit.chi2 / fit.freedom - 1) < 3 * np.sqrt(2 / fit.freedom)
+    assert abs(fit.holdout_score**2 - 1) < 4 * np.sqrt(2 / 160)
+    assert names["error"] < 0.06 and all(share > 0.85 for share in names["covered"].values())
+    # What the law cannot do, whatever its weights.
+    speeds = np.linspace(-2.0, 2.0, 101)
+    assert (np.asarray(fit.system.neural["crank.mu"](speeds)) * speeds <= 0).all()
+
+
 def test_overflowing_tanks():
     """The runs are those of SciPy, and the note's words hold."""
     measured("tanks/estimation.csv")
