@@ -526,6 +526,45 @@ def test_slider_crank():
     assert (np.asarray(fit.system.neural["crank.mu"](speeds)) * speeds <= 0).all()
 
 
+def test_positioning():
+    """Between ticks and stops the slide's acceleration is constant: runs are parabolas, piece by piece."""
+    names = names_after("positioning")
+    period, end, times = names["PERIOD"], names["END"], np.asarray(names["times"])
+
+    def by_hand(wish, target, m=1.0, level=2.0, breakaway=3.0):
+        """Positions at all times."""
+        s, v, mode, found = 0.0, 0.0, 0, []
+        for k in range(round(end / period)):
+            u, t, left = float(wish(np.array([target - s, v]))[0]), k * period, period
+            inside = times[(times >= t - 1e-9) & (times < t + period - 1e-9)] - t
+            if mode == 0 and abs(u) >= breakaway:
+                mode = int(np.sign(u))
+            done = 0.0
+            while True:
+                a = (u - mode * level) / m if mode else 0.0
+                stops = mode != 0 and v * a < 0 and -v / a < left
+                length = -v / a if stops else left
+                now = inside[(inside >= done - 1e-9) & (inside < done + length - (0 if stops else 1e-9))] - done
+                found += (s + v * now + a * now**2 / 2).tolist()
+                s, v, done, left = s + v * length + a * length**2 / 2, v + a * length, done + length, left - length
+                if not stops:
+                    break
+                v, mode = 0.0, int(np.sign(u)) if abs(u) >= breakaway else 0
+        return np.array([*found, s])
+
+    changed = {"slide.m": 1.2, "slide.level": 2.4, "slide.breakaway": 3.6}
+    for system in (names["plain"], names["trained"]):
+        wish = jax.jit(lambda given, law=system.neural["slide.wish"]: law(given))
+        for d in (0.08, 0.18):
+            run = np.asarray(names["follow"](system, d))
+            np.testing.assert_allclose(run[:, 0], by_hand(wish, d), rtol=0, atol=1e-8)  # parabolas: rounding, amplified
+            run = np.asarray(names["follow"](system.with_parameters(changed), d))
+            np.testing.assert_allclose(run[:, 0], by_hand(wish, d, 1.2, 2.4, 3.6), rtol=0, atol=1e-8)
+    assert names["training"].best_loss < 0.05 * names["training"].history[0]
+    assert np.abs(names["off"]).max() < 3.0 < 20.0 < np.abs(names["short"]).min()
+    assert all(after < 0.3 * before for before, after in names["worst"].values())
+
+
 def test_overflowing_tanks():
     """The runs are those of SciPy, and the note's words hold."""
     measured("tanks/estimation.csv")
