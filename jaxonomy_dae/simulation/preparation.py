@@ -21,7 +21,8 @@ class TracedOnce(eqx.Module):
     """A vector field that is a function of its own in the program around it.
 
     A solver calls the field a dozen times and more. Each call would be traced, differentiated, batched and lowered by
-    itself: in the fit of a pendulum's drag, a quarter of the time before XLA is at work, and of the program's lines. XLA sees the same, since it puts functions where they are called.
+    itself: in the fit of a pendulum's drag, a quarter of the time before XLA is at work, and of the program's lines.
+    XLA sees the same, since it puts functions where they are called.
 
     - `call`: made for one program and let go with it, as are its traces.
     """
