@@ -190,7 +190,7 @@ def handle(
 
 
 def _within(rate: Any, arrival: Arrival) -> Any:
-    """The largest distance from zero at which a guard with this rate reaches zero, or has left it, within the window."""
+    """How far from zero a guard with this rate may be that reaches zero, or has left it, within the window."""
     return jnp.minimum(jnp.abs(rate) * arrival.window, CLOSE * arrival.size)
 
 
@@ -206,9 +206,9 @@ def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, dela
     are singular with q, as where a switch closes onto a diode that conducts, modes that are chosen by their conditions
     change along with it: to the first ones of `_alternatives` that hold.
 
-    `rose` says which guards had risen to zero before the event. Returns (q, dx/dt, the states whose slope hardly changes
-    during the delay, the sides of the guards, events left, guards that an event made true, guards that are stuck); only
-    q is differentiated.
+    `rose` says which guards had risen to zero before the event. Returns (q, dx/dt, the states whose slope hardly
+    changes during the delay, the sides of the guards, events left, guards that an event made true, guards that are
+    stuck); only q is differentiated.
     """
     c, g = problem.n_clocks, problem.n_guards
     left = instant.left & ~one_hot(event, c + g)

@@ -1,5 +1,6 @@
 """What a problem asks for, checked against its system: every refusal names what there is instead."""
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -8,9 +9,11 @@ from ..diagnosis.unused_parameters import unused_parameters
 from ..errors import ModelError, nearest
 from ..model.tables import ZERO
 from ..system.system import AcausalSystem
+from .coordinates import Coordinates
 from .filtering import Filter, Innovations, check_model
 from .multiple_shooting import Shooting
 from .program import weights_of
+from .training import Training
 
 METHODS = ("single", "growing")
 
@@ -102,3 +105,29 @@ def checked_method(system: AcausalSystem, given: Any) -> str | Shooting | Filter
             "have no fixed number of degrees of freedom: use method='growing'"
         )
     return given
+
+
+def started(system: AcausalSystem, start: Any) -> AcausalSystem:
+    """The system at whose values a search begins: the problem's, or the one that `start` is."""
+    if not isinstance(start, AcausalSystem):
+        return system
+    merged = start.merged()
+    if merged.plan != system.plan:
+        raise ModelError("start is a system of another model: give one of the same, or values by names")
+    return merged
+
+
+def as_asked(c: Coordinates, freeze: Any, start: Any, bounds: Mapping[str, Any] | None) -> Coordinates:
+    """Coordinates with the values where a search begins, what is held and narrower bounds; arguments as of
+    `Problem.fit`."""
+    values: dict[str, Any] = {}
+    if isinstance(start, Training):
+        known = start.objective.coordinates
+        if known.names != c.names:
+            raise ModelError("start is a training of other unknowns or experiments: train this problem, or give names")
+        c = dataclasses.replace(c, start=known.natural(start.objective.full(start.z)))
+    elif start is not None and not isinstance(start, AcausalSystem):
+        values = dict(start)
+    names = [freeze] if isinstance(freeze, str) else freeze
+    held = dict(names) if isinstance(names, Mapping) else dict.fromkeys(names)
+    return c.bounded(dict(bounds or {})).changed(values, fixed=False).changed(held, fixed=True)

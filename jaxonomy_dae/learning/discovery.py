@@ -74,7 +74,7 @@ class Candidate:
 
     def coefficients(self, level: float = 0.95) -> Table:
         """The coefficients by term, with linear intervals."""
-        factor = self.estimate._quantile(level)
+        factor = self.estimate.quantile(level)
         values = np.asarray(self.law.coefficients, float)
         rows = [
             Row(term, c, c - factor * s, c + factor * s, "", "" if s < abs(c) else "may be zero")

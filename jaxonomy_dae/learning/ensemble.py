@@ -53,7 +53,7 @@ class Ensemble:
         far they disagree, `between`, and part what each knows of itself."""
         bands = [one.band(name, grid, law, along, level) for one in self.kept]
         mean, between, spread = _mixed([b.mean for b in bands], [b.spread for b in bands])
-        factor = self.best._quantile(level)
+        factor = self.best.quantile(level)
         ends = np.stack([b.explored for b in bands])
         explored = np.stack([ends[..., 0].min(axis=0), ends[..., 1].max(axis=0)], axis=-1)
         return Band(
@@ -65,7 +65,7 @@ class Ensemble:
     ) -> Prediction:
         """Any variables, as `Estimate.predict`, with the members' disagreement in the band."""
         found = [one.predict(names, ts, experiment, level) for one in self.kept]
-        factor, parts = self.best._quantile(level), ({}, {}, {}, {})
+        factor, parts = self.best.quantile(level), ({}, {}, {}, {})
         for name in found[0].mean:
             mean, _, spread = _mixed([f.mean[name] for f in found], [f.spread[name] for f in found])
             for part, values in zip(parts, (mean, spread, mean - factor * spread, mean + factor * spread), strict=True):

@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from ..errors import ModelError, nearest
 from ..system.system import AcausalSystem
+from .agreement import log_likelihood, rms_by_name
 from .band import Band, band, explored
 from .descent import Minimum
 from .discovery import Discovery, discover
@@ -18,13 +19,13 @@ from .factors import Factors
 from .figures import plot_correlations, plot_history, plot_residuals, plot_runs
 from .holdout import holdout_score, with_own_starts
 from .identifiability import Identifiability, identifiability, spreads
-from .likelihood import Likelihood
+from .intervals import intervals
 from .objective import Objective
 from .prediction import Prediction, at_samples, prediction
 from .profile import profile
 from .program import with_values
 from .smoothing import followed
-from .table import Row, Table
+from .table import Table
 from .training import Training
 from .whiteness import Whiteness, whiteness
 
@@ -187,8 +188,9 @@ class Estimate:
         narrow."""
         return {label: {n: whiteness(r) for n, r in by.items()} for label, by in self.residuals.items()}
 
-    def _quantile(self, level: float) -> float:
-        """The quantile of the normal distribution, or where noise was estimated, of Student's."""
+    def quantile(self, level: float) -> float:
+        """How many standard deviations an interval goes to each side: of the normal distribution, or where noise was
+        estimated, of Student's."""
         upper = 0.5 * (1 + level)
         if self.objective.evidence.labels:
             return float(scipy.stats.t.ppf(upper, max(self.freedom, 1.0)))
@@ -197,25 +199,7 @@ class Estimate:
     def table(self, level: float = 0.95) -> Table:
         """Parameters and starts with linear intervals, on the coordinates' scale, so those of positive parameters are
         positive; and what reached a bound, is not determined, or was frozen."""
-        c, factor = self.objective.coordinates, self._quantile(level)
-        low, high = c.z_bounds
-        moved, rows = set(np.flatnonzero(self.objective.free)), []
-        scalars = np.array([not name.endswith("]") for name in c.names])  # such as a sensor law's gain
-        for k in np.flatnonzero(~c.is_weight | scalars).tolist():
-            z, spread, note = self.point[k], self.spread[k], ""
-            ends = z - factor * spread, z + factor * spread
-            if k not in moved:
-                note = "frozen" if c.fixed[k] else "held out: fitted to this experiment alone"
-            elif z <= low[k] or z >= high[k]:
-                note = f"bound reached: {c.natural(self.point)[k]:g}"
-            elif spread >= 1:
-                note = "not determined"
-            inside = (-np.inf, np.inf)
-            if np.isfinite(spread):
-                inside = np.clip([c.natural_at(k, e) for e in ends], c.low[k], c.high[k])
-            value = float(c.natural(self.point)[k])
-            rows.append(Row(c.names[k], value, float(inside[0]), float(inside[1]), c.units[k], note))
-        return Table(tuple(rows), level)
+        return intervals(self, level)
 
     def identifiability(self) -> Identifiability:
         """The directions that the data determine, at the values found."""
@@ -257,7 +241,7 @@ class Estimate:
         - `law`: `law(network, u)` at one grid point, a number; default: the network's first output.
         - `along`: what is explored: a variable's name, or a function of a solution; default: the network's inputs.
         """
-        return band(self, name, grid, law, along, self._quantile(level))
+        return band(self, name, grid, law, along, self.quantile(level))
 
     def predict(
         self, names: str | Sequence[str], ts: Any = None, experiment: int | str = 0, level: float = 0.95
@@ -270,7 +254,7 @@ class Estimate:
         - `experiment`: its place or name.
         """
         return prediction(
-            self, [names] if isinstance(names, str) else list(names), ts, experiment, self._quantile(level)
+            self, [names] if isinstance(names, str) else list(names), ts, experiment, self.quantile(level)
         )
 
     def explored(self, name: str, along: str | Callable[[Any], Any] | None = None) -> Float[np.ndarray, "inputs 2"]:
@@ -326,18 +310,13 @@ class Estimate:
 
     def _followed(self, names: str | Sequence[str], experiment: int | str, how: str, steps: int, level: float) -> Any:
         chosen = [names] if isinstance(names, str) else list(names)
-        return followed(self, chosen, experiment, how, steps, self._quantile(level))
+        return followed(self, chosen, experiment, how, steps, self.quantile(level))
 
     @property
     def log_likelihood(self) -> float:
         """ln L of the samples that were fitted, without priors: of models with p coordinates and n samples, that of the
         least 2p − 2 ln L (Akaike) or p ln n − 2 ln L (Schwarz) is to be preferred."""
-        weights, residual = self.minimum.weights, self.minimum.found.residual
-        count = self.objective.stacked.weight[self.objective.rows[0]]
-        none = np.zeros_like(self.minimum.z)
-        cost = dataclasses.replace(weights, precision=none, mean=none).cost(self.minimum.z, residual)
-        logs = 0.0 if isinstance(weights, Likelihood) else float(np.sum(count * np.log(weights.row / np.sqrt(count))))
-        return logs - cost - 0.5 * float(np.sum(count) * np.log(2 * np.pi))
+        return log_likelihood(self)
 
     def discover(self, name: str, terms: Any, *, width: int = 3, most: int = 3) -> Discovery:
         """Closed forms in a network's place: combinations of terms, refitted through the model on the data, with all
@@ -389,20 +368,7 @@ class Estimate:
     def rms(self) -> dict[str, dict[str, float]]:
         """Root mean square errors by experiment and name, in the variables' units, those held out included: of runs, or
         with `Filter` and `Innovations`, of predictions one step ahead."""
-        s, rows = self.objective.stacked, self.objective.rows
-        errors = np.full(s.values.shape, np.nan)
-        errors[rows] = self.minimum.found.residual
-        if not np.isin(np.arange(len(s.labels)), rows[0]).all():
-            free_runs = self.objective.predicted(self.point).outputs - s.values
-            errors = np.where(np.isnan(errors), free_runs, errors)
-        found: dict[str, dict[str, float]] = {}
-        for k, label in enumerate(s.labels):
-            for j, name in enumerate(s.outputs):
-                seen = s.observed[k, :, j]
-                if seen.any():
-                    error = errors[k, :, j][seen]
-                    found.setdefault(label, {})[name] = float(np.sqrt(np.mean(error**2)))
-        return found
+        return rms_by_name(self)
 
     @functools.cached_property
     def holdout_score(self) -> float:

@@ -84,7 +84,7 @@ def plot_runs(estimate: "Estimate", names: Any, axes: Any, level: float) -> np.n
     s, units = estimate.objective.stacked, _units(estimate)
     chosen = _chosen(names, s.outputs, "data of")
     outputs, spread = estimate.at_samples
-    factor = estimate._quantile(level)
+    factor = estimate.quantile(level)
     shown = range(min(len(s.labels), EACH))
     axes = grid_of_axes(axes, len(chosen), len(shown), "a plot of data and runs")
     for row, name in zip(axes, chosen, strict=True):

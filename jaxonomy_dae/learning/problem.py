@@ -1,19 +1,17 @@
 """A problem: a system, data of experiments, and what is to be learned from them."""
 
 import copy
-import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Float
 
-from ..errors import ModelError, SimulationError, nearest
+from ..errors import ModelError, SimulationError
 from ..system.system import AcausalSystem
-from .asked import check_start, checked_method, names_to_train, penalties
+from .asked import as_asked, check_start, checked_method, names_to_train, penalties, started
 from .coordinates import Coordinates, coordinates
 from .data import Data, Stacked, stack
 from .descent import Minimum
@@ -28,7 +26,8 @@ from .holdout import holdout_score
 from .identifiability import Identifiability, identifiability
 from .multiple_shooting import Shooting, shoot
 from .objective import Objective
-from .program import Layout, predict
+from .program import Layout
+from .residuals import residuals
 from .runs import run, why_not
 from .starting_points import starting_points
 from .training import GradientSteps, Training, train
@@ -167,27 +166,9 @@ class Problem:
         `{experiment: {name: array of shape (n,)}}`; NaN where a run fails.
         """
         layout, s = self._layout, self._stacked
-        model = self.system if model is None else model.merged()
         objective = self._objective(s, coordinates(self.system, self.observers, layout, s, self._errors(s)[1]))
-        shared, own = objective.numbers(objective.coordinates.start)
-        shared = shared[len(shared) - len(layout.shared) :]
-        for name, value in (starts or {}).items():
-            value = jnp.asarray(value, shared.dtype)
-            if name in layout.shared:
-                shared = shared.at[layout.shared.index(name)].set(value)
-            elif name in layout.own:
-                own = own.at[:, layout.own.index(name)].set(value)
-            else:
-                raise ModelError(f"the start of '{name}' is not unknown: " + nearest(name, layout.shared + layout.own))
-        plain = dataclasses.replace(layout, parameters=(), modules=(), extra=())
-        observers = self.observers | dict(observe or {})
-        outputs = predict(model, observers, plain, adjoint, shared, own, objective.conditions)
-        sigma = np.where(np.isnan(s.sigma), 1.0, s.sigma)
-        scaled = jnp.where(s.observed, (outputs - s.values) / sigma[:, None, :], 0.0)
-        return {
-            label: {name: scaled[k, :count, j] for j, name in enumerate(s.outputs) if s.observed[k, :, j].any()}
-            for k, (label, count) in enumerate(zip(s.labels, s.counts, strict=True))
-        }
+        model = self.system if model is None else model.merged()
+        return residuals(objective, model, dict(starts or {}), dict(observe or {}), adjoint)
 
     def _objective(self, stacked: Stacked, c: Coordinates) -> Objective:
         given = (self.system, self.observers, self._layout, stacked, c, self.penalties, ~stacked.holdout)
@@ -311,28 +292,9 @@ class Problem:
         return SimulationError(why_not(objective))
 
     def _coordinates(self, stacked: Stacked, freeze: Any, start: Any, bounds: Any) -> Coordinates:
-        system, values = self.system, {}
-        if isinstance(start, AcausalSystem):
-            system = start.merged()
-            if system.plan != self.system.plan:
-                raise ModelError("start is a system of another model: give one of the same, or values by names")
-        elif start is not None and not isinstance(start, Training):
-            values = dict(start)
+        system = started(self.system, start)
         c = coordinates(system, self.observers, self._layout, stacked, self._errors(stacked)[1])
-        if isinstance(start, Training):
-            known = start.objective.coordinates
-            if known.names != c.names:
-                raise ModelError(
-                    "start is a training of other unknowns or experiments: train this problem, or give names"
-                )
-            c = dataclasses.replace(c, start=known.natural(start.objective.full(start.z)))
-        c = c.bounded(dict(bounds or {})).changed(values, fixed=False)
-        held = (
-            dict(freeze)
-            if isinstance(freeze, Mapping)
-            else dict.fromkeys([freeze] if isinstance(freeze, str) else freeze)
-        )
-        return c.changed(held, fixed=True)
+        return as_asked(c, freeze, start, bounds)
 
     def _descend(
         self, objective: Objective, point: np.ndarray, shares: list[float], steps: int, adam: int, rate: float

@@ -173,7 +173,7 @@ def _too_many_events(events: Events, max_events: int, t: float) -> str:
 
 
 def _stuck(solution: Solution, event: int, t: float, instant: float) -> str:
-    """Says why event number `event` happens, or its relation turns, again and again at the instant t, of that length."""
+    """Says why event number `event` happens, or its relation turns, again and again at t, an instant of that length."""
     table: Any = solution.system.plan.events
     if table.table.relation[event]:
         return _sliding(table.names[event], t)

@@ -91,7 +91,7 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
     chosen = options.solver if ts is None else right_between_steps(options.solver)
     tolerance = largest_tolerance(system, controller)
     solver = prepared(system, chosen, implicit, watch, tolerance)
-    term = term_of(system, implicit)
+    term = term_of(system, implicit, forwards=isinstance(options.adjoint, diffrax.ForwardMode))
     # With an implicit solver the controller chooses the first step itself: `dt0=None`.
     own_start = implicit and not isinstance(controller, diffrax.StepTo)
     dt0 = None if own_start else first_step(system, t0, t1, x0, inputs, solver.order(term), controller)

@@ -487,6 +487,84 @@ def test_sticking_friction():
     assert abs(row.value - names["MORE"]) < 2 * (row.high - row.low)
 
 
+def test_slider_crank():
+    names = names_after("slider_crank")
+    r, rod, J, m, g = 0.05, 0.15, 6e-3, 1.0, 9.81
+
+    def mu(v):
+        return -np.tanh(v / 0.05) * (0.10 + 0.08 * np.exp(-((v / 0.25) ** 2)) + 0.05 * abs(v))
+
+    def turn(phi, w, press):
+        """The crank's acceleration and (S, N, f); x = r·cos φ + √(l² − r²·sin² φ)."""
+        s, c = np.sin(phi), np.cos(phi)
+        root = np.sqrt(rod**2 - (r * s) ** 2)
+        slope = -r * s - r**2 * s * c / root
+        bend = -r * c - r**2 * (c**2 - s**2) / root - r**4 * (s * c) ** 2 / root**3
+        along, across, friction = root / rod, -r * s / rod, mu(slope * w)
+        lever = r * (c * across - s * along)
+        # J·a = lever·S; m·(slope·a + bend·w²) = f − along·S; N = m·g + press + across·S; f = μ·N
+        a, S = np.linalg.solve(
+            [[J, -lever], [m * slope, along - friction * across]], [0.0, friction * (m * g + press) - m * bend * w**2]
+        )
+        N = m * g + press + across * S
+        return a, (S, N, friction * N)
+
+    for name, (end, press) in names["ENDS"].items():
+        run = names["runs"][name]
+        field = lambda t, y, press=press: (y[1], turn(*y, press)[0])  # noqa: E731
+        y = solve_ivp(field, (0, end), [0.5, 20.0], "DOP853", np.asarray(run.ts), rtol=1e-12, atol=1e-12).y
+        np.testing.assert_allclose(run["crank.phi"], y[0], rtol=0, atol=1e-7)  # 600 steps at rtol 1e-10 of 30 rad
+        forces = np.array([turn(*state, press)[1] for state in y.T])
+        for k, force in enumerate(("crank.S", "crank.N", "crank.f")):
+            np.testing.assert_allclose(run[force], forces[:, k], rtol=0, atol=1e-5)
+    fit = names["fit"]
+    assert abs(fit.chi2 / fit.freedom - 1) < 3 * np.sqrt(2 / fit.freedom)
+    assert abs(fit.holdout_score**2 - 1) < 4 * np.sqrt(2 / 160)
+    assert names["error"] < 0.06 and all(share > 0.85 for share in names["covered"].values())
+    # What the law cannot do, whatever its weights.
+    speeds = np.linspace(-2.0, 2.0, 101)
+    assert (np.asarray(fit.system.neural["crank.mu"](speeds)) * speeds <= 0).all()
+
+
+def test_positioning():
+    """Between ticks and stops the slide's acceleration is constant: runs are parabolas, piece by piece."""
+    names = names_after("positioning")
+    period, end, times = names["PERIOD"], names["END"], np.asarray(names["times"])
+
+    def by_hand(wish, target, m=1.0, level=2.0, breakaway=3.0):
+        """Positions at all times."""
+        s, v, mode, found = 0.0, 0.0, 0, []
+        for k in range(round(end / period)):
+            u, t, left = float(wish(np.array([target - s, v]))[0]), k * period, period
+            inside = times[(times >= t - 1e-9) & (times < t + period - 1e-9)] - t
+            if mode == 0 and abs(u) >= breakaway:
+                mode = int(np.sign(u))
+            done = 0.0
+            while True:
+                a = (u - mode * level) / m if mode else 0.0
+                stops = mode != 0 and v * a < 0 and -v / a < left
+                length = -v / a if stops else left
+                now = inside[(inside >= done - 1e-9) & (inside < done + length - (0 if stops else 1e-9))] - done
+                found += (s + v * now + a * now**2 / 2).tolist()
+                s, v, done, left = s + v * length + a * length**2 / 2, v + a * length, done + length, left - length
+                if not stops:
+                    break
+                v, mode = 0.0, int(np.sign(u)) if abs(u) >= breakaway else 0
+        return np.array([*found, s])
+
+    changed = {"slide.m": 1.2, "slide.level": 2.4, "slide.breakaway": 3.6}
+    for system in (names["plain"], names["trained"]):
+        wish = jax.jit(lambda given, law=system.neural["slide.wish"]: law(given))
+        for d in (0.08, 0.18):
+            run = np.asarray(names["follow"](system, d))
+            np.testing.assert_allclose(run[:, 0], by_hand(wish, d), rtol=0, atol=1e-8)  # parabolas: rounding, amplified
+            run = np.asarray(names["follow"](system.with_parameters(changed), d))
+            np.testing.assert_allclose(run[:, 0], by_hand(wish, d, 1.2, 2.4, 3.6), rtol=0, atol=1e-8)
+    assert names["training"].best_loss < 0.05 * names["training"].history[0]
+    assert np.abs(names["off"]).max() < 3.0 < 20.0 < np.abs(names["short"]).min()
+    assert all(after < 0.3 * before for before, after in names["worst"].values())
+
+
 def test_overflowing_tanks():
     """The runs are those of SciPy, and the note's words hold."""
     measured("tanks/estimation.csv")
