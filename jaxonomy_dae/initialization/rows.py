@@ -18,6 +18,7 @@ import scipy.linalg
 import scipy.sparse as sp
 
 from ..errors import InitializationError
+from ..expressions.errors import KNOWN
 from ..judgement.rank import above_errors
 from ..judgement.scaling import balanced, equilibrated
 from ..lowering.plan import SystemPlan
@@ -31,8 +32,6 @@ from ..model.tables import ZERO, Start
 from ..structure.matching import match_in_order
 
 DENSE_LIMIT = 600  # quantities up to which ranks are numerical; above, rows are matched with quantities
-OPEN = 1e-7  # a direction less than this along a quantity leaves it determined
-RANK = 1e-11  # pivots smaller than this, of equilibrated equations, are rounding
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,6 +68,7 @@ class _Generic:
     columns: np.ndarray  # by which the columns were multiplied
     values: np.ndarray  # of parameters
     solve_for: tuple[int, ...]
+    noise: float  # how far, in the Frobenius norm, the equilibrated Jacobian may be off
 
     @property
     def n(self) -> int:
@@ -171,21 +171,26 @@ def _generic(plan: SystemPlan, solve_for: tuple[int, ...]) -> _Generic:
         none = np.zeros(n_parameters)
         size, parameter_size = natural_sizes(extended.groups, extended.n_equations, size, none, by_terms=True)
     jacobian, errors, point, values = generic_jacobian(extended, size, parameter_size)
-    jacobian = above_errors(jacobian[:, :n], errors[:, :n])
+    errors = errors[:, :n]
+    jacobian = above_errors(jacobian[:, :n], errors)
     if solve_for:
         jacobian = sp.hstack([jacobian, sp.csr_array(_parameter_columns(plan, point, values, solve_for))], format="csr")
     # Directions that are open must not look closed because of units. Beyond the limit only the pattern is read.
     scales = balanced if n + len(solve_for) <= DENSE_LIMIT else equilibrated
-    scaled, _, columns = scales(jacobian)
-    return _Generic(scaled, columns, values, solve_for)
+    scaled, rows, columns = scales(jacobian)
+    known: Any = sp.csr_array(sp.diags_array(rows) @ errors @ sp.diags_array(columns[:n]))
+    noise = np.hypot(np.linalg.norm(known.data), KNOWN * np.linalg.norm(scaled.data))
+    return _Generic(scaled, columns, values, solve_for, float(noise))
 
 
-def _pivoted(jacobian: np.ndarray) -> tuple[np.ndarray, int]:
-    """An orthogonal basis whose first `rank` columns span the rows, and that rank."""
+def _pivoted(jacobian: np.ndarray, noise: float) -> tuple[np.ndarray, int, float]:
+    """An orthogonal basis whose first `rank` columns span the rows, that rank, and the least pivot that counts: one
+    that is not below what the matrix may be off by."""
     factors: Any = scipy.linalg.qr(jacobian.T, pivoting=True)
     q, r, _ = factors
     pivots = np.abs(np.diag(r))
-    return q, int((pivots > RANK * max(pivots.max(initial=0.0), 1e-300)).sum())
+    rank = int((pivots > noise).sum())
+    return q, rank, float(pivots[:rank].min(initial=1.0))
 
 
 def _parameter_columns(plan: SystemPlan, point, values, solve_for) -> np.ndarray:
@@ -227,22 +232,33 @@ def _candidates(plan: SystemPlan, guess) -> list[tuple[StartRow, bool]]:
 
 
 class _Directions:
-    """The directions that equations leave open, shape (columns, freedom), closed one by one."""
+    """The directions that equations leave open, shape (columns, freedom), closed one by one.
 
-    def __init__(self, jacobian: np.ndarray):
-        q, rank = _pivoted(jacobian)
+    A basis of them is off by what the equations are off by, over the least pivot so far (a perturbation bound of null
+    spaces; Golub & Van Loan 2013, section 8.6): a row that has less along them than that says nothing about them.
+    """
+
+    def __init__(self, generic: _Generic):
+        q, rank, self._pivot = _pivoted(generic.jacobian.toarray(), generic.noise)
         self.free = q[:, rank:]
+        self._noise = generic.noise
+
+    @property
+    def error(self) -> float:
+        """How far the open directions may be off."""
+        return self._noise / self._pivot
 
     def open(self, gradient: np.ndarray) -> bool:
         """True if a row of this gradient is not determined yet."""
-        return bool(np.linalg.norm(gradient @ self.free) >= OPEN)
+        return bool(np.linalg.norm(gradient @ self.free) > self.error)
 
     def close(self, gradient: np.ndarray) -> bool:
-        """Closes the direction of a row's gradient; returns False if the row is determined already."""
+        """Closes a direction by a row of this gradient; False if it closes none."""
         along = gradient @ self.free
-        size = np.linalg.norm(along)
-        if not size >= OPEN:
+        size = float(np.linalg.norm(along))
+        if not size > self.error:
             return False
+        self._pivot = min(self._pivot, size)
         # A Householder reflection turns the direction into the first column, which is left out.
         along = along / size
         reflector = along.copy()
@@ -253,7 +269,7 @@ class _Directions:
 
 
 def _by_rank(plan: SystemPlan, generic: _Generic, overrides, fixed, guess) -> InitialRows:
-    directions = _Directions(generic.jacobian.toarray())
+    directions = _Directions(generic)
     kept, independent, dropped, settled = [], [], [], []
     alone = [not directions.open(generic.row(row)) for row in (*overrides, *fixed)]  # whatever is given
     for row, follows in zip((*overrides, *fixed), alone, strict=True):
@@ -364,12 +380,12 @@ def _check_count(
             f"Leave {'it' if len(given) == 1 else 'them'} out{others}."
         )
     left = np.linalg.norm(directions.free[generic.n :], axis=1)
-    undetermined = [w for w, size in zip(wanted, left, strict=True) if size >= OPEN]
+    undetermined = [w for w, size in zip(wanted, left, strict=True) if size > directions.error]
     if undetermined:
         missing = directions.free.shape[1]
         moving = np.linalg.norm(directions.free[: generic.n], axis=1)
         pinned = {r.quantity for r in kept}
-        free = [q for q in np.flatnonzero(moving >= OPEN).tolist() if q not in pinned]
+        free = [q for q in np.flatnonzero(moving > directions.error).tolist() if q not in pinned]
         candidates = [plan.quantity_name[q] for q in free if plan.is_visible(q)]
         if candidates:
             hint = f"Give {'one' if missing == 1 else missing} of: {_some(candidates)}"

@@ -234,3 +234,27 @@ def test_guesses_that_differ():
         system = compiled(TwoBranches(EqnEnv(), "c", first, second))
         found = system.observe(["c.a"], 0.0, system.initialize())
         assert float(found[0]) == pytest.approx(expected)
+
+
+class NearlyParallel(Component):
+    """u = x + y and v = x + (1 + e)·y, both with fixed starts."""
+
+    def __init__(self, ev, name, e):
+        super().__init__(ev, name)
+        x, y = self.variable("x"), self.variable("y")
+        u = self.variable("u", start=self.parameter("us", 1.0), fixed=True)
+        v = self.variable("v", start=self.parameter("vs", 1.0), fixed=True)
+        self.add_equations(Eq(der(x), -x), Eq(der(y), -y), Eq(u, x + y), Eq(v, x + (1 + e) * y))
+
+
+@pytest.mark.parametrize("e", [1e-4, 1e-8])
+def test_starts_that_are_nearly_parallel_determine_the_states(e):
+    """y = (v − u)/e: neither start follows from the other, though e is a number that all points share."""
+    system = compiled(NearlyParallel(EqnEnv(), "c", e))
+
+    def y(v):
+        return system.with_parameters({"c.vs": v}).initialize()[1]
+
+    value, slope = jax.value_and_grad(y)(1 + e)
+    assert float(value) == pytest.approx(1.0, rel=1e-15 / e)
+    assert float(slope) == pytest.approx(1 / e, rel=1e-15 / e)
