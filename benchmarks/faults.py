@@ -146,7 +146,7 @@ FAULTS = [
         "tests/plants/test_events.py",
     ),
     Fault(
-        "testing.py",
+        "testing/energy.py",
         "<= rtol:",
         "<= 1e3 * rtol:",
         "tests/plants/test_energy.py",
@@ -170,9 +170,9 @@ FAULTS = [
         "tests/kernels/test_program_cache.py",
     ),
     Fault(
-        "model/jacobian.py",
-        "for x in out], axis=-1) * group.factor",
-        "for x in out], axis=-1)",
+        "model/group.py",
+        "return self._stacked(out) * self.factor",
+        "return self._stacked(out)",
         "tests/compiler tests/kernels/test_names.py",
     ),
 ]

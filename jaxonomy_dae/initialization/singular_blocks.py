@@ -203,5 +203,6 @@ def _constraints(plan: SystemPlan, values: BlockValues) -> Iterator[BlockFinding
     singular = not rank.is_regular
     at = tuple((name, float(values.quantities[plan.states[k]])) for name, k in zip(names, states, strict=True))
     yield BlockFinding(
-        float(condition), singular, m, names, tuple(plan.describe(texts[e]) for e in dependent), at, False
-    )
+        float(condition), singular, m, names, tuple(plan.describe(texts[e]) for e in dependent), at, False,
+        undecided=singular and is_undecided(matrix),
+    )  # fmt: skip

@@ -68,7 +68,9 @@ class Group:
     @np.errstate(all="ignore")
     def partials(self, at: Point) -> Float[np.ndarray, "n slots"]:
         """∂(residual)/∂(quantity), by slots."""
-        return self._stacked(self._of_slots(self.slots(at.values), at)) * self.factor
+        slots = self.slots(at.values)
+        out = self.template.partial_values(slots, *self.numbers(at), at.t, at.networks, backend="numpy")
+        return self._stacked(out) * self.factor
 
     @np.errstate(all="ignore")
     def partial_errors(self, at: Point, errors: np.ndarray) -> Float[np.ndarray, "n slots"]:
@@ -107,9 +109,6 @@ class Group:
         """The quantities in a slot for which the residuals, affine in it, are zero."""
         out = self.template.solve(slot, self.slots(at.values), *self.numbers(at), at.t, at.networks, backend="numpy")
         return np.broadcast_to(np.asarray(out, float), (len(self),)) / self.factor[:, slot]
-
-    def _of_slots(self, slots: list[np.ndarray], at: Point) -> Sequence[Any]:
-        return self.template.partial_values(slots, *self.numbers(at), at.t, at.networks, backend="numpy")
 
     def _stacked(self, by_slot: Sequence[Any]) -> np.ndarray:
         columns = [np.broadcast_to(np.asarray(v, float), (len(self),)) for v in by_slot]
