@@ -522,8 +522,8 @@ def test_slider_crank():
     assert abs(fit.holdout_score**2 - 1) < 4 * np.sqrt(2 / 160)
     assert names["error"] < 0.06 and all(share > 0.85 for share in names["covered"].values())
     # What the law cannot do, whatever its weights.
-    speeds = np.linspace(-2.0, 2.0, 101)
-    assert (np.asarray(fit.system.neural["crank.mu"](speeds)) * speeds <= 0).all()
+    speeds = np.linspace(-2.0, 2.0, 101)[:, None]
+    assert (np.asarray(jax.vmap(fit.system.neural["crank.mu"])(speeds)) * speeds <= 0).all()
 
 
 def test_positioning():
