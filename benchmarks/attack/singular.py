@@ -82,7 +82,7 @@ def make(seed: int, roundings: int | None = None) -> Position:
 # --- mechanisms ------------------------------------------------------------------------------------------------------
 
 
-class _Loop(Component):
+class Loop(Component):
     """J·q'' = forces + (∂g/∂q)ᵀ·λ with 0 = g(q) in the plane, the first of q given at the start."""
 
     def __init__(self, ev, name, starts, inertias, closure):
@@ -104,7 +104,7 @@ class _Loop(Component):
 def _loop(rng, number: Number, starts, closure) -> AcausalDiagram:
     ev = EqnEnv()
     inertias = [number(log_uniform(rng, -1, 1)) for _ in starts]
-    return AcausalDiagram().add(_Loop(ev, names(rng, 1)[0], starts, inertias, closure))
+    return AcausalDiagram().add(Loop(ev, names(rng, 1)[0], starts, inertias, closure))
 
 
 def _parallelogram(rng, offset: float, number: Number):

@@ -38,7 +38,8 @@ def test_the_processor_does_not_decide(kernel):
     """OpenBLAS has kernels for each processor, whose results differ in the last digits; those that this processor does
     not have the instructions for end the process."""
     package = Path(jaxonomy_dae.__file__).parents[1]
-    environment = os.environ | {"OPENBLAS_CORETYPE": kernel, "JAX_ENABLE_X64": "1", "PYTHONPATH": str(package)}
+    path = os.pathsep.join(map(str, (package, Path(__file__).parents[2] / "benchmarks")))
+    environment = os.environ | {"OPENBLAS_CORETYPE": kernel, "JAX_ENABLE_X64": "1", "PYTHONPATH": path}
     script = Path(__file__).with_name("verdicts.py")
     done = subprocess.run([sys.executable, str(script)], env=environment, capture_output=True, text=True)
     if done.returncode < 0:

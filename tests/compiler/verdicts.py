@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-import sympy
+from attack.singular import Loop
 from sympy import cos, sin
 
 import jaxonomy_dae.library.planar as pl
@@ -24,27 +24,10 @@ MODES = ("auto", "dummy_derivatives", "projection")
 FOUR = 4 * np.finfo(float).eps
 
 
-class _Loop(Component):
-    """A mechanism of one loop, J·q'' = forces + (∂g/∂q)ᵀ·λ with 0 = g(q) in the plane, the first of q at its start."""
-
-    def __init__(self, ev, name, starts, closure):
-        super().__init__(ev, name)
-        q = []
-        for k, start in enumerate(starts):
-            given = self.parameter(f"start{k}", start)
-            q.append(self.variable(f"q{k}", start=given, fixed=k == 0))
-        speed = [self.variable("w0", start=1.0, fixed=True), *(self.variable(f"w{k}") for k in range(1, len(q)))]
-        multipliers = [self.variable("lx"), self.variable("ly")]
-        g = closure(self, *q)
-        for k, (position, w) in enumerate(zip(q, speed, strict=True)):
-            force = sum(m * sympy.diff(e, position) for m, e in zip(multipliers, g, strict=True))
-            self.add_equations(Eq(der(position), w), Eq((1.0 + 0.1 * k) * der(w), 0.3 - w + force))
-        self.add_equations(*(Eq(e, 0) for e in g))
-
-
 def loop(starts, closure):
     ev = EqnEnv()
-    return AcausalDiagram().add(_Loop(ev, "loop", starts, closure))
+    inertias = [1.0 + 0.1 * k for k in range(len(starts))]
+    return AcausalDiagram().add(Loop(ev, "loop", starts, inertias, closure))
 
 
 def four_bar(start, coupler_start=0.0, rocker_start=None, lengths=(0.8, 2.0, 0.8, 2.0)):
