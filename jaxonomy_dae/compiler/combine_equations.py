@@ -228,21 +228,26 @@ def cancels_elsewhere(
 
     Parameters in `kept`, discrete variables, are as they are given.
     """
-    slopes = [
-        [multiply(w, partial_derivative(e, label)) for w, e in zip(weights, equations, strict=True)] for label in gone
+    place = {label: k for k, label in enumerate(gone)}
+    inside = [
+        (place[label], multiply(w, partial_derivative(e, label)))
+        for w, e in zip(weights, equations, strict=True)
+        for label in sorted(e.leaves & place.keys(), key=place.__getitem__)
     ]
-    graphs = [g for row in slopes for g in row]
+    owner, graphs = [k for k, _ in inside], [graph for _, graph in inside]
     labels = sorted(frozenset().union(*(g.leaves for g in graphs)), key=repr)
     if not any(label[0] == "quantity" or label == TIME_LABEL or of_parameters for label in labels):
         return True
     columns = _far_points(labels, values, kept, of_parameters)
     # Points are exact, but far out 1 + x⁴ − x⁴ is zero: what evaluation loses says nothing either.
-    terms, errors = (
-        np.stack([np.broadcast_to(np.asarray(v, float), (FAR,)) for v in found]).reshape(len(gone), len(equations), FAR)
-        for found in KernelWithErrors(graphs, labels)(columns, [np.zeros(FAR)] * len(columns))
-    )
-    left, size, lost = np.abs(terms.sum(axis=1)), np.abs(terms).sum(axis=1), errors.sum(axis=1)
-    return not (np.isfinite(size + lost).all(axis=0) & (left > CLEARLY * size + lost)).any()
+    left, size, lost = np.zeros((3, len(gone), FAR))
+    for k, value, error in zip(
+        owner, *KernelWithErrors(graphs, labels)(columns, [np.zeros(FAR)] * len(columns)), strict=True
+    ):
+        left[k] += value
+        size[k] += np.abs(value)
+        lost[k] += error
+    return not (np.isfinite(size + lost).all(axis=0) & (np.abs(left) > CLEARLY * size + lost)).any()
 
 
 def _coefficients(graph: Node) -> dict[Hashable, float] | None:

@@ -1,25 +1,98 @@
 """Left null vectors of matrices that are known at sample points.
 
-A square block of the system Jacobian is singular wherever the model is if some w(p) ≠ 0 has wᵀJ(x, p) = 0 for all
-states x. Given the block's entries as graphs and as numbers at several states, w is found from the matrices of all
-states side by side; whether it depends on the parameters p, from their values at other parameters. What counts as zero
-is decided by size relative to the terms that cancel, so no unit and no rounding of coefficients matters.
+A square block of the system Jacobian is singular wherever the model is if some w ≠ 0 has wᵀJ(x) = 0 for all states x:
+w is found from the matrices of several states side by side. What counts as zero is decided by size relative to the
+terms that cancel, so no unit and no rounding of coefficients matters.
 """
 
-from collections.abc import Callable, Sequence
+import dataclasses
+import math
+from collections.abc import Sequence
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 
-from ..expressions.node import ONE, ZERO, Node, Number, constant, divide, linear, multiply, scale
+from ..expressions.node import Number
 from ..judgement.rank import above_errors, rank_of
+from ..judgement.sparse_rank import sparse_rank_of
+from . import elimination
+from .elimination import Row
+from .rounded import Rounded
 
+DENSE = 200  # equations of a block up to which singular values are computed, some 20 ms
 DEFICIENT = 1e-11  # singular values below, of a matrix with rows and columns scaled, are examined
 CANCELLED = 1e-11  # of the terms: a sum this small is zero
 NOTHING = (1e-8, 1e-13)  # weights below are left out, the larger ones if columns cancel without them
-REFINEMENTS = 2
+REFINEMENTS = 2  # each gains the digits that the one before has
 LARGEST_DENOMINATOR = 1000  # of a fraction that a computed weight is taken for
 SIMPLE = 1_000_000  # numerator times denominator: beyond, fractions come as near to any number by chance
+
+
+@dataclasses.dataclass(frozen=True)
+class BlockMatrix:
+    """A block's entries at one point or at several side by side, and bounds of their errors."""
+
+    shape: tuple[int, int]
+    row: np.ndarray
+    column: np.ndarray
+    value: np.ndarray
+    error: np.ndarray
+
+    @classmethod
+    def of(cls, shape: tuple[int, int], entries: Sequence[tuple[np.ndarray, ...]]) -> "BlockMatrix":
+        """From parts (row, column, value, error); what stands at one place is added."""
+        return cls(shape, *(np.concatenate(part) for part in zip(*entries, strict=True)))
+
+    @property
+    def is_finite(self) -> bool:
+        return bool(np.isfinite(self.value).all())
+
+    def beside(self, other: "BlockMatrix") -> "BlockMatrix":
+        """This matrix with another one, of as many rows, to its right."""
+        pairs = ((self.row, other.row), (self.column, other.column + self.shape[1]))
+        entries = [np.concatenate(pair) for pair in (*pairs, (self.value, other.value), (self.error, other.error))]
+        return BlockMatrix((self.shape[0], self.shape[1] + other.shape[1]), *entries)
+
+    def sparse(self) -> tuple[Any, Any]:
+        """The matrix, and the bounds of its errors."""
+        place = (self.row, self.column)
+        values, errors = (sp.coo_array((data, place), shape=self.shape).tocsr() for data in (self.value, self.error))
+        return values, errors
+
+    def rows(self) -> list[Row]:
+        """Its rows, without entries that may be zero."""
+        rows: list[Row] = [{} for _ in range(self.shape[0])]
+        entries = (self.row.tolist(), self.column.tolist(), self.value.tolist(), self.error.tolist())
+        for i, j, value, error in zip(*entries, strict=True):
+            found = Rounded(value, error)
+            rows[i][j] = rows[i][j] + found if j in rows[i] else found
+        return [{j: value for j, value in row.items() if value} for row in rows]
+
+
+def null_vectors(matrix: BlockMatrix) -> list[Row]:
+    """Vectors w with wᵀA = 0 for the matrix A, by number of the row; fewest entries first."""
+    if matrix.shape[0] <= DENSE:
+        return [
+            dict(zip(np.flatnonzero(w).tolist(), w[w != 0].tolist(), strict=True))
+            for w in left_null_vectors(*(part.toarray() for part in matrix.sparse()))
+        ]
+    if matrix.shape[0] == matrix.shape[1] and sparse_rank_of(*matrix.sparse()).is_regular:
+        return []
+    rows = matrix.rows()
+    found = elimination.null_vectors(rows, Rounded(1.0, 0.0))
+    return [{i: weight.value for i, weight in w.items()} for w in found if _cancels_in(w, rows)]
+
+
+def _cancels_in(weights: Row, rows: Sequence[Row]) -> bool:
+    """True if every column of Σ weight·row is a rounding error. An elimination that lost all digits shows no
+    combination."""
+    terms: dict[int, list[float]] = {}
+    for i, weight in weights.items():
+        for c, entry in rows[i].items():
+            terms.setdefault(c, []).append(weight.value * entry.value)
+    return all(abs(math.fsum(found)) <= CANCELLED * sum(map(abs, found)) for found in terms.values())
 
 
 def cancels(weights: np.ndarray, matrix: np.ndarray) -> bool:
@@ -78,68 +151,3 @@ def rational(value: float) -> Number:
     found = Fraction(value).limit_denominator(LARGEST_DENOMINATOR)
     is_simple = abs(found.numerator) * found.denominator <= SIMPLE
     return found if is_simple and abs(float(found) - value) <= 1e-11 * abs(value) else value
-
-
-def weights_in_parameters(
-    graphs: Sequence[Sequence[Node]],
-    values: Callable[[Sequence[Node]], tuple[np.ndarray, np.ndarray]],
-    unit: int,
-) -> list[Node] | None:
-    """w(p) with w[unit] = 1 and wᵀA(p) = 0, in graphs; None if there is none.
-
-    **Arguments:**
-
-    - `graphs`: the entries of A, by rows; their leaves are parameters.
-    - `values`: of graphs, at sample parameters, and bounds of their errors: both of shape (graphs, samples).
-    """
-    m, n = len(graphs), len(graphs[0])
-    numbers, errors = (found.reshape(m, n, -1) for found in values([g for row in graphs for g in row]))
-    if not np.isfinite(numbers).all():
-        return None
-    samples = [left_null_vectors(numbers[:, :, k], errors[:, :, k]) for k in range(numbers.shape[2])]
-    if any(len(found) != 1 or found[0][unit] == 0 for found in samples):
-        return None
-    weights = np.array([found[0] / found[0][unit] for found in samples])
-    if (np.abs(weights - weights[0]) <= 1e-10 * np.abs(weights[0])).all():
-        return [constant(rational(float(w))) for w in weights[0]]
-    return _solved(graphs, numbers, values, unit)
-
-
-def _solved(graphs, numbers: np.ndarray, values, unit: int) -> list[Node] | None:
-    """By elimination: Σ_{i ≠ unit} wᵢ Aᵢⱼ = −A_unit,j, the pivots chosen by size at the first sample."""
-    others = [k for k in range(len(graphs)) if k != unit]
-    # Rows are the equations of this system, one for each column j of A; the last entry is the right-hand side.
-    table = [[graphs[i][j] for i in others] + [scale(-1, graphs[unit][j])] for j in range(len(graphs[0]))]
-    size = np.array([[np.abs(numbers[i, j]) for i in others] + [np.abs(numbers[unit, j])] for j in range(len(table))])
-    order: list[tuple[int, int]] = []
-    free_rows, free_columns = set(range(len(table))), set(range(len(others)))
-    while free_columns:
-        current = values([g for row in table for g in row])[0].reshape(len(table), len(others) + 1, -1)
-        candidates = [
-            (abs(current[r, c, 0]) / max(size[r, :, 0].max(), 1e-300), -r, -c)
-            for r in free_rows
-            for c in free_columns
-            if (np.abs(current[r, c]) > CANCELLED * size[r, c]).all()
-        ]
-        if not candidates:
-            return None
-        _, r, c = max(candidates)
-        r, c = -r, -c
-        order.append((r, c))
-        free_rows.discard(r)
-        free_columns.discard(c)
-        for k in range(len(table)):
-            if k == r or table[k][c] is ZERO:
-                continue
-            factor = divide(table[k][c], table[r][c])
-            ratio = np.abs(current[k, c] / current[r, c])
-            size[k] = size[k] + ratio * size[r]
-            row = [linear([(1, a), (-1, multiply(factor, b))]) for a, b in zip(table[k], table[r], strict=True)]
-            updated, _ = values(row)
-            small = (np.abs(updated) <= CANCELLED * size[k]).all(axis=1)
-            table[k] = [ZERO if s or j == c else g for j, (g, s) in enumerate(zip(row, small, strict=True))]
-    weights: list[Node] = [ZERO] * len(graphs)
-    weights[unit] = ONE
-    for r, c in order:
-        weights[others[c]] = divide(table[r][-1], table[r][c])
-    return weights

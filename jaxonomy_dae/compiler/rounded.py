@@ -39,8 +39,3 @@ class Rounded:
         value = self.value / other.value
         least = abs(other.value) - other.error
         return Rounded(value, (self.error + abs(value) * other.error) / least + EPS * abs(value))
-
-
-def rounded(value: float) -> Rounded:
-    """A number that is given: off by one rounding."""
-    return Rounded(value, EPS * abs(value))

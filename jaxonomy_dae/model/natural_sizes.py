@@ -1,6 +1,6 @@
 """Sizes of quantities and parameters at which all terms of all equations are alike, whatever the units."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,7 +9,7 @@ import scipy.sparse.linalg
 from jaxtyping import Bool, Float
 
 from .extended import ExtendedGroup
-from .group import Point
+from .group import Group, Point
 from .jacobian import generic
 from .tables import ZERO
 
@@ -17,7 +17,9 @@ ROUNDS = 3  # of least squares: entries depend on sizes, and are evaluated anew 
 STEP = 1e-3  # of the logarithm of an argument
 FARTHEST = 100.0  # decades from one that a size may be looked for
 STEEPEST = 8.0  # power that an entry is taken for
-DAMPING = 1e-3  # keeps sizes that nothing tells where they are
+# Keeps sizes that nothing tells where they are. A size at the end of a chain of n links hangs on its beginning with a
+# singular value near 2/n, and of normal equations 1e-12 is left beside rounding.
+DAMPING = 1e-6
 RELUCTANCE = 0.1  # weight of a decade by which a size has moved, beside one by which a term is off
 
 
@@ -29,6 +31,12 @@ class _Seen(NamedTuple):
     equation: np.ndarray
     by_quantity: tuple[np.ndarray, np.ndarray, np.ndarray]
     by_parameter: tuple[np.ndarray, np.ndarray, np.ndarray]
+
+    n_own: int  # of the powers in quantities: entries have one in the quantity to which they belong
+
+    def is_linear(self, is_known: np.ndarray) -> bool:
+        """True if nothing but these powers, and parameters that are known, (parameters,), moves them."""
+        return len(self.by_quantity[0]) == self.n_own and bool(is_known[self.by_parameter[1]].all())
 
     def powers(self, n_quantities: int, n_parameters: int, n_equations: int) -> Any:
         """The powers in quantities, parameters and units of equations, a sparse matrix."""
@@ -64,10 +72,10 @@ def natural_sizes(
     begun = np.log10(np.abs(np.append(quantity, parameter)))
     constants = _constants(groups, parameters)
     for _ in range(ROUNDS):
-        entries = _seen(groups, quantity, parameter, _entries, by_columns=True)
+        entries = _seen(groups, quantity, parameter, _Entries)
         if not len(entries.logarithm):
             break
-        seen = [entries, constants] + ([_seen(groups, quantity, parameter, _terms)] if by_terms else [])
+        seen = [entries, constants] + ([_seen(groups, quantity, parameter, _Terms)] if by_terms else [])
         matrix: Any = sp.vstack([s.powers(n, n_parameters, n_equations) for s in seen], format="csr")
         matrix.data[known[matrix.indices]] = 0.0
         off = np.concatenate([s.logarithm for s in seen])
@@ -75,18 +83,29 @@ def natural_sizes(
             moved = np.log10(np.abs(np.append(quantity, parameter))) - begun
             stay = sp.eye_array(len(moved), matrix.shape[1]) * RELUCTANCE
             matrix, off = sp.vstack([matrix, stay], format="csr"), np.append(off, RELUCTANCE * moved)
-        linalg: Any = scipy.sparse.linalg
-        found = linalg.lsmr(matrix, -off, damp=DAMPING, atol=1e-4, btol=1e-4, maxiter=20 * n)[0]
+        found = _least_squares(matrix, -off)
         quantity, parameter = _moved(quantity, found[:n]), _moved(parameter, found[n : n + n_parameters])
-        if np.abs(found[: n + n_parameters]).max(initial=0.0) < 0.3:
+        if (
+            all(s.is_linear(parameters != 0.0) for s in seen)
+            or np.abs(found[: n + n_parameters]).max(initial=0.0) < 0.3
+        ):
             break
     return quantity, parameter
+
+
+def _least_squares(matrix: Any, right: np.ndarray) -> np.ndarray:
+    """The x of least norm with A·x near b, by normal equations: logarithms need a few digits, of which an iterative
+    method takes as many steps as a chain has links."""
+    normal = (matrix.T @ matrix + DAMPING**2 * sp.eye_array(matrix.shape[1])).tocsc()
+    options = {"SymmetricMode": True}
+    factors = scipy.sparse.linalg.splu(normal, permc_spec="COLAMD", diag_pivot_thresh=0.0, options=options)
+    return factors.solve(matrix.T @ right)
 
 
 def are_told(groups: Sequence[ExtendedGroup], n: int, parameters: Float[np.ndarray, " p"]) -> Bool[np.ndarray, " n"]:
     """True for quantities of whose size an equation says something, shape (n,): it has a slope in them near 1. Of
     exp(x/u) for a small u it has none, so that x's size stays 1 though nothing says so."""
-    entries = _seen(groups, np.ones(n), np.where(parameters == 0.0, 1.0, parameters), _entries, by_columns=True)
+    entries = _seen(groups, np.ones(n), np.where(parameters == 0.0, 1.0, parameters), _Entries)
     out = np.zeros(n, bool)
     out[entries.by_quantity[1]] = True
     return out
@@ -112,20 +131,13 @@ def _constants(groups: Sequence[ExtendedGroup], parameters: np.ndarray) -> _Seen
         values.append(np.log10(there[used]))
         equations.append(group.equation[used])
     none = _joined([])
-    return _Seen(np.concatenate(values), np.concatenate(equations), none, none)
-
-
-_Sizes = Callable[[ExtendedGroup, Point], np.ndarray]
+    return _Seen(np.concatenate(values), np.concatenate(equations), none, none, 0)
 
 
 def _seen(
-    groups: Sequence[ExtendedGroup],
-    quantity: np.ndarray,
-    parameter: np.ndarray,
-    sizes: _Sizes,
-    by_columns: bool = False,
+    groups: Sequence[ExtendedGroup], quantity: np.ndarray, parameter: np.ndarray, of: type["_Entries"] | type["_Terms"]
 ) -> _Seen:
-    """Evaluates `sizes` of the groups at a generic point. With `by_columns`, entries are multiplied by the sizes of the
+    """Evaluates the entries, or the terms, of the groups at a generic point. Entries are multiplied by the sizes of the
     quantities to which they belong."""
     rng = np.random.default_rng(1)
     point, parameters = quantity * generic(rng, quantity.shape), parameter * generic(rng, parameter.shape)
@@ -136,9 +148,11 @@ def _seen(
     for group in groups:
         if group.quantity.shape[1] == 0 or group.template.opaque is not None:
             continue
-        size = sizes(group, Point.of(point, parameters, 0.5))
+        own = _with_arguments_of_its_own(group)
+        arguments = np.append(point, 0.0)[group.quantity], parameters[group.parameter]
+        size = of.sizes(own, *arguments)
         used = (size > 0) & np.isfinite(size)
-        if by_columns:
+        if of is _Entries:
             used &= group.quantity != ZERO
         if not used.any():
             continue
@@ -146,36 +160,74 @@ def _seen(
         place[used] = first + np.arange(used.sum())
         first += int(used.sum())
         logarithm = np.log10(size[used])
-        if by_columns:
+        if of is _Entries:
             column = group.quantity[used]
             logarithm = logarithm + np.log10(np.abs(point[column]))
             powers[0].append((place[used], column, np.ones(len(column))))
         logarithms.append(logarithm)
         equations.append(np.broadcast_to(group.equation[:, None], used.shape)[used])
-        if by_columns and all(group.template.coefficient_is_number(j) for j in range(size.shape[1])):
-            continue
-        for collected, vector, ids in zip(powers, (point, parameters), (group.quantity, group.parameter), strict=True):
-            for j in range(ids.shape[1]):
-                moved = vector.copy()
-                moved[ids[:, j]] *= 1 + STEP
-                after = sizes(group, Point.of(*((moved, parameters) if vector is point else (point, moved)), 0.5))
+        for side, (ids, readers) in enumerate(zip((group.quantity, group.parameter), of.read(group), strict=True)):
+            for owner in _apart(readers, size.shape[1]):
+                moved = list(arguments)
+                moved[side] = arguments[side].copy()
+                moved[side][:, np.unique(owner[owner >= 0])] *= 1 + STEP
                 with np.errstate(all="ignore"):
-                    power = np.log(after / size) / np.log1p(STEP)
-                hit = used & np.isfinite(power) & (np.abs(power) > 1e-6) & (ids[:, j] != ZERO)[:, None]
-                owner = np.broadcast_to(ids[:, j][:, None], used.shape)
-                collected.append((place[hit], owner[hit], np.clip(power[hit], -STEEPEST, STEEPEST)))
-    return _Seen(np.concatenate(logarithms), np.concatenate(equations), _joined(powers[0]), _joined(powers[1]))
+                    power = np.log(of.sizes(own, *moved) / size) / np.log1p(STEP)
+                moving = ids[:, owner]
+                hit = used & np.isfinite(power) & (np.abs(power) > 1e-6) & (owner >= 0) & (moving != ZERO)
+                powers[side].append((place[hit], moving[hit], np.clip(power[hit], -STEEPEST, STEEPEST)))
+    n_own = first if of is _Entries else 0
+    return _Seen(np.concatenate(logarithms), np.concatenate(equations), _joined(powers[0]), _joined(powers[1]), n_own)
+
+
+def _with_arguments_of_its_own(group: ExtendedGroup) -> Group:
+    """The group with a quantity and a parameter for each place in which an instance reads one, by rows: moving one of
+    them moves nothing in other places."""
+    quantities, parameters = (np.arange(ids.size).reshape(ids.shape) for ids in (group.quantity, group.parameter))
+    return Group(group.template, group.equation, quantities, group.factor, parameters, group.coefficient)
+
+
+def _apart(readers: Sequence[frozenset[int]], n: int) -> Iterator[np.ndarray]:
+    """Arguments that can be moved at once, as no two of them are read by the same of n values (Curtis, Powell & Reid
+    1974): for each set of them, the argument that each value reads, (n,), or −1. `readers` are those of each
+    argument."""
+    sets: list[np.ndarray] = []
+    for k, values in enumerate(readers):
+        if not values:
+            continue
+        reading = np.fromiter(values, np.int64)
+        owner = next((owner for owner in sets if (owner[reading] < 0).all()), None)
+        if owner is None:
+            sets.append(owner := np.full(n, -1))
+        owner[reading] = k
+    yield from sets
+
+
+class _Entries:
+    """|∂F_e/∂x_q| for each slot."""
+
+    @staticmethod
+    def sizes(group: Group, quantities: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        return np.abs(group.partials(Point.of(quantities.ravel(), parameters.ravel(), 0.5)))
+
+    @staticmethod
+    def read(group: Group) -> tuple[list[frozenset[int]], list[frozenset[int]]]:
+        return group.template.readers_of_partials()
+
+
+class _Terms:
+    """|term| for each term of F_e."""
+
+    @staticmethod
+    def sizes(group: Group, quantities: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        return np.abs(group.terms(Point.of(quantities.ravel(), parameters.ravel(), 0.5)))
+
+    @staticmethod
+    def read(group: Group) -> tuple[list[frozenset[int]], list[frozenset[int]]]:
+        return group.template.readers_of_terms()
 
 
 def _joined(powers: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     places, arguments, values = zip(*powers, strict=True) if powers else ([], [], [])
     none = np.zeros(0, np.int64)
     return np.concatenate([none, *places]), np.concatenate([none, *arguments]), np.concatenate([np.zeros(0), *values])
-
-
-def _entries(group: ExtendedGroup, at: Point) -> np.ndarray:
-    return np.abs(group.partials(at))
-
-
-def _terms(group: ExtendedGroup, at: Point) -> np.ndarray:
-    return np.abs(group.terms(at))

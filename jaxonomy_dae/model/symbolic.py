@@ -143,10 +143,30 @@ class SymbolicTemplate(AbstractTemplate):
         known = [KNOWN * np.abs(v) for v in given]
         return tuple(self._partials_with_errors([*slots, *given], [*errors, *known])[1])
 
+    @functools.cached_property
+    def _terms(self) -> Sequence[Node]:
+        is_linear = all(self.coefficient_is_number(k) for k in range(len(self.slots)))
+        return [] if is_linear else terms(self.graph)
+
     def term_values(self, slots, parameters, coefficients, t) -> list:
-        if all(self.coefficient_is_number(k) for k in range(len(self.slots))):
+        if not self._terms:
             return []
-        return self._evaluate("terms", lambda: terms(self.graph), (slots, parameters, coefficients, t), "numpy")
+        return self._evaluate("terms", lambda: self._terms, (slots, parameters, coefficients, t), "numpy")
+
+    def readers_of_partials(self) -> tuple[list[frozenset[int]], list[frozenset[int]]]:
+        return self._readers(self.partials)
+
+    def readers_of_terms(self) -> tuple[list[frozenset[int]], list[frozenset[int]]]:
+        return self._readers(self._terms)
+
+    def _readers(self, graphs: Sequence[Node]) -> tuple[list[frozenset[int]], list[frozenset[int]]]:
+        reading: dict[Hashable, set[int]] = {}
+        for k, graph in enumerate(graphs):
+            for label in graph.leaves:
+                reading.setdefault(label, set()).add(k)
+        labels = list(map(slot_label, self.slots)), list(map(parameter_label, range(self.n_parameters)))
+        of_slots, of_parameters = ([frozenset(reading.get(label, ())) for label in side] for side in labels)
+        return of_slots, of_parameters
 
     def solve(self, position: int, slots, parameters, coefficients, t, networks, backend="jax") -> Any:
         def solved() -> list[Node]:

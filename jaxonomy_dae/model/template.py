@@ -60,6 +60,15 @@ class AbstractTemplate(abc.ABC):
         all, in a linear equation."""
         return []
 
+    def readers_of_partials(self) -> tuple[list[frozenset[int]], list[frozenset[int]]]:
+        """For each slot, and for each parameter, the positions of the partial derivatives that depend on it. Here for
+        partial derivatives that are numbers."""
+        return [frozenset()] * len(self.slots), [frozenset()] * self.n_parameters
+
+    def readers_of_terms(self) -> tuple[list[frozenset[int]], list[frozenset[int]]]:
+        """As `readers_of_partials`, of the values of `term_values`."""
+        return [frozenset()] * len(self.slots), [frozenset()] * self.n_parameters
+
     @abc.abstractmethod
     def solve(self, position: int, slots, parameters, coefficients, t, networks, backend="jax") -> Any:
         """The value of the slot at `position` for which the residual, affine in it, is zero; the value given there is

@@ -9,7 +9,6 @@ from .extended import Extended
 from .natural_sizes import are_told, natural_sizes
 from .reduced import ReducedModel
 
-LIMIT = 600  # quantities up to which sizes are looked for; beyond, those that are not declared are 1
 DECADES = 30  # that they may span: single precision has 38
 
 
@@ -32,9 +31,6 @@ def unrounded_sizes(model: ReducedModel) -> Float[np.ndarray, " quantities"]:
 
 
 def _unrounded(model: ReducedModel, parameters: np.ndarray) -> np.ndarray:
-    if model.extended.quantities.n_unknown > LIMIT:
-        declared = declared_scale(model)
-        return np.where(declared == 0.0, 1.0, np.abs(declared))
     return _balanced(model.extended, parameters, _declared_or_started(model, parameters))
 
 
@@ -43,8 +39,6 @@ def error_sizes(model: ReducedModel, parameters: Float[np.ndarray, " parameters"
     the typical ones, except that a start which is rounding itself, as L·sin(π) is, says nothing. Zero where nothing is
     known."""
     extended, declared = model.extended, declared_scale(model)
-    if extended.quantities.n_unknown > LIMIT:
-        return declared
     started = _declared_or_started(model, parameters)
     typical = _balanced(extended, parameters, started)
     if (np.abs(started) > KNOWN * typical.max(initial=0.0))[started != 0.0].all():

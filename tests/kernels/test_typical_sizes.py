@@ -111,3 +111,20 @@ def test_declared_sizes_hold_in_models_of_any_size(n):
     system = compiled(Chain(EqnEnv(), "c"))
     quantities, _ = system.plan.resolve([f"c.x[{k}]" for k in range(n)])
     assert (np.abs(np.log2(np.asarray(system.typical_sizes)[quantities] / 1e-6)) <= 1).all()
+
+
+@pytest.mark.parametrize("n", [20, 700])
+def test_sizes_come_from_data_in_models_of_any_size(n):
+    """Of more than 600 unknowns those that were not declared were 1."""
+
+    class Chain(Component):
+        def __init__(self, ev, name):
+            super().__init__(ev, name)
+            x, tau = self.vector("x", n), self.parameter("tau", 1e3)
+            supply = self.parameter("supply", 1e-6)
+            before = [supply, *x[:-1]]
+            self.add_equations(*(Eq(tau * der(a), b - a) for a, b in zip(x, before, strict=True)))
+
+    system = compiled(Chain(EqnEnv(), "c"))
+    quantities, _ = system.plan.resolve([f"c.x[{k}]" for k in range(n)])
+    assert (np.abs(np.log10(np.asarray(system.typical_sizes)[quantities] / 1e-6)) <= 1).all()

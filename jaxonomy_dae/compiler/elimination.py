@@ -1,4 +1,4 @@
-"""Left null vectors of sparse matrices of fractions, or of numbers with their roundings, by elimination.
+"""Left null vectors of sparse matrices by elimination: of fractions, of numbers with their roundings, of functions.
 
 Coefficients of highest derivatives are mostly small numbers, ±1 in connections and differences. There nothing needs to
 be judged: a row that becomes empty is a combination of others, whatever the size of the block. Rows and columns with
@@ -7,25 +7,31 @@ In other units, coefficients are rounded: a number that may be zero is left out.
 """
 
 import heapq
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 from typing import Any
 
-from .rounded import Rounded
-
-Field = Fraction | Rounded
 Row = dict[int, Any]  # of numbers of one field: Any, as no type says that two are of the same
 
 
-def sparsest_null_vector(rows: Sequence[Row], one: Field = Fraction(1)) -> Row | None:
-    """w ≠ 0 with Σ wᵢ·rowᵢ = 0, by number of the row: of those that the elimination finds, the one with the fewest
-    entries, the first of several. None if the rows are independent. `one` is that of the numbers' field."""
-    empty, operations = _eliminated([dict(row) for row in rows])
+def null_vectors(
+    rows: Sequence[Row], one: Any = Fraction(1), is_weak: Callable[[Any], bool] = lambda value: False
+) -> list[Row]:
+    """Vectors w ≠ 0 with Σ wᵢ·rowᵢ = 0, by number of the row: those that the elimination finds, as many as there are
+    redundant rows, fewest entries first.
+
+    **Arguments:**
+
+    - `rows`: entries other than zero by column. A field is what has +, −, ·, / and is false where it is zero.
+    - `one`: that of the field.
+    - `is_weak`: for numbers by which a division is best avoided.
+    """
+    empty, operations = _eliminated([dict(row) for row in rows], is_weak)
     found = [_combination(row, operations, one) for row in empty]
-    return min(found, key=lambda w: (len(w), sorted(w)), default=None)
+    return sorted(found, key=lambda w: (len(w), sorted(w)))
 
 
-def _eliminated(rows: list[Row]) -> tuple[list[int], list[tuple[int, int, Any]]]:
+def _eliminated(rows: list[Row], is_weak: Callable[[Any], bool]) -> tuple[list[int], list[tuple[int, int, Any]]]:
     """The rows that become empty; and the operations row −= factor·pivot, as (row, pivot, factor), in order."""
     members: dict[int, set[int]] = {}
     for i, row in enumerate(rows):
@@ -43,7 +49,7 @@ def _eliminated(rows: list[Row]) -> tuple[list[int], list[tuple[int, int, Any]]]
         if not pivot:
             empty.append(i)
             continue
-        column = min(pivot, key=lambda c: (len(members[c]), c))
+        column = min(pivot, key=lambda c: (is_weak(pivot[c]), len(members[c]), c))
         for c in pivot:
             members[c].discard(i)
         for k in sorted(members[column]):
@@ -62,7 +68,7 @@ def _eliminated(rows: list[Row]) -> tuple[list[int], list[tuple[int, int, Any]]]
     return sorted(empty), operations
 
 
-def _combination(row: int, operations: Sequence[tuple[int, int, Any]], one: Field) -> Row:
+def _combination(row: int, operations: Sequence[tuple[int, int, Any]], one: Any) -> Row:
     """The weights of the original rows in a reduced row: undoes `operations`, the last one first."""
     weights: Row = {row: one}
     for k, i, factor in reversed(operations):
