@@ -22,7 +22,6 @@ from .elimination import Row
 from .rounded import Rounded
 
 DENSE = 200  # equations of a block up to which singular values are computed, some 20 ms
-DEFICIENT = 1e-11  # singular values below, of a matrix with rows and columns scaled, are examined
 CANCELLED = 1e-11  # of the terms: a sum this small is zero
 NOTHING = (1e-8, 1e-13)  # weights below are left out, the larger ones if columns cancel without them
 REFINEMENTS = 2  # each gains the digits that the one before has
@@ -107,7 +106,7 @@ def left_null_vectors(matrix: np.ndarray, errors: np.ndarray) -> list[np.ndarray
     `errors` are bounds of the errors of A's entries.
     """
     rank = rank_of(matrix, errors)
-    null = rank.u[:, rank.s <= DEFICIENT * max(rank.s[0], 1e-300)].T
+    null = rank.u[:, rank.number :].T
     found = _verified(null, rank.r, above_errors(matrix, rank.errors))
     return sorted(found, key=lambda w: (np.count_nonzero(w), *np.flatnonzero(w).tolist()))
 

@@ -23,8 +23,7 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
 from ..expressions.errors import KNOWN
-from ..judgement.rank import above_errors
-from ..judgement.scaling import balanced
+from ..judgement.rank import above_errors, rank_of
 from ..model.constraint_jacobian import (
     ConstraintEntries,
     constraint_entries,
@@ -43,7 +42,6 @@ from .wording import listed, words
 
 LARGEST = 600  # constraints of a part that is examined
 DEPENDENT = 1e-7  # a singular value of the equilibrated Jacobian: roots of second order are found to half of the digits
-ALWAYS = 1e-12  # the same where it is constant: no point that is found decides
 UNCHANGED = 1e-5  # relative
 MECHANICAL = ("Planar", "Translational", "Rotational")
 SHOWN = 12  # names
@@ -129,12 +127,12 @@ def _of_part(at: ModelAt, entries: ConstraintEntries, rows: np.ndarray) -> list[
     bounds = matrix_of(evaluate_errors(*where, KNOWN * (np.abs(at.point.values[:-1]) + at.error_sizes)))
     if not np.isfinite(matrix).all():
         return []
-    matrix = above_errors(matrix, bounds)  # sin(1e-17) is zero, and no scale may make it one
-    scaled, row_scale, column_scale = balanced(matrix)
-    u, s, vt = np.linalg.svd(scaled.toarray())
-    small = ALWAYS if entries.constant.all() else DEPENDENT
-    rank = int((s > small * max(s[0], 1e-300)).sum())
-    left, right = u[:, rank:], vt[rank:].T
+    rank = rank_of(matrix, bounds)
+    row_scale, column_scale = rank.r, rank.c
+    # Where it is constant, no point that is found decides.
+    number = rank.number if entries.constant.all() else int((rank.s > DEPENDENT * rank.s[0]).sum())
+    left, right = rank.u[:, number:], rank.vt[number:].T
+    matrix = above_errors(matrix, bounds)  # sin(1e-17) is zero
     if not left.shape[1]:
         return []
     changed = np.zeros((left.shape[1], right.shape[1], right.shape[1]))

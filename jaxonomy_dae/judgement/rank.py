@@ -76,6 +76,16 @@ class Rank:
         """True if the rows are independent."""
         return self.uncertainty < 1
 
+    @functools.cached_property
+    def number(self) -> int:
+        """The rank that every matrix within the errors has: no singular value moves by more than ‖N‖ (Weyl 1912)."""
+        m = len(self.s)
+        if self.is_regular:
+            return m
+        noise = self.r[:, None] * self.errors * self.c
+        moved = np.sqrt(noise.sum(axis=0).max(initial=0.0) * noise.sum(axis=1).max(initial=0.0))
+        return int((self.s[: m - 1] > moved + m * EPS * self.s.max(initial=0.0)).sum())
+
 
 def is_undecided(matrix: Float[np.ndarray, "m n"]) -> bool:
     """True if a matrix that is singular within its errors would be regular if its entries were exact to one
