@@ -22,11 +22,11 @@ from ..lowering.plan import SystemPlan
 from ..model.declared import declared_scale, quantity_bounds
 from ..programs.cache import compiled
 from ..system.system import AcausalSystem
+from ..tolerances import ZERO_WITHIN, spacing
 
 PASSES = 4  # of equilibration: the first one takes scales away, the others balance
 # A singular value below SINGULAR·n·eps of the largest one is rounding. n·eps alone is the usual measure for a matrix
 # with exact entries (NumPy's matrix_rank).
-SINGULAR = 1e2
 
 
 class Equilibrium(NamedTuple):
@@ -124,4 +124,4 @@ def open_directions(found: Equilibrium) -> tuple[Float[Array, " k"], Float[Array
 
 def is_open(values: Float[Array, " k"]) -> Bool[Array, " k"]:
     """True for directions that nothing determines: their singular values are zero up to rounding."""
-    return values <= SINGULAR * values.shape[0] * float(jnp.finfo(values.dtype).eps)
+    return values <= ZERO_WITHIN * values.shape[0] * spacing(values.dtype)

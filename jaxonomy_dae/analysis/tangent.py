@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..tolerances import RANK
+
 ALIKE = 0.5  # of the largest pivot: what counts as equally good, so that rounding decides nothing
-SINGULAR = 1e-10  # a pivot, relative to the first one, that counts as rounding: the constraint repeats others
 
 
 class Coordinates(NamedTuple):
@@ -32,7 +33,7 @@ def choose_coordinates(jacobian: Float[np.ndarray, "c n"]) -> Coordinates:
     for _ in range(min(c, n)):
         size = np.abs(left)
         largest = size.max(initial=0.0)
-        if largest <= SINGULAR:
+        if largest <= RANK:  # in units of a gradient: the constraint repeats others
             break
         alike = np.argwhere(size >= ALIKE * largest)
         # The last column, and in it the first row: a choice that rounding does not change.

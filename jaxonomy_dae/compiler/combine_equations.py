@@ -17,15 +17,12 @@ from ..model.provenance import Provenance, Provenances
 from ..model.symbolic import SymbolicTemplate, number_label, parameter_label, slot_label, template_of
 from ..model.tables import ZERO, EquationGroup
 from ..modeling.symbols import TIME_LABEL
-from .null_vectors import CANCELLED
+from ..tolerances import CANCELLED, MEANT_EQUAL, SLIGHT
 
 POINTS = 4  # sample values of the parameters, the first of them those given (see `near`)
 FAR = 64  # points at which a cancellation must hold, too, …
 # … over these powers of ten of quantities and of parameters given: to where branches of conditions turn.
 REACH, REACH_OF_PARAMETERS = 5.0, 2.0
-# Of the terms: what is left of them where they clearly do not cancel, beyond the errors of their evaluation. Weights
-# and coefficients are numbers that cancel to rounding; a branch that is another one leaves a part of order one.
-CLEARLY = 1e-3
 NEARER = 6  # how often sample points come nearer to zero
 
 
@@ -172,7 +169,7 @@ def combine(
         rest = substitute(total, {label: constant(value) for label in cancelled})
         after = samples([rest])[0]
         finite = np.isfinite(before).all(axis=0)
-        same = np.abs(after - before.sum(axis=0)) <= 1e-9 * np.abs(before).sum(axis=0)
+        same = np.abs(after - before.sum(axis=0)) <= MEANT_EQUAL * np.abs(before).sum(axis=0)
         if finite.any() and same[finite].all():
             return rest
     return None
@@ -247,7 +244,7 @@ def cancels_elsewhere(
         left[k] += value
         size[k] += np.abs(value)
         lost[k] += error
-    return not (np.isfinite(size + lost).all(axis=0) & (np.abs(left) > CLEARLY * size + lost)).any()
+    return not (np.isfinite(size + lost).all(axis=0) & (np.abs(left) > SLIGHT * size + lost)).any()
 
 
 def _coefficients(graph: Node) -> dict[Hashable, float] | None:

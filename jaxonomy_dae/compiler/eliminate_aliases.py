@@ -19,9 +19,8 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 from ..model.linear_template import LinearTemplate
 from ..model.provenance import Provenances
 from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, VariableTable
+from ..tolerances import EPS, NOISE
 
-ROUNDING = 1e-15  # of a coefficient as it was written
-EPS = 2.0**-52
 DECADES = 30.0  # that factors span at most: single precision has 38
 SWEEPS = 8  # after which equations of any length are looked at one by one
 
@@ -130,7 +129,7 @@ def _terms_of(groups: Sequence[EquationGroup]) -> tuple[_Terms, int]:
         np.concatenate(none + [g.variable.ravel() for g in groups]),
         np.concatenate(none + [g.order.ravel() for g in groups]),
         coefficient,
-        ROUNDING * np.abs(coefficient),
+        NOISE * EPS * np.abs(coefficient),
     ), int(first[-1])
 
 

@@ -7,12 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..expressions.errors import KNOWN
 from ..model.extended import ExtendedGroup
 from ..model.group import Group, Point
 from ..model.natural_sizes import natural_sizes
 from ..model.tables import ZERO, EquationGroup, equation_offsets
 from ..structure.pantelides import Offsets
+from ..tolerances import KNOWN
 from .combine_equations import quantity_label, somewhere, tried
 from .elimination import Row
 from .null_vectors import BlockMatrix

@@ -17,13 +17,12 @@ import scipy.sparse as sp
 from ..expressions.node import Number
 from ..judgement.rank import above_errors, rank_of
 from ..judgement.sparse_rank import sparse_rank_of
+from ..tolerances import CANCELLED, NO_WEIGHT
 from . import elimination
 from .elimination import Row
 from .rounded import Rounded
 
 DENSE = 200  # equations of a block up to which singular values are computed, some 20 ms
-CANCELLED = 1e-11  # of the terms: a sum this small is zero
-NOTHING = (1e-8, 1e-13)  # weights below are left out, the larger ones if columns cancel without them
 REFINEMENTS = 2  # each gains the digits that the one before has
 LARGEST_DENOMINATOR = 1000  # of a fraction that a computed weight is taken for
 SIMPLE = 1_000_000  # numerator times denominator: beyond, fractions come as near to any number by chance
@@ -125,7 +124,7 @@ def _verified(null: np.ndarray, rows: np.ndarray, matrix: np.ndarray) -> list[np
         chosen.append(int(c))
     found = []
     for w, c in zip(null, chosen, strict=True):
-        candidates = (np.where(np.abs(w) < least, 0.0, w) * rows / rows[c] for least in NOTHING)
+        candidates = (np.where(np.abs(w) < least, 0.0, w) * rows / rows[c] for least in NO_WEIGHT)
         found.append(next((w for w in candidates if cancels(w, matrix)), None))
     return [_refined(w, matrix) for w in found if w is not None]
 
@@ -149,4 +148,4 @@ def rational(value: float) -> Number:
     """The simple fraction that a number rounds, if there is one."""
     found = Fraction(value).limit_denominator(LARGEST_DENOMINATOR)
     is_simple = abs(found.numerator) * found.denominator <= SIMPLE
-    return found if is_simple and abs(float(found) - value) <= 1e-11 * abs(value) else value
+    return found if is_simple and abs(float(found) - value) <= CANCELLED * abs(value) else value

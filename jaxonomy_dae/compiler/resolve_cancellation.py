@@ -15,7 +15,7 @@ import numpy as np
 from ..diagnosis.wording import alternatives, itemised, some
 from ..errors import StructuralError
 from ..expressions.differentiate import partial_derivative
-from ..expressions.errors import KNOWN, KernelWithErrors
+from ..expressions.errors import KernelWithErrors
 from ..expressions.node import Node, constant
 from ..expressions.substitute import substitute
 from ..model.incidence import incidence
@@ -26,6 +26,7 @@ from ..structure.diagonal_blocks import diagonal_blocks
 from ..structure.incidence import Incidence
 from ..structure.matching import maximum_matching
 from ..structure.pantelides import Offsets, reduce_index
+from ..tolerances import KNOWN
 from . import elimination
 from .combine_equations import cancels_elsewhere, combine, graph_of, group_of, near, quantity_label, tried
 from .elimination import Row

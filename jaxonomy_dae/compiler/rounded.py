@@ -6,7 +6,7 @@ it, a number says whether it is zero: 1e-3·3.6·x − 0.0036·x is, and 1e-15·
 
 import dataclasses
 
-EPS = 2.0**-52  # the rounding of one operation in double precision, as a bound
+from ..tolerances import EPS
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

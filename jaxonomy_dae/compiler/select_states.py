@@ -17,7 +17,6 @@ import numpy as np
 
 from ..diagnosis.redundant_constraints import ModelAt, dependent_constraints
 from ..errors import StructuralError
-from ..expressions.errors import KNOWN
 from ..judgement.rank import above_errors, rank_of
 from ..model.consistent_point import initial_point
 from ..model.constraint_jacobian import constraint_entries, evaluate, evaluate_errors, independent_parts
@@ -27,11 +26,11 @@ from ..model.group import Point
 from ..model.reduced import ReducedModel
 from ..model.tables import ZERO, EquationGroup, equation_offsets
 from ..model.typical_sizes import error_sizes, unrounded_sizes
+from ..tolerances import ALIKE, KNOWN
 from .preferences import Merit
 
 POOR_PIVOT = 0.1  # a preferred pivot may be this much smaller than the best one
 POORER_PIVOT = 1e-3  # so much smaller if the better ones would all be of preferred states
-ALIKE = 1e-6  # pivots that differ by less are equal: rounding, and units, do not choose
 
 
 @dataclasses.dataclass(frozen=True)

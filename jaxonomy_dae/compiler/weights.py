@@ -10,11 +10,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ..expressions.node import ONE, ZERO, Node, constant, divide, linear, multiply, number
+from ..tolerances import CANCELLED, EPS
 from . import elimination
 from .null_vectors import rational
-
-EPS = 2.0**-52  # the rounding of one operation in double precision, as a bound
-SAME = 1e-10  # relative difference of the values of a weight that is a number
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -99,5 +97,5 @@ def weights_in_parameters(
 def _simplest(weight: Sampled) -> Node:
     """Its graph, a number where its values are the same."""
     first = float(weight.value[0])
-    is_number = (np.abs(weight.value - first) <= SAME * abs(first)).all()
+    is_number = (np.abs(weight.value - first) <= CANCELLED * abs(first)).all()
     return constant(rational(first)) if is_number else weight.graph

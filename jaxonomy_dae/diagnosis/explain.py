@@ -10,6 +10,7 @@ import numpy as np
 
 from ..model.coefficients import Entries
 from ..model.tables import ZERO, AliasTable, FlatModel, equation_offsets, provenance_of
+from ..tolerances import NO_PART, RANK
 from .wording import DomainWords, listed, words
 
 LARGEST = 400  # equations among which the smallest dependent set is sought
@@ -52,10 +53,10 @@ class Explainer:
             drawn = np.where(np.isnan(here), random.uniform(0.5, 2.0, len(here)), here)
             np.add.at(matrix[i], np.searchsorted(variables, self.entries.variable[inside]), drawn)
         u, singular, _ = np.linalg.svd(matrix, full_matrices=True)
-        rank = int((singular > 1e-10).sum())
+        rank = int((singular > RANK).sum())
         if rank != len(rows) - 1:
             return rows, variables
-        rows = rows[np.abs(u[:, -1]) > 1e-8]
+        rows = rows[np.abs(u[:, -1]) > NO_PART]
         kept = [self.entries.variable[self.start[r] : self.start[r + 1]] for r in rows.tolist()]
         return rows, np.unique(np.concatenate(kept)) if kept else variables[:0]
 

@@ -22,7 +22,6 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
-from ..expressions.errors import KNOWN
 from ..judgement.rank import above_errors, rank_of
 from ..model.constraint_jacobian import (
     ConstraintEntries,
@@ -38,11 +37,10 @@ from ..model.provenance import Provenance
 from ..model.reduced import ReducedModel
 from ..model.tables import ZERO, AliasTable, FlatModel, equation_offsets, provenance_of
 from ..model.typical_sizes import error_sizes
+from ..tolerances import HALF_OF_THE_DIGITS, KNOWN, NO_PART, UNCHANGED
 from .wording import listed, words
 
 LARGEST = 600  # constraints of a part that is examined
-DEPENDENT = 1e-7  # a singular value of the equilibrated Jacobian: roots of second order are found to half of the digits
-UNCHANGED = 1e-5  # relative
 MECHANICAL = ("Planar", "Translational", "Rotational")
 SHOWN = 12  # names
 YIELDS = "or replace one by a part that yields, such as a spring"
@@ -130,7 +128,7 @@ def _of_part(at: ModelAt, entries: ConstraintEntries, rows: np.ndarray) -> list[
     rank = rank_of(matrix, bounds)
     row_scale, column_scale = rank.r, rank.c
     # Where it is constant, no point that is found decides.
-    number = rank.number if entries.constant.all() else int((rank.s > DEPENDENT * rank.s[0]).sum())
+    number = rank.number if entries.constant.all() else int((rank.s > HALF_OF_THE_DIGITS * rank.s[0]).sum())
     left, right = rank.u[:, number:], rank.vt[number:].T
     matrix = above_errors(matrix, bounds)  # sin(1e-17) is zero
     if not left.shape[1]:
@@ -149,7 +147,7 @@ def _of_part(at: ModelAt, entries: ConstraintEntries, rows: np.ndarray) -> list[
     found = []
     for basis, is_redundant in ((left @ still, True), (left @ kept, False)):
         for support in _connected(basis, matrix):
-            count = int(np.linalg.matrix_rank(basis[support], tol=1e-6))
+            count = int(np.linalg.matrix_rank(basis[support], tol=NO_PART))
             weight = row_scale[support, None] * basis[support]
             names, forces = _behind(at, rows[support], weight)
             if names:
@@ -167,7 +165,7 @@ def _unchanged(changed: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray
 
 def _connected(basis: np.ndarray, matrix: np.ndarray) -> list[np.ndarray]:
     """The rows of a basis that are not zero, in sets that share no column of the matrix."""
-    support = np.flatnonzero(np.abs(basis).max(axis=1, initial=0.0) > 1e-6)
+    support = np.flatnonzero(np.abs(basis).max(axis=1, initial=0.0) > NO_PART)
     if not len(support):
         return []
     row, column = np.nonzero(matrix[support])
@@ -270,7 +268,7 @@ def _ties(flat: FlatModel, alias: AliasTable, demand: dict[int, np.ndarray]) -> 
         component, ends = edges[number]
         own = dict(ends)[v]
         passed = -left.pop(v, np.zeros(1)) / own
-        if component and np.abs(passed).max() > 1e-6 * scale:
+        if component and np.abs(passed).max() > NO_PART * scale:
             names.add(component)
         open_[v].clear()
         for other, slope in ends:

@@ -15,9 +15,8 @@ from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel
 from ..structure.dulmage_mendelsohn import dulmage_mendelsohn
 from ..structure.incidence import Incidence, compress
 from ..structure.matching import maximum_matching
+from ..tolerances import MEANT_EQUAL
 from .wording import counted, listed
-
-CLOSE = 1e-9  # numbers that differ by less, relative to their size, are meant to be equal
 
 
 def check_equal_starts(flat: FlatModel, groups: tuple[EquationGroup, ...], alias: AliasTable) -> tuple[str, ...]:
@@ -79,7 +78,7 @@ def check_equal_starts(flat: FlatModel, groups: tuple[EquationGroup, ...], alias
 
 
 def _equal(a: float, b: float) -> bool:
-    return abs(a - b) <= CLOSE * max(abs(a), abs(b))
+    return abs(a - b) <= MEANT_EQUAL * max(abs(a), abs(b))
 
 
 def _check_linear(flat: FlatModel, groups, numbers: dict[tuple[int, int], tuple[int, float]]):
@@ -96,7 +95,7 @@ def _check_linear(flat: FlatModel, groups, numbers: dict[tuple[int, int], tuple[
         inside = group.order < highest
         here = np.where(inside, value[group.variable, np.where(inside, group.order, 0)], np.nan)
         terms = group.coefficient * here
-        wrong = np.abs(terms.sum(axis=1)) > CLOSE * np.abs(terms).max(axis=1)  # False for NaN
+        wrong = np.abs(terms.sum(axis=1)) > MEANT_EQUAL * np.abs(terms).max(axis=1)  # False for NaN
         if wrong.any():
             k = int(np.argmax(wrong))
             pairs = zip(group.variable[k].tolist(), group.order[k].tolist(), strict=True)

@@ -15,15 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from ..tolerances import EPS, KNOWN
 from .functions import TABLE
 from .kernel import Kernel, is_active
 from .node import Node, leaf
 
-ROUNDING = float(np.finfo(float).eps)
-# Numbers that are given come out of computations (a start L·sin(φ), a parameter 0.1 + 0.2, a root that Newton's method
-# found with the kernels of some BLAS): they differ by some roundings from what is meant, and of sixteen digits fourteen
-# count. tests/compiler/test_verdicts.py moves starts by 4 roundings; the rest is for how mechanisms pass them on.
-KNOWN = 64 * ROUNDING
 # The argument of any other function is a number without a unit, in which a step of one is large: an angle of 1e-17 that
 # was computed is zero to rounding.
 WITHOUT_SCALE = frozenset(
@@ -48,7 +44,7 @@ class KernelWithErrors:
                 bounds[k] = errors[position]
             for k, value in self._kernel.constants:
                 is_exact = isinstance(value, np.bool_) or value.is_integer()
-                bounds[k] = 0.0 if is_exact else ROUNDING * abs(value)
+                bounds[k] = 0.0 if is_exact else EPS * abs(value)
             for k, node, places, guard in self._kernel.steps:
                 inside = [found[a] for a in places]
                 bound = _bound(node, found[k], inside, [bounds[a] for a in places])
@@ -64,14 +60,14 @@ def _bound(node: Node, value: Any, inside: list[Any], errors: list[Any]) -> Any:
         start, coefficients = node.data
         terms = [abs(float(c)) * np.abs(a) for c, a in zip(coefficients, inside, strict=True)]
         carried = [abs(float(c)) * e for c, e in zip(coefficients, errors, strict=True)]
-        return sum(carried) + ROUNDING * (abs(float(start)) + sum(terms))
+        return sum(carried) + EPS * (abs(float(start)) + sum(terms))
     if operation == "product":
         return _product(node.data, value, inside, errors)
     if operation == "power":
         base, exponent = inside
         by_base = np.abs(value * exponent / base)
         by_exponent = np.abs(value * np.log(np.abs(base)))
-        return _times(by_base, errors[0]) + _times(by_exponent, errors[1]) + ROUNDING * np.abs(value)
+        return _times(by_base, errors[0]) + _times(by_exponent, errors[1]) + EPS * np.abs(value)
     if operation == "select":
         return np.where(inside[0], errors[1], errors[2])
     if operation not in TABLE:
@@ -80,7 +76,7 @@ def _bound(node: Node, value: Any, inside: list[Any], errors: list[Any]) -> Any:
     if operation not in WITHOUT_SCALE:
         errors = [np.where(e == 0.0, 0.0, np.maximum(e, KNOWN)) for e in errors]
     carried = [_times(np.abs(s), e) for s, e in zip(slopes, errors, strict=True)]
-    return sum(carried) + ROUNDING * np.abs(value)
+    return sum(carried) + EPS * np.abs(value)
 
 
 def _product(exponents: Sequence[Any], value: Any, bases: list[Any], errors: list[Any]) -> Any:
@@ -94,7 +90,7 @@ def _product(exponents: Sequence[Any], value: Any, bases: list[Any], errors: lis
         growth = growth + (e * np.log1p(relative) if e > 0 else -e * relative)
         largest = largest * (size + error) ** e if e > 0 else largest * size**e
     grown = np.where(value == 0.0, largest, np.abs(value) * np.expm1(growth))
-    return grown + ROUNDING * len(bases) * np.abs(value)
+    return grown + EPS * len(bases) * np.abs(value)
 
 
 def _times(slope: Any, error: Any) -> Any:

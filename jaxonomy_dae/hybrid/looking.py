@@ -11,15 +11,12 @@ from jax import lax
 from ..adjoint.closure_conversion import any_member
 from ..adjoint.resting import still
 from ..aliases import Args, State, Time
+from ..tolerances import WINDOW
 from .event_map import AHEAD, CLOSE, Arrival
 from .problem import AbstractHybridProblem, HybridState
 from .search import first_crossing
 from .side import ABOVE, BELOW, RESTS, rounding
 
-# Part of a step: a guard that would reach zero so soon after its end counts as having reached it. A step that is
-# retried up to a crossing has other errors than the step in which the crossing was located, so that it ends a little
-# off. Set by hand: test_hybrid_runs.py and test_event_map.py pass with ten times it and a tenth.
-WINDOW = 1e-6
 # Where guards are looked at, as parts of a step; and how far, as a part of its size, a guard may be from the parabola
 # through its values at the first, the middle and the last of these. One that bends more may cross zero unseen, and the
 # step is taken in halves. With ten times BEND, test_hybrid_runs.py::test_guards_faster_than_the_states fails; a tenth

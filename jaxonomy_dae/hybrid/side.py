@@ -17,12 +17,9 @@ from typing import Any
 
 import jax.numpy as jnp
 
-ABOVE, RESTS, BELOW = 1.0, 0.5, 0.0  # numbers, to be part of the integrated state; what is positive is armed
+from ..tolerances import BAND
 
-# Of the largest value that a guard has had, in spacings of floating-point numbers: the half-width of the band. Rounding
-# errors of a guard in the states, and of the states themselves, add up to some hundreds of them in the models of the
-# tests. With a tenth, test_hybrid_runs.py::test_nothing_falls_through_a_floor fails; ten times it passes.
-BAND = 4096.0
+ABOVE, RESTS, BELOW = 1.0, 0.5, 0.0  # numbers, to be part of the integrated state; what is positive is armed
 
 
 def rounding(size: Any) -> Any:

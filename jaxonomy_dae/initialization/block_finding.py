@@ -3,7 +3,6 @@
 import dataclasses
 
 DENSE_LIMIT = 200  # unknowns up to which a block gets a singular value decomposition
-ILL_CONDITIONED = 1e12
 
 
 @dataclasses.dataclass(frozen=True)

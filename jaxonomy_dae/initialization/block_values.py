@@ -5,12 +5,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..expressions.errors import KNOWN
 from ..lowering.plan import SystemPlan
 from ..lowering.schedule import Step, StepEquation
 from ..model.group import Point
 from ..model.networks import Networks
 from ..model.typical_sizes import error_sizes
+from ..tolerances import KNOWN
 
 
 def slots_of_partials(equation: StepEquation) -> list[int]:

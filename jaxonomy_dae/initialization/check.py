@@ -11,9 +11,9 @@ from jax.core import Tracer
 from ..errors import InitializationError
 from ..solvers.rows import not_a_number
 from ..system.input_values import input_values
+from ..tolerances import solved
 from .initialize import InitialPoint, is_consistent
 from .report import InitializationReport
-from .sizes import tolerance
 
 
 def check(
@@ -67,4 +67,4 @@ def check(
 def _slack(found: InitialPoint, low: np.ndarray, high: np.ndarray) -> Any:
     """The distance by which rounding may put parameters solved for out of their bounds, shape (solved,)."""
     bounds = np.maximum(np.where(np.isfinite(low), np.abs(low), 0), np.where(np.isfinite(high), np.abs(high), 0))
-    return tolerance(found.x.dtype) * jnp.maximum(jnp.abs(found.solved), jnp.asarray(bounds, found.x.dtype))
+    return solved(found.x.dtype) * jnp.maximum(jnp.abs(found.solved), jnp.asarray(bounds, found.x.dtype))

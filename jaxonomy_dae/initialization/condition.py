@@ -7,9 +7,8 @@ import scipy.sparse as sp
 
 from ..judgement.rank import EASY, Rank, rank_of
 from ..judgement.sparse_rank import sparse_rank_of
-from .block_finding import DENSE_LIMIT, ILL_CONDITIONED
-
-TINY = 1e-300  # takes the place of zero in denominators
+from ..tolerances import ILL_CONDITIONED, TINY
+from .block_finding import DENSE_LIMIT
 
 NullVectors = Callable[[int], np.ndarray]
 

@@ -11,8 +11,9 @@ from jaxtyping import Array, Bool, Float
 
 from ..errors import ModelError
 from ..linear.least_squares import least_squares
+from ..tolerances import solved
 from .ladder import FAILED, GIVEN, Found
-from .sizes import Sizes, column_sizes, row_sizes, soft_weight, tolerance, weighed
+from .sizes import Sizes, column_sizes, row_sizes, soft_weight, weighed
 
 MAX_STEPS = 1000  # of a solver of the user's, some of which take many cheap steps
 
@@ -65,7 +66,7 @@ def find_root_with(
     x = jnp.where(jnp.all(jnp.isfinite(sharper)), sharper, x)
     value, jacobian = linearized(x)
     size, noise = row_sizes(weighed(jacobian), x, sizes, unit, magnitude(x))
-    limit = tolerance(dtype) * size + noise
+    limit = solved(dtype) * size + noise
     holds = jnp.all((jnp.abs(value) <= limit) | jnp.asarray(soft & (not square)))
     method = jnp.where(holds, GIVEN, FAILED).astype(jnp.int32)
     return Found(x, jacobian, limit, unit, method, jnp.asarray(found.stats["num_steps"], jnp.int32))

@@ -29,16 +29,16 @@ from ..programs.staging import is_staged
 from ..system.evaluate import Refinement
 from ..system.inputs import read_inputs
 from ..system.system_at import SystemAt
+from ..tolerances import CLOSE, NOISE, solved
 from .given_solver import find_root_with
 from .initial_values import check_initial
 from .ladder import FAILED, STAGED, find_root
 from .rows import InitialRows, StartRow, initial_rows
-from .sizes import NOISE, Sizes, tolerance
+from .sizes import Sizes
 from .sparse_newton import SparseRows, sparse_newton, sparse_rows
 from .stages import solve_in_stages, stages
 
 PERTURBATIONS = 8  # of the start, and of parameters, that show the sizes of terms
-CANCELLED = 1e3  # rounding errors of what is zero because its terms cancel, in units of eps times its typical size
 
 
 class InitialPoint(NamedTuple):
@@ -86,7 +86,7 @@ def initialize(
     if rows.direct:
         nothing = jnp.zeros((), jnp.int32)
         residual = starts(point, x0) - target
-        limit = tolerance(point.dtype) * (jnp.abs(starts(point, x0)) + _data_sizes(plan, rows, given, parameters)[0])
+        limit = solved(point.dtype) * (jnp.abs(starts(point, x0)) + _data_sizes(plan, rows, given, parameters)[0])
         return InitialPoint(x0, x0[:0], residual, limit, target, nothing, nothing, None)
     n_equations = plan.n_constraints + len(plan.carried)
 
@@ -193,7 +193,7 @@ def initialize(
         limit = limit + excused
     if not rows.n_soft:  # what held still does, though redundant rows that differ by rounding share the difference
         held = jnp.abs(frozen(remaining)) <= limit
-        kept = jnp.abs(frozen(remaining - jacobian @ step)) <= limit / tolerance(point.dtype) ** 0.5
+        kept = jnp.abs(frozen(remaining - jacobian @ step)) <= limit / solved(point.dtype) ** 0.5
         w = jnp.where(good & jnp.any(held & ~kept), jnp.nan, w)
     return InitialPoint(w[:n], w[n:], remaining, limit, full, found.method, found.evaluations, found.jacobian)
 
@@ -277,7 +277,7 @@ def _rounding(residual: Callable[..., Any], settings, start: Any, sizes: Sizes, 
     moved = jax.vmap(lambda v, p: jax.jvp(rows, (start, parameters), (v, p))[1])(*along)
     slope, terms = (jnp.max(jnp.abs(m), axis=0) for m in jnp.split(moved, 2))
     eps = float(jnp.finfo(dtype).eps)
-    noise = NOISE * eps * terms + CANCELLED * eps * typical
+    noise = NOISE * eps * terms + CLOSE * eps * typical
     return jnp.where((typical > 0) & (jnp.abs(value) <= noise) & (slope <= noise), noise, 0)
 
 

@@ -27,9 +27,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ..tolerances import NOISE, ZERO_WITHIN, solved, spacing
+from ..tolerances import close as close_within
 from .machine import Machine, Scalars
 from .probing import SIZED, probed
-from .sizes import NOISE, Sizes, column_sizes, row_sizes, soft_weight, tolerance, weighed
+from .sizes import Sizes, column_sizes, row_sizes, soft_weight, weighed
 
 METHODS = (
     "the start was consistent",
@@ -137,8 +139,7 @@ def _climb(
     """Climbs the ladder in the units that `find_root` has chosen. `in_units` is true where unknowns are measured in
     typical sizes; otherwise slopes at the start show their sizes."""
     dtype, n = start.dtype, start.shape[0]
-    eps = float(jnp.finfo(dtype).eps)
-    close, enough = min(1e3 * eps, 0.1 * tolerance(dtype)), tolerance(dtype)
+    eps, close, enough = spacing(dtype), close_within(dtype), solved(dtype)
     where, one = jnp.where, jnp.ones((), dtype)
     is_soft = np.zeros(m, bool) if soft is None else soft
     hard, weighted = jnp.asarray(~is_soft), jnp.asarray(np.where(is_soft, soft_weight(dtype), 1.0), dtype)
@@ -157,7 +158,7 @@ def _climb(
     inside = jnp.asarray(np.ones(m) if core is None else np.isin(np.arange(m), core), dtype)
     # Steps of least norm, with fewer equations than unknowns; and on the way to the nearest point, which may lie where
     # an unknown has no slope, as at the side of a circle.
-    least = 1e2 * eps
+    least = ZERO_WITHIN * eps
     floor = 0.0 if m >= n else least
 
     def packed(*scalars) -> Any:

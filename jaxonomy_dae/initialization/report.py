@@ -8,24 +8,22 @@ import numpy as np
 
 from ..diagnosis.redundant_constraints import DependentConstraints, ModelAt, dependent_constraints, no_freedom
 from ..diagnosis.wording import listed
-from ..linear.least_squares import ridge
 from ..lowering.plan import SystemPlan
 from ..model.tables import ZERO
 from ..system.input_values import input_values
 from ..system.sections import SHOWN, Sections, some
-from .block_finding import ILL_CONDITIONED, BlockFinding
+from ..tolerances import DIGIT, HALF_OF_THE_DIGITS, ILL_CONDITIONED, TINY, ridge, solved
+from .block_finding import BlockFinding
 from .constraints_at import constraints_at
 from .initialize import InitialPoint, is_consistent
 from .ladder import FAILED, METHODS, NEAREST
 from .rows import StartRow, initial_rows, supports
 from .singular_blocks import examine_blocks
-from .sizes import tolerance
 
 WORST = 5  # rows that do not hold, in a text
-SUSPICIOUS = 1e7  # the condition number from which on constraints are asked whether they are redundant
-# Condition times `ridge` from which on gradients of a start lose digits: measured on x + y = a, x + (1 + e)·y = b, they
-# are off by 1.4e-6 where it is 0.07, by 1.4 % at 0.7 and by 35 % at 2.4.
-GRADIENTS_SUFFER = 0.1
+SUSPICIOUS = (
+    1 / HALF_OF_THE_DIGITS
+)  # the condition number from which on constraints are asked whether they are redundant
 CONDITION_LIMIT = 500  # unknowns up to which the condition of the initial equations is computed
 
 
@@ -91,7 +89,7 @@ class InitializationReport(Sections):
         self._target = np.asarray(found.target, float)[len(self._residual) - len(self._rows.kept) :]
         self._x = np.asarray(found.x, float)
         self._limit = np.asarray(found.limit, float)
-        self._relative = tolerance(found.x.dtype)
+        self._relative = solved(found.x.dtype)
         self.consistent = bool(is_consistent(found))
 
     # --- starts ------------------------------------------------------------------------------------------------
@@ -233,7 +231,7 @@ class InitializationReport(Sections):
             return None
         matrix = np.asarray(jacobian, float)
         for axis in (1, 0, 1):
-            matrix = matrix / np.maximum(np.abs(matrix).max(axis=axis, keepdims=True), 1e-300)
+            matrix = matrix / np.maximum(np.abs(matrix).max(axis=axis, keepdims=True), TINY)
         s = np.linalg.svd(matrix, compute_uv=False)
         return float(s[0] / s[-1]) if s[-1] > 0 else np.inf
 
@@ -253,7 +251,9 @@ class InitializationReport(Sections):
                 f"the initial equations are ill-conditioned, {self._condition:.1e}: the starts hardly determine the "
                 "point, and its gradients are not reliable"
             )
-        elif self._condition is not None and self._condition * ridge(self._found.x.dtype) > GRADIENTS_SUFFER:
+        elif self._condition is not None and self._condition * ridge(self._found.x.dtype) > DIGIT:
+            # Measured on x + y = a, x + (1 + e)·y = b: gradients are off by 1.4e-6 where it is 0.07, by 1.4 % at 0.7
+            # and by 35 % at 2.4.
             out.append(
                 f"the initial equations are ill-conditioned, {self._condition:.1e}: gradients with respect to the "
                 "starts lose digits"

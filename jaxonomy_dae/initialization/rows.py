@@ -18,7 +18,6 @@ import scipy.linalg
 import scipy.sparse as sp
 
 from ..errors import InitializationError
-from ..expressions.errors import KNOWN
 from ..judgement.rank import above_errors
 from ..judgement.scaling import balanced, equilibrated
 from ..lowering.plan import SystemPlan
@@ -30,6 +29,7 @@ from ..model.networks import Networks
 from ..model.quantities import ABSENT
 from ..model.tables import ZERO, Start
 from ..structure.matching import match_in_order
+from ..tolerances import ILL_CONDITIONED, KNOWN, NO_PART, TINY
 
 DENSE_LIMIT = 600  # quantities up to which ranks are numerical; above, rows are matched with quantities
 
@@ -83,7 +83,7 @@ class _Generic:
         for parameter, slope in self._slopes(row):
             out[self.n + self.solve_for.index(parameter)] -= slope / (row.factor or 1.0)
         out *= self.columns
-        return out / max(np.abs(out).max(initial=0.0), 1e-300)
+        return out / max(np.abs(out).max(initial=0.0), TINY)
 
     def pattern(self, row: StartRow) -> list[int]:
         """The columns on which a start row depends."""
@@ -353,8 +353,8 @@ def supports(
 def _support(generic: _Generic, row: StartRow, base: list[StartRow]) -> tuple[tuple[StartRow, ...], np.ndarray]:
     """The rows of `base`, and the equations, of which a row is a combination."""
     matrix = np.concatenate([generic.jacobian.toarray(), *(generic.row(r)[None, :] for r in base)])
-    weight = np.abs(np.linalg.lstsq(matrix.T, generic.row(row), rcond=1e-12)[0])
-    used = weight > 1e-6 * max(weight.max(initial=0.0), 1e-300)
+    weight = np.abs(np.linalg.lstsq(matrix.T, generic.row(row), rcond=1 / ILL_CONDITIONED)[0])
+    used = weight > NO_PART * max(weight.max(initial=0.0), TINY)
     n = generic.jacobian.shape[0]
     return tuple(r for r, u in zip(base, used[n:], strict=True) if u), np.flatnonzero(used[:n])
 

@@ -11,12 +11,12 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from ..expressions.errors import KNOWN
 from ..judgement.rank import is_undecided, rank_of
 from ..lowering.plan import SystemPlan
 from ..lowering.schedule import SparseStep, Step, StepEquation
 from ..model.tables import ZERO
-from .block_finding import DENSE_LIMIT, ILL_CONDITIONED, BlockFinding
+from ..tolerances import ILL_CONDITIONED, KNOWN, RANK, SLIGHT
+from .block_finding import DENSE_LIMIT, BlockFinding
 from .block_values import BlockValues, slots_of_partials
 from .condition import conditions, left_null
 from .sparse_blocks import sparse_finding
@@ -113,8 +113,8 @@ def _finding(
 ) -> BlockFinding:
     names = [plan.quantity_name[int(u[b])] for u in step.unknown]
     texts = [plan.describe(int(e.equation[b])) for e in step.equations]
-    chosen = np.flatnonzero(np.abs(right).max(axis=1, initial=0.0) > 1e-3)
-    dependent = np.flatnonzero(np.abs(left).max(axis=1, initial=0.0) > 1e-3)
+    chosen = np.flatnonzero(np.abs(right).max(axis=1, initial=0.0) > SLIGHT)
+    dependent = np.flatnonzero(np.abs(left).max(axis=1, initial=0.0) > SLIGHT)
     variables = tuple(names[u] for u in chosen) or tuple(names)
     equations = tuple(dict.fromkeys(texts[e] for e in dependent)) or tuple(dict.fromkeys(texts))
     causes = _causes(plan, values, step, b, left, right) if singular or left.shape[1] else ()
@@ -139,7 +139,7 @@ def _causes(plan: SystemPlan, values: BlockValues, step: Step, b: int, left, rig
         if anyhow or not left.shape[1]:
             return True
         along = np.abs(left.T @ (change / scale) @ right)
-        return bool(((along > 1e-9) & (along * scale > errors)).any())
+        return bool(((along > RANK) & (along * scale > errors)).any())
 
     found: list[tuple[str, float]] = []
     for p in sorted({int(p) for e in step.equations for p in e.parameter[b]}):
@@ -195,7 +195,7 @@ def _constraints(plan: SystemPlan, values: BlockValues) -> Iterator[BlockFinding
     condition = rank.condition if rank.is_regular else np.inf
     if condition < ILL_CONDITIONED:
         return
-    dependent = np.flatnonzero(np.abs(left_null(rank)).max(axis=1, initial=0.0) > 1e-3)
+    dependent = np.flatnonzero(np.abs(left_null(rank)).max(axis=1, initial=0.0) > SLIGHT)
     states = np.flatnonzero(np.abs(matrix[dependent]).max(axis=0, initial=0.0) > 0)
     if not len(states):
         states = np.array(sorted({k for r in dependent for k in plan.constraint_pattern[r]}), np.int64)

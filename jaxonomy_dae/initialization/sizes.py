@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-NOISE = 8.0  # rounding errors of a row, in units of eps
-DIGIT = 0.1  # of its terms: a row of which not one digit is known
+from ..tolerances import DIGIT, NOISE, solved, spacing
 
 
 class Sizes(NamedTuple):
@@ -20,14 +19,9 @@ class Sizes(NamedTuple):
     soft: Float[Array, " m"]  # distances that weigh the same in soft rows
 
 
-def tolerance(dtype: Any) -> float:
-    """The largest residual that counts as rounding, relative to the size of a row's terms."""
-    return float(jnp.finfo(dtype).eps) ** 0.6
-
-
 def soft_weight(dtype: Any) -> float:
     """The weight of soft rows beside others: they move these by its square, a tenth of what counts as rounding."""
-    return float(np.sqrt(0.1 * tolerance(dtype)))
+    return float(np.sqrt(0.1 * solved(dtype)))
 
 
 Weigh = Callable[[Any], Any]
@@ -48,7 +42,7 @@ def row_sizes(weigh: Weigh, x: Any, sizes: Sizes, unit: Any, terms: Any = None) 
     - `terms`: the magnitude of each row; where it is not known (infinite or not-a-number), and if nothing is given,
         slopes stand for it.
     """
-    eps = float(jnp.finfo(x.dtype).eps)
+    eps = spacing(x.dtype)
     reach = jnp.maximum(jnp.abs(x), sizes.nominal)
     size = weigh(reach) if terms is None else jnp.where(jnp.isfinite(terms), terms, weigh(reach))
     size = size + sizes.data

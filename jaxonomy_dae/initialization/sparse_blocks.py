@@ -6,7 +6,8 @@ import scipy.sparse as sp
 from ..judgement.sparse_rank import sparse_rank_of
 from ..lowering.plan import SystemPlan
 from ..lowering.schedule import SparseStep
-from .block_finding import DENSE_LIMIT, ILL_CONDITIONED, BlockFinding
+from ..tolerances import ILL_CONDITIONED, NO_PART, SLIGHT
+from .block_finding import DENSE_LIMIT, BlockFinding
 from .block_values import BlockValues
 
 
@@ -40,8 +41,8 @@ def sparse_finding(plan: SystemPlan, values: BlockValues, step: SparseStep) -> B
     if rank.is_regular and rank.condition < ILL_CONDITIONED:
         return None
     left, right = rank.null_vectors()
-    chosen = np.flatnonzero(np.abs(right) > 1e-3 * np.abs(right).max())
-    dependent = np.flatnonzero(np.abs(left) > 1e-3 * np.abs(left).max())
+    chosen = np.flatnonzero(np.abs(right) > SLIGHT * np.abs(right).max())
+    dependent = np.flatnonzero(np.abs(left) > SLIGHT * np.abs(left).max())
     left, right = rank.r * left, rank.c * right
     names = tuple(plan.quantity_name[int(step.unknown[0][k])] for k in chosen)
     equations = tuple(dict.fromkeys(plan.describe(int(texts[k])) for k in dependent))
@@ -69,5 +70,5 @@ def _causes(
             change = values.partials(equation, moved) - before
             np.add.at(effect, p, u * (change * v).sum(axis=1))
     size = np.abs(np.where(np.isfinite(effect), effect, np.inf))
-    found = np.flatnonzero(size > 1e-6 * size.max(initial=0.0))[:DENSE_LIMIT]
+    found = np.flatnonzero(size > NO_PART * size.max(initial=0.0))[:DENSE_LIMIT]
     return tuple((plan.flat.parameters.names[p], float(values.parameters[p])) for p in found)

@@ -18,9 +18,11 @@ from ..linear.choice import SPARSE_DENSITY, SPARSE_FROM
 from ..linear.sparse import SparsePattern, available, is_double, sparse_jacobian
 from ..linear.whole import solve_whole
 from ..lowering.plan import SystemPlan
+from ..tolerances import close as close_within
+from ..tolerances import solved
 from .ladder import DECREASE, METHODS, NEWTON_LIMIT, SHORTEST
 from .rows import InitialRows
-from .sizes import Sizes, row_sizes, tolerance
+from .sizes import Sizes, row_sizes
 
 
 class SparseRows(NamedTuple):
@@ -88,8 +90,7 @@ def sparse_newton(
     """Newton's method from `start`, steps halved until the residual falls and no bound is crossed; `magnitude` says how
     large the terms of each row are, as for `find_root`."""
     dtype = start.dtype
-    eps, enough = float(jnp.finfo(dtype).eps), tolerance(dtype)
-    close = min(1e3 * eps, 0.1 * enough)
+    close, enough = close_within(dtype), solved(dtype)
     low, high = jnp.asarray(bounds.T, dtype)
     start = jnp.clip(start, low, high)
     unit = jnp.where(sizes.known > 0, sizes.known, 1)

@@ -18,12 +18,12 @@ from scipy.sparse.csgraph import connected_components
 
 from ..lowering.plan import SystemPlan
 from ..structure.matching import maximum_matching
+from ..tolerances import close as close_within
 from .rows import InitialRows
 from .sizes import Sizes, column_sizes
 
 LEAST_LEVEL = 2  # times that a constraint must have been differentiated for stages to be worth their compile time
 LIMIT = 40  # steps in a block
-CLOSE = 1e3  # rounding errors within which a block is solved
 
 
 @functools.lru_cache(maxsize=64)
@@ -71,7 +71,7 @@ def solve_in_stages(
     """Levenberg–Marquardt steps in one block after the other, blocks before it held."""
     n, last = len(block), int(block.max(initial=0))
     dtype = start.dtype
-    close = CLOSE * float(jnp.finfo(dtype).eps)
+    close = close_within(dtype)
 
     def step(state):
         trial, base, merit_base, damping, number, count = state

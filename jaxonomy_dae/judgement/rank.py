@@ -16,9 +16,9 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float
 
+from ..tolerances import EPS, TINY
 from .scaling import balanced, equilibrated
 
-EPS = float(np.finfo(float).eps)
 EASY = 1e8  # a condition number below which scales that cost an iterative solve are not looked for
 ITERATIONS = 20  # of the power method for ρ, whose bound holds whenever it stops
 
@@ -68,7 +68,7 @@ class Rank:
         for _ in range(ITERATIONS):
             y = product @ x
             bound = min(bound, float((y / x).max(initial=0.0)))  # Collatz and Wielandt, for any x > 0
-            x = np.maximum(y / max(y.max(initial=0.0), 1e-300), EPS)
+            x = np.maximum(y / max(y.max(initial=0.0), TINY), EPS)
         return bound
 
     @property

@@ -8,7 +8,8 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg
 
-from .rank import EASY, EPS, above_errors
+from ..tolerances import EPS
+from .rank import EASY, above_errors
 from .scaling import balanced, equilibrated
 
 

@@ -1,17 +1,11 @@
 """Dense least squares that also answers where a matrix leaves directions open."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-
-def ridge(dtype: Any) -> float:
-    """What directions that a matrix leaves open are held by, beside rows of size one: far below the rounding of what
-    only such directions feel. A solution in directions of the size σ is off by up to (ridge/σ)² of itself."""
-    return float(jnp.finfo(dtype).eps) ** 0.75
+from ..tolerances import ridge
 
 
 def least_squares(matrix: Float[Array, "m n"], right: Float[Array, " m"]) -> Float[Array, " n"]:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..errors import ModelError
+from ..tolerances import ILL_CONDITIONED
 
 
 class Mass:
@@ -63,7 +64,7 @@ class Mass:
         if self.is_diagonal:
             return (self.array == 0).astype(float)
         u, s, _ = np.linalg.svd(self.array)
-        null = u[:, s <= s.max(initial=0.0) * 1e-12]
+        null = u[:, s <= s.max(initial=0.0) / ILL_CONDITIONED]
         return null @ null.T
 
     @property
@@ -76,7 +77,7 @@ class Mass:
         if self.is_diagonal:
             return (self.array != 0).astype(float)
         _, s, vt = np.linalg.svd(self.array)
-        kept = vt[s > s.max(initial=0.0) * 1e-12]
+        kept = vt[s > s.max(initial=0.0) / ILL_CONDITIONED]
         return kept.T @ kept
 
     def differential_part(self, v: Any) -> Any:

@@ -33,15 +33,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..structure.tearing import Tearing
+from ..tolerances import TOLERATED, TOLERATED_NORM
 from .inverse import FORMULA, inverse
 from .once import once
 from .written_out import UNROLLED
 
 APART = 8  # equations of a block from which on what its phases hand on is computed once, and not where it is read
 CORRECTIONS = 2  # where an unknown of the sequence depends on another; else one is enough
-TOLERATED = 2.0**20  # residual of an equation in units of eps times its terms: 2e-10 in double precision
-TOLERATED_NORM = 2.0**8  # the same in the equilibrated norm: 6e-14, what elimination with pivoting may leave
-TOLERATED_LOSS = 2.0**8  # the least that may be left of the terms of S, in units of eps
 
 Entries = Mapping[tuple[int, int], Any]
 
@@ -159,7 +157,7 @@ class _Elimination:
             sizes[u] = _product(abs(self.over_pivot[u]), _total(terms, None)) if terms else 0.0
         (e,) = self.tearing.residuals
         size = _total([_product(abs(a), sizes[v]) for v, a in self.rows[e]], None)
-        return jnp.where(abs(schur) > TOLERATED_LOSS * float(jnp.finfo(self.like.dtype).eps) * size, schur, jnp.nan)
+        return jnp.where(abs(schur) > TOLERATED_NORM * float(jnp.finfo(self.like.dtype).eps) * size, schur, jnp.nan)
 
     # Rows over the tearing variables: {place: entry} where few, an array of shape (m, *batch) where many.
 

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..errors import ModelError
+from ..tolerances import TOLERATED, TOLERATED_NORM, UNDETERMINED
 from .once import once
 from .operator import SparseLinearOperator
 from .sparse import DENSE, ULPS, SparsePattern, available, check_solvable, is_double, solve_sparse
@@ -27,9 +28,6 @@ LAPACK = 48  # unknowns up to which dense elimination is faster than KLU, which 
 GOOD = 2.0**10  # residual in units of eps times the terms of an equation, above which a solution of KLU is refined
 REFINEMENTS = 2  # of a solution by KLU, at most
 MORE_REFINEMENTS = 10  # the same, of a solution by an iterative method
-TOLERATED = 2.0**20  # the same, above which a solution is refused: 2e-10 in double precision
-UNDETERMINED = 2.0**-4  # of the largest unknown: what changes so by rounding is not known to its first digit
-TOLERATED_NORM = 2.0**8  # in units of eps times the largest unknown of the scaled system, for each √n
 
 
 def solve_whole(

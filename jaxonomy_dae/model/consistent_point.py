@@ -6,6 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..judgement.scaling import equilibrated
+from ..tolerances import ILL_CONDITIONED
 from .declared import start_guess
 from .extended import Extended
 from .group import Point
@@ -71,5 +72,5 @@ def consistent_point(extended: Extended, guess: Point, fixed: list[tuple[int, fl
 
 def _least_norm(matrix: Any, right: np.ndarray) -> np.ndarray:
     if matrix.shape[1] <= 1500:
-        return np.linalg.lstsq(matrix.toarray(), right, rcond=1e-12)[0]
+        return np.linalg.lstsq(matrix.toarray(), right, rcond=1 / ILL_CONDITIONED)[0]
     return sp.linalg.lsmr(matrix, right, atol=1e-12, btol=1e-12, maxiter=10 * matrix.shape[1])[0]

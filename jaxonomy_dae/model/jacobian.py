@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float
 
-from ..expressions.errors import KNOWN
+from ..tolerances import KNOWN
 from .extended import Extended, ExtendedGroup
 from .group import Point
 from .tables import ZERO

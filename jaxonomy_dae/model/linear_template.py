@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..tolerances import EPS, NOISE
 from .template import AbstractTemplate, Slot
 
 
@@ -43,7 +44,7 @@ class LinearTemplate(AbstractTemplate):
 
     def is_unmoved(self, direction: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
         terms = coefficients * direction
-        return np.abs(terms.sum(axis=1)) <= 8 * np.finfo(float).eps * np.abs(terms).sum(axis=1)
+        return np.abs(terms.sum(axis=1)) <= NOISE * EPS * np.abs(terms).sum(axis=1)
 
     def residual(self, slots, parameters, coefficients, t, networks, backend="jax"):
         total = 0.0

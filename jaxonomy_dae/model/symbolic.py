@@ -10,13 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..expressions.differentiate import directional_derivative, partial_derivative, raised
-from ..expressions.errors import KNOWN, KernelWithErrors
+from ..expressions.errors import KernelWithErrors
 from ..expressions.kernel import Kernel
 from ..expressions.magnitude import magnitude
 from ..expressions.node import ONE, ZERO, Node, constant, divide, leaf, linear, scale, split
 from ..expressions.substitute import substitute
 from ..expressions.terms import terms
 from ..modeling.symbols import TIME_LABEL, ParameterSymbol, VariableSymbol, symbol_label
+from ..tolerances import KNOWN
 from .template import AbstractTemplate, Slot
 
 

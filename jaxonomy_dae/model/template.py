@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..expressions.errors import KNOWN
+from ..tolerances import KNOWN
 
 Slot = tuple[int, int]
 

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from ..expressions.errors import KNOWN
+from ..tolerances import KNOWN
 from .declared import declared_scale
 from .extended import Extended
 from .natural_sizes import are_told, natural_sizes

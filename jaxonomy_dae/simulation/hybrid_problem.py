@@ -15,20 +15,10 @@ from ..model.tables import EventTable
 from ..solvers.switching import Watch
 from ..system.system import AcausalSystem
 from ..system.system_at import SystemAt
+from ..tolerances import CONSISTENT, LEFT, PULL, RESOLUTION
 from .preparation import prepared, term_of
 
-# Times that differ by less are one instant: so many spacings of floating-point numbers at the largest time of a run.
-RESOLUTION = 32.0
-# Part of each state's size by which the projection onto the constraints may move what an event wrote and left. If it
-# moves more, the event asked for what the constraints do not admit, and the projection would decide what was meant
-# (test_event_attacks.py::test_a_reset_that_hidden_constraints_do_not_admit).
-CONSISTENT = 1e-4
 RESTART = 8  # Gauss–Newton steps onto the constraints after an event; from 1e-4 they lead to 1e-8 and to rounding
-# Part of the speed (or charge) that an impulse takes away that may be left of it. The impulse is found by one linear
-# step, exact if the jump is affine; more left than this shows that it is not
-# (test_library_contacts.py::test_a_jump_that_is_not_affine_is_refused).
-LEFT = 1e-6
-PULL = 1e-9  # of the largest impulse: contacts that pull by less do so by rounding alone, and are not released
 # Contacts are released at most this many times while one impact is resolved. If an impulse would still have to pull,
 # the event fails.
 TRIES = 3

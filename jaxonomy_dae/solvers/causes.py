@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..aliases import Args, State, Terms, Time
+from ..tolerances import TINY
 from .dae_term import FlatProblem
 from .index_one import consistent_slope
 
@@ -100,7 +101,7 @@ def _escape(here: np.ndarray, y: State, t: float, t1: float, weight: np.ndarray,
     value = np.asarray(y)
     growing = value * here > 0
     rest = np.where(growing, np.abs(value) / np.maximum(np.abs(here), np.finfo(here.dtype).tiny), np.inf)
-    large = np.abs(value) > 1e4 * np.minimum(weight / np.maximum(np.abs(value), 1e-300) * 1e6, 1.0)
+    large = np.abs(value) > 1e4 * np.minimum(weight / np.maximum(np.abs(value), TINY) * 1e6, 1.0)
     k = int(np.argmin(np.where(large, rest, np.inf)))
     if not (large[k] and rest[k] < 1e-3 * (t1 - t)):
         return ""

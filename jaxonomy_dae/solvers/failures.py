@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..aliases import Args, Result, State, Terms, Time, Tolerance
+from ..tolerances import KNOWN, KNOWN_ROUNDINGS, SLIGHT, spacing
 from .causes import cause_of, first_bad_row
 from .dae_term import FlatProblem
 from .index_one import algebraic_part, consistent_slope, index_matrix
 
-ROUNDING = 64.0  # errors of a row, in units of eps times its terms
 LARGE = 300  # unknowns up to which matrices are looked at
 SHOWN = 4
 
@@ -62,7 +62,7 @@ def start_check(problem: FlatProblem, t: Time, rtol: Tolerance, atol: Tolerance)
     residual = algebraic_part(problem, right)
     weight = rtol * jnp.abs(problem_y) + _flat(atol, problem_y)
     shift = chosen.apply(chosen.factor(matrix), matrix, residual) / weight
-    rounding = ROUNDING * float(jnp.finfo(problem_y.dtype).eps) * chosen.row_sizes(jacobian, problem_y)
+    rounding = KNOWN_ROUNDINGS * spacing(problem_y.dtype) * chosen.row_sizes(jacobian, problem_y)
     if not problem.mass.is_diagonal:
         rounding = jnp.abs(jnp.asarray(problem.mass.algebraic, problem_y.dtype)) @ rounding
     looked_at = chosen.materialise(matrix) if problem_y.shape[0] <= LARGE else None
@@ -113,10 +113,10 @@ def null_names(matrix: np.ndarray, names: Sequence[str]) -> str:
     columns = np.abs(matrix / np.where(rows == 0, 1, rows)[:, None]).max(axis=0)
     scaled = matrix / np.where(rows == 0, 1, rows)[:, None] / np.where(columns == 0, 1, columns)[None, :]
     _, s, v = np.linalg.svd(scaled)
-    if s.size and s[-1] > 1e-14 * len(s) * s[0]:
+    if s.size and s[-1] > KNOWN * len(s) * s[0]:
         return ""
     null = np.abs(v[-1])
-    return ", ".join(f"'{names[k]}'" for k in np.argsort(-null)[:SHOWN] if null[k] > 1e-3)
+    return ", ".join(f"'{names[k]}'" for k in np.argsort(-null)[:SHOWN] if null[k] > SLIGHT)
 
 
 def how_it_stopped(result: Result, t: Time, max_steps: int) -> str:

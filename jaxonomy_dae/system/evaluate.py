@@ -37,14 +37,12 @@ from ..lowering.program import (
 from ..model.linear_template import LinearTemplate, scaled
 from ..model.networks import Networks
 from ..model.tables import ZERO
+from ..tolerances import NOISE, ZERO_WITHIN, solved, spacing
 
 UNROLLED_REPETITIONS = 4  # of a loop, written out in each of its iterations
 LONG_SUM = 16  # linear equations with more terms are one gather and one sum
 NEWTON_STEPS = 60  # to the root of a nonlinear block, at most; a double root takes 27
 ROUGH = 1e-2  # residual of an equation relative to its terms, where one Newton correction is made
-NOISE = 8.0  # times what rounding may have left in an equation
-ZERO_WITHIN = 1e2  # in units of eps and of its typical size: what cannot be told from zero. A double root at zero is
-# approached by half the way in each step, 46 of the 60 to here
 
 
 class Refinement(enum.Enum):
@@ -170,7 +168,7 @@ class Evaluation(AbstractEvaluation):
             local = self._follow(planned, self._corrected(planned, z))
             holds = self._holds(planned, local, ROUGH)
         else:
-            still, tolerated = self.frozen(), rounding(self.dtype)
+            still, tolerated = self.frozen(), solved(self.dtype)
             z, holds = find_root(
                 lambda z: still._holds(planned, still._follow(planned, z), tolerated),
                 functools.partial(still._corrected, planned),
@@ -241,7 +239,7 @@ class Evaluation(AbstractEvaluation):
         """The part that rounding may have left in each unknown that follows from others (a running error analysis,
         Wilkinson 1963): a difference of pressures is not known to its own digits, but to theirs."""
         noise: list[Any] = [0.0] * len(local)
-        eps = float(jnp.finfo(self.dtype).eps)
+        eps = spacing(self.dtype)
         for e, u in planned.step.tearing.sequence:
             equation = planned.equations[e]
             _, slots, partials = self._terms(equation, local)
@@ -314,7 +312,7 @@ class Evaluation(AbstractEvaluation):
             u = self._whole_corrected(planned, u)
             holds = self._whole_holds(planned, u, ROUGH)
         else:
-            still, tolerated = self.frozen(), rounding(self.dtype)
+            still, tolerated = self.frozen(), solved(self.dtype)
             (u,), holds = find_root(
                 lambda z: still._whole_holds(planned, z[0], tolerated),
                 lambda z: [still._whole_corrected(planned, z[0])],
@@ -420,11 +418,6 @@ def _slope(function, slots: list[Any], k: int) -> Any:
     return jax.jvp(lambda s: function(*slots[:k], s, *slots[k + 1 :]), (slots[k],), (jnp.ones_like(slots[k]),))[1]
 
 
-def rounding(dtype: Any) -> float:
-    """The residual relative to its terms that counts as rounding: what initialization allows, too."""
-    return float(jnp.finfo(dtype).eps) ** 0.6
-
-
 def is_small(
     residual: Any,
     terms: Any,
@@ -441,7 +434,7 @@ def is_small(
     - `partials`, `typical`, `noise`: its partial derivatives by slots; the typical sizes of these; and what rounding
         may have left in them beyond their own.
     """
-    eps = float(jnp.finfo(jnp.result_type(residual)).eps)
+    eps = spacing(jnp.result_type(residual))
     pairs = list(zip(partials, typical, strict=False))  # of a network, its output alone
     floor = _weighed([(p, s) for p, s in pairs if not _is_nothing(s)])
     left = _weighed([(p, n) for p, n in zip(partials, noise, strict=False) if not _is_nothing(n)])

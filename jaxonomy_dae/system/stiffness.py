@@ -10,9 +10,9 @@ import numpy as np
 from ..lowering.plan import SystemPlan
 from ..model.consistent_point import initial_point
 from ..model.jacobian import residual_and_jacobian
+from ..tolerances import RANK, TINY
 
 LARGE = 300  # quantities up to which it is found
-RANK = 1e-10
 
 
 def fastest_decay(plan: SystemPlan) -> float:
@@ -34,7 +34,7 @@ def _fastest_decay(plan: SystemPlan) -> float:
     matrix = residual_and_jacobian(plan.extended, at)[1].toarray()[:, :n]
     if not np.isfinite(matrix).all():
         return 0.0
-    rows = np.maximum(np.abs(matrix).max(axis=1, initial=0.0), 1e-300)[:, None]
+    rows = np.maximum(np.abs(matrix).max(axis=1, initial=0.0), TINY)[:, None]
     unit = np.abs(matrix / rows).max(axis=0, initial=0.0)
     unit = 1 / np.where(unit > 0, unit, 1.0)  # of every quantity
     _, s, v = np.linalg.svd(matrix / rows * unit)

@@ -1,4 +1,5 @@
-"""Numbers that were chosen say what they are: each named constant has a comment beside it or above it."""
+"""Numbers that were chosen say what they are: each named constant has a comment beside it or above it; and those by
+which results are judged stand in one table."""
 
 import ast
 import re
@@ -60,3 +61,39 @@ def test_every_constant_has_a_comment():
 def test_what_counts_as_explained():
     source = "A = 1  # of steps\n\n# Both are times.\nB = 2.0\nC = (1, 2)\n\nD = 1e-3\nE = [0]\n\nF = 1\n"
     assert list(unexplained(source)) == ["D", "E", "F"]
+
+
+# Small numbers elsewhere belong to methods, and decide how they proceed: steps, dampings, what is asked of a solver.
+METHODS = {
+    "hybrid/search": "where an interval is cut, and where the search in it ends",
+    "initialization/ladder": "the shortest step along a curve; the least gain",
+    "judgement/sparse_rank": "a shift for inverse iteration",
+    "linear/sparse": "what stands for a zero in a factorization",
+    "model/consistent_point": "where an iteration ends",
+    "simulation/arguments": "sample times that lie outside the interval by their rounding",
+    "simulation/solution": "tolerances of a run, by default",
+    "simulation/step_sizes": "first steps",
+    "solvers/solve": "tolerances of a run, by default",
+}
+APART = {"learning", "library", "modeling", "plotting", "testing", "units"}  # they judge no solution of equations
+JUDGING = 1e-7  # a relative number below is no step, share or damping, in all but METHODS
+
+
+def small_numbers(source: str) -> list[float]:
+    numbers = [node.value for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Constant)]
+    return [v for v in numbers if isinstance(v, float) and 0 < abs(v) <= JUDGING]
+
+
+def test_what_judges_results_stands_in_one_table():
+    found = set()
+    for path in sorted(ROOT.rglob("*.py")):
+        name = path.relative_to(ROOT).with_suffix("").as_posix()
+        if name.split("/")[0] not in APART | {"tolerances"} and small_numbers(path.read_text()):
+            found.add(name)
+    assert found == set(METHODS), "thresholds go into tolerances.py, with what they rest on"
+
+
+def test_the_table_is_short():
+    source = (ROOT / "tolerances.py").read_text()
+    assert len(list(constants(source))) <= 30
+    assert not list(unexplained(source))

@@ -10,9 +10,9 @@ import jaxonomy_dae
 
 ROOT = Path(jaxonomy_dae.__file__).parent
 ORDER = [
-    "errors", "optional", "aliases", "private_names", "programs", "expressions", "units", "modeling", "structure",
-    "judgement", "linear", "adjoint", "solvers", "hybrid", "model", "diagnosis", "compiler", "lowering", "system",
-    "initialization", "simulation", "learning", "analysis", "plotting", "testing", "library",
+    "errors", "optional", "aliases", "tolerances", "private_names", "programs", "expressions", "units", "modeling",
+    "structure", "judgement", "linear", "adjoint", "solvers", "hybrid", "model", "diagnosis", "compiler", "lowering",
+    "system", "initialization", "simulation", "learning", "analysis", "plotting", "testing", "library",
 ]  # fmt: skip
 # Methods that hand over to a room above their own, when they are called.
 DEFERRED = {("system", "initialization"), ("simulation", "plotting"), ("analysis", "plotting")}

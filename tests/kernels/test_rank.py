@@ -6,10 +6,11 @@ import pytest
 import scipy.sparse as sp
 import sympy
 
-from jaxonomy_dae.expressions.errors import KNOWN, ROUNDING, KernelWithErrors
+from jaxonomy_dae.expressions.errors import KernelWithErrors
 from jaxonomy_dae.expressions.from_sympy import read
 from jaxonomy_dae.judgement.rank import rank_of, rounding
 from jaxonomy_dae.judgement.sparse_rank import sparse_rank_of
+from jaxonomy_dae.tolerances import EPS, KNOWN
 
 X, Y, Z = symbols = sympy.symbols("x y z")
 EXPRESSIONS = [
@@ -41,8 +42,8 @@ def test_bounds_hold(expression, size):
         with mpmath.workdps(40):
             true = sympy.lambdify(symbols, expression, "mpmath")(*map(mpmath.mpf, exact))
             # Beyond the first order there are squares of errors: 1e-18 here, times a curvature.
-            assert abs(mpmath.mpf(float(value)) - true) <= 2 * float(bound) + 2 * ROUNDING + 1e3 * size**2
-        assert bound <= 1e3 * (size + ROUNDING) * (1 + abs(value)) * 10
+            assert abs(mpmath.mpf(float(value)) - true) <= 2 * float(bound) + 2 * EPS + 1e3 * size**2
+        assert bound <= 1e3 * (size + EPS) * (1 + abs(value)) * 10
 
 
 @pytest.mark.parametrize(
@@ -52,7 +53,7 @@ def test_bounds_hold(expression, size):
         (X - Y, (0.3, 0.1 + 0.2)),
         (sympy.sin(X), (np.pi,)),
         (sympy.cos(X), (-7.5 * np.pi,)),
-        (sympy.sin(X), (4 * ROUNDING,)),
+        (sympy.sin(X), (4 * EPS,)),
         (X * sympy.sin(Y) * Z, (1e12, 2 * np.pi, 1e-3)),
         (1 - sympy.tanh(X) ** 2, (40.0,)),
         (X * X - Y, (1.1, 1.1**2)),
