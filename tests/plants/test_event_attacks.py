@@ -6,6 +6,7 @@ right to rounding and to the search for events, a few 1e-12.
 
 import functools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -220,6 +221,29 @@ def test_modes_that_contradict_the_other_equations():
 
     with pytest.raises(SimulationError, match=r"t=1: no mode is consistent there, 'c: when\(.* are true in turn"):
         simulate(model(write), 3.0, ts=jnp.array([3.0]))
+
+
+@pytest.mark.long("a run is compiled")
+def test_an_input_that_jumps_over_a_level_at_which_it_was():
+    """A guard that rests at zero and has jumped when the step begins falls, though it does not fall on: two clutches
+    pressed by a step from zero were pressed when the next event came, 0.16 s later, without a word."""
+
+    def write(self, ev):
+        x, u, on = self.variable("x", start=0.0, fixed=True), self.input("u"), self.discrete("on", start=0)
+        self.add_equations(Eq(der(x), on))
+        self.when(u > 0, assign(on, 1), on=Eq(on, 0))
+
+    system = model(write)
+
+    def reached(case):
+        before, after, rate = case
+        u = lambda t: jnp.where(t < 0.4, before, after + rate * (t - 0.4))  # noqa: E731
+        return simulate(system, 1.0, ts=jnp.array([1.0]), inputs={"c.u": u}, jump_ts=0.4)["c.x"][0]
+
+    # Values before and after it, and the rate after it.
+    cases = jnp.array([[0, 1, 0], [0, 1, -1], [0, 1, 1], [0, 1e-9, 0], [-1, 1, 0], [0, 0, 0], [0, -1, 1]])
+    found = jax.lax.map(reached, cases)
+    np.testing.assert_allclose(found, [0.6, 0.6, 0.6, 0.6, 0.6, 0.0, 0.0], atol=1e-9)
 
 
 @pytest.mark.parametrize("left", [pytest.param("a corner", marks=pytest.mark.slow), "a ramp"])
