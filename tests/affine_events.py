@@ -136,6 +136,7 @@ class Affine(AbstractHybridProblem):
     )
     revocable: tuple[bool, ...] = eqx.field(static=True, default=tuple(k >= CLOCKS + RELATION for k in range(EVENTS)))
     relations: tuple[bool, ...] = eqx.field(static=True, default=tuple(k >= CLOCKS + RELATION for k in range(EVENTS)))
+    strict: tuple[bool, ...] = eqx.field(static=True, default=(False,) * EVENTS)
     choices: tuple[int, ...] = eqx.field(static=True, default=())
     choice_guards: tuple[int, ...] = eqx.field(static=True, default=())
     only_kinks: bool = eqx.field(static=True, default=False)

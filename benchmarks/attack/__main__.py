@@ -56,6 +56,7 @@ def arguments(given: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--minutes", type=minutes, help="draw from all families in turn, for so long")
     parser.add_argument("--family", type=families, help=f"all, or of {', '.join(FAMILIES)}")
     parser.add_argument("--seed", type=natural, help="default: from the clock, with --minutes; else 0")
+    parser.add_argument("--processes", type=natural, default=2, help="with --minutes: so many, beside each other")
     parser.add_argument("--count", type=natural, default=100, help="models of each family, without --minutes")
     parser.add_argument("--moving", type=natural, default=0, help="integrate every so many-th model too (0: none)")
     parser.add_argument(
@@ -76,6 +77,8 @@ def arguments(given: list[str] | None = None) -> argparse.Namespace:
             parser.error(f"the family '{name}' cannot be rescaled")
     if out.seed is None:
         out.seed = 0 if out.minutes is None else int(time.time()) % 100_000
+    if not out.processes:
+        parser.error("at least 1 process is needed")
     if out.minutes is None and not out.count:
         parser.error("a count of at least 1 is needed")
     if PUBLISHED in out.family and out.minutes is None and not out.units:
@@ -116,7 +119,8 @@ def main() -> int:
     os.environ["JAX_ENABLE_X64"] = "1"
     if given.minutes is not None:
         print(f"seed {given.seed}, {given.minutes:g} minutes", flush=True)
-        return 0 if attack(draws(given.family, given.seed), given.minutes, lambda text: print(text, flush=True)) else 1
+        drawn, tell = draws(given.family, given.seed), lambda text: print(text, flush=True)
+        return 0 if attack(drawn, given.minutes, tell, given.processes, given.refusals) else 1
     print(HEAD, flush=True)
     return 0 if all([counted(family, given) for family in given.family]) else 1
 

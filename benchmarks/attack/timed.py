@@ -12,7 +12,6 @@ from multiprocessing.connection import Connection
 from .draws import Draw
 from .outcome import GOOD, HEAD, Outcome, row
 
-PROCESSES = 2
 KEPT = 10  # models whose compiled programs a process keeps
 # A model that is late is stopped where Python runs; one that XLA compiles for ever, after as many seconds of processor
 # time, with its process.
@@ -69,9 +68,12 @@ class Worker:
         self.process.join()
 
 
-def attack(draws: Iterator[Draw], minutes: float, tell: Callable[[str], None]) -> bool:
-    """Judges models until the time is spent, and tells of each that is not right or truly refused, and then all counts.
-    Returns whether there was none."""
+def attack(
+    draws: Iterator[Draw], minutes: float, tell: Callable[[str], None], processes: int = 2, refusals: bool = False
+) -> bool:
+    """Judges models by so many `processes` until the time is spent, and tells of each that is not right or truly
+    refused, with `refusals` of those refused as well, and then all counts. Returns whether all were right or truly
+    refused."""
     end = time.monotonic() + 60 * minutes
     lock = threading.Lock()
     outcomes: dict[str, list[tuple[int, Outcome]]] = collections.defaultdict(list)
@@ -85,12 +87,12 @@ def attack(draws: Iterator[Draw], minutes: float, tell: Callable[[str], None]) -
                 note, outcome = worker.judged(draw)
                 with lock:
                     outcomes[draw.row].append((draw.seed, outcome))
-                    if outcome.kind not in GOOD:
+                    if outcome.kind not in GOOD or (refusals and outcome.kind == "refused"):
                         tell(f"{outcome.kind}: {draw.row} ({note}): {outcome.text[:600]}\n    {draw.command}")
         finally:
             worker.stop()
 
-    threads = [threading.Thread(target=work) for _ in range(PROCESSES)]
+    threads = [threading.Thread(target=work) for _ in range(processes)]
     for thread in threads:
         thread.start()
     for thread in threads:

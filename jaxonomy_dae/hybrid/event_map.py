@@ -115,7 +115,7 @@ def handle(
         is_clock = event < c
         k = jnp.clip(event - c, 0, max(g - 1, 0))
         delay = rate = jnp.zeros_like(t)
-        rose = jnp.zeros((g,), bool)
+        rose = onto = jnp.zeros((g,), bool)
         if at_start and g:
             rate = arrival.rate[k]
         elif g:
@@ -125,6 +125,8 @@ def handle(
             # What has just risen to zero would be above it but for this event: it falls if the event turns it back. A
             # relation has an opposite, which falls then.
             rose = (state.armed == BELOW) & _is_zero(value, rates, arrival) & (rates > 0) & ~relations[c:]
+            # What has jumped onto zero and does not move there is true unless it is strict.
+            onto = arrival.jumped & (value == 0) & (rates == 0) & ~jnp.asarray(problem.strict[c:], bool)
             crossing = -values[k] / jnp.where(rate == 0, 1.0, rate)
             # Where another event has made the guard slow, rounding is all that is left of its value.
             frozen = lax.stop_gradient(crossing)
@@ -143,7 +145,7 @@ def handle(
         moved = jnp.any(x != reached) & ~relations[event]
         approach = jnp.where(instant.caused[k] | at_start, 0.0, rate) if g else rate
         new, after, slow, armed, left, caused, stuck = _following(
-            problem, t, x, new, instant, event, arrival, delay, moved, approach, rose, args
+            problem, t, x, new, instant, event, arrival, delay, moved, approach, rose, onto, args
         )
         turns = state.turns + (~is_clock).astype(t.dtype)
         slides = ~is_clock & (turns > SLIDES + TURNS * g)
@@ -199,16 +201,16 @@ def _is_zero(value: Any, rate: Any, arrival: Arrival) -> Any:
     return jnp.abs(value) <= jnp.maximum(rounding(arrival.size), _within(rate, arrival))
 
 
-def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, delay, moved, approach, rose, args):
+def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, delay, moved, approach, rose, onto, args):
     """The situation after an event.
 
     `moved` says whether the event wrote states, `approach` how fast its guard fell before, or zero. Where the equations
     are singular with q, as where a switch closes onto a diode that conducts, modes that are chosen by their conditions
     change along with it: to the first ones of `_alternatives` that hold.
 
-    `rose` says which guards had risen to zero before the event. Returns (q, dx/dt, the states whose slope hardly
-    changes during the delay, the sides of the guards, events left, guards that an event made true, guards that are
-    stuck); only q is differentiated.
+    `rose` says which guards had risen to zero before the event, `onto` which had jumped onto it. Returns (q, dx/dt, the
+    states whose slope hardly changes during the delay, the sides of the guards, events left, guards that an event made
+    true, guards that are stuck); only q is differentiated.
     """
     c, g = problem.n_clocks, problem.n_guards
     left = instant.left & ~one_hot(event, c + g)
@@ -272,7 +274,8 @@ def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, dela
     # decides. One that seems to fall by rounding alone is waited for: if it does fall, the next step finds it.
     flat = is_flat(value, rate)
     falling = jnp.where(flat, 0.5 * (rate + rate_ahead), rate)
-    true = jnp.where(zero, falling * arrival.span < -band, value < 0)
+    stays = left[c:] & onto & (value == 0)
+    true = jnp.where(zero, (falling * arrival.span < -band) | stays, value < 0)
     was_armed = ((instant.state.armed > 0) & ~here) | (turns_back & (event >= c)) | (rose & ~here)
     # What this event made true happens next. What was to happen does so, though a state starts anew: unless what was
     # assigned makes its condition false, or it is revocable and undone.

@@ -125,9 +125,15 @@ def _met(problem, dense, t0, t1, y0: HybridState, x1, args, times, values, off, 
     armed = above | (y0.armed == RESTS)
     raised = jnp.where((y0.armed == RESTS) & ~above, band, 0.0)  # what rests falls where it leaves the band
     values = values + raised
-    # One may also reach zero and stay; and what rests may begin below the band, by rounding, and rise.
-    below = (values[1:] < 0) & (above[:-1] | (values[1:] < values[:-1]))
-    crossed = armed[:-1] & (below | ((values[1:] == 0) & (values[:-1] > 0)))
+    # What rests may have been left below the band, by no more than rounding or the window, and rise: what is farther
+    # below has jumped, as an input does where a step begins.
+    rise = (values[1:] - values[:-1]) / (h * jnp.asarray(np.diff(LOOKS), values.dtype)[:, None])
+    left_there = jnp.maximum(band, jnp.minimum(rise * window, CLOSE * size))
+    below = (values[1:] < 0) & (above[:-1] | (rise <= 0) | (values[1:] < -left_there))
+    # One may also reach zero and stay; or have jumped there, which makes a condition true if it is not strict.
+    strict = np.array(problem.strict[problem.n_clocks :], bool)
+    stays = (values[1:] == 0) & ((values[:-1] > 0) | ((values[:-1] == 0) & above[:-1] & ~strict))
+    crossed = armed[:-1] & (below | stays)
     last = values[-1]
 
     def reaches_zero(rate):

@@ -29,6 +29,7 @@ class AbstractHybridProblem(eqx.Module):
     noted: eqx.AbstractVar[tuple[bool, ...]]  # which are counted and listed
     revocable: eqx.AbstractVar[tuple[bool, ...]]  # which another event may undo before they happen
     relations: eqx.AbstractVar[tuple[bool, ...]]  # which say what a relation is, from the initial time on
+    strict: eqx.AbstractVar[tuple[bool, ...]]  # whose conditions are false where their guards are zero
     opposite: eqx.AbstractVar[tuple[int, ...]]  # of each guard: the one that falls where its relation turns back, or −1
     choices: eqx.AbstractVar[tuple[int, ...]]  # discrete values, 0 or 1, that their conditions choose, …
     choice_guards: eqx.AbstractVar[tuple[int, ...]]  # … which hold while these guards are not negative

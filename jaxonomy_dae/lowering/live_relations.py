@@ -130,6 +130,6 @@ def _without(table: EventTable, gone: np.ndarray) -> EventTable:
     number_of = np.cumsum(kept) - 1
     return EventTable(
         of(table.text), table.guard[kept], of(table.clocks), of(table.message), of(table.noted), of(table.revocable),
-        of(table.relation), of(table.kink), of(table.immediate), number_of[table.event[rows]], table.state[rows],
-        table.discrete[rows], table.value[rows], table.constant[rows], table.left_alone,
+        of(table.relation), of(table.kink), of(table.strict), of(table.immediate), number_of[table.event[rows]],
+        table.state[rows], table.discrete[rows], table.value[rows], table.constant[rows], table.left_alone,
     )  # fmt: skip

@@ -227,6 +227,7 @@ def _digest(
         e.revocable,
         e.relation,
         e.kink,
+        e.strict,
         e.immediate,
         e.event,
         e.state,

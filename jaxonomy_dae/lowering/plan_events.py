@@ -153,7 +153,8 @@ def _in_order(table: EventTable, reads: list[set[int]]) -> EventTable:
     return dataclasses.replace(
         table, text=moved(table.text), guard=table.guard[everything], clocks=tuple(table.clocks[e] for e in order),
         message=moved(table.message), noted=moved(table.noted), revocable=moved(table.revocable),
-        relation=moved(table.relation), kink=moved(table.kink), immediate=moved(table.immediate),
+        relation=moved(table.relation), kink=moved(table.kink), strict=moved(table.strict),
+        immediate=moved(table.immediate),
         event=place[table.event] if len(table.event) else table.event,
     )  # fmt: skip
 

@@ -203,6 +203,7 @@ class EventTable:
     revocable: tuple[bool, ...]  # whether another event at the same instant may undo it before it happens
     relation: tuple[bool, ...]  # whether an event says what a relation is, from the initial time on
     kink: tuple[bool, ...]  # whether equations as written go on with the same values there
+    strict: tuple[bool, ...]  # whether its condition is false where its guard is zero
     immediate: tuple[bool, ...]  # whether an event happens at the initial time, if its condition holds there
     event: np.ndarray  # (actions,)
     state: np.ndarray  # (actions,): the variable that starts anew, or −1
@@ -216,7 +217,7 @@ class EventTable:
 
 
 _NONE = np.zeros(0, np.int64)
-NO_EVENTS = EventTable((), _NONE, (), (), (), (), (), (), (), _NONE, _NONE, _NONE, _NONE, np.zeros(0))
+NO_EVENTS = EventTable((), _NONE, (), (), (), (), (), (), (), (), _NONE, _NONE, _NONE, _NONE, np.zeros(0))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,7 +7,18 @@ import sympy
 from ..errors import ModelError
 from ..expressions.from_sympy import symbols_of
 from .environment import EqnEnv
-from .events import Action, Assign, Reinit, Sampled, Terminate, When, guard_of, relation_in_discretes, while_on
+from .events import (
+    Action,
+    Assign,
+    Reinit,
+    Sampled,
+    Terminate,
+    When,
+    guard_of,
+    is_strict,
+    relation_in_discretes,
+    while_on,
+)
 from .symbols import DiscreteSymbol, PreviousSymbol, RelationSymbol, VariableSymbol
 
 
@@ -130,7 +141,19 @@ class EventDeclarations:
             raise ModelError(f"{where}: on= is for conditions on variables; a sampled event always happens")
         values = self._values(actions, number, where)
         self.events.append(
-            When(shown, guard, clock, tuple(actions), values, immediate, noted, revocable, relation, kink)
+            When(
+                shown,
+                guard,
+                clock,
+                tuple(actions),
+                values,
+                immediate,
+                noted,
+                revocable,
+                relation,
+                kink,
+                is_strict(condition),
+            )  # fmt: skip
         )
 
     def _hidden(self, name: str, expression: sympy.Expr) -> str:

@@ -55,7 +55,7 @@ class When:
     time, too, if its condition holds there; one that is not `noted` only says that equations change. One that is
     `revocable` does not happen if another event at the same instant has made its condition false again. A `relation`
     says what a hidden discrete variable is, from the initial time on; it is a `kink` if equations go on with the same
-    values where it turns."""
+    values where it turns. A `strict` condition is false where its guard is zero."""
 
     text: str
     guard: str | None
@@ -67,6 +67,7 @@ class When:
     revocable: bool = False
     relation: bool = False
     kink: bool = False
+    strict: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,6 +167,15 @@ def guard_of(condition: Any, where: str) -> sympy.Expr:
     if isinstance(condition, sympy.GreaterThan | sympy.StrictGreaterThan):
         return relation.rhs - relation.lhs
     return _refused(condition, where)
+
+
+def is_strict(condition: Any) -> bool:
+    """True for conditions with a relation that is false where its sides are equal; False for clocks."""
+    if isinstance(condition, sympy.Not):
+        return is_strict(to_nnf(condition))
+    if isinstance(condition, sympy.And | sympy.Or):
+        return any(is_strict(c) for c in condition.args)
+    return isinstance(condition, sympy.StrictLessThan | sympy.StrictGreaterThan)
 
 
 def while_on(guard: sympy.Expr, condition: Any) -> sympy.Expr:

@@ -39,6 +39,7 @@ class SystemProblem(AbstractHybridProblem):
     noted: tuple[bool, ...] = eqx.field(static=True)
     revocable: tuple[bool, ...] = eqx.field(static=True)
     relations: tuple[bool, ...] = eqx.field(static=True)
+    strict: tuple[bool, ...] = eqx.field(static=True)
     opposite: tuple[int, ...] = eqx.field(static=True)
     choices: tuple[int, ...] = eqx.field(static=True)
     choice_guards: tuple[int, ...] = eqx.field(static=True)
@@ -159,6 +160,7 @@ def problem_for(
         noted=events.table.noted,
         revocable=events.table.revocable,
         relations=events.table.relation,
+        strict=events.table.strict,
         opposite=_opposite(events.table, events.n_clocks),
         choices=choices,
         choice_guards=choice_guards,

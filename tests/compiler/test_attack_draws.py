@@ -24,6 +24,7 @@ from sympy import Float, Symbol
         (["--minutes", "1", "--family", "pumps"], "there is no family 'pumps'; there are resistors, circuits,"),
         (["--family", "events", "--units", "all"], "the family 'events' cannot be rescaled"),
         (["--family", "published"], "needs --units"),
+        (["--minutes", "1", "--processes", "0"], "at least 1 process is needed"),
     ],
 )
 def test_what_cannot_be_meant(capsys, given, said):

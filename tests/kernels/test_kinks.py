@@ -37,6 +37,7 @@ class Stop(AbstractHybridProblem):
     noted: tuple[bool, ...] = eqx.field(static=True, default=(False, False))
     revocable: tuple[bool, ...] = eqx.field(static=True, default=(True, True))
     relations: tuple[bool, ...] = eqx.field(static=True, default=(True, True))
+    strict: tuple[bool, ...] = eqx.field(static=True, default=(True, False))
     opposite: tuple[int, ...] = eqx.field(static=True, default=(1, 0))
     choices: tuple[int, ...] = eqx.field(static=True, default=())
     choice_guards: tuple[int, ...] = eqx.field(static=True, default=())

@@ -6,6 +6,7 @@ right to rounding and to the search for events, a few 1e-12.
 
 import functools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -220,6 +221,46 @@ def test_modes_that_contradict_the_other_equations():
 
     with pytest.raises(SimulationError, match=r"t=1: no mode is consistent there, 'c: when\(.* are true in turn"):
         simulate(model(write), 3.0, ts=jnp.array([3.0]))
+
+
+def conditions_on_an_input():
+    def write(self, ev):
+        x, y, u = self.variable("x", start=0.0, fixed=True), self.variable("y", start=0.0, fixed=True), self.input("u")
+        self.add_equations(Eq(der(x), sympy.Piecewise((1, u > 0), (0, True))))
+        self.add_equations(Eq(der(y), sympy.Piecewise((1, u >= 0), (0, True))))
+        for k, condition in enumerate((u > 0, u >= 0, u < 0, u <= 0)):
+            n = self.discrete(f"n{k}", start=0)
+            self.when(condition, assign(n, pre(n) + 1))
+
+    return model(write)
+
+
+def seen(solution):
+    return jnp.stack([solution[f"c.{name}"][0] for name in ("x", "y", "n0", "n1", "n2", "n3")])
+
+
+def truths(u):
+    return np.array([u > 0, u >= 0, u < 0, u <= 0], float)
+
+
+@pytest.mark.long("a run is compiled")
+def test_an_input_that_jumps_over_a_level_or_onto_it():
+    """A guard that has jumped when the step begins does not fall any more. Clutches pressed by a step from 0 were
+    pressed when the next event came, 0.16 s later, and what was on while u > 0 stayed on for u = 0, without a word."""
+    system = conditions_on_an_input()
+
+    def reached(case):
+        before, after, rate = case
+        u = lambda t: jnp.where(t < 0.4, before, after + rate * (t - 0.4))  # noqa: E731
+        return seen(simulate(system, 1.0, ts=jnp.array([1.0]), inputs={"c.u": u}, jump_ts=0.4))
+
+    cases = np.array([(a, b, r) for a in (-1, 0, 1) for b in (-1, 0, 1) for r in (-1, 0, 1) if b or not r], float)
+    cases = np.vstack([cases, [0, 1e-9, 0]])
+    sides = truths(cases[:, 0]), truths(cases[:, 1])
+    happened = (1 - sides[0]) * sides[1]
+    happened[[1, 3]] += (cases[:, 0] == 0) * sides[1][[0, 2]]  # what was at zero falls where it leaves zero
+    known = np.vstack([(0.4 * sides[0] + 0.6 * sides[1])[:2], happened]).T
+    np.testing.assert_allclose(jax.lax.map(reached, jnp.asarray(cases)), known, atol=1e-9)
 
 
 @pytest.mark.parametrize("left", [pytest.param("a corner", marks=pytest.mark.slow), "a ramp"])

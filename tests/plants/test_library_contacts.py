@@ -377,7 +377,7 @@ def test_a_run_that_cannot_begin_in_its_mode(bob):
 @pytest.mark.slow
 def test_a_run_that_begins_beyond_a_stop():
     stop = falling(HardStop(EqnEnv(), "stop"), height=-0.5)
-    with pytest.raises(SimulationError, match="began a mode whose constraint is far from what it asks for"):
+    with pytest.raises(SimulationError, match="entered a mode whose constraint does not hold at that instant"):
         simulate(stop, 1.0)
 
 
