@@ -27,9 +27,9 @@ from ..errors import InitializationError, ModelError, SimulationError, nearest
 from .coordinates import coordinates
 from .data import Stacked
 from .estimate import Estimate
+from .experiment import Planned
 from .identifiability import natural_scale
 from .objective import Objective
-from .planned import Planned
 from .program import Layout, predict_and_differentiate
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from ..errors import ModelError, SimulationError
 from .design import informations, known_of
 from .estimate import Estimate
-from .planned import Planned
+from .experiment import Planned
 
 if TYPE_CHECKING:
     from .problem import Problem

@@ -16,6 +16,7 @@ All candidates are one program: which terms count is an argument of it.
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -29,12 +30,10 @@ from jaxtyping import Array, Float
 from ..errors import ModelError, SimulationError, nearest
 from ..programs.cache import compiled
 from ..system.system import AcausalSystem
-from .beam_search import beam_search
 from .blocks import Block, block_of, inputs_seen
-from .closed_form import ClosedForm
 from .libraries import Library
 from .table import Row, Table
-from .term import AbstractTerm
+from .term import AbstractTerm, ClosedForm
 
 if TYPE_CHECKING:
     from .estimate import Estimate
@@ -281,3 +280,24 @@ def _refitted(
         bounds={c.names[k]: (float(c.low[k]), float(c.high[k])) for k in numbers},
         freeze=frozen,
     )
+
+
+def beam_search(
+    score: Callable[[tuple[int, ...]], float], count: int, width: int, most: int
+) -> dict[tuple[int, ...], float]:
+    """The scores of all subsets that were looked at, ascending tuples of 0, …, count − 1; less is better.
+
+    All subsets of one; then, from the `width` best subsets of k, all of k + 1 that contain one of them; until none of a
+    size is better than the best of all smaller ones, or `most` are in.
+    """
+    found: dict[tuple[int, ...], float] = {}
+    level: list[tuple[int, ...]] = [(k,) for k in range(count)]
+    while level:
+        best = min(found.values(), default=float("inf"))
+        scores = {subset: score(subset) for subset in level}
+        found |= scores
+        if len(level[0]) >= most or not min(scores.values()) < best:
+            break
+        beam = sorted(scores, key=lambda s: (scores[s], s))[:width]
+        level = sorted({tuple(sorted((*s, k))) for s in beam for k in range(count) if k not in s})
+    return found

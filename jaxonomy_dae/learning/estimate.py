@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from ..errors import ModelError, nearest
 from ..system.system import AcausalSystem
-from .agreement import log_likelihood, rms_by_name
+from .agreement import Whiteness, log_likelihood, rms_by_name, whiteness
 from .band import Band, band, explored
 from .descent import Minimum
 from .discovery import Discovery, discover
@@ -19,15 +19,13 @@ from .factors import Factors
 from .figures import plot_correlations, plot_history, plot_residuals, plot_runs
 from .holdout import holdout_score, with_own_starts
 from .identifiability import Identifiability, identifiability, spreads
-from .intervals import intervals
+from .intervals import intervals, profile
 from .objective import Objective
 from .prediction import Prediction, at_samples, prediction
-from .profile import profile
 from .program import with_values
 from .smoothing import followed
 from .table import Table
 from .training import Training
-from .whiteness import Whiteness, whiteness
 
 if TYPE_CHECKING:
     from .posterior import Posterior

@@ -27,8 +27,8 @@ from ..system.evaluate import Refinement
 from ..system.input_values import by_entry
 from ..system.inputs import read_inputs, value_at
 from ..system.system import AcausalSystem
-from .diffusion import affine_flow, linear_flow
 from .filtering import Structure
+from .linear_models import affine_flow, linear_flow
 from .program import Layout, outputs_of, placed, with_kinds
 
 ITERATIONS = 4  # Gauss–Newton steps onto the constraints after a correction, which converge quadratically

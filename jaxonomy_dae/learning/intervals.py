@@ -1,13 +1,70 @@
-"""Linear intervals of what was estimated, as a table."""
+"""Intervals of what was estimated: linear ones, and those of the profile likelihood (Venzon & Moolgavkar 1988, Applied
+Statistics 37:87)."""
 
+import dataclasses
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.optimize
+import scipy.stats
 
 from .table import Row, Table
 
 if TYPE_CHECKING:
     from .estimate import Estimate
+
+FURTHEST = 10  # doublings of the linear interval before an end counts as infinite
+
+
+def profile(estimate: "Estimate", position: int, level: float) -> tuple[float, float]:
+    """The interval of one coordinate, in natural values."""
+    objective, minimum = estimate.objective, estimate.minimum
+    c = objective.coordinates
+    allowed = 0.5 * float(scipy.stats.chi2.ppf(level, 1))
+    held = np.array(c.fixed)
+    held[position] = True
+    free = objective.free
+    others = np.flatnonzero(np.flatnonzero(free) != position)
+    weights = dataclasses.replace(
+        minimum.weights, precision=minimum.weights.precision[others], mean=minimum.weights.mean[others]
+    )
+    own = int(np.flatnonzero(np.flatnonzero(free) == position)[0])
+    prior, mean = minimum.weights.precision[own], minimum.weights.mean[own]
+    best = estimate.minimum.cost
+    warm = [minimum.z[others]]
+
+    def excess(z: float) -> float:
+        """By how much the cost exceeds the allowed one when the coordinate is held at z and everything else is
+        fitted."""
+        start = np.array(c.start)
+        start[free] = c.natural(estimate.point)[free]
+        start[position] = c.natural_at(position, z)
+        at = dataclasses.replace(objective, coordinates=dataclasses.replace(c, start=start, fixed=held))
+        own_cost = 0.5 * prior * (z - mean) ** 2
+        reached = estimate.problem.reach(at, warm[0], weights)
+        cost = np.inf if reached is None else reached.cost
+        if reached is not None:
+            warm[0] = reached.z
+        return min(cost + own_cost - best, 1e6) - allowed
+
+    centre, spread = float(estimate.point[position]), float(estimate.spread[position])
+    ends = []
+    for sign, bound in zip((-1, 1), (b[position] for b in c.z_bounds), strict=True):
+        warm[0] = minimum.z[others]
+        step = spread if np.isfinite(spread) and spread > 0 else 1.0
+        inner, z, end = centre, centre, sign * np.inf
+        for _ in range(FURTHEST):
+            z = centre + sign * 2 * step
+            z = max(z, bound) if sign < 0 else min(z, bound)
+            if excess(z) > 0:
+                end = float(scipy.optimize.brentq(excess, inner, z, xtol=1e-3 * step))  # pyright: ignore[reportArgumentType]
+                break
+            if z == bound:
+                end = bound
+                break
+            inner, step = z, 2 * step
+        ends.append(c.natural_at(position, end))
+    return ends[0], ends[1]
 
 
 def intervals(estimate: "Estimate", level: float) -> Table:

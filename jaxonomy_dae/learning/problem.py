@@ -21,15 +21,13 @@ from .evaluation import Evaluation, Weights
 from .experiment import Experiment, Unknown
 from .filter_objective import AheadObjective, FilterObjective
 from .filtering import Extra, Filter, Innovations, Structure, structure_and_extras
-from .first_order import adam_steps
 from .holdout import holdout_score
 from .identifiability import Identifiability, identifiability
 from .multiple_shooting import Shooting, shoot
 from .objective import Objective
 from .program import Layout
-from .residuals import residuals
-from .runs import run, why_not
-from .starting_points import starting_points
+from .runs import residuals, run, why_not
+from .starting_points import adam_steps, starting_points
 from .training import GradientSteps, Training, train
 
 GROWING = tuple(k / 10 for k in range(1, 11))  # shares of the time

@@ -8,6 +8,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, overload
 
+import jax.numpy as jnp
 import numpy as np
 
 from ..modeling.interval import Interval
@@ -309,3 +310,17 @@ def provenance_of(groups: tuple[EquationGroup, ...], equation: int) -> Provenanc
     """The provenance of an equation."""
     group, place = locate(groups, equation)
     return group.provenance[place]
+
+
+def complete(dependents: Sequence[DependentParameters], array: Any) -> Any:
+    """All parameters, shape (*batch, n), with the dependent ones computed from the others; NumPy or JAX."""
+    for group in dependents:
+        given = [array[..., column] for column in group.parameter.T]
+        if isinstance(array, np.ndarray):
+            array = array.copy()
+            with np.errstate(all="ignore"):  # what is not finite is named by those who call
+                array[..., group.target] = group.template.residual([], given, [], 0.0, None, backend="numpy")
+        else:
+            value = group.template.residual([], given, [], 0.0, None)
+            array = array.at[..., group.target].set(jnp.asarray(value, array.dtype))
+    return array

@@ -23,8 +23,7 @@ from ..solvers.solve import check_tolerances, default_tolerances
 from ..solvers.solve_arguments import jump_times
 from ..solvers.switching import BOUNDARY, MANY, Watch
 from ..system.inputs import check_range, read_inputs, step_ends
-from ..system.solver_choice import Choice, implicit_choice, solver_choice
-from ..system.stiffness import fastest_decay
+from ..system.solver_choice import Choice, fastest_decay, implicit_choice, solver_choice
 from ..system.system import AcausalSystem
 from .arguments import check_arguments, check_parameters
 from .failures import explain, mode_at_start, raised

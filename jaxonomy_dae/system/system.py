@@ -16,8 +16,8 @@ from ..errors import ModelError, nearest
 from ..linear.sparse import SparseMatrix, SparsePattern, sparse_jacobian
 from ..lowering.gather import SCALARS
 from ..lowering.plan import SystemPlan
-from ..model.dependent_parameters import complete
 from ..model.pickling import functions_by_name, named_functions
+from ..model.tables import complete
 from ..model.typical_sizes import typical_sizes
 from .bounds import constrained, unconstrained
 from .evaluate import Refinement
