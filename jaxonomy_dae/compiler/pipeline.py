@@ -8,7 +8,7 @@ from ..diagnosis.structure import check_structure
 from ..diagnosis.unused_parameters import note_unused
 from ..diagnosis.wording import listed
 from ..errors import ModelError
-from ..model.coefficients import incidence
+from ..model.incidence import incidence
 from ..model.quantities import map_quantities
 from ..model.reduced import ReducedModel
 from ..model.tables import FlatModel

@@ -19,16 +19,17 @@ from ..expressions.differentiate import partial_derivative
 from ..expressions.errors import KNOWN, KernelWithErrors
 from ..expressions.node import Node, constant, number
 from ..expressions.substitute import substitute
-from ..model.coefficients import incidence
 from ..model.extended import ExtendedGroup
 from ..model.group import Group, Point
+from ..model.incidence import incidence
 from ..model.natural_sizes import natural_sizes
 from ..model.provenance import Provenance, combination
 from ..model.tables import ZERO, EquationGroup, ParameterTable, equation_offsets, provenance_of
 from ..modeling.symbols import TIME_LABEL
+from ..structure.diagonal_blocks import diagonal_blocks
 from ..structure.incidence import Incidence
 from ..structure.matching import maximum_matching
-from ..structure.pantelides import Offsets, diagonal_blocks, reduce_index
+from ..structure.pantelides import Offsets, reduce_index
 from .combine_equations import cancels_elsewhere, combine, graph_of, group_of, near, quantity_label, somewhere, tried
 from .exact_null_vectors import Row, sparsest_null_vector
 from .null_vectors import CANCELLED, left_null_vectors, rational, weights_in_parameters

@@ -13,7 +13,7 @@ from ..lowering.plan import SystemPlan
 from ..model.tables import ZERO
 from ..system.input_values import input_values
 from ..system.sections import SHOWN, Sections, some
-from .block_finding import ILL_CONDITIONED, BlockFinding
+from .condition import ILL_CONDITIONED, BlockFinding
 from .constraints_at import constraints_at
 from .initialize import InitialPoint, is_consistent
 from .ladder import FAILED, METHODS, NEAREST

@@ -6,8 +6,8 @@ import scipy.sparse as sp
 from ..judgement.sparse_rank import sparse_rank_of
 from ..lowering.plan import SystemPlan
 from ..lowering.schedule import SparseStep
-from .block_finding import DENSE_LIMIT, ILL_CONDITIONED, BlockFinding
 from .block_values import BlockValues
+from .condition import DENSE_LIMIT, ILL_CONDITIONED, BlockFinding
 
 
 def sparse_finding(plan: SystemPlan, values: BlockValues, step: SparseStep) -> BlockFinding | None:

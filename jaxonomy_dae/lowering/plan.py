@@ -21,7 +21,8 @@ from ..model.reduced import ReducedModel
 from ..model.tables import ZERO, FlatModel, provenance_of
 from . import pattern
 from .gather import Gather
-from .plan_events import EventPlan, HeldPlan
+from .plan_events import EventPlan
+from .plan_held import HeldPlan
 from .plan_waves import WaveGroup
 from .program import Program, plan
 from .schedule import TORN, AnyStep, needed

@@ -1,5 +1,4 @@
-"""How a compiled system evaluates its events, and the constraints that come and go with modes: programs for conditions
-and for what events write."""
+"""How a compiled system evaluates its events: programs for conditions and for what events write."""
 
 import dataclasses
 import graphlib
@@ -10,7 +9,7 @@ import numpy as np
 from ..errors import ModelError
 from ..model.extended import Extended
 from ..model.quantities import QuantityMap
-from ..model.tables import ZERO, DependentParameters, EventTable, FlatModel, HeldTable
+from ..model.tables import ZERO, DependentParameters, EventTable, FlatModel
 from .gather import NOTHING, Gather
 from .program import Program
 from .schedule import AnyStep
@@ -181,28 +180,3 @@ def _following(flat: FlatModel) -> tuple[DependentParameters, ...]:
             moved[group.target[rows]] = True
             found.append(DependentParameters(group.template, group.target[rows], group.parameter[rows]))
     return tuple(found)
-
-
-@dataclasses.dataclass(frozen=True)
-class HeldPlan:
-    """The branches of `either` that are differentiated, as `table` lists them."""
-
-    table: HeldTable
-    active_program: Program
-    active: Gather
-    level_program: Program
-    level: Gather
-    force_program: Program
-    force: Gather
-    last: np.ndarray  # (held,): the level of each that jumps
-
-
-def plan_held(table: HeldTable, variables: QuantityMap, program: Callable[[np.ndarray], Program]) -> HeldPlan | None:
-    """Plans the constraints of a model; `program` makes the program that computes chosen quantities. None if it has
-    none."""
-    if not len(table):
-        return None
-
-    last = np.searchsorted(table.owner, np.arange(len(table)), side="right") - 1
-    active, level, force = (read_variables(variables, v, program) for v in (table.active, table.level, table.force))
-    return HeldPlan(table, *active, *level, *force, last)

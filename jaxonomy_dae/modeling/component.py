@@ -15,12 +15,10 @@ from .declarations import START, Account, Learned, Parameter, Variable, full_nam
 from .environment import EqnEnv
 from .equations import residual_of
 from .events import HeldBranch, When
-from .functions import of_scalars
 from .interval import Interval, as_interval
-from .kinds import check_kind
 from .mode_declarations import ModeDeclarations
 from .names import check_name
-from .networks import count_outputs
+from .networks import check_kind, count_outputs, of_scalars
 from .ports import Domain, Port
 from .real_number import real_number
 from .symbols import DiscreteSymbol, ParameterSymbol, PreviousSymbol, TimeSymbol, VariableSymbol

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..aliases import Inputs, State, Time
-from ..initialization.block_finding import BlockFinding
+from ..initialization.condition import BlockFinding
 from ..initialization.singular_blocks import examine_blocks
 from ..lowering.schedule import AnyStep, StepEquation
 from ..model.group import Point

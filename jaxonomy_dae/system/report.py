@@ -6,7 +6,7 @@ import numpy as np
 
 from ..diagnosis.wording import counted
 from ..lowering.plan import SystemPlan
-from ..model.coefficients import incidence
+from ..model.incidence import incidence
 from ..model.tables import provenance_of
 from ..structure.pantelides import Offsets, reduce_index
 from .event_report import clock_events, condition_events, discrete_starts, mode_equations, relation_events

@@ -17,7 +17,8 @@ from ..linear.whole import solve_whole
 from ..linear.written_out import UNROLLED, solve, solve_dense
 from ..lowering.gather import SCALARS, Gather, entries, take, times
 from ..lowering.plan import ConstraintGroup, PlannedRow, SystemPlan
-from ..lowering.plan_events import EventPlan, HeldPlan
+from ..lowering.plan_events import EventPlan
+from ..lowering.plan_held import HeldPlan
 from ..lowering.program import Program
 from ..model.networks import Networks
 from ..model.tables import Start

@@ -10,8 +10,7 @@ from jaxonomy_dae.compiler.null_vectors import cancels, left_null_vectors
 from jaxonomy_dae.errors import StructuralError
 from jaxonomy_dae.expressions.functions import apply
 from jaxonomy_dae.expressions.node import constant, leaf, linear, power, scale
-from jaxonomy_dae.initialization.block_finding import ILL_CONDITIONED
-from jaxonomy_dae.initialization.condition import conditions
+from jaxonomy_dae.initialization.condition import ILL_CONDITIONED, conditions
 from jaxonomy_dae.judgement.rank import rank_of, rounding
 from jaxonomy_dae.judgement.scaling import geometric_scales
 
