@@ -1,16 +1,14 @@
 """How well an estimate agrees with its data: errors by name, the likelihood, and whether residuals look like noise."""
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.stats
 from jaxtyping import Float
 
+from .descent import Minimum
 from .likelihood import Likelihood
-
-if TYPE_CHECKING:
-    from .estimate import Estimate
+from .objective import Objective
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,9 +33,8 @@ def whiteness(residual: Float[np.ndarray, " n"]) -> Whiteness:
     return Whiteness(float(rho[0]), float(scipy.stats.chi2.sf(statistic, lags)))
 
 
-def log_likelihood(estimate: "Estimate") -> float:
+def log_likelihood(objective: Objective, m: Minimum) -> float:
     """As `Estimate.log_likelihood`."""
-    m, objective = estimate.minimum, estimate.objective
     count = objective.stacked.weight[objective.rows[0]]
     none = np.zeros_like(m.z)
     cost = dataclasses.replace(m.weights, precision=none, mean=none).cost(m.z, m.found.residual)
@@ -46,13 +43,13 @@ def log_likelihood(estimate: "Estimate") -> float:
     return logs - cost - 0.5 * float(np.sum(count) * np.log(2 * np.pi))
 
 
-def rms_by_name(estimate: "Estimate") -> dict[str, dict[str, float]]:
+def rms_by_name(objective: Objective, m: Minimum, point: Float[np.ndarray, " p"]) -> dict[str, dict[str, float]]:
     """As `Estimate.rms`."""
-    s, rows = estimate.objective.stacked, estimate.objective.rows
+    s, rows = objective.stacked, objective.rows
     errors = np.full(s.values.shape, np.nan)
-    errors[rows] = estimate.minimum.found.residual
+    errors[rows] = m.found.residual
     if not np.isin(np.arange(len(s.labels)), rows[0]).all():
-        free_runs = estimate.objective.predicted(estimate.point).outputs - s.values
+        free_runs = objective.predicted(point).outputs - s.values
         errors = np.where(np.isnan(errors), free_runs, errors)
     found: dict[str, dict[str, float]] = {}
     for k, label in enumerate(s.labels):

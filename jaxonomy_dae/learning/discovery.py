@@ -27,7 +27,7 @@ import scipy.stats
 import sympy
 from jaxtyping import Array, Float
 
-from ..errors import ModelError, SimulationError, nearest
+from ..errors import ModelError, SimulationError, nearest, whole_number
 from ..programs.cache import compiled
 from ..system.system import AcausalSystem
 from .blocks import Block, block_of, inputs_seen
@@ -170,9 +170,8 @@ def discover(
         raise ModelError(f"{where}: there is no network of this name that was trained: " + nearest(name, modules))
     if not isinstance(library, Library):
         raise ModelError(f"{where}: terms is a library, learning.powers(4) or learning.terms('v', …); got {library!r}")
-    for what, number in (("width", width), ("most", most)):
-        if isinstance(number, bool) or not isinstance(number, int) or number < 1:
-            raise ModelError(f"{where}: {what} is a whole number ≥ 1; got {number!r}")
+    whole_number(width, f"{where}: width")
+    whole_number(most, f"{where}: most")
     block = block_of(estimate.system.plan, name)
     assert block is not None
     terms = library.of(block.inputs[0], len(block.outputs), where)
@@ -225,7 +224,7 @@ class _Start:
     @classmethod
     def of(cls, estimate: "Estimate", name: str, block: Block, terms: tuple[AbstractTerm, ...]) -> "_Start":
         dtype = estimate.system.parameters.values.dtype
-        u = jnp.asarray(inputs_seen(estimate, block), dtype)
+        u = jnp.asarray(inputs_seen(estimate.objective, estimate.point, block), dtype)
         whole = ClosedForm(jnp.ones(len(terms), dtype), jnp.ones(len(terms), bool), terms)
         values, features = _values_and_features(estimate.system.neural[name], block, whole, u)
         values, features = np.asarray(values, float).ravel(), np.asarray(features, float).reshape(-1, len(terms))

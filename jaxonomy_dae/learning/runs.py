@@ -13,20 +13,14 @@ from ..errors import InitializationError, ModelError, SimulationError, nearest
 from ..simulation.simulate import simulate
 from ..system.system import AcausalSystem
 from .objective import Objective
-from .program import predict, with_values
+from .program import Setting, placed, predict
 
 
 def run(objective: Objective, z: Float[np.ndarray, " p"], experiment: int, ts: Any = None) -> Any:
     """An ordinary simulation of one experiment at a point."""
     layout, s = objective.layout, objective.stacked
     shared, own = objective.numbers(objective.coordinates.natural(z))
-    system, _, starts = with_values(objective.system, objective.observers, layout, shared)
-    initial = dict(zip(layout.shared, starts, strict=True))
-    initial |= dict(zip(layout.own, own[experiment], strict=True))
-    initial |= dict(zip(layout.known, objective.conditions.known[experiment], strict=True))
-    given = {name: float(v) for name, v in initial.items() if name in system.parameters}
-    system = system.with_parameters(given) if given else system
-    initial = {name: v for name, v in initial.items() if name not in given}
+    system, _, initial = placed(objective.setting, shared, own[experiment], objective.conditions.known[experiment])
     inputs = {n: (t[experiment], v[experiment], dict(s.kinds)[n]) for n, (t, v) in s.inputs.items()}
     end = s.counts[experiment]
     times = s.times[experiment, :end] if ts is None else ts
@@ -73,7 +67,8 @@ def residuals(
         else:
             raise ModelError(f"the start of '{name}' is not unknown: " + nearest(name, layout.shared + layout.own))
     plain = dataclasses.replace(layout, parameters=(), modules=(), extra=())
-    outputs = predict(model, objective.observers | observe, plain, adjoint, shared, own, objective.conditions)
+    setting = Setting(model, objective.observers | observe, plain)
+    outputs = predict(setting, adjoint, shared, own, objective.conditions)
     sigma = np.where(np.isnan(s.sigma), 1.0, s.sigma)
     scaled = jnp.where(s.observed, (outputs - s.values) / sigma[:, None, :], 0.0)
     return {

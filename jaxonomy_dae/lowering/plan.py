@@ -168,18 +168,23 @@ class SystemPlan:
         bring."""
         return self.n_constraints + (0 if self.held is None else len(self.held.table.level))
 
+    @property
+    def _scheduled(self) -> pattern.Scheduled:
+        rows = [(row.rows, row.quantities) for row in self.rows]
+        return pattern.Scheduled(self.extended.quantities.n, self.states, self.carried, self.steps, rows)
+
     @functools.cached_property
     def jacobian_pattern(self) -> SparsePattern | None:
         """The places of ∂(vector field)/∂(state) that can be nonzero at a consistent state, shape (n_state, n_state);
         None if it has too many places to list."""
-        return pattern.field_pattern(self)
+        return pattern.field_pattern(self._scheduled)
 
     @functools.cached_property
     def dae_pattern(self) -> SparsePattern | None:
         """The places that can be nonzero in the Jacobian of [f(t, x, z); g(t, x, z)] with respect to the state array
         [x, z]: the states' derivatives with z read from the array, not refined, then the residuals of the nonlinear
         blocks. Sorted by row, each place once; None if there are too many to list."""
-        return pattern.dae_pattern(self)
+        return pattern.dae_pattern(self._scheduled)
 
     @functools.cached_property
     def carried_pattern(self) -> SparsePattern | None:

@@ -215,6 +215,20 @@ class EventTable:
     def __len__(self):
         return len(self.text)
 
+    def take(self, events: Sequence[int]) -> "EventTable":
+        """The table with these events, in this order, sampled ones first, and what they write."""
+        place = np.full(len(self), -1, np.int64)
+        place[events] = np.arange(len(events))
+        rows = place[self.event] >= 0
+        columns = ("text", "message", "noted", "revocable", "relation", "kink", "immediate")
+        of_events = {name: tuple(getattr(self, name)[e] for e in events) for name in columns}
+        of_actions = {name: getattr(self, name)[rows] for name in ("state", "discrete", "value", "constant")}
+        clocks = tuple(self.clocks[e] for e in events if e < len(self.clocks))
+        event = place[self.event[rows]]
+        return dataclasses.replace(
+            self, guard=self.guard[events], clocks=clocks, event=event, **of_events, **of_actions
+        )
+
 
 _NONE = np.zeros(0, np.int64)
 NO_EVENTS = EventTable((), _NONE, (), (), (), (), (), (), (), _NONE, _NONE, _NONE, _NONE, np.zeros(0))

@@ -17,9 +17,9 @@ from typing import Any, ParamSpec, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.core import Tracer
 
 from .machine import Use, mappings, memory, return_memory
+from .staging import is_traced
 
 # Of the mappings that Linux allows, and of the memory that this process could have. What is left must hold what is
 # compiled until use is measured next: a gradient takes 800 (two states) to 4,500 mappings (double pendulum), 7 %.
@@ -99,7 +99,7 @@ class ProgramCache:
         arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
         static = tuple(_ARRAY if eqx.is_array(leaf) else leaf for leaf in leaves)
         key = function, structure, static, tuple(jax.typeof(a) for a in arrays)
-        traced = _is_traced(arrays)
+        traced = is_traced(arrays)
         with self._lock:
             program = self._programs.get(key)
             if program is None:
@@ -112,7 +112,7 @@ class ProgramCache:
         finally:
             with self._lock:
                 program.calls -= 1
-        if not traced and _is_traced(jax.tree.leaves(outcome)):
+        if not traced and is_traced(jax.tree.leaves(outcome)):
             # The function closed over a traced value, which is another one at the next call.
             with self._lock:
                 self._programs.pop(key, program).clear()
@@ -168,10 +168,6 @@ class ProgramCache:
         for key in idle:
             self._programs.pop(key).clear()
         return len(idle)
-
-
-def _is_traced(leaves: list[Any]) -> bool:
-    return any(isinstance(leaf, Tracer) for leaf in leaves)
 
 
 def _text(use: Use) -> str:
