@@ -6,7 +6,7 @@ import numpy as np
 
 from .errors import ModelError
 from .optional import optional_module
-from .simulation.by_name import ByName
+from .simulation.labelled import ByName
 from .system.system import AcausalSystem
 
 SEPARATE = 12  # entries of an array that get a colour each

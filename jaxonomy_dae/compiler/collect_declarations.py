@@ -7,9 +7,8 @@ import numpy as np
 import sympy
 
 from ..errors import ModelError
-from ..model.dependent_parameters import complete
 from ..model.symbolic import SymbolicTemplate, canonical
-from ..model.tables import DependentParameters, ParameterTable, StartGroup, Starts, VariableTable
+from ..model.tables import DependentParameters, ParameterTable, StartGroup, Starts, VariableTable, complete
 from ..modeling.declarations import EachValue, Variable
 from ..modeling.interval import Interval
 from .number_model import Instances, ModelNumbers

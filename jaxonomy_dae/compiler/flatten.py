@@ -16,8 +16,7 @@ from .connect_ports import connect_ports
 from .connect_signals import connect_signals
 from .group_builder import GroupBuilder
 from .number_model import ModelNumbers, array_names
-from .read_accounts import read_accounts
-from .read_equations import add_components
+from .read_equations import add_components, read_accounts
 
 
 def flatten(diagram: AcausalDiagram) -> FlatModel:

@@ -1,8 +1,9 @@
-"""Equations of components as templates and rows of integers."""
+"""Equations of components, and what they declare of energies and powers, as templates and rows of integers."""
 
 from typing import Any
 
 import numpy as np
+import sympy
 
 from ..errors import ModelError
 from ..expressions.from_sympy import UnsupportedExpression, read, symbols_of
@@ -11,6 +12,7 @@ from ..expressions.to_sympy import shortened
 from ..model.linear_template import LinearTemplate
 from ..model.provenance import Provenances, Written
 from ..model.symbolic import canonical, linear_coefficients
+from ..model.tables import AccountGroup
 from ..model.template import AbstractTemplate
 from ..modeling.symbols import ParameterSymbol, PreviousSymbol, TimeSymbol, VariableSymbol, symbol_label
 from .group_builder import GroupBuilder
@@ -93,3 +95,36 @@ def read_expression(expression: Any, component: str) -> Node:
         return read(expression, symbol_label)
     except UnsupportedExpression as error:
         raise ModelError(f"component '{component}': 0 = {shortened(expression)}: {error}") from None
+
+
+def read_accounts(model: ModelNumbers) -> tuple[AccountGroup, ...]:
+    """One group for each declaration of components of one shape.
+
+    **Raises:**
+
+    - `ModelError` for a symbol that no component declared.
+    """
+    read_once: dict[sympy.Expr, Node] = {}
+    owners: dict[tuple, list[Instances]] = {}
+    for i in model.instances:
+        for account in i.component.accounts:
+            shape = (account.kind, account.expression, tuple(i.component.variables), tuple(i.component.parameters))
+            owners.setdefault(shape, []).append(i)
+    groups = []
+    for (kind, expression, *_), parts in owners.items():
+        if expression not in read_once:
+            read_once[expression] = read_expression(expression, model.path(parts[0]))
+        graph = read_once[expression]
+        variables, parameters = slots_of(model, parts[0], expression, graph)
+        members = Members(model, parts)
+        groups.append(
+            AccountGroup(
+                kind,
+                canonical(graph, variables, parameters),
+                members.ids([v.path for v in variables], "variable"),
+                np.tile(np.array([v.order for v in variables], np.int64), (len(members.number), 1)),
+                members.ids([p.path for p in parameters], "parameter"),
+                members.number,
+            )
+        )
+    return tuple(groups)

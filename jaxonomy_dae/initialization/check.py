@@ -3,12 +3,11 @@
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
 from ..errors import InitializationError
+from ..programs.staging import is_traced
 from ..solvers.rows import not_a_number
 from ..system.input_values import input_values
 from ..tolerances import solved
@@ -27,7 +26,7 @@ def check(
     table = system.parameters.table
     low, high = table.bounds[np.array([table.index(n) for n in solve_for], np.int64)].T
     driving = input_values(system.plan, inputs, t0, found.x.dtype) if running else ()
-    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((found, system, t0, driving)))
+    traced = is_traced((found, system, t0, driving))
     if traced or throw is False:
         slack = _slack(found, low, high)
         outside = jnp.any(~((found.solved >= low - slack) & (found.solved <= high + slack)))

@@ -1,5 +1,6 @@
-"""Condition numbers and null vectors of blocks."""
+"""Condition numbers and null vectors of blocks, and what is found out about those that are singular, or nearly so."""
 
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -8,9 +9,10 @@ import scipy.sparse as sp
 from ..judgement.rank import EASY, Rank, rank_of
 from ..judgement.sparse_rank import sparse_rank_of
 from ..tolerances import ILL_CONDITIONED, TINY
-from .block_finding import DENSE_LIMIT
 
 NullVectors = Callable[[int], np.ndarray]
+
+DENSE_LIMIT = 200  # unknowns up to which a block gets a singular value decomposition
 
 
 def conditions(matrices: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, NullVectors, NullVectors]:
@@ -69,3 +71,21 @@ def _at_a_glance(matrices: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, 
         condition = np.where(s[:, -1] > 0, s[:, 0] / s[:, -1], np.inf)
         # No singular value moves by more than the norm of the errors.
         return condition, np.linalg.norm(errors / rows / columns, axis=(1, 2)) < s[:, -1]
+
+
+@dataclasses.dataclass(frozen=True)
+class BlockFinding:
+    """A block that is singular, or nearly so: the variables it leaves open, the equations that depend on each other,
+    and the parameters and variables that make it so, with their values.
+
+    `undecided`: it is regular as its numbers stand, and singular within their errors, so that nobody can tell.
+    """
+
+    condition: float
+    singular: bool
+    size: int
+    variables: tuple[str, ...]
+    equations: tuple[str, ...]
+    causes: tuple[tuple[str, float], ...]
+    causes_are_parameters: bool
+    undecided: bool = False

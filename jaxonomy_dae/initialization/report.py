@@ -13,7 +13,7 @@ from ..model.tables import ZERO
 from ..system.input_values import input_values
 from ..system.sections import SHOWN, Sections, some
 from ..tolerances import DIGIT, HALF_OF_THE_DIGITS, ILL_CONDITIONED, TINY, ridge, solved
-from .block_finding import BlockFinding
+from .condition import BlockFinding
 from .constraints_at import constraints_at
 from .initialize import InitialPoint, is_consistent
 from .ladder import FAILED, METHODS, NEAREST

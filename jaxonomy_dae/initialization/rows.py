@@ -22,12 +22,11 @@ from ..judgement.rank import above_errors
 from ..judgement.scaling import balanced, equilibrated
 from ..lowering.plan import SystemPlan
 from ..model.declared import declared_scale, leading_starts
-from ..model.dependent_parameters import complete
 from ..model.jacobian import generic_jacobian
 from ..model.natural_sizes import natural_sizes
 from ..model.networks import Networks
 from ..model.quantities import ABSENT
-from ..model.tables import ZERO, Start
+from ..model.tables import ZERO, Start, complete
 from ..structure.matching import match_in_order
 from ..tolerances import ILL_CONDITIONED, KNOWN, NO_PART, TINY
 

@@ -16,9 +16,8 @@ from ..lowering.plan import SystemPlan
 from ..lowering.schedule import SparseStep, Step, StepEquation
 from ..model.tables import ZERO
 from ..tolerances import ILL_CONDITIONED, KNOWN, RANK, SLIGHT
-from .block_finding import DENSE_LIMIT, BlockFinding
 from .block_values import BlockValues, slots_of_partials
-from .condition import conditions, left_null
+from .condition import DENSE_LIMIT, BlockFinding, conditions, left_null
 from .sparse_blocks import sparse_finding
 
 

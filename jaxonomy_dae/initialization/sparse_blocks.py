@@ -7,8 +7,8 @@ from ..judgement.sparse_rank import sparse_rank_of
 from ..lowering.plan import SystemPlan
 from ..lowering.schedule import SparseStep
 from ..tolerances import ILL_CONDITIONED, NO_PART, SLIGHT
-from .block_finding import DENSE_LIMIT, BlockFinding
 from .block_values import BlockValues
+from .condition import DENSE_LIMIT, BlockFinding
 
 
 def sparse_finding(plan: SystemPlan, values: BlockValues, step: SparseStep) -> BlockFinding | None:

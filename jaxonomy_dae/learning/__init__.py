@@ -1,7 +1,7 @@
 """Learning what a compiled system lacks, from records, or by any loss."""
 
+from .agreement import Whiteness as Whiteness
 from .band import Band as Band
-from .closed_form import ClosedForm as ClosedForm
 from .data import Data as Data
 from .design import Advice as Advice
 from .design import next_experiment as next_experiment
@@ -12,6 +12,7 @@ from .ensemble import Ensemble as Ensemble
 from .ensemble import ensemble as ensemble
 from .estimate import Estimate as Estimate
 from .experiment import Experiment as Experiment
+from .experiment import Planned as Planned
 from .experiment import Unknown as Unknown
 from .filtering import Filter as Filter
 from .filtering import Innovations as Innovations
@@ -31,12 +32,11 @@ from .libraries import terms as terms
 from .minimize import Minimized as Minimized
 from .minimize import minimize as minimize
 from .multiple_shooting import Shooting as Shooting
-from .planned import Planned as Planned
 from .posterior import Posterior as Posterior
 from .prediction import Prediction as Prediction
 from .problem import Problem as Problem
 from .table import Table as Table
+from .term import ClosedForm as ClosedForm
 from .training import GradientSteps as GradientSteps
 from .training import Training as Training
 from .training import Update as Update
-from .whiteness import Whiteness as Whiteness

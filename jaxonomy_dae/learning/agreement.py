@@ -1,19 +1,40 @@
-"""How well an estimate agrees with its data: errors by name, and the likelihood."""
+"""How well an estimate agrees with its data: errors by name, the likelihood, and whether residuals look like noise."""
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.stats
+from jaxtyping import Float
 
+from .descent import Minimum
 from .likelihood import Likelihood
-
-if TYPE_CHECKING:
-    from .estimate import Estimate
+from .objective import Objective
 
 
-def log_likelihood(estimate: "Estimate") -> float:
+@dataclasses.dataclass(frozen=True)
+class Whiteness:
+    """The test of one output of one experiment: the correlation of neighbouring residuals, and the probability that
+    white noise would show as much over all lags looked at (Ljung & Box 1978)."""
+
+    correlation: float
+    probability: float
+
+
+def whiteness(residual: Float[np.ndarray, " n"]) -> Whiteness:
+    """The test over as many lags as ln n, the number of which Ljung and Box's statistic is advised for (Tsay 2010)."""
+    n = len(residual)
+    centred = residual - residual.mean()
+    power = float(centred @ centred)
+    lags = max(int(np.log(n)), 1)
+    if n <= lags + 1 or power == 0:
+        return Whiteness(np.nan, np.nan)
+    rho = np.array([float(centred[k:] @ centred[:-k]) for k in range(1, lags + 1)]) / power
+    statistic = n * (n + 2) * float(np.sum(rho**2 / (n - np.arange(1, lags + 1))))
+    return Whiteness(float(rho[0]), float(scipy.stats.chi2.sf(statistic, lags)))
+
+
+def log_likelihood(objective: Objective, m: Minimum) -> float:
     """As `Estimate.log_likelihood`."""
-    m, objective = estimate.minimum, estimate.objective
     count = objective.stacked.weight[objective.rows[0]]
     none = np.zeros_like(m.z)
     cost = dataclasses.replace(m.weights, precision=none, mean=none).cost(m.z, m.found.residual)
@@ -22,13 +43,13 @@ def log_likelihood(estimate: "Estimate") -> float:
     return logs - cost - 0.5 * float(np.sum(count) * np.log(2 * np.pi))
 
 
-def rms_by_name(estimate: "Estimate") -> dict[str, dict[str, float]]:
+def rms_by_name(objective: Objective, m: Minimum, point: Float[np.ndarray, " p"]) -> dict[str, dict[str, float]]:
     """As `Estimate.rms`."""
-    s, rows = estimate.objective.stacked, estimate.objective.rows
+    s, rows = objective.stacked, objective.rows
     errors = np.full(s.values.shape, np.nan)
-    errors[rows] = estimate.minimum.found.residual
+    errors[rows] = m.found.residual
     if not np.isin(np.arange(len(s.labels)), rows[0]).all():
-        free_runs = estimate.objective.predicted(estimate.point).outputs - s.values
+        free_runs = objective.predicted(point).outputs - s.values
         errors = np.where(np.isnan(errors), free_runs, errors)
     found: dict[str, dict[str, float]] = {}
     for k, label in enumerate(s.labels):

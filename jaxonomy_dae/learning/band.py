@@ -12,9 +12,10 @@ from jaxtyping import Float
 from ..errors import ModelError, nearest
 from ..model.opaque import OpaqueFunction
 from ..programs.cache import compiled
+from .axes import new_axes
 from .blocks import block_of, inputs_seen
-from .figures import plot_band
 from .program import weights_of, with_weights
+from .runs import run
 
 if TYPE_CHECKING:
     from .estimate import Estimate
@@ -45,7 +46,31 @@ class Band:
 
         - `truth`: a law to compare with, if one is known: a function of the grid, or values, shape `(n,)`.
         """
-        return plot_band(self, ax, truth, label)
+        ax = new_axes(ax)
+        points = self.grid.reshape(len(self.grid), -1)
+        moving = [k for k in range(points.shape[1]) if np.ptp(points[:, k]) > 0]
+        if len(moving) > 1:
+            raise ModelError(f"a band is drawn along one input; this grid moves {len(moving)} of them")
+        column = moving[0] if moving else 0
+        x = points[:, column]
+        if len(self.explored):
+            low, high = self.explored[min(column, len(self.explored) - 1)]
+            ax.axvspan(low, high, color="C2", alpha=0.12, linewidth=0, label="explored")
+        ax.fill_between(x, self.low, self.high, color="C0", alpha=0.3, linewidth=0)
+        ax.plot(x, self.mean, color="C0", linewidth=1.6, label=label)
+        if truth is not None:
+            values = truth(self.grid) if callable(truth) else truth
+            ax.plot(x, np.asarray(values, float), "--", color="C3", linewidth=1.4, label="true")
+        inside = self.inside if len(self.explored) else np.ones(len(x), bool)
+        if inside.any():  # a band that is wide elsewhere would leave nothing to be seen
+            low, high = self.low[inside].min(), self.high[inside].max()
+            room = max(high - low, np.ptp(self.mean)) * 0.4 or 1.0
+            ax.set_ylim(min(low, self.mean.min()) - room, max(high, self.mean.max()) + room)
+        ax.set_xlabel("input")
+        ax.set_ylabel("law")
+        ax.grid(True, alpha=0.3)
+        ax.legend()
+        return ax
 
 
 def band(
@@ -117,12 +142,9 @@ def explored(estimate: "Estimate", name: str, along: Any) -> np.ndarray:
     if along is None:
         if block is None:
             return np.zeros((0, 2))
-        seen = inputs_seen(estimate, block)
+        seen = inputs_seen(estimate.objective, estimate.point, block)
     else:
-        runs = (
-            estimate.problem.run(estimate.objective, estimate.point, int(k))
-            for k in np.flatnonzero(estimate.objective.counted)
-        )
+        runs = (run(estimate.objective, estimate.point, int(k)) for k in np.flatnonzero(estimate.objective.counted))
         columns = [np.asarray(run[along] if isinstance(along, str) else along(run), float) for run in runs]
         seen = np.concatenate(columns)[:, None]
     return np.stack([seen.min(axis=0), seen.max(axis=0)], axis=1)

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float
 from ..errors import ModelError, nearest
 from ..lowering.plan import SystemPlan
 from ..system.inputs import KINDS
+from .axes import LEGEND, chosen_names, grid_of_axes
 from .experiment import Experiment, Unknown, check_increasing
-from .figures import plot_data
 
 
 class Data:
@@ -45,7 +45,23 @@ class Data:
 
     def plot(self, names: str | Sequence[str] | None = None, *, axes: Any = None) -> Any:
         """Draws the records over time, one row of axes for each name; returns Matplotlib axes."""
-        return plot_data(self, names, axes)
+        known = list(dict.fromkeys(name for one in self.experiments for name in one.data))
+        chosen = chosen_names(names, known, "data of")
+        axes = grid_of_axes(axes, len(chosen), 1, "a plot of data")
+        for ax, name in zip(axes[:, 0], chosen, strict=True):
+            for k, (label, one) in enumerate(zip(self.labels, self.experiments, strict=True)):
+                if name not in one.data:
+                    continue
+                values = one.data[name].reshape(len(one.times), -1)
+                style = dict(marker=".", linestyle="none", color=f"C{k % 10}", alpha=0.5 if one.holdout else 1.0)
+                lines = ax.plot(one.times, values, **style)
+                lines[0].set_label(label + " (held out)" * one.holdout)
+            ax.set_ylabel(name)
+            ax.grid(True, alpha=0.3)
+        axes[-1, 0].set_xlabel("time [s]")
+        if len(self) <= LEGEND:
+            axes[0, 0].legend()
+        return axes[:, 0]
 
 
 @dataclasses.dataclass(frozen=True)

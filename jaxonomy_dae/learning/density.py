@@ -25,10 +25,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..errors import ModelError
 from ..programs.cache import compiled
-from .devices import each
+from .devices import each, each_with_slopes
 from .factors import Factors
 from .objective import Misfit, Objective
-from .program import Layout, Weighted
+from .program import Layout, Setting, Weighted
 
 if TYPE_CHECKING:
     from .estimate import Estimate
@@ -66,9 +66,7 @@ class Posed(eqx.Module):
 class Program(NamedTuple):
     """The static and dynamic parts from which the density's program is built."""
 
-    system: Any
-    observers: dict[str, Any]
-    layout: Layout
+    setting: Setting
     function: Any
     structure: Any
     backwards: bool
@@ -110,16 +108,17 @@ def numbers_at(posed: Posed, layout: Layout, z: Float[Array, " f"]) -> tuple[Flo
 def density(program: Program, posed: Posed, u: Float[Array, " u"]) -> Float[Array, ""]:
     """ln p; −∞ where a run fails. It has a rule for its own gradient, which is zero there."""
 
-    def one(shared, own, c):
-        found = program.function(*program[:3], program.structure, shared, own, c)
-        return found, found
+    layout = program.setting.layout
 
-    def with_slopes(shared, own, c):
-        (by_shared, by_own), found = jax.jacfwd(one, argnums=(0, 1), has_aux=True)(shared, own, c)
-        return found, (by_shared, by_own)
+    def one(shared, own, c):
+        return program.function(program.setting, program.structure, shared, own, c)
 
     def all_squares(shared, own):
-        return each(one, program.layout.mesh, shared, own, posed.told)[0]
+        return each(one, layout.mesh, shared, own, posed.told)
+
+    def with_slopes(shared, own):
+        found, *slopes = each_with_slopes(one, layout.mesh, shared, own, posed.told)
+        return found, slopes
 
     squares = jax.custom_vjp(all_squares)
 
@@ -127,13 +126,13 @@ def density(program: Program, posed: Posed, u: Float[Array, " u"]) -> Float[Arra
         by_shared, by_own = slopes
         return jnp.einsum("ek,eks->s", out, by_shared), jnp.einsum("ek,eko->eo", out, by_own)
 
-    squares.defvjp(lambda shared, own: each(with_slopes, program.layout.mesh, shared, own, posed.told), backwards)
+    squares.defvjp(with_slopes, backwards)
     if program.backwards:
         squares = all_squares
 
     def value(u):
         z, logs, slope = coordinates_at(posed, u)
-        found, levels = squares(*numbers_at(posed, program.layout, z)), posed.levels
+        found, levels = squares(*numbers_at(posed, layout, z)), posed.levels
         if len(logs):
             level = logs[levels.place]
             scaled = found * jnp.exp(-2 * level) + 2 * levels.count * level
@@ -199,8 +198,7 @@ def posed(estimate: "Estimate") -> tuple[Program, Posed, tuple[str, ...]]:
         jnp.asarray(c.log[free]), array(c.size[free]), array(low), array(high), array(weights.precision),
         array(weights.mean), array(centre), array(root),
     )  # fmt: skip
-    parts = misfit.function, misfit.structure, misfit.backwards
-    program = Program(objective.system, objective.observers, objective.layout, *parts)
+    program = Program(objective.setting, misfit.function, misfit.structure, misfit.backwards)
     return program, told, names
 
 

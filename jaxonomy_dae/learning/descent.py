@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from .evaluation import Evaluation, Rows, Weights
 from .factors import Factors
@@ -82,6 +82,25 @@ class AbstractMerit(abc.ABC):
         return step
 
 
+def can_move(
+    z: Float[np.ndarray, " p"],
+    gradient: Float[np.ndarray, " p"],
+    bounds: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]],
+) -> Bool[np.ndarray, " p"]:
+    """True for coordinates that do not lie on a bound across which descent would push them."""
+    low, high = bounds
+    return ~(((z <= low) & (gradient > 0)) | ((z >= high) & (gradient < 0)))
+
+
+def damping_after(damping: float, ratio: float) -> float:
+    """The damping after a step that gained this part of what its linearization promised."""
+    if ratio > 0.7:
+        damping /= 5
+    elif ratio < 0.3:
+        damping *= 3
+    return max(damping, 1e-12)
+
+
 def descend(
     merit: AbstractMerit,
     start: Float[np.ndarray, " p"],
@@ -102,8 +121,7 @@ def descend(
 
     The point; None if the start itself cannot be evaluated.
     """
-    low, high = bounds
-    z = np.clip(start, low, high)
+    z = np.clip(start, *bounds)
     found = merit.evaluate(z)
     if found is None:
         return None
@@ -113,8 +131,7 @@ def descend(
     for k in range(steps + 1):
         rows, cost = weights.applied(z, found), weights.cost(z, found.residual)
         history.append(cost)
-        gradient = rows.jacobian.T @ rows.residual
-        free = ~(((z <= low) & (gradient > 0)) | ((z >= high) & (gradient < 0)))
+        free = can_move(z, rows.jacobian.T @ rows.residual, bounds)
         factors = Factors.of(rows.residual, rows.jacobian[:, free], noise)
         following, settled = (weights, True) if reweigh is None else reweigh(z, found, weights, factors, free)
         if settled and (merit.left(factors, cost, len(rows.residual), noise) <= OFFSET or idle >= PATIENCE):
@@ -155,10 +172,6 @@ def _better(
         if reached is not None:
             promised = 0.5 * float(np.sum(rows.residual**2) - np.sum((rows.residual + rows.jacobian @ (new - z)) ** 2))
             ratio = (cost - reached.cost) / max(promised, np.finfo(float).eps * abs(cost), np.finfo(float).tiny)
-            if ratio > 0.7:
-                damping /= 5
-            elif ratio < 0.3:
-                damping *= 3
-            return reached, trial + 1, max(damping, 1e-12)
+            return reached, trial + 1, damping_after(damping, ratio)
         damping *= 6
     return None, TRIALS, damping

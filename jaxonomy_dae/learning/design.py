@@ -15,25 +15,23 @@ its own size, an unknown start to its spread. So directions that nothing determi
 & Verdinelli 1995, Statistical Science 10:273).
 """
 
-import copy
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..errors import InitializationError, ModelError, SimulationError, nearest
+from ..errors import InitializationError, ModelError, SimulationError, nearest, whole_number
 from .coordinates import coordinates
 from .data import Stacked
 from .estimate import Estimate
+from .experiment import Planned
 from .identifiability import natural_scale
 from .objective import Objective
-from .planned import Planned
+from .problem import Problem
 from .program import Layout, predict_and_differentiate
-
-if TYPE_CHECKING:
-    from .problem import Problem
+from .runs import run
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -81,7 +79,7 @@ class Known:
     `scale` is d(natural value)/d(coordinate); `chosen` are the coordinates about which experiments are to tell.
     """
 
-    problem: "Problem"
+    problem: Problem
     objective: Objective
     natural: Float[np.ndarray, " p"]  # values of all coordinates
     information: Float[np.ndarray, "s s"]
@@ -104,7 +102,7 @@ class Known:
         return {n: float(v) for n, v in zip(names[plain], np.sqrt(variance[plain]), strict=True)}
 
 
-def known_of(source: "Problem | Estimate", names: Any, alone: bool) -> Known:
+def known_of(source: Problem | Estimate, names: Any, alone: bool) -> Known:
     """The information of a problem at its nominal values, or of an estimate at its own."""
     if isinstance(source, Estimate):
         problem, objective = source.problem, source.objective
@@ -143,7 +141,7 @@ def _chosen(objective: Objective, shared: Bool[np.ndarray, " shared"], names: An
 
 
 def next_experiment(
-    source: "Problem | Estimate",
+    source: Problem | Estimate,
     candidates: Sequence[Planned],
     names: Sequence[str] | str | None = None,
     *,
@@ -180,8 +178,7 @@ def next_experiment(
     plans: list[Planned] = [] if isinstance(candidates, Planned) else list(candidates)
     if not plans or not all(isinstance(one, Planned) for one in plans):
         raise ModelError("candidates are a list of learning.Planned(times, {'m.x': sigma}, ...), at least one")
-    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-        raise ModelError(f"count is a whole number ≥ 1; got {count!r}")
+    whole_number(count, "count")
     labels, gained = informations(known, plans)
     fails = np.array([not np.isfinite(m).all() for m in gained])
     if fails.all():
@@ -206,9 +203,8 @@ def next_experiment(
 def informations(known: Known, plans: list[Planned]) -> tuple[tuple[str, ...], Float[np.ndarray, "c s s"]]:
     """Labels, and the information of each planned experiment on what is shared and free; NaN where its run fails."""
     layout, stacked, shared, own = _placed(known, plans)
-    conditions = _objective(known, layout, stacked).conditions
-    o = known.objective
-    found = predict_and_differentiate(o.system, o.observers, layout, shared, own, conditions)
+    planned = _objective(known, layout, stacked)
+    found = predict_and_differentiate(planned.setting, shared, own, planned.conditions)
     outputs, by_shared, by_own = (np.asarray(a, np.float64) for a in found)
     column = _columns(known, layout)
     starts = _start_scales(stacked, layout)
@@ -298,10 +294,8 @@ def _why(known: Known, plans: list[Planned]) -> str:
     layout, stacked, shared, own = _placed(known, plans)
     at = _objective(known, layout, stacked)
     point = np.concatenate([np.asarray(shared, float), np.asarray(own, float).ravel()])
-    other = copy.copy(known.problem)
-    other._layout = layout
     try:
-        other.run(at, at.coordinates.scaled(point), 0)
+        run(at, at.coordinates.scaled(point), 0)
     except (InitializationError, ModelError, SimulationError) as error:
         return f"no candidate can be simulated; the first, {stacked.labels[0]}, fails: {error}"
     return f"no candidate can be simulated; the first, {stacked.labels[0]}: its predictions are not finite"

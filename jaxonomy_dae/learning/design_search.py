@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import scipy.optimize
@@ -11,10 +11,8 @@ from jaxtyping import Float
 from ..errors import ModelError, SimulationError
 from .design import informations, known_of
 from .estimate import Estimate
-from .planned import Planned
-
-if TYPE_CHECKING:
-    from .problem import Problem
+from .experiment import Planned
+from .problem import Problem
 
 STEP = 1e-3  # of a parameter's range: runs at rtol 1e-6 have differences good to 1e-3
 TOLERANCE = 1e-4  # nats that a step must gain
@@ -37,7 +35,7 @@ class Design:
 
 
 def design_experiment(
-    source: "Problem | Estimate",
+    source: Problem | Estimate,
     make: Callable[[Float[np.ndarray, " p"]], Planned],
     start: Any,
     bounds: Any,

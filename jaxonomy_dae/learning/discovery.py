@@ -16,6 +16,7 @@ All candidates are one program: which terms count is an argument of it.
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -26,15 +27,13 @@ import scipy.stats
 import sympy
 from jaxtyping import Array, Float
 
-from ..errors import ModelError, SimulationError, nearest
+from ..errors import ModelError, SimulationError, nearest, whole_number
 from ..programs.cache import compiled
 from ..system.system import AcausalSystem
-from .beam_search import beam_search
 from .blocks import Block, block_of, inputs_seen
-from .closed_form import ClosedForm
 from .libraries import Library
 from .table import Row, Table
-from .term import AbstractTerm
+from .term import AbstractTerm, ClosedForm
 
 if TYPE_CHECKING:
     from .estimate import Estimate
@@ -171,9 +170,8 @@ def discover(
         raise ModelError(f"{where}: there is no network of this name that was trained: " + nearest(name, modules))
     if not isinstance(library, Library):
         raise ModelError(f"{where}: terms is a library, learning.powers(4) or learning.terms('v', …); got {library!r}")
-    for what, number in (("width", width), ("most", most)):
-        if isinstance(number, bool) or not isinstance(number, int) or number < 1:
-            raise ModelError(f"{where}: {what} is a whole number ≥ 1; got {number!r}")
+    whole_number(width, f"{where}: width")
+    whole_number(most, f"{where}: most")
     block = block_of(estimate.system.plan, name)
     assert block is not None
     terms = library.of(block.inputs[0], len(block.outputs), where)
@@ -226,7 +224,7 @@ class _Start:
     @classmethod
     def of(cls, estimate: "Estimate", name: str, block: Block, terms: tuple[AbstractTerm, ...]) -> "_Start":
         dtype = estimate.system.parameters.values.dtype
-        u = jnp.asarray(inputs_seen(estimate, block), dtype)
+        u = jnp.asarray(inputs_seen(estimate.objective, estimate.point, block), dtype)
         whole = ClosedForm(jnp.ones(len(terms), dtype), jnp.ones(len(terms), bool), terms)
         values, features = _values_and_features(estimate.system.neural[name], block, whole, u)
         values, features = np.asarray(values, float).ravel(), np.asarray(features, float).reshape(-1, len(terms))
@@ -281,3 +279,24 @@ def _refitted(
         bounds={c.names[k]: (float(c.low[k]), float(c.high[k])) for k in numbers},
         freeze=frozen,
     )
+
+
+def beam_search(
+    score: Callable[[tuple[int, ...]], float], count: int, width: int, most: int
+) -> dict[tuple[int, ...], float]:
+    """The scores of all subsets that were looked at, ascending tuples of 0, …, count − 1; less is better.
+
+    All subsets of one; then, from the `width` best subsets of k, all of k + 1 that contain one of them; until none of a
+    size is better than the best of all smaller ones, or `most` are in.
+    """
+    found: dict[tuple[int, ...], float] = {}
+    level: list[tuple[int, ...]] = [(k,) for k in range(count)]
+    while level:
+        best = min(found.values(), default=float("inf"))
+        scores = {subset: score(subset) for subset in level}
+        found |= scores
+        if len(level[0]) >= most or not min(scores.values()) < best:
+            break
+        beam = sorted(scores, key=lambda s: (scores[s], s))[:width]
+        level = sorted({tuple(sorted((*s, k))) for s in beam for k in range(count) if k not in s})
+    return found

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,14 +11,12 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Float
 
-from ..errors import ModelError, SimulationError, nearest
+from ..errors import ModelError, SimulationError, nearest, whole_number
 from ..system.system import AcausalSystem
 from .band import Band
 from .estimate import Estimate
 from .prediction import Prediction
-
-if TYPE_CHECKING:
-    from .problem import Problem
+from .problem import Problem
 
 REJECTED = 1e-3  # the probability below which noise is no excuse for a worse fit
 
@@ -74,7 +72,7 @@ class Ensemble:
 
 
 def ensemble(
-    problem: "Problem",
+    problem: Problem,
     members: int = 8,
     *,
     seed: int = 0,
@@ -129,12 +127,11 @@ def _deviance(estimate: Estimate) -> float:
 
 
 def _starts(
-    problem: "Problem", modules: list[str], members: int, seed: int, networks: Mapping[str, Sequence[Any]] | None
+    problem: Problem, modules: list[str], members: int, seed: int, networks: Mapping[str, Sequence[Any]] | None
 ) -> list[AcausalSystem]:
     system = problem.system
     if networks is None:
-        if isinstance(members, bool) or not isinstance(members, int) or members < 1:
-            raise ModelError(f"members is a whole number ≥ 1; got {members!r}")
+        whole_number(members, "members")
         rng = np.random.default_rng(seed)
         drawn = [{name: _drawn(system.neural[name], rng) for name in modules} for _ in range(members - 1)]
         return [system, *(_with(system, one) for one in drawn)]

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from ..errors import ModelError, nearest
 from ..system.system import AcausalSystem
-from .agreement import log_likelihood, rms_by_name
+from .agreement import Whiteness, log_likelihood, rms_by_name, whiteness
 from .band import Band, band, explored
 from .descent import Minimum
 from .discovery import Discovery, discover
@@ -19,15 +19,13 @@ from .factors import Factors
 from .figures import plot_correlations, plot_history, plot_residuals, plot_runs
 from .holdout import holdout_score, with_own_starts
 from .identifiability import Identifiability, identifiability, spreads
-from .intervals import intervals
+from .intervals import intervals, profile
 from .objective import Objective
 from .prediction import Prediction, at_samples, prediction
-from .profile import profile
 from .program import with_values
 from .smoothing import followed
 from .table import Table
 from .training import Training
-from .whiteness import Whiteness, whiteness
 
 if TYPE_CHECKING:
     from .posterior import Posterior
@@ -60,7 +58,7 @@ class Estimate:
         """The estimate at a minimum."""
         point = with_own_starts(objective, minimum.z, minimum.weights)
         shared, _ = objective.numbers(objective.coordinates.natural(point))
-        system, observers, _ = with_values(objective.system, objective.observers, objective.layout, shared)
+        system, observers, _ = with_values(objective.setting, shared)
         return cls(problem, objective, minimum, point, system, observers, training)
 
     def __repr__(self):
@@ -199,7 +197,7 @@ class Estimate:
     def table(self, level: float = 0.95) -> Table:
         """Parameters and starts with linear intervals, on the coordinates' scale, so those of positive parameters are
         positive; and what reached a bound, is not determined, or was frozen."""
-        return intervals(self, level)
+        return intervals(self.objective, self.point, self.spread, self.quantile(level), level)
 
     def identifiability(self) -> Identifiability:
         """The directions that the data determine, at the values found."""
@@ -213,7 +211,11 @@ class Estimate:
         Noise levels and precisions stay as found.
         """
         chosen = [names] if isinstance(names, str) else list(names)
-        return {name: profile(self, self._position(name), level) for name in chosen}
+        return {name: self._profile(self._position(name), level) for name in chosen}
+
+    def _profile(self, position: int, level: float) -> tuple[float, float]:
+        spread = float(self.spread[position])
+        return profile(self.objective, self.minimum, self.point, spread, position, level, self.problem.reach)
 
     def _position(self, name: str) -> int:
         c = self.objective.coordinates
@@ -253,9 +255,7 @@ class Estimate:
         - `ts`: times, increasing, from its start on; default: its own.
         - `experiment`: its place or name.
         """
-        return prediction(
-            self, [names] if isinstance(names, str) else list(names), ts, experiment, self.quantile(level)
-        )
+        return prediction(self.objective, self.point, self.root, names, ts, experiment, self.quantile(level))
 
     def explored(self, name: str, along: str | Callable[[Any], Any] | None = None) -> Float[np.ndarray, "inputs 2"]:
         """From the least to the greatest value that the experiments saw of each input of a learned law, or of what
@@ -309,14 +309,13 @@ class Estimate:
         return self._followed(names, experiment, "ahead", steps, level)
 
     def _followed(self, names: str | Sequence[str], experiment: int | str, how: str, steps: int, level: float) -> Any:
-        chosen = [names] if isinstance(names, str) else list(names)
-        return followed(self, chosen, experiment, how, steps, self.quantile(level))
+        return followed(self.objective, self.point, names, experiment, how, steps, self.quantile(level))
 
     @property
     def log_likelihood(self) -> float:
         """ln L of the samples that were fitted, without priors: of models with p coordinates and n samples, that of the
         least 2p − 2 ln L (Akaike) or p ln n − 2 ln L (Schwarz) is to be preferred."""
-        return log_likelihood(self)
+        return log_likelihood(self.objective, self.minimum)
 
     def discover(self, name: str, terms: Any, *, width: int = 3, most: int = 3) -> Discovery:
         """Closed forms in a network's place: combinations of terms, refitted through the model on the data, with all
@@ -345,30 +344,31 @@ class Estimate:
     def plot(self, names: str | Sequence[str] | None = None, *, axes: Any = None, level: float = 0.95) -> Any:
         """Draws samples, and fitted runs with their bands at the times of the samples: rows of axes for names, columns
         for experiments (the first four of them); returns Matplotlib axes."""
-        return plot_runs(self, names, axes, level)
+        outputs, spread = self.at_samples
+        return plot_runs(self.objective, outputs, self.quantile(level) * spread, names, axes)
 
     def plot_residuals(self, *, axes: Any = None) -> Any:
         """Draws residuals in units of the noise over time, and their autocorrelation; returns Matplotlib axes."""
-        return plot_residuals(self, axes)
+        return plot_residuals(self.objective, self.minimum, axes)
 
     def plot_history(self, ax: Any = None) -> Any:
         """Draws how the misfit came down; returns Matplotlib axes."""
-        return plot_history(self, ax)
+        return plot_history(self.minimum, ax)
 
     def plot_correlations(self, ax: Any = None) -> Any:
         """Draws the correlations of parameters and starts; returns Matplotlib axes."""
-        return plot_correlations(self, ax)
+        return plot_correlations(self.objective, self.correlation, ax)
 
     @functools.cached_property
     def at_samples(self) -> tuple[Float[np.ndarray, "e n k"], Float[np.ndarray, "e n k"]]:
         """All outputs at the times of the samples, as `objective.stacked` has them, and their standard deviations."""
-        return at_samples(self)
+        return at_samples(self.objective, self.point, self.root)
 
     @functools.cached_property
     def rms(self) -> dict[str, dict[str, float]]:
         """Root mean square errors by experiment and name, in the variables' units, those held out included: of runs, or
         with `Filter` and `Innovations`, of predictions one step ahead."""
-        return rms_by_name(self)
+        return rms_by_name(self.objective, self.minimum, self.point)
 
     @functools.cached_property
     def holdout_score(self) -> float:

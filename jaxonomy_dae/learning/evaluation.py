@@ -37,15 +37,18 @@ class Weights:
         """Σ ln (1/σ), which the cost does not contain."""
         return float(np.sum(np.log(self.row)))
 
+    def prior(self, z: Float[np.ndarray, " p"]) -> Rows:
+        """A row for each prior."""
+        chosen = np.flatnonzero(self.precision)
+        root = np.sqrt(self.precision)
+        return Rows((root * (z - self.mean))[chosen], np.diag(root)[chosen])
+
     def applied(self, z: Float[np.ndarray, " p"], found: Evaluation) -> Rows:
         """Weighted residuals and Jacobian, with a row for each prior."""
-        chosen = np.flatnonzero(self.precision)
-        root = np.sqrt(self.precision[chosen])
-        prior = np.zeros((len(chosen), len(z)))
-        prior[np.arange(len(chosen)), chosen] = root
+        prior = self.prior(z)
         return Rows(
-            np.concatenate([self.row * found.residual, root * (z - self.mean)[chosen]]),
-            np.concatenate([self.row[:, None] * found.jacobian, prior]),
+            np.concatenate([self.row * found.residual, prior.residual]),
+            np.concatenate([self.row[:, None] * found.jacobian, prior.jacobian]),
         )
 
     def cost(self, z: Float[np.ndarray, " p"], residual: Float[np.ndarray, " m"]) -> float:

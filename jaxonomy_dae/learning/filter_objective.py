@@ -91,12 +91,12 @@ class AheadObjective(Objective):
     def track(self, z: Float[np.ndarray, " p"]) -> Track:
         """All that the filter finds, of all experiments."""
         shared, own = self.numbers(self.coordinates.natural(z))
-        return track(self.system, self.observers, self.layout, self.structure, shared, own, self.told)
+        return track(self.setting, self.structure, shared, own, self.told)
 
     def _ahead(self, z: Float[np.ndarray, " p"]) -> tuple[Predicted, Predicted]:
         """Predictions and their variances with derivatives."""
         shared, own = self.numbers(self.coordinates.natural(z))
-        found = predict_ahead(self.system, self.observers, self.layout, self.structure, shared, own, self.told)
+        found = predict_ahead(self.setting, self.structure, shared, own, self.told)
         first, second = ([np.asarray(pair[k], np.float64) for pair in found] for k in (0, 1))
         return Predicted(*first), Predicted(*second)
 

@@ -9,11 +9,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..programs.cache import compiled
-from ..system.system import AcausalSystem
-from .devices import each
+from .devices import each, each_with_slopes
 from .filter_steps import Told, corrected_by, model_of, moved_by, onwards, read, read_values, start_of
 from .filtering import Structure
-from .program import Layout, Weighted, with_kinds
+from .program import Setting, Weighted, with_kinds
 
 
 class Track(NamedTuple):
@@ -36,11 +35,9 @@ class Track(NamedTuple):
     discrete: Any
 
 
-def _track(
-    system: AcausalSystem, observers: Any, layout: Layout, structure: Structure, shared: Any, own: Any, told: Told
-) -> Track:
+def _track(setting: Setting, structure: Structure, shared: Any, own: Any, told: Told) -> Track:
     """Runs the filter over one experiment."""
-    model = model_of(system, observers, layout, structure, shared, own, told)
+    layout, model = setting.layout, model_of(setting, structure, shared, own, told)
 
     def step(carry, row):
         t, ends, y, seen, inputs = row
@@ -58,18 +55,15 @@ def _track(
         out = Track(predicted, variance, x, p, after, p_after, phi, discrete)
         return (after, p_after), out
 
-    start = start_of(system, observers, layout, structure, shared, own, told)
+    start = start_of(setting, structure, shared, own, told)
     rows = told.times, told.ends, told.values, told.observed, told.inputs
     return jax.lax.scan(step, start, rows)[1]
 
 
-def misfit_ahead(
-    system: AcausalSystem, observers: dict[str, Any], layout: Layout, structure: Structure, shared: Any, own: Any,
-    c: Weighted,
-) -> Float[Array, " k"]:  # fmt: skip
+def misfit_ahead(setting: Setting, structure: Structure, shared: Any, own: Any, c: Weighted) -> Float[Array, " k"]:
     """For one experiment and each output, the sum of squared weighted errors of predictions, or of a filter, Σ w (r²/s
     + ln s) of innovations r and their variances s."""
-    found = _track(system, observers, layout, structure, shared, own, c.told)
+    found = _track(setting, structure, shared, own, c.told)
     seen, residual = c.row > 0, found.predicted - c.values
     if not structure.is_filter:
         return jnp.sum(jnp.where(seen, c.row * residual, 0.0) ** 2, axis=0)
@@ -78,49 +72,30 @@ def misfit_ahead(
 
 
 @compiled
-def track(
-    system: AcausalSystem, observers: dict[str, Any], layout: Layout, structure: Structure, shared: Any, own: Any,
-    told: Told,
-) -> Track:  # fmt: skip
+def track(setting: Setting, structure: Structure, shared: Any, own: Any, told: Told) -> Track:
     """All that a filter finds, of all experiments; NaN from where a run failed."""
-    return each(lambda s, o, c: _track(system, observers, layout, structure, s, o, c), layout.mesh, shared, own, told)
+    return each(lambda s, o, c: _track(setting, structure, s, o, c), setting.layout.mesh, shared, own, told)
 
 
 @compiled
-def predict_ahead(
-    system: AcausalSystem, observers: dict[str, Any], layout: Layout, structure: Structure, shared: Any, own: Any,
-    told: Told,
-) -> tuple[Any, Any, Any]:  # fmt: skip
+def predict_ahead(setting: Setting, structure: Structure, shared: Any, own: Any, told: Told) -> tuple[Any, Any, Any]:
     """(predictions, variances), each of shape (e, n, k), and their derivatives by the shared numbers, shape
     (e, n, k, s), and by each experiment's own."""
 
     def one(shared, own, c):
-        found = _track(system, observers, layout, structure, shared, own, c)
-        return found[:2], found[:2]
+        return _track(setting, structure, shared, own, c)[:2]
 
-    def with_slopes(shared, own, c):
-        (by_shared, by_own), found = _pairs(jax.jacfwd(one, argnums=(0, 1), has_aux=True)(shared, own, c))
-        return found, by_shared, by_own
-
-    return each(with_slopes, layout.mesh, shared, own, told)
-
-
-def _pairs(found: Any) -> Any:
-    """Derivatives of (predictions, variances) by (shared, own), turned to (shared, own) of (predictions,
-    variances)."""
-    slopes, values = found
-    return ((slopes[0][0], slopes[1][0]), (slopes[0][1], slopes[1][1])), values
+    return each_with_slopes(one, setting.layout.mesh, shared, own, told)
 
 
 @compiled
 def read_states(
-    system: AcausalSystem, observers: dict[str, Any], layout: Layout, shared: Any, own: Any, told: Told, x: Any, p: Any,
-    discrete: Any,
-) -> tuple[Float[Array, "e n k"], Float[Array, "e n k"]]:  # fmt: skip
+    setting: Setting, shared: Any, own: Any, told: Told, x: Any, p: Any, discrete: Any
+) -> tuple[Float[Array, "e n k"], Float[Array, "e n k"]]:
     """The outputs of states at n times, and their standard deviations, of covariances P."""
 
     def one(shared, own, told, x, p, discrete):
-        model = model_of(system, observers, layout, Structure(), shared, own, told)
+        layout, model = setting.layout, model_of(setting, Structure(), shared, own, told)
 
         def at(t, inputs, x, p, q):
             m = model._replace(inputs=with_kinds(inputs, layout))
@@ -134,12 +109,11 @@ def read_states(
 
 @compiled
 def go_on(
-    system: AcausalSystem, observers: dict[str, Any], layout: Layout, structure: Structure, steps: int, shared: Any,
-    own: Any, told: Told, x: Any, p: Any,
-) -> tuple[Any, Any, Any]:  # fmt: skip
+    setting: Setting, structure: Structure, steps: int, shared: Any, own: Any, told: Told, x: Any, p: Any
+) -> tuple[Any, Any, Any]:
     """States, covariances and discrete values `steps` times further on, of the first n − steps times of one experiment,
     with nothing measured on the way."""
-    model = model_of(system, observers, layout, structure, shared, own, told)
+    layout, model = setting.layout, model_of(setting, structure, shared, own, told)
     n = len(told.times)
     ahead = jnp.asarray(np.arange(n - steps)[:, None] + np.arange(1, steps + 1))
 

@@ -27,9 +27,10 @@ from ..system.evaluate import Refinement
 from ..system.input_values import by_entry
 from ..system.inputs import read_inputs, value_at
 from ..system.system import AcausalSystem
-from .diffusion import affine_flow, linear_flow
+from ..system.system_at import SystemAt
 from .filtering import Structure
-from .program import Layout, outputs_of, placed, with_kinds
+from .linear_models import affine_flow, linear_flow
+from .program import Layout, Setting, outputs_of, placed, with_kinds
 
 ITERATIONS = 4  # Gauss–Newton steps onto the constraints after a correction, which converge quadratically
 
@@ -65,10 +66,9 @@ class Model(NamedTuple):
     gain: Float[Array, "f k"]
 
 
-def model_of(
-    system: AcausalSystem, observers: Any, layout: Layout, structure: Structure, shared: Any, own: Any, told: Told
-) -> Model:
-    here, laws, initial = placed(system, observers, layout, shared, own, told.known)
+def model_of(setting: Setting, structure: Structure, shared: Any, own: Any, told: Told) -> Model:
+    system, _, layout = setting
+    here, laws, initial = placed(setting, shared, own, told.known)
     end = len(shared) - len(layout.shared)
     extra = iter(shared[end - len(layout.extra) : end])
     f, k = len(system.plan.states), len(layout.outputs)
@@ -87,15 +87,14 @@ def model_of(
     return Model(here, laws, initial, {}, jnp.diag(diffusion), driven, sigma, gain)
 
 
-def start_of(
-    system: AcausalSystem, observers: Any, layout: Layout, structure: Structure, shared: Any, own: Any, told: Told
-) -> tuple[Any, Any]:
+def start_of(setting: Setting, structure: Structure, shared: Any, own: Any, told: Told) -> tuple[Any, Any]:
     """The state at the start and the covariance that the priors of known starts give it."""
+    system, _, layout = setting
     f = len(system.plan.states)
     inputs = with_kinds(jax.tree.map(lambda a: a[0], told.inputs), layout)
 
     def at(known):
-        here, _, initial = placed(system, observers, layout, shared, own, known)
+        here, _, initial = placed(setting, shared, own, known)
         found = here.initialize(told.t0, inputs or None, initial or None, throw=False)
         return found, found
 
@@ -124,43 +123,35 @@ def _held(m: Model, discrete: Any) -> AcausalSystem:
 
 def _jacobian(m: Model, t: Any, x: Any) -> Float[Array, "f f"]:
     """∂f/∂x of the differential states, algebraic unknowns following them."""
-    plan = m.here.plan
-    f = len(plan.states)
-    here = m.here.at(t, m.inputs)
+    f, here = len(m.here.plan.states), m.here.at(t, m.inputs)
+    return jax.jacfwd(lambda first: _slopes(here, jnp.concatenate([first, x[f:]])))(x[:f])
 
-    def slopes(first):
-        state = here.split(jnp.concatenate([first, x[f:]]))
-        if len(plan.carried):
-            state = here.refined(state, Refinement.ROOT)
-        return here.semi_explicit(here.join(state))[:f]
 
-    return jax.jacfwd(slopes)(x[:f])
+def _slopes(here: SystemAt, x: Any) -> Float[Array, " f"]:
+    """The slopes of the differential states, algebraic unknowns following them."""
+    state = here.split(x)
+    if len(here.plan.carried):
+        state = here.refined(state, Refinement.ROOT)
+    return here.semi_explicit(here.join(state))[: len(here.plan.states)]
 
 
 def _intensity(m: Model, t: Any, x: Any) -> Float[Array, "f f"]:
     """σσᵀ at a state, that of noise of inputs included; kept in the tangent space of the constraints."""
     plan = m.here.plan
-    f, tangent = len(plan.states), _tangent(m, t, x, None)
+    tangent = _tangent(m, t, x, None)
     g = m.diffusion if tangent is None else tangent @ m.diffusion @ tangent.T
     if not m.driven:
         return g
     sources = by_entry(plan, read_inputs(plan, x.dtype, m.inputs))
     names = list(m.driven)
-    at = jnp.stack([jnp.asarray(_input_at(plan, sources, name, t), x.dtype) for name in names])
+    given = (sources.get(name, plan.inputs.defaults[plan.inputs.place[name]]) for name in names)
+    at = jnp.stack([jnp.asarray(value_at(source, t), x.dtype) for source in given])
 
     def slopes(values):
-        here = m.here.at(t, {**sources, **dict(zip(names, values, strict=True))})
-        state = here.split(x)
-        if len(plan.carried):
-            state = here.refined(state, Refinement.ROOT)
-        return here.semi_explicit(here.join(state))[:f]
+        return _slopes(m.here.at(t, {**sources, **dict(zip(names, values, strict=True))}), x)
 
     b = jax.jacfwd(slopes)(at) * jnp.stack([m.driven[name] for name in names])
     return g + b @ b.T
-
-
-def _input_at(plan: Any, sources: dict[str, Any], name: str, t: Any) -> Any:
-    return value_at(sources.get(name, plan.inputs.defaults[plan.inputs.place[name]]), t)
 
 
 def _tangent(m: Model, t: Any, x: Any, discrete: Any) -> Float[Array, "f f"] | None:
@@ -175,16 +166,12 @@ def _tangent(m: Model, t: Any, x: Any, discrete: Any) -> Float[Array, "f f"] | N
 
 def read(m: Model, layout: Layout, t: Any, x: Any, discrete: Any) -> tuple[Float[Array, " k"], Float[Array, "k f"]]:
     """Outputs at a state, and their derivatives by its differential entries."""
-    f = len(m.here.plan.states)
-    inputs = read_inputs(m.here.plan, x.dtype, m.inputs)
-    here = _held(m, discrete)
+    f, here = len(m.here.plan.states), _held(m, discrete)
 
     def outputs(first):
         full = jnp.concatenate([first, x[f:]])
         full = here.project(t, full, m.inputs) if m.here.is_constrained else full
-        values = None if discrete is None else discrete[None]
-        solution = Solution(t[None], full[None], m.here, inputs, {}, diffrax.RESULTS.successful, discrete=values)
-        found = outputs_of(solution, m.laws, layout, x.dtype)[0]
+        found = read_values(m, layout, t, full, discrete)
         return found, found
 
     slopes, found = jax.jacfwd(outputs, has_aux=True)(x[:f])
@@ -244,6 +231,7 @@ def _forward_linear(m: Model, ends: Float[Array, " m"], x: Any, p: Any) -> tuple
 
 
 def read_values(m: Model, layout: Layout, t: Any, x: Any, discrete: Any) -> Float[Array, " k"]:
+    """Outputs at a state."""
     inputs = read_inputs(m.here.plan, x.dtype, m.inputs)
     values = None if discrete is None else discrete[None]
     solution = Solution(t[None], x[None], m.here, inputs, {}, diffrax.RESULTS.successful, discrete=values)

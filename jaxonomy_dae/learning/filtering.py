@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError, nearest
+from ..errors import ModelError, nearest, whole_number
 from ..system.system import AcausalSystem
 from .data import Stacked
 from .experiment import ESTIMATE, Unknown
@@ -52,8 +52,7 @@ class Filter:
             )
         for name, value in self.noise.items():
             _check(f"Filter: noise of '{name}'", value, positive=True)
-        if not isinstance(self.substeps, int) or isinstance(self.substeps, bool) or self.substeps < 1:
-            raise ModelError(f"Filter: substeps is a whole number ≥ 1; got {self.substeps!r}")
+        whole_number(self.substeps, "Filter: substeps")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -54,7 +54,7 @@ class Batches:
             conditions = jax.tree.map(lambda a: a[chosen], conditions)
         if not len(row):
             return 0.0, np.zeros_like(z)
-        found = predict_and_differentiate(o.system, o.observers, o.layout, shared, own, conditions)
+        found = predict_and_differentiate(o.setting, shared, own, conditions)
         outputs, by_shared, by_own = (np.asarray(a, np.float64) for a in found)
         at = place, index, output
         residual = row * (outputs[at] - o.stacked.values[experiment, index, output])

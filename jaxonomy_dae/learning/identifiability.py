@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from .axes import new_axes
 from .evaluation import Evaluation, Weights
 from .factors import Factors
-from .figures import plot_spectrum
 from .objective import Objective
 
 
@@ -66,7 +66,15 @@ class Identifiability:
 
     def plot(self, ax: Any = None) -> Any:
         """Draws the eigenvalues of the scaled Fisher information; returns Matplotlib axes."""
-        return plot_spectrum(self, ax)
+        ax = new_axes(ax)
+        floor = np.finfo(float).tiny
+        ax.semilogy(np.arange(1, len(self.spectrum) + 1), np.maximum(self.spectrum, floor), "o", markersize=4)
+        ax.axhspan(ax.get_ylim()[0], 1.0, color="C3", alpha=0.1, linewidth=0, label="not determined")
+        ax.set_xlabel("direction")
+        ax.set_ylabel("eigenvalue")
+        ax.grid(True, alpha=0.3)
+        ax.legend()
+        return ax
 
 
 def natural_scale(objective: Objective, z: Float[np.ndarray, " f"]) -> Float[np.ndarray, " f"]:

@@ -1,24 +1,92 @@
-"""Linear intervals of what was estimated, as a table."""
+"""Intervals of what was estimated: linear ones, and those of the profile likelihood (Venzon & Moolgavkar 1988, Applied
+Statistics 37:87)."""
 
-from typing import TYPE_CHECKING
+import dataclasses
+from collections.abc import Callable
 
 import numpy as np
+import scipy.optimize
+import scipy.stats
+from jaxtyping import Float
 
+from .descent import Minimum
+from .evaluation import Weights
+from .objective import Objective
 from .table import Row, Table
 
-if TYPE_CHECKING:
-    from .estimate import Estimate
+FURTHEST = 10  # doublings of the linear interval before an end counts as infinite
 
 
-def intervals(estimate: "Estimate", level: float) -> Table:
+def profile(
+    objective: Objective, minimum: Minimum, point: Float[np.ndarray, " p"], spread: float, position: int, level: float,
+    reach: Callable[[Objective, np.ndarray, Weights], Minimum | None],
+) -> tuple[float, float]:  # fmt: skip
+    """The interval of one coordinate, in natural values.
+
+    **Arguments:**
+
+    - `point`: all coordinates at the minimum; `spread`: the standard deviation of this one.
+    - `reach`: `reach(objective, start, weights)` is the minimum next to a start, with weights that stay as they are.
+    """
+    c = objective.coordinates
+    allowed = 0.5 * float(scipy.stats.chi2.ppf(level, 1))
+    held = np.array(c.fixed)
+    held[position] = True
+    free = objective.free
+    others = np.flatnonzero(np.flatnonzero(free) != position)
+    weights = dataclasses.replace(
+        minimum.weights, precision=minimum.weights.precision[others], mean=minimum.weights.mean[others]
+    )
+    own = int(np.flatnonzero(np.flatnonzero(free) == position)[0])
+    prior, mean = minimum.weights.precision[own], minimum.weights.mean[own]
+    best = minimum.cost
+    warm = [minimum.z[others]]
+
+    def excess(z: float) -> float:
+        """By how much the cost exceeds the allowed one when the coordinate is held at z and everything else is
+        fitted."""
+        start = np.array(c.start)
+        start[free] = c.natural(point)[free]
+        start[position] = c.natural_at(position, z)
+        at = dataclasses.replace(objective, coordinates=dataclasses.replace(c, start=start, fixed=held))
+        own_cost = 0.5 * prior * (z - mean) ** 2
+        reached = reach(at, warm[0], weights)
+        cost = np.inf if reached is None else reached.cost
+        if reached is not None:
+            warm[0] = reached.z
+        return min(cost + own_cost - best, 1e6) - allowed
+
+    centre = float(point[position])
+    ends = []
+    for sign, bound in zip((-1, 1), (b[position] for b in c.z_bounds), strict=True):
+        warm[0] = minimum.z[others]
+        step = spread if np.isfinite(spread) and spread > 0 else 1.0
+        inner, z, end = centre, centre, sign * np.inf
+        for _ in range(FURTHEST):
+            z = centre + sign * 2 * step
+            z = max(z, bound) if sign < 0 else min(z, bound)
+            if excess(z) > 0:
+                end = float(scipy.optimize.brentq(excess, inner, z, xtol=1e-3 * step))  # pyright: ignore[reportArgumentType]
+                break
+            if z == bound:
+                end = bound
+                break
+            inner, step = z, 2 * step
+        ends.append(c.natural_at(position, end))
+    return ends[0], ends[1]
+
+
+def intervals(
+    objective: Objective, point: Float[np.ndarray, " p"], spreads: Float[np.ndarray, " p"], factor: float, level: float
+) -> Table:
     """As `Estimate.table`: parameters and starts, with what is to be said of each."""
-    c, factor, point = estimate.objective.coordinates, estimate.quantile(level), estimate.point
+    c = objective.coordinates
     low, high = c.z_bounds
     natural = c.natural(point)
-    moved, rows = set(np.flatnonzero(estimate.objective.free)), []
+    moved, rows = set(np.flatnonzero(objective.free)), []
     scalars = np.array([not name.endswith("]") for name in c.names])  # such as a sensor law's gain
     for k in np.flatnonzero(~c.is_weight | scalars).tolist():
-        z, spread, note = point[k], estimate.spread[k], ""
+        z, spread, note = point[k], spreads[k], ""
         ends = z - factor * spread, z + factor * spread
         if k not in moved:
             note = "frozen" if c.fixed[k] else "held out: fitted to this experiment alone"

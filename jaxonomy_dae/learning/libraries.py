@@ -8,8 +8,7 @@ import sympy
 
 from ..errors import ModelError, nearest
 from ..expressions.from_sympy import UnsupportedExpression, read, symbols_of
-from ..modeling.functions import of_scalars
-from ..modeling.networks import count_outputs
+from ..modeling.networks import count_outputs, of_scalars
 from .term import AbstractTerm, OfFunction, Power, Written, local_name
 
 

@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jax.core import Tracer
 from tqdm import tqdm
 
 from ..diagnosis.unused_parameters import unused_parameters
@@ -22,6 +21,7 @@ from ..diagnosis.wording import listed
 from ..errors import InitializationError, ModelError, SimulationError, SteadyStateError
 from ..modeling.interval import Interval
 from ..programs.cache import compiled
+from ..programs.staging import is_traced
 from ..system.bounds import project
 from ..system.system import AcausalSystem
 
@@ -103,7 +103,7 @@ def minimize(
         raise ModelError(f"loss is a function of the model, loss(model, *args); got {loss!r}")
     if not isinstance(args, tuple):
         raise ModelError(f"args is a tuple of further arguments, args=(data,); got {type(args).__name__}")
-    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((model, args))):
+    if is_traced((model, args)):
         raise ModelError("minimize takes its steps in Python: call it outside jit, grad and vmap")
     if not isinstance(optimizer, optax.GradientTransformation):
         raise ModelError(f"optimizer must be one of Optax, such as optax.adam(0.02); got {optimizer!r}")

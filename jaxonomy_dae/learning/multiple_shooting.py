@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from ..errors import ModelError
 from .block_elimination import Blocks, eliminate, linear
-from .descent import OFFSET, PATIENCE, TRIALS, Minimum
+from .descent import OFFSET, PATIENCE, TRIALS, Minimum, can_move, damping_after
 from .evaluation import Weights
 from .evidence import Evidence
 from .factors import Factors
@@ -82,12 +82,6 @@ class Merit:
         """Weighted rows."""
         return blocks.weighted(self.segments.by_sample(self.weights.row), self.continuity, self.multiplier)
 
-    def prior(self, z: Float[np.ndarray, " f"]) -> tuple[Float[np.ndarray, "r f"], Float[np.ndarray, " r"]]:
-        """The rows of priors, and their residuals."""
-        root = np.sqrt(self.weights.precision)
-        chosen = np.flatnonzero(root)
-        return np.diag(root)[chosen], (root * (z - self.weights.mean))[chosen]
-
     def heavier(self, continuity: float) -> "Merit":
         """A copy with a larger weight `continuity` and the same Lagrange multipliers."""
         return dataclasses.replace(
@@ -124,12 +118,7 @@ class Descent:
             self.evaluations += 1
             gain = -np.inf if new is None else cost - merit.cost(new)
             if new is not None and gain > 0:
-                ratio = gain / max(cost - promised, np.finfo(float).tiny)
-                if ratio > 0.7:
-                    self.damping /= 5
-                elif ratio < 0.3:
-                    self.damping *= 3
-                self.damping = max(self.damping, 1e-12)
+                self.damping = damping_after(self.damping, gain / max(cost - promised, np.finfo(float).tiny))
                 return new, gain
             self.damping *= 6
         return None
@@ -138,13 +127,13 @@ class Descent:
         self, merit: Merit, point: Point, blocks: Blocks, size: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, float] | None:
         """(coordinates, states at the nodes, cost that the linear rows promise) of a damped step."""
-        segments, (low, high), z = self.segments, self.bounds, point.z
+        segments, z = self.segments, point.z
         left = eliminate(blocks, np.sqrt(self.damping) * size)
-        prior, off = merit.prior(z)
+        off, prior = merit.weights.prior(z)
         rows = np.concatenate([segments.spread_out(left.rows), prior])
         residual = np.concatenate([left.residual.ravel(), off])
         gradient = rows.T @ residual
-        moves = ~(((z <= low) & (gradient > 0)) | ((z >= high) & (gradient < 0)))
+        moves = can_move(z, gradient, self.bounds)
         step = np.zeros_like(z)
         if moves.any():
             # Directions that no segment shows beyond the integration's error are not followed.
@@ -156,7 +145,7 @@ class Descent:
             damped = np.concatenate([rows[:, moves] @ seen, np.sqrt(self.damping) * np.eye(seen.shape[1])])
             right = np.concatenate([-residual, np.zeros(seen.shape[1])])
             step[moves] = seen @ np.linalg.lstsq(damped, right, rcond=ROUNDED)[0]
-        new = np.clip(z + step, low, high)
+        new = np.clip(z + step, *self.bounds)
         common = segments.common(new - z)
         nodes = left.nodes(common)
         if np.array_equal(new, z) and not np.any(nodes):
@@ -261,11 +250,10 @@ def _noise(merit: Merit, point: Point, jacobian: Float[np.ndarray, "m f"], toler
 def _reweighed(merit: Merit, point: Point, evidence: Evidence | None, tolerance: float) -> tuple[Merit, bool, float]:
     """The merit with better noise levels and priors, whether these have settled, and the remaining step in radii of the
     confidence region, were continuity to hold."""
-    z, (low, high) = point.z, merit.segments.objective.bounds
+    z = point.z
     found = merit.segments.evaluation(point)
     residual, jacobian = merit.weights.applied(z, found)
-    gradient = jacobian.T @ residual
-    moves = ~(((z <= low) & (gradient > 0)) | ((z >= high) & (gradient < 0)))
+    moves = can_move(z, jacobian.T @ residual, merit.segments.objective.bounds)
     noise = _noise(merit, point, jacobian, tolerance)
     factors = Factors.of(residual, jacobian[:, moves], noise)
     remaining = offset(factors, 0.5 * float(residual @ residual), len(residual), noise)

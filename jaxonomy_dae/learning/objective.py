@@ -23,7 +23,7 @@ from .evaluation import Evaluation, Weights
 from .evidence import Evidence
 from .experiment import Unknown
 from .least_squares import minimise
-from .program import Conditions, Layout, Weighted, misfit, predict, predict_and_differentiate
+from .program import Conditions, Layout, Setting, Weighted, misfit, predict, predict_and_differentiate
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +49,7 @@ MANY = 40  # numbers of one experiment beyond which a gradient backwards costs l
 
 
 class Misfit(NamedTuple):
-    """A function of (system, sensor laws, layout, structure, shared numbers, own numbers, what is told of one
+    """A function of (setting, structure, shared numbers, own numbers, what is told of one
     experiment), of shape (outputs,), its structure, what it is told of all, and whether its gradient is found
     backwards."""
 
@@ -71,6 +71,11 @@ class Objective:
     coordinates: Coordinates
     penalties: dict[str, Any]  # "evidence" or a precision, by the name of a group
     counted: Bool[np.ndarray, " e"]
+
+    @property
+    def setting(self) -> Setting:
+        """What the programs are made for."""
+        return Setting(self.system, self.observers, self.layout)
 
     def until(self, share: float) -> "Objective":
         """A copy with a share of each experiment's time."""
@@ -143,7 +148,7 @@ class Objective:
     def predicted(self, z: Float[np.ndarray, " p"]) -> Predicted:
         """Everything at a point, by the program."""
         shared, own = self.numbers(self.coordinates.natural(z))
-        found = predict_and_differentiate(self.system, self.observers, self.layout, shared, own, self.conditions)
+        found = predict_and_differentiate(self.setting, shared, own, self.conditions)
         return Predicted(*(np.asarray(a, np.float64) for a in found))
 
     def evaluate(self, z: Float[np.ndarray, " f"]) -> Evaluation | None:
@@ -160,7 +165,7 @@ class Objective:
         """Residuals alone; None where a run that counts fails."""
         shared, own = self.numbers(self.coordinates.natural(self.full(z)))
         forwards = diffrax.ForwardMode()
-        outputs = predict(self.system, self.observers, self.layout, forwards, shared, own, self.conditions)
+        outputs = predict(self.setting, forwards, shared, own, self.conditions)
         found = np.asarray(outputs, np.float64)[self.rows] - self.stacked.values[self.rows]
         return found if np.isfinite(found).all() else None
 

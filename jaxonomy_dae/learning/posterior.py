@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..errors import ModelError, nearest
+from ..errors import ModelError, nearest, whole_number
 from ..programs.cache import compiled
 from .band import Band, law_of, law_values
 from .chains import begin, blackjax, chain
 from .density import coordinates_at, posed
 from .prediction import Prediction, under
-from .program import Layout, run_one
+from .program import Conditions, Setting, run_one
 from .table import Row, Table
 
 if TYPE_CHECKING:
@@ -130,8 +130,7 @@ class Posterior:
 
     def _thinned(self, count: int) -> Float[np.ndarray, "n p"]:
         """So many points, evenly from all chains."""
-        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-            raise ModelError(f"draws is a whole number ≥ 1; got {count!r}")
+        whole_number(count, "draws")
         flat = self.points.reshape(len(self), -1)
         return flat[np.unique(np.linspace(0, len(flat) - 1, count).round().astype(int))]
 
@@ -141,12 +140,11 @@ class Posterior:
     ) -> Prediction:  # fmt: skip
         """Any variables under the conditions of an experiment, as `Estimate.predict`, but from runs at so many of the
         draws: their mean, standard deviation and quantiles."""
-        chosen = [names] if isinstance(names, str) else list(names)
-        objective, k, chosen, conditions = under(self.estimate, chosen, ts, experiment)
+        objective, k, chosen, conditions = under(self.estimate.objective, names, ts, experiment)
         points = self._thinned(draws)
         parts = [objective.numbers(objective.coordinates.natural(point)) for point in points]
         shared, own = jnp.stack([part[0] for part in parts]), jnp.stack([part[1][k] for part in parts])
-        found = _runs(objective.system, objective.observers, objective.layout, shared, own, conditions)
+        found = _runs(objective.setting, shared, own, conditions)
         outputs = np.asarray(found, np.float64)
         ends = np.quantile(outputs, [0.5 - level / 2, 0.5 + level / 2], axis=0)
         parts = outputs.mean(axis=0), outputs.std(axis=0), *ends
@@ -170,11 +168,11 @@ class Posterior:
 
 
 @compiled
-def _runs(system: Any, observers: dict[str, Any], layout: Layout, shared: Any, own: Any, conditions: Any) -> Any:
+def _runs(setting: Setting, shared: Any, own: Any, conditions: Conditions) -> Any:
     """The outputs of one experiment for several values, one after the other: as a batch, each would take as many steps
     as the longest."""
     c = jax.tree.map(lambda a: a[0], conditions)
-    return jax.lax.map(lambda at: run_one(system, observers, layout, None, at[0], at[1], c), (shared, own))
+    return jax.lax.map(lambda at: run_one(setting, None, at[0], at[1], c), (shared, own))
 
 
 def _listed(names: list[str]) -> str:
@@ -185,8 +183,7 @@ def _listed(names: list[str]) -> str:
 def sample(estimate: "Estimate", draws: int, chains: int, warmup: int, seed: int) -> Posterior:
     """Draws from the posterior around an estimate."""
     for what, value, least in (("draws", draws, 4), ("chains", chains, 1), ("warmup", warmup, 0)):
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise ModelError(f"{what} is a whole number ≥ {least}; got {value!r}")
+        whole_number(value, what, least)
     blackjax()
     program, told, names = posed(estimate)
     rng, found = np.random.default_rng(seed), []

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,12 +10,9 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import ModelError, nearest
-from .figures import plot_prediction
+from .axes import chosen_names, grid_of_axes
 from .objective import Objective, Predicted
 from .program import Conditions, predict_and_differentiate
-
-if TYPE_CHECKING:
-    from .estimate import Estimate
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,61 +26,81 @@ class Prediction:
     low: dict[str, np.ndarray]
     high: dict[str, np.ndarray]
 
+    @classmethod
+    def of(
+        cls, ts: np.ndarray, names: Sequence[str], mean: np.ndarray, spread: np.ndarray, factor: float
+    ) -> "Prediction":
+        """Variables of which mean and standard deviation are known, shape (n, names), with bands that go `factor`
+        standard deviations to each side."""
+        columns = mean, spread, mean - factor * spread, mean + factor * spread
+        return cls(ts, *(dict(zip(names, column.T, strict=True)) for column in columns))
+
     def plot(self, names: str | Sequence[str] | None = None, *, axes: Any = None) -> Any:
         """Draws variables with their bands, one below the other; returns Matplotlib axes."""
-        return plot_prediction(self, names, axes)
+        chosen = chosen_names(names, list(self.mean), "predictions of")
+        axes = grid_of_axes(axes, len(chosen), 1, "a plot of predictions")
+        for ax, name in zip(axes[:, 0], chosen, strict=True):
+            ax.fill_between(self.ts, self.low[name], self.high[name], color="C0", alpha=0.3, linewidth=0)
+            ax.plot(self.ts, self.mean[name], color="C0", linewidth=1.5)
+            ax.set_ylabel(name)
+            ax.grid(True, alpha=0.3)
+        axes[-1, 0].set_xlabel("time [s]")
+        return axes[:, 0]
+
+
+def named(objective: Objective, names: str | Sequence[str], experiment: int | str) -> tuple[list[str], int]:
+    """(names of variables and sensor laws, those of arrays by their entries; the place of an experiment)."""
+    labels, plan = objective.stacked.labels, objective.system.plan
+    k = labels.index(experiment) if experiment in labels else experiment
+    if not isinstance(k, int) or not -len(labels) <= k < len(labels):
+        raise ModelError(f"there is no experiment {experiment!r}: " + nearest(str(experiment), labels))
+    chosen = [names] if isinstance(names, str) else names
+    found = [n for name in chosen for n in ([name] if name in objective.observers else plan.entry_names([name]))]
+    plan.resolve([name for name in found if name not in objective.observers])
+    return found, k % len(labels)
 
 
 def under(
-    estimate: "Estimate", names: list[str], ts: Any, experiment: int | str
+    objective: Objective, names: str | Sequence[str], ts: Any, experiment: int | str
 ) -> tuple[Objective, int, list[str], Conditions]:
     """(objective whose outputs are the variables named, the experiment's place, these names, its conditions)."""
-    objective = estimate.objective
-    s, plan = objective.stacked, objective.system.plan
-    k = s.labels.index(experiment) if experiment in s.labels else experiment
-    if not isinstance(k, int) or not -len(s.labels) <= k < len(s.labels):
-        raise ModelError(f"there is no experiment {experiment!r}: " + nearest(str(experiment), s.labels))
-    names = [n for name in names for n in ([name] if name in objective.observers else plan.entry_names([name]))]
-    for name in names:
-        if name not in objective.observers:
-            plan.resolve([name])
+    s = objective.stacked
+    names, k = named(objective, names, experiment)
     times = s.times[k, : s.counts[k]] if ts is None else np.asarray(ts, float)
     if times.ndim != 1 or not len(times) or (np.diff(times) < 0).any() or times[0] < s.t0[k] or times[-1] <= s.t0[k]:
         raise ModelError(f"ts must be increasing times, of shape (n,), that start at {s.t0[k]:g} or later")
     layout = dataclasses.replace(objective.layout, outputs=tuple(names), mesh=None)
-    one = Objective(
-        objective.system, objective.observers, layout,
-        s, objective.coordinates, {}, objective.counted,
-    )  # fmt: skip
+    one = Objective(*objective.setting._replace(layout=layout), s, objective.coordinates, {}, objective.counted)
     conditions = jax.tree.map(lambda a: a[k][None], one.conditions)
     conditions = dataclasses.replace(conditions, times=jnp.asarray(times[None], conditions.times.dtype))
-    return one, k % len(s.labels), names, conditions
+    return one, k, names, conditions
 
 
-def prediction(estimate: "Estimate", names: list[str], ts: Any, experiment: int | str, factor: float) -> Prediction:
-    """Predictions under the conditions of an experiment, linearized around the estimate."""
-    one, k, names, conditions = under(estimate, names, ts, experiment)
+def prediction(
+    objective: Objective, point: Float[np.ndarray, " p"], root: Float[np.ndarray, "p r"], names: str | Sequence[str],
+    ts: Any, experiment: int | str, factor: float,
+) -> Prediction:  # fmt: skip
+    """Predictions under the conditions of an experiment, linearized around a point with the covariance `root`·rootᵀ."""
+    one, k, names, conditions = under(objective, names, ts, experiment)
     c, times = one.coordinates, np.asarray(conditions.times[0], np.float64)
-    shared, own = one.numbers(c.natural(estimate.point))
-    found = predict_and_differentiate(one.system, one.observers, one.layout, shared, own[k][None], conditions)
+    shared, own = one.numbers(c.natural(point))
+    found = predict_and_differentiate(one.setting, shared, own[k][None], conditions)
     alone = Predicted(*(np.asarray(a, np.float64) for a in found))
     n, j = len(times), len(names)
     rows = tuple(a.ravel() for a in np.meshgrid([0], np.arange(n), np.arange(j), indexing="ij"))
     place = c.n_shared + k * c.n_own
     columns = np.concatenate([np.arange(c.n_shared), place + np.arange(c.n_own)])
-    slope = alone.jacobian(rows) * c.slope(estimate.point)[columns]
-    spread = np.linalg.norm(slope @ estimate.root[columns], axis=1).reshape(n, j)
-    mean = alone.outputs[0]
-    by = [dict(zip(names, a.T, strict=True)) for a in (mean, spread, mean - factor * spread, mean + factor * spread)]
-    return Prediction(times, *by)
+    slope = alone.jacobian(rows) * c.slope(point)[columns]
+    spread = np.linalg.norm(slope @ root[columns], axis=1).reshape(n, j)
+    return Prediction.of(times, names, alone.outputs[0], spread, factor)
 
 
-def at_samples(estimate: "Estimate") -> tuple[Float[np.ndarray, "e n k"], Float[np.ndarray, "e n k"]]:
+def at_samples(
+    objective: Objective, point: Float[np.ndarray, " p"], root: Float[np.ndarray, "p r"]
+) -> tuple[Float[np.ndarray, "e n k"], Float[np.ndarray, "e n k"]]:
     """All outputs at the samples' times, by the program of the fit, and their standard deviations."""
-    c, found = estimate.objective.coordinates, estimate.objective.predicted(estimate.point)
-    scale = c.slope(estimate.point)
-    shared = scale[: c.n_shared, None] * estimate.root[: c.n_shared]
-    own = scale[c.n_shared :, None] * estimate.root[c.n_shared :]
-    own = own.reshape(c.experiments, c.n_own, estimate.root.shape[1])
-    moves = found.by_shared @ shared + np.einsum("enko,eor->enkr", found.by_own, own)
-    return found.outputs, np.linalg.norm(moves, axis=-1)
+    c, found = objective.coordinates, objective.predicted(point)
+    moves = c.slope(point)[:, None] * root
+    shared, own = moves[: c.n_shared], moves[c.n_shared :].reshape(c.experiments, c.n_own, root.shape[1])
+    along = found.by_shared @ shared + np.einsum("enko,eor->enkr", found.by_own, own)
+    return found.outputs, np.linalg.norm(along, axis=-1)

@@ -21,15 +21,13 @@ from .evaluation import Evaluation, Weights
 from .experiment import Experiment, Unknown
 from .filter_objective import AheadObjective, FilterObjective
 from .filtering import Extra, Filter, Innovations, Structure, structure_and_extras
-from .first_order import adam_steps
 from .holdout import holdout_score
 from .identifiability import Identifiability, identifiability
 from .multiple_shooting import Shooting, shoot
 from .objective import Objective
 from .program import Layout
-from .residuals import residuals
-from .runs import run, why_not
-from .starting_points import starting_points
+from .runs import residuals, why_not
+from .starting_points import adam_steps, starting_points
 from .training import GradientSteps, Training, train
 
 GROWING = tuple(k / 10 for k in range(1, 11))  # shares of the time
@@ -232,7 +230,7 @@ class Problem:
         for point in starting_points(objective, starts, seed):
             training = None
             if first is not None:
-                training = train(self, objective, point, first)
+                training = train(objective, point, first)
                 point = training.z
             found = self._descend(objective, point, shares, steps, adam, learning_rate)
             if found is None:
@@ -242,7 +240,7 @@ class Problem:
             if best is None or score < best[0]:
                 best = score, found, training
         if best is None:
-            raise self.not_simulated(objective)
+            raise SimulationError(why_not(objective))
         return Estimate.of(self, objective, best[1], best[2])
 
     def train(
@@ -263,7 +261,7 @@ class Problem:
             raise ModelError(f"train takes learning.GradientSteps(optax.adam(0.02), steps=200); got {how!r}")
         self._check_steps(0, None, how)
         objective = self._prepared(data, freeze, start, bounds)
-        return train(self, objective, objective.coordinates.z_start[objective.free], how)
+        return train(objective, objective.coordinates.z_start[objective.free], how)
 
     def _prepared(self, data: Any, freeze: Any, start: Any, bounds: Any) -> Objective:
         """The objective, from the arguments of `fit`."""
@@ -286,10 +284,6 @@ class Problem:
                 f"gradient steps are those of runs, not of {type(self.method).__name__}: train with method='single' "
                 "first, and give fit(start=training.values)"
             )
-
-    def not_simulated(self, objective: Objective) -> SimulationError:
-        """The error where no start can be simulated."""
-        return SimulationError(why_not(objective))
 
     def _coordinates(self, stacked: Stacked, freeze: Any, start: Any, bounds: Any) -> Coordinates:
         system = started(self.system, start)
@@ -325,10 +319,6 @@ class Problem:
             return Minimum(start, found, weights, cost, [cost], 1, True, "nothing is searched", rtol)
         return objective.lowest(start, weights=weights)
 
-    def run(self, objective: Objective, z: Float[np.ndarray, " p"], experiment: int, ts: Any = None) -> Any:
-        """An ordinary simulation of one experiment at a point."""
-        return run(objective, z, experiment, ts)
-
     def with_law(self, name: str, law: Any, system: AcausalSystem, stacked: Stacked) -> "Problem":
         """A copy with another law in a network's place, without a prior, in the system given."""
         other = copy.copy(self)
@@ -357,7 +347,7 @@ class Problem:
         z = objective.coordinates.z_start[objective.free]
         found = objective.evaluate(z)
         if found is None:
-            raise self.not_simulated(objective)
+            raise SimulationError(why_not(objective))
         return objective, objective.weights(z, found), found, z
 
     @property

@@ -10,7 +10,7 @@ starts are their own.
 
 import dataclasses
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from ..programs.cache import compiled
 from ..simulation.simulate import simulate
 from ..system.system import AcausalSystem
-from .devices import each
+from .devices import each, each_with_slopes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,6 +44,14 @@ class Layout:
     def n_own(self) -> int:
         """The number of values that each experiment has of its own."""
         return len(self.own)
+
+
+class Setting(NamedTuple):
+    """What a program is made for: a system, sensor laws by name, and the layout of its numbers."""
+
+    system: AcausalSystem
+    observers: dict[str, Any]
+    layout: Layout
 
 
 class Conditions(eqx.Module):
@@ -80,8 +88,9 @@ def with_weights(module: Any, numbers: Any) -> Any:
     return eqx.combine(jax.tree.unflatten(structure, new), module)
 
 
-def with_values(system: AcausalSystem, observers: dict[str, Any], layout: Layout, shared: Any) -> tuple[Any, Any, Any]:
-    """(system, observers, shared starts) with the shared numbers in their places."""
+def with_values(setting: Setting, shared: Any) -> tuple[AcausalSystem, dict[str, Any], Any]:
+    """(system, sensor laws, shared starts) with the shared numbers in their places."""
+    system, observers, layout = setting
     n = len(layout.parameters)
     if n:
         system = system.with_parameters({name: shared[k] for k, name in enumerate(layout.parameters)})
@@ -97,11 +106,10 @@ def with_values(system: AcausalSystem, observers: dict[str, Any], layout: Layout
     return system, observers, shared[n + len(layout.extra) :]
 
 
-def placed(
-    system: AcausalSystem, observers: dict[str, Any], layout: Layout, shared: Any, own: Any, known: Any
-) -> tuple[AcausalSystem, dict[str, Any], dict[str, Any]]:
-    """(system, observers, starts by variables' names) of one experiment, with its own parameters in their places."""
-    system, observers, starts = with_values(system, observers, layout, shared)
+def placed(setting: Setting, shared: Any, own: Any, known: Any) -> tuple[AcausalSystem, dict[str, Any], dict[str, Any]]:
+    """(system, sensor laws, starts by variables' names) of one experiment, with its own parameters in their places."""
+    layout = setting.layout
+    system, observers, starts = with_values(setting, shared)
     initial = dict(zip(layout.shared, starts, strict=True))
     initial |= dict(zip(layout.own, own, strict=True))
     initial |= dict(zip(layout.known, known, strict=True))
@@ -112,11 +120,10 @@ def placed(
     return system, observers, initial
 
 
-def run_one(
-    system: AcausalSystem, observers: dict[str, Any], layout: Layout, adjoint: Any, shared: Any, own: Any, c: Conditions
-) -> Float[Array, "n k"]:
+def run_one(setting: Setting, adjoint: Any, shared: Any, own: Any, c: Conditions) -> Float[Array, "n k"]:
     """The outputs of one experiment."""
-    system, observers, initial = placed(system, observers, layout, shared, own, c.known)
+    layout = setting.layout
+    system, observers, initial = placed(setting, shared, own, c.known)
     solution = simulate(
         system, c.times[-1], t0=c.t0, ts=c.times, initial=initial or None, adjoint=adjoint, throw=False,
         inputs=with_kinds(c.inputs, layout), **dict(layout.options),
@@ -124,11 +131,9 @@ def run_one(
     return outputs_of(solution, observers, layout, c.times.dtype)
 
 
-def misfit(
-    system: AcausalSystem, observers: dict[str, Any], layout: Layout, adjoint: Any, shared: Any, own: Any, c: Weighted
-) -> Float[Array, " k"]:
+def misfit(setting: Setting, adjoint: Any, shared: Any, own: Any, c: Weighted) -> Float[Array, " k"]:
     """The sum of squared weighted residuals of each output in a run of one experiment; NaN where it fails."""
-    outputs = run_one(system, observers, layout, adjoint, shared, own, c.told)
+    outputs = run_one(setting, adjoint, shared, own, c.told)
     return jnp.sum(jnp.where(c.row > 0, c.row * (outputs - c.values), 0.0) ** 2, axis=0)
 
 
@@ -147,30 +152,22 @@ def outputs_of(solution: Any, observers: dict[str, Any], layout: Layout, dtype: 
 
 
 @compiled
-def predict(
-    system: AcausalSystem, observers: dict[str, Any], layout: Layout, adjoint: Any, shared: Any, own: Any,
-    conditions: Conditions,
-) -> Float[Array, "e n k"]:  # fmt: skip
+def predict(setting: Setting, adjoint: Any, shared: Any, own: Any, conditions: Conditions) -> Float[Array, "e n k"]:
     """The outputs of all experiments; NaN where a run failed."""
 
     def one(shared, own, c):
-        return run_one(system, observers, layout, adjoint, shared, own, c)
+        return run_one(setting, adjoint, shared, own, c)
 
-    return each(one, layout.mesh, shared, own, conditions)
+    return each(one, setting.layout.mesh, shared, own, conditions)
 
 
 @compiled
 def predict_and_differentiate(
-    system: AcausalSystem, observers: dict[str, Any], layout: Layout, shared: Any, own: Any, conditions: Conditions
+    setting: Setting, shared: Any, own: Any, conditions: Conditions
 ) -> tuple[Float[Array, "e n k"], Float[Array, "e n k s"], Float[Array, "e n k o"]]:
     """The outputs of all experiments, and their derivatives by the shared numbers and by each experiment's own."""
 
     def one(shared, own, c):
-        found = run_one(system, observers, layout, diffrax.ForwardMode(), shared, own, c)
-        return found, found
+        return run_one(setting, diffrax.ForwardMode(), shared, own, c)
 
-    def with_slopes(shared, own, c):
-        (by_shared, by_own), found = jax.jacfwd(one, argnums=(0, 1), has_aux=True)(shared, own, c)
-        return found, by_shared, by_own
-
-    return each(with_slopes, layout.mesh, shared, own, conditions)
+    return each_with_slopes(one, setting.layout.mesh, shared, own, conditions)

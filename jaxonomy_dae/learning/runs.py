@@ -1,28 +1,26 @@
-"""Ordinary simulations of experiments, beside the compiled program: to look at them, and to say why they fail."""
+"""Experiments outside of a fit: ordinary simulations, to look at them and to say why they fail; and residuals by name,
+for losses of one's own."""
 
+import dataclasses
 import math
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..errors import InitializationError, ModelError, SimulationError
+from ..errors import InitializationError, ModelError, SimulationError, nearest
 from ..simulation.simulate import simulate
+from ..system.system import AcausalSystem
 from .objective import Objective
-from .program import with_values
+from .program import Setting, placed, predict
 
 
 def run(objective: Objective, z: Float[np.ndarray, " p"], experiment: int, ts: Any = None) -> Any:
     """An ordinary simulation of one experiment at a point."""
     layout, s = objective.layout, objective.stacked
     shared, own = objective.numbers(objective.coordinates.natural(z))
-    system, _, starts = with_values(objective.system, objective.observers, layout, shared)
-    initial = dict(zip(layout.shared, starts, strict=True))
-    initial |= dict(zip(layout.own, own[experiment], strict=True))
-    initial |= dict(zip(layout.known, objective.conditions.known[experiment], strict=True))
-    given = {name: float(v) for name, v in initial.items() if name in system.parameters}
-    system = system.with_parameters(given) if given else system
-    initial = {name: v for name, v in initial.items() if name not in given}
+    system, _, initial = placed(objective.setting, shared, own[experiment], objective.conditions.known[experiment])
     inputs = {n: (t[experiment], v[experiment], dict(s.kinds)[n]) for n, (t, v) in s.inputs.items()}
     end = s.counts[experiment]
     times = s.times[experiment, :end] if ts is None else ts
@@ -51,3 +49,29 @@ def why_not(objective: Objective) -> str:
         return f"no start can be simulated; from the first, {s.labels[k]} fails: {error}"
     what = "its predictions are not finite" if failed else "their derivatives are not finite"
     return f"no start can be simulated; from the first, {s.labels[k]}: {what}"
+
+
+def residuals(
+    objective: Objective, model: AcausalSystem, starts: dict[str, Any], observe: dict[str, Any], adjoint: Any
+) -> dict[str, dict[str, Any]]:
+    """As `Problem.residuals`: predictions of a model like the objective's less its data, in units of the noise."""
+    layout, s = objective.layout, objective.stacked
+    shared, own = objective.numbers(objective.coordinates.start)
+    shared = shared[len(shared) - len(layout.shared) :]
+    for name, value in starts.items():
+        value = jnp.asarray(value, shared.dtype)
+        if name in layout.shared:
+            shared = shared.at[layout.shared.index(name)].set(value)
+        elif name in layout.own:
+            own = own.at[:, layout.own.index(name)].set(value)
+        else:
+            raise ModelError(f"the start of '{name}' is not unknown: " + nearest(name, layout.shared + layout.own))
+    plain = dataclasses.replace(layout, parameters=(), modules=(), extra=())
+    setting = Setting(model, objective.observers | observe, plain)
+    outputs = predict(setting, adjoint, shared, own, objective.conditions)
+    sigma = np.where(np.isnan(s.sigma), 1.0, s.sigma)
+    scaled = jnp.where(s.observed, (outputs - s.values) / sigma[:, None, :], 0.0)
+    return {
+        label: {name: scaled[k, :count, j] for j, name in enumerate(s.outputs) if s.observed[k, :, j].any()}
+        for k, (label, count) in enumerate(zip(s.labels, s.counts, strict=True))
+    }

@@ -141,7 +141,7 @@ class Segments:
         o, c = self.objective, self.cut
         shared, own = self._numbers(z)
         start = Conditions(c.times[:, 0], c.t0[:, 0], c.known, c.inputs)
-        found = first_states(o.system, o.observers, o.layout, shared, own, start)
+        found = first_states(o.setting, shared, own, start)
         x, by_shared, by_own = (np.asarray(a, np.float64) for a in found)
         with np.errstate(invalid="ignore", over="ignore"):
             slope = np.concatenate([by_shared, by_own], axis=-1) * self._slopes(z)[:, None]
@@ -213,7 +213,7 @@ class Segments:
         if not np.isfinite(states).all() or not np.isfinite(directions).all():
             return None
         x, bases = jnp.asarray(states, shared.dtype), jnp.asarray(directions, shared.dtype)
-        return directions, run_segments(o.system, o.observers, o.layout, self.moving, shared, own, x, bases, self.cut)
+        return directions, run_segments(o.setting, self.moving, shared, own, x, bases, self.cut)
 
     def ends(self, z: Float[np.ndarray, " f"], states: Float[np.ndarray, "e N n"]) -> Float[np.ndarray, "e N n"]:
         """The states at the ends of segments that begin at `states`; NaN where a run fails."""
@@ -227,10 +227,7 @@ class Segments:
         n, f = len(size), len(o.system.plan.states)
         if not o.system.is_constrained:
             return states, np.broadcast_to(np.diag(size), (*states.shape, n))
-        found = on_constraints(
-            o.system, o.observers, o.layout, ITERATIONS, shared, own, jnp.asarray(states, shared.dtype),
-            self.cut,
-        )  # fmt: skip
+        found = on_constraints(o.setting, ITERATIONS, shared, own, jnp.asarray(states, shared.dtype), self.cut)
         states, slope = (np.asarray(a, np.float64) for a in found)
         if not np.isfinite(slope).all():
             return states, slope

@@ -12,9 +12,8 @@ from jaxtyping import Array, Float
 
 from ..programs.cache import compiled
 from ..simulation.simulate import simulate
-from ..system.system import AcausalSystem
-from .devices import each
-from .program import Conditions, Layout, outputs_of, placed, with_kinds
+from .devices import each, each_with_slopes
+from .program import Conditions, Setting, outputs_of, placed, with_kinds
 
 
 class Cut(eqx.Module):
@@ -37,34 +36,28 @@ class Ran(eqx.Module):
 
 @compiled
 def first_states(
-    system: AcausalSystem, observers: dict[str, Any], layout: Layout, shared: Any, own: Any, conditions: Conditions
+    setting: Setting, shared: Any, own: Any, conditions: Conditions
 ) -> tuple[Float[Array, "e n"], Float[Array, "e n s"], Float[Array, "e n o"]]:
     """The states at which experiments start, and their derivatives by the shared numbers and by each one's own."""
 
     def one(shared, own, c):
-        here, _, initial = placed(system, observers, layout, shared, own, c.known)
-        found = here.initialize(c.t0, with_kinds(c.inputs, layout) or None, initial or None, throw=False)
-        return found, found
+        here, _, initial = placed(setting, shared, own, c.known)
+        return here.initialize(c.t0, with_kinds(c.inputs, setting.layout) or None, initial or None, throw=False)
 
-    def with_slopes(shared, own, c):
-        (by_shared, by_own), found = jax.jacfwd(one, argnums=(0, 1), has_aux=True)(shared, own, c)
-        return found, by_shared, by_own
-
-    return each(with_slopes, layout.mesh, shared, own, conditions)
+    return each_with_slopes(one, setting.layout.mesh, shared, own, conditions)
 
 
 @compiled
 def on_constraints(
-    system: AcausalSystem, observers: dict[str, Any], layout: Layout, iterations: int, shared: Any, own: Any,
-    states: Any, cut: Cut,
-) -> tuple[Float[Array, "e N n"], Float[Array, "e N n f"]]:  # fmt: skip
+    setting: Setting, iterations: int, shared: Any, own: Any, states: Any, cut: Cut
+) -> tuple[Float[Array, "e N n"], Float[Array, "e N n f"]]:
     """The states at the nodes moved onto the constraints, and the derivatives there of this projection by the f
     differential states."""
-    f = len(system.plan.states)
+    f = len(setting.system.plan.states)
 
     def one(shared, own, x, t, c):
-        here, _, _ = placed(system, observers, layout, shared, own, c.known)
-        inputs = with_kinds(c.inputs, layout) or None
+        here, _, _ = placed(setting, shared, own, c.known)
+        inputs = with_kinds(c.inputs, setting.layout) or None
         x = here.project(t, x, inputs, iterations=iterations)
         slope = jax.jacfwd(lambda first: here.project(t, jnp.concatenate([first, x[f:]]), inputs))(x[:f])
         return x, slope
@@ -73,24 +66,23 @@ def on_constraints(
         states, c = told
         return jax.vmap(lambda x, t: one(shared, own, x, t, c))(states, c.t0)
 
-    return each(nodes, layout.mesh, shared, own, (states, cut))
+    return each(nodes, setting.layout.mesh, shared, own, (states, cut))
 
 
 @compiled
 def run_segments(
-    system: AcausalSystem, observers: dict[str, Any], layout: Layout, moving: tuple[int, ...], shared: Any, own: Any,
-    states: Any, bases: Any, cut: Cut,
-) -> tuple[Ran, Ran]:  # fmt: skip
+    setting: Setting, moving: tuple[int, ...], shared: Any, own: Any, states: Any, bases: Any, cut: Cut
+) -> tuple[Ran, Ran]:
     """All segments, from states at the nodes; and their derivatives, in a last axis, by numbers common to segments, at
     the places `moving` in [shared | own], and by the coefficients of `bases`, shape (e, N, n, d), along which nodes
     move."""
-    count, places = len(moving), np.array(moving, int)
+    layout, count, places = setting.layout, len(moving), np.array(moving, int)
 
     def one(moved, shared, own, x, basis, times, t0, c):
         both = jnp.concatenate([shared, own]).at[places].set(moved[:count])
         shared, own = both[: len(shared)], both[len(shared) :]
         delta = moved[count:]
-        here, laws, _ = placed(system, observers, layout, shared, own, c.known)
+        here, laws, _ = placed(setting, shared, own, c.known)
         solution = simulate(
             here, times[-1], t0=t0, ts=times, initial=x + basis @ delta, adjoint=diffrax.ForwardMode(), throw=False,
             inputs=with_kinds(c.inputs, layout), **dict(layout.options),

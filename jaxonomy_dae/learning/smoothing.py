@@ -1,65 +1,57 @@
 """What samples tell of states: filtered, smoothed, and predicted some steps ahead."""
 
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..errors import ModelError, nearest
+from ..errors import ModelError
 from .filter_objective import AheadObjective, FilterObjective
 from .filter_program import Track, go_on, read_states
-from .prediction import Prediction
-
-if TYPE_CHECKING:
-    from .estimate import Estimate
+from .objective import Objective
+from .prediction import Prediction, named
 
 SINGULAR = 1e-12  # eigenvalues of a scaled covariance, relative to the largest, that count as none
 
 
 def followed(
-    estimate: "Estimate", names: list[str], experiment: int | str, how: str, steps: int, factor: float
-) -> Prediction:
+    objective: Objective, point: Float[np.ndarray, " p"], names: str | Sequence[str], experiment: int | str, how: str,
+    steps: int, factor: float,
+) -> Prediction:  # fmt: skip
     """Variables of an experiment: `"filtered"`, `"smoothed"` or `"ahead"` by a number of steps."""
-    objective = estimate.objective
     kinds = (FilterObjective,) if how != "ahead" else (AheadObjective,)
     if not isinstance(objective, AheadObjective) or not isinstance(objective, kinds):
         needed = "learning.Filter" if how != "ahead" else "learning.Filter or learning.Innovations"
         raise ModelError(f"{how} variables are those of Problem(method={needed}(...))")
-    s, plan = objective.stacked, objective.system.plan
-    k = s.labels.index(experiment) if experiment in s.labels else experiment
-    if not isinstance(k, int) or not -len(s.labels) <= k < len(s.labels):
-        raise ModelError(f"there is no experiment {experiment!r}: " + nearest(str(experiment), s.labels))
+    s = objective.stacked
+    names, k = named(objective, names, experiment)
     count = s.counts[k]
     if not isinstance(steps, int) or isinstance(steps, bool) or not 1 <= steps <= count:
         raise ModelError(f"steps is a whole number from 1 to the {count} samples of this experiment; got {steps!r}")
-    names = [n for name in names for n in ([name] if name in objective.observers else plan.entry_names([name]))]
-    for name in names:
-        if name not in objective.observers:
-            plan.resolve([name])
-    found = jax.tree.map(lambda a: a[k, :count], objective.track(estimate.point))
+    found = jax.tree.map(lambda a: a[k, :count], objective.track(point))
     first = 0
     if how == "filtered":
         x, p, q = found.after, found.p_after, found.discrete
     elif how == "smoothed":
-        x, p = smooth(found, len(plan.states))
+        x, p = smooth(found, len(objective.system.plan.states))
         q = found.discrete
     elif steps == 1:
         x, p, q = found.before, found.p_before, found.discrete
     else:
-        x, p, q = _further(objective, estimate.point, k, count, found, steps)
+        x, p, q = _further(objective, point, k, count, found, steps)
         first = steps
-    mean, spread = _read(objective, estimate.point, k, slice(first, count), names, x, p, q)
+    mean, spread = _read(objective, point, k, slice(first, count), names, x, p, q)
     times = s.times[k, :count]
     if first:  # nothing was predicted so far ahead of the first ones
         missing = np.full((first, len(names)), np.nan)
         mean, spread = np.concatenate([missing, mean]), np.concatenate([missing, spread])
     if not isinstance(objective, FilterObjective):
         spread = np.full_like(spread, np.nan)
-    by = [dict(zip(names, a.T, strict=True)) for a in (mean, spread, mean - factor * spread, mean + factor * spread)]
-    return Prediction(times, *by)
+    return Prediction.of(times, names, mean, spread, factor)
 
 
 def smooth(found: Track, f: int) -> tuple[Float[np.ndarray, "n x"], Float[np.ndarray, "n f f"]]:
@@ -99,19 +91,15 @@ def _further(
     """States, covariances and discrete values that follow `steps` samples after the filtered ones."""
     shared, own, told = _numbers(objective, point, k, slice(0, count))
     told = jax.tree.map(lambda a: a[0], told)
-    first = found.after, found.p_after
-    return go_on(
-        objective.system, objective.observers, objective.layout, objective.structure, steps, shared, own[0], told,
-        *first,
-    )  # fmt: skip
+    return go_on(objective.setting, objective.structure, steps, shared, own[0], told, found.after, found.p_after)
 
 
 def _read(
     objective: AheadObjective, point: Any, k: int, rows: slice, names: list[str], x: Any, p: Any, q: Any
 ) -> tuple[np.ndarray, np.ndarray]:
     shared, own, told = _numbers(objective, point, k, rows)
-    layout = dataclasses.replace(objective.layout, outputs=tuple(names))
+    setting = objective.setting._replace(layout=dataclasses.replace(objective.layout, outputs=tuple(names)))
     batch = jax.tree.map(lambda a: jnp.asarray(a, told.times.dtype)[None], (x, p, q))
-    found = read_states(objective.system, objective.observers, layout, shared, own, told, *batch)
+    found = read_states(setting, shared, own, told, *batch)
     mean, spread = (np.asarray(a[0], np.float64) for a in found)
     return mean, spread

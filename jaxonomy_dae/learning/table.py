@@ -6,7 +6,9 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from .figures import plot_table
+import numpy as np
+
+from .axes import new_axes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +51,29 @@ class Table:
     def plot(self, ax: Any = None, *, true: Mapping[str, float] | None = None) -> Any:
         """Draws the intervals relative to the values, with crosses at `true` values by name, where these are known;
         returns Matplotlib axes."""
-        return plot_table(self, ax, true)
+        rows = self.rows
+        ax = new_axes(ax, 7.0, 0.38 * len(rows) + 1.2)
+        for k, row in enumerate(rows):
+            size = abs(row.value) or 1.0
+            if np.isfinite(row.high - row.low):
+                ends = [100 * (end - row.value) / size for end in (row.low, row.high)]
+                ax.plot(ends, [k, k], color="C0", linewidth=5, alpha=0.45, solid_capstyle="butt")
+                ax.plot(0, k, "o", color="C0", markersize=4)
+            else:
+                ax.axhspan(k - 0.3, k + 0.3, color="C3", alpha=0.15, linewidth=0)
+            if true is not None and row.name in true:
+                ax.plot(100 * (float(true[row.name]) - row.value) / size, k, "x", color="C3", markersize=7)
+            if row.note:
+                ax.annotate(
+                    row.note, (0.995, k), xycoords=("axes fraction", "data"), ha="right", va="center", fontsize=8
+                )
+        ax.set_yticks(
+            range(len(rows)), [f"{row.name} = {row.value:.4g}{' ' * bool(row.unit)}{row.unit}" for row in rows]
+        )
+        ax.set_ylim(len(rows) - 0.5, -0.5)
+        ax.set_xlabel(f"{100 * self.level:g} % interval, relative to the value [%]")
+        ax.grid(True, axis="x", alpha=0.3)
+        return ax
 
     def _repr_html_(self) -> str:
         rows = ("".join(f"<td>{html.escape(c)}</td>" for c in line) for line in self._cells())

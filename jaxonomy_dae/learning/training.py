@@ -4,7 +4,7 @@ import dataclasses
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -13,16 +13,14 @@ import numpy as np
 import optax
 from jaxtyping import Float
 
-from ..errors import ModelError
+from ..errors import ModelError, SimulationError, whole_number
+from .axes import new_axes
 from .checkpoint import fingerprint, read_facts, read_state, save
 from .evaluation import Evaluation, Weights
-from .figures import new_axes
 from .gradient import Batches
 from .holdout import holdout_score
 from .objective import Objective
-
-if TYPE_CHECKING:
-    from .problem import Problem
+from .runs import why_not
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,13 +55,12 @@ class GradientSteps:
     def __post_init__(self):
         if not isinstance(self.optimizer, optax.GradientTransformation):
             raise ModelError(f"optimizer must be one of Optax, such as optax.adam(0.02); got {self.optimizer!r}")
-        numbers = {"steps": 0, "batch": 1, "patience": 1, "every": 1}
-        for name, least in numbers.items():
-            value = getattr(self, name)
-            if value is None and name in ("batch", "patience"):
-                continue
-            if not isinstance(value, int) or isinstance(value, bool) or value < least:
-                raise ModelError(f"GradientSteps: {name} is a whole number ≥ {least}; got {value!r}")
+        whole_number(self.steps, "GradientSteps: steps", 0)
+        whole_number(self.every, "GradientSteps: every")
+        if self.batch is not None:
+            whole_number(self.batch, "GradientSteps: batch")
+        if self.patience is not None:
+            whole_number(self.patience, "GradientSteps: patience")
         shares = tuple(float(share) for share in self.horizons)
         if not shares or shares[-1] != 1.0 or any(not 0 < share <= 1 for share in shares):
             raise ModelError(f"horizons are shares in (0, 1], the last of them 1; got {self.horizons!r}")
@@ -159,7 +156,7 @@ class State:
         ]  # fmt: skip
 
 
-def train(problem: "Problem", objective: Objective, start: Float[np.ndarray, " f"], plan: GradientSteps) -> Training:
+def train(objective: Objective, start: Float[np.ndarray, " f"], plan: GradientSteps) -> Training:
     """Trains from a point."""
     held_out = bool(objective.stacked.holdout.any())
     if plan.patience is not None and not held_out:
@@ -169,7 +166,7 @@ def train(problem: "Problem", objective: Objective, start: Float[np.ndarray, " f
     z = np.clip(start, low, high)
     weights = _weights(stages[plan.share(0)], z)
     if weights is None:
-        raise problem.not_simulated(objective)
+        raise SimulationError(why_not(objective))
     with jax.numpy_dtype_promotion("standard"):
         optimizer = plan.optimizer.init(jnp.asarray(z))
     state = State(z, z, optimizer, weights, [], [], [])

@@ -1,8 +1,10 @@
-"""Laws that components of more than one domain share, as expressions."""
+"""Laws that components of several domains share, as expressions; steps and pulses in time, whose edges are events."""
 
 from typing import Any
 
-from sympy import asinh, exp, pi, sin, sqrt, tanh
+from sympy import Piecewise, asinh, exp, frac, pi, sin, sqrt, tanh
+
+from ..modeling import Component
 
 
 def penetration(s: Any, gap: Any, smooth: Any) -> tuple[Any, Any]:
@@ -32,3 +34,14 @@ def stribeck(v: Any, sliding: Any, breakaway: Any, stribeck_speed: Any, viscous:
 def sine(t: Any, amplitude: Any, frequency: Any, phase: Any) -> Any:
     """amplitude·sin(2π·frequency·t + phase)."""
     return amplitude * sin(2 * pi * frequency * t + phase)
+
+
+def step(component: Component, start_time: Any) -> Any:
+    """0, and 1 from `start_time` on."""
+    return Piecewise((1, component.relation(component.ev.t >= start_time)), (0, True))
+
+
+def pulse(component: Component, period: Any, width: Any, start_time: Any) -> Any:
+    """1 in the first part `width` of every `period` from `start_time` on, else 0."""
+    cycle = (component.ev.t - start_time) / period
+    return Piecewise((1, component.relation((cycle >= 0) & (frac(cycle) < width))), (0, True))

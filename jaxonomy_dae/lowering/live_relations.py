@@ -50,7 +50,7 @@ def without_live_relations(
         f"{where}: '{condition[:-1]}' is no event: nonlinear equations that it stands in determine what it compares"
         for where, _, condition in (text.partition(": when(") for text in texts)
     )
-    return dataclasses.replace(flat, events=_without(table, gone)), notes
+    return dataclasses.replace(flat, events=table.take(np.flatnonzero(~gone).tolist())), notes
 
 
 def _compared(
@@ -118,18 +118,3 @@ def _with_known(template: AbstractTemplate, columns: tuple[int, ...]) -> Abstrac
         else:
             known[n] = rebuilt(n, [known[a] for a in n.arguments]) if n.arguments else n
     return template_of(known[template.graph], template.slots, template.n_parameters, template.n_coefficients)
-
-
-def _without(table: EventTable, gone: np.ndarray) -> EventTable:
-    """The table without some events."""
-    kept, rows = ~gone, ~gone[table.event]
-
-    def of(column: Sequence) -> tuple:
-        return tuple(e for e, stays in zip(column, kept, strict=False) if stays)
-
-    number_of = np.cumsum(kept) - 1
-    return EventTable(
-        of(table.text), table.guard[kept], of(table.clocks), of(table.message), of(table.noted), of(table.revocable),
-        of(table.relation), of(table.kink), of(table.strict), of(table.immediate), number_of[table.event[rows]],
-        table.state[rows], table.discrete[rows], table.value[rows], table.constant[rows], table.left_alone,
-    )  # fmt: skip

@@ -218,28 +218,10 @@ def _digest(
         feed(a.kind, a.template.key, a.variable, a.order, a.parameter, a.component)
     for row in flat.rows:
         feed(row.opaque.index, row.targets, row.inputs, sorted(row.opaque.time_positions))
-    e = flat.events
-    feed(
-        e.text,
-        e.guard,
-        e.message,
-        e.noted,
-        e.revocable,
-        e.relation,
-        e.kink,
-        e.strict,
-        e.immediate,
-        e.event,
-        e.state,
-        e.discrete,
-        e.value,
-        e.constant,
-        e.left_alone,
-        flat.parameters.discrete,
-    )
-    feed(*((s.template.key, s.parameters) if s else "once" for clock in e.clocks for s in clock))
-    h = flat.held
-    feed(h.text, h.active, h.impulse, h.force, h.closed, h.level, h.owner, flat.parameters.n_relations)
+    events = vars(flat.events) | {"clocks": None}
+    feed(*events.values(), flat.parameters.discrete)
+    feed(*((s.template.key, s.parameters) if s else "once" for clock in flat.events.clocks for s in clock))
+    feed(*vars(flat.held).values(), flat.parameters.n_relations)
     if linear_solver is not None:
         feed(repr(linear_solver))
     feed(states, selection.constraints, selection.dummies, extended.base, extended.level)

@@ -8,47 +8,28 @@ model.
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Protocol
+from typing import NamedTuple
 
 import numpy as np
 
 from ..linear.sparse import SparsePattern
-from ..model.extended import Extended
 from .schedule import AnyStep, SparseStep
 
 LIMIT = 30_000_000  # entries of rows, above which the pattern counts as dense
 
 
-class InjectedRow(Protocol):
-    """A correction of finished rows: the rows, and the quantities that it reads."""
+class Scheduled(NamedTuple):
+    """The part of a plan that its pattern follows from; the plan keeps the pattern, and imports this module."""
+
+    n_quantities: int
+    states: np.ndarray
+    carried: np.ndarray
+    steps: Sequence[AnyStep]
+    corrected: Sequence[tuple[Sequence[int], np.ndarray]]  # finished rows, and the quantities that a correction reads
 
     @property
-    def rows(self) -> tuple[int, ...]: ...
-
-    @property
-    def quantities(self) -> np.ndarray: ...
-
-
-class Scheduled(Protocol):
-    """The part of a `SystemPlan` that its pattern follows from; the plan keeps the pattern, and imports this module."""
-
-    @property
-    def extended(self) -> Extended: ...
-
-    @property
-    def states(self) -> np.ndarray: ...
-
-    @property
-    def carried(self) -> np.ndarray: ...
-
-    @property
-    def n_state(self) -> int: ...
-
-    @property
-    def steps(self) -> tuple[AnyStep, ...]: ...
-
-    @property
-    def rows(self) -> Sequence[InjectedRow]: ...
+    def n_state(self) -> int:
+        return len(self.states) + len(self.carried)
 
 
 class TooDense(Exception):
@@ -68,7 +49,7 @@ class Dependencies:
     solved for (and depend on what their block reads) or read from the state array."""
 
     def __init__(self, plan: Scheduled, refined: bool):
-        n = plan.extended.quantities.n
+        n = plan.n_quantities
         self.width = plan.n_state
         self.refined = refined
         self.place = np.zeros(n, np.int64)
@@ -77,9 +58,7 @@ class Dependencies:
         self.row = np.zeros(n + 1, np.int64)
         self.segments: list[ColumnSets] = []
         self.entries = 0
-        self.residuals: list[
-            ColumnSets
-        ] = []  # of nonlinear blocks, in the order of the state array's algebraic unknowns
+        self.residuals: list[ColumnSets] = []  # of nonlinear blocks, in the order of the algebraic unknowns
         single = ColumnSets(np.arange(self.width + 1), np.arange(self.width, dtype=np.int32))
         self._store(single, [plan.states])
 
@@ -208,13 +187,13 @@ def field_rows(dependencies: Dependencies, plan: Scheduled) -> ColumnSets:
     for step in plan.steps:
         dependencies.add(step)
     rows = dependencies.of(plan.states + 1)
-    if not plan.rows:
+    if not plan.corrected:
         return rows
     places, columns = entries([rows])
-    for row in plan.rows:
-        read = np.unique(dependencies.of(row.quantities).columns)
-        places = np.concatenate([places, np.repeat(np.array(row.rows, np.int64), len(read))])
-        columns = np.concatenate([columns, np.tile(read, len(row.rows))])
+    for corrected, quantities in plan.corrected:
+        read = np.unique(dependencies.of(quantities).columns)
+        places = np.concatenate([places, np.repeat(np.array(corrected, np.int64), len(read))])
+        columns = np.concatenate([columns, np.tile(read, len(corrected))])
     places, columns = unique_entries(places, columns, dependencies.width)
     counts = np.bincount(places, minlength=len(plan.states))
     return ColumnSets(np.concatenate([[0], np.cumsum(counts)]), columns.astype(np.int32))

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import lineax as lx
 import numpy as np
@@ -20,13 +20,36 @@ from ..model.quantities import QuantityMap
 from ..model.reduced import ReducedModel
 from ..model.tables import ZERO, FlatModel, provenance_of
 from . import pattern
-from .dummy_blocks import DummyBlocks, dummy_blocks
 from .gather import Gather
 from .plan_events import EventPlan
 from .plan_held import HeldPlan
 from .plan_waves import WaveGroup
 from .program import Program, plan
 from .schedule import TORN, AnyStep, needed
+
+
+class DummyBlocks(NamedTuple):
+    """n nonlinear blocks of m equations that determine dummy derivatives.
+
+    `rows` and `columns`, shape (n, m), are places in the residuals g of all nonlinear blocks and in their unknowns z.
+    """
+
+    rows: np.ndarray
+    columns: np.ndarray
+
+
+def dummy_blocks(steps: Sequence[AnyStep], dummies: np.ndarray) -> tuple[DummyBlocks, ...]:
+    """The nonlinear blocks that determine `dummies`, quantities that a minimal set of states leaves out."""
+    found: list[DummyBlocks] = []
+    start = 0
+    for step in steps:
+        if not step.carried:
+            continue
+        holds = np.isin(np.concatenate(step.unknown), dummies)
+        if holds.any():
+            found.extend(DummyBlocks(start + rows, start + columns) for rows, columns in step.blocks_of(holds))
+        start += sum(len(quantities) for quantities in step.guessed)
+    return tuple(found)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,18 +168,23 @@ class SystemPlan:
         bring."""
         return self.n_constraints + (0 if self.held is None else len(self.held.table.level))
 
+    @property
+    def _scheduled(self) -> pattern.Scheduled:
+        rows = [(row.rows, row.quantities) for row in self.rows]
+        return pattern.Scheduled(self.extended.quantities.n, self.states, self.carried, self.steps, rows)
+
     @functools.cached_property
     def jacobian_pattern(self) -> SparsePattern | None:
         """The places of ∂(vector field)/∂(state) that can be nonzero at a consistent state, shape (n_state, n_state);
         None if it has too many places to list."""
-        return pattern.field_pattern(self)
+        return pattern.field_pattern(self._scheduled)
 
     @functools.cached_property
     def dae_pattern(self) -> SparsePattern | None:
         """The places that can be nonzero in the Jacobian of [f(t, x, z); g(t, x, z)] with respect to the state array
         [x, z]: the states' derivatives with z read from the array, not refined, then the residuals of the nonlinear
         blocks. Sorted by row, each place once; None if there are too many to list."""
-        return pattern.dae_pattern(self)
+        return pattern.dae_pattern(self._scheduled)
 
     @functools.cached_property
     def carried_pattern(self) -> SparsePattern | None:

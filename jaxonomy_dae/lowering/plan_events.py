@@ -144,19 +144,7 @@ def _in_order(table: EventTable, reads: list[set[int]]) -> EventTable:
             f"the sampled events {names} need each other's results at the same instant, directly or through "
             "equations: let one of them read the value before, pre(…)"
         ) from None
-    everything = [*order, *range(len(reads), len(table))]
-    place = np.argsort(np.array(everything, np.int64), kind="stable")
-
-    def moved(column: Sequence) -> tuple:
-        return tuple(column[e] for e in everything)
-
-    return dataclasses.replace(
-        table, text=moved(table.text), guard=table.guard[everything], clocks=tuple(table.clocks[e] for e in order),
-        message=moved(table.message), noted=moved(table.noted), revocable=moved(table.revocable),
-        relation=moved(table.relation), kink=moved(table.kink), strict=moved(table.strict),
-        immediate=moved(table.immediate),
-        event=place[table.event] if len(table.event) else table.event,
-    )  # fmt: skip
+    return table.take([*order, *range(len(reads), len(table))])
 
 
 def read_variables(

@@ -9,7 +9,7 @@ whole: their equations are grouped by template, and their matrix is sparse.
 import abc
 import dataclasses
 from collections.abc import Iterator, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -43,7 +43,7 @@ class StepEquation(Group):
     @property
     def inside(self) -> list[int]:
         """The slots of local unknowns."""
-        return [k for k, u in enumerate(self.local) if u >= 0]
+        return _inside(self.local)
 
 
 class AbstractStep(abc.ABC):
@@ -258,22 +258,22 @@ def build_schedule(extended: Extended, blocks: Blocks, entry_sizes: EntrySizes) 
         here = places[group_of[blocks.equations[places]] == g]
         if len(here):
             keyed.extend(_single_steps(group, g, row_of, blocks, here, block_of_place))
-    shapes: dict[tuple, list[int]] = {}
-    details: dict[int, tuple] = {}
+    shapes: dict[tuple, list[_Block]] = {}
     for b in np.flatnonzero(sizes > 1).tolist():
-        detail = _block_detail(extended, blocks, b, group_of, row_of)
-        details[b] = detail
-        shapes.setdefault((int(blocks.level[b]), detail[2]), []).append(b)
-    large: dict[tuple[int, bool], list[int]] = {}
-    for (level, _), members in shapes.items():
-        found = _block_step(extended, level, [details[b] for b in members], group_of, row_of, entry_sizes)
-        if isinstance(found, Step):
-            keyed.append(((level, 1, int(details[members[0]][0][0])), found))
+        block = _block(extended, blocks, b, group_of, row_of)
+        shapes.setdefault((int(blocks.level[b]), block.shape), []).append(block)
+    large: dict[tuple[int, bool], list[_Block]] = {}
+    for (level, shape), alike in shapes.items():
+        linear = all(extended.groups[g].template.is_affine_in(_inside(slots)) for g, slots in shape)
+        step = _torn_step(extended, level, linear, alike, row_of, entry_sizes)
+        if step is None:
+            large.setdefault((level, linear), []).extend(alike)
         else:
-            large.setdefault((level, found), []).extend(members)
+            keyed.append(((level, 1, alike[0].equations[0]), step))
     for (level, linear), members in large.items():
-        step = _sparse_step(extended, level, linear, [details[b] for b in sorted(members)], group_of, row_of)
-        keyed.append(((level, 1, int(details[min(members)][0][0])), step))
+        members = sorted(members, key=lambda block: block.number)
+        step = _sparse_step(extended, level, linear, members, group_of, row_of)
+        keyed.append(((level, 1, members[0].equations[0]), step))
     keyed.sort(key=lambda pair: pair[0])
     return tuple(step for _, step in keyed)
 
@@ -308,8 +308,21 @@ def _equation(group: ExtendedGroup, rows: np.ndarray, local: dict[int, int]) -> 
     )
 
 
-def _block_detail(extended: Extended, blocks: Blocks, b: int, group_of, row_of):
-    """(equations, unknowns, shape) of a block, equations by template and unknowns by number."""
+class _Block(NamedTuple):
+    """A block of several equations, in the order of their templates, and as many unknowns. Its shape says for each
+    equation the group that it is of, and the local unknown in each slot; −1: a quantity from outside."""
+
+    number: int
+    equations: list[int]
+    unknowns: list[int]
+    shape: tuple[tuple[int, tuple[int, ...]], ...]
+
+
+def _inside(slots: tuple[int, ...]) -> list[int]:
+    return [k for k, u in enumerate(slots) if u >= 0]
+
+
+def _block(extended: Extended, blocks: Blocks, b: int, group_of: np.ndarray, row_of: np.ndarray) -> _Block:
     inside = slice(int(blocks.pointer[b]), int(blocks.pointer[b + 1]))
     equations = sorted(blocks.equations[inside].tolist(), key=lambda e: (int(group_of[e]), e))
     unknowns = sorted(blocks.unknowns[inside].tolist())
@@ -318,24 +331,22 @@ def _block_detail(extended: Extended, blocks: Blocks, b: int, group_of, row_of):
         (int(group_of[e]), tuple(local.get(q, -1) for q in extended.groups[group_of[e]].quantity[row_of[e]].tolist()))
         for e in equations
     )
-    return equations, unknowns, shape
+    return _Block(b, equations, unknowns, shape)
 
 
-def _block_step(
-    extended: Extended, level: int, details: list[tuple], group_of, row_of, entry_sizes: EntrySizes
-) -> Step | bool:
-    """The step of blocks of one shape; or, if they are to stay whole, whether they are linear."""
-    shape = details[0][2]
-    templates = [extended.groups[g].template for g, _ in shape]
-    positions = [[k for k, u in enumerate(slots) if u >= 0] for _, slots in shape]
-    linear = all(t.is_affine_in(p) for t, p in zip(templates, positions, strict=True))
+def _torn_step(
+    extended: Extended, level: int, linear: bool, alike: list[_Block], row_of: np.ndarray, entry_sizes: EntrySizes
+) -> Step | None:
+    """The step of blocks of one shape, torn and written out; None if they are to stay whole."""
+    shape = alike[0].shape
     if len(shape) > WRITTEN_OUT[linear]:
-        return linear
+        return None
     contains, solvable = [], []
     entries: dict[tuple[int, int], np.ndarray] = {}
     numbers = set()
-    for e, (template, inside, (g, slots)) in enumerate(zip(templates, positions, shape, strict=True)):
-        rows = row_of[np.array([d[0][e] for d in details])]
+    for e, (g, slots) in enumerate(shape):
+        template, inside = extended.groups[g].template, _inside(slots)
+        rows = row_of[[block.equations[e] for block in alike]]
         for k in inside:
             at = (e, slots[k])
             size = entry_sizes.of(g, k)[rows]
@@ -351,21 +362,22 @@ def _block_step(
         solvable.append(frozenset(safe))
     torn = tear(contains, solvable, BlockSizes(entries, frozenset(numbers)))
     if len(torn.tearing) > TORN:
-        return linear
+        return None
     equations = []
-    for k, (g, slots) in enumerate(shape):
-        rows = row_of[np.array([d[0][k] for d in details])]
-        equations.append(_equation(extended.groups[g], rows, {s: u for s, u in enumerate(slots) if u >= 0}))
-    n_unknowns = len(details[0][1])
-    unknown = tuple(np.array([d[1][u] for d in details]) for u in range(n_unknowns))
+    for e, (g, slots) in enumerate(shape):
+        rows = row_of[[block.equations[e] for block in alike]]
+        equations.append(_equation(extended.groups[g], rows, {k: slots[k] for k in _inside(slots)}))
+    unknown = tuple(np.array(column) for column in zip(*(block.unknowns for block in alike), strict=True))
     return Step(level, tuple(equations), unknown, torn, linear)
 
 
-def _sparse_step(extended: Extended, level: int, linear: bool, details: list[tuple], group_of, row_of) -> SparseStep:
+def _sparse_step(
+    extended: Extended, level: int, linear: bool, members: list[_Block], group_of: np.ndarray, row_of: np.ndarray
+) -> SparseStep:
     """The step of large blocks, whatever their shapes."""
-    equation = np.concatenate([np.array(d[0]) for d in details])
-    unknown = np.concatenate([np.array(d[1]) for d in details])
-    block = np.repeat(np.arange(len(details)), [len(d[0]) for d in details])
+    equation = np.concatenate([block.equations for block in members])
+    unknown = np.concatenate([block.unknowns for block in members])
+    block = np.repeat(np.arange(len(members)), [len(block.equations) for block in members])
     equations, equation_block = [], []
     for g in np.unique(group_of[equation]).tolist():
         here = np.flatnonzero(group_of[equation] == g)

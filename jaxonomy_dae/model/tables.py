@@ -8,6 +8,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, overload
 
+import jax.numpy as jnp
 import numpy as np
 
 from ..modeling.interval import Interval
@@ -215,6 +216,20 @@ class EventTable:
     def __len__(self):
         return len(self.text)
 
+    def take(self, events: Sequence[int]) -> "EventTable":
+        """The table with these events, in this order, sampled ones first, and what they write."""
+        place = np.full(len(self), -1, np.int64)
+        place[events] = np.arange(len(events))
+        rows = place[self.event] >= 0
+        columns = ("text", "message", "noted", "revocable", "relation", "kink", "immediate")
+        of_events = {name: tuple(getattr(self, name)[e] for e in events) for name in columns}
+        of_actions = {name: getattr(self, name)[rows] for name in ("state", "discrete", "value", "constant")}
+        clocks = tuple(self.clocks[e] for e in events if e < len(self.clocks))
+        event = place[self.event[rows]]
+        return dataclasses.replace(
+            self, guard=self.guard[events], clocks=clocks, event=event, **of_events, **of_actions
+        )
+
 
 _NONE = np.zeros(0, np.int64)
 NO_EVENTS = EventTable((), _NONE, (), (), (), (), (), (), (), (), _NONE, _NONE, _NONE, _NONE, np.zeros(0))
@@ -310,3 +325,17 @@ def provenance_of(groups: tuple[EquationGroup, ...], equation: int) -> Provenanc
     """The provenance of an equation."""
     group, place = locate(groups, equation)
     return group.provenance[place]
+
+
+def complete(dependents: Sequence[DependentParameters], array: Any) -> Any:
+    """All parameters, shape (*batch, n), with the dependent ones computed from the others; NumPy or JAX."""
+    for group in dependents:
+        given = [array[..., column] for column in group.parameter.T]
+        if isinstance(array, np.ndarray):
+            array = array.copy()
+            with np.errstate(all="ignore"):  # what is not finite is named by those who call
+                array[..., group.target] = group.template.residual([], given, [], 0.0, None, backend="numpy")
+        else:
+            value = group.template.residual([], given, [], 0.0, None)
+            array = array.at[..., group.target].set(jnp.asarray(value, array.dtype))
+    return array

@@ -8,7 +8,7 @@ become branches on discrete variables, which are as the relation says until an e
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import sympy
 
@@ -53,11 +53,7 @@ class Turning:
     condition: Any
     watched: Any
     kink: bool = False
-
-    @property
-    def starts(self) -> tuple[float, ...]:
-        """The initial values of its hidden discrete variables."""
-        return (float(LIVE),)
+    starts: ClassVar = (float(LIVE),)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,11 +64,7 @@ class Stepping:
     number: int
     argument: Any
     watched: Any
-
-    @property
-    def starts(self) -> tuple[float, ...]:
-        """The initial values of its hidden discrete variables."""
-        return (float(LIVE), 0.0)
+    starts: ClassVar = (float(LIVE), 0.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,11 +76,7 @@ class Timed:
     condition: Any
     edges: Edges
     kink: bool = False
-
-    @property
-    def starts(self) -> tuple[float, ...]:
-        """The initial values of its hidden discrete variables."""
-        return (float(LIVE),)
+    starts: ClassVar = (float(LIVE),)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,13 +87,10 @@ class TimedSteps:
     number: int
     argument: Any
     edges: Edges
-
-    @property
-    def starts(self) -> tuple[float, ...]:
-        """The initial values of its hidden discrete variables."""
-        return (float(LIVE), 0.0)
+    starts: ClassVar = (float(LIVE), 0.0)
 
 
+# Each `starts` its hidden discrete variables at these values.
 Watched = Turning | Stepping | Timed | TimedSteps
 
 
@@ -147,7 +132,7 @@ def _replaced(condition: Any, forms: dict[Any, Any]) -> Any:
     return condition
 
 
-def is_watched(condition: Any) -> bool:
+def varies(condition: Any) -> bool:
     """True if the truth of a condition can change between events: some symbol in it moves."""
     return any(_moves(s) for s in symbols_of(condition))
 
@@ -258,7 +243,7 @@ class _Rewriting:
         live, guarded = self.numbers.split(self._as_written(condition))
         for r in relations_in(in_relations_of_time(self._as_written(condition))):
             self.timed_places.setdefault(r, []).append(places)
-        if not is_watched(guarded):
+        if not varies(guarded):
             return live
         # What is known of time is so in the guard; equations that are looked at outside of runs have all as it is.
         number = self._numbers(1)
@@ -323,7 +308,7 @@ def _chosen(turn: Turn, a: Any, b: Any, relation: Any) -> Any:
     if a.is_number:
         a, b = b, a
     condition = relation(a, b, evaluate=False)
-    return sympy.Piecewise((a, turn(condition) if _varies(condition) else condition), (b, True), evaluate=False)
+    return sympy.Piecewise((a, turn(condition) if varies(condition) else condition), (b, True), evaluate=False)
 
 
 def _absolute(turn: Turn, _: Turn, u: Any) -> Any:
@@ -482,7 +467,7 @@ def _varying(order: list[Any]) -> set[Any]:
     out: set[Any] = set()
     for e in order:
         conditions = (c for _, c in _pairs(e)) if isinstance(e, sympy.Piecewise) else ()
-        if _moves(e) or any(a in out for a in _arguments(e)) or any(_varies(c) for c in conditions):
+        if _moves(e) or any(a in out for a in _arguments(e)) or any(varies(c) for c in conditions):
             out.add(e)
     return out
 
@@ -491,14 +476,10 @@ def _moves(symbol: Any) -> bool:
     return isinstance(symbol, VariableSymbol | TimeSymbol)
 
 
-def _varies(condition: Any) -> bool:
-    return any(_moves(s) for s in symbols_of(condition))
-
-
 def _can_turn(condition: Any) -> bool:
     """True if a condition can become an event: it varies between events, contains no event's relation yet, and a guard
     can be made both of it and of its negation."""
-    if not _varies(condition) or any(isinstance(s, RelationSymbol) for s in symbols_of(condition)):
+    if not varies(condition) or any(isinstance(s, RelationSymbol) for s in symbols_of(condition)):
         return False  # constant between events; or an event already
     try:
         for c in (condition, sympy.Not(condition)):

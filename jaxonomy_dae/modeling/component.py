@@ -15,12 +15,10 @@ from .declarations import START, Account, Learned, Parameter, Variable, full_nam
 from .environment import EqnEnv
 from .equations import residual_of
 from .events import HeldBranch, When
-from .functions import of_scalars
 from .interval import Interval, as_interval
-from .kinds import check_kind
 from .mode_declarations import ModeDeclarations
 from .names import check_name
-from .networks import count_outputs
+from .networks import check_kind, count_outputs, of_scalars
 from .ports import Domain, Port
 from .real_number import real_number
 from .symbols import DiscreteSymbol, ParameterSymbol, PreviousSymbol, TimeSymbol, VariableSymbol
@@ -128,11 +126,12 @@ class Component(ModeDeclarations, metaclass=Construction):
             )
         super().__setattr__(name, value)
 
-    def _claim(self, name: str, what: str):
+    def _check_open(self, what: str) -> None:
         if self._sealed:
-            raise ModelError(
-                f"component '{self.path}' is complete: declare its {what} '{name}' inside __init__ of its class"
-            )
+            raise ModelError(f"component '{self.path}' is complete: {what} inside __init__ of its class")
+
+    def _claim(self, name: str, what: str):
+        self._check_open(f"declare its {what} '{name}'")
         check_name(name, what, f"component '{self.name}': ")
         for table, kind in (
             (self.parameters, "parameter"),
@@ -322,8 +321,7 @@ class Component(ModeDeclarations, metaclass=Construction):
         name = f"{derivative}{START}"
         if name in self.variables:
             raise ModelError(f"component '{self.name}': {derivative} has a start already")
-        if self._sealed:
-            raise ModelError(f"component '{self.path}' is complete: say the start of {derivative} inside its __init__")
+        self._check_open(f"say the start of {derivative}")
         self.add_equations(sympy.Eq(self._declare(name, "start", value, fixed), derivative, evaluate=False))
 
     def input(self, name: str, default: float | None = None, unit: str = "") -> VariableSymbol:
@@ -444,8 +442,7 @@ class Component(ModeDeclarations, metaclass=Construction):
 
         - `ModelError` if an equation is trivially true or false, or has a symbol the component does not know.
         """
-        if self._sealed:
-            raise ModelError(f"component '{self.path}' is complete: add its equations inside __init__ of its class")
+        self._check_open("add its equations")
         for equation in equations:
             if not isinstance(equation, sympy.Basic | bool | int | float):
                 raise ModelError(f"component '{self.name}': {equation!r} is not an equation")
@@ -486,8 +483,7 @@ class Component(ModeDeclarations, metaclass=Construction):
         self._declare_accounts("supply", expressions)
 
     def _declare_accounts(self, kind: str, expressions: tuple[Any, ...]):
-        if self._sealed:
-            raise ModelError(f"component '{self.path}' is complete: declare its {kind} inside __init__ of its class")
+        self._check_open(f"declare its {kind}")
         for given in expressions:
             expression = self.symbol(given) if isinstance(given, str) else given
             if isinstance(given, int | float):

@@ -9,8 +9,7 @@ from .connections import Connection, Signal, resolve_ends
 from .environment import EqnEnv
 from .names import check_name
 from .neural import NeuralDAEBlock
-from .owner import Owner
-from .ports import Port
+from .ports import Owner, Port
 
 
 class AcausalDiagram:

@@ -31,7 +31,7 @@ class EventDeclarations:
     path: str
     events: list[When]
     equations: list[sympy.Expr]
-    _sealed: bool
+    _check_open: Any
     add_equations: Any
     _declare: Any
     _declare_parameter: Any
@@ -110,8 +110,7 @@ class EventDeclarations:
         revocable: bool = False, text: str | None = None, relation: bool = False, watched: Any = sympy.true,
         kink: bool = False,
     ) -> None:  # fmt: skip
-        if self._sealed:
-            raise ModelError(f"component '{self.path}' is complete: declare its events inside __init__ of its class")
+        self._check_open("declare its events")
         where = f"component '{self.name}': when"
         if not actions:
             raise ModelError(f"{where}({condition}): say what happens: reinit(…), assign(…) or terminate(…)")

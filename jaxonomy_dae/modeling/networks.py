@@ -1,4 +1,5 @@
-"""Networks as the compiler sees them: their weights as arrays, and how many outputs they have."""
+"""Networks and functions of the user's: their numbers as arrays, how many outputs they have, of which kind they are;
+and why JAX cannot trace one."""
 
 from collections.abc import Callable
 from typing import Any
@@ -6,9 +7,9 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from ..errors import ModelError
-from .untraceable import why_untraceable
 
 
 def as_weights(theta: Any) -> Any:
@@ -39,3 +40,67 @@ def count_outputs(network: Callable, inputs: int, where: str, theta: Any = None,
         scalar = "a scalar or " if noun == "function" else ""
         raise ModelError(f"{where}: the {noun} must return {scalar}a vector of shape (outputs,); got shape {found}")
     return out.shape[0]
+
+
+def check_kind(network: Any, kind: Any, where: str) -> None:
+    """Refuses a network that is not of a kind: a class, or a tuple of classes.
+
+    **Raises:**
+
+    - `ModelError` if it is not, naming the component, what was found, and what the kind promises.
+    """
+    kinds = kind if isinstance(kind, tuple) else (kind,)
+    if not kinds or not all(isinstance(k, type) for k in kinds):
+        raise ModelError(f"{where}: kind is a class such as learning.AbstractPassive, or a tuple of them; got {kind!r}")
+    if isinstance(network, kinds):
+        return
+    names = " or ".join(k.__name__ for k in kinds)
+    promise = " ".join((kinds[0].__doc__ or "").split("\n\n")[0].split())
+    found = network.__name__ if isinstance(network, type) else type(network).__name__
+    raise ModelError(
+        f"{where}: only a law of kind {names} may stand here; got {found}, which promises nothing of it."
+        + (f" {kinds[0].__name__}: {promise}" if promise else "")
+    )
+
+
+def _on_device(leaf: Any) -> Any:
+    """A NumPy array as one of JAX; with its type, for which `asarray` compiles no program."""
+    return jnp.asarray(leaf, jnp.result_type(leaf.dtype)) if isinstance(leaf, np.ndarray) else leaf
+
+
+class OfScalars(eqx.Module):
+    """A function of scalars as a function of one vector, u ↦ (outputs,); the arrays it holds are leaves."""
+
+    function: Any
+
+    def __call__(self, u: Any) -> Any:
+        return jnp.atleast_1d(jnp.asarray(self.function(*u)))
+
+
+def of_scalars(function: Any) -> OfScalars:
+    """`function(x, y, …) -> scalar or (outputs,)` as a module; NumPy arrays in it become JAX arrays."""
+    return OfScalars(jax.tree.map(_on_device, function))
+
+
+def uses_numpy(error: Exception) -> bool:
+    """True if JAX raised the error because the function computes with NumPy or math."""
+    numbers_wanted = jax.errors.TracerArrayConversionError | jax.errors.ConcretizationTypeError
+    return isinstance(error, numbers_wanted) and not isinstance(error, jax.errors.TracerBoolConversionError)
+
+
+def why_untraceable(error: Exception, of: str, example: str) -> str:
+    """The rest of the sentence "the function …": the mistake that made JAX raise this error.
+
+    **Arguments:**
+
+    - `of`: the function's argument in words, such as "the time"; `example` is how it is written, such as "t".
+    """
+    if isinstance(error, jax.errors.TracerBoolConversionError):
+        return f"decides by {of} with a Python `if`, `and` or `min`: use jnp.where({example} < …, a, b)"
+    if uses_numpy(error):
+        return (
+            "computes with NumPy or math, which JAX cannot trace: use jax.numpy (jnp.sin for math.sin, jnp.interp for "
+            "np.interp)"
+        )
+    first = str(error).split("\n")[0]
+    return f"failed when called with {of}: {type(error).__name__}" + (f": {first}" if first else "")

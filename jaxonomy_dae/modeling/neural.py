@@ -5,9 +5,8 @@ from typing import Any, Literal
 
 from ..errors import ModelError
 from .component import Component
-from .kinds import check_kind
 from .names import check_name
-from .networks import as_weights, count_outputs
+from .networks import as_weights, check_kind, count_outputs
 
 
 class NeuralDAEBlock:

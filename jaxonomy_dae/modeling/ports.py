@@ -5,8 +5,7 @@ positive into the component.
 """
 
 import dataclasses
-
-from .owner import Owner
+from typing import Any, Protocol, runtime_checkable
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,6 +38,27 @@ Planar = Domain(
     through=(("fx", "N"), ("fy", "N"), ("tau", "N*m")),
 )
 Hydraulic = Domain("Hydraulic", across=(("p", "Pa"),), through=(("m_flow", "kg/s"),))
+
+
+@runtime_checkable
+class Owner(Protocol):
+    """A component, as its ports see it. Ports are parts of components, and so cannot import their class."""
+
+    name: str
+
+    @property
+    def path(self) -> str:
+        """The component's full name."""
+        ...
+
+    @property
+    def parent(self) -> "Owner | None":
+        """The component that contains it."""
+        ...
+
+    def symbol(self, name: str) -> Any:
+        """The symbol of a declared variable or parameter, as the component now being written sees it."""
+        ...
 
 
 class Port:

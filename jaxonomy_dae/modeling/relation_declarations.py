@@ -7,7 +7,7 @@ import sympy
 from sympy.logic.boolalg import BooleanAtom
 
 from ..expressions.to_sympy import shortened
-from .automatic_events import Splitting, Stepping, Timed, TimedSteps, Turning, is_watched, turned, with_events
+from .automatic_events import Splitting, Stepping, Timed, TimedSteps, Turning, turned, varies, with_events
 from .event_declarations import EventDeclarations
 from .events import LIVE, Assign, Sampled
 from .symbols import PreviousSymbol, RelationSymbol
@@ -43,7 +43,7 @@ class RelationDeclarations(EventDeclarations):
         for each in numbers.timed.values():
             self.relations.extend(each.starts)
             self._ticks(each)
-        if numbers.timed and not is_watched(guarded):
+        if numbers.timed and not varies(guarded):
             return live
         known = self._hidden_discrete(float(LIVE))
         self._turns(Turning(known.number, guarded, sympy.true))

@@ -16,10 +16,10 @@ from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
-from jax.core import Tracer
+import jax.numpy as jnp
 
 from .machine import Use, mappings, memory, return_memory
-from .options import quick
+from .staging import is_traced
 
 # Of the mappings that Linux allows, and of the memory that this process could have. What is left must hold what is
 # compiled until use is measured next: a gradient takes 800 (two states) to 4,500 mappings (double pendulum), 7 %.
@@ -32,6 +32,12 @@ PAUSE = 100  # a measurement takes some 2 µs for each mapping, up to 0.1 s; 1 %
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
+
+# XLA's older code generator for CPUs makes one kernel of what the newer one makes several. Of the tutorial's pendulum,
+# a program takes 290 mappings, 66 MB and 4.5 s instead of 802, 234 MB and 8.8 s; of a double pendulum 679, 196 MB and
+# 18 s instead of 1,702, 476 MB and 27 s. It runs in the same time (4.4 ms a call), and 1.25 times as long (49 ms): what
+# is saved is spent after some hundred calls. (jax 0.10.2, two cores.)
+_QUICK = {"xla_cpu_use_fusion_emitters": False}
 
 
 class _CompiledFunction:
@@ -93,7 +99,7 @@ class ProgramCache:
         arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
         static = tuple(_ARRAY if eqx.is_array(leaf) else leaf for leaf in leaves)
         key = function, structure, static, tuple(jax.typeof(a) for a in arrays)
-        traced = _is_traced(arrays)
+        traced = is_traced(arrays)
         with self._lock:
             program = self._programs.get(key)
             if program is None:
@@ -106,7 +112,7 @@ class ProgramCache:
         finally:
             with self._lock:
                 program.calls -= 1
-        if not traced and _is_traced(jax.tree.leaves(outcome)):
+        if not traced and is_traced(jax.tree.leaves(outcome)):
             # The function closed over a traced value, which is another one at the next call.
             with self._lock:
                 self._programs.pop(key, program).clear()
@@ -164,10 +170,6 @@ class ProgramCache:
         return len(idle)
 
 
-def _is_traced(leaves: list[Any]) -> bool:
-    return any(isinstance(leaf, Tracer) for leaf in leaves)
-
-
 def _text(use: Use) -> str:
     return (
         f"the compiled programs of this process take {use.used:,} of the {use.allowed:,} memory mappings that Linux "
@@ -193,3 +195,15 @@ def compiled(function: Callable[_P, _T], runs_once: bool = True) -> Callable[_P,
         return PROGRAMS.call(function, runs_once, args, kwargs)
 
     return call
+
+
+@functools.cache
+def quick() -> dict[str, bool]:
+    """Options of `jax.jit` for a program of which compilation takes longer than its runs; none on other processors."""
+    if jax.default_backend() != "cpu":
+        return {}
+    try:
+        jax.jit(jnp.negative, compiler_options=_QUICK).lower(0.0).compile()
+    except Exception:  # an XLA without the older code generator: JAX promises no type of error
+        return {}
+    return _QUICK

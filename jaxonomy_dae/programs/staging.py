@@ -8,6 +8,11 @@ import jax
 from jax.core import Tracer
 
 
+def is_traced(tree: Any) -> bool:
+    """True if a leaf is a tracer: inside `jax.jit`, `jax.grad`, `jax.vmap` and the like."""
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
+
+
 def is_staged(tree: Any) -> bool:
     """True if a leaf has no value yet: inside `jax.jit`, loops, `jax.make_jaxpr`.
 

@@ -2,13 +2,12 @@
 
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..errors import ModelError
+from ..programs.staging import is_traced
 from .accounts import account_values, chosen_terms
 from .simulate import simulate
 from .solution import Solution
@@ -36,7 +35,7 @@ def energy_balance(solution: Solution, rtol: float, atol: float) -> EnergyBalanc
         events write states or discrete variables.
     """
     system, ts = solution.system, solution.ts
-    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(solution)):
+    if is_traced(solution):
         raise ModelError("the balance of energy needs numbers: ask for it outside jit, grad and vmap")
     if ts.ndim != 1:
         raise ModelError(f"the balance of energy is that of one solution; this is a batch of shape {ts.shape[:-1]}")

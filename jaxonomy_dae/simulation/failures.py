@@ -16,11 +16,10 @@ from ..solvers.failures import SHOWN, explain_failure, how_it_stopped
 from ..system.inputs import value_at
 from ..system.system import AcausalSystem
 from ..tolerances import CONSISTENT
-from .admitted import NOT_ADMITTED, TEXT
+from .arguments import NOT_ADMITTED, TEXT
 from .event_log import Events
-from .failed_blocks import failed_block
+from .failed_blocks import equation_not_finite, failed_block
 from .hybrid_problem import RESTART, resolution
-from .not_finite import equation_not_finite
 from .preparation import term_of
 from .solution import Solution
 from .step_sizes import scaled_atol

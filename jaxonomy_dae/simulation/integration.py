@@ -21,7 +21,7 @@ from ..programs.cache import compiled
 from ..solvers.drive import integrate, is_implicit, right_between_steps
 from ..solvers.rows import not_a_number, padded
 from ..solvers.switching import STIFF, Watch
-from .admitted import NOT_ADMITTED, TEXT, are_admitted, inputs_are_finite
+from .arguments import NOT_ADMITTED, TEXT, are_admitted, inputs_are_finite
 from .event_log import EventLog
 from .from_state import from_state
 from .hybrid_problem import problem_for, with_event_control

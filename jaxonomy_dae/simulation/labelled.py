@@ -1,13 +1,51 @@
-"""Solutions as tables of other libraries: a data frame of pandas, a data set of xarray."""
+"""Solutions as tables of other libraries, a data frame of pandas, a data set of xarray; and the part of a solution's
+interface that tables and figures read."""
 
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Array, Float
 
 from ..errors import ModelError
 from ..model.array_names import inner_name
 from ..optional import optional_module
-from .by_name import ByName
+from ..system.system import AcausalSystem
+from .event_log import EventLog, Events
+
+
+@runtime_checkable
+class ByName(Protocol):
+    """A solution whose variables are read by name. Methods of `Solution` call tables and figures, which therefore
+    cannot import its class."""
+
+    @property
+    def ts(self) -> Float[Array, "*batch n"]:
+        """The saved times."""
+        ...
+
+    @property
+    def system(self) -> AcausalSystem:
+        """The system that was simulated."""
+        ...
+
+    @property
+    def event_log(self) -> EventLog | None:
+        """The events as arrays; None if the model has none."""
+        ...
+
+    @property
+    def events(self) -> Events:
+        """The events by name."""
+        ...
+
+    def __getitem__(self, name: Any) -> Any:
+        """The values of a variable, or of several."""
+        ...
+
+    def __contains__(self, name: str) -> bool: ...
+
+    def __iter__(self) -> Iterator[str]: ...
 
 
 def data_frame(solution: ByName, names: tuple[str, ...]) -> Any:

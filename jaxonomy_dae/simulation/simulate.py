@@ -8,14 +8,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
 from ..adjoint.default import default_adjoint
 from ..errors import InitializationError, SimulationError
 from ..initialization.check import check
 from ..lowering.plan import SystemPlan
 from ..programs.cache import PROGRAMS
-from ..programs.staging import is_forwards, is_staged
+from ..programs.staging import is_forwards, is_staged, is_traced
 from ..solvers import BDF, Rodas5P, Tsit5
 from ..solvers.causes import decay_at, is_stiff
 from ..solvers.drive import is_implicit
@@ -23,8 +22,7 @@ from ..solvers.solve import check_tolerances, default_tolerances
 from ..solvers.solve_arguments import jump_times
 from ..solvers.switching import BOUNDARY, MANY, Watch
 from ..system.inputs import check_range, read_inputs, step_ends
-from ..system.solver_choice import Choice, implicit_choice, solver_choice
-from ..system.stiffness import fastest_decay
+from ..system.solver_choice import Choice, fastest_decay, implicit_choice, solver_choice
 from ..system.system import AcausalSystem
 from .arguments import check_arguments, check_parameters
 from .failures import explain, mode_at_start, raised
@@ -136,15 +134,15 @@ def simulate(
         initial = {name: jnp.asarray(v, dtype) for name, v in sorted((initial or {}).items())}
     else:
         initial = jnp.asarray(initial, dtype)
-    duration = None if _is_traced((t0, t1)) else float(t1) - float(t0)
+    duration = None if is_traced((t0, t1)) else float(t1) - float(t0)
     t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
     if ts is not None:
         ts = jnp.asarray(ts, dtype)
-        if not _is_traced((t0, t1, ts)):
+        if not is_traced((t0, t1, ts)):
             ts = jnp.asarray(np.clip(ts, t0, t1), dtype)  # `check_arguments` lets rounding pass, Diffrax does not
     given = (system, t0, t1, ts, inputs, initial)
     most_events = MOST_EVENTS if max_events is None else max_events
-    sides_possible = not _is_traced((given, adjoint, stepsize_controller))
+    sides_possible = not is_traced((given, adjoint, stepsize_controller))
 
     def options(solver: Any, room: int = ROOM) -> Options:
         events = system.plan.events
@@ -177,7 +175,7 @@ def simulate(
             outcome = run_compiled(given, options(solver), None)
         return _traced(outcome, given, choice, checked, (max_steps, most_events))
 
-    traced = _is_traced((given, options(solver)))
+    traced = is_traced((given, options(solver)))
     switches = not choice.final and stepsize_controller is None
     if traced:
         why = _stiff_without_a_run(system.plan, duration) if switches else ""
@@ -187,7 +185,7 @@ def simulate(
         return in_program(is_staged((given, options(solver))))
     watch = Watch(t1, jnp.asarray(np.divide(scaled_atol(system, atol), rtol), dtype)) if switches else None
     outcome = run_compiled(given, options(solver), watch)
-    if _is_traced(outcome):  # a network may close over a traced value, which shows in the outcome only
+    if is_traced(outcome):  # a network may close over a traced value, which shows in the outcome only
         return in_program(staged=True)
     counts = outcome.numbers()
     if throw is not False:
@@ -250,7 +248,3 @@ def _traced(
         outcome.ts, x, system, inputs, outcome.stats, outcome.result, choice.solver, choice.reason, outcome.discrete,
         outcome.events,
     )  # fmt: skip
-
-
-def _is_traced(tree: Any) -> bool:
-    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))

@@ -9,13 +9,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..errors import ModelError
 from ..lowering.gather import times
 from ..programs.cache import compiled
-from ..programs.staging import is_staged
+from ..programs.staging import is_staged, is_traced
 from ..system.system import AcausalSystem
 from .accounts import account_values, chosen_terms
 from .event_log import EventLog, Events
@@ -228,7 +227,7 @@ class Solution(eqx.Module):
         rows = {"shape of states": self.states.shape, "states": ", ".join(self.system.states[:SHOWN])}
         if len(self.system.states) > SHOWN:
             rows["states"] += f", … ({len(self.system.states)})"
-        if not _is_traced((self.ts, self.result, self.counts)) and self.ts.size and self.ts.ndim == 1:
+        if not is_traced((self.ts, self.result, self.counts)) and self.ts.size and self.ts.ndim == 1:
             rows["time"] = f"{float(self.ts[0]):g} to {float(self.ts[-1]):g}, saved {self.ts.shape[0]} times"
             rows["result"] = "finished" if self.result == diffrax.RESULTS.successful else f"failed: {self.result}"
             rows["steps"] = self.counts.get("num_steps", "")
@@ -240,10 +239,6 @@ class Solution(eqx.Module):
 def _each(batch: Solution, read: Callable[[Solution], Any]) -> Any:
     """Reads every solution of a batch, by mapping over the batch axes."""
     return eqx.filter_vmap(read)(batch)
-
-
-def _is_traced(tree: Any) -> bool:
-    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def _places(system: AcausalSystem, quantity: np.ndarray) -> np.ndarray | None:

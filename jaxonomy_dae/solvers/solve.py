@@ -17,7 +17,7 @@ from ..adjoint.resting import HeldBack, Resting
 from ..adjoint.stored_adjoint import StoredAdjoint
 from ..errors import InitializationError, ModelError, SimulationError
 from ..programs.cache import PROGRAMS, compiled
-from ..programs.staging import is_forwards, is_staged
+from ..programs.staging import is_forwards, is_staged, is_traced
 from .bdf import BDF
 from .dae_term import DAETerm, FlatProblem
 from .drive import integrate, is_multistep, right_between_steps
@@ -119,7 +119,7 @@ def solve_dae(
         check, solution, last = _compiled(*arguments)
     known = list(names) if names is not None else [f"y[{k}]" for k in range(n)]
     outcome = (check, solution.result)
-    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(outcome)):
+    if is_traced(outcome):
         if throw is True or throw is None and not staged:
             ys = check.error_if(solution.ys)
             solution = eqx.tree_at(lambda s: s.ys, solution, solution.result.error_if(ys, solution.result != OK))

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 from ..errors import ModelError, nearest
 from ..lowering.plan import SystemPlan
 from ..model.array_names import regular_shape, wrong_shape
-from ..modeling.untraceable import uses_numpy, why_untraceable
+from ..modeling.networks import uses_numpy, why_untraceable
 from .closed_function import ClosedFunction, closed_function
 
 KINDS = ("linear", "cubic", "held")

@@ -14,8 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..errors import ModelError, nearest
 from ..model.array_names import ArrayNames
-from ..model.dependent_parameters import complete
-from ..model.tables import DependentParameters
+from ..model.tables import DependentParameters, complete
 from ..modeling.interval import Interval, closed_ends
 from ..modeling.real_number import real_number
 from .bounds import Ends

@@ -7,9 +7,9 @@ import numpy as np
 from ..diagnosis.wording import counted
 from ..lowering.plan import SystemPlan
 from ..model.incidence import incidence
-from ..model.tables import provenance_of
+from ..model.symbolic import SymbolicTemplate, number_label, parameter_label
+from ..model.tables import EventTable, FlatModel, Start, provenance_of
 from ..structure.pantelides import Offsets, reduce_index
-from .event_report import clock_events, condition_events, discrete_starts, mode_equations, relation_events
 from .sections import Sections, folded, some
 from .solver_choice import solver_choice
 
@@ -112,17 +112,23 @@ class SystemReport(Sections):
     @property
     def discretes(self) -> list[str]:
         """The discrete variables and their starts."""
-        return discrete_starts(self._plan.flat, self._values)
+        flat = self._plan.flat
+        return (
+            [f"{flat.parameters.names[p]} = {self._values[p]:g}" for p in _declared(flat)] if len(flat.events) else []
+        )
 
     @property
     def events(self) -> list[str]:
         """The events of conditions, and what they do. Relations in equations are listed apart."""
-        return condition_events(self._plan.flat)
+        flat, table = self._plan.flat, self._plan.flat.events
+        return [f"{table.text[e]}: {_actions(flat, e)}" for e in _noted(table) if e >= len(table.clocks)]
 
     @property
     def relations(self) -> list[str]:
         """The relations in equations, and the jumps of sources, at which steps end. `smooth(...)` leaves one alone."""
-        return relation_events(self._plan.flat)
+        table = self._plan.flat.events
+        found = (text.partition(": when(") for text, is_one in zip(table.text, table.relation, strict=True) if is_one)
+        return list(dict.fromkeys(f"{where}: {condition[:-1]}" for where, _, condition in found))
 
     @property
     def left_alone(self) -> list[str]:
@@ -132,12 +138,30 @@ class SystemReport(Sections):
     @property
     def clocks(self) -> list[str]:
         """The sampled events, their periods and offsets, and what they do."""
-        return clock_events(self._plan.flat, self._values)
+        flat, table = self._plan.flat, self._plan.flat.events
+        out = []
+        for e in _noted(table):
+            if e < len(table.clocks):
+                period, offset = (_number(part, self._values) for part in table.clocks[e])
+                out.append(f"{table.text[e]}, every {period:g} s from {offset:g} s: {_actions(flat, e)}")
+        return out
 
     @property
     def modes(self) -> list[str]:
         """The equations with two branches, of which a discrete variable chooses one."""
-        return mode_equations(self._plan.flat)
+        flat = self._plan.flat
+        discrete = np.array(_declared(flat), np.int64)
+        out = []
+        for group in flat.groups:
+            if not isinstance(group.template, SymbolicTemplate) or group.template.graph.operation != "select":
+                continue
+            labels = [parameter_label(k) for k in range(group.template.n_parameters)]
+            condition = group.template.graph.arguments[0]
+            if condition.leaves <= {*labels, *map(number_label, range(group.template.n_coefficients))}:
+                read = [k for k, label in enumerate(labels) if label in condition.leaves]
+                rows = np.flatnonzero(np.isin(group.parameter[:, read], discrete).any(axis=1))
+                out += [str(group.provenance[row]) for row in rows.tolist()]
+        return out
 
     @property
     def index_changes(self) -> list[str]:
@@ -185,3 +209,36 @@ class SystemReport(Sections):
         ]
         kept = [(title, [e for e in entries if e]) for title, entries in sections]
         return head, [(title, entries) for title, entries in kept if entries]
+
+
+def _declared(flat: FlatModel) -> list[int]:
+    """The parameters that are discrete variables, relations left out."""
+    table = flat.parameters
+    return table.discrete[: len(table.discrete) - table.n_relations].tolist()
+
+
+def _noted(table: EventTable) -> list[int]:
+    """The events that users wrote."""
+    return [e for e, noted in enumerate(table.noted) if noted]
+
+
+def _actions(flat: FlatModel, event: int) -> str:
+    """The actions of an event, in the words in which they are declared; values that are not numbers are left out, and
+    so are hidden variables."""
+    table = flat.events
+    out = []
+    for row in np.flatnonzero(table.event == event).tolist():
+        value = "…" if table.value[row] >= 0 else f"{table.constant[row]:g}"
+        if table.state[row] >= 0:
+            out.append(f"reinit({flat.variables.names[table.state[row]]}, {value})")
+        elif table.discrete[row] < len(_declared(flat)):
+            name = flat.parameters.names[flat.parameters.discrete[table.discrete[row]]]
+            out.append(f"assign({name}, {value})")
+    message = table.message[event]
+    return ", ".join([*out, *([f"terminate({message!r})"] if message is not None else [])])
+
+
+def _number(start: Start | None, values: np.ndarray) -> float:
+    if start is None:
+        return float("inf")
+    return float(start.template.residual([], [*values[list(start.parameters)]], [], 0.0, None, backend="numpy"))

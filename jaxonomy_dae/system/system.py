@@ -16,9 +16,10 @@ from ..errors import ModelError, nearest
 from ..linear.sparse import SparseMatrix, SparsePattern, sparse_jacobian
 from ..lowering.gather import SCALARS
 from ..lowering.plan import SystemPlan
-from ..model.dependent_parameters import complete
 from ..model.pickling import functions_by_name, named_functions
+from ..model.tables import complete
 from ..model.typical_sizes import typical_sizes
+from ..programs.staging import is_traced
 from .bounds import constrained, unconstrained
 from .evaluate import Refinement
 from .input_values import missing_input
@@ -499,7 +500,7 @@ class AcausalSystem(eqx.Module):
         names = self._names_to_solve_for(solve_for)
         initial = self.plan.one_by_one(initial)
         found = find_initial(self, t0, inputs, initial, names)
-        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((found, self, t0))):
+        if is_traced((found, self, t0)):
             raise ModelError("initialization_report needs numbers: call it outside jit, grad and vmap")
         return InitializationReport(self, found, t0, inputs, initial, names)
 

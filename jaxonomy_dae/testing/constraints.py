@@ -2,10 +2,10 @@
 
 import jax
 import numpy as np
-from jax.core import Tracer
 
 from ..errors import ModelError
 from ..programs.cache import compiled
+from ..programs.staging import is_traced
 from ..simulation.solution import Solution
 from .certificate import Certificate
 
@@ -33,7 +33,7 @@ def assert_constraints(solution: Solution, rtol: float = 1e-6, atol: float = 1e-
     - `ModelError` for a batch, inside jit, and for rows that were not reached.
     """
     system = solution.system
-    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(solution)):
+    if is_traced(solution):
         raise ModelError("assert_constraints needs numbers: call it outside jit, grad and vmap")
     if solution.ts.ndim != 1:
         raise ModelError(f"assert_constraints takes one solution; this is a batch of shape {solution.ts.shape[:-1]}")

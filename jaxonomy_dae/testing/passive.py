@@ -10,7 +10,7 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Array, Float
 
-from ..errors import ModelError
+from ..errors import ModelError, whole_number
 from ..learning.laws import AbstractPassive, PortHamiltonian
 from .certificate import Certificate
 
@@ -103,8 +103,8 @@ def _typical(law: Any, size: int | None, inputs: Any) -> tuple[np.ndarray, int]:
     if own is not None and size is not None and size != own:
         raise ModelError(f"assert_passive: this law has size {own}; leave size={size} out")
     size = own if size is None else size
-    if size is not None and (isinstance(size, bool) or not isinstance(size, int) or size < 1):
-        raise ModelError(f"assert_passive: size is a whole number ≥ 1; got {size!r}")
+    if size is not None:
+        whole_number(size, "assert_passive: size")
     given = getattr(law, "inputs", None) if inputs is None and own is not None else inputs
     if given is None and own is not None:
         given = 1.0

@@ -5,7 +5,7 @@ import pytest
 from problems import compiled, oscillator, pendulum, rc_circuit
 
 from jaxonomy_dae import Component, EqnEnv, der
-from jaxonomy_dae.system.stiffness import fastest_decay
+from jaxonomy_dae.system.solver_choice import fastest_decay
 
 
 class Follower(Component):

@@ -21,9 +21,8 @@ DEFERRED = {("system", "initialization"), ("simulation", "plotting"), ("analysis
 CLOSING = {
     ("simulation/solution", "simulation/energy_balance"): "the balance of a solution is that of a second run",
     ("learning/*", "learning/estimate"): "an estimate's methods call the modules that read it",
-    ("learning/*", "learning/problem"): "a problem makes the estimates that know it",
+    ("learning/estimate", "learning/problem"): "a problem makes the estimates that know it",
     ("learning/estimate", "learning/posterior"): "an estimate's method, with an optional package",
-    ("learning/figures", "learning/*"): "figures of records whose methods draw them",
 }
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from jaxonomy_dae import ModelError
 from jaxonomy_dae.learning import ClosedForm, powers, terms
-from jaxonomy_dae.learning.beam_search import beam_search
+from jaxonomy_dae.learning.discovery import beam_search
 
 X, Y = sympy.symbols("x y", real=True)
 POINTS = np.array([[0.3, -1.2], [-2.0, 0.5], [1e-3, 4.0]])

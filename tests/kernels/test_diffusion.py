@@ -7,7 +7,7 @@ import pytest
 import scipy.linalg
 from kalman import discretized, held
 
-from jaxonomy_dae.learning.diffusion import affine_flow, linear_flow
+from jaxonomy_dae.learning.linear_models import affine_flow, linear_flow
 
 
 @pytest.mark.parametrize("n, h", [(1, 0.3), (3, 0.7), (4, 5.0)])

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import scipy.optimize
 
+from jaxonomy_dae.learning.agreement import whiteness
 from jaxonomy_dae.learning.evaluation import Evaluation, Weights
 from jaxonomy_dae.learning.evidence import Evidence
 from jaxonomy_dae.learning.factors import Factors
 from jaxonomy_dae.learning.identifiability import spreads
 from jaxonomy_dae.learning.least_squares import minimise
-from jaxonomy_dae.learning.whiteness import whiteness
 
 FREE = -np.inf, np.inf
 

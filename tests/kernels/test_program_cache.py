@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxonomy_dae.programs import cache, machine, options
+from jaxonomy_dae.programs import cache, machine
 from jaxonomy_dae.programs.machine import Use
 from jaxonomy_dae.programs.staging import is_staged
 
@@ -257,9 +257,9 @@ def test_errors_of_functions_pass_through():
 
 def test_an_unknown_compiler_option_is_left_out(monkeypatch):
     """Of an XLA that lost the older code generator."""
-    monkeypatch.setattr(options, "_QUICK", {"xla_cpu_no_such_option": False})
-    monkeypatch.setattr(options.jax, "default_backend", lambda: "cpu")
-    assert options.quick.__wrapped__() == {}
+    monkeypatch.setattr(cache, "_QUICK", {"xla_cpu_no_such_option": False})
+    monkeypatch.setattr(cache.jax, "default_backend", lambda: "cpu")
+    assert cache.quick.__wrapped__() == {}
 
 
 def test_what_is_staged():

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from ...errors import ModelError
-from .network import count, divided, sizes, tanh_network
+from ...errors import ModelError, whole_number
+from .network import divided, sizes, tanh_network
 
 
 class Bounded(eqx.Module):
@@ -38,8 +38,8 @@ class Bounded(eqx.Module):
 
     def __init__(self, low: Any, high: Any, in_size: int = 1, out_size: int = 1, *, key: PRNGKeyArray, width: int = 8,
                  depth: int = 2, inputs: Any = 1.0):  # fmt: skip
-        in_size, out_size = count(in_size, "Bounded: in_size"), count(out_size, "Bounded: out_size")
-        self.network = tanh_network(in_size, out_size, count(width, "Bounded: width"), depth, key)
+        in_size, out_size = whole_number(in_size, "Bounded: in_size"), whole_number(out_size, "Bounded: out_size")
+        self.network = tanh_network(in_size, out_size, whole_number(width, "Bounded: width"), depth, key)
         self.low, self.high = _ends(low, out_size), _ends(high, out_size)
         if any(not (math.isfinite(a) and math.isfinite(b) and a < b) for a, b in zip(self.low, self.high, strict=True)):
             raise ModelError(f"Bounded: low and high are finite and ascend, for each output; got {low!r} and {high!r}")

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from .network import count, divided, multiplied, sizes, tanh_network, typical
+from ...errors import whole_number
+from .network import divided, multiplied, sizes, tanh_network, typical
 
 
 class Conservative(eqx.Module):
@@ -37,9 +38,9 @@ class Conservative(eqx.Module):
 
     def __init__(self, size: int, *, key: PRNGKeyArray, width: int = 8, depth: int = 2,
                  inputs: Any = 1.0, energy: Any = 1.0):  # fmt: skip
-        self.size = count(size, "Conservative: size")
-        depth = count(depth, "Conservative: depth")
-        self.network = tanh_network(size, 1, count(width, "Conservative: width"), depth, key)
+        self.size = whole_number(size, "Conservative: size")
+        depth = whole_number(depth, "Conservative: depth")
+        self.network = tanh_network(size, 1, whole_number(width, "Conservative: width"), depth, key)
         self.inputs = sizes(inputs, size, "Conservative: inputs")
         self.energy = typical(energy, "Conservative: energy")
 

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from .network import count, divided, multiplied, sizes, tanh_network, typical
+from ...errors import whole_number
+from .network import divided, multiplied, sizes, tanh_network, typical
 from .passive import AbstractPassive
 from .structure import dissipation, interconnection, response
 
@@ -42,9 +43,9 @@ class Dissipation(AbstractPassive):
 
     def __init__(self, size: int, states: int = 0, *, key: PRNGKeyArray, width: int = 8, depth: int = 2,
                  inputs: Any = 1.0, power: Any = 1.0):  # fmt: skip
-        self.size = count(size, "Dissipation: size")
-        total = size + count(states, "Dissipation: states", 0)
-        width = count(width, "Dissipation: width")
+        self.size = whole_number(size, "Dissipation: size")
+        total = size + whole_number(states, "Dissipation: states", 0)
+        width = whole_number(width, "Dissipation: width")
         self.network = (
             tanh_network(states, size * size, width, depth, key) if states else jax.random.normal(key, (size * size,))
         )

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from .network import count, tanh_network, typical
+from ...errors import whole_number
+from .network import tanh_network, typical
 from .passive import AbstractPassive
 
 REST = 0.01  # of the typical input: below it, |v| is rounded off, so that N is smooth at rest
@@ -38,8 +39,8 @@ class IsotropicPassive(AbstractPassive):
 
     def __init__(self, size: int = 1, *, key: PRNGKeyArray, width: int = 8, depth: int = 2, inputs: Any = 1.0,
                  power: Any = 1.0):  # fmt: skip
-        self.size = count(size, "IsotropicPassive: size")
-        self.network = tanh_network(1, 1, count(width, "IsotropicPassive: width"), depth, key)
+        self.size = whole_number(size, "IsotropicPassive: size")
+        self.network = tanh_network(1, 1, whole_number(width, "IsotropicPassive: width"), depth, key)
         self.inputs = typical(inputs, "IsotropicPassive: inputs")
         self.power = typical(power, "IsotropicPassive: power")
 

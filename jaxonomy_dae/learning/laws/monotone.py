@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from ...errors import ModelError
-from .network import count, divided, multiplied, sizes
+from ...errors import ModelError, whole_number
+from .network import divided, multiplied, sizes
 
 
 class Monotone(eqx.Module):
@@ -43,8 +43,8 @@ class Monotone(eqx.Module):
     def __init__(self, in_size: int = 1, out_size: int = 1, increasing: bool | tuple[bool, ...] = True, *,
                  key: PRNGKeyArray, width: int = 8, depth: int = 1, inputs: Any = 1.0,
                  outputs: Any = 1.0):  # fmt: skip
-        in_size, out_size = count(in_size, "Monotone: in_size"), count(out_size, "Monotone: out_size")
-        width, depth = count(width, "Monotone: width"), count(depth, "Monotone: depth")
+        in_size, out_size = whole_number(in_size, "Monotone: in_size"), whole_number(out_size, "Monotone: out_size")
+        width, depth = whole_number(width, "Monotone: width"), whole_number(depth, "Monotone: depth")
         directions = (increasing,) * in_size if isinstance(increasing, bool) else tuple(increasing)
         if len(directions) != in_size or not all(isinstance(d, bool) for d in directions):
             raise ModelError(

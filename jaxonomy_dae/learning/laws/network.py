@@ -40,18 +40,6 @@ def typical(given: Any, what: str) -> float:
     return sizes(given, 1, what)[0]
 
 
-def count(given: Any, what: str, least: int = 1) -> int:
-    """A number of inputs, outputs or neurons.
-
-    **Raises:**
-
-    - `ModelError` for what is not a whole number, or less than `least`.
-    """
-    if isinstance(given, bool) or not isinstance(given, int) or given < least:
-        raise ModelError(f"{what} is a whole number ≥ {least}; got {given!r}")
-    return given
-
-
 def divided(u: Float[Array, "*batch n"], by: tuple[float, ...]) -> Float[Array, "*batch n"]:
     """Values in units of their typical sizes."""
     return u / jnp.asarray(by, u.dtype)

@@ -5,7 +5,8 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from .network import count, divided, multiplied, sizes, tanh_network
+from ...errors import whole_number
+from .network import divided, multiplied, sizes, tanh_network
 
 
 class Odd(eqx.Module):
@@ -31,8 +32,8 @@ class Odd(eqx.Module):
 
     def __init__(self, in_size: int = 1, out_size: int = 1, *, key: PRNGKeyArray, width: int = 8, depth: int = 2,
                  inputs: Any = 1.0, outputs: Any = 1.0):  # fmt: skip
-        in_size, out_size = count(in_size, "Odd: in_size"), count(out_size, "Odd: out_size")
-        self.network = tanh_network(in_size, out_size, count(width, "Odd: width"), depth, key)
+        in_size, out_size = whole_number(in_size, "Odd: in_size"), whole_number(out_size, "Odd: out_size")
+        self.network = tanh_network(in_size, out_size, whole_number(width, "Odd: width"), depth, key)
         self.inputs = sizes(inputs, in_size, "Odd: inputs")
         self.outputs = sizes(outputs, out_size, "Odd: outputs")
 

@@ -6,7 +6,8 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from .network import count, divided, multiplied, sizes, tanh_network, typical
+from ...errors import whole_number
+from .network import divided, multiplied, sizes, tanh_network, typical
 from .structure import response
 
 
@@ -55,9 +56,9 @@ class Passive(AbstractPassive):
 
     def __init__(self, size: int = 1, *, key: PRNGKeyArray, context: int = 0, width: int = 8, depth: int = 2,
                  inputs: Any = 1.0, power: Any = 1.0):  # fmt: skip
-        self.size = count(size, "Passive: size")
-        total = size + count(context, "Passive: context", 0)
-        self.network = tanh_network(total, size * size, count(width, "Passive: width"), depth, key)
+        self.size = whole_number(size, "Passive: size")
+        total = size + whole_number(context, "Passive: context", 0)
+        self.network = tanh_network(total, size * size, whole_number(width, "Passive: width"), depth, key)
         self.inputs = sizes(inputs, total, "Passive: inputs")
         self.power = typical(power, "Passive: power")
 

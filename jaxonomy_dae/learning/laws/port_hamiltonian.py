@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from .network import count, divided, multiplied, sizes, tanh_network, typical
+from ...errors import whole_number
+from .network import divided, multiplied, sizes, tanh_network, typical
 from .structure import response
 
 
@@ -40,8 +41,8 @@ class PortHamiltonian(eqx.Module):
 
     def __init__(self, size: int, *, key: PRNGKeyArray, width: int = 8, depth: int = 2,
                  inputs: Any = 1.0, energy: Any = 1.0, time: Any = 1.0):  # fmt: skip
-        self.size = count(size, "PortHamiltonian: size")
-        width, depth = count(width, "PortHamiltonian: width"), count(depth, "PortHamiltonian: depth")
+        self.size = whole_number(size, "PortHamiltonian: size")
+        width, depth = whole_number(width, "PortHamiltonian: width"), whole_number(depth, "PortHamiltonian: depth")
         storage_key, key = jax.random.split(key)
         self.storage = tanh_network(size, 1, width, depth, storage_key)
         self.network = tanh_network(size, size * size, width, depth, key)

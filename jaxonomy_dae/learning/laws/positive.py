@@ -6,7 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from .network import count, divided, multiplied, sizes, tanh_network
+from ...errors import whole_number
+from .network import divided, multiplied, sizes, tanh_network
 
 
 class Positive(eqx.Module):
@@ -32,8 +33,8 @@ class Positive(eqx.Module):
 
     def __init__(self, in_size: int = 1, out_size: int = 1, *, key: PRNGKeyArray, width: int = 8, depth: int = 2,
                  inputs: Any = 1.0, outputs: Any = 1.0):  # fmt: skip
-        in_size, out_size = count(in_size, "Positive: in_size"), count(out_size, "Positive: out_size")
-        self.network = tanh_network(in_size, out_size, count(width, "Positive: width"), depth, key)
+        in_size, out_size = whole_number(in_size, "Positive: in_size"), whole_number(out_size, "Positive: out_size")
+        self.network = tanh_network(in_size, out_size, whole_number(width, "Positive: width"), depth, key)
         self.inputs = sizes(inputs, in_size, "Positive: inputs")
         self.outputs = sizes(outputs, out_size, "Positive: outputs")
 

@@ -1,8 +1,7 @@
 """Sources of voltage and current: constant, of time, of a signal, controlled."""
 
 from ...modeling import POSITIVE, Eq, EqnEnv, Value
-from ..laws import sine
-from ..steps import pulse, step
+from ..laws import pulse, sine, step
 from .two_pin import TwoPin, TwoPorts
 
 

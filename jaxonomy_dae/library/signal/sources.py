@@ -7,8 +7,7 @@ from sympy import Max, Min
 
 from ...errors import ModelError
 from ...modeling import NONNEGATIVE, POSITIVE, Component, EqnEnv, Value
-from ..laws import sine
-from ..steps import pulse, step
+from ..laws import pulse, sine, step
 
 
 class Constant(Component):

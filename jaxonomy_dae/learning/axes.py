@@ -1,0 +1,40 @@
+"""Matplotlib axes for figures of data, fits and what is known of them (extra `plot`)."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ..errors import ModelError, nearest
+from ..optional import optional_module
+
+LEGEND = 8  # up to this many entries, a legend is drawn
+
+
+def new_axes(ax: Any, width: float = 7.0, height: float = 3.5) -> Any:
+    """The axes given, or new ones."""
+    plt = optional_module("matplotlib.pyplot", "plot", "plotting needs Matplotlib")
+    return plt.subplots(figsize=(width, height), layout="constrained")[1] if ax is None else ax
+
+
+def grid_of_axes(axes: Any, rows: int, columns: int, what: str) -> np.ndarray:
+    """Axes of shape (rows, columns): those given, or new ones that share their times."""
+    if axes is None:
+        plt = optional_module("matplotlib.pyplot", "plot", "plotting needs Matplotlib")
+        size = (min(3.2 * columns + 3.0, 14.0), 2.3 * rows + 0.9)
+        return plt.subplots(rows, columns, figsize=size, sharex="col", squeeze=False, layout="constrained")[1]
+    found = np.asarray(axes, object)
+    if found.size != rows * columns:
+        raise ModelError(f"{what} needs {rows} × {columns} axes; got {found.size}")
+    return found.reshape(rows, columns)
+
+
+def chosen_names(given: str | Sequence[str] | None, known: Sequence[str], what: str) -> list[str]:
+    """The names that were given, or all of those known."""
+    if given is None:
+        return list(known)
+    chosen = [given] if isinstance(given, str) else list(given)
+    for name in chosen:
+        if name not in known:
+            raise ModelError(f"plot: there are no {what} '{name}': " + nearest(name, known))
+    return chosen
