@@ -136,6 +136,7 @@ class Affine(AbstractHybridProblem):
     )
     revocable: tuple[bool, ...] = eqx.field(static=True, default=tuple(k >= CLOCKS + RELATION for k in range(EVENTS)))
     relations: tuple[bool, ...] = eqx.field(static=True, default=tuple(k >= CLOCKS + RELATION for k in range(EVENTS)))
+    strikes: tuple[bool, ...] = eqx.field(static=True, default=(False,) * EVENTS)
     strict: tuple[bool, ...] = eqx.field(static=True, default=(False,) * EVENTS)
     choices: tuple[int, ...] = eqx.field(static=True, default=())
     choice_guards: tuple[int, ...] = eqx.field(static=True, default=())
@@ -155,8 +156,8 @@ class Affine(AbstractHybridProblem):
         height, rate, phase = self.numbers.waves.T
         return self.numbers.guards @ jnp.concatenate([x, q, q, jnp.ones((1,))]) + height * jnp.sin(rate * t + phase)
 
-    def written(self, t, x, q, previous, event, args):
-        new = self.numbers.writes[event] @ jnp.concatenate([x, q, previous, jnp.ones((1,))])
+    def written(self, t, x, q, previous, events, args):
+        new = self.numbers.writes[jnp.argmax(events)] @ jnp.concatenate([x, q, previous, jnp.ones((1,))])
         return new[:STATES], new[STATES:]
 
     def settled(self, t, x, q, events, args):

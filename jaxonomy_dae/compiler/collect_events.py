@@ -75,6 +75,7 @@ def event_table(model: ModelNumbers) -> EventTable:
         tuple(when.relation for when in whens),
         tuple(when.kink for when in whens),
         tuple(when.strict for when in whens),
+        tuple(when.strike for when in whens),
         tuple(when.immediate for when in whens),
         event,
         state,

@@ -103,9 +103,11 @@ def handle(
     At the initial time, `at_start`, events do not move with parameters, and are logged only if they end the run.
     """
     c, g = problem.n_clocks, problem.n_guards
-    noted = jnp.asarray(problem.noted)
+    noted, of_guards = jnp.asarray(problem.noted), jnp.arange(c + g) >= c
     ends = jnp.asarray(problem.ends).astype(t.dtype)
     relations = jnp.asarray(problem.relations)
+    strikes = jnp.asarray(problem.strikes, bool)
+    several = sum(problem.strikes) > 1
 
     def one(instant: Instant) -> Instant:
         state, q, before = instant.state, instant.state.q, instant.slope
@@ -114,20 +116,17 @@ def handle(
         event = jnp.where(jnp.any(instant.left), jnp.argmax(instant.left), c + g)
         is_clock = event < c
         k = jnp.clip(event - c, 0, max(g - 1, 0))
-        delay = rate = jnp.zeros_like(t)
+        delay, rates = jnp.zeros_like(t), arrival.rate
         rose = onto = jnp.zeros((g,), bool)
-        if at_start and g:
-            rate = arrival.rate[k]
-        elif g:
+        if g and not at_start:
             values = problem.guards(t, state.x, q, args)
             value, rates = problem.rates(t, state.x, q, args, before)
-            rate = rates[k]
             # What has just risen to zero would be above it but for this event: it falls if the event turns it back. A
             # relation has an opposite, which falls then.
             rose = (state.armed == BELOW) & _is_zero(value, rates, arrival) & (rates > 0) & ~relations[c:]
             # What has jumped onto zero and does not move there is true unless it is strict.
             onto = arrival.jumped & (value == 0) & (rates == 0) & ~jnp.asarray(problem.strict[c:], bool)
-            crossing = -values[k] / jnp.where(rate == 0, 1.0, rate)
+            crossing = -values[k] / jnp.where(rates[k] == 0, 1.0, rates[k])
             # Where another event has made the guard slow, rounding is all that is left of its value.
             frozen = lax.stop_gradient(crossing)
             crossing = crossing + (jnp.clip(frozen, -arrival.window, arrival.window) - frozen)
@@ -138,28 +137,35 @@ def handle(
             delay = jnp.where(is_clock, exact - lax.stop_gradient(exact), delay)
         time = t + delay
         reached = state.x + before * delay
-        x, new = problem.written(time, reached, q, instant.previous, event, args)
+        # What strikes at the same instant does so at once, whatever the order: a box that falls flat does not turn.
+        happening = one_hot(event, c + g)
+        if several:
+            happening = happening | (instant.left & strikes & strikes[event])
+        x, new = problem.written(time, reached, q, instant.previous, happening, args)
         ticks = state.ticks + one_hot(event, c).astype(state.ticks.dtype)
-        logged = (~is_clock & noted[event] & (not at_start)) | (ends[event] > 0)
-        row = jnp.where(logged, state.count.astype(int), state.times.shape[0] + 1)
+        logged = happening & ((of_guards & noted & (not at_start)) | (ends > 0))
+        shown = jnp.arange(c + g) if several else event[None]
+        row = state.count.astype(int) + jnp.cumsum(logged[shown]) - 1
+        row = jnp.where(logged[shown], row, state.times.shape[0] + 1)
+        rate = jnp.concatenate([jnp.zeros((c,), t.dtype), rates])[shown]
         moved = jnp.any(x != reached) & ~relations[event]
-        approach = jnp.where(instant.caused[k] | at_start, 0.0, rate) if g else rate
+        approach = jnp.where(instant.caused | at_start, 0.0, rates)
         new, after, slow, armed, left, caused, stuck = _following(
-            problem, t, x, new, instant, event, arrival, delay, moved, approach, rose, onto, args
+            problem, t, x, new, instant, event, happening, arrival, delay, moved, approach, rose, onto, args
         )
         turns = state.turns + (~is_clock).astype(t.dtype)
         slides = ~is_clock & (turns > SLIDES + TURNS * g)
         again = jnp.where(slides, event, jnp.where(jnp.any(stuck), c + jnp.argmax(stuck), -1)) if g else jnp.array(-1)
         # What is too fast to be followed back, as a current that a blocked diode stops, has that value at once.
         back = delay - (1.0 - slow) * lax.stop_gradient(delay)
-        state = state.noted(row, time, event, rate, jnp.concatenate([reached, q]), jnp.concatenate([x, new])).but(
+        state = state.noted(row, time, shown, rate, jnp.concatenate([reached, q]), jnp.concatenate([x, new])).but(
             x=x - after * back,
             q=new,
             armed=armed,
             ticks=ticks,
             due=lax.stop_gradient(problem.due(ticks)),
-            count=state.count + logged.astype(state.count.dtype),
-            ended=jnp.maximum(state.ended, ends[event]),
+            count=state.count + jnp.sum(logged).astype(state.count.dtype),
+            ended=jnp.maximum(state.ended, jnp.max(jnp.where(happening, ends, 0.0))),
             stuck=again.astype(t.dtype),
             turns=turns,
         )
@@ -201,10 +207,12 @@ def _is_zero(value: Any, rate: Any, arrival: Arrival) -> Any:
     return jnp.abs(value) <= jnp.maximum(rounding(arrival.size), _within(rate, arrival))
 
 
-def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, delay, moved, approach, rose, onto, args):
-    """The situation after an event.
+def _following(
+    problem, t, x, q, instant: Instant, event, happening, arrival: Arrival, delay, moved, approach, rose, onto, args
+):  # fmt: skip
+    """The situation after an event, or after all that are `happening`, of which it is the first.
 
-    `moved` says whether the event wrote states, `approach` how fast its guard fell before, or zero. Where the equations
+    `moved` says whether they wrote states, `approach` how fast the guards fell before, or zero. Where the equations
     are singular with q, as where a switch closes onto a diode that conducts, modes that are chosen by their conditions
     change along with it: to the first ones of `_alternatives` that hold.
 
@@ -213,14 +221,14 @@ def _following(problem, t, x, q, instant: Instant, event, arrival: Arrival, dela
     true, guards that are stuck); only q is differentiated.
     """
     c, g = problem.n_clocks, problem.n_guards
-    left = instant.left & ~one_hot(event, c + g)
+    left = instant.left & ~happening
     if not g:
         slope = problem.slope(t, x, q, args)
         return q, slope, jnp.ones_like(x), instant.state.armed, left, instant.caused, instant.stuck
     written_q = q
     problem, t, x, q, delay, args = still(constant_once((problem, t, x, q, delay, args)))
     instant = still(instant)
-    here = event - c == jnp.arange(g)
+    here = happening[c:]
     rested = here & (instant.state.armed == RESTS)
     turns_back = jnp.asarray(problem.opposite)[jnp.clip(event - c, 0, g - 1)] == jnp.arange(g)
     band = rounding(arrival.size)

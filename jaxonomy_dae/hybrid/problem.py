@@ -29,6 +29,7 @@ class AbstractHybridProblem(eqx.Module):
     noted: eqx.AbstractVar[tuple[bool, ...]]  # which are counted and listed
     revocable: eqx.AbstractVar[tuple[bool, ...]]  # which another event may undo before they happen
     relations: eqx.AbstractVar[tuple[bool, ...]]  # which say what a relation is, from the initial time on
+    strikes: eqx.AbstractVar[tuple[bool, ...]]  # which happen at once with others of them at the same instant
     strict: eqx.AbstractVar[tuple[bool, ...]]  # whose conditions are false where their guards are zero
     opposite: eqx.AbstractVar[tuple[int, ...]]  # of each guard: the one that falls where its relation turns back, or −1
     choices: eqx.AbstractVar[tuple[int, ...]]  # discrete values, 0 or 1, that their conditions choose, …
@@ -59,10 +60,11 @@ class AbstractHybridProblem(eqx.Module):
         x: Float[Array, " n"],
         q: Float[Array, " q"],
         previous: Float[Array, " q"],
-        event: Any,
+        events: Bool[Array, " events"],
         args: Args,
     ) -> tuple[Float[Array, " n"], Float[Array, " q"]]:
-        """(x, q) after an event, consistent; `previous` are the discrete values before the instant."""
+        """(x, q) after an event, or after several `strikes`, consistent; `previous` are the discrete values before the
+        instant."""
 
     @abc.abstractmethod
     def settled(
@@ -132,14 +134,17 @@ class HybridState(eqx.Module):
         assert not changes
         return dataclasses.replace(self, **whole)
 
-    def noted(self, row: Any, time: Time, event: Any, rate: Any, before: Any, after: Any) -> "HybridState":
-        """A copy with an event written to column `row` of the log; unchanged if there is no such column."""
+    def noted(self, row: Any, time: Time, events: Any, rate: Any, before: Any, after: Any) -> "HybridState":
+        """A copy with events that happen at once, (events,), written to columns `row` of the log, where there are such
+        columns."""
         log, sides = self.log, self.sides
         if log.shape[1]:
-            column = jnp.stack([time, event.astype(time.dtype), lax.stop_gradient(rate)])
-            log = log.at[:, row].set(column, mode="drop")
+            columns = jnp.stack(
+                [jnp.broadcast_to(time, rate.shape), events.astype(time.dtype), lax.stop_gradient(rate)]
+            )
+            log = log.at[:, row].set(columns, mode="drop")
         if sides.shape[1]:
-            sides = sides.at[:, row].set(jnp.stack([before, after]), mode="drop")
+            sides = sides.at[:, row].set(jnp.stack([before, after])[:, None], mode="drop")
         return dataclasses.replace(self, log=log, sides=sides)
 
     armed = property(lambda self: self.of_guards[..., 0, :])

@@ -205,6 +205,7 @@ class EventTable:
     relation: tuple[bool, ...]  # whether an event says what a relation is, from the initial time on
     kink: tuple[bool, ...]  # whether equations as written go on with the same values there
     strict: tuple[bool, ...]  # whether its condition is false where its guard is zero
+    strike: tuple[bool, ...]  # whether a contact closes, at once with others that close at the same instant
     immediate: tuple[bool, ...]  # whether an event happens at the initial time, if its condition holds there
     event: np.ndarray  # (actions,)
     state: np.ndarray  # (actions,): the variable that starts anew, or −1
@@ -221,7 +222,7 @@ class EventTable:
         place = np.full(len(self), -1, np.int64)
         place[events] = np.arange(len(events))
         rows = place[self.event] >= 0
-        columns = ("text", "message", "noted", "revocable", "relation", "kink", "immediate")
+        columns = ("text", "message", "noted", "revocable", "relation", "kink", "strict", "strike", "immediate")
         of_events = {name: tuple(getattr(self, name)[e] for e in events) for name in columns}
         of_actions = {name: getattr(self, name)[rows] for name in ("state", "discrete", "value", "constant")}
         clocks = tuple(self.clocks[e] for e in events if e < len(self.clocks))
@@ -232,7 +233,7 @@ class EventTable:
 
 
 _NONE = np.zeros(0, np.int64)
-NO_EVENTS = EventTable((), _NONE, (), (), (), (), (), (), (), (), _NONE, _NONE, _NONE, _NONE, np.zeros(0))
+NO_EVENTS = EventTable((), _NONE, (), (), (), (), (), (), (), (), (), _NONE, _NONE, _NONE, _NONE, np.zeros(0))
 
 
 @dataclasses.dataclass(frozen=True)

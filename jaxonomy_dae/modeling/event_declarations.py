@@ -108,7 +108,7 @@ class EventDeclarations:
     def _event(
         self, condition: Any, actions: tuple[Action, ...], on: Any, immediate: bool, noted: bool = True,
         revocable: bool = False, text: str | None = None, relation: bool = False, watched: Any = sympy.true,
-        kink: bool = False,
+        kink: bool = False, strike: bool = False,
     ) -> None:  # fmt: skip
         self._check_open("declare its events")
         where = f"component '{self.name}': when"
@@ -152,6 +152,7 @@ class EventDeclarations:
                 relation,
                 kink,
                 is_strict(condition),
+                strike,
             )  # fmt: skip
         )
 

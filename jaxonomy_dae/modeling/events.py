@@ -55,7 +55,8 @@ class When:
     time, too, if its condition holds there; one that is not `noted` only says that equations change. One that is
     `revocable` does not happen if another event at the same instant has made its condition false again. A `relation`
     says what a hidden discrete variable is, from the initial time on; it is a `kink` if equations go on with the same
-    values where it turns. A `strict` condition is false where its guard is zero."""
+    values where it turns. A `strict` condition is false where its guard is zero. A `strike` closes a
+    contact, at once with others that close at the same instant."""
 
     text: str
     guard: str | None
@@ -68,6 +69,7 @@ class When:
     relation: bool = False
     kink: bool = False
     strict: bool = False
+    strike: bool = False
 
 
 @dataclasses.dataclass(frozen=True)

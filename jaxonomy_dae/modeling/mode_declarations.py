@@ -102,7 +102,7 @@ class ModeDeclarations(RelationDeclarations):
                 Assign(lifted, sympy.Piecewise((1, bounces), (0, True))),
             )
         shown = f"{gap <= 0}, on={open_}"
-        self._event(gap + depth <= 0, struck, open_, True, revocable=True, text=shown)
+        self._event(gap + depth <= 0, struck, open_, True, revocable=True, text=shown, strike=True)
         self._event(force <= 0, (Assign(active, no), Assign(lifted, no)), closed, True, revocable=True)
         low: Any = sympy.Ne(lifted, 1)
         self._event(gap >= clearance, (Assign(lifted, yes),), sympy.And(open_, low), True, noted=False)

@@ -1,5 +1,6 @@
 """A compiled system as a problem with events."""
 
+from collections.abc import Callable
 from typing import Any
 
 import diffrax
@@ -8,8 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..adjoint.resting import still
 from ..aliases import Args, Controller, State, Time, Tolerance
 from ..hybrid.control import EventControl
+from ..hybrid.first_order import constant_once
 from ..hybrid.problem import AbstractHybridProblem
 from ..model.tables import EventTable
 from ..solvers.switching import Watch
@@ -19,9 +22,9 @@ from ..tolerances import CONSISTENT, LEFT, PULL, RESOLUTION
 from .preparation import prepared, term_of
 
 RESTART = 8  # Gauss–Newton steps onto the constraints after an event; from 1e-4 they lead to 1e-8 and to rounding
-# Contacts are released at most this many times while one impact is resolved. If an impulse would still have to pull,
-# the event fails.
-TRIES = 3
+# Contacts are exchanged at most this many times, for each of them, while one impact is resolved. If an impulse would
+# still have to pull, the event fails.
+TRIES = 4
 
 
 class SystemProblem(AbstractHybridProblem):
@@ -39,6 +42,7 @@ class SystemProblem(AbstractHybridProblem):
     noted: tuple[bool, ...] = eqx.field(static=True)
     revocable: tuple[bool, ...] = eqx.field(static=True)
     relations: tuple[bool, ...] = eqx.field(static=True)
+    strikes: tuple[bool, ...] = eqx.field(static=True)
     strict: tuple[bool, ...] = eqx.field(static=True)
     opposite: tuple[int, ...] = eqx.field(static=True)
     choices: tuple[int, ...] = eqx.field(static=True)
@@ -60,16 +64,16 @@ class SystemProblem(AbstractHybridProblem):
     def clocks(self):
         return SystemAt(self.system.plan, self.system.numbers, (), 0.0, {}, self.system.typical_sizes).clocks()
 
-    def written(self, t, x, q, previous, event, args):
-        events: Any = self.system.plan.events
+    def written(self, t, x, q, previous, events, args):
+        plan: Any = self.system.plan.events
         values = self.system.around_event(t, q, previous, args).event_values(x)
-        happens = jnp.asarray(events.table.event) == event
-        is_state, is_discrete = events.state >= 0, events.table.discrete >= 0
-        place = events.state[is_state]
-        new = (values / jnp.asarray(events.factor, values.dtype))[is_state]
+        happens = events[plan.table.event]
+        is_state, is_discrete = plan.state >= 0, plan.table.discrete >= 0
+        place = plan.state[is_state]
+        new = (values / jnp.asarray(plan.factor, values.dtype))[is_state]
         x = x.at[place].add(jnp.where(happens[is_state], new - x[place], 0.0))
         before = q
-        place, new = events.table.discrete[is_discrete], values[is_discrete]
+        place, new = plan.table.discrete[is_discrete], values[is_discrete]
         q = q.at[place].add(jnp.where(happens[is_discrete], new - q[place], 0.0))
         if self.system.plan.held is None:
             return self.admitted(t, x, q, args), q
@@ -94,39 +98,70 @@ class SystemProblem(AbstractHybridProblem):
         the impulses do what they should).
 
         An equation e' + κ·e = 0 takes the place of e' = 0. States along ∂f/∂κ at κ = 0 are those after the impulse that
-        takes e away: exact where e is affine in what jumps (speeds; charges of linear capacitors). What is closed and
-        only pushes lets go if its impulse would be negative (Moreau 1988).
+        takes e away: exact where e is affine in what jumps (speeds; charges of linear capacitors).
+
+        Contacts push and do not pull: of those that strike or are closed, some act, with impulses p ≥ 0, and the others
+        part, w = e⁺ − (1 − strength)·e ≥ 0 (Moreau 1988; Newton's law of restitution). Which ones act is found by
+        exchanging the first that pulls or does not part, until there is none (Murty 1974: finite where all impulses
+        have energies, as of independent contacts; from those that were closed, so that one that repeats others never
+        acts).
         """
         plan: Any = self.system.plan
         held, n = plan.held, len(plan.states)
         place, pushes = held.table.impulse, held.table.closed >= 0
         closed = held.table.closed[pushes]
         held_before, _ = self.system.holding(before).at(t, args).held(x)
-        _, levels = self.system.holding(q).at(t, args).held(x)
+        holds, levels = self.system.holding(q).at(t, args).held(x)
+        e = levels[held.last]
+        strength = jnp.where(q[place] == 0, holds * (1 - held_before), q[place])
 
-        def attempt(q, _):
-            """The jump with q; and q without what this jump would have to pull instead of push."""
-            holds, _ = self.system.holding(q).at(t, args).held(x)
-            strength = jnp.where(q[place] == 0, holds * (1 - held_before), q[place])
+        def jump(problem: SystemProblem, t: Time, acting: Any, x: State, q: Any, strength: Any, args: Args) -> Any:
+            """(q with the contacts that act, the states after their impulses, these, e⁺)."""
+            system = problem.system
+            q = q.at[closed].set(jnp.where(acting[pushes], q[closed], 0.0))
+            strength = jnp.where(acting, strength, 0.0)
 
             def responds(strength):
-                system = self.system.holding(q.at[place].set(strength))
-                return system.vector_field(t, x, args), system.at(t, args).held_forces(x)
+                on = system.holding(q.at[place].set(strength))
+                return on.vector_field(t, x, args), on.at(t, args).held_forces(x)
 
             _, (change, pushed) = jax.jvp(responds, (strength,), (strength,))
-            pulls = (holds > 0) & (strength == 0) & (pushed < -PULL * jnp.max(jnp.abs(pushed)))
-            lets_go = pulls[pushes]
-            return q.at[closed].set(jnp.where(lets_go, 0.0, q[closed])), (change, strength, jnp.any(lets_go))
+            after = x.at[:n].add(change[:n])
+            q = q.at[place].set(0.0)
+            return q, after, pushed, system.holding(q).at(t, args).held(after)[1][held.last]
 
-        length = 1 + min(int(pushes.sum()), TRIES)
-        q, tried = jax.lax.scan(attempt, q, length=length)
-        change, strength, wrong = jax.tree.map(lambda rows: rows[-1], tried)
-        q = q.at[place].set(0.0)
-        after = x.at[:n].add(change[:n])
-        _, levels_after = self.system.holding(q).at(t, args).held(after)
-        e, left = levels[held.last], levels_after[held.last]
+        acting, wrong = jnp.ones(len(pushes), bool), jnp.zeros((), bool)
+        if len(pushes) > 1 and pushes.any():
+            strikes = pushes & (strength > 0)
+            may_change = strikes | (pushes & (holds > 0))
+            acting, wrong = self._acting(jump, t, x, q, strength, e, strikes, may_change, args)
+        q, after, _, left = jump(self, t, acting, x, q, strength, args)
         done = jnp.abs(left - (1 - strength) * e) <= LEFT * jnp.abs(strength * e)
-        return after, q, jnp.all(done | (strength == 0)) & ~wrong
+        return after, q, jnp.all(done | (strength == 0) | ~acting) & ~wrong
+
+    def _acting(
+        self, jump: Callable[..., Any], t: Time, x: State, q: Any, strength: Any, e: Any, strikes: Any, may_change: Any,
+        args: Args,
+    ) -> tuple[Any, Any]:  # fmt: skip
+        """Which contacts act, and whether that could not be found; not differentiated."""
+        problem, t, x, q, strength, e, args = still(constant_once((self, t, x, q, strength, e, args)))
+        n = len(may_change)
+        speed = PULL * jnp.max(jnp.abs(strength * e), initial=0.0)
+
+        def exchanged(carry):
+            acting, _, count = carry
+            _, _, pushed, after = jump(problem, t, acting, x, q, strength, args)
+            pulls = acting & (pushed < -PULL * jnp.max(jnp.abs(pushed)))
+            meets = ~acting & (after - (1 - strength) * e < -speed)
+            wrong = may_change & (pulls | meets)
+            first = jnp.arange(n) == jnp.argmax(wrong)
+            return jnp.where(wrong & first, ~acting, acting), jnp.any(wrong), count + 1
+
+        # One that strikes alone acts, and is tried first.
+        alone = jnp.sum(strikes) == 1
+        begin = ~strikes | alone, jnp.ones((), bool), jnp.zeros((), int)
+        acting, wrong, _ = jax.lax.while_loop(lambda c: c[1] & (c[2] < TRIES * n), exchanged, begin)
+        return acting, wrong
 
     def admitted(self, t: Time, x: State, q: Any, args: Args) -> Any:
         """The state projected onto the constraints that hold with q; NaN if it is not near them."""
@@ -160,6 +195,7 @@ def problem_for(
         noted=events.table.noted,
         revocable=events.table.revocable,
         relations=events.table.relation,
+        strikes=events.table.strike,
         strict=events.table.strict,
         opposite=_opposite(events.table, events.n_clocks),
         choices=choices,

@@ -37,6 +37,7 @@ class Stop(AbstractHybridProblem):
     noted: tuple[bool, ...] = eqx.field(static=True, default=(False, False))
     revocable: tuple[bool, ...] = eqx.field(static=True, default=(True, True))
     relations: tuple[bool, ...] = eqx.field(static=True, default=(True, True))
+    strikes: tuple[bool, ...] = eqx.field(static=True, default=(False, False))
     strict: tuple[bool, ...] = eqx.field(static=True, default=(True, False))
     opposite: tuple[int, ...] = eqx.field(static=True, default=(1, 0))
     choices: tuple[int, ...] = eqx.field(static=True, default=())
@@ -55,8 +56,8 @@ class Stop(AbstractHybridProblem):
     def guards(self, t, x, q, args):
         return jnp.stack([self.p - x[0], x[0] - self.p])
 
-    def written(self, t, x, q, previous, event, args):
-        return x, jnp.where(event == 0, jnp.ones_like(q), jnp.zeros_like(q))
+    def written(self, t, x, q, previous, events, args):
+        return x, jnp.where(events[0], jnp.ones_like(q), jnp.zeros_like(q))
 
     def settled(self, t, x, q, events, args):
         return jnp.where(events[0], 1.0, jnp.where(events[1], 0.0, q))
