@@ -1,7 +1,7 @@
 """Errors in the equations, for `Problem(method=...)`: process noise, or what was measured fed back.
 
 A settings object is turned into what the program is built from (`Structure`, names and places alone) and into the
-coordinates that come with it (`Extra`, with guesses that the data suggest).
+coordinates that come with it (with guesses that the data suggest).
 """
 
 import dataclasses
@@ -13,6 +13,7 @@ import numpy as np
 
 from ..errors import ModelError, nearest, whole_number
 from ..system.system import AcausalSystem
+from .coordinates import Coordinate
 from .data import Stacked
 from .experiment import ESTIMATE, Unknown
 from .linear_models import is_linear
@@ -121,24 +122,9 @@ class Structure:
         return bool(self.noise)
 
 
-@dataclasses.dataclass(frozen=True)
-class Extra:
-    """A coordinate that comes with a method; `spread` is that of its prior, on the coordinate's scale."""
-
-    name: str
-    unit: str
-    log: bool
-    size: float
-    guess: float
-    low: float
-    high: float
-    spread: float
-    fixed: bool
-
-
 def structure_and_extras(
     method: Filter | Innovations, system: AcausalSystem, stacked: Stacked
-) -> tuple[Structure, tuple[Extra, ...]]:
+) -> tuple[Structure, tuple[Coordinate, ...]]:
     """Returns (the static choices of the program, its coordinates beside those of the problem).
 
     **Raises:**
@@ -245,7 +231,7 @@ def _state(system: AcausalSystem, name: str, what: str) -> tuple[int, float]:
     return int(place[0]), float(factor[0])
 
 
-def _extra(name: str, unit: str, value: Any, guess: float, size: float, *, log: bool) -> Extra:
+def _extra(name: str, unit: str, value: Any, guess: float, size: float, *, log: bool) -> Coordinate:
     known = not isinstance(value, Unknown | str)
     spread = math.inf
     if isinstance(value, Unknown):
@@ -254,7 +240,7 @@ def _extra(name: str, unit: str, value: Any, guess: float, size: float, *, log: 
     elif known:
         guess = float(value)
     low, high = (guess / FAR, guess * FAR) if log else (-math.inf, math.inf)
-    return Extra(name, unit, log, size, guess, low, high, spread, known)
+    return Coordinate(name, unit, name, False, log, size, guess, low, high, spread, known)
 
 
 def _noise_unit(place: int | str, unit: str) -> str:

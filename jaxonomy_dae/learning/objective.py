@@ -18,11 +18,11 @@ from jaxtyping import Bool, Float, Int
 from ..system.system import AcausalSystem
 from .coordinates import Coordinates
 from .data import Stacked
-from .descent import Minimum
+from .descent import Minimum, descend
 from .evaluation import Evaluation, Weights
 from .evidence import Evidence
 from .experiment import Unknown
-from .least_squares import minimise
+from .least_squares import SumOfSquares
 from .program import Conditions, Layout, Setting, Weighted, misfit, predict, predict_and_differentiate
 
 
@@ -180,7 +180,8 @@ class Objective:
             weigh, reweigh = lambda *_: weights, None
         columns = self.coordinates.n_shared + self.coordinates.n_own  # of the program, whatever is frozen
         alone = self.residual if columns > FEW else None
-        return minimise(self.evaluate, alone, start, self.bounds, weigh, reweigh, steps, self.tolerance)
+        merit = SumOfSquares(self.evaluate, weigh, alone)
+        return descend(merit, start, self.bounds, reweigh, steps, self.tolerance)
 
     @property
     def tolerance(self) -> float:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from ..errors import ModelError, SimulationError
 from ..system.system import AcausalSystem
 from .asked import as_asked, check_start, checked_method, names_to_train, penalties, started
-from .coordinates import Coordinates, coordinates
+from .coordinates import Coordinate, Coordinates, coordinates
 from .data import Data, Stacked, stack
 from .descent import Minimum
 from .devices import check_mesh
@@ -20,12 +20,12 @@ from .estimate import Estimate
 from .evaluation import Evaluation, Weights
 from .experiment import Experiment, Unknown
 from .filter_objective import AheadObjective, FilterObjective
-from .filtering import Extra, Filter, Innovations, Structure, structure_and_extras
+from .filtering import Filter, Innovations, Structure, structure_and_extras
 from .holdout import holdout_score
 from .identifiability import Identifiability, identifiability
 from .multiple_shooting import Shooting, shoot
 from .objective import Objective
-from .program import Layout
+from .program import Layout, Setting
 from .runs import residuals, why_not
 from .starting_points import adam_steps, starting_points
 from .training import GradientSteps, Training, train
@@ -128,7 +128,11 @@ class Problem:
             tuple(self._options.items()), tuple(e.name for e in extras), self._mesh,
         )  # fmt: skip
 
-    def _errors(self, stacked: Stacked) -> tuple[Structure, tuple[Extra, ...]]:
+    @property
+    def _setting(self) -> Setting:
+        return Setting(self.system, self.observers, self._layout)
+
+    def _errors(self, stacked: Stacked) -> tuple[Structure, tuple[Coordinate, ...]]:
         """The static choices that the method adds to the program, and its coordinates."""
         if isinstance(self.method, Filter | Innovations):
             return structure_and_extras(self.method, self.system, stacked)
@@ -163,17 +167,17 @@ class Problem:
 
         `{experiment: {name: array of shape (n,)}}`; NaN where a run fails.
         """
-        layout, s = self._layout, self._stacked
-        objective = self._objective(s, coordinates(self.system, self.observers, layout, s, self._errors(s)[1]))
+        s = self._stacked
+        objective = self._objective(s, coordinates(self._setting, s, self._errors(s)[1]))
         model = self.system if model is None else model.merged()
         return residuals(objective, model, dict(starts or {}), dict(observe or {}), adjoint)
 
     def _objective(self, stacked: Stacked, c: Coordinates) -> Objective:
-        given = (self.system, self.observers, self._layout, stacked, c, self.penalties, ~stacked.holdout)
+        given = stacked, c, self.penalties, ~stacked.holdout
         if not isinstance(self.method, Filter | Innovations):
-            return Objective(*given)
+            return Objective(*self._setting, *given)
         kind = FilterObjective if isinstance(self.method, Filter) else AheadObjective
-        return kind(*given, self._errors(stacked)[0])
+        return kind(*self._setting, *given, self._errors(stacked)[0])
 
     # --- fitting -----------------------------------------------------------------------------------------------
 
@@ -286,9 +290,8 @@ class Problem:
             )
 
     def _coordinates(self, stacked: Stacked, freeze: Any, start: Any, bounds: Any) -> Coordinates:
-        system = started(self.system, start)
-        c = coordinates(system, self.observers, self._layout, stacked, self._errors(stacked)[1])
-        return as_asked(c, freeze, start, bounds)
+        setting = self._setting._replace(system=started(self.system, start))
+        return as_asked(coordinates(setting, stacked, self._errors(stacked)[1]), freeze, start, bounds)
 
     def _descend(
         self, objective: Objective, point: np.ndarray, shares: list[float], steps: int, adam: int, rate: float

@@ -14,7 +14,7 @@ import optax
 from jaxtyping import Float
 
 from ..errors import ModelError, SimulationError, whole_number
-from .axes import new_axes
+from ..optional import new_axes
 from .checkpoint import fingerprint, read_facts, read_state, save
 from .evaluation import Evaluation, Weights
 from .gradient import Batches
