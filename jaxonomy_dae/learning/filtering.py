@@ -135,26 +135,16 @@ def structure_and_extras(
     units = dict(zip(system.plan.flat.variables.names, system.plan.flat.variables.unit, strict=True))
     if isinstance(method, Innovations):
         gains = _gains(method, system, stacked)
-        nominal = system.plan.nominal
-        size_of = {j: _size(stacked, j) for j in range(len(stacked.outputs))}
-        extras = []
-        for name, value, place, output, factor in gains:
-            size = abs(float(nominal[place]) * factor) / size_of[output]
-            extras.append(_extra(name, "", value, 0.0, size, log=False))
+        sizes = [abs(float(system.plan.nominal[p]) * f) / _size(stacked, j) for _, _, p, j, f in gains]
+        pairs = zip(gains, sizes, strict=True)
+        extras = [_extra(name, "", value, 0.0, size, log=False) for (name, value, *_), size in pairs]
         return Structure(gain=tuple((p, j, f) for _, _, p, j, f in gains), is_linear=linear), tuple(extras)
     noise = _noise(method, system)
     guesses = _intensities(system, stacked, [place for _, _, place, _ in noise])
-    extras = [
-        _extra(
-            f"noise of {name}",
-            _noise_unit(place, units.get(name, "")),
-            value,
-            guesses[place] * abs(factor),
-            1.0,
-            log=True,
-        )
-        for name, value, place, factor in noise
-    ]
+    extras = []
+    for name, value, place, factor in noise:
+        unit = _noise_unit(place, units.get(name, ""))
+        extras.append(_extra(f"noise of {name}", unit, value, guesses[place] * abs(factor), 1.0, log=True))
     unknown = np.isnan(stacked.sigma) & stacked.observed.any(axis=1)
     estimated = tuple(np.flatnonzero(unknown.any(axis=0)).tolist())
     for j in estimated:

@@ -199,6 +199,29 @@ class Objective:
         residual = (self.predicted(full).outputs[rows] - s.values[rows]) / level
         return float(np.sqrt(np.mean(residual**2))) if np.isfinite(residual).all() else np.inf
 
+    # --- experiments that are held out ---------------------------------------------------------------------------
+
+    def with_own_starts(self, z: Float[np.ndarray, " f"], weights: Weights) -> Float[np.ndarray, " p"]:
+        """All coordinates after a fit. The unknown starts of experiments that were held out are fitted to these with
+        all else fixed: that is what they alone can tell, and all that is taken from them."""
+        full, held, c = self.full(z), self.stacked.holdout, self.coordinates
+        if not held.any() or not c.n_own:
+            return full
+        fixed = np.array(c.fixed)
+        fixed[: c.n_shared] = True
+        c = dataclasses.replace(c, start=c.natural(full), fixed=fixed)
+        alone = dataclasses.replace(self.with_noise(self.sigma(z, weights)), coordinates=c, counted=held, penalties={})
+        if not alone.free.any() or not len(alone.rows[0]):
+            return full
+        best = alone.lowest(full[alone.free])
+        return full if best is None else alone.full(best.z)
+
+    def holdout_score(self, z: Float[np.ndarray, " f"], weights: Weights) -> float:
+        """The root mean square of the residuals of experiments that are held out, in units of the noise; infinite where
+        a run fails."""
+        rows = np.nonzero(self.stacked.observed & self.stacked.holdout[:, None, None])
+        return self.scored(self.with_own_starts(z, weights), self.sigma(z, weights), rows)
+
     # --- weights -----------------------------------------------------------------------------------------------
 
     @functools.cached_property

@@ -21,7 +21,6 @@ from .evaluation import Evaluation, Weights
 from .experiment import Experiment, Unknown
 from .filter_objective import AheadObjective, FilterObjective
 from .filtering import Filter, Innovations, Structure, structure_and_extras
-from .holdout import holdout_score
 from .identifiability import Identifiability, identifiability
 from .multiple_shooting import Shooting, shoot
 from .objective import Objective
@@ -93,11 +92,12 @@ class Problem:
         self.starts = dict(starts or {})
         self._options = {"rtol": rtol, "atol": atol, "max_steps": max_steps, **options}
         self._mesh = check_mesh(mesh)
-        self._train = names_to_train(system, self.observers, train)
+        # Names of parameters, one by one, and of networks and sensor laws.
+        self.trained = names_to_train(system, self.observers, train)
         self.method = checked_method(system, method)
         self._stacked = self._stack(self.data)
         self._layout = self._laid_out(self._stacked)
-        self.penalties = penalties(system, self._train[1], regularize)
+        self.penalties = penalties(system, self.trained[1], regularize)
 
     # --- set-up ------------------------------------------------------------------------------------------------
 
@@ -106,17 +106,17 @@ class Problem:
             data if isinstance(data, Data) else Data(data), self.system.plan, tuple(self.observers), self.starts
         )
         unused = [name for name in self.observers if name not in stacked.outputs]
-        if unused and unused[0] in self._train[1]:
+        if unused and unused[0] in self.trained[1]:
             raise ModelError(f"train: there are no data of '{unused[0]}' to train its sensor law with")
         return stacked
 
     def _laid_out(self, stacked: Stacked) -> Layout:
-        parameters, modules = self._train
+        parameters, modules = self.trained
         _, extras = self._errors(stacked)
         shared, own, known = [], [], []
         for name, values in stacked.starts.items():
             unknown = [v for v in values if isinstance(v, Unknown)]
-            check_start(self.system, self._train[0], name, bool(unknown))
+            check_start(self.system, self.trained[0], name, bool(unknown))
             kind = known if not unknown or self._is_marginal(name, unknown) else shared if unknown[0].shared else own
             kind.append(name)
         if not parameters and not modules and not shared and not own and all(e.fixed for e in extras):
@@ -240,7 +240,7 @@ class Problem:
             if found is None:
                 continue
             by_cost = isinstance(self.method, Filter) or not stacked.holdout.any()
-            score = found.cost if by_cost else holdout_score(objective, found.z, found.weights)
+            score = found.cost if by_cost else objective.holdout_score(found.z, found.weights)
             if best is None or score < best[0]:
                 best = score, found, training
         if best is None:
@@ -352,11 +352,6 @@ class Problem:
         if found is None:
             raise SimulationError(why_not(objective))
         return objective, objective.weights(z, found), found, z
-
-    @property
-    def trained(self) -> tuple[list[str], list[str]]:
-        """Names of parameters, one by one, and of networks and sensor laws that are trained."""
-        return self._train
 
     def laid_out(self, experiments: Sequence[Experiment]) -> tuple[Layout, Stacked]:
         """The layout and the stacked data of other experiments of the same system, for a program of their own."""
