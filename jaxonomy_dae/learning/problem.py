@@ -25,7 +25,7 @@ from .identifiability import Identifiability, identifiability
 from .multiple_shooting import Shooting, shoot
 from .objective import Objective
 from .program import Layout, Setting
-from .runs import residuals, why_not
+from .runs import residuals, run, why_not
 from .starting_points import adam_steps, starting_points
 from .training import GradientSteps, Training, train
 
@@ -321,6 +321,10 @@ class Problem:
             cost = weights.cost(start, found.residual)
             return Minimum(start, found, weights, cost, [cost], 1, True, "nothing is searched", rtol)
         return objective.lowest(start, weights=weights)
+
+    def run(self, objective: Objective, z: Float[np.ndarray, " p"], experiment: int, ts: Any = None) -> Any:
+        """An ordinary simulation of one experiment at a point."""
+        return run(objective, z, experiment, ts)
 
     def with_law(self, name: str, law: Any, system: AcausalSystem, stacked: Stacked) -> "Problem":
         """A copy with another law in a network's place, without a prior, in the system given."""
