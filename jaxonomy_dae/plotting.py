@@ -5,7 +5,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from .errors import ModelError
-from .optional import optional_module
+from .optional import new_axes, optional_module, pyplot
 from .simulation.labelled import ByName
 from .system.system import AcausalSystem
 
@@ -41,10 +41,6 @@ class Response(Protocol):
         ...
 
 
-def _pyplot() -> Any:
-    return optional_module("matplotlib.pyplot", "plot", "plotting needs Matplotlib")
-
-
 def plot_solution(solution: ByName, *names: str, ax: Any = None, events: bool = True) -> Any:
     """Draws variables over time, discrete ones as steps, and returns the axes.
 
@@ -55,12 +51,10 @@ def plot_solution(solution: ByName, *names: str, ax: Any = None, events: bool = 
     - `events`: whether the events in `solution.events` are marked by thin vertical lines, more than 40 by ticks. The
         legend names them, if there are few.
     """
-    plt = _pyplot()
     names = names or tuple(n for n in solution.system.states if n in solution)
     if not names:
         raise ModelError("nothing to plot: the system has no states; name some variables")
-    if ax is None:
-        _, ax = plt.subplots(figsize=(7.0, 3.5), layout="constrained")
+    ax = new_axes(ax)
     flat = solution.system.plan.flat
     units = dict(zip(flat.variables.names, flat.variables.unit, strict=True))
     units |= dict(zip(flat.parameters.names, flat.parameters.units, strict=True))
@@ -161,7 +155,6 @@ def phase(solution: ByName, x: str, y: str, ax: Any = None) -> Any:
     - `x`, `y`: names of variables, of no arrays.
     - `ax`: Matplotlib axes to draw into, so that several solutions make one portrait; new ones by default.
     """
-    plt = _pyplot()
     columns = []
     for name in (x, y):
         values = np.asarray(solution[name], float)
@@ -170,8 +163,7 @@ def phase(solution: ByName, x: str, y: str, ax: Any = None) -> Any:
                 f"a phase portrait takes single variables; '{name}' is an array of {_entries(solution, name)[:3]}"
             )
         columns.append(values.reshape(-1, values.shape[-1]))
-    if ax is None:
-        _, ax = plt.subplots(figsize=(4.6, 4.4), layout="constrained")
+    ax = new_axes(ax, 4.6, 4.4)
     flat = solution.system.plan.flat
     units = dict(zip(flat.variables.names, flat.variables.unit, strict=True))
     for across, up in zip(*columns, strict=True):
@@ -190,7 +182,6 @@ def structure(system: AcausalSystem, ax: Any = None) -> Any:
     Rows are equations, columns the unknowns they are solved for; a dot says that the equation contains the unknown.
     Simultaneous blocks are framed, their tearing variables red.
     """
-    plt = _pyplot()
     plan = system.plan
     blocks, extended = plan.blocks, plan.extended
     n = len(blocks.unknowns)
@@ -208,9 +199,8 @@ def structure(system: AcausalSystem, ax: Any = None) -> Any:
     row = row[row >= 0]
     torn = [column_of[quantities] for step in plan.steps for quantities in step.torn]
     is_torn = np.isin(column, np.concatenate(torn)) if torn else np.zeros(len(column), bool)
-    if ax is None:
-        size = float(np.clip(0.22 * n + 2.0, 3.5, 9.0))
-        _, ax = plt.subplots(figsize=(size, size), layout="constrained")
+    side = float(np.clip(0.22 * n + 2.0, 3.5, 9.0))
+    ax = new_axes(ax, side, side)
     dot = float(np.clip(2000.0 / n**2, 0.5, 40.0))
     ax.scatter(column[~is_torn], row[~is_torn], s=dot, color="C0", linewidths=0)
     ax.scatter(column[is_torn], row[is_torn], s=dot, color="C3", linewidths=0)
@@ -218,7 +208,7 @@ def structure(system: AcausalSystem, ax: Any = None) -> Any:
         first, last = int(blocks.pointer[k]), int(blocks.pointer[k + 1])
         if last - first > 1:
             corner, side = (first - 0.5, first - 0.5), last - first
-            ax.add_patch(plt.Rectangle(corner, side, side, fill=False, color="0.4", linewidth=0.8))
+            ax.add_patch(pyplot().Rectangle(corner, side, side, fill=False, color="0.4", linewidth=0.8))
     ax.set_xlim(-0.5, n - 0.5)
     ax.set_ylim(n - 0.5, -0.5)
     ax.set_aspect("equal")
@@ -241,10 +231,9 @@ def bode(response: Response, *pairs: tuple[str, str], axes: Any = None) -> Any:
     - `pairs`: `(output, input)` each; default: all.
     - `axes`: two Matplotlib axes to draw into, for magnitude and phase; new ones by default.
     """
-    plt = _pyplot()
     pairs = _pairs_of(response, pairs)
     if axes is None:
-        _, axes = plt.subplots(2, 1, sharex=True, figsize=(7.0, 5.0), layout="constrained")
+        _, axes = pyplot().subplots(2, 1, sharex=True, figsize=(7.0, 5.0), layout="constrained")
     elif np.shape(axes) != (2,):
         raise ModelError(f"a Bode plot needs two axes, for magnitude and phase; got shape {np.shape(axes)}")
     upper, lower = axes
@@ -273,10 +262,8 @@ def nyquist(response: Response, *pairs: tuple[str, str], ax: Any = None) -> Any:
     - `pairs`: `(output, input)` each; default: all.
     - `ax`: Matplotlib axes to draw into; new ones by default.
     """
-    plt = _pyplot()
     pairs = _pairs_of(response, pairs)
-    if ax is None:
-        _, ax = plt.subplots(figsize=(5.0, 5.0), layout="constrained")
+    ax = new_axes(ax, 5.0, 5.0)
     order = np.argsort(np.asarray(response.omega))
     for pair in pairs:
         values = np.asarray(response[pair])[order]

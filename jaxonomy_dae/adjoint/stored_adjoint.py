@@ -1,7 +1,10 @@
 """Reverse-mode differentiation of a solve from a record of its steps."""
 
+import contextlib
+import contextvars
 import dataclasses
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import diffrax
@@ -21,6 +24,8 @@ LARGEST_RECORD = 2**25  # bytes; a solve whose record would be larger is left to
 # Bytes of a record that may have more than 64 rows: with 256 rows, states of up to 4 kB. Most solves then fit into the
 # record, and no step is taken twice.
 ROOMY_RECORD = 2**20
+
+_forward: contextvars.ContextVar[bool] = contextvars.ContextVar("forward_mode", default=False)
 
 
 class StoredAdjoint(diffrax.AbstractAdjoint):
@@ -273,3 +278,21 @@ def _with_buffers(state, buffers):
         [leaf for pair in buffers for leaf in pair],
         is_leaf=lambda leaf: leaf is None,
     )
+
+
+@contextlib.contextmanager
+def forward_mode() -> Iterator[None]:
+    """A context in which functions are traced for forward-mode differentiation: the default adjoint is
+    `diffrax.ForwardMode`."""
+    token = _forward.set(True)
+    try:
+        yield
+    finally:
+        _forward.reset(token)
+
+
+def default_adjoint(forwards: bool) -> diffrax.AbstractAdjoint:
+    """The adjoint where the user gives none. `forwards` is true if forward mode alone differentiates the arguments."""
+    if forwards or _forward.get():
+        return diffrax.ForwardMode()
+    return StoredAdjoint() if has_stored_adjoint() else diffrax.RecursiveCheckpointAdjoint()

@@ -92,6 +92,12 @@ def listed(names: Iterable[str], shown: int = SHOWN, joint: str = "and") -> str:
     return f" {joint} ".join([", ".join(names[:-1]), names[-1]]) if len(names) > 1 else "".join(names)
 
 
+def quoted(names: Iterable[str], shown: int = SHOWN) -> str:
+    """'a', 'b', 'c'; of long lists the beginning, and the rest counted."""
+    names = [f"'{n}'" for n in names]
+    return ", ".join(names[:shown]) + (f" and {len(names) - shown} more" if len(names) > shown else "")
+
+
 def some(names: Sequence[str], shown: int = SHOWN) -> str:
     """a, b, c; of long lists the beginning."""
     return ", ".join(names[:shown]) + (", …" if len(names) > shown else "")
@@ -107,11 +113,11 @@ def counted(n: int, what: str) -> str:
     return f"{n} {what}{'' if n == 1 else 's'}"
 
 
-def itemised(equations: Sequence[Provenance], shown: int = SHOWN) -> list[str]:
+def itemised(equations: Sequence[Provenance]) -> list[str]:
     """A line for each equation; long lists are cut, and the components of the rest named."""
     count = collections.Counter(equations)
-    lines = [f"  {e}" + (f"  (written {n} times)" if n > 1 else "") for e, n in list(count.items())[:shown]]
-    rest = list(count)[shown:]
+    lines = [f"  {e}" + (f"  (written {n} times)" if n > 1 else "") for e, n in list(count.items())[:SHOWN]]
+    rest = list(count)[SHOWN:]
     if rest:
         owners = [e.component for e in rest if e.is_written]
         lines.append(f"  … and {len(rest)} more" + (f", of {listed(owners, 4)}" if owners else ""))

@@ -17,6 +17,7 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
 
+from ..diagnosis.wording import quoted
 from ..errors import InitializationError
 from ..judgement.rank import above_errors
 from ..judgement.scaling import balanced, equilibrated
@@ -55,7 +56,6 @@ class InitialRows:
     direct: bool  # every kept row is a state and nothing else constrains the states
     redundant: tuple[int, ...]  # rows that must hold, though they follow from others
     settled: tuple[int, ...]  # of these, rows that follow from equations alone: no unknown moves them
-    promoted: tuple[str, ...]  # states that start at or near their guess, as nothing else determines them
     dropped: tuple[str, ...]  # fixed starts that values given by the caller outrank
 
 
@@ -123,9 +123,8 @@ def initial_rows(plan: SystemPlan, names: tuple[str, ...], solve_for: tuple[int,
             if r.quantity in held:
                 again.append(k)
             held.add(r.quantity)
-        promoted = tuple(plan.quantity_name[q] for q in entries if q not in held)
         independent = tuple(k not in again for k in range(len(rows)))
-        return InitialRows(guess, tuple(rows), 0, independent, True, tuple(again), (), promoted, ())
+        return InitialRows(guess, tuple(rows), 0, independent, True, tuple(again), (), ())
     generic = _generic(plan, solve_for)
     ranked = _by_rank if generic.jacobian.shape[1] <= DENSE_LIMIT else _by_matching
     return ranked(plan, generic, overrides, fixed, guess)
@@ -293,7 +292,7 @@ def _by_rank(plan: SystemPlan, generic: _Generic, overrides, fixed, guess) -> In
             soft.append((row, closes))
     if generic.solve_for:
         _check_count(plan, generic, directions, [kept[k] for k in redundant], [*kept, *(row for row, _ in soft)])
-    return _chosen(guess, kept, independent, soft, redundant, tuple(settled), dropped, plan)
+    return _chosen(guess, kept, independent, soft, redundant, tuple(settled), dropped)
 
 
 def _by_matching(plan: SystemPlan, generic: _Generic, overrides, fixed, guess) -> InitialRows:
@@ -314,20 +313,17 @@ def _by_matching(plan: SystemPlan, generic: _Generic, overrides, fixed, guess) -
     soft = [(row, True) for row, m in zip(rows[hard:], matched[hard:], strict=True) if m]
     missing = generic.jacobian.shape[1] - n_equations - int(matched.sum())
     if generic.solve_for and (missing or any(rows[k].given >= 0 for k in redundant)):
-        unknown = _some([plan.flat.parameters.names[p] for p in generic.solve_for])
+        unknown = quoted([plan.flat.parameters.names[p] for p in generic.solve_for])
         what = "too few" if missing else "too many"
         raise InitializationError(f"solve_for: {what} values in initial={{...}} to determine {unknown}")
     dropped = [row.name for row, gone in zip(rows[:hard], is_dropped, strict=True) if gone]
-    return _chosen(guess, kept, independent, soft, redundant, (), dropped, plan)
+    return _chosen(guess, kept, independent, soft, redundant, (), dropped)
 
 
-def _chosen(
-    guess, kept: list[StartRow], independent: list[bool], soft, redundant, settled, dropped, plan
-) -> InitialRows:
+def _chosen(guess, kept: list[StartRow], independent: list[bool], soft, redundant, settled, dropped) -> InitialRows:
     alone = (*independent, *(closes for _, closes in soft))
-    names = tuple(plan.quantity_name[row.quantity] for row, _ in soft)
     rows = (*kept, *(row for row, _ in soft))
-    return InitialRows(guess, rows, len(soft), alone, False, redundant, settled, names, tuple(dropped))
+    return InitialRows(guess, rows, len(soft), alone, False, redundant, settled, tuple(dropped))
 
 
 # --- what follows from what ----------------------------------------------------------------------------------------
@@ -371,11 +367,11 @@ def _check_count(
         for row in given:
             equations |= set(_support(generic, row, base)[1].tolist())
         found = _parameters_of(plan, sorted(equations), set(generic.solve_for))
-        others = f", or solve for one more parameter ({_some(found)})" if found else ""
+        others = f", or solve for one more parameter ({quoted(found)})" if found else ""
         more = "a value" if len(given) == 1 else f"{len(given)} values"
         raise InitializationError(
             f"solve_for: {more} too many for {len(wanted)} unknown parameter{'s' * (len(wanted) > 1)} "
-            f"({_some(wanted)}): {_some([r.name for r in given])} follow{'s' * (len(given) == 1)} from the others. "
+            f"({quoted(wanted)}): {quoted([r.name for r in given])} follow{'s' * (len(given) == 1)} from the others. "
             f"Leave {'it' if len(given) == 1 else 'them'} out{others}."
         )
     left = np.linalg.norm(directions.free[generic.n :], axis=1)
@@ -387,14 +383,14 @@ def _check_count(
         free = [q for q in np.flatnonzero(moving > directions.error).tolist() if q not in pinned]
         candidates = [plan.quantity_name[q] for q in free if plan.is_visible(q)]
         if candidates:
-            hint = f"Give {'one' if missing == 1 else missing} of: {_some(candidates)}"
+            hint = f"Give {'one' if missing == 1 else missing} of: {quoted(candidates)}"
         else:
             hint = "No variable depends on it at the initial point: leave it out of solve_for"
         raise InitializationError(
-            f"solve_for: {missing} value{'s' * (missing > 1)} too few: nothing determines {_some(undetermined)}. "
+            f"solve_for: {missing} value{'s' * (missing > 1)} too few: nothing determines {quoted(undetermined)}. "
             f"{hint}, in initial={{...}} or as a fixed start."
             if candidates
-            else f"solve_for: nothing determines {_some(undetermined)}. {hint}."
+            else f"solve_for: nothing determines {quoted(undetermined)}. {hint}."
         )
 
 
@@ -407,8 +403,3 @@ def _parameters_of(plan: SystemPlan, equations: list[int], without: set[int]) ->
         found |= set(group.parameter[chosen[group.equation]].ravel().tolist())
     table = plan.flat.parameters
     return [table.names[p] for p in sorted(found - without) if p not in table.expressions]
-
-
-def _some(names: Any, shown: int = 6) -> str:
-    names = [f"'{n}'" for n in names]
-    return ", ".join(names[:shown]) + (f" and {len(names) - shown} more" if len(names) > shown else "")

@@ -6,23 +6,16 @@ from typing import Any
 import numpy as np
 
 from ..errors import ModelError, nearest
-from ..optional import optional_module
+from ..optional import pyplot
 
 LEGEND = 8  # up to this many entries, a legend is drawn
-
-
-def new_axes(ax: Any, width: float = 7.0, height: float = 3.5) -> Any:
-    """The axes given, or new ones."""
-    plt = optional_module("matplotlib.pyplot", "plot", "plotting needs Matplotlib")
-    return plt.subplots(figsize=(width, height), layout="constrained")[1] if ax is None else ax
 
 
 def grid_of_axes(axes: Any, rows: int, columns: int, what: str) -> np.ndarray:
     """Axes of shape (rows, columns): those given, or new ones that share their times."""
     if axes is None:
-        plt = optional_module("matplotlib.pyplot", "plot", "plotting needs Matplotlib")
         size = (min(3.2 * columns + 3.0, 14.0), 2.3 * rows + 0.9)
-        return plt.subplots(rows, columns, figsize=size, sharex="col", squeeze=False, layout="constrained")[1]
+        return pyplot().subplots(rows, columns, figsize=size, sharex="col", squeeze=False, layout="constrained")[1]
     found = np.asarray(axes, object)
     if found.size != rows * columns:
         raise ModelError(f"{what} needs {rows} × {columns} axes; got {found.size}")

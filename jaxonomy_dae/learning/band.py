@@ -11,8 +11,8 @@ from jaxtyping import Float
 
 from ..errors import ModelError, nearest
 from ..model.opaque import OpaqueFunction
+from ..optional import new_axes
 from ..programs.cache import compiled
-from .axes import new_axes
 from .blocks import block_of, inputs_seen
 from .program import weights_of, with_weights
 from .runs import run

@@ -9,7 +9,7 @@ by their size, so that 1 is a change that would be natural in any unit. Weights 
 
 import dataclasses
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,11 +18,26 @@ from jaxtyping import Bool, Float
 
 from ..errors import ModelError, nearest
 from ..modeling.interval import Interval, closed_ends
-from ..system.system import AcausalSystem
+from ..system.parameters import ParameterNames
 from .data import Stacked
 from .experiment import Unknown
-from .filtering import Extra
-from .program import Layout
+from .program import Setting
+
+
+class Coordinate(NamedTuple):
+    """One coordinate; fields as those of `Coordinates`."""
+
+    name: str
+    unit: str
+    group: str
+    is_weight: bool
+    log: bool
+    size: float
+    start: float
+    low: float = -math.inf
+    high: float = math.inf
+    spread: float = math.inf
+    fixed: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,12 +153,12 @@ class Coordinates:
         return chosen
 
 
-def coordinates(
-    system: AcausalSystem, observers: dict[str, Any], layout: Layout, stacked: Stacked, extras: tuple[Extra, ...] = ()
-) -> Coordinates:
+def coordinates(setting: Setting, stacked: Stacked, extras: tuple[Coordinate, ...] = ()) -> Coordinates:
     """The coordinates of a problem, which start at the values of its system and at the guesses of unknown starts;
     `extras` come with its method."""
-    table, rows = system.parameters.table, []
+    system, observers, layout = setting
+    table = system.parameters.table
+    rows: list[Coordinate] = []
     numbers = np.array(system.parameters.array) if system.parameters.known is None else system.parameters.known
     index = [table.index(name) for name in layout.parameters]
     ends = closed_ends([table.intervals[k] for k in index])
@@ -151,13 +166,12 @@ def coordinates(
         name, interval, value = table.names[k], table.intervals[k], float(numbers[k])
         log = is_positive(interval)
         size = 1.0 if log else abs(value) or 1.0
-        rows.append((name, table.units[k], name, False, log, size, value, low, high, math.inf, False))
+        rows.append(Coordinate(name, table.units[k], name, False, log, size, value, low, high))
     for name in layout.modules:
         module = system.neural[name] if name in system.neural else observers[name]
         for one, value in _named_weights(name, module):
-            rows.append((one, "", name, True, False, 1.0, value, -math.inf, math.inf, math.inf, False))
-    for e in extras:
-        rows.append((e.name, e.unit, e.name, False, e.log, e.size, e.guess, e.low, e.high, e.spread, e.fixed))
+            rows.append(Coordinate(one, "", name, True, False, 1.0, value))
+    rows.extend(extras)
     n_plain = len(rows)
     units = dict(zip(table.names, table.units, strict=True))
     units |= dict(zip(system.plan.flat.variables.names, system.plan.flat.variables.unit, strict=True))
@@ -194,7 +208,7 @@ def _named_weights(name: str, module: Any) -> list[tuple[str, float]]:
     return found
 
 
-def _start(label: str, units: dict[str, str], name: str, given: Any, table: Any) -> tuple[Any, ...]:
+def _start(label: str, units: dict[str, str], name: str, given: Any, table: ParameterNames) -> Coordinate:
     low, high = -math.inf, math.inf
     log = False
     if name in table.names:
@@ -206,4 +220,4 @@ def _start(label: str, units: dict[str, str], name: str, given: Any, table: Any)
     spread = math.inf if known or given.spread is None else float(given.spread)
     size = 1.0 if log else spread if math.isfinite(spread) else abs(guess) or 1.0
     spread /= guess if log else size
-    return (label, units.get(name, ""), name, False, log, size, guess, low, high, spread, known)
+    return Coordinate(label, units.get(name, ""), name, False, log, size, guess, low, high, spread, known)

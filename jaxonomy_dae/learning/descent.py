@@ -49,16 +49,16 @@ class Reached(NamedTuple):
     cost: float
 
 
+@dataclasses.dataclass(frozen=True)
 class AbstractMerit(abc.ABC):
-    """The function that a descent decreases."""
+    """The function that a descent decreases.
 
-    @abc.abstractmethod
-    def evaluate(self, z: Float[np.ndarray, " p"]) -> Evaluation | None:
-        """Residuals and Jacobian; None where they cannot be found."""
+    - `evaluate`: residuals and Jacobian at a point; None where they cannot be found, so that a trial is rejected.
+    - `weights`: those of a point that was evaluated: the first ones, at the start.
+    """
 
-    @abc.abstractmethod
-    def weights(self, z: Float[np.ndarray, " p"], found: Evaluation) -> Weights:
-        """The first weights, from the start."""
+    evaluate: Callable[[Float[np.ndarray, " p"]], Evaluation | None]
+    weights: Callable[[Float[np.ndarray, " p"], Evaluation], Weights]
 
     @abc.abstractmethod
     def reach(self, z: Float[np.ndarray, " p"], weights: Weights, below: float) -> Reached | None:

@@ -245,8 +245,8 @@ def _placed(known: Known, plans: list[Planned]) -> tuple[Layout, Stacked, Any, A
 
 def _objective(known: Known, layout: Layout, stacked: Stacked) -> Objective:
     o = known.objective
-    c = coordinates(o.system, o.observers, layout, stacked)
-    return Objective(o.system, o.observers, layout, stacked, c, {}, np.ones(len(stacked.labels), bool))
+    setting = o.setting._replace(layout=layout)
+    return Objective(*setting, stacked, coordinates(setting, stacked), {}, np.ones(len(stacked.labels), bool))
 
 
 def _columns(known: Known, layout: Layout) -> np.ndarray:

@@ -17,7 +17,6 @@ from .descent import Minimum
 from .discovery import Discovery, discover
 from .factors import Factors
 from .figures import plot_correlations, plot_history, plot_residuals, plot_runs
-from .holdout import holdout_score, with_own_starts
 from .identifiability import Identifiability, identifiability, spreads
 from .intervals import intervals, profile
 from .objective import Objective
@@ -56,7 +55,7 @@ class Estimate:
         cls, problem: "Problem", objective: Objective, minimum: Minimum, training: Training | None = None
     ) -> "Estimate":
         """The estimate at a minimum."""
-        point = with_own_starts(objective, minimum.z, minimum.weights)
+        point = objective.with_own_starts(minimum.z, minimum.weights)
         shared, _ = objective.numbers(objective.coordinates.natural(point))
         system, observers, _ = with_values(objective.setting, shared)
         return cls(problem, objective, minimum, point, system, observers, training)
@@ -101,18 +100,14 @@ class Estimate:
         z, (low, high) = self.minimum.z, self.objective.bounds
         residual, jacobian = self.minimum.weights.applied(z, self.minimum.found)
         moves = ~((z <= low) | (z >= high))
-        factors = Factors.of(residual, jacobian[:, moves], self._noise)
+        factors = Factors.of(residual, jacobian[:, moves], self.minimum.noise)
         return factors, np.flatnonzero(self.objective.free)[moves]
-
-    @property
-    def _noise(self) -> float:
-        return self.minimum.noise
 
     @functools.cached_property
     def root(self) -> Float[np.ndarray, "p r"]:
         """A, with the covariance A Aᵀ of all coordinates, as far as the data and priors determine them."""
         factors, chosen = self._linear
-        small = factors.root(factors.rank(self._noise))
+        small = factors.root(factors.rank(self.minimum.noise))
         out = np.zeros((len(self.point), small.shape[1]))
         out[chosen] = small
         return out
@@ -135,7 +130,7 @@ class Estimate:
         """Standard deviations on the coordinates' scale: 0 for what cannot move, infinite where not determined."""
         factors, chosen = self._linear
         out = np.zeros(len(self.point))
-        out[chosen] = spreads(factors, self._noise)
+        out[chosen] = spreads(factors, self.minimum.noise)
         return out
 
     @property
@@ -202,7 +197,7 @@ class Estimate:
     def identifiability(self) -> Identifiability:
         """The directions that the data determine, at the values found."""
         m = self.minimum
-        return identifiability(self.objective, m.weights, m.found, m.z, self._noise)
+        return identifiability(self.objective, m.weights, m.found, m.z, self.minimum.noise)
 
     def profile(self, names: Sequence[str] | str, level: float = 0.95) -> dict[str, tuple[float, float]]:
         """Intervals by profile likelihood: the values between which the cost, with everything else fitted anew, stays
@@ -375,4 +370,4 @@ class Estimate:
         """The root mean square of residuals of experiments held out, in units of the noise; NaN if there are none."""
         if not self.objective.stacked.holdout.any():
             return float("nan")
-        return holdout_score(self.objective, self.minimum.z, self.minimum.weights)
+        return self.objective.holdout_score(self.minimum.z, self.minimum.weights)

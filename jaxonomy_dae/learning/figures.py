@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import ModelError
-from .axes import LEGEND, chosen_names, grid_of_axes, new_axes
+from ..optional import new_axes
+from .axes import LEGEND, chosen_names, grid_of_axes
 from .descent import Minimum
 from .objective import Objective
 

@@ -8,14 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from .descent import Minimum
+from .descent import Minimum, descend
 from .evaluation import Evaluation, Weights
 from .evidence import Evidence
 from .experiment import Unknown
 from .filter_program import Track, misfit_ahead, predict_ahead, track
 from .filter_steps import Told
 from .filtering import Structure
-from .likelihood import Likelihood, score
+from .likelihood import Likelihood, Scoring
 from .objective import Misfit, Objective, Predicted
 from .program import Weighted
 
@@ -153,15 +153,16 @@ class FilterObjective(AheadObjective):
         self, start: Float[np.ndarray, " f"], steps: int = 200, weights: Weights | None = None
     ) -> Minimum | None:
         """As `Objective.lowest`, by scoring."""
-        given = self.evaluate, start, self.bounds, self.coordinates.log[self.free]
-        if weights is None:
-            reweigh = None if self.evidence.is_idle else self.evidence.reweigh
-            return score(*given, self.weights, reweigh, steps, self.tolerance)
 
         def held(z, found):
-            return dataclasses.replace(self.weights(z, found), precision=weights.precision, mean=weights.mean)
+            here = self.weights(z, found)
+            return (
+                here if weights is None else dataclasses.replace(here, precision=weights.precision, mean=weights.mean)
+            )
 
-        return score(*given, held, None, steps, self.tolerance)
+        merit = Scoring(self.evaluate, held, self.coordinates.log[self.free])
+        reweigh = self.evidence.reweigh if weights is None and not self.evidence.is_idle else None
+        return descend(merit, start, self.bounds, reweigh, steps, self.tolerance)
 
     def sigma(self, z: Float[np.ndarray, " f"], weights: Weights) -> dict[str, float]:
         """Noise levels that were estimated."""

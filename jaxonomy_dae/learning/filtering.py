@@ -1,7 +1,7 @@
 """Errors in the equations, for `Problem(method=...)`: process noise, or what was measured fed back.
 
 A settings object is turned into what the program is built from (`Structure`, names and places alone) and into the
-coordinates that come with it (`Extra`, with guesses that the data suggest).
+coordinates that come with it (with guesses that the data suggest).
 """
 
 import dataclasses
@@ -13,6 +13,7 @@ import numpy as np
 
 from ..errors import ModelError, nearest, whole_number
 from ..system.system import AcausalSystem
+from .coordinates import Coordinate
 from .data import Stacked
 from .experiment import ESTIMATE, Unknown
 from .linear_models import is_linear
@@ -121,24 +122,9 @@ class Structure:
         return bool(self.noise)
 
 
-@dataclasses.dataclass(frozen=True)
-class Extra:
-    """A coordinate that comes with a method; `spread` is that of its prior, on the coordinate's scale."""
-
-    name: str
-    unit: str
-    log: bool
-    size: float
-    guess: float
-    low: float
-    high: float
-    spread: float
-    fixed: bool
-
-
 def structure_and_extras(
     method: Filter | Innovations, system: AcausalSystem, stacked: Stacked
-) -> tuple[Structure, tuple[Extra, ...]]:
+) -> tuple[Structure, tuple[Coordinate, ...]]:
     """Returns (the static choices of the program, its coordinates beside those of the problem).
 
     **Raises:**
@@ -149,26 +135,16 @@ def structure_and_extras(
     units = dict(zip(system.plan.flat.variables.names, system.plan.flat.variables.unit, strict=True))
     if isinstance(method, Innovations):
         gains = _gains(method, system, stacked)
-        nominal = system.plan.nominal
-        size_of = {j: _size(stacked, j) for j in range(len(stacked.outputs))}
-        extras = []
-        for name, value, place, output, factor in gains:
-            size = abs(float(nominal[place]) * factor) / size_of[output]
-            extras.append(_extra(name, "", value, 0.0, size, log=False))
+        sizes = [abs(float(system.plan.nominal[p]) * f) / _size(stacked, j) for _, _, p, j, f in gains]
+        pairs = zip(gains, sizes, strict=True)
+        extras = [_extra(name, "", value, 0.0, size, log=False) for (name, value, *_), size in pairs]
         return Structure(gain=tuple((p, j, f) for _, _, p, j, f in gains), is_linear=linear), tuple(extras)
     noise = _noise(method, system)
     guesses = _intensities(system, stacked, [place for _, _, place, _ in noise])
-    extras = [
-        _extra(
-            f"noise of {name}",
-            _noise_unit(place, units.get(name, "")),
-            value,
-            guesses[place] * abs(factor),
-            1.0,
-            log=True,
-        )
-        for name, value, place, factor in noise
-    ]
+    extras = []
+    for name, value, place, factor in noise:
+        unit = _noise_unit(place, units.get(name, ""))
+        extras.append(_extra(f"noise of {name}", unit, value, guesses[place] * abs(factor), 1.0, log=True))
     unknown = np.isnan(stacked.sigma) & stacked.observed.any(axis=1)
     estimated = tuple(np.flatnonzero(unknown.any(axis=0)).tolist())
     for j in estimated:
@@ -245,7 +221,7 @@ def _state(system: AcausalSystem, name: str, what: str) -> tuple[int, float]:
     return int(place[0]), float(factor[0])
 
 
-def _extra(name: str, unit: str, value: Any, guess: float, size: float, *, log: bool) -> Extra:
+def _extra(name: str, unit: str, value: Any, guess: float, size: float, *, log: bool) -> Coordinate:
     known = not isinstance(value, Unknown | str)
     spread = math.inf
     if isinstance(value, Unknown):
@@ -254,7 +230,7 @@ def _extra(name: str, unit: str, value: Any, guess: float, size: float, *, log: 
     elif known:
         guess = float(value)
     low, high = (guess / FAR, guess * FAR) if log else (-math.inf, math.inf)
-    return Extra(name, unit, log, size, guess, low, high, spread, known)
+    return Coordinate(name, unit, name, False, log, size, guess, low, high, spread, known)
 
 
 def _noise_unit(place: int | str, unit: str) -> str:

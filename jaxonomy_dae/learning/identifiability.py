@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .axes import new_axes
+from ..optional import new_axes
 from .evaluation import Evaluation, Weights
 from .factors import Factors
 from .objective import Objective

@@ -13,8 +13,8 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
-from .descent import OFFSET, AbstractMerit, Minimum, Reached, Reweigh, descend
-from .evaluation import Evaluation, Weights
+from .descent import OFFSET, AbstractMerit, Reached
+from .evaluation import Weights
 from .factors import Factors
 
 GAIN = 1e-9  # relative decrease of the sum of squares below which it is the integration's noise: rtol² is less
@@ -22,19 +22,13 @@ GAIN = 1e-9  # relative decrease of the sum of squares below which it is the int
 
 @dataclasses.dataclass(frozen=True)
 class SumOfSquares(AbstractMerit):
-    """A sum of squares with weights that a step does not change; fields as the arguments of `minimise`."""
+    """A sum of squares with weights that a step does not change.
 
-    evaluation: Callable[[np.ndarray], Evaluation | None]
-    residual: Callable[[np.ndarray], np.ndarray | None] | None
-    first: Callable[[np.ndarray, Evaluation], Weights]
+    - `residual`: residuals alone. Trials that fail are dear: without the Jacobian of a hundred columns, a hundred times
+        less. None: trials are evaluated at once, which is less where columns are few.
+    """
 
-    def evaluate(self, z: Float[np.ndarray, " p"]) -> Evaluation | None:
-        """Calls the function that was given."""
-        return self.evaluation(z)
-
-    def weights(self, z: Float[np.ndarray, " p"], found: Evaluation) -> Weights:
-        """Calls the function that was given."""
-        return self.first(z, found)
+    residual: Callable[[Float[np.ndarray, " p"]], Float[np.ndarray, " m"] | None] | None
 
     def reach(self, z: Float[np.ndarray, " p"], weights: Weights, below: float) -> Reached | None:
         """The residuals alone tell whether a point costs less, if they can be had alone."""
@@ -42,7 +36,7 @@ class SumOfSquares(AbstractMerit):
             tried = self.residual(z)
             if tried is None or not weights.cost(z, tried) < below:
                 return None
-        found = self.evaluation(z)
+        found = self.evaluate(z)
         if found is None:
             return None
         cost = weights.cost(z, found.residual)
@@ -60,28 +54,6 @@ class SumOfSquares(AbstractMerit):
     def next_weights(self, here: Weights, better: Weights) -> Weights:
         """Better ones."""
         return better
-
-
-def minimise(
-    evaluate: Callable[[Float[np.ndarray, " p"]], Evaluation | None],
-    residual: Callable[[Float[np.ndarray, " p"]], Float[np.ndarray, " m"] | None] | None,
-    start: Float[np.ndarray, " p"],
-    bounds: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]],
-    weights: Callable[[Float[np.ndarray, " p"], Evaluation], Weights],
-    reweigh: Reweigh | None = None,
-    steps: int = 200,
-    noise: float = float(np.sqrt(np.finfo(float).eps)),
-) -> Minimum | None:
-    """Descends from a start; as `descend`.
-
-    **Arguments:**
-
-    - `evaluate`, `residual`: residuals and Jacobian, and residuals alone, at a point; None where they cannot be found,
-        so that a trial is rejected. Trials that fail are dear: without the Jacobian of a hundred columns, a hundred
-        times less. No `residual`: trials are evaluated at once, which is less where columns are few.
-    - `weights`: the first weights, from the start.
-    """
-    return descend(SumOfSquares(evaluate, residual, weights), start, bounds, reweigh, steps, noise)
 
 
 def offset(factors: Factors, cost: float, rows: int, noise: float) -> float:

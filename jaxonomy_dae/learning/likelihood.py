@@ -10,12 +10,11 @@ squares; only whether a step is better is for the likelihood to say.
 """
 
 import dataclasses
-from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .descent import AbstractMerit, Minimum, Reached, Reweigh, descend
+from .descent import AbstractMerit, Reached
 from .evaluation import Evaluation, Rows, Weights
 from .factors import Factors
 
@@ -53,26 +52,21 @@ class Likelihood(Weights):
 
 @dataclasses.dataclass(frozen=True)
 class Scoring(AbstractMerit):
-    """A likelihood, of which every point has weights of its own; fields as of `score`."""
+    """A likelihood, of which every point has weights of its own. Its descent stops where the remaining step is a
+    thousandth of the confidence region's radius: gᵀF⁻¹g ≤ 10⁻⁶ for each coordinate, with the gradient g and the Fisher
+    information F; or where steps in a row gain nothing.
 
-    evaluation: Callable[[np.ndarray], Evaluation | None]
+    - `limited`: the coordinates that are logarithms, whose steps are limited.
+    """
+
     limited: Bool[np.ndarray, " p"]
-    at: Callable[[np.ndarray, Evaluation], Weights]
-
-    def evaluate(self, z: Float[np.ndarray, " p"]) -> Evaluation | None:
-        """Calls the function that was given."""
-        return self.evaluation(z)
-
-    def weights(self, z: Float[np.ndarray, " p"], found: Evaluation) -> Weights:
-        """Calls the function that was given."""
-        return self.at(z, found)
 
     def reach(self, z: Float[np.ndarray, " p"], weights: Weights, below: float) -> Reached | None:
         """By the likelihood there, with the priors at hand."""
-        found = self.evaluation(z)
+        found = self.evaluate(z)
         if found is None:
             return None
-        here = dataclasses.replace(self.at(z, found), precision=weights.precision, mean=weights.mean)
+        here = dataclasses.replace(self.weights(z, found), precision=weights.precision, mean=weights.mean)
         cost = here.cost(z, found.residual)
         return Reached(z, found, here, cost) if cost < below else None
 
@@ -92,22 +86,3 @@ class Scoring(AbstractMerit):
     def shortened(self, step: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
         """Logarithms change by no more than `LONGEST`."""
         return np.where(self.limited, np.clip(step, -LONGEST, LONGEST), step)
-
-
-def score(
-    evaluate: Callable[[Float[np.ndarray, " p"]], Evaluation | None],
-    start: Float[np.ndarray, " p"],
-    bounds: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]],
-    limited: Bool[np.ndarray, " p"],
-    weights: Callable[[Float[np.ndarray, " p"], Evaluation], Weights],
-    reweigh: Reweigh | None = None,
-    steps: int = 200,
-    noise: float = 1e-6,
-) -> Minimum | None:
-    """Descends from a start; as `descend`. `weights` are those of a point, and a step of the coordinates that are
-    logarithms is `limited`.
-
-    It stops where the remaining step is a thousandth of the confidence region's radius: gᵀF⁻¹g ≤ 10⁻⁶ for each
-    coordinate, with the gradient g and the Fisher information F; or where steps in a row gain nothing.
-    """
-    return descend(Scoring(evaluate, limited, weights), start, bounds, reweigh, steps, noise)

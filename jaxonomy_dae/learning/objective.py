@@ -18,11 +18,11 @@ from jaxtyping import Bool, Float, Int
 from ..system.system import AcausalSystem
 from .coordinates import Coordinates
 from .data import Stacked
-from .descent import Minimum
+from .descent import Minimum, descend
 from .evaluation import Evaluation, Weights
 from .evidence import Evidence
 from .experiment import Unknown
-from .least_squares import minimise
+from .least_squares import SumOfSquares
 from .program import Conditions, Layout, Setting, Weighted, misfit, predict, predict_and_differentiate
 
 
@@ -180,7 +180,8 @@ class Objective:
             weigh, reweigh = lambda *_: weights, None
         columns = self.coordinates.n_shared + self.coordinates.n_own  # of the program, whatever is frozen
         alone = self.residual if columns > FEW else None
-        return minimise(self.evaluate, alone, start, self.bounds, weigh, reweigh, steps, self.tolerance)
+        merit = SumOfSquares(self.evaluate, weigh, alone)
+        return descend(merit, start, self.bounds, reweigh, steps, self.tolerance)
 
     @property
     def tolerance(self) -> float:
@@ -197,6 +198,29 @@ class Objective:
         level = np.where(np.isnan(s.sigma), 1.0, s.sigma)[rows[0], rows[2]]
         residual = (self.predicted(full).outputs[rows] - s.values[rows]) / level
         return float(np.sqrt(np.mean(residual**2))) if np.isfinite(residual).all() else np.inf
+
+    # --- experiments that are held out ---------------------------------------------------------------------------
+
+    def with_own_starts(self, z: Float[np.ndarray, " f"], weights: Weights) -> Float[np.ndarray, " p"]:
+        """All coordinates after a fit. The unknown starts of experiments that were held out are fitted to these with
+        all else fixed: that is what they alone can tell, and all that is taken from them."""
+        full, held, c = self.full(z), self.stacked.holdout, self.coordinates
+        if not held.any() or not c.n_own:
+            return full
+        fixed = np.array(c.fixed)
+        fixed[: c.n_shared] = True
+        c = dataclasses.replace(c, start=c.natural(full), fixed=fixed)
+        alone = dataclasses.replace(self.with_noise(self.sigma(z, weights)), coordinates=c, counted=held, penalties={})
+        if not alone.free.any() or not len(alone.rows[0]):
+            return full
+        best = alone.lowest(full[alone.free])
+        return full if best is None else alone.full(best.z)
+
+    def holdout_score(self, z: Float[np.ndarray, " f"], weights: Weights) -> float:
+        """The root mean square of the residuals of experiments that are held out, in units of the noise; infinite where
+        a run fails."""
+        rows = np.nonzero(self.stacked.observed & self.stacked.holdout[:, None, None])
+        return self.scored(self.with_own_starts(z, weights), self.sigma(z, weights), rows)
 
     # --- weights -----------------------------------------------------------------------------------------------
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..diagnosis.wording import quoted
 from ..errors import ModelError, nearest, whole_number
 from ..programs.cache import compiled
 from .band import Band, law_of, law_values
@@ -100,9 +101,9 @@ class Posterior:
         few = [name for name, value in self.effective.items() if not value >= ENOUGH]
         found = []
         if far:
-            found.append(f"chains disagree about {_listed(far)}: more draws= or a longer warmup=")
+            found.append(f"chains disagree about {quoted(far, 4)}: more draws= or a longer warmup=")
         if few:
-            found.append(f"fewer than {ENOUGH} effective draws of {_listed(few)}: more draws=")
+            found.append(f"fewer than {ENOUGH} effective draws of {quoted(few, 4)}: more draws=")
         if self.diverged.any():
             found.append(f"{self.diverged.sum()} trajectories diverged: corners of the posterior may be missing")
         return found
@@ -173,11 +174,6 @@ def _runs(setting: Setting, shared: Any, own: Any, conditions: Conditions) -> An
     as the longest."""
     c = jax.tree.map(lambda a: a[0], conditions)
     return jax.lax.map(lambda at: run_one(setting, None, at[0], at[1], c), (shared, own))
-
-
-def _listed(names: list[str]) -> str:
-    more = f" and {len(names) - 4} more" if len(names) > 4 else ""
-    return ", ".join(f"'{name}'" for name in names[:4]) + more
 
 
 def sample(estimate: "Estimate", draws: int, chains: int, warmup: int, seed: int) -> Posterior:

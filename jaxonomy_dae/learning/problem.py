@@ -12,7 +12,7 @@ from jaxtyping import Float
 from ..errors import ModelError, SimulationError
 from ..system.system import AcausalSystem
 from .asked import as_asked, check_start, checked_method, names_to_train, penalties, started
-from .coordinates import Coordinates, coordinates
+from .coordinates import Coordinate, Coordinates, coordinates
 from .data import Data, Stacked, stack
 from .descent import Minimum
 from .devices import check_mesh
@@ -20,13 +20,12 @@ from .estimate import Estimate
 from .evaluation import Evaluation, Weights
 from .experiment import Experiment, Unknown
 from .filter_objective import AheadObjective, FilterObjective
-from .filtering import Extra, Filter, Innovations, Structure, structure_and_extras
-from .holdout import holdout_score
+from .filtering import Filter, Innovations, Structure, structure_and_extras
 from .identifiability import Identifiability, identifiability
 from .multiple_shooting import Shooting, shoot
 from .objective import Objective
-from .program import Layout
-from .runs import residuals, why_not
+from .program import Layout, Setting
+from .runs import residuals, run, why_not
 from .starting_points import adam_steps, starting_points
 from .training import GradientSteps, Training, train
 
@@ -93,11 +92,12 @@ class Problem:
         self.starts = dict(starts or {})
         self._options = {"rtol": rtol, "atol": atol, "max_steps": max_steps, **options}
         self._mesh = check_mesh(mesh)
-        self._train = names_to_train(system, self.observers, train)
+        # Names of parameters, one by one, and of networks and sensor laws.
+        self.trained = names_to_train(system, self.observers, train)
         self.method = checked_method(system, method)
         self._stacked = self._stack(self.data)
         self._layout = self._laid_out(self._stacked)
-        self.penalties = penalties(system, self._train[1], regularize)
+        self.penalties = penalties(system, self.trained[1], regularize)
 
     # --- set-up ------------------------------------------------------------------------------------------------
 
@@ -106,17 +106,17 @@ class Problem:
             data if isinstance(data, Data) else Data(data), self.system.plan, tuple(self.observers), self.starts
         )
         unused = [name for name in self.observers if name not in stacked.outputs]
-        if unused and unused[0] in self._train[1]:
+        if unused and unused[0] in self.trained[1]:
             raise ModelError(f"train: there are no data of '{unused[0]}' to train its sensor law with")
         return stacked
 
     def _laid_out(self, stacked: Stacked) -> Layout:
-        parameters, modules = self._train
+        parameters, modules = self.trained
         _, extras = self._errors(stacked)
         shared, own, known = [], [], []
         for name, values in stacked.starts.items():
             unknown = [v for v in values if isinstance(v, Unknown)]
-            check_start(self.system, self._train[0], name, bool(unknown))
+            check_start(self.system, self.trained[0], name, bool(unknown))
             kind = known if not unknown or self._is_marginal(name, unknown) else shared if unknown[0].shared else own
             kind.append(name)
         if not parameters and not modules and not shared and not own and all(e.fixed for e in extras):
@@ -128,7 +128,11 @@ class Problem:
             tuple(self._options.items()), tuple(e.name for e in extras), self._mesh,
         )  # fmt: skip
 
-    def _errors(self, stacked: Stacked) -> tuple[Structure, tuple[Extra, ...]]:
+    @property
+    def _setting(self) -> Setting:
+        return Setting(self.system, self.observers, self._layout)
+
+    def _errors(self, stacked: Stacked) -> tuple[Structure, tuple[Coordinate, ...]]:
         """The static choices that the method adds to the program, and its coordinates."""
         if isinstance(self.method, Filter | Innovations):
             return structure_and_extras(self.method, self.system, stacked)
@@ -163,17 +167,17 @@ class Problem:
 
         `{experiment: {name: array of shape (n,)}}`; NaN where a run fails.
         """
-        layout, s = self._layout, self._stacked
-        objective = self._objective(s, coordinates(self.system, self.observers, layout, s, self._errors(s)[1]))
+        s = self._stacked
+        objective = self._objective(s, coordinates(self._setting, s, self._errors(s)[1]))
         model = self.system if model is None else model.merged()
         return residuals(objective, model, dict(starts or {}), dict(observe or {}), adjoint)
 
     def _objective(self, stacked: Stacked, c: Coordinates) -> Objective:
-        given = (self.system, self.observers, self._layout, stacked, c, self.penalties, ~stacked.holdout)
+        given = stacked, c, self.penalties, ~stacked.holdout
         if not isinstance(self.method, Filter | Innovations):
-            return Objective(*given)
+            return Objective(*self._setting, *given)
         kind = FilterObjective if isinstance(self.method, Filter) else AheadObjective
-        return kind(*given, self._errors(stacked)[0])
+        return kind(*self._setting, *given, self._errors(stacked)[0])
 
     # --- fitting -----------------------------------------------------------------------------------------------
 
@@ -236,7 +240,7 @@ class Problem:
             if found is None:
                 continue
             by_cost = isinstance(self.method, Filter) or not stacked.holdout.any()
-            score = found.cost if by_cost else holdout_score(objective, found.z, found.weights)
+            score = found.cost if by_cost else objective.holdout_score(found.z, found.weights)
             if best is None or score < best[0]:
                 best = score, found, training
         if best is None:
@@ -286,9 +290,8 @@ class Problem:
             )
 
     def _coordinates(self, stacked: Stacked, freeze: Any, start: Any, bounds: Any) -> Coordinates:
-        system = started(self.system, start)
-        c = coordinates(system, self.observers, self._layout, stacked, self._errors(stacked)[1])
-        return as_asked(c, freeze, start, bounds)
+        setting = self._setting._replace(system=started(self.system, start))
+        return as_asked(coordinates(setting, stacked, self._errors(stacked)[1]), freeze, start, bounds)
 
     def _descend(
         self, objective: Objective, point: np.ndarray, shares: list[float], steps: int, adam: int, rate: float
@@ -318,6 +321,10 @@ class Problem:
             cost = weights.cost(start, found.residual)
             return Minimum(start, found, weights, cost, [cost], 1, True, "nothing is searched", rtol)
         return objective.lowest(start, weights=weights)
+
+    def run(self, objective: Objective, z: Float[np.ndarray, " p"], experiment: int, ts: Any = None) -> Any:
+        """An ordinary simulation of one experiment at a point."""
+        return run(objective, z, experiment, ts)
 
     def with_law(self, name: str, law: Any, system: AcausalSystem, stacked: Stacked) -> "Problem":
         """A copy with another law in a network's place, without a prior, in the system given."""
@@ -349,11 +356,6 @@ class Problem:
         if found is None:
             raise SimulationError(why_not(objective))
         return objective, objective.weights(z, found), found, z
-
-    @property
-    def trained(self) -> tuple[list[str], list[str]]:
-        """Names of parameters, one by one, and of networks and sensor laws that are trained."""
-        return self._train
 
     def laid_out(self, experiments: Sequence[Experiment]) -> tuple[Layout, Stacked]:
         """The layout and the stacked data of other experiments of the same system, for a program of their own."""

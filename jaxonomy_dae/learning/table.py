@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .axes import new_axes
+from ..optional import new_axes
 
 
 @dataclasses.dataclass(frozen=True)

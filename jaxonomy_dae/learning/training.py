@@ -14,11 +14,10 @@ import optax
 from jaxtyping import Float
 
 from ..errors import ModelError, SimulationError, whole_number
-from .axes import new_axes
+from ..optional import new_axes
 from .checkpoint import fingerprint, read_facts, read_state, save
 from .evaluation import Evaluation, Weights
 from .gradient import Batches
-from .holdout import holdout_score
 from .objective import Objective
 from .runs import why_not
 
@@ -202,7 +201,7 @@ def train(objective: Objective, start: Float[np.ndarray, " f"], plan: GradientSt
         state.history.append(loss)
         due = state.step % plan.every == 0
         if due and held_out and following == 1.0:
-            score = holdout_score(objective, state.z, state.weights)
+            score = objective.holdout_score(state.z, state.weights)
             state.scored.append(state.step)
             state.scores.append(score)
             if score < state.best_value:
@@ -212,7 +211,8 @@ def train(objective: Objective, start: Float[np.ndarray, " f"], plan: GradientSt
             if plan.callback(Update(state.step, loss, score, values_at(objective, state.z))) is True:
                 message, stopped = f"ended by the callback after {state.step} updates", True
         if plan.checkpoint is not None and writes and (due or stopped or state.step == plan.steps):
-            save(plan.checkpoint, facts | _counts(state), state.arrays())
+            counts = {"taken": len(state.history), "scored": len(state.scores), "rows": len(state.weights.row)}
+            save(plan.checkpoint, facts | counts, state.arrays())
     last = not np.isfinite(state.best_value)  # nothing to choose by
     if not held_out and plan.batch is None and state.step == plan.steps:
         # The last point has not been looked at yet.
@@ -252,10 +252,6 @@ def _facts(objective: Objective, plan: GradientSteps, optimizer: Any) -> dict[st
         "every": plan.every,
         "horizons": [[share, plan.steps] for share in plan.horizons] if len(plan.horizons) > 1 else [],
     }
-
-
-def _counts(state: State) -> dict[str, Any]:
-    return {"taken": len(state.history), "scored": len(state.scores), "rows": len(state.weights.row)}
 
 
 def _resumed(plan: GradientSteps, facts: dict[str, Any], like: State, stages: dict[float, Batches]) -> State:

@@ -56,7 +56,19 @@ def stick_slip(
     component.when(Abs(friction) >= breakaway, assign(mode, sign(friction)), on=Eq(mode, 0))
 
 
-class Clutch(Component):
+class _Pressed(Component):
+    """Shafts on which a normal force presses."""
+
+    def _pressed(self, mu: Value, fn_max: Value, cgeo: Value, peak: Value) -> tuple[Any, Any]:
+        """(the friction under the whole normal force while shafts slide, how many times that they hold)."""
+        coefficient = self.parameter("mu", mu, unit="1", bounds=NONNEGATIVE)
+        largest = self.parameter("fn_max", fn_max, unit="N", bounds=NONNEGATIVE)
+        geometry = self.parameter("cgeo", cgeo, unit="m", bounds=NONNEGATIVE)
+        ratio = self.parameter("peak", peak, unit="1", bounds=(1.0, float("inf")))
+        return coefficient * geometry * largest, ratio
+
+
+class Clutch(_Pressed):
     """Two shafts pressed together: the input `u` is the normal force as a part of `fn_max`.
 
     While they slide, tau = mode·mu·cgeo·fn with fn = fn_max·max(u, 0); they stick until |tau| reaches peak times that;
@@ -68,10 +80,7 @@ class Clutch(Component):
         self, ev: EqnEnv, name: str, mu: Value = 0.5, fn_max: Value = 1.0, cgeo: Value = 1.0, peak: Value = 1.0
     ):
         super().__init__(ev, name)
-        coefficient = self.parameter("mu", mu, unit="1", bounds=NONNEGATIVE)
-        largest = self.parameter("fn_max", fn_max, unit="N", bounds=NONNEGATIVE)
-        geometry = self.parameter("cgeo", cgeo, unit="m", bounds=NONNEGATIVE)
-        ratio = self.parameter("peak", peak, unit="1", bounds=(1.0, float("inf")))
+        most, ratio = self._pressed(mu, fn_max, cgeo, peak)
         a, b = self.port("flange_a", Rotational), self.port("flange_b", Rotational)
         u = self.input("u", unit="1")
         phi = self.variable("phi_rel", unit="rad")
@@ -83,28 +92,25 @@ class Clutch(Component):
             Eq(w, der(phi)),
             Eq(b.tau, tau),
             Eq(a.tau + b.tau, 0),
-            Eq(slipping, coefficient * geometry * largest * smooth(Max(u, 0))),
+            Eq(slipping, most * smooth(Max(u, 0))),
         )
         stick_slip(self, w, tau, slipping, ratio * slipping, pressed=u)
         self.declare_dissipation(tau * w)
 
 
-class Brake(Component):
+class Brake(_Pressed):
     """A shaft pressed against the ground: as `Clutch`, with the shaft's own speed `w`."""
 
     def __init__(
         self, ev: EqnEnv, name: str, mu: Value = 0.5, fn_max: Value = 1.0, cgeo: Value = 1.0, peak: Value = 1.0
     ):
         super().__init__(ev, name)
-        coefficient = self.parameter("mu", mu, unit="1", bounds=NONNEGATIVE)
-        largest = self.parameter("fn_max", fn_max, unit="N", bounds=NONNEGATIVE)
-        geometry = self.parameter("cgeo", cgeo, unit="m", bounds=NONNEGATIVE)
-        ratio = self.parameter("peak", peak, unit="1", bounds=(1.0, float("inf")))
+        most, ratio = self._pressed(mu, fn_max, cgeo, peak)
         flange = self.port("flange", Rotational)
         u = self.input("u", unit="1")
         w = self.variable("w", unit="rad/s")
         slipping = self.variable("slipping", unit="N*m")
-        self.add_equations(Eq(w, der(flange.phi)), Eq(slipping, coefficient * geometry * largest * smooth(Max(u, 0))))
+        self.add_equations(Eq(w, der(flange.phi)), Eq(slipping, most * smooth(Max(u, 0))))
         stick_slip(self, w, flange.tau, slipping, ratio * slipping, pressed=u)
         self.declare_dissipation(flange.tau * w)
 
@@ -127,7 +133,7 @@ class StickingFriction(Component):
         self.declare_dissipation(f * v)
 
 
-class OneWayClutch(Component):
+class OneWayClutch(_Pressed):
     """A freewheel, and a clutch beside it: flange_b may run faster than flange_a, never slower.
 
     While they are locked, der(w_rel) = 0 with a torque tau from a to b that is not below −peak·slipping; while
@@ -141,10 +147,7 @@ class OneWayClutch(Component):
         self, ev: EqnEnv, name: str, mu: Value = 0.5, fn_max: Value = 1.0, cgeo: Value = 1.0, peak: Value = 1.0
     ):
         super().__init__(ev, name)
-        coefficient = self.parameter("mu", mu, unit="1", bounds=NONNEGATIVE)
-        largest = self.parameter("fn_max", fn_max, unit="N", bounds=NONNEGATIVE)
-        geometry = self.parameter("cgeo", cgeo, unit="m", bounds=NONNEGATIVE)
-        ratio = self.parameter("peak", peak, unit="1", bounds=(1.0, float("inf")))
+        most, ratio = self._pressed(mu, fn_max, cgeo, peak)
         a, b = self.port("flange_a", Rotational), self.port("flange_b", Rotational)
         u = self.input("u", default=0.0, unit="1")
         w = self.variable("w_rel", unit="rad/s")
@@ -155,7 +158,7 @@ class OneWayClutch(Component):
             Eq(w, der(b.phi - a.phi)),
             Eq(b.tau, -tau),
             Eq(a.tau + b.tau, 0),
-            Eq(slipping, coefficient * geometry * largest * smooth(Max(u, 0))),
+            Eq(slipping, most * smooth(Max(u, 0))),
         )
         self.either(Eq(locked, 1), der(w), tau + slipping)
         self.when(w <= 0, assign(locked, 1), on=Eq(locked, 0), at_start=True)

@@ -177,17 +177,17 @@ def _regularised_root(x: sympy.Expr, small: sympy.Expr) -> sympy.Expr:
 
 
 class _Restriction(_TwoPort):
-    """A sharp-edged orifice whose area is a parameter times an opening."""
+    """A sharp-edged orifice."""
 
-    def _restrict(self, A: Value, Cd: Value, rho: Value, dp_small: Value, opening: sympy.Expr):
+    def _through(self, A: Value, Cd: Value, rho: Value, dp_small: Value) -> tuple[sympy.Expr, sympy.Symbol]:
+        """(the flow through it where it is open, the flow)."""
         area = self.parameter("A", A, unit="m2", bounds=NONNEGATIVE)
         discharge = self.parameter("Cd", Cd, unit="1", bounds=POSITIVE)
         density = self.parameter("rho", rho, unit="kg/m3", bounds=POSITIVE)
         small = self.parameter("dp_small", dp_small, unit="Pa", bounds=POSITIVE)
         dp, flow = self._two_ports()
-        root = _regularised_root(dp, small)
-        self.add_equations(Eq(flow, opening * area * discharge * sympy.sqrt(2 * density) * root))
         self.declare_dissipation(dp * flow / density)
+        return area * discharge * sympy.sqrt(2 * density) * _regularised_root(dp, small), flow
 
 
 class Orifice(_Restriction):
@@ -207,7 +207,8 @@ class Orifice(_Restriction):
         dp_small: Value = 100.0,
     ):
         super().__init__(ev, name)
-        self._restrict(A, Cd, rho, dp_small, sympy.Integer(1))
+        through, flow = self._through(A, Cd, rho, dp_small)
+        self.add_equations(Eq(flow, through))
 
 
 class Valve(_Restriction):
@@ -227,7 +228,9 @@ class Valve(_Restriction):
         dp_small: Value = 100.0,
     ):
         super().__init__(ev, name)
-        self._restrict(A, Cd, rho, dp_small, self.input("opening", default=1.0, unit="1"))
+        opening = self.input("opening", default=1.0, unit="1")
+        through, flow = self._through(A, Cd, rho, dp_small)
+        self.add_equations(Eq(flow, opening * through))
 
 
 class CheckValve(_TwoPort):
@@ -248,7 +251,7 @@ class CheckValve(_TwoPort):
         self.declare_dissipation(dp * flow / density)
 
 
-class ReliefValve(_TwoPort):
+class ReliefValve(_Restriction):
     """A valve that opens where dp reaches `p_open`, and shuts where it has fallen to `p_close` < p_open (pascal).
 
     While it is open, it is an `Orifice` with `A` ≥ 0, `Cd` > 0, `rho` > 0 and `dp_small` > 0; while it is shut,
@@ -269,15 +272,10 @@ class ReliefValve(_TwoPort):
         super().__init__(ev, name)
         upper, lower = self.parameter("p_open", p_open, unit="Pa"), self.parameter("p_close", p_close, unit="Pa")
         in_order(self, "p_close", "p_open")
-        area = self.parameter("A", A, unit="m2", bounds=NONNEGATIVE)
-        discharge = self.parameter("Cd", Cd, unit="1", bounds=POSITIVE)
-        density = self.parameter("rho", rho, unit="kg/m3", bounds=POSITIVE)
-        small = self.parameter("dp_small", dp_small, unit="Pa", bounds=POSITIVE)
+        through, flow = self._through(A, Cd, rho, dp_small)
         opened = self.discrete("opened", start=0, unit="1")
-        dp, flow = self._two_ports()
-        through = area * discharge * sympy.sqrt(2 * density) * _regularised_root(dp, small)
         self.either(Eq(opened, 1), flow - through, flow)
-        self.declare_dissipation(dp * flow / density)
+        dp = self.dp
         self.when(dp >= upper, assign(opened, 1), on=Eq(opened, 0), at_start=True)
         self.when(dp <= lower, assign(opened, 0), on=Eq(opened, 1))
 

@@ -73,13 +73,8 @@ def _shape(step: AnyStep, number: int) -> tuple:
     return (
         step.n,
         step.tearing,
-        tuple(
-            (
-                e.template.key,
-                e.local,
-                e.factor.tobytes() + (e.quantity == ZERO).tobytes(),
-                e.coefficient.tobytes(),
-            )
+        *(
+            (e.template.key, e.local, e.factor.tobytes() + (e.quantity == ZERO).tobytes(), e.coefficient.tobytes())
             for e in step.equations
         ),
     )
@@ -113,25 +108,13 @@ def _loop(steps: Sequence[AnyStep], start: int, period: int, count: int, source:
     count = count if holds.all() else int(np.argmin(holds))
     if count < LEAST:
         return None
-    chosen = chosen[: count * period]
-    inside = follows[count - 1]
     place = np.stack([(where[0, :, 0] - start) % period, where[0, :, 1], where[0, :, 2]], axis=1)
-    return Loop(
-        tuple(chosen[:period]),
-        count,
-        reads[:count],
-        np.where(inside, back, -1),
-        place,
-        np.stack(
-            [
-                np.concatenate(
-                    [e.parameter.ravel() for s in chosen[k * period : (k + 1) * period] for e in s.equations]
-                )
-                for k in range(count)
-            ]
-        ),
-        tuple(
-            tuple(np.stack([s.unknown[u] for s in chosen[p::period]]) for u in range(len(chosen[p].unknown)))
-            for p in range(period)
-        ),
+    repetitions = [chosen[k * period : (k + 1) * period] for k in range(count)]
+    body = repetitions[0]
+    parameters = np.stack([np.concatenate([e.parameter.ravel() for s in r for e in s.equations]) for r in repetitions])
+    unknown = tuple(
+        tuple(np.stack([r[p].unknown[u] for r in repetitions]) for u in range(len(step.unknown)))
+        for p, step in enumerate(body)
     )
+    back = np.where(follows[count - 1], back, -1)
+    return Loop(tuple(body), count, reads[:count], back, place, parameters, unknown)

@@ -57,9 +57,9 @@ def as_interval(bounds: Any, where: str) -> Interval:
     return found
 
 
-def closed_ends(intervals: Sequence[Interval], dtype: Any = np.float64) -> Float[np.ndarray, "n 2"]:
-    """The least and the greatest number of each interval, among those of a floating-point type."""
-    ends = np.array([(i.low, i.high) for i in intervals], dtype).reshape(-1, 2)
+def closed_ends(intervals: Sequence[Interval]) -> Float[np.ndarray, "n 2"]:
+    """The least and the greatest number of each interval, in double precision."""
+    ends = np.array([(i.low, i.high) for i in intervals], float).reshape(-1, 2)
     opened = np.array([(i.open_low, i.open_high) for i in intervals], bool).reshape(-1, 2)
-    inside = np.nextafter(ends, np.array([np.inf, -np.inf], dtype))
+    inside = np.nextafter(ends, np.array([np.inf, -np.inf]))
     return np.where(opened, inside, ends)

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..aliases import Inputs, State, Time
+from ..diagnosis.wording import quoted
 from ..initialization.condition import BlockFinding
 from ..initialization.singular_blocks import examine_blocks
 from ..lowering.schedule import AnyStep, StepEquation
@@ -90,22 +91,22 @@ def _why(system: AcausalSystem, step: AnyStep, t: Time, x: State, inputs: Inputs
         return _no_root(system, step, x, f"has no solution {place}")
     if step.whole and plan.linear_solver is not None:
         return (
-            f"The block of equations for {_some(names)} was not solved {place}, though it is not singular: "
+            f"The block of equations for {quoted(names, SHOWN)} was not solved {place}, though it is not singular: "
             f"linear_solver={plan.linear_solver} did not converge. Let it take more steps (of GMRES, a larger restart "
             f"and max_steps), or compile without linear_solver.{_equations(system, step)}"
         )
     return (
-        f"The block of equations for {_some(names)} has no accurate solution {place}, though it is not singular: the "
-        "order in which it is eliminated was chosen for the parameter values that the model was compiled with, and "
-        f"fails at the present ones. Compile the model with these values.{_equations(system, step)}"
+        f"The block of equations for {quoted(names, SHOWN)} has no accurate solution {place}, though it is not "
+        "singular: the order in which it is eliminated was chosen for the parameter values that the model was compiled "
+        f"with, and fails at the present ones. Compile the model with these values.{_equations(system, step)}"
     )
 
 
 def _singular(block: BlockFinding, place: str) -> str:
     causes = ", ".join(f"'{name}' = {value:.6g}" for name, value in block.causes[:SHOWN])
     nearly = "singular" if block.singular else f"nearly singular (condition number {block.condition:.1e})"
-    one = f"The equation for {_some(block.variables)} is" if block.size == 1 else (
-        f"The block of {block.size} equations that is to determine {_some(block.variables)} is"
+    one = f"The equation for {quoted(block.variables, SHOWN)} is" if block.size == 1 else (
+        f"The block of {block.size} equations that is to determine {quoted(block.variables, SHOWN)} is"
     )  # fmt: skip
     texts = "".join(f"\n  {text}" for text in block.equations[:SHOWN])
     return f"{one} {nearly} {place}{f', with {causes}' if causes else ''}:{texts}\n"
@@ -144,11 +145,6 @@ def _just_beyond(system: AcausalSystem, t: Time, x: State, t1: Time, inputs: Inp
 def _equations(system: AcausalSystem, step: AnyStep) -> str:
     texts = dict.fromkeys(system.plan.describe(int(e)) for equation in step.equations for e in equation.equation)
     return "".join(f"\n  {text}" for text in list(texts)[:SHOWN]) + ("\n  …" if len(texts) > SHOWN else "")
-
-
-def _some(names: Any) -> str:
-    names = [f"'{name}'" for name in names]
-    return ", ".join(names[:SHOWN]) + (f" and {len(names) - SHOWN} more" if len(names) > SHOWN else "")
 
 
 def equation_not_finite(system: AcausalSystem, inputs: Any, t: Time, x: State) -> str:

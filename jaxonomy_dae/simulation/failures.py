@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..aliases import Inputs, Result, State, Time, Tolerance
-from ..diagnosis.wording import listed
+from ..diagnosis.wording import listed, quoted
 from ..hybrid.solver import MOVED, STUCK, TOO_MANY
 from ..lowering.plan import SystemPlan
 from ..solvers.choice_guard import SINGULAR_CHOICE
@@ -275,10 +275,8 @@ def _singular_choice(solution: Solution, first: tuple[Any, Any], t: Time, x: Sta
     lost = columns[int(np.argmin(here))]
     values = np.asarray(x)[len(plan.states) + lost]
     shown = ", ".join(f"'{system.carried[c]}' = {v:.3g}" for c, v in list(zip(lost, values, strict=True))[:SHOWN])
-    states = ", ".join(f"'{name}'" for name in system.states[:SHOWN])
-    more = f" and {len(system.states) - SHOWN} more" if len(system.states) > SHOWN else ""
     return (
-        f"the integration stopped at t={float(t):.6g}: the states {states}{more} have become a singular choice. There "
-        f"they no longer determine {shown}, and it cannot be told which branch continues. "
+        f"the integration stopped at t={float(t):.6g}: the states {quoted(system.states, SHOWN)} have become a "
+        f"singular choice. There they no longer determine {shown}, and it cannot be told which branch continues. "
         'Compile with state_selection="auto", which has no such points, or with other prefer_states'
     )

@@ -8,8 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ..adjoint.resting import HeldBack, Resting
-from ..adjoint.stored_adjoint import StoredAdjoint
 from ..aliases import Args, Controller, Result, Solver, State, Time
 from ..hybrid.problem import HybridState
 from ..hybrid.solver import WithEvents
@@ -107,8 +105,6 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
         term, solver = HybridTerm(problem), WithEvents(chosen, options.max_events)
         controller = with_event_control(controller)
         saved_of = _state_and_discrete
-    if not isinstance(options.adjoint, StoredAdjoint) and Resting.of(term, solver, controller, y0, inputs, t1 - t0):
-        controller = HeldBack(controller, term, solver)  # pyright: ignore[reportCallIssue]
     save = diffrax.SubSaveAt(t0=True, steps=True, fn=saved_of) if ts is None else diffrax.SubSaveAt(ts=ts, fn=saved_of)
     done = integrate(
         term, solver, t0, t1, dt0, y0, inputs,

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..adjoint.default import default_adjoint
+from ..adjoint.stored_adjoint import default_adjoint
 from ..errors import InitializationError, SimulationError
 from ..initialization.check import check
 from ..lowering.plan import SystemPlan

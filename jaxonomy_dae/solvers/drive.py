@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 
 from ..adjoint.late_times import diffeqsolve, times_fit
+from ..adjoint.resting import HeldBack, Resting
+from ..adjoint.stored_adjoint import StoredAdjoint
 from ..aliases import Args, Controller, Result, Solver, State, Terms, Time
 from .bdf import BDF
 from .projected import Projected
@@ -60,6 +62,9 @@ def integrate(
     checked: bool = False, goes_on: Any = True,
 ) -> Run:  # fmt: skip
     """Integrates; returns the values asked for, the last accepted point, and counts, Jacobians included."""
+    # `StoredAdjoint` holds steps back by itself, where it is differentiated.
+    if not isinstance(adjoint, StoredAdjoint) and Resting.of(term, solver, controller, y0, args, t1 - t0):
+        controller = HeldBack(controller, term, solver)  # pyright: ignore[reportCallIssue]
     fits = times_fit(t0, t1, save.ts, controller)
     if checked and fits is not True:
         t1 = eqx.error_if(t1, jnp.logical_not(fits), TIMES)

@@ -12,9 +12,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 
-from ..adjoint.default import default_adjoint
-from ..adjoint.resting import HeldBack, Resting
-from ..adjoint.stored_adjoint import StoredAdjoint
+from ..adjoint.stored_adjoint import default_adjoint
 from ..errors import InitializationError, ModelError, SimulationError
 from ..programs.cache import PROGRAMS, compiled
 from ..programs.staging import is_forwards, is_staged, is_traced
@@ -204,23 +202,10 @@ def _solve(term, t0, t1, y0, ts, args, tolerances, options, checked=False):
     check: StartCheck = start_check(FlatProblem(term, y0, args), t0, *tolerances)
     save = diffrax.SubSaveAt(t1=True) if ts is None else diffrax.SubSaveAt(ts=ts)
     solver = solver if ts is None else right_between_steps(solver)
-    # `StoredAdjoint` does so by itself, where it is differentiated.
-    if not isinstance(adjoint, StoredAdjoint) and Resting.of(term, solver, controller, y0, args, t1 - t0):
-        controller = HeldBack(controller, term, solver)  # pyright: ignore[reportCallIssue]
     run = integrate(
-        term,
-        solver,
-        t0,
-        t1,
-        None,
-        y0,
-        args,
-        save=save,
-        controller=controller,
-        adjoint=adjoint,
-        max_steps=max_steps,
+        term, solver, t0, t1, None, y0, args, save=save, controller=controller, adjoint=adjoint, max_steps=max_steps,
         checked=checked,
-    )
+    )  # fmt: skip
     reached = jnp.isfinite(run.ts) & check.is_fine
     saved = run.ys if ts is None else _on_constraints(term, args, run.ts, run.ys, y0)
     saved = jax.tree.map(lambda y: not_a_number(y, reached, y0, args), saved)

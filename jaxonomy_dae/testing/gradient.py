@@ -11,7 +11,7 @@ from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from ..adjoint.default import forward_mode
+from ..adjoint.stored_adjoint import forward_mode
 from ..errors import ModelError
 from .certificate import Certificate
 

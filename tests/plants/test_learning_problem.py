@@ -10,7 +10,6 @@ from swinging import DRAG, LENGTH, RELEASE, SIGMA, compiled_pendulum, record
 
 from jaxonomy_dae.errors import SimulationError
 from jaxonomy_dae.learning import Data, Problem, Unknown
-from jaxonomy_dae.learning.runs import run
 from jaxonomy_dae.programs.cache import PROGRAMS
 
 
@@ -116,8 +115,8 @@ def test_a_band_has_the_slope_and_spread_of_the_law(fit):
 def test_bands_of_variables_that_were_not_measured(fit):
     found = fit.predict(["pend.vx", "pend.x"], ts=[0.5, 1.0])
     step = 1e-4
-    other = run(fit.objective, fit.point + np.eye(len(fit.point))[2] * step, 0, ts=np.array([0.5, 1.0]))
-    plain = run(fit.objective, fit.point, 0, ts=np.array([0.5, 1.0]))
+    other = fit.problem.run(fit.objective, fit.point + np.eye(len(fit.point))[2] * step, 0, ts=np.array([0.5, 1.0]))
+    plain = fit.problem.run(fit.objective, fit.point, 0, ts=np.array([0.5, 1.0]))
     np.testing.assert_allclose(found.mean["pend.vx"], plain["pend.vx"], rtol=1e-6)
     slope = (other["pend.vx"] - plain["pend.vx"]) / step
     assert (found.spread["pend.vx"] < 1.0).all() and (np.abs(slope) > 0).all()
