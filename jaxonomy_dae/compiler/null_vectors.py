@@ -17,7 +17,7 @@ import scipy.sparse as sp
 from ..expressions.node import Number
 from ..judgement.rank import above_errors, rank_of
 from ..judgement.sparse_rank import sparse_rank_of
-from ..tolerances import CANCELLED, NO_WEIGHT
+from ..tolerances import CANCELLED, KNOWN, NO_WEIGHT
 from . import elimination
 from .elimination import Row
 from .rounded import Rounded
@@ -40,8 +40,10 @@ class BlockMatrix:
 
     @classmethod
     def of(cls, shape: tuple[int, int], entries: Sequence[tuple[np.ndarray, ...]]) -> "BlockMatrix":
-        """From parts (row, column, value, error); what stands at one place is added."""
-        return cls(shape, *(np.concatenate(part) for part in zip(*entries, strict=True)))
+        """From parts (row, column, value, error); what stands at one place is added. Numbers that were given are known to
+        `KNOWN`, as entries computed from them are."""
+        row, column, value, error = (np.concatenate(part) for part in zip(*entries, strict=True))
+        return cls(shape, row, column, value, np.maximum(error, KNOWN * np.abs(value)))
 
     @property
     def is_finite(self) -> bool:

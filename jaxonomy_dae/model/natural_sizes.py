@@ -98,7 +98,7 @@ def _least_squares(matrix: Any, right: np.ndarray) -> np.ndarray:
     method takes as many steps as a chain has links."""
     normal = (matrix.T @ matrix + DAMPING**2 * sp.eye_array(matrix.shape[1])).tocsc()
     options = {"SymmetricMode": True}
-    factors = scipy.sparse.linalg.splu(normal, permc_spec="COLAMD", diag_pivot_thresh=0.0, options=options)
+    factors = scipy.sparse.linalg.splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
     return factors.solve(matrix.T @ right)
 
 
