@@ -40,8 +40,8 @@ class BlockMatrix:
 
     @classmethod
     def of(cls, shape: tuple[int, int], entries: Sequence[tuple[np.ndarray, ...]]) -> "BlockMatrix":
-        """From parts (row, column, value, error); what stands at one place is added. Numbers that were given are known to
-        `KNOWN`, as entries computed from them are."""
+        """From parts (row, column, value, error); what stands at one place is added. Entries that are given numbers are
+        known to `KNOWN`, as those that are computed from such."""
         row, column, value, error = (np.concatenate(part) for part in zip(*entries, strict=True))
         return cls(shape, row, column, value, np.maximum(error, KNOWN * np.abs(value)))
 
