@@ -9,6 +9,7 @@ import pytest
 from problems import compiled
 
 from jaxonomy_dae import Component, EqnEnv, der, simulate
+from jaxonomy_dae.simulation.hybrid_problem import problem_for
 
 G = 9.81
 
@@ -41,29 +42,58 @@ def after_impact(j, v, e):
     raise AssertionError("no set of contacts acts")
 
 
-@pytest.mark.long("impacts of two contacts, in a batch")
+def cases(n, count):
+    """Jacobians of gaps that all close at speed 1, the speeds and the restitutions."""
+    rng, found = np.random.default_rng(0), []
+    while len(found) < count:
+        j, v = rng.normal(size=(n, n)), rng.normal(size=n)
+        j /= -(j @ v)[:, None]
+        if np.linalg.cond(j) < 100:
+            found.append((j, v, np.array([0.0, *rng.choice([0.0, 0.3, 0.9], n - 1)])))
+    return [jnp.asarray(np.stack(column)) for column in zip(*found, strict=True)]
+
+
+def given(j, v, e):
+    n = len(v)
+    values = {f"b.j{i}{k}": j[i, k] for i in range(n) for k in range(n)}
+    return values | {f"b.start{k}": v[k] for k in range(n)} | {f"b.e{i}": e[i] for i in range(1, n)}
+
+
+@pytest.mark.long("the response to an impulse, in a loop and with its derivative")
 @pytest.mark.parametrize("n", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_impacts_are_the_complementarity_problems(n):
     """They were taken one after another, in the order in which they had been declared: two supports on one side of a
     falling rod left it with −0.6 and 0.6, or, declared the other way round, with −0.5 and 0.5."""
-    rng = np.random.default_rng(0)
-    cases = []
-    while len(cases) < 60:
-        j, v = rng.normal(size=(n, n)), rng.normal(size=n)
-        j /= -(j @ v)[:, None]  # all gaps close at speed 1
-        if np.linalg.cond(j) < 100:
-            cases.append((j, v, np.array([0.0, *rng.choice([0.0, 0.3, 0.9], n - 1)])))
+    system = compiled(Body(EqnEnv(), "b", n))
+    t = jnp.zeros(())
+
+    def strike(j, v, e):
+        problem = problem_for(system.with_parameters(given(j, v, e)), t, t + 1, False, None, 1e-6)
+        at = dict(zip([f"b.q{k}" for k in range(n)], jnp.linalg.solve(j, -jnp.ones(n)), strict=True))
+        at |= {f"b.v{k}": v[k] for k in range(n)}
+        x, q = jnp.stack([at[name] for name in system.states]), system.discrete_values
+        after, _ = problem.written(t, x, q, q, jnp.asarray(problem.strikes), {})
+        return jnp.stack([after[system.states.index(f"b.v{k}")] for k in range(n)])
+
+    j, v, e = cases(n, 200)
+    found = jax.jit(jax.vmap(strike))(j, v, e)
+    expected = np.stack([after_impact(*map(np.asarray, case)) for case in zip(j, v, e, strict=True)])
+    np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
+
+
+@pytest.mark.slow
+def test_a_run_through_such_impacts():
+    n = 2
     system = compiled(Body(EqnEnv(), "b", n))
 
     def run(j, v, e):
-        given = {f"b.j{i}{k}": j[i, k] for i in range(n) for k in range(n)}
-        given |= {f"b.start{k}": v[k] for k in range(n)} | {f"b.e{i}": e[i] for i in range(1, n)}
-        # Before the next impact of any: gaps open at most at speeds of some ten.
-        solution = simulate(system.with_parameters(given), 1 + 1e-6, throw=False)
+        # Before the next impact of any: gaps open at speeds of some ten at most.
+        solution = simulate(system.with_parameters(given(j, v, e)), 1 + 1e-6, throw=False)
         return jnp.stack([solution[f"b.v{k}"][-1] for k in range(n)])
 
-    found = jax.jit(jax.vmap(run))(*map(jnp.asarray, map(np.stack, zip(*cases, strict=True))))
-    expected = np.stack([after_impact(*case) for case in cases])
+    j, v, e = cases(n, 60)
+    found = jax.jit(jax.vmap(run))(j, v, e)
+    expected = np.stack([after_impact(*map(np.asarray, case)) for case in zip(j, v, e, strict=True)])
     np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
 
 
