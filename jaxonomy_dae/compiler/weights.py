@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ..expressions.node import ONE, ZERO, Node, constant, divide, linear, multiply, number
-from ..tolerances import CANCELLED, EPS
+from ..tolerances import CANCELLED, EPS, KNOWN
 from . import elimination
 from .null_vectors import rational
 
@@ -80,7 +80,7 @@ def weights_in_parameters(
         return None
     sampled: list[elimination.Row] = [{} for _ in rows]
     for (i, c, graph), value, error in zip(entries, numbers, errors, strict=True):
-        found = Sampled(graph, value, error)
+        found = Sampled(graph, value, np.maximum(error, KNOWN * np.abs(value)))  # given numbers are known to that
         if found:
             sampled[i][c] = found
     one = Sampled(ONE, np.ones(numbers.shape[1]), np.zeros(numbers.shape[1]))

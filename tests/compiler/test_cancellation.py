@@ -229,3 +229,15 @@ def test_rates_that_a_switch_couples_are_refused():
     ev = EqnEnv()
     with pytest.raises(StructuralError, match="singular for d.coupled = 1, though not in general"):
         AcausalCompiler(ev, AcausalDiagram().add(Coupled(ev)))()
+
+
+@pytest.mark.parametrize("roundings", [-4, -1, 0, 1, 4])
+def test_numbers_that_are_dependent_to_some_roundings(roundings):
+    """Rates with a matrix of rank one, whose last entry somebody computed: it is off by some roundings, and means the
+    same. Whether it had a null vector, and whether weights were found, was decided by single roundings."""
+    a, b, c = 0.99019405712519406, 0.018397215587545368, 1.0953425563846717e-4
+    last = c * b / a * (1 + roundings * 2.0**-52)
+    system = _compiled(
+        "yz", lambda y, z, t: (a * der(y) + b * der(z) + 1.9 * y - 1, c * der(y) + last * der(z) + 0.6 * z)
+    )
+    assert len(system.states) == 1
