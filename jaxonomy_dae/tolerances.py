@@ -28,14 +28,14 @@ TINY = 1e-300  # takes the place of zero in denominators, far below any square o
 
 # In units of EPS times the terms: what the sum of a handful of terms, each of them rounded, may be off by.
 NOISE = 8.0
-# Of the terms: a combination of equations with weights that were computed cancels to this. Weights come from an
-# elimination of up to some hundred equations and lose three digits at most in tests/compiler/test_cancellation.py.
+# Of the terms: a combination of equations with weights that were computed cancels to this. Weights come out of an
+# elimination, and may have lost some digits. Set by hand.
 CANCELLED = 1e-11
 # Entries of a null vector that are left out, relative to its largest: to the first, if columns cancel without them,
 # else to the second, which are the singular value decomposition's own roundings.
 NO_WEIGHT = (1e-8, 1e-13)
-# Of the largest: less than this in a null vector, or of what is passed on along a graph, has no part in it; computed
-# null vectors of the mechanisms in the tests have zeros of 1e-9 at most.
+# Of the largest: less than this in a null vector, or of what is passed on along a graph, has no part in it. Set by
+# hand, between the roundings of an ill-conditioned null vector and the least entry of one that is meant.
 NO_PART = 1e-6
 # Of the largest: what has less has no part that is worth a word, in an error that names those that depend on each
 # other; and terms that leave more of themselves than this do not cancel. A branch that is another one leaves a part of
@@ -55,7 +55,7 @@ DIGIT = 0.1  # relative: what is uncertain by more is not known to its first dig
 # to half of the digits.
 HALF_OF_THE_DIGITS = 1e-7
 # Relative change of a constraint along what its linearization leaves free, below which it changes in the third order
-# alone; points are found to HALF_OF_THE_DIGITS, and second derivatives of the tests' mechanisms amplify that by ten.
+# alone. Points are found to HALF_OF_THE_DIGITS, which second derivatives amplify. Set by hand.
 UNCHANGED = 1e-5
 
 
@@ -65,8 +65,8 @@ def spacing(dtype: Any) -> float:
 
 
 def solved(dtype: Any) -> float:
-    """The largest residual of an equation that holds, relative to its terms: 4e-10 in double, 7e-5 in single precision.
-    Between a root that is found, 1e-13, and a point that is none: the ladder's methods end at either."""
+    """The largest residual of an equation that holds, relative to its terms: 4e-10 in double, 7e-5 in single
+    precision. Set by hand, above what cancellation inside of terms leaves where a search can do no better."""
     return spacing(dtype) ** 0.6
 
 

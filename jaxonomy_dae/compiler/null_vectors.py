@@ -22,8 +22,8 @@ from . import elimination
 from .elimination import Row
 from .rounded import Rounded
 
-DENSE = 200  # equations of a block up to which singular values are computed, some 20 ms
-REFINEMENTS = 2  # each gains the digits that the one before has
+DENSE = 200  # equations of a block up to which singular values are computed, in some 0.1 s
+REFINEMENTS = 2  # set by hand
 LARGEST_DENOMINATOR = 1000  # of a fraction that a computed weight is taken for
 SIMPLE = 1_000_000  # numerator times denominator: beyond, fractions come as near to any number by chance
 

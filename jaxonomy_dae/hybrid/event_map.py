@@ -137,7 +137,8 @@ def handle(
             delay = jnp.where(is_clock, exact - lax.stop_gradient(exact), delay)
         time = t + delay
         reached = state.x + before * delay
-        # What strikes at the same instant does so at once, whatever the order: a box that falls flat does not turn.
+        # What strikes at the same instant does so at once, whatever the order: a box that falls flat does not turn. All
+        # share the δ of the first: if a parameter parts their instants, the derivative is one-sided, as at any kink.
         happening = one_hot(event, c + g)
         if several:
             happening = happening | (instant.left & strikes & strikes[event])

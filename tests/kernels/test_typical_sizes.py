@@ -128,3 +128,23 @@ def test_sizes_come_from_data_in_models_of_any_size(n):
     system = compiled(Chain(EqnEnv(), "c"))
     quantities, _ = system.plan.resolve([f"c.x[{k}]" for k in range(n)])
     assert (np.abs(np.log10(np.asarray(system.typical_sizes)[quantities] / 1e-6)) <= 1).all()
+
+
+@pytest.mark.parametrize("power", [2, 3])
+def test_a_quantity_that_stands_in_two_places_counts_once(power):
+    """Where variables are equal, the slots of a product are one quantity: aᵖ = c has a = c^(1/p)."""
+
+    class Product(Component):
+        def __init__(self, ev, name):
+            super().__init__(ev, name)
+            parts = [self.variable(f"a{k}") for k in range(power)]
+            c, h = self.parameter("c", 1e-12), self.variable("h", start=0.0, fixed=True)
+            product = parts[0]
+            for part in parts[1:]:
+                product = product * part
+                self.add_equations(Eq(part, parts[0]))
+            self.add_equations(Eq(product, c), Eq(der(h), parts[0]))
+
+    system = compiled(Product(EqnEnv(), "p"))
+    quantity = system.plan.resolve(["p.a0"])[0][0]
+    assert abs(np.log10(system.typical_sizes[quantity] / 1e-12 ** (1 / power))) < 0.5
