@@ -41,7 +41,7 @@ def ladder(n: int):
     from jaxonomy_dae.library.electrical import Capacitor, Ground, Resistor, VoltageSource
 
     ev, diagram = EqnEnv(), AcausalDiagram()
-    source, ground = VoltageSource(ev, "source", v=1.0), Ground(ev, "ground")
+    source, ground = VoltageSource(ev, "source", V=1.0), Ground(ev, "ground")
     diagram.connect(source.n, ground.p)
     before = source.p
     for k in range(n):
@@ -59,7 +59,7 @@ def array(n: int):
     from jaxonomy_dae.library.electrical import Capacitor, Ground, Resistor, VoltageSource
 
     ev, diagram = EqnEnv(), AcausalDiagram()
-    source, ground = VoltageSource(ev, "source", v=1.0), Ground(ev, "ground")
+    source, ground = VoltageSource(ev, "source", V=1.0), Ground(ev, "ground")
     r = diagram.add_array(ev, "r", Resistor, n)
     c = diagram.add_array(ev, "c", Capacitor, n, initial_voltage=0.0)
     diagram.connect(source.p, r[0].p)

@@ -73,7 +73,7 @@ def pendulum() -> AcausalCompiler:
 def motor() -> AcausalCompiler:
     """A motor behind a shaft that gives way, at a constant voltage."""
     ev, diagram = EqnEnv(), AcausalDiagram()
-    source, ground = el.VoltageSource(ev, "source", v=12.0), el.Ground(ev, "ground")
+    source, ground = el.VoltageSource(ev, "source", V=12.0), el.Ground(ev, "ground")
     drive = el.DCMotor(ev, "motor", d=1e-4, initial_current=0.0, initial_angle=0.0, initial_speed=0.0)
     shaft = rot.SpringDamper(ev, "shaft", 20.0, 0.01)
     load = rot.Inertia(ev, "load", 2e-3, initial_angle=0.0, initial_speed=0.0)

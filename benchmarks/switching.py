@@ -22,7 +22,7 @@ from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, simulate
 def ladder(n: int, switching: bool) -> AcausalCompiler:
     """1 V charges n capacitors, each through a resistor from the node before and a diode."""
     ev, diagram = EqnEnv(), AcausalDiagram()
-    source, ground = el.VoltageSource(ev, "source", v=1.0), el.Ground(ev, "ground")
+    source, ground = el.VoltageSource(ev, "source", V=1.0), el.Ground(ev, "ground")
     series = diagram.add_array(ev, "r", el.Resistor, n, 0.5)
     tank = diagram.add_array(ev, "c", el.Capacitor, n, 1.0, initial_voltage=0.0)
     if switching:

@@ -1,5 +1,33 @@
 """Differentiable acausal modeling: components and equations in, one Equinox module out."""
 
+# Functions of SymPy that equations are written with, so that a model needs one import.
+from sympy import Abs as Abs
+from sympy import And as And
+from sympy import Heaviside as Heaviside
+from sympy import Max as Max
+from sympy import Min as Min
+from sympy import Ne as Ne
+from sympy import Not as Not
+from sympy import Or as Or
+from sympy import Piecewise as Piecewise
+from sympy import acos as acos
+from sympy import asin as asin
+from sympy import atan as atan
+from sympy import atan2 as atan2
+from sympy import ceiling as ceiling
+from sympy import cos as cos
+from sympy import cosh as cosh
+from sympy import exp as exp
+from sympy import floor as floor
+from sympy import log as log
+from sympy import pi as pi
+from sympy import sign as sign
+from sympy import sin as sin
+from sympy import sinh as sinh
+from sympy import sqrt as sqrt
+from sympy import tan as tan
+from sympy import tanh as tanh
+
 from .analysis import FrequencyResponse as FrequencyResponse
 from .analysis import OperatingPoint as OperatingPoint
 from .analysis import StateSpace as StateSpace
@@ -9,15 +37,19 @@ from .analysis import linearize as linearize
 from .analysis import steady_state as steady_state
 from .analysis import sweep as sweep
 from .errors import InitializationError as InitializationError
+from .errors import JaxonomyDaeError as JaxonomyDaeError
 from .errors import ModelError as ModelError
 from .errors import SimulationError as SimulationError
 from .errors import SteadyStateError as SteadyStateError
 from .errors import StructuralError as StructuralError
 from .errors import UnitError as UnitError
+from .modeling import NONNEGATIVE as NONNEGATIVE
+from .modeling import POSITIVE as POSITIVE
 from .modeling import AcausalDiagram as AcausalDiagram
 from .modeling import Component as Component
 from .modeling import Domain as Domain
 from .modeling import Electrical as Electrical
+from .modeling import Eq as Eq
 from .modeling import EqnEnv as EqnEnv
 from .modeling import Hydraulic as Hydraulic
 from .modeling import Interval as Interval

@@ -5,7 +5,11 @@ from collections.abc import Iterable
 from typing import Any
 
 
-class ModelError(ValueError):
+class JaxonomyDaeError(Exception):
+    """The base class of all errors that this package raises for a model, a start or a run."""
+
+
+class ModelError(JaxonomyDaeError, ValueError):
     """The model as written is not well formed: a name, a port, a value, a shape."""
 
 
@@ -17,15 +21,15 @@ class UnitError(ModelError):
     """Units do not fit together, or a text is not a unit."""
 
 
-class InitializationError(RuntimeError):
+class InitializationError(JaxonomyDaeError, RuntimeError):
     """No consistent initial point was found."""
 
 
-class SteadyStateError(RuntimeError):
+class SteadyStateError(JaxonomyDaeError, RuntimeError):
     """No equilibrium was found, or one that does not determine all states."""
 
 
-class SimulationError(RuntimeError):
+class SimulationError(JaxonomyDaeError, RuntimeError):
     """The integration stopped before its end."""
 
 

@@ -22,7 +22,7 @@ class Cell(Component):
 def ladder(n: int, in_array: bool, R=1.0, C=1.0):
     """n cells on a source of 1 V; the cells as an array or as single components `cell0`, …"""
     ev, diagram = EqnEnv(), AcausalDiagram()
-    source, ground = VoltageSource(ev, "source", v=1.0), Ground(ev, "ground")
+    source, ground = VoltageSource(ev, "source", V=1.0), Ground(ev, "ground")
     diagram.connect(source.n, ground.p)
     if in_array:
         cells = diagram.add_array(ev, "cell", Cell, n, R, C=C)

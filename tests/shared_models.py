@@ -150,7 +150,7 @@ MODELS = {
 def attenuator(n, rs=1.0, rp=1.0):
     """n sections of the library's resistors between a source of 1 V and a capacitor at 0 V."""
     ev, diagram = EqnEnv(), AcausalDiagram()
-    source, ground, end = VoltageSource(ev, "V", v=1.0), Ground(ev, "G"), Capacitor(ev, "C", initial_voltage=0.0)
+    source, ground, end = VoltageSource(ev, "V", V=1.0), Ground(ev, "G"), Capacitor(ev, "C", initial_voltage=0.0)
     low, at = [source.n, ground.p, end.n], source.p
     for k in range(n):
         s, p = Resistor(ev, f"s{k}", R=rs), Resistor(ev, f"p{k}", R=rp)

@@ -161,7 +161,7 @@ def test_two_capacitors_in_parallel():
 
 
 def test_capacitor_loop_with_a_source():
-    source = VoltageSource(EV, "source", v=2.0)
+    source = VoltageSource(EV, "source", V=2.0)
     c1, c2 = Capacitor(EV, "c1", C=1.0), Capacitor(EV, "c2", C=3.0, initial_voltage=0.5)
     system = circuit((source, 1, 0), (c1, 1, 2), (c2, 2, 0), (Resistor(EV, "r", R=1.0), 2, 0))
     assert system.report.index == 2 and system.report.degrees_of_freedom == 1

@@ -34,7 +34,7 @@ class Net(Component):
         super().__init__(ev, name)
         total = self.parameter("R", R)
         k = self.parameter("k", total**2)
-        source, h = self.add(VoltageSource(ev, "s", v=2 * total)), self.add(Halves(ev, "h", R=total + k))
+        source, h = self.add(VoltageSource(ev, "s", V=2 * total)), self.add(Halves(ev, "h", R=total + k))
         c = self.add(Capacitor(ev, "c", C=1 / k, initial_voltage=total))
         g = self.add(Ground(ev, "g"))
         self.connect(source.p, h.p), self.connect(h.n, c.p), self.connect(c.n, source.n, g.p)

@@ -59,7 +59,7 @@ def system():
     """On one source of 1 V: a ladder of six cells with values of their own, and two rows of seven cells, arrays in an
     array; beside them a plate of 3 × 4 nodes, joined by conductors in both directions."""
     ev, diagram = EqnEnv(), AcausalDiagram()
-    source, ground = VoltageSource(ev, "source", v=1.0), Ground(ev, "ground")
+    source, ground = VoltageSource(ev, "source", V=1.0), Ground(ev, "ground")
     diagram.connect(source.n, ground.p)
     cells = diagram.add_array(ev, "cell", Cell, 6, R_EACH, C=C_EACH)
     diagram.connect(source.p, cells[0].a)
@@ -168,7 +168,7 @@ def test_random_networks(seed):
     arrays, singles = (EqnEnv(), AcausalDiagram()), (EqnEnv(), AcausalDiagram())
 
     def build(ev, diagram, in_array: bool):
-        source, ground = VoltageSource(ev, "source", v=1.0), Ground(ev, "ground")
+        source, ground = VoltageSource(ev, "source", V=1.0), Ground(ev, "ground")
         starts = {"c": {"initial_voltage": 0.1}, "l": {"initial_current": 0.2}, "r": {}}
         parts = {
             k: diagram.add_array(ev, k, kind, n, values[k], **starts[k])

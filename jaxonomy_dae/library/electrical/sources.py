@@ -8,20 +8,20 @@ from .two_pin import TwoPin, TwoPorts
 class VoltageSource(TwoPin):
     """An ideal source: the voltage is the parameter `V` (volt), whatever the current."""
 
-    def __init__(self, ev: EqnEnv, name: str, v: Value = 1.0):
+    def __init__(self, ev: EqnEnv, name: str, V: Value = 1.0):
         super().__init__(ev, name)
-        source = self.parameter("V", v, unit="V")
+        V = self.parameter("V", V, unit="V")
         voltage, current = self._two_pins()
-        self.add_equations(Eq(voltage, source))
+        self.add_equations(Eq(voltage, V))
         self.declare_supply(-voltage * current)
 
 
 class CurrentSource(TwoPin):
     """An ideal source: the current from `p` to `n` through it is the parameter `I` (ampere), whatever the voltage."""
 
-    def __init__(self, ev: EqnEnv, name: str, i: Value = 1.0):
+    def __init__(self, ev: EqnEnv, name: str, I: Value = 1.0):  # noqa: E741
         super().__init__(ev, name)
-        source = self.parameter("I", i, unit="A")
+        source = self.parameter("I", I, unit="A")
         voltage, current = self._two_pins()
         self.add_equations(Eq(current, source))
         self.declare_supply(-voltage * current)
