@@ -5,7 +5,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from .errors import ModelError
-from .optional import new_axes, optional_module, pyplot
+from .optional import QUANTITIES, axis_label, legend_beside, new_axes, optional_module, pyplot
 from .simulation.labelled import ByName
 from .system.system import AcausalSystem
 
@@ -42,32 +42,47 @@ class Response(Protocol):
 
 
 def plot_solution(solution: ByName, *names: str, ax: Any = None, events: bool = True) -> Any:
-    """Draws variables over time, discrete ones as steps, and returns the axes.
+    """Draws variables over time, discrete ones as steps: one panel for each unit, one below the other.
 
     **Arguments:**
 
     - `names`: of variables; default: the differential states. An array of more than 12 is drawn in one colour.
-    - `ax`: Matplotlib axes to draw into; new ones by default.
+    - `ax`: Matplotlib axes to draw everything into; a new figure by default.
     - `events`: whether the events in `solution.events` are marked by thin vertical lines, more than 40 by ticks. The
         legend names them, if there are few.
+
+    **Returns:** the Matplotlib axes; an array of them if there are several panels.
     """
     names = names or tuple(n for n in solution.system.states if n in solution)
     if not names:
         raise ModelError("nothing to plot: the system has no states; name some variables")
-    ax = new_axes(ax)
     flat = solution.system.plan.flat
-    units = dict(zip(flat.variables.names, flat.variables.unit, strict=True))
-    units |= dict(zip(flat.parameters.names, flat.parameters.units, strict=True))
+    unit_of = dict(zip(flat.variables.names, flat.variables.unit, strict=True))
+    unit_of |= dict(zip(flat.parameters.names, flat.parameters.units, strict=True))
+    lines = [one for name in names for one in _lines(solution, name)]
+    units = [unit_of.get(_entries(solution, name)[0]) or "" for name in lines]
+    panels = list(dict.fromkeys(units))
+    if ax is not None or len(panels) == 1:
+        axes = new_axes(ax)
+        _panel(solution, lines, units, axes, events)
+        return axes
+    size = (7.0, 2.1 * len(panels) + 0.6)
+    _, axes = pyplot().subplots(len(panels), 1, sharex=True, figsize=size, layout="constrained")
+    for panel, unit in zip(axes, panels, strict=True):
+        chosen = [name for name, its in zip(lines, units, strict=True) if its == unit]
+        _panel(solution, chosen, [unit] * len(chosen), panel, events)
+        panel.label_outer()
+    return axes
+
+
+def _panel(solution: ByName, names: list[str], units: list[str], ax: Any, events: bool) -> None:
+    """Draws some variables into one pair of axes."""
     time = np.asarray(solution.ts)
-    names = tuple(one for name in names for one in _lines(solution, name))
-    first = {name: _entries(solution, name)[0] for name in names}
-    shown = [units.get(first[n], "") for n in names]
-    shown = ["" if unit == "1" else unit for unit in shown]
-    common = shown[0] if len(set(shown)) == 1 else None
-    for name, unit in zip(names, shown, strict=True):
-        label = name if common is not None or not unit else f"{name} [{unit}]"
+    common = units[0] if len(set(units)) == 1 else None
+    for name, unit in zip(names, units, strict=True):
+        label = name if common is not None else axis_label(name, unit)
         values = np.asarray(solution[name])
-        style = "steps-post" if first[name] in solution.system.discretes else "default"
+        style = "steps-post" if _entries(solution, name)[0] in solution.system.discretes else "default"
         if values.ndim == 1:
             points = (time, values) if style == "default" else _steps(solution, name)
             ax.plot(*points, label=label, linewidth=1.6, drawstyle=style)
@@ -76,15 +91,14 @@ def plot_solution(solution: ByName, *names: str, ax: Any = None, events: bool = 
         line = ax.plot(time, rest[:, 0], label=label, linewidth=0.8, drawstyle=style)[0]
         ax.plot(time, rest[:, 1:], color=line.get_color(), linewidth=0.8, alpha=0.5, drawstyle=style)
     marked = _mark_events(solution, ax) if events else False
-    ax.set_xlabel("time [s]")
-    if common:
-        ax.set_ylabel(f"{names[0]} [{common}]" if len(names) == 1 else f"[{common}]")
-    elif len(names) == 1:
-        ax.set_ylabel(names[0])
+    ax.set_xlabel("Time / s")
+    if len(names) == 1:
+        ax.set_ylabel(axis_label(names[0], units[0]))
+    elif common and common != "1":
+        ax.set_ylabel(axis_label(QUANTITIES.get(common, "Value"), common))
     ax.grid(True, alpha=0.3)
     if len(names) > 1 or marked:
-        ax.legend()
-    return ax
+        legend_beside(ax)
 
 
 def _entries(solution: ByName, name: str) -> list[str]:
@@ -170,8 +184,7 @@ def phase(solution: ByName, x: str, y: str, ax: Any = None) -> Any:
         (line,) = ax.plot(across, up, linewidth=1.4)
         ax.plot(across[:1], up[:1], "o", color=line.get_color(), markersize=5)
     for name, put in ((x, ax.set_xlabel), (y, ax.set_ylabel)):
-        unit = units.get(name, "")
-        put(f"{name} [{unit}]" if unit and unit != "1" else name)
+        put(axis_label(name, units.get(name)))
     ax.grid(True, alpha=0.3)
     return ax
 
@@ -244,12 +257,12 @@ def bode(response: Response, *pairs: tuple[str, str], axes: Any = None) -> Any:
         with np.errstate(divide="ignore"):  # −∞ dB, a gap in the line
             upper.semilogx(omega, 20.0 * np.log10(np.abs(values)), label=_arrow(pair), linewidth=1.6)
         lower.semilogx(omega, np.degrees(np.unwrap(np.angle(values))), label=_arrow(pair), linewidth=1.6)
-    upper.set_ylabel("magnitude [dB]")
-    lower.set_ylabel("phase [°]")
-    lower.set_xlabel("angular frequency [rad/s]")
+    upper.set_ylabel("Magnitude / dB")
+    lower.set_ylabel("Phase / °")
+    lower.set_xlabel("Angular frequency / (rad/s)")
     for ax in (upper, lower):
         ax.grid(True, which="both", alpha=0.3)
-    upper.legend()
+    legend_beside(upper)
     return axes
 
 
@@ -271,11 +284,11 @@ def nyquist(response: Response, *pairs: tuple[str, str], ax: Any = None) -> Any:
         (line,) = ax.plot(real, imaginary, label=_arrow(pair), linewidth=1.6)
         ax.plot(real, -imaginary, "--", color=line.get_color(), linewidth=1.0)
     ax.plot([-1.0], [0.0], "+", color="C3", markersize=9)
-    ax.set_xlabel("real part")
-    ax.set_ylabel("imaginary part")
+    ax.set_xlabel("Real part")
+    ax.set_ylabel("Imaginary part")
     ax.set_aspect("equal", adjustable="datalim")
     ax.grid(True, alpha=0.3)
-    ax.legend()
+    legend_beside(ax)
     return ax
 
 

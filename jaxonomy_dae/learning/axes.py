@@ -11,11 +11,11 @@ from ..optional import pyplot
 LEGEND = 8  # up to this many entries, a legend is drawn
 
 
-def grid_of_axes(axes: Any, rows: int, columns: int, what: str) -> np.ndarray:
+def grid_of_axes(axes: Any, rows: int, columns: int, what: str, share: str = "col") -> np.ndarray:
     """Axes of shape (rows, columns): those given, or new ones that share their times."""
     if axes is None:
         size = (min(3.2 * columns + 3.0, 14.0), 2.3 * rows + 0.9)
-        return pyplot().subplots(rows, columns, figsize=size, sharex="col", squeeze=False, layout="constrained")[1]
+        return pyplot().subplots(rows, columns, figsize=size, sharex=share, squeeze=False, layout="constrained")[1]
     found = np.asarray(axes, object)
     if found.size != rows * columns:
         raise ModelError(f"{what} needs {rows} × {columns} axes; got {found.size}")

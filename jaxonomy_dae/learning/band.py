@@ -66,8 +66,8 @@ class Band:
             low, high = self.low[inside].min(), self.high[inside].max()
             room = max(high - low, np.ptp(self.mean)) * 0.4 or 1.0
             ax.set_ylim(min(low, self.mean.min()) - room, max(high, self.mean.max()) + room)
-        ax.set_xlabel("input")
-        ax.set_ylabel("law")
+        ax.set_xlabel("Input")
+        ax.set_ylabel("Output")
         ax.grid(True, alpha=0.3)
         ax.legend()
         return ax

@@ -58,7 +58,7 @@ class Data:
                 lines[0].set_label(label + " (held out)" * one.holdout)
             ax.set_ylabel(name)
             ax.grid(True, alpha=0.3)
-        axes[-1, 0].set_xlabel("time [s]")
+        axes[-1, 0].set_xlabel("Time / s")
         if len(self) <= LEGEND:
             axes[0, 0].legend()
         return axes[:, 0]

@@ -6,12 +6,13 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import ModelError
-from ..optional import new_axes
+from ..optional import axis_label, legend_beside, new_axes
 from .axes import LEGEND, chosen_names, grid_of_axes
 from .descent import Minimum
 from .objective import Objective
 
-EACH = 4  # up to this many experiments have columns of their own
+SIDE_BY_SIDE = 4  # columns of experiments; more begin new rows
+MOST = 24  # experiments that are drawn: more are too small to read
 WRITTEN = 12  # up to this many names, correlations are written into their cells
 
 
@@ -19,31 +20,36 @@ def plot_runs(
     objective: Objective, outputs: Float[np.ndarray, "e n k"], half: Float[np.ndarray, "e n k"], names: Any, axes: Any
 ) -> np.ndarray:
     """Samples and the fitted runs with bands that go `half` to each side: rows of axes for names, columns for
-    experiments."""
+    experiments; after four experiments, the rows begin anew."""
     s, variables = objective.stacked, objective.system.plan.flat.variables
     units = dict(zip(variables.names, variables.unit, strict=True))
     chosen = chosen_names(names, s.outputs, "data of")
-    shown = range(min(len(s.labels), EACH))
-    axes = grid_of_axes(axes, len(chosen), len(shown), "a plot of data and runs")
-    for row, name in zip(axes, chosen, strict=True):
-        j = s.outputs.index(name)
-        for ax, k in zip(row, shown, strict=True):
-            count, seen = s.counts[k], s.observed[k, :, j]
-            ts, mean, off = s.times[k, :count], outputs[k, :count, j], half[k, :count, j]
-            ax.plot(s.times[k][seen], s.values[k, seen, j], ".", color="0.35", markersize=4, label="measured")
-            ax.plot(ts, mean, color="C0", linewidth=1.5, label="fitted" if not s.holdout[k] else "predicted")
-            ax.fill_between(ts, mean - off, mean + off, color="C0", alpha=0.25, linewidth=0)
-            ax.grid(True, alpha=0.3)
-        unit = units.get(name, "")
-        row[0].set_ylabel(f"{name} [{unit}]" if unit and unit != "1" else name)
-    for ax, k in zip(axes[0], shown, strict=True):
-        if len(s.labels) > 1:
+    shown = min(len(s.labels), MOST)
+    columns = min(shown, SIDE_BY_SIDE)
+    groups = -(-shown // columns)
+    axes = grid_of_axes(axes, len(chosen) * groups, columns, "a plot of data and runs", "all" if groups > 1 else "col")
+    for place in np.ndindex(groups, len(chosen), columns):
+        group, row, column = place
+        k, ax, name = group * columns + column, axes[group * len(chosen) + row, column], chosen[row]
+        if k >= shown:
+            ax.set_visible(False)
+            continue
+        j, count = s.outputs.index(name), s.counts[k]
+        seen = s.observed[k, :, j]
+        ts, mean, off = s.times[k, :count], outputs[k, :count, j], half[k, :count, j]
+        ax.plot(s.times[k][seen], s.values[k, seen, j], ".", color="0.5", markersize=4, label="measured")
+        ax.plot(ts, mean, color="C0", linewidth=1.5, label="fitted" if not s.holdout[k] else "predicted")
+        ax.fill_between(ts, mean - off, mean + off, color="C0", alpha=0.25, linewidth=0)
+        ax.grid(True, alpha=0.3)
+        if column == 0:
+            ax.set_ylabel(axis_label(name, units.get(name)))
+        if row == 0 and len(s.labels) > 1:
             ax.set_title(s.labels[k] + " (held out)" * bool(s.holdout[k]), loc="left", fontsize="medium")
-        ax.legend(fontsize="small")
     for ax in axes[-1]:
-        ax.set_xlabel("time [s]")
-    if len(s.labels) > EACH:
-        axes[0, -1].annotate(f"and {len(s.labels) - EACH} more", (1, 1.01), xycoords="axes fraction", ha="right")
+        ax.set_xlabel("Time / s")
+    legend_beside(axes[0, columns - 1])
+    if len(s.labels) > shown:
+        axes[0, -1].annotate(f"and {len(s.labels) - shown} more", (1, 1.01), xycoords="axes fraction", ha="right")
     return axes
 
 
@@ -73,12 +79,12 @@ def plot_residuals(objective: Objective, minimum: Minimum, axes: Any) -> np.ndar
             right.plot(np.arange(1, lags + 1), moved, ".-", markersize=4, linewidth=0.8, color=f"C{e % 10}")
             longest = max(longest, len(r))
         right.axhspan(-1.96 / np.sqrt(longest), 1.96 / np.sqrt(longest), color="C2", alpha=0.12, linewidth=0)
-        left.set_ylabel(f"{s.outputs[j]}\nresidual [σ]")
-        right.set_ylabel("correlation")
-    axes[-1, 0].set_xlabel("time [s]")
-    axes[-1, 1].set_xlabel("lag [samples]")
+        left.set_ylabel(f"{s.outputs[j]}\nResidual / σ")
+        right.set_ylabel("Correlation")
+    axes[-1, 0].set_xlabel("Time / s")
+    axes[-1, 1].set_xlabel("Lag / samples")
     if len(s.labels) <= LEGEND:
-        axes[0, 0].legend(fontsize="small", loc="upper right")
+        legend_beside(axes[0, 1], of=axes[0, 0])
     return axes
 
 
@@ -87,8 +93,8 @@ def plot_history(minimum: Minimum, ax: Any) -> Any:
     ax = new_axes(ax)
     history = np.array(minimum.history, float)
     ax.semilogy(np.sqrt(2 * history / len(minimum.weights.row)), ".-")
-    ax.set_xlabel("steps of least squares")
-    ax.set_ylabel("root mean square residual [σ]")
+    ax.set_xlabel("Steps of least squares")
+    ax.set_ylabel("RMS residual / σ")
     ax.grid(True, which="both", alpha=0.3)
     return ax
 

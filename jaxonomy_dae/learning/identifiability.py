@@ -70,8 +70,8 @@ class Identifiability:
         floor = np.finfo(float).tiny
         ax.semilogy(np.arange(1, len(self.spectrum) + 1), np.maximum(self.spectrum, floor), "o", markersize=4)
         ax.axhspan(ax.get_ylim()[0], 1.0, color="C3", alpha=0.1, linewidth=0, label="not determined")
-        ax.set_xlabel("direction")
-        ax.set_ylabel("eigenvalue")
+        ax.set_xlabel("Direction")
+        ax.set_ylabel("Eigenvalue")
         ax.grid(True, alpha=0.3)
         ax.legend()
         return ax

@@ -44,7 +44,7 @@ class Prediction:
             ax.plot(self.ts, self.mean[name], color="C0", linewidth=1.5)
             ax.set_ylabel(name)
             ax.grid(True, alpha=0.3)
-        axes[-1, 0].set_xlabel("time [s]")
+        axes[-1, 0].set_xlabel("Time / s")
         return axes[:, 0]
 
 

@@ -71,7 +71,7 @@ class Table:
             range(len(rows)), [f"{row.name} = {row.value:.4g}{' ' * bool(row.unit)}{row.unit}" for row in rows]
         )
         ax.set_ylim(len(rows) - 0.5, -0.5)
-        ax.set_xlabel(f"{100 * self.level:g} % interval, relative to the value [%]")
+        ax.set_xlabel(f"{100 * self.level:g} % interval, relative to the value / %")
         ax.grid(True, axis="x", alpha=0.3)
         return ax
 

@@ -114,8 +114,8 @@ class Training:
         if len(self.scores[0]):
             ax.semilogy(*self.scores, "o-", markersize=3, label="held out")
         ax.axvline(self.step, color="0.7", linewidth=0.8)
-        ax.set_xlabel("updates")
-        ax.set_ylabel("root mean square residual [σ]")
+        ax.set_xlabel("Updates")
+        ax.set_ylabel("RMS residual / σ")
         ax.legend()
         return ax
 

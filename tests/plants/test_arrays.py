@@ -132,7 +132,7 @@ def test_plots(solution):
     assert [line.get_label() for line in axes.lines] == [*(f"cell[{k}].c.v" for k in range(6)), "source.v"]
     axes = solution.plot("row.cell.c.v")
     assert len(axes.lines) == 14 and axes.lines[0].get_label() == "row.cell.c.v"
-    assert axes.get_ylabel() == "row.cell.c.v [V]"
+    assert axes.get_ylabel() == "row.cell.c.v / V"
 
 
 @pytest.mark.parametrize("n", [3, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 11))])

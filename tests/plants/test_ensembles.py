@@ -123,7 +123,7 @@ def test_records_are_drawn_without_a_model(plt):
 def test_figures_show_what_was_found(plt):
     fit = members().best
     axes = fit.plot()
-    assert axes.shape == (1, 3) and axes[0, 0].get_ylabel() == "c.x [K]" and "held out" in axes[0, 2].get_title("left")
+    assert axes.shape == (1, 3) and axes[0, 0].get_ylabel() == "c.x / K" and "held out" in axes[0, 2].get_title("left")
     (t, measured), (_, fitted) = lines(axes[0, 0])
     assert len(t) == 39 and len(fitted) == 40  # one sample is missing
     np.testing.assert_allclose((fitted[t.searchsorted(TIMES[10])] - measured[9]) / SIGMA, 0, atol=6)
@@ -152,6 +152,6 @@ def test_figures_show_what_was_found(plt):
     run = simulate(fit.system, 1.0, ts=np.linspace(0.0, 1.0, 5))
     ax = run.plot_phase("c.x", "c.law")
     np.testing.assert_allclose(lines(ax)[0][0], run["c.x"])
-    assert ax.get_xlabel() == "c.x [K]"
+    assert ax.get_xlabel() == "c.x / K"
     with pytest.raises(ModelError, match="needs 1 × 3 axes; got 1"):
         fit.plot(axes=[ax])

@@ -264,12 +264,15 @@ def test_a_constrained_systems_rows_up_to_a_failure():
 def test_plot(solution):
     plt = pytest.importorskip("matplotlib.pyplot")
     axes = solution.plot()
-    assert [line.get_label() for line in axes.lines] == ["mass.s [m]", "mass.v [m/s]"]
-    np.testing.assert_array_equal(axes.lines[0].get_ydata(), solution["mass.s"])
-    assert axes.get_xlabel() == "time [s]"
+    assert [ax.get_ylabel() for ax in axes] == ["mass.s / m", "mass.v / (m/s)"]  # one panel for each unit
+    np.testing.assert_array_equal(axes[0].lines[0].get_ydata(), solution["mass.s"])
+    assert axes[1].get_xlabel() == "Time / s"
+    together = solution.plot("mass.s", "wall.flange.s")
+    assert together.get_ylabel() == "Position / m"
+    assert [line.get_label() for line in together.lines] == ["mass.s", "wall.flange.s"]
     _, given = plt.subplots()
     assert solution.plot("spring.f", ax=given) is given
-    assert given.get_ylabel() == "spring.f [N]"
+    assert given.get_ylabel() == "spring.f / N"
     plt.close("all")
 
 
