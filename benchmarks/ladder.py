@@ -98,7 +98,7 @@ def chain(n: int):
         rigid = k % 3 == 2
         start = {} if rigid else {"initial_position": k + 1.0 + 0.1 * (k % 3 == 0), "initial_velocity": 0.0}
         mass = Mass(ev, f"m{k}", **start)
-        link = Rod(ev, f"link{k}", length=1.0) if rigid else Spring(ev, f"link{k}", K=100.0, length=1.0)
+        link = Rod(ev, f"link{k}", length=1.0) if rigid else Spring(ev, f"link{k}", c=100.0, length=1.0)
         diagram.connect(before, link.flange_a)
         diagram.connect(link.flange_b, mass.flange)
         before = mass.flange

@@ -1,7 +1,7 @@
 """Translational mechanics along a line.
 
 Conventions: absolute position `s` in metre, force `f` in newton counted positive into the component at a flange, so a
-mass obeys M·dv/dt = flange.f.
+mass obeys m·dv/dt = flange.f.
 """
 
 import sympy
@@ -12,7 +12,7 @@ from .laws import penetration, penetration_energy, stribeck
 
 
 class Mass(Component):
-    """A sliding mass: M·dv/dt = flange.f, `M` > 0 in kilogram.
+    """A sliding mass: m·dv/dt = flange.f, `m` > 0 in kilogram.
 
     A given `initial_position` (metre) or `initial_velocity` (metre per second) holds at the start; otherwise 0 is a
     guess.
@@ -22,12 +22,12 @@ class Mass(Component):
         self,
         ev: EqnEnv,
         name: str,
-        M: Value = 1.0,
+        m: Value = 1.0,
         initial_position: Value | None = None,
         initial_velocity: Value | None = None,
     ):
         super().__init__(ev, name)
-        m = self.parameter("M", M, unit="kg", bounds=POSITIVE)
+        m = self.parameter("m", m, unit="kg", bounds=POSITIVE)
         s0 = self.parameter("initial_position", initial_position or 0.0, unit="m")
         v0 = self.parameter("initial_velocity", initial_velocity or 0.0, unit="m/s")
         flange = self.port("flange", Translational)
@@ -49,12 +49,12 @@ class _Compliant(Component):
 
 
 class Spring(_Compliant):
-    """A linear spring that pulls its ends together: f = K·(flange_b.s − flange_a.s − length), `K` ≥ 0 in newton per
+    """A linear spring that pulls its ends together: f = c·(flange_b.s − flange_a.s − length), `c` ≥ 0 in newton per
     metre."""
 
-    def __init__(self, ev: EqnEnv, name: str, K: Value = 1.0, length: Value = 0.0):
+    def __init__(self, ev: EqnEnv, name: str, c: Value = 1.0, length: Value = 0.0):
         super().__init__(ev, name)
-        k = self.parameter("K", K, unit="N/m", bounds=NONNEGATIVE)
+        k = self.parameter("c", c, unit="N/m", bounds=NONNEGATIVE)
         rest = self.parameter("length", length, unit="m")
         s, f = self._two_flanges()
         self.add_equations(Eq(f, k * (s - rest)))
@@ -62,11 +62,11 @@ class Spring(_Compliant):
 
 
 class Damper(_Compliant):
-    """A linear damper: f = D·der(flange_b.s − flange_a.s), `D` ≥ 0 in newton second per metre."""
+    """A linear damper: f = d·der(flange_b.s − flange_a.s), `d` ≥ 0 in newton second per metre."""
 
-    def __init__(self, ev: EqnEnv, name: str, D: Value = 1.0):
+    def __init__(self, ev: EqnEnv, name: str, d: Value = 1.0):
         super().__init__(ev, name)
-        d = self.parameter("D", D, unit="N*s/m", bounds=NONNEGATIVE)
+        d = self.parameter("d", d, unit="N*s/m", bounds=NONNEGATIVE)
         s, f = self._two_flanges()
         v = self.variable("v_rel", unit="m/s")
         self.add_equations(Eq(v, der(s)), Eq(f, d * v))
@@ -95,13 +95,13 @@ class FixedPosition(Component):
 
 
 class SpringDamper(_Compliant):
-    """A linear spring and damper side by side: f = K·(s_rel − length) + D·v_rel with v_rel = der(s_rel), where `K`,
-    `D` ≥ 0."""
+    """A linear spring and damper side by side: f = c·(s_rel − length) + d·v_rel with v_rel = der(s_rel), where `c`,
+    `d` ≥ 0."""
 
-    def __init__(self, ev: EqnEnv, name: str, K: Value = 1.0, D: Value = 1.0, length: Value = 0.0):
+    def __init__(self, ev: EqnEnv, name: str, c: Value = 1.0, d: Value = 1.0, length: Value = 0.0):
         super().__init__(ev, name)
-        stiffness = self.parameter("K", K, unit="N/m", bounds=NONNEGATIVE)
-        damping = self.parameter("D", D, unit="N*s/m", bounds=NONNEGATIVE)
+        stiffness = self.parameter("c", c, unit="N/m", bounds=NONNEGATIVE)
+        damping = self.parameter("d", d, unit="N*s/m", bounds=NONNEGATIVE)
         relaxed = self.parameter("length", length, unit="m")
         s, f = self._two_flanges()
         speed = self.variable("v_rel", unit="m/s")
@@ -111,15 +111,15 @@ class SpringDamper(_Compliant):
 
 
 class NonlinearSpring(_Compliant):
-    """A spring that hardens (or softens) with the cube: f = K·e + K3·e³ with e = s_rel − length (Duffing 1918).
+    """A spring that hardens (or softens) with the cube: f = c·e + c3·e³ with e = s_rel − length (Duffing 1918).
 
-    `K` in N/m, `K3` in N/m3.
+    `c` in N/m, `c3` in N/m3.
     """
 
-    def __init__(self, ev: EqnEnv, name: str, K: Value = 1.0, K3: Value = 0.0, length: Value = 0.0):
+    def __init__(self, ev: EqnEnv, name: str, c: Value = 1.0, c3: Value = 0.0, length: Value = 0.0):
         super().__init__(ev, name)
-        linear = self.parameter("K", K, unit="N/m")
-        cubic = self.parameter("K3", K3, unit="N/m3")
+        linear = self.parameter("c", c, unit="N/m")
+        cubic = self.parameter("c3", c3, unit="N/m3")
         relaxed = self.parameter("length", length, unit="m")
         s, f = self._two_flanges()
         e = s - relaxed
@@ -128,10 +128,10 @@ class NonlinearSpring(_Compliant):
 
 
 class Backlash(_Compliant):
-    """Play between two parts: nothing is transmitted while |s_rel| < gap/2; beyond, f = K·δ + D·dδ/dt with the
+    """Play between two parts: nothing is transmitted while |s_rel| < gap/2; beyond, f = c·δ + d·dδ/dt with the
     penetration δ, whose corners are rounded over `smooth` (metre).
 
-    `gap` ≥ 0 in metre, `K` ≥ 0 in N/m, `D` ≥ 0 in `N*s/m`.
+    `gap` ≥ 0 in metre, `c` ≥ 0 in N/m, `d` ≥ 0 in `N*s/m`.
     """
 
     def __init__(
@@ -139,14 +139,14 @@ class Backlash(_Compliant):
         ev: EqnEnv,
         name: str,
         gap: Value = 0.01,
-        K: Value = 1e4,
-        D: Value = 10.0,
+        c: Value = 1e4,
+        d: Value = 10.0,
         smooth: Value = 1e-4,
     ):
         super().__init__(ev, name)
         play = self.parameter("gap", gap, unit="m", bounds=NONNEGATIVE)
-        stiffness = self.parameter("K", K, unit="N/m", bounds=NONNEGATIVE)
-        damping = self.parameter("D", D, unit="N*s/m", bounds=NONNEGATIVE)
+        stiffness = self.parameter("c", c, unit="N/m", bounds=NONNEGATIVE)
+        damping = self.parameter("d", d, unit="N*s/m", bounds=NONNEGATIVE)
         corner = self.parameter("smooth", smooth, unit="m", bounds=POSITIVE)
         s, f = self._two_flanges()
         speed = self.variable("v_rel", unit="m/s")
@@ -158,16 +158,16 @@ class Backlash(_Compliant):
 
 class ElasticStop(_Compliant):
     """A spring and a damper that push and do not pull: with the depth e = length − s_rel, f = 0 for e ≤ 0, and
-    f = −K·e + D·v_rel for e > 0, where the damper's force is limited to ±K·e, so that f is continuous and never
+    f = −c·e + d·v_rel for e > 0, where the damper's force is limited to ±c·e, so that f is continuous and never
     positive (the law of ElastoGap in the Modelica Standard Library 4).
 
-    `K`, `D` ≥ 0; `length` in metre. The discrete variable `touching` is 1 or 0.
+    `c`, `d` ≥ 0; `length` in metre. The discrete variable `touching` is 1 or 0.
     """
 
-    def __init__(self, ev: EqnEnv, name: str, K: Value = 1e4, D: Value = 10.0, length: Value = 0.0):
+    def __init__(self, ev: EqnEnv, name: str, c: Value = 1e4, d: Value = 10.0, length: Value = 0.0):
         super().__init__(ev, name)
-        stiffness = self.parameter("K", K, unit="N/m", bounds=NONNEGATIVE)
-        damping = self.parameter("D", D, unit="N*s/m", bounds=NONNEGATIVE)
+        stiffness = self.parameter("c", c, unit="N/m", bounds=NONNEGATIVE)
+        damping = self.parameter("d", d, unit="N*s/m", bounds=NONNEGATIVE)
         least = self.parameter("length", length, unit="m")
         s, f = self._two_flanges()
         speed = self.variable("v_rel", unit="m/s")

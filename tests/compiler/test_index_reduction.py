@@ -174,7 +174,7 @@ def test_inductor_cut_set():
 
 
 def test_rigid_rod_between_masses():
-    m1, m2 = Mass(EV, "m1", M=1.0, initial_position=0.0, initial_velocity=2.0), Mass(EV, "m2", M=3.0)
+    m1, m2 = Mass(EV, "m1", m=1.0, initial_position=0.0, initial_velocity=2.0), Mass(EV, "m2", m=3.0)
     diagram = AcausalDiagram().connect(m1.flange, (rod := Rod(EV, "rod", length=1.5)).flange_a)
     diagram.connect(rod.flange_b, m2.flange)
     system = AcausalCompiler(EV, diagram)()

@@ -34,14 +34,14 @@ NESTED = [[1.0, 2.0], [3.0]]
 # (a component made of wrong arguments, the whole error)
 REFUSED = [
     # Values of parameters.
-    (lambda ev: tr.Mass(ev, "m", -1.0), "parameter 'm.M' must lie in (0, inf); got -1"),
+    (lambda ev: tr.Mass(ev, "m", -1.0), "parameter 'm.m' must lie in (0, inf); got -1"),
     (lambda ev: rot.Inertia(ev, "J", 0.0), "parameter 'J.J' must lie in (0, inf); got 0"),
-    (lambda ev: tr.Mass(ev, "m", None), "parameter 'm.M' must be a number; got NoneType"),
-    (lambda ev: tr.Mass(ev, "m", True), "parameter 'm.M' must be a number; got True"),
+    (lambda ev: tr.Mass(ev, "m", None), "parameter 'm.m' must be a number; got NoneType"),
+    (lambda ev: tr.Mass(ev, "m", True), "parameter 'm.m' must be a number; got True"),
     (lambda ev: el.TimedSwitch(ev, "s", True), "parameter 's.time' must be a number; got True"),
     (
         lambda ev: tr.Mass(ev, "m", "2"),
-        "parameter 'm.M' must be a real number; got the string '2': write 2 without quotes",
+        "parameter 'm.m' must be a real number; got the string '2': write 2 without quotes",
     ),
     (lambda ev: el.Capacitor(ev, "c", "5uF"), "parameter 'c.C' must be a real number; got the string '5uF'"),
     (lambda ev: hy.Tank(ev, "t", np.nan), "parameter 't.A' must be finite; got nan"),

@@ -92,7 +92,7 @@ TOO_FEW = (
 
 TOO_MANY = (
     "solve_for: a value too many for 1 unknown parameter ('spring.length'): 'spring.f' follows from the others. "
-    "Leave it out, or solve for one more parameter ('wall.position', 'damper.D', 'mass.M')."
+    "Leave it out, or solve for one more parameter ('wall.position', 'damper.d', 'mass.m')."
 )
 
 
@@ -291,8 +291,8 @@ def test_names_to_solve_for_are_checked():
     system = oscillator()
     with pytest.raises(ModelError, match=r"did you mean 'spring\.length'"):
         system.initialize(solve_for=["spring.lenght"])
-    with pytest.raises(ModelError, match=r"write solve_for=\['spring\.K'\]"):
-        system.initialize(solve_for="spring.K")
+    with pytest.raises(ModelError, match=r"write solve_for=\['spring\.c'\]"):
+        system.initialize(solve_for="spring.c")
     with pytest.raises(ModelError, match="is a variable"):
         system.initialize(solve_for=["mass.s"])
 

@@ -317,7 +317,7 @@ def test_poles_and_their_gradient():
     system = oscillator()
 
     def pole(damping):
-        space = linearize(system.with_parameters({"damper.D": damping}), [], ["mass.s"])
+        space = linearize(system.with_parameters({"damper.d": damping}), [], ["mass.s"])
         return space.poles()[1]
 
     @jax.jit

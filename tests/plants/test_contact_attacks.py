@@ -14,7 +14,7 @@ from jaxonomy_dae import EqnEnv, simulate
 from jaxonomy_dae.library.contacts import HardStop
 
 G, N, END, MOST = 9.81, 3, 2.0, 120
-KINDS = ("m{}.M", "s{}.restitution", "m{}.initial_position", "m{}.initial_velocity")
+KINDS = ("m{}.m", "s{}.restitution", "m{}.initial_position", "m{}.initial_velocity")
 
 
 def from_impact_to_impact(p):

@@ -122,9 +122,9 @@ def test_mechanics_that_is_not_linear():
     """A mass on a hardening spring with friction, driven against a stop with play by a moving end."""
     ev = EqnEnv()
     mass = tr.Mass(ev, "mass", 0.5, initial_position=0.02, initial_velocity=0.0)
-    spring, friction = tr.NonlinearSpring(ev, "spring", K=40.0, K3=2e4), tr.Friction(ev, "friction", sliding=0.1)
-    stop, wall = tr.Backlash(ev, "stop", gap=0.02, K=500.0, D=1.0, smooth=1e-3), tr.FixedPosition(ev, "wall")
-    soft, shaker = tr.SpringDamper(ev, "soft", K=20.0, D=0.3), tr.PositionSource(ev, "shaker")
+    spring, friction = tr.NonlinearSpring(ev, "spring", c=40.0, c3=2e4), tr.Friction(ev, "friction", sliding=0.1)
+    stop, wall = tr.Backlash(ev, "stop", gap=0.02, c=500.0, d=1.0, smooth=1e-3), tr.FixedPosition(ev, "wall")
+    soft, shaker = tr.SpringDamper(ev, "soft", c=20.0, d=0.3), tr.PositionSource(ev, "shaker")
     system = compiled(
         mass, spring, friction, stop, wall, soft, shaker,
         connect=[
@@ -145,7 +145,7 @@ def test_mechanics_that_is_not_linear():
 def test_a_speed_that_the_model_does_not_have():
     """A force on the end of a massless spring: its speed is that of the force's change, f'/K, and of the mass."""
     ev = EqnEnv()
-    force, spring = tr.Force(ev, "force"), tr.Spring(ev, "spring", K=3.0)
+    force, spring = tr.Force(ev, "force"), tr.Spring(ev, "spring", c=3.0)
     mass = tr.Mass(ev, "mass", 2.0, initial_position=0.0, initial_velocity=0.0)
     system = compiled(force, spring, mass, connect=[(force.flange, spring.flange_b), (spring.flange_a, mass.flange)])
     inputs = {"force.f": lambda t: 1.5 * jnp.sin(2.0 * t)}

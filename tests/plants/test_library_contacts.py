@@ -240,7 +240,7 @@ def test_a_rope_between_two_carts():
     system = compiled(rope, first, second, connect=[(second.flange, rope.flange_a), (rope.flange_b, first.flange)])
 
     def run(m):
-        return simulate(system.with_parameters({"first.M": m}), 2.0, **TIGHT)
+        return simulate(system.with_parameters({"first.m": m}), 2.0, **TIGHT)
 
     solution = run(1.0)
     measured("events", solution.events.ts[:1], [0.5], 1e-10)

@@ -236,7 +236,7 @@ EXAMPLES = {
         same("elastoGap1.v_rel", "elastoGap2.s_rel", "springDamper1.v_rel", "springDamper2.s_rel"),
         3e-5,
         1e-5,
-        "elastoGap2.K",
+        "elastoGap2.c",
         "mass2.s",
     ),
     "Friction": Example(

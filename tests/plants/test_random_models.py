@@ -279,7 +279,7 @@ def three_masses():
 
 
 TS = np.array([0.7, 1.5])
-VARIED = ["m0.M", "m1.M", "m2.M", "s0_0.K", "s0_1.K", "s1_0.K", "s2_0.K"]
+VARIED = ["m0.m", "m1.m", "m2.m", "s0_0.c", "s0_1.c", "s1_0.c", "s2_0.c"]
 
 
 @hypothesis.settings(max_examples=15)

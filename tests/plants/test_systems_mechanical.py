@@ -112,8 +112,8 @@ def lift():
             pressure, x, v = y
             area = p["cylinder.A"]
             stored = fed(t, pressure) - p["cylinder.rho"] * area * v
-            force = area * (pressure - p["cylinder.p_ambient"]) + WEIGHT - p["damper.D"] * v
-            return [stored / (p["chamber.rho"] * p["chamber.C"]), v, force / p["mass.M"]]
+            force = area * (pressure - p["cylinder.p_ambient"]) + WEIGHT - p["damper.d"] * v
+            return [stored / (p["chamber.rho"] * p["chamber.C"]), v, force / p["mass.m"]]
 
         start = [p["chamber.initial_pressure"], p["mass.initial_position"], p["mass.initial_velocity"]]
         pressure, x, v = integrated(slopes, start, TS_LIFT, ends=OPENED[0])
@@ -153,7 +153,7 @@ def quarter_car():
 
     def expected(p):
         M, m, k, d, K, D = (
-            p[n] for n in ("body.M", "wheel.M", "strut.K", "strut.D", "tyre.K", "tyre.D")
+            p[n] for n in ("body.m", "wheel.m", "strut.c", "strut.d", "tyre.c", "tyre.d")
         )  # fmt: skip
         a = np.array([
             [0.0, 1.0, 0.0, 0.0],
@@ -374,7 +374,7 @@ def slider_crank():
         )  # fmt: skip
         axis = p["world.phi"] + p["guide.angle"]
         weight = p["slider.m"] * (p["slider.g_x"] * np.cos(axis) + p["slider.g_y"] * np.sin(axis))
-        pull = p["coil.K"] * (s - p["base.position"] - p["coil.length"]) + p["coil.D"] * v
+        pull = p["coil.c"] * (s - p["base.position"] - p["coil.length"]) + p["coil.d"] * v
         force = p["slider.m"] * a - weight + pull
         return {
             "guide.s": s, "guide.v": v, "motor.flange.tau": -force * v / SPEED,
