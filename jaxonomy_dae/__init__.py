@@ -64,6 +64,7 @@ from .modeling import pre as pre
 from .modeling import reinit as reinit
 from .modeling import smooth as smooth
 from .modeling import terminate as terminate
+from .simulation.saved_state import SavedState as SavedState
 from .simulation.simulate import simulate as simulate
 from .simulation.solution import Solution as Solution
 from .system.acausal_compiler import AcausalCompiler as AcausalCompiler

@@ -43,7 +43,10 @@ class HybridInterpolation(diffrax.AbstractLocalInterpolation):
         at_end = self.fired & (t0 >= self.t1 - self.resolution)
         after = self.y1.x + self.slope * (t0 - lax.stop_gradient(self.t1))
         x = jnp.where(at_end, after, self.inner(self.t0, self.t1, t0))
-        return self.y1.but(x=x, q=jnp.where(at_end, self.y1.q, self.y0.q))
+        q, armed, ticks = (
+            jnp.where(at_end, getattr(self.y1, part), getattr(self.y0, part)) for part in ("q", "armed", "ticks")
+        )
+        return self.y1.but(x=x, q=q, armed=armed, ticks=ticks)
 
 
 class _DenseOutput(eqx.Module):

@@ -1,6 +1,6 @@
 """Where a run with events begins."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,48 +10,84 @@ from ..adjoint.resting import still
 from ..aliases import Args, State, Time
 from .event_map import Arrival, handle
 from .problem import AbstractHybridProblem, HybridState
-from .side import ABOVE, BELOW, RESTS
+from .side import ABOVE, BELOW, RESTS, rounding
 
 ROUNDS = 4  # each settles relations that depend on those settled before: a relation within a relation takes two
 
 
+class Resumed(NamedTuple):
+    """The memory of the events of a run from which another one goes on; all events of the instant have happened.
+
+    - `sides`: on which side of zero each guard is, shape (guards,).
+    - `ticked`: 1.0 for clocks that have ticked at this instant, shape (clocks,).
+    - `sizes`: how large the guards have been, shape (guards,).
+    """
+
+    sides: Any
+    ticked: Any
+    sizes: Any
+
+
 def start(
-    problem: AbstractHybridProblem, t0: Time, x0: State, q0: Any, args: Args, logged: int, sides: bool
-) -> HybridState:
-    """The state at the initial time, after the clocks that tick there, and after the events that are immediate.
+    problem: AbstractHybridProblem, t0: Time, x0: State, q0: Any, args: Args, logged: int, sides: bool,
+    resumed: Resumed | None = None,
+) -> HybridState:  # fmt: skip
+    """The state at the initial time, after the clocks that tick there, and after the events that are immediate; or, of
+    a run that is `resumed`, after events whose guards have jumped since, as by another input.
 
     `logged` says for how many events there is room, `sides` whether the states before and after them are kept.
     """
-    c, g = problem.n_clocks, problem.n_guards
-    dtype = t0.dtype
+    c, dtype = problem.n_clocks, t0.dtype
     nothing, infinite = jnp.zeros((), dtype), jnp.full((logged,), jnp.inf, dtype)
-    period, offset = (lax.stop_gradient(v) for v in problem.clocks())
     tolerance = problem.resolution
-    passed = t0 - tolerance - offset
-    ticks = jnp.where(jnp.isinf(period), (passed > 0).astype(dtype), jnp.ceil(passed / period))
     relations = np.array(problem.relations, bool)
-    ticks = jnp.where(relations[:c], ticks, jnp.maximum(ticks, 0.0))  # relations have turned at all times
+    ticks = _ticks_before(problem, t0, None if resumed is None else resumed.ticked)
     due = problem.due(ticks) <= t0 + tolerance
-    q0, rate, value = _settled(problem, t0, x0, q0, due, args)
+    q0, rate, value = _settled(problem, t0, x0, q0, due, args, resumed)
     ticks = ticks + (due & relations[:c]).astype(dtype)
-    holding, size = _holds(value, rate), jnp.abs(value)
-    armed = jnp.zeros((0,), dtype)
-    if g:
-        armed = jnp.where(holding, BELOW, jnp.where(value == 0, RESTS, ABOVE)).astype(dtype)
+    size = jnp.abs(value)
+    if resumed is None:
+        due_conditions = holding = _holds(value, rate)
+        armed = jnp.where(holding, BELOW, jnp.where(value == 0, RESTS, ABOVE))
+        at_once = np.array(problem.immediate[c:], bool) & ~relations[c:]
+    else:
+        size = jnp.maximum(size, resumed.sizes)
+        band, far = rounding(size), _beyond_doubt(size)
+        due_conditions = (resumed.sides > 0) & (value < -far)
+        armed = jnp.where(value > band, ABOVE, jnp.where(value < -far, BELOW, resumed.sides))
+        at_once = ~relations[c:]
     rows = jnp.full((logged if sides else 0, len(x0) + len(q0)), jnp.nan, dtype)
     state = HybridState.of(
-        x0, q0, armed=armed, size=size, ticks=ticks, due=lax.stop_gradient(problem.due(ticks)), span=nothing,
-        request=jnp.full_like(t0, jnp.inf), ended=nothing, stuck=nothing - 1.0, turns=nothing, count=nothing,
-        times=infinite, which=jnp.full_like(infinite, -1.0), rate=jnp.zeros_like(infinite), before=rows, after=rows,
+        x0, q0, armed=armed.astype(dtype), size=size, ticks=ticks, due=lax.stop_gradient(problem.due(ticks)),
+        span=nothing, request=jnp.full_like(t0, jnp.inf), ended=nothing, stuck=nothing - 1.0, turns=nothing,
+        count=nothing, times=infinite, which=jnp.full_like(infinite, -1.0), rate=jnp.zeros_like(infinite),
+        before=rows, after=rows,
     )  # fmt: skip
-    at_once = np.array(problem.immediate[c:], bool) & ~relations[c:]
     if relations[:c].all() and not at_once.any():
         return state
-    due_conditions = holding & at_once
+    due_conditions = due_conditions & at_once
     due = jnp.concatenate([state.due <= t0 + tolerance, due_conditions])
     # What holds at the start need not be near zero.
-    arrival = Arrival(jnp.zeros_like(x0), rate, due, due_conditions, size, tolerance, tolerance)
-    return handle(problem, t0, state, arrival, args, at_start=True)[0]
+    slope = jnp.zeros_like(x0) if resumed is None else problem.slope(t0, x0, q0, args)
+    arrival = Arrival(slope, rate, due, due_conditions, size, tolerance, tolerance)
+    return handle(problem, t0, state, arrival, args, at_start=resumed is None)[0]
+
+
+def _ticks_before(problem: AbstractHybridProblem, t0: Time, ticked: Any) -> Any:
+    """How often each clock has ticked before t0, and at t0 if it has `ticked` there."""
+    dtype, c = t0.dtype, problem.n_clocks
+    period, offset = (lax.stop_gradient(v) for v in problem.clocks())
+    relations = np.array(problem.relations[:c], bool)
+    passed = t0 - problem.resolution - offset
+    ticks = jnp.where(jnp.isinf(period), (passed > 0).astype(dtype), jnp.ceil(passed / period))
+    ticks = jnp.where(relations, ticks, jnp.maximum(ticks, 0.0))  # relations have turned at all times
+    if ticked is None:
+        return ticks
+    # Of a clock that has ticked here, the next tick is clearly later, though rounding may have put this one on either
+    # side of t0.
+    slack = jnp.sqrt(jnp.finfo(dtype).eps)
+    next_one = jnp.where(jnp.isinf(period), 1.0, jnp.floor((t0 - offset) / period + slack) + 1.0)
+    return jnp.where((ticked > 0) & ~relations, next_one, ticks)
 
 
 def _holds(value: Any, rate: Any) -> Any:
@@ -60,15 +96,22 @@ def _holds(value: Any, rate: Any) -> Any:
     return jnp.where(value == 0, rate < 0, value < 0)
 
 
+def _beyond_doubt(size: Any) -> Any:
+    """How far beyond zero a guard that was on the other side must be when a run is resumed, to have jumped there: saved
+    states are on the constraints up to much less than half of the digits."""
+    return jnp.sqrt(jnp.finfo(size.dtype).eps) * size
+
+
 def _settled(
-    problem: AbstractHybridProblem, t0: Time, x0: State, q0: Any, due: Any, args: Args
+    problem: AbstractHybridProblem, t0: Time, x0: State, q0: Any, due: Any, args: Args, resumed: Resumed | None
 ) -> tuple[Any, Any, Any]:
     """Settles the relations at the initial time: each gets the truth of its sides, or, if its clock is `due`, what that
-    writes. Returns (q, rates of the guards, values of the guards); q does not move with parameters."""
+    writes; of a run that is `resumed`, one whose sides are equal keeps its truth. Returns (q, rates of the guards,
+    values of the guards); q does not move with parameters."""
     c, g = problem.n_clocks, problem.n_guards
     relations = np.array(problem.relations, bool)
-    given = still((problem, t0, x0, q0, due, args))
-    problem, t0, x0, begin, due, args = given
+    given = still((problem, t0, x0, q0, due, args, resumed))
+    problem, t0, x0, begin, due, args, resumed = given
 
     def written(q: Any, clocks: Any, holding: Any) -> Any:
         return problem.settled(t0, x0, q, jnp.concatenate([clocks, holding]) & relations, args)
@@ -79,10 +122,15 @@ def _settled(
             return problem.guards(t0, x0, q, args), jnp.where(first, -1.0, 1.0).astype(x0.dtype)
         return problem.rates(t0, x0, q, args, problem.slope(t0, x0, q, args))
 
+    def holding(value: Any, rate: Any) -> Any:
+        if resumed is None:
+            return _holds(value, rate)
+        return value < -_beyond_doubt(jnp.maximum(jnp.abs(value), resumed.sizes))
+
     def once(k: Any, carry: Any) -> Any:
         """One round: relations are set by the guards of the round before, and the guards are evaluated again."""
         q, rate, value = carry
-        q = jnp.where(k > 0, written(q, jnp.zeros((c,), bool), _holds(value, rate)), q)
+        q = jnp.where(k > 0, written(q, jnp.zeros((c,), bool), holding(value, rate)), q)
         value, rate = looked_at(q)
         return q, rate, value
 

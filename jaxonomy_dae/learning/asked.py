@@ -99,6 +99,11 @@ def checked_method(system: AcausalSystem, given: Any) -> str | Shooting | Filter
             f"method: '{system.discretes[0]}' is a discrete variable, which the nodes of multiple shooting do "
             "not carry from segment to segment: use method='growing'"
         )
+    if isinstance(given, Shooting) and plan.events is not None and (plan.events.state >= 0).any():
+        raise ModelError(
+            f"method: events of this model write states ({plan.events.names[0]}), and a node of multiple shooting does "
+            "not tell on which side of an event it lies: use method='growing'"
+        )
     if isinstance(given, Shooting) and plan.held is not None:
         raise ModelError(
             "method: constraints of this model come and go with its modes, so that the nodes of multiple shooting "

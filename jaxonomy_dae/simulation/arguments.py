@@ -24,7 +24,8 @@ from ..system.closed_function import ClosedFunction
 from ..system.inputs import value_at
 from ..system.system import AcausalSystem
 from ..system.system_at import SystemAt
-from .from_state import check_shape
+from .from_state import check_array
+from .saved_state import SavedState, check_saved_state, initial_time
 
 MOST_ROOM = 4 * 2**30  # bytes that saved steps may reserve
 
@@ -70,11 +71,13 @@ def check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_contr
             "end too: leave it out, or bound the steps with dtmax="
         )
     check_longest_step(dtmax)
-    _check_interval(t0, t1, ts)
-    if hasattr(initial, "ndim"):
-        check_shape(system, initial)
+    if isinstance(initial, SavedState):
+        check_saved_state(system, t0, initial)
+    elif hasattr(initial, "ndim"):
+        check_array(system, initial)
     else:
         check_initial(system, initial)
+    _check_interval(initial_time(t0, initial), t1, ts)
     _check_periods(system)
 
 

@@ -40,9 +40,17 @@ def _typical(system: AcausalSystem) -> Any:
     return jax.lax.stop_gradient(system.typical_sizes[np.concatenate([plan.states, plan.carried])])
 
 
-def check_shape(system: AcausalSystem, initial: Any) -> None:
-    """Raises a `ModelError` if an array cannot be a state of this system."""
-    n = system.plan.n_state
+def check_array(system: AcausalSystem, initial: Any) -> None:
+    """Raises a `ModelError` if an array cannot be, or does not say, the state of this system."""
+    n, events = system.plan.n_state, system.plan.events
+    if events is not None:
+        written = [events.names[e] for e in events.table.event.tolist() if not events.table.relation[e]]
+        if written:
+            discrete = f", nor the discrete variables ('{system.discretes[0]}')" if system.discretes else ""
+            raise ModelError(
+                f"initial: this array does not hold what is known of events ('{written[0]}'){discrete}: go on from "
+                "another run with initial=solution.at(k), or start anew with values by names, initial={'m.x': 1.0}"
+            )
     if jnp.shape(initial) != (n,):
         raise ModelError(
             f"initial: a whole state of this system has shape ({n},); got shape {jnp.shape(initial)}. Single values go "
@@ -59,6 +67,6 @@ def check_state(found: InitialPoint) -> None:
     """Raises an `InitializationError` where a state was not moved onto the constraints."""
     if not is_consistent(found):
         raise InitializationError(
-            "no state that satisfies the constraints was found near the one given: give a row of solution.states of "
+            "no state that satisfies the constraints was found near the one given: give solution.at(k) of a run of "
             "the same model, or values by names, initial={'m.x': 1.0}"
         )

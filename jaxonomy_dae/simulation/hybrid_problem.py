@@ -204,6 +204,18 @@ def problem_for(
     )  # fmt: skip
 
 
+def without_clocked(system: AcausalSystem, q: Any) -> Any:
+    """The discrete values with the relations of time as they are before they are known: a run that goes on from another
+    one, perhaps with other parameters, looks at the clock instead."""
+    events: Any = system.plan.events
+    table = events.table
+    clocked = np.array(table.relation, bool)[table.event] & (table.event < events.n_clocks)
+    chosen = np.unique(table.discrete[clocked])
+    if not len(chosen):
+        return q
+    return q.at[chosen].set(jnp.asarray(system.plan.flat.parameters.values[events.discrete[chosen]], q.dtype))
+
+
 def _choices(table: EventTable, n_clocks: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Returns (the discrete values that `complementary` chooses, the guards that choose them)."""
     chooses = np.array(table.revocable, bool) & ~np.array(table.relation, bool)

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from ..aliases import Args, Controller, Result, Solver, State, Time
+from ..hybrid.control import ENDED
 from ..hybrid.problem import HybridState
 from ..hybrid.solver import WithEvents
 from ..hybrid.start import start
@@ -22,8 +23,9 @@ from ..solvers.switching import STIFF, Watch
 from .arguments import NOT_ADMITTED, TEXT, are_admitted, inputs_are_finite
 from .event_log import EventLog
 from .from_state import from_state
-from .hybrid_problem import problem_for, with_event_control
+from .hybrid_problem import problem_for, with_event_control, without_clocked
 from .preparation import largest_tolerance, prepared, term_of
+from .saved_state import Memory, SavedState, same_time
 from .step_sizes import first_step
 
 # Gauss–Newton steps by which saved states are moved onto the constraints. Dense output starts them within some
@@ -51,7 +53,8 @@ class Outcome(eqx.Module):
     - `ts`, `x`: the saved times and states; `last`: the last accepted point (t, x).
     - `stats`, `result`: counts of steps, and Diffrax's result code.
     - `is_stiff`: True if the run was given up because stability, not accuracy, limits explicit steps.
-    - `discrete`, `events`: with events, the discrete values at the saved times, and the log.
+    - `discrete`, `events`, `memory`: with events, the discrete values at the saved times, the log, and what another
+        run needs to go on.
     """
 
     found: InitialPoint
@@ -64,6 +67,7 @@ class Outcome(eqx.Module):
     discrete: Any = None
     events: EventLog | None = None
     held: Any = None  # the discrete values at the last accepted point
+    memory: Memory | None = None
 
     def numbers(self) -> dict[str, Any]:
         """The counts as Python integers."""
@@ -80,8 +84,15 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
         system = eqx.tree_at(
             lambda s: s.parameters.values, system, eqx.error_if(system.parameters.values, ~admitted, TEXT)
         )
-    by_names = isinstance(initial, Mapping)
-    found = initialize(system, t0, inputs, initial) if by_names else from_state(system, t0, inputs, initial)
+    resumed = None
+    if isinstance(initial, SavedState):
+        admitted = admitted & same_time(t0, initial)
+        system, resumed = system.holding(initial.discrete), initial.events
+        found = from_state(system, t0, inputs, initial.x)
+    elif isinstance(initial, Mapping):
+        found = initialize(system, t0, inputs, initial)
+    else:
+        found = from_state(system, t0, inputs, initial)
     if checked:
         found = check(system, found, t0, inputs, initial, running=True, throw=True)
     x0, controller = found.x, options.controller
@@ -94,6 +105,7 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
     own_start = implicit and not isinstance(controller, diffrax.StepTo)
     dt0 = None if own_start else first_step(system, t0, t1, x0, inputs, solver.order(term), controller)
     y0: Any = x0
+    ended = jnp.array(False)
     saved_of: Any = _whole
     consistent = is_consistent(found)
     if system.plan.events is not None:
@@ -101,24 +113,29 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
         if system.plan.held is not None:
             admitted = jnp.all(jnp.isfinite(problem.admitted(t0, x0, system.discrete_values, inputs)))
             consistent = consistent & admitted
-        y0 = start(problem, t0, x0, system.discrete_values, inputs, options.room, options.save_events)
+        q0 = system.discrete_values if resumed is None else without_clocked(system, system.discrete_values)
+        y0 = start(problem, t0, x0, q0, inputs, options.room, options.save_events, resumed)
+        ended = y0.ended > 0
         term, solver = HybridTerm(problem), WithEvents(chosen, options.max_events)
         controller = with_event_control(controller)
-        saved_of = _state_and_discrete
+        saved_of = _with_events
     save = diffrax.SubSaveAt(t0=True, steps=True, fn=saved_of) if ts is None else diffrax.SubSaveAt(ts=ts, fn=saved_of)
     done = integrate(
         term, solver, t0, t1, dt0, y0, inputs,
         save=save, controller=controller, adjoint=options.adjoint, max_steps=options.max_steps,
-        progress=options.progress, checked=checked, goes_on=admitted,
+        progress=options.progress, checked=checked, goes_on=admitted & ~ended,
     )  # fmt: skip
     saved, x, last = done.ts, done.ys, done.last
-    discrete, events, held = None, None, None
+    discrete, events, held, memory = None, None, None, None
     if system.plan.events is not None:
-        x, discrete = x
+        x, discrete, marks = x
         events = EventLog.of(last[1])
+        memory = Memory.of(problem, saved, marks, last[1].size)
         held, last = last[1].q, (last[0], last[1].x)
     x = jnp.asarray(x)
     filled = jnp.isfinite(saved)
+    if ts is not None:
+        filled = filled & ~(ended & (ts > t0))
     okay = diffrax.is_okay(done.result)
     if system.is_constrained:
         # Rows that were not reached are projected at the start, so that their derivatives are finite, and left out
@@ -139,8 +156,9 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
         x = jnp.where(filled[:, None], projected, x)
     if ts is None:
         steps = done.stats["num_accepted_steps"]
-        if discrete is not None:
+        if memory is not None:
             _, discrete = padded(saved, discrete, steps)
+            memory = memory.padded(saved, steps)
         saved, x = padded(saved, x, steps)
         filled = filled | okay
     else:
@@ -151,13 +169,16 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
     x = not_a_number(x, filled & consistent, x0, system, inputs)
     failure: Any = diffrax.RESULTS.nonlinear_divergence
     result = diffrax.RESULTS.where(okay | ~diffrax.is_okay(done.result), done.result, failure)
+    result = diffrax.RESULTS.where(ended & okay, ENDED, result)
     result = diffrax.RESULTS.where(consistent, result, failure)
     looked_at = diffrax.is_okay(result) | inputs_are_finite(inputs, last[0], t1)
     result = diffrax.RESULTS.where(admitted & looked_at, result, NOT_ADMITTED)
     stiff = consistent & (done.result == STIFF) if watch is not None else jnp.array(False)
     if discrete is not None:
         discrete = jnp.where((filled & consistent)[:, None], discrete, jnp.nan)
-    return Outcome(found._replace(jacobian=None), saved, x, last, done.stats, result, stiff, discrete, events, held)
+    return Outcome(
+        found._replace(jacobian=None), saved, x, last, done.stats, result, stiff, discrete, events, held, memory
+    )
 
 
 run_compiled = compiled(run)
@@ -167,5 +188,5 @@ def _whole(t: Time, y: State, args: Args) -> Any:
     return y
 
 
-def _state_and_discrete(t: Time, y: HybridState, args: Args) -> Any:
-    return y.x, y.q
+def _with_events(t: Time, y: HybridState, args: Args) -> Any:
+    return y.x, y.q, jax.lax.stop_gradient(jnp.concatenate([y.armed, y.ticks]))

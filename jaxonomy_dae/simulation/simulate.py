@@ -29,6 +29,7 @@ from .failures import explain, mode_at_start, raised
 from .from_state import check_state
 from .integration import Options, Outcome, run, run_compiled
 from .preparation import term_of
+from .saved_state import SavedState, initial_time
 from .solution import Solution
 from .step_sizes import clipped, controller_for, scaled_atol
 
@@ -42,7 +43,7 @@ def simulate(
     system: AcausalSystem,
     t1: Any,
     *,
-    t0: Any = 0.0,
+    t0: Any = None,
     ts: Any = None,
     solver: diffrax.AbstractSolver[Any] | None = None,
     rtol: Any = None,
@@ -64,7 +65,7 @@ def simulate(
     **Arguments:**
 
     - `system`: from an `AcausalCompiler`.
-    - `t0`, `t1`: the interval, `t0 < t1`.
+    - `t0`, `t1`: the interval, `t0 < t1`. `t0` None: the time of a whole state given as `initial`, otherwise 0.
     - `ts`: when to save, shape `(n,)`, increasing, inside the interval; None saves every step taken. Inside jit, where
         shapes are fixed, there are then `max_steps + 1` rows, and those beyond the last step repeat it.
     - `solver`: any Diffrax solver for ordinary differential equations, or `solvers.BDF`, `solvers.Rodas5P` for stiff
@@ -77,9 +78,11 @@ def simulate(
     - `inputs`: by the inputs' names: constants; samples `(times, values)`, interpolated linearly, or with `"cubic"` or
         `"held"` as a third entry; `diffrax.LinearInterpolation` and `diffrax.CubicInterpolation`; functions of time.
         Steps end at the times of samples. What a function reads from its surroundings is read at this call.
-    - `initial`: values at `t0` by variables' names, which outrank the starts declared in components. Or a whole state,
-        shape `(n_state,)`, such as a row of `solution.states`: it is moved onto the constraints, and declared starts
-        are not looked at.
+    - `initial`: values at `t0` by variables' names, which outrank the starts declared in components. Or the whole state
+        of another run, `solution.at(k)`, from which this one goes on: with its discrete variables, modes, and clocks
+        that have ticked; declared starts, and discrete variables set by `with_parameters`, are not looked at. Of a
+        model without events, other than relations in equations, an array of shape `(n_state,)` is a whole state, too:
+        it is moved onto the constraints.
     - `adjoint`: how to differentiate; default `solvers.StoredAdjoint()`, and `diffrax.ForwardMode()` under `jax.jvp`
         and `jax.jacfwd`; name the latter for a function that is jitted before it is differentiated.
     - `stepsize_controller`: instead of the controller made from the tolerances.
@@ -119,6 +122,7 @@ def simulate(
         if initial is None or isinstance(initial, Mapping):
             initial = system.plan.one_by_one(initial)
     check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_controller, dtmax, max_steps)
+    t0 = initial_time(t0, initial)
     dtype = system.parameters.values.dtype
     inputs = read_inputs(system.plan, dtype, inputs)
     check_range(inputs, t0, t1)
@@ -133,7 +137,7 @@ def simulate(
     if initial is None or isinstance(initial, Mapping):
         initial = {name: jnp.asarray(v, dtype) for name, v in sorted((initial or {}).items())}
     else:
-        initial = jnp.asarray(initial, dtype)
+        initial = jax.tree.map(lambda part: jnp.asarray(part, dtype), initial)
     duration = None if is_traced((t0, t1)) else float(t1) - float(t0)
     t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
     if ts is not None:
@@ -210,16 +214,19 @@ def simulate(
     if outcome.events is not None and max_events is None and outcome.events.count > ROOM:
         doublings = int(np.ceil(np.log2(float(outcome.events.count) / ROOM)))
         outcome = run_compiled(given, options(solver, ROOM * 2**doublings), None)
-    saved, x, discrete = outcome.ts, outcome.x, outcome.discrete
+    saved, x, discrete, memory = outcome.ts, outcome.x, outcome.discrete, outcome.memory
     if ts is None:
         taken = counts["num_accepted_steps"] + 1
         saved, x, discrete = jax.tree.map(lambda rows: rows[:taken], (saved, x, discrete))
+        memory = memory if memory is None else memory.first(taken)
     solution = Solution(
-        saved, x, system, inputs, counts, outcome.result, choice.solver, choice.reason, discrete, outcome.events
-    )
+        saved, x, system, inputs, counts, outcome.result, choice.solver, choice.reason, discrete, outcome.events,
+        memory,
+    )  # fmt: skip
     if throw is not False and not bool(diffrax.is_okay(outcome.result)):
         first = t0, outcome.found.x
-        mode = mode_at_start(system, inputs, *first)
+        begun = system.holding(initial.discrete) if isinstance(initial, SavedState) else system
+        mode = mode_at_start(begun, inputs, *first)
         if mode:
             raise InitializationError(mode)
         if outcome.held is not None:
@@ -246,5 +253,5 @@ def _traced(
         x = raised(x, outcome.result, system.plan.events is not None, *bounds)
     return Solution(
         outcome.ts, x, system, inputs, outcome.stats, outcome.result, choice.solver, choice.reason, outcome.discrete,
-        outcome.events,
+        outcome.events, outcome.memory,
     )  # fmt: skip

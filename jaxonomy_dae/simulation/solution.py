@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..errors import ModelError
@@ -19,6 +20,7 @@ from ..system.system import AcausalSystem
 from .accounts import account_values, chosen_terms
 from .event_log import EventLog, Events
 from .labelled import data_frame, data_set
+from .saved_state import Memory, SavedState
 
 SHOWN = 8  # states that notebooks list
 
@@ -28,12 +30,13 @@ class Solution(eqx.Module):
 
     - `ts`: the saved times, shape `(n,)`.
     - `states`: the state array at these times, shape `(n, len(system.states) + len(system.carried))`, on the hidden
-        constraints.
+        constraints. `at(k)` is the whole state at one of them, with discrete variables and what is known of events.
     - `system`, `inputs`: what was simulated; inputs as they were read.
     - `counts`: steps taken, accepted, rejected, and Jacobians of implicit solvers; `stats` adds the solver's name and
         why it was chosen.
     - `discrete`: the values of discrete variables at these times, shape `(n, len(system.discretes))`; None without
         events. At the time of an event, what it wrote.
+    - `memory`: what another run needs to know of the events, see `at`.
     - `result`: Diffrax's result code. Where the integration stopped early, later rows are NaN.
 
     A solution that `equinox.filter_vmap` returns is a batch: shapes get its axis in front.
@@ -49,6 +52,29 @@ class Solution(eqx.Module):
     reason: str = eqx.field(static=True, default="")
     discrete: Float[Array, "n q"] | None = None
     event_log: EventLog | None = None
+    memory: Memory | None = None
+
+    def at(self, k: Any) -> SavedState:
+        """The whole state at the saved time number `k`, from which another run goes on: `simulate(system, t1,
+        initial=solution.at(-1))` is as if this one had not stopped there. Inside jit, `k` may be traced; of a batch,
+        a batch of states.
+
+        **Raises:**
+
+        - `ModelError` if there is no such row, or it was not reached.
+        """
+        n = self.ts.shape[-1]
+        if not isinstance(k, Tracer) and not -n <= int(k) < n:
+            raise ModelError(f"solution.at({int(k)}): there are {n} saved times")
+        t, x, none = self.ts[..., k], self.states[..., k, :], self.states[..., k, :0]
+        if not isinstance(x, Tracer) and x.ndim == 1 and not np.isfinite(x).all():
+            raise ModelError(f"solution.at({int(k)}): the run did not get to t={float(t):g} ({self.result})")
+        if self.discrete is None or self.memory is None:
+            return SavedState(t, x, none, none, none, none)
+        memory = self.memory
+        return SavedState(
+            t, x, self.discrete[..., k, :], memory.sides[..., k, :], memory.ticked[..., k, :], memory.sizes
+        )
 
     def __getitem__(self, name: Any) -> Any:
         """The values of a variable, or of several: `solution["pend.x"]` has shape `(n,)`, and

@@ -291,6 +291,35 @@ def test_more_than_a_hundred_events_are_listed():
     assert len(solution.events.names) == 150
 
 
+@pytest.mark.long("runs with saved steps and with saved times are compiled, each in jit, too")
+def test_a_run_that_ends_where_it_begins():
+    """x' = 1000 from 1, and the end where x ≥ 1/2, at the start, too: one row. A first step was taken, to 0.001."""
+
+    def write(self, ev):
+        x = self.variable("x", start=1.0, fixed=True)
+        self.add_equations(Eq(der(x), 1e3))
+        self.when(x >= self.parameter("most", 0.5), terminate("over"), at_start=True)
+
+    system, ts = model(write), jnp.linspace(0.0, 1.0, 5)
+    over = simulate(system, 1.0)
+    np.testing.assert_array_equal(over.ts, [0.0])
+    np.testing.assert_array_equal(over["c.x"], [1.0])
+    assert over.events.terminated == "over" and len(over.events) == 1 and float(over.events.ts[0]) == 0.0
+    saved = simulate(system, 1.0, ts=ts)
+    np.testing.assert_array_equal(saved["c.x"], [1.0, *[np.nan] * 4])
+    assert saved.events.terminated == "over" and saved.result == over.result
+
+    def inside(most, ts=None):
+        solution = simulate(system.with_parameters({"c.most": most}), 1.0, ts=ts, max_steps=64)
+        return solution.ts, solution["c.x"], solution.result == over.result
+
+    times, x, ended = jax.jit(inside)(0.5)
+    assert (times == 0).all() and (x == 1).all() and ended
+    _, x, ended = jax.jit(lambda most: jax.vmap(lambda m: inside(m, ts))(most))(jnp.array([0.5, 2.0, 1e4]))
+    np.testing.assert_array_equal(np.isfinite(x), [[True] + [False] * 4, [True] + [False] * 4, [True] * 5])
+    np.testing.assert_array_equal(ended, [True, True, False])
+
+
 def test_events_of_a_model_without_any():
     solution = simulate(model(lambda self, ev: clock_hand(self)), 1.0)
     assert len(solution.events) == solution.events.count == 0

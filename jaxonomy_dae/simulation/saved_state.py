@@ -1,0 +1,112 @@
+"""Whole states of runs, from which other runs go on."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from ..errors import ModelError
+from ..hybrid.problem import AbstractHybridProblem
+from ..hybrid.start import Resumed
+from ..solvers.rows import padded
+from ..system.system import AcausalSystem
+from ..tolerances import KNOWN_ROUNDINGS
+
+
+class SavedState(eqx.Module):
+    """The whole state of a run at one time, as `solution.at(k)` returns it. Another run goes on from there:
+
+    ```python
+    first = simulate(system, 5.0, ts=ts)
+    second = simulate(system, 10.0, initial=first.at(-1))
+    ```
+
+    A pytree of arrays, which may be the carry of `jax.lax.scan`, mapped over and differentiated.
+
+    - `t`: the time.
+    - `x`: the array of states, as `system.vector_field` takes it, shape `(n_state,)`.
+    - `discrete`: the discrete variables, `system.discretes`, and after them those of relations, shape `(q,)`.
+        `system.holding(state.discrete)` is the system while they have these values:
+        `system.holding(state.discrete).vector_field(state.t, state.x)`.
+    - `sides`, `ticked`, `sizes`: what is known of the events: on which side each condition is, which clocks have ticked
+        at this time, and how large the quantities in conditions have been.
+    """
+
+    t: Any
+    x: Float[Array, "*batch n"]
+    discrete: Float[Array, "*batch q"]
+    sides: Float[Array, "*batch guards"]
+    ticked: Float[Array, "*batch clocks"]
+    sizes: Float[Array, "*batch guards"]
+
+    @property
+    def events(self) -> Resumed:
+        """What is known of the events."""
+        return Resumed(*(jax.lax.stop_gradient(part) for part in (self.sides, self.ticked, self.sizes)))
+
+
+class Memory(eqx.Module):
+    """Of a run with events: `sides` of the guards and `ticked` clocks at the n saved times, and the guards' `sizes`."""
+
+    sides: Float[Array, "*batch n guards"]
+    ticked: Float[Array, "*batch n clocks"]
+    sizes: Float[Array, "*batch guards"]
+
+    @classmethod
+    def of(cls, problem: AbstractHybridProblem, ts: Any, marks: Any, sizes: Any) -> "Memory":
+        """The memory of the rows saved at `ts`, whose `marks` are the sides of the guards and the counts of ticks."""
+        sides, ticks = marks[:, : problem.n_guards], marks[:, problem.n_guards :]
+        since = jnp.abs(jax.vmap(problem.due)(ticks - 1.0) - ts[:, None])
+        ticked = (ticks > 0) & (since <= 2 * problem.resolution)
+        return jax.lax.stop_gradient(cls(sides, ticked.astype(sides.dtype), sizes))
+
+    def first(self, rows: int) -> "Memory":
+        """The first rows alone."""
+        return Memory(self.sides[:rows], self.ticked[:rows], self.sizes)
+
+    def padded(self, ts: Any, steps: Any) -> "Memory":
+        """With the rows beyond the steps taken replaced by the last one."""
+        sides, ticked = (padded(ts, rows, steps)[1] for rows in (self.sides, self.ticked))
+        return Memory(sides, ticked, self.sizes)
+
+
+def initial_time(t0: Any, initial: Any) -> Any:
+    """The time at which a run begins: as given, that of a whole state, or 0."""
+    if t0 is not None:
+        return t0
+    return initial.t if isinstance(initial, SavedState) else 0.0
+
+
+def same_time(t0: Any, state: SavedState) -> Any:
+    """True if a state is that of the time t0, up to the rounding of a few sums."""
+    return jnp.abs(t0 - state.t) <= KNOWN_ROUNDINGS * jnp.finfo(state.x.dtype).eps * jnp.abs(state.t)
+
+
+def check_saved_state(system: AcausalSystem, t0: Any, state: SavedState) -> None:
+    """Raises a `ModelError` if a state cannot be one of this system, or is of another time than `t0`."""
+    events, n = system.plan.events, system.plan.n_state
+    clocks, guards, discretes = (
+        (0, 0, 0) if events is None else (events.n_clocks, len(events) - events.n_clocks, len(events.discrete))
+    )
+    needed = {"x": n, "discrete": discretes, "sides": guards, "ticked": clocks, "sizes": guards}
+    for name, length in needed.items():
+        shape = jnp.shape(getattr(state, name))
+        if shape != (length,):
+            raise ModelError(
+                f"initial: a state of this system has {name} of shape ({length},); this one has {shape}. It is a state "
+                "of another model, or a batch: map over batches with equinox.filter_vmap"
+            )
+    finite = [part for part in (state.t, state.x, state.discrete) if not isinstance(part, Tracer)]
+    if not all(np.isfinite(np.asarray(part)).all() for part in finite):
+        raise ModelError("initial: this state has entries that are not finite: the run that it is of did not get there")
+    if t0 is None or isinstance(t0, Tracer) or isinstance(state.t, Tracer):
+        return
+    if not bool(same_time(jnp.asarray(t0, state.x.dtype), state)):
+        raise ModelError(
+            f"t0={float(t0):g}, but the state given as initial is that of t={float(state.t):g}: leave t0 out. To go on "
+            "from it at another time, say so with dataclasses.replace(state, t=...)"
+        )
