@@ -105,7 +105,7 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
     own_start = implicit and not isinstance(controller, diffrax.StepTo)
     dt0 = None if own_start else first_step(system, t0, t1, x0, inputs, solver.order(term), controller)
     y0: Any = x0
-    ended = jnp.array(False)
+    goes_on = admitted
     saved_of: Any = _whole
     consistent = is_consistent(found)
     if system.plan.events is not None:
@@ -115,7 +115,7 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
             consistent = consistent & admitted
         q0 = system.discrete_values if resumed is None else without_clocked(system, system.discrete_values)
         y0 = start(problem, t0, x0, q0, inputs, options.room, options.save_events, resumed)
-        ended = y0.ended > 0
+        goes_on = admitted & (y0.ended == 0)
         term, solver = HybridTerm(problem), WithEvents(chosen, options.max_events)
         controller = with_event_control(controller)
         saved_of = _with_events
@@ -123,7 +123,7 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
     done = integrate(
         term, solver, t0, t1, dt0, y0, inputs,
         save=save, controller=controller, adjoint=options.adjoint, max_steps=options.max_steps,
-        progress=options.progress, checked=checked, goes_on=admitted & ~ended,
+        progress=options.progress, checked=checked, goes_on=goes_on,
     )  # fmt: skip
     saved, x, last = done.ts, done.ys, done.last
     discrete, events, held, memory = None, None, None, None
@@ -134,8 +134,8 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
         held, last = last[1].q, (last[0], last[1].x)
     x = jnp.asarray(x)
     filled = jnp.isfinite(saved)
-    if ts is not None:
-        filled = filled & ~(ended & (ts > t0))
+    if system.plan.events is not None and ts is not None:
+        filled = filled & (goes_on | (ts == t0))
     okay = diffrax.is_okay(done.result)
     if system.is_constrained:
         # Rows that were not reached are projected at the start, so that their derivatives are finite, and left out
@@ -156,7 +156,7 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
         x = jnp.where(filled[:, None], projected, x)
     if ts is None:
         steps = done.stats["num_accepted_steps"]
-        if memory is not None:
+        if discrete is not None and memory is not None:
             _, discrete = padded(saved, discrete, steps)
             memory = memory.padded(saved, steps)
         saved, x = padded(saved, x, steps)
@@ -169,7 +169,8 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
     x = not_a_number(x, filled & consistent, x0, system, inputs)
     failure: Any = diffrax.RESULTS.nonlinear_divergence
     result = diffrax.RESULTS.where(okay | ~diffrax.is_okay(done.result), done.result, failure)
-    result = diffrax.RESULTS.where(ended & okay, ENDED, result)
+    if system.plan.events is not None:
+        result = diffrax.RESULTS.where(okay & ~goes_on, ENDED, result)
     result = diffrax.RESULTS.where(consistent, result, failure)
     looked_at = diffrax.is_okay(result) | inputs_are_finite(inputs, last[0], t1)
     result = diffrax.RESULTS.where(admitted & looked_at, result, NOT_ADMITTED)
