@@ -11,7 +11,7 @@ import sys
 import time
 
 from .draws import FAMILIES, NETWORKS, PUBLISHED, SWITCHING, UNITS, Draw, draws
-from .outcome import GOOD, HEAD, row
+from .outcome import GOOD, HEAD, Outcome, row
 from .timed import attack
 
 # Every model is run once, so compiling takes most of the time.
@@ -91,25 +91,23 @@ def counted(family: str, given: argparse.Namespace) -> bool:
     from .judge import drop_programs
     from .timed import KEPT
 
-    outcomes, others = [], []
+    counts: dict[str, list[tuple[int, Outcome]]] = {}
     for k in range(given.count):
         seed = given.seed + k
         draw = Draw(family, seed, given.units, bool(given.moving) and seed % given.moving == 0, given.variants)
         note, found = draw.judged()
-        outcomes.append((seed, found[0]))
-        others += [(seed, outcome) for outcome in found[1:]]
         for j, outcome in enumerate(found):
+            counts.setdefault(draw.row_of(j, outcome), []).append((seed, outcome))
             if outcome.kind not in GOOD:
-                which = f", variant {j}" if j else ""
+                which = f", variant {j}" if j and not outcome.part else ""
                 print(f"  {outcome.kind}: {draw.row} {seed}{which} ({note}): {outcome.text[:400]}", flush=True)
             elif given.refusals and outcome.kind == "refused":
                 print(f"  refused: {draw.row} {seed} ({note}): {outcome.text[:400]}", flush=True)
         if k % KEPT == KEPT - 1:
             drop_programs()
-    print(row(draw.row, outcomes), flush=True)
-    if others:
-        print(row(f"{draw.row}, variants", others), flush=True)
-    return all(outcome.kind in GOOD for _, outcome in [*outcomes, *others])
+    for name, outcomes in sorted(counts.items()):
+        print(row(name, outcomes), flush=True)
+    return all(outcome.kind in GOOD for outcomes in counts.values() for _, outcome in outcomes)
 
 
 def main() -> int:

@@ -16,6 +16,7 @@ OWN = (
     "blocks",
     "pairs",
     "idle",
+    "invariance",
 )  # they say themselves what is right, by `judged(seed)`
 FAMILIES = (*NETWORKS, "events", *SWITCHING, "gradients", *OWN)
 UNITS = ("equations", "parameters", "units", "all")  # what is rescaled: `benchmarks/rescaling.py`
@@ -40,6 +41,12 @@ class Draw:
     def row(self) -> str:
         """The line of the table that counts it."""
         return f"{self.family}, rescaled" if self.units else self.family
+
+    def row_of(self, number: int, outcome: Outcome) -> str:
+        """The line of the table that counts the outcome of this number."""
+        if outcome.part:
+            return f"{self.row} {outcome.part}"
+        return f"{self.row}, variants" if number and self.variants else self.row
 
     @property
     def command(self) -> str:

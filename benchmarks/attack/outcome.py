@@ -16,12 +16,14 @@ class Outcome:
         refused for another reason; 'crashed', by an error that is not the package's; 'late'; or 'wrong'.
     - `error`: the worst error in units of what is allowed. `text`: where it was, or the error's message.
     - `seconds`: of processor time.
+    - `part`: what part of a family it is counted with, if that has several.
     """
 
     kind: str
     error: float
     text: str
     seconds: float
+    part: str = ""
 
 
 HEAD = f"{'':<22}" + "".join(f"{k:>9}" for k in KINDS) + "   worst/allowed   s each   slowest"

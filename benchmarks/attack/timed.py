@@ -36,6 +36,11 @@ def serve(connection: Connection) -> None:
             drop_programs()
 
 
+def _worst(found: list[Outcome]) -> Outcome:
+    """The first that is not good, or the first."""
+    return next((o for o in found if o.kind not in GOOD), found[0])
+
+
 class Worker:
     """A process that judges models; another takes its place where it dies."""
 
@@ -50,18 +55,17 @@ class Worker:
         self.process.start()
         inside.close()
 
-    def judged(self, draw: Draw) -> tuple[str, Outcome]:
+    def judged(self, draw: Draw) -> tuple[str, list[Outcome]]:
         try:
             self.connection.send(draw)
-            note, outcomes = self.connection.recv()
-            return note, next((o for o in outcomes if o.kind not in GOOD), outcomes[0])
+            return self.connection.recv()
         except (EOFError, ConnectionError):
             self.process.join()
             code = self.process.exitcode
             self._start()
             if code == -signal.SIGXCPU:
-                return "", Outcome("late", float("inf"), f"killed after {LONGEST} s", LONGEST)
-            return "", Outcome("crashed", float("inf"), f"its process ended with exit code {code}", 0.0)
+                return "", [Outcome("late", float("inf"), f"killed after {LONGEST} s", LONGEST)]
+            return "", [Outcome("crashed", float("inf"), f"its process ended with exit code {code}", 0.0)]
 
     def stop(self) -> None:
         self.connection.close()
@@ -84,11 +88,12 @@ def attack(
             while time.monotonic() < end:
                 with lock:
                     draw = next(draws)
-                note, outcome = worker.judged(draw)
+                note, found = worker.judged(draw)
                 with lock:
-                    outcomes[draw.row].append((draw.seed, outcome))
-                    if outcome.kind not in GOOD or (refusals and outcome.kind == "refused"):
-                        tell(f"{outcome.kind}: {draw.row} ({note}): {outcome.text[:600]}\n    {draw.command}")
+                    for outcome in found if any(o.part for o in found) else [_worst(found)]:
+                        outcomes[draw.row_of(0, outcome)].append((draw.seed, outcome))
+                        if outcome.kind not in GOOD or (refusals and outcome.kind == "refused"):
+                            tell(f"{outcome.kind}: {draw.row} ({note}): {outcome.text[:600]}\n    {draw.command}")
         finally:
             worker.stop()
 
