@@ -102,7 +102,9 @@ class _Whole(Component):
             for target, ids in zip(group.target, group.parameter, strict=True)
         }
         for p, name in enumerate(table.names):
-            value = computed[p] / factors.parameter[p] if p in computed else table.values[p] / factors.parameter[p]
+            value = (
+                computed[p] / factors.parameter[p] if p in computed else model.declares.values[p] / factors.parameter[p]
+            )
             declared[p] = self.parameter(f"p_{plain(name)}", value)
 
         def start_of(start: Start, s: float) -> sympy.Expr:
@@ -160,7 +162,7 @@ class _Whole(Component):
                 scales.append(float(factors.variable[v]))
         results = [int(written[k][0].variable[written[k][1], 0]) for k in range(len(written))]
         old = tuple(factors.variable[results].tolist())
-        network = Scaled(model.networks[function.name], function.function, tuple(scales), old)
+        network = Scaled(model.declares.networks[function.name], function.function, tuple(scales), old)
         if function.function is not None:
             inputs.append(ev.t)
         outputs = self.learned(name, network, inputs)
@@ -206,7 +208,7 @@ def rescaled(
         if row.opaque.function is not None:
             inputs.append("time")
         old = tuple(factors.variable[list(row.targets)].tolist())
-        network = Scaled(model.networks[row.opaque.name], row.opaque.function, tuple(scales), old)
+        network = Scaled(model.declares.networks[row.opaque.name], row.opaque.function, tuple(scales), old)
         diagram.add_neural_correction_block(
             NeuralDAEBlock(network, targets=targets, inputs=inputs, name=f"n_{plain(row.opaque.name)}", inject="row")
         )

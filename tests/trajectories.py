@@ -15,6 +15,7 @@ from reference_systems import ReferenceSystem, integrated, system_of, values_of
 
 from jaxonomy_dae import AcausalSystem, Solution
 from jaxonomy_dae.model.consistent_point import initial_point
+from jaxonomy_dae.model.tables import Declared
 from jaxonomy_dae.system.inputs import read_inputs
 
 ASIDE = 1e-12  # of a run's length: as near to an edge as the field is evaluated, beside its jump
@@ -43,7 +44,8 @@ def states_at(
     assert not system.carried, "the field of nonlinear blocks is only as good as a stage needs it"
     assert not system.plan.n_constraints, "inputs at the start move redundant states, and a run projects them"
     plan = system.plan
-    start = initial_point(plan.model).values[plan.states]  # by NumPy: `initialize` compiles its ladder
+    declared = Declared(np.asarray(system.numbers), system.neural)
+    start = initial_point(plan.model, declared).values[plan.states]  # by NumPy: `initialize` compiles its ladder
     field = jax.jit(lambda t, x: system.vector_field(t, x, inputs))
     aside = ASIDE * (ts[-1] - ts[0])
     return integrated(lambda t, x: np.asarray(field(t, x)), start, ts, ends=edges, rtol=rtol, aside=aside).T

@@ -73,19 +73,20 @@ def _network(rng: np.random.Generator) -> Case:
         case = make(seed)
         if case.motion is None or not 1 <= (case.freedom or 0) <= MOST_STATES:
             continue
-        table = flatten(case.diagram).parameters
+        flat = flatten(case.diagram)
+        table = flat.parameters
         parts = list(dict.fromkeys(name.partition(".")[0] for name in table.names))
         if len(parts) > MOST_PARTS:
             continue
-        old = dict(zip(table.names, table.values.tolist(), strict=True))
+        old = dict(zip(table.names, flat.declares.values.tolist(), strict=True))
         motion = case.motion
         changed = {}  # parameter → (its part, the motions for factors 1 ± h, 1 ± h/2)
         for part in (parts[k] for k in rng.permutation(len(parts))[:6]):
             nearby = [make(seed, {part: 1 + h}) for h in (STEP, -STEP, STEP / 2, -STEP / 2)]
             # A gear in a loop, for instance, must be what it is.
             if len(changed) < 4 and all(c.motion is not None and c.freedom == case.freedom for c in nearby):
-                after = flatten(nearby[0].diagram).parameters
-                new = dict(zip(after.names, after.values.tolist(), strict=True))
+                after = flatten(nearby[0].diagram)
+                new = dict(zip(after.parameters.names, after.declares.values.tolist(), strict=True))
                 moved = [n for n in old if n.startswith(f"{part}.") and new[n] == old[n] * (1 + STEP)]
                 changed |= {n: [c.motion.follow(case.initial, motion.ts) for c in nearby] for n in moved[:1]}
         names = list(motion.values)

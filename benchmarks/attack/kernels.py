@@ -44,9 +44,9 @@ def verdict(diagram, mode: str = "auto") -> Verdict:
         plan = lower(compile_flat(flat, mode, ()))
     except ModelError as error:
         return Verdict(None, f"{type(error).__name__}: {error}")
-    at = initial_point(plan.model)
+    at = initial_point(plan.model, flat.declares)
     values = at.values[:-1].copy()
-    _, fixed = start_guess(plan.model)
+    _, fixed = start_guess(plan.model, flat.declares.values)
     values[list(fixed)] = list(fixed.values())
     x = values[[*plan.states, *plan.carried]]
     for finding in examine_blocks(plan, at.parameters, at.networks.weights, 0.0, x, lambda: np.zeros(0)):

@@ -17,20 +17,19 @@ def check_pivots(
     offsets: Offsets,
     columns: Columns,
     parameters: ParameterTable,
+    numbers: np.ndarray,
 ):
-    """Checks the equations that alone determine a quantity.
+    """Checks the equations that alone determine a quantity; `numbers` are the values of all parameters.
 
     **Raises:**
 
     - `StructuralError` if its coefficient is zero for the given parameter values, to rounding of its terms.
     """
-    zero = _zero_pivots(groups, signature, offsets, columns.number, parameters.values)
+    zero = _zero_pivots(groups, signature, offsets, columns.number, numbers)
     if not len(zero):
         return
     group, place = locate(groups, int(zero[0]))
-    values = [
-        f"{parameters.names[p]} = {parameters.values[p]:g}" for p in dict.fromkeys(group.parameter[place].tolist())
-    ]
+    values = [f"{parameters.names[p]} = {numbers[p]:g}" for p in dict.fromkeys(group.parameter[place].tolist())]
     raise StructuralError(
         f"the equation {group.provenance[place]} determines nothing for {', '.join(values)}: the coefficient of what "
         "it should determine is zero. Give other values, or leave the component out."

@@ -107,7 +107,8 @@ def _parameters(model: ModelNumbers, members: Sequence[tuple[Instances, int]], p
         yield [i.parameter + own[path] if path in own else model.parameter(i, path) for path in paths]
 
 
-def parameter_table(model: ModelNumbers) -> ParameterTable:
+def parameter_table(model: ModelNumbers) -> tuple[ParameterTable, np.ndarray]:
+    """The declarations of all parameters, and their values."""
     n = model.n_parameters
     names, units, bounds = [""] * n, [""] * n, [Interval()] * n
     values = np.zeros(n)
@@ -146,18 +147,17 @@ def parameter_table(model: ModelNumbers) -> ParameterTable:
     starts = np.zeros(n_relations)
     for i in model.instances:
         starts[i.relation[:, None] - model.n_parameters + np.arange(len(i.component.relations))] = i.component.relations
-    array = np.concatenate([array, starts])
     n_more = n_relations + len(model.discrete)
-    return ParameterTable(
+    table = ParameterTable(
         [*names, *(f"pre({names[p]})" for p in model.discrete)],
-        np.concatenate([array, array[model.discrete]]),
         [*units, *[""] * n_more],
         [*bounds, *[Interval()] * n_more],
         dependents,
         expressions,
         model.discrete,
-        n_relations,
+        starts,
     )
+    return table, table.everything(array)
 
 
 def _place_in(value: EachValue, i: Instances) -> np.ndarray:

@@ -7,7 +7,7 @@ symbolic work does not grow with the number of instances.
 
 from typing import Any
 
-from ..model.tables import FlatModel
+from ..model.tables import Declared, FlatModel
 from ..modeling.diagram import AcausalDiagram
 from .add_networks import add_corrections, add_learned_terms
 from .collect_declarations import parameter_table, variable_table
@@ -35,12 +35,12 @@ def flatten(diagram: AcausalDiagram) -> FlatModel:
     ports = connect_ports(model, diagram, builder)
     driven = connect_signals(model, diagram, builder)
     variables = variable_table(model, driven)
-    parameters = parameter_table(model)
+    parameters, values = parameter_table(model)
     groups = builder.groups()
     variables, groups, rows = add_corrections(model, diagram, variables, groups, networks)
     events, held, accounts = event_table(model), held_table(model), read_accounts(model)
     name = diagram.name or ""
     return FlatModel(
-        variables, parameters, groups, networks, rows, model.paths, ports, name, events, held, accounts,
-        array_names(model),
+        variables, parameters, groups, Declared(values, networks), tuple(networks), rows, model.paths, ports, name,
+        events, held, accounts, array_names(model),
     )  # fmt: skip

@@ -43,9 +43,9 @@ def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> Co
     equal = check_equal_starts(flat, groups, alias)
 
     groups, signature, offsets, cancelled = reduce_with_cancellation(
-        groups, signature, columns, matching, flat.parameters
+        groups, signature, columns, matching, flat.parameters, flat.declares.values
     )
-    check_pivots(groups, signature, offsets, columns, flat.parameters)
+    check_pivots(groups, signature, offsets, columns, flat.parameters, flat.declares.values)
     extended = differentiate_equations(groups, offsets, columns)
     model = ReducedModel(flat, alias, groups, extended, map_quantities(alias, extended.quantities))
 

@@ -47,11 +47,12 @@ def reduce_with_cancellation(
     columns: Columns,
     matching: np.ndarray,
     parameters: ParameterTable,
+    values: np.ndarray,
 ) -> tuple[tuple[EquationGroup, ...], Incidence, Offsets, tuple[str, ...]]:
     """Index reduction, repeated until no diagonal block with constant coefficients is singular.
 
-    `signature` is the incidence of the equations, `matching` what `match_highest` finds in it. Returns the
-    equations, changed where something cancelled, their incidence and offsets, and notes.
+    `signature` is the incidence of the equations, `matching` what `match_highest` finds in it; `values` are those of
+    all parameters. Returns the equations, changed where something cancelled, their incidence and offsets, and notes.
 
     **Raises:**
 
@@ -62,7 +63,7 @@ def reduce_with_cancellation(
     highest: np.ndarray | None = matching
     for _ in range(ROUNDS):
         offsets = reduce_index(signature, columns.least_of_unknown, highest)
-        jacobian = HighestDerivatives(groups, offsets, columns.number, parameters.values)
+        jacobian = HighestDerivatives(groups, offsets, columns.number, values)
         replaced, added, combined = [], [], []
         for equations in _blocks_that_may_cancel(signature, jacobian):
             found = _combination(jacobian, equations, parameters.names, parameters.discrete)

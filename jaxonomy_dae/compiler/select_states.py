@@ -131,7 +131,7 @@ def select_states(model: ReducedModel, mode: str, merit: Sequence[Merit]) -> Sta
                 projected[rows] = True
                 continue
             if at is None:
-                at, scale = initial_point(model), _scale(model)
+                at, scale = initial_point(model, model.flat.declares), _scale(model)
                 numbers = evaluate(groups, extended, entries, at)
                 known = KNOWN * (np.abs(at.values[:-1]) + error_sizes(model, at.parameters))
                 errors = evaluate_errors(groups, extended, entries, at, known)
@@ -163,7 +163,7 @@ def _scale(model: ReducedModel) -> np.ndarray:
     """The sizes by which variables are compared as states: as declared, or what their equations imply. They are not
     rounded, for rounding could turn a small difference into a factor of two."""
     declared = declared_scale(model)
-    return np.where(declared == 0.0, unrounded_sizes(model), declared)
+    return np.where(declared == 0.0, unrounded_sizes(model, model.flat.declares.values), declared)
 
 
 def _dependence(model: ReducedModel, settled: np.ndarray, at: Point, rows: np.ndarray) -> str:

@@ -31,7 +31,7 @@ def check_equal_starts(flat: FlatModel, groups: tuple[EquationGroup, ...], alias
     """
     table = flat.variables
     fixed = np.flatnonzero(table.fixed).tolist()
-    values = table.start.values(flat.parameters.values)
+    values = table.start.values(flat.declares.values)
     notes: list[str] = []
     first: dict[tuple[int, int], int] = {}
     numbers: dict[tuple[int, int], tuple[int, float]] = {}
@@ -110,11 +110,12 @@ def note_several_guesses(model: ReducedModel) -> tuple[str, ...]:
     """Notes on guesses of one quantity that differ: one of them counts, and the user should know which."""
     variables, table = model.variables, model.flat.variables
     v = np.flatnonzero(table.start.is_given & (variables.quantity >= 0))
-    value = table.start.values(model.flat.parameters.values)[v] / variables.factor[v]
+    parameters = model.flat.declares.values
+    value = table.start.values(parameters)[v] / variables.factor[v]
     of: dict[int, list[int]] = {}
     for k, q in enumerate(variables.quantity[v].tolist()):
         of.setdefault(q, []).append(k)
-    leading = set(leading_starts(model).tolist())
+    leading = set(leading_starts(model, parameters).tolist())
     notes = []
     for places in of.values():
         if len(places) < 2 or table.fixed[v[places]].any():

@@ -1,11 +1,11 @@
 """Values and Jacobians of blocks at a point, in NumPy."""
 
-import functools
 from collections.abc import Callable
 
 import numpy as np
 
 from ..lowering.plan import SystemPlan
+from ..lowering.remembered import remembered
 from ..lowering.schedule import Step, StepEquation
 from ..model.group import Point
 from ..model.networks import Networks
@@ -105,7 +105,7 @@ class BlockValues:
             self.quantities[quantities] = found[:, u]
 
 
-@functools.lru_cache(maxsize=64)
+@remembered
 def _error_sizes(plan: SystemPlan, parameters: bytes) -> np.ndarray:
     """The sizes to whose rounding all quantities are known."""
     return error_sizes(plan.model, np.frombuffer(parameters))

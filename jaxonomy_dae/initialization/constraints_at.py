@@ -26,7 +26,7 @@ def constraints_at(
     quantities = plan.extended.quantities
     if not plan.extended.level.any() or quantities.n_unknown > LARGEST or not np.isfinite(x).all():
         return None
-    guess, _ = start_guess(plan.model)
+    guess, _ = start_guess(plan.model, parameters, plan.leading)
     pins = dict(zip([*plan.states.tolist(), *plan.carried.tolist()], x.tolist(), strict=True))
     guess[list(pins)] = list(pins.values())
     if quantities.n > quantities.n_unknown:

@@ -22,7 +22,8 @@ from ..errors import InitializationError
 from ..judgement.rank import above_errors
 from ..judgement.scaling import balanced, equilibrated
 from ..lowering.plan import SystemPlan
-from ..model.declared import declared_scale, leading_starts
+from ..lowering.remembered import remembered
+from ..model.declared import declared_scale
 from ..model.jacobian import generic_jacobian
 from ..model.natural_sizes import natural_sizes
 from ..model.networks import Networks
@@ -101,7 +102,7 @@ class _Generic:
         return [(k, slope if np.isfinite(slope) else 1.0) for k, slope in pairs if k in self.solve_for]
 
 
-@functools.lru_cache(maxsize=256)
+@remembered
 def initial_rows(plan: SystemPlan, names: tuple[str, ...], solve_for: tuple[int, ...] = ()) -> InitialRows:
     """Chooses the rows for values given of `names`.
 
@@ -138,8 +139,7 @@ def _declared(plan: SystemPlan, names: tuple[str, ...]) -> tuple[list[StartRow],
         for k, (name, q, s) in enumerate(zip(names, *plan.resolve(names), strict=True))
     ]
     overridden = {r.quantity for r in overrides}
-    is_zero = variables.start.is_number & (variables.start.values(plan.flat.parameters.values) == 0.0)
-    leading = set(leading_starts(plan.model).tolist())
+    is_zero, leading = variables.start.is_zero, set(plan.leading.tolist())
     started: dict[int, StartRow] = {}
     fixed: list[StartRow] = []
     for v in np.flatnonzero(variables.start.is_given).tolist():
@@ -156,7 +156,7 @@ def _declared(plan: SystemPlan, names: tuple[str, ...]) -> tuple[list[StartRow],
     return overrides, fixed, started
 
 
-@functools.lru_cache(maxsize=64)
+@remembered
 def _generic(plan: SystemPlan, solve_for: tuple[int, ...]) -> _Generic:
     """Reads no values of parameters and no starts, which equal plans need not share."""
     extended = plan.extended

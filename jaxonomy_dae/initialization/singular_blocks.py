@@ -6,13 +6,13 @@ that some Jacobian depends on are computed.
 """
 
 import dataclasses
-import functools
 from collections.abc import Callable, Iterator
 
 import numpy as np
 
 from ..judgement.rank import is_undecided, rank_of
 from ..lowering.plan import SystemPlan
+from ..lowering.remembered import remembered
 from ..lowering.schedule import SparseStep, Step, StepEquation
 from ..model.tables import ZERO
 from ..tolerances import ILL_CONDITIONED, KNOWN, RANK, SLIGHT
@@ -29,7 +29,7 @@ class _Check:
     solved: frozenset[int]
 
 
-@functools.lru_cache(maxsize=64)
+@remembered
 def _plan_check(plan: SystemPlan) -> _Check:
     examined, wanted = set(), np.zeros(plan.extended.quantities.n, bool)
     solved: set[int] = set()

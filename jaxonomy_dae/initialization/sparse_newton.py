@@ -5,7 +5,6 @@ hold, guesses included, or says that it found none; then the ladder climbs on. A
 derivatives as its pattern has colours, a step one factorization by KLU.
 """
 
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -18,6 +17,7 @@ from ..linear.choice import SPARSE_DENSITY, SPARSE_FROM
 from ..linear.sparse import SparsePattern, available, is_double, sparse_jacobian
 from ..linear.whole import solve_whole
 from ..lowering.plan import SystemPlan
+from ..lowering.remembered import remembered
 from ..tolerances import close as close_within
 from ..tolerances import solved
 from .ladder import DECREASE, METHODS, NEWTON_LIMIT, SHORTEST
@@ -46,7 +46,7 @@ class SparseFound(NamedTuple):
     evaluations: Int[Array, ""]
 
 
-@functools.lru_cache(maxsize=64)
+@remembered
 def sparse_rows(plan: SystemPlan, rows: InitialRows) -> SparseRows | None:
     """The pattern of the rows; None if dense algebra will do, or must."""
     n, equations = plan.n_state, plan.n_constraints + len(plan.carried)

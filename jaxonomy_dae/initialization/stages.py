@@ -5,7 +5,6 @@ and so on up the derivatives. All at once, from guesses of zero, their search ma
 small. What comes out is where the ladder starts, not a result.
 """
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -17,6 +16,7 @@ from jaxtyping import Array, Float, Int
 from scipy.sparse.csgraph import connected_components
 
 from ..lowering.plan import SystemPlan
+from ..lowering.remembered import remembered
 from ..structure.matching import maximum_matching
 from ..tolerances import close as close_within
 from .rows import InitialRows
@@ -26,7 +26,7 @@ LEAST_LEVEL = 2  # times that a constraint must have been differentiated for sta
 LIMIT = 40  # steps in a block
 
 
-@functools.lru_cache(maxsize=64)
+@remembered
 def stages(plan: SystemPlan, rows: InitialRows) -> tuple[np.ndarray, np.ndarray] | None:
     """For each unknown the row that is matched with it, and the place of its block in the order of solution; None where
     stages are of no use, or not known."""

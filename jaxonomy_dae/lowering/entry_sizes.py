@@ -17,10 +17,11 @@ class EntrySizes:
 
     def __init__(self, model: ReducedModel):
         self.extended = model.extended
-        guess, _ = start_guess(model)
-        networks = Networks(tuple(model.flat.networks.values()))
+        declared = model.flat.declares
+        guess, _ = start_guess(model, declared.values)
+        networks = Networks(tuple(declared.networks.values()))
         points = (guess, guess + quantity_scale(model))
-        self.points = [Point.of(values, model.flat.parameters.values, 0.0, networks) for values in points]
+        self.points = [Point.of(values, declared.values, 0.0, networks) for values in points]
         self._groups: dict[int, np.ndarray] = {}
 
     def of(self, group: int, slot: int) -> np.ndarray:

@@ -1,9 +1,7 @@
 """Lowering: the compiler's tables become the static plan of an `AcausalSystem`."""
 
 import dataclasses
-import hashlib
 from collections.abc import Sequence
-from typing import Any
 
 import lineax as lx
 import numpy as np
@@ -14,7 +12,6 @@ from ..linear.sparse import check_solvable
 from ..model.declared import leading_starts, quantity_scale
 from ..model.extended import Extended
 from ..model.quantities import QuantityMap
-from ..model.reduced import ReducedModel
 from ..model.tables import ZERO, FlatModel, RowInjection
 from .entry_sizes import EntrySizes
 from .gather import NOTHING
@@ -102,13 +99,11 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
         quantities.order[input_quantities],
     )
     in_state = np.concatenate([state_order, carried])
-    opaque = {g.template.opaque.index: g.template.opaque for g in extended.groups if g.template.opaque is not None}
-    opaque |= {r.opaque.index: r.opaque for r in flat.rows}
-    functions = tuple(opaque[k].function if k in opaque else None for k in range(len(flat.networks)))
     waves = plan_waves(needed(steps, np.concatenate([following, rates, constraint_slots, *watched]), n))
+    structure = dataclasses.replace(reduced, flat=dataclasses.replace(flat, declared=None))
     return SystemPlan(
-        digest=_digest(reduced, model.mode, selection, state_order, steps, linear_solver),
-        model=reduced,
+        model=structure,
+        leading=leading_starts(reduced, flat.declares.values),
         selection=selection,
         steps=steps,
         blocks=model.blocks,
@@ -125,8 +120,7 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
         constraints=planned_constraints,
         constraint_pattern=constraint_pattern,
         rows=rows,
-        network_names=tuple(flat.networks),
-        functions=functions,
+        network_names=flat.network_names,
         linear_solver=linear_solver,
         events=events,
         held=held,
@@ -184,50 +178,3 @@ def _plan_row(row: RowInjection, inputs, variables: QuantityMap, states, layout:
     gathers = tuple(layout.gather(np.array([q]), np.array([s])) for q, s in zip(*inputs, strict=True))
     rows = tuple(position[q] for q in targets.tolist())
     return PlannedRow(row.opaque, rows, gathers, tuple(factors.tolist()), inputs[0])
-
-
-def _digest(
-    model: ReducedModel,
-    mode: str,
-    selection: StateSelection,
-    states: np.ndarray,
-    steps: Sequence[AnyStep],
-    linear_solver: Any,
-) -> str:
-    """A digest of all that determines the plan."""
-    hasher = hashlib.sha256()
-
-    def feed(*parts: Any):
-        for part in parts:
-            hasher.update(part.tobytes() if isinstance(part, np.ndarray) else repr(part).encode())
-            hasher.update(b"|")
-
-    flat, extended = model.flat, model.extended
-    v = flat.variables
-    feed(flat.name, mode, v.names, v.is_input, v.fixed, v.nominal, v.bounds, v.default, flat.parameters.names)
-    feed(v.unit)  # guesses of one unit are measured by the largest of them
-    for s in v.start.groups:
-        feed(s.template.key, s.variable, s.parameter)
-    for d in flat.parameters.dependents:
-        feed(d.template.key, d.target, d.parameter)
-    for g in flat.groups:
-        feed(g.template.key, g.variable, g.order, g.factor, g.parameter, g.coefficient)
-    for name in flat.networks:
-        feed(name)
-    for a in flat.accounts:
-        feed(a.kind, a.template.key, a.variable, a.order, a.parameter, a.component)
-    for row in flat.rows:
-        feed(row.opaque.index, row.targets, row.inputs, sorted(row.opaque.time_positions))
-    events = vars(flat.events) | {"clocks": None}
-    feed(*events.values(), flat.parameters.discrete)
-    feed(*((s.template.key, s.parameters) if s else "once" for clock in flat.events.clocks for s in clock))
-    feed(*vars(flat.held).values(), flat.parameters.n_relations)
-    if linear_solver is not None:
-        feed(repr(linear_solver))
-    feed(states, selection.constraints, selection.dummies, extended.base, extended.level)
-    feed(leading_starts(model))  # depend on the values of parameters
-    for step in steps:
-        # How a block is torn depends on the values of the parameters.
-        if len(step.unknown) > 1 or step.whole:
-            feed(step.elimination, *step.unknown)
-    return hasher.hexdigest()

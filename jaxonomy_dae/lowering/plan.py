@@ -14,6 +14,7 @@ from ..errors import ModelError, nearest
 from ..linear.sparse import SparsePattern
 from ..model.array_names import inner_name, one_by_one
 from ..model.extended import Extended, ExtendedGroup
+from ..model.identity import Identity
 from ..model.opaque import OpaqueFunction
 from ..model.provenance import differentiated
 from ..model.quantities import QuantityMap
@@ -93,10 +94,13 @@ class InputTable:
 
 @dataclasses.dataclass(frozen=True)
 class SystemPlan:
-    """All that is static about a compiled system; compared and hashed by its digest."""
+    """All that is static about a compiled system, and no value that may be another later.
 
-    digest: str
+    Plans are equal if all that they consist of is equal: programs that were compiled for one serve the other.
+    """
+
     model: ReducedModel
+    leading: np.ndarray  # the variables whose starts count, one for each quantity that has any
     selection: StateSelection
     steps: tuple[AnyStep, ...]
     blocks: Blocks
@@ -115,19 +119,25 @@ class SystemPlan:
     constraint_pattern: tuple[frozenset[int], ...] | None
     rows: tuple[PlannedRow, ...]
     network_names: tuple[str, ...]
-    functions: tuple[Any, ...]
     linear_solver: lx.AbstractLinearSolver | None  # of blocks that stay whole
     events: EventPlan | None
     held: HeldPlan | None  # constraints that come and go with modes
     waves: tuple[WaveGroup, ...]  # that states, conditions and constraints depend on
 
     def __eq__(self, other):
-        if not isinstance(other, SystemPlan) or self.digest != other.digest:
-            return False
-        return self.functions == other.functions and bool(self.linear_solver == other.linear_solver)
+        return self is other or (isinstance(other, SystemPlan) and self._identity == other._identity)
 
     def __hash__(self):
-        return hash(self.digest)
+        return hash(self._identity)
+
+    @functools.cached_property
+    def _identity(self) -> Identity:
+        return Identity.of(self)
+
+    @property
+    def digest(self) -> str:
+        """A digest of the structure, the same in every process; functions in it are told apart by names alone."""
+        return self._identity.digest
 
     @property
     def flat(self) -> FlatModel:
@@ -203,7 +213,17 @@ class SystemPlan:
 
     def reading(self, quantities: np.ndarray) -> Program:
         """The program that computes these quantities and nothing else."""
-        return _reading(self, tuple(np.unique(quantities).tolist()))
+        wanted = np.unique(quantities)
+        key = wanted.tobytes()
+        if key not in self._programs:
+            n, n_unknown = self.extended.quantities.n, self.extended.quantities.n_unknown
+            inputs, steps = np.arange(n_unknown, n), needed(self.steps, wanted, n)
+            self._programs[key] = plan(steps, self.states, inputs, n, self.carried, self.linear_solver)
+        return self._programs[key]
+
+    @functools.cached_property
+    def _programs(self) -> dict[bytes, Program]:
+        return {}
 
     def quantity_of(self, variable: int) -> tuple[int, float]:
         """(quantity, factor) of a variable; quantity ZERO if it is identically zero."""
@@ -282,11 +302,3 @@ class SystemPlan:
             quantity.append(q if q == ZERO else q + order)
             factor.append(s)
         return np.array(quantity, np.int64), np.array(factor, float)
-
-
-@functools.lru_cache(maxsize=256)
-def _reading(system: SystemPlan, quantities: tuple[int, ...]) -> Program:
-    steps = needed(system.steps, np.array(quantities, np.int64), system.extended.quantities.n)
-    inputs = np.arange(system.extended.quantities.n_unknown, system.extended.quantities.n)
-    n = system.extended.quantities.n
-    return plan(steps, system.states, inputs, n, system.carried, system.linear_solver)

@@ -13,13 +13,14 @@ from .group import Point
 from .jacobian import residual_and_jacobian
 from .networks import Networks
 from .reduced import ReducedModel
+from .tables import Declared
 
 
-def initial_point(model: ReducedModel) -> Point:
+def initial_point(model: ReducedModel, declared: Declared) -> Point:
     """All quantities near the declared starts, consistent where possible."""
-    guess, pins = start_guess(model)
-    networks = Networks(tuple(model.flat.networks.values()))
-    at = Point.of(guess, model.flat.parameters.values, 0.0, networks)
+    guess, pins = start_guess(model, declared.values)
+    networks = Networks(tuple(declared.networks.values()))
+    at = Point.of(guess, declared.values, 0.0, networks)
     return consistent_point(model.extended, at, list(pins.items()))
 
 

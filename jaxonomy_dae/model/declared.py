@@ -32,28 +32,31 @@ def quantity_bounds(model: ReducedModel) -> np.ndarray:
     return np.stack([low, high], axis=-1)
 
 
-def leading_starts(model: ReducedModel) -> Int[np.ndarray, " variables"]:
+def leading_starts(model: ReducedModel, parameters: np.ndarray) -> Int[np.ndarray, " variables"]:
     """The variables whose starts count, one for each quantity that has any.
 
-    A fixed start goes before a guess. Of guesses it is the one that is larger at the declared values, and the positive
-    one of two that differ in sign: zero is what is written where nothing is known, and a rule by place or by name would
-    let these decide which branch a model starts on.
+    A fixed start goes before a guess. Of guesses it is the one that is larger at these values of the parameters, and
+    the positive one of two that differ in sign: zero is what is written where nothing is known, and a rule by place or
+    by name would let these decide which branch a model starts on.
     """
     flat, variables = model.flat, model.variables
     v = np.flatnonzero(flat.variables.start.is_given & (variables.quantity >= 0))
-    value = flat.variables.start.values(flat.parameters.values)[v] / variables.factor[v]
+    value = flat.variables.start.values(parameters)[v] / variables.factor[v]
     order = np.lexsort((-v, value, np.abs(value), flat.variables.fixed[v]))
     last = np.full(int(variables.quantity.max(initial=-1)) + 1, -1)
     last[variables.quantity[v[order]]] = v[order]
     return last[last >= 0]
 
 
-def start_guess(model: ReducedModel) -> tuple[np.ndarray, dict[int, float]]:
-    """The declared starts of all quantities (zero where there is none), and those that are fixed."""
+def start_guess(
+    model: ReducedModel, parameters: np.ndarray, leading: np.ndarray | None = None
+) -> tuple[np.ndarray, dict[int, float]]:
+    """The declared starts of all quantities (zero where there is none), and those that are fixed, at these values of
+    the parameters; of the variables in `leading`, if it is given."""
     flat, variables = model.flat, model.variables
     guess = np.zeros(model.extended.quantities.n)
-    chosen = leading_starts(model)
+    chosen = leading_starts(model, parameters) if leading is None else leading
     q, fixed = variables.quantity[chosen], flat.variables.fixed[chosen]
-    value = flat.variables.start.values(flat.parameters.values)[chosen] / variables.factor[chosen]
+    value = flat.variables.start.values(parameters)[chosen] / variables.factor[chosen]
     guess[q] = value
     return guess, dict(zip(q[fixed].tolist(), value[fixed].tolist(), strict=True))

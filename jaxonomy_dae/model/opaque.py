@@ -144,6 +144,14 @@ class OpaqueTemplate(AbstractTemplate):
         }
 
     def _numpy(self, what: str, slots, t, networks) -> np.ndarray:
+        if not networks.weights:  # none is known: they count as zero
+            columns = np.stack(np.broadcast_arrays(*slots), axis=-1).astype(float)
+            one_hot = np.arange(len(slots)) == 0
+            return {
+                "value": np.zeros(columns.shape[:-1]),
+                "residual": columns[..., 0],
+                "partials": np.broadcast_to(one_hot.astype(float), columns.shape),
+            }[what]
         # These are constants, also while a user's function is being traced.
         with jax.ensure_compile_time_eval():
             columns = jnp.asarray(np.stack(np.broadcast_arrays(*slots), axis=-1), dtype=float)

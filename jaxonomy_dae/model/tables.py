@@ -14,7 +14,6 @@ import numpy as np
 from ..modeling.interval import Interval
 from .array_names import ArrayNames
 from .opaque import OpaqueFunction
-from .pickling import functions_by_name, named_functions
 from .provenance import Provenance, Provenances
 from .symbolic import SymbolicTemplate
 from .template import AbstractTemplate
@@ -58,6 +57,12 @@ class Starts(Sequence[Start | None]):
         """True for variables that have a start which no parameter changes."""
         number = [group.parameter.shape[1] == 0 for group in self.groups]
         return np.array([*number, False], bool)[self._place[:, 0]]
+
+    @property
+    def is_zero(self) -> np.ndarray:
+        """True for variables whose start is the number zero."""
+        most = max((int(group.parameter.max(initial=-1)) for group in self.groups), default=-1)
+        return self.is_number & (self.values(np.ones(most + 1)) == 0.0)
 
     def values(self, parameters: np.ndarray) -> np.ndarray:
         """The starts of all variables, zero where there is none."""
@@ -138,16 +143,25 @@ class ParameterTable:
     """The declarations of all parameters, by id."""
 
     names: list[str]
-    values: np.ndarray
     units: list[str]
     bounds: list[Interval]
     dependents: tuple[DependentParameters, ...]  # each reads only what those before it have computed
     expressions: dict[int, str]  # of the dependent ones, in full names
     discrete: np.ndarray  # those that events assign, hidden ones last, such as relations that are events
-    n_relations: int  # how many hidden ones follow what was declared; then comes what `discrete` was before an event
+    relation_starts: np.ndarray  # of the hidden ones, which follow what was declared
 
     def __len__(self):
         return len(self.names)
+
+    @property
+    def n_relations(self) -> int:
+        """The number of hidden ones; what `discrete` was before an event comes after them."""
+        return len(self.relation_starts)
+
+    def everything(self, declared: np.ndarray) -> np.ndarray:
+        """The values of all parameters, given those that were declared, (n_declared,)."""
+        values = np.concatenate([declared, self.relation_starts])
+        return np.concatenate([values, values[self.discrete]])
 
     @property
     def n_declared(self) -> int:
@@ -272,13 +286,22 @@ class AccountGroup:
 
 
 @dataclasses.dataclass(frozen=True)
+class Declared:
+    """What components declare beside the structure of the model: numbers and networks that may be others later."""
+
+    values: np.ndarray  # of all parameters
+    networks: dict[str, Any]
+
+
+@dataclasses.dataclass(frozen=True)
 class FlatModel:
     """A flattened model."""
 
     variables: VariableTable
     parameters: ParameterTable
     groups: tuple[EquationGroup, ...]
-    networks: dict[str, Any]
+    declared: Declared | None  # None in a plan, which is structure alone
+    network_names: tuple[str, ...]
     rows: tuple[RowInjection, ...]
     components: list[str]  # full names, by id
     ports: PortTable
@@ -288,11 +311,11 @@ class FlatModel:
     accounts: tuple[AccountGroup, ...] = ()
     arrays: ArrayNames = ArrayNames()
 
-    def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"networks": functions_by_name(self.networks)}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state | {"networks": named_functions(state["networks"])})
+    @property
+    def declares(self) -> Declared:
+        """What the compiler may read of declared numbers and networks."""
+        assert self.declared is not None, "a plan holds no values"
+        return self.declared
 
     @property
     def n_equations(self) -> int:

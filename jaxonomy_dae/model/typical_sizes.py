@@ -24,10 +24,12 @@ def _rounded(sizes: Float[np.ndarray, " quantities"]) -> Float[np.ndarray, " qua
     return 2.0 ** np.round(np.log2(sizes))
 
 
-def unrounded_sizes(model: ReducedModel) -> Float[np.ndarray, " quantities"]:
+def unrounded_sizes(
+    model: ReducedModel, parameters: Float[np.ndarray, " parameters"]
+) -> Float[np.ndarray, " quantities"]:
     """As `typical_sizes` before rounding to powers of two. State selection compares sizes, and rounding could turn a
     small difference into a factor of two."""
-    return _unrounded(model, model.flat.parameters.values)
+    return _unrounded(model, parameters)
 
 
 def _unrounded(model: ReducedModel, parameters: np.ndarray) -> np.ndarray:

@@ -1,5 +1,6 @@
 """`simulate`: a compiled system integrated by Diffrax."""
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,7 +13,6 @@ import numpy as np
 from ..adjoint.stored_adjoint import default_adjoint
 from ..errors import InitializationError, SimulationError
 from ..initialization.check import check
-from ..lowering.plan import SystemPlan
 from ..programs.cache import PROGRAMS
 from ..programs.staging import is_forwards, is_staged, is_traced
 from ..solvers import BDF, Rodas5P, Tsit5
@@ -22,7 +22,7 @@ from ..solvers.solve import check_tolerances, default_tolerances
 from ..solvers.solve_arguments import jump_times
 from ..solvers.switching import BOUNDARY, MANY, Watch
 from ..system.inputs import check_range, read_inputs, step_ends
-from ..system.solver_choice import Choice, fastest_decay, implicit_choice, solver_choice
+from ..system.solver_choice import Choice, Stiffness, implicit_choice, solver_choice
 from ..system.system import AcausalSystem
 from .arguments import check_arguments, check_parameters
 from .failures import explain, mode_at_start, raised
@@ -144,7 +144,8 @@ def simulate(
         ts = jnp.asarray(ts, dtype)
         if not is_traced((t0, t1, ts)):
             ts = jnp.asarray(np.clip(ts, t0, t1), dtype)  # `check_arguments` lets rounding pass, Diffrax does not
-    given = (system, t0, t1, ts, inputs, initial)
+    # The solver is chosen here, so that the programs of models that differ in how stiff they are are the same.
+    given = (dataclasses.replace(system, stiffness=None), t0, t1, ts, inputs, initial)
     most_events = MOST_EVENTS if max_events is None else max_events
     sides_possible = not is_traced((given, adjoint, stepsize_controller))
 
@@ -177,12 +178,12 @@ def simulate(
         else:  # under `jax.grad` and `jax.vmap` outside of jit, where values are known
             checked = throw is not False
             outcome = run_compiled(given, options(solver), None)
-        return _traced(outcome, given, choice, checked, (max_steps, most_events))
+        return _traced(outcome, system, inputs, choice, checked, (max_steps, most_events))
 
     traced = is_traced((given, options(solver)))
     switches = not choice.final and stepsize_controller is None
     if traced:
-        why = _stiff_without_a_run(system.plan, duration) if switches else ""
+        why = _stiff_without_a_run(system.stiffness, duration) if switches else ""
         if why:
             choice = implicit_choice(system.plan, why)
             solver = SOLVERS[choice.solver]()
@@ -236,19 +237,19 @@ def simulate(
     return solution
 
 
-def _stiff_without_a_run(plan: SystemPlan, duration: float | None) -> str:
+def _stiff_without_a_run(stiffness: Stiffness | None, duration: float | None) -> str:
     """The reason to count a system as stiff where an explicit solver cannot be tried first, inside jit; "" if it is
     not. Runs outside of jit leave no trace for this: the result would depend on what the process did before."""
-    if duration is None or fastest_decay(plan) * duration <= BOUNDARY * MANY:
+    if stiffness is None or duration is None or stiffness.decay * duration <= BOUNDARY * MANY:
         return ""
-    return f"stiff: at the declared start something decays within {1 / fastest_decay(plan):.2g}"
+    return f"stiff: at the declared start something decays within about {1 / stiffness.decay:.0e}"
 
 
 def _traced(
-    outcome: Outcome, given: tuple[Any, ...], choice: Choice, checked: bool, bounds: tuple[int, int]
+    outcome: Outcome, system: AcausalSystem, inputs: Any, choice: Choice, checked: bool, bounds: tuple[int, int]
 ) -> Solution:
     """The solution where values cannot be read: inside jit, grad or vmap."""
-    system, inputs, x = given[0], given[4], outcome.x
+    x = outcome.x
     if checked:
         x = raised(x, outcome.result, system.plan.events is not None, *bounds)
     return Solution(

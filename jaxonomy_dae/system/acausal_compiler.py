@@ -20,6 +20,7 @@ from ..modeling.environment import EqnEnv
 from ..modeling.networks import as_weights
 from .parameters import ParameterNames, Parameters
 from .report import SystemReport
+from .solver_choice import Stiffness
 from .system import AcausalSystem
 
 Mode = Literal["auto", "dummy_derivatives", "projection"]
@@ -97,19 +98,19 @@ class AcausalCompiler:
             check_units_of(self.diagram)
         model = compile_flat(flat, self.state_selection, self.prefer_states)
         plan = lower(model, self.linear_solver)
-        self._report = SystemReport(plan)
-        declared = flat.parameters
-        n = declared.n_declared
-        table = ParameterNames(
-            declared.names[:n], declared.units[:n], declared.bounds[:n], declared.dependents, declared.expressions,
-            flat.arrays, plan.digest,
+        table, declared = flat.parameters, flat.declares
+        self._report = SystemReport(plan, declared.values)
+        n = table.n_declared
+        names = ParameterNames(
+            table.names[:n], table.units[:n], table.bounds[:n], table.dependents, table.expressions, flat.arrays,
+            plan.digest,
         )  # fmt: skip
         with jax.ensure_compile_time_eval():  # also where it is called while a function is traced
             values = jnp.asarray(declared.values[:n], dtype=jnp.result_type(float))
             sizes = jnp.asarray(typical_sizes(model.reduced, declared.values), dtype=values.dtype)
-        parameters = Parameters(values, None, (), table)
-        neural = {name: _own(network) for name, network in flat.networks.items()}
-        return AcausalSystem(parameters, neural, sizes, plan)
+        parameters = Parameters(values, None, (), names)
+        neural = {name: _own(network) for name, network in declared.networks.items()}
+        return AcausalSystem(parameters, neural, sizes, plan, Stiffness(plan.model, declared.values))
 
 
 def _own(network: Any) -> Any:

@@ -18,6 +18,9 @@ from jax.core import Tracer
 
 from ..private_names import private
 
+# Parameters of JAX's calls of functions with rules of their own for derivatives that hold the rules.
+RULES = ("jvp_jaxpr_fun", "fwd_jaxpr_thunk", "bwd", "out_trees")
+
 
 @dataclasses.dataclass(frozen=True)
 class _TracedFunction:
@@ -82,8 +85,9 @@ def _is_data(literal: Any) -> bool:
     return jnp.issubdtype(literal.aval.dtype, jnp.inexact) or bool(np.shape(literal.val))
 
 
-def _key_of_jaxpr(jaxpr: Any) -> Hashable:
-    """A hashable value that two jaxprs share only if they compute the same from the same constants."""
+def _key_of_jaxpr(jaxpr: Any, inside: tuple[Hashable, ...] = ()) -> Hashable:
+    """A hashable value that two jaxprs share only if they compute the same from the same constants, derivatives
+    included. `inside` are the functions with rules of their own for derivatives in whose rules the jaxpr stands."""
     number: dict[Any, int] = {}
     literal = private("Literal")
 
@@ -98,22 +102,51 @@ def _key_of_jaxpr(jaxpr: Any) -> Hashable:
             equation.primitive,
             tuple(atom(a) for a in equation.invars),
             tuple((atom(v), v.aval.str_short()) for v in equation.outvars),
-            tuple((name, _key(value)) for name, value in sorted(equation.params.items())),
+            tuple((name, _key(value, inside)) for name, value in sorted(equation.params.items()) if name not in RULES),
+            _key_of_rules(equation, inside),
         )
         for equation in jaxpr.eqns
     )
     return head, body, tuple(atom(v) for v in jaxpr.outvars)
 
 
-def _key(value: Any) -> Hashable:
+def _key_of_rules(equation: Any, inside: tuple[Hashable, ...]) -> Hashable:
+    """The derivatives of a function that has rules of its own, such as `jax.nn.relu`, by what the rules compute.
+
+    JAX holds the rules as functions made anew whenever the function is traced, so that they tell nothing themselves.
+    Rules that cannot be traced by themselves are compared as objects.
+    """
+    rules = {name: equation.params[name] for name in RULES if name in equation.params}
+    if not rules:
+        return None
+    own = _key(equation.params["call_jaxpr"], inside)
+    if inside.count(own) > 1:
+        return "again"  # the rule of relu calls relu
+    inside = (*inside, own)
+    nonzero = [False] * len(equation.invars)
+    try:
+        if "jvp_jaxpr_fun" in rules:
+            jaxpr, constants, zeros = rules["jvp_jaxpr_fun"].call_wrapped(*nonzero)
+            return _key_of_jaxpr(jaxpr, inside), _key(constants), tuple(zeros)
+        forwards, constants = rules["fwd_jaxpr_thunk"].call_wrapped(*nonzero)
+        computed = iter(forwards.outvars)  # what is kept for the way back, but for arguments that are kept as they are
+        kept = [next(computed) if k is None else equation.invars[k] for k in rules["out_trees"]()[2]]
+        given = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in (*kept, *equation.outvars)]
+        backwards = jax.make_jaxpr(lambda *values: rules["bwd"].call_wrapped(*values))(*given)
+        return _key_of_jaxpr(forwards, inside), _key(constants), _key(backwards, inside)
+    except Exception:  # JAX promises nothing of how it holds them
+        return tuple((name, _Same(rule)) for name, rule in rules.items())
+
+
+def _key(value: Any, inside: tuple[Hashable, ...] = ()) -> Hashable:
     if isinstance(value, private("ClosedJaxpr")):
-        return _key_of_jaxpr(value.jaxpr), tuple(_key(c) for c in value.consts)
+        return _key_of_jaxpr(value.jaxpr, inside), tuple(_key(c) for c in value.consts)
     if isinstance(value, private("Jaxpr")):
-        return _key_of_jaxpr(value)
+        return _key_of_jaxpr(value, inside)
     if isinstance(value, tuple | list):
-        return type(value).__name__, tuple(_key(v) for v in value)
+        return type(value).__name__, tuple(_key(v, inside) for v in value)
     if isinstance(value, dict):
-        return tuple((k, _key(v)) for k, v in sorted(value.items()))
+        return tuple((k, _key(v, inside)) for k, v in sorted(value.items()))
     if isinstance(value, Tracer):
         return _Same(value)
     if isinstance(value, np.ndarray | np.generic | jax.Array) or hasattr(value, "__array__"):

@@ -24,13 +24,14 @@ class SystemReport(Sections):
     (equations that change with discrete variables) and `index_changes` (the constraints that come and go with them, and
     the index while they hold).
 
-    `values` are those of all parameters, as they were declared if not given: starts and periods depend on them.
+    `values` are those of all parameters, on which starts and periods depend; None where they are not known, inside jit
+    and in a batch.
     """
 
     def __init__(self, plan: SystemPlan, values: np.ndarray | None = None):
         self._plan = plan
         flat = plan.flat
-        self._values = flat.parameters.values if values is None else values
+        self._values = values
         self.n_equations = flat.n_equations
         self.n_unknowns = len(flat.variables) - int(flat.variables.is_input.sum())
         self.n_aliases = len(plan.model.alias.eliminated)
@@ -112,10 +113,9 @@ class SystemReport(Sections):
     @property
     def discretes(self) -> list[str]:
         """The discrete variables and their starts."""
-        flat = self._plan.flat
-        return (
-            [f"{flat.parameters.names[p]} = {self._values[p]:g}" for p in _declared(flat)] if len(flat.events) else []
-        )
+        flat, values = self._plan.flat, self._values
+        names = [(p, flat.parameters.names[p]) for p in _declared(flat)] if len(flat.events) else []
+        return [name if values is None else f"{name} = {values[p]:g}" for p, name in names]
 
     @property
     def events(self) -> list[str]:
@@ -141,9 +141,13 @@ class SystemReport(Sections):
         flat, table = self._plan.flat, self._plan.flat.events
         out = []
         for e in _noted(table):
-            if e < len(table.clocks):
+            if e >= len(table.clocks):
+                continue
+            when = ""
+            if self._values is not None:
                 period, offset = (_number(part, self._values) for part in table.clocks[e])
-                out.append(f"{table.text[e]}, every {period:g} s from {offset:g} s: {_actions(flat, e)}")
+                when = f", every {period:g} s from {offset:g} s"
+            out.append(f"{table.text[e]}{when}: {_actions(flat, e)}")
         return out
 
     @property

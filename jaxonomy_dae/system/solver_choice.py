@@ -7,6 +7,8 @@ import numpy as np
 from ..lowering.plan import SystemPlan
 from ..model.consistent_point import initial_point
 from ..model.jacobian import residual_and_jacobian
+from ..model.reduced import ReducedModel
+from ..model.tables import Declared
 from ..solvers.solve import SMALL
 from ..tolerances import RANK, TINY
 
@@ -41,28 +43,50 @@ def implicit_choice(plan: SystemPlan, why: str) -> Choice:
     return Choice("BDF", f"{why}; cheaper for {plan.n_state} unknowns", True)
 
 
-def fastest_decay(plan: SystemPlan) -> float:
+class Stiffness:
+    """How fast a model decays at its declared start, to a decade: a static part of a system.
+
+    A program for traced values must choose a solver without knowing them, so that this belongs to what the program is
+    made for: of two models that are alike but for their parameters, a stiff one must not run the explicit program of
+    the other. The decade is found when it is first asked for: most runs try an explicit solver, and never ask.
+    """
+
+    def __init__(self, model: ReducedModel, parameters: np.ndarray):
+        self._found: float | None = None
+        self._asked = model, parameters
+
+    @property
+    def decay(self) -> float:
+        """The fastest decay per unit of time, to the nearest power of ten; 0 if there is none."""
+        if self._found is None:
+            fastest = fastest_decay(*self._asked)
+            self._found = 0.0 if fastest == 0.0 else float(10.0 ** np.round(np.log10(fastest)))
+        return self._found
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Stiffness):
+            return False
+        return self is other or np.array_equal(self._asked[1], other._asked[1]) or self.decay == other.decay
+
+    def __hash__(self) -> int:
+        return 0  # all else that is static tells models apart
+
+
+@np.errstate(all="ignore")
+def fastest_decay(model: ReducedModel, parameters: np.ndarray) -> float:
     """The largest −Re λ among the eigenvalues λ that decay rather than oscillate, per unit of time; 0 if there are
     none, or if the system is large.
 
     The equations, linearised at a consistent point, leave the quantities q = N c free, with N a basis of the null space
     of ∂F/∂q. Each quantity v and its derivative obey d(N_v c)/dt = N_v' c, so c' = N_v⁺ N_v' c: the eigenvalues of that
-    matrix are those of the system, whatever its index and its states.
+    matrix are those of the system, whatever its index and its states. Networks count as zero: their weights change.
     """
-    known = vars(plan)
-    if "_fastest_decay" not in known:  # as `functools.cached_property` does; not by the digest, which knows no values
-        known["_fastest_decay"] = _fastest_decay(plan)
-    return known["_fastest_decay"]
-
-
-@np.errstate(all="ignore")
-def _fastest_decay(plan: SystemPlan) -> float:
-    quantities = plan.extended.quantities
+    quantities = model.extended.quantities
     n = quantities.n_unknown
     if not 0 < n <= LARGE:
         return 0.0
-    at = initial_point(plan.model)
-    matrix = residual_and_jacobian(plan.extended, at)[1].toarray()[:, :n]
+    at = initial_point(model, Declared(parameters, {}))
+    matrix = residual_and_jacobian(model.extended, at)[1].toarray()[:, :n]
     if not np.isfinite(matrix).all():
         return 0.0
     rows = np.maximum(np.abs(matrix).max(axis=1, initial=0.0), TINY)[:, None]

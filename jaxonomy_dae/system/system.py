@@ -25,6 +25,7 @@ from .evaluate import Refinement
 from .input_values import missing_input
 from .inputs import read_inputs
 from .parameters import Parameters
+from .solver_choice import Stiffness
 from .system_at import SystemAt
 
 
@@ -44,6 +45,7 @@ class AcausalSystem(eqx.Module):
     neural: dict[str, Any]
     typical_sizes: Float[Array, " quantities"]
     plan: SystemPlan = eqx.field(static=True)
+    stiffness: Stiffness | None = eqx.field(static=True)  # None where no solver is left to be chosen
     modes: Float[Array, "*batch relations"] | None = None  # hidden discrete variables, within a run
 
     # --- names -------------------------------------------------------------------------------------------------
@@ -84,7 +86,9 @@ class AcausalSystem(eqx.Module):
         return SystemReport(self.plan, self.parameters.known)
 
     def __reduce__(self):
-        return _unpickled, (self.parameters, functions_by_name(self.neural), self.typical_sizes, self.plan)
+        return _unpickled, (
+            self.parameters, functions_by_name(self.neural), self.typical_sizes, self.plan, self.stiffness, self.modes
+        )  # fmt: skip
 
     def __repr__(self):
         plan = self.plan
@@ -131,9 +135,7 @@ class AcausalSystem(eqx.Module):
         known, plan = parameters.known, self.plan
         if known is None or isinstance(self.typical_sizes, Tracer):
             return self.typical_sizes
-        values = plan.flat.parameters.values.copy()
-        values[: len(known)] = known
-        sizes = typical_sizes(plan.model, values)
+        sizes = typical_sizes(plan.model, plan.flat.parameters.everything(known))
         with jax.ensure_compile_time_eval():
             return jnp.asarray(sizes, self.typical_sizes.dtype)
 
@@ -260,7 +262,7 @@ class AcausalSystem(eqx.Module):
             table = self.plan.flat.parameters
             if not table.n_relations:
                 return array
-            hidden = jnp.asarray(table.values[table.n_declared : table.n_declared + table.n_relations], array.dtype)
+            hidden = jnp.asarray(table.relation_starts, array.dtype)
             hidden = jnp.broadcast_to(hidden, (*array.shape[:-1], len(hidden)))
             shown = array[..., table.discrete[: len(table.discrete) - table.n_relations]]
             return jnp.concatenate([array, hidden, shown, hidden], axis=-1)
@@ -278,7 +280,7 @@ class AcausalSystem(eqx.Module):
             array = complete(events.dependents, array.at[chosen].set(values[:n]))
         # A start that is an expression holds at the start alone.
         parameters = Parameters(array, None, (), self.parameters.table.given(chosen))
-        return AcausalSystem(parameters, self.neural, self.typical_sizes, self.plan, values[n:])
+        return AcausalSystem(parameters, self.neural, self.typical_sizes, self.plan, None, values[n:])
 
     def around_event(self, t: Any, values: Any, previous: Any, args: Any = None) -> SystemAt:
         """`at`, with discrete variables that have these values and had others before the event at hand."""
@@ -295,7 +297,8 @@ class AcausalSystem(eqx.Module):
             return jnp.zeros((0,))
         array = self.parameters.array
         visible = array[..., events.discrete[: events.n_visible]]
-        starts = self.plan.flat.parameters.values[events.discrete[events.n_visible :]]
+        table = self.plan.flat.parameters
+        starts = table.relation_starts[events.discrete[events.n_visible :] - table.n_declared]
         hidden = jnp.broadcast_to(jnp.asarray(starts, array.dtype), (*visible.shape[:-1], len(starts)))
         return jnp.concatenate([visible, hidden if self.modes is None else self.modes], axis=-1)
 
@@ -515,5 +518,5 @@ class AcausalSystem(eqx.Module):
         return names
 
 
-def _unpickled(parameters: Parameters, neural: Any, typical_sizes: Any, plan: SystemPlan) -> AcausalSystem:
-    return AcausalSystem(parameters, named_functions(neural), typical_sizes, plan)
+def _unpickled(parameters: Parameters, neural: Any, *others: Any) -> AcausalSystem:
+    return AcausalSystem(parameters, named_functions(neural), *others)

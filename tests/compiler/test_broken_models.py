@@ -35,7 +35,7 @@ def pencil(flat, seed=0) -> np.ndarray:
     s = rng.uniform(0.7, 1.3)
     values = rng.uniform(0.5, 1.5, (n, 3))
     matrix, row = np.zeros((flat.n_equations, n)), 0
-    parameters = np.clip(flat.parameters.values, -10.0, 10.0)  # 1e300 is regular, though not in float64
+    parameters = np.clip(flat.declares.values, -10.0, 10.0)  # 1e300 is regular, though not in float64
     for group in flat.groups:
         slots = list(values[group.variable, group.order].T)
         partials = group.template.partial_values(
@@ -65,7 +65,7 @@ def check(recipe):
         flat = flatten(compiler_of(recipe, names).diagram)
     except ModelError:
         return "malformed"
-    if flat.networks:
+    if flat.network_names:
         return "learned"
     if "start" in text or text.startswith("ModelError"):
         return "starts"

@@ -21,7 +21,7 @@ def compiled(write):
 def waves(system):
     """{(ω, φ)} of the plan, evaluated in NumPy."""
     plan, found = system.plan, set()
-    values = np.asarray(plan.flat.parameters.values, float)
+    values = plan.flat.parameters.everything(system.parameters.known)
     for group in plan.waves:
         given = [values[c] for c in group.parameter.T], list(group.coefficient.T)
         n = len(group.parameter)

@@ -156,15 +156,16 @@ def verdict(diagram: AcausalDiagram, mode: str, seed: int | None = None) -> str:
     is_start = np.zeros(len(flat.parameters), bool)
     for group in flat.variables.start.groups:
         is_start[group.parameter] = True
-    parameters = moved(flat.parameters.values, is_start, seed)
-    flat = dataclasses.replace(flat, parameters=dataclasses.replace(flat.parameters, values=parameters))
+    parameters = moved(flat.declares.values, is_start, seed)
+    declared = dataclasses.replace(flat.declares, values=parameters)
+    flat = dataclasses.replace(flat, declared=declared)
     try:
         plan = lower(compile_flat(flat, mode, ()))
     except StructuralError:
         return "refused"
-    at = initial_point(plan.model)
+    at = initial_point(plan.model, declared)
     values = at.values[:-1].copy()
-    _, fixed = start_guess(plan.model)
+    _, fixed = start_guess(plan.model, parameters)
     values[list(fixed)] = list(fixed.values())
     x = values[[*plan.states, *plan.carried]]
     x = moved(x, np.ones(len(x), bool), seed)
