@@ -158,6 +158,10 @@ class ParameterTable:
         """The number of hidden ones; what `discrete` was before an event comes after them."""
         return len(self.relation_starts)
 
+    def starts_of(self, relations: np.ndarray) -> np.ndarray:
+        """The starts of hidden discrete variables, given their ids."""
+        return self.relation_starts[relations - self.n_declared]
+
     def everything(self, declared: np.ndarray) -> np.ndarray:
         """The values of all parameters, given those that were declared, (n_declared,)."""
         values = np.concatenate([declared, self.relation_starts])

@@ -213,7 +213,7 @@ def without_clocked(system: AcausalSystem, q: Any) -> Any:
     chosen = np.unique(table.discrete[clocked])
     if not len(chosen):
         return q
-    return q.at[chosen].set(jnp.asarray(system.plan.flat.parameters.values[events.discrete[chosen]], q.dtype))
+    return q.at[chosen].set(jnp.asarray(system.plan.flat.parameters.starts_of(events.discrete[chosen]), q.dtype))
 
 
 def _choices(table: EventTable, n_clocks: int) -> tuple[tuple[int, ...], tuple[int, ...]]:

@@ -297,8 +297,7 @@ class AcausalSystem(eqx.Module):
             return jnp.zeros((0,))
         array = self.parameters.array
         visible = array[..., events.discrete[: events.n_visible]]
-        table = self.plan.flat.parameters
-        starts = table.relation_starts[events.discrete[events.n_visible :] - table.n_declared]
+        starts = self.plan.flat.parameters.starts_of(events.discrete[events.n_visible :])
         hidden = jnp.broadcast_to(jnp.asarray(starts, array.dtype), (*visible.shape[:-1], len(starts)))
         return jnp.concatenate([visible, hidden if self.modes is None else self.modes], axis=-1)
 

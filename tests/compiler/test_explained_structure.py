@@ -291,7 +291,7 @@ CASES = {
         "determine is zero. Give other values, or leave the component out.",
     ),
     "masses that cancel": (
-        lambda: model({"a": "Mass", "b": "FreeMass"}, "a.flange b.flange", a={"M": 1.0}, b={"M": -1.0}),
+        lambda: model({"a": "Mass", "b": "FreeMass"}, "a.flange b.flange", a={"m": 1.0}, b={"M": -1.0}),
         "these equations are singular for a.M = 1, b.M = -1, though not in general. Change the parameters, or "
         "state the constraint that follows as an equation of its own:\n"
         "  a: 0 = M*der(v) - flange.f\n"
