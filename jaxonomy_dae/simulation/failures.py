@@ -20,6 +20,7 @@ from .arguments import NOT_ADMITTED, TEXT
 from .event_log import Events
 from .failed_blocks import equation_not_finite, failed_block
 from .hybrid_problem import RESTART, resolution
+from .lost_constraints import lost_constraint
 from .preparation import term_of
 from .solution import Solution
 from .step_sizes import scaled_atol
@@ -107,6 +108,9 @@ def explain(
     singular = _singular_choice(solution, first, t, x)
     if singular:
         return f"{singular}."
+    found = lost_constraint(system, inputs, t, x, t1)
+    if found:
+        return f"the integration stopped at t={float(t):g}: {found}."
     block = failed_block(system, first, last, t1, inputs)
     if block:
         return how_it_stopped(solution.result, t, max_steps) + block

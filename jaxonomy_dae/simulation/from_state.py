@@ -20,7 +20,7 @@ ITERATIONS = 8  # Gauss–Newton steps onto the constraints; they converge quadr
 def from_state(system: AcausalSystem, t0: Time, inputs: Any, x: Float[Array, " n"]) -> InitialPoint:
     """The consistent point next to a state. The search is not differentiated; a last step carries first derivatives by
     the state and by parameters, which are those of the projection at the point found."""
-    limit = jnp.sqrt(jnp.finfo(x.dtype).eps) * (jnp.abs(x) + _typical(system))
+    limit = jnp.sqrt(jnp.finfo(x.dtype).eps) * (jnp.abs(x) + system.state_sizes)
     nothing = jnp.zeros((), jnp.int32)
     if not system.is_constrained:
         return InitialPoint(x, x[:0], jnp.zeros_like(x), limit, jnp.zeros_like(x), nothing, nothing, None)
@@ -33,11 +33,6 @@ def from_state(system: AcausalSystem, t0: Time, inputs: Any, x: Float[Array, " n
     # near has the value of the search and, by x − frozen(x), the derivative of x: the last step carries it over.
     moved = system.project(t0, near + (x - frozen(x)), inputs, iterations=1)
     return InitialPoint(moved, x[:0], frozen(moved - near), limit, jnp.zeros_like(x), nothing, nothing, None)
-
-
-def _typical(system: AcausalSystem) -> Any:
-    plan = system.plan
-    return jax.lax.stop_gradient(system.typical_sizes[np.concatenate([plan.states, plan.carried])])
 
 
 def check_array(system: AcausalSystem, initial: Any) -> None:

@@ -24,13 +24,9 @@ from .arguments import NOT_ADMITTED, TEXT, are_admitted, inputs_are_finite
 from .event_log import EventLog
 from .from_state import from_state
 from .hybrid_problem import problem_for, with_event_control, without_clocked
-from .preparation import largest_tolerance, prepared, term_of
+from .preparation import SAVED_ITERATIONS, largest_tolerance, prepared, term_of
 from .saved_state import Memory, SavedState, same_time
 from .step_sizes import first_step
-
-# Gauss–Newton steps by which saved states are moved onto the constraints. Dense output starts them within some
-# tolerances of a constraint, and each step squares that distance.
-SAVED_ITERATIONS = 3
 
 
 class Options(eqx.Module):
@@ -99,7 +95,8 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
     implicit = is_implicit(options.solver)
     chosen = options.solver if ts is None else right_between_steps(options.solver)
     tolerance = largest_tolerance(system, controller)
-    solver = prepared(system, chosen, implicit, watch, tolerance)
+    judged = not isinstance(controller, diffrax.StepTo)
+    solver = prepared(system, chosen, implicit, watch, tolerance, judged)
     term = term_of(system, implicit, forwards=isinstance(options.adjoint, diffrax.ForwardMode))
     # With an implicit solver the controller chooses the first step itself: `dt0=None`.
     own_start = implicit and not isinstance(controller, diffrax.StepTo)
@@ -137,23 +134,24 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
     if system.plan.events is not None and ts is not None:
         filled = filled & (goes_on | (ts == t0))
     okay = diffrax.is_okay(done.result)
+    safe, times = jnp.where(filled[:, None], x, x0), jnp.where(filled, saved, t0)
+    holds = finite = jnp.all(jnp.isfinite(safe), axis=1)
     if system.is_constrained:
         # Rows that were not reached are projected at the start, so that their derivatives are finite, and left out
         # below.
-        safe, times = jnp.where(filled[:, None], x, x0), jnp.where(filled, saved, t0)
-
         def projected_onto(t, y, q):
             now = system if q is None else system.holding(q)
-            return now.project(t, y, inputs, iterations=SAVED_ITERATIONS)
+            return now.project_fully(t, y, inputs, SAVED_ITERATIONS)
 
         values = None if discrete is None else jnp.where(filled[:, None], discrete, system.discrete_values)
         projected = jax.vmap(projected_onto)(times, safe, values)
-        # The run counts as failed at the first row at which nonlinear blocks have no solution.
-        lost = filled & jnp.all(jnp.isfinite(x), axis=1) & ~jnp.all(jnp.isfinite(projected), axis=1)
-        found_all, k = ~jnp.any(lost), jnp.argmax(lost)
-        last = jax.tree.map(lambda a, b: jnp.where(found_all, a, b), last, (times[k], safe[k]))
-        okay = okay & found_all
+        holds = jnp.all(jnp.isfinite(projected), axis=1)
         x = jnp.where(filled[:, None], projected, x)
+    # The run counts as failed at the first row that is not finite, or at which the equations have no solution.
+    right, k = jnp.all(holds), jnp.argmax(~holds)
+    okay, filled = okay & right, filled & (right | (jnp.arange(len(filled)) < k))
+    k = jnp.where(finite[k], k, jnp.maximum(k - 1, 0))
+    last = jax.tree.map(lambda a, b: jnp.where(right, a, b), last, (times[k], safe[k]))
     if ts is None:
         steps = done.stats["num_accepted_steps"]
         if discrete is not None and memory is not None:

@@ -17,6 +17,11 @@ from ..solvers.projected import with_projection
 from ..solvers.switching import Watch
 from ..system.system import AcausalSystem
 
+# Gauss–Newton steps by which states are moved onto the constraints where no error estimate vouches for them: saved
+# ones, and those at the ends of prescribed steps. Dense output starts them within some tolerances of a constraint, and
+# each step squares that distance.
+SAVED_ITERATIONS = 3
+
 
 class TracedOnce(eqx.Module):
     """A vector field that is a function of its own in the program around it.
@@ -53,25 +58,37 @@ def term_of(system: AcausalSystem, implicit: bool, forwards: bool = False) -> di
     return DAETerm(field, mass=system.mass, pattern=plan.dae_pattern if plan.n_state >= SPARSE_FROM else None)
 
 
-def prepared(system: AcausalSystem, solver: Solver, implicit: bool, watch: Watch | None, atol: Tolerance) -> Any:
-    """The solver with what the system supplies filled in: projections and the determinants to watch."""
+def prepared(
+    system: AcausalSystem, solver: Solver, implicit: bool, watch: Watch | None, atol: Tolerance, judged: bool = True
+) -> Any:
+    """The solver with what the system supplies filled in: projections and the determinants to watch.
+
+    How far a projection moves counts as an error of the step, so that steps which end where the constraints have no
+    solution are rejected. Where steps are not `judged` by their errors, the projection itself must converge.
+    """
     if isinstance(solver, Tsit5) and watch is not None:
         solver = Tsit5(looped=solver.looped, watch=watch)
     # A minimal set of states may become a singular choice on the way.
     guard = ChoiceGuard(system.dummy_determinants, atol) if system.plan.dummy_blocks else None
+    project = system.project if judged else _converged(system)
     if system.is_constrained and not implicit:
-        return with_projection(solver, system.project, strict=bool(system.carried), guard=guard)
+        return with_projection(solver, project, strict=True, guard=guard)
     if isinstance(solver, BDF):
         if solver.algebraic_errors is None:
             solver = dataclasses.replace(solver, algebraic_errors=False)
         if system.plan.n_projected and solver.projection is None:
-            solver = dataclasses.replace(solver, projection=system.project)
+            solver = dataclasses.replace(solver, projection=project)
         return dataclasses.replace(solver, guard=guard)
     if implicit and system.plan.n_projected:
-        return with_projection(solver, system.project, strict=False, guard=guard)
+        return with_projection(solver, project, strict=True, guard=guard)
     if implicit and guard is not None:
         return with_projection(solver, _unchanged, strict=False, guard=guard)
     return solver
+
+
+def _converged(system: AcausalSystem) -> Callable[..., Any]:
+    """The projection, not-a-number where it does not converge."""
+    return lambda t, x, args: system.project_fully(t, x, args, SAVED_ITERATIONS)
 
 
 def largest_tolerance(system: AcausalSystem, controller: Controller) -> Any:

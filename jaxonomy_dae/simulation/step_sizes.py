@@ -9,7 +9,6 @@ import jax.numpy as jnp
 
 from ..aliases import Controller, Solver, State, Time, Tolerance
 from ..errors import ModelError
-from ..solvers.drive import is_implicit
 from ..solvers.solve import step_control
 from ..solvers.step_control import UNSEEN, ConstantLengths
 from ..system.inputs import StepEnds
@@ -30,10 +29,7 @@ def controller_for(system: AcausalSystem, solver: Solver, rtol: Tolerance, atol:
     """The step-size controller for these tolerances, the absolute ones in units of the nominal values. If the user
     gives no longest step, it is bounded by the period of the waves that drive the model."""
     atol = scaled_atol(system, atol)
-    if is_implicit(solver):
-        controller: Any = step_control(solver, rtol, atol, dtmax=dtmax)
-    else:
-        controller = diffrax.PIDController(rtol=rtol, atol=atol, dtmax=dtmax)
+    controller: Any = step_control(solver, rtol, atol, dtmax=dtmax)
     if dtmax is not None or not system.plan.waves:
         return controller
     at = SystemAt(system.plan, system.numbers, (), 0.0, {}, system.typical_sizes)

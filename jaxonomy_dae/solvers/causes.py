@@ -84,8 +84,9 @@ def _jump(slope: Slope, here: np.ndarray, t: Time, y: State, weight: np.ndarray,
     if not np.isfinite(gaps).all():
         return ""
     wide, middle, narrow = gaps
-    # A jump has the same size at all scales; what is smooth, however steep, falls in proportion.
-    jumps = (narrow > 0.3 * wide) & (middle > 0.3 * wide) & (wide > 0.1 * np.max(np.abs(here)))
+    # A jump has the same size at all scales; what is smooth, however steep, falls in proportion, and a pole rises.
+    alike = (np.minimum(narrow, middle) > 0.3 * wide) & (np.maximum(narrow, middle) < 3.0 * wide)
+    jumps = alike & (wide > 0.1 * np.max(np.abs(here)))
     if not jumps.any():
         return ""
     k = int(np.argmax(np.where(jumps, wide / weight, 0)))

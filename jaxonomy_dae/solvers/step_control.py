@@ -16,6 +16,11 @@ SAFETY = 0.9  # of the step that would just meet the tolerance (Hairer, Nørsett
 # In tolerances: the first step is chosen as if everything moved by as much in the problem's own time. Motion below the
 # tolerance, at rest or nearly so, is then resolved, too; its derivatives may be asked for, though no error shows it.
 UNSEEN = 1e3
+# Spacings of floating-point numbers at t: steps so short make no way, and time itself is known to four digits in them.
+SHORT = 1e4
+# Rejections with no step of ordinary length between them. A jump of 1e6 tolerances inside a step takes 20 of them; at a
+# turning point, beyond which there is no solution, steps of a few spacings are accepted and rejected in turn.
+MOST_TRIES = 100
 # A solver that chooses its own step sizes writes them into its error estimate, whose norm e a controller reads back:
 # e = SAFETY/φ for a growth or a rejection by the factor φ (what the ordinary formula for order 1 makes of it too), and
 # e = SAFETY + (1 − SAFETY)·φ for a step that is kept though the next shall be smaller.
@@ -42,12 +47,13 @@ def tolerance_like(atol: Tolerance, y: State) -> Any:
 
 
 class StepControl(diffrax.AbstractAdaptiveStepSizeController):
-    """Step sizes for `BDF` and `Rodas5P`, from tolerances of the local error.
+    """Step sizes from tolerances of the local error.
 
     Differs from `diffrax.PIDController` in three points. The first step (`dt0=None`) comes from the slopes of the
-    equations themselves, in their own time scale. A step size that falls below the spacing of floating-point numbers
-    ends the integration with `RESULTS.dt_min_reached`. A solver that is `steered`, as `BDF` is, chooses step sizes
-    itself and may shorten the next step after one it kept.
+    equations themselves, in their own time scale. `RESULTS.dt_min_reached` ends an integration whose step size falls
+    below the spacing of floating-point numbers, or that has rejected 100 steps without a step of ordinary length
+    between them. A solver that is `steered`, as `BDF` is, chooses step sizes itself and may shorten the next step after
+    one it kept.
 
     **Arguments:**
 
@@ -67,12 +73,13 @@ class StepControl(diffrax.AbstractAdaptiveStepSizeController):
         return self
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        """The end of the first step, and the state of the controller: whether the last step was rejected."""
+        """The end of the first step, and the state of the controller: the number of rejections since the last step of
+        ordinary length, negative if the last step was accepted."""
         if dt0 is None:
             dt0 = self._first(terms, t0, t1, y0, args, func, 1 if self.steered else int(error_order or 1))
         if self.dtmax is not None:
             dt0 = jnp.minimum(dt0, self.dtmax)
-        return t0 + dt0, jnp.array(False)
+        return t0 + dt0, jnp.zeros((), jnp.int32)
 
     def _first(self, terms, t0, t1, y0, args, func, order):
         """h with c = h^(p+1)·|y'|·r^p in units of the tolerance, where r = |y''|/|y'| is the problem's own rate."""
@@ -105,7 +112,7 @@ class StepControl(diffrax.AbstractAdaptiveStepSizeController):
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
         """Accepts or rejects the step and proposes the next one; see `diffrax.AbstractStepSizeController`."""
-        rejected = controller_state
+        rejected, tries = controller_state > 0, jnp.abs(controller_state)
         t0, t1 = jnp.asarray(t0), jnp.asarray(t1)
 
         def scaled(a, b, e, atol):
@@ -127,11 +134,12 @@ class StepControl(diffrax.AbstractAdaptiveStepSizeController):
             dt = jnp.minimum(dt, self.dtmax)
         start = jnp.where(keep, t1, t0)
         # A step of a few spacings of floating-point numbers cannot be shortened in a useful way.
-        least = 4 * jnp.finfo(t1.dtype).eps * jnp.abs(start)
-        failed = ~keep & ((dt <= least) | (dt == 0))
+        spacing = jnp.finfo(t1.dtype).eps * jnp.abs(start)
+        tries = jnp.where(keep, jnp.where(t1 - t0 > SHORT * spacing, 0, -tries), tries + 1)
+        failed = ~keep & ((dt <= 4 * spacing) | (dt == 0) | (tries > MOST_TRIES))
         result = diffrax.RESULTS.where(failed, diffrax.RESULTS.dt_min_reached, diffrax.RESULTS.successful)
         dt = jax.lax.stop_gradient(dt)
-        return keep, start, start + dt, False, ~keep, result
+        return keep, start, start + dt, False, tries, result
 
 
 class ConstantLengths(WrappedControl):

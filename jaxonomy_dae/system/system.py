@@ -20,6 +20,7 @@ from ..model.pickling import functions_by_name, named_functions
 from ..model.tables import complete
 from ..model.typical_sizes import typical_sizes
 from ..programs.staging import is_traced
+from ..tolerances import CONSISTENT
 from .bounds import constrained, unconstrained
 from .evaluate import Refinement
 from .input_values import missing_input
@@ -357,6 +358,21 @@ class AcausalSystem(eqx.Module):
     def project(self, t: Any, x: Float[Array, " n"], args: Any = None, iterations: int = 1) -> Float[Array, " n"]:
         """The state moved onto the hidden constraints (nothing to do if there are none)."""
         return self.at(t, args).project(x, iterations)
+
+    def project_fully(self, t: Any, x: Float[Array, " n"], args: Any, iterations: int) -> Float[Array, " n"]:
+        """As `project`, not-a-number where the hidden constraints are not met then: the last step of a search that
+        converges quadratically is short."""
+        if not self.plan.n_projected:
+            return self.project(t, x, args, iterations)
+        near = self.project(t, x, args, iterations - 1)
+        found = self.project(t, near, args)
+        short = jnp.abs(found - near) <= CONSISTENT * (jnp.abs(found) + self.state_sizes)
+        return jnp.where(jax.lax.stop_gradient(jnp.all(short)), found, jnp.nan)
+
+    @property
+    def state_sizes(self) -> Float[Array, " n"]:
+        """The typical sizes of the entries of the state, shape (n_state,); not differentiated."""
+        return jax.lax.stop_gradient(self.typical_sizes[np.concatenate([self.plan.states, self.plan.carried])])
 
     def dummy_determinants(self, t: Any, x: Float[Array, " n"], args: Any = None) -> Float[Array, " blocks"]:
         """The determinants that vanish where the choice of states is singular, one for every nonlinear block that

@@ -10,7 +10,7 @@ from sympy import Eq
 from testset import PROBLEMS
 
 from jaxonomy_dae import Component, EqnEnv, assign, der, simulate
-from jaxonomy_dae.solvers import Rodas5P
+from jaxonomy_dae.solvers import Rodas5P, Tsit5
 
 TS = np.array([0.5, 4.0, 10.0])
 
@@ -243,3 +243,30 @@ def test_published_problems_with_nothing_said(name):
     for coarse, fine in ((1e-4, 1e-6), (1e-6, 1e-8)):
         # Below the tolerance itself an error may be small by chance (its sign changes) and has nothing to prove.
         assert found[fine] < found[coarse] or found[fine] <= max(fine, uncertain), found
+
+
+# --- steps that are rejected ---------------------------------------------------------------------------------------
+
+
+class Burning(Component):
+    """Cells of fuel that heat themselves up and run out: c' = −k(T)·(1 − exp(−c/50)), T' by c'. Long steps lead to
+    c ≪ 0, where the exponential overflows."""
+
+    def __init__(self, ev, name, count=2):
+        super().__init__(ev, name)
+        for i in range(count):
+            T, c = self.variable(f"T{i}", start=300.0, fixed=True), self.variable(f"c{i}", start=3000.0, fixed=True)
+            rate = 5.5e6 * sympy.exp(-5680 / T) * (1 - sympy.exp(-c / 50))
+            self.add_equations(Eq(der(c), -rate), Eq(der(T), (900.0 + 50 * i - T) / 200 + 0.01 * rate))
+
+
+def test_rejected_steps_do_not_repeat():
+    """Kind: a run that rejects steps without end. A step that ended at infinity had an error that is not a number, from
+    which the controller proposed the same step again: 8 steps accepted and 16,376 rejected."""
+    system, ts = compiled(Burning(EqnEnv(), "b")), np.array([1000.0])
+    solution = simulate(system, 1000.0, ts=ts)
+    reference = simulate(system, 1000.0, ts=ts, solver=Rodas5P(), rtol=1e-9, atol=1e-10)
+    assert solution.stats["solver"] == "Rodas5P" and solution.stats["num_explicit_steps"] < 2000
+    np.testing.assert_allclose(solution["b.T1"], reference["b.T1"], rtol=1e-5)
+    explicit = simulate(system, 300.0, ts=ts * 0.3, solver=Tsit5(), throw=False)
+    assert explicit.stats["num_rejected_steps"] < 2000
