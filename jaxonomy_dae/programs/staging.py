@@ -5,6 +5,8 @@ from collections.abc import Iterator
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 
 
@@ -20,7 +22,12 @@ def is_staged(tree: Any) -> bool:
     run each operation by itself: compiling a loop anew at every call. There a compiled program is called, which JAX
     differentiates or batches as a whole.
     """
-    return any(isinstance([*_layers(leaf)][-1], Tracer) for leaf in jax.tree.leaves(tree))
+    return any(isinstance([*layers(leaf)][-1], Tracer) for leaf in jax.tree.leaves(tree))
+
+
+def as_array(value: Any) -> Any:
+    """Numbers, or lists of numbers, as an array: of NumPy where values are known, so that nothing is compiled."""
+    return jnp.asarray(value) if is_traced(value) else np.asarray(value)
 
 
 def is_forwards(tree: Any) -> bool:
@@ -28,11 +35,11 @@ def is_forwards(tree: Any) -> bool:
 
     `jax.jit(jax.jacfwd(f))` is known for what it is; inside `jax.jacfwd(jax.jit(f))` it cannot be seen.
     """
-    kinds = [{type(layer).__name__ for layer in _layers(leaf)} for leaf in jax.tree.leaves(tree)]
+    kinds = [{type(layer).__name__ for layer in layers(leaf)} for leaf in jax.tree.leaves(tree)]
     return any("JVPTracer" in found for found in kinds) and not any("LinearizeTracer" in found for found in kinds)
 
 
-def _layers(leaf: Any) -> Iterator[Any]:
+def layers(leaf: Any) -> Iterator[Any]:
     """The leaf and the tracers inside it, from the outside in, as far as differentiation and batching have wrapped it;
     a tracer of another kind is the last."""
     yield leaf

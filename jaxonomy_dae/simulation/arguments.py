@@ -21,7 +21,7 @@ from ..errors import ModelError
 from ..initialization.initial_values import check_initial
 from ..solvers.solve_arguments import check_finite, check_longest_step
 from ..system.closed_function import ClosedFunction
-from ..system.inputs import value_at
+from ..system.inputs import SampledInput, samples_fit, value_at
 from ..system.system import AcausalSystem
 from ..system.system_at import SystemAt
 from .from_state import check_array
@@ -30,7 +30,10 @@ from .saved_state import SavedState, check_saved_state, initial_time
 MOST_ROOM = 4 * 2**30  # bytes that saved steps may reserve
 
 NOT_ADMITTED: Any = diffrax.RESULTS.nonfinite
-TEXT = "a parameter, a weight or an input is not finite, or a parameter is out of its bounds"
+TEXT = (
+    "a parameter, a weight or an input is not finite, a parameter is out of its bounds, or the samples of an input do "
+    "not increase in time or do not reach over the run"
+)
 # Times at which inputs are looked at, relative to what is left of a run: what made it stop lies just ahead, on a scale
 # that only the run knows.
 AHEAD = np.concatenate([[0.0], 10.0 ** np.linspace(-15, 0, 64)])
@@ -144,11 +147,14 @@ def check_parameters(system: AcausalSystem):
                 raise ModelError(f"a weight of network '{name}' is not finite: go back to an earlier iterate")
 
 
-def are_admitted(system: AcausalSystem, inputs: Inputs) -> Bool[Array, ""]:
-    """True if parameters, weights, constants and samples are finite, and parameters are within their bounds."""
+def are_admitted(system: AcausalSystem, inputs: Inputs, t0: Time, t1: Time) -> Bool[Array, ""]:
+    """True if parameters, weights, constants and samples are finite, parameters are within their bounds, and samples
+    reach over the run."""
     data = [source for source in inputs.values() if not isinstance(source, ClosedFunction)]
     leaves = jax.tree.leaves(eqx.filter((system.neural, data), eqx.is_inexact_array))
-    return jnp.stack([system.parameters.are_admitted, *(jnp.isfinite(leaf).all() for leaf in leaves)]).all()
+    finite = [jnp.isfinite(leaf).all() for leaf in leaves]
+    fit = [samples_fit(inputs, t0, t1)] if any(isinstance(s, SampledInput) for s in data) else []
+    return jnp.stack([system.parameters.are_admitted, *finite, *fit]).all()
 
 
 def inputs_are_finite(inputs: Inputs, t: Time, t1: Time) -> Bool[Array, ""]:

@@ -11,6 +11,7 @@ from ..aliases import Inputs, Result, State, Time, Tolerance
 from ..diagnosis.wording import listed, quoted
 from ..hybrid.solver import MOVED, STUCK, TOO_MANY
 from ..lowering.plan import SystemPlan
+from ..programs.members import failed_members
 from ..solvers.choice_guard import SINGULAR_CHOICE
 from ..solvers.failures import SHOWN, explain_failure, how_it_stopped
 from ..system.inputs import value_at
@@ -39,10 +40,10 @@ REST = (
 PROBES = 64  # times at which inputs are looked at
 
 
-def raised(x: State, result: Result, has_events: bool, max_steps: int, max_events: int) -> Any:
-    """x, with a run-time error if the run failed: in traced runs only a code is known."""
+def _codes(result: Result, has_events: bool, max_steps: int, max_events: int) -> tuple[Any, list[str]]:
+    """A number for the reason by which a run failed, traced, 0 if it did not; and what the numbers from 1 on mean."""
     codes = diffrax.RESULTS
-    lost = "nonlinear blocks have no solution there, or the start is not consistent"
+    lost = "the equations have no solution there, or the start is not consistent"
     many = f"more than max_events={max_events} events" if has_events else "too many rejected steps"
     texts = [
         (codes.max_steps_reached, f"max_steps={max_steps} was reached"),
@@ -53,12 +54,28 @@ def raised(x: State, result: Result, has_events: bool, max_steps: int, max_event
         (SINGULAR_CHOICE, "the states have become a singular choice"),
         (codes.nonlinear_divergence, f"{lost}, or an event wrote a value that is not finite" if has_events else lost),
     ]
-    index = sum(jnp.where(result == code, k, 0) for k, (code, _) in enumerate(texts, start=1))
-    found = ["it failed", *(text for _, text in texts)]
+    number = sum(jnp.where(result == code, k, 0) for k, (code, _) in enumerate(texts, start=1))
+    number = jnp.where(diffrax.is_okay(result), 0, jnp.where(number == 0, len(texts) + 1, number))
+    return number, [*(text for _, text in texts), "it failed"]
+
+
+def raised(x: State, result: Result, has_events: bool, max_steps: int, max_events: int) -> Any:
+    """x, with a run-time error if the run failed: in traced runs only a code is known."""
+    number, texts = _codes(result, has_events, max_steps, max_events)
     messages = [
-        f"the integration stopped: {text}. simulate(...) outside jit, grad and vmap says where" for text in found
+        f"the integration stopped: {text}. simulate(...) outside jit, grad and vmap says where" for text in texts
     ]
-    return eqx.branched_error_if(x, ~diffrax.is_okay(result), index, messages)
+    return eqx.branched_error_if(x, number > 0, jnp.maximum(number - 1, 0), messages)
+
+
+def failed_in_batch(result: Result, has_events: bool, max_steps: int, max_events: int) -> str:
+    """The members of a batch outside of jit that failed, by number, and why; "" if none did."""
+    found = failed_members(*_codes(result, has_events, max_steps, max_events))
+    return (
+        f"runs that stopped {found}. Their rows are not-a-number; simulate(...) of one alone says where"
+        if found
+        else ""
+    )
 
 
 def explain(

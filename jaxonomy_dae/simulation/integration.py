@@ -74,7 +74,7 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
     """Integrates `(system, t0, t1, ts, inputs, initial)`; `watch` is for Tsit5. With `checked`, an inconsistent start
     and times that do not fit are errors while running."""
     system, t0, t1, ts, inputs, initial = given
-    admitted = are_admitted(system, inputs)
+    admitted = are_admitted(system, inputs, t0, t1)
     system = system.merged()  # so that bounds are looked at once, and not whenever equations are
     if checked:
         system = eqx.tree_at(

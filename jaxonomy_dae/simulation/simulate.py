@@ -1,6 +1,7 @@
 """`simulate`: a compiled system integrated by Diffrax."""
 
 import dataclasses
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -14,6 +15,7 @@ from ..adjoint.stored_adjoint import default_adjoint
 from ..errors import InitializationError, SimulationError
 from ..initialization.check import check
 from ..programs.cache import PROGRAMS
+from ..programs.members import is_batched
 from ..programs.staging import is_forwards, is_staged, is_traced
 from ..solvers import BDF, Rodas5P, Tsit5
 from ..solvers.causes import decay_at, is_stiff
@@ -25,7 +27,7 @@ from ..system.inputs import check_range, read_inputs, step_ends
 from ..system.solver_choice import Choice, Stiffness, implicit_choice, solver_choice
 from ..system.system import AcausalSystem
 from .arguments import check_arguments, check_parameters
-from .failures import explain, mode_at_start, raised
+from .failures import explain, failed_in_batch, mode_at_start, raised
 from .from_state import check_state
 from .integration import Options, Outcome, run, run_compiled
 from .preparation import term_of
@@ -102,9 +104,10 @@ def simulate(
     - `progress`: shows a progress bar.
     - `throw`: whether to raise if the start is not consistent or the integration fails. Otherwise `solution.result`
         has a code, rows that were not reached are NaN, and so are their derivatives; `RESULTS.nonfinite` stands for
-        parameters out of their bounds, and for parameters, weights and inputs that are not finite. None: outside jit,
-        grad and vmap. Inside, True puts callbacks to the host into the program, which JAX's persistent compilation
-        cache then does not keep.
+        parameters out of their bounds, for parameters, weights and inputs that are not finite, and for samples that do
+        not reach over the run. None: outside jit and vmap; `jax.vmap` outside of jit warns, with the numbers of the
+        members that failed. Inside jit, True puts callbacks to the host into the program, which JAX's persistent
+        compilation cache then does not keep.
 
     **Returns:**
 
@@ -178,6 +181,9 @@ def simulate(
         else:  # under `jax.grad` and `jax.vmap` outside of jit, where values are known
             checked = throw is not False
             outcome = run_compiled(given, options(solver), None)
+            if is_batched(outcome.result):
+                _say_of_members(outcome, system, (max_steps, most_events), throw)
+                checked = False
         return _traced(outcome, system, inputs, choice, checked, (max_steps, most_events))
 
     traced = is_traced((given, options(solver)))
@@ -243,6 +249,15 @@ def _stiff_without_a_run(stiffness: Stiffness | None, duration: float | None) ->
     if stiffness is None or duration is None or stiffness.decay * duration <= BOUNDARY * MANY:
         return ""
     return f"stiff: at the declared start something decays within about {1 / stiffness.decay:.0e}"
+
+
+def _say_of_members(outcome: Outcome, system: AcausalSystem, bounds: tuple[int, int], throw: bool | None) -> None:
+    """Says which members of a batch failed, outside of jit: in a warning, or in an error if it is asked for."""
+    text = "" if throw is False else failed_in_batch(outcome.result, system.plan.events is not None, *bounds)
+    if text and throw:
+        raise SimulationError(text)
+    if text:
+        warnings.warn(text, RuntimeWarning, stacklevel=4)
 
 
 def _traced(

@@ -1,6 +1,7 @@
 """`solve_dae`: a differential-algebraic equation of the user's own, solved and checked."""
 
 import math
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,6 +16,7 @@ from jax.flatten_util import ravel_pytree
 from ..adjoint.stored_adjoint import default_adjoint
 from ..errors import InitializationError, ModelError, SimulationError
 from ..programs.cache import PROGRAMS, compiled
+from ..programs.members import failed_members, is_batched
 from ..programs.staging import is_forwards, is_staged, is_traced
 from .bdf import BDF
 from .dae_term import DAETerm, FlatProblem
@@ -70,9 +72,9 @@ def solve_dae(
     - `dtmax`: the longest step.
     - `names`: of the unknowns, in order, for error messages.
     - `throw`: whether to raise if the start is inconsistent or the integration fails. Otherwise `solution.result` has a
-        code, rows that were not reached are NaN, and so are their derivatives. None: outside jit, grad and vmap.
-        Inside, True puts callbacks to the host into the program, which JAX's persistent compilation cache then does
-        not keep.
+        code, rows that were not reached are NaN, and so are their derivatives. None: outside jit and vmap; `jax.vmap`
+        outside of jit warns, with the numbers of the members that failed. Inside jit, True puts callbacks to the host
+        into the program, which JAX's persistent compilation cache then does not keep.
 
     **Returns:**
 
@@ -118,7 +120,9 @@ def solve_dae(
     known = list(names) if names is not None else [f"y[{k}]" for k in range(n)]
     outcome = (check, solution.result)
     if is_traced(outcome):
-        if throw is True or throw is None and not staged:
+        if is_batched(outcome) and not staged:
+            _say_of_members(check, solution.result, max_steps, throw)
+        elif throw is True or throw is None and not staged:
             ys = check.error_if(solution.ys)
             solution = eqx.tree_at(lambda s: s.ys, solution, solution.result.error_if(ys, solution.result != OK))
         return solution
@@ -133,6 +137,26 @@ def solve_dae(
             )  # fmt: skip
             raise SimulationError(text)
     return solution
+
+
+def _say_of_members(check: StartCheck, result: Any, max_steps: int, throw: bool | None) -> None:
+    """Says which members of a batch failed, outside of jit: in a warning, or in an error if it is asked for."""
+    codes = diffrax.RESULTS
+    number = jnp.where(result == OK, 0, 4)
+    number = jnp.where(result == codes.max_steps_reached, 1, number)
+    number = jnp.where(result == codes.dt_min_reached, 2, number)
+    number = jnp.where(check.is_fine, number, 3)
+    texts = [
+        f"max_steps={max_steps} was reached",
+        "no step was short enough to be accepted",
+        "the start is not consistent",
+        "it failed",
+    ]
+    text = "" if throw is False else failed_members(number, texts)
+    if text and throw:
+        raise SimulationError(f"integrations that stopped {text}")
+    if text:
+        warnings.warn(f"integrations that stopped {text}. Their rows are not-a-number", RuntimeWarning, stacklevel=3)
 
 
 def _inexact(leaf: Any) -> Any:

@@ -10,6 +10,7 @@ from jax.core import Tracer
 
 from ..aliases import State, Time, Tolerance
 from ..errors import ModelError
+from ..programs.staging import as_array
 
 
 def check_finite(**numbers: Any) -> None:
@@ -65,7 +66,7 @@ def tolerance_of(atol: Tolerance, y: State) -> Any:
 
 def jump_times(jump_ts: Any, dtype: Any) -> Any:
     """Times of jumps as an array: a number or shape (n,)."""
-    array = jump_ts if isinstance(jump_ts, Tracer) else np.asarray(jump_ts)
+    array = as_array(jump_ts)
     if array.ndim > 1 or array.dtype.kind not in "iuf":
         raise ModelError(f"jump_ts must be a number or shape (n,); got {array.dtype} of shape {array.shape}")
     if not isinstance(array, Tracer) and not np.isfinite(array).all():

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..errors import ModelError, nearest
 from ..lowering.plan import SystemPlan
@@ -245,6 +245,9 @@ def _interpolation(name: str, path: Any, shape: tuple[int, ...]) -> SampledInput
     return SampledInput(path, 0 if isinstance(path, diffrax.LinearInterpolation) else 1)
 
 
+SLACK = 1e-6  # of the interval: by how much samples may miss its ends, which are computed
+
+
 def check_range(inputs: Mapping[str, Any], t0: Any, t1: Any):
     """Raises a `ModelError` if samples do not reach over the interval; held ones may end before it does."""
     if isinstance(t0, Tracer) or isinstance(t1, Tracer):
@@ -253,12 +256,26 @@ def check_range(inputs: Mapping[str, Any], t0: Any, t1: Any):
         if not isinstance(value, SampledInput) or isinstance(value.path.ts, Tracer):
             continue
         first, last = float(value.path.ts[0]), float(value.path.ts[-1])
-        slack = 1e-6 * (float(t1) - float(t0))
-        if first > float(t0) + slack or (last < float(t1) - slack and value.smoothness >= 0):
+        if not _reach_over(value, float(t0), float(t1), last - first if t0 == t1 else t1 - t0):
+            whole = f"the run from {float(t0):g} to {float(t1):g}: give samples for all of it, or integrate over less"
             raise ModelError(
-                f"the samples of input '{name}' reach from {first:g} to {last:g}, the run from {float(t0):g} to "
-                f"{float(t1):g}: give samples for all of it, or integrate over less"
+                f"the samples of input '{name}' reach from {first:g} to {last:g}, "
+                + (whole if t0 != t1 else f"and t={float(t0):g} is not among them: give samples there too")
             )
+
+
+def _reach_over(sampled: SampledInput, t0: Any, t1: Any, length: Any) -> Any:
+    ts, slack = sampled.path.ts, SLACK * length
+    begins = ts[0] <= t0 + slack
+    return begins & (ts[-1] >= t1 - slack) if sampled.smoothness >= 0 else begins
+
+
+def samples_fit(inputs: Mapping[str, Any], t0: Any, t1: Any) -> Bool[Array, ""]:
+    """True if the times of samples increase and reach over the interval. Where values are known, those that do not are
+    refused by name."""
+    sampled = [source for source in inputs.values() if isinstance(source, SampledInput)]
+    fine = [_reach_over(s, t0, t1, t1 - t0) & jnp.all(jnp.diff(s.path.ts) > 0) for s in sampled]
+    return jnp.all(jnp.stack(fine)) if fine else jnp.array(True)
 
 
 class StepEnds(NamedTuple):

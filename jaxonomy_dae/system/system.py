@@ -24,7 +24,7 @@ from ..tolerances import CONSISTENT
 from .bounds import constrained, unconstrained
 from .evaluate import Refinement
 from .input_values import missing_input
-from .inputs import read_inputs
+from .inputs import check_range, read_inputs
 from .parameters import Parameters
 from .solver_choice import Stiffness
 from .system_at import SystemAt
@@ -409,6 +409,8 @@ class AcausalSystem(eqx.Module):
         if entries is not None:
             return self.observe(entries[0], t, x, args).reshape(entries[1])
         quantity, factor = self.plan.resolve([names] if single else self.plan.entry_names(names))
+        args = read_inputs(self.plan, self.parameters.values.dtype, args)
+        check_range(args, t, t)
         values = self.at(t, args).quantities(x, quantity, factor)
         return values[0] if single else values
 
@@ -483,6 +485,8 @@ class AcausalSystem(eqx.Module):
         names = self._names_to_solve_for(solve_for)
         if solver is not None:
             check_solver(solver)
+        inputs = read_inputs(self.plan, self.parameters.values.dtype, inputs)
+        check_range(inputs, t0, t0)
         initial = self.plan.one_by_one(initial)
         found = find_initial(self, t0, inputs, initial, names, solver)
         found = check(self, found, t0, inputs, initial, names, throw=throw)

@@ -260,6 +260,7 @@ class Burning(Component):
             self.add_equations(Eq(der(c), -rate), Eq(der(T), (900.0 + 50 * i - T) / 200 + 0.01 * rate))
 
 
+@pytest.mark.long("two solvers of a stiff model")
 def test_rejected_steps_do_not_repeat():
     """Kind: a run that rejects steps without end. A step that ended at infinity had an error that is not a number, from
     which the controller proposed the same step again: 8 steps accepted and 16,376 rejected."""

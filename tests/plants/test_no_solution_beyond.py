@@ -68,6 +68,7 @@ def test_refused_at_the_time_by_its_equation(kind, said, way):
     assert solution.counts["num_rejected_steps"] < 1000  # one that steps in place rejects half of 16,384
 
 
+@pytest.mark.long("batches by four solvers")
 @pytest.mark.parametrize("way", WAYS)
 def test_members_fail_by_themselves(sine, way):
     """Kind: the same inside jit and vmap."""

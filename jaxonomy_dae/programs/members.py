@@ -1,0 +1,48 @@
+"""Members of a batch by number, where `jax.vmap` is at work outside of jit and values can be read."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from .staging import layers
+
+SHOWN = 8  # members that a sentence lists
+
+
+def is_batched(tree: Any) -> bool:
+    """True if `jax.vmap` is at work on a leaf."""
+    return any(hasattr(layer, "batch_dim") for leaf in jax.tree.leaves(tree) for layer in layers(leaf))
+
+
+def values_of_members(leaf: Any) -> np.ndarray:
+    """The values of a leaf without a shape of its own, one for each member: an axis for each `jax.vmap` around it, the
+    outermost first."""
+    *around, values = layers(leaf)
+    axes = [layer.batch_dim for layer in around if getattr(layer, "batch_dim", None) is not None]
+    values = np.asarray(values)
+    for place, axis in enumerate(reversed(axes)):
+        values = np.moveaxis(values, place + axis, place)
+    return values
+
+
+def numbered(chosen: np.ndarray) -> str:
+    """The numbers of the members for which `chosen` is true: "member 1", "members 0, 3 and 7 of 100"."""
+    places = np.argwhere(chosen).tolist()
+    shown = [str(p[0]) if len(p) == 1 else str(tuple(p)) for p in places[:SHOWN]]
+    if len(places) > SHOWN:
+        listed = ", ".join(shown) + f" and {len(places) - SHOWN} more"
+    else:
+        listed = ", ".join(shown[:-1]) + (" and " if len(shown) > 1 else "") + shown[-1]
+    return f"member{'s' if len(places) > 1 else ''} {listed} of {' by '.join(map(str, chosen.shape))}"
+
+
+def failed_members(codes: Any, texts: Sequence[str]) -> str:
+    """The members of a batch for which `codes` is not zero, in sentences; "" if there is none. `texts` explains the
+    codes 1, 2, …"""
+    values = values_of_members(codes)
+    found = [f"{numbered(values == k)}: {text}" for k, text in enumerate(texts, start=1) if (values == k).any()]
+    if not found:
+        return ""
+    return f"under jax.vmap, {'; '.join(found)}"
