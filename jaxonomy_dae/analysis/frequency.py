@@ -19,12 +19,13 @@ def frequency_response(
     omega: Any,
     at: OperatingPoint | None = None,
     t: Any = 0.0,
+    sampled: bool = False,
 ) -> FrequencyResponse:
     """The response of outputs to small sinusoids at inputs, around an operating point.
 
     **Arguments:**
 
-    - `inputs`, `outputs`, `at`, `t`: as in `linearize`.
+    - `inputs`, `outputs`, `at`, `t`, `sampled`: as in `linearize`.
     - `omega`: angular frequencies (rad/s), shape `(k,)`.
 
     **Returns:**
@@ -36,4 +37,4 @@ def frequency_response(
 
     - as `linearize`.
     """
-    return linearize(system, inputs, outputs, at=at, t=t).frequency_response(jnp.asarray(omega))
+    return linearize(system, inputs, outputs, at=at, t=t, sampled=sampled).frequency_response(jnp.asarray(omega))

@@ -7,16 +7,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..diagnosis.wording import some
 from ..errors import ModelError, nearest
-from ..programs.cache import compiled
 from ..programs.staging import is_staged
-from ..system.evaluate import Refinement
 from ..system.input_values import by_entry
 from ..system.inputs import read_inputs, value_at
 from ..system.system import AcausalSystem
+from .events_at_rest import resting_events
 from .operating_point import OperatingPoint
+from .partials import Partials, compiled_partials, on_tangent, partials_at
+from .sampled import Sampled, sampled_space
 from .state_space import StateSpace
-from .steady_state import check_system, equilibrium_from, is_traced, point_of
+from .steady_state import Drifting, check_system, equilibrium_from, is_traced, point_of
 from .tangent import Coordinates, choose_coordinates
 
 
@@ -28,6 +30,7 @@ def linearize(
     at: OperatingPoint | None = None,
     t: Any = 0.0,
     states: Sequence[str] | None = None,
+    sampled: bool = False,
 ) -> StateSpace:
     """The linear state space of small deviations from an operating point, with exact derivatives.
 
@@ -41,6 +44,10 @@ def linearize(
         states on which nothing depends, such as the angle of a free shaft, stay where they are.
     - `t`: the time, if `at` is left out.
     - `states`: which states are coordinates, where hidden constraints make some redundant.
+    - `sampled`: whether to describe a model with sampled controllers by its change from tick to tick. The states of the
+        result are those of the model and the discrete variables that clocks write, as they are just before a tick;
+        inputs stay constant for a period, and outputs are those just after the tick. Of clocks with several periods it
+        is the period after which all repeat.
 
     **Returns:**
 
@@ -54,6 +61,9 @@ def linearize(
 
     - `ModelError` for unknown names, an input without a value, an input that the model differentiates (its response has
         no state space), and `states` that are not coordinates.
+    - `ModelError` for a model that depends on what clocks write, without `sampled`; with it, if the model has no clock,
+        or clocks without a common period; for a point at which an event is just about to happen that changes the model.
+        Inside jit, what depends on values is not-a-number.
     - `SteadyStateError` if `at` is left out and there is no equilibrium; inside jit, grad and vmap the state space is
         then not-a-number.
     """
@@ -65,65 +75,80 @@ def linearize(
     quantity, factor = system.plan.resolve(outputs)
     _check_inputs(system, names, given, at)
     if at is None:
-        found, t, read = equilibrium_from(system, t, given, None, (), throw=None)
+        found, t, read = equilibrium_from(system, t, given, None, Drifting(), throw=None)
         at = point_of(system, found, t, read, drifting=(), singular_is_error=False, throw=None)
     if jnp.ndim(at.x) != 1:
         raise ModelError("the operating point is a batch: linearize each with equinox.filter_vmap")
     values = read_inputs(system.plan, dtype, {**by_entry(system.plan, at.inputs), **given})
     u = jnp.stack([_value_at(system, values, name, at.t) for name in names]) if names else at.x[:0]
-    arguments = (system, at.t, at.x, values, u, tuple(names), tuple(quantity.tolist()), tuple(factor.tolist()))
-    parts = _partials(*arguments) if is_staged(arguments) else _compiled(*arguments)
-    coordinates = _coordinates(system, parts[1], states)
-    return _reduced(system, parts, at.x, u, coordinates, tuple(names), tuple(outputs))
+    q = at.system.discrete_values.astype(at.x.dtype)
+    arguments = (system, at.t, at.x, q, values, u, tuple(names), tuple(quantity.tolist()), tuple(factor.tolist()))
+    partials = partials_at(*arguments) if is_staged(arguments) else compiled_partials(*arguments)
+    partials = _smooth(system, partials)
+    coordinates = _coordinates(system, partials, states)
+    if sampled:
+        point = Sampled(at.t, at.x, q, values, u, tuple(names), tuple(outputs))
+        return sampled_space(system, point, partials, coordinates)
+    partials = _between_ticks(system, partials)
+    return _reduced(system, partials, at.x, u, coordinates, tuple(names), tuple(outputs))
 
 
-def _partials(
-    system: AcausalSystem, t: Any, x: Any, values: Any, u: Any, names: tuple[str, ...],
-    quantity: tuple[int, ...], factor: tuple[float, ...],
-) -> Any:  # fmt: skip
-    """Slopes, constraints and outputs, and their Jacobians with respect to states and inputs: ((f, h, y), (∂/∂x, ∂/∂u)
-    of each)."""
-    n = len(system.plan.states)
-    which, scale = np.array(quantity, np.int64), np.array(factor)
-
-    def everything(state, u):
-        here = system.at(t, {**values, **dict(zip(names, u, strict=True))})
-        full = here.split(jnp.concatenate([state, x[n:]]))
-        if len(system.plan.carried):  # which follow the states and the inputs
-            full = here.refined(full, Refinement.ROOT)
-        joined = here.join(full)
-        read = here.quantities(joined, np.maximum(which, 0), scale) if len(which) else joined[:0]
-        y = jnp.where(jnp.asarray(which < 0), 0.0, read)
-        return here.semi_explicit(joined)[:n], here.constraint_vector(full), y
-
-    return everything(x[:n], u), jax.jacfwd(everything, (0, 1))(x[:n], u)
+def _smooth(system: AcausalSystem, partials: Partials) -> Partials:
+    """The partial derivatives, if the model has the same on both sides of all events that are near."""
+    if not is_traced(partials) and not bool(partials.agree):
+        table: Any = system.plan.events
+        texts = dict.fromkeys(table.names[k] for k in np.flatnonzero(np.asarray(partials.near)).tolist())
+        raise ModelError(
+            f"the point lies where {some([repr(text) for text in texts])} turns, and the model has another derivative "
+            "on the other side: linearize it at a point beside it"
+        )
+    return jax.tree.map(lambda leaf: _where(partials.agree, leaf), partials)
 
 
-_compiled = compiled(_partials)
+def _between_ticks(system: AcausalSystem, partials: Partials) -> Partials:
+    """The partial derivatives, if no clock writes what they depend on."""
+    blocks = [partials.of_slopes[2], partials.of_constraints[2], partials.of_outputs[2]]
+    depends = jnp.any(jnp.concatenate(blocks) != 0, axis=0)
+    if not is_traced(partials) and bool(jnp.any(depends)):
+        events: Any = resting_events(system.plan)
+        plan: Any = system.plan.events
+        place = events.unknown[np.flatnonzero(np.asarray(depends))]
+        names = some([repr(system.discretes[k]) for k in place.tolist()])
+        rows = events.ticking[np.isin(plan.table.discrete[events.ticking], place)]
+        clocks = some([repr(t) for t in dict.fromkeys(plan.names[e] for e in plan.table.event[rows].tolist())])
+        raise ModelError(
+            f"the model is sampled: between ticks it depends on {names}, which {clocks} writes, and a continuous state "
+            "space would hold that constant. linearize(..., sampled=True) gives the discrete-time model from tick to "
+            "tick; for the plant alone, compile it without its controller"
+        )
+    return jax.tree.map(lambda leaf: _where(~jnp.any(depends), leaf), partials)
+
+
+def _where(fine: Any, leaf: Any) -> Any:
+    return jnp.where(fine, leaf, jnp.nan) if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf
 
 
 def _reduced(
-    system: AcausalSystem, parts: Any, x: Any, u: Any, coordinates: Coordinates, names: tuple[str, ...],
+    system: AcausalSystem, partials: Partials, x: Any, u: Any, coordinates: Coordinates, names: tuple[str, ...],
     outputs: tuple[str, ...],
 ) -> StateSpace:  # fmt: skip
-    """The state space on the tangent of the constraints: dependent states d follow from coordinates q by ∂h/∂d·δd +
-    ∂h/∂q·δq = 0. Inputs that hidden constraints contain would be differentiated; they have been refused before."""
-    (slopes, _, y), ((f_x, f_u), (h_x, _), (y_x, y_u)) = parts
-    kept, dependent, rows = coordinates
+    """The state space on the tangent of the constraints. Inputs that hidden constraints contain would be
+    differentiated; they have been refused before."""
+    kept = coordinates.kept
     states = tuple(system.states[k] for k in kept)
-    if len(dependent):
-        inner = h_x[rows][:, dependent]
-        d_q = -jnp.linalg.solve(inner, h_x[rows][:, kept])
-        f_x = f_x[:, kept] + f_x[:, dependent] @ d_q
-        y_x = y_x[:, kept] + y_x[:, dependent] @ d_q
-    return StateSpace(f_x[kept], f_u[kept], y_x, y_u, x[kept], u, y, slopes[kept], states, names, outputs)
+    follow, slopes = on_tangent(partials, coordinates)
+    y_x, y_u, _ = partials.of_outputs
+    return StateSpace(
+        slopes[kept], partials.of_slopes[1][kept], y_x @ follow, y_u, x[kept], u, partials.outputs,
+        partials.slopes[kept], states, names, outputs,
+    )  # fmt: skip
 
 
-def _coordinates(system: AcausalSystem, jacobians: Any, wanted: Sequence[str] | None) -> Coordinates:
+def _coordinates(system: AcausalSystem, partials: Partials, wanted: Sequence[str] | None) -> Coordinates:
     """Chooses the states that serve as coordinates on the hidden constraints: those in `wanted`, else by the values of
     the constraints' Jacobian at the point."""
     n, c = len(system.states), system.plan.n_constraints
-    h_x = jacobians[1][0]
+    h_x = partials.of_constraints[0]
     if not c:
         if wanted is not None and set(wanted) != set(system.states):
             raise ModelError(f"states: no hidden constraint makes a state redundant; all are needed: {system.states}")

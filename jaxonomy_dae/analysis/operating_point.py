@@ -22,7 +22,8 @@ class OperatingPoint(eqx.Module):
     """A consistent point of a system: `point["pend.x"]` is a scalar, `point[["pend.x", "pend.y"]]` has shape `(2,)`.
 
     - `x`: the state array, shape `(len(system.states) + len(system.carried),)`.
-    - `system`, `t`, `inputs`: whose point it is, the time, and the inputs as they were read.
+    - `system`, `t`, `inputs`: whose point it is, with its discrete variables as they are there; the time, and the
+        inputs as they were read.
     - `residual`: the largest of all that should be zero there, each in units of what rounding may leave of it: at most
         1 where the point is what it claims to be.
 
@@ -36,8 +37,9 @@ class OperatingPoint(eqx.Module):
     residual: Float[Array, ""]
 
     def __getitem__(self, name: Any) -> Any:
-        """The value of a variable, or of several; `"der(...)"` of what the model differentiates, and `"time"`. For the
-        name of an array, its shape; among several names, it stands for those of all entries.
+        """The value of a variable, or of several, discrete ones included; `"der(...)"` of what the model
+        differentiates, and `"time"`. For the name of an array, its shape; among several names, it stands for those of
+        all entries.
 
         **Raises:**
 
@@ -52,18 +54,22 @@ class OperatingPoint(eqx.Module):
         array = plan.entries(name) if isinstance(name, str) else None
         if array is not None:
             return self[array[0]].reshape(array[1])
-        names = [name] if single else plan.entry_names(name)
-        quantity, factor = plan.resolve([n for n in names if n != "time"])
+        discrete = self.system.discretes
+        names = (
+            [name] if single else [n for one in name for n in ([one] if one in discrete else plan.entry_names([one]))]
+        )
+        quantity, factor = plan.resolve([n for n in names if n != "time" and n not in discrete])
         given = (self.system, self.t, self.x, self.inputs)
         values = _every_quantity(*given) if is_staged(given) else _compiled(*given)
         zero = jnp.asarray(quantity < 0)
         found = iter(jnp.where(zero, 0.0, values[np.maximum(quantity, 0)] * jnp.asarray(factor, self.x.dtype)))
-        read = [self.t if n == "time" else next(found) for n in names]
+        modes = self.system.discrete_values
+        read = [self.t if n == "time" else modes[discrete.index(n)] if n in discrete else next(found) for n in names]
         return read[0] if single else jnp.stack(read) if read else jnp.zeros((0,), self.x.dtype)
 
     @property
     def start(self) -> dict[str, Any]:
-        """The states by name: `simulate(system, t1, initial=point.start)` goes on from here."""
+        """The states by name: `simulate(point.system, t1, initial=point.start)` goes on from here."""
         return {name: self.x[..., k] for k, name in enumerate(self.system.states)}
 
     def to_dict(self) -> dict[str, Any]:

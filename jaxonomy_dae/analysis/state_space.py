@@ -26,6 +26,9 @@ class StateSpace(eqx.Module):
     - `x0`, `u0`, `y0`: the point of linearization; `dx0`, the derivatives there, vanishes at an equilibrium.
 
     Units are those of the variables, and per second in A and B.
+
+    With a period `dt` (second) it is a discrete-time model: the left side is then the change of x from one tick to the
+    next, x(k + 1) − x0 = dx0 + A·(x(k) − x0) + B·(u(k) − u0), with inputs that are constant in between.
     """
 
     A: Float[Array, "n n"]
@@ -39,16 +42,20 @@ class StateSpace(eqx.Module):
     states: tuple[str, ...] = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
+    dt: Float[Array, ""] | None = None
 
     def poles(self) -> Complex[Array, " n"]:
-        """The eigenvalues of A (1/s), those that decay slowest first; differentiable where they are distinct."""
+        """The eigenvalues of A (1/s; of a discrete-time model, factors from tick to tick), those that decay slowest
+        first; differentiable where they are distinct."""
         if not self.states:
             return jnp.zeros((0,), _complex(self.A))
         found = jnp.linalg.eigvals(self.A)
-        return found[jnp.lexsort((found.imag, -found.real))]
+        slowness = found.real if self.dt is None else jnp.abs(found)
+        return found[jnp.lexsort((found.imag, -found.real, -slowness))]
 
     def frequency_response(self, omega: Any) -> FrequencyResponse:
-        """The response to sinusoids, C·(jω − A)⁻¹·B + D.
+        """The response to sinusoids, C·(jω − A)⁻¹·B + D; of a discrete-time model, with exp(jω·dt) in the place of jω,
+        from samples of inputs to samples of outputs.
 
         **Arguments:**
 
@@ -64,7 +71,10 @@ class StateSpace(eqx.Module):
         eye = jnp.eye(len(self.states), dtype=a.dtype)
 
         def at(w):
-            return c @ jnp.linalg.solve(jax.lax.complex(jnp.zeros_like(w), w) * eye - a, b) + d
+            angle = w if self.dt is None else w * self.dt
+            turn = jax.lax.complex(jnp.zeros_like(angle), angle)
+            turn = turn if self.dt is None else jnp.exp(turn)
+            return c @ jnp.linalg.solve(turn * eye - a, b) + d
 
         return FrequencyResponse(omega, jax.vmap(at)(omega), self.inputs, self.outputs)
 
@@ -86,7 +96,8 @@ class StateSpace(eqx.Module):
             kind: [name.replace(".", "_") for name in given]
             for kind, given in (("states", self.states), ("inputs", self.inputs), ("outputs", self.outputs))
         }
-        return control.StateSpace(*matrices, **names)
+        dt = 0 if self.dt is None else float(self.dt)
+        return control.StateSpace(*matrices, dt, **names)
 
     def __repr__(self):
         lines = [self._head()]
@@ -113,7 +124,10 @@ class StateSpace(eqx.Module):
 
     def _head(self) -> str:
         kinds = (("state", self.states), ("input", self.inputs), ("output", self.outputs))
-        return f"StateSpace({', '.join(counted(len(names), kind) for kind, names in kinds)})"
+        counts = [counted(len(names), kind) for kind, names in kinds]
+        if self.dt is not None:
+            counts.append("from tick to tick")
+        return f"StateSpace({', '.join(counts)})"
 
     def _tables(self) -> list[tuple[str, Any, tuple[str, ...], tuple[str, ...]]]:
         tables = [

@@ -1,7 +1,7 @@
 """`steady_state`: where all derivatives vanish."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,7 +18,16 @@ from ..solvers.rows import not_a_number
 from ..system.inputs import read_inputs
 from ..system.system import AcausalSystem
 from .equilibrium import Equilibrium, compiled_search, find_equilibrium, is_open, open_directions, unknowns
+from .events_at_rest import resting_events
 from .operating_point import OperatingPoint
+
+
+class Drifting(NamedTuple):
+    """What stays as it starts: places in the state array, and places among the discrete values."""
+
+    states: tuple[int, ...] = ()
+    discrete: tuple[int, ...] = ()
+
 
 WORST = 4  # equations, or directions, that an error names
 IN_DIRECTION = 0.1  # of its largest entry: what else belongs to a direction that nothing determines
@@ -38,6 +47,12 @@ def steady_state(
 
     Starts declared as fixed do not bind it. The algebra is dense: meant for up to some thousand states.
 
+    Of a model with events it is the point at which none has anything left to change: relations are as their sides say,
+    of each `complementary` pair the side that is zero fits the point, what a sampled controller writes is what it has
+    written before, and where the condition of an event holds, the event has happened. There is none where events follow
+    each other without end, as a thermostat's, where an event ends the run, and where each tick of a clock changes
+    something, as a counter.
+
     **Arguments:**
 
     - `system`: a compiled system.
@@ -45,23 +60,24 @@ def steady_state(
     - `inputs`: as in `simulate`.
     - `initial`: where the search starts, values by variables' names; otherwise at the initial point. Where there are
         several equilibria, it chooses.
-    - `drifting`: states whose derivatives need not vanish, such as the angle of a shaft that turns at a steady speed:
-        they keep their values at the start.
+    - `drifting`: states whose derivatives need not vanish, such as the angle of a shaft that turns at a steady speed,
+        and discrete variables that need not settle, such as a counter: they keep their values at the start.
     - `throw`: whether to raise if there is no such point; otherwise its values are not-a-number, and so are their
         derivatives. None: outside jit, grad and vmap. Inside, True puts callbacks to the host into the program, which
         JAX's persistent compilation cache then does not keep.
 
     **Returns:**
 
-    An `OperatingPoint`: `point["motor.rotor.w"]`. It is differentiable with respect to parameters, networks and inputs,
-    by the implicit function theorem, to second order; the search itself is not differentiated. It works inside `jit`,
-    `grad` and `vmap`.
+    An `OperatingPoint`: `point["motor.rotor.w"]`, `point["diode.active"]`. It is differentiable with respect to
+    parameters, networks and inputs, by the implicit function theorem, to second order; the search itself is not
+    differentiated. It works inside `jit`, `grad` and `vmap`.
 
     **Raises:**
 
-    - `ModelError` for an unknown name, and a name in `drifting` that is not a state.
-    - `SteadyStateError` if no equilibrium was found, with the derivatives that do not vanish; and if it is singular,
-        with the states that nothing determines. Inside jit, these are Equinox run-time errors.
+    - `ModelError` for an unknown name, and a name in `drifting` that is neither a state nor a discrete variable.
+    - `SteadyStateError` if no equilibrium was found, with the derivatives that do not vanish, or with the event that
+        does not let the system rest; and if it is singular, with the states that nothing determines. Inside jit, these
+        are Equinox run-time errors.
     - `InitializationError` if there is no consistent initial point to start from.
     """
     check_system(system)
@@ -71,7 +87,7 @@ def steady_state(
 
 
 def equilibrium_from(
-    system: AcausalSystem, t: Any, inputs: Any, initial: Any, drifting: tuple[int, ...], throw: bool | None
+    system: AcausalSystem, t: Any, inputs: Any, initial: Any, drifting: Drifting, throw: bool | None
 ) -> tuple[Equilibrium, Any, dict[str, Any]]:
     """The search from the initial point; the time and the inputs as arrays and as they were read."""
     dtype = system.parameters.values.dtype
@@ -82,11 +98,11 @@ def equilibrium_from(
     inputs, t = read_inputs(system.plan, dtype, inputs), jnp.asarray(t, dtype)
     given = (system, t, begin.x, inputs)
     if not is_staged(given):
-        found = compiled_search(*given, drifting)
+        found = compiled_search(*given, *drifting)
         # An input's function may close over a traced value, which shows in the outcome only.
         if not is_staged(found):
             return found, t, inputs
-    return find_equilibrium(*given, drifting), t, inputs
+    return find_equilibrium(*given, *drifting), t, inputs
 
 
 def point_of(
@@ -111,7 +127,8 @@ def point_of(
     elif singular:
         raise SteadyStateError(_singular(system, found, drifting))
     relative = jnp.abs(found.residual) / jnp.where(found.limit > 0, found.limit, 1)
-    return OperatingPoint(x, system, t, inputs, jax.lax.stop_gradient(jnp.max(relative, initial=0.0)))
+    resting = system.holding(found.q) if len(found.q) else system
+    return OperatingPoint(x, resting, t, inputs, jax.lax.stop_gradient(jnp.max(relative, initial=0.0)))
 
 
 def is_traced(tree: Any) -> bool:
@@ -130,24 +147,29 @@ def check_system(system: Any):
         )
 
 
-def _places(system: AcausalSystem, drifting: Sequence[str]) -> tuple[int, ...]:
-    """The places of drifting states in the state array."""
+def _places(system: AcausalSystem, drifting: Sequence[str]) -> Drifting:
     if isinstance(drifting, str):
         raise ModelError(f"drifting is a list of names; write drifting=[{drifting!r}]")
     states = system.plan.states.tolist()
-    places = []
+    places, discrete = [], []
     for name in drifting:
+        if name in system.discretes:
+            discrete.append(system.discretes.index(name))
+            continue
         quantity = int(system.plan.resolve([name])[0][0])
         if quantity not in states:
-            raise ModelError(f"drifting: '{name}' is not a state: " + nearest(name, system.states))
+            known = [*system.states, *system.discretes]
+            raise ModelError(f"drifting: '{name}' is neither a state nor a discrete variable: " + nearest(name, known))
         places.append(states.index(quantity))
-    return tuple(sorted(set(places)))
+    return Drifting(tuple(sorted(set(places))), tuple(sorted(set(discrete))))
 
 
 # --- what is said when there is none -------------------------------------------------------------------------------
 
 
 def _not_found(system: AcausalSystem, found: Equilibrium, drifting: tuple[str, ...]) -> str:
+    if int(found.event) >= 0:
+        return _restless(system, int(found.event))
     residual, limit = np.abs(np.asarray(found.residual)), np.asarray(found.limit)
     excess = residual / np.where(limit > 0, limit, np.finfo(limit.dtype).tiny)
     excess = np.where(np.isfinite(excess), excess, np.inf)
@@ -155,20 +177,41 @@ def _not_found(system: AcausalSystem, found: Equilibrium, drifting: tuple[str, .
     worst = [k for k in np.argsort(-excess, kind="stable")[:WORST].tolist() if excess[k] > 1]
     left = "; ".join(f"{rows[k]} = {float(found.residual[k]):.3g}" for k in worst)
     text = f"no equilibrium was found; where the search ended, these are not zero: {left}."
+    written = _written_names(system, drifting)
+    counted = [written[k - len(rows)] for k in worst if k >= len(rows) - len(written)]
+    if counted:
+        return f"{text} If what a clock changes at each tick may go on, as a counter does, say drifting={counted}"
     loose = _undetermined(system, found, drifting)
     if loose:
         return (
             f"{text} Nothing there depends on {_directions(loose)}: if that may drift, as the angle of a shaft that "
             f"turns, say drifting={_first_names(loose)}"
         )
-    return f"{text} If there is one, start the search nearer to it: initial={{'{system.states[0]}': ...}}"
+    begin = f"initial={{'{system.states[0]}': ...}}" if system.states else "another time, t=..."
+    return f"{text} If there is one, start the search nearer to it: {begin}"
+
+
+def _restless(system: AcausalSystem, event: int) -> str:
+    plan: Any = system.plan.events
+    table = plan.table
+    text = table.text[event]
+    if table.message[event] is not None:
+        return f"no steady state: '{text}' holds at the equilibrium, where it ends the run ({table.message[event]!r})"
+    rows = table.event == event
+    names = [system.discretes[k] for k in table.discrete[rows].tolist() if 0 <= k < plan.n_visible]
+    names += [system.states[k] for k in plan.state[rows].tolist() if k >= 0]
+    return (
+        f"no steady state: at each equilibrium of the equations an event happens that leads to another one, and so on "
+        f"without end, as '{text}'. If what it writes may stay as it starts, say drifting={names}; if another mode is "
+        "meant, start the search nearer to it, with initial={...} and with_parameters({...})"
+    )
 
 
 def _singular(system: AcausalSystem, found: Equilibrium, drifting: tuple[str, ...]) -> str:
     loose = _undetermined(system, found, drifting)
     return (
         f"the equilibrium is singular: nothing determines {_directions(loose)}. To keep the value at the start, say "
-        f"drifting={_first_names(loose)}; or add what holds it, such as a spring or a load"
+        f"drifting={_enough(system, found, drifting)}; or add what holds it, such as a spring or a load"
     )
 
 
@@ -186,7 +229,7 @@ def _undetermined(system: AcausalSystem, found: Equilibrium, drifting: tuple[str
     if not found.jacobian.shape[1] or not bool(jnp.all(jnp.isfinite(found.jacobian))):
         return []
     values, directions = open_directions(found)
-    names = np.array([*system.states, *system.carried])[unknowns(system.plan, _places(system, drifting))]
+    names = np.array(_unknown_names(system, drifting))
     loose = []
     for direction in np.abs(np.asarray(directions)[np.asarray(is_open(values))]):
         inside = names[direction > IN_DIRECTION * direction.max()].tolist()
@@ -194,8 +237,45 @@ def _undetermined(system: AcausalSystem, found: Equilibrium, drifting: tuple[str
     return [names for k, names in enumerate(loose) if names not in loose[:k]]
 
 
+def _enough(system: AcausalSystem, found: Equilibrium, drifting: tuple[str, ...]) -> str:
+    """States that may drift so that the others are determined: a mass that friction holds keeps its place and speed."""
+    names, n_rows = _unknown_names(system, drifting), len(unknowns(system.plan, _places(system, drifting).states))
+    kept, left = list(range(len(names))), found
+    while len(kept) and (loose := np.flatnonzero(np.asarray(is_open(open_directions(left)[0])))).size:
+        direction = np.abs(np.asarray(open_directions(left)[1]))[loose[0]]
+        del kept[int(np.argmax(direction > IN_DIRECTION * direction.max()))]
+        rows = [k for k in range(found.jacobian.shape[0]) if k >= n_rows or k in kept]
+        left = found._replace(jacobian=found.jacobian[np.array(rows, int)][:, np.array(kept, int)])
+        left = left._replace(unit=found.unit[np.array(kept, int)])
+    chosen = [name for k, name in enumerate(names) if k not in kept]
+    return f"[{', '.join(map(repr, chosen[:WORST]))}{', …' if len(chosen) > WORST else ''}]"
+
+
+def _unknown_names(system: AcausalSystem, drifting: tuple[str, ...]) -> list[str]:
+    places = _places(system, drifting)
+    every = [*system.states, *system.carried]
+    events = resting_events(system.plan, places.discrete, places.states)
+    sampled = [] if events is None else [system.discretes[k] for k in events.unknown.tolist()]
+    return [every[k] for k in unknowns(system.plan, places.states)] + sampled
+
+
 def _row_names(system: AcausalSystem, drifting: tuple[str, ...]) -> list[str]:
     plan = system.plan
     rows = [f"der({n})" for n in system.states] + [f"the equation that determines {n}" for n in system.carried]
-    rows = [rows[k] for k in unknowns(plan, _places(system, drifting))]
-    return rows + [f"the constraint {plan.describe(int(e))}" for e in plan.selection.constraints]
+    rows = [rows[k] for k in unknowns(plan, _places(system, drifting).states)]
+    rows += [f"the constraint {plan.describe(int(e))}" for e in plan.selection.constraints]
+    if plan.held is not None:
+        rows += [f"the branch {plan.held.table.text[k]}" for k in plan.held.table.owner.tolist()]
+    return rows + [f"the change of {name}" for name in _written_names(system, drifting)]
+
+
+def _written_names(system: AcausalSystem, drifting: tuple[str, ...]) -> list[str]:
+    """The variables that clocks write, one for each row of ticks."""
+    plan, places = system.plan, _places(system, drifting)
+    events = resting_events(plan, places.discrete, places.states)
+    if events is None or plan.events is None:
+        return []
+    table = plan.events.table
+    states = [system.states[plan.events.state[k]] if plan.events.state[k] >= 0 else "" for k in events.ticking]
+    values = [int(k) for k in table.discrete[events.ticking]]
+    return [state or system.discretes[k] for state, k in zip(states, values, strict=True)]

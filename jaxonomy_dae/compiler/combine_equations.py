@@ -1,15 +1,37 @@
-"""A linear combination of equations, in which some quantities cancel, as a new equation."""
+"""A linear combination of equations, in which some quantities cancel, as a new equation.
+
+A quantity cancels if its slope in the combination is zero. Where the algebra of terms shows that, it is so for all
+parameters and states. Where only values at sample points show it, as of Min(p, 1e4) − p, the new equation guards
+itself: it has no value where the slope is not zero, so that nothing is computed from an equation that does not hold.
+"""
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
 
 from ..expressions.differentiate import partial_derivative
 from ..expressions.errors import KernelWithErrors
+from ..expressions.functions import apply
 from ..expressions.kernel import Kernel
+from ..expressions.node import (
+    ONE,
+    TRUE,
+    Node,
+    both,
+    compare,
+    constant,
+    leaf,
+    linear,
+    multiply,
+    number,
+    power,
+    scale,
+    select,
+    split,
+)
 from ..expressions.node import ZERO as ZERO_NODE
-from ..expressions.node import Node, constant, leaf, linear, multiply, number, scale, split
 from ..expressions.substitute import substitute
 from ..expressions.terms import terms as multiplied_out
 from ..model.linear_template import LinearTemplate
@@ -20,10 +42,9 @@ from ..modeling.symbols import TIME_LABEL
 from ..tolerances import CANCELLED, MEANT_EQUAL, SLIGHT
 
 POINTS = 4  # sample values of the parameters, the first of them those given (see `near`)
-FAR = 64  # points at which a cancellation must hold, too, …
-# … over these powers of ten of quantities and of parameters given: to where branches of conditions turn.
-REACH, REACH_OF_PARAMETERS = 5.0, 2.0
 NEARER = 6  # how often sample points come nearer to zero
+
+MINUS, HALF = constant(-1), Fraction(1, 2)
 
 
 def quantity_label(variable: int, order: int) -> Hashable:
@@ -113,10 +134,25 @@ class Samples:
 
     def __call__(self, graphs: Sequence[Node]) -> np.ndarray:
         """Shape (graphs, points)."""
-        # Those of these graphs alone: a combination of n equations is asked about each of its n quantities.
-        labels = sorted(frozenset().union(*(g.leaves for g in graphs)), key=self._place.__getitem__)
-        found = Kernel(graphs, labels)([self._columns[self._place[label]] for label in labels], "numpy")
+        labels, columns = self._of(graphs)
+        found = Kernel(graphs, labels)(columns, "numpy")
         return np.stack([np.broadcast_to(np.asarray(v, float), (3 * POINTS,)) for v in found])
+
+    def is_rounding(self, graph: Node) -> bool:
+        """True if a graph is a rounding error at all points at which it has a value other than zero."""
+        if number(graph) is not None:
+            return number(graph) == 0
+        labels, columns = self._of([graph])
+        (value,), (bound,) = KernelWithErrors([graph], labels)(columns, [np.zeros(3 * POINTS)] * len(columns))
+        value, bound = (np.broadcast_to(np.asarray(v, float), (3 * POINTS,)) for v in (value, bound))
+        says = np.isfinite(value + bound) & (bound > 0)
+        return bool(says.any() and (np.abs(value) <= bound)[says].all())
+
+    def _of(self, graphs: Sequence[Node]) -> tuple[list[Hashable], list[np.ndarray]]:
+        """The labels of these graphs alone, and their values: a combination of n equations is asked about each of its n
+        quantities."""
+        labels = sorted(frozenset().union(*(g.leaves for g in graphs)), key=self._place.__getitem__)
+        return labels, [self._columns[self._place[label]] for label in labels]
 
 
 @np.errstate(all="ignore")  # points where equations overflow are left out
@@ -157,7 +193,8 @@ def combine(
         # Where there are values at some points only, slopes of zero may be what underflowed.
         seen = finite.all() or (size[finite] > 0).any()
         if finite.any() and seen and small[finite].all():
-            if label not in without.leaves or label in gone or _is_rounding(without, label, values, kept):
+            alone = label not in without.leaves or label in gone
+            if alone or samples.is_rounding(_sum_of_terms([partial_derivative(without, label)])):
                 cancelled.append(label)
             else:
                 stays = True
@@ -166,13 +203,32 @@ def combine(
         return None
     before = samples(terms)
     for value in (0, 1, 0.7):
-        rest = substitute(total, {label: constant(value) for label in cancelled})
+        chosen = {label: constant(value) for label in cancelled}
+        rest = substitute(total, chosen)
         after = samples([rest])[0]
         finite = np.isfinite(before).all(axis=0)
         same = np.abs(after - before.sum(axis=0)) <= MEANT_EQUAL * np.abs(before).sum(axis=0)
         if finite.any() and same[finite].all():
-            return rest
+            slopes = [[multiply(w, partial_derivative(e, label)) for w, e in occurs[label]] for label in cancelled]
+            return _guarded(rest, [[substitute(s, chosen) for s in terms] for terms in slopes])
     return None
+
+
+def _guarded(graph: Node, slopes: Sequence[Sequence[Node]]) -> Node | None:
+    """The graph, without a value where one of these sums is not zero beside its terms; None if they read quantities
+    that the graph does not, which it would then seem to determine."""
+    holds = []
+    for terms in slopes:
+        left = _sum_of_terms(terms)
+        if number(left) == 0:
+            continue
+        size = linear((1, apply("abs", term)) for term in terms)
+        holds.append(compare("less_equal", apply("abs", left), scale(SLIGHT, size)))
+        if any(label[0] == "quantity" and label not in graph.leaves for label in left.leaves | size.leaves):
+            return None
+    condition = both(*holds)
+    # A factor, for the equation is differentiated, too. The root of minus one is not a number.
+    return graph if condition is TRUE else multiply(graph, power(select(condition, ONE, MINUS), HALF))
 
 
 def _sum_of_terms(parts: Sequence[Node]) -> Node:
@@ -182,69 +238,6 @@ def _sum_of_terms(parts: Sequence[Node]) -> Node:
         collected.setdefault(rest, []).append(c)
     sums = {rest: (sum(found), sum(map(abs, found))) for rest, found in collected.items()}
     return linear((c, rest) for rest, (c, size) in sums.items() if abs(c) > CANCELLED * size)
-
-
-def _is_rounding(graph: Node, label: Hashable, values: np.ndarray, kept: np.ndarray) -> bool:
-    """True if a graph's slope in a quantity is a rounding error at all sampled points at which it has a value other
-    than zero."""
-    slope = _sum_of_terms([partial_derivative(graph, label)])
-    labels = sorted(slope.leaves, key=repr)
-    columns = _far_points(labels, values, kept, of_parameters=True)
-    (value,), (bound,) = KernelWithErrors([slope], labels)(columns, [np.zeros(FAR)] * len(columns))
-    value, bound = (np.broadcast_to(np.asarray(v, float), (FAR,)) for v in (value, bound))
-    says = np.isfinite(value + bound) & (bound > 0)
-    return number(slope) == 0 or bool(says.any() and (np.abs(value) <= bound)[says].all())
-
-
-def _far_points(labels: Sequence[Any], values: np.ndarray, kept: np.ndarray, of_parameters: bool) -> list[np.ndarray]:
-    """Values of quantities of all sizes and signs, FAR of each; and of parameters, those given or, with
-    `of_parameters`, others, but for those in `kept`."""
-    rng = np.random.default_rng(0)
-    columns = []
-    for label in labels:
-        sign, power = rng.choice([-1.0, 1.0], FAR), rng.uniform(-1.0, 1.0, FAR)
-        if label == TIME_LABEL:
-            columns.append(10.0 ** (REACH * power))
-        elif label[0] == "quantity":
-            columns.append(sign * 10.0 ** (REACH * power))
-        elif not of_parameters or label[1] in kept:
-            columns.append(np.full(FAR, values[label[1]]))
-        else:
-            columns.append(sign * 10.0 ** (REACH_OF_PARAMETERS * power) * (abs(values[label[1]]) or 1.0))
-    return columns
-
-
-@np.errstate(all="ignore")
-def cancels_elsewhere(
-    equations: Sequence[Node], weights: Sequence[Node], gone: Sequence[Hashable], values: np.ndarray, kept: np.ndarray,
-    of_parameters: bool,
-) -> bool:  # fmt: skip
-    """True if a combination that cancels near the points that were tried cancels at quantities of other sizes and
-    signs, too, or with `of_parameters`, at other parameters: a condition may choose another branch there. Points
-    without values say nothing.
-
-    Parameters in `kept`, discrete variables, are as they are given.
-    """
-    place = {label: k for k, label in enumerate(gone)}
-    inside = [
-        (place[label], multiply(w, partial_derivative(e, label)))
-        for w, e in zip(weights, equations, strict=True)
-        for label in sorted(e.leaves & place.keys(), key=place.__getitem__)
-    ]
-    owner, graphs = [k for k, _ in inside], [graph for _, graph in inside]
-    labels = sorted(frozenset().union(*(g.leaves for g in graphs)), key=repr)
-    if not any(label[0] == "quantity" or label == TIME_LABEL or of_parameters for label in labels):
-        return True
-    columns = _far_points(labels, values, kept, of_parameters)
-    # Points are exact, but far out 1 + x⁴ − x⁴ is zero: what evaluation loses says nothing either.
-    left, size, lost = np.zeros((3, len(gone), FAR))
-    for k, value, error in zip(
-        owner, *KernelWithErrors(graphs, labels)(columns, [np.zeros(FAR)] * len(columns)), strict=True
-    ):
-        left[k] += value
-        size[k] += np.abs(value)
-        lost[k] += error
-    return not (np.isfinite(size + lost).all(axis=0) & (np.abs(left) > SLIGHT * size + lost)).any()
 
 
 def _coefficients(graph: Node) -> dict[Hashable, float] | None:

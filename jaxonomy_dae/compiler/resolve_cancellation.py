@@ -28,7 +28,7 @@ from ..structure.matching import maximum_matching
 from ..structure.pantelides import Offsets, reduce_index
 from ..tolerances import KNOWN
 from . import elimination
-from .combine_equations import cancels_elsewhere, combine, graph_of, group_of, near, quantity_label, tried
+from .combine_equations import combine, graph_of, group_of, near, quantity_label, tried
 from .elimination import Row
 from .highest_derivatives import HighestDerivatives
 from .null_vectors import null_vectors, rational
@@ -198,12 +198,6 @@ def _sampled_combination(
         raise StructuralError(
             "\n".join([_for_values(jacobian, equations, names, concerned, discrete), *itemised(sources)])
         )
-    if not cancels_elsewhere(written, found, top, jacobian.values, discrete, of_parameters=False):
-        return None  # regular in general: singular where a condition says so
-    if not cancels_elsewhere(written, found, top, jacobian.values, discrete, of_parameters=True):
-        concerned = sorted({label[1] for e in written for label in e.leaves if label[0] == "of model"})
-        message = _for_values(jacobian, equations, names, concerned, discrete)
-        raise StructuralError("\n".join([message, *itemised(sources)]))
     return _replacement(jacobian, equations, used, written, found, unit, top, sources, discrete)
 
 

@@ -289,7 +289,7 @@ class SystemAt:
             raise ModelError("no constraint of this system comes and goes with modes")
         return self.plan.held
 
-    def _projected_onto(self, x: Any) -> Any:
+    def projected_onto(self, x: Any) -> Any:
         """All residuals that states are projected onto: zero, whatever the state, where a mode does not ask for one."""
         residuals = self.constraint_vector(self.split(x))
         if self.plan.held is None:
@@ -344,7 +344,7 @@ class SystemAt:
         x, rest = array[:n], array[n:]
 
         def vector(x):
-            return self._projected_onto(jnp.concatenate([x, rest]))
+            return self.projected_onto(jnp.concatenate([x, rest]))
 
         value, pull = jax.vjp(vector, x)
         jacobian = jax.vmap(lambda e: pull(e)[0])(jnp.eye(value.shape[0], dtype=self.dtype))

@@ -1,0 +1,101 @@
+"""The partial derivatives of a model at a point, of which linear models are made."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..lowering.plan import SystemPlan
+from ..programs.cache import compiled
+from ..system.evaluate import Refinement
+from ..system.system import AcausalSystem
+from ..tolerances import spacing
+from .events_at_rest import both_sides, resting_events
+from .tangent import Coordinates
+
+
+class Partials(NamedTuple):
+    """What a linear model is made of, at a point.
+
+    - `slopes`, `outputs`: dx/dt and y.
+    - `of_slopes`, `of_constraints`, `of_outputs`: their derivatives, and those of hidden constraints, with respect to
+        states, inputs and the discrete values that clocks write.
+    - `agree`: whether all of it is the same on both sides of events at whose levels the point lies; `near`: which
+        events these are.
+    """
+
+    slopes: Any
+    outputs: Any
+    of_slopes: tuple[Any, Any, Any]
+    of_constraints: tuple[Any, Any, Any]
+    of_outputs: tuple[Any, Any, Any]
+    agree: Any
+    near: Any
+
+
+def partials_at(
+    system: AcausalSystem, t: Any, x: Any, q: Any, values: Any, u: Any, names: tuple[str, ...],
+    quantity: tuple[int, ...], factor: tuple[float, ...],
+) -> Partials:  # fmt: skip
+    n = len(system.plan.states)
+    which, scale = np.array(quantity, np.int64), np.array(factor)
+    events = resting_events(system.plan)
+    sampled = np.zeros(0, np.int64) if events is None else events.unknown
+
+    def everything(state, u, held, q):
+        now = system.holding(q.at[sampled].set(held) if len(sampled) else q)
+        here = now.at(t, {**values, **dict(zip(names, u, strict=True))})
+        full = here.split(jnp.concatenate([state, x[n:]]))
+        if len(system.plan.carried):  # which follow the states and the inputs
+            full = here.refined(full, Refinement.ROOT)
+        joined = here.join(full)
+        read = here.quantities(joined, np.maximum(which, 0), scale) if len(which) else joined[:0]
+        y = jnp.where(jnp.asarray(which < 0), 0.0, read)
+        return here.semi_explicit(joined)[:n], here.constraint_vector(full), y
+
+    def of(q):
+        def twice(*given):
+            state, u, held = given
+            found = everything(state, u, held, q)
+            return found, found
+
+        return jax.jacfwd(twice, (0, 1, 2), has_aux=True)(x[:n], u, q[sampled])
+
+    if events is None or not len(system.plan.events or ()):
+        (of_slopes, of_constraints, of_outputs), (slopes, _, y) = of(q)
+        return Partials(slopes, y, of_slopes, of_constraints, of_outputs, jnp.array(True), jnp.zeros(0, bool))
+    sides, near = both_sides(system, t, values, events, x, q)
+    on_sides = jax.vmap(of)(sides.at[0].set(q))
+    (of_slopes, of_constraints, of_outputs), (slopes, _, y) = jax.tree.map(lambda a: a[0], on_sides)
+    agree = jnp.stack([_alike(leaf) for leaf in jax.tree.leaves(on_sides)]).all()
+    return Partials(slopes, y, of_slopes, of_constraints, of_outputs, agree & ~_moves(system.plan, near), near)
+
+
+def _alike(sides: Any) -> Any:
+    """Whether rows are the same, to half of the digits of the largest entry."""
+    allowed = spacing(sides.dtype) ** 0.5 * jnp.max(jnp.abs(sides), initial=0.0)
+    return jnp.all(jnp.abs(sides - sides[0]) <= allowed)
+
+
+def _moves(plan: SystemPlan, near: Any) -> Any:
+    """Whether one of these events lets states jump, or ends the run."""
+    events: Any = plan.events
+    moves = np.array([message is not None for message in events.table.message])
+    moves[events.table.event[events.state >= 0]] = True
+    return jnp.any(near & moves)
+
+
+def on_tangent(partials: Partials, coordinates: Coordinates) -> tuple[Any, Any]:
+    """(how states follow from the coordinates, shape (states, coordinates); the derivatives of slopes with respect to
+    states that keep to the constraints). Dependent states d follow from coordinates q by ∂h/∂d·δd + ∂h/∂q·δq = 0."""
+    kept, dependent, rows = coordinates
+    h_x = partials.of_constraints[0]
+    follow = jnp.zeros((h_x.shape[1], len(kept)), h_x.dtype).at[kept, np.arange(len(kept))].set(1.0)
+    if len(dependent):
+        inner = h_x[rows][:, dependent]
+        follow = follow.at[dependent].set(-jnp.linalg.solve(inner, h_x[rows][:, kept]))
+    return follow, partials.of_slopes[0] @ follow
+
+
+compiled_partials = compiled(partials_at)

@@ -1,0 +1,178 @@
+"""The discrete-time state space of a model with sampled controllers.
+
+Given are the partial derivatives of a model at a point, and its clocks. Over the period after which all clocks repeat,
+ticks and flows take turns: a tick is linear with the Jacobian of what its events write; between ticks, where discrete
+values z and inputs u are constant, deviations follow d(x, z, u)/dt = F·(x, z, u), whose solution is exp(F·duration).
+Their product is the state space. (Franklin, Powell & Workman 1998, section 4.3.)
+"""
+
+from fractions import Fraction
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from ..diagnosis.wording import some
+from ..errors import ModelError
+from ..system.system import AcausalSystem
+from ..system.system_at import SystemAt
+from ..tolerances import MEANT_EQUAL
+from .events_at_rest import RestingEvents, resting_events, ticked
+from .partials import Partials, on_tangent
+from .state_space import StateSpace
+from .tangent import Coordinates
+
+RATIO = 1000  # the largest denominator of a ratio of two periods that counts as one of integers
+TICKS = 1000  # in a period of all clocks: each instant is a matrix exponential
+
+
+class Sampled(NamedTuple):
+    """A point, what drives it there, and the names of inputs and outputs."""
+
+    t: Any
+    x: Any
+    q: Any
+    values: Any
+    u: Any
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+
+class Instants(NamedTuple):
+    """The ticks of one period of all clocks: of each instant the events, and their numbers of ticks; and how many ticks
+    of each clock it takes until all repeat."""
+
+    events: tuple[tuple[int, ...], ...]
+    numbers: tuple[tuple[int, ...], ...]
+    counts: dict[int, int]
+
+
+def sampled_space(system: AcausalSystem, point: Sampled, partials: Partials, coordinates: Coordinates) -> StateSpace:
+    """The discrete-time state space, of the states and the discrete variables that clocks write, before the first tick
+    of a period."""
+    plan, events = system.plan, resting_events(system.plan)
+    if events is None or not len(events.ticking):
+        raise ModelError("sampled=True is for models with events of clocks, when(self.sampled(T), ...); this has none")
+    plan_of_events: Any = plan.events
+    if plan.n_projected and (plan_of_events.state[events.ticking] >= 0).any():
+        raise ModelError(
+            "a clock writes states of a model with hidden constraints, which has no linear model from tick to tick yet"
+        )
+    instants = instants_of(system, events)
+    times, fine = _times(system, instants)
+    fine &= jnp.all(partials.of_constraints[2] == 0)  # otherwise states jump at ticks, by more than events write
+    n, k, m = len(plan.states), len(events.unknown), len(point.u)
+    kept = coordinates.kept
+    follow, slopes = on_tangent(partials, coordinates)
+    dtype, size = point.x.dtype, len(kept) + k + m + 1
+    inner = slice(0, len(kept) + k)
+
+    # Deviations are (coordinates, discrete values, inputs, 1): the last carries what changes without any.
+    flow = jnp.zeros((size, size), dtype)
+    of_slopes = jnp.concatenate(
+        [slopes[kept], partials.of_slopes[2][kept], partials.of_slopes[1][kept], partials.slopes[kept, None]], axis=1
+    )
+    flow = flow.at[: len(kept)].set(of_slopes)
+    spread = jnp.zeros((n + k + m, size - 1), dtype)
+    spread = spread.at[:n, : len(kept)].set(follow).at[n:, len(kept) :].set(jnp.eye(k + m, dtype=dtype))
+
+    def tick(events_now: tuple[int, ...]) -> Any:
+        def written(given):
+            state, held, u = jnp.split(given, [n, n + k])
+            driving = {**point.values, **dict(zip(point.inputs, u, strict=True))}
+            x, q = jnp.concatenate([state, point.x[n:]]), point.q.at[events.unknown].set(held)
+            x, q = ticked(system, point.t, driving, events_now, x, q)
+            after = jnp.concatenate([x[:n][kept], q[events.unknown], u])
+            return after, after
+
+        given = jnp.concatenate([point.x[:n], point.q[events.unknown], point.u])
+        jacobian, after = jax.jacfwd(written, has_aux=True)(given)
+        before = jnp.concatenate([point.x[:n][kept], point.q[events.unknown], point.u])
+        moved = jnp.concatenate([jacobian @ spread, (after - before)[:, None]], axis=1)
+        return jnp.concatenate([moved, jnp.eye(1, size, size - 1, dtype=dtype)])
+
+    alike = {now: tick(now) for now in dict.fromkeys(instants.events)}
+    first = alike[instants.events[0]]
+    whole = jnp.eye(size, dtype=dtype)
+    for now, duration in zip(instants.events, jnp.diff(times), strict=True):
+        whole = jax.scipy.linalg.expm(flow * duration) @ alike[now] @ whole
+    y_x, y_u, y_z = partials.of_outputs
+    read = jnp.concatenate([y_x @ follow, y_z, y_u, jnp.zeros((len(point.outputs), 1), dtype)], axis=1) @ first
+    if not isinstance(fine, Tracer) and not bool(fine):
+        raise ModelError("hidden constraints depend on what a clock writes: states jump at its ticks, which have no "
+                         "linear model yet")  # fmt: skip
+    whole, read = jnp.where(fine, whole, jnp.nan), jnp.where(fine, read, jnp.nan)
+    places = slice(len(kept) + k, len(kept) + k + m)
+    names = (*(system.states[c] for c in kept), *(system.discretes[c] for c in events.unknown.tolist()))
+    return StateSpace(
+        whole[inner, inner], whole[inner, places], read[:, inner], read[:, places],
+        jnp.append(point.x[:n][kept], point.q[events.unknown]), point.u, partials.outputs + read[:, -1],
+        whole[inner, -1], names, point.inputs, point.outputs, times[-1] - times[0],
+    )  # fmt: skip
+
+
+def instants_of(system: AcausalSystem, events: RestingEvents) -> Instants:
+    """The ticks of one period of all clocks, in their order at the values of parameters that are known (inside jit,
+    those that were declared).
+
+    **Raises:**
+
+    - `ModelError` if the periods have no common multiple, or if it takes more than `TICKS` ticks.
+    """
+    plan: Any = system.plan.events
+    clocks = np.unique(plan.table.event[events.ticking]).tolist()
+    known, values = system.parameters.known, system.plan.flat.parameters.values
+    if known is not None:
+        values = np.append(known, values[len(known) :])
+    with jax.ensure_compile_time_eval():
+        both = SystemAt(system.plan, jnp.asarray(values), (), 0.0, {}, system.plan.nominal).clocks()
+    periods, offsets = (np.asarray(v)[clocks] for v in both)
+    shortest = periods.min()
+    ratios = [Fraction(p / shortest).limit_denominator(RATIO) for p in periods.tolist()]
+    apart = np.abs(np.array([float(r) for r in ratios]) * shortest - periods) > MEANT_EQUAL * periods
+    grid = np.lcm.reduce([r.denominator for r in ratios])
+    parts = [int(r * int(grid)) for r in ratios]
+    common = int(np.lcm.reduce(parts))
+    counts = {e: common // part for e, part in zip(clocks, parts, strict=True)}
+    if apart.any() or sum(counts.values()) > TICKS:
+        listed = some([f"'{plan.names[e]}' every {p:g} s" for e, p in zip(clocks, periods.tolist(), strict=True)])
+        raise ModelError(
+            f"the clocks {listed} do not tick together again within {TICKS} ticks, so that there is no linear model of "
+            "one period: choose periods that are in the ratio of small integers"
+        )
+    at = sorted(
+        (float(o + number * p), e, number)
+        for e, o, p in zip(clocks, offsets.tolist(), periods.tolist(), strict=True)
+        for number in range(-int(np.floor((o - offsets.min()) / p + MEANT_EQUAL)), counts[e]
+                            - int(np.floor((o - offsets.min()) / p + MEANT_EQUAL)))
+    )  # fmt: skip
+    groups: list[list[tuple[float, int, int]]] = []
+    for time, e, number in at:
+        if groups and time - groups[-1][0][0] <= MEANT_EQUAL * shortest:
+            groups[-1].append((time, e, number))
+        else:
+            groups.append([(time, e, number)])
+    ordered = [sorted(group, key=lambda entry: entry[1]) for group in groups]
+    return Instants(
+        tuple(tuple(e for _, e, _ in group) for group in ordered),
+        tuple(tuple(number for _, _, number in group) for group in ordered),
+        counts,
+    )
+
+
+def _times(system: AcausalSystem, instants: Instants) -> tuple[Any, Any]:
+    """(The times of the instants, and of the first one of the next period; whether ticks are in the order that was
+    taken for granted)."""
+    periods, offsets = SystemAt(system.plan, system.numbers, (), 0.0, {}, system.typical_sizes).clocks()
+    rows = [
+        [offsets[e] + number * periods[e] for e, number in zip(now, numbers, strict=True)]
+        for now, numbers in zip(instants.events, instants.numbers, strict=True)
+    ]
+    lengths = jnp.stack([count * periods[e] for e, count in instants.counts.items()])
+    times = jnp.stack([row[0] for row in rows] + [rows[0][0] + lengths[0]])
+    allowed = MEANT_EQUAL * jnp.min(lengths)
+    together = [jnp.max(jnp.abs(jnp.stack(row) - row[0])) <= allowed for row in rows]
+    fine = jnp.all(jnp.stack(together)) & jnp.all(jnp.diff(times) > 0)
+    return times, fine & (jnp.max(lengths) - jnp.min(lengths) <= allowed)

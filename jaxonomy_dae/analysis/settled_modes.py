@@ -1,0 +1,106 @@
+"""Which modes a system rests in.
+
+Given are a search for the equilibrium with modes as they are, and a start. Events that happen at the initial time do
+so first. Then the equilibrium is found, the first event whose condition holds there and that would change something
+happens, and so on until none is left. Where there is no equilibrium, or events lead back to where they were, modes that
+equations choose (`complementary`) are changed, few at once, and it all begins again.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from ..system.system import AcausalSystem
+from ..tolerances import solved
+from .events_at_rest import RestingEvents, after_event, next_event
+
+# Equilibria that are tried from one set of modes, and as many for each event: independent modes need one search each.
+ROUNDS, FOR_EACH = 16, 4
+
+
+class Point(NamedTuple):
+    """A point: states, discrete values, the action that wrote each of these (−1 for none), and whether one did."""
+
+    x: Any
+    q: Any
+    writer: Any
+    changed: Any
+
+
+class Root(NamedTuple):
+    """What a search found: the unknowns, the rows' Jacobian, the largest residuals that count as rounding, the
+    unknowns' sizes, and whether it is a root."""
+
+    w: Any
+    jacobian: Any
+    limit: Any
+    unit: Any
+    good: Any
+
+
+class _Search(NamedTuple):
+    """The state of the loop: the point to search from, what was found at last, the event that is left there, the set of
+    modes tried, the rounds with it, a point and an event of an earlier round, what came out of the first set."""
+
+    at: Point
+    root: Root
+    event: Any
+    modes: Any
+    rounds: Any
+    before: tuple[Point, Any]
+    first: tuple[Point, Root, Any]
+    goes_on: Any
+
+
+def settle(
+    system: AcausalSystem, t: Any, inputs: Any, events: RestingEvents, begin: Point,
+    search: Callable[[Point], tuple[Point, Root]],
+) -> tuple[Point, Root, Any]:  # fmt: skip
+    """Returns (the point, what the search found there, the event that does not let it rest or −1)."""
+    limit = ROUNDS + FOR_EACH * int(events.acting.sum())
+    flips = jnp.asarray(events.flips)
+
+    def following(event: Any, at: Point) -> Point:
+        x, q, writer = after_event(system, t, inputs, events, event, at.x, at.q, at.writer)
+        return Point(x, q, writer, at.changed | (q != at.q) | (writer != at.writer))
+
+    def at_start(carry: tuple[Any, Any, Point]) -> tuple[Any, Any, Point]:
+        count, event, at = carry
+        at = following(event, at)
+        return count + 1, next_event(system, t, inputs, events, at.x, at.q, True), at
+
+    event = next_event(system, t, inputs, events, begin.x, begin.q, True)
+    unfinished = jnp.array(0), event, begin
+    _, _, begin = jax.lax.while_loop(lambda c: (c[1] >= 0) & (c[0] < limit), at_start, unfinished)
+
+    def once(state: _Search) -> _Search:
+        here, root = search(state.at)
+        event = jnp.where(root.good, next_event(system, t, inputs, events, here.x, here.q, False), -1)
+        after = following(event, here)
+        settled = root.good & (event < 0)
+        # Brent's method: rounds are compared with one whose number is a power of two.
+        earlier, last = state.before
+        moved = jnp.abs(after.x - earlier.x) > solved(after.x.dtype) * jnp.maximum(jnp.abs(after.x), jnp.abs(earlier.x))
+        again = (event == last) & ~jnp.any(moved) & jnp.all(after.q == earlier.q)
+        fails = ~settled & (~root.good | again | (state.rounds >= limit))
+        keep = (state.rounds & (state.rounds - 1)) == 0
+        before = jax.tree.map(lambda a, b: jnp.where(keep, a, b), (after, event), state.before)
+        modes = state.modes + jnp.where(fails, 1, 0)
+        flipped = flips[jnp.minimum(modes, len(flips) - 1)]
+        anew = begin._replace(q=jnp.where(flipped, 1 - begin.q, begin.q), changed=begin.changed | flipped)
+        at = jax.tree.map(lambda a, b, c: jnp.where(settled, a, jnp.where(fails, b, c)), here, anew, after)
+        found = here, root, event
+        first = jax.tree.map(lambda a, b: jnp.where(state.modes == 0, a, b), found, state.first)
+        rounds = jnp.where(fails, 1, state.rounds + 1)
+        return _Search(at, root, event, modes, rounds, before, first, ~settled & (modes < len(flips)))
+
+    shapes = jax.eval_shape(search, begin)
+    here, root = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
+    nothing = here, root, jnp.array(-1)
+    state = _Search(begin, root, nothing[2], jnp.array(0), jnp.array(1), (here, nothing[2]), nothing, jnp.array(True))
+    state = jax.lax.while_loop(lambda s: s.goes_on, once, state)
+    settled = state.root.good & (state.event < 0)
+    last = state.at, state.root, state.event
+    return jax.tree.map(lambda a, b: jnp.where(settled, a, b), last, state.first)

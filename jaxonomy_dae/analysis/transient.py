@@ -1,0 +1,65 @@
+"""Towards an equilibrium along the trajectory that leads to it.
+
+Where a saturation holds everything back, slopes do not depend on the states: no Newton step leads away. Implicit Euler
+steps of growing length do (pseudo-transient continuation, Kelley & Keyes 1998). One Newton step is taken for each, and
+the step is shortened where that does not solve its equation, as where it would jump over the range in which a
+controller is not saturated.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..linear.least_squares import least_squares
+
+STEPS = 200  # from a hundredth of the fastest time constant, three times as long each, they pass thirty decades
+LONGER, SHORTER = 3.0, 0.25
+LEFT = 0.5  # of a step's equation, after its Newton step: the part of the slope that may be
+NEAR = 1e-3  # of slopes at the start: then Newton's method does the rest
+
+
+def pseudo_transient(
+    function: Callable[[Any], Any], mass: Float[Array, " n"], start: Float[Array, " n"], unit: Float[Array, " n"]
+) -> Float[Array, " n"]:
+    """A point near the equilibrium of mass·dx/dt = F(x) that a start leads to, or where the steps end; `unit` are sizes
+    of the unknowns."""
+
+    def scaled(w):
+        return function(w * unit)
+
+    def slopes(w):
+        return jax.jacfwd(lambda w: (scaled(w),) * 2, has_aux=True)(w)
+
+    def sizes(jacobian, value):
+        size = jnp.sum(jnp.abs(jacobian), axis=1) + jnp.abs(value)
+        return jnp.where(size > 0, size, 1)
+
+    inertia = mass * unit
+    w = start / unit
+    jacobian, value = slopes(w)
+    fastest = jnp.max(jnp.where(inertia > 0, sizes(jacobian, value) / jnp.where(inertia > 0, inertia, 1), 0))
+    first = jnp.max(jnp.abs(value) / sizes(jacobian, value))
+
+    def goes_on(carry):
+        count, _, _, left = carry
+        return (count < STEPS) & (left > NEAR * first)
+
+    def step(carry):
+        count, w, h, left = carry
+        jacobian, value = slopes(w)
+        size = sizes(jacobian, value)
+        matrix = (jnp.diag(inertia / h) - jacobian) / size[:, None]
+        change = least_squares(matrix, value / size)
+        after = scaled(w + change)
+        off = jnp.max(jnp.abs(inertia * change / h - after) / size)
+        now = jnp.max(jnp.abs(value) / size)
+        fine = jnp.isfinite(off) & (off <= LEFT * now)
+        w = jnp.where(fine, w + change, w)
+        left = jnp.where(fine, jnp.max(jnp.abs(after) / size), left)
+        return count + 1, w, h * jnp.where(fine, LONGER, SHORTER), left
+
+    begin = jnp.array(0), w, 0.01 / jnp.where(fastest > 0, fastest, 1), first
+    return jax.lax.while_loop(goes_on, step, begin)[1] * unit
