@@ -26,6 +26,7 @@ from ..expressions.node import (
     linear,
     multiply,
     number,
+    postorder,
     power,
     scale,
     select,
@@ -42,6 +43,9 @@ from ..modeling.symbols import TIME_LABEL
 from ..tolerances import CANCELLED, MEANT_EQUAL, SLIGHT
 
 POINTS = 4  # sample values of the parameters, the first of them those given (see `near`)
+# Operations whose values say nothing of those elsewhere. Of all others, values at random points tell whether a sum of
+# them is zero everywhere.
+BRANCHES = frozenset({"select", "abs", "sign", "floor", "ceiling", "heaviside", "max", "min", "mod"})
 NEARER = 6  # how often sample points come nearer to zero
 
 MINUS, HALF = constant(-1), Fraction(1, 2)
@@ -193,8 +197,11 @@ def combine(
         # Where there are values at some points only, slopes of zero may be what underflowed.
         seen = finite.all() or (size[finite] > 0).any()
         if finite.any() and seen and small[finite].all():
-            alone = label not in without.leaves or label in gone
-            if alone or samples.is_rounding(_sum_of_terms([partial_derivative(without, label)])):
+            left = ZERO_NODE
+            if label in without.leaves and label not in gone:
+                left = _sum_of_terms([partial_derivative(without, label)])
+            # What is zero on one branch need not be so on another.
+            if number(left) == 0 or (not has_branches(left) and samples.is_rounding(left)):
                 cancelled.append(label)
             else:
                 stays = True
@@ -212,6 +219,21 @@ def combine(
             slopes = [[multiply(w, partial_derivative(e, label)) for w, e in occurs[label]] for label in cancelled]
             return _guarded(rest, [[substitute(s, chosen) for s in terms] for terms in slopes])
     return None
+
+
+def slope_left(equations: Sequence[Node], weights: Sequence[Node], label: Hashable) -> Node:
+    """The slope of a combination in a quantity, multiplied out: zero if that shows that the quantity cancels."""
+    inside = [(w, e) for w, e in zip(weights, equations, strict=True) if label in e.leaves]
+    return _sum_of_terms([multiply(w, partial_derivative(e, label)) for w, e in inside])
+
+
+def has_branches(graph: Node, of_parameters: bool = True) -> bool:
+    """True if a condition decides what a graph is; one on quantities or time, without `of_parameters`."""
+    return any(
+        n.operation in BRANCHES
+        and (of_parameters or any(label == TIME_LABEL or label[0] == "quantity" for label in n.leaves))
+        for n in postorder([graph])
+    )
 
 
 def _guarded(graph: Node, slopes: Sequence[Sequence[Node]]) -> Node | None:

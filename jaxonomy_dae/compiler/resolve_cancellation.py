@@ -28,7 +28,7 @@ from ..structure.matching import maximum_matching
 from ..structure.pantelides import Offsets, reduce_index
 from ..tolerances import KNOWN
 from . import elimination
-from .combine_equations import combine, graph_of, group_of, near, quantity_label, tried
+from .combine_equations import combine, graph_of, group_of, has_branches, near, quantity_label, slope_left, tried
 from .elimination import Row
 from .highest_derivatives import HighestDerivatives
 from .null_vectors import null_vectors, rational
@@ -198,6 +198,8 @@ def _sampled_combination(
         raise StructuralError(
             "\n".join([_for_values(jacobian, equations, names, concerned, discrete), *itemised(sources)])
         )
+    if any(has_branches(slope_left(written, found, label), of_parameters=False) for label in top):
+        return None  # regular in general: singular where a condition says so
     return _replacement(jacobian, equations, used, written, found, unit, top, sources, discrete)
 
 

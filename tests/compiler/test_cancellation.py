@@ -8,8 +8,10 @@ from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der
 from jaxonomy_dae.compiler.combine_equations import combine, quantity_label
 from jaxonomy_dae.compiler.null_vectors import cancels, left_null_vectors
 from jaxonomy_dae.errors import StructuralError
+from jaxonomy_dae.expressions.differentiate import directional_derivative
 from jaxonomy_dae.expressions.functions import apply
-from jaxonomy_dae.expressions.node import constant, leaf, linear, power, scale
+from jaxonomy_dae.expressions.kernel import Kernel
+from jaxonomy_dae.expressions.node import compare, constant, leaf, linear, multiply, power, scale, select
 from jaxonomy_dae.initialization.condition import conditions
 from jaxonomy_dae.judgement.rank import rank_of, rounding
 from jaxonomy_dae.judgement.scaling import geometric_scales
@@ -187,48 +189,48 @@ def test_what_cancels_on_one_branch_only_stays(coefficient):
     assert sorted(system.states) == ["d.x", "d.y"] and not any("cancel" in note for note in system.report.notes)
 
 
+P = ("of model", 0)
+
+
 @pytest.mark.parametrize(
-    ("coefficient", "p"),
+    ("coefficient", "p", "elsewhere"),
     [
-        (lambda p: sympy.Min(p, 10), 1.0),
-        (lambda p: sympy.Abs(p), 2.0),
-        (lambda p: sympy.Max(p, -3), 1.0),
-        (lambda p: sympy.Piecewise((p, p < 5), (2 * p, True)), 1.0),
+        (lambda p: apply("min", p, constant(10)), 1.0, 100.0),
+        (lambda p: apply("min", p, constant(10**4)), 1.0, 1e5),  # farther than any sample
+        (lambda p: apply("abs", p), 2.0, -2.0),
+        (lambda p: apply("max", p, constant(-3)), 1.0, -10.0),
+        (lambda p: select(compare("less", p, constant(5)), p, linear([(2, p)])), 1.0, 7.0),
     ],
-    ids=["Min", "Abs", "Max", "Piecewise"],
+    ids=["min", "far", "abs", "max", "piecewise"],
 )
-def test_what_cancels_for_some_parameters_only_is_refused(coefficient, p):
-    """`with_parameters` to the other side of a branch gave numbers that break the equations."""
+def test_what_cancels_for_some_parameters_only_is_guarded(coefficient, p, elsewhere):
+    """x' + p·y' + x and x' + c(p)·y' + 2·y, where c(p) is p for some p: their difference has no y' then. With
+    `with_parameters` to the other side of a branch it was taken for the difference all the same, where the branch lay
+    beyond the sample points; where it did not, the model was refused. Neither it nor its derivative has a value
+    there."""
+    x, y, dx, dy, q = map(leaf, (X, Y, DX, DY, P))
+    one = linear([(1, dx), (1, multiply(q, dy)), (1, x)])
+    other = linear([(1, dx), (1, multiply(coefficient(q), dy)), (2, y)])
+    kept = np.zeros(0, int)
+    combined = combine([one, other], [constant(-1), constant(1)], [DX, DY], np.array([p]), kept, dict)
+    assert combined is not None and combined.leaves == {X, Y, P}
+    rate = directional_derivative(combined, {X: dx, Y: dy})
+    with np.errstate(invalid="ignore"):
+        values = Kernel([combined, rate], [X, Y, DX, DY, P])(
+            [np.full(2, v) for v in (0.3, 0.7, 0.2, 0.5)] + [np.array([p, elsewhere])], "numpy"
+        )
+    np.testing.assert_allclose([v[0] for v in values], [2 * 0.7 - 0.3, 2 * 0.5 - 0.2], rtol=1e-15)
+    assert all(np.isnan(v[1]) for v in values)
 
-    class Switched(Component):
-        def __init__(self, ev):
-            super().__init__(ev, "d")
-            x, y = self.variable("x", start=1.0, fixed=True), self.variable("y")
-            q = self.parameter("p", p)
-            self.add_equations(
-                sympy.Eq(der(x) + q * der(y), -x),
-                sympy.Eq(der(x) + coefficient(q) * der(y), -x - y + sympy.sin(ev.t)),
-            )
 
-    ev = EqnEnv()
-    with pytest.raises(StructuralError, match=f"singular for d.p = {p:g}, though not in general"):
-        AcausalCompiler(ev, AcausalDiagram().add(Switched(ev)))()
-
-
-def test_rates_that_a_switch_couples_are_refused():
-    """Compiled with the switch on, an equation was replaced by y1 + y2 = 0, which `with_parameters` kept when it was
-    off."""
-
-    class Coupled(Component):
-        def __init__(self, ev):
-            super().__init__(ev, "d")
-            on, y1, y2 = self.parameter("coupled", 1.0), self.variable("y1"), self.variable("y2")
-            rate = sympy.Piecewise((der(y1) - der(y2), on > 0.5), (der(y1), True))
-            self.add_equations(sympy.Eq(rate, -y1), sympy.Eq(der(y2) - der(y1), -y2))
-
-    ev = EqnEnv()
-    with pytest.raises(StructuralError, match="singular for d.coupled = 1, though not in general"):
-        AcausalCompiler(ev, AcausalDiagram().add(Coupled(ev)))()
+def test_what_cancels_in_algebra_is_not_guarded():
+    """(p + 1)·y' − p·y' − y' has no y' whatever p is, and the combination asks for nothing at run time."""
+    x, y, dy, q = map(leaf, (X, Y, DY, P))
+    one = linear([(1, multiply(linear([(1, q)], 1), dy)), (1, x)])
+    other = linear([(1, multiply(q, dy)), (1, dy), (2, y)])
+    kept = np.zeros(0, int)
+    combined = combine([one, other], [constant(-1), constant(1)], [DY], np.array([1.5]), kept, dict)
+    assert combined is not None and combined.leaves == {X, Y}
 
 
 @pytest.mark.parametrize("roundings", [-4, -1, 0, 1, 4])
