@@ -235,7 +235,7 @@ def test_no_equilibrium():
 
 
 def test_arguments_of_a_steady_state():
-    with pytest.raises(ModelError, match=r"drifting: 'motor\.resistor\.v' is not a state"):
+    with pytest.raises(ModelError, match=r"drifting: 'motor\.resistor\.v' is neither a state"):
         steady_state(motor(), inputs={"source.u": 0.0}, drifting=["motor.resistor.v"])
     with pytest.raises(ModelError, match=r"write drifting=\['motor\.rotor\.phi'\]"):
         steady_state(motor(), inputs={"source.u": 0.0}, drifting="motor.rotor.phi")
