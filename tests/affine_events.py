@@ -186,11 +186,11 @@ def run(numbers: Numbers, t1: Any, ts: Any, solver: Any, adjoint: Any) -> Ran:
     t0, t1 = jnp.zeros(()), jnp.asarray(t1)
     problem = Affine(numbers, 32.0 * jnp.finfo(t1.dtype).eps * t1)
     done = integrate(
-        HybridTerm(problem), WithEvents(solver, MAX_EVENTS), t0, t1, 0.01 * t1,
+        HybridTerm(problem), WithEvents(solver, MAX_EVENTS, MAX_EVENTS), t0, t1, 0.01 * t1,
         start(problem, t0, numbers.x, numbers.q, None, MAX_EVENTS, False), None,
         save=diffrax.SubSaveAt(ts=ts, fn=lambda t, y, args: (y.x, y.q)),
         controller=EventControl(diffrax.PIDController(rtol=1e-10, atol=1e-10)),
         adjoint=adjoint, max_steps=2000,
     )  # fmt: skip
     _, last = done.last
-    return Ran(*done.ys, last.x, last.times, last.count, done.result._value)
+    return Ran(*done.ys, last.x, last.table.log[:, 0], last.count, done.result._value)

@@ -19,7 +19,8 @@ class SolveProgram(eqx.Module):
 
     step: Any  # (tprev, tnext, y, solver_state, made_jump) -> what the solver's `step` returns
     adapt: Any  # (controller, tprev, tnext, y, y1, y_error, controller_state) -> what its `adapt_step_size` returns
-    body: Any  # (state, buffers, active, first) -> (state, buffers): one attempted step, bookkeeping included
+    # (state, buffers, active, first) -> (state, buffers, rows for the table): one attempted step, bookkeeping included
+    body: Any
     rest: Any  # (attempted step, second run) -> (end of the next one, second run), or None: see resting.py
     save_steps: tuple[Any, ...]  # for each part of `SaveAt`: (t, y) -> what it saves of a step, or None
     save_ts: tuple[Any, ...]  # for each part: (t, tprev, tnext, dense_info) -> what it saves at a time, or None

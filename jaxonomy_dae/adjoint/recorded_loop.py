@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from ..private_names import private
+from .appended import appended
 from .closure_conversion import SolveProgram, any_member, apart, going, read, rows, unless_waiting, written
 from .packing import Packing
 from .resting import held_back
@@ -17,20 +18,22 @@ from .step_times import StepTimes
 
 
 @eqx.filter_custom_vjp
-def solve(numbers: dict[str, Any], program: SolveProgram) -> tuple[Any, Any]:
-    """Takes steps until the end and returns the final `(state, buffers)`.
+def solve(numbers: dict[str, Any], program: SolveProgram) -> tuple[Any, Any, Any]:
+    """Takes steps until the end and returns the final `(state, buffers, table)`.
 
-    `numbers` holds every array that the solve depends on: `state` and `buffers` to start from, `t1`, the `controller`'s
-    own, the times `ts` of each part of `SaveAt`, and by the names of `program`'s functions what these close over.
+    `numbers` holds every array that the solve depends on: `state`, `buffers` and `table` to start from, `t1`, the
+    `controller`'s own, the times `ts` of each part of `SaveAt`, and by the names of `program`'s functions what these
+    close over.
     """
 
     def advance(carry):
-        state, buffers = carry
+        state, buffers, table = carry
         active = going(state, numbers, program)
-        new, buffers = program.body(numbers["body"], state, buffers, active, jnp.array(True))
-        return unless_waiting(active, new, state), buffers
+        new, buffers, noted = program.body(numbers["body"], state, buffers, active, jnp.array(True))
+        # A step that is rejected appends nothing: it leaves the state as it was.
+        return unless_waiting(active, new, state), buffers, appended(table, noted, state.y, new.y)
 
-    start = numbers["state"], numbers["buffers"]
+    start = numbers["state"], numbers["buffers"], numbers["table"]
     return lax.while_loop(lambda carry: any_member(going(carry[0], numbers, program)), advance, start)
 
 
@@ -73,37 +76,39 @@ class _Recorder:
     def empty(self):
         return rows((self.start[0], jnp.array(False)), self.program.chunk)
 
-    def run(self, packed, buffers, record, count, first):
-        """Attempts at most `count` steps. Returns (carry, buffers, record, rows filled); the rows of `record` are
-        overwritten."""
+    def run(self, packed, buffers, table, record, filled, count, first):
+        """Attempts at most `count` steps. Returns (carry, buffers, table, record, rows filled). The rows of
+        `record` are overwritten; `filled` of them were in use. Where the table is None, nothing is appended."""
+        none = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), self.program.body.out_struct[2])
 
         def attempt(loop):
-            packed, buffers, _ = loop
+            packed, buffers, *_ = loop
             carry = self.unpack(packed)
             state, last, moves, pushed = carry
             active = going(state, self.numbers, self.program)
-            new, buffers = self.program.body(self.numbers["body"], state, buffers, active, first)
+            new, buffers, noted = self.program.body(self.numbers["body"], state, buffers, active, first)
             accepted = active & (new.num_accepted_steps > state.num_accepted_steps)
             new, held, pushed = held_back(state, new, accepted, pushed, self.numbers, self.program)
             after = new, jnp.where(accepted, state.tnext, last), self.times.after(state, moves, held), pushed
             # Members of a batch that have finished keep what they have, while the others go on.
             after = unless_waiting(active, after, carry)
-            return self.pack(self._taken_apart(*after)), buffers, accepted
+            return self.pack(self._taken_apart(*after)), buffers, noted, accepted
 
         def advance(loop):
-            packed, buffers, k, record, filled = loop
+            packed, buffers, table, k, record, filled = loop
             before = packed[0]
-            packed, buffers, accepted = apart(k < count, attempt, (packed, buffers, jnp.array(False)))
+            packed, buffers, noted, accepted = apart(k < count, attempt, (packed, buffers, none, jnp.array(False)))
+            if table is not None:
+                table = appended(table, noted, self.row.unpack(before)["y"], self.row.unpack(packed[0])["y"])
             # A new chunk is recorded over the last one: only the rows of one chunk are held at a time.
             filled = jnp.where(k % self.program.chunk == 0, 0, filled)
             record = written(record, filled, (before, accepted))
-            return packed, buffers, k + 1, record, filled + any_member(accepted).astype(filled.dtype)
+            return packed, buffers, table, k + 1, record, filled + any_member(accepted).astype(filled.dtype)
 
-        zero = jnp.array(0, jnp.int32)
-        loop = (packed, buffers, zero, record, zero)
-        loop = lax.while_loop(lambda loop: (loop[2] < count) & self.going(loop[0]), advance, loop)
-        packed, buffers, _, record, filled = loop
-        return packed, buffers, record, filled
+        loop = (packed, buffers, table, jnp.array(0, jnp.int32), record, filled)
+        loop = lax.while_loop(lambda loop: (loop[3] < count) & self.going(loop[0]), advance, loop)
+        packed, buffers, table, _, record, filled = loop
+        return packed, buffers, table, record, filled
 
 
 @solve.def_fwd
@@ -112,26 +117,29 @@ def _(perturbed, numbers, program):
     points = program.points
 
     def advance(loop):
-        carry, buffers, chunks, stride, kept, record, _ = loop
+        carry, buffers, table, chunks, stride, kept, record, filled = loop
 
         # When all points are in use, every other one is given up and the stride doubles: their number stays bounded
-        # however long the solve is.
-        def thin():
-            return jax.tree.map(lambda a: a.at[: points // 2].set(a[:points:2]), kept), 2 * stride
+        # however long the solve is. A loop of one or no turn, since XLA copies what a `cond` passes through.
+        def thinned(both):
+            return jax.tree.map(lambda a: a.at[: points // 2].set(a[:points:2]), both[0]), 2 * both[1]
 
-        kept, stride = lax.cond(chunks == points * stride, thin, lambda: (kept, stride))
+        kept, stride = lax.while_loop(lambda both: chunks == points * both[1], thinned, (kept, stride))
         row = jnp.where(chunks % stride == 0, chunks // stride, points)  # the last row is for what is not kept
         kept = written(kept, row, carry)
-        carry, buffers, record, filled = recorder.run(carry, buffers, record, program.chunk, jnp.array(True))
-        return carry, buffers, chunks + 1, stride, kept, record, filled
+        carry, buffers, table, record, filled = recorder.run(
+            carry, buffers, table, record, filled, program.chunk, jnp.array(True)
+        )
+        return carry, buffers, table, chunks + 1, stride, kept, record, filled
 
     start = recorder.start
     one, zero = jnp.array(1, jnp.int32), jnp.array(0, jnp.int32)
-    loop = (start, numbers["buffers"], zero, one, rows(start, points + 1), recorder.empty(), zero)
+    saved = numbers["buffers"], numbers["table"]
+    loop = (start, *saved, zero, one, rows(start, points + 1), recorder.empty(), zero)
     loop = lax.while_loop(lambda loop: recorder.going(loop[0]), advance, loop)
-    carry, buffers, chunks, stride, kept, record, filled = loop
+    carry, buffers, table, chunks, stride, kept, record, filled = loop
     state, _, moves, _ = recorder.unpack(carry)
-    return (state, buffers), (state, moves, chunks, stride, kept, record, filled)
+    return (state, buffers, table), (state, moves, chunks, stride, kept, record, filled)
 
 
 @solve.def_bwd
@@ -147,26 +155,24 @@ def _(residuals, cotangents, perturbed, numbers, program):
     start = reverse.start(state, moves)
     packing = Packing(start)
 
-    def again(q, record, _):
-        point = q // stride
-        count = (q - point * stride + 1) * program.chunk
-        _, _, record, filled = recorder.run(read(kept, point), blank, record, count, jnp.array(False))
-        return record, filled
-
     def backwards(packed, row):
         row, accepted = row
         return packing.pack(reverse.step(packing.unpack(packed), recorder.row.unpack(row), accepted))
 
     def advance(loop):
         q, record, filled, packed = loop
+        # The record holds the last chunk. Each one before is taken once more, from the nearest point kept. A count of
+        # zero steps, instead of a `cond`, and before the rows are read: XLA would copy the record otherwise.
+        point = q // stride
+        count = jnp.where(q == chunks - 1, 0, (q - point * stride + 1) * program.chunk)
+        again = recorder.run(read(kept, point), blank, None, record, filled, count, jnp.array(False))
+        *_, record, filled = again
 
         def one(inner):
             k, packed = inner
             return k - 1, apart(k > 0, backwards, packed, read(record, k - 1))
 
         _, packed = lax.while_loop(lambda inner: inner[0] > 0, one, (filled, packed))
-        # The chunk before is taken once more, from the nearest point kept, to fill the record with its rows.
-        record, filled = lax.cond(q > 0, again, lambda _, *same: same, q - 1, record, filled)
         return q - 1, record, filled, packed
 
     loop = (chunks - 1, record, filled, packing.pack(start))

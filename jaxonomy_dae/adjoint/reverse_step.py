@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from ..private_names import private
+from .appended import NOTED, appended_transposed
 from .closure_conversion import SolveProgram, any_member, inexact, read, unless_waiting
 from .step_times import StepTimes
 
@@ -19,7 +20,7 @@ class ReverseStep:
 
     def __init__(self, cotangents: Any, perturbed: Any, numbers: Any, program: SolveProgram, times: StepTimes):
         self.numbers, self.program, self.times = numbers, program, times
-        self.state_cotangent, self.saved = cotangents
+        self.state_cotangent, self.saved, self.table = cotangents
         self.timed = times.count > 0
 
         def taken(flags, consts):
@@ -37,6 +38,8 @@ class ReverseStep:
         self.save_steps = [i for i in live if program.every[i]]
         self.save_ts = [i for i in live if program.save_ts[i] is not None]
         self.saved = [_full(ct, like) for ct, like in zip(self.saved, numbers["buffers"], strict=True)]
+        self.appends = bool(jax.tree.leaves(self.table))
+        self.table = _full(self.table, numbers["table"]) if self.appends else self.table
 
     def start(self, state: Any, moves: Any) -> dict[str, Any]:
         """The carry of the reverse loop at the end of the solve."""
@@ -76,20 +79,22 @@ class ReverseStep:
             y1, _, dense, state1, _ = self.program.step(consts, *ends, y, state, jump)
             dense, fixed = eqx.partition(dense, eqx.is_inexact_array)
             rest.append(fixed)
-            return y1, inexact(state1), dense if dense_wanted else ()
+            noted = inexact(dense[NOTED]) if self.appends else ()
+            return y1, inexact(state1), dense if dense_wanted else (), noted
 
         consts = self.consts["step"][0]
         # Where no time is differentiated, the ends of the step are constants, and their cotangents are not compiled.
         if self.timed:
-            (y1, _, dense), pull = jax.vjp(forward, row["y"], moving, ends, consts)
+            (y1, _, dense, noted), pull = jax.vjp(forward, row["y"], moving, ends, consts)
         else:
-            (y1, _, dense), pull = jax.vjp(lambda y, s, c: forward(y, s, ends, c), row["y"], moving, consts)
+            (y1, _, dense, noted), pull = jax.vjp(lambda y, s, c: forward(y, s, ends, c), row["y"], moving, consts)
         for i in self.save_steps:
             carry = self._saved_step(carry, i, kept, y1)
         dense_ct, ends_ct = _zeros(dense), _zeros(ends)
         for i in self.save_ts:
             carry, dense_ct, ends_ct = self._saved_times(carry, i, row, kept, dense, rest[0], dense_ct, ends_ct)
-        out = pull((carry["y"], carry["solver_state"], dense_ct))
+        noted_ct = appended_transposed(self.table, noted, row["y"], y1) if self.appends else ()
+        out = pull((carry["y"], carry["solver_state"], dense_ct, noted_ct))
         carry = carry | dict(
             y=out[0],
             solver_state=out[1],
@@ -173,10 +178,11 @@ class ReverseStep:
             tnext=tnext,
             controller_state=(controller_state, None),
         )
-        # Rows saved in the loop were constant before it; the others are passed through.
+        # Rows saved or appended in the loop were constant before it; the others are passed through.
         return out | dict(
-            state=state, buffers=tuple(self.saved), t1=t1, controller=controller, ts=tuple(carry["ts"]),
-            step=carry["step"], save_steps=tuple(carry["save_steps"]), save_ts=tuple(carry["save_ts"]),
+            state=state, buffers=tuple(self.saved), table=self.table, t1=t1, controller=controller,
+            ts=tuple(carry["ts"]), step=carry["step"],
+            save_steps=tuple(carry["save_steps"]), save_ts=tuple(carry["save_ts"]),
         )  # fmt: skip
 
 

@@ -25,6 +25,7 @@ from ..adjoint.closure_conversion import any_member, written
 from ..adjoint.resting import still
 from ..aliases import Args, Time
 from .first_order import constant_once
+from .log import EventRows
 from .problem import AbstractHybridProblem, HybridState, one_hot
 from .side import ABOVE, BELOW, RESTS, rounding
 
@@ -63,6 +64,7 @@ class Instant(eqx.Module):
     - `slope`: dx/dt after the last event.
     - `arrived`: the continuous state before the instant.
     - `stuck`: the guards that an event has left at zero, about to fall again, shape (guards,).
+    - `noted`: the events of this instant that are listed.
     """
 
     state: HybridState
@@ -73,6 +75,7 @@ class Instant(eqx.Module):
     slope: Any
     arrived: Any
     stuck: Any
+    noted: EventRows
 
 
 class Arrival(NamedTuple):
@@ -95,19 +98,30 @@ class Arrival(NamedTuple):
     span: Time
 
 
+def most_at_once(problem: AbstractHybridProblem) -> int:
+    """The largest number of events that can be listed at one instant."""
+    return _most_in_turn(problem) * max(sum(problem.strikes), 1)
+
+
+def _most_in_turn(problem: AbstractHybridProblem) -> int:
+    return problem.n_clocks + min(2 * problem.n_guards, CONDITIONS_AT_ONE_INSTANT)
+
+
 def handle(
-    problem: AbstractHybridProblem, t: Time, state: HybridState, arrival: Arrival, args: Args, at_start: bool = False
-) -> tuple[HybridState, Any]:
-    """Returns (the state after all events of an instant, dx/dt there).
+    problem: AbstractHybridProblem, t: Time, state: HybridState, arrival: Arrival, args: Args, noted: EventRows,
+    at_start: bool = False,
+) -> tuple[HybridState, Any, EventRows]:  # fmt: skip
+    """Returns (the state after all events of an instant, dx/dt there, `noted` with the events that are listed).
 
     At the initial time, `at_start`, events do not move with parameters, and are logged only if they end the run.
     """
     c, g = problem.n_clocks, problem.n_guards
-    noted, of_guards = jnp.asarray(problem.noted), jnp.arange(c + g) >= c
+    listed, of_guards = jnp.asarray(problem.noted), jnp.arange(c + g) >= c
     ends = jnp.asarray(problem.ends).astype(t.dtype)
     relations = jnp.asarray(problem.relations)
     strikes = jnp.asarray(problem.strikes, bool)
     several = sum(problem.strikes) > 1
+    first = state.count
 
     def one(instant: Instant) -> Instant:
         state, q, before = instant.state, instant.state.q, instant.slope
@@ -144,10 +158,10 @@ def handle(
             happening = happening | (instant.left & strikes & strikes[event])
         x, new = problem.written(time, reached, q, instant.previous, happening, args)
         ticks = state.ticks + one_hot(event, c).astype(state.ticks.dtype)
-        logged = happening & ((of_guards & noted & (not at_start)) | (ends > 0))
+        logged = happening & ((of_guards & listed & (not at_start)) | (ends > 0))
         shown = jnp.arange(c + g) if several else event[None]
-        row = state.count.astype(int) + jnp.cumsum(logged[shown]) - 1
-        row = jnp.where(logged[shown], row, state.times.shape[0] + 1)
+        row = (state.count - first).astype(int) + jnp.cumsum(logged[shown]) - 1
+        row = jnp.where(logged[shown], row, noted.log.shape[0])
         rate = jnp.concatenate([jnp.zeros((c,), t.dtype), rates])[shown]
         moved = jnp.any(x != reached) & ~relations[event]
         approach = jnp.where(instant.caused | at_start, 0.0, rates)
@@ -159,7 +173,10 @@ def handle(
         again = jnp.where(slides, event, jnp.where(jnp.any(stuck), c + jnp.argmax(stuck), -1)) if g else jnp.array(-1)
         # What is too fast to be followed back, as a current that a blocked diode stops, has that value at once.
         back = delay - (1.0 - slow) * lax.stop_gradient(delay)
-        state = state.noted(row, time, shown, rate, jnp.concatenate([reached, q]), jnp.concatenate([x, new])).but(
+        now_noted = instant.noted.written(
+            row, time, shown, rate, jnp.concatenate([reached, q]), jnp.concatenate([x, new])
+        )
+        state = state.but(
             x=x - after * back,
             q=new,
             armed=armed,
@@ -172,7 +189,7 @@ def handle(
         )
         # Clocks that tick together read what was before all of them.
         previous = jnp.where(jnp.any(left[:c]), instant.previous, new) if c else new
-        return Instant(state, left, caused, delay, previous, after, instant.arrived, stuck)
+        return Instant(state, left, caused, delay, previous, after, instant.arrived, stuck, now_noted)
 
     def while_any_is_left(step: Callable[[Instant], Instant], times: int) -> Callable[[Instant], Instant]:
         def once(instant: Instant, _: None) -> tuple[Instant, None]:
@@ -186,8 +203,8 @@ def handle(
         return lambda instant: lax.scan(once, instant, length=times)[0]
 
     none = jnp.zeros((g,), bool)
-    start = Instant(state, arrival.due, arrival.jumped, jnp.zeros_like(t), state.q, arrival.slope, state.x, none)
-    length = c + min(2 * g, CONDITIONS_AT_ONE_INSTANT)
+    start = Instant(state, arrival.due, arrival.jumped, jnp.zeros_like(t), state.q, arrival.slope, state.x, none, noted)
+    length = _most_in_turn(problem)
     # Loops of fixed length, whose bodies are skipped where nothing is left: reverse mode cannot go back over a `while`.
     # Of a thousand clocks, few tick at once: loops in a loop pass over the others in √1000 steps.
     inner = max(math.isqrt(length), min(length, CONDITIONS_AT_ONE_INSTANT))
@@ -195,7 +212,7 @@ def handle(
     if length > inner:
         handled = while_any_is_left(handled, -(-length // inner))
     instant = handled(start)
-    return instant.state, instant.slope
+    return instant.state, instant.slope, instant.noted
 
 
 def _within(rate: Any, arrival: Arrival) -> Any:

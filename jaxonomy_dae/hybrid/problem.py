@@ -11,8 +11,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from ..adjoint.appended import AbstractAppending
 from ..aliases import Args, State, Time
 from .first_order import constant_once
+from .log import EventRows
 
 
 class AbstractHybridProblem(eqx.Module):
@@ -95,7 +97,7 @@ class AbstractHybridProblem(eqx.Module):
         return jax.jvp(lambda t, x: frozen.guards(t, x, q, args), (t, x), (jnp.ones_like(t), slope))
 
 
-class HybridState(eqx.Module):
+class HybridState(AbstractAppending):
     """The state that is integrated: the continuous state `x`, the discrete values `q`, and the bookkeeping of events.
     The latter is packed into few arrays: XLA compiles the passing on of the state from step to step for each array.
 
@@ -106,9 +108,7 @@ class HybridState(eqx.Module):
         infinity.
     - `ended`: 1.0 once an event has ended the run; `stuck`: the number of one that happens again and again at one
         instant, else −1; `turns`: how often guards have fallen without time going on.
-    - `count`, `times`, `which`, `rate`: how many events there were, and of the first ones the time, the number of the
-        event and how fast its guard fell.
-    - `before`, `after`: (x, q) at the times of the first events, on both sides; no rows if they are not asked for.
+    - `count`: how many events there were; `table`: the first ones, or None where `StoredAdjoint` keeps them elsewhere.
     """
 
     x: Float[Array, " n"]
@@ -116,13 +116,13 @@ class HybridState(eqx.Module):
     of_guards: Float[Array, "2 guards"]
     of_clocks: Float[Array, "2 clocks"]
     of_run: Float[Array, "6"]
-    log: Float[Array, "3 events"]
-    sides: Float[Array, "2 rows m"]
+    table: EventRows | None
 
     @classmethod
-    def of(cls, x: State, q: Any, **parts: Any) -> "HybridState":
+    def of(cls, x: State, q: Any, table: EventRows | None, **parts: Any) -> "HybridState":
         """A state of all its parts."""
-        return cls(x, q, *(jnp.stack([parts[name] for name in names]) for names in _PARTS.values()))
+        packed = {field: jnp.stack([parts[name] for name in names]) for field, names in _PARTS.items()}
+        return cls(x=x, q=q, table=table, **packed)
 
     def but(self, **changes: Any) -> "HybridState":
         """A copy with the named parts replaced."""
@@ -134,19 +134,6 @@ class HybridState(eqx.Module):
         assert not changes
         return dataclasses.replace(self, **whole)
 
-    def noted(self, row: Any, time: Time, events: Any, rate: Any, before: Any, after: Any) -> "HybridState":
-        """A copy with events that happen at once, (events,), written to columns `row` of the log, where there are such
-        columns."""
-        log, sides = self.log, self.sides
-        if log.shape[1]:
-            columns = jnp.stack(
-                [jnp.broadcast_to(time, rate.shape), events.astype(time.dtype), lax.stop_gradient(rate)]
-            )
-            log = log.at[:, row].set(columns, mode="drop")
-        if sides.shape[1]:
-            sides = sides.at[:, row].set(jnp.stack([before, after])[:, None], mode="drop")
-        return dataclasses.replace(self, log=log, sides=sides)
-
     armed = property(lambda self: self.of_guards[..., 0, :])
     size = property(lambda self: self.of_guards[..., 1, :])
     ticks = property(lambda self: self.of_clocks[..., 0, :])
@@ -157,19 +144,12 @@ class HybridState(eqx.Module):
     stuck = property(lambda self: self.of_run[..., 3])
     turns = property(lambda self: self.of_run[..., 4])
     count = property(lambda self: self.of_run[..., 5])
-    times = property(lambda self: self.log[..., 0, :])
-    which = property(lambda self: self.log[..., 1, :])
-    rate = property(lambda self: self.log[..., 2, :])
-    before = property(lambda self: self.sides[..., 0, :, :])
-    after = property(lambda self: self.sides[..., 1, :, :])
 
 
 _PARTS = {
     "of_guards": ("armed", "size"),
     "of_clocks": ("ticks", "due"),
     "of_run": ("span", "request", "ended", "stuck", "turns", "count"),
-    "log": ("times", "which", "rate"),
-    "sides": ("before", "after"),
 }
 
 

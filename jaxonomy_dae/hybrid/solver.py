@@ -8,10 +8,12 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from ..adjoint.appended import NOTED, apart, appended, together
 from ..adjoint.closure_conversion import any_member
 from ..aliases import Time
-from .event_map import handle
+from .event_map import handle, most_at_once
 from .kinks import turned
+from .log import EventRows
 from .looking import looked_at
 from .problem import HybridState
 from .term import bound, problem_of
@@ -35,6 +37,7 @@ class HybridInterpolation(diffrax.AbstractLocalInterpolation):
     fired: Any
     slope: Any
     resolution: Time
+    noted: EventRows  # the events at its end that are listed
 
     def evaluate(self, t0, t1=None, left=True):
         if t1 is not None:
@@ -64,10 +67,13 @@ class WithEvents(diffrax.AbstractWrappedSolver):
 
     - `solver`: the problem prepares it for the discrete values at hand.
     - `max_events`: more of them end the run with `TOO_MANY`.
+    - `room`: how many of them are listed; `sides`: with the states before and after them.
     """
 
     solver: diffrax.AbstractSolver
     max_events: int = eqx.field(static=True)
+    room: int = eqx.field(static=True, default=0)
+    sides: bool = eqx.field(static=True, default=False)
 
     term_structure = diffrax.AbstractTerm
     interpolation_cls = HybridInterpolation  # pyright: ignore[reportAssignmentType]
@@ -116,6 +122,7 @@ class WithEvents(diffrax.AbstractWrappedSolver):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         problem = problem_of(terms)
+        y0, table = apart(y0)
         inner_state, jumped = solver_state
         made_jump = jumped if made_jump is False else made_jump | jumped
         solver = problem.prepared(self.solver, y0.q)
@@ -128,18 +135,26 @@ class WithEvents(diffrax.AbstractWrappedSolver):
         state = y0.but(x=x1, armed=armed, size=arrival.size, span=arrival.span, request=request, turns=turns)
         fired = jnp.any(arrival.due)
 
+        noted = EventRows.empty(
+            min(self.room, most_at_once(problem)), self.sides, len(y0.x) + len(y0.q), jnp.result_type(t1)
+        )
+        none = jnp.zeros_like(x1), noted
+
         def events(state):
-            return handle(problem, t1, state, arrival, args)
+            return handle(problem, t1, state, arrival, args, noted)
 
         if problem.only_kinks:
             y1, slope = turned(problem, t1, state, values, arrival.due, args), jnp.zeros_like(x1)
         else:
-            y1, slope = lax.cond(any_member(fired), events, lambda state: (state, jnp.zeros_like(x1)), state)
+            y1, slope, noted = lax.cond(any_member(fired), events, lambda state: (state, *none), state)
             # The branch is taken if any member of a batch has an event; the others keep their states.
             y1 = jax.tree.map(lambda a, b: jnp.where(fired, a, b), y1, state)
-        dense_info = dict(inner=dense, y0=y0, y1=y1, fired=fired, slope=slope, resolution=problem.resolution)
+        dense_info = dict(
+            inner=dense, y0=y0, y1=y1, fired=fired, slope=slope, resolution=problem.resolution, **{NOTED: noted}
+        )
         finite = jnp.all(jnp.isfinite(y1.x)) & jnp.all(jnp.isfinite(y1.q))
         result = diffrax.RESULTS.where(fired & ~finite & jnp.all(jnp.isfinite(x1)), NOT_FINITE, result)
         result = diffrax.RESULTS.where(y1.count > self.max_events, TOO_MANY, result)
         result = diffrax.RESULTS.where((y1.stuck >= 0) & (y1.ended == 0), STUCK, result)
+        y1 = together(y1, appended(table, noted, y0, y1))
         return y1, y_error, dense_info, (inner_state, fired), result

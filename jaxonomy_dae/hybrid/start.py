@@ -1,5 +1,6 @@
 """Where a run with events begins."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ from jax import lax
 from ..adjoint.resting import still
 from ..aliases import Args, State, Time
 from .event_map import Arrival, handle
+from .log import EventRows
 from .problem import AbstractHybridProblem, HybridState
 from .side import ABOVE, BELOW, RESTS, rounding
 
@@ -38,7 +40,7 @@ def start(
     `logged` says for how many events there is room, `sides` whether the states before and after them are kept.
     """
     c, dtype = problem.n_clocks, t0.dtype
-    nothing, infinite = jnp.zeros((), dtype), jnp.full((logged,), jnp.inf, dtype)
+    nothing = jnp.zeros((), dtype)
     tolerance = problem.resolution
     relations = np.array(problem.relations, bool)
     ticks = _ticks_before(problem, t0, None if resumed is None else resumed.ticked)
@@ -56,12 +58,11 @@ def start(
         due_conditions = (resumed.sides > 0) & (value < -far)
         armed = jnp.where(value > band, ABOVE, jnp.where(value < -far, BELOW, resumed.sides))
         at_once = ~relations[c:]
-    rows = jnp.full((logged if sides else 0, len(x0) + len(q0)), jnp.nan, dtype)
+    table = EventRows.empty(logged, sides, len(x0) + len(q0), dtype)
     state = HybridState.of(
-        x0, q0, armed=armed.astype(dtype), size=size, ticks=ticks, due=lax.stop_gradient(problem.due(ticks)),
+        x0, q0, table, armed=armed.astype(dtype), size=size, ticks=ticks, due=lax.stop_gradient(problem.due(ticks)),
         span=nothing, request=jnp.full_like(t0, jnp.inf), ended=nothing, stuck=nothing - 1.0, turns=nothing,
-        count=nothing, times=infinite, which=jnp.full_like(infinite, -1.0), rate=jnp.zeros_like(infinite),
-        before=rows, after=rows,
+        count=nothing,
     )  # fmt: skip
     if relations[:c].all() and not at_once.any():
         return state
@@ -70,7 +71,8 @@ def start(
     # What holds at the start need not be near zero.
     slope = jnp.zeros_like(x0) if resumed is None else problem.slope(t0, x0, q0, args)
     arrival = Arrival(slope, rate, due, due_conditions, size, tolerance, tolerance)
-    return handle(problem, t0, state, arrival, args, at_start=resumed is None)[0]
+    state, _, table = handle(problem, t0, state, arrival, args, table, at_start=resumed is None)
+    return dataclasses.replace(state, table=table)
 
 
 def _ticks_before(problem: AbstractHybridProblem, t0: Time, ticked: Any) -> Any:

@@ -1,5 +1,7 @@
-"""Members of a batch by number, where `jax.vmap` is at work outside of jit and values can be read."""
+"""Members of a batch: whether `jax.vmap` is at work, and outside of jit, where values can be read, members by
+number."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,6 +16,19 @@ SHOWN = 8  # members that a sentence lists
 def is_batched(tree: Any) -> bool:
     """True if `jax.vmap` is at work on a leaf."""
     return any(hasattr(layer, "batch_dim") for leaf in jax.tree.leaves(tree) for layer in layers(leaf))
+
+
+def batch_size(tree: Any) -> int:
+    """How many members `jax.vmap` computes at once, as far as the leaves show it; 1 outside of batches.
+
+    In `jax.vmap(jax.jit(f))` it cannot be seen from inside f.
+    """
+    return max((math.prod(map(_mapped, layers(leaf))) for leaf in jax.tree.leaves(tree)), default=1)
+
+
+def _mapped(layer: Any) -> int:
+    axis = getattr(layer, "batch_dim", None)  # of a BatchTracer
+    return layer.val.shape[axis] if isinstance(axis, int) else 1
 
 
 def values_of_members(leaf: Any) -> np.ndarray:

@@ -37,8 +37,10 @@ class EventLog(eqx.Module):
     @classmethod
     def of(cls, state: HybridState) -> "EventLog":
         """The log in the last state of a run."""
-        frozen = jax.lax.stop_gradient((state.which, jnp.abs(state.rate), state.count, state.stuck))
-        return cls(state.times, *frozen, state.before, state.after)
+        table: Any = state.table
+        ts, which, rate = (table.log[:, k] for k in range(3))
+        frozen = jax.lax.stop_gradient((which, jnp.abs(rate), state.count, state.stuck))
+        return cls(ts, *frozen, table.sides[:, 0], table.sides[:, 1])
 
 
 class Events:

@@ -113,7 +113,7 @@ def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: 
         q0 = system.discrete_values if resumed is None else without_clocked(system, system.discrete_values)
         y0 = start(problem, t0, x0, q0, inputs, options.room, options.save_events, resumed)
         goes_on = admitted & (y0.ended == 0)
-        term, solver = HybridTerm(problem), WithEvents(chosen, options.max_events)
+        term, solver = HybridTerm(problem), WithEvents(chosen, options.max_events, options.room, options.save_events)
         controller = with_event_control(controller)
         saved_of = _with_events
     save = diffrax.SubSaveAt(t0=True, steps=True, fn=saved_of) if ts is None else diffrax.SubSaveAt(ts=ts, fn=saved_of)

@@ -15,7 +15,7 @@ from ..adjoint.stored_adjoint import default_adjoint
 from ..errors import InitializationError, SimulationError
 from ..initialization.check import check
 from ..programs.cache import PROGRAMS
-from ..programs.members import is_batched
+from ..programs.members import batch_size, is_batched
 from ..programs.staging import is_forwards, is_staged, is_traced
 from ..solvers import BDF, Rodas5P, Tsit5
 from ..solvers.causes import decay_at, is_stiff
@@ -161,7 +161,7 @@ def simulate(
         control = stepsize_controller
         if control is None:
             control = controller_for(system, solver, rtol, atol, dtmax)
-        chosen = default_adjoint(is_forwards(given)) if adjoint is None else adjoint
+        chosen = default_adjoint(is_forwards(given), batch_size(given)) if adjoint is None else adjoint
         return Options(
             solver, chosen, clipped(control, jump_ts, ends),
             max_steps + ends.count, progress, most_events, room, sides,

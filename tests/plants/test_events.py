@@ -193,6 +193,30 @@ def test_second_derivatives_are_refused():
             jax.eval_shape(twice, 0.8)
 
 
+@pytest.mark.long("a gradient in a batch is traced")
+def test_memory_of_gradients_in_a_batch():
+    """The log of events was part of each of 385 kept states: 1.65 MB for a ball. It is kept once, beside a state of 16
+    numbers, in few rows where there are many members."""
+
+    room, members = 1000, 1000
+
+    def height(e):
+        return simulate(thrown(e=e), 3.0, ts=EVENLY, max_events=room)["ball.h"][-1]
+
+    program = jax.make_jaxpr(jax.vmap(jax.grad(height)))(jnp.full(members, 0.8))
+    largest = max(sum(v.aval.size * v.aval.dtype.itemsize for v in loop.outvars) for loop in loops(program))
+    assert largest / members <= 16e3 + room * 3 * 8
+
+
+def loops(program):
+    """The while loops of a program, those inside of others included."""
+    for equation in program.eqns:
+        if equation.primitive.name == "while":
+            yield equation
+        for leaf in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda v: hasattr(v, "eqns")):
+            yield from loops(leaf) if hasattr(leaf, "eqns") else ()
+
+
 # --- many parts, one run ---------------------------------------------------------------------------------------------
 
 
