@@ -15,11 +15,12 @@ said of it by one of the letters:
 from collections.abc import Callable
 
 from ..outcome import Outcome
-from . import modes, points, solvers
+from . import modes, points, process, solvers
 from .said import Pairs
 
 MOVING = 5  # every so many-th model is run, where a point would do
 LETTERS: dict[str, Callable[[int], Pairs]] = {
+    "a": process.process,
     "b": modes.modes,
     "c": lambda number: points.order(number, number % MOVING == 0),
     "e": lambda number: points.units(number, number % MOVING == 1),

@@ -19,7 +19,7 @@ from .sketch import Sketch, diagram_of
 REFUSALS = (ModelError, InitializationError, SimulationError, SteadyStateError, eqx.EquinoxRuntimeError)
 POINT = 1e-9  # of a variable's size: what a point may differ by
 FAINT = 1e-3  # of the largest value that is compared with it: a variable's size, at least
-TOLERANCES = {"rtol": 1e-9, "atol": 1e-11}  # of runs; what they may differ by:
+TOLERANCES: dict[str, Any] = {"rtol": 1e-9, "atol": 1e-11}  # of runs; what they may differ by:
 ALONG = 2e-6  # of a variable's size
 
 

@@ -1,0 +1,221 @@
+"""Letter a: in a process of its own, or after twins that differ in one argument of one declaration.
+
+Programs are cached by what they are made from; what is forgotten there serves the wrong model. Everything that is said
+of a model must be what a fresh process says, to the last bit.
+"""
+
+import dataclasses
+import functools
+import multiprocessing
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import sympy
+from sympy import Expr, Float
+
+from .drawing import draw
+from .rewrite import mapped, numbers
+from .sketch import Declared, Happens, Part, Sketch
+
+TWINS = 4  # of each model
+
+
+def _other(d: Declared, rng: np.random.Generator) -> tuple[str, Mapping[str, Any]] | None:
+    """One argument of a declaration, and what it becomes."""
+    args = dict(d.args)
+    choices: list[tuple[str, dict[str, Any]]] = [("unit", {"unit": str(rng.choice(["m", "kg", "mm"]))})]
+    if d.kind == "parameter":
+        value = args["value"]
+        choices += [("bounds", {"bounds": (-50.0, 50.0 + 100 * float(rng.random()))})]
+        if not isinstance(value, Expr):
+            choices += [("bounds", {"bounds": (value - 1.0, value + 1.5)})]
+            choices += [("value", {"value": value * float(rng.choice([1.25, 1e3]))})] * ("bounds" not in args)
+    if d.kind == "variable":
+        choices += [("nominal", {"nominal": float(10 ** rng.uniform(-4, 4))}), ("bounds", {"bounds": (-1e3, 1e3)})]
+        if "start" in args:
+            choices += [("start", {"start": args["start"] * 1.25}), ("fixed", {"fixed": not args.get("fixed", False)})]
+    if d.kind == "input":
+        choices += [("default", {"default": args["default"] + 1.0})] * 3
+    if d.kind == "discrete":
+        choices += [("start", {"start": args["start"] + 0.5})]
+    what, change = choices[int(rng.integers(len(choices)))]
+    return f"{what} of {d.kind} {d.name}", args | change
+
+
+def _with_other_number(e: Any, rng: np.random.Generator) -> Any:
+    """The expression with one of its literal numbers changed; None if it has none."""
+    literals = sorted(sympy.sympify(e).atoms(Float), key=float)
+    if not literals:
+        return None
+    chosen = literals[int(rng.integers(len(literals)))]
+    return e.xreplace({chosen: Float(1.125 * float(chosen))})
+
+
+def twin(sketch: Sketch, rng: np.random.Generator) -> tuple[Sketch, str]:
+    """The sketch with something declared otherwise, and what."""
+    while True:
+        at = int(rng.integers(len(sketch.parts)))
+        part = sketch.parts[at]
+        kind = rng.random()
+        if kind < 0.7:
+            k = int(rng.integers(len(part.declared)))
+            what, args = _other(part.declared[k], rng)  # pyright: ignore[reportGeneralTypeIssues]
+            declared = (*part.declared[:k], dataclasses.replace(part.declared[k], args=args), *part.declared[k + 1 :])
+            other = dataclasses.replace(part, declared=declared)
+        elif kind < 0.85 or not part.events:
+            k = int(rng.integers(len(part.equations)))
+            changed = _with_other_number(part.equations[k], rng)
+            if changed is None:
+                continue
+            what = f"a number in equation {k}"
+            other = dataclasses.replace(part, equations=(*part.equations[:k], changed, *part.equations[k + 1 :]))
+        else:
+            k = int(rng.integers(len(part.events)))
+            found = _other_event(part.events[k], rng)
+            if found is None:
+                continue
+            what = f"event {k}"
+            other = dataclasses.replace(part, events=(*part.events[:k], found, *part.events[k + 1 :]))
+
+        def change(p: Part, part: Part = part, other: Part = other) -> Part:
+            return other if p is part else p
+
+        return mapped(sketch, change), what
+
+
+def _other_event(event: Happens, rng: np.random.Generator) -> Happens | None:
+    if event.period is None:
+        changed = _with_other_number(event.condition, rng)
+        return None if changed is None else dataclasses.replace(event, condition=changed)
+    return dataclasses.replace(event, period=event.period * Float(1.125))
+
+
+def models(number: int) -> tuple[list[Sketch], list[str]]:
+    """A model and its twins, and what is different in each."""
+    rng = np.random.default_rng([number, 23])
+    sketch = draw(rng, most=2)
+    found, what = [sketch], ["the model"]
+    for _ in range(TWINS):
+        other, difference = twin(sketch, rng)
+        found.append(other)
+        what.append(difference)
+    return found, what
+
+
+@functools.cache
+def _programs():
+    """Jitted functions of a system, one of each in a process: JAX tells twins apart by what they are made of."""
+    import jax
+
+    from jaxonomy_dae import simulate
+
+    @functools.partial(jax.jit, static_argnums=2)
+    def point(system, x, names):
+        return system.observe(list(names), 0.0, x), system.vector_field(0.0, x)
+
+    @functools.partial(jax.jit, static_argnums=(2, 3))
+    def run(system, ts, names, kinds, inputs):
+        inputs = {n: (*v, *dict(kinds)[n]) if isinstance(v, tuple) else v for n, v in inputs.items()}
+        solution = simulate(system, ts[-1], ts=ts, inputs=inputs)
+        return [solution[n] for n in names], solution.result
+
+    @functools.partial(jax.jit, static_argnums=1)
+    def bounded(system, names):
+        free = system.unconstrain(*names)
+        return [free[n] for n in names], system.constrain(free).parameters.values
+
+    return point, run, bounded
+
+
+def everything(sketch: Sketch, running: bool) -> dict[str, Any]:
+    """What is said of a model: texts, and numbers in hexadecimal; a refusal is a text."""
+    from jaxonomy_dae import simulate
+
+    from .said import compiled, inputs_of, variables_of
+
+    out: dict[str, Any] = {}
+
+    def tell(what: str, values: Any) -> None:
+        try:
+            found = values()
+            out[what] = found if isinstance(found, str) else [float(v).hex() for v in np.ravel(np.asarray(found))]
+        except Exception as error:
+            out[what] = f"{type(error).__name__}: {error}"
+
+    try:
+        system = compiled(sketch)
+    except Exception as error:
+        return {"compiled": f"{type(error).__name__}: {error}"}
+    point, run, bounded = _programs()
+    names = tuple(variables_of(sketch).values())
+    variables = tuple(n for n in names if n in system.variables)
+    tell("report", lambda: str(system.report))
+    tell("parameters", lambda: system.parameters.values)
+    tell("typical sizes", lambda: system.typical_sizes)
+    tell("start", system.initialize)
+    tell("report of the start", lambda: str(system.initialization_report()))
+    x = None
+    if not isinstance(out["start"], str):
+        x = system.initialize()
+        tell("variables and slopes", lambda: np.concatenate(point(system, x, variables)))
+    free = tuple(sketch.names()[n] for n in numbers(sketch))
+    if free:
+        tell("free numbers", lambda: np.concatenate([np.ravel(a) for a in bounded(system, free)]))
+    if running and x is not None:
+        ts = np.linspace(0.2, 1.0, 5) * sketch.end
+        inputs = inputs_of(sketch)
+        kinds = tuple((n, v[2:]) for n, v in inputs.items() if isinstance(v, tuple))
+        arrays = {n: v[:2] if isinstance(v, tuple) else v for n, v in inputs.items()}
+
+        def eager():
+            solution = simulate(system, sketch.end, ts=ts, inputs=inputs)
+            return np.stack([np.asarray(solution[n]) for n in names])
+
+        def inside():
+            values, result = run(system, ts, names, kinds, arrays)
+            return np.append(np.stack(values), float(np.asarray(result._value)))
+
+        tell("run", eager)
+        tell("run inside jit", inside)
+    return out
+
+
+def in_order(number: int, order: tuple[int, ...], running: bool) -> list[dict[str, Any]]:
+    """What is said of a model and its twins, one after the other."""
+    found, _ = models(number)
+    return [everything(found[k], running) for k in order]
+
+
+@functools.cache
+def _fresh_processes():
+    """A pool whose processes have imported everything, and run one task each."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["benchmarks.attack.invariance.process", "jaxonomy_dae.learning"])
+    return context.Pool(1, maxtasksperchild=1)
+
+
+def process(number: int):
+    """Letter a."""
+    from .said import Pairs
+
+    found, what = models(number)
+    running = number % 2 == 0
+    pairs = Pairs("a", found[0].note)
+    count = len(found)
+
+    def ask(order: tuple[int, ...]) -> list[dict[str, Any]]:
+        return _fresh_processes().apply(in_order, (number, order, running))
+
+    alone = [ask((k,))[0] for k in range(count)]
+    for order in (tuple(range(count)), tuple(reversed(range(count)))):
+        for k, told in zip(order, ask(order), strict=True):
+            faults = [
+                f"{key}: {told.get(key)!r:.200}, alone {alone[k][key]!r:.200}"
+                for key in alone[k]
+                if told.get(key) != alone[k][key]
+            ]
+            refused = any(isinstance(alone[k].get(key), str) for key in ("compiled", "start", "run"))
+            text = "; ".join(faults) or str(alone[k].get("start"))[:100]
+            pairs.add(f"{what[k]}, in order {order}", np.inf if faults else 0.0, text, refused)
+    return pairs
