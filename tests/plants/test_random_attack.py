@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import pytest
+from attack import invariance
 from attack.draws import FAMILIES, NETWORKS, Draw
 from attack.outcome import GOOD
 from problems import ROOT
@@ -84,3 +85,22 @@ def test_right_sides_that_are_zero_but_for_rounding():
     # Computed once in a solution and once more in its check, by fused multiply-adds only once, they differ by all of
     # what they are, and the check fails.
     assert judge_apart("--family", "descriptors", "--seed", "281", "--count", "1") == [[1, 0, 0, 0, 0, 0]]
+
+
+# Numbers of cheap models, by letter: what must not matter, and does not. `make attack FAMILY=invariance` draws others.
+INVARIANT = {"b": (100,), "c": (1, 22), "d": (0, 9), "e": (2, 22), "h": (1, 30), "i": (100,)}
+
+
+@pytest.mark.long("some of them compile several runs")
+@pytest.mark.parametrize("letter, number", [(letter, n) for letter, ns in INVARIANT.items() for n in ns])
+def test_what_must_not_matter(letter, number):
+    pairs = invariance.LETTERS[letter](number)
+    assert len(pairs.outcomes) > 2
+    for outcome in pairs.outcomes:
+        assert outcome.kind == "right" or (letter == "b" and outcome.kind == "refused"), f"({pairs.note}): {outcome}"
+
+
+@pytest.mark.long("each process of seven compiles a model by itself")
+def test_a_twin_before_it_does_not_matter():
+    pairs = invariance.LETTERS["a"](1)
+    assert [o.kind for o in pairs.outcomes] == ["right"] * 10, pairs.outcomes

@@ -15,7 +15,7 @@ said of it by one of the letters:
 from collections.abc import Callable
 
 from ..outcome import Outcome
-from . import modes, points, process, solvers
+from . import continuation, modes, points, process, solvers
 from .said import Pairs
 
 MOVING = 5  # every so many-th model is run, where a point would do
@@ -23,6 +23,7 @@ LETTERS: dict[str, Callable[[int], Pairs]] = {
     "a": process.process,
     "b": modes.modes,
     "c": lambda number: points.order(number, number % MOVING == 0),
+    "d": continuation.continuation,
     "e": lambda number: points.units(number, number % MOVING == 1),
     "h": lambda number: points.questions(number, number % MOVING == 2),
     "i": solvers.solvers,

@@ -187,7 +187,6 @@ def in_order(number: int, order: tuple[int, ...], running: bool) -> list[dict[st
     return [everything(found[k], running) for k in order]
 
 
-@functools.cache
 def _fresh_processes():
     """A pool whose processes have imported everything, and run one task each."""
     context = multiprocessing.get_context("forkserver")
@@ -204,12 +203,16 @@ def process(number: int):
     pairs = Pairs("a", found[0].note)
     count = len(found)
 
-    def ask(order: tuple[int, ...]) -> list[dict[str, Any]]:
-        return _fresh_processes().apply(in_order, (number, order, running))
+    orders = (tuple(range(count)), tuple(reversed(range(count))))
+    with _fresh_processes() as pool:
 
-    alone = [ask((k,))[0] for k in range(count)]
-    for order in (tuple(range(count)), tuple(reversed(range(count)))):
-        for k, told in zip(order, ask(order), strict=True):
+        def ask(order: tuple[int, ...]) -> list[dict[str, Any]]:
+            return pool.apply(in_order, (number, order, running))
+
+        alone = [ask((k,))[0] for k in range(count)]
+        together = [ask(order) for order in orders]
+    for order, told_of in zip(orders, together, strict=True):
+        for k, told in zip(order, told_of, strict=True):
             faults = [
                 f"{key}: {told.get(key)!r:.200}, alone {alone[k][key]!r:.200}"
                 for key in alone[k]
