@@ -7,7 +7,6 @@ import scipy.stats
 from jaxtyping import Float
 
 from .descent import Minimum
-from .likelihood import Likelihood
 from .objective import Objective
 
 
@@ -33,14 +32,11 @@ def whiteness(residual: Float[np.ndarray, " n"]) -> Whiteness:
     return Whiteness(float(rho[0]), float(scipy.stats.chi2.sf(statistic, lags)))
 
 
-def log_likelihood(objective: Objective, m: Minimum) -> float:
+def log_likelihood(m: Minimum) -> float:
     """As `Estimate.log_likelihood`."""
-    count = objective.stacked.weight[objective.rows[0]]
     none = np.zeros_like(m.z)
     cost = dataclasses.replace(m.weights, precision=none, mean=none).cost(m.z, m.found.residual)
-    in_cost = isinstance(m.weights, Likelihood)  # the logarithms of noise levels
-    logs = 0.0 if in_cost else float(np.sum(count * np.log(m.weights.row / np.sqrt(count))))
-    return logs - cost - 0.5 * float(np.sum(count) * np.log(2 * np.pi))
+    return m.weights.log_rows - cost - 0.5 * m.weights.samples * float(np.log(2 * np.pi))
 
 
 def rms_by_name(objective: Objective, m: Minimum, point: Float[np.ndarray, " p"]) -> dict[str, dict[str, float]]:

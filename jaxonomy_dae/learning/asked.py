@@ -112,10 +112,8 @@ def checked_method(system: AcausalSystem, given: Any) -> str | Shooting | Filter
     return given
 
 
-def started(system: AcausalSystem, start: Any) -> AcausalSystem:
-    """The system at whose values a search begins: the problem's, or the one that `start` is."""
-    if not isinstance(start, AcausalSystem):
-        return system
+def started(system: AcausalSystem, start: AcausalSystem) -> AcausalSystem:
+    """The system at whose values a search begins, if it is one of the same model."""
     merged = start.merged()
     if merged.plan != system.plan:
         raise ModelError("start is a system of another model: give one of the same, or values by names")

@@ -5,6 +5,8 @@
 
 Parameters that must be positive are on a logarithmic scale, so a step multiplies them; others, and starts, are measured
 by their size, so that 1 is a change that would be natural in any unit. Weights are as they are.
+
+Sizes, bounds and priors belong to the problem. Where a search begins changes `start` alone.
 """
 
 import dataclasses
@@ -38,6 +40,7 @@ class Coordinate(NamedTuple):
     high: float = math.inf
     spread: float = math.inf
     fixed: bool = False
+    centre: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,6 +60,7 @@ class Coordinates:
     low: Float[np.ndarray, " p"]
     high: Float[np.ndarray, " p"]
     spread: Float[np.ndarray, " p"]  # of the prior of a start, on the coordinates' scale; infinite where there is none
+    centre: Float[np.ndarray, " p"]  # of this prior, on the coordinates' scale
     fixed: Bool[np.ndarray, " p"]
     n_shared: int
     n_own: int  # of each experiment
@@ -117,8 +121,13 @@ class Coordinates:
         for name, value in values.items():
             chosen = self._known(name)
             if value is not None:
-                if np.ndim(value) or isinstance(value, str) or not np.isfinite(value) or self.is_weight[chosen].any():
+                if np.ndim(value) or isinstance(value, str) or not np.isfinite(value):
                     raise ModelError(f"'{name}' needs a finite number; got {value!r}")
+                if name not in self.names:
+                    raise ModelError(
+                        f"'{name}' stands for {chosen.sum()} weights, which one number cannot set: give a system, "
+                        f"start=fit.system, or single weights by their names, such as '{self.names[chosen.argmax()]}'"
+                    )
                 outside = (value < self.low[chosen]) | (value > self.high[chosen])
                 if outside.any():
                     low, high = self.low[chosen][0], self.high[chosen][0]
@@ -156,7 +165,7 @@ class Coordinates:
 def coordinates(setting: Setting, stacked: Stacked, extras: tuple[Coordinate, ...] = ()) -> Coordinates:
     """The coordinates of a problem, which start at the values of its system and at the guesses of unknown starts;
     `extras` come with its method."""
-    system, observers, layout = setting
+    system, observers, layout, _ = setting
     table = system.parameters.table
     rows: list[Coordinate] = []
     numbers = np.array(system.parameters.array) if system.parameters.known is None else system.parameters.known
@@ -181,12 +190,12 @@ def coordinates(setting: Setting, stacked: Stacked, extras: tuple[Coordinate, ..
     for k, label in enumerate(stacked.labels):
         for name in layout.own:
             rows.append(_start(f"{name}, {label}", units, name, stacked.starts[name][k], table))
-    names, unit, group, is_weight, log, size, start, low, high, spread, fixed = zip(*rows, strict=True)
-    columns = (np.array(column, float) for column in (size, start, low, high, spread))
-    size, start, low, high, spread = columns
+    names, unit, group, is_weight, log, size, start, low, high, spread, fixed, centre = zip(*rows, strict=True)
+    columns = (np.array(column, float) for column in (size, start, low, high, spread, centre))
+    size, start, low, high, spread, centre = columns
     return Coordinates(
-        names, unit, group, np.array(is_weight), np.array(log), size, start, low, high, spread, np.array(fixed),
-        n_shared, len(layout.own), len(stacked.labels),
+        names, unit, group, np.array(is_weight), np.array(log), size, start, low, high, spread, centre,
+        np.array(fixed), n_shared, len(layout.own), len(stacked.labels),
     )  # fmt: skip
 
 
@@ -217,7 +226,10 @@ def _start(label: str, units: dict[str, str], name: str, given: Any, table: Para
         log = is_positive(interval)
     known = not isinstance(given, Unknown)
     guess = float(given if known else given.guess)
+    if not low <= guess <= high:
+        raise ModelError(f"{label}: the guess must lie in [{low:g}, {high:g}], as '{name}' does; got {guess:g}")
     spread = math.inf if known or given.spread is None else float(given.spread)
     size = 1.0 if log else spread if math.isfinite(spread) else abs(guess) or 1.0
     spread /= guess if log else size
-    return Coordinate(label, units.get(name, ""), name, False, log, size, guess, low, high, spread, known)
+    centre = math.log(guess) if log else guess / size
+    return Coordinate(label, units.get(name, ""), name, False, log, size, guess, low, high, spread, known, centre)

@@ -204,7 +204,7 @@ def _samples(name: str, source: Any, one: Experiment, label: str) -> tuple[np.nd
     """(times, values, kind) of an input; a constant is of any kind."""
     end = float(one.times[-1])
     if isinstance(source, int | float | np.number):
-        return np.array([one.t0, end]), np.full(2, float(source)), None
+        return np.array([one.t0, max(end, one.t0 + 1.0)]), np.full(2, float(source)), None
     if not isinstance(source, tuple | list) or len(source) not in (2, 3):
         raise ModelError(
             f"{label}: input '{name}' is a number or samples, (times, values) or (times, values, 'held'); got "
@@ -257,5 +257,11 @@ def _starts(data: Data, given: dict[str, Any]) -> dict[str, tuple[Any, ...]]:
         shared = {v.shared for v in values if isinstance(v, Unknown)}
         if len(shared) == 2 or (True in shared and not all(isinstance(v, Unknown) for v in values)):
             raise ModelError(f"the start of '{name}' is shared in some experiments only: share it in all or in none")
+        other = [k for k, v in enumerate(values) if True in shared and v != values[0]]
+        if other:
+            raise ModelError(
+                f"the start of '{name}' is one number, shared by all experiments, but {data.labels[0]} says "
+                f"{values[0]} and {data.labels[other[0]]} says {values[other[0]]}: give the same guess and spread"
+            )
         out[name] = tuple(values)
     return out

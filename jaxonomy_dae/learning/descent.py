@@ -4,12 +4,15 @@ factorization each.
 Bounds are kept by projection: a coordinate that lies on one, and would be pushed out, is left out of the step (Moré
 1978 for the scaling by columns, Madsen, Nielsen & Tingleff 2004 for the damping, Bertsekas 1982 for the active set).
 What is descended on, an `AbstractMerit`, says what a point costs, how much is left to go, and what gain is not noticed.
+
+Costs come from an integration, whose error is a noise of its own. Where no step gains, the search measures that noise
+by one more point beside the one at hand, and goes on with a tighter tolerance if the noise is what stops it.
 """
 
 import abc
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -20,6 +23,14 @@ from .factors import Factors
 TRIALS = 12  # dampings tried from one point: the last is 6¹² times the first
 PATIENCE = 3  # steps in a row without gain
 OFFSET = 1e-3  # of the confidence region's radius, what may be left to go (Bates & Watts 1981, Technometrics 23:179)
+CLOSE = 0.05  # of this radius, what a search that no step takes further may leave: no interval moves by more
+POLISHED = 12  # steps at the end, as long as three of them leave less than a third
+MIXED = 4  # earlier steps that these are mixed with (Walker & Ni 2011: three to five suffice)
+ROUNDED = 1e-10  # relative rounding of differences of steps
+EXACT = 1e-7  # of the radius, below which rounding decides: the square root of eps, as the cost is quadratic
+FIRST = 1e-3  # damping to begin with, for columns of norm one (Madsen, Nielsen & Tingleff 2004, section 3.2)
+BESIDE = 1e-8  # relative step by which noise is measured: what the cost truly changes by is less than its rounding
+SETTLED = 0.01  # relative change of a precision or noise level, which changes no interval by as much
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,9 +46,12 @@ class Minimum:
     converged: bool
     message: str
     noise: float  # relative error of the Jacobian: directions within it count as not determined
+    left: float  # what is left to go, in radii of the confidence region
+    tolerance: float  # of the integration, relative
 
 
-Reweigh = Callable[[np.ndarray, Evaluation, Weights, Factors, np.ndarray], tuple[Weights, bool]]
+# Better weights, and by which part noise levels and precisions change.
+Reweigh = Callable[[np.ndarray, Evaluation, Weights, Factors, np.ndarray], tuple[Weights, float]]
 
 
 class Reached(NamedTuple):
@@ -55,22 +69,31 @@ class AbstractMerit(abc.ABC):
 
     - `evaluate`: residuals and Jacobian at a point; None where they cannot be found, so that a trial is rejected.
     - `weights`: those of a point that was evaluated: the first ones, at the start.
+    - `noise`: the relative error of the Jacobian, the tolerance of the integration: directions within it are not
+        followed.
+    - `finer`: the same with a tolerance that is less by a factor; None where the precision does not allow it.
     """
 
     evaluate: Callable[[Float[np.ndarray, " p"]], Evaluation | None]
     weights: Callable[[Float[np.ndarray, " p"], Evaluation], Weights]
+    noise: float
+    finer: Callable[[float], "AbstractMerit | None"]
+
+    @abc.abstractmethod
+    def cost(self, z: Float[np.ndarray, " p"], weights: Weights) -> float:
+        """The cost of a point, infinite where it cannot be found."""
 
     @abc.abstractmethod
     def reach(self, z: Float[np.ndarray, " p"], weights: Weights, below: float) -> Reached | None:
         """A point, if it costs less than `below`."""
 
     @abc.abstractmethod
-    def left(self, factors: Factors, cost: float, rows: int, noise: float) -> float:
-        """The remaining step in radii of the confidence region."""
+    def unnoticed(self, cost: float, rows: float, columns: int) -> float:
+        """A gain by a step that counts as none."""
 
     @abc.abstractmethod
-    def unnoticed(self, cost: float, rows: int, columns: int) -> float:
-        """A gain by a step that counts as none."""
+    def at(self, z: Float[np.ndarray, " p"], found: Evaluation, weights: Weights) -> Weights:
+        """The weights at another point, with noise levels and precisions of those given."""
 
     @abc.abstractmethod
     def next_weights(self, here: Weights, better: Weights) -> Weights:
@@ -101,21 +124,67 @@ def damping_after(damping: float, ratio: float) -> float:
     return max(damping, 1e-12)
 
 
+def offset(factors: Factors, noise: float) -> float:
+    """The remaining step in radii of the confidence region, which noise levels set: the relative offset."""
+    rank = factors.rank(noise)
+    return float(np.sqrt(np.mean(factors.projected[:rank] ** 2))) if rank else 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class _Here:
+    """A point with all that follows from one factorization there: better weights, how much these change, and what is
+    left to go."""
+
+    z: Float[np.ndarray, " p"]
+    found: Evaluation
+    weights: Weights
+    rows: Rows
+    cost: float
+    free: Bool[np.ndarray, " p"]
+    factors: Factors
+    following: Weights
+    change: float
+    left: float
+
+    @classmethod
+    def of(
+        cls, merit: AbstractMerit, z: np.ndarray, found: Evaluation, weights: Weights, bounds: tuple, reweigh: Any
+    ) -> "_Here":
+        rows, cost = weights.applied(z, found), weights.cost(z, found.residual)
+        free = can_move(z, rows.jacobian.T @ rows.residual, bounds)
+        factors = Factors.of(rows.residual, rows.jacobian[:, free], merit.noise)
+        following, change = (weights, 0.0) if reweigh is None else reweigh(z, found, weights, factors, free)
+        return cls(z, found, weights, rows, cost, free, factors, following, change, offset(factors, merit.noise))
+
+    @property
+    def settled(self) -> bool:
+        """True if weights are as good as those they would become."""
+        return self.change <= SETTLED
+
+    @property
+    def worst(self) -> float:
+        """What is left to go, of coordinates or of weights."""
+        return max(self.left, self.change)
+
+    @property
+    def heavy(self) -> float:
+        """How many rows there are, weights counted, and priors."""
+        return self.weights.samples + len(self.rows.residual) - len(self.weights.row)
+
+
 def descend(
     merit: AbstractMerit,
     start: Float[np.ndarray, " p"],
     bounds: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]],
     reweigh: Reweigh | None,
     steps: int,
-    noise: float,
 ) -> Minimum | None:
     """Descends from a start.
 
     **Arguments:**
 
-    - `reweigh`: `(z, found, weights, factors, free)` to better weights, and whether they have settled; called once for
-        each factorization, for the next step.
-    - `noise`: the relative error of the Jacobian: directions within it are not followed.
+    - `reweigh`: `(z, found, weights, factors, free)` to better weights, and how much they change; called once for each
+        factorization, for the next step.
 
     **Returns:**
 
@@ -125,53 +194,119 @@ def descend(
     found = merit.evaluate(z)
     if found is None:
         return None
-    weights = merit.weights(z, found)
-    damping, history, count, idle = 1e-3, [], 1, 0
-    converged, message = False, f"stopped after {steps} steps, not yet converged; steps= allows more"
+    here = _Here.of(merit, z, found, merit.weights(z, found), bounds, reweigh)
+    damping, history, count, idle, renewed = FIRST, [], 1, 0, False
+    reason = f"stopped after {steps} steps, not yet converged; steps= allows more"
     for k in range(steps + 1):
-        rows, cost = weights.applied(z, found), weights.cost(z, found.residual)
-        history.append(cost)
-        free = can_move(z, rows.jacobian.T @ rows.residual, bounds)
-        factors = Factors.of(rows.residual, rows.jacobian[:, free], noise)
-        following, settled = (weights, True) if reweigh is None else reweigh(z, found, weights, factors, free)
-        if settled and (merit.left(factors, cost, len(rows.residual), noise) <= OFFSET or idle >= PATIENCE):
-            converged, message = True, f"converged after {k} steps"
+        history.append(here.cost)
+        if here.settled and here.left <= OFFSET:
+            reason = f"converged after {k} steps"
             break
         if k == steps:
             break
-        better, tried, damping = _better(merit, z, weights, cost, rows, factors, free, bounds, damping, noise)
+        better, tried, damping = _better(merit, here, bounds, damping)
         count += tried
-        if better is None:
-            idle += 1
-            if settled or idle > PATIENCE:
-                converged, message = True, f"converged after {k} steps: no step gains more"
+        least = merit.unnoticed(here.cost, here.heavy, len(here.z))
+        gained = 0.0 if better is None else here.cost - better.cost
+        idle = 0 if gained > least else idle + 1
+        renewed = renewed and idle > 0
+        if better is not None:
+            weights = merit.next_weights(better.weights, here.following)
+            here = _Here.of(merit, better.z, better.found, weights, bounds, reweigh)
+        if better is None or idle >= PATIENCE:
+            finer, tried = _finer(merit, here, least)
+            count += tried
+            found = None if finer is None else finer.evaluate(here.z)
+            if finer is not None and found is not None:
+                merit, damping, idle, count = finer, FIRST, 0, count + 1
+                here = _Here.of(merit, here.z, found, merit.at(here.z, found, here.weights), bounds, reweigh)
+            elif damping > 1 and not renewed:  # columns have norm one: beyond, damping alone keeps steps short
+                damping, idle, renewed = FIRST, 0, True
+            elif here.settled or idle > 2 * PATIENCE:
+                closed = here.left <= CLOSE
+                reason = f"{'converged' if closed else 'stopped'} after {k} steps: no step gains more"
                 break
-        else:
-            z, found, weights = better[:3]
-            if cost - better.cost > merit.unnoticed(cost, len(rows.residual), len(z)):
-                idle = 0
-            elif damping <= 1:  # the columns have norm one: beyond, damping alone keeps steps short
-                idle += 1
-        weights = merit.next_weights(weights, following)
-    return Minimum(z, found, weights, weights.cost(z, found.residual), history, count, converged, message, noise)
+            elif better is None:
+                weights = merit.next_weights(here.weights, here.following)
+                here = _Here.of(merit, here.z, here.found, weights, bounds, reweigh)
+    converged = reason.startswith("converged")
+    if converged:
+        here, polished = _polished(merit, here, bounds, reweigh, history)
+        count += polished
+    return Minimum(
+        here.z, here.found, here.weights, here.cost, history, count, converged, reason, merit.noise, here.left,
+        merit.noise,
+    )  # fmt: skip
 
 
 def _better(
-    merit: AbstractMerit, z: np.ndarray, weights: Weights, cost: float, rows: Rows, factors: Factors, free: np.ndarray,
-    bounds: tuple[np.ndarray, np.ndarray], damping: float, noise: float,
-) -> tuple[Reached | None, int, float]:  # fmt: skip
+    merit: AbstractMerit, here: _Here, bounds: tuple[np.ndarray, np.ndarray], damping: float
+) -> tuple[Reached | None, int, float]:
     """A point that costs less, how many were tried, and the next damping."""
-    rank = factors.rank(noise)
+    rank, rows = here.factors.rank(merit.noise), here.rows
     for trial in range(TRIALS):
-        step = np.zeros_like(z)
-        step[free] = factors.step(damping, rank)
-        new = np.clip(z + merit.shortened(step), *bounds)
-        if np.array_equal(new, z):
+        step = np.zeros_like(here.z)
+        step[here.free] = here.factors.step(damping, rank)
+        new = np.clip(here.z + merit.shortened(step), *bounds)
+        if np.array_equal(new, here.z):
             return None, trial, damping
-        reached = merit.reach(new, weights, cost)
+        reached = merit.reach(new, here.weights, here.cost)
         if reached is not None:
-            promised = 0.5 * float(np.sum(rows.residual**2) - np.sum((rows.residual + rows.jacobian @ (new - z)) ** 2))
-            ratio = (cost - reached.cost) / max(promised, np.finfo(float).eps * abs(cost), np.finfo(float).tiny)
-            return reached, trial + 1, damping_after(damping, ratio)
+            moved = rows.residual + rows.jacobian @ (new - here.z)
+            promised = 0.5 * float(np.sum(rows.residual**2) - np.sum(moved**2))
+            floor = max(np.finfo(float).eps * abs(here.cost), np.finfo(float).tiny)
+            return reached, trial + 1, damping_after(damping, (here.cost - reached.cost) / max(promised, floor))
         damping *= 6
     return None, TRIALS, damping
+
+
+def _finer(merit: AbstractMerit, here: _Here, least: float) -> tuple[AbstractMerit | None, int]:
+    """(the merit with a tighter tolerance, if the integration's noise hides gains that would count; evaluations)."""
+    step = np.zeros_like(here.z)
+    step[here.free] = here.factors.step(0.0, here.factors.rank(merit.noise))
+    size = float(np.max(np.abs(step), initial=0.0))
+    if here.left <= OFFSET or not size:
+        return None, 0
+    beside = merit.cost(here.z + step * (BESIDE / size), here.weights)
+    noise = abs(beside - here.cost)
+    if not noise > 0.1 * least:
+        return None, 1
+    return merit.finer(float(np.clip(0.1 * least / noise, 1e-4, 0.1))), 1
+
+
+def _polished(
+    merit: AbstractMerit, here: _Here, bounds: tuple[np.ndarray, np.ndarray], reweigh: Reweigh | None,
+    history: list[float],
+) -> tuple[_Here, int]:  # fmt: skip
+    """(the point after full steps, as long as these converge; evaluations): so that a fit ends at its minimum, wherever
+    it began, and not at the edge of what counts as near.
+
+    Full steps converge by a factor that the residuals' curvature sets. Anderson's mixing of the last few (1965, J. ACM
+    12:547) makes of that what a secant makes of a slope."""
+    best, count, scale = here, 0, np.ones_like(here.z)
+    scale[here.free] = here.factors.scale
+    points: list[np.ndarray] = []
+    steps: list[np.ndarray] = []
+    marks = [here.worst]
+    while count < POLISHED and best.worst > EXACT:
+        step = np.zeros_like(here.z)
+        step[here.free] = here.factors.step(0.0, here.factors.rank(merit.noise))
+        points, steps = [*points[-MIXED:], here.z], [*steps[-MIXED:], step]
+        z = here.z + step
+        if len(steps) > 1:
+            by_point, by_step = np.diff(points, axis=0).T, np.diff(steps, axis=0).T
+            mixed = np.linalg.lstsq(scale[:, None] * by_step, scale * step, rcond=ROUNDED)[0]
+            z = z - (by_point + by_step) @ mixed
+        z = np.clip(z, *bounds)
+        found = merit.evaluate(z)
+        count += 1
+        if found is None:
+            break
+        here = _Here.of(merit, z, found, merit.at(z, found, here.following), bounds, reweigh)
+        if here.worst < best.worst:
+            best = here
+            history.append(here.cost)
+        marks.append(best.worst)
+        if len(marks) > PATIENCE and marks[-1] > marks[-1 - PATIENCE] / 3:
+            break
+    return best, count

@@ -246,7 +246,9 @@ def _placed(known: Known, plans: list[Planned]) -> tuple[Layout, Stacked, Any, A
 def _objective(known: Known, layout: Layout, stacked: Stacked) -> Objective:
     o = known.objective
     setting = o.setting._replace(layout=layout)
-    return Objective(*setting, stacked, coordinates(setting, stacked), {}, np.ones(len(stacked.labels), bool))
+    return Objective(
+        *setting[:3], o.fine, stacked, coordinates(setting, stacked), {}, np.ones(len(stacked.labels), bool)
+    )
 
 
 def _columns(known: Known, layout: Layout) -> np.ndarray:

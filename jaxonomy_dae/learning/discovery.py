@@ -200,7 +200,7 @@ def discover(
 def criterion(fitted: "Estimate", terms: int) -> float:
     """Schwarz's criterion; what all candidates have in common, such as other parameters, is left out."""
     weights = fitted.minimum.weights
-    return 2 * fitted.minimum.cost - 2 * weights.log_rows + terms * float(np.log(len(weights.row)))
+    return 2 * fitted.minimum.cost - 2 * weights.log_rows + terms * float(np.log(weights.samples))
 
 
 def _lack_of_fit(network: "Estimate", closed: "Estimate", name: str) -> float:
@@ -269,13 +269,13 @@ def _refitted(
     dtype = system.parameters.values.dtype
     present = np.isin(np.arange(len(terms)), subset)
     law = ClosedForm(jnp.asarray(start.coefficients(subset), dtype), jnp.asarray(present), terms)
-    problem = estimate.problem.with_law(name, law, system, estimate.objective.stacked)
+    problem = estimate.problem.with_law(name, law, estimate.objective.stacked)
     natural = c.natural(estimate.point)
     others = [k for k in range(len(c)) if c.group[k] != name]
     numbers = [k for k in others if not c.is_weight[k]]
     frozen = [c.names[k] for k in others if c.fixed[k]] + _labels(name, np.flatnonzero(~present))
     return problem.fit(
-        start={c.names[k]: float(natural[k]) for k in numbers},
+        start={c.names[k]: float(natural[k]) for k in others},
         bounds={c.names[k]: (float(c.low[k]), float(c.high[k])) for k in numbers},
         freeze=frozen,
     )

@@ -122,8 +122,8 @@ def ensemble(
 
 
 def _deviance(estimate: Estimate) -> float:
-    """−2 ln (likelihood), less a constant."""
-    return estimate.chi2 - 2 * float(np.sum(np.log(estimate.minimum.weights.row)))
+    """−2 ln (likelihood)."""
+    return -2 * estimate.log_likelihood
 
 
 def _starts(

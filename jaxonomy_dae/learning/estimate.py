@@ -136,13 +136,13 @@ class Estimate:
     @property
     def jacobian(self) -> Float[np.ndarray, "m f"]:
         """The derivatives of the residuals, in units of the noise, by the coordinates that were searched."""
-        return self.minimum.weights.row[:, None] * self.minimum.found.jacobian
+        return self.minimum.weights.scale[:, None] * self.minimum.found.jacobian
 
     @property
     def residuals(self) -> dict[str, dict[str, np.ndarray]]:
         """Predictions less data by experiment and name, where there are samples, in units of the noise."""
         s = self.objective.stacked
-        scaled = self.minimum.weights.row * self.minimum.found.residual
+        scaled = self.minimum.weights.scale * self.minimum.found.residual
         experiment, _, output = self.objective.rows
         found: dict[str, dict[str, np.ndarray]] = {}
         for k, label in enumerate(s.labels):
@@ -154,9 +154,11 @@ class Estimate:
 
     @functools.cached_property
     def freedom(self) -> float:
-        """Degrees of freedom: samples less the effective number of coordinates (the sum of leverages)."""
-        root = self.root[self.objective.free]
-        return len(self.minimum.found.residual) - float(np.sum((self.jacobian @ root) ** 2))
+        """Degrees of freedom: samples, each as often as its experiment's weight says, less the effective number of
+        coordinates (the sum of leverages)."""
+        weights, root = self.minimum.weights, self.root[self.objective.free]
+        leverages = np.sum((weights.row[:, None] * self.minimum.found.jacobian @ root) ** 2)
+        return weights.samples - float(leverages)
 
     @property
     def chi2(self) -> float:
@@ -310,7 +312,7 @@ class Estimate:
     def log_likelihood(self) -> float:
         """ln L of the samples that were fitted, without priors: of models with p coordinates and n samples, that of the
         least 2p − 2 ln L (Akaike) or p ln n − 2 ln L (Schwarz) is to be preferred."""
-        return log_likelihood(self.objective, self.minimum)
+        return log_likelihood(self.minimum)
 
     def discover(self, name: str, terms: Any, *, width: int = 3, most: int = 3) -> Discovery:
         """Closed forms in a network's place: combinations of terms, refitted through the model on the data, with all

@@ -26,16 +26,28 @@ class Rows(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Weights:
-    """The weights of residuals and priors in the cost."""
+    """The weights of residuals and priors in the cost. A residual of weight w counts as w residuals of the same value
+    would, in every sum and in every number of samples."""
 
-    row: Float[np.ndarray, " m"]  # 1/σ
+    row: Float[np.ndarray, " m"]  # √w/σ
     precision: Float[np.ndarray, " p"]  # of the normal prior of each coordinate; 0 where there is none
     mean: Float[np.ndarray, " p"]
+    share: Float[np.ndarray, " m"]  # √w
+
+    @property
+    def samples(self) -> float:
+        """The number of samples, Σ w."""
+        return float(np.sum(self.share**2))
+
+    @property
+    def scale(self) -> Float[np.ndarray, " m"]:
+        """1/σ of each sample."""
+        return self.row / self.share
 
     @property
     def log_rows(self) -> float:
-        """Σ ln (1/σ), which the cost does not contain."""
-        return float(np.sum(np.log(self.row)))
+        """Σ w ln (1/σ), which the cost does not contain."""
+        return float(np.sum(self.share**2 * np.log(self.scale)))
 
     def prior(self, z: Float[np.ndarray, " p"]) -> Rows:
         """A row for each prior."""

@@ -5,7 +5,8 @@ residuals, the evidence of the data is greatest where (MacKay 1992, Neural Compu
 
     α = γ / Σ w²,   γ = k − α·trace C,      σ² = Σ r² / (n − γ_r),   γ_r = Σ leverages of the residuals,
 
-with C the covariance of the weights. γ is how many of them the data determine. Both are brought up to date with every
+with C the covariance of the weights. γ is how many of them the data determine. A residual of weight w counts w times,
+in n as in the sums. Both are brought up to date with every
 step of the descent, as Foresee and Hagan do (1997, Proc. ICNN), which costs nothing: C comes from the factors that
 the step takes anyway.
 """
@@ -18,7 +19,7 @@ from jaxtyping import Bool, Int
 from .evaluation import Evaluation, Weights
 from .factors import Factors
 
-SETTLED = 0.01  # relative change of a precision or noise level, which changes no interval by as much
+NEAR = 2.0  # χ² for each sample, beyond which it is the misfit that speaks, and precisions of priors stay as they are
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +30,6 @@ class Evidence:
     noise: Int[np.ndarray, " m"]  # the group of each residual; −1: its noise level is known
     labels: tuple[str, ...]  # of these groups
     floor: np.ndarray  # (groups,): the rounding of the data, below which no noise can be seen
-    share: np.ndarray  # (m,): the square root of the experiment's weight
     groups: tuple[Bool[np.ndarray, " p"], ...]  # whose precision is to be found
 
     @property
@@ -40,7 +40,7 @@ class Evidence:
     def sigma(self, weights: Weights) -> dict[str, float]:
         """The noise level of each group."""
         return {
-            label: float((self.share / weights.row)[self.noise == k][0])
+            label: float(1 / weights.scale[self.noise == k][0])
             for k, label in enumerate(self.labels)
             if (weights.row[self.noise == k] > 0).any()
         }
@@ -50,33 +50,40 @@ class Evidence:
         row = np.array(weights.row)
         for k, floor in enumerate(self.floor):
             chosen = self.noise == k
-            row[chosen] = self.share[chosen] / max(_rms(found.residual[chosen]), floor)
+            share = weights.share[chosen]
+            row[chosen] = share / max(_rms(found.residual[chosen], share), floor)
         return dataclasses.replace(weights, row=row)
 
     def reweigh(
         self, z: np.ndarray, found: Evaluation, weights: Weights, factors: Factors, free: np.ndarray
-    ) -> tuple[Weights, bool]:
-        """Better weights, and whether they are as good as the same."""
+    ) -> tuple[Weights, float]:
+        """Better weights, and the greatest relative change. As long as residuals of known noise levels are larger than
+        these say, precisions stay: the evidence would let go of a prior that nothing else replaces."""
         root = factors.root(factors.rank(np.finfo(float).eps * len(found.residual)))
         row, precision = np.array(weights.row), np.array(weights.precision)
         changes = [0.0]
         for k, floor in enumerate(self.floor):
             chosen = self.noise == k
+            share = weights.share[chosen]
+            count = float(np.sum(share**2))
             spread = (weights.row[chosen, None] * found.jacobian[np.ix_(chosen, free)]) @ root
-            left = max(chosen.sum() - float(np.sum(spread**2)), 1.0)
-            sigma = max(_rms(found.residual[chosen]) * np.sqrt(chosen.sum() / left), floor)
-            changes.append(abs(np.log(sigma * row[chosen][0] / self.share[chosen][0])))
-            row[chosen] = self.share[chosen] / sigma
+            left = max(count - float(np.sum(spread**2)), 1.0)
+            sigma = max(_rms(found.residual[chosen], share) * np.sqrt(count / left), floor)
+            changes.append(abs(np.log(sigma * row[chosen][0] / share[0])))
+            row[chosen] = share / sigma
         variance = np.zeros(len(z))
         variance[free] = np.sum(root**2, axis=1)
-        for group in self.groups:
+        known = self.noise < 0
+        misfit = float(np.sum((weights.row * found.residual)[known] ** 2))
+        near = misfit <= NEAR * float(np.sum(weights.share[known] ** 2))
+        for group in self.groups if near else ():
             old = weights.precision[group][0]
-            known = max(group.sum() - old * float(np.sum(variance[group])), 1e-3)
-            new = known / max(float(np.sum((z - weights.mean)[group] ** 2)), np.finfo(float).tiny)
+            determined = max(group.sum() - old * float(np.sum(variance[group])), 1e-3)
+            new = determined / max(float(np.sum((z - weights.mean)[group] ** 2)), np.finfo(float).tiny)
             changes.append(abs(np.log(new / old)))
             precision[group] = new
-        return dataclasses.replace(weights, row=row, precision=precision), bool(max(changes) <= SETTLED)
+        return dataclasses.replace(weights, row=row, precision=precision), float(max(changes))
 
 
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
+def _rms(values: np.ndarray, share: np.ndarray) -> float:
+    return float(np.sqrt(np.average(values**2, weights=share**2)))

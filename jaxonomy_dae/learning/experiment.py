@@ -164,7 +164,7 @@ def _times(given: Any, t0: float) -> np.ndarray:
     if len(bad):
         raise ModelError(f"times[{bad[0]}] is {times[bad[0]]}: every row needs a time")
     check_increasing(times)
-    if not _is_finite(t0) or times[0] < t0 or times[-1] <= t0:
+    if not _is_finite(t0) or times[0] < t0:
         raise ModelError(
             f"times lie outside of the experiment: it starts at t0={t0:g}, the times reach from {times[0]:g} to "
             f"{times[-1]:g}. Give t0={times[0]:g}, or leave earlier rows out"

@@ -56,7 +56,7 @@ def plot_runs(
 def plot_residuals(objective: Objective, minimum: Minimum, axes: Any) -> np.ndarray:
     """Residuals in units of the noise over time, and their autocorrelation: rows of axes for names."""
     s = objective.stacked
-    rows, scaled = objective.rows, minimum.weights.row * minimum.found.residual
+    rows, scaled = objective.rows, minimum.weights.scale * minimum.found.residual
     present = [j for j in range(len(s.outputs)) if (rows[2] == j).any()]
     axes = grid_of_axes(axes, len(present), 2, "a plot of residuals")
     for k, row in enumerate(axes):  # times on the left, lags on the right
@@ -92,7 +92,7 @@ def plot_history(minimum: Minimum, ax: Any) -> Any:
     """Draws how the misfit came down, step by step; returns the axes."""
     ax = new_axes(ax)
     history = np.array(minimum.history, float)
-    ax.semilogy(np.sqrt(2 * history / len(minimum.weights.row)), ".-")
+    ax.semilogy(np.sqrt(2 * history / minimum.weights.samples), ".-")
     ax.set_xlabel("Steps of least squares")
     ax.set_ylabel("RMS residual / σ")
     ax.grid(True, which="both", alpha=0.3)

@@ -16,7 +16,7 @@ from .filter_program import Track, misfit_ahead, predict_ahead, track
 from .filter_steps import Told
 from .filtering import Structure
 from .likelihood import Likelihood, Scoring
-from .objective import Misfit, Objective, Predicted
+from .objective import Misfit, Objective, Predicted, Weigh
 from .program import Weighted
 
 
@@ -138,16 +138,14 @@ class FilterObjective(AheadObjective):
         """Weights by the variances at this point, and priors."""
         base = super().weights(z, found)
         assert found.variance is not None
-        share = np.sqrt(self.stacked.weight[self.rows[0]])
-        return Likelihood(share / np.sqrt(found.variance), base.precision, base.mean, share)
+        return Likelihood(base.share / np.sqrt(found.variance), base.precision, base.mean, base.share)
 
     @functools.cached_property
     def evidence(self) -> Evidence:
         """As `Objective.evidence`, for precisions alone: noise levels are coordinates."""
-        share = np.sqrt(self.stacked.weight[self.rows[0]])
         groups = [self._group(name) for name, given in self.penalties.items() if given == "evidence"]
         chosen = tuple(group for group in groups if group.any())
-        return Evidence(np.full(len(share), -1), (), np.zeros(0), share, chosen)
+        return Evidence(np.full(len(self.rows[0]), -1), (), np.zeros(0), chosen)
 
     def lowest(
         self, start: Float[np.ndarray, " f"], steps: int = 200, weights: Weights | None = None
@@ -160,9 +158,15 @@ class FilterObjective(AheadObjective):
                 here if weights is None else dataclasses.replace(here, precision=weights.precision, mean=weights.mean)
             )
 
-        merit = Scoring(self.evaluate, held, self.coordinates.log[self.free])
         reweigh = self.evidence.reweigh if weights is None and not self.evidence.is_idle else None
-        return descend(merit, start, self.bounds, reweigh, steps, self.tolerance)
+        return descend(self._scoring(held), start, self.bounds, reweigh, steps)
+
+    def _scoring(self, weigh: Weigh) -> Scoring:
+        def finer(factor: float) -> Scoring | None:
+            other = self.finer(factor)
+            return None if other is None else other._scoring(weigh)
+
+        return Scoring(self.evaluate, weigh, self.tolerance, finer, self.coordinates.log[self.free])
 
     def sigma(self, z: Float[np.ndarray, " f"], weights: Weights) -> dict[str, float]:
         """Noise levels that were estimated."""
@@ -170,8 +174,11 @@ class FilterObjective(AheadObjective):
         names = (self.stacked.outputs[j] for j in self.structure.sigma)
         return {name: float(natural[f"sigma of {name}"]) for name in names}
 
-    def scored(self, full: Float[np.ndarray, " p"], sigma: dict[str, float], rows: tuple[np.ndarray, ...]) -> float:
-        """The root mean square of standardized innovations."""
+    def standardized(
+        self, full: Float[np.ndarray, " p"], sigma: dict[str, float], rows: tuple[np.ndarray, ...]
+    ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+        """(innovations of chosen samples in units of their standard deviations, these)."""
         predicted, variance = self._ahead(full)
-        scaled = (predicted.outputs[rows] - self.stacked.values[rows]) / np.sqrt(variance.outputs[rows])
-        return float(np.sqrt(np.mean(scaled**2))) if np.isfinite(scaled).all() else np.inf
+        with np.errstate(invalid="ignore"):
+            level = np.sqrt(variance.outputs[rows])
+        return (predicted.outputs[rows] - self.stacked.values[rows]) / level, level

@@ -30,7 +30,7 @@ from ..system.system import AcausalSystem
 from ..system.system_at import SystemAt
 from .filtering import Structure
 from .linear_models import affine_flow, linear_flow
-from .program import Layout, Setting, outputs_of, placed, with_kinds
+from .program import Layout, Setting, outputs_of, placed, run_end, with_kinds
 
 ITERATIONS = 4  # Gauss–Newton steps onto the constraints after a correction, which converge quadratically
 
@@ -53,8 +53,8 @@ class Told(eqx.Module):
 
 class Model(NamedTuple):
     """One experiment's system with all numbers in their places: `here`, sensor laws, initial values by name, inputs;
-    and what the method adds: intensities of diffusion, shape (f, f), and of noise of inputs, noise levels, shape (k,),
-    and K, shape (f, k)."""
+    what the method adds: intensities of diffusion, shape (f, f), and of noise of inputs, noise levels, shape (k,), and
+    K, shape (f, k); and the options of `simulate`."""
 
     here: AcausalSystem
     laws: dict[str, Any]
@@ -64,10 +64,11 @@ class Model(NamedTuple):
     driven: dict[str, Any]
     sigma: Float[Array, " k"]
     gain: Float[Array, "f k"]
+    options: dict[str, Any]
 
 
 def model_of(setting: Setting, structure: Structure, shared: Any, own: Any, told: Told) -> Model:
-    system, _, layout = setting
+    system, _, layout, _ = setting
     here, laws, initial = placed(setting, shared, own, told.known)
     end = len(shared) - len(layout.shared)
     extra = iter(shared[end - len(layout.extra) : end])
@@ -84,12 +85,12 @@ def model_of(setting: Setting, structure: Structure, shared: Any, own: Any, told
     gain = jnp.zeros((f, k), shared.dtype)
     for place, j, factor in structure.gain:
         gain = gain.at[place, j].set(next(extra) / factor)
-    return Model(here, laws, initial, {}, jnp.diag(diffusion), driven, sigma, gain)
+    return Model(here, laws, initial, {}, jnp.diag(diffusion), driven, sigma, gain, setting.options)
 
 
 def start_of(setting: Setting, structure: Structure, shared: Any, own: Any, told: Told) -> tuple[Any, Any]:
     """The state at the start and the covariance that the priors of known starts give it."""
-    system, _, layout = setting
+    system, _, layout, _ = setting
     f = len(system.plan.states)
     inputs = with_kinds(jax.tree.map(lambda a: a[0], told.inputs), layout)
 
@@ -105,14 +106,12 @@ def start_of(setting: Setting, structure: Structure, shared: Any, own: Any, told
     return found, root @ root.T
 
 
-def _run(m: Model, layout: Layout, t0: Any, t1: Any, x: Any) -> tuple[Any, Any]:
-    """(state, discrete values) at t1 of a run from a state at t0; padded times repeat, and runs of no length are made
-    of next to none."""
-    least = 1e-12 * (1.0 + jnp.abs(t0))
-    t1 = jnp.where(t1 > t0, t1, t0 + least)
+def _run(m: Model, t0: Any, t1: Any, x: Any) -> tuple[Any, Any]:
+    """(state, discrete values) at t1 of a run from a state at t0; padded times repeat."""
+    t1 = run_end(t0, t1)
     solution = simulate(
         m.here, t1, t0=t0, ts=t1[None], initial=x, adjoint=diffrax.ForwardMode(), throw=False,
-        inputs=m.inputs, **dict(layout.options),
+        inputs=m.inputs, **m.options,
     )  # fmt: skip
     return solution.states[-1], None if solution.discrete is None else solution.discrete[-1]
 
@@ -178,7 +177,7 @@ def read(m: Model, layout: Layout, t: Any, x: Any, discrete: Any) -> tuple[Float
     return found, slopes
 
 
-def _forward(m: Model, layout: Layout, substeps: int, t0: Any, t1: Any, x: Any, p: Any) -> tuple[Any, Any, Any]:
+def _forward(m: Model, substeps: int, t0: Any, t1: Any, x: Any, p: Any) -> tuple[Any, Any, Any]:
     """State, covariance and Φ at t1, from those at t0."""
     f = len(m.here.plan.states)
 
@@ -187,7 +186,7 @@ def _forward(m: Model, layout: Layout, substeps: int, t0: Any, t1: Any, x: Any, 
         start, stop = ends
 
         def flow(first):
-            found, _ = _run(m, layout, start, stop, jnp.concatenate([first, x[f:]]))
+            found, _ = _run(m, start, stop, jnp.concatenate([first, x[f:]]))
             return found[:f], found
 
         first, g = _jacobian(m, start, x), _intensity(m, start, x)
@@ -246,8 +245,8 @@ def onwards(
     if structure.is_linear:
         return *_forward_linear(m, ends, x, p), None
     if structure.is_filter:
-        return *_forward(m, layout, structure.substeps, ends[0], ends[-1], x, p), None
-    x, discrete = _run(m, layout, ends[0], ends[-1], x)
+        return *_forward(m, structure.substeps, ends[0], ends[-1], x, p), None
+    x, discrete = _run(m, ends[0], ends[-1], x)
     return x, p, jnp.zeros_like(p), discrete
 
 

@@ -230,7 +230,8 @@ def _extra(name: str, unit: str, value: Any, guess: float, size: float, *, log: 
     elif known:
         guess = float(value)
     low, high = (guess / FAR, guess * FAR) if log else (-math.inf, math.inf)
-    return Coordinate(name, unit, name, False, log, size, guess, low, high, spread, known)
+    centre = math.log(guess) if log else guess / size
+    return Coordinate(name, unit, name, False, log, size, guess, low, high, spread, known, centre)
 
 
 def _noise_unit(place: int | str, unit: str) -> str:
@@ -241,21 +242,29 @@ def _noise_unit(place: int | str, unit: str) -> str:
 
 def _increments(stacked: Stacked, j: int) -> tuple[float, float]:
     """The root mean squares of what an output changes by from sample to sample, and of that per √time."""
-    steps, rates = [], []
-    for k in np.flatnonzero(~stacked.holdout):
+    steps, rates, often = [], [], []
+    for k in _fitted(stacked):
         seen = stacked.observed[k, :, j]
         change, dt = np.diff(stacked.values[k, seen, j]), np.diff(stacked.times[k, seen])
         steps.append(change)
         rates.append(change / np.sqrt(dt))
-    step, rate = np.concatenate(steps), np.concatenate(rates)
+        often.append(np.full(len(dt), stacked.weight[k]))
+    step, rate, count = np.concatenate(steps), np.concatenate(rates), np.concatenate(often)
     least = 1e-3 * _size(stacked, j)
     if not len(step):
         return least, least
-    return max(float(np.sqrt(np.mean(step**2))), least), max(float(np.sqrt(np.mean(rate**2))), least)
+    found = (float(np.sqrt(np.average(a**2, weights=count))) for a in (step, rate))
+    first, second = (max(value, least) for value in found)
+    return first, second
+
+
+def _fitted(stacked: Stacked) -> list[int]:
+    """The experiments that are fitted."""
+    return np.flatnonzero(~stacked.holdout & (stacked.weight > 0)).tolist()
 
 
 def _size(stacked: Stacked, j: int) -> float:
-    return float(np.max(np.abs(stacked.values[:, :, j]), initial=0.0)) or 1.0
+    return float(np.max(np.abs(stacked.values[_fitted(stacked), :, j]), initial=0.0)) or 1.0
 
 
 def _intensities(system: AcausalSystem, stacked: Stacked, places: list[int | str]) -> dict[int | str, float]:
@@ -270,13 +279,17 @@ def _intensities(system: AcausalSystem, stacked: Stacked, places: list[int | str
         quantity, factor = plan.resolve([name])
         for place in np.flatnonzero(plan.states == quantity[0]).tolist():
             found[place] = 0.5 * _increments(stacked, j)[1] / abs(float(factor[0]))
-    span = float(np.max(stacked.times[:, -1] - stacked.t0))
+    seen = np.any(stacked.observed, axis=2)
+    fitted = [k for k in _fitted(stacked) if seen[k].any()]
+    ends = [stacked.times[k, seen[k]][-1] - stacked.t0[k] for k in fitted]
+    span, rows = max(ends, default=0.0) or 1.0, max((int(seen[k].sum()) for k in fitted), default=1)
     known = [found[p] / nominal[p] for p in found]
     typical = float(np.mean(known)) if known else HIDDEN / math.sqrt(span)
     for place in places:
         if isinstance(place, str):
-            size = float(np.max(np.abs(stacked.inputs[place][1]), initial=0.0)) if place in stacked.inputs else 0.0
-            found[place] = HIDDEN * (size or 1.0) * math.sqrt(span / stacked.times.shape[1])
+            given = place in stacked.inputs
+            size = float(np.max(np.abs(stacked.inputs[place][1][fitted]), initial=0.0)) if given else 0.0
+            found[place] = HIDDEN * (size or 1.0) * math.sqrt(span / rows)
         elif place not in found:
             found[place] = HIDDEN * typical * float(nominal[place])
     return found

@@ -39,21 +39,21 @@ class Batches:
     def cost_and_gradient(
         self, z: Float[np.ndarray, " f"], weights: Weights, chosen: Int[np.ndarray, " b"] | None
     ) -> tuple[float, Float[np.ndarray, " f"]] | None:
-        """½ Σ (weighted residuals)² of the chosen experiments for each of their samples, with the priors' part for each
-        sample of all; None where a run fails."""
+        """½ Σ (weighted residuals)² and the priors' part, for each sample of all experiments that count; None where a
+        run fails. The sum over the chosen experiments stands for that over all, in proportion to their number: so the
+        mean over batches is the cost of all, and priors count once."""
         o = self.objective
         full = o.full(z)
         shared, own = o.numbers(o.coordinates.natural(full))
         experiment, index, output = o.rows
-        row, place, conditions = weights.row, experiment, o.conditions
+        row, place, conditions, samples = weights.row, experiment, o.conditions, weights.samples
         if chosen is not None:
+            samples *= len(chosen) / len(self.counted)
             inside = np.isin(experiment, chosen)
             row, experiment, index, output = row[inside], experiment[inside], index[inside], output[inside]
             place = np.searchsorted(chosen, experiment)
             own = own[chosen]
             conditions = jax.tree.map(lambda a: a[chosen], conditions)
-        if not len(row):
-            return 0.0, np.zeros_like(z)
         found = predict_and_differentiate(o.setting, shared, own, conditions)
         outputs, by_shared, by_own = (np.asarray(a, np.float64) for a in found)
         at = place, index, output
@@ -66,6 +66,7 @@ class Batches:
             np.add.at(each, experiment, (row * residual)[:, None] * by_own[at])
             gradient[c.n_shared :] = each.ravel()
         pull = weights.precision * (z - weights.mean)
-        cost = 0.5 * float(residual @ residual) / len(row) + 0.5 * float(pull @ (z - weights.mean)) / len(weights.row)
-        slope = (gradient * c.slope(full))[o.free] / len(row) + pull / len(weights.row)
+        prior = 0.5 * float(pull @ (z - weights.mean)) / weights.samples
+        cost = 0.5 * float(residual @ residual) / samples + prior
+        slope = (gradient * c.slope(full))[o.free] / samples + pull / weights.samples
         return (cost, slope) if np.isfinite(cost) and np.isfinite(slope).all() else None

@@ -2,9 +2,9 @@
 
 Given residuals r(z) and their Jacobian, finds the least of ½ |W r|² + ½ Σ precision·(z − mean)² inside bounds.
 
-It stops where the remaining step is a thousandth of the confidence region's radius, which the residuals themselves set
-(the relative offset of Bates & Watts 1981); or where, along a curved valley of which the data tell next to nothing,
-steps in a row each lower the cost by less than a thousandth of the residuals' variance for each coordinate.
+It stops where the remaining step is a thousandth of the confidence region's radius, which the noise levels set (the
+relative offset of Bates & Watts 1981); or where, along a curved valley of which the data tell next to nothing, steps in
+a row each lower the cost by less than a thousandth of the residuals' variance for each coordinate.
 """
 
 import dataclasses
@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .descent import OFFSET, AbstractMerit, Reached
-from .evaluation import Weights
-from .factors import Factors
+from .evaluation import Evaluation, Weights
 
 GAIN = 1e-9  # relative decrease of the sum of squares below which it is the integration's noise: rtol² is less
 
@@ -30,6 +29,15 @@ class SumOfSquares(AbstractMerit):
 
     residual: Callable[[Float[np.ndarray, " p"]], Float[np.ndarray, " m"] | None] | None
 
+    def cost(self, z: Float[np.ndarray, " p"], weights: Weights) -> float:
+        """By the residuals alone, if they can be had alone."""
+        if self.residual is None:
+            found = self.evaluate(z)
+            tried = None if found is None else found.residual
+        else:
+            tried = self.residual(z)
+        return np.inf if tried is None else weights.cost(z, tried)
+
     def reach(self, z: Float[np.ndarray, " p"], weights: Weights, below: float) -> Reached | None:
         """The residuals alone tell whether a point costs less, if they can be had alone."""
         if self.residual is not None:
@@ -42,27 +50,16 @@ class SumOfSquares(AbstractMerit):
         cost = weights.cost(z, found.residual)
         return Reached(z, found, weights, cost) if cost < below else None
 
-    def left(self, factors: Factors, cost: float, rows: int, noise: float) -> float:
-        """The relative offset."""
-        return offset(factors, cost, rows, noise)
-
-    def unnoticed(self, cost: float, rows: int, columns: int) -> float:
+    def unnoticed(self, cost: float, rows: float, columns: int) -> float:
         """A thousandth of the residuals' variance for each coordinate."""
         freedom = rows - columns
-        return max(OFFSET * columns * cost / freedom if freedom > 0 else 0.0, GAIN * cost)
+        variance = min(2 * cost / freedom, 1.0) if freedom > 0 else 0.0
+        return max(0.5 * OFFSET * columns * variance, GAIN * cost)
+
+    def at(self, z: Float[np.ndarray, " p"], found: Evaluation, weights: Weights) -> Weights:
+        """The same."""
+        return weights
 
     def next_weights(self, here: Weights, better: Weights) -> Weights:
         """Better ones."""
         return better
-
-
-def offset(factors: Factors, cost: float, rows: int, noise: float) -> float:
-    """The remaining step in radii of the confidence region; infinite where there are no degrees of freedom."""
-    determined = factors.rank(noise)
-    explained = float(np.sum(factors.projected[:determined] ** 2))
-    if explained == 0:
-        return 0.0
-    freedom, rest = rows - determined, 2 * cost - explained
-    if freedom <= 0 or rest <= 0:
-        return np.inf
-    return float(np.sqrt((explained / determined) / (rest / freedom)))

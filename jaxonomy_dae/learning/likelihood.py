@@ -16,7 +16,6 @@ from jaxtyping import Bool, Float
 
 from .descent import AbstractMerit, Reached
 from .evaluation import Evaluation, Rows, Weights
-from .factors import Factors
 
 GAIN = 1e-5  # decrease of −ln L for each coordinate that is not noticed: that of a step of 0.004 standard deviations
 # Change of a coordinate by one step, a factor of 7 on a logarithmic scale: far away, the expected information is not
@@ -26,9 +25,7 @@ LONGEST = 2.0
 
 @dataclasses.dataclass(frozen=True)
 class Likelihood(Weights):
-    """The weights of innovations: `row` is √(w/s), with `share` √w for the weight w of its experiment."""
-
-    share: Float[np.ndarray, " m"]
+    """The weights of innovations: `row` is √(w/s)."""
 
     @property
     def log_rows(self) -> float:
@@ -47,7 +44,7 @@ class Likelihood(Weights):
 
     def cost(self, z: Float[np.ndarray, " p"], residual: Float[np.ndarray, " m"]) -> float:
         """½ Σ w (r²/s + ln s) + ½ Σ precision·(z − mean)²."""
-        return super().cost(z, residual) - float(np.sum(self.share**2 * np.log(self.row / self.share)))
+        return super().cost(z, residual) - super().log_rows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,21 +58,25 @@ class Scoring(AbstractMerit):
 
     limited: Bool[np.ndarray, " p"]
 
+    def cost(self, z: Float[np.ndarray, " p"], weights: Weights) -> float:
+        """By the likelihood there, with the priors at hand."""
+        found = self.evaluate(z)
+        return np.inf if found is None else self.at(z, found, weights).cost(z, found.residual)
+
+    def at(self, z: Float[np.ndarray, " p"], found: Evaluation, weights: Weights) -> Weights:
+        """Those that the model says, with the priors at hand."""
+        return dataclasses.replace(self.weights(z, found), precision=weights.precision, mean=weights.mean)
+
     def reach(self, z: Float[np.ndarray, " p"], weights: Weights, below: float) -> Reached | None:
         """By the likelihood there, with the priors at hand."""
         found = self.evaluate(z)
         if found is None:
             return None
-        here = dataclasses.replace(self.weights(z, found), precision=weights.precision, mean=weights.mean)
+        here = self.at(z, found, weights)
         cost = here.cost(z, found.residual)
         return Reached(z, found, here, cost) if cost < below else None
 
-    def left(self, factors: Factors, cost: float, rows: int, noise: float) -> float:
-        """√(gᵀF⁻¹g) for each coordinate that is determined."""
-        rank = factors.rank(noise)
-        return float(np.sqrt(np.mean(factors.projected[:rank] ** 2))) if rank else 0.0
-
-    def unnoticed(self, cost: float, rows: int, columns: int) -> float:
+    def unnoticed(self, cost: float, rows: float, columns: int) -> float:
         """A small part of a likelihood ratio that would mean something."""
         return GAIN * columns
 

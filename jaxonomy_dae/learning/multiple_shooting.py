@@ -17,11 +17,11 @@ from jaxtyping import Float
 
 from ..errors import ModelError
 from .block_elimination import Blocks, eliminate, linear
-from .descent import OFFSET, PATIENCE, TRIALS, Minimum, can_move, damping_after
+from .descent import OFFSET, PATIENCE, SETTLED, TRIALS, Minimum, can_move, damping_after, offset
 from .evaluation import Weights
 from .evidence import Evidence
 from .factors import Factors
-from .least_squares import GAIN, offset
+from .least_squares import GAIN
 from .node_guesses import node_guesses, sizes
 from .objective import Objective
 from .segments import Point, Segments
@@ -30,7 +30,7 @@ WEIGHTS = (10.0, 1e2, 1e3)  # of gaps in units of the states' ranges: at first a
 HEAVIEST = 1e7  # in the end, if multipliers alone do not close them
 SHRINK = 0.25  # of gaps from one set of multipliers to the next, as in LANCELOT (Conn, Gould & Toint 1992)
 FEW = 10  # steps at each of these weights
-SETTLED = 0.01  # relative decrease of the cost by a step, below which the weight grows
+SLOW = 0.01  # relative decrease of the cost by a step, below which the weight grows
 CLOSED = 0.1  # gaps that count as none, in units of the integration's relative tolerance
 ROUNDED = 1e-12  # relative rounding errors of a segment's Jacobian, of some thousand operations
 
@@ -204,11 +204,11 @@ def shoot(
             if found is None:
                 break
             point, gain = found
-            if gain < SETTLED * cost:
+            if gain < SLOW * cost:
                 break
         merit, _, _ = _reweighed(merit, point, evidence, tolerance)
     converged, message = False, f"stopped after {steps} steps, not yet converged; steps= allows more"
-    idle, before = 0, np.inf
+    remaining, idle, before = np.inf, 0, np.inf
     for k in range(steps + 1):
         history.append(merit.cost(point))
         gain = 0.0
@@ -235,7 +235,7 @@ def shoot(
     noise = _noise(merit, point, merit.weights.applied(point.z, found).jacobian, tolerance)
     return ShootingMinimum(
         point.z, found, merit.weights, merit.weights.cost(point.z, found.residual), history, descent.evaluations,
-        converged, message, noise, segments.nodes[:, :-1], point.states, point.blocks.gap,
+        converged, message, noise, remaining, tolerance, segments.nodes[:, :-1], point.states, point.blocks.gap,
     )  # fmt: skip
 
 
@@ -256,8 +256,8 @@ def _reweighed(merit: Merit, point: Point, evidence: Evidence | None, tolerance:
     moves = can_move(z, jacobian.T @ residual, merit.segments.objective.bounds)
     noise = _noise(merit, point, jacobian, tolerance)
     factors = Factors.of(residual, jacobian[:, moves], noise)
-    remaining = offset(factors, 0.5 * float(residual @ residual), len(residual), noise)
+    remaining = offset(factors, noise)
     if evidence is None or evidence.is_idle:
         return merit, True, remaining
-    weights, settled = evidence.reweigh(z, found, merit.weights, factors, moves)
-    return dataclasses.replace(merit, weights=weights), settled, remaining
+    weights, change = evidence.reweigh(z, found, merit.weights, factors, moves)
+    return dataclasses.replace(merit, weights=weights), change <= SETTLED, remaining

@@ -8,12 +8,12 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import diffrax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ..system.system import AcausalSystem
 from .coordinates import Coordinates
@@ -44,8 +44,13 @@ class Predicted:
         return np.concatenate([shared, columns.reshape(m, experiments * n_own)], axis=1)
 
 
+FINEST = 1e3  # roundings, to which an integration of some hundred steps can be told to keep
 FEW = 8  # columns up to which residuals alone cost almost as much as with their Jacobian, and a program of their own
 MANY = 40  # numbers of one experiment beyond which a gradient backwards costs less: of 97, 6 ms where forwards it is 14
+
+
+Same = TypeVar("Same", bound="Objective")
+Weigh = Callable[[np.ndarray, Evaluation], Weights]
 
 
 class Misfit(NamedTuple):
@@ -62,11 +67,12 @@ class Misfit(NamedTuple):
 @dataclasses.dataclass(frozen=True)
 class Objective:
     """The function that a fit minimises: a system with what stands around it, data, coordinates, and which experiments
-    count."""
+    count. `fine` is the factor by which the tolerances of the problem are tightened."""
 
     system: AcausalSystem
     observers: dict[str, Any]
     layout: Layout
+    fine: float
     stacked: Stacked
     coordinates: Coordinates
     penalties: dict[str, Any]  # "evidence" or a precision, by the name of a group
@@ -75,7 +81,8 @@ class Objective:
     @property
     def setting(self) -> Setting:
         """What the programs are made for."""
-        return Setting(self.system, self.observers, self.layout)
+        fine = jnp.asarray(self.fine, self.system.parameters.values.dtype)
+        return Setting(self.system, self.observers, self.layout, fine)
 
     def until(self, share: float) -> "Objective":
         """A copy with a share of each experiment's time."""
@@ -116,7 +123,14 @@ class Objective:
             jnp.asarray(s.t0, dtype),
             jnp.asarray(np.array(known, float).reshape(len(s.labels), len(self.layout.known)), dtype),
             inputs,
+            self._lengths,
         )
+
+    @property
+    def _lengths(self) -> Int[Array, " e"] | None:
+        """The place of each experiment's number of times among those that sensor laws are evaluated for."""
+        lengths = self.layout.lengths
+        return jnp.asarray([lengths.index(count) for count in self.stacked.counts]) if lengths else None
 
     @property
     def misfit(self) -> Misfit:
@@ -178,26 +192,56 @@ class Objective:
             weigh, reweigh = self.weights, None if self.evidence.is_idle else self.evidence.reweigh
         else:
             weigh, reweigh = lambda *_: weights, None
+        return descend(self._merit(weigh), start, self.bounds, reweigh, steps)
+
+    def _merit(self, weigh: Weigh) -> SumOfSquares:
         columns = self.coordinates.n_shared + self.coordinates.n_own  # of the program, whatever is frozen
         alone = self.residual if columns > FEW else None
-        merit = SumOfSquares(self.evaluate, weigh, alone)
-        return descend(merit, start, self.bounds, reweigh, steps, self.tolerance)
+
+        def finer(factor: float) -> SumOfSquares | None:
+            other = self.finer(factor)
+            return None if other is None else other._merit(weigh)
+
+        return SumOfSquares(self.evaluate, weigh, self.tolerance, finer, alone)
 
     @property
     def tolerance(self) -> float:
         """The relative tolerance of the integration, and so of Jacobians."""
-        return float(dict(self.layout.options)["rtol"])
+        return float(dict(self.layout.options)["rtol"]) * self.fine
+
+    def finer(self: Same, factor: float) -> Same | None:
+        """A copy whose tolerances are less by a factor, as far as the precision goes; None where it goes no further, or
+        where steps are not controlled by tolerances."""
+        least = FINEST * float(jnp.finfo(self.system.parameters.values.dtype).eps)
+        tolerance = max(self.tolerance * factor, least)
+        if tolerance > 0.5 * self.tolerance or "stepsize_controller" in dict(self.layout.options):
+            return None
+        return self.at_tolerance(tolerance)
+
+    def at_tolerance(self: Same, tolerance: float) -> Same:
+        """A copy with this relative tolerance, and the absolute one in proportion."""
+        return dataclasses.replace(self, fine=self.fine * tolerance / self.tolerance)
 
     def sigma(self, z: Float[np.ndarray, " f"], weights: Weights) -> dict[str, float]:
         """Noise levels that were estimated, by name, at a minimum."""
         return self.evidence.sigma(weights)
 
-    def scored(self, full: Float[np.ndarray, " p"], sigma: dict[str, float], rows: tuple[np.ndarray, ...]) -> float:
-        """The root mean square of residuals of chosen samples, in units of the noise; infinite where a run fails."""
+    def surprise(self, found: Minimum) -> float:
+        """−ln (likelihood) at a minimum, less a constant, with the priors that were given: by it, minima of the same
+        data compare, whatever noise levels they found. Priors of precisions that each chose for itself are left out."""
+        given = np.array(found.weights.precision)
+        for group in self.evidence.groups:
+            given[group] = 0.0
+        weights = dataclasses.replace(found.weights, precision=given)
+        return weights.cost(found.z, found.found.residual) - weights.log_rows
+
+    def standardized(
+        self, full: Float[np.ndarray, " p"], sigma: dict[str, float], rows: tuple[np.ndarray, ...]
+    ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+        """(residuals of chosen samples in units of the noise, these units)."""
         s = self.with_noise(sigma).stacked
         level = np.where(np.isnan(s.sigma), 1.0, s.sigma)[rows[0], rows[2]]
-        residual = (self.predicted(full).outputs[rows] - s.values[rows]) / level
-        return float(np.sqrt(np.mean(residual**2))) if np.isfinite(residual).all() else np.inf
+        return (self.predicted(full).outputs[rows] - s.values[rows]) / level, level
 
     # --- experiments that are held out ---------------------------------------------------------------------------
 
@@ -216,11 +260,23 @@ class Objective:
         best = alone.lowest(full[alone.free])
         return full if best is None else alone.full(best.z)
 
+    def held_out(self, z: Float[np.ndarray, " f"], weights: Weights) -> tuple[float, float]:
+        """Of experiments that are held out, (root mean square of the residuals in units of the noise, −ln (likelihood)
+        less a constant): the first tells how well they are met, the second compares points of different noise levels.
+        Infinite where a run fails; NaN if none counts."""
+        held = self.stacked.holdout & (self.stacked.weight > 0)
+        rows = np.nonzero(self.stacked.observed & held[:, None, None])
+        if not len(rows[0]):
+            return np.nan, np.nan
+        u, level = self.standardized(self.with_own_starts(z, weights), self.sigma(z, weights), rows)
+        if not np.isfinite(u).all():
+            return np.inf, np.inf
+        count = self.stacked.weight[rows[0]]
+        return float(np.sqrt(np.average(u**2, weights=count))), float(np.sum(count * (0.5 * u**2 + np.log(level))))
+
     def holdout_score(self, z: Float[np.ndarray, " f"], weights: Weights) -> float:
-        """The root mean square of the residuals of experiments that are held out, in units of the noise; infinite where
-        a run fails."""
-        rows = np.nonzero(self.stacked.observed & self.stacked.holdout[:, None, None])
-        return self.scored(self.with_own_starts(z, weights), self.sigma(z, weights), rows)
+        """The root mean square of the residuals of experiments that are held out, in units of the noise."""
+        return self.held_out(z, weights)[0]
 
     # --- weights -----------------------------------------------------------------------------------------------
 
@@ -239,7 +295,6 @@ class Objective:
             noise,
             tuple(s.outputs[k] for k in chosen),
             floor,
-            np.sqrt(s.weight[experiment]),
             tuple(group for group in groups if group.any()),
         )
 
@@ -250,7 +305,7 @@ class Objective:
         row = np.sqrt(s.weight[experiment]) / np.where(np.isnan(sigma), 1.0, sigma)
         spread = c.spread[self.free]
         precision = np.where(np.isfinite(spread), 1 / np.where(np.isfinite(spread), spread, 1.0) ** 2, 0.0)
-        mean = np.where(precision > 0, c.z_start[self.free], 0.0)
+        mean = np.where(precision > 0, c.centre[self.free], 0.0)
         for name, given in self.penalties.items():
             group = self._group(name)
             if group.any() and given is not None:
@@ -258,7 +313,7 @@ class Objective:
                 size = float(np.sum(z[group] ** 2))
                 first = group.sum() / size if size > 0 else 1.0
                 precision[group] = first if given == "evidence" else float(given)
-        return self.evidence.first(Weights(row, precision, mean), found)
+        return self.evidence.first(Weights(row, precision, mean, np.sqrt(s.weight[experiment])), found)
 
     def _group(self, name: str) -> Bool[np.ndarray, " f"]:
         chosen = np.array([name == group for group in self.coordinates.group], bool)

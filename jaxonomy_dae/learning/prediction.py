@@ -69,8 +69,9 @@ def under(
     times = s.times[k, : s.counts[k]] if ts is None else np.asarray(ts, float)
     if times.ndim != 1 or not len(times) or (np.diff(times) < 0).any() or times[0] < s.t0[k] or times[-1] <= s.t0[k]:
         raise ModelError(f"ts must be increasing times, of shape (n,), that start at {s.t0[k]:g} or later")
-    layout = dataclasses.replace(objective.layout, outputs=tuple(names), mesh=None)
-    one = Objective(*objective.setting._replace(layout=layout), s, objective.coordinates, {}, objective.counted)
+    layout = dataclasses.replace(objective.layout, outputs=tuple(names), mesh=None, lengths=())
+    system, observers = objective.system, objective.observers
+    one = Objective(system, observers, layout, objective.fine, s, objective.coordinates, {}, objective.counted)
     conditions = jax.tree.map(lambda a: a[k][None], one.conditions)
     conditions = dataclasses.replace(conditions, times=jnp.asarray(times[None], conditions.times.dtype))
     return one, k, names, conditions

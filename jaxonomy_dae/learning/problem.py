@@ -1,6 +1,7 @@
 """A problem: a system, data of experiments, and what is to be learned from them."""
 
 import copy
+import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -10,6 +11,7 @@ from jax.sharding import Mesh
 from jaxtyping import Float
 
 from ..errors import ModelError, SimulationError
+from ..solvers.solve import check_tolerances, default_tolerances
 from ..system.system import AcausalSystem
 from .asked import as_asked, check_start, checked_method, names_to_train, penalties, started
 from .coordinates import Coordinate, Coordinates, coordinates
@@ -53,7 +55,7 @@ class Problem:
     - `method`: `"single"`, each experiment is one run; `"growing"`, the same with growing `horizons`;
         `Shooting(...)`, multiple shooting, for what diverges; or for equations with errors, `Filter(...)`, the
         likelihood of a Kalman filter, or `Innovations(...)`, predictions one step ahead.
-    - `rtol`, `atol`, `max_steps`, and others in `options`: as in `simulate`.
+    - `rtol`, `atol`, `max_steps`, and others in `options`: as in `simulate`, whose defaults hold.
     - `mesh`: devices among which the experiments are divided, `jax.make_mesh((jax.device_count(),), ("experiments",))`;
         of several processes too, each of which runs the same program with the same data (`jax.distributed`).
 
@@ -73,8 +75,8 @@ class Problem:
         regularize: Mapping[str, Any] | str | float | None = "evidence",
         observe: Mapping[str, Any] | None = None,
         method: str | Shooting | Filter | Innovations = "single",
-        rtol: float = 1e-6,
-        atol: float = 1e-8,
+        rtol: float | None = None,
+        atol: float | None = None,
         max_steps: int = 4096,
         mesh: Mesh | None = None,
         **options: Any,
@@ -90,6 +92,9 @@ class Problem:
                 raise ModelError(f"observe: '{name}' is the name of a network or variable: choose another")
         self.data = data if isinstance(data, Data) else Data(data)
         self.starts = dict(starts or {})
+        dtype = system.parameters.values.dtype
+        rtol, atol = default_tolerances(rtol, atol, dtype)
+        check_tolerances(rtol, atol, dtype)
         self._options = {"rtol": rtol, "atol": atol, "max_steps": max_steps, **options}
         self._mesh = check_mesh(mesh)
         # Names of parameters, one by one, and of networks and sensor laws.
@@ -123,14 +128,16 @@ class Problem:
             raise ModelError(
                 "nothing is to be learned: name parameters, networks or sensor laws in train=, or make a start Unknown"
             )
+        lengths = tuple(sorted(set(stacked.counts))) if self.observers else ()
         return Layout(
             stacked.outputs, tuple(parameters), tuple(modules), tuple(shared), tuple(own), tuple(known), stacked.kinds,
-            tuple(self._options.items()), tuple(e.name for e in extras), self._mesh,
+            tuple(self._options.items()), tuple(e.name for e in extras), lengths if len(lengths) > 1 else (),
+            self._mesh,
         )  # fmt: skip
 
     @property
     def _setting(self) -> Setting:
-        return Setting(self.system, self.observers, self._layout)
+        return Setting(self.system, self.observers, self._layout, 1.0)
 
     def _errors(self, stacked: Stacked) -> tuple[Structure, tuple[Coordinate, ...]]:
         """The static choices that the method adds to the program, and its coordinates."""
@@ -173,11 +180,12 @@ class Problem:
         return residuals(objective, model, dict(starts or {}), dict(observe or {}), adjoint)
 
     def _objective(self, stacked: Stacked, c: Coordinates) -> Objective:
+        model = self.system, self.observers, self._laid_out(stacked), 1.0
         given = stacked, c, self.penalties, ~stacked.holdout
         if not isinstance(self.method, Filter | Innovations):
-            return Objective(*self._setting, *given)
+            return Objective(*model, *given)
         kind = FilterObjective if isinstance(self.method, Filter) else AheadObjective
-        return kind(*self._setting, *given, self._errors(stacked)[0])
+        return kind(*model, *given, self._errors(stacked)[0])
 
     # --- fitting -----------------------------------------------------------------------------------------------
 
@@ -207,8 +215,8 @@ class Problem:
         - `bounds`: narrower than those declared, by name.
         - `first`: steps of an optimizer of Optax before those of least squares; `estimate.training` is their history.
         - `starts`: from how many points; all but the first are drawn around it by `seed`: parameters within a factor of
-            e or their bounds, starts by their spread, networks with weights of the same sizes. The best is the one of
-            the least score on experiments that are held out, or else, and for a `Filter`, of the least cost.
+            e or their bounds, starts by their spread, networks with weights of the same sizes. The best is the one to
+            which experiments that are held out are most likely, or else, and for a `Filter`, those that are fitted.
         - `adam`: so many gradient steps at first, with `learning_rate` on the scale of the coordinates.
         - `horizons`: shares of the time that are fitted one after the other, such as `(0.25, 0.5, 1)`: what diverges
             over the whole time is caught early. None: all of it, or with `method="growing"`, ten of them.
@@ -239,13 +247,13 @@ class Problem:
             found = self._descend(objective, point, shares, steps, adam, learning_rate)
             if found is None:
                 continue
-            by_cost = isinstance(self.method, Filter) or not stacked.holdout.any()
-            score = found.cost if by_cost else objective.holdout_score(found.z, found.weights)
-            if best is None or score < best[0]:
+            by_fit = isinstance(self.method, Filter) or not stacked.holdout.any()
+            score = objective.surprise(found) if by_fit else objective.held_out(found.z, found.weights)[1]
+            if best is None or not score >= best[0]:
                 best = score, found, training
         if best is None:
             raise SimulationError(why_not(objective))
-        return Estimate.of(self, objective, best[1], best[2])
+        return Estimate.of(self, objective.at_tolerance(best[1].tolerance), best[1], best[2])
 
     def train(
         self,
@@ -270,7 +278,8 @@ class Problem:
     def _prepared(self, data: Any, freeze: Any, start: Any, bounds: Any) -> Objective:
         """The objective, from the arguments of `fit`."""
         stacked = self._stacked if data is None else self._stack(data)
-        if stacked is not self._stacked and self._laid_out(stacked) != self._layout:
+        same = dataclasses.replace(self._laid_out(stacked), lengths=self._layout.lengths)
+        if same != self._layout:
             raise ModelError(
                 "these data name other outputs, inputs or unknown starts than the problem's: make a Problem of them"
             )
@@ -290,8 +299,12 @@ class Problem:
             )
 
     def _coordinates(self, stacked: Stacked, freeze: Any, start: Any, bounds: Any) -> Coordinates:
-        setting = self._setting._replace(system=started(self.system, start))
-        return as_asked(coordinates(setting, stacked, self._errors(stacked)[1]), freeze, start, bounds)
+        extras = self._errors(stacked)[1]
+        c = coordinates(self._setting, stacked, extras)
+        if isinstance(start, AcausalSystem):
+            there = self._setting._replace(system=started(self.system, start))
+            c = dataclasses.replace(c, start=coordinates(there, stacked, extras).start)
+        return as_asked(c, freeze, start, bounds)
 
     def _descend(
         self, objective: Objective, point: np.ndarray, shares: list[float], steps: int, adam: int, rate: float
@@ -301,6 +314,8 @@ class Problem:
         found = None
         for share in shares:
             here = objective.until(share)
+            if found is not None:
+                here = here.at_tolerance(found.tolerance)
             if adam and share == shares[0]:
                 point = adam_steps(here, point, adam, rate)
             found = here.lowest(point, steps)
@@ -319,17 +334,17 @@ class Problem:
             if found is None:
                 return None
             cost = weights.cost(start, found.residual)
-            return Minimum(start, found, weights, cost, [cost], 1, True, "nothing is searched", rtol)
+            return Minimum(start, found, weights, cost, [cost], 1, True, "nothing is searched", rtol, 0.0, rtol)
         return objective.lowest(start, weights=weights)
 
     def run(self, objective: Objective, z: Float[np.ndarray, " p"], experiment: int, ts: Any = None) -> Any:
         """An ordinary simulation of one experiment at a point."""
         return run(objective, z, experiment, ts)
 
-    def with_law(self, name: str, law: Any, system: AcausalSystem, stacked: Stacked) -> "Problem":
-        """A copy with another law in a network's place, without a prior, in the system given."""
+    def with_law(self, name: str, law: Any, stacked: Stacked) -> "Problem":
+        """A copy with another law in a network's place, without a prior."""
         other = copy.copy(self)
-        other.system = eqx.tree_at(lambda s: s.neural, system, system.neural | {name: law})
+        other.system = eqx.tree_at(lambda s: s.neural, self.system, self.system.neural | {name: law})
         other._stacked, other.penalties = stacked, self.penalties | {name: None}
         return other
 

@@ -9,6 +9,7 @@ starts are their own.
 """
 
 import dataclasses
+import functools
 import math
 from typing import Any, NamedTuple
 
@@ -17,10 +18,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
+from ..errors import ModelError
 from ..programs.cache import compiled
 from ..simulation.simulate import simulate
+from ..simulation.solution import Solution
 from ..system.system import AcausalSystem
 from .devices import each, each_with_slopes
 
@@ -38,6 +41,7 @@ class Layout:
     kinds: tuple[tuple[str, str], ...]  # of inputs
     options: tuple[tuple[str, Any], ...]  # of `simulate`
     extra: tuple[str, ...] = ()  # coordinates that come with a method, before the shared starts
+    lengths: tuple[int, ...] = ()  # of records, if they differ and there are sensor laws
     mesh: Mesh | None = None  # the devices that share the experiments
 
     @property
@@ -47,11 +51,19 @@ class Layout:
 
 
 class Setting(NamedTuple):
-    """What a program is made for: a system, sensor laws by name, and the layout of its numbers."""
+    """What a program is made for: a system, sensor laws by name, the layout of its numbers, and a factor of the
+    tolerances, `fine`, below one where a search has to see more than the integration's error lets it."""
 
     system: AcausalSystem
     observers: dict[str, Any]
     layout: Layout
+    fine: float | Float[Array, ""]
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """The options of `simulate`. Tolerances are values, so that others compile nothing."""
+        given = dict(self.layout.options)
+        return given | {name: jax.tree.map(lambda a: a * self.fine, given[name]) for name in ("rtol", "atol")}
 
 
 class Conditions(eqx.Module):
@@ -61,6 +73,7 @@ class Conditions(eqx.Module):
     t0: Float[Array, " e"]
     known: Float[Array, "e known"]
     inputs: dict[str, tuple[Float[Array, "e _"], Float[Array, "e _"]]]
+    length: Int[Array, " e"] | None = None  # the place of each one's number of times in `Layout.lengths`
 
 
 class Weighted(eqx.Module):
@@ -90,7 +103,7 @@ def with_weights(module: Any, numbers: Any) -> Any:
 
 def with_values(setting: Setting, shared: Any) -> tuple[AcausalSystem, dict[str, Any], Any]:
     """(system, sensor laws, shared starts) with the shared numbers in their places."""
-    system, observers, layout = setting
+    system, observers, layout, _ = setting
     n = len(layout.parameters)
     if n:
         system = system.with_parameters({name: shared[k] for k, name in enumerate(layout.parameters)})
@@ -125,10 +138,10 @@ def run_one(setting: Setting, adjoint: Any, shared: Any, own: Any, c: Conditions
     layout = setting.layout
     system, observers, initial = placed(setting, shared, own, c.known)
     solution = simulate(
-        system, c.times[-1], t0=c.t0, ts=c.times, initial=initial or None, adjoint=adjoint, throw=False,
-        inputs=with_kinds(c.inputs, layout), **dict(layout.options),
+        system, run_end(c.t0, c.times[-1]), t0=c.t0, ts=c.times, initial=initial or None, adjoint=adjoint, throw=False,
+        inputs=with_kinds(c.inputs, layout), **setting.options,
     )  # fmt: skip
-    return outputs_of(solution, observers, layout, c.times.dtype)
+    return outputs_of(solution, observers, layout, c.times.dtype, c.length)
 
 
 def misfit(setting: Setting, adjoint: Any, shared: Any, own: Any, c: Weighted) -> Float[Array, " k"]:
@@ -143,12 +156,49 @@ def with_kinds(inputs: dict[str, Any], layout: Layout) -> dict[str, Any]:
     return {name: (*samples, kinds[name]) for name, samples in inputs.items()}
 
 
-def outputs_of(solution: Any, observers: dict[str, Any], layout: Layout, dtype: Any) -> Float[Array, "n k"]:
-    """The outputs of a run."""
+def run_end(t0: Any, last: Any) -> Any:
+    """The end of a run to the last sample: runs of no length are made of next to none."""
+    return jnp.where(last > t0, last, t0 + 8 * jnp.finfo(t0.dtype).eps * (1 + jnp.abs(t0)))
+
+
+def outputs_of(
+    solution: Solution, observers: dict[str, Any], layout: Layout, dtype: Any, length: Any = None
+) -> Float[Array, "n k"]:
+    """The outputs of a run. Sensor laws see its record alone: none of the times by which it was padded."""
     variables = [name for name in layout.outputs if name not in observers]
     read = dict(zip(variables, solution[variables].T, strict=True)) if variables else {}
-    derived = {name: observers[name](solution) for name in layout.outputs if name in observers}
-    return jnp.stack([read[n] if n in read else jnp.asarray(derived[n], dtype) for n in layout.outputs], axis=1)
+    chosen = [name for name in layout.outputs if name in observers]
+
+    def derived(rows: int) -> dict[str, Any]:
+        own = solution if rows == len(solution.ts) else _first_rows(solution, rows)
+        found = {name: _checked(name, observers[name](own), rows, dtype) for name in chosen}
+        return {name: jnp.pad(values, (0, len(solution.ts) - rows), mode="edge") for name, values in found.items()}
+
+    if chosen and length is not None:
+        read |= jax.lax.switch(length, [functools.partial(derived, rows) for rows in layout.lengths])
+    elif chosen:
+        read |= derived(len(solution.ts))
+    return jnp.stack([read[n] for n in layout.outputs], axis=1)
+
+
+def _first_rows(solution: Solution, rows: int) -> Solution:
+    def first(a: Any) -> Any:
+        return None if a is None else a[:rows]
+
+    return dataclasses.replace(
+        solution, ts=first(solution.ts), states=first(solution.states), discrete=first(solution.discrete)
+    )
+
+
+def _checked(name: str, values: Any, rows: int, dtype: Any) -> Float[Array, " n"]:
+    """What a sensor law returned, if it is a real number for each time."""
+    values = jnp.asarray(values)
+    if values.shape != (rows,) or not jnp.issubdtype(values.dtype, jnp.floating):
+        raise ModelError(
+            f"observe: '{name}' must return a real number for each of the {rows} times, shape ({rows},); got "
+            f"{values.dtype} of shape {values.shape}"
+        )
+    return values.astype(dtype)
 
 
 @compiled

@@ -2,7 +2,6 @@
 for losses of one's own."""
 
 import dataclasses
-import math
 from typing import Any
 
 import jax.numpy as jnp
@@ -13,7 +12,7 @@ from ..errors import InitializationError, ModelError, SimulationError, nearest
 from ..simulation.simulate import simulate
 from ..system.system import AcausalSystem
 from .objective import Objective
-from .program import Setting, placed, predict
+from .program import Setting, placed, predict, run_end
 
 
 def run(objective: Objective, z: Float[np.ndarray, " p"], experiment: int, ts: Any = None) -> Any:
@@ -24,11 +23,11 @@ def run(objective: Objective, z: Float[np.ndarray, " p"], experiment: int, ts: A
     inputs = {n: (t[experiment], v[experiment], dict(s.kinds)[n]) for n, (t, v) in s.inputs.items()}
     end = s.counts[experiment]
     times = s.times[experiment, :end] if ts is None else ts
-    t1 = max(float(times[-1]), np.nextafter(s.t0[experiment], math.inf))
+    t0 = jnp.asarray(s.t0[experiment], objective.conditions.t0.dtype)
     return simulate(
         system,
-        t1,
-        t0=s.t0[experiment],
+        run_end(t0, jnp.asarray(times[-1], t0.dtype)),
+        t0=t0,
         ts=times,
         inputs=inputs or None,
         initial=initial or None,
@@ -67,7 +66,7 @@ def residuals(
         else:
             raise ModelError(f"the start of '{name}' is not unknown: " + nearest(name, layout.shared + layout.own))
     plain = dataclasses.replace(layout, parameters=(), modules=(), extra=())
-    setting = Setting(model, objective.observers | observe, plain)
+    setting = Setting(model, objective.observers | observe, plain, objective.setting.fine)
     outputs = predict(setting, adjoint, shared, own, objective.conditions)
     sigma = np.where(np.isnan(s.sigma), 1.0, s.sigma)
     scaled = jnp.where(s.observed, (outputs - s.values) / sigma[:, None, :], 0.0)

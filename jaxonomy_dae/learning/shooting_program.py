@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from ..programs.cache import compiled
 from ..simulation.simulate import simulate
 from .devices import each, each_with_slopes
-from .program import Conditions, Setting, outputs_of, placed, with_kinds
+from .program import Conditions, Setting, outputs_of, placed, run_end, with_kinds
 
 
 class Cut(eqx.Module):
@@ -84,8 +84,8 @@ def run_segments(
         delta = moved[count:]
         here, laws, _ = placed(setting, shared, own, c.known)
         solution = simulate(
-            here, times[-1], t0=t0, ts=times, initial=x + basis @ delta, adjoint=diffrax.ForwardMode(), throw=False,
-            inputs=with_kinds(c.inputs, layout), **dict(layout.options),
+            here, run_end(t0, times[-1]), t0=t0, ts=times, initial=x + basis @ delta, adjoint=diffrax.ForwardMode(),
+            throw=False, inputs=with_kinds(c.inputs, layout), **setting.options,
         )  # fmt: skip
         found = Ran(outputs_of(solution, laws, layout, times.dtype), solution.states[0], solution.states[-1])
         return found, found

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from ..errors import ModelError, SimulationError, whole_number
 from ..optional import new_axes
-from .checkpoint import fingerprint, read_facts, read_state, save
+from .checkpoint import described, fingerprint, read_facts, read_state, save
 from .evaluation import Evaluation, Weights
 from .gradient import Batches
 from .objective import Objective
@@ -36,8 +36,8 @@ class GradientSteps:
     - `patience`: with experiments held out, training ends after so many steps without a better score of these.
     - `callback`: called after each step with an `Update`; what returns True ends the training.
     - `checkpoint`: a file. Where it exists, training goes on from it, and ends as if it had not been interrupted, bit
-        for bit; it is written every `every` steps and at the end. The file tells the model, the data and these
-        settings; that the optimizer has the same rates is for the caller to see to.
+        for bit; it is written every `every` steps and at the end. The file tells the model, the data, the integration
+        and these settings; that the optimizer has the same rates is for the caller to see to.
     - `every`: after how many steps the held-out experiments are scored, at the whole horizon, and checkpoints written.
     """
 
@@ -87,7 +87,7 @@ class Training:
 
     - `z`: the best point, of the coordinates that are searched: that of the best score of experiments held out, or else
         of the least loss at the whole horizon, or with batches, whose losses cannot be compared, the last one.
-    - `history`: the loss at each step, ½ (residual/σ)² for each sample.
+    - `history`: the loss at each step, ½ (residual/σ)² for each sample, a batch's in proportion to its experiments.
     - `scores`: `(steps, score)` of experiments held out.
     - `step`: after how many updates the best point was reached.
     """
@@ -149,9 +149,9 @@ class State:
         """The arrays that a checkpoint keeps."""
         w = self.weights
         return [
-            self.z, self.best, self.optimizer, w.row, w.precision, w.mean, np.array(self.history, float),
-            np.array(self.scored, int), np.array(self.scores, float), np.array(self.best_step),
-            np.array(self.best_value),
+            self.z, self.best, self.optimizer, w.row, w.precision, w.mean, w.share,
+            np.array(self.history, float), np.array(self.scored, int), np.array(self.scores, float),
+            np.array(self.best_step), np.array(self.best_value),
         ]  # fmt: skip
 
 
@@ -238,14 +238,19 @@ def _facts(objective: Objective, plan: GradientSteps, optimizer: Any) -> dict[st
     """The facts that must agree for a checkpoint to fit, by name."""
     s, c = objective.stacked, objective.coordinates
     data = [s.times, s.t0, s.values, s.observed, s.sigma, s.weight, s.holdout, dict(s.inputs), repr(s.starts)]
-    searched = [np.array(objective.free), c.low, c.high, c.start[~objective.free], c.size]
+    searched = [np.array(objective.free), c.low, c.high, c.start[~objective.free], c.size, c.spread, c.centre]
+    functions = [objective.system.neural, objective.observers]
     return {
         "model": objective.system.plan.digest,
         "set of unknowns": json.dumps(
             [list(c.names), fingerprint(searched), sorted(map(str, objective.penalties.items()))]
         ),
         "set of values": fingerprint(eqx.filter((objective.system, objective.observers), eqx.is_array)),
+        "set of networks and sensor laws": fingerprint(described(functions)),
         "set of data": fingerprint(data),
+        "kind of inputs": [list(pair) for pair in s.kinds],
+        "integration": fingerprint(described(dict(objective.layout.options))),
+        "precision": str(objective.system.parameters.values.dtype),
         "optimizer": str(jax.tree.structure(optimizer)),
         "batch": plan.batch,
         "seed": plan.seed,
@@ -260,12 +265,12 @@ def _resumed(plan: GradientSteps, facts: dict[str, Any], like: State, stages: di
     taken, scored, rows = (int(counts[name]) for name in ("taken", "scored", "rows"))
     shape = dataclasses.replace(
         like, history=[0.0] * taken, scored=[0] * scored, scores=[0.0] * scored,
-        weights=dataclasses.replace(like.weights, row=np.zeros(rows)),
+        weights=dataclasses.replace(like.weights, row=np.zeros(rows), share=np.zeros(rows)),
     )  # fmt: skip
-    z, best, optimizer, row, precision, mean, history, at, scores, best_step, best_value = read_state(
+    z, best, optimizer, row, precision, mean, share, history, at, scores, best_step, best_value = read_state(
         plan.checkpoint, shape.arrays()
     )
     return State(
-        z, best, optimizer, Weights(row, precision, mean), history.tolist(), at.tolist(), scores.tolist(),
+        z, best, optimizer, Weights(row, precision, mean, share), history.tolist(), at.tolist(), scores.tolist(),
         int(best_step), float(best_value),
     )  # fmt: skip

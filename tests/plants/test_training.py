@@ -51,13 +51,15 @@ def problem(held_out=False):
 
 
 def reference_loss(z, experiments):
-    """½ (residual/σ)² for each sample, in [log k, g / |start of g|]."""
-    parts = []
-    for e in experiments:
+    """½ (residual/σ)² for each sample of all five experiments, for which those chosen stand in proportion, in
+    [log k, g / |start of g|]."""
+    parts, chosen = [], list(experiments)
+    samples = sum(len(record(e).times) for e in range(5))
+    for e in chosen:
         one = record(e)
         x = closed_form(jnp.exp(z[0]), 0.5 * z[1], STARTS[e], jnp.asarray(one.times))
         parts.append((x - one.data["d.x"]) / SIGMA)
-    return 0.5 * jnp.mean(jnp.concatenate(parts) ** 2)
+    return 0.5 * jnp.sum(jnp.concatenate(parts) ** 2) * (5 / len(chosen)) / samples
 
 
 def test_gradients_are_those_of_the_closed_form():
@@ -169,7 +171,7 @@ def test_least_squares_after_gradient_steps_share_a_program():
     np.testing.assert_allclose(first.point, alone.point, atol=2e-3 * alone.spread.max())
     assert len(first.training.history) == 40 and first.training.history[-1] < first.training.history[0]
     again = problem().fit(start=first.training)
-    np.testing.assert_array_equal(again.point, first.point)
+    np.testing.assert_allclose(again.point, first.point, rtol=1e-14)  # through natural values and back
 
 
 def test_training_ends_where_held_out_experiments_get_worse():
