@@ -24,10 +24,12 @@ TRIALS = 12  # dampings tried from one point: the last is 6¹² times the first
 PATIENCE = 3  # steps in a row without gain
 OFFSET = 1e-3  # of the confidence region's radius, what may be left to go (Bates & Watts 1981, Technometrics 23:179)
 CLOSE = 0.05  # of this radius, what a search that no step takes further may leave: no interval moves by more
+VALLEY = 1.0  # the same, where undamped steps gain next to nothing: predictions are off by less than their bands
 POLISHED = 12  # steps at the end, as long as three of them leave less than a third
 MIXED = 4  # earlier steps that these are mixed with (Walker & Ni 2011: three to five suffice)
 ROUNDED = 1e-10  # relative rounding of differences of steps
 EXACT = 1e-7  # of the radius, below which rounding decides: the square root of eps, as the cost is quadratic
+SHORTENED = 6  # lengths of an undamped step that are tried, each a quarter of the one before
 FIRST = 1e-3  # damping to begin with, for columns of norm one (Madsen, Nielsen & Tingleff 2004, section 3.2)
 BESIDE = 1e-8  # relative step by which noise is measured: what the cost truly changes by is less than its rounding
 SETTLED = 0.01  # relative change of a precision or noise level, which changes no interval by as much
@@ -195,7 +197,7 @@ def descend(
     if found is None:
         return None
     here = _Here.of(merit, z, found, merit.weights(z, found), bounds, reweigh)
-    damping, history, count, idle, renewed = FIRST, [], 1, 0, False
+    damping, history, count, idle = FIRST, [], 1, 0
     reason = f"stopped after {steps} steps, not yet converged; steps= allows more"
     for k in range(steps + 1):
         history.append(here.cost)
@@ -209,26 +211,31 @@ def descend(
         least = merit.unnoticed(here.cost, here.heavy, len(here.z))
         gained = 0.0 if better is None else here.cost - better.cost
         idle = 0 if gained > least else idle + 1
-        renewed = renewed and idle > 0
         if better is not None:
             weights = merit.next_weights(better.weights, here.following)
             here = _Here.of(merit, better.z, better.found, weights, bounds, reweigh)
-        if better is None or idle >= PATIENCE:
-            finer, tried = _finer(merit, here, least)
-            count += tried
-            found = None if finer is None else finer.evaluate(here.z)
-            if finer is not None and found is not None:
-                merit, damping, idle, count = finer, FIRST, 0, count + 1
-                here = _Here.of(merit, here.z, found, merit.at(here.z, found, here.weights), bounds, reweigh)
-            elif damping > 1 and not renewed:  # columns have norm one: beyond, damping alone keeps steps short
-                damping, idle, renewed = FIRST, 0, True
-            elif here.settled or idle > 2 * PATIENCE:
-                closed = here.left <= CLOSE
-                reason = f"{'converged' if closed else 'stopped'} after {k} steps: no step gains more"
-                break
-            elif better is None:
-                weights = merit.next_weights(here.weights, here.following)
-                here = _Here.of(merit, here.z, here.found, weights, bounds, reweigh)
+        if better is not None and idle < PATIENCE:
+            continue
+        stuck = better is None or damping > 1  # columns have norm one: beyond, damping alone keeps steps short
+        along, tried = _along(merit, here, bounds, least) if stuck else (None, 0)
+        count += tried
+        if along is not None:
+            weights = merit.next_weights(along.weights, here.following)
+            here, damping, idle = _Here.of(merit, along.z, along.found, weights, bounds, reweigh), FIRST, 0
+            continue
+        finer, tried = _finer(merit, here, least)
+        count += tried
+        found = None if finer is None else finer.evaluate(here.z)
+        if finer is not None and found is not None:
+            merit, damping, idle, count = finer, FIRST, 0, count + 1
+            here = _Here.of(merit, here.z, found, merit.at(here.z, found, here.weights), bounds, reweigh)
+        elif here.settled or idle > 2 * PATIENCE:
+            closed = here.left <= (CLOSE if stuck else VALLEY)
+            reason = f"{'converged' if closed else 'stopped'} after {k} steps: no step gains more"
+            break
+        elif better is None:
+            weights = merit.next_weights(here.weights, here.following)
+            here = _Here.of(merit, here.z, here.found, weights, bounds, reweigh)
     converged = reason.startswith("converged")
     if converged:
         here, polished = _polished(merit, here, bounds, reweigh, history)
@@ -260,6 +267,23 @@ def _better(
     return None, TRIALS, damping
 
 
+def _along(
+    merit: AbstractMerit, here: _Here, bounds: tuple[np.ndarray, np.ndarray], least: float
+) -> tuple[Reached | None, int]:
+    """(a point on the way of an undamped step that gains enough to count; how many were tried). Damping takes long to
+    shorten steps along a curved valley, and leaves out the directions in which the valley runs."""
+    step = np.zeros_like(here.z)
+    step[here.free] = here.factors.step(0.0, here.factors.rank(merit.noise))
+    if here.left <= OFFSET:
+        return None, 0
+    for trial in range(SHORTENED):
+        new = np.clip(here.z + 0.25**trial * merit.shortened(step), *bounds)
+        reached = merit.reach(new, here.weights, here.cost - least)
+        if reached is not None:
+            return reached, trial + 1
+    return None, SHORTENED
+
+
 def _finer(merit: AbstractMerit, here: _Here, least: float) -> tuple[AbstractMerit | None, int]:
     """(the merit with a tighter tolerance, if the integration's noise hides gains that would count; evaluations)."""
     step = np.zeros_like(here.z)
@@ -281,8 +305,8 @@ def _polished(
     """(the point after full steps, as long as these converge; evaluations): so that a fit ends at its minimum, wherever
     it began, and not at the edge of what counts as near.
 
-    Full steps converge by a factor that the residuals' curvature sets. Anderson's mixing of the last few (1965, J. ACM
-    12:547) makes of that what a secant makes of a slope."""
+    Full steps, and better weights with each, converge by a factor that the residuals' curvature and the priors set.
+    Anderson's mixing of the last few (1965, J. ACM 12:547) makes of that what a secant makes of a slope."""
     best, count, scale = here, 0, np.ones_like(here.z)
     scale[here.free] = here.factors.scale
     points: list[np.ndarray] = []
@@ -291,18 +315,20 @@ def _polished(
     while count < POLISHED and best.worst > EXACT:
         step = np.zeros_like(here.z)
         step[here.free] = here.factors.step(0.0, here.factors.rank(merit.noise))
-        points, steps = [*points[-MIXED:], here.z], [*steps[-MIXED:], step]
-        z = here.z + step
+        new, weights = here.z + step, here.following
+        points = [*points[-MIXED:], _packed(scale * here.z, here.weights)]
+        steps = [*steps[-MIXED:], _packed(scale * new, weights) - points[-1]]
         if len(steps) > 1:
             by_point, by_step = np.diff(points, axis=0).T, np.diff(steps, axis=0).T
-            mixed = np.linalg.lstsq(scale[:, None] * by_step, scale * step, rcond=ROUNDED)[0]
-            z = z - (by_point + by_step) @ mixed
-        z = np.clip(z, *bounds)
+            mixed = np.linalg.lstsq(by_step, steps[-1], rcond=ROUNDED)[0]
+            packed = points[-1] + steps[-1] - (by_point + by_step) @ mixed
+            new, weights = packed[: len(new)] / scale, _unpacked(packed[len(new) :], weights)
+        z = np.clip(new, *bounds)
         found = merit.evaluate(z)
         count += 1
         if found is None:
             break
-        here = _Here.of(merit, z, found, merit.at(z, found, here.following), bounds, reweigh)
+        here = _Here.of(merit, z, found, merit.at(z, found, weights), bounds, reweigh)
         if here.worst < best.worst:
             best = here
             history.append(here.cost)
@@ -310,3 +336,15 @@ def _polished(
         if len(marks) > PATIENCE and marks[-1] > marks[-1 - PATIENCE] / 3:
             break
     return best, count
+
+
+def _packed(z: Float[np.ndarray, " p"], weights: Weights) -> Float[np.ndarray, " n"]:
+    """Coordinates, and the logarithms of weights and precisions."""
+    return np.concatenate([z, np.log(weights.row), np.log(weights.precision[weights.precision > 0])])
+
+
+def _unpacked(logs: Float[np.ndarray, " n"], weights: Weights) -> Weights:
+    """Weights with other rows and precisions."""
+    precision, m = np.array(weights.precision), len(weights.row)
+    precision[precision > 0] = np.exp(logs[m:])
+    return dataclasses.replace(weights, row=np.exp(logs[:m]), precision=precision)

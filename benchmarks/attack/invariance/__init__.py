@@ -8,6 +8,8 @@ said of it by one of the letters:
 - c, order: declarations in any order, other names;
 - d, continuation: a run that goes on from a saved state;
 - e, units: all in other units, sizes from 1e-18 to 1e12;
+- f, records: how they are cut, padded, repeated, ordered and put together, of linear models of their own;
+- g, where the search began: values, intervals and verdicts of fits, of these models;
 - h, what else is asked: an output, a derivative, an unused parameter, an unused component;
 - i, solver: explicit and implicit ones, saved times, events at the ends, at saved times and at other events.
 """
@@ -15,7 +17,7 @@ said of it by one of the letters:
 from collections.abc import Callable
 
 from ..outcome import Outcome
-from . import continuation, modes, points, process, solvers
+from . import continuation, modes, points, process, records, solvers
 from .said import Pairs
 
 MOVING = 5  # every so many-th model is run, where a point would do
@@ -25,6 +27,8 @@ LETTERS: dict[str, Callable[[int], Pairs]] = {
     "c": lambda number: points.order(number, number % MOVING == 0),
     "d": continuation.continuation,
     "e": lambda number: points.units(number, number % MOVING == 1),
+    "f": records.written,
+    "g": records.begun,
     "h": lambda number: points.questions(number, number % MOVING == 2),
     "i": solvers.solvers,
 }
