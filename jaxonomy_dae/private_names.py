@@ -13,6 +13,7 @@ These things are relied on that have no name of their own, or one that is public
 - that Diffrax fills the controller's tolerances into the root finder of a solver, be it wrapped: `FROM_CONTROLLER`;
 - that Diffrax lengthens a step to the end of the interval from 100 floating-point numbers before it: `clip_floor`;
 - the classes `JVPTracer` and `LinearizeTracer` of JAX by name, and what tracers wrap: `programs/staging.py`;
+- the attribute `_cached` of what `equinox.filter_jit` returns, the `jax.jit` inside: `clear_jitted`;
 - that XLA for CPUs does not take a call apart that is marked `inlineable="false"`: `linear/once.py`.
 """
 
@@ -26,6 +27,7 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
+import jax
 
 TRIED = {
     "diffrax": ("0.7.2",),
@@ -126,6 +128,15 @@ def has_stored_adjoint() -> bool:
             "to rounding, but slower"
         )
     return lacking is None
+
+
+def clear_jitted(function: Any) -> None:
+    """Frees the programs of a function of `equinox.filter_jit`, its derivatives by JAX included."""
+    cached = getattr(function, "_cached", None)
+    if cached is not None:
+        return cached.clear_cache()
+    _warn_once(f"{_versions('equinox')} has no _cached: all of JAX's programs are dropped where one would be enough")
+    jax.clear_caches()
 
 
 @functools.cache

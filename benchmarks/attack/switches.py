@@ -133,15 +133,16 @@ class _Programs:
         except InitializationError as error:
             return Found(states, refusal=f"{type(error).__name__}: {error}")
         arrays, static = eqx.partition(system, eqx.is_array)
-        if system.plan not in self.programs:
+        key = jax.tree.structure(arrays)
+        if key not in self.programs:
             names = [f"c.y{k}" for k in range(self.n)]
 
             def both(arrays, x):
                 whole = eqx.combine(arrays, static)
                 return whole.observe(names, 0.0, x), whole.vector_field(0.0, x)
 
-            self.programs[system.plan] = jax.jit(both).lower(arrays, x).compile(compiler_options=CHEAP)
-        y, rates = self.programs[system.plan](arrays, x)
+            self.programs[key] = jax.jit(both).lower(arrays, x).compile(compiler_options=CHEAP)
+        y, rates = self.programs[key](arrays, x)
         dy = np.full(self.n, np.nan)
         for name, rate in zip(states, np.asarray(rates).tolist(), strict=False):
             sign, bare = (-1.0, name[1:]) if name.startswith("-") else (1.0, name)

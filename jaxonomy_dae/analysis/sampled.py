@@ -114,20 +114,27 @@ def sampled_space(system: AcausalSystem, point: Sampled, partials: Partials, coo
 
 
 def instants_of(system: AcausalSystem, events: RestingEvents) -> Instants:
-    """The ticks of one period of all clocks, in their order at the values of parameters that are known (inside jit,
-    those that were declared).
+    """The ticks of one period of all clocks, in their order.
 
     **Raises:**
 
-    - `ModelError` if the periods have no common multiple, or if it takes more than `TICKS` ticks.
+    - `ModelError` if the periods have no common multiple, or if it takes more than `TICKS` ticks; and inside jit, for
+        clocks whose periods or offsets differ and are parameters.
     """
     plan: Any = system.plan.events
     clocks = np.unique(plan.table.event[events.ticking]).tolist()
-    known, values = system.parameters.known, system.plan.flat.parameters.values
-    if known is not None:
-        values = np.append(known, values[len(known) :])
+    known = system.parameters.known
+    declared = [plan.table.clocks[e] for e in clocks]
+    if known is None and len(set(declared)) == 1:  # their order is known whatever the period is
+        return Instants((tuple(clocks),), ((0,) * len(clocks),), dict.fromkeys(clocks, 1))
+    if known is None and any(part.parameters for clock in declared for part in clock):
+        raise ModelError(
+            "inside jit, grad and vmap the order of ticks cannot be told by the values of periods that are parameters: "
+            "write them as numbers, or give all clocks one period and one offset"
+        )
     with jax.ensure_compile_time_eval():
-        both = SystemAt(system.plan, jnp.asarray(values), (), 0.0, {}, system.plan.nominal).clocks()
+        numbers = jnp.zeros((0,)) if known is None else jnp.asarray(known)
+        both = SystemAt(system.plan, numbers, (), 0.0, {}, jnp.zeros((0,))).clocks()
     periods, offsets = (np.asarray(v)[clocks] for v in both)
     shortest = periods.min()
     ratios = [Fraction(p / shortest).limit_denominator(RATIO) for p in periods.tolist()]
@@ -142,12 +149,13 @@ def instants_of(system: AcausalSystem, events: RestingEvents) -> Instants:
             f"the clocks {listed} do not tick together again within {TICKS} ticks, so that there is no linear model of "
             "one period: choose periods that are in the ratio of small integers"
         )
+    # From the first offset on: others begin their period with the first tick after it.
+    first = [-int(np.floor((o - offsets.min()) / p + MEANT_EQUAL)) for o, p in zip(offsets, periods, strict=True)]
     at = sorted(
         (float(o + number * p), e, number)
-        for e, o, p in zip(clocks, offsets.tolist(), periods.tolist(), strict=True)
-        for number in range(-int(np.floor((o - offsets.min()) / p + MEANT_EQUAL)), counts[e]
-                            - int(np.floor((o - offsets.min()) / p + MEANT_EQUAL)))
-    )  # fmt: skip
+        for e, o, p, begin in zip(clocks, offsets.tolist(), periods.tolist(), first, strict=True)
+        for number in range(begin, begin + counts[e])
+    )
     groups: list[list[tuple[float, int, int]]] = []
     for time, e, number in at:
         if groups and time - groups[-1][0][0] <= MEANT_EQUAL * shortest:

@@ -285,7 +285,7 @@ def _invariant(group: EquationGroup, weight: np.ndarray) -> np.ndarray:
         return out
     unmoved = np.ones(len(rest), bool)
     for o in np.unique(group.order[rest]).tolist():  # a function of time and its derivatives move independently
-        direction = np.where(group.order[rest] == o, weight[rest], 0).astype(np.int64)
+        direction = np.where(group.order[rest] == o, weight[rest], 0.0)
         unmoved &= group.template.is_unmoved(direction, group.coefficient[rest])
     out[rest] = unmoved
     return out

@@ -13,11 +13,11 @@ from ..expressions.differentiate import directional_derivative, partial_derivati
 from ..expressions.errors import KernelWithErrors
 from ..expressions.kernel import Kernel
 from ..expressions.magnitude import magnitude
-from ..expressions.node import ONE, ZERO, Node, constant, divide, leaf, linear, scale, split
+from ..expressions.node import ONE, ZERO, Node, constant, divide, leaf, scale, split
 from ..expressions.substitute import substitute
 from ..expressions.terms import terms
 from ..modeling.symbols import TIME_LABEL, ParameterSymbol, VariableSymbol, symbol_label
-from ..tolerances import KNOWN
+from ..tolerances import EPS, KNOWN, NOISE
 from .template import AbstractTemplate, Slot
 
 
@@ -108,11 +108,14 @@ class SymbolicTemplate(AbstractTemplate):
         n = len(self.slots)
         patterns, which = np.unique(np.hstack([direction, coefficients]), axis=0, return_inverse=True)
         zero = []
-        for pattern in patterns:
-            values = dict(zip(self._numbers, map(constant, pattern[n:].tolist()), strict=True))
+        for pattern in patterns.tolist():
+            values = dict(zip(self._numbers, map(constant, pattern[n:]), strict=True))
             partials = [substitute(p, values) for p in self.partials] if values else self.partials
-            along = pattern[:n].astype(direction.dtype).tolist()
-            zero.append(linear(zip(along, partials, strict=True)) is ZERO)
+            along: dict[Node, list[float]] = {}
+            for weight, partial in zip(pattern[:n], partials, strict=True):
+                for factor, rest in map(split, terms(partial) if weight else ()):
+                    along.setdefault(rest, []).append(weight * float(factor))
+            zero.append(all(abs(sum(parts)) <= NOISE * EPS * sum(map(abs, parts)) for parts in along.values()))
         return np.array(zero, bool)[which.ravel()]
 
     def _evaluate(self, key: Any, graphs: Callable[[], Sequence[Node]], arguments: tuple[Any, ...], backend: str):

@@ -96,8 +96,8 @@ class AbstractTemplate(abc.ABC):
 
     @abc.abstractmethod
     def is_unmoved(self, direction: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-        """True if Σ direction·∂(residual)/∂(slot) is zero wherever the slots are; `direction` are integers of shape (n,
-        slots), the result has shape (n,)."""
+        """True if Σ direction·∂(residual)/∂(slot) is zero wherever the slots are; `direction` has shape (n, slots),
+        the result (n,). Sums of rounding errors are zero."""
 
     def is_affine_in(self, positions: Sequence[int]) -> bool:
         """True if the residual is affine, jointly, in the slots at these positions."""

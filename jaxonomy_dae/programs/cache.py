@@ -18,6 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from ..private_names import clear_jitted
 from .machine import Use, mappings, memory, return_memory
 from .staging import is_traced
 
@@ -71,10 +72,7 @@ class _CompiledFunction:
     def clear(self) -> None:
         """Frees the compiled program, its derivatives by JAX included."""
         for run in (self._run, self._run_quick):
-            cached = getattr(run, "_cached", None)  # the `jax.jit` inside, a private name of Equinox
-            if cached is None:
-                return jax.clear_caches()
-            cached.clear_cache()
+            clear_jitted(run)
 
 
 _ARRAY = object()  # stands where an array was

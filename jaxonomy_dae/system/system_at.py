@@ -315,7 +315,9 @@ class SystemAt:
     def _least_norm_step(self, state: Any) -> Any:
         plan = self.plan
         n = len(plan.states)
-        weight = plan.nominal**2
+        nominal = plan.nominal[:n]
+        # In units of the states, and each constraint beside the largest unit in it: squares of single precision
+        # underflow at 1e-19.
         if isinstance(state, tuple) and plan.n_constraints <= UNROLLED and plan.held is None:
             rest = state[n:]
 
@@ -329,16 +331,21 @@ class SystemAt:
             m = len(value)
             rows = [pull([one if j == k else zero for j in range(m)]) for k in range(m)]
             pattern = plan.constraint_pattern or (frozenset(range(n)),) * m
+            largest = [max((nominal[c] for c in inside), default=1.0) for inside in pattern]
+            unit = [[nominal[c] / size for c in range(n)] for size in largest]
             gram = [
-                [_sum([float(weight[c]) * rows[a][c] * rows[b][c] for c in sorted(pattern[a] & pattern[b])], zero)
+                [_sum([times(unit[a][c] * unit[b][c], rows[a][c] * rows[b][c])
+                       for c in sorted(pattern[a] & pattern[b])], zero)
                  for b in range(m)]
                 for a in range(m)
             ]  # fmt: skip
+            value = [times(1 / size, v) for size, v in zip(largest, value, strict=True)]
             multiplier = solve(gram, value, positive=True)  # of a definite matrix: scales do not matter
             moved = [
-                s - float(weight[c]) * _sum([rows[a][c] * multiplier[a] for a in range(m) if c in pattern[a]], zero)
+                s - _sum([times(nominal[c] * unit[a][c], rows[a][c] * multiplier[a])
+                          for a in range(m) if c in pattern[a]], zero)
                 for c, s in enumerate(state[:n])
-            ]
+            ]  # fmt: skip
             return (*moved, *rest)
         array = self.join(state)
         x, rest = array[:n], array[n:]
@@ -348,9 +355,9 @@ class SystemAt:
 
         value, pull = jax.vjp(vector, x)
         jacobian = jax.vmap(lambda e: pull(e)[0])(jnp.eye(value.shape[0], dtype=self.dtype))
-        w = jnp.asarray(weight[:n], self.dtype)
+        jacobian = jacobian * jnp.asarray(nominal, self.dtype)
         # Each constraint in units of its gradient: multiplied by 1e9 it is projected onto alike.
-        size = jnp.sqrt(jnp.sum(jax.lax.stop_gradient(jacobian) ** 2 * w, axis=1))
+        size = jnp.max(jnp.abs(jax.lax.stop_gradient(jacobian)), axis=1, initial=0.0)
         absent: Any = None
         if plan.held is not None:  # a row that asks for nothing is zero, and is left out
             active, _ = self.held(array)
@@ -358,9 +365,9 @@ class SystemAt:
             size = size + absent
         unit = 1 / size
         jacobian, value = jacobian * unit[:, None], value * unit
-        gram = (jacobian * w) @ jacobian.T
+        gram = jacobian @ jacobian.T
         multiplier = jnp.linalg.solve(gram if absent is None else gram + jnp.diag(absent), value)
-        return self.split(jnp.concatenate([x - w * (jacobian.T @ multiplier), rest]))
+        return self.split(jnp.concatenate([x - jnp.asarray(nominal, self.dtype) * (jacobian.T @ multiplier), rest]))
 
     # --- events ------------------------------------------------------------------------------------------------
 

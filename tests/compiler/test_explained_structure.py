@@ -11,8 +11,16 @@ import pytest
 from problems import EV, FreeMass, compiled, component
 from sympy import Eq, exp, sin
 
-from jaxonomy_dae import AcausalDiagram, EqnEnv, ModelError, StructuralError, der
-from jaxonomy_dae.library.electrical import Capacitor, CurrentSource, Ground, Inductor, Resistor, VoltageSource
+from jaxonomy_dae import AcausalDiagram, Component, EqnEnv, ModelError, StructuralError, der
+from jaxonomy_dae.library.electrical import (
+    Capacitor,
+    CurrentSource,
+    Ground,
+    Inductor,
+    Resistor,
+    VoltageSensor,
+    VoltageSource,
+)
 from jaxonomy_dae.library.planar import PlanarPendulum
 from jaxonomy_dae.library.thermal import FixedTemperature, HeatCapacitor, ThermalConductor
 from jaxonomy_dae.library.translational import Damper, FixedPosition, Mass, Rod, Spring
@@ -471,3 +479,20 @@ def test_slips_of_the_pen():
     assert message_of(lambda: diagram.add(Ground(ev, "g"))) == (
         "two components are named 'g': rename one of them, or make a new diagram if this is the same model again"
     )
+
+
+@pytest.mark.parametrize("factor", [1.0, 2.0, 0.3])
+def test_a_pin_that_is_a_multiple_has_a_level(factor):
+    """A source holds its pin at a multiple of a state. Where the factor was not ±1, the state's part in its own
+    equation counted as none, and a circuit with a ground was said to have none."""
+
+    class Source(Component):
+        def __init__(self, ev, name):
+            super().__init__(ev, name)
+            p, u = self.port("p", Electrical), self.variable("u", start=1.0, fixed=True)
+            self.add_equations(Eq(p.v, factor * u), Eq(der(u), -u))
+
+    ev = EqnEnv()
+    source, meter, ground = Source(ev, "a"), VoltageSensor(ev, "v"), Ground(ev, "g")
+    system = compiled(source, meter, ground, connect=[(source.p, meter.p), (meter.n, ground.p)])
+    assert system.states == ["a.u"]

@@ -27,8 +27,9 @@ print(jaxonomy_dae.__file__)
 
 SINGLE = """
 import jax, jax.numpy as jnp, numpy as np
-from problems import angle_solution, drag_on, pendulum
-from jaxonomy_dae import ModelError, simulate
+from problems import angle_solution, compiled, drag_on, pendulum
+from sympy import Eq
+from jaxonomy_dae import Component, EqnEnv, ModelError, der, simulate
 
 system = pendulum(drag_on("vx"))
 assert system.parameters.array.dtype == jnp.float32
@@ -48,6 +49,18 @@ for name in ("x", "y", "vx", "vy"):
 np.testing.assert_allclose(solution["pend.lam"], expected.lam, rtol=1e-3)
 # Projected, as far as single precision goes (eps 1.2e-7).
 assert float(jnp.max(jnp.abs(solution.constraint_residual()))) < 1e-6
+
+class Charges(Component):
+    def __init__(self, ev):
+        super().__init__(ev, "c")
+        a, b = (self.variable(n, start=1e-20, nominal=1e-20, unit="C") for n in "ab")
+        i = self.variable("i", nominal=1e-20)
+        self.add_equations(Eq(der(a), -a + i), Eq(der(b), -2 * b + i), Eq(a + b, 2e-20))
+
+small = compiled(Charges(EqnEnv()), state_selection="projection")
+assert small.states == ["c.a", "c.b"]
+near = small.project(0.0, jnp.array([1.5e-20, 1e-20]), None, iterations=1)
+np.testing.assert_allclose(near, [1.25e-20, 0.75e-20], rtol=1e-5)
 print("done")
 """
 
