@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..errors import ModelError
+from ..programs.staging import as_array
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,6 +139,6 @@ def wrong_shape(name: str, shape: tuple[int, ...], value: Any) -> str:
 def regular_shape(value: Any) -> tuple[int, ...] | None:
     """The shape of numbers, nested lists and arrays; None if they have none."""
     try:
-        return np.shape(value)
-    except (ValueError, TypeError):  # rows of different lengths; traced arrays in a list
+        return np.shape(as_array(value))
+    except (ValueError, TypeError):  # rows of different lengths
         return None

@@ -56,8 +56,8 @@ def check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_contr
             "its constraints and leaves the algebraic variables out. Use the default StoredAdjoint(), "
             "RecursiveCheckpointAdjoint(), or ForwardMode() for few parameters"
         )
-    if not isinstance(max_steps, int) or max_steps < 1:
-        raise ModelError(f"max_steps must be a positive integer; got {max_steps!r}")
+    if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
+        raise ModelError(f"max_steps must be a positive integer; got {_told(max_steps)}")
     room = (max_steps + 1) * system.plan.n_state * system.parameters.values.dtype.itemsize
     if ts is None and room > MOST_ROOM:
         raise ModelError(
@@ -82,6 +82,22 @@ def check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_contr
         check_initial(system, initial)
     _check_interval(initial_time(t0, initial), t1, ts)
     _check_periods(system)
+
+
+def check_switches(max_events: Any, **switches: Any) -> None:
+    """Raises a `ModelError` for options that are not Python numbers: they decide what the program is."""
+    for name, value in switches.items():
+        if value is not None and not isinstance(value, bool | np.bool_):
+            raise ModelError(f"{name} must be True or False; got {_told(value)}")
+    whole = isinstance(max_events, int | np.integer) and not isinstance(max_events, bool)
+    if max_events is not None and not (whole and max_events >= 0):
+        raise ModelError(f"max_events must be an integer, 0 or more; got {_told(max_events)}")
+
+
+def _told(value: Any) -> str:
+    if isinstance(value, Tracer):
+        return "a traced value, which is not known when the program is made: give it from outside of jit, grad and vmap"
+    return repr(value)
 
 
 def _check_periods(system: AcausalSystem):

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ..aliases import Args, Controller, Result, Solver, State, Time
+from ..aliases import Args, Controller, Inputs, Result, Solver, State, Time
 from ..hybrid.control import ENDED
 from ..hybrid.problem import HybridState
 from ..hybrid.solver import WithEvents
@@ -20,6 +20,7 @@ from ..programs.cache import compiled
 from ..solvers.drive import integrate, is_implicit, right_between_steps
 from ..solvers.rows import not_a_number, padded
 from ..solvers.switching import STIFF, Watch
+from ..system.system import AcausalSystem
 from .arguments import NOT_ADMITTED, TEXT, are_admitted, inputs_are_finite
 from .event_log import EventLog
 from .from_state import from_state
@@ -27,6 +28,18 @@ from .hybrid_problem import problem_for, with_event_control, without_clocked
 from .preparation import SAVED_ITERATIONS, largest_tolerance, prepared, term_of
 from .saved_state import Memory, SavedState, same_time
 from .step_sizes import first_step
+
+
+class Given(eqx.Module):
+    """What is integrated: a system over an interval, with inputs as they were read, from values by names, a state, or
+    where another run ended; saved at `ts`, or after every step."""
+
+    system: AcausalSystem
+    t0: Time
+    t1: Time
+    ts: Any
+    inputs: Inputs
+    initial: Any
 
 
 class Options(eqx.Module):
@@ -70,10 +83,11 @@ class Outcome(eqx.Module):
         return {name: int(value) for name, value in self.stats.items() if jnp.ndim(value) == 0}
 
 
-def run(given: tuple[Any, ...], options: Options, watch: Watch | None, checked: bool = False) -> Outcome:
-    """Integrates `(system, t0, t1, ts, inputs, initial)`; `watch` is for Tsit5. With `checked`, an inconsistent start
+def run(given: Given, options: Options, watch: Watch | None, checked: bool = False) -> Outcome:
+    """Integrates what is given; `watch` is for Tsit5. With `checked`, an inconsistent start
     and times that do not fit are errors while running."""
-    system, t0, t1, ts, inputs, initial = given
+    system, t0, t1, ts = given.system, given.t0, given.t1, given.ts
+    inputs, initial = given.inputs, given.initial
     admitted = are_admitted(system, inputs, t0, t1)
     system = system.merged()  # so that bounds are looked at once, and not whenever equations are
     if checked:

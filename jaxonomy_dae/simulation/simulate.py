@@ -16,7 +16,7 @@ from ..errors import InitializationError, SimulationError
 from ..initialization.check import check
 from ..programs.cache import PROGRAMS
 from ..programs.members import batch_size, is_batched
-from ..programs.staging import is_forwards, is_staged, is_traced
+from ..programs.staging import as_array, is_forwards, is_staged, is_traced
 from ..solvers import BDF, Rodas5P, Tsit5
 from ..solvers.causes import decay_at, is_stiff
 from ..solvers.drive import is_implicit
@@ -26,13 +26,13 @@ from ..solvers.switching import BOUNDARY, MANY, Watch
 from ..system.inputs import check_range, read_inputs, step_ends
 from ..system.solver_choice import Choice, Stiffness, implicit_choice, solver_choice
 from ..system.system import AcausalSystem
-from .arguments import check_arguments, check_parameters
+from .arguments import check_arguments, check_parameters, check_switches
 from .failures import explain, failed_in_batch, mode_at_start, raised
 from .from_state import check_state
-from .integration import Options, Outcome, run, run_compiled
+from .integration import Given, Options, Outcome, run, run_compiled
 from .preparation import term_of
 from .saved_state import SavedState, initial_time
-from .solution import Solution
+from .solution import Asked, Solution
 from .step_sizes import clipped, controller_for, scaled_atol
 
 FEW_NUMBERS = 20_000  # on one side of all events: up to so many, states before and after events are kept (160 kB)
@@ -124,6 +124,8 @@ def simulate(
     if isinstance(system, AcausalSystem):  # `check_arguments` says what to do with anything else
         if initial is None or isinstance(initial, Mapping):
             initial = system.plan.one_by_one(initial)
+    ts = ts if ts is None or hasattr(ts, "ndim") else as_array(ts)
+    check_switches(max_events, save_events=save_events, progress=progress, throw=throw)
     check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_controller, dtmax, max_steps)
     t0 = initial_time(t0, initial)
     dtype = system.parameters.values.dtype
@@ -148,7 +150,7 @@ def simulate(
         if not is_traced((t0, t1, ts)):
             ts = jnp.asarray(np.clip(ts, t0, t1), dtype)  # `check_arguments` lets rounding pass, Diffrax does not
     # The solver is chosen here, so that the programs of models that differ in how stiff they are are the same.
-    given = (dataclasses.replace(system, stiffness=None), t0, t1, ts, inputs, initial)
+    given = Given(dataclasses.replace(system, stiffness=None), t0, t1, ts, inputs, initial)
     most_events = MOST_EVENTS if max_events is None else max_events
     sides_possible = not is_traced((given, adjoint, stepsize_controller))
 
@@ -167,6 +169,7 @@ def simulate(
             max_steps + ends.count, progress, most_events, room, sides,
         )  # fmt: skip
 
+    asked = Asked.of(jump_ts, dtmax, max_steps, solver if stepsize_controller is None else None)
     if solver is None:
         choice = solver_choice(system.plan)
         solver = SOLVERS[choice.solver]()
@@ -184,7 +187,7 @@ def simulate(
             if is_batched(outcome.result):
                 _say_of_members(outcome, system, (max_steps, most_events), throw)
                 checked = False
-        return _traced(outcome, system, inputs, choice, checked, (max_steps, most_events))
+        return _traced(outcome, system, inputs, choice, asked, checked, (max_steps, most_events))
 
     traced = is_traced((given, options(solver)))
     switches = not choice.final and stepsize_controller is None
@@ -228,7 +231,7 @@ def simulate(
         memory = memory if memory is None else memory.first(taken)
     solution = Solution(
         saved, x, system, inputs, counts, outcome.result, choice.solver, choice.reason, discrete, outcome.events,
-        memory,
+        memory, asked,
     )  # fmt: skip
     if throw is not False and not bool(diffrax.is_okay(outcome.result)):
         first = t0, outcome.found.x
@@ -261,7 +264,13 @@ def _say_of_members(outcome: Outcome, system: AcausalSystem, bounds: tuple[int, 
 
 
 def _traced(
-    outcome: Outcome, system: AcausalSystem, inputs: Any, choice: Choice, checked: bool, bounds: tuple[int, int]
+    outcome: Outcome,
+    system: AcausalSystem,
+    inputs: Any,
+    choice: Choice,
+    asked: Asked,
+    checked: bool,
+    bounds: tuple[int, int],
 ) -> Solution:
     """The solution where values cannot be read: inside jit, grad or vmap."""
     x = outcome.x
@@ -269,5 +278,5 @@ def _traced(
         x = raised(x, outcome.result, system.plan.events is not None, *bounds)
     return Solution(
         outcome.ts, x, system, inputs, outcome.stats, outcome.result, choice.solver, choice.reason, outcome.discrete,
-        outcome.events, outcome.memory,
+        outcome.events, outcome.memory, asked,
     )  # fmt: skip

@@ -1,6 +1,6 @@
 """Solutions: every variable by name."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from html import escape
 from typing import Any
 
@@ -25,6 +25,29 @@ from .saved_state import Memory, SavedState
 SHOWN = 8  # states that notebooks list
 
 
+class Asked(eqx.Module):
+    """How a run was asked for, beside its tolerances, so that another run of the same model is made alike.
+
+    - `solver`: None if it was left to `simulate`, steps were prescribed, or it holds arrays.
+    """
+
+    jump_ts: Any
+    dtmax: Any
+    max_steps: int = eqx.field(static=True)
+    solver: Any = eqx.field(static=True, default=None)
+
+    @staticmethod
+    def of(jump_ts: Any, dtmax: Any, max_steps: int, solver: Any) -> "Asked":
+        """The options, with a solver only if solutions that name it can be compared."""
+        known = not any(eqx.is_array(leaf) for leaf in jax.tree.leaves(solver)) and isinstance(solver, Hashable)
+        return Asked(jump_ts, dtmax, max_steps, solver if known else None)
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """The arguments of `simulate`."""
+        return {"jump_ts": self.jump_ts, "dtmax": self.dtmax, "max_steps": self.max_steps, "solver": self.solver}
+
+
 class Solution(eqx.Module):
     """What `simulate` returns; `solution["pend.x"]` has shape `(n,)`, one value for each saved time.
 
@@ -37,6 +60,7 @@ class Solution(eqx.Module):
     - `discrete`: the values of discrete variables at these times, shape `(n, len(system.discretes))`; None without
         events. At the time of an event, what it wrote.
     - `memory`: what another run needs to know of the events, see `at`.
+    - `asked`: the options of the run.
     - `result`: Diffrax's result code. Where the integration stopped early, later rows are NaN.
 
     A solution that `equinox.filter_vmap` returns is a batch: shapes get its axis in front.
@@ -53,6 +77,7 @@ class Solution(eqx.Module):
     discrete: Float[Array, "n q"] | None = None
     event_log: EventLog | None = None
     memory: Memory | None = None
+    asked: Asked | None = None
 
     def at(self, k: Any) -> SavedState:
         """The whole state at the saved time number `k`, from which another run goes on: `simulate(system, t1,

@@ -21,6 +21,7 @@ from ..errors import ModelError, nearest
 from ..lowering.plan import SystemPlan
 from ..model.array_names import regular_shape, wrong_shape
 from ..modeling.networks import uses_numpy, why_untraceable
+from ..programs.staging import as_array
 from .closed_function import ClosedFunction, closed_function
 
 KINDS = ("linear", "cubic", "held")
@@ -121,7 +122,7 @@ def _constants(name: str, value: Any, dtype: Any, shape: tuple[int, ...]) -> Any
         return _constant(name, value, dtype)
     if found != shape:
         raise ModelError(f"inputs: {wrong_shape(name, shape, value)}")
-    array = value if isinstance(value, jax.Array) else np.asarray(value)
+    array = value if isinstance(value, jax.Array) else as_array(value)
     if array.dtype.kind not in "biuf":
         raise ModelError(f"inputs: '{name}' must be real numbers; got {array.dtype}")
     if not isinstance(array, Tracer) and not np.isfinite(array).all():
@@ -203,8 +204,8 @@ def _column(name: str, which: str, values: Any, dtype: Any, shape: tuple[int, ..
     """Real and finite numbers of shape (n, *shape)."""
     wanted = f"({', '.join(['n', *map(str, shape)])}{'' if shape else ','})"
     try:
-        array = values if isinstance(values, Tracer) else np.asarray(values)
-    except ValueError:
+        array = as_array(values)
+    except (TypeError, ValueError):
         raise ModelError(f"input '{name}': {which} must have shape {wanted}") from None
     if array.ndim == 0 or array.shape[1:] != shape or array.dtype.kind not in "biuf":
         raise ModelError(

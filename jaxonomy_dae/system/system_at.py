@@ -43,6 +43,7 @@ class SystemAt:
 
     def split(self, x: Any) -> Any:
         """The state as a tuple of scalars, if it has up to `SCALARS` entries; else as an array."""
+        x = jnp.asarray(x)
         if jnp.shape(x) != (self.plan.n_state,):
             raise ModelError(f"a state of this system has shape ({self.plan.n_state},); got {jnp.shape(x)}")
         return tuple(entries(x)) if self.plan.n_state <= SCALARS else x

@@ -361,3 +361,23 @@ def test_accounts_inside_jit_and_batches():
         batch.energy_balance_error()
     with pytest.raises(ModelError, match="outside jit"):
         jax.jit(lambda d: simulate(system.with_parameters({"b.d": d}), 1.0, ts=ts).energy_balance_error())(0.6)
+
+
+def test_the_second_run_takes_the_options_of_the_first():
+    """Kind: a run that is made again forgets what it was asked for. A pulse of 1 ms in 100 s, which `jump_ts` resolves,
+    was stepped over in the run that integrates powers, and a right model did not balance."""
+
+    class Pulsed(Component):
+        def __init__(self, ev, name):
+            super().__init__(ev, name)
+            u, x = self.input("u", default=0.0), self.variable("x", start=0.0, fixed=True)
+            self.add_equations(Eq(der(x), u - x / 100))
+            self.declare_energy(x**2 / 2)
+            self.declare_supply(u * x)
+            self.declare_dissipation(x**2 / 100)
+
+    system = compiled(Pulsed(EqnEnv(), "c"))
+    inputs = {"c.u": lambda t: jnp.where((t >= 50.0) & (t < 50.001), 1000.0, 0.0)}
+    solution = simulate(system, 100.0, ts=np.linspace(0.0, 100.0, 5), inputs=inputs, jump_ts=[50.0, 50.001], **TIGHT)
+    np.testing.assert_allclose(solution["c.x"][-1], 100 * (np.exp(-0.49999) - np.exp(-0.5)) * 1000, rtol=1e-6)
+    assert np.abs(solution.energy_balance_error()).max() < BALANCED
