@@ -20,6 +20,9 @@ STEEPEST = 8.0  # power that an entry is taken for
 # Keeps sizes that nothing tells where they are. A size at the end of a chain of n links hangs on its beginning with a
 # singular value near 2/n, and of normal equations 1e-12 is left beside rounding.
 DAMPING = 1e-6
+# Weight of a decade by which a derivative is off its quantity over the model's time scale: what equations tell wins by
+# its square, and it wins over DAMPING by as much.
+SLOW = 1e-3
 RELUCTANCE = 0.1  # weight of a decade by which a size has moved, beside one by which a term is off
 
 
@@ -54,6 +57,7 @@ def natural_sizes(
     size: Float[np.ndarray, " n"],
     parameters: Float[np.ndarray, " p"],
     by_terms: bool = False,
+    rates: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " p"]]:
     """Sizes s with |∂F_e/∂x_q|·s_q near 1 in units of each equation, in the least-squares sense of logarithms (Curtis &
     Reid 1972, where the entries depend on the sizes as well). What an equation has without quantities, such as the
@@ -63,6 +67,8 @@ def natural_sizes(
 
     - `size`: of every quantity, with signs, from which the search begins: those other than ±1 are declared and stay.
     - `parameters`: values that stay; zero for those whose size is looked for, too.
+    - `rates`: (quantities, their derivatives by time). What no equation tells is such that these are 1/T of those, with
+        one T for the whole model: the speed of a nanometre's oscillation lies between its amplitude and acceleration.
     - `by_terms`: terms count as well as entries, which do not see that one of their terms is lost beside others; and
         sizes move only for what it gains.
     """
@@ -70,7 +76,7 @@ def natural_sizes(
     known = np.concatenate([np.abs(size) != 1.0, parameters != 0.0, np.zeros(n_equations, bool)])
     quantity, parameter = size.copy(), np.where(parameters == 0.0, 1.0, parameters)
     begun = np.log10(np.abs(np.append(quantity, parameter)))
-    constants = _constants(groups, parameters)
+    constants, time = _constants(groups, parameters), 0.0
     for _ in range(ROUNDS):
         entries = _seen(groups, quantity, parameter, _Entries)
         if not len(entries.logarithm):
@@ -83,7 +89,14 @@ def natural_sizes(
             moved = np.log10(np.abs(np.append(quantity, parameter))) - begun
             stay = sp.eye_array(len(moved), matrix.shape[1]) * RELUCTANCE
             matrix, off = sp.vstack([matrix, stay], format="csr"), np.append(off, RELUCTANCE * moved)
+        if rates is not None:
+            slopes, late = _slopes(*rates, matrix.shape[1], known, np.log10(np.abs(quantity)), time)
+            matrix, off = (
+                sp.vstack([sp.hstack([matrix, sp.csr_array((len(off), 1))]), slopes], format="csr"),
+                np.append(off, late),
+            )
         found = _least_squares(matrix, -off)
+        time += float(found[-1]) if rates is not None else 0.0
         quantity, parameter = _moved(quantity, found[:n]), _moved(parameter, found[n : n + n_parameters])
         if (
             all(s.is_linear(parameters != 0.0) for s in seen)
@@ -91,6 +104,19 @@ def natural_sizes(
         ):
             break
     return quantity, parameter
+
+
+def _slopes(
+    lower: np.ndarray, higher: np.ndarray, width: int, known: np.ndarray, size: np.ndarray, time: float
+) -> tuple[Any, np.ndarray]:
+    """Rows log s(q') − log s(q) + log T = 0 with a column for log T behind the others, and how far off each is."""
+    k = np.arange(len(lower))
+    rows, columns = np.concatenate([k, k, k]), np.concatenate([higher, lower, np.full(len(k), width)])
+    values = SLOW * np.repeat([1.0, -1.0, 1.0], len(k))
+    values[np.append(known, False)[columns]] = 0.0
+    return sp.csr_array((values, (rows, columns)), shape=(len(k), width + 1)), SLOW * (
+        size[higher] - size[lower] + time
+    )
 
 
 def _least_squares(matrix: Any, right: np.ndarray) -> np.ndarray:

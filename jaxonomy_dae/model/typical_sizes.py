@@ -6,9 +6,11 @@ from jaxtyping import Float
 from ..tolerances import KNOWN
 from .declared import declared_scale
 from .extended import Extended
+from .jacobian import generic
 from .natural_sizes import are_told, natural_sizes
 from .reduced import ReducedModel
 
+MOVED = 1e-6  # of parameters: a difference from which a slope is told to six digits
 DECADES = 30  # that they may span: single precision has 38
 
 
@@ -57,6 +59,9 @@ def _declared_or_started(model: ReducedModel, parameters: np.ndarray) -> np.ndar
     """Nominal values, and else first starts; zero where there is none."""
     size, starts = declared_scale(model), model.flat.variables.start
     values = starts.values(parameters)
+    # A start that is computed may be rounding alone, as L·sin(π) is; a number that is given is what it is.
+    moved = starts.values(parameters * (1 + MOVED * generic(np.random.default_rng(1), parameters.shape)))
+    values = np.where(np.abs(values) <= KNOWN * np.abs(moved - values) / MOVED, 0.0, values)
     for v in np.flatnonzero(starts.is_given).tolist():
         quantity, factor = model.variables[v]
         if quantity >= 0 and size[quantity] == 0.0:
@@ -68,5 +73,9 @@ def _declared_or_started(model: ReducedModel, parameters: np.ndarray) -> np.ndar
 def _balanced(extended: Extended, parameters: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Sizes that make terms alike, where `size` is zero."""
     start = np.where(size == 0.0, 1.0, size)
-    found, _ = natural_sizes(extended.groups, extended.n_equations, start, parameters)
+    q = extended.quantities
+    lower = np.flatnonzero((q.owner[:-1] == q.owner[1:]) & (q.order[1:] == q.order[:-1] + 1))
+    found, _ = natural_sizes(
+        extended.groups, extended.n_equations, start, parameters, rates=(lower, lower + 1) if len(lower) else None
+    )
     return 10.0 ** np.clip(np.log10(np.abs(found)), -DECADES, DECADES)

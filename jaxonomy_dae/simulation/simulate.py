@@ -76,7 +76,8 @@ def simulate(
         follows from eigenvalues at the declared start. Systems with hidden constraints are projected onto them after
         every step and at every saved time.
     - `rtol`, `atol`: tolerances of the local error, by default 1e-6 and 1e-8 (1e-4 and 1e-6 in single precision);
-        `atol` is multiplied by the states' nominal values.
+        `atol` is multiplied by the states' nominal values; where none is declared, by the size that starts and
+        equations tell, if that is less than one.
     - `inputs`: by the inputs' names: constants; samples `(times, values)`, interpolated linearly, or with `"cubic"` or
         `"held"` as a third entry; `diffrax.LinearInterpolation` and `diffrax.CubicInterpolation`; functions of time.
         Steps end at the times of samples. What a function reads from its surroundings is read at this call.

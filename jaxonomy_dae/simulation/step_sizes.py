@@ -6,9 +6,11 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from ..aliases import Controller, Solver, State, Time, Tolerance
 from ..errors import ModelError
+from ..programs.staging import is_traced
 from ..solvers.solve import step_control
 from ..solvers.step_control import UNSEEN, ConstantLengths
 from ..system.inputs import StepEnds
@@ -18,11 +20,16 @@ from .wave_control import WaveControl
 
 
 def scaled_atol(system: AcausalSystem, atol: Tolerance) -> Any:
-    """The absolute tolerance in units of the nominal values of the states."""
-    nominal = system.plan.nominal
-    if len(nominal) and (nominal != 1).any():
-        return atol * jnp.asarray(nominal, atol.dtype)
-    return atol
+    """The absolute tolerance of each entry of the state, shape (n_state,): in units of its nominal value, or of its
+    typical size where none is declared and that is less than one.
+
+    A state of some nanometres would otherwise be all tolerance; of a large one the relative tolerance counts.
+    """
+    nominal, typical = system.plan.nominal, system.state_sizes
+    if is_traced((typical, atol)):
+        return atol * jnp.where(nominal != 1, nominal, jnp.minimum(typical, 1.0)).astype(atol.dtype)
+    size = np.where(nominal != 1, nominal, np.minimum(np.asarray(typical), 1.0))
+    return jnp.asarray(np.asarray(atol) * size, atol.dtype)
 
 
 def controller_for(system: AcausalSystem, solver: Solver, rtol: Tolerance, atol: Tolerance, dtmax: Time) -> Any:

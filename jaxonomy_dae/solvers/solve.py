@@ -17,7 +17,7 @@ from ..adjoint.stored_adjoint import default_adjoint
 from ..errors import InitializationError, ModelError, SimulationError
 from ..programs.cache import PROGRAMS, compiled
 from ..programs.members import failed_members, is_batched
-from ..programs.staging import is_forwards, is_staged, is_traced
+from ..programs.staging import as_array, is_forwards, is_staged, is_traced
 from .bdf import BDF
 from .dae_term import DAETerm, FlatProblem
 from .drive import integrate, is_multistep, right_between_steps
@@ -88,6 +88,9 @@ def solve_dae(
     """
     y0 = jax.tree.map(_inexact, y0)
     dtype = jnp.result_type(*jax.tree.leaves(y0))
+    ts = ts if ts is None or hasattr(ts, "ndim") else as_array(ts)
+    if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
+        raise ModelError(f"max_steps must be a positive integer that is known beforehand; got {max_steps!r}")
     check_times(t0, t1, ts)
     check_longest_step(dtmax)
     rtol, atol = default_tolerances(rtol, atol, dtype)

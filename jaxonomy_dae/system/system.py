@@ -370,9 +370,10 @@ class AcausalSystem(eqx.Module):
         return jnp.where(jax.lax.stop_gradient(jnp.all(short)), found, jnp.nan)
 
     @property
-    def state_sizes(self) -> Float[Array, " n"]:
+    def state_sizes(self) -> Any:
         """The typical sizes of the entries of the state, shape (n_state,); not differentiated."""
-        return jax.lax.stop_gradient(self.typical_sizes[np.concatenate([self.plan.states, self.plan.carried])])
+        places, sizes = np.concatenate([self.plan.states, self.plan.carried]), self.typical_sizes
+        return jax.lax.stop_gradient(sizes[places]) if is_traced(sizes) else np.asarray(sizes)[places]
 
     def dummy_determinants(self, t: Any, x: Float[Array, " n"], args: Any = None) -> Float[Array, " blocks"]:
         """The determinants that vanish where the choice of states is singular, one for every nonlinear block that
