@@ -63,10 +63,13 @@ class Dense(eqx.Module):
         if n <= UNROLLED_INVERSE:
             rows = [[matrix[i, j] for j in range(n)] for i in range(n)]
             return jnp.stack(solve_unrolled(rows, list(jnp.eye(n, dtype=matrix.dtype))))
-        lu, _, order = jax.lax.linalg.lu(matrix)
+        # Pivots are compared in units of their rows: the unit of an equation must not decide.
+        largest = jnp.max(jnp.abs(matrix), axis=1)
+        unit = 1 / jnp.where(largest == 0, 1, largest)
+        lu, _, order = jax.lax.linalg.lu(matrix * unit[:, None])
         if n > EXPLICIT_INVERSE:
-            return lu, order
-        return _substitute(lu, jnp.eye(n, dtype=matrix.dtype)[order])
+            return lu, order, unit
+        return _substitute(lu, jnp.diag(unit)[order])
 
     def operator(self, matrix: Any) -> lx.AbstractLinearOperator:
         """The matrix as a Lineax operator."""
@@ -79,23 +82,23 @@ class Dense(eqx.Module):
     def empty(self, n: int, dtype: Any) -> Any:
         """Zeros in the shapes of a factorisation."""
         square = jnp.zeros((n, n), dtype)
-        return (square, jnp.zeros((n,), jnp.int32)) if n > EXPLICIT_INVERSE else square
+        return (square, jnp.zeros((n,), jnp.int32), jnp.zeros((n,), dtype)) if n > EXPLICIT_INVERSE else square
 
     def apply(self, factor: Any, matrix: Any, b: Any) -> Any:
         """W⁻¹ b, without derivatives."""
         if isinstance(factor, tuple):
-            lu, order = factor
-            return _substitute(lu, b[order][:, None])[:, 0]
+            lu, order, unit = factor
+            return _substitute(lu, (unit * b)[order][:, None])[:, 0]
         return factor @ b
 
     def apply_transposed(self, factor: Any, c: Any) -> Any:
         """W⁻ᵀ c, without derivatives."""
         if not isinstance(factor, tuple):
             return factor.T @ c
-        lu, order = factor
+        lu, order, unit = factor
         y = jax.lax.linalg.triangular_solve(lu, c[:, None], left_side=True, lower=False, transpose_a=True)
         y = jax.lax.linalg.triangular_solve(lu, y, left_side=True, lower=True, transpose_a=True, unit_diagonal=True)
-        return jnp.zeros_like(c).at[order].set(y[:, 0])
+        return unit * jnp.zeros_like(c).at[order].set(y[:, 0])
 
     def solve(self, factor: Any, matrix: Any, b: Any) -> Any:
         """W⁻¹ b, differentiable."""

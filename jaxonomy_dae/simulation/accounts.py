@@ -16,6 +16,7 @@ from ..errors import ModelError, nearest
 from ..lowering.plan import SystemPlan
 from ..model.networks import Networks
 from ..model.tables import ZERO, AccountGroup
+from ..programs.blocks import at_times
 from ..programs.cache import compiled
 from ..programs.staging import is_staged
 from ..system.system import AcausalSystem
@@ -49,7 +50,7 @@ def _terms(system: AcausalSystem, ts: Any, states: Any, inputs: Any, discrete: A
     def one(t, x, q):
         return _at_one_time(system if q is None else system.holding(q), t, x, inputs)
 
-    return jax.vmap(one)(ts, states, discrete)
+    return at_times(one, ts, states, discrete, width=system.plan.extended.quantities.n)
 
 
 _compiled = compiled(_terms)

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from ..errors import ModelError
 from ..lowering.gather import times
+from ..programs.blocks import at_times
 from ..programs.cache import compiled
 from ..programs.staging import is_staged, is_traced
 from ..system.system import AcausalSystem
@@ -132,7 +133,7 @@ class Solution(eqx.Module):
         given = (self.system, self.ts, self.states, self.inputs, self.discrete)
         if is_staged(given):
             return _observed(*given, quantity, factor)[:, 0]
-        return _one(*given, jnp.asarray(quantity[0]), jnp.asarray(factor[0], self.states.dtype))
+        return _chosen(*given, jnp.asarray(quantity), jnp.asarray(factor, self.states.dtype))[:, 0]
 
     def _state(self, quantity: int, factor: float) -> Any:
         """The values of quantities that are zero or part of the state array; None for others."""
@@ -163,8 +164,10 @@ class Solution(eqx.Module):
         elif is_staged(given):
             values = _observed(*given, quantity, factor)
         else:
-            chosen = _everything(*given)[:, quantity] * jnp.asarray(factor, self.states.dtype)
-            values = jnp.where(quantity < 0, 0.0, chosen)
+            n = 1 << (len(quantity) - 1).bit_length()  # numbers of names that share a program
+            padded = np.resize(quantity, n), np.resize(factor, n)
+            chosen = _chosen(*given, jnp.asarray(padded[0]), jnp.asarray(padded[1], self.states.dtype))
+            values = jnp.where(quantity < 0, 0.0, chosen[:, : len(quantity)])
         if not own:
             return values
         place = {name: k for k, name in enumerate(own)}
@@ -313,21 +316,20 @@ def _observed(system: AcausalSystem, ts, states, inputs, discrete, quantity: np.
     def one(t, x, q):
         return _held(system, q).at(t, inputs).quantities(x, read, factor)
 
-    return jnp.where(quantity < 0, 0.0, jax.vmap(one)(ts, states, discrete))
+    values = at_times(one, ts, states, discrete, width=system.plan.extended.quantities.n)
+    return jnp.where(quantity < 0, 0.0, values)
 
 
 @compiled
-def _everything(system: AcausalSystem, ts, states, inputs, discrete):
-    """All quantities at all times, shape (n, quantities)."""
+def _chosen(system: AcausalSystem, ts, states, inputs, discrete, quantity, factor):
+    """The values of quantities, shape (n, quantities). Their numbers are traced, so that one program serves as many
+    names whichever they are; all quantities are computed, at a block of times after another."""
     every = np.arange(system.plan.extended.quantities.n)
-    return _observed(system, ts, states, inputs, discrete, every, np.ones(len(every)))
 
+    def one(t, x, q):
+        return factor * _held(system, q).at(t, inputs).quantities(x, every, np.ones(len(every)))[quantity]
 
-@compiled
-def _one(system: AcausalSystem, ts, states, inputs, discrete, quantity, factor):
-    """The values of one quantity, shape (n,). Its number is traced, so that one program serves all names."""
-    every = np.arange(system.plan.extended.quantities.n)
-    return factor * _observed(system, ts, states, inputs, discrete, every, np.ones(len(every)))[:, quantity]
+    return at_times(one, ts, states, discrete, width=len(every))
 
 
 @compiled

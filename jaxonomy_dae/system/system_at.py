@@ -22,6 +22,7 @@ from ..lowering.plan_held import HeldPlan
 from ..lowering.program import Program
 from ..model.networks import Networks
 from ..model.tables import Start
+from ..programs.staging import is_traced
 from ..solvers.field_size import is_large
 from .evaluate import Evaluation, Refinement, newton
 from .input_values import input_values
@@ -405,7 +406,9 @@ class SystemAt:
         return values
 
     def waves(self) -> tuple[Any, Any]:
-        """Angular frequencies and phases of what drives the model, shape (waves,) each; NaN for phases that move."""
+        """Angular frequencies and phases of what drives the model, shape (waves,) each; NaN for phases that move. Where
+        parameters are known, waves on which nothing depends, as those of amplitude zero, have the frequency zero. Where
+        they are traced, derivatives by the amplitude may be asked for, which need steps that see the wave."""
         frequencies, phases = [], []
         for group in self.plan.waves:
             n = len(group.parameter)
@@ -415,7 +418,10 @@ class SystemAt:
                 found = jnp.asarray(template.residual([], *given, self.t, None), self.dtype)
                 return jnp.broadcast_to(found, (n,))
 
-            frequencies.append(values(group.frequency))
+            frequency = values(group.frequency)
+            if group.weight is not None and not is_traced(self.parameters):
+                frequency = jnp.where(values(group.weight) == 0.0, 0.0, frequency)
+            frequencies.append(frequency)
             phases.append(jnp.full((n,), jnp.nan, self.dtype) if group.phase is None else values(group.phase))
         return jnp.concatenate(frequencies), jnp.concatenate(phases)
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from sympy import Eq, cos, sin
+from sympy import Eq, Piecewise, cos, sin
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, assign, der, pre
 from jaxonomy_dae.library import electrical as el
@@ -81,3 +81,39 @@ def test_the_frequency_of_a_constraint_and_of_a_condition():
         self.when(y - 3 * cos(9 * self.ev.t) <= 0, assign(n, pre(n) + 1))
 
     assert {w for w, _ in waves(compiled(write))} == {4.0, 9.0}
+
+
+def weights(system, p):
+    """The weights of the waves of the plan where the parameter p is `p`, in NumPy; None where they are not known."""
+    plan = system.plan
+    values = np.array(plan.flat.parameters.everything(system.parameters.known))
+    values[plan.flat.parameters.names.index("d.p")] = p
+    found = []
+    for group in plan.waves:
+        given = [values[c] for c in group.parameter.T], list(group.coefficient.T)
+        weight = group.weight
+        found.append(None if weight is None else float(np.ravel(weight.residual([], *given, 0.0, None, "numpy"))[0]))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("force", "is_zero"),
+    [
+        (lambda t, w, p, x: p * sin(w * t), True),
+        (lambda t, w, p, x: x**2 * p * cos(w * t) ** 3, True),
+        (lambda t, w, p, x: p * sin(w * t) + cos(w * t), False),
+        (lambda t, w, p, x: (1 + p) * sin(w * t), False),
+        (lambda t, w, p, x: x * sin(w * t + p), False),
+    ],
+)
+def test_waves_on_which_nothing_depends(force, is_zero):
+    """Kind: a source that is switched off changes the run. Its amplitude is a factor that is zero."""
+    system = compiled(driven(force))
+    assert [weight == 0.0 for weight in weights(system, 0.0)] == [is_zero]
+    assert weights(system, 0.3)[0] > 0.0
+
+
+def test_branches_have_no_weight():
+    """A derivative that is zero on the branch at hand says nothing of the other one."""
+    found = weights(compiled(driven(lambda t, w, p, x: Piecewise((sin(w * t), x > 2), (0.0, True)))), 0.0)
+    assert found == [None]

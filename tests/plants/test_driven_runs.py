@@ -9,10 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import sympy
+from problems import compiled, component
 from scipy.integrate import solve_ivp
 from scipy.special import lambertw
+from sympy import Eq
 
-from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, simulate
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, der, simulate
 from jaxonomy_dae.library import electrical as el
 
 VT, IS = 1.380649e-23 / 1.602176634e-19 * 300.15, 1e-3
@@ -71,3 +74,19 @@ def test_steps_without_what_drives_them():
     """What the bound is for: without it the run ends far off, and says nothing."""
     found = simulate(system(), 10.0, ts=TS, dtmax=jnp.inf)
     assert abs(float(found["c.v"][-1]) - exact()[-1]) > 1
+
+
+def test_a_source_that_is_switched_off_limits_no_step():
+    """Kind: what has no effect costs the run. A source of amplitude zero and 1e6 rad/s limited steps to a quarter of
+    its period: max_steps at t = 0.026."""
+
+    def write(self, ev):
+        x, a = self.variable("x", start=1.0, fixed=True), self.parameter("a", 0.0)
+        self.add_equations(Eq(der(x), -x + a * sympy.sin(1e6 * ev.t)))
+
+    system = compiled(component(write))
+    solution = simulate(system, 1.0, ts=jnp.array([1.0]))
+    np.testing.assert_allclose(solution["c.x"], np.exp(-1.0), rtol=1e-5)
+    assert solution.counts["num_steps"] < 50
+    on = simulate(system.with_parameters({"c.a": 1.0}), 1e-4, ts=jnp.array([1e-4]))
+    assert on.counts["num_steps"] > 50
