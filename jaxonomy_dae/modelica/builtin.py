@@ -1,0 +1,211 @@
+"""The functions that every Modelica model may call."""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import sympy
+
+from ..errors import ModelError
+from ..modeling.automatic_events import smooth
+from .values import Value, as_number, both, chosen, either, entrywise, is_condition, is_constant
+
+
+def _of_numbers(number: Callable[..., float], symbol: Callable[..., Any]) -> Callable[..., Value]:
+    """A function of entries: `number` of constants, `symbol` of expressions."""
+
+    def one(*arguments: Value) -> Value:
+        arguments = tuple(map(as_number, arguments))
+        if all(isinstance(a, int | float) for a in arguments):
+            try:
+                return number(*arguments)
+            except (ValueError, OverflowError, ZeroDivisionError) as error:
+                raise ModelError(f"{getattr(symbol, '__name__', symbol)}{arguments}: {error}") from None
+        return symbol(*map(sympy.sympify, arguments))
+
+    return lambda *arguments: entrywise(one, *arguments)
+
+
+def _sign(x: float) -> int:
+    return (x > 0) - (x < 0)
+
+
+def _quotient(a: Any, b: Any) -> Any:
+    """The quotient without its fraction, rounded towards zero."""
+    q = sympy.sympify(a) / sympy.sympify(b)
+    return sympy.Piecewise((sympy.floor(q), q >= 0), (sympy.ceiling(q), True), evaluate=False)
+
+
+def _extreme(smaller: bool) -> Callable[..., Value]:
+    """`min` or `max` of two values or of the entries of an array. As in Modelica it is not an event."""
+    number, symbol = (min, sympy.Min) if smaller else (max, sympy.Max)
+
+    def extreme(*arguments: Value) -> Value:
+        entries = flattened(arguments[0]) if len(arguments) == 1 else list(arguments)
+        if not entries:
+            raise ModelError(f"{number.__name__} of an empty array")
+        if all(is_condition(e) for e in entries):
+            return functools.reduce(both if smaller else either, entries)
+        if all(isinstance(e, int | float) for e in entries):
+            return number(entries)
+        return smooth(symbol(*entries, evaluate=False))
+
+    return extreme
+
+
+def flattened(value: Value) -> list[Value]:
+    """All entries of an array, in rows."""
+    return [x for entry in value for x in flattened(entry)] if isinstance(value, list) else [value]
+
+
+def sizes(value: Value) -> list[int]:
+    """The size of each dimension of an array."""
+    return [len(value), *(sizes(value[0]) if value else [])] if isinstance(value, list) else []
+
+
+def filled(value: Value, *counts: int) -> Value:
+    return value if not counts else [filled(value, *counts[1:]) for _ in range(int(counts[0]))]
+
+
+def total(value: Value) -> Value:
+    out: Value = 0
+    for entry in flattened(value):
+        out = out + entry
+    return out
+
+
+def product(value: Value) -> Value:
+    out: Value = 1
+    for entry in flattened(value):
+        out = out * entry
+    return out
+
+
+def matrix_product(a: list, b: Value) -> Value:
+    """The product of arrays of one or two dimensions."""
+    if not isinstance(a[0], list):
+        if not isinstance(b[0], list):
+            return total([x * y for x, y in zip(a, b, strict=True)])
+        return [total([x * row[j] for x, row in zip(a, b, strict=True)]) for j in range(len(b[0]))]
+    return [matrix_product(row, b) for row in a]
+
+
+def transposed(a: list) -> list:
+    return [list(column) for column in zip(*a, strict=True)]
+
+
+def _cross(a: list, b: list) -> list:
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+
+def concatenated(dimension: int, *arrays: list) -> list:
+    if dimension == 1:
+        return [entry for array in arrays for entry in array]
+    return [concatenated(dimension - 1, *rows) for rows in zip(*arrays, strict=True)]
+
+
+def promoted(value: Value, dimensions: int) -> Value:
+    """An array with dimensions of one entry added at the end."""
+    missing = dimensions - len(sizes(value))
+    for _ in range(missing):
+        value = entrywise(lambda x: [x], value) if not isinstance(value, list) else _innermost(value)
+    return value
+
+
+def _innermost(value: list) -> list:
+    return [_innermost(v) if isinstance(v, list) else [v] for v in value]
+
+
+def _linspace(first: Value, last: Value, count: int) -> list:
+    return [first + (last - first) * k / (count - 1) for k in range(int(count))]
+
+
+def _size(value: Value, dimension: int | None = None) -> Value:
+    return sizes(value) if dimension is None else sizes(value)[int(dimension) - 1]
+
+
+def _integer(x: Value) -> Value:
+    return x if isinstance(x, int) else math.floor(x) if isinstance(x, float) else sympy.floor(x)
+
+
+def _semi_linear(x: Value, positive: Value, negative: Value) -> Value:
+    return chosen(x >= 0, positive * x, negative * x, quiet=True)
+
+
+def _text(value: Value, *_: Value, **__: Value) -> str:
+    return str(value)
+
+
+def _boolean_as_integer(value: Value) -> Value:
+    return as_number(value) if is_condition(value) else value
+
+
+FUNCTIONS: dict[str, Callable[..., Value]] = {
+    "sin": _of_numbers(math.sin, sympy.sin),
+    "cos": _of_numbers(math.cos, sympy.cos),
+    "tan": _of_numbers(math.tan, sympy.tan),
+    "asin": _of_numbers(math.asin, sympy.asin),
+    "acos": _of_numbers(math.acos, sympy.acos),
+    "atan": _of_numbers(math.atan, sympy.atan),
+    "atan2": _of_numbers(math.atan2, sympy.atan2),
+    "sinh": _of_numbers(math.sinh, sympy.sinh),
+    "cosh": _of_numbers(math.cosh, sympy.cosh),
+    "tanh": _of_numbers(math.tanh, sympy.tanh),
+    "exp": _of_numbers(math.exp, sympy.exp),
+    "log": _of_numbers(math.log, sympy.log),
+    "log10": _of_numbers(math.log10, lambda x: sympy.log(x) / math.log(10.0)),
+    "sqrt": _of_numbers(math.sqrt, sympy.sqrt),
+    "abs": _of_numbers(abs, lambda x: smooth(sympy.Abs(x))),
+    "sign": _of_numbers(_sign, lambda x: smooth(sympy.sign(x))),
+    "floor": _of_numbers(math.floor, sympy.floor),
+    "ceil": _of_numbers(math.ceil, sympy.ceiling),
+    "integer": lambda x: entrywise(_integer, x),
+    "mod": _of_numbers(lambda a, b: a - math.floor(a / b) * b, sympy.Mod),
+    "div": _of_numbers(lambda a, b: math.trunc(a / b), _quotient),
+    "rem": _of_numbers(lambda a, b: a - math.trunc(a / b) * b, lambda a, b: a - _quotient(a, b) * b),
+    "min": _extreme(True),
+    "max": _extreme(False),
+    "sum": total,
+    "product": product,
+    "size": _size,
+    "ndims": lambda a: len(sizes(a)),
+    "fill": filled,
+    "zeros": lambda *n: filled(0.0, *n),
+    "ones": lambda *n: filled(1.0, *n),
+    "identity": lambda n: [[1.0 if i == j else 0.0 for j in range(n)] for i in range(n)],
+    "diagonal": lambda v: [[v[i] if i == j else 0.0 for j in range(len(v))] for i in range(len(v))],
+    "linspace": _linspace,
+    "cat": concatenated,
+    "promote": promoted,
+    "transpose": transposed,
+    "cross": _cross,
+    "skew": lambda x: [[0, -x[2], x[1]], [x[2], 0, -x[0]], [-x[1], x[0], 0]],
+    "outerProduct": lambda a, b: [[x * y for y in b] for x in a],
+    "scalar": lambda a: flattened(a)[0],
+    "vector": flattened,
+    "matrix": lambda a: promoted(a, 2),
+    "semiLinear": _semi_linear,
+    "homotopy": lambda actual, simplified: actual,
+    "String": _text,
+    "Integer": _boolean_as_integer,
+    "cardinality": lambda a: 0,
+}
+
+
+def power(a: Value, b: Value) -> Value:
+    if isinstance(a, int | float) and isinstance(b, int | float):
+        return a**b if a >= 0 or float(b).is_integer() else math.nan
+    if isinstance(b, float) and b.is_integer():
+        b = int(b)
+    return sympy.sympify(a) ** b
+
+
+def quotient(a: Value, b: Value) -> Value:
+    if isinstance(a, int | float) and isinstance(b, int | float):
+        if b == 0:
+            raise ModelError(f"division of {a} by zero")
+        return a / b
+    if isinstance(b, int | float) and b == 0:
+        raise ModelError(f"division of {a} by zero")
+    return a / sympy.Float(b) if isinstance(b, int | float) and is_constant(b) else a / b

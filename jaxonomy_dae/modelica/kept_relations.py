@@ -1,0 +1,70 @@
+"""Relations that discrete equations read: each has one truth at a time, kept in a hidden discrete variable.
+
+Between events the truth is kept, as in Modelica. So all modes of an instant see the same truth, where a quantity rests at
+the level too, and continuous equations see the one that the modes see.
+"""
+
+from typing import Any
+
+import sympy
+
+from ..modeling.automatic_events import Splitting, Turning, turned, varies
+from ..modeling.component import Component
+from ..modeling.events import LIVE
+from ..modeling.symbols import RelationSymbol
+from .values import Value, plain
+
+_ORDER = (sympy.StrictGreaterThan, sympy.GreaterThan, sympy.StrictLessThan, sympy.LessThan)
+
+
+class KeptRelations:
+    """The relations of a component whose truth is kept."""
+
+    def __init__(self, component: Component):
+        self.component = component
+        self.forms: dict[Any, tuple[Any, Any]] = {}  # (form in equations, form in conditions of events)
+
+    def in_events(self, condition: Value) -> Value:
+        """A condition of an event in kept truths. One relation alone stays as it is: it is found where it turns."""
+        if isinstance(condition, bool) or isinstance(condition, _ORDER):
+            return condition
+        return plain(self._replaced(condition, 1))
+
+    def in_equations(self, expression: Any) -> Any:
+        """An expression with relations that events read replaced by their kept truths."""
+        if not self.forms:
+            return expression
+        found = {r: self._form(r, 0) for r in expression.atoms(*_ORDER) if self._known(r)}
+        return expression.xreplace(found) if found else expression
+
+    def _replaced(self, condition: Any, form: int) -> Any:
+        if isinstance(condition, _ORDER) and varies(condition):
+            return self._form(condition, form)
+        if isinstance(condition, sympy.And | sympy.Or | sympy.Not):
+            return condition.func(*(self._replaced(part, form) for part in condition.args))
+        return condition
+
+    def _known(self, relation: Any) -> bool:
+        return relation in self.forms or sympy.Not(relation) in self.forms
+
+    def _form(self, relation: Any, form: int) -> Any:
+        opposite = sympy.Not(relation)
+        if opposite in self.forms:
+            return sympy.Not(self.forms[opposite][form])
+        if relation not in self.forms:
+            self.forms[relation] = self._kept(relation)
+        return self.forms[relation][form]
+
+    def _kept(self, relation: Any) -> tuple[Any, Any]:
+        """Declares the variable that keeps the truth of a relation, and the events that set it."""
+        c = self.component
+        numbers = Splitting(len(c.relations))
+        live, guarded = numbers.split(relation)
+        for each in numbers.timed.values():
+            c.relations.extend(each.starts)
+            c._ticks(each)
+        if numbers.timed and not varies(guarded):
+            return live, guarded
+        known: Any = c._hidden_discrete(float(LIVE))
+        c._turns(Turning(known.number, guarded, sympy.true))
+        return turned(known.number, relation), sympy.Eq(RelationSymbol(known.number), 1)

@@ -1,0 +1,129 @@
+"""Modelica's tables: interpolation that the Modelica library calls in C.
+
+A table with a constant argument is a number; with another one it is a `Piecewise` polynomial, so that a table over time
+has its corners at times known beforehand.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import scipy.interpolate
+import sympy
+
+from ..errors import ModelError
+from ..modeling.automatic_events import smooth
+from .values import Value
+
+# The literals of Modelica.Blocks.Types.Smoothness and Extrapolation.
+LINEAR, AKIMA, CONSTANT, FRITSCH_BUTLAND, STEFFEN, MODIFIED_AKIMA = 1, 2, 3, 4, 5, 6
+HOLD, LAST_TWO, PERIODIC, NONE = 1, 2, 3, 4
+NEVER = 1e60  # a time event that does not come: corners of a table over time are found from its Piecewise
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """Rows of abscissa and values; `start`, `offset` shift and begin a table over time."""
+
+    rows: np.ndarray
+    columns: list[int]
+    smoothness: int
+    extrapolation: int
+    start: float = -np.inf
+    shift: float = 0.0
+
+    def value(self, column: int, u: Value, events: bool) -> Value:
+        """The value at `u` of the given one of the columns, counted from 1."""
+        x = self.rows[:, 0] + self.shift
+        y = self.rows[:, int(self.columns[int(column) - 1]) - 1]
+        if len(x) == 1:
+            return float(y[0])
+        if self.extrapolation == PERIODIC:
+            period = float(x[-1] - x[0])
+            u = x[0] + (sympy.Mod(u - x[0], period) if isinstance(u, sympy.Expr) else (u - x[0]) % period)
+        pieces = self._pieces(x, y)
+        if isinstance(u, int | float):
+            k = max(int(np.searchsorted(x, u, side="right")) - 1, 0)
+            k, beyond = min(k, len(pieces) - 1), not x[0] <= u < x[-1]
+            return float(self._ends(pieces, x, y, u)[0 if u < x[0] else 1]) if beyond else float(pieces[k](u))
+        low, high = self._ends(pieces, x, y, u)
+        branches = [(low, u < float(x[0]))]
+        branches += [(p(u), u < float(x[k + 1])) for k, p in enumerate(pieces) if x[k + 1] > x[k]]
+        out = sympy.Piecewise(*branches, (high, True), evaluate=False)
+        return out if events else smooth(out)
+
+    def _ends(self, pieces: list[Callable], x: np.ndarray, y: np.ndarray, u: Value) -> tuple[Value, Value]:
+        """The values before the first and after the last abscissa."""
+        if self.extrapolation == LAST_TWO and self.smoothness == CONSTANT:
+            return float(y[0]), float(y[-1])
+        if self.extrapolation in (LAST_TWO, PERIODIC):
+            return _line(pieces[0], x[0], y[0], u), _line(pieces[-1], x[-1], y[-1], u)
+        return float(y[0]), float(y[-1])
+
+    def _pieces(self, x: np.ndarray, y: np.ndarray) -> list[Callable[[Value], Value]]:
+        """A polynomial for each interval."""
+        if self.smoothness == CONSTANT:
+            return [_polynomial((float(v),), 0.0) for v in y[:-1]]
+        if self.smoothness == LINEAR or len(x) == 2:
+            slopes = np.divide(np.diff(y), np.diff(x), out=np.zeros(len(x) - 1), where=np.diff(x) > 0)
+            return [_polynomial((float(s), float(v)), float(a)) for s, v, a in zip(slopes, y, x, strict=False)]
+        if (np.diff(x) <= 0).any():
+            raise ModelError("a smooth table needs rising abscissae")
+        if self.smoothness in (AKIMA, MODIFIED_AKIMA):
+            method = "akima" if self.smoothness == AKIMA else "makima"
+            found = scipy.interpolate.Akima1DInterpolator(x, y, method=method)
+        else:
+            found = scipy.interpolate.PchipInterpolator(x, y)
+        return [_polynomial(tuple(map(float, c)), float(a)) for c, a in zip(found.c.T, x, strict=False)]
+
+
+def _polynomial(coefficients: tuple[float, ...], at: float) -> Callable[[Value], Value]:
+    def value(u: Value) -> Value:
+        out: Value = coefficients[0]
+        for c in coefficients[1:]:
+            out = out * (u - at) + c
+        return sympy.Float(out) if isinstance(out, float) and isinstance(u, sympy.Expr) else out
+
+    return value
+
+
+def _line(piece: Callable[[Value], Value], x: float, y: float, u: Value) -> Value:
+    """The tangent of a polynomial at an end of its interval."""
+    t = sympy.Symbol("t")
+    slope = sympy.diff(sympy.sympify(piece(t)), t)
+    return float(y) + float(slope.subs(t, float(x))) * (u - float(x))
+
+
+def _numbers(table: Value, name: str, file: str) -> np.ndarray:
+    if file not in ("NoName", ""):
+        raise ModelError(f"the table '{name}' is in the file '{file}', which is not read")
+    return np.array(table, float)
+
+
+def table_1d(
+    name: str, file: str, table: Value, columns: list[int], smoothness: int = LINEAR, extrapolation: int = LAST_TWO,
+    *_: Value,
+) -> Table:  # fmt: skip
+    return Table(_numbers(table, name, file), columns, smoothness, extrapolation)
+
+
+def time_table(
+    name: str, file: str, table: Value, start: float, columns: list[int], smoothness: int = LINEAR,
+    extrapolation: int = LAST_TWO, shift: float = 0.0, *_: Value,
+) -> Table:  # fmt: skip
+    return Table(_numbers(table, name, file), columns, smoothness, extrapolation, start, shift)
+
+
+EXTERNALS: dict[str, Callable[..., Value]] = {
+    "Modelica.Blocks.Types.ExternalCombiTable1D": table_1d,
+    "Modelica.Blocks.Types.ExternalCombiTimeTable": time_table,
+    "ModelicaStandardTables_CombiTable1D_getValue": lambda table, column, u: table.value(column, u, False),
+    "ModelicaStandardTables_CombiTable1D_minimumAbscissa": lambda table: float(table.rows[0, 0]),
+    "ModelicaStandardTables_CombiTable1D_maximumAbscissa": lambda table: float(table.rows[-1, 0]),
+    "ModelicaStandardTables_CombiTimeTable_getValue": lambda table, column, t, *_: table.value(column, t, True),
+    "ModelicaStandardTables_CombiTimeTable_minimumTime": lambda table: float(table.rows[0, 0]),
+    "ModelicaStandardTables_CombiTimeTable_maximumTime": lambda table: float(table.rows[-1, 0]),
+    "ModelicaStandardTables_CombiTimeTable_nextTimeEvent": lambda *_: NEVER,
+    "ModelicaInternal_print": lambda *_: None,
+    "ModelicaStreams_closeFile": lambda *_: None,
+}
