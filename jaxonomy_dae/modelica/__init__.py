@@ -1,6 +1,6 @@
-"""Models written in Modelica."""
+"""Models written in Modelica: flat text in, components out."""
 
 from .component import FlatComponent as FlatComponent
-from .component import FlatModel as FlatModel
-from .component import flat_model as flat_model
+from .flat_model import FlatModel as FlatModel
+from .flat_model import load as load
 from .read_base import read_base as read_base

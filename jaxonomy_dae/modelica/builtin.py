@@ -156,7 +156,7 @@ FUNCTIONS: dict[str, Callable[..., Value]] = {
     "log": _of_numbers(math.log, sympy.log),
     "log10": _of_numbers(math.log10, lambda x: sympy.log(x) / math.log(10.0)),
     "sqrt": _of_numbers(math.sqrt, sympy.sqrt),
-    "abs": _of_numbers(abs, lambda x: smooth(sympy.Abs(x))),
+    "abs": _of_numbers(lambda x: x if x >= 0 else -x, lambda x: smooth(sympy.Abs(x))),
     "sign": _of_numbers(_sign, lambda x: smooth(sympy.sign(x))),
     "floor": _of_numbers(math.floor, sympy.floor),
     "ceil": _of_numbers(math.ceil, sympy.ceiling),

@@ -2,10 +2,17 @@
 
 import dataclasses
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..errors import ModelError
 from .tree import Assignment, Branches, Call, Class, Effect, Equality, Expression, Loop, Reference, Several, Statement
+
+
+class OfAlgorithm(NamedTuple):
+    """Stands for what an algorithm assigns to a variable: the number of the algorithm, and the variable's name."""
+
+    number: int
+    name: str
 
 
 @dataclasses.dataclass
@@ -50,6 +57,7 @@ def find_definitions(model: Class, is_discrete: Callable[[str], bool]) -> Discre
     ]
     candidates = [(s, _definable(s, is_discrete, by_when)) for s in [*others, *bindings]]
     equations: list[Statement] = [s for s, sides in candidates if not sides]
+    of: dict[str, Any]
     of, left = _matched([(s, sides) for s, sides in candidates if sides], is_discrete)
     equations += left
     assigned = []
@@ -60,24 +68,13 @@ def find_definitions(model: Class, is_discrete: Callable[[str], bool]) -> Discre
             if is_discrete(name):
                 of[name] = k
             else:
-                equations.append(Equality(Reference((name,), ((),)), OfAlgorithm(k, name), _line(section)))
+                equations.append(Equality(Reference((name,), ((),)), OfAlgorithm(k, name), section[0].line))  # type: ignore[arg-type]
     read_before = {name for s in [*model.equations, *model.algorithms, *bindings] for name in _read_before(s)}
     followed = [name for name in of if name in read_before and name not in by_when]
     return DiscreteDefinitions(
         of, by_when | set(followed), followed, equations, whens,
         [*model.initial_equations, *(s for a in model.initial_algorithms for s in a)], algorithms, assigned,
     )  # fmt: skip
-
-
-def _line(statements: tuple[Statement, ...]) -> int:
-    return statements[0].line if statements else 0
-
-
-class OfAlgorithm:
-    """Stands for what an algorithm assigns to a variable."""
-
-    def __init__(self, number: int, name: str):
-        self.number, self.name = number, name
 
 
 def _definable(s: Statement, is_discrete: Callable[[str], bool], by_when: set[str]) -> list[tuple[str, Expression]]:

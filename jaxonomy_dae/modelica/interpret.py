@@ -1,7 +1,7 @@
 """Evaluates Modelica expressions and algorithms over symbols: what is constant is computed, the rest becomes SymPy.
 
-Functions are carried out statement by statement. An `if` whose condition is not constant is carried out in both branches,
-and what they assign is joined by a choice; loops must have constant bounds.
+Functions are carried out statement by statement. An `if` whose condition is not constant is carried out in both
+branches, and a choice joins what they assign. Loops must have constant bounds.
 """
 
 from collections.abc import Callable, Mapping
@@ -72,17 +72,18 @@ class Interpreter:
     - `classes`: functions, records and enumerations, by name.
     - `names`: what a name of the model means.
     - `special`: calls that only the model can answer, such as `pre`, by name: from the arguments as written.
+    - `externals`: functions in place of those that are written in C, by name.
     """
 
     def __init__(
         self,
         classes: Mapping[str, Class],
         names: Names,
-        special: Mapping[str, Callable[..., Value]] | None = None,
+        special: Mapping[str, Callable[..., Value]],
+        externals: Mapping[str, Callable[..., Value]],
     ):
         self.classes, self.names = classes, names
-        self.special = special or {}
-        self.externals: dict[str, Callable[..., Value]] = {}
+        self.special, self.externals = special, externals
         self.literals = {
             f"{c.name}.{literal}": k for c in classes.values() for k, literal in enumerate(c.literals, start=1)
         }
@@ -128,6 +129,10 @@ class Interpreter:
                 value = self._entry(_field(value, field), subscripts, names)
             return value
         raise ModelError(f"'{e.path}' is not declared")
+
+    def name_of(self, e: Reference) -> str:
+        """The name of a variable that is declared by itself, an entry of an array among them."""
+        return (self._entry_name(e, self.names) if any(e.subscripts) else None) or e.path
 
     def _entry_name(self, e: Reference, names: Names) -> str | None:
         """The name of an entry that is declared by itself, as 'x[2]'."""

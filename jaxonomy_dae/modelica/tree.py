@@ -192,8 +192,8 @@ class Declaration(NamedTuple):
 
 
 class Class(NamedTuple):
-    """A model, function, record, package or type. `literals` are those of an enumeration, `base` what a short definition
-    stands for. `external` is the called C function, if there is one."""
+    """A model, function, record, package or type. `literals` are those of an enumeration, `base` is what a short
+    definition stands for. `external` is the called C function, if there is one."""
 
     kind: str
     name: str

@@ -116,7 +116,8 @@ def parts_of_choice(value: Value) -> list[tuple[Value, Value]]:
         return [(value, True)]
     out: list[tuple[Value, Value]] = []
     otherwise: Value = True
-    for branch, condition in value.args:
+    branches: tuple[Any, ...] = value.args
+    for branch, condition in branches:
         here = both(otherwise, plain(condition))
         out.extend((v, both(here, c)) for v, c in parts_of_choice(branch))
         otherwise = both(otherwise, negated(plain(condition)))

@@ -11,7 +11,7 @@ from ..errors import ModelError, nearest
 from .arrays import ComponentArray, make_array
 from .connections import Connection, Signal, resolve_ends
 from .construction import Construction
-from .declarations import START, Account, Learned, Parameter, Variable, full_name
+from .declarations import INITIALLY, START, Account, Learned, Parameter, Variable, full_name
 from .environment import EqnEnv
 from .equations import residual_of
 from .events import HeldBranch, When
@@ -323,6 +323,29 @@ class Component(ModeDeclarations, metaclass=Construction):
             raise ModelError(f"component '{self.name}': {derivative} has a start already")
         self._check_open(f"say the start of {derivative}")
         self.add_equations(sympy.Eq(self._declare(name, "start", value, fixed), derivative, evaluate=False))
+
+    def initially(self, *equations: Any) -> None:
+        """Adds equations that hold at the initial time: `self.initially(Eq(der(T), 0))` starts at rest.
+
+        Each takes the place of one fixed start. Starts that are not fixed give way.
+
+        **Arguments:**
+
+        - `equations`: SymPy `Eq`s, or expressions that are zero, in variables, their derivatives and parameters.
+
+        **Raises:**
+
+        - `ModelError` for what is not an equation.
+        """
+        self._check_open("add its initial equations")
+        for equation in equations:
+            try:
+                residual = residual_of(equation)
+            except (ModelError, TypeError) as error:
+                raise ModelError(f"component '{self.name}': initially: {error}") from None
+            number = sum(name.startswith(INITIALLY) for name in self.variables)
+            symbol = self._declare(f"{INITIALLY}[{number}]", "event", 0.0, True)
+            self.equations.append(symbol - residual)
 
     def input(self, name: str, default: float | None = None, unit: str = "") -> VariableSymbol:
         """Declares an input: a function of time given to `simulate(inputs={"component.name": ...})`.

@@ -9,6 +9,7 @@ import sympy
 from .interval import Interval
 from .symbols import TimeSymbol, VariableSymbol
 
+INITIALLY = ":initially"  # begins the names of what is zero at the initial time
 START = ":start"  # ends the name of what is declared by the start of a derivative
 Value: TypeAlias = float | int | sympy.Expr  # a number, or an expression in parameters
 

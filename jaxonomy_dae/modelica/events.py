@@ -1,0 +1,177 @@
+"""What happens at events of a flat model: modes that follow their equations, and `when`.
+
+A mode m = f(pre(m), relations, reals) is a discrete variable with one event for each value that f can take: it happens
+where f has that value and m has not. Events of one instant are repeated until none is left, so that m = f(m) then, with
+the continuous variables of their loop solved for in between: the event iteration of the Modelica Language Specification
+3.6, Appendix B.
+"""
+
+from collections.abc import Iterator
+from typing import Any
+
+import sympy
+
+from ..errors import ModelError
+from ..modeling.events import Sampled, assign, pre, reinit, terminate
+from ..modeling.symbols import DiscreteSymbol, VariableSymbol
+from .scope import Scope
+from .tree import (
+    Array,
+    Assignment,
+    Binary,
+    Branches,
+    Call,
+    Effect,
+    Equality,
+    Expression,
+    Reference,
+    Several,
+    Statement,
+    Unary,
+)
+from .values import Value, as_condition, as_number, both, chosen, is_condition, negated, parts_of_choice, plain
+
+
+def write_mode(scope: Scope, name: str) -> None:
+    """Adds the events by which a discrete variable follows its equation."""
+    m: Any = DiscreteSymbol(name)
+    value = scope.defined(name, scope.definitions.of[name])
+    if is_condition(value):
+        cases = [(sympy.Integer(1), as_condition(value)), (sympy.Integer(0), negated(value))]
+    else:
+        cases = parts_of_choice(sympy.sympify(value))
+    for result, holds in cases:
+        if result == m:
+            continue
+        if any(isinstance(s, VariableSymbol) for s in sympy.sympify(result).free_symbols):
+            raise ModelError(f"its value {result} changes in time")
+        condition = scope.kept.in_events(both(holds, plain(sympy.Ne(m, result))))
+        if not isinstance(condition, bool):
+            scope.component._event(condition, (assign(m, result),), None, True, noted=False, revocable=True)
+
+
+def write_end_of_start(scope: Scope) -> None:
+    """Ends the initial time, after all else that happens there: events of one instant happen in the order of their
+    declaration."""
+    if scope.initial is not None:
+        starts: Any = sympy.Eq(scope.initial, 1)
+        scope.component._event(starts, (assign(scope.initial, 0),), None, True, noted=False)
+
+
+def write_when(scope: Scope, s: Branches) -> None:
+    """Adds the events of a `when`."""
+    earlier: list[Value] = []
+    for condition, body in s.branches:
+        conditions = [_event(scope, each, body, earlier) for each in _each_condition(condition)]
+        earlier += [c for c in conditions if c is not None]
+
+
+def _event(scope: Scope, condition: Expression, body: tuple[Statement, ...], earlier: list[Value]) -> Value:
+    """Adds one event; returns its condition, or None for a clock. The event of an `elsewhen` does not happen while an
+    earlier condition holds."""
+    parts = _conjuncts(condition)
+    values = [scope.evaluate(_inner(p)) for p in parts]
+    clocks = [v for v in values if isinstance(v, Sampled)]
+    holds: Value = True
+    for v in [v for v in values if not isinstance(v, Sampled)] + [negated(e) for e in earlier]:
+        holds = both(holds, v)
+    if holds is False or (holds is True and not clocks):
+        return None  # it never becomes true
+    at_start = any(isinstance(p, Call) and p.function == "initial" for p in parts)
+    actions = _actions(scope, body, holds if clocks else True)
+    if actions:
+        happens = clocks[0] if clocks else scope.kept.in_events(holds)
+        scope.component.when(happens, *actions, at_start=at_start)
+    return None if clocks else holds
+
+
+def _actions(scope: Scope, body: tuple[Statement, ...], only_if: Value) -> list[Any]:
+    scope.in_action = True
+    try:
+        found = list(_each_action(scope, body))
+    finally:
+        scope.in_action = False
+    out = []
+    for target, value in found:
+        if isinstance(target, str):
+            out.append(terminate(target))
+        elif isinstance(target, DiscreteSymbol):
+            out.append(assign(target, chosen(only_if, as_number(value), pre(target))))
+        else:
+            out.append(reinit(target, chosen(only_if, value, target)))
+    return out
+
+
+def _each_action(scope: Scope, body: tuple[Statement, ...]) -> Iterator[tuple[Any, Value]]:
+    """Pairs (variable, new value); a text for `terminate`."""
+    for s in body:
+        if isinstance(s, Effect):
+            name, arguments = s.call.function, s.call.arguments
+            if name == "reinit":
+                yield scope.evaluate(arguments[0]), sympy.sympify(scope.evaluate(arguments[1]))
+            elif name == "terminate":
+                yield str(scope.evaluate(arguments[0])), None
+        elif isinstance(s, Equality | Assignment):
+            target, value = (s.left, s.right) if isinstance(s, Equality) else (s.target, s.value)
+            yield from _assigned(scope, target, scope.evaluate(value))
+        elif isinstance(s, Branches) and s.kind == "if":
+            yield from _chosen_actions(scope, s)
+        else:
+            raise ModelError(f"a {type(s).__name__.lower()} in a when")
+
+
+def _assigned(scope: Scope, target: Expression, value: Value) -> Iterator[tuple[Any, Value]]:
+    if isinstance(target, Several):
+        for each, v in zip(target.entries, value, strict=False):
+            if each is not None:
+                yield from _assigned(scope, each, v)
+        return
+    if not isinstance(target, Reference):
+        raise ModelError("in a when, a variable stands on the left")
+    name = scope.interpreter.name_of(target)
+    if name not in scope.definitions.stored:
+        raise ModelError(f"'{name}' cannot be assigned in a when")
+    if not isinstance(value, str):
+        yield DiscreteSymbol(name), sympy.sympify(as_number(value))
+
+
+def _chosen_actions(scope: Scope, s: Branches) -> Iterator[tuple[Any, Value]]:
+    """An `if` within a when: each target has the value of the branch that holds, or the one before."""
+    found: dict[Any, list[tuple[Value, Value]]] = {}
+    otherwise: Value = True
+    for condition, body in s.branches:
+        holds = as_condition(scope.evaluate(condition))
+        here = both(otherwise, holds)
+        for target, value in _each_action(scope, body) if here is not False else ():
+            if isinstance(target, str):
+                raise ModelError("terminate under an if in a when")
+            found.setdefault(target, []).append((here, value))
+        otherwise = both(otherwise, negated(holds))
+        if otherwise is False:
+            break
+    for target, cases in found.items():
+        value: Value = pre(target)
+        for condition, result in reversed(cases):
+            value = chosen(condition, result, value)
+        yield target, value
+
+
+def _conjuncts(e: Expression) -> list[Expression]:
+    """The conditions that `and` joins."""
+    if isinstance(e, Binary) and e.operator == "and":
+        return [*_conjuncts(e.left), *_conjuncts(e.right)]
+    return [e]
+
+
+def _each_condition(condition: Expression) -> tuple[Expression, ...]:
+    """The conditions of which each makes the event: the entries of an array; `change(b)` is b and not b."""
+    if isinstance(condition, Array):
+        return tuple(c for entry in condition.entries for c in _each_condition(entry))
+    if isinstance(condition, Call) and condition.function == "change":
+        return (condition.arguments[0], Unary("not", condition.arguments[0]))
+    return (condition,)
+
+
+def _inner(condition: Expression) -> Expression:
+    """The condition whose change to true makes an event: `edge(b)` is that of b."""
+    return condition.arguments[0] if isinstance(condition, Call) and condition.function == "edge" else condition

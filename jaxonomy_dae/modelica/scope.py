@@ -1,0 +1,314 @@
+"""What the names of a flat model mean, and the declarations that they need.
+
+A Real variable is a variable of the component, a Real parameter becomes a parameter where it is first read, other
+parameters are constants. Boolean, Integer and enumeration variables are of two kinds: those that are kept from event to
+event are discrete variables; the others are expressions, put in wherever they are read.
+"""
+
+import re
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import sympy
+
+from ..errors import ModelError
+from ..modeling.component import Component
+from ..modeling.symbols import DiscreteSymbol, ParameterSymbol, PreviousSymbol, der
+from .definitions import assigned_in, find_definitions
+from .flat_model import FlatModel
+from .interpret import Interpreter
+from .kept_relations import KeptRelations
+from .tables import EXTERNALS
+from .tree import Assignment, Declaration, Equality, Expression, Reference, Truth
+from .values import Record, Value, as_number, both, is_condition, negated, plain
+
+REAL = "Real"
+_TEXTS = ("String", "StateSelect", "AssertionLevel")
+_CONSTANT = {"parameter", "constant"}
+
+
+class Scope:
+    """The names of a flat model that is being written into a component.
+
+    - `interpreter`: evaluates expressions in these names.
+    - `definitions`: which statement determines which variable.
+    - `kept`: relations whose truth is kept between events.
+    - `in_action`: True while values are evaluated that an event writes: `pre(m)` is then the value before it.
+    - `initial`: the discrete variable that is 1 at the initial time; None if nothing asks for it.
+    """
+
+    def __init__(self, flat: FlatModel, component: Component):
+        self.flat, self.component = flat, component
+        self.declared = {d.name: d for d in flat.model.declarations}
+        self.known: dict[str, Value] = {"time": component.ev.t}
+        self.entries, self.fields = _gather(self.declared)
+        self.being: list[str] = []
+        special: dict[str, Callable[..., Value]] = {
+            "pre": self._pre, "edge": self._edge, "change": self._change, "initial": self._initial,
+            "terminal": lambda: False, "sample": self._sample, "delay": _delay,
+        }  # fmt: skip
+        self.interpreter = Interpreter(flat.classes, self.value, special, EXTERNALS)
+        self.definitions = find_definitions(flat.model, self.is_discrete)
+        self.kept = KeptRelations(component)
+        self.in_action = False
+        self.initial: Any = None
+
+    def evaluate(self, e: Expression) -> Value:
+        return self.interpreter.evaluate(e)
+
+    def is_discrete(self, name: str) -> bool:
+        """True for variables that change at events only."""
+        d = self.declared.get(name)
+        if d is None or d.prefixes & _CONSTANT:
+            return False
+        return "discrete" in d.prefixes or self.kind(d.type) != REAL
+
+    def kind(self, name: str) -> str:
+        """Real, Integer, Boolean or String: what a type is made of; an enumeration is an Integer."""
+        c = self.flat.classes.get(name)
+        if c is None:
+            return name
+        if c.literals:
+            return "Integer"
+        return self.kind(c.base.type) if c.base is not None else name
+
+    def value(self, name: str) -> Value:
+        if name in self.known:
+            return self.known[name]
+        d = self.declared.get(name)
+        if d is None:
+            return self.known.setdefault(name, self._gathered(name))
+        if name in self.being:
+            circle = " → ".join([*self.being[self.being.index(name) :], name])
+            raise ModelError(f"the values of {circle} depend on each other")
+        self.being.append(name)
+        before_action, self.in_action = self.in_action, False
+        try:
+            value = self._constant(d) if d.prefixes & _CONSTANT else self._expression_of(d)
+        finally:
+            self.being.pop()
+            self.in_action = before_action
+        self.known[name] = value
+        return value
+
+    def _gathered(self, name: str) -> Value:
+        """An array or a record whose entries are declared one by one."""
+        if name in self.entries:
+            return self._array_of(name, self.entries[name], 0)
+        if name in self.fields:
+            return Record({f: self.value(f"{name}.{f}") for f in self.fields[name]})
+        raise KeyError(name)
+
+    def _array_of(self, name: str, places: list[tuple[int, ...]], depth: int) -> Value:
+        """The array of the entries at these places, which have equal numbers before `depth`."""
+        out = []
+        for k in sorted({p[depth] for p in places}):
+            inside = [p for p in places if p[depth] == k]
+            if len(inside[0]) > depth + 1:
+                out.append(self._array_of(name, inside, depth + 1))
+            else:
+                out.append(self.value(f"{name}[{','.join(map(str, inside[0]))}]"))
+        return out
+
+    def _constant(self, d: Declaration) -> Value:
+        """The value of a parameter: a symbol for a Real, which is then a parameter of the component."""
+        if d.value is None or self._is_unknown(d):
+            found = self._initial_algorithm(d.name)
+            if isinstance(found, int | float | bool):
+                return self._as_parameter(d, found)
+        if self._is_unknown(d):
+            return self._unknown_parameter(d)
+        if d.value is None and "start" in d.modifiers and self.kind(d.type) != REAL:
+            return self.evaluate(d.modifiers["start"])
+        if d.value is None:
+            if self.kind(d.type) == REAL and not d.dimensions:
+                start = d.modifiers.get("start")
+                return 0.0 if start is None else self._as_parameter(d, self.evaluate(start))
+            raise ModelError(f"the parameter '{d.name}' has no value")
+        return self._as_parameter(d, self.evaluate(d.value))
+
+    def _initial_algorithm(self, name: str) -> Value:
+        """What an initial algorithm assigns to a parameter; None if none does."""
+        for statements in self.flat.model.initial_algorithms:
+            if name not in assigned_in(statements):
+                continue
+            local: dict[str, Value] = {}
+            self.interpreter.execute(
+                statements, local, lambda n, local=local: local[n] if n in local else self.value(n)
+            )
+            self.known.update(local)
+            return local.get(name)
+        return None
+
+    def _as_parameter(self, d: Declaration, value: Value) -> Value:
+        if self.kind(d.type) != REAL or "constant" in d.prefixes or isinstance(value, list):
+            return value
+        if isinstance(value, int | float):
+            value = float(value)
+        elif not isinstance(value, sympy.Expr):
+            return value
+        elif any(not isinstance(s, ParameterSymbol) or isinstance(s, DiscreteSymbol) for s in value.free_symbols):
+            return value
+        return self.component.parameter(d.name, value, unit=self._unit(d))
+
+    def _unit(self, d: Declaration) -> str:
+        value = d.modifiers.get("unit")
+        return "" if value is None else str(getattr(value, "text", ""))
+
+    def _expression_of(self, d: Declaration) -> Value:
+        """What a Boolean or Integer variable is, in terms of what it depends on."""
+        found = self.definitions.of.get(d.name)
+        if found is None:  # an input of the model that nothing drives
+            start = self._start(d.modifiers.get("start")) or 0
+            return bool(start) if self.kind(d.type) == "Boolean" else int(start)
+        return self.defined(d.name, found)
+
+    def defined(self, name: str, found: Any) -> Value:
+        if isinstance(found, int):  # the number of an algorithm
+            values = self.algorithm(found)
+            self.known.update({k: v for k, v in values.items() if k not in self.known})
+            return values[name]
+        return self.evaluate(found)
+
+    def algorithm(self, number: int) -> dict[str, Value]:
+        """What an algorithm assigns."""
+        statements = self.definitions.algorithms[number]
+        local: dict[str, Value] = {}
+        for name in self.definitions.assigned[number]:
+            if name in self.definitions.stored:
+                local[name] = self.stored(name)
+
+        def names(name: str) -> Value:
+            return local[name] if name in local else self.value(name)
+
+        self.interpreter.execute(statements, local, names)
+        return local
+
+    # --- declarations ------------------------------------------------------------------------------------------------
+
+    def declare_variables(self) -> None:
+        for d in self.flat.model.declarations:
+            kind = self.kind(d.type)
+            if d.prefixes & _CONSTANT:
+                if self._is_unknown(d):
+                    self.value(d.name)
+                continue
+            if kind in _TEXTS:
+                continue
+            if d.name in self.definitions.stored:
+                self._declare_stored(d)
+            elif not self.is_discrete(d.name):
+                self._declare_real(d)
+
+    def _is_unknown(self, d: Declaration) -> bool:
+        return d.modifiers.get("fixed") == Truth(False) and self.kind(d.type) == REAL
+
+    def _unknown_parameter(self, d: Declaration) -> Value:
+        """A parameter that initial equations determine: a variable that does not change. If one of them just says
+        what it is, it is a parameter."""
+        value = self._said_initially(d.name)
+        if isinstance(value, int | float):
+            return self._as_parameter(d, value)
+        start = d.modifiers.get("start") if d.value is None else d.value
+        symbol = self.component.variable(d.name, start=self._start(start), unit=self._unit(d))
+        self.component.add_equations(sympy.Eq(der(symbol), 0, evaluate=False))
+        return symbol
+
+    def _said_initially(self, name: str) -> Value:
+        """The value that an initial equation gives to a parameter by itself; None if there is none."""
+        for s in self.definitions.initial:
+            if isinstance(s, Equality | Assignment):
+                target, value = (s.left, s.right) if isinstance(s, Equality) else (s.target, s.value)
+                if isinstance(target, Reference) and target.path == name and not any(target.subscripts):
+                    try:
+                        return self.interpreter.evaluate(value, self._at_start)
+                    except ModelError:
+                        return None
+        return None
+
+    def _at_start(self, name: str) -> Value:
+        return self.flat.experiment.get("StartTime", 0.0) if name == "time" else self.value(name)
+
+    def _declare_stored(self, d: Declaration) -> None:
+        start = self._start(d.modifiers.get("start"))
+        start = 0 if start is None else as_number(start)
+        self.component.discrete(d.name, start=start)
+        self.known[d.name] = self.stored(d.name)
+
+    def stored(self, name: str) -> Value:
+        symbol = DiscreteSymbol(name)
+        return sympy.Eq(symbol, 1) if self.kind(self.declared[name].type) == "Boolean" else symbol
+
+    def _declare_real(self, d: Declaration) -> None:
+        if self.kind(d.type) != REAL:
+            raise ModelError(f"line {d.line}: '{d.name}' is of the type '{d.type}', which is not known here")
+        nominal = self._start(d.modifiers.get("nominal"))
+        start = self._start(d.modifiers.get("start"))
+        fixed = d.modifiers.get("fixed") == Truth(True)
+        if fixed and start is None:
+            start = 0.0
+        self.known[d.name] = self.component.variable(
+            d.name, start=start, fixed=fixed, unit=self._unit(d),
+            nominal=abs(nominal) if isinstance(nominal, int | float) and nominal else None,
+        )  # fmt: skip
+        if d.value is not None:
+            self.definitions.equations.append(Equality(Reference((d.name,), ((),)), d.value, d.line))
+
+    def _start(self, e: Expression | None) -> Value:
+        """A start value: a number, or an expression in parameters."""
+        if e is None:
+            return None
+        value = self.evaluate(e)
+        if is_condition(value):
+            value = as_number(value)
+        if isinstance(value, sympy.Expr) and any(not isinstance(s, ParameterSymbol) for s in value.free_symbols):
+            return None
+        return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+    def _pre(self, e: Expression) -> Value:
+        value = self.evaluate(e)
+        if not self.in_action:
+            return value  # between events the value before is the present one
+        return before(value)
+
+    def _edge(self, e: Expression) -> Value:
+        now = self.evaluate(e)
+        return both(now, negated(before(now))) if self.in_action else now
+
+    def _change(self, e: Expression) -> Value:
+        now = self.evaluate(e)
+        return negated(plain(sympy.Eq(as_number(now), as_number(before(now)))))
+
+    def _initial(self) -> Value:
+        if self.initial is None:
+            self.component.discrete(":initial", start=1)
+            self.initial = DiscreteSymbol(":initial")
+        return sympy.Eq(self.initial, 1)
+
+    def _sample(self, start: Expression, interval: Expression) -> Value:
+        return self.component.sampled(self.evaluate(interval), self.evaluate(start))
+
+
+def _delay(*_: Expression) -> Value:
+    raise ModelError("delay(…) needs the past of a variable, which is not kept")
+
+
+def _gather(names: Iterable[str]) -> tuple[dict[str, list[tuple[int, ...]]], dict[str, list[str]]]:
+    """(places of the entries, names of the fields) by the name of an array or record that flattening took apart."""
+    entries: dict[str, dict[tuple[int, ...], None]] = {}
+    fields: dict[str, dict[str, None]] = {}
+    for name in names:
+        for end in re.finditer(r"\[([\d,]+)\]", name):
+            place = tuple(map(int, end.group(1).split(",")))
+            entries.setdefault(name[: end.start()], {})[place] = None
+        for dot in re.finditer(r"\.", name):
+            rest = name[dot.end() :]
+            fields.setdefault(name[: dot.start()], {})[re.split(r"[.\[]", rest)[0]] = None
+    return {k: list(v) for k, v in entries.items()}, {k: list(v) for k, v in fields.items()}
+
+
+def before(value: Value) -> Value:
+    """A value before the event."""
+    if not isinstance(value, sympy.Basic):
+        return value
+    return value.xreplace({s: PreviousSymbol(s.path) for s in value.free_symbols if isinstance(s, DiscreteSymbol)})

@@ -1,0 +1,80 @@
+"""The initial equations of a flat model."""
+
+import dataclasses
+
+import sympy
+
+from ..errors import ModelError
+from ..modeling.symbols import DiscreteSymbol, ParameterSymbol, VariableSymbol
+from .continuous import pairs, side_by_side
+from .scope import Scope
+from .tree import Assignment, Branches, Call, Equality, Statement
+from .values import Value, as_number, is_condition
+
+
+def write_initial_equation(scope: Scope, s: Statement) -> None:
+    """Adds what one statement says of the initial time."""
+    if isinstance(s, Branches):
+        found = side_by_side(scope, s)
+    elif isinstance(s, Equality | Assignment):
+        a, b = (s.left, s.right) if isinstance(s, Equality) else (s.target, s.value)
+        if isinstance(a, Call) and a.function == "pre":  # before the first event it is what it starts at
+            a = a.arguments[0]
+        found = pairs(scope.evaluate(a), scope.evaluate(b))
+    else:
+        return
+    for left, right in found:
+        _hold_initially(scope, left, right)
+
+
+def _hold_initially(scope: Scope, left: Value, right: Value) -> None:
+    """A start, where one side is a variable and the other is known beforehand; otherwise an equation at the start."""
+    c = scope.component
+    left, right = _unwrapped(left), _unwrapped(right)
+    for a, b in ((left, right), (right, left)):
+        known = _in_parameters(b)
+        if isinstance(a, DiscreteSymbol):
+            if known:
+                c.parameters[a.path] = c.parameters[a.path].with_value(_plain(b))
+            return
+        if isinstance(a, VariableSymbol) and known:
+            if a.order:
+                c.start(a, b, fixed=True)
+                return
+            variable = c.variables[a.path]
+            if not variable.fixed:
+                c.variables[a.path] = dataclasses.replace(variable, start=sympy.sympify(b), fixed=True)
+                return
+    symbols = {s for side in (left, right) if isinstance(side, sympy.Basic) for s in side.free_symbols}
+    if any(isinstance(s, VariableSymbol) for s in symbols):
+        c.initially(sympy.Eq(left, right, evaluate=False))
+        return
+    difference = _numerical(scope, sympy.sympify(left - right))
+    if difference != 0:
+        raise ModelError(f"the initial equation {left} = {right} does not hold for the declared starts")
+
+
+def _numerical(scope: Scope, value: Value) -> Value:
+    """An expression in parameters and discrete variables at their declared values."""
+    values: dict[sympy.Basic, Value] = {scope.component.ev.t: scope.flat.experiment.get("StartTime", 0.0)}
+    for s in value.free_symbols:
+        if isinstance(s, ParameterSymbol):
+            declared = scope.component.parameters[s.path].value
+            values[s] = _numerical(scope, declared) if isinstance(declared, sympy.Basic) else declared
+    return value.subs(values) if value.free_symbols else value
+
+
+def _unwrapped(value: Value) -> Value:
+    """A truth as a number; that of a Boolean variable as the variable."""
+    if is_condition(value) and isinstance(value, sympy.Eq) and isinstance(value.args[0], DiscreteSymbol):
+        return value.args[0]
+    return as_number(value)
+
+
+def _in_parameters(value: Value) -> bool:
+    symbols = value.free_symbols if isinstance(value, sympy.Basic) else set()
+    return all(isinstance(s, ParameterSymbol) and not isinstance(s, DiscreteSymbol) for s in symbols)
+
+
+def _plain(value: Value) -> Value:
+    return float(value) if isinstance(value, int | float) or value.is_number else value
