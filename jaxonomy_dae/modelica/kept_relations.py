@@ -1,7 +1,7 @@
 """Relations that discrete equations read: each has one truth at a time, kept in a hidden discrete variable.
 
-Between events the truth is kept, as in Modelica. All modes of an instant see the same truth, also where a quantity rests
-at the level, and continuous equations see the one that the modes see.
+Between events the truth is kept, as in Modelica. All modes of an instant see the same truth, also where a quantity
+rests at the level, and continuous equations see the one that the modes see.
 """
 
 from typing import Any

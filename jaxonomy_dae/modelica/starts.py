@@ -1,6 +1,7 @@
 """The initial equations of a flat model."""
 
 import dataclasses
+import math
 
 import sympy
 
@@ -49,8 +50,8 @@ def _hold_initially(scope: Scope, left: Value, right: Value) -> None:
     if any(isinstance(s, VariableSymbol) for s in symbols):
         c.initially(sympy.Eq(left, right, evaluate=False))
         return
-    difference = _numerical(scope, sympy.sympify(left - right))
-    if difference != 0:
+    a, b = (float(_numerical(scope, sympy.sympify(side))) for side in (left, right))
+    if not math.isclose(a, b, rel_tol=1e-9):  # a text has up to sixteen digits
         raise ModelError(f"the initial equation {left} = {right} does not hold for the declared starts")
 
 
