@@ -84,12 +84,19 @@ class Scope:
         self.being.append(name)
         before_action, self.in_action = self.in_action, False
         try:
-            value = self._constant(d) if d.prefixes & _CONSTANT else self._expression_of(d)
+            value = self._found(d)
         finally:
             self.being.pop()
             self.in_action = before_action
         self.known[name] = value
         return value
+
+    def _found(self, d: Declaration) -> Value:
+        if d.prefixes & _CONSTANT:
+            return self._constant(d)
+        if d.name in self.definitions.stored:
+            return self._declare_stored(d)
+        return self._expression_of(d) if self.is_discrete(d.name) else self._declare_real(d)
 
     def _gathered(self, name: str) -> Value:
         """An array or a record whose entries are declared one by one."""
@@ -187,18 +194,15 @@ class Scope:
     # --- declarations ------------------------------------------------------------------------------------------------
 
     def declare_variables(self) -> None:
+        """Declares what is a variable of the component, in the order of the text."""
         for d in self.flat.model.declarations:
-            kind = self.kind(d.type)
             if d.prefixes & _CONSTANT:
                 if self._is_unknown(d):
                     self.value(d.name)
-                continue
-            if kind in _TEXTS:
-                continue
-            if d.name in self.definitions.stored:
-                self._declare_stored(d)
-            elif not self.is_discrete(d.name):
-                self._declare_real(d)
+            elif self.kind(d.type) not in _TEXTS and (
+                d.name in self.definitions.stored or not self.is_discrete(d.name)
+            ):
+                self.value(d.name)
 
     def _is_unknown(self, d: Declaration) -> bool:
         return d.modifiers.get("fixed") == Truth(False) and self.kind(d.type) == REAL
@@ -229,17 +233,17 @@ class Scope:
     def _at_start(self, name: str) -> Value:
         return self.flat.experiment.get("StartTime", 0.0) if name == "time" else self.value(name)
 
-    def _declare_stored(self, d: Declaration) -> None:
+    def _declare_stored(self, d: Declaration) -> Value:
         start = self._start(d.modifiers.get("start"))
         start = 0 if start is None else as_number(start)
         self.component.discrete(d.name, start=start)
-        self.known[d.name] = self.stored(d.name)
+        return self.stored(d.name)
 
     def stored(self, name: str) -> Value:
         symbol = DiscreteSymbol(name)
         return sympy.Eq(symbol, 1) if self.kind(self.declared[name].type) == "Boolean" else symbol
 
-    def _declare_real(self, d: Declaration) -> None:
+    def _declare_real(self, d: Declaration) -> Value:
         if self.kind(d.type) != REAL:
             raise ModelError(f"line {d.line}: '{d.name}' is of the type '{d.type}', which is not known here")
         nominal = self._start(d.modifiers.get("nominal"))
@@ -247,12 +251,12 @@ class Scope:
         fixed = d.modifiers.get("fixed") == Truth(True)
         if fixed and start is None:
             start = 0.0
-        self.known[d.name] = self.component.variable(
+        if d.value is not None:
+            self.definitions.equations.append(Equality(Reference((d.name,), ((),)), d.value, d.line))
+        return self.component.variable(
             d.name, start=start, fixed=fixed, unit=self._unit(d),
             nominal=abs(nominal) if isinstance(nominal, int | float) and nominal else None,
         )  # fmt: skip
-        if d.value is not None:
-            self.definitions.equations.append(Equality(Reference((d.name,), ((),)), d.value, d.line))
 
     def _start(self, e: Expression | None) -> Value:
         """A start value: a number, or an expression in parameters."""

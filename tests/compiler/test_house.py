@@ -12,7 +12,7 @@ ROOT = Path(jaxonomy_dae.__file__).parent
 ORDER = [
     "errors", "optional", "aliases", "tolerances", "private_names", "programs", "expressions", "units", "modeling",
     "structure", "judgement", "linear", "adjoint", "solvers", "hybrid", "model", "diagnosis", "compiler", "lowering",
-    "system", "initialization", "simulation", "learning", "analysis", "plotting", "testing", "library",
+    "system", "initialization", "simulation", "learning", "analysis", "plotting", "testing", "library", "modelica",
 ]  # fmt: skip
 # Methods that hand over to a room above their own, when they are called.
 DEFERRED = {("system", "initialization"), ("simulation", "plotting"), ("analysis", "plotting")}

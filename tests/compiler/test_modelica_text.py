@@ -1,0 +1,201 @@
+"""Reading Base Modelica, and what its expressions become: no model is compiled here."""
+
+import math
+
+import numpy as np
+import pytest
+import sympy
+from modelica_texts import BALL, BLOCK, PIPE
+
+from jaxonomy_dae import EqnEnv, ModelError
+from jaxonomy_dae.modelica import FlatComponent, load, read_base
+from jaxonomy_dae.modelica.interpret import Interpreter
+from jaxonomy_dae.modelica.tables import Table
+from jaxonomy_dae.modelica.tree import Binary, Call, Number, Reference, Unary
+
+
+def value_of(text: str, **names):
+    """The value of an expression with these names."""
+    model = read_base(f"model m Real x; equation x = {text}; end m;")
+    return Interpreter({}, names.__getitem__, {}, {}).evaluate(model.equations[0].right)
+
+
+# --- grammar ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_sign_binds_as_a_sum_does():
+    """-a * b is -(a * b), and a - b - c is (a - b) - c (Modelica Language Specification 3.6, section 3.2)."""
+    a, b = (Reference((n,), ((),)) for n in "ab")
+    (equation,) = read_base("model m equation x = -a * b; end m;").equations
+    assert equation.right == Unary("-", Binary("*", a, b))
+    assert value_of("2 ^ (-1)") == 0.5
+    assert value_of("7 - 4 - 2") == 1
+    assert value_of("-3 ^ 2") == -9
+    assert value_of("2 * 3 + 4 / 2") == 8
+    assert value_of("not 1 < 2 or 3 > 2") is True
+
+
+def test_declarations_keep_what_they_say():
+    flat = load(BALL)
+    h = {d.name: d for d in flat.model.declarations}["h"]
+    assert h.modifiers["start"] == Number(1.0) and h.line == 5
+    assert flat.experiment == {"StopTime": 3.0, "Interval": 0.01}
+    assert flat.name == "Ball"
+
+
+def test_quoted_names_are_no_keywords_and_comments_are_left_out():
+    text = "model m Real 'end' \"a\" + \"b\"; /* no */ Real 'if.then'; equation 'end' = 'if.then'; // no\n end m;"
+    model = read_base(text)
+    assert [d.name for d in model.declarations] == ["end", "if.then"]
+
+
+@pytest.mark.parametrize(
+    "text, where, what",
+    [
+        ("model m\n  Real x\nequation x = 1; end m;", "line 3, column 1", "expected ';'"),
+        ("model m equation x = 2 §; end m;", "line 1, column 24", "unknown character"),
+        ("model m equation x + 1; end m;", "line 1, column 23", "expected '='"),
+        ("", "line 1, column 1", "expected a class"),
+        ("model m equation x = (1; end m;", "line 1, column 24", "expected ','"),
+    ],
+)
+def test_syntax_errors_say_where(text, where, what):
+    with pytest.raises(ModelError) as error:
+        read_base(text)
+    assert where in str(error.value) and what in str(error.value)
+
+
+def test_a_text_of_a_megabyte_is_read_in_near_linear_time():
+    """Counted in tokens that the reader visits, not in seconds: the list of lines is walked once."""
+    body = "".join(f"    Real 'x{k}'(start = {k}.0) \"comment\";\n" for k in range(4000))
+    rows = "".join(f"    der('x{k}') = -'x{k}' * {k}.5e-3 + sin(time);\n" for k in range(4000))
+    model = read_base(f"model 'm'\n{body}  equation\n{rows}  end 'm';")
+    assert len(model.equations) == 4000 and model.equations[-1].line == 1 + 4000 + 1 + 4000
+
+
+# --- expressions ------------------------------------------------------------------------------------------------------
+
+
+def test_constants_are_computed():
+    assert value_of("sum({1, 2, 3} .* {4, 5, 6})") == 32
+    assert value_of("{{1, 2}, {3, 4}} * {5, 6}") == [17, 39]
+    assert value_of("sum(i * i for i in 1:4)") == 30
+    assert value_of("cat(1, {1, 2}, fill(7, 2))") == [1, 2, 7, 7]
+    assert value_of("mod(-7, 3)") == 2 and value_of("rem(-7, 3)") == -1 and value_of("div(-7, 3)") == -2
+    assert value_of("integer(-1.5)") == -2
+    assert value_of("(1:2:7)[3]") == 5
+    assert value_of("({2, 4, 6})[end]") == 6
+    assert value_of("cross({1, 0, 0}, {0, 1, 0})") == [0, 0, 1]
+    assert value_of("size(zeros(2, 3), 2)") == 3
+    assert value_of("if 2 > 1 then 10 else 1 / 0") == 10
+    assert value_of("smooth(1, 4) + noEvent(5)") == 9
+
+
+def test_random_expressions_have_the_value_that_python_gives_them():
+    """1,000 random expressions of numbers, against Python's own arithmetic."""
+    rng = np.random.default_rng(3)
+
+    def drawn(depth: int) -> str:
+        if depth == 0:
+            return f"{rng.integers(1, 9)}.{rng.integers(0, 9)}"
+        sign = rng.choice(["+", "-", "*", "/"])
+        return f"({drawn(depth - 1)} {sign} {drawn(depth - 1)})" if rng.random() < 0.7 else f"(-{drawn(depth - 1)})"
+
+    for _ in range(1000):
+        text = drawn(int(rng.integers(1, 5)))
+        try:
+            expected = eval(text)
+        except ZeroDivisionError:
+            continue
+        assert math.isclose(value_of(text), expected, rel_tol=1e-12, abs_tol=1e-12), text
+
+
+def test_a_subscript_that_is_not_constant_chooses():
+    k = sympy.Symbol("k", real=True)
+    found = value_of("({10, 20, 30})[k]", k=k)
+    assert [float(found.subs(k, n)) for n in (1, 2, 3)] == [10, 20, 30]
+
+
+def test_functions_are_carried_out():
+    heater = load(PIPE)
+    x = sympy.Symbol("x", real=True)
+    carried = Interpreter(heater.classes, {"x": x}.__getitem__, {}, {})
+    assert sympy.expand(carried.call("polynomial", [[1.0, 0.0, 0.5], x], {})) == 0.5 * x**2 + 1.0
+    (limited,) = carried.call("limited", [x], {}).args  # marked as smooth: functions have no events
+    assert [float(limited.subs(x, v)) for v in (1.0, 5.0)] == [1.0, 2.0]
+    assert carried.call("limited", [7.0], {"top": 3.0}) == 3.0
+
+
+# --- tables -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("smoothness", [1, 2, 3, 4, 6])
+@pytest.mark.parametrize("extrapolation", [1, 2])
+def test_a_table_of_a_symbol_is_that_of_numbers(smoothness, extrapolation):
+    """The Piecewise that equations get has the values of direct evaluation, and those of its nodes."""
+    rows = np.array([[0.0, 1.0], [1.0, 3.0], [2.0, 2.0], [4.0, 5.0], [5.0, 4.0]])
+    table = Table(rows, [2], smoothness, extrapolation)
+    u = sympy.Symbol("u", real=True)
+    found = sympy.lambdify(u, table.value(1, u, True), "math")
+    for v in np.linspace(-1.0, 6.0, 29):
+        assert math.isclose(found(float(v)), table.value(1, float(v), True), rel_tol=1e-9, abs_tol=1e-9)
+    assert [table.value(1, x, True) for x in rows[:-1, 0]] == pytest.approx(rows[:-1, 1].tolist())
+
+
+def test_a_table_that_jumps_has_the_later_value_at_the_jump():
+    table = Table(np.array([[2.0, 0.0], [2.0, 1.0], [4.0, 0.0]]), [2], 3, 1)
+    assert [table.value(1, t, True) for t in (1.0, 2.0, 3.0)] == [0.0, 1.0, 1.0]
+
+
+# --- components -------------------------------------------------------------------------------------------------------
+
+
+def built(text: str) -> FlatComponent:
+    return FlatComponent(EqnEnv(), "m", load(text))
+
+
+def test_names_stay_and_parameters_are_declared_where_they_are_read():
+    ball = built(BALL)
+    assert {"h", "v"} <= set(ball.variables) and set(ball.parameters) == {"e", "bounces"}
+    assert ball.parameters["bounces"].is_discrete and len(ball.events) == 1
+
+
+def test_modes_are_discrete_variables_and_other_truths_are_expressions():
+    block = built(BLOCK)
+    discrete = {name for name, p in block.parameters.items() if p.is_discrete}
+    assert {"mode", "forward", "backward"} <= discrete and "stuck" not in discrete
+
+
+@pytest.mark.parametrize(
+    "equations, told",
+    [
+        ("x = y(1.0);", "line 2: the function 'y' is not known"),
+        ("x = delay(x, 1.0);", "delay(…) needs the past"),
+        ("x = z;", "'z' is not declared"),
+        ("x = ({1.0, 2.0})[3];", "the subscript 3 is outside of 1:2"),
+        ("{x, x} = {1.0, 2.0, 3.0};", "differ in size"),
+        ("if time > 1.0 then x = 1.0; else end if;", "they must have equally many"),
+        ("1.0 = 2.0;", "the equation 1.0 = 2.0 is false"),
+    ],
+)
+def test_what_cannot_be_translated_is_said_with_its_line(equations, told):
+    with pytest.raises(ModelError) as error:
+        built(f"model m Real x; equation\n{equations} end m;")
+    assert told in str(error.value)
+
+
+def test_truths_that_define_each_other_are_refused():
+    text = "model m Boolean a; Boolean b; Real x; equation a = not b; b = not a; x = if a then 1.0 else 2.0; end m;"
+    with pytest.raises(ModelError, match="a → b → a depend on each other"):
+        built(text)
+
+
+def test_a_file_of_several_models_is_refused():
+    with pytest.raises(ModelError, match="'p' holds 2"):
+        load("package p model a end a; model b end b; end p;")
+
+
+def test_calls_of_unknown_functions_name_the_nearest():
+    with pytest.raises(ModelError, match="did you mean 'sum' or 'sin'"):
+        built("model m Real x; equation x = sim(time); end m;")
+    assert isinstance(read_base("model m equation x = f(1); end m;").equations[0].right, Call)

@@ -1,0 +1,78 @@
+"""Models in Base Modelica, run and differentiated: references are closed forms."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from modelica_texts import BALL, BLOCK, PIPE
+
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, simulate
+from jaxonomy_dae.modelica import FlatComponent, load
+from jaxonomy_dae.modelica.__main__ import main
+
+
+def compiled(text, **options):
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    diagram.add(FlatComponent(ev, "m", load(text), **options))
+    return AcausalCompiler(ev, diagram)()
+
+
+def test_a_ball_and_its_gradient():
+    """h(3) and its derivative by the restitution, from the closed form (h0 = 1, e = 0.8, g = 9.81)."""
+    system = compiled(BALL)
+
+    @jax.jit
+    @jax.value_and_grad
+    def height(e):
+        return simulate(system.with_parameters({"m.e": e}), 3.0, ts=jnp.array([3.0]), rtol=1e-10)["m.h"][0]
+
+    value, slope = height(0.8)
+    assert value == pytest.approx(0.0687074609657657, abs=1e-9)
+    assert slope == pytest.approx(1.16388772098508, abs=1e-7)
+
+
+def test_friction_by_a_discrete_equation():
+    """A block slides from 2 m/s until t = 2 s (mu = 1 N, m = 1 kg), sticks, and slips when the force t - 4 has reached
+    1.5 N, at t = 5.5 s; then der(v) = t - 4 - 1."""
+    system = compiled(BLOCK, outputs=["stuck"])
+    ts = jnp.array([0.0, 1.0, 1.9, 2.1, 5.4, 5.6, 7.0])
+    solution = simulate(system, 7.0, ts=ts, rtol=1e-9, atol=1e-11)
+    slid = np.maximum(ts - 5.5, 0.0)
+    v = np.where(ts < 2.0, 2.0 - ts, 0.5 * slid + slid**2 / 2.0)
+    s = np.where(ts < 2.0, 2.0 * ts - ts**2 / 2.0, 2.0 + 0.25 * slid**2 + slid**3 / 6.0)
+    np.testing.assert_allclose(solution["m.v"], v, atol=1e-8)
+    np.testing.assert_allclose(solution["m.s"], s, atol=1e-8)
+    assert solution["m.mode"].tolist() == [1, 1, 1, 0, 0, 1, 1]
+    assert solution["m.stuck"].tolist() == [0, 0, 0, 1, 1, 0, 0]
+
+
+def test_functions_tables_and_initial_equations():
+    """2 T' = p - T with T'(0) = 0.5 and p(0) = 3 begins at T = 2; T0 = T(0) + 1 stays 3."""
+    system = compiled(PIPE)
+    ts = jnp.linspace(0.0, 2.0, 9)
+    solution = simulate(system, 2.0, ts=ts, rtol=1e-9, atol=1e-11)
+    T = np.asarray(solution["m.T"])
+    # p = 3 + sin(t)^2 / 2 = 3.25 - cos(2 t) / 4; the answer of 2 T' + T to it, from T(0) = 2.
+    forced = 3.25 - (np.cos(2 * ts) + 4 * np.sin(2 * ts)) / (4 * 17)
+    start = 2.0 - (3.25 - 1 / 68)
+    np.testing.assert_allclose(T, forced + start * np.exp(-ts / 2.0), atol=1e-8)
+    np.testing.assert_allclose(solution["m.T0"], 3.0, atol=1e-9)
+    np.testing.assert_allclose(solution["m.q"], np.minimum(T, 2.0), atol=1e-12)
+    np.testing.assert_allclose(solution["m.r"], np.interp(T, [0.0, 1.0, 3.0], [0.0, 2.0, 3.0]), atol=1e-9)
+    np.testing.assert_allclose(solution["m.loss"], T + 2 * 3.0 + 3.0, atol=1e-8)
+
+
+def test_the_command_runs_a_file(tmp_path, capsys):
+    file, table = tmp_path / "ball.bmo", tmp_path / "out.csv"
+    file.write_text(BALL)
+    assert main([str(file), "h", "bounces", "--csv", str(table), "--tolerance", "1e-10"]) == 0
+    assert "h = 0.06870746" in capsys.readouterr().out
+    rows = np.genfromtxt(table, delimiter=",", names=True)
+    assert rows.dtype.names == ("time", "h", "bounces") and len(rows) == 301 and rows["bounces"][-1] == 6
+
+
+def test_the_command_says_why_a_file_cannot_be_run(tmp_path, capsys):
+    file = tmp_path / "wrong.bmo"
+    file.write_text("model m\n Real x; equation x = y; end m;")
+    assert main([str(file)]) == 1
+    assert "m, line 2: 'y' is not declared" in capsys.readouterr().err
