@@ -4,6 +4,7 @@ Functions are carried out statement by statement. An `if` whose condition is not
 branches, and a choice joins what they assign. Loops must have constant bounds.
 """
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, NoReturn
 
@@ -238,7 +239,7 @@ class Interpreter:
 
     def _range(self, e: Range, names: Names) -> list:
         first, step, last = (self.constant(x, names) for x in (e.first, e.step, e.last))
-        count = int((last - first) / step + 1e-9) + 1
+        count = math.floor(round((last - first) / step, 6)) + 1  # rounding: 0.3 / 0.1 is below 3
         return [first + k * step for k in range(max(count, 0))]
 
     def _matrix(self, e: Matrix, names: Names) -> list:

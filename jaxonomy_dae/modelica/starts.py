@@ -51,7 +51,7 @@ def _hold_initially(scope: Scope, left: Value, right: Value) -> None:
         c.initially(sympy.Eq(left, right, evaluate=False))
         return
     a, b = (float(_numerical(scope, sympy.sympify(side))) for side in (left, right))
-    if not math.isclose(a, b, rel_tol=1e-9):  # a text has up to sixteen digits
+    if not math.isclose(a, b):  # a text has up to sixteen digits
         raise ModelError(f"the initial equation {left} = {right} does not hold for the declared starts")
 
 

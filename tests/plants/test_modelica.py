@@ -17,6 +17,7 @@ def compiled(text, **options):
     return AcausalCompiler(ev, diagram)()
 
 
+@pytest.mark.long("a gradient through events")
 def test_a_ball_and_its_gradient():
     """h(3) and its derivative by the restitution, from the closed form (h0 = 1, e = 0.8, g = 9.81)."""
     system = compiled(BALL)
@@ -31,6 +32,7 @@ def test_a_ball_and_its_gradient():
     assert slope == pytest.approx(1.16388772098508, abs=1e-7)
 
 
+@pytest.mark.long("two modes and a loop of events in one program")
 def test_friction_by_a_discrete_equation():
     """A block slides from 2 m/s until t = 2 s (mu = 1 N, m = 1 kg), sticks, and slips when the force t - 4 has reached
     1.5 N, at t = 5.5 s; then der(v) = t - 4 - 1."""
@@ -62,6 +64,7 @@ def test_functions_tables_and_initial_equations():
     np.testing.assert_allclose(solution["m.loss"], T + 2 * 3.0 + 3.0, atol=1e-8)
 
 
+@pytest.mark.long("a run with events")
 def test_the_command_runs_a_file(tmp_path, capsys):
     file, table = tmp_path / "ball.bmo", tmp_path / "out.csv"
     file.write_text(BALL)
