@@ -9,6 +9,7 @@ equations and the rows before it leave open.
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -21,6 +22,7 @@ from ..diagnosis.wording import quoted
 from ..errors import InitializationError
 from ..judgement.rank import above_errors
 from ..judgement.scaling import balanced, equilibrated
+from ..judgement.sparse_rank import sparse_rank_of
 from ..lowering.plan import SystemPlan
 from ..lowering.remembered import remembered
 from ..model.declared import declared_scale
@@ -30,9 +32,11 @@ from ..model.networks import Networks
 from ..model.quantities import ABSENT
 from ..model.tables import ZERO, Start, complete
 from ..structure.matching import match_in_order
-from ..tolerances import ILL_CONDITIONED, KNOWN, NO_PART, TINY
+from ..tolerances import HALF_OF_THE_DIGITS, ILL_CONDITIONED, KNOWN, NO_PART, TINY
 
-DENSE_LIMIT = 600  # quantities up to which ranks are numerical; above, rows are matched with quantities
+# Quantities up to which one orthogonal factorization ranks all rows. Above, rows are matched with quantities, and then
+# judged by sparse factorizations: the verdicts are the same (tests/compiler/test_many_starts.py).
+DENSE_LIMIT = 600
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,17 +82,24 @@ class _Generic:
     def row(self, row: StartRow) -> np.ndarray:
         """The gradient of a start row, scaled."""
         out = np.zeros(self.jacobian.shape[1])
-        if row.quantity != ZERO:
-            out[row.quantity] = 1.0
-        for parameter, slope in self._slopes(row):
-            out[self.n + self.solve_for.index(parameter)] -= slope / (row.factor or 1.0)
-        out *= self.columns
-        return out / max(np.abs(out).max(initial=0.0), TINY)
+        for place, value in self.entries(row):
+            out[place] = value
+        return out
 
-    def pattern(self, row: StartRow) -> list[int]:
-        """The columns on which a start row depends."""
-        places = [] if row.quantity == ZERO else [row.quantity]
-        return places + [self.n + self.solve_for.index(parameter) for parameter, _ in self._slopes(row)]
+    def rows(self, rows: Sequence[StartRow]) -> Any:
+        """The gradients of start rows, sparse."""
+        entries = [(k, place, value) for k, row in enumerate(rows) for place, value in self.entries(row)]
+        k, place, value = zip(*entries, strict=True) if entries else ((), (), ())
+        return sp.csr_array((value, (k, place)), shape=(len(rows), self.jacobian.shape[1]))
+
+    def entries(self, row: StartRow) -> list[tuple[int, float]]:
+        """The columns on which a start row depends, and its gradient there, scaled."""
+        found = [] if row.quantity == ZERO else [(row.quantity, 1.0)]
+        for parameter, slope in self._slopes(row):
+            found.append((self.n + self.solve_for.index(parameter), -slope / (row.factor or 1.0)))
+        scaled = [(place, value * float(self.columns[place])) for place, value in found]
+        largest = max((abs(value) for _, value in scaled), default=TINY)
+        return [(place, value / max(largest, TINY)) for place, value in scaled]
 
     def _slopes(self, row: StartRow) -> list[tuple[int, float]]:
         start = row.start
@@ -297,27 +308,77 @@ def _by_rank(plan: SystemPlan, generic: _Generic, overrides, fixed, guess) -> In
 
 def _by_matching(plan: SystemPlan, generic: _Generic, overrides, fixed, guess) -> InitialRows:
     """The choice of rows for many quantities: a row is independent if it can be matched with a quantity beside the
-    equations and the rows before it."""
+    equations and the rows before it, and if numbers do not say otherwise."""
     rows = [*overrides, *fixed, *(row for row, _ in _candidates(plan, guess))]
     hard = len(overrides) + len(fixed)
     n_equations = generic.jacobian.shape[0]
     bare = [row if k < hard else dataclasses.replace(row, start=None) for k, row in enumerate(rows)]
-    patterns = [generic.pattern(row) for row in bare]
-    pointer = np.concatenate([generic.jacobian.indptr, generic.jacobian.nnz + np.cumsum([len(p) for p in patterns])])
-    columns = np.concatenate([generic.jacobian.indices, *(np.array(p, np.int64) for p in patterns)])
+    gradients = generic.rows(bare)
+    pointer = np.concatenate([generic.jacobian.indptr, generic.jacobian.nnz + gradients.indptr[1:]])
+    columns = np.concatenate([generic.jacobian.indices, gradients.indices]).astype(np.int64)
     matched = match_in_order(pointer, columns, generic.jacobian.shape[1], n_equations)[n_equations:] >= 0
-    is_dropped = [bool(overrides) and row.given < 0 and not m for row, m in zip(rows[:hard], matched, strict=False)]
+    missing = generic.jacobian.shape[1] - n_equations - int(matched.sum())
+    settled = np.zeros(0, np.int64)
+    if not missing:
+        matched, settled = _exchanged(generic, gradients, matched, hard)
+    is_dropped = [
+        bool(overrides) and row.given < 0 and not m and k not in settled
+        for k, (row, m) in enumerate(zip(rows[:hard], matched, strict=False))
+    ]
     kept = [row for row, gone in zip(rows[:hard], is_dropped, strict=True) if not gone]
     independent = [bool(m) for m, gone in zip(matched[:hard], is_dropped, strict=True) if not gone]
     redundant = tuple(k for k, alone in enumerate(independent) if not alone)
     soft = [(row, True) for row, m in zip(rows[hard:], matched[hard:], strict=True) if m]
-    missing = generic.jacobian.shape[1] - n_equations - int(matched.sum())
     if generic.solve_for and (missing or any(rows[k].given >= 0 for k in redundant)):
         unknown = quoted([plan.flat.parameters.names[p] for p in generic.solve_for])
         what = "too few" if missing else "too many"
         raise InitializationError(f"solve_for: {what} values in initial={{...}} to determine {unknown}")
     dropped = [row.name for row, gone in zip(rows[:hard], is_dropped, strict=True) if gone]
-    return _chosen(guess, kept, independent, soft, redundant, (), dropped)
+    alone = {rows[k].name for k in settled.tolist() if k < hard}
+    follows = tuple(k for k, row in enumerate(kept) if row.name in alone)
+    return _chosen(guess, kept, independent, soft, redundant, follows, dropped)
+
+
+def _exchanged(generic: _Generic, gradients: Any, chosen: np.ndarray, hard: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows that numbers do not make dependent. Given are the gradients of all rows, and those `chosen` so that the
+    equations and they can be matched with all quantities. Returns the rows to be chosen, and of the
+    first `hard` those that follow from the equations alone.
+
+    While the matrix of equations and chosen rows is singular, the last row of a combination that vanishes gives way to
+    the first one that closes the direction that is left open: so each is independent of those before it, as if they had
+    been taken one after the other.
+    """
+    chosen, n_equations = chosen.copy(), generic.jacobian.shape[0]
+    for _ in range(len(chosen)):
+        inside = np.flatnonzero(chosen)
+        matrix = sp.csr_array(sp.vstack([generic.jacobian, gradients[inside]]))
+        rank = sparse_rank_of(matrix, KNOWN * abs(matrix))
+        if rank.is_regular:
+            outside = np.flatnonzero(~chosen[:hard])
+            weights = _weights_of(rank, gradients[outside], n_equations)
+            return chosen, outside[~weights.any(axis=1)] if len(outside) else outside
+        left, right = rank.null_vectors()
+        if np.abs(left @ rank.scaled).max() > HALF_OF_THE_DIGITS or np.abs(rank.scaled @ right).max() > (
+            HALF_OF_THE_DIGITS
+        ):
+            break  # ill-conditioned, which makes no row follow from others
+        weight, open_ = np.abs(left[n_equations:]), np.abs(gradients @ (rank.c * right))
+        part = inside[weight > NO_PART * np.abs(left).max()]
+        closes = np.flatnonzero(~chosen & (open_ > NO_PART * open_.max(initial=0.0)))
+        if not len(part) or not len(closes):
+            break
+        chosen[part[-1]] = False
+        chosen[next((k for k in closes.tolist() if k != part[-1]), part[-1])] = True
+    return chosen, np.zeros(0, np.int64)
+
+
+def _weights_of(rank: Any, gradients: Any, n_equations: int) -> np.ndarray:
+    """Of which chosen rows, beside the equations, other rows are combinations, shape (rows, chosen)."""
+    out = np.zeros((gradients.shape[0], len(rank.r) - n_equations), bool)
+    for k in range(gradients.shape[0]):
+        weight = np.abs(rank.factors.solve(gradients[[k]].toarray()[0] * rank.c, trans="T"))
+        out[k] = weight[n_equations:] > NO_PART * max(weight.max(initial=0.0), TINY)
+    return out
 
 
 def _chosen(guess, kept: list[StartRow], independent: list[bool], soft, redundant, settled, dropped) -> InitialRows:
@@ -337,12 +398,24 @@ def supports(
     rows = initial_rows(plan, names, solve_for)
     if rows.direct:
         return {k: (next(r for r in rows.kept if r.quantity == rows.kept[k].quantity),) for k in rows.redundant}
-    generic = _generic(plan, solve_for) if rows.redundant else None
-    if generic is None or generic.n > DENSE_LIMIT:
-        return {k: () for k in rows.redundant}
+    if not rows.redundant:
+        return {}
+    generic = _generic(plan, solve_for)
     hard = len(rows.kept) - rows.n_soft
     base = [r for r, alone in zip(rows.kept[:hard], rows.independent[:hard], strict=True) if alone]
-    return {k: _support(generic, rows.kept[k], base)[0] for k in rows.redundant}
+    if generic.jacobian.shape[1] <= DENSE_LIMIT:
+        return {k: _support(generic, rows.kept[k], base)[0] for k in rows.redundant}
+    alone = [r for r, alone in zip(rows.kept, rows.independent, strict=True) if alone]
+    matrix: Any = sp.csr_array(sp.vstack([generic.jacobian, generic.rows(alone)]))
+    rank = sparse_rank_of(matrix, KNOWN * abs(matrix)) if matrix.shape[0] == matrix.shape[1] else None
+    if rank is None or not rank.is_regular:
+        return {k: () for k in rows.redundant}
+    gradients = generic.rows([rows.kept[k] for k in rows.redundant])
+    used = _weights_of(rank, gradients, generic.jacobian.shape[0])
+    return {
+        k: tuple(r for r, u in zip(alone, row, strict=True) if u and r in base)
+        for k, row in zip(rows.redundant, used, strict=True)
+    }
 
 
 def _support(generic: _Generic, row: StartRow, base: list[StartRow]) -> tuple[tuple[StartRow, ...], np.ndarray]:
