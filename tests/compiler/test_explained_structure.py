@@ -300,9 +300,9 @@ CASES = {
     ),
     "masses that cancel": (
         lambda: model({"a": "Mass", "b": "FreeMass"}, "a.flange b.flange", a={"m": 1.0}, b={"M": -1.0}),
-        "these equations are singular for a.M = 1, b.M = -1, though not in general. Change the parameters, or "
+        "these equations are singular for a.m = 1, b.M = -1, though not in general. Change the parameters, or "
         "state the constraint that follows as an equation of its own:\n"
-        "  a: 0 = M*der(v) - flange.f\n"
+        "  a: 0 = m*der(v) - flange.f\n"
         "  b: 0 = M*der(v) - flange.f",
     ),
     "starts that contradict": (
