@@ -62,7 +62,7 @@ def add_corrections(model: ModelNumbers, diagram: AcausalDiagram, variables: Var
     physics: list[int] = []  # the new variables u
     builder = GroupBuilder()
     names = list(variables.names)
-    known = {name: k for k, name in enumerate(names)}
+    known = variables.index if diagram.blocks else {}
 
     def find(reference, block, what: str) -> int:
         component, name = reference

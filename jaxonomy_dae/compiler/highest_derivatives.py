@@ -152,7 +152,7 @@ class HighestDerivatives:
             groups.append(
                 ExtendedGroup(group.template, own, quantity, group.factor, group.parameter, group.coefficient, own, 0)
             )
-        size, _ = natural_sizes(groups, count, np.ones(len(number)), self.values, by_terms=True)
+        size, _ = natural_sizes(groups, count, np.zeros(len(number)), self.values, by_terms=True)
         return groups, np.array(list(number), np.int64).reshape(-1, 2), np.abs(size)
 
     def rows(

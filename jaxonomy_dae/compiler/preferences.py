@@ -25,8 +25,8 @@ def merits(model: ReducedModel, prefer_states: Sequence[str]) -> list[Merit]:
     chosen = flat.variables.start.is_given & (variables.quantity >= 0)
     started[variables.quantity[chosen]] = 1
     fixed[variables.quantity[chosen & flat.variables.fixed]] = 1
-    index = {name: k for k, name in enumerate(flat.variables.names)}
     wanted = _entries(flat, prefer_states)
+    index = flat.variables.index if wanted else {}
     for k, name in enumerate(wanted):
         if name not in index:
             raise ModelError(f"prefer_states: '{name}' is not a variable: " + nearest(name, index))
@@ -39,9 +39,10 @@ def merits(model: ReducedModel, prefer_states: Sequence[str]) -> list[Merit]:
 def note_not_followed(model: ReducedModel, prefer_states: Sequence[str], states: np.ndarray) -> tuple[str, ...]:
     """Notes on names in `prefer_states` that did not become states: the states and inputs determine them, for others
     were better pivots, or no equation differentiates them."""
-    index = {name: k for k, name in enumerate(model.flat.variables.names)}
     chosen = set(states.tolist())
-    left = [n for n in _entries(model.flat, prefer_states) if model.variables[index[n]][0] not in chosen]
+    wanted = _entries(model.flat, prefer_states)
+    index = model.flat.variables.index if wanted else {}
+    left = [n for n in wanted if model.variables[index[n]][0] not in chosen]
     if not left:
         return ()
     is_none, it = ("is no state", "it") if len(left) == 1 else ("are no states", "them")

@@ -211,18 +211,23 @@ def _dummy_derivatives(model: ReducedModel, dense, errors, c, columns, merit: Se
 
 def _pivots(matrix: np.ndarray, errors: np.ndarray, keys: list[tuple]) -> list[int] | None:
     """Chooses as many columns as rows that are nonsingular together: those least wanted as states (by `keys`) whose
-    pivots are not poor. None if the matrix is singular."""
+    pivots are not poor. None if the matrix is singular.
+
+    Errors are carried through the elimination: of columns that are nearly parallel a pivot may be all error, and is none.
+    """
     if not rank_of(matrix, errors).is_regular:
         return None
     matrix = above_errors(matrix, errors)
-    work = matrix / np.abs(matrix).max(axis=1, keepdims=True)
+    largest = np.abs(matrix).max(axis=1, keepdims=True)
+    work, off = matrix / largest, errors / largest
     free_rows = list(range(work.shape[0]))
     free_columns = list(range(work.shape[1]))
     picked: list[int] = []
     while free_rows:
         if not free_columns:
             return None
-        sub = np.abs(work[np.ix_(free_rows, free_columns)])
+        inside = np.ix_(free_rows, free_columns)
+        sub = np.where(np.abs(work[inside]) > off[inside], np.abs(work[inside]), 0.0)
         best_of_column = sub.max(axis=0)
         best = best_of_column.max()
         if not best > 0:
@@ -237,7 +242,9 @@ def _pivots(matrix: np.ndarray, errors: np.ndarray, keys: list[tuple]) -> list[i
         picked.append(column)
         if free_rows:
             factors = work[free_rows, column] / work[row, column]
+            of_factors = (off[free_rows, column] + np.abs(factors) * off[row, column]) / np.abs(work[row, column])
             work[free_rows] -= np.outer(factors, work[row])
+            off[free_rows] += np.outer(np.abs(factors), off[row]) + np.outer(of_factors, np.abs(work[row]))
     return sorted(picked)
 
 

@@ -173,12 +173,13 @@ def _generic(plan: SystemPlan, solve_for: tuple[int, ...]) -> _Generic:
     extended = plan.extended
     n = extended.quantities.n_unknown
     size = declared_scale(plan.model)
-    size[size == 0.0] = 1.0
     n_parameters = len(plan.flat.parameters)
     parameter_size = np.ones(n_parameters)
     if n <= DENSE_LIMIT:  # parameters, as generic numbers, would make some equations stiff beside others
         none = np.zeros(n_parameters)
         size, parameter_size = natural_sizes(extended.groups, extended.n_equations, size, none, by_terms=True)
+    else:
+        size = np.where(size == 0.0, 1.0, size)
     jacobian, errors, point, values = generic_jacobian(extended, size, parameter_size)
     errors = errors[:, :n]
     jacobian = above_errors(jacobian[:, :n], errors)

@@ -159,10 +159,10 @@ class SystemPlan:
         """A user's name for every quantity."""
         return self.model.names
 
-    @functools.cached_property
+    @property
     def variable_index(self) -> dict[str, int]:
         """The number of every variable by name."""
-        return {name: k for k, name in enumerate(self.flat.variables.names)}
+        return self.flat.variables.index
 
     @property
     def n_state(self) -> int:

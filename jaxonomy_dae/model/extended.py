@@ -65,9 +65,9 @@ class ExtendedGroup(Group):
         )
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Extended:
-    """The extended system."""
+    """The extended system; what is found for one is kept by it, so that it is equal to itself alone."""
 
     groups: tuple[ExtendedGroup, ...]
     n_equations: int

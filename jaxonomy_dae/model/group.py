@@ -111,5 +111,6 @@ class Group:
         return np.broadcast_to(np.asarray(out, float), (len(self),)) / self.factor[:, slot]
 
     def _stacked(self, by_slot: Sequence[Any]) -> np.ndarray:
-        columns = [np.broadcast_to(np.asarray(v, float), (len(self),)) for v in by_slot]
-        return np.stack(columns, axis=-1) if columns else np.zeros((len(self), 0))
+        shape = (len(self),)
+        columns = [v if np.shape(v) == shape else np.broadcast_to(np.asarray(v, float), shape) for v in by_slot]
+        return np.array(columns, float).T if columns else np.zeros((*shape, 0))

@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-import scipy.sparse.linalg
 from jaxtyping import Bool, Float
 
+from ..linear.graph_elimination import GraphElimination
 from .extended import ExtendedGroup
 from .group import Group, Point
 from .jacobian import generic
@@ -58,6 +58,7 @@ def natural_sizes(
     parameters: Float[np.ndarray, " p"],
     by_terms: bool = False,
     rates: tuple[np.ndarray, np.ndarray] | None = None,
+    factors: "Factors | None" = None,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " p"]]:
     """Sizes s with |∂F_e/∂x_q|·s_q near 1 in units of each equation, in the least-squares sense of logarithms (Curtis &
     Reid 1972, where the entries depend on the sizes as well). What an equation has without quantities, such as the
@@ -65,16 +66,18 @@ def natural_sizes(
 
     **Arguments:**
 
-    - `size`: of every quantity, with signs, from which the search begins: those other than ±1 are declared and stay.
+    - `size`: of every quantity, with signs, as far as it is known; zero for those whose size is looked for.
     - `parameters`: values that stay; zero for those whose size is looked for, too.
     - `rates`: (quantities, their derivatives by time). What no equation tells is such that these are 1/T of those, with
         one T for the whole model: the speed of a nanometre's oscillation lies between its amplitude and acceleration.
     - `by_terms`: terms count as well as entries, which do not see that one of their terms is lost beside others; and
         sizes move only for what it gains.
+    - `factors`: of an earlier search in the same equations, to be used again where they are the same.
     """
+    factors = Factors() if factors is None else factors
     n, n_parameters = len(size), len(parameters)
-    known = np.concatenate([np.abs(size) != 1.0, parameters != 0.0, np.zeros(n_equations, bool)])
-    quantity, parameter = size.copy(), np.where(parameters == 0.0, 1.0, parameters)
+    known = np.concatenate([size != 0.0, parameters != 0.0, np.zeros(n_equations, bool)])
+    quantity, parameter = (np.where(given == 0.0, 1.0, given) for given in (size, parameters))
     begun = np.log10(np.abs(np.append(quantity, parameter)))
     constants, time = _constants(groups, parameters), 0.0
     for _ in range(ROUNDS):
@@ -91,11 +94,10 @@ def natural_sizes(
             matrix, off = sp.vstack([matrix, stay], format="csr"), np.append(off, RELUCTANCE * moved)
         if rates is not None:
             slopes, late = _slopes(*rates, matrix.shape[1], known, np.log10(np.abs(quantity)), time)
-            matrix, off = (
-                sp.vstack([sp.hstack([matrix, sp.csr_array((len(off), 1))]), slopes], format="csr"),
-                np.append(off, late),
-            )
-        found = _least_squares(matrix, -off)
+            matrix = sp.vstack([sp.hstack([matrix, sp.csr_array((len(off), 1))]), slopes], format="csr")
+            off = np.append(off, late)
+        matrix.eliminate_zeros()
+        found = factors.least_squares(matrix, -off)
         time += float(found[-1]) if rates is not None else 0.0
         quantity, parameter = _moved(quantity, found[:n]), _moved(parameter, found[n : n + n_parameters])
         if (
@@ -119,13 +121,26 @@ def _slopes(
     )
 
 
-def _least_squares(matrix: Any, right: np.ndarray) -> np.ndarray:
-    """The x of least norm with A·x near b, by normal equations: logarithms need a few digits, of which an iterative
-    method takes as many steps as a chain has links."""
-    normal = (matrix.T @ matrix + DAMPING**2 * sp.eye_array(matrix.shape[1])).tocsc()
-    options = {"SymmetricMode": True}
-    factors = scipy.sparse.linalg.splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
-    return factors.solve(matrix.T @ right)
+class Factors:
+    """Least squares by the factors of the last matrix, as long as it is the same: where entries are products of
+    parameters, other values of these change the right-hand side alone."""
+
+    def __init__(self):
+        self._matrix: Any = None
+        self._factors: GraphElimination
+
+    def least_squares(self, matrix: Any, right: np.ndarray) -> np.ndarray:
+        """The x of least norm with A·x near b, by normal equations: logarithms need a few digits, of which an iterative
+        method takes as many steps as a chain has links."""
+        if self._matrix is None or not _are_equal(self._matrix, matrix):
+            normal = matrix.T @ matrix + DAMPING**2 * sp.eye_array(matrix.shape[1])
+            self._matrix, self._factors = matrix, GraphElimination(normal)
+        return self._factors.solve(matrix.T @ right)
+
+
+def _are_equal(one: Any, other: Any) -> bool:
+    parts = ("indptr", "indices", "data")
+    return one.shape == other.shape and all(np.array_equal(getattr(one, p), getattr(other, p)) for p in parts)
 
 
 def are_told(groups: Sequence[ExtendedGroup], n: int, parameters: Float[np.ndarray, " p"]) -> Bool[np.ndarray, " n"]:

@@ -5,6 +5,7 @@ of integers. After alias elimination a slot also has a factor, and variable −1
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any, overload
 
@@ -109,6 +110,11 @@ class VariableTable:
     port: np.ndarray  # the port it belongs to, −1 if none
     is_across: np.ndarray
     is_internal: np.ndarray  # made by the compiler, and not to be read by users
+
+    @functools.cached_property
+    def index(self) -> dict[str, int]:
+        """The number of every variable by name."""
+        return {name: k for k, name in enumerate(self.names)}
 
     def __len__(self):
         return len(self.names)

@@ -1,5 +1,7 @@
 """Sizes of quantities of which nothing is declared, by what their equations say."""
 
+import weakref
+
 import numpy as np
 from jaxtyping import Float
 
@@ -7,19 +9,21 @@ from ..tolerances import KNOWN
 from .declared import declared_scale
 from .extended import Extended
 from .jacobian import generic
-from .natural_sizes import are_told, natural_sizes
+from .natural_sizes import Factors, are_told, natural_sizes
 from .reduced import ReducedModel
 
 MOVED = 1e-6  # of parameters: a difference from which a slope is told to six digits
 DECADES = 30  # that they may span: single precision has 38
+# Answers kept for one model: with and without starts, at the values it was compiled with and at others.
+ROOM = 4
 
 
 def typical_sizes(
     model: ReducedModel, parameters: Float[np.ndarray, " parameters"]
 ) -> Float[np.ndarray, " quantities"]:
-    """The typical sizes of all quantities, at the parameter values the model was compiled with; powers of two, by which
-    numbers are multiplied without rounding."""
-    return _rounded(_unrounded(model, parameters))
+    """The typical sizes of all quantities, at these values of the parameters; powers of two, by which numbers are
+    multiplied without rounding."""
+    return _rounded(unrounded_sizes(model, parameters))
 
 
 def _rounded(sizes: Float[np.ndarray, " quantities"]) -> Float[np.ndarray, " quantities"]:
@@ -31,10 +35,6 @@ def unrounded_sizes(
 ) -> Float[np.ndarray, " quantities"]:
     """As `typical_sizes` before rounding to powers of two. State selection compares sizes, and rounding could turn a
     small difference into a factor of two."""
-    return _unrounded(model, parameters)
-
-
-def _unrounded(model: ReducedModel, parameters: np.ndarray) -> np.ndarray:
     return _balanced(model.extended, parameters, _declared_or_started(model, parameters))
 
 
@@ -56,26 +56,46 @@ def error_sizes(model: ReducedModel, parameters: Float[np.ndarray, " parameters"
 
 
 def _declared_or_started(model: ReducedModel, parameters: np.ndarray) -> np.ndarray:
-    """Nominal values, and else first starts; zero where there is none."""
+    """Nominal values, and else the first starts that are not zero; zero where there is none."""
     size, starts = declared_scale(model), model.flat.variables.start
+    v = np.flatnonzero(starts.is_given & (model.variables.quantity >= 0))
     values = starts.values(parameters)
     # A start that is computed may be rounding alone, as L·sin(π) is; a number that is given is what it is.
     moved = starts.values(parameters * (1 + MOVED * generic(np.random.default_rng(1), parameters.shape)))
     values = np.where(np.abs(values) <= KNOWN * np.abs(moved - values) / MOVED, 0.0, values)
-    for v in np.flatnonzero(starts.is_given).tolist():
-        quantity, factor = model.variables[v]
-        if quantity >= 0 and size[quantity] == 0.0:
-            value = values[v] / factor
-            size[quantity] = value if np.isfinite(value) else 0.0
+    quantity, value = model.variables.quantity[v], values[v] / model.variables.factor[v]
+    tells = np.isfinite(value) & (value != 0.0) & (size[quantity] == 0.0)
+    told, first = np.unique(quantity[tells], return_index=True)
+    size[told] = value[tells][first]
     return size
+
+
+class _Balance:
+    """What was found for a model: other values of parameters that its equations do not read change nothing."""
+
+    def __init__(self, extended: Extended):
+        self.factors = Factors()
+        read = [group.parameter.ravel() for group in extended.groups]
+        self.read = np.unique(np.concatenate([np.zeros(0, np.int64), *read]))
+        q = extended.quantities
+        lower = np.flatnonzero((q.owner[:-1] == q.owner[1:]) & (q.order[1:] == q.order[:-1] + 1))
+        self.rates = (lower, lower + 1) if len(lower) else None
+        self.found: dict[tuple[bytes, bytes], np.ndarray] = {}
+
+
+_BALANCES: weakref.WeakKeyDictionary[Extended, _Balance] = weakref.WeakKeyDictionary()
 
 
 def _balanced(extended: Extended, parameters: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Sizes that make terms alike, where `size` is zero."""
-    start = np.where(size == 0.0, 1.0, size)
-    q = extended.quantities
-    lower = np.flatnonzero((q.owner[:-1] == q.owner[1:]) & (q.order[1:] == q.order[:-1] + 1))
-    found, _ = natural_sizes(
-        extended.groups, extended.n_equations, start, parameters, rates=(lower, lower + 1) if len(lower) else None
-    )
-    return 10.0 ** np.clip(np.log10(np.abs(found)), -DECADES, DECADES)
+    balance = _BALANCES.setdefault(extended, _Balance(extended))
+    key = size.tobytes(), parameters[balance.read].tobytes()
+    if key not in balance.found:
+        sizes, _ = natural_sizes(
+            extended.groups, extended.n_equations, size, parameters, rates=balance.rates, factors=balance.factors
+        )
+        while len(balance.found) >= ROOM:
+            balance.found.pop(next(iter(balance.found)), None)
+        balance.found[key] = 10.0 ** np.clip(np.log10(np.abs(sizes)), -DECADES, DECADES)
+        balance.found[key].flags.writeable = False
+    return balance.found[key]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ..errors import ModelError
 
@@ -59,7 +59,15 @@ def as_interval(bounds: Any, where: str) -> Interval:
 
 def closed_ends(intervals: Sequence[Interval]) -> Float[np.ndarray, "n 2"]:
     """The least and the greatest number of each interval, in double precision."""
-    ends = np.array([(i.low, i.high) for i in intervals], float).reshape(-1, 2)
-    opened = np.array([(i.open_low, i.open_high) for i in intervals], bool).reshape(-1, 2)
+    distinct, which = distinct_intervals(intervals)
+    ends = np.array([(i.low, i.high) for i in distinct], float).reshape(-1, 2)
+    opened = np.array([(i.open_low, i.open_high) for i in distinct], bool).reshape(-1, 2)
     inside = np.nextafter(ends, np.array([np.inf, -np.inf]))
-    return np.where(opened, inside, ends)
+    return np.where(opened, inside, ends)[which]
+
+
+def distinct_intervals(intervals: Sequence[Interval]) -> tuple[list[Interval], Int[np.ndarray, " n"]]:
+    """The objects among intervals, of which arrays of components share a few, and which of them each is."""
+    objects = {id(i): i for i in intervals}
+    place = {key: k for k, key in enumerate(objects)}
+    return list(objects.values()), np.array([place[key] for key in map(id, intervals)], np.int64)

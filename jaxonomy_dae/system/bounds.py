@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..modeling.interval import Interval
+from ..modeling.interval import Interval, distinct_intervals
 
 KEPT = 0.1  # of the distance to an open end, at least, after one update
 
@@ -48,8 +48,10 @@ class Ends(NamedTuple):
     @classmethod
     def of(cls, intervals: Sequence[Interval]) -> "Ends":
         """The ends of a list of intervals, shape (n,)."""
-        columns = zip(*((i.low, i.high, i.open_low, i.open_high) for i in intervals), strict=True)
-        return cls(*map(np.array, columns)) if len(intervals) else cls(*np.zeros((2, 0)), *np.zeros((2, 0), bool))
+        distinct, which = distinct_intervals(intervals)
+        columns = zip(*((i.low, i.high, i.open_low, i.open_high) for i in distinct), strict=True)
+        ends = map(np.array, columns) if distinct else (*np.zeros((2, 0)), *np.zeros((2, 0), bool))
+        return cls(*ends).take(which)
 
     def take(self, chosen: np.ndarray) -> "Ends":
         """The ends at indices, in their shape."""
