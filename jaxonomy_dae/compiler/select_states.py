@@ -213,7 +213,7 @@ def _pivots(matrix: np.ndarray, errors: np.ndarray, keys: list[tuple]) -> list[i
     """Chooses as many columns as rows that are nonsingular together: those least wanted as states (by `keys`) whose
     pivots are not poor. None if the matrix is singular.
 
-    Errors are carried through the elimination: of columns that are nearly parallel a pivot may be all error, and is none.
+    Errors are carried through the elimination: of columns that are nearly parallel, a pivot may be nothing but error.
     """
     if not rank_of(matrix, errors).is_regular:
         return None
