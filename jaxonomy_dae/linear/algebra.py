@@ -60,6 +60,8 @@ class Dense(eqx.Module):
     def factor(self, matrix: Any) -> Any:
         """The factors that solves need: an explicit inverse of small matrices, LU factors of larger ones."""
         n = matrix.shape[0]
+        if not n:  # a model without states
+            return matrix
         if n <= UNROLLED_INVERSE:
             rows = [[matrix[i, j] for j in range(n)] for i in range(n)]
             return jnp.stack(solve_unrolled(rows, list(jnp.eye(n, dtype=matrix.dtype))))

@@ -1,12 +1,17 @@
 """Letter d: a run in one piece, and one that goes on from a saved state."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+from sympy import Symbol, sympify
 
 from jaxonomy_dae import simulate
 
+from .rewrite import numbers
 from .said import ALONG, TOLERANCES, Pairs, Said, said, times
+from .sketch import Sketch
 from .subject import Subject, subject
 
 
@@ -17,7 +22,7 @@ def continuation(number: int) -> Pairs:
     ts = times(rng, s.end)
     names = list(s.names.values())
 
-    def run(ts, end=s.end, initial=s.initial):
+    def run(ts, end=s.end, initial: Any = s.initial):
         return simulate(s.system, end, ts=ts, initial=initial, inputs=s.inputs, **TOLERANCES)
 
     def read(solution) -> dict[str, np.ndarray]:
@@ -60,6 +65,9 @@ def continuation(number: int) -> Pairs:
         inner = [float(t) for t in happened[np.isfinite(happened)] if 0 < t < ts[4]]
         if inner:
             places.append(("an event", inner[int(rng.integers(len(inner)))]))
+    ticks = [] if s.sketch is None else ticks_of(s.sketch)
+    if ticks:
+        places.append(("a tick", ticks[int(rng.integers(len(ticks)))]))
     if s.inputs:
         places.append(("a sample", 0.5 * s.end))
     for what, t in places:
@@ -73,6 +81,16 @@ def continuation(number: int) -> Pairs:
     if number % 3 == 0:
         _in_a_loop(pairs, s, ts, names, reference)
     return pairs
+
+
+def ticks_of(sketch: Sketch) -> list[float]:
+    """Instants inside a run at which clocks tick."""
+    values = {Symbol(n): v for n, v in numbers(sketch).items()}
+    found = []
+    for event in (e for part in sketch.parts for e in part.events if e.period is not None):
+        period, offset = (float(sympify(v).xreplace(values)) for v in (event.period, event.offset))
+        found += (offset + period * np.arange(1, int((sketch.end - offset) / period))).tolist()
+    return found
 
 
 def _in_a_loop(pairs: Pairs, s: Subject, ts: np.ndarray, names: list[str], reference: Said) -> None:

@@ -1,14 +1,14 @@
 """Random sketches: small parts of ordinary and of strange kinds, coupled at random."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import sympy
 from sympy import Abs, Expr, Max, Min, Mod, Piecewise, Symbol, cos, floor, sin, sqrt
 
-from .sketch import Declared, Happens, Part, Sketch, T, before, rate
+from .sketch import Declared, Happens, Mode, Part, Sketch, T, before, rate
 
 STRANGE_SHARE = 0.35  # of parts
 
@@ -24,6 +24,7 @@ class Draft:
     declared: list[Declared] = dataclasses.field(default_factory=list)
     equations: list[Expr] = dataclasses.field(default_factory=list)
     events: list[Happens] = dataclasses.field(default_factory=list)
+    modes: list[Mode] = dataclasses.field(default_factory=list)
     signals: list[Symbol] = dataclasses.field(default_factory=list)
     sockets: list[Symbol] = dataclasses.field(default_factory=list)
     inputs: dict[str, Any] = dataclasses.field(default_factory=dict)
@@ -355,15 +356,15 @@ STRANGE = (
 )  # fmt: skip
 HOPELESS = (_contradicting_start, _no_solution)  # to be refused
 
-KINDS = {f.__name__[1:]: f for f in (*ORDINARY, *HAPPENING, *STRANGE, *HOPELESS)}
 
-
-def draw(rng: np.random.Generator, most: int = 3, only: tuple[str, ...] = ()) -> Sketch:
-    """One to `most` parts, or those named by `only`."""
+def draw(
+    rng: np.random.Generator, most: int = 3, first: Sequence[Callable[[Draft], None]] = (), more: bool = True
+) -> Sketch:
+    """One to `most` parts; before them, those of `first`, alone unless there are `more`."""
     end = round(float(rng.uniform(1.5, 3.0)), 3)
-    kinds: list[Callable[[Draft], None]] = [KINDS[name] for name in only]
-    strange = any(kind in (*STRANGE, *HOPELESS) for kind in kinds)
-    if not kinds:
+    kinds = list(first)
+    strange = bool(first)
+    if more:
         for _ in range(int(rng.integers(1, most + 1))):
             strange_one = rng.random() < STRANGE_SHARE
             strange = strange or strange_one
@@ -385,7 +386,10 @@ def draw(rng: np.random.Generator, most: int = 3, only: tuple[str, ...] = ()) ->
                 couplings.append(u - d.uniform(-0.5, 0.5) * other)
             else:
                 couplings.append(u - d.uniform(-0.5, 0.5))
-    parts = tuple(Part(f"part{d.number}", tuple(d.declared), tuple(d.equations), tuple(d.events)) for d in drafts)
+    parts = tuple(
+        Part(f"part{d.number}", tuple(d.declared), tuple(d.equations), tuple(d.events), modes=tuple(d.modes))
+        for d in drafts
+    )
     note = "+".join(kind.__name__[1:] for kind in kinds)
     return Sketch(
         parts, tuple(couplings), {k: v for d in drafts for k, v in d.inputs.items()}, end,

@@ -3,10 +3,10 @@ run."""
 
 import numpy as np
 
-from .drawing import draw
 from .rewrite import ASKED, asked, in_units, random_units, renamed, reordered
 from .said import ALONG, POINT, Pairs, Said, along, at_start, compiled, inputs_of, said, times, variables_of
 from .sketch import Sketch
+from .stranger import drawn
 
 
 def both(sketch: Sketch, names: dict[str, str], ts: np.ndarray | None, scale: float = 1.0) -> tuple[Said, Said]:
@@ -26,7 +26,7 @@ def both(sketch: Sketch, names: dict[str, str], ts: np.ndarray | None, scale: fl
 def sketch_of(number: int) -> tuple[Sketch, np.random.Generator]:
     """The model of a number, and what draws go on from."""
     rng = np.random.default_rng([number, 21])
-    return draw(rng), rng
+    return drawn(number, rng), rng
 
 
 def order(number: int, moving: bool) -> Pairs:
@@ -64,7 +64,8 @@ def units(number: int, moving: bool) -> Pairs:
         ("units, with nominal", -12, 9, True),
         ("units", -9, 9, False),
         ("small", 6, 18, False),  # values of 1e-18 to 1e-6
-        ("large, with nominal", -12, -6, True),
+        ("small, with nominal", 6, 18, True),
+        ("large", -12, -6, number % 2 == 0),
     ):
 
         def pair(what=what, low=low, high=high, nominal=nominal):

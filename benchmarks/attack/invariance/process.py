@@ -4,6 +4,7 @@ Programs are cached by what they are made from; what is forgotten there serves t
 of a model must be what a fresh process says, to the last bit.
 """
 
+import contextlib
 import dataclasses
 import functools
 import multiprocessing
@@ -132,7 +133,7 @@ def everything(sketch: Sketch, running: bool) -> dict[str, Any]:
     """What is said of a model: texts, and numbers in hexadecimal; a refusal is a text."""
     from jaxonomy_dae import simulate
 
-    from .said import compiled, inputs_of, variables_of
+    from .said import REFUSALS, compiled, inputs_of, variables_of
 
     out: dict[str, Any] = {}
 
@@ -140,12 +141,12 @@ def everything(sketch: Sketch, running: bool) -> dict[str, Any]:
         try:
             found = values()
             out[what] = found if isinstance(found, str) else [float(v).hex() for v in np.ravel(np.asarray(found))]
-        except Exception as error:
+        except REFUSALS as error:
             out[what] = f"{type(error).__name__}: {error}"
 
     try:
         system = compiled(sketch)
-    except Exception as error:
+    except REFUSALS as error:
         return {"compiled": f"{type(error).__name__}: {error}"}
     point, run, bounded = _programs()
     names = tuple(variables_of(sketch).values())
@@ -181,10 +182,15 @@ def everything(sketch: Sketch, running: bool) -> dict[str, Any]:
     return out
 
 
-def in_order(number: int, order: tuple[int, ...], running: bool) -> list[dict[str, Any]]:
-    """What is said of a model and its twins, one after the other."""
+def in_order(number: int, order: tuple[int, ...], running: bool, fault: int | None) -> list[dict[str, Any]]:
+    """What is said of a model and its twins, one after the other; with a deliberate fault, if one is given."""
     found, _ = models(number)
-    return [everything(found[k], running) for k in order]
+    with contextlib.ExitStack() as stack:
+        if fault is not None:
+            from .planted import FAULTS, planted
+
+            stack.enter_context(planted(FAULTS[fault]))
+        return [everything(found[k], running) for k in order]
 
 
 def _fresh_processes():
@@ -194,8 +200,8 @@ def _fresh_processes():
     return context.Pool(1, maxtasksperchild=1)
 
 
-def process(number: int):
-    """Letter a."""
+def process(number: int, planted: int | None = None):
+    """Letter a; with the deliberate fault number `planted`."""
     from .said import Pairs
 
     found, what = models(number)
@@ -207,7 +213,7 @@ def process(number: int):
     with _fresh_processes() as pool:
 
         def ask(order: tuple[int, ...]) -> list[dict[str, Any]]:
-            return pool.apply(in_order, (number, order, running))
+            return pool.apply(in_order, (number, order, running, planted))
 
         alone = [ask((k,))[0] for k in range(count)]
         together = [ask(order) for order in orders]

@@ -59,8 +59,13 @@ def _substituted(part: Part, symbols: Mapping[Symbol, Any], to: Callable[[str], 
         for e in part.events
     )
     declared = tuple(Declared(d.kind, to(d.name), {k: other(v) for k, v in d.args.items()}) for d in part.declared)
+    modes = tuple(
+        dataclasses.replace(m, args=tuple(map(other, m.args)), options={k: other(v) for k, v in m.options.items()})
+        for m in part.modes
+    )
     return dataclasses.replace(
         part,
+        modes=modes,
         declared=declared,
         equations=tuple(map(other, part.equations)),
         events=events,

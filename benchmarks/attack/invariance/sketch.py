@@ -53,6 +53,15 @@ class Happens:
 
 
 @dataclasses.dataclass(frozen=True)
+class Mode:
+    """Branches of an equation, by `kind`, either or complementary: the arguments of the method of that name."""
+
+    kind: str
+    args: tuple[Any, ...]
+    options: Mapping[str, Any]
+
+
+@dataclasses.dataclass(frozen=True)
 class Part:
     """One component."""
 
@@ -61,6 +70,7 @@ class Part:
     equations: tuple[Expr, ...]
     events: tuple[Happens, ...] = ()
     outputs: tuple[tuple[str, Expr], ...] = ()
+    modes: tuple[Mode, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,6 +146,8 @@ class _Written(Component):
         for name, value in part.outputs:
             self.output(name, _conditions(value, seen))
         self.add_equations(*(_conditions(e, seen) for e in part.equations))
+        for mode in part.modes:
+            getattr(self, mode.kind)(*(_conditions(a, seen) for a in mode.args), **mode.options)
         for event in part.events:
             if event.period is not None:
                 condition = self.sampled(_conditions(event.period, seen), _conditions(event.offset, seen))

@@ -9,10 +9,10 @@ import numpy as np
 
 from jaxonomy_dae import AcausalCompiler, AcausalSystem
 
-from .drawing import draw
 from .rewrite import numbers, varied
 from .said import inputs_of, variables_of
 from .sketch import Sketch, diagram_of
+from .stranger import drawn
 
 # Whose models the package is asked for a run of, too; by how many of theirs one can afford.
 OTHERS = ("circuits", "thermal", "mechanisms", "relations", "events", "drives", "pipes", "gears", "rods", "shafts")
@@ -84,5 +84,5 @@ def subject(number: int) -> tuple[Subject, np.random.Generator]:
     rng = np.random.default_rng([number, 21])
     if number % EVERY == EVERY - 1:
         return of_family(number, rng), rng
-    sketch = draw(rng)
+    sketch = drawn(number, rng)
     return of_sketch(sketch, rng), rng

@@ -1,0 +1,221 @@
+"""Deliberate faults, some for each letter, and the number of a model by which the letter notices them.
+
+`python -m benchmarks.attack.invariance.planted` plants one after the other, each in a process of its own, and prints
+what notices it; letters and numbers choose among them. The exit status is 1 if one is not noticed.
+"""
+
+import contextlib
+import dataclasses
+import multiprocessing
+import os
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any
+from unittest import mock
+
+Bend = Callable[[Any], Any]  # from what is there to what takes its place
+
+
+@dataclasses.dataclass(frozen=True)
+class Planted:
+    """`letter` must find the fault with the model `number`. `target`: "module:name" or "module:class.name" inside the
+    package; `bend` makes what stands in its place."""
+
+    letter: str
+    number: int
+    what: str
+    target: str
+    bend: Bend
+
+
+@contextlib.contextmanager
+def planted(fault: Planted) -> Iterator[None]:
+    """While this lasts, the fault is in the package."""
+    import importlib
+
+    module, _, path = fault.target.partition(":")
+    owner: Any = importlib.import_module(f"jaxonomy_dae.{module}")
+    *classes, name = path.split(".")
+    for part in classes:
+        owner = getattr(owner, part)
+    with mock.patch.object(owner, name, fault.bend(owner.__dict__[name])):
+        yield
+
+
+def forgets(*kinds: str) -> Bend:
+    """A walk over a plan to which all objects of these types are alike."""
+
+    def bend(walk: Any) -> Any:
+        return lambda self, part: b"" if any(c.__name__ in kinds for c in type(part).__mro__) else walk(self, part)
+
+    return bend
+
+
+def _sizes_by_count(sizes: Any) -> Any:
+    kept: dict[Any, Any] = {}
+
+    def bent(model: Any, values: Any) -> Any:
+        found = sizes(model, values)
+        return kept.setdefault(found.shape, found)
+
+    return bent
+
+
+def _always_well(traced: Any) -> Any:
+    import diffrax
+
+    def bent(outcome: Any, *rest: Any) -> Any:
+        return traced(dataclasses.replace(outcome, result=diffrax.RESULTS.successful), *rest)
+
+    return bent
+
+
+def _looser_inside(controller: Any) -> Any:
+    from jaxonomy_dae.programs.staging import is_traced
+
+    def bent(system: Any, solver: Any, rtol: Any, atol: Any, dtmax: Any) -> Any:
+        factor = 1e6 if is_traced(system) else 1.0
+        return controller(system, solver, rtol * factor, atol * factor, dtmax)
+
+    return bent
+
+
+def _parameter_bent(chosen: Callable[[Any], int]) -> Bend:
+    """A compiler that reads one of the parameters wrongly."""
+
+    def bend(call: Any) -> Any:
+        def bent(self: Any) -> Any:
+            system = call(self)
+            names = list(system.parameters.names)
+            if not names:
+                return system
+            name = names[chosen(names)]
+            return system.with_parameters({name: float(system.parameters[name]) * (1 + 1e-6)})
+
+        return bent
+
+    return bend
+
+
+def _at(change: Callable[[Any, Any, Any], Any]) -> Bend:
+    """Saved states that are changed: `change(state, solution, k)`."""
+
+    def bend(at: Any) -> Any:
+        return lambda self, k: change(at(self, k), self, k)
+
+    return bend
+
+
+def _starts_again(state: Any, solution: Any, k: Any) -> Any:
+    return dataclasses.replace(state, discrete=solution.system.discrete_values)
+
+
+def _row_before(state: Any, solution: Any, k: Any) -> Any:
+    return dataclasses.replace(state, x=0.999 * state.x)
+
+
+def _tocked(state: Any, solution: Any, k: Any) -> Any:
+    return dataclasses.replace(state, ticked=1.0 - state.ticked)
+
+
+def _no_small_values(initialize: Any) -> Any:
+    import jax.numpy as jnp
+
+    def bent(*args: Any, **options: Any) -> Any:
+        x = initialize(*args, **options)
+        return jnp.where(jnp.abs(x) < 1e-8, 0.0, x)
+
+    return bent
+
+
+def _by_count(names: Callable[[Any], int]) -> Bend:
+    """Slopes that hang on how many names there are."""
+
+    def bend(field: Any) -> Any:
+        return lambda self, *args: field(self, *args) * (1 + 1e-6 * names(self))
+
+    return bend
+
+
+def _step_off(step: Any) -> Any:
+    def bent(self: Any, *args: Any, **options: Any) -> Any:
+        y1, *rest = step(self, *args, **options)
+        return y1 * (1 + 1e-4), *rest
+
+    return bent
+
+
+def _dense_off(step: Any) -> Any:
+    def bent(self: Any, *args: Any, **options: Any) -> Any:
+        y1, error, dense, *rest = step(self, *args, **options)
+        return y1, error, {**dense, "k": dense["k"] * 1.01}, *rest
+
+    return bent
+
+
+FAULTS = (
+    Planted("a", 1, "bounds are no part of a model's identity", "model.identity:_Walk._of", forgets("Interval")),
+    Planted("a", 17, "equations are no part of a model's identity", "model.identity:_Walk._of",
+            forgets("AbstractTemplate", "Node", "ndarray")),
+    Planted("a", 17, "typical sizes are kept by how many there are", "system.acausal_compiler:typical_sizes", _sizes_by_count),
+    Planted("b", 14, "what is out of bounds is admitted inside jit", "simulation.integration:are_admitted",
+            lambda _: lambda *rest: True),
+    Planted("b", 100, "inside jit, all runs end well", "simulation.simulate:_traced", _always_well),
+    Planted("b", 100, "tolerances are looser inside jit", "simulation.simulate:controller_for", _looser_inside),
+    Planted("c", 2, "the parameter declared first is off", "system.acausal_compiler:AcausalCompiler.__call__",
+            _parameter_bent(lambda names: 0)),
+    Planted("c", 9, "the parameter that is first by name is off", "system.acausal_compiler:AcausalCompiler.__call__",
+            _parameter_bent(lambda names: names.index(min(names)))),
+    Planted("d", 8, "discrete variables start again", "simulation.solution:Solution.at", _at(_starts_again)),
+    Planted("d", 0, "a saved state is off", "simulation.solution:Solution.at", _at(_row_before)),
+    Planted("d", 1, "clocks forget what has ticked", "simulation.solution:Solution.at", _at(_tocked)),
+    Planted("e", 22, "small starts are zero", "system.system:AcausalSystem.initialize", _no_small_values),
+    Planted("e", 21, "nominal values scale no tolerance", "simulation.step_sizes:scaled_atol",
+            lambda _: lambda system, atol: atol),
+    Planted("h", 2, "slopes hang on how many parameters there are", "system.system:AcausalSystem.vector_field",
+            _by_count(lambda system: len(system.parameters.names))),
+    Planted("h", 1, "slopes hang on how many variables there are", "system.system:AcausalSystem.vector_field",
+            _by_count(lambda system: len(system.variables))),
+    Planted("i", 100, "steps of BDF are off", "solvers.bdf:BDF.step", _step_off),
+    Planted("i", 100, "steps of Rodas5P are off", "solvers.rodas5p:Rodas5P.step", _step_off),
+    Planted("i", 100, "between steps, Tsit5 is off", "solvers.tsit5:Tsit5.step", _dense_off),
+)  # fmt: skip
+
+
+def noticed(number: int) -> str:
+    """What the letter says of the fault of this number; empty if it does not notice it."""
+    from . import LETTERS, process
+
+    fault = FAULTS[number]
+    if fault.letter == "a":
+        pairs = process.process(fault.number, planted=number)
+    else:
+        with planted(fault):
+            pairs = LETTERS[fault.letter](fault.number)
+    return next((o.text[:300] for o in pairs.outcomes if o.kind == "wrong"), "")
+
+
+def apart(number: int) -> str:
+    """`noticed` in a process of its own, whose programs nobody else uses."""
+    if FAULTS[number].letter == "a":
+        return noticed(number)  # it starts processes of its own
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["benchmarks.attack.invariance", "jaxonomy_dae.learning"])
+    with context.Pool(1, maxtasksperchild=1) as pool:
+        return pool.apply(noticed, (number,))
+
+
+def main() -> int:
+    os.environ["JAX_ENABLE_X64"] = "1"  # read where processes start
+    chosen, missed = sys.argv[1:], 0  # letters, or numbers of faults
+    for k, fault in enumerate(FAULTS):
+        if chosen and fault.letter not in chosen and str(k) not in chosen:
+            continue
+        found = apart(k)
+        missed += not found
+        print(f"{fault.letter} {fault.number:>3} {fault.what}: {found or 'NOT NOTICED'}", flush=True)
+    return min(missed, 1)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
