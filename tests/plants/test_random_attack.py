@@ -9,6 +9,7 @@ import sys
 import pytest
 from attack import invariance
 from attack.draws import FAMILIES, NETWORKS, Draw
+from attack.invariance import planted
 from attack.outcome import GOOD
 from problems import ROOT
 
@@ -104,3 +105,14 @@ def test_what_must_not_matter(letter, number):
 def test_a_twin_before_it_does_not_matter():
     pairs = invariance.LETTERS["a"](1)
     assert [o.kind for o in pairs.outcomes] == ["right"] * 10, pairs.outcomes
+
+
+# One deliberate fault of each letter that compares points; `python -m benchmarks.attack.invariance.planted` plants all.
+PLANTED = [
+    k for k, fault in enumerate(planted.FAULTS) if (fault.letter, fault.number) in (("c", 2), ("e", 22), ("h", 2))
+]
+
+
+@pytest.mark.parametrize("k", PLANTED)
+def test_a_planted_fault_is_noticed(k):
+    assert planted.apart(k)
