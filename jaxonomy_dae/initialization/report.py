@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from ..diagnosis.lost_cancellation import lost_cancellation
 from ..diagnosis.redundant_constraints import DependentConstraints, ModelAt, dependent_constraints, no_freedom
 from ..diagnosis.wording import listed
 from ..lowering.plan import SystemPlan
@@ -277,6 +278,10 @@ class InitializationReport(Sections):
 
     def _inconsistent(self) -> str:
         if not np.isfinite(self._residual).all() or not np.isfinite(self._x).all():
+            plan, numbers = self._plan, np.asarray(self._system.numbers, float)
+            lost = lost_cancellation(plan.model.groups, numbers, plan.flat.parameters.names, self.time)
+            if lost is not None:
+                return f"no consistent initial point: {lost}."
             wrong = [r.text for r in self.residuals if not np.isfinite(r.value)][:4]
             return (
                 "no consistent initial point: the equations are not finite at the start values"

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..aliases import Inputs, Result, State, Time, Tolerance
+from ..diagnosis.lost_cancellation import lost_cancellation
 from ..diagnosis.wording import listed, quoted
 from ..hybrid.solver import MOVED, STUCK, TOO_MANY
 from ..lowering.plan import SystemPlan
@@ -115,6 +116,10 @@ def explain(
     bad = _bad_input(system.plan, inputs, float(t0), float(t), float(t1))
     if bad:
         return f"the integration stopped at t={float(t):g}: {bad}"
+    plan, numbers = system.plan, np.asarray(system.numbers, float)
+    lost = lost_cancellation(plan.model.groups, numbers, plan.flat.parameters.names, float(t))
+    if lost:
+        return f"the integration stopped at t={float(t):g}: {lost}."
     equation = equation_not_finite(system, inputs, t, x)
     if equation:
         where, mend = ("at the start", "Start elsewhere, or look") if float(t) == float(t0) else ("there", "Look")
