@@ -258,10 +258,14 @@ def check_range(inputs: Mapping[str, Any], t0: Any, t1: Any):
             continue
         first, last = float(value.path.ts[0]), float(value.path.ts[-1])
         if not _reach_over(value, float(t0), float(t1), last - first if t0 == t1 else t1 - t0):
-            whole = f"the run from {float(t0):g} to {float(t1):g}: give samples for all of it, or integrate over less"
+            if t0 == t1:
+                raise ModelError(
+                    f"the samples of input '{name}' reach from {first:g} to {last:g}, and t={float(t0):g} is not among "
+                    "them: give samples there too"
+                )
             raise ModelError(
-                f"the samples of input '{name}' reach from {first:g} to {last:g}, "
-                + (whole if t0 != t1 else f"and t={float(t0):g} is not among them: give samples there too")
+                f"the samples of input '{name}' reach from {first:g} to {last:g}, the run from {float(t0):g} to "
+                f"{float(t1):g}: give samples for all of it, or integrate over less"
             )
 
 
