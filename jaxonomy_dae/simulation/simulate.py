@@ -2,7 +2,7 @@
 
 import dataclasses
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import diffrax
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..adjoint.stored_adjoint import default_adjoint
-from ..errors import InitializationError, SimulationError
+from ..errors import InitializationError, ModelError, SimulationError
 from ..initialization.check import check
 from ..programs.cache import PROGRAMS
 from ..programs.members import batch_size, is_batched
@@ -56,6 +56,7 @@ def simulate(
     stepsize_controller: diffrax.AbstractStepSizeController[Any, Any] | None = None,
     jump_ts: Any = None,
     dtmax: Any = None,
+    control: Sequence[str] = (),
     max_steps: int = 16384,
     max_events: int | None = None,
     save_events: bool | None = None,
@@ -95,6 +96,8 @@ def simulate(
         depend, where ω is an expression in parameters, and long steps end at its zeros and extremes; `jnp.inf` leaves
         that out. Inputs that are functions do not tell their periods: derivatives by the amplitude of one, where this
         is zero, need a longest step if the input is faster than what it acts on.
+    - `control`: variables whose errors count, beside those of the states, such as a pressure that hangs on a mass by a
+        large factor. A warning names them where a solution is read and the tolerance of a state shows in them.
     - `max_steps`: bounds the steps taken, beside those that end at samples; with `ts=None` as many rows are reserved.
     - `max_events`: bounds the events of conditions; `solution.events` has room for as many. None: 12,800 of them, and
         as much room as is needed outside jit, grad and vmap, where a run with more than 100 is made again with room for
@@ -126,6 +129,9 @@ def simulate(
         if initial is None or isinstance(initial, Mapping):
             initial = system.plan.one_by_one(initial)
     ts = ts if ts is None or hasattr(ts, "ndim") else as_array(ts)
+    if isinstance(control, str):
+        raise ModelError(f"control is a list of variables' names; write control=[{control!r}]")
+    control = tuple(control)
     check_switches(max_events, save_events=save_events, progress=progress, throw=throw)
     check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_controller, dtmax, max_steps)
     t0 = initial_time(t0, initial)
@@ -161,16 +167,20 @@ def simulate(
         room = listed if events is not None and events.are_listed else 0
         few = room * (system.plan.n_state + len(system.discretes)) <= FEW_NUMBERS
         sides = few and sides_possible if save_events is None else save_events
-        control = stepsize_controller
-        if control is None:
-            control = controller_for(system, solver, rtol, atol, dtmax)
+        steps = stepsize_controller
+        if steps is None:
+            steps = controller_for(system, solver, rtol, atol, dtmax, control)
         chosen = default_adjoint(is_forwards(given), batch_size(given)) if adjoint is None else adjoint
         return Options(
-            solver, chosen, clipped(control, jump_ts, ends),
+            solver, chosen, clipped(steps, jump_ts, ends),
             max_steps + ends.count, progress, most_events, room, sides,
         )  # fmt: skip
 
-    asked = Asked.of(jump_ts, dtmax, max_steps, solver if stepsize_controller is None else None)
+    if control and stepsize_controller is not None:
+        raise ModelError("control= and stepsize_controller= both say what errors count: leave one of them out")
+    prescribed = stepsize_controller is not None
+    tolerances = None if prescribed else (rtol, scaled_atol(system, atol))
+    asked = Asked.of(jump_ts, dtmax, max_steps, None if prescribed else solver, control, tolerances)
     if solver is None:
         choice = solver_choice(system.plan)
         solver = SOLVERS[choice.solver]()

@@ -1,5 +1,6 @@
 """Solutions: every variable by name."""
 
+import warnings
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from html import escape
 from typing import Any
@@ -14,11 +15,12 @@ from jaxtyping import Array, Float
 
 from ..errors import ModelError
 from ..lowering.gather import times
-from ..programs.blocks import at_times
+from ..programs.blocks import at_times, fit
 from ..programs.cache import compiled
 from ..programs.staging import is_staged, is_traced
 from ..system.system import AcausalSystem
 from .accounts import account_values, chosen_terms
+from .amplified import amplified, is_looked_at, sentence
 from .event_log import EventLog, Events
 from .labelled import data_frame, data_set
 from .saved_state import Memory, SavedState
@@ -36,17 +38,20 @@ class Asked(eqx.Module):
     dtmax: Any
     max_steps: int = eqx.field(static=True)
     solver: Any = eqx.field(static=True, default=None)
+    control: tuple[str, ...] = eqx.field(static=True, default=())
+    tolerances: tuple[Any, Any] | None = None  # rtol, and atol of each state
 
     @staticmethod
-    def of(jump_ts: Any, dtmax: Any, max_steps: int, solver: Any) -> "Asked":
+    def of(jump_ts: Any, dtmax: Any, max_steps: int, solver: Any, control: tuple[str, ...], tolerances: Any) -> "Asked":
         """The options, with a solver only if solutions that name it can be compared."""
         known = not any(eqx.is_array(leaf) for leaf in jax.tree.leaves(solver)) and isinstance(solver, Hashable)
-        return Asked(jump_ts, dtmax, max_steps, solver if known else None)
+        return Asked(jump_ts, dtmax, max_steps, solver if known else None, control, tolerances)
 
     @property
     def options(self) -> dict[str, Any]:
-        """The arguments of `simulate`."""
-        return {"jump_ts": self.jump_ts, "dtmax": self.dtmax, "max_steps": self.max_steps, "solver": self.solver}
+        """The arguments of `simulate`, without tolerances."""
+        names = ("jump_ts", "dtmax", "max_steps", "solver", "control")
+        return {name: getattr(self, name) for name in names}
 
 
 class Solution(eqx.Module):
@@ -133,7 +138,9 @@ class Solution(eqx.Module):
         given = (self.system, self.ts, self.states, self.inputs, self.discrete)
         if is_staged(given):
             return _observed(*given, quantity, factor)[:, 0]
-        return _chosen(*given, jnp.asarray(quantity), jnp.asarray(factor, self.states.dtype))[:, 0]
+        values, some = _chosen(*given, jnp.asarray(quantity), jnp.asarray(factor, self.states.dtype))
+        self._look_at((name,), quantity, factor, values, some)
+        return values[:, 0]
 
     def _state(self, quantity: int, factor: float) -> Any:
         """The values of quantities that are zero or part of the state array; None for others."""
@@ -145,6 +152,21 @@ class Solution(eqx.Module):
             return None
         column = self.states[:, int(place[0])]
         return times(factor, column)
+
+    def _look_at(self, names: Sequence[str], quantity: np.ndarray, factor: np.ndarray, values: Any, some: Any) -> None:
+        """Warns of variables that amplify the tolerances of the run, outside of jit; `some` are the values of all
+        quantities at a few times."""
+        asked = self.asked
+        if asked is None or asked.tolerances is None or is_traced((self, values)) or not is_looked_at(self.system):
+            return
+        rows = _some(self.ts.shape[0])
+        rtol, atol = map(np.asarray, asked.tolerances)
+        at = list(zip(np.asarray(self.ts, float)[rows].tolist(), np.asarray(some, float), strict=True))
+        tolerances = rtol * np.abs(np.asarray(self.states, float)[rows]) + atol
+        found = amplified(self.system, names, quantity, factor, np.asarray(values, float), at, tolerances)
+        found = [one for one in found if one.name not in asked.control]
+        if found:
+            warnings.warn(sentence(found), RuntimeWarning, stacklevel=4)
 
     def _columns(self, names: tuple[str, ...]) -> Any:
         """The values of several variables, shape `(n, len(names))`, evaluated at once."""
@@ -166,8 +188,9 @@ class Solution(eqx.Module):
         else:
             n = 1 << (len(quantity) - 1).bit_length()  # numbers of names that share a program
             padded = np.resize(quantity, n), np.resize(factor, n)
-            chosen = _chosen(*given, jnp.asarray(padded[0]), jnp.asarray(padded[1], self.states.dtype))
+            chosen, some = _chosen(*given, jnp.asarray(padded[0]), jnp.asarray(padded[1], self.states.dtype))
             values = jnp.where(quantity < 0, 0.0, chosen[:, : len(quantity)])
+            self._look_at([n for n in names if n not in own], quantity, factor, values, some)
         if not own:
             return values
         place = {name: k for k, name in enumerate(own)}
@@ -322,14 +345,25 @@ def _observed(system: AcausalSystem, ts, states, inputs, discrete, quantity: np.
 
 @compiled
 def _chosen(system: AcausalSystem, ts, states, inputs, discrete, quantity, factor):
-    """The values of quantities, shape (n, quantities). Their numbers are traced, so that one program serves as many
-    names whichever they are; all quantities are computed, at a block of times after another."""
+    """The values of quantities, shape (n, quantities), and those of all quantities at `_some` times. Their numbers are
+    traced, so that one program serves as many names whichever they are; all quantities are computed, at a block of
+    times after another."""
     every = np.arange(system.plan.extended.quantities.n)
 
-    def one(t, x, q):
-        return factor * _held(system, q).at(t, inputs).quantities(x, every, np.ones(len(every)))[quantity]
+    def all_at(t, x, q):
+        return _held(system, q).at(t, inputs).quantities(x, every, np.ones(len(every)))
 
-    return at_times(one, ts, states, discrete, width=len(every))
+    rows, some = (ts, states, discrete), _some(ts.shape[0])
+    if fit(ts.shape[0], len(every)):
+        found = jax.vmap(all_at)(*rows)
+        return factor * found[:, quantity], found[some]
+    values = at_times(lambda *row: factor * all_at(*row)[quantity], *rows, width=len(every))
+    return values, jax.vmap(all_at)(*jax.tree.map(lambda row: row[some], rows))
+
+
+def _some(n: int) -> np.ndarray:
+    """The first, the middle and the last of n places."""
+    return np.unique([0, n // 2, n - 1])
 
 
 @compiled

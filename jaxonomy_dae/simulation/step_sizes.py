@@ -1,5 +1,6 @@
 """Step sizes for a compiled system: the controller, the first step, and where steps must end."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import diffrax
@@ -16,6 +17,7 @@ from ..solvers.step_control import UNSEEN, ConstantLengths
 from ..system.inputs import StepEnds
 from ..system.system import AcausalSystem
 from ..system.system_at import SystemAt
+from .controlled_variables import with_variables
 from .wave_control import WaveControl
 
 
@@ -32,11 +34,14 @@ def scaled_atol(system: AcausalSystem, atol: Tolerance) -> Any:
     return jnp.asarray(np.asarray(atol) * size, atol.dtype)
 
 
-def controller_for(system: AcausalSystem, solver: Solver, rtol: Tolerance, atol: Tolerance, dtmax: Time) -> Any:
+def controller_for(
+    system: AcausalSystem, solver: Solver, rtol: Tolerance, atol: Tolerance, dtmax: Time, control: Sequence[str] = ()
+) -> Any:
     """The step-size controller for these tolerances, the absolute ones in units of the nominal values. If the user
     gives no longest step, it is bounded by the period of the waves that drive the model."""
-    atol = scaled_atol(system, atol)
-    controller: Any = step_control(solver, rtol, atol, dtmax=dtmax)
+    controller: Any = step_control(solver, rtol, scaled_atol(system, atol), dtmax=dtmax)
+    if control:
+        controller = with_variables(system, controller, solver, control, atol)
     if dtmax is not None or not system.plan.waves:
         return controller
     at = SystemAt(system.plan, system.numbers, (), 0.0, {}, system.typical_sizes)

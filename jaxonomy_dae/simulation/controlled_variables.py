@@ -1,0 +1,88 @@
+"""Variables that are not states, under the error control of a run.
+
+A variable y(t, x) may hang on a state by a large factor: the pressure of a stiff volume on the mass in it. Errors of
+the state that its tolerance allows then show. Here |∂y/∂x|·|error of x| counts as an error of y beside rtol·|y| + atol.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..adjoint.resting import still
+from ..adjoint.wrapped_control import WrappedControl
+from ..aliases import Args, Controller, State, Time, Tolerance
+from ..errors import ModelError
+from ..programs.staging import is_traced
+from ..solvers import BDF
+from ..solvers.drive import inner
+from ..system.system import AcausalSystem
+
+
+class ControlledVariables(WrappedControl):
+    """Wraps a controller so that the error norm has entries for variables of the model, too.
+
+    - `quantity`, `factor`: the variables, shape (m,) each; `extra`: their absolute tolerances, shape (m,).
+    """
+
+    controller: Controller
+    system: AcausalSystem
+    extra: Tolerance
+    quantity: tuple[int, ...] = eqx.field(static=True)
+    factor: tuple[float, ...] = eqx.field(static=True)
+
+    def wrap(self, direction):
+        return eqx.tree_at(lambda c: c.controller, self, self.controller.wrap(direction))
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        """The end of the first step, and the state of the controller."""
+        return self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+
+    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
+        """As `controller.adapt_step_size`, of the state and the variables."""
+        own, given, here, there, y_, y1, error = still((self, args, t0, t1, y0, y1_candidate, y_error))
+        before, after = own._read(here, y_, given), own._read(there, y1, given)
+        slopes = jax.jacrev(lambda x: own._read(there, x, given))(y1)
+        # Without signs: error estimates of two states may have lost theirs, and must not cancel.
+        moved = jnp.abs(slopes) @ jnp.abs(error)
+        atol = jnp.concatenate([jnp.broadcast_to(own.controller.atol, y1.shape), own.extra])
+        controller = eqx.tree_at(lambda c: c.atol, self.controller, atol)
+        pairs: Any = ((y0, before), (y1_candidate, after), (y_error, moved))
+        joined = [jnp.concatenate(pair) for pair in pairs]
+        return controller.adapt_step_size(t0, t1, *joined[:2], args, joined[2], error_order, controller_state)
+
+    def _read(self, t: Time, x: State, args: Args) -> Any:
+        return self.system.at(t, args).quantities(x, np.array(self.quantity), np.array(self.factor))
+
+
+def with_variables(system: AcausalSystem, controller: Any, solver: Any, names: Sequence[str], atol: Tolerance) -> Any:
+    """The controller, with the variables of these names under error control, too.
+
+    **Raises:**
+
+    - `ModelError` for a solver that chooses its own steps, and for models with events that write.
+    """
+    if isinstance(inner(solver), BDF):
+        raise ModelError(
+            "control= needs a solver whose steps follow from the errors of all states: use solver=Rodas5P(); BDF "
+            "chooses its order and steps by errors of its own"
+        )
+    if system.plan.events is not None and len(system.plan.events.discrete):
+        raise ModelError(
+            "control= does not know the discrete variables and modes of this model: give a smaller rtol instead"
+        )
+    quantity, factor = system.plan.resolve(system.plan.entry_names(list(names)))
+    read = quantity >= 0
+    quantity, factor = quantity[read], factor[read]
+    size = np.minimum(np.abs(factor) * _sizes(system)[quantity], 1.0)
+    extra = atol * jnp.asarray(size, atol.dtype)
+    return ControlledVariables(controller, system, extra, tuple(quantity.tolist()), tuple(factor.tolist()))  # pyright: ignore[reportCallIssue]
+
+
+def _sizes(system: AcausalSystem) -> np.ndarray:
+    """The typical sizes of all quantities, one where they are traced."""
+    sizes = system.typical_sizes
+    return np.ones(sizes.shape) if is_traced(sizes) else np.asarray(sizes)
