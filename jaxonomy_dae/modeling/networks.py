@@ -39,6 +39,16 @@ def count_outputs(network: Callable, inputs: int, where: str, theta: Any = None,
         found = getattr(out, "shape", type(out).__name__)
         scalar = "a scalar or " if noun == "function" else ""
         raise ModelError(f"{where}: the {noun} must return {scalar}a vector of shape (outputs,); got shape {found}")
+    if jnp.issubdtype(out.dtype, jnp.complexfloating):
+        raise ModelError(
+            f"{where}: the {noun} must return real numbers; got {out.dtype}: return jnp.real(…) and jnp.imag(…) as two "
+            "outputs"
+        )
+    if not jnp.issubdtype(out.dtype, jnp.floating):
+        raise ModelError(
+            f"{where}: the {noun} must return floating-point numbers, which have derivatives; got {out.dtype}: write "
+            "jnp.where(…, 1.0, 0.0), or jnp.asarray(…, float)"
+        )
     return out.shape[0]
 
 

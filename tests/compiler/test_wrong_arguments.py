@@ -309,3 +309,20 @@ def test_models(build, parts):
         build()
     for part in parts:
         assert part in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("law", "said"),
+    [
+        (lambda x: jnp.where(x > 0, 1, 0), "floating-point numbers.*got int"),
+        (lambda x: x > 0, "floating-point numbers.*got bool"),
+        (lambda x: jax.lax.complex(x, x), "real numbers; got complex"),
+        (lambda x: jnp.ones((2, 2)) * x, "shape"),
+        (lambda x: "one", "law"),
+    ],
+)
+def test_what_functions_return_is_checked(law, said):
+    """Kind: what a user's function returns is checked as what users declare, where the model is written."""
+
+    with pytest.raises(ModelError, match=said):
+        compiled(component(lambda self, ev: self.function("law", law, [self.variable("x")])))
