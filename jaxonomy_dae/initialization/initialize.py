@@ -25,6 +25,7 @@ from ..lowering.gather import Gather, take, times
 from ..lowering.plan import SystemPlan
 from ..model.declared import declared_scale, quantity_bounds
 from ..programs.cache import PROGRAMS, compiled
+from ..programs.platform import precisely
 from ..programs.staging import is_staged
 from ..system.evaluate import Refinement
 from ..system.inputs import read_inputs
@@ -61,6 +62,7 @@ class InitialPoint(NamedTuple):
     jacobian: Any
 
 
+@precisely
 def initialize(
     system,
     t0: Any,

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from ..programs.platform import platform
 from . import written_out
 from .once import stacked
 
@@ -22,7 +23,7 @@ def inverse(matrix: Sequence[Sequence[Any]]) -> list[list[Any]]:
     m, shape = len(matrix), matrix[0][0].shape
     if m == 1:
         return [[1 / matrix[0][0]]]
-    if m <= FORMULA or jax.default_backend() != "cpu":
+    if m <= FORMULA or platform() != "cpu":
         return written_out.inverse(matrix)
     dense = jnp.reshape(stacked([a for row in matrix for a in row]), (m, m, *shape))
     found = _of_batch(dense) if shape else _of_one(dense)

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from ..private_names import MissingName, private
+from ..programs.platform import platform
 
 
 def joined(parts: Sequence[Any]) -> Any:
@@ -58,7 +59,7 @@ def _stack(*rows: Any) -> Any:
 
 def _called(function: Any, parts: Sequence[Any]) -> Any:
     # XLA for GPUs takes a call that stays for a graph of commands.
-    if jax.default_backend() != "cpu":
+    if platform() != "cpu":
         return function(*parts)
     try:
         mark = private("set_xla_metadata")

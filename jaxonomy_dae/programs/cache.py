@@ -20,6 +20,7 @@ import jax.numpy as jnp
 
 from ..private_names import clear_jitted
 from .machine import Use, mappings, memory, return_memory
+from .platform import platform
 from .staging import is_traced
 
 # Of the mappings that Linux allows, and of the memory that this process could have. What is left must hold what is
@@ -195,11 +196,13 @@ def compiled(function: Callable[_P, _T], runs_once: bool = True) -> Callable[_P,
     return call
 
 
-@functools.cache
 def quick() -> dict[str, bool]:
     """Options of `jax.jit` for a program of which compilation takes longer than its runs; none on other processors."""
-    if jax.default_backend() != "cpu":
-        return {}
+    return _quick() if platform() == "cpu" else {}
+
+
+@functools.cache
+def _quick() -> dict[str, bool]:
     try:
         jax.jit(jnp.negative, compiler_options=_QUICK).lower(0.0).compile()
     except Exception:  # an XLA without the older code generator: JAX promises no type of error

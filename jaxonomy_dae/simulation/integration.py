@@ -17,6 +17,7 @@ from ..hybrid.term import HybridTerm
 from ..initialization.check import check
 from ..initialization.initialize import InitialPoint, initialize, is_consistent
 from ..programs.cache import compiled
+from ..programs.platform import precisely
 from ..solvers.drive import integrate, is_implicit, right_between_steps
 from ..solvers.rows import not_a_number, padded
 from ..solvers.switching import STIFF, Watch
@@ -83,6 +84,7 @@ class Outcome(eqx.Module):
         return {name: int(value) for name, value in self.stats.items() if jnp.ndim(value) == 0}
 
 
+@precisely
 def run(given: Given, options: Options, watch: Watch | None, checked: bool = False) -> Outcome:
     """Integrates what is given; `watch` is for Tsit5. With `checked`, an inconsistent start
     and times that do not fit are errors while running."""

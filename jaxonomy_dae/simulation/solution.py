@@ -17,6 +17,7 @@ from ..errors import ModelError
 from ..lowering.gather import times
 from ..programs.blocks import at_times, fit
 from ..programs.cache import compiled
+from ..programs.platform import precisely
 from ..programs.staging import is_staged, is_traced
 from ..system.system import AcausalSystem
 from .accounts import account_values, chosen_terms
@@ -344,6 +345,7 @@ def _observed(system: AcausalSystem, ts, states, inputs, discrete, quantity: np.
 
 
 @compiled
+@precisely
 def _chosen(system: AcausalSystem, ts, states, inputs, discrete, quantity, factor):
     """The values of quantities, shape (n, quantities), and those of all quantities at `_some` times. Their numbers are
     traced, so that one program serves as many names whichever they are; all quantities are computed, at a block of

@@ -17,6 +17,7 @@ from ..adjoint.stored_adjoint import default_adjoint
 from ..errors import InitializationError, ModelError, SimulationError
 from ..programs.cache import PROGRAMS, compiled
 from ..programs.members import failed_members, is_batched
+from ..programs.platform import precisely
 from ..programs.staging import as_array, is_forwards, is_staged, is_traced
 from .bdf import BDF
 from .dae_term import DAETerm, FlatProblem
@@ -224,6 +225,7 @@ def _rounded_up(value: float) -> float:
     return math.ceil(value / unit) * unit
 
 
+@precisely
 def _solve(term, t0, t1, y0, ts, args, tolerances, options, checked=False):
     solver, adjoint, controller, max_steps = options
     check: StartCheck = start_check(FlatProblem(term, y0, args), t0, *tolerances)

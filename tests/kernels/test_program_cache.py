@@ -259,7 +259,7 @@ def test_an_unknown_compiler_option_is_left_out(monkeypatch):
     """Of an XLA that lost the older code generator."""
     monkeypatch.setattr(cache, "_QUICK", {"xla_cpu_no_such_option": False})
     monkeypatch.setattr(cache.jax, "default_backend", lambda: "cpu")
-    assert cache.quick.__wrapped__() == {}
+    assert cache._quick.__wrapped__() == {}
 
 
 def test_what_is_staged():

@@ -1,0 +1,36 @@
+"""What programs are made for: the platform at hand, and products of matrices in full precision."""
+
+import jax
+import jax.numpy as jnp
+from problems import pendulum
+
+from jaxonomy_dae import simulate
+from jaxonomy_dae.programs.platform import platform, precisely
+from jaxonomy_dae.solvers import Rodas5P
+
+
+def test_the_platform_is_that_of_the_default_device():
+    """Kind: `jax.default_backend()` asked where programs are made for another device."""
+    assert platform() == jax.default_backend()
+    with jax.default_device(jax.devices("cpu")[0]):
+        assert platform() == "cpu"
+
+
+def test_products_of_matrices_are_in_full_precision():
+    """Kind: a result that hangs on the processor. GPUs round the factors of products in single precision to ten bits
+    by default, so that Newton's method rests at 1e-3. A precision that the user chose stays."""
+    product = precisely(lambda a: a @ a)
+    assert "HIGHEST" in jax.jit(product).lower(jnp.ones((2, 2), jnp.float32)).as_text()
+    with jax.default_matmul_precision("bfloat16"):
+        assert "HIGHEST" not in jax.jit(product).lower(jnp.ones((2, 2), jnp.float32)).as_text()
+
+
+def test_runs_are_in_full_precision():
+    system = pendulum()
+
+    def last(m):
+        return simulate(system.with_parameters({"pend.m": m}), 1.0, ts=jnp.ones(1), solver=Rodas5P())["pend.x"][0]
+
+    text = jax.jit(jax.grad(last)).lower(1.0).as_text()
+    dots = [line for line in text.splitlines() if "dot_general" in line]
+    assert dots and all("HIGHEST" in line for line in dots)
