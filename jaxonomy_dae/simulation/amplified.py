@@ -19,6 +19,7 @@ from ..tolerances import RANK, TINY
 # 1/200 of its range by the tolerance of one step ended 1/30 off (test_tolerances.py::test_an_amplified_tolerance).
 NOTABLE = 1e-3
 STEADY = 1e-3  # of its size: a variable that moves by less is compared with its size
+MORE = 10.0  # than the relative tolerance of a variable, or of its typical size: less is rounding, or as asked for
 LARGE = 100  # quantities up to which this is looked at: it costs their number to the third power, 5 ms at 100
 SHOWN = 3  # variables that a sentence explains
 
@@ -50,7 +51,7 @@ def is_looked_at(system: AcausalSystem) -> bool:
 
 def amplified(
     system: AcausalSystem, names: Sequence[str], quantity: np.ndarray, factor: np.ndarray, values: np.ndarray,
-    at: Sequence[tuple[float, np.ndarray]], tolerances: np.ndarray,
+    at: Sequence[tuple[float, np.ndarray]], tolerances: np.ndarray, rtol: float,
 ) -> list[Amplified]:  # fmt: skip
     """The variables that the tolerance of a state moves notably.
 
@@ -59,8 +60,9 @@ def amplified(
     - `names`, `quantity`, `factor`: the variables, shape (m,); `values`: at the saved times, shape (times, m).
     - `at`: some times, and all quantities then.
     - `tolerances`: of the entries of the state at these times, shape (some times, n_state).
+    - `rtol`: what the user asked for.
     """
-    plan = system.plan
+    plan, typical = system.plan, np.asarray(system.typical_sizes)
     states = np.concatenate([plan.states, plan.carried])
     slopes = np.stack([_slopes(system, states, t, all_values) for t, all_values in at])
     known = np.arange(plan.extended.quantities.n_unknown)
@@ -70,9 +72,10 @@ def amplified(
         if q not in known or q in states or not len(column):
             continue
         size, scale = float(np.abs(column).max()), float(np.ptp(column))
+        own = MORE * rtol * max(size, float(typical[q]))  # that much would be no error of the variable itself
         scale = scale if scale > STEADY * size else size
         moved = np.abs(f * slopes[:, q]) * tolerances
-        if np.isfinite(moved).all() and moved.max() > NOTABLE * scale:
+        if np.isfinite(moved).all() and moved.max() > max(NOTABLE * scale, own):
             time, state = np.unravel_index(int(np.argmax(moved)), moved.shape)
             hangs = float(abs(f * slopes[time, q, state]))
             found.append(Amplified(name, float(moved.max()), [*system.states, *system.carried][state], hangs, scale))

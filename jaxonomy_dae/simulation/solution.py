@@ -164,7 +164,7 @@ class Solution(eqx.Module):
         rtol, atol = map(np.asarray, asked.tolerances)
         at = list(zip(np.asarray(self.ts, float)[rows].tolist(), np.asarray(some, float), strict=True))
         tolerances = rtol * np.abs(np.asarray(self.states, float)[rows]) + atol
-        found = amplified(self.system, names, quantity, factor, np.asarray(values, float), at, tolerances)
+        found = amplified(self.system, names, quantity, factor, np.asarray(values, float), at, tolerances, float(rtol))
         found = [one for one in found if one.name not in asked.control]
         if found:
             warnings.warn(sentence(found), RuntimeWarning, stacklevel=4)
