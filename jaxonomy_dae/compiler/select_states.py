@@ -25,7 +25,7 @@ from ..model.extended import Extended
 from ..model.group import Point
 from ..model.reduced import ReducedModel
 from ..model.tables import ZERO, EquationGroup, equation_offsets
-from ..model.typical_sizes import error_sizes, unrounded_sizes
+from ..model.typical_sizes import typical_sizes, unrounded_sizes
 from ..tolerances import ALIKE, KNOWN
 from .preferences import Merit
 
@@ -133,7 +133,7 @@ def select_states(model: ReducedModel, mode: str, merit: Sequence[Merit]) -> Sta
             if at is None:
                 at, scale = initial_point(model, model.flat.declares), _scale(model)
                 numbers = evaluate(groups, extended, entries, at)
-                known = KNOWN * (np.abs(at.values[:-1]) + error_sizes(model, at.parameters))
+                known = KNOWN * (np.abs(at.values[:-1]) + typical_sizes(model, at.parameters))
                 errors = evaluate_errors(groups, extended, entries, at, known)
             columns = np.unique(entries.column[members])
             dense, bounds = np.zeros((2, len(rows), len(columns)))

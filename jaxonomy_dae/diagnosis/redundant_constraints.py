@@ -36,7 +36,7 @@ from ..model.linear_template import LinearTemplate
 from ..model.provenance import Provenance
 from ..model.reduced import ReducedModel
 from ..model.tables import ZERO, AliasTable, FlatModel, equation_offsets, provenance_of
-from ..model.typical_sizes import error_sizes
+from ..model.typical_sizes import typical_sizes
 from ..tolerances import HALF_OF_THE_DIGITS, KNOWN, NO_PART, UNCHANGED
 from .wording import listed, words
 
@@ -57,7 +57,7 @@ class ModelAt:
     @functools.cached_property
     def error_sizes(self) -> np.ndarray:
         """The sizes to whose rounding all quantities are known."""
-        return error_sizes(self.model, self.point.parameters)
+        return typical_sizes(self.model, self.point.parameters)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,15 +1,15 @@
 """Values and Jacobians of blocks at a point, in NumPy."""
 
+import functools
 from collections.abc import Callable
 
 import numpy as np
 
 from ..lowering.plan import SystemPlan
-from ..lowering.remembered import remembered
 from ..lowering.schedule import Step, StepEquation
 from ..model.group import Point
 from ..model.networks import Networks
-from ..model.typical_sizes import error_sizes
+from ..model.typical_sizes import typical_sizes
 from ..tolerances import KNOWN
 
 
@@ -69,8 +69,11 @@ class BlockValues:
     def errors(self) -> np.ndarray:
         """Bounds of the errors of quantities: they are found by Newton's method, so to rounding of themselves and of
         their typical sizes."""
-        known = _error_sizes(self.plan, np.asarray(self.parameters, float).tobytes())
-        return KNOWN * (np.abs(self.quantities) + np.append(known, 0.0))
+        return KNOWN * (np.abs(self.quantities) + np.append(self._typical, 0.0))
+
+    @functools.cached_property
+    def _typical(self) -> np.ndarray:
+        return typical_sizes(self.plan.model, np.asarray(self.parameters, float))
 
     def residual(self, equation: StepEquation) -> np.ndarray:
         """The residuals of an equation, (n,)."""
@@ -103,9 +106,3 @@ class BlockValues:
             found = np.full(residual.shape, np.nan)
         for u, quantities in enumerate(step.unknown):
             self.quantities[quantities] = found[:, u]
-
-
-@remembered
-def _error_sizes(plan: SystemPlan, parameters: bytes) -> np.ndarray:
-    """The sizes to whose rounding all quantities are known."""
-    return error_sizes(plan.model, np.frombuffer(parameters))

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from ..linear.graph_elimination import GraphElimination
 from .extended import ExtendedGroup
@@ -141,15 +141,6 @@ class Factors:
 def _are_equal(one: Any, other: Any) -> bool:
     parts = ("indptr", "indices", "data")
     return one.shape == other.shape and all(np.array_equal(getattr(one, p), getattr(other, p)) for p in parts)
-
-
-def are_told(groups: Sequence[ExtendedGroup], n: int, parameters: Float[np.ndarray, " p"]) -> Bool[np.ndarray, " n"]:
-    """True for quantities of whose size an equation says something, shape (n,): it has a slope in them near 1. Of
-    exp(x/u) for a small u it has none, so that x's size stays 1 though nothing says so."""
-    entries = _seen(groups, np.ones(n), np.where(parameters == 0.0, 1.0, parameters), _Entries)
-    out = np.zeros(n, bool)
-    out[entries.by_quantity[1]] = True
-    return out
 
 
 def _moved(size: np.ndarray, decades: np.ndarray) -> np.ndarray:

@@ -9,13 +9,12 @@ from ..tolerances import KNOWN
 from .declared import declared_scale
 from .extended import Extended
 from .jacobian import generic
-from .natural_sizes import Factors, are_told, natural_sizes
+from .natural_sizes import Factors, natural_sizes
 from .reduced import ReducedModel
 
 MOVED = 1e-6  # of parameters: a difference from which a slope is told to six digits
 DECADES = 30  # that they may span: single precision has 38
-# Answers kept for one model: with and without starts, at the values it was compiled with and at others.
-ROOM = 4
+ROOM = 4  # answers kept for one model: at the values it was compiled with, at those it is run with, and two between
 
 
 def typical_sizes(
@@ -36,23 +35,6 @@ def unrounded_sizes(
     """As `typical_sizes` before rounding to powers of two. State selection compares sizes, and rounding could turn a
     small difference into a factor of two."""
     return _balanced(model.extended, parameters, _declared_or_started(model, parameters))
-
-
-def error_sizes(model: ReducedModel, parameters: Float[np.ndarray, " parameters"]) -> Float[np.ndarray, " quantities"]:
-    """The sizes to whose rounding quantities are known, where they are near zero, at these values of the parameters:
-    the typical ones, except that a start which is rounding itself, as L·sin(π) is, says nothing. Zero where nothing is
-    known."""
-    extended, declared = model.extended, declared_scale(model)
-    started = _declared_or_started(model, parameters)
-    typical = _balanced(extended, parameters, started)
-    if (np.abs(started) > KNOWN * typical.max(initial=0.0))[started != 0.0].all():
-        return _rounded(typical)
-    without = _balanced(extended, parameters, declared)
-    is_rounding = (np.abs(started) <= KNOWN * without) & (started != 0.0)
-    is_rounding &= are_told(extended.groups, extended.quantities.n, parameters)
-    if not is_rounding.any():
-        return _rounded(typical)
-    return _balanced(extended, parameters, np.where(is_rounding, declared, started))
 
 
 def _declared_or_started(model: ReducedModel, parameters: np.ndarray) -> np.ndarray:

@@ -126,8 +126,11 @@ class AcausalSystem(eqx.Module):
         - `ModelError` for unknown names, values that are not finite or out of bounds. Inside jit, grad and vmap, where
             values are not known, those become not-a-number, and so does all that is computed with them: see `simulate`.
         """
-        changed = self.parameters.replaced(values)
-        system, sizes = eqx.tree_at(lambda s: s.parameters, self, changed), self._sizes_at(changed)
+        return self._at(self.parameters.replaced(values))
+
+    def _at(self, parameters: Parameters) -> "AcausalSystem":
+        """The system with these parameters, and the typical sizes that follow from them."""
+        system, sizes = eqx.tree_at(lambda s: s.parameters, self, parameters), self._sizes_at(parameters)
         # Of one that holds some leaves only, as `partition` makes it, sizes may be None, which `tree_at` does not take.
         return system if sizes is self.typical_sizes else eqx.tree_at(lambda s: s.typical_sizes, system, sizes)
 
@@ -499,7 +502,7 @@ class AcausalSystem(eqx.Module):
         # Rounding must not leave the bounds, nor the clip the gradient.
         solved = found.solved + jax.lax.stop_gradient(jnp.clip(found.solved, low, high) - found.solved)
         values = table.complete(self.parameters.array.at[index].set(solved))
-        return found.x, eqx.tree_at(lambda s: s.parameters, self, Parameters(values, None, (), table))
+        return found.x, self._at(Parameters(values, None, (), table))
 
     def initialization_report(
         self,

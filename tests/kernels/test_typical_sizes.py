@@ -148,3 +148,76 @@ def test_a_quantity_that_stands_in_two_places_counts_once(power):
     system = compiled(Product(EqnEnv(), "p"))
     quantity = system.plan.resolve(["p.a0"])[0][0]
     assert abs(np.log10(system.typical_sizes[quantity] / 1e-12 ** (1 / power))) < 0.5
+
+
+def size_of(system, name):
+    return float(system.typical_sizes[system.plan.resolve([name])[0][0]])
+
+
+class Heated(Component):
+    """A pressure in bar, its force by a large area, and what follows."""
+
+    def __init__(self, ev, name, **declared):
+        super().__init__(ev, name)
+        p, force = self.variable("p", **declared), self.variable("force")
+        x, area = self.variable("x", start=0.0, fixed=True), self.parameter("area", 1e5)
+        self.add_equations(Eq(p, ev.t + 1), Eq(force, area * p), Eq(der(x), 2 * force))
+
+
+@pytest.mark.parametrize("what", ["nominal", "start"])
+@pytest.mark.parametrize("size", [1e-9, 1.0, 1e6])
+def test_a_size_of_one_is_declared_as_any_other(what, size):
+    """Unknown was written as 1, so that nominal=1.0 and start=±1 counted as not declared, and sizes jumped between 1.0
+    and 1.0000001."""
+    signs = (1.0, -1.0) if what == "start" else (1.0,)
+    found = [
+        [size_of(compiled(Heated(EqnEnv(), "c", **{what: sign * value})), f"c.{n}") for n in ("p", "force", "x")]
+        for sign in signs
+        for value in (size, size * (1 + 1e-7), size * (1 - 1e-7))
+    ]
+    assert found == [found[0]] * len(found)
+    assert 0.7 < found[0][0] / size < 1.5
+
+
+class Spring(Component):
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        length, k = self.parameter("length", 1.0), self.parameter("k", 2.0)
+        x, v = self.variable("x"), self.variable("v")
+        self.add_equations(Eq(der(x), v), Eq(der(v), -k * (x - length)))
+
+
+def test_sizes_follow_parameters_that_are_solved_for():
+    """They stayed those of the values from which the search began."""
+    system = compiled(Spring(EqnEnv(), "s"))
+    values = {"s.x": 1e6, "s.v": 0.0, "der(s.v)": 0.0}
+    _, found = system.initialize(initial=values, solve_for=["s.length"])
+    assert float(found.parameters["s.length"]) == pytest.approx(1e6, rel=1e-9)
+    given = system.with_parameters({"s.length": found.parameters["s.length"]})
+    np.testing.assert_array_equal(found.typical_sizes, given.typical_sizes)
+    assert (np.asarray(found.typical_sizes) != np.asarray(system.typical_sizes)).any()
+
+
+class Gas(Component):
+    """p·(V − b·n) = n·RT, of so little that n is below the rounding of a size that its equation alone suggests."""
+
+    def __init__(self, ev, name, amount, pressure, how):
+        super().__init__(ev, name)
+        heat = 2494.0
+        volume, b = self.parameter("V", 1.3 * amount * heat / pressure), self.parameter("b", 0.325 * heat / pressure)
+        start = self.parameter("n0", amount) if how == "parameter" else amount
+        n, p = self.variable("n", start=start, fixed=True), self.variable("p")
+        if how == "derivative":
+            rate = self.variable("rate", start=-amount, fixed=True)
+            self.add_equations(Eq(der(rate), -rate))
+        self.add_equations(Eq(der(n), -n), Eq(p * (volume - b * n), n * heat))
+
+
+@pytest.mark.parametrize("how", ["number", "parameter", "derivative"])
+@pytest.mark.parametrize(("amount", "pressure"), [(1e-18, 1e12), (1e-15, 1e-6), (1e9, 1e-12)])
+def test_a_start_tells_the_size_of_its_variable(amount, pressure, how):
+    """A start of 1e-18 was taken for the rounding of a size that another equation tells, and the model for singular."""
+    system = compiled(Gas(EqnEnv(), "c", amount, pressure, how))
+    assert 0.7 < size_of(system, "c.n") / amount < 1.5
+    found = float(system.observe("c.p", 0.0, system.initialize()))
+    assert found == pytest.approx(pressure / 0.975, rel=1e-9)
