@@ -97,7 +97,12 @@ def eliminate_aliases(model: FlatModel) -> tuple[tuple[EquationGroup, ...], Alia
         found = _join(terms, n_rows, classes)
         if (found == ZERO).all():
             rows = np.unique(terms.row) if sweep >= SWEEPS else _short(terms, n_rows)
-            found = _follow(terms.take(np.isin(terms.row, rows)), n_rows, classes)
+            short = terms.take(np.isin(terms.row, rows))
+            # What is equal goes before what is a multiple, so that the order of equations does not decide whether a
+            # velocity is named by its position or a position by its acceleration (v = x' and v' = −k·x).
+            found = _follow(short, n_rows, classes, multiples=False)
+            if (found == ZERO).all():
+                found = _follow(short, n_rows, classes, multiples=True)
             sweep += 1
         used = np.flatnonzero(found != ZERO)
         if not len(used):
@@ -223,8 +228,9 @@ def _join(terms: _Terms, n_rows: int, classes: _Classes) -> np.ndarray:
     return found
 
 
-def _follow(terms: _Terms, n_rows: int, classes: _Classes) -> np.ndarray:
-    """Uses rows a = c·dᵏb/dtᵏ one after the other; returns the variable that each row replaces, or −1."""
+def _follow(terms: _Terms, n_rows: int, classes: _Classes, multiples: bool) -> np.ndarray:
+    """Uses rows a = c·dᵏb/dtᵏ one after the other, without `multiples` those with c = ±1; returns the variable that
+    each row replaces, or −1."""
     found = np.full(n_rows, ZERO)
     links: dict[int, tuple[int, int, float, int]] = {}
 
@@ -253,7 +259,8 @@ def _follow(terms: _Terms, n_rows: int, classes: _Classes) -> np.ndarray:
                 merged[key] = merged.get(key, 0.0) + c
                 noise[key] = noise.get(key, 0.0) + abs(factor) * error + EPS * products * abs(c)
         left = [(*key, c) for key, c in merged.items() if abs(c) > noise[key]]
-        link = _as_link(left, classes) if 1 <= len(left) <= 2 else None
+        usable = len(left) == 1 or (len(left) == 2 and (multiples or abs(left[0][2]) == abs(left[1][2])))
+        link = _as_link(left, classes) if usable else None
         if link is not None:
             found[row], links[link[0]] = link[0], link[1]
     if links:

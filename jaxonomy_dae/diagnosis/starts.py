@@ -68,8 +68,9 @@ def check_equal_starts(flat: FlatModel, groups: tuple[EquationGroup, ...], alias
             w = first[key]
             same = factor == alias.factor[w] and table.start[w] == start
             settled = same or (key in numbers and numbers[key][0] == w and number is not None)
+            pair = " and ".join(sorted((f"'{table.names[w]}'", f"'{name}'")))
             notes.append(
-                f"'{table.names[w]}' and '{name}' are one quantity, and both starts are fixed: "
+                f"{pair} are one quantity, and both starts are fixed: "
                 + ("they agree, so one of them is enough" if settled else "they must agree; one of them is enough")
             )
         first.setdefault(key, v)
