@@ -1,13 +1,12 @@
-"""The figures of README and tutorial, for light pages and dark ones, in `docs/images/`.
+"""The figures of the first page and of the benchmarks, for light pages and dark ones, in `docs/images/`.
 
-    python docs/figures.py
+    python docs/figures.py              # both
+    python docs/figures.py benchmarks   # from the tables of docs/benchmarks.md
 
-`pendulum-*.svg` shows the model of `examples/neural_dae_pendulum_drag.py`, trained as there; `tutorial-*.svg` what the
-blocks of `docs/tutorial.md` compute, which are run one after the other.
+`pendulum-*.svg` shows the model of `examples/neural_dae_pendulum_drag.py`, trained as there, in a row and, for narrow
+screens, in two rows.
 """
 
-import contextlib
-import io
 import pathlib
 import re
 import sys
@@ -19,8 +18,6 @@ import numpy as np
 
 ROOT = pathlib.Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "examples"))
-
-import neural_dae_pendulum_drag as study  # noqa: E402
 
 IMAGES = ROOT / "docs" / "images"
 INKS = {"light": ("#1f2328", "#59636e", "#0969da", "#d1600a"), "dark": ("#f0f6fc", "#9198a1", "#58a6ff", "#f0883e")}
@@ -57,17 +54,17 @@ def panels(axes: Any, true: Any, data: Any, runs: dict[str, Any], laws: dict[str
     samples.plot(t, angle(runs["no drag"]), color=faint, lw=1.2)
     samples.plot(t, angle(runs["learned"]), color=learned, lw=1.8)
     samples.plot(t[::4], np.asarray(measured)[::4], "o", color=truth, ms=3.6, mew=0)
-    samples.set(xlabel="time [s]", ylabel="angle [°]")
+    samples.set(xlabel="Time / s", ylabel="Angle / °")
 
     grid = laws["grid"]
     law.plot(grid, laws["truth"], color=truth, lw=5, alpha=0.45, solid_capstyle="round")
     law.plot(grid, laws["learned"], color=learned, lw=1.8)
-    law.set(xlabel="speed [m/s]", ylabel="drag [N]", xlim=(0, None), ylim=(0, None))
+    law.set(xlabel="Speed / (m/s)", ylabel="Drag / N", xlim=(0, None), ylim=(0, None))
 
     pull.plot(t, np.asarray(study.tension(true))[:SHOWN], color=truth, lw=5, alpha=0.45, solid_capstyle="round")
     pull.plot(t, np.asarray(study.tension(runs["no drag"]))[:SHOWN], color=faint, lw=1.2)
     pull.plot(t, np.asarray(study.tension(runs["learned"]))[:SHOWN], color=learned, lw=1.8)
-    pull.set(xlabel="time [s]", ylabel="pull of the rod [N]")
+    pull.set(xlabel="Time / s", ylabel="Pull of the rod / N")
 
     titles = ("Physics, with a gap", "Trained on positions", "The law comes out,", "and a force never measured")
     dress(axes, titles, ink, faint)
@@ -85,6 +82,9 @@ def dress(axes: Any, titles: tuple[str, ...], ink: str, faint: str) -> None:
 
 
 def pendulum() -> None:
+    global study
+    import neural_dae_pendulum_drag as study
+
     true = study.angle_equation(study.HIGH_RELEASE, lambda v: -study.DRAG * study.speed(v) * v, study.SAMPLES)
     noise = study.NOISE * jax.random.normal(jax.random.key(1), (len(study.SAMPLES), 2))
     data = np.asarray(study.positions(true) + noise)
@@ -94,19 +94,26 @@ def pendulum() -> None:
     grid = np.linspace(0.0, float(np.hypot(true["pend.vx"], true["pend.vy"]).max()), 100)
     laws = {"grid": grid, "truth": study.DRAG * grid**2, "learned": study.law_of(systems["learned"], grid)}
     for kind, inks in INKS.items():
-        figure, axes = plt.subplots(1, 4, figsize=(13, 3.3), width_ratios=[1, 1.15, 1, 1.15], layout="constrained")
-        panels(axes, true, data, runs, laws, inks)
-        legend = {
-            "truth": {"color": inks[3], "lw": 5, "alpha": 0.45},
-            "measured, with noise of 1 mm": {"color": inks[3], "ls": "", "marker": "o", "ms": 4},
-            "with the learned network": {"color": inks[2], "lw": 1.8},
-            "without drag": {"color": inks[1], "lw": 1.2},
-        }
-        handles = [plt.Line2D([], [], label=label, **look) for label, look in legend.items()]
-        figure.legend(
-            handles=handles, loc="outside lower center", ncols=4, frameon=False, labelcolor=inks[0], fontsize=10
-        )
-        save(figure, f"pendulum-{kind}")
+        for name, shape, size in (("pendulum", (1, 4), (13, 3.3)), ("pendulum-narrow", (2, 2), (5.6, 5.6))):
+            ratios = [1, 1.15, 1, 1.15][: shape[1]]
+            figure, axes = plt.subplots(*shape, figsize=size, width_ratios=ratios, layout="constrained")
+            panels(axes.ravel(), true, data, runs, laws, inks)
+            legend = {
+                "truth": {"color": inks[3], "lw": 5, "alpha": 0.45},
+                "measured, with noise of 1 mm": {"color": inks[3], "ls": "", "marker": "o", "ms": 4},
+                "with the learned network": {"color": inks[2], "lw": 1.8},
+                "without drag": {"color": inks[1], "lw": 1.2},
+            }
+            handles = [plt.Line2D([], [], label=label, **look) for label, look in legend.items()]
+            figure.legend(
+                handles=handles,
+                loc="outside lower center",
+                ncols=shape[1],
+                frameon=False,
+                labelcolor=inks[0],
+                fontsize=10,
+            )
+            save(figure, f"{name}-{kind}")
 
 
 def save(figure: Any, name: str) -> None:
@@ -116,40 +123,92 @@ def save(figure: Any, name: str) -> None:
     plt.close(figure)
 
 
-def tutorial() -> None:
-    blocks = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs" / "tutorial.md").read_text(), re.M | re.S)
-    n: dict[str, Any] = {}
-    with contextlib.redirect_stdout(io.StringIO()):
-        for block in blocks:
-            exec(block, n)
-    ts = np.linspace(0.0, 1800.0, 361)
-    opened = {"pi.setpoint": 333.15, "room.T": (n["opened"], n["room_T"])}
-    controlled = n["simulate"](n["controlled"], 1800.0, ts=ts, inputs=opened)["block.T"] - 273.15
-    trained, before = (
-        n["simulate"](s, 1800.0, ts=ts, inputs=n["inputs"])["block.T"] - 273.15 for s in (n["fit"].system, n["model"])
-    )
-    u = np.linspace(0.0, 45.0, 91)
-    band = n["fit"].band("loss.law", u)
-    reached = np.asarray(n["measured"]) - 293.15
-    for kind, (ink, faint, blue, orange) in INKS.items():
-        figure, axes = plt.subplots(1, 3, figsize=(10, 2.9), layout="constrained")
-        held, record, law = axes
-        held.axhline(60.0, color=orange, lw=1, ls=":")
-        held.plot(ts / 60, controlled, color=blue, lw=1.8)
-        held.set(xlabel="time [min]", ylabel="temperature [°C]")
-        record.plot(np.asarray(n["moments"]) / 60, np.asarray(n["measured"]) - 273.15, "o", color=orange, ms=3.4, mew=0)
-        record.plot(ts / 60, before, color=faint, lw=1.2)
-        record.plot(ts / 60, trained, color=blue, lw=1.6)
-        record.set(xlabel="time [min]", ylabel="temperature [°C]")
-        law.plot(u, n["true_law"](u), color=orange, lw=5, alpha=0.45, solid_capstyle="round")
-        law.fill_between(u, band.low, band.high, color=blue, alpha=0.3, lw=0)
-        law.plot(u, band.mean, color=blue, lw=1.8)
-        law.plot(reached, np.zeros_like(reached), "|", color=orange, ms=7, clip_on=False)
-        law.set(xlabel="difference in temperature [K]", ylabel="heat flow [W]", xlim=(0, 45), ylim=(0, None))
-        dress(axes, ("Under control", "The record, and the model", "The law"), ink, faint)
-        save(figure, f"tutorial-{kind}")
+# --- benchmarks --------------------------------------------------------------------------------------------------
+
+
+def rows(heading: str) -> list[list[str]]:
+    """The lines of the tables below a heading of docs/benchmarks.md, split where two spaces or more are."""
+    text = (ROOT / "docs" / "benchmarks.md").read_text()
+    section = text[text.index(f"## {heading}") :].partition("\n## ")[0]
+    lines = "\n".join(re.findall(r"^```text\n(.*?)^```$", section, re.M | re.S)).splitlines()
+    return [re.split(r"\s{2,}", line.strip()) for line in lines if line.strip()]
+
+
+def work_precision(axes: Any, inks: tuple[str, ...]) -> None:
+    table = [row for row in rows("Solvers for DAEs") if len(row) > 8 and row[1] in ("bdf", "rodas5p", "idas")]
+    colours = {"rodas5p": inks[2], "bdf": inks[3], "idas": inks[1]}
+    for ax, problem in zip(axes, ("robertson", "chemakzo", "transamp"), strict=True):
+        for solver, colour in colours.items():
+            chosen = [row for row in table if row[0] == problem and row[1] == solver]
+            ax.semilogy([float(r[4]) for r in chosen], [float(r[-1]) for r in chosen], "o-", color=colour, label=solver)
+        ax.set(title=problem, xlabel="Digits")
+    axes[0].set_ylabel("Time / ms")
+
+
+def compile_times(ax: Any, inks: tuple[str, ...]) -> None:
+    found: dict[str, list[tuple[float, float]]] = {"ladder": [], "array": []}
+    for row in rows("How compiling scales"):
+        kind = row[0].split()[0]
+        if kind in found and row[1].isdigit():
+            found[kind].append((float(row[1]), float(row[6].rstrip("s"))))
+    published = {
+        "ModelingToolkit.jl, published": [(12e3, 52.5), (48e3, 1148)],
+        "the same, loops rerolled": [(12e3, 3.9), (48e3, 34), (240e3, 1198)],
+        "Dymola, published": [(12e3, 6.8), (48e3, 24), (108e3, 57)],
+        "OpenModelica, published": [(12e3, 67), (48e3, 393)],
+    }
+    for (label, points), colour in zip(
+        (("single components", found["ladder"]), ("arrays", found["array"])), inks[2:], strict=False
+    ):
+        ax.loglog(*zip(*points, strict=True), "o-", color=colour, label=label)
+    for (label, points), mark in zip(published.items(), "sD^v", strict=True):
+        ax.loglog(*zip(*points, strict=True), mark, ls=":", color=inks[1], label=label, ms=5)
+    ax.set(xlabel="Equations", ylabel="Build, compile, solve / s")
+
+
+def gradient_cost(ax: Any, inks: tuple[str, ...]) -> None:
+    table = [row for row in rows("Compile times of medium models") if len(row) >= 9]
+    table = [row for row in table if re.fullmatch(r"[\d.]+", row[-1])]
+    names = [row[0] for row in table]
+    value = [float(r[-7]) + float(r[-6]) for r in table]
+    gradient = [float(r[-4]) + float(r[-3]) for r in table]
+    at = np.arange(len(names))
+    ax.barh(at - 0.2, value, 0.4, color=inks[2], label="value")
+    ax.barh(at + 0.2, gradient, 0.4, color=inks[3], label="value and gradient")
+    ax.set_yticks(at, names)
+    ax.invert_yaxis()
+    ax.set(xlabel="Tracing and XLA / s")
+
+
+def batches(ax: Any, inks: tuple[str, ...]) -> None:
+    table = [row for row in rows("The pendulum") if len(row) == 4 and row[2].endswith(" ms")]
+    batch = [row for row in table if float(row[-2].split()[0]) > 20]
+    at = np.arange(len(batch))
+    ours = ["ours" in row[0] for row in batch]
+    colours = [inks[2] if mine else inks[1] for mine in ours]
+    ax.barh(at, [float(r[-2].split()[0]) for r in batch], color=colours)
+    ax.set_yticks(at, [row[0] for row in batch])
+    ax.invert_yaxis()
+    ax.set(xlabel="Time / ms")
+
+
+def benchmarks() -> None:
+    shapes = {1: (1, 3, 3.1), 2: (1, 1, 3.6), 3: (1, 1, 5.2), 4: (1, 1, 2.8)}
+    draws = {1: work_precision, 2: compile_times, 3: gradient_cost, 4: batches}
+    for kind, inks in INKS.items():
+        for number, draw in draws.items():
+            *shape, height = shapes[number]
+            figure, axes = plt.subplots(*shape, figsize=(6.6, height), layout="constrained", sharey=number == 1)
+            draw(axes, inks)
+            each = np.ravel(axes)
+            for ax in each:
+                dress([ax], [ax.get_title()], inks[0], inks[1])
+            if number < 4:
+                each[-1].legend(loc="center left", bbox_to_anchor=(1, 0.5), frameon=False, labelcolor=inks[0])
+            save(figure, f"pages/verification-{number}-{kind}")
 
 
 if __name__ == "__main__":
-    pendulum()
-    tutorial()
+    if "benchmarks" not in sys.argv:
+        pendulum()
+    benchmarks()

@@ -1,7 +1,10 @@
-"""The gallery: an overview, and the notebooks of `examples/gallery` with their stored outputs (a hook of MkDocs)."""
+"""The gallery: an overview, and the notebooks of `examples` with their stored outputs (a hook of MkDocs)."""
 
 import base64
+import dataclasses
+import functools
 import json
+import os
 import pathlib
 from typing import Any
 
@@ -9,11 +12,63 @@ from mkdocs.plugins import event_priority
 from mkdocs.structure.files import File
 
 TITLE = "Gallery"
-NOTEBOOKS = pathlib.Path(__file__).parents[1] / "examples" / "gallery"
+EXAMPLES = pathlib.Path(__file__).parents[1] / "examples"
+
+
+@dataclasses.dataclass(frozen=True)
+class Entry:
+    """A notebook: its file without suffix, the one idea that it teaches, and the processor time of a first run, if it
+    was measured."""
+
+    stem: str
+    idea: str
+    time: str = ""
+
+    @property
+    def path(self) -> pathlib.Path:
+        inside = EXAMPLES / "gallery" / f"{self.stem}.ipynb"
+        return inside if inside.exists() else EXAMPLES / f"{self.stem}.ipynb"
+
+
+# By level; in each, the easier ones first.
+LEVELS: dict[str, tuple[Entry, ...]] = {
+    "First": (
+        Entry(
+            "neural_dae_pendulum_drag",
+            "A network inside a constraint: constraint forces respond to it.",
+            "one to two minutes",
+        ),
+        Entry("motor_control", "Library parts, a controller, and gains trained by a gradient."),
+        Entry("linkage", "A closed loop of joints, and derivatives of its motion.", "30 seconds"),
+        Entry("circuit", "Frequency responses, and parts identified from one."),
+    ),
+    "Learning laws": (
+        Entry("clogged_filter", "A network in an algebraic equation."),
+        Entry("slider_crank", "A coefficient that multiplies a constraint force nobody measured."),
+        Entry("bounce", "Gradients through jumps, and a policy trained through them."),
+        Entry("sticking_friction", "A friction law with modes: stick and slip."),
+        Entry("positioning", "A sampled neural controller trained through friction that sticks."),
+    ),
+    "Engineering studies": (
+        Entry("battery_pack", "Arrays of cells with heat; which cell is bad?"),
+        Entry("house", "Identify, control and design a house by one model."),
+        Entry("next_experiment", "Which experiment tells most, before it is made."),
+    ),
+    "Measured data": (
+        Entry("battery_pulses", "A cell's equivalent circuit from measured pulses."),
+        Entry("overflowing_tanks", "Physics and a learned correction on a public benchmark."),
+        Entry("measured_house", "Equations with errors: a Kalman filter inside the fit."),
+    ),
+}
+DOWNLOADS = {"battery_pulses", "overflowing_tanks", "measured_house"}
+
+
+def entries() -> list[Entry]:
+    return [entry for level in LEVELS.values() for entry in level]
 
 
 def notebooks() -> list[pathlib.Path]:
-    return sorted(NOTEBOOKS.glob("*.ipynb"))
+    return [entry.path for entry in entries()]
 
 
 def introduction_of(notebook: pathlib.Path) -> list[str]:
@@ -25,6 +80,7 @@ def title_of(notebook: pathlib.Path) -> str:
     return introduction_of(notebook)[0].removeprefix("# ")
 
 
+@functools.cache
 def last_figure_of(notebook: pathlib.Path) -> bytes:
     """The last figure that is stored in it, a PNG."""
     cells = json.loads(notebook.read_text())["cells"]
@@ -33,18 +89,34 @@ def last_figure_of(notebook: pathlib.Path) -> bytes:
 
 
 def overview() -> str:
-    """The first page: what each notebook is about, with its last figure."""
-    lines = ["# Gallery", "", "Notebooks to read from top to bottom, or to run: they lie in `examples/gallery`.", ""]
-    for path in notebooks():
-        title, about = introduction_of(path)[:2]
-        sentences = about[: about.rindex(".") + 1]  # what comes after begins a list
-        lines += [f"## [{title.removeprefix('# ')}]({path.name})", "", sentences, ""]
-        lines += [f"[![The last figure]({path.stem}.png)]({path.name})", ""]
+    """The first page: what each notebook teaches, how long it runs, and its last figure."""
+    lines = [
+        "# Gallery",
+        "",
+        "Longer studies, ordered by level. Each teaches one idea and says what it could not show. Open a notebook from",
+        "the folder `examples` of the repository, or download it here. Times are processor time of a first",
+        "run, most of it compilation.",
+        "",
+    ]
+    for level, members in LEVELS.items():
+        lines += [f"## {level}", ""]
+        for entry in members:
+            name = os.path.relpath(entry.path, EXAMPLES / "gallery")
+            data = " Downloads its data once." if entry.stem in DOWNLOADS else ""
+            lines += [f"### [{title_of(entry.path)}]({name})", ""]
+            download = f'[Download]({entry.stem}.txt){{ download="{entry.path.name}" }}'
+            time = f" *About {entry.time}.*" if entry.time else ""
+            lines += [f"{entry.idea}{time}{data} {download}"]
+            lines += ["", f"[![The last figure]({entry.stem}.png)]({name})", ""]
     return "\n".join(lines)
 
 
 def on_config(config: Any) -> Any:
-    pages = ["gallery/index.md", *({title_of(path): f"gallery/{path.name}"} for path in notebooks())]
+    pages: list[Any] = ["gallery/index.md"]
+    for level, members in LEVELS.items():
+        pages.append(
+            {level: [{title_of(entry.path): entry.path.relative_to(EXAMPLES).as_posix()} for entry in members]}
+        )
     config.nav = [{TITLE: pages} if TITLE in entry else entry for entry in config.nav]
     return config
 
@@ -53,7 +125,8 @@ def on_config(config: Any) -> Any:
 def on_files(files: Any, config: Any) -> Any:
     files.append(File.generated(config, "gallery/index.md", content=overview()))
     for path in notebooks():
-        source, site = str(NOTEBOOKS.parent), config.site_dir
-        files.append(File(f"gallery/{path.name}", source, site, config.use_directory_urls))
+        site = config.site_dir
+        files.append(File(path.relative_to(EXAMPLES).as_posix(), str(EXAMPLES), site, config.use_directory_urls))
         files.append(File.generated(config, f"gallery/{path.stem}.png", content=last_figure_of(path)))
+        files.append(File.generated(config, f"gallery/{path.stem}.txt", content=path.read_text()))
     return files

@@ -369,13 +369,12 @@ def overview() -> str:
     lines = [
         "# Components",
         "",
-        "The components of `jaxonomy_dae.library`, by domain. These pages are made from the code: equations, defaults",
-        "and units are those that are compiled. All components take the environment and a name first; the values of",
-        "parameters may be numbers or, within a component, expressions in its parameters. The unit of numbers is 1;",
-        "what has no unit, as most signals, takes that of what it is connected to.",
+        "The components of `jaxonomy_dae.library`, by domain. These pages are made from the code, so equations,",
+        "defaults and units are those that are compiled. Every component takes the environment and a name first.",
+        "Values of parameters may be numbers or, inside a component, expressions in its parameters. Signals without a",
+        "unit take that of what they are connected to. The [glossary](../glossary.md#names-in-the-library) has names.",
         "",
-        "What each component is checked against, and with what error, has a page:",
-        "[Components and their references](../components.md).",
+        "[Components and their references](../components.md) says what each one was compared with.",
         "",
     ]
     for domain in domains():

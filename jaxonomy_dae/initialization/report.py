@@ -288,7 +288,7 @@ class InitializationReport(Sections):
                 + (f" ({'; '.join(wrong)})" if wrong else "")
                 + ". Give start values at a regular point with `initial={...}` or in the components."
             )
-        lines = ["no consistent initial point was found; what does not hold, worst first:"]
+        lines = ["no consistent initial point was found; conditions that could not be met, largest error first:"]
         for r in self.residuals[:WORST]:
             variables = "" if r.is_start else f", in {some(r.variables)}"
             lines.append(f"  {r.text}{variables}: off by {abs(r.value):.3g}")
@@ -386,8 +386,8 @@ def _contradiction(r: Redundant) -> str:
     names = [r.name, *(n for n, _ in r.follows_from)]
     values = [r.value, *(v for _, v in r.follows_from)]
     return (
-        f"{_joined(names)} are fixed at {_joined([f'{v:.6g}' for v in values])}, which contradict each other: free one "
-        "start (fixed=False), or give values that agree."
+        f"{_joined(names)} are fixed at {_joined([f'{v:.6g}' for v in values])}, which contradict each other: "
+        "release one start (fixed=False, or without the component's argument `initial_…`), or give values that agree."
     )
 
 

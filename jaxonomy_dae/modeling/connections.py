@@ -85,13 +85,13 @@ def _check_single_ports(ports: Sequence[Port], where: str) -> None:
     domain, seen = ports[0].domain, set()
     for port in ports:
         if port.domain is not domain and port.domain != domain:
-            raise ModelError(_TWO_DOMAINS.format(where, port, ports[0]))
+            raise ModelError(_TWO_DOMAINS.format(where, _in_domain(port), _in_domain(ports[0])))
         if id(port) in seen:
             raise ModelError(_ITSELF.format(where, port.component.path, port.name))
         seen.add(id(port))
 
 
-_TWO_DOMAINS = "{}: cannot connect {!r} to {!r}: a connection joins ports of one domain"
+_TWO_DOMAINS = "{}: cannot connect {} to {}: ports must have the same domain"
 _ITSELF = "{}: '{}.{}' is connected to itself: name each port once"
 
 
@@ -101,7 +101,7 @@ def _check_ports(ends: Sequence[Port | PortArray], by_element: bool, where: str)
     for end in ends:
         port = end.port if isinstance(end, PortArray) else end
         if port.domain != first.domain:
-            raise ModelError(_TWO_DOMAINS.format(where, end, ends[0]))
+            raise ModelError(_TWO_DOMAINS.format(where, _in_domain(end), _in_domain(ends[0])))
         numbers = end.chosen.numbers if isinstance(end, PortArray) else np.zeros((), np.int64)
         others = seen.setdefault(id(port), [])
         twice = any((numbers == other).any() for other in others)
@@ -110,6 +110,10 @@ def _check_ports(ends: Sequence[Port | PortArray], by_element: bool, where: str)
         if twice:
             raise ModelError(_ITSELF.format(where, port.component.path, port.name))
         others.append(numbers)
+
+
+def _in_domain(end: Port | PortArray) -> str:
+    return f"{_named(end)} ({(end.port if isinstance(end, PortArray) else end).domain.name})"
 
 
 def _listed(ends: Sequence[Any]) -> str:

@@ -49,7 +49,11 @@ def check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_contr
             "equinox.filter_vmap(lambda s: simulate(s, ...))(system)"
         )
     if solver is not None and not isinstance(solver, diffrax.AbstractSolver):
-        raise ModelError(f"solver must be a Diffrax solver such as diffrax.Tsit5(); got {solver!r}")
+        if isinstance(solver, type) and issubclass(solver, diffrax.AbstractSolver):
+            got = f"the class {solver.__name__}: write {solver.__name__}()"
+        else:
+            got = f"{solver!r}. For stiff models give solvers.Rodas5P() or solvers.BDF(), or leave solver out"
+        raise ModelError(f"solver must be a Diffrax solver such as diffrax.Tsit5(); got {got}")
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ModelError(
             "adjoint=BacksolveAdjoint() is wrong for constrained systems: it integrates the state backwards without "

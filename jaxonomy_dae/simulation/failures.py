@@ -208,7 +208,7 @@ def _stuck(solution: Solution, event: int, t: float, instant: float) -> str:
     lately = times > t - instant
     often = np.bincount(which[lately & (which >= 0)], minlength=len(table.names)) > 1
     names = [name for k, name in enumerate(table.names) if k == event or often[k]]
-    text = f"the integration stopped at t={t:.6g}: {listed(names)} would happen again and again there"
+    text = f"the integration stopped at t={t:.6g}: {listed(names)} would happen again and again there (Zeno behaviour)"
     accumulate = _accumulation(times[(which == event) & ~lately])
     if accumulate:
         return f"{text}: {accumulate}. {REST}"
@@ -260,10 +260,10 @@ def _sliding(name: str, t: float) -> str:
     """Explains a relation that turns again and again at the instant t, and what to write instead."""
     where, _, condition = name.partition(": when(")
     return (
-        f"the integration stopped at t={t:.6g}: the solution stays where '{condition[:-1]}' of component '{where}' "
-        "turns. On either side of it the equations lead back, at once. Say what holds there: with self.either and a "
-        "mode, as a brake that sticks has one; or let the conditions for turning forth and back lie apart "
-        "(hysteresis), with self.when; or round the kink, for instance tanh(x/small) instead of sign(x)"
+        f"the integration stopped at t={t:.6g}: chattering. On both sides of '{condition[:-1]}' of component "
+        f"'{where}' the equations drive the solution back to where it turns. Say what holds there with a mode "
+        "(self.either, see library.friction); or let the conditions for turning forth and back lie apart (hysteresis), "
+        "with self.when; or use a smooth law, for instance tanh(x/small) instead of sign(x)"
     )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..aliases import State, Time
-from ..linear.choice import choose
+from ..linear.choice import check_linear_solver, choose
 from .dae_term import FlatProblem
 from .field_size import is_large
 from .index_one import consistent_point, consistent_slope
@@ -137,6 +137,10 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
 
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar = Rodas5PInterpolation
+
+    def __check_init__(self):
+        if self.linear_solver is not None:
+            check_linear_solver(self.linear_solver)
 
     def order(self, terms):
         return 5

@@ -75,6 +75,9 @@ class AcausalCompiler:
             raise ModelError(f"state_selection is 'auto', 'dummy_derivatives' or 'projection'; got {state_selection!r}")
         if isinstance(prefer_states, str):
             raise ModelError(f"prefer_states is a list of names; write prefer_states=[{prefer_states!r}]")
+        for k, name in enumerate(prefer_states):
+            if not isinstance(name, str):
+                raise ModelError(f"prefer_states is a list of variables' names; entry {k} is {name!r}")
         if linear_solver is not None:
             check_linear_solver(linear_solver)
         self.ev = ev

@@ -249,8 +249,8 @@ class AcausalSystem(eqx.Module):
         missing = missing_input(self.plan, args)
         if missing is not None:
             raise ModelError(
-                f"input '{missing}' has no default: connect a signal to it, or give it with "
-                f"inputs={{'{missing}': function_of_time}}"
+                f"input '{missing}' was not given, and has no default: pass inputs={{'{missing}': 1.0}}, (times, "
+                "values) or a function of time, or connect a signal to it"
             )
         networks = tuple(self.neural[n] for n in self.plan.network_names)
         return SystemAt(self.plan, self.numbers, networks, t, args, self.typical_sizes)

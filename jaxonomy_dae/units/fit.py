@@ -29,7 +29,7 @@ RATIO = "atan2"
 CONDITIONS = ("true", "false", "not", "and", "or")
 COMPARISONS = ("less", "less_equal", "equal")
 ONE_UNIT = {
-    "sum": "what is added or equal needs one unit",
+    "sum": "terms of a sum must have one unit",
     "select": "branches need one unit",
     "less": "sides of a comparison need one unit",
     "less_equal": "sides of a comparison need one unit",

@@ -148,9 +148,25 @@ def test_equations_as_text():
 def test_the_gallery_has_an_overview():
     gallery = pytest.importorskip("gallery")  # a hook, which needs MkDocs
     text = gallery.overview()
-    for path in gallery.notebooks():
-        section = text[text.index(f"]({path.name})") :]
-        assert re.match(r"\]\([^)]+\)\n\n[^#]+\.\n\n\[!", section)  # heading, whole sentences, figure
-        assert f"({path.stem}.png)" in section
-        assert gallery.last_figure_of(path).startswith(b"\x89PNG")
-    assert len(gallery.notebooks()) > 4
+    for entry in gallery.entries():
+        assert re.search(rf"### \[[^\]]+\]\([./]*{entry.stem}\.ipynb\)\n\n[^\n]+\.", text), entry.stem
+        assert f"({entry.stem}.png)" in text and "TIME" not in text
+        assert gallery.last_figure_of(entry.path).startswith(b"\x89PNG")
+    found = {path.stem for path in (gallery.EXAMPLES / "gallery").glob("*.ipynb")} | {"neural_dae_pendulum_drag"}
+    assert found == {entry.stem for entry in gallery.entries()}
+
+
+def test_each_object_of_the_api_has_a_page():
+    """On file systems that do not tell cases apart, too."""
+    pages = pytest.importorskip("api_pages")
+    names = [match[1] for path in pages.groups() for match in pages.OBJECT.finditer(path.read_text())]
+    files = [pages.file_of(name).lower() for name in names]
+    assert len(files) == len({*files}) > 80
+    for path in pages.groups():
+        assert ":::" not in pages.overview(path)
+    assert not [name for name in names if not pages.first_sentence(name)]
+
+
+def test_rows_of_errors_become_headings():
+    headings = pytest.importorskip("error_headings")
+    assert headings.ROW.sub(r"\1: \3", "| `no start` | None was given. | Give one. |") == "no start: Give one."

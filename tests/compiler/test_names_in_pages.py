@@ -14,16 +14,13 @@ from jaxonomy_dae.simulation.solution import Solution
 from jaxonomy_dae.system.system import AcausalSystem
 
 DOCS = pathlib.Path(__file__).parents[2] / "docs"
-PAGES = [
-    "coming-from.md", "errors.md", "saving.md", "solvers.md", "learning.md", "tutorial.md", "hybrid.md", "analysis.md",
-    "llms.txt",
-]  # fmt: skip
+PAGES = [path.relative_to(DOCS).as_posix() for path in sorted(DOCS.rglob("*.md"))] + ["llms.txt", "../README.md"]
 OWNERS = {
     "self": Component, "system": AcausalSystem, "solution": Solution, "fit": learning.Estimate,
     "problem": learning.Problem, "training": learning.Training, "diagram": AcausalDiagram, "learning": learning,
     "solvers": solvers, "diffrax": diffrax,
 }  # fmt: skip
-OTHER = {("training", "model"), ("training", "history")}  # of what `minimize` returns
+OTHER = {("training", "model"), ("training", "history"), ("solution", "ys")}  # of `minimize`, `solve_dae`
 
 
 def code(page):

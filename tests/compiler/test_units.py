@@ -179,7 +179,7 @@ def test_what_has_no_unit_fits_everything(model):
 
 # --- what does not -----------------------------------------------------------------------------------------------
 
-ADDED = "what is added or equal needs one unit"
+ADDED = "terms of a sum must have one unit"
 MISFITS = [
     (of("V", "Ohm", "A", write=lambda v, r, i: Eq(v, r * i**2)), f"{ADDED}, but 'a' is in V and 'b*c**2' in W"),
     (of("m", "s", "m", write=lambda a, t, b: Eq(a, b + t)), f"{ADDED}, but 'a' is in m and 'b' in s"),
@@ -268,9 +268,9 @@ def test_the_whole_message():
     assert isinstance(error.value, ModelError)
     assert str(error.value) == (
         "units do not fit in 2 places:\n"
-        "- one (Spring): 0 = -k*x**2 + f: what is added or equal needs one unit, but 'f' is in N and 'k*x**2' in J "
+        "- one (Spring): 0 = -k*x**2 + f: terms of a sum must have one unit, but 'f' is in N and 'k*x**2' in J "
         "(2 more components like it)\n"
-        "- one (Spring): 0 = -time + x: what is added or equal needs one unit, but 'x' is in m and 'time' in s "
+        "- one (Spring): 0 = -time + x: terms of a sum must have one unit, but 'x' is in m and 'time' in s "
         "(2 more components like it)"
     )
     AcausalCompiler(EV, diagram)  # is asked for nothing
@@ -368,9 +368,9 @@ def test_relations_that_are_events_are_reported_once():
     [
         ({"height": "s"}, f"when((h <= low) & (v < limit)): {ADDED}, but 'h' is in m and 'low' in s"),
         ({"speed": "mm/s"}, f"when((h <= low) & (v < limit)): {ADDED}, but 'v' is in m/s and 'limit' in mm/s"),
-        ({"back": "kg"}, "reinit(v, -e*v): what is added or equal needs one unit, but 'v' is in m/s and 'e*v'"),
+        ({"back": "kg"}, "reinit(v, -e*v): terms of a sum must have one unit, but 'v' is in m/s and 'e*v'"),
         ({"count": "m"}, f"assign(n, one + pre(n)): {ADDED}, but 'n' is in 1 and 'one' in m"),
-        ({"period": "m"}, "the period of sampled(T) = T: what is added or equal needs one unit, but"),
+        ({"period": "m"}, "the period of sampled(T) = T: terms of a sum must have one unit, but"),
     ],
 )
 def test_events(units, said):
@@ -404,7 +404,7 @@ def test_accounts_of_energy():
             self.declare_dissipation(J * w * der(w))
 
     assert wrong(Flywheel(EV, "f")) == [
-        "f (Flywheel): the supply J*w**2: what is added or equal needs one unit, but 'J*w**2' is in J and 'supply' in W"
+        "f (Flywheel): the supply J*w**2: terms of a sum must have one unit, but 'J*w**2' is in J and 'supply' in W"
     ]
 
 

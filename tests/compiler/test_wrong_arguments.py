@@ -291,7 +291,7 @@ def port_for_a_signal():
         (ring, ("in the mode a.active = 0, b.active = 0", "Give a value other than zero to a.Goff or b.Goff, or")),
         (
             port_of_another_domain,
-            ("shaft.flange_a: Rotational port", "body.frame: Planar port", "a connection joins ports of one domain"),
+            ("'shaft.flange_a' (Rotational)", "'body.frame' (Planar)", "ports must have the same domain"),
         ),
         (port_for_a_signal, ("connect joins ports, or a variable and inputs; got both: 'r.p', 'gain.u'",)),
     ],
@@ -326,3 +326,14 @@ def test_what_functions_return_is_checked(law, said):
 
     with pytest.raises(ModelError, match=said):
         compiled(component(lambda self, ev: self.function("law", law, [self.variable("x")])))
+
+
+def test_classes_and_lists_where_objects_and_names_belong():
+    """`solver=diffrax.Tsit5` printed the class; `prefer_states=[["c.v"]]` was "unhashable type: 'list'"."""
+    system = rc_circuit()
+    with pytest.raises(ModelError, match=r"got the class Tsit5: write Tsit5\(\)"):
+        simulate(system, 1.0, solver=diffrax.Tsit5)
+    with pytest.raises(ModelError, match=r"got 'Radau'. For stiff models give solvers.Rodas5P\(\)"):
+        simulate(system, 1.0, solver="Radau")
+    with pytest.raises(ModelError, match=r"entry 0 is \['c.v'\]"):
+        AcausalCompiler(EqnEnv(), AcausalDiagram(), prefer_states=[["c.v"]])

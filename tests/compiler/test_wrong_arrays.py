@@ -122,7 +122,7 @@ def wrong_start():
         (lengths_disagree, r"arrays of one shape join element by element.*'cell.a \(3\)', 'cell.b \(2\)'"),
         (beyond, r"array 'cell' has shape \(4,\): index 4 is out of bounds"),
         (itself, r"'cell.a' is connected to itself"),
-        (other_domain, r"a connection joins ports of one domain"),
+        (other_domain, r"ports must have the same domain"),
         (a_list, r"must be a number; got list.*Values of limit for each component are given as a NumPy array"),
         (unused, r"'mode' has a value for each component, but Choosing does not use it in a parameter or an equation"),
         (texts, r"the values of R must be real numbers; got texts"),

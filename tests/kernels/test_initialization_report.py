@@ -60,18 +60,18 @@ redundant, as they follow from others:
     b.v = 1, from a.v = 1"""
 
 CONTRADICTION = """\
-no consistent initial point was found; what does not hold, worst first:
+no consistent initial point was found; conditions that could not be met, largest error first:
   start of a.v, 1: off by 1
-b.v and a.v are fixed at 2 and 1, which contradict each other: free one start (fixed=False), or give values that \
-agree."""
+b.v and a.v are fixed at 2 and 1, which contradict each other: release one start (fixed=False, or without the \
+component's argument `initial_…`), or give values that agree."""
 
 OFF_THE_CIRCLE = """\
-no consistent initial point was found; what does not hold, worst first:
+no consistent initial point was found; conditions that could not be met, largest error first:
   pend: 0 = -L**2 + x**2 + y**2, in pend.x, pend.y: off by 0.235
   start of pend.x, 0.9: off by 0.114
   start of pend.y, -0.9: off by 0.114
-pend.y and pend.x are fixed at -0.9 and 0.9, which contradict each other: free one start (fixed=False), or give \
-values that agree."""
+pend.y and pend.x are fixed at -0.9 and 0.9, which contradict each other: release one start (fixed=False, or without \
+the component's argument `initial_…`), or give values that agree."""
 
 SHORT = """\
 the equations are singular at the initial point with r1.R = 0, r2.R = 0: they do not determine source.i
