@@ -76,7 +76,8 @@ def same_configuration():
 
 
 def with_marks(page: pathlib.Path):
-    return pytest.param(page, id=name_of(page), marks=[] if name_of(page) in QUICK else [pytest.mark.slow])
+    mark = pytest.mark.long("the pages that a reader runs first") if name_of(page) in QUICK else pytest.mark.slow
+    return pytest.param(page, id=name_of(page), marks=[mark])
 
 
 @pytest.mark.parametrize("page", [with_marks(page) for page in pages()])
