@@ -116,9 +116,11 @@ def handle(
     At the initial time, `at_start`, events do not move with parameters, and are logged only if they end the run.
     """
     c, g = problem.n_clocks, problem.n_guards
-    listed, of_guards = jnp.asarray(problem.noted), jnp.arange(c + g) >= c
+    listed = np.array(problem.noted, bool) & (np.arange(c + g) >= c) & (not at_start)
     ends = jnp.asarray(problem.ends).astype(t.dtype)
     relations = jnp.asarray(problem.relations)
+    # At the initial time, what is zero and begins to fall is an event of the first step, and no part of this instant.
+    waits = (arrival.size == 0) & (arrival.rate < 0) & ~arrival.due[c:] if at_start else np.zeros(g, bool)
     strikes = jnp.asarray(problem.strikes, bool)
     several = sum(problem.strikes) > 1
     first = state.count
@@ -158,7 +160,7 @@ def handle(
             happening = happening | (instant.left & strikes & strikes[event])
         x, new = problem.written(time, reached, q, instant.previous, happening, args)
         ticks = state.ticks + one_hot(event, c).astype(state.ticks.dtype)
-        logged = happening & ((of_guards & listed & (not at_start)) | (ends > 0))
+        logged = happening & (listed | (ends > 0))
         shown = jnp.arange(c + g) if several else event[None]
         row = (state.count - first).astype(int) + jnp.cumsum(logged[shown]) - 1
         row = jnp.where(logged[shown], row, noted.log.shape[0])
@@ -166,7 +168,7 @@ def handle(
         moved = jnp.any(x != reached) & ~relations[event]
         approach = jnp.where(instant.caused | at_start, 0.0, rates)
         new, after, slow, armed, left, caused, stuck = _following(
-            problem, t, x, new, instant, event, happening, arrival, delay, moved, approach, rose, onto, args
+            problem, t, x, new, instant, event, happening, arrival, delay, moved, approach, rose, onto, waits, args
         )
         turns = state.turns + (~is_clock).astype(t.dtype)
         slides = ~is_clock & (turns > SLIDES + TURNS * g)
@@ -226,7 +228,8 @@ def _is_zero(value: Any, rate: Any, arrival: Arrival) -> Any:
 
 
 def _following(
-    problem, t, x, q, instant: Instant, event, happening, arrival: Arrival, delay, moved, approach, rose, onto, args
+    problem, t, x, q, instant: Instant, event, happening, arrival: Arrival, delay, moved, approach, rose, onto, waits,
+    args,
 ):  # fmt: skip
     """The situation after an event, or after all that are `happening`, of which it is the first.
 
@@ -234,7 +237,8 @@ def _following(
     are singular with q, as where a switch closes onto a diode that conducts, modes that are chosen by their conditions
     change along with it: to the first ones of `_alternatives` that hold.
 
-    `rose` says which guards had risen to zero before the event, `onto` which had jumped onto it. Returns (q, dx/dt, the
+    `rose` says which guards had risen to zero before the event, `onto` which had jumped onto it, `waits` which fall
+    from zero after this instant. Returns (q, dx/dt, the
     states whose slope hardly changes during the delay, the sides of the guards, events left, guards that an event made
     true, guards that are stuck); only q is differentiated.
     """
@@ -300,13 +304,16 @@ def _following(
     # decides. One that seems to fall by rounding alone is waited for: if it does fall, the next step finds it.
     flat = is_flat(value, rate)
     falling = jnp.where(flat, 0.5 * (rate + rate_ahead), rate)
-    stays = left[c:] & onto & (value == 0)
-    true = jnp.where(zero, (falling * arrival.span < -band) | stays, value < 0)
+    # Where an event makes what does not move equal, as what other relations are made of, a condition that is not strict
+    # has become true.
+    equal = zero & (rate == 0) & (instant.state.armed == ABOVE) & ~here & problem.true_at_zero
+    stays = (left[c:] & onto & (value == 0)) | equal
+    true = jnp.where(zero, ((falling * arrival.span < -band) & ~waits) | stays, value < 0)
     was_armed = ((instant.state.armed > 0) & ~here) | (turns_back & (event >= c)) | (rose & ~here)
     # What this event made true happens next. What was to happen does so, though a state starts anew: unless what was
     # assigned makes its condition false, or it is revocable and undone.
     stands = left[c:] & ~np.array(problem.revocable[c:], bool) & reached
-    caused = (((was_armed | (left[c:] & instant.caused)) & true) | stands) & ~zero
+    caused = (((was_armed | (left[c:] & instant.caused)) & true) | stands) & (~zero | equal)
     next_ones = ((was_armed | left[c:]) & true & ~here) | stands
     rests = was_armed | left[c:] | (falling * arrival.span > band)  # what was undone may happen later
     side = jnp.where(zero, jnp.where(rests, RESTS, BELOW), ABOVE)

@@ -8,6 +8,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
@@ -77,6 +78,15 @@ class AbstractHybridProblem(eqx.Module):
     @abc.abstractmethod
     def clocks(self) -> tuple[Float[Array, " clocks"], Float[Array, " clocks"]]:
         """Periods and offsets of the sampled events; the period is infinite for one that happens once."""
+
+    @property
+    def true_at_zero(self) -> Bool[np.ndarray, " guards"]:
+        """The guards whose conditions hold where they are zero: those that are not strict, but for those that choose a
+        mode, of which two are zero at once."""
+        strict, relations, revocable = (
+            np.array(column[self.n_clocks :], bool) for column in (self.strict, self.relations, self.revocable)
+        )
+        return ~strict & (relations | ~revocable)
 
     def due(self, ticks: Float[Array, " clocks"]) -> Float[Array, " clocks"]:
         """The time of the next tick of each clock, given the number of ticks so far."""

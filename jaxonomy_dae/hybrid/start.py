@@ -49,9 +49,12 @@ def start(
     ticks = ticks + (due & relations[:c]).astype(dtype)
     size = jnp.abs(value)
     if resumed is None:
-        due_conditions = holding = _holds(value, rate)
-        armed = jnp.where(holding, BELOW, jnp.where(value == 0, RESTS, ABOVE))
+        # A strict condition whose sides are equal is false: if it becomes true at once, that is an event of the first
+        # step. One that happens at the start, if it holds there, happens at once then, too.
+        turned, holds = _turned(problem, value, rate), (value < 0) | ((value == 0) & problem.true_at_zero)
+        armed = jnp.where(jnp.where(relations[c:], turned, holds), BELOW, jnp.where(value == 0, RESTS, ABOVE))
         at_once = np.array(problem.immediate[c:], bool) & ~relations[c:]
+        due_conditions = holds | ((value == 0) & (rate < 0))
     else:
         size = jnp.maximum(size, resumed.sizes)
         band, far = rounding(size), _beyond_doubt(size)
@@ -92,10 +95,10 @@ def _ticks_before(problem: AbstractHybridProblem, t0: Time, ticked: Any) -> Any:
     return jnp.where((ticked > 0) & ~relations, next_one, ticks)
 
 
-def _holds(value: Any, rate: Any) -> Any:
-    """True for conditions that hold at the start. A guard at zero is judged by its rate: the condition holds if the
-    guard is falling."""
-    return jnp.where(value == 0, rate < 0, value < 0)
+def _turned(problem: AbstractHybridProblem, value: Any, rate: Any) -> Any:
+    """True for relations that hold from the initial time on. A guard at zero is judged by its rate, and where that is
+    zero, too, by the kind of its relation."""
+    return (value < 0) | ((value == 0) & ((rate < 0) | ((rate == 0) & problem.true_at_zero)))
 
 
 def _beyond_doubt(size: Any) -> Any:
@@ -126,7 +129,7 @@ def _settled(
 
     def holding(value: Any, rate: Any) -> Any:
         if resumed is None:
-            return _holds(value, rate)
+            return _turned(problem, value, rate)
         return value < -_beyond_doubt(jnp.maximum(jnp.abs(value), resumed.sizes))
 
     def once(k: Any, carry: Any) -> Any:

@@ -145,6 +145,13 @@ def turned(number: int, condition: Any) -> Any:
     return sympy.Or(holds, sympy.And(unknown, condition))
 
 
+def jumps(e: Any) -> bool:
+    """True if an expression has a part that may jump while its symbols do not, and is not marked as smooth."""
+    order = _inside_out([e])
+    varying = _varying(order)
+    return any(isinstance(part, (sympy.Piecewise, sympy.sign, sympy.Heaviside, *ROUNDING)) for part in varying)
+
+
 @functools.lru_cache(maxsize=4096)  # large models write the same few equations
 def with_events(residuals: tuple[sympy.Expr, ...], first: int) -> tuple[tuple[sympy.Expr, ...], tuple[Watched, ...]]:
     """Replaces relations in equations by hidden discrete variables, numbered from `first`. Returns (equations, the
@@ -203,7 +210,7 @@ class _Rewriting:
         if _has_an_end(e):
             inside[0] = self._within_domain(e, inside[0])
         if isinstance(e, KINKED) and e in self.varying:
-            return _FORMS[type(e)](functools.partial(self._turning, [e]), functools.partial(self._stepping, e), *inside)
+            return _FORMS[type(e)](functools.partial(self._turns, [e]), functools.partial(self._stepping, e), *inside)
         if all(new is old for new, old in zip(inside, e.args, strict=True)):
             return e
         return e.func(*inside)
@@ -213,8 +220,9 @@ class _Rewriting:
         for branch, condition in e.args:
             if condition not in self.conditions:
                 self.places[condition] = [e]
+                inside = {r: r.func(*(self.new[a] for a in r.args), evaluate=False) for r in _sides_of(condition)}
                 self.conditions[condition] = (
-                    self._turning(self.places[condition], condition) if _can_turn(condition) else condition
+                    self._turning(self.places[condition], condition, inside) if _can_turn(condition) else condition
                 )
             else:
                 self.places[condition].append(e)
@@ -238,24 +246,31 @@ class _Rewriting:
         written_so = sympy.And(_holding(self.needed[e], lambda c: c), outside)
         return back if written_so is sympy.false else sympy.Piecewise((live, written_so), (back, True), evaluate=False)
 
-    def _turning(self, places: list[Any], condition: Any) -> Any:
-        """The condition in terms of hidden discrete variables. Those that it needs are noted, to be declared later."""
-        live, guarded = self.numbers.split(self._as_written(condition))
-        for r in relations_in(in_relations_of_time(self._as_written(condition))):
+    def _turns(self, places: list[Any], relation: Any) -> Any:
+        """`_turning` for a relation whose sides are in their new forms."""
+        written = relation.func(*(self.old.get(side, side) for side in relation.args), evaluate=False)
+        return self._turning(places, written, {written: relation})
+
+    def _turning(self, places: list[Any], condition: Any, inside: dict[Any, Any]) -> Any:
+        """The condition, as it is written, in terms of hidden discrete variables; `inside` has its relations with sides
+        in their new forms. The variables that it needs are noted, to be declared later."""
+        live, guarded = self.numbers.split(condition)
+        for r in relations_in(in_relations_of_time(condition)):
             self.timed_places.setdefault(r, []).append(places)
         if not varies(guarded):
             return live
-        # What is known of time is so in the guard; equations that are looked at outside of runs have all as it is.
-        number = self._numbers(1)
-        self.found.append((Turning, number, _replaced(guarded, {self._as_written(condition): condition}), places))
-        return turned(number, condition)
-
-    def _as_written(self, condition: Any) -> Any:
-        """A relation with its sides in their original forms."""
+        # What is known of time, and of relations inside its sides, is so in the guard, which jumps at their events and
+        # moves with them; equations that are looked at outside of runs have all as it is.
+        forms = dict(inside)
         if not isinstance(condition, sympy.core.relational.Relational):
-            return condition
-        sides = [self.old.get(side, side) for side in condition.args]
-        return condition.func(*sides, evaluate=False)
+            # Of two sides that jump onto each other, the kind of their own relation decides.
+            for r in (r for r in relations_in(guarded) if r in inside and any(map(jumps, r.args))):
+                own = self._numbers(1)
+                self.found.append((Turning, own, inside[r], places))
+                forms[r] = sympy.Eq(RelationSymbol(own), 1)
+        number = self._numbers(1)
+        self.found.append((Turning, number, _replaced(guarded, forms), places))
+        return turned(number, condition)
 
     def _numbers(self, count: int) -> int:
         """The first of so many numbers of hidden discrete variables."""
@@ -414,19 +429,20 @@ def _vanish_on(surface: Any, expressions_in: Callable[[Any], tuple[Any, ...]]) -
     for v in sorted((s for s in symbols_of(surface) if isinstance(s, VariableSymbol | sympy.Dummy)), key=str):
         slope = sympy.diff(surface, v)
         if slope.is_number and slope.is_nonzero:
-            place = {v: v - surface / slope}
-            return all(sympy.expand(d.xreplace(place)) == 0 for d in expressions_in(v))
+            place, differences = {v: v - surface / slope}, expressions_in(v)
+            if any(d.has(sympy.Derivative, sympy.Subs) for d in differences):
+                return False  # inside what jumps, which SymPy does not differentiate
+            return all(sympy.expand(d.xreplace(place)) == 0 for d in differences)
     return False
 
 
 def _is_hidden(residual: sympy.Expr) -> bool:
-    """True if the residual contains a variable that the compiler added, whose path begins with a colon."""
-    return any(isinstance(s, VariableSymbol) and s.path.startswith(":") for s in symbols_of(residual))
+    """True if the residual defines what events read. Sides of conditions of their own have events themselves."""
+    return any(isinstance(s, VariableSymbol) and s.path.startswith((":when", ":held")) for s in symbols_of(residual))
 
 
 def _inside_out(roots: Sequence[Any]) -> list[Any]:
-    """The parts of expressions, each once, inner ones first. Parts of conditions, and parts marked as smooth, are left
-    out."""
+    """The parts of expressions, each once, inner ones first. Parts marked as smooth are left out."""
     seen: set[Any] = set()
     out: list[Any] = []
     stack = [(e, False) for e in reversed(roots)]
@@ -455,11 +471,17 @@ def _arguments(e: Any) -> list[Any]:
     if isinstance(e, Smooth):
         return []
     if isinstance(e, sympy.Piecewise):
-        return [branch for branch, _ in _pairs(e)]
+        sides = [a for _, condition in _pairs(e) for r in _sides_of(condition) for a in r.args]
+        return [*(branch for branch, _ in _pairs(e)), *sides]
     try:
         return list(parts_of(e))
     except UnsupportedExpression:  # refused when the equation is read
         return []
+
+
+def _sides_of(condition: Any) -> list[Any]:
+    """The relations whose sides are parts of an expression: those of a condition that can become an event."""
+    return relations_in(condition) if _can_turn(condition) else []
 
 
 def _varying(order: list[Any]) -> set[Any]:
@@ -499,6 +521,8 @@ def _needed_where(roots: Sequence[Any], order: list[Any]) -> dict[Any, Needed]:
                 needed[a] = union(needed[a], here)
             continue
         for branch, condition in _pairs(e):
+            for a in (a for r in _sides_of(condition) for a in r.args):
+                needed[a] = union(needed[a], here)
             taken = here
             if condition is not sympy.true:
                 taken, here = within(here, (condition, True)), within(here, (condition, False))

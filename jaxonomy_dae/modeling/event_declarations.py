@@ -36,6 +36,7 @@ class EventDeclarations:
     _declare: Any
     _declare_parameter: Any
     _check_parameters_only: Any
+    _without_jumps: Any
 
     def discrete(self, name: str, start: Any = 0.0, unit: str = "") -> DiscreteSymbol:
         """Declares a discrete variable: constant but for the events that assign it.
@@ -119,12 +120,12 @@ class EventDeclarations:
                 raise ModelError(
                     f"{where}: what happens is said with reinit(…), assign(…) and terminate(…); got {action!r}"
                 )
-        number = len(self.events)
         clock = condition if isinstance(condition, Sampled) else None
         guard, shown = None, text or f"sampled({getattr(clock, 'period', '')})"
         if clock is None:
             shown = text or (str(condition) if on is None else f"{condition}, on={on}")
-            expression = guard_of(condition, where)
+            watchable = condition if relation else self._without_jumps(condition)  # which may add events
+            expression = guard_of(watchable, where)
             if on is not None:
                 expression = while_on(expression, relation_in_discretes(on, f"{where}, on"))
             expression = while_on(expression, watched)
@@ -135,10 +136,10 @@ class EventDeclarations:
             past = [s for s in symbols if isinstance(s, PreviousSymbol)]
             if past:
                 raise ModelError(f"{where}({condition}): a condition is on the present: write {past[0].path}")
-            guard = self._hidden(f":when[{number}]", expression)
+            guard = self._hidden(f":when[{len(self.events)}]", expression)
         elif on is not None:
             raise ModelError(f"{where}: on= is for conditions on variables; a sampled event always happens")
-        values = self._values(actions, number, where)
+        values = self._values(actions, len(self.events), where)
         self.events.append(
             When(
                 shown,

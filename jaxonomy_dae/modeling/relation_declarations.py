@@ -7,10 +7,10 @@ import sympy
 from sympy.logic.boolalg import BooleanAtom
 
 from ..expressions.to_sympy import shortened
-from .automatic_events import Splitting, Stepping, Timed, TimedSteps, Turning, turned, varies, with_events
+from .automatic_events import Splitting, Stepping, Timed, TimedSteps, Turning, jumps, turned, varies, with_events
 from .event_declarations import EventDeclarations
 from .events import LIVE, Assign, Sampled
-from .symbols import PreviousSymbol, RelationSymbol
+from .symbols import PreviousSymbol, RelationSymbol, VariableSymbol
 
 
 class RelationDeclarations(EventDeclarations):
@@ -46,8 +46,32 @@ class RelationDeclarations(EventDeclarations):
         if numbers.timed and not varies(guarded):
             return live
         known = self._hidden_discrete(float(LIVE))
-        self._turns(Turning(known.number, guarded, sympy.true))
+        self._turns(Turning(known.number, self._without_jumps(guarded), sympy.true))
         return turned(known.number, condition)
+
+    def _without_jumps(self, condition: Any) -> Any:
+        """The condition for a guard that turns where sides jump, as floor(x) does, and moves with these jumps: such a
+        side is a variable of its own, whose equation has events as others have. Among several conditions, one with such
+        a side is an event of its own, for of two sides that jump onto each other its kind of relation decides."""
+        if isinstance(condition, sympy.And | sympy.Or | sympy.Not):
+            return condition.func(*map(self._turning_alone, condition.args))
+        if not isinstance(condition, sympy.core.relational.Relational):
+            return condition
+        sides = [self._as_variable(side) if jumps(side) else side for side in condition.args]
+        return condition.func(*sides, evaluate=False)
+
+    def _turning_alone(self, condition: Any) -> Any:
+        own = self._without_jumps(condition)
+        if own == condition or not isinstance(condition, sympy.core.relational.Relational):
+            return own
+        known = self._hidden_discrete(float(LIVE))
+        self._turns(Turning(known.number, own, sympy.true))
+        return sympy.Eq(known, 1)
+
+    def _as_variable(self, side: Any) -> VariableSymbol:
+        symbol = self._declare(f":side[{len(self.equations)}]", "event")
+        self.equations.append(symbol - side)
+        return symbol
 
     def _hidden_discrete(self, start: float) -> RelationSymbol:
         """Declares a discrete variable that is not shown."""

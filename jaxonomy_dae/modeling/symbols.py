@@ -131,6 +131,11 @@ class TimeSymbol(sympy.Symbol):
         return (), {}
 
 
+class _NotDifferentiatedBySymPy(ModelError, NotImplementedError):
+    """SymPy itself tries to differentiate by time where it looks whether the conditions of nested `Piecewise` cover all
+    real numbers, and goes on without the answer if that is not implemented."""
+
+
 class EnvironmentTime(TimeSymbol):
     """Time as users write it, `ev.t`. SymPy would differentiate by it as if variables were constants."""
 
@@ -138,7 +143,9 @@ class EnvironmentTime(TimeSymbol):
 
     @property
     def _diff_wrt(self):
-        raise ModelError("`diff` by ev.t does not see that variables change in time: write der(x), der(x * y), …")
+        raise _NotDifferentiatedBySymPy(
+            "`diff` by ev.t does not see that variables change in time: write der(x), der(x * y), …"
+        )
 
 
 ENVIRONMENT_TIME = EnvironmentTime()
