@@ -156,9 +156,9 @@ class Affine(AbstractHybridProblem):
         height, rate, phase = self.numbers.waves.T
         return self.numbers.guards @ jnp.concatenate([x, q, q, jnp.ones((1,))]) + height * jnp.sin(rate * t + phase)
 
-    def written(self, t, x, q, previous, events, args):
-        new = self.numbers.writes[jnp.argmax(events)] @ jnp.concatenate([x, q, previous, jnp.ones((1,))])
-        return new[:STATES], new[STATES:]
+    def written(self, t, x, read, q, previous, events, args):
+        new = self.numbers.writes[jnp.argmax(events)] @ jnp.concatenate([read, q, previous, jnp.ones((1,))])
+        return x + (new[:STATES] - read), new[STATES:]
 
     def settled(self, t, x, q, events, args):
         new = (self.numbers.writes @ jnp.concatenate([x, q, q, jnp.ones((1,))]))[:, STATES:]

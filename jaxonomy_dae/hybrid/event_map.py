@@ -60,7 +60,8 @@ class Instant(eqx.Module):
     - `left`: the events still to happen, shape (clocks + guards,).
     - `caused`: the guards that another event of this instant made fall, shape (guards,).
     - `delay`: δ of the last event (second).
-    - `previous`: the discrete values before the instant.
+    - `round`: the events that happen as one: all read what was before the first of them; what they cause comes after.
+    - `before`, `approach`, `previous`: the continuous state before this round, its slope, and the discrete values.
     - `slope`: dx/dt after the last event.
     - `arrived`: the continuous state before the instant.
     - `stuck`: the guards that an event has left at zero, about to fall again, shape (guards,).
@@ -71,6 +72,9 @@ class Instant(eqx.Module):
     left: Any
     caused: Any
     delay: Time
+    round: Any
+    before: Any
+    approach: Any
     previous: Any
     slope: Any
     arrived: Any
@@ -129,7 +133,13 @@ def handle(
         state, q, before = instant.state, instant.state.q, instant.slope
         # Where nothing is left, as in some members of a batch, nothing happens: derivatives of what would have happened
         # need not be finite.
-        event = jnp.where(jnp.any(instant.left), jnp.argmax(instant.left), c + g)
+        goes_on = jnp.any(instant.round & instant.left)
+        together = instant.left & (instant.round | ~goes_on)
+        base, base_slope, previous = (
+            jnp.where(goes_on, kept, now)
+            for kept, now in ((instant.before, state.x), (instant.approach, before), (instant.previous, q))
+        )
+        event = jnp.where(jnp.any(together), jnp.argmax(together), c + g)
         is_clock = event < c
         k = jnp.clip(event - c, 0, max(g - 1, 0))
         delay, rates = jnp.zeros_like(t), arrival.rate
@@ -158,7 +168,7 @@ def handle(
         happening = one_hot(event, c + g)
         if several:
             happening = happening | (instant.left & strikes & strikes[event])
-        x, new = problem.written(time, reached, q, instant.previous, happening, args)
+        x, new = problem.written(time, reached, base + base_slope * delay, q, previous, happening, args)
         ticks = state.ticks + one_hot(event, c).astype(state.ticks.dtype)
         logged = happening & (listed | (ends > 0))
         shown = jnp.arange(c + g) if several else event[None]
@@ -189,9 +199,9 @@ def handle(
             stuck=again.astype(t.dtype),
             turns=turns,
         )
-        # Clocks that tick together read what was before all of them.
-        previous = jnp.where(jnp.any(left[:c]), instant.previous, new) if c else new
-        return Instant(state, left, caused, delay, previous, after, instant.arrived, stuck, now_noted)
+        return Instant(
+            state, left, caused, delay, together, base, base_slope, previous, after, instant.arrived, stuck, now_noted
+        )
 
     def while_any_is_left(step: Callable[[Instant], Instant], times: int) -> Callable[[Instant], Instant]:
         def once(instant: Instant, _: None) -> tuple[Instant, None]:
@@ -205,7 +215,10 @@ def handle(
         return lambda instant: lax.scan(once, instant, length=times)[0]
 
     none = jnp.zeros((g,), bool)
-    start = Instant(state, arrival.due, arrival.jumped, jnp.zeros_like(t), state.q, arrival.slope, state.x, none, noted)
+    start = Instant(
+        state, arrival.due, arrival.jumped, jnp.zeros_like(t), arrival.due, state.x, arrival.slope, state.q,
+        arrival.slope, state.x, none, noted,
+    )  # fmt: skip
     length = _most_in_turn(problem)
     # Loops of fixed length, whose bodies are skipped where nothing is left: reverse mode cannot go back over a `while`.
     # Of a thousand clocks, few tick at once: loops in a loop pass over the others in √1000 steps.

@@ -61,13 +61,14 @@ class AbstractHybridProblem(eqx.Module):
         self,
         t: Time,
         x: Float[Array, " n"],
+        read: Float[Array, " n"],
         q: Float[Array, " q"],
         previous: Float[Array, " q"],
         events: Bool[Array, " events"],
         args: Args,
     ) -> tuple[Float[Array, " n"], Float[Array, " q"]]:
-        """(x, q) after an event, or after several `strikes`, consistent; `previous` are the discrete values before the
-        instant."""
+        """(x, q) after an event, or after several `strikes`, consistent. What they write is computed from the states
+        `read`, and with `previous`, the discrete values, before all events that happen as one."""
 
     @abc.abstractmethod
     def settled(

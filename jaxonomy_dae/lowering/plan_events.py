@@ -105,12 +105,16 @@ def _only_as_written(parameters: np.ndarray, extended: Extended) -> bool:
 
 
 def _reads(flat: FlatModel, variables: QuantityMap, steps: Sequence[AnyStep], n: int) -> list[set[int]]:
-    """The discrete variables that each sampled event reads as they are at its instant, through equations too."""
+    """The discrete variables that each event reads as they are at its instant, through equations too. Those of
+    relations are left out: they have one event that sets them either way."""
     table = flat.events
     place = {int(p): k for k, p in enumerate(flat.parameters.discrete)}
     out = []
-    for event in range(len(table.clocks)):
+    for event in range(len(table)):
         values = table.value[(table.event == event) & (table.value >= 0)]
+        if not len(values) or (event >= len(table.clocks) and table.relation[event]):
+            out.append(set())
+            continue
         found = _parameters_behind(variables.quantity[values], steps, n)
         out.append({place[p] for p in found if p in place})
     return out
@@ -130,21 +134,32 @@ def _parameters_behind(quantities: np.ndarray, steps: Sequence[AnyStep], n: int)
 
 
 def _in_order(table: EventTable, reads: list[set[int]]) -> EventTable:
-    """The events in the order in which they happen at one instant: of sampled ones, those that write what others read
-    come first."""
+    """The events in the order in which they happen at one instant: those that write what others read come first,
+    sampled ones before conditions."""
     writes = [set(table.discrete[(table.event == e) & (table.discrete >= 0)].tolist()) for e in range(len(reads))]
-    sorter: graphlib.TopologicalSorter[int] = graphlib.TopologicalSorter({e: () for e in range(len(reads))})
-    for e, read in enumerate(reads):
-        sorter.add(e, *(k for k, written in enumerate(writes) if k != e and read & written))
+    n = len(table.clocks)
+
+    def sorted_by_reads(events: range) -> list[int]:
+        sorter: graphlib.TopologicalSorter[int] = graphlib.TopologicalSorter({e: () for e in events})
+        readers = [e for e in events if reads[e]]
+        for e in readers:
+            sorter.add(e, *(k for k in events if k != e and reads[e] & writes[k]))
+        return list(sorter.static_order())
+
     try:
-        order = list(sorter.static_order())
+        clocks = sorted_by_reads(range(n))
     except graphlib.CycleError as error:
         names = ", ".join(f"'{table.text[e]}'" for e in dict.fromkeys(error.args[1]))
         raise ModelError(
             f"the sampled events {names} need each other's results at the same instant, directly or through "
             "equations: let one of them read the value before, pre(…)"
         ) from None
-    return table.take([*order, *range(len(reads), len(table))])
+    conditions = range(n, len(table))
+    try:
+        order = sorted_by_reads(conditions)
+    except graphlib.CycleError:  # conditions that need each other's results need not become true at one instant
+        order = list(conditions)
+    return table.take([*clocks, *order])
 
 
 def read_variables(

@@ -64,9 +64,9 @@ class SystemProblem(AbstractHybridProblem):
     def clocks(self):
         return SystemAt(self.system.plan, self.system.numbers, (), 0.0, {}, self.system.typical_sizes).clocks()
 
-    def written(self, t, x, q, previous, events, args):
+    def written(self, t, x, read, q, previous, events, args):
         plan: Any = self.system.plan.events
-        values = self.system.around_event(t, q, previous, args).event_values(x)
+        values = self.system.around_event(t, q, previous, args).event_values(read)
         happens = events[plan.table.event]
         is_state, is_discrete = plan.state >= 0, plan.table.discrete >= 0
         place = plan.state[is_state]

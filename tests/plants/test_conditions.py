@@ -16,7 +16,7 @@ import sympy
 from problems import compiled, component
 from sympy import Abs, And, Heaviside, Max, Min, Mod, Or, Piecewise, ceiling, floor, sign
 
-from jaxonomy_dae import Eq, assign, der, pre, simulate
+from jaxonomy_dae import Eq, assign, der, pre, reinit, simulate
 
 TIGHT = dict(rtol=1e-10, atol=1e-10)
 pytestmark = pytest.mark.long("runs of models with events are compiled")
@@ -233,3 +233,41 @@ def test_conditions_of_events_whose_sides_jump():
     np.testing.assert_allclose(values, [sum(end - a / w for a in times) for times in at.values()], atol=1e-10)
     np.testing.assert_allclose(slopes, [sum(a / w**2 for a in times) for times in at.values()], atol=1e-9)
     assert not [name for name in system.variables if ":" in name]
+
+
+# --- several events at one instant -----------------------------------------------------------------------------------
+
+
+def at_one_instant(order):
+    """At t = 1 a state reaches a level and starts anew, a clock ticks, and others read what these write."""
+
+    def write(self, ev):
+        x, v = self.variable("x", start=0.0, fixed=True), self.variable("v", start=1.0, fixed=True)
+        last, n, m, k, s = (self.discrete(name, start=int(name == "k")) for name in ("last", "n", "m", "k", "s"))
+        d = self.variable("d")
+        self.add_equations(Eq(der(x), v), Eq(der(v), 0), Eq(d, 3 * n))
+        declared = [
+            lambda: self.when(x >= 1, reinit(v, -0.5 * v), reinit(x, 0.9)),
+            lambda: self.when(x >= 1, assign(last, 10 * pre(x) + v)),
+            lambda: self.when(ev.t >= 1, assign(n, pre(n) + 1)),
+            lambda: self.when(x >= 1, assign(m, d + 100 * pre(n))),
+            lambda: self.when(self.sampled(0.5, 0.5), assign(s, pre(s) + x), assign(k, 2 * pre(k))),
+            lambda: self.when(n >= 1, assign(k, pre(k) + 100)),
+        ]
+        for place in order:
+            declared[place]()
+
+    return compiled(component(write))
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2, 3, 4, 5), (5, 4, 3, 2, 1, 0), (3, 1, 0, 5, 2, 4)])
+def test_events_at_one_instant_in_any_order(order):
+    """All read the states before any of them, discrete variables with `pre` as before all, and without as assigned at
+    the instant; what one of them makes true comes after them. A state that an event declared before had reset was read
+    as it was then. The last row is an event at t1."""
+    system = at_one_instant(order)
+    names = ["c.x", "c.v", "c.last", "c.n", "c.m", "c.k", "c.s"]
+    known = [0.9, -0.5, 11.0, 1.0, 3.0, 104.0, 1.5]
+    solution = simulate(system, 1.5, ts=jnp.array([0.75, 1.0, 1.25]), **TIGHT)
+    np.testing.assert_allclose(solution[names][1:], [known, [0.775, *known[1:]]], atol=1e-9)
+    np.testing.assert_allclose(simulate(system, 1.0, ts=jnp.array([1.0]), **TIGHT)[names], [known], atol=1e-9)
