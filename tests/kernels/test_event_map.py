@@ -153,7 +153,7 @@ def test_clocks_and_immediate_events_at_the_start():
         return start(problem, t0, x0, numbers.q, None, MAX_EVENTS, False)
 
     held = begin(numbers, 0.0, numbers.x)
-    np.testing.assert_allclose(held.q[:2], [11.5, 1.0])
+    np.testing.assert_allclose(held.q[:2], [10.5, 1.0])  # both read what was before them
     assert float(held.count) == 0 and float(held.due[0]) == 0.5
     later = begin(numbers, 0.7, numbers.x + 2.0)  # between two ticks, and the guard is above zero
     np.testing.assert_allclose(later.q[:2], [0.5, 0.0])
