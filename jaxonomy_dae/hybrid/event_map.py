@@ -10,7 +10,6 @@ second derivative is not that of the flow, and is refused. A clock ticks at τ =
 parameters, in the same manner.
 """
 
-import itertools
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -26,6 +25,7 @@ from ..adjoint.resting import still
 from ..aliases import Args, Time
 from .first_order import constant_once
 from .log import EventRows
+from .modes import Search, sets_to_flip
 from .problem import AbstractHybridProblem, HybridState, one_hot
 from .side import ABOVE, BELOW, RESTS, rounding
 
@@ -50,7 +50,6 @@ SINKING = 4.0
 # How often guards may fall while time does not go on, beside so often for each. Beyond, relations turn back and forth,
 # or conditions make each other true without end.
 SLIDES, TURNS = 64, 4
-ALTERNATIVES = 128  # modes that are tried where equations are singular: one of 127 diodes, or any two of 15
 
 
 class Instant(eqx.Module):
@@ -248,7 +247,7 @@ def _following(
 
     `moved` says whether they wrote states, `approach` how fast the guards fell before, or zero. Where the equations
     are singular with q, as where a switch closes onto a diode that conducts, modes that are chosen by their conditions
-    change along with it: to the first ones of `_alternatives` that hold.
+    change along with it (`modes`).
 
     `rose` says which guards had risen to zero before the event, `onto` which had jumped onto it, `waits` which fall
     from zero after this instant. Returns (q, dx/dt, the
@@ -274,17 +273,13 @@ def _following(
         so before."""
         return _is_zero(value, rate, arrival) & ((jnp.abs(rate) * ahead <= band) | rested)
 
-    others = jnp.asarray(_alternatives(problem.choices, len(q)))
-    conditions = np.array(problem.choice_guards, int)
-
-    def in_mode(m, q):
-        return jnp.where(others[m], 1.0 - q, q) if problem.choices else q
+    sets, conditions = jnp.asarray(sets_to_flip(problem.choices, len(q))), np.array(problem.choice_guards, int)
 
     # Slopes, guards and their rates after the event, with what was before it, before the delay, and, where a guard is
     # flat, a little ahead: in a loop, for XLA compiles the equations as often as they are written.
     def look(carry):
-        k, m, slopes, values, rates = carry
-        slope, now = slopes[0], in_mode(m, q)
+        k, search, slopes, values, rates = carry
+        slope, now = slopes[0], jnp.where(search.flipped(sets), 1.0 - q, q) if problem.choices else q
         places = jnp.stack([x, instant.arrived, x - slope * delay, x + slope * ahead])
         time = t + jnp.stack([delay, jnp.zeros_like(t), jnp.zeros_like(t), ahead])[k]
         own = problem.slope(time, places[k], now, args)
@@ -292,20 +287,20 @@ def _following(
         value, rate = problem.rates(time, places[k], now, args, jnp.where((k == 0) | (k == 3), own, slope))
         carry = slopes, written(values, k, value), written(rates, k, rate)
         if not problem.choices:
-            return k + 1, m, *carry
-        held = (value >= 0) | _is_zero(value, rate, arrival)
-        holds = jnp.all(jnp.isfinite(own)) & jnp.all(jnp.isfinite(value)) & ((m == 0) | jnp.all(held[conditions]))
-        goes_on = holds | (k > 0) | (m == len(others) - 1)
-        return k + goes_on.astype(k.dtype), m + (~goes_on).astype(m.dtype), *carry
+            return k + 1, search, *carry
+        violated = (value < 0) & ~_is_zero(value, rate, arrival)
+        after, found = search.after(sets, own, value, violated[conditions])
+        after = jax.tree.map(lambda new, old: jnp.where(k == 0, new, old), after, search)
+        return k + (found | (k > 0)).astype(k.dtype), after, *carry
 
     def unfinished(carry):
         k, _, _, values, rates = carry
         return (k < 3) | ((k == 3) & jnp.any(is_flat(values[0], rates[0])))
 
-    rows, none = jnp.zeros((4, g), x.dtype), jnp.array(0)
-    begin = none, none, jnp.zeros((4, *x.shape), x.dtype), rows, rows
-    _, mode, (slope, _, earlier, _), values, rates = lax.while_loop(unfinished, look, begin)
-    written_q = in_mode(mode, written_q)
+    rows = jnp.zeros((4, g), x.dtype)
+    begin = jnp.array(0), Search.begin(len(q), x.dtype), jnp.zeros((4, *x.shape), x.dtype), rows, rows
+    _, search, (slope, _, earlier, _), values, rates = lax.while_loop(unfinished, look, begin)
+    written_q = jnp.where(search.base, 1.0 - written_q, written_q) if problem.choices else written_q
     slow = (jnp.abs(earlier - slope) <= STEADY * jnp.abs(slope)).astype(x.dtype)
     (value, at_arrival, _, _), (rate, rate_there, _, rate_ahead) = values, rates
     reached = at_arrival <= jnp.maximum(band, _within(rate_there, arrival))
@@ -345,14 +340,3 @@ def _following(
     stuck = ((here & moved & (side == RESTS)) | instant.stuck) & held
     side = side.astype(instant.state.armed.dtype)
     return written_q, slope, slow, side, jnp.concatenate([left[:c], next_ones]), caused, stuck
-
-
-def _alternatives(choices: tuple[int, ...], n: int) -> np.ndarray:
-    """Sets of discrete values to flip in turn while a consistent mode is sought, shape (sets + 1, n): none, each of
-    `choices`, each pair of them (at most `ALTERNATIVES` sets). The last row is none again: it stands for "not
-    found"."""
-    sets = [(), *((k,) for k in choices), *itertools.combinations(choices, 2)][:ALTERNATIVES]
-    rows = np.zeros((len(sets) + 1, n), bool)
-    for row, chosen in zip(rows, sets, strict=False):
-        row[list(chosen)] = True
-    return rows

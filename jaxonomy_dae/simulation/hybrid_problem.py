@@ -187,7 +187,7 @@ def problem_for(
     """The problem of a system that has events, to be run from t0 to t1."""
     events: Any = system.plan.events
     ends = tuple(message is not None for message in events.table.message)
-    choices, choice_guards = ((), ()) if system.plan.held is not None else _choices(events.table, events.n_clocks)
+    choices, choice_guards = _choices(system)
     return SystemProblem(
         system=system, watch=watch, tolerance=tolerance, implicit=implicit,
         resolution=resolution(t0, t1),
@@ -216,9 +216,15 @@ def without_clocked(system: AcausalSystem, q: Any) -> Any:
     return q.at[chosen].set(jnp.asarray(system.plan.flat.parameters.starts_of(events.discrete[chosen]), q.dtype))
 
 
-def _choices(table: EventTable, n_clocks: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Returns (the discrete values that `complementary` chooses, the guards that choose them)."""
+def _choices(system: AcausalSystem) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Returns (the discrete values that `complementary` chooses, the guards that choose them). Contacts between states
+    are left out: they close by impulses, and do not make equations singular."""
+    events: Any = system.plan.events
+    table, n_clocks = events.table, events.n_clocks
     chooses = np.array(table.revocable, bool) & ~np.array(table.relation, bool)
+    if system.plan.held is not None:
+        closed = system.plan.held.table.closed
+        chooses[table.event[np.isin(table.discrete, closed[closed >= 0])]] = False
     rows = chooses[table.event] & (table.discrete >= 0) & (table.event >= n_clocks)
     return tuple(np.unique(table.discrete[rows]).tolist()), tuple(np.unique(table.event[rows] - n_clocks).tolist())
 
