@@ -40,3 +40,4 @@ from .term import ClosedForm as ClosedForm
 from .training import GradientSteps as GradientSteps
 from .training import Training as Training
 from .training import Update as Update
+from .verdict import FitWarning as FitWarning

@@ -60,7 +60,7 @@ class Coordinates:
     low: Float[np.ndarray, " p"]
     high: Float[np.ndarray, " p"]
     spread: Float[np.ndarray, " p"]  # of the prior of a start, on the coordinates' scale; infinite where there is none
-    centre: Float[np.ndarray, " p"]  # of this prior, on the coordinates' scale
+    centre: Float[np.ndarray, " p"]  # of this prior, on the coordinates' scale; of weights, those of the problem
     fixed: Bool[np.ndarray, " p"]
     n_shared: int
     n_own: int  # of each experiment
@@ -179,7 +179,7 @@ def coordinates(setting: Setting, stacked: Stacked, extras: tuple[Coordinate, ..
     for name in layout.modules:
         module = system.neural[name] if name in system.neural else observers[name]
         for one, value in _named_weights(name, module):
-            rows.append(Coordinate(one, "", name, True, False, 1.0, value))
+            rows.append(Coordinate(one, "", name, True, False, 1.0, value, centre=value))
     rows.extend(extras)
     n_plain = len(rows)
     units = dict(zip(table.names, table.units, strict=True))

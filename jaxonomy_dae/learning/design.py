@@ -16,22 +16,28 @@ its own size, an unknown start to its spread. So directions that nothing determi
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
+import scipy.linalg
 from jaxtyping import Bool, Float
 
 from ..errors import InitializationError, ModelError, SimulationError, nearest, whole_number
-from .coordinates import coordinates
+from .coordinates import Coordinates, coordinates
 from .data import Stacked
 from .estimate import Estimate
 from .experiment import Planned
+from .filter_objective import AheadObjective
+from .filter_program import predict_ahead
 from .identifiability import natural_scale
 from .objective import Objective
 from .problem import Problem
 from .program import Layout, predict_and_differentiate
 from .runs import run
+
+DRAWS = 64  # records of innovations at most, for the information of a filter: exact up to 63 samples
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -118,7 +124,7 @@ def known_of(source: Problem | Estimate, names: Any, alone: bool) -> Known:
     count = int(shared.sum())
     information = np.diag(prior[:count])
     if not alone:
-        jacobian = weights.row[:, None] * found.jacobian
+        jacobian = dataclasses.replace(weights, precision=np.zeros_like(prior)).applied(z, found).jacobian
         whole = jacobian.T @ jacobian + np.diag(prior)
         information = _without(whole, count)
     natural = c.natural(objective.full(z))
@@ -204,27 +210,66 @@ def informations(known: Known, plans: list[Planned]) -> tuple[tuple[str, ...], F
     """Labels, and the information of each planned experiment on what is shared and free; NaN where its run fails."""
     layout, stacked, shared, own = _placed(known, plans)
     planned = _objective(known, layout, stacked)
-    found = predict_and_differentiate(planned.setting, shared, own, planned.conditions)
-    outputs, by_shared, by_own = (np.asarray(a, np.float64) for a in found)
-    column = _columns(known, layout)
+    column = _columns(known, planned.coordinates)
     starts = _start_scales(stacked, layout)
-    out = np.full((len(plans), *known.information.shape), np.nan)
-    for k in range(len(plans)):
-        seen = stacked.observed[k]
-        row = np.sqrt(stacked.weight[k]) / np.broadcast_to(stacked.sigma[k], seen.shape)[seen]
-        a = np.zeros((len(row), len(known.free)))
-        a[:, column] = by_shared[k][seen]
-        a = (row[:, None] * a * known.scale)[:, known.free]
-        if not np.isfinite(a).all() or not np.isfinite(outputs[k][seen]).all():
-            continue
-        b = row[:, None] * by_own[k][seen] * starts[k]
-        own_free = ~np.array([_is_known(stacked, name, k) for name in layout.own], bool)
-        joint = np.concatenate([a, b[:, own_free]], axis=1)
-        whole = joint.T @ joint
-        n = a.shape[1]
-        whole[np.arange(n, len(whole)), np.arange(n, len(whole))] += 1.0  # own starts: their spread is the unit
-        out[k] = _without(whole, n)
+    joint = [np.zeros((0, 0))] * len(plans)
+    told = list(_told(planned, shared, own))
+    for one in told:
+        for k in range(len(plans)):
+            seen = stacked.observed[k]
+            own_free = ~np.array([_is_known(stacked, name, k) for name in layout.own], bool)
+            rows = []
+            for by_shared, by_own in one:
+                a = np.zeros((int(seen.sum()), len(known.free)))
+                a[:, column] = by_shared[k][seen]
+                b = by_own[k][seen] * starts[k]
+                rows.append(np.concatenate([(a * known.scale)[:, known.free], b[:, own_free]], axis=1))
+            whole = stacked.weight[k] * sum(r.T @ r for r in rows) / len(told)
+            joint[k] = joint[k] + whole if len(joint[k]) else whole
+    out, n = np.full((len(plans), *known.information.shape), np.nan), int(known.free.sum())
+    for k, whole in enumerate(joint):
+        if np.isfinite(whole).all():
+            own_starts = np.arange(n, len(whole))
+            whole[own_starts, own_starts] += 1.0  # their spread is the unit
+            out[k] = _without(whole, n)
     return stacked.labels, out
+
+
+def _told(planned: Objective, shared: Any, own: Any) -> Iterator[tuple[tuple[np.ndarray, np.ndarray], ...]]:
+    """Pairs of derivatives by shared and own numbers, of shapes (c, n, k, s) and (c, n, k, o), whose squares the
+    information is the sum of: those of predictions, in units of the noise, and of a filter those of the logarithms of
+    the variances as well (`likelihood`). What a filter predicts depends on its samples: of these, some records of
+    innovations ±1 are drawn, orthogonal to each other as columns of a Hadamard matrix are, so that their mean is the
+    expectation where predictions are linear in the samples."""
+    s = planned.stacked
+    if not isinstance(planned, AheadObjective):
+        outputs, *slopes = predict_and_differentiate(planned.setting, shared, own, planned.conditions)
+        yield (_scaled(np.asarray(outputs), slopes, s.sigma[:, None, :]),)
+        return
+    structure = dataclasses.replace(planned.structure, is_drawn=True)
+    count = min(2 ** int(np.ceil(np.log2(s.values[0].size + 1))), DRAWS)
+    signs = scipy.linalg.hadamard(count)[:, 1 + np.arange(s.values[0].size) % (count - 1)]
+    for row in signs:
+        values = jnp.asarray(np.broadcast_to(row.reshape(s.values[0].shape), s.values.shape), planned.told.values.dtype)
+        told = dataclasses.replace(planned.told, values=values)
+        pairs = predict_ahead(planned.setting, structure, shared, own, told)
+        (mean, variance), *slopes = pairs
+        first, second = ([part[j] for part in slopes] for j in (0, 1))
+        if not structure.is_filter:
+            yield (_scaled(np.asarray(mean), first, s.sigma[:, None, :]),)
+            continue
+        variance = np.asarray(variance, np.float64)
+        with np.errstate(invalid="ignore"):
+            level = np.sqrt(variance)
+        yield _scaled(np.asarray(mean), first, level), _scaled(variance, second, np.sqrt(2) * variance)
+
+
+def _scaled(values: np.ndarray, slopes: Any, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives by shared and own numbers in units of shape (c, n, k); not-a-number where a run fails."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        factor = np.where(np.isfinite(values), 1.0, np.nan) / unit
+    by_shared, by_own = (np.asarray(a, np.float64) * factor[..., None] for a in slopes)
+    return by_shared, by_own
 
 
 def _placed(known: Known, plans: list[Planned]) -> tuple[Layout, Stacked, Any, Any]:
@@ -240,22 +285,25 @@ def _placed(known: Known, plans: list[Planned]) -> tuple[Layout, Stacked, Any, A
         )
     at = _objective(known, layout, stacked)
     own = at.coordinates.split(at.coordinates.start)[1]
-    return layout, stacked, *at.numbers(np.concatenate([known.natural[_columns(known, layout)], own.ravel()]))
+    return layout, stacked, *at.numbers(np.concatenate([known.natural[_columns(known, at.coordinates)], own.ravel()]))
 
 
 def _objective(known: Known, layout: Layout, stacked: Stacked) -> Objective:
-    o = known.objective
-    setting = o.setting._replace(layout=layout)
-    return Objective(
-        *setting[:3], o.fine, stacked, coordinates(setting, stacked), {}, np.ones(len(stacked.labels), bool)
-    )
+    """What planned experiments are looked at by: runs, or the method of the estimate at hand."""
+    o, counted = known.objective, np.ones(len(stacked.labels), bool)
+    structure, extras = known.problem.errors(stacked)
+    c = coordinates(o.setting._replace(layout=layout), stacked, extras)
+    given = o.system, o.observers, layout, o.fine, stacked, c, {}, counted
+    if not isinstance(o, AheadObjective):
+        return Objective(*given)
+    return type(o)(*given, structure)
 
 
-def _columns(known: Known, layout: Layout) -> np.ndarray:
-    """The places of a layout's shared numbers among those of the estimate at hand."""
-    base, c = known.objective.layout, known.objective.coordinates
-    plain = c.n_shared - len(base.shared)
-    return np.array([*range(plain), *(plain + base.shared.index(name) for name in layout.shared)], int)
+def _columns(known: Known, planned: Coordinates) -> np.ndarray:
+    """The places of shared numbers among those of the estimate at hand. Noise levels of its samples are not there:
+    those of planned ones are given."""
+    place = {name: k for k, name in enumerate(known.objective.coordinates.names)}
+    return np.array([place[name] for name in planned.names[: planned.n_shared]], int)
 
 
 def _is_known(stacked: Stacked, name: str, k: int) -> bool:

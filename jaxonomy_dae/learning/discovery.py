@@ -278,6 +278,7 @@ def _refitted(
         start={c.names[k]: float(natural[k]) for k in others},
         bounds={c.names[k]: (float(c.low[k]), float(c.high[k])) for k in numbers},
         freeze=frozen,
+        warn=False,
     )
 
 

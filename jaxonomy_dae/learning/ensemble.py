@@ -105,10 +105,11 @@ def ensemble(
         )
     # Not in one vmap: on two cores, the Jacobian of eight pendulums with 97 weights takes 0.74 s there, where eight by
     # themselves take 0.20 s, and the program compiles for as long as that of a single one again.
+    given: dict[str, Any] = {"warn": False} | options  # members in worse minima are left out
     estimates, reason = [], None
     for system in _starts(problem, modules, members, seed, networks):
         try:
-            estimates.append(problem.fit(start=system, **options))
+            estimates.append(problem.fit(start=system, **given))
         except SimulationError as error:
             reason = reason or error
     if not estimates:

@@ -25,6 +25,7 @@ from .program import with_values
 from .smoothing import followed
 from .table import Table
 from .training import Training
+from .verdict import reasons
 
 if TYPE_CHECKING:
     from .posterior import Posterior
@@ -63,6 +64,17 @@ class Estimate:
     def __repr__(self):
         score = f", held out {self.holdout_score:.3g} σ" if self.objective.stacked.holdout.any() else ""
         return f"Estimate({self.message}: χ² {self.chi2:.4g} of {self.freedom:.1f} degrees of freedom{score})"
+
+    @functools.cached_property
+    def reasons(self) -> tuple[str, ...]:
+        """What is against this fit, each with what to try next; empty if it can be relied on."""
+        return reasons(self)
+
+    @property
+    def ok(self) -> bool:
+        """True if the search came to its end, what noise levels say is met, residuals look like white noise, and all
+        that was searched is determined by the data and inside its bounds. `reasons` says what is not so."""
+        return not self.reasons
 
     # --- values ------------------------------------------------------------------------------------------------
 

@@ -114,6 +114,11 @@ class AheadObjective(Objective):
 class FilterObjective(AheadObjective):
     """The likelihood of an extended Kalman filter."""
 
+    @property
+    def has_variances(self) -> bool:
+        """Innovations have."""
+        return True
+
     def evaluate(self, z: Float[np.ndarray, " f"]) -> Evaluation | None:
         """Errors of predictions and their variances, with Jacobians; None where a run that counts fails."""
         full = self.full(z)
@@ -143,7 +148,8 @@ class FilterObjective(AheadObjective):
     @functools.cached_property
     def evidence(self) -> Evidence:
         """As `Objective.evidence`, for precisions alone: noise levels are coordinates."""
-        groups = [self._group(name) for name, given in self.penalties.items() if given == "evidence"]
+        chosen_by_data = [name for name, given in self.penalties.items() if given == "evidence" and self.whole]
+        groups = [self._group(name) for name in chosen_by_data]
         chosen = tuple(group for group in groups if group.any())
         return Evidence(np.full(len(self.rows[0]), -1), (), np.zeros(0), chosen)
 

@@ -45,11 +45,13 @@ def _track(setting: Setting, structure: Structure, shared: Any, own: Any, told: 
         x, p, phi, discrete = onwards(m, layout, structure, ends, *carry)
         if structure.is_filter:
             outputs, slopes = read(m, layout, t, x, discrete)
-            d, corrected, (variance, predicted) = corrected_by(x, p, (y, outputs, slopes, seen, m.sigma))
+            row = y, outputs, slopes, seen, m.sigma
+            d, corrected, (variance, predicted) = corrected_by(x, p, row, structure.is_drawn)
         else:
             corrected = p
             predicted = read_values(m, layout, t, x, discrete)
             variance = jnp.ones_like(predicted)
+            y = jax.lax.stop_gradient(predicted + m.sigma * y) if structure.is_drawn else y
             d = m.gain @ jnp.where(seen, y - predicted, 0.0)
         after, p_after = moved_by(m, t, x, d, corrected, discrete)
         out = Track(predicted, variance, x, p, after, p_after, phi, discrete)

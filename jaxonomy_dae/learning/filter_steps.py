@@ -250,9 +250,9 @@ def onwards(
     return x, p, jnp.zeros_like(p), discrete
 
 
-def corrected_by(x: Any, p: Any, row: tuple[Any, ...]) -> tuple[Any, Any, Any]:
+def corrected_by(x: Any, p: Any, row: tuple[Any, ...], is_drawn: bool = False) -> tuple[Any, Any, Any]:
     """(state less the prediction, covariance, variances) after the outputs of one time, taken one by one (Joseph's
-    form, in which rounding leaves the covariance positive)."""
+    form, in which rounding leaves the covariance positive). Samples that are drawn are told as `Structure` says."""
     eye = jnp.eye(len(p), dtype=p.dtype)
 
     def one(carry, given):
@@ -261,6 +261,8 @@ def corrected_by(x: Any, p: Any, row: tuple[Any, ...]) -> tuple[Any, Any, Any]:
         across = p @ slope
         s = slope @ across + sigma**2
         gain = jnp.where(seen, across / s, 0.0)
+        if is_drawn:
+            y = jax.lax.stop_gradient(predicted + slope @ d + jnp.sqrt(s) * y)
         d = d + gain * (y - predicted - slope @ d)
         rest = eye - jnp.outer(gain, slope)
         return (d, rest @ p @ rest.T + jnp.outer(gain, gain) * sigma**2), (s, predicted + slope @ carry[0])

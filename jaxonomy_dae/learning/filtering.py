@@ -108,6 +108,8 @@ class Structure:
     - `gain`: (place in the state array, output, factor) of each entry of a constant gain.
     - `substeps`: how many parts the time between samples has.
     - `is_linear`: whether the flow is a matrix exponential.
+    - `is_drawn`: whether samples are told as what they deviate by from their prediction, in standard deviations, so
+        that the record is one that the model itself might have made.
     """
 
     noise: tuple[tuple[int | str, float], ...] = ()
@@ -115,6 +117,7 @@ class Structure:
     gain: tuple[tuple[int, int, float], ...] = ()
     substeps: int = 1
     is_linear: bool = False
+    is_drawn: bool = False
 
     @property
     def is_filter(self) -> bool:

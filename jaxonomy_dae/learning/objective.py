@@ -77,6 +77,12 @@ class Objective:
     coordinates: Coordinates
     penalties: dict[str, Any]  # "evidence" or a precision, by the name of a group
     counted: Bool[np.ndarray, " e"]
+    whole: bool = dataclasses.field(default=True, kw_only=True)  # the time of all experiments counts
+
+    @property
+    def has_variances(self) -> bool:
+        """True if the model itself says how large residuals are."""
+        return False
 
     @property
     def setting(self) -> Setting:
@@ -85,8 +91,9 @@ class Objective:
         return Setting(self.system, self.observers, self.layout, fine)
 
     def until(self, share: float) -> "Objective":
-        """A copy with a share of each experiment's time."""
-        return dataclasses.replace(self, stacked=self.stacked.until(share))
+        """A copy with a share of each experiment's time. Over a part of it, precisions of weights stay as they begin:
+        what the first samples do not need may be needed later."""
+        return dataclasses.replace(self, stacked=self.stacked.until(share), whole=share >= 1)
 
     @functools.cached_property
     def rows(self) -> tuple[Int[np.ndarray, " m"], ...]:
@@ -290,7 +297,8 @@ class Objective:
         values = s.values[self.rows]
         sizes = [np.max(np.abs(values[noise == k]), initial=0.0) for k in range(len(chosen))]
         floor = np.maximum(np.array(sizes) * np.finfo(self.system.parameters.values.dtype).eps, np.finfo(float).tiny)
-        groups = [self._group(name) for name, given in self.penalties.items() if given == "evidence"]
+        chosen_by_data = [name for name, given in self.penalties.items() if given == "evidence" and self.whole]
+        groups = [self._group(name) for name in chosen_by_data]
         return Evidence(
             noise,
             tuple(s.outputs[k] for k in chosen),
@@ -309,8 +317,8 @@ class Objective:
         for name, given in self.penalties.items():
             group = self._group(name)
             if group.any() and given is not None:
-                # All weights determined, to begin with; weights that are all zero are taken to be of order one.
-                size = float(np.sum(z[group] ** 2))
+                # The sizes of the weights that the problem came with; if all are zero, of order one.
+                size = float(np.sum(c.centre[self.free][group] ** 2))
                 first = group.sum() / size if size > 0 else 1.0
                 precision[group] = first if given == "evidence" else float(given)
         return self.evidence.first(Weights(row, precision, mean, np.sqrt(s.weight[experiment])), found)

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -14,6 +15,7 @@ from ..errors import ModelError, SimulationError
 from ..solvers.solve import check_tolerances, default_tolerances
 from ..system.system import AcausalSystem
 from .asked import as_asked, check_start, checked_method, names_to_train, penalties, started
+from .beginnings import beginning
 from .coordinates import Coordinate, Coordinates, coordinates
 from .data import Data, Stacked, stack
 from .descent import Minimum
@@ -30,6 +32,7 @@ from .program import Layout, Setting
 from .runs import residuals, run, why_not
 from .starting_points import adam_steps, starting_points
 from .training import GradientSteps, Training, train
+from .verdict import FitWarning
 
 GROWING = tuple(k / 10 for k in range(1, 11))  # shares of the time
 
@@ -117,7 +120,7 @@ class Problem:
 
     def _laid_out(self, stacked: Stacked) -> Layout:
         parameters, modules = self.trained
-        _, extras = self._errors(stacked)
+        _, extras = self.errors(stacked)
         shared, own, known = [], [], []
         for name, values in stacked.starts.items():
             unknown = [v for v in values if isinstance(v, Unknown)]
@@ -139,7 +142,7 @@ class Problem:
     def _setting(self) -> Setting:
         return Setting(self.system, self.observers, self._layout, 1.0)
 
-    def _errors(self, stacked: Stacked) -> tuple[Structure, tuple[Coordinate, ...]]:
+    def errors(self, stacked: Stacked) -> tuple[Structure, tuple[Coordinate, ...]]:
         """The static choices that the method adds to the program, and its coordinates."""
         if isinstance(self.method, Filter | Innovations):
             return structure_and_extras(self.method, self.system, stacked)
@@ -175,7 +178,7 @@ class Problem:
         `{experiment: {name: array of shape (n,)}}`; NaN where a run fails.
         """
         s = self._stacked
-        objective = self._objective(s, coordinates(self._setting, s, self._errors(s)[1]))
+        objective = self._objective(s, coordinates(self._setting, s, self.errors(s)[1]))
         model = self.system if model is None else model.merged()
         return residuals(objective, model, dict(starts or {}), dict(observe or {}), adjoint)
 
@@ -185,7 +188,7 @@ class Problem:
         if not isinstance(self.method, Filter | Innovations):
             return Objective(*model, *given)
         kind = FilterObjective if isinstance(self.method, Filter) else AheadObjective
-        return kind(*model, *given, self._errors(stacked)[0])
+        return kind(*model, *given, self.errors(stacked)[0])
 
     # --- fitting -----------------------------------------------------------------------------------------------
 
@@ -203,6 +206,7 @@ class Problem:
         learning_rate: float = 0.02,
         horizons: Sequence[float] | None = None,
         steps: int = 200,
+        warn: bool = True,
     ) -> Estimate:
         """The most probable values: least squares in units of the noise, with the priors that were given.
 
@@ -221,6 +225,11 @@ class Problem:
         - `horizons`: shares of the time that are fitted one after the other, such as `(0.25, 0.5, 1)`: what diverges
             over the whole time is caught early. None: all of it, or with `method="growing"`, ten of them.
         - `steps`: how many steps of least squares at most.
+        - `warn`: whether a `FitWarning` tells the `reasons` for which the estimate is not `ok`.
+
+        Where `start`, `first`, `adam` and `horizons` are left out, networks begin at their own weights or with a last
+        layer of zero, whichever is closer to the data, and if both are far from them, horizons grow. Where no step
+        gains, the search measures the error of the integration, and tightens its tolerances if it is in the way.
 
         **Raises:**
 
@@ -228,32 +237,37 @@ class Problem:
         - `SimulationError` if no start can be simulated, with the reason of the first.
         """
         objective = self._prepared(data, freeze, start, bounds)
-        stacked = objective.stacked
         if first is not None and (adam or (starts > 1 and first.checkpoint is not None)):
             other = "adam=" if adam else "a checkpoint with several starts"
             raise ModelError(f"first= does not go with {other}: leave one of them out")
         self._check_steps(adam, horizons, first)
+        plain = self.method == "single" and horizons is None and start is None and first is None and not adam
         if horizons is None:
             horizons = GROWING if self.method == "growing" else (1.0,)
-        shares = [float(share) for share in horizons]
+        shares = tuple(float(share) for share in horizons)
         if not shares or shares[-1] != 1.0 or any(not 0 < share <= 1 for share in shares):
             raise ModelError(f"horizons are shares in (0, 1], the last of them 1; got {tuple(horizons)}")
+        by_fit = isinstance(self.method, Filter) or not objective.stacked.holdout.any()
         best: tuple[float, Minimum, Training | None] | None = None
         for point in starting_points(objective, starts, seed):
-            training = None
+            training, spans = None, shares
             if first is not None:
                 training = train(objective, point, first)
                 point = training.z
-            found = self._descend(objective, point, shares, steps, adam, learning_rate)
+            if plain:
+                point, spans = beginning(objective, point)
+            found = self._descend(objective, point, spans, steps, adam, learning_rate)
             if found is None:
                 continue
-            by_fit = isinstance(self.method, Filter) or not stacked.holdout.any()
             score = objective.surprise(found) if by_fit else objective.held_out(found.z, found.weights)[1]
             if best is None or not score >= best[0]:
                 best = score, found, training
         if best is None:
             raise SimulationError(why_not(objective))
-        return Estimate.of(self, objective.at_tolerance(best[1].tolerance), best[1], best[2])
+        fit = Estimate.of(self, objective.at_tolerance(best[1].tolerance), best[1], best[2])
+        if warn and fit.reasons:
+            warnings.warn(f"this fit is not to be relied on: {'; '.join(fit.reasons)}", FitWarning, stacklevel=2)
+        return fit
 
     def train(
         self,
@@ -299,7 +313,7 @@ class Problem:
             )
 
     def _coordinates(self, stacked: Stacked, freeze: Any, start: Any, bounds: Any) -> Coordinates:
-        extras = self._errors(stacked)[1]
+        extras = self.errors(stacked)[1]
         c = coordinates(self._setting, stacked, extras)
         if isinstance(start, AcausalSystem):
             there = self._setting._replace(system=started(self.system, start))
@@ -307,7 +321,7 @@ class Problem:
         return as_asked(c, freeze, start, bounds)
 
     def _descend(
-        self, objective: Objective, point: np.ndarray, shares: list[float], steps: int, adam: int, rate: float
+        self, objective: Objective, point: np.ndarray, shares: Sequence[float], steps: int, adam: int, rate: float
     ) -> Minimum | None:
         if isinstance(self.method, Shooting):
             return shoot(objective, self.method, point, steps, self._options["rtol"])

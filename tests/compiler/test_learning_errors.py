@@ -11,6 +11,7 @@ from hybrid_models import Doubling
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv
 from jaxonomy_dae.errors import ModelError
 from jaxonomy_dae.learning import Data, Experiment, Filter, GradientSteps, Innovations, Problem, Shooting, Unknown
+from jaxonomy_dae.learning.training import _facts
 from jaxonomy_dae.modeling import Component, Eq, der
 
 TIMES = np.array([1.0, 2.0, 3.0])
@@ -19,7 +20,7 @@ TIMES = np.array([1.0, 2.0, 3.0])
 class Tank(Component):
     def __init__(self, ev, name="tank"):
         super().__init__(ev, name)
-        k = self.parameter("k", 0.5, unit="1/s")
+        k = self.parameter("k", 0.5, unit="1/s", bounds=(0.0, np.inf))
         self.parameter("idle", 1.0)
         u = self.input("u")
         level = self.variable("level", start=1.0, fixed=True, unit="m")
@@ -206,3 +207,41 @@ def test_what_filters_do_not_do(system):
     diagram.add(Doubling(ev, "d"))
     with pytest.raises(ModelError, match="Innovations: 'd.d' is a discrete variable"):
         Problem(AcausalCompiler(ev, diagram)(), Experiment(TIMES, {"d.y": TIMES}), train=["d.a"], method=Innovations())
+
+
+def test_a_checkpoint_tells_the_integration_the_inputs_and_the_functions(system):
+    """Training went on from files that were written with other tolerances, other interpolation, or another law."""
+
+    def facts(kind="linear", law=lambda s: s["tank.level"], **given):
+        data = record({"gauge": TIMES}, inputs={"tank.u": (np.array([0.0, 3.0]), np.ones(2), kind)}, sigma=1.0)
+        problem = Problem(system, data, train=["tank.k"], observe={"gauge": law}, **given)
+        return _facts(problem._prepared(None, (), None, None), GradientSteps(optax.sgd(0.1), 5), ())
+
+    def gain(by):
+        return lambda s: by * s["tank.level"]
+
+    base = facts()
+    assert facts() == base and facts(law=gain(2.0)) == facts(law=gain(2.0))
+    for name, other in {
+        "kind of inputs": facts("held"),
+        "integration": facts(rtol=1e-4),
+        "set of networks and sensor laws": facts(law=lambda s: 2.0 * s["tank.level"]),
+    }.items():
+        assert [key for key in base if base[key] != other[key]] == [name]
+    assert facts(law=gain(2.0)) != facts(law=gain(3.0))
+
+
+def test_one_guess_for_what_all_experiments_share(system):
+    """The first experiment's guess and spread held for all, whatever the others said."""
+    experiments = [record(initial={"tank.level": Unknown(g, spread=0.1, shared=True)}) for g in (1.0, 2.0)]
+    with pytest.raises(
+        ModelError, match="'tank.level' is one number, shared by all experiments, but experiment 0 says"
+    ):
+        Problem(system, Data(*experiments))
+
+
+def test_priors_outside_of_bounds(system):
+    data = record(initial={"tank.k": Unknown(-1.0)})
+    problem = Problem(system, data, train=[])
+    with pytest.raises(ModelError, match=r"tank.k, experiment 0: the guess must lie in \[0, inf\].*; got -1"):
+        problem.fit()

@@ -1,11 +1,13 @@
 """Levenberg–Marquardt, evidence and intervals on models that have closed forms."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import scipy.optimize
 
 from jaxonomy_dae.learning.agreement import whiteness
-from jaxonomy_dae.learning.descent import descend
+from jaxonomy_dae.learning.descent import CLOSE, descend
 from jaxonomy_dae.learning.evaluation import Evaluation, Weights
 from jaxonomy_dae.learning.evidence import Evidence
 from jaxonomy_dae.learning.factors import Factors
@@ -145,3 +147,49 @@ def test_whiteness_tells_noise_from_what_is_left_over():
     assert whiteness(noise + np.sin(np.linspace(0, 6, 400))).probability < 1e-6
     probabilities = [whiteness(rng.standard_normal(200)).probability for _ in range(400)]
     assert abs(np.mean(np.array(probabilities) < 0.1) - 0.1) < 0.06  # four standard deviations of the share
+
+
+def test_a_search_tightens_the_tolerance_that_stops_it():
+    """Residuals carried an integration's error, in which the search ended, called converged, wherever it was."""
+    rng = np.random.default_rng(1)
+    ts = np.linspace(0.1, 3.0, 40)
+    y = np.exp(-1.3 * ts) + 1e-3 * rng.standard_normal(40)
+
+    def merit_at(tolerance):
+        def residual(z):
+            rough = np.sin(1e7 * np.sum(z) + np.arange(40))  # another at every point
+            return z[1] * np.exp(-z[0] * ts) - y + tolerance * rough
+
+        def evaluate(z):
+            law = np.exp(-z[0] * ts)
+            return Evaluation(residual(z), np.stack([-ts * z[1] * law, law], axis=1))
+
+        def finer(factor):
+            return merit_at(tolerance * factor) if tolerance > 1e-12 else None
+
+        def weights(z, found):
+            return Weights(np.full(40, 1e3), np.zeros(2), np.zeros(2), np.ones(40))
+
+        return merit(evaluate, weights, residual, finer, tolerance)
+
+    bounds = np.full(2, -np.inf), np.full(2, np.inf)
+    found = descend(merit_at(3e-3), np.array([3.0, 0.3]), bounds, None, 200)
+    best = scipy.optimize.curve_fit(lambda t, a, x0: x0 * np.exp(-a * t), ts, y, [1.0, 1.0], xtol=1e-14, ftol=1e-14)[0]
+    assert found.converged and found.tolerance < 1e-4
+    np.testing.assert_allclose(found.z, best, rtol=1e-4)
+    stuck = dataclasses.replace(merit_at(3e-3), finer=lambda factor: None)
+    ended = descend(stuck, np.array([3.0, 0.3]), bounds, None, 200)
+    assert ended.converged == (ended.left <= CLOSE) and ended.left > 3 * found.left
+
+
+def test_a_prior_stays_while_the_misfit_is_large():
+    """Far from the data, everything seems determined: precisions went to zero, and did not come back."""
+    rng = np.random.default_rng(2)
+    design = rng.standard_normal((30, 4))
+    evidence = Evidence(np.full(30, -1), (), np.zeros(0), (np.ones(4, bool),))
+    before = Weights(np.ones(30), np.full(4, 2.0), np.zeros(4), np.ones(30))
+    for size, stays in ((100.0, True), (1.0, False)):
+        found = Evaluation(size * rng.standard_normal(30), design)
+        factors = Factors.of(*before.applied(np.full(4, 5.0), found), NOISE)
+        after, change = evidence.reweigh(np.full(4, 5.0), found, before, factors, np.ones(4, bool))
+        assert (after.precision[0] == 2.0) == stays and (change == 0) == stays

@@ -11,7 +11,8 @@ from problems import compiled
 
 from jaxonomy_dae import EqnEnv, ModelError, pre, reinit
 from jaxonomy_dae.errors import SimulationError
-from jaxonomy_dae.learning import Experiment, Planned, Problem, Unknown, design_experiment, next_experiment
+from jaxonomy_dae.learning import Experiment, Filter, Planned, Problem, Unknown, design_experiment, next_experiment
+from jaxonomy_dae.learning.design import informations, known_of
 from jaxonomy_dae.modeling import POSITIVE, Component, Eq, der
 
 pytestmark = pytest.mark.slow  # residuals and their Jacobian compile for ten seconds each
@@ -241,3 +242,38 @@ def test_gains_are_those_of_random_models():
     for k, (t, s) in enumerate(zip(sets, sigma, strict=True)):
         j = np.asarray(jax.jacfwd(lambda z: jnp.exp(z[1] - jnp.exp(z[0]) * t) / s)(jnp.log(jnp.array([K, A]))))  # noqa: B023
         np.testing.assert_allclose(advice.gain[k], 0.5 * np.linalg.slogdet(np.eye(2) + j.T @ j)[1], rtol=1e-5)
+
+
+def information_of_a_noisy_decay(times, k, a, noise, sigma):
+    """Of (ln k, ln noise): the Fisher information of normal samples of x' = −k·x + noise, in closed form."""
+
+    def moments(logs):
+        k, noise = np.exp(logs)
+        early = np.minimum.outer(times, times)
+        covariance = noise**2 * np.exp(-k * np.abs(np.subtract.outer(times, times))) * (1 - np.exp(-2 * k * early))
+        return a * np.exp(-k * times), covariance / (2 * k) + sigma**2 * np.eye(len(times))
+
+    logs, h = np.log([k, noise]), 1e-5
+    ends = [[moments(logs + s * h * np.eye(2)[j]) for s in (1, -1)] for j in range(2)]
+    mean, cov = ([(up[i] - down[i]) / (2 * h) for up, down in ends] for i in (0, 1))
+    inverse = np.linalg.inv(moments(logs)[1])
+    both = [(i, j) for i in range(2) for j in range(2)]
+    parts = [mean[i] @ inverse @ mean[j] + 0.5 * np.trace(inverse @ cov[i] @ inverse @ cov[j]) for i, j in both]
+    return np.reshape(parts, (2, 2))
+
+
+def test_a_filter_is_told_by_samples_through_its_variances_too():
+    """Planned experiments of a filter were least squares of runs, without process noise, or crashed."""
+    times = np.linspace(0.2, 4.0, 20)
+    x = A * np.exp(-K * times) + 0.05 * np.random.default_rng(0).standard_normal(20)
+    record = Experiment(times, {"d.x": x})
+    fit = Problem(system(), record, train=["d.k"], method=Filter({"d.x": "estimate"})).fit(warn=False)
+    known = known_of(fit, None, False)
+    plans = [Planned(times, {"d.x": 0.05}) for times in ([0.5, 1.0, 1.5, 4.0], np.linspace(0.1, 2.0, 9))]
+    found = informations(known, plans)[1]
+    natural = fit.values["d.k"], fit.values["noise of d.x"]
+    chosen = [k for k, name in enumerate(fit.objective.coordinates.names) if name in ("d.k", "noise of d.x")]
+    for plan, got in zip(plans, found, strict=True):
+        expected = information_of_a_noisy_decay(np.asarray(plan.times, float), natural[0], A, natural[1], 0.05)
+        np.testing.assert_allclose(got[np.ix_(chosen, chosen)], expected, rtol=1e-5, atol=1e-7 * expected.max())
+    assert np.isfinite(next_experiment(fit, plans).gain).all()

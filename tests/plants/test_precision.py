@@ -61,6 +61,17 @@ small = compiled(Charges(EqnEnv()), state_selection="projection")
 assert small.states == ["c.a", "c.b"]
 near = small.project(0.0, jnp.array([1.5e-20, 1e-20]), None, iterations=1)
 np.testing.assert_allclose(near, [1.25e-20, 0.75e-20], rtol=1e-5)
+
+# Fits were refused for a tolerance that nobody gave.
+from jaxonomy_dae.learning import Experiment, Problem
+ts = np.linspace(0.1, 1.5, 15)
+expected = angle_solution(-1.2, 0.0, ts, force=lambda vx, vy: (-0.5 * vx * abs(vx), 0.0))
+noise = 1e-2 * np.random.default_rng(0).standard_normal(15)
+fit = Problem(system, Experiment(ts, {"pend.x": expected.x + noise}, sigma=1e-2), train=["pend.L"]).fit(
+    start={"pend.L": 0.8}
+)
+row = fit.table(level=0.999)["pend.L"]
+assert fit.ok and row.low < 1.0 < row.high and row.high - row.low < 0.2, fit.table()
 print("done")
 """
 

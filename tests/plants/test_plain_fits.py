@@ -1,0 +1,100 @@
+"""What `fit()` does where nothing is said, and what it says of its outcome: a decay with a learned law."""
+
+import functools
+import warnings
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from sympy import Eq
+
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der, learning
+from jaxonomy_dae.learning.beginnings import beginning, silent
+
+TS = np.linspace(0.1, 4.0, 40)
+NOISE = 1e-2
+
+
+class Learned(Component):
+    """x' = v, v' = −x + k·f(v)."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        x, v = (self.variable(n, start=s, fixed=True) for n, s in (("x", 1.0), ("v", 0.0)))
+        k = self.parameter("k", 0.0)
+        network = eqx.nn.MLP(1, 1, 4, 1, jnp.tanh, key=jax.random.key(0))
+        (f,) = self.learned("f", network, inputs=[v])
+        self.add_equations(Eq(der(x), v), Eq(der(v), -x + f - k * v))
+
+
+@functools.cache
+def system():
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    diagram.add(Learned(ev, "c"))
+    return AcausalCompiler(ev, diagram)()
+
+
+def with_network(change):
+    network = system().neural["c.f"]
+    return eqx.tree_at(lambda s: s.neural["c.f"], system(), jax.tree.map(change, network, is_leaf=eqx.is_array))
+
+
+def record(a=0.3, seed=0, **given):
+    """Of x'' = −x − a·x', with noise."""
+    w = np.sqrt(1 - a**2 / 4)
+    x = np.exp(-a * TS / 2) * (np.cos(w * TS) + a / (2 * w) * np.sin(w * TS))
+    noise = NOISE * np.random.default_rng(seed).standard_normal(len(TS))
+    return learning.Experiment(TS, {"c.x": x + noise}, **{"sigma": NOISE} | given)
+
+
+@pytest.mark.long("residuals alone")
+def test_a_network_begins_silent_unless_it_says_something():
+    """A network drawn at random took runs anywhere; one that was trained before is kept."""
+
+    def begun(model):
+        problem = learning.Problem(model, record(), train=["c.f"])
+        objective = problem._prepared(None, (), None, None)
+        z = objective.coordinates.z_start
+        return z, silent(objective, z), *beginning(objective, z)
+
+    drawn, quiet, chosen, _ = begun(with_network(lambda a: 3 * a if eqx.is_array(a) else a))
+    last = np.array([n.startswith("c.f.layers[1]") for n in learning.Problem(system(), record(), train=["c.f"])
+                     ._prepared(None, (), None, None).coordinates.names])  # fmt: skip
+    assert (quiet[last] == 0).all() and (quiet[~last] == drawn[~last]).all() and last.sum() == 5
+    np.testing.assert_array_equal(chosen, quiet)
+    # tanh(s·v)·(−0.3/s) is −0.3·v for small s: weights that were trained
+    good = np.zeros(len(last))
+    objective = learning.Problem(system(), record(), train=["c.f"])._prepared(None, (), None, None)
+    names = objective.coordinates.names
+    good[names.index("c.f.layers[0].weight[0]")], good[names.index("c.f.layers[1].weight[0]")] = 0.1, -3.0
+    np.testing.assert_array_equal(beginning(objective, good)[0], good)
+
+
+@pytest.mark.long("residuals with and without their Jacobian")
+def test_a_plain_fit_of_a_network_is_right_and_says_so():
+    fit = learning.Problem(system(), record(), train=["c.f"]).fit()
+    assert fit.ok and fit.minimum.converged and not fit.reasons
+    band = fit.band("c.f", np.linspace(-0.5, 0.4, 10))
+    assert band.inside.all() and (band.spread < 0.05).all()
+    np.testing.assert_array_less(np.abs(band.mean + 0.3 * band.grid), 3.5 * band.spread)
+
+
+@pytest.mark.long("residuals and their Jacobian")
+def test_what_is_against_a_fit_is_said():
+    """Fits of wrong models were called converged, without a word."""
+    quiet = with_network(lambda a: 0 * a if eqx.is_array(a) else a)
+    problem = learning.Problem(quiet, record(), train=["c.k"])
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        assert problem.fit().ok
+    assert not said
+    with pytest.warns(learning.FitWarning, match="not to be relied on: χ² is .* residuals are not white noise: 'c.x'"):
+        wrong = problem.fit(bounds={"c.k": (-1.0, 0.1)})
+    assert not wrong.ok and any("bound was reached by 'c.k'" in reason for reason in wrong.reasons)
+    estimated = problem.fit(record(sigma="estimate"), bounds={"c.k": (-1.0, 0.1)}, warn=False)
+    assert any("white noise" in reason for reason in estimated.reasons)
+    assert not any("χ²" in reason for reason in estimated.reasons)  # a noise level that is estimated explains any
+    short = problem.fit(record(), steps=0, warn=False)
+    assert "not yet converged" in short.reasons[0]
