@@ -22,6 +22,7 @@ class SolveProgram(eqx.Module):
     # (state, buffers, active, first) -> (state, buffers, rows for the table): one attempted step, bookkeeping included
     body: Any
     rest: Any  # (attempted step, second run) -> (end of the next one, second run), or None: see resting.py
+    first: Any  # (start, end, y) -> (end of the first step,), or None: see resting.py
     save_steps: tuple[Any, ...]  # for each part of `SaveAt`: (t, y) -> what it saves of a step, or None
     save_ts: tuple[Any, ...]  # for each part: (t, tprev, tnext, dense_info) -> what it saves at a time, or None
     every: tuple[int, ...] = eqx.field(static=True)  # for each part: it saves every so many steps, 0 for none
@@ -38,7 +39,7 @@ class ClosureConverted(eqx.Module):
     `shard_map` some do.
     """
 
-    jaxpr: Any
+    call: Any  # (arrays it closes over, *arrays among the arguments) -> arrays: a function of its own in the program
     inputs: Any = eqx.field(static=True)  # the structure of the arrays among the arguments
     outputs: Any = eqx.field(static=True)  # (structure of the arrays it returns, their shapes and dtypes)
     static: Any = eqx.field(static=True)  # what it returns beside arrays: (leaves, structure)
@@ -47,7 +48,7 @@ class ClosureConverted(eqx.Module):
         leaves, structure = jax.tree.flatten(eqx.filter(args, eqx.is_array))
         if structure != self.inputs:
             raise TypeError(f"a closure-converted function was made for {self.inputs}; got {structure}")
-        return self._combined(private("eval_jaxpr")(self.jaxpr, consts, *leaves))
+        return self._combined(self.call(consts, *leaves))
 
     @property
     def out_struct(self) -> Any:
@@ -76,7 +77,13 @@ def closure_convert(function: Any, *args: Args) -> tuple[ClosureConverted, list[
     closed = jax.make_jaxpr(flat)(*leaves)
     out_structure, (others, others_structure) = found
     shapes = tuple(jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in closed.out_avals)
-    converted = ClosureConverted(closed.jaxpr, structure, (out_structure, shapes), (tuple(others), others_structure))
+    evaluate = private("eval_jaxpr")
+
+    @jax.jit
+    def call(consts, *leaves):
+        return evaluate(closed.jaxpr, consts, *leaves)
+
+    converted = ClosureConverted(call, structure, (out_structure, shapes), (tuple(others), others_structure))
     return converted, list(closed.consts)
 
 

@@ -46,15 +46,21 @@ class _Recorder:
 
     def __init__(self, numbers: dict[str, Any], program: SolveProgram, times: StepTimes):
         self.numbers, self.program, self.times = numbers, program, times
-        state, moves = numbers["state"], times.start()
-        # The first step may have been made shorter for what rests; its end then moves with its start.
-        held = numbers["first"] < state.tnext
-        state = dataclasses.replace(state, tnext=jnp.where(held, numbers["first"], state.tnext))
-        if times.count:
-            moves = moves[0], jnp.where(held, moves[0], moves[1]), *moves[2:]
-        carry = self._taken_apart(state, jnp.full_like(state.tprev, -jnp.inf), moves, numbers["pushed"])
-        self.row, self.rest = (Packing(part) for part in carry)
-        self.start = self.pack(carry)
+        self.row, self.rest = (Packing(part) for part in self._given(numbers["state"], times.start()))
+
+    def _given(self, state, moves):
+        return self._taken_apart(state, jnp.full_like(state.tprev, -jnp.inf), moves, self.numbers["pushed"])
+
+    def start(self):
+        """The carry at the start, packed."""
+        state, moves = self.numbers["state"], self.times.start()
+        if self.program.first is not None:  # it may be shorter for what rests; its end then moves with its start
+            (first,) = self.program.first(self.numbers["first"], state.tprev, state.tnext, state.y)
+            held = first < state.tnext
+            state = dataclasses.replace(state, tnext=jnp.where(held, first, state.tnext))
+            if self.times.count:
+                moves = moves[0], jnp.where(held, moves[0], moves[1]), *moves[2:]
+        return self.pack(self._given(state, moves))
 
     def _taken_apart(self, state, last, moves, pushed):
         names = ("y", "solver_state", "tprev", "tnext") + (("made_jump",) if self.program.jumps else ())
@@ -73,8 +79,8 @@ class _Recorder:
     def going(self, packed):
         return any_member(going(self.unpack(packed)[0], self.numbers, self.program))
 
-    def empty(self):
-        return rows((self.start[0], jnp.array(False)), self.program.chunk)
+    def empty(self, start):
+        return rows((start[0], jnp.array(False)), self.program.chunk)
 
     def run(self, packed, buffers, table, record, filled, count, first):
         """Attempts at most `count` steps. Returns (carry, buffers, table, record, rows filled). The rows of
@@ -132,10 +138,10 @@ def _(perturbed, numbers, program):
         )
         return carry, buffers, table, chunks + 1, stride, kept, record, filled
 
-    start = recorder.start
+    start = recorder.start()
     one, zero = jnp.array(1, jnp.int32), jnp.array(0, jnp.int32)
     saved = numbers["buffers"], numbers["table"]
-    loop = (start, *saved, zero, one, rows(start, points + 1), recorder.empty(), zero)
+    loop = (start, *saved, zero, one, rows(start, points + 1), recorder.empty(start), zero)
     loop = lax.while_loop(lambda loop: recorder.going(loop[0]), advance, loop)
     carry, buffers, table, chunks, stride, kept, record, filled = loop
     state, _, moves, _ = recorder.unpack(carry)

@@ -113,9 +113,14 @@ class Resting(eqx.Module):
         the first step must not exceed `RESOLVED` divided by the rate at which slopes answer to a push."""
         resting, t, end, y = still((self, t, end, y))
         terms, solver, x, _ = resting._between_events(y, y)
-        slope, scale = solver.func(terms, t, x, resting.args), resting._scale(x)
+        scale = resting._scale(x)
+
+        def look(point, _):
+            slope = solver.func(terms, t, point, resting.args)
+            return x + jnp.where(resting._rests(slope, x), PUSH * scale * _pattern(x), 0.0), slope
+
+        _, (slope, pushed) = lax.scan(look, x, length=2)  # a loop: the field is compiled once
         rests = resting._rests(slope, x)
-        pushed = solver.func(terms, t, x + jnp.where(rests, PUSH * scale * _pattern(x), 0.0), resting.args)
         rate = jnp.max(jnp.abs(pushed - slope) / scale) / PUSH
         resolved = jnp.minimum(end, t + RESOLVED / jnp.where(rate > 0, rate, 1.0))
         first = jnp.where(jnp.isfinite(rate), jnp.where(rate > 0, resolved, end), t)

@@ -218,19 +218,20 @@ def _functions(
         return closure_convert(lambda t, y: part.fn(t, y, args), s.tprev, y1) if part.steps else none
 
     at_ts, at_steps = [save_ts(part) for part in parts], [save_step(part) for part in parts]
-    rest, pushed = none, ()
-    resting, first = Resting.of(terms, solver, stepsize_controller, s.y, args, t1 - s.tprev), s.tnext
+    rest, first, pushed = none, none, ()
+    resting = Resting.of(terms, solver, stepsize_controller, s.y, args, t1 - s.tprev)
     if resting is not None:
-        pushed, first = resting.begin(s.tprev, s.y), resting.first_end(s.tprev, s.tnext, s.y)
+        pushed = resting.begin(s.tprev, s.y)
+        first = closure_convert(lambda *given: (resting.first_end(*given),), s.tprev, s.tnext, s.y)
         tried = AttemptedStep(s.tprev, s.tnext, s.y, s.y, jnp.array(False), made_jump, s.tprev, s.tnext)
         rest = closure_convert(lambda *given: resting.restrained(*given), tried, pushed)
     functions = dict(
-        rest=rest[0], step=step[0], adapt=adapted[0], jumps=made_jump is not False,
+        rest=rest[0], first=first[0], step=step[0], adapt=adapted[0], jumps=made_jump is not False,
         every=tuple(int(part.steps) for part in parts),
         save_ts=tuple(f for f, _ in at_ts), save_steps=tuple(f for f, _ in at_steps),
     )  # fmt: skip
     numbers = dict(
-        rest=rest[1], pushed=pushed, first=lax.stop_gradient(first), step=step[1], adapt=adapted[1],
+        rest=rest[1], first=first[1], pushed=pushed, step=step[1], adapt=adapted[1],
         controller=controller, t1=jnp.asarray(t1),
         ts=tuple(part.ts for part in parts),
         save_ts=tuple(c for _, c in at_ts), save_steps=tuple(c for _, c in at_steps),

@@ -14,7 +14,6 @@ from jaxtyping import Array, Float
 from ..diagnosis.wording import counted, some
 from ..errors import ModelError, nearest
 from ..linear.sparse import SparseMatrix, SparsePattern, sparse_jacobian
-from ..lowering.gather import SCALARS
 from ..lowering.plan import SystemPlan
 from ..model.pickling import functions_by_name, named_functions
 from ..model.tables import complete
@@ -313,11 +312,7 @@ class AcausalSystem(eqx.Module):
 
     def vector_field(self, t: Any, x: Float[Array, " n"], args: Any = None) -> Float[Array, " n"]:
         """d(state)/dt for `diffrax.ODETerm(system.vector_field)`; `args` is the dictionary of inputs, or None."""
-        if self.plan.n_state > SCALARS:
-            return self.at(t, args).vector_field(x)
-        # Reverse mode recomputes a small field rather than storing what it needs of every stage: a few fused kernels
-        # instead of a store for each intermediate value, a quarter of the time of a gradient.
-        return eqx.filter_checkpoint(lambda s, t, x, args: s.at(t, args).vector_field(x))(self, t, x, args)
+        return self.at(t, args).vector_field(x)
 
     def semi_explicit(self, t: Any, x: Float[Array, " n"], args: Any = None) -> Float[Array, " n"]:
         """The right-hand side of M d(state)/dt = F(t, state): slopes of the differential states, then the residuals of
