@@ -11,7 +11,7 @@ from ..errors import ModelError, nearest
 from ..model.array_names import ArrayEntry, ArrayNames
 from ..modeling.arrays import ComponentArray
 from ..modeling.component import Component
-from ..modeling.declarations import full_name
+from ..modeling.declarations import around_path
 from ..modeling.diagram import AcausalDiagram
 
 RELATION = ":relation["  # begins the path of a relation that is an event
@@ -158,9 +158,11 @@ class ModelNumbers:
         """The full names of all variables, by id."""
         names = [""] * self.n_variables
         for i in self.instances:
+            paths = [self.paths[c] for c in i.number.tolist()]
             for k, name in enumerate(i.component.variables):
-                for v, c in zip((i.variable + k).tolist(), i.number.tolist(), strict=True):
-                    names[v] = full_name(self.paths[c], name)
+                before, after = around_path(name)
+                for v, path in zip((i.variable + k).tolist(), paths, strict=True):
+                    names[v] = before + path + after
         return names
 
     def _position(self, names: tuple[str, ...]) -> dict[str, int]:

@@ -74,5 +74,11 @@ class Account:
 
 def full_name(path: str, name: str) -> str:
     """The name in the model of a variable that a component declares: `path.x`, `der(path.x)`."""
+    before, after = around_path(name)
+    return f"{before}{path}{after}"
+
+
+def around_path(name: str) -> tuple[str, str]:
+    """What stands before and after a component's path in the full name of its variable."""
     before, der, inner = name.removesuffix(START).rpartition("der(") if name.endswith(START) else ("", "", name)
-    return f"{before}{der}{path}.{inner}"
+    return before + der, f".{inner}"
