@@ -11,7 +11,7 @@ from problems import compiled, component
 from sympy import Eq
 
 from jaxonomy_dae import ModelError, SimulationError, der, simulate
-from jaxonomy_dae.solvers import DAETerm, solve_dae
+from jaxonomy_dae.solvers import BDF, DAETerm, Rodas5P, Tsit5, solve_dae
 
 TS = jnp.array([0.5, 1.0])
 
@@ -137,3 +137,60 @@ def test_samples_are_not_extrapolated_at_a_point(system):
     with pytest.raises(ModelError, match="'c.u'.*t=2 is not among them"):
         system.observe("der(c.x)", 2.0, jnp.ones(1), inputs)
     np.testing.assert_allclose(system.observe("der(c.x)", 1.0, jnp.ones(1), inputs), 2.0)
+
+
+# --- traced arguments ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def lag():
+    """x' = u − x."""
+
+    def write(self, ev):
+        x, u = self.variable("x", start=1.0, fixed=True), self.input("u", default=0.0)
+        self.add_equations(Eq(der(x), u - x))
+
+    return compiled(component(write))
+
+
+@pytest.mark.long("gradients of two runs")
+def test_lists_may_hold_what_is_traced(lag):
+    """Kind: what is traced is allowed wherever its value is. `jump_ts=[te]` under `grad`, and samples and times in
+    lists, were JAX's bare TracerArrayConversionError. x(1) = 1/e + 1 − exp(te − 1) for a step at te."""
+
+    def stepped(te):
+        inputs = {"c.u": lambda t: jnp.where(t >= te, 1.0, 0.0)}
+        return simulate(lag, 1.0, ts=[0.5, 1.0], inputs=inputs, jump_ts=[te])["c.x"][1]
+
+    def sampled(te):
+        inputs = {"c.u": ([0.0, te, 1.0], [1.0, 1.0, te])}
+        return simulate(lag, 1.0, ts=[te, 1.0], inputs=inputs)["c.x"][0]
+
+    value, slope = jax.value_and_grad(stepped)(0.3)
+    np.testing.assert_allclose([value, slope], [np.exp(-1) + 1 - np.exp(-0.7), -np.exp(-0.7)], rtol=1e-5)
+    np.testing.assert_allclose(jax.jit(stepped)(0.3), value, rtol=1e-12)
+    np.testing.assert_allclose(jax.grad(sampled)(0.3), 0.0, atol=1e-5)  # x = 1 as long as u = 1
+
+
+@pytest.mark.parametrize("name", ["max_steps", "max_events", "save_events", "throw", "progress"])
+def test_what_the_program_hangs_on_is_refused_if_traced(lag, name):
+    """Kind: as above. A traced `save_events` became part of the key under which programs are kept, and every later call
+    of the process failed at its comparison."""
+    with pytest.raises(ModelError, match=rf"{name} must be .*traced value"):
+        jax.jit(lambda v: simulate(lag, 1.0, **{name: v})["c.x"])(1 if name.startswith("max") else True)
+    with pytest.raises(ModelError, match=f"{name} must be"):
+        simulate(lag, 1.0, **{name: 0.5})
+    assert np.isfinite(simulate(lag, 1.0, ts=TS)["c.x"]).all()
+
+
+@pytest.mark.long("three solvers")
+@pytest.mark.parametrize("solver", [Tsit5(), Rodas5P(), BDF()])
+def test_saved_times_do_not_move_the_solution(system, solver):
+    """Kind: what is asked changes the answer. x = 1/(1 + t) for k = −1."""
+    decaying = system.with_parameters({"c.k": -1.0})
+    few = simulate(decaying, 1.0, ts=TS, solver=solver)
+    many = simulate(decaying, 1.0, ts=jnp.sort(jnp.append(jnp.linspace(0.01, 0.99, 40), TS)), solver=solver)
+    places = np.searchsorted(many.ts, TS)
+    np.testing.assert_allclose(many["c.x"][places], few["c.x"], rtol=1e-13)
+    assert many.stats["num_steps"] == few.stats["num_steps"]
+    np.testing.assert_allclose(few["c.x"], 1 / (1 + np.asarray(TS)), rtol=2e-5)
