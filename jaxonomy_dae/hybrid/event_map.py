@@ -312,9 +312,10 @@ def _following(
     # decides. One that seems to fall by rounding alone is waited for: if it does fall, the next step finds it.
     flat = is_flat(value, rate)
     falling = jnp.where(flat, 0.5 * (rate + rate_ahead), rate)
-    # Where an event makes what does not move equal, as what other relations are made of, a condition that is not strict
-    # has become true.
+    # Where an event makes sides equal that do not move, as sides made of other relations, a relation that is not strict
+    # has become true. Conditions of events wait until they leave zero: modes of something at rest would turn for ever.
     equal = zero & (rate == 0) & (instant.state.armed == ABOVE) & ~here & problem.true_at_zero
+    equal = equal & np.array(problem.relations[c:], bool)
     stays = (left[c:] & onto & (value == 0)) | equal
     true = jnp.where(zero, ((falling * arrival.span < -band) & ~waits) | stays, value < 0)
     was_armed = ((instant.state.armed > 0) & ~here) | (turns_back & (event >= c)) | (rose & ~here)

@@ -136,9 +136,11 @@ class StickingFriction(Component):
 class OneWayClutch(_Pressed):
     """A freewheel, and a clutch beside it: flange_b may run faster than flange_a, never slower.
 
-    While they are locked, der(w_rel) = 0 with a torque tau from a to b that is not below −peak·slipping; while
+    While they are locked, w_rel = 0 with a torque tau from a to b that is not below −peak·slipping; while
     w_rel = der(flange_b.phi − flange_a.phi) ≥ 0 is free, tau = −slipping, with slipping = mu·cgeo·fn_max·max(u, 0). The
-    input `u` is 0 if nothing drives it, and then there is no friction. The discrete variable `locked` is 1 or 0.
+    input `u` is 0 if nothing drives it, and then there is no friction. The discrete variable `locked` is 1 or 0. If
+    flange_b is slower than flange_a at the initial time, an impulse makes them equally fast at once; angular momentum
+    is conserved.
 
     `mu`, `fn_max` (newton), `cgeo` (metre) ≥ 0; `peak` ≥ 1.
     """
@@ -160,7 +162,7 @@ class OneWayClutch(_Pressed):
             Eq(a.tau + b.tau, 0),
             Eq(slipping, most * smooth(Max(u, 0))),
         )
-        self.either(Eq(locked, 1), der(w), tau + slipping)
+        self.either(Eq(locked, 1), w, tau + slipping, order=1)
         self.when(w <= 0, assign(locked, 1), on=Eq(locked, 0), at_start=True)
         self.when(tau <= -ratio * slipping, assign(locked, 0), on=Eq(locked, 1), at_start=True)
         self.declare_dissipation(-tau * w)

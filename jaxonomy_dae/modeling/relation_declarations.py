@@ -9,8 +9,11 @@ from sympy.logic.boolalg import BooleanAtom
 from ..expressions.to_sympy import shortened
 from .automatic_events import Splitting, Stepping, Timed, TimedSteps, Turning, jumps, turned, varies, with_events
 from .event_declarations import EventDeclarations
-from .events import LIVE, Assign, Sampled
+from .events import LIVE, Assign, Sampled, is_strict
 from .symbols import PreviousSymbol, RelationSymbol, VariableSymbol
+
+
+_ORDERED = (sympy.StrictLessThan, sympy.LessThan, sympy.StrictGreaterThan, sympy.GreaterThan)
 
 
 class RelationDeclarations(EventDeclarations):
@@ -51,18 +54,21 @@ class RelationDeclarations(EventDeclarations):
 
     def _without_jumps(self, condition: Any) -> Any:
         """The condition for a guard that turns where sides jump, as floor(x) does, and moves with these jumps: such a
-        side is a variable of its own, whose equation has events as others have. Among several conditions, one with such
-        a side is an event of its own, for of two sides that jump onto each other its kind of relation decides."""
+        side is a variable of its own, whose equation has events as others have.
+
+        Where two sides may jump onto each other, so that the kind of their relation decides, it is an event of its own:
+        among several conditions, and where equal sides make it true.
+        """
         if isinstance(condition, sympy.And | sympy.Or | sympy.Not):
-            return condition.func(*map(self._turning_alone, condition.args))
+            return condition.func(*(self._turning_alone(part, self._without_jumps(part)) for part in condition.args))
         if not isinstance(condition, sympy.core.relational.Relational):
             return condition
         sides = [self._as_variable(side) if jumps(side) else side for side in condition.args]
-        return condition.func(*sides, evaluate=False)
+        own = condition.func(*sides, evaluate=False)
+        return own if is_strict(condition) else self._turning_alone(condition, own)
 
-    def _turning_alone(self, condition: Any) -> Any:
-        own = self._without_jumps(condition)
-        if own == condition or not isinstance(condition, sympy.core.relational.Relational):
+    def _turning_alone(self, condition: Any, own: Any) -> Any:
+        if own == condition or not isinstance(own, _ORDERED):
             return own
         known = self._hidden_discrete(float(LIVE))
         self._turns(Turning(known.number, own, sympy.true))

@@ -372,6 +372,20 @@ def test_stick_and_slip():
     np.testing.assert_array_equal(run.values("f.mode", ts), [0, 1, 1, 0, 1, 1])
 
 
+@pytest.mark.long("a run with an impulse is compiled")
+def test_a_freewheel_that_begins_by_slipping_the_wrong_way():
+    """J·w is conserved where flange_b catches up at once: it stayed slower by 10 rad/s, "locked"."""
+    ev = EqnEnv()
+    wheel, a, b = OneWayClutch(ev, "c"), rot.Inertia(ev, "a", 1.0), rot.Inertia(ev, "b", 2.0)
+    system = compiled(a, wheel, b, connect=[(a.flange_b, wheel.flange_a), (wheel.flange_b, b.flange_a)])
+    still = {"a.phi": 0.0, "b.phi": 0.0, "b.w": 0.0}
+    solution = simulate(system, 1.0, ts=jnp.array([0.0, 1.0]), initial={"a.w": 10.0, **still})
+    np.testing.assert_allclose(solution[["a.w", "b.w", "c.w_rel"]], [[10 / 3, 10 / 3, 0.0]] * 2, atol=1e-9)
+    np.testing.assert_array_equal(solution["c.locked"], [1, 1])
+    faster = simulate(system, 1.0, ts=jnp.array([0.0, 1.0]), initial={"a.w": -10.0, **still})
+    np.testing.assert_allclose(faster[["a.w", "b.w"]], [[-10.0, 0.0]] * 2, atol=1e-9)
+
+
 @pytest.mark.slow
 @checks({OneWayClutch: ("SciPy's DOP853 from switch to switch", "a.w", "b.w", "events")}, origin=ORIGIN)
 def test_a_freewheel():
