@@ -12,7 +12,6 @@ from .event_declarations import EventDeclarations
 from .events import LIVE, Assign, Sampled, is_strict
 from .symbols import PreviousSymbol, RelationSymbol, VariableSymbol
 
-
 _ORDERED = (sympy.StrictLessThan, sympy.LessThan, sympy.StrictGreaterThan, sympy.GreaterThan)
 
 
