@@ -18,7 +18,7 @@ from ..diagnosis.wording import some
 from ..errors import ModelError
 from ..system.system import AcausalSystem
 from ..system.system_at import SystemAt
-from ..tolerances import MEANT_EQUAL
+from ..tolerances import KNOWN_ROUNDINGS, MEANT_EQUAL, spacing
 from .events_at_rest import RestingEvents, resting_events, ticked
 from .partials import Partials, on_tangent
 from .state_space import StateSpace
@@ -135,10 +135,11 @@ def instants_of(system: AcausalSystem, events: RestingEvents) -> Instants:
     with jax.ensure_compile_time_eval():
         numbers = jnp.zeros((0,)) if known is None else jnp.asarray(known)
         both = SystemAt(system.plan, numbers, (), 0.0, {}, jnp.zeros((0,))).clocks()
-    periods, offsets = (np.asarray(v)[clocks] for v in both)
+    periods, offsets = (np.asarray(v, float)[clocks] for v in both)
+    equal = _equal(system.parameters.array.dtype)
     shortest = periods.min()
     ratios = [Fraction(p / shortest).limit_denominator(RATIO) for p in periods.tolist()]
-    apart = np.abs(np.array([float(r) for r in ratios]) * shortest - periods) > MEANT_EQUAL * periods
+    apart = np.abs(np.array([float(r) for r in ratios]) * shortest - periods) > equal * periods
     grid = np.lcm.reduce([r.denominator for r in ratios])
     parts = [int(r * int(grid)) for r in ratios]
     common = int(np.lcm.reduce(parts))
@@ -150,7 +151,7 @@ def instants_of(system: AcausalSystem, events: RestingEvents) -> Instants:
             "one period: choose periods that are in the ratio of small integers"
         )
     # From the first offset on: others begin their period with the first tick after it.
-    first = [-int(np.floor((o - offsets.min()) / p + MEANT_EQUAL)) for o, p in zip(offsets, periods, strict=True)]
+    first = [-int(np.floor((o - offsets.min()) / p + equal)) for o, p in zip(offsets, periods, strict=True)]
     at = sorted(
         (float(o + number * p), e, number)
         for e, o, p, begin in zip(clocks, offsets.tolist(), periods.tolist(), first, strict=True)
@@ -158,7 +159,7 @@ def instants_of(system: AcausalSystem, events: RestingEvents) -> Instants:
     )
     groups: list[list[tuple[float, int, int]]] = []
     for time, e, number in at:
-        if groups and time - groups[-1][0][0] <= MEANT_EQUAL * shortest:
+        if groups and time - groups[-1][0][0] <= equal * shortest:
             groups[-1].append((time, e, number))
         else:
             groups.append([(time, e, number)])
@@ -180,7 +181,12 @@ def _times(system: AcausalSystem, instants: Instants) -> tuple[Any, Any]:
     ]
     lengths = jnp.stack([count * periods[e] for e, count in instants.counts.items()])
     times = jnp.stack([row[0] for row in rows] + [rows[0][0] + lengths[0]])
-    allowed = MEANT_EQUAL * jnp.min(lengths)
+    allowed = _equal(times.dtype) * jnp.min(lengths)
     together = [jnp.max(jnp.abs(jnp.stack(row) - row[0])) <= allowed for row in rows]
     fine = jnp.all(jnp.stack(together)) & jnp.all(jnp.diff(times) > 0)
     return times, fine & (jnp.max(lengths) - jnp.min(lengths) <= allowed)
+
+
+def _equal(dtype: Any) -> float:
+    """Relative: times that are one."""
+    return max(MEANT_EQUAL, KNOWN_ROUNDINGS * spacing(dtype))

@@ -29,7 +29,7 @@ SINGLE = """
 import jax, jax.numpy as jnp, numpy as np
 from problems import angle_solution, compiled, drag_on, pendulum
 from sympy import Eq
-from jaxonomy_dae import Component, EqnEnv, ModelError, der, simulate
+from jaxonomy_dae import Component, EqnEnv, ModelError, assign, der, linearize, simulate
 
 system = pendulum(drag_on("vx"))
 assert system.parameters.array.dtype == jnp.float32
@@ -72,6 +72,17 @@ fit = Problem(system, Experiment(ts, {"pend.x": expected.x + noise}, sigma=1e-2)
 )
 row = fit.table(level=0.999)["pend.L"]
 assert fit.ok and row.low < 1.0 < row.high and row.high - row.low < 0.2, fit.table()
+
+class Sampled(Component):
+    def __init__(self, ev):
+        super().__init__(ev, "c")
+        x, u = self.variable("x", start=0.0, fixed=True), self.discrete("u")
+        self.when(self.sampled(0.1), assign(u, 3 * (1 - x)))
+        self.add_equations(Eq(der(x), u - x))
+
+space = linearize(compiled(Sampled(EqnEnv())), [], ["c.x"], sampled=True)
+np.testing.assert_allclose(space.A, [[4 * np.exp(-0.1) - 3, 0], [-3, 0]], rtol=1e-5)
+np.testing.assert_allclose([*space.x0, space.dt], [0.75, 0.75, 0.1], rtol=1e-5)
 print("done")
 """
 
