@@ -95,7 +95,7 @@ def _rests(d: Draft):
 def _offset(d: Draft):
     """A small motion on a large value."""
     size = 10.0 ** float(d.rng.integers(3, 7))
-    x, y = d.state("x", size, size), d.variable("y")
+    x, y = d.state("x", size, size), d.variable("y", size)  # known as well as x
     d.equations += [rate(x) + (x - size) - sin(d.uniform(1, 3) * T), y - (x - size)]
 
 
