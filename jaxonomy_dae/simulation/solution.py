@@ -138,15 +138,20 @@ class Solution(eqx.Module):
             return column
         given = (self.system, self.ts, self.states, self.inputs, self.discrete)
         if is_staged(given):
-            return _observed(*given, quantity, factor)[:, 0]
+            return self._where_reached(_observed(*given, quantity, factor))[:, 0]
         values, some = _chosen(*given, jnp.asarray(quantity), jnp.asarray(factor, self.states.dtype))
         self._look_at((name,), quantity, factor, values, some)
-        return values[:, 0]
+        return self._where_reached(values)[:, 0]
+
+    def _where_reached(self, values: Any) -> Any:
+        """The values, shape (n, k), with not-a-number in rows that the run did not reach. Constants and functions of
+        time could be evaluated there, too."""
+        return jnp.where(jnp.isfinite(self.states).all(axis=-1, keepdims=True), values, jnp.nan)
 
     def _state(self, quantity: int, factor: float) -> Any:
         """The values of quantities that are zero or part of the state array; None for others."""
         if quantity < 0:
-            return jnp.zeros(self.ts.shape, self.states.dtype)
+            return self._where_reached(jnp.zeros((*self.ts.shape, 1), self.states.dtype))[:, 0]
         plan = self.system.plan
         place = np.flatnonzero(np.concatenate([plan.states, plan.carried]) == quantity)
         if not len(place):
@@ -192,6 +197,7 @@ class Solution(eqx.Module):
             chosen, some = _chosen(*given, jnp.asarray(padded[0]), jnp.asarray(padded[1], self.states.dtype))
             values = jnp.where(quantity < 0, 0.0, chosen[:, : len(quantity)])
             self._look_at([n for n in names if n not in own], quantity, factor, values, some)
+        values = self._where_reached(values)
         if not own:
             return values
         place = {name: k for k, name in enumerate(own)}

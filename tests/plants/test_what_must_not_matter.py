@@ -1,11 +1,12 @@
 """Things that must not matter, and once did: found by `make attack FAMILY=invariance`."""
 
 import diffrax
+import jax
 import numpy as np
 import pytest
 import sympy
 
-from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, Eq, EqnEnv, simulate
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, Eq, EqnEnv, der, simulate
 from jaxonomy_dae.solvers import BDF, Rodas5P
 
 
@@ -27,3 +28,26 @@ def test_the_solver_of_a_model_without_states(solver):
     system = model(lambda c: c.add_equations(Eq(c.variable("y"), sympy.sin(c.ev.t))))
     solution = simulate(system, 1.0, ts=np.array([0.5, 1.0]), solver=solver())
     np.testing.assert_allclose(solution["c.y"], np.sin([0.5, 1.0]), rtol=1e-12)
+
+
+@pytest.mark.long("the names together, one by one, and in a batch are programs of their own")
+def test_rows_that_were_not_reached():
+    """Whether a variable depends on the state: constants, functions of time and zeros had values in rows that a run did
+    not reach, where all else is not-a-number."""
+
+    def build(c):
+        k, x = c.parameter("k", 1.0, bounds=(0.0, 10.0)), c.variable("x", start=1.0, fixed=True)
+        constant, zero, wave = c.variable("constant"), c.variable("zero"), c.variable("wave")
+        c.add_equations(Eq(der(x), -k * x), Eq(constant, 0.3), Eq(zero, 0), Eq(wave, sympy.cos(c.ev.t)))
+
+    system, names = model(build), ["c.constant", "c.zero", "c.wave", "c.x"]
+
+    def run(k):
+        solution = simulate(system.with_parameters({"c.k": k}), 1.0, ts=np.array([0.0, 1.0]))
+        return solution[names], [solution[name] for name in names]
+
+    within, beyond = jax.vmap(jax.jit(run))(np.array([1.0, 20.0]))[0]
+    np.testing.assert_allclose(within[1], [0.3, 0.0, np.cos(1.0), np.exp(-1.0)], rtol=1e-5)
+    assert np.isnan(beyond).all()
+    together, apart = jax.jit(run)(20.0)
+    assert np.isnan(together).all() and np.isnan(apart).all()
