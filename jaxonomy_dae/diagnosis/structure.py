@@ -180,10 +180,36 @@ def _too_few(flat: FlatModel, n_equations: int, variables: np.ndarray, concerned
     if len(near):
         close = listed(flat.ports.names[p] for p in near)
         return f"{text}: {'is' if len(near) == 1 else 'are'} {close} meant to be connected?"
+    short = _short_of_equations(flat, concerned)
+    if short:
+        return f"{short} Probably missing is one for {listed(names, joint='or')}."
     if len(names) == 1:
         return f"{text}: add an equation for it, declare it as an input, or leave it out."
     what = "an equation" if missing == 1 else f"{missing} equations"
     return f"{text}: add {what}, or declare {'one' if missing == 1 else missing} of them as an input."
+
+
+def _short_of_equations(flat: FlatModel, concerned: np.ndarray) -> str:
+    """Names a component that wrote fewer equations than it has variables and through quantities at its ports, which are
+    what a component without children owes; "" if there is none among those concerned."""
+    v = flat.variables
+    owns = np.bincount(v.owner[~v.is_input & ~(v.is_port & v.is_across)], minlength=len(flat.components))
+    owners = np.unique(v.owner[concerned & v.is_port]).tolist()
+    written = {flat.components[k]: 0 for k in owners}
+    within: set[str] = set()  # with children or networks, whose equations count for it
+    for group in flat.groups:
+        for provenance in group.provenance:
+            if provenance.component in written:
+                written[provenance.component] += 1
+            within.update(name for name in written if provenance.component.startswith(f"{name}."))
+    for k in owners:
+        name = flat.components[k]
+        if name not in within and written[name] < owns[k]:
+            return (
+                f"component '{name}' has {counted(written[name], 'equation')}, but needs {owns[k]}: one for each of "
+                "its variables and one for each of its ports."
+            )
+    return ""
 
 
 def _only_through(flat: FlatModel, concerned: np.ndarray) -> bool:

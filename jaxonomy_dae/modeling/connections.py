@@ -40,6 +40,11 @@ def resolve_ends(ends: Sequence[Any], where: str) -> tuple[Connection | None, li
                 raise ModelError(f"component '{end.path}' has no {what} '{name}': " + nearest(name, known))
             end = end[name] if name not in inner.ports else getattr(end, name)
         if type(end) is not Port and not _is_port(end) and not _is_signal(end):
+            owner: Any = getattr(end, "__self__", None)  # a method, as `r.port`, where a port was meant
+            if isinstance(type(owner), Construction):
+                raise ModelError(
+                    f"{where}: '{owner.path}.{end.__name__}' is a method, not a port: " + nearest("", owner.ports)
+                )
             raise ModelError(
                 f"{where}: connect takes ports, symbols of variables, or a component and a name; got {end!r}"
             )

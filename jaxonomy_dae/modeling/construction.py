@@ -1,11 +1,13 @@
 """What happens around a component's `__init__`: symbols among its arguments are marked as its parent's, it is closed
 when construction ends, and common slips are explained."""
 
+import inspect
+import re
 from typing import Any
 
 from sympy import SympifyError
 
-from ..errors import ModelError
+from ..errors import ModelError, nearest
 from .symbols import SHADOWED, seen_from_child
 
 
@@ -19,11 +21,13 @@ class Construction(type):
             if "_sealed" in component.__dict__:
                 component._with_events()
         except (TypeError, SympifyError) as error:
-            hint = _hint(error, cls.__name__)
+            hint = _wrong_keyword(error, cls) or _hint(error, cls.__name__)
             if hint is None:
                 raise
             first = str(error).split("\n")[0]
-            detail = "" if " at 0x" in first else f" ({first})"  # objects without a name say nothing
+            detail = (
+                "" if " at 0x" in first or "unexpected keyword" in first else f" ({first})"
+            )  # objects without a name say nothing
             raise ModelError(f"{cls.__name__}: {hint}{detail}") from error
         if "_sealed" not in component.__dict__:
             raise ModelError(f"{cls.__name__}: {_HOW_TO_BEGIN}")
@@ -32,6 +36,15 @@ class Construction(type):
 
 
 _HOW_TO_BEGIN = "its __init__ must begin with super().__init__(ev, name)"
+
+
+def _wrong_keyword(raised: Exception, cls: type) -> str | None:
+    """Names the arguments that a component has if it was given another one; None for other errors."""
+    found = re.search(rf"^{cls.__name__}\.__init__\(\) got an unexpected keyword argument '(\w+)'", str(raised))
+    if found is None:
+        return None
+    known = [name for name in inspect.signature(cls.__init__).parameters if name not in ("self", "ev", "name")]
+    return f"there is no argument '{found[1]}': {nearest(found[1], known)}"
 
 
 def _hint(raised: Exception, name: str) -> str | None:

@@ -170,3 +170,12 @@ def test_each_object_of_the_api_has_a_page():
 def test_rows_of_errors_become_headings():
     headings = pytest.importorskip("error_headings")
     assert headings.ROW.sub(r"\1: \3", "| `no start` | None was given. | Give one. |") == "no start: Give one."
+
+
+@pytest.mark.parametrize("page", ["../README.md", "start/install.md", "start/first-model.md", "start/first-fit.md"])
+def test_first_pages_have_short_sentences(page):
+    text = re.sub(r"^```.*?^```$|\\\[.*?\\\]", "", (DOCS / page).read_text(), flags=re.M | re.S)
+    for paragraph in re.split(r"\n\s*\n|\n(?=[-|] |\d+\. )", text):
+        words = re.sub(r"`[^`]*`", "code", " ".join(paragraph.split()))
+        for sentence in re.split(r"(?<=[.!?:;])\s+", "" if words.startswith(("|", "#", "!")) else words):
+            assert len(sentence.split()) <= 30, sentence

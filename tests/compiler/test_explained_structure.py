@@ -11,7 +11,7 @@ import pytest
 from problems import EV, FreeMass, compiled, component
 from sympy import Eq, exp, sin
 
-from jaxonomy_dae import AcausalDiagram, Component, EqnEnv, ModelError, StructuralError, der
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, ModelError, StructuralError, der
 from jaxonomy_dae.library.electrical import (
     Capacitor,
     CurrentSource,
@@ -469,8 +469,7 @@ def test_slips_of_the_pen():
     assert list(diagram.components) == ["r", "m", "g"]
     assert message_of(lambda: diagram.connect(r.p, r.p)) == "diagram: 'r.p' is connected to itself: name each port once"
     assert message_of(lambda: diagram.connect(r.p, m.flange)) == (
-        "diagram: cannot connect m.flange: Translational port to r.p: Electrical port: a connection joins ports of one "
-        "domain"
+        "diagram: cannot connect 'm.flange' (Translational) to 'r.p' (Electrical): ports must have the same domain"
     )
     assert message_of(lambda: diagram.connect(r.p)) == "diagram: connect needs at least two ports; got 'r.p' only"
     assert (
@@ -496,3 +495,31 @@ def test_a_pin_that_is_a_multiple_has_a_level(factor):
     source, meter, ground = Source(ev, "a"), VoltageSensor(ev, "v"), Ground(ev, "g")
     system = compiled(source, meter, ground, connect=[(source.p, meter.p), (meter.n, ground.p)])
     assert system.states == ["a.u"]
+
+
+class Forgetful(Component):
+    """A resistor without p.i + n.i = 0."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        p, n = self.port("p", Electrical), self.port("n", Electrical)
+        v = self.variable("v")
+        self.add_equations(Eq(v, p.v - n.v), Eq(v, 3 * p.i))
+
+
+def test_a_forgotten_equation_of_a_port_is_laid_to_its_component():
+    """The message blamed two currents, one of the ground, and advised to declare one of them as an input."""
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    c, g, s = Forgetful(ev, "c"), Ground(ev, "g"), VoltageSource(ev, "s")
+    diagram.connect(s.p, c.p).connect(s.n, c.n, g.p)
+    with pytest.raises(ModelError, match=r"component 'c' has 2 equations, but needs 3: .*'c\.n\.i'"):
+        AcausalCompiler(ev, diagram)()
+
+
+def test_slips_of_names_list_what_there_is():
+    """A wrong keyword was Python's TypeError; `connect(c.port, …)` printed a bound method."""
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    with pytest.raises(ModelError, match=r"no argument 'initial_volt': did you mean 'initial_voltage'"):
+        Capacitor(ev, "k", initial_volt=1.0)
+    with pytest.raises(ModelError, match=r"'g\.port' is a method, not a port: known names: 'p'"):
+        diagram.connect(Ground(ev, "g").port, VoltageSource(ev, "s").n)
