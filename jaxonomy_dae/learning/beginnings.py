@@ -9,6 +9,8 @@ Over a short time, a run depends on its numbers almost linearly. Where a run ove
 horizons grow.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -34,7 +36,7 @@ def silent(objective: Objective, point: Float[np.ndarray, " f"]) -> Float[np.nda
     return out[objective.free]
 
 
-def _last_layer(network: eqx.Module) -> np.ndarray | None:
+def _last_layer(network: Any) -> np.ndarray | None:
     """True for those of its trained numbers that are the last linear layer's; None if it has none."""
 
     def is_linear(node: object) -> bool:
