@@ -109,7 +109,7 @@ def ensemble(
     estimates, reason = [], None
     for system in _starts(problem, modules, members, seed, networks):
         try:
-            estimates.append(problem.fit(start=system, **given))
+            estimates.append(problem.beginning_at(system).fit(**given))
         except SimulationError as error:
             reason = reason or error
     if not estimates:

@@ -355,6 +355,12 @@ class Problem:
         """An ordinary simulation of one experiment at a point."""
         return run(objective, z, experiment, ts)
 
+    def beginning_at(self, system: AcausalSystem) -> "Problem":
+        """A copy with other weights of its networks to begin with."""
+        other = copy.copy(self)
+        other.system = system
+        return other
+
     def with_law(self, name: str, law: Any, stacked: Stacked) -> "Problem":
         """A copy with another law in a network's place, without a prior."""
         other = copy.copy(self)
