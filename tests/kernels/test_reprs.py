@@ -157,7 +157,7 @@ def test_a_report_lists_events():
     assert mode.startswith("c: 0 = Piecewise(") and "Eq(mode, 1)" in mode
     assert "too large" in report._repr_html_() and "<summary>1 clock</summary>" in report._repr_html_()
 
-    # Starts and periods are those of the system at hand; of a batch, those that were declared.
+    # Starts and periods are those of the system at hand; of a batch, and of a part, none is known, and none is said.
     changed = system.with_parameters({"c.T": 0.25, "c.first": 6.0, "c.mode": 0.0})
     assert section(changed.report, "2 discrete variables") == ["c.n = 1.5, c.mode = 0"]
     assert "every 0.25 s" in str(changed.report)
@@ -165,7 +165,8 @@ def test_a_report_lists_events():
     assert "every 0.25 s" in str(eqx.combine(trainable, frozen).report)
     batch = eqx.filter_vmap(lambda T: system.with_parameters({"c.T": T}))(jnp.array([0.2, 0.3]))
     for part in (batch, trainable, frozen, jax.tree.map(lambda _: False, system)):
-        assert "every 0.1 s" in str(part.report)
+        assert section(part.report, "1 clock") == ["c: when(sampled(T)): assign(c.n, …)"]
+        assert section(part.report, "2 discrete variables") == ["c.n, c.mode"]
     printed = []
     jax.jit(lambda s: printed.append((str(changed.report), str(s.report))))(changed)
     assert "every 0.25 s" in printed[0][0] and "every 0.1 s" in printed[0][1]
