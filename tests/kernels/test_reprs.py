@@ -169,7 +169,7 @@ def test_a_report_lists_events():
         assert section(part.report, "2 discrete variables") == ["c.n, c.mode"]
     printed = []
     jax.jit(lambda s: printed.append((str(changed.report), str(s.report))))(changed)
-    assert "every 0.25 s" in printed[0][0] and "every 0.1 s" in printed[0][1]
+    assert "every 0.25 s" in printed[0][0] and "every" not in printed[0][1]  # inside jit values are not known
 
 
 def test_jumps_of_sources_are_relations_of_a_report():
