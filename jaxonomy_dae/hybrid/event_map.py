@@ -155,6 +155,8 @@ def handle(
             # Where another event has made the guard slow, rounding is all that is left of its value.
             frozen = lax.stop_gradient(crossing)
             crossing = crossing + (jnp.clip(frozen, -arrival.window, arrival.window) - frozen)
+            # What rested falls where it leaves the band, perhaps so slowly that its slope is another one at zero.
+            crossing = crossing - jnp.where(state.armed[k] == RESTS, lax.stop_gradient(crossing), 0.0)
             crossing = jnp.where(instant.caused[k], instant.delay, crossing)
             delay = jnp.where(is_clock, delay, crossing)
         if c and not at_start:
