@@ -1,0 +1,273 @@
+"""The examples of the Modelica Standard Library, read, compiled, run, compared and differentiated.
+
+    python -m benchmarks.modelica_library --texts FOLDER --references FOLDER [--only TEXT] [--out FILE] [--resume]
+
+`--texts` holds Base Modelica files `Modelica.*.bmo` (OpenModelica/BaseModelicaLibraryTesting.jl on GitHub, branch
+gh-pages, folders `results/main/Modelica/4.1.0/files/*`), in one folder or below it. `--references` is a checkout of
+modelica/MAP-LIB_ReferenceResults, branch v4.1.0. Neither is part of this project.
+
+Each file runs in a process of its own, with limits of time and memory. A run agrees if each reference signal (those of
+`comparisonSignals.txt`, or all) is within 0.2 % of its range, where values may also be those within 0.2 % of the run's
+time before or after. A gradient is that of the sum of squares of the signals at the end, by two parameters, in reverse
+mode beside central differences. Lines of JSON go to `--out`, and a table by sub-library to the standard output.
+"""
+
+import argparse
+import collections
+import json
+import os
+import re
+import resource
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+
+SECONDS, MEMORY = 120, 4 << 30  # of one file's process: time of the processor, bytes of memory beside XLA's code
+AGREES = 0.002  # of a signal's range, and of the run's time
+LOOKED_INTO = 0.02
+POINTS = 1000  # the most saved times
+STEP, CLOSE = 1e-5, 1e-3  # of a parameter, for differences; relative error of a gradient that counts as right
+
+
+def main() -> int:
+    asked = _arguments()
+    files = sorted(Path(asked.texts).rglob("Modelica.*.bmo"), key=lambda f: f.name)
+    files = [f for f in files if asked.only in f.name]
+    done = {r["model"]: r for r in _read(asked.out)} if asked.resume else {}
+    for k, file in enumerate(files):
+        if file.stem in done:
+            continue
+        row = _in_a_process(file, asked)
+        done[file.stem] = row
+        with open(asked.out, "a", encoding="utf-8") as out:
+            out.write(json.dumps(row) + "\n")
+        print(f"{k + 1}/{len(files)} {file.stem}: {_short(row)}", file=sys.stderr, flush=True)
+    print(_page(list(done.values())))
+    return 0
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.modelica_library")
+    parser.add_argument("--texts", required=True)
+    parser.add_argument("--references", required=True)
+    parser.add_argument("--only", default="", help="files whose name contains this")
+    parser.add_argument("--out", default="modelica_library.jsonl")
+    parser.add_argument("--resume", action="store_true", help="leave out what is in --out already")
+    parser.add_argument("--no-gradients", action="store_true")
+    parser.add_argument("--seconds", type=int, default=SECONDS, help="of processor time, for each file")
+    parser.add_argument("--one", help=argparse.SUPPRESS)  # a process for one file
+    asked = parser.parse_args()
+    if asked.one:
+        print(json.dumps(_one(Path(asked.one), Path(asked.references), not asked.no_gradients)))
+        sys.exit(0)
+    return asked
+
+
+def _in_a_process(file: Path, asked: argparse.Namespace) -> dict:
+    def limits() -> None:
+        resource.setrlimit(resource.RLIMIT_CPU, (asked.seconds, asked.seconds + 5))
+        resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
+
+    command = [sys.executable, "-m", "benchmarks.modelica_library", *sys.argv[1:], "--one", str(file)]
+    start = time.monotonic()
+    found = subprocess.run(command, capture_output=True, text=True, preexec_fn=limits)
+    lines = found.stdout.strip().splitlines()
+    if found.returncode == 0 and lines:
+        return json.loads(lines[-1])
+    why = "late" if found.returncode in (-9, -24) else f"the process ended with {found.returncode}"
+    return {"model": file.stem, "error": why, "seconds": round(time.monotonic() - start, 1)}
+
+
+def _one(file: Path, references: Path, gradients: bool) -> dict:
+    """The row of one file, in this process."""
+    sys.setrecursionlimit(20_000)
+    warnings.simplefilter("ignore")
+    row: dict = {"model": file.stem, "reached": "nothing"}
+    start = time.process_time()
+    try:
+        for stage in _stages(file, references, gradients, row):
+            row["reached"] = stage
+            row[f"until_{stage}"] = round(time.process_time() - start, 2)
+    except MemoryError:
+        row["error"] = "memory"
+    except Exception as error:
+        row["error"] = f"{type(error).__name__}: {error}"[:600]
+    row["seconds"] = round(time.process_time() - start, 2)
+    return row
+
+
+def _stages(file: Path, references: Path, gradients: bool, row: dict):
+    """Reads, translates, compiles, runs, compares and differentiates; yields the name of each stage after it."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, simulate
+    from jaxonomy_dae.modelica import FlatComponent, load
+
+    jax.config.update("jax_enable_x64", True)
+    flat = load(file)
+    yield "read"
+    names, data = _reference(file.stem, references)
+    changing = {d.name for d in flat.model.declarations if not d.prefixes & {"parameter", "constant"}}
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    component = FlatComponent(ev, "m", flat, outputs=[n for n in names if n in changing])
+    diagram.add(component)
+    yield "translated"
+    system = AcausalCompiler(ev, diagram, prefer_states=[f"m.{v}" for v in flat.preferred_states])()
+    row["equations"], row["states"] = system.plan.flat.n_equations, len(system.states)
+    yield "compiled"
+    said = flat.experiment
+    begin, end = said.get("StartTime", 0.0), said.get("StopTime", 1.0)
+    ts = np.unique(data[:, 0]) if len(data) else np.linspace(begin, end, 201)
+    ts = ts[(ts >= begin) & (ts <= end)]
+    ts = jnp.asarray(ts[:: -(-len(ts) // POINTS)])
+    rtol = min(said.get("Tolerance", 1e-6), 1e-6)
+    solution = simulate(system, end, t0=begin, ts=ts, rtol=rtol)
+    row["steps"] = int(solution.stats["num_steps"])
+    yield "run"
+    if not len(data):
+        row["error"] = "no reference"
+        return
+    errors = sorted(
+        ((_deviation(np.asarray(ts), _signal(solution, system, name), data[:, 0], data[:, k]), name)
+         for k, name in enumerate(names) if name != "time"),
+        reverse=True,
+    )  # fmt: skip
+    row["worst"] = errors[:3]
+    if errors[0][0] > AGREES:
+        row["error"] = f"deviates: {errors[0][1]} by {errors[0][0]:.3g} of its range"
+        return
+    yield "agrees"
+    if gradients:
+        signals = [f"m.{n}" for n in names if f"m.{n}" in system.variables]
+        fixed = [f"m.{n}" for n, v in component.variables.items() if v.fixed and not n.startswith((":", "der("))]
+        row["gradient"] = _gradient(system, signals, fixed, begin, end, rtol)
+        if row["gradient"] is None:
+            row["error"] = "no parameter and no start to differentiate by"
+        elif row["gradient"] <= CLOSE:
+            yield "gradient"
+        else:
+            row["error"] = f"the gradient is off by {row['gradient']:.3g}"
+
+
+def _reference(stem: str, references: Path):
+    """(names of the signals, trajectories with the time in the first column)."""
+    import numpy as np
+
+    folder = references.joinpath(*stem.split("."))
+    file = folder / f"{folder.name}.csv"
+    if not file.exists():
+        return [], np.zeros((0, 1))
+    with file.open(encoding="utf-8") as text:
+        names = [n.strip().strip('"') for n in re.split(r",(?=(?:[^\"]*\"[^\"]*\")*[^\"]*$)", text.readline().strip())]
+    data = np.loadtxt(file, delimiter=",", skiprows=1, ndmin=2)
+    listed = folder / "comparisonSignals.txt"
+    wanted = {s.strip() for s in listed.read_text(encoding="utf-8").splitlines()} if listed.exists() else set(names)
+    places = [0] + [k for k, n in enumerate(names) if n in wanted and n != "time"]
+    return [names[k] for k in places], data[:, places]
+
+
+def _signal(solution, system, name: str):
+    """The trajectory of a signal; a parameter is constant."""
+    import numpy as np
+
+    full = f"m.{name}"
+    if full in system.parameters.names and full not in solution:
+        return np.full(len(solution.ts), float(system.parameters[full]))
+    return np.asarray(solution[full], float)
+
+
+def _deviation(ts, ours, times, theirs) -> float:
+    """The largest deviation from the tube about a reference, relative to the reference's range."""
+    import numpy as np
+
+    if not np.isfinite(ours).all():
+        return float("inf")
+    size = max(float(np.ptp(theirs)), 1e-3 * float(np.abs(theirs).max()), 1e-12)
+    away = np.abs(ours - np.interp(ts, times, theirs))
+    span = AGREES * (times[-1] - times[0])
+    for i in np.flatnonzero(away > AGREES * size):
+        near = theirs[(times >= ts[i] - span) & (times <= ts[i] + span)]
+        away[i] = max(float(near.min()) - ours[i], ours[i] - float(near.max()), 0.0)
+    return float(away.max()) / size
+
+
+def _gradient(system, names: list[str], fixed: list[str], begin: float, end: float, rtol: float) -> float | None:
+    """The relative error of the derivatives of the sum of squares of the signals at the end, by up to two parameters or
+    fixed starts: reverse mode against central differences. None if there is none of these."""
+    import jax
+    import jax.numpy as jnp
+
+    from jaxonomy_dae import simulate
+
+    values = system.parameters
+    by = [n for n in values.names if float(values[n]) and not n.startswith("m.:")][:2]
+    starts = fixed[: 2 - len(by)]
+    if not (by or starts) or not names:
+        return None
+    tight = min(rtol, 1e-9)
+    point = simulate(system, end, t0=begin, ts=jnp.array([begin]))
+
+    @jax.jit
+    def loss(p):
+        changed = system.with_parameters(dict(zip(by, p[: len(by)], strict=True)))
+        initial = dict(zip(starts, p[len(by) :], strict=True)) or None
+        last = simulate(
+            changed, end, t0=begin, ts=jnp.array([end]), rtol=tight, atol=tight * 1e-2, initial=initial
+        )  # fmt: skip
+        return sum(jnp.sum(last[n] ** 2) for n in names)
+
+    at = jnp.array([*(float(values[n]) for n in by), *(float(point[n][0]) for n in starts)])
+    found = jax.jit(jax.grad(loss))(at)
+    worst = 0.0
+    for k in range(len(at)):
+        h = STEP * (abs(float(at[k])) or 1.0)
+        slope = (loss(at.at[k].add(h)) - loss(at.at[k].add(-h))) / (2 * h)
+        scale = max(abs(float(slope)), 1e-3 * abs(float(loss(at))) / (abs(float(at[k])) or 1.0))
+        worst = max(worst, abs(float(found[k] - slope)) / max(scale, 1e-300))
+    return worst
+
+
+def _read(file: str) -> list[dict]:
+    if not os.path.exists(file):
+        return []
+    with open(file, encoding="utf-8") as lines:
+        return [json.loads(line) for line in lines]
+
+
+def _short(row: dict) -> str:
+    return f"{row.get('reached', 'nothing')} in {row['seconds']} s. {row.get('error', '')[:150]}"
+
+
+STAGES = ("read", "translated", "compiled", "run", "agrees", "gradient")
+
+
+def _page(rows: list[dict]) -> str:
+    """A table by sub-library, the reasons of failures, and runs that deviate by more than 2 %."""
+    of: dict[str, list[dict]] = collections.defaultdict(list)
+    for row in rows:
+        of[".".join(row["model"].split(".")[1:3])].append(row)
+    lines = ["| sub-library | files | " + " | ".join(STAGES) + " |", "|---" * (len(STAGES) + 2) + "|"]
+    for name, group in [*sorted(of.items()), ("**all**", rows)]:
+        counts = [sum(STAGES.index(r["reached"]) >= k for r in group if r.get("reached") in STAGES) for k in range(6)]
+        lines.append(f"| {name} | {len(group)} | " + " | ".join(map(str, counts)) + " |")
+    reasons = collections.Counter(_reason(r["error"]) for r in rows if "error" in r)
+    lines += ["", "| reason | files |", "|---|---|", *(f"| {why} | {n} |" for why, n in reasons.most_common(30))]
+    far = [(r["worst"][0], r["model"]) for r in rows if r.get("worst") and r["worst"][0][0] > LOOKED_INTO]
+    lines += ["", "Deviations of more than 2 % of a signal's range:", *(f"- {m}: {n} {e:.3g}" for (e, n), m in far)]
+    return "\n".join(lines)
+
+
+def _reason(error: str) -> str:
+    """An error without its names, numbers and lines."""
+    first = re.sub(r"^(\w+: )\w+, line \d+: ", r"\1", error.split("\n")[0])
+    return re.sub(r"\d[\d.e+-]*", "N", re.sub(r"'[^']*'", "'…'", re.sub(r"^(\w+: )\w+, line \d+: ", r"\1", first)))[
+        :100
+    ]
+
+
+if __name__ == "__main__":
+    sys.exit(main())
