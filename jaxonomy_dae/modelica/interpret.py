@@ -12,7 +12,8 @@ import sympy
 
 from ..errors import ModelError, nearest
 from ..modeling.symbols import der
-from .builtin import FUNCTIONS, filled, matrix_product, power, quotient
+from .builtin import FUNCTIONS, filled, matrix_product
+from .operations import ARITHMETIC, RELATIONS, of_complex_numbers
 from .tree import (
     Array,
     Assignment,
@@ -43,28 +44,17 @@ from .tree import (
 from .values import (
     Record,
     Value,
-    as_number,
     both,
     chosen,
     either,
     entrywise,
     is_condition,
     negated,
-    parts_of_choice,
-    plain,
 )
 
 Names = Callable[[str], Value]  # the value of a name; raises KeyError for an unknown one
 MOST_ROUNDS = 100_000  # of a loop that is carried out while the model is read
 DEEPEST = 200  # calls within calls; Python's own limit lies at a thousand frames
-
-
-class _Return(Exception):
-    pass
-
-
-class _Break(Exception):
-    pass
 
 
 class Interpreter:
@@ -183,30 +173,15 @@ class Interpreter:
                 return a
             return entrywise(both if sign == "and" else either, a, self.evaluate(e.right, names))
         a, b = self.evaluate(e.left, names), self.evaluate(e.right, names)
-        if sign in _RELATIONS:
-            return _RELATIONS[sign](a, b)
+        if sign in RELATIONS:
+            return RELATIONS[sign](a, b)
         if sign == "*" and isinstance(a, list) and isinstance(b, list):
             return matrix_product(a, b)
         if sign == "+" and isinstance(a, str):
             return a + str(b)
         if isinstance(a, Record) or isinstance(b, Record):
-            return self._overloaded(sign, a, b)
-        return entrywise(_ARITHMETIC[sign.removeprefix(".")], a, b)
-
-    def _overloaded(self, sign: str, a: Value, b: Value) -> Value:
-        """An operation of complex numbers, the only operator record of flat models."""
-        x, y = (v if isinstance(v, Record) else Record(re=v, im=0.0) for v in (a, b))
-        if sign in "+-":
-            return Record({k: _ARITHMETIC[sign](x[k], y[k]) for k in x})
-        if sign == "*":
-            return Record(re=x["re"] * y["re"] - x["im"] * y["im"], im=x["re"] * y["im"] + x["im"] * y["re"])
-        if sign == "/":
-            size = y["re"] ** 2 + y["im"] ** 2
-            return Record(
-                re=quotient(x["re"] * y["re"] + x["im"] * y["im"], size),
-                im=quotient(x["im"] * y["re"] - x["re"] * y["im"], size),
-            )
-        raise ModelError(f"'{sign}' of records")
+            return of_complex_numbers(sign, a, b)
+        return entrywise(ARITHMETIC[sign.removeprefix(".")], a, b)
 
     def _choice(self, e: Choice, names: Names) -> Value:
         pairs = []
@@ -333,11 +308,8 @@ class Interpreter:
                     local[d.name] = self.evaluate(d.value, names)
                 else:
                     local[d.name] = self._unset(d, names)
-            try:
-                for statements in function.algorithms:
-                    self.execute(statements, local, names)
-            except _Return:
-                pass
+            for statements in function.algorithms:
+                self.execute(statements, local, names)
         except ModelError as error:
             raise ModelError(f"{function.name}: {error}") from None
         finally:
@@ -364,18 +336,39 @@ class Interpreter:
     # --- statements --------------------------------------------------------------------------------------------------
 
     def execute(self, statements: tuple[Statement, ...], local: dict[str, Value], names: Names) -> None:
-        """Carries out an algorithm; assigns to `local`."""
+        """Carries out an algorithm; assigns to `local`.
+
+        `return` and `break` become truths in `local`, conditions under a condition that is not constant. What follows
+        is carried out where they do not hold.
+        """
         for s in statements:
-            if isinstance(s, Assignment | Equality):
-                target, value = (s.target, s.value) if isinstance(s, Assignment) else (s.left, s.right)
-                self._assign(target, self.evaluate(value, names), local, names)
-            elif isinstance(s, Branches):
-                self._branches(s, local, names)
-            elif isinstance(s, Loop):
-                self._loop(s, local, names)
-            elif isinstance(s, Jump):
-                raise _Return if s.kind == "return" else _Break
-            # What stands alone is a check or a message: assert, print.
+            ended = either(local.get("return", False), local.get("break", False))
+            if ended is True:
+                return
+            if ended is False:
+                self._statement(s, local, names)
+                continue
+            copied = dict(local)
+            self._statement(s, copied, _local(copied, names))
+            self._join(ended, dict(local), copied, local)
+
+    def _statement(self, s: Statement, local: dict[str, Value], names: Names) -> None:
+        if isinstance(s, Assignment | Equality):
+            target, value = (s.target, s.value) if isinstance(s, Assignment) else (s.left, s.right)
+            self._assign(target, self.evaluate(value, names), local, names)
+        elif isinstance(s, Branches):
+            self._branches(s, local, names)
+        elif isinstance(s, Loop):
+            self._loop(s, local, names)
+        elif isinstance(s, Jump):
+            local[s.kind] = True
+        # What stands alone is a check or a message: assert, print.
+
+    def _join(self, condition: Value, a: dict[str, Value], b: dict[str, Value], local: dict[str, Value]) -> None:
+        """Assigns what two branches assign: that of `a` where the condition holds."""
+        for name in a.keys() | b.keys():
+            otherwise = False if name in ("return", "break") else local.get(name)
+            local[name] = _joined(condition, a.get(name, otherwise), b.get(name, otherwise), self.quiet)
 
     def _assign(self, target: Expression, value: Value, local: dict[str, Value], names: Names) -> None:
         if isinstance(target, Several):
@@ -438,43 +431,42 @@ class Interpreter:
             results = []
             for statements in (body, (rest,)):
                 copied = dict(local)
-                inner = _local(copied, names)
-                try:
-                    self.execute(statements, copied, inner)
-                except (_Return, _Break):
-                    raise ModelError(f"return and break under a condition that is not constant: {holds}") from None
+                self.execute(statements, copied, _local(copied, names))
                 results.append(copied)
-            for name in results[0].keys() | results[1].keys():
-                a, b = (r.get(name, local.get(name)) for r in results)
-                local[name] = _joined(holds, a, b, self.quiet)
+            self._join(holds, results[0], results[1], local)
             return
 
     def _loop(self, s: Loop, local: dict[str, Value], names: Names) -> None:
-        try:
-            if s.condition is not None:
-                for _ in range(MOST_ROUNDS):
-                    holds = self.evaluate(s.condition, names)
-                    if not isinstance(holds, bool):
-                        raise ModelError(f"the condition of a while loop must be constant; got {holds}")
-                    if not holds:
-                        return
-                    self.execute(s.body, local, names)
-                raise ModelError(f"a while loop takes more than {MOST_ROUNDS} rounds")
+        outer = local.get("break", False)
+        if s.condition is None:
             self._rounds(s.iterators, s.body, local, names)
-        except _Break:
-            return
+        else:
+            self._while(s.condition, s.body, local, names)
+        local["break"] = outer
+
+    def _while(self, condition: Expression, body: tuple, local: dict[str, Value], names: Names) -> None:
+        for _ in range(MOST_ROUNDS):
+            holds = self.evaluate(condition, names)
+            if not isinstance(holds, bool):
+                raise ModelError(f"the condition of a while loop must be constant; got {holds}")
+            if not holds or local.get("return") is True or local.get("break") is True:
+                return
+            self.execute(body, local, names)
+        raise ModelError(f"a while loop takes more than {MOST_ROUNDS} rounds")
 
     def _rounds(self, iterators: tuple, body: tuple, local: dict[str, Value], names: Names) -> None:
         (name, over), *rest = iterators
-        shadowed = local.get(name, _Break)
+        was_there, shadowed = name in local, local.get(name)
         for value in self._range_of(over, names):
+            if local.get("return") is True or local.get("break") is True:
+                break
             local[name] = value
             if rest:
                 self._rounds(tuple(rest), body, local, names)
             else:
                 self.execute(body, local, names)
         local.pop(name, None)
-        if shadowed is not _Break:
+        if was_there:
             local[name] = shadowed
 
 
@@ -531,52 +523,6 @@ def _refused(_: Interpreter, e: Any, __: Names) -> NoReturn:
     raise ModelError(f"{type(e).__name__} cannot stand in an expression")
 
 
-def _equal(a: Value, b: Value) -> Value:
-    if is_condition(a) or is_condition(b):
-        return either(both(a, b), both(negated(a), negated(b)))
-    if isinstance(a, str) or isinstance(b, str) or (isinstance(a, int | float) and isinstance(b, int | float)):
-        return a == b
-    for choice, number in ((a, b), (b, a)):
-        if isinstance(choice, sympy.Piecewise) and isinstance(number, int | float):
-            found: Value = False
-            for value, condition in parts_of_choice(choice):
-                found = either(found, both(condition, _equal(_plain_number(value), number)))
-            return found
-    return plain(sympy.Eq(a, b))
-
-
-def _plain_number(value: Value) -> Value:
-    """SymPy's numbers as Python's."""
-    if isinstance(value, sympy.Integer):
-        return int(value)
-    return float(value) if isinstance(value, sympy.Number) else value
-
-
-def _relation(number: Callable[[Any, Any], bool], symbol: Any) -> Callable[[Value, Value], Value]:
-    def relation(a: Value, b: Value) -> Value:
-        a, b = as_number(a), as_number(b)
-        if isinstance(a, int | float | str) and isinstance(b, int | float | str):
-            return number(a, b)
-        return plain(symbol(a, b))
-
-    return relation
-
-
-_RELATIONS: dict[str, Callable[[Value, Value], Value]] = {
-    "<": _relation(lambda a, b: a < b, sympy.Lt),
-    "<=": _relation(lambda a, b: a <= b, sympy.Le),
-    ">": _relation(lambda a, b: a > b, sympy.Gt),
-    ">=": _relation(lambda a, b: a >= b, sympy.Ge),
-    "==": _equal,
-    "<>": lambda a, b: negated(_equal(a, b)),
-}
-_ARITHMETIC: dict[str, Callable[[Value, Value], Value]] = {
-    "+": lambda a, b: a + b,
-    "-": lambda a, b: a - b,
-    "*": lambda a, b: a * b,
-    "/": quotient,
-    "^": power,
-}
 _EVALUATED: dict[type, Callable[[Interpreter, Any, Names], Value]] = {
     Number: lambda self, e, names: e.value,
     Truth: lambda self, e, names: e.truth,

@@ -8,6 +8,7 @@ import sympy
 from modelica_texts import BALL, BLOCK, PIPE
 
 from jaxonomy_dae import EqnEnv, ModelError
+from jaxonomy_dae.expressions.smooth import Smooth
 from jaxonomy_dae.modelica import FlatComponent, load, read_base
 from jaxonomy_dae.modelica.interpret import Interpreter
 from jaxonomy_dae.modelica.tables import Table
@@ -124,6 +125,43 @@ def test_functions_are_carried_out():
     (limited,) = carried.call("limited", [x], {}).args  # marked as smooth: functions have no events
     assert [float(limited.subs(x, v)) for v in (1.0, 5.0)] == [1.0, 2.0]
     assert carried.call("limited", [7.0], {"top": 3.0}) == 3.0
+
+
+def test_return_and_break_under_a_condition():
+    """What follows a conditional return is carried out where it did not happen."""
+    text = """package p
+      function first "the place of the first entry above x; minus one if there is none"
+        input Real c[:]; input Real x; output Real y;
+      algorithm
+        y := -1.0;
+        for i in 1:size(c, 1) loop
+          if c[i] > x then y := i; return; end if;
+        end for;
+      end first;
+      function passed "entries before the first that is above x, and ten more if there is none"
+        input Real c[:]; input Real x; output Real y;
+      protected
+        Boolean all;
+      algorithm
+        y := 0.0;
+        all := true;
+        for i in 1:size(c, 1) loop
+          if c[i] > x then all := false; break; end if;
+          y := y + 1.0;
+        end for;
+        if all then y := y + 10.0; end if;
+      end passed;
+      model m end m;
+    end p;"""
+    x = sympy.Symbol("x", real=True)
+    carried = Interpreter(load(text).classes, {"x": x}.__getitem__, {}, {})
+    entries = [1.0, 5.0, 3.0]
+    for name, of_none in (("first", -1.0), ("passed", 13.0)):
+        found = sympy.lambdify(x, carried.call(name, [entries, x], {}).replace(Smooth, lambda e: e), "math")
+        for value in (0.0, 2.0, 4.0, 6.0):
+            place = next((k for k, c in enumerate(entries) if c > value), None)
+            expected = of_none if place is None else place + (1.0 if name == "first" else 0.0)
+            assert found(value) == carried.call(name, [entries, value], {}) == expected
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------

@@ -1,0 +1,74 @@
+"""Modelica's operators on numbers, truths, texts and expressions."""
+
+from collections.abc import Callable
+from typing import Any
+
+import sympy
+
+from ..errors import ModelError
+from .builtin import power, quotient
+from .values import Record, Value, as_number, both, either, is_condition, negated, parts_of_choice, plain
+
+
+def _equal(a: Value, b: Value) -> Value:
+    if is_condition(a) or is_condition(b):
+        return either(both(a, b), both(negated(a), negated(b)))
+    if isinstance(a, str) or isinstance(b, str) or (isinstance(a, int | float) and isinstance(b, int | float)):
+        return a == b
+    for choice, number in ((a, b), (b, a)):
+        if isinstance(choice, sympy.Piecewise) and isinstance(number, int | float):
+            found: Value = False
+            for value, condition in parts_of_choice(choice):
+                found = either(found, both(condition, _equal(_plain_number(value), number)))
+            return found
+    return plain(sympy.Eq(a, b))
+
+
+def _plain_number(value: Value) -> Value:
+    """SymPy's numbers as Python's."""
+    if isinstance(value, sympy.Integer):
+        return int(value)
+    return float(value) if isinstance(value, sympy.Number) else value
+
+
+def _relation(number: Callable[[Any, Any], bool], symbol: Any) -> Callable[[Value, Value], Value]:
+    def relation(a: Value, b: Value) -> Value:
+        a, b = as_number(a), as_number(b)
+        if isinstance(a, int | float | str) and isinstance(b, int | float | str):
+            return number(a, b)
+        return plain(symbol(a, b))
+
+    return relation
+
+
+RELATIONS: dict[str, Callable[[Value, Value], Value]] = {
+    "<": _relation(lambda a, b: a < b, sympy.Lt),
+    "<=": _relation(lambda a, b: a <= b, sympy.Le),
+    ">": _relation(lambda a, b: a > b, sympy.Gt),
+    ">=": _relation(lambda a, b: a >= b, sympy.Ge),
+    "==": _equal,
+    "<>": lambda a, b: negated(_equal(a, b)),
+}
+ARITHMETIC: dict[str, Callable[[Value, Value], Value]] = {
+    "+": lambda a, b: a + b,
+    "-": lambda a, b: a - b,
+    "*": lambda a, b: a * b,
+    "/": quotient,
+    "^": power,
+}
+
+
+def of_complex_numbers(sign: str, a: Value, b: Value) -> Value:
+    """An operation of complex numbers, the only operator record of flat models."""
+    x, y = (v if isinstance(v, Record) else Record(re=v, im=0.0) for v in (a, b))
+    if sign in "+-":
+        return Record({k: ARITHMETIC[sign](x[k], y[k]) for k in x})
+    if sign == "*":
+        return Record(re=x["re"] * y["re"] - x["im"] * y["im"], im=x["re"] * y["im"] + x["im"] * y["re"])
+    if sign == "/":
+        size = y["re"] ** 2 + y["im"] ** 2
+        return Record(
+            re=quotient(x["re"] * y["re"] + x["im"] * y["im"], size),
+            im=quotient(x["im"] * y["re"] - x["re"] * y["im"], size),
+        )
+    raise ModelError(f"'{sign}' of records")
