@@ -45,17 +45,22 @@ def write_mode(scope: Scope, name: str) -> None:
             continue
         if any(isinstance(s, VariableSymbol) for s in sympy.sympify(result).free_symbols):
             raise ModelError(f"its value {result} changes in time")
-        condition = scope.kept.in_events(both(holds, plain(sympy.Ne(m, result))))
+        pending = both(holds, plain(sympy.Ne(m, result)))
+        condition = scope.kept.in_events(pending)
         if not isinstance(condition, bool):
+            scope.pending.append(pending)
             scope.component._event(condition, (assign(m, result),), None, True, noted=False, revocable=True)
 
 
 def write_end_of_start(scope: Scope) -> None:
-    """Ends the initial time, after all else that happens there: events of one instant happen in the order of their
-    declaration."""
-    if scope.initial is not None:
-        starts: Any = sympy.Eq(scope.initial, 1)
-        scope.component._event(starts, (assign(scope.initial, 0),), None, True, noted=False)
+    """Ends the initial time when all modes have settled."""
+    if scope.initial is None:
+        return
+    ends: Any = sympy.Eq(scope.initial, 1)
+    for pending in scope.pending:
+        ends = both(ends, negated(pending))
+    condition = scope.kept.in_events(ends)
+    scope.component._event(condition, (assign(scope.initial, 0),), None, True, noted=False, revocable=True)
 
 
 def write_when(scope: Scope, s: Branches) -> None:

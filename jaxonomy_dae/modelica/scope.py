@@ -35,6 +35,7 @@ class Scope:
     - `kept`: relations whose truth is kept between events.
     - `in_action`: True while values are evaluated that an event writes: `pre(m)` is then the value before it.
     - `initial`: the discrete variable that is 1 at the initial time; None if nothing asks for it.
+    - `pending`: conditions that hold while a mode is not what its equation says.
     """
 
     def __init__(self, flat: FlatModel, component: Component):
@@ -52,6 +53,7 @@ class Scope:
         self.kept = KeptRelations(component)
         self.in_action = False
         self.initial: Any = None
+        self.pending: list[Value] = []
 
     def evaluate(self, e: Expression) -> Value:
         return self.interpreter.evaluate(e)
