@@ -38,9 +38,9 @@ LEVELS: dict[str, tuple[Entry, ...]] = {
             "A network inside a constraint: constraint forces respond to it.",
             "one to two minutes",
         ),
-        Entry("motor_control", "Library parts, a controller, and gains trained by a gradient."),
+        Entry("motor_control", "Library parts, a controller, and gains trained by a gradient.", "30 seconds"),
         Entry("linkage", "A closed loop of joints, and derivatives of its motion.", "30 seconds"),
-        Entry("circuit", "Frequency responses, and parts identified from one."),
+        Entry("circuit", "Frequency responses, and parts identified from one.", "25 seconds"),
     ),
     "Learning laws": (
         Entry("clogged_filter", "A network in an algebraic equation."),
@@ -55,7 +55,7 @@ LEVELS: dict[str, tuple[Entry, ...]] = {
         Entry("next_experiment", "Which experiment tells most, before it is made."),
     ),
     "Measured data": (
-        Entry("battery_pulses", "A cell's equivalent circuit from measured pulses."),
+        Entry("battery_pulses", "A cell's equivalent circuit from measured pulses.", "30 seconds"),
         Entry("overflowing_tanks", "Physics and a learned correction on a public benchmark."),
         Entry("measured_house", "Equations with errors: a Kalman filter inside the fit."),
     ),
