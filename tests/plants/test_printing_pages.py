@@ -10,7 +10,7 @@ from run_pages import BLOCK, DOCS, blocks_of, name_of, pages
 
 NUMBER = r"-?\d+(?:\.\d*)?(?:e[+-]\d+)?"
 QUICK = {"start/install.md", "start/first-model.md", "how-to/units.md"}  # in the default run
-LANGUAGES = {"python", "text", "sh"}
+LANGUAGES = {"python", "text", "sh", "bash", "modelica", "json"}
 
 
 def same_words(found, said):
