@@ -35,8 +35,7 @@ def _hold_initially(scope: Scope, left: Value, right: Value) -> None:
     for a, b in ((left, right), (right, left)):
         known = _in_parameters(b)
         if isinstance(a, DiscreteSymbol):
-            if known:
-                c.parameters[a.path] = c.parameters[a.path].with_value(_plain(b))
+            c.parameters[a.path] = c.parameters[a.path].with_value(_plain(b) if known else _number(scope, a, b))
             return
         if isinstance(a, VariableSymbol) and known:
             if a.order:
@@ -53,6 +52,13 @@ def _hold_initially(scope: Scope, left: Value, right: Value) -> None:
     a, b = (float(_numerical(scope, sympy.sympify(side))) for side in (left, right))
     if not math.isclose(a, b):  # a text has up to sixteen digits
         raise ModelError(f"the initial equation {left} = {right} does not hold for the declared starts")
+
+
+def _number(scope: Scope, variable: DiscreteSymbol, value: Value) -> float:
+    """The start of a discrete variable that depends on time, or on the starts of others."""
+    if any(isinstance(s, VariableSymbol) for s in value.free_symbols):
+        raise ModelError(f"the start of '{variable}', {value}, depends on continuous variables")
+    return float(_numerical(scope, value))
 
 
 def _numerical(scope: Scope, value: Value) -> Value:

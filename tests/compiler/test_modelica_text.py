@@ -204,6 +204,15 @@ def test_modes_are_discrete_variables_and_other_truths_are_expressions():
     assert {"mode", "forward", "backward"} <= discrete and "stuck" not in discrete
 
 
+def test_starts_of_discrete_variables_are_computed():
+    """As those of a periodic source, which begins in the middle of a period: one was left at zero."""
+    text = """model m Integer n(start = 7); Real t0; Real x;
+      initial algorithm n := integer((time + 0.35) / 0.1); t0 := n * 0.1 - 0.35;
+      equation when time >= (pre(n) + 1) * 0.1 then n = pre(n) + 1; t0 = time; end when; x = time - t0; end m;"""
+    parameters = built(text).parameters
+    assert parameters["n"].value == 3 and parameters["t0"].value == pytest.approx(-0.05)
+
+
 @pytest.mark.parametrize(
     "equations, told",
     [
