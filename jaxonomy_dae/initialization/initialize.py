@@ -338,7 +338,7 @@ def _sizes(plan: SystemPlan, rows: InitialRows, given: list, parameters: Any, st
     target, guess = _data_sizes(plan, rows, given, parameters)
     known = jnp.maximum(jnp.maximum(jnp.append(guess, jnp.zeros(more, dtype)), jnp.abs(start)), nominal)
     data = jnp.concatenate([jnp.zeros((plan.n_constraints + len(plan.carried),), dtype), target])
-    return Sizes(nominal, known, data, _distances(plan, rows, nominal, guess, len(data)))
+    return Sizes(nominal, known, data, _distances(plan, rows, data))
 
 
 def _with_velocities(sizes: Sizes, x: Any, plan: SystemPlan, here: SystemAt) -> Sizes:
@@ -359,20 +359,19 @@ def _with_velocities(sizes: Sizes, x: Any, plan: SystemPlan, here: SystemAt) -> 
     return sizes._replace(known=sizes.known.at[velocity].max(frequency * sizes.known[position]))
 
 
-def _distances(plan: SystemPlan, rows: InitialRows, nominal: Any, guess: Any, m: int) -> Any:
+def _distances(plan: SystemPlan, rows: InitialRows, sizes: Any) -> Any:
     """Distances that weigh the same when the point nearest to guesses is looked for: nominal values, or the largest
-    guess of all variables of one unit."""
-    out = jnp.zeros((m,), guess.dtype)
+    guess of all variables of one unit; `sizes` are those of the rows' targets, equations first."""
+    out = jnp.zeros_like(sizes)
     if not rows.n_soft:
         return out
-    place = {int(q): k for k, q in enumerate((*plan.states, *plan.carried))}
     soft = rows.kept[-rows.n_soft :]
-    where = np.array([place[row.quantity] for row in soft])
     units = [_unit_of(plan, row.name) for row in soft]
-    factor = jnp.asarray(np.abs([row.factor for row in soft]), guess.dtype)
     same = np.array([[a == b for b in units] for a in units])
-    shared = jnp.max(jnp.where(same, (factor * guess[where])[None, :], 0), axis=1)
-    return out.at[m - rows.n_soft :].set(jnp.where(nominal[where] > 0, factor * nominal[where], shared))
+    shared = jnp.max(jnp.where(same, sizes[-rows.n_soft :][None, :], 0), axis=1)
+    factor = np.abs([row.factor for row in soft])
+    nominal = jnp.asarray(factor * declared_scale(plan.model)[[row.quantity for row in soft]], sizes.dtype)
+    return out.at[-rows.n_soft :].set(jnp.where(nominal > 0, nominal, shared))
 
 
 def _unit_of(plan: SystemPlan, name: str) -> str:

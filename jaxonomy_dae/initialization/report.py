@@ -113,15 +113,21 @@ class InitializationReport(Sections):
         held = {r.quantity for r in rows.kept[:n]}
         parameters = np.asarray(self._system.numbers, float)
         out = []
-        for k, q in enumerate((*plan.states, *plan.carried)):
-            if int(q) in held:
+        entries = [int(q) for q in (*plan.states, *plan.carried)]
+        moved = self._residual[len(self._residual) - len(rows.kept) :]
+        for k in range(n, len(rows.kept)):
+            if rows.kept[k].quantity not in entries:
+                guess = float(self._target[k])
+                out.append(Guess(rows.kept[k].name, guess, guess + float(moved[k])))
+        for k, q in enumerate(entries):
+            if q in held:
                 continue
             row = rows.guess[k]
             guess = 0.0
             if row is not None and row.given < 0 and row.start is not None:
                 values = list(parameters[list(row.start.parameters)])
                 guess = float(row.start.template.residual([], values, [], 0.0, None, backend="numpy")) / row.factor
-            name = plan.quantity_name[int(q)]
+            name = plan.quantity_name[q]
             out.append(Guess(name, guess + 0.0, float(self._x[k]) + 0.0))
         return out
 

@@ -127,7 +127,8 @@ def initial_rows(plan: SystemPlan, names: tuple[str, ...], solve_for: tuple[int,
     guess = tuple(started.get(q) for q in entries)
     inside = set(plan.states.tolist())
     rows = [*overrides, *fixed]
-    free = not plan.n_constraints and not len(plan.carried) and not solve_for
+    others = _others(plan, started) if None in guess else []
+    free = not plan.n_constraints and not len(plan.carried) and not solve_for and not others
     if free and all(r.quantity in inside for r in rows):
         held: set[int] = set()
         again = []  # starts of variables that equal one with a start of its own
@@ -139,7 +140,17 @@ def initial_rows(plan: SystemPlan, names: tuple[str, ...], solve_for: tuple[int,
         return InitialRows(guess, tuple(rows), 0, independent, True, tuple(again), (), ())
     generic = _generic(plan, solve_for)
     ranked = _by_rank if generic.jacobian.shape[1] <= DENSE_LIMIT else _by_matching
-    return ranked(plan, generic, overrides, fixed, guess)
+    return ranked(plan, generic, overrides, fixed, guess, others)
+
+
+def _others(plan: SystemPlan, started: dict[int, StartRow]) -> list[StartRow]:
+    """The declared starts of quantities that could be states, for their derivatives occur, and are not. What is asked
+    of a model changes which quantities are states, and must not change the initial point."""
+    quantities = plan.extended.quantities
+    entries = {int(q) for q in (*plan.states, *plan.carried)}
+    differentiated = quantities.order < quantities.highest[quantities.owner]
+    chosen = (q for q in sorted(started) if q not in entries and q != ZERO and differentiated[q])
+    return [started[q] for q in chosen]
 
 
 def _declared(plan: SystemPlan, names: tuple[str, ...]) -> tuple[list[StartRow], list[StartRow], dict[int, StartRow]]:
@@ -231,14 +242,16 @@ def _parameter_columns(plan: SystemPlan, point, values, solve_for) -> np.ndarray
     return np.where(np.isfinite(out), out, 1.0)
 
 
-def _candidates(plan: SystemPlan, guess) -> list[tuple[StartRow, bool]]:
+def _candidates(plan: SystemPlan, guess, others: list[StartRow]) -> list[tuple[StartRow, bool]]:
     """Guesses in the order in which they are taken, and whether each is a declared guess of a state: what a user
-    declares before zeros, states before algebraic unknowns."""
+    declares before zeros, states before algebraic unknowns, and these before `others`."""
     entries = [int(q) for q in (*plan.states, *plan.carried)]
     n = len(plan.states)
     ranked = sorted(range(len(entries)), key=lambda k: (guess[k] is None, k >= n, k))
     rows = [guess[k] or StartRow(plan.quantity_name[entries[k]], entries[k], 1.0, None) for k in ranked]
-    return [(row, guess[k] is not None and k < n) for row, k in zip(rows, ranked, strict=True)]
+    found = [(row, guess[k] is not None and k < n) for row, k in zip(rows, ranked, strict=True)]
+    declared = len(guess) - guess.count(None)
+    return [*found[:declared], *((row, False) for row in others), *found[declared:]]
 
 
 class _Directions:
@@ -278,7 +291,7 @@ class _Directions:
         return True
 
 
-def _by_rank(plan: SystemPlan, generic: _Generic, overrides, fixed, guess) -> InitialRows:
+def _by_rank(plan: SystemPlan, generic: _Generic, overrides, fixed, guess, others) -> InitialRows:
     directions = _Directions(generic)
     kept, independent, dropped, settled = [], [], [], []
     alone = [not directions.open(generic.row(row)) for row in (*overrides, *fixed)]  # whatever is given
@@ -292,7 +305,7 @@ def _by_rank(plan: SystemPlan, generic: _Generic, overrides, fixed, guess) -> In
         kept.append(row)
         independent.append(closes)
     redundant = tuple(k for k, closes in enumerate(independent) if not closes)
-    candidates = _candidates(plan, guess)
+    candidates = _candidates(plan, guess, others)
     gradients = [generic.row(dataclasses.replace(row, start=None)) for row, _ in candidates]
     undecided = [directions.open(gradient) for gradient in gradients]
     soft: list[tuple[StartRow, bool]] = []
@@ -307,10 +320,10 @@ def _by_rank(plan: SystemPlan, generic: _Generic, overrides, fixed, guess) -> In
     return _chosen(guess, kept, independent, soft, redundant, tuple(settled), dropped)
 
 
-def _by_matching(plan: SystemPlan, generic: _Generic, overrides, fixed, guess) -> InitialRows:
+def _by_matching(plan: SystemPlan, generic: _Generic, overrides, fixed, guess, others) -> InitialRows:
     """The choice of rows for many quantities: a row is independent if it can be matched with a quantity beside the
     equations and the rows before it, and if numbers do not say otherwise."""
-    rows = [*overrides, *fixed, *(row for row, _ in _candidates(plan, guess))]
+    rows = [*overrides, *fixed, *(row for row, _ in _candidates(plan, guess, others))]
     hard = len(overrides) + len(fixed)
     n_equations = generic.jacobian.shape[0]
     bare = [row if k < hard else dataclasses.replace(row, start=None) for k, row in enumerate(rows)]

@@ -150,3 +150,35 @@ def test_what_is_no_start_is_refused(wrong, text):
     with pytest.raises(ModelError) as error:
         Wrong(EqnEnv(), "c")
     assert text in str(error.value)
+
+
+class Observed(Component):
+    """Two relaxations whose coupling also has the derivative of x, of which y is the negative: if der(y) is asked for,
+    x and its derivative are states, and `slow` is none."""
+
+    def __init__(self, ev, name, is_asked):
+        super().__init__(ev, name)
+        slow = self.variable("slow", start=0.432)
+        x = self.variable("x", start=0.906, fixed=True)
+        y, z = self.variable("y"), self.variable("z")
+        self.add_equations(
+            Eq(der(slow), 0.7 - slow), Eq(z, x - 1.907 * y), Eq(0.532 * z + 0.361 * slow + y, 0), Eq(der(x), -y)
+        )
+        if is_asked:
+            curvature = self.variable("curvature")
+            self.add_equations(Eq(curvature, der(y)))
+
+
+def test_a_guess_outranks_a_zero_whatever_is_asked_for():
+    """Kind: what is asked of a model changes which quantities are states, and so moved a declared guess of a quantity
+    that was no state any more. Closed form: y = −(0.532 x + 0.361 slow)/(1 − 0.532·1.907)."""
+    ev = EqnEnv()
+    system = compiled(Observed(ev, "plain", False), Observed(ev, "asked", True))
+    assert "der(asked.x)" in system.states and "asked.slow" not in system.states  # else nothing is tested
+    start = system.initialize()
+    right = -(0.532 * 0.906 + 0.361 * 0.432) / (1 - 0.532 * 1.907)
+    for name in ("plain", "asked"):
+        found = system.observe([f"{name}.slow", f"{name}.y"], 0.0, start)
+        np.testing.assert_allclose(found, [0.432, right], rtol=1e-12)
+    moved = {guess.name: guess.moved for guess in system.initialization_report().guesses}
+    assert abs(moved["asked.slow"]) < 1e-12 and abs(moved["der(asked.x)"]) > 1
