@@ -101,6 +101,9 @@ def first_step(
     h1 = jnp.where(largest <= 1e-15, jnp.maximum(1e-6, h0 * 1e-3), (0.01 / jnp.maximum(largest, 1e-15)) ** power)
     h = jnp.minimum(jnp.minimum(100 * h0, h1), t1 - t0)
     # Where slopes are small beside how fast they change, the run begins nearly at rest: the step resolves that change.
-    h = jnp.where(d1**2 < UNSEEN * d2, jnp.minimum(h, 0.1 * d1 / jnp.maximum(d2, 1e-15)), h)
-    h = jnp.where(jnp.isfinite(h) & (h > 0), h, 1e-6 * (t1 - t0))
+    # A slope may be rounding alone, as behind an event: the step is never shorter than from a slope of zero.
+    from_rest = 1e-6 * (t1 - t0)
+    resolved = jnp.maximum(0.1 * d1 / jnp.maximum(d2, 1e-15), from_rest)
+    h = jnp.where(d1**2 < UNSEEN * d2, jnp.minimum(h, resolved), h)
+    h = jnp.where(jnp.isfinite(h) & (h > 0), h, from_rest)
     return jax.lax.stop_gradient(h)  # inputs may close over what is differentiated

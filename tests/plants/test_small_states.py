@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import sympy
 from problems import compiled, component
 from sympy import Eq
 
@@ -64,3 +65,19 @@ def test_a_start_that_is_rounding_tells_no_size():
     solution = simulate(system, 1.0, ts=np.array([1.0]))
     assert solution.counts["num_steps"] < 100
     np.testing.assert_allclose(solution["p.y"], 1.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("offset", [0.0, 5e-16, 1e-13])
+def test_a_slope_that_is_rounding_tells_no_step(offset):
+    """Kind: a first step from a slope that is rounding, as behind an event that begins where a current is zero. At
+    t = 1 its length was lost in rounding, and steps of length zero, which have no error, were kept without end.
+    Closed form: x' = sin(k(t − 1)) + offset."""
+
+    def write(self, ev):
+        k, added = self.parameter("k", 3.0), self.parameter("offset", offset)
+        x = self.variable("x", start=0.5)
+        self.add_equations(Eq(der(x), sympy.sin(k * (ev.t - 1)) + added))
+
+    solution = simulate(compiled(component(write)), 2.0, t0=1.0, ts=np.array([2.0]), rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(solution["c.x"], 0.5 + (1 - np.cos(3.0)) / 3, rtol=1e-8)
+    assert solution.counts["num_steps"] < 100
