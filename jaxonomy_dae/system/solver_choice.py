@@ -71,6 +71,9 @@ class Stiffness:
     def __hash__(self) -> int:
         return 0  # all else that is static tells models apart
 
+    def __repr__(self) -> str:  # JAX prints it where two systems do not stack
+        return f"Stiffness(decays by about {self.decay:.0e} per unit of time)"
+
 
 @np.errstate(all="ignore")
 def fastest_decay(model: ReducedModel, parameters: np.ndarray) -> float:

@@ -86,8 +86,22 @@ def test_tree_at_replaces_parameters_and_networks():
 def test_systems_are_pytrees_of_arrays(rc):
     leaves = jax.tree.leaves(rc)
     assert leaves and all(isinstance(leaf, jax.Array) for leaf in leaves)
-    assert jax.tree.structure(rc) == jax.tree.structure(rc_circuit(R=7.0))  # values are not part of the structure
+    assert jax.tree.structure(rc) == jax.tree.structure(rc_circuit(R=1.7))  # values are not part of the structure
     assert jax.tree.structure(rc) != jax.tree.structure(pendulum())
+
+
+def test_systems_of_one_structure_are_stacked(rc):
+    """Values are no part of a plan. Of a system's static part, they tell only how fast it decays, to a decade: for
+    traced values a solver is chosen by that. So members of an ensemble are one model with other values, however far
+    these are apart, and a model compiled with values of another decade says what it differs in.
+    """
+    far = rc_circuit(R=2e4)
+    assert far.plan == rc.plan
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), rc, rc.with_parameters({"r.R": 2e4}))
+    rows = eqx.filter_vmap(lambda s: s.vector_field(0.0, jnp.array([1.0])))(stacked)
+    np.testing.assert_allclose(rows[:, 0], [(3.0 - 1.0) / (R * 0.5) for R in (2.0, 2e4)], rtol=1e-12)  # rounding
+    with pytest.raises(ValueError, match=r"Stiffness\(decays by about 1e-04 per unit of time\)"):
+        jax.tree.map(lambda *leaves: jnp.stack(leaves), far, rc)
 
 
 # --- ensembles ---------------------------------------------------------------------------------------------------
