@@ -52,8 +52,9 @@ class Minimum:
     tolerance: float  # of the integration, relative
 
 
-# Better weights, and by which part noise levels and precisions change.
-Reweigh = Callable[[np.ndarray, Evaluation, Weights, Factors, np.ndarray], tuple[Weights, float]]
+# Better weights, and by which part noise levels and precisions change. The last argument: whether the point is a
+# minimum for the present weights.
+Reweigh = Callable[[np.ndarray, Evaluation, Weights, Factors, np.ndarray, bool], tuple[Weights, float]]
 
 
 class Reached(NamedTuple):
@@ -150,13 +151,16 @@ class _Here:
 
     @classmethod
     def of(
-        cls, merit: AbstractMerit, z: np.ndarray, found: Evaluation, weights: Weights, bounds: tuple, reweigh: Any
-    ) -> "_Here":
+        cls, merit: AbstractMerit, z: np.ndarray, found: Evaluation, weights: Weights, bounds: tuple, reweigh: Any,
+        is_minimum: bool = False,
+    ) -> "_Here":  # fmt: skip
         rows, cost = weights.applied(z, found), weights.cost(z, found.residual)
         free = can_move(z, rows.jacobian.T @ rows.residual, bounds)
         factors = Factors.of(rows.residual, rows.jacobian[:, free], merit.noise)
-        following, change = (weights, 0.0) if reweigh is None else reweigh(z, found, weights, factors, free)
-        return cls(z, found, weights, rows, cost, free, factors, following, change, offset(factors, merit.noise))
+        left = offset(factors, merit.noise)
+        is_minimum = is_minimum or left <= OFFSET
+        following, change = (weights, 0.0) if reweigh is None else reweigh(z, found, weights, factors, free, is_minimum)
+        return cls(z, found, weights, rows, cost, free, factors, following, change, left)
 
     @property
     def settled(self) -> bool:
@@ -185,8 +189,8 @@ def descend(
 
     **Arguments:**
 
-    - `reweigh`: `(z, found, weights, factors, free)` to better weights, and how much they change; called once for each
-        factorization, for the next step.
+    - `reweigh`: `(z, found, weights, factors, free, is_minimum)` to better weights, and how much they change; called
+        once for each factorization, for the next step, and where the search would end.
 
     **Returns:**
 
@@ -229,13 +233,16 @@ def descend(
         if finer is not None and found is not None:
             merit, damping, idle, count = finer, FIRST, 0, count + 1
             here = _Here.of(merit, here.z, found, merit.at(here.z, found, here.weights), bounds, reweigh)
-        elif here.settled or idle > 2 * PATIENCE:
+            continue
+        # Weights that stay until the search has found its minimum are now free to change.
+        here = _Here.of(merit, here.z, here.found, here.weights, bounds, reweigh, is_minimum=True)
+        if here.settled or idle > 2 * PATIENCE:
             closed = here.left <= (CLOSE if stuck else VALLEY)
             reason = f"{'converged' if closed else 'stopped'} after {k} steps: no step gains more"
             break
-        elif better is None:
+        if better is None:
             weights = merit.next_weights(here.weights, here.following)
-            here = _Here.of(merit, here.z, here.found, weights, bounds, reweigh)
+            here, damping = _Here.of(merit, here.z, here.found, weights, bounds, reweigh), FIRST
     converged = reason.startswith("converged")
     if converged:
         here, polished = _polished(merit, here, bounds, reweigh, history)
@@ -328,7 +335,7 @@ def _polished(
         count += 1
         if found is None:
             break
-        here = _Here.of(merit, z, found, merit.at(z, found, weights), bounds, reweigh)
+        here = _Here.of(merit, z, found, merit.at(z, found, weights), bounds, reweigh, is_minimum=True)
         if here.worst < best.worst:
             best = here
             history.append(here.cost)

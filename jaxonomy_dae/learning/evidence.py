@@ -55,10 +55,13 @@ class Evidence:
         return dataclasses.replace(weights, row=row)
 
     def reweigh(
-        self, z: np.ndarray, found: Evaluation, weights: Weights, factors: Factors, free: np.ndarray
+        self, z: np.ndarray, found: Evaluation, weights: Weights, factors: Factors, free: np.ndarray, is_minimum: bool
     ) -> tuple[Weights, float]:
-        """Better weights, and the greatest relative change. As long as residuals of known noise levels are larger than
-        these say, precisions stay: the evidence would let go of a prior that nothing else replaces."""
+        """Better weights, and the greatest relative change.
+
+        On the way through residuals that are larger than their known noise levels, precisions stay: the formula holds
+        at a minimum, and elsewhere would let go of a prior that nothing else replaces. At a minimum they change in any
+        case: a prior that is too strong keeps residuals large."""
         root = factors.root(factors.rank(np.finfo(float).eps * len(found.residual)))
         row, precision = np.array(weights.row), np.array(weights.precision)
         changes = [0.0]
@@ -76,7 +79,7 @@ class Evidence:
         known = self.noise < 0
         misfit = float(np.sum((weights.row * found.residual)[known] ** 2))
         near = misfit <= NEAR * float(np.sum(weights.share[known] ** 2))
-        for group in self.groups if near else ():
+        for group in self.groups if near or is_minimum else ():
             old = weights.precision[group][0]
             determined = max(group.sum() - old * float(np.sum(variance[group])), 1e-3)
             new = determined / max(float(np.sum((z - weights.mean)[group] ** 2)), np.finfo(float).tiny)

@@ -206,7 +206,7 @@ def shoot(
             point, gain = found
             if gain < SLOW * cost:
                 break
-        merit, _, _ = _reweighed(merit, point, evidence, tolerance)
+        merit, _, _ = _reweighed(merit, point, evidence, tolerance, ended=False)
     converged, message = False, f"stopped after {steps} steps, not yet converged; steps= allows more"
     remaining, idle, before = np.inf, 0, np.inf
     for k in range(steps + 1):
@@ -219,7 +219,7 @@ def shoot(
         idle = 0 if gain > max(GAIN * history[-1], OFFSET * len(point.z)) else idle + 1
         if gain > left and not idle and k < steps:
             continue
-        merit, settled, remaining = _reweighed(merit, point, evidence, tolerance)
+        merit, settled, remaining = _reweighed(merit, point, evidence, tolerance, ended=idle > PATIENCE)
         widest = float(np.abs(point.blocks.gap).max(initial=0.0))
         if settled and widest <= CLOSED * tolerance and (remaining <= OFFSET or idle > PATIENCE):
             converged, message = True, f"converged after {len(history)} steps"
@@ -247,9 +247,11 @@ def _noise(merit: Merit, point: Point, jacobian: Float[np.ndarray, "m f"], toler
     return float(np.clip(tolerance * alone / largest if largest > 0 else tolerance, ROUNDED, tolerance))
 
 
-def _reweighed(merit: Merit, point: Point, evidence: Evidence | None, tolerance: float) -> tuple[Merit, bool, float]:
+def _reweighed(
+    merit: Merit, point: Point, evidence: Evidence | None, tolerance: float, ended: bool
+) -> tuple[Merit, bool, float]:
     """The merit with better noise levels and priors, whether these have settled, and the remaining step in radii of the
-    confidence region, were continuity to hold."""
+    confidence region, were continuity to hold. `ended`: no step gains more."""
     z = point.z
     found = merit.segments.evaluation(point)
     residual, jacobian = merit.weights.applied(z, found)
@@ -259,5 +261,5 @@ def _reweighed(merit: Merit, point: Point, evidence: Evidence | None, tolerance:
     remaining = offset(factors, noise)
     if evidence is None or evidence.is_idle:
         return merit, True, remaining
-    weights, change = evidence.reweigh(z, found, merit.weights, factors, moves)
+    weights, change = evidence.reweigh(z, found, merit.weights, factors, moves, ended or remaining <= OFFSET)
     return dataclasses.replace(merit, weights=weights), change <= SETTLED, remaining

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.integrate
 from sympy import Eq
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der, learning
@@ -98,3 +99,35 @@ def test_what_is_against_a_fit_is_said():
     assert not any("χ²" in reason for reason in estimated.reasons)  # a noise level that is estimated explains any
     short = problem.fit(record(), steps=0, warn=False)
     assert "not yet converged" in short.reasons[0]
+
+
+class Spring(Component):
+    """x'' = f(x) − d·x'."""
+
+    def __init__(self, ev, name, law):
+        super().__init__(ev, name)
+        x, v = (self.variable(n, start=s, fixed=True) for n, s in (("x", 1.0), ("v", 0.0)))
+        d = self.parameter("d", 0.4)
+        (f,) = self.learned("f", law, inputs=[x])
+        self.add_equations(Eq(der(x), v), Eq(der(v), f - d * v))
+
+
+@pytest.mark.long("a fit that begins far from its data: half of its steps lead away from a law that is linear")
+def test_a_plain_fit_finds_a_law_that_bends():
+    """Fits of a hardening spring ended in a linear law, χ² twelve times the freedom, which the prior held there."""
+
+    def hardening(x):
+        return -4.0 * x - 3.0 * x**3
+
+    ts = np.linspace(0.1, 6.0, 60)
+    exact = scipy.integrate.solve_ivp(
+        lambda t, z: [z[1], hardening(z[0]) - 0.4 * z[1]], (0, 6), [1.0, 0.0], t_eval=ts, rtol=1e-10, atol=1e-12
+    ).y[0]
+    data = learning.Experiment(ts, {"c.x": exact + 0.02 * np.random.default_rng(0).standard_normal(60)}, sigma=0.02)
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    diagram.add(Spring(ev, "c", learning.Odd(key=jax.random.key(0), inputs=1.0, outputs=5.0)))
+    fit = learning.Problem(AcausalCompiler(ev, diagram)(), data, train=["c.f", "c.d"]).fit()
+    assert fit.ok and fit.chi2 < fit.freedom + 3 * np.sqrt(2 * fit.freedom)
+    band = fit.band("c.f", np.linspace(0.1, 0.9, 9))
+    np.testing.assert_array_less(np.abs(band.mean - hardening(band.grid)), 4 * band.spread)
+    np.testing.assert_array_less(np.abs(band.mean - hardening(band.grid)), 0.03 * 7)
