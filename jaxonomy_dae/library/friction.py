@@ -43,7 +43,9 @@ def stick_slip(
     mode = component.discrete("mode", start=2, unit="1")
     still = component.parameter("standstill", STANDSTILL, unit=component.variables[str(speed)].unit, bounds=POSITIVE)
     branch = Piecewise((0, Eq(mode, 2)), (mode * sliding, True))
-    component.either(Eq(mode, 0), der(speed), friction - branch)
+    # No friction holds parts whose motion is prescribed: it is −(−der(speed))/0 there, infinite with the sign of their
+    # acceleration, so that they slide on at once, the way they go.
+    component.either(Eq(mode, 0), -der(speed), friction - branch)
     direction = Piecewise((1, speed > still), (-1, speed < -still), (0, True))
     moving = Eq(Abs(mode), 1)
     if pressed is None:

@@ -372,6 +372,34 @@ def test_stick_and_slip():
     np.testing.assert_array_equal(run.values("f.mode", ts), [0, 1, 1, 0, 1, 1])
 
 
+@pytest.mark.long("a run with events is compiled")
+def test_friction_does_not_hold_a_prescribed_motion():
+    """Kind: a mode that cannot hold what it is to hold. The friction of parts that are moved by a source had the wrong
+    sign where they turned back: sticking and breaking away followed each other without end. Friction has the sign of
+    the speed, whichever flange moves."""
+    ev = EqnEnv()
+    wall, shift = line.FixedPosition(ev, "wall"), line.PositionSource(ev, "shift")
+    one, other = StickingFriction(ev, "one", SLIDING, BREAKAWAY), StickingFriction(ev, "other", SLIDING, BREAKAWAY)
+    turn, shaft, gear = rot.AngleSource(ev, "turn"), rot.Inertia(ev, "shaft", INERTIA), rot.IdealGear(ev, "gear", -3.0)
+    brake = Brake(ev, "brake", mu=0.4, fn_max=10.0, cgeo=1.5, peak=1.5)
+    system = compiled(
+        wall, shift, one, other, turn, shaft, gear, brake,
+        connect=[
+            (wall.flange, one.flange_a, other.flange_b), (shift.flange, one.flange_b, other.flange_a),
+            (turn.flange, shaft.flange_a), (shaft.flange_b, gear.flange_a), (gear.flange_b, brake.flange),
+        ],
+    )  # fmt: skip
+    # Not at 0.25 and 0.75, where both turn back.
+    ts = jnp.array([0.1, 0.24, 0.26, 0.6, 0.74, 0.76, 1.0])
+    inputs = {"shift.u": lambda t: 0.1 * jnp.sin(2 * np.pi * t), "turn.u": lambda t: 0.2 * jnp.sin(2 * np.pi * t)}
+    solution = simulate(system, 1.0, ts=ts, inputs={**inputs, "brake.u": 1.0})
+    sign = np.sign(np.cos(2 * np.pi * np.asarray(ts)))
+    np.testing.assert_array_equal(np.sign(solution["brake.w"]), np.sign(solution["brake.flange.tau"]))
+    np.testing.assert_allclose(np.abs(solution["brake.flange.tau"]), 6.0, rtol=1e-12)
+    np.testing.assert_allclose(solution["one.f"], SLIDING * sign, rtol=1e-12)
+    np.testing.assert_allclose(solution["other.f"], -SLIDING * sign, rtol=1e-12)
+
+
 @pytest.mark.long("a run with an impulse is compiled")
 def test_a_freewheel_that_begins_by_slipping_the_wrong_way():
     """J·w is conserved where flange_b catches up at once: it stayed slower by 10 rad/s, "locked"."""
