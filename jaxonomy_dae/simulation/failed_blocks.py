@@ -48,6 +48,23 @@ def failed_block(system: AcausalSystem, first: Instant, last: Instant, t1: Time,
     return _just_beyond(system, t, x, t1, inputs) if len(system.plan.carried) else ""
 
 
+def singular_mode(system: AcausalSystem, first: Instant, last: Instant, inputs: Inputs) -> str:
+    """Sentences on the mode that an event began at the last point (t, x), in which states have no slope. Those that it
+    spoiled are looked at with their values from the start of the run: a mode makes blocks singular wherever it is."""
+    t, x = last
+    names = system.discretes
+    values = np.asarray(system.discrete_values)[: len(names)]
+    mode = ", ".join(f"'{name}' = {value:.6g}" for name, value in [*zip(names, values, strict=True)][:SHOWN])
+    found = _findings(system, t, np.where(np.isfinite(x), x, first[1]), inputs)
+    singular = next((block for block in found if block.singular), None)
+    shown = f", with {mode}. " if mode and singular is None else ". "
+    return (
+        f"the integration stopped at t={float(t):g}: an event began a mode in which states have no finite slope{shown}"
+        + ("" if singular is None else _singular(singular, "there"))
+        + "Let events write values with which the equations have a solution."
+    )
+
+
 def _first_failed(system: AcausalSystem, t: Time, x: State, inputs: Inputs) -> AnyStep | None:
     """The first step that has no value, among nonlinear ones and those of two or more equations."""
     plan = system.plan

@@ -20,7 +20,7 @@ from ..system.system import AcausalSystem
 from ..tolerances import CONSISTENT
 from .arguments import NOT_ADMITTED, TEXT
 from .event_log import Events
-from .failed_blocks import equation_not_finite, failed_block
+from .failed_blocks import equation_not_finite, failed_block, singular_mode
 from .hybrid_problem import RESTART, resolution
 from .lost_constraints import lost_constraint
 from .preparation import term_of
@@ -99,7 +99,10 @@ def explain(
         return _too_many_events(solution.events, max_events, float(t))
     if log is not None and solution.result == STUCK:
         return _stuck(solution, int(log.stuck), float(t), MOVED * float(resolution(t0, t1)))
-    written = _written_not_finite(system, x)
+    written, others = _not_finite(system, x)
+    if others and not written and not system.is_constrained and system.plan.held is None:
+        return singular_mode(system, first, (t, x), inputs) + _of_short_circuits(system)
+    written = written or others
     if written:
         return f"the integration stopped at t={float(t):g}: an event gave {written} a value that is not finite" + (
             ", or it entered a mode whose constraint does not hold at that instant (its gap or speed is not zero), or "
@@ -108,9 +111,6 @@ def explain(
             else ", or left states that the hidden constraints do not admit: let it write, with reinit(...), all that "
             "jumps" + _of_kinks(system)
             if system.is_constrained
-            else ", or began a mode in which equations are singular, as where ideal switches and diodes short-circuit "
-            "a source or a capacitor: give those a resistance, Ron=1e-5"
-            if system.report.modes
             else ""
         )
     bad = _bad_input(system.plan, inputs, float(t0), float(t), float(t1))
@@ -166,14 +166,28 @@ def mode_at_start(system: AcausalSystem, inputs: Inputs, t0: Time, x0: State) ->
     )
 
 
-def _written_not_finite(system: AcausalSystem, x: State) -> str:
-    """The names of discrete variables and states that are not finite after an event; "" if all are."""
-    if system.plan.events is None:
-        return ""
+def _not_finite(system: AcausalSystem, x: State) -> tuple[str, str]:
+    """The names of discrete variables and states that are not finite after an event: those that events write, and the
+    others, which an event spoils by a mode in which they have no slope."""
+    events = system.plan.events
+    if events is None:
+        return "", ""
     names = system.discretes
-    pairs = [*zip(names, np.asarray(system.discrete_values)[: len(names)], strict=True)]
-    pairs += [*zip(system.states, np.asarray(x)[: len(system.states)], strict=True)]
-    return ", ".join(repr(name) for name, value in pairs if not np.isfinite(value))
+    n = len(system.states)
+    resets = np.isin(np.arange(n), events.state)
+    pairs = [*zip(names, np.asarray(system.discrete_values)[: len(names)], [True] * len(names), strict=True)]
+    pairs += [*zip(system.states, np.asarray(x)[:n], resets, strict=True)]
+    lost = [(repr(name), resets) for name, value, resets in pairs if not np.isfinite(value)]
+    return ", ".join(name for name, resets in lost if resets), ", ".join(name for name, resets in lost if not resets)
+
+
+def _of_short_circuits(system: AcausalSystem) -> str:
+    """What may be wrong with ideal switches, if there are any."""
+    if not system.report.modes:
+        return ""
+    return (
+        " Ideal switches and diodes that short-circuit a source or a capacitor do so: give those a resistance, Ron=1e-5"
+    )
 
 
 def _too_many_events(events: Events, max_events: int, t: float) -> str:

@@ -144,6 +144,22 @@ def test_values_that_become_not_finite(parameter, name):
         run(**{parameter: 0.5})
 
 
+def test_a_mode_in_which_equations_are_singular():
+    """Kind: a text that blames what an event does not write. The event gives k the value 1, and y + w is asked for to
+    be two things at once: 'c.q' was said to have been given a value by an event."""
+
+    def write(self, ev):
+        time, k = clock_hand(self), self.discrete("k", start=2)
+        q, y, w = self.variable("q", start=1.0, fixed=True), self.variable("y"), self.variable("w")
+        self.add_equations(Eq(k * y + w, q), Eq(y + w, q / 2), Eq(der(q), -y - w / 10))
+        self.when(time >= 0.5, assign(k, 1))
+
+    with pytest.raises(SimulationError, match="began a mode in which") as found:
+        simulate(model(write), 1.0, ts=jnp.array([1.0]))
+    text = str(found.value)
+    assert "'c.y', 'c.w' is singular" in text and "'c.k' = 1" in text and "an event gave" not in text
+
+
 @pytest.mark.parametrize("period", [0.0, -0.5])
 def test_a_period_that_is_not_positive(period):
     with pytest.raises(ModelError, match=r"sampled\(T.*period must be positive"):
