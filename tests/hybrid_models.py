@@ -1,6 +1,6 @@
 """Models with events that several tests share."""
 
-from sympy import Abs, sign
+from sympy import Abs, sign, sqrt
 
 from jaxonomy_dae import (
     AcausalCompiler,
@@ -137,3 +137,18 @@ class Doubling(Component):
         y, d = self.variable("y", start=0.0, fixed=True), self.discrete("d", start=2 * a)
         self.add_equations(Eq(der(x), 1), Eq(der(y), d))
         self.when(x >= 1, reinit(x, 0), assign(d, 2 * pre(d)))
+
+
+class Bob(Component):
+    """A point on a string, written as equations."""
+
+    def __init__(self, ev, name, L=1.0, v0=5.2):
+        super().__init__(ev, name)
+        L, v0, m, g = self.parameter("L", L), self.parameter("v0", v0), self.parameter("m", 2.0), 9.81
+        x, y = self.variable("x", start=0.0, fixed=True), self.variable("y", start=-L, fixed=True)
+        vx, vy = self.variable("vx", start=v0, fixed=True), self.variable("vy", start=0.0, fixed=True)
+        pull = self.variable("pull")
+        self.add_equations(
+            Eq(der(x), vx), Eq(der(y), vy), Eq(m * der(vx), -pull * x), Eq(m * der(vy), -pull * y - m * g)
+        )
+        self.complementary(L - sqrt(x**2 + y**2), pull, "taut", order=2, start=1)

@@ -9,6 +9,12 @@ HEIGHT = 0.0687074609657657
 SLOPES = [1.16388772098508, -0.00234772681723926, 0.0917386610428829]
 SIXTH_BY_E = 7.78065538147
 
+# Length 1, 5.2 m/s at the lowest point, g = 9.81: it goes slack where v²/L = −g·y/L, the bob flies a parabola back to
+# the circle, and the speed along the radius is lost there. Closed forms, evaluated with mpmath.
+SLACK, TAUT = 0.487173065075081, 0.487173065075081 + 0.620541476212468
+AT_1_5 = np.array([-0.711904658648973, -0.702276125889161])
+BY_V0 = np.array([0.688280822774, -0.69771747341])
+
 G, HEAVY, LIGHT = 9.81, 1.0, 0.3
 
 

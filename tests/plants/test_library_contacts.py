@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 import scipy.optimize
 from component_references import checks, measured
+from hybrid_models import Bob
+from hybrid_references import AT_1_5, BOUNCES, BY_V0, HEIGHT, SLACK, SLOPES, TAUT
 from problems import compiled
 from sympy import sqrt
 
@@ -34,27 +36,6 @@ def central(f, p, h):
 
 
 # --- a string that goes slack ----------------------------------------------------------------------------------------
-
-# Length 1, 5.2 m/s at the lowest point, g = 9.81: it goes slack where v²/L = −g·y/L, the bob flies a parabola back to
-# the circle, and the speed along the radius is lost there. Closed forms, evaluated with mpmath.
-SLACK, TAUT = 0.487173065075081, 0.487173065075081 + 0.620541476212468
-AT_1_5 = np.array([-0.711904658648973, -0.702276125889161])
-BY_V0 = np.array([0.688280822774, -0.69771747341])
-
-
-class Bob(Component):
-    """A point on a string, written as equations."""
-
-    def __init__(self, ev, name, L=1.0, v0=5.2):
-        super().__init__(ev, name)
-        L, v0, m, g = self.parameter("L", L), self.parameter("v0", v0), self.parameter("m", 2.0), 9.81
-        x, y = self.variable("x", start=0.0, fixed=True), self.variable("y", start=-L, fixed=True)
-        vx, vy = self.variable("vx", start=v0, fixed=True), self.variable("vy", start=0.0, fixed=True)
-        pull = self.variable("pull")
-        self.add_equations(
-            Eq(der(x), vx), Eq(der(y), vy), Eq(m * der(vx), -pull * x), Eq(m * der(vy), -pull * y - m * g)
-        )
-        self.complementary(L - sqrt(x**2 + y**2), pull, "taut", order=2, start=1)
 
 
 @pytest.fixture(scope="module")
@@ -154,11 +135,6 @@ def falling(*parts, connect=(), M=1.0, height=1.0, velocity=0.0):
     return compiled(*parts, ground, mass, weight, connect=between)
 
 
-# Dropped from 1 m, restitution 0.8, g = 9.81: t₀ = √(2h/g), then flights of 2·eᵏ·t₀. Closed forms, by mpmath.
-BOUNCES = [0.451523640985731, 1.1739614665629, 1.75191172702464, 2.21427193539402, 2.58416010208954, 2.88007063544594]
-AT_3, BY_RESTITUTION, BY_HEIGHT = 0.0687074609657657, 1.16388772098508, 0.0917386610428829
-
-
 @pytest.mark.slow
 @checks(
     {HardStop: ("closed form of a bouncing ball", "height", "bounces", "by restitution", "by height")}, origin=ORIGIN
@@ -173,11 +149,11 @@ def test_a_ball_on_a_stop():
         ][-1]
 
     solution = simulate(system, 3.0, **given)
-    measured("height", solution["mass.s"][-1], AT_3, SMOOTH)
+    measured("height", solution["mass.s"][-1], HEIGHT, SMOOTH)
     measured("bounces", solution.events.ts[:6], BOUNCES, 1e-10)
     by = jax.jit(jax.grad(height, (0, 1)))(0.8, 1.0)
-    measured("by restitution", by[0], BY_RESTITUTION, SMOOTH)
-    measured("by height", by[1], BY_HEIGHT, SMOOTH)
+    measured("by restitution", by[0], SLOPES[0], SMOOTH)
+    measured("by height", by[1], SLOPES[2], SMOOTH)
 
 
 @pytest.mark.slow
