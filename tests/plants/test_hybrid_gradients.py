@@ -120,10 +120,10 @@ def program(case: str):
     return jax.jit(jax.grad(run))
 
 
-# Digits at tolerances of 1e-6 and 1e-10. Where every piece is a polynomial the order of the method is enough for it, and
-# only rounding and event localization are left. The others keep their tolerances, over 35 switches of the thermostat
-# and 25 periods of the loop. The slope by the period is a sixtieth of what is integrated: the absolute tolerance takes
-# nearly two of its digits.
+# Digits at tolerances of 1e-6 and 1e-10. Where every piece is a polynomial, the method integrates it exactly; only
+# rounding and event localization are left. Errors of the others add up over 35 switches of the thermostat and 25
+# periods of the loop. The slope by the period is a sixtieth of what is integrated: the absolute tolerance takes nearly
+# two of its digits.
 DIGITS = {
     "a ball": (10, 10),
     "a thermostat": (7, 9),
