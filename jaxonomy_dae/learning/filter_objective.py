@@ -148,7 +148,7 @@ class FilterObjective(AheadObjective):
     @functools.cached_property
     def evidence(self) -> Evidence:
         """As `Objective.evidence`, for precisions alone: noise levels are coordinates."""
-        chosen_by_data = [name for name, given in self.penalties.items() if given == "evidence" and self.whole]
+        chosen_by_data = [name for name, given in self.penalties.items() if given == "evidence" and self.near is None]
         groups = [self._group(name) for name in chosen_by_data]
         chosen = tuple(group for group in groups if group.any())
         return Evidence(np.full(len(self.rows[0]), -1), (), np.zeros(0), chosen)

@@ -77,7 +77,8 @@ class Objective:
     coordinates: Coordinates
     penalties: dict[str, Any]  # "evidence" or a precision, by the name of a group
     counted: Bool[np.ndarray, " e"]
-    whole: bool = dataclasses.field(default=True, kw_only=True)  # the time of all experiments counts
+    # Over a part of the time, the centre of the priors of weights, free coordinates; None: zero, over all of it.
+    near: Float[np.ndarray, " f"] | None = dataclasses.field(default=None, kw_only=True)
 
     @property
     def has_variances(self) -> bool:
@@ -90,10 +91,12 @@ class Objective:
         fine = jnp.asarray(self.fine, self.system.parameters.values.dtype)
         return Setting(self.system, self.observers, self.layout, fine)
 
-    def until(self, share: float) -> "Objective":
-        """A copy with a share of each experiment's time. Over a part of it, precisions of weights stay as they begin:
-        what the first samples do not need may be needed later."""
-        return dataclasses.replace(self, stacked=self.stacked.until(share), whole=share >= 1)
+    def until(self, share: float, near: Float[np.ndarray, " f"]) -> "Objective":
+        """A copy with a share of each experiment's time. Over a part of it, priors of weights have their centre at
+        `near`, and precisions that stay: what the first samples do not need may be needed later. Towards zero, inner
+        layers shrink to where tanh is linear, and a search over more time hardly gets away from there."""
+        near_part = None if share >= 1 else near
+        return dataclasses.replace(self, stacked=self.stacked.until(share), near=near_part)
 
     @functools.cached_property
     def rows(self) -> tuple[Int[np.ndarray, " m"], ...]:
@@ -297,7 +300,7 @@ class Objective:
         values = s.values[self.rows]
         sizes = [np.max(np.abs(values[noise == k]), initial=0.0) for k in range(len(chosen))]
         floor = np.maximum(np.array(sizes) * np.finfo(self.system.parameters.values.dtype).eps, np.finfo(float).tiny)
-        chosen_by_data = [name for name, given in self.penalties.items() if given == "evidence" and self.whole]
+        chosen_by_data = [name for name, given in self.penalties.items() if given == "evidence" and self.near is None]
         groups = [self._group(name) for name in chosen_by_data]
         return Evidence(
             noise,
@@ -321,6 +324,8 @@ class Objective:
                 size = float(np.sum(c.centre[self.free][group] ** 2))
                 first = group.sum() / size if size > 0 else 1.0
                 precision[group] = first if given == "evidence" else float(given)
+                if given == "evidence" and self.near is not None:
+                    mean[group] = self.near[group]
         return self.evidence.first(Weights(row, precision, mean, np.sqrt(s.weight[experiment])), found)
 
     def _group(self, name: str) -> Bool[np.ndarray, " f"]:

@@ -15,7 +15,7 @@ from ..errors import ModelError, SimulationError
 from ..solvers.solve import check_tolerances, default_tolerances
 from ..system.system import AcausalSystem
 from .asked import as_asked, check_start, checked_method, names_to_train, penalties, started
-from .beginnings import beginning
+from .beginnings import beginning, silent
 from .coordinates import Coordinate, Coordinates, coordinates
 from .data import Data, Stacked, stack
 from .descent import Minimum
@@ -223,7 +223,8 @@ class Problem:
             which experiments that are held out are most likely, or else, and for a `Filter`, those that are fitted.
         - `adam`: so many gradient steps at first, with `learning_rate` on the scale of the coordinates.
         - `horizons`: shares of the time that are fitted one after the other, such as `(0.25, 0.5, 1)`: what diverges
-            over the whole time is caught early. None: all of it, or with `method="growing"`, ten of them.
+            over the whole time is caught early. Over a part, inner layers stay close to where they are, as far as
+            the data let them. None: all of it, or with `method="growing"`, ten of them.
         - `steps`: how many steps of least squares at most.
         - `warn`: whether a `FitWarning` tells the `reasons` for which the estimate is not `ok`.
 
@@ -327,7 +328,7 @@ class Problem:
             return shoot(objective, self.method, point, steps, self._options["rtol"])
         found = None
         for share in shares:
-            here = objective.until(share)
+            here = objective.until(share, silent(objective, point))
             if found is not None:
                 here = here.at_tolerance(found.tolerance)
             if adam and share == shares[0]:

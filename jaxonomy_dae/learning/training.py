@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from ..errors import ModelError, SimulationError, whole_number
 from ..optional import new_axes
+from .beginnings import silent
 from .checkpoint import described, fingerprint, read_facts, read_state, save
 from .evaluation import Evaluation, Weights
 from .gradient import Batches
@@ -161,7 +162,8 @@ def train(objective: Objective, start: Float[np.ndarray, " f"], plan: GradientSt
     if plan.patience is not None and not held_out:
         raise ModelError("patience needs experiments that are held out: Experiment(..., holdout=True)")
     low, high = objective.bounds
-    stages = {share: Batches(objective.until(share), plan.batch, plan.seed) for share in plan.horizons}
+    near = silent(objective, start)
+    stages = {share: Batches(objective.until(share, near), plan.batch, plan.seed) for share in plan.horizons}
     z = np.clip(start, low, high)
     weights = _weights(stages[plan.share(0)], z)
     if weights is None:
