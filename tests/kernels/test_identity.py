@@ -267,6 +267,10 @@ PAIRS: dict[str, tuple[tuple[Any, Any], str]] = {
     "vector.bounds": (pair(calls, "vector", "u", 2, 1.0, bounds=Two((0.0, 2.0), (0.0, 9.0))), STRUCTURE),
     "start.derivative": (pair(calls, "start", Two(SLOPE, lambda s, self: der(s.x)), 1.0), STRUCTURE),
     "start.value": (pair(calls, "start", SLOPE, Two(1.0, 2.0)), STRUCTURE),
+    "initially.equations": (
+        pair(calls, "initially", Two(lambda s, self: Eq(s.y, 1), lambda s, self: Eq(s.y, s.x))),
+        STRUCTURE,
+    ),
     "start.fixed": (pair(calls, "start", SLOPE, 1.0, fixed=Two(False, True)), STRUCTURE),
     "input.name": (pair(calls, "input", Two("u", "w"), 1.0), STRUCTURE),
     "input.default": (pair(calls, "input", "u", Two(1.0, 2.0)), STRUCTURE),

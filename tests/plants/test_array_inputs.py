@@ -236,7 +236,7 @@ NAN = np.array([0.0, np.nan, 1.0])
         ({"lag.u": (WHEN, np.ones((6, 1)) * NAN)}, r"input 'lag.u': values\[0, 1\] is nan; leave the sample out"),
         ({"lag.u": lambda t: jnp.ones(2) * t}, r"must return one number or an array of shape \(3,\) for a time"),
         ({"lag.u": 1.0, "lag[2].u": 2.0}, r"inputs: 'lag\[2\].u' is given twice, by its own name and as part of an"),
-        ({"lag[0].u": 1.0, "lag[2].u": 2.0}, r"input 'lag\[1\].u' has no default"),
+        ({"lag[0].u": 1.0, "lag[2].u": 2.0}, r"input 'lag\[1\].u' was not given, and has no default"),
         ({"lag.x": 1.0}, r"'lag.x' is not an input of this system"),
         ({"lag.u": (WHEN / 2, np.ones((6, 3)))}, r"samples of input 'lag.u' reach from 0 to 1, the run from 0 to 2"),
     ],
