@@ -9,7 +9,7 @@ import sympy
 
 from ..errors import ModelError
 from ..modeling.automatic_events import smooth
-from .values import Value, as_number, both, chosen, either, entrywise, is_condition, is_constant
+from .values import Value, as_number, both, chosen, either, entrywise, is_condition
 
 
 def _of_numbers(number: Callable[..., float], symbol: Callable[..., Any]) -> Callable[..., Value]:
@@ -208,4 +208,4 @@ def quotient(a: Value, b: Value) -> Value:
         return a / b
     if isinstance(b, int | float) and b == 0:
         raise ModelError(f"division of {a} by zero")
-    return a / sympy.Float(b) if isinstance(b, int | float) and is_constant(b) else a / b
+    return a / sympy.Float(b) if isinstance(b, int | float) else a / b

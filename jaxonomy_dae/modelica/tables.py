@@ -13,7 +13,7 @@ import sympy
 
 from ..errors import ModelError
 from ..modeling.automatic_events import smooth
-from .values import Value
+from .values import Value, chosen
 
 # The literals of Modelica.Blocks.Types.Smoothness and Extrapolation.
 LINEAR, AKIMA, CONSTANT, FRITSCH_BUTLAND, STEFFEN, MODIFIED_AKIMA = 1, 2, 3, 4, 5, 6
@@ -23,7 +23,8 @@ NEVER = 1e60  # a time event that does not come: corners of a table over time ar
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """Rows of abscissa and values; `start`, `offset` shift and begin a table over time."""
+    """Rows of abscissa and values. A table over time is shifted by `shift`. It is zero before `start`: the output of
+    Modelica.Blocks.Sources.CombiTimeTable is its offset there."""
 
     rows: np.ndarray
     columns: list[int]
@@ -34,6 +35,12 @@ class Table:
 
     def value(self, column: int, u: Value, events: bool) -> Value:
         """The value at `u` of the given one of the columns, counted from 1."""
+        found = self._interpolated(column, u, events)
+        if self.start <= -NEVER or not np.isfinite(self.start):
+            return found
+        return chosen(u < float(self.start), 0.0, found, quiet=not events)
+
+    def _interpolated(self, column: int, u: Value, events: bool) -> Value:
         x = self.rows[:, 0] + self.shift
         y = self.rows[:, int(self.columns[int(column) - 1]) - 1]
         if len(x) == 1:

@@ -23,15 +23,6 @@ def is_condition(value: Value) -> bool:
     return isinstance(value, bool | Boolean) and not isinstance(value, sympy.Symbol)
 
 
-def is_constant(value: Value) -> bool:
-    """True for what holds no symbol."""
-    if isinstance(value, list):
-        return all(map(is_constant, value))
-    if isinstance(value, Record):
-        return all(map(is_constant, value.values()))
-    return not isinstance(value, sympy.Basic) or not value.free_symbols
-
-
 def as_number(value: Value) -> Value:
     """A truth as 1 or 0; other values as they are."""
     if isinstance(value, bool):

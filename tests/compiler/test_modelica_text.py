@@ -185,6 +185,15 @@ def test_a_table_that_jumps_has_the_later_value_at_the_jump():
     assert [table.value(1, t, True) for t in (1.0, 2.0, 3.0)] == [0.0, 1.0, 1.0]
 
 
+def test_a_table_over_time_is_zero_before_its_start():
+    """Its start was read and left unused."""
+    table = Table(np.array([[0.0, 5.0], [2.0, 7.0]]), [2], 1, 2, start=1.0)
+    t = sympy.Symbol("t", real=True)
+    found = sympy.lambdify(t, table.value(1, t, True), "math")
+    for at, expected in ((0.5, 0.0), (1.0, 6.0), (1.5, 6.5)):
+        assert table.value(1, at, True) == found(at) == expected
+
+
 # --- components -------------------------------------------------------------------------------------------------------
 
 
