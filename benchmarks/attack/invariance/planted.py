@@ -159,6 +159,49 @@ def _dense_off(step: Any) -> Any:
     return bent
 
 
+def _share_of_one(weights: Any) -> Any:
+    import numpy as np
+
+    def bent(self: Any, *args: Any) -> Any:
+        found = weights(self, *args)
+        return dataclasses.replace(found, share=np.ones_like(found.share))
+
+    return bent
+
+
+def _missing_are_zero(stack: Any) -> Any:
+    import numpy as np
+
+    def bent(*args: Any) -> Any:
+        found = stack(*args)
+        return dataclasses.replace(found, observed=np.ones_like(found.observed))
+
+    return bent
+
+
+def _moved_with_start(change: Callable[[Any], dict[str, Any]]) -> Bend:
+    """Coordinates of which something else begins where the search does."""
+
+    def bend(as_asked: Any) -> Any:
+        def bent(*args: Any) -> Any:
+            found = as_asked(*args)
+            return dataclasses.replace(found, **change(found))
+
+        return bent
+
+    return bend
+
+
+def _centre_at_start(c: Any) -> dict[str, Any]:
+    return {"centre": c.z_start}
+
+
+def _size_of_start(c: Any) -> dict[str, Any]:
+    import numpy as np
+
+    return {"size": np.where(c.log, 1.0, np.abs(c.start))}
+
+
 FAULTS = (
     Planted("a", 1, "bounds are no part of a model's identity", "model.identity:_Walk._of", forgets("Interval")),
     Planted("a", 17, "models with the same names are the same", "lowering.plan:SystemPlan._identity", _by_names),
@@ -178,6 +221,11 @@ FAULTS = (
     Planted("e", 22, "small starts are zero", "system.system:AcausalSystem.initialize", _no_small_values),
     Planted("e", 21, "nominal values scale no tolerance", "simulation.step_sizes:scaled_atol",
             lambda _: lambda system, atol: atol),
+    Planted("f", 0, "a weight counts in residuals alone", "learning.objective:Objective.weights", _share_of_one),
+    Planted("f", 1, "missing samples are zeros", "learning.problem:stack", _missing_are_zero),
+    Planted("g", 0, "priors begin where the search does", "learning.problem:as_asked",
+            _moved_with_start(_centre_at_start)),
+    Planted("g", 0, "sizes are those of the start", "learning.problem:as_asked", _moved_with_start(_size_of_start)),
     Planted("h", 2, "slopes hang on how many parameters there are", "system.system:AcausalSystem.vector_field",
             _by_count(lambda system: len(system.parameters.names))),
     Planted("h", 1, "slopes hang on how many variables there are", "system.system:AcausalSystem.vector_field",

@@ -8,7 +8,7 @@ import contextlib
 import dataclasses
 import functools
 import multiprocessing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -129,11 +129,32 @@ def _programs():
     return point, run, bounded
 
 
-def everything(sketch: Sketch, running: bool) -> dict[str, Any]:
+@dataclasses.dataclass(frozen=True)
+class Asked:
+    """A model that a process makes, and what it is asked: values of `names` (all, if None), bounds of the parameters
+    `free`, and runs with these inputs to `end`."""
+
+    make: Callable[[], Any]
+    end: float
+    names: tuple[str, ...] | None = None
+    free: tuple[str, ...] | None = None
+    inputs: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+
+def asked_of(sketch: Sketch) -> Asked:
+    """What is asked of a sketch."""
+    from .said import compiled, inputs_of, variables_of
+
+    free = tuple(sketch.names()[n] for n in numbers(sketch))
+    names = tuple(variables_of(sketch).values())
+    return Asked(lambda: compiled(sketch), sketch.end, names, free, inputs_of(sketch))
+
+
+def everything(asked: Asked, running: bool) -> dict[str, Any]:
     """What is said of a model: texts, and numbers in hexadecimal; a refusal is a text."""
     from jaxonomy_dae import simulate
 
-    from .said import REFUSALS, compiled, inputs_of, variables_of
+    from .said import REFUSALS
 
     out: dict[str, Any] = {}
 
@@ -145,11 +166,11 @@ def everything(sketch: Sketch, running: bool) -> dict[str, Any]:
             out[what] = f"{type(error).__name__}: {error}"
 
     try:
-        system = compiled(sketch)
+        system = asked.make()
     except REFUSALS as error:
         return {"compiled": f"{type(error).__name__}: {error}"}
     point, run, bounded = _programs()
-    names = tuple(variables_of(sketch).values())
+    names = (*system.variables, *system.discretes) if asked.names is None else asked.names
     variables = tuple(n for n in names if n in system.variables)
     tell("report", lambda: str(system.report))
     tell("parameters", lambda: system.parameters.values)
@@ -160,17 +181,19 @@ def everything(sketch: Sketch, running: bool) -> dict[str, Any]:
     if not isinstance(out["start"], str):
         x = system.initialize()
         tell("variables and slopes", lambda: np.concatenate(point(system, x, variables)))
-    free = tuple(sketch.names()[n] for n in numbers(sketch))
+    free = tuple(system.parameters.names) if asked.free is None else asked.free
     if free:
         tell("free numbers", lambda: np.concatenate([np.ravel(a) for a in bounded(system, free)]))
     if running and x is not None:
-        ts = np.linspace(0.2, 1.0, 5) * sketch.end
-        inputs = inputs_of(sketch)
-        kinds = tuple((n, v[2:]) for n, v in inputs.items() if isinstance(v, tuple))
-        arrays = {n: v[:2] if isinstance(v, tuple) else v for n, v in inputs.items()}
+        ts = np.linspace(0.2, 1.0, 5) * asked.end
+        kinds = tuple((n, v[2:]) for n, v in asked.inputs.items() if isinstance(v, tuple))
+        arrays = {n: v[:2] if isinstance(v, tuple) else v for n, v in asked.inputs.items()}
 
         def eager():
-            solution = simulate(system, sketch.end, ts=ts, inputs=inputs)
+            solution = simulate(system, asked.end, ts=ts, inputs=asked.inputs)
+            tell("what a run says", lambda: repr(solution))
+            for account in (solution.energy, solution.dissipation, solution.supply):
+                tell(account.__name__, account)
             return np.stack([np.asarray(solution[n]) for n in names])
 
         def inside():
@@ -182,9 +205,22 @@ def everything(sketch: Sketch, running: bool) -> dict[str, Any]:
     return out
 
 
+def asked_for(number: int) -> tuple[str, list[Asked], list[str]]:
+    """What model it is, what processes are asked of it and its twins, and what is different in each; of every third
+    number, of a pair that differs in one argument of one declaration."""
+    if number % 3:
+        found, what = models(number)
+        return found[0].note, [asked_of(sketch) for sketch in found], what
+    from .declarations import PAIRS, built
+
+    name = list(PAIRS)[number // 3 % len(PAIRS)]
+    sides, _ = PAIRS[name]
+    return name, [Asked(functools.partial(built, side), 1.0) for side in sides], ["one side", "the other side"]
+
+
 def in_order(number: int, order: tuple[int, ...], running: bool, fault: int | None) -> list[dict[str, Any]]:
     """What is said of a model and its twins, one after the other; with a deliberate fault, if one is given."""
-    found, _ = models(number)
+    _, found, _ = asked_for(number)
     with contextlib.ExitStack() as stack:
         if fault is not None:
             from .planted import FAULTS, planted
@@ -204,9 +240,9 @@ def process(number: int, planted: int | None = None):
     """Letter a; with the deliberate fault number `planted`."""
     from .said import Pairs
 
-    found, what = models(number)
-    running = number % 2 == 0
-    pairs = Pairs("a", found[0].note)
+    note, found, what = asked_for(number)
+    running = number % 3 == 0 or number % 2 == 0
+    pairs = Pairs("a", note)
     count = len(found)
 
     orders = (tuple(range(count)), tuple(reversed(range(count))))
