@@ -20,7 +20,8 @@ from jaxonomy_dae import AcausalDiagram, Component, EqnEnv, Interval, NeuralDAEB
 from jaxonomy_dae.expressions.to_sympy import write
 from jaxonomy_dae.model.linear_template import LinearTemplate
 from jaxonomy_dae.model.opaque import OpaqueFunction
-from jaxonomy_dae.model.tables import EquationGroup, FlatModel, Start
+from jaxonomy_dae.model.starts import Start
+from jaxonomy_dae.model.tables import EquationGroup, FlatModel
 from jaxonomy_dae.modeling.symbols import TIME_LABEL, ParameterSymbol, VariableSymbol
 
 NAME = "m"

@@ -19,6 +19,7 @@ from sympy.printing.str import StrPrinter
 import jaxonomy_dae.library
 from jaxonomy_dae import Component, Domain, EqnEnv
 from jaxonomy_dae.modeling.arrays import ComponentArray, PortArray
+from jaxonomy_dae.modeling.event_flags import EventFlag
 from jaxonomy_dae.modeling.events import Assign, Reinit, Sampled, Terminate
 from jaxonomy_dae.modeling.interval import Interval
 from jaxonomy_dae.modeling.symbols import ParameterSymbol, RelationSymbol
@@ -87,18 +88,11 @@ def as_written() -> Iterator[tuple[list[Any], list[Any]]]:
         add_equations(self, *given)
 
     def noted_event(
-        self: Component,
-        condition: Any,
-        actions: Any,
-        on: Any,
-        immediate: bool,
-        noted: bool = True,
-        *rest: Any,
-        **more: Any,
+        self: Component, condition: Any, actions: Any, on: Any, flags: EventFlag, *rest: Any, **more: Any
     ) -> None:
-        if noted:
+        if EventFlag.LISTED in flags:
             events.append((self, condition, actions, on))
-        event(self, condition, actions, on, immediate, noted, *rest, **more)
+        event(self, condition, actions, on, flags, *rest, **more)
 
     def noted_either(self: Component, condition: Any, then: Any, otherwise: Any, order: int, pushes: Any) -> Any:
         so_far = len(equations)

@@ -14,10 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxonomy_dae.hybrid.control import EventControl
+from jaxonomy_dae.hybrid.facts import EventFacts
 from jaxonomy_dae.hybrid.problem import AbstractHybridProblem
 from jaxonomy_dae.hybrid.solver import WithEvents
 from jaxonomy_dae.hybrid.start import start
 from jaxonomy_dae.hybrid.term import HybridTerm
+from jaxonomy_dae.modeling.event_flags import NO_FLAG, EventFlag
 from jaxonomy_dae.solvers.drive import integrate
 
 STATES, DISCRETES, CLOCKS = 4, 4, 3
@@ -124,24 +126,24 @@ def affine(
     return Numbers(x, start_q, slopes, guards, waves, writes, clocks), names
 
 
+def _flags(guard: int) -> EventFlag:
+    if guard >= RELATION:
+        return EventFlag.RELATION | EventFlag.REVOCABLE
+    return EventFlag.LISTED | (EventFlag.AT_START if guard == IMMEDIATE else NO_FLAG)
+
+
+FACTS = EventFacts(
+    flags=(NO_FLAG,) * CLOCKS + tuple(map(_flags, range(GUARDS))),
+    n_clocks=CLOCKS,
+    ends=tuple(k == CLOCKS + ENDING for k in range(EVENTS)),
+    opposite=(-1,) * RELATION + (RELATION + 1, RELATION),
+)
+
+
 class Affine(AbstractHybridProblem):
     numbers: Numbers
     resolution: Any
-    n_clocks: int = eqx.field(static=True, default=CLOCKS)
-    n_guards: int = eqx.field(static=True, default=GUARDS)
-    ends: tuple[bool, ...] = eqx.field(static=True, default=tuple(k == CLOCKS + ENDING for k in range(EVENTS)))
-    immediate: tuple[bool, ...] = eqx.field(static=True, default=tuple(k == CLOCKS + IMMEDIATE for k in range(EVENTS)))
-    noted: tuple[bool, ...] = eqx.field(
-        static=True, default=(False,) * CLOCKS + (True,) * RELATION + (False,) * (GUARDS - RELATION)
-    )
-    revocable: tuple[bool, ...] = eqx.field(static=True, default=tuple(k >= CLOCKS + RELATION for k in range(EVENTS)))
-    relations: tuple[bool, ...] = eqx.field(static=True, default=tuple(k >= CLOCKS + RELATION for k in range(EVENTS)))
-    strikes: tuple[bool, ...] = eqx.field(static=True, default=(False,) * EVENTS)
-    strict: tuple[bool, ...] = eqx.field(static=True, default=(False,) * EVENTS)
-    choices: tuple[int, ...] = eqx.field(static=True, default=())
-    choice_guards: tuple[int, ...] = eqx.field(static=True, default=())
-    only_kinks: bool = eqx.field(static=True, default=False)
-    opposite: tuple[int, ...] = eqx.field(static=True, default=(-1,) * RELATION + (RELATION + 1, RELATION))
+    facts: EventFacts = eqx.field(static=True, default=FACTS)
 
     def term(self, q):
         return diffrax.ODETerm(lambda t, x, args: self.field(t, x, q, args))

@@ -19,6 +19,7 @@ import numpy as np
 
 from ..lowering.plan import SystemPlan
 from ..model.declared import declared_scale
+from ..modeling.event_flags import EventFlag
 from ..system.system import AcausalSystem
 from ..tolerances import solved
 
@@ -54,7 +55,7 @@ def resting_events(plan: SystemPlan, kept: Sequence[int] = (), drifting: Sequenc
     if events is None:
         return None
     table = events.table
-    relation = np.array(table.relation, bool)
+    relation = table.are(EventFlag.RELATION)
     ignored = np.isin(table.discrete, list(kept)) & (table.discrete >= 0)
     ignored |= np.isin(events.state, list(drifting)) & (events.state >= 0)
     mine = ~relation[table.event] & ~ignored
@@ -66,9 +67,9 @@ def resting_events(plan: SystemPlan, kept: Sequence[int] = (), drifting: Sequenc
     unknown, computed = sampled.astype(np.int64), np.setdiff1d(computed, sampled).astype(np.int64)
     acting = np.zeros(len(table), bool)
     acting[table.event[mine & ~clocked]] = True
-    acting |= np.array([m is not None for m in table.message]) & ~relation
+    acting |= table.ends & ~relation
     acting[: events.n_clocks] = False
-    chooses = mine & ~clocked & np.array(table.revocable, bool)[table.event]
+    chooses = mine & ~clocked & table.are(EventFlag.REVOCABLE)[table.event]
     chooses &= (table.discrete >= 0) & (table.discrete < events.n_visible)
     flips = _flips(np.unique(table.discrete[chooses]).tolist(), len(events.discrete))
     return RestingEvents(unknown, ticking, computed, acting, ignored, flips)
@@ -111,14 +112,13 @@ def next_event(
     none = guard_rounding(system, here, x)
     # A condition such as v <= 0 holds at zero. Of the two sides of a complementary pair both may be zero, and then
     # either mode will do.
-    at_zero = ~(np.array(table.strict) | np.array(table.revocable))[plan.n_clocks :]
+    at_zero = ~table.are(EventFlag.STRICT | EventFlag.REVOCABLE)[plan.n_clocks :]
     holds = jnp.concatenate([jnp.zeros(plan.n_clocks, bool), (value < -none) | (at_zero & (value <= none))])
     values, now = _written(system, t, inputs, x, q)
     differs = jnp.abs(values - now) > solved(x.dtype) * jnp.maximum(jnp.abs(values), jnp.abs(now))
     changes = jnp.zeros(len(table), bool).at[table.event].max(differs & ~events.ignored)
-    ends = np.array([message is not None for message in table.message])
-    acting = events.acting & (np.array(table.immediate, bool) if at_start else True)
-    happens = holds & acting & (changes | ends)
+    acting = events.acting & (table.are(EventFlag.AT_START) if at_start else True)
+    happens = holds & acting & (changes | table.ends)
     return jnp.where(jnp.any(happens), jnp.argmax(happens), -1)
 
 

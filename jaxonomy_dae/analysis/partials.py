@@ -81,7 +81,7 @@ def _alike(sides: Any) -> Any:
 def _moves(plan: SystemPlan, near: Any) -> Any:
     """Whether one of these events lets states jump, or ends the run."""
     events: Any = plan.events
-    moves = np.array([message is not None for message in events.table.message])
+    moves = events.table.ends
     moves[events.table.event[events.state >= 0]] = True
     return jnp.any(near & moves)
 

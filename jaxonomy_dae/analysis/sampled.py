@@ -124,7 +124,7 @@ def instants_of(system: AcausalSystem, events: RestingEvents) -> Instants:
     plan: Any = system.plan.events
     clocks = np.unique(plan.table.event[events.ticking]).tolist()
     known = system.parameters.known
-    declared = [plan.table.clocks[e] for e in clocks]
+    declared = [plan.table.events[e].clock for e in clocks]
     if known is None and len(set(declared)) == 1:  # their order is known whatever the period is
         return Instants((tuple(clocks),), ((0,) * len(clocks),), dict.fromkeys(clocks, 1))
     if known is None and any(part.parameters for clock in declared for part in clock):

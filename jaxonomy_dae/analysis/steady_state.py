@@ -195,8 +195,9 @@ def _restless(system: AcausalSystem, event: int) -> str:
     plan: Any = system.plan.events
     table = plan.table
     text = table.text[event]
-    if table.message[event] is not None:
-        return f"no steady state: '{text}' holds at the equilibrium, where it ends the run ({table.message[event]!r})"
+    message = table.events[event].message
+    if message is not None:
+        return f"no steady state: '{text}' holds at the equilibrium, where it ends the run ({message!r})"
     rows = table.event == event
     names = [system.discretes[k] for k in table.discrete[rows].tolist() if 0 <= k < plan.n_visible]
     names += [system.states[k] for k in plan.state[rows].tolist() if k >= 0]

@@ -128,18 +128,20 @@ def add_corrections(model: ModelNumbers, diagram: AcausalDiagram, variables: Var
     extra = len(names) - len(variables)
     if extra:
         variables = VariableTable(
-            names,
-            np.concatenate([variables.is_input, np.zeros(extra, bool)]),
-            np.concatenate([variables.is_port, np.zeros(extra, bool)]),
-            variables.start.padded(extra),
-            np.concatenate([variables.fixed, np.zeros(extra, bool)]),
-            np.concatenate([variables.nominal, np.zeros(extra)]),
-            np.concatenate([variables.bounds, np.tile([-np.inf, np.inf], (extra, 1))]),
-            [*variables.unit, *[""] * extra],
-            [*variables.default, *[None] * extra],
-            np.concatenate([variables.owner, np.full(extra, -1)]),
-            np.concatenate([variables.port, np.full(extra, -1)]),
-            np.concatenate([variables.is_across, np.zeros(extra, bool)]),
-            np.concatenate([variables.is_internal, np.isin(np.arange(len(variables), len(names)), physics)]),
+            names=names,
+            is_input=np.concatenate([variables.is_input, np.zeros(extra, bool)]),
+            is_port=np.concatenate([variables.is_port, np.zeros(extra, bool)]),
+            start=variables.start.padded(extra),
+            fixed=np.concatenate([variables.fixed, np.zeros(extra, bool)]),
+            nominal=np.concatenate([variables.nominal, np.zeros(extra)]),
+            bounds=np.concatenate([variables.bounds, np.tile([-np.inf, np.inf], (extra, 1))]),
+            unit=[*variables.unit, *[""] * extra],
+            default=[*variables.default, *[None] * extra],
+            owner=np.concatenate([variables.owner, np.full(extra, -1)]),
+            port=np.concatenate([variables.port, np.full(extra, -1)]),
+            is_across=np.concatenate([variables.is_across, np.zeros(extra, bool)]),
+            is_internal=np.concatenate(
+                [variables.is_internal, np.isin(np.arange(len(variables), len(names)), physics)]
+            ),
         )
     return variables, groups, tuple(rows)

@@ -18,6 +18,7 @@ from ..expressions.to_sympy import shortened
 from ..modeling.component import Component
 from ..modeling.declarations import START
 from ..modeling.diagram import AcausalDiagram
+from ..modeling.event_flags import EventFlag
 from ..modeling.events import Sampled, Terminate, When
 from ..modeling.symbols import TIME_LABEL, symbol_label
 from ..units.fit import misfit_of_units, misfits_of_condition, misfits_of_equation, misfits_of_value
@@ -169,7 +170,9 @@ def _statements(component: Component, unit_of: UnitOf) -> Iterator[Statement]:
         if isinstance(value, str) and not isinstance(action, Terminate)
     }
     # A relation that is an event stands in an equation, too.
-    unseen = {name for when in component.events if not when.noted for name in (when.guard, *when.values)}
+    unseen = {
+        name for when in component.events if EventFlag.LISTED not in when.flags for name in (when.guard, *when.values)
+    }
     for equation in (component.as_written.get(e, e) for e in component.equations):
         # What events compute are hidden variables, each with an equation of its own.
         event = None
@@ -198,7 +201,7 @@ def _statements(component: Component, unit_of: UnitOf) -> Iterator[Statement]:
         if value is not None:
             yield _given(f"'{name}' = {shortened(value)}", name, value, unit_of(("parameter of", name)))
     for when in component.events:
-        if isinstance(when.clock, Sampled) and when.noted:
+        if isinstance(when.clock, Sampled) and (EventFlag.LISTED in when.flags):
             for what, value in (("period", when.clock.period), ("offset", when.clock.offset)):
                 if value is not None and _symbolic(value) is not None:
                     yield _given(f"the {what} of {when.text} = {shortened(value)}", f"a {what}", value, SECOND)

@@ -7,8 +7,9 @@ import numpy as np
 import sympy
 
 from ..errors import ModelError
+from ..model.starts import StartGroup, Starts
 from ..model.symbolic import SymbolicTemplate, canonical
-from ..model.tables import DependentParameters, ParameterTable, StartGroup, Starts, VariableTable, complete
+from ..model.tables import DependentParameters, ParameterTable, VariableTable, complete
 from ..modeling.declarations import EachValue, Variable
 from ..modeling.interval import Interval
 from .number_model import Instances, ModelNumbers
@@ -62,19 +63,19 @@ def variable_table(model: ModelNumbers, driven: set[int]) -> VariableTable:
     default[~is_input] = None
     bounds = np.array([(v.bounds.low, v.bounds.high) for v, *_ in records], float).reshape(-1, 2)
     return VariableTable(
-        model.variable_names,
-        is_input,
-        column(lambda v, p, a: v.kind == "port", bool),
-        _starts(model, started),
-        column(lambda v, p, a: v.fixed, bool),
-        column(lambda v, p, a: v.nominal, float),
-        bounds[record],
-        column(lambda v, p, a: v.unit, object).tolist(),
-        default.tolist(),
-        owner,
-        port,
-        column(lambda v, p, a: a, bool),
-        column(lambda v, p, a: v.kind in ("start", "event"), bool),
+        names=model.variable_names,
+        is_input=is_input,
+        is_port=column(lambda v, p, a: v.kind == "port", bool),
+        start=_starts(model, started),
+        fixed=column(lambda v, p, a: v.fixed, bool),
+        nominal=column(lambda v, p, a: v.nominal, float),
+        bounds=bounds[record],
+        unit=column(lambda v, p, a: v.unit, object).tolist(),
+        default=default.tolist(),
+        owner=owner,
+        port=port,
+        is_across=column(lambda v, p, a: a, bool),
+        is_internal=column(lambda v, p, a: v.kind in ("start", "event"), bool),
     )
 
 

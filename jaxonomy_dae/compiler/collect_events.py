@@ -1,15 +1,15 @@
 """The events of all components, as one table."""
 
-import dataclasses
 from typing import Any
 
 import numpy as np
 
 from ..expressions.to_sympy import shortened
+from ..model.events import Event, EventTable, HeldTable, Write
+from ..model.starts import Start
 from ..model.symbolic import canonical
-from ..model.tables import NO_EVENTS, EventTable, HeldTable, Start
 from ..modeling.automatic_events import relations_left_alone
-from ..modeling.events import Assign, Terminate, When
+from ..modeling.events import Assign, Reinit, Terminate, When
 from .number_model import Instances, ModelNumbers
 from .read_equations import read_expression
 
@@ -22,7 +22,7 @@ def event_table(model: ModelNumbers) -> EventTable:
             found.extend((k, n, i, row, when) for row, k in enumerate(i.number.tolist()))
     left_alone = _left_alone(model)
     if not found:
-        return dataclasses.replace(NO_EVENTS, left_alone=left_alone)
+        return EventTable(left_alone=left_alone)
     found.sort(key=lambda entry: (entry[4].clock is None, entry[0], entry[1]))
     place = {int(p): i for i, p in enumerate(model.discrete)}
     known: dict[tuple[int, str, bool], np.ndarray] = {}
@@ -44,46 +44,34 @@ def event_table(model: ModelNumbers) -> EventTable:
         graph = read_expression(expression, model.paths[i.number[row]])
         return Start(canonical(graph, (), symbols), tuple(parameter(i, s.path, row) for s in symbols))
 
-    rows: list[tuple[int, int, int, int, float]] = []
-    for e, (_, _, i, row, when) in enumerate(found):
-        for action, value in zip(when.actions, when.values, strict=True):
-            if isinstance(action, Terminate):
-                continue
-            is_name = isinstance(value, str)
-            target = action.target.path
-            rows.append(
-                (
-                    e,
-                    -1 if isinstance(action, Assign) else variable(i, target, row),
-                    place[parameter(i, target, row)] if isinstance(action, Assign) else -1,
-                    variable(i, value, row) if is_name else -1,
-                    0.0 if is_name else float(value),  # type: ignore[arg-type]
-                )
-            )
-    columns = list(zip(*rows, strict=True)) or [()] * 5
-    event, state, discrete, value = (np.array(c, np.int64) for c in columns[:4])
-    whens = [when for *_, when in found]
-    return EventTable(
-        tuple(f"{model.paths[k]}: when({when.text})" for k, *_, when in found),
-        np.array([-1 if w.guard is None else variable(i, w.guard, row) for _, _, i, row, w in found], np.int64),
-        tuple((None if w.clock.period is None else in_parameters(i, row, w.clock.period),
-               in_parameters(i, row, w.clock.offset))
-              for _, _, i, row, w in found if w.clock is not None),
-        tuple(next((a.message for a in w.actions if isinstance(a, Terminate)), None) for w in whens),
-        tuple(when.noted for when in whens),
-        tuple(when.revocable for when in whens),
-        tuple(when.relation for when in whens),
-        tuple(when.kink for when in whens),
-        tuple(when.strict for when in whens),
-        tuple(when.strike for when in whens),
-        tuple(when.immediate for when in whens),
-        event,
-        state,
-        discrete,
-        value,
-        np.array(columns[4], float),
-        left_alone,
-    )  # fmt: skip
+    def write(i: Instances, row: int, action: Reinit | Assign, value: str | float) -> Write:
+        target = action.target.path
+        is_name = isinstance(value, str)
+        return Write(
+            state=-1 if isinstance(action, Assign) else variable(i, target, row),
+            discrete=place[parameter(i, target, row)] if isinstance(action, Assign) else -1,
+            value=variable(i, value, row) if is_name else -1,
+            constant=0.0 if is_name else float(value),
+        )
+
+    def event(k: int, i: Instances, row: int, when: When) -> Event:
+        clock = when.clock
+        period = None if clock is None or clock.period is None else in_parameters(i, row, clock.period)
+        return Event(
+            owner=model.paths[k],
+            condition=when.text,
+            guard=-1 if when.guard is None else variable(i, when.guard, row),
+            clock=None if clock is None else (period, in_parameters(i, row, clock.offset)),
+            message=next((a.message for a in when.actions if isinstance(a, Terminate)), None),
+            flags=when.flags,
+            writes=tuple(
+                write(i, row, action, value)
+                for action, value in zip(when.actions, when.values, strict=True)
+                if not isinstance(action, Terminate) and value is not None
+            ),
+        )
+
+    return EventTable(tuple(event(k, i, row, when) for k, _, i, row, when in found), left_alone)
 
 
 def _left_alone(model: ModelNumbers) -> tuple[str, ...]:

@@ -125,19 +125,19 @@ class ModelNumbers:
                 shape = (*shape, *array.shape)
             number, variable, parameter, relation, port = first.T
             found = Instances(
-                component,
-                parent,
-                up,
-                array,
-                shape,
-                component.name if parent is None else f"{parent.path}.{component.name}",
-                number,
-                variable,
-                parameter,
-                relation,
-                port,
-                self._position(tuple(component.variables)),
-                self._position(tuple(component.parameters)),
+                component=component,
+                parent=parent,
+                up=up,
+                array=array,
+                shape=shape,
+                path=component.name if parent is None else f"{parent.path}.{component.name}",
+                number=number,
+                variable=variable,
+                parameter=parameter,
+                relation=relation,
+                port=port,
+                variable_positions=self._position(tuple(component.variables)),
+                parameter_positions=self._position(tuple(component.parameters)),
             )
             self.instances.append(found)
             push(component.children, found, first + np.array(_own(component)))

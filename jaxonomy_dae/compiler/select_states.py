@@ -150,12 +150,12 @@ def select_states(model: ReducedModel, mode: str, merit: Sequence[Merit]) -> Sta
     below_last = extended.level < c[extended.base]
     constraints = np.flatnonzero(below_last & projected[extended.base])
     return StateSelection(
-        states,
-        constraints,
-        np.flatnonzero(is_dummy & ~settled),
-        np.flatnonzero(projected),
-        np.flatnonzero(settled),
-        tuple(notes),
+        states=states,
+        constraints=constraints,
+        dummies=np.flatnonzero(is_dummy & ~settled),
+        projected=np.flatnonzero(projected),
+        settled=np.flatnonzero(settled),
+        notes=tuple(notes),
     )
 
 

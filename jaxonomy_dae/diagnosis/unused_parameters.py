@@ -15,7 +15,7 @@ def unused_parameters(flat: FlatModel) -> list[int]:
     used = np.zeros(len(table), bool)
     for group in (*flat.groups, *flat.accounts, *flat.variables.start.groups):
         used[group.parameter.ravel()] = True
-    for start in (s for clock in flat.events.clocks for s in clock if s):
+    for start in (s for event in flat.events.events for s in event.clock or () if s):
         used[list(start.parameters)] = True
     for dependents in reversed(table.dependents):  # each reads only those before it
         read = dependents.parameter[used[dependents.target]]

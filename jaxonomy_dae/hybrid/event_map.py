@@ -23,6 +23,7 @@ from jax import lax
 from ..adjoint.closure_conversion import any_member, written
 from ..adjoint.resting import still
 from ..aliases import Args, Time
+from ..modeling.event_flags import EventFlag
 from .first_order import constant_once
 from .log import EventRows
 from .modes import Search, sets_to_flip
@@ -103,11 +104,11 @@ class Arrival(NamedTuple):
 
 def most_at_once(problem: AbstractHybridProblem) -> int:
     """The largest number of events that can be listed at one instant."""
-    return _most_in_turn(problem) * max(sum(problem.strikes), 1)
+    return _most_in_turn(problem) * max(int(problem.facts.are(EventFlag.STRIKE).sum()), 1)
 
 
 def _most_in_turn(problem: AbstractHybridProblem) -> int:
-    return problem.n_clocks + min(2 * problem.n_guards, CONDITIONS_AT_ONE_INSTANT)
+    return problem.facts.n_clocks + min(2 * problem.facts.n_guards, CONDITIONS_AT_ONE_INSTANT)
 
 
 def handle(
@@ -118,14 +119,14 @@ def handle(
 
     At the initial time, `at_start`, events do not move with parameters, and are logged only if they end the run.
     """
-    c, g = problem.n_clocks, problem.n_guards
-    listed = np.array(problem.noted, bool) & (np.arange(c + g) >= c) & (not at_start)
-    ends = jnp.asarray(problem.ends).astype(t.dtype)
-    relations = jnp.asarray(problem.relations)
+    c, g = problem.facts.n_clocks, problem.facts.n_guards
+    listed = problem.facts.are(EventFlag.LISTED) & (np.arange(c + g) >= c) & (not at_start)
+    ends = jnp.asarray(problem.facts.ends).astype(t.dtype)
+    relations = jnp.asarray(problem.facts.are(EventFlag.RELATION))
     # At the initial time, what is zero and begins to fall is an event of the first step, and no part of this instant.
     waits = (arrival.size == 0) & (arrival.rate < 0) & ~arrival.due[c:] if at_start else np.zeros(g, bool)
-    strikes = jnp.asarray(problem.strikes, bool)
-    several = sum(problem.strikes) > 1
+    several = problem.facts.are(EventFlag.STRIKE).sum() > 1
+    strikes = jnp.asarray(problem.facts.are(EventFlag.STRIKE))
     first = state.count
 
     def one(instant: Instant) -> Instant:
@@ -150,7 +151,7 @@ def handle(
             # relation has an opposite, which falls then.
             rose = (state.armed == BELOW) & _is_zero(value, rates, arrival) & (rates > 0) & ~relations[c:]
             # What has jumped onto zero and does not move there is true unless it is strict.
-            onto = arrival.jumped & (value == 0) & (rates == 0) & ~jnp.asarray(problem.strict[c:], bool)
+            onto = arrival.jumped & (value == 0) & (rates == 0) & ~problem.facts.are(EventFlag.STRICT)[c:]
             crossing = -values[k] / jnp.where(rates[k] == 0, 1.0, rates[k])
             # Where another event has made the guard slow, rounding is all that is left of its value.
             frozen = lax.stop_gradient(crossing)
@@ -256,7 +257,7 @@ def _following(
     states whose slope hardly changes during the delay, the sides of the guards, events left, guards that an event made
     true, guards that are stuck); only q is differentiated.
     """
-    c, g = problem.n_clocks, problem.n_guards
+    c, g = problem.facts.n_clocks, problem.facts.n_guards
     left = instant.left & ~happening
     if not g:
         slope = problem.slope(t, x, q, args)
@@ -266,7 +267,7 @@ def _following(
     instant = still(instant)
     here = happening[c:]
     rested = here & (instant.state.armed == RESTS)
-    turns_back = jnp.asarray(problem.opposite)[jnp.clip(event - c, 0, g - 1)] == jnp.arange(g)
+    turns_back = jnp.asarray(problem.facts.opposite)[jnp.clip(event - c, 0, g - 1)] == jnp.arange(g)
     band = rounding(arrival.size)
     ahead = AHEAD * arrival.span
 
@@ -275,20 +276,23 @@ def _following(
         so before."""
         return _is_zero(value, rate, arrival) & ((jnp.abs(rate) * ahead <= band) | rested)
 
-    sets, conditions = jnp.asarray(sets_to_flip(problem.choices, len(q))), np.array(problem.choice_guards, int)
+    sets, conditions = (
+        jnp.asarray(sets_to_flip(problem.facts.choices, len(q))),
+        np.array(problem.facts.choice_guards, int),
+    )
 
     # Slopes, guards and their rates after the event, with what was before it, before the delay, and, where a guard is
     # flat, a little ahead: in a loop, for XLA compiles the equations as often as they are written.
     def look(carry):
         k, search, slopes, values, rates = carry
-        slope, now = slopes[0], jnp.where(search.flipped(sets), 1.0 - q, q) if problem.choices else q
+        slope, now = slopes[0], jnp.where(search.flipped(sets), 1.0 - q, q) if problem.facts.choices else q
         places = jnp.stack([x, instant.arrived, x - slope * delay, x + slope * ahead])
         time = t + jnp.stack([delay, jnp.zeros_like(t), jnp.zeros_like(t), ahead])[k]
         own = problem.slope(time, places[k], now, args)
         slopes = written(slopes, k, own)
         value, rate = problem.rates(time, places[k], now, args, jnp.where((k == 0) | (k == 3), own, slope))
         carry = slopes, written(values, k, value), written(rates, k, rate)
-        if not problem.choices:
+        if not problem.facts.choices:
             return k + 1, search, *carry
         violated = (value < 0) & ~_is_zero(value, rate, arrival)
         after, found = search.after(sets, own, value, violated[conditions])
@@ -302,7 +306,7 @@ def _following(
     rows = jnp.zeros((4, g), x.dtype)
     begin = jnp.array(0), Search.begin(len(q), x.dtype), jnp.zeros((4, *x.shape), x.dtype), rows, rows
     _, search, (slope, _, earlier, _), values, rates = lax.while_loop(unfinished, look, begin)
-    written_q = jnp.where(search.base, 1.0 - written_q, written_q) if problem.choices else written_q
+    written_q = jnp.where(search.base, 1.0 - written_q, written_q) if problem.facts.choices else written_q
     slow = (jnp.abs(earlier - slope) <= STEADY * jnp.abs(slope)).astype(x.dtype)
     (value, at_arrival, _, _), (rate, rate_there, _, rate_ahead) = values, rates
     reached = at_arrival <= jnp.maximum(band, _within(rate_there, arrival))
@@ -316,14 +320,14 @@ def _following(
     falling = jnp.where(flat, 0.5 * (rate + rate_ahead), rate)
     # Where an event makes sides equal that do not move, as sides made of other relations, a relation that is not strict
     # has become true. Conditions of events wait until they leave zero: modes of something at rest would turn for ever.
-    equal = zero & (rate == 0) & (instant.state.armed == ABOVE) & ~here & problem.true_at_zero
-    equal = equal & np.array(problem.relations[c:], bool)
+    equal = zero & (rate == 0) & (instant.state.armed == ABOVE) & ~here & problem.facts.true_at_zero
+    equal = equal & problem.facts.are(EventFlag.RELATION)[c:]
     stays = (left[c:] & onto & (value == 0)) | equal
     true = jnp.where(zero, ((falling * arrival.span < -band) & ~waits) | stays, value < 0)
     was_armed = ((instant.state.armed > 0) & ~here) | (turns_back & (event >= c)) | (rose & ~here)
     # What this event made true happens next. What was to happen does so, though a state starts anew: unless what was
     # assigned makes its condition false, or it is revocable and undone.
-    stands = left[c:] & ~np.array(problem.revocable[c:], bool) & reached
+    stands = left[c:] & ~problem.facts.are(EventFlag.REVOCABLE)[c:] & reached
     caused = (((was_armed | (left[c:] & instant.caused)) & true) | stands) & (~zero | equal)
     next_ones = ((was_armed | left[c:]) & true & ~here) | stands
     rests = was_armed | left[c:] | (falling * arrival.span > band)  # what was undone may happen later

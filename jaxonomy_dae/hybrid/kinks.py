@@ -25,7 +25,7 @@ def turned(
 
     The guard of a relation falls, and the one of its opposite is armed: it rises, or rests at zero.
     """
-    opposite, c = np.array(problem.opposite, int), problem.n_clocks
+    opposite, c = np.array(problem.facts.opposite, int), problem.facts.n_clocks
     ticks = state.ticks + due[:c].astype(state.ticks.dtype)
     q = problem.settled(t, state.x, state.q, due, args)
     events, due = due, due[c:]

@@ -11,6 +11,7 @@ from jax import lax
 from ..adjoint.closure_conversion import any_member
 from ..adjoint.resting import still
 from ..aliases import Args, State, Time
+from ..modeling.event_flags import EventFlag
 from ..tolerances import WINDOW
 from .event_map import AHEAD, CLOSE, Arrival
 from .problem import AbstractHybridProblem, HybridState
@@ -77,7 +78,7 @@ def looked_at(
     at the end. A jump is located, and its rate known, by the equations.
     """
     problem, dense, t0, t1, y0, x1, args = still((problem, dense, t0, t1, y0, x1, args))
-    h, q, g = t1 - t0, y0.q, problem.n_guards
+    h, q, g = t1 - t0, y0.q, problem.facts.n_guards
     span = jnp.maximum(h, FORGOTTEN * y0.span)
     window = jnp.maximum(WINDOW * span, problem.resolution)
     # The controller lets steps end at ticks, up to rounding.
@@ -87,7 +88,7 @@ def looked_at(
 
     if not g:
         before = zero
-        if not problem.only_kinks:
+        if not problem.facts.only_kinks:
             before = lax.cond(any_member(jnp.any(ticking)), lambda: problem.slope(t1, x1, q, args), lambda: zero)
         return Met(never, y0.armed, y0.size, Arrival(before, y0.size, ticking, none, y0.size, window, span))
 
@@ -115,8 +116,8 @@ def looked_at(
 def _met(problem, dense, t0, t1, y0: HybridState, x1, args, times, values, off, clocks: Met) -> Met:
     """Looks for events in a step, given the guards' `values` at `times`, shape (looks, guards), `off`, their distance
     from a parabola, shape (guards,), and the result `clocks` for sampled events alone."""
-    h, q, g, arrival = t1 - t0, y0.q, problem.n_guards, clocks.arrival
-    span, window, ticking = arrival.span, arrival.window, arrival.due[: problem.n_clocks]
+    h, q, g, arrival = t1 - t0, y0.q, problem.facts.n_guards, clocks.arrival
+    span, window, ticking = arrival.span, arrival.window, arrival.due[: problem.facts.n_clocks]
     size = jnp.max(jnp.abs(values), axis=0)
     band = rounding(arrival.size)
     # What has left the band above zero anywhere before is above, and armed, as is what rests.
@@ -131,7 +132,7 @@ def _met(problem, dense, t0, t1, y0: HybridState, x1, args, times, values, off, 
     left_there = jnp.maximum(band, jnp.minimum(rise * window, CLOSE * size))
     below = (values[1:] < 0) & (above[:-1] | (rise <= 0) | (values[1:] < -left_there))
     # One may also reach zero and stay; or have jumped there, which makes a condition true if it is not strict.
-    strict = np.array(problem.strict[problem.n_clocks :], bool)
+    strict = problem.facts.are(EventFlag.STRICT)[problem.facts.n_clocks :]
     stays = (values[1:] == 0) & ((values[:-1] > 0) | ((values[:-1] == 0) & above[:-1] & ~strict))
     crossed = armed[:-1] & (below | stays)
     last = values[-1]
@@ -147,7 +148,7 @@ def _met(problem, dense, t0, t1, y0: HybridState, x1, args, times, values, off, 
 
     # A step that cannot be parted any further: its parts would not be told from its ends.
     short = h <= 4 * problem.resolution
-    if problem.only_kinks:
+    if problem.facts.only_kinks:
         before, near = jnp.zeros_like(x1), reaches_zero(jnp.asarray(_RATE_AT_END, values.dtype) @ values / h)
     else:
         doubtful = jnp.any(armed[-1] & (last <= CLOSE * size)) | jnp.any(ticking) | short
@@ -166,7 +167,7 @@ def _met(problem, dense, t0, t1, y0: HybridState, x1, args, times, values, off, 
         place = jnp.argmax(jnp.any(crossed, axis=1))
 
         def guards(t):
-            if problem.only_kinks:
+            if problem.facts.only_kinks:
                 return _between((t - t0) / h, values - raised) + raised[place + 1]
             return problem.guards(t, dense(t0, t1, t), q, args) + raised[place + 1]
 

@@ -8,12 +8,12 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..adjoint.appended import AbstractAppending
 from ..aliases import Args, State, Time
+from .facts import EventFacts
 from .first_order import constant_once
 from .log import EventRows
 
@@ -21,23 +21,10 @@ from .log import EventRows
 class AbstractHybridProblem(eqx.Module):
     """Equations whose discrete values `q` stay constant between events.
 
-    Sampled events come first, `n_clocks` of them, then `n_guards` events of conditions: each has a guard that falls
-    through zero where its condition becomes true.
+    Each event of a condition has a guard, which falls through zero where the condition becomes true.
     """
 
-    n_clocks: eqx.AbstractVar[int]
-    n_guards: eqx.AbstractVar[int]
-    ends: eqx.AbstractVar[tuple[bool, ...]]  # which events end the run
-    immediate: eqx.AbstractVar[tuple[bool, ...]]  # which happen at the initial time, if their conditions hold there
-    noted: eqx.AbstractVar[tuple[bool, ...]]  # which are counted and listed
-    revocable: eqx.AbstractVar[tuple[bool, ...]]  # which another event may undo before they happen
-    relations: eqx.AbstractVar[tuple[bool, ...]]  # which say what a relation is, from the initial time on
-    strikes: eqx.AbstractVar[tuple[bool, ...]]  # which happen at once with others of them at the same instant
-    strict: eqx.AbstractVar[tuple[bool, ...]]  # whose conditions are false where their guards are zero
-    opposite: eqx.AbstractVar[tuple[int, ...]]  # of each guard: the one that falls where its relation turns back, or −1
-    choices: eqx.AbstractVar[tuple[int, ...]]  # discrete values, 0 or 1, that their conditions choose, …
-    choice_guards: eqx.AbstractVar[tuple[int, ...]]  # … which hold while these guards are not negative
-    only_kinks: eqx.AbstractVar[bool]  # whether all events are relations at which dx/dt and guards do not jump
+    facts: eqx.AbstractVar[EventFacts]
     resolution: eqx.AbstractVar[Any]  # a time that is nothing beside the run, but more than rounding
 
     @abc.abstractmethod
@@ -79,15 +66,6 @@ class AbstractHybridProblem(eqx.Module):
     @abc.abstractmethod
     def clocks(self) -> tuple[Float[Array, " clocks"], Float[Array, " clocks"]]:
         """Periods and offsets of the sampled events; the period is infinite for one that happens once."""
-
-    @property
-    def true_at_zero(self) -> Bool[np.ndarray, " guards"]:
-        """The guards whose conditions hold where they are zero: those that are not strict, but for those that choose a
-        mode, of which two are zero at once."""
-        strict, relations, revocable = (
-            np.array(column[self.n_clocks :], bool) for column in (self.strict, self.relations, self.revocable)
-        )
-        return ~strict & (relations | ~revocable)
 
     def due(self, ticks: Float[Array, " clocks"]) -> Float[Array, " clocks"]:
         """The time of the next tick of each clock, given the number of ticks so far."""

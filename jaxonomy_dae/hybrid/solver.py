@@ -143,7 +143,7 @@ class WithEvents(diffrax.AbstractWrappedSolver):
         def events(state):
             return handle(problem, t1, state, arrival, args, noted)
 
-        if problem.only_kinks:
+        if problem.facts.only_kinks:
             y1, slope = turned(problem, t1, state, values, arrival.due, args), jnp.zeros_like(x1)
         else:
             y1, slope, noted = lax.cond(any_member(fired), events, lambda state: (state, *none), state)

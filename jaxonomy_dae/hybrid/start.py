@@ -9,6 +9,7 @@ from jax import lax
 
 from ..adjoint.resting import still
 from ..aliases import Args, State, Time
+from ..modeling.event_flags import EventFlag
 from .event_map import Arrival, handle
 from .log import EventRows
 from .problem import AbstractHybridProblem, HybridState
@@ -39,10 +40,10 @@ def start(
 
     `logged` says for how many events there is room, `sides` whether the states before and after them are kept.
     """
-    c, dtype = problem.n_clocks, t0.dtype
+    c, dtype = problem.facts.n_clocks, t0.dtype
     nothing = jnp.zeros((), dtype)
     tolerance = problem.resolution
-    relations = np.array(problem.relations, bool)
+    relations = problem.facts.are(EventFlag.RELATION)
     ticks = _ticks_before(problem, t0, None if resumed is None else resumed.ticked)
     due = problem.due(ticks) <= t0 + tolerance
     q0, rate, value = _settled(problem, t0, x0, q0, due, args, resumed)
@@ -51,9 +52,9 @@ def start(
     if resumed is None:
         # A strict condition whose sides are equal is false: if it becomes true at once, that is an event of the first
         # step. One that happens at the start, if it holds there, happens at once then, too.
-        turned, holds = _turned(problem, value, rate), (value < 0) | ((value == 0) & problem.true_at_zero)
+        turned, holds = _turned(problem, value, rate), (value < 0) | ((value == 0) & problem.facts.true_at_zero)
         armed = jnp.where(jnp.where(relations[c:], turned, holds), BELOW, jnp.where(value == 0, RESTS, ABOVE))
-        at_once = np.array(problem.immediate[c:], bool) & ~relations[c:]
+        at_once = problem.facts.are(EventFlag.AT_START)[c:] & ~relations[c:]
         due_conditions = holds | ((value == 0) & (rate < 0))
     else:
         size = jnp.maximum(size, resumed.sizes)
@@ -80,9 +81,9 @@ def start(
 
 def _ticks_before(problem: AbstractHybridProblem, t0: Time, ticked: Any) -> Any:
     """How often each clock has ticked before t0, and at t0 if it has `ticked` there."""
-    dtype, c = t0.dtype, problem.n_clocks
+    dtype, c = t0.dtype, problem.facts.n_clocks
     period, offset = (lax.stop_gradient(v) for v in problem.clocks())
-    relations = np.array(problem.relations[:c], bool)
+    relations = problem.facts.are(EventFlag.RELATION)[:c]
     passed = t0 - problem.resolution - offset
     ticks = jnp.where(jnp.isinf(period), (passed > 0).astype(dtype), jnp.ceil(passed / period))
     ticks = jnp.where(relations, ticks, jnp.maximum(ticks, 0.0))  # relations have turned at all times
@@ -98,7 +99,7 @@ def _ticks_before(problem: AbstractHybridProblem, t0: Time, ticked: Any) -> Any:
 def _turned(problem: AbstractHybridProblem, value: Any, rate: Any) -> Any:
     """True for relations that hold from the initial time on. A guard at zero is judged by its rate, and where that is
     zero, too, by the kind of its relation."""
-    return (value < 0) | ((value == 0) & ((rate < 0) | ((rate == 0) & problem.true_at_zero)))
+    return (value < 0) | ((value == 0) & ((rate < 0) | ((rate == 0) & problem.facts.true_at_zero)))
 
 
 def _beyond_doubt(size: Any) -> Any:
@@ -113,8 +114,8 @@ def _settled(
     """Settles the relations at the initial time: each gets the truth of its sides, or, if its clock is `due`, what that
     writes; of a run that is `resumed`, one whose sides are equal keeps its truth. Returns (q, rates of the guards,
     values of the guards); q does not move with parameters."""
-    c, g = problem.n_clocks, problem.n_guards
-    relations = np.array(problem.relations, bool)
+    c, g = problem.facts.n_clocks, problem.facts.n_guards
+    relations = problem.facts.are(EventFlag.RELATION)
     given = still((problem, t0, x0, q0, due, args, resumed))
     problem, t0, x0, begin, due, args, resumed = given
 
@@ -122,8 +123,8 @@ def _settled(
         return problem.settled(t0, x0, q, jnp.concatenate([clocks, holding]) & relations, args)
 
     def looked_at(q: Any) -> tuple[Any, Any]:
-        if problem.only_kinks:  # which of two that are opposite holds at zero does not matter
-            first = np.arange(g) < np.array(problem.opposite)
+        if problem.facts.only_kinks:  # which of two that are opposite holds at zero does not matter
+            first = np.arange(g) < np.array(problem.facts.opposite)
             return problem.guards(t0, x0, q, args), jnp.where(first, -1.0, 1.0).astype(x0.dtype)
         return problem.rates(t0, x0, q, args, problem.slope(t0, x0, q, args))
 

@@ -30,7 +30,8 @@ from ..model.jacobian import generic_jacobian
 from ..model.natural_sizes import natural_sizes
 from ..model.networks import Networks
 from ..model.quantities import ABSENT
-from ..model.tables import ZERO, Start, complete
+from ..model.starts import Start
+from ..model.tables import ZERO, complete
 from ..structure.matching import match_in_order
 from ..tolerances import HALF_OF_THE_DIGITS, ILL_CONDITIONED, KNOWN, NO_PART, TINY
 

@@ -13,10 +13,12 @@ import numpy as np
 
 from ..expressions.node import FALSE, Node, leaf, number, postorder
 from ..expressions.substitute import rebuilt
+from ..model.events import EventTable
 from ..model.quantities import QuantityMap
 from ..model.symbolic import SymbolicTemplate, parameter_label, template_of
-from ..model.tables import ZERO, EventTable, FlatModel
+from ..model.tables import ZERO, FlatModel
 from ..model.template import AbstractTemplate
+from ..modeling.event_flags import EventFlag
 from ..modeling.events import LIVE
 from .schedule import AnyStep, Step
 
@@ -27,7 +29,7 @@ def without_live_relations(
     """Returns (the model without the events of relations that nonlinear equations need as they are, notes about
     them)."""
     table = flat.events
-    relation = np.array(table.relation, bool)
+    relation = table.are(EventFlag.RELATION)
     if not relation.any():
         return flat, ()
     rows = relation[table.event] & (table.discrete >= 0)
@@ -45,10 +47,10 @@ def without_live_relations(
         count = gone.sum()
         gone[table.event[live[assigned] & (assigned >= 0)]] = True
         live[assigned[gone[table.event] & (assigned >= 0)]] = True
-    texts = dict.fromkeys(table.text[e] for e in np.flatnonzero(gone & relation).tolist())
+    turned = [table.events[e] for e in np.flatnonzero(gone & relation).tolist()]
     notes = tuple(
-        f"{where}: '{condition[:-1]}' is no event: nonlinear equations that it stands in determine what it compares"
-        for where, _, condition in (text.partition(": when(") for text in texts)
+        f"{owner}: '{condition}' is no event: nonlinear equations that it stands in determine what it compares"
+        for owner, condition in dict.fromkeys((event.owner, event.condition) for event in turned)
     )
     return dataclasses.replace(flat, events=table.take(np.flatnonzero(~gone).tolist())), notes
 

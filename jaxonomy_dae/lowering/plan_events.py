@@ -7,9 +7,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ..errors import ModelError
+from ..hybrid.facts import EventFacts
+from ..model.events import EventTable, HeldTable
 from ..model.extended import Extended
 from ..model.quantities import QuantityMap
-from ..model.tables import ZERO, DependentParameters, EventTable, FlatModel
+from ..model.tables import ZERO, DependentParameters, FlatModel
+from ..modeling.event_flags import EventFlag
 from .gather import NOTHING, Gather
 from .program import Program
 from .schedule import AnyStep
@@ -19,12 +22,11 @@ from .schedule import AnyStep
 class EventPlan:
     """The events of a system.
 
-    Sampled events come first, `n_clocks` of them; `guard` reads the values of the others, which fall through zero. The
+    Sampled events come first; `guard` reads the values of the others, which fall through zero. The
     rows of `state`, `factor` and `value` belong to the actions of `table`.
     """
 
     table: EventTable
-    n_clocks: int
     guards: Program
     guard: Gather
     values: Program
@@ -34,7 +36,12 @@ class EventPlan:
     discrete: np.ndarray  # the parameters that are discrete variables, hidden ones last
     n_visible: int  # how many of them were declared
     dependents: tuple[DependentParameters, ...]  # the parameters that follow them
-    only_kinks: bool  # whether no event changes values of states or slopes
+    facts: EventFacts
+
+    @property
+    def n_clocks(self) -> int:
+        """How many events are sampled."""
+        return self.table.n_clocks
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -44,7 +51,7 @@ class EventPlan:
     @property
     def are_listed(self) -> bool:
         """True if any of them is listed."""
-        return any(self.table.noted[self.n_clocks :]) or any(message is not None for message in self.table.message)
+        return bool(self.table.are(EventFlag.LISTED)[self.n_clocks :].any() or self.table.ends.any())
 
     def __len__(self) -> int:
         return len(self.table)
@@ -70,8 +77,7 @@ def plan_events(
     if not len(table):
         return None
     table = _in_order(table, _reads(flat, variables, steps, extended.quantities.n))
-    n_clocks = len(table.clocks)
-    guards, guard = read_variables(variables, table.guard[n_clocks:], program)
+    guards, guard = read_variables(variables, table.guard[table.n_clocks :], program)
     values, value = read_variables(variables, table.value, program)
     position = {int(q): k for k, q in enumerate(states)}
     place, factor = np.full(len(table.state), -1, np.int64), np.ones(len(table.state))
@@ -92,11 +98,51 @@ def plan_events(
                     f"{table.text[table.event[row]]}: '{flat.variables.names[table.state[other]]}' and "
                     f"'{flat.variables.names[v]}' are one state, which is given two values by one event: reinit one"
                 )
+    choices, choice_guards = _choices(table, flat.held)
     return EventPlan(
-        table, n_clocks, guards, guard, values, value, place, factor, flat.parameters.discrete,
-        len(flat.parameters.discrete) - flat.parameters.n_relations, _following(flat),
-        all(table.kink) and _only_as_written(flat.parameters.discrete, extended),
-    )  # fmt: skip
+        table=table,
+        guards=guards,
+        guard=guard,
+        values=values,
+        value=value,
+        state=place,
+        factor=factor,
+        discrete=flat.parameters.discrete,
+        n_visible=len(flat.parameters.discrete) - flat.parameters.n_relations,
+        dependents=_following(flat),
+        facts=EventFacts(
+            flags=tuple(event.flags for event in table.events),
+            n_clocks=table.n_clocks,
+            ends=tuple(table.ends.tolist()),
+            opposite=_opposite(table),
+            choices=choices,
+            choice_guards=choice_guards,
+            only_kinks=bool(table.are(EventFlag.KINK).all()) and _only_as_written(flat.parameters.discrete, extended),
+        ),
+    )
+
+
+def _choices(table: EventTable, held: HeldTable) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Returns (the discrete values that `complementary` chooses, the guards that choose them). Contacts between states
+    are left out: they close by impulses, and do not make equations singular."""
+    chooses = table.are(EventFlag.REVOCABLE) & ~table.are(EventFlag.RELATION)
+    chooses[table.event[np.isin(table.discrete, held.closed[held.closed >= 0])]] = False
+    rows = chooses[table.event] & (table.discrete >= 0) & (table.event >= table.n_clocks)
+    guards = table.event[rows] - table.n_clocks
+    return tuple(np.unique(table.discrete[rows]).tolist()), tuple(np.unique(guards).tolist())
+
+
+def _opposite(table: EventTable) -> tuple[int, ...]:
+    """For each guard of a relation, the number of the guard that sets the same discrete value the other way; −1 for
+    other guards."""
+    opposite = [-1] * (len(table) - table.n_clocks)
+    other: dict[int, int] = {}
+    for guard, event in enumerate(table.events[table.n_clocks :]):
+        for write in event.writes if EventFlag.RELATION in event.flags else ():
+            if write.discrete in other:
+                opposite[guard], opposite[other[write.discrete]] = other[write.discrete], guard
+            other[write.discrete] = guard
+    return tuple(opposite)
 
 
 def _only_as_written(parameters: np.ndarray, extended: Extended) -> bool:
@@ -112,7 +158,8 @@ def _reads(flat: FlatModel, variables: QuantityMap, steps: Sequence[AnyStep], n:
     out = []
     for event in range(len(table)):
         values = table.value[(table.event == event) & (table.value >= 0)]
-        if not len(values) or (event >= len(table.clocks) and table.relation[event]):
+        is_relation = event >= table.n_clocks and EventFlag.RELATION in table.events[event].flags
+        if is_relation or not len(values):
             out.append(set())
             continue
         found = _parameters_behind(variables.quantity[values], steps, n)
@@ -137,7 +184,7 @@ def _in_order(table: EventTable, reads: list[set[int]]) -> EventTable:
     """The events in the order in which they happen at one instant: those that write what others read come first,
     sampled ones before conditions."""
     writes = [set(table.discrete[(table.event == e) & (table.discrete >= 0)].tolist()) for e in range(len(reads))]
-    n = len(table.clocks)
+    n = table.n_clocks
 
     def sorted_by_reads(events: range) -> list[int]:
         sorter: graphlib.TopologicalSorter[int] = graphlib.TopologicalSorter({e: () for e in events})

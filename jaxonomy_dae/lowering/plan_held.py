@@ -5,8 +5,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ..model.events import HeldTable
 from ..model.quantities import QuantityMap
-from ..model.tables import HeldTable
 from .gather import Gather
 from .plan_events import read_variables
 from .program import Program

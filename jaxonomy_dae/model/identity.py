@@ -7,6 +7,7 @@ is of no known type is refused, so that nothing is forgotten.
 """
 
 import dataclasses
+import enum
 import functools
 import hashlib
 import types
@@ -79,6 +80,8 @@ class _Walk:
                 return self._all(name, [*part, *part.values()])
             case set() | frozenset():
                 return _digest(name, *sorted(map(self.digest, part)))
+            case enum.Enum():
+                return _digest(name, repr(part.value).encode())
             case type():
                 return _digest("type", f"{part.__module__}.{part.__qualname__}".encode())
             case Node():

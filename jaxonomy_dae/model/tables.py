@@ -7,90 +7,21 @@ of integers. After alias elimination a slot also has a factor, and variable −1
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any, overload
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from ..modeling.interval import Interval
 from .array_names import ArrayNames
+from .events import NO_EVENTS, NONE_HELD, EventTable, HeldTable
 from .opaque import OpaqueFunction
 from .provenance import Provenance, Provenances
+from .starts import Starts
 from .symbolic import SymbolicTemplate
 from .template import AbstractTemplate
 
 ZERO = -1  # stands for a variable, or quantity, that is identically zero
-
-
-@dataclasses.dataclass(frozen=True)
-class Start:
-    """A start value: an expression in parameters, as a template without slots, and the parameters it reads."""
-
-    template: SymbolicTemplate
-    parameters: tuple[int, ...]
-
-
-@dataclasses.dataclass(frozen=True)
-class StartGroup:
-    """The starts of several variables that one template computes, each from its own parameters."""
-
-    template: SymbolicTemplate
-    variable: np.ndarray  # (n,)
-    parameter: np.ndarray  # (n, parameters of the template)
-
-
-class Starts(Sequence[Start | None]):
-    """The start of every variable, None where there is none."""
-
-    def __init__(self, n: int, groups: Sequence[StartGroup]):
-        self.groups = tuple(groups)
-        self._place = np.full((n, 2), -1, np.int64)
-        for k, group in enumerate(self.groups):
-            self._place[group.variable] = np.stack([np.full(len(group.variable), k), np.arange(len(group.variable))], 1)
-
-    @property
-    def is_given(self) -> np.ndarray:
-        """True for variables that have a start."""
-        return self._place[:, 0] >= 0
-
-    @property
-    def is_number(self) -> np.ndarray:
-        """True for variables that have a start which no parameter changes."""
-        number = [group.parameter.shape[1] == 0 for group in self.groups]
-        return np.array([*number, False], bool)[self._place[:, 0]]
-
-    @property
-    def is_zero(self) -> np.ndarray:
-        """True for variables whose start is the number zero."""
-        most = max((int(group.parameter.max(initial=-1)) for group in self.groups), default=-1)
-        return self.is_number & (self.values(np.ones(most + 1)) == 0.0)
-
-    def values(self, parameters: np.ndarray) -> np.ndarray:
-        """The starts of all variables, zero where there is none."""
-        out = np.zeros(len(self))
-        for group in self.groups:
-            columns = list(parameters[group.parameter].T)
-            out[group.variable] = group.template.residual([], columns, [], 0.0, None, backend="numpy")
-        return out
-
-    def padded(self, extra: int) -> "Starts":
-        """A copy with `extra` more variables, which have no start."""
-        return Starts(len(self) + extra, self.groups)
-
-    def __len__(self):
-        return len(self._place)
-
-    @overload
-    def __getitem__(self, index: int) -> "Start | None": ...
-    @overload
-    def __getitem__(self, index: slice) -> "list[Start | None]": ...
-    def __getitem__(self, index):
-        if isinstance(index, slice):
-            return [self[k] for k in range(len(self))[index]]
-        group, place = self._place[index].tolist()
-        if group < 0:
-            return None
-        return Start(self.groups[group].template, tuple(self.groups[group].parameter[place].tolist()))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -214,69 +145,6 @@ class RowInjection:
     opaque: OpaqueFunction
     targets: tuple[int, ...]
     inputs: tuple[int, ...]  # variables, time left out
-
-
-@dataclasses.dataclass(frozen=True)
-class EventTable:
-    """The events of a model, sampled ones first; and what they write, one row for each action."""
-
-    text: tuple[str, ...]  # of each event
-    guard: np.ndarray  # (events,): the variable that falls through zero; −1 for sampled ones
-    clocks: tuple[tuple[Start | None, Start], ...]  # period and offset of the sampled ones; some happen once
-    message: tuple[str | None, ...]  # with which an event ends the run
-    noted: tuple[bool, ...]  # whether an event is listed; others only say that equations change
-    revocable: tuple[bool, ...]  # whether another event at the same instant may undo it before it happens
-    relation: tuple[bool, ...]  # whether an event says what a relation is, from the initial time on
-    kink: tuple[bool, ...]  # whether equations as written go on with the same values there
-    strict: tuple[bool, ...]  # whether its condition is false where its guard is zero
-    strike: tuple[bool, ...]  # whether a contact closes, at once with others that close at the same instant
-    immediate: tuple[bool, ...]  # whether an event happens at the initial time, if its condition holds there
-    event: np.ndarray  # (actions,)
-    state: np.ndarray  # (actions,): the variable that starts anew, or −1
-    discrete: np.ndarray  # (actions,): the place among the discrete variables of the one assigned, or −1
-    value: np.ndarray  # (actions,): the variable that has the value, or −1 for …
-    constant: np.ndarray  # (actions,): … a number
-    left_alone: tuple[str, ...] = ()  # the parts of equations with relations that are no events
-
-    def __len__(self):
-        return len(self.text)
-
-    def take(self, events: Sequence[int]) -> "EventTable":
-        """The table with these events, in this order, sampled ones first, and what they write."""
-        place = np.full(len(self), -1, np.int64)
-        place[events] = np.arange(len(events))
-        rows = place[self.event] >= 0
-        columns = ("text", "message", "noted", "revocable", "relation", "kink", "strict", "strike", "immediate")
-        of_events = {name: tuple(getattr(self, name)[e] for e in events) for name in columns}
-        of_actions = {name: getattr(self, name)[rows] for name in ("state", "discrete", "value", "constant")}
-        clocks = tuple(self.clocks[e] for e in events if e < len(self.clocks))
-        event = place[self.event[rows]]
-        return dataclasses.replace(
-            self, guard=self.guard[events], clocks=clocks, event=event, **of_events, **of_actions
-        )
-
-
-_NONE = np.zeros(0, np.int64)
-NO_EVENTS = EventTable((), _NONE, (), (), (), (), (), (), (), (), (), _NONE, _NONE, _NONE, _NONE, np.zeros(0))
-
-
-@dataclasses.dataclass(frozen=True)
-class HeldTable:
-    """The branches of `either` that are differentiated: constraints that come and go with modes."""
-
-    text: tuple[str, ...]  # of each
-    active: np.ndarray  # (held,): the variable that is 1 while it holds, and 0 otherwise
-    impulse: np.ndarray  # (held,): the place among the discrete variables of what lets an impulse act
-    force: np.ndarray  # (held,): the variable that is never negative, or −1
-    closed: np.ndarray  # (held,): the place among the discrete variables of the one that lets go at 0, or −1
-    level: np.ndarray  # (levels,): the variables that are zero while they hold …
-    owner: np.ndarray  # (levels,): … each with its constraint, the highest derivative of a constraint last
-
-    def __len__(self):
-        return len(self.text)
-
-
-NONE_HELD = HeldTable((), *(_NONE,) * 6)
 
 
 @dataclasses.dataclass(frozen=True)

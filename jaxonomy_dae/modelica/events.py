@@ -12,6 +12,7 @@ from typing import Any
 import sympy
 
 from ..errors import ModelError
+from ..modeling.event_flags import EventFlag
 from ..modeling.events import Sampled, assign, pre, reinit, terminate
 from ..modeling.symbols import DiscreteSymbol, VariableSymbol
 from .scope import Scope
@@ -49,7 +50,7 @@ def write_mode(scope: Scope, name: str) -> None:
         condition = scope.kept.in_events(pending)
         if not isinstance(condition, bool):
             scope.pending.append(pending)
-            scope.component._event(condition, (assign(m, result),), None, True, noted=False, revocable=True)
+            scope.component._event(condition, (assign(m, result),), None, EventFlag.AT_START | EventFlag.REVOCABLE)
 
 
 def write_end_of_start(scope: Scope) -> None:
@@ -60,7 +61,7 @@ def write_end_of_start(scope: Scope) -> None:
     for pending in scope.pending:
         ends = both(ends, negated(pending))
     condition = scope.kept.in_events(ends)
-    scope.component._event(condition, (assign(scope.initial, 0),), None, True, noted=False, revocable=True)
+    scope.component._event(condition, (assign(scope.initial, 0),), None, EventFlag.AT_START | EventFlag.REVOCABLE)
 
 
 def write_when(scope: Scope, s: Branches) -> None:

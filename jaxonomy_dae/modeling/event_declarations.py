@@ -7,6 +7,7 @@ import sympy
 from ..errors import ModelError
 from ..expressions.from_sympy import symbols_of
 from .environment import EqnEnv
+from .event_flags import NO_FLAG, EventFlag
 from .events import (
     Action,
     Assign,
@@ -104,13 +105,18 @@ class EventDeclarations:
 
         - `ModelError` for conditions and actions that cannot be meant.
         """
-        self._event(condition, actions, on, at_start)
+        self._event(condition, actions, on, EventFlag.LISTED | (EventFlag.AT_START if at_start else NO_FLAG))
 
     def _event(
-        self, condition: Any, actions: tuple[Action, ...], on: Any, immediate: bool, noted: bool = True,
-        revocable: bool = False, text: str | None = None, relation: bool = False, watched: Any = sympy.true,
-        kink: bool = False, strike: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        condition: Any,
+        actions: tuple[Action, ...],
+        on: Any,
+        flags: EventFlag,
+        text: str | None = None,
+        watched: Any = sympy.true,
+    ) -> None:
+        """Declares an event, shown as `text`; its guard is monitored only while `watched` holds."""
         self._check_open("declare its events")
         where = f"component '{self.name}': when"
         if not actions:
@@ -124,7 +130,9 @@ class EventDeclarations:
         guard, shown = None, text or f"sampled({getattr(clock, 'period', '')})"
         if clock is None:
             shown = text or (str(condition) if on is None else f"{condition}, on={on}")
-            watchable = condition if relation else self._without_jumps(condition)  # which may add events
+            watchable = (
+                condition if EventFlag.RELATION in flags else self._without_jumps(condition)
+            )  # which may add events
             expression = guard_of(watchable, where)
             if on is not None:
                 expression = while_on(expression, relation_in_discretes(on, f"{where}, on"))
@@ -140,22 +148,9 @@ class EventDeclarations:
         elif on is not None:
             raise ModelError(f"{where}: on= is for conditions on variables; a sampled event always happens")
         values = self._values(actions, len(self.events), where)
-        self.events.append(
-            When(
-                shown,
-                guard,
-                clock,
-                tuple(actions),
-                values,
-                immediate,
-                noted,
-                revocable,
-                relation,
-                kink,
-                is_strict(condition),
-                strike,
-            )  # fmt: skip
-        )
+        if is_strict(condition):
+            flags |= EventFlag.STRICT
+        self.events.append(When(shown, guard, clock, tuple(actions), values, flags))
 
     def _hidden(self, name: str, expression: sympy.Expr) -> str:
         """Declares a variable that equals an expression, and is not shown."""

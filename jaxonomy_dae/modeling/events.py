@@ -8,6 +8,7 @@ from sympy.logic.boolalg import BooleanAtom, BooleanFunction, to_nnf
 
 from ..errors import ModelError
 from ..expressions.from_sympy import symbols_of
+from .event_flags import EventFlag
 from .symbols import DiscreteSymbol, ParameterSymbol, PreviousSymbol, RelationSymbol, TimeSymbol, VariableSymbol
 
 LIVE = 2  # a relation that is as its sides say
@@ -49,27 +50,19 @@ class Sampled:
 
 @dataclasses.dataclass(frozen=True)
 class When:
-    """One `when` of a component: `guard` is the name of the hidden variable that falls through zero where the condition
-    becomes true, `clock` the period and the offset of a sampled one. `values` are the names of the hidden variables, or
-    the numbers, that the actions write; `text` is what the user wrote. One that is `immediate` happens at the initial
-    time, too, if its condition holds there; one that is not `noted` only says that equations change. One that is
-    `revocable` does not happen if another event at the same instant has made its condition false again. A `relation`
-    says what a hidden discrete variable is, from the initial time on; it is a `kink` if equations go on with the same
-    values where it turns. A `strict` condition is false where its guard is zero. A `strike` closes a
-    contact, at once with others that close at the same instant."""
+    """One `when` of a component.
+
+    `text` is the condition as the user wrote it. `guard` is the name of the hidden variable that falls through zero
+    where the condition becomes true; a sampled event has a `clock` instead. `values` are the names of the hidden
+    variables, or the numbers, that the actions write.
+    """
 
     text: str
     guard: str | None
     clock: Sampled | None
     actions: tuple[Action, ...]
     values: tuple[str | float | None, ...]
-    immediate: bool = False
-    noted: bool = True
-    revocable: bool = False
-    relation: bool = False
-    kink: bool = False
-    strict: bool = False
-    strike: bool = False
+    flags: EventFlag
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,6 +6,7 @@ import sympy
 
 from ..errors import ModelError
 from .equations import zero_of
+from .event_flags import EventFlag
 from .events import Assign, HeldBranch, relation_in_discretes
 from .relation_declarations import RelationDeclarations
 from .symbols import DiscreteSymbol, RelationSymbol, der
@@ -83,9 +84,10 @@ class ModeDeclarations(RelationDeclarations):
         closed: Any = sympy.Eq(active, 1)
         open_: Any = sympy.Eq(active, 0)
         impulse = self._either(closed, gap, force, order, active)
+        chooses = EventFlag.LISTED | EventFlag.AT_START | EventFlag.REVOCABLE
         if impulse is None:
-            self._event(force <= 0, (Assign(active, sympy.Integer(0)),), closed, True, revocable=True)
-            self._event(gap <= 0, (Assign(active, sympy.Integer(1)),), open_, True, revocable=True)
+            self._event(force <= 0, (Assign(active, sympy.Integer(0)),), closed, chooses)
+            self._event(gap <= 0, (Assign(active, sympy.Integer(1)),), open_, chooses)
             return active
         # What has just been let go is within rounding of the gap, and would be caught again: until it has lifted, it
         # must go through the clearance.
@@ -102,10 +104,10 @@ class ModeDeclarations(RelationDeclarations):
                 Assign(lifted, sympy.Piecewise((1, bounces), (0, True))),
             )
         shown = f"{gap <= 0}, on={open_}"
-        self._event(gap + depth <= 0, struck, open_, True, revocable=True, text=shown, strike=True)
-        self._event(force <= 0, (Assign(active, no), Assign(lifted, no)), closed, True, revocable=True)
+        self._event(gap + depth <= 0, struck, open_, chooses | EventFlag.STRIKE, shown)
+        self._event(force <= 0, (Assign(active, no), Assign(lifted, no)), closed, chooses)
         low: Any = sympy.Ne(lifted, 1)
-        self._event(gap >= clearance, (Assign(lifted, yes),), sympy.And(open_, low), True, noted=False)
+        self._event(gap >= clearance, (Assign(lifted, yes),), sympy.And(open_, low), EventFlag.AT_START)
         return active
 
     def _either(

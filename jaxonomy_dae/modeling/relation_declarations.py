@@ -9,6 +9,7 @@ from sympy.logic.boolalg import BooleanAtom
 from ..expressions.to_sympy import shortened
 from .automatic_events import Splitting, Stepping, Timed, TimedSteps, Turning, jumps, turned, varies, with_events
 from .event_declarations import EventDeclarations
+from .event_flags import NO_FLAG, EventFlag
 from .events import LIVE, Assign, Sampled, is_strict
 from .symbols import PreviousSymbol, RelationSymbol, VariableSymbol
 
@@ -121,7 +122,7 @@ class RelationDeclarations(EventDeclarations):
             self._relation_clock(clock, shortened(now), Assign(live, sympy.Integer(0)), Assign(known, value))
 
     def _relation_clock(self, clock: Sampled, text: str, *actions: Assign, kink: bool = False) -> None:
-        self._event(clock, actions, None, False, False, False, text, True, kink=kink)
+        self._event(clock, actions, None, EventFlag.RELATION | (EventFlag.KINK if kink else NO_FLAG), text)
 
     def _steps(self, whole: Stepping) -> None:
         """Events of a whole part. One may leave more than one number behind at an instant, where the argument jumps."""
@@ -138,7 +139,8 @@ class RelationDeclarations(EventDeclarations):
             self._relation_event(condition, text, sympy.And(found, watched), Assign(known, value))
 
     def _relation_event(self, condition: Any, text: str, watched: Any, *actions: Assign, kink: bool = False) -> None:
-        self._event(condition, actions, None, True, False, True, text, True, watched, kink)
+        flags = EventFlag.AT_START | EventFlag.REVOCABLE | EventFlag.RELATION | (EventFlag.KINK if kink else NO_FLAG)
+        self._event(condition, actions, None, flags, text, watched)
 
 
 def _unless(condition: Any, otherwise: Any, value: Any) -> Any:

@@ -92,7 +92,7 @@ class Events:
 
     @property
     def terminated(self) -> str | None:
-        messages = [self._table.table.message[k] for k in self._numbers()]
+        messages = [self._table.table.events[k].message for k in self._numbers()]
         return messages[-1] if messages else None
 
     @property

@@ -12,6 +12,8 @@ from ..diagnosis.lost_cancellation import lost_cancellation
 from ..diagnosis.wording import listed, quoted
 from ..hybrid.solver import MOVED, STUCK, TOO_MANY
 from ..lowering.plan import SystemPlan
+from ..model.events import Event
+from ..modeling.event_flags import EventFlag
 from ..programs.members import failed_members
 from ..solvers.choice_guard import SINGULAR_CHOICE
 from ..solvers.failures import SHOWN, explain_failure, how_it_stopped
@@ -215,8 +217,8 @@ def _too_many_events(events: Events, max_events: int, t: float) -> str:
 def _stuck(solution: Solution, event: int, t: float, instant: float) -> str:
     """Says why event number `event` happens, or its relation turns, again and again at t, an instant of that length."""
     table: Any = solution.system.plan.events
-    if table.table.relation[event]:
-        return _sliding(table.names[event], t)
+    if EventFlag.RELATION in table.table.events[event].flags:
+        return _sliding(table.table.events[event], t)
     times, which = np.asarray(solution.events.ts), np.asarray(solution.events.which, int)
     # Where events accumulate, the last ones follow each other as rounding has it.
     lately = times > t - instant
@@ -226,7 +228,7 @@ def _stuck(solution: Solution, event: int, t: float, instant: float) -> str:
     accumulate = _accumulation(times[(which == event) & ~lately])
     if accumulate:
         return f"{text}: {accumulate}. {REST}"
-    revocable = np.array(table.table.revocable, bool)
+    revocable = table.table.are(EventFlag.REVOCABLE)
     if len(names) > 1 and all(revocable[k] for k in range(len(table.names)) if k == event or often[k]):
         return (
             f"the integration stopped at t={t:.6g}: no mode is consistent there, {listed(names)} are true in turn. "
@@ -270,12 +272,11 @@ def _of_kinks(system: AcausalSystem) -> str:
     )
 
 
-def _sliding(name: str, t: float) -> str:
+def _sliding(relation: Event, t: float) -> str:
     """Explains a relation that turns again and again at the instant t, and what to write instead."""
-    where, _, condition = name.partition(": when(")
     return (
-        f"the integration stopped at t={t:.6g}: chattering. On both sides of '{condition[:-1]}' of component "
-        f"'{where}' the equations drive the solution back to where it turns. Say what holds there with a mode "
+        f"the integration stopped at t={t:.6g}: chattering. On both sides of '{relation.condition}' of component "
+        f"'{relation.owner}' the equations drive the solution back to where it turns. Say what holds there with a mode "
         "(self.either, see library.friction); or let the conditions for turning forth and back lie apart (hysteresis), "
         "with self.when; or use a smooth law, for instance tanh(x/small) instead of sign(x)"
     )

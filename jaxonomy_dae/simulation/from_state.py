@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from ..aliases import Time
 from ..errors import InitializationError, ModelError
 from ..initialization.initialize import InitialPoint, is_consistent
+from ..modeling.event_flags import EventFlag
 from ..system.system import AcausalSystem
 
 ITERATIONS = 8  # Gauss–Newton steps onto the constraints; they converge quadratically, from 0.1 in four to rounding
@@ -39,7 +40,8 @@ def check_array(system: AcausalSystem, initial: Any) -> None:
     """Raises a `ModelError` if an array cannot be, or does not say, the state of this system."""
     n, events = system.plan.n_state, system.plan.events
     if events is not None:
-        written = [events.names[e] for e in events.table.event.tolist() if not events.table.relation[e]]
+        relation = events.table.are(EventFlag.RELATION)
+        written = [events.names[e] for e in events.table.event.tolist() if not relation[e]]
         if written:
             discrete = f", nor the discrete variables ('{system.discretes[0]}')" if system.discretes else ""
             raise ModelError(

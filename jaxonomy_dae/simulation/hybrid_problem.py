@@ -12,9 +12,11 @@ import numpy as np
 from ..adjoint.resting import still
 from ..aliases import Args, Controller, State, Time, Tolerance
 from ..hybrid.control import EventControl
+from ..hybrid.facts import EventFacts
 from ..hybrid.first_order import constant_once
 from ..hybrid.problem import AbstractHybridProblem
-from ..model.tables import EventTable
+from ..lowering.plan_events import EventPlan
+from ..modeling.event_flags import EventFlag
 from ..solvers.switching import Watch
 from ..system.system import AcausalSystem
 from ..system.system_at import SystemAt
@@ -28,26 +30,21 @@ TRIES = 4
 
 
 class SystemProblem(AbstractHybridProblem):
-    """The equations of a system and its events. `watch` and `tolerance` are for its solvers."""
+    """The equations of a system and its events; the plan of the system says what these are. `watch` and `tolerance` are
+    for its solvers."""
 
     system: AcausalSystem
     watch: Watch | None
     tolerance: Tolerance
     resolution: Time
     implicit: bool = eqx.field(static=True)
-    n_clocks: int = eqx.field(static=True)
-    n_guards: int = eqx.field(static=True)
-    ends: tuple[bool, ...] = eqx.field(static=True)
-    immediate: tuple[bool, ...] = eqx.field(static=True)
-    noted: tuple[bool, ...] = eqx.field(static=True)
-    revocable: tuple[bool, ...] = eqx.field(static=True)
-    relations: tuple[bool, ...] = eqx.field(static=True)
-    strikes: tuple[bool, ...] = eqx.field(static=True)
-    strict: tuple[bool, ...] = eqx.field(static=True)
-    opposite: tuple[int, ...] = eqx.field(static=True)
-    choices: tuple[int, ...] = eqx.field(static=True)
-    choice_guards: tuple[int, ...] = eqx.field(static=True)
-    only_kinks: bool = eqx.field(static=True)
+    facts: EventFacts = eqx.field(static=True)
+
+    @property
+    def events(self) -> EventPlan:
+        """How the system evaluates its events."""
+        assert self.system.plan.events is not None
+        return self.system.plan.events
 
     def term(self, q):
         return term_of(self.system.holding(q), self.implicit)
@@ -65,7 +62,7 @@ class SystemProblem(AbstractHybridProblem):
         return SystemAt(self.system.plan, self.system.numbers, (), 0.0, {}, self.system.typical_sizes).clocks()
 
     def written(self, t, x, read, q, previous, events, args):
-        plan: Any = self.system.plan.events
+        plan = self.events
         values = self.system.around_event(t, q, previous, args).event_values(read)
         happens = events[plan.table.event]
         is_state, is_discrete = plan.state >= 0, plan.table.discrete >= 0
@@ -81,8 +78,7 @@ class SystemProblem(AbstractHybridProblem):
         return jnp.where(done, self.admitted(t, x, q, args), jnp.nan), q
 
     def settled(self, t, x, q, events, args):
-        events_of: Any = self.system.plan.events
-        table = events_of.table
+        table = self.events.table
         assigns = table.discrete >= 0
         values = self.system.around_event(t, q, q, args).event_values(x)[assigns]
         # More than one event may write a value, but then the same.
@@ -186,22 +182,14 @@ def problem_for(
 ) -> SystemProblem:
     """The problem of a system that has events, to be run from t0 to t1."""
     events: Any = system.plan.events
-    ends = tuple(message is not None for message in events.table.message)
-    choices, choice_guards = _choices(system)
     return SystemProblem(
-        system=system, watch=watch, tolerance=tolerance, implicit=implicit,
+        system=system,
+        watch=watch,
+        tolerance=tolerance,
         resolution=resolution(t0, t1),
-        n_clocks=events.n_clocks, n_guards=len(events) - events.n_clocks, ends=ends, immediate=events.table.immediate,
-        noted=events.table.noted,
-        revocable=events.table.revocable,
-        relations=events.table.relation,
-        strikes=events.table.strike,
-        strict=events.table.strict,
-        opposite=_opposite(events.table, events.n_clocks),
-        choices=choices,
-        choice_guards=choice_guards,
-        only_kinks=events.only_kinks,
-    )  # fmt: skip
+        implicit=implicit,
+        facts=events.facts,
+    )
 
 
 def without_clocked(system: AcausalSystem, q: Any) -> Any:
@@ -209,39 +197,11 @@ def without_clocked(system: AcausalSystem, q: Any) -> Any:
     one, perhaps with other parameters, looks at the clock instead."""
     events: Any = system.plan.events
     table = events.table
-    clocked = np.array(table.relation, bool)[table.event] & (table.event < events.n_clocks)
+    clocked = table.are(EventFlag.RELATION)[table.event] & (table.event < events.n_clocks)
     chosen = np.unique(table.discrete[clocked])
     if not len(chosen):
         return q
     return q.at[chosen].set(jnp.asarray(system.plan.flat.parameters.starts_of(events.discrete[chosen]), q.dtype))
-
-
-def _choices(system: AcausalSystem) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Returns (the discrete values that `complementary` chooses, the guards that choose them). Contacts between states
-    are left out: they close by impulses, and do not make equations singular."""
-    events: Any = system.plan.events
-    table, n_clocks = events.table, events.n_clocks
-    chooses = np.array(table.revocable, bool) & ~np.array(table.relation, bool)
-    if system.plan.held is not None:
-        closed = system.plan.held.table.closed
-        chooses[table.event[np.isin(table.discrete, closed[closed >= 0])]] = False
-    rows = chooses[table.event] & (table.discrete >= 0) & (table.event >= n_clocks)
-    return tuple(np.unique(table.discrete[rows]).tolist()), tuple(np.unique(table.event[rows] - n_clocks).tolist())
-
-
-def _opposite(table: EventTable, n_clocks: int) -> tuple[int, ...]:
-    """For each guard of a relation, the number of the guard that sets the same discrete value the other way; −1 for
-    other guards."""
-    opposite = np.full(len(table) - n_clocks, -1)
-    other: dict[int, int] = {}
-    for event, discrete in zip(table.event.tolist(), table.discrete.tolist(), strict=True):
-        if not table.relation[event] or event < n_clocks:
-            continue
-        guard = event - n_clocks
-        if discrete in other:
-            opposite[[guard, other[discrete]]] = other[discrete], guard
-        other[discrete] = guard
-    return tuple(opposite.tolist())
 
 
 def with_event_control(controller: Controller) -> Any:

@@ -59,7 +59,7 @@ class Memory(eqx.Module):
     @classmethod
     def of(cls, problem: AbstractHybridProblem, ts: Any, marks: Any, sizes: Any) -> "Memory":
         """The memory of the rows saved at `ts`, whose `marks` are the sides of the guards and the counts of ticks."""
-        sides, ticks = marks[:, : problem.n_guards], marks[:, problem.n_guards :]
+        sides, ticks = marks[:, : problem.facts.n_guards], marks[:, problem.facts.n_guards :]
         since = jnp.abs(jax.vmap(problem.due)(ticks - 1.0) - ts[:, None])
         ticked = (ticks > 0) & (since <= 2 * problem.resolution)
         return jax.lax.stop_gradient(cls(sides, ticked.astype(sides.dtype), sizes))

@@ -6,9 +6,12 @@ import numpy as np
 
 from ..diagnosis.wording import counted
 from ..lowering.plan import SystemPlan
+from ..model.events import EventTable
 from ..model.incidence import incidence
+from ..model.starts import Start
 from ..model.symbolic import SymbolicTemplate, number_label, parameter_label
-from ..model.tables import EventTable, FlatModel, Start, provenance_of
+from ..model.tables import FlatModel, provenance_of
+from ..modeling.event_flags import EventFlag
 from ..structure.pantelides import Offsets, reduce_index
 from .sections import Sections, folded, some
 from .solver_choice import solver_choice
@@ -121,14 +124,14 @@ class SystemReport(Sections):
     def events(self) -> list[str]:
         """The events of conditions, and what they do. Relations in equations are listed apart."""
         flat, table = self._plan.flat, self._plan.flat.events
-        return [f"{table.text[e]}: {_actions(flat, e)}" for e in _noted(table) if e >= len(table.clocks)]
+        return [f"{table.text[e]}: {_actions(flat, e)}" for e in _listed(table) if e >= table.n_clocks]
 
     @property
     def relations(self) -> list[str]:
         """The relations in equations, and the jumps of sources, at which steps end. `smooth(...)` leaves one alone."""
         table = self._plan.flat.events
-        found = (text.partition(": when(") for text, is_one in zip(table.text, table.relation, strict=True) if is_one)
-        return list(dict.fromkeys(f"{where}: {condition[:-1]}" for where, _, condition in found))
+        found = [event for event in table.events if EventFlag.RELATION in event.flags]
+        return list(dict.fromkeys(f"{event.owner}: {event.condition}" for event in found))
 
     @property
     def left_alone(self) -> list[str]:
@@ -140,12 +143,13 @@ class SystemReport(Sections):
         """The sampled events, their periods and offsets, and what they do."""
         flat, table = self._plan.flat, self._plan.flat.events
         out = []
-        for e in _noted(table):
-            if e >= len(table.clocks):
+        for e in _listed(table):
+            clock = table.events[e].clock
+            if clock is None:
                 continue
             when = ""
             if self._values is not None:
-                period, offset = (_number(part, self._values) for part in table.clocks[e])
+                period, offset = (_number(part, self._values) for part in clock)
                 when = f", every {period:g} s from {offset:g} s"
             out.append(f"{table.text[e]}{when}: {_actions(flat, e)}")
         return out
@@ -221,9 +225,9 @@ def _declared(flat: FlatModel) -> list[int]:
     return table.discrete[: len(table.discrete) - table.n_relations].tolist()
 
 
-def _noted(table: EventTable) -> list[int]:
+def _listed(table: EventTable) -> list[int]:
     """The events that users wrote."""
-    return [e for e, noted in enumerate(table.noted) if noted]
+    return np.flatnonzero(table.are(EventFlag.LISTED)).tolist()
 
 
 def _actions(flat: FlatModel, event: int) -> str:
@@ -231,14 +235,14 @@ def _actions(flat: FlatModel, event: int) -> str:
     so are hidden variables."""
     table = flat.events
     out = []
-    for row in np.flatnonzero(table.event == event).tolist():
-        value = "…" if table.value[row] >= 0 else f"{table.constant[row]:g}"
-        if table.state[row] >= 0:
-            out.append(f"reinit({flat.variables.names[table.state[row]]}, {value})")
-        elif table.discrete[row] < len(_declared(flat)):
-            name = flat.parameters.names[flat.parameters.discrete[table.discrete[row]]]
+    for write in table.events[event].writes:
+        value = "…" if write.value >= 0 else f"{write.constant:g}"
+        if write.state >= 0:
+            out.append(f"reinit({flat.variables.names[write.state]}, {value})")
+        elif write.discrete < len(_declared(flat)):
+            name = flat.parameters.names[flat.parameters.discrete[write.discrete]]
             out.append(f"assign({name}, {value})")
-    message = table.message[event]
+    message = table.events[event].message
     return ", ".join([*out, *([f"terminate({message!r})"] if message is not None else [])])
 
 

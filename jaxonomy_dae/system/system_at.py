@@ -21,7 +21,7 @@ from ..lowering.plan_events import EventPlan
 from ..lowering.plan_held import HeldPlan
 from ..lowering.program import Program
 from ..model.networks import Networks
-from ..model.tables import Start
+from ..model.starts import Start
 from ..programs.staging import is_traced
 from ..solvers.field_size import is_large
 from .evaluate import Evaluation, Refinement, newton
@@ -387,7 +387,7 @@ class SystemAt:
 
     def clocks(self) -> tuple[Any, Any]:
         """Periods and offsets of sampled events, shape (clocks,) each; infinite periods of those that happen once."""
-        clocks = self._events().table.clocks
+        clocks = [event.clock for event in self._events().table.events if event.clock is not None]
         periods, offsets = zip(*clocks, strict=True) if clocks else ((), ())
         return self._computed(periods), self._computed(offsets)
 

@@ -14,15 +14,18 @@ import pytest
 
 from jaxonomy_dae.errors import ModelError
 from jaxonomy_dae.hybrid.control import EventControl
+from jaxonomy_dae.hybrid.facts import EventFacts
 from jaxonomy_dae.hybrid.first_order import differentiable_once
 from jaxonomy_dae.hybrid.problem import AbstractHybridProblem
 from jaxonomy_dae.hybrid.solver import WithEvents
 from jaxonomy_dae.hybrid.start import start
 from jaxonomy_dae.hybrid.term import HybridTerm
+from jaxonomy_dae.modeling.event_flags import EventFlag
 from jaxonomy_dae.solvers import StoredAdjoint
 from jaxonomy_dae.solvers.drive import integrate
 
 END = 3.0
+RELATION = EventFlag.AT_START | EventFlag.REVOCABLE | EventFlag.RELATION
 
 
 class Stop(AbstractHybridProblem):
@@ -30,19 +33,13 @@ class Stop(AbstractHybridProblem):
 
     p: Any
     resolution: Any
-    n_clocks: int = eqx.field(static=True, default=0)
-    n_guards: int = eqx.field(static=True, default=2)
-    ends: tuple[bool, ...] = eqx.field(static=True, default=(False, False))
-    immediate: tuple[bool, ...] = eqx.field(static=True, default=(True, True))
-    noted: tuple[bool, ...] = eqx.field(static=True, default=(False, False))
-    revocable: tuple[bool, ...] = eqx.field(static=True, default=(True, True))
-    relations: tuple[bool, ...] = eqx.field(static=True, default=(True, True))
-    strikes: tuple[bool, ...] = eqx.field(static=True, default=(False, False))
-    strict: tuple[bool, ...] = eqx.field(static=True, default=(True, False))
-    opposite: tuple[int, ...] = eqx.field(static=True, default=(1, 0))
-    choices: tuple[int, ...] = eqx.field(static=True, default=())
-    choice_guards: tuple[int, ...] = eqx.field(static=True, default=())
-    only_kinks: bool = eqx.field(static=True, default=True)
+    facts: EventFacts = eqx.field(
+        static=True,
+        default=EventFacts(
+            flags=(RELATION | EventFlag.STRICT, RELATION), n_clocks=0, ends=(False, False), opposite=(1, 0),
+            only_kinks=True,
+        ),
+    )  # fmt: skip
 
     def term(self, q):
         return diffrax.ODETerm(lambda t, x, args: self.field(t, x, q, args))

@@ -9,6 +9,7 @@ import pytest
 from problems import compiled
 
 from jaxonomy_dae import Component, EqnEnv, der, simulate
+from jaxonomy_dae.modeling.event_flags import EventFlag
 from jaxonomy_dae.simulation.hybrid_problem import problem_for
 
 G = 9.81
@@ -72,7 +73,7 @@ def test_impacts_are_the_complementarity_problems(n):
         at = dict(zip([f"b.q{k}" for k in range(n)], jnp.linalg.solve(j, -jnp.ones(n)), strict=True))
         at |= {f"b.v{k}": v[k] for k in range(n)}
         x, q = jnp.stack([at[name] for name in system.states]), system.discrete_values
-        after, _ = problem.written(t, x, x, q, q, jnp.asarray(problem.strikes), {})
+        after, _ = problem.written(t, x, x, q, q, jnp.asarray(problem.facts.are(EventFlag.STRIKE)), {})
         return jnp.stack([after[system.states.index(f"b.v{k}")] for k in range(n)])
 
     j, v, e = cases(n, 200)
