@@ -3,6 +3,7 @@
 Closed form for 0 < p < 1: sin t up to x = p, then about 3p/4 with the rate 2, and from x = p on with the rate 1 again.
 """
 
+import dataclasses
 from typing import Any
 
 import diffrax
@@ -26,6 +27,7 @@ from jaxonomy_dae.solvers.drive import integrate
 
 END = 3.0
 RELATION = EventFlag.AT_START | EventFlag.REVOCABLE | EventFlag.RELATION
+FACTS = EventFacts(flags=(RELATION | EventFlag.STRICT, RELATION), n_clocks=0, ends=(False, False), opposite=(1, 0))
 
 
 class Stop(AbstractHybridProblem):
@@ -33,13 +35,7 @@ class Stop(AbstractHybridProblem):
 
     p: Any
     resolution: Any
-    facts: EventFacts = eqx.field(
-        static=True,
-        default=EventFacts(
-            flags=(RELATION | EventFlag.STRICT, RELATION), n_clocks=0, ends=(False, False), opposite=(1, 0),
-            only_kinks=True,
-        ),
-    )  # fmt: skip
+    facts: EventFacts = eqx.field(static=True)
 
     def term(self, q):
         return diffrax.ODETerm(lambda t, x, args: self.field(t, x, q, args))
@@ -65,7 +61,7 @@ class Stop(AbstractHybridProblem):
 
 def final(p, only_kinks):
     """(x at the end, the discrete value there), at rtol = atol = 1e-10."""
-    problem = Stop(p, 1e-14, only_kinks=only_kinks)
+    problem = Stop(p, 1e-14, dataclasses.replace(FACTS, only_kinks=only_kinks))
     t0, t1 = jnp.zeros(()), jnp.asarray(END)
     done = integrate(
         HybridTerm(problem), WithEvents(diffrax.Tsit5(), 64), t0, t1, 0.1,
