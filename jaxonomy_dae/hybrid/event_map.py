@@ -319,9 +319,11 @@ def _following(
     flat = is_flat(value, rate)
     falling = jnp.where(flat, 0.5 * (rate + rate_ahead), rate)
     # Where an event makes sides equal that do not move, as sides made of other relations, a relation that is not strict
-    # has become true. Conditions of events wait until they leave zero: modes of something at rest would turn for ever.
+    # has become true, and so has a condition whose side jumped there when an equation changed its branch. Other
+    # conditions wait until they leave zero: modes of something at rest would turn for ever.
     equal = zero & (rate == 0) & (instant.state.armed == ABOVE) & ~here & problem.facts.true_at_zero
-    equal = equal & problem.facts.are(EventFlag.RELATION)[c:]
+    relations = problem.facts.are(EventFlag.RELATION)
+    equal = equal & (relations[c:] | jnp.asarray(relations)[event])
     stays = (left[c:] & onto & (value == 0)) | equal
     true = jnp.where(zero, ((falling * arrival.span < -band) & ~waits) | stays, value < 0)
     was_armed = ((instant.state.armed > 0) & ~here) | (turns_back & (event >= c)) | (rose & ~here)

@@ -7,7 +7,7 @@ the synchronous data flow principle"; here the branch is an equation of its own,
 
 from typing import Any
 
-from sympy import Abs, And, Max, Ne, Piecewise, sign
+from sympy import Abs, And, Max, Min, Ne, Piecewise, sign
 
 from ..modeling import (
     NONNEGATIVE,
@@ -25,13 +25,17 @@ from ..modeling import (
 from .arguments import in_order
 
 STANDSTILL = 1e-6  # m/s or rad/s: slower parts that are pressed together stick at once
+# Acceleration of stuck parts per friction, below any rounding in SI units, and a normal number in single precision. It
+# determines the friction of parts that a source moves: zero while they rest, beyond any breakaway once they start.
+COMPLIANCE = 1e-30
 
 
 def stick_slip(
     component: Component, speed: Any, friction: Any, sliding: Any, breakaway: Any, pressed: Any = None
 ) -> None:
     """Adds the friction between two parts to a component; below the speed of its parameter `standstill`, parts that are
-    pressed together stick at once.
+    pressed together stick at once. Parts whose motion a source prescribes do not feel the friction: it is zero while
+    they rest, and slides the way they go otherwise.
 
     **Arguments:**
 
@@ -41,11 +45,13 @@ def stick_slip(
     - `pressed`: what is positive while the parts are pressed together; None if they always are.
     """
     mode = component.discrete("mode", start=2, unit="1")
-    still = component.parameter("standstill", STANDSTILL, unit=component.variables[str(speed)].unit, bounds=POSITIVE)
+    speed_unit = component.variables[str(speed)].unit
+    still = component.parameter("standstill", STANDSTILL, unit=speed_unit, bounds=POSITIVE)
+    per = {"m/s": "1/kg", "rad/s": "rad/(kg*m*m)"}[speed_unit]
+    compliance = component.parameter("compliance", COMPLIANCE, unit=per, bounds=POSITIVE)
+    stuck: Any = Eq(mode, 0)
     branch = Piecewise((0, Eq(mode, 2)), (mode * sliding, True))
-    # No friction holds parts whose motion is prescribed: it is −(−der(speed))/0 there, infinite with the sign of their
-    # acceleration, so that they slide on at once, the way they go.
-    component.either(Eq(mode, 0), -der(speed), friction - branch)
+    component.either(stuck, compliance * friction - der(speed), friction - branch)
     direction = Piecewise((1, speed > still), (-1, speed < -still), (0, True))
     moving = Eq(Abs(mode), 1)
     if pressed is None:
@@ -55,7 +61,10 @@ def stick_slip(
         component.when(pressed <= 0, assign(mode, 2), on=Ne(mode, 2), at_start=True)
         component.when(pressed > 0, assign(mode, direction), on=Eq(mode, 2), at_start=True)
         component.when(And(mode * speed <= 0, pressed > 0), assign(mode, 0), on=moving)
-    component.when(Abs(friction) >= breakaway, assign(mode, sign(friction)), on=Eq(mode, 0))
+    # Not more than twice the breakaway, so that friction that no source lets hold leaves the guard its size.
+    component.when(smooth(Min(Abs(friction), 2 * breakaway)) >= breakaway, assign(mode, sign(friction)), on=stuck)
+    # A source that jumps to a speed, as an interpolated position does, moves parts without acceleration.
+    component.when(Abs(speed) > still, assign(mode, sign(speed)), on=stuck)
 
 
 class _Pressed(Component):
