@@ -180,7 +180,7 @@ def simulate(
         raise ModelError("control= and stepsize_controller= both say what errors count: leave one of them out")
     prescribed = stepsize_controller is not None
     tolerances = None if prescribed else (rtol, scaled_atol(system, atol))
-    asked = Asked.of(jump_ts, dtmax, max_steps, None if prescribed else solver, control, tolerances)
+    asked = Asked.of(jump_ts, dtmax, max_steps, None if prescribed else solver, control, tolerances, throw is not False)
     if solver is None:
         choice = solver_choice(system.plan)
         solver = SOLVERS[choice.solver]()

@@ -23,6 +23,7 @@ from ..system.system import AcausalSystem
 from .accounts import account_values, chosen_terms
 from .amplified import amplified, is_looked_at, sentence
 from .event_log import EventLog, Events
+from .finite_values import refuse_not_finite, warn_of_members
 from .labelled import data_frame, data_set
 from .saved_state import Memory, SavedState
 
@@ -33,6 +34,7 @@ class Asked(eqx.Module):
     """How a run was asked for, beside its tolerances, so that another run of the same model is made alike.
 
     - `solver`: None if it was left to `simulate`, steps were prescribed, or it holds arrays.
+    - `throw`: whether variables that are not finite are refused where they are read.
     """
 
     jump_ts: Any
@@ -41,12 +43,15 @@ class Asked(eqx.Module):
     solver: Any = eqx.field(static=True, default=None)
     control: tuple[str, ...] = eqx.field(static=True, default=())
     tolerances: tuple[Any, Any] | None = None  # rtol, and atol of each state
+    throw: bool = eqx.field(static=True, default=True)
 
     @staticmethod
-    def of(jump_ts: Any, dtmax: Any, max_steps: int, solver: Any, control: tuple[str, ...], tolerances: Any) -> "Asked":
+    def of(
+        jump_ts: Any, dtmax: Any, max_steps: int, solver: Any, control: tuple[str, ...], tolerances: Any, throw: bool
+    ) -> "Asked":
         """The options, with a solver only if solutions that name it can be compared."""
         known = not any(eqx.is_array(leaf) for leaf in jax.tree.leaves(solver)) and isinstance(solver, Hashable)
-        return Asked(jump_ts, dtmax, max_steps, solver if known else None, control, tolerances)
+        return Asked(jump_ts, dtmax, max_steps, solver if known else None, control, tolerances, throw)
 
     @property
     def options(self) -> dict[str, Any]:
@@ -117,6 +122,8 @@ class Solution(eqx.Module):
         **Raises:**
 
         - `ModelError` for an unknown name.
+        - `SimulationError` for a variable that is not finite at a saved time. Inside jit and vmap, and of a run with
+            `throw=False`, it is not-a-number there.
         """
         if not isinstance(name, str):
             if not isinstance(name, Sequence) or not all(isinstance(one, str) for one in name):
@@ -125,7 +132,10 @@ class Solution(eqx.Module):
         if name == "time":
             return self.ts
         if self.states.ndim > 2:
-            return _each(self, lambda one: one[name])
+            values = _each(self, lambda one: one[name])
+            if self.asked is not None and self.asked.throw:
+                warn_of_members(name, values, self.states)
+            return values
         if self.discrete is not None and name in self.system.discretes:
             return self.discrete[:, self.system.discretes.index(name)]
         entries = self.system.plan.entries(name)
@@ -144,9 +154,10 @@ class Solution(eqx.Module):
         return self._where_reached(values)[:, 0]
 
     def _where_reached(self, values: Any) -> Any:
-        """The values, shape (n, k), with not-a-number in rows that the run did not reach. Constants and functions of
-        time could be evaluated there, too."""
-        return jnp.where(jnp.isfinite(self.states).all(axis=-1, keepdims=True), values, jnp.nan)
+        """The values, shape (n, k), with not-a-number where they are not finite, and in rows that the run did not
+        reach. Constants and functions of time could be evaluated there, too."""
+        reached = jnp.isfinite(self.states).all(axis=-1, keepdims=True)
+        return jnp.where(reached & jnp.isfinite(values), values, jnp.nan)
 
     def _state(self, quantity: int, factor: float) -> Any:
         """The values of quantities that are zero or part of the state array; None for others."""
@@ -160,10 +171,15 @@ class Solution(eqx.Module):
         return times(factor, column)
 
     def _look_at(self, names: Sequence[str], quantity: np.ndarray, factor: np.ndarray, values: Any, some: Any) -> None:
-        """Warns of variables that amplify the tolerances of the run, outside of jit; `some` are the values of all
-        quantities at a few times."""
+        """Outside of jit, refuses variables that are not finite, and warns of those that amplify the tolerances of the
+        run; `some` are the values of all quantities at a few times."""
         asked = self.asked
-        if asked is None or asked.tolerances is None or is_traced((self, values)) or not is_looked_at(self.system):
+        if asked is None or is_traced((self, values)):
+            return
+        if asked.throw:
+            rows = self.ts, self.states, self.discrete
+            refuse_not_finite(self.system, names, quantity, values, rows, self.inputs)
+        if asked.tolerances is None or not is_looked_at(self.system):
             return
         rows = _some(self.ts.shape[0])
         rtol, atol = map(np.asarray, asked.tolerances)

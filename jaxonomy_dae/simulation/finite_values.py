@@ -1,0 +1,102 @@
+"""Variables that are not finite at a saved time, though the states are.
+
+Such a variable is read by no state: a quotient, a logarithm, or what a mode leaves undetermined. It is refused where it
+is read, with the equation that gives it no finite value.
+"""
+
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..errors import SimulationError
+from ..lowering.schedule import AnyStep
+from ..programs.members import numbered
+from ..programs.staging import is_traced
+from ..system.system import AcausalSystem
+
+SHOWN = 4  # equations, and values in each, that an error lists
+
+
+def refuse_not_finite(
+    system: AcausalSystem, names: Sequence[str], quantity: np.ndarray, values: Any, rows: tuple[Any, Any, Any],
+    inputs: Any,
+) -> None:  # fmt: skip
+    """**Arguments:**
+
+    - `names`, `quantity`: of variables, and what they are; −1 is zero.
+    - `values`: shape (times, variables).
+    - `rows`: the saved times, states and discrete values; a state that is not finite was not reached.
+
+    **Raises:**
+
+    - `SimulationError` that names the first variable that is not finite, the time, and the equation.
+    """
+    ts, states, discrete = (None if part is None else np.asarray(part, float) for part in rows)
+    assert ts is not None and states is not None
+    found = np.asarray(values, float)
+    reached = np.isfinite(states).all(axis=-1, keepdims=True)
+    wrong = ~np.isfinite(found) & reached
+    if not wrong.any():
+        return
+    k = int(np.argmax(wrong.any(axis=1)))
+    column = int(np.argmax(wrong[k]))
+    at = system if discrete is None else system.holding(jnp.asarray(discrete[k]))
+    several = f", and at {wrong[:, column].sum() - 1} more saved times" if wrong[:, column].sum() > 1 else ""
+    raise SimulationError(
+        f"'{names[column]}' is {found[k, column]:g} at t={ts[k]:.6g}{several}, while all states are finite. "
+        + _cause(at, int(quantity[column]), ts[k], states[k], inputs)
+        + "Write the equation so that it has a finite value there, or leave such rows to the reader with "
+        "simulate(..., throw=False), which returns not-a-number"
+    )
+
+
+def warn_of_members(name: str, values: Any, states: Any) -> None:
+    """Warns, outside of jit, that a variable is not finite in members of a batch that reached their saved times."""
+    if is_traced((values, states)):
+        return
+    reached = np.isfinite(states).all(axis=-1)
+    found = np.isfinite(values)
+    wrong = reached & ~found.reshape(*reached.shape, -1).all(axis=-1)
+    if wrong.any():
+        warnings.warn(
+            f"'{name}' is not a number at saved times of {numbered(wrong.any(axis=-1))}, while all states are finite. "
+            "Simulate such a member alone, outside of jit, to see why",
+            RuntimeWarning,
+            stacklevel=4,
+        )
+
+
+def _cause(system: AcausalSystem, quantity: int, t: float, x: np.ndarray, inputs: Any) -> str:
+    """Sentences on the first equation on the way to a quantity that has no finite value, with the values it reads."""
+    plan = system.plan
+    every = np.arange(plan.extended.quantities.n)
+    computed = np.asarray(system.at(jnp.asarray(t), inputs).quantities(jnp.asarray(x), every, np.ones(len(every))))
+    values = np.append(computed.astype(float), 0.0)  # the constant zero is −1, the last entry
+    of: dict[int, AnyStep] = {int(q): step for step in plan.steps for q in np.concatenate(step.unknown)}
+    while True:
+        if quantity not in of:
+            return ""
+        wanted = np.zeros(len(every), bool)
+        wanted[quantity] = True
+        behind = of[quantity].behind(wanted)
+        before = [q for e, rows in behind for r in rows for q in e.quantity[r].tolist() if not np.isfinite(values[q])]
+        before = [q for q in before if of.get(q) is not of[quantity]]
+        if not before:
+            break
+        quantity = before[0]
+    numbers = np.asarray(system.numbers, float)
+    lines = []
+    for equation, rows in behind:
+        for row in rows:
+            read = dict.fromkeys(q for q in equation.quantity[row].tolist() if q >= 0 and np.isfinite(values[q]))
+            given = {plan.quantity_name[q]: values[q] for q in read}
+            named = [(plan.flat.parameters.names[p], numbers[p]) for p in equation.parameter[row].tolist()]
+            given |= {name: value for name, value in named if " " not in name}  # relations are numbered
+            shown = ", ".join(f"'{name}' = {value:.6g}" for name, value in [*given.items()][:SHOWN])
+            lines.append(plan.describe(int(equation.equation[row])) + (f", with {shown}" if shown else ""))
+    more = "\n  …" if len(lines) > SHOWN else ""
+    listed = "".join(f"\n  {line}" for line in lines[:SHOWN])
+    return f"No finite value of '{plan.quantity_name[quantity]}' follows there from{listed}{more}\n"
