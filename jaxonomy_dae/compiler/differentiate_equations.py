@@ -1,4 +1,9 @@
-"""Differentiates the equations as often as index reduction asks for: the extended system, in quantities."""
+"""Differentiation of the equations that index reduction chose.
+
+Given the offsets, returns the extended system: each equation with its derivatives up to the order that was found, in
+quantities, which are numbered derivatives of variables. The derivative of a template is taken once for its shape
+(`expressions/differentiate.py`), whatever the number of its instances. Nothing is removed.
+"""
 
 import numpy as np
 

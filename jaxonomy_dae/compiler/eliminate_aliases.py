@@ -140,7 +140,7 @@ def _terms_of(groups: Sequence[EquationGroup]) -> tuple[_Terms, int]:
 
 def _canonical(terms: _Terms, classes: _Classes) -> _Terms:
     """The rows in roots, terms of equal quantity merged; what rounding leaves of terms that cancel is nothing."""
-    terms = terms.take(classes.root[terms.variable] != ZERO)
+    terms = terms.take(np.append(classes.root, ZERO)[terms.variable] != ZERO)
     v = terms.variable
     factor = classes.factor[v]
     coefficient = factor * terms.coefficient
@@ -294,10 +294,10 @@ def _as_link(row: list[tuple[int, int, float]], classes: _Classes) -> tuple[int,
 
 
 def _substitute(group: EquationGroup, table: AliasTable) -> EquationGroup:
-    variable = table.root[group.variable]
-    factor = table.factor[group.variable]
-    order = np.where(variable == ZERO, 0, group.order + table.order[group.variable])
-    return dataclasses.replace(group, variable=variable, order=order, factor=factor)
+    root, order, factor = np.append(table.root, ZERO), np.append(table.order, 0), np.append(table.factor, 0.0)
+    variable = root[group.variable]  # at ZERO, which is −1, the last entry
+    order = np.where(variable == ZERO, 0, group.order + order[group.variable])
+    return dataclasses.replace(group, variable=variable, order=order, factor=factor[group.variable])
 
 
 def _linear_groups(terms: _Terms, rows: np.ndarray, provenance: Provenances) -> list[EquationGroup]:

@@ -1,4 +1,8 @@
-"""Which variables the incidence of a model has columns for."""
+"""Which variables the incidence of a model has columns for.
+
+Given the aliases, returns the variables that are left as columns, unknowns before inputs. A variable that was replaced
+has no column. Where it equals a derivative, `least` keeps the order, so that index reduction provides that derivative.
+"""
 
 import dataclasses
 

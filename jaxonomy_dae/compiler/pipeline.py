@@ -1,4 +1,19 @@
-"""The compiler: all passes in order."""
+"""The compiler: all passes in order.
+
+Given a flattened model, returns the tables that lowering turns into a plan. The order has reasons:
+
+1. Aliases go first. Most equations of a diagram are connections. A velocity that is replaced by the derivative of its
+   position lowers the index, too, so that the passes behind see a smaller problem.
+2. The structure is checked before any derivative is taken: missing or excess equations are explained in the equations
+   that the user wrote.
+3. Cancellation and index reduction alternate, since equations in which highest derivatives cancel must be combined
+   before they are differentiated. Then all equations are differentiated, once, as often as these passes found.
+4. States are selected after that, because the hidden constraints decide between candidates.
+5. Blocks are ordered last, with states and inputs known.
+
+Every variable that a pass removes is found again: aliases through `AliasTable`, everything else as a quantity that the
+blocks determine.
+"""
 
 import dataclasses
 from collections.abc import Sequence
@@ -34,7 +49,16 @@ class CompiledModel:
 
 
 def compile_flat(flat: FlatModel, mode: str, prefer_states: Sequence[str]) -> CompiledModel:
-    """Runs the passes on a flattened model."""
+    """Runs the passes on a flattened model.
+
+    **Arguments:**
+
+    - `mode`: how states are selected, as in `AcausalCompiler`; `prefer_states`: names of variables.
+
+    **Raises:**
+
+    - `ModelError`, `StructuralError` as `AcausalCompiler`.
+    """
     groups, alias = eliminate_aliases(flat)
     columns = number_columns(flat, alias)
     signature = incidence(groups, columns.number, columns.n_unknown)

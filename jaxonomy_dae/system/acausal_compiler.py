@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 
+from ..compiler.added_passes import ModelPass, run_passes
 from ..compiler.check_units import check_units as check_units_of
 from ..compiler.flatten import flatten
 from ..compiler.pipeline import compile_flat
@@ -19,6 +20,7 @@ from ..modeling.diagram import AcausalDiagram
 from ..modeling.environment import EqnEnv
 from ..modeling.networks import as_weights
 from .parameters import ParameterNames, Parameters
+from .passes import Passes
 from .report import SystemReport
 from .solver_choice import Stiffness
 from .system import AcausalSystem
@@ -41,6 +43,8 @@ class AcausalCompiler:
         equations, which is given a `SparseLinearOperator` with rows and columns scaled. What it leaves is corrected by
         solving again until every equation holds to rounding, or is not-a-number. By default LAPACK up to 48 equations,
         then KLU.
+    - `passes`: functions from a `FlatModel` to another one, run after flattening and before all other passes; see
+        *Adding a pass* in the documentation of development.
     - `check_units`: whether declared units are compared, in equations, starts, events, accounts of energy and connected
         signals; needs the extra `units`.
 
@@ -50,7 +54,7 @@ class AcausalCompiler:
     - `UnitError`: units do not fit together.
     - `StructuralError`: equations and unknowns do not fit together.
 
-    `compiler.report` says what was done, after the call.
+    After the call, `compiler.report` describes the system, and `compiler.passes` what each pass made of the model.
     """
 
     def __init__(
@@ -61,6 +65,7 @@ class AcausalCompiler:
         state_selection: Mode = "auto",
         prefer_states: Sequence[str] = (),
         linear_solver: lx.AbstractLinearSolver | None = None,
+        passes: Sequence[ModelPass] = (),
         check_units: bool = False,
     ):
         if not isinstance(ev, EqnEnv) or not isinstance(diagram, AcausalDiagram):
@@ -78,6 +83,9 @@ class AcausalCompiler:
         for k, name in enumerate(prefer_states):
             if not isinstance(name, str):
                 raise ModelError(f"prefer_states is a list of variables' names; entry {k} is {name!r}")
+        for k, each in enumerate(passes):
+            if not callable(each):
+                raise ModelError(f"passes is a list of functions of a FlatModel; entry {k} is {each!r}")
         if linear_solver is not None:
             check_linear_solver(linear_solver)
         self.ev = ev
@@ -86,7 +94,9 @@ class AcausalCompiler:
         self.prefer_states = tuple(prefer_states)
         self.linear_solver = linear_solver
         self.check_units = check_units
+        self._added = tuple(passes)
         self._report: SystemReport | None = None
+        self._passes: Passes | None = None
 
     @property
     def report(self) -> SystemReport:
@@ -95,14 +105,21 @@ class AcausalCompiler:
             raise ModelError("nothing has been compiled yet: call the compiler first")
         return self._report
 
+    @property
+    def passes(self) -> Passes:
+        """What each pass of the last call made of the model, in user names: `print(compiler.passes)`."""
+        if self._passes is None:
+            raise ModelError("nothing has been compiled yet: call the compiler first")
+        return self._passes
+
     def __call__(self) -> AcausalSystem:
-        flat = flatten(self.diagram)
+        flat, added = run_passes(flatten(self.diagram), self._added)
         if self.check_units:
             check_units_of(self.diagram)
         model = compile_flat(flat, self.state_selection, self.prefer_states)
         plan = lower(model, self.linear_solver)
         table, declared = flat.parameters, flat.declares
-        self._report = SystemReport(plan, declared.values)
+        self._report, self._passes = SystemReport(plan, declared.values), Passes(plan, added)
         n = table.n_declared
         names = ParameterNames(
             table.names[:n], table.units[:n], table.bounds[:n], table.dependents, table.expressions, flat.arrays,
