@@ -8,6 +8,7 @@ import numpy as np
 from jax.core import Tracer
 
 from ..errors import ModelError
+from ..modeling.real_number import is_unknown_to_jax
 
 
 def check_initial(system: Any, initial: Any) -> None:
@@ -19,9 +20,10 @@ def check_initial(system: Any, initial: Any) -> None:
     for name, value in initial.items():
         if name in system.parameters.names:
             raise ModelError(f"initial: '{name}' is a parameter; use system.with_parameters({{'{name}': value}})")
-        if isinstance(value, str) or np.shape(value) != ():
-            found = repr(value) if isinstance(value, str) else f"shape {np.shape(value)}"
-            raise ModelError(f"initial: '{name}' needs a scalar; got {found}")
+        if is_unknown_to_jax(value) or np.shape(value) != ():
+            found = f"shape {np.shape(value)}" if np.shape(value) else repr(value)
+            hint = "" if isinstance(value, str) or np.shape(value) else ": write float(...)"
+            raise ModelError(f"initial: '{name}' needs a scalar; got {found}{hint}")
         if jnp.issubdtype(jnp.result_type(value), jnp.complexfloating):
             raise ModelError(f"initial: '{name}' must be real; got {jnp.result_type(value)}")
         if not isinstance(value, Tracer) and not np.isfinite(np.asarray(value, float)):

@@ -1,5 +1,7 @@
 """Numbers a user gives: what can stand for one, and what cannot."""
 
+import decimal
+import fractions
 import math
 import numbers
 from typing import Any
@@ -33,6 +35,11 @@ def real_number(value: Any, where: str, hint: str = "") -> float:
     if not math.isfinite(number):
         raise ModelError(f"{where} must be finite; got {number}")
     return number
+
+
+def is_unknown_to_jax(value: Any) -> bool:
+    """True for numbers that JAX does not read, such as those of SymPy, and for texts."""
+    return isinstance(value, str | sympy.Basic | fractions.Fraction | decimal.Decimal)
 
 
 def _is_numeral(text: str) -> bool:

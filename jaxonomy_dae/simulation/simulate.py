@@ -144,7 +144,7 @@ def simulate(
         check_tolerances(rtol, atol, dtype)
     rtol, atol = jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype)
     dtmax = None if dtmax is None else jnp.asarray(dtmax, dtype)
-    jump_ts = None if jump_ts is None else jump_times(jump_ts, dtype)
+    jump_ts = jump_times(jump_ts, dtype)
     # Numbers become arrays, so that another value is not another program.
     if initial is None or isinstance(initial, Mapping):
         initial = {name: jnp.asarray(v, dtype) for name, v in sorted((initial or {}).items())}

@@ -104,7 +104,7 @@ def solve_dae(
     if solver is None:
         solver = default_solver(n)
     if stepsize_controller is None:
-        jumps = None if jump_ts is None else jump_times(jump_ts, dtype)
+        jumps = jump_times(jump_ts, dtype)
         longest = None if dtmax is None else jnp.asarray(dtmax, dtype)
         stepsize_controller = step_control(solver, rtol, atol, jumps, longest)
     if isinstance(adjoint, diffrax.BacksolveAdjoint):

@@ -20,7 +20,7 @@ def check_finite(**numbers: Any) -> None:
             continue
         if isinstance(value, str):
             raise ModelError(f"{name} must be a finite number; got the string {value!r}: leave the quotes out")
-        if value is None or np.shape(value) != () or not math.isfinite(value):
+        if value is None or np.shape(value) != () or np.iscomplexobj(value) or not math.isfinite(value):
             raise ModelError(f"{name} must be a finite number; got {value}")
 
 
@@ -65,7 +65,9 @@ def tolerance_of(atol: Tolerance, y: State) -> Any:
 
 
 def jump_times(jump_ts: Any, dtype: Any) -> Any:
-    """Times of jumps as an array: a number or shape (n,)."""
+    """Times of jumps, a number or shape (n,), as an array; None if there is none."""
+    if jump_ts is None or np.shape(jump_ts) == (0,):
+        return None
     array = as_array(jump_ts)
     if array.ndim > 1 or array.dtype.kind not in "iuf":
         raise ModelError(f"jump_ts must be a number or shape (n,); got {array.dtype} of shape {array.shape}")

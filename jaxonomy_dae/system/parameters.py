@@ -16,7 +16,7 @@ from ..errors import ModelError, nearest
 from ..model.array_names import ArrayNames
 from ..model.tables import DependentParameters, complete
 from ..modeling.interval import Interval, closed_ends
-from ..modeling.real_number import real_number
+from ..modeling.real_number import is_unknown_to_jax, real_number
 from .bounds import Ends
 from .sections import HTML_SHOWN, SHOWN
 
@@ -282,8 +282,8 @@ class Parameters(eqx.Module):
     def _checked(self, k: int, value: Any, batch: tuple[int, ...]) -> Any:
         name = self.table.names[k]
         where = f"parameter '{name}'"
-        if isinstance(value, str):
-            return real_number(value, where)  # which raises
+        if is_unknown_to_jax(value):
+            value = real_number(value, where)
         shape = jnp.shape(value)
         if batch and shape not in ((), batch):
             raise ModelError(f"{where} needs a scalar or, in this batch of systems, shape {batch}; got shape {shape}")

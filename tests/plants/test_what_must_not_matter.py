@@ -1,12 +1,14 @@
 """Things that must not matter, and once did: found by `make attack FAMILY=invariance`."""
 
+import fractions
+
 import diffrax
 import jax
 import numpy as np
 import pytest
 import sympy
 
-from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, Eq, EqnEnv, der, simulate
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, Eq, EqnEnv, ModelError, der, simulate
 from jaxonomy_dae.solvers import BDF, Rodas5P
 
 
@@ -51,3 +53,19 @@ def test_rows_that_were_not_reached():
     assert np.isnan(beyond).all()
     together, apart = jax.jit(run)(20.0)
     assert np.isnan(together).all() and np.isnan(apart).all()
+
+
+def test_how_a_number_is_written():
+    """The type of a number: what a declaration takes for a number was an error of JAX in `with_parameters` and
+    `initial`; an empty list of jumps was one of Diffrax."""
+    system = model(lambda c: c.add_equations(Eq(der(c.variable("x", start=1.0, fixed=True)), -c.parameter("k", 1))))
+    for number in (fractions.Fraction(3, 4), sympy.Rational(3, 4), sympy.Float(0.75), np.float32(0.75), 0.75):
+        assert system.with_parameters({"c.k": number}).parameters["c.k"] == 0.75
+    with pytest.raises(ModelError, match="must be a number; got Symbol"):
+        system.with_parameters({"c.k": sympy.Symbol("a")})
+    with pytest.raises(ModelError, match=r"'c.x' needs a scalar; got Fraction\(3, 4\): write float"):
+        system.initialize(initial={"c.x": fractions.Fraction(3, 4)})
+    with pytest.raises(ModelError, match="t1 must be a finite number"):
+        simulate(system, 1j, ts=[0.5])  # pyright: ignore[reportArgumentType]
+    none, empty = (simulate(system, 1.0, ts=[1.0], jump_ts=jumps)["c.x"] for jumps in (None, []))
+    np.testing.assert_array_equal(none, empty)
