@@ -107,21 +107,21 @@ def models(number: int) -> tuple[list[Sketch], list[str]]:
 @functools.cache
 def _programs():
     """Jitted functions of a system, one of each in a process: JAX tells twins apart by what they are made of."""
-    import jax
+    import equinox as eqx
 
     from jaxonomy_dae import simulate
 
-    @functools.partial(jax.jit, static_argnums=2)
+    @eqx.filter_jit
     def point(system, x, names):
         return system.observe(list(names), 0.0, x), system.vector_field(0.0, x)
 
-    @functools.partial(jax.jit, static_argnums=(2, 3))
+    @eqx.filter_jit
     def run(system, ts, names, kinds, inputs):
         inputs = {n: (*v, *dict(kinds)[n]) if isinstance(v, tuple) else v for n, v in inputs.items()}
         solution = simulate(system, ts[-1], ts=ts, inputs=inputs)
         return [solution[n] for n in names], solution.result
 
-    @functools.partial(jax.jit, static_argnums=1)
+    @eqx.filter_jit
     def bounded(system, names):
         free = system.unconstrain(*names)
         return [free[n] for n in names], system.constrain(free).parameters.values
