@@ -4,6 +4,8 @@ import importlib
 import re
 from typing import Any
 
+from .errors import MissingPackage
+
 # What an axis shows if several variables of one unit share it.
 QUANTITIES = {
     "m": "Position", "m/s": "Velocity", "m/s2": "Acceleration", "rad": "Angle", "rad/s": "Angular velocity",
@@ -18,12 +20,12 @@ def optional_module(module: str, extra: str, need: str) -> Any:
 
     **Raises:**
 
-    - `ImportError` that says what needs it, and how it is installed.
+    - `MissingPackage` that says what needs it, and how it is installed.
     """
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise ImportError(f"{need}: pip install 'jaxonomy_dae[{extra}]'") from error
+        raise MissingPackage(f"{need}: pip install 'jaxonomy_dae[{extra}]'") from error
 
 
 def pyplot() -> Any:

@@ -29,6 +29,8 @@ import diffrax
 import equinox as eqx
 import jax
 
+from .errors import JaxonomyDaeError
+
 TRIED = {
     "diffrax": ("0.7.2",),
     "equinox": ("0.13.6", "0.13.8"),
@@ -75,7 +77,7 @@ FOR_STORED_ADJOINT = (
 FOR_LATE_TIMES = ("SaveState", "State")
 
 
-class MissingName(RuntimeError):
+class MissingName(JaxonomyDaeError, RuntimeError):
     """A library no longer has a private name that this package uses."""
 
 

@@ -6,6 +6,7 @@ jaxonomy_dae; the models are written with it, the expectations are not.
 
 import os
 import pathlib
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -280,3 +281,11 @@ def run(program: str) -> str:
     )
     assert done.returncode == 0, done.stderr
     return done.stdout
+
+
+# --- texts -------------------------------------------------------------------------------------------------------
+
+
+def without_lines(error: object) -> str:
+    """The text of an error, with the lines of code that it names left out."""
+    return re.sub(r" {1,2}\([\w.]+\.py:\d+\)", "", str(error))

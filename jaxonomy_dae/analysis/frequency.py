@@ -5,12 +5,14 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from ..errors import explained_keywords
 from ..system.system import AcausalSystem
 from .linearize import linearize
 from .operating_point import OperatingPoint
 from .response import FrequencyResponse
 
 
+@explained_keywords()
 def frequency_response(
     system: AcausalSystem,
     *,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..diagnosis.wording import some
-from ..errors import ModelError, nearest
+from ..errors import ModelError, explained_keywords, nearest
 from ..programs.staging import is_staged
 from ..system.input_values import by_entry
 from ..system.inputs import read_inputs, value_at
@@ -22,6 +22,7 @@ from .steady_state import Drifting, check_system, equilibrium_from, is_traced, p
 from .tangent import Coordinates, choose_coordinates
 
 
+@explained_keywords()
 def linearize(
     system: AcausalSystem,
     inputs: Sequence[str] | Mapping[str, Any],

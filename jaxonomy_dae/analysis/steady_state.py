@@ -10,7 +10,7 @@ import numpy as np
 from jax.core import Tracer
 
 from ..diagnosis.wording import some
-from ..errors import ModelError, SteadyStateError, nearest
+from ..errors import ModelError, SteadyStateError, explained_keywords, nearest
 from ..initialization.check import check
 from ..initialization.initialize import find_initial
 from ..programs.staging import is_staged
@@ -33,6 +33,7 @@ WORST = 4  # equations, or directions, that an error names
 IN_DIRECTION = 0.1  # of its largest entry: what else belongs to a direction that nothing determines
 
 
+@explained_keywords()
 def steady_state(
     system: AcausalSystem,
     *,

@@ -6,6 +6,7 @@ import numpy as np
 
 from ..errors import ModelError
 from ..model.provenance import Provenance
+from ..modeling.component import Component
 from ..modeling.connections import Signal
 from ..modeling.diagram import AcausalDiagram
 from .group_builder import GroupBuilder
@@ -31,10 +32,7 @@ def connect_signals(model: ModelNumbers, diagram: AcausalDiagram, builder: Group
             for symbol in signal:
                 found = model.resolve(i, symbol.path, "variables")
                 if found is None:
-                    raise ModelError(
-                        f"{paths[0]}: '{symbol.path}' is connected, but it is not a variable there: add the component "
-                        "to the diagram, and connect what it, or its direct children, declare"
-                    )
+                    raise ModelError(f"{paths[0]}: '{symbol.path}' is connected, but {_why(model, i, symbol.path)}")
                 columns.append(found)
             for where, ids in zip(paths, np.stack(columns, axis=1).tolist(), strict=True):
                 # A component's own input is given from outside; inside it drives like any variable.
@@ -61,3 +59,21 @@ def connect_signals(model: ModelNumbers, diagram: AcausalDiagram, builder: Group
                         Provenance(f"connection of {names[source]}, {names[v]}: equal signals"),
                     )
     return set(driven)
+
+
+def _why(model: ModelNumbers, i: Instances | None, path: str) -> str:
+    """Why a path of a connected variable leads nowhere in a component, or in the diagram if i is None."""
+    children = model.top if i is None else i.component.children
+    adding = "diagram.add" if i is None else "self.add"
+    place = "the diagram" if i is None else f"'{model.path(i)}'"
+    head, dot, rest = path.partition(".")
+    if not dot:
+        return f"{place} has no such variable: connect variables of its components, such as component.{path}"
+    while dot and head in children:
+        child = children[head]
+        children = child.children if isinstance(child, Component) else {}
+        place, (head, dot, rest) = f"'{child.path}'", rest.partition(".")
+    if dot:
+        return f"'{head}' is not a component of {place}: add it, {adding}({head})"
+    inside = [name for name, child in children.items() if isinstance(child, Component) and head in child.variables]
+    return f"{place} has no variable '{head}'" + (f": connect that of {inside[0]}" if inside else "")

@@ -10,10 +10,11 @@ from ..expressions.from_sympy import UnsupportedExpression, read, symbols_of
 from ..expressions.node import Node
 from ..expressions.to_sympy import shortened
 from ..model.linear_template import LinearTemplate
-from ..model.provenance import Provenances, Written
+from ..model.provenance import Lines, Provenances, Written
 from ..model.symbolic import canonical, linear_coefficients
 from ..model.tables import AccountGroup
 from ..model.template import AbstractTemplate
+from ..modeling.component import line_of
 from ..modeling.symbols import ParameterSymbol, PreviousSymbol, TimeSymbol, VariableSymbol, symbol_label
 from .group_builder import GroupBuilder
 from .lift_numbers import TemplateRows, lifted
@@ -35,7 +36,7 @@ def add_components(model: ModelNumbers, builder: GroupBuilder):
     for (graphs, _, _), parts in by_shape.items():
         members = Members(model, parts)
         number = members.number
-        for graph, residual in zip(graphs, parts[0].component.equations, strict=True):
+        for k, (graph, residual) in enumerate(zip(graphs, parts[0].component.equations, strict=True)):
             variables, parameters = slots_of(model, parts[0], residual, graph)
             coefficients = linear_coefficients(graph, variables)
             ids = members.ids([v.path for v in variables], "variable")
@@ -44,7 +45,8 @@ def add_components(model: ModelNumbers, builder: GroupBuilder):
             parameter_ids[:, before] = model.previous[parameter_ids[:, before]]
             order = np.tile([v.order for v in variables], (len(number), 1))
             shown = parts[0].component.as_written.get(residual, residual)
-            provenance = Provenances.made(Written(f"0 = {shortened(shown)}", model.paths), number, True)
+            lines = Lines([i.number for i in parts], [line_of(i.component, i.component.equations[k]) for i in parts])
+            provenance = Provenances.made(Written(f"0 = {shortened(shown)}", model.paths, lines), number, True)
             if coefficients is None:
                 template: AbstractTemplate = canonical(graph, variables, parameters)
                 numbers = np.zeros((len(number), 0))

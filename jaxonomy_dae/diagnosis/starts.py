@@ -102,8 +102,8 @@ def _check_linear(flat: FlatModel, groups, numbers: dict[tuple[int, int], tuple[
             pairs = zip(group.variable[k].tolist(), group.order[k].tolist(), strict=True)
             names = [flat.variables.names[numbers[q][0]] for q in pairs]
             raise StructuralError(
-                f"the fixed starts of {listed(names)} contradict the equation {group.provenance[k]}. Free one of them "
-                "(fixed=False), or give values that agree."
+                f"the fixed starts of {listed(names)} contradict the equation {group.provenance[k].located}. Free one "
+                "of them (fixed=False), or give values that agree."
             )
 
 

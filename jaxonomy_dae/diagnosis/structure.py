@@ -14,6 +14,7 @@ from ..model.tables import ZERO, AliasTable, EquationGroup, FlatModel, provenanc
 from ..structure.dulmage_mendelsohn import dulmage_mendelsohn
 from ..structure.incidence import Incidence
 from ..structure.matching import maximum_matching
+from .balance import more_than_owed, sets_input_of_child, short_of_equations
 from .recognise import recognise
 from .redundant_constraints import too_many
 from .wording import counted, itemised, listed
@@ -52,12 +53,12 @@ def check_structure(
             if not len(variables):
                 text = provenance_of(flat.groups, int(rows[0]))
                 texts.append(
-                    f"this equation contains no unknown: {text}. Remove it, or declare its input as a variable."
+                    f"this equation contains no unknown: {text.located}. Remove it, or declare its input as a variable."
                 )
                 continue
             names = [flat.variables.names[v] for v in variables if not flat.variables.is_port[v]]
             names = names or [flat.variables.names[v] for v in variables]
-            texts.append(_too_many([provenance_of(flat.groups, int(r)) for r in rows], len(variables), names))
+            texts.append(_too_many(flat, [provenance_of(flat.groups, int(r)) for r in rows], len(variables), names))
     else:
         texts = []
         for rows, columns in over:
@@ -74,7 +75,7 @@ def check_structure(
                 under = [one for one in under if not _only_through(flat, np.isin(alias.root, unknown[one[1]]))]
                 continue
             best = _best(flat, alias, unknown, columns).tolist()
-            texts.append(_too_many(*_with_multiples(flat, alias, rows, groups, columns, best)))
+            texts.append(_too_many(flat, *_with_multiples(flat, alias, rows, groups, columns, best)))
         empty = [provenance_of(groups, int(rows[0])) for rows, columns in over if not len(columns)]
         texts += _repeated(flat, empty) if empty else []
     texts += [
@@ -95,7 +96,10 @@ def _joined(texts: list[str], unseen: int = 0) -> str:
     return "\n".join(["the equations do not fit together:", *(f"- {t}" for t in texts[:PARTS]), *more])
 
 
-def _too_many(equations: list[Provenance], n_unknowns: int, names: list[str]) -> str:
+def _too_many(flat: FlatModel, equations: list[Provenance], n_unknowns: int, names: list[str]) -> str:
+    known = sets_input_of_child(flat, equations) or more_than_owed(flat, equations)
+    if known:
+        return known
     n = len(equations)
     if n > n_unknowns:
         lines = [
@@ -146,9 +150,9 @@ def _repeated(flat: FlatModel, empty: list[Provenance]) -> list[str]:
             empty = [e for e in empty if e not in equations]
             names = [flat.variables.names[v] for v in unknown[columns] if not flat.variables.is_port[v]]
             texts.append(
-                _too_many(equations, len(columns), names or [flat.variables.names[v] for v in unknown[columns]])
+                _too_many(flat, equations, len(columns), names or [flat.variables.names[v] for v in unknown[columns]])
             )
-    return texts + [f"this equation only repeats what others say: {e}. Remove it." for e in empty]
+    return texts + [f"this equation only repeats what others say: {e.located}. Remove it." for e in empty]
 
 
 def _unused_inside(flat: FlatModel) -> np.ndarray:
@@ -180,36 +184,13 @@ def _too_few(flat: FlatModel, n_equations: int, variables: np.ndarray, concerned
     if len(near):
         close = listed(flat.ports.names[p] for p in near)
         return f"{text}: {'is' if len(near) == 1 else 'are'} {close} meant to be connected?"
-    short = _short_of_equations(flat, concerned)
+    short = short_of_equations(flat, concerned, names)
     if short:
-        return f"{short} Probably missing is one for {listed(names, joint='or')}."
+        return short
     if len(names) == 1:
         return f"{text}: add an equation for it, declare it as an input, or leave it out."
     what = "an equation" if missing == 1 else f"{missing} equations"
     return f"{text}: add {what}, or declare {'one' if missing == 1 else missing} of them as an input."
-
-
-def _short_of_equations(flat: FlatModel, concerned: np.ndarray) -> str:
-    """Names a component that wrote fewer equations than it has variables and through quantities at its ports, which are
-    what a component without children owes; "" if there is none among those concerned."""
-    v = flat.variables
-    owns = np.bincount(v.owner[~v.is_input & ~(v.is_port & v.is_across)], minlength=len(flat.components))
-    owners = np.unique(v.owner[concerned & v.is_port]).tolist()
-    written = {flat.components[k]: 0 for k in owners}
-    within: set[str] = set()  # with children or networks, whose equations count for it
-    for group in flat.groups:
-        for provenance in group.provenance:
-            if provenance.component in written:
-                written[provenance.component] += 1
-            within.update(name for name in written if provenance.component.startswith(f"{name}."))
-    for k in owners:
-        name = flat.components[k]
-        if name not in within and written[name] < owns[k]:
-            return (
-                f"component '{name}' has {counted(written[name], 'equation')}, but needs {owns[k]}: one for each of "
-                "its variables and one for each of its ports."
-            )
-    return ""
 
 
 def _only_through(flat: FlatModel, concerned: np.ndarray) -> bool:

@@ -116,7 +116,7 @@ def counted(n: int, what: str) -> str:
 def itemised(equations: Sequence[Provenance]) -> list[str]:
     """A line for each equation; long lists are cut, and the components of the rest named."""
     count = collections.Counter(equations)
-    lines = [f"  {e}" + (f"  (written {n} times)" if n > 1 else "") for e, n in list(count.items())[:SHOWN]]
+    lines = [f"  {e.located}" + (f"  (written {n} times)" if n > 1 else "") for e, n in list(count.items())[:SHOWN]]
     rest = list(count)[SHOWN:]
     if rest:
         owners = [e.component for e in rest if e.is_written]

@@ -1,6 +1,7 @@
 """What initialization did, in user names: for `system.initialization_report()`, and for the text of its errors."""
 
 import functools
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -41,12 +42,14 @@ class Guess(NamedTuple):
 
 
 class Redundant(NamedTuple):
-    """A start that the equations and other starts determine: pairs of name and value."""
+    """A start that the equations and other starts determine: pairs of name and value. `arguments` are the parameters
+    of components that fix these starts, where there is one for each."""
 
     name: str
     value: float
     follows_from: tuple[tuple[str, float], ...]
     agrees: bool
+    arguments: tuple[str, ...] = ()
 
 
 class Residual(NamedTuple):
@@ -150,8 +153,21 @@ class InitializationReport(Sections):
             chosen = [first + j for j in involved]
             agrees = bool((np.abs(self._residual[chosen]) <= self._limit[chosen]).all())
             name, number = value(rows.kept[k])
-            out.append(Redundant(name, number, tuple(value(o) for o in others), agrees))
+            arguments = self._arguments([rows.kept[k], *others])
+            out.append(Redundant(name, number, tuple(value(o) for o in others), agrees, arguments))
         return out
+
+    def _arguments(self, starts: Sequence[StartRow]) -> tuple[str, ...]:
+        """The parameters that are the declared starts of these rows; none if one of them has another kind of start."""
+        flat = self._plan.flat
+        found = []
+        for row in starts:
+            names = [flat.parameters.names[p] for p in (row.start.parameters if row.start else ())]
+            # A component's own parameter, which is the start of nothing else that it fixes.
+            if len(names) != 1 or names[0].rpartition(".")[0] != row.name.rpartition(".")[0]:
+                return ()
+            found += names
+        return tuple(dict.fromkeys(found))
 
     # --- residuals ---------------------------------------------------------------------------------------------
 
@@ -178,13 +194,13 @@ class InitializationReport(Sections):
         out = []
         for planned in plan.constraints:
             for e, q in zip(planned.group.equation, planned.group.quantity, strict=True):
-                out.append((plan.describe(int(e)), self._names(q)))
+                out.append((plan.locate(int(e)), self._names(q)))
         for step in plan.steps:
             if step.carried:
                 for equation in step.left:
                     for b in range(len(equation.equation)):
                         names = self._names(equation.quantity[b])
-                        out.append((plan.describe(int(equation.equation[b])), names))
+                        out.append((plan.locate(int(equation.equation[b])), names))
         return out + starts
 
     def _names(self, quantities: np.ndarray) -> tuple[str, ...]:
@@ -389,11 +405,15 @@ def _contradiction(r: Redundant) -> str:
             f"{r.name} is fixed at {r.value:.6g}, but the equations alone determine it: free it (fixed=False), or give "
             "a value that agrees."
         )
+    release = "release one start (fixed=False, or without the component's argument `initial_…`)"
+    if r.arguments:
+        arguments = [f"`{name.rpartition('.')[2]}` of {name.rpartition('.')[0]}" for name in r.arguments]
+        release = f"leave out {' or '.join(arguments)} (in components of your own: fixed=False)"
     names = [r.name, *(n for n, _ in r.follows_from)]
     values = [r.value, *(v for _, v in r.follows_from)]
     return (
         f"{_joined(names)} are fixed at {_joined([f'{v:.6g}' for v in values])}, which contradict each other: "
-        "release one start (fixed=False, or without the component's argument `initial_…`), or give values that agree."
+        f"{release}, or give values that agree."
     )
 
 

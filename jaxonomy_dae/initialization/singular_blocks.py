@@ -111,7 +111,7 @@ def _finding(
     plan: SystemPlan, values: BlockValues, step: Step, b: int, condition, singular, left, right
 ) -> BlockFinding:
     names = [plan.quantity_name[int(u[b])] for u in step.unknown]
-    texts = [plan.describe(int(e.equation[b])) for e in step.equations]
+    texts = [plan.locate(int(e.equation[b])) for e in step.equations]
     chosen = np.flatnonzero(np.abs(right).max(axis=1, initial=0.0) > SLIGHT)
     dependent = np.flatnonzero(np.abs(left).max(axis=1, initial=0.0) > SLIGHT)
     variables = tuple(names[u] for u in chosen) or tuple(names)
@@ -202,6 +202,6 @@ def _constraints(plan: SystemPlan, values: BlockValues) -> Iterator[BlockFinding
     singular = not rank.is_regular
     at = tuple((name, float(values.quantities[plan.states[k]])) for name, k in zip(names, states, strict=True))
     yield BlockFinding(
-        float(condition), singular, m, names, tuple(plan.describe(texts[e]) for e in dependent), at, False,
+        float(condition), singular, m, names, tuple(plan.locate(texts[e]) for e in dependent), at, False,
         undecided=singular and is_undecided(matrix),
     )  # fmt: skip

@@ -45,7 +45,7 @@ def sparse_finding(plan: SystemPlan, values: BlockValues, step: SparseStep) -> B
     dependent = np.flatnonzero(np.abs(left) > SLIGHT * np.abs(left).max())
     left, right = rank.r * left, rank.c * right
     names = tuple(plan.quantity_name[int(step.unknown[0][k])] for k in chosen)
-    equations = tuple(dict.fromkeys(plan.describe(int(texts[k])) for k in dependent))
+    equations = tuple(dict.fromkeys(plan.locate(int(texts[k])) for k in dependent))
     singular = not rank.is_regular
     causes = _causes(plan, values, step, column, left, right) if singular else ()
     return BlockFinding(rank.condition, singular, n, names, equations, causes, bool(causes))

@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from ..diagnosis.unused_parameters import unused_parameters
 from ..diagnosis.wording import listed
-from ..errors import InitializationError, ModelError, SimulationError, SteadyStateError
+from ..errors import InitializationError, ModelError, SimulationError, SteadyStateError, explained_keywords
 from ..modeling.interval import Interval
 from ..programs.cache import compiled
 from ..programs.staging import is_traced
@@ -56,6 +56,7 @@ class Minimized(Generic[Model]):
         return f"<p><code>{html.escape(repr(self))}</code></p><details><summary>model</summary>{model}</details>"
 
 
+@explained_keywords()
 def minimize(
     model: Model,
     loss: Callable[..., Any],

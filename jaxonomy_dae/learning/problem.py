@@ -11,7 +11,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Float
 
-from ..errors import ModelError, SimulationError
+from ..errors import ModelError, SimulationError, explained_keywords
 from ..solvers.solve import check_tolerances, default_tolerances
 from ..system.system import AcausalSystem
 from .asked import as_asked, check_start, checked_method, names_to_train, penalties, started
@@ -68,6 +68,7 @@ class Problem:
         model reads, for an unknown start of an algebraic variable, and for data that do not fit.
     """
 
+    @explained_keywords()
     def __init__(
         self,
         system: AcausalSystem,
@@ -192,6 +193,7 @@ class Problem:
 
     # --- fitting -----------------------------------------------------------------------------------------------
 
+    @explained_keywords()
     def fit(
         self,
         data: Data | Experiment | None = None,

@@ -14,6 +14,7 @@ import lineax as lx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from ..errors import ModelError
 from .algebra import Dense as DenseAlgebra
 from .operator import SparseLinearOperator
 from .sparse import SparsePattern, factorised_solve
@@ -37,7 +38,7 @@ class _AbstractDirect(lx.AbstractLinearSolver[_State]):
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> _State:
         del options
         if operator.in_size() != operator.out_size():
-            raise ValueError(
+            raise ModelError(
                 f"{type(self).__name__} solves square systems; this operator is {operator.out_size()} × "
                 f"{operator.in_size()}"
             )
@@ -82,7 +83,7 @@ class WrittenOut(_AbstractDirect):
     def _kept(self, operator):
         n = operator.in_size()
         if n > UNROLLED:
-            raise ValueError(f"WrittenOut is for up to {UNROLLED} unknowns; this operator has {n}: use Dense()")
+            raise ModelError(f"WrittenOut is for up to {UNROLLED} unknowns; this operator has {n}: use Dense()")
         return operator.as_matrix(), None
 
     def _solved(self, state, b):
@@ -113,7 +114,7 @@ class KLU(_AbstractDirect):
 
     def _kept(self, operator):
         if not isinstance(operator, SparseLinearOperator):
-            raise ValueError(
+            raise ModelError(
                 f"KLU solves with a SparseLinearOperator; got {type(operator).__name__}. Give the entries and their "
                 "places: SparseLinearOperator(values, SparsePattern(rows, cols, n))"
             )

@@ -9,6 +9,7 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..errors import ModelError
 from .sparse import SparsePattern
 
 
@@ -30,7 +31,7 @@ class SparseLinearOperator(lx.AbstractLinearOperator):
 
     def __init__(self, values: Float[Array, " nnz"], pattern: SparsePattern, tags: object | frozenset[object] = ()):
         if jnp.shape(values) != (len(pattern),):
-            raise ValueError(f"values must have shape ({len(pattern)},), one for each place; got {jnp.shape(values)}")
+            raise ModelError(f"values must have shape ({len(pattern)},), one for each place; got {jnp.shape(values)}")
         self.values, self.pattern = values, pattern
         many = isinstance(tags, frozenset | set | tuple | list)
         self.tags = frozenset(tags if many else (tags,))  # pyright: ignore[reportArgumentType]

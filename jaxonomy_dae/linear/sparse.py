@@ -26,7 +26,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Float
 
-from ..errors import ModelError
+from ..errors import MissingPackage, ModelError
 
 EXTRA = 'pip install "jaxonomy_dae[sparse]"'
 DENSE = 1000  # simultaneous equations that dense elimination may solve if there is no sparse solver: about 20 ms
@@ -51,10 +51,10 @@ class SparsePattern:
         self.n = int(n)
         self.n_rows = self.n if n_rows is None else int(n_rows)
         if self.rows.shape != self.cols.shape or self.rows.ndim != 1:
-            raise ValueError(f"rows {self.rows.shape} and cols {self.cols.shape} must be vectors of one length")
+            raise ModelError(f"rows {self.rows.shape} and cols {self.cols.shape} must be vectors of one length")
         for name, places, size in (("rows", self.rows, self.n_rows), ("cols", self.cols, self.n)):
             if len(places) and not (0 <= places.min() and places.max() < size):
-                raise ValueError(f"{name} must lie in 0 … {size - 1}; got {places.min()} … {places.max()}")
+                raise ModelError(f"{name} must lie in 0 … {size - 1}; got {places.min()} … {places.max()}")
         self.rows.flags.writeable = self.cols.flags.writeable = False
         hasher = hashlib.sha256(repr((self.n_rows, self.n)).encode())
         hasher.update(self.rows.tobytes() + self.cols.tobytes())
@@ -152,7 +152,7 @@ class SparseMatrix(eqx.Module):
         return solve_sparse(self.pattern, self.values, b, transpose)
 
 
-class MissingSparseSolver(ImportError):
+class MissingSparseSolver(MissingPackage):
     """The package for sparse solves is not installed."""
 
 
@@ -209,9 +209,9 @@ def solve_sparse(
     """
     klu()
     if pattern.n_rows != pattern.n:
-        raise ValueError(f"a matrix to be solved with must be square; this one is {pattern.n_rows} × {pattern.n}")
+        raise ModelError(f"a matrix to be solved with must be square; this one is {pattern.n_rows} × {pattern.n}")
     if not is_double():
-        raise ValueError(
+        raise ModelError(
             "sparse solves compute in float64: call jax.config.update('jax_enable_x64', True) at the start"
         )
     if not pattern.n:
@@ -238,7 +238,7 @@ def factorised_solve(
     """As `solve_sparse`, without derivatives."""
     klu()
     if not is_double():
-        raise ValueError(
+        raise ModelError(
             "sparse solves compute in float64: call jax.config.update('jax_enable_x64', True) at the start"
         )
     if pattern.coalesced is not None:

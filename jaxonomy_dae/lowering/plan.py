@@ -234,6 +234,11 @@ class SystemPlan:
         base, level = int(self.extended.base[equation]), int(self.extended.level[equation])
         return differentiated(provenance_of(self.model.groups, base), level)
 
+    def locate(self, equation: int) -> str:
+        """The text of an extended equation with the line of the user's code, for errors."""
+        line = provenance_of(self.model.groups, int(self.extended.base[equation])).line
+        return self.describe(equation) + (f"  ({line})" if line else "")
+
     @property
     def visible_variables(self) -> list[str]:
         """The names a user may read: all but those made for corrected derivatives."""

@@ -20,6 +20,7 @@ import sympy
 
 from ..expressions.node import Node
 from ..linear.sparse import SparsePattern
+from .provenance import Lines
 from .template import AbstractTemplate
 
 
@@ -88,6 +89,8 @@ class _Walk:
                 return _digest(name, part.digest)
             case AbstractTemplate():
                 return _digest(name, part.key.encode(), self.digest(part.opaque))
+            case Lines():
+                return _digest(name)  # where a model is written does not change what it is
             case SparsePattern():
                 return _digest(name, part.digest.encode())
             case sympy.Basic():

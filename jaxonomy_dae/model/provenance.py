@@ -12,12 +12,13 @@ class Provenance(NamedTuple):
     """The component or network that wrote an equation, and what the equation says; `str` puts both together.
 
     `component` is empty for connections and for what passes made; `sources` are the equations as written that a pass
-    combined.
+    combined; `line` is where in a user's code the equation was written, or the library's component made.
     """
 
     statement: str
     component: str = ""
     sources: "tuple[Provenance, ...]" = ()
+    line: str = ""
 
     @property
     def is_written(self) -> bool:
@@ -26,6 +27,11 @@ class Provenance(NamedTuple):
 
     def __str__(self):
         return f"{self.component}: {self.statement}" if self.component else self.statement
+
+    @property
+    def located(self) -> str:
+        """The text with the line of the user's code, for errors."""
+        return f"{self}  ({self.line})" if self.line else str(self)
 
 
 class Provenances(Sequence[Provenance]):
@@ -103,14 +109,29 @@ class Provenances(Sequence[Provenance]):
 Source = Callable[[int], Provenance]
 
 
+class Lines:
+    """Lines of a user's code, by the numbers of components. Messages print them; they tell no two models apart."""
+
+    def __init__(self, numbers: Sequence[np.ndarray], lines: Sequence[str]):
+        self._numbers, self._lines = tuple(numbers), tuple(lines)
+
+    def of(self, number: int) -> str:
+        """The line of a component; "" if it is not known."""
+        places = zip(self._numbers, self._lines, strict=True)
+        return next((line for numbers, line in places if number in numbers), "")
+
+
+NO_LINES = Lines((), ())
+
+
 class Written:
     """Source of provenances: one equation of many components, chosen by number."""
 
-    def __init__(self, statement: str, components: Sequence[str]):
-        self.statement, self.components = statement, components
+    def __init__(self, statement: str, components: Sequence[str], lines: Lines = NO_LINES):
+        self.statement, self.components, self.lines = statement, components, lines
 
     def __call__(self, component: int) -> Provenance:
-        return Provenance(self.statement, self.components[component])
+        return Provenance(self.statement, self.components[component], line=self.lines.of(component))
 
 
 def combination(equations: Sequence[Provenance]) -> Provenance:

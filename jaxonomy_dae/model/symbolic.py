@@ -157,6 +157,10 @@ class SymbolicTemplate(AbstractTemplate):
             return []
         return self._evaluate("terms", lambda: self._terms, (slots, parameters, coefficients, t), "numpy")
 
+    def values_of(self, nodes: Sequence[Node], slots, parameters, coefficients, t) -> list:
+        """The values of parts of the graph, in NumPy."""
+        return self._evaluate(("parts", *nodes), lambda: nodes, (slots, parameters, coefficients, t), "numpy")
+
     def readers_of_partials(self) -> tuple[list[frozenset[int]], list[frozenset[int]]]:
         return self._readers(self.partials)
 

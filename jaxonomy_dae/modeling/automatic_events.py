@@ -364,7 +364,8 @@ def relations_left_alone(residual: sympy.Expr) -> tuple[Any, ...]:
         return ()
     order = _inside_out([_with_marks(residual)])
     found = [e.args[0] for e in order if isinstance(e, Smooth)]
-    return tuple(e for e in found if any(isinstance(p, (sympy.Piecewise, *KINKED)) for p in _varying(_inside_out([e]))))
+    kinked = (sympy.Piecewise, *KINKED)
+    return tuple(Smooth(e) for e in found if any(isinstance(p, kinked) for p in _varying(_inside_out([e]))))
 
 
 @functools.lru_cache(maxsize=4096)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import sympy
 
-from ..errors import ModelError, nearest
+from ..errors import ModelError, UnknownAttribute, nearest
 from .arrays import ComponentArray, make_array
 from .connections import Connection, Signal, resolve_ends
 from .construction import Construction
@@ -19,6 +19,7 @@ from .interval import Interval, as_interval
 from .mode_declarations import ModeDeclarations
 from .names import check_name
 from .networks import check_kind, count_outputs, of_scalars
+from .place import line_of_caller
 from .ports import Domain, Port
 from .real_number import real_number
 from .symbols import DiscreteSymbol, ParameterSymbol, PreviousSymbol, TimeSymbol, VariableSymbol
@@ -66,6 +67,8 @@ class Component(ModeDeclarations, metaclass=Construction):
         self.as_written: dict[sympy.Expr, sympy.Expr] = {}
         self.held_branches: list[HeldBranch] = []
         self.accounts: list[Account] = []
+        self._line = line_of_caller()
+        self._lines: dict[sympy.Expr, str] = {}  # of equations that were written on lines of their own
         self._sealed = False
 
     # --- names -------------------------------------------------------------------------------------------------
@@ -109,7 +112,7 @@ class Component(ModeDeclarations, metaclass=Construction):
                 return self.symbol(name)
         tables = ("ports", "children", "variables", "parameters")
         declared = [n for table in tables for n in self.__dict__.get(table, ()) if "." not in n]
-        raise AttributeError(
+        raise UnknownAttribute(
             f"{type(self).__name__} '{self.__dict__.get('name', '')}' has no attribute '{name}'"
             + (f": {nearest(name, declared)}" if declared and not name.startswith("_") else "")
         )
@@ -466,15 +469,19 @@ class Component(ModeDeclarations, metaclass=Construction):
         - `ModelError` if an equation is trivially true or false, or has a symbol the component does not know.
         """
         self._check_open("add its equations")
+        line = line_of_caller()
         for equation in equations:
             if not isinstance(equation, sympy.Basic | bool | int | float):
                 raise ModelError(f"component '{self.name}': {equation!r} is not an equation")
             try:
-                self.equations.append(residual_of(equation))
+                residual = residual_of(equation)
             except ModelError as error:
                 raise ModelError(f"component '{self.name}': {error}") from None
             except TypeError:  # not even hashable, such as a matrix
                 raise ModelError(f"component '{self.name}': {equation!r} is not an equation") from None
+            self.equations.append(residual)
+            if line != self._line:
+                self._lines.setdefault(residual, line)
 
     # --- energy ------------------------------------------------------------------------------------------------
 
@@ -576,9 +583,16 @@ class Component(ModeDeclarations, metaclass=Construction):
 
 _BASE_ATTRIBUTES = (
     *"ev name parent parameters variables ports children equations".split(),
-    *"learned_terms connections signals events relations as_written held_branches accounts _sealed".split(),
+    *"learned_terms connections signals events relations as_written held_branches accounts".split(),
+    *"_line _lines _sealed".split(),
 )
 
 
 def _noun(what: str) -> str:
     return "network" if what == "learned term" else what
+
+
+def line_of(component: Component, residual: sympy.Expr) -> str:
+    """Where in the user's code an equation was added; for a component of the library, where that was made."""
+    lines = component._lines
+    return lines.get(component.as_written.get(residual, residual), component._line) if lines else component._line

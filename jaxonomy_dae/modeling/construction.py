@@ -1,13 +1,12 @@
 """What happens around a component's `__init__`: symbols among its arguments are marked as its parent's, it is closed
 when construction ends, and common slips are explained."""
 
-import inspect
 import re
 from typing import Any
 
 from sympy import SympifyError
 
-from ..errors import ModelError, nearest
+from ..errors import ModelError, keywords_of, wrong_keyword
 from .symbols import SHADOWED, seen_from_child
 
 
@@ -21,13 +20,14 @@ class Construction(type):
             if "_sealed" in component.__dict__:
                 component._with_events()
         except (TypeError, SympifyError) as error:
-            hint = _wrong_keyword(error, cls) or _hint(error, cls.__name__)
+            wrong = _wrong_keyword(error, cls)
+            if wrong is not None:
+                raise ModelError(wrong) from error
+            hint = _hint(error, cls.__name__)
             if hint is None:
                 raise
             first = str(error).split("\n")[0]
-            detail = (
-                "" if " at 0x" in first or "unexpected keyword" in first else f" ({first})"
-            )  # objects without a name say nothing
+            detail = "" if " at 0x" in first else f" ({first})"  # objects without a name say nothing
             raise ModelError(f"{cls.__name__}: {hint}{detail}") from error
         if "_sealed" not in component.__dict__:
             raise ModelError(f"{cls.__name__}: {_HOW_TO_BEGIN}")
@@ -39,12 +39,26 @@ _HOW_TO_BEGIN = "its __init__ must begin with super().__init__(ev, name)"
 
 
 def _wrong_keyword(raised: Exception, cls: type) -> str | None:
-    """Names the arguments that a component has if it was given another one; None for other errors."""
-    found = re.search(rf"^{cls.__name__}\.__init__\(\) got an unexpected keyword argument '(\w+)'", str(raised))
-    if found is None:
+    """Names the arguments of a class of components, or of a method of it, that was given another one; None for other
+    errors."""
+    found = re.search(r"^(\w+)\.(\w+)\(\) got an unexpected keyword argument '(\w+)'", str(raised))
+    owner = next((c for c in cls.__mro__ if found is not None and c.__name__ == found[1]), None)
+    method = None if found is None else getattr(owner, found[2], None)
+    if found is None or method is None:
         return None
-    known = [name for name in inspect.signature(cls.__init__).parameters if name not in ("self", "ev", "name")]
-    return f"there is no argument '{found[1]}': {nearest(found[1], known)}"
+    where = found[2] if found[2] != "__init__" else cls.__name__
+    known = [name for name in keywords_of(method) if where != cls.__name__ or name not in ("ev", "name")]
+    return wrong_keyword(where, found[3], known, _ELSEWHERE)
+
+
+_ELSEWHERE = {
+    "initial": "start=",
+    "initial_value": "start=",
+    "guess": "start=",
+    "units": "unit=",
+    "min": "bounds=(low, high)",
+    "max": "bounds=(low, high)",
+}
 
 
 def _hint(raised: Exception, name: str) -> str | None:

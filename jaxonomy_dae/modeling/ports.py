@@ -7,6 +7,8 @@ positive into the component.
 import dataclasses
 from typing import Any, Protocol, runtime_checkable
 
+from ..errors import UnknownAttribute
+
 
 @dataclasses.dataclass(frozen=True)
 class Domain:
@@ -75,7 +77,7 @@ class Port:
         domain = self.domain
         known = [n for n, _ in (*domain.across, *domain.through)]
         if name not in known:
-            raise AttributeError(
+            raise UnknownAttribute(
                 f"the {domain.name} port '{self.component.name}.{self.name}' has no '{name}': it has {', '.join(known)}"
             )
         return self.component.symbol(f"{self.name}.{name}")

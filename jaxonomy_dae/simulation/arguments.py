@@ -6,6 +6,7 @@ is `NOT_ADMITTED`.
 """
 
 import math
+import warnings
 from typing import Any
 
 import diffrax
@@ -77,6 +78,7 @@ def check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_contr
             "stepsize_controller=StepTo(...) prescribes where steps end, but this model has events, at which they must "
             "end too: leave it out, or bound the steps with dtmax="
         )
+    _note_single_precision(system)
     check_longest_step(dtmax)
     if isinstance(initial, SavedState):
         check_saved_state(system, t0, initial)
@@ -86,6 +88,17 @@ def check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_contr
         check_initial(system, initial)
     _check_interval(initial_time(t0, initial), t1, ts)
     _check_periods(system)
+
+
+def _note_single_precision(system: AcausalSystem) -> None:
+    """Warns of a system whose numbers were made before JAX was told to use double precision."""
+    if system.parameters.values.dtype == np.float32 and jax.config.jax_enable_x64:  # pyright: ignore
+        warnings.warn(
+            "the system was compiled before double precision was enabled, so its numbers are float32: compile it after "
+            'jax.config.update("jax_enable_x64", True)',
+            RuntimeWarning,
+            stacklevel=4,
+        )
 
 
 def check_switches(max_events: Any, **switches: Any) -> None:

@@ -3,8 +3,6 @@
 Every quantity is computed at the last accepted point as a run computes it, and just beyond. The first step of the
 schedule with an unknown that is not finite, though all it reads is, has failed: because its matrix is singular, because
 the order in which it is eliminated divides by zero, or because Newton's method finds no root.
-
-Before it, an equation may have no finite value at all where it reads finite ones.
 """
 
 from typing import Any
@@ -16,9 +14,7 @@ from ..aliases import Inputs, State, Time
 from ..diagnosis.wording import quoted
 from ..initialization.condition import BlockFinding
 from ..initialization.singular_blocks import examine_blocks
-from ..lowering.schedule import AnyStep, StepEquation
-from ..model.group import Point
-from ..model.networks import Networks
+from ..lowering.schedule import AnyStep
 from ..model.tables import ZERO
 from ..programs.cache import compiled
 from ..solvers.dae_term import FlatProblem
@@ -30,7 +26,6 @@ from .preparation import term_of
 SHOWN = 4  # names, values and equations of each kind in an error
 NEAR = 10.0 ** np.arange(-15, -5)  # parts of the interval
 Instant = tuple[Any, Any]  # (time, state)
-ANY = 0.5  # the value given to the unknown of an equation that is only asked whether it is finite
 
 
 def failed_block(system: AcausalSystem, first: Instant, last: Instant, t1: Time, inputs: Inputs) -> str:
@@ -71,7 +66,7 @@ def _first_failed(system: AcausalSystem, t: Time, x: State, inputs: Inputs) -> A
     known = np.arange(plan.extended.quantities.n_unknown, plan.extended.quantities.n)
     computed = np.concatenate([plan.states, *(q for step in plan.steps for q in step.unknown), known])
     values = np.full(plan.extended.quantities.n + 1, np.nan)
-    values[computed] = _quantities(system, t, jnp.asarray(x), inputs, tuple(computed.tolist()))
+    values[computed] = quantities(system, t, jnp.asarray(x), inputs, tuple(computed.tolist()))
     values[ZERO] = 0.0
     for step in plan.steps:
         if np.isfinite(values[np.concatenate(step.unknown)]).all():
@@ -83,7 +78,8 @@ def _first_failed(system: AcausalSystem, t: Time, x: State, inputs: Inputs) -> A
 
 
 @compiled
-def _quantities(system: AcausalSystem, t: Time, x: State, inputs: Inputs, chosen: tuple[int, ...]) -> Any:
+def quantities(system: AcausalSystem, t: Time, x: State, inputs: Inputs, chosen: tuple[int, ...]) -> Any:
+    """The values of quantities, by number, at a point."""
     return system.at(t, inputs).quantities(x, np.array(chosen), np.ones(len(chosen)))
 
 
@@ -160,36 +156,5 @@ def _just_beyond(system: AcausalSystem, t: Time, x: State, t1: Time, inputs: Inp
 
 
 def _equations(system: AcausalSystem, step: AnyStep) -> str:
-    texts = dict.fromkeys(system.plan.describe(int(e)) for equation in step.equations for e in equation.equation)
+    texts = dict.fromkeys(system.plan.locate(int(e)) for equation in step.equations for e in equation.equation)
     return "".join(f"\n  {text}" for text in list(texts)[:SHOWN]) + ("\n  …" if len(texts) > SHOWN else "")
-
-
-def equation_not_finite(system: AcausalSystem, inputs: Any, t: Time, x: State) -> str:
-    """Names the first equation, in the order of solution, that reads finite values and is not finite itself, with what
-    it reads; "" if there is none."""
-    plan = system.plan
-    every = np.arange(plan.extended.quantities.n)
-    found = system.at(t, inputs).quantities(x, every, np.ones(len(every)))
-    values = np.append(np.asarray(found, float), 0.0)  # ZERO is −1: the last entry
-    finite = np.isfinite(values)
-    parameters = np.asarray(system.numbers, float)
-    networks = Networks(tuple(system.neural[n] for n in plan.network_names))
-    at = Point(np.where(finite, values, ANY), parameters, float(t), networks)
-    for step in plan.steps:
-        own = np.zeros(len(values), bool)
-        own[np.concatenate(step.unknown)] = True
-        for equation in step.equations:
-            known = (finite | own)[equation.quantity].all(axis=1)
-            wrong = ~np.isfinite(equation.residual(at)) & known
-            if wrong.any():
-                return _text(system, equation, int(np.argmax(wrong)), values, finite, parameters)
-    return ""
-
-
-def _text(system: AcausalSystem, equation: StepEquation, place: int, values, finite, parameters) -> str:
-    plan = system.plan
-    read = dict.fromkeys(equation.quantity[place].tolist())
-    given = {plan.quantity_name[q]: values[q] for q in read if q >= 0 and finite[q]}
-    given |= {plan.flat.parameters.names[p]: parameters[p] for p in equation.parameter[place].tolist()}
-    shown = ", ".join(f"'{name}' = {value:.6g}" for name, value in list(given.items())[:SHOWN])
-    return plan.describe(int(equation.equation[place])) + (f", with {shown}" if shown else "")

@@ -21,8 +21,9 @@ from ..system.inputs import value_at
 from ..system.system import AcausalSystem
 from ..tolerances import CONSISTENT
 from .arguments import NOT_ADMITTED, TEXT
+from .end_of_domain import end_of_domain, equation_not_finite
 from .event_log import Events
-from .failed_blocks import equation_not_finite, failed_block, singular_mode
+from .failed_blocks import failed_block, singular_mode
 from .hybrid_problem import RESTART, resolution
 from .lost_constraints import lost_constraint
 from .preparation import term_of
@@ -123,10 +124,11 @@ def explain(
     if lost:
         return f"the integration stopped at t={float(t):g}: {lost}."
     equation = equation_not_finite(system, inputs, t, x)
-    if equation:
+    if equation is not None:
         where, mend = ("at the start", "Start elsewhere, or look") if float(t) == float(t0) else ("there", "Look")
         return (
-            f"the integration stopped at t={float(t):g}: an equation is not finite {where}, {equation}. {mend} for a "
+            f"the integration stopped at t={float(t):g}: an equation is not finite {where}, "
+            f"{equation.text(system)}. {mend} for a "
             "division by zero, or a root or logarithm without a real value."
         )
     singular = _singular_choice(solution, first, t, x)
@@ -138,6 +140,9 @@ def explain(
     block = failed_block(system, first, last, t1, inputs)
     if block:
         return how_it_stopped(solution.result, t, max_steps) + block
+    domain = end_of_domain(system, t, x, t1, inputs)
+    if domain:
+        return f"the integration stopped at t={float(t):g}: {domain}."
     names = [*system.states, *system.carried]
     return explain_failure(
         term_of(system, implicit), inputs, t, x, names,

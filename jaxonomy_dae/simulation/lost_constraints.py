@@ -45,7 +45,7 @@ def lost_constraint(system: AcausalSystem, inputs: Inputs, t: Time, x: State, t1
             worst = int(np.argmax(np.where(unmet, np.nan_to_num(before, nan=np.inf), -1.0)))
             return (
                 "an equation has no solution beyond that is near the last point: "
-                f"{system.plan.describe(int(equation[worst]))}. It asks for what cannot be (a mechanism out of reach, "
+                f"{system.plan.locate(int(equation[worst]))}. It asks for what cannot be (a mechanism out of reach, "
                 "a value out of the range of its law). End the run earlier, or change what drives it"
             )
     return ""

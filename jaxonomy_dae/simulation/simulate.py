@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..adjoint.stored_adjoint import default_adjoint
-from ..errors import InitializationError, ModelError, SimulationError
+from ..errors import InitializationError, ModelError, SimulationError, explained_keywords
 from ..initialization.check import check
 from ..programs.cache import PROGRAMS
 from ..programs.members import batch_size, is_batched
@@ -23,6 +23,7 @@ from ..solvers.drive import is_implicit
 from ..solvers.solve import check_tolerances, default_tolerances
 from ..solvers.solve_arguments import jump_times
 from ..solvers.switching import BOUNDARY, MANY, Watch
+from ..system.input_values import check_given
 from ..system.inputs import check_range, read_inputs, step_ends
 from ..system.solver_choice import Choice, Stiffness, implicit_choice, solver_choice
 from ..system.system import AcausalSystem
@@ -41,6 +42,29 @@ MOST_EVENTS = 2**7 * ROOM  # of a run, if the user does not say: with a few step
 SOLVERS = {"Tsit5": Tsit5, "Rodas5P": Rodas5P, "BDF": BDF}
 
 
+# Options of scipy.integrate.solve_ivp and of diffrax.diffeqsolve, and what they are here.
+ELSEWHERE = {
+    "method": "solver=diffrax.Tsit5(), solvers.BDF() or solvers.Rodas5P(), or leave it out",
+    "t_eval": "ts=",
+    "t_span": "simulate(system, t1, t0=t0)",
+    "args": "system.with_parameters({...}) for parameters, inputs={...} for inputs",
+    "p": "system.with_parameters({...})",
+    "params": "system.with_parameters({...})",
+    "parameters": "system.with_parameters({...})",
+    "y0": "initial={'component.variable': value}",
+    "x0": "initial={'component.variable': value}",
+    "max_step": "dtmax=",
+    "first_step": "stepsize_controller=diffrax.PIDController(...), which takes it into account with dt0",
+    "dt0": "stepsize_controller=, or leave it out: the first step is chosen",
+    "dense_output": "ts=, the times to save",
+    "saveat": "ts=, the times to save",
+    "events": "self.when(condition, ...) in a component",
+    "event": "self.when(condition, ...) in a component",
+    "u": "inputs={'component.input': value}",
+}
+
+
+@explained_keywords(ELSEWHERE)
 def simulate(
     system: AcausalSystem,
     t1: Any,
@@ -137,6 +161,7 @@ def simulate(
     t0 = initial_time(t0, initial)
     dtype = system.parameters.values.dtype
     inputs = read_inputs(system.plan, dtype, inputs)
+    check_given(system.plan, inputs)
     check_range(inputs, t0, t1)
     ends = step_ends(system.plan, inputs)
     rtol, atol = default_tolerances(rtol, atol, dtype)

@@ -11,6 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
 from ..aliases import State, Time
+from ..errors import ModelError
 from ..linear.choice import check_linear_solver, choose
 from .bdf_coefficients import Coefficients, coefficients, interpolate
 from .choice_guard import ChoiceGuard
@@ -106,7 +107,7 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
 
     def __check_init__(self):
         if self.max_order not in range(1, 6):
-            raise ValueError(f"max_order must be 1, 2, 3, 4 or 5; got {self.max_order}")
+            raise ModelError(f"max_order must be 1, 2, 3, 4 or 5; got {self.max_order}")
         if self.linear_solver is not None:
             check_linear_solver(self.linear_solver)
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from ..errors import ModelError
 from ..linear.choice import LinearAlgebra
 from ..private_names import FROM_CONTROLLER
 from .dae_term import FlatProblem
@@ -28,7 +29,7 @@ class Tolerances(eqx.Module):
     def values(self, dtype: Any) -> tuple[Any, Any, Callable[[Any], Any]]:
         """(rtol, atol flat, norm)."""
         if self.rtol is FROM_CONTROLLER:
-            raise ValueError(
+            raise ModelError(
                 "BDF needs tolerances: call it by diffrax.diffeqsolve, or BDF(root_finder=Tolerances(...))"
             )
         leaves = [jnp.ravel(jnp.asarray(leaf, dtype)) for leaf in jax.tree.leaves(self.atol)]

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from diffrax import AbstractSolver
 from diffrax import AbstractWrappedSolver as _Wrapped
 
+from ..errors import ModelError
 from .choice_guard import ChoiceGuard
 
 Projection = Callable[[Any, Any, Any], Any]
@@ -39,7 +40,7 @@ class Projected(_Wrapped):
 
     def __check_init__(self):
         if isinstance(self.solver, Projected):
-            raise ValueError("the solver is wrapped in Projected already")
+            raise ModelError("the solver is wrapped in Projected already")
 
     @property
     def term_structure(self):
@@ -85,7 +86,7 @@ class Projected(_Wrapped):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         if self.projection is None:
-            raise ValueError("Projected needs a projection outside simulate(): Projected(solver, system.project)")
+            raise ModelError("Projected needs a projection outside simulate(): Projected(solver, system.project)")
         largest: Any = None
         if self.guard is not None:
             solver_state, largest = solver_state

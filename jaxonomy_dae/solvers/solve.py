@@ -14,7 +14,7 @@ from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 
 from ..adjoint.stored_adjoint import default_adjoint
-from ..errors import InitializationError, ModelError, SimulationError
+from ..errors import InitializationError, ModelError, SimulationError, explained_keywords
 from ..programs.cache import PROGRAMS, compiled
 from ..programs.members import failed_members, is_batched
 from ..programs.platform import precisely
@@ -35,6 +35,7 @@ SAVED_ITERATIONS = 4
 SMALL = 30  # up to this many unknowns a factorisation costs less than the steps that a multistep method saves
 
 
+@explained_keywords()
 def solve_dae(
     term: Any,
     t1: Any,

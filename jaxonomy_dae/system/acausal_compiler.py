@@ -12,7 +12,7 @@ from ..compiler.added_passes import ModelPass, run_passes
 from ..compiler.check_units import check_units as check_units_of
 from ..compiler.flatten import flatten
 from ..compiler.pipeline import compile_flat
-from ..errors import ModelError
+from ..errors import ModelError, explained_keywords
 from ..linear.choice import check_linear_solver
 from ..lowering.lower import lower
 from ..model.typical_sizes import typical_sizes
@@ -57,6 +57,7 @@ class AcausalCompiler:
     After the call, `compiler.report` describes the system, and `compiler.passes` what each pass made of the model.
     """
 
+    @explained_keywords()
     def __init__(
         self,
         ev: EqnEnv,

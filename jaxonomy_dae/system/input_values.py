@@ -7,18 +7,30 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..errors import ModelError
 from ..lowering.gather import SCALARS, entries, take
 from ..lowering.plan import SystemPlan
 from .inputs import Entry, value_at
 
 
-def missing_input(plan: SystemPlan, inputs: Mapping[str, Any]) -> str | None:
-    """The first input that has neither a value nor a default; None if all have."""
+def check_given(plan: SystemPlan, inputs: Mapping[str, Any]) -> None:
+    """Checks that every input has a value or a default.
+
+    **Raises:**
+
+    - `ModelError` that names the first one that has neither.
+    """
     table = plan.inputs
     given = np.zeros(len(table.names), bool)
     for name in inputs:
         given[plan.input_places(name)] = True
-    return next((table.names[k] for k in np.flatnonzero(~given).tolist() if table.defaults[k] is None), None)
+    for k in np.flatnonzero(~given).tolist():
+        if table.defaults[k] is None:
+            missing = table.names[k]
+            raise ModelError(
+                f"input '{missing}' was not given, and has no default: pass inputs={{'{missing}': 1.0}}, (times, "
+                "values) or a function of time, or connect a signal to it"
+            )
 
 
 def by_entry(plan: SystemPlan, inputs: Mapping[str, Any]) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from ..programs.staging import is_traced
 from ..tolerances import CONSISTENT
 from .bounds import constrained, unconstrained
 from .evaluate import Refinement
-from .input_values import missing_input
+from .input_values import check_given
 from .inputs import check_range, read_inputs
 from .parameters import Parameters
 from .solver_choice import Stiffness
@@ -245,12 +245,7 @@ class AcausalSystem(eqx.Module):
     def at(self, t: Any, args: Any = None) -> SystemAt:
         """The system at a time, with these inputs, ready to be evaluated at states."""
         args = read_inputs(self.plan, self.parameters.values.dtype, args)
-        missing = missing_input(self.plan, args)
-        if missing is not None:
-            raise ModelError(
-                f"input '{missing}' was not given, and has no default: pass inputs={{'{missing}': 1.0}}, (times, "
-                "values) or a function of time, or connect a signal to it"
-            )
+        check_given(self.plan, args)
         networks = tuple(self.neural[n] for n in self.plan.network_names)
         return SystemAt(self.plan, self.numbers, networks, t, args, self.typical_sizes)
 

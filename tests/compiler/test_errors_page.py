@@ -8,9 +8,10 @@ import re
 import pytest
 
 import jaxonomy_dae
+from jaxonomy_dae import ModelError
+from jaxonomy_dae.errors.page import GAP, entries, entry_for
 
 DOCS = pathlib.Path(__file__).parents[2] / "docs"
-GAP = "…"
 
 
 def text_of(node: ast.AST) -> str | None:
@@ -54,3 +55,23 @@ def test_there_are_rows():
 def test_the_package_says_it(text):
     assert re.fullmatch("`[^`]{12,}`", text), "one text in backticks, long enough to be told from others"
     assert text[1:-1] in said(), text
+
+
+def test_anchors_are_unique():
+    anchors = [entry.anchor for entry in entries()]
+    assert len(anchors) == len({*anchors}) == len(rows())
+
+
+@pytest.mark.parametrize("entry", entries(), ids=lambda entry: entry.anchor)
+def test_a_text_leads_to_its_entry(entry):
+    """An error that begins and ends with other words, and has names in the gaps, is explained by its own entry."""
+    message = f"component 'a': {entry.text.replace(GAP, 'some.name')} (line 3)\nand more."
+    assert entry_for(message) is entry
+
+
+def test_an_error_names_its_entry():
+    error = ModelError("component 'c' is complete: add its equations inside __init__ of its class")
+    assert error.__notes__ == ["Explained in docs/errors.md#component-is-complete-inside-init-of"]
+    assert error.explanation.startswith("Something was added after the component was made. Fix: Move it")
+    other = ModelError("there is no text like this")
+    assert not hasattr(other, "__notes__") and other.explanation == ""

@@ -218,7 +218,8 @@ def test_one_member_that_fails_does_not_disturb_the_others():
     assert good.tolist() == [True, False, True]
     np.testing.assert_allclose(slope, [1 / 2, 0.0, 1 / 4], rtol=1e-12, atol=1e-12)
     with pytest.raises(
-        InitializationError, match=r"first:\n  c: 0 = -p\*x \+ z\*\*2 \+ 1, in c\.x, der\(c\.x\): off by"
+        InitializationError,
+        match=r"first:\n  c: 0 = -p\*x \+ z\*\*2 \+ 1  \(test_\w+\.py:\d+\), in c\.x, der\(c\.x\): off by",
     ):
         system.with_parameters({"c.p": 0.5}).initialize()
 

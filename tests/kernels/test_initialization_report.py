@@ -5,7 +5,7 @@ import html.parser
 import jax
 import numpy as np
 import pytest
-from problems import FreeMass, compiled, environment, oscillator, pendulum, rc_circuit
+from problems import FreeMass, compiled, environment, oscillator, pendulum, rc_circuit, without_lines
 from sympy import Eq, cos, sin
 
 from jaxonomy_dae import Component, EqnEnv, InitializationError, ModelError, der, simulate
@@ -33,7 +33,7 @@ def divider(r1, r2):
 def error(function):
     with pytest.raises(InitializationError) as caught:
         function()
-    return str(caught.value)
+    return without_lines(caught.value)
 
 
 # --- texts -------------------------------------------------------------------------------------------------------
@@ -62,8 +62,8 @@ redundant, as they follow from others:
 CONTRADICTION = """\
 no consistent initial point was found; conditions that could not be met, largest error first:
   start of a.v, 1: off by 1
-b.v and a.v are fixed at 2 and 1, which contradict each other: release one start (fixed=False, or without the \
-component's argument `initial_…`), or give values that agree."""
+b.v and a.v are fixed at 2 and 1, which contradict each other: leave out `initial_voltage` of b or `initial_voltage` \
+of a (in components of your own: fixed=False), or give values that agree."""
 
 OFF_THE_CIRCLE = """\
 no consistent initial point was found; conditions that could not be met, largest error first:

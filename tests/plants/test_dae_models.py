@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 import sympy
-from problems import angle_solution, compiled, pendulum
+from problems import angle_solution, compiled, pendulum, without_lines
 from testset import PROBLEMS
 
 from jaxonomy_dae import Component, EqnEnv, ModelError, SimulationError, der, simulate
@@ -246,7 +246,7 @@ def test_a_model_that_is_not_finite_at_its_start(folded, solver):
     system = folded.with_parameters({"cell.a": 1.0, "cell.b": 3.0})
     with pytest.raises(SimulationError) as caught:
         simulate(system, 6.0, ts=TS, solver=solver)
-    assert str(caught.value) == (
+    assert without_lines(caught.value) == (
         "the integration stopped at t=0: an equation is not finite at the start, cell: 0 = -a*sqrt(-b + x) + der(x) + "
         "1, with 'cell.x' = 2, 'cell.a' = 1, 'cell.b' = 3. Start elsewhere, or look for a division by zero, or a root "
         "or logarithm without a real value."

@@ -1,36 +1,10 @@
-"""The package's errors. Every message speaks in user names and says what to do."""
+"""Checks of values, and suggestions of names, that all rooms share."""
 
 import difflib
 from collections.abc import Iterable
 from typing import Any
 
-
-class JaxonomyDaeError(Exception):
-    """The base class of all errors that this package raises for a model, a start or a run."""
-
-
-class ModelError(JaxonomyDaeError, ValueError):
-    """The model as written is not well formed: a name, a port, a value, a shape."""
-
-
-class StructuralError(ModelError):
-    """The equations and the unknowns do not fit together, whatever their values."""
-
-
-class UnitError(ModelError):
-    """Units do not fit together, or a text is not a unit."""
-
-
-class InitializationError(JaxonomyDaeError, RuntimeError):
-    """No consistent initial point was found."""
-
-
-class SteadyStateError(JaxonomyDaeError, RuntimeError):
-    """No equilibrium was found, or one that does not determine all states."""
-
-
-class SimulationError(JaxonomyDaeError, RuntimeError):
-    """The integration stopped before its end."""
+from .kinds import ModelError
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

@@ -1,0 +1,50 @@
+"""Calls with a keyword that does not exist: the error names the nearest one, or what another tool's option is here."""
+
+import functools
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Any, ParamSpec, TypeVar
+
+from .kinds import ModelError
+from .wrong_values import nearest
+
+P = ParamSpec("P")
+R = TypeVar("R")
+NOWHERE: Mapping[str, str] = {}
+
+
+def explained_keywords(elsewhere: Mapping[str, str] = NOWHERE) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """A decorator that refuses unknown keywords with a `ModelError` that says what to write.
+
+    **Arguments:**
+
+    - `elsewhere`: what keywords of other tools are here, such as `{"t_eval": "ts"}`.
+    """
+
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        known = keywords_of(function)
+
+        @functools.wraps(function)
+        def call(*args: P.args, **kwargs: P.kwargs) -> R:
+            for name in kwargs:
+                if name not in known:
+                    raise ModelError(
+                        wrong_keyword(function.__qualname__.removesuffix(".__init__"), name, known, elsewhere)
+                    )
+            return function(*args, **kwargs)
+
+        return call
+
+    return decorate
+
+
+def keywords_of(function: Callable[..., Any]) -> list[str]:
+    """The names that a function can be given arguments by."""
+    kinds = (inspect.Parameter.KEYWORD_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return [n for n, p in inspect.signature(function).parameters.items() if p.kind in kinds and n != "self"]
+
+
+def wrong_keyword(where: str, name: str, known: list[str], elsewhere: Mapping[str, str] = NOWHERE) -> str:
+    """The text of an error about a keyword that a call does not have."""
+    here = f"write {elsewhere[name]}" if name in elsewhere else nearest(name, known)
+    return f"{where}: there is no argument '{name}': {here}"
