@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..initialization.initialize import frozen_inputs
-from ..initialization.ladder import FAILED, find_root
+from ..initialization.ladder import FAILED, find_root, looking
+from ..initialization.problem import frozen_inputs
 from ..initialization.sizes import Sizes
 from ..linear.least_squares import least_squares
 from ..lowering.plan import SystemPlan
@@ -120,9 +120,8 @@ def find_equilibrium(
 
         def root_from(start):
             sizes = Sizes(nominal, jnp.maximum(jnp.abs(start), nominal), zero, zero)
-            found = jax.lax.stop_gradient(
-                find_root(function, m, start, sizes, core, None, bounds, typical, lambda w: magnitude(w, base))
-            )
+            look = looking(function, lambda w: magnitude(w, base))
+            found = jax.lax.stop_gradient(find_root(look, m, start, sizes, core, None, bounds, typical))
             return Root(found.x, found.jacobian, found.limit, found.unit, found.method < FAILED)
 
         if events is None or m > k:

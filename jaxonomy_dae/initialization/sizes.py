@@ -3,20 +3,20 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from ..tolerances import DIGIT, NOISE, solved, spacing
+from .arrays import Numbers, namespace
 
 
 class Sizes(NamedTuple):
     """The units of unknowns and rows; zero where nothing is known."""
 
-    nominal: Float[Array, " n"]  # declared sizes of unknowns
-    known: Float[Array, " n"]  # sizes of unknowns by their declarations, starts and guesses
-    data: Float[Array, " m"]  # sizes of what each row is compared with
-    soft: Float[Array, " m"]  # distances that weigh the same in soft rows
+    nominal: Float[Numbers, " n"]  # declared sizes of unknowns
+    known: Float[Numbers, " n"]  # sizes of unknowns by their declarations, starts and guesses
+    data: Float[Numbers, " m"]  # sizes of what each row is compared with
+    soft: Float[Numbers, " m"]  # distances that weigh the same in soft rows
 
 
 def soft_weight(dtype: Any) -> float:
@@ -29,7 +29,8 @@ Weigh = Callable[[Any], Any]
 
 def weighed(jacobian: Any) -> Weigh:
     """Σ |∂F/∂x|·v of each row as a function of v, for a dense Jacobian."""
-    slopes = jnp.where(jnp.isfinite(jacobian), jnp.abs(jacobian), 0)
+    xp = namespace(jacobian)
+    slopes = xp.where(xp.isfinite(jacobian), xp.abs(jacobian), 0)
     return lambda v: slopes @ v
 
 
@@ -42,27 +43,28 @@ def row_sizes(weigh: Weigh, x: Any, sizes: Sizes, unit: Any, terms: Any = None) 
     - `terms`: the magnitude of each row; where it is not known (infinite or not-a-number), and if nothing is given,
         slopes stand for it.
     """
-    eps = spacing(x.dtype)
-    reach = jnp.maximum(jnp.abs(x), sizes.nominal)
-    size = weigh(reach) if terms is None else jnp.where(jnp.isfinite(terms), terms, weigh(reach))
+    xp, eps = namespace(x), spacing(x.dtype)
+    reach = xp.maximum(xp.abs(x), sizes.nominal)
+    size = weigh(reach) if terms is None else xp.where(xp.isfinite(terms), terms, weigh(reach))
     size = size + sizes.data
-    noise = NOISE * eps * (weigh(jnp.maximum(unit, reach)) + sizes.data)
+    noise = NOISE * eps * (weigh(xp.maximum(unit, reach)) + sizes.data)
     # sin(10¹⁷) is not known to any digit: rounding of its argument excuses nothing.
-    return size, jnp.where(eps * weigh(jnp.abs(x)) > DIGIT * size, 0, noise)
+    return size, xp.where(eps * weigh(xp.abs(x)) > DIGIT * size, 0, noise)
 
 
 def column_sizes(value: Any, jacobian: Any, sizes: Sizes, power: Any = None) -> Any:
     """A size for every unknown: as known, or else what its rows imply, |∂F/∂xⱼ|·xⱼ being of the size of their other
     terms; 1 where nothing is known. With `power`, shape (m, n), terms are |jacobian|·xⱼ**power."""
-    tiny, huge = float(jnp.finfo(jacobian.dtype).tiny), 1 / float(jnp.finfo(jacobian.dtype).eps)
-    magnitude = jnp.where(jnp.isfinite(jacobian), jnp.abs(jacobian), 0)
-    offset = jnp.maximum(sizes.data, jnp.where(jnp.isfinite(value), jnp.abs(value), 0))
+    xp = namespace(jacobian)
+    tiny, huge = float(xp.finfo(jacobian.dtype).tiny), 1 / float(xp.finfo(jacobian.dtype).eps)
+    magnitude = xp.where(xp.isfinite(jacobian), xp.abs(jacobian), 0)
+    offset = xp.maximum(sizes.data, xp.where(xp.isfinite(value), xp.abs(value), 0))
     size = sizes.known
     for _ in range(2):
         terms = magnitude * (size[None, :] if power is None else size[None, :] ** power)
-        row = jnp.maximum(offset, jnp.max(terms, axis=1, initial=0.0))
+        row = xp.maximum(offset, xp.max(terms, axis=1, initial=0.0))
         seen = (magnitude > tiny) & (row > tiny)[:, None]
-        ratio = jnp.where(seen, row[:, None] / jnp.where(seen, magnitude, 1), jnp.inf)
-        implied = jnp.min(ratio if power is None else ratio ** (1 / power), axis=0, initial=jnp.inf)
-        size = jnp.where(sizes.known > 0, sizes.known, jnp.where(implied < huge, implied, 0))
-    return jnp.where(size > 0, size, 1)
+        ratio = xp.where(seen, row[:, None] / xp.where(seen, magnitude, 1), xp.inf)
+        implied = xp.min(ratio if power is None else ratio ** (1 / power), axis=0, initial=xp.inf)
+        size = xp.where(sizes.known > 0, sizes.known, xp.where(implied < huge, implied, 0))
+    return xp.where(size > 0, size, 1)

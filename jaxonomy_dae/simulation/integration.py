@@ -16,6 +16,7 @@ from ..hybrid.start import start
 from ..hybrid.term import HybridTerm
 from ..initialization.check import check
 from ..initialization.initialize import InitialPoint, initialize, is_consistent
+from ..initialization.ladder import Found
 from ..programs.cache import compiled
 from ..programs.platform import precisely
 from ..solvers.drive import integrate, is_implicit, right_between_steps
@@ -85,9 +86,11 @@ class Outcome(eqx.Module):
 
 
 @precisely
-def run(given: Given, options: Options, watch: Watch | None, checked: bool = False) -> Outcome:
+def run(
+    given: Given, options: Options, watch: Watch | None, checked: bool = False, begun: Found | None = None
+) -> Outcome:
     """Integrates what is given; `watch` is for Tsit5. With `checked`, an inconsistent start
-    and times that do not fit are errors while running."""
+    and times that do not fit are errors while running. `begun` is the start that `search_outside` found, if it did."""
     system, t0, t1, ts = given.system, given.t0, given.t1, given.ts
     inputs, initial = given.inputs, given.initial
     admitted = are_admitted(system, inputs, t0, t1)
@@ -102,7 +105,7 @@ def run(given: Given, options: Options, watch: Watch | None, checked: bool = Fal
         system, resumed = system.holding(initial.discrete), initial.events
         found = from_state(system, t0, inputs, initial.x)
     elif isinstance(initial, Mapping):
-        found = initialize(system, t0, inputs, initial)
+        found = initialize(system, t0, inputs, initial, found=begun)
     else:
         found = from_state(system, t0, inputs, initial)
     if checked:

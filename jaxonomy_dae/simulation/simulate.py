@@ -14,6 +14,7 @@ import numpy as np
 from ..adjoint.stored_adjoint import default_adjoint
 from ..errors import InitializationError, ModelError, SimulationError, explained_keywords
 from ..initialization.check import check
+from ..initialization.initialize import search_outside
 from ..programs.cache import PROGRAMS
 from ..programs.members import batch_size, is_batched
 from ..programs.staging import as_array, is_forwards, is_staged, is_traced
@@ -183,6 +184,8 @@ def simulate(
             ts = jnp.asarray(np.clip(ts, t0, t1), dtype)  # `check_arguments` lets rounding pass, Diffrax does not
     # The solver is chosen here, so that the programs of models that differ in how stiff they are are the same.
     given = Given(dataclasses.replace(system, stiffness=None), t0, t1, ts, inputs, initial)
+    # One search for all runs of this call, whichever solvers they take.
+    searched = search_outside(given.system, t0, inputs, initial) if isinstance(initial, Mapping) else None
     most_events = MOST_EVENTS if max_events is None else max_events
     sides_possible = not is_traced((given, adjoint, stepsize_controller))
 
@@ -216,10 +219,10 @@ def simulate(
         checked = throw is True
         if staged:
             PROGRAMS.make_room()
-            outcome = run(given, options(solver), None, checked)
+            outcome = run(given, options(solver), None, checked, searched)
         else:  # under `jax.grad` and `jax.vmap` outside of jit, where values are known
             checked = throw is not False
-            outcome = run_compiled(given, options(solver), None)
+            outcome = run_compiled(given, options(solver), None, begun=searched)
             if is_batched(outcome.result):
                 _say_of_members(outcome, system, (max_steps, most_events), throw)
                 checked = False
@@ -234,7 +237,7 @@ def simulate(
             solver = SOLVERS[choice.solver]()
         return in_program(is_staged((given, options(solver))))
     watch = Watch(t1, jnp.asarray(np.divide(scaled_atol(system, atol), rtol), dtype)) if switches else None
-    outcome = run_compiled(given, options(solver), watch)
+    outcome = run_compiled(given, options(solver), watch, begun=searched)
     if is_traced(outcome):  # a network may close over a traced value, which shows in the outcome only
         return in_program(staged=True)
     counts = outcome.numbers()
@@ -255,11 +258,11 @@ def simulate(
             choice = implicit_choice(system.plan, found)
             solver = SOLVERS[choice.solver]()
             before = {"num_explicit_steps": counts["num_steps"], "stiff_from": float(outcome.last[0])}
-            outcome = run_compiled(given, options(solver), None)
+            outcome = run_compiled(given, options(solver), None, begun=searched)
             counts = outcome.numbers() | before
     if outcome.events is not None and max_events is None and outcome.events.count > ROOM:
         doublings = int(np.ceil(np.log2(float(outcome.events.count) / ROOM)))
-        outcome = run_compiled(given, options(solver, ROOM * 2**doublings), None)
+        outcome = run_compiled(given, options(solver, ROOM * 2**doublings), None, begun=searched)
     saved, x, discrete, memory = outcome.ts, outcome.x, outcome.discrete, outcome.memory
     if ts is None:
         taken = counts["num_accepted_steps"] + 1

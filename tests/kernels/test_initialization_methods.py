@@ -12,7 +12,7 @@ from sympy import Eq, atan
 from jaxonomy_dae import Component, EqnEnv, InitializationError, ModelError, der, simulate
 from jaxonomy_dae.initialization import initialize as initialization
 from jaxonomy_dae.initialization.initialize import find_initial, is_consistent
-from jaxonomy_dae.initialization.ladder import METHODS, find_root
+from jaxonomy_dae.initialization.ladder import METHODS, find_root, looking
 from jaxonomy_dae.initialization.sizes import Sizes
 
 # x³ − 2x + 2 = 0 has one real root, by Cardano's formula; |F| has a local minimum at √(2/3), where F = 2 − (4/3)√(2/3).
@@ -31,7 +31,7 @@ def climb(function, start, core="all"):
 
     @jax.jit
     def climbed(x):
-        found = find_root(function, m, x, sizes(x, m), chosen)
+        found = find_root(looking(function), m, x, sizes(x, m), chosen)
         return found.x, found.method, jnp.abs(function(found.x)).max()
 
     x, method, residual = climbed(start)
@@ -45,7 +45,7 @@ def climb_one(which, start):
     def function(x):
         return jax.lax.switch(which, list(ONE_UNKNOWN.values()), x)
 
-    found = find_root(function, 1, start, sizes(start, 1), np.arange(1))
+    found = find_root(looking(function), 1, start, sizes(start, 1), np.arange(1))
     return found.x, found.method, jnp.abs(function(found.x)).max()
 
 
@@ -113,7 +113,7 @@ def test_a_second_climb_where_nothing_is_known(name):
     """Every rung ended where it began: zero is nobody's guess, and the sizes of unknowns are tried as one."""
     function, root = STATIONARY[name]
     n, nothing = len(root), np.zeros(len(root))
-    found = jax.jit(lambda x: find_root(function, n, x, Sizes(*[jnp.zeros(n)] * 4), np.arange(n)).x)(nothing)
+    found = jax.jit(lambda x: find_root(looking(function), n, x, Sizes(*[jnp.zeros(n)] * 4), np.arange(n)).x)(nothing)
     np.testing.assert_allclose(found, root, rtol=1e-12)
 
 
@@ -147,7 +147,7 @@ def test_members_of_a_batch_are_on_their_own_rungs():
     @jax.jit
     @jax.vmap
     def roots(start):
-        found = find_root(ONE_UNKNOWN["cubic"], 1, start, sizes(start, 1), np.arange(1))
+        found = find_root(looking(ONE_UNKNOWN["cubic"]), 1, start, sizes(start, 1), np.arange(1))
         return found.x, found.method
 
     x, method = roots(starts)
@@ -298,7 +298,9 @@ def test_climbing_again_comes_to_an_end():
     def function(x):
         return jnp.stack([x[0] ** 2 + 1, x[1] ** 2 + 1]) + jnp.where(jnp.sum(x**2) > 0.25, jnp.nan, 0)
 
-    method = jax.jit(lambda x: find_root(function, 2, x, Sizes(*[jnp.zeros(2)] * 4), np.arange(2)).method)(np.zeros(2))
+    method = jax.jit(lambda x: find_root(looking(function), 2, x, Sizes(*[jnp.zeros(2)] * 4), np.arange(2)).method)(
+        np.zeros(2)
+    )
     assert METHODS[int(method)] == "none"
 
 
