@@ -12,6 +12,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +22,7 @@ from ..errors import ModelError
 from ..linear.least_squares import least_squares
 from ..linear.sparse import sparse_jacobian
 from ..linear.whole import solve_whole
+from ..lowering.plan import SystemPlan
 from ..programs.cache import PROGRAMS, compiled
 from ..programs.platform import precisely
 from ..programs.staging import is_staged, is_traced
@@ -30,7 +32,7 @@ from .given_solver import find_root_with
 from .initial_values import check_initial
 from .ladder import FAILED, STAGED, Found, Look, find_root
 from .problem import InitialProblem, bounds_of, independent_rows
-from .rows import initial_rows
+from .rows import InitialRows, initial_rows
 from .sizes import Sizes
 from .sparse_newton import SparseRows, sparse_newton, sparse_rows
 from .stages import solve_in_stages, stages
@@ -179,6 +181,41 @@ def search_outside(
     with np.errstate(all="ignore"):  # what is not finite is a rung's failure, as in a program
         root = find_root(look, m, first.w, first.sizes, core, soft, bounds, first.typical)
     return jax.tree.map(jnp.asarray, root)
+
+
+def known_start(system: Any, t0: Any, inputs: Any, initial: Mapping[str, Any] | None) -> InitialPoint | None:
+    """For a program that somebody else compiles: the consistent point, if all that it follows from has a value while
+    that is traced, as where the weights of networks are trained that no constraint reads. None otherwise.
+
+    Inputs that are functions may close over anything, and are left to the program.
+    """
+    plan = system.plan
+    numbers = all(isinstance(v, int | float | tuple | list | np.ndarray | jax.Array) for v in (inputs or {}).values())
+    if not numbers or is_traced((eqx.tree_at(lambda s: s.neural, system, {}), t0, inputs, initial)):
+        return None
+    rows = initial_rows(plan, tuple(sorted(initial or ())))
+    if rows.direct or _read_networks(plan, rows):
+        return None
+    # Only the field reads weights then, which tells at most how fast is fast: what is not finite there says nothing.
+    neural = jax.tree.map(
+        lambda leaf: np.full(leaf.shape, np.nan, leaf.dtype) if eqx.is_inexact_array(leaf) else leaf, system.neural
+    )
+    with jax.ensure_compile_time_eval():
+        neural = jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf, neural)
+        found = find_initial(eqx.tree_at(lambda s: s.neural, system, neural), t0, inputs, initial)
+    return None if is_traced(found) else found
+
+
+def _read_networks(plan: SystemPlan, rows: InitialRows) -> bool:
+    """True if a row of the initial equations depends on a network."""
+    programs = (
+        plan.constraint_program,
+        plan.carried_residuals,
+        plan.reading(np.array([row.quantity for row in rows.kept], np.int64)),
+    )
+    return any(p.reads_networks for p in programs) or any(
+        planned.group.template.opaque is not None for planned in plan.constraints
+    )
 
 
 def _large_point(problem: InitialProblem, sparse: SparseRows) -> InitialPoint:

@@ -73,6 +73,11 @@ class AbstractPlanned(abc.ABC):
     def evaluate(self, evaluation: AbstractEvaluation, refine: Any) -> list[Any]:
         """The chunks it computes."""
 
+    @property
+    @abc.abstractmethod
+    def reads_networks(self) -> bool:
+        """As that of `Program`."""
+
 
 @dataclasses.dataclass(frozen=True)
 class PlannedStep(AbstractPlanned):
@@ -84,6 +89,10 @@ class PlannedStep(AbstractPlanned):
 
     def evaluate(self, evaluation: AbstractEvaluation, refine: Any) -> list[Any]:
         return evaluation.step(self, refine)
+
+    @property
+    def reads_networks(self) -> bool:
+        return _is_opaque(self.equations)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,6 +110,10 @@ class PlannedSparse(AbstractPlanned):
 
     def evaluate(self, evaluation: AbstractEvaluation, refine: Any) -> list[Any]:
         return evaluation.sparse_step(self, refine)
+
+    @property
+    def reads_networks(self) -> bool:
+        return _is_opaque(self.equations)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,6 +134,10 @@ class PlannedLoop(AbstractPlanned):
     def evaluate(self, evaluation: AbstractEvaluation, refine: Any) -> list[Any]:
         return evaluation.loop(self)
 
+    @property
+    def reads_networks(self) -> bool:
+        return any(step.reads_networks for step in self.body)
+
 
 @dataclasses.dataclass(frozen=True)
 class Program:
@@ -128,6 +145,15 @@ class Program:
 
     steps: tuple[AbstractPlanned, ...]
     layout: Layout
+
+    @property
+    def reads_networks(self) -> bool:
+        """True if a network or another function that SymPy does not see is evaluated."""
+        return any(planned.reads_networks for planned in self.steps)
+
+
+def _is_opaque(equations: Sequence[PlannedEquation]) -> bool:
+    return any(planned.equation.template.opaque is not None for planned in equations)
 
 
 def plan(

@@ -87,10 +87,15 @@ class Outcome(eqx.Module):
 
 @precisely
 def run(
-    given: Given, options: Options, watch: Watch | None, checked: bool = False, begun: Found | None = None
+    given: Given,
+    options: Options,
+    watch: Watch | None,
+    checked: bool = False,
+    begun: Found | InitialPoint | None = None,
 ) -> Outcome:
     """Integrates what is given; `watch` is for Tsit5. With `checked`, an inconsistent start
-    and times that do not fit are errors while running. `begun` is the start that `search_outside` found, if it did."""
+    and times that do not fit are errors while running. `begun` is what
+    is known of the start: what `search_outside` found, or all of it."""
     system, t0, t1, ts = given.system, given.t0, given.t1, given.ts
     inputs, initial = given.inputs, given.initial
     admitted = are_admitted(system, inputs, t0, t1)
@@ -104,6 +109,8 @@ def run(
         admitted = admitted & same_time(t0, initial)
         system, resumed = system.holding(initial.discrete), initial.events
         found = from_state(system, t0, inputs, initial.x)
+    elif isinstance(begun, InitialPoint):
+        found = begun
     elif isinstance(initial, Mapping):
         found = initialize(system, t0, inputs, initial, found=begun)
     else:

@@ -14,7 +14,7 @@ import numpy as np
 from ..adjoint.stored_adjoint import default_adjoint
 from ..errors import InitializationError, ModelError, SimulationError, explained_keywords
 from ..initialization.check import check
-from ..initialization.initialize import search_outside
+from ..initialization.initialize import known_start, search_outside
 from ..programs.cache import PROGRAMS
 from ..programs.members import batch_size, is_batched
 from ..programs.staging import as_array, is_forwards, is_staged, is_traced
@@ -161,6 +161,7 @@ def simulate(
     check_arguments(system, t0, t1, ts, initial, adjoint, solver, stepsize_controller, dtmax, max_steps)
     t0 = initial_time(t0, initial)
     dtype = system.parameters.values.dtype
+    as_given = t0, inputs, initial  # inside jit, arrays made of these have no values
     inputs = read_inputs(system.plan, dtype, inputs)
     check_given(system.plan, inputs)
     check_range(inputs, t0, t1)
@@ -184,8 +185,10 @@ def simulate(
             ts = jnp.asarray(np.clip(ts, t0, t1), dtype)  # `check_arguments` lets rounding pass, Diffrax does not
     # The solver is chosen here, so that the programs of models that differ in how stiff they are are the same.
     given = Given(dataclasses.replace(system, stiffness=None), t0, t1, ts, inputs, initial)
-    # One search for all runs of this call, whichever solvers they take.
-    searched = search_outside(given.system, t0, inputs, initial) if isinstance(initial, Mapping) else None
+    staged = is_staged(given)
+    begun = None
+    if isinstance(initial, Mapping):  # one search for all runs of this call, whichever solvers they take
+        begun = known_start(system, *as_given) if staged else search_outside(system, t0, inputs, initial)
     most_events = MOST_EVENTS if max_events is None else max_events
     sides_possible = not is_traced((given, adjoint, stepsize_controller))
 
@@ -219,10 +222,10 @@ def simulate(
         checked = throw is True
         if staged:
             PROGRAMS.make_room()
-            outcome = run(given, options(solver), None, checked, searched)
+            outcome = run(given, options(solver), None, checked, begun)
         else:  # under `jax.grad` and `jax.vmap` outside of jit, where values are known
             checked = throw is not False
-            outcome = run_compiled(given, options(solver), None, begun=searched)
+            outcome = run_compiled(given, options(solver), None, begun=begun)
             if is_batched(outcome.result):
                 _say_of_members(outcome, system, (max_steps, most_events), throw)
                 checked = False
@@ -237,7 +240,7 @@ def simulate(
             solver = SOLVERS[choice.solver]()
         return in_program(is_staged((given, options(solver))))
     watch = Watch(t1, jnp.asarray(np.divide(scaled_atol(system, atol), rtol), dtype)) if switches else None
-    outcome = run_compiled(given, options(solver), watch, begun=searched)
+    outcome = run_compiled(given, options(solver), watch, begun=begun)
     if is_traced(outcome):  # a network may close over a traced value, which shows in the outcome only
         return in_program(staged=True)
     counts = outcome.numbers()
@@ -258,11 +261,11 @@ def simulate(
             choice = implicit_choice(system.plan, found)
             solver = SOLVERS[choice.solver]()
             before = {"num_explicit_steps": counts["num_steps"], "stiff_from": float(outcome.last[0])}
-            outcome = run_compiled(given, options(solver), None, begun=searched)
+            outcome = run_compiled(given, options(solver), None, begun=begun)
             counts = outcome.numbers() | before
     if outcome.events is not None and max_events is None and outcome.events.count > ROOM:
         doublings = int(np.ceil(np.log2(float(outcome.events.count) / ROOM)))
-        outcome = run_compiled(given, options(solver, ROOM * 2**doublings), None, begun=searched)
+        outcome = run_compiled(given, options(solver, ROOM * 2**doublings), None, begun=begun)
     saved, x, discrete, memory = outcome.ts, outcome.x, outcome.discrete, outcome.memory
     if ts is None:
         taken = counts["num_accepted_steps"] + 1
@@ -274,8 +277,8 @@ def simulate(
     )  # fmt: skip
     if throw is not False and not bool(diffrax.is_okay(outcome.result)):
         first = t0, outcome.found.x
-        begun = system.holding(initial.discrete) if isinstance(initial, SavedState) else system
-        mode = mode_at_start(begun, inputs, *first)
+        held = system.holding(initial.discrete) if isinstance(initial, SavedState) else system
+        mode = mode_at_start(held, inputs, *first)
         if mode:
             raise InitializationError(mode)
         if outcome.held is not None:
