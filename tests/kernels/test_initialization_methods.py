@@ -127,6 +127,28 @@ def test_the_rung(name):
         np.testing.assert_allclose(x, root, rtol=1e-12, atol=1e-12)
 
 
+@jax.jit
+def look_at_one(which, x):
+    return looking(lambda x: jax.lax.switch(which, list(ONE_UNKNOWN.values()), x))(x)
+
+
+SHARED = [name for name, (function, *_) in PROBLEMS.items() if not callable(function)]
+
+
+@pytest.mark.parametrize("name", SHARED)
+def test_outside_of_programs_the_rung_is_the_same(name):
+    """Where values are known the ladder runs in NumPy, and must not lead elsewhere than the one in programs."""
+    function, start, method, _ = PROBLEMS[name]
+    which, start = np.int32(list(ONE_UNKNOWN).index(function)), np.asarray(start, float)
+    known = Sizes(*map(np.asarray, sizes(start, 1)))
+    with np.errstate(all="ignore"):
+        found = find_root(lambda x: jax.device_get(look_at_one(which, x)), 1, start, known, np.arange(1))
+    x, used, _ = climb_problem(function, start)
+    assert METHODS[int(found.method)] == used == method
+    assert isinstance(found.x, np.ndarray)
+    np.testing.assert_allclose(found.x, x, rtol=1e-12, atol=1e-12)
+
+
 def test_without_a_root_the_best_point_is_returned():
     x, used, residual = climb_problem("no root", [2.0])
     assert used == METHODS[-1]
