@@ -28,6 +28,7 @@ from .first_order import constant_once
 from .log import EventRows
 from .modes import Search, sets_to_flip
 from .problem import AbstractHybridProblem, HybridState, one_hot
+from .rivals import Rivals
 from .side import ABOVE, BELOW, RESTS, rounding
 
 CONDITIONS_AT_ONE_INSTANT = 32  # if more events are due, the rest happen in another step, which is as good as none
@@ -66,6 +67,7 @@ class Instant(eqx.Module):
     - `arrived`: the continuous state before the instant.
     - `stuck`: the guards that an event has left at zero, about to fall again, shape (guards,).
     - `noted`: the events of this instant that are listed.
+    - `wrote`: which event of this round wrote each contested place last.
     """
 
     state: HybridState
@@ -80,6 +82,7 @@ class Instant(eqx.Module):
     arrived: Any
     stuck: Any
     noted: EventRows
+    wrote: Any
 
 
 class Arrival(NamedTuple):
@@ -128,6 +131,7 @@ def handle(
     several = problem.facts.are(EventFlag.STRIKE).sum() > 1
     strikes = jnp.asarray(problem.facts.are(EventFlag.STRIKE))
     first = state.count
+    rivals = Rivals.of(problem.facts)
 
     def one(instant: Instant) -> Instant:
         state, q, before = instant.state, instant.state.q, instant.slope
@@ -170,7 +174,7 @@ def handle(
         happening = one_hot(event, c + g)
         if several:
             happening = happening | (instant.left & strikes & strikes[event])
-        x, new = problem.written(time, reached, base + base_slope * delay, q, previous, happening, args)
+        x, written = problem.written(time, reached, base + base_slope * delay, q, previous, happening, args)
         ticks = state.ticks + one_hot(event, c).astype(state.ticks.dtype)
         logged = happening & (listed | (ends > 0))
         shown = jnp.arange(c + g) if several else event[None]
@@ -180,11 +184,16 @@ def handle(
         moved = jnp.any(x != reached) & ~relations[event]
         approach = jnp.where(instant.caused | at_start, 0.0, rates)
         new, after, slow, armed, left, caused, stuck = _following(
-            problem, t, x, new, instant, event, happening, arrival, delay, moved, approach, rose, onto, waits, args
+            problem, t, x, written, instant, event, happening, arrival, delay, moved, approach, rose, onto, waits, args
         )
         turns = state.turns + (~is_clock).astype(t.dtype)
         slides = ~is_clock & (turns > SLIDES + TURNS * g)
         again = jnp.where(slides, event, jnp.where(jnp.any(stuck), c + jnp.argmax(stuck), -1)) if g else jnp.array(-1)
+        wrote = instant.wrote
+        if rivals.places:
+            both = jnp.concatenate([reached, q]), jnp.concatenate([x, written])
+            clash, wrote = rivals.after(event, *both, jnp.where(goes_on, wrote, rivals.nobody))
+            again = jnp.where(clash < -1, clash, jnp.where(state.stuck < -1, state.stuck.astype(int), again))
         # What is too fast to be followed back, as a current that a blocked diode stops, has that value at once.
         back = delay - (1.0 - slow) * lax.stop_gradient(delay)
         now_noted = instant.noted.written(
@@ -202,7 +211,19 @@ def handle(
             turns=turns,
         )
         return Instant(
-            state, left, caused, delay, together, base, base_slope, previous, after, instant.arrived, stuck, now_noted
+            state,
+            left,
+            caused,
+            delay,
+            together,
+            base,
+            base_slope,
+            previous,
+            after,
+            instant.arrived,
+            stuck,
+            now_noted,
+            wrote,
         )
 
     def while_any_is_left(step: Callable[[Instant], Instant], times: int) -> Callable[[Instant], Instant]:
@@ -219,7 +240,7 @@ def handle(
     none = jnp.zeros((g,), bool)
     start = Instant(
         state, arrival.due, arrival.jumped, jnp.zeros_like(t), arrival.due, state.x, arrival.slope, state.q,
-        arrival.slope, state.x, none, noted,
+        arrival.slope, state.x, none, noted, rivals.nobody,
     )  # fmt: skip
     length = _most_in_turn(problem)
     # Loops of fixed length, whose bodies are skipped where nothing is left: reverse mode cannot go back over a `while`.

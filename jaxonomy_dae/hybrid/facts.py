@@ -17,6 +17,8 @@ class EventFacts:
     - `choices`: discrete values, 0 or 1, that are chosen by conditions, which hold while the guards `choice_guards` are
       not negative.
     - `only_kinks`: whether all events are relations at which neither dx/dt nor guards jump.
+    - `contested`: (event, place) for each place that several events may write with different values; places are those
+      of (x, q) in one array, those of q counted from its end, −1 the last.
     """
 
     flags: tuple[EventFlag, ...]
@@ -26,6 +28,7 @@ class EventFacts:
     choices: tuple[int, ...] = ()
     choice_guards: tuple[int, ...] = ()
     only_kinks: bool = False
+    contested: tuple[tuple[int, int], ...] = ()
 
     @property
     def n_guards(self) -> int:

@@ -96,7 +96,8 @@ class HybridState(AbstractAppending):
     - `span`: how long the steps have been of late; `request`: where the step that was tried should have ended, or
         infinity.
     - `ended`: 1.0 once an event has ended the run; `stuck`: the number of one that happens again and again at one
-        instant, else −1; `turns`: how often guards have fallen without time going on.
+        instant, below −1 for two that contradict each other (`rivals.pair_of`), else −1; `turns`: how often guards have
+        fallen without time going on.
     - `count`: how many events there were; `table`: the first ones, or None where `StoredAdjoint` keeps them elsewhere.
     """
 

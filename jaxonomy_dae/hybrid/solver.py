@@ -22,6 +22,7 @@ MOVED = 1e3  # times the resolution: with a longer step time has gone on, and tu
 
 TOO_MANY: Any = diffrax.RESULTS.max_steps_rejected  # events
 STUCK: Any = diffrax.RESULTS.stagnation  # an event happens again and again at one instant
+CLASH: Any = diffrax.RESULTS.conlim  # two events give one variable different values at one instant
 NOT_FINITE: Any = diffrax.RESULTS.nonlinear_divergence  # what an event wrote
 
 
@@ -156,5 +157,6 @@ class WithEvents(diffrax.AbstractWrappedSolver):
         result = diffrax.RESULTS.where(fired & ~finite & jnp.all(jnp.isfinite(x1)), NOT_FINITE, result)
         result = diffrax.RESULTS.where(y1.count > self.max_events, TOO_MANY, result)
         result = diffrax.RESULTS.where((y1.stuck >= 0) & (y1.ended == 0), STUCK, result)
+        result = diffrax.RESULTS.where(y1.stuck < -1, CLASH, result)
         y1 = together(y1, appended(table, noted, y0, y1))
         return y1, y_error, dense_info, (inner_state, fired), result

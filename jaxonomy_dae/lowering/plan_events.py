@@ -118,6 +118,7 @@ def plan_events(
             choices=choices,
             choice_guards=choice_guards,
             only_kinks=bool(table.are(EventFlag.KINK).all()) and _only_as_written(flat.parameters.discrete, extended),
+            contested=_contested(table, place, len(flat.parameters.discrete)),
         ),
     )
 
@@ -143,6 +144,22 @@ def _opposite(table: EventTable) -> tuple[int, ...]:
                 opposite[guard], opposite[other[write.discrete]] = other[write.discrete], guard
             other[write.discrete] = guard
     return tuple(opposite)
+
+
+def _contested(table: EventTable, state: np.ndarray, n_discrete: int) -> tuple[tuple[int, int], ...]:
+    """(event, place) for what several events write, if not all of them the same number. Events that choose a mode or
+    turn a relation exclude each other, and contacts strike as one."""
+    exclusive = table.are(EventFlag.RELATION | EventFlag.REVOCABLE | EventFlag.STRIKE)
+    writers: dict[int, list[int]] = {}
+    for row, event in enumerate(table.event.tolist()):
+        place = int(state[row]) if state[row] >= 0 else int(table.discrete[row]) - n_discrete
+        if not exclusive[event]:
+            writers.setdefault(place, []).append(row)
+    out = []
+    for place, rows in writers.items():
+        same = (table.value[rows] < 0).all() and len(set(table.constant[rows].tolist())) == 1
+        out += [] if same or len(rows) < 2 else [(int(table.event[row]), place) for row in rows]
+    return tuple(out)
 
 
 def _only_as_written(parameters: np.ndarray, extended: Extended) -> bool:

@@ -10,7 +10,8 @@ import numpy as np
 from ..aliases import Inputs, Result, State, Time, Tolerance
 from ..diagnosis.lost_cancellation import lost_cancellation
 from ..diagnosis.wording import listed, quoted
-from ..hybrid.solver import MOVED, STUCK, TOO_MANY
+from ..hybrid.rivals import pair_of
+from ..hybrid.solver import CLASH, MOVED, STUCK, TOO_MANY
 from ..lowering.plan import SystemPlan
 from ..model.events import Event
 from ..modeling.event_flags import EventFlag
@@ -54,6 +55,7 @@ def _codes(result: Result, has_events: bool, max_steps: int, max_events: int) ->
         (codes.dt_min_reached, "no step was short enough to be accepted"),
         (TOO_MANY, many),
         (STUCK, "an event happens, or a relation turns, again and again at one instant"),
+        (CLASH, "two events give one variable different values at one instant"),
         (NOT_ADMITTED, TEXT),
         (SINGULAR_CHOICE, "the states have become a singular choice"),
         (codes.nonlinear_divergence, f"{lost}, or an event wrote a value that is not finite" if has_events else lost),
@@ -102,6 +104,8 @@ def explain(
         return _too_many_events(solution.events, max_events, float(t))
     if log is not None and solution.result == STUCK:
         return _stuck(solution, int(log.stuck), float(t), MOVED * float(resolution(t0, t1)))
+    if log is not None and solution.result == CLASH:
+        return _clash(solution, int(log.stuck), float(t))
     written, others = _not_finite(system, x)
     if others and not written and not system.is_constrained and system.plan.held is None:
         return singular_mode(system, first, (t, x), inputs) + _of_short_circuits(system)
@@ -248,6 +252,23 @@ def _stuck(solution: Solution, event: int, t: float, instant: float) -> str:
     return (
         f"{text}: what it writes leaves its condition on the verge of being true, and the equations make it true at "
         f"once. {REST}"
+    )
+
+
+def _clash(solution: Solution, number: int, t: float) -> str:
+    """Says which two events contradict each other at t, and in what."""
+    system = solution.system
+    plan: Any = system.plan.events
+    pair = pair_of(number, len(plan) + 1)
+    places = [{place for event, place in plan.facts.contested if event == k} for k in pair]
+    events = sorted(plan.names[k] for k in pair)
+    names = [*system.states, *system.carried, *system.discretes]
+    hidden = len(plan.discrete) - plan.n_visible
+    shared = [names[place + hidden if place < 0 else place] for place in sorted(places[0] & places[1])]
+    return (
+        f"the integration stopped at t={t:.6g}: {listed(events)} happen at one instant and give {listed(shared)} "
+        "different values. Let one event write it, with a Piecewise that says which value counts, or give them "
+        "conditions (on=…) that exclude each other"
     )
 
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from ..aliases import Args, Controller, Inputs, Result, Solver, State, Time
 from ..hybrid.control import ENDED
 from ..hybrid.problem import HybridState
-from ..hybrid.solver import WithEvents
+from ..hybrid.solver import CLASH, WithEvents
 from ..hybrid.start import start
 from ..hybrid.term import HybridTerm
 from ..initialization.check import check
@@ -128,7 +128,8 @@ def run(
     own_start = implicit and not isinstance(controller, diffrax.StepTo)
     dt0 = None if own_start else first_step(system, t0, t1, x0, inputs, solver.order(term), controller)
     y0: Any = x0
-    goes_on = admitted
+    goes_on: Any = admitted
+    clashes: Any = None
     saved_of: Any = _whole
     consistent = is_consistent(found)
     if system.plan.events is not None:
@@ -138,7 +139,8 @@ def run(
             consistent = consistent & admitted
         q0 = system.discrete_values if resumed is None else without_clocked(system, system.discrete_values)
         y0 = start(problem, t0, x0, q0, inputs, options.room, options.save_events, resumed)
-        goes_on = admitted & (y0.ended == 0)
+        clashes = y0.stuck < -1
+        goes_on = admitted & (y0.ended == 0) & ~clashes
         term, solver = HybridTerm(problem), WithEvents(chosen, options.max_events, options.room, options.save_events)
         controller = with_event_control(controller)
         saved_of = _with_events
@@ -195,6 +197,7 @@ def run(
     result = diffrax.RESULTS.where(okay | ~diffrax.is_okay(done.result), done.result, failure)
     if system.plan.events is not None:
         result = diffrax.RESULTS.where(okay & ~goes_on, ENDED, result)
+        result = diffrax.RESULTS.where(clashes, CLASH, result)
     result = diffrax.RESULTS.where(consistent, result, failure)
     looked_at = diffrax.is_okay(result) | inputs_are_finite(inputs, last[0], t1)
     result = diffrax.RESULTS.where(admitted & looked_at, result, NOT_ADMITTED)
