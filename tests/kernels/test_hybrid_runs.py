@@ -4,6 +4,7 @@ One compiled gradient runs them all; slow tests run them as one batch. What is i
 rtol = atol = 1e-10: values are right to a few tolerances.
 """
 
+import dataclasses
 import functools
 
 import diffrax
@@ -12,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from affine_events import CLOCKS, GUARDS, MAX_EVENTS, RELATION, STATES, Affine, Event, Relation, affine, run
+from affine_events import CLOCKS, FACTS, GUARDS, MAX_EVENTS, RELATION, STATES, Affine, Event, Relation, affine, run
 from hybrid_references import (
     BOUNCES,
     HEAVY,
@@ -29,6 +30,7 @@ from jaxonomy_dae.hybrid.control import ENDED
 from jaxonomy_dae.hybrid.side import RESTS
 from jaxonomy_dae.hybrid.solver import NOT_FINITE, STUCK, TOO_MANY
 from jaxonomy_dae.hybrid.start import start
+from jaxonomy_dae.modeling.event_flags import NO_FLAG, EventFlag
 from jaxonomy_dae.solvers import StoredAdjoint
 
 SAVED = 60
@@ -230,8 +232,9 @@ def slope(name, event, target, factor):
 @eqx.filter_jit
 def begun(numbers):
     """The state after the initial time, where all conditions happen that hold there and are not undone."""
-    guards = (False,) * CLOCKS + (True,) * RELATION + (False,) * (GUARDS - RELATION)
-    problem = Affine(numbers, 1e-14, immediate=guards, revocable=guards)
+    flags = (NO_FLAG,) * CLOCKS + (EventFlag.AT_START | EventFlag.REVOCABLE,) * RELATION
+    facts = dataclasses.replace(FACTS, flags=flags + (NO_FLAG,) * (GUARDS - RELATION))
+    problem = Affine(numbers, 1e-14, facts)
     return start(problem, jnp.zeros(()), numbers.x, numbers.q, None, 0, False)
 
 
