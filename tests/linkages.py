@@ -18,8 +18,8 @@ class Linkage(Bench):
     def parallelogram(self, prefix="", start=1.0):
         """Two cranks of 0.8 and a coupler of 2, the first crank at the angle `start`; the coupler."""
         west, east = self(pl.World, f"{prefix}west"), self(pl.World, f"{prefix}east", 2.0)
-        crank = self(pl.MassiveLink, f"{prefix}crank", 0.8, initial_phi=start, initial_omega=1.0)
-        rocker = self(pl.MassiveLink, f"{prefix}rocker", 0.8, guess_phi=start)
+        crank = self(pl.MassiveLink, f"{prefix}crank", 0.8, initial_angle=start, initial_speed=1.0)
+        rocker = self(pl.MassiveLink, f"{prefix}rocker", 0.8, guess_angle=start)
         coupler = self(pl.MassiveLink, f"{prefix}coupler", 2.0)
         for k, ends in enumerate(
             [
@@ -33,7 +33,7 @@ class Linkage(Bench):
     def bar(self, coupler, length=0.8, prefix="", start=1.0):
         """A third bar, from the ground to the middle of the coupler."""
         middle, half = self(pl.World, f"{prefix}middle", 1.0), self(pl.Link, f"{prefix}half", 1.0)
-        bar = self(pl.MassiveLink, f"{prefix}bar", length, guess_phi=start)
+        bar = self(pl.MassiveLink, f"{prefix}bar", length, guess_angle=start)
         self.join(half.frame_a, coupler.frame_a)
         self.pin(f"{prefix}pin5", middle.frame, bar.frame_a)
         self.pin(f"{prefix}pin6", bar.frame_b, half.frame_b)

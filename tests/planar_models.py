@@ -13,8 +13,8 @@ import jaxonomy_dae.library.rotational as rot
 def double_pendulum(mode):
     """Two uniform rods; in the minimal form the states are the angles, which are good everywhere."""
     b = Bench()
-    world, first = b(pl.World, "world"), b(pl.Revolute, "j1", initial_phi=0.3, initial_omega=0.0)
-    second = b(pl.Revolute, "j2", initial_phi=0.5, initial_omega=0.0)
+    world, first = b(pl.World, "world"), b(pl.Revolute, "j1", initial_angle=0.3, initial_speed=0.0)
+    second = b(pl.Revolute, "j2", initial_angle=0.5, initial_speed=0.0)
     upper, lower = b(pl.MassiveLink, "a", 1.0), b(pl.MassiveLink, "b", 0.8, m=0.5)
     b.chain(world.frame, first.frame_a, first.frame_b, upper.frame_a, upper.frame_b, second.frame_a, second.frame_b,
             lower.frame_a)  # fmt: skip
@@ -27,9 +27,9 @@ def four_bar():
     """A crank that turns fully, its coupler and a rocker, all uniform rods; guesses choose the open position."""
     b = Bench()
     west, east = b(pl.World, "west"), b(pl.World, "east", 2.0)
-    crank, coupler = b(pl.MassiveLink, "crank", 0.8), b(pl.MassiveLink, "coupler", 1.9, m=0.6, guess_phi=0.3)
-    rocker = b(pl.MassiveLink, "rocker", 1.5, m=1.5, guess_phi=1.7)
-    pins = [b(pl.Revolute, "j1", initial_phi=1.0, initial_omega=5.0), *(b(pl.Revolute, f"j{k}") for k in (2, 3, 4))]
+    crank, coupler = b(pl.MassiveLink, "crank", 0.8), b(pl.MassiveLink, "coupler", 1.9, m=0.6, guess_angle=0.3)
+    rocker = b(pl.MassiveLink, "rocker", 1.5, m=1.5, guess_angle=1.7)
+    pins = [b(pl.Revolute, "j1", initial_angle=1.0, initial_speed=5.0), *(b(pl.Revolute, f"j{k}") for k in (2, 3, 4))]
     b.chain(west.frame, pins[0].frame_a, pins[0].frame_b, crank.frame_a, crank.frame_b, pins[1].frame_a,
             pins[1].frame_b, coupler.frame_a, coupler.frame_b, pins[2].frame_a, pins[2].frame_b, rocker.frame_b,
             east.frame, pins[3].frame_a, pins[3].frame_b, rocker.frame_a)  # fmt: skip
@@ -44,7 +44,7 @@ def squeezing_mechanism(facts):
         b(pl.World, n, x, y) for n, x, y in (("O", 0.0, 0.0), ("A", p.xa, p.ya), ("B", p.xb, p.yb), ("C", p.xc, p.yc))
     )
     k1, k2, k3, k4, k5, k6, k7 = (
-        b(pl.MassiveLink, f"K{k + 1}", *geometry, g_y=0.0, guess_phi=angle)
+        b(pl.MassiveLink, f"K{k + 1}", *geometry, g_y=0.0, guess_angle=angle)
         for k, (geometry, angle) in enumerate([
             ((p.rr, 0.0, p.m1, p.I1, p.ra, 0.0), beta),
             ((-p.d, 0.0, p.m2, p.I2, -p.da, 0.0), beta + theta),
@@ -63,7 +63,7 @@ def squeezing_mechanism(facts):
         ("P6", k2.frame_b, k6.frame_b),
     ):  # fmt: skip
         # One degree of freedom: an angle and its speed are given; the guesses choose among the positions.
-        given = dict(initial_phi=theta, initial_omega=0.0) if name == "Theta" else {}
+        given = dict(initial_angle=theta, initial_speed=0.0) if name == "Theta" else {}
         pins[name] = b(pl.Revolute, name, **given)
         b.chain(one, pins[name].frame_a, pins[name].frame_b, other)
     hook, spring = b(pl.Link, "D", p.sd, -p.sc), b(pl.SpringDamper, "spring", p.c0, 0.0, p.l0)

@@ -28,7 +28,7 @@ def pendulum(m=GUESS["b.m"], length=GUESS["b.rx"], d=GUESS["brake.d"]):
     """Two uniform rods, the first of one kilogram and one metre; states are the angles from the x axis."""
     ev, diagram = EqnEnv(), AcausalDiagram()
     world = World(ev, name="world")
-    first, second = (Revolute(ev, name=f"j{k}", initial_phi=0.5, initial_omega=0.0) for k in (1, 2))
+    first, second = (Revolute(ev, name=f"j{k}", initial_angle=0.5, initial_speed=0.0) for k in (1, 2))
     upper, lower = MassiveLink(ev, "a", 1.0), MassiveLink(ev, "b", length, m=m)
     brake, still = rotational.Damper(ev, "brake", d), rotational.FixedAngle(ev, "still")
     for one, other in (

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from ..errors import InitializationError, ModelError, SimulationError, SteadyStateError, explained_keywords
+from ..errors import InitializationError, ModelError, SimulationError, SteadyStateError
 from ..optional import optional_module
 from ..programs.cache import compiled
 from ..simulation.labelled import dataset_of
@@ -84,7 +84,6 @@ class Sweep(eqx.Module):
         return f"<table><caption>Sweep{' (zipped)' if self.zipped else ''}</caption>{cells}</table>"
 
 
-@explained_keywords()
 def sweep(
     system: AcausalSystem,
     parameters: Mapping[str, Any],

@@ -23,6 +23,8 @@ def explained_keywords(elsewhere: Mapping[str, str] = NOWHERE) -> Callable[[Call
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         known = keywords_of(function)
+        if any(p.kind is inspect.Parameter.VAR_KEYWORD for p in inspect.signature(function).parameters.values()):
+            raise TypeError(f"{function.__qualname__} hands any keyword on")
 
         @functools.wraps(function)
         def call(*args: P.args, **kwargs: P.kwargs) -> R:

@@ -55,12 +55,12 @@ class _Compliant(Component):
 
 
 class Spring(_Compliant):
-    """A linear spring: tau = c·(phi_rel − phi_rel0), `c` ≥ 0 in N·m/rad, `phi_rel0` in radian."""
+    """A linear spring: tau = c·(phi_rel − angle), `c` ≥ 0 in N·m/rad, `angle` in radian."""
 
-    def __init__(self, ev: EqnEnv, name: str, c: Value = 1.0, phi_rel0: Value = 0.0):
+    def __init__(self, ev: EqnEnv, name: str, c: Value = 1.0, angle: Value = 0.0):
         super().__init__(ev, name)
         stiffness = self.parameter("c", c, unit="N*m/rad", bounds=NONNEGATIVE)
-        rest = self.parameter("phi_rel0", phi_rel0, unit="rad")
+        rest = self.parameter("angle", angle, unit="rad")
         phi, tau = self._two_flanges()
         self.add_equations(Eq(tau, stiffness * (phi - rest)))
         self.declare_energy(stiffness * (phi - rest) ** 2 / 2)
@@ -110,14 +110,14 @@ class FixedAngle(Component):
 
 
 class SpringDamper(_Compliant):
-    """A linear spring and damper side by side: tau = c·(phi_rel − phi_rel0) + d·w_rel with w_rel = der(phi_rel),
+    """A linear spring and damper side by side: tau = c·(phi_rel − angle) + d·w_rel with w_rel = der(phi_rel),
     `c`, `d` ≥ 0."""
 
-    def __init__(self, ev: EqnEnv, name: str, c: Value = 1.0, d: Value = 1.0, phi_rel0: Value = 0.0):
+    def __init__(self, ev: EqnEnv, name: str, c: Value = 1.0, d: Value = 1.0, angle: Value = 0.0):
         super().__init__(ev, name)
         stiffness = self.parameter("c", c, unit="N*m/rad", bounds=NONNEGATIVE)
         damping = self.parameter("d", d, unit="N*m*s/rad", bounds=NONNEGATIVE)
-        relaxed = self.parameter("phi_rel0", phi_rel0, unit="rad")
+        relaxed = self.parameter("angle", angle, unit="rad")
         phi_rel, tau = self._two_flanges()
         speed = self.variable("w_rel", unit="rad/s")
         self.add_equations(Eq(speed, der(phi_rel)), Eq(tau, stiffness * (phi_rel - relaxed) + damping * speed))
@@ -126,16 +126,16 @@ class SpringDamper(_Compliant):
 
 
 class NonlinearSpring(_Compliant):
-    """A spring that hardens (or softens) with the cube: tau = c·e + c3·e³ with e = phi_rel − phi_rel0 (Duffing 1918).
+    """A spring that hardens (or softens) with the cube: tau = c·e + c3·e³ with e = phi_rel − angle (Duffing 1918).
 
     `c` in `N*m/rad`, `c3` in `N*m/rad3`.
     """
 
-    def __init__(self, ev: EqnEnv, name: str, c: Value = 1.0, c3: Value = 0.0, phi_rel0: Value = 0.0):
+    def __init__(self, ev: EqnEnv, name: str, c: Value = 1.0, c3: Value = 0.0, angle: Value = 0.0):
         super().__init__(ev, name)
         linear = self.parameter("c", c, unit="N*m/rad")
         cubic = self.parameter("c3", c3, unit="N*m/rad3")
-        relaxed = self.parameter("phi_rel0", phi_rel0, unit="rad")
+        relaxed = self.parameter("angle", angle, unit="rad")
         phi_rel, tau = self._two_flanges()
         e = phi_rel - relaxed
         self.add_equations(Eq(tau, linear * e + cubic * e**3))

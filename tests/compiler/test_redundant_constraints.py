@@ -16,7 +16,7 @@ def test_a_door_on_two_hinges():
     """Regression: the fault was reported twice, for x and for y."""
     b = Linkage()
     wall, door = b(pl.World, "wall"), b(pl.MassiveLink, "door")
-    b.pin("top", wall.frame, door.frame_a, initial_phi=0.3, initial_omega=0.0)
+    b.pin("top", wall.frame, door.frame_a, initial_angle=0.3, initial_speed=0.0)
     b.pin("bottom", wall.frame, door.frame_a)
     expected = (
         "'top' and 'bottom' form a loop, and each of them fixes a difference of 'x' and 'y': one too many. Remove one "
@@ -28,7 +28,7 @@ def test_a_door_on_two_hinges():
 def test_a_slider_on_two_parallel_guides():
     b = Linkage()
     bed, sled = b(pl.World, "bed"), b(pl.Body, "sled")
-    left, right = b(pl.Prismatic, "left", initial_s=0.2, initial_v=0.0), b(pl.Prismatic, "right")
+    left, right = b(pl.Prismatic, "left", initial_position=0.2, initial_velocity=0.0), b(pl.Prismatic, "right")
     aside, across = b(pl.Link, "aside", 0.0, 0.5), b(pl.Link, "across", 0.0, 0.5)
     b.join(bed.frame, left.frame_a, aside.frame_a)
     b.join(left.frame_b, sled.frame, across.frame_a)
@@ -83,7 +83,7 @@ def test_what_hangs_on_the_loop_is_not_named():
     b = Linkage()
     coupler = b.parallelogram()
     b.bar(coupler)
-    b.pin("hook", coupler.frame_b, b(pl.MassiveLink, "pendulum", 0.5, initial_phi=-1.0, initial_omega=0.0).frame_a)
+    b.pin("hook", coupler.frame_b, b(pl.MassiveLink, "pendulum", 0.5, initial_angle=-1.0, initial_speed=0.0).frame_a)
     assert b.refusal("dummy_derivatives").splitlines()[-1] == REDUNDANT.format(LOOP, "one of them follows")
 
 

@@ -70,8 +70,8 @@ REFUSED = [
         "'h': lower must not be above upper; got lower=1 and upper=0: exchange them",
     ),
     (
-        lambda ev: sig.DiscretePI(ev, "p", lower=1.0, upper=-1.0),
-        "'p': lower must not be above upper; got lower=1 and upper=-1: exchange them",
+        lambda ev: sig.DiscretePI(ev, "p", low=1.0, high=-1.0),
+        "'p': low must not be above high; got low=1 and high=-1: exchange them",
     ),
     (
         lambda ev: friction.StickingFriction(ev, "f", 2.0, 1.0),

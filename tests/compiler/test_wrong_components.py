@@ -140,7 +140,7 @@ def test_battery(make, message):
     "make, named",
     [
         (lambda ev: pl.Body(ev, "b", m=0.0), r"b\.m"),
-        (lambda ev: pl.Body(ev, "b", I=-1.0), r"b\.I"),
+        (lambda ev: pl.Body(ev, "b", J=-1.0), r"b\.J"),
         (lambda ev: pl.MassiveLink(ev, "k", m=-1.0), r"k\.m"),
         (lambda ev: pl.SpringDamper(ev, "s", c=-1.0), r"s\.c"),
     ],

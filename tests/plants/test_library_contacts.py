@@ -111,8 +111,8 @@ def test_a_string_between_frames():
     ev = EqnEnv()
     world, string = planar.World(ev, "world"), planar.String(ev, "string", 1.0, taut=True)
     bob = planar.Body(
-        ev, "bob", 2.0, 1.0, initial_x=0.0, initial_y=-1.0, initial_phi=0.0, initial_vx=5.2, initial_vy=0.0,
-        initial_omega=0.0,
+        ev, "bob", 2.0, 1.0, initial_x=0.0, initial_y=-1.0, initial_angle=0.0, initial_vx=5.2, initial_vy=0.0,
+        initial_speed=0.0,
     )  # fmt: skip
     system = compiled(world, string, bob, connect=[(world.frame, string.frame_a), (string.frame_b, bob.frame)])
     solution = simulate(system, 1.5, **TIGHT)

@@ -261,7 +261,7 @@ def dynamic():
     b.join(wall.port_b, out.heat)
     expected |= {"mass.T": 293.15 + 8.0 + (300.0 - 293.15 - 8.0) * np.exp(-2.0 / 5.0 * TS)}
 
-    # R(w)·w' = k·V integrates to R_off·w − (R_off − R_on)·w²/2 = … + k·V·t.
+    # R(w)·w' = k·V integrates to Roff·w − (Roff − Ron)·w²/2 = … + k·V·t.
     memory = b(el.Memristor, "memory", 1.0, 5.0, 0.2, 0.1)
     b.source("m_source", 4.0, memory.p)
     b.earth(memory.n)

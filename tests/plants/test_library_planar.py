@@ -50,7 +50,7 @@ def components():
     x0, y0, turned = 0.3, -0.2, 0.4
 
     # A point mass on a link without mass: the angle equation, and the force in the link from the radial balance.
-    pin = b(pl.Revolute, "pin", initial_phi=-1.2 - turned, initial_omega=0.5)
+    pin = b(pl.Revolute, "pin", initial_angle=-1.2 - turned, initial_speed=0.5)
     link, bob = b(pl.Link, "link", 1.3), b(pl.Body, "bob", 0.7, 0.0)
     b.chain(world.frame, pin.frame_a, pin.frame_b, link.frame_a, link.frame_b, bob.frame)
     swing = angle_solution(-1.2, 0.5, TS, L=1.3, m=0.7)
@@ -66,13 +66,13 @@ def components():
     }
 
     # A uniform rod released at rest: the inertia about its end is m·L²/3, so it swings like a point at 2L/3.
-    hinge, rod = b(pl.Revolute, "hinge", initial_phi=0.3 - turned, initial_omega=0.0), b(pl.MassiveLink, "rod", 1.5)
+    hinge, rod = b(pl.Revolute, "hinge", initial_angle=0.3 - turned, initial_speed=0.0), b(pl.MassiveLink, "rod", 1.5)
     b.chain(world.frame, hinge.frame_a, hinge.frame_b, rod.frame_a)
     expected |= {"rod.body.phi": elliptic_angle(0.3, TS, L=1.0)}
 
     # A torsion spring and damper at a pin: (I + m·c²)·phi'' + d·phi' + k·(phi − rest) = 0 without gravity.
-    wrist = b(pl.Revolute, "wrist", initial_phi=0.6, initial_omega=-1.0)
-    hand = b(pl.MassiveLink, "hand", 1.0, m=2.0, I=0.5, cx=0.4, cy=-0.3, g_y=0.0)
+    wrist = b(pl.Revolute, "wrist", initial_angle=0.6, initial_speed=-1.0)
+    hand = b(pl.MassiveLink, "hand", 1.0, m=2.0, J=0.5, cx=0.4, cy=-0.3, g_y=0.0)
     coil, wall = b(rot.SpringDamper, "coil", 5.0, 0.4, 0.2), b(rot.FixedAngle, "wall")
     b.chain(world.frame, wrist.frame_a, wrist.frame_b, hand.frame_a, wall.flange, coil.flange_a)
     b.join(coil.flange_b, wrist.flange)
@@ -80,8 +80,14 @@ def components():
 
     # A slide on an incline, with a spring, a damper and a force along it; the incline carries the rest.
     slope = turned + 0.25
-    slide, sled = b(pl.Prismatic, "slide", 0.25, initial_s=0.5, initial_v=0.2), b(pl.Body, "sled", 1.6, 0.3)
-    free, falling = b(pl.Prismatic, "free", 0.25, initial_s=0.0, initial_v=1.0), b(pl.Body, "falling", 0.8)
+    slide, sled = (
+        b(pl.Prismatic, "slide", 0.25, initial_position=0.5, initial_velocity=0.2),
+        b(pl.Body, "sled", 1.6, 0.3),
+    )
+    free, falling = (
+        b(pl.Prismatic, "free", 0.25, initial_position=0.0, initial_velocity=1.0),
+        b(pl.Body, "falling", 0.8),
+    )
     buffer, stop = b(line.SpringDamper, "buffer", 12.0, 0.9), b(line.FixedPosition, "stop")
     push = b(line.Force, "push")
     b.chain(world.frame, slide.frame_a, slide.frame_b, sled.frame, stop.flange, buffer.flange_a)
@@ -105,9 +111,9 @@ def components():
     # Two bodies on a spring and damper: distance r and direction of the line, and the common drift.
     m, n, c, d, rest = 1.2, 0.8, 9.0, 0.3, 0.6
     left = b(pl.Body, "left", m, 0.1, g_y=0.0, initial_x=0.0, initial_y=0.0, initial_vx=0.1, initial_vy=-0.3,
-             initial_phi=0.0, initial_omega=0.7)  # fmt: skip
+             initial_angle=0.0, initial_speed=0.7)  # fmt: skip
     right = b(pl.Body, "right", n, 0.1, g_y=0.0, initial_x=1.0, initial_y=0.0, initial_vx=0.4, initial_vy=0.9,
-              initial_phi=0.0, initial_omega=0.0)  # fmt: skip
+              initial_angle=0.0, initial_speed=0.0)  # fmt: skip
     rope = b(pl.SpringDamper, "rope", c, d, rest)
     b.chain(left.frame, rope.frame_a, rope.frame_b, right.frame)
     reduced, spin = m * n / (m + n), 1.2  # the line turns at 1.2 rad/s at the start: r²·dα/dt is conserved
@@ -129,12 +135,12 @@ def components():
     }
 
     # A force and a torque on a free body; a force at the end of a lever on a pinned one.
-    puck = b(pl.Body, "puck", 2.0, 0.4, g_x=0.5, initial_x=1.0, initial_y=2.0, initial_phi=0.1, initial_vx=-1.0,
-             initial_vy=0.0, initial_omega=0.0)  # fmt: skip
+    puck = b(pl.Body, "puck", 2.0, 0.4, g_x=0.5, initial_x=1.0, initial_y=2.0, initial_angle=0.1, initial_vx=-1.0,
+             initial_vy=0.0, initial_speed=0.0)  # fmt: skip
     force, torque = b(pl.Force, "force"), b(pl.Torque, "torque")
     b.join(puck.frame, force.frame, torque.frame)
     inputs |= {"force.fx": 3.0, "force.fy": -1.0, "torque.tau": lambda t: 0.2 * t}
-    axle, wheel = b(pl.Revolute, "axle", initial_phi=0.0, initial_omega=0.0), b(pl.Body, "wheel", 1.0, 0.5, g_y=0.0)
+    axle, wheel = b(pl.Revolute, "axle", initial_angle=0.0, initial_speed=0.0), b(pl.Body, "wheel", 1.0, 0.5, g_y=0.0)
     arm, pull = b(pl.Link, "arm", 0.6, -0.2), b(pl.Force, "pull")
     b.chain(world.frame, axle.frame_a, arm.frame_b, pull.frame)
     b.join(axle.frame_b, wheel.frame, arm.frame_a)
@@ -238,7 +244,7 @@ def test_energy_of_components():
 
 # --- double pendulum -----------------------------------------------------------------------------------------------
 
-RODS = {"a.m": 1.0, "a.rx": 1.0, "b.m": 0.5, "b.rx": 0.8, "j1.initial_phi": 0.3, "j2.initial_phi": 0.5}
+RODS = {"a.m": 1.0, "a.rx": 1.0, "b.m": 0.5, "b.rx": 0.8, "j1.initial_angle": 0.3, "j2.initial_angle": 0.5}
 
 
 def double_reference(ts, values):
@@ -299,7 +305,7 @@ def test_runs_of_a_double_pendulum(mode):
 # --- four-bar linkage ----------------------------------------------------------------------------------------------
 
 BARS = {"crank.m": 1.0, "crank.rx": 0.8, "coupler.m": 0.6, "coupler.rx": 1.9, "rocker.m": 1.5, "rocker.rx": 1.5,
-        "east.x": 2.0, "j1.initial_phi": 1.0, "j1.initial_omega": 5.0}  # fmt: skip
+        "east.x": 2.0, "j1.initial_angle": 1.0, "j1.initial_speed": 5.0}  # fmt: skip
 
 
 def loop(phi, crank, coupler, rocker, ground):
@@ -356,7 +362,7 @@ def test_four_bar_linkage():
 
 @pytest.mark.slow
 def test_guesses_choose_the_position_of_a_loop():
-    crossed = four_bar().with_parameters({"coupler.body.initial_phi": -1.2, "rocker.body.initial_phi": -2.3})
+    crossed = four_bar().with_parameters({"coupler.body.initial_angle": -1.2, "rocker.body.initial_angle": -2.3})
     names = ["coupler.body.phi", "rocker.body.phi"]
     # The mirror image of the open position in the line from the crank's end to the rocker's pin.
     at, swing, *_ = loop(1.0, 0.8, 1.9, 1.5, 2.0)

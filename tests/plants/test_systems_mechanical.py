@@ -208,7 +208,7 @@ def planetary():
         a = np.block([
             [np.zeros((2, 2)), np.eye(2)], [-np.linalg.solve(mass, stiffness), -np.linalg.solve(mass, damping)],
         ])  # fmt: skip
-        relaxed = p["hold.c"] * (p["base.angle"] + p["hold.phi_rel0"])
+        relaxed = p["hold.c"] * (p["base.angle"] + p["hold.angle"])
         b = np.concatenate([np.zeros(2), np.linalg.solve(mass, [DRIVING, relaxed])])
         start = [p[f"{part}.initial_{what}"] for what in ("angle", "speed") for part in ("sun", "ring")]
         y = linear(a, start, b, TS_GEAR)
@@ -248,8 +248,8 @@ def chain(p, names, pins):
     n = len(names)
     ends = [at(p, "world"), *((k, vector[k]) for k in range(n - 1))]
     mechanism = Mechanism(mass, inertia, gravity, vector / 2, [(ends[k], (k, 0.0)) for k in range(n)])
-    angles = p["world.phi"] + np.cumsum([p[f"{j}.initial_phi"] for j in pins])
-    speeds = np.cumsum([p[f"{j}.initial_omega"] for j in pins])
+    angles = p["world.phi"] + np.cumsum([p[f"{j}.initial_angle"] for j in pins])
+    speeds = np.cumsum([p[f"{j}.initial_speed"] for j in pins])
     q, v = mechanism.start(angles, list(zip(np.eye(n), angles, strict=True)), speeds)
     return mechanism.solve(q, v, TS_PENDULUM)[:2]
 
@@ -274,7 +274,7 @@ def triple_pendulum():
         b = Bench()
         end = b(pl.World, "world").frame
         for k, (angle, length, mass) in enumerate([(0.3, 1.0, 1.0), (0.5, 0.8, 0.5), (-0.4, 0.6, 0.7)], 1):
-            pin = b(pl.Revolute, f"j{k}", initial_phi=angle, initial_omega=0.0)
+            pin = b(pl.Revolute, f"j{k}", initial_angle=angle, initial_speed=0.0)
             rod = b(pl.MassiveLink, f"rod{k}", length, m=mass)
             b.chain(end, pin.frame_a, pin.frame_b, rod.frame_a)
             end = rod.frame_b
@@ -307,7 +307,7 @@ def test_the_reference_of_the_triple_pendulum():
     p = {"world.x": 0.0, "world.y": 0.0, "world.phi": 0.0}
     for k in range(3):
         p |= {f"r{k}.rx": length[k], f"r{k}.ry": 0.0, f"r{k}.m": m[k], f"r{k}.g_x": 0.0, f"r{k}.g_y": -GRAVITY}
-        p |= {f"j{k}.initial_phi": [0.3, 0.5, -0.4][k], f"j{k}.initial_omega": 0.0}
+        p |= {f"j{k}.initial_angle": [0.3, 0.5, -0.4][k], f"j{k}.initial_speed": 0.0}
     found = chain(p, ["r0", "r1", "r2"], ["j0", "j1", "j2"])
     # Both are integrated to 1e-12, for each of fewer than 1,000 steps.
     np.testing.assert_allclose(np.concatenate(found), true, rtol=0, atol=1e-9)
@@ -326,9 +326,9 @@ def four_bar():
             (at(p, "east"), (2, 0.0)),
         ]  # fmt: skip
         mechanism = Mechanism(mass, inertia, gravity, vector / 2, ends)
-        start = p["west.phi"] + p["j1.initial_phi"]
-        guess = [start, p["coupler.body.initial_phi"], p["rocker.body.initial_phi"]]
-        q, v = mechanism.start(guess, [(np.eye(3)[0], start)], [p["j1.initial_omega"]])
+        start = p["west.phi"] + p["j1.initial_angle"]
+        guess = [start, p["coupler.body.initial_angle"], p["rocker.body.initial_angle"]]
+        q, v = mechanism.start(guess, [(np.eye(3)[0], start)], [p["j1.initial_speed"]])
         q, w, centre = mechanism.solve(q, v, TS_LOOP)
         return {
             "j1.phi": q[0] - p["west.phi"], "j1.omega": w[0], "j4.phi": q[2] - p["east.phi"],
@@ -350,8 +350,8 @@ def slider_crank():
         b = Bench()
         world, slider, motor = b(pl.World, "world"), b(pl.Body, "slider", 2.5), b(rot.AngleSource, "motor")
         crank, coupler = b(pl.Link, "crank", 0.4), b(pl.Link, "coupler", 1.1)
-        pins = [b(pl.Revolute, "drive"), b(pl.Revolute, "elbow"), b(pl.Revolute, "wrist", guess_phi=0.2)]
-        guide = b(pl.Prismatic, "guide", 0.3, guess_s=1.4)
+        pins = [b(pl.Revolute, "drive"), b(pl.Revolute, "elbow"), b(pl.Revolute, "wrist", guess_angle=0.2)]
+        guide = b(pl.Prismatic, "guide", 0.3, guess_position=1.4)
         coil, base = b(tr.SpringDamper, "coil", 15.0, 2.0, 0.9), b(tr.FixedPosition, "base")
         b.chain(world.frame, pins[0].frame_a, pins[0].frame_b, crank.frame_a, crank.frame_b, pins[1].frame_a,
                 pins[1].frame_b, coupler.frame_a, coupler.frame_b, pins[2].frame_a, world.frame, guide.frame_a,
@@ -406,16 +406,16 @@ def andrews():
         ]  # fmt: skip
         mechanism = Mechanism(
             np.array([p[f"{n}.m"] for n in names]),
-            np.array([p[f"{n}.I"] for n in names]),
+            np.array([p[f"{n}.J"] for n in names]),
             np.array([p[f"{n}.g_x"] + 1j * p[f"{n}.g_y"] for n in names]),
             np.array([p[f"{n}.cx"] + 1j * p[f"{n}.cy"] for n in names]),
             pins,
             {0: torque},
             (at(p, "C"), (2, p["D.rx"] + 1j * p["D.ry"]), p["spring.c"], p["spring.d"], p["spring.length"]),
         )
-        guess = [p[f"{n}.body.initial_phi"] for n in names]
+        guess = [p[f"{n}.body.initial_angle"] for n in names]
         between = np.array([-1.0, 1.0, 0, 0, 0, 0, 0])
-        q, v = mechanism.start(guess, [(between, p["Theta.initial_phi"])], [p["Theta.initial_omega"]])
+        q, v = mechanism.start(guess, [(between, p["Theta.initial_angle"])], [p["Theta.initial_speed"]])
         q, w, _ = mechanism.solve(q, v, TS_ANDREWS)
         return {
             "beta.phi": q[0] - p["O.phi"], "gamma.phi": q[2] - p["B.phi"], "Theta.omega": w[1] - w[0],

@@ -111,9 +111,9 @@ class Potentiometer(Component):
 
 
 class Memristor(TwoPin):
-    """A resistor whose resistance follows the charge that has passed: v = (R_on·w + R_off·(1 − w))·i, dw/dt = k·i.
+    """A resistor whose resistance follows the charge that has passed: v = (Ron·w + Roff·(1 − w))·i, dw/dt = k·i.
 
-    `R_on`, `R_off` ≥ 0 in ohm, the drift `k` in 1/(A·s); `w` is the doped part, between 0 and 1 if the charge is small
+    `Ron`, `Roff` ≥ 0 in ohm, the drift `k` in 1/(A·s); `w` is the doped part, between 0 and 1 if the charge is small
     enough, and starts at `initial_w`. Linear drift: Strukov, Snider, Stewart & Williams (2008), Nature 453:80, eqs. 5
     and 6.
     """
@@ -122,14 +122,14 @@ class Memristor(TwoPin):
         self,
         ev: EqnEnv,
         name: str,
-        R_on: Value = 100.0,
-        R_off: Value = 16e3,
+        Ron: Value = 100.0,
+        Roff: Value = 16e3,
         k: Value = 1e4,
         initial_w: Value = 0.1,
     ):
         super().__init__(ev, name)
-        on = self.parameter("R_on", R_on, unit="Ohm", bounds=NONNEGATIVE)
-        off = self.parameter("R_off", R_off, unit="Ohm", bounds=NONNEGATIVE)
+        on = self.parameter("Ron", Ron, unit="Ohm", bounds=NONNEGATIVE)
+        off = self.parameter("Roff", Roff, unit="Ohm", bounds=NONNEGATIVE)
         drift = self.parameter("k", k, unit="1/(A*s)")
         w0 = self.parameter("initial_w", initial_w, unit="1")
         w = self.variable("w", start=w0, fixed=True, unit="1")

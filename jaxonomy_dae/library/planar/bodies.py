@@ -31,18 +31,18 @@ class Body(Component):
 
         dx/dt = vx,       m·dvx/dt = frame.fx + m·g_x
         dy/dt = vy,       m·dvy/dt = frame.fy + m·g_y
-        dphi/dt = omega,  I·domega/dt = frame.tau
+        dphi/dt = omega,  J·domega/dt = frame.tau
 
     where x, y and phi are those of the frame.
 
     **Arguments:**
 
-    - `m` > 0: mass (kilogram). `I` ≥ 0: moment of inertia about the centre of mass (kg·m²). It may be zero where the
+    - `m` > 0: mass (kilogram). `J` ≥ 0: moment of inertia about the centre of mass (kg·m²). It may be zero where the
         body cannot turn freely, as at the end of a link.
     - `g_x`, `g_y`: gravity's components (metre per second squared).
-    - `initial_x`, `initial_y` (metre), `initial_phi` (radian), `initial_vx`, `initial_vy` (metre per second),
-        `initial_omega` (radian per second): they hold at the start where they are given.
-    - `guess_x`, `guess_y`, `guess_phi`: where the search for a start begins for what is not given; the parameters
+    - `initial_x`, `initial_y` (metre), `initial_angle` (radian), `initial_vx`, `initial_vy` (metre per second),
+        `initial_speed` (radian per second): they hold at the start where they are given.
+    - `guess_x`, `guess_y`, `guess_angle`: where the search for a start begins for what is not given; the parameters
         `initial_x`, … are then the guesses. A closed loop has several positions in which it fits together, and the
         guesses choose among them.
     """
@@ -52,22 +52,22 @@ class Body(Component):
         ev: EqnEnv,
         name: str,
         m: Value = 1.0,
-        I: Value = 1.0,  # noqa: E741 (the inertia's symbol)
+        J: Value = 1.0,
         g_x: Value = 0.0,
         g_y: Value = -9.81,
         initial_x: Value | None = None,
         initial_y: Value | None = None,
-        initial_phi: Value | None = None,
+        initial_angle: Value | None = None,
         initial_vx: Value | None = None,
         initial_vy: Value | None = None,
-        initial_omega: Value | None = None,
+        initial_speed: Value | None = None,
         guess_x: Value = 0.0,
         guess_y: Value = 0.0,
-        guess_phi: Value = 0.0,
+        guess_angle: Value = 0.0,
     ):
         super().__init__(ev, name)
         mass = self.parameter("m", m, unit="kg", bounds=POSITIVE)
-        inertia = self.parameter("I", I, unit="kg*m2", bounds=NONNEGATIVE)
+        inertia = self.parameter("J", J, unit="kg*m2", bounds=NONNEGATIVE)
         gx, gy = self.parameter("g_x", g_x, unit="m/s2"), self.parameter("g_y", g_y, unit="m/s2")
         frame = self.port("frame", Planar)
 
@@ -77,7 +77,7 @@ class Body(Component):
 
         x, vx = state("x", "m", initial_x, guess_x), state("vx", "m/s", initial_vx)
         y, vy = state("y", "m", initial_y, guess_y), state("vy", "m/s", initial_vy)
-        phi, omega = state("phi", "rad", initial_phi, guess_phi), state("omega", "rad/s", initial_omega)
+        phi, omega = state("phi", "rad", initial_angle, guess_angle), state("omega", "rad/s", initial_speed)
         self.add_equations(
             Eq(x, frame.x),
             Eq(y, frame.y),
@@ -128,12 +128,12 @@ class MassiveLink(Component):
 
     - `rx`, `ry`: from frame_a to frame_b along the axes of frame_a (metre).
     - `m` > 0: mass (kilogram).
-    - `I` ≥ 0: moment of inertia about the centre of mass (kg·m²); that of a thin uniform rod, m·(rx² + ry²)/12, if left
+    - `J` ≥ 0: moment of inertia about the centre of mass (kg·m²); that of a thin uniform rod, m·(rx² + ry²)/12, if left
         out.
     - `cx`, `cy`: from frame_a to the centre of mass along the axes of frame_a (metre); half of `rx`, `ry` if left out.
     - `g_x`, `g_y`: gravity's components (metre per second squared).
-    - `initial_phi` (radian), `initial_omega` (radian per second): they hold at the start where they are given.
-    - `guess_x`, `guess_y` (metre, of the centre of mass), `guess_phi` (radian): where the search for a start begins.
+    - `initial_angle` (radian), `initial_speed` (radian per second): they hold at the start where they are given.
+    - `guess_x`, `guess_y` (metre, of the centre of mass), `guess_angle` (radian): where the search for a start begins.
     """
 
     def __init__(
@@ -143,31 +143,31 @@ class MassiveLink(Component):
         rx: Value = 1.0,
         ry: Value = 0.0,
         m: Value = 1.0,
-        I: Value | None = None,  # noqa: E741
+        J: Value | None = None,
         cx: Value | None = None,
         cy: Value | None = None,
         g_x: Value = 0.0,
         g_y: Value = -9.81,
-        initial_phi: Value | None = None,
-        initial_omega: Value | None = None,
+        initial_angle: Value | None = None,
+        initial_speed: Value | None = None,
         guess_x: Value = 0.0,
         guess_y: Value = 0.0,
-        guess_phi: Value = 0.0,
+        guess_angle: Value = 0.0,
     ):
         super().__init__(ev, name)
         frame_a, frame_b = self.port("frame_a", Planar), self.port("frame_b", Planar)
         ahead, aside = self.parameter("rx", rx, unit="m"), self.parameter("ry", ry, unit="m")
         mass = self.parameter("m", m, unit="kg", bounds=POSITIVE)
         thin_rod = mass * (ahead**2 + aside**2) / 12
-        inertia = self.parameter("I", thin_rod if I is None else I, unit="kg*m2", bounds=NONNEGATIVE)
+        inertia = self.parameter("J", thin_rod if J is None else J, unit="kg*m2", bounds=NONNEGATIVE)
         x = self.parameter("cx", ahead / 2 if cx is None else cx, unit="m")
         y = self.parameter("cy", aside / 2 if cy is None else cy, unit="m")
         gx, gy = self.parameter("g_x", g_x, unit="m/s2"), self.parameter("g_y", g_y, unit="m/s2")
         body = self.add(
             Body(
                 ev, "body", mass, inertia, gx, gy,
-                initial_phi=initial_phi, initial_omega=initial_omega,
-                guess_x=guess_x, guess_y=guess_y, guess_phi=guess_phi,
+                initial_angle=initial_angle, initial_speed=initial_speed,
+                guess_x=guess_x, guess_y=guess_y, guess_angle=guess_angle,
             )
         )  # fmt: skip
         near, far = self.add(Link(ev, "near", x, y)), self.add(Link(ev, "far", ahead - x, aside - y))

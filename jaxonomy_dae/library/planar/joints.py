@@ -19,8 +19,8 @@ class Revolute(TwoFrames):
 
     **Arguments:**
 
-    - `initial_phi` (radian), `initial_omega` (radian per second): they hold at the start where they are given.
-    - `guess_phi` (radian): where the search for a start begins if `initial_phi` is not given. In a closed loop it
+    - `initial_angle` (radian), `initial_speed` (radian per second): they hold at the start where they are given.
+    - `guess_angle` (radian): where the search for a start begins if `initial_angle` is not given. In a closed loop it
         chooses among the positions in which the loop fits together.
     """
 
@@ -28,17 +28,17 @@ class Revolute(TwoFrames):
         self,
         ev: EqnEnv,
         name: str,
-        initial_phi: Value | None = None,
-        initial_omega: Value | None = None,
-        guess_phi: Value = 0.0,
+        initial_angle: Value | None = None,
+        initial_speed: Value | None = None,
+        guess_angle: Value = 0.0,
     ):
         super().__init__(ev, name)
-        phi0 = self.parameter("initial_phi", guess_phi if initial_phi is None else initial_phi, unit="rad")
-        omega0 = self.parameter("initial_omega", 0.0 if initial_omega is None else initial_omega, unit="rad/s")
+        phi0 = self.parameter("initial_angle", guess_angle if initial_angle is None else initial_angle, unit="rad")
+        omega0 = self.parameter("initial_speed", 0.0 if initial_speed is None else initial_speed, unit="rad/s")
         a, b = self._two_frames()
         flange = self.port("flange", Rotational)
-        phi = self.variable("phi", start=phi0, fixed=initial_phi is not None, unit="rad")
-        omega = self.variable("omega", start=omega0, fixed=initial_omega is not None, unit="rad/s")
+        phi = self.variable("phi", start=phi0, fixed=initial_angle is not None, unit="rad")
+        omega = self.variable("omega", start=omega0, fixed=initial_speed is not None, unit="rad/s")
         self.add_equations(
             Eq(b.x, a.x),
             Eq(b.y, a.y),
@@ -64,8 +64,8 @@ class Prismatic(TwoFrames):
     **Arguments:**
 
     - `angle`: of the axis in frame_a (radian).
-    - `initial_s` (metre), `initial_v` (metre per second): they hold at the start where they are given.
-    - `guess_s` (metre): where the search for a start begins if `initial_s` is not given.
+    - `initial_position` (metre), `initial_velocity` (metre per second): they hold at the start where they are given.
+    - `guess_position` (metre): where the search for a start begins if `initial_position` is not given.
     """
 
     def __init__(
@@ -73,18 +73,20 @@ class Prismatic(TwoFrames):
         ev: EqnEnv,
         name: str,
         angle: Value = 0.0,
-        initial_s: Value | None = None,
-        initial_v: Value | None = None,
-        guess_s: Value = 0.0,
+        initial_position: Value | None = None,
+        initial_velocity: Value | None = None,
+        guess_position: Value = 0.0,
     ):
         super().__init__(ev, name)
         inclination = self.parameter("angle", angle, unit="rad")
-        s0 = self.parameter("initial_s", guess_s if initial_s is None else initial_s, unit="m")
-        v0 = self.parameter("initial_v", 0.0 if initial_v is None else initial_v, unit="m/s")
+        s0 = self.parameter(
+            "initial_position", guess_position if initial_position is None else initial_position, unit="m"
+        )
+        v0 = self.parameter("initial_velocity", 0.0 if initial_velocity is None else initial_velocity, unit="m/s")
         a, b = self._two_frames()
         flange = self.port("flange", Translational)
-        s = self.variable("s", start=s0, fixed=initial_s is not None, unit="m")
-        v = self.variable("v", start=v0, fixed=initial_v is not None, unit="m/s")
+        s = self.variable("s", start=s0, fixed=initial_position is not None, unit="m")
+        v = self.variable("v", start=v0, fixed=initial_velocity is not None, unit="m/s")
         along_x, along_y = cos(a.phi + inclination), sin(a.phi + inclination)
         self.add_equations(
             Eq(b.x, a.x + s * along_x),

@@ -25,11 +25,11 @@ class SampleHold(Component):
 
 class DiscretePI(Component):
     """A sampled controller: every `period` (second), y = kp·u + I with I the sum of ki·period·u so far, bounded by
-    `lower` and `upper`; the sum waits while y is at a bound and u drives it further."""
+    `low` and `high`; the sum waits while y is at a bound and u drives it further."""
 
     def __init__(
         self, ev: EqnEnv, name: str, kp: Value = 1.0, ki: Value = 1.0, period: Value = 0.1,
-        lower: Value = -sympy.oo, upper: Value = sympy.oo,
+        low: Value = -sympy.oo, high: Value = sympy.oo,
     ):  # fmt: skip
         super().__init__(ev, name)
         proportional, integral = self.parameter("kp", kp), self.parameter("ki", ki)
@@ -38,14 +38,14 @@ class DiscretePI(Component):
         held, total = self.discrete("held"), self.discrete("total")
         wished = proportional * u + pre(total)
         bounded, free = wished, sympy.true
-        if upper is not sympy.oo:
-            high = self.parameter("upper", upper)
-            bounded, free = sympy.Min(bounded, high), sympy.And(free, sympy.Or(wished <= high, u <= 0))
-        if lower is not -sympy.oo:
-            low = self.parameter("lower", lower)
-            bounded, free = sympy.Max(bounded, low), sympy.And(free, sympy.Or(wished >= low, u >= 0))
-        if upper is not sympy.oo and lower is not -sympy.oo:
-            in_order(self, "lower", "upper")
+        if high is not sympy.oo:
+            top = self.parameter("high", high)
+            bounded, free = sympy.Min(bounded, top), sympy.And(free, sympy.Or(wished <= top, u <= 0))
+        if low is not -sympy.oo:
+            bottom = self.parameter("low", low)
+            bounded, free = sympy.Max(bounded, bottom), sympy.And(free, sympy.Or(wished >= bottom, u >= 0))
+        if high is not sympy.oo and low is not -sympy.oo:
+            in_order(self, "low", "high")
         self.add_equations(Eq(y, held))
         step = sympy.Piecewise((integral * T * u, free), (0, True))
         self.when(self.sampled(T), assign(held, bounded), assign(total, pre(total) + step))
