@@ -68,7 +68,6 @@ class Problem:
         model reads, for an unknown start of an algebraic variable, and for data that do not fit.
     """
 
-    @explained_keywords()
     def __init__(
         self,
         system: AcausalSystem,
