@@ -15,14 +15,22 @@ mode beside central differences. Lines of JSON go to `--out`, and a table by sub
 import argparse
 import collections
 import json
+import multiprocessing
 import os
 import re
 import resource
-import subprocess
 import sys
 import time
 import warnings
 from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, simulate
+from jaxonomy_dae.modelica import FlatComponent, load
 
 SECONDS, MEMORY = 120, 4 << 30  # of one file's process: time of the processor, bytes of memory beside XLA's code
 AGREES = 0.002  # of a signal's range, and of the run's time
@@ -33,7 +41,7 @@ STEP, CLOSE = 1e-5, 1e-3  # of a parameter, for differences; relative error of a
 
 def main() -> int:
     asked = _arguments()
-    files = sorted(Path(asked.texts).rglob("Modelica.*.bmo"), key=lambda f: f.name)
+    files = sorted(Path(asked.texts).rglob("Modelica.*.bmo"), key=lambda f: f.stat().st_size)
     files = [f for f in files if asked.only in f.name]
     done = {r["model"]: r for r in _read(asked.out)} if asked.resume else {}
     for k, file in enumerate(files):
@@ -57,27 +65,31 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--resume", action="store_true", help="leave out what is in --out already")
     parser.add_argument("--no-gradients", action="store_true")
     parser.add_argument("--seconds", type=int, default=SECONDS, help="of processor time, for each file")
-    parser.add_argument("--one", help=argparse.SUPPRESS)  # a process for one file
-    asked = parser.parse_args()
-    if asked.one:
-        print(json.dumps(_one(Path(asked.one), Path(asked.references), not asked.no_gradients)))
-        sys.exit(0)
-    return asked
+    return parser.parse_args()
 
 
 def _in_a_process(file: Path, asked: argparse.Namespace) -> dict:
-    def limits() -> None:
-        resource.setrlimit(resource.RLIMIT_CPU, (asked.seconds, asked.seconds + 5))
-        resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
-
-    command = [sys.executable, "-m", "benchmarks.modelica_library", *sys.argv[1:], "--one", str(file)]
+    """The row of one file, from a copy of this process, which has imported everything already."""
     start = time.monotonic()
-    found = subprocess.run(command, capture_output=True, text=True, preexec_fn=limits)
-    lines = found.stdout.strip().splitlines()
-    if found.returncode == 0 and lines:
-        return json.loads(lines[-1])
-    why = "late" if found.returncode in (-9, -24) else f"the process ended with {found.returncode}"
-    return {"model": file.stem, "error": why, "seconds": round(time.monotonic() - start, 1)}
+    here, there = multiprocessing.Pipe(duplex=False)
+    child = multiprocessing.get_context("fork").Process(target=_with_limits, args=(there, file, asked))
+    child.start()
+    there.close()
+    try:
+        return here.recv()
+    except EOFError:
+        child.join()
+        why = "late" if child.exitcode in (-9, -24) else f"the process ended with {child.exitcode}"
+        return {"model": file.stem, "error": why, "seconds": round(time.monotonic() - start, 1)}
+    finally:
+        child.join()
+
+
+def _with_limits(there: Any, file: Path, asked: argparse.Namespace) -> None:
+    used = int(time.process_time())
+    resource.setrlimit(resource.RLIMIT_CPU, (used + asked.seconds, used + asked.seconds + 5))
+    resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
+    there.send(_one(file, Path(asked.references), not asked.no_gradients))
 
 
 def _one(file: Path, references: Path, gradients: bool) -> dict:
@@ -100,13 +112,6 @@ def _one(file: Path, references: Path, gradients: bool) -> dict:
 
 def _stages(file: Path, references: Path, gradients: bool, row: dict):
     """Reads, translates, compiles, runs, compares and differentiates; yields the name of each stage after it."""
-    import jax
-    import jax.numpy as jnp
-    import numpy as np
-
-    from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, simulate
-    from jaxonomy_dae.modelica import FlatComponent, load
-
     jax.config.update("jax_enable_x64", True)
     flat = load(file)
     yield "read"
@@ -133,7 +138,7 @@ def _stages(file: Path, references: Path, gradients: bool, row: dict):
         return
     errors = sorted(
         ((_deviation(np.asarray(ts), _signal(solution, system, name), data[:, 0], data[:, k]), name)
-         for k, name in enumerate(names) if name != "time"),
+         for k, name in enumerate(names) if k),
         reverse=True,
     )  # fmt: skip
     row["worst"] = errors[:3]
@@ -155,8 +160,6 @@ def _stages(file: Path, references: Path, gradients: bool, row: dict):
 
 def _reference(stem: str, references: Path):
     """(names of the signals, trajectories with the time in the first column)."""
-    import numpy as np
-
     folder = references.joinpath(*stem.split("."))
     file = folder / f"{folder.name}.csv"
     if not file.exists():
@@ -166,14 +169,12 @@ def _reference(stem: str, references: Path):
     data = np.loadtxt(file, delimiter=",", skiprows=1, ndmin=2)
     listed = folder / "comparisonSignals.txt"
     wanted = {s.strip() for s in listed.read_text(encoding="utf-8").splitlines()} if listed.exists() else set(names)
-    places = [0] + [k for k, n in enumerate(names) if n in wanted and n != "time"]
+    places = [0] + [k for k, n in enumerate(names) if n in wanted and n.lower() != "time"]
     return [names[k] for k in places], data[:, places]
 
 
 def _signal(solution, system, name: str):
     """The trajectory of a signal; a parameter is constant."""
-    import numpy as np
-
     full = f"m.{name}"
     if full in system.parameters.names and full not in solution:
         return np.full(len(solution.ts), float(system.parameters[full]))
@@ -182,8 +183,6 @@ def _signal(solution, system, name: str):
 
 def _deviation(ts, ours, times, theirs) -> float:
     """The largest deviation from the tube about a reference, relative to the reference's range."""
-    import numpy as np
-
     if not np.isfinite(ours).all():
         return float("inf")
     size = max(float(np.ptp(theirs)), 1e-3 * float(np.abs(theirs).max()), 1e-12)
@@ -198,11 +197,6 @@ def _deviation(ts, ours, times, theirs) -> float:
 def _gradient(system, names: list[str], fixed: list[str], begin: float, end: float, rtol: float) -> float | None:
     """The relative error of the derivatives of the sum of squares of the signals at the end, by up to two parameters or
     fixed starts: reverse mode against central differences. None if there is none of these."""
-    import jax
-    import jax.numpy as jnp
-
-    from jaxonomy_dae import simulate
-
     values = system.parameters
     by = [n for n in values.names if float(values[n]) and not n.startswith("m.:")][:2]
     starts = fixed[: 2 - len(by)]

@@ -14,7 +14,7 @@ Sides = tuple[Value, Value]
 def write_equation(scope: Scope, s: Statement) -> None:
     """Adds the equations of one statement to the component."""
     if isinstance(s, Equality):
-        for sides in _equal(scope, s.left, s.right):
+        for sides in equal(scope, s.left, s.right):
             _add(scope, sides)
     elif isinstance(s, Branches):
         for sides in side_by_side(scope, s):
@@ -23,12 +23,12 @@ def write_equation(scope: Scope, s: Statement) -> None:
         raise ModelError("a loop of equations is not read")
 
 
-def _equal(scope: Scope, left: Expression, right: Expression) -> list[Sides]:
+def equal(scope: Scope, left: Expression, right: Expression) -> list[Sides]:
     if isinstance(right, OfAlgorithm):
         return pairs(scope.evaluate(left), scope.algorithm(right.number)[right.name])
-    values = scope.evaluate(right)
     if not isinstance(left, Several):
-        return pairs(scope.evaluate(left), values)
+        return pairs(scope.evaluate(left), scope.evaluate(right))
+    values = scope.interpreter.results(right)
     given = [(e, v) for e, v in zip(left.entries, values, strict=False) if e is not None]
     return [pair for e, v in given for pair in pairs(scope.evaluate(e), v)]
 
@@ -49,7 +49,7 @@ def _sides(scope: Scope, statements: tuple[Statement, ...]) -> list[Sides]:
     out: list[Sides] = []
     for s in statements:
         if isinstance(s, Equality):
-            out += _equal(scope, s.left, s.right)
+            out += equal(scope, s.left, s.right)
         elif isinstance(s, Branches) and s.kind == "if":
             out += side_by_side(scope, s)
         elif not isinstance(s, Effect):

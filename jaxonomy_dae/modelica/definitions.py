@@ -1,11 +1,26 @@
 """Which statement of a flat model determines which Boolean, Integer or enumeration variable."""
 
 import dataclasses
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 from ..errors import ModelError
-from .tree import Assignment, Branches, Call, Class, Effect, Equality, Expression, Loop, Reference, Several, Statement
+from .tree import (
+    Assignment,
+    Branches,
+    Call,
+    Choice,
+    Class,
+    Effect,
+    Equality,
+    Expression,
+    Loop,
+    Reference,
+    Several,
+    Statement,
+    Truth,
+)
 
 
 class OfAlgorithm(NamedTuple):
@@ -41,7 +56,7 @@ class DiscreteDefinitions:
 def find_definitions(model: Class, is_discrete: Callable[[str], bool]) -> DiscreteDefinitions:
     """Splits the statements of a model."""
     whens = [s for s in model.equations if isinstance(s, Branches) and s.kind == "when"]
-    others = [s for s in model.equations if s not in whens] if whens else list(model.equations)
+    others = _with_choices((s for s in model.equations if s not in whens) if whens else model.equations, is_discrete)
     algorithms = []
     for section in model.algorithms:
         inside = [s for s in section if isinstance(s, Branches) and s.kind == "when"]
@@ -49,7 +64,7 @@ def find_definitions(model: Class, is_discrete: Callable[[str], bool]) -> Discre
         whens += inside
         if any(not isinstance(s, Effect) for s in rest):
             algorithms.append(rest)
-    by_when = {name for s in whens for _, body in s.branches for name in assigned_in(body)}
+    by_when = set(with_entries((name for s in whens for _, body in s.branches for name in assigned_in(body)), model))
     bindings = [
         Equality(Reference((d.name,), ((),)), d.value, d.line)
         for d in model.declarations
@@ -62,19 +77,47 @@ def find_definitions(model: Class, is_discrete: Callable[[str], bool]) -> Discre
     equations += left
     assigned = []
     for k, section in enumerate(algorithms):
-        names = list(dict.fromkeys(assigned_in(section)))
+        names = with_entries(assigned_in(section), model)
         assigned.append(names)
         for name in names:
             if is_discrete(name):
                 of[name] = k
             else:
                 equations.append(Equality(Reference((name,), ((),)), OfAlgorithm(k, name), section[0].line))  # type: ignore[arg-type]
-    read_before = {name for s in [*model.equations, *model.algorithms, *bindings] for name in _read_before(s)}
+    before = (name for s in [*model.equations, *model.algorithms, *bindings] for name in _read_before(s))
+    read_before = set(with_entries(before, model))
     followed = [name for name in of if name in read_before and name not in by_when]
     return DiscreteDefinitions(
         of, by_when | set(followed), followed, equations, whens,
         [*model.initial_equations, *(s for a in model.initial_algorithms for s in a)], algorithms, assigned,
     )  # fmt: skip
+
+
+def _with_choices(statements: Iterable[Statement], is_discrete: Callable[[str], bool]) -> list[Statement]:
+    """The statements with an equation for each discrete variable that all branches of an `if` determine."""
+    out: list[Statement] = []
+    for s in statements:
+        if not (isinstance(s, Branches) and s.kind == "if"):
+            out.append(s)
+            continue
+        conditions = [c for c, _ in s.branches]
+        bodies = [_with_choices(body, is_discrete) for _, body in s.branches]
+        values = [
+            {e.left.path: e.right for e in body
+             if isinstance(e, Equality) and isinstance(e.left, Reference) and is_discrete(e.left.path)}
+            for body in bodies
+        ]  # fmt: skip
+        names = [n for n in values[0] if all(n in v for v in values)] if conditions[-1] == Truth(True) else []
+        for n in names:
+            branches = tuple((c, v[n]) for c, v in zip(conditions[:-1], values, strict=False))
+            out.append(Equality(Reference((n,), ((),)), Choice(branches, values[-1][n]), s.line))
+        rest = tuple(
+            (c, tuple(e for e in body if not (isinstance(e, Equality) and getattr(e.left, "path", None) in names)))
+            for c, body in zip(conditions, bodies, strict=True)
+        )
+        if any(body for _, body in rest):
+            out.append(s._replace(branches=rest))
+    return out
 
 
 def _definable(s: Statement, is_discrete: Callable[[str], bool], by_when: set[str]) -> list[tuple[str, Expression]]:
@@ -136,10 +179,22 @@ def assigned_in(statements: tuple[Statement, ...]) -> Iterator[str]:
 
 
 def _name(e: Reference) -> str:
-    if not any(e.subscripts):
-        return e.path
-    numbers = [getattr(x, "value", "?") for x in e.subscripts[0]]
-    return f"{e.parts[0]}[{','.join(map(str, numbers))}]"
+    """The name of what a reference stands for; a subscript that is not a number is '?' in it."""
+    numbers = [",".join(str(getattr(x, "value", "?")) for x in s) for s in e.subscripts]
+    return ".".join(f"{part}[{n}]" if n else part for part, n in zip(e.parts, numbers, strict=True))
+
+
+def with_entries(names: Iterable[str], model: Class) -> list[str]:
+    """The names, with those of all entries for an array and where a name has a '?'."""
+    out: dict[str, None] = {}
+    declared = {d.name for d in model.declarations}
+    for name in names:
+        if name in declared:
+            out[name] = None
+            continue
+        entry = re.compile(re.escape(name).replace(r"\?", r"\d+") + r"(\[[\d,]+\])?")
+        out.update({d.name: None for d in model.declarations if entry.fullmatch(d.name)})
+    return list(out)
 
 
 def _read_before(statement: Any) -> Iterator[str]:

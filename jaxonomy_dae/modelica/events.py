@@ -6,6 +6,8 @@ the continuous variables of their loop solved for in between: the event iteratio
 3.6, Appendix B.
 """
 
+import collections
+import functools
 from collections.abc import Iterator
 from typing import Any
 
@@ -15,7 +17,8 @@ from ..errors import ModelError
 from ..modeling.event_flags import EventFlag
 from ..modeling.events import Sampled, assign, pre, reinit, terminate
 from ..modeling.symbols import DiscreteSymbol, VariableSymbol
-from .scope import Scope
+from .definitions import assigned_in, with_entries
+from .scope import Scope, before
 from .tree import (
     Array,
     Assignment,
@@ -25,6 +28,7 @@ from .tree import (
     Effect,
     Equality,
     Expression,
+    Loop,
     Reference,
     Several,
     Statement,
@@ -83,12 +87,23 @@ def _event(scope: Scope, condition: Expression, body: tuple[Statement, ...], ear
         holds = both(holds, v)
     if holds is False or (holds is True and not clocks):
         return None  # it never becomes true
+    if clocks:  # at a tick, pre(m) is the value before it
+        holds = functools.reduce(both, [*_before_tick(scope, parts), *(negated(e) for e in earlier)], True)
     at_start = any(isinstance(p, Call) and p.function == "initial" for p in parts)
     actions = _actions(scope, body, holds if clocks else True)
     if actions:
         happens = clocks[0] if clocks else scope.kept.in_events(holds)
         scope.component.when(happens, *actions, at_start=at_start)
     return None if clocks else holds
+
+
+def _before_tick(scope: Scope, parts: list[Expression]) -> list[Value]:
+    """The conditions beside a clock, at its tick."""
+    scope.in_action = True
+    try:
+        return [v for v in (scope.evaluate(_inner(p)) for p in parts) if not isinstance(v, Sampled)]
+    finally:
+        scope.in_action = False
 
 
 def _actions(scope: Scope, body: tuple[Statement, ...], only_if: Value) -> list[Any]:
@@ -110,6 +125,9 @@ def _actions(scope: Scope, body: tuple[Statement, ...], only_if: Value) -> list[
 
 def _each_action(scope: Scope, body: tuple[Statement, ...]) -> Iterator[tuple[Any, Value]]:
     """Pairs (variable, new value); a text for `terminate`."""
+    if any(isinstance(s, Assignment | Loop) for s in body):
+        yield from _of_algorithm(scope, tuple(s for s in body if not isinstance(s, Effect)))
+        body = tuple(s for s in body if isinstance(s, Effect))
     for s in body:
         if isinstance(s, Effect):
             name, arguments = s.call.function, s.call.arguments
@@ -119,11 +137,31 @@ def _each_action(scope: Scope, body: tuple[Statement, ...]) -> Iterator[tuple[An
                 yield str(scope.evaluate(arguments[0])), None
         elif isinstance(s, Equality | Assignment):
             target, value = (s.left, s.right) if isinstance(s, Equality) else (s.target, s.value)
-            yield from _assigned(scope, target, scope.evaluate(value))
+            several = isinstance(target, Several)
+            found = scope.interpreter.results(value) if several else scope.evaluate(value)
+            yield from _assigned(scope, target, found)
         elif isinstance(s, Branches) and s.kind == "if":
             yield from _chosen_actions(scope, s)
         else:
             raise ModelError(f"a {type(s).__name__.lower()} in a when")
+
+
+def _of_algorithm(scope: Scope, body: tuple[Statement, ...]) -> Iterator[tuple[Any, Value]]:
+    """What statements assign one after another. A variable has its value before the event until it is assigned, and
+    what is assigned once and then read is read as the new value of the variable."""
+    model, stored = scope.flat.model, scope.definitions.stored
+    count = collections.Counter(n for s in body for n in with_entries(assigned_in((s,)), model))
+    local: dict[str, Value] = {n: before(scope.stored(n)) for n in count if n in stored}
+    found: dict[str, Value] = {}
+    for s in body:
+        scope.interpreter.execute((s,), local, lambda n: local[n] if n in local else scope.value(n))
+        for n in with_entries(assigned_in((s,)), model):
+            if n in stored:
+                found[n] = local[n]
+                if count[n] == 1:
+                    local[n] = scope.stored(n)
+    for n, value in found.items():
+        yield DiscreteSymbol(n), sympy.sympify(as_number(value))
 
 
 def _assigned(scope: Scope, target: Expression, value: Value) -> Iterator[tuple[Any, Value]]:

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from ..errors import ModelError
-from .read_base import read_base
+from .read_base import INSIDE, read_base, written
 from .tree import Class, Number, Reference
 
 PREFERRED = ("StateSelect.prefer", "StateSelect.always")
@@ -58,4 +58,27 @@ def load(source: str | Path) -> FlatModel:
     models = [c for c in outermost.classes if c.kind == "model"]
     if len(models) != 1:
         raise ModelError(f"a flat text holds one model; '{outermost.name}' holds {len(models)}")
-    return FlatModel(models[0], {c.name: c for c in outermost.classes if c is not models[0]})
+    classes = {c.name: c for c in outermost.classes if c is not models[0]}
+    return FlatModel(_with_numbers(models[0], literal_numbers(classes)), classes)
+
+
+def literal_numbers(classes: Mapping[str, Class]) -> dict[str, int]:
+    """The numbers of all literals of enumerations, by name."""
+    return {f"{c.name}.{literal}": k for c in classes.values() for k, literal in enumerate(c.literals, start=1)}
+
+
+def _with_numbers(model: Class, literals: Mapping[str, int]) -> Class:
+    """The model with numbers for literals in the names of entries, such as 'delay[\'Logic\'.\'one\']'."""
+    declarations = []
+    for d in model.declarations:
+        if INSIDE in d.name:
+            name = written(d.name)
+            inside = [
+                ",".join(str(literals[e.path]) if isinstance(e, Reference) else str(getattr(e, "value", "")) for e in s)
+                for s in name.subscripts
+            ]
+            d = d._replace(
+                name=".".join(f"{p}[{n}]" if n else p for p, n in zip(name.parts, inside, strict=True))
+            )  # fmt: skip
+        declarations.append(d)
+    return model._replace(declarations=tuple(declarations))

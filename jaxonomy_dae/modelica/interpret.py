@@ -13,6 +13,7 @@ import sympy
 from ..errors import ModelError, nearest
 from ..modeling.symbols import der
 from .builtin import FUNCTIONS, filled, matrix_product
+from .flat_model import literal_numbers
 from .operations import ARITHMETIC, RELATIONS, of_complex_numbers
 from .tree import (
     Array,
@@ -43,6 +44,7 @@ from .tree import (
 )
 from .values import (
     Record,
+    Results,
     Value,
     both,
     chosen,
@@ -64,6 +66,7 @@ class Interpreter:
     - `names`: what a name of the model means.
     - `special`: calls that only the model can answer, such as `pre`, by name: from the arguments as written.
     - `externals`: functions in place of those that are written in C, by name.
+    - `entries`: the places of the entries that are declared one by one, by the name of their array.
     """
 
     def __init__(
@@ -72,12 +75,11 @@ class Interpreter:
         names: Names,
         special: Mapping[str, Callable[..., Value]],
         externals: Mapping[str, Callable[..., Value]],
+        entries: Mapping[str, list[tuple[int, ...]]] | None = None,
     ):
-        self.classes, self.names = classes, names
+        self.classes, self.names, self.entries = classes, names, entries or {}
         self.special, self.externals = special, externals
-        self.literals = {
-            f"{c.name}.{literal}": k for c in classes.values() for k, literal in enumerate(c.literals, start=1)
-        }
+        self.literals = literal_numbers(classes)
         self.quiet = False  # True inside of noEvent, smooth and functions: conditions there are no events
         self.quieted: set[Any] = set()  # conditions that stood in noEvent
         self.depth = 0
@@ -85,7 +87,12 @@ class Interpreter:
     # --- expressions -------------------------------------------------------------------------------------------------
 
     def evaluate(self, e: Expression, names: Names | None = None) -> Value:
-        """The value of an expression, with `names` in place of the model's."""
+        """The value of an expression, with `names` in place of the model's; the first result of a function."""
+        value = self.results(e, names)
+        return value[0] if isinstance(value, Results) else value
+
+    def results(self, e: Expression, names: Names | None = None) -> Value:
+        """As `evaluate`, but all results of a function."""
         return _EVALUATED[type(e)](self, e, names or self.names)
 
     def _reference(self, e: Reference, names: Names) -> Value:
@@ -101,7 +108,7 @@ class Interpreter:
 
     def _by_parts(self, e: Reference, names: Names) -> Value:
         """A reference into an array or record: the longest beginning that has a name, then fields and subscripts."""
-        if len(e.parts) == 1 and e.subscripts[0]:
+        if any(e.subscripts):
             written = self._entry_name(e, names)
             if written is not None:
                 try:
@@ -126,14 +133,17 @@ class Interpreter:
         return (self._entry_name(e, self.names) if any(e.subscripts) else None) or e.path
 
     def _entry_name(self, e: Reference, names: Names) -> str | None:
-        """The name of an entry that is declared by itself, as 'x[2]'."""
-        try:
-            numbers = [self.constant(s, names) for s in e.subscripts[0] if not isinstance(s, Whole | End)]
-        except ModelError:
-            return None
-        if len(numbers) != len(e.subscripts[0]) or not all(isinstance(n, int) for n in numbers):
-            return None
-        return f"{e.parts[0]}[{','.join(map(str, numbers))}]"
+        """The name of an entry that is declared by itself, as 'x[2].y'."""
+        out = []
+        for part, subscripts in zip(e.parts, e.subscripts, strict=True):
+            try:
+                numbers = [self.constant(s, names) for s in subscripts if not isinstance(s, Whole | End)]
+            except (ModelError, KeyError):
+                return None
+            if len(numbers) != len(subscripts) or not all(isinstance(n, int) for n in numbers):
+                return None
+            out.append(f"{part}[{','.join(map(str, numbers))}]" if numbers else part)
+        return ".".join(out)
 
     def _entry(self, value: Value, subscripts: tuple[Expression, ...], names: Names) -> Value:
         if not subscripts:
@@ -265,11 +275,12 @@ class Interpreter:
 
     def call(self, name: str, arguments: list[Value], named: dict[str, Value]) -> Value:
         """The results of a function: one value, or a list of several."""
-        if name in self.externals:
-            return self.externals[name](*arguments, **named)
+        last = name.rpartition(".")[2]
+        for known in (name, last):
+            if known in self.externals:
+                return self.externals[known](*arguments, **named)
         function = self.classes.get(name)
         if function is None or function.external is not None:
-            last = name.rpartition(".")[2]
             if name.startswith("Modelica.Math.") and last in FUNCTIONS:
                 return FUNCTIONS[last](*arguments, **named)
         if function is None:
@@ -315,7 +326,7 @@ class Interpreter:
         finally:
             self.quiet, self.depth = before, self.depth - 1
         outputs = [local[d.name] for d in function.declarations if "output" in d.prefixes]
-        return outputs[0] if len(outputs) == 1 else outputs
+        return outputs[0] if len(outputs) == 1 else Results(outputs)
 
     def _unset(self, d: Declaration, names: Names) -> Value:
         """What a variable of a function holds before it is assigned."""
@@ -355,7 +366,8 @@ class Interpreter:
     def _statement(self, s: Statement, local: dict[str, Value], names: Names) -> None:
         if isinstance(s, Assignment | Equality):
             target, value = (s.target, s.value) if isinstance(s, Assignment) else (s.left, s.right)
-            self._assign(target, self.evaluate(value, names), local, names)
+            found = (self.results if isinstance(target, Several) else self.evaluate)(value, names)
+            self._assign(target, found, local, names)
         elif isinstance(s, Branches):
             self._branches(s, local, names)
         elif isinstance(s, Loop):
@@ -379,19 +391,26 @@ class Interpreter:
         if not isinstance(target, Reference):
             raise ModelError("only variables can be assigned")
         if len(target.parts) == 1 and not target.subscripts[0]:
-            local[target.parts[0]] = _copied(value)
+            self._assign_whole(target.parts[0], _copied(value), local)
             return
-        if len(target.parts) == 1:
-            entry = self._entry_name(target, names)
-            if entry in local:
-                local[entry] = value
-                return
-        if target.path in local:
-            local[target.path] = value
+        entry = self._entry_name(target, names)
+        if entry is not None and (entry in local or target.parts[0] not in local):
+            local[entry] = value
             return
         local[target.parts[0]] = self._changed(
             local.get(target.parts[0]), target.subscripts[0], target.parts[1:], target.subscripts[1:], value, names
         )
+
+    def _assign_whole(self, name: str, value: Value, local: dict[str, Value]) -> None:
+        """Assigns to a variable; one by one to the entries of an array of the model, which are declared one by one."""
+        places = self.entries.get(name, ()) if name not in local and isinstance(value, list) else ()
+        if not places:
+            local[name] = value
+        for place in places:
+            entry = value
+            for k in place:
+                entry = entry[k - 1]
+            local[f"{name}[{','.join(map(str, place))}]"] = entry
 
     def _changed(self, old: Value, subscripts: tuple, parts: tuple, rest: tuple, value: Value, names: Names) -> Value:
         """An array or record with one place changed."""

@@ -47,6 +47,8 @@ _LEVEL = {  # binary operators, and how strongly they bind
     "+": 5, "-": 5, ".+": 5, ".-": 5, "*": 6, "/": 6, ".*": 6, "./": 6, "^": 7, ".^": 7,
 }  # fmt: skip
 _NOT, _SUM, _POWER = 3, 5, 7
+INSIDE = "[\\'"  # a quoted name with names in its subscripts
+_PART = re.compile(r"([^\[\]]+)(?:\[((?:'(?:[^'\\]|\\.)*'|[^\]'])*)\])?\.?")
 _PREFIXES = frozenset(
     "parameter constant discrete input output final flow stream inner outer each protected public".split()
 )
@@ -63,6 +65,16 @@ def read_base(text: str) -> Class:
     - `ModelError` for what is not Base Modelica, with line and column.
     """
     return _Reader(text).file()
+
+
+def written(name: str) -> Reference:
+    """A quoted name with subscripts inside, such as 'x[\\'i\\'].y', as the reference x[i].y."""
+    parts: list[str] = []
+    subscripts: list[tuple[Expression, ...]] = []
+    for part, inside in _PART.findall(re.sub(r"\\(.)", r"\1", name)):
+        parts.append(part)
+        subscripts.append(_Reader(f"[{inside}]")._subscripts() if inside else ())
+    return Reference(tuple(parts), tuple(subscripts))
 
 
 class _Reader:
@@ -223,10 +235,19 @@ class _Reader:
         return Several(tuple(entries))
 
     def _reference(self) -> Expression:
-        parts, subscripts = [self.name()], [self._subscripts()]
-        while self.take("."):
-            parts.append(self.name())
-            subscripts.append(self._subscripts())
+        parts: list[str] = []
+        subscripts: list[tuple[Expression, ...]] = []
+        while not parts or self.take("."):
+            name = self.name()
+            if INSIDE in name:
+                within = written(name)
+                parts.extend(within.parts)
+                subscripts.extend(within.subscripts)
+                if self.at("["):
+                    subscripts[-1] += self._subscripts()
+            else:
+                parts.append(name)
+                subscripts.append(self._subscripts())
         if self.take("("):
             arguments, named = self._arguments(")")
             return self._parts_of(Call(".".join(parts), arguments, named))

@@ -18,6 +18,7 @@ from .definitions import assigned_in, find_definitions
 from .flat_model import FlatModel
 from .interpret import Interpreter
 from .kept_relations import KeptRelations
+from .left_out import LEFT_OUT
 from .tables import EXTERNALS
 from .tree import Assignment, Declaration, Equality, Expression, Reference, Truth
 from .values import Record, Value, as_number, both, is_condition, negated, plain
@@ -48,7 +49,7 @@ class Scope:
             "pre": self._pre, "edge": self._edge, "change": self._change, "initial": self._initial,
             "terminal": lambda: False, "sample": self._sample, "delay": _delay,
         }  # fmt: skip
-        self.interpreter = Interpreter(flat.classes, self.value, special, EXTERNALS)
+        self.interpreter = Interpreter(flat.classes, self.value, special, LEFT_OUT | EXTERNALS, self.entries)
         self.definitions = find_definitions(flat.model, self.is_discrete)
         self.kept = KeptRelations(component)
         self.in_action = False
@@ -168,7 +169,7 @@ class Scope:
         """What a Boolean or Integer variable is, in terms of what it depends on."""
         found = self.definitions.of.get(d.name)
         if found is None:  # an input of the model that nothing drives
-            start = self._start(d.modifiers.get("start")) or 0
+            start = self._start(d.modifiers.get("start")) or self._least(d.type)
             return bool(start) if self.kind(d.type) == "Boolean" else int(start)
         return self.defined(d.name, found)
 
@@ -237,9 +238,16 @@ class Scope:
 
     def _declare_stored(self, d: Declaration) -> Value:
         start = self._start(d.modifiers.get("start"))
-        start = 0 if start is None else as_number(start)
+        start = self._least(d.type) if start is None else as_number(start)
         self.component.discrete(d.name, start=start)
         return self.stored(d.name)
+
+    def _least(self, type_name: str) -> int:
+        """What a discrete variable starts at if nothing says so: an enumeration at its first literal, others at 0."""
+        c = self.flat.classes.get(type_name)
+        if c is not None and c.base is not None:
+            return self._least(c.base.type)
+        return 1 if c is not None and c.literals else 0
 
     def stored(self, name: str) -> Value:
         symbol = DiscreteSymbol(name)

@@ -7,9 +7,9 @@ import sympy
 
 from ..errors import ModelError
 from ..modeling.symbols import DiscreteSymbol, ParameterSymbol, VariableSymbol
-from .continuous import pairs, side_by_side
+from .continuous import equal, side_by_side
 from .scope import Scope
-from .tree import Assignment, Branches, Call, Equality, Statement
+from .tree import Assignment, Branches, Call, Equality, Reference, Statement
 from .values import Value, as_number, is_condition
 
 
@@ -21,7 +21,9 @@ def write_initial_equation(scope: Scope, s: Statement) -> None:
         a, b = (s.left, s.right) if isinstance(s, Equality) else (s.target, s.value)
         if isinstance(a, Call) and a.function == "pre":  # before the first event it is what it starts at
             a = a.arguments[0]
-        found = pairs(scope.evaluate(a), scope.evaluate(b))
+            if isinstance(a, Reference) and scope.interpreter.name_of(a) not in scope.definitions.stored:
+                return  # nothing reads it
+        found = equal(scope, a, b)
     else:
         return
     for left, right in found:

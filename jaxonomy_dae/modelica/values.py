@@ -19,6 +19,10 @@ class Record(dict):
     """The values of a record's fields, in the order of their declaration."""
 
 
+class Results(list):
+    """The results of a function that has several."""
+
+
 def is_condition(value: Value) -> bool:
     return isinstance(value, bool | Boolean) and not isinstance(value, sympy.Symbol)
 

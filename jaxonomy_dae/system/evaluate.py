@@ -41,7 +41,8 @@ from ..tolerances import NOISE, ZERO_WITHIN, solved, spacing
 
 UNROLLED_REPETITIONS = 4  # of a loop, written out in each of its iterations
 LONG_SUM = 16  # linear equations with more terms are one gather and one sum
-NEWTON_STEPS = 60  # to the root of a nonlinear block, at most; a double root takes 27
+NEWTON_STEPS = 120  # to the root of a nonlinear block, at most, halvings included; a double root takes 27
+SURE = 1e-6  # residuals so small, relative to their terms at the start, need not fall: rounding has a part in them
 ROUGH = 1e-2  # residual of an equation relative to its terms, where one Newton correction is made
 
 
@@ -171,13 +172,20 @@ class Evaluation(AbstractEvaluation):
             still, tolerated = self.frozen(), solved(self.dtype)
             z, holds = find_root(
                 lambda z: still._holds(planned, still._follow(planned, z), tolerated),
-                functools.partial(still._corrected, planned),
+                lambda z: newton_step(functools.partial(still._residuals, planned), z),
                 functools.partial(self._corrected, planned),
+                still._sizes_of_rows(planned, z),
                 z,
             )
             local = self._follow(planned, z)
         nan = jnp.full(shape, jnp.nan, self.dtype)
         return [jax.lax.select(holds, u, nan) for u in local]
+
+    def _sizes_of_rows(self, planned: PlannedStep, z: list[Any]) -> list[Any]:
+        """How large the terms of the residual equations are."""
+        local = self._follow(planned, z)
+        equations = [planned.equations[e] for e in planned.step.tearing.residuals]
+        return [self._filled(self._magnitude(equation, local), z[0].shape) for equation in equations]
 
     def _corrected(self, planned: PlannedStep, z: list[Any]) -> list[Any]:
         """The tearing variables after one Newton step."""
@@ -315,18 +323,32 @@ class Evaluation(AbstractEvaluation):
             still, tolerated = self.frozen(), solved(self.dtype)
             (u,), holds = find_root(
                 lambda z: still._whole_holds(planned, z[0], tolerated),
-                lambda z: [still._whole_corrected(planned, z[0])],
+                lambda z: still._whole_step(planned, z),
                 lambda z: [self._whole_corrected(planned, z[0])],
+                [still._whole_sizes(planned, u)],
                 [u],
             )
         return jnp.where(holds, u, jnp.nan)
 
     def _whole_corrected(self, planned: PlannedSparse, u: Any) -> Any:
         """The unknowns of large blocks after one Newton step, which is exact if the equations are affine."""
+        return u + self._whole_step(planned, [u])[1][0]
+
+    def _whole_step(self, planned: PlannedSparse, z: list[Any]) -> tuple[list[Any], list[Any]]:
+        """(The residuals, a Newton step) of large blocks."""
+        (u,) = z
         equations = self._whole(planned, u)
         residual = jnp.concatenate([r for r, _ in equations])
         matrix, checked = self._entries(planned, equations), planned.guess is None
-        return u - solve_whole(planned.pattern, matrix, residual, checked=checked, solver=planned.linear_solver)
+        step = solve_whole(planned.pattern, matrix, residual, checked=checked, solver=planned.linear_solver)
+        return [residual], [-step]
+
+    def _whole_sizes(self, planned: PlannedSparse, u: Any) -> Any:
+        """How large the terms of the equations of large blocks are."""
+        there = self._beside(u)
+        return jnp.concatenate(
+            [self._filled(there._magnitude(e, []), (len(e.equation.equation),)) for e in planned.equations]
+        )
 
     def _entries(self, planned: PlannedSparse, equations: list[tuple[Any, Sequence[Any]]]) -> Any:
         """The entries of the matrix of large blocks, from the residuals and partial derivatives of their equations."""
@@ -455,27 +477,43 @@ def _is_nothing(value: Any) -> bool:
 
 def find_root(
     holds: Callable[[list[Any]], Any],
-    corrected: Callable[[list[Any]], list[Any]],
+    stepped: Callable[[list[Any]], tuple[list[Any], list[Any]]],
     differentiable: Callable[[list[Any]], list[Any]],
+    sizes: list[Any],
     z: list[Any],
 ) -> tuple[list[Any], Any]:
     """Newton's method from z until all `holds`, one verdict for each of a batch of problems; and the verdicts.
+
+    `stepped` gives the residuals and the step. A step is halved until the largest residual falls, relative to the
+    `sizes` of their terms at the start: whole steps go back and forth between the branches of a law with a kink.
 
     The search is not differentiated. Two more steps of the `differentiable` correction follow: by the implicit function
     theorem the first carries first derivatives and the second one second derivatives.
     """
 
     def going(carry):
-        _, found, count = carry
+        *_, found, count = carry
         return ~jnp.all(found) & (count < NEWTON_STEPS)
 
     def body(carry):
-        z, found, count = carry
-        z = [jnp.where(found, a, b) for a, b in zip(z, corrected(z), strict=True)]
-        return z, holds(z), count + 1
+        trial, z, step, part, least, found, count = carry
+        residuals, new_step = stepped(trial)
+        off = [jnp.abs(r) / jnp.where(s > 0, s, 1) for r, s in zip(residuals, sizes, strict=True)]
+        largest = functools.reduce(jnp.maximum, off)
+        largest = jnp.max(largest) if jnp.ndim(found) < jnp.ndim(largest) else largest
+        falls = (largest <= (1 - part / 4) * least) | (least <= SURE)
+        part = jnp.where(falls, jnp.minimum(2 * part, 1), part / 2)
+        least = jnp.where(falls, largest, least)
+        z = [jnp.where(falls, a, b) for a, b in zip(trial, z, strict=True)]
+        step = [jnp.where(falls, a, b) for a, b in zip(new_step, step, strict=True)]
+        trial = [jnp.where(found, t, a + part * d) for t, a, d in zip(trial, z, step, strict=True)]
+        return trial, z, step, part, least, holds(trial), count + 1
 
-    z = jax.lax.stop_gradient(z)
-    z, found, _ = jax.lax.while_loop(going, body, (z, holds(z), 0))
+    z, sizes = jax.lax.stop_gradient((z, sizes))
+    found = holds(z)
+    one = jnp.ones(jnp.shape(found), z[0].dtype)
+    begin = z, z, [jnp.zeros_like(a) for a in z], one, jnp.inf * one, found, 0
+    z, *_, found, _ = jax.lax.while_loop(going, body, begin)
     z = jax.lax.stop_gradient(z)
     for _ in range(2):
         z = differentiable(z)
@@ -483,20 +521,25 @@ def find_root(
 
 
 def newton(residuals: Callable[[list[Any]], list[Any]], z: list[Any]) -> list[Any]:
-    """One Newton step for r(z) = 0, lists of arrays of one shape (a batch of problems); exact if r is affine."""
+    """z after a Newton step for r(z) = 0, lists of arrays of one shape (a batch of problems); exact if r is affine."""
+    return [a + d for a, d in zip(z, newton_step(residuals, z)[1], strict=True)]
+
+
+def newton_step(residuals: Callable[[list[Any]], list[Any]], z: list[Any]) -> tuple[list[Any], list[Any]]:
+    """(r(z), a Newton step)."""
     m = len(z)
     if m <= UNROLLED:
         value, push = jax.linearize(residuals, z)
         columns = [push([jnp.ones_like(a) if j == k else jnp.zeros_like(a) for j, a in enumerate(z)]) for k in range(m)]
         step = solve([[column[r] for column in columns] for r in range(m)], value)
-        return [a - b for a, b in zip(z, step, strict=True)]
+        return value, [-d for d in step]
     stacked = jnp.stack(z)
     value, push = jax.linearize(lambda v: jnp.stack(residuals(list(v))), stacked)
     basis = jnp.eye(m, dtype=stacked.dtype).reshape(m, m, *([1] * z[0].ndim))
     columns = jax.vmap(push)(jnp.broadcast_to(basis, (m, *stacked.shape)))  # (unknown, equation, *batch)
     matrix = jnp.moveaxis(columns, (1, 0), (-2, -1))
     step = solve_dense(matrix, jnp.moveaxis(value, 0, -1))
-    return list(stacked - jnp.moveaxis(step, -1, 0))
+    return list(value), list(-jnp.moveaxis(step, -1, 0))
 
 
 def scaled_by(factor: Any, value: Any, dtype) -> Any:

@@ -11,8 +11,10 @@ from jaxonomy_dae import EqnEnv, ModelError
 from jaxonomy_dae.expressions.smooth import Smooth
 from jaxonomy_dae.modelica import FlatComponent, load, read_base
 from jaxonomy_dae.modelica.interpret import Interpreter
+from jaxonomy_dae.modelica.left_out import LEFT_OUT, time_table_coefficients
 from jaxonomy_dae.modelica.tables import Table
 from jaxonomy_dae.modelica.tree import Binary, Call, Number, Reference, Unary
+from jaxonomy_dae.modeling.symbols import VariableSymbol
 
 
 def value_of(text: str, **names):
@@ -164,6 +166,56 @@ def test_return_and_break_under_a_condition():
             assert found(value) == carried.call(name, [entries, value], {}) == expected
 
 
+def test_functions_that_texts_leave_out():
+    """Against NumPy: norms, a rotation and its angle, the phases of windings, a filter's cut-off."""
+    frames = "Modelica.Mechanics.MultiBody.Frames"
+    v = [3.0, -4.0, 12.0]
+    assert LEFT_OUT["Modelica.Math.Vectors.length"](v) == 13.0
+    assert LEFT_OUT["Modelica.Math.Vectors.normalize"](v) == pytest.approx([x / 13 for x in v])
+    axis = [x / 13 for x in v]
+    turned = LEFT_OUT[f"{frames}.TransformationMatrices.planarRotation"](axis, 0.7)
+    np.testing.assert_allclose(np.array(turned) @ np.array(turned).T, np.eye(3), atol=1e-14)
+    np.testing.assert_allclose(np.array(turned) @ axis, axis, atol=1e-14)
+    x = [1.0, 2.0, -0.5]
+    after = LEFT_OUT[f"{frames}.TransformationMatrices.resolve2"](turned, x)
+    assert LEFT_OUT[f"{frames}.planarRotationAngle"](axis, x, after) == pytest.approx(0.7)
+    assert LEFT_OUT[f"{frames}.TransformationMatrices.resolve1"](turned, after) == pytest.approx(x)
+    orientation = LEFT_OUT["Modelica.Electrical.Polyphase.Functions.symmetricOrientation"]
+    assert orientation(3) == pytest.approx([0, 2 * math.pi / 3, 4 * math.pi / 3])
+    assert orientation(6) == pytest.approx([*orientation(3), *(a - math.pi / 6 for a in orientation(3))])
+
+
+def test_a_time_table_is_a_line_until_its_next_event():
+    """Its rows jump at t = 2; a line until the next row, and the last one goes on."""
+    rows = [[0.0, 0.0], [1.0, 2.0], [2.0, 3.0], [2.0, 5.0], [4.0, 1.0]]
+    t = sympy.Symbol("t", real=True)
+    found = time_table_coefficients(rows, 0.5, 0.0, t, 1, 1e-14, 1.0)
+    functions = [sympy.lambdify(t, sympy.sympify(e).replace(Smooth, lambda e: e), "math") for e in found]
+    for at, value, event in ((1.5, 1.5, 2.0), (2.5, 3.0, 3.0), (3.0, 5.5, 3.0), (6.0, -0.5, 6.0)):  # none from t = 3
+        a, b, next_event, _ = (f(at) for f in functions)
+        assert a * at + b == pytest.approx(value) and next_event == pytest.approx(event)
+
+
+def test_quoted_names_with_subscripts_inside():
+    """OpenModelica writes x[i].y in a loop as one quoted name, and literals in the names of entries."""
+    text = r"""package p
+      type 'L' = enumeration('\'U\'', 'one');
+      model m
+        constant Integer 't[\'L\'.\'\\\'U\\\'\']' = 5;
+        constant Integer 't[\'L\'.\'one\']' = 7;
+        Real 'x[1].y'; Real 'x[2].y'; Real 'z';
+      equation
+        'z' = 't[1]' + 't[2]' + time;
+      algorithm
+        for 'i' in 1:2 loop 'x[\'i\'].y' := 'i' * time; end for;
+      end m;
+    end p;"""
+    component = built(text)
+    time = component.ev.t
+    x1, x2, z = map(VariableSymbol, ("x[1].y", "x[2].y", "z"))
+    assert {e.subs({x1: time, x2: 2 * time, z: 12 + time}) for e in component.equations} == {0}
+
+
 # --- tables -----------------------------------------------------------------------------------------------------------
 
 
@@ -220,6 +272,41 @@ def test_starts_of_discrete_variables_are_computed():
       equation when time >= (pre(n) + 1) * 0.1 then n = pre(n) + 1; t0 = time; end when; x = time - t0; end m;"""
     parameters = built(text).parameters
     assert parameters["n"].value == 3 and parameters["t0"].value == pytest.approx(-0.05)
+
+
+def test_truths_that_each_branch_of_an_if_determines():
+    text = """model m Boolean b; Real x; equation
+      if time < 1.0 then b = true; x = 1.0; else b = time > 2.0; x = 2.0; end if; end m;"""
+    component = FlatComponent(EqnEnv(), "m", load(text), outputs=["b"])
+    assert {n for n in component.variables if n[0] != ":"} == {"x", "b"}
+
+
+def test_the_value_before_the_start_of_what_is_not_kept_is_nothing():
+    """`pre(b) = false` was compared with b itself, and said not to hold."""
+    text = """model m Boolean b; Real x; initial equation pre(b) = false; equation b = time >= 0.0;
+      x = if b then 1.0 else 0.0; end m;"""
+    assert "x" in built(text).variables
+
+
+def actions_of(text: str) -> dict[str, str]:
+    (event,) = built(text).events
+    return {str(a.target): str(a.value) for a in event.actions}
+
+
+def test_an_algorithm_in_a_when_goes_on_from_the_values_before_it():
+    """A variable that is read before it is assigned has its value before the event; a loop is carried out."""
+    text = """model m Integer n(start = 0); Integer k(start = 0); Integer j(start = 1); Real x;
+      equation x = n + k + j;
+      algorithm when time > 1.0 then n := n + 1; k := 2 * n; for i in 1:3 loop j := j * 2; end for; end when; end m;"""
+    found = actions_of(text)
+    assert found["n"] == "pre(n) + 1" and found["k"] == "2*n" and found["j"] == "8*pre(j)"
+
+
+def test_at_a_tick_pre_is_the_value_before_it():
+    """`pre(k) <> 0` beside a clock was the value that the tick gives to k: a circle."""
+    text = """model m Integer k(start = -1); Integer j(start = 2); Real x; equation x = k + j;
+      when pre(k) <> 0 and sample(0.0, 1.0) then k = pre(j); j = pre(j) - 1; end when; end m;"""
+    assert "Ne(pre(k), 0)" in actions_of(text)["k"]
 
 
 @pytest.mark.parametrize(

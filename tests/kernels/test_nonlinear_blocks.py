@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from problems import compiled
-from sympy import Abs, atan, exp
+from sympy import Abs, Max, Min, atan, exp
 
-from jaxonomy_dae import Component, EqnEnv, der
+from jaxonomy_dae import Component, EqnEnv, der, smooth
 from jaxonomy_dae.lowering import schedule
 from jaxonomy_dae.lowering.schedule import SparseStep
 
@@ -67,11 +67,27 @@ def evaluate(laws):
 
 
 def test_what_does_not_converge_is_not_a_number(evaluate):
-    """A cycle; no root, a minimum of |r|; the same from near the minimum; divergence. These came out as numbers: the
-    fourth iterate, whatever it was."""
-    found = evaluate([CUBIC, PARABOLA, PARABOLA, (0, 0, 1, 0, 0)], [0.0, 0.5, 0.5, 0.0], [0.0, 1.0, 1e-9, 3.0])
+    """A cycle; no root, a minimum of |r|; the same from near the minimum. These came out as numbers: the fourth
+    iterate, whatever it was."""
+    found = evaluate([CUBIC, PARABOLA, PARABOLA], [0.0, 0.5, 0.5], [0.0, 1.0, 1e-9])
     for value in found[:3]:
         assert np.isnan(value).all()
+
+
+def test_where_whole_steps_diverge_shorter_ones_find_the_root(evaluate):
+    """atan z = 0 from 3: whole steps of Newton's method go away from the root, farther each time."""
+    found = evaluate([(0, 0, 1, 0, 0)], [0.0], [3.0])
+    for value in (found[0], found[2]):
+        np.testing.assert_allclose(value, 0.0, atol=1e-12)
+
+
+def test_branches_of_a_law_with_kinks_are_left_again():
+    """z + clip(K z, −15, 15) = x = 10 from z = 20: whole steps go back and forth between −5 and 25, and a run whose
+    input jumps ended in a value that is not a number."""
+    gain = 15_000.0
+    system = implicit(lambda x, u, z, *_: [z + smooth(Max(-15, Min(15, gain * z))) - x], 2.0, 1.0)
+    found = jax.jit(lambda state: system.observe("m.z0", 0.0, state))(np.array([10.0, 20.0]))
+    np.testing.assert_allclose(found, 10 / (1 + gain), rtol=1e-12)
 
 
 def test_random_states_give_roots_or_nothing(evaluate):
