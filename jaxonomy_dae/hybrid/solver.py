@@ -11,6 +11,7 @@ from jax import lax
 from ..adjoint.appended import NOTED, apart, appended, together
 from ..adjoint.closure_conversion import any_member
 from ..aliases import Time
+from ..solvers.wrapped import WrappedSolver
 from .event_map import handle, most_at_once
 from .kinks import turned
 from .log import EventRows
@@ -63,7 +64,7 @@ class _DenseOutput(eqx.Module):
         return self.interpolation(t0=t0, t1=t1, **self.info).evaluate(t)
 
 
-class WithEvents(diffrax.AbstractWrappedSolver):
+class WithEvents(WrappedSolver):
     """Wraps a solver so that steps end where an event happens.
 
     - `solver`: the problem prepares it for the discrete values at hand.
@@ -82,30 +83,6 @@ class WithEvents(diffrax.AbstractWrappedSolver):
     @property
     def term_compatible_contr_kwargs(self):  # pyright: ignore[reportIncompatibleVariableOverride]
         return {}
-
-    @property
-    def scan_kind(self):
-        """The wrapped solver's kind of loop over its stages (`diffrax.AbstractRungeKutta.scan_kind`)."""
-        return self.solver.scan_kind  # pyright: ignore[reportAttributeAccessIssue]
-
-    @property
-    def root_finder(self):
-        """The wrapped solver's root finder; Diffrax reads it to fill in tolerances."""
-        return self.solver.root_finder  # pyright: ignore[reportAttributeAccessIssue]
-
-    @property
-    def root_find_max_steps(self):
-        """The wrapped solver's limit on the iterations of its root finder."""
-        return self.solver.root_find_max_steps  # pyright: ignore[reportAttributeAccessIssue]
-
-    def order(self, terms):
-        return self.solver.order(terms)
-
-    def strong_order(self, terms):
-        return self.solver.strong_order(terms)
-
-    def error_order(self, terms):
-        return self.solver.error_order(terms)
 
     def func(self, terms, t0, y0, args):
         if isinstance(y0, HybridState):

@@ -11,11 +11,12 @@ from diffrax import AbstractWrappedSolver as _Wrapped
 
 from ..errors import ModelError
 from .choice_guard import ChoiceGuard
+from .wrapped import WrappedSolver
 
 Projection = Callable[[Any, Any, Any], Any]
 
 
-class Projected(_Wrapped):
+class Projected(WrappedSolver):
     """Wraps a Diffrax solver: after every step, y₁ is moved onto a manifold.
 
     The standard projection method (Hairer, Lubich & Wanner 2006, Geometric Numerical Integration, Algorithm IV.4.2):
@@ -53,32 +54,6 @@ class Projected(_Wrapped):
     @property
     def term_compatible_contr_kwargs(self):  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.solver.term_compatible_contr_kwargs
-
-    # Diffrax reads and replaces these on a solver that counts as a Runge–Kutta or an implicit one, wrapped or not.
-
-    @property
-    def scan_kind(self):
-        """The wrapped solver's kind of loop over its stages (`diffrax.AbstractRungeKutta.scan_kind`)."""
-        return self.solver.scan_kind  # pyright: ignore[reportAttributeAccessIssue]
-
-    @property
-    def root_finder(self):
-        """The wrapped solver's root finder; Diffrax reads it to fill in tolerances."""
-        return self.solver.root_finder  # pyright: ignore[reportAttributeAccessIssue]
-
-    @property
-    def root_find_max_steps(self):
-        """The wrapped solver's limit on the iterations of its root finder."""
-        return self.solver.root_find_max_steps  # pyright: ignore[reportAttributeAccessIssue]
-
-    def order(self, terms):
-        return self.solver.order(terms)
-
-    def strong_order(self, terms):
-        return self.solver.strong_order(terms)
-
-    def error_order(self, terms):
-        return self.solver.error_order(terms)
 
     def init(self, terms, t0, t1, y0, args):
         state = self.solver.init(terms, t0, t1, y0, args)
