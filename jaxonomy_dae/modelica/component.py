@@ -1,12 +1,12 @@
 """A flat Modelica model as a component."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from ..errors import ModelError
 from ..modeling.component import Component
 from ..modeling.environment import EqnEnv
-from .continuous import write_equation
+from .continuous import Law, equation_of, write_equation, write_law
 from .events import write_end_of_start, write_mode, write_when
 from .flat_model import FlatModel
 from .scope import Scope
@@ -25,26 +25,37 @@ class FlatComponent(Component):
     - `outputs`: names of Boolean and Integer variables to be found in the solution. Those that a `when` assigns, and
         those of which `pre(…)` is read, are there anyway.
 
+    - `laws`: other laws for some variables, by name. `laws={"damper.f": law}` puts `damper.f = law(m, f)` in the place
+        of the equation `damper.f = f` of the text, with m the component: `m.symbol("damper.v_rel")` is a symbol of it,
+        `m.learned(…)` puts a network in, and `f + …` is a term beside the written one.
+
     **Raises:**
 
-    - `ModelError` for what cannot be translated, with its line in the text.
+    - `ModelError` for what cannot be translated, with its line in the text; for a law of a variable that no equation,
+        or more than one, gives by itself.
     """
 
-    def __init__(self, ev: EqnEnv, name: str, flat: FlatModel, outputs: Sequence[str] = ()):
+    def __init__(
+        self, ev: EqnEnv, name: str, flat: FlatModel, outputs: Sequence[str] = (), laws: Mapping[str, Law] | None = None
+    ):
         super().__init__(ev, name)
         self.flat = flat
         scope = Scope(flat, self)
         found = scope.definitions
         scope.declare_variables()
+        replaced = {variable: equation_of(scope, variable) for variable in laws or ()}
+        equations = [s for s in found.equations if not any(s is r.statement for r in replaced.values())]
         for mode in found.followed:
             self._located(scope.declared[mode].line, write_mode, scope, mode)
         for write, statements in (
             (write_when, found.whens),
-            (write_equation, found.equations),
+            (write_equation, equations),
             (write_initial_equation, found.initial),
         ):
             for s in statements:
                 self._located(s.line, write, scope, s)
+        for variable, law in (laws or {}).items():
+            self._located(replaced[variable].statement.line, write_law, scope, replaced[variable], law)
         for output in outputs:
             if output not in self.variables and output not in self.parameters:
                 self.output(output, as_number(scope.value(output)))

@@ -8,10 +8,8 @@ from typing import Any
 
 import sympy
 
-from ..modeling.automatic_events import Splitting, Turning, turned, varies
+from ..modeling.automatic_events import varies
 from ..modeling.component import Component
-from ..modeling.events import LIVE
-from ..modeling.symbols import RelationSymbol
 from .values import Value, plain
 
 _ORDER = (sympy.StrictGreaterThan, sympy.GreaterThan, sympy.StrictLessThan, sympy.LessThan)
@@ -52,19 +50,5 @@ class KeptRelations:
         if opposite in self.forms:
             return sympy.Not(self.forms[opposite][form])
         if relation not in self.forms:
-            self.forms[relation] = self._kept(relation)
+            self.forms[relation] = self.component._followed(relation)
         return self.forms[relation][form]
-
-    def _kept(self, relation: Any) -> tuple[Any, Any]:
-        """Declares the variable that keeps the truth of a relation, and the events that set it."""
-        c = self.component
-        numbers = Splitting(len(c.relations))
-        live, guarded = numbers.split(relation)
-        for each in numbers.timed.values():
-            c.relations.extend(each.starts)
-            c._ticks(each)
-        if numbers.timed and not varies(guarded):
-            return live, guarded
-        known: Any = c._hidden_discrete(float(LIVE))
-        c._turns(Turning(known.number, guarded, sympy.true))
-        return turned(known.number, relation), sympy.Eq(RelationSymbol(known.number), 1)

@@ -39,18 +39,21 @@ class RelationDeclarations(EventDeclarations):
 
         - `ModelError` for what is not a condition.
         """
-        if isinstance(condition, BooleanAtom | bool):
-            return condition
+        return condition if isinstance(condition, BooleanAtom | bool) else self._followed(condition)[0]
+
+    def _followed(self, condition: Any) -> tuple[Any, Any]:
+        """Declares the events of a condition. Returns (the condition as equations see it between events, the truth that
+        the last event has left)."""
         numbers = Splitting(len(self.relations))
         live, guarded = numbers.split(condition)
         for each in numbers.timed.values():
             self.relations.extend(each.starts)
             self._ticks(each)
         if numbers.timed and not varies(guarded):
-            return live
-        known = self._hidden_discrete(float(LIVE))
+            return live, guarded
+        known: Any = self._hidden_discrete(float(LIVE))
         self._turns(Turning(known.number, self._without_jumps(guarded), sympy.true))
-        return turned(known.number, condition)
+        return turned(known.number, condition), sympy.Eq(known, 1)
 
     def _without_jumps(self, condition: Any) -> Any:
         """The condition for a guard that turns where sides jump, as floor(x) does, and moves with these jumps: such a

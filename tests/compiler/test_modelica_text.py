@@ -327,6 +327,31 @@ def test_what_cannot_be_translated_is_said_with_its_line(equations, told):
     assert told in str(error.value)
 
 
+DAMPED = """model m
+  parameter Real d = 2.0; Real x(start = 1.0, fixed = true); Real v(start = 0.0, fixed = true); Real f; Real g;
+  equation der(x) = v; der(v) = -x - f; f = d * v; g = f; end m;"""
+
+
+def test_a_law_takes_the_place_of_an_equation():
+    """A term beside the written law; a function in its place."""
+    for law, left in ((lambda m, f: f + m.symbol("v") ** 3, "-d*v + f - v**3"), (_doubled, "f - law")):
+        component = FlatComponent(EqnEnv(), "m", load(DAMPED), laws={"f": law})
+        assert [str(e) for e in component.equations] == ["der(x) - v", "der(v) + f + x", "-f + g", left]
+
+
+def _doubled(m, f):
+    return m.function("law", lambda v: 2.0 * v, [m.symbol("v")])[0]
+
+
+def test_a_law_for_what_no_equation_gives_is_refused():
+    for name, told in (
+        ("g", "replaces the one equation that says 'g = …'; found on no line"),
+        ("w", "no variable 'w'"),
+    ):
+        with pytest.raises(ModelError, match=told):
+            FlatComponent(EqnEnv(), "m", load(DAMPED), laws={name: lambda m, f: f})
+
+
 def test_truths_that_define_each_other_are_refused():
     text = "model m Boolean a; Boolean b; Real x; equation a = not b; b = not a; x = if a then 1.0 else 2.0; end m;"
     with pytest.raises(ModelError, match="a → b → a depend on each other"):
