@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from sympy import Max, Min
+from sympy import Max, Min, sympify
 
 from ..errors import ModelError
 from ..modeling import smooth
@@ -23,7 +23,7 @@ def interpolated(u: Any, x: np.ndarray, values: Sequence[Any], kind: str) -> tup
     Kinds are those of `signal.Table1D`; with 'cubic', the slope at the end of a piece is that of its chord. Outside of
     the points the last piece goes on.
     """
-    return _interpolated(u, tuple(x.tolist()), tuple(values), kind)
+    return _interpolated(u, tuple(x.tolist()), tuple(map(sympify, values)), kind)  # in Python, 2 and 2.0 are equal
 
 
 @functools.lru_cache(maxsize=64)  # the cells of a pack have the same expression; SymPy takes 20 ms to make it

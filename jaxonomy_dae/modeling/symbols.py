@@ -182,7 +182,8 @@ def seen_from_child(value: Any) -> Any:
     return value
 
 
-_remembered = functools.lru_cache(maxsize=4096)(sympy.Eq)  # large models write the same few equations
+# Large models write the same few equations. By type, since 2, 2.0 and True are equal in Python, but not in an equation.
+_remembered = functools.lru_cache(maxsize=4096, typed=True)(sympy.Eq)
 
 
 SHADOWED = (

@@ -69,3 +69,21 @@ def test_how_a_number_is_written():
         simulate(system, 1j, ts=[0.5])  # pyright: ignore[reportArgumentType]
     none, empty = (simulate(system, 1.0, ts=[1.0], jump_ts=jumps)["c.x"] for jumps in (None, []))
     np.testing.assert_array_equal(none, empty)
+
+
+def test_which_numbers_were_written_before():
+    """The process: equations were remembered by their sides, and 2 == 2.0 and 1 == True in Python. So a model had the
+    numbers of one compiled before it, with another digest, and `Eq(y, True)` was accepted or not."""
+
+    def compiled(number):
+        def build(c):
+            x = c.variable("x", start=1.0, fixed=True)
+            c.add_equations(Eq(der(x), -x), Eq(c.variable("y"), number))
+
+        return model(build)
+
+    written = [2.0, 2, 2.0, 1, 2]
+    digests = [compiled(number).plan.digest for number in written]
+    assert digests[0] == digests[2] != digests[1] == digests[4]
+    with pytest.raises(ModelError, match="is not an equation"):
+        compiled(True)
