@@ -23,6 +23,8 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
 from ..judgement.rank import above_errors, rank_of
+from ..judgement.scaling import equilibrated
+from ..linear.sparse_least_squares import SparseLeastSquares
 from ..model.constraint_jacobian import (
     ConstraintEntries,
     constraint_entries,
@@ -40,7 +42,10 @@ from ..model.typical_sizes import typical_sizes
 from ..tolerances import HALF_OF_THE_DIGITS, KNOWN, NO_PART, UNCHANGED
 from .wording import listed, words
 
-LARGEST = 600  # constraints of a part that is examined
+LARGEST = 600  # constraints whose singular values are computed, in some 0.2 s
+WHOLE = LARGEST  # constraints of a part in which those that depend on each other are not sought first
+SAMPLES = 4  # random directions of a larger part that stand for all: what none of them sees has probability zero
+NO_SHARE = 1e-4  # of the largest, in a random vector for which uᵀG is zero to some six digits: no part of any such u
 MECHANICAL = ("Planar", "Translational", "Rotational")
 SHOWN = 12  # names
 YIELDS = "or replace one by a part that yields, such as a spring"
@@ -92,8 +97,7 @@ def dependent_constraints(at: ModelAt) -> list[DependentConstraints]:
     entries, parts = _parts(at)
     found = []
     for rows, members in parts:
-        if len(rows) <= LARGEST:
-            found += _of_part(at, entries.take(members), rows)
+        found += _of_part(at, entries.take(members), rows)
     return sorted(found, key=lambda f: not f.is_redundant)
 
 
@@ -108,12 +112,18 @@ def _parts(at: ModelAt) -> tuple[ConstraintEntries, list[tuple[np.ndarray, np.nd
 
 def _of_part(at: ModelAt, entries: ConstraintEntries, rows: np.ndarray) -> list[DependentConstraints]:
     columns = np.unique(entries.column)
-    place = (np.searchsorted(rows, entries.row), np.searchsorted(columns, entries.column))
     quantities = at.model.extended.quantities
     c = np.bincount(at.model.extended.base) - 1
     if len(np.unique(c[rows])) > 1:
         return []  # constraints of several orders: their Jacobian is no derivative by one set of quantities
     position = quantities.first[columns] + quantities.highest[columns] - c[rows[0]]
+    free = None
+    if len(rows) > WHOLE:
+        rows, free = _dependent_rows(at, entries, rows, columns)
+        entries = entries.take(np.isin(entries.row, rows))
+        if not 0 < len(rows) <= LARGEST:
+            return []
+    place = (np.searchsorted(rows, entries.row), np.searchsorted(columns, entries.column))
 
     def matrix_of(numbers: np.ndarray) -> np.ndarray:
         dense = np.zeros((len(rows), len(columns)))
@@ -121,15 +131,14 @@ def _of_part(at: ModelAt, entries: ConstraintEntries, rows: np.ndarray) -> list[
         return dense
 
     where = at.model.groups, at.model.extended, entries, at.point
-    matrix = matrix_of(evaluate(*where))
-    bounds = matrix_of(evaluate_errors(*where, KNOWN * (np.abs(at.point.values[:-1]) + at.error_sizes)))
+    matrix, bounds = map(matrix_of, _values_and_errors(at, entries))
     if not np.isfinite(matrix).all():
         return []
     rank = rank_of(matrix, bounds)
     row_scale, column_scale = rank.r, rank.c
     # Where it is constant, no point that is found decides.
     number = rank.number if entries.constant.all() else int((rank.s > HALF_OF_THE_DIGITS * rank.s[0]).sum())
-    left, right = rank.u[:, number:], rank.vt[number:].T
+    left, right = rank.u[:, number:], rank.vt[number:].T if free is None else free / column_scale[:, None]
     matrix = above_errors(matrix, bounds)  # sin(1e-17) is zero
     if not left.shape[1]:
         return []
@@ -153,6 +162,35 @@ def _of_part(at: ModelAt, entries: ConstraintEntries, rows: np.ndarray) -> list[
             if names:
                 found.append(DependentConstraints(names, count, is_redundant, forces))
     return found
+
+
+def _values_and_errors(at: ModelAt, entries: ConstraintEntries) -> tuple[np.ndarray, np.ndarray]:
+    """The entries of the Jacobian, and bounds of their errors."""
+    where = at.model.groups, at.model.extended, entries, at.point
+    known = KNOWN * (np.abs(at.point.values[:-1]) + at.error_sizes)
+    return evaluate(*where), evaluate_errors(*where, known)
+
+
+def _dependent_rows(
+    at: ModelAt, entries: ConstraintEntries, rows: np.ndarray, columns: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of a large part: the constraints that some combination u with uᵀG = 0 contains, and directions v with Gv = 0,
+    shape (columns, samples). Both are what least squares leave of random vectors."""
+    place = (np.searchsorted(rows, entries.row), np.searchsorted(columns, entries.column))
+    shape = len(rows), len(columns)
+    values, errors = (sp.csr_array((v, place), shape=shape) for v in _values_and_errors(at, entries))
+    jacobian = sp.csr_array(above_errors(values, errors))
+    if not np.isfinite(jacobian.data).all():
+        return rows[:0], np.zeros((len(columns), 0))
+    scaled, _, unit = equilibrated(jacobian)
+    forwards, backwards, rng = SparseLeastSquares(scaled), SparseLeastSquares(scaled.T), np.random.default_rng(0)
+    shares = np.zeros(len(rows))
+    free = np.zeros((len(columns), SAMPLES))
+    for k in range(SAMPLES):
+        u, v = rng.normal(size=len(rows)), rng.normal(size=len(columns))
+        shares = np.maximum(shares, np.abs(u - scaled @ forwards.solve(u)))
+        free[:, k] = unit * (v - scaled.T @ backwards.solve(v))
+    return rows[shares > NO_SHARE], free
 
 
 def _unchanged(changed: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray]:

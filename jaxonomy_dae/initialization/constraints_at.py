@@ -11,8 +11,6 @@ from ..model.declared import start_guess
 from ..model.group import Point
 from ..model.networks import Networks
 
-LARGEST = 1500  # unknown quantities: up to there, positions that are not states are found by dense algebra
-
 
 def constraints_at(
     plan: SystemPlan,
@@ -22,9 +20,9 @@ def constraints_at(
     x: np.ndarray,
     inputs: Callable[[], np.ndarray],
 ) -> ModelAt | None:
-    """The values of all quantities where the states are `x`; None if nothing was differentiated, or too much."""
+    """The values of all quantities where the states are `x`; None if nothing was differentiated."""
     quantities = plan.extended.quantities
-    if not plan.extended.level.any() or quantities.n_unknown > LARGEST or not np.isfinite(x).all():
+    if not plan.extended.level.any() or not np.isfinite(x).all():
         return None
     guess, _ = start_guess(plan.model, parameters, plan.leading)
     pins = dict(zip([*plan.states.tolist(), *plan.carried.tolist()], x.tolist(), strict=True))

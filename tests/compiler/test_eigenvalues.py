@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from problems import compiled, oscillator, pendulum, rc_circuit
 
-from jaxonomy_dae import Component, EqnEnv, der
+from jaxonomy_dae import Component, Eq, EqnEnv, der
+from jaxonomy_dae.system import solver_choice
 from jaxonomy_dae.system.solver_choice import fastest_decay as fastest_decay_of
 
 
@@ -33,3 +34,37 @@ def test_eigenvalues_at_the_start():
 
 def test_eigenvalues_are_those_of_the_values_not_the_structure():
     assert [fastest_decay(rc_circuit(R=r, C=1.0)) for r in (1.0, 1e-3)] == pytest.approx([1.0, 1e3], rel=1e-9)
+
+
+class Rod(Component):
+    """n cells that exchange heat with their neighbours, the first and the last with what is at 0."""
+
+    def __init__(self, ev, n, k):
+        super().__init__(ev, "rod")
+        k, T = self.parameter("k", k), self.vector("T", n, start=1.0, fixed=True)
+        q = self.vector("q", n + 1)
+        for i in range(n + 1):
+            self.add_equations(Eq(q[i], (T[i - 1] if i else 0) - (T[i] if i < n else 0)))
+        self.add_equations(*(Eq(der(T[i]), k * (q[i] - q[i + 1])) for i in range(n)))
+
+
+@pytest.mark.parametrize("n", [20, 300])
+def test_eigenvalues_of_large_models(n):
+    """Kind: a verdict that hangs on the size of the model. Above 300 quantities nothing decayed: a stiff model took
+    explicit steps inside jit. −4k·sin²(j·π/(2(n + 1))) are the eigenvalues; of large models the fastest is found to
+    some per cent."""
+    system = compiled(Rod(EqnEnv(), n, 1e4))
+    assert fastest_decay(system) == pytest.approx(4e4 * np.sin(n * np.pi / (2 * (n + 1))) ** 2, rel=1e-2)
+
+
+def test_both_methods_agree(monkeypatch):
+    """Of small models, too, whatever their index."""
+    systems = [
+        rc_circuit(R=2e-3, C=0.5),
+        oscillator(M=2.0, D=600.0, K=5.0),
+        pendulum(),
+        compiled(Rod(EqnEnv(), 40, 1.0)),
+    ]
+    by_singular_values = [fastest_decay(system) for system in systems]
+    monkeypatch.setattr(solver_choice, "LARGE", 0)
+    assert [fastest_decay(system) for system in systems] == pytest.approx(by_singular_values, rel=1e-6, abs=1e-6)
