@@ -26,7 +26,7 @@ class SparseLeastSquares:
     """The factors for a sparse matrix A, shape (m, n), with entries near one (`judgement.scaling.equilibrated`)."""
 
     def __init__(self, matrix: Any):
-        self.matrix = sp.csr_array(matrix)
+        self.matrix: Any = sp.csr_array(matrix)
         m, n = self.matrix.shape
         one, ridge = sp.eye_array(m), REGULARIZATION * sp.eye_array(n)
         augmented: Any = sp.block_array([[one, self.matrix], [self.matrix.T, -ridge]], format="csc")

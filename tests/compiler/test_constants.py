@@ -69,6 +69,7 @@ METHODS = {
     "initialization/ladder": "the shortest step along a curve; the least gain",
     "judgement/sparse_rank": "a shift for inverse iteration",
     "linear/sparse": "what stands for a zero in a factorization",
+    "linear/sparse_least_squares": "regularization of what is solved again with the rest",
     "model/consistent_point": "where an iteration ends",
     "simulation/arguments": "sample times that lie outside the interval by their rounding",
     "simulation/solution": "tolerances of a run, by default",
