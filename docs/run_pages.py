@@ -63,6 +63,12 @@ def figures_of(page: pathlib.Path) -> str:
     return name_of(page).removesuffix(".md").replace(os.sep, "-").strip(".-")
 
 
+def program(page: pathlib.Path, text: str, block: Block) -> Any:
+    """A block as compiled code. Messages name its lines as those of a script that holds all blocks of the page."""
+    before = "".join(other.content for other in blocks_of(text[: block.begin]) if other.runs)
+    return compile("\n" * before.count("\n") + block.content, f"{page.stem}.py", "exec")
+
+
 def save_figures(names: list[str]) -> None:
     """Saves the open figures for light and dark pages, and closes them."""
     import matplotlib.pyplot as plt
@@ -95,7 +101,7 @@ def run(page: pathlib.Path) -> str:
                     continue
                 said = io.StringIO()
                 with plt.rc_context(STYLE), contextlib.redirect_stdout(said):
-                    exec(compile(block.content, f"{name_of(page)}, block {k}", "exec"), names)
+                    exec(program(page, text, block), names)
                     new = [f"{stem}-{drawn + j + 1}" for j in range(len(plt.get_fignums()))] if shows else []
                     save_figures(new) if shows else plt.close("all")
                 drawn, figures = drawn + len(new), figures + new

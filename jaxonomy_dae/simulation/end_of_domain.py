@@ -108,10 +108,11 @@ def end_of_domain(system: AcausalSystem, t: Time, x: State, t1: Time, inputs: In
         dt = part * float(t1 - t)
         found = equation_not_finite(system, inputs, t + dt, np.asarray(x) + dt * slope)
         if found is not None:
-            which = found.part(system)
+            # Values there are zero up to a rounding error: the boundary of the domain.
+            which, where = found.part(system), system.plan.locate(int(found.equation.equation[found.row]))
             return (
-                f"just beyond, {repr(which) if which else 'a function'} leaves its domain in {found.text(system)}. "
-                "Write the equation so that it has a value there (for instance with Max(…, small) as the argument), or "
-                "end the run earlier"
+                f"just beyond, {repr(which) if which else 'a function'} leaves its domain in {where}. Write the "
+                "equation so that it has a value there (for instance with Max(…, small) as the argument), or end "
+                "the run earlier"
             )
     return ""

@@ -6,7 +6,7 @@ import re
 import jax
 import numpy as np
 import pytest
-from run_pages import BLOCK, DOCS, blocks_of, name_of, pages
+from run_pages import BLOCK, DOCS, blocks_of, name_of, pages, program
 
 NUMBER = r"-?\d+(?:\.\d*)?(?:e[+-]\d+)?"
 QUICK = {"start/install.md", "start/first-model.md", "how-to/units.md"}  # in the default run
@@ -91,10 +91,11 @@ def test_a_page_prints_what_it_says(page, capsys, tmp_path, monkeypatch, same_co
     plt.switch_backend("Agg")
     names, printed, before = {"__name__": "page"}, "", None
     with jax.numpy_dtype_promotion("standard"):  # as in a notebook
-        for k, block in enumerate(blocks_of(page.read_text())):
+        text = page.read_text()
+        for k, block in enumerate(blocks_of(text)):
             if block.runs:
                 assert not printed, f"what block {k} prints is not shown: {printed}"
-                exec(compile(block.content, f"{name_of(page)}, block {k}", "exec"), names)
+                exec(program(page, text, block), names)
                 printed = capsys.readouterr().out
                 plt.close("all")
             elif block.language == "text" and not block.titled and before is not None and before.runs:
