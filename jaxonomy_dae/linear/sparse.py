@@ -16,7 +16,9 @@ together (Curtis, Powell & Reid 1974), a greedy colouring of the pattern's colum
 import functools
 import hashlib
 import importlib
+import importlib.util
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import equinox as eqx
@@ -167,24 +169,26 @@ def klu() -> Any:
 
     **Raises:** `MissingSparseSolver`, which names the extra to install.
     """
-    x64 = is_double()
-    platform = jax.config.read("jax_platform_name")
+    # A new thread has no settings but those of the process: `with jax.enable_x64(True)` around the first sparse solve is
+    # not to become one of these.
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(_imported).result()
+
+
+def _imported() -> Any:
+    settings = {name: jax.config.values[name] for name in ("jax_enable_x64", "jax_platform_name")}
     try:
         return importlib.import_module("klujax")
     except ImportError as error:
         raise MissingSparseSolver(f"sparse solves need the package klujax: {EXTRA}") from error
     finally:
-        jax.config.update("jax_enable_x64", x64)
-        jax.config.update("jax_platform_name", platform)
+        for name, value in settings.items():
+            jax.config.update(name, value)
 
 
 def available() -> bool:
-    """True if the package for sparse solves is installed."""
-    try:
-        klu()
-    except MissingSparseSolver:
-        return False
-    return True
+    """True if the package for sparse solves is installed; it is not imported."""
+    return importlib.util.find_spec("klujax") is not None
 
 
 def solve_sparse(
@@ -207,13 +211,13 @@ def solve_sparse(
     - When run: JAX's run-time error "singular matrix" if entries cancel to a pivot of exactly zero; `nudged` avoids it
         by changing every entry by a few units in its last place. Entries that vanish give what is not finite.
     """
-    klu()
     if pattern.n_rows != pattern.n:
         raise ModelError(f"a matrix to be solved with must be square; this one is {pattern.n_rows} × {pattern.n}")
     if not is_double():
         raise ModelError(
             "sparse solves compute in float64: call jax.config.update('jax_enable_x64', True) at the start"
         )
+    klu()
     if not pattern.n:
         return b
     if pattern.coalesced is not None:

@@ -1,7 +1,10 @@
 """What programs are made for: the platform at hand, and products of matrices in full precision."""
 
 import jax
+import jax.export
 import jax.numpy as jnp
+import numpy as np
+import pytest
 from problems import pendulum
 
 from jaxonomy_dae import simulate
@@ -14,6 +17,18 @@ def test_the_platform_is_that_of_the_default_device():
     assert platform() == jax.default_backend()
     with jax.default_device(jax.devices("cpu")[0]):
         assert platform() == "cpu"
+
+
+@pytest.mark.parametrize("platforms", [["cuda"], ["cpu", "cuda"]])
+def test_programs_can_be_exported_for_other_platforms(platforms):
+    """Kind: the processor at hand instead of the one a program is made for. What is chosen by it may cost time on the
+    other one, and nothing else."""
+    system = pendulum()
+    x = jnp.asarray([0.6, 0.0, -0.8, 0.0])
+    field = jax.jit(lambda x: system.vector_field(0.0, x))
+    exported = jax.export.export(field, platforms=platforms)(x)
+    if "cpu" in platforms:
+        np.testing.assert_allclose(exported.call(x), field(x), rtol=1e-14, atol=1e-14)
 
 
 def test_products_of_matrices_are_in_full_precision():
