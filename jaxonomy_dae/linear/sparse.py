@@ -169,8 +169,8 @@ def klu() -> Any:
 
     **Raises:** `MissingSparseSolver`, which names the extra to install.
     """
-    # A new thread has no settings but those of the process: `with jax.enable_x64(True)` around the first sparse solve is
-    # not to become one of these.
+    # A new thread has no settings but those of the process: `with jax.enable_x64(True)` around the first sparse solve
+    # is not to become one of these.
     with ThreadPoolExecutor(1) as pool:
         return pool.submit(_imported).result()
 
