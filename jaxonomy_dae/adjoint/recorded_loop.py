@@ -150,6 +150,11 @@ def _(perturbed, numbers, program):
 
 @solve.def_bwd
 def _(residuals, cotangents, perturbed, numbers, program):
+    with jax.default_matmul_precision(program.precision):
+        return _backwards(residuals, cotangents, perturbed, numbers, program)
+
+
+def _backwards(residuals, cotangents, perturbed, numbers, program):
     residuals, numbers = jax.tree.map(jnp.asarray, (residuals, numbers))  # JAX hands constants over as its literals
     state, moves, chunks, stride, kept, record, filled = residuals
     times = StepTimes(perturbed, numbers, program)

@@ -127,6 +127,7 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
             converted, consts = closure_convert(body, start, buffers, flag, flag)
             program = SolveProgram(
                 **functions, body=converted, max_steps=max_steps, chunk=chunk, points=points,
+                precision=jax.config.jax_default_matmul_precision,  # pyright: ignore[reportAttributeAccessIssue]
             )  # fmt: skip
             given = dict(state=start, buffers=buffers, table=_arrays(empty), body=consts)
             final, buffers, table = solve(numbers | given, program)
