@@ -90,6 +90,37 @@ def closure_convert(function: Any, *args: Args) -> tuple[ClosureConverted, list[
     return converted, list(closed.consts)
 
 
+def by_itself_or_batched(
+    one: ClosureConverted, of_one: list[Any], many: ClosureConverted, of_many: list[Any]
+) -> tuple[ClosureConverted, Any]:
+    """A function in two forms that return the same, with the arrays that each closes over: `one` where it is called by
+    itself, `many` in a batch and where it is differentiated."""
+
+    @jax.custom_jvp
+    def call(consts, *leaves):
+        return alone(consts, *leaves)
+
+    @call.defjvp
+    def _(primals, tangents):
+        (_, consts), *leaves = primals
+        (_, moving), *tangents = tangents
+        return jax.jvp(many.call, (consts, *leaves), (moving, *tangents))
+
+    @jax.custom_batching.custom_vmap
+    def alone(consts, *leaves):
+        return one.call(consts[0], *leaves)
+
+    @alone.def_vmap
+    def _(axis_size, in_batched, consts, *leaves):
+        del axis_size
+        axes = jax.tree.map(lambda batched: 0 if batched else None, (in_batched[0][1], *in_batched[1:]))
+        out = jax.vmap(many.call, in_axes=axes)(consts[1], *leaves)
+        return out, jax.tree.map(lambda _: True, out)
+
+    both = ClosureConverted(jax.jit(call), many.inputs, many.outputs, many.static)
+    return both, (of_one, of_many)
+
+
 @jax.custom_jvp
 def unless_waiting(active: Bool[Array, ""], new: PyTree, old: PyTree) -> PyTree:
     """Returns `new`; but `old` for a member of a batch that is no longer active and waits for the slowest one."""

@@ -17,7 +17,7 @@ from ..aliases import Terms
 from ..private_names import has_stored_adjoint, private
 from ..programs.members import batch_size
 from .appended import NOTED, apart, together
-from .closure_conversion import SolveProgram, closure_convert, unless_waiting
+from .closure_conversion import SolveProgram, by_itself_or_batched, closure_convert, unless_waiting
 from .recorded_loop import solve
 from .resting import AttemptedStep, Resting
 from .reverse_step import state_saves
@@ -106,7 +106,11 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
             progress_meter_state=(init_state.progress_meter_state, jnp.array(True)),
         )
 
-        stepper = _Solver(functions["step"], numbers["step"], solver, terms)
+        quick = _quickly(**{**given, "init_state": init_state}, made_jump=functions["jumps"]) if members == 1 else None
+        forward, consts = functions["step"], numbers["step"]
+        if quick is not None:
+            forward, consts = by_itself_or_batched(*quick, forward, consts)
+        stepper = _Solver(forward, consts, solver, terms)
 
         def outer(cond_fun, body_fun, start, *, max_steps, buffers):
             del cond_fun, buffers
@@ -238,6 +242,30 @@ def _functions(
         save_ts=tuple(c for _, c in at_ts), save_steps=tuple(c for _, c in at_steps),
     )  # fmt: skip
     return functions, numbers
+
+
+def _quickly(*, args, terms, solver, init_state, made_jump, **_) -> tuple[Any, list[Any]] | None:
+    """The step with its stages in a loop, if the solver has both forms: by itself, outside of batches, it takes the
+    same time and compiles in a part of it. What is differentiated is the other form."""
+    looped = _in_a_loop(solver)
+    if looped is None:
+        return None
+    s = init_state
+
+    def take_step(tprev, tnext, y, solver_state, made_jump):
+        y1, y_error, dense, state, result = looped.step(terms, tprev, tnext, y, args, solver_state, made_jump)
+        return y1, y_error, dense, _arrays(state), result
+
+    jump = jnp.array(False) if made_jump else False
+    return closure_convert(take_step, s.tprev, s.tnext, s.y, s.solver_state, jump)
+
+
+def _in_a_loop(solver: Any) -> Any:
+    """The solver with its stages in a loop; None if it has but one form, or the user has chosen."""
+    if isinstance(solver, diffrax.AbstractWrappedSolver):
+        inner = _in_a_loop(solver.solver)
+        return None if inner is None else dataclasses.replace(solver, solver=inner)
+    return dataclasses.replace(solver, looped=True) if getattr(solver, "looped", False) is None else None
 
 
 class _Solver:
