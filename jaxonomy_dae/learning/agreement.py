@@ -34,8 +34,7 @@ def whiteness(residual: Float[np.ndarray, " n"]) -> Whiteness:
 
 def log_likelihood(m: Minimum) -> float:
     """As `Estimate.log_likelihood`."""
-    none = np.zeros_like(m.z)
-    cost = dataclasses.replace(m.weights, precision=none, mean=none).cost(m.z, m.found.residual)
+    cost = m.weights.cost(m.z, m.found.residual) - m.weights.prior_cost(m.z)
     return m.weights.log_rows - cost - 0.5 * m.weights.samples * float(np.log(2 * np.pi))
 
 

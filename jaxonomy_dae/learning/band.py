@@ -13,7 +13,7 @@ from ..errors import ModelError, nearest
 from ..model.opaque import OpaqueFunction
 from ..optional import new_axes
 from ..programs.cache import compiled
-from .blocks import block_of, inputs_seen
+from .blocks import block_of
 from .program import weights_of, with_weights
 from .runs import run
 
@@ -142,7 +142,7 @@ def explored(estimate: "Estimate", name: str, along: Any) -> np.ndarray:
     if along is None:
         if block is None:
             return np.zeros((0, 2))
-        seen = inputs_seen(estimate.objective, estimate.point, block)
+        seen = estimate.objective.seen(estimate.point)[name]
     else:
         runs = (run(estimate.objective, estimate.point, int(k)) for k in np.flatnonzero(estimate.objective.counted))
         columns = [np.asarray(run[along] if isinstance(along, str) else along(run), float) for run in runs]

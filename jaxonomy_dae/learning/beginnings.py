@@ -59,7 +59,7 @@ def misfit(objective: Objective, point: Float[np.ndarray, " f"]) -> tuple[float,
     if residual is None:
         return np.inf, True
     weights = objective.weights(point, Evaluation(residual, np.zeros((len(residual), len(point)))))
-    bare = weights.cost(point, residual) - 0.5 * float(np.sum(weights.precision * (point - weights.mean) ** 2))
+    bare = weights.cost(point, residual) - weights.prior_cost(point)
     s, (experiment, index, output) = objective.stacked, objective.rows
     known = objective.evidence.noise < 0
     far = [np.abs(residual * weights.scale)[known] / FAR]

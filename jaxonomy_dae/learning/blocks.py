@@ -1,14 +1,9 @@
-"""Where a learned block stands in a model, and what its inputs were in the experiments."""
+"""Where a learned block stands in a model."""
 
 import dataclasses
 
-import numpy as np
-from jaxtyping import Float
-
 from ..lowering.plan import SystemPlan
 from ..model.opaque import OpaqueFunction, OpaqueTemplate
-from .objective import Objective
-from .runs import run
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,14 +50,3 @@ def _derivative(name: str, order: int) -> str:
 def _with_time(row: list[str], opaque: OpaqueFunction) -> tuple[str, ...]:
     rest = iter(row)
     return tuple("time" if j in opaque.time_positions else next(rest) for j in range(opaque.n_inputs))
-
-
-def inputs_seen(objective: Objective, point: Float[np.ndarray, " p"], block: Block) -> Float[np.ndarray, "n inputs"]:
-    """The inputs of a block in the experiments that were fitted, at their sample times."""
-    found = []
-    for k in np.flatnonzero(objective.counted):
-        solution = run(objective, point, int(k))
-        for row in block.inputs:
-            columns = [np.asarray(solution.ts if n == "time" else solution[n], float) for n in row]
-            found.append(np.stack(columns, axis=1))
-    return np.concatenate(found)

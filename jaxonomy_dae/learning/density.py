@@ -2,7 +2,9 @@
 
 With coordinates z as a fit has them, residuals r of the samples, weights w of experiments, and the fit's normal priors,
 
-    ln p(z, σ) = −½ Σ w (r/σ)² − Σ w ln σ − ½ Σ precision·(z − mean)² + constant.
+    ln p(z, σ) = −½ Σ w (r/σ)² − Σ w ln σ − ½ Σ precision·(z − mean)² + constant,
+
+with the prior of smoothness of learned laws, linearized at the fit.
 
 Noise levels that are estimated are sampled with the rest, with a flat prior of their logarithm; z is flat where it has
 no prior. Coordinates with bounds are functions of free numbers y (`between`), and the logarithm of dz/dy is added. What
@@ -59,6 +61,8 @@ class Posed(eqx.Module):
     high: Float[Array, " f"]
     precision: Float[Array, " f"]
     mean: Float[Array, " f"]
+    bends: Float[Array, "r f"]  # rows of the prior of smoothness, linearized, and their values at z = 0
+    bend: Float[Array, " r"]
     centre: Float[Array, " u"]
     root: Float[Array, "u u"]
 
@@ -137,7 +141,8 @@ def density(program: Program, posed: Posed, u: Float[Array, " u"]) -> Float[Arra
             level = logs[levels.place]
             scaled = found * jnp.exp(-2 * level) + 2 * levels.count * level
             found = jnp.where(levels.sampled, scaled, found)
-        return slope - 0.5 * jnp.sum(found) - 0.5 * jnp.sum(posed.precision * (z - posed.mean) ** 2)
+        prior = jnp.sum(posed.precision * (z - posed.mean) ** 2) + jnp.sum((posed.bends @ z + posed.bend) ** 2)
+        return slope - 0.5 * jnp.sum(found) - 0.5 * prior
 
     @jax.custom_vjp
     def safe(u):
@@ -192,11 +197,14 @@ def posed(estimate: "Estimate") -> tuple[Program, Posed, tuple[str, ...]]:
     def array(values: Any) -> Any:
         return jnp.asarray(values, dtype)
 
+    priors = weights.prior(z)
+    bent = slice(np.count_nonzero(weights.precision), None)
+    bends, bend = priors.jacobian[bent], priors.residual[bent] - priors.jacobian[bent] @ z
     levels = Levels(jnp.asarray(sampled), jnp.asarray(place), array(np.where(sampled, counts, 0.0)))
     told = Posed(
         misfit.told, levels, array(c.natural(estimate.point)), jnp.asarray(np.flatnonzero(free)),
         jnp.asarray(c.log[free]), array(c.size[free]), array(low), array(high), array(weights.precision),
-        array(weights.mean), array(centre), array(root),
+        array(weights.mean), array(bends), array(bend), array(centre), array(root),
     )  # fmt: skip
     program = Program(objective.setting, misfit.function, misfit.structure, misfit.backwards)
     return program, told, names

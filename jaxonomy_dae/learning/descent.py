@@ -22,9 +22,11 @@ from .factors import Factors
 
 TRIALS = 12  # dampings tried from one point: the last is 6¹² times the first
 PATIENCE = 3  # steps in a row without gain
+PERSISTENCE = 12  # the same, where what is reported still has a way to go: small gains add up along a curved valley
 OFFSET = 1e-3  # of the confidence region's radius, what may be left to go (Bates & Watts 1981, Technometrics 23:179)
-CLOSE = 0.05  # of this radius, what a search that no step takes further may leave: no interval moves by more
-VALLEY = 1.0  # the same, where undamped steps gain next to nothing: predictions are off by less than their bands
+# Of its standard deviation, by which anything that is reported may move yet where no step gains more: it adds 2 % to
+# errors.
+CLOSE = 0.2
 POLISHED = 12  # steps at the end, as long as three of them leave less than a third
 MIXED = 4  # earlier steps that these are mixed with (Walker & Ni 2011: three to five suffice)
 ROUNDED = 1e-10  # relative rounding of differences of steps
@@ -75,12 +77,14 @@ class AbstractMerit(abc.ABC):
     - `noise`: the relative error of the Jacobian, the tolerance of the integration: directions within it are not
         followed.
     - `finer`: the same with a tolerance that is less by a factor; None where the precision does not allow it.
+    - `hidden`: the coordinates that are not reported by themselves, such as weights of networks.
     """
 
     evaluate: Callable[[Float[np.ndarray, " p"]], Evaluation | None]
     weights: Callable[[Float[np.ndarray, " p"], Evaluation], Weights]
     noise: float
     finer: Callable[[float], "AbstractMerit | None"]
+    hidden: Bool[np.ndarray, "*p"]
 
     @abc.abstractmethod
     def cost(self, z: Float[np.ndarray, " p"], weights: Weights) -> float:
@@ -162,6 +166,19 @@ class _Here:
         following, change = (weights, 0.0) if reweigh is None else reweigh(z, found, weights, factors, free, is_minimum)
         return cls(z, found, weights, rows, cost, free, factors, following, change, left)
 
+    def open(self, merit: AbstractMerit) -> float:
+        """By how much of their standard deviations a full step moves the coordinates that are reported, each, and the
+        predictions of the data, together. Weights of networks are not reported: they may have far to go along a curved
+        valley in which laws and predictions stay what they are."""
+        rank = self.factors.rank(merit.noise)
+        step, root = self.factors.step(0.0, rank), self.factors.root(rank)
+        spread, shown = np.linalg.norm(root, axis=1), ~np.broadcast_to(merit.hidden, self.z.shape)[self.free]
+        single = np.abs(step[shown]) / np.where(spread[shown] > 0, spread[shown], 1.0)
+        prior = self.weights.prior(self.z).jacobian[:, self.free]
+        known = rank - float(np.sum((prior @ root) ** 2))  # directions that the data determine
+        moved = float(np.sum(self.factors.projected[:rank] ** 2) - np.sum((prior @ step) ** 2))
+        return max(float(np.max(single, initial=0.0)), float(np.sqrt(max(moved, 0.0) / max(known, 1.0))))
+
     @property
     def settled(self) -> bool:
         """True if weights are as good as those they would become."""
@@ -218,7 +235,7 @@ def descend(
         if better is not None:
             weights = merit.next_weights(better.weights, here.following)
             here = _Here.of(merit, better.z, better.found, weights, bounds, reweigh)
-        if better is not None and idle < PATIENCE:
+        if better is not None and (idle < PATIENCE or (idle < PERSISTENCE and here.open(merit) > CLOSE)):
             continue
         stuck = better is None or damping > 1  # columns have norm one: beyond, damping alone keeps steps short
         along, tried = _along(merit, here, bounds, least) if stuck else (None, 0)
@@ -236,8 +253,8 @@ def descend(
             continue
         # Weights that stay until the search has found its minimum are now free to change.
         here = _Here.of(merit, here.z, here.found, here.weights, bounds, reweigh, is_minimum=True)
-        if here.settled or idle > 2 * PATIENCE:
-            closed = here.left <= (CLOSE if stuck else VALLEY)
+        if here.settled or idle > PERSISTENCE + PATIENCE:
+            closed = here.open(merit) <= CLOSE
             reason = f"{'converged' if closed else 'stopped'} after {k} steps: no step gains more"
             break
         if better is None:
@@ -347,11 +364,14 @@ def _polished(
 
 def _packed(z: Float[np.ndarray, " p"], weights: Weights) -> Float[np.ndarray, " n"]:
     """Coordinates, and the logarithms of weights and precisions."""
-    return np.concatenate([z, np.log(weights.row), np.log(weights.precision[weights.precision > 0])])
+    return np.concatenate(
+        [z, np.log(weights.row), np.log(weights.precision[weights.precision > 0]), np.log(weights.stiffness)]
+    )
 
 
 def _unpacked(logs: Float[np.ndarray, " n"], weights: Weights) -> Weights:
     """Weights with other rows and precisions."""
     precision, m = np.array(weights.precision), len(weights.row)
-    precision[precision > 0] = np.exp(logs[m:])
-    return dataclasses.replace(weights, row=np.exp(logs[:m]), precision=precision)
+    end = m + int(np.sum(precision > 0))
+    precision[precision > 0] = np.exp(logs[m:end])
+    return dataclasses.replace(weights, row=np.exp(logs[:m]), precision=precision, stiffness=np.exp(logs[end:]))

@@ -30,7 +30,7 @@ from jaxtyping import Array, Float
 from ..errors import ModelError, SimulationError, nearest, whole_number
 from ..programs.cache import compiled
 from ..system.system import AcausalSystem
-from .blocks import Block, block_of, inputs_seen
+from .blocks import Block, block_of
 from .libraries import Library
 from .table import Row, Table
 from .term import AbstractTerm, ClosedForm
@@ -224,7 +224,7 @@ class _Start:
     @classmethod
     def of(cls, estimate: "Estimate", name: str, block: Block, terms: tuple[AbstractTerm, ...]) -> "_Start":
         dtype = estimate.system.parameters.values.dtype
-        u = jnp.asarray(inputs_seen(estimate.objective, estimate.point, block), dtype)
+        u = jnp.asarray(estimate.objective.seen(estimate.point)[name], dtype)
         whole = ClosedForm(jnp.ones(len(terms), dtype), jnp.ones(len(terms), bool), terms)
         values, features = _values_and_features(estimate.system.neural[name], block, whole, u)
         values, features = np.asarray(values, float).ravel(), np.asarray(features, float).reshape(-1, len(terms))

@@ -180,13 +180,13 @@ class Estimate:
     @property
     def effective(self) -> dict[str, float]:
         """The number of weights of each network that the data determine."""
-        c, out = self.objective.coordinates, {}
-        precision = np.zeros(len(c))
-        precision[self.objective.free] = self.minimum.weights.precision
-        variance = np.sum(self.root**2, axis=1)
+        c, free, out = self.objective.coordinates, self.objective.free, {}
+        prior = self.minimum.weights.prior(self.minimum.z).jacobian
+        held = prior @ self.root[free]
         for name in dict.fromkeys(g for g, w in zip(c.group, c.is_weight, strict=True) if w):
-            chosen = np.array([g == name for g in c.group]) & self.objective.free  # what is frozen is not determined
-            out[name] = float(np.sum(1 - precision[chosen] * variance[chosen]))
+            chosen = np.array([g == name for g in c.group])[free]  # what is frozen is not determined
+            own = (prior[:, chosen] != 0).any(axis=1)
+            out[name] = float(chosen.sum() - np.sum(held[own] ** 2))
         return out
 
     @property

@@ -6,6 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from .smoothness import Bends
+
 
 class Evaluation(NamedTuple):
     """Residuals as they are, not weighted, and their Jacobian; and where the model says how large they should be, their
@@ -33,6 +35,8 @@ class Weights:
     precision: Float[np.ndarray, " p"]  # of the normal prior of each coordinate; 0 where there is none
     mean: Float[np.ndarray, " p"]
     share: Float[np.ndarray, " m"]  # √w
+    bends: Bends | None = None  # the derivatives of learned laws whose prior is around zero
+    stiffness: Float[np.ndarray, " g"] = dataclasses.field(default_factory=lambda: np.zeros(0))  # precisions of these
 
     @property
     def samples(self) -> float:
@@ -50,10 +54,31 @@ class Weights:
         return float(np.sum(self.share**2 * np.log(self.scale)))
 
     def prior(self, z: Float[np.ndarray, " p"]) -> Rows:
-        """A row for each prior."""
+        """A row for each prior of a coordinate, and each derivative of a law."""
         chosen = np.flatnonzero(self.precision)
         root = np.sqrt(self.precision)
-        return Rows((root * (z - self.mean))[chosen], np.diag(root)[chosen])
+        plain = Rows((root * (z - self.mean))[chosen], np.diag(root)[chosen])
+        if self.bends is None:
+            return plain
+        values, slopes = self.bends.at(z)
+        root = np.sqrt(self.stiffness)[self.bends.group]
+        return Rows(
+            np.concatenate([plain.residual, root * values]),
+            np.concatenate([plain.jacobian, root[:, None] * slopes]),
+        )
+
+    def prior_cost(self, z: Float[np.ndarray, " p"]) -> float:
+        """½ Σ precision·(z − mean)² and the same of derivatives."""
+        cost = 0.5 * float(np.sum(self.precision * (z - self.mean) ** 2))
+        if self.bends is not None:
+            cost += 0.5 * float(np.sum(self.stiffness[self.bends.group] * self.bends.at(z)[0] ** 2))
+        return cost
+
+    def with_priors_of(self, other: "Weights") -> "Weights":
+        """These weights of residuals, and the priors of others."""
+        return dataclasses.replace(
+            self, precision=other.precision, mean=other.mean, bends=other.bends, stiffness=other.stiffness
+        )
 
     def applied(self, z: Float[np.ndarray, " p"], found: Evaluation) -> Rows:
         """Weighted residuals and Jacobian, with a row for each prior."""
@@ -64,5 +89,5 @@ class Weights:
         )
 
     def cost(self, z: Float[np.ndarray, " p"], residual: Float[np.ndarray, " m"]) -> float:
-        """½ |W r|² + ½ Σ precision·(z − mean)²."""
-        return 0.5 * float(np.sum((self.row * residual) ** 2) + np.sum(self.precision * (z - self.mean) ** 2))
+        """½ |W r|² and what the priors add."""
+        return 0.5 * float(np.sum((self.row * residual) ** 2)) + self.prior_cost(z)

@@ -14,11 +14,14 @@ the step takes anyway.
 import dataclasses
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from .evaluation import Evaluation, Weights
 from .factors import Factors
 
+HEAVIEST = 1e4  # of the squares of the data's columns, what those of a prior of smoothness may be
+LIGHTEST = 1e-16  # of this, what is no prior any more, relative to rounding
+FAINT = 0.1  # of a degree of freedom: a prior of derivatives that leaves less need not be stronger
 NEAR = 2.0  # χ² for each sample, beyond which it is the misfit that speaks, and precisions of priors stay as they are
 
 
@@ -31,6 +34,7 @@ class Evidence:
     labels: tuple[str, ...]  # of these groups
     floor: np.ndarray  # (groups,): the rounding of the data, below which no noise can be seen
     groups: tuple[Bool[np.ndarray, " p"], ...]  # whose precision is to be found
+    laws: tuple[Bool[np.ndarray, " p"], ...] = ()  # the weights of each law that has a prior of smoothness
 
     @property
     def is_idle(self) -> bool:
@@ -63,7 +67,7 @@ class Evidence:
         at a minimum, and elsewhere would let go of a prior that nothing else replaces. At a minimum they change in any
         case: a prior that is too strong keeps residuals large."""
         root = factors.root(factors.rank(np.finfo(float).eps * len(found.residual)))
-        row, precision = np.array(weights.row), np.array(weights.precision)
+        row = np.array(weights.row)
         changes = [0.0]
         for k, floor in enumerate(self.floor):
             chosen = self.noise == k
@@ -74,18 +78,76 @@ class Evidence:
             sigma = max(_rms(found.residual[chosen], share) * np.sqrt(count / left), floor)
             changes.append(abs(np.log(sigma * row[chosen][0] / share[0])))
             row[chosen] = share / sigma
-        variance = np.zeros(len(z))
-        variance[free] = np.sum(root**2, axis=1)
         known = self.noise < 0
         misfit = float(np.sum((weights.row * found.residual)[known] ** 2))
         near = misfit <= NEAR * float(np.sum(weights.share[known] ** 2))
-        for group in self.groups if near or is_minimum else ():
-            old = weights.precision[group][0]
-            determined = max(group.sum() - old * float(np.sum(variance[group])), 1e-3)
-            new = determined / max(float(np.sum((z - weights.mean)[group] ** 2)), np.finfo(float).tiny)
-            changes.append(abs(np.log(new / old)))
-            precision[group] = new
-        return dataclasses.replace(weights, row=row, precision=precision), float(max(changes))
+        better = dataclasses.replace(weights, row=row)
+        if (self.groups or self.laws) and (near or is_minimum):
+            wide = np.zeros((len(z), root.shape[1]))
+            wide[free] = root
+            for group in self.groups:
+                better, moved = self._priors(z, found, better, group, wide)
+                changes.append(moved)
+        return better, float(max(changes))
+
+    def _priors(
+        self, z: np.ndarray, found: Evaluation, weights: Weights, group: np.ndarray, root: np.ndarray
+    ) -> tuple[Weights, float]:
+        """(better precisions of one group of coordinates, and of the derivatives of a law whose weights they are; how
+        much they change)."""
+        precision, stiffness = np.array(weights.precision), np.array(weights.stiffness)
+        old, size = precision[group][0], int(group.sum())
+        own = [k for k, law in enumerate(self.laws) if np.array_equal(law, group)]
+        inside: list[int] = []
+        slopes, values, of_row, data = np.zeros((0, size)), np.zeros(0), np.zeros(0, int), 0.0
+        if weights.bends is not None and own:
+            inside = np.flatnonzero(weights.bends.owner == own[0]).tolist()
+            rows = np.isin(weights.bends.group, inside)
+            values, slopes = (a[rows] for a in weights.bends.at(z))
+            of_row, slopes = weights.bends.group[rows], slopes[:, group]
+            # Beside rows so much heavier than the data's, the data's would be lost to rounding.
+            data = np.sum((weights.row[:, None] * found.jacobian[:, group]) ** 2)
+        # The prior's own covariance, from the singular values of the derivatives' rows relative to those of weights.
+        scaled = np.sqrt(stiffness[of_row] / old)[:, None] * slopes if len(slopes) else slopes
+        left, s, _ = np.linalg.svd(scaled, full_matrices=False)
+        shares = s**2 / (1 + s**2)
+        determined = size - float(np.sum(shares)) - old * float(np.sum(root[group] ** 2))
+        square = float(np.sum((z - weights.mean)[group] ** 2))
+        precision[group] = _updated(determined, square)
+        changes = [abs(np.log(precision[group][0] / old))]
+        for k in inside:
+            mine = of_row == k
+            spread = stiffness[k] * float(np.sum((slopes[mine] @ root[group]) ** 2))
+            determined = float(np.sum(left[mine] ** 2 @ shares)) - spread
+            most = HEAVIEST * data / max(float(np.sum(slopes[mine] ** 2)), np.finfo(float).tiny)
+            heaviest = most if determined > FAINT else stiffness[k]
+            new = np.clip(_updated(determined, float(np.sum(values[mine] ** 2))), LIGHTEST * most, heaviest)
+            # A prior that decides next to nothing may go on changing.
+            changes.append(abs(np.log(new / stiffness[k])) * min(max(determined, 0.0), 1.0))
+            stiffness[k] = new
+        return dataclasses.replace(weights, precision=precision, stiffness=stiffness), max(changes)
+
+
+def log_evidence(z: Float[np.ndarray, " p"], found: Evaluation, weights: Weights) -> float:
+    """ln of the probability of the data whatever the coordinates, less a constant, by Laplace's approximation at a
+    minimum: by it, priors of different forms compare."""
+    has_prior = weights.precision > 0
+    prior = weights.prior(z).jacobian[:, has_prior]
+    whole = weights.applied(z, found).jacobian
+    size = np.linalg.norm(whole, axis=0)
+    size[size == 0] = 1.0
+    logs = [np.log(np.linalg.svd(rows, compute_uv=False)) for rows in (prior / size[has_prior], whole / size)]
+    # Sizes of coordinates without a prior stand for units, which are the same for all that is compared.
+    return (
+        weights.log_rows
+        - weights.cost(z, found.residual)
+        + float(logs[0].sum() - logs[1].sum() - np.log(size[~has_prior]).sum())
+    )
+
+
+def _updated(determined: float, square: float) -> float:
+    """A precision that explains a sum of squares by as many numbers as the data determine."""
+    return max(determined, 1e-3) / max(square, np.finfo(float).tiny)
 
 
 def _rms(values: np.ndarray, share: np.ndarray) -> float:

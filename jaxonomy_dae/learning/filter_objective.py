@@ -143,7 +143,9 @@ class FilterObjective(AheadObjective):
         """Weights by the variances at this point, and priors."""
         base = super().weights(z, found)
         assert found.variance is not None
-        return Likelihood(base.share / np.sqrt(found.variance), base.precision, base.mean, base.share)
+        return Likelihood(
+            base.share / np.sqrt(found.variance), base.precision, base.mean, base.share, base.bends, base.stiffness
+        )
 
     @functools.cached_property
     def evidence(self) -> Evidence:
@@ -160,9 +162,7 @@ class FilterObjective(AheadObjective):
 
         def held(z, found):
             here = self.weights(z, found)
-            return (
-                here if weights is None else dataclasses.replace(here, precision=weights.precision, mean=weights.mean)
-            )
+            return here if weights is None else here.with_priors_of(weights)
 
         reweigh = self.evidence.reweigh if weights is None and not self.evidence.is_idle else None
         return descend(self._scoring(held), start, self.bounds, reweigh, steps)
@@ -172,7 +172,7 @@ class FilterObjective(AheadObjective):
             other = self.finer(factor)
             return None if other is None else other._scoring(weigh)
 
-        return Scoring(self.evaluate, weigh, self.tolerance, finer, self.coordinates.log[self.free])
+        return Scoring(self.evaluate, weigh, self.tolerance, finer, self.hidden, self.coordinates.log[self.free])
 
     def sigma(self, z: Float[np.ndarray, " f"], weights: Weights) -> dict[str, float]:
         """Noise levels that were estimated."""

@@ -65,8 +65,8 @@ class Batches:
             each = np.zeros((c.experiments, c.n_own))
             np.add.at(each, experiment, (row * residual)[:, None] * by_own[at])
             gradient[c.n_shared :] = each.ravel()
-        pull = weights.precision * (z - weights.mean)
-        prior = 0.5 * float(pull @ (z - weights.mean)) / weights.samples
+        off, by = weights.prior(z)
+        pull, prior = by.T @ off, 0.5 * float(off @ off) / weights.samples
         cost = 0.5 * float(residual @ residual) / samples + prior
         slope = (gradient * c.slope(full))[o.free] / samples + pull / weights.samples
         return (cost, slope) if np.isfinite(cost) and np.isfinite(slope).all() else None

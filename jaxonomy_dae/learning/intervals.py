@@ -50,7 +50,7 @@ def profile(
         start[position] = c.natural_at(position, z)
         at = dataclasses.replace(objective, coordinates=dataclasses.replace(c, start=start, fixed=held))
         own_cost = 0.5 * prior * (z - mean) ** 2
-        reached = reach(at, warm[0], weights)
+        reached = reach(at, warm[0], weights if weights.bends is None else dataclasses.replace(weights, bends=at.bends))
         cost = np.inf if reached is None else reached.cost
         if reached is not None:
             warm[0] = reached.z

@@ -65,7 +65,7 @@ class Scoring(AbstractMerit):
 
     def at(self, z: Float[np.ndarray, " p"], found: Evaluation, weights: Weights) -> Weights:
         """Those that the model says, with the priors at hand."""
-        return dataclasses.replace(self.weights(z, found), precision=weights.precision, mean=weights.mean)
+        return self.weights(z, found).with_priors_of(weights)
 
     def reach(self, z: Float[np.ndarray, " p"], weights: Weights, below: float) -> Reached | None:
         """By the likelihood there, with the priors at hand."""
@@ -82,7 +82,7 @@ class Scoring(AbstractMerit):
 
     def next_weights(self, here: Weights, better: Weights) -> Weights:
         """The weights at the current point, with better precisions."""
-        return dataclasses.replace(here, precision=better.precision)
+        return here.with_priors_of(better)
 
     def shortened(self, step: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
         """Logarithms change by no more than `LONGEST`."""

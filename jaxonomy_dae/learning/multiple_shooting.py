@@ -75,8 +75,7 @@ class Merit:
     def cost(self, point: Point) -> float:
         """½ Σ |rows|²."""
         b = self.blocks(point.blocks)
-        prior = np.sum(self.weights.precision * (point.z - self.weights.mean) ** 2)
-        return 0.5 * float(np.sum(b.residual**2) + np.sum(b.gap**2) + prior)
+        return 0.5 * float(np.sum(b.residual**2) + np.sum(b.gap**2)) + self.weights.prior_cost(point.z)
 
     def blocks(self, blocks: Blocks) -> Blocks:
         """Weighted rows."""

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..system.system import AcausalSystem
+from .blocks import Block, block_of
 from .coordinates import Coordinates
 from .data import Stacked
 from .descent import Minimum, descend
@@ -24,6 +25,7 @@ from .evidence import Evidence
 from .experiment import Unknown
 from .least_squares import SumOfSquares
 from .program import Conditions, Layout, Setting, Weighted, misfit, predict, predict_and_differentiate
+from .smoothness import Bends, Law, spread_out
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,6 +81,8 @@ class Objective:
     counted: Bool[np.ndarray, " e"]
     # Over a part of the time, the centre of the priors of weights, free coordinates; None: zero, over all of it.
     near: Float[np.ndarray, " f"] | None = dataclasses.field(default=None, kw_only=True)
+    # Networks with a prior of smoothness, and where they have it.
+    laws: tuple[Law, ...] = dataclasses.field(default=(), kw_only=True)
 
     @property
     def has_variances(self) -> bool:
@@ -187,21 +191,69 @@ class Objective:
 
     def residual(self, z: Float[np.ndarray, " f"]) -> Float[np.ndarray, " m"] | None:
         """Residuals alone; None where a run that counts fails."""
-        shared, own = self.numbers(self.coordinates.natural(self.full(z)))
-        forwards = diffrax.ForwardMode()
-        outputs = predict(self.setting, forwards, shared, own, self.conditions)
-        found = np.asarray(outputs, np.float64)[self.rows] - self.stacked.values[self.rows]
+        found = self._runs(self.full(z))[..., : len(self.layout.outputs)][self.rows] - self.stacked.values[self.rows]
         return found if np.isfinite(found).all() else None
 
+    def _runs(self, full: Float[np.ndarray, " p"]) -> Float[np.ndarray, "e n _"]:
+        """The outputs of all experiments, and after them the inputs of trained networks, by one program."""
+        shared, own = self.numbers(self.coordinates.natural(full))
+        outputs = (*self.layout.outputs, *self._inputs)
+        setting = self.setting._replace(layout=dataclasses.replace(self.layout, outputs=outputs))
+        return np.asarray(predict(setting, diffrax.ForwardMode(), shared, own, self.conditions), np.float64)
+
+    @functools.cached_property
+    def blocks(self) -> dict[str, Block]:
+        """The trained networks that stand in the equations."""
+        found = {name: block_of(self.system.plan, name) for name in self.layout.modules if name in self.system.neural}
+        return {name: block for name, block in found.items() if block is not None}
+
+    @functools.cached_property
+    def _inputs(self) -> tuple[str, ...]:
+        names = dict.fromkeys(n for block in self.blocks.values() for row in block.inputs for n in row)
+        return tuple(n for n in names if n not in self.layout.outputs)
+
+    def seen(self, full: Float[np.ndarray, " p"]) -> dict[str, Float[np.ndarray, "m inputs"]]:
+        """The inputs of each trained network at the samples' times of the experiments that count, by runs from a
+        point."""
+        runs, names = self._runs(full), (*self.layout.outputs, *self._inputs)
+        counts = [k for k in np.flatnonzero(self.counted) if self.stacked.counts[k]]
+        rows = np.concatenate([runs[k, : self.stacked.counts[k]] for k in counts])
+        found = {}
+        for name, block in self.blocks.items():
+            found[name] = np.concatenate([rows[:, [names.index(n) for n in row]] for row in block.inputs])
+        return found
+
+    def explored(self, z: Float[np.ndarray, " f"]) -> "Objective":
+        """A copy whose networks have a prior of smoothness where runs from a point lead them."""
+        chosen = [name for name in self.blocks if self.penalties.get(name) == "evidence" and self._group(name).any()]
+        full, laws = self.full(z), []
+        seen = self.seen(full) if chosen else {}
+        for name in chosen:
+            points = seen[name][np.isfinite(seen[name]).all(axis=1)]
+            if len(points):
+                columns = np.flatnonzero([name == group for group in self.coordinates.group])
+                network, block = self.system.neural[name], self.blocks[name]
+                laws.append(Law(network, block.opaque, columns, spread_out(points), 0.5 * np.ptp(points, axis=0)))
+        return dataclasses.replace(self, laws=tuple(laws))
+
+    @functools.cached_property
+    def bends(self) -> Bends | None:
+        """The derivatives of networks whose prior is smoothness."""
+        return Bends.of(self.laws, self.coordinates.z_start, np.flatnonzero(self.free)) if self.laws else None
+
     def lowest(
-        self, start: Float[np.ndarray, " f"], steps: int = 200, weights: Weights | None = None
-    ) -> Minimum | None:
+        self, start: Float[np.ndarray, " f"], steps: int = 200, weights: Weights | None = None,
+        first: Weights | None = None,
+    ) -> Minimum | None:  # fmt: skip
         """The minimum next to a start, None if that cannot be evaluated; with `weights` that stay as they are, or those
-        that the data choose."""
-        if weights is None:
-            weigh, reweigh = self.weights, None if self.evidence.is_idle else self.evidence.reweigh
-        else:
-            weigh, reweigh = lambda *_: weights, None
+        that the data choose, beginning with the priors of `first`."""
+
+        def weigh(z: np.ndarray, found: Evaluation) -> Weights:
+            if weights is not None:
+                return weights
+            return self.weights(z, found) if first is None else self.weights(z, found).with_priors_of(first)
+
+        reweigh = self.evidence.reweigh if weights is None and not self.evidence.is_idle else None
         return descend(self._merit(weigh), start, self.bounds, reweigh, steps)
 
     def _merit(self, weigh: Weigh) -> SumOfSquares:
@@ -212,7 +264,12 @@ class Objective:
             other = self.finer(factor)
             return None if other is None else other._merit(weigh)
 
-        return SumOfSquares(self.evaluate, weigh, self.tolerance, finer, alone)
+        return SumOfSquares(self.evaluate, weigh, self.tolerance, finer, self.hidden, alone)
+
+    @property
+    def hidden(self) -> Bool[np.ndarray, " f"]:
+        """The free coordinates that are weights."""
+        return self.coordinates.is_weight[self.free]
 
     @property
     def tolerance(self) -> float:
@@ -242,7 +299,7 @@ class Objective:
         given = np.array(found.weights.precision)
         for group in self.evidence.groups:
             given[group] = 0.0
-        weights = dataclasses.replace(found.weights, precision=given)
+        weights = dataclasses.replace(found.weights, precision=given, bends=None)
         return weights.cost(found.z, found.found.residual) - weights.log_rows
 
     def standardized(
@@ -264,7 +321,9 @@ class Objective:
         fixed = np.array(c.fixed)
         fixed[: c.n_shared] = True
         c = dataclasses.replace(c, start=c.natural(full), fixed=fixed)
-        alone = dataclasses.replace(self.with_noise(self.sigma(z, weights)), coordinates=c, counted=held, penalties={})
+        alone = dataclasses.replace(
+            self.with_noise(self.sigma(z, weights)), coordinates=c, counted=held, penalties={}, laws=()
+        )
         if not alone.free.any() or not len(alone.rows[0]):
             return full
         best = alone.lowest(full[alone.free])
@@ -307,7 +366,14 @@ class Objective:
             tuple(s.outputs[k] for k in chosen),
             floor,
             tuple(group for group in groups if group.any()),
+            self._laws,
         )
+
+    @property
+    def _laws(self) -> tuple[np.ndarray, ...]:
+        """The weights of each law that has a prior of smoothness."""
+        places = np.flatnonzero(self.free)
+        return () if self.near is not None else tuple(np.isin(places, law.columns) for law in self.laws)
 
     def weights(self, z: Float[np.ndarray, " f"], found: Evaluation) -> Weights:
         """The first weights: noise levels that are known or as large as the residuals, and priors."""
@@ -326,7 +392,10 @@ class Objective:
                 precision[group] = first if given == "evidence" else float(given)
                 if given == "evidence" and self.near is not None:
                     mean[group] = self.near[group]
-        return self.evidence.first(Weights(row, precision, mean, np.sqrt(s.weight[experiment])), found)
+        first = Weights(row, precision, mean, np.sqrt(s.weight[experiment]))
+        if self.bends is not None and self.near is None:
+            first = dataclasses.replace(first, bends=self.bends, stiffness=self.bends.first(z))
+        return self.evidence.first(first, found)
 
     def _group(self, name: str) -> Bool[np.ndarray, " f"]:
         chosen = np.array([name == group for group in self.coordinates.group], bool)

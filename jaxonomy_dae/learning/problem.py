@@ -30,6 +30,7 @@ from .multiple_shooting import Shooting, shoot
 from .objective import Objective
 from .program import Layout, Setting
 from .runs import residuals, run, why_not
+from .smoother import smoother
 from .starting_points import adam_steps, starting_points
 from .training import GradientSteps, Training, train
 from .verdict import FitWarning
@@ -250,7 +251,7 @@ class Problem:
         if not shares or shares[-1] != 1.0 or any(not 0 < share <= 1 for share in shares):
             raise ModelError(f"horizons are shares in (0, 1], the last of them 1; got {tuple(horizons)}")
         by_fit = isinstance(self.method, Filter) or not objective.stacked.holdout.any()
-        best: tuple[float, Minimum, Training | None] | None = None
+        best: tuple[float, Objective, Minimum, Training | None] | None = None
         for point in starting_points(objective, starts, seed):
             training, spans = None, shares
             if first is not None:
@@ -261,12 +262,14 @@ class Problem:
             found = self._descend(objective, point, spans, steps, adam, learning_rate)
             if found is None:
                 continue
-            score = objective.surprise(found) if by_fit else objective.held_out(found.z, found.weights)[1]
+            here, lowest = found
+            score = here.surprise(lowest) if by_fit else here.held_out(lowest.z, lowest.weights)[1]
             if best is None or not score >= best[0]:
-                best = score, found, training
+                best = score, here, lowest, training
         if best is None:
             raise SimulationError(why_not(objective))
-        fit = Estimate.of(self, objective.at_tolerance(best[1].tolerance), best[1], best[2])
+        _, here, lowest, training = best
+        fit = Estimate.of(self, here.at_tolerance(lowest.tolerance), lowest, training)
         if warn and fit.reasons:
             warnings.warn(f"this fit is not to be relied on: {'; '.join(fit.reasons)}", FitWarning, stacklevel=2)
         return fit
@@ -324,9 +327,11 @@ class Problem:
 
     def _descend(
         self, objective: Objective, point: np.ndarray, shares: Sequence[float], steps: int, adam: int, rate: float
-    ) -> Minimum | None:
+    ) -> tuple[Objective, Minimum] | None:
+        """(the objective as it was in the end, its minimum); None where a start cannot be evaluated."""
         if isinstance(self.method, Shooting):
-            return shoot(objective, self.method, point, steps, self._options["rtol"])
+            found = shoot(objective, self.method, point, steps, self._options["rtol"])
+            return None if found is None else (objective, found)
         found = None
         for share in shares:
             here = objective.until(share, silent(objective, point))
@@ -338,7 +343,8 @@ class Problem:
             if found is None:
                 return None
             point = found.z
-        return found
+        assert found is not None
+        return smoother(objective, found, steps) or (objective, found)
 
     def reach(self, objective: Objective, start: np.ndarray, weights: Weights) -> Minimum | None:
         """The minimum next to a start, with weights that stay as they are."""

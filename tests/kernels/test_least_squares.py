@@ -19,7 +19,7 @@ NOISE = float(np.sqrt(np.finfo(float).eps))  # relative, of Jacobians in closed 
 
 
 def merit(evaluate, weights, residual, finer=lambda factor: None, noise=NOISE):
-    return SumOfSquares(evaluate, weights, noise, finer, residual)
+    return SumOfSquares(evaluate, weights, noise, finer, np.array(False), residual)
 
 
 def solve(function, jacobian, start, low=FREE[0], high=FREE[1], weights=None, reweigh=None, steps=200):

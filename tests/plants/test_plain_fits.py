@@ -138,3 +138,19 @@ def test_a_fit_from_coarse_to_fine_finds_a_law_that_bends():
         band = fit.band("c.f", np.linspace(0.1, 0.9, 9))
         np.testing.assert_array_less(np.abs(band.mean - hardening(band.grid)), 4 * band.spread)
         np.testing.assert_array_less(np.abs(band.mean - hardening(band.grid)), 0.03 * 7)
+
+
+@pytest.mark.long("residuals with and without their Jacobian, two fits")
+def test_two_seeds_give_the_same_law_where_the_data_say_the_same():
+    """What the data leave open was decided by the weights that the network was drawn with."""
+    problem, laws = learning.Problem(system(), record(seed=3), train=["c.f"]), []
+    grid = np.linspace(-0.5, 0.4, 10)
+    for key in (1, 2):
+        drawn = eqx.nn.MLP(1, 1, 4, 1, jnp.tanh, key=jax.random.key(key))
+        fit = problem.beginning_at(eqx.tree_at(lambda s: s.neural["c.f"], system(), drawn)).fit()
+        assert fit.ok and fit.minimum.weights.bends is not None
+        laws.append(fit.band("c.f", grid))
+    first, second = laws
+    np.testing.assert_array_less(np.abs(first.mean - second.mean), 0.2 * first.spread)
+    np.testing.assert_array_less(np.abs(first.mean + 0.3 * grid), 3.5 * first.spread)
+    assert (first.spread < 0.05).all()
