@@ -12,24 +12,32 @@ from .objective import Objective
 
 @dataclasses.dataclass(frozen=True)
 class Whiteness:
-    """The test of one output of one experiment: the correlation of neighbouring residuals, and the probability that
-    white noise would show as much over all lags looked at (Ljung & Box 1978)."""
+    """The test of one output of one experiment: the correlation of neighbouring residuals, and Ljung and Box's
+    `statistic` (1978) over so many `lags`, which is χ² of as many degrees of freedom for white noise."""
 
     correlation: float
-    probability: float
+    statistic: float
+    lags: int
+
+    @property
+    def probability(self) -> float:
+        """The probability that white noise would show as much."""
+        return float(scipy.stats.chi2.sf(self.statistic, self.lags))
 
 
 def whiteness(residual: Float[np.ndarray, " n"]) -> Whiteness:
-    """The test over as many lags as ln n, the number of which Ljung and Box's statistic is advised for (Tsay 2010)."""
+    """The test over as many lags as ln n, the number of which Ljung and Box's statistic is advised for (Tsay 2010).
+    Missing samples, NaN, are left out."""
+    residual = residual[np.isfinite(residual)]
     n = len(residual)
     centred = residual - residual.mean()
     power = float(centred @ centred)
     lags = max(int(np.log(n)), 1)
     if n <= lags + 1 or power == 0:
-        return Whiteness(np.nan, np.nan)
+        return Whiteness(np.nan, np.nan, lags)
     rho = np.array([float(centred[k:] @ centred[:-k]) for k in range(1, lags + 1)]) / power
     statistic = n * (n + 2) * float(np.sum(rho**2 / (n - np.arange(1, lags + 1))))
-    return Whiteness(float(rho[0]), float(scipy.stats.chi2.sf(statistic, lags)))
+    return Whiteness(float(rho[0]), statistic, lags)
 
 
 def log_likelihood(m: Minimum) -> float:

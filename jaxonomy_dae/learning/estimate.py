@@ -18,7 +18,7 @@ from .discovery import Discovery, discover
 from .factors import Factors
 from .figures import plot_correlations, plot_history, plot_residuals, plot_runs
 from .identifiability import Identifiability, identifiability, spreads
-from .intervals import intervals, profile
+from .intervals import intervals, noise_intervals, profile
 from .objective import Objective
 from .prediction import Prediction, at_samples, prediction
 from .program import with_values
@@ -152,16 +152,17 @@ class Estimate:
 
     @property
     def residuals(self) -> dict[str, dict[str, np.ndarray]]:
-        """Predictions less data by experiment and name, where there are samples, in units of the noise."""
-        s = self.objective.stacked
-        scaled = self.minimum.weights.scale * self.minimum.found.residual
-        experiment, _, output = self.objective.rows
+        """Predictions less data of the experiments that were fitted, by experiment and name, in units of the noise: a
+        number for each row of the record, NaN where nothing was measured."""
+        s, rows = self.objective.stacked, self.objective.rows
+        scaled = np.full(s.values.shape, np.nan)
+        scaled[rows] = self.minimum.weights.scale * self.minimum.found.residual
         found: dict[str, dict[str, np.ndarray]] = {}
         for k, label in enumerate(s.labels):
             for j, name in enumerate(s.outputs):
-                chosen = (experiment == k) & (output == j)
-                if chosen.any():
-                    found.setdefault(label, {})[name] = scaled[chosen]
+                own = scaled[k, : s.counts[k], j]
+                if np.isfinite(own).any():
+                    found.setdefault(label, {})[name] = own
         return found
 
     @functools.cached_property
@@ -205,8 +206,10 @@ class Estimate:
 
     def table(self, level: float = 0.95) -> Table:
         """Parameters and starts with linear intervals, on the coordinates' scale, so those of positive parameters are
-        positive; and what reached a bound, is not determined, or was frozen."""
-        return intervals(self.objective, self.point, self.spread, self.quantile(level), level)
+        positive; what reached a bound, is not determined, or was frozen; and noise levels that were estimated, with
+        intervals of χ²."""
+        noise = noise_intervals(self.objective, self.minimum, self.root, level)
+        return intervals(self.objective, self.point, self.spread, self.quantile(level), level, noise)
 
     def identifiability(self) -> Identifiability:
         """The directions that the data determine, at the values found."""

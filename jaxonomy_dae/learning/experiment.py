@@ -3,16 +3,18 @@
 import csv
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError, nearest
+from ..errors import ModelError, nearest, whole_number
 from ..lowering.plan import SystemPlan
+from .records import interpolated, low_pass, smoothed, untrended
 
 ESTIMATE = "estimate"
+UNEVEN = 1e-3  # of a time step, by which steps may differ and still count as even
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,6 +141,94 @@ class Experiment:
             raise ModelError(f"{path}: there are no rows below the first line")
         table = {key: _cells([row[key] for row in rows]) for key in rows[0]}
         return cls.from_frame(table, data, time=time, **others)
+
+    # --- parts of a record, and coarser ones ---------------------------------------------------------------------
+
+    def window(self, start: float, end: float, initial: Mapping[str, Any] | None = None) -> "Experiment":
+        """The samples from `start` to `end`, as an experiment that begins at `start`; `initial` in place of the values
+        that were known at `t0`.
+
+        **Raises:**
+
+        - `ModelError` where there are no samples, or values are known at `t0` and not at `start`.
+        """
+        if not (_is_finite(start) and _is_finite(end) and self.t0 <= start < end):
+            raise ModelError(f"window: start and end are times, {self.t0:g} ≤ start < end; got {start!r} and {end!r}")
+        rows = (self.times >= start) & (self.times <= end)
+        if not rows.any():
+            raise ModelError(f"window: there is no sample from {start:g} to {end:g}")
+        new = dict(initial or {})
+        old = [name for name, value in self.initial.items() if _is_finite(value) and name not in new]
+        if start > self.t0 and old:
+            raise ModelError(
+                f"window: '{old[0]}' is known at {self.t0:g}, not at {start:g}: say what it is there, "
+                f"initial={{'{old[0]}': Unknown(guess)}}; a parameter keeps its value, {self.initial[old[0]]!r}"
+            )
+        data = {name: values[rows] for name, values in self.data.items()}
+        return self._with(self.times[rows], data, initial=dict(self.initial) | new, t0=start)
+
+    def resample(self, times: Any) -> "Experiment":
+        """The record at other times, by linear interpolation; NaN where a neighbour is missing, and outside of it.
+        Noise of samples that share a neighbour is no longer independent: for fewer samples, `decimate`."""
+        new = _times(times, self.t0)
+        if len(self.times) < 2:
+            raise ModelError("resample: a record of one sample cannot be interpolated")
+        return self._with(new, self._each(lambda values: interpolated(self.times, values, new)))
+
+    def decimate(self, factor: int) -> "Experiment":
+        """Every `factor`-th sample, after a low-pass filter without delay, so that faster oscillations and noise are
+        not taken for slow ones. Known noise levels shrink as those of white noise do.
+
+        **Raises:**
+
+        - `ModelError` for steps of time that are not even, and for missing samples.
+        """
+        whole_number(factor, "decimate: factor")
+        steps = np.diff(self.times)
+        if len(steps) < factor or np.ptp(steps) > UNEVEN * steps.mean():
+            raise ModelError(f"decimate needs more than {factor} samples at even steps: resample(times) makes them so")
+        for name, values in self.data.items():
+            if np.isnan(values).any():
+                raise ModelError(f"decimate: '{name}' has missing samples, over which no filter goes: window() a part")
+        response = low_pass(factor) if factor > 1 else np.ones(1)
+        quieter = float(np.linalg.norm(response))
+        data = self._each(lambda values: smoothed(values, response)[::factor])
+        sigma = {name: level * quieter for name, level in self._levels().items()}
+        return self._with(self.times[::factor], data, sigma=sigma)
+
+    def detrend(self, names: str | Sequence[str] | None = None, degree: int = 1) -> "Experiment":
+        """The record less a polynomial trend of least squares: of all signals, or of those named; degree 0 takes their
+        means away."""
+        chosen = list(self.data) if names is None else [names] if isinstance(names, str) else list(names)
+        whole_number(degree, "detrend: degree", least=0)
+        for name in chosen:
+            if name not in self.data:
+                raise ModelError(f"detrend: there are no data of '{name}': " + nearest(name, self.data))
+            least = int(np.isfinite(self.data[name]).sum(axis=0).min())
+            if least <= degree:
+                raise ModelError(f"detrend: '{name}' has {least} samples, too few for a trend of degree {degree}")
+        changed = self._each(lambda values: untrended(self.times, values, degree), chosen)
+        return self._with(self.times, dict(self.data) | changed)
+
+    def _levels(self) -> dict[str, float]:
+        """The standard deviation for each name; NaN where it is to be estimated."""
+        assert isinstance(self.sigma, Mapping)
+        return {name: float(level) for name, level in self.sigma.items()}
+
+    def _each(self, change: Callable[[Any], Any], names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+        """The signals, changed as columns, in their shapes."""
+        found = {}
+        for name in self.data if names is None else names:
+            values = self.data[name]
+            columns = change(values.reshape(len(values), -1))
+            found[name] = columns.reshape(len(columns), *values.shape[1:])
+        return found
+
+    def _with(self, times: np.ndarray, data: dict[str, np.ndarray], **changes: Any) -> "Experiment":
+        """A copy with other samples."""
+        levels = {"sigma": self._levels()} | changes
+        sigma = {name: ESTIMATE if math.isnan(level) else level for name, level in levels["sigma"].items()}
+        return dataclasses.replace(self, times=times, data=data, **levels | {"sigma": sigma})
 
 
 def _is_finite(value: Any) -> bool:

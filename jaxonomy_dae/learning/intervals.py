@@ -77,9 +77,10 @@ def profile(
 
 
 def intervals(
-    objective: Objective, point: Float[np.ndarray, " p"], spreads: Float[np.ndarray, " p"], factor: float, level: float
-) -> Table:
-    """As `Estimate.table`: parameters and starts, with what is to be said of each."""
+    objective: Objective, point: Float[np.ndarray, " p"], spreads: Float[np.ndarray, " p"], factor: float, level: float,
+    noise: list[Row],
+) -> Table:  # fmt: skip
+    """As `Estimate.table`: parameters and starts, with what is to be said of each, and noise levels."""
     c = objective.coordinates
     low, high = c.z_bounds
     natural = c.natural(point)
@@ -98,4 +99,21 @@ def intervals(
         if np.isfinite(spread):
             inside = np.clip([c.natural_at(k, e) for e in ends], c.low[k], c.high[k])
         rows.append(Row(c.names[k], float(natural[k]), float(inside[0]), float(inside[1]), c.units[k], note))
-    return Table(tuple(rows), level)
+    return Table((*rows, *noise), level)
+
+
+def noise_intervals(objective: Objective, minimum: Minimum, root: Float[np.ndarray, "p r"], level: float) -> list[Row]:
+    """Noise levels that were estimated: ν·s²/σ² is χ² of ν degrees of freedom, those of the samples less what the
+    coordinates took of them."""
+    weights, evidence = minimum.weights, objective.evidence
+    variables = objective.system.plan.flat.variables
+    units = dict(zip(variables.names, variables.unit, strict=True))
+    taken = np.sum((weights.row[:, None] * minimum.found.jacobian @ root[objective.free]) ** 2, axis=1)
+    rows = []
+    for k, name in enumerate(evidence.labels):
+        own = evidence.noise == k
+        freedom = max(float(np.sum(weights.share[own] ** 2) - np.sum(taken[own])), 1.0)
+        value = float(1 / weights.scale[own][0])
+        low, high = (value * np.sqrt(freedom / scipy.stats.chi2.ppf(0.5 + s * level / 2, freedom)) for s in (1, -1))
+        rows.append(Row(f"sigma of {name}", value, float(low), float(high), units.get(name, ""), ""))
+    return rows

@@ -24,7 +24,7 @@ from ..model.opaque import OpaqueFunction
 from ..programs.cache import compiled
 from .program import with_weights
 
-ORDERS = (2, 3)
+ORDERS = (2, 3)  # of derivatives: those of a piecewise linear law, and of a parabola, cost nothing or little
 POINTS = 48  # at which derivatives are taken: the law of a smoothing spline changes by less than its band beyond thirty
 
 

@@ -49,22 +49,35 @@ def _chi2(fit: "Estimate") -> list[str]:
 
 
 def _colour(fit: "Estimate") -> list[str]:
-    """Residuals that are correlated from sample to sample."""
-    s, names = fit.objective.stacked, []
-    tests = [(label, n, w) for label, by in fit.whiteness.items() for n, w in by.items() if w.probability >= 0]
-    for label, n, w in tests:
-        k, j = s.labels.index(label), s.outputs.index(n)
-        size = float(np.max(np.abs(s.values[k, :, j]), initial=0.0))
-        rms = float(np.sqrt(np.mean(fit.residuals[label][n] ** 2)))
-        faint = fit.rms[label][n] < FAINT * fit.minimum.tolerance * size or rms < BELOW
-        if w.probability * len(tests) < IMPROBABLE and not faint:
-            names.append(f"'{n}' of {label} (neighbours correlate by {w.correlation:.2f})")
-    if not names:
+    """Outputs whose residuals are correlated from sample to sample, over all experiments together (Ljung and Box's
+    statistics add up)."""
+    s, tests = fit.objective.stacked, {}
+    for label, by in fit.whiteness.items():
+        for name, test in by.items():
+            if test.statistic >= 0 and not _is_faint(fit, label, name):
+                tests.setdefault(name, []).append((label, test))
+    found = []
+    for name, each in tests.items():
+        together = scipy.stats.chi2.sf(sum(t.statistic for _, t in each), sum(t.lags for _, t in each))
+        alone = min(t.probability for _, t in each) * len(each)
+        if min(float(together), alone) * len(tests) < IMPROBABLE:
+            label, worst = min(each, key=lambda pair: pair[1].probability)
+            where = f" of {label}" if len(s.labels) > 1 else ""
+            found.append(f"'{name}'{where} (neighbours correlate by {worst.correlation:.2f})")
+    if not found:
         return []
     return [
-        f"residuals are not white noise: {', '.join(names[:4])}. The model lacks something there, or noise is "
+        f"residuals are not white noise: {', '.join(found[:4])}. The model lacks something there, or noise is "
         "correlated: intervals are too narrow. Look at fit.plot_residuals()"
     ]
+
+
+def _is_faint(fit: "Estimate", label: str, name: str) -> bool:
+    """True for residuals that are the integration's error, or as small as those of exact data."""
+    s = fit.objective.stacked
+    size = float(np.nanmax(np.abs(s.values[s.labels.index(label), :, s.outputs.index(name)]), initial=0.0))
+    rms = float(np.sqrt(np.nanmean(fit.residuals[label][name] ** 2)))
+    return fit.rms[label][name] < FAINT * fit.minimum.tolerance * size or rms < BELOW
 
 
 def _table(fit: "Estimate") -> list[str]:

@@ -132,8 +132,10 @@ def test_figures_show_what_was_found(plt):
     np.testing.assert_allclose(fit.at_samples[1][0, :, 0], ordinary.spread["c.x"], rtol=1e-6, atol=1e-12)
 
     left, right = fit.plot_residuals()[0]
-    np.testing.assert_allclose(lines(left)[0][1], fit.residuals["cools"]["c.x"])
     r = fit.residuals["cools"]["c.x"]
+    assert len(r) == 40
+    r = r[np.isfinite(r)]
+    np.testing.assert_allclose(lines(left)[0][1], r)
     np.testing.assert_allclose(lines(right)[0][1][0], r[1:] @ r[:-1] / (r @ r))
 
     assert len(lines(fit.plot_history())[0][0]) == len(fit.minimum.history)
