@@ -10,6 +10,7 @@ import numpy as np
 import optax
 import pytest
 import scipy.optimize
+import scipy.stats
 import sympy
 from sympy import Eq
 
@@ -122,6 +123,10 @@ def test_a_weight_counts_as_often_as_it_says():
     assert fit.freedom == pytest.approx(3 * 24 + 7 - 1, rel=1e-9) and fit.chi2 == pytest.approx(fit.freedom, rel=1e-4)
     expected = (x - np.exp(-a * TS)) / -sigma["c.x"]
     np.testing.assert_allclose(fit.residuals["experiment 0"]["c.x"], expected, rtol=1e-4)
+    row = fit.table()["sigma of c.x"]  # 43 samples, of whose degrees of freedom `a` takes less than one
+    assert row.value == fit.sigma["c.x"] and row.low < row.value < row.high
+    ends = [np.sqrt(n / scipy.stats.chi2.ppf(q, n)) for q, n in ((0.975, 43), (0.975, 42), (0.025, 43), (0.025, 42))]
+    assert ends[1] < row.low / row.value < ends[0] and ends[2] < row.high / row.value < ends[3]
 
 
 @pytest.mark.long("residuals and their Jacobian of two experiments")
