@@ -34,6 +34,7 @@ from ..model.starts import Start
 from ..model.tables import ZERO, complete
 from ..structure.matching import match_in_order
 from ..tolerances import HALF_OF_THE_DIGITS, ILL_CONDITIONED, KNOWN, NO_PART, TINY
+from .integrated import integrated
 
 # Quantities up to which one orthogonal factorization ranks all rows. Above, rows are matched with quantities, and then
 # judged by sparse factorizations: the verdicts are the same (tests/compiler/test_many_starts.py).
@@ -128,9 +129,10 @@ def initial_rows(plan: SystemPlan, names: tuple[str, ...], solve_for: tuple[int,
     guess = tuple(started.get(q) for q in entries)
     inside = set(plan.states.tolist())
     rows = [*overrides, *fixed]
-    others = _others(plan, started) if None in guess else []
-    free = not plan.n_constraints and not len(plan.carried) and not solve_for and not others
-    if free and all(r.quantity in inside for r in rows):
+    others = [started[q] for q in sorted(started.keys() - {*entries, ZERO})]
+    free = not plan.n_constraints and not len(plan.carried) and not solve_for
+    ranks = _ranks(plan, guess, others) if others or not free else None
+    if free and all(r.quantity in inside for r in rows) and (ranks is None or _are_states(ranks, inside)):
         held: set[int] = set()
         again = []  # starts of variables that equal one with a start of its own
         for k, r in enumerate(rows):
@@ -141,17 +143,7 @@ def initial_rows(plan: SystemPlan, names: tuple[str, ...], solve_for: tuple[int,
         return InitialRows(guess, tuple(rows), 0, independent, True, tuple(again), (), ())
     generic = _generic(plan, solve_for)
     ranked = _by_rank if generic.jacobian.shape[1] <= DENSE_LIMIT else _by_matching
-    return ranked(plan, generic, overrides, fixed, guess, others)
-
-
-def _others(plan: SystemPlan, started: dict[int, StartRow]) -> list[StartRow]:
-    """The declared starts of quantities that could be states, for their derivatives occur, and are not. What is asked
-    of a model changes which quantities are states, and must not change the initial point."""
-    quantities = plan.extended.quantities
-    entries = {int(q) for q in (*plan.states, *plan.carried)}
-    differentiated = quantities.order < quantities.highest[quantities.owner]
-    chosen = (q for q in sorted(started) if q not in entries and q != ZERO and differentiated[q])
-    return [started[q] for q in chosen]
+    return ranked(plan, generic, overrides, fixed, guess, _ranks(plan, guess, others) if ranks is None else ranks)
 
 
 def _declared(plan: SystemPlan, names: tuple[str, ...]) -> tuple[list[StartRow], list[StartRow], dict[int, StartRow]]:
@@ -243,16 +235,42 @@ def _parameter_columns(plan: SystemPlan, point, values, solve_for) -> np.ndarray
     return np.where(np.isfinite(out), out, 1.0)
 
 
-def _candidates(plan: SystemPlan, guess, others: list[StartRow]) -> list[tuple[StartRow, bool]]:
-    """Guesses in the order in which they are taken, and whether each is a declared guess of a state: what a user
-    declares before zeros, states before algebraic unknowns, and these before `others`."""
+@dataclasses.dataclass(frozen=True)
+class _Rank:
+    """Guesses that count equally: all that are open share what is open, or each takes what is left, in order."""
+
+    rows: tuple[StartRow, ...]
+    shares: bool
+
+
+def _ranks(plan: SystemPlan, guess: Sequence[StartRow | None], others: Sequence[StartRow]) -> list[_Rank]:
+    """Guesses in the order in which they count: what is declared before the zeros of states and of algebraic unknowns
+    without a start, and quantities that the model integrates before all others. `others` are declared starts of what is
+    neither state nor unknown."""
     entries = [int(q) for q in (*plan.states, *plan.carried)]
-    n = len(plan.states)
-    ranked = sorted(range(len(entries)), key=lambda k: (guess[k] is None, k >= n, k))
-    rows = [guess[k] or StartRow(plan.quantity_name[entries[k]], entries[k], 1.0, None) for k in ranked]
-    found = [(row, guess[k] is not None and k < n) for row, k in zip(rows, ranked, strict=True)]
-    declared = len(guess) - guess.count(None)
-    return [*found[:declared], *((row, False) for row in others), *found[declared:]]
+    inside = integrated(plan)
+    declared = [*(row for row in guess if row is not None), *others]
+    zeros = [
+        StartRow(plan.quantity_name[q], q, 1.0, None) for q, row in zip(entries, guess, strict=True) if row is None
+    ]
+    states = set(plan.states.tolist())
+    return [
+        _Rank(tuple(row for row in declared if inside[row.quantity]), True),
+        _Rank(tuple(row for row in declared if not inside[row.quantity]), True),
+        _Rank(tuple(row for row in zeros if row.quantity in states), False),
+        _Rank(tuple(row for row in zeros if row.quantity not in states), False),
+    ]
+
+
+def _are_states(ranks: Sequence[_Rank], states: set[int]) -> bool:
+    """True if the guesses that determine the point are those of the states, and of nothing else."""
+    left = set(states)
+    for rank in ranks:
+        quantities = {row.quantity for row in rank.rows}
+        if left and not quantities <= states:
+            return False
+        left -= quantities
+    return True
 
 
 class _Directions:
@@ -292,7 +310,7 @@ class _Directions:
         return True
 
 
-def _by_rank(plan: SystemPlan, generic: _Generic, overrides, fixed, guess, others) -> InitialRows:
+def _by_rank(plan: SystemPlan, generic: _Generic, overrides, fixed, guess, ranks: Sequence[_Rank]) -> InitialRows:
     directions = _Directions(generic)
     kept, independent, dropped, settled = [], [], [], []
     alone = [not directions.open(generic.row(row)) for row in (*overrides, *fixed)]  # whatever is given
@@ -306,25 +324,23 @@ def _by_rank(plan: SystemPlan, generic: _Generic, overrides, fixed, guess, other
         kept.append(row)
         independent.append(closes)
     redundant = tuple(k for k, closes in enumerate(independent) if not closes)
-    candidates = _candidates(plan, guess, others)
-    gradients = [generic.row(dataclasses.replace(row, start=None)) for row, _ in candidates]
-    undecided = [directions.open(gradient) for gradient in gradients]
     soft: list[tuple[StartRow, bool]] = []
-    for (row, is_declared), gradient, is_open in zip(candidates, gradients, undecided, strict=True):
-        if not is_open:
-            continue
-        closes = directions.close(gradient)
-        if closes or is_declared:  # guesses of equal rank share what is open
-            soft.append((row, closes))
+    for rank in ranks:
+        gradients = [generic.row(dataclasses.replace(row, start=None)) for row in rank.rows]
+        undecided = [directions.open(gradient) for gradient in gradients]
+        for row, gradient, is_open in zip(rank.rows, gradients, undecided, strict=True):
+            closes = is_open and directions.close(gradient)
+            if closes or (is_open and rank.shares):
+                soft.append((row, closes))
     if generic.solve_for:
         _check_count(plan, generic, directions, [kept[k] for k in redundant], [*kept, *(row for row, _ in soft)])
     return _chosen(guess, kept, independent, soft, redundant, tuple(settled), dropped)
 
 
-def _by_matching(plan: SystemPlan, generic: _Generic, overrides, fixed, guess, others) -> InitialRows:
+def _by_matching(plan: SystemPlan, generic: _Generic, overrides, fixed, guess, ranks: Sequence[_Rank]) -> InitialRows:
     """The choice of rows for many quantities: a row is independent if it can be matched with a quantity beside the
     equations and the rows before it, and if numbers do not say otherwise."""
-    rows = [*overrides, *fixed, *(row for row, _ in _candidates(plan, guess, others))]
+    rows = [*overrides, *fixed, *(row for rank in ranks for row in rank.rows)]
     hard = len(overrides) + len(fixed)
     n_equations = generic.jacobian.shape[0]
     bare = [row if k < hard else dataclasses.replace(row, start=None) for k, row in enumerate(rows)]

@@ -38,7 +38,7 @@ def unrounded_sizes(
 
 
 def _declared_or_started(model: ReducedModel, parameters: np.ndarray) -> np.ndarray:
-    """Nominal values, and else the first starts that are not zero; zero where there is none."""
+    """Nominal values, and else the largest starts; zero where there is none."""
     size, starts = declared_scale(model), model.flat.variables.start
     v = np.flatnonzero(starts.is_given & (model.variables.quantity >= 0))
     values = starts.values(parameters)
@@ -47,8 +47,7 @@ def _declared_or_started(model: ReducedModel, parameters: np.ndarray) -> np.ndar
     values = np.where(np.abs(values) <= KNOWN * np.abs(moved - values) / MOVED, 0.0, values)
     quantity, value = model.variables.quantity[v], values[v] / model.variables.factor[v]
     tells = np.isfinite(value) & (value != 0.0) & (size[quantity] == 0.0)
-    told, first = np.unique(quantity[tells], return_index=True)
-    size[told] = value[tells][first]
+    np.maximum.at(size, quantity[tells], np.abs(value[tells]))
     return size
 
 

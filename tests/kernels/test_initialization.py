@@ -258,3 +258,63 @@ def test_starts_that_are_nearly_parallel_determine_the_states(e):
     value, slope = jax.value_and_grad(y)(1 + e)
     assert float(value) == pytest.approx(1.0, rel=1e-15 / e)
     assert float(slope) == pytest.approx(1 / e, rel=1e-15 / e)
+
+
+class Drains(Component):
+    """der(x) = −y and y + c·y³ = 2·x − 1, of which also der(y) may be asked."""
+
+    def __init__(self, ev, name, starts, c=0.0, asked=False):
+        super().__init__(ev, name)
+        v = {n: self.variable(n, start=start) for n, start in starts.items()}
+        x, y = v["x"], v["y"]
+        self.add_equations(Eq(der(x), -y), Eq(y + c * y**3, 2 * x - 1))
+        if asked:
+            self.output("slope", der(y))
+
+
+@pytest.mark.parametrize("asked", [False, True])
+@pytest.mark.parametrize("c", [0.0, 0.3])
+@pytest.mark.parametrize("starts, x", [({"x": 0.5, "y": 0.7}, 0.5), ({"x": None, "y": 0.7}, None)])
+def test_what_is_asked_does_not_move_the_start(starts, x, c, asked):
+    """What is asked: with an output der(y), y was a state or could be one, and its guess counted as much as that of x,
+    or more. In a linear block, the zero of x that nobody declared outranked the guess of y, but not with that
+    output."""
+    expected = (0.7 + c * 0.7**3 + 1) / 2 if x is None else x
+    for order in ("xy", "yx"):
+        system = compiled(Drains(EqnEnv(), "c", {n: starts[n] for n in order}, c, asked))
+        found = system.observe(["c.x"], 0.0, system.initialize())
+        assert float(found[0]) == pytest.approx(expected, rel=1e-12)
+
+
+class Coupled(Component):
+    """Two states with a relation between them: one of them is eliminated. The guess nearest to (a, b) is sought."""
+
+    def __init__(self, ev, name, starts):
+        super().__init__(ev, name)
+        v = {n: self.variable(n, start=start) for n, start in starts.items()}
+        x, y, f = v["x"], v["y"], self.variable("f")
+        self.add_equations(Eq(der(x), f - x), Eq(der(y), -2 * y - f), Eq(x - 2 * y, 1))
+
+
+def test_guesses_of_what_is_no_state_count_as_much():
+    """The order of declaration: the first of two variables became the state, and its guess held; the other's did not
+    count. Now the point is the nearest to both."""
+    for order in ("xy", "yx"):
+        system = compiled(Coupled(EqnEnv(), "c", {n: {"x": 0.4, "y": 0.9}[n] for n in order}))
+        assert len(system.states) == 1
+        found = system.observe(["c.x", "c.y"], 0.0, system.initialize())
+        np.testing.assert_allclose(found, [0.88, -0.06], rtol=1e-9)
+
+
+class Equal(Component):
+    def __init__(self, ev, name, order):
+        super().__init__(ev, name)
+        v = {n: self.variable(n, start={"x": 1e-6, "y": 0.9}[n]) for n in order}
+        self.add_equations(Eq(der(v["x"]), -v["x"]), Eq(v["y"], v["x"]))
+
+
+def test_the_size_of_variables_that_are_equal():
+    """The order of declaration: the size was that of the first start."""
+    one, other = (compiled(Equal(EqnEnv(), "c", order)) for order in ("xy", "yx"))
+    np.testing.assert_array_equal(one.typical_sizes, other.typical_sizes)
+    assert float(np.max(one.typical_sizes)) == 1.0
