@@ -64,6 +64,9 @@ from .modeling import pre as pre
 from .modeling import reinit as reinit
 from .modeling import smooth as smooth
 from .modeling import terminate as terminate
+from .programs.compilations import Compilation as Compilation
+from .programs.compilations import compilations as compilations
+from .programs.kept import keep_programs as keep_programs
 from .simulation.saved_state import SavedState as SavedState
 from .simulation.simulate import simulate as simulate
 from .simulation.solution import Solution as Solution

@@ -14,6 +14,7 @@ These things are relied on that have no name of their own, or one that is public
 - that Diffrax lengthens a step to the end of the interval from 100 floating-point numbers before it: `clip_floor`;
 - the classes `JVPTracer` and `LinearizeTracer` of JAX by name, and what tracers wrap: `programs/staging.py`;
 - the attribute `_cached` of what `equinox.filter_jit` returns, the `jax.jit` inside: `clear_jitted`;
+- the attribute `_consts` of a function that `jax.jit` has traced, the values that it closes over: `constants`;
 - that XLA for CPUs does not take a call apart that is marked `inlineable="false"`: `linear/once.py`.
 """
 
@@ -39,6 +40,9 @@ TRIED = {
     "optimistix": ("0.1.0",),
 }
 NAMES = {
+    "serialize_executable": "jax.experimental.serialize_executable.serialize",
+    "deserialize_executable": "jax.experimental.serialize_executable.deserialize_and_load",
+    "Zero": "jax.interpreters.ad.Zero",
     "clip_to_end": "diffrax._integrate._clip_to_end",
     "loop": "diffrax._integrate.loop",
     "SaveState": "diffrax._integrate.SaveState",
@@ -139,6 +143,11 @@ def clear_jitted(function: Any) -> None:
         return cached.clear_cache()
     _warn_once(f"{_versions('equinox')} has no _cached: all of JAX's programs are dropped where one would be enough")
     jax.clear_caches()
+
+
+def constants(traced: Any) -> Any:
+    """The values that a function traced by `jax.jit` closes over, and that its program would need as arguments."""
+    return getattr(traced, "_consts", ())
 
 
 @functools.cache

@@ -25,7 +25,7 @@ from ..linear.whole import solve_whole
 from ..lowering.plan import SystemPlan
 from ..programs.cache import PROGRAMS, compiled
 from ..programs.platform import precisely
-from ..programs.staging import is_staged, is_traced
+from ..programs.staging import is_staged, is_traced, on_device
 from ..system.inputs import read_inputs
 from ..tolerances import solved
 from .given_solver import find_root_with
@@ -165,7 +165,7 @@ def search_outside(
     n, dtype = plan.n_state + len(unknown), system.parameters.values.dtype
 
     def looked(w: Any) -> Any:
-        return _compiled_look(system, t0, inputs, initial, solve_for, jnp.asarray(w))
+        return _compiled_look(system, t0, inputs, initial, solve_for, on_device(w))
 
     first = looked(np.full(n, np.nan, dtype))
     if is_traced(first):  # a network may close over a traced value
@@ -180,7 +180,7 @@ def search_outside(
     core, bounds = independent_rows(plan, rows, n), bounds_of(plan, len(unknown))
     with np.errstate(all="ignore"):  # what is not finite is a rung's failure, as in a program
         root = find_root(look, m, first.w, first.sizes, core, soft, bounds, first.typical)
-    return jax.tree.map(jnp.asarray, root)
+    return jax.tree.map(on_device, root)
 
 
 def known_start(system: Any, t0: Any, inputs: Any, initial: Mapping[str, Any] | None) -> InitialPoint | None:
@@ -324,8 +324,8 @@ def find_initial(
         raise ModelError(f"t0 must be a time, a number; got {t0!r}. Values at the start go to initial={{...}}")
     check_initial(system, initial)
     inputs = read_inputs(system.plan, dtype, inputs)
-    initial = {name: jnp.asarray(v, dtype) for name, v in sorted((initial or {}).items())}
-    arguments = (system, jnp.asarray(t0, dtype), inputs, initial, solve_for)
+    initial = {name: on_device(v, dtype) for name, v in sorted((initial or {}).items())}
+    arguments = (system, on_device(t0, dtype), inputs, initial, solve_for)
     if not is_staged(arguments):
         begun = search_outside(*arguments) if solver is None else None
         found = _compiled(*arguments, solver, begun)

@@ -1,8 +1,7 @@
 """Programs compiled for calls with plain arrays, kept while there is room.
 
 `equinox.filter_jit` keeps every program for ever, also those of models and functions that are gone: its cache refers
-to the functions that it is looked up by. Here each program has a `filter_jit` of its own, which can be let go, with
-the derivatives that JAX compiled of it.
+to the functions that it is looked up by. Here each program can be dropped, with its derivatives and batches.
 """
 
 import functools
@@ -16,12 +15,11 @@ from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 
-from ..private_names import clear_jitted
 from .machine import Use, mappings, memory, return_memory
-from .platform import platform
+from .reasons import reason
 from .staging import is_traced
+from .transformed import Function
 
 # Of the mappings that Linux allows, and of the memory that this process could have. What is left must hold what is
 # compiled until use is measured next: a gradient takes 800 (two states) to 4,500 mappings (double pendulum), 7 %.
@@ -35,55 +33,38 @@ PAUSE = 100  # a measurement takes some 2 µs for each mapping, up to 0.1 s; 1 %
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
-# XLA's older code generator for CPUs makes one kernel of what the newer one makes several. Of the tutorial's pendulum,
-# a program takes 290 mappings, 66 MB and 4.5 s instead of 802, 234 MB and 8.8 s; of a double pendulum 679, 196 MB and
-# 18 s instead of 1,702, 476 MB and 27 s. It runs in the same time (4.4 ms a call), and 1.25 times as long (49 ms): what
-# is saved is spent after some hundred calls. (jax 0.10.2, two cores.)
-_QUICK = {"xla_cpu_use_fusion_emitters": False}
+_ARRAY = object()  # stands where an array was
 
 
-class _CompiledFunction:
-    """A compiled function for certain static values; `calls` counts the calls that have not returned yet."""
+class _Called:
+    """A function for certain static values; `calls` counts the calls that have not returned yet."""
 
-    def __init__(self, function: Callable, runs_once: bool, structure: Any, static: tuple[Any, ...]):
+    def __init__(self, function: Callable, runs_once: bool, structure: Any, static: tuple[Any, ...], why: str):
         def run(arrays: list[Any]) -> Any:
             rest = iter(arrays)
             leaves = [next(rest) if leaf is _ARRAY else leaf for leaf in static]
             args, kwargs = jax.tree.unflatten(structure, leaves)
             return function(*args, **kwargs)
 
-        run.__name__ = run.__qualname__ = getattr(function, "__name__", "run")  # what profiles and errors show
         self.calls = 0
-        self._run = eqx.filter_jit(run)
-        self._run_quick = self._run
-        if runs_once and quick():
-            self._run_quick = eqx.filter_jit(run, compiler_options=quick())  # pyright: ignore[reportCallIssue]
-
-    def __call__(self, arrays: list[Any], traced: bool) -> Any:
-        # JAX takes compiler options for whole programs only, not for what it differentiates, batches or makes a part of
-        # another program: there the arguments are traced, or the outcome would be.
-        if not traced:
-            try:
-                return self._run_quick(arrays)
-            except ValueError as error:
-                if "top-level" not in str(error):
-                    raise
-        return self._run(arrays)
-
-    def clear(self) -> None:
-        """Frees the compiled program, its derivatives by JAX included."""
-        for run in (self._run, self._run_quick):
-            clear_jitted(run)
+        self.function = Function(run, getattr(function, "__name__", "run"), why, runs_once)
 
 
-_ARRAY = object()  # stands where an array was
+def _surroundings(arrays: list[Any]) -> Hashable:
+    """What else decides about a program: where its arrays lie, and JAX's options."""
+    config: Any = jax.config
+    where = frozenset(d for a in arrays if not is_traced(a) for d in a.devices())
+    return (
+        where, config.jax_default_device, config.jax_enable_x64, config.jax_default_matmul_precision,
+        config.jax_numpy_dtype_promotion, config.jax_numpy_rank_promotion,
+    )  # fmt: skip
 
 
 class ProgramCache:
     """Programs by function, structure, static values, shapes and dtypes; the most recently used is the last."""
 
     def __init__(self):
-        self._programs: OrderedDict[Hashable, _CompiledFunction] = OrderedDict()
+        self._programs: OrderedDict[Hashable, _Called] = OrderedDict()
         self._lock = threading.RLock()
         self._next = 0.0  # when use may be measured again, in seconds of `time.perf_counter`
         self._left: dict[Callable, int] = {mappings: 0, memory: 0}  # what freeing left, of each
@@ -97,24 +78,24 @@ class ProgramCache:
         leaves, structure = jax.tree.flatten((args, kwargs))
         arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
         static = tuple(_ARRAY if eqx.is_array(leaf) else leaf for leaf in leaves)
-        key = function, structure, static, tuple(jax.typeof(a) for a in arrays)
-        traced = is_traced(arrays)
+        key = function, structure, static, tuple(jax.typeof(a) for a in arrays), _surroundings(arrays)
         with self._lock:
             program = self._programs.get(key)
             if program is None:
                 self.make_room()
-                program = self._programs[key] = _CompiledFunction(function, runs_once, structure, static)
+                why = reason(key, self._programs)
+                program = self._programs[key] = _Called(function, runs_once, structure, static, why)
             self._programs.move_to_end(key)
             program.calls += 1
         try:
-            outcome = program(arrays, traced)
+            outcome = program.function(arrays)
         finally:
             with self._lock:
                 program.calls -= 1
-        if not traced and is_traced(jax.tree.leaves(outcome)):
+        if not is_traced(arrays) and is_traced(jax.tree.leaves(outcome)):
             # The function closed over a traced value, which is another one at the next call.
             with self._lock:
-                self._programs.pop(key, program).clear()
+                self._programs.pop(key, program).function.clear()
         return outcome
 
     def clear(self) -> None:
@@ -165,7 +146,7 @@ class ProgramCache:
         """Drops the `count` least recently used programs that are not running; returns how many were dropped."""
         idle = [key for key, program in self._programs.items() if not program.calls][: max(count, 0)]
         for key in idle:
-            self._programs.pop(key).clear()
+            self._programs.pop(key).function.clear()
         return len(idle)
 
 
@@ -186,7 +167,7 @@ def compiled(function: Callable[_P, _T], runs_once: bool = True) -> Callable[_P,
     """The function, compiled at the first call for each structure, static values and shapes, as by
     `equinox.filter_jit`. Programs are let go if there are more than the machine has room for.
 
-    `runs_once` says that a program's runs take less time than its compilation does: it is compiled quickly.
+    `runs_once` False says that its runs take more time than any compilation: it is optimized at once (`tiers.py`).
     """
 
     @functools.wraps(function)
@@ -194,17 +175,3 @@ def compiled(function: Callable[_P, _T], runs_once: bool = True) -> Callable[_P,
         return PROGRAMS.call(function, runs_once, args, kwargs)
 
     return call
-
-
-def quick() -> dict[str, bool]:
-    """Options of `jax.jit` for a program of which compilation takes longer than its runs; none on other processors."""
-    return _quick() if platform() == "cpu" else {}
-
-
-@functools.cache
-def _quick() -> dict[str, bool]:
-    try:
-        jax.jit(jnp.negative, compiler_options=_QUICK).lower(0.0).compile()
-    except Exception:  # an XLA without the older code generator: JAX promises no type of error
-        return {}
-    return _QUICK

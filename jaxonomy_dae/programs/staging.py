@@ -1,7 +1,7 @@
 """What tracers tell: whether what is computed now becomes part of a program that somebody else compiles, and how it
 will be differentiated."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
@@ -28,6 +28,24 @@ def is_staged(tree: Any) -> bool:
 def as_array(value: Any) -> Any:
     """Numbers, or lists of numbers, as an array: of NumPy where values are known, so that nothing is compiled."""
     return jnp.asarray(value) if is_traced(value) else np.asarray(value)
+
+
+def on_device(value: Any, dtype: Any = None) -> Any:
+    """A number, or an array, as JAX' array of this type: where values are known, without a program that converts it."""
+    # `jnp.asarray` compiles a program for each shape; `device_put` might share the memory of what it is given.
+    return jnp.asarray(value, dtype) if is_traced(value) else jax.device_put(np.array(value, dtype))
+
+
+def picked(array: Any, place: Any) -> Any:
+    """`array[place]`, by NumPy where values are known, so that nothing is compiled."""
+    return array[place] if is_traced(array) else jax.device_put(np.array(np.asarray(array)[place]))
+
+
+def joined(parts: Sequence[Any]) -> Any:
+    """Arrays joined along their last axis, by NumPy where values are known, so that nothing is compiled."""
+    if is_traced(parts):
+        return jnp.concatenate(parts, axis=-1)
+    return on_device(np.concatenate([np.asarray(part) for part in parts], axis=-1))
 
 
 def is_forwards(tree: Any) -> bool:

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from ..errors import ModelError
 from ..hybrid.problem import HybridState
+from ..programs.staging import on_device
 from ..system.system import AcausalSystem
 
 SHOWN = 12  # events in the text of a log
@@ -31,8 +32,8 @@ class EventLog(eqx.Module):
     @classmethod
     def empty(cls, batch: tuple[int, ...], m: int, dtype: Any) -> "EventLog":
         """The log of runs of a model without events."""
-        none, rows = jnp.zeros((*batch, 0), dtype), jnp.zeros((*batch, 0, m), dtype)
-        return cls(none, none, none, jnp.zeros(batch, dtype), jnp.full(batch, -1.0, dtype), rows, rows)
+        none, rows, zero = (on_device(np.zeros((*batch, *shape), dtype)) for shape in ((0,), (0, m), ()))
+        return cls(none, none, none, zero, on_device(np.full(batch, -1.0, dtype)), rows, rows)
 
     @classmethod
     def of(cls, state: HybridState) -> "EventLog":

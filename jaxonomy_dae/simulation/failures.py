@@ -4,18 +4,21 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ..aliases import Inputs, Result, State, Time, Tolerance
 from ..diagnosis.lost_cancellation import lost_cancellation
 from ..diagnosis.wording import listed, quoted
+from ..errors import SimulationError
 from ..hybrid.rivals import pair_of
 from ..hybrid.solver import CLASH, MOVED, STUCK, TOO_MANY
 from ..lowering.plan import SystemPlan
 from ..model.events import Event
 from ..modeling.event_flags import EventFlag
-from ..programs.members import failed_members
+from ..programs.members import failed_members, is_batched
+from ..programs.staging import is_traced, layers
 from ..solvers.choice_guard import SINGULAR_CHOICE
 from ..solvers.failures import SHOWN, explain_failure, how_it_stopped
 from ..system.inputs import value_at
@@ -42,6 +45,7 @@ REST = (
     "Say how the model rests: a mode in which it stays (complementary(…, rest_speed=…), contacts.HardStop; a discrete "
     "variable that the event assigns and the equations read), or when(…, terminate(…)) before"
 )
+OKAY: Any = (diffrax.RESULTS.successful, diffrax.RESULTS.event_occurred)  # what `diffrax.is_okay` accepts
 PROBES = 64  # times at which inputs are looked at
 
 
@@ -65,12 +69,27 @@ def _codes(result: Result, has_events: bool, max_steps: int, max_events: int) ->
     return number, [*(text for _, text in texts), "it failed"]
 
 
+def is_code(result: Result, *codes: Result) -> bool:
+    """True if a known result is one of the codes."""
+
+    def number(code: Result) -> int:
+        return int(np.asarray(jax.tree.leaves(code)[0]))
+
+    return number(result) in map(number, codes)
+
+
 def raised(x: State, result: Result, has_events: bool, max_steps: int, max_events: int) -> Any:
     """x, with a run-time error if the run failed: in traced runs only a code is known."""
-    number, texts = _codes(result, has_events, max_steps, max_events)
+    values = jax.tree.map(lambda leaf: [*layers(leaf)][-1], result)
+    known = not is_traced(values) and not is_batched(result)  # under `jax.grad` outside of jit
+    if known and is_code(values, *OKAY):
+        return x
+    number, texts = _codes(values if known else result, has_events, max_steps, max_events)
     messages = [
         f"the integration stopped: {text}. simulate(...) outside jit, grad and vmap says where" for text in texts
     ]
+    if known:
+        raise SimulationError(messages[int(number) - 1])
     return eqx.branched_error_if(x, number > 0, jnp.maximum(number - 1, 0), messages)
 
 

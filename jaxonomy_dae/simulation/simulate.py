@@ -17,7 +17,7 @@ from ..initialization.check import check
 from ..initialization.initialize import known_start, search_outside
 from ..programs.cache import PROGRAMS
 from ..programs.members import batch_size, is_batched
-from ..programs.staging import as_array, is_forwards, is_staged, is_traced
+from ..programs.staging import as_array, is_forwards, is_staged, is_traced, on_device, picked
 from ..solvers import BDF, Rodas5P, Tsit5
 from ..solvers.causes import decay_at, is_stiff
 from ..solvers.drive import is_implicit
@@ -28,8 +28,9 @@ from ..system.input_values import check_given
 from ..system.inputs import check_range, read_inputs, step_ends
 from ..system.solver_choice import Choice, Stiffness, implicit_choice, solver_choice
 from ..system.system import AcausalSystem
+from ..system.system_at import SystemAt
 from .arguments import check_arguments, check_parameters, check_switches
-from .failures import explain, failed_in_batch, mode_at_start, raised
+from .failures import OKAY, explain, failed_in_batch, is_code, mode_at_start, raised
 from .from_state import check_state
 from .integration import Given, Options, Outcome, run, run_compiled
 from .preparation import term_of
@@ -169,20 +170,21 @@ def simulate(
     rtol, atol = default_tolerances(rtol, atol, dtype)
     if stepsize_controller is None:
         check_tolerances(rtol, atol, dtype)
-    rtol, atol = jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype)
-    dtmax = None if dtmax is None else jnp.asarray(dtmax, dtype)
+    rtol, atol = on_device(rtol, dtype), on_device(atol, dtype)
+    dtmax = None if dtmax is None else on_device(dtmax, dtype)
     jump_ts = jump_times(jump_ts, dtype)
     # Numbers become arrays, so that another value is not another program.
     if initial is None or isinstance(initial, Mapping):
-        initial = {name: jnp.asarray(v, dtype) for name, v in sorted((initial or {}).items())}
+        initial = {name: on_device(v, dtype) for name, v in sorted((initial or {}).items())}
     else:
-        initial = jax.tree.map(lambda part: jnp.asarray(part, dtype), initial)
+        initial = jax.tree.map(lambda part: on_device(part, dtype), initial)
     duration = None if is_traced((t0, t1)) else float(t1) - float(t0)
-    t0, t1 = jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)
+    t0, t1 = on_device(t0, dtype), on_device(t1, dtype)
     if ts is not None:
-        ts = jnp.asarray(ts, dtype)
+        ts = on_device(ts, dtype)
         if not is_traced((t0, t1, ts)):
-            ts = jnp.asarray(np.clip(ts, t0, t1), dtype)  # `check_arguments` lets rounding pass, Diffrax does not
+            # `check_arguments` lets rounding pass, Diffrax does not.
+            ts = on_device(np.clip(np.asarray(ts), t0, t1), dtype)
     # The solver is chosen here, so that the programs of models that differ in how stiff they are are the same.
     given = Given(dataclasses.replace(system, stiffness=None), t0, t1, ts, inputs, initial)
     staged = is_staged(given)
@@ -240,7 +242,9 @@ def simulate(
             solver = SOLVERS[choice.solver]()
         return in_program(is_staged((given, options(solver))))
     watch = Watch(t1, jnp.asarray(np.divide(scaled_atol(system, atol), rtol), dtype)) if switches else None
-    outcome = run_compiled(given, options(solver), watch, begun=begun)
+    room = _room_for(_expected_events(system, float(t1) - float(t0)))
+    room = room if room * (system.plan.n_state + len(system.discretes)) <= FEW_NUMBERS else ROOM
+    outcome = run_compiled(given, options(solver, room), watch, begun=begun)
     if is_traced(outcome):  # a network may close over a traced value, which shows in the outcome only
         return in_program(staged=True)
     counts = outcome.numbers()
@@ -252,7 +256,7 @@ def simulate(
             check_state(outcome.found)
     if switches:
         stiff = bool(outcome.is_stiff)
-        if outcome.result == diffrax.RESULTS.max_steps_reached:
+        if is_code(outcome.result, diffrax.RESULTS.max_steps_reached):
             there = system if outcome.held is None else system.holding(outcome.held)
             decay = decay_at(term_of(there, implicit=False), inputs, *outcome.last)
             stiff = is_stiff(decay, float(t1 - outcome.last[0]), max_steps)
@@ -261,21 +265,20 @@ def simulate(
             choice = implicit_choice(system.plan, found)
             solver = SOLVERS[choice.solver]()
             before = {"num_explicit_steps": counts["num_steps"], "stiff_from": float(outcome.last[0])}
-            outcome = run_compiled(given, options(solver), None, begun=begun)
+            outcome = run_compiled(given, options(solver, room), None, begun=begun)
             counts = outcome.numbers() | before
-    if outcome.events is not None and max_events is None and outcome.events.count > ROOM:
-        doublings = int(np.ceil(np.log2(float(outcome.events.count) / ROOM)))
-        outcome = run_compiled(given, options(solver, ROOM * 2**doublings), None, begun=begun)
+    if outcome.events is not None and max_events is None and float(outcome.events.count) > room:
+        outcome = run_compiled(given, options(solver, _room_for(float(outcome.events.count))), None, begun=begun)
     saved, x, discrete, memory = outcome.ts, outcome.x, outcome.discrete, outcome.memory
     if ts is None:
         taken = counts["num_accepted_steps"] + 1
-        saved, x, discrete = jax.tree.map(lambda rows: rows[:taken], (saved, x, discrete))
+        saved, x, discrete = jax.tree.map(lambda rows: picked(rows, slice(taken)), (saved, x, discrete))
         memory = memory if memory is None else memory.first(taken)
     solution = Solution(
         saved, x, system, inputs, counts, outcome.result, choice.solver, choice.reason, discrete, outcome.events,
         memory, asked,
     )  # fmt: skip
-    if throw is not False and not bool(diffrax.is_okay(outcome.result)):
+    if throw is not False and not is_code(outcome.result, *OKAY):
         first = t0, outcome.found.x
         held = system.holding(initial.discrete) if isinstance(initial, SavedState) else system
         mode = mode_at_start(held, inputs, *first)
@@ -286,6 +289,22 @@ def simulate(
         text = explain(solution, first, outcome.last, t1, is_implicit(solver), max_steps, most_events, rtol, atol)
         raise SimulationError(text)
     return solution
+
+
+def _expected_events(system: AcausalSystem, duration: float) -> float:
+    """The events that a model with clocks has, if each of its conditions comes true once in every shortest period: so
+    the log of the first run has room for them, and no second program with a larger one is compiled."""
+    events = system.plan.events
+    if events is None or not events.n_clocks:
+        return 0.0
+    at = SystemAt(system.plan, system.numbers, (), 0.0, {}, system.typical_sizes)
+    shortest = float(np.min(np.asarray(at.clocks()[0])))
+    return min(duration / shortest * len(events), MOST_EVENTS)
+
+
+def _room_for(events: float) -> int:
+    """The room of a log for so many events: of few different sizes, each of which is a program."""
+    return ROOM * 2 ** max(int(np.ceil(np.log2(max(events, 1.0) / ROOM))), 0)
 
 
 def _stiff_without_a_run(stiffness: Stiffness | None, duration: float | None) -> str:

@@ -18,7 +18,7 @@ from ..lowering.gather import times
 from ..programs.blocks import at_times, fit
 from ..programs.cache import compiled
 from ..programs.platform import precisely
-from ..programs.staging import is_staged, is_traced
+from ..programs.staging import is_staged, is_traced, on_device, picked
 from ..system.system import AcausalSystem
 from .accounts import account_values, chosen_terms
 from .amplified import amplified, is_looked_at, sentence
@@ -103,15 +103,19 @@ class Solution(eqx.Module):
         n = self.ts.shape[-1]
         if not isinstance(k, Tracer) and not -n <= int(k) < n:
             raise ModelError(f"solution.at({int(k)}): there are {n} saved times")
-        t, x, none = self.ts[..., k], self.states[..., k, :], self.states[..., k, :0]
+
+        def cut(rows: Any, place: Any) -> Any:
+            return rows[place] if isinstance(k, Tracer) else picked(rows, place)
+
+        row = (..., k, slice(None))
+        t, x, none = cut(self.ts, (..., k)), cut(self.states, row), cut(self.states, (..., k, slice(0)))
         if not isinstance(x, Tracer) and x.ndim == 1 and not np.isfinite(x).all():
             raise ModelError(f"solution.at({int(k)}): the run did not get to t={float(t):g} ({self.result})")
         if self.discrete is None or self.memory is None:
             return SavedState(t, x, none, none, none, none)
         memory = self.memory
-        return SavedState(
-            t, x, self.discrete[..., k, :], memory.sides[..., k, :], memory.ticked[..., k, :], memory.sizes
-        )
+        sides, ticked = cut(memory.sides, row), cut(memory.ticked, row)
+        return SavedState(t, x, cut(self.discrete, row), sides, ticked, memory.sizes)
 
     def __getitem__(self, name: Any) -> Any:
         """The values of a variable, or of several: `solution["pend.x"]` has shape `(n,)`, and
@@ -137,7 +141,7 @@ class Solution(eqx.Module):
                 warn_of_members(name, values, self.states)
             return values
         if self.discrete is not None and name in self.system.discretes:
-            return self.discrete[:, self.system.discretes.index(name)]
+            return picked(self.discrete, (slice(None), self.system.discretes.index(name)))
         entries = self.system.plan.entries(name)
         if entries is not None:
             names, shape = entries
@@ -149,26 +153,31 @@ class Solution(eqx.Module):
         given = (self.system, self.ts, self.states, self.inputs, self.discrete)
         if is_staged(given):
             return self._where_reached(_observed(*given, quantity, factor))[:, 0]
-        values, some = _chosen(*given, jnp.asarray(quantity), jnp.asarray(factor, self.states.dtype))
+        values, some = _chosen(*given, on_device(quantity), on_device(factor, self.states.dtype))
         self._look_at((name,), quantity, factor, values, some)
-        return self._where_reached(values)[:, 0]
+        return picked(self._where_reached(values), (slice(None), 0))
 
     def _where_reached(self, values: Any) -> Any:
         """The values, shape (n, k), with not-a-number where they are not finite, and in rows that the run did not
         reach. Constants and functions of time could be evaluated there, too."""
-        reached = jnp.isfinite(self.states).all(axis=-1, keepdims=True)
-        return jnp.where(reached & jnp.isfinite(values), values, jnp.nan)
+        known = not is_traced((self.states, values))
+        xp: Any = np if known else jnp
+        states, values = (np.asarray(self.states), np.asarray(values)) if known else (self.states, values)
+        reached = xp.isfinite(states).all(axis=-1, keepdims=True)
+        found = xp.where(reached & xp.isfinite(values), values, xp.nan)
+        return on_device(found) if known else found
 
     def _state(self, quantity: int, factor: float) -> Any:
         """The values of quantities that are zero or part of the state array; None for others."""
         if quantity < 0:
-            return self._where_reached(jnp.zeros((*self.ts.shape, 1), self.states.dtype))[:, 0]
+            zeros = np.zeros((*self.ts.shape, 1), self.states.dtype)
+            return picked(self._where_reached(zeros), (slice(None), 0))
         plan = self.system.plan
         place = np.flatnonzero(np.concatenate([plan.states, plan.carried]) == quantity)
         if not len(place):
             return None
-        column = self.states[:, int(place[0])]
-        return times(factor, column)
+        column = picked(self.states, (slice(None), int(place[0])))
+        return column if factor == 1 else times(factor, column)
 
     def _look_at(self, names: Sequence[str], quantity: np.ndarray, factor: np.ndarray, values: Any, some: Any) -> None:
         """Outside of jit, refuses variables that are not finite, and warns of those that amplify the tolerances of the
@@ -197,10 +206,12 @@ class Solution(eqx.Module):
         own = {"time": self.ts} if "time" in names else {}
         if self.discrete is not None:
             places = {n: k for k, n in enumerate(self.system.discretes)}
-            own |= {n: self.discrete[:, places[n]] for n in names if n in places}
+            own |= {n: picked(self.discrete, (slice(None), places[n])) for n in names if n in places}
         quantity, factor = self.system.plan.resolve([name for name in names if name not in own])
         given = (self.system, self.ts, self.states, self.inputs, self.discrete)
         inside = _places(self.system, quantity)
+        if not is_traced((given, own)):
+            return self._known_columns(names, own, quantity, factor, inside)
         if inside is not None:
             values = jnp.where(quantity < 0, 0.0, self.states[:, inside] * jnp.asarray(factor, self.states.dtype))
         elif not (quantity >= 0).any():
@@ -210,9 +221,8 @@ class Solution(eqx.Module):
         else:
             n = 1 << (len(quantity) - 1).bit_length()  # numbers of names that share a program
             padded = np.resize(quantity, n), np.resize(factor, n)
-            chosen, some = _chosen(*given, jnp.asarray(padded[0]), jnp.asarray(padded[1], self.states.dtype))
+            chosen, _ = _chosen(*given, jnp.asarray(padded[0]), jnp.asarray(padded[1], self.states.dtype))
             values = jnp.where(quantity < 0, 0.0, chosen[:, : len(quantity)])
-            self._look_at([n for n in names if n not in own], quantity, factor, values, some)
         values = self._where_reached(values)
         if not own:
             return values
@@ -220,6 +230,27 @@ class Solution(eqx.Module):
         others = iter(range(len(own), len(own) + values.shape[-1]))
         order = np.array([place[name] if name in place else next(others) for name in names])
         return jnp.concatenate([jnp.stack([*own.values()], axis=-1), values], axis=-1)[:, order]
+
+    def _known_columns(
+        self, names: tuple[str, ...], own: dict[str, Any], quantity: np.ndarray, factor: np.ndarray, inside: Any
+    ) -> Any:
+        """`_columns` outside of jit, grad and vmap: one program at most."""
+        read = [name for name in names if name not in own]
+        values = np.zeros((*self.ts.shape, len(read)), self.states.dtype)
+        if inside is not None:
+            values = np.asarray(self.states)[:, inside] * factor.astype(values.dtype)
+        elif (quantity >= 0).any():
+            n = 1 << (len(quantity) - 1).bit_length()  # numbers of names that share a program
+            given = (self.system, self.ts, self.states, self.inputs, self.discrete)
+            padded = on_device(np.resize(quantity, n)), on_device(np.resize(factor, n), values.dtype)
+            chosen, some = _chosen(*given, *padded)
+            values = np.asarray(chosen)[:, : len(quantity)]
+            self._look_at(read, quantity, factor, np.where(quantity < 0, 0.0, values), some)
+        values = np.where(quantity < 0, 0.0, values)
+        reached = np.isfinite(np.asarray(self.states)).all(axis=-1, keepdims=True)
+        values = np.where(reached & np.isfinite(values), values, np.nan)
+        columns = dict(zip(read, values.T, strict=True)) | {name: np.asarray(one) for name, one in own.items()}
+        return on_device(np.stack([columns[name] for name in names], axis=-1))
 
     @property
     def events(self) -> Events:
@@ -251,7 +282,8 @@ class Solution(eqx.Module):
     def to_dict(self) -> dict[str, Any]:
         """All variables, and `"time"`, by name."""
         names = ("time", *self)
-        return dict(zip(names, jnp.moveaxis(self._columns(names), -1, 0), strict=True))
+        columns = self._columns(names)
+        return {name: picked(columns, (..., k)) for k, name in enumerate(names)}
 
     def energy(self, component: str | None = None) -> Float[Array, "*batch n"]:
         """The energy stored at the saved times (joule), shape `(n,)`: the sum of all that components declare, or of one

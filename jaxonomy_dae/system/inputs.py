@@ -21,7 +21,7 @@ from ..errors import ModelError, nearest
 from ..lowering.plan import SystemPlan
 from ..model.array_names import regular_shape, wrong_shape
 from ..modeling.networks import uses_numpy, why_untraceable
-from ..programs.staging import as_array
+from ..programs.staging import as_array, is_traced, on_device
 from .closed_function import ClosedFunction, closed_function
 
 KINDS = ("linear", "cubic", "held")
@@ -128,14 +128,16 @@ def _constants(name: str, value: Any, dtype: Any, shape: tuple[int, ...]) -> Any
     if not isinstance(array, Tracer) and not np.isfinite(array).all():
         index = tuple(np.argwhere(~np.isfinite(np.asarray(array)))[0].tolist())
         raise ModelError(f"input '{name}' must be finite; its entry {list(index)} is {array[index]}")
-    return jnp.asarray(array, dtype)
+    return on_device(array, dtype)
 
 
 def _constant(name: str, value: Any, dtype: Any) -> Any:
     if isinstance(value, str):
         raise ModelError(f"input '{name}' must be a number, samples or a function of time; got the text {value!r}")
     try:
-        array = jnp.asarray(value)
+        array = jnp.asarray(value) if is_traced(value) else np.asarray(value)
+        if array.dtype.kind not in "biufcV":  # V: numbers of eight bits and the like
+            raise TypeError
     except (TypeError, ValueError):
         raise ModelError(
             f"input '{name}' must be a number, samples or a function of time; got {type(value).__name__}. For samples "
@@ -152,7 +154,7 @@ def _constant(name: str, value: Any, dtype: Any) -> Any:
         )
     if not isinstance(array, Tracer) and not np.isfinite(array):
         raise ModelError(f"input '{name}' must be finite; got {array}")
-    return array.astype(dtype)
+    return on_device(array, dtype)
 
 
 # --- functions -----------------------------------------------------------------------------------------------------

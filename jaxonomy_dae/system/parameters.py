@@ -17,6 +17,8 @@ from ..model.array_names import ArrayNames
 from ..model.tables import DependentParameters, complete
 from ..modeling.interval import Interval, closed_ends
 from ..modeling.real_number import is_unknown_to_jax, real_number
+from ..programs.cache import compiled
+from ..programs.staging import is_staged, is_traced, on_device, picked
 from .bounds import Ends
 from .sections import HTML_SHOWN, SHOWN
 
@@ -74,8 +76,13 @@ class ParameterNames:
         return sorted(found)
 
     def complete(self, array: Any) -> Any:
-        """All values, shape (*batch, n), with the dependent ones computed from the others."""
-        return complete(self.dependents, array)
+        """All values, shape (*batch, n), with the dependent ones computed from the others: by NumPy where they are
+        known."""
+        if not self.dependents or isinstance(array, np.ndarray) or is_staged(array):
+            return complete(self.dependents, array)
+        if is_traced(array):
+            return _completed(self, array)
+        return on_device(complete(self.dependents, np.array(array)))
 
     def given(self, chosen: np.ndarray) -> "ParameterNames":
         """A copy of the table in which these parameters are given even where they were computed from others."""
@@ -167,7 +174,7 @@ class Parameters(eqx.Module):
         entries = self.table.entries(name)
         if entries is not None:
             if not self.free_index:
-                return self.array[..., entries]
+                return picked(self.array, (..., entries))
             parts = [self[self.table.names[k]] for k in entries.ravel().tolist()]
             return jnp.stack(parts, axis=-1).reshape(*parts[0].shape, *entries.shape)
         k = self.table.index(name)
@@ -177,7 +184,7 @@ class Parameters(eqx.Module):
                     f"parameter '{name}' is {self.table.expressions[k]}, which a part of a partitioned system cannot "
                     "compute: join both with equinox.combine"
                 )
-            return self.array[..., k]
+            return picked(self.array, (..., k))
         if k in self.free_index:
             part, place = self.free, self.free_index.index(k)
         else:
@@ -186,7 +193,7 @@ class Parameters(eqx.Module):
             raise ModelError(
                 f"parameter '{name}' is in the other part of a partitioned system: join both with equinox.combine"
             )
-        return part[..., place]
+        return picked(part, (..., place))
 
     def __contains__(self, name: object) -> bool:
         return isinstance(name, str) and (name in self.table._index or self.table.entries(name) is not None)
@@ -200,7 +207,7 @@ class Parameters(eqx.Module):
     def items(self) -> list[tuple[str, Any]]:
         """Pairs of name and value."""
         array = self.array
-        return [(name, array[..., k]) for k, name in enumerate(self.table.names)]
+        return [(name, picked(array, (..., k))) for k, name in enumerate(self.table.names)]
 
     def merged(self) -> "Parameters":
         """The values with nothing set apart."""
@@ -227,22 +234,25 @@ class Parameters(eqx.Module):
             raise ModelError(f"parameters are given by names, {{'m.k': 2.0}}; got {type(new).__name__}")
         array = self.array
         batch = array.shape[:-1]
-        for name, entries in self.table.chosen(new).items():
+        chosen = self.table.chosen(new)
+        given: dict[str, Any] = {}
+        for name, entries in chosen.items():
             value = new[name]
             if entries.ndim:
                 value = np.asarray(value) if isinstance(value, list | tuple) else value
                 value = self._checked_array(name, entries, value, batch)
             else:
                 value = self._checked(int(entries), value, batch)
-            value = jnp.asarray(value, array.dtype)
-            if isinstance(value, Tracer):
-                value = _inside(value, self.table.ends.take(entries))
-            array = array.at[..., entries].set(value)
-        array = self.table.complete(array)
-        if isinstance(array, Tracer):
-            chosen = np.array(list(self.table.expressions), np.int64)
-            ends = self.table.ends.take(chosen)
-            array = array if ends.are_none else array.at[..., chosen].set(_inside(array[..., chosen], ends))
+            given[name] = value
+        if is_staged((array, given)):
+            array = _with_values(self.table, array, given)
+        elif is_traced((array, given)):
+            array = _set(self.table, array, {n: v if is_traced(v) else on_device(v) for n, v in given.items()})
+        else:
+            array = np.array(array)
+            for name, value in given.items():
+                array[..., chosen[name]] = np.asarray(value)
+            array = on_device(complete(self.table.dependents, array))
         changed = Parameters(array, None, (), self.table)
         problem = changed.problem
         if problem is not None:
@@ -357,6 +367,32 @@ class Parameters(eqx.Module):
         shown = [f"{name}={apart.get(k) or _text(array[..., k])}" for k, name in enumerate(self.table.names[:SHOWN])]
         batch = f"batch of shape {array.shape[:-1]}: " if array.ndim > 1 else ""
         return f"Parameters({batch}{_some(shown, len(self))})"
+
+
+def _with_values(table: ParameterNames, array: Any, given: Mapping[str, Any]) -> Any:
+    """All values with those given, where some are traced: what is out of its bounds becomes not-a-number."""
+    for name, entries in table.chosen(given).items():
+        value = jnp.asarray(given[name], array.dtype)
+        if isinstance(value, Tracer):
+            value = _inside(value, table.ends.take(entries))
+        array = array.at[..., entries].set(value)
+    array = complete(table.dependents, array)
+    if isinstance(array, Tracer):
+        chosen = np.array(list(table.expressions), np.int64)
+        ends = table.ends.take(chosen)
+        array = array if ends.are_none else array.at[..., chosen].set(_inside(array[..., chosen], ends))
+    return array
+
+
+@compiled
+def _set(table: ParameterNames, array: Any, given: dict[str, Any]) -> Any:
+    """`_with_values` under `jax.grad` and `jax.vmap` outside of jit: one program."""
+    return _with_values(table, array, given)
+
+
+@compiled
+def _completed(table: ParameterNames, array: Any) -> Any:
+    return complete(table.dependents, array)
 
 
 def _inside(values: Any, ends: Ends) -> Any:

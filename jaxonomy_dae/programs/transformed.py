@@ -1,0 +1,207 @@
+"""A function of arrays that is compiled where values are known, and so are its derivatives and its batches.
+
+Under `jax.grad` and `jax.vmap` outside of jit, JAX would compile the derivative or the batch of a compiled function
+with all optimizations. Here both are functions of arrays again, and are compiled as the function itself is. The
+derivative in reverse mode is two programs: the values and all that the pullback needs, and the pullback. Whatever else
+is at work (`jax.jvp`, `jax.jit` around, arrays on several devices, `jax.debug_nans`), JAX transforms the function.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..private_names import clear_jitted, private
+from .staging import is_staged, is_traced, layers
+from .tiers import Program
+
+
+class Function:
+    """`function(arrays)`, which returns any pytree, for arrays of certain shapes.
+
+    - `name`: what profiles and records show; `why`: what made it necessary.
+    - `runs_once`: its runs are expected to take less time than its compilation does.
+    """
+
+    def __init__(self, function: Callable[[list[Any]], Any], name: str, why: str, runs_once: bool):
+        def run(arrays: list[Any]) -> Any:
+            return function(arrays)
+
+        run.__name__ = run.__qualname__ = name
+        self.function, self.name, self.why, self.runs_once = function, name, why, runs_once
+        self._transformed: Any = eqx.filter_jit(run)  # for what JAX transforms
+        self._program: Program | None = None
+        self._derived: dict[Any, Function] = {}
+
+    def __call__(self, arrays: list[Any]) -> Any:
+        arrays = [a if isinstance(a, jax.Array) else jax.device_put(a) for a in arrays]  # JAX' own kind of float
+        kind = _at_work(arrays)
+        if kind == "LinearizeTracer":
+            return self._differentiated(arrays)
+        if kind == "BatchTracer":
+            return self._batched(arrays)
+        if kind or not _is_plain(arrays):
+            return self._transformed(arrays)
+        if self._program is None:
+            self._program = Program(self.function, arrays, self.name, self.why, self.runs_once)
+        return self._program(arrays) if self._program.stands_alone else self._transformed(arrays)
+
+    def clear(self) -> None:
+        """Frees what was compiled."""
+        clear_jitted(self._transformed)
+        self._program = None
+        for one in self._derived.values():
+            one.clear()
+        self._derived.clear()
+
+    def _derive(self, key: Any, function: Callable[[list[Any]], Any], name: str) -> "Function":
+        if key not in self._derived:
+            self._derived[key] = Function(function, name, self.why, self.runs_once)
+        return self._derived[key]
+
+    def _differentiated(self, arrays: list[Any]) -> Any:
+        """The outcome in reverse mode, with respect to the arrays that are traced."""
+        chosen = tuple(
+            k for k, a in enumerate(arrays) if is_traced(a) and jnp.issubdtype(a.dtype, jnp.inexact)
+        )  # fmt: skip
+        values = self._derive(("values", chosen), lambda arrays: _values(self.function, chosen, arrays), self.name)
+        shape: list[Any] = []  # what the outcome is, beside its arrays
+
+        @jax.custom_vjp
+        def call(*arrays: Any) -> Any:
+            return forward(*arrays)[0]
+
+        def forward(*arrays: Any) -> Any:
+            smooth, rest, pullback = values([*arrays])
+            shape[:] = [rest]
+            leaves, structure = jax.tree.flatten(pullback)
+            return smooth, _Residuals(leaves, structure)
+
+        def backward(residuals: _Residuals, cotangents: list[Any]) -> Any:
+            # A cotangent that is zero throughout belongs to an outcome that is not read.
+            read = tuple(_is_nonzero(c) for c in cotangents)
+            leaves, structure = residuals.leaves, residuals.structure
+            n = len(leaves)
+
+            def pulled(arrays: list[Any]) -> list[Any]:
+                pullback = jax.tree.unflatten(structure, arrays[:n])
+                given = iter(arrays[n:])
+                return list(pullback([next(given) if r else z() for r, z in zip(read, zeros, strict=True)]))
+
+            zeros = [_zero_like(c) for c in cotangents]
+            transpose = values._derive(("pullback", read, structure), pulled, f"gradient of {self.name}")
+            found = iter(transpose([*leaves, *(c for c, r in zip(cotangents, read, strict=True) if r)]))
+            return tuple(next(found) if k in chosen else None for k in range(len(arrays)))
+
+        call.defvjp(forward, backward)
+        smooth = call(*arrays)
+        return _combined(smooth, shape[0])
+
+    def _batched(self, arrays: list[Any]) -> Any:
+        """The outcome under one `jax.vmap` of known values."""
+        axes = [getattr(a, "batch_dim", None) for a in arrays]
+        values = [[*layers(a)][-1] for a in arrays]
+        k = next(k for k, axis in enumerate(axes) if axis is not None)
+        size = values[k].shape[axes[k]]
+
+        def many(arrays: list[Any]) -> Any:
+            fixed: list[Any] = []
+
+            def one(*arrays: Any) -> Any:
+                moving, rest = eqx.partition(self.function([*arrays]), eqx.is_array)
+                fixed[:] = [rest]
+                return moving
+
+            return jax.vmap(one, in_axes=axes, axis_size=size)(*arrays), fixed[0]
+
+        moving, rest = self._derive(("batch", size, tuple(axes)), many, f"batch of {self.name}")(values)
+
+        @jax.custom_batching.custom_vmap
+        def member(_: Any) -> Any:
+            return jax.tree.map(lambda rows: jnp.zeros(rows.shape[1:], rows.dtype), moving)
+
+        @member.def_vmap
+        def members(size: int, is_batched: Any, _: Any) -> Any:
+            return moving, jax.tree.map(lambda rows: True, moving)
+
+        return eqx.combine(member(arrays[k]), rest)
+
+
+class _Residuals(eqx.Module):
+    """The arrays of a pullback, and its structure."""
+
+    leaves: list[Any]
+    structure: Any = eqx.field(static=True)
+
+
+def _values(function: Callable[[list[Any]], Any], chosen: tuple[int, ...], arrays: list[Any]) -> Any:
+    """The inexact arrays of the outcome in a list, the outcome without them, and the pullback."""
+
+    def of(*moved: Any) -> Any:
+        given = list(arrays)
+        for k, value in zip(chosen, moved, strict=True):
+            given[k] = value
+        smooth, rest = eqx.partition(function(given), eqx.is_inexact_array)
+        others, fixed = eqx.partition(rest, eqx.is_array)
+        shape[:] = [jax.tree.structure(smooth), fixed]
+        return jax.tree.leaves(smooth), others
+
+    shape: list[Any] = []
+    smooth, pullback, others = jax.vjp(of, *(arrays[k] for k in chosen), has_aux=True)
+    structure, fixed = shape
+    return smooth, (_Static(structure), eqx.combine(others, fixed)), pullback
+
+
+class _Static(eqx.Module):
+    """A structure that passes through compiled programs."""
+
+    structure: Any = eqx.field(static=True)
+
+
+def _combined(smooth: list[Any], rest: tuple[_Static, Any]) -> Any:
+    return eqx.combine(jax.tree.unflatten(rest[0].structure, smooth), rest[1])
+
+
+_SOMETHING = np.zeros((), bool)
+
+
+def _at_work(arrays: list[Any]) -> str:
+    """The kind of tracer that wraps the others, if these wrap values; "other" if that is not one of two that are
+    dealt with, or cannot be told; "" if nothing is traced."""
+    if not is_traced(arrays):
+        return ""
+    if is_staged(arrays):
+        return "other"
+    kinds = [tuple(type(layer).__name__ for layer in layers(a))[:-1] for a in arrays]
+    deepest = max(kinds, key=len)
+    # All others must be wrapped by the same, or by what it wraps.
+    if any(kind != deepest[len(deepest) - len(kind) :] and kind[:1] != deepest[:1] for kind in kinds):
+        return "other"
+    if deepest[0] == "LinearizeTracer" or deepest == ("BatchTracer",):
+        return deepest[0]
+    return "other"
+
+
+def _is_plain(arrays: list[Any]) -> bool:
+    """True if a program may be called as it is: arrays lie on one device, and nothing asks JAX for more checks."""
+    config: Any = jax.config
+    if config.jax_disable_jit or config.jax_debug_nans or config.jax_debug_infs or config.jax_check_tracer_leaks:
+        return False
+    if len({d for a in arrays for d in a.devices()}) > 1:
+        return False
+    # Inside another program, what is computed becomes a part of it, also where no argument is traced.
+    return not is_staged(jax.device_put(_SOMETHING))
+
+
+def _is_nonzero(cotangent: Any) -> bool:
+    return is_traced(cotangent) or bool(np.any(np.asarray(cotangent)))
+
+
+def _zero_like(cotangent: Any) -> Callable[[], Any]:
+    """Makes the cotangent of what is not read: not an array of zeros, which would be computed with, and times infinity
+    is not a number."""
+    kind = jax.typeof(cotangent)
+    return lambda: private("Zero")(kind)
