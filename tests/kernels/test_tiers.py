@@ -178,6 +178,7 @@ def test_programs_that_call_python_are_not_kept(tiered, folder):
 
 LEAVE = """
 import jax, jax.numpy as jnp
+jax.config.update("jax_enable_compilation_cache", False)
 from jaxonomy_dae.programs import tiers
 from jaxonomy_dae.programs.cache import ProgramCache
 tiers._chosen_by_the_user = lambda: False
@@ -193,10 +194,11 @@ if WAITS:
     (called,) = programs._programs.values()
     called.function._program._spent = 1e6
     programs.call(many, True, (jnp.ones(3),), {})
-    print("optimizing", len(tiers._THREADS))
+    print("optimizing", sum(thread.is_alive() for thread in tiers._THREADS))
 """
 
 
+@pytest.mark.long("two processes that import JAX")
 @pytest.mark.parametrize("waits", [False, True])
 def test_the_interpreter_leaves_cleanly(waits):
     """A script that ends after its second call has nothing to wait for; one that ends while XLA optimizes waits for it,
