@@ -44,7 +44,7 @@ def compiler(ev: EqnEnv, *parts: Component, connect: list[tuple[Any, ...]]) -> A
 
 def rod_on_a_pin() -> AcausalCompiler:
     ev = EqnEnv()
-    world, pin = pl.World(ev, "world"), pl.Revolute(ev, "pin", initial_phi=0.5, initial_omega=0.0)
+    world, pin = pl.World(ev, "world"), pl.Revolute(ev, "pin", initial_angle=0.5, initial_speed=0.0)
     rod = pl.MassiveLink(ev, "rod", 1.0)
     return compiler(ev, world, pin, rod, connect=[(world.frame, pin.frame_a), (pin.frame_b, rod.frame_a)])
 
@@ -54,10 +54,10 @@ def four_bar() -> AcausalCompiler:
     ev = EqnEnv()
     west, east = pl.World(ev, "west"), pl.World(ev, "east", 2.0)
     crank = pl.MassiveLink(ev, "crank", 0.8)
-    coupler = pl.MassiveLink(ev, "coupler", 1.9, m=0.6, guess_phi=0.3)
-    rocker = pl.MassiveLink(ev, "rocker", 1.5, m=1.5, guess_phi=1.7)
+    coupler = pl.MassiveLink(ev, "coupler", 1.9, m=0.6, guess_angle=0.3)
+    rocker = pl.MassiveLink(ev, "rocker", 1.5, m=1.5, guess_angle=1.7)
     pins = [
-        pl.Revolute(ev, "j1", initial_phi=1.0, initial_omega=5.0), *(pl.Revolute(ev, f"j{k}") for k in (2, 3, 4))
+        pl.Revolute(ev, "j1", initial_angle=1.0, initial_speed=5.0), *(pl.Revolute(ev, f"j{k}") for k in (2, 3, 4))
     ]  # fmt: skip
     return compiler(
         ev, west, east, crank, coupler, rocker, *pins,
