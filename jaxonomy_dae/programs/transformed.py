@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..private_names import clear_jitted, private
+from ..private_names import MissingName, clear_jitted, private
 from .staging import is_staged, is_traced, layers
 from .tiers import Program
 
@@ -203,5 +203,9 @@ def _is_nonzero(cotangent: Any) -> bool:
 def _zero_like(cotangent: Any) -> Callable[[], Any]:
     """Makes the cotangent of what is not read: not an array of zeros, which would be computed with, and times infinity
     is not a number."""
-    kind = jax.typeof(cotangent)
-    return lambda: private("Zero")(kind)
+    kind, shape, dtype = jax.typeof(cotangent), cotangent.shape, cotangent.dtype
+    try:
+        zero = private("Zero")
+    except MissingName:
+        return lambda: jnp.zeros(shape, dtype)
+    return lambda: zero(kind)
