@@ -66,7 +66,7 @@ def panels(axes: Any, true: Any, data: Any, runs: dict[str, Any], laws: dict[str
     pull.plot(t, np.asarray(study.tension(runs["learned"]))[:SHOWN], color=learned, lw=1.8)
     pull.set(xlabel="Time / s", ylabel="Pull of the rod / N")
 
-    titles = ("Physics, with a gap", "Trained on positions", "The law comes out,", "a force never measured")
+    titles = ("Physics, with a gap", "Trained on positions", "The law it learned", "A force never measured")
     dress(axes, titles, ink, faint)
 
 
