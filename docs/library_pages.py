@@ -14,6 +14,7 @@ from typing import Any
 
 import jax
 import sympy
+from library_latex import displayed
 from sympy.printing.str import StrPrinter
 
 import jaxonomy_dae.library
@@ -40,6 +41,7 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
 }
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 TITLE = "Library"
+WIDTH = 80  # letters in a line of code at 1280 px
 
 
 # --- what there is -----------------------------------------------------------------------------------------------
@@ -208,13 +210,6 @@ def text_of(expression: Any) -> str:
     return Printer().doprint(sympy.sympify(expression))
 
 
-def equation_text(equation: Any) -> str:
-    if isinstance(equation, sympy.Eq):
-        return f"{text_of(equation.lhs)} = {text_of(equation.rhs)}"
-    text = text_of(equation)
-    return f"0 = {text.removeprefix('(').removesuffix(')') if isinstance(equation, sympy.Piecewise) else text}"
-
-
 def event_text(condition: Any, actions: Iterable[Any], on: Any) -> str:
     if isinstance(condition, Sampled):
         offset = f", from {text_of(condition.offset)} on" if condition.offset else ""
@@ -267,12 +262,10 @@ def component_section(cls: type[Component]) -> list[str]:
         component = make(cls)
     signature = inspect.signature(cls.__init__)
     given = [p for p in signature.parameters.values() if p.name not in ("self", "ev", "name")]
-    arguments = "".join(
-        f", {p.name}" + ("" if p.default is p.empty else f"={p.default!r}")
-        for p in given
-        if p.kind is not p.VAR_KEYWORD
-    )
-    lines = [f"## {cls.__name__}", "", "```python", f"{cls.__name__}(ev, name{arguments})", "```", ""]
+    arguments = [
+        p.name + ("" if p.default is p.empty else f"={p.default!r}") for p in given if p.kind is not p.VAR_KEYWORD
+    ]
+    lines = [f"## {cls.__name__}", "", "```python", *call_text(cls.__name__, ["ev", "name", *arguments]), "```", ""]
     lines += [inspect.getdoc(cls) or "", ""]
     lines += [_ports_text(component), ""]
     lines += table(
@@ -292,9 +285,9 @@ def component_section(cls: type[Component]) -> list[str]:
             *((code(p.name), "discrete", p.unit, _value_text(p.value)) for p in discrete),
         ],
     )
-    own = [equation_text(equation) for owner, equation in equations if owner is component]
+    own = [equation for owner, equation in equations if owner is component]
     if own:
-        lines += ["```text", *own, "```", ""]
+        lines += displayed(own)
     happens = [event_text(*event) for owner, *event in events if owner is component]
     if happens:
         lines += ["Events:", "", "```text", *happens, "```", ""]
@@ -304,6 +297,18 @@ def component_section(cls: type[Component]) -> list[str]:
         joined = [" — ".join(_end_text(component, end) for end in c.ends) for c in component.connections]
         lines += ["```text", *joined, "```", ""] if joined else []
     return lines
+
+
+def call_text(name: str, arguments: list[str]) -> list[str]:
+    """A call in lines of at most `WIDTH` letters."""
+    lines, whole = [""], f"{name}({', '.join(arguments)})"
+    if len(whole) <= WIDTH:
+        return [whole]
+    for argument in arguments:
+        if len(f"{lines[-1]} {argument},") + 4 > WIDTH:
+            lines.append("")
+        lines[-1] = f"{lines[-1]} {argument},".strip()
+    return [f"{name}(", *(f"    {line}" for line in lines), ")"]
 
 
 def _ports_text(component: Component) -> str:

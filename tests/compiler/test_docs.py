@@ -6,7 +6,8 @@ import pathlib
 import re
 
 import pytest
-from library_pages import classes_of, components_of, domains, equation_text, overview, text_of
+from library_latex import equation, name_text
+from library_pages import classes_of, components_of, domains, overview, text_of
 from library_pages import page as write_page
 from sympy import Abs, Eq, Max, Piecewise, Rational, Symbol, exp, pi, sqrt, symbols
 
@@ -80,7 +81,7 @@ def test_pages_have_what_components_declare(domain):
         names = [*component.parameters, *(n for n, v in component.variables.items() if v.kind not in hidden)]
         for name in (*names, *component.ports, *component.children):
             assert f"`{name}`" in section
-        assert "```text" in section and "Piecewise" not in section and ":relation" not in section
+        assert (r"\[" in section or "```text" in section) and "Piecewise" not in section and ":relation" not in section
         assert "**" not in re.sub(r"\*\*(Arguments|Raises):\*\*", "", section)
 
 
@@ -97,18 +98,20 @@ def test_a_section():
         "| `C` | `1` | F | > 0 |\n| `initial_voltage` | `0` | V |  |\n\n"
         "| Variable | Unit | Start |\n| --- | --- | --- |\n"
         "| `v` | V | `initial_voltage` (a guess) |\n| `i` | A |  |\n\n"
-        "```text\nv = p.v − n.v\ni = p.i\nn.i + p.i = 0\nC·der(v) = i\n```\n\n"
+        "\\[\n\\begin{aligned}\nv &= v_{\\mathrm{p}} - v_{\\mathrm{n}} \\\\\n"
+        "i &= i_{\\mathrm{p}} \\\\\ni_{\\mathrm{n}} + i_{\\mathrm{p}} &= 0 \\\\\n"
+        "C \\, \\dot{v} &= i\n\\end{aligned}\n\\]\n\n"
     )
 
 
 def test_events_and_parts():
     electrical = page("electrical")
     assert "when u > threshold, while closed = 0: closed becomes 1" in electrical
-    assert "0 = v − Ron·i if closed = 1, i − Goff·v otherwise" in electrical
+    assert r"0 &= \begin{cases} v - \mathrm{Ron} \, i & \text{for}\: \mathrm{closed} = 1" in electrical
     assert "| `inductor` | Inductor |" in electrical and "inductor.n — emf.p" in electrical
     signal = page("signal")
     assert "every period seconds: held becomes u" in signal
-    assert "y = height·(1 if t ≥ start_time, 0 otherwise) + offset" in signal
+    assert r"1 & \text{for}\: t \geq \mathrm{start\_time} \\0 & \text{otherwise}" in signal
 
 
 a, b, x = symbols("a b x", real=True)
@@ -141,8 +144,8 @@ def test_expressions_as_text(expression, text):
 
 
 def test_equations_as_text():
-    assert equation_text(Eq(a, b)) == "a = b"
-    assert equation_text(a - b) == "0 = a − b"
+    assert equation(Eq(a, b)) == "a &= b"
+    assert equation(a - b) == "0 &= a - b"
 
 
 def test_the_gallery_has_an_overview():
@@ -179,3 +182,32 @@ def test_first_pages_have_short_sentences(page):
         words = re.sub(r"`[^`]*`", "code", " ".join(paragraph.split()))
         for sentence in re.split(r"(?<=[.!?:;])\s+", "" if words.startswith(("|", "#", "!")) else words):
             assert len(sentence.split()) <= 30, sentence
+
+
+@pytest.mark.parametrize(
+    "path, written",
+    [
+        ("v", "v"),
+        ("p.v", r"v_{\mathrm{p}}"),
+        ("phi_rel", r"\phi_{\mathrm{rel}}"),
+        ("R0", r"R_{\mathrm{0}}"),
+        ("flange_a.tau", r"\tau_{\mathrm{flange\_a}}"),
+        ("initial_angle", r"\mathrm{initial\_angle}"),
+    ],
+)
+def test_names_in_equations(path, written):
+    assert name_text(path) == written
+
+
+def test_equations_of_components_are_formulas_that_close():
+    """Braces and brackets of LaTeX are balanced in every equation of the library, and nothing is left of Python's names
+    for hidden variables."""
+    for domain in domains():
+        text = page(domain)
+        formulas = re.findall(r"\\\[\n(.*?)\n\\\]", text, re.S)
+        assert formulas or domain == "contacts"
+        for formula in formulas:
+            plain = formula.replace(r"\{", "").replace(r"\}", "")
+            assert plain.count("{") == plain.count("}"), formula
+            assert formula.count(r"\left") == formula.count(r"\right"), formula
+            assert not re.search(r":(?!\s|})", formula.replace(r"\:", "")), formula
