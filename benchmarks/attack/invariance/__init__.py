@@ -5,7 +5,7 @@ said of it by one of the letters:
 
 - a, process: alone in a fresh process, or after a twin that differs in one argument of one declaration;
 - b, mode: eager, jit, vmap, a loop, inside a gradient, members of a batch that fail included;
-- c, order: declarations in any order, other names;
+- c, order: declarations and connections in any order, other names;
 - d, continuation: a run that goes on from a saved state;
 - e, units: all in other units, sizes from 1e-18 to 1e12;
 - f, records: how they are cut, padded, repeated, ordered and put together, of linear models of their own;
@@ -17,14 +17,16 @@ said of it by one of the letters:
 from collections.abc import Callable
 
 from ..outcome import Outcome
-from . import continuation, modes, points, process, records, solvers
+from . import connections, continuation, modes, points, process, records, solvers
 from .said import Pairs
 
 MOVING = 5  # every so many-th model is run, where a point would do
 LETTERS: dict[str, Callable[[int], Pairs]] = {
     "a": process.process,
     "b": modes.modes,
-    "c": lambda number: points.order(number, number % MOVING == 0),
+    "c": lambda number: (
+        connections.connections(number) if number % 4 == 3 else points.order(number, number % MOVING == 0)
+    ),
     "d": continuation.continuation,
     "e": lambda number: points.units(number, number % MOVING == 1),
     "f": records.written,
