@@ -21,6 +21,7 @@ from ..programs.members import failed_members, is_batched
 from ..programs.staging import is_traced, layers
 from ..solvers.choice_guard import SINGULAR_CHOICE
 from ..solvers.failures import SHOWN, explain_failure, how_it_stopped
+from ..solvers.switching import STIFF
 from ..system.inputs import value_at
 from ..system.system import AcausalSystem
 from ..tolerances import CONSISTENT
@@ -59,6 +60,7 @@ def _codes(result: Result, has_events: bool, max_steps: int, max_events: int) ->
         (codes.dt_min_reached, "no step was short enough to be accepted"),
         (TOO_MANY, many),
         (STUCK, "an event happens, or a relation turns, again and again at one instant"),
+        (STIFF, f"the system is stiff, and max_steps={max_steps} hardly suffice: use solver=Rodas5P() or BDF()"),
         (CLASH, "two events give one variable different values at one instant"),
         (NOT_ADMITTED, TEXT),
         (SINGULAR_CHOICE, "the states have become a singular choice"),
@@ -125,6 +127,12 @@ def explain(
         return _stuck(solution, int(log.stuck), float(t), MOVED * float(resolution(t0, t1)))
     if log is not None and solution.result == CLASH:
         return _clash(solution, int(log.stuck), float(t))
+    if solution.result == STIFF:
+        return (
+            f"the integration stopped at t={float(t):.6g}: the system is stiff. From there on stability, not accuracy, "
+            f"limits explicit steps, so that max_steps={max_steps} hardly suffice to t={float(t1):g}. Write "
+            "solver=jaxonomy_dae.solvers.Rodas5P(), BDF() for many unknowns, or leave solver= out"
+        )
     written, others = _not_finite(system, x)
     if others and not written and not system.is_constrained and system.plan.held is None:
         return singular_mode(system, first, (t, x), inputs) + _of_short_circuits(system)

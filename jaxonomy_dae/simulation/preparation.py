@@ -66,8 +66,10 @@ def prepared(
     How far a projection moves counts as an error of the step, so that steps which end where the constraints have no
     solution are rejected. Where steps are not `judged` by their errors, the projection itself must converge.
     """
+    if type(solver) is diffrax.Tsit5 and watch is not None:
+        solver = Tsit5(solver.scan_kind)
     if isinstance(solver, Tsit5) and watch is not None:
-        solver = Tsit5(looped=solver.looped, watch=watch)
+        solver = dataclasses.replace(solver, watch=watch)
     # A minimal set of states may become a singular choice on the way.
     guard = ChoiceGuard(system.dummy_determinants, atol) if system.plan.dummy_blocks else None
     project = system.project if judged else _converged(system)

@@ -23,7 +23,7 @@ from ..solvers.causes import decay_at, is_stiff
 from ..solvers.drive import is_implicit
 from ..solvers.solve import check_tolerances, default_tolerances
 from ..solvers.solve_arguments import jump_times
-from ..solvers.switching import BOUNDARY, MANY, Watch
+from ..solvers.switching import BOUNDARY, MANY, SHARE, Watch
 from ..system.input_values import check_given
 from ..system.inputs import check_range, read_inputs, step_ends
 from ..system.solver_choice import Choice, Stiffness, implicit_choice, solver_choice
@@ -220,14 +220,21 @@ def simulate(
     else:
         choice = Choice(type(solver).__name__, "as asked for", final=True)
 
+    def watch(traced: bool) -> Watch | None:
+        # Where the default cannot be replaced, it would cost every program inside jit 1 to 2 % of its lines.
+        if prescribed or not isinstance(solver, diffrax.Tsit5) or (traced and not choice.final):
+            return None
+        floor = jnp.asarray(jnp.divide(scaled_atol(system, atol), rtol), dtype)
+        return Watch(t1, floor, int(SHARE * max_steps), of_run=True) if choice.final else Watch(t1, floor)
+
     def in_program(staged: bool) -> Solution:
         checked = throw is True
         if staged:
             PROGRAMS.make_room()
-            outcome = run(given, options(solver), None, checked, begun)
+            outcome = run(given, options(solver), watch(True), checked, begun)
         else:  # under `jax.grad` and `jax.vmap` outside of jit, where values are known
             checked = throw is not False
-            outcome = run_compiled(given, options(solver), None, begun=begun)
+            outcome = run_compiled(given, options(solver), watch(True), begun=begun)
             if is_batched(outcome.result):
                 _say_of_members(outcome, system, (max_steps, most_events), throw)
                 checked = False
@@ -241,10 +248,9 @@ def simulate(
             choice = implicit_choice(system.plan, why)
             solver = SOLVERS[choice.solver]()
         return in_program(is_staged((given, options(solver))))
-    watch = Watch(t1, jnp.asarray(np.divide(scaled_atol(system, atol), rtol), dtype)) if switches else None
     room = _room_for(_expected_events(system, float(t1) - float(t0)))
     room = room if room * (system.plan.n_state + len(system.discretes)) <= FEW_NUMBERS else ROOM
-    outcome = run_compiled(given, options(solver, room), watch, begun=begun)
+    outcome = run_compiled(given, options(solver, room), watch(False), begun=begun)
     if is_traced(outcome):  # a network may close over a traced value, which shows in the outcome only
         return in_program(staged=True)
     counts = outcome.numbers()

@@ -1,5 +1,6 @@
 """`simulate(solver=None)`: explicit where that pays, implicit where stability limits the steps, found by running."""
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,8 +10,9 @@ from problems import compiled, damped_oscillation, oscillator
 from sympy import Eq
 from testset import PROBLEMS
 
-from jaxonomy_dae import Component, EqnEnv, assign, der, simulate
+from jaxonomy_dae import Component, EqnEnv, SimulationError, assign, der, simulate
 from jaxonomy_dae.solvers import Rodas5P, Tsit5
+from jaxonomy_dae.solvers.switching import STIFF
 
 TS = np.array([0.5, 4.0, 10.0])
 
@@ -271,3 +273,28 @@ def test_rejected_steps_do_not_repeat():
     np.testing.assert_allclose(solution["b.T1"], reference["b.T1"], rtol=1e-5)
     explicit = simulate(system, 300.0, ts=ts * 0.3, solver=Tsit5(), throw=False)
     assert explicit.stats["num_rejected_steps"] < 2000
+
+
+class Depleting(Component):
+    """x' = −k·(x − cos t), k' = k: stability shortens explicit steps more and more."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        x, k = self.variable("x", start=1.0, fixed=True), self.variable("k", start=1.0, fixed=True)
+        self.add_equations(Eq(der(x), -k * (x - sympy.cos(ev.t))), Eq(der(k), k))
+
+
+@pytest.mark.long("runs of two solvers are compiled")
+def test_explicit_steps_that_do_not_suffice():
+    """Kind: a run that cannot end is stopped by the number of its steps. Explicit steps that the user chose went on, a
+    fifth of them rejected, to max_steps; the run ends where they will not suffice, and inside jit with that code."""
+    system, ts = compiled(Depleting(EqnEnv(), "c")), jnp.array([11.0])
+    for solver in (Tsit5(), diffrax.Tsit5()):
+        with pytest.raises(SimulationError, match="the system is stiff.* hardly suffice to t=11. Write .*Rodas5P"):
+            simulate(system, 11.0, ts=ts, solver=solver)
+    stopped = simulate(system, 11.0, ts=ts, solver=Tsit5(), throw=False)
+    assert stopped.result == STIFF and stopped.counts["num_rejected_steps"] < 2000
+    inside = jax.jit(lambda: simulate(system, 11.0, ts=ts, solver=Tsit5()))()
+    assert inside.result == STIFF._value and np.isnan(inside["c.x"]).all()
+    allowed = simulate(system, 11.0, ts=ts, solver=Tsit5(), max_steps=100_000)
+    np.testing.assert_allclose(allowed["c.x"], np.cos(ts), atol=1e-3)
