@@ -295,6 +295,6 @@ def test_explicit_steps_that_do_not_suffice():
     stopped = simulate(system, 11.0, ts=ts, solver=Tsit5(), throw=False)
     assert stopped.result == STIFF and stopped.counts["num_rejected_steps"] < 2000
     inside = jax.jit(lambda: simulate(system, 11.0, ts=ts, solver=Tsit5()))()
-    assert inside.result == STIFF._value and np.isnan(inside["c.x"]).all()
+    assert inside.result == STIFF and np.isnan(inside["c.x"]).all()
     allowed = simulate(system, 11.0, ts=ts, solver=Tsit5(), max_steps=100_000)
     np.testing.assert_allclose(allowed["c.x"], np.cos(ts), atol=1e-3)
