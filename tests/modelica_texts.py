@@ -53,6 +53,35 @@ BLOCK = """package 'Block'
 end 'Block';
 """
 
+# A token that two steps hand to each other after 1 s and after 0.5 s, as the steps of a state graph do: a step gives it
+# away and the other one takes it at once, and the time at which a step got it is that of the same instant.
+TOKEN = """model 'Token'
+  Boolean 'a'(start = true, fixed = true);
+  Boolean 'b'(start = false, fixed = true);
+  Boolean 'ready';
+  Boolean 'leaves a';
+  Boolean 'leaves b';
+  discrete Real 'ta'(start = 0.0, fixed = true);
+  discrete Real 'tb'(start = 0.0, fixed = true);
+  Real 'waited';
+  Real 'y';
+equation
+  when pre('a') then
+    'ta' = time;
+  end when;
+  when pre('b') then
+    'tb' = time;
+  end when;
+  'waited' = if pre('b') then time - 'tb' else 0.0;
+  'leaves a' = pre('a') and time >= 'ta' + 1.0;
+  'leaves b' = pre('b') and 'waited' > 0.5;
+  'a' = 'leaves b' or pre('a') and not 'leaves a';
+  'b' = 'leaves a' or pre('b') and not 'leaves b';
+  'ready' = pre('a');
+  'y' = if 'ready' then 1.0 else 0.0;
+end 'Token';
+"""
+
 # Functions with loops and branches, arrays, records, enumerations, tables, initial equations, an algorithm.
 PIPE = """package 'Heater'
   type 'Shape' = enumeration('Flat', 'Round' "with a comment");

@@ -1,15 +1,14 @@
 """A flat Modelica model as a component."""
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 from ..errors import ModelError
 from ..modeling.component import Component
 from ..modeling.environment import EqnEnv
 from .continuous import Law, equation_of, write_equation, write_law
-from .events import write_end_of_start, write_mode, write_when
+from .events import write_end_of_start, write_modes, write_when
 from .flat_model import FlatModel
-from .scope import Scope
+from .scope import Scope, located
 from .starts import write_initial_equation
 from .values import as_number
 
@@ -45,30 +44,20 @@ class FlatComponent(Component):
         scope.declare_variables()
         replaced = {variable: equation_of(scope, variable) for variable in laws or ()}
         equations = [s for s in found.equations if not any(s is r.statement for r in replaced.values())]
-        for mode in found.followed:
-            self._located(scope.declared[mode].line, write_mode, scope, mode)
+        write_modes(scope)
         for write, statements in (
             (write_when, found.whens),
             (write_equation, equations),
             (write_initial_equation, found.initial),
         ):
             for s in statements:
-                self._located(s.line, write, scope, s)
+                located(flat.name, s.line, write, scope, s)
         for variable, law in (laws or {}).items():
-            self._located(replaced[variable].statement.line, write_law, scope, replaced[variable], law)
+            located(flat.name, replaced[variable].statement.line, write_law, scope, replaced[variable], law)
         for output in outputs:
             if output not in self.variables and output not in self.parameters:
                 self.output(output, as_number(scope.value(output)))
         write_end_of_start(scope)
-
-    def _located(self, line: int, write: Callable[..., None], *arguments: Any) -> None:
-        """Writes a statement; errors say where it stands."""
-        try:
-            write(*arguments)
-        except ModelError as error:
-            raise ModelError(f"{self.flat.name}, line {line}: {error}") from None
-        except (TypeError, ValueError, AttributeError, IndexError, RecursionError) as error:
-            raise ModelError(f"{self.flat.name}, line {line}: {type(error).__name__}: {error}") from error
 
     def _claim(self, name: str, what: str):
         self._check_open(f"declare its {what} '{name}'")

@@ -8,7 +8,7 @@ the continuous variables of their loop solved for in between: the event iteratio
 
 import collections
 import functools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import sympy
@@ -16,9 +16,10 @@ import sympy
 from ..errors import ModelError
 from ..modeling.event_flags import EventFlag
 from ..modeling.events import Sampled, assign, pre, reinit, terminate
-from ..modeling.symbols import DiscreteSymbol, VariableSymbol
+from ..modeling.symbols import DiscreteSymbol, PreviousSymbol, VariableSymbol
+from .before_only import BeforeOnly
 from .definitions import assigned_in, with_entries
-from .scope import Scope, before
+from .scope import Scope, before, located
 from .tree import (
     Array,
     Assignment,
@@ -34,27 +35,117 @@ from .tree import (
     Statement,
     Unary,
 )
-from .values import Value, as_condition, as_number, both, chosen, is_condition, negated, parts_of_choice, plain
+from .values import (
+    Value,
+    as_condition,
+    as_number,
+    both,
+    chosen,
+    either,
+    is_condition,
+    negated,
+    parts_of_choice,
+    plain,
+)
 
 
-def write_mode(scope: Scope, name: str) -> None:
-    """Adds the events by which a discrete variable follows its equation."""
-    m: Any = DiscreteSymbol(name)
-    value = scope.defined(name, scope.definitions.of[name])
+def write_modes(scope: Scope) -> None:
+    """Adds the events by which discrete variables follow their equations."""
+    known = BeforeOnly(scope, [n for s in _simple_whens(scope) for n in assigned_in(s.branches[0][1])])
+    before_only = [n for n in scope.definitions.followed if _located(scope, n, lambda _, n: known.is_mode(n))]
+    if len(before_only) < 2:
+        before_only = []
+    for name in scope.definitions.followed:
+        if name not in before_only:
+            _located(scope, name, _write_mode)
+    _write_together(scope, before_only)
+
+
+def _located(scope: Scope, name: str, do: Callable[[Scope, str], Any]) -> Any:
+    return located(scope.flat.name, scope.declared[name].line, do, scope, name)
+
+
+def _cases(scope: Scope, name: str) -> list[tuple[Value, Value]]:
+    """The values that a mode can take, each with the condition under which it should have it."""
+    value = _with_whens(scope, scope.defined(name, scope.definitions.of[name]))
     if is_condition(value):
-        cases = [(sympy.Integer(1), as_condition(value)), (sympy.Integer(0), negated(value))]
-    else:
-        cases = parts_of_choice(sympy.sympify(value))
-    for result, holds in cases:
-        if result == m:
-            continue
+        return [(sympy.Integer(1), as_condition(value)), (sympy.Integer(0), negated(value))]
+    cases = parts_of_choice(sympy.sympify(value))
+    for result, _ in cases:
         if any(isinstance(s, VariableSymbol) for s in sympy.sympify(result).free_symbols):
             raise ModelError(f"its value {result} changes in time")
-        pending = both(holds, plain(sympy.Ne(m, result)))
+    return cases
+
+
+def _write_mode(scope: Scope, name: str) -> None:
+    m: Any = DiscreteSymbol(name)
+    for result, holds in _cases(scope, name):
+        pending = False if result == m else both(holds, plain(sympy.Ne(m, result)))
         condition = scope.kept.in_events(pending)
         if not isinstance(condition, bool):
             scope.pending.append(pending)
             scope.component._event(condition, (assign(m, result),), None, EventFlag.AT_START | EventFlag.REVOCABLE)
+
+
+def _write_together(scope: Scope, names: list[str]) -> None:
+    """Adds the events of modes that change at once: each gets the value that its equation has before. Two events in
+    turn, for an event happens where its condition becomes true, and modes may have to change again."""
+    pending: Value = False
+    actions = []
+    for name in names:
+        m: Any = DiscreteSymbol(name)
+        cases = _located(scope, name, _cases)
+        value: Value = cases[-1][0]
+        for result, holds in cases:
+            pending = either(pending, both(holds, plain(sympy.Ne(m, result))))
+        for result, holds in reversed(cases[:-1]):
+            value = chosen(scope.kept.in_events(holds, alone=False), result, value)
+        actions.append(assign(m, before(sympy.sympify(value))))
+    if isinstance(pending, bool):
+        return
+    scope.pending.append(pending)
+    turn = _hidden(scope, ":turn", 0)
+    for now in (0, 1):
+        condition = scope.kept.in_events(both(pending, plain(sympy.Eq(turn, now))))
+        scope.component._event(condition, (*actions, assign(turn, 1 - now)), None, EventFlag.AT_START)
+
+
+def _hidden(scope: Scope, name: str, start: float) -> Any:
+    """Declares a discrete variable that is not the text's."""
+    scope.component.discrete(name, start=start)
+    return DiscreteSymbol(name)
+
+
+def _with_whens(scope: Scope, value: Value) -> Value:
+    """The value of a mode where a `when` is due that assigns what the mode reads: equations and whens of an instant are
+    one system, so that a mode that makes the when happen does not meet the values before it."""
+    for s in _simple_whens(scope):
+        targets = {DiscreteSymbol(n) for n in with_entries(assigned_in(s.branches[0][1]), scope.flat.model)}
+        if not isinstance(value, sympy.Basic) or not value.free_symbols & targets:
+            continue
+        condition = scope.evaluate(s.branches[0][0])
+        if isinstance(condition, bool | Sampled) or not is_condition(condition):
+            continue
+        done = scope.done.get(s)
+        if done is None:
+            done = scope.done[s] = _hidden(scope, f":done[{len(scope.done)}]", 1)
+            ends = scope.kept.in_events(both(negated(condition), plain(sympy.Ne(done, 0))))
+            scope.component._event(ends, (assign(done, 0),), None, EventFlag.AT_START | EventFlag.REVOCABLE)
+        new = {a.target: a.value.xreplace(_present(a.value)) for a in _actions(scope, s.branches[0][1], True)}
+        value = chosen(both(condition, plain(sympy.Eq(done, 0))), value.xreplace(new), value)
+    return value
+
+
+def _simple_whens(scope: Scope) -> Iterator[Branches]:
+    """The whens of one branch that assign values and do nothing else."""
+    for s in scope.definitions.whens:
+        if len(s.branches) == 1 and all(isinstance(each, Equality | Assignment) for each in s.branches[0][1]):
+            yield s
+
+
+def _present(value: sympy.Basic) -> dict[sympy.Basic, sympy.Basic]:
+    """The values before an event as the present ones, which they are until it happens."""
+    return {s: DiscreteSymbol(s.path) for s in value.free_symbols if isinstance(s, PreviousSymbol)}
 
 
 def write_end_of_start(scope: Scope) -> None:
@@ -72,13 +163,16 @@ def write_when(scope: Scope, s: Branches) -> None:
     """Adds the events of a `when`."""
     earlier: list[Value] = []
     for condition, body in s.branches:
-        conditions = [_event(scope, each, body, earlier) for each in _each_condition(condition)]
+        done = [assign(scope.done[s], 1)] if s in scope.done else []
+        conditions = [_event(scope, each, body, earlier, done) for each in _each_condition(condition)]
         earlier += [c for c in conditions if c is not None]
 
 
-def _event(scope: Scope, condition: Expression, body: tuple[Statement, ...], earlier: list[Value]) -> Value:
-    """Adds one event; returns its condition, or None for a clock. The event of an `elsewhen` does not happen while an
-    earlier condition holds."""
+def _event(
+    scope: Scope, condition: Expression, body: tuple[Statement, ...], earlier: list[Value], more: list[Any]
+) -> Value:
+    """Adds one event, with `more` actions; returns its condition, or None for a clock. The event of an `elsewhen` does
+    not happen while an earlier condition holds."""
     parts = _conjuncts(condition)
     values = [scope.evaluate(_inner(p)) for p in parts]
     clocks = [v for v in values if isinstance(v, Sampled)]
@@ -93,7 +187,7 @@ def _event(scope: Scope, condition: Expression, body: tuple[Statement, ...], ear
     actions = _actions(scope, body, holds if clocks else True)
     if actions:
         happens = clocks[0] if clocks else scope.kept.in_events(holds)
-        scope.component.when(happens, *actions, at_start=at_start)
+        scope.component.when(happens, *actions, *more, at_start=at_start)
     return None if clocks else holds
 
 

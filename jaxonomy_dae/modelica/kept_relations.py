@@ -22,9 +22,9 @@ class KeptRelations:
         self.component = component
         self.forms: dict[Any, tuple[Any, Any]] = {}  # (form in equations, form in conditions of events)
 
-    def in_events(self, condition: Value) -> Value:
+    def in_events(self, condition: Value, alone: bool = True) -> Value:
         """A condition of an event in kept truths. One relation alone stays as it is: it is found where it turns."""
-        if isinstance(condition, bool) or isinstance(condition, _ORDER):
+        if isinstance(condition, bool) or (alone and isinstance(condition, _ORDER)):
             return condition
         return plain(self._replaced(condition, 1))
 

@@ -20,7 +20,7 @@ from .interpret import Interpreter
 from .kept_relations import KeptRelations
 from .left_out import LEFT_OUT
 from .tables import EXTERNALS
-from .tree import Assignment, Declaration, Equality, Expression, Reference, Truth
+from .tree import Assignment, Branches, Declaration, Equality, Expression, Reference, Truth
 from .values import Record, Value, as_number, both, is_condition, negated, plain
 
 REAL = "Real"
@@ -37,16 +37,19 @@ class Scope:
     - `in_action`: True while values are evaluated that an event writes: `pre(m)` is then the value before it.
     - `initial`: the discrete variable that is 1 at the initial time; None if nothing asks for it.
     - `pending`: conditions that hold while a mode is not what its equation says.
+    - `done`: for whens that assign what modes read, the discrete variable that is 1 from their event until their
+      condition is false.
     """
 
     def __init__(self, flat: FlatModel, component: Component):
         self.flat, self.component = flat, component
         self.declared = {d.name: d for d in flat.model.declarations}
         self.known: dict[str, Value] = {"time": component.ev.t}
+        self.known_at_events: dict[str, Value] = {}
         self.entries, self.fields = _gather(self.declared)
         self.being: list[str] = []
         special: dict[str, Callable[..., Value]] = {
-            "pre": self._pre, "edge": self._edge, "change": self._change, "initial": self._initial,
+            "pre": self._pre, "edge": self._edge, "change": self._change, "initial": self.at_start,
             "terminal": lambda: False, "sample": self._sample, "delay": _delay,
         }  # fmt: skip
         self.interpreter = Interpreter(flat.classes, self.value, special, LEFT_OUT | EXTERNALS, self.entries)
@@ -55,6 +58,7 @@ class Scope:
         self.in_action = False
         self.initial: Any = None
         self.pending: list[Value] = []
+        self.done: dict[Branches, Any] = {}
 
     def evaluate(self, e: Expression) -> Value:
         return self.interpreter.evaluate(e)
@@ -76,8 +80,9 @@ class Scope:
         return self.kind(c.base.type) if c.base is not None else name
 
     def value(self, name: str) -> Value:
-        if name in self.known:
-            return self.known[name]
+        known = self._known_of(name)
+        if name in known:
+            return known[name]
         d = self.declared.get(name)
         if d is None:
             return self.known.setdefault(name, self._gathered(name))
@@ -85,14 +90,21 @@ class Scope:
             circle = " → ".join([*self.being[self.being.index(name) :], name])
             raise ModelError(f"the values of {circle} depend on each other")
         self.being.append(name)
-        before_action, self.in_action = self.in_action, False
+        before_action = self.in_action
+        self.in_action = known is self.known_at_events
         try:
             value = self._found(d)
         finally:
             self.being.pop()
             self.in_action = before_action
-        self.known[name] = value
+        known[name] = value
         return value
+
+    def _known_of(self, name: str) -> dict[str, Value]:
+        """Where the value of a name is kept: what is an expression reads pre(m) in another way at events."""
+        if not self.in_action or name in self.definitions.stored or not self.is_discrete(name):
+            return self.known
+        return self.known_at_events
 
     def _found(self, d: Declaration) -> Value:
         if d.prefixes & _CONSTANT:
@@ -176,7 +188,8 @@ class Scope:
     def defined(self, name: str, found: Any) -> Value:
         if isinstance(found, int):  # the number of an algorithm
             values = self.algorithm(found)
-            self.known.update({k: v for k, v in values.items() if k not in self.known})
+            known = self._known_of(name)
+            known.update({k: v for k, v in values.items() if k not in known})
             return values[name]
         return self.evaluate(found)
 
@@ -293,7 +306,8 @@ class Scope:
         now = self.evaluate(e)
         return negated(plain(sympy.Eq(as_number(now), as_number(before(now)))))
 
-    def _initial(self) -> Value:
+    def at_start(self) -> Value:
+        """The condition that holds at the initial time, until all modes have settled."""
         if self.initial is None:
             self.component.discrete(":initial", start=1)
             self.initial = DiscreteSymbol(":initial")
@@ -301,6 +315,16 @@ class Scope:
 
     def _sample(self, start: Expression, interval: Expression) -> Value:
         return self.component.sampled(self.evaluate(interval), self.evaluate(start))
+
+
+def located(model: str, line: int, do: Callable[..., Any], *arguments: Any) -> Any:
+    """Does something for a statement of the text; errors say where it stands."""
+    try:
+        return do(*arguments)
+    except ModelError as error:
+        raise ModelError(f"{model}, line {line}: {error}") from None
+    except (TypeError, ValueError, AttributeError, IndexError, RecursionError) as error:
+        raise ModelError(f"{model}, line {line}: {type(error).__name__}: {error}") from error
 
 
 def _delay(*_: Expression) -> Value:

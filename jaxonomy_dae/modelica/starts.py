@@ -6,6 +6,7 @@ import math
 import sympy
 
 from ..errors import ModelError
+from ..modeling.events import assign
 from ..modeling.symbols import DiscreteSymbol, ParameterSymbol, VariableSymbol
 from .continuous import equal, side_by_side
 from .scope import Scope
@@ -37,7 +38,10 @@ def _hold_initially(scope: Scope, left: Value, right: Value) -> None:
     for a, b in ((left, right), (right, left)):
         known = _in_parameters(b)
         if isinstance(a, DiscreteSymbol):
-            c.parameters[a.path] = c.parameters[a.path].with_value(_plain(b) if known else _number(scope, a, b))
+            if isinstance(b, sympy.Basic) and any(isinstance(s, VariableSymbol) for s in b.free_symbols):
+                c.when(scope.at_start(), assign(a, b), at_start=True)
+            else:
+                c.parameters[a.path] = c.parameters[a.path].with_value(_plain(b) if known else _number(scope, b))
             return
         if isinstance(a, VariableSymbol) and known:
             if a.order:
@@ -56,10 +60,8 @@ def _hold_initially(scope: Scope, left: Value, right: Value) -> None:
         raise ModelError(f"the initial equation {left} = {right} does not hold for the declared starts")
 
 
-def _number(scope: Scope, variable: DiscreteSymbol, value: Value) -> float:
+def _number(scope: Scope, value: Value) -> float:
     """The start of a discrete variable that depends on time, or on the starts of others."""
-    if any(isinstance(s, VariableSymbol) for s in value.free_symbols):
-        raise ModelError(f"the start of '{variable}', {value}, depends on continuous variables")
     return float(_numerical(scope, value))
 
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from modelica_texts import BALL, BLOCK, PIPE
+from modelica_texts import BALL, BLOCK, PIPE, TOKEN
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, simulate
 from jaxonomy_dae.modelica import FlatComponent, load
@@ -48,6 +48,20 @@ def test_friction_by_a_discrete_equation():
     assert solution["m.stuck"].tolist() == [0, 0, 0, 1, 1, 0, 0]
 
 
+@pytest.mark.long("modes that change at once, again and again")
+def test_modes_that_hand_on_a_token_change_at_once():
+    """One of the two took back what the other did, and a time of arrival was read before the when that assigns it: the
+    token got lost, or was handed on at once."""
+    system = compiled(TOKEN)
+    ts = jnp.array([0.5, 0.99, 1.01, 1.49, 1.51, 2.49, 2.51, 2.99, 3.01, 3.9])
+    solution = simulate(system, 4.0, ts=ts)
+    np.testing.assert_array_equal(solution["m.a"], [1, 1, 0, 0, 1, 1, 0, 0, 1, 1])
+    np.testing.assert_array_equal(solution["m.b"], 1 - np.asarray(solution["m.a"]))
+    np.testing.assert_array_equal(solution["m.y"], solution["m.a"])
+    np.testing.assert_allclose([solution["m.ta"][-1], solution["m.tb"][-1]], [3.0, 2.5], atol=1e-9)
+
+
+@pytest.mark.long("two compilations")
 def test_functions_tables_and_initial_equations():
     """2 T' = p - T with T'(0) = 0.5 and p(0) = 3 begins at T = 2; T0 = T(0) + 1 stays 3."""
     system = compiled(PIPE)

@@ -1,0 +1,76 @@
+"""Which modes follow from what was before an instant alone: none of this kind takes back what another one does."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import sympy
+
+from ..errors import ModelError
+from ..modeling.symbols import DiscreteSymbol, PreviousSymbol, VariableSymbol
+from .definitions import OfAlgorithm, with_entries
+from .scope import Scope
+from .tree import Call, Equality, Expression, Reference
+from .values import Value
+
+
+class BeforeOnly:
+    """Looks into the equations of modes, and of the continuous variables that they read: `pre(m)`, time, states and
+    what whens assign are known before an instant, other discrete variables are not."""
+
+    def __init__(self, scope: Scope, by_when: Sequence[str]):
+        self.scope = scope
+        equations = scope.definitions.equations
+        self.by_when = set(with_entries(by_when, scope.flat.model))
+        self.states = {scope.interpreter.name_of(e) for s in equations for e in _differentiated(s)}
+        self.given: dict[str, list[Expression]] = {}
+        for s in equations:
+            if isinstance(s, Equality) and not isinstance(s.right, OfAlgorithm):
+                for side, other in ((s.left, s.right), (s.right, s.left)):
+                    if isinstance(side, Reference):
+                        self.given.setdefault(scope.interpreter.name_of(side), []).append(other)
+        self.found: dict[str, bool] = {}
+
+    def is_mode(self, name: str) -> bool:
+        """True for a mode of this kind."""
+        return self._is(self._at_event(lambda: self.scope.defined(name, self.scope.definitions.of[name])))
+
+    def _is(self, value: Value) -> bool:
+        symbols = value.free_symbols if isinstance(value, sympy.Basic) else set()
+        return all(self._is_symbol(s) for s in symbols)
+
+    def _is_symbol(self, s: Any) -> bool:
+        if isinstance(s, VariableSymbol):
+            return not s.order and self._is_variable(s.path)
+        return not isinstance(s, DiscreteSymbol) or isinstance(s, PreviousSymbol) or s.path in self.by_when
+
+    def _is_variable(self, name: str) -> bool:
+        if name in self.states:
+            return True
+        if name not in self.found:
+            self.found[name] = False  # in a circle of equations, nothing is known
+            self.found[name] = any(self._is_expression(e) for e in self.given.get(name, ()))
+        return self.found[name]
+
+    def _is_expression(self, e: Expression) -> bool:
+        try:
+            return self._is(self._at_event(lambda: self.scope.evaluate(e)))
+        except ModelError:
+            return False
+
+    def _at_event(self, evaluate: Any) -> Value:
+        self.scope.in_action = True
+        try:
+            return evaluate()
+        finally:
+            self.scope.in_action = False
+
+
+def _differentiated(statement: Any) -> Iterator[Reference]:
+    """The variables in der(…)."""
+    stack = [statement]
+    while stack:
+        e = stack.pop()
+        if isinstance(e, Call) and e.function == "der" and isinstance(e.arguments[0], Reference):
+            yield e.arguments[0]
+        if isinstance(e, tuple):
+            stack.extend(e)
