@@ -28,12 +28,13 @@ from ..programs.platform import precisely
 from ..programs.staging import is_staged, is_traced, on_device
 from ..system.inputs import read_inputs
 from ..tolerances import solved
+from .explicit import Substitution, substitution
 from .given_solver import find_root_with
 from .initial_values import check_initial
 from .ladder import FAILED, STAGED, Found, Look, find_root
 from .problem import InitialProblem, bounds_of, independent_rows
 from .rows import InitialRows, initial_rows
-from .sizes import Sizes
+from .sizes import Sizes, column_sizes, row_sizes, weighed
 from .sparse_newton import SparseRows, sparse_newton, sparse_rows
 from .stages import solve_in_stages, stages
 
@@ -114,6 +115,11 @@ def _searched(problem: InitialProblem, solver: Any) -> Found:
     """The search inside a program."""
     plan, rows, start, sizes = problem.plan, problem.rows, problem.start, problem.sizes
     core = problem.core
+    searched = solver is not None or len(problem.unknown) or (rows.n_soft and core is None)
+    if not searched and not np.isfinite(problem.bounds).any():
+        order = substitution(plan, rows)
+        if order is not None:
+            return _substituted(problem, order)
     staged = None if len(problem.unknown) else stages(plan, rows)
     if staged is not None:
         start = jax.lax.stop_gradient(solve_in_stages(problem.function, start, sizes, *staged))
@@ -125,6 +131,23 @@ def _searched(problem: InitialProblem, solver: Any) -> Found:
         return found
     moved = jnp.any(start != problem.start)
     return found._replace(method=jnp.where((found.method == 0) & moved, STAGED, found.method))
+
+
+def _substituted(problem: InitialProblem, order: Substitution) -> Found:
+    """The point where unknowns follow from each other."""
+    start, sizes, unit = problem.start, problem.sizes, problem.typical
+    over = jnp.asarray(1 / order.coefficient, start.dtype)
+    x = start
+    if order.levels:
+        x, _ = jax.lax.scan(lambda w, _: (w - over * problem.function(w)[order.row], None), start, length=order.levels)
+    at = problem.look(x)
+    measured = sizes._replace(nominal=sizes.nominal / unit, known=sizes.known / unit)
+    unit = unit * column_sizes(at.value, at.jacobian * unit, measured)
+    size, noise = row_sizes(weighed(at.jacobian), x, sizes, unit, at.terms)
+    limit = solved(start.dtype) * size + noise
+    holds = jnp.all(jnp.abs(at.value) <= limit) & jnp.all(jnp.isfinite(at.jacobian))
+    method = jnp.where(holds, int(order.levels > 0), FAILED).astype(jnp.int32)
+    return Found(x, at.jacobian, limit, unit, method, jnp.asarray(order.levels + 1, jnp.int32))
 
 
 class _Looked(NamedTuple):
