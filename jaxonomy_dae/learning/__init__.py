@@ -2,6 +2,11 @@
 
 from .agreement import Whiteness as Whiteness
 from .band import Band as Band
+from .comparison import Compared as Compared
+from .comparison import Comparison as Comparison
+from .comparison import CrossValidation as CrossValidation
+from .comparison import compare as compare
+from .comparison import cross_validate as cross_validate
 from .data import Data as Data
 from .design import Advice as Advice
 from .design import next_experiment as next_experiment
@@ -40,4 +45,5 @@ from .term import ClosedForm as ClosedForm
 from .training import GradientSteps as GradientSteps
 from .training import Training as Training
 from .training import Update as Update
+from .unseen import Score as Score
 from .verdict import FitWarning as FitWarning

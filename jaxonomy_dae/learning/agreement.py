@@ -52,7 +52,7 @@ def rms_by_name(objective: Objective, m: Minimum, point: Float[np.ndarray, " p"]
     errors = np.full(s.values.shape, np.nan)
     errors[rows] = m.found.residual
     if not np.isin(np.arange(len(s.labels)), rows[0]).all():
-        free_runs = objective.predicted(point).outputs - s.values
+        free_runs = objective.outputs(point) - s.values
         errors = np.where(np.isnan(errors), free_runs, errors)
     found: dict[str, dict[str, float]] = {}
     for k, label in enumerate(s.labels):

@@ -15,6 +15,7 @@ from .agreement import Whiteness, log_likelihood, rms_by_name, whiteness
 from .band import Band, band, explored
 from .descent import Minimum
 from .discovery import Discovery, discover
+from .experiment import Experiment
 from .factors import Factors
 from .figures import plot_correlations, plot_history, plot_residuals, plot_runs
 from .identifiability import Identifiability, identifiability, spreads
@@ -25,6 +26,7 @@ from .program import with_values
 from .smoothing import followed
 from .table import Table
 from .training import Training
+from .unseen import Score, Unseen
 from .verdict import reasons
 
 if TYPE_CHECKING:
@@ -229,6 +231,10 @@ class Estimate:
         spread = float(self.spread[position])
         return profile(self.objective, self.minimum, self.point, spread, position, level, self.problem.reach)
 
+    def position(self, name: str) -> int:
+        """The place of a coordinate among all."""
+        return self.objective.coordinates.names.index(name)
+
     def _position(self, name: str) -> int:
         c = self.objective.coordinates
         found = [k for k in np.flatnonzero(self.objective.free) if c.names[k] == name]
@@ -258,16 +264,39 @@ class Estimate:
         return band(self, name, grid, law, along, self.quantile(level))
 
     def predict(
-        self, names: str | Sequence[str], ts: Any = None, experiment: int | str = 0, level: float = 0.95
-    ) -> Prediction:
+        self, names: str | Sequence[str], ts: Any = None, experiment: int | str | Experiment = 0, level: float = 0.95,
+        *, first: int | None = None,
+    ) -> Prediction:  # fmt: skip
         """Any variables under the conditions of an experiment, measured or not, with bands.
 
         **Arguments:**
 
         - `ts`: times, increasing, from its start on; default: its own.
-        - `experiment`: its place or name.
+        - `experiment`: the place or name of one of the problem's, or a new one. What is unknown of a new one's start is
+            fitted to its samples, with all else as found.
+        - `first`: of how many rows of a new experiment; default: all.
         """
-        return prediction(self.objective, self.point, self.root, names, ts, experiment, self.quantile(level))
+        objective, point, root, experiment = self._under(experiment, first)
+        return prediction(objective, point, root, names, ts, experiment, self.quantile(level))
+
+    def score(self, experiment: Experiment, *, first: int | None = None) -> Score:
+        """How well the samples of a new experiment are met, those of its `first` rows included, to which its unknown
+        start is fitted (default: to all).
+
+        ```python
+        print(fit.score(learning.Experiment(ts, {"pend.x": x}, initial={"pend.theta": 0.3})))
+        ```
+        """
+        return Unseen.of(self, experiment, first).score()
+
+    def _under(self, experiment: Any, first: int | None) -> tuple[Objective, np.ndarray, np.ndarray, int | str]:
+        """(objective, all coordinates, A of their covariance A Aᵀ, place or name) of an experiment."""
+        if not isinstance(experiment, Experiment):
+            if first is not None:
+                raise ModelError("first= goes with a new experiment: the problem's own were fitted")
+            return self.objective, self.point, self.root, experiment
+        new = Unseen.of(self, experiment, first)
+        return new.objective, new.point, new.root, 0
 
     def explored(self, name: str, along: str | Callable[[Any], Any] | None = None) -> Float[np.ndarray, "inputs 2"]:
         """From the least to the greatest value that the experiments saw of each input of a learned law, or of what
@@ -301,7 +330,9 @@ class Estimate:
 
         return sample(self, draws, chains, warmup, seed)
 
-    def filtered(self, names: str | Sequence[str], experiment: int | str = 0, level: float = 0.95) -> Prediction:
+    def filtered(
+        self, names: str | Sequence[str], experiment: int | str | Experiment = 0, level: float = 0.95
+    ) -> Prediction:
         """Any variables at the times of an experiment, from its samples up to each of them, with bands of the states'
         covariance, to which the parameters' uncertainty is not added; of `method=Filter(...)`.
 
@@ -309,19 +340,22 @@ class Estimate:
         """
         return self._followed(names, experiment, "filtered", 1, level)
 
-    def smoothed(self, names: str | Sequence[str], experiment: int | str = 0, level: float = 0.95) -> Prediction:
+    def smoothed(
+        self, names: str | Sequence[str], experiment: int | str | Experiment = 0, level: float = 0.95
+    ) -> Prediction:
         """As `filtered`, from all samples of the experiment, later ones included (Rauch, Tung & Striebel 1965)."""
         return self._followed(names, experiment, "smoothed", 1, level)
 
     def ahead(
-        self, names: str | Sequence[str], steps: int = 1, experiment: int | str = 0, level: float = 0.95
+        self, names: str | Sequence[str], steps: int = 1, experiment: int | str | Experiment = 0, level: float = 0.95
     ) -> Prediction:
         """As `filtered`, from samples that are at least `steps` rows old, NaN in the first `steps` rows if there are
         more than one; of `method=Innovations(...)` too, without bands."""
         return self._followed(names, experiment, "ahead", steps, level)
 
-    def _followed(self, names: str | Sequence[str], experiment: int | str, how: str, steps: int, level: float) -> Any:
-        return followed(self.objective, self.point, names, experiment, how, steps, self.quantile(level))
+    def _followed(self, names: str | Sequence[str], experiment: Any, how: str, steps: int, level: float) -> Any:
+        objective, point, _, experiment = self._under(experiment, None)
+        return followed(objective, point, names, experiment, how, steps, self.quantile(level))
 
     @property
     def log_likelihood(self) -> float:

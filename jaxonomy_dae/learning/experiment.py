@@ -165,7 +165,7 @@ class Experiment:
                 f"initial={{'{old[0]}': Unknown(guess)}}; a parameter keeps its value, {self.initial[old[0]]!r}"
             )
         data = {name: values[rows] for name, values in self.data.items()}
-        return self._with(self.times[rows], data, initial=dict(self.initial) | new, t0=start)
+        return self.changed(times=self.times[rows], data=data, initial=dict(self.initial) | new, t0=start)
 
     def resample(self, times: Any) -> "Experiment":
         """The record at other times, by linear interpolation; NaN where a neighbour is missing, and outside of it.
@@ -173,7 +173,7 @@ class Experiment:
         new = _times(times, self.t0)
         if len(self.times) < 2:
             raise ModelError("resample: a record of one sample cannot be interpolated")
-        return self._with(new, self._each(lambda values: interpolated(self.times, values, new)))
+        return self.changed(times=new, data=self._each(lambda values: interpolated(self.times, values, new)))
 
     def decimate(self, factor: int) -> "Experiment":
         """Every `factor`-th sample, after a low-pass filter without delay, so that faster oscillations and noise are
@@ -194,7 +194,7 @@ class Experiment:
         quieter = float(np.linalg.norm(response))
         data = self._each(lambda values: smoothed(values, response)[::factor])
         sigma = {name: level * quieter for name, level in self._levels().items()}
-        return self._with(self.times[::factor], data, sigma=sigma)
+        return self.changed(times=self.times[::factor], data=data, sigma=sigma)
 
     def detrend(self, names: str | Sequence[str] | None = None, degree: int = 1) -> "Experiment":
         """The record less a polynomial trend of least squares: of all signals, or of those named; degree 0 takes their
@@ -208,7 +208,7 @@ class Experiment:
             if least <= degree:
                 raise ModelError(f"detrend: '{name}' has {least} samples, too few for a trend of degree {degree}")
         changed = self._each(lambda values: untrended(self.times, values, degree), chosen)
-        return self._with(self.times, dict(self.data) | changed)
+        return self.changed(data=dict(self.data) | changed)
 
     def _levels(self) -> dict[str, float]:
         """The standard deviation for each name; NaN where it is to be estimated."""
@@ -224,11 +224,11 @@ class Experiment:
             found[name] = columns.reshape(len(columns), *values.shape[1:])
         return found
 
-    def _with(self, times: np.ndarray, data: dict[str, np.ndarray], **changes: Any) -> "Experiment":
-        """A copy with other samples."""
-        levels = {"sigma": self._levels()} | changes
-        sigma = {name: ESTIMATE if math.isnan(level) else level for name, level in levels["sigma"].items()}
-        return dataclasses.replace(self, times=times, data=data, **levels | {"sigma": sigma})
+    def changed(self, **changes: Any) -> "Experiment":
+        """A copy with other fields; noise levels that are to be estimated stay so."""
+        levels = changes.get("sigma", self._levels())
+        sigma = {name: ESTIMATE if math.isnan(level) else level for name, level in levels.items()}
+        return dataclasses.replace(self, **changes | {"sigma": sigma})
 
 
 def _is_finite(value: Any) -> bool:

@@ -104,9 +104,13 @@ class AheadObjective(Objective):
         """Predictions one step ahead."""
         return self._ahead(z)[0]
 
+    def outputs(self, z: Float[np.ndarray, " p"]) -> Float[np.ndarray, "e n k"]:
+        """Predictions one step ahead, of all experiments."""
+        return np.asarray(self.track(z).predicted, np.float64)
+
     def residual(self, z: Float[np.ndarray, " f"]) -> Float[np.ndarray, " m"] | None:
         """Errors of predictions alone; None where a run that counts fails."""
-        found = np.asarray(self.track(self.full(z)).predicted, np.float64)[self.rows] - self.stacked.values[self.rows]
+        found = self.outputs(self.full(z))[self.rows] - self.stacked.values[self.rows]
         return found if np.isfinite(found).all() else None
 
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
 import diffrax
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -173,16 +174,27 @@ class Objective:
         shared, own = self.coordinates.split(natural)
         return jnp.asarray(shared, dtype), jnp.asarray(own, dtype)
 
-    def predicted(self, z: Float[np.ndarray, " p"]) -> Predicted:
-        """Everything at a point, by the program."""
+    def predicted(self, z: Float[np.ndarray, " p"], of: Bool[np.ndarray, " e"] | None = None) -> Predicted:
+        """Everything at a point, by the program; NaN for the outputs of other experiments than those asked for."""
         shared, own = self.numbers(self.coordinates.natural(z))
-        found = predict_and_differentiate(self.setting, shared, own, self.conditions)
-        return Predicted(*(np.asarray(a, np.float64) for a in found))
+        if of is None or of.all():
+            found = predict_and_differentiate(self.setting, shared, own, self.conditions)
+            return Predicted(*(np.asarray(a, np.float64) for a in found))
+        some = jax.tree.map(lambda a: a[of], self.conditions)
+        found = predict_and_differentiate(self.setting, shared, own[of], some)
+        wide = [np.full((len(of), *a.shape[1:]), fill) for a, fill in zip(found, (np.nan, 0.0, 0.0), strict=True)]
+        for all_of, few in zip(wide, found, strict=True):
+            all_of[of] = few
+        return Predicted(*wide)
+
+    def outputs(self, z: Float[np.ndarray, " p"]) -> Float[np.ndarray, "e n k"]:
+        """The outputs of all experiments at a point, without derivatives."""
+        return self._runs(z)[..., : len(self.layout.outputs)]
 
     def evaluate(self, z: Float[np.ndarray, " f"]) -> Evaluation | None:
         """Residuals and Jacobian of the free coordinates; None where a run that counts fails."""
         full = self.full(z)
-        found = self.predicted(full)
+        found = self.predicted(full, self.counted)
         residual = found.outputs[self.rows] - self.stacked.values[self.rows]
         jacobian = (found.jacobian(self.rows) * self.coordinates.slope(full))[:, self.free]
         if not (np.isfinite(residual).all() and np.isfinite(jacobian).all()):
@@ -191,7 +203,7 @@ class Objective:
 
     def residual(self, z: Float[np.ndarray, " f"]) -> Float[np.ndarray, " m"] | None:
         """Residuals alone; None where a run that counts fails."""
-        found = self._runs(self.full(z))[..., : len(self.layout.outputs)][self.rows] - self.stacked.values[self.rows]
+        found = self.outputs(self.full(z))[self.rows] - self.stacked.values[self.rows]
         return found if np.isfinite(found).all() else None
 
     def _runs(self, full: Float[np.ndarray, " p"]) -> Float[np.ndarray, "e n _"]:
@@ -308,7 +320,7 @@ class Objective:
         """(residuals of chosen samples in units of the noise, these units)."""
         s = self.with_noise(sigma).stacked
         level = np.where(np.isnan(s.sigma), 1.0, s.sigma)[rows[0], rows[2]]
-        return (self.predicted(full).outputs[rows] - s.values[rows]) / level, level
+        return (self.outputs(full)[rows] - s.values[rows]) / level, level
 
     # --- experiments that are held out ---------------------------------------------------------------------------
 
@@ -401,7 +413,13 @@ class Objective:
         chosen = np.array([name == group for group in self.coordinates.group], bool)
         return chosen[self.free]
 
-    def with_noise(self, sigma: dict[str, float]) -> "Objective":
+    def first_rows(self: Same, count: int) -> Same:
+        """A copy in which only the first rows of each record count."""
+        s = self.stacked
+        early = np.arange(s.observed.shape[1]) < count
+        return dataclasses.replace(self, stacked=dataclasses.replace(s, observed=s.observed & early[:, None]))
+
+    def with_noise(self: Same, sigma: dict[str, float]) -> Same:
         """A copy with these noise levels in place of those to be estimated."""
         s = self.stacked
         row = np.array([sigma.get(name, math.nan) for name in s.outputs])

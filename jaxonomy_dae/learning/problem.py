@@ -104,13 +104,14 @@ class Problem:
         # Names of parameters, one by one, and of networks and sensor laws.
         self.trained = names_to_train(system, self.observers, train)
         self.method = checked_method(system, method)
-        self._stacked = self._stack(self.data)
-        self._layout = self._laid_out(self._stacked)
+        self._stacked = self.stacked(self.data)
+        self._layout = self.layout_of(self._stacked)
         self.penalties = penalties(system, self.trained[1], regularize)
 
     # --- set-up ------------------------------------------------------------------------------------------------
 
-    def _stack(self, data: Data | Experiment) -> Stacked:
+    def stacked(self, data: Data | Experiment) -> Stacked:
+        """The data, checked against the model, as arrays."""
         stacked = stack(
             data if isinstance(data, Data) else Data(data), self.system.plan, tuple(self.observers), self.starts
         )
@@ -119,7 +120,8 @@ class Problem:
             raise ModelError(f"train: there are no data of '{unused[0]}' to train its sensor law with")
         return stacked
 
-    def _laid_out(self, stacked: Stacked) -> Layout:
+    def layout_of(self, stacked: Stacked) -> Layout:
+        """The names of the numbers that a program for these data takes and returns."""
         parameters, modules = self.trained
         _, extras = self.errors(stacked)
         shared, own, known = [], [], []
@@ -179,13 +181,14 @@ class Problem:
         `{experiment: {name: array of shape (n,)}}`; NaN where a run fails.
         """
         s = self._stacked
-        objective = self._objective(s, coordinates(self._setting, s, self.errors(s)[1]))
+        objective = self.objective_of(s, coordinates(self._setting, s, self.errors(s)[1]))
         model = self.system if model is None else model.merged()
         return residuals(objective, model, dict(starts or {}), dict(observe or {}), adjoint)
 
-    def _objective(self, stacked: Stacked, c: Coordinates) -> Objective:
-        model = self.system, self.observers, self._laid_out(stacked), 1.0
-        given = stacked, c, self.penalties, ~stacked.holdout
+    def objective_of(self, stacked: Stacked, c: Coordinates, penalties: dict[str, Any] | None = None) -> Objective:
+        """The function that a fit minimises."""
+        model = self.system, self.observers, self.layout_of(stacked), 1.0
+        given = stacked, c, self.penalties if penalties is None else penalties, ~stacked.holdout
         if not isinstance(self.method, Filter | Innovations):
             return Objective(*model, *given)
         kind = FilterObjective if isinstance(self.method, Filter) else AheadObjective
@@ -296,13 +299,13 @@ class Problem:
 
     def _prepared(self, data: Any, freeze: Any, start: Any, bounds: Any) -> Objective:
         """The objective, from the arguments of `fit`."""
-        stacked = self._stacked if data is None else self._stack(data)
-        same = dataclasses.replace(self._laid_out(stacked), lengths=self._layout.lengths)
+        stacked = self._stacked if data is None else self.stacked(data)
+        same = dataclasses.replace(self.layout_of(stacked), lengths=self._layout.lengths)
         if same != self._layout:
             raise ModelError(
                 "these data name other outputs, inputs or unknown starts than the problem's: make a Problem of them"
             )
-        objective = self._objective(stacked, self._coordinates(stacked, freeze, start, bounds))
+        objective = self.objective_of(stacked, self._coordinates(stacked, freeze, start, bounds))
         if not objective.free.any():
             raise ModelError("everything is frozen: there is nothing to fit")
         return objective
@@ -393,7 +396,7 @@ class Problem:
     ) -> tuple[Objective, Weights, Evaluation, Float[np.ndarray, " f"]]:
         """The start of a search. Returns (objective, first weights, residuals with their Jacobian, free
         coordinates)."""
-        objective = self._objective(self._stacked, self._coordinates(self._stacked, freeze, start, None))
+        objective = self.objective_of(self._stacked, self._coordinates(self._stacked, freeze, start, None))
         z = objective.coordinates.z_start[objective.free]
         found = objective.evaluate(z)
         if found is None:
@@ -403,4 +406,4 @@ class Problem:
     def laid_out(self, experiments: Sequence[Experiment]) -> tuple[Layout, Stacked]:
         """The layout and the stacked data of other experiments of the same system, for a program of their own."""
         stacked = stack(Data(*experiments), self.system.plan, tuple(self.observers), self.starts)
-        return self._laid_out(stacked), stacked
+        return self.layout_of(stacked), stacked

@@ -19,7 +19,7 @@ def compiled(component):
 
 
 def objective_of(problem):
-    objective = problem._objective(problem._stacked, problem._coordinates(problem._stacked, (), None, None))
+    objective = problem.objective_of(problem._stacked, problem._coordinates(problem._stacked, (), None, None))
     return objective, objective.coordinates.z_start[objective.free]
 
 

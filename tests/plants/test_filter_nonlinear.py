@@ -21,7 +21,7 @@ def compiled(component):
 
 def at_start(problem):
     """(objective, its evaluation, −ln L) at the start."""
-    objective = problem._objective(problem._stacked, problem._coordinates(problem._stacked, (), None, None))
+    objective = problem.objective_of(problem._stacked, problem._coordinates(problem._stacked, (), None, None))
     z = objective.coordinates.z_start[objective.free]
     found = objective.evaluate(z)
     weights = objective.weights(z, found)
@@ -205,7 +205,7 @@ def test_kinks():
     one = learning.Experiment(times, {"tank.x": y}, sigma=0.1, inputs={"tank.u": u})
     method = learning.Innovations({("tank.x", "tank.x"): learning.Unknown(0.4)})
     problem = learning.Problem(system, one, train=["tank.k"], method=method, rtol=1e-9, atol=1e-11)
-    objective = problem._objective(problem._stacked, problem._coordinates(problem._stacked, (), None, None))
+    objective = problem.objective_of(problem._stacked, problem._coordinates(problem._stacked, (), None, None))
     z = objective.coordinates.z_start
     found = objective.evaluate(z)
     np.testing.assert_allclose(found.residual, expected - y, atol=1e-6)

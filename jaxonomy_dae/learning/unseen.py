@@ -1,0 +1,112 @@
+"""A fit under new data: what it predicts, and how well."""
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from ..errors import ModelError, SimulationError
+from .coordinates import coordinates
+from .data import Data
+from .experiment import Experiment
+from .factors import Factors
+from .objective import Objective
+from .runs import why_not
+
+if TYPE_CHECKING:
+    from .estimate import Estimate
+
+
+@dataclasses.dataclass(frozen=True)
+class Score:
+    """How well new data are met.
+
+    - `rms`: root mean square errors by name, in the variables' units.
+    - `relative`: the root mean square of all errors in units of the noise, about one where the model is right.
+    - `log_likelihood`: ln L of these data.
+    """
+
+    rms: dict[str, float]
+    relative: float
+    log_likelihood: float
+
+    def __repr__(self):
+        errors = ", ".join(f"{name}: {value:.4g}" for name, value in self.rms.items())
+        return f"Score({self.relative:.3g} σ; {errors})"
+
+
+@dataclasses.dataclass(frozen=True)
+class Unseen:
+    """A new experiment under what was found: its objective, all its coordinates, and A of their covariance A Aᵀ."""
+
+    objective: Objective
+    point: Float[np.ndarray, " p"]
+    root: Float[np.ndarray, "p r"]
+
+    @classmethod
+    def of(cls, estimate: "Estimate", experiment: Any, first: int | None) -> "Unseen":
+        """An experiment with everything shared as it was found. Its own unknown starts are fitted to its `first`
+        rows, or to all of them.
+
+        **Raises:**
+
+        - `ModelError` for data that do not fit the model; `SimulationError` where no run can be made.
+        """
+        if not isinstance(experiment, Experiment):
+            raise ModelError(f"new data are an Experiment; got a {type(experiment).__name__}")
+        if first is not None and (isinstance(first, bool) or not isinstance(first, int) or first < 1):
+            raise ModelError(f"first is a number of rows ≥ 1, or None for all; got {first!r}")
+        problem, fitted = estimate.problem, estimate.objective
+        stacked = problem.stacked(Data(experiment.changed(holdout=False, weight=1.0)))
+        layout, extras = problem.layout_of(stacked), problem.errors(stacked)[1]
+        c = coordinates(fitted.setting._replace(layout=layout), stacked, extras)
+        known = estimate.values
+        shared = [k for k in range(c.n_shared) if c.names[k] in known]
+        new = [c.names[k] for k in range(c.n_shared) if c.names[k] not in known]
+        if new:
+            raise ModelError(f"'{new[0]}' was not estimated: give the new experiment a number for it in initial=")
+        start, fixed = np.array(c.start), np.array(c.fixed)
+        start[shared], fixed[shared] = [known[c.names[k]] for k in shared], True
+        c = dataclasses.replace(c, start=start, fixed=fixed)
+        whole = problem.objective_of(stacked, c, penalties={}).with_noise(estimate.sigma)
+        whole = whole.at_tolerance(fitted.tolerance)
+        own = whole if first is None else whole.first_rows(first)
+        point, places = whole.coordinates.z_start, [estimate.position(c.names[k]) for k in shared]
+        root = np.zeros((len(point), estimate.root.shape[1]))
+        root[shared] = estimate.root[places]
+        if not own.free.any():
+            return cls(whole, point, root)
+        found = own.lowest(point[own.free])
+        if found is None:
+            raise SimulationError(why_not(own))
+        point = own.full(found.z)
+        # The starts follow from what is shared by the same least squares, and have an uncertainty of their own.
+        free = own.free
+        moving = dataclasses.replace(c, start=c.natural(point), fixed=np.zeros(len(c), bool))
+        found_all = dataclasses.replace(own, coordinates=moving).evaluate(point)
+        assert found_all is not None
+        rows = found.weights.row[:, None] * found_all.jacobian
+        prior = found.weights.prior(found.z).jacobian
+        by_own = np.concatenate([rows[:, free], prior])
+        by_shared = np.concatenate([rows[:, shared], np.zeros((len(prior), len(shared)))])
+        factors = Factors.of(np.zeros(len(by_own)), by_own, found.noise)
+        alone = factors.root(factors.rank(found.noise))
+        root = np.concatenate([root, np.zeros((len(point), alone.shape[1]))], axis=1)
+        root[free, : estimate.root.shape[1]] = -alone @ (alone.T @ (by_own.T @ (by_shared @ estimate.root[places])))
+        root[free, estimate.root.shape[1] :] = alone
+        return cls(whole, point, root)
+
+    def score(self) -> Score:
+        """How well the samples are met."""
+        o = self.objective
+        s, rows = o.stacked, o.rows
+        u, level = o.standardized(self.point, {}, rows)
+        errors = u * level
+        rms = {
+            name: float(np.sqrt(np.mean(errors[rows[2] == j] ** 2)))
+            for j, name in enumerate(s.outputs)
+            if (rows[2] == j).any()
+        }
+        likelihood = -0.5 * float(np.sum(u**2 + 2 * np.log(level) + np.log(2 * np.pi)))
+        return Score(rms, float(np.sqrt(np.mean(u**2))), likelihood)
