@@ -7,6 +7,7 @@ compiled program, whatever their numbers are.
 """
 
 import dataclasses
+import weakref
 from collections.abc import Callable, Hashable
 from typing import Any
 
@@ -22,28 +23,28 @@ from ..private_names import private
 RULES = ("jvp_jaxpr_fun", "fwd_jaxpr_thunk", "bwd", "out_trees")
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+class _Program:
+    """What a jaxpr computes: one object for all jaxprs that compute the same."""
+
+
+# By what they are made of. Parts of a key are programs of their own, so that keys stay flat: the rules for derivatives
+# of a user's checks contain each other, and as nested tuples they were too deep to be compared.
+_PROGRAMS: weakref.WeakValueDictionary[Hashable, _Program] = weakref.WeakValueDictionary()
+
+
+def _program(key: Hashable) -> _Program:
+    try:
+        return _PROGRAMS.setdefault(key, _Program())
+    except ValueError:  # of a comparison of arrays somewhere in parameters of users: nothing equals it
+        return _Program()
+
+
+@dataclasses.dataclass(frozen=True)
 class _TracedFunction:
-    """A traced function without its numbers, compared by what it computes.
+    """A traced function without its numbers, compared by what it computes."""
 
-    A function whose parts cannot be compared, such as one with a user's check, whose rules for derivatives contain each
-    other, equals only itself.
-    """
-
-    jaxpr: Any
-    key: Hashable
-    hashed: int
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, _TracedFunction) or self.hashed != other.hashed:
-            return False
-        try:
-            return self is other or self.key == other.key
-        except (RecursionError, ValueError):
-            return False
-
-    def __hash__(self):
-        return self.hashed
+    jaxpr: Any = dataclasses.field(compare=False)
+    program: _Program
 
 
 class ClosedFunction(eqx.Module):
@@ -62,8 +63,8 @@ def closed_function(function: Callable[[Any], Any], dtype: Any) -> ClosedFunctio
     """Traces a function of a scalar time of the given dtype; what it returns must be one array."""
     closed = jax.make_jaxpr(function)(jax.ShapeDtypeStruct((), dtype))
     jaxpr, numbers = _with_numbers_lifted(closed.jaxpr)
-    key = _key_of_jaxpr(jaxpr)
-    return ClosedFunction([_own(c) for c in (*closed.consts, *numbers)], _TracedFunction(jaxpr, key, hash(key)))
+    constants = [_own(c) for c in (*closed.consts, *numbers)]
+    return ClosedFunction(constants, _TracedFunction(jaxpr, _program_of(jaxpr)))
 
 
 def _with_numbers_lifted(jaxpr: Any) -> tuple[Any, list[Any]]:
@@ -97,9 +98,9 @@ def _is_data(literal: Any) -> bool:
     return jnp.issubdtype(literal.aval.dtype, jnp.inexact) or bool(np.shape(literal.val))
 
 
-def _key_of_jaxpr(jaxpr: Any, inside: tuple[Hashable, ...] = ()) -> Hashable:
-    """A hashable value that two jaxprs share only if they compute the same from the same constants, derivatives
-    included. `inside` are the functions with rules of their own for derivatives in whose rules the jaxpr stands."""
+def _program_of(jaxpr: Any, inside: tuple[Hashable, ...] = ()) -> _Program:
+    """The object that two jaxprs share only if they compute the same from the same constants, derivatives included.
+    `inside` are the functions with rules of their own for derivatives in whose rules the jaxpr stands."""
     number: dict[Any, int] = {}
     literal = private("Literal")
 
@@ -119,7 +120,7 @@ def _key_of_jaxpr(jaxpr: Any, inside: tuple[Hashable, ...] = ()) -> Hashable:
         )
         for equation in jaxpr.eqns
     )
-    return head, body, tuple(atom(v) for v in jaxpr.outvars)
+    return _program((head, body, tuple(atom(v) for v in jaxpr.outvars)))
 
 
 def _key_of_rules(equation: Any, inside: tuple[Hashable, ...]) -> Hashable:
@@ -139,22 +140,22 @@ def _key_of_rules(equation: Any, inside: tuple[Hashable, ...]) -> Hashable:
     try:
         if "jvp_jaxpr_fun" in rules:
             jaxpr, constants, zeros = rules["jvp_jaxpr_fun"].call_wrapped(*nonzero)
-            return _key_of_jaxpr(jaxpr, inside), _key(constants), tuple(zeros)
+            return _program_of(jaxpr, inside), _key(constants), tuple(zeros)
         forwards, constants = rules["fwd_jaxpr_thunk"].call_wrapped(*nonzero)
         computed = iter(forwards.outvars)  # what is kept for the way back, but for arguments that are kept as they are
         kept = [next(computed) if k is None else equation.invars[k] for k in rules["out_trees"]()[2]]
         given = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in (*kept, *equation.outvars)]
         backwards = jax.make_jaxpr(lambda *values: rules["bwd"].call_wrapped(*values))(*given)
-        return _key_of_jaxpr(forwards, inside), _key(constants), _key(backwards, inside)
+        return _program_of(forwards, inside), _key(constants), _key(backwards, inside)
     except Exception:  # JAX promises nothing of how it holds them
         return tuple((name, _Same(rule)) for name, rule in rules.items())
 
 
 def _key(value: Any, inside: tuple[Hashable, ...] = ()) -> Hashable:
     if isinstance(value, private("ClosedJaxpr")):
-        return _key_of_jaxpr(value.jaxpr, inside), tuple(_key(c) for c in value.consts)
+        return _program_of(value.jaxpr, inside), tuple(_key(c) for c in value.consts)
     if isinstance(value, private("Jaxpr")):
-        return _key_of_jaxpr(value, inside)
+        return _program_of(value, inside)
     if isinstance(value, tuple | list):
         return type(value).__name__, tuple(_key(v, inside) for v in value)
     if isinstance(value, dict):
