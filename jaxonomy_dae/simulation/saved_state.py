@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from ..errors import ModelError
 from ..hybrid.problem import AbstractHybridProblem
 from ..hybrid.start import Resumed
+from ..programs.staging import picked
 from ..solvers.rows import padded
 from ..system.system import AcausalSystem
 from ..tolerances import KNOWN_ROUNDINGS
@@ -66,7 +67,7 @@ class Memory(eqx.Module):
 
     def first(self, rows: int) -> "Memory":
         """The first rows alone."""
-        return Memory(self.sides[:rows], self.ticked[:rows], self.sizes)
+        return Memory(picked(self.sides, slice(rows)), picked(self.ticked, slice(rows)), self.sizes)
 
     def padded(self, ts: Any, steps: Any) -> "Memory":
         """With the rows beyond the steps taken replaced by the last one."""

@@ -17,6 +17,7 @@ from ..initialization.check import check
 from ..initialization.initialize import known_start, search_outside
 from ..programs.cache import PROGRAMS
 from ..programs.members import batch_size, is_batched
+from ..programs.rows import filled_up
 from ..programs.staging import as_array, is_forwards, is_staged, is_traced, on_device, picked
 from ..solvers import BDF, Rodas5P, Tsit5
 from ..solvers.causes import decay_at, is_stiff
@@ -250,7 +251,8 @@ def simulate(
         return in_program(is_staged((given, options(solver))))
     room = _room_for(_expected_events(system, float(t1) - float(t0)))
     room = room if room * (system.plan.n_state + len(system.discretes)) <= FEW_NUMBERS else ROOM
-    outcome = run_compiled(given, options(solver, room), watch(False), begun=begun)
+    given_rows = given if ts is None else dataclasses.replace(given, ts=filled_up(ts))
+    outcome = run_compiled(given_rows, options(solver, room), watch(False), begun=begun)
     if is_traced(outcome):  # a network may close over a traced value, which shows in the outcome only
         return in_program(staged=True)
     counts = outcome.numbers()
@@ -271,15 +273,16 @@ def simulate(
             choice = implicit_choice(system.plan, found)
             solver = SOLVERS[choice.solver]()
             before = {"num_explicit_steps": counts["num_steps"], "stiff_from": float(outcome.last[0])}
-            outcome = run_compiled(given, options(solver, room), None, begun=begun)
+            outcome = run_compiled(given_rows, options(solver, room), None, begun=begun)
             counts = outcome.numbers() | before
     if outcome.events is not None and max_events is None and float(outcome.events.count) > room:
-        outcome = run_compiled(given, options(solver, _room_for(float(outcome.events.count))), None, begun=begun)
-    saved, x, discrete, memory = outcome.ts, outcome.x, outcome.discrete, outcome.memory
-    if ts is None:
-        taken = counts["num_accepted_steps"] + 1
-        saved, x, discrete = jax.tree.map(lambda rows: picked(rows, slice(taken)), (saved, x, discrete))
-        memory = memory if memory is None else memory.first(taken)
+        room = _room_for(float(outcome.events.count))
+        outcome = run_compiled(given_rows, options(solver, room), None, begun=begun)
+    memory, n = outcome.memory, len(ts) if ts is not None else counts["num_accepted_steps"] + 1
+    saved, x, discrete = (outcome.ts, outcome.x, outcome.discrete)
+    if n < len(saved):
+        saved, x, discrete = jax.tree.map(lambda rows: picked(rows, slice(n)), (saved, x, discrete))
+        memory = memory if memory is None else memory.first(n)
     solution = Solution(
         saved, x, system, inputs, counts, outcome.result, choice.solver, choice.reason, discrete, outcome.events,
         memory, asked,

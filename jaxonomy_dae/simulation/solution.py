@@ -18,6 +18,7 @@ from ..lowering.gather import times
 from ..programs.blocks import at_times, fit
 from ..programs.cache import compiled
 from ..programs.platform import precisely
+from ..programs.rows import filled_up, size_for
 from ..programs.staging import is_staged, is_traced, on_device, picked
 from ..system.system import AcausalSystem
 from .accounts import account_values, chosen_terms
@@ -153,9 +154,10 @@ class Solution(eqx.Module):
         given = (self.system, self.ts, self.states, self.inputs, self.discrete)
         if is_staged(given):
             return self._where_reached(_observed(*given, quantity, factor))[:, 0]
-        values, some = _chosen(*given, on_device(quantity), on_device(factor, self.states.dtype))
-        self._look_at((name,), quantity, factor, values, some)
-        return picked(self._where_reached(values), (slice(None), 0))
+        if not is_traced(given):
+            return picked(self._known_columns((name,), {}, quantity, factor, None), (slice(None), 0))
+        values, _ = _chosen(*given, on_device(quantity), on_device(factor, self.states.dtype))
+        return self._where_reached(values)[:, 0]
 
     def _where_reached(self, values: Any) -> Any:
         """The values, shape (n, k), with not-a-number where they are not finite, and in rows that the run did not
@@ -190,7 +192,7 @@ class Solution(eqx.Module):
             refuse_not_finite(self.system, names, quantity, values, rows, self.inputs)
         if asked.tolerances is None or not is_looked_at(self.system):
             return
-        rows = _some(self.ts.shape[0])
+        rows = np.minimum(_some(size_for(self.ts.shape[0])), self.ts.shape[0] - 1)
         rtol, atol = map(np.asarray, asked.tolerances)
         at = list(zip(np.asarray(self.ts, float)[rows].tolist(), np.asarray(some, float), strict=True))
         tolerances = rtol * np.abs(np.asarray(self.states, float)[rows]) + atol
@@ -241,10 +243,10 @@ class Solution(eqx.Module):
             values = np.asarray(self.states)[:, inside] * factor.astype(values.dtype)
         elif (quantity >= 0).any():
             n = 1 << (len(quantity) - 1).bit_length()  # numbers of names that share a program
-            given = (self.system, self.ts, self.states, self.inputs, self.discrete)
+            ts, states, discrete = filled_up((self.ts, self.states, self.discrete))
             padded = on_device(np.resize(quantity, n)), on_device(np.resize(factor, n), values.dtype)
-            chosen, some = _chosen(*given, *padded)
-            values = np.asarray(chosen)[:, : len(quantity)]
+            chosen, some = _chosen(self.system, ts, states, self.inputs, discrete, *padded)
+            values = np.asarray(chosen)[: len(self.ts), : len(quantity)]
             self._look_at(read, quantity, factor, np.where(quantity < 0, 0.0, values), some)
         values = np.where(quantity < 0, 0.0, values)
         reached = np.isfinite(np.asarray(self.states)).all(axis=-1, keepdims=True)
@@ -277,7 +279,10 @@ class Solution(eqx.Module):
         """The residuals of all hidden constraints at the saved times, shape `(n, constraints)`."""
         if self.states.ndim > 2:
             return _each(self, Solution.constraint_residual)
-        return _constraint_residual(self.system, self.ts, self.states, self.inputs, self.discrete)
+        if is_traced(self):
+            return _constraint_residual(self.system, self.ts, self.states, self.inputs, self.discrete)
+        ts, states, discrete = filled_up((self.ts, self.states, self.discrete))
+        return picked(_constraint_residual(self.system, ts, states, self.inputs, discrete), slice(len(self.ts)))
 
     def to_dict(self) -> dict[str, Any]:
         """All variables, and `"time"`, by name."""
@@ -307,7 +312,12 @@ class Solution(eqx.Module):
         chosen = chosen_terms(self.system.plan, kind, component)
         if self.states.ndim > 2:
             return _each(self, lambda one: one._account(kind, component))
-        return jnp.sum(account_values(self.system, self.ts, self.states, self.inputs, self.discrete)[:, chosen], axis=1)
+        if is_traced(self):
+            values = account_values(self.system, self.ts, self.states, self.inputs, self.discrete)
+            return jnp.sum(values[:, chosen], axis=1)
+        ts, states, discrete = filled_up((self.ts, self.states, self.discrete))
+        values = np.asarray(account_values(self.system, ts, states, self.inputs, discrete))
+        return on_device(values[: len(self.ts), chosen].sum(axis=1))
 
     def energy_balance_error(self, *, rtol: float = 1e-8, atol: float = 1e-10) -> Float[Array, " n"]:
         """By how much the account of energy fails to balance at the saved times, shape `(n,)`:

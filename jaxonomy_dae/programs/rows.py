@@ -1,0 +1,31 @@
+"""Rows of any number, filled up to few different numbers, so that records of different lengths share a program."""
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from .staging import on_device
+
+DOUBLED = 1024  # up to so many, the next power of two: what more rows cost is nothing beside a compilation
+PARTS = 8  # of each doubling beyond, so that at most an eighth is computed in vain
+
+
+def size_for(n: int) -> int:
+    """The number of rows to which n are filled up."""
+    doubled = 1 << max(n - 1, 0).bit_length()
+    if doubled <= DOUBLED:
+        return doubled
+    part = doubled // 2 // PARTS
+    return -(-n // part) * part
+
+
+def filled_up(rows: Any) -> Any:
+    """Arrays with one length, filled up with copies of the last row, outside of jit."""
+
+    def filled(array: Any) -> Any:
+        values = np.asarray(array)
+        more = size_for(len(values)) - len(values)
+        return on_device(np.concatenate([values, np.repeat(values[-1:], more, axis=0)])) if more else array
+
+    return jax.tree.map(filled, rows)
