@@ -225,7 +225,9 @@ def simulate(
         # Where the default cannot be replaced, it would cost every program inside jit 1 to 2 % of its lines.
         if prescribed or not isinstance(solver, diffrax.Tsit5) or (traced and not choice.final):
             return None
-        floor = jnp.asarray(jnp.divide(scaled_atol(system, atol), rtol), dtype)
+        size = scaled_atol(system, atol)
+        known = not is_traced((size, rtol))
+        floor = on_device(np.divide(size, rtol) if known else jnp.divide(size, rtol), dtype)
         return Watch(t1, floor, int(SHARE * max_steps), of_run=True) if choice.final else Watch(t1, floor)
 
     def in_program(staged: bool) -> Solution:
