@@ -116,7 +116,7 @@ bench: $(VENV)/.stamp-dev
 	@set -e; for f in benchmarks/[!_]*.py; do echo "== $$f"; $(BIN)/python "$$f"; done
 
 notebook: $(VENV)/.stamp-dev
-	$(BIN)/jupyter-execute --inplace $(NOTEBOOKS)
+	$(BIN)/python docs/execute_notebooks.py $(NOTEBOOKS)
 
 clean:
 	rm -rf build dist site .pytest_cache .ruff_cache .hypothesis examples/output $(FLOORS)

@@ -81,11 +81,13 @@ def title_of(notebook: pathlib.Path) -> str:
 
 
 @functools.cache
-def last_figure_of(notebook: pathlib.Path) -> bytes:
-    """The last figure that is stored in it, a PNG."""
-    cells = json.loads(notebook.read_text())["cells"]
-    figures = [o["data"]["image/png"] for c in cells for o in c.get("outputs", ()) if "image/png" in o.get("data", ())]
-    return base64.b64decode("".join(figures[-1]))
+def last_figure_of(notebook: pathlib.Path) -> tuple[str, bytes]:
+    """The last figure that is stored in it: the suffix of its kind, and what it holds."""
+    outputs = [o.get("data", {}) for c in json.loads(notebook.read_text())["cells"] for o in c.get("outputs", ())]
+    last = next(data for data in reversed(outputs) if {"image/svg+xml", "image/png"} & {*data})
+    if "image/svg+xml" in last:
+        return "svg", "".join(last["image/svg+xml"]).encode()
+    return "png", base64.b64decode("".join(last["image/png"]))
 
 
 def overview() -> str:
@@ -107,7 +109,7 @@ def overview() -> str:
             download = f'[Download]({entry.stem}.txt){{ download="{entry.path.name}" }}'
             time = f" *About {entry.time}.*" if entry.time else ""
             lines += [f"{entry.idea}{time}{data} {download}"]
-            lines += ["", f"[![The last figure]({entry.stem}.png)]({name})", ""]
+            lines += ["", f"[![The last figure]({entry.stem}.{last_figure_of(entry.path)[0]})]({name})", ""]
     return "\n".join(lines)
 
 
@@ -127,6 +129,7 @@ def on_files(files: Any, config: Any) -> Any:
     for path in notebooks():
         site = config.site_dir
         files.append(File(path.relative_to(EXAMPLES).as_posix(), str(EXAMPLES), site, config.use_directory_urls))
-        files.append(File.generated(config, f"gallery/{path.stem}.png", content=last_figure_of(path)))
+        suffix, figure = last_figure_of(path)
+        files.append(File.generated(config, f"gallery/{path.stem}.{suffix}", content=figure))
         files.append(File.generated(config, f"gallery/{path.stem}.txt", content=path.read_text()))
     return files

@@ -271,7 +271,7 @@ def part_a():
     data = states(truth)[AT_HORIZONS]
     table(
         "The truth at the three times of the loss",
-        ["t [s]", "vx, tutorial", "vx, here", "x, tutorial", "x, here"],
+        ["T / s", "vx, tutorial", "vx, here", "x, tutorial", "x, here"],
         [
             [f"{t:.1f}", f"{theirs[0]:+.5f}", f"{ours[0]:+.8f}", f"{theirs[1]:+.5f}", f"{ours[1]:+.8f}"]
             for t, theirs, ours in zip(HORIZONS, TUTORIAL["states"], np.asarray(data), strict=True)
@@ -357,7 +357,7 @@ def draw_tutorial(runs):
         ax.axvline(
             float(t), color="k", linestyle=":", linewidth=1, label="seen by the loss" if t == HORIZONS[0] else None
         )
-    draw(ax, {k: (TIMES, angle(run)) for k, run in shown.items()}, "time [s]", "angle from the +x axis [rad]", "Swing")
+    draw(ax, {k: (TIMES, angle(run)) for k, run in shown.items()}, "Time / s", "Angle from the +x axis / rad", "Swing")
     save(figure, "a2_angle")
 
     off_circle = {
@@ -369,18 +369,18 @@ def draw_tutorial(runs):
         ["", "tutorial", "here"],
         [
             ["no drag: relative change of energy", TUTORIAL["energy"], largest(ideal - ideal[0]) / abs(ideal[0])],
-            ["truth: largest rise of energy between samples [J]", "", max(float(np.max(np.diff(damped))), 0.0)],
-            ["no drag: |x² + y² − L²| [m²]", TUTORIAL["constraint"]["no drag"], largest(off_circle["no drag"])],
-            ["truth: |x² + y² − L²| [m²]", TUTORIAL["constraint"]["truth"], largest(off_circle["truth"])],
+            ["Truth: largest rise of energy between samples / J", "", max(float(np.max(np.diff(damped))), 0.0)],
+            ["No drag: |x² + y² − L²| / m²", TUTORIAL["constraint"]["no drag"], largest(off_circle["no drag"])],
+            ["Truth: |x² + y² − L²| / m²", TUTORIAL["constraint"]["truth"], largest(off_circle["truth"])],
         ],
     )
     print("  The tutorial's energy rests on differences of x and y; here the velocities are read by their names.")
     figure, (left, right) = plt.subplots(1, 2, figsize=(13, 4), layout="constrained")
-    draw(left, {k: (TIMES, energy(run)) for k, run in shown.items()}, "time [s]", "energy [J]", "Mechanical energy")
+    draw(left, {k: (TIMES, energy(run)) for k, run in shown.items()}, "Time / s", "Energy / J", "Mechanical energy")
     printed = max(TUTORIAL["constraint"].values())
     right.axhline(printed, color="k", linestyle=":", linewidth=1, label="tutorial, largest")
     distances = {k: (TIMES, np.where(v == 0, np.nan, np.abs(v))) for k, v in off_circle.items()}
-    draw(right, distances, "time [s]", "$|x^2+y^2-L^2|$ [m$^2$], where not 0", "Constraint", True,
+    draw(right, distances, "Time / s", "$|x^2+y^2-L^2|$ [m$^2$], where not 0", "Constraint", True,
          linestyle="none", marker=".", markersize=4)  # fmt: skip
     right.set_ylim(1e-17, 1e-13)
     save(figure, "a3_energy_and_constraint")
@@ -397,7 +397,9 @@ def report_law(runs, model, learned):
         return np.asarray(jax.vmap(lambda v: network(0.0, v[None], system.neural["drag"])[0])(jnp.asarray(grid)))
 
     laws = {name: law(system) for name, system in learned.items()}
-    rows = [["velocities explored [m/s]", "[{:+.2f}, {:+.2f}]".format(*TUTORIAL["band"]), f"[{low:+.2f}, {high:+.2f}]"]]
+    rows = [
+        ["Velocities explored / (m/s)", "[{:+.2f}, {:+.2f}]".format(*TUTORIAL["band"]), f"[{low:+.2f}, {high:+.2f}]"]
+    ]
     for k, (name, values) in enumerate(laws.items()):
         for where, mask in (("inside", inside), ("outside", ~inside)):
             printed = f"{TUTORIAL['law'][where]:.4f}" if k == 0 else ""
@@ -406,7 +408,7 @@ def report_law(runs, model, learned):
 
     figure, ax = plt.subplots(figsize=(8, 5), layout="constrained")
     curves = {"truth": (grid, true), f"learned, after update {KEPT}": (grid, laws[f"after update {KEPT}"])}
-    draw(ax, curves, "velocity $v_x$ [m/s]", "correction [m/s²]", "Law", band=(low, high))
+    draw(ax, curves, "Velocity $v_x$ / (m/s)", "Correction / (m/s²)", "Law", band=(low, high))
     save(figure, "a4_law")
 
 
@@ -424,13 +426,13 @@ def row_and_equation(row):
     pairs = [np.asarray(states(run))[AT_HORIZONS] for run in runs.values()]
     table(
         "(vx, x) with the same drag on vx: added to the row, to the equation, and in a model with one angle",
-        ["t [s]", *runs],
+        ["T / s", *runs],
         [[f"{t:.1f}", *(f"{vx:+.6f}, {x:+.6f}" for vx, x in at_t)] for t, *at_t in zip(HORIZONS, *pairs, strict=True)],
     )
     one_angle = runs.pop("one angle")
     table(
         f"Largest deviation from the model with one angle over {DURATION:g} s",
-        ["", "x [m]", "link's pull [N]"],
+        ["", "$x$ / m", "Link's pull / N"],
         [
             [name, largest(run["pend.x"] - one_angle["pend.x"]), largest(tension(run) - tension(one_angle))]
             for name, run in runs.items()
@@ -541,7 +543,7 @@ def compare(systems, band, true, data):
     errors = {name: rms(angle(run) - angle(true)) for name, run in runs.items()}
     table(
         f"Against the truth over {DURATION:g} s; law between {low:.2f} and {high:.2f} m/s",
-        ["", "angle, rms [rad]", "better by", "law, rms [%]", "link's pull, max [N]", "misfit / noise"],
+        ["", "Angle, rms / rad", "better by", "Law, rms / %", "Link's pull, max / N", "misfit / noise"],
         [
             [
                 name,
@@ -574,10 +576,10 @@ def draw_swings(runs, true, data):
         k: (SAMPLES, np.linalg.norm(np.asarray(positions(runs[k]) - positions(true)), axis=1))
         for k in ("no drag", "learned", "closed form")
     }
-    draw(axes[0], angles, None, "angle [rad]", "Swing")
-    draw(axes[1], pulls, None, "pull [N]", "The link's pull, never measured")
+    draw(axes[0], angles, None, "Angle / rad", "Swing")
+    draw(axes[1], pulls, None, "Pull / N", "The link's pull, never measured")
     axes[2].axhline(NOISE, color="k", linestyle=":", linewidth=1, label="noise of the samples")
-    draw(axes[2], distances, "time [s]", "distance [m]", "Distance from the true position", log=True)
+    draw(axes[2], distances, "Time / s", "Distance / m", "Distance from the true position", log=True)
     save(figure, "b1_swings")
 
 
@@ -587,11 +589,11 @@ def draw_law(band, laws, law):
     shown = {"truth": law, "learned": laws["learned"], "closed form": laws["closed form"]}
     errors = {k: (band.grid, np.abs(v - law)) for k, v in shown.items() if k != "truth"}
     left.fill_between(band.grid, band.low, band.high, color="C0", alpha=0.25, linewidth=0)
-    draw(left, {k: (band.grid, v) for k, v in shown.items()}, "speed [m/s]", "deceleration [m/s²]", "Law of drag",
+    draw(left, {k: (band.grid, v) for k, v in shown.items()}, "Speed / (m/s)", "Deceleration / (m/s²)", "Law of drag",
          band=explored)  # fmt: skip
     left.set_ylim(-0.5, 1.1 * law.max())
     right.fill_between(band.grid, 1e-6, half, color="C0", alpha=0.2, linewidth=0, label="95 % band")
-    draw(right, errors, "speed [m/s]", "error [m/s²]", "Its error", log=True, band=explored)
+    draw(right, errors, "Speed / (m/s)", "Error / (m/s²)", "Its error", log=True, band=explored)
     right.set_ylim(1e-5, 10)
     save(figure, "b2_law")
 

@@ -55,7 +55,7 @@ class FrequencyResponse(eqx.Module):
         return bode(self, *pairs, axes=axes)
 
     def nyquist(self, *pairs: tuple[str, str], ax: Any = None) -> Any:
-        """Draws responses in the complex plane, those at −ω dashed, with the point −1.
+        """Draws responses in the complex plane, with the point −1. Responses at −ω are dashed.
 
         **Arguments:**
 

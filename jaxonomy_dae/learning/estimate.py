@@ -41,7 +41,7 @@ class Estimate:
     - `system`: with the values found; `observers`: the sensor laws, with theirs.
     - `minimum`: where the descent ended: its `history`, `converged`, `message`, and weighted with `minimum.weights` its
         residuals and Jacobian.
-    - `point`: all coordinates there, as `objective.coordinates` names them.
+    - `point`: the values of all coordinates at the estimate; `objective.coordinates` has their names.
     - `training`: what came before least squares, with `first=`.
     """
 

@@ -41,7 +41,7 @@ class Unknown:
 class Experiment:
     """One record.
 
-    - `times`: when it was sampled, increasing, shape `(n,)`.
+    - `times`: the sampling times, increasing, shape `(n,)`.
     - `data`: by the variables' names, shape `(n,)`, or `(n, *shape)` for the name of an array; NaN where there is no
         sample.
     - `sigma`: standard deviations of the noise, by name or one number for all, in the variables' units; or

@@ -117,8 +117,8 @@ class Posterior:
         return "\n".join([head, *self._complaints])
 
     def table(self, level: float = 0.95) -> Table:
-        """Medians of parameters, starts and noise levels, with the intervals that leave the same share of draws out on
-        both sides; and of which chains disagree."""
+        """A table of parameters, starts and noise levels: medians, and intervals with the same share of draws left out
+        on both sides. It names those on which chains disagree."""
         c, rows = self.estimate.objective.coordinates, []
         units = dict(zip(c.names, c.units, strict=True))
         weights = {name for name, w in zip(c.names, c.is_weight, strict=True) if w and name.endswith("]")}

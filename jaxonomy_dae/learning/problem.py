@@ -230,7 +230,7 @@ class Problem:
         - `horizons`: shares of the time that are fitted one after the other, such as `(0.25, 0.5, 1)`: what diverges
             over the whole time is caught early. Over a part, inner layers stay close to where they are, as far as
             the data let them. None: all of it, or with `method="growing"`, ten of them.
-        - `steps`: how many steps of least squares at most.
+        - `steps`: the largest number of steps of least squares.
         - `warn`: whether a `FitWarning` tells the `reasons` for which the estimate is not `ok`.
 
         Where `start`, `first`, `adam` and `horizons` are left out, networks begin at their own weights or with a last

@@ -169,7 +169,7 @@ class HeatedCell(_Cell):
 
     - `Ea`: the activation energy of the series resistance (joule per mole), `R0` > 0 (ohm) at `T_ref` > 0 (kelvin).
     - `dUdT`: the entropic coefficient (volt per kelvin).
-    - The others are those of `Cell`.
+    - All other arguments are those of `Cell`.
 
     **Raises:**
 
@@ -295,9 +295,9 @@ class Pack(_Pack):
     **Arguments:**
 
     - `series`, `parallel`: how many, each ≥ 1.
-    - The others are those of `Cell`. `Q`, `R0`, `eta`, `initial_soc` and the entries of `R`, `C` and `initial_v` are
-        one value for all cells, a parameter of the pack, or an array of shape (series, parallel), whose entries are
-        parameters of the cells.
+    - All other arguments are those of `Cell`. `Q`, `R0`, `eta`, `initial_soc` and the entries of `R`, `C` and
+        `initial_v` are one value for all cells, a parameter of the pack, or an array of shape (series, parallel), whose
+        entries are parameters of the cells.
 
     **Raises:**
 

@@ -305,8 +305,8 @@ class Component(ModeDeclarations, metaclass=Construction):
 
         - `derivative`: `der(x)`, `der(der(x))`, … of a variable of this component or of a child.
         - `value`: a number or an expression in parameters.
-        - `fixed`: whether it must hold; otherwise it guides the search for a consistent initial point, where equations
-            have several solutions for the derivative, and where it is free.
+        - `fixed`: whether it must hold. Otherwise it is a guess for the search for a consistent initial point, which
+            counts where the equations have several solutions for the derivative, and where it is free.
 
         **Raises:**
 
@@ -394,7 +394,7 @@ class Component(ModeDeclarations, metaclass=Construction):
             `component.name` (one output) or `component.name[0]`, `component.name[1]`, …
         - `network`: a callable pytree, `network(u) -> (outputs,)`, such as an `equinox.nn.MLP`.
         - `inputs`: symbols of variables (or `ev.t`); `u` has shape `(len(inputs),)`, in this order.
-        - `outputs`: how many outputs; found by tracing the network when left out.
+        - `outputs`: the number of outputs. If left out, it is found by tracing the network.
         - `kind`: the class that the network must be of, or several, for a component whose physics relies on it:
             `kind=jaxonomy_dae.learning.AbstractPassive` admits only laws that bring no energy in.
 
@@ -424,7 +424,7 @@ class Component(ModeDeclarations, metaclass=Construction):
             `equinox.Module`, or a method of one), the arrays in it are leaves of the system, and
             `system.partition("component.name")` makes them trainable.
         - `inputs`: symbols of variables (or `ev.t`), in this order.
-        - `outputs`: how many outputs; found by tracing the function when left out.
+        - `outputs`: the number of outputs. If left out, it is found by tracing the function.
 
         **Returns:**
 

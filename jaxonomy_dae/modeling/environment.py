@@ -10,7 +10,7 @@ class EqnEnv:
     **Arguments:**
 
     - `constants`: named numbers every component of the model can read, such as `gravity=9.81`, as
-        `ev.constants["gravity"]`. They are plain numbers: what is to be trained or varied should be a parameter.
+        `ev.constants["gravity"]`. They are plain numbers. A value to be trained or varied should be a parameter.
 
     `ev.t` is the symbol of time; it may stand in any equation.
 

@@ -40,7 +40,7 @@ NONNEGATIVE = Interval(0.0, math.inf)
 
 
 def as_interval(bounds: Any, where: str) -> Interval:
-    """The interval that `bounds`, an `Interval` or a pair (low, high) of a closed one, declares."""
+    """The interval that `bounds` declares: an `Interval`, or a pair (low, high) for a closed interval."""
     if isinstance(bounds, Interval):
         found = bounds
     else:

@@ -26,7 +26,7 @@ class SavedState(eqx.Module):
     second = simulate(system, 10.0, initial=first.at(-1))
     ```
 
-    A pytree of arrays, which may be the carry of `jax.lax.scan`, mapped over and differentiated.
+    A pytree of arrays. It may be the carry of `jax.lax.scan`, and it can be mapped over and differentiated.
 
     - `t`: the time.
     - `x`: the array of states, as `system.vector_field` takes it, shape `(n_state,)`.

@@ -136,9 +136,9 @@ def simulate(
     - `throw`: whether to raise if the start is not consistent or the integration fails. Otherwise `solution.result`
         has a code, rows that were not reached are NaN, and so are their derivatives; `RESULTS.nonfinite` stands for
         parameters out of their bounds, for parameters, weights and inputs that are not finite, and for samples that do
-        not reach over the run. None: outside jit and vmap; `jax.vmap` outside of jit warns, with the numbers of the
-        members that failed. Inside jit, True puts callbacks to the host into the program, which JAX's persistent
-        compilation cache then does not keep.
+        not reach over the run. None raises outside jit and vmap. `jax.vmap` outside of jit warns instead, with the
+        numbers of the members that failed. Inside jit, True puts callbacks to the host into the program. JAX's
+        persistent compilation cache does not keep such a program.
 
     **Returns:**
 

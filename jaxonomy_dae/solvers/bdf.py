@@ -79,7 +79,7 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
     - `max_order`: 1 to 5.
     - `fixed_order`: stay at `max_order` once it is reached; for convergence studies.
     - `linear_solver`: any Lineax solver, such as `lineax.GMRES(rtol, atol)`, or one of `jaxonomy_dae.linear`; None
-        chooses by size. It is handed a `SparseLinearOperator` where the term has a pattern.
+        chooses by size. It receives a `SparseLinearOperator` where the term has a pattern.
     - `algebraic_errors`: whether the error test counts what is not differentiated. If not, there
         are fewer steps (often far fewer where M is not diagonal), and their ends are as accurate; but nothing checks
         the dense output of an algebraic unknown that varies faster than the rest. None counts it where M is diagonal,

@@ -118,7 +118,7 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
     **Arguments:**
 
     - `linear_solver`: any Lineax solver, such as `lineax.GMRES(rtol, atol)`, or one of `jaxonomy_dae.linear`; None
-        chooses by size. It is handed a `SparseLinearOperator` where the term has a pattern.
+        chooses by size. It receives a `SparseLinearOperator` where the term has a pattern.
 
     - `dense_errors`: whether the error test counts the dense output of differentiated unknowns inside of a step, too,
         by its defect there: one more evaluation. Without, what is very stiff is right at the ends of steps, which may

@@ -40,9 +40,9 @@ class AcausalCompiler:
         Jacobian is constant, projection elsewhere.
     - `prefer_states`: names of variables that should be states, the most important first.
     - `linear_solver`: a Lineax solver, such as `lineax.GMRES(rtol=1e-8, atol=1e-8)`, for large blocks of simultaneous
-        equations, which is given a `SparseLinearOperator` with rows and columns scaled. What it leaves is corrected by
-        solving again until every equation holds to rounding, or is not-a-number. By default LAPACK up to 48 equations,
-        then KLU.
+        equations. It receives a `SparseLinearOperator` with scaled rows and columns. Its residual is corrected by
+        further solves until every equation holds to rounding; if that fails, the result is not-a-number. By default,
+        LAPACK solves up to 48 equations, and KLU larger blocks.
     - `passes`: functions from a `FlatModel` to another one, run after flattening and before all other passes; see
         *Adding a pass* in the documentation of development.
     - `check_units`: whether declared units are compared, in equations, starts, events, accounts of energy and connected

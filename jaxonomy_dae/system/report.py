@@ -85,7 +85,7 @@ class SystemReport(Sections):
 
     @property
     def algebraics(self) -> list[str]:
-        """The unknowns that are solved for, derivatives left out."""
+        """The unknowns that are solved for, without derivatives."""
         plan = self._plan
         named: dict[int, str] = {}
         for name in plan.visible_variables:

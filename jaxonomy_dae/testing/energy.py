@@ -16,7 +16,7 @@ def assert_energy_balance(solution: Solution, rtol: float = 1e-4) -> Certificate
 
     - `solution`: of a model whose components declare energies and powers; those of `jaxonomy_dae.library` do.
     - `rtol`: the largest error allowed at any saved time, relative to the largest of all that was stored, supplied or
-        lost on the way. The saved states carry the error of their own run: allow a hundred times its tolerance.
+        lost on the way. The saved states carry the error of their own run. Allow a hundred times its tolerance.
 
     **Returns:**
 

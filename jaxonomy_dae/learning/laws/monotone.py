@@ -15,9 +15,9 @@ from .network import divided, multiplied, sizes
 class Monotone(eqx.Module):
     """Each output rises, or stays, where an input rises; with `increasing=False`, where it falls.
 
-    Hidden layers are h ← tanh(W h + b), and the outputs V h + S u + b with the inputs u: all of W, V and S are squares
-    of what is trained, so they are ≥ 0. Sums with such weights, tanh, and what is composed of them, do not fall where
-    their arguments rise; so ∂f/∂u ≥ 0 for all weights. All continuous monotone functions of k variables are
+    Hidden layers are h ← tanh(W h + b). The outputs are V h + S u + b, with the inputs u. All entries of W, V and S are
+    squares of trained numbers, so they are ≥ 0. Sums with such weights, tanh, and their compositions do not fall where
+    their arguments rise, so ∂f/∂u ≥ 0 for all weights. All continuous monotone functions of k variables are
     approximated on a bounded region with k hidden layers (Daniels & Velikova 2010, IEEE Trans. Neural Networks 21:906);
     of one variable with one, whose steps add up.
 
