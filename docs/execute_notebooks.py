@@ -41,7 +41,11 @@ def main(paths: list[str]) -> None:
             before = spent()
             notebook = nbformat.read(path, as_version=4)
             client = nbclient.NotebookClient(notebook, timeout=None, resources={"metadata": {"path": str(path.parent)}})
-            client.execute()
+            try:
+                client.execute()
+            except nbclient.exceptions.CellExecutionError as error:
+                print(f"{path.name}: {error}", flush=True)
+                continue
             for cell in notebook.cells:
                 cell.metadata.pop("execution", None)  # times of day
             text = nbformat.writes(notebook)
