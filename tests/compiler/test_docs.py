@@ -153,8 +153,9 @@ def test_the_gallery_has_an_overview():
     text = gallery.overview()
     for entry in gallery.entries():
         assert re.search(rf"### \[[^\]]+\]\([./]*{entry.stem}\.ipynb\)\n\n[^\n]+\.", text), entry.stem
-        assert f"({entry.stem}.png)" in text and "TIME" not in text
-        assert gallery.last_figure_of(entry.path).startswith(b"\x89PNG")
+        suffix, figure = gallery.last_figure_of(entry.path)
+        assert f"({entry.stem}.{suffix})" in text and "TIME" not in text
+        assert b"<svg" in figure if suffix == "svg" else figure.startswith(b"\x89PNG")
     found = {path.stem for path in (gallery.EXAMPLES / "gallery").glob("*.ipynb")} | {"neural_dae_pendulum_drag"}
     assert found == {entry.stem for entry in gallery.entries()}
 
