@@ -12,16 +12,18 @@ from .objective import Objective
 
 @dataclasses.dataclass(frozen=True)
 class Whiteness:
-    """The test of one output of one experiment: the correlation of neighbouring residuals, and Ljung and Box's
-    `statistic` (1978) over so many `lags`, which is χ² of as many degrees of freedom for white noise."""
+    """The tests of one output of one experiment: the correlation of neighbouring residuals; Ljung and Box's `statistic`
+    (1978) over so many `lags`, which is χ² of as many degrees of freedom for white noise; and the probability that white
+    noise has as high a `peak` among its frequencies, which a missing mode makes."""
 
     correlation: float
     statistic: float
     lags: int
+    peak: float
 
     @property
     def probability(self) -> float:
-        """The probability that white noise would show as much."""
+        """The probability that white noise would show as much correlation."""
         return float(scipy.stats.chi2.sf(self.statistic, self.lags))
 
 
@@ -34,10 +36,20 @@ def whiteness(residual: Float[np.ndarray, " n"]) -> Whiteness:
     power = float(centred @ centred)
     lags = max(int(np.log(n)), 1)
     if n <= lags + 1 or power == 0:
-        return Whiteness(np.nan, np.nan, lags)
+        return Whiteness(np.nan, np.nan, lags, np.nan)
     rho = np.array([float(centred[k:] @ centred[:-k]) for k in range(1, lags + 1)]) / power
     statistic = n * (n + 2) * float(np.sum(rho**2 / (n - np.arange(1, lags + 1))))
-    return Whiteness(float(rho[0]), statistic, lags)
+    return Whiteness(float(rho[0]), statistic, lags, peak(centred))
+
+
+def peak(centred: Float[np.ndarray, " n"]) -> float:
+    """The probability that the periodogram of white noise has a peak as high as this, relative to its sum: of m
+    frequencies, at most m·(1 − g)^(m − 1) (Fisher 1929, Proc. R. Soc. A 125:54)."""
+    squares = np.abs(np.fft.rfft(centred)[1 : (len(centred) + 1) // 2]) ** 2
+    if len(squares) < 2:
+        return 1.0
+    share = float(squares.max() / squares.sum())
+    return min(len(squares) * (1 - share) ** (len(squares) - 1), 1.0)
 
 
 def log_likelihood(m: Minimum) -> float:

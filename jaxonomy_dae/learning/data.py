@@ -76,7 +76,7 @@ class Stacked:
     t0: Float[np.ndarray, " e"]
     values: Float[np.ndarray, "e n k"]
     observed: Bool[np.ndarray, "e n k"]
-    sigma: Float[np.ndarray, "e k"]  # NaN: to be estimated
+    sigma: Float[np.ndarray, "e n k"]  # NaN: to be estimated
     weight: Float[np.ndarray, " e"]
     holdout: Bool[np.ndarray, " e"]
     inputs: dict[str, tuple[Float[np.ndarray, "e m"], Float[np.ndarray, "e m"]]]
@@ -84,6 +84,28 @@ class Stacked:
     starts: dict[str, tuple[Any, ...]]  # a number or an Unknown for each experiment
     labels: tuple[str, ...]
     counts: tuple[int, ...]  # of times
+
+    @property
+    def estimated(self) -> Bool[np.ndarray, "e k"]:
+        """True where a noise level is to be estimated."""
+        return np.isnan(self.sigma[:, 0])
+
+    @property
+    def levels(self) -> Float[np.ndarray, "e k"]:
+        """Noise levels that are the same for all samples of a name in an experiment; NaN: to be estimated.
+
+        **Raises:**
+
+        - `ModelError` where they differ.
+        """
+        differs = np.argwhere(np.ptp(self.sigma, axis=1) > 0)
+        if len(differs):
+            k, j = differs[0]
+            raise ModelError(
+                f"{self.labels[k]}: '{self.outputs[j]}' has a noise level for each sample, which filters do not take: "
+                "give one for all, or use method='single'"
+            )
+        return self.sigma[:, 0]
 
     def until(self, share: float) -> "Stacked":
         """A copy of the same shapes in which only this share of each experiment's time counts."""
@@ -101,7 +123,7 @@ def stack(data: Data, plan: SystemPlan, derived: tuple[str, ...], starts: dict[s
     experiments = data.experiments
     outputs: dict[str, None] = {}
     columns: list[dict[str, np.ndarray]] = []
-    sigmas: list[dict[str, float]] = []
+    sigmas: list[dict[str, np.ndarray]] = []
     for label, one in zip(data.labels, experiments, strict=True):
         column, sigma = _columns(one, plan, derived, label)
         columns.append(column)
@@ -109,11 +131,13 @@ def stack(data: Data, plan: SystemPlan, derived: tuple[str, ...], starts: dict[s
         outputs |= dict.fromkeys(column)
     n = max(len(one.times) for one in experiments)
     shape = (len(experiments), n, len(outputs))
-    values = np.full(shape, math.nan)
+    values, levels = np.full(shape, math.nan), np.full(shape, math.nan)
     for k, (one, column) in enumerate(zip(experiments, columns, strict=True)):
         for j, name in enumerate(outputs):
             if name in column:
                 values[k, : len(one.times), j] = column[name]
+                levels[k, :, j] = np.resize(sigmas[k][name][-1:], n)
+                levels[k, : len(one.times), j] = sigmas[k][name]
     observed = np.isfinite(values)
     training = ~np.array([one.holdout for one in experiments])
     if not observed[training].any():
@@ -126,7 +150,7 @@ def stack(data: Data, plan: SystemPlan, derived: tuple[str, ...], starts: dict[s
         t0=np.array([one.t0 for one in experiments], float),
         values=np.where(observed, values, 0.0),
         observed=observed,
-        sigma=np.array([[s.get(name, math.nan) for name in outputs] for s in sigmas]),
+        sigma=levels,
         weight=np.array([one.weight for one in experiments], float),
         holdout=~training,
         inputs=inputs,
@@ -143,11 +167,10 @@ def _padded(array: np.ndarray, n: int) -> np.ndarray:
 
 def _columns(
     one: Experiment, plan: SystemPlan, derived: tuple[str, ...], label: str
-) -> tuple[dict[str, np.ndarray], dict[str, float]]:
-    """The samples and noise levels of an experiment, those of arrays by their entries."""
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """The samples of an experiment and their noise levels, those of arrays by their entries."""
     column: dict[str, np.ndarray] = {}
-    sigma: dict[str, float] = {}
-    sigmas: Any = one.sigma  # by name, once it has been read
+    sigma: dict[str, np.ndarray] = {}
     for name, values in one.data.items():
         entries = None if name in derived else plan.entries(name)
         if entries is None:
@@ -163,10 +186,11 @@ def _columns(
             wanted = ", ".join(["n", *map(str, shape)])
             raise ModelError(f"{label}: data of '{name}' must have shape ({wanted}); got {values.shape}")
         flat = values.reshape(len(values), -1)
+        levels = np.broadcast_to(one.levels[name], values.shape).reshape(flat.shape)
         for j, entry in enumerate(names):
             if entry in column:
                 raise ModelError(f"{label}: data of '{entry}' are given twice, by its own name and as part of an array")
-            column[entry], sigma[entry] = flat[:, j], sigmas[name]
+            column[entry], sigma[entry] = flat[:, j], levels[:, j]
     return column, sigma
 
 

@@ -186,7 +186,7 @@ def posed(estimate: "Estimate") -> tuple[Program, Posed, tuple[str, ...]]:
     counted = np.zeros(s.values.shape, bool)
     counted[objective.rows] = True
     counts = counted.sum(axis=1) * s.weight[:, None]  # by experiment and output
-    sampled = np.isnan(s.sigma) & np.isin(np.arange(len(s.outputs)), places)
+    sampled = s.estimated & np.isin(np.arange(len(s.outputs)), places)
     place = np.zeros(len(s.outputs), int)
     place[places] = np.arange(len(places))
     total = np.array([counts[sampled[:, j], j].sum() for j in places])

@@ -244,7 +244,7 @@ def _told(planned: Objective, shared: Any, own: Any) -> Iterator[tuple[tuple[np.
     s = planned.stacked
     if not isinstance(planned, AheadObjective):
         outputs, *slopes = predict_and_differentiate(planned.setting, shared, own, planned.conditions)
-        yield (_scaled(np.asarray(outputs), slopes, s.sigma[:, None, :]),)
+        yield (_scaled(np.asarray(outputs), slopes, s.sigma),)
         return
     structure = dataclasses.replace(planned.structure, is_drawn=True)
     count = min(2 ** int(np.ceil(np.log2(s.values[0].size + 1))), DRAWS)
@@ -256,7 +256,7 @@ def _told(planned: Objective, shared: Any, own: Any) -> Iterator[tuple[tuple[np.
         (mean, variance), *slopes = pairs
         first, second = ([part[j] for part in slopes] for j in (0, 1))
         if not structure.is_filter:
-            yield (_scaled(np.asarray(mean), first, s.sigma[:, None, :]),)
+            yield (_scaled(np.asarray(mean), first, s.sigma),)
             continue
         variance = np.asarray(variance, np.float64)
         with np.errstate(invalid="ignore"):

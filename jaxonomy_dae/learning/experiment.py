@@ -44,8 +44,9 @@ class Experiment:
     - `times`: the sampling times, increasing, shape `(n,)`.
     - `data`: by the variables' names, shape `(n,)`, or `(n, *shape)` for the name of an array; NaN where there is no
         sample.
-    - `sigma`: standard deviations of the noise, by name or one number for all, in the variables' units; or
-        `"estimate"`: found from the residuals, one for each name, the same in all experiments.
+    - `sigma`: standard deviations of the noise, by name or one number for all, in the variables' units: numbers, or
+        arrays with one for each sample, as `0.01 + 0.02 * abs(y)` for errors in part relative; or `"estimate"`: found
+        from the residuals, one for each name, the same in all experiments.
     - `inputs`: by name, `(times, values)`, or with `"held"` or `"cubic"` as a third entry, or a constant.
     - `initial`: values at `t0` by variables' names, known (numbers) or `Unknown`. A parameter's name gives this
         experiment its own value of it.
@@ -63,7 +64,7 @@ class Experiment:
 
     times: Any
     data: Mapping[str, Any]
-    sigma: Mapping[str, Any] | float | str = ESTIMATE
+    sigma: Mapping[str, Any] | float | str | np.ndarray = ESTIMATE
     inputs: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     initial: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     weight: float = 1.0
@@ -81,21 +82,23 @@ class Experiment:
         if not (_is_finite(self.weight) and self.weight >= 0):
             raise ModelError(f"weight is a number ≥ 0; got {self.weight!r}")
 
-    def _sigmas(self) -> dict[str, float]:
-        """The standard deviation for each name; NaN where it is to be estimated."""
+    def _sigmas(self) -> "dict[str, float | np.ndarray]":
+        """The standard deviation for each name, or for each of its samples; NaN where it is to be estimated."""
         given = self.sigma
         if isinstance(given, Mapping):
             unknown = [name for name in given if name not in self.data]
             if unknown:
                 raise ModelError(f"sigma: there are no data of '{unknown[0]}': " + nearest(unknown[0], self.data))
         by_name = given if isinstance(given, Mapping) else dict.fromkeys(self.data, given)
-        out = {}
-        for name in self.data:
+        out: dict[str, float | np.ndarray] = {}
+        for name, samples in self.data.items():
             value = by_name.get(name, ESTIMATE)
             if isinstance(value, str) and value == ESTIMATE:
                 out[name] = math.nan
             elif not isinstance(value, str) and _is_finite(value) and value > 0:
                 out[name] = float(value)
+            elif isinstance(value, np.ndarray | list | tuple):
+                out[name] = _levels_of(name, value, samples)
             else:
                 raise ModelError(f"sigma of '{name}' is a standard deviation > 0, or 'estimate'; got {value!r}")
         return out
@@ -165,7 +168,8 @@ class Experiment:
                 f"initial={{'{old[0]}': Unknown(guess)}}; a parameter keeps its value, {self.initial[old[0]]!r}"
             )
         data = {name: values[rows] for name, values in self.data.items()}
-        return self.changed(times=self.times[rows], data=data, initial=dict(self.initial) | new, t0=start)
+        sigma = {name: _rows(level, rows) for name, level in self.levels.items()}
+        return self.changed(times=self.times[rows], data=data, sigma=sigma, initial=dict(self.initial) | new, t0=start)
 
     def resample(self, times: Any) -> "Experiment":
         """The record at other times, by linear interpolation; NaN where a neighbour is missing, and outside of it.
@@ -173,7 +177,14 @@ class Experiment:
         new = _times(times, self.t0)
         if len(self.times) < 2:
             raise ModelError("resample: a record of one sample cannot be interpolated")
-        return self.changed(times=new, data=self._each(lambda values: interpolated(self.times, values, new)))
+
+        def between(values: np.ndarray) -> np.ndarray:
+            return interpolated(self.times, values, new)
+
+        varying = [name for name, level in self.levels.items() if isinstance(level, np.ndarray)]
+        if varying:
+            raise ModelError(f"resample: '{varying[0]}' has a noise level for each sample: give one for all")
+        return self.changed(times=new, data=self._each(between))
 
     def decimate(self, factor: int) -> "Experiment":
         """Every `factor`-th sample, after a low-pass filter without delay, so that faster oscillations and noise are
@@ -193,7 +204,7 @@ class Experiment:
         response = low_pass(factor) if factor > 1 else np.ones(1)
         quieter = float(np.linalg.norm(response))
         data = self._each(lambda values: smoothed(values, response)[::factor])
-        sigma = {name: level * quieter for name, level in self._levels().items()}
+        sigma = {name: _rows(level, slice(None, None, factor)) * quieter for name, level in self.levels.items()}
         return self.changed(times=self.times[::factor], data=data, sigma=sigma)
 
     def detrend(self, names: str | Sequence[str] | None = None, degree: int = 1) -> "Experiment":
@@ -210,10 +221,11 @@ class Experiment:
         changed = self._each(lambda values: untrended(self.times, values, degree), chosen)
         return self.changed(data=dict(self.data) | changed)
 
-    def _levels(self) -> dict[str, float]:
-        """The standard deviation for each name; NaN where it is to be estimated."""
+    @property
+    def levels(self) -> "dict[str, float | np.ndarray]":
+        """The standard deviation for each name, or for each of its samples; NaN where it is to be estimated."""
         assert isinstance(self.sigma, Mapping)
-        return {name: float(level) for name, level in self.sigma.items()}
+        return dict(self.sigma)
 
     def _each(self, change: Callable[[Any], Any], names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
         """The signals, changed as columns, in their shapes."""
@@ -226,13 +238,36 @@ class Experiment:
 
     def changed(self, **changes: Any) -> "Experiment":
         """A copy with other fields; noise levels that are to be estimated stay so."""
-        levels = changes.get("sigma", self._levels())
-        sigma = {name: ESTIMATE if math.isnan(level) else level for name, level in levels.items()}
+        levels = changes.get("sigma", self.levels)
+        sigma = {
+            name: ESTIMATE if np.ndim(level) == 0 and math.isnan(level) else level for name, level in levels.items()
+        }
         return dataclasses.replace(self, **changes | {"sigma": sigma})
 
 
 def _is_finite(value: Any) -> bool:
     return isinstance(value, int | float | np.integer | np.floating) and math.isfinite(value)
+
+
+def _rows(level: Any, rows: Any) -> Any:
+    """The noise levels of some rows."""
+    return level if np.ndim(level) == 0 else level[rows]
+
+
+def _levels_of(name: str, given: Any, samples: np.ndarray) -> np.ndarray:
+    """A noise level for each sample; one where there is none."""
+    levels = np.asarray(given)
+    if levels.dtype.kind not in "iuf" or levels.shape != samples.shape:
+        raise ModelError(
+            f"sigma of '{name}' needs a number for each sample, shape {samples.shape}; got {levels.dtype} of shape "
+            f"{levels.shape}"
+        )
+    levels = np.where(np.isnan(samples), 1.0, levels.astype(float))
+    bad = np.argwhere(~(np.isfinite(levels) & (levels > 0)))
+    if len(bad):
+        where = ", ".join(map(str, bad[0]))
+        raise ModelError(f"sigma of '{name}' is a standard deviation > 0; entry [{where}] is {levels[tuple(bad[0])]}")
+    return levels
 
 
 def check_increasing(times: np.ndarray, where: str = "") -> None:

@@ -38,7 +38,7 @@ class AheadObjective(Objective):
 
         spreads = [[spread(name, s.starts[name][k]) for name in self.layout.known] for k in range(len(s.labels))]
         estimated = np.isin(np.arange(len(s.outputs)), self.structure.sigma)
-        sigma = np.where(np.isnan(s.sigma) & ~estimated, 1.0, s.sigma)
+        sigma = np.where(s.estimated & ~estimated, 1.0, s.levels)
         return Told(
             c.times, c.t0, c.known, self._windows, jnp.asarray(s.values, dtype), jnp.asarray(s.observed),
             jnp.asarray(sigma, dtype), jnp.asarray(np.array(spreads, float).reshape(c.known.shape), dtype),

@@ -148,7 +148,7 @@ def structure_and_extras(
     for name, value, place, factor in noise:
         unit = _noise_unit(place, units.get(name, ""))
         extras.append(_extra(f"noise of {name}", unit, value, guesses[place] * abs(factor), 1.0, log=True))
-    unknown = np.isnan(stacked.sigma) & stacked.observed.any(axis=1)
+    unknown = stacked.estimated & stacked.observed.any(axis=1)
     estimated = tuple(np.flatnonzero(unknown.any(axis=0)).tolist())
     for j in estimated:
         name = stacked.outputs[j]

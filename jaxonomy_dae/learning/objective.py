@@ -159,7 +159,7 @@ class Objective:
         s, dtype = self.stacked, self.system.parameters.values.dtype
         level = np.where(np.isnan(s.sigma), 1.0, s.sigma)
         row = np.zeros(s.values.shape)
-        row[self.rows] = (np.sqrt(s.weight)[:, None] / level)[self.rows[0], self.rows[2]]
+        row[self.rows] = (np.sqrt(s.weight)[:, None, None] / level)[self.rows]
         return Weighted(told, jnp.asarray(s.values, dtype), jnp.asarray(row, dtype))
 
     def full(self, z: Float[np.ndarray, " f"]) -> Float[np.ndarray, " p"]:
@@ -319,7 +319,7 @@ class Objective:
     ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
         """(residuals of chosen samples in units of the noise, these units)."""
         s = self.with_noise(sigma).stacked
-        level = np.where(np.isnan(s.sigma), 1.0, s.sigma)[rows[0], rows[2]]
+        level = np.where(np.isnan(s.sigma), 1.0, s.sigma)[rows]
         return (self.outputs(full)[rows] - s.values[rows]) / level, level
 
     # --- experiments that are held out ---------------------------------------------------------------------------
@@ -364,8 +364,8 @@ class Objective:
     @functools.cached_property
     def evidence(self) -> Evidence:
         """The noise levels and precisions that the evidence determines."""
-        s, (experiment, _, output) = self.stacked, self.rows
-        unknown = np.isnan(s.sigma[experiment, output])
+        s, (_, _, output) = self.stacked, self.rows
+        unknown = np.isnan(s.sigma[self.rows])
         chosen = np.unique(output[unknown])
         noise = np.where(unknown, np.searchsorted(chosen, output), -1)
         values = s.values[self.rows]
@@ -389,8 +389,8 @@ class Objective:
 
     def weights(self, z: Float[np.ndarray, " f"], found: Evaluation) -> Weights:
         """The first weights: noise levels that are known or as large as the residuals, and priors."""
-        s, c, (experiment, _, output) = self.stacked, self.coordinates, self.rows
-        sigma = s.sigma[experiment, output]
+        s, c, experiment = self.stacked, self.coordinates, self.rows[0]
+        sigma = s.sigma[self.rows]
         row = np.sqrt(s.weight[experiment]) / np.where(np.isnan(sigma), 1.0, sigma)
         spread = c.spread[self.free]
         precision = np.where(np.isfinite(spread), 1 / np.where(np.isfinite(spread), spread, 1.0) ** 2, 0.0)

@@ -69,7 +69,7 @@ def residuals(
     setting = Setting(model, objective.observers | observe, plain, objective.setting.fine)
     outputs = predict(setting, adjoint, shared, own, objective.conditions)
     sigma = np.where(np.isnan(s.sigma), 1.0, s.sigma)
-    scaled = jnp.where(s.observed, (outputs - s.values) / sigma[:, None, :], 0.0)
+    scaled = jnp.where(s.observed, (outputs - s.values) / sigma, 0.0)
     return {
         label: {name: scaled[k, :count, j] for j, name in enumerate(s.outputs) if s.observed[k, :, j].any()}
         for k, (label, count) in enumerate(zip(s.labels, s.counts, strict=True))

@@ -1,6 +1,6 @@
 """Whether a fit can be relied on: what is against it, each with what to try next.
 
-A reason is given only where chance would give it to a right model once in some thousand fits.
+A reason is given only where chance would give it to a right model once in some hundred fits.
 """
 
 from typing import TYPE_CHECKING
@@ -13,7 +13,8 @@ from ..diagnosis.wording import listed
 if TYPE_CHECKING:
     from .estimate import Estimate
 
-IMPROBABLE = 1e-4  # probability below which noise is no excuse
+# Probability below which noise is no excuse: with two such checks, right models are doubted once in five hundred fits.
+IMPROBABLE = 1e-3
 FAINT = 10.0  # times the integration's tolerance: residuals below are its error, which is never white
 BELOW = 0.1  # of the noise that was stated: residuals below, of exact data, need not look like it
 
@@ -50,7 +51,7 @@ def _chi2(fit: "Estimate") -> list[str]:
 
 def _colour(fit: "Estimate") -> list[str]:
     """Outputs whose residuals are correlated from sample to sample, over all experiments together (Ljung and Box's
-    statistics add up)."""
+    statistics add up), or have a frequency that stands out."""
     s, tests = fit.objective.stacked, {}
     for label, by in fit.whiteness.items():
         for name, test in by.items():
@@ -59,9 +60,9 @@ def _colour(fit: "Estimate") -> list[str]:
     found = []
     for name, each in tests.items():
         together = scipy.stats.chi2.sf(sum(t.statistic for _, t in each), sum(t.lags for _, t in each))
-        alone = min(t.probability for _, t in each) * len(each)
+        alone = min(min(t.probability, t.peak) for _, t in each) * 2 * len(each)
         if min(float(together), alone) * len(tests) < IMPROBABLE:
-            label, worst = min(each, key=lambda pair: pair[1].probability)
+            label, worst = min(each, key=lambda pair: min(pair[1].probability, pair[1].peak))
             where = f" of {label}" if len(s.labels) > 1 else ""
             found.append(f"'{name}'{where} (neighbours correlate by {worst.correlation:.2f})")
     if not found:

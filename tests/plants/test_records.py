@@ -16,6 +16,7 @@ from sympy import Eq
 
 from benchmarks.attack.invariance.records import WAYS, begun, written
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, der, learning
+from jaxonomy_dae.errors import ModelError
 
 TIGHT = {"rtol": 1e-10, "atol": 1e-12}
 TS = np.linspace(0.1, 2.0, 12)
@@ -171,3 +172,44 @@ def test_where_a_search_began_does_not_matter():
     """Sizes and priors were those of the start, so that notes and intervals moved with it."""
     for outcome in begun(0).outcomes + begun(1).outcomes:
         assert outcome.kind == "right", outcome.text
+
+
+@pytest.mark.long("residuals and their Jacobian")
+def test_a_noise_level_for_each_sample():
+    """Errors that grow with what is measured: the fit is that of SciPy with the same weights."""
+    rng = np.random.default_rng(4)
+    level = 0.002 + 0.05 * np.exp(-1.3 * TS)
+    x = np.exp(-1.3 * TS) + level * rng.standard_normal(12)
+    x[5] = np.nan
+    level[5] = np.nan  # where nothing was measured, no level is needed
+    data = learning.Experiment(TS, {"c.x": x, "c.z": (1 - np.exp(-1.3 * TS)) / 1.3}, sigma={"c.x": level, "c.z": 0.1})
+    fit = learning.Problem(system(Falling), data, train=["c.a"], **TIGHT).fit()
+
+    def residuals(a):
+        e = np.exp(-a[0] * TS)
+        return np.r_[((e - x) / level)[np.isfinite(x)], ((1 - e) / a[0] - data.data["c.z"]) / 0.1]
+
+    best = scipy.optimize.least_squares(residuals, [1.0], xtol=1e-14, ftol=1e-14)
+    np.testing.assert_allclose(fit.values["c.a"], best.x[0], rtol=1e-6)
+    np.testing.assert_allclose(fit.spread[0], 1 / np.linalg.norm(best.jac), rtol=1e-4)
+    assert fit.chi2 == pytest.approx(2 * best.cost, rel=1e-6) and not fit.sigma
+    r = fit.residuals["experiment 0"]["c.x"]
+    np.testing.assert_allclose(r[np.isfinite(x)], best.fun[:11], rtol=1e-4, atol=1e-6)
+    assert np.isnan(r[5]) and len(r) == 12
+
+
+def test_noise_levels_that_do_not_fit():
+    cases = [
+        (np.ones(11), r"shape \(12,\); got float64 of shape \(11,\)"),
+        (-np.ones(12), r"entry \[0\] is -1"),
+        (np.full(12, np.nan), r"entry \[0\] is nan"),
+    ]
+    for level, text in cases:
+        with pytest.raises(ModelError, match=text):
+            learning.Experiment(TS, {"c.x": TS}, sigma={"c.x": level})
+    varying = learning.Experiment(TS, {"c.x": TS}, sigma=np.linspace(0.1, 0.2, 12))
+    part, coarse = varying.window(0.5, 1.5), varying.detrend()
+    assert isinstance(part.levels["c.x"], np.ndarray) and len(part.levels["c.x"]) == len(part.times)
+    np.testing.assert_array_equal(coarse.levels["c.x"], np.linspace(0.1, 0.2, 12))
+    with pytest.raises(ModelError, match="'c.x' has a noise level for each sample, which filters do not take"):
+        learning.Problem(system(Falling), varying, train=["c.a"], method=learning.Filter(noise={"c.x": 0.1})).fit()
