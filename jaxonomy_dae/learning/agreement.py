@@ -12,9 +12,12 @@ from .objective import Objective
 
 @dataclasses.dataclass(frozen=True)
 class Whiteness:
-    """The tests of one output of one experiment: the correlation of neighbouring residuals; Ljung and Box's `statistic`
-    (1978) over so many `lags`, which is χ² of as many degrees of freedom for white noise; and the probability that white
-    noise has as high a `peak` among its frequencies, which a missing mode makes."""
+    """The tests of one output of one experiment.
+
+    - `correlation`: of neighbouring residuals.
+    - `statistic`: Ljung and Box's (1978) over so many `lags`; χ² of as many degrees of freedom for white noise.
+    - `peak`: the probability that white noise has as high a peak among its frequencies, which a missing mode makes.
+    """
 
     correlation: float
     statistic: float

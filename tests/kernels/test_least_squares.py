@@ -221,6 +221,6 @@ def test_a_frequency_that_stands_out_is_noticed():
     rng, n = np.random.default_rng(5), 200
     white = np.array([whiteness(rng.standard_normal(n)).peak for _ in range(1000)])
     assert 0.03 < np.mean(white < 0.05) < 0.07 and 0.003 < np.mean(white < 0.01) < 0.02
-    mode = 0.7 * np.sin(0.9 * np.arange(n))
+    mode = 0.8 * np.sin(0.9 * np.arange(n))
     seen = [whiteness(mode + rng.standard_normal(n)) for _ in range(20)]
     assert sum(w.peak < 1e-3 for w in seen) >= 17 > 10 > sum(w.probability < 1e-3 for w in seen)
