@@ -17,6 +17,7 @@ Chunk = Any  # an array of shape (n,), a scalar, or a tuple of scalars
 
 
 FEW = 256  # entries that are read as scalars together
+GATHER = 2  # operations that a gather takes: instead, values may come in so many pieces more than there are arrays
 SCALARS = 32  # up to this many states, or inputs, tracing is done on scalars
 
 
@@ -42,7 +43,8 @@ def take(array: Any, index: np.ndarray) -> Any:
             return jax.lax.slice(array, (int(index[0]),), (int(index[-1]) + 1,), (step,))
     if n == 1:
         return jax.lax.slice(array, (int(index[0]),), (int(index[0]) + 1,))
-    return array[index]
+    # The index is right as it is: XLA need not look whether it is.
+    return jnp.asarray(array).at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 def times(factor: Any, value: Any) -> Any:
@@ -77,7 +79,11 @@ class Gather:
         return times(float(self.factor[0]) if same else jnp.asarray(self.factor, dtype), value)
 
     def _from_several(self, chunks: list[Chunk], dtype) -> Any:
+        breaks = np.flatnonzero((np.diff(self.chunk) != 0) | (np.diff(self.offset) != 1)) + 1
         used = np.unique(self.chunk)
+        if len(breaks) < len(used) + GATHER:
+            runs = np.split(np.arange(len(self.chunk)), breaks)
+            return joined([self._run(chunks, run, dtype) for run in runs])
         parts, start, position = [], np.zeros(int(used.max()) + 2, np.int64), 0
         for c in used:
             part = jnp.zeros(1, dtype) if c < 0 else _as_vector(chunks[c])
@@ -85,6 +91,14 @@ class Gather:
             parts.append(part)
             position += part.shape[0]
         return take(joined(parts), start[self.chunk] + np.maximum(self.offset, 0))
+
+    def _run(self, chunks: list[Chunk], run: np.ndarray, dtype) -> Any:
+        """Values that lie beside each other, shape (len(run),)."""
+        chunk, offset = int(self.chunk[run[0]]), self.offset[run]
+        if chunk < 0:
+            return jnp.zeros(len(run), dtype)
+        source = chunks[chunk]
+        return jnp.reshape(source, (-1,)) if _is_scalar(source) else take(source, offset)
 
 
 NOTHING = Gather(*(np.zeros(0, np.int64),) * 3)

@@ -99,7 +99,7 @@ def run(
     system, t0, t1, ts = given.system, given.t0, given.t1, given.ts
     inputs, initial = given.inputs, given.initial
     admitted = are_admitted(system, inputs, t0, t1)
-    system = system.merged()  # so that bounds are looked at once, and not whenever equations are
+    system = system.settled()  # so that bounds are looked at once, and not whenever equations are
     if checked:
         system = eqx.tree_at(
             lambda s: s.parameters.values, system, eqx.error_if(system.parameters.values, ~admitted, TEXT)

@@ -213,6 +213,12 @@ class Parameters(eqx.Module):
         """The values with nothing set apart."""
         return Parameters(self.array, None, (), self.table)
 
+    def settled(self) -> "Parameters":
+        """The values with nothing set apart, and none that is computed from others: for a program that sets none, and
+        would compute these wherever it reads one."""
+        computed = np.array(sorted(self.table.expressions), np.int64)
+        return Parameters(self.array, None, (), self.table.given(computed))
+
     def freed(self, names: tuple[str, ...]) -> "Parameters":
         """The values with the named ones set apart in `free`."""
         index = tuple(dict.fromkeys(self.table.settable(n) for name in names for n in self.table.one_by_one(name)))

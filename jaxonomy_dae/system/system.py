@@ -243,6 +243,10 @@ class AcausalSystem(eqx.Module):
         """This system with nothing set apart by `partition`."""
         return eqx.tree_at(lambda s: s.parameters, self, self.parameters.merged())
 
+    def settled(self) -> "AcausalSystem":
+        """`merged`, with parameters that are computed from others as numbers: for a program that sets none."""
+        return eqx.tree_at(lambda s: s.parameters, self, self.parameters.settled())
+
     # --- computing ---------------------------------------------------------------------------------------------
 
     def at(self, t: Any, args: Any = None) -> SystemAt:
