@@ -9,7 +9,7 @@ from .continuous import Law, equation_of, write_equation, write_law
 from .events import write_end_of_start, write_modes, write_when
 from .flat_model import FlatModel
 from .scope import Scope, located
-from .starts import write_initial_equation
+from .starts import write_initial_algorithm, write_initial_equation
 from .values import as_number
 
 
@@ -52,6 +52,8 @@ class FlatComponent(Component):
         ):
             for s in statements:
                 located(flat.name, s.line, write, scope, s)
+        for statements in filter(None, flat.model.initial_algorithms):
+            located(flat.name, statements[0].line, write_initial_algorithm, scope, statements)
         for variable, law in (laws or {}).items():
             located(flat.name, replaced[variable].statement.line, write_law, scope, replaced[variable], law)
         for output in outputs:

@@ -39,7 +39,7 @@ class DiscreteDefinitions:
     - `followed`: those of `stored` that no `when` assigns, in the order of their definitions.
     - `equations`: what is left, for the continuous variables.
     - `whens`: the `when`s of equations and algorithms.
-    - `initial`: initial equations and what initial algorithms assign.
+    - `initial`: initial equations.
     - `algorithms`, `assigned`: the other algorithms, and the names that each assigns.
     """
 
@@ -89,7 +89,7 @@ def find_definitions(model: Class, is_discrete: Callable[[str], bool]) -> Discre
     followed = [name for name in of if name in read_before and name not in by_when]
     return DiscreteDefinitions(
         of, by_when | set(followed), followed, equations, whens,
-        [*model.initial_equations, *(s for a in model.initial_algorithms for s in a)], algorithms, assigned,
+        list(model.initial_equations), algorithms, assigned,
     )  # fmt: skip
 
 

@@ -8,9 +8,10 @@ import sympy
 from ..errors import ModelError
 from ..modeling.events import assign
 from ..modeling.symbols import DiscreteSymbol, ParameterSymbol, VariableSymbol
-from .continuous import equal, side_by_side
+from .continuous import equal, pairs, side_by_side
+from .definitions import assigned_in, with_entries
 from .scope import Scope
-from .tree import Assignment, Branches, Call, Equality, Reference, Statement
+from .tree import Branches, Call, Equality, Reference, Statement
 from .values import Value, as_number, is_condition
 
 
@@ -18,8 +19,8 @@ def write_initial_equation(scope: Scope, s: Statement) -> None:
     """Adds what one statement says of the initial time."""
     if isinstance(s, Branches):
         found = side_by_side(scope, s)
-    elif isinstance(s, Equality | Assignment):
-        a, b = (s.left, s.right) if isinstance(s, Equality) else (s.target, s.value)
+    elif isinstance(s, Equality):
+        a, b = s.left, s.right
         if isinstance(a, Call) and a.function == "pre":  # before the first event it is what it starts at
             a = a.arguments[0]
             if isinstance(a, Reference) and scope.interpreter.name_of(a) not in scope.definitions.stored:
@@ -29,6 +30,15 @@ def write_initial_equation(scope: Scope, s: Statement) -> None:
         return
     for left, right in found:
         _hold_initially(scope, left, right)
+
+
+def write_initial_algorithm(scope: Scope, statements: tuple[Statement, ...]) -> None:
+    """Adds what an algorithm has assigned at its end: a value that it assigns first and replaces later is none."""
+    local: dict[str, Value] = {}
+    scope.interpreter.execute(statements, local, lambda n: local[n] if n in local else scope.value(n))
+    for name in with_entries(assigned_in(statements), scope.flat.model):
+        for left, right in pairs(scope.value(name), local[name]):
+            _hold_initially(scope, left, right)
 
 
 def _hold_initially(scope: Scope, left: Value, right: Value) -> None:

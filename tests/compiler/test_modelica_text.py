@@ -309,6 +309,13 @@ def test_at_a_tick_pre_is_the_value_before_it():
     assert "Ne(pre(k), 0)" in actions_of(text)["k"]
 
 
+def test_an_initial_algorithm_counts_at_its_end():
+    """Its first value of p was compared with its last one, and said not to hold."""
+    text = """model m parameter Real p(fixed = false); constant Real q = 3.0; Real x;
+      initial algorithm p := 60.0; if p * q > 100.0 then p := 24.0; end if; equation x = p; end m;"""
+    assert built(text).parameters["p"].value == 24.0
+
+
 @pytest.mark.parametrize(
     "equations, told",
     [
