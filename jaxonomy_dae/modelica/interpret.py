@@ -6,6 +6,7 @@ branches, and a choice joins what they assign. Loops must have constant bounds.
 
 import math
 from collections.abc import Callable, Mapping
+from itertools import islice
 from typing import Any, NoReturn
 
 import sympy
@@ -56,6 +57,7 @@ from .values import (
 
 Names = Callable[[str], Value]  # the value of a name; raises KeyError for an unknown one
 MOST_ROUNDS = 100_000  # of a loop that is carried out while the model is read
+LONG = 30  # nodes of an expression of a function that gets a name; a sum of three products has ten
 DEEPEST = 200  # calls within calls; Python's own limit lies at a thousand frames
 
 
@@ -66,6 +68,7 @@ class Interpreter:
     - `names`: what a name of the model means.
     - `special`: calls that only the model can answer, such as `pre`, by name: from the arguments as written.
     - `externals`: functions in place of those that are written in C, by name.
+    - `named`: gives an expression of a function a name, so that what is read several times stands once.
     - `entries`: the places of the entries that are declared one by one, by the name of their array.
     """
 
@@ -76,13 +79,16 @@ class Interpreter:
         special: Mapping[str, Callable[..., Value]],
         externals: Mapping[str, Callable[..., Value]],
         entries: Mapping[str, list[tuple[int, ...]]] | None = None,
+        named: Callable[[sympy.Expr], Value] = lambda e: e,
     ):
         self.classes, self.names, self.entries = classes, names, entries or {}
         self.special, self.externals = special, externals
         self.literals = literal_numbers(classes)
         self.quiet = False  # True inside of noEvent, smooth and functions: conditions there are no events
         self.quieted: set[Any] = set()  # conditions that stood in noEvent
+        self.named = named
         self.depth = 0
+        self.guarded = 0  # conditions that are not constant, around what is carried out
 
     # --- expressions -------------------------------------------------------------------------------------------------
 
@@ -195,6 +201,7 @@ class Interpreter:
 
     def _choice(self, e: Choice, names: Names) -> Value:
         pairs = []
+        guarded = self.guarded
         for condition, value in e.branches:
             holds = self.evaluate(condition, names)
             if holds is False:
@@ -202,9 +209,11 @@ class Interpreter:
             if holds is True:
                 pairs.append((True, self.evaluate(value, names)))
                 break
+            self.guarded = guarded + 1
             pairs.append((holds, self.evaluate(value, names)))
         else:
             pairs.append((True, self.evaluate(e.otherwise, names)))
+        self.guarded = guarded
         out = pairs[-1][1]
         for condition, value in reversed(pairs[:-1]):
             out = chosen(condition, value, out, self.quiet or condition in self.quieted)
@@ -308,15 +317,15 @@ class Interpreter:
     def _carried_out(self, function: Class, inputs: list[Declaration], given: dict[str, Value]) -> Value:
         if self.depth > DEEPEST:
             raise ModelError(f"the function '{function.name}' calls itself too often")
-        before, self.quiet, self.depth = self.quiet, True, self.depth + 1
+        before, guarded, self.quiet, self.depth = self.quiet, self.guarded, True, self.depth + 1
         local: dict[str, Value] = {}
         names = _local(local, self.names)
         try:
             for d in function.declarations:
                 if "input" in d.prefixes:
-                    local[d.name] = self._input(d, given, local)
+                    local[d.name] = self._named(self._input(d, given, local))
                 elif d.value is not None:
-                    local[d.name] = self.evaluate(d.value, names)
+                    local[d.name] = self._named(self.evaluate(d.value, names))
                 else:
                     local[d.name] = self._unset(d, names)
             for statements in function.algorithms:
@@ -324,9 +333,20 @@ class Interpreter:
         except ModelError as error:
             raise ModelError(f"{function.name}: {error}") from None
         finally:
-            self.quiet, self.depth = before, self.depth - 1
+            self.quiet, self.guarded, self.depth = before, guarded, self.depth - 1
         outputs = [local[d.name] for d in function.declarations if "output" in d.prefixes]
         return outputs[0] if len(outputs) == 1 else Results(outputs)
+
+    def _named(self, value: Value) -> Value:
+        """A value of a function by names for what is long in it. Under a condition nothing gets a name: it need not
+        have a value where the condition does not hold."""
+        if isinstance(value, list):
+            return [self._named(v) for v in value]
+        if isinstance(value, Record):
+            return Record({k: self._named(v) for k, v in value.items()})
+        if not self.depth or self.guarded or not isinstance(value, sympy.Expr):
+            return value
+        return value if sum(1 for _ in islice(sympy.preorder_traversal(value), LONG)) < LONG else self.named(value)
 
     def _unset(self, d: Declaration, names: Names) -> Value:
         """What a variable of a function holds before it is assigned."""
@@ -360,14 +380,16 @@ class Interpreter:
                 self._statement(s, local, names)
                 continue
             copied = dict(local)
+            self.guarded += 1
             self._statement(s, copied, _local(copied, names))
+            self.guarded -= 1
             self._join(ended, dict(local), copied, local)
 
     def _statement(self, s: Statement, local: dict[str, Value], names: Names) -> None:
         if isinstance(s, Assignment | Equality):
             target, value = (s.target, s.value) if isinstance(s, Assignment) else (s.left, s.right)
             found = (self.results if isinstance(target, Several) else self.evaluate)(value, names)
-            self._assign(target, found, local, names)
+            self._assign(target, self._named(found), local, names)
         elif isinstance(s, Branches):
             self._branches(s, local, names)
         elif isinstance(s, Loop):
@@ -448,10 +470,12 @@ class Interpreter:
                 return
             rest = s._replace(branches=s.branches[k + 1 :])
             results = []
+            self.guarded += 1
             for statements in (body, (rest,)):
                 copied = dict(local)
                 self.execute(statements, copied, _local(copied, names))
                 results.append(copied)
+            self.guarded -= 1
             self._join(holds, results[0], results[1], local)
             return
 

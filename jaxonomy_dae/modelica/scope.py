@@ -35,6 +35,7 @@ class Scope:
     - `definitions`: which statement determines which variable.
     - `kept`: relations whose truth is kept between events.
     - `in_action`: True while values are evaluated that an event writes: `pre(m)` is then the value before it.
+    - `names`: names of long expressions of functions.
     - `initial`: the discrete variable that is 1 at the initial time; None if nothing asks for it.
     - `pending`: conditions that hold while a mode is not what its equation says.
     - `done`: for whens that assign what modes read, the discrete variable that is 1 from their event until their
@@ -43,6 +44,7 @@ class Scope:
 
     def __init__(self, flat: FlatModel, component: Component):
         self.flat, self.component = flat, component
+        self.kept = KeptRelations(component)
         self.declared = {d.name: d for d in flat.model.declarations}
         self.known: dict[str, Value] = {"time": component.ev.t}
         self.known_at_events: dict[str, Value] = {}
@@ -52,9 +54,11 @@ class Scope:
             "pre": self._pre, "edge": self._edge, "change": self._change, "initial": self.at_start,
             "terminal": lambda: False, "sample": self._sample, "delay": _delay,
         }  # fmt: skip
-        self.interpreter = Interpreter(flat.classes, self.value, special, LEFT_OUT | EXTERNALS, self.entries)
+        self.interpreter = Interpreter(
+            flat.classes, self.value, special, LEFT_OUT | EXTERNALS, self.entries, self._named
+        )
         self.definitions = find_definitions(flat.model, self.is_discrete)
-        self.kept = KeptRelations(component)
+        self.names: dict[sympy.Expr, Any] = {}
         self.in_action = False
         self.initial: Any = None
         self.pending: list[Value] = []
@@ -291,6 +295,21 @@ class Scope:
         if isinstance(value, sympy.Expr) and any(not isinstance(s, ParameterSymbol) for s in value.free_symbols):
             return None
         return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+    def _named(self, e: sympy.Expr) -> Value:
+        """A hidden parameter or variable that is equal to an expression of a function."""
+        if e in self.names:
+            return self.names[e]
+        symbols = e.free_symbols
+        if any(isinstance(s, PreviousSymbol) for s in symbols):
+            return e
+        name = f":value[{len(self.names)}]"
+        if all(isinstance(s, ParameterSymbol) and not isinstance(s, DiscreteSymbol) for s in symbols):
+            self.names[e] = self.component.parameter(name, e)
+        else:
+            self.names[e] = self.component.variable(name)
+            self.component.add_equations(sympy.Eq(self.names[e], self.kept.in_equations(e), evaluate=False))
+        return self.names[e]
 
     def _pre(self, e: Expression) -> Value:
         value = self.evaluate(e)

@@ -274,6 +274,29 @@ def test_starts_of_discrete_variables_are_computed():
     assert parameters["n"].value == 3 and parameters["t0"].value == pytest.approx(-0.05)
 
 
+def test_long_expressions_of_functions_stand_once():
+    """Rounds of a function that reads its last result four times: the expression of n rounds had 4^n terms. Under a
+    condition nothing gets a name: log(x) need not have a value there."""
+    text = """package p
+      function f input Real x; output Real y; algorithm
+        y := x;
+        for i in 1:30 loop y := y * sin(y) + cos(y) / (1.0 + y * y); end for;
+      end f;
+      function g input Real x; output Real y; algorithm
+        if x > 0.0 then y := log(x) * log(x) + log(x) / (1.0 + log(x)) - log(2.0 * x) * log(3.0 * x);
+        else y := 0.0; end if;
+      end g;
+      model m parameter Real a = 0.3; Real x; Real y; Real z; equation
+        x = f(a); y = f(time + x); z = g(time - 1.0);
+      end m;
+    end p;"""
+    component = built(text)
+    assert all(len(str(e)) < 400 for e in component.equations)
+    assert len([n for n in component.parameters if n.startswith(":value")]) >= 15
+    logs = [e for e in component.equations if "log" in str(e)]
+    assert len(logs) == 1 and "Piecewise" in str(logs[0])
+
+
 def test_truths_that_each_branch_of_an_if_determines():
     text = """model m Boolean b; Real x; equation
       if time < 1.0 then b = true; x = 1.0; else b = time > 2.0; x = 2.0; end if; end m;"""
