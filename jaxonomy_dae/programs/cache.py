@@ -15,6 +15,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 
 from .machine import Use, mappings, memory, return_memory
 from .reasons import reason
@@ -76,7 +77,8 @@ class ProgramCache:
     def call(self, function: Callable, runs_once: bool, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Calls `function(*args, **kwargs)` through the program compiled at the first call of this kind."""
         leaves, structure = jax.tree.flatten((args, kwargs))
-        arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
+        # Those of NumPy, such as weights of a user's, lie nowhere yet.
+        arrays = [leaf if isinstance(leaf, jax.Array) else jnp.asarray(leaf) for leaf in leaves if eqx.is_array(leaf)]
         static = tuple(_ARRAY if eqx.is_array(leaf) else leaf for leaf in leaves)
         key = function, structure, static, tuple(jax.typeof(a) for a in arrays), _surroundings(arrays)
         with self._lock:

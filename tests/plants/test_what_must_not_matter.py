@@ -1,9 +1,12 @@
 """Things that must not matter, and once did: found by `make attack FAMILY=invariance`."""
 
 import fractions
+from typing import Any
 
 import diffrax
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import sympy
@@ -87,3 +90,25 @@ def test_which_numbers_were_written_before():
     assert digests[0] == digests[2] != digests[1] == digests[4]
     with pytest.raises(ModelError, match="is not an equation"):
         compiled(True)
+
+
+@pytest.mark.long("a run, and its start")
+def test_whose_arrays_weights_are():
+    """The library of an array: weights of NumPy were an error of the programs that are kept for the next process."""
+
+    class Law(eqx.Module):
+        weight: Any
+
+        def __call__(self, u):
+            return (self.weight * u[0])[None]
+
+    def run(weight):
+        def build(c):
+            x = c.variable("x", start=1.0, fixed=True)
+            c.add_equations(Eq(der(x), -c.learned("law", Law(weight), inputs=[x])[0]))
+
+        return simulate(model(build), 1.0, ts=[0.5, 1.0])["c.x"]
+
+    values = [run(weight) for weight in (np.array(0.5), jnp.array(0.5))]
+    np.testing.assert_array_equal(*values)
+    np.testing.assert_allclose(values[0], np.exp([-0.25, -0.5]), rtol=1e-5)
