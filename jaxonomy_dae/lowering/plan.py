@@ -207,6 +207,18 @@ class SystemPlan:
         return SparsePattern(found.rows[inside] - n, found.cols[inside] - n, len(self.carried))
 
     @functools.cached_property
+    def written_blocks(self) -> tuple[DummyBlocks, ...]:
+        """All nonlinear blocks that are written out, not factorised as one sparse system."""
+        steps = [step for step in self.steps if step.carried]
+        starts = np.cumsum([0, *(sum(len(quantities) for quantities in step.guessed) for step in steps)])
+        return tuple(
+            DummyBlocks(start + rows, start + columns)
+            for start, step in zip(starts.tolist(), steps, strict=False)
+            if not step.whole
+            for rows, columns in step.blocks_of(np.ones(sum(map(len, step.unknown)), bool))
+        )
+
+    @functools.cached_property
     def dummy_blocks(self) -> tuple[DummyBlocks, ...]:
         """The nonlinear blocks whose unknowns were dropped from the candidates for states."""
         return dummy_blocks(self.steps, self.selection.dummies) if len(self.carried) else ()

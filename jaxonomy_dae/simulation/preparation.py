@@ -80,6 +80,8 @@ def prepared(
             solver = dataclasses.replace(solver, algebraic_errors=False)
         if system.plan.n_projected and solver.projection is None:
             solver = dataclasses.replace(solver, projection=project)
+        if guard is None and system.plan.written_blocks:
+            guard = ChoiceGuard(system.block_determinants, atol, ends_near=False)
         return dataclasses.replace(solver, guard=guard)
     if implicit and system.plan.n_projected:
         return with_projection(solver, project, strict=True, guard=guard)

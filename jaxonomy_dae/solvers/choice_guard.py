@@ -43,14 +43,19 @@ class ChoiceGuard(eqx.Module):
 
     - `measure`: `(t, y, args) -> determinants`, about 1 where regular.
     - `atol`: the absolute tolerance of the run in units of the nominal values, which says what "nearly" is.
+    - `ends_near`: False to reject such steps alone, where z is solved for with the states: a method that extrapolates z
+        steps over a branch point of g(x, z) = 0, and goes on along one of the branches.
     """
 
     measure: Callable[[Any, Any, Any], Determinants]
     atol: Tolerance
+    ends_near: bool = eqx.field(static=True, default=True)
 
     def judge(self, largest: Determinants, t: Time, y: State, args: Args) -> Verdict:
         """Judges a step by its end."""
         found = self.measure(t, y, args)
+        if not self.ends_near:
+            return Verdict(jnp.all((found * jnp.sign(largest) > 0) | (largest == 0)), jnp.array(True), found)
         along, size = jnp.sign(largest) * found, jnp.abs(largest)
         nearest = jnp.maximum(NEAREST * size, jnp.minimum(IN_DOUBT * self.atol, 0.1))
         return Verdict(

@@ -383,6 +383,13 @@ class AcausalSystem(eqx.Module):
         )
         return jax.lax.stop_gradient(frozen.at(t, args).dummy_determinants(x))
 
+    def block_determinants(self, t: Any, x: Float[Array, " n"], args: Any = None) -> Float[Array, " blocks"]:
+        """The determinants of all nonlinear blocks that are written out; not differentiated."""
+        frozen, t, x, args = jax.tree.map(
+            lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf, (self, t, x, args)
+        )
+        return jax.lax.stop_gradient(frozen.at(t, args).block_determinants(x))
+
     @property
     def is_constrained(self) -> bool:
         """True if a state must satisfy hidden constraints, or carries unknowns of nonlinear blocks."""

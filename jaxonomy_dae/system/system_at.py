@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse as sp
 
 from ..errors import ModelError
 from ..linear.sparse import SparsePattern, sparse_jacobian
@@ -149,6 +150,29 @@ class SystemAt:
 
     def carried_vector(self, t: Any, state: Any) -> Any:
         return jnp.concatenate([jnp.reshape(r, (-1,)) for r in self._carried(t, state)])
+
+    def block_determinants(self, x: Any) -> Any:
+        """det ∂g/∂z of every nonlinear block that is written out, shape (blocks,)."""
+        plan = self.plan
+        n, m = len(plan.states), len(plan.carried)
+        y = self.join(self.split(x))
+
+        def of_z(z):
+            return self.carried_vector(self.t, self.split(jnp.concatenate([y[:n], z])))
+
+        found = []
+        if plan.carried_pattern is None:
+            jacobian = jax.jacfwd(of_z)(y[n:])
+            found = [jacobian[b.rows[:, :, None], b.columns[:, None, :]] for b in plan.written_blocks]
+        else:
+            pattern = plan.carried_pattern
+            entries = jnp.append(sparse_jacobian(of_z, pattern)(y[n:]), 0.0)
+            place = sp.csr_array((np.arange(1, len(pattern) + 1), (pattern.rows, pattern.cols)), shape=(m, m))
+            for b in plan.written_blocks:  # −1, the last entry, where there is none
+                rows = np.broadcast_to(b.rows[:, :, None], (*b.rows.shape, b.columns.shape[1]))
+                columns = np.broadcast_to(b.columns[:, None, :], rows.shape)
+                found.append(entries[np.asarray(place[rows.ravel(), columns.ravel()]).reshape(rows.shape) - 1])
+        return jnp.concatenate([b[:, 0, 0] if b.shape[-1] == 1 else jnp.linalg.det(b) for b in found])
 
     def dummy_determinants(self, x: Any) -> Any:
         """det ∂g/∂z of every block that determines dummy derivatives z, each equation g = 0 in units of its gradient

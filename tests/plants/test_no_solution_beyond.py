@@ -46,6 +46,27 @@ class Turning(Component):
         self.add_equations(Eq(der(x), 1), Eq(z**2, 0.5 - x), Eq(w, der(z)))
 
 
+class Root(Component):
+    """y² = x, x' = y from x(0) = 1/2 along y < 0: the solution branches at t = √2, into x = 0 and y = (t − √2)/2."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        x, y = self.variable("x", start=0.5, fixed=True), self.variable("y", start=-1.0)
+        self.add_equations(Eq(der(x), y), Eq(y**2, x))
+
+
+@pytest.mark.parametrize("way", ["default", "Rodas5P", "BDF"])
+@pytest.mark.long("runs by three solvers are compiled")
+def test_a_branch_point_is_not_stepped_over(way):
+    """Kind: a solver that goes on where others refuse. BDF extrapolated y through zero, and took one of the branches:
+    the determinant of the block changed its sign within a step."""
+    system = compiled(Root(EqnEnv(), "c"))
+    with pytest.raises(SimulationError, match="no step was short enough") as raised:
+        simulate(system, 2.5, ts=TS, **WAYS[way])
+    stopped = float(str(raised.value).split("stopped at t=")[1].split(":")[0])
+    np.testing.assert_allclose(stopped, np.sqrt(2), atol=1e-4)
+
+
 @pytest.fixture(scope="module")
 def sine():
     return compiled(Sine(EqnEnv(), "c"))
