@@ -67,6 +67,8 @@ from .modeling import terminate as terminate
 from .programs.compilations import Compilation as Compilation
 from .programs.compilations import compilations as compilations
 from .programs.kept import keep_programs as keep_programs
+from .simulation.saved_programs import load_compiled as load_compiled
+from .simulation.saved_programs import save_compiled as save_compiled
 from .simulation.saved_state import SavedState as SavedState
 from .simulation.simulate import simulate as simulate
 from .simulation.solution import Solution as Solution

@@ -78,12 +78,20 @@ def key(text: bytes) -> str | None:
     """A digest of a program, as StableHLO, and all that its machine code depends on; None if programs are not kept."""
     if folder() is None:
         return None
+    told = machine_and_versions() | {"flags": os.environ.get("XLA_FLAGS", "")}
+    return hashlib.sha256(text + repr(sorted(told.items())).encode()).hexdigest()
+
+
+def machine_and_versions() -> dict[str, str]:
+    """What an executable of this process is made for, by what that is."""
     jaxlib = sys.modules.get("jaxlib")
-    told = (
-        jax.__version__, getattr(jaxlib, "__version__", ""), jax.default_backend(), _machine(),
-        os.environ.get("XLA_FLAGS", ""), sys.version,
-    )  # fmt: skip
-    return hashlib.sha256(text + repr(told).encode()).hexdigest()
+    return {
+        "version of JAX": jax.__version__,
+        "version of jaxlib": getattr(jaxlib, "__version__", ""),
+        "version of Python": ".".join(map(str, sys.version_info[:3])),
+        "backend": jax.default_backend(),
+        "processor": _machine(),
+    }
 
 
 def _path(key: str, options: dict[str, Any]) -> Path | None:

@@ -1,0 +1,83 @@
+"""Programs that are compiled ahead of time, and run by another process without compiling."""
+
+import json
+import pickle
+import re
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..errors import ModelError
+from ..linear.sparse import klu
+from ..private_names import private
+from ..programs.kept import CALLBACK, machine_and_versions
+
+MARK = b"jaxonomy_dae program 1\n"
+
+
+def save_compiled(compiled: Any, path: str | PathLike[str]) -> None:
+    """Writes a program that was compiled ahead of time, `jax.jit(f).lower(*arguments).compile()`, to a file.
+
+    The file is machine code for this processor, this system and these versions of Python and JAX. `jax.export` gives
+    what other machines can compile.
+
+    **Raises:**
+
+    - `ModelError` if the program calls Python, as with `throw=True`, or if its arguments or results are of types that
+        cannot be pickled.
+    """
+    text = compiled.as_text() or ""
+    targets = sorted(set(re.findall(r'custom_call_target="([^"]+)"', text)))
+    if any(CALLBACK.decode() in target for target in targets):
+        raise ModelError(
+            "save_compiled: this program calls Python, which no other process can do for it: leave out throw=True, "
+            "progress=True and prints"
+        )
+    content, arguments, results = private("serialize_executable")(compiled)
+    told = {"made for": machine_and_versions(), "calls": targets}
+    try:
+        trees = pickle.dumps([jax.tree.unflatten(t, [0] * t.num_leaves) for t in (arguments, results)])
+    except Exception as error:  # whatever the classes of the user's own raise
+        raise ModelError(
+            f"save_compiled: the arguments or results cannot be pickled ({error}): take and return arrays, in tuples, "
+            "lists or dictionaries"
+        ) from error
+    Path(path).write_bytes(MARK + pickle.dumps((json.dumps(told), trees, content)))
+
+
+def load_compiled(path: str | PathLike[str]) -> Any:
+    """The program of `save_compiled`, to be called with arguments of the same shapes and types: nothing is compiled or
+    traced. Loading runs code from the file: load only what you or somebody you trust has written.
+
+    **Raises:**
+
+    - `ModelError` for another file, and for a program made for another processor or by other versions.
+    """
+    whole = Path(path).read_bytes()
+    if not whole.startswith(MARK):
+        raise ModelError(f"load_compiled: '{path}' is not a file of save_compiled")
+    text, trees, content = pickle.loads(whole[len(MARK) :])
+    told = json.loads(text)
+    for what, here in machine_and_versions().items():
+        if told["made for"].get(what) != here:
+            there = told["made for"].get(what)
+            found = f": {there}, here {here}" if len(f"{there}{here}") < 80 else ""
+            raise ModelError(
+                f"load_compiled: '{path}' was made for another {what}{found}. Compile and save it again here, or use "
+                "jax.export"
+            )
+    _register(told["calls"])
+    arguments, results = map(jax.tree.structure, pickle.loads(trees))
+    return private("deserialize_executable")(content, arguments, results, execution_devices=jax.devices()[:1])
+
+
+def _register(targets: list[str]) -> None:
+    """Makes known what a program calls: without this, a fresh process crashes at its first run."""
+    if any(target.startswith("lapack") for target in targets):
+        jax.jit(jnp.linalg.inv).lower(np.eye(1))
+    if any("klu" in target for target in targets):
+        klu()

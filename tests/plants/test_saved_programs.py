@@ -1,0 +1,72 @@
+"""Programs that are compiled ahead of time, and run by another process without compiling anything."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from problems import rc_circuit, rc_voltage, run
+
+from jaxonomy_dae import ModelError, load_compiled, save_compiled, simulate, solvers
+from jaxonomy_dae.simulation import saved_programs
+
+TS = np.linspace(0.0, 2.0, 3)
+READ = """
+import jax, time
+jax.config.update("jax_enable_x64", True)
+from jaxonomy_dae import load_compiled
+compiled = []
+jax.monitoring.register_event_duration_secs_listener(
+    lambda event, seconds, **what: compiled.append(event) if event.endswith("backend_compile_duration") else None
+)
+program = load_compiled(PATH)
+value, gradient = program(jax.device_put(2.0))
+print(repr(float(value)), repr(float(gradient)), len(compiled))
+"""
+
+
+def end(R):
+    system = rc_circuit().with_parameters({"r.R": R})
+    return simulate(system, 2.0, ts=TS, solver=solvers.Rodas5P(), throw=False)["c.v"][-1]
+
+
+@pytest.mark.long("a run and its gradient are compiled, and a second process loads them")
+def test_a_run_and_its_gradient_in_another_process(tmp_path):
+    """The other process compiles nothing, and does not crash where LAPACK is called. Values are those of the first
+    process, to the last bit, and those of the closed form."""
+    jax.config.update("jax_enable_compilation_cache", False)  # what is read from there cannot be written once more
+    try:
+        compiled = jax.jit(jax.value_and_grad(end)).lower(2.0).compile()
+    finally:
+        jax.config.update("jax_enable_compilation_cache", True)
+    save_compiled(compiled, tmp_path / "run.bin")
+    value, gradient, count = run(f"PATH = {str(tmp_path / 'run.bin')!r}\n{READ}").split()
+    here = compiled(jnp.asarray(2.0))
+    assert (float(value), float(gradient), int(count)) == (float(here[0]), float(here[1]), 0)
+    assert float(value) == pytest.approx(rc_voltage(2.0), rel=1e-5)  # rtol 1e-6
+
+
+def small():
+    return jax.jit(lambda x: {"twice": 2 * x}).lower(1.0).compile()
+
+
+def test_files_of_other_machines_and_of_other_kinds_are_refused(tmp_path, monkeypatch):
+    path = tmp_path / "small.bin"
+    save_compiled(small(), path)
+    there = saved_programs.machine_and_versions()
+    monkeypatch.setattr(saved_programs, "machine_and_versions", lambda: there | {"version of JAX": "0.1"})
+    with pytest.raises(ModelError, match=rf"another version of JAX: {jax.__version__}, here 0.1. Compile"):
+        load_compiled(path)
+    monkeypatch.setattr(saved_programs, "machine_and_versions", lambda: there | {"processor": "abacus" * 20})
+    with pytest.raises(ModelError, match="another processor. Compile"):
+        load_compiled(path)
+    path.write_bytes(b"something else")
+    with pytest.raises(ModelError, match="not a file of save_compiled"):
+        load_compiled(path)
+
+
+def test_programs_that_call_python_are_refused(tmp_path):
+    def checked(x):
+        return jax.pure_callback(lambda v: v, jax.ShapeDtypeStruct((), x.dtype), x)
+
+    with pytest.raises(ModelError, match="calls Python.*throw=True"):
+        save_compiled(jax.jit(checked).lower(1.0).compile(), tmp_path / "checked.bin")
