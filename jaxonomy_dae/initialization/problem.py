@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Int
 
 from ..lowering.gather import Gather, take, times
 from ..lowering.plan import SystemPlan
@@ -53,7 +54,7 @@ class InitialProblem:
         self.point: SystemAt = system.at(t0, inputs)
         parameters, dtype = self.point.parameters, self.point.dtype
         both = (*rows.kept, *rows.guess)
-        values, sizes = start_values(both, self._given, parameters), frozen(_start_sizes(both, self._given, parameters))
+        values, sizes = start_values(both, self._given, parameters)
         kept, units = len(rows.kept), jnp.asarray(_units(rows.guess), dtype)
         self.target, self.data = values[:kept], sizes[:kept]
         self.x0 = values[kept:] * units
@@ -95,7 +96,7 @@ class InitialProblem:
         parameters, inputs, target = moving
         here, x = self._at(parameters, inputs, w), w[: self.plan.n_state]
         if len(self.unknown):
-            target = start_values(self.rows.kept, self._given, here.parameters)
+            target, _ = start_values(self.rows.kept, self._given, here.parameters)
         state = here.split(x)
         parts = [here.constraint_vector(state)]
         if len(self.plan.carried):
@@ -268,51 +269,47 @@ def _units(rows: tuple[StartRow | None, ...]) -> np.ndarray:
     return np.array([1.0 if row is None else 1.0 / (row.factor or 1.0) for row in rows])
 
 
-def start_values(rows: tuple[StartRow | None, ...], given: list, parameters: Any) -> Any:
-    """The values of start rows, shape (rows,): one vectorised kernel for each distinct start expression."""
-    return _by_expression(rows, given, parameters, lambda kernel, values: kernel(values), lambda stack: stack)
-
-
-def _start_sizes(rows: tuple[StartRow | None, ...], given: list, parameters: Any) -> Any:
-    """The sizes of their terms, |value| + Σ |∂(value)/∂(parameter)|·|parameter|, which rounding is relative to."""
-
-    def size(kernel, values):
-        value, pull = jax.vjp(kernel, values)
-        (slopes,) = pull(jnp.ones_like(value))
-        return sum((jnp.abs(s * v) for s, v in zip(slopes, values, strict=True)), jnp.abs(value))
-
-    return _by_expression(rows, given, parameters, size, jnp.abs)
-
-
-def _by_expression(rows, given: list, parameters: Any, of_kernel, of_given) -> Any:
+def start_values(rows: tuple[StartRow | None, ...], given: list, parameters: Any) -> tuple[Any, Any]:
+    """The values of start rows, shape (rows,): one vectorised kernel for each distinct start expression. And the sizes
+    of their terms, |value| + Σ |∂(value)/∂(parameter)|·|parameter|, which rounding is relative to: constants."""
     members: dict[str, list[int]] = {}
     for k, row in enumerate(rows):
         key = "zero" if row is None or (row.start is None and row.given < 0) else "given"
         if row is not None and row.start is not None and row.given < 0:
             key = row.start.template.key
         members.setdefault(key, []).append(k)
-    parts = []
+    dtype, parts, sizes = parameters.dtype, [], []
     for key, places in members.items():
-        shape = (len(places),)
+        shape, chosen = (len(places),), [rows[k] for k in places]
         if key == "zero":
-            parts.append(jnp.zeros(shape, parameters.dtype))
-            continue
-        chosen = [rows[k] for k in places]
-        if key == "given":
-            stack = jnp.stack([jnp.asarray(given[row.given], parameters.dtype) for row in chosen])
-            parts.append(of_given(stack))
-            continue
-        starts = [row.start for row in chosen]
-        columns = np.array([start.parameters for start in starts], np.int64).T
-        template = starts[0].template
+            value = size = jnp.zeros(shape, dtype)
+        elif key == "given":
+            value = jnp.stack([jnp.asarray(given[row.given], dtype) for row in chosen if row])
+            size = jnp.abs(value)
+        else:
+            starts = [row.start for row in chosen if row and row.start]
+            columns = np.array([start.parameters for start in starts], np.int64).T
+            template = starts[0].template
 
-        def kernel(values, template=template, shape=shape):
-            value = template.residual([], values, [], jnp.zeros((), parameters.dtype), None)
-            return jnp.broadcast_to(jnp.asarray(value, parameters.dtype), shape)
+            def kernel(*values, template=template, shape=shape):
+                value = template.residual([], list(values), [], jnp.zeros((), dtype), None)
+                return jnp.broadcast_to(jnp.asarray(value, dtype), shape)
 
-        parts.append(of_kernel(kernel, [take(parameters, column) for column in columns]))
+            read = [_column(parameters, column) for column in columns]
+            value, pull = jax.vjp(kernel, *read)
+            slopes = pull(jnp.ones(shape, dtype))
+            size = sum((jnp.abs(s * v) for s, v in zip(slopes, read, strict=True)), jnp.abs(value))
+        parts.append(value)
+        sizes.append(jax.lax.stop_gradient(size))
     if not parts:
-        return jnp.zeros((0,), parameters.dtype)
-    order = np.concatenate(list(members.values()))
-    joined = jnp.concatenate(parts) if len(parts) > 1 else parts[0]
-    return joined if (np.diff(order) > 0).all() else take(joined, np.argsort(order, kind="stable"))
+        return jnp.zeros((0,), dtype), jnp.zeros((0,), dtype)
+    order = np.argsort(np.concatenate(list(members.values())), kind="stable")
+    value, size = (take(jnp.concatenate(found), order) for found in (parts, sizes))
+    return value, size
+
+
+def _column(parameters: Any, column: Int[np.ndarray, " n"]) -> Any:
+    """parameters[column]; a single one that all read is no gather."""
+    if (column == column[0]).all():
+        return jnp.broadcast_to(parameters[int(column[0])], column.shape)
+    return take(parameters, column)
