@@ -30,6 +30,12 @@ def spent() -> float:
     return used.ru_utime + used.ru_stime
 
 
+def without_paths(warnings: str) -> str:
+    """Warnings as users read them, without the files and lines of this machine."""
+    lines = re.findall(r"(\w+Warning: .*)", warnings)
+    return "\n".join(lines) + "\n" if lines else warnings
+
+
 def main(paths: list[str]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         profile = pathlib.Path(folder) / "profile_default"
@@ -48,6 +54,9 @@ def main(paths: list[str]) -> None:
                 continue
             for cell in notebook.cells:
                 cell.metadata.pop("execution", None)  # times of day
+                for output in cell.get("outputs", ()):
+                    if output.get("name") == "stderr":
+                        output.name, output.text = "stdout", without_paths(output.text)
             text = nbformat.writes(notebook)
             path.write_text(re.sub(r"[ \t]+(?=\\n)", "", text).rstrip() + "\n")
             print(

@@ -159,7 +159,7 @@ def minimize(
                     f"stopped after {k} updates: {_what(number)}{f' ({why})' if why else ''}. The best iterate, after "
                     f"{best_step} updates, is returned; a smaller learning rate or optax.clip_by_global_norm may help"
                 )
-                warnings.warn(message, RuntimeWarning, stacklevel=2)
+                warnings.warn(message, RuntimeWarning, stacklevel=3)
                 break
             if k < steps:
                 trainable, state = following, following_state
@@ -192,7 +192,7 @@ def _warn_of_unused(trainable: AcausalSystem) -> None:
             f"train: nothing in the model reads {listed(unused, 12)}, so no trajectory depends on it: was the number "
             "used in an equation, instead of what self.parameter(...) returns?",
             RuntimeWarning,
-            stacklevel=4,
+            stacklevel=5,
         )
 
 
@@ -211,7 +211,7 @@ def _bounds(trainable: Any) -> tuple[Interval, ...]:
 def _check_dependents(model: Any) -> None:
     problem = model.parameters.problem if isinstance(model, AcausalSystem) else None
     if problem is not None:
-        warnings.warn(f"{problem}. Bound the parameters it depends on, too", RuntimeWarning, stacklevel=3)
+        warnings.warn(f"{problem}. Bound the parameters it depends on, too", RuntimeWarning, stacklevel=4)
 
 
 def _check_args(args: tuple) -> None:

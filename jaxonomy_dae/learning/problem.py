@@ -274,7 +274,7 @@ class Problem:
         _, here, lowest, training = best
         fit = Estimate.of(self, here.at_tolerance(lowest.tolerance), lowest, training)
         if warn and fit.reasons:
-            warnings.warn(f"this fit is not to be relied on: {'; '.join(fit.reasons)}", FitWarning, stacklevel=2)
+            warnings.warn(f"this fit is not to be relied on: {'; '.join(fit.reasons)}", FitWarning, stacklevel=3)
         return fit
 
     def train(

@@ -97,7 +97,7 @@ def _note_single_precision(system: AcausalSystem) -> None:
             "the system was compiled before double precision was enabled, so its numbers are float32: compile it after "
             'jax.config.update("jax_enable_x64", True)',
             RuntimeWarning,
-            stacklevel=4,
+            stacklevel=5,
         )
 
 

@@ -332,7 +332,7 @@ def _say_of_members(outcome: Outcome, system: AcausalSystem, bounds: tuple[int, 
     if text and throw:
         raise SimulationError(text)
     if text:
-        warnings.warn(text, RuntimeWarning, stacklevel=4)
+        warnings.warn(text, RuntimeWarning, stacklevel=5)
 
 
 def _traced(

@@ -161,7 +161,7 @@ def _say_of_members(check: StartCheck, result: Any, max_steps: int, throw: bool 
     if text and throw:
         raise SimulationError(f"integrations that stopped {text}")
     if text:
-        warnings.warn(f"integrations that stopped {text}. Their rows are not-a-number", RuntimeWarning, stacklevel=3)
+        warnings.warn(f"integrations that stopped {text}. Their rows are not-a-number", RuntimeWarning, stacklevel=4)
 
 
 def _inexact(leaf: Any) -> Any:
