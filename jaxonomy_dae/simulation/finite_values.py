@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..errors import SimulationError
+from ..lowering.plan import SystemPlan
 from ..lowering.schedule import AnyStep
 from ..programs.members import numbered
 from ..programs.staging import is_traced
@@ -34,11 +35,12 @@ def refuse_not_finite(
 
     - `SimulationError` that names the first variable that is not finite, the time, and the equation.
     """
+    found = np.asarray(values, float)
+    if np.isfinite(found).all():
+        return
     ts, states, discrete = (None if part is None else np.asarray(part, float) for part in rows)
     assert ts is not None and states is not None
-    found = np.asarray(values, float)
-    reached = np.isfinite(states).all(axis=-1, keepdims=True)
-    wrong = ~np.isfinite(found) & reached
+    wrong = ~np.isfinite(found) & np.isfinite(states).all(axis=-1, keepdims=True)
     if not wrong.any():
         return
     k = int(np.argmax(wrong.any(axis=1)))
@@ -51,6 +53,23 @@ def refuse_not_finite(
         + "Write the equation so that it has a finite value there, or leave such rows to the reader with "
         "simulate(..., throw=False), which returns not-a-number"
     )
+
+
+def refuse_account(plan: SystemPlan, kind: str, terms: np.ndarray, values: Any, rows: tuple[Any, Any]) -> None:
+    """As `refuse_not_finite`, of declared energies or powers: `values`, shape (times, terms), of the terms `terms`."""
+    found = np.asarray(values, float)
+    if np.isfinite(found).all():
+        return
+    ts, states = (np.asarray(part, float) for part in rows)
+    wrong = ~np.isfinite(found) & np.isfinite(states).all(axis=-1, keepdims=True)
+    if wrong.any():
+        k, term = (int(place[0]) for place in np.nonzero(wrong))
+        owner = np.concatenate([account.component for account in plan.flat.accounts])[terms[term]]
+        name = plan.flat.components[owner]
+        raise SimulationError(
+            f"the {kind} that '{name}' declares is {found[k, term]:g} at t={ts[k]:.6g}, while all states are finite. "
+            "Write the declaration so that it has a finite value there"
+        )
 
 
 def warn_of_members(name: str, values: Any, states: Any) -> None:

@@ -24,7 +24,7 @@ from ..system.system import AcausalSystem
 from .accounts import account_values, chosen_terms
 from .amplified import amplified, is_looked_at, sentence
 from .event_log import EventLog, Events
-from .finite_values import refuse_not_finite, warn_of_members
+from .finite_values import refuse_account, refuse_not_finite, warn_of_members
 from .labelled import data_frame, data_set
 from .saved_state import Memory, SavedState
 
@@ -316,8 +316,10 @@ class Solution(eqx.Module):
             values = account_values(self.system, self.ts, self.states, self.inputs, self.discrete)
             return jnp.sum(values[:, chosen], axis=1)
         ts, states, discrete = filled_up((self.ts, self.states, self.discrete))
-        values = np.asarray(account_values(self.system, ts, states, self.inputs, discrete))
-        return on_device(values[: len(self.ts), chosen].sum(axis=1))
+        values = np.asarray(account_values(self.system, ts, states, self.inputs, discrete))[: len(self.ts), chosen]
+        if self.asked is not None and self.asked.throw:
+            refuse_account(self.system.plan, kind, chosen, values, (self.ts, self.states))
+        return on_device(values.sum(axis=1))
 
     def energy_balance_error(self, *, rtol: float = 1e-8, atol: float = 1e-10) -> Float[Array, " n"]:
         """By how much the account of energy fails to balance at the saved times, shape `(n,)`:

@@ -19,15 +19,16 @@ TS = jnp.linspace(0.0, 2.0, 5)
 
 
 class Quotient(Component):
-    """x' = −p from x(0) = 1; y = √x is not a number beyond x = 0, z reads it, and nothing determines f in mode 1."""
+    """x' = −p from x(0) = 1.1; y = √x is not a number beyond x = 0, z reads it, and nothing determines f in mode 1."""
 
     def __init__(self, ev, name):
         super().__init__(ev, name)
-        x, y, z, f = (self.variable(n, start=1.0, fixed=n == "x") for n in ("x", "y", "z", "f"))
+        x, y, z, f = (self.variable(n, start=1.1, fixed=n == "x") for n in ("x", "y", "z", "f"))
         p, mode = self.parameter("p", 1.0), self.discrete("mode", start=0)
         self.add_equations(Eq(der(x), -p), Eq(y, sympy.sqrt(x)), Eq(z, 2 * y + 1))
         self.either(Eq(mode, 1), sympy.Integer(0), f - 2)
         self.when(x <= 0.3, assign(mode, 1))
+        self.declare_energy(y**2)
 
 
 @functools.cache
@@ -44,20 +45,22 @@ def test_a_variable_that_is_not_finite_is_refused_where_it_is_read():
     """Kind: what no state reads is not judged by the run. Variables were not-a-number at saved times without a word;
     now an error names the variable, the time and the equation, and other variables can be read."""
     solution = run(quotient())
-    np.testing.assert_allclose(solution["c.x"], 1 - np.asarray(TS), atol=1e-12)
+    np.testing.assert_allclose(solution["c.x"], 1.1 - np.asarray(TS), atol=1e-12)
     for read in ("c.z", ["c.x", "c.z"]):
-        with pytest.raises(SimulationError, match=r"(?s)'c.z' is nan at t=1.5.*'c.y' follows.*sqrt.*'c.x' = -0.5"):
+        with pytest.raises(SimulationError, match=r"(?s)'c.z' is nan at t=1.5.*'c.y' follows.*sqrt.*'c.x' = -0.4"):
             solution[read]
     with pytest.raises(SimulationError, match=r"(?s)'c.f' is nan at t=1, and at 2 more.*'c.mode' = 1"):
         solution["c.f"]
     with pytest.raises(SimulationError, match="c.f"):
         solution.to_dict()
+    with pytest.raises(SimulationError, match="the energy that 'c' declares is nan at t=1.5"):
+        solution.energy()
 
 
 @pytest.mark.long("runs with an event are compiled")
 def test_in_batches_and_in_jit_it_is_not_a_number():
     """A member that fails does so alone; the warning outside of jit names it. With `throw=False` nothing is raised."""
-    reached = 2 * np.sqrt(1 - np.asarray(TS[:3])) + 1
+    reached = 2 * np.sqrt(1.1 - np.asarray(TS[:3])) + 1
 
     def of(p, **options):
         return run(quotient().with_parameters({"c.p": p}), **options)
@@ -68,7 +71,7 @@ def test_in_batches_and_in_jit_it_is_not_a_number():
     batch = eqx.filter_vmap(of)(jnp.array([0.25, 1.0]))
     with pytest.warns(RuntimeWarning, match="'c.z' is not a number at saved times of member 1 of 2"):
         values = batch["c.z"]
-    np.testing.assert_allclose(values[0], 2 * np.sqrt(1 - 0.25 * np.asarray(TS)) + 1, atol=1e-7)
+    np.testing.assert_allclose(values[0], 2 * np.sqrt(1.1 - 0.25 * np.asarray(TS)) + 1, atol=1e-7)
     assert np.isnan(values[1, 3:]).all()
 
 
