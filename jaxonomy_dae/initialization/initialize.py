@@ -318,9 +318,16 @@ def _nearest_point(problem: InitialProblem, w, jacobian, unit, good) -> tuple[An
 
 
 def _twice(step: Callable[[Any], tuple[Any, Any]], w: Any) -> tuple[Any, Any]:
-    """w after two steps, in a loop, so that they are compiled once; and what the first one found on the way."""
-    w, seen = jax.lax.scan(lambda w, _: step(w), w, length=2)
-    return w, jax.tree.map(lambda a: a[0], seen)
+    """w after two steps, in a loop, so that they are compiled once; and what the first one found on the way, which is
+    carried on: JAX cannot transpose a scan if none of what it collects is read (jax 0.10.2)."""
+    none = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(step, w)[1])
+
+    def once(carry: Any, first: Any) -> Any:
+        w, seen = carry
+        w, new = step(w)
+        return (w, jax.tree.map(lambda a, b: jnp.where(first, a, b), new, seen)), None
+
+    return jax.lax.scan(once, (w, none), np.array([True, False]))[0]
 
 
 def is_consistent(found: InitialPoint) -> Any:

@@ -81,3 +81,13 @@ def test_what_follows_by_substitution(name):
     assert (order(system) is not None) is follows
     inside, outside = jax.jit(lambda: system.initialize())(), system.initialize()
     np.testing.assert_allclose(inside, outside, rtol=1e-13)
+
+
+def test_derivatives_outside_of_jit():
+    """Pullbacks of `jax.jacrev` and `jax.grad` failed: a loop collected residuals that nothing read."""
+    system = pendulum()
+
+    def start(length):
+        return system.with_parameters({"pend.L": length}).initialize()
+
+    np.testing.assert_allclose(jax.jacrev(start)(1.2), jax.jacfwd(start)(1.2), rtol=1e-14, atol=1e-15)
