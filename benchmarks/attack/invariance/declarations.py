@@ -374,6 +374,7 @@ PAIRS: dict[str, tuple[tuple[Any, Any], str]] = {
         STRUCTURE,
     ),
     "AcausalCompiler.check_units": (({}, {"check_units": False}), NOTHING),
+    "AcausalCompiler.passes": (({}, {"passes": (lambda flat: flat,)}), NOTHING),
 }
 
 
