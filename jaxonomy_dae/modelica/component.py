@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
-from ..errors import ModelError
+from ..errors import ModelError, nearest
 from ..modeling.component import Component
 from ..modeling.environment import EqnEnv
 from .continuous import Law, equation_of, write_equation, write_law
@@ -57,6 +57,10 @@ class FlatComponent(Component):
         for variable, law in (laws or {}).items():
             located(flat.name, replaced[variable].statement.line, write_law, scope, replaced[variable], law)
         for output in outputs:
+            if output not in scope.declared:
+                raise ModelError(
+                    f"outputs: '{flat.name}' has no variable '{output}': {nearest(output, scope.declared)}"
+                )
             if output not in self.variables and output not in self.parameters:
                 self.output(output, as_number(scope.value(output)))
         write_end_of_start(scope)

@@ -393,6 +393,11 @@ def test_a_file_of_several_models_is_refused():
         load("package p model a end a; model b end b; end p;")
 
 
+def test_an_output_that_is_not_declared_is_refused():
+    with pytest.raises(ModelError, match="outputs: 'm' has no variable 'gg'"):
+        FlatComponent(EqnEnv(), "m", load(DAMPED), outputs=["gg"])
+
+
 def test_calls_of_unknown_functions_name_the_nearest():
     with pytest.raises(ModelError, match="did you mean 'sum' or 'sin'"):
         built("model m Real x; equation x = sim(time); end m;")
