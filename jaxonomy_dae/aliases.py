@@ -7,6 +7,7 @@ any pytree of the user's. Their names say which of these is meant.
 from typing import Any, TypeAlias
 
 Time: TypeAlias = Any  # an instant, or a length of time: a number or an array of shape ()
+Times: TypeAlias = Any  # instants: an array of shape (n,), or a list of numbers
 State: TypeAlias = Any  # what is integrated: an array of shape (n,), or of a user's equation, any pytree of arrays
 Tolerance: TypeAlias = Any  # a number, an array of the state's shape, or a pytree like the state
 Args: TypeAlias = Any  # what equations get beside time and state: any pytree; of a compiled system, its `Inputs`

@@ -5,6 +5,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from ..aliases import Time
 from ..errors import explained_keywords
 from ..system.system import AcausalSystem
 from .linearize import linearize
@@ -20,7 +21,7 @@ def frequency_response(
     outputs: Sequence[str],
     omega: Any,
     at: OperatingPoint | None = None,
-    t: Any = 0.0,
+    t: Time = 0.0,
     sampled: bool = False,
 ) -> FrequencyResponse:
     """The response of outputs to small sinusoids at inputs, around an operating point.

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..aliases import Time
 from ..diagnosis.wording import some
 from ..errors import ModelError, explained_keywords, nearest
 from ..programs.staging import is_staged
@@ -29,7 +30,7 @@ def linearize(
     outputs: Sequence[str],
     *,
     at: OperatingPoint | None = None,
-    t: Any = 0.0,
+    t: Time = 0.0,
     states: Sequence[str] | None = None,
     sampled: bool = False,
 ) -> StateSpace:

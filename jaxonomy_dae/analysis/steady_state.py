@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from ..aliases import Time
 from ..diagnosis.wording import some
 from ..errors import ModelError, SteadyStateError, explained_keywords, nearest
 from ..initialization.check import check
@@ -37,7 +38,7 @@ IN_DIRECTION = 0.1  # of its largest entry: what else belongs to a direction tha
 def steady_state(
     system: AcausalSystem,
     *,
-    t: Any = 0.0,
+    t: Time = 0.0,
     inputs: Mapping[str, Any] | None = None,
     initial: Mapping[str, Any] | None = None,
     drifting: Sequence[str] = (),

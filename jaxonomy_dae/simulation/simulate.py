@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..adjoint.stored_adjoint import default_adjoint
+from ..aliases import Time, Times, Tolerance
 from ..errors import InitializationError, ModelError, SimulationError, explained_keywords
 from ..initialization.check import check
 from ..initialization.initialize import known_start, search_outside
@@ -70,19 +71,19 @@ ELSEWHERE = {
 @explained_keywords(ELSEWHERE)
 def simulate(
     system: AcausalSystem,
-    t1: Any,
+    t1: Time,
     *,
-    t0: Any = None,
-    ts: Any = None,
+    t0: Time = None,
+    ts: Times = None,
     solver: diffrax.AbstractSolver[Any] | None = None,
-    rtol: Any = None,
-    atol: Any = None,
+    rtol: Tolerance = None,
+    atol: Tolerance = None,
     inputs: Mapping[str, Any] | None = None,
     initial: Mapping[str, Any] | Any = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController[Any, Any] | None = None,
-    jump_ts: Any = None,
-    dtmax: Any = None,
+    jump_ts: Times = None,
+    dtmax: Time = None,
     control: Sequence[str] = (),
     max_steps: int = 16384,
     max_events: int | None = None,

@@ -12,6 +12,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from ..aliases import Time
 from ..diagnosis.wording import counted, some
 from ..errors import ModelError, nearest
 from ..linear.sparse import SparseMatrix, SparsePattern, sparse_jacobian
@@ -249,7 +250,7 @@ class AcausalSystem(eqx.Module):
 
     # --- computing ---------------------------------------------------------------------------------------------
 
-    def at(self, t: Any, args: Any = None) -> SystemAt:
+    def at(self, t: Time, args: Any = None) -> SystemAt:
         """The system at a time, with these inputs, ready to be evaluated at states."""
         args = read_inputs(self.plan, self.parameters.values.dtype, args)
         check_given(self.plan, args)
@@ -287,7 +288,7 @@ class AcausalSystem(eqx.Module):
         parameters = Parameters(array, None, (), self.parameters.table.given(chosen))
         return AcausalSystem(parameters, self.neural, self.typical_sizes, self.plan, None, values[n:])
 
-    def around_event(self, t: Any, values: Any, previous: Any, args: Any = None) -> SystemAt:
+    def around_event(self, t: Time, values: Any, previous: Any, args: Any = None) -> SystemAt:
         """`at`, with discrete variables that have these values and had others before the event at hand."""
         held = self.holding(values)
         point = held.at(t, args)
@@ -312,11 +313,11 @@ class AcausalSystem(eqx.Module):
         events = self.plan.events
         return [] if events is None else [self.parameters.names[p] for p in events.discrete[: events.n_visible]]
 
-    def vector_field(self, t: Any, x: Float[Array, " n"], args: Any = None) -> Float[Array, " n"]:
+    def vector_field(self, t: Time, x: Float[Array, " n"], args: Any = None) -> Float[Array, " n"]:
         """d(state)/dt for `diffrax.ODETerm(system.vector_field)`; `args` is the dictionary of inputs, or None."""
         return self.at(t, args).vector_field(x)
 
-    def semi_explicit(self, t: Any, x: Float[Array, " n"], args: Any = None) -> Float[Array, " n"]:
+    def semi_explicit(self, t: Time, x: Float[Array, " n"], args: Any = None) -> Float[Array, " n"]:
         """The right-hand side of M d(state)/dt = F(t, state): slopes of the differential states, then the residuals of
         nonlinear blocks, whose rows of `mass` are zero."""
         return self.at(t, args).semi_explicit(x)
@@ -332,7 +333,7 @@ class AcausalSystem(eqx.Module):
         None if it is so large and dense that its places are not worth listing."""
         return self.plan.jacobian_pattern
 
-    def jacobian(self, t: Any, x: Float[Array, " n"], args: Any = None) -> SparseMatrix:
+    def jacobian(self, t: Time, x: Float[Array, " n"], args: Any = None) -> SparseMatrix:
         """∂(vector field)/∂(state) at a consistent state, sparse: `.values` at the places of `.pattern`, `.dense()`,
         `.solve(b)`, `matrix @ vector`.
 
@@ -355,11 +356,11 @@ class AcausalSystem(eqx.Module):
             )
         return SparseMatrix(sparse_jacobian(point.vector_field, pattern)(x), pattern)
 
-    def project(self, t: Any, x: Float[Array, " n"], args: Any = None, iterations: int = 1) -> Float[Array, " n"]:
+    def project(self, t: Time, x: Float[Array, " n"], args: Any = None, iterations: int = 1) -> Float[Array, " n"]:
         """The state moved onto the hidden constraints (nothing to do if there are none)."""
         return self.at(t, args).project(x, iterations)
 
-    def project_fully(self, t: Any, x: Float[Array, " n"], args: Any, iterations: int) -> Float[Array, " n"]:
+    def project_fully(self, t: Time, x: Float[Array, " n"], args: Any, iterations: int) -> Float[Array, " n"]:
         """As `project`, not-a-number where the hidden constraints are not met then: the last step of a search that
         converges quadratically is short."""
         if not self.plan.n_projected:
@@ -375,7 +376,7 @@ class AcausalSystem(eqx.Module):
         places, sizes = np.concatenate([self.plan.states, self.plan.carried]), self.typical_sizes
         return jax.lax.stop_gradient(sizes[places]) if is_traced(sizes) else np.asarray(sizes)[places]
 
-    def dummy_determinants(self, t: Any, x: Float[Array, " n"], args: Any = None) -> Float[Array, " blocks"]:
+    def dummy_determinants(self, t: Time, x: Float[Array, " n"], args: Any = None) -> Float[Array, " blocks"]:
         """The determinants that vanish where the choice of states is singular, one for every nonlinear block that
         determines variables left out of a minimal set; not differentiated."""
         frozen, t, x, args = jax.tree.map(
@@ -383,7 +384,7 @@ class AcausalSystem(eqx.Module):
         )
         return jax.lax.stop_gradient(frozen.at(t, args).dummy_determinants(x))
 
-    def block_determinants(self, t: Any, x: Float[Array, " n"], args: Any = None) -> Float[Array, " blocks"]:
+    def block_determinants(self, t: Time, x: Float[Array, " n"], args: Any = None) -> Float[Array, " blocks"]:
         """The determinants of all nonlinear blocks that are written out; not differentiated."""
         frozen, t, x, args = jax.tree.map(
             lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf, (self, t, x, args)
@@ -395,7 +396,7 @@ class AcausalSystem(eqx.Module):
         """True if a state must satisfy hidden constraints, or carries unknowns of nonlinear blocks."""
         return bool(self.plan.n_projected or len(self.plan.carried))
 
-    def constraint_residual(self, t: Any, x: Float[Array, " n"], args: Any = None) -> Float[Array, " m"]:
+    def constraint_residual(self, t: Time, x: Float[Array, " n"], args: Any = None) -> Float[Array, " m"]:
         """The residuals of all hidden constraints at a state."""
         point = self.at(t, args)
         state = point.split(x)
@@ -404,7 +405,7 @@ class AcausalSystem(eqx.Module):
             parts.append(point.carried_vector(point.t, state))
         return jnp.concatenate(parts)
 
-    def observe(self, names: str | Sequence[str], t: Any, x: Float[Array, " n"], args: Any = None) -> Any:
+    def observe(self, names: str | Sequence[str], t: Time, x: Float[Array, " n"], args: Any = None) -> Any:
         """The values of variables at a state: a scalar for one name, shape `(len(names),)` for several; for the name of
         an array, `"cell.v"`, its shape. Among several names, it stands for those of all entries.
 
@@ -430,7 +431,7 @@ class AcausalSystem(eqx.Module):
     @overload
     def initialize(
         self,
-        t0: Any = 0.0,
+        t0: Time = 0.0,
         inputs: Mapping[str, Any] | None = None,
         initial: Mapping[str, Any] | None = None,
         *,
@@ -441,7 +442,7 @@ class AcausalSystem(eqx.Module):
     @overload
     def initialize(
         self,
-        t0: Any = 0.0,
+        t0: Time = 0.0,
         inputs: Mapping[str, Any] | None = None,
         initial: Mapping[str, Any] | None = None,
         *,
@@ -452,7 +453,7 @@ class AcausalSystem(eqx.Module):
 
     def initialize(
         self,
-        t0: Any = 0.0,
+        t0: Time = 0.0,
         inputs: Mapping[str, Any] | None = None,
         initial: Mapping[str, Any] | None = None,
         *,
@@ -515,7 +516,7 @@ class AcausalSystem(eqx.Module):
 
     def initialization_report(
         self,
-        t0: Any = 0.0,
+        t0: Time = 0.0,
         inputs: Mapping[str, Any] | None = None,
         initial: Mapping[str, Any] | None = None,
         *,
@@ -552,7 +553,7 @@ class AcausalSystem(eqx.Module):
 
 @compiled
 @precisely
-def _observed(system: AcausalSystem, t: Any, x: Any, args: Any, quantity: Any, factor: Any) -> Any:
+def _observed(system: AcausalSystem, t: Time, x: Any, args: Any, quantity: Any, factor: Any) -> Any:
     """The values of quantities at a state. Their numbers are traced, so that one program serves all names."""
     every = np.arange(system.plan.extended.quantities.n)
     found = system.at(t, args).quantities(x, every, np.ones(len(every)))
