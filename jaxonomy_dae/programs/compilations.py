@@ -45,8 +45,9 @@ def noted(compilation: Compilation) -> None:
 def compilations() -> tuple[Compilation, ...]:
     """What this process compiled so far for calls outside of jit, in this order: names, reasons, processor seconds.
 
-    `len(jaxonomy_dae.compilations())` before and after a call says how many programs the call needed. Programs that
-    your own `jax.jit` makes, and operations of `jax.numpy` by themselves, are not among them.
+    `len(jaxonomy_dae.compilations())` before and after a call says how many programs the call needed. Not among them
+    are programs of your own `jax.jit`, those of `jax.jvp` and `jax.jacfwd`, those that call Python, and operations of
+    `jax.numpy` by themselves.
     """
     with _LOCK:
         return tuple(_RECORDS)

@@ -8,6 +8,7 @@ Competitive snoopy caching, Algorithmica 3). The outcomes of both differ by roun
 """
 
 import atexit
+import contextlib
 import functools
 import os
 import threading
@@ -82,7 +83,8 @@ class Program:
         self._lock = threading.Lock()
         self._key = kept.key(text)
         self._cost = 0.0
-        options = quick() if runs_once else {}
+        on_cpu = all(device.platform == "cpu" for a in arrays for device in a.devices())
+        options = quick() if runs_once and on_cpu else {}
         # What an earlier process has optimized is as good as new.
         run = self._loaded({}, arrays)
         if run is not None:
@@ -167,8 +169,9 @@ class Program:
         lowered = self._lowered
         if lowered is None:
             return
-        run = self._loaded({}, self._arrays) or self._compiled({})[0]
-        self._run, self._lowered = run, None
+        with contextlib.suppress(Exception):  # of memory that is short: the quick program goes on
+            self._run = self._loaded({}, self._arrays) or self._compiled({})[0]
+        self._lowered = None
 
 
 _THREADS: "weakref.WeakSet[threading.Thread]" = weakref.WeakSet()
