@@ -11,7 +11,7 @@ import numpy as np
 
 from ..aliases import Controller, Solver, State, Time, Tolerance
 from ..errors import ModelError
-from ..programs.staging import is_traced
+from ..programs.staging import is_traced, joined, on_device
 from ..solvers.solve import step_control
 from ..solvers.step_control import UNSEEN, ConstantLengths
 from ..system.inputs import StepEnds
@@ -31,7 +31,7 @@ def scaled_atol(system: AcausalSystem, atol: Tolerance) -> Any:
     if is_traced((typical, atol)):
         return atol * jnp.where(nominal != 1, nominal, jnp.minimum(typical, 1.0)).astype(atol.dtype)
     size = np.where(nominal != 1, nominal, np.minimum(np.asarray(typical), 1.0))
-    return jnp.asarray(np.asarray(atol) * size, atol.dtype)
+    return on_device(np.asarray(atol) * size, atol.dtype)
 
 
 def controller_for(
@@ -57,9 +57,9 @@ def clipped(controller: Controller, jump_ts: Any, ends: StepEnds) -> Any:
     jumps = ends.jumps if jump_ts is None else [jump_ts, *ends.jumps]
     if not jumps and not ends.kinks:
         return controller
-    joined = [jnp.concatenate(ts) if ts else None for ts in (jumps, ends.kinks)]
+    times = [joined(ts) if ts else None for ts in (jumps, ends.kinks)]
     lengths = ConstantLengths(controller)  # pyright: ignore[reportCallIssue]
-    return diffrax.ClipStepSizeController(lengths, step_ts=joined[1], jump_ts=joined[0])
+    return diffrax.ClipStepSizeController(lengths, step_ts=times[1], jump_ts=times[0])
 
 
 def first_step(

@@ -23,7 +23,7 @@ from ..lowering.plan_held import HeldPlan
 from ..lowering.program import Program
 from ..model.networks import Networks
 from ..model.starts import Start
-from ..programs.staging import is_traced, on_device
+from ..programs.staging import is_traced, joined, on_device
 from ..solvers.field_size import is_large
 from .evaluate import Evaluation, Refinement, newton
 from .input_values import input_values
@@ -440,20 +440,23 @@ class SystemAt:
         parameters are known, waves on which nothing depends, as those of amplitude zero, have the frequency zero. Where
         they are traced, derivatives by the amplitude may be asked for, which need steps that see the wave."""
         frequencies, phases = [], []
+        known = not is_traced((self.parameters, self.t))
+        xp: Any = np if known else jnp
+        numbers, t = (np.asarray(self.parameters), np.asarray(self.t)) if known else (self.parameters, self.t)
         for group in self.plan.waves:
             n = len(group.parameter)
-            given = [self.parameters[column] for column in group.parameter.T], list(group.coefficient.T)
+            given = [numbers[column] for column in group.parameter.T], list(group.coefficient.T)
 
             def values(template, n=n, given=given):
-                found = jnp.asarray(template.residual([], *given, self.t, None), self.dtype)
-                return jnp.broadcast_to(found, (n,))
+                found = template.residual([], *given, t, None, backend="numpy" if known else "jax")
+                return xp.broadcast_to(xp.asarray(found, self.dtype), (n,))
 
             frequency = values(group.frequency)
             if group.weight is not None and not is_traced(self.parameters):
-                frequency = jnp.where(values(group.weight) == 0.0, 0.0, frequency)
+                frequency = xp.where(values(group.weight) == 0.0, 0.0, frequency)
             frequencies.append(frequency)
-            phases.append(jnp.full((n,), jnp.nan, self.dtype) if group.phase is None else values(group.phase))
-        return jnp.concatenate(frequencies), jnp.concatenate(phases)
+            phases.append(xp.full((n,), xp.nan, self.dtype) if group.phase is None else values(group.phase))
+        return joined(frequencies), joined(phases)
 
     def _events(self) -> EventPlan:
         if self.plan.events is None:
