@@ -226,3 +226,26 @@ def test_a_batch_of_states():
         return simulate(system.with_parameters({"c.Kp": gain}), 1.0, ts=ts[2:], initial=state, **TIGHT)
 
     np.testing.assert_allclose(eqx.filter_vmap(on)(gains, states)["c.x"], batch["c.x"][:, 2:], atol=1e-9)
+
+
+class Rectified(Component):
+    """A current through an ideal diode into a charge q, from a source sin(3t)."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        i, v, q = self.variable("i"), self.variable("v"), self.variable("q", start=0.0, fixed=True)
+        self.add_equations(Eq(v + i, sympy.sin(3 * ev.t) - 0.3 * q), Eq(der(q), i))
+        self.complementary(-v, i)
+
+
+@pytest.mark.long("runs with events are compiled")
+def test_from_the_instant_at_which_a_diode_blocks():
+    """Kind: a guard inside its band that falls was neither due nor below: a run that went on from the instant of the
+    event, or a nanosecond before or after it, took steps of length zero."""
+    system, tight = compiled(Rectified(EqnEnv(), "c")), {"rtol": 1e-9, "atol": 1e-11}
+    whole = simulate(system, 2.5, ts=jnp.array([2.5]), **tight)
+    instant = float(whole.events.ts[0])
+    for t in (instant - 1e-9, instant, instant + 1e-9):
+        first = simulate(system, t, ts=jnp.array([t]), **tight)
+        second = simulate(system, 2.5, ts=jnp.array([2.5]), initial=first.at(-1), **tight)
+        np.testing.assert_allclose(second["c.q"], whole["c.q"], rtol=1e-8)
