@@ -27,6 +27,9 @@ OFFSET = 1e-3  # of the confidence region's radius, what may be left to go (Bate
 # Of its standard deviation, by which anything that is reported may move yet where no step gains more: it adds 2 % to
 # errors.
 CLOSE = 0.2
+# The same of predictions: along a valley that bends in many weights, the step of a linearization promises more than
+# there is to gain.
+VALLEY = 1.0
 POLISHED = 12  # steps at the end, as long as three of them leave less than a third
 MIXED = 4  # earlier steps that these are mixed with (Walker & Ni 2011: three to five suffice)
 ROUNDED = 1e-10  # relative rounding of differences of steps
@@ -166,10 +169,10 @@ class _Here:
         following, change = (weights, 0.0) if reweigh is None else reweigh(z, found, weights, factors, free, is_minimum)
         return cls(z, found, weights, rows, cost, free, factors, following, change, left)
 
-    def open(self, merit: AbstractMerit) -> float:
-        """By how much of their standard deviations a full step moves the coordinates that are reported, each, and the
-        predictions of the data, together. Weights of networks are not reported: they may have far to go along a curved
-        valley in which laws and predictions stay what they are."""
+    def open(self, merit: AbstractMerit) -> tuple[float, float]:
+        """By how much of their standard deviations a full step moves (the coordinates that are reported, at most; the
+        predictions of the data, in root mean square). Weights of networks are not reported: they may have far to go
+        along a curved valley in which laws and predictions stay what they are."""
         rank = self.factors.rank(merit.noise)
         step, root = self.factors.step(0.0, rank), self.factors.root(rank)
         spread, shown = np.linalg.norm(root, axis=1), ~np.broadcast_to(merit.hidden, self.z.shape)[self.free]
@@ -177,7 +180,7 @@ class _Here:
         prior = self.weights.prior(self.z).jacobian[:, self.free]
         known = rank - float(np.sum((prior @ root) ** 2))  # directions that the data determine
         moved = float(np.sum(self.factors.projected[:rank] ** 2) - np.sum((prior @ step) ** 2))
-        return max(float(np.max(single, initial=0.0)), float(np.sqrt(max(moved, 0.0) / max(known, 1.0))))
+        return float(np.max(single, initial=0.0)), float(np.sqrt(max(moved, 0.0) / max(known, 1.0)))
 
     @property
     def settled(self) -> bool:
@@ -235,7 +238,7 @@ def descend(
         if better is not None:
             weights = merit.next_weights(better.weights, here.following)
             here = _Here.of(merit, better.z, better.found, weights, bounds, reweigh)
-        if better is not None and (idle < PATIENCE or (idle < PERSISTENCE and here.open(merit) > CLOSE)):
+        if better is not None and (idle < PATIENCE or (idle < PERSISTENCE and max(here.open(merit)) > CLOSE)):
             continue
         stuck = better is None or damping > 1  # columns have norm one: beyond, damping alone keeps steps short
         along, tried = _along(merit, here, bounds, least) if stuck else (None, 0)
@@ -254,7 +257,8 @@ def descend(
         # Weights that stay until the search has found its minimum are now free to change.
         here = _Here.of(merit, here.z, here.found, here.weights, bounds, reweigh, is_minimum=True)
         if here.settled or idle > PERSISTENCE + PATIENCE:
-            closed = here.open(merit) <= CLOSE
+            single, together = here.open(merit)
+            closed = single <= CLOSE and together <= VALLEY
             reason = f"{'converged' if closed else 'stopped'} after {k} steps: no step gains more"
             break
         if better is None:

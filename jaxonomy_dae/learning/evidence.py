@@ -117,9 +117,12 @@ class Evidence:
         changes = [abs(np.log(precision[group][0] / old))]
         for k in inside:
             mine = of_row == k
+            weight = float(np.sum(slopes[mine] ** 2))
+            if weight < np.sqrt(np.finfo(float).tiny):  # an output that no weight bends, as a piecewise linear one
+                continue
             spread = stiffness[k] * float(np.sum((slopes[mine] @ root[group]) ** 2))
             determined = float(np.sum(left[mine] ** 2 @ shares)) - spread
-            most = HEAVIEST * data / max(float(np.sum(slopes[mine] ** 2)), np.finfo(float).tiny)
+            most = HEAVIEST * data / weight
             heaviest = most if determined > FAINT else stiffness[k]
             new = np.clip(_updated(determined, float(np.sum(values[mine] ** 2))), LIGHTEST * most, heaviest)
             # A prior that decides next to nothing may go on changing.

@@ -103,3 +103,25 @@ def test_precisions_are_those_of_greatest_evidence():
     covariance = np.eye(40) + jacobian @ np.linalg.solve(prior.T @ prior, jacobian.T)
     closed = -0.5 * data @ np.linalg.solve(covariance, data) - 0.5 * np.linalg.slogdet(covariance)[1]
     np.testing.assert_allclose(-minus(here), closed, rtol=1e-9)
+
+
+class Ramp(eqx.Module):
+    """Piecewise linear: no weight bends it."""
+
+    weights: jnp.ndarray
+
+    def __call__(self, u):
+        return jnp.maximum(self.weights * u[0], 0.0)
+
+
+def test_a_law_that_nothing_bends_has_no_prior_of_derivatives():
+    """Its precision went to infinity, with a warning of NumPy."""
+    everything, one = np.ones(1, bool), np.ones(1)
+    bends = bends_of(Ramp(jnp.ones(1)), np.array([[0.5], [1.0]]), one)
+    evidence = Evidence(np.full(3, -1), (), np.zeros(0), (everything,), (everything,))
+    weights = Weights(np.ones(3), one, np.zeros(1), np.ones(3), bends, np.ones(2))
+    found = Evaluation(np.zeros(3), np.ones((3, 1)))
+    factors = Factors.of(*weights.applied(one, found), 1e-12)
+    better, change = evidence.reweigh(one, found, weights, factors, everything, True)
+    np.testing.assert_array_equal(better.stiffness, [1.0, 1.0])
+    assert np.isfinite(change) and np.isfinite(better.precision).all()
