@@ -88,10 +88,16 @@ class Function:
 
             def pulled(arrays: list[Any]) -> list[Any]:
                 pullback = jax.tree.unflatten(structure, arrays[:n])
-                given = iter(arrays[n:])
-                return list(pullback([next(given) if r else z() for r, z in zip(read, zeros, strict=True)]))
 
-            zeros = [_zero_like(c) for c in cotangents]
+                def pulled_by(zeros: list[Any]) -> list[Any]:
+                    given = iter(arrays[n:])
+                    return list(pullback([next(given) if r else z for r, z in zip(read, zeros, strict=True)]))
+
+                try:
+                    return pulled_by([_zero_like(c) for c in cotangents])
+                except (TypeError, ValueError):  # JAX 0.10.2 takes a stacked zero of a scan for one of its steps
+                    return pulled_by([jnp.zeros(c.shape, c.dtype) for c in cotangents])
+
             transpose = values._derive(("pullback", read, structure), pulled, f"gradient of {self.name}")
             found = iter(transpose([*leaves, *(c for c, r in zip(cotangents, read, strict=True) if r)]))
             return tuple(next(found) if k in chosen else None for k in range(len(arrays)))
@@ -200,12 +206,10 @@ def _is_nonzero(cotangent: Any) -> bool:
     return is_traced(cotangent) or bool(np.any(np.asarray(cotangent)))
 
 
-def _zero_like(cotangent: Any) -> Callable[[], Any]:
-    """Makes the cotangent of what is not read: not an array of zeros, which would be computed with, and times infinity
+def _zero_like(cotangent: Any) -> Any:
+    """The cotangent of what is not read: not an array of zeros, which would be computed with, and times infinity
     is not a number."""
-    kind, shape, dtype = jax.typeof(cotangent), cotangent.shape, cotangent.dtype
     try:
-        zero = private("Zero")
+        return private("Zero")(jax.typeof(cotangent))
     except MissingName:
-        return lambda: jnp.zeros(shape, dtype)
-    return lambda: zero(kind)
+        return jnp.zeros(cotangent.shape, cotangent.dtype)

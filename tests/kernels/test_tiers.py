@@ -267,6 +267,23 @@ def test_cotangents_that_are_zero_are_left_out():
     assert jax.grad(lambda x: programs.call(both, True, (x,), {})[1])(jnp.array(4.0)) == 0.25
 
 
+def test_rows_of_a_loop_that_are_not_read():
+    """JAX takes the zero cotangent of rows that a loop collects for that of one row."""
+
+    def collected(x):
+        def step(v, _):
+            following = jnp.sin(v)
+            return following, (following, jnp.cos(v))
+
+        last, (rows, others) = jax.lax.scan(step, x, length=2)
+        return rows[0] * others[1], last, rows, others
+
+    programs, x = ProgramCache(), jnp.array([0.3, 0.4])
+    for k in range(4):
+        found = jax.grad(lambda x, k=k: programs.call(collected, True, (x,), {})[k].sum())(x)
+        np.testing.assert_allclose(found, jax.grad(lambda x, k=k: collected(x)[k].sum())(x), rtol=1e-14)
+
+
 def test_reasons():
     """A record says what made another program necessary."""
     programs, since = ProgramCache(), len(compilations())
