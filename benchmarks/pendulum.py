@@ -42,7 +42,7 @@ def build(inject: str, state_selection: str, network=network):
     """The pendulum with the network's correction on vx."""
     ev = EqnEnv()
     diagram = AcausalDiagram()
-    bob = PlanarPendulum(ev, name="pend", initial_angle=handwritten.RELEASE)
+    bob = PlanarPendulum(ev, name="pend", initial_theta=handwritten.RELEASE)
     diagram.add(bob)
     theta = handwritten.tutorial_weights()
     diagram.add_neural_correction_block(
@@ -117,7 +117,7 @@ def rollouts():
 
         def ours(angles, theta, system=system):
             def one(angle):
-                released = with_weights(system, theta).with_parameters({"pend.initial_angle": angle})
+                released = with_weights(system, theta).with_parameters({"pend.initial_theta": angle})
                 solution = simulate(released, t1=1.5, ts=TS, rtol=handwritten.RTOL, atol=handwritten.ATOL)
                 return solution["pend.vx"], solution["pend.x"]
 

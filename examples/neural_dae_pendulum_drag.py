@@ -63,7 +63,7 @@ TUTORIAL = {
 def pendulum(release, correction=None, theta=None, *, targets=("vx", "vy"), inject="equation", **selection):
     """Compiles the pendulum, released from rest, with or without a correction of its accelerations."""
     ev, diagram = EqnEnv(), AcausalDiagram()
-    bob = PlanarPendulum(ev, name="pend", m=MASS, L=LENGTH, g_y=-GRAVITY, initial_angle=release)
+    bob = PlanarPendulum(ev, name="pend", m=MASS, L=LENGTH, g_y=-GRAVITY, initial_theta=release)
     diagram.add(bob)
     if correction is not None:
         diagram.add_neural_correction_block(

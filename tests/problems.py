@@ -87,7 +87,7 @@ def pendulum(*blocks: Any, name: str = "pend", compiler: dict[str, Any] | None =
 
     `blocks` are functions from the component to a `NeuralDAEBlock`.
     """
-    bob = PlanarPendulum(EqnEnv(), name, **({"initial_angle": RELEASE} | parameters))
+    bob = PlanarPendulum(EqnEnv(), name, **({"initial_theta": RELEASE} | parameters))
     return compiled(bob, blocks=[block(bob) for block in blocks], **(compiler or {}))
 
 

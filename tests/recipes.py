@@ -172,7 +172,7 @@ def compiler_of(recipe, names) -> AcausalCompiler:
         elif kind == "law":
             made.append(Law(ev, name, *rest))
         else:
-            made.append(PlanarPendulum(ev, name, initial_angle=-1.0))
+            made.append(PlanarPendulum(ev, name, initial_theta=-1.0))
     diagram = AcausalDiagram()
     diagram.add(*(made[k] for k in recipe["order"]))
     for ends in recipe["nodes"]:

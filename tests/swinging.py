@@ -10,7 +10,7 @@ from jaxonomy_dae.learning import Experiment
 from jaxonomy_dae.library.planar import PlanarPendulum
 
 LENGTH, DRAG, SIGMA = 1.1, 0.3, 2e-3
-RELEASE = "pend.initial_angle"
+RELEASE = "pend.initial_theta"
 
 
 def drag(t, v, theta):
@@ -20,7 +20,7 @@ def drag(t, v, theta):
 def compiled_pendulum():
     """1 m long, which is not right, with the block `drag`."""
     ev, diagram = EqnEnv(), AcausalDiagram()
-    bob = PlanarPendulum(ev, name="pend", m=1.0, L=1.0, initial_angle=-1.0)
+    bob = PlanarPendulum(ev, name="pend", m=1.0, L=1.0, initial_theta=-1.0)
     diagram.add(bob)
     block = NeuralDAEBlock(drag, jnp.array([0.1]), targets=[(bob, "vx"), (bob, "vy")], name="drag")
     diagram.add_neural_correction_block(block)

@@ -208,8 +208,8 @@ def _force(rng: np.random.Generator) -> Case:
         "m": float(rng.uniform(0.5, 2)),
         "L": float(rng.uniform(0.5, 2)),
         "g_y": -9.81,
-        "initial_angle": float(rng.uniform(-2.5, 0.5)),
-        "initial_speed": float(rng.uniform(-1, 1)),
+        "initial_theta": float(rng.uniform(-2.5, 0.5)),
+        "initial_omega": float(rng.uniform(-1, 1)),
     }
     ts = np.linspace(0.0, float(rng.uniform(0.5, 1.5)), 5)[1:]
     p = np.concatenate([list(values.values()), _weights(network)])

@@ -157,7 +157,7 @@ def next_experiment(
     """Chooses, among some experiments, those that would tell most about what is estimated.
 
     ```python
-    plans = [learning.Planned(ts, {"pend.x": 1e-3}, initial={"pend.initial_angle": a}) for a in (-1.2, 0.0, 0.5)]
+    plans = [learning.Planned(ts, {"pend.x": 1e-3}, initial={"pend.initial_theta": a}) for a in (-1.2, 0.0, 0.5)]
     print(learning.next_experiment(fit, plans, names=["drag"]))
     ```
 

@@ -16,7 +16,7 @@ def test_structure():
 def minimal(theta, *prefer):
     """The states and the notes of a pendulum with two states, released at an angle."""
     options = {"state_selection": "dummy_derivatives", "prefer_states": prefer}
-    report = pendulum(initial_angle=theta, compiler=options).report
+    report = pendulum(initial_theta=theta, compiler=options).report
     return {name.removeprefix("pend.") for name in report.states}, " ".join(report.notes)
 
 

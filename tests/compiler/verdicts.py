@@ -70,7 +70,7 @@ def in_line():
 
 def pendulum(theta, length=1.0):
     ev = EqnEnv()
-    return AcausalDiagram().add(pl.PlanarPendulum(ev, "pend", initial_angle=theta, L=length))
+    return AcausalDiagram().add(pl.PlanarPendulum(ev, "pend", initial_theta=theta, L=length))
 
 
 class _Lever(Component):

@@ -77,7 +77,7 @@ def declared():
         Cubic(ev, "redundant", x_start=2.0, x_fixed=True),
         Bare(ev, "bare"),
         Charged(ev, "charged"),
-        PlanarPendulum(ev, "pend", initial_angle=RELEASE),
+        PlanarPendulum(ev, "pend", initial_theta=RELEASE),
     )
     return started(system, {})
 
@@ -89,7 +89,7 @@ def given():
     system = compiled(
         Cubic(ev, "x", x_start=2.0, x_fixed=True),
         Cubic(ev, "y", x_start=2.0, x_fixed=True),
-        PlanarPendulum(ev, "pend", initial_angle=RELEASE),
+        PlanarPendulum(ev, "pend", initial_theta=RELEASE),
         Oscillator(ev, "osc"),
         Discharging(ev, "out"),
         Discharging(ev, "back"),

@@ -272,7 +272,7 @@ def test_a_valve_opening_and_its_bounds():
 @pytest.mark.slow
 def test_two_parameters_from_two_values_on_a_constrained_model():
     """The mass and the length of a pendulum from its tension and its speed, at x = 0: 2·λ·L = m·(v²/L + g)."""
-    system = pendulum(initial_angle=-np.pi / 2)
+    system = pendulum(initial_theta=-np.pi / 2)
     given = {"pend.x": 0.0, "pend.y": -2.0, "pend.vx": 1.0, "pend.lam": 7.0}
     _, found = system.initialize(initial=given, solve_for=["pend.L", "pend.m"])
     assert float(found.parameters["pend.L"]) == pytest.approx(2.0, rel=1e-12)
@@ -283,8 +283,8 @@ def test_two_parameters_from_two_values_on_a_constrained_model():
 def test_a_start_expression_of_an_unknown_parameter():
     """The release angle from a height: y = L·sin(θ), θ unknown."""
     system = pendulum()
-    _, found = system.initialize(initial={"pend.y": -0.8}, solve_for=["pend.initial_angle"])
-    assert np.sin(float(found.parameters["pend.initial_angle"])) == pytest.approx(-0.8, rel=1e-10)
+    _, found = system.initialize(initial={"pend.y": -0.8}, solve_for=["pend.initial_theta"])
+    assert np.sin(float(found.parameters["pend.initial_theta"])) == pytest.approx(-0.8, rel=1e-10)
 
 
 def test_names_to_solve_for_are_checked():

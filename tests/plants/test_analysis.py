@@ -335,7 +335,7 @@ def test_poles_and_their_gradient():
 @pytest.mark.parametrize("angle", [-np.pi / 2, -1.2], ids=["hanging", "released from -1.2"])
 def test_poles_of_a_pendulum_with_redundant_states(angle):
     """±j·√(g/L), on the tangent of the constraints."""
-    system = pendulum().with_parameters({"pend.initial_angle": angle})
+    system = pendulum().with_parameters({"pend.initial_theta": angle})
     space = linearize(system, [], ["pend.lam", "pend.y", "pend.x"])
     assert space.states == ("pend.x", "pend.vx")
     np.testing.assert_allclose(space.A, [[0.0, 1.0], [-9.81, 0.0]], atol=ROUNDING)

@@ -163,7 +163,7 @@ def test_vmap_over_release_angles_at_the_charts_singular_points(plain):
     @jax.vmap
     def swing(angle):
         solution = simulate(
-            plain.with_parameters({"pend.initial_angle": angle}), 1.2, ts=ts, rtol=1e-10, atol=1e-12
+            plain.with_parameters({"pend.initial_theta": angle}), 1.2, ts=ts, rtol=1e-10, atol=1e-12
         )  # fmt: skip
         return jnp.stack([solution[f"pend.{n}"] for n in ("x", "y", "vx", "vy", "lam")])
 

@@ -17,7 +17,7 @@ TS = np.linspace(0.0, 1.0, 11)
 @pytest.fixture(scope="module")
 def swing():
     """Of length 2, from 0.3 rad."""
-    system = compiled(PlanarPendulum(EqnEnv(), name="pend", L=2.0, initial_angle=0.3))
+    system = compiled(PlanarPendulum(EqnEnv(), name="pend", L=2.0, initial_theta=0.3))
     return simulate(system, 1.0, ts=TS)
 
 

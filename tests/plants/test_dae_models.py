@@ -151,7 +151,7 @@ def by_differences(function, values):
 def test_gradients_of_a_constrained_model(solver):
     # The multiplier is not a state: its gradient goes through hidden constraints and the projection. The reference is
     # SciPy's solution for the angle, at 1e-13.
-    names, values = ("pend.L", "pend.g_y", "pend.m", "pend.initial_angle"), np.array([1.3, -9.81, 0.6, -1.2])
+    names, values = ("pend.L", "pend.g_y", "pend.m", "pend.initial_theta"), np.array([1.3, -9.81, 0.6, -1.2])
     at_end = final(pendulum(), names, (), 0.7, "pend.lam", solver)
     found = jax.jit(jax.grad(lambda v: at_end(v, 1e-8, None)))(values)
 

@@ -53,7 +53,7 @@ def angle_error(system):
 @pytest.fixture(scope="module")
 def problem():
     ev, diagram = EqnEnv(), AcausalDiagram()
-    bob = PlanarPendulum(ev, name="pend", initial_angle=RELEASE)
+    bob = PlanarPendulum(ev, name="pend", initial_theta=RELEASE)
     diagram.add(bob)
     law = IsotropicPassive(2, key=jax.random.key(0), inputs=3.0, power=13.0)
     block = NeuralDAEBlock(law, targets=[(bob, "vx"), (bob, "vy")], name="drag")

@@ -16,7 +16,7 @@ from jaxonomy_dae import Component, EqnEnv, der, simulate
 
 TIMES = np.array([0.5, 1.0, 1.5])
 WEIGHTS = np.array([[1.0, -0.7, 0.4], [0.3, 0.8, -0.5], [0.05, -0.04, 0.03]])  # of x, y, lam at the three times
-TRAINED = ("drag", "pend.m", "pend.L", "pend.g_y", "pend.initial_angle")
+TRAINED = ("drag", "pend.m", "pend.L", "pend.g_y", "pend.initial_theta")
 
 
 # Tight, so that what central differences see of the step-size control is below 1e-6 of the gradient. Between the modes
@@ -36,7 +36,7 @@ class Gradients:
 
     def __init__(self, mode):
         system = pendulum(
-            drag_on("vx", "vy", network=mlp(2, 2)), initial_speed=0.3, m=0.8, L=1.2, compiler={"state_selection": mode}
+            drag_on("vx", "vy", network=mlp(2, 2)), initial_omega=0.3, m=0.8, L=1.2, compiler={"state_selection": mode}
         )
         trainable, frozen = system.partition(*TRAINED)
         self.flat, unravel = ravel_pytree(trainable)

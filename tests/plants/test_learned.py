@@ -294,7 +294,7 @@ def plant():
     free, timed, cam = Free(ev, "free"), Free(ev, "timed"), Cam(ev, "cam", jnp.tanh)
     store, ground = Capacitor(ev, "store", 0.5, initial_voltage=1.0), Ground(ev, "g")
     leak = LearnedResistor(ev, "leak", explicit_law, "i")
-    bob = PlanarPendulum(ev, "pend", initial_angle=RELEASE)
+    bob = PlanarPendulum(ev, "pend", initial_theta=RELEASE)
     speed = Speedometer(ev)
 
     def sine(t, u, theta):

@@ -72,7 +72,7 @@ def plain():
 @pytest.mark.slow
 def test_full_swings_pass_both_charts_singular_points(plain):
     ts = np.linspace(0.0, 20.0, 401)
-    system = plain.with_parameters({"pend.initial_angle": np.pi / 6})
+    system = plain.with_parameters({"pend.initial_theta": np.pi / 6})
     assert set(system.states) == {"pend.x", "pend.y", "pend.vx", "pend.vy"}
     solution = simulate(system, 20.0, ts=ts, rtol=1e-8, atol=1e-10)
     x, y = np.asarray(solution["pend.x"]), np.asarray(solution["pend.y"])
@@ -91,7 +91,7 @@ def test_full_swings_pass_both_charts_singular_points(plain):
 def test_projection_after_every_step_keeps_loose_solves_useful(plain):
     """Projecting the saved values alone, the states between having drifted, would leave an error of 0.6 m here."""
     ts = np.linspace(0.0, 20.0, 401)
-    solution = simulate(plain.with_parameters({"pend.initial_angle": np.pi / 6}), 20.0, ts=ts, rtol=1e-4, atol=1e-6)
+    solution = simulate(plain.with_parameters({"pend.initial_theta": np.pi / 6}), 20.0, ts=ts, rtol=1e-4, atol=1e-6)
     angle = elliptic_angle(np.pi / 6, ts)
     distance = np.hypot(solution["pend.x"] - np.cos(angle), solution["pend.y"] - np.sin(angle))
     assert np.max(distance) < 0.05  # some hundred times the tolerance
@@ -103,7 +103,7 @@ def test_projection_after_every_step_keeps_loose_solves_useful(plain):
     plain=pendulum,
 )
 def test_cash(plain):
-    system = plain.with_parameters({"pend.g_y": -1.0, "pend.initial_angle": 0.0, "pend.initial_speed": 1.0})
+    system = plain.with_parameters({"pend.g_y": -1.0, "pend.initial_theta": 0.0, "pend.initial_omega": 1.0})
     solution = simulate(system, 2.0, ts=OFTEN, **TIGHT)
     names = ("pend.x", "pend.y", "pend.vx", "pend.vy", "pend.lam")
     found = np.array([solution[n][200] for n in names]) * np.array([1, 1, 1, 1, 2])  # y5 = 2·lam
@@ -111,7 +111,7 @@ def test_cash(plain):
 
 
 def test_period_two(plain):
-    system = plain.with_parameters({"pend.g_y": -PERIOD_TWO_GRAVITY, "pend.initial_angle": 0.0})
+    system = plain.with_parameters({"pend.g_y": -PERIOD_TWO_GRAVITY, "pend.initial_theta": 0.0})
     solution = simulate(system, 2.0, ts=OFTEN, **TIGHT)
     # At half a period the bob rests on the other side, then it is back: exact, but for 100 steps at 1e-11.
     for name, expected in (("x", [-1, 1]), ("y", [0, 0]), ("vx", [0, 0]), ("vy", [0, 0]), ("lam", [0, 0])):
@@ -122,7 +122,7 @@ def test_period_two(plain):
 
 @pytest.mark.slow
 def test_period_two_does_not_drift(plain):
-    system = plain.with_parameters({"pend.g_y": -PERIOD_TWO_GRAVITY, "pend.initial_angle": 0.0})
+    system = plain.with_parameters({"pend.g_y": -PERIOD_TWO_GRAVITY, "pend.initial_theta": 0.0})
     solution = simulate(system, 200.0, ts=jnp.array([2.0, 20.0, 200.0]), rtol=1e-11, atol=1e-12, max_steps=200_000)
     np.testing.assert_allclose(solution["pend.x"], 1.0, rtol=0, atol=1e-9)
     # The period error grows with time: 1e-9 per period, 100 periods.
@@ -134,7 +134,7 @@ def test_a_forced_singular_chart_fails_loudly():
     # With (y, vy) as states x = ±√(L² − y²) cannot be followed through the lowest point, which a release from rest
     # reaches after a quarter of the period 4·K(sin²(A/2))·√(L/g), amplitude A = π/2 − 1.2.
     ev = EqnEnv()
-    diagram = AcausalDiagram().add(PlanarPendulum(ev, "pend", initial_angle=-1.2))
+    diagram = AcausalDiagram().add(PlanarPendulum(ev, "pend", initial_theta=-1.2))
     options = dict(state_selection="dummy_derivatives", prefer_states=["pend.vy", "pend.y"])
     system = AcausalCompiler(ev, diagram, **options)()
     assert system.states == ["pend.y", "pend.vy"]
@@ -152,7 +152,7 @@ def test_a_forced_singular_chart_fails_loudly():
 def test_a_forced_singular_chart_is_right_as_far_as_it_goes(states):
     names = [f"pend.{s}" for s in states]
     compiler = {"state_selection": "dummy_derivatives", "prefer_states": names}
-    system = pendulum(initial_angle=np.pi / 6, compiler=compiler)
+    system = pendulum(initial_theta=np.pi / 6, compiler=compiler)
     assert system.states == names
     ts = np.linspace(0.0, 3.0, 61)
     solution = simulate(system, 3.0, ts=ts, rtol=1e-8, atol=1e-10, max_steps=2000, throw=False)

@@ -48,7 +48,7 @@ def pendulum():
 @pytest.mark.slow
 def test_a_constrained_model(pendulum):
     """The nodes move along x² + y² = L², and L changes: four states with two degrees of freedom."""
-    release = "pend.initial_angle"
+    release = "pend.initial_theta"
     data = learning.Data(
         record(0, 50, -1.0, initial={release: learning.Unknown(-0.9)}),
         record(1, 30, -0.4, initial={release: learning.Unknown(-0.5)}),

@@ -27,13 +27,13 @@ SOLVERS = [
 @pytest.fixture(scope="module")
 def minimal():
     options = {"state_selection": "dummy_derivatives", "prefer_states": ["pend.x", "pend.vx"]}
-    system = pendulum(initial_angle=0.5, compiler=options)
+    system = pendulum(initial_theta=0.5, compiler=options)
     assert system.states == ["pend.x", "pend.vx"]
     return system
 
 
 def released(system, theta, L=1.0):
-    return system.with_parameters({"pend.initial_angle": theta, "pend.L": L})
+    return system.with_parameters({"pend.initial_theta": theta, "pend.L": L})
 
 
 @pytest.mark.slow
@@ -100,7 +100,7 @@ def test_inside_jit(minimal):
 @pytest.mark.slow
 def test_the_one_of_two_that_is_singular_is_named():
     ev = EqnEnv()
-    pair = [PlanarPendulum(ev, name, initial_angle=theta) for name, theta in (("a", -1.2), ("b", 0.5))]
+    pair = [PlanarPendulum(ev, name, initial_theta=theta) for name, theta in (("a", -1.2), ("b", 0.5))]
     options = {"state_selection": "dummy_derivatives", "prefer_states": ["a.x", "a.vx", "b.x", "b.vx"]}
     system = compiled(*pair, **options)
     with pytest.raises(SimulationError, match=r"no longer determine 'b\.y'"):

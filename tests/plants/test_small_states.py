@@ -59,7 +59,7 @@ def test_sizes_between_a_state_and_its_acceleration(oscillator):
 def test_a_start_that_is_rounding_tells_no_size():
     """L·cos(π/2) = 6e-17 is no size of x. A pendulum that begins upright stays there, or falls; its steps must not be
     those of a motion of 1e-16."""
-    bob = PlanarPendulum(EqnEnv(), name="p", m=1.0, L=1.0, initial_angle=np.pi / 2, initial_speed=0.0)
+    bob = PlanarPendulum(EqnEnv(), name="p", m=1.0, L=1.0, initial_theta=np.pi / 2, initial_omega=0.0)
     system = compiled(bob)
     assert np.asarray(system.typical_sizes)[system.plan.quantity_name.index("p.x")] > 1e-3
     solution = simulate(system, 1.0, ts=np.array([1.0]))

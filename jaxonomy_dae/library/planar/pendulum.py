@@ -17,8 +17,8 @@ class PlanarPendulum(Component):
     **Arguments:**
 
     - `m` > 0: mass (kilogram). `L` > 0: length (metre). `g_x`, `g_y`: gravity's components (metre per second squared).
-    - `initial_angle`: angle at the start from the +x axis, counter-clockwise (radian).
-    - `initial_speed`: angular velocity at the start (radian per second).
+    - `initial_theta`: angle at the start from the +x axis, counter-clockwise (radian).
+    - `initial_omega`: angular velocity at the start (radian per second).
     """
 
     def __init__(
@@ -29,16 +29,16 @@ class PlanarPendulum(Component):
         L: Value = 1.0,
         g_x: Value = 0.0,
         g_y: Value = -9.81,
-        initial_angle: Value = 0.0,
-        initial_speed: Value = 0.0,
+        initial_theta: Value = 0.0,
+        initial_omega: Value = 0.0,
     ):
         super().__init__(ev, name)
         mass = self.parameter("m", m, unit="kg", bounds=POSITIVE)
         length = self.parameter("L", L, unit="m", bounds=POSITIVE)
         gx = self.parameter("g_x", g_x, unit="m/s2")
         gy = self.parameter("g_y", g_y, unit="m/s2")
-        theta = self.parameter("initial_angle", initial_angle, unit="rad")
-        omega = self.parameter("initial_speed", initial_speed, unit="rad/s")
+        theta = self.parameter("initial_theta", initial_theta, unit="rad")
+        omega = self.parameter("initial_omega", initial_omega, unit="rad/s")
         x = self.variable("x", start=length * cos(theta), fixed=True, unit="m")
         y = self.variable("y", start=length * sin(theta), fixed=True, unit="m")
         vx = self.variable("vx", start=-length * omega * sin(theta), fixed=True, unit="m/s")
