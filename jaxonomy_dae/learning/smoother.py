@@ -6,9 +6,9 @@ from .descent import Minimum
 from .evidence import log_evidence
 from .objective import Objective
 
-# Steps of the second look at most: single laws took 5 to 23 from the first minimum; where more are needed, the first
+# Steps of the second look at most: single laws took 5 to 60 from the first minimum; where more are needed, the first
 # look is the better start of another fit.
-SECOND = 40
+SECOND = 100
 
 
 def smoother(objective: Objective, found: Minimum, steps: int) -> tuple[Objective, Minimum] | None:
