@@ -30,6 +30,9 @@ from .events_at_rest import left_by_ticks, recomputed, resting_events
 from .settled_modes import Point, Root, settle
 from .transient import pseudo_transient
 
+# 1/s, relative to the size of a state: a slope that is slower counts as zero, for it would take 1e17 years to move the
+# state by its size. Parts that friction holds creep so, by its compliance (`library/friction.py`).
+AT_REST = 1e-25
 PASSES = 4  # of equilibration: the first one takes scales away, the others balance
 # A singular value below SINGULAR·n·eps of the largest one is rounding. n·eps alone is the usual measure for a matrix
 # with exact entries (NumPy's matrix_rank).
@@ -76,10 +79,16 @@ def find_equilibrium(
     def parts(w, base: Point):
         return base.x.at[free].set(w[:n]), base.q.at[solved_for].set(w[n:]) if len(solved_for) else base.q
 
+    sizes = jax.lax.stop_gradient(system.typical_sizes[plan.states])
+    slowest = jnp.append(AT_REST * sizes, jnp.zeros(len(plan.carried), sizes.dtype))
+
     def residual(w, base: Point, system, t, inputs):
         x, q = parts(w, base)
         here = system.holding(q).at(t, inputs)
-        rows = [here.semi_explicit(x)[free], here.projected_onto(x)]
+        slopes = here.semi_explicit(x)
+        creeping = jnp.abs(slopes) <= slowest
+        slopes = slopes - jax.lax.stop_gradient(jnp.where(creeping, slopes, 0))
+        rows = [slopes[free], here.projected_onto(x)]
         if events is not None and len(events.ticking):
             rows.append(left_by_ticks(system, t, inputs, events, x, q))
         return jnp.concatenate(rows)

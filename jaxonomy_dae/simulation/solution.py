@@ -252,7 +252,8 @@ class Solution(eqx.Module):
         reached = np.isfinite(np.asarray(self.states)).all(axis=-1, keepdims=True)
         values = np.where(reached & np.isfinite(values), values, np.nan)
         columns = dict(zip(read, values.T, strict=True)) | {name: np.asarray(one) for name, one in own.items()}
-        return on_device(np.stack([columns[name] for name in names], axis=-1))
+        empty = np.zeros((*self.ts.shape, 0), self.states.dtype)
+        return on_device(np.stack([columns[name] for name in names], axis=-1) if names else empty)
 
     @property
     def events(self) -> Events:

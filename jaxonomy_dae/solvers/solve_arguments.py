@@ -66,9 +66,9 @@ def tolerance_of(atol: Tolerance, y: State) -> Any:
 
 def jump_times(jump_ts: Any, dtype: Any) -> Any:
     """Times of jumps, a number or shape (n,), as an array; None if there is none."""
-    if jump_ts is None or np.shape(jump_ts) == (0,):
+    array = None if jump_ts is None else as_array(jump_ts)
+    if array is None or array.shape == (0,):
         return None
-    array = as_array(jump_ts)
     if array.ndim > 1 or array.dtype.kind not in "iuf":
         raise ModelError(f"jump_ts must be a number or shape (n,); got {array.dtype} of shape {array.shape}")
     if not isinstance(array, Tracer) and not np.isfinite(array).all():

@@ -51,7 +51,7 @@ def far(law, guess):
 def test_far_away_nothing_is_a_root_that_is_none():
     """Terms of size one were judged beside |∂F/∂p|·|p|: at 1e13, sin(p) = 2 held."""
     for guess in (1e13, 1e17):
-        with pytest.raises(InitializationError, match=r"0 = sin\(p\) - 2, in c\.p: off by"):
+        with pytest.raises(InitializationError, match=r"0 = sin\(p\) - 2 .*, in c\.p: off by"):
             far(lambda p: Eq(sympy.sin(p), 2), guess).initialize()
     system = far(lambda p: Eq(sympy.sin(p), sympy.Rational(3, 10)), 1e10)
     p = float(system.observe("c.p", 0.0, system.initialize()))

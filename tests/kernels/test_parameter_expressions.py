@@ -300,7 +300,7 @@ def test_signals_inside_a_component():
         ([lambda a, b: (a.k, b.u)], r"connect takes ports, symbols of variables.*got a\.k"),
         ([lambda a, b: (a.y, "u", b)], r"connect takes ports"),
         ([lambda a, b: (a, "z", b, "u")], r"component 'a' has no variable 'z'"),
-        ([lambda a, b: (Integrator(a.ev, "c").y, a.u)], r"diagram: 'c\.y' is connected.*add the component"),
+        ([lambda a, b: (Integrator(a.ev, "c").y, a.u)], r"diagram: 'c\.y' is connected.*add it"),
     ],
 )
 def test_signals_that_cannot_be(connections, message):
