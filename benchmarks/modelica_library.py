@@ -288,7 +288,7 @@ def _page(rows: list[dict], files: int) -> str:
     head = ("sub-library", "tried", *STAGES)
     lines = [
         HEAD,
-        f"Of {files} texts, the smallest first, {len(rows)} have been tried. Of the runs "
+        f"Of {files} texts, {len(rows)} have been tried. Of the runs "
         f"that agree, {sum('gradient' in r for r in rows)} have been differentiated.",
         "",
     ]
