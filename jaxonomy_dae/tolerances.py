@@ -113,3 +113,7 @@ CONSISTENT = 1e-4
 # (test_library_contacts.py::test_a_jump_that_is_not_affine_is_refused).
 LEFT = 1e-6
 PULL = 1e-9  # of the largest impulse: contacts that pull by less do so by rounding alone, and are not released
+# 1/s, relative to the size of a state: a slope that is slower counts as zero in analyses, for it would take 1e17 years
+# to move the state by its size. Parts that friction holds creep so, by its compliance (`library/friction.py`;
+# test_analysis_of_events.py::test_friction_that_sticks).
+AT_REST = 1e-25

@@ -25,14 +25,11 @@ from ..lowering.plan import SystemPlan
 from ..model.declared import declared_scale, quantity_bounds
 from ..programs.cache import compiled
 from ..system.system import AcausalSystem
-from ..tolerances import ZERO_WITHIN, spacing
+from ..tolerances import AT_REST, ZERO_WITHIN, spacing
 from .events_at_rest import left_by_ticks, recomputed, resting_events
 from .settled_modes import Point, Root, settle
 from .transient import pseudo_transient
 
-# 1/s, relative to the size of a state: a slope that is slower counts as zero, for it would take 1e17 years to move the
-# state by its size. Parts that friction holds creep so, by its compliance (`library/friction.py`).
-AT_REST = 1e-25
 PASSES = 4  # of equilibration: the first one takes scales away, the others balance
 # A singular value below SINGULAR·n·eps of the largest one is rounding. n·eps alone is the usual measure for a matrix
 # with exact entries (NumPy's matrix_rank).

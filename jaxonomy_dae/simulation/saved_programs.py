@@ -23,7 +23,8 @@ def save_compiled(compiled: Any, path: str | PathLike[str]) -> None:
     """Writes a program that was compiled ahead of time, `jax.jit(f).lower(*arguments).compile()`, to a file.
 
     The file is machine code for this processor, this system and these versions of Python and JAX. `jax.export` gives
-    what other machines can compile.
+    what other machines can compile. A program that JAX read from its persistent cache cannot be written once more: the
+    file would lack parts of it. Compile with the option `jax_enable_compilation_cache` off.
 
     **Raises:**
 

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.experimental.compilation_cache.compilation_cache import reset_cache
 from problems import rc_circuit, rc_voltage, run
 
 from jaxonomy_dae import ModelError, load_compiled, save_compiled, simulate, solvers
@@ -33,11 +34,14 @@ def end(R):
 def test_a_run_and_its_gradient_in_another_process(tmp_path):
     """The other process compiles nothing, and does not crash where LAPACK is called. Values are those of the first
     process, to the last bit, and those of the closed form."""
-    jax.config.update("jax_enable_compilation_cache", False)  # what is read from there cannot be written once more
+    # What is read from the cache cannot be written once more; whether there is one is remembered until it is reset.
+    jax.config.update("jax_enable_compilation_cache", False)
+    reset_cache()
     try:
         compiled = jax.jit(jax.value_and_grad(end)).lower(2.0).compile()
     finally:
         jax.config.update("jax_enable_compilation_cache", True)
+        reset_cache()
     save_compiled(compiled, tmp_path / "run.bin")
     value, gradient, count = run(f"PATH = {str(tmp_path / 'run.bin')!r}\n{READ}").split()
     here = compiled(jnp.asarray(2.0))
