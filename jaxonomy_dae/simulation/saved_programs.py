@@ -23,13 +23,13 @@ def save_compiled(compiled: Any, path: str | PathLike[str]) -> None:
     """Writes a program that was compiled ahead of time, `jax.jit(f).lower(*arguments).compile()`, to a file.
 
     The file is machine code for this processor, this system and these versions of Python and JAX. `jax.export` gives
-    what other machines can compile. A program that JAX read from its persistent cache cannot be written once more: the
-    file would lack parts of it. Compile with the option `jax_enable_compilation_cache` off.
+    what other machines can compile. Where JAX has a persistent cache, the program is run once, with zeros, from what is
+    written: JAX cannot write a program once more that it read from there (jax 0.10.2).
 
     **Raises:**
 
-    - `ModelError` if the program calls Python, as with `throw=True`, or if its arguments or results are of types that
-        cannot be pickled.
+    - `ModelError` if the program calls Python, as with `throw=True`, if it comes from JAX's persistent cache, or if its
+        arguments or results are of types that cannot be pickled.
     """
     text = compiled.as_text() or ""
     targets = sorted(set(re.findall(r'custom_call_target="([^"]+)"', text)))
@@ -47,6 +47,8 @@ def save_compiled(compiled: Any, path: str | PathLike[str]) -> None:
             f"save_compiled: the arguments or results cannot be pickled ({error}): take and return arrays, in tuples, "
             "lists or dictionaries"
         ) from error
+    if jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
+        _try(compiled, _loaded(content, arguments, results))
     Path(path).write_bytes(MARK + pickle.dumps((json.dumps(told), trees, content)))
 
 
@@ -73,7 +75,23 @@ def load_compiled(path: str | PathLike[str]) -> Any:
             )
     _register(told["calls"])
     arguments, results = map(jax.tree.structure, pickle.loads(trees))
+    return _loaded(content, arguments, results)
+
+
+def _loaded(content: bytes, arguments: Any, results: Any) -> Any:
     return private("deserialize_executable")(content, arguments, results, execution_devices=jax.devices()[:1])
+
+
+def _try(compiled: Any, loaded: Any) -> None:
+    """Runs a program once. Parts that its file lacks are missed whatever the values of its arguments."""
+    arguments, keywords = jax.tree.map(lambda info: jnp.zeros(info.shape, info.dtype), compiled.args_info)
+    try:
+        jax.block_until_ready(loaded(*arguments, **keywords))
+    except jax.errors.JaxRuntimeError as error:
+        raise ModelError(
+            f"save_compiled: what JAX writes of this program does not run ({error}), as where it was read from JAX's "
+            "persistent cache. Compile it in a process that does not set jax_compilation_cache_dir"
+        ) from error
 
 
 def _register(targets: list[str]) -> None:
