@@ -3,8 +3,9 @@ momentum over all parts that are joined at that instant (Pfeiffer & Glocker 1996
 Contacts").
 """
 
-from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Rotational, Translational, Value, assign, der
+from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Rotational, Value, assign, der
 from .arguments import yes_or_no
+from .one_axis import AlongLine, Compliant
 
 # Metre: by how much parts may overlap just after they have let go. Far below the sizes of mechanisms, and far above the
 # rounding of a length of one metre, 2e-16.
@@ -14,7 +15,7 @@ CLEARANCE = 1e-9
 REST_SPEED = 1e-3
 
 
-class HardStop(Component):
+class HardStop(AlongLine, Compliant):
     """A rigid stop between two flanges: s_rel = flange_b.s − flange_a.s does not fall below `length`.
 
     While s_rel > length nothing is transmitted; while the flanges touch, the force `f` ≥ 0 pushes them apart. Where
@@ -43,16 +44,14 @@ class HardStop(Component):
         back = self.parameter("restitution", restitution, unit="1", bounds=(0.0, 1.0))
         slow = self.parameter("rest_speed", rest_speed, unit="m/s", bounds=NONNEGATIVE)
         tiny = self.parameter("clearance", clearance, unit="m", bounds=POSITIVE)
-        a, b = self.port("flange_a", Translational), self.port("flange_b", Translational)
-        s, f = self.variable("s_rel", unit="m"), self.variable("f", unit="N")
-        self.add_equations(Eq(s, b.s - a.s), Eq(b.f, -f), Eq(a.f + b.f, 0))
+        s, f = self._two_flanges(pushes=True)
         start = yes_or_no(touching, name, "touching")
         self.complementary(
             s - least, f, "touching", order=2, restitution=back, rest_speed=slow, clearance=tiny, start=start
         )
 
 
-class Rope(Component):
+class Rope(AlongLine, Compliant):
     """A massless rope that cannot be stretched, between two flanges: s_rel = flange_b.s − flange_a.s ≤ length.
 
     While s_rel < length it is slack; while it is taut, the force `f` ≥ 0 pulls its ends together. Where it becomes
@@ -71,9 +70,7 @@ class Rope(Component):
         super().__init__(ev, name)
         most = self.parameter("length", length, unit="m")
         tiny = self.parameter("clearance", clearance, unit="m", bounds=POSITIVE)
-        a, b = self.port("flange_a", Translational), self.port("flange_b", Translational)
-        s, f = self.variable("s_rel", unit="m"), self.variable("f", unit="N")
-        self.add_equations(Eq(s, b.s - a.s), Eq(b.f, f), Eq(a.f + b.f, 0))
+        s, f = self._two_flanges()
         start = yes_or_no(taut, name, "taut")
         self.complementary(most - s, f, "taut", order=2, clearance=tiny, start=start)
 

@@ -23,6 +23,7 @@ from ..modeling import (
     smooth,
 )
 from .arguments import in_order
+from .one_axis import AboutAxis, Compliant
 
 STANDSTILL = 1e-6  # m/s or rad/s: slower parts that are pressed together stick at once
 # Acceleration of stuck parts per friction, below any rounding in SI units, and a normal number in single precision. It
@@ -79,7 +80,7 @@ class _Pressed(Component):
         return coefficient * geometry * largest, ratio
 
 
-class Clutch(_Pressed):
+class Clutch(_Pressed, AboutAxis, Compliant):
     """Two shafts pressed together: the input `u` is the normal force as a part of `fn_max`.
 
     While they slide, tau = mode·mu·cgeo·fn with fn = fn_max·max(u, 0); they stick until |tau| reaches peak times that;
@@ -92,19 +93,11 @@ class Clutch(_Pressed):
     ):
         super().__init__(ev, name)
         most, ratio = self._pressed(mu, fn_max, cgeo, peak)
-        a, b = self.port("flange_a", Rotational), self.port("flange_b", Rotational)
+        phi, tau = self._two_flanges()
+        w = self._relative_speed(phi)
         u = self.input("u", unit="1")
-        phi = self.variable("phi_rel", unit="rad")
-        w = self.variable("w_rel", unit="rad/s")
-        tau = self.variable("tau", unit="N*m")
         slipping = self.variable("slipping", unit="N*m")
-        self.add_equations(
-            Eq(phi, b.phi - a.phi),
-            Eq(w, der(phi)),
-            Eq(b.tau, tau),
-            Eq(a.tau + b.tau, 0),
-            Eq(slipping, most * smooth(Max(u, 0))),
-        )
+        self.add_equations(Eq(slipping, most * smooth(Max(u, 0))))
         stick_slip(self, w, tau, slipping, ratio * slipping, pressed=u)
         self.declare_dissipation(tau * w)
 

@@ -4,10 +4,13 @@ Conventions: absolute angle `phi` in radian, torque `tau` in newton metre counte
 flange, so an inertia obeys J·dw/dt = flange_a.tau + flange_b.tau.
 """
 
-import sympy
+from ..modeling import POSITIVE, Component, Eq, EqnEnv, Rotational, Value, der
+from . import one_axis
+from .one_axis import AboutAxis
 
-from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Rotational, Value, der
-from .laws import penetration, penetration_energy, stribeck
+
+class _Compliant(AboutAxis, one_axis.Compliant):
+    """Two flanges and one torque that turns them towards each other: phi_rel = flange_b.phi − flange_a.phi."""
 
 
 class Inertia(Component):
@@ -43,39 +46,16 @@ class Inertia(Component):
         self.declare_energy(inertia * w**2 / 2)
 
 
-class _Compliant(Component):
-    """Two flanges and one torque that turns them towards each other: phi_rel = flange_b.phi − flange_a.phi."""
-
-    def _two_flanges(self) -> tuple[sympy.Symbol, sympy.Symbol]:
-        a, b = self.port("flange_a", Rotational), self.port("flange_b", Rotational)
-        phi = self.variable("phi_rel", unit="rad")
-        tau = self.variable("tau", unit="N*m")
-        self.add_equations(Eq(phi, b.phi - a.phi), Eq(b.tau, tau), Eq(a.tau + b.tau, 0))
-        return phi, tau
-
-
 class Spring(_Compliant):
     """A linear spring: tau = c·(phi_rel − angle), `c` ≥ 0 in N·m/rad, `angle` in radian."""
 
     def __init__(self, ev: EqnEnv, name: str, c: Value = 1.0, angle: Value = 0.0):
         super().__init__(ev, name)
-        stiffness = self.parameter("c", c, unit="N*m/rad", bounds=NONNEGATIVE)
-        rest = self.parameter("angle", angle, unit="rad")
-        phi, tau = self._two_flanges()
-        self.add_equations(Eq(tau, stiffness * (phi - rest)))
-        self.declare_energy(stiffness * (phi - rest) ** 2 / 2)
+        self._linear(c, None, angle)
 
 
-class Damper(_Compliant):
+class Damper(AboutAxis, one_axis.Damper):
     """A linear damper: tau = d·w_rel with w_rel = der(phi_rel), `d` ≥ 0 in N·m·s/rad."""
-
-    def __init__(self, ev: EqnEnv, name: str, d: Value = 1.0):
-        super().__init__(ev, name)
-        damping = self.parameter("d", d, unit="N*m*s/rad", bounds=NONNEGATIVE)
-        phi, tau = self._two_flanges()
-        w = self.variable("w_rel", unit="rad/s")
-        self.add_equations(Eq(w, der(phi)), Eq(tau, damping * w))
-        self.declare_dissipation(tau * w)
 
 
 class IdealGear(Component):
@@ -88,25 +68,16 @@ class IdealGear(Component):
         self.add_equations(Eq(a.phi, n * b.phi), Eq(n * a.tau + b.tau, 0))
 
 
-class Torque(Component):
+class Torque(AboutAxis, one_axis.EffortSource):
     """A torque on a flange, from outside: the input `tau` (N·m), which is 0 unless `simulate` is given it."""
 
-    def __init__(self, ev: EqnEnv, name: str):
-        super().__init__(ev, name)
-        flange = self.port("flange", Rotational)
-        tau = self.input("tau", default=0.0, unit="N*m")
-        self.add_equations(Eq(flange.tau, -tau))
-        self.declare_supply(tau * der(flange.phi))
 
-
-class FixedAngle(Component):
+class FixedAngle(AboutAxis, one_axis.Fixed):
     """A flange held at the parameter `angle` (radian)."""
 
     def __init__(self, ev: EqnEnv, name: str, angle: Value = 0.0):
         super().__init__(ev, name)
-        where = self.parameter("angle", angle, unit="rad")
-        flange = self.port("flange", Rotational)
-        self.add_equations(Eq(flange.phi, where))
+        self._hold("angle", angle)
 
 
 class SpringDamper(_Compliant):
@@ -115,14 +86,7 @@ class SpringDamper(_Compliant):
 
     def __init__(self, ev: EqnEnv, name: str, c: Value = 1.0, d: Value = 1.0, angle: Value = 0.0):
         super().__init__(ev, name)
-        stiffness = self.parameter("c", c, unit="N*m/rad", bounds=NONNEGATIVE)
-        damping = self.parameter("d", d, unit="N*m*s/rad", bounds=NONNEGATIVE)
-        relaxed = self.parameter("angle", angle, unit="rad")
-        phi_rel, tau = self._two_flanges()
-        speed = self.variable("w_rel", unit="rad/s")
-        self.add_equations(Eq(speed, der(phi_rel)), Eq(tau, stiffness * (phi_rel - relaxed) + damping * speed))
-        self.declare_energy(stiffness * (phi_rel - relaxed) ** 2 / 2)
-        self.declare_dissipation(damping * speed**2)
+        self._linear(c, d, angle)
 
 
 class NonlinearSpring(_Compliant):
@@ -133,45 +97,18 @@ class NonlinearSpring(_Compliant):
 
     def __init__(self, ev: EqnEnv, name: str, c: Value = 1.0, c3: Value = 0.0, angle: Value = 0.0):
         super().__init__(ev, name)
-        linear = self.parameter("c", c, unit="N*m/rad")
-        cubic = self.parameter("c3", c3, unit="N*m/rad3")
-        relaxed = self.parameter("angle", angle, unit="rad")
-        phi_rel, tau = self._two_flanges()
-        e = phi_rel - relaxed
-        self.add_equations(Eq(tau, linear * e + cubic * e**3))
-        self.declare_energy(linear * e**2 / 2 + cubic * e**4 / 4)
+        self._cubic(c, c3, angle)
 
 
-class Backlash(_Compliant):
+class Backlash(AboutAxis, one_axis.Backlash):
     """Play between two parts: nothing is transmitted while |phi_rel| < gap/2; beyond, tau = c·δ + d·dδ/dt with the
     penetration δ, whose corners are rounded over `smooth` (radian).
 
     `gap` ≥ 0 in radian, `c` ≥ 0 in `N*m/rad`, `d` ≥ 0 in `N*m*s/rad`.
     """
 
-    def __init__(
-        self,
-        ev: EqnEnv,
-        name: str,
-        gap: Value = 0.01,
-        c: Value = 1e4,
-        d: Value = 10.0,
-        smooth: Value = 1e-4,
-    ):
-        super().__init__(ev, name)
-        play = self.parameter("gap", gap, unit="rad", bounds=NONNEGATIVE)
-        stiffness = self.parameter("c", c, unit="N*m/rad", bounds=NONNEGATIVE)
-        damping = self.parameter("d", d, unit="N*m*s/rad", bounds=NONNEGATIVE)
-        corner = self.parameter("smooth", smooth, unit="rad", bounds=POSITIVE)
-        phi_rel, tau = self._two_flanges()
-        speed = self.variable("w_rel", unit="rad/s")
-        depth, slope = penetration(phi_rel, play, corner)
-        self.add_equations(Eq(speed, der(phi_rel)), Eq(tau, stiffness * depth + damping * slope * speed))
-        self.declare_energy(stiffness * penetration_energy(phi_rel, play, corner))
-        self.declare_dissipation(damping * slope * speed**2)
 
-
-class Friction(_Compliant):
+class Friction(AboutAxis, one_axis.Friction):
     """Dry and viscous friction between two parts that slide on each other, smooth in w_rel = der(phi_rel):
     tau = [sliding + (breakaway − sliding)·exp(−(w_rel/stribeck_speed)²)]·tanh(w_rel/smooth) + viscous·w_rel
     (Armstrong-Hélouvry, Dupont & Canudas de Wit 1994, Automatica 30:1083).
@@ -180,76 +117,27 @@ class Friction(_Compliant):
     radian per second. It does not stick: under a torque below `breakaway` parts creep at a speed below `smooth`.
     """
 
-    def __init__(
-        self,
-        ev: EqnEnv,
-        name: str,
-        sliding: Value = 1.0,
-        breakaway: Value = 1.5,
-        stribeck_speed: Value = 0.1,
-        viscous: Value = 0.0,
-        smooth: Value = 1e-3,
-    ):
-        super().__init__(ev, name)
-        coulomb = self.parameter("sliding", sliding, unit="N*m", bounds=NONNEGATIVE)
-        static = self.parameter("breakaway", breakaway, unit="N*m", bounds=NONNEGATIVE)
-        fades = self.parameter("stribeck_speed", stribeck_speed, unit="rad/s", bounds=POSITIVE)
-        fluid = self.parameter("viscous", viscous, unit="N*m*s/rad", bounds=NONNEGATIVE)
-        width = self.parameter("smooth", smooth, unit="rad/s", bounds=POSITIVE)
-        phi_rel, tau = self._two_flanges()
-        speed = self.variable("w_rel", unit="rad/s")
-        self.add_equations(Eq(speed, der(phi_rel)), Eq(tau, stribeck(speed, coulomb, static, fades, fluid, width)))
-        self.declare_dissipation(tau * speed)
 
-
-class AngleSource(Component):
+class AngleSource(AboutAxis, one_axis.PositionSource):
     """A flange moved by the input `u`: flange.phi = u (radian); what drives it must be differentiable in
     time as often as the model asks."""
 
-    def __init__(self, ev: EqnEnv, name: str):
-        super().__init__(ev, name)
-        flange = self.port("flange", Rotational)
-        self.add_equations(Eq(flange.phi, self.input("u", unit="rad")))
-        self.declare_supply(-flange.tau * der(flange.phi))
 
-
-class SpeedSource(Component):
+class SpeedSource(AboutAxis, one_axis.MovedAtSpeed):
     """A flange moved at the speed of the input `u` (radian per second), from `initial_angle` (radian) on."""
 
     def __init__(self, ev: EqnEnv, name: str, initial_angle: Value = 0.0):
         super().__init__(ev, name)
-        start = self.parameter("initial_angle", initial_angle, unit="rad")
-        flange = self.port("flange", Rotational)
-        where = self.variable("phi", start=start, fixed=True, unit="rad")
-        self.add_equations(Eq(where, flange.phi), Eq(der(where), self.input("u", unit="rad/s")))
-        self.declare_supply(-flange.tau * der(where))
+        self._move(initial_angle)
 
 
-class AngleSensor(Component):
+class AngleSensor(AboutAxis, one_axis.PositionSensor):
     """The output `y` is the angle of a flange (radian); it takes no torque."""
 
-    def __init__(self, ev: EqnEnv, name: str):
-        super().__init__(ev, name)
-        flange = self.port("flange", Rotational)
-        self.output("y", flange.phi, unit="rad")
-        self.add_equations(Eq(flange.tau, 0))
 
-
-class SpeedSensor(Component):
+class SpeedSensor(AboutAxis, one_axis.SpeedSensor):
     """The output `y` is the speed of a flange (radian per second); it takes no torque."""
 
-    def __init__(self, ev: EqnEnv, name: str):
-        super().__init__(ev, name)
-        flange = self.port("flange", Rotational)
-        self.output("y", der(flange.phi), unit="rad/s")
-        self.add_equations(Eq(flange.tau, 0))
 
-
-class TorqueSensor(Component):
+class TorqueSensor(AboutAxis, one_axis.EffortSensor):
     """Two flanges that move as one; the output `y` is the torque into `flange_a` (newton metre)."""
-
-    def __init__(self, ev: EqnEnv, name: str):
-        super().__init__(ev, name)
-        a, b = self.port("flange_a", Rotational), self.port("flange_b", Rotational)
-        self.output("y", a.tau, unit="N*m")
-        self.add_equations(Eq(a.phi, b.phi), Eq(a.tau + b.tau, 0))

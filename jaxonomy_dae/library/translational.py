@@ -4,11 +4,15 @@ Conventions: absolute position `s` in metre, force `f` in newton counted positiv
 mass obeys m·dv/dt = flange.f.
 """
 
-import sympy
 from sympy import Piecewise
 
 from ..modeling import NONNEGATIVE, POSITIVE, Component, Eq, EqnEnv, Translational, Value, assign, der
-from .laws import penetration, penetration_energy, stribeck
+from . import one_axis
+from .one_axis import AlongLine
+
+
+class _Compliant(AlongLine, one_axis.Compliant):
+    """Two flanges and one force that pulls them together: s_rel = flange_b.s − flange_a.s."""
 
 
 class Mass(Component):
@@ -37,40 +41,17 @@ class Mass(Component):
         self.declare_energy(m * v**2 / 2)
 
 
-class _Compliant(Component):
-    """Two flanges and one force that pulls them together: s_rel = flange_b.s − flange_a.s."""
-
-    def _two_flanges(self) -> tuple[sympy.Symbol, sympy.Symbol]:
-        a, b = self.port("flange_a", Translational), self.port("flange_b", Translational)
-        s = self.variable("s_rel", unit="m")
-        f = self.variable("f", unit="N")
-        self.add_equations(Eq(s, b.s - a.s), Eq(b.f, f), Eq(a.f + b.f, 0))
-        return s, f
-
-
 class Spring(_Compliant):
     """A linear spring that pulls its ends together: f = c·(flange_b.s − flange_a.s − length), `c` ≥ 0 in newton per
     metre."""
 
     def __init__(self, ev: EqnEnv, name: str, c: Value = 1.0, length: Value = 0.0):
         super().__init__(ev, name)
-        k = self.parameter("c", c, unit="N/m", bounds=NONNEGATIVE)
-        rest = self.parameter("length", length, unit="m")
-        s, f = self._two_flanges()
-        self.add_equations(Eq(f, k * (s - rest)))
-        self.declare_energy(k * (s - rest) ** 2 / 2)
+        self._linear(c, None, length)
 
 
-class Damper(_Compliant):
+class Damper(AlongLine, one_axis.Damper):
     """A linear damper: f = d·der(flange_b.s − flange_a.s), `d` ≥ 0 in newton second per metre."""
-
-    def __init__(self, ev: EqnEnv, name: str, d: Value = 1.0):
-        super().__init__(ev, name)
-        d = self.parameter("d", d, unit="N*s/m", bounds=NONNEGATIVE)
-        s, f = self._two_flanges()
-        v = self.variable("v_rel", unit="m/s")
-        self.add_equations(Eq(v, der(s)), Eq(f, d * v))
-        self.declare_dissipation(f * v)
 
 
 class Rod(Component):
@@ -84,14 +65,12 @@ class Rod(Component):
         self.add_equations(Eq(b.s - a.s, distance), Eq(b.f, f), Eq(a.f + b.f, 0))
 
 
-class FixedPosition(Component):
+class FixedPosition(AlongLine, one_axis.Fixed):
     """A flange held at the parameter `position` (metre)."""
 
     def __init__(self, ev: EqnEnv, name: str, position: Value = 0.0):
         super().__init__(ev, name)
-        where = self.parameter("position", position, unit="m")
-        flange = self.port("flange", Translational)
-        self.add_equations(Eq(flange.s, where))
+        self._hold("position", position)
 
 
 class SpringDamper(_Compliant):
@@ -100,14 +79,7 @@ class SpringDamper(_Compliant):
 
     def __init__(self, ev: EqnEnv, name: str, c: Value = 1.0, d: Value = 1.0, length: Value = 0.0):
         super().__init__(ev, name)
-        stiffness = self.parameter("c", c, unit="N/m", bounds=NONNEGATIVE)
-        damping = self.parameter("d", d, unit="N*s/m", bounds=NONNEGATIVE)
-        relaxed = self.parameter("length", length, unit="m")
-        s, f = self._two_flanges()
-        speed = self.variable("v_rel", unit="m/s")
-        self.add_equations(Eq(speed, der(s)), Eq(f, stiffness * (s - relaxed) + damping * speed))
-        self.declare_energy(stiffness * (s - relaxed) ** 2 / 2)
-        self.declare_dissipation(damping * speed**2)
+        self._linear(c, d, length)
 
 
 class NonlinearSpring(_Compliant):
@@ -118,42 +90,15 @@ class NonlinearSpring(_Compliant):
 
     def __init__(self, ev: EqnEnv, name: str, c: Value = 1.0, c3: Value = 0.0, length: Value = 0.0):
         super().__init__(ev, name)
-        linear = self.parameter("c", c, unit="N/m")
-        cubic = self.parameter("c3", c3, unit="N/m3")
-        relaxed = self.parameter("length", length, unit="m")
-        s, f = self._two_flanges()
-        e = s - relaxed
-        self.add_equations(Eq(f, linear * e + cubic * e**3))
-        self.declare_energy(linear * e**2 / 2 + cubic * e**4 / 4)
+        self._cubic(c, c3, length)
 
 
-class Backlash(_Compliant):
+class Backlash(AlongLine, one_axis.Backlash):
     """Play between two parts: nothing is transmitted while |s_rel| < gap/2; beyond, f = c·δ + d·dδ/dt with the
     penetration δ, whose corners are rounded over `smooth` (metre).
 
     `gap` ≥ 0 in metre, `c` ≥ 0 in N/m, `d` ≥ 0 in `N*s/m`.
     """
-
-    def __init__(
-        self,
-        ev: EqnEnv,
-        name: str,
-        gap: Value = 0.01,
-        c: Value = 1e4,
-        d: Value = 10.0,
-        smooth: Value = 1e-4,
-    ):
-        super().__init__(ev, name)
-        play = self.parameter("gap", gap, unit="m", bounds=NONNEGATIVE)
-        stiffness = self.parameter("c", c, unit="N/m", bounds=NONNEGATIVE)
-        damping = self.parameter("d", d, unit="N*s/m", bounds=NONNEGATIVE)
-        corner = self.parameter("smooth", smooth, unit="m", bounds=POSITIVE)
-        s, f = self._two_flanges()
-        speed = self.variable("v_rel", unit="m/s")
-        depth, slope = penetration(s, play, corner)
-        self.add_equations(Eq(speed, der(s)), Eq(f, stiffness * depth + damping * slope * speed))
-        self.declare_energy(stiffness * penetration_energy(s, play, corner))
-        self.declare_dissipation(damping * slope * speed**2)
 
 
 class ElasticStop(_Compliant):
@@ -183,7 +128,7 @@ class ElasticStop(_Compliant):
         self.declare_dissipation(brake * speed)
 
 
-class Friction(_Compliant):
+class Friction(AlongLine, one_axis.Friction):
     """Dry and viscous friction between two parts that slide on each other, smooth in v = v_rel = der(s_rel):
     f = [sliding + (breakaway − sliding)·exp(−(v/stribeck_speed)²)]·tanh(v/smooth) + viscous·v
     (Armstrong-Hélouvry, Dupont & Canudas de Wit 1994, Automatica 30:1083).
@@ -192,87 +137,31 @@ class Friction(_Compliant):
     metre per second. It does not stick: under a force below `breakaway` parts creep at a speed below `smooth`.
     """
 
-    def __init__(
-        self,
-        ev: EqnEnv,
-        name: str,
-        sliding: Value = 1.0,
-        breakaway: Value = 1.5,
-        stribeck_speed: Value = 0.1,
-        viscous: Value = 0.0,
-        smooth: Value = 1e-3,
-    ):
-        super().__init__(ev, name)
-        coulomb = self.parameter("sliding", sliding, unit="N", bounds=NONNEGATIVE)
-        static = self.parameter("breakaway", breakaway, unit="N", bounds=NONNEGATIVE)
-        fades = self.parameter("stribeck_speed", stribeck_speed, unit="m/s", bounds=POSITIVE)
-        fluid = self.parameter("viscous", viscous, unit="N*s/m", bounds=NONNEGATIVE)
-        width = self.parameter("smooth", smooth, unit="m/s", bounds=POSITIVE)
-        s, f = self._two_flanges()
-        speed = self.variable("v_rel", unit="m/s")
-        self.add_equations(Eq(speed, der(s)), Eq(f, stribeck(speed, coulomb, static, fades, fluid, width)))
-        self.declare_dissipation(f * speed)
 
-
-class Force(Component):
+class Force(AlongLine, one_axis.EffortSource):
     """A force on a flange, from outside: the input `f` (N), which is 0 unless `simulate` is given it."""
 
-    def __init__(self, ev: EqnEnv, name: str):
-        super().__init__(ev, name)
-        flange = self.port("flange", Translational)
-        f = self.input("f", default=0.0, unit="N")
-        self.add_equations(Eq(flange.f, -f))
-        self.declare_supply(f * der(flange.s))
 
-
-class PositionSource(Component):
+class PositionSource(AlongLine, one_axis.PositionSource):
     """A flange moved by the input `u`: flange.s = u (metre); what drives it must be differentiable in
     time as often as the model asks."""
 
-    def __init__(self, ev: EqnEnv, name: str):
-        super().__init__(ev, name)
-        flange = self.port("flange", Translational)
-        self.add_equations(Eq(flange.s, self.input("u", unit="m")))
-        self.declare_supply(-flange.f * der(flange.s))
 
-
-class SpeedSource(Component):
+class SpeedSource(AlongLine, one_axis.MovedAtSpeed):
     """A flange moved at the speed of the input `u` (metre per second), from `initial_position` (metre) on."""
 
     def __init__(self, ev: EqnEnv, name: str, initial_position: Value = 0.0):
         super().__init__(ev, name)
-        start = self.parameter("initial_position", initial_position, unit="m")
-        flange = self.port("flange", Translational)
-        where = self.variable("s", start=start, fixed=True, unit="m")
-        self.add_equations(Eq(where, flange.s), Eq(der(where), self.input("u", unit="m/s")))
-        self.declare_supply(-flange.f * der(where))
+        self._move(initial_position)
 
 
-class PositionSensor(Component):
+class PositionSensor(AlongLine, one_axis.PositionSensor):
     """The output `y` is the position of a flange (metre); it takes no force."""
 
-    def __init__(self, ev: EqnEnv, name: str):
-        super().__init__(ev, name)
-        flange = self.port("flange", Translational)
-        self.output("y", flange.s, unit="m")
-        self.add_equations(Eq(flange.f, 0))
 
-
-class SpeedSensor(Component):
+class SpeedSensor(AlongLine, one_axis.SpeedSensor):
     """The output `y` is the speed of a flange (metre per second); it takes no force."""
 
-    def __init__(self, ev: EqnEnv, name: str):
-        super().__init__(ev, name)
-        flange = self.port("flange", Translational)
-        self.output("y", der(flange.s), unit="m/s")
-        self.add_equations(Eq(flange.f, 0))
 
-
-class ForceSensor(Component):
+class ForceSensor(AlongLine, one_axis.EffortSensor):
     """Two flanges that move as one; the output `y` is the force into `flange_a` (newton)."""
-
-    def __init__(self, ev: EqnEnv, name: str):
-        super().__init__(ev, name)
-        a, b = self.port("flange_a", Translational), self.port("flange_b", Translational)
-        self.output("y", a.f, unit="N")
-        self.add_equations(Eq(a.s, b.s), Eq(a.f + b.f, 0))
