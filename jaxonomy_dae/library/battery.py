@@ -28,6 +28,7 @@ from ..modeling import (
     der,
     smooth,
 )
+from ..modeling.arrays import ComponentArray
 from .arguments import count, increasing, row
 from .electrical.two_pin import TwoPin
 from .interpolation import interpolated, known_kind
@@ -51,33 +52,39 @@ class _Circuit(NamedTuple):
     heat: Any  # what the RC pairs lose
 
 
+class _CellData(NamedTuple):
+    """What describes the circuit of a cell in rows: the table of the open-circuit voltage and the RC pairs."""
+
+    soc: Any
+    ocv: Any
+    R: Sequence[Value]
+    C: Sequence[Value]
+    initial_v: Sequence[Value] | None
+    kind: str
+
+    def checked(self, name: str) -> "_CellData":
+        """The rows as arrays, whose lengths agree. `name` is that of the component, for messages."""
+        points = increasing(self.soc, name, "soc")
+        ocv, R, C = row(self.ocv, name, "ocv"), row(self.R, name, "R"), row(self.C, name, "C")
+        if len(ocv) != len(points):
+            raise ModelError(f"'{name}': ocv has {len(ocv)} entries, soc has {len(points)}: they must agree")
+        starts = None if self.initial_v is None else row(self.initial_v, name, "initial_v")
+        voltages = len(R) if starts is None else len(starts)
+        if not len(R) == len(C) == voltages:
+            raise ModelError(
+                f"'{name}' needs a resistance, a capacity and, if given, a voltage for each RC pair; got {len(R)} in "
+                f"R, {len(C)} in C and {voltages} in initial_v"
+            )
+        known_kind(self.kind, name)
+        return _CellData(points, ocv, R, C, starts, self.kind)
+
+
 class _Cell(TwoPin):
     """The parts that cells share."""
 
-    def _circuit(
-        self,
-        soc: Any,
-        ocv: Any,
-        Q: Value,
-        R: Sequence[Value],
-        C: Sequence[Value],
-        eta: Value,
-        initial_soc: Value,
-        initial_v: Sequence[Value] | None,
-        kind: str,
-    ) -> _Circuit:
-        name = self.name
-        points = increasing(soc, name, "soc")
-        ocv, R, C = row(ocv, name, "ocv"), row(R, name, "R"), row(C, name, "C")
-        if len(ocv) != len(points):
-            raise ModelError(f"'{name}': ocv has {len(ocv)} entries, soc has {len(points)}: they must agree")
-        starts = [0.0] * len(R) if initial_v is None else row(initial_v, name, "initial_v")
-        if not len(R) == len(C) == len(starts):
-            raise ModelError(
-                f"'{name}' needs a resistance, a capacity and, if given, a voltage for each RC pair; got {len(R)} in "
-                f"R, {len(C)} in C and {len(starts)} in initial_v"
-            )
-        known_kind(kind, name)
+    def _circuit(self, given: _CellData, Q: Value, eta: Value, initial_soc: Value) -> _Circuit:
+        points, ocv, R, C, starts, kind = given.checked(self.name)
+        starts = [0.0] * len(R) if starts is None else starts
         volts = [self.parameter(f"ocv{k}", value, unit="V") for k, value in enumerate(ocv, start=1)]
         charge = HOUR * self.parameter("Q", Q, unit="A*h", bounds=POSITIVE)
         efficiency = self.parameter("eta", eta, unit="1", bounds=EFFICIENCY)
@@ -145,7 +152,7 @@ class Cell(_Cell):
     ):
         super().__init__(ev, name)
         resistance = self.parameter("R0", R0, unit="Ohm", bounds=POSITIVE)
-        c = self._circuit(soc, ocv, Q, R, C, eta, initial_soc, initial_v, kind)
+        c = self._circuit(_CellData(soc, ocv, R, C, initial_v, kind), Q, eta, initial_soc)
         voltage = self.output("ocv", c.table, unit="V")
         self.add_equations(Eq(c.voltage, voltage + resistance * c.current + c.overpotentials))
         self.declare_energy(c.table_energy)
@@ -200,7 +207,7 @@ class HeatedCell(_Cell):
         entropy = self.parameter("dUdT", dUdT, unit="V/K")
         reference = self.parameter("T_ref", T_ref, unit="K", bounds=POSITIVE)
         heat = self.port("heat", Thermal)
-        c = self._circuit(soc, ocv, Q, R, C, eta, initial_soc, initial_v, kind)
+        c = self._circuit(_CellData(soc, ocv, R, C, initial_v, kind), Q, eta, initial_soc)
         voltage = self.output("ocv", c.table + entropy * (heat.T - reference), unit="V")
         gas = self.parameter("gas_constant", GAS_CONSTANT, unit="J/(mol*K)", bounds=POSITIVE)
         r = self.output("r", resistance * exp(activation / gas * (1 / heat.T - 1 / reference)), unit="Ohm")
@@ -250,25 +257,10 @@ class _Pack(Component):
         return {what: self._each(what, value, shape, *_OF_CELLS[what]) for what, value in values.items()}
 
     def _cells(
-        self,
-        kind: type[Component],
-        shape: tuple[int, int],
-        soc: Any,
-        ocv: Any,
-        R: Sequence[Any],
-        C: Sequence[Any],
-        initial_v: Sequence[Any] | None,
-        table: str,
-        values: dict[str, Any],
-    ) -> Any:
+        self, kind: type[Component], shape: tuple[int, int], given: _CellData, values: dict[str, Any]
+    ) -> ComponentArray:
         """Adds the cells and connects them; returns them, an array of the given shape."""
-        points = increasing(soc, self.name, "soc")
-        ocv, R, C = row(ocv, self.name, "ocv"), row(R, self.name, "R"), row(C, self.name, "C")
-        if len(ocv) != len(points):
-            raise ModelError(f"'{self.name}': ocv has {len(ocv)} entries, soc has {len(points)}: they must agree")
-        if initial_v is not None:
-            initial_v = row(initial_v, self.name, "initial_v")
-        known_kind(table, self.name)
+        points, ocv, R, C, initial_v, table = given.checked(self.name)
         p, n = self.port("p", Electrical), self.port("n", Electrical)
         volts = [self.parameter(f"ocv{k}", value, unit="V") for k, value in enumerate(ocv, start=1)]
 
@@ -323,7 +315,7 @@ class Pack(_Pack):
     ):
         super().__init__(ev, name)
         values = {"Q": Q, "R0": R0, "eta": eta, "initial_soc": initial_soc}
-        self._cells(Cell, _shape(name, series, parallel), soc, ocv, R, C, initial_v, kind, values)
+        self._cells(Cell, _shape(name, series, parallel), _CellData(soc, ocv, R, C, initial_v, kind), values)
 
 
 class HeatedPack(_Pack):
@@ -374,7 +366,7 @@ class HeatedPack(_Pack):
         super().__init__(ev, name)
         shape = _shape(name, series, parallel)
         values = {"Q": Q, "R0": R0, "eta": eta, "initial_soc": initial_soc, "Ea": Ea, "dUdT": dUdT, "T_ref": T_ref}
-        cells = self._cells(HeatedCell, shape, soc, ocv, R, C, initial_v, kind, values)
+        cells = self._cells(HeatedCell, shape, _CellData(soc, ocv, R, C, initial_v, kind), values)
         thermal = {"C_heat": C_heat, "G_coolant": G_coolant, "initial_temperature": initial_temperature}
         each = self._values(shape, thermal)
         between = self.parameter("G_neighbour", G_neighbour, unit="W/K", bounds=NONNEGATIVE)

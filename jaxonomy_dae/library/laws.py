@@ -4,7 +4,7 @@ from typing import Any
 
 from sympy import Piecewise, asinh, exp, frac, pi, sin, sqrt, tanh
 
-from ..modeling import Component
+from ..modeling import POSITIVE, Component, Value
 
 
 def penetration(s: Any, gap: Any, smooth: Any) -> tuple[Any, Any]:
@@ -31,17 +31,38 @@ def stribeck(v: Any, sliding: Any, breakaway: Any, stribeck_speed: Any, viscous:
     return (sliding + (breakaway - sliding) * exp(-((v / stribeck_speed) ** 2))) * tanh(v / smooth) + viscous * v
 
 
-def sine(t: Any, amplitude: Any, frequency: Any, phase: Any) -> Any:
-    """amplitude·sin(2π·frequency·t + phase)."""
-    return amplitude * sin(2 * pi * frequency * t + phase)
+# Waveforms declare their parameters in the component that they drive; `unit` is that of the value.
 
 
-def step(component: Component, start_time: Any) -> Any:
-    """0, and 1 from `start_time` on."""
-    return Piecewise((1, component.relation(component.ev.t >= start_time)), (0, True))
+def sine(component: Component, amplitude: Value, frequency: Value, phase: Value, offset: Value, unit: str) -> Any:
+    """offset + amplitude·sin(2π·frequency·t + phase)."""
+    a = component.parameter("amplitude", amplitude, unit=unit)
+    f = component.parameter("frequency", frequency, unit="Hz")
+    shift = component.parameter("phase", phase, unit="rad")
+    return component.parameter("offset", offset, unit=unit) + a * sin(2 * pi * f * component.ev.t + shift)
 
 
-def pulse(component: Component, period: Any, width: Any, start_time: Any) -> Any:
-    """1 in the first part `width` of every `period` from `start_time` on, else 0."""
-    cycle = (component.ev.t - start_time) / period
-    return Piecewise((1, component.relation((cycle >= 0) & (frac(cycle) < width))), (0, True))
+def step(component: Component, height: Value, start_time: Value, offset: Value, unit: str) -> Any:
+    """offset, and offset + height from `start_time` on."""
+    h = component.parameter("height", height, unit=unit)
+    begin = component.parameter("start_time", start_time, unit="s")
+    risen = Piecewise((1, component.relation(component.ev.t >= begin)), (0, True))
+    return component.parameter("offset", offset, unit=unit) + h * risen
+
+
+def pulse(
+    component: Component,
+    height: Value,
+    period: Value,
+    width: Value,
+    start_time: Value,
+    offset: Value,
+    unit: str,
+) -> Any:
+    """offset + height in the first part `width` of every `period` from `start_time` on, else offset."""
+    h = component.parameter("height", height, unit=unit)
+    length = component.parameter("period", period, unit="s", bounds=POSITIVE)
+    part = component.parameter("width", width, unit="1", bounds=(0.0, 1.0))
+    cycle = (component.ev.t - component.parameter("start_time", start_time, unit="s")) / length
+    on = Piecewise((1, component.relation((cycle >= 0) & (frac(cycle) < part))), (0, True))
+    return component.parameter("offset", offset, unit=unit) + h * on

@@ -1,6 +1,10 @@
 """Sources of voltage and current: constant, of time, of a signal, controlled."""
 
-from ...modeling import POSITIVE, Eq, EqnEnv, Value
+from typing import ClassVar
+
+import sympy
+
+from ...modeling import Eq, EqnEnv, Value
 from ..laws import pulse, sine, step
 from .two_pin import TwoPin, TwoPorts
 
@@ -50,114 +54,87 @@ class SignalCurrent(TwoPin):
 
 
 class _OfTime(TwoPin):
-    """A source whose value is an expression in time."""
+    """A source whose voltage or current, as `unit` says, is an expression in time."""
 
-    def _drive(self, quantity: str, value):
+    unit: ClassVar[str]
+
+    def _drive(self, value: sympy.Expr) -> None:
         voltage, current = self._two_pins()
-        self.add_equations(Eq(voltage if quantity == "v" else current, value))
+        self.add_equations(Eq(voltage if self.unit == "V" else current, value))
         self.declare_supply(-voltage * current)
 
-    def _sine(self, amplitude: Value, frequency: Value, phase: Value, offset: Value, unit: str):
-        a = self.parameter("amplitude", amplitude, unit=unit)
-        f = self.parameter("frequency", frequency, unit="Hz")
-        shift = self.parameter("phase", phase, unit="rad")
-        return self.parameter("offset", offset, unit=unit) + sine(self.ev.t, a, f, shift)
 
-    def _step(self, height: Value, start_time: Value, offset: Value, unit: str):
-        h = self.parameter("height", height, unit=unit)
-        t0 = self.parameter("start_time", start_time, unit="s")
-        return self.parameter("offset", offset, unit=unit) + h * step(self, t0)
-
-    def _pulse(self, height: Value, period: Value, width: Value, start_time: Value, offset: Value, unit: str):
-        h = self.parameter("height", height, unit=unit)
-        length = self.parameter("period", period, unit="s", bounds=POSITIVE)
-        part = self.parameter("width", width, unit="1", bounds=(0.0, 1.0))
-        t0 = self.parameter("start_time", start_time, unit="s")
-        return self.parameter("offset", offset, unit=unit) + h * pulse(self, length, part, t0)
+class _Sine(_OfTime):
+    def __init__(
+        self,
+        ev: EqnEnv,
+        name: str,
+        amplitude: Value = 1.0,
+        frequency: Value = 1.0,
+        phase: Value = 0.0,
+        offset: Value = 0.0,
+    ):
+        super().__init__(ev, name)
+        self._drive(sine(self, amplitude, frequency, phase, offset, self.unit))
 
 
-class SineVoltage(_OfTime):
+class _Step(_OfTime):
+    def __init__(self, ev: EqnEnv, name: str, height: Value = 1.0, start_time: Value = 0.0, offset: Value = 0.0):
+        super().__init__(ev, name)
+        self._drive(step(self, height, start_time, offset, self.unit))
+
+
+class _Pulse(_OfTime):
+    def __init__(
+        self,
+        ev: EqnEnv,
+        name: str,
+        height: Value = 1.0,
+        period: Value = 1.0,
+        width: Value = 0.5,
+        start_time: Value = 0.0,
+        offset: Value = 0.0,
+    ):
+        super().__init__(ev, name)
+        self._drive(pulse(self, height, period, width, start_time, offset, self.unit))
+
+
+class SineVoltage(_Sine):
     """v = offset + amplitude·sin(2π·frequency·t + phase), in volt, hertz and radian."""
 
-    def __init__(
-        self,
-        ev: EqnEnv,
-        name: str,
-        amplitude: Value = 1.0,
-        frequency: Value = 1.0,
-        phase: Value = 0.0,
-        offset: Value = 0.0,
-    ):
-        super().__init__(ev, name)
-        self._drive("v", self._sine(amplitude, frequency, phase, offset, "V"))
+    unit = "V"
 
 
-class SineCurrent(_OfTime):
+class SineCurrent(_Sine):
     """i = offset + amplitude·sin(2π·frequency·t + phase), in ampere, hertz and radian."""
 
-    def __init__(
-        self,
-        ev: EqnEnv,
-        name: str,
-        amplitude: Value = 1.0,
-        frequency: Value = 1.0,
-        phase: Value = 0.0,
-        offset: Value = 0.0,
-    ):
-        super().__init__(ev, name)
-        self._drive("i", self._sine(amplitude, frequency, phase, offset, "A"))
+    unit = "A"
 
 
-class StepVoltage(_OfTime):
+class StepVoltage(_Step):
     """v = offset, and offset + height from `start_time` (second) on, in volt. The step is an event."""
 
-    def __init__(self, ev: EqnEnv, name: str, height: Value = 1.0, start_time: Value = 0.0, offset: Value = 0.0):
-        super().__init__(ev, name)
-        self._drive("v", self._step(height, start_time, offset, "V"))
+    unit = "V"
 
 
-class StepCurrent(_OfTime):
+class StepCurrent(_Step):
     """i = offset, and offset + height from `start_time` (second) on, in ampere. The step is an event."""
 
-    def __init__(self, ev: EqnEnv, name: str, height: Value = 1.0, start_time: Value = 0.0, offset: Value = 0.0):
-        super().__init__(ev, name)
-        self._drive("i", self._step(height, start_time, offset, "A"))
+    unit = "A"
 
 
-class PulseVoltage(_OfTime):
+class PulseVoltage(_Pulse):
     """v = offset + height in the first part `width` (0 to 1) of every `period` (second) from `start_time` on, else
     offset, in volt. Its edges are events."""
 
-    def __init__(
-        self,
-        ev: EqnEnv,
-        name: str,
-        height: Value = 1.0,
-        period: Value = 1.0,
-        width: Value = 0.5,
-        start_time: Value = 0.0,
-        offset: Value = 0.0,
-    ):
-        super().__init__(ev, name)
-        self._drive("v", self._pulse(height, period, width, start_time, offset, "V"))
+    unit = "V"
 
 
-class PulseCurrent(_OfTime):
+class PulseCurrent(_Pulse):
     """i = offset + height in the first part `width` (0 to 1) of every `period` (second) from `start_time` on, else
     offset, in ampere. Its edges are events."""
 
-    def __init__(
-        self,
-        ev: EqnEnv,
-        name: str,
-        height: Value = 1.0,
-        period: Value = 1.0,
-        width: Value = 0.5,
-        start_time: Value = 0.0,
-        offset: Value = 0.0,
-    ):
-        super().__init__(ev, name)
-        self._drive("i", self._pulse(height, period, width, start_time, offset, "A"))
+    unit = "A"
 
 
 class VoltageControlledVoltage(TwoPorts):

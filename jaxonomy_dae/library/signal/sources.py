@@ -23,9 +23,7 @@ class Step(Component):
 
     def __init__(self, ev: EqnEnv, name: str, height: Value = 1.0, start_time: Value = 0.0, offset: Value = 0.0):
         super().__init__(ev, name)
-        h, o = self.parameter("height", height), self.parameter("offset", offset)
-        t0 = self.parameter("start_time", start_time, unit="s")
-        self.output("y", o + h * step(self, t0))
+        self.output("y", step(self, height, start_time, offset, unit=""))
 
 
 class Ramp(Component):
@@ -60,9 +58,7 @@ class Sine(Component):
         offset: Value = 0.0,
     ):
         super().__init__(ev, name)
-        a, o = self.parameter("amplitude", amplitude), self.parameter("offset", offset)
-        f, shift = self.parameter("frequency", frequency, unit="Hz"), self.parameter("phase", phase, unit="rad")
-        self.output("y", o + sine(ev.t, a, f, shift))
+        self.output("y", sine(self, amplitude, frequency, phase, offset, unit=""))
 
 
 class Pulse(Component):
@@ -80,11 +76,7 @@ class Pulse(Component):
         offset: Value = 0.0,
     ):
         super().__init__(ev, name)
-        h, o = self.parameter("height", height), self.parameter("offset", offset)
-        part = self.parameter("width", width, unit="1", bounds=(0.0, 1.0))
-        length = self.parameter("period", period, unit="s", bounds=POSITIVE)
-        t0 = self.parameter("start_time", start_time, unit="s")
-        self.output("y", o + h * pulse(self, length, part, t0))
+        self.output("y", pulse(self, height, period, width, start_time, offset, unit=""))
 
 
 class Noise(Component):
