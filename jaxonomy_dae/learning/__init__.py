@@ -39,6 +39,8 @@ from .minimize import minimize as minimize
 from .multiple_shooting import Shooting as Shooting
 from .posterior import Posterior as Posterior
 from .prediction import Prediction as Prediction
+from .priors import LogNormal as LogNormal
+from .priors import Normal as Normal
 from .problem import Problem as Problem
 from .table import Table as Table
 from .term import ClosedForm as ClosedForm

@@ -11,6 +11,7 @@ Sizes, bounds and priors belong to the problem. Where a search begins changes `s
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -23,6 +24,7 @@ from ..modeling.interval import Interval, closed_ends
 from ..system.parameters import ParameterNames
 from .data import Stacked
 from .experiment import Unknown
+from .priors import LogNormal, Normal
 from .program import Setting
 
 
@@ -59,7 +61,7 @@ class Coordinates:
     start: Float[np.ndarray, " p"]
     low: Float[np.ndarray, " p"]
     high: Float[np.ndarray, " p"]
-    spread: Float[np.ndarray, " p"]  # of the prior of a start, on the coordinates' scale; infinite where there is none
+    spread: Float[np.ndarray, " p"]  # of the prior, on the coordinates' scale; infinite where there is none
     centre: Float[np.ndarray, " p"]  # of this prior, on the coordinates' scale; of weights, those of the problem
     fixed: Bool[np.ndarray, " p"]
     n_shared: int
@@ -154,6 +156,30 @@ class Coordinates:
             low[chosen], high[chosen] = new_low, new_high
         return dataclasses.replace(self, low=low, high=high)
 
+    def with_priors(self, priors: Mapping[str, Any]) -> "Coordinates":
+        """A copy with priors of parameters by name, each on the scale on which it is normal; a pair is a range."""
+        columns = {name: np.array(getattr(self, name)) for name in ("log", "size", "start", "low", "high", "spread")}
+        centre = np.array(self.centre)
+        for name, prior in priors.items():
+            chosen = np.array([name == group for group in self.group], bool)
+            new: dict[str, Any] = {}
+            if isinstance(prior, Normal):
+                new = {"log": False, "size": prior.spread, "spread": 1.0}
+                centre[chosen] = prior.mean / prior.spread
+            elif isinstance(prior, LogNormal):
+                new = {"log": True, "size": 1.0, "spread": math.log(prior.factor)}
+                new["low"] = np.maximum(self.low[chosen], np.finfo(float).tiny)
+                new["start"] = np.where(self.start[chosen] > 0, self.start[chosen], prior.median)
+                centre[chosen] = math.log(prior.median)
+            else:
+                new = {"low": prior[0], "high": prior[1]}
+            double = np.flatnonzero(chosen & np.isfinite(self.spread))
+            if "spread" in new and len(double):
+                raise ModelError(f"priors: '{self.names[double[0]]}' has a spread already, by Unknown: leave one out")
+            for column, values in new.items():
+                columns[column][chosen] = values
+        return dataclasses.replace(self, centre=centre, **columns)
+
     def _known(self, name: str) -> Bool[np.ndarray, " p"]:
         chosen = self.members(name)
         if not chosen.any():
@@ -162,9 +188,11 @@ class Coordinates:
         return chosen
 
 
-def coordinates(setting: Setting, stacked: Stacked, extras: tuple[Coordinate, ...] = ()) -> Coordinates:
+def coordinates(
+    setting: Setting, stacked: Stacked, extras: tuple[Coordinate, ...], priors: Mapping[str, Any]
+) -> Coordinates:
     """The coordinates of a problem, which start at the values of its system and at the guesses of unknown starts;
-    `extras` come with its method."""
+    `extras` come with its method, `priors` by names of parameters."""
     system, observers, layout, _ = setting
     table = system.parameters.table
     rows: list[Coordinate] = []
@@ -196,7 +224,7 @@ def coordinates(setting: Setting, stacked: Stacked, extras: tuple[Coordinate, ..
     return Coordinates(
         names, unit, group, np.array(is_weight), np.array(log), size, start, low, high, spread, centre,
         np.array(fixed), n_shared, len(layout.own), len(stacked.labels),
-    )  # fmt: skip
+    ).with_priors(priors)  # fmt: skip
 
 
 def is_positive(interval: Interval) -> bool:

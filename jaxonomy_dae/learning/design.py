@@ -25,7 +25,7 @@ import scipy.linalg
 from jaxtyping import Bool, Float
 
 from ..errors import InitializationError, ModelError, SimulationError, nearest, whole_number
-from .coordinates import Coordinates, coordinates
+from .coordinates import Coordinates
 from .data import Stacked
 from .estimate import Estimate
 from .experiment import Planned
@@ -291,8 +291,8 @@ def _placed(known: Known, plans: list[Planned]) -> tuple[Layout, Stacked, Any, A
 def _objective(known: Known, layout: Layout, stacked: Stacked) -> Objective:
     """What planned experiments are looked at by: runs, or the method of the estimate at hand."""
     o, counted = known.objective, np.ones(len(stacked.labels), bool)
-    structure, extras = known.problem.errors(stacked)
-    c = coordinates(o.setting._replace(layout=layout), stacked, extras)
+    structure = known.problem.errors(stacked)[0]
+    c = known.problem.coordinates_of(o.setting._replace(layout=layout), stacked)
     given = o.system, o.observers, layout, o.fine, stacked, c, {}, counted
     if not isinstance(o, AheadObjective):
         return Objective(*given)

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..errors import ModelError, nearest, whole_number
 from ..lowering.plan import SystemPlan
+from .priors import is_finite
 from .records import interpolated, low_pass, smoothed, untrended
 
 ESTIMATE = "estimate"
@@ -31,9 +32,9 @@ class Unknown:
     shared: bool = False
 
     def __post_init__(self):
-        if not _is_finite(self.guess):
+        if not is_finite(self.guess):
             raise ModelError(f"Unknown needs a finite guess; got {self.guess!r}")
-        if self.spread is not None and not (_is_finite(self.spread) and self.spread > 0):
+        if self.spread is not None and not (is_finite(self.spread) and self.spread > 0):
             raise ModelError(f"Unknown: spread is a standard deviation > 0, or None; got {self.spread!r}")
 
 
@@ -79,7 +80,7 @@ class Experiment:
         count = len(self.times)
         object.__setattr__(self, "data", {name: _samples(name, v, count) for name, v in self.data.items()})
         object.__setattr__(self, "sigma", self._sigmas())
-        if not (_is_finite(self.weight) and self.weight >= 0):
+        if not (is_finite(self.weight) and self.weight >= 0):
             raise ModelError(f"weight is a number ≥ 0; got {self.weight!r}")
 
     def _sigmas(self) -> "dict[str, float | np.ndarray]":
@@ -95,7 +96,7 @@ class Experiment:
             value = by_name.get(name, ESTIMATE)
             if isinstance(value, str) and value == ESTIMATE:
                 out[name] = math.nan
-            elif not isinstance(value, str) and _is_finite(value) and value > 0:
+            elif not isinstance(value, str) and is_finite(value) and value > 0:
                 out[name] = float(value)
             elif isinstance(value, np.ndarray | list | tuple):
                 out[name] = _levels_of(name, value, samples)
@@ -155,13 +156,13 @@ class Experiment:
 
         - `ModelError` where there are no samples, or values are known at `t0` and not at `start`.
         """
-        if not (_is_finite(start) and _is_finite(end) and self.t0 <= start < end):
+        if not (is_finite(start) and is_finite(end) and self.t0 <= start < end):
             raise ModelError(f"window: start and end are times, {self.t0:g} ≤ start < end; got {start!r} and {end!r}")
         rows = (self.times >= start) & (self.times <= end)
         if not rows.any():
             raise ModelError(f"window: there is no sample from {start:g} to {end:g}")
         new = dict(initial or {})
-        old = [name for name, value in self.initial.items() if _is_finite(value) and name not in new]
+        old = [name for name, value in self.initial.items() if is_finite(value) and name not in new]
         if start > self.t0 and old:
             raise ModelError(
                 f"window: '{old[0]}' is known at {self.t0:g}, not at {start:g}: say what it is there, "
@@ -245,10 +246,6 @@ class Experiment:
         return dataclasses.replace(self, **changes | {"sigma": sigma})
 
 
-def _is_finite(value: Any) -> bool:
-    return isinstance(value, int | float | np.integer | np.floating) and math.isfinite(value)
-
-
 def _rows(level: Any, rows: Any) -> Any:
     """The noise levels of some rows."""
     return level if np.ndim(level) == 0 else level[rows]
@@ -289,7 +286,7 @@ def _times(given: Any, t0: float) -> np.ndarray:
     if len(bad):
         raise ModelError(f"times[{bad[0]}] is {times[bad[0]]}: every row needs a time")
     check_increasing(times)
-    if not _is_finite(t0) or times[0] < t0:
+    if not is_finite(t0) or times[0] < t0:
         raise ModelError(
             f"times lie outside of the experiment: it starts at t0={t0:g}, the times reach from {times[0]:g} to "
             f"{times[-1]:g}. Give t0={times[0]:g}, or leave earlier rows out"

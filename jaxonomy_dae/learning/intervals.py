@@ -15,6 +15,7 @@ from .objective import Objective
 from .table import Row, Table
 
 FURTHEST = 10  # doublings of the linear interval before an end counts as infinite
+SILENT = 0.98  # of its prior's spread: data that narrow it by less say as much as a sample of five times that spread
 
 
 def profile(
@@ -85,6 +86,7 @@ def intervals(
     low, high = c.z_bounds
     natural = c.natural(point)
     moved, rows = set(np.flatnonzero(objective.free)), []
+    away = objective.ran_away(point)
     scalars = np.array([not name.endswith("]") for name in c.names])  # such as a sensor law's gain
     for k in np.flatnonzero(~c.is_weight | scalars).tolist():
         z, spread, note = point[k], spreads[k], ""
@@ -93,6 +95,11 @@ def intervals(
             note = "frozen" if c.fixed[k] else "held out: fitted to this experiment alone"
         elif z <= low[k] or z >= high[k]:
             note = f"bound reached: {natural[k]:g}"
+        elif away[k]:
+            note = "ran away"
+            spread = np.inf
+        elif np.isfinite(c.spread[k]) and spread > SILENT * c.spread[k]:
+            note = "by its prior"
         elif spread >= 1:
             note = "not determined"
         inside = (-np.inf, np.inf)

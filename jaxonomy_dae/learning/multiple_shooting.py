@@ -178,7 +178,7 @@ def shoot(
     The point; None if the segments cannot be run from the start.
     """
     segments = Segments(objective, shooting.nodes)
-    z = np.clip(start, *objective.bounds)
+    z = np.clip(start, *objective.limits)
     states = node_guesses(segments, z)
     if states is None:
         return None
@@ -186,7 +186,7 @@ def shoot(
     point = segments.evaluate(z, states, size)
     if point is None:
         return None
-    descent = Descent(segments, size, objective.bounds, tolerance)
+    descent = Descent(segments, size, objective.limits, tolerance)
     evidence = objective.evidence
     if weights is None:
         weights = objective.weights(z, segments.evaluation(point))
@@ -254,7 +254,7 @@ def _reweighed(
     z = point.z
     found = merit.segments.evaluation(point)
     residual, jacobian = merit.weights.applied(z, found)
-    moves = can_move(z, jacobian.T @ residual, merit.segments.objective.bounds)
+    moves = can_move(z, jacobian.T @ residual, merit.segments.objective.limits)
     noise = _noise(merit, point, jacobian, tolerance)
     factors = Factors.of(residual, jacobian[:, moves], noise)
     remaining = offset(factors, noise)

@@ -48,6 +48,9 @@ class Predicted:
 
 
 FINEST = 1e3  # roundings, to which an integration of some hundred steps can be told to keep
+# Factor, or change in its own size, by which a number without bounds may leave the start of its search: a guess in
+# another unit (nano) is still within reach, and what runs further is not held by the data.
+AWAY = 1e9
 FEW = 8  # columns up to which residuals alone cost almost as much as with their Jacobian, and a program of their own
 MANY = 40  # numbers of one experiment beyond which a gradient backwards costs less: of 97, 6 ms where forwards it is 14
 
@@ -122,6 +125,22 @@ class Objective:
         """(lower, upper) bounds of the free coordinates, shape (f,) each."""
         low, high = self.coordinates.z_bounds
         return low[self.free], high[self.free]
+
+    @functools.cached_property
+    def limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """(lower, upper) ends of a search for the free coordinates, shape (f,) each: bounds, and where there is none,
+        so far from the start that the data do not hold the coordinate."""
+        c, (low, high) = self.coordinates, self.bounds
+        reach = np.where(c.is_weight, np.inf, np.where(c.log, np.log(AWAY), AWAY))[self.free]
+        start = c.z_start[self.free]
+        return np.where(np.isfinite(low), low, start - reach), np.where(np.isfinite(high), high, start + reach)
+
+    def ran_away(self, full: Float[np.ndarray, " p"]) -> Bool[np.ndarray, " p"]:
+        """True for coordinates whose search ended so far from its start that the data do not hold them."""
+        (low, high), (least, most) = self.limits, self.bounds
+        z, out = full[self.free], np.zeros(len(full), bool)
+        out[self.free] = ((z <= low) & (low > least)) | ((z >= high) & (high < most))
+        return out
 
     @functools.cached_property
     def conditions(self) -> Conditions:
@@ -266,7 +285,7 @@ class Objective:
             return self.weights(z, found) if first is None else self.weights(z, found).with_priors_of(first)
 
         reweigh = self.evidence.reweigh if weights is None and not self.evidence.is_idle else None
-        return descend(self._merit(weigh), start, self.bounds, reweigh, steps)
+        return descend(self._merit(weigh), start, self.limits, reweigh, steps)
 
     def _merit(self, weigh: Weigh) -> SumOfSquares:
         columns = self.coordinates.n_shared + self.coordinates.n_own  # of the program, whatever is frozen

@@ -28,6 +28,7 @@ from .filtering import Filter, Innovations, Structure, structure_and_extras
 from .identifiability import Identifiability, identifiability
 from .multiple_shooting import Shooting, shoot
 from .objective import Objective
+from .priors import priors_by_name
 from .program import Layout, Setting
 from .runs import residuals, run, why_not
 from .smoother import smoother
@@ -51,6 +52,8 @@ class Problem:
     - `train`: names of parameters (also of arrays of them), of networks, and of sensor laws in `observe`; default: all
         networks. Parameters that must be positive are searched on a logarithmic scale; declared bounds hold.
     - `starts`: `Unknown(...)` or numbers by variables' names, for experiments that do not name them in `initial`.
+    - `priors`: what is known of parameters beforehand, by name: `learning.Normal(mean, spread)`,
+        `learning.LogNormal(median, factor)`, or a range `(low, high)`. Every method takes them.
     - `regularize`: of the weights of networks and sensor laws, by name: `"evidence"`, a normal prior whose precision
         the data choose; a number, its precision; None, no prior. Default: `"evidence"` for networks, None for sensor
         laws.
@@ -76,6 +79,7 @@ class Problem:
         train: Sequence[str] | str | None = None,
         *,
         starts: Mapping[str, Any] | None = None,
+        priors: Mapping[str, Any] | None = None,
         regularize: Mapping[str, Any] | str | float | None = "evidence",
         observe: Mapping[str, Any] | None = None,
         method: str | Shooting | Filter | Innovations = "single",
@@ -106,6 +110,9 @@ class Problem:
         self.method = checked_method(system, method)
         self._stacked = self.stacked(self.data)
         self._layout = self.layout_of(self._stacked)
+        unknown = [*self.trained[0], *self._layout.shared, *self._layout.own]
+        table = system.parameters.table
+        self.priors = priors_by_name(priors or {}, table, [name for name in unknown if name in table.names])
         self.penalties = penalties(system, self.trained[1], regularize)
 
     # --- set-up ------------------------------------------------------------------------------------------------
@@ -151,6 +158,10 @@ class Problem:
             return structure_and_extras(self.method, self.system, stacked)
         return Structure(), ()
 
+    def coordinates_of(self, setting: Setting, stacked: Stacked) -> Coordinates:
+        """The coordinates for these data, with the problem's priors."""
+        return coordinates(setting, stacked, self.errors(stacked)[1], self.priors)
+
     def _is_marginal(self, name: str, unknown: list[Unknown]) -> bool:
         """True if the prior of a start is that of a filter, which needs no search."""
         own = all(u.spread is not None and not u.shared for u in unknown)
@@ -181,7 +192,7 @@ class Problem:
         `{experiment: {name: array of shape (n,)}}`; NaN where a run fails.
         """
         s = self._stacked
-        objective = self.objective_of(s, coordinates(self._setting, s, self.errors(s)[1]))
+        objective = self.objective_of(s, self.coordinates_of(self._setting, s))
         model = self.system if model is None else model.merged()
         return residuals(objective, model, dict(starts or {}), dict(observe or {}), adjoint)
 
@@ -321,11 +332,10 @@ class Problem:
             )
 
     def _coordinates(self, stacked: Stacked, freeze: Any, start: Any, bounds: Any) -> Coordinates:
-        extras = self.errors(stacked)[1]
-        c = coordinates(self._setting, stacked, extras)
+        c = self.coordinates_of(self._setting, stacked)
         if isinstance(start, AcausalSystem):
             there = self._setting._replace(system=started(self.system, start))
-            c = dataclasses.replace(c, start=coordinates(there, stacked, extras).start)
+            c = dataclasses.replace(c, start=self.coordinates_of(there, stacked).start)
         return as_asked(c, freeze, start, bounds)
 
     def _descend(

@@ -35,7 +35,7 @@ def adam_steps(
 ) -> Float[np.ndarray, " f"]:
     """The point of least cost among so many steps of Adam on the scale of the coordinates, kept inside the bounds.
     Weights of noise and priors are those of the start."""
-    z = np.clip(start, *objective.bounds)
+    z = np.clip(start, *objective.limits)
     found = objective.evaluate(z)
     if found is None:
         return z
@@ -50,7 +50,7 @@ def adam_steps(
         mean = DECAY[0] * mean + (1 - DECAY[0]) * gradient
         square = DECAY[1] * square + (1 - DECAY[1]) * gradient**2
         step = (mean / (1 - DECAY[0] ** k)) / (np.sqrt(square / (1 - DECAY[1] ** k)) + 1e-8)
-        z = np.clip(z - rate * step, *objective.bounds)
+        z = np.clip(z - rate * step, *objective.limits)
         found = objective.evaluate(z) if k <= steps else None
         if found is None:
             break

@@ -161,7 +161,7 @@ def train(objective: Objective, start: Float[np.ndarray, " f"], plan: GradientSt
     held_out = bool(objective.stacked.holdout.any())
     if plan.patience is not None and not held_out:
         raise ModelError("patience needs experiments that are held out: Experiment(..., holdout=True)")
-    low, high = objective.bounds
+    low, high = objective.limits
     near = silent(objective, start)
     stages = {share: Batches(objective.until(share, near), plan.batch, plan.seed) for share in plan.horizons}
     z = np.clip(start, low, high)

@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import ModelError, SimulationError
-from .coordinates import coordinates
 from .data import Data
 from .experiment import Experiment
 from .factors import Factors
@@ -59,8 +58,7 @@ class Unseen:
             raise ModelError(f"first is a number of rows ≥ 1, or None for all; got {first!r}")
         problem, fitted = estimate.problem, estimate.objective
         stacked = problem.stacked(Data(experiment.changed(holdout=False, weight=1.0)))
-        layout, extras = problem.layout_of(stacked), problem.errors(stacked)[1]
-        c = coordinates(fitted.setting._replace(layout=layout), stacked, extras)
+        c = problem.coordinates_of(fitted.setting._replace(layout=problem.layout_of(stacked)), stacked)
         known = estimate.values
         shared = [k for k in range(c.n_shared) if c.names[k] in known]
         new = [c.names[k] for k in range(c.n_shared) if c.names[k] not in known]

@@ -9,6 +9,7 @@ import numpy as np
 import scipy.stats
 
 from ..diagnosis.wording import listed
+from .objective import AWAY
 
 if TYPE_CHECKING:
     from .estimate import Estimate
@@ -86,10 +87,16 @@ def _table(fit: "Estimate") -> list[str]:
     rows, found = fit.table(), []
     ends = [row.name for row in rows if row.note.startswith("bound reached")]
     lost = [row.name for row in rows if row.note == "not determined"]
+    away = [row.name for row in rows if row.note == "ran away"]
+    if away:
+        found.append(
+            f"nothing in the data keeps {listed(away, 6)} from running away, to {AWAY:.0e} times its start: begin "
+            "closer, freeze it, or give it a prior, priors=, or bounds="
+        )
     if ends:
         found.append(f"a bound was reached by {listed(ends, 6)}: widen bounds=, or look whether it should be there")
     if lost:
         found.append(
-            f"the data do not determine {listed(lost, 6)}: freeze it, give it a spread, or see fit.identifiability()"
+            f"the data do not determine {listed(lost, 6)}: freeze it, give it a prior, or see fit.identifiability()"
         )
     return found
