@@ -15,6 +15,7 @@ import lineax as lx
 import numpy as np
 
 from ..errors import ModelError
+from . import dense
 from .mass import Mass
 from .operator import SparseLinearOperator
 from .sparse import SparsePattern, compressed, solve_sparse
@@ -65,13 +66,8 @@ class Dense(eqx.Module):
         if n <= UNROLLED_INVERSE:
             rows = [[matrix[i, j] for j in range(n)] for i in range(n)]
             return jnp.stack(solve_unrolled(rows, list(jnp.eye(n, dtype=matrix.dtype))))
-        # Pivots are compared in units of their rows: the unit of an equation must not decide.
-        largest = jnp.max(jnp.abs(matrix), axis=1)
-        unit = 1 / jnp.where(largest == 0, 1, largest)
-        lu, _, order = jax.lax.linalg.lu(matrix * unit[:, None])
-        if n > EXPLICIT_INVERSE:
-            return lu, order, unit
-        return _substitute(lu, jnp.diag(unit)[order])
+        factors = dense.factor(matrix)
+        return factors if n > EXPLICIT_INVERSE else dense.inverse(factors)
 
     def operator(self, matrix: Any) -> lx.AbstractLinearOperator:
         """The matrix as a Lineax operator."""
@@ -84,23 +80,19 @@ class Dense(eqx.Module):
     def empty(self, n: int, dtype: Any) -> Any:
         """Zeros in the shapes of a factorisation."""
         square = jnp.zeros((n, n), dtype)
-        return (square, jnp.zeros((n,), jnp.int32), jnp.zeros((n,), dtype)) if n > EXPLICIT_INVERSE else square
+        if n <= EXPLICIT_INVERSE:
+            return square
+        return dense.Factors(square, jnp.zeros((n,), jnp.int32), jnp.zeros((n,), dtype))
 
     def apply(self, factor: Any, matrix: Any, b: Any) -> Any:
         """W⁻¹ b, without derivatives."""
-        if isinstance(factor, tuple):
-            lu, order, unit = factor
-            return _substitute(lu, (unit * b)[order][:, None])[:, 0]
-        return factor @ b
+        return dense.solve(factor, b[:, None])[:, 0] if isinstance(factor, dense.Factors) else factor @ b
 
     def apply_transposed(self, factor: Any, c: Any) -> Any:
         """W⁻ᵀ c, without derivatives."""
-        if not isinstance(factor, tuple):
-            return factor.T @ c
-        lu, order, unit = factor
-        y = jax.lax.linalg.triangular_solve(lu, c[:, None], left_side=True, lower=False, transpose_a=True)
-        y = jax.lax.linalg.triangular_solve(lu, y, left_side=True, lower=True, transpose_a=True, unit_diagonal=True)
-        return unit * jnp.zeros_like(c).at[order].set(y[:, 0])
+        if isinstance(factor, dense.Factors):
+            return dense.transpose_solve(factor, c[:, None])[:, 0]
+        return factor.T @ c
 
     def solve(self, factor: Any, matrix: Any, b: Any) -> Any:
         """W⁻¹ b, differentiable."""
@@ -111,11 +103,6 @@ class Dense(eqx.Module):
             lambda _, c: self.apply(factor, None, c),
             lambda _, c: self.apply_transposed(factor, c),
         )
-
-
-def _substitute(lu: Any, b: Any) -> Any:
-    y = jax.lax.linalg.triangular_solve(lu, b, left_side=True, lower=True, unit_diagonal=True)
-    return jax.lax.linalg.triangular_solve(lu, y, left_side=True, lower=False)
 
 
 class Sparse(eqx.Module):

@@ -34,6 +34,7 @@ import numpy as np
 
 from ..structure.tearing import Tearing
 from ..tolerances import TOLERATED, TOLERATED_NORM
+from . import dense
 from .inverse import FORMULA, inverse
 from .once import once
 from .written_out import UNROLLED
@@ -122,14 +123,12 @@ class _Elimination:
             self.w[u] = {j: _product(scale, a) for j, a in row.items()} if self.written_out else _product(scale, row)
         schur = [self._row_of_schur(e) for e in tearing.residuals]
         if self.written_out:
-            dense = [[self._filled(row.get(j, 0.0)) for j in range(m)] for row in schur]
+            entries = [[self._filled(row.get(j, 0.0)) for j in range(m)] for row in schur]
             if self.exact:
-                dense[0][0] = self._more_than_rounding(dense[0][0])
-            self.inverse = inverse(dense)
+                entries[0][0] = self._more_than_rounding(entries[0][0])
+            self.inverse = inverse(entries)
         else:
-            dense = jnp.stack([jnp.moveaxis(row, 0, -1) for row in schur], axis=-2)  # (*batch, m, m)
-            self.unit = 1 / jnp.max(jnp.abs(dense), axis=-1, keepdims=True)
-            self.lu, _, self.order = jax.lax.linalg.lu(dense * self.unit)
+            self.factors = dense.factor(jnp.stack([jnp.moveaxis(row, 0, -1) for row in schur], axis=-2))
 
     def _filled(self, value: Any) -> Any:
         return jnp.broadcast_to(jnp.asarray(value, self.like.dtype), self.like.shape)
@@ -190,17 +189,8 @@ class _Elimination:
             s = self._once(s)
             entry = (lambda r, c: self.inverse[c][r]) if transposed else (lambda r, c: self.inverse[r][c])
             return self._once([_total([entry(r, c) * s[c] for c in range(m)], None) for r in range(m)])
-        b = jnp.moveaxis(jnp.stack(s), 0, -1)[..., None]
-        solve = functools.partial(jax.lax.linalg.triangular_solve, self.lu, left_side=True)
-        if transposed:
-            y = solve(b, lower=False, transpose_a=True)
-            y = solve(y, lower=True, transpose_a=True, unit_diagonal=True)
-            place = jnp.argsort(self.order, axis=-1)
-            y = jnp.take_along_axis(y, place[..., None], axis=-2) * self.unit
-        else:
-            y = jnp.take_along_axis(b * self.unit, self.order[..., None], axis=-2)
-            y = solve(solve(y, lower=True, unit_diagonal=True), lower=False)
-        return list(jnp.moveaxis(y[..., 0], -1, 0))
+        solve = dense.transpose_solve if transposed else dense.solve
+        return list(jnp.moveaxis(solve(self.factors, jnp.moveaxis(jnp.stack(s), 0, -1)[..., None])[..., 0], -1, 0))
 
     def solve(self, b: Sequence[Any]) -> list[Any]:
         """A⁻¹ b."""

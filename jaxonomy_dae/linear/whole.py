@@ -20,6 +20,8 @@ from jaxtyping import Array, Float
 
 from ..errors import ModelError
 from ..tolerances import TOLERATED, TOLERATED_NORM, UNDETERMINED
+from . import dense
+from .dense import over
 from .once import once
 from .operator import SparseLinearOperator
 from .sparse import DENSE, ULPS, SparsePattern, available, check_solvable, is_double, solve_sparse
@@ -49,8 +51,8 @@ def solve_whole(
         pattern, inverse = pattern.coalesced
         values = jnp.zeros(len(pattern), values.dtype).at[inverse].add(values)
     n = pattern.n
-    dense = solver is None and (n <= LAPACK or not (is_double() and available()))
-    if dense:
+    by_lapack = solver is None and (n <= LAPACK or not (is_double() and available()))
+    if by_lapack:
         check_solvable(n)
         if n > DENSE:
             raise ModelError(
@@ -63,7 +65,7 @@ def solve_whole(
     if solver is not None:
         solve, most = _by_lineax(pattern, frozen, solver), MORE_REFINEMENTS
     else:
-        solve, most = _lapack(pattern, frozen) if dense else _klu(pattern, frozen), REFINEMENTS
+        solve, most = _lapack(pattern, frozen) if by_lapack else _klu(pattern, frozen), REFINEMENTS
 
     rounding = np.random.default_rng(0).uniform(-1, 1, n)  # signs alone may cancel in sums
 
@@ -84,7 +86,7 @@ def solve_whole(
 
         x = solve(b, transpose)
         missing, size = residual(x)
-        if dense:
+        if by_lapack:
             x = x + solve(missing, transpose)
         else:  # a loop, not a branch: what it closes over must stay out of batches
             begin = x, missing, jnp.any(jnp.abs(missing) > GOOD * eps * size), 0
@@ -96,7 +98,7 @@ def solve_whole(
         holds = jnp.all(jnp.abs(missing) <= eps * allowed + TOLERATED / eps * tiny)
         if solver is None:
             # Of singular equations that agree, any of many solutions: this one changes with the equations' last digits.
-            change = solve((1 if dense else ULPS) * eps * jnp.asarray(rounding, b.dtype) * size, transpose)
+            change = solve((1 if by_lapack else ULPS) * eps * jnp.asarray(rounding, b.dtype) * size, transpose)
             holds = holds & (jnp.max(jnp.abs(change)) <= UNDETERMINED * jnp.max(jnp.abs(x)))
         return jnp.where(holds, x, jnp.nan)
 
@@ -120,30 +122,11 @@ def _scales(pattern: SparsePattern, values: Any) -> tuple[Any, Any]:
     return rows * again, columns
 
 
-def over(size: Any) -> Any:
-    """1 / size to a power of two, from the bits of its exponent; 1 where there is nothing to scale."""
-    kind = jnp.finfo(size.dtype)
-    whole = jnp.int64 if kind.bits == 64 else jnp.int32
-    bias = kind.maxexp - 1
-    exponent = jax.lax.bitcast_convert_type(size, whole) >> kind.nmant
-    power = jax.lax.bitcast_convert_type((2 * bias - 1 - exponent) << kind.nmant, size.dtype)
-    # No power of two is one over what is subnormal, or near the largest number.
-    return jnp.where((exponent > 0) & (exponent < 2 * bias - 1), power, 1.0)
-
-
 def _lapack(pattern: SparsePattern, values: Any) -> Any:
-    lu, _, order = jax.lax.linalg.lu(pattern.dense(values))
+    factors = dense.factor(pattern.dense(values))
 
     def solve(b: Any, transpose: bool) -> Any:
-        def triangular(lower: bool, right: Any) -> Any:
-            return jax.lax.linalg.triangular_solve(
-                lu, right, left_side=True, lower=lower, transpose_a=transpose, unit_diagonal=lower
-            )
-
-        if not transpose:
-            return triangular(False, triangular(True, b[order][:, None]))[:, 0]
-        y = triangular(True, triangular(False, b[:, None]))[:, 0]
-        return jnp.zeros_like(b).at[order].set(y)
+        return (dense.transpose_solve if transpose else dense.solve)(factors, b[:, None])[:, 0]
 
     return solve
 

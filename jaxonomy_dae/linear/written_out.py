@@ -6,7 +6,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 UNROLLED = 6  # unknowns up to which an elimination is written out rather than left to LAPACK
 # By how much a pivot must be larger than the one above it. XLA computes a comparison anew in every fused loop that
@@ -68,9 +67,3 @@ def solve_many(
 def _largest(row: Sequence[Any]) -> Any:
     sizes = [jnp.abs(jax.lax.stop_gradient(entry)) for entry in row]
     return functools.reduce(jnp.maximum, sizes)
-
-
-def solve_dense(matrix: Float[Array, "*batch n n"], right: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
-    """Solves A·x = b by LAPACK, the rows scaled before it compares pivots."""
-    unit = 1 / jnp.max(jnp.abs(jax.lax.stop_gradient(matrix)), axis=-1, keepdims=True)
-    return jnp.linalg.solve(matrix * unit, right[..., None] * unit)[..., 0]

@@ -22,9 +22,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..linear.dense import solve_dense
 from ..linear.torn import solve_torn
 from ..linear.whole import solve_whole
-from ..linear.written_out import UNROLLED, solve, solve_dense
+from ..linear.written_out import UNROLLED, solve
 from ..lowering.gather import FEW, Chunk, Gather, entries, take, times
 from ..lowering.program import (
     AbstractEvaluation,

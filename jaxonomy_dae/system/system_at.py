@@ -13,9 +13,10 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..errors import ModelError
+from ..linear.dense import solve_dense
 from ..linear.sparse import SparsePattern, sparse_jacobian
 from ..linear.whole import solve_whole
-from ..linear.written_out import UNROLLED, solve, solve_dense
+from ..linear.written_out import UNROLLED, solve
 from ..lowering.gather import SCALARS, Gather, entries, take, times
 from ..lowering.plan import ConstraintGroup, PlannedRow, SystemPlan
 from ..lowering.plan_events import EventPlan

@@ -15,7 +15,8 @@ def test_units_of_rows_do_not_choose_pivots(blocks):
     matrix = np.kron(np.eye(blocks), [[1e-10, 1.0], [1.0, 1.0]]) + 1e-3 * np.roll(np.eye(n), 3, axis=1)
     unit = np.tile([1e12, 1.0], blocks)
     expected = np.linspace(1.0, 2.0, n)
-    factor = Dense().factor(jnp.asarray(unit[:, None] * matrix))
-    np.testing.assert_allclose(Dense().apply(factor, None, unit * (matrix @ expected)), expected, rtol=1e-12)
-    transposed = Dense().apply_transposed(factor, (unit[:, None] * matrix).T @ (expected / unit))
+    scaled = unit[:, None] * matrix
+    factor = Dense().factor(jnp.asarray(scaled))
+    np.testing.assert_allclose(Dense().apply(factor, None, jnp.asarray(scaled @ expected)), expected, rtol=1e-12)
+    transposed = Dense().apply_transposed(factor, jnp.asarray(scaled.T @ (expected / unit)))
     np.testing.assert_allclose(transposed * unit, expected, rtol=1e-12)

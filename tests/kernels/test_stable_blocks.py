@@ -16,8 +16,9 @@ from problems import compiled
 from shared_models import attenuator, levers
 
 from jaxonomy_dae import AcausalCompiler, Component, EqnEnv, der
+from jaxonomy_dae.linear.dense import solve_dense
 from jaxonomy_dae.linear.torn import solve_torn
-from jaxonomy_dae.linear.written_out import solve, solve_dense
+from jaxonomy_dae.linear.written_out import solve
 from jaxonomy_dae.structure.tearing import LINKS, BlockSizes, Tearing, tear
 
 # --- the solver of torn blocks ------------------------------------------------------------------------------------
