@@ -2,15 +2,19 @@
 
 The magnitude of a sum is Σ |coefficient|·magnitude, where that of the sum itself may be zero: x + 10⁶ − 10⁶ has the
 magnitude |x| + 2·10⁶, and is known to that times the unit of rounding (Wilkinson 1963). A function of an argument
-without digits, such as sin(10¹³), is as large as its value, not as its argument.
+without digits, such as sin(10¹³), is as large as its value, not as its argument. What cancels in the argument still
+limits the value: f(a) has the magnitude |f(a)| + |f′(a)|·(magnitude of a − |a|), so that atan2(y − 1, x) is zero to the
+digits of y.
 """
 
 from collections.abc import Callable, Hashable
 
-from .functions import apply
+from ..tolerances import EPS
+from .functions import TABLE, apply
 from .node import Node, constant, leaf, linear, multiply, postorder, power, select
 
 LARGER = frozenset({"max", "min", "hypot"})  # are as large as the largest of their arguments, or nearly so
+STEEP = frozenset({"asin", "acos"})  # have an infinite slope where they are finite
 
 
 def magnitude(node: Node, size_label: Callable[[Hashable], Hashable | None]) -> Node:
@@ -21,12 +25,17 @@ def magnitude(node: Node, size_label: Callable[[Hashable], Hashable | None]) -> 
     - `size_label`: the label of the magnitude of a leaf, given that of its value; None where it is |value|.
     """
     found: dict[Node, Node] = {}
+    cancels: dict[Node, bool] = {}  # a sum in it may be smaller than its terms
     for n in postorder([node]):
-        found[n] = _magnitude(n, found, size_label)
+        is_sum = n.operation == "sum" and (len(n.arguments) > 1 or n.data[0] != 0)
+        cancels[n] = is_sum or any(cancels[a] for a in n.arguments)
+        found[n] = _magnitude(n, found, cancels, size_label)
     return found[node]
 
 
-def _magnitude(n: Node, found: dict[Node, Node], size_label: Callable[[Hashable], Hashable | None]) -> Node:
+def _magnitude(
+    n: Node, found: dict[Node, Node], cancels: dict[Node, bool], size_label: Callable[[Hashable], Hashable | None]
+) -> Node:
     operation = n.operation
     if operation == "leaf":
         label = size_label(n.data)
@@ -51,4 +60,12 @@ def _magnitude(n: Node, found: dict[Node, Node], size_label: Callable[[Hashable]
         return linear((1, found[a]) for a in n.arguments)
     if operation in ("true", "false", "less", "less_equal", "equal", "not", "and", "or"):
         return n  # a condition
-    return apply("abs", n)
+    size = apply("abs", n)
+    if operation not in TABLE or operation in STEEP or not any(cancels[a] for a in n.arguments):
+        return size
+    excess = [linear([(1, found[a]), (-1, apply("abs", a))]) for a in n.arguments]
+    if operation == "atan2":  # an angle, whose slopes are below 1/r
+        r = apply("max", apply("hypot", *n.arguments), linear((EPS, found[a]) for a in n.arguments))
+        return linear([(1, size), *((1, multiply(e, power(r, -1))) for e in excess)])
+    slopes = TABLE[operation].partials(*n.arguments)
+    return linear([(1, size), *((1, multiply(apply("abs", s), e)) for s, e in zip(slopes, excess, strict=True))])

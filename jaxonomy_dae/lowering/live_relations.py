@@ -10,17 +10,20 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from ..expressions.node import FALSE, Node, leaf, number, postorder
 from ..expressions.substitute import rebuilt
 from ..model.events import EventTable
 from ..model.quantities import QuantityMap
-from ..model.symbolic import SymbolicTemplate, parameter_label, template_of
+from ..model.symbolic import SymbolicTemplate, parameter_label, slot_label, template_of
 from ..model.tables import ZERO, FlatModel
 from ..model.template import AbstractTemplate
 from ..modeling.event_flags import EventFlag
 from ..modeling.events import LIVE
-from .schedule import AnyStep, Step
+from ..structure.matching import maximum_matching
+from .schedule import AnyStep, Step, StepEquation
 
 
 def without_live_relations(
@@ -84,11 +87,11 @@ def _compared(
 def _needed_as_they_are(step: AnyStep, parameters: np.ndarray, quantities: np.ndarray) -> np.ndarray:
     """The relations that a nonlinear step's equations need as they are."""
     relations = np.unique(parameters)
-    if not any(np.isin(e.parameter, relations).any() for e in step.equations) or _is_affine(step, relations):
+    if not any(np.isin(e.parameter, relations).any() for e in step.equations):
         return np.zeros(0, np.int64)
     pairs = {*zip(parameters.tolist(), quantities.tolist(), strict=True)}
     found: set[int] = set()
-    for equation in step.equations:
+    for equation in _in_nonlinear_blocks(step, relations):
         for column in equation.parameter.T:
             for row in np.flatnonzero(np.isin(column, relations)).tolist():
                 p = int(column[row])
@@ -97,14 +100,51 @@ def _needed_as_they_are(step: AnyStep, parameters: np.ndarray, quantities: np.nd
     return np.array(sorted(found), np.int64)
 
 
-def _is_affine(step: AnyStep, relations: np.ndarray) -> bool:
-    """True if a step's equations are affine in its unknowns once relations are known."""
+def _in_nonlinear_blocks(step: AnyStep, relations: np.ndarray) -> list[StepEquation]:
+    """The equations of a step that stand in nonlinear blocks once relations are known."""
+    known = []
     for equation in step.equations:
         columns = tuple(np.flatnonzero(np.isin(equation.parameter, relations).any(axis=0)).tolist())
-        template = _with_known(equation.template, columns)
-        if not all(template.is_affine_in(np.flatnonzero(place).tolist()) for place in step.places(equation)):
-            return False
-    return True
+        known.append(_with_known(equation.template, columns))
+    both = list(zip(step.equations, known, strict=True))
+    blocks = _blocks(both, len(step.unknown)) if isinstance(step, Step) else None
+    if blocks is None:
+        affine = all(t.is_affine_in(np.flatnonzero(place).tolist()) for e, t in both for place in step.places(e))
+        return [] if affine else list(step.equations)
+    block_of, determined = blocks
+    nonlinear = set()
+    for k, (equation, template) in enumerate(both):
+        inside = [slot for slot, u in enumerate(equation.local) if u in determined[block_of[k]]]
+        if not template.is_affine_in(inside):
+            nonlinear.add(block_of[k])
+    return [equation for k, equation in enumerate(step.equations) if block_of[k] in nonlinear]
+
+
+def _blocks(
+    equations: list[tuple[StepEquation, AbstractTemplate]], count: int
+) -> tuple[list[int], dict[int, set[int]]] | None:
+    """(the number of the block of each equation, the local unknowns that each block determines): the strong components
+    of what the equations read. None if they cannot be matched with their unknowns."""
+    read = []
+    for equation, template in equations:
+        read.append(sorted({u for slot, u in enumerate(equation.local) if u >= 0 and _reads(template, slot)}))
+    pointer = np.cumsum([0, *map(len, read)])
+    matched = maximum_matching(pointer, np.concatenate(read).astype(np.int64), count)
+    if (matched < 0).any():
+        return None
+    owner = {int(u): k for k, u in enumerate(matched)}
+    heads = [owner[u] for reads in read for u in reads]
+    tails = np.repeat(np.arange(len(read)), np.diff(pointer))
+    graph = csr_array((np.ones(len(heads)), (tails, heads)), shape=(len(read), len(read)))
+    block_of = connected_components(graph, directed=True, connection="strong")[1].tolist()
+    determined: dict[int, set[int]] = {}
+    for block, u in zip(block_of, matched.tolist(), strict=True):
+        determined.setdefault(block, set()).add(u)
+    return block_of, determined
+
+
+def _reads(template: AbstractTemplate, slot: int) -> bool:
+    return not isinstance(template, SymbolicTemplate) or slot_label(template.slots[slot]) in template.graph.leaves
 
 
 def _with_known(template: AbstractTemplate, columns: tuple[int, ...]) -> AbstractTemplate:

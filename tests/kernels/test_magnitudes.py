@@ -26,6 +26,10 @@ BY_HAND = [
     (sympy.sqrt(X + 3) - 1, 1 + 1),
     (sympy.Piecewise((X + 5, X < 0), (Y, True)), 2 + 5),
     (sympy.Max(X + 2, -Y), (2 + 2) + 10),
+    (sympy.sin(X + 2), 0 + 1 * (4 - 0)),
+    (sympy.exp(X * (X + 1)), np.exp(2.0) * (1 + 2 * 3 - 2)),
+    (sympy.atan2(X + 2, Y), 0 + (4 - 0 + 10 - 3) / 3),
+    (sympy.atan2(X + 2, X + 2), 0 + 8 / (8 * 2.0**-52)),
 ]
 
 
@@ -57,6 +61,18 @@ def test_far_away_nothing_is_a_root_that_is_none():
     p = float(system.observe("c.p", 0.0, system.initialize()))
     assert abs(p - 1e10) < 7
     assert np.sin(p) == pytest.approx(0.3, abs=4 * np.spacing(1e10))
+
+
+def test_an_angle_of_a_difference_is_zero_to_the_digits_of_its_terms():
+    """What no number q makes zero, atan2(2.311 q − 0.106 p, p), was judged beside itself: no start was found."""
+
+    def write(self, ev):
+        p, q = self.variable("p", start=1.3916, fixed=True), self.variable("q", start=1.0)
+        self.add_equations(Eq(der(p), -p), Eq(der(q), -q))
+        self.initially(Eq(sympy.atan2(2.311 * q - 0.106 * p, p), 0))
+
+    system = compiled(component(write))
+    assert float(system.observe("c.q", 0.0, system.initialize())) == pytest.approx(0.106 * 1.3916 / 2.311, rel=1e-15)
 
 
 def test_far_away_nothing_is_an_equilibrium_that_is_none():

@@ -284,14 +284,28 @@ def test_relations_that_nonlinear_equations_need_as_they_are(name):
     assert float(slope) == pytest.approx(expected, rel=1e-3, abs=1e-4)
 
 
+def valve_behind_a_resistance(self, x, q, r, k):
+    drop = self.variable("drop")
+    return [Eq(x, r * q + drop), Eq(q, Piecewise((k * drop, drop > 0), (k * drop / 10, True)))]
+
+
+def valve_by_a_nonlinear_sensor(self, x, q, r, k):
+    """What the relation compares is a nonlinear function of the block's unknowns, which reads no relation itself."""
+    drop, sensed = self.variable("drop"), self.variable("sensed")
+    valve = Eq(q, Piecewise((k * drop, sensed > 0), (k * drop / 10, True)))
+    return [Eq(x, r * q + drop), valve, Eq(sensed, smooth(Piecewise((drop**3, drop > -1), (drop, True))))]
+
+
+def test_a_block_that_falls_apart_once_relations_are_known_keeps_their_events():
+    """Beside a nonlinear equation of the same block, relations of its linear part were no events."""
+    system = compiled(Flow(EqnEnv(), "c", valve_by_a_nonlinear_sensor))
+    assert len(system.plan.events) == 2 and not system.report.notes
+
+
 @pytest.mark.slow
-def test_relations_between_linear_branches_are_events_in_blocks_too():
+@pytest.mark.parametrize("law", [valve_behind_a_resistance, valve_by_a_nonlinear_sensor])
+def test_relations_between_linear_branches_are_events_in_blocks_too(law):
     """A valve that lets ten times as much through in one direction, behind a resistance."""
-
-    def law(self, x, q, r, k):
-        drop = self.variable("drop")
-        return [Eq(x, r * q + drop), Eq(q, Piecewise((k * drop, drop > 0), (k * drop / 10, True)))]
-
     system = compiled(Flow(EqnEnv(), "c", law))
     assert len(system.plan.events) == 2 and not system.report.notes
 
