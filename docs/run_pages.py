@@ -26,6 +26,7 @@ WIDTH = 5.8  # inches, so that letters stay legible on a screen of 400 px
 STYLE = {
     "text.color": INK, "axes.edgecolor": INK, "axes.labelcolor": INK, "xtick.color": INK, "ytick.color": INK,
     "axes.spines.top": False, "axes.spines.right": False, "font.size": 10.5, "svg.hashsalt": "pages",
+    "legend.frameon": False,
 }  # fmt: skip
 
 

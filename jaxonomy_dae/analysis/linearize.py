@@ -42,30 +42,30 @@ def linearize(
     - `inputs`: the names of inputs; or a dictionary with their values at the point, where they have no default. An
         array's name stands for those of all entries, here and in `outputs` and `states`.
     - `outputs`: the names of variables; `"der(...)"` of what the model differentiates is one too.
-    - `at`: the point, from `steady_state`. If left out, the equilibrium that a search from the initial point finds;
-        states on which nothing depends, such as the angle of a free shaft, stay where they are.
+    - `at`: the point, from `steady_state`. By default, the equilibrium that a search from the initial point finds. States
+        on which nothing depends keep their values, such as the angle of a free shaft.
     - `t`: the time, if `at` is left out.
-    - `states`: which states are coordinates, where hidden constraints make some redundant.
+    - `states`: the states to use as coordinates if hidden constraints make some states redundant.
     - `sampled`: whether to describe a model with sampled controllers by its change from tick to tick. The states of the
         result are those of the model and the discrete variables that clocks write, as they are just before a tick;
-        inputs stay constant for a period, and outputs are those just after the tick. Of clocks with several periods it
-        is the period after which all repeat.
+        inputs stay constant for a period, and outputs are those just after the tick. If clocks have different periods,
+        the model describes their common period.
 
     **Returns:**
 
     A `StateSpace`, whose states are the system's differential states. Where hidden constraints make states redundant,
-    it is reduced to the tangent of the constraints: the coordinates are named states (of a pendulum that hangs,
-    `pend.x` and `pend.vx`), as many as there are degrees of freedom; the others follow from them. It is differentiable
-    with respect to parameters and networks, the movement of the operating point included. Inside `jit`, `grad` and
-    `vmap`, redundant states need `states`, since the choice depends on values.
+    it is reduced to the tangent of the constraints: the coordinates are as many named states as there are degrees of
+    freedom, for a hanging pendulum `pend.x` and `pend.vx`. It is differentiable with respect to parameters and
+    networks, including the motion of the operating point. Inside `jit`, `grad` and `vmap`, redundant states need
+    `states`, since the choice depends on values.
 
     **Raises:**
 
     - `ModelError` for unknown names, an input without a value, an input that the model differentiates (its response has
         no state space), and `states` that are not coordinates.
-    - `ModelError` for a model that depends on what clocks write, without `sampled`; with it, if the model has no clock,
-        or clocks without a common period; for a point at which an event is just about to happen that changes the model.
-        Inside jit, what depends on values is not-a-number.
+    - `ModelError` for a model that depends on variables written by clocks, without `sampled`; with `sampled`, if the
+        model has no clock or no common period; and at a point where an event is about to change the model. Inside jit,
+        not-a-number stands for errors that depend on values.
     - `SteadyStateError` if `at` is left out and there is no equilibrium; inside jit, grad and vmap the state space is
         then not-a-number.
     """

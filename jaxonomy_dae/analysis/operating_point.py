@@ -22,12 +22,12 @@ class OperatingPoint(eqx.Module):
     """A consistent point of a system: `point["pend.x"]` is a scalar, `point[["pend.x", "pend.y"]]` has shape `(2,)`.
 
     - `x`: the state array, shape `(len(system.states) + len(system.carried),)`.
-    - `system`, `t`, `inputs`: whose point it is, with its discrete variables as they are there; the time, and the
-        inputs as they were read.
-    - `residual`: the largest of all that should be zero there, each in units of what rounding may leave of it: at most
-        1 where the point is what it claims to be.
+    - `system`, `t`, `inputs`: the system with its discrete variables at this point, the time, and the inputs as
+        `simulate` would read them.
+    - `residual`: the largest residual of the equations, in units of its own rounding error. It is at most 1 at a valid
+        point.
 
-    A point that `equinox.filter_vmap` returns is a batch: shapes get its axis in front.
+    If `equinox.filter_vmap` returns the point, it is a batch: all shapes have a leading batch axis.
     """
 
     x: Float[Array, " n"]
@@ -69,7 +69,7 @@ class OperatingPoint(eqx.Module):
 
     @property
     def start(self) -> dict[str, Any]:
-        """The states by name: `simulate(point.system, t1, initial=point.start)` goes on from here."""
+        """The states by name: `simulate(point.system, t1, initial=point.start)` continues from here."""
         return {name: self.x[..., k] for k, name in enumerate(self.system.states)}
 
     def to_dict(self) -> dict[str, Any]:

@@ -22,13 +22,13 @@ class StateSpace(eqx.Module):
     """d(x − x0)/dt = dx0 + A·(x − x0) + B·(u − u0), y − y0 = C·(x − x0) + D·(u − u0).
 
     - `A`, `B`, `C`, `D`: shapes `(n, n)`, `(n, m)`, `(p, n)`, `(p, m)`.
-    - `states`, `inputs`, `outputs`: names of what x, u and y hold, in this order.
+    - `states`, `inputs`, `outputs`: the names of the entries of x, u and y.
     - `x0`, `u0`, `y0`: the point of linearization; `dx0`, the derivatives there, vanishes at an equilibrium.
 
-    Units are those of the variables, and per second in A and B.
+    A and B have the units of the variables per second; C and D have the units of the variables.
 
-    With a period `dt` (second) it is a discrete-time model: the left side is then the change of x from one tick to the
-    next, x(k + 1) − x0 = dx0 + A·(x(k) − x0) + B·(u(k) − u0), with inputs that are constant in between.
+    With a period `dt` (second), the model is a discrete-time one. The left side is then the change of x from one tick
+    to the next, x(k + 1) − x0 = dx0 + A·(x(k) − x0) + B·(u(k) − u0), with inputs that are constant in between.
     """
 
     A: Float[Array, "n n"]
@@ -45,8 +45,8 @@ class StateSpace(eqx.Module):
     dt: Float[Array, ""] | None = None
 
     def poles(self) -> Complex[Array, " n"]:
-        """The eigenvalues of A (1/s; of a discrete-time model, factors from tick to tick), those that decay slowest
-        first; differentiable where they are distinct."""
+        """The eigenvalues of A, the slowest decay first: in 1/s, or for a discrete-time model as factors from tick to
+        tick. They are differentiable where they are distinct."""
         if not self.states:
             return jnp.zeros((0,), _complex(self.A))
         found = jnp.linalg.eigvals(self.A)
@@ -54,8 +54,8 @@ class StateSpace(eqx.Module):
         return found[jnp.lexsort((found.imag, -found.real, -slowness))]
 
     def frequency_response(self, omega: Any) -> FrequencyResponse:
-        """The response to sinusoids, C·(jω − A)⁻¹·B + D; of a discrete-time model, with exp(jω·dt) in the place of jω,
-        from samples of inputs to samples of outputs.
+        """The response to sinusoids, C·(jω − A)⁻¹·B + D. A discrete-time model has exp(jω·dt) in place of jω, and
+        responds from samples of inputs to samples of outputs.
 
         **Arguments:**
 

@@ -47,26 +47,25 @@ def steady_state(
     """The equilibrium of a system: the point at which the derivatives of all states vanish and every equation holds,
     hidden constraints included.
 
-    Starts declared as fixed do not bind it. The algebra is dense: meant for up to some thousand states.
+    Fixed starts are not conditions here. The linear algebra is dense and meant for up to a few thousand states.
 
-    Of a model with events it is the point at which none has anything left to change: relations are as their sides say,
-    of each `complementary` pair the side that is zero fits the point, what a sampled controller writes is what it has
-    written before, and where the condition of an event holds, the event has happened. There is none where events follow
-    each other without end, as a thermostat's, where an event ends the run, and where each tick of a clock changes
-    something, as a counter.
+    In a model with events, no event changes anything at this point. Relations match their sides, each `complementary`
+    pair has the right side at zero, sampled controllers repeat their last output, and every event whose condition holds
+    has happened. There is no equilibrium if events follow each other without end (a thermostat), if an event ends the
+    run, or if each tick changes something (a counter).
 
     **Arguments:**
 
     - `system`: a compiled system.
-    - `t`: the time, a scalar; equations and inputs that depend on time are frozen at it.
+    - `t`: the time, a scalar; equations and inputs are evaluated at this time.
     - `inputs`: as in `simulate`.
-    - `initial`: where the search starts, values by variables' names; otherwise at the initial point. Where there are
-        several equilibria, it chooses.
-    - `drifting`: states whose derivatives need not vanish, such as the angle of a shaft that turns at a steady speed,
-        and discrete variables that need not settle, such as a counter: they keep their values at the start.
-    - `throw`: whether to raise if there is no such point; otherwise its values are not-a-number, and so are their
-        derivatives. None: outside jit, grad and vmap. Inside, True puts callbacks to the host into the program, which
-        JAX's persistent compilation cache then does not keep.
+    - `initial`: where the search starts, values by variables' names; default: the initial point. It decides which of
+        several equilibria is found.
+    - `drifting`: states whose derivatives need not vanish, such as the angle of a shaft at steady speed, and discrete
+        variables that need not settle, such as a counter. They keep their start values.
+    - `throw`: whether to raise an error if there is no such point. With False, its values and their derivatives are
+        not-a-number. None: raise outside jit, grad and vmap only. Inside jit, True needs callbacks to the host, and
+        JAX's persistent cache does not keep such programs.
 
     **Returns:**
 
@@ -77,9 +76,9 @@ def steady_state(
     **Raises:**
 
     - `ModelError` for an unknown name, and a name in `drifting` that is neither a state nor a discrete variable.
-    - `SteadyStateError` if no equilibrium was found, with the derivatives that do not vanish, or with the event that
-        does not let the system rest; and if it is singular, with the states that nothing determines. Inside jit, these
-        are Equinox run-time errors.
+    - `SteadyStateError` if no equilibrium was found; the text names the derivatives that do not vanish, or the event
+        that keeps the system from rest. Also if the equilibrium is singular; the text names the undetermined states.
+        Inside jit, these are Equinox run-time errors.
     - `InitializationError` if there is no consistent initial point to start from.
     """
     check_system(system)

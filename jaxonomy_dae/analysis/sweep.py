@@ -23,7 +23,7 @@ from .steady_state import check_system
 
 
 class Sweep(eqx.Module):
-    """Results with the parameter values they belong to.
+    """The results of a sweep and their parameter values.
 
     - `axes`: the values of each parameter by name: shape `(k,)`, or `(k, *shape)` of an array. In a grid, each
         parameter is an axis of the results, in this order; zipped, all share the first axis.
@@ -97,8 +97,8 @@ def sweep(
     **Arguments:**
 
     - `system`: a compiled system.
-    - `parameters`: values by parameters' names, each of shape `(k,)`. For the name of an array of parameters, each
-        value is for all of its entries; values of shape `(k, *shape)` are for one each.
+    - `parameters`: values by parameters' names, each of shape `(k,)`. If a name stands for an array of parameters, each
+        value sets all of its entries; values of shape `(k, *shape)` set them one by one.
     - `function`: from the system with its new values to an array or a pytree of arrays, such as
         `lambda s: steady_state(s)["load.v"]`; it is traced. If left out, the system is simulated.
     - `zipped`: by default all combinations are computed, a grid with one axis for each parameter, in the order of
@@ -107,14 +107,14 @@ def sweep(
 
     **Returns:**
 
-    A `Sweep`. It is differentiable. The same function called again with other values is not compiled anew.
+    A `Sweep`. It is differentiable. Calling the same function again with other values does not compile anything.
 
     **Raises:**
 
     - `ModelError` for an unknown parameter, a value out of its bounds, and shapes that do not fit.
-    - What the function raises for the first values that give not-a-number, when called with them outside of programs:
-        `SimulationError`, `SteadyStateError` or `InitializationError`. With `throw=False` in it, and where the sweep is
-        itself inside jit, grad or vmap, it is not-a-number without an error.
+    - `SimulationError`, `SteadyStateError` or `InitializationError`: if results are not-a-number, the function is
+        called again with the first such values, outside of compiled programs, and its error is raised. With
+        `throw=False` in the function, or with the sweep inside jit, grad or vmap, the result is not-a-number instead.
     """
     check_system(system)
     columns = {name: _values(system, name, given) for name, given in _named(parameters).items()}

@@ -6,8 +6,8 @@ from .page import PAGE, entry_for
 
 
 class JaxonomyDaeError(Exception):
-    """The base class of all errors that this package raises. Python shows below the message where the page of errors
-    explains it, if it does; `explanation` is what the page says."""
+    """The base class of all errors that this package raises. Below the message, Python shows where the page of errors
+    explains it. `explanation` holds the text of that entry."""
 
     def __init__(self, *args: Any):
         super().__init__(*args)
@@ -17,13 +17,13 @@ class JaxonomyDaeError(Exception):
 
     @property
     def explanation(self) -> str:
-        """What the page of errors says of this error; "" if it is not there."""
+        """The text of this error's entry on the page of errors; "" if it has none."""
         entry = entry_for(str(self))
         return "" if entry is None else f"{entry.meaning} Fix: {entry.fix}"
 
 
 class ModelError(JaxonomyDaeError, ValueError):
-    """The model as written is not well formed: a name, a port, a value, a shape."""
+    """The model is not well formed: a name, a port, a value or a shape is wrong."""
 
 
 class StructuralError(ModelError):
@@ -50,7 +50,7 @@ class InitializationError(JaxonomyDaeError, RuntimeError):
 
 
 class SteadyStateError(JaxonomyDaeError, RuntimeError):
-    """No equilibrium was found, or one that does not determine all states."""
+    """No equilibrium was found, or the equilibrium leaves some states undetermined."""
 
 
 class SimulationError(JaxonomyDaeError, RuntimeError):

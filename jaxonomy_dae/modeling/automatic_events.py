@@ -25,18 +25,18 @@ KINKED = (sympy.Max, sympy.Min, sympy.Abs, sympy.sign, sympy.Heaviside, *ROUNDIN
 
 
 def smooth(expression: Any) -> Any:
-    """Marks an expression so that its relations do not become events: for kinks that matter less than the steps they
-    cost, and for branches that agree where they meet, as a series near a point and a formula elsewhere.
+    """Marks an expression so that its relations do not become events. Use it for kinks whose effect does not justify
+    the extra steps, and for branches that agree where they meet, such as a series near a point and a formula elsewhere.
 
     ```python
     self.add_equations(Eq(q, smooth(Max(u, 0)) * k))
     ```
 
-    The solver then takes small steps across kinks, and derivatives do not see that a jump moves in time.
+    The solver then takes small steps across kinks, and derivatives ignore the shift of a jump in time.
 
     **Raises:**
 
-    - `ModelError` for what is not an expression.
+    - `ModelError` if the argument is not an expression.
     """
     found = sympy.sympify(expression)
     if isinstance(expression, str) or not isinstance(found, sympy.Expr):

@@ -42,7 +42,7 @@ class Component(ModeDeclarations, metaclass=Construction):
     **Arguments:**
 
     - `ev`: the model's `EqnEnv`.
-    - `name`: the component's name, without dots; the model's names are `"name.variable"`.
+    - `name`: the component's name, without dots. The model's variables are then called `"name.variable"`.
 
     A variable of a child component is written as an attribute of the child, `self.r1.v`, or as `self.r1["v"]`.
     """
@@ -79,14 +79,15 @@ class Component(ModeDeclarations, metaclass=Construction):
         return self.name if self.parent is None else f"{self.parent.path}.{self.name}"
 
     def outside_path(self) -> str:
-        """The path of this component as seen from the nearest ancestor that is still being written."""
+        """The path of this component relative to the nearest ancestor whose declaration is not finished."""
         if not self._sealed:
             return ""
         above = "" if self.parent is None else self.parent.outside_path()
         return f"{above}{self.name}."
 
     def symbol(self, name: str) -> sympy.Symbol:
-        """The symbol of a declared variable or parameter, as the component now being written sees it."""
+        """The symbol of a declared variable or parameter, for use in the component whose declaration is not
+        finished."""
         if name in self.variables:
             return VariableSymbol(self.outside_path() + name)
         if name in self.parameters:
@@ -171,15 +172,17 @@ class Component(ModeDeclarations, metaclass=Construction):
 
         - `name`: its local name.
         - `value`: a finite number (a Python or NumPy scalar); or an expression in other parameters, of this component
-            or given by its parent, such as `Resistor(ev, "a", R=R / 2)`: the parameter then depends on those, and
-            follows them when they are set or trained.
+            or given by its parent, such as `Resistor(ev, "a", R=R / 2)`: the parameter then follows those parameters
+            when they are set or trained.
         - `unit`: shown in reports and plots, and compared by `AcausalCompiler(check_units=True)`.
         - `bounds`: the admissible values: a pair (low, high) of a closed interval, or an `Interval`, whose ends may be
-            open. Whatever sets the parameter keeps them: declaration, `with_parameters`, `fit`, `initialize`.
+            open. They hold wherever the parameter is set: in the declaration, `with_parameters`, `fit` and
+            `initialize`.
 
         **Raises:**
 
-        - `ModelError` if the value is not a finite number inside the bounds; for an expression, when compiled.
+        - `ModelError` if the value is not a finite number inside the bounds. The values of expressions are checked at
+            compilation.
         """
         return ParameterSymbol(self._declare_parameter(name, "parameter", value, unit, bounds))
 
@@ -251,18 +254,19 @@ class Component(ModeDeclarations, metaclass=Construction):
 
         - `name`: its local name.
         - `start`: a number or an expression in parameters: its value at the initial time.
-        - `fixed`: whether `start` must hold; otherwise it guides the search for a consistent initial point.
-        - `nominal`: a positive number, its typical size in its unit; scales tolerances and projections, and says what
-            counts as zero. If left out, it is 1 for tolerances; elsewhere sizes are taken from values and equations.
+        - `fixed`: whether `start` must hold. If not, it is only a guess for the search for a consistent initial point.
+        - `nominal`: a positive number, the typical size in the variable's unit. It scales tolerances and projections,
+            and decides what counts as zero. By default it is 1 for tolerances; elsewhere sizes follow from values and
+            equations.
         - `unit`: shown in reports and plots, and compared by `AcausalCompiler(check_units=True)`.
-        - `bounds`: an interval that the search for a consistent initial point does not leave, such as `(0.0, math.inf)`
-            for what stands in a logarithm or root. It acts on states and on unknowns of nonlinear blocks. A start on a
-            bound is moved inside.
+        - `bounds`: an interval that the search for a consistent initial point does not leave, for example `(0.0,
+            math.inf)` for the argument of a logarithm or a root. It applies to states and to unknowns of nonlinear
+            blocks. A start on a bound is moved inside.
 
         **Raises:**
 
-        - `ModelError` for a start that is not a finite number or an expression in parameters, or that is out of its
-            bounds; for a nominal value that is not positive.
+        - `ModelError` for a start that is not a finite number or an expression in parameters, for a start out of its
+            bounds, and for a nominal value that is not positive.
         """
         self._claim(name, "variable")
         return self._declare(name, "variable", start, fixed, nominal, unit, bounds=bounds)
@@ -284,7 +288,7 @@ class Component(ModeDeclarations, metaclass=Construction):
         - `name`: of the vector; in the solution, `solution["component.name[0]"]`.
         - `count`: how many entries.
         - `start`: a sequence with a start for each (None where there is none), or one for all.
-        - `fixed`, `nominal`, `unit`, `bounds`: of all entries, as in `variable`; what has no start is not fixed.
+        - `fixed`, `nominal`, `unit`, `bounds`: of all entries, as in `variable`. An entry without a start is not fixed.
         """
         self._claim(name, "variable")
         if not isinstance(count, int) or count < 1:
@@ -299,19 +303,19 @@ class Component(ModeDeclarations, metaclass=Construction):
         )
 
     def start(self, derivative: Any, value: Any, fixed: bool = False) -> None:
-        """Says what a derivative is at the initial time: `self.start(der(x), 2.0)`.
+        """Prescribes a derivative at the initial time: `self.start(der(x), 2.0)`.
 
         **Arguments:**
 
         - `derivative`: `der(x)`, `der(der(x))`, … of a variable of this component or of a child.
         - `value`: a number or an expression in parameters.
-        - `fixed`: whether it must hold. Otherwise it is a guess for the search for a consistent initial point, which
-            counts where the equations have several solutions for the derivative, and where it is free.
+        - `fixed`: whether it must hold. If not, it is a guess for the search for a consistent initial point. A guess
+            matters if the equations have several solutions for the derivative, or leave it free.
 
         **Raises:**
 
-        - `ModelError` if it is not the derivative of a variable, for a second start of the same derivative, and for a
-            value as in `variable`.
+        - `ModelError` if the first argument is not the derivative of a variable, if this derivative already has a
+            start, and for wrong values as in `variable`.
         """
         if not isinstance(derivative, VariableSymbol) or not derivative.order:
             mend = (
@@ -330,7 +334,7 @@ class Component(ModeDeclarations, metaclass=Construction):
     def initially(self, *equations: Any) -> None:
         """Adds equations that hold at the initial time: `self.initially(Eq(der(T), 0))` starts at rest.
 
-        Each takes the place of one fixed start. Starts that are not fixed give way.
+        Each equation replaces one fixed start. Starts that are not fixed give way.
 
         **Arguments:**
 
@@ -353,7 +357,7 @@ class Component(ModeDeclarations, metaclass=Construction):
     def input(self, name: str, default: float | None = None, unit: str = "") -> VariableSymbol:
         """Declares an input: a function of time given to `simulate(inputs={"component.name": ...})`.
 
-        With a `default` it may be left out, and is then that constant.
+        If it has a `default`, it may be left out and is then constant.
         """
         self._claim(name, "input")
         if default is not None:
@@ -395,17 +399,19 @@ class Component(ModeDeclarations, metaclass=Construction):
         - `network`: a callable pytree, `network(u) -> (outputs,)`, such as an `equinox.nn.MLP`.
         - `inputs`: symbols of variables (or `ev.t`); `u` has shape `(len(inputs),)`, in this order.
         - `outputs`: the number of outputs. If left out, it is found by tracing the network.
-        - `kind`: the class that the network must be of, or several, for a component whose physics relies on it:
-            `kind=jaxonomy_dae.learning.AbstractPassive` admits only laws that bring no energy in.
+        - `kind`: the class, or classes, of which the network must be an instance. Use it if the physics of the
+            component relies on a property: `kind=jaxonomy_dae.learning.AbstractPassive` admits only laws that bring no
+            energy in.
 
         **Returns:**
 
-        A tuple of symbols. They may stand in any equation, algebraic ones included; where index reduction
-        differentiates them, the network is differentiated with `jax.jvp`.
+        A tuple of symbols. They can be used in any equation, also in algebraic ones. Index reduction differentiates the
+        network with `jax.jvp`.
 
         **Raises:**
 
-        - `ModelError` if the network does not take `(len(inputs),)`, does not return a vector, or is of another kind.
+        - `ModelError` if the network does not accept shape `(len(inputs),)`, does not return a vector, or is not of the
+            kind.
         """
         if kind is not None:
             check_kind(network, kind, f"learned term '{self.path}.{name}'")
@@ -419,17 +425,16 @@ class Component(ModeDeclarations, metaclass=Construction):
         **Arguments:**
 
         - `name`: its outputs are the variables `component.name` (one output) or `component.name[0]`, …
-        - `function`: `function(x, y, …)`, a scalar for each input, that returns a scalar or a vector `(outputs,)`: any
-            function that JAX can trace and differentiate, such as an interpolation table. If it is a pytree (an
-            `equinox.Module`, or a method of one), the arrays in it are leaves of the system, and
+        - `function`: `function(x, y, …)` takes a scalar for each input and returns a scalar or a vector `(outputs,)`.
+            Any function works that JAX can trace and differentiate, such as an interpolation table. If it is a pytree
+            (an `equinox.Module`, or a method of one), the arrays in it are leaves of the system, and
             `system.partition("component.name")` makes them trainable.
         - `inputs`: symbols of variables (or `ev.t`), in this order.
         - `outputs`: the number of outputs. If left out, it is found by tracing the function.
 
         **Returns:**
 
-        A tuple of symbols, for use in any equation; where index reduction differentiates them, the function is
-        differentiated with `jax.jvp`.
+        A tuple of symbols for use in any equation. Index reduction differentiates the function with `jax.jvp`.
 
         **Raises:**
 
@@ -466,7 +471,7 @@ class Component(ModeDeclarations, metaclass=Construction):
 
         **Raises:**
 
-        - `ModelError` if an equation is trivially true or false, or has a symbol the component does not know.
+        - `ModelError` if an equation is trivially true or false, or contains a symbol that the component does not know.
         """
         self._check_open("add its equations")
         line = line_of_caller()
@@ -486,30 +491,31 @@ class Component(ModeDeclarations, metaclass=Construction):
     # --- energy ------------------------------------------------------------------------------------------------
 
     def declare_energy(self, *expressions: Any) -> None:
-        """Says what energy the component stores (joule): `self.declare_energy(m * v**2 / 2)`.
+        """Declares the energy that the component stores (joule): `self.declare_energy(m * v**2 / 2)`.
 
-        The declarations of energy, dissipation and supply are read by `solution.energy()` and checked against each
-        other by `jaxonomy_dae.testing.assert_energy_balance`. They are no equations: simulations do not compute them.
+        `solution.energy()` reads the declarations of energy, dissipation and supply, and
+        `jaxonomy_dae.testing.assert_energy_balance` compares them. They are not equations, and simulations do not
+        compute them.
 
         **Arguments:**
 
-        - `expressions`: in variables, their derivatives and parameters of this component or of its children; or names
-            of its variables. Several are added up.
+        - `expressions`: expressions in variables, their derivatives and parameters of this component or of its
+            children, or names of its variables. Several are added up.
 
         **Raises:**
 
-        - `ModelError` for what is not an expression or a name; for unknown symbols, when compiled.
+        - `ModelError` for an argument that is not an expression or a name; for unknown symbols, at compilation.
         """
         self._declare_accounts("energy", expressions)
 
     def declare_dissipation(self, *expressions: Any) -> None:
-        """Says what power is lost in the component, to where the model does not follow it (watt): `d * v**2`. A heat
-        that leaves at a thermal port is not lost. Otherwise as `declare_energy`."""
+        """Declares the power that the component loses to outside the model (watt): `d * v**2`. Heat that leaves through
+        a thermal port is not lost. Otherwise as `declare_energy`."""
         self._declare_accounts("dissipation", expressions)
 
     def declare_supply(self, *expressions: Any) -> None:
-        """Says what power the component brings into the model from outside (watt), negative where it takes power out.
-        Otherwise as `declare_energy`."""
+        """Declares the power that the component brings into the model from outside (watt). It is negative if the
+        component takes power out. Otherwise as `declare_energy`."""
         self._declare_accounts("supply", expressions)
 
     def _declare_accounts(self, kind: str, expressions: tuple[Any, ...]):
@@ -545,21 +551,22 @@ class Component(ModeDeclarations, metaclass=Construction):
     def add_array(
         self, name: str, kind: "type[Component]", shape: int | tuple[int, ...], /, *args: Any, **kwargs: Any
     ) -> ComponentArray:
-        """Adds an array of equal components; returns it. Its names are `"self.name[17].variable"`.
+        """Adds an array of equal components and returns it. Its variables are called `"self.name[17].variable"`.
 
         **Arguments:**
 
         - `name`: of the array.
         - `kind`: the class of its components.
         - `shape`: how many, or a tuple for an array of several dimensions.
-        - `args`, `kwargs`: for `kind(ev, name, *args, **kwargs)`. NumPy arrays of the array's shape, alone or in a
-            list, hold a value for each component; all else is the same for all.
+        - `args`, `kwargs`: for `kind(ev, name, *args, **kwargs)`. A NumPy array of the array's shape, alone or in a
+            list, has one value for each component. All other arguments are the same for all components.
 
-        A learned term or function of `kind` is one for all components of the array, `system.neural["self.name.term"]`.
+        All components of the array share one learned term or function of `kind`, `system.neural["self.name.term"]`.
 
         **Raises:**
 
-        - `ModelError` for a shape that is not positive, arrays of another shape, and values that the component refuses.
+        - `ModelError` for a shape that is not positive, for arrays of another shape, and for values that the component
+            refuses.
         """
         self._claim(name, "child component")
         array = make_array(self.ev, name, kind, shape, args, kwargs)

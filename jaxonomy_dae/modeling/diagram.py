@@ -22,8 +22,8 @@ class AcausalDiagram:
     diagram.connect(resistor, "n", ground, "p")
     ```
 
-    A component whose port is connected is added by itself; `add` is needed for the others, those joined by signals
-    alone among them.
+    Connecting a port adds its component to the diagram. Use `add` for all other components, such as those that are
+    connected by signals only.
     """
 
     def __init__(self, name: str | None = None):
@@ -40,7 +40,7 @@ class AcausalDiagram:
 
         **Raises:**
 
-        - `ModelError` if a name is used twice, or a component belongs to another one already.
+        - `ModelError` if a name is used twice, or a component already belongs to another one.
         """
         for component in components:
             if isinstance(component, ComponentArray) and self.components.get(component.name) is component:
@@ -75,7 +75,7 @@ class AcausalDiagram:
 
         **Raises:**
 
-        - `ModelError` as that method, and if the name is used already.
+        - `ModelError` as `Component.add_array`, and if the name is already used.
         """
         check_name(name, "component")
         if name in self.components or name in self.blocks:
@@ -109,7 +109,7 @@ class AcausalDiagram:
         return self
 
     def add_neural_correction_block(self, block: NeuralDAEBlock) -> "AcausalDiagram":
-        """Adds a learned correction; several may be added, also on the same target, and their effects sum.
+        """Adds a learned correction. Several corrections of one target add up.
 
         **Raises:**
 

@@ -9,10 +9,10 @@ class EqnEnv:
 
     **Arguments:**
 
-    - `constants`: named numbers every component of the model can read, such as `gravity=9.81`, as
-        `ev.constants["gravity"]`. They are plain numbers. A value to be trained or varied should be a parameter.
+    - `constants`: named numbers that every component can read, such as `gravity=9.81`, as `ev.constants["gravity"]`.
+        They are plain numbers. Use a parameter for a value that is trained or varied.
 
-    `ev.t` is the symbol of time; it may stand in any equation.
+    `ev.t` is the symbol of time, for use in any equation.
 
     **Raises:**
 

@@ -81,11 +81,11 @@ class HeldBranch:
 
 
 def pre(symbol: Any) -> sympy.Expr:
-    """The value of a variable before the event that is being handled; for use in `reinit` and `assign`.
+    """The value of a variable before the present event, for use in `reinit` and `assign`.
 
     **Raises:**
 
-    - `ModelError` for what is neither a variable nor a discrete variable.
+    - `ModelError` if the argument is neither a variable nor a discrete variable.
     """
     if isinstance(symbol, DiscreteSymbol):
         return PreviousSymbol(symbol.path)
@@ -95,7 +95,7 @@ def pre(symbol: Any) -> sympy.Expr:
 
 
 def reinit(variable: Any, value: Any) -> Reinit:
-    """In `when`: lets a state start anew. In `value`, variables have their values before the event.
+    """In `when`: sets a state to a new value. In `value`, variables have their values before the event.
 
     **Raises:**
 
@@ -110,7 +110,7 @@ def reinit(variable: Any, value: Any) -> Reinit:
 
 
 def assign(variable: Any, value: Any) -> Assign:
-    """In `when`: gives a discrete variable a value, which it keeps until the next event that assigns it.
+    """In `when`: assigns a value to a discrete variable, which keeps it until the next event assigns another one.
 
     **Raises:**
 
@@ -123,7 +123,7 @@ def assign(variable: Any, value: Any) -> Assign:
 
 
 def terminate(message: str) -> Terminate:
-    """In `when`: ends the run. `solution.events.terminated` then has the message."""
+    """In `when`: ends the run. `solution.events.terminated` then holds the message."""
     if not isinstance(message, str) or not message:
         raise ModelError(f"terminate takes a text that says why the run ends; got {message!r}")
     return Terminate(message)

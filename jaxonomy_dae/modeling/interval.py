@@ -13,10 +13,10 @@ from ..errors import ModelError
 
 @dataclasses.dataclass(frozen=True)
 class Interval:
-    """The values from `low` to `high`; an end that is `open` is not admissible itself, an infinite end never is.
+    """The values from `low` to `high`. An open end is not admissible itself, and an infinite end never is.
 
     `Interval(0.0, math.inf, open_low=True)` holds the positive numbers. Training approaches an open end without
-    reaching it, and may stay on a closed one.
+    reaching it, and can reach a closed end.
     """
 
     low: float = -math.inf

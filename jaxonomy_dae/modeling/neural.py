@@ -18,20 +18,20 @@ class NeuralDAEBlock:
         `network(t, u, theta) -> (n_targets,)`.
     - `theta`: the weights of a plain function, any pytree of arrays (a flat vector, usually).
     - `targets`: pairs `(component, "variable")` or full names `"component.variable"`, one for each output.
-    - `inputs`: what `u` gathers, in this order; pairs, names, or `"time"`. Default: the targets.
+    - `inputs`: the entries of `u`, in this order: pairs, names, or `"time"`. Default: the targets.
     - `name`: `system.neural[name]` holds the module, or `theta`.
     - `inject`: `"equation"` makes the target's derivative *physics + correction* inside the model's equations, so that
         hidden constraints and multipliers respond. `"row"` adds the correction to the finished right-hand side of the
-        target's row instead, and the constraints never see it; the target must then be a state, and the
-        system compiled with `state_selection="dummy_derivatives"`.
-    - `kind`: the class that `network` must be of, such as `learning.AbstractPassive`, or a tuple of them, as in
-        `Component.learned`: for functions that build a model around a network they are given. What a kind promises, it
-        promises of the network's own inputs and outputs.
+        target's row instead, and the constraints do not see it. The target must then be a state, and the system must be
+        compiled with `state_selection="dummy_derivatives"`.
+    - `kind`: the class of which `network` must be an instance, such as `learning.AbstractPassive`, or a tuple of
+        classes, as in `Component.learned`. It serves functions that build a model around a given network. A kind
+        promises something about the network's own inputs and outputs.
 
     **Raises:**
 
-    - `ModelError` if targets or inputs are malformed, the network is not of the kind, or its output does not have one
-        entry for each target.
+    - `ModelError` if targets or inputs are malformed, if the network is not of the kind, or if its output does not have
+        one entry for each target.
     """
 
     def __init__(

@@ -12,7 +12,7 @@ from ..errors import UnknownAttribute
 
 @dataclasses.dataclass(frozen=True)
 class Domain:
-    """A physical domain: the quantities that ports of it have.
+    """A physical domain: the quantities of its ports.
 
     ```python
     Magnetic = Domain("Magnetic", across=(("V_m", "A"),), through=(("Phi", "Wb"),))
@@ -21,8 +21,8 @@ class Domain:
     **Arguments:**
 
     - `name`: what messages call it.
-    - `across`: pairs of a name and a unit, of quantities that are equal where ports are joined.
-    - `through`: the same, of quantities that sum to zero there, counted positive into the component.
+    - `across`: pairs (name, unit) of the quantities that are equal at connected ports.
+    - `through`: pairs (name, unit) of the quantities that sum to zero there. They count positive into the component.
     """
 
     name: str

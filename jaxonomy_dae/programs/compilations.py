@@ -12,9 +12,9 @@ MOST = 10_000  # records that are kept: 2 MB
 class Compilation(NamedTuple):
     """One program that was compiled, or read from the folder of kept programs.
 
-    - `name`: of the function; "gradient of run" is its transpose.
+    - `name`: the name of the function. "gradient of run" is the transposed program.
     - `how`: "quick", "optimized", or "loaded" from the folder.
-    - `why`: what made the program necessary.
+    - `why`: why the program was necessary.
     - `traced`, `lowered`, `compiled`: processor seconds, all threads together.
     """
 
@@ -43,11 +43,12 @@ def noted(compilation: Compilation) -> None:
 
 
 def compilations() -> tuple[Compilation, ...]:
-    """What this process compiled so far for calls outside of jit, in this order: names, reasons, processor seconds.
+    """The programs that this process has compiled so far for calls outside of jit, in this order, with their reasons
+    and processor seconds.
 
-    `len(jaxonomy_dae.compilations())` before and after a call says how many programs the call needed. Not among them
-    are programs of your own `jax.jit`, those of `jax.jvp` and `jax.jacfwd`, those that call Python, and operations of
-    `jax.numpy` by themselves.
+    `len(jaxonomy_dae.compilations())` before and after a call says how many programs the call needed. The list leaves
+    out programs of your own `jax.jit`, of `jax.jvp` and `jax.jacfwd`, programs that call Python, and single operations
+    of `jax.numpy`.
     """
     with _LOCK:
         return tuple(_RECORDS)

@@ -29,12 +29,12 @@ _CHOSEN: list[Path | None] = []
 
 
 def keep_programs(folder: str | os.PathLike[str] | None) -> None:
-    """Says where programs compiled outside of jit are kept for the next process; None: nowhere.
+    """Sets the folder that keeps programs compiled outside of jit for the next process; None: no folder.
 
-    Without a call, it is the folder that the environment variable `JAXONOMY_DAE_CACHE` names (empty: nowhere), or else
-    `jaxonomy_dae` in the user's cache directory. A folder grows to 1 GiB; then the files that were not used for the
-    longest time are deleted. It may be deleted at any time. Files are executable code: use a folder in which only you
-    may write. While JAX's own cache is on (`jax_compilation_cache_dir`), that one serves instead.
+    The default is the folder in the environment variable `JAXONOMY_DAE_CACHE` (empty: no folder), or else
+    `jaxonomy_dae` in the user's cache directory. A folder grows to 1 GiB; then the least recently used files are
+    deleted. You may delete it at any time. The files are executable code: use a folder in which only you may write.
+    While JAX's own cache is on (`jax_compilation_cache_dir`), it is used instead.
     """
     _CHOSEN[:] = [None if folder is None else Path(folder).expanduser()]
 

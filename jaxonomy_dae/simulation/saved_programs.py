@@ -22,9 +22,9 @@ MARK = b"jaxonomy_dae program 1\n"
 def save_compiled(compiled: Any, path: str | PathLike[str]) -> None:
     """Writes a program that was compiled ahead of time, `jax.jit(f).lower(*arguments).compile()`, to a file.
 
-    The file is machine code for this processor, this system and these versions of Python and JAX. `jax.export` gives
-    what other machines can compile. Where JAX has a persistent cache, the program is run once, with zeros, from what is
-    written: JAX cannot write a program once more that it read from there (jax 0.10.2).
+    The file is machine code for this processor, this system and these versions of Python and JAX. `jax.export` makes
+    files that other machines can compile. If JAX's persistent cache is on, the written program is run once, with zeros,
+    because JAX cannot write a program again that it read from its cache (jax 0.10.2).
 
     **Raises:**
 
@@ -53,12 +53,12 @@ def save_compiled(compiled: Any, path: str | PathLike[str]) -> None:
 
 
 def load_compiled(path: str | PathLike[str]) -> Any:
-    """The program of `save_compiled`, to be called with arguments of the same shapes and types: nothing is compiled or
-    traced. Loading runs code from the file: load only what you or somebody you trust has written.
+    """Loads a program that `save_compiled` wrote. Call it with arguments of the same shapes and types: nothing is
+    compiled or traced. Loading runs code from the file, so load only files of people you trust.
 
     **Raises:**
 
-    - `ModelError` for another file, and for a program made for another processor or by other versions.
+    - `ModelError` for a file of another kind, and for a program of another processor or other versions.
     """
     whole = Path(path).read_bytes()
     if not whole.startswith(MARK):

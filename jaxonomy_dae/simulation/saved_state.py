@@ -19,22 +19,22 @@ from ..tolerances import KNOWN_ROUNDINGS
 
 
 class SavedState(eqx.Module):
-    """The whole state of a run at one time, as `solution.at(k)` returns it. Another run goes on from there:
+    """The whole state of a run at one time, as `solution.at(k)` returns it. Another run can continue from it:
 
     ```python
     first = simulate(system, 5.0, ts=ts)
     second = simulate(system, 10.0, initial=first.at(-1))
     ```
 
-    A pytree of arrays. It may be the carry of `jax.lax.scan`, and it can be mapped over and differentiated.
+    It is a pytree of arrays. It can be the carry of `jax.lax.scan`, and works under `jax.vmap` and `jax.grad`.
 
     - `t`: the time.
-    - `x`: the array of states, as `system.vector_field` takes it, shape `(n_state,)`.
-    - `discrete`: the discrete variables, `system.discretes`, and after them those of relations, shape `(q,)`.
+    - `x`: the array of states for `system.vector_field`, shape `(n_state,)`.
+    - `discrete`: the discrete variables, `system.discretes`, followed by those of relations, shape `(q,)`.
         `system.holding(state.discrete)` is the system while they have these values:
         `system.holding(state.discrete).vector_field(state.t, state.x)`.
-    - `sides`, `ticked`, `sizes`: what is known of the events: on which side each condition is, which clocks have ticked
-        at this time, and how large the quantities in conditions have been.
+    - `sides`, `ticked`, `sizes`: the memory of the events: the side of each condition, the clocks that have ticked at
+        this time, and the largest sizes of the quantities in conditions.
     """
 
     t: Any

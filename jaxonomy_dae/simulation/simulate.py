@@ -97,61 +97,63 @@ def simulate(
 
     - `system`: from an `AcausalCompiler`.
     - `t0`, `t1`: the interval, `t0 < t1`. `t0` None: the time of a whole state given as `initial`, otherwise 0.
-    - `ts`: when to save, shape `(n,)`, increasing, inside the interval; None saves every step taken. Inside jit, where
-        shapes are fixed, there are then `max_steps + 1` rows, and those beyond the last step repeat it.
+    - `ts`: when to save, shape `(n,)`, increasing, inside the interval; None saves every step. Inside jit, where shapes
+        are fixed, there are then `max_steps + 1` rows, and rows beyond the last step repeat it.
     - `solver`: any Diffrax solver for ordinary differential equations, or `solvers.BDF`, `solvers.Rodas5P` for stiff
-        systems and those with nonlinear blocks. None chooses, and `solution.stats` says what and why: explicit steps,
-        and where stability limits them, the run is made with Rodas5P or BDF. Inside jit, grad and vmap, the choice
-        follows from eigenvalues at the declared start. Systems with hidden constraints are projected onto them after
-        every step and at every saved time.
+        systems and those with nonlinear blocks. None chooses, and `solution.stats` gives the choice and its reason. The
+        run begins with explicit steps; if stability limits them, it is repeated with Rodas5P or BDF. Inside jit, grad
+        and vmap, the choice follows from the eigenvalues at the declared start. Systems with hidden constraints are
+        projected onto them after every step and at every saved time.
     - `rtol`, `atol`: tolerances of the local error, by default 1e-6 and 1e-8 (1e-4 and 1e-6 in single precision);
-        `atol` is multiplied by the states' nominal values; where none is declared, by the size that starts and
-        equations tell, if that is less than one.
+        `atol` is multiplied by the nominal values of the states. A state without a nominal value has the size that
+        follows from starts and equations, if that is below one.
     - `inputs`: by the inputs' names: constants; samples `(times, values)`, interpolated linearly, or with `"cubic"` or
         `"held"` as a third entry; `diffrax.LinearInterpolation` and `diffrax.CubicInterpolation`; functions of time.
-        Steps end at the times of samples. What a function reads from its surroundings is read at this call.
-    - `initial`: values at `t0` by variables' names, which outrank the starts declared in components. Or the whole state
-        of another run, `solution.at(k)`, from which this one goes on: with its discrete variables, modes, and clocks
-        that have ticked; declared starts, and discrete variables set by `with_parameters`, are not looked at. Of a
-        model without events, other than relations in equations, an array of shape `(n_state,)` is a whole state, too:
-        it is moved onto the constraints.
-    - `adjoint`: how to differentiate; default `solvers.StoredAdjoint()`, and `diffrax.ForwardMode()` under `jax.jvp`
-        and `jax.jacfwd`; name the latter for a function that is jitted before it is differentiated.
+        Steps end at the times of samples. A function reads variables of its surroundings when `simulate` is called.
+    - `initial`: values at `t0` by variables' names. They replace the starts declared in components. Or the whole state
+        of another run, `solution.at(k)`: this run continues from it, with its discrete variables, modes and clocks, and
+        ignores declared starts and discrete variables set by `with_parameters`. If the model has no events other than
+        relations in equations, an array of shape `(n_state,)` is a whole state, too. It is projected onto the
+        constraints.
+    - `adjoint`: how to differentiate. The default is `solvers.StoredAdjoint()`, and `diffrax.ForwardMode()` under
+        `jax.jvp` and `jax.jacfwd`. Give `diffrax.ForwardMode()` yourself if a function is jitted before it is
+        differentiated in forward mode.
     - `stepsize_controller`: instead of the controller made from the tolerances.
-    - `jump_ts`: times at which functions given as inputs jump, a number or shape `(n,)`: steps end there and the method
-        starts anew.
+    - `jump_ts`: times at which input functions jump, a number or shape `(n,)`. Steps end there, and the method
+        restarts.
     - `dtmax`: the longest step. None: a quarter of the shortest period of sin(ωt + φ) in equations on which states
-        depend, where ω is an expression in parameters, and long steps end at its zeros and extremes; `jnp.inf` leaves
-        that out. Inputs that are functions do not tell their periods: derivatives by the amplitude of one, where this
-        is zero, need a longest step if the input is faster than what it acts on.
-    - `control`: variables whose errors count, beside those of the states, such as a pressure that hangs on a mass by a
-        large factor. A warning names them where a solution is read and the tolerance of a state shows in them.
-    - `max_steps`: bounds the steps taken, beside those that end at samples; with `ts=None` as many rows are reserved.
-    - `max_events`: bounds the events of conditions; `solution.events` has room for as many. None: 12,800 of them, and
-        as much room as is needed outside jit, grad and vmap, where a run with more than 100 is made again with room for
-        twice as many, four times, and so on; inside, the first 100 are listed. Relations in
-        equations are not.
-    - `save_events`: whether `solution.events` also has variables before and after events; None: outside jit, and if
-        they take little room.
+        depend, if ω is an expression in parameters; long steps also end at zeros and extremes of the sine. `jnp.inf`
+        removes this limit. The periods of input functions are unknown. Give `dtmax` for the derivative by an amplitude
+        that is zero, if the input is faster than the model.
+    - `control`: variables whose errors count in addition to those of the states, such as a pressure that depends on a
+        mass by a large factor. When a solution is read, a warning names variables that amplify the tolerance of a
+        state.
+    - `max_steps`: the largest number of steps, without those that end at samples. With `ts=None`, this many rows are
+        reserved.
+    - `max_events`: the largest number of events of conditions, which is also the room in `solution.events`. None:
+        12,800 events. Outside jit, grad and vmap, the room starts at 100 events, and the run is repeated with twice the
+        room until all fit. Inside, the first 100 are listed. Switches of relations in equations are not listed.
+    - `save_events`: whether `solution.events` also has the variables before and after events. None: outside jit, if
+        they need little memory.
     - `progress`: shows a progress bar.
-    - `throw`: whether to raise if the start is not consistent or the integration fails. Otherwise `solution.result`
-        has a code, rows that were not reached are NaN, and so are their derivatives; `RESULTS.nonfinite` stands for
-        parameters out of their bounds, for parameters, weights and inputs that are not finite, and for samples that do
-        not reach over the run. None raises outside jit and vmap. `jax.vmap` outside of jit warns instead, with the
-        numbers of the members that failed. Inside jit, True puts callbacks to the host into the program. JAX's
-        persistent compilation cache does not keep such a program.
+    - `throw`: whether to raise an error if the start is inconsistent or the integration fails. With False,
+        `solution.result` has a code, and rows that were not reached are NaN, with their derivatives.
+        `RESULTS.nonfinite` stands for parameters out of bounds, for parameters, weights and inputs that are not finite,
+        and for samples that do not cover the run. None raises outside jit and vmap. `jax.vmap` outside of jit warns
+        instead and names the members that failed. Inside jit, True puts callbacks to the host into the program, and
+        JAX's persistent cache does not keep such a program.
 
     **Returns:**
 
     A `Solution`: `solution["pend.x"]` has shape `(n,)`.
 
-    Called outside of jit, it is compiled once for each structure, set of options and shapes, and `jax.grad`, `jax.vmap`
-    and `jax.jvp` transform that program. Inside `jax.jit` it is traced like any function.
+    Outside of jit, it is compiled once for each structure, set of options and shapes. `jax.grad`, `jax.vmap` and
+    `jax.jvp` transform that program. Inside `jax.jit` it is traced like any function.
 
     **Raises:**
 
     - `ModelError` for arguments that cannot work; `InitializationError`; `SimulationError`. Inside jit, grad and vmap,
-        with `throw=True`, what depends on values is an Equinox run-time error.
+        with `throw=True`, errors that depend on values are Equinox run-time errors.
     """
     if isinstance(system, AcausalSystem):  # `check_arguments` says what to do with anything else
         if initial is None or isinstance(initial, Mapping):

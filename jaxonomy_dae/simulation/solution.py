@@ -62,21 +62,21 @@ class Asked(eqx.Module):
 
 
 class Solution(eqx.Module):
-    """What `simulate` returns; `solution["pend.x"]` has shape `(n,)`, one value for each saved time.
+    """The result of `simulate`. `solution["pend.x"]` has shape `(n,)`, one value for each saved time.
 
     - `ts`: the saved times, shape `(n,)`.
     - `states`: the state array at these times, shape `(n, len(system.states) + len(system.carried))`, on the hidden
-        constraints. `at(k)` is the whole state at one of them, with discrete variables and what is known of events.
-    - `system`, `inputs`: what was simulated; inputs as they were read.
-    - `counts`: steps taken, accepted, rejected, and Jacobians of implicit solvers; `stats` adds the solver's name and
-        why it was chosen.
+        constraints. `at(k)` is the whole state at one of them, with discrete variables and the memory of events.
+    - `system`, `inputs`: the system and the inputs as they were read.
+    - `counts`: steps taken, accepted, rejected, and Jacobians of implicit solvers; `stats` adds the name of the solver
+        and the reason for choosing it.
     - `discrete`: the values of discrete variables at these times, shape `(n, len(system.discretes))`; None without
-        events. At the time of an event, what it wrote.
-    - `memory`: what another run needs to know of the events, see `at`.
+        events. At the time of an event, they are the values after it.
+    - `memory`: the memory of the events for another run, see `at`.
     - `asked`: the options of the run.
-    - `result`: Diffrax's result code. Where the integration stopped early, later rows are NaN.
+    - `result`: Diffrax's result code. If the integration stopped early, later rows are NaN.
 
-    A solution that `equinox.filter_vmap` returns is a batch: shapes get its axis in front.
+    If `equinox.filter_vmap` returns the solution, it is a batch: all shapes have a leading batch axis.
     """
 
     ts: Float[Array, " n"]
@@ -93,13 +93,13 @@ class Solution(eqx.Module):
     asked: Asked | None = None
 
     def at(self, k: Any) -> SavedState:
-        """The whole state at the saved time number `k`, from which another run goes on: `simulate(system, t1,
-        initial=solution.at(-1))` is as if this one had not stopped there. Inside jit, `k` may be traced; of a batch,
-        a batch of states.
+        """The whole state at the saved time number `k`. Another run continues from it: `simulate(system, t1,
+        initial=solution.at(-1))` goes on as if this run had not stopped. Inside jit, `k` may be traced. A batch has a
+        batch of states.
 
         **Raises:**
 
-        - `ModelError` if there is no such row, or it was not reached.
+        - `ModelError` if there is no such row, or the run did not reach it.
         """
         n = self.ts.shape[-1]
         if not isinstance(k, Tracer) and not -n <= int(k) < n:
@@ -292,8 +292,8 @@ class Solution(eqx.Module):
         return {name: picked(columns, (..., k)) for k, name in enumerate(names)}
 
     def energy(self, component: str | None = None) -> Float[Array, "*batch n"]:
-        """The energy stored at the saved times (joule), shape `(n,)`: the sum of all that components declare, or of one
-        component and what it contains.
+        """The energy stored at the saved times (joule), shape `(n,)`: of all components, or of one component and its
+        children.
 
         **Raises:**
 
@@ -323,21 +323,21 @@ class Solution(eqx.Module):
         return on_device(values.sum(axis=1))
 
     def energy_balance_error(self, *, rtol: float = 1e-8, atol: float = 1e-10) -> Float[Array, " n"]:
-        """By how much the account of energy fails to balance at the saved times, shape `(n,)`:
+        """The error of the energy balance at the saved times, shape `(n,)`:
 
             [stored(t) − stored(t0) − ∫(supply − dissipation) dt] / scale
 
-        from the first saved time t0 on. The scale is the largest of all that was stored, supplied or lost on the way,
-        so that 0 is a balance and 1 is nothing like it.
+        from the first saved time t0 on. The scale is the largest energy that was stored, supplied or lost during the
+        run. So 0 is a perfect balance, and an error of 1 is as large as the energies themselves.
 
-        The integral is that of a second run from the first saved state, with the tolerances `rtol` and `atol`: powers
-        at the four Gauss points between its steps and saved times, read along its dense output. What remains is the
-        error of the saved states, or a declaration that is wrong or missing.
+        A second run from the first saved state, with the tolerances `rtol` and `atol`, gives the integral: it evaluates
+        powers at four Gauss points between its steps and saved times, along its dense output. The remaining error is
+        that of the saved states, or of a wrong or missing declaration.
 
         **Raises:**
 
-        - `ModelError` inside jit, of a batch, of a solution with rows that were not reached, and of a model whose
-            events write states or discrete variables, which may change what is stored at an instant.
+        - `ModelError` inside jit, for a batch, for a solution with rows that were not reached, and for a model whose
+            events write states or discrete variables, because such events may change the stored energy at an instant.
         """
         from .energy_balance import energy_balance
 

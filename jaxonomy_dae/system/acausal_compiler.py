@@ -33,7 +33,7 @@ class AcausalCompiler:
 
     **Arguments:**
 
-    - `ev`: the environment the components were made with.
+    - `ev`: the environment of the components.
     - `diagram`: the model.
     - `state_selection`: `"dummy_derivatives"` integrates a minimal set of states; `"projection"` integrates all
         candidates and projects onto the hidden constraints; `"auto"` takes dummy derivatives where the constraints'
@@ -54,7 +54,7 @@ class AcausalCompiler:
     - `UnitError`: units do not fit together.
     - `StructuralError`: equations and unknowns do not fit together.
 
-    After the call, `compiler.report` describes the system, and `compiler.passes` what each pass made of the model.
+    After the call, `compiler.report` describes the system, and `compiler.passes` lists the effect of each pass.
     """
 
     @explained_keywords()
@@ -108,7 +108,7 @@ class AcausalCompiler:
 
     @property
     def passes(self) -> Passes:
-        """What each pass of the last call made of the model, in user names: `print(compiler.passes)`."""
+        """The effect of each pass of the last call, in the names of the user: `print(compiler.passes)`."""
         if self._passes is None:
             raise ModelError("nothing has been compiled yet: call the compiler first")
         return self._passes

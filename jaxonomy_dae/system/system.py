@@ -39,10 +39,9 @@ class AcausalSystem(eqx.Module):
     - `parameters`: a flat array with names, `system.parameters["pend.m"]`.
     - `neural`: the networks by name, `system.neural["drag"]`.
     - `states`, `algebraics`, `variables`: names.
-    - `typical_sizes`: how large each quantity of the equations usually is, a power of two, as declared (`nominal`) or
-        as starts and equations say at the values of the parameters (inside jit, grad and vmap, where these are not
-        known, at those that the system has outside): where searches begin to look, and beside what zero is judged.
-        Nothing is differentiated by them.
+    - `typical_sizes`: the typical size of each quantity in the equations, a power of two. It is declared (`nominal`) or
+        follows from starts and equations at the parameters' values; inside jit, grad and vmap, at the values outside.
+        Searches begin at this scale, and it decides what counts as zero. Typical sizes are not differentiated.
     """
 
     parameters: Parameters
@@ -61,7 +60,8 @@ class AcausalSystem(eqx.Module):
 
     @property
     def carried(self) -> list[str]:
-        """Tearing variables of nonlinear blocks: they follow the states in the state array, as algebraic unknowns."""
+        """The tearing variables of nonlinear blocks. They are algebraic unknowns and follow the states in the state
+        array."""
         return [self.plan.quantity_name[q] for q in self.plan.carried]
 
     @property
@@ -71,7 +71,7 @@ class AcausalSystem(eqx.Module):
 
     @property
     def algebraics(self) -> list[str]:
-        """The variables that are neither states nor equal to one."""
+        """The variables that are neither states nor aliases of states."""
         chosen = set(self.plan.states.tolist())
         inputs = set(self.plan.inputs.names)
         names = self.plan.variable_index
@@ -126,8 +126,8 @@ class AcausalSystem(eqx.Module):
 
         **Raises:**
 
-        - `ModelError` for unknown names, values that are not finite or out of bounds. Inside jit, grad and vmap, where
-            values are not known, those become not-a-number, and so does all that is computed with them: see `simulate`.
+        - `ModelError` for unknown names, and for values that are not finite or out of bounds. Inside jit, grad and
+            vmap, where values are unknown, such values become not-a-number, and all results with them: see `simulate`.
         """
         return self._at(self.parameters.replaced(values))
 
@@ -147,7 +147,7 @@ class AcausalSystem(eqx.Module):
             return jnp.asarray(sizes, self.typical_sizes.dtype)
 
     def unconstrain(self, *names: str) -> dict[str, Any]:
-        """Parameters as free numbers z, to be trained by steps that know no bounds:
+        """Parameters as free numbers z, for optimizers that know no bounds:
 
             z = log(x − low),  z = −log(high − x),  z = log((x − low)/(high − x)),  z = x
 
@@ -158,16 +158,16 @@ class AcausalSystem(eqx.Module):
 
         **Arguments:**
 
-        - `names`: of parameters, of arrays of them, and of networks, whose weights are taken as they are.
+        - `names`: of parameters, of arrays of parameters, and of networks. Weights of networks are not transformed.
 
         **Returns:**
 
-        By name, the free numbers, in the shapes of the parameters; of a network, its inexact arrays.
+        The free numbers by name, in the shapes of the parameters; for a network, its inexact arrays.
 
         **Raises:**
 
-        - `ModelError` for a name that is neither, for a parameter that is computed from others, and for a value that
-            lies on a bound, to which no number belongs (inside jit, an infinite one).
+        - `ModelError` for a name that is neither, for a parameter that is computed from others, and for a value on a
+            bound, which has no finite z (inside jit, z is then infinite).
         """
         table = self.parameters.table
         chosen = table.chosen(self._parameters_among(names))
@@ -185,8 +185,8 @@ class AcausalSystem(eqx.Module):
         return {name: out[name] for name in names}
 
     def constrain(self, free: Mapping[str, Any]) -> "AcausalSystem":
-        """The system whose parameters are within their bounds what `free`, from `unconstrain`, says: any free number
-        belongs to a value inside, be it traced or not. What it does not name stays as it is.
+        """The system with the parameters that belong to the free numbers of `unconstrain`. Every free number, traced or
+        not, belongs to a value inside the bounds. All other parameters keep their values.
 
         **Raises:**
 
@@ -217,10 +217,10 @@ class AcausalSystem(eqx.Module):
         return chosen
 
     def partition(self, *names: str) -> tuple["AcausalSystem", "AcausalSystem"]:
-        """Separates what is trained: `(trainable, frozen)`, to be joined again by `equinox.combine`.
+        """Separates the trained numbers: returns `(trainable, frozen)`, which `equinox.combine` joins again.
 
-        `names` are networks (`"drag"`) and parameters (`"pend.m"`). Parameters are trained as they are: what a step
-        leads out of its bounds becomes not-a-number. `unconstrain` gives numbers that have no bounds.
+        `names` are networks (`"drag"`) and parameters (`"pend.m"`). Parameters are not transformed: a parameter that a
+        step moves out of its bounds becomes not-a-number. `unconstrain` gives numbers without bounds.
 
         **Raises:**
 
@@ -241,11 +241,11 @@ class AcausalSystem(eqx.Module):
         return eqx.partition(system, wanted)
 
     def merged(self) -> "AcausalSystem":
-        """This system with nothing set apart by `partition`."""
+        """This system with trainable and frozen parts joined again."""
         return eqx.tree_at(lambda s: s.parameters, self, self.parameters.merged())
 
     def settled(self) -> "AcausalSystem":
-        """`merged`, with parameters that are computed from others as numbers: for a program that sets none."""
+        """`merged`, with dependent parameters evaluated to numbers, for a program that sets no parameters."""
         return eqx.tree_at(lambda s: s.parameters, self, self.parameters.settled())
 
     # --- computing ---------------------------------------------------------------------------------------------
@@ -276,7 +276,7 @@ class AcausalSystem(eqx.Module):
         return joined([array, picked(values, (..., slice(events.n_visible, None))), values])
 
     def holding(self, values: Any) -> "AcausalSystem":
-        """The system while its discrete variables, and after them the hidden ones, have these values."""
+        """The system with these values of its discrete variables, followed by the hidden ones."""
         events = self.plan.events
         if events is None or not len(events.discrete):
             return self
@@ -289,7 +289,7 @@ class AcausalSystem(eqx.Module):
         return AcausalSystem(parameters, self.neural, self.typical_sizes, self.plan, None, values[n:])
 
     def around_event(self, t: Time, values: Any, previous: Any, args: Any = None) -> SystemAt:
-        """`at`, with discrete variables that have these values and had others before the event at hand."""
+        """`at`, with these values of the discrete variables and other values before the present event."""
         held = self.holding(values)
         point = held.at(t, args)
         numbers = point.parameters.at[-len(previous) :].set(previous) if len(previous) else point.parameters
@@ -329,8 +329,8 @@ class AcausalSystem(eqx.Module):
 
     @property
     def jacobian_pattern(self) -> SparsePattern | None:
-        """The places at which the Jacobian of the vector field can have entries: `.rows` and `.cols`, sorted by row.
-        None if it is so large and dense that its places are not worth listing."""
+        """The sparsity pattern of the Jacobian of the vector field: `.rows` and `.cols`, sorted by row. None if the
+        Jacobian is large and dense."""
         return self.plan.jacobian_pattern
 
     def jacobian(self, t: Time, x: Float[Array, " n"], args: Any = None) -> SparseMatrix:
@@ -357,12 +357,12 @@ class AcausalSystem(eqx.Module):
         return SparseMatrix(sparse_jacobian(point.vector_field, pattern)(x), pattern)
 
     def project(self, t: Time, x: Float[Array, " n"], args: Any = None, iterations: int = 1) -> Float[Array, " n"]:
-        """The state moved onto the hidden constraints (nothing to do if there are none)."""
+        """Projects the state onto the hidden constraints, if there are any."""
         return self.at(t, args).project(x, iterations)
 
     def project_fully(self, t: Time, x: Float[Array, " n"], args: Any, iterations: int) -> Float[Array, " n"]:
-        """As `project`, not-a-number where the hidden constraints are not met then: the last step of a search that
-        converges quadratically is short."""
+        """As `project`, but not-a-number if the hidden constraints do not hold afterwards. A short last step shows that
+        the search converged."""
         if not self.plan.n_projected:
             return self.project(t, x, args, iterations)
         near = self.project(t, x, args, iterations - 1)
@@ -377,15 +377,16 @@ class AcausalSystem(eqx.Module):
         return jax.lax.stop_gradient(sizes[places]) if is_traced(sizes) else np.asarray(sizes)[places]
 
     def dummy_determinants(self, t: Time, x: Float[Array, " n"], args: Any = None) -> Float[Array, " blocks"]:
-        """The determinants that vanish where the choice of states is singular, one for every nonlinear block that
-        determines variables left out of a minimal set; not differentiated."""
+        """The determinants that vanish where the choice of states is singular: one for each nonlinear block that
+        determines variables outside the minimal set. They are not differentiated."""
         frozen, t, x, args = jax.tree.map(
             lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf, (self, t, x, args)
         )
         return jax.lax.stop_gradient(frozen.at(t, args).dummy_determinants(x))
 
     def block_determinants(self, t: Time, x: Float[Array, " n"], args: Any = None) -> Float[Array, " blocks"]:
-        """The determinants of all nonlinear blocks that are written out; not differentiated."""
+        """The determinants of all nonlinear blocks that are solved by written-out elimination. They are not
+        differentiated."""
         frozen, t, x, args = jax.tree.map(
             lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf, (self, t, x, args)
         )
@@ -406,8 +407,9 @@ class AcausalSystem(eqx.Module):
         return jnp.concatenate(parts)
 
     def observe(self, names: str | Sequence[str], t: Time, x: Float[Array, " n"], args: Any = None) -> Any:
-        """The values of variables at a state: a scalar for one name, shape `(len(names),)` for several; for the name of
-        an array, `"cell.v"`, its shape. Among several names, it stands for those of all entries.
+        """The values of variables at a state: a scalar for one name, shape `(len(names),)` for several names, and the
+        array's shape for the name of an array such as `"cell.v"`. Among several names, the name of an array stands for
+        all of its entries.
 
         **Raises:**
 
@@ -467,30 +469,29 @@ class AcausalSystem(eqx.Module):
 
         - `t0`: the initial time.
         - `inputs`: as in `simulate`.
-        - `initial`: values of variables at `t0`; they outrank the starts declared in components. `"der(m.v)"` is the
+        - `initial`: values of variables at `t0`. They replace the starts declared in components. `"der(m.v)"` is the
             derivative of a variable that the model differentiates.
-        - `solve_for`: parameters that are unknown: as many more values as there are names must be given in `initial`
-            or be fixed in components. The search starts at their present values. A rest length for which a mass is in
+        - `solve_for`: parameters that are unknown. For each of them, one more value must be given in `initial` or fixed
+            in components. The search starts at their present values. To find the rest length for which a mass is in
             equilibrium at 0.3 m: `initial={"m.x": 0.3, "m.v": 0.0, "der(m.v)": 0.0}, solve_for=["spring.length"]`.
-        - `solver`: an Optimistix root finder or least-squares solver, such as
-            `optimistix.LevenbergMarquardt(rtol=1e-8, atol=1e-8)`, instead of the ladder of methods. It sees unknowns
-            and rows divided by their sizes.
-        - `throw`: whether to raise if there is no such state; otherwise it is not-a-number, and so are its derivatives.
-            None: outside jit, grad and vmap. Inside, True puts callbacks to the host into the program, which JAX's
-            persistent compilation cache then does not keep.
+        - `solver`: an Optimistix root finder or least-squares solver, such as `optimistix.LevenbergMarquardt(rtol=1e-8,
+            atol=1e-8)`, in place of the sequence of built-in methods. Unknowns and equations are scaled by their sizes.
+        - `throw`: whether to raise an error if there is no such state. With False, the state and its derivatives are
+            then not-a-number. None: raise outside jit, grad and vmap only. Inside jit, True needs callbacks to the
+            host, and JAX's persistent cache does not keep such programs.
 
         **Returns:**
 
-        The state, shape `(len(states) + len(carried),)`: differentiable with respect to parameters and values given.
-        With `solve_for`, the pair of the state and a system that holds the parameters found; go on with that system
-        and the same `initial`, as in `simulate(found, t1, initial=...)`.
+        The state, shape `(len(states) + len(carried),)`: differentiable with respect to parameters and given values.
+        With `solve_for`, the state and a system with the parameters found; continue with that system and the same
+        `initial`, as in `simulate(found, t1, initial=...)`.
 
         **Raises:**
 
         - `InitializationError` if fixed starts contradict the equations, if no consistent point was found, if a block
-            of equations is singular there, if the values given are too few or too many for `solve_for`, or if a
-            parameter found is out of its bounds. Inside jit, with `throw=True`, what depends on values is an Equinox
-            run-time error.
+            of equations is singular there, if too few or too many values are given for `solve_for`, or if a parameter
+            found is out of its bounds. Inside jit, with `throw=True`, errors that depend on values are Equinox run-time
+            errors.
         """
         from ..initialization.check import check
         from ..initialization.given_solver import check_solver
@@ -522,8 +523,8 @@ class AcausalSystem(eqx.Module):
         *,
         solve_for: Sequence[str] = (),
     ):
-        """A report of what `initialize` does with the same arguments, to be printed: which starts hold, which were
-        guesses and how far each moved, which are redundant or contradict each other, what does not hold, which method
+        """A printable report of `initialize` with the same arguments: the starts that hold, the guesses and how far
+        each moved, starts that are redundant or contradict each other, conditions that do not hold, and the method that
         succeeded.
 
         **Raises:**
