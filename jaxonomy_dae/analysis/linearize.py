@@ -42,8 +42,8 @@ def linearize(
     - `inputs`: the names of inputs; or a dictionary with their values at the point, where they have no default. An
         array's name stands for those of all entries, here and in `outputs` and `states`.
     - `outputs`: the names of variables; `"der(...)"` of what the model differentiates is one too.
-    - `at`: the point, from `steady_state`. By default, the equilibrium that a search from the initial point finds. States
-        on which nothing depends keep their values, such as the angle of a free shaft.
+    - `at`: the point, from `steady_state`. By default, the equilibrium that a search from the initial point finds. The
+        states on which nothing depends keep their values, such as the angle of a free shaft.
     - `t`: the time, if `at` is left out.
     - `states`: the states to use as coordinates if hidden constraints make some states redundant.
     - `sampled`: whether to describe a model with sampled controllers by its change from tick to tick. The states of the

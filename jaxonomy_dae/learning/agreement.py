@@ -14,9 +14,11 @@ from .objective import Objective
 class Whiteness:
     """The tests of one output of one experiment.
 
-    - `correlation`: of neighbouring residuals.
-    - `statistic`: Ljung and Box's (1978) over so many `lags`; χ² of as many degrees of freedom for white noise.
-    - `peak`: the probability that white noise has as high a peak among its frequencies, which a missing mode makes.
+    - `correlation`: the correlation of neighbouring residuals.
+    - `statistic`: the statistic of Ljung and Box (1978) over `lags` lags. For white noise it has a χ² distribution with
+        `lags` degrees of freedom.
+    - `peak`: the probability that the spectrum of white noise has a peak as high as this one. A missing mode of the
+        model makes such a peak.
     """
 
     correlation: float

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 @dataclasses.dataclass(frozen=True)
 class Band:
     """A law at the points of a `grid`: `mean`, the standard deviation `spread`, the band from `low` to `high`, shape
-    `(n,)`; `explored`: from the least to the greatest value that the experiments saw, for each input, shape
-    `(inputs, 2)`; `between`: of an ensemble, the standard deviation of its members, part of the `spread`."""
+    `(n,)`; `explored`: the range of values in the experiments for each input, shape `(inputs, 2)`; `between`: in an
+    ensemble, the standard deviation of its members, which is a part of the `spread`."""
 
     grid: Float[np.ndarray, " n *inputs"]
     mean: Float[np.ndarray, " n"]
@@ -44,7 +44,7 @@ class Band:
     def plot(self, ax: Any = None, *, truth: Any = None, label: str = "learned") -> Any:
         """Draws the law with its band and the region explored; returns Matplotlib axes.
 
-        - `truth`: a law to compare with, if one is known: a function of the grid, or values, shape `(n,)`.
+        - `truth`: the true law, if it is known: a function of the grid, or values, shape `(n,)`.
         """
         ax = new_axes(ax)
         points = self.grid.reshape(len(self.grid), -1)

@@ -15,8 +15,8 @@ from .unseen import Score
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class CrossValidation:
-    """The outcome of `cross_validate`: for each fold, the names of the experiments left out, the fit to the others, and
-    a `Score` by experiment left out."""
+    """The result of `cross_validate`: for each fold, the names of the held-out experiments, the fit to the others, and
+    a `Score` for each held-out experiment."""
 
     folds: tuple[tuple[str, ...], ...]
     fits: tuple[Estimate, ...]
@@ -31,7 +31,7 @@ class CrossValidation:
 
     @property
     def log_likelihood(self) -> float:
-        """ln L of the experiments left out: the greater, the better the model."""
+        """ln L of the held-out experiments. A better model has a greater one."""
         return float(sum(score.log_likelihood for score in self.scores.values()))
 
     def __repr__(self):
@@ -43,13 +43,13 @@ class CrossValidation:
 def cross_validate(
     problem: Problem, folds: int | Sequence[Sequence[str]] | None = None, **options: Any
 ) -> CrossValidation:
-    """Fits to all experiments but some, which then are predicted: in turn, until each was left out once.
+    """Fits to all experiments but some, and predicts those. This is repeated until each experiment was held out once.
 
     **Arguments:**
 
-    - `problem`: of several experiments. A long record makes several, by `Experiment.window`.
-    - `folds`: how many, which take experiments in turn; or the names of the experiments that each leaves out; default:
-        one experiment at a time.
+    - `problem`: a problem with several experiments. `Experiment.window` makes several out of a long record.
+    - `folds`: the number of folds, to which experiments are dealt in turn; or the names of the held-out experiments of
+        each fold. Default: one experiment at a time.
     - `options`: as for `problem.fit`.
 
     **Raises:**
@@ -91,9 +91,9 @@ def left_out(data: Data, names: Sequence[str]) -> Data:
 
 @dataclasses.dataclass(frozen=True)
 class Compared:
-    """One of several fits: χ² and its degrees of freedom, `effective` numbers that the data determine, Schwarz's
-    criterion `bic`, of which less is better, by how much it is more than the best one's, and the ln L of experiments
-    that are held out (NaN if there are none)."""
+    """One of several fits: χ² and its degrees of freedom; the number of coordinates that the data determine,
+    `effective`; Schwarz's criterion `bic` (less is better) and its distance from the best one; and ln L of held-out
+    experiments (NaN if there are none)."""
 
     chi2: float
     freedom: float
@@ -128,9 +128,9 @@ class Comparison:
 
 
 def compare(fits: Mapping[str, Estimate]) -> Comparison:
-    """Fits of several models to the same data, by Schwarz's criterion with the numbers that the data determine, and by
-    experiments held out. Differences above 6 are strong evidence, below 2 hardly any (Kass & Raftery 1995, J. Am. Stat.
-    Assoc. 90:773).
+    """Compares fits of several models to the same data, by Schwarz's criterion with the effective number of
+    coordinates, and by held-out experiments. A difference above 6 is strong evidence, and a difference below 2 is
+    hardly any (Kass & Raftery 1995, J. Am. Stat. Assoc. 90:773).
 
     **Raises:**
 

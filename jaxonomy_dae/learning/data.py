@@ -18,8 +18,7 @@ from .experiment import Experiment, Unknown, check_increasing
 class Data:
     """Experiments that are fitted together.
 
-    They may differ in length, sampling and in what was measured; of inputs and starts, each must name what the others
-    do.
+    They may differ in length, sampling and measured variables. All of them must name the same inputs and starts.
     """
 
     def __init__(self, *experiments: Experiment):

@@ -42,14 +42,14 @@ DRAWS = 64  # records of innovations at most, for the information of a filter: e
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Advice:
-    """Candidates compared, to be printed.
+    """A printable comparison of candidates.
 
     - `labels`: of the candidates.
-    - `gain`: what each is expected to tell, in nats; ln 2 = 0.69 halves the spread of one parameter. NaN where its run
-        fails.
-    - `chosen`: the best, by position; if several were asked for, each next one given those before it.
-    - `before`: standard deviations of parameters and shared starts as they are known now, by name, on the coordinates'
-        scale (relative, for positive parameters); `after`: with each candidate, shape `(candidates,)`.
+    - `gain`: the expected information of each candidate, in nats; ln 2 = 0.69 halves the spread of one parameter. NaN
+        if its run fails.
+    - `chosen`: the positions of the best candidates. Each further one is the best in addition to those before it.
+    - `before`: the present standard deviations of parameters and shared starts, by name, on the coordinates' scale
+        (relative for positive parameters); `after`: those with each candidate, shape `(candidates,)`.
     """
 
     labels: tuple[str, ...]
@@ -60,7 +60,7 @@ class Advice:
 
     @property
     def best(self) -> int:
-        """The position of the one that tells most."""
+        """The position of the most informative candidate."""
         return self.chosen[0]
 
     def __repr__(self):
@@ -154,26 +154,26 @@ def next_experiment(
     count: int = 1,
     alone: bool = False,
 ) -> Advice:
-    """Chooses, among some experiments, those that would tell most about what is estimated.
+    """Chooses the most informative experiments among candidates.
 
     ```python
     plans = [learning.Planned(ts, {"pend.x": 1e-3}, initial={"pend.initial_theta": a}) for a in (-1.2, 0.0, 0.5)]
     print(learning.next_experiment(fit, plans, names=["drag"]))
     ```
 
-    All candidates are one compiled program, shorter ones padded; events in the model are differentiated through.
+    One compiled program serves all candidates; shorter ones are padded. Derivatives pass through events of the model.
 
     **Arguments:**
 
-    - `source`: an estimate, whose values and data count; or a problem, with its nominal values, before any fit.
-    - `candidates`: what could be done: times, inputs, starts, and what would be measured.
-    - `names`: of parameters, networks and shared starts about which to learn; default: all.
-    - `count`: how many experiments to choose; the same may be chosen again.
-    - `alone`: as if no data were at hand.
+    - `source`: an estimate, with its values and data; or before any fit, a problem with its nominal values.
+    - `candidates`: the possible experiments: times, inputs, starts, and measured variables.
+    - `names`: the parameters, networks and shared starts of interest; default: all.
+    - `count`: the number of experiments to choose. One candidate may be chosen repeatedly.
+    - `alone`: whether to ignore the present data.
 
     **Returns:**
 
-    `Advice`. Its gains hold for the values at hand: a design is as good as the guess of what it is designed for.
+    `Advice`. Its gains hold for the present values, so a design is as good as these values are.
 
     **Raises:**
 

@@ -20,8 +20,9 @@ TOLERANCE = 1e-4  # nats that a step must gain
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Design:
-    """The outcome of `design_experiment`: the parameters found, `values`; the experiment they make, `planned`; what
-    it is expected to tell, `gain`, in nats, and at the `start`; the `history` of gains; and why the search ended."""
+    """The result of `design_experiment`: the parameters found, `values`; their experiment, `planned`; the expected
+    information `gain`, in nats, and that at the `start`; the `history` of gains; and the reason for the end of the
+    search."""
 
     values: Float[np.ndarray, " p"]
     planned: Planned
@@ -44,20 +45,20 @@ def design_experiment(
     alone: bool = False,
     steps: int = 40,
 ) -> Design:
-    """The experiment that tells most among those that `make` describes: a search along the gradient of the gain (see
-    `next_experiment`) in bounds, by quasi-Newton steps (L-BFGS-B).
+    """Finds the most informative experiment among those that `make` describes. The search follows the gradient of the
+    gain (see `next_experiment`) within bounds, by quasi-Newton steps (L-BFGS-B).
 
-    The gradient is that of central differences, which are candidates of one batch: all of the search is one compiled
-    program, where exact second derivatives of runs would be another that compiles for minutes.
+    Central differences give the gradient; their points are candidates of one batch, so that the search needs one
+    compiled program. Exact second derivatives of runs would need a program that compiles for minutes.
 
     **Arguments:**
 
     - `source`, `names`, `alone`: as for `next_experiment`.
     - `make`: `make(p)` is the `Planned` experiment of parameters p, shape `(p,)`: times, amplitudes and switching times
         of inputs, starts. Its shapes do not depend on p.
-    - `start`: where the search begins, shape `(p,)`; it ends at a local optimum.
+    - `start`: the start of the search, shape `(p,)`. It ends at a local optimum.
     - `bounds`: `(low, high)` of each, finite.
-    - `steps`: how many at most.
+    - `steps`: the largest number of steps.
 
     **Raises:**
 

@@ -98,12 +98,12 @@ class Candidate:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Discovery:
-    """Closed forms in the place of a network.
+    """Closed forms that replace a network.
 
-    - `candidates`: all that could be fitted, the best first.
-    - `chosen`: the one of fewest terms among those that the data do not tell from the best.
-    - `lack_of_fit`: the probability that noise alone makes the chosen form explain the data as much worse than the
-        network does. Where it is small, the library lacks a term.
+    - `candidates`: all forms that could be fitted, the best first.
+    - `chosen`: the form with the fewest terms among those that the data cannot distinguish from the best.
+    - `lack_of_fit`: the probability that noise alone makes the chosen form fit the data as much worse than the network.
+        If it is small, the library lacks a term.
     """
 
     name: str
@@ -118,7 +118,7 @@ class Discovery:
 
     @property
     def estimate(self) -> "Estimate":
-        """The fit of the closed form and of all else that was estimated with it."""
+        """The fit of the closed form, and of everything that was estimated with it."""
         return self.chosen.estimate
 
     @property

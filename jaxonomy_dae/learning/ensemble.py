@@ -25,9 +25,9 @@ REJECTED = 1e-3  # the probability below which noise is no excuse for a worse fi
 class Ensemble:
     """Estimates from several seeds.
 
-    - `estimates`: all that could be fitted, the best first.
-    - `kept`: those that the data do not tell from the best: twice the logarithm of their likelihood is less by no more
-        than noise may make it (one in a thousand), for as many weights as the data determine. Others are local minima.
+    - `estimates`: all fits that succeeded, the best first.
+    - `kept`: the fits that the data cannot distinguish from the best: noise alone would explain the difference of the
+        log-likelihoods, except once in a thousand, for as many weights as the data determine. Others are local minima.
     """
 
     estimates: tuple[Estimate, ...]
@@ -47,8 +47,8 @@ class Ensemble:
         return f"Ensemble(of {len(self.kept)}, χ² {chi2}" + f"; {left} more ended in worse minima" * bool(left) + ")"
 
     def band(self, name: str, grid: Any, law: Any = None, along: Any = None, level: float = 0.95) -> Band:
-        """A learned law over a grid, as `Estimate.band`: the mean of the members, with a spread of which part is how
-        far they disagree, `between`, and part what each knows of itself."""
+        """A learned law over a grid, as `Estimate.band`: the mean of the members. Its spread combines their
+        disagreement, `between`, and the spread of each member."""
         bands = [one.band(name, grid, law, along, level) for one in self.kept]
         mean, between, spread = _mixed([b.mean for b in bands], [b.spread for b in bands])
         factor = self.best.quantile(level)
@@ -79,17 +79,19 @@ def ensemble(
     networks: Mapping[str, Sequence[Any]] | None = None,
     **options: Any,
 ) -> Ensemble:
-    """Fits from several seeds of the networks' weights, one after the other by the program that a single fit compiles.
+    """Fits from several seeds of the networks' weights, one after the other, with the compiled program of a single fit.
 
-    The band of one fit is linearized around one minimum. Other weights may explain the data as well and say something
-    else where these are silent; members that disagree show it (Lakshminarayanan, Pritzel & Blundell 2017, NeurIPS 30).
+    The band of one fit is linearized around one minimum. Other weights may explain the data equally well, and differ
+    where there are no data. Disagreement of the members shows this (Lakshminarayanan, Pritzel & Blundell 2017, NeurIPS
+    30).
 
     **Arguments:**
 
-    - `problem`: with networks or sensor laws that are trained.
-    - `members`: how many; the first begins at the problem's own weights, others at arrays of the same sizes, drawn by
-        `seed`.
-    - `networks`: instead, the networks to begin with by name, as many each: `{"drag": [Drag(key) for key in keys]}`.
+    - `problem`: a problem that trains networks or sensor laws.
+    - `members`: the number of members. The first begins at the problem's own weights, the others at random arrays of
+        the same sizes, drawn by `seed`.
+    - `networks`: alternatively, the initial networks by name, one for each member: `{"drag": [Drag(key) for key in
+        keys]}`.
     - `options`: as for `problem.fit`, but for `start`.
 
     **Raises:**

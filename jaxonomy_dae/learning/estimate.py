@@ -36,13 +36,13 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Estimate:
-    """The outcome of `Problem.fit`.
+    """The result of `Problem.fit`.
 
-    - `system`: with the values found; `observers`: the sensor laws, with theirs.
-    - `minimum`: where the descent ended: its `history`, `converged`, `message`, and weighted with `minimum.weights` its
-        residuals and Jacobian.
+    - `system`: the system with the values found; `observers`: the fitted sensor laws.
+    - `minimum`: the end of the descent: its `history`, `converged` and `message`, and the residuals and the Jacobian,
+        weighted with `minimum.weights`.
     - `point`: the values of all coordinates at the estimate; `objective.coordinates` has their names.
-    - `training`: what came before least squares, with `first=`.
+    - `training`: the training before least squares, with `first=`.
     """
 
     problem: "Problem"
@@ -74,8 +74,8 @@ class Estimate:
 
     @property
     def ok(self) -> bool:
-        """True if the search came to its end, what noise levels say is met, residuals look like white noise, and all
-        that was searched is determined by the data and inside its bounds. `reasons` says what is not so."""
+        """True if the search converged, χ² agrees with the noise levels, residuals look like white noise, and all
+        unknowns are determined by the data and inside their bounds. `reasons` lists what is wrong."""
         return not self.reasons
 
     # --- values ------------------------------------------------------------------------------------------------
@@ -93,7 +93,7 @@ class Estimate:
 
     @property
     def starts(self) -> dict[str, Any]:
-        """Unknown starts as found: a number if shared, else shape `(experiments,)`."""
+        """The estimated starts: a number if shared, else shape `(experiments,)`."""
         layout, (shared, own) = self.objective.layout, self.objective.coordinates.split(
             self.objective.coordinates.natural(self.point)
         )  # fmt: skip
@@ -194,22 +194,21 @@ class Estimate:
 
     @property
     def whiteness(self) -> dict[str, dict[str, Whiteness]]:
-        """Tests of whether residuals look like noise, by experiment and name. Where they do not, intervals are too
-        narrow."""
+        """Tests whether residuals look like noise, by experiment and name. If they do not, intervals are too narrow."""
         return {label: {n: whiteness(r) for n, r in by.items()} for label, by in self.residuals.items()}
 
     def quantile(self, level: float) -> float:
-        """How many standard deviations an interval goes to each side: of the normal distribution, or where noise was
-        estimated, of Student's."""
+        """Half of the width of an interval in standard deviations: a quantile of the normal distribution, or if the
+        noise was estimated, of Student's distribution."""
         upper = 0.5 * (1 + level)
         if self.objective.evidence.labels:
             return float(scipy.stats.t.ppf(upper, max(self.freedom, 1.0)))
         return float(scipy.stats.norm.ppf(upper))
 
     def table(self, level: float = 0.95) -> Table:
-        """Parameters and starts with linear intervals, on the coordinates' scale, so those of positive parameters are
-        positive; what reached a bound, is not determined, or was frozen; and noise levels that were estimated, with
-        intervals of χ²."""
+        """Parameters and starts with linearized intervals on the coordinates' scale, so that intervals of positive
+        parameters are positive. Notes mark values that reached a bound, are not determined, or were frozen. Estimated
+        noise levels have χ² intervals."""
         noise = noise_intervals(self.objective, self.minimum, self.root, level)
         return intervals(self.objective, self.point, self.spread, self.quantile(level), level, noise)
 
@@ -219,8 +218,8 @@ class Estimate:
         return identifiability(self.objective, m.weights, m.found, m.z, self.minimum.noise)
 
     def profile(self, names: Sequence[str] | str, level: float = 0.95) -> dict[str, tuple[float, float]]:
-        """Intervals by profile likelihood: the values between which the cost, with everything else fitted anew, stays
-        within half the quantile of χ² of the least. They need no linearization; infinite ends are not determined.
+        """Intervals by profile likelihood: inside them the cost, with everything else refitted, exceeds the minimum by
+        less than half a quantile of χ². They need no linearization. An infinite end is not determined.
 
         Noise levels and precisions stay as found.
         """
@@ -252,14 +251,15 @@ class Estimate:
         along: str | Callable[[Any], Any] | None = None,
         level: float = 0.95,
     ) -> Band:
-        """A learned law over a grid, with its spread and the region that the experiments explored.
+        """A learned law over a grid, with its spread and the explored region.
 
         **Arguments:**
 
-        - `name`: of a network or sensor law that was trained.
+        - `name`: the name of a trained network or sensor law.
         - `grid`: shape `(n,)`, or `(n, inputs)`.
         - `law`: `law(network, u)` at one grid point, a number; default: the network's first output.
-        - `along`: what is explored: a variable's name, or a function of a solution; default: the network's inputs.
+        - `along`: the quantity whose explored range is shown: a variable's name, or a function of a solution; default:
+            the network's inputs.
         """
         return band(self, name, grid, law, along, self.quantile(level))
 
@@ -271,17 +271,17 @@ class Estimate:
 
         **Arguments:**
 
-        - `ts`: times, increasing, from its start on; default: its own.
-        - `experiment`: the place or name of one of the problem's, or a new one. What is unknown of a new one's start is
-            fitted to its samples, with all else as found.
-        - `first`: of how many rows of a new experiment; default: all.
+        - `ts`: increasing times from its start on; default: its own.
+        - `experiment`: the index or name of one of the problem's experiments, or a new experiment. Unknown starts of a
+            new experiment are fitted to its samples, and everything else is kept.
+        - `first`: the number of rows of a new experiment to which its unknown starts are fitted; default: all.
         """
         objective, point, root, experiment = self._under(experiment, first)
         return prediction(objective, point, root, names, ts, experiment, self.quantile(level))
 
     def score(self, experiment: Experiment, *, first: int | None = None) -> Score:
-        """How well the samples of a new experiment are met, those of its `first` rows included, to which its unknown
-        start is fitted (default: to all).
+        """Scores the prediction of a new experiment. Its unknown starts are fitted to its `first` rows (default: all),
+        which count, too.
 
         ```python
         print(fit.score(learning.Experiment(ts, {"pend.x": x}, initial={"pend.theta": 0.3})))
@@ -299,29 +299,30 @@ class Estimate:
         return new.objective, new.point, new.root, 0
 
     def explored(self, name: str, along: str | Callable[[Any], Any] | None = None) -> Float[np.ndarray, "inputs 2"]:
-        """From the least to the greatest value that the experiments saw of each input of a learned law, or of what
-        `along` names."""
+        """The range of values that the experiments contain, of each input of a learned law, or of the quantity
+        `along`."""
         return explored(self, name, along)
 
     def sample(self, draws: int = 500, *, chains: int = 4, warmup: int = 150, seed: int = 0) -> "Posterior":
-        """Samples of the posterior, of the density whose maximum the fit found, where intervals from a linearization do
-        not do: by the No-U-Turn sampler (Hoffman & Gelman 2014), extra `bayes`.
+        """Samples of the posterior density, whose maximum is the fit, by the No-U-Turn sampler (Hoffman & Gelman 2014;
+        extra `bayes`). Use it if intervals from a linearization are not good enough.
 
-        Coordinates, bounds and priors are those of the fit; noise levels that are estimated are sampled too. Precisions
-        of weights that the data chose stay as found. Steps are scaled by the linearized covariance. Each gradient costs
-        as much as a Jacobian of the fit, and a draw of parameters takes some three to seven of them; networks of many
-        weights take hundreds, and their chains may not come together.
+        Coordinates, bounds and priors are those of the fit; estimated noise levels are sampled, too. Precisions of
+        weights keep their estimated values. Steps are scaled by the linearized covariance. Each gradient costs as much
+        as a Jacobian of the fit. A draw of parameters takes three to seven gradients; networks with many weights take
+        hundreds, and their chains may not agree.
 
         **Arguments:**
 
         - `draws`: of each chain.
-        - `chains`: each begins elsewhere around the estimate; whether they agree says whether draws are enough.
-        - `warmup`: steps before these, in which the length of steps is found.
-        - `seed`: of all random numbers.
+        - `chains`: the number of chains. Each begins at another point around the estimate, and their agreement shows
+            whether there are enough draws.
+        - `warmup`: the number of steps before them, which adapt the step length.
+        - `seed`: the seed of all random numbers.
 
         **Raises:**
 
-        - `ModelError` where the density has no finite integral, with the names of what neither data, priors nor bounds
+        - `ModelError` if the density has no finite integral; the text names what neither data, priors nor bounds
             determine.
         - `SimulationError` if runs fail all around the estimate.
         - `ImportError` without BlackJAX.
@@ -333,24 +334,24 @@ class Estimate:
     def filtered(
         self, names: str | Sequence[str], experiment: int | str | Experiment = 0, level: float = 0.95
     ) -> Prediction:
-        """Any variables at the times of an experiment, from its samples up to each of them, with bands of the states'
-        covariance, to which the parameters' uncertainty is not added; of `method=Filter(...)`.
+        """Estimates of any variables at the times of an experiment, each from the samples up to that time. Needs
+        `method=Filter(...)`. Bands follow from the covariance of the states, without the uncertainty of parameters.
 
-        Where nothing was measured, these are predictions: with NaN in the last hours, a forecast of those.
+        Rows without measurements are predictions: with NaN in the last hours, the result is a forecast.
         """
         return self._followed(names, experiment, "filtered", 1, level)
 
     def smoothed(
         self, names: str | Sequence[str], experiment: int | str | Experiment = 0, level: float = 0.95
     ) -> Prediction:
-        """As `filtered`, from all samples of the experiment, later ones included (Rauch, Tung & Striebel 1965)."""
+        """As `filtered`, but from all samples of the experiment, including later ones (Rauch, Tung & Striebel 1965)."""
         return self._followed(names, experiment, "smoothed", 1, level)
 
     def ahead(
         self, names: str | Sequence[str], steps: int = 1, experiment: int | str | Experiment = 0, level: float = 0.95
     ) -> Prediction:
-        """As `filtered`, from samples that are at least `steps` rows old, NaN in the first `steps` rows if there are
-        more than one; of `method=Innovations(...)` too, without bands."""
+        """As `filtered`, but from samples that are at least `steps` rows old. The first `steps` rows are NaN if `steps`
+        is above one. Also works with `method=Innovations(...)`, without bands."""
         return self._followed(names, experiment, "ahead", steps, level)
 
     def _followed(self, names: str | Sequence[str], experiment: Any, how: str, steps: int, level: float) -> Any:
@@ -359,13 +360,13 @@ class Estimate:
 
     @property
     def log_likelihood(self) -> float:
-        """ln L of the samples that were fitted, without priors: of models with p coordinates and n samples, that of the
-        least 2p − 2 ln L (Akaike) or p ln n − 2 ln L (Schwarz) is to be preferred."""
+        """ln L of the fitted samples, without priors. Prefer the model with the smallest 2p − 2 ln L (Akaike) or p ln n
+        − 2 ln L (Schwarz), for p coordinates and n samples."""
         return log_likelihood(self.minimum)
 
     def discover(self, name: str, terms: Any, *, width: int = 3, most: int = 3) -> Discovery:
-        """Closed forms in a network's place: combinations of terms, refitted through the model on the data, with all
-        else that is estimated, and compared by BIC.
+        """Replaces a network by closed forms: combinations of terms that are refitted to the data through the model,
+        together with all other unknowns, and compared by BIC.
 
         ```python
         law = fit.discover("drag", learning.powers(4))
@@ -375,10 +376,10 @@ class Estimate:
 
         **Arguments:**
 
-        - `name`: of a network that was trained, by `learned` or as a `NeuralDAEBlock`.
+        - `name`: the name of a trained network, from `learned` or a `NeuralDAEBlock`.
         - `terms`: `learning.powers(4)`, `learning.terms("v*Abs(v)", "tanh(v/0.1)")`, or both, joined by +.
-        - `width`: how many forms of each number of terms are carried on to the next.
-        - `most`: how many terms a form has at most.
+        - `width`: the number of forms of each length that the search extends further.
+        - `most`: the largest number of terms of a form.
 
         **Raises:**
 
@@ -388,8 +389,8 @@ class Estimate:
         return discover(self, name, terms, width, most)
 
     def plot(self, names: str | Sequence[str] | None = None, *, axes: Any = None, level: float = 0.95) -> Any:
-        """Draws samples, and fitted runs with their bands at the times of the samples: rows of axes for names, columns
-        for experiments (the first four of them); returns Matplotlib axes."""
+        """Draws samples, and fitted runs with their bands at the times of the samples. Rows of axes are names; columns
+        are the first four experiments. Returns Matplotlib axes."""
         outputs, spread = self.at_samples
         return plot_runs(self.objective, outputs, self.quantile(level) * spread, names, axes)
 
@@ -398,7 +399,7 @@ class Estimate:
         return plot_residuals(self.objective, self.minimum, axes)
 
     def plot_history(self, ax: Any = None) -> Any:
-        """Draws how the misfit came down; returns Matplotlib axes."""
+        """Draws the misfit over the steps; returns Matplotlib axes."""
         return plot_history(self.minimum, ax)
 
     def plot_correlations(self, ax: Any = None) -> Any:
