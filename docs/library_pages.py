@@ -40,6 +40,7 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
     "TransferFunction": {"numerator": [1.0], "denominator": [1.0, 1.0]},
 }
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+SHARED = {"one_axis"}  # modules of classes that domains share; a component needs a domain
 TITLE = "Library"
 WIDTH = 80  # letters in a line of code at 1280 px
 
@@ -65,7 +66,7 @@ def classes_of(domain: str) -> list[type[Component]]:
 
 def domains() -> list[str]:
     """The domains that have components, signals last."""
-    names = [m.name for m in pkgutil.iter_modules(jaxonomy_dae.library.__path__)]
+    names = [m.name for m in pkgutil.iter_modules(jaxonomy_dae.library.__path__) if m.name not in SHARED]
     return sorted((n for n in names if classes_of(n)), key=lambda n: (n == "signal", n))
 
 
