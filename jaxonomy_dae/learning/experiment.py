@@ -22,9 +22,9 @@ UNEVEN = 1e-3  # of a time step, by which steps may differ and still count as ev
 class Unknown:
     """A start that is estimated.
 
-    - `guess`: where the search begins.
-    - `spread`: the standard deviation of a normal prior around the guess; None: nothing is known beforehand.
-    - `shared`: whether all experiments have the same value, or each its own.
+    - `guess`: the start of the search.
+    - `spread`: the standard deviation of a normal prior around the guess; None: no prior.
+    - `shared`: whether all experiments share one value.
     """
 
     guess: float
@@ -46,21 +46,21 @@ class Experiment:
     - `data`: by the variables' names, shape `(n,)`, or `(n, *shape)` for the name of an array; NaN where there is no
         sample.
     - `sigma`: standard deviations of the noise, by name or one number for all, in the variables' units: numbers, or
-        arrays with one for each sample, as `0.01 + 0.02 * abs(y)` for errors in part relative; or `"estimate"`: found
-        from the residuals, one for each name, the same in all experiments.
+        arrays with one value for each sample, such as `0.01 + 0.02 * abs(y)` for partly relative errors; or
+        `"estimate"`: estimated from the residuals, one for each name, the same in all experiments.
     - `inputs`: by name, `(times, values)`, or with `"held"` or `"cubic"` as a third entry, or a constant.
-    - `initial`: values at `t0` by variables' names, known (numbers) or `Unknown`. A parameter's name gives this
-        experiment its own value of it.
-    - `weight`: how often the record counts.
-    - `holdout`: kept out of the fit, and used to score it. Of its own it keeps unknown starts alone, which are fitted
-        to it with everything else held.
-    - `t0`: the time at which it starts.
-    - `name`: what reports call it.
+    - `initial`: values at `t0` by variables' names, known (numbers) or `Unknown`. The name of a parameter gives this
+        experiment a value of its own.
+    - `weight`: the weight of the record.
+    - `holdout`: whether to keep the record out of the fit and score the fit with it. Only its own unknown starts are
+        fitted to it, with everything else held.
+    - `t0`: the time at which the experiment starts.
+    - `name`: the name in reports.
 
     **Raises:**
 
-    - `ModelError` for times that do not increase or lie before `t0`, for shapes that do not fit, and for data that are
-        infinite, by variable and index.
+    - `ModelError` if times do not increase or lie before `t0`, if shapes do not fit, and if data are infinite; the text
+        names variable and index.
     """
 
     times: Any
@@ -114,7 +114,7 @@ class Experiment:
         inputs: Mapping[str, Any] | None = None,
         **others: Any,
     ) -> "Experiment":
-        """A record from a data frame of pandas, or anything that has columns by name.
+        """A record from a pandas data frame, or from any object with columns by name.
 
         **Arguments:**
 
@@ -149,12 +149,12 @@ class Experiment:
     # --- parts of a record, and coarser ones ---------------------------------------------------------------------
 
     def window(self, start: float, end: float, initial: Mapping[str, Any] | None = None) -> "Experiment":
-        """The samples from `start` to `end`, as an experiment that begins at `start`; `initial` in place of the values
-        that were known at `t0`.
+        """The samples from `start` to `end`, as an experiment that begins at `start`. `initial` replaces the values
+        known at `t0`.
 
         **Raises:**
 
-        - `ModelError` where there are no samples, or values are known at `t0` and not at `start`.
+        - `ModelError` if there are no samples, or if values are known at `t0` but not at `start`.
         """
         if not (is_finite(start) and is_finite(end) and self.t0 <= start < end):
             raise ModelError(f"window: start and end are times, {self.t0:g} ≤ start < end; got {start!r} and {end!r}")
@@ -173,8 +173,9 @@ class Experiment:
         return self.changed(times=self.times[rows], data=data, sigma=sigma, initial=dict(self.initial) | new, t0=start)
 
     def resample(self, times: Any) -> "Experiment":
-        """The record at other times, by linear interpolation; NaN where a neighbour is missing, and outside of it.
-        Noise of samples that share a neighbour is no longer independent: for fewer samples, `decimate`."""
+        """The record at other times, by linear interpolation. Samples are NaN if a neighbour is missing, and outside
+        the record. Samples with a common neighbour no longer have independent noise; use `decimate` to reduce the
+        number of samples."""
         new = _times(times, self.t0)
         if len(self.times) < 2:
             raise ModelError("resample: a record of one sample cannot be interpolated")
@@ -188,12 +189,12 @@ class Experiment:
         return self.changed(times=new, data=self._each(between))
 
     def decimate(self, factor: int) -> "Experiment":
-        """Every `factor`-th sample, after a low-pass filter without delay, so that faster oscillations and noise are
-        not taken for slow ones. Known noise levels shrink as those of white noise do.
+        """Every `factor`-th sample, after a low-pass filter without delay against aliasing. Known noise levels decrease
+        as for white noise.
 
         **Raises:**
 
-        - `ModelError` for steps of time that are not even, and for missing samples.
+        - `ModelError` for uneven sampling times and for missing samples.
         """
         whole_number(factor, "decimate: factor")
         steps = np.diff(self.times)
@@ -209,8 +210,8 @@ class Experiment:
         return self.changed(times=self.times[::factor], data=data, sigma=sigma)
 
     def detrend(self, names: str | Sequence[str] | None = None, degree: int = 1) -> "Experiment":
-        """The record less a polynomial trend of least squares: of all signals, or of those named; degree 0 takes their
-        means away."""
+        """The record without a polynomial trend (least squares), for all signals or the named ones. Degree 0 removes
+        the means."""
         chosen = list(self.data) if names is None else [names] if isinstance(names, str) else list(names)
         whole_number(degree, "detrend: degree", least=0)
         for name in chosen:
@@ -238,7 +239,7 @@ class Experiment:
         return found
 
     def changed(self, **changes: Any) -> "Experiment":
-        """A copy with other fields; noise levels that are to be estimated stay so."""
+        """A copy with other fields. Noise levels that are estimated are still estimated."""
         levels = changes.get("sigma", self.levels)
         sigma = {
             name: ESTIMATE if np.ndim(level) == 0 and math.isnan(level) else level for name, level in levels.items()
@@ -347,10 +348,10 @@ def _cells(texts: list[str]) -> Any:
 class Planned:
     """An experiment that could be made, for `learning.next_experiment`.
 
-    - `times`: when it would be sampled, increasing, shape `(n,)`.
-    - `measure`: what would be measured, the standard deviation of the noise by variables' names, in their units.
-    - `inputs`, `initial`, `weight`, `t0`, `name`: as in `Experiment`. An unknown start is of no use by itself, and is
-        allowed for: the samples must determine it too.
+    - `times`: the sampling times, increasing, shape `(n,)`.
+    - `measure`: the standard deviations of the noise by the names of the measured variables, in their units.
+    - `inputs`, `initial`, `weight`, `t0`, `name`: as in `Experiment`. An unknown start reduces the expected
+        information, because the samples must determine it, too.
     """
 
     times: Any

@@ -34,13 +34,13 @@ class Filter:
 
     - `noise`: by names of states, σ in the state's unit per √second; by names of inputs, the intensity of white noise ν
         that is added to the input, in the input's unit times √second: a force on a mechanism, whose constraints then
-        hold exactly. Each a number, `"estimate"`, or `Unknown(guess)`, which is estimated, with `spread` the relative
-        standard deviation of a prior. The name of an array stands for each of its entries.
-    - `substeps`: into how many parts the time between samples is cut. The flow and its derivatives are exact at any
-        distance; the noise that is gathered on the way is integrated with a Jacobian that is constant over each part.
+        hold exactly. Each is a number, `"estimate"`, or `Unknown(guess)`. An `Unknown` is estimated, and its `spread`
+        is the relative standard deviation of a prior. The name of an array stands for each of its entries.
+    - `substeps`: the number of parts between two samples. The flow and its derivatives are exact at any distance. The
+        integral of the noise assumes a constant Jacobian over each part.
 
-    Starts that are `Unknown(guess, spread)` have the normal prior of Kalman's filter, and are not searched; those
-    without a spread are estimated. Noise levels of measurements that are to be estimated are coordinates too.
+    Starts that are `Unknown(guess, spread)` get the normal prior of a Kalman filter and are not searched. Starts
+    without a spread are estimated. Estimated noise levels of measurements are coordinates, too.
     """
 
     noise: Mapping[str, Any]
@@ -59,15 +59,15 @@ class Filter:
 @dataclasses.dataclass(frozen=True)
 class Innovations:
     """Predictions one step ahead, for `Problem(method=...)`: each sample moves the states by a constant gain K times
-    what it deviates from its prediction (the prediction-error form; Ljung 1999, System Identification, section 4.3),
+    the prediction error (the prediction-error form; Ljung 1999, System Identification, section 4.3),
 
         x ← x + K (y − ŷ),
 
-    and the sum of squared prediction errors is least. It is less than a filter, whose gain follows from noise levels,
-    but needs no covariance, and its cost for each step is that of simulation.
+    and the sum of squared prediction errors is minimized. The gain does not follow from noise levels as in a filter.
+    But no covariance is needed, and a step costs as much as in a simulation.
 
-    - `gain`: `"estimate"`, of every differential state by every output; or by pairs of names (state, output), a number,
-        `"estimate"` or `Unknown(guess, spread)`; other entries of K are zero.
+    - `gain`: `"estimate"` for all differential states and outputs; or for pairs of names (state, output) a number,
+        `"estimate"` or `Unknown(guess, spread)`. All other entries of K are zero.
     """
 
     gain: Mapping[tuple[str, str], Any] | str = ESTIMATE

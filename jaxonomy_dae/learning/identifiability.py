@@ -36,14 +36,15 @@ class Direction:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Identifiability:
-    """The report, to be printed.
+    """A printable report.
 
-    - `spectrum`: eigenvalues of the scaled Fisher information, the greatest first; 1/√ of each is the standard
-        deviation of its direction, relative to what is natural.
-    - `directions`: those not determined.
-    - `alone`, `together`: standard deviations of parameters and starts, on the coordinates' scale, if all else were
-        known, and as it is.
-    - `confounded`: for each, the other name whose knowledge would help most, and to which standard deviation.
+    - `spectrum`: eigenvalues of the scaled Fisher information, the greatest first. The standard deviation of a
+        direction is 1/√ of its eigenvalue, in natural units of the coordinates.
+    - `directions`: the directions that the data do not determine.
+    - `alone`, `together`: standard deviations of parameters and starts on the coordinates' scale: conditional on all
+        others, and marginal.
+    - `confounded`: for each name, the other name whose exact value would help most, and the standard deviation that
+        would remain.
     """
 
     spectrum: Float[np.ndarray, " k"]

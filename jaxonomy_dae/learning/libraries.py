@@ -36,7 +36,7 @@ class Library:
 
 
 def powers(highest: int) -> Library:
-    """The terms v, v|v|, v|v|², …, v|v|^(highest−1): what friction and drag are made of.
+    """The terms v, v|v|, v|v|², …, v|v|^(highest−1): the usual terms of friction and drag.
 
     For a block of several inputs and as many outputs, v is the vector of its inputs and |v| its length, and each term
     has one coefficient.
@@ -51,20 +51,20 @@ def powers(highest: int) -> Library:
 
 
 def terms(*expressions: Any, **functions: Callable[..., Any]) -> Library:
-    """Terms as one writes them.
+    """Terms from expressions and functions.
 
     **Arguments:**
 
     - `expressions`: SymPy expressions or texts, `"v*Abs(v)"`, `"tanh(v/0.1)"`, in the names of the block's inputs, full
-        (SymPy symbols) or without their component; a block of one input takes any one symbol. For a block of several
-        outputs, a tuple of one for each is one term; a single expression is one term for each output, each with
-        its own coefficient.
+        (SymPy symbols) or without their component. A block of one input accepts any symbol. For a block of several
+        outputs, a tuple with one expression for each is one term; a single expression is one term for each output, each
+        with its own coefficient.
     - `functions`: JAX functions by name, `plateau=lambda v: jnp.tanh(v / 0.1)`, called with a scalar for each input;
         they return a scalar, as a single expression, or one value for each output.
 
     **Raises:**
 
-    - `ModelError` for what is neither; when used, for symbols that are no inputs.
+    - `ModelError` for other arguments; when used, for symbols that are not inputs.
     """
     entries: list[Any] = []
     for given in expressions:

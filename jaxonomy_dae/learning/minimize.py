@@ -30,7 +30,7 @@ Model = TypeVar("Model", bound=eqx.Module)
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Minimized(Generic[Model]):
-    """The outcome of `minimize`.
+    """The result of `minimize`.
 
     - `model`: the best iterate, of the same structure as the model given.
     - `last`: the last iterate.
@@ -69,29 +69,29 @@ def minimize(
 ) -> Minimized[Model]:
     """Minimizes any loss by gradient steps; keeps the best iterate.
 
-    This is for what is no fit to records: the losses of a converter, the misses of a controller, the cost of a house.
-    Records are fitted by `Problem`, which takes far better steps and returns intervals.
+    Use it for losses that are not fits to records: the losses of a converter, the error of a controller, the cost of a
+    house. Fit records with `Problem`, which takes far better steps and returns intervals.
 
-    Declared bounds of parameters hold in every iterate: a step is projected onto a closed end, and towards an open end
-    goes nine tenths of the way at most. A parameter that is an expression in trained ones may leave its bounds, which a
-    `RuntimeWarning` then says.
+    Declared bounds of parameters hold in every iterate: a step is projected onto a closed end, and goes at most nine
+    tenths of the way to an open end. A parameter that is an expression in trained ones may leave its bounds; a
+    `RuntimeWarning` then says so.
 
     **Arguments:**
 
     - `model`: an `AcausalSystem`, or any Equinox module, such as a controller whose loss simulates a system.
     - `loss`: `loss(model, *args)`, a scalar; it is compiled once, with its gradient and the update.
     - `optimizer`: such as `optax.adam(0.02)`.
-    - `steps`: how many updates.
+    - `steps`: the number of updates.
     - `train`: for a system, names of networks and parameters (default: all its networks); for another module, a filter
         as in `equinox.partition` (default: all its inexact arrays).
-    - `args`: further arguments of the loss, such as a system. Arrays among them may change without compiling anew.
+    - `args`: further arguments of the loss, such as a system. New values of arrays among them compile nothing.
     - `progress`: shows a bar with the loss.
 
     **Returns:**
 
-    A `Minimized`. If the loss or its gradient is not finite, the steps stop with a `RuntimeWarning`, which says why
-    where a simulation inside fails, and the best iterate so far is returned. Another one names trained parameters
-    that nothing in the model reads.
+    A `Minimized`. If the loss or its gradient is not finite, the steps stop with a `RuntimeWarning`, and the best
+    iterate so far is returned. The warning gives the reason if a simulation failed. Another warning names trained
+    parameters that nothing in the model reads.
 
     **Raises:**
 

@@ -39,11 +39,11 @@ ROUNDED = 1e-12  # relative rounding errors of a segment's Jacobian, of some tho
 class Shooting:
     """Multiple shooting (Bock 1981), for `Problem(method=...)`.
 
-    - `nodes`: into how many segments each experiment's time is cut. Over a segment, the model should not amplify
-        errors by much more than ten.
+    - `nodes`: the number of segments of each experiment. Over one segment, the model should amplify errors by at most
+        about ten.
 
-    The differential states at the nodes are unknowns; they begin at smoothed samples where they, or their integrals,
-    were measured. For models with hidden constraints, nodes move along these.
+    The differential states at the nodes are unknowns; they begin at smoothed samples if they, or their integrals, were
+    measured. With hidden constraints, nodes move along the constraints.
     """
 
     nodes: int = 30

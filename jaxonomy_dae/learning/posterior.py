@@ -29,14 +29,14 @@ ENOUGH = 400  # effective draws for means and intervals (as above)
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Posterior:
-    """Draws of all that was estimated, from `Estimate.sample`.
+    """Draws of all estimated quantities, from `Estimate.sample`.
 
     - `points`: all coordinates, as `estimate.objective.coordinates` names them, shape `(chains, draws, p)`.
     - `sigma`: noise levels that were estimated, by name, shape `(chains, draws)`.
-    - `log_density`: ln p but for a constant, shape `(chains, draws)`.
-    - `diverged`: of each chain, how many trajectories went astray: in corners that it cannot turn, so that what is
-        beyond them is missing.
-    - `steps`: of each chain, how many gradients it took.
+    - `log_density`: ln p up to a constant, shape `(chains, draws)`.
+    - `diverged`: the number of diverging trajectories of each chain. They occur in sharp corners of the density, and
+        the region beyond is then missing.
+    - `steps`: the number of gradients of each chain.
 
     `posterior["pend.L"]` are the values of a parameter, start, weight or noise level, shape `(chains, draws)`.
     """
@@ -92,7 +92,7 @@ class Posterior:
 
     @property
     def mixed(self) -> bool:
-        """True if the draws can be relied on: chains agree, there are enough, and no trajectory went astray."""
+        """True if the draws are reliable: chains agree, there are enough draws, and no trajectory diverged."""
         return not self._complaints
 
     @functools.cached_property
@@ -117,8 +117,8 @@ class Posterior:
         return "\n".join([head, *self._complaints])
 
     def table(self, level: float = 0.95) -> Table:
-        """A table of parameters, starts and noise levels: medians, and intervals with the same share of draws left out
-        on both sides. It names those on which chains disagree."""
+        """A table of parameters, starts and noise levels: medians and intervals with equal tails. It marks quantities
+        on which chains disagree."""
         c, rows = self.estimate.objective.coordinates, []
         units = dict(zip(c.names, c.units, strict=True))
         weights = {name for name, w in zip(c.names, c.is_weight, strict=True) if w and name.endswith("]")}
@@ -139,8 +139,7 @@ class Posterior:
         self, names: str | Sequence[str], ts: Any = None, experiment: int | str = 0, level: float = 0.95,
         draws: int = 200,
     ) -> Prediction:  # fmt: skip
-        """Any variables under the conditions of an experiment, as `Estimate.predict`, but from runs at so many of the
-        draws: their mean, standard deviation and quantiles."""
+        """As `Estimate.predict`, but from runs at several draws: their mean, standard deviation and quantiles."""
         objective, k, chosen, conditions = under(self.estimate.objective, names, ts, experiment)
         points = self._thinned(draws)
         parts = [objective.numbers(objective.coordinates.natural(point)) for point in points]
@@ -157,7 +156,7 @@ class Posterior:
         self, name: str, grid: Any, law: Callable | None = None, along: Any = None, level: float = 0.95,
         draws: int = 200,
     ) -> Band:  # fmt: skip
-        """A learned law over a grid, as `Estimate.band`, but from so many of the draws."""
+        """As `Estimate.band`, but from several draws."""
         module, law, called = law_of(self.estimate, name, grid, law)
         c = self.estimate.objective.coordinates
         columns = np.array([g == name for g in c.group]) & c.is_weight

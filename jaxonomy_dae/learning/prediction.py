@@ -17,8 +17,8 @@ from .program import Conditions, predict_and_differentiate
 
 @dataclasses.dataclass(frozen=True)
 class Prediction:
-    """Variables by name at `ts`: `mean`, the standard deviation `spread` that the estimate's uncertainty makes, and the
-    band from `low` to `high`, each of shape `(n,)`. The noise of measurements comes on top."""
+    """Variables by name at `ts`: `mean`, the standard deviation `spread` from the uncertainty of the estimate, and the
+    band from `low` to `high`, each of shape `(n,)`. The noise of measurements is not included."""
 
     ts: Float[np.ndarray, " n"]
     mean: dict[str, np.ndarray]

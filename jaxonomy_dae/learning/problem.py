@@ -40,10 +40,10 @@ GROWING = tuple(k / 10 for k in range(1, 11))  # shares of the time
 
 
 class Problem:
-    """Parameters, networks, sensor laws and starts of a system, to be learned from experiments.
+    """Parameters, networks, sensor laws and starts of a system that are learned from experiments.
 
-    The program behind it is compiled once, at the first fit: other data of the same shapes, noise levels, starts,
-    bounds, frozen values and weights of priors are arguments of it.
+    Its program is compiled once, at the first fit. Other data of the same shapes, noise levels, starts, bounds, frozen
+    values and weights of priors compile nothing.
 
     **Arguments:**
 
@@ -68,8 +68,8 @@ class Problem:
 
     **Raises:**
 
-    - `ModelError` for names that do not exist, for a trainable without numbers, for a parameter that nothing in the
-        model reads, for an unknown start of an algebraic variable, and for data that do not fit.
+    - `ModelError` for unknown names, for a trainable without numbers, for a parameter that nothing in the model reads,
+        for an unknown start of an algebraic variable, and for data that do not fit.
     """
 
     def __init__(
@@ -128,7 +128,7 @@ class Problem:
         return stacked
 
     def layout_of(self, stacked: Stacked) -> Layout:
-        """The names of the numbers that a program for these data takes and returns."""
+        """The names of arguments and results of a program for these data."""
         parameters, modules = self.trained
         _, extras = self.errors(stacked)
         shared, own, known = [], [], []
@@ -177,8 +177,8 @@ class Problem:
         observe: Mapping[str, Any] | None = None,
         adjoint: Any = None,
     ) -> dict[str, dict[str, Any]]:
-        """Predictions less data by experiment and name, in units of the noise where it is known, zero where there is
-        no sample: for losses of one's own, inside jit and grad too.
+        """Predictions minus data by experiment and name, in units of the noise if it is known, and zero where there is
+        no sample. Use them in losses of your own, also inside jit and grad.
 
         **Arguments:**
 
@@ -224,34 +224,36 @@ class Problem:
         steps: int = 200,
         warn: bool = True,
     ) -> Estimate:
-        """The most probable values: least squares in units of the noise, with the priors that were given.
+        """Finds the most probable values, by least squares in units of the noise with the given priors.
 
         **Arguments:**
 
-        - `data`: other data than the problem's. If they have the same shapes and unknown starts, nothing is compiled.
-        - `freeze`: parameters, starts and networks that stay as they are, or `{name: value}`.
-        - `start`: where the search begins, values by name; or a system, such as that of an earlier estimate; or what
-            `train` returned.
+        - `data`: other data than the problem's. Data with the same shapes and unknown starts compile nothing.
+        - `freeze`: parameters, starts and networks that keep their values, or `{name: value}`.
+        - `start`: the start of the search: values by name, a system such as that of an earlier estimate, or a result of
+            `train`.
         - `bounds`: narrower than those declared, by name.
-        - `first`: steps of an optimizer of Optax before those of least squares; `estimate.training` is their history.
-        - `starts`: from how many points; all but the first are drawn around it by `seed`: parameters within a factor of
-            e or their bounds, starts by their spread, networks with weights of the same sizes. The best is the one to
-            which experiments that are held out are most likely, or else, and for a `Filter`, those that are fitted.
-        - `adam`: so many gradient steps at first, with `learning_rate` on the scale of the coordinates.
-        - `horizons`: shares of the time that are fitted one after the other, such as `(0.25, 0.5, 1)`: what diverges
-            over the whole time is caught early. Over a part, inner layers stay close to where they are, as far as
-            the data let them. None: all of it, or with `method="growing"`, ten of them.
+        - `first`: steps of an Optax optimizer before least squares; `estimate.training` is their history.
+        - `starts`: the number of starting points. All but the first are drawn around it by `seed`: parameters within a
+            factor of e or their bounds, starts by their spread, networks with weights of the same sizes. The best
+            result is the one with the greatest likelihood of held-out experiments, or without any, and for a `Filter`,
+            of fitted ones.
+        - `adam`: the number of gradient steps before least squares, with `learning_rate` on the scale of the
+            coordinates.
+        - `horizons`: shares of the record that are fitted one after the other, such as `(0.25, 0.5, 1)`, against runs
+            that diverge over the whole record. Over a part, inner layers of networks stay close to their start if the
+            data allow it. None: the whole record, or with `method="growing"`, ten shares.
         - `steps`: the largest number of steps of least squares.
-        - `warn`: whether a `FitWarning` tells the `reasons` for which the estimate is not `ok`.
+        - `warn`: whether a `FitWarning` gives the `reasons` if the estimate is not `ok`.
 
-        Where `start`, `first`, `adam` and `horizons` are left out, networks begin at their own weights or with a last
-        layer of zero, whichever is closer to the data, and if both are far from them, horizons grow. Where no step
-        gains, the search measures the error of the integration, and tightens its tolerances if it is in the way.
+        Without `start`, `first`, `adam` and `horizons`, networks begin at their own weights or with a last layer of
+        zero, whichever is closer to the data. If both are far from the data, horizons grow. If no step reduces the
+        cost, the search measures the error of the integration, and tightens the tolerances if that error is the cause.
 
         **Raises:**
 
         - `ModelError` for names, values and shapes that do not fit.
-        - `SimulationError` if no start can be simulated, with the reason of the first.
+        - `SimulationError` if no start can be simulated; the text gives the reason of the first.
         """
         objective = self._prepared(data, freeze, start, bounds)
         if first is not None and (adam or (starts > 1 and first.checkpoint is not None)):
@@ -297,10 +299,10 @@ class Problem:
         start: "Mapping[str, float] | AcausalSystem | Training | None" = None,
         bounds: Mapping[str, tuple[float, float]] | None = None,
     ) -> Training:
-        """Gradient steps alone, on the cost that `fit` minimises; arguments as there.
+        """Takes gradient steps only, on the cost of `fit` and with its arguments.
 
-        Noise levels that are to be estimated, and precisions of weights, stay what they are at the beginning. Go on
-        with `fit(start=training)`, which finds them.
+        Unknown noise levels and precisions of weights keep their first values. Continue with `fit(start=training)`,
+        which estimates them.
         """
         if not isinstance(how, GradientSteps):
             raise ModelError(f"train takes learning.GradientSteps(optax.adam(0.02), steps=200); got {how!r}")
@@ -360,7 +362,7 @@ class Problem:
         return smoother(objective, found, steps) or (objective, found)
 
     def reach(self, objective: Objective, start: np.ndarray, weights: Weights) -> Minimum | None:
-        """The minimum next to a start, with weights that stay as they are."""
+        """The minimum next to a start, with constant weights."""
         rtol = self._options["rtol"]
         if isinstance(self.method, Shooting):
             return shoot(objective, self.method, start, 200, rtol, weights)
@@ -377,13 +379,13 @@ class Problem:
         return run(objective, z, experiment, ts)
 
     def beginning_at(self, system: AcausalSystem) -> "Problem":
-        """A copy with other weights of its networks to begin with."""
+        """A copy whose networks begin at other weights."""
         other = copy.copy(self)
         other.system = system
         return other
 
     def with_law(self, name: str, law: Any, stacked: Stacked) -> "Problem":
-        """A copy with another law in a network's place, without a prior."""
+        """A copy with another law in place of a network, without a prior."""
         other = copy.copy(self)
         other.system = eqx.tree_at(lambda s: s.neural, self.system, self.system.neural | {name: law})
         other._stacked, other.penalties = stacked, self.penalties | {name: None}
@@ -396,7 +398,7 @@ class Problem:
     ) -> Identifiability:
         """The directions that the data could determine at the nominal values: the Fisher information, before any fit.
 
-        Noise levels that are to be estimated are taken as large as the residuals are at the start.
+        Unknown noise levels are assumed to be as large as the residuals at the start.
         """
         objective, weights, found, z = self.nominal(freeze, start)
         return identifiability(objective, weights, found, z, self._options["rtol"])

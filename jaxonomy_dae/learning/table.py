@@ -49,8 +49,8 @@ class Table:
         return "\n".join("  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in cells)
 
     def plot(self, ax: Any = None, *, true: Mapping[str, float] | None = None) -> Any:
-        """Draws the intervals relative to the values, with crosses at `true` values by name, where these are known;
-        returns Matplotlib axes."""
+        """Draws the intervals relative to the values, with crosses at the `true` values that are given by name; returns
+        Matplotlib axes."""
         rows = self.rows
         ax = new_axes(ax, 7.0, 0.38 * len(rows) + 1.2)
         for k, row in enumerate(rows):

@@ -133,8 +133,8 @@ class ClosedForm(AbstractReplacement):
     """f(u) = Σ c·φ(u) over terms φ, of shape `(outputs,)`.
 
     - `coefficients`: c, trained.
-    - `present`: which terms count. It is an array, and so an argument of compiled programs: with another choice,
-        nothing is compiled. What is absent is not evaluated at u, where it may be infinite, but at 1.
+    - `present`: the terms that count. It is an array and therefore an argument of compiled programs: another choice
+        compiles nothing. Absent terms are evaluated at 1 rather than at u, where they may be infinite.
     """
 
     coefficients: Float[Array, " terms"]
@@ -149,12 +149,12 @@ class ClosedForm(AbstractReplacement):
         return jnp.asarray(total)
 
     def chosen(self) -> "ClosedForm":
-        """A copy without the terms that are absent."""
+        """A copy without absent terms."""
         kept = np.flatnonzero(np.asarray(self.present))
         return ClosedForm(self.coefficients[kept], self.present[kept], tuple(self.terms[k] for k in kept))
 
     def expressions(self, *symbols: sympy.Symbol) -> tuple[sympy.Expr, ...]:
-        """The law of each output in symbols of the inputs: to be written into a component's equations, or read."""
+        """The law of each output in symbols of the inputs, for reading or for the equations of a component."""
         parts = [
             [sympy.Float(float(c)) * e for e in term.expressions(symbols)]
             for c, term, is_in in zip(self.coefficients, self.terms, np.asarray(self.present), strict=True)

@@ -25,21 +25,22 @@ from .runs import why_not
 
 @dataclasses.dataclass(frozen=True)
 class GradientSteps:
-    """How to train by gradients, for `Problem.train(...)` and `Problem.fit(first=...)`.
+    """Settings of training by gradients, for `Problem.train(...)` and `Problem.fit(first=...)`.
 
     - `optimizer`: of Optax, such as `optax.adam(0.02)` with a number or a schedule, or
         `optax.chain(optax.clip_by_global_norm(1.0), optax.adam(0.02))`. It moves the coordinates: logarithms of
         positive parameters, other numbers in units of their size.
-    - `steps`: how many updates.
-    - `batch`: how many experiments each step looks at; None: all, by the program that least squares uses. Experiments
-        are drawn by `seed`; a batch is another program, compiled once.
-    - `horizons`: shares of the time, each for an equal part of the steps.
-    - `patience`: with experiments held out, training ends after so many steps without a better score of these.
-    - `callback`: called after each step with an `Update`; what returns True ends the training.
-    - `checkpoint`: a file. Where it exists, training goes on from it, and ends as if it had not been interrupted, bit
-        for bit; it is written every `every` steps and at the end. The file tells the model, the data, the integration
-        and these settings; that the optimizer has the same rates is for the caller to see to.
-    - `every`: after how many steps the held-out experiments are scored, at the whole horizon, and checkpoints written.
+    - `steps`: the number of updates.
+    - `batch`: the number of experiments in each step, drawn by `seed`; None: all, with the program of least squares. A
+        batch needs another program, which is compiled once.
+    - `horizons`: shares of the record's length, each for an equal part of the steps.
+    - `patience`: training ends after this number of steps without a better score of held-out experiments.
+    - `callback`: called after each step with an `Update`. If it returns True, training ends.
+    - `checkpoint`: a file, written every `every` steps and at the end. If it exists, training continues from it and
+        ends bit for bit as without interruption. Other models, data, tolerances or settings are refused. The rates of
+        the optimizer are not compared: give the same ones.
+    - `every`: the number of steps between scores of held-out experiments, at the whole horizon, and between
+        checkpoints.
     """
 
     optimizer: optax.GradientTransformation
@@ -73,8 +74,8 @@ class GradientSteps:
 
 @dataclasses.dataclass(frozen=True)
 class Update:
-    """The argument of a callback after `step` updates: the `loss` before the last one, for each sample; the latest
-    `score` of experiments held out, NaN if there is none; and `values` by name."""
+    """The argument of a callback after `step` updates: the `loss` for each sample before the last update; the latest
+    `score` of held-out experiments, NaN if there is none; and `values` by name."""
 
     step: int
     loss: float
@@ -84,13 +85,15 @@ class Update:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Training:
-    """The outcome of `Problem.train`.
+    """The result of `Problem.train`.
 
-    - `z`: the best point, of the coordinates that are searched: that of the best score of experiments held out, or else
-        of the least loss at the whole horizon, or with batches, whose losses cannot be compared, the last one.
-    - `history`: the loss at each step, ½ (residual/σ)² for each sample, a batch's in proportion to its experiments.
+    - `z`: the best point in the searched coordinates: that with the best score of held-out experiments, or without any,
+        that with the least loss at the whole horizon. With batches, whose losses cannot be compared, it is the last
+        point.
+    - `history`: the loss at each step, ½ (residual/σ)² for each sample. The loss of a batch is scaled to all
+        experiments.
     - `scores`: `(steps, score)` of experiments held out.
-    - `step`: after how many updates the best point was reached.
+    - `step`: the number of updates to the best point.
     """
 
     objective: Objective
@@ -109,7 +112,7 @@ class Training:
         return values_at(self.objective, self.z)
 
     def plot(self, ax: Any = None) -> Any:
-        """Draws the history, and the scores of experiments held out; returns Matplotlib axes."""
+        """Draws the history and the scores of held-out experiments; returns Matplotlib axes."""
         ax = new_axes(ax)
         ax.semilogy(np.arange(len(self.history)), np.sqrt(2 * self.history), label="fitted")
         if len(self.scores[0]):

@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class Score:
-    """How well new data are met.
+    """The score of a prediction of new data.
 
     - `rms`: root mean square errors by name, in the variables' units.
-    - `relative`: the root mean square of all errors in units of the noise, about one where the model is right.
+    - `relative`: the root mean square of all errors in units of the noise: about one for a right model.
     - `log_likelihood`: ln L of these data.
     """
 

@@ -21,7 +21,7 @@ BELOW = 0.1  # of the noise that was stated: residuals below, of exact data, nee
 
 
 class FitWarning(UserWarning):
-    """A fit says why it cannot be relied on."""
+    """The warning of a fit that is not reliable. Its text gives the reasons."""
 
 
 def reasons(fit: "Estimate") -> tuple[str, ...]:

@@ -16,19 +16,20 @@ class Bounded(eqx.Module):
     """low ≤ f(u) ≤ high for all u and all weights: f = low + (high − low)·σ(g(u)), with the logistic σ of a tanh
     network g.
 
-    Because 0 < σ < 1; and in rounded numbers, because from each bound the nearer half of the range is counted with
-    σ(−g) = 1 − σ(g), so nothing is rounded beyond it.
+    The bounds hold because 0 < σ < 1. They hold in floating-point numbers, too, because each half of the range is
+    computed from its own bound, with σ(−g) = 1 − σ(g).
 
     **Arguments:**
 
     - `low`, `high`: the bounds, in the outputs' units, one number or one for each output.
-    - `in_size`, `out_size`: how many inputs and outputs there are.
+    - `in_size`, `out_size`: the numbers of inputs and outputs.
     - `key`: for the weights. `width`, `depth`: of the hidden layers.
-    - `inputs`: what they typically are, one number or one for each.
+    - `inputs`: typical sizes of the inputs, one number or one for each.
 
     **Raises:**
 
-    - `ModelError` for bounds that are not finite or do not ascend, and for counts and sizes that are not positive.
+    - `ModelError` for bounds that are not finite or not in ascending order, and for counts and sizes that are not
+        positive.
     """
 
     network: eqx.nn.MLP

@@ -14,16 +14,15 @@ from .network import divided, multiplied, sizes, tanh_network, typical
 class Conservative(eqx.Module):
     """F(x) = −∇V(x), with the potential V from a tanh network.
 
-    What F does along a path is V at its beginning less V at its end, whichever way the path goes: around a closed path
-    it does no work, because F is a gradient (its Jacobian, minus the Hessian of V, is symmetric). And V is bounded:
-    |V| ≤ 2 · energy · Σ|weights of the last layer|, for |tanh| ≤ 1 and V(0) = 0, so no path whatever draws more from
-    it.
+    The work of F along a path is V at its beginning minus V at its end. It is zero around a closed path, because F is a
+    gradient (its Jacobian, minus the Hessian of V, is symmetric). V is bounded: |V| ≤ 2 · energy · Σ|weights of the
+    last layer|, because |tanh| ≤ 1 and V(0) = 0. So no path can extract more energy.
 
     **Arguments:**
 
-    - `size`: how many entries x and F have.
+    - `size`: the number of entries of x and F.
     - `key`: for the weights. `width`, `depth`: of the hidden layers; depth ≥ 1.
-    - `inputs`: what x typically is, one number or one for each. `energy`: what V typically is (joule for forces and
+    - `inputs`: typical sizes of x, one number or one for each. `energy`: the typical size of V (joule for forces and
         positions in SI units).
 
     **Raises:**

@@ -18,18 +18,18 @@ class Dissipation(AbstractPassive):
     """f(e, x) = (J(x) − R(x)) e, linear in the efforts e, with R(x) symmetric and positive semidefinite and J(x) skew
     (van der Schaft & Jeltsema 2014, Port-Hamiltonian systems theory).
 
-    Efforts are velocities, voltages, pressures, …; f are the forces, currents, flows, … that answer, counted so that
-    f·e is the power that comes in. From the numbers W(x) of a tanh network, R = L D Lᵀ with L unit lower triangular and
-    D = diag(softplus(…)) ≥ 0, and J = U − Uᵀ. So eᵀ R e = Σ D (Lᵀ e)² ≥ 0 and eᵀ J e = 0, and f·e = −eᵀ R e ≤ 0
-    whatever the weights. All positive definite R and all skew J are of this form. In rounded numbers, f·e
-    exceeds zero by no more than the rounding of the products that it is summed of.
+    Efforts are velocities, voltages or pressures; f are the resulting forces, currents or flows, with signs such that
+    f·e is the power into the model. From the numbers W(x) of a tanh network, R = L D Lᵀ with L unit lower triangular
+    and D = diag(softplus(…)) ≥ 0, and J = U − Uᵀ. So eᵀ R e = Σ D (Lᵀ e)² ≥ 0 and eᵀ J e = 0, and f·e = −eᵀ R e ≤ 0
+    whatever the weights. All positive definite R and all skew J are of this form. In floating-point numbers, f·e
+    exceeds zero by no more than the rounding errors of its summands.
 
     **Arguments:**
 
-    - `size`: how many efforts there are; they are the first inputs.
-    - `states`: how many inputs x follow them; R and J are constant if there are none.
+    - `size`: the number of efforts, which are the first inputs.
+    - `states`: the number of inputs x after them. Without any, R and J are constant.
     - `key`: for the weights. `width`, `depth`: of the hidden layers.
-    - `inputs`: what e and x typically are, one number or one for each. `power`: what |f·e| typically is.
+    - `inputs`: typical sizes of e and x, one number or one for each. `power`: the typical size of |f·e|.
 
     **Raises:**
 

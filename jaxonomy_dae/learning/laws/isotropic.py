@@ -17,15 +17,15 @@ REST = 0.01  # of the typical input: below it, |v| is rounded off, so that N is 
 class IsotropicPassive(AbstractPassive):
     """N(v) = −k(|v|) v with k > 0 from a tanh network: the drag of still air, friction on a plane without grain.
 
-    Passive because N·v = −k |v|² ≤ 0, exactly also in rounded numbers, where each entry of N has the sign that its
-    entry of v has not. Turning v turns N. For |v|, the network is given √(|v|² + δ²) − δ with δ = 0.01·`inputs`, so
-    that N has derivatives of all orders at rest too.
+    It is passive because N·v = −k |v|² ≤ 0. This also holds exactly in floating-point numbers, where each entry of N
+    has the opposite sign of its entry of v. Rotating v rotates N. In place of |v|, the network gets √(|v|² + δ²) − δ
+    with δ = 0.01·`inputs`, so that N has derivatives of all orders at rest, too.
 
     **Arguments:**
 
-    - `size`: how many entries v and N have.
+    - `size`: the number of entries of v and N.
     - `key`: for the weights. `width`, `depth`: of the hidden layers.
-    - `inputs`, `power`: what |v| and |N·v| typically are.
+    - `inputs`, `power`: typical sizes of |v| and |N·v|.
 
     **Raises:**
 

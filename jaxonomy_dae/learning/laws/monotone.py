@@ -13,20 +13,19 @@ from .network import divided, multiplied, sizes
 
 
 class Monotone(eqx.Module):
-    """Each output rises, or stays, where an input rises; with `increasing=False`, where it falls.
+    """No output falls when an input rises; with `increasing=False`, no output rises.
 
     Hidden layers are h ← tanh(W h + b). The outputs are V h + S u + b, with the inputs u. All entries of W, V and S are
     squares of trained numbers, so they are ≥ 0. Sums with such weights, tanh, and their compositions do not fall where
-    their arguments rise, so ∂f/∂u ≥ 0 for all weights. All continuous monotone functions of k variables are
-    approximated on a bounded region with k hidden layers (Daniels & Velikova 2010, IEEE Trans. Neural Networks 21:906);
-    of one variable with one, whose steps add up.
+    their arguments rise, so ∂f/∂u ≥ 0 for all weights. With k hidden layers it approximates all continuous monotone
+    functions of k variables on a bounded region (Daniels & Velikova 2010, IEEE Trans. Neural Networks 21:906).
 
     **Arguments:**
 
-    - `in_size`, `out_size`: how many inputs and outputs there are.
+    - `in_size`, `out_size`: the numbers of inputs and outputs.
     - `increasing`: whether outputs rise with an input or fall, one for all or one for each input.
     - `key`: for the weights. `width`, `depth`: of the hidden layers.
-    - `inputs`, `outputs`: what they typically are, one number or one for each, in their units.
+    - `inputs`, `outputs`: typical sizes in their units, one number or one for each.
 
     **Raises:**
 

@@ -12,14 +12,14 @@ from .network import divided, multiplied, sizes, tanh_network
 class Odd(eqx.Module):
     """f(−u) = −f(u) for all u and all weights: f(u) = (g(u) − g(−u))/2 with a tanh network g.
 
-    Odd because f(−u) = (g(−u) − g(u))/2 = −f(u), also in rounded numbers; so f(0) = 0. Every odd f is of this form,
-    with g = f.
+    It is odd because f(−u) = (g(−u) − g(u))/2 = −f(u), also in floating-point numbers. So f(0) = 0. Every odd f has
+    this form, with g = f.
 
     **Arguments:**
 
-    - `in_size`, `out_size`: how many inputs and outputs there are.
+    - `in_size`, `out_size`: the numbers of inputs and outputs.
     - `key`: for the weights. `width`, `depth`: of the hidden layers.
-    - `inputs`, `outputs`: what they typically are, one number or one for each, in their units.
+    - `inputs`, `outputs`: typical sizes in their units, one number or one for each.
 
     **Raises:**
 

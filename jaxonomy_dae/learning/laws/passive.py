@@ -12,11 +12,11 @@ from .structure import response
 
 
 class AbstractPassive(eqx.Module):
-    """A law N of `size` outputs whose first `size` inputs v are what its outputs work on: N(v, …)·v ≤ 0 for all inputs
-    and all weights.
+    """A law N with `size` outputs, which do work on its first `size` inputs v: N(v, …)·v ≤ 0 for all inputs and all
+    weights.
 
     If v is a velocity and N a force in its direction, or v a voltage and −N the current through an element, the law
-    never brings energy into the model. `Component.learned(..., kind=learning.AbstractPassive)` takes no other.
+    never brings energy into the model. `Component.learned(..., kind=learning.AbstractPassive)` accepts only such laws.
     """
 
     size: eqx.AbstractVar[int]
@@ -29,20 +29,20 @@ class AbstractPassive(eqx.Module):
 class Passive(AbstractPassive):
     """N(v, p) = (J(v, p) − R(v, p)) v, with R symmetric and positive semidefinite, J skew, both from a tanh network.
 
-    Passive because N·v = vᵀ J v − vᵀ R v = −vᵀ R v ≤ 0: a skew J has vᵀ J v = 0, and R = L D Lᵀ with D ≥ 0 has
-    vᵀ R v = Σ D (Lᵀ v)² ≥ 0 (`Dissipation` says more). Where v ≠ 0, every passive law is of this form:
-    R = −(N·v) v vᵀ/|v|⁴ and J = (w vᵀ − v wᵀ)/|v|² with w = N + R v, which is orthogonal to v. At v = 0, N = 0, as for
-    every continuous passive law. In rounded numbers, N·v exceeds zero by no more than the rounding of the products that
-    it is summed of; with one output, not at all.
+    Passive because N·v = vᵀ J v − vᵀ R v = −vᵀ R v ≤ 0: a skew J has vᵀ J v = 0, and R = L D Lᵀ with D ≥ 0 has vᵀ R v =
+    Σ D (Lᵀ v)² ≥ 0 (`Dissipation` says more). Where v ≠ 0, every passive law is of this form: R = −(N·v) v vᵀ/|v|⁴ and
+    J = (w vᵀ − v wᵀ)/|v|² with w = N + R v, which is orthogonal to v. At v = 0, N = 0, as for every continuous passive
+    law. In floating-point numbers, N·v exceeds zero by no more than the rounding errors of its summands, and with one
+    output not at all.
 
     **Arguments:**
 
     - `size`: how many entries v and N have.
-    - `context`: how many further inputs p there are, after v: what R and J may depend on beside v.
+    - `context`: the number of further inputs p after v, on which R and J may depend, too.
     - `key`: for the weights. `width`, `depth`: of the hidden layers.
-    - `inputs`: what v and p typically are, one number or one for each, in their units.
-    - `power`: what |N·v| typically is, in its unit (watt for forces and velocities), at such v. One number, for with
-        different sizes for the outputs there would be other laws than passive ones.
+    - `inputs`: typical sizes of v and p in their units, one number or one for each.
+    - `power`: the typical size of |N·v| at such v, in its unit (watt for forces and velocities). It is one number,
+        because different sizes of outputs would destroy passivity.
 
     **Raises:**
 

@@ -18,14 +18,14 @@ class PortHamiltonian(eqx.Module):
 
     Along x' = f(x), dH/dt = ∇H·f = −∇Hᵀ R ∇H ≤ 0 for all weights, as for `Dissipation`, whose efforts ∇H is. And with
     H(x) = energy·(½|x/inputs|² + network(x/inputs) − network(0)), whose network is bounded, H → ∞ with |x|: as H never
-    rises, no solution leaves the bounded set {H ≤ H(x(0))}. With R = 0 the energy is kept.
+    rises, no solution leaves the bounded set {H ≤ H(x(0))}. With R = 0 the energy is conserved.
 
     **Arguments:**
 
-    - `size`: how many states x there are.
+    - `size`: the number of states x.
     - `key`: for the weights. `width`, `depth`: of the hidden layers; depth ≥ 1.
-    - `inputs`: what x typically is, one number or one for each. `energy`: what H typically is. `time`: in which x
-        changes by as much as it typically is.
+    - `inputs`: typical sizes of x, one number or one for each. `energy`: the typical size of H. `time`: the time in
+        which x changes by its typical size.
 
     **Raises:**
 

@@ -13,14 +13,15 @@ from .network import divided, multiplied, sizes, tanh_network
 class Positive(eqx.Module):
     """f(u) > 0 for all u and all weights: f = (g + √(g² + 4))/2 of a tanh network g (Barron 2021, arXiv:2112.11687).
 
-    Because √(g² + 4) > |g|; in rounded numbers, because a negative g is taken by 2/(√(g² + 4) − g), a quotient of
-    positive numbers. Where an exponential or softplus would underflow to zero, this falls as 1/|g| only.
+    It is positive because √(g² + 4) > |g|. For negative g it is computed as 2/(√(g² + 4) − g), a quotient of positive
+    numbers, so it is positive in floating-point numbers, too. An exponential or softplus would underflow to zero; this
+    function decreases only as 1/|g|.
 
     **Arguments:**
 
-    - `in_size`, `out_size`: how many inputs and outputs there are.
+    - `in_size`, `out_size`: the numbers of inputs and outputs.
     - `key`: for the weights. `width`, `depth`: of the hidden layers.
-    - `inputs`, `outputs`: what they typically are, one number or one for each, in their units.
+    - `inputs`, `outputs`: typical sizes in their units, one number or one for each.
 
     **Raises:**
 
