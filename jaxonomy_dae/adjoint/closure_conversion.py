@@ -19,7 +19,8 @@ class SolveProgram(eqx.Module):
 
     step: Any  # (tprev, tnext, y, solver_state, made_jump) -> what the solver's `step` returns
     adapt: Any  # (controller, tprev, tnext, y, y1, y_error, controller_state) -> what its `adapt_step_size` returns
-    # (state, buffers, active, first) -> (state, buffers, rows for the table): one attempted step, bookkeeping included
+    # (state, buffers, active, first) -> (state, buffers, rows for the table, (the end of the step, its error)): one
+    # attempted step, bookkeeping included
     body: Any
     rest: Any  # (attempted step, second run) -> (end of the next one, second run), or None: see resting.py
     first: Any  # (start, end, y) -> (end of the first step,), or None: see resting.py
@@ -162,6 +163,12 @@ def going(state: Any, numbers: dict[str, Any], program: SolveProgram) -> Bool[Ar
     """True while a solve has steps left to take."""
     on = (state.tprev < numbers["t1"]) & diffrax.is_successful(state.result)
     return on if program.max_steps is None else on & (state.num_steps < program.max_steps)
+
+
+def as_traced(result: Any) -> Any:
+    """A result code that Python knows, as a value of the program. Two that Python knows are compared by programs of
+    their own, which JAX compiles on the way."""
+    return jax.tree.map(lambda code: jnp.full(jnp.shape(code), code, jnp.result_type(code)), result)
 
 
 def any_member(flag: Bool[Array, ""]) -> Bool[Array, ""]:

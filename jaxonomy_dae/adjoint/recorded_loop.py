@@ -29,7 +29,7 @@ def solve(numbers: dict[str, Any], program: SolveProgram) -> tuple[Any, Any, Any
     def advance(carry):
         state, buffers, table = carry
         active = going(state, numbers, program)
-        new, buffers, noted = program.body(numbers["body"], state, buffers, active, jnp.array(True))
+        new, buffers, noted, _ = program.body(numbers["body"], state, buffers, active, jnp.array(True))
         # A step that is rejected appends nothing: it leaves the state as it was.
         return unless_waiting(active, new, state), buffers, appended(table, noted, state.y, new.y)
 
@@ -92,10 +92,10 @@ class _Recorder:
             carry = self.unpack(packed)
             state, last, moves, pushed = carry
             active = going(state, self.numbers, self.program)
-            new, buffers, noted = self.program.body(self.numbers["body"], state, buffers, active, first)
+            new, buffers, noted, taken = self.program.body(self.numbers["body"], state, buffers, active, first)
             accepted = active & (new.num_accepted_steps > state.num_accepted_steps)
             new, held, pushed = held_back(state, new, accepted, pushed, self.numbers, self.program)
-            after = new, jnp.where(accepted, state.tnext, last), self.times.after(state, moves, held), pushed
+            after = new, jnp.where(accepted, state.tnext, last), self.times.after(state, moves, taken, held), pushed
             # Members of a batch that have finished keep what they have, while the others go on.
             after = unless_waiting(active, after, carry)
             return self.pack(self._taken_apart(*after)), buffers, noted, accepted

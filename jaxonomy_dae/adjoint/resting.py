@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..aliases import Args, Controller, Solver, State, Terms, Time
 from ..private_names import FROM_CONTROLLER
-from .closure_conversion import SolveProgram, any_member
+from .closure_conversion import SolveProgram, any_member, as_traced
 from .wrapped_control import WrappedControl
 
 # PUSH and MOTION are parts of a component's scale, |y| + atol/rtol: its size, and what tolerances make of zero.
@@ -177,7 +177,7 @@ class Resting(eqx.Module):
             keep, _, following, *_ = self.controller.adapt_step_size(
                 start, end, y, y1, self.args, error, order, controlled
             )
-            keep = keep & jnp.all(jnp.isfinite(y1)) & diffrax.is_okay(result)
+            keep = keep & jnp.all(jnp.isfinite(y1)) & diffrax.is_okay(as_traced(result))
             shorter = jnp.where(jnp.isfinite(following), jnp.clip(following - start, 0.0, 0.5 * (end - start)), 0.0)
             # Not less than a tenth: an error that is not finite says nothing about how much shorter would do.
             shorter = jnp.maximum(shorter, 0.1 * (end - start))

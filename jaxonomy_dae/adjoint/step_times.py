@@ -51,15 +51,15 @@ class StepTimes:
         return self.seeds()[0] if self.count else ()
 
     def after(
-        self, state: Any, moves: PyTree[Float[Array, "seeds ..."]], held: Bool[Array, ""]
+        self, state: Any, moves: PyTree[Float[Array, "seeds ..."]], taken: tuple[Any, Any], held: Bool[Array, ""]
     ) -> PyTree[Float[Array, "seeds ..."]]:
-        """The tangents `moves` of (start, end, controller state), advanced over the step that `state` is about to
-        attempt. Where `held`, a flag, is set, the end of the next step moves with its start: it keeps its length."""
+        """The tangents `moves` of (start, end, controller state), advanced over the step that `state` attempts; `taken`
+        are the state at its end and the error. Where `held`, a flag, is set, the end of the next step moves with its
+        start: it keeps its length."""
         if not self.count:
             return ()
         program, numbers = self.program, self.numbers
-        jump = state.made_jump if program.jumps else False
-        y1, error, *_ = program.step(numbers["step"], state.tprev, state.tnext, state.y, state.solver_state, jump)
+        y1, error = taken
         error = jax.tree.map(lambda e: jnp.where(jnp.isnan(e), jnp.inf, e), error)
         fixed = eqx.filter(state.controller_state[0], eqx.is_inexact_array, inverse=True)
         floor = clip_floor(numbers["t1"])

@@ -17,7 +17,7 @@ from ..aliases import Terms
 from ..private_names import has_stored_adjoint, private
 from ..programs.members import batch_size
 from .appended import NOTED, apart, together
-from .closure_conversion import SolveProgram, by_itself_or_batched, closure_convert, unless_waiting
+from .closure_conversion import SolveProgram, as_traced, by_itself_or_batched, closure_convert, unless_waiting
 from .recorded_loop import solve
 from .resting import AttemptedStep, Resting
 from .reverse_step import state_saves
@@ -102,6 +102,7 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
         state = dataclasses.replace(
             init_state,
             made_jump=jnp.asarray(init_state.made_jump) if functions["jumps"] else False,
+            result=as_traced(init_state.result),
             controller_state=(init_state.controller_state, jnp.array(True)),
             progress_meter_state=(init_state.progress_meter_state, jnp.array(True)),
         )
@@ -124,7 +125,8 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
                     progress_meter_state=(state.progress_meter_state[0], first),
                 )
                 out = _arrays(body_fun(_with_buffers(state, buffers)))
-                return _without_buffers(out), tuple((save.ts, save.ys) for save in state_saves(out)), stepper.noted
+                saved = tuple((save.ts, save.ys) for save in state_saves(out))
+                return _without_buffers(out), saved, stepper.noted, stepper.taken
 
             start = _without_buffers(start)
             flag = jnp.array(True)
@@ -270,9 +272,10 @@ def _in_a_loop(solver: Any) -> Any:
 
 class _Solver:
     """The part of a solver's interface that Diffrax's loop calls. `noted` are the rows that the last step appends to
-    the table of the state."""
+    the table of the state, `taken` its end and error."""
 
     noted: Any = None
+    taken: Any = None
 
     def __init__(self, step, consts, solver, terms):
         self.function, self.consts, self.interpolation_cls = step, consts, solver.interpolation_cls
@@ -283,7 +286,7 @@ class _Solver:
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         y1, y_error, dense, *rest = self.function(self.consts, t0, t1, y0, solver_state, made_jump)
-        self.noted = dense.get(NOTED)
+        self.noted, self.taken = dense.get(NOTED), (y1, y_error)
         return y1, y_error, dense, *rest
 
 

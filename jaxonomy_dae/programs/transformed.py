@@ -13,6 +13,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import ShapedArray
+from jax.custom_derivatives import SymbolicZero
 
 from ..private_names import MissingName, clear_jitted, private
 from .staging import is_staged, is_traced, layers
@@ -72,17 +74,17 @@ class Function:
 
         @jax.custom_vjp
         def call(*arrays: Any) -> Any:
-            return forward(*arrays)[0]
+            return values([*arrays])[0]
 
-        def forward(*arrays: Any) -> Any:
-            smooth, rest, pullback = values([*arrays])
+        def forward(*given: Any) -> Any:
+            smooth, rest, pullback = values([one.value for one in given])
             shape[:] = [rest]
             leaves, structure = jax.tree.flatten(pullback)
             return smooth, _Residuals(leaves, structure)
 
         def backward(residuals: _Residuals, cotangents: list[Any]) -> Any:
-            # A cotangent that is zero throughout belongs to an outcome that is not read.
-            read = tuple(_is_nonzero(c) for c in cotangents)
+            # JAX would make arrays of zeros for what is not read, by a program for each shape.
+            read = tuple(not isinstance(c, SymbolicZero) for c in cotangents)
             leaves, structure = residuals.leaves, residuals.structure
             n = len(leaves)
 
@@ -102,7 +104,7 @@ class Function:
             found = iter(transpose([*leaves, *(c for c, r in zip(cotangents, read, strict=True) if r)]))
             return tuple(next(found) if k in chosen else None for k in range(len(arrays)))
 
-        call.defvjp(forward, backward)
+        call.defvjp(forward, backward, symbolic_zeros=True)
         smooth = call(*arrays)
         return _combined(smooth, shape[0])
 
@@ -202,14 +204,10 @@ def _is_plain(arrays: list[Any]) -> bool:
     return not is_staged(jax.device_put(_SOMETHING))
 
 
-def _is_nonzero(cotangent: Any) -> bool:
-    return is_traced(cotangent) or bool(np.any(np.asarray(cotangent)))
-
-
 def _zero_like(cotangent: Any) -> Any:
     """The cotangent of what is not read: not an array of zeros, which would be computed with, and times infinity
     is not a number."""
     try:
-        return private("Zero")(jax.typeof(cotangent))
+        return private("Zero")(ShapedArray(cotangent.shape, cotangent.dtype))
     except MissingName:
         return jnp.zeros(cotangent.shape, cotangent.dtype)

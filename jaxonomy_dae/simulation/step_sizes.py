@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..adjoint.resting import still
 from ..aliases import Controller, Solver, State, Time, Tolerance
 from ..errors import ModelError
 from ..programs.staging import is_traced, joined, on_device
@@ -44,8 +45,10 @@ def controller_for(
         controller = with_variables(system, controller, solver, control, atol)
     if dtmax is not None or not system.plan.waves:
         return controller
-    at = SystemAt(system.plan, system.numbers, (), 0.0, {}, system.typical_sizes)
-    return WaveControl(controller, *at.waves())  # pyright: ignore[reportCallIssue]
+    # The ends of steps are constants of differentiation. Where their values are known, nothing is compiled for them.
+    known = eqx.tree_at(lambda s: s.parameters, system, still(system.parameters))
+    at = SystemAt(system.plan, known.numbers, (), 0.0, {}, system.typical_sizes)
+    return WaveControl(controller, *at.waves(is_traced(system.parameters)))  # pyright: ignore[reportCallIssue]
 
 
 def clipped(controller: Controller, jump_ts: Any, ends: StepEnds) -> Any:
@@ -69,10 +72,7 @@ def first_step(
     if isinstance(controller, diffrax.StepTo) or not x0.shape[0]:
         return None if isinstance(controller, diffrax.StepTo) else t1 - t0
     rtol, atol = getattr(controller, "rtol", 1e-6), getattr(controller, "atol", 1e-8)
-    frozen, t0, t1 = jax.tree.map(
-        lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, ((system, x0, inputs), t0, t1)
-    )
-    system, x0, inputs = frozen
+    system, x0, inputs, t0, t1 = still((system, x0, inputs, t0, t1))
     scale = atol + rtol * jnp.abs(x0)
 
     def size(v):

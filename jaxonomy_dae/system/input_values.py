@@ -10,6 +10,7 @@ import numpy as np
 from ..errors import ModelError
 from ..lowering.gather import SCALARS, entries, take
 from ..lowering.plan import SystemPlan
+from ..programs.staging import is_traced
 from .inputs import Entry, value_at
 
 
@@ -62,7 +63,7 @@ def input_values(plan: SystemPlan, given: Mapping[str, Any] | None, t: Any, dtyp
         mine = np.flatnonzero(np.isin(table.owner, inputs))
         for order in np.unique(table.order[mine]).tolist():
             chosen = mine[table.order[mine] == order]
-            value = _derivative(lambda s: jnp.asarray(value_at(source, s), dtype), order)(t)
+            value = _derivative(lambda s: _typed(value_at(source, s), dtype), order)(t)
             if jnp.ndim(value):
                 value = take(jnp.ravel(value), position[table.owner[chosen]])
             parts.append((chosen, value))
@@ -81,6 +82,11 @@ def input_values(plan: SystemPlan, given: Mapping[str, Any] | None, t: Any, dtyp
     for chosen, value in parts:
         values |= zip(chosen.tolist(), entries(value) if jnp.ndim(value) else [value] * len(chosen), strict=True)
     return tuple(values[q] for q in range(n))
+
+
+def _typed(value: Any, dtype: Any) -> Any:
+    """The value as an array of this type. While a program is traced, JAX would convert a number by another program."""
+    return jnp.asarray(value, dtype) if is_traced(value) else np.asarray(value, dtype)
 
 
 def _derivative(function: Callable, order: int) -> Callable:

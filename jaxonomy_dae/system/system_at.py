@@ -436,10 +436,11 @@ class SystemAt:
             values = values.at[np.array(places)].set(jnp.broadcast_to(jnp.asarray(new, self.dtype), (len(places),)))
         return values
 
-    def waves(self) -> tuple[Any, Any]:
+    def waves(self, differentiated: bool = False) -> tuple[Any, Any]:
         """Angular frequencies and phases of what drives the model, shape (waves,) each; NaN for phases that move. Where
-        parameters are known, waves on which nothing depends, as those of amplitude zero, have the frequency zero. Where
-        they are traced, derivatives by the amplitude may be asked for, which need steps that see the wave."""
+        parameters are known, waves on which nothing depends, as those of amplitude zero, have the frequency zero.
+        Derivatives by the amplitude need steps that see the wave: where they are `differentiated` or traced, all
+        waves count."""
         frequencies, phases = [], []
         known = not is_traced((self.parameters, self.t))
         xp: Any = np if known else jnp
@@ -453,7 +454,7 @@ class SystemAt:
                 return xp.broadcast_to(xp.asarray(found, self.dtype), (n,))
 
             frequency = values(group.frequency)
-            if group.weight is not None and not is_traced(self.parameters):
+            if group.weight is not None and not differentiated and not is_traced(self.parameters):
                 frequency = xp.where(values(group.weight) == 0.0, 0.0, frequency)
             frequencies.append(frequency)
             phases.append(xp.full((n,), xp.nan, self.dtype) if group.phase is None else values(group.phase))

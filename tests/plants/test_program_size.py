@@ -22,6 +22,14 @@ def motor() -> AcausalSystem:
     return compiled(machine, source, ground, connect=[(source.p, machine.p), (source.n, machine.n, ground.p)])
 
 
+def driven() -> AcausalSystem:
+    """By a wave, whose frequency is a parameter."""
+    ev = EqnEnv()
+    source, r = el.SineVoltage(ev, "source", amplitude=10.0, frequency=50.0), el.Resistor(ev, "r", 10.0)
+    c, ground = el.Capacitor(ev, "c", 1e-3, initial_voltage=0.0), el.Ground(ev, "ground")
+    return compiled(source, r, c, ground, connect=[(source.p, r.p), (r.n, c.p), (c.n, source.n, ground.p)])
+
+
 def rectifier() -> AcausalSystem:
     """The diode's voltage is implicit."""
     ev = EqnEnv()
@@ -41,6 +49,7 @@ MODELS = {
     "double pendulum": (lambda: double_pendulum("auto"), "a.m", (3, 7), (11800, 30500)),
     "ball": (lambda: hybrid(Ball, "ball"), "ball.e", (6, 17), (5200, 12000)),
     "motor": (motor, "motor.R", (3, 11), (2100, 5700)),
+    "driven": (driven, "r.R", (3, 11), (2200, 5600)),
     "rectifier": (rectifier, "r.R", (5, 23), (6700, 13800)),
     "ladder": (lambda: ladder(100, False), "source.V", (3, 11), (1900, 5300)),
 }
