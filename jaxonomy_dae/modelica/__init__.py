@@ -2,5 +2,6 @@
 
 from .component import FlatComponent as FlatComponent
 from .flat_model import FlatModel as FlatModel
-from .flat_model import load as load
+from .load import load as load
 from .read_base import read_base as read_base
+from .read_rumoca import read_rumoca as read_rumoca

@@ -18,7 +18,8 @@ from ..simulation.solution import Solution
 from ..system.acausal_compiler import AcausalCompiler
 from ..system.system import AcausalSystem
 from .component import FlatComponent
-from .flat_model import FlatModel, load
+from .flat_model import FlatModel
+from .load import load
 
 POINTS = 500  # saved times, where the text does not say how far apart they are
 MOST_POINTS = 100_000

@@ -23,7 +23,10 @@ def write_equation(scope: Scope, s: Statement) -> None:
     elif isinstance(s, Branches):
         for sides in side_by_side(scope, s):
             _add(scope, sides)
-    elif not isinstance(s, Effect):
+    elif isinstance(s, Effect):
+        if s.call.function == "connect":
+            raise ModelError("connect(…) is not flat: Modelica with connections is read by load(source, model=…)")
+    else:
         raise ModelError("a loop of equations is not read")
 
 

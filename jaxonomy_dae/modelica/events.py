@@ -159,36 +159,73 @@ def write_end_of_start(scope: Scope) -> None:
     scope.component._event(condition, (assign(scope.initial, 0),), None, EventFlag.AT_START | EventFlag.REVOCABLE)
 
 
+Rise = tuple[Any, Value]  # the truth of a condition when branches were chosen last, a discrete variable; the condition
+
+
 def write_when(scope: Scope, s: Branches) -> None:
     """Adds the events of a `when`."""
-    earlier: list[Value] = []
+    done = [assign(scope.done[s], 1)] if s in scope.done else []
+    chain: list[tuple[list[Rise], tuple[Statement, ...]]] = []
     for condition, body in s.branches:
-        done = [assign(scope.done[s], 1)] if s in scope.done else []
-        conditions = [_event(scope, each, body, earlier, done) for each in _each_condition(condition)]
-        earlier += [c for c in conditions if c is not None]
+        found = [_event(scope, each, body, chain, done, len(s.branches) > 1) for each in _each_condition(condition)]
+        chain.append(([r for r in found if r is not None], body))
+    if any(rises for rises, _ in chain):
+        _write_chain(scope, chain)
 
 
 def _event(
-    scope: Scope, condition: Expression, body: tuple[Statement, ...], earlier: list[Value], more: list[Any]
-) -> Value:
-    """Adds one event, with `more` actions; returns its condition, or None for a clock. The event of an `elsewhen` does
-    not happen while an earlier condition holds."""
+    scope: Scope, condition: Expression, body: tuple[Statement, ...], chain: list, more: list[Any], among: bool
+) -> Rise | None:
+    """Adds one event, with `more` actions; for a branch `among` others, returns what its event rests on instead.
+    Branches of clocks and of the initial time are events of their own; a clock's does not act where a branch before it
+    in the chain does."""
     parts = _conjuncts(condition)
     values = [scope.evaluate(_inner(p)) for p in parts]
     clocks = [v for v in values if isinstance(v, Sampled)]
-    holds: Value = True
-    for v in [v for v in values if not isinstance(v, Sampled)] + [negated(e) for e in earlier]:
-        holds = both(holds, v)
+    holds = functools.reduce(both, [v for v in values if not isinstance(v, Sampled)], True)
     if holds is False or (holds is True and not clocks):
         return None  # it never becomes true
     if clocks:  # at a tick, pre(m) is the value before it
-        holds = functools.reduce(both, [*_before_tick(scope, parts), *(negated(e) for e in earlier)], True)
+        conditions = [*_before_tick(scope, parts), *(negated(_risen(rises)) for rises, _ in chain)]
+        if actions := _actions(scope, body, functools.reduce(both, conditions, True)):
+            scope.component.when(clocks[0], *actions, *more)
+        return None
     at_start = any(isinstance(p, Call) and p.function == "initial" for p in parts)
-    actions = _actions(scope, body, holds if clocks else True)
-    if actions:
-        happens = clocks[0] if clocks else scope.kept.in_events(holds)
-        scope.component.when(happens, *actions, *more, at_start=at_start)
-    return None if clocks else holds
+    if among and not at_start:
+        return _hidden(scope, f":held[{len(scope.component.parameters)}]", 1), holds
+    if actions := _actions(scope, body, True):
+        scope.component.when(scope.kept.in_events(holds), *actions, *more, at_start=at_start)
+    return None
+
+
+def _risen(rises: list[Rise]) -> Value:
+    """True from when one of these conditions becomes true until branches are chosen."""
+    return functools.reduce(either, (both(holds, plain(sympy.Eq(held, 0))) for held, holds in rises), False)
+
+
+def _write_chain(scope: Scope, chain: list[tuple[list[Rise], tuple[Statement, ...]]]) -> None:
+    """Adds the events of branches of which the first acts whose condition becomes true (Modelica Language Specification
+    3.6, 8.3.5). Two events in turn, as for modes that change at once."""
+    kept, ends = scope.kept.in_events, EventFlag.AT_START | EventFlag.REVOCABLE
+    risen: Value = False
+    cases: dict[Any, list[tuple[Value, Value]]] = {}
+    for rises, body in chain:
+        here = both(_risen(rises), negated(risen))
+        risen = either(risen, here)
+        for held, holds in rises:
+            still = both(negated(holds), plain(sympy.Ne(held, 0)))
+            scope.component._event(kept(still), (assign(held, 0),), None, ends)
+            cases[held] = [(before(kept(holds, alone=False)), 1)]
+        for target, value in _pairs(scope, body) if here is not False else ():
+            if isinstance(target, str):
+                scope.component.when(kept(here), terminate(target))
+            else:
+                cases.setdefault(target, []).append((before(kept(here, alone=False)), value))
+    actions = [_action(target, _first(target, found)) for target, found in cases.items()]
+    turn = _hidden(scope, f":turn[{len(scope.component.parameters)}]", 0)
+    for now in (0, 1):
+        condition = kept(both(risen, plain(sympy.Eq(turn, now))))
+        scope.component._event(condition, (*actions, assign(turn, 1 - now)), None, EventFlag.LISTED)
 
 
 def _before_tick(scope: Scope, parts: list[Expression]) -> list[Value]:
@@ -200,21 +237,33 @@ def _before_tick(scope: Scope, parts: list[Expression]) -> list[Value]:
         scope.in_action = False
 
 
-def _actions(scope: Scope, body: tuple[Statement, ...], only_if: Value) -> list[Any]:
+def _pairs(scope: Scope, body: tuple[Statement, ...]) -> list[tuple[Any, Value]]:
+    """Pairs (variable, new value) of all actions, as `_each_action` finds them, with the values before the event."""
     scope.in_action = True
     try:
-        found = list(_each_action(scope, body))
+        return list(_each_action(scope, body))
     finally:
         scope.in_action = False
-    out = []
-    for target, value in found:
-        if isinstance(target, str):
-            out.append(terminate(target))
-        elif isinstance(target, DiscreteSymbol):
-            out.append(assign(target, chosen(only_if, as_number(value), pre(target))))
-        else:
-            out.append(reinit(target, chosen(only_if, value, target)))
-    return out
+
+
+def _actions(scope: Scope, body: tuple[Statement, ...], only_if: Value) -> list[Any]:
+    return [
+        terminate(target) if isinstance(target, str) else _action(target, _first(target, [(only_if, value)]))
+        for target, value in _pairs(scope, body)
+    ]
+
+
+def _action(target: Any, value: Value) -> Any:
+    return assign(target, value) if isinstance(target, DiscreteSymbol) else reinit(target, value)
+
+
+def _first(target: Any, cases: list[tuple[Value, Value]]) -> Value:
+    """The value of the first case whose condition holds; the one before the event if none does."""
+    discrete = isinstance(target, DiscreteSymbol)
+    value: Value = pre(target) if discrete else target
+    for condition, result in reversed(cases):
+        value = chosen(condition, as_number(result) if discrete else result, value)
+    return value
 
 
 def _each_action(scope: Scope, body: tuple[Statement, ...]) -> Iterator[tuple[Any, Value]]:

@@ -2,10 +2,9 @@
 
 import dataclasses
 from collections.abc import Mapping
-from pathlib import Path
 
 from ..errors import ModelError
-from .read_base import INSIDE, read_base, written
+from .read_base import INSIDE, written
 from .tree import Class, Number, Reference
 
 PREFERRED = ("StateSelect.prefer", "StateSelect.always")
@@ -39,20 +38,13 @@ class FlatModel:
         return tuple(name for name, e in chosen if isinstance(e, Reference) and e.path in PREFERRED)
 
 
-def load(source: str | Path) -> FlatModel:
-    """Reads a model in Base Modelica.
-
-    **Arguments:**
-
-    - `source`: the path of a file, or the text itself.
+def flat_of(outermost: Class) -> FlatModel:
+    """The flat model that a package of Base Modelica holds.
 
     **Raises:**
 
-    - `ModelError` for what is not Base Modelica, with line and column, and for a text that does not hold exactly one
-        model.
+    - `ModelError` for a package that does not hold exactly one model.
     """
-    is_text = isinstance(source, str) and ("\n" in source or not source.endswith((".bmo", ".mo")))
-    outermost = read_base(str(source) if is_text else Path(source).read_text(encoding="utf-8"))
     if outermost.kind in ("model", "class", "block"):
         return FlatModel(outermost, {})
     models = [c for c in outermost.classes if c.kind == "model"]

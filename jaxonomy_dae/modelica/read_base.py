@@ -67,6 +67,11 @@ def read_base(text: str) -> Class:
     return _Reader(text).file()
 
 
+def read_modifiers(text: str) -> dict[str, Any]:
+    """What stands in parentheses behind a name, such as `(StopTime = 2.0)`."""
+    return _Reader(text).modifiers()
+
+
 def written(name: str) -> Reference:
     """A quoted name with subscripts inside, such as 'x[\\'i\\'].y', as the reference x[i].y."""
     parts: list[str] = []

@@ -272,9 +272,14 @@ class Scope:
 
     def _declare_real(self, d: Declaration) -> Value:
         if self.kind(d.type) != REAL:
-            raise ModelError(f"line {d.line}: '{d.name}' is of the type '{d.type}', which is not known here")
+            raise ModelError(
+                f"line {d.line}: '{d.name}' is of the type '{d.type}', which is not known here; "
+                "Modelica that is not flat is read by load(source, model=…)"
+            )
         nominal = self._start(d.modifiers.get("nominal"))
         start = self._start(d.modifiers.get("start"))
+        if "input" in d.prefixes and d.value is None:
+            return self.component.input(d.name, default=None if start is None else float(start), unit=self._unit(d))
         fixed = d.modifiers.get("fixed") == Truth(True)
         if fixed and start is None:
             start = 0.0

@@ -61,6 +61,40 @@ def test_modes_that_hand_on_a_token_change_at_once():
     np.testing.assert_allclose([solution["m.ta"][-1], solution["m.tb"][-1]], [3.0, 2.5], atol=1e-9)
 
 
+WHENS = """model 'Whens'
+  Real 'x';
+  Integer 'high'(fixed = true, start = 0);
+  Integer 'low'(fixed = true, start = 0);
+  Integer 'first'(fixed = true, start = 0);
+equation
+  'x' = sin(1.5707963267948966*time);
+  when 'x' > 0.8 then
+    'high' = pre('high') + 1;
+  elsewhen 'x' > 0.3 then
+    'low' = pre('low') + 1;
+  end when;
+  when time > 2 and 'x' < 0 then
+    'first' = pre('first') + 1;
+  elsewhen time > 3.5 then
+    'first' = pre('first') + 10;
+  elsewhen 2*time > 7 then
+    'first' = pre('first') + 100;
+  end when;
+end 'Whens';
+"""
+
+
+@pytest.mark.long("events of two chains in one program")
+def test_an_elsewhen_acts_when_its_condition_becomes_true():
+    """A branch happened when the condition of an earlier branch ended, and did not while that held. Which of them
+    *become* true at an instant is asked: the first of these acts."""
+    ts = jnp.array([0.1, 0.4, 0.9, 1.7, 3.4, 3.6, 4.4, 4.9])
+    solution = simulate(compiled(WHENS), 5.0, ts=ts)
+    assert solution["m.high"].tolist() == [0, 0, 1, 1, 1, 1, 1, 2]
+    assert solution["m.low"].tolist() == [0, 1, 1, 1, 1, 1, 2, 2]
+    assert solution["m.first"].tolist() == [0, 0, 0, 0, 1, 11, 11, 11]
+
+
 @pytest.mark.long("two compilations")
 def test_functions_tables_and_initial_equations():
     """2 T' = p - T with T'(0) = 0.5 and p(0) = 3 begins at T = 2; T0 = T(0) + 1 stays 3."""

@@ -1,0 +1,144 @@
+"""The dictionary of rumoca becomes the record of a flat model. NumPy only."""
+
+import copy
+
+import pytest
+from modelica_sources import BALL, SOURCES, stored, without_places
+
+from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv
+from jaxonomy_dae.errors import ModelError
+from jaxonomy_dae.modelica import FlatComponent, load, read_rumoca
+
+# der(x) = -k x, y = 2 x; written by hand, with places in the source.
+TEXT = "model Decay\n  parameter Real k = 3;\n  Real x(start = 1, fixed = true), y;\n\n  y = 2*x;\nend Decay;\n"
+
+
+def at(text):
+    start = TEXT.index(text)
+    return {"origin": "source", "span": {"source": 7, "start": start, "end": start + len(text)}}
+
+
+def by_hand():
+    nothing = {"fixed": None, "binding": None, "min": None, "max": None, "nominal": None, "unit": None}
+    nothing |= {"state_select": "Default", "description": None}
+    lists = (
+        "functions", "domains", "initialization_equation_operations", "initial_discrete_values",
+        "initial_parameter_values", "discrete_real_equations", "discrete_value_owners", "model_event_transactions",
+        "relations", "conditions", "event_actions", "clocks", "clock_ownerships", "previous_values", "terminals",
+        "delays",
+    )  # fmt: skip
+    return {
+        "schema_version": 43,
+        "source_map": {"files": [[7, "Decay.mo", TEXT]]},
+        "storage": {name: [] for name in lists} | {
+            "value_types": [{"scalar": "real", "dimensions": [], "record_name": None, "record_fields": []}],
+            "variables": [
+                {"name": "k", "role": "parameter", "value_type": 0, "declaration": at("k = 3"),
+                 "attributes": nothing | {"binding": 0, "start": 0}},
+                {"name": "x", "role": "state", "value_type": 0, "declaration": at("x(start"),
+                 "attributes": nothing | {"start": 1, "fixed": [True], "unit": "m"}},
+                {"name": "y", "role": "algebraic", "value_type": 0, "declaration": at("y;"),
+                 "attributes": nothing | {"start": 11}},
+            ],
+            "expressions": {
+                "nodes": [
+                    {"literal": {"integer": 3}}, {"literal": {"real": 1.0}},
+                    {"coordinate": {"derivative": 1}}, {"coordinate": {"parameter": 0}}, {"coordinate": {"state": 1}},
+                    {"binary": {"operator": "multiply", "lhs": 3, "rhs": 4}},
+                    {"unary": {"operator": "negate", "operand": 5}},
+                    {"binary": {"operator": "subtract", "lhs": 2, "rhs": 6}},
+                    {"coordinate": {"algebraic": 2}}, {"array": {"operand_count": 2}},
+                    {"index": {"base": 9, "subscript_count": 1}}, {"literal": {"real": 0.0}},
+                    {"binary": {"operator": "subtract", "lhs": 8, "rhs": 10}},
+                ],
+                "provenance": [at("3")] * 11 + [at("y;")] + [at("y = 2*x")],
+                "operands": [0, 5], "subscripts": [{"kind": {"index": 0}}],
+            },
+            "continuous_equation_operations": [
+                {"residual": {"residual": 7, "provenance": at("Real x")}},
+                {"residual": {"residual": 12, "provenance": at("y = 2*x")}},
+            ],
+        },
+    }  # fmt: skip
+
+
+def test_a_dictionary_by_hand():
+    flat = read_rumoca(by_hand(), "Decay")
+    assert [(d.name, d.line) for d in flat.model.declarations] == [("k", 2), ("x", 3), ("y", 3)]
+    assert [e.line for e in flat.model.equations] == [3, 5]
+    assert "start" not in flat.model.declarations[2].modifiers  # rumoca's own, which stands where the variable does
+    with pytest.raises(ModelError, match=r"Decay, line 5: the subscript 3 is outside of 1:2"):
+        FlatComponent(EqnEnv(), "m", flat)
+
+
+@pytest.mark.parametrize("model", SOURCES)
+def test_parameters_stay_symbols(model):
+    """Each Real parameter of the source is a parameter of the system, arrays by their entries."""
+    ev, diagram = EqnEnv(), AcausalDiagram()
+    flat = read_rumoca(stored(model), model)
+    diagram.add(FlatComponent(ev, "m", flat))
+    system = AcausalCompiler(ev, diagram)()
+    parameters = {d.name for d in flat.model.declarations if "parameter" in d.prefixes and d.type == "Real"}
+    assert parameters, model
+    assert {f"m.{name}" for name in parameters} <= set(system.parameters.names)
+
+
+@pytest.mark.parametrize("model", SOURCES)
+def test_the_stored_dictionaries_are_those_of_rumoca(model):
+    pytest.importorskip("rumoca", reason="rumoca is not installed: pip install 'jaxonomy_dae[modelica]'")
+    import rumoca
+
+    assert without_places(rumoca.Session().loads(SOURCES[model], model=model).to_dict("dae")) == stored(model)
+    flat = load(SOURCES[model], model)
+    assert flat.experiment["StopTime"] > 0
+    assert [d.name for d in flat.model.declarations] == [d.name for d in read_rumoca(stored(model)).model.declarations]
+
+
+def changed(change):
+    dae = copy.deepcopy(by_hand())
+    change(dae["storage"])
+    return dae
+
+
+@pytest.mark.parametrize(
+    "dae, told",
+    [
+        (by_hand() | {"schema_version": 44}, r'reads schema 43 .* this is schema 44. pip install "rumoca==0.10.2"'),
+        ({"variables": {}, "equations": []}, r"names no schema. pip install"),
+        (
+            changed(lambda s: s["expressions"]["nodes"].__setitem__(12, {"curl": {"operand": 3}})),
+            r"Decay, line 5: an expression of the kind 'curl' is not read",
+        ),
+        (
+            changed(lambda s: s["continuous_equation_operations"][0].__setitem__("residual", {"residual": 99})),
+            r"Decay: the dictionary has no expression 99",
+        ),
+        (
+            changed(lambda s: s["variables"][1].__setitem__("role", "shadow")),
+            r"Decay, line 3: the variable 'x' of the kind real shadow is not read",
+        ),
+        (
+            changed(lambda s: s["variables"][0]["attributes"].update(binding=None, start=None)),
+            r"the parameter 'k' has no value",
+        ),
+    ],
+)
+def test_what_is_not_read_is_said(dae, told):
+    with pytest.raises(ModelError, match=told):
+        FlatComponent(EqnEnv(), "m", read_rumoca(dae, "Decay"))
+
+
+@pytest.mark.parametrize(
+    "source, model, told",
+    [
+        ("model A\n Real x;\nequation\n x = ;\nend A;", "A", r"Modelica, line 4, column 6: unexpected `;`"),
+        ("model A\n Lib.Part p;\nend A;", "A", r"line 2: the type reference 'Lib.Part' is not found; roots="),
+        ("model A\n Real x;\nequation\n x = foo(3);\nend A;", "A", r"line 4: the function call 'foo' is not found"),
+        ("model A\n Real x, y;\nequation\n x = 1;\nend A;", "A", r"'A' has 1 equation for 2 unknowns"),
+        (BALL, "Bal", r"there is no model 'Bal': did you mean 'Ball'\?"),
+    ],
+)
+def test_bad_sources(source, model, told):
+    pytest.importorskip("rumoca", reason="rumoca is not installed: pip install 'jaxonomy_dae[modelica]'")
+    with pytest.raises(ModelError, match=told):
+        load(source, model)
