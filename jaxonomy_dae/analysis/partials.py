@@ -8,7 +8,7 @@ import numpy as np
 
 from ..lowering.plan import SystemPlan
 from ..programs.cache import compiled
-from ..system.evaluate import Refinement
+from ..system.nonlinear import Refinement
 from ..system.system import AcausalSystem
 from ..tolerances import spacing
 from .events_at_rest import both_sides, resting_events

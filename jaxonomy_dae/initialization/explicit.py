@@ -41,7 +41,7 @@ def substitution(plan: SystemPlan, rows: InitialRows) -> Substitution | None:
     for planned in steps:
         assert isinstance(planned, PlannedStep)
         _follow(planned.step, known)
-    equations = [_sum(*terms, known) for planned in plan.constraints for terms in _terms(planned.group)]
+    equations = [_sum(*terms, known) for planned in plan.constraints for terms in _terms(planned.equation)]
     starts = len(equations)
     equations += [_sum([row.quantity], [row.factor], known) for row in rows.kept]
     n = len(plan.states)

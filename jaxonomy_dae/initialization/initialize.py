@@ -237,7 +237,7 @@ def _read_networks(plan: SystemPlan, rows: InitialRows) -> bool:
         plan.reading(np.array([row.quantity for row in rows.kept], np.int64)),
     )
     return any(p.reads_networks for p in programs) or any(
-        planned.group.template.opaque is not None for planned in plan.constraints
+        planned.equation.template.opaque is not None for planned in plan.constraints
     )
 
 

@@ -17,7 +17,7 @@ from jaxtyping import Int
 from ..lowering.gather import Gather, take, times
 from ..lowering.plan import SystemPlan
 from ..model.declared import declared_scale, quantity_bounds
-from ..system.evaluate import Refinement
+from ..system.nonlinear import Refinement
 from ..system.system_at import SystemAt
 from ..tolerances import CLOSE, NOISE
 from .ladder import looking

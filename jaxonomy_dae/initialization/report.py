@@ -15,12 +15,11 @@ from ..model.tables import ZERO
 from ..system.input_values import input_values
 from ..system.sections import SHOWN, Sections, some
 from ..tolerances import DIGIT, HALF_OF_THE_DIGITS, ILL_CONDITIONED, TINY, ridge, solved
-from .condition import BlockFinding
 from .constraints_at import constraints_at
 from .initialize import InitialPoint, is_consistent
 from .ladder import FAILED, METHODS, NEAREST
 from .rows import StartRow, initial_rows, supports
-from .singular_blocks import examine_blocks
+from .singular_blocks import BlockFinding, examine_blocks
 
 WORST = 5  # rows that do not hold, in a text
 SUSPICIOUS = (
@@ -193,7 +192,7 @@ class InitializationReport(Sections):
             return starts
         out = []
         for planned in plan.constraints:
-            for e, q in zip(planned.group.equation, planned.group.quantity, strict=True):
+            for e, q in zip(planned.equation.equation, planned.equation.quantity, strict=True):
                 out.append((plan.locate(int(e)), self._names(q)))
         for step in plan.steps:
             if step.carried:

@@ -388,7 +388,7 @@ def _exchanged(generic: _Generic, gradients: Any, chosen: np.ndarray, hard: int)
             outside = np.flatnonzero(~chosen[:hard])
             weights = _weights_of(rank, gradients[outside], n_equations)
             return chosen, outside[~weights.any(axis=1)] if len(outside) else outside
-        left, right = rank.null_vectors()
+        left, right = (vectors[:, 0] for vectors in rank.null_vectors())
         if np.abs(left @ rank.scaled).max() > HALF_OF_THE_DIGITS or np.abs(rank.scaled @ right).max() > (
             HALF_OF_THE_DIGITS
         ):

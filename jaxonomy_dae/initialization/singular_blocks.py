@@ -10,15 +10,35 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from ..judgement.rank import is_undecided, rank_of
+from ..judgement.rank import Rank, are_evident, is_undecided, rank_of
+from ..judgement.sparse_rank import SparseRank
 from ..lowering.plan import SystemPlan
 from ..lowering.remembered import remembered
 from ..lowering.schedule import SparseStep, Step, StepEquation
+from ..model.group import Group, Point
+from ..model.networks import Networks
 from ..model.tables import ZERO
-from ..tolerances import ILL_CONDITIONED, KNOWN, RANK, SLIGHT
-from .block_values import BlockValues, slots_of_partials
-from .condition import DENSE_LIMIT, BlockFinding, conditions, left_null
-from .sparse_blocks import sparse_finding
+from ..model.typical_sizes import typical_sizes
+from ..tolerances import ILL_CONDITIONED, SLIGHT
+from .block_matrix import DENSE_LIMIT, Block, Known, blocks_of
+
+
+@dataclasses.dataclass(frozen=True)
+class BlockFinding:
+    """A block that is singular, or nearly so: the variables it leaves open, the equations that depend on each other,
+    and the parameters and variables that make it so, with their values.
+
+    `undecided`: it is regular as its numbers stand, and singular within their errors, so that nobody can tell.
+    """
+
+    condition: float
+    singular: bool
+    size: int
+    variables: tuple[str, ...]
+    equations: tuple[str, ...]
+    causes: tuple[tuple[str, float], ...]
+    causes_are_parameters: bool
+    undecided: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,12 +62,12 @@ def _plan_check(plan: SystemPlan) -> _Check:
             continue
         examined.add(k)
         for equation in step.equations:
-            for slot in slots_of_partials(equation):
-                source = equation.quantity[:, slot]
-                wanted[source[source != ZERO]] = True
+            inside = (equation.template.slots_of_partial(slot) for slot in equation.inside)
+            source = equation.quantity[:, sorted(frozenset().union(*inside))]
+            wanted[source[source != ZERO]] = True
     settled = plan.selection.settled
     for planned in plan.constraints:
-        wanted[settled[np.isin(settled, planned.group.quantity)]] = True
+        wanted[settled[np.isin(settled, planned.equation.quantity)]] = True
     for k in reversed(range(len(plan.steps))):
         step = plan.steps[k]
         if any(wanted[q].any() for q in step.unknown):
@@ -78,114 +98,142 @@ def examine_blocks(
     **Arguments:**
 
     - `parameters`, `x`: flat arrays.
-    - `inputs`: a function that gives the values of the inputs' quantities; called only if they are needed.
-    - `limit`: the condition number from which on a block that is written out is reported.
+    - `inputs`: a function that gives the values of the inputs' quantities; called only if there are any.
+    - `limit`: the condition number from which on a block is reported.
     """
     check = _plan_check(plan)
     if not check.examined and not plan.n_constraints:
         return
-    values = BlockValues(plan, parameters, networks, t, x, inputs)
+    quantities = plan.extended.quantities
+    values = np.full(quantities.n, np.nan)
+    values[[*plan.states, *plan.carried]] = x
+    if quantities.n > quantities.n_unknown:
+        values[quantities.n_unknown :] = inputs()
+    parameters = np.asarray(parameters, float)
+    known = Known(Point.of(values, parameters, t, Networks(networks)), typical_sizes(plan.model, parameters))
     for k, step in enumerate(plan.steps):
-        if isinstance(step, SparseStep):
-            finding = sparse_finding(plan, values, step)
-            if finding is not None:
-                yield finding
-                if finding.singular:
-                    return
+        if k not in check.examined | check.solved:
             continue
-        if step.carried and (k in check.solved or k in check.examined):
-            values.follow(step)
-        if k in check.examined:
-            condition, left, right = conditions(values.jacobian(step), values.jacobian_errors(step))
-            for b in np.flatnonzero(~(condition < limit)):
-                singular = not np.isfinite(condition[b])
-                yield _finding(plan, values, step, int(b), float(condition[b]), singular, left(int(b)), right(int(b)))
-                if singular:
+        if isinstance(step, SparseStep):
+            blocks = blocks_of(step)
+        else:
+            if step.carried:
+                _follow(step, known)
+            elif k in check.solved:
+                _solve(step, known)
+            blocks = blocks_of(step, np.flatnonzero(_are_suspicious(step, known))) if k in check.examined else ()
+        for block in blocks:
+            if step.whole and not step.carried:
+                known.put(block.unknown, 0.0)
+            rank = block.rank(known)
+            if rank is None:
+                continue
+            condition = rank.condition if rank.is_regular else np.inf
+            if not condition < limit:
+                yield _finding(plan, known, block, rank)
+                if not rank.is_regular:
                     return
-        if k in check.solved and not step.carried:
-            values.solve(step)
-    yield from _constraints(plan, values)
+            if step.whole and not step.carried:
+                known.put(block.unknown, rank.solve(-block.residual(known)))
+    yield from _constraints(plan, known)
 
 
-def _finding(
-    plan: SystemPlan, values: BlockValues, step: Step, b: int, condition, singular, left, right
-) -> BlockFinding:
-    names = [plan.quantity_name[int(u[b])] for u in step.unknown]
-    texts = [plan.locate(int(e.equation[b])) for e in step.equations]
-    chosen = np.flatnonzero(np.abs(right).max(axis=1, initial=0.0) > SLIGHT)
-    dependent = np.flatnonzero(np.abs(left).max(axis=1, initial=0.0) > SLIGHT)
-    variables = tuple(names[u] for u in chosen) or tuple(names)
-    equations = tuple(dict.fromkeys(texts[e] for e in dependent)) or tuple(dict.fromkeys(texts))
-    causes = _causes(plan, values, step, b, left, right) if singular or left.shape[1] else ()
-    parameters = bool(causes) and causes[0][0] in plan.flat.parameters.names
-    undecided = singular and len(names) <= DENSE_LIMIT and is_undecided(values.jacobian(step)[b])
-    return BlockFinding(condition, singular, len(names), variables, equations, causes, parameters, undecided)
+def _in_blocks(step: Step, of_slots: Callable[[Group], np.ndarray]) -> np.ndarray:
+    """Numbers by slots, (n, slots) of each of a step's equations, as matrices of its n blocks, shape (n, k, k)."""
+    k = len(step.unknown)
+    out = np.zeros((step.n, k, k))
+    for e, equation in enumerate(step.equations):
+        found = of_slots(equation)
+        for slot in equation.inside:
+            out[:, e, equation.local[slot]] += found[:, slot]
+    return out
 
 
-def _causes(plan: SystemPlan, values: BlockValues, step: Step, b: int, left, right) -> tuple[tuple[str, float], ...]:
-    """The parameters, or else the variables, a change of which makes the block regular: those for which uᵀ·∂J·v ≠ 0 for
-    null vectors u and v, beyond the errors of J: a multiple of what is zero but for rounding is no cause."""
-    before = values.jacobian(step)[b]
-    errors = np.abs(left).T @ values.jacobian_errors(step)[b] @ np.abs(right)
+def _are_suspicious(step: Step, known: Known) -> np.ndarray:
+    """True for blocks that are not evidently regular, shape (n,)."""
+    matrices = _in_blocks(step, lambda equation: equation.partials(known.at))
+    errors = _in_blocks(step, lambda equation: equation.partial_errors(known.at, known.errors))
+    return ~are_evident(matrices, errors)
 
-    def matters(after: np.ndarray, anyhow: bool = False) -> bool:
-        change = after - before
-        if not np.isfinite(change).all():
-            return True
-        scale = np.abs(change).max(initial=0.0)
-        if scale == 0.0:
-            return False
-        if anyhow or not left.shape[1]:
-            return True
-        along = np.abs(left.T @ (change / scale) @ right)
-        return bool(((along > RANK) & (along * scale > errors)).any())
 
-    found: list[tuple[str, float]] = []
-    for p in sorted({int(p) for e in step.equations for p in e.parameter[b]}):
-        parameters = values.parameters.copy()
-        parameters[p] += 1e-3 * (abs(parameters[p]) or 1.0)
-        if matters(values.jacobian(step, parameters)[b]):
-            found.append((plan.flat.parameters.names[p], float(values.parameters[p])))
+def _follow(step: Step, known: Known):
+    """Computes the unknowns that follow from the tearing variables in the state."""
+    for e, u in step.tearing.sequence:
+        equation = step.equations[e]
+        (slot,) = [k for k in equation.inside if equation.local[k] == u]
+        known.put(step.unknown[u], equation.solved(slot, known.at))
+
+
+def _solve(step: Step, known: Known):
+    """Computes the unknowns of a linear step."""
+    for quantities in step.unknown:
+        known.put(quantities, 0.0)
+    residual = np.stack([equation.residual(known.at) for equation in step.equations], axis=-1)
+    try:
+        with np.errstate(all="ignore"):
+            matrices = _in_blocks(step, lambda equation: equation.partials(known.at))
+            found = np.linalg.solve(matrices, -residual[..., None])[..., 0]
+    except np.linalg.LinAlgError:
+        found = np.full(residual.shape, np.nan)
+    for u, quantities in enumerate(step.unknown):
+        known.put(quantities, found[:, u])
+
+
+def _finding(plan: SystemPlan, known: Known, block: Block, rank: Rank | SparseRank) -> BlockFinding:
+    left, right = (np.abs(vectors).max(axis=1, initial=0.0) for vectors in rank.null_vectors())
+    names = [plan.quantity_name[q] for q in block.unknown.tolist()]
+    texts = [plan.locate(e) for group in block.equations for e in group.equation.tolist()]
+    variables = [name for name, size in zip(names, right, strict=True) if size > SLIGHT * right.max()]
+    equations = [text for text, size in zip(texts, left, strict=True) if size > SLIGHT * left.max()]
+    causes = _causes(plan, known, block, rank) if left.any() else ()
+    singular, n = not rank.is_regular, len(names)
+    undecided = singular and n <= DENSE_LIMIT and is_undecided(block.jacobian(known).toarray())
+    return BlockFinding(
+        rank.condition if rank.is_regular else np.inf,
+        singular,
+        n,
+        tuple(variables) or tuple(names),
+        tuple(dict.fromkeys(equations or texts)),
+        causes,
+        bool(causes) and causes[0][0] in plan.flat.parameters.names,
+        undecided,
+    )
+
+
+def _causes(plan: SystemPlan, known: Known, block: Block, rank: Rank | SparseRank) -> tuple[tuple[str, float], ...]:
+    """The parameters, or else the variables, a change of which makes the block regular."""
+    parameters, names = known.at.parameters, plan.flat.parameters.names
+    changing = np.flatnonzero(block.effects(known, rank, of_parameters=True).matters).tolist()
+    found = [(names[p], float(parameters[p])) for p in changing[:DENSE_LIMIT]]
     # A parameter that is not zero only scales what is: the cause is what is zero.
     zero = [c for c in found if c[1] == 0.0]
     if zero:
         return tuple(zero)
-    moved: list[tuple[str, float]] = []
-    touched: list[tuple[str, float]] = []  # where it is of the second order
-    sizes = values.errors / KNOWN  # a step along 1e-16 rad alone would show nothing
-    sources = {int(e.quantity[b, s]) for e in step.equations for s in slots_of_partials(e)} - {ZERO}
-    for q in sorted(sources):
-        kept = values.quantities[q]
-        values.quantities[q] = kept + 1e-3 * (sizes[q] or 1.0)
-        after = values.jacobian(step)[b]
-        values.quantities[q] = kept
-        name = plan.quantity_name[q]
-        named = (name, float(kept) + 0.0)
-        if matters(after):
-            moved.append(named)
-        elif kept == 0.0 and matters(after, anyhow=True):
-            touched.append(named)
+    values, effects = known.at.values, block.effects(known, rank, of_parameters=False)
+    named = [(name, float(value) + 0.0) for name, value in zip(plan.quantity_name, values, strict=False)]
+    moved = [named[q] for q in np.flatnonzero(effects.matters[:-1]).tolist()]
+    touched = [named[q] for q in np.flatnonzero(effects.touches[:-1] & (values[:-1] == 0.0)).tolist()]
     return tuple([c for c in moved if c[1] == 0.0] or found or moved or touched)
 
 
-def _constraints(plan: SystemPlan, values: BlockValues) -> Iterator[BlockFinding]:
+def _constraints(plan: SystemPlan, known: Known) -> Iterator[BlockFinding]:
     """Hidden constraints that depend on each other at the state: the projection could not tell them apart."""
-    m = plan.n_constraints
+    m, values = plan.n_constraints, known.at.values
     if not m or plan.constraint_pattern is None or m > DENSE_LIMIT:
         return
-    place = np.full(len(values.quantities), -1)  # ZERO is −1: the last entry
+    place = np.full(len(values), -1)  # ZERO is −1: the last entry
     place[plan.states] = np.arange(len(plan.states))
     matrix, errors = np.zeros((2, m, len(plan.states)))
     texts = []
     row = 0
     for planned in plan.constraints:
-        group = planned.group
-        if np.isnan(values.quantities[group.quantity]).any() or group.template.opaque is not None:
+        group = planned.equation
+        if np.isnan(values[group.quantity]).any() or group.template.opaque is not None:
             return
         instance, slot = np.nonzero(place[group.quantity] >= 0)
         entries = row + instance, place[group.quantity[instance, slot]]
-        np.add.at(matrix, entries, group.partials(values.point)[instance, slot])
-        np.add.at(errors, entries, group.partial_errors(values.point, values.errors)[instance, slot])
+        np.add.at(matrix, entries, group.partials(known.at)[instance, slot])
+        np.add.at(errors, entries, group.partial_errors(known.at, known.errors)[instance, slot])
         texts += group.equation.tolist()
         row += len(group)
     if not np.isfinite(matrix).all():
@@ -194,13 +242,13 @@ def _constraints(plan: SystemPlan, values: BlockValues) -> Iterator[BlockFinding
     condition = rank.condition if rank.is_regular else np.inf
     if condition < ILL_CONDITIONED:
         return
-    dependent = np.flatnonzero(np.abs(left_null(rank)).max(axis=1, initial=0.0) > SLIGHT)
+    dependent = np.flatnonzero(np.abs(rank.null_vectors()[0]).max(axis=1, initial=0.0) > SLIGHT)
     states = np.flatnonzero(np.abs(matrix[dependent]).max(axis=0, initial=0.0) > 0)
     if not len(states):
         states = np.array(sorted({k for r in dependent for k in plan.constraint_pattern[r]}), np.int64)
     names = tuple(plan.quantity_name[int(plan.states[k])] for k in states)
     singular = not rank.is_regular
-    at = tuple((name, float(values.quantities[plan.states[k]])) for name, k in zip(names, states, strict=True))
+    at = tuple((name, float(values[plan.states[k]])) for name, k in zip(names, states, strict=True))
     yield BlockFinding(
         float(condition), singular, m, names, tuple(plan.locate(texts[e]) for e in dependent), at, False,
         undecided=singular and is_undecided(matrix),

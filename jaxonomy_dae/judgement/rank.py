@@ -16,7 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float
 
-from ..tolerances import EPS, TINY
+from ..tolerances import EPS, ILL_CONDITIONED, TINY
 from .scaling import balanced, equilibrated
 
 EASY = 1e8  # a condition number below which scales that cost an iterative solve are not looked for
@@ -76,6 +76,17 @@ class Rank:
         """True if the rows are independent."""
         return self.uncertainty < 1
 
+    def null_vectors(self) -> tuple[np.ndarray, np.ndarray]:
+        """Left and right singular vectors of the scaled matrix, as columns, of singular values that count as zero; at
+        least one each if the rows are dependent."""
+        least = max(self.s.max(initial=0.0), TINY) / ILL_CONDITIONED
+        small = np.flatnonzero(self.s <= (least if self.is_regular else max(least, self.s[-1])))
+        return self.u[:, small], self.vt[small].T
+
+    def solve(self, b: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """A⁻¹ b of a square matrix that is regular."""
+        return self.c * (self.vt.T @ (self.u.T @ (self.r * b) / self.s))
+
     @functools.cached_property
     def number(self) -> int:
         """The rank that every matrix within the errors has: no singular value moves by more than ‖N‖ (Weyl 1912)."""
@@ -91,6 +102,23 @@ def is_undecided(matrix: Float[np.ndarray, "m n"]) -> bool:
     """True if a matrix that is singular within its errors would be regular if its entries were exact to one
     rounding."""
     return rank_of(matrix, rounding(matrix)).is_regular
+
+
+def are_evident(matrices: Float[np.ndarray, "b n n"], errors: Float[np.ndarray, "b n n"]) -> np.ndarray:
+    """True for matrices that are finite, regular and well-conditioned at a glance, as most are, shape (b,): with rows
+    and then columns scaled to a largest entry of 1."""
+    finite = np.isfinite(matrices).all(axis=(1, 2))
+    size, errors = np.where(finite[:, None, None], np.abs(matrices), 0.0), np.where(finite[:, None, None], errors, 0.0)
+    if matrices.shape[1] == 1:  # a single coefficient has no scale but zero
+        return finite & (size > errors)[:, 0, 0]
+    seen = np.where(size > errors, matrices, 0.0)
+    rows = np.abs(seen).max(axis=2, keepdims=True, initial=0.0) + TINY
+    columns = np.abs(seen / rows).max(axis=1, keepdims=True, initial=0.0) + TINY
+    s = np.linalg.svd(seen / rows / columns, compute_uv=False)
+    with np.errstate(all="ignore"):
+        # No singular value moves by more than the norm of the errors.
+        moved = np.linalg.norm(errors / rows / columns, axis=(1, 2))
+        return finite & (moved < s[:, -1]) & (s[:, 0] < EASY * s[:, -1])
 
 
 def rank_of(matrix: Float[np.ndarray, "m n"], errors: Float[np.ndarray, "m n"]) -> Rank:

@@ -28,8 +28,13 @@ class SparseRank:
     def is_regular(self) -> bool:
         return self.uncertainty < 1 and self.condition * len(self.r) * EPS < 1
 
+    def solve(self, b: np.ndarray) -> np.ndarray:
+        """A⁻¹ b of a matrix that is regular."""
+        return self.c * self.factors.solve(self.r * b)
+
     def null_vectors(self) -> tuple[np.ndarray, np.ndarray]:
-        """Left and right null vectors of the scaled matrix, singular or nearly so, by inverse iteration."""
+        """A left and a right null vector of the scaled matrix, singular or nearly so, as columns, by inverse
+        iteration."""
         n = len(self.r)
         linalg: Any = scipy.sparse.linalg
         shift = 1e-10 * sp.diags_array(1 + np.arange(n) / n)  # regular, whatever the kernel
@@ -39,7 +44,7 @@ class SparseRank:
             right = factors.solve(right)
             left = factors.solve(left, trans="T")
             right, left = right / np.abs(right).max(), left / np.abs(left).max()
-        return left, right
+        return left[:, None], right[:, None]
 
 
 def sparse_rank_of(matrix: Any, errors: Any) -> SparseRank:

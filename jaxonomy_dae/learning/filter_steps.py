@@ -23,9 +23,9 @@ from jaxtyping import Array, Bool, Float
 
 from ..simulation.simulate import simulate
 from ..simulation.solution import Solution
-from ..system.evaluate import Refinement
 from ..system.input_values import by_entry
 from ..system.inputs import read_inputs, value_at
+from ..system.nonlinear import Refinement
 from ..system.system import AcausalSystem
 from ..system.system_at import SystemAt
 from .filtering import Structure

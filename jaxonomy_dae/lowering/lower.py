@@ -16,12 +16,12 @@ from ..model.tables import ZERO, FlatModel, RowInjection
 from .entry_sizes import EntrySizes
 from .gather import NOTHING
 from .live_relations import without_live_relations
-from .plan import ConstraintGroup, InputTable, PlannedRow, SystemPlan
+from .plan import InputTable, PlannedRow, SystemPlan
 from .plan_events import plan_events
 from .plan_held import plan_held
 from .plan_waves import plan_waves
-from .program import Layout, Program, plan
-from .schedule import AnyStep, build_schedule, needed
+from .program import Layout, Program, plan, plan_equation
+from .schedule import AnyStep, build_schedule, equation_of, needed
 
 
 def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = None) -> SystemPlan:
@@ -54,15 +54,7 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
 
     constraint_groups, constraint_slots, constraint_pattern = _constraints(extended, selection, state_order)
     constraint_program = program(needed(steps, constraint_slots, n))
-    planned_constraints = tuple(
-        ConstraintGroup(
-            g,
-            tuple(
-                constraint_program.layout.gather(g.quantity[:, k], g.factor[:, k]) for k in range(g.quantity.shape[1])
-            ),
-        )
-        for g in constraint_groups
-    )
+    planned_constraints = tuple(plan_equation(group, constraint_program.layout) for group in constraint_groups)
 
     events = plan_events(
         flat,
@@ -153,7 +145,7 @@ def _constraints(extended: Extended, selection: StateSelection, states: np.ndarr
         rows = np.flatnonzero(wanted[group.equation])
         if not len(rows):
             continue
-        taken = group.take(rows)
+        taken = equation_of(group, rows, {})
         groups.append(taken)
         slots.append(taken.quantity.ravel())
         for row in taken.quantity.tolist():

@@ -13,7 +13,7 @@ from ..compiler.select_states import StateSelection
 from ..errors import ModelError, nearest
 from ..linear.sparse import SparsePattern
 from ..model.array_names import inner_name, one_by_one
-from ..model.extended import Extended, ExtendedGroup
+from ..model.extended import Extended
 from ..model.identity import Identity
 from ..model.opaque import OpaqueFunction
 from ..model.provenance import differentiated
@@ -25,7 +25,7 @@ from .gather import Gather
 from .plan_events import EventPlan
 from .plan_held import HeldPlan
 from .plan_waves import WaveGroup
-from .program import Program, plan
+from .program import PlannedEquation, Program, plan
 from .schedule import TORN, AnyStep, needed
 
 
@@ -51,14 +51,6 @@ def dummy_blocks(steps: Sequence[AnyStep], dummies: np.ndarray) -> tuple[DummyBl
             found.extend(DummyBlocks(start + rows, start + columns) for rows, columns in step.blocks_of(holds))
         start += sum(len(quantities) for quantities in step.guessed)
     return tuple(found)
-
-
-@dataclasses.dataclass(frozen=True)
-class ConstraintGroup:
-    """Residuals of one template to project onto, read from a program's results."""
-
-    group: ExtendedGroup
-    slots: tuple[Gather, ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,7 +107,7 @@ class SystemPlan:
     carried_rates: Gather | None  # where the model itself has the derivatives of all `carried`
     carried_residuals: Program
     constraint_program: Program
-    constraints: tuple[ConstraintGroup, ...]
+    constraints: tuple[PlannedEquation, ...]
     constraint_pattern: tuple[frozenset[int], ...] | None
     rows: tuple[PlannedRow, ...]
     network_names: tuple[str, ...]

@@ -87,6 +87,11 @@ class PlannedStep(AbstractPlanned):
     equations: tuple[PlannedEquation, ...]
     guess: tuple[Gather, ...]
 
+    @property
+    def left(self) -> tuple[PlannedEquation, ...]:
+        """The equations that tearing variables must fulfil."""
+        return tuple(self.equations[e] for e in self.step.tearing.residuals)
+
     def evaluate(self, evaluation: AbstractEvaluation, refine: Any) -> list[Any]:
         return evaluation.step(self, refine)
 
@@ -107,6 +112,11 @@ class PlannedSparse(AbstractPlanned):
     pattern: SparsePattern
     guess: Gather | None
     linear_solver: lx.AbstractLinearSolver | None
+
+    @property
+    def left(self) -> tuple[PlannedEquation, ...]:
+        """The equations that the unknowns must fulfil."""
+        return self.equations
 
     def evaluate(self, evaluation: AbstractEvaluation, refine: Any) -> list[Any]:
         return evaluation.sparse_step(self, refine)
@@ -185,7 +195,7 @@ def plan(
             planned.append(_plan_sparse(step, layout, place, linear_solver))
         else:
             unknown = step.unknown
-            equations = tuple(_plan_equation(e, layout) for e in step.equations)
+            equations = tuple(plan_equation(e, layout) for e in step.equations)
             guess = tuple(_from_state(place[quantities]) for quantities in step.guessed)
             planned.append(PlannedStep(step, equations, guess))
         for quantities in unknown:
@@ -194,7 +204,8 @@ def plan(
     return Program(tuple(planned), Layout(chunk, offset))
 
 
-def _plan_equation(equation: StepEquation, layout: Layout) -> PlannedEquation:
+def plan_equation(equation: StepEquation, layout: Layout) -> PlannedEquation:
+    """Plans to read what an equation has from outside of its step."""
     outside = [k for k, u in enumerate(equation.local) if u < 0]
     gathers = iter(layout.gathers(equation.quantity[:, outside].T, equation.factor[:, outside].T) if outside else ())
     sources = tuple(-1 - u if u >= 0 else next(gathers) for u in equation.local)

@@ -289,14 +289,15 @@ def _single_steps(group: ExtendedGroup, g: int, row_of, blocks: Blocks, places, 
     for (lv, _), members in shapes.items():
         r = rows[members]
         positions = np.flatnonzero(hit[members[0]])
-        equation = _equation(group, r, {int(p): 0 for p in positions})
+        equation = equation_of(group, r, {int(p): 0 for p in positions})
         template = group.template
         linear = template.is_affine_in([int(p) for p in positions])
         torn = Tearing(((0, 0),), (), ()) if linear else Tearing((), (0,), (0,))
         yield (lv, 0, int(equation.equation[0])), Step(lv, (equation,), (unknown[members],), torn, linear)
 
 
-def _equation(group: ExtendedGroup, rows: np.ndarray, local: dict[int, int]) -> StepEquation:
+def equation_of(group: ExtendedGroup, rows: np.ndarray, local: dict[int, int]) -> StepEquation:
+    """Some instances of a group, whose slots hold these local unknowns."""
     return StepEquation(
         group.template,
         group.equation[rows],
@@ -366,7 +367,7 @@ def _torn_step(
     equations = []
     for e, (g, slots) in enumerate(shape):
         rows = row_of[[block.equations[e] for block in alike]]
-        equations.append(_equation(extended.groups[g], rows, {k: slots[k] for k in _inside(slots)}))
+        equations.append(equation_of(extended.groups[g], rows, {k: slots[k] for k in _inside(slots)}))
     unknown = tuple(np.array(column) for column in zip(*(block.unknowns for block in alike), strict=True))
     return Step(level, tuple(equations), unknown, torn, linear)
 
@@ -381,6 +382,6 @@ def _sparse_step(
     equations, equation_block = [], []
     for g in np.unique(group_of[equation]).tolist():
         here = np.flatnonzero(group_of[equation] == g)
-        equations.append(_equation(extended.groups[g], row_of[equation[here]], {}))
+        equations.append(equation_of(extended.groups[g], row_of[equation[here]], {}))
         equation_block.append(block[here])
     return SparseStep(level, tuple(equations), (unknown,), block, tuple(equation_block), linear)

@@ -51,19 +51,6 @@ class ExtendedGroup(Group):
     base: np.ndarray  # the equation as written that each comes from (n,)
     level: int
 
-    def take(self, rows: np.ndarray) -> "ExtendedGroup":
-        """The instances of these rows."""
-        return ExtendedGroup(
-            self.template,
-            self.equation[rows],
-            self.quantity[rows],
-            self.factor[rows],
-            self.parameter[rows],
-            self.coefficient[rows],
-            self.base[rows],
-            self.level,
-        )
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Extended:

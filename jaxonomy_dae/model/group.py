@@ -6,13 +6,16 @@ arguments of a template together in NumPy; `system.evaluate` does so for traced 
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
 
 from .networks import Networks
 from .template import AbstractTemplate
+
+
+G = TypeVar("G", bound="Group")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,6 +53,17 @@ class Group:
 
     def __len__(self):
         return len(self.equation)
+
+    def take(self: G, rows: Any) -> G:
+        """The instances of these rows."""
+        columns = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        return dataclasses.replace(self, **{n: c[rows] for n, c in columns.items() if isinstance(c, np.ndarray)})
+
+    def apart(self) -> "Group":
+        """The instances with a quantity and a parameter for each place in which one reads them, by rows: moving one of
+        them moves nothing in other places."""
+        quantities, parameters = (np.arange(ids.size).reshape(ids.shape) for ids in (self.quantity, self.parameter))
+        return Group(self.template, self.equation, quantities, self.factor, parameters, self.coefficient)
 
     def slots(self, values: np.ndarray) -> list[np.ndarray]:
         """The values of each slot, (n,), where the quantities have values of shape (quantities + 1,)."""

@@ -180,7 +180,7 @@ def _seen(
     for group in groups:
         if group.quantity.shape[1] == 0 or group.template.opaque is not None:
             continue
-        own = _with_arguments_of_its_own(group)
+        own = group.apart()
         arguments = np.append(point, 0.0)[group.quantity], parameters[group.parameter]
         size = of.sizes(own, *arguments)
         used = (size > 0) & np.isfinite(size)
@@ -210,13 +210,6 @@ def _seen(
                 powers[side].append((place[hit], moving[hit], np.clip(power[hit], -STEEPEST, STEEPEST)))
     n_own = first if of is _Entries else 0
     return _Seen(np.concatenate(logarithms), np.concatenate(equations), _joined(powers[0]), _joined(powers[1]), n_own)
-
-
-def _with_arguments_of_its_own(group: ExtendedGroup) -> Group:
-    """The group with a quantity and a parameter for each place in which an instance reads one, by rows: moving one of
-    them moves nothing in other places."""
-    quantities, parameters = (np.arange(ids.size).reshape(ids.shape) for ids in (group.quantity, group.parameter))
-    return Group(group.template, group.equation, quantities, group.factor, parameters, group.coefficient)
 
 
 def _apart(readers: Sequence[frozenset[int]], n: int) -> Iterator[np.ndarray]:

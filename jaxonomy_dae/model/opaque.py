@@ -179,5 +179,11 @@ class OpaqueTemplate(AbstractTemplate):
     def partial_values(self, slots, parameters, coefficients, t, networks, backend="jax"):
         if backend == "numpy":
             return tuple(np.moveaxis(self._numpy("partials", slots, t, networks), -1, 0))
-        values = jnp.stack([jnp.asarray(s, jnp.asarray(t).dtype) for s in slots])
-        return tuple(jax.jacfwd(lambda v: self.residual(list(v), (), (), t, networks))(values))
+        # Each instance is a function of its own slots alone: one direction moves the same slot of all.
+        values = jnp.stack(jnp.broadcast_arrays(*(jnp.asarray(s, jnp.asarray(t).dtype) for s in slots)))
+
+        def along(direction):
+            return jax.jvp(lambda v: self.residual(list(v), (), (), t, networks), (values,), (direction,))[1]
+
+        basis = jnp.eye(len(slots), dtype=values.dtype).reshape(len(slots), len(slots), *[1] * (values.ndim - 1))
+        return tuple(jax.vmap(along)(jnp.broadcast_to(basis, (len(slots), *values.shape))))

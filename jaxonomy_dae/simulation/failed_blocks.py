@@ -12,8 +12,7 @@ import numpy as np
 
 from ..aliases import Inputs, State, Time
 from ..diagnosis.wording import quoted
-from ..initialization.condition import BlockFinding
-from ..initialization.singular_blocks import examine_blocks
+from ..initialization.singular_blocks import BlockFinding, examine_blocks
 from ..lowering.schedule import AnyStep
 from ..model.tables import ZERO
 from ..programs.cache import compiled

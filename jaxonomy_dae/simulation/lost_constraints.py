@@ -31,9 +31,8 @@ def lost_constraint(system: AcausalSystem, inputs: Inputs, t: Time, x: State, t1
     """A sentence that names a hidden constraint which has no solution near x just beyond t; "" if all have one."""
     if not system.plan.n_constraints:
         return ""
-    groups = system.plan.constraints
-    equation = np.concatenate([planned.group.equation for planned in groups])
-    level = np.concatenate([np.full(len(planned.group), planned.group.level) for planned in groups])
+    equation = np.concatenate([planned.equation.equation for planned in system.plan.constraints])
+    level = system.plan.extended.level[equation]
     for dt in np.diff(BEYOND, prepend=0.0) * float(t1 - t):
         dt = jnp.asarray(dt, jnp.asarray(t).dtype)
         found, before, after, leads_back = _search(system, t, dt, x, inputs)

@@ -25,9 +25,9 @@ from ..programs.platform import precisely
 from ..programs.staging import is_staged, is_traced, joined, on_device, picked
 from ..tolerances import CONSISTENT
 from .bounds import constrained, unconstrained
-from .evaluate import Refinement
 from .input_values import check_given
 from .inputs import check_range, read_inputs
+from .nonlinear import Refinement
 from .parameters import Parameters
 from .solver_choice import Stiffness
 from .system_at import SystemAt

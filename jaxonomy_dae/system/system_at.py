@@ -18,7 +18,7 @@ from ..linear.sparse import SparsePattern, sparse_jacobian
 from ..linear.whole import solve_whole
 from ..linear.written_out import UNROLLED, solve
 from ..lowering.gather import SCALARS, Gather, entries, take, times
-from ..lowering.plan import ConstraintGroup, PlannedRow, SystemPlan
+from ..lowering.plan import PlannedRow, SystemPlan
 from ..lowering.plan_events import EventPlan
 from ..lowering.plan_held import HeldPlan
 from ..lowering.program import Program
@@ -26,9 +26,11 @@ from ..model.networks import Networks
 from ..model.starts import Start
 from ..programs.staging import is_traced, joined, on_device
 from ..solvers.field_size import is_large
-from .evaluate import Evaluation, Refinement, newton
+from .evaluate import Evaluation
 from .input_values import input_values
 from .measured import Measured
+from .nonlinear import Refinement
+from .roots import newton
 
 
 class SystemAt:
@@ -150,7 +152,7 @@ class SystemAt:
         return self.run(self.plan.carried_residuals, state, Refinement.NONE, t=t).residuals
 
     def carried_vector(self, t: Any, state: Any) -> Any:
-        return jnp.concatenate([jnp.reshape(r, (-1,)) for r in self._carried(t, state)])
+        return self._joined(self._carried(t, state))
 
     def block_determinants(self, x: Any) -> Any:
         """det ∂g/∂z of every nonlinear block that is written out, shape (blocks,)."""
@@ -233,29 +235,15 @@ class SystemAt:
     def constraints(self, state: Any) -> list[Any]:
         """The hidden constraints' residuals, one array for each template: scalars, or shape (instances,)."""
         evaluation = self.run(self.plan.constraint_program, state, Refinement.NONE)
-        return [self._constraint(evaluation, group) for group in self.plan.constraints]
-
-    def _constraint(self, evaluation: Evaluation, planned: ConstraintGroup) -> Any:
-        value = planned.group.template.residual(*self._constraint_arguments(evaluation, planned))
-        n = len(planned.group)
-        return jnp.broadcast_to(jnp.asarray(value, self.dtype), () if n == 1 else (n,))
-
-    def _constraint_arguments(self, evaluation: Evaluation, planned: ConstraintGroup):
-        """The arguments of a constraint group's template."""
-        group = planned.group
-        slots = [evaluation.read(g) for g in planned.slots]
-        if len(group) == 1:
-            parameters = [evaluation.parameter(int(k)) for k in group.parameter[0]]
-            coefficients: list[Any] = [float(c) for c in group.coefficient[0]]
-        else:
-            parameters = [take(self.parameters, column) for column in group.parameter.T]
-            coefficients = list(group.coefficient.T)
-        return slots, parameters, coefficients, self.t, evaluation.networks
+        found = (evaluation.equation(planned) for planned in self.plan.constraints)
+        return [at.filled(at.residual()) for at in found]
 
     def constraint_vector(self, state: Any) -> Any:
         """All hidden constraints' residuals, shape (n_constraints,)."""
-        values = [jnp.reshape(v, (-1,)) for v in self.constraints(state)]
-        return jnp.concatenate(values) if values else jnp.zeros((0,), self.dtype)
+        return self._joined(self.constraints(state))
+
+    def _joined(self, parts: Sequence[Any]) -> Any:
+        return jnp.concatenate([jnp.reshape(v, (-1,)) for v in parts]) if parts else jnp.zeros((0,), self.dtype)
 
     # --- magnitudes --------------------------------------------------------------------------------------------
 
@@ -273,17 +261,11 @@ class SystemAt:
     def constraint_magnitudes(self, x: Any, sizes: Any) -> Any:
         """The magnitudes of the hidden constraints' terms, shape (n_constraints,)."""
         evaluation = self._measured(self.plan.constraint_program, x, sizes)
-        found = []
-        for planned in self.plan.constraints:
-            sizes = [evaluation.size(g) for g in planned.slots]
-            value = planned.group.template.magnitude(sizes, *self._constraint_arguments(evaluation, planned))
-            found.append(jnp.broadcast_to(jnp.asarray(value, self.dtype), (len(planned.group),)))
-        return jnp.concatenate(found) if found else jnp.zeros((0,), self.dtype)
+        return self._joined([evaluation.terms_of(evaluation.equation(planned)) for planned in self.plan.constraints])
 
     def carried_magnitudes(self, x: Any, sizes: Any) -> Any:
         """The magnitudes of the terms of nonlinear blocks, shape (carried,)."""
-        found = self._measured(self.plan.carried_residuals, x, sizes).carried_magnitudes
-        return jnp.concatenate([jnp.reshape(v, (-1,)) for v in found]) if found else jnp.zeros((0,), self.dtype)
+        return self._joined(self._measured(self.plan.carried_residuals, x, sizes).carried_magnitudes)
 
     def magnitudes(self, x: Any, sizes: Any, quantity: np.ndarray, factor: np.ndarray) -> Any:
         """The magnitudes of quantities with factors, shape (len(quantity),); infinite or not-a-number where it is not

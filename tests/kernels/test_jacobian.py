@@ -9,7 +9,7 @@ from shared_models import MODELS, cascade
 
 from jaxonomy_dae import ModelError
 from jaxonomy_dae.lowering import pattern
-from jaxonomy_dae.system.evaluate import Refinement
+from jaxonomy_dae.system.nonlinear import Refinement
 
 
 def covers(found, dense: np.ndarray):

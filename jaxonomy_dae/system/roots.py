@@ -1,0 +1,118 @@
+"""Newton's method for batches of small systems, and the verdict that ends it."""
+
+import functools
+import operator
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from ..linear.dense import solve_dense
+from ..linear.written_out import UNROLLED, solve
+from ..tolerances import NOISE, ZERO_WITHIN, spacing
+
+NEWTON_STEPS = 120  # to the root of a nonlinear block, at most, halvings included; a double root takes 27
+SURE = 1e-6  # residuals so small, relative to their terms at the start, need not fall: rounding has a part in them
+
+
+def is_small(
+    residual: Any,
+    terms: Any,
+    partials: Sequence[Any],
+    typical: Sequence[Any],
+    tolerated: float,
+    noise: Sequence[Any] = (),
+) -> Any:
+    """True if a residual is small beside its terms, or beside the rounding of what it is computed from.
+
+    **Arguments:**
+
+    - `terms`: the magnitude of its terms.
+    - `partials`, `typical`, `noise`: its partial derivatives by slots; the typical sizes of these; and what rounding
+        may have left in them beyond their own.
+    """
+    eps = spacing(jnp.result_type(residual))
+    pairs = list(zip(partials, typical, strict=False))  # of a network, its output alone
+    floor = _weighed([(p, s) for p, s in pairs if not _is_nothing(s)])
+    left = _weighed([(p, n) for p, n in zip(partials, noise, strict=False) if not _is_nothing(n)])
+    allowed = tolerated * terms + ZERO_WITHIN * eps * floor + NOISE * left
+    # Where a slope is infinite, as that of a root at zero, the equation holds exactly or not at all.
+    return (jnp.abs(residual) <= allowed) & ((allowed < jnp.inf) | (residual == 0))
+
+
+def _weighed(pairs: Sequence[tuple[Any, Any]]) -> Any:
+    """Σ |a|·b."""
+    return functools.reduce(operator.add, [abs(a) * b for a, b in pairs], 0.0)
+
+
+def _is_nothing(value: Any) -> bool:
+    """True if a value is the Python number 0.0, known while a program is traced."""
+    return isinstance(value, float) and value == 0.0
+
+
+def find_root(
+    holds: Callable[[list[Any]], Any],
+    stepped: Callable[[list[Any]], tuple[list[Any], list[Any]]],
+    differentiable: Callable[[list[Any]], list[Any]],
+    sizes: list[Any],
+    z: list[Any],
+) -> tuple[list[Any], Any]:
+    """Newton's method from z until all `holds`, one verdict for each of a batch of problems; and the verdicts.
+
+    `stepped` gives the residuals and the step. A step is halved until the largest residual falls, relative to the
+    `sizes` of their terms at the start: whole steps go back and forth between the branches of a law with a kink.
+
+    The search is not differentiated. Two more steps of the `differentiable` correction follow: by the implicit function
+    theorem the first carries first derivatives and the second one second derivatives.
+    """
+
+    def going(carry):
+        *_, found, count = carry
+        return ~jnp.all(found) & (count < NEWTON_STEPS)
+
+    def body(carry):
+        trial, z, step, part, least, found, count = carry
+        residuals, new_step = stepped(trial)
+        off = [jnp.abs(r) / jnp.where(s > 0, s, 1) for r, s in zip(residuals, sizes, strict=True)]
+        largest = functools.reduce(jnp.maximum, off)
+        largest = jnp.max(largest) if jnp.ndim(found) < jnp.ndim(largest) else largest
+        falls = (largest <= (1 - part / 4) * least) | (least <= SURE)
+        part = jnp.where(falls, jnp.minimum(2 * part, 1), part / 2)
+        least = jnp.where(falls, largest, least)
+        z = [jnp.where(falls, a, b) for a, b in zip(trial, z, strict=True)]
+        step = [jnp.where(falls, a, b) for a, b in zip(new_step, step, strict=True)]
+        trial = [jnp.where(found, t, a + part * d) for t, a, d in zip(trial, z, step, strict=True)]
+        return trial, z, step, part, least, holds(trial), count + 1
+
+    z, sizes = jax.lax.stop_gradient((z, sizes))
+    found = holds(z)
+    one = jnp.ones(jnp.shape(found), z[0].dtype)
+    begin = z, z, [jnp.zeros_like(a) for a in z], one, jnp.inf * one, found, 0
+    z, *_, found, _ = jax.lax.while_loop(going, body, begin)
+    z = jax.lax.stop_gradient(z)
+    for _ in range(2):
+        z = differentiable(z)
+    return z, found
+
+
+def newton(residuals: Callable[[list[Any]], list[Any]], z: list[Any]) -> list[Any]:
+    """z after a Newton step for r(z) = 0, lists of arrays of one shape (a batch of problems); exact if r is affine."""
+    return [a + d for a, d in zip(z, newton_step(residuals, z)[1], strict=True)]
+
+
+def newton_step(residuals: Callable[[list[Any]], list[Any]], z: list[Any]) -> tuple[list[Any], list[Any]]:
+    """(r(z), a Newton step)."""
+    m = len(z)
+    if m <= UNROLLED:
+        value, push = jax.linearize(residuals, z)
+        columns = [push([jnp.ones_like(a) if j == k else jnp.zeros_like(a) for j, a in enumerate(z)]) for k in range(m)]
+        step = solve([[column[r] for column in columns] for r in range(m)], value)
+        return value, [-d for d in step]
+    stacked = jnp.stack(z)
+    value, push = jax.linearize(lambda v: jnp.stack(residuals(list(v))), stacked)
+    basis = jnp.eye(m, dtype=stacked.dtype).reshape(m, m, *([1] * z[0].ndim))
+    columns = jax.vmap(push)(jnp.broadcast_to(basis, (m, *stacked.shape)))  # (unknown, equation, *batch)
+    matrix = jnp.moveaxis(columns, (1, 0), (-2, -1))
+    step = solve_dense(matrix, jnp.moveaxis(value, 0, -1))
+    return list(value), list(-jnp.moveaxis(step, -1, 0))
