@@ -14,7 +14,6 @@ from jaxtyping import Float
 from .networks import Networks
 from .template import AbstractTemplate
 
-
 G = TypeVar("G", bound="Group")
 
 
