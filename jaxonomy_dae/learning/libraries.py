@@ -1,6 +1,7 @@
 """Libraries: which terms are tried, before it is known of which inputs."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -9,7 +10,7 @@ import sympy
 from ..errors import ModelError, nearest
 from ..expressions.from_sympy import UnsupportedExpression, read, symbols_of
 from ..modeling.networks import count_outputs, of_scalars
-from .term import AbstractTerm, OfFunction, Power, Written, local_name
+from .term import AbstractTerm, Inner, OfFunction, Power, Written, inner_of, local_name
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,8 +32,12 @@ class Library:
         - `ModelError` for symbols that are no inputs, for expressions that cannot be evaluated, and for other counts of
             outputs.
         """
-        found = [term for entry in self.entries for term in entry(inputs, outputs, where)]
-        return tuple(dict.fromkeys(found))
+        found = tuple(dict.fromkeys(term for entry in self.entries for term in entry(inputs, outputs, where)))
+        numbers = [one.name for one in inner_of(found)]
+        for name in numbers:
+            if numbers.count(name) > 1:
+                raise ModelError(f"{where}: '{name}' stands in several terms, with several ranges: give one for all")
+        return found
 
 
 def powers(highest: int) -> Library:
@@ -50,8 +55,12 @@ def powers(highest: int) -> Library:
     return Library((_Powers(highest),))
 
 
-def terms(*expressions: Any, **functions: Callable[..., Any]) -> Library:
-    """Terms from expressions and functions.
+def terms(*expressions: Any, **others: Callable[..., Any] | tuple[float, float]) -> Library:
+    """Terms from expressions and functions. Symbols that are not inputs are numbers to be found with the coefficients:
+
+    ```python
+    learning.terms("v", "v*Abs(v)", "sign(v)*exp(-(v/v_s)**2)", v_s=(0.01, 1.0))
+    ```
 
     **Arguments:**
 
@@ -59,13 +68,17 @@ def terms(*expressions: Any, **functions: Callable[..., Any]) -> Library:
         (SymPy symbols) or without their component. A block of one input accepts any symbol. For a block of several
         outputs, a tuple with one expression for each is one term; a single expression is one term for each output, each
         with its own coefficient.
-    - `functions`: JAX functions by name, `plateau=lambda v: jnp.tanh(v / 0.1)`, called with a scalar for each input;
-        they return a scalar, as a single expression, or one value for each output.
+    - `others`: JAX functions by name, `plateau=lambda v: jnp.tanh(v / 0.1)`, called with a scalar for each input;
+        they return a scalar, as a single expression, or one value for each output. Also ranges `(low, high)` of numbers
+        inside expressions. A number without a range is positive and is searched around 1 and around the size of the
+        inputs. The same name in several terms is the same number.
 
     **Raises:**
 
-    - `ModelError` for other arguments; when used, for symbols that are not inputs.
+    - `ModelError` for other arguments; when used, for expressions without an input and for numbers that act only as a
+        coefficient does.
     """
+    ranges = {name: _range(name, given) for name, given in others.items() if not callable(given)}
     entries: list[Any] = []
     for given in expressions:
         parts = given if isinstance(given, tuple | list) else (given,)
@@ -73,14 +86,23 @@ def terms(*expressions: Any, **functions: Callable[..., Any]) -> Library:
             raise ModelError(
                 f"terms takes SymPy expressions, texts, or functions by name (drag=lambda v: …); got {given!r}"
             )
-        entries.append(_Expressions(tuple(parts), isinstance(given, tuple | list)))
-    for name, function in functions.items():
-        if not callable(function):
-            raise ModelError(f"terms: '{name}' needs a function of the block's inputs; got {function!r}")
-        entries.append(_Function(name, function))
+        entries.append(_Expressions(tuple(parts), isinstance(given, tuple | list), tuple(ranges.items())))
+    entries.extend(_Function(name, function) for name, function in others.items() if callable(function))
     if not entries:
         raise ModelError('terms needs at least one expression or function: terms("v", "v*Abs(v)")')
     return Library(tuple(entries))
+
+
+def _range(name: str, given: Any) -> tuple[float, float]:
+    try:
+        low, high = (float(end) for end in given)
+    except (TypeError, ValueError):
+        raise ModelError(
+            f"terms: '{name}' needs a function of the block's inputs, or a range (low, high) of a number; got {given!r}"
+        ) from None
+    if not (math.isfinite(low) and math.isfinite(high) and low < high):
+        raise ModelError(f"terms: the range of '{name}' is a pair low < high; got ({low:g}, {high:g})")
+    return low, high
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,6 +122,7 @@ class _Powers:
 class _Expressions:
     parts: tuple[Any, ...]
     is_vector: bool
+    ranges: tuple[tuple[str, tuple[float, float]], ...]  # of numbers inside, by name
 
     def __call__(self, inputs: tuple[str, ...], outputs: int, where: str) -> list[AbstractTerm]:
         symbols = tuple(sympy.Symbol(f"u{k}", real=True) for k in range(len(inputs)))
@@ -109,35 +132,62 @@ class _Expressions:
             raise ModelError(f"{where}: term {self.parts} has {len(written)} entries, but the block {outputs} outputs")
         if self.is_vector or outputs == 1:
             label = texts[0] if outputs == 1 else f"[{', '.join(texts)}]"
-            return [Written(label, symbols, written)]
+            return [self._written(label, symbols, written)]
         zero = sympy.Integer(0)
         rows = [tuple(written[0] if k == j else zero for k in range(outputs)) for j in range(outputs)]
-        return [Written(f"{texts[0]} in output {j}", symbols, row) for j, row in enumerate(rows)]
+        return [self._written(f"{texts[0]} in output {j}", symbols, row) for j, row in enumerate(rows)]
+
+    def _written(self, label: str, symbols: tuple[sympy.Symbol, ...], written: tuple[sympy.Expr, ...]) -> Written:
+        """A term, with the numbers inside it after its inputs."""
+        inside = sorted({s for e in written for s in symbols_of(e)} - set(symbols), key=str)
+        numbers = tuple(Inner(s.name, dict(self.ranges).get(s.name)) for s in inside)
+        return Written(label, (*symbols, *inside), written, numbers)
 
     def _read(self, part: Any, inputs: tuple[str, ...], symbols: tuple[sympy.Symbol, ...], where: str) -> sympy.Expr:
-        """An expression in the symbols of the inputs."""
+        """An expression in the symbols of the inputs, and of the numbers inside it."""
         local = [local_name(name) for name in inputs]
         known = {n: s for n, s, count in zip(local, symbols, map(local.count, local), strict=True) if count == 1}
         known |= dict(zip(inputs, symbols, strict=True))
+        ranges = dict(self.ranges)
+        both = [name for name in ranges if name in known]
+        if both:
+            raise ModelError(f"{where}: '{both[0]}' is an input of the block, and cannot be a number to be found")
+        numbers = {name: _number(name, ranges.get(name)) for name in ranges}
         try:
-            expression = sympy.sympify(part, locals=dict(known))  # pyright: ignore[reportCallIssue]
+            expression = sympy.sympify(part, locals=known | numbers)  # pyright: ignore[reportCallIssue]
         except (sympy.SympifyError, SyntaxError, TypeError, AttributeError) as error:
             raise ModelError(f"{where}: term {part!r} is no expression that SymPy reads") from error
         found = sorted((s for s in symbols_of(expression) if s not in symbols), key=str)
         other = {s: known[s.name] for s in found if s.name in known}
         strange = [s for s in found if s not in other]
-        if len(inputs) == 1 and len(strange) == 1 and not other and not set(symbols) & symbols_of(expression):
-            other[strange.pop()] = symbols[0]
-        if strange:
+        reads = bool(other) or bool(set(symbols) & symbols_of(expression))
+        free = [s for s in strange if s.name not in ranges]
+        if len(inputs) == 1 and len(free) == 1 and not reads:
+            other[free[0]], reads = symbols[0], True
+            strange.remove(free[0])
+        if strange and not reads:
             raise ModelError(
                 f"{where}: '{strange[0]}' in term '{part}' is no input of the block: " + nearest(str(strange[0]), known)
             )
+        other |= {s: _number(s.name, ranges.get(s.name)) for s in strange}
         expression = expression.subs(other, simultaneous=True)
         try:
             read(expression, lambda s: s)
         except UnsupportedExpression as error:
             raise ModelError(f"{where}: term '{part}': {error}") from None
+        for s in strange:
+            number = other[s]
+            if not set(symbols) & symbols_of(sympy.simplify(sympy.diff(expression, number) / expression)):
+                raise ModelError(
+                    f"{where}: '{s}' in term '{part}' is no input of the block: {nearest(s.name, known)}; as a number "
+                    "to be found, it does what the term's coefficient does"
+                )
         return expression
+
+
+def _number(name: str, range: tuple[float, float] | None) -> sympy.Symbol:
+    """The symbol of a number inside."""
+    return sympy.Symbol(name, positive=True) if Inner(name, range).is_log else sympy.Symbol(name, real=True)
 
 
 @dataclasses.dataclass(frozen=True)

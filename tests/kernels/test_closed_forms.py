@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from jaxonomy_dae import ModelError
 from jaxonomy_dae.learning import ClosedForm, powers, terms
-from jaxonomy_dae.learning.discovery import beam_search
+from jaxonomy_dae.learning.discovery import _Start, beam_search
 
 X, Y = sympy.symbols("x y", real=True)
 POINTS = np.array([[0.3, -1.2], [-2.0, 0.5], [1e-3, 4.0]])
@@ -91,12 +91,73 @@ def test_what_is_absent_is_not_evaluated():
     assert [t.name for t in short.terms] == ["x"] and short.expressions(X) == (2.0 * X,)
 
 
+INNER = {"v_s": (0.01, 2.0), "p": (0.5, 3.0)}
+
+
+@pytest.mark.long("small programs for three points")
+def test_numbers_inside_terms():
+    """Only combinations of known functions could be found: a width or an exponent had to be guessed beforehand."""
+    library = terms("v", "tanh(v/v_s)", "sign(v)*Abs(v)**p", "v*exp(-(v/v_s)**2)", **INNER)
+    chosen = library.of(("c.v",), 1, "here")
+    law = ClosedForm(jnp.array([1.0, 2.0, 3.0, 4.0]), jnp.ones(4, bool), chosen, jnp.log(jnp.array([0.3, 1.7])))
+    assert {name: round(float(v), 12) for name, v in law.numbers.items()} == {"v_s": 0.3, "p": 1.7}
+    (written,) = law.expressions(X)
+    for v in (-0.8, 0.02, 0.4):
+        right = v + 2 * np.tanh(v / 0.3) + 3 * np.sign(v) * abs(v) ** 1.7 + 4 * v * np.exp(-((v / 0.3) ** 2))
+        np.testing.assert_allclose(law(jnp.array([v])), [right], rtol=1e-13)
+        np.testing.assert_allclose(float(written.subs(X, v)), right, rtol=1e-13)
+    short = ClosedForm(law.coefficients, jnp.array([True, False, True, False]), chosen, law.inner).chosen()
+    assert list(short.numbers) == ["p"] and float(short.numbers["p"]) == pytest.approx(1.7, rel=1e-14)
+    (free,) = terms("v**3/(k + v**2)").of(("c.v",), 1, "here")
+    assert [one.name for one in free.inner] == ["k"] and free.inner[0].range is None
+    signed = terms("tanh(v - v0)", v0=(-1.0, 1.0)).of(("c.v",), 1, "here")
+    law = ClosedForm(jnp.ones(1), jnp.ones(1, bool), signed, jnp.array([-0.5]))
+    np.testing.assert_allclose(law(jnp.array([0.2])), [np.tanh(0.7)], rtol=1e-14)
+
+
+def test_numbers_inside_begin_where_they_meet_the_networks_curve():
+    v = np.linspace(-1, 1, 81)[:, None]
+    chosen = terms("v", "tanh(v/v_s)", "sign(v)*Abs(v)**p", p=(1.2, 4.0)).of(("c.v",), 1, "here")
+    values = 0.3 * v + 0.5 * np.tanh(v / 0.2)
+    inner = [one.name for term in chosen for one in term.inner]
+    ends = {"v_s": (1e-3, 10.0), "p": (1.2, 4.0)}
+    low, high = np.log([ends[n] for n in inner]).T
+    start = _Start(chosen, v, values, low, high)
+    best = start.laws((0, 1))[0]
+    assert float(best.numbers["v_s"]) == pytest.approx(0.2, rel=1e-3)
+    np.testing.assert_allclose(best.coefficients, [0.3, 0.5, 0.0], atol=1e-3)
+    left = start._fitted((0, 2), start._features(np.asarray(start.laws((0, 2))[0].inner)[None])[0])[1]
+    grid = low + np.linspace(0, 1, 9)[:, None] * (high - low)
+    assert left <= min(start._fitted((0, 2), f)[1] for f in start._features(grid)) * (1 + 1e-6)
+    assert len(start.laws((0,))) == 1
+
+
+@pytest.mark.parametrize(
+    "make, words",
+    [
+        (lambda: terms("a*v"), "'a' in term 'a.v' is no input .* it does what the term's coefficient does"),
+        (lambda: terms("v**2/b**3"), "'b' in term .* it does what the term's coefficient does"),
+        (lambda: terms("tanh(v/w)", w=(2.0, 1.0)), "the range of 'w' is a pair low < high"),
+        (lambda: terms("tanh(v/w)", w=3.0), r"'w' needs a function of the block's inputs, or a range"),
+        (lambda: terms("tanh(v/w)", v=(1.0, 2.0)), "'v' is an input of the block, and cannot be a number"),
+        (lambda: terms("exp(a/b)"), "'a' in term 'exp.a/b.' is no input of the block"),
+        (
+            lambda: terms("tanh(v/w)", w=(1.0, 2.0)) + terms("v*exp(-v/w)", w=(1.0, 3.0)),
+            "'w' stands in several terms, with several ranges",
+        ),
+    ],
+)
+def test_numbers_inside_that_do_not_fit(make, words):
+    with pytest.raises(ModelError, match=words):
+        make().of(("c.v",), 1, "here")
+
+
 @pytest.mark.parametrize(
     "make, words",
     [
         (lambda: powers(0), r"powers\(highest\) takes a whole number ≥ 1; got 0"),
         (lambda: terms(), "at least one expression or function"),
-        (lambda: terms(drag=3.0), "'drag' needs a function of the block's inputs; got 3.0"),
+        (lambda: terms(drag=3.0), "'drag' needs a function of the block's inputs, or a range .* got 3.0"),
         (lambda: terms(None), "takes SymPy expressions, texts, or functions by name.*got None"),
         (
             lambda: powers(2).of(("c.x", "c.y"), 1, "here"),

@@ -16,7 +16,7 @@ from problems import compiled
 from sympy import Eq
 
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, Component, EqnEnv, ModelError, NeuralDAEBlock, der, simulate
-from jaxonomy_dae.learning import Experiment, IsotropicPassive, Passive, Problem, Unknown, powers, terms
+from jaxonomy_dae.learning import Experiment, IsotropicPassive, Odd, Passive, Problem, Unknown, powers, terms
 from jaxonomy_dae.library.planar import PlanarPendulum
 from jaxonomy_dae.programs.cache import PROGRAMS
 
@@ -223,3 +223,47 @@ def test_the_law_of_a_component_written_into_another(fit):
     system = compiled(Slider(EqnEnv()))
     expected = eqx.filter_jit(law)(jnp.array([3.0, 4.0]))
     np.testing.assert_allclose(system.vector_field(0.0, jnp.array([3.0, 4.0])), expected, rtol=1e-12)
+
+
+class Rubbing(Component):
+    """x' = v, v' = u − 2x − f(v), with a learned friction f."""
+
+    def __init__(self, ev, name):
+        super().__init__(ev, name)
+        x, v = self.variable("x", start=0.5, fixed=True), self.variable("v", start=0.0, fixed=True)
+        u = self.input("u", default=0.0)
+        (f,) = self.learned("f", Odd(key=jax.random.key(0), inputs=0.3, outputs=1.0), inputs=[v])
+        self.add_equations(Eq(der(x), v), Eq(der(v), u - 2 * x - f))
+
+
+def test_a_velocity_inside_a_term_is_found_with_the_coefficients():
+    """Stribeck's friction, of which the velocity at which it falls off is not known."""
+
+    def friction(v):
+        return np.tanh(v / 0.05) * (0.4 + 0.5 * np.exp(-((v / 0.25) ** 2))) + 0.3 * v
+
+    def force(t):
+        return 1.6 * np.sin(1.7 * t) + 0.5 * np.sin(4.1 * t)
+
+    ts, tu = np.linspace(0, 6, 121)[1:], np.linspace(0, 6, 601)
+    x = scipy.integrate.solve_ivp(
+        lambda t, s: [s[1], force(t) - 2 * s[0] - friction(s[1])],
+        (0, 6),
+        [0.5, 0.0],
+        "LSODA",
+        ts,
+        rtol=1e-9,
+        atol=1e-11,
+    ).y[0]
+    problem = None
+    for seed in range(2):
+        noise = 1e-3 * np.random.default_rng(seed).standard_normal(120)
+        data = Experiment(ts, {"s.x": x + noise}, sigma=1e-3, inputs={"s.u": (tu, force(tu), "cubic")})
+        problem = problem or Problem(compiled(Rubbing(EqnEnv(), "s")), data)
+        falling = "tanh(v/0.05)*exp(-(v/v_s)**2)"
+        found = problem.fit(data, warn=False).discover("s.f", terms("v", "tanh(v/0.05)", falling, "v*Abs(v)"))
+        assert set(found.chosen.terms) == {"v", "tanh(v/0.05)", falling}
+        row = found.chosen.coefficients(0.999)["v_s"]
+        assert row.low < 0.25 < row.high and row.high - row.low < 0.05
+        assert float(found.law.numbers["v_s"]) == row.value and "v_s = 0.2" in repr(found)
+        assert found.lack_of_fit > 1e-3
