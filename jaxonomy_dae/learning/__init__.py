@@ -37,11 +37,13 @@ from .libraries import terms as terms
 from .minimize import Minimized as Minimized
 from .minimize import minimize as minimize
 from .multiple_shooting import Shooting as Shooting
+from .noise import Noise as Noise
 from .posterior import Posterior as Posterior
 from .prediction import Prediction as Prediction
 from .priors import LogNormal as LogNormal
 from .priors import Normal as Normal
 from .problem import Problem as Problem
+from .progress import Progress as Progress
 from .table import Table as Table
 from .term import ClosedForm as ClosedForm
 from .training import GradientSteps as GradientSteps

@@ -1,13 +1,17 @@
 """How well an estimate agrees with its data: errors by name, the likelihood, and whether residuals look like noise."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 import scipy.stats
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from .descent import Minimum
 from .objective import Objective
+
+STRONGEST = 0.97  # correlation of neighbours: beyond, a record has too few independent parts for its covariance
+SHORTEST = 8  # frequencies of a record below which its lowest ones are those that a fit takes away
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,12 +23,14 @@ class Whiteness:
         `lags` degrees of freedom.
     - `peak`: the probability that the spectrum of white noise has a peak as high as this one. A missing mode of the
         model makes such a peak.
+    - `spectrum`: the periodogram from the lowest frequency on, of mean one.
     """
 
     correlation: float
     statistic: float
     lags: int
     peak: float
+    spectrum: tuple[float, ...] = ()
 
     @property
     def probability(self) -> float:
@@ -42,19 +48,35 @@ def whiteness(residual: Float[np.ndarray, " n"]) -> Whiteness:
     lags = max(int(np.log(n)), 1)
     if n <= lags + 1 or power == 0:
         return Whiteness(np.nan, np.nan, lags, np.nan)
+    squares = np.abs(np.fft.rfft(centred)[1 : (n + 1) // 2]) ** 2
     rho = np.array([float(centred[k:] @ centred[:-k]) for k in range(1, lags + 1)]) / power
     statistic = n * (n + 2) * float(np.sum(rho**2 / (n - np.arange(1, lags + 1))))
-    return Whiteness(float(rho[0]), statistic, lags, peak(centred))
+    return Whiteness(float(rho[0]), statistic, lags, peak(squares), tuple((squares / squares.mean()).tolist()))
 
 
-def peak(centred: Float[np.ndarray, " n"]) -> float:
+def peak(squares: Float[np.ndarray, " m"]) -> float:
     """The probability that the periodogram of white noise has a peak as high as this, relative to its sum: of m
     frequencies, at most m·(1 − g)^(m − 1) (Fisher 1929, Proc. R. Soc. A 125:54)."""
-    squares = np.abs(np.fft.rfft(centred)[1 : (len(centred) + 1) // 2]) ** 2
     if len(squares) < 2:
         return 1.0
     share = float(squares.max() / squares.sum())
     return min(len(squares) * (1 - share) ** (len(squares) - 1), 1.0)
+
+
+def slow(tests: Sequence[Whiteness]) -> float:
+    """The probability that white noise has as much power at its lowest frequencies, of all outputs and experiments
+    together: where a model errs, its errors are as slow as what it describes. 1, 2, 4, … frequencies are tried, up to a
+    quarter of them, each against χ² of two degrees of freedom for each frequency (a smooth test; Neyman 1937), with
+    Bonferroni's bound. A fit takes power from low frequencies, so that right models are doubted less often."""
+    spectra = [np.array(test.spectrum) for test in tests if len(test.spectrum) >= SHORTEST]
+    if not spectra:
+        return 1.0
+    counts = 2 ** np.arange(int(np.log2(max(map(len, spectra)) / 4)) + 1)
+    found = []
+    for count in counts:
+        chosen = [spectrum[: min(count, len(spectrum) // 4)] for spectrum in spectra]
+        found.append(scipy.stats.chi2.sf(2 * sum(map(np.sum, chosen)), 2 * sum(map(len, chosen))))
+    return min(float(min(found)) * len(counts), 1.0)
 
 
 def log_likelihood(m: Minimum) -> float:
@@ -78,3 +100,36 @@ def rms_by_name(objective: Objective, m: Minimum, point: Float[np.ndarray, " p"]
             if seen.any():
                 found.setdefault(label, {})[name] = float(np.sqrt(np.mean(errors[k, :, j][seen] ** 2)))
     return found
+
+
+def correlated(
+    scores: Float[np.ndarray, "m f"], experiment: Int[np.ndarray, " m"], row: Int[np.ndarray, " m"]
+) -> Float[np.ndarray, "f f"]:
+    """The covariance of Σ scores where residuals are correlated in time and between outputs: the middle of the sandwich
+    H⁻¹ Ω H⁻¹. Each component is first whitened as noise of first order (Andrews & Monahan 1992, Econometrica 60:953);
+    of what is left, lags up to L count less the further they are (Newey & West 1987, Econometrica 55:703), with L by
+    the correlation of neighbours that is left (Andrews 1991, Econometrica 59:817)."""
+    out = np.zeros((scores.shape[1], scores.shape[1]))
+    for k in np.unique(experiment):
+        own = experiment == k
+        place = row[own] - row[own].min()
+        by_row = np.zeros((int(place.max()) + 1, scores.shape[1]))
+        np.add.at(by_row, place, scores[own])
+        rho = _of_neighbours(by_row)
+        white = np.concatenate([by_row[:1] * np.sqrt(1 - rho**2), by_row[1:] - rho * by_row[:-1]])
+        left = float(np.max(np.abs(_of_neighbours(white)), initial=0.0))
+        alpha = 4 * left**2 / (1 - left**2) ** 2
+        lags = min(int(np.ceil(1.1447 * (alpha * len(white)) ** (1 / 3))), len(white) - 1)
+        part = white.T @ white
+        for lag in range(1, lags + 1):
+            both = white[lag:].T @ white[:-lag]
+            part += (1 - lag / (lags + 1)) * (both + both.T)
+        out += part / np.outer(1 - rho, 1 - rho)
+    return out
+
+
+def _of_neighbours(rows: Float[np.ndarray, "n f"]) -> Float[np.ndarray, " f"]:
+    """The correlation of each column's neighbours."""
+    power = np.sum(rows**2, axis=0)
+    found = np.sum(rows[1:] * rows[:-1], axis=0) / np.where(power > 0, power, 1.0)
+    return np.clip(found, -STRONGEST, STRONGEST)

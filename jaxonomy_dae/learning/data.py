@@ -13,6 +13,7 @@ from ..lowering.plan import SystemPlan
 from ..system.inputs import KINDS
 from .axes import LEGEND, chosen_names, grid_of_axes
 from .experiment import Experiment, Unknown, check_increasing
+from .noise import Noise
 
 
 class Data:
@@ -76,6 +77,9 @@ class Stacked:
     values: Float[np.ndarray, "e n k"]
     observed: Bool[np.ndarray, "e n k"]
     sigma: Float[np.ndarray, "e n k"]  # NaN: to be estimated
+    unit: Float[np.ndarray, "e n k"]  # by which a level that is estimated is multiplied
+    level_of: tuple[str, ...]  # the name of each output's level: its own, or one that outputs share
+    tails: Float[np.ndarray, "k 2"]  # of each output's noise: degrees of freedom, and knee
     weight: Float[np.ndarray, " e"]
     holdout: Bool[np.ndarray, " e"]
     inputs: dict[str, tuple[Float[np.ndarray, "e m"], Float[np.ndarray, "e m"]]]
@@ -97,7 +101,7 @@ class Stacked:
 
         - `ModelError` where they differ.
         """
-        differs = np.argwhere(np.ptp(self.sigma, axis=1) > 0)
+        differs = np.argwhere((np.ptp(self.sigma, axis=1) > 0) | (np.ptp(self.unit, axis=1) > 0))
         if len(differs):
             k, j = differs[0]
             raise ModelError(
@@ -105,6 +109,18 @@ class Stacked:
                 "give one for all, or use method='single'"
             )
         return self.sigma[:, 0]
+
+    def check_plain(self, what: str) -> None:
+        """Refuses noise that is not normal, or has a level that outputs share, with a `ModelError`; `what` does not
+        take it."""
+        bent = np.flatnonzero(np.isfinite(self.tails).any(axis=1))
+        shared = [name for name, level in zip(self.outputs, self.level_of, strict=True) if level != name]
+        if len(bent) or shared:
+            name = self.outputs[bent[0]] if len(bent) else shared[0]
+            kind = "has tails" if len(bent) else "shares its level"
+            raise ModelError(
+                f"the noise of '{name}' {kind}, which {what} does not take: use method='single', or leave it out"
+            )
 
     def until(self, share: float) -> "Stacked":
         """A copy of the same shapes in which only this share of each experiment's time counts."""
@@ -123,20 +139,27 @@ def stack(data: Data, plan: SystemPlan, derived: tuple[str, ...], starts: dict[s
     outputs: dict[str, None] = {}
     columns: list[dict[str, np.ndarray]] = []
     sigmas: list[dict[str, np.ndarray]] = []
+    noises: dict[str, Noise] = {}
     for label, one in zip(data.labels, experiments, strict=True):
-        column, sigma = _columns(one, plan, derived, label)
+        column, sigma, noise = _columns(one, plan, derived, label)
         columns.append(column)
         sigmas.append(sigma)
         outputs |= dict.fromkeys(column)
+        for name, own in noise.items():
+            first = noises.setdefault(name, own)
+            if (own.shared, own.tails) != (first.shared, first.tails):
+                raise ModelError(f"{label}: the noise of '{name}' has another distribution or shared level than before")
     n = max(len(one.times) for one in experiments)
     shape = (len(experiments), n, len(outputs))
-    values, levels = np.full(shape, math.nan), np.full(shape, math.nan)
+    values, levels, unit = np.full(shape, math.nan), np.full(shape, math.nan), np.ones(shape)
     for k, (one, column) in enumerate(zip(experiments, columns, strict=True)):
         for j, name in enumerate(outputs):
             if name in column:
                 values[k, : len(one.times), j] = column[name]
-                levels[k, :, j] = np.resize(sigmas[k][name][-1:], n)
-                levels[k, : len(one.times), j] = sigmas[k][name]
+                level, own = sigmas[k][name].T
+                for all_of, column_of in ((levels, level), (unit, own)):
+                    all_of[k, :, j] = column_of[-1]
+                    all_of[k, : len(one.times), j] = column_of
     observed = np.isfinite(values)
     training = ~np.array([one.holdout for one in experiments])
     if not observed[training].any():
@@ -150,6 +173,9 @@ def stack(data: Data, plan: SystemPlan, derived: tuple[str, ...], starts: dict[s
         values=np.where(observed, values, 0.0),
         observed=observed,
         sigma=levels,
+        unit=unit,
+        level_of=tuple(noises[name].shared or name for name in outputs),
+        tails=np.array([noises[name].tails for name in outputs]),
         weight=np.array([one.weight for one in experiments], float),
         holdout=~training,
         inputs=inputs,
@@ -166,10 +192,12 @@ def _padded(array: np.ndarray, n: int) -> np.ndarray:
 
 def _columns(
     one: Experiment, plan: SystemPlan, derived: tuple[str, ...], label: str
-) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """The samples of an experiment and their noise levels, those of arrays by their entries."""
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, Noise]]:
+    """The samples of an experiment, their noise levels with what these are multiplied by, shape (n, 2), and their
+    noise; those of arrays by their entries."""
     column: dict[str, np.ndarray] = {}
     sigma: dict[str, np.ndarray] = {}
+    noises: dict[str, Noise] = {}
     for name, values in one.data.items():
         entries = None if name in derived else plan.entries(name)
         if entries is None:
@@ -185,12 +213,15 @@ def _columns(
             wanted = ", ".join(["n", *map(str, shape)])
             raise ModelError(f"{label}: data of '{name}' must have shape ({wanted}); got {values.shape}")
         flat = values.reshape(len(values), -1)
-        levels = np.broadcast_to(one.levels[name], values.shape).reshape(flat.shape)
+        noise, level = one.noise(name), one.levels[name]
+        unit = 1.0 if noise.scale is None or not np.isnan(level).all() else noise.scale
+        pair = [np.broadcast_to(a, values.shape).reshape(flat.shape) for a in (level, unit)]
         for j, entry in enumerate(names):
             if entry in column:
                 raise ModelError(f"{label}: data of '{entry}' are given twice, by its own name and as part of an array")
-            column[entry], sigma[entry] = flat[:, j], levels[:, j]
-    return column, sigma
+            column[entry], sigma[entry] = flat[:, j], np.stack([a[:, j] for a in pair], axis=1)
+            noises[entry] = noise
+    return column, sigma, noises
 
 
 def _inputs(data: Data, plan: SystemPlan) -> tuple[dict[str, Any], tuple[tuple[str, str], ...]]:

@@ -172,6 +172,7 @@ def posed(estimate: "Estimate") -> tuple[Program, Posed, tuple[str, ...]]:
     """
     objective, minimum = estimate.objective, estimate.minimum
     s, c, free = objective.stacked, objective.coordinates, objective.free
+    s.check_plain("the sampler")
     misfit: Misfit = objective.misfit
     names, dtype = objective.evidence.labels, objective.system.parameters.values.dtype
     low, high = objective.bounds

@@ -204,6 +204,7 @@ def descend(
     bounds: tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]],
     reweigh: Reweigh | None,
     steps: int,
+    watch: Callable[[int, float, float, float], Any] | None = None,
 ) -> Minimum | None:
     """Descends from a start.
 
@@ -225,6 +226,9 @@ def descend(
     reason = f"stopped after {steps} steps, not yet converged; steps= allows more"
     for k in range(steps + 1):
         history.append(here.cost)
+        if watch is not None:
+            misfit = float(np.sum(here.weights.bent(here.found.residual)[0] ** 2))
+            watch(k, here.cost, misfit / max(here.weights.samples, 1.0), here.worst)
         if here.settled and here.left <= OFFSET:
             reason = f"converged after {k} steps"
             break

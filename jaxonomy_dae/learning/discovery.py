@@ -247,8 +247,9 @@ def criterion(fitted: "Estimate", count: int) -> float:
 def _lack_of_fit(network: "Estimate", closed: "Estimate", name: str) -> float:
     """The probability of the increase of χ² where the closed form is right: with γ weights that the data determine, the
     network would take up χ²(γ) of the noise."""
-    row = network.minimum.weights.row
-    increase = float(np.sum((row * closed.minimum.found.residual) ** 2)) - network.chi2
+    weights = network.minimum.weights
+    misfits = [np.sum(weights.bent(fit.minimum.found.residual)[0] ** 2) for fit in (closed, network)]
+    increase = float(misfits[0] - misfits[1])
     return float(scipy.stats.chi2.sf(increase, max(network.effective[name], 1.0)))
 
 

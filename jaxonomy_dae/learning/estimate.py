@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from ..errors import ModelError, nearest
 from ..system.system import AcausalSystem
-from .agreement import Whiteness, log_likelihood, rms_by_name, whiteness
+from .agreement import Whiteness, correlated, log_likelihood, rms_by_name, whiteness
 from .band import Band, band, explored
 from .descent import Minimum
 from .discovery import Discovery, discover
@@ -112,7 +112,7 @@ class Estimate:
     def _linear(self) -> tuple[Factors, np.ndarray]:
         """Factors of the columns that can move, and which of all coordinates these are: not frozen, not on a bound."""
         z, (low, high) = self.minimum.z, self.objective.bounds
-        residual, jacobian = self.minimum.weights.applied(z, self.minimum.found)
+        residual, jacobian = self.minimum.weights.expected(z, self.minimum.found)
         moves = ~((z <= low) | (z >= high))
         factors = Factors.of(residual, jacobian[:, moves], self.minimum.noise)
         return factors, np.flatnonzero(self.objective.free)[moves]
@@ -156,9 +156,13 @@ class Estimate:
     def residuals(self) -> dict[str, dict[str, np.ndarray]]:
         """Predictions less data of the experiments that were fitted, by experiment and name, in units of the noise: a
         number for each row of the record, NaN where nothing was measured."""
-        s, rows = self.objective.stacked, self.objective.rows
+        return self._by_record(self.minimum.weights.scale * self.minimum.found.residual)
+
+    def _by_record(self, values: Float[np.ndarray, " m"]) -> dict[str, dict[str, np.ndarray]]:
+        """Numbers of all samples that were fitted, by experiment and name."""
+        s = self.objective.stacked
         scaled = np.full(s.values.shape, np.nan)
-        scaled[rows] = self.minimum.weights.scale * self.minimum.found.residual
+        scaled[self.objective.rows] = values
         found: dict[str, dict[str, np.ndarray]] = {}
         for k, label in enumerate(s.labels):
             for j, name in enumerate(s.outputs):
@@ -172,13 +176,14 @@ class Estimate:
         """Degrees of freedom: samples, each as often as its experiment's weight says, less the effective number of
         coordinates (the sum of leverages)."""
         weights, root = self.minimum.weights, self.root[self.objective.free]
-        leverages = np.sum((weights.row[:, None] * self.minimum.found.jacobian @ root) ** 2)
+        leverages = np.sum((weights.informing[:, None] * self.minimum.found.jacobian @ root) ** 2)
         return weights.samples - float(leverages)
 
     @property
     def chi2(self) -> float:
         """The sum of squared residuals in units of the noise; about `freedom` if model and noise levels are right."""
-        return float(np.sum((self.minimum.weights.row * self.minimum.found.residual) ** 2))
+        weights = self.minimum.weights
+        return float(np.sum((weights.share * weights.scores(self.minimum.found.residual)) ** 2))
 
     @property
     def effective(self) -> dict[str, float]:
@@ -195,7 +200,26 @@ class Estimate:
     @property
     def whiteness(self) -> dict[str, dict[str, Whiteness]]:
         """Tests whether residuals look like noise, by experiment and name. If they do not, intervals are too narrow."""
-        return {label: {n: whiteness(r) for n, r in by.items()} for label, by in self.residuals.items()}
+        scores = self._by_record(self.minimum.weights.scores(self.minimum.found.residual))
+        return {label: {n: whiteness(r) for n, r in by.items()} for label, by in scores.items()}
+
+    @functools.cached_property
+    def correlated_spread(self) -> Float[np.ndarray, " p"]:
+        """Standard deviations like `spread`, which hold if residuals are correlated in time."""
+        o, m = self.objective, self.minimum
+        if o.has_variances:
+            return self.spread
+        v, slope = m.weights.bent(m.found.residual)
+        scores = v[:, None] * slope[:, None] * m.found.jacobian
+        middle = correlated(scores, o.rows[0], o.rows[1])
+        prior = m.weights.prior(m.z).jacobian
+        small = self.root[o.free]
+        inner = small.T @ (middle + prior.T @ prior) @ small
+        out = np.array(self.spread)
+        wide = np.sqrt(np.maximum(np.einsum("pr,rs,ps->p", self.root, inner, self.root), 0.0))
+        known = np.isfinite(out) & (out > 0)
+        out[known] = wide[known]
+        return out
 
     def quantile(self, level: float) -> float:
         """Half of the width of an interval in standard deviations: a quantile of the normal distribution, or if the
@@ -205,12 +229,13 @@ class Estimate:
             return float(scipy.stats.t.ppf(upper, max(self.freedom, 1.0)))
         return float(scipy.stats.norm.ppf(upper))
 
-    def table(self, level: float = 0.95) -> Table:
+    def table(self, level: float = 0.95, *, white: bool = True) -> Table:
         """Parameters and starts with linearized intervals on the coordinates' scale, so that intervals of positive
         parameters are positive. Notes mark values that reached a bound, are not determined, or were frozen. Estimated
-        noise levels have χ² intervals."""
+        noise levels have χ² intervals. With `white=False` the intervals hold if residuals are correlated in time."""
         noise = noise_intervals(self.objective, self.minimum, self.root, level)
-        return intervals(self.objective, self.point, self.spread, self.quantile(level), level, noise)
+        spread = self.spread if white else self.correlated_spread
+        return intervals(self.objective, self.point, spread, self.quantile(level), level, noise)
 
     def identifiability(self) -> Identifiability:
         """The directions that the data determine, at the values found."""

@@ -1,11 +1,12 @@
 """Residuals at a point, and how much each of them counts."""
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from .noise import Tails
 from .smoothness import Bends
 
 
@@ -37,6 +38,7 @@ class Weights:
     share: Float[np.ndarray, " m"]  # √w
     bends: Bends | None = None  # the derivatives of learned laws whose prior is around zero
     stiffness: Float[np.ndarray, " g"] = dataclasses.field(default_factory=lambda: np.zeros(0))  # precisions of these
+    tails: Tails | None = None  # distributions of the noise; None: all are normal
 
     @property
     def samples(self) -> float:
@@ -50,8 +52,35 @@ class Weights:
 
     @property
     def log_rows(self) -> float:
-        """Σ w ln (1/σ), which the cost does not contain."""
-        return float(np.sum(self.share**2 * np.log(self.scale)))
+        """Σ w ln (1/σ), which the cost does not contain, and what distributions with tails have besides."""
+        logs = np.log(self.scale) if self.tails is None else np.log(self.scale) + self.tails.log_peak()
+        return float(np.sum(self.share**2 * logs))
+
+    def bent(self, residual: Float[np.ndarray, " m"]) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+        """(weighted residuals v, of which ½ v² is the cost; their derivatives by the residuals)."""
+        if self.tails is None:
+            return self.row * residual, self.row
+        v, slope = self.tails.bent(self.scale * residual)
+        return self.share * v, self.row * slope
+
+    def pull(self, residual: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+        """How much each residual counts beside one of normal noise."""
+        return np.ones_like(residual) if self.tails is None else self.tails.pull(self.scale * residual)
+
+    def scores(self, residual: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+        """Residuals as standard normal numbers, if model and noise are right."""
+        u = self.scale * residual
+        return u if self.tails is None else self.tails.scores(u)
+
+    @property
+    def informing(self) -> Float[np.ndarray, " m"]:
+        """√ of Fisher's information of each sample about its mean."""
+        return self.row if self.tails is None else self.row * np.sqrt(self.tails.information())
+
+    def part(self, rows: Any) -> "Weights":
+        """The weights of some residuals."""
+        tails = None if self.tails is None else self.tails[rows]
+        return dataclasses.replace(self, row=self.row[rows], share=self.share[rows], tails=tails)
 
     def prior(self, z: Float[np.ndarray, " p"]) -> Rows:
         """A row for each prior of a coordinate, and each derivative of a law."""
@@ -82,12 +111,19 @@ class Weights:
 
     def applied(self, z: Float[np.ndarray, " p"], found: Evaluation) -> Rows:
         """Weighted residuals and Jacobian, with a row for each prior."""
+        return self._rows(z, found, *self.bent(found.residual))
+
+    def expected(self, z: Float[np.ndarray, " p"], found: Evaluation) -> Rows:
+        """The same, of which the square of the Jacobian is the information that is expected of such samples."""
+        return self._rows(z, found, self.bent(found.residual)[0], self.informing)
+
+    def _rows(self, z: np.ndarray, found: Evaluation, residual: np.ndarray, row: np.ndarray) -> Rows:
         prior = self.prior(z)
         return Rows(
-            np.concatenate([self.row * found.residual, prior.residual]),
-            np.concatenate([self.row[:, None] * found.jacobian, prior.jacobian]),
+            np.concatenate([residual, prior.residual]),
+            np.concatenate([row[:, None] * found.jacobian, prior.jacobian]),
         )
 
     def cost(self, z: Float[np.ndarray, " p"], residual: Float[np.ndarray, " m"]) -> float:
         """½ |W r|² and what the priors add."""
-        return 0.5 * float(np.sum((self.row * residual) ** 2)) + self.prior_cost(z)
+        return 0.5 * float(np.sum(self.bent(residual)[0] ** 2)) + self.prior_cost(z)

@@ -34,6 +34,7 @@ class Evidence:
     labels: tuple[str, ...]  # of these groups
     floor: np.ndarray  # (groups,): the rounding of the data, below which no noise can be seen
     groups: tuple[Bool[np.ndarray, " p"], ...]  # whose precision is to be found
+    unit: Float[np.ndarray, " m"] | float = 1.0  # by which each residual's level is multiplied
     laws: tuple[Bool[np.ndarray, " p"], ...] = ()  # the weights of each law that has a prior of smoothness
 
     @property
@@ -44,7 +45,7 @@ class Evidence:
     def sigma(self, weights: Weights) -> dict[str, float]:
         """The noise level of each group."""
         return {
-            label: float(1 / weights.scale[self.noise == k][0])
+            label: float(1 / (weights.scale * self.unit)[self.noise == k][0])
             for k, label in enumerate(self.labels)
             if (weights.row[self.noise == k] > 0).any()
         }
@@ -55,7 +56,8 @@ class Evidence:
         for k, floor in enumerate(self.floor):
             chosen = self.noise == k
             share = weights.share[chosen]
-            row[chosen] = share / max(_rms(found.residual[chosen], share), floor)
+            unit = (np.ones(len(row)) * self.unit)[chosen]
+            row[chosen] = share / unit / max(_rms(found.residual[chosen] / unit, share), floor)
         return dataclasses.replace(weights, row=row)
 
     def reweigh(
@@ -75,11 +77,13 @@ class Evidence:
             count = float(np.sum(share**2))
             spread = (weights.row[chosen, None] * found.jacobian[np.ix_(chosen, free)]) @ root
             left = max(count - float(np.sum(spread**2)), 1.0)
-            sigma = max(_rms(found.residual[chosen], share) * np.sqrt(count / left), floor)
-            changes.append(abs(np.log(sigma * row[chosen][0] / share[0])))
-            row[chosen] = share / sigma
+            unit = (np.ones(len(row)) * self.unit)[chosen]
+            counted = np.sqrt(weights.pull(found.residual)[chosen]) * found.residual[chosen] / unit
+            sigma = max(_rms(counted, share) * np.sqrt(count / left), floor)
+            changes.append(abs(np.log(sigma * (row * self.unit)[chosen][0] / share[0])))
+            row[chosen] = share / (unit * sigma)
         known = self.noise < 0
-        misfit = float(np.sum((weights.row * found.residual)[known] ** 2))
+        misfit = float(np.sum(weights.bent(found.residual)[0][known] ** 2))
         near = misfit <= NEAR * float(np.sum(weights.share[known] ** 2))
         better = dataclasses.replace(weights, row=row)
         if (self.groups or self.laws) and (near or is_minimum):

@@ -11,10 +11,10 @@ import numpy as np
 
 from ..errors import ModelError, nearest, whole_number
 from ..lowering.plan import SystemPlan
+from .noise import ESTIMATE, Noise
 from .priors import is_finite
 from .records import interpolated, low_pass, smoothed, untrended
 
-ESTIMATE = "estimate"
 UNEVEN = 1e-3  # of a time step, by which steps may differ and still count as even
 
 
@@ -47,7 +47,8 @@ class Experiment:
         sample.
     - `sigma`: standard deviations of the noise, by name or one number for all, in the variables' units: numbers, or
         arrays with one value for each sample, such as `0.01 + 0.02 * abs(y)` for partly relative errors; or
-        `"estimate"`: estimated from the residuals, one for each name, the same in all experiments.
+        `"estimate"`: estimated from the residuals, one for each name, the same in all experiments; or `Noise(...)`, for
+        levels that are shared by sensors or proportional to a scale, and for outliers.
     - `inputs`: by name, `(times, values)`, or with `"held"` or `"cubic"` as a third entry, or a constant.
     - `initial`: values at `t0` by variables' names, known (numbers) or `Unknown`. The name of a parameter gives this
         experiment a value of its own.
@@ -65,7 +66,7 @@ class Experiment:
 
     times: Any
     data: Mapping[str, Any]
-    sigma: Mapping[str, Any] | float | str | np.ndarray = ESTIMATE
+    sigma: Mapping[str, Any] | float | str | np.ndarray | Noise = ESTIMATE
     inputs: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     initial: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     weight: float = 1.0
@@ -83,23 +84,27 @@ class Experiment:
         if not (is_finite(self.weight) and self.weight >= 0):
             raise ModelError(f"weight is a number ≥ 0; got {self.weight!r}")
 
-    def _sigmas(self) -> "dict[str, float | np.ndarray]":
-        """The standard deviation for each name, or for each of its samples; NaN where it is to be estimated."""
+    def _sigmas(self) -> "dict[str, float | np.ndarray | Noise]":
+        """The standard deviation for each name, or for each of its samples; NaN where it is to be estimated; or its
+        noise."""
         given = self.sigma
         if isinstance(given, Mapping):
             unknown = [name for name in given if name not in self.data]
             if unknown:
                 raise ModelError(f"sigma: there are no data of '{unknown[0]}': " + nearest(unknown[0], self.data))
         by_name = given if isinstance(given, Mapping) else dict.fromkeys(self.data, given)
-        out: dict[str, float | np.ndarray] = {}
+        out: dict[str, float | np.ndarray | Noise] = {}
         for name, samples in self.data.items():
-            value = by_name.get(name, ESTIMATE)
+            value: Any = by_name.get(name, ESTIMATE)
             if isinstance(value, str) and value == ESTIMATE:
                 out[name] = math.nan
             elif not isinstance(value, str) and is_finite(value) and value > 0:
                 out[name] = float(value)
             elif isinstance(value, np.ndarray | list | tuple):
                 out[name] = _levels_of(name, value, samples)
+            elif isinstance(value, Noise):
+                scale = None if value.scale is None else _levels_of(name, value.scale, samples)
+                out[name] = value.number if value.is_plain else dataclasses.replace(value, scale=scale)
             else:
                 raise ModelError(f"sigma of '{name}' is a standard deviation > 0, or 'estimate'; got {value!r}")
         return out
@@ -169,7 +174,7 @@ class Experiment:
                 f"initial={{'{old[0]}': Unknown(guess)}}; a parameter keeps its value, {self.initial[old[0]]!r}"
             )
         data = {name: values[rows] for name, values in self.data.items()}
-        sigma = {name: _rows(level, rows) for name, level in self.levels.items()}
+        sigma = {name: _rows(level, rows) for name, level in self._noise.items()}
         return self.changed(times=self.times[rows], data=data, sigma=sigma, initial=dict(self.initial) | new, t0=start)
 
     def resample(self, times: Any) -> "Experiment":
@@ -183,7 +188,7 @@ class Experiment:
         def between(values: np.ndarray) -> np.ndarray:
             return interpolated(self.times, values, new)
 
-        varying = [name for name, level in self.levels.items() if isinstance(level, np.ndarray)]
+        varying = [name for name, level in self.levels.items() if np.ndim(level) or self.noise(name).scale is not None]
         if varying:
             raise ModelError(f"resample: '{varying[0]}' has a noise level for each sample: give one for all")
         return self.changed(times=new, data=self._each(between))
@@ -206,7 +211,7 @@ class Experiment:
         response = low_pass(factor) if factor > 1 else np.ones(1)
         quieter = float(np.linalg.norm(response))
         data = self._each(lambda values: smoothed(values, response)[::factor])
-        sigma = {name: _rows(level, slice(None, None, factor)) * quieter for name, level in self.levels.items()}
+        sigma = {name: _rows(level, slice(None, None, factor), quieter) for name, level in self._noise.items()}
         return self.changed(times=self.times[::factor], data=data, sigma=sigma)
 
     def detrend(self, names: str | Sequence[str] | None = None, degree: int = 1) -> "Experiment":
@@ -226,8 +231,21 @@ class Experiment:
     @property
     def levels(self) -> "dict[str, float | np.ndarray]":
         """The standard deviation for each name, or for each of its samples; NaN where it is to be estimated."""
+        noises = {name: self.noise(name) for name in self.data}
+        plain = {name for name, one in noises.items() if one.scale is None or math.isnan(one.number)}
+        return {name: one.number * (1.0 if name in plain else one.scale) for name, one in noises.items()}
+
+    @property
+    def _noise(self) -> "dict[str, float | np.ndarray | Noise]":
         assert isinstance(self.sigma, Mapping)
         return dict(self.sigma)
+
+    def noise(self, name: str) -> Noise:
+        """The noise of a signal; that of a level for each sample has this level as its scale."""
+        given = self._noise[name]
+        if isinstance(given, Noise):
+            return given
+        return Noise(1.0, scale=given) if np.ndim(given) else Noise(ESTIMATE if np.isnan(given) else float(given))
 
     def _each(self, change: Callable[[Any], Any], names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
         """The signals, changed as columns, in their shapes."""
@@ -240,16 +258,21 @@ class Experiment:
 
     def changed(self, **changes: Any) -> "Experiment":
         """A copy with other fields. Noise levels that are estimated are still estimated."""
-        levels = changes.get("sigma", self.levels)
+        levels = changes.get("sigma", self._noise)
         sigma = {
-            name: ESTIMATE if np.ndim(level) == 0 and math.isnan(level) else level for name, level in levels.items()
+            name: ESTIMATE if isinstance(level, float) and math.isnan(level) else level
+            for name, level in levels.items()
         }
         return dataclasses.replace(self, **changes | {"sigma": sigma})
 
 
-def _rows(level: Any, rows: Any) -> Any:
-    """The noise levels of some rows."""
-    return level if np.ndim(level) == 0 else level[rows]
+def _rows(level: Any, rows: Any, factor: float = 1.0) -> Any:
+    """The noise of some rows, of a factor less where its level is known."""
+    if isinstance(level, Noise):
+        scale = None if level.scale is None else level.scale[rows]
+        known = level.level if isinstance(level.level, str) else level.level * factor
+        return dataclasses.replace(level, level=known, scale=scale)
+    return (level if np.ndim(level) == 0 else level[rows]) * factor
 
 
 def _levels_of(name: str, given: Any, samples: np.ndarray) -> np.ndarray:

@@ -169,7 +169,7 @@ class FilterObjective(AheadObjective):
             return here if weights is None else here.with_priors_of(weights)
 
         reweigh = self.evidence.reweigh if weights is None and not self.evidence.is_idle else None
-        return descend(self._scoring(held), start, self.limits, reweigh, steps)
+        return descend(self._scoring(held), start, self.limits, reweigh, steps, self.watch)
 
     def _scoring(self, weigh: Weigh) -> Scoring:
         def finer(factor: float) -> Scoring | None:

@@ -46,18 +46,19 @@ class Batches:
         full = o.full(z)
         shared, own = o.numbers(o.coordinates.natural(full))
         experiment, index, output = o.rows
-        row, place, conditions, samples = weights.row, experiment, o.conditions, weights.samples
+        counted, place, conditions, samples = weights, experiment, o.conditions, weights.samples
         if chosen is not None:
             samples *= len(chosen) / len(self.counted)
             inside = np.isin(experiment, chosen)
-            row, experiment, index, output = row[inside], experiment[inside], index[inside], output[inside]
+            counted = weights.part(inside)
+            experiment, index, output = experiment[inside], index[inside], output[inside]
             place = np.searchsorted(chosen, experiment)
             own = own[chosen]
             conditions = jax.tree.map(lambda a: a[chosen], conditions)
         found = predict_and_differentiate(o.setting, shared, own, conditions)
         outputs, by_shared, by_own = (np.asarray(a, np.float64) for a in found)
         at = place, index, output
-        residual = row * (outputs[at] - o.stacked.values[experiment, index, output])
+        residual, row = counted.bent(outputs[at] - o.stacked.values[experiment, index, output])
         c = o.coordinates
         gradient = np.zeros(len(c))
         gradient[: c.n_shared] = by_shared[at].T @ (row * residual)

@@ -115,12 +115,12 @@ def noise_intervals(objective: Objective, minimum: Minimum, root: Float[np.ndarr
     weights, evidence = minimum.weights, objective.evidence
     variables = objective.system.plan.flat.variables
     units = dict(zip(variables.names, variables.unit, strict=True))
-    taken = np.sum((weights.row[:, None] * minimum.found.jacobian @ root[objective.free]) ** 2, axis=1)
+    taken = np.sum((weights.informing[:, None] * minimum.found.jacobian @ root[objective.free]) ** 2, axis=1)
     rows = []
     for k, name in enumerate(evidence.labels):
         own = evidence.noise == k
         freedom = max(float(np.sum(weights.share[own] ** 2) - np.sum(taken[own])), 1.0)
-        value = float(1 / weights.scale[own][0])
+        value = float(1 / (weights.scale * evidence.unit)[own][0])
         low, high = (value * np.sqrt(freedom / scipy.stats.chi2.ppf(0.5 + s * level / 2, freedom)) for s in (1, -1))
         rows.append(Row(f"sigma of {name}", value, float(low), float(high), units.get(name, ""), ""))
     return rows

@@ -42,6 +42,10 @@ class Likelihood(Weights):
             np.concatenate([plain.jacobian, self.share[:, None] * found.log_slope / np.sqrt(2)]),
         )
 
+    def expected(self, z: Float[np.ndarray, " p"], found: Evaluation) -> Rows:
+        """The same."""
+        return self.applied(z, found)
+
     def cost(self, z: Float[np.ndarray, " p"], residual: Float[np.ndarray, " m"]) -> float:
         """½ Σ w (r²/s + ln s) + ½ Σ precision·(z − mean)²."""
         return super().cost(z, residual) - super().log_rows

@@ -219,6 +219,9 @@ def shoot(
         if gain > left and not idle and k < steps:
             continue
         merit, settled, remaining = _reweighed(merit, point, evidence, tolerance, ended=idle > PATIENCE)
+        if objective.watch is not None:
+            data = merit.weights.row * segments.evaluation(point).residual
+            objective.watch(k, history[-1], float(data @ data) / max(merit.weights.samples, 1.0), remaining)
         widest = float(np.abs(point.blocks.gap).max(initial=0.0))
         if settled and widest <= CLOSED * tolerance and (remaining <= OFFSET or idle > PATIENCE):
             converged, message = True, f"converged after {len(history)} steps"

@@ -25,6 +25,7 @@ from .evaluation import Evaluation, Weights
 from .evidence import Evidence
 from .experiment import Unknown
 from .least_squares import SumOfSquares
+from .noise import Tails
 from .program import Conditions, Layout, Setting, Weighted, misfit, predict, predict_and_differentiate
 from .smoothness import Bends, Law, spread_out
 
@@ -85,6 +86,8 @@ class Objective:
     counted: Bool[np.ndarray, " e"]
     # Over a part of the time, the centre of the priors of weights, free coordinates; None: zero, over all of it.
     near: Float[np.ndarray, " f"] | None = dataclasses.field(default=None, kw_only=True)
+    # What is told of each step: its number, the cost, χ² for each sample, and what remains.
+    watch: Callable[[int, float, float, float], Any] | None = dataclasses.field(default=None, kw_only=True)
     # Networks with a prior of smoothness, and where they have it.
     laws: tuple[Law, ...] = dataclasses.field(default=(), kw_only=True)
 
@@ -176,7 +179,7 @@ class Objective:
     def weighted(self, told: Any) -> Weighted:
         """The conditions `told` with samples and their weights, for the programs."""
         s, dtype = self.stacked, self.system.parameters.values.dtype
-        level = np.where(np.isnan(s.sigma), 1.0, s.sigma)
+        level = np.where(np.isnan(s.sigma), s.unit, s.sigma)
         row = np.zeros(s.values.shape)
         row[self.rows] = (np.sqrt(s.weight)[:, None, None] / level)[self.rows]
         return Weighted(told, jnp.asarray(s.values, dtype), jnp.asarray(row, dtype))
@@ -285,7 +288,7 @@ class Objective:
             return self.weights(z, found) if first is None else self.weights(z, found).with_priors_of(first)
 
         reweigh = self.evidence.reweigh if weights is None and not self.evidence.is_idle else None
-        return descend(self._merit(weigh), start, self.limits, reweigh, steps)
+        return descend(self._merit(weigh), start, self.limits, reweigh, steps, self.watch)
 
     def _merit(self, weigh: Weigh) -> SumOfSquares:
         columns = self.coordinates.n_shared + self.coordinates.n_own  # of the program, whatever is frozen
@@ -338,7 +341,7 @@ class Objective:
     ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
         """(residuals of chosen samples in units of the noise, these units)."""
         s = self.with_noise(sigma).stacked
-        level = np.where(np.isnan(s.sigma), 1.0, s.sigma)[rows]
+        level = np.where(np.isnan(s.sigma), s.unit, s.sigma)[rows]
         return (self.outputs(full)[rows] - s.values[rows]) / level, level
 
     # --- experiments that are held out ---------------------------------------------------------------------------
@@ -353,7 +356,7 @@ class Objective:
         fixed[: c.n_shared] = True
         c = dataclasses.replace(c, start=c.natural(full), fixed=fixed)
         alone = dataclasses.replace(
-            self.with_noise(self.sigma(z, weights)), coordinates=c, counted=held, penalties={}, laws=()
+            self.with_noise(self.sigma(z, weights)), coordinates=c, counted=held, penalties={}, laws=(), watch=None
         )
         if not alone.free.any() or not len(alone.rows[0]):
             return full
@@ -371,8 +374,13 @@ class Objective:
         u, level = self.standardized(self.with_own_starts(z, weights), self.sigma(z, weights), rows)
         if not np.isfinite(u).all():
             return np.inf, np.inf
-        count = self.stacked.weight[rows[0]]
-        return float(np.sqrt(np.average(u**2, weights=count))), float(np.sum(count * (0.5 * u**2 + np.log(level))))
+        count, surprise = self.stacked.weight[rows[0]], self.surprises(u, rows[2]) + np.log(level)
+        return float(np.sqrt(np.average(u**2, weights=count))), float(np.sum(count * surprise))
+
+    def surprises(self, u: Float[np.ndarray, " m"], output: Int[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+        """−ln of the density of residuals in units of the noise, times √(2π)."""
+        tails = Tails(*self.stacked.tails[output].T)
+        return 0.5 * tails.bent(u)[0] ** 2 - tails.log_peak()
 
     def holdout_score(self, z: Float[np.ndarray, " f"], weights: Weights) -> float:
         """The root mean square of the residuals of experiments that are held out, in units of the noise."""
@@ -385,18 +393,20 @@ class Objective:
         """The noise levels and precisions that the evidence determines."""
         s, (_, _, output) = self.stacked, self.rows
         unknown = np.isnan(s.sigma[self.rows])
-        chosen = np.unique(output[unknown])
-        noise = np.where(unknown, np.searchsorted(chosen, output), -1)
-        values = s.values[self.rows]
+        chosen = tuple(dict.fromkeys(s.level_of[j] for j in np.unique(output[unknown])))
+        place = np.array([chosen.index(name) if name in chosen else -1 for name in s.level_of])
+        noise, unit = np.where(unknown, place[output], -1), s.unit[self.rows]
+        values = s.values[self.rows] / unit
         sizes = [np.max(np.abs(values[noise == k]), initial=0.0) for k in range(len(chosen))]
         floor = np.maximum(np.array(sizes) * np.finfo(self.system.parameters.values.dtype).eps, np.finfo(float).tiny)
         chosen_by_data = [name for name, given in self.penalties.items() if given == "evidence" and self.near is None]
         groups = [self._group(name) for name in chosen_by_data]
         return Evidence(
             noise,
-            tuple(s.outputs[k] for k in chosen),
+            chosen,
             floor,
             tuple(group for group in groups if group.any()),
+            unit,
             self._laws,
         )
 
@@ -423,10 +433,16 @@ class Objective:
                 precision[group] = first if given == "evidence" else float(given)
                 if given == "evidence" and self.near is not None:
                     mean[group] = self.near[group]
-        first = Weights(row, precision, mean, np.sqrt(s.weight[experiment]))
+        first = Weights(row, precision, mean, np.sqrt(s.weight[experiment]), tails=self.tails)
         if self.bends is not None and self.near is None:
             first = dataclasses.replace(first, bends=self.bends, stiffness=self.bends.first(z))
         return self.evidence.first(first, found)
+
+    @functools.cached_property
+    def tails(self) -> Tails | None:
+        """The distributions of the samples that count; None: all are normal."""
+        freedom, knee = self.stacked.tails[self.rows[2]].T
+        return Tails(freedom, knee) if np.isfinite([freedom, knee]).any() else None
 
     def _group(self, name: str) -> Bool[np.ndarray, " f"]:
         chosen = np.array([name == group for group in self.coordinates.group], bool)
@@ -441,6 +457,6 @@ class Objective:
     def with_noise(self: Same, sigma: dict[str, float]) -> Same:
         """A copy with these noise levels in place of those to be estimated."""
         s = self.stacked
-        row = np.array([sigma.get(name, math.nan) for name in s.outputs])
-        known = np.where(np.isnan(s.sigma), row, s.sigma)
+        row = np.array([sigma.get(name, math.nan) for name in s.level_of])
+        known = np.where(np.isnan(s.sigma), row * s.unit, s.sigma)
         return dataclasses.replace(self, stacked=dataclasses.replace(s, sigma=known))

@@ -14,11 +14,11 @@ from jaxtyping import Float
 from ..errors import ModelError, SimulationError, explained_keywords
 from ..solvers.solve import check_tolerances, default_tolerances
 from ..system.system import AcausalSystem
-from .asked import as_asked, check_start, checked_method, names_to_train, penalties, started
+from .asked import METHODS, as_asked, check_start, checked_method, names_to_train, penalties, started
 from .beginnings import beginning, silent
 from .coordinates import Coordinate, Coordinates, coordinates
 from .data import Data, Stacked, stack
-from .descent import Minimum
+from .descent import OFFSET, Minimum
 from .devices import check_mesh
 from .estimate import Estimate
 from .evaluation import Evaluation, Weights
@@ -30,6 +30,7 @@ from .multiple_shooting import Shooting, shoot
 from .objective import Objective
 from .priors import priors_by_name
 from .program import Layout, Setting
+from .progress import reporter
 from .runs import residuals, run, why_not
 from .smoother import smoother
 from .starting_points import adam_steps, starting_points
@@ -198,6 +199,8 @@ class Problem:
 
     def objective_of(self, stacked: Stacked, c: Coordinates, penalties: dict[str, Any] | None = None) -> Objective:
         """The function that a fit minimises."""
+        if self.method not in METHODS:
+            stacked.check_plain(f"method={type(self.method).__name__}")
         model = self.system, self.observers, self.layout_of(stacked), 1.0
         given = stacked, c, self.penalties if penalties is None else penalties, ~stacked.holdout
         if not isinstance(self.method, Filter | Innovations):
@@ -223,6 +226,7 @@ class Problem:
         horizons: Sequence[float] | None = None,
         steps: int = 200,
         warn: bool = True,
+        progress: Any = None,
     ) -> Estimate:
         """Finds the most probable values, by least squares in units of the noise with the given priors.
 
@@ -245,6 +249,8 @@ class Problem:
             data allow it. None: the whole record, or with `method="growing"`, ten shares.
         - `steps`: the largest number of steps of least squares.
         - `warn`: whether a `FitWarning` gives the `reasons` if the estimate is not `ok`.
+        - `progress`: True prints a line for each step: cost, χ²/n, what remains, seconds left. Or a function that is
+            called with a `learning.Progress`.
 
         Without `start`, `first`, `adam` and `horizons`, networks begin at their own weights or with a last layer of
         zero, whichever is closer to the data. If both are far from the data, horizons grow. If no step reduces the
@@ -256,6 +262,7 @@ class Problem:
         - `SimulationError` if no start can be simulated; the text gives the reason of the first.
         """
         objective = self._prepared(data, freeze, start, bounds)
+        objective = dataclasses.replace(objective, watch=reporter(progress, OFFSET))
         if first is not None and (adam or (starts > 1 and first.checkpoint is not None)):
             other = "adam=" if adam else "a checkpoint with several starts"
             raise ModelError(f"first= does not go with {other}: leave one of them out")
@@ -285,6 +292,7 @@ class Problem:
         if best is None:
             raise SimulationError(why_not(objective))
         _, here, lowest, training = best
+        here = dataclasses.replace(here, watch=None)
         fit = Estimate.of(self, here.at_tolerance(lowest.tolerance), lowest, training)
         if warn and fit.reasons:
             warnings.warn(f"this fit is not to be relied on: {'; '.join(fit.reasons)}", FitWarning, stacklevel=3)

@@ -242,7 +242,19 @@ def _weights(batches: Batches, z: Float[np.ndarray, " f"]) -> Weights | None:
 def _facts(objective: Objective, plan: GradientSteps, optimizer: Any) -> dict[str, Any]:
     """The facts that must agree for a checkpoint to fit, by name."""
     s, c = objective.stacked, objective.coordinates
-    data = [s.times, s.t0, s.values, s.observed, s.sigma, s.weight, s.holdout, dict(s.inputs), repr(s.starts)]
+    data = [
+        s.times,
+        s.t0,
+        s.values,
+        s.observed,
+        s.sigma,
+        s.unit,
+        s.tails,
+        s.weight,
+        s.holdout,
+        dict(s.inputs),
+        repr(s.starts),
+    ]
     searched = [np.array(objective.free), c.low, c.high, c.start[~objective.free], c.size, c.spread, c.centre]
     functions = [objective.system.neural, objective.observers]
     return {
@@ -275,7 +287,8 @@ def _resumed(plan: GradientSteps, facts: dict[str, Any], like: State, stages: di
     z, best, optimizer, row, precision, mean, share, history, at, scores, best_step, best_value = read_state(
         plan.checkpoint, shape.arrays()
     )
+    weights = dataclasses.replace(like.weights, row=row, precision=precision, mean=mean, share=share)
     return State(
-        z, best, optimizer, Weights(row, precision, mean, share), history.tolist(), at.tolist(), scores.tolist(),
+        z, best, optimizer, weights, history.tolist(), at.tolist(), scores.tolist(),
         int(best_step), float(best_value),
     )  # fmt: skip

@@ -106,5 +106,5 @@ class Unseen:
             for j, name in enumerate(s.outputs)
             if (rows[2] == j).any()
         }
-        likelihood = -0.5 * float(np.sum(u**2 + 2 * np.log(level) + np.log(2 * np.pi)))
+        likelihood = -float(np.sum(o.surprises(u, rows[2]) + np.log(level) + 0.5 * np.log(2 * np.pi)))
         return Score(rms, float(np.sqrt(np.mean(u**2))), likelihood)

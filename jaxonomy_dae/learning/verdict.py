@@ -1,6 +1,6 @@
 """Whether a fit can be relied on: what is against it, each with what to try next.
 
-A reason is given only where chance would give it to a right model once in some hundred fits.
+A reason is given only where chance would give it to a right model once in a hundred fits.
 """
 
 from typing import TYPE_CHECKING
@@ -9,13 +9,15 @@ import numpy as np
 import scipy.stats
 
 from ..diagnosis.wording import listed
+from .agreement import slow
 from .objective import AWAY
 
 if TYPE_CHECKING:
     from .estimate import Estimate
 
-# Probability below which noise is no excuse: with two such checks, right models are doubted once in five hundred fits.
-IMPROBABLE = 1e-3
+# Probability below which noise is no excuse: with two such checks, right models are doubted in less than one of fifty
+# fits, as each bounds what chance does from above.
+IMPROBABLE = 1e-2
 FAINT = 10.0  # times the integration's tolerance: residuals below are its error, which is never white
 BELOW = 0.1  # of the noise that was stated: residuals below, of exact data, need not look like it
 
@@ -40,7 +42,7 @@ def _chi2(fit: "Estimate") -> list[str]:
     if not known.any() or fit.objective.has_variances:
         return []
     count = float(np.sum(m.weights.share[known] ** 2))
-    chi2 = float(np.sum((m.weights.row * m.found.residual)[known] ** 2))
+    chi2 = float(np.sum((m.weights.share * m.weights.scores(m.found.residual))[known] ** 2))
     freedom = max(count * fit.freedom / m.weights.samples, 1.0)
     if scipy.stats.chi2.sf(chi2, freedom) > IMPROBABLE:
         return []
@@ -52,7 +54,8 @@ def _chi2(fit: "Estimate") -> list[str]:
 
 def _colour(fit: "Estimate") -> list[str]:
     """Outputs whose residuals are correlated from sample to sample, over all experiments together (Ljung and Box's
-    statistics add up), or have a frequency that stands out."""
+    statistics add up), or have a frequency that stands out; and what all outputs have in common: power at low
+    frequencies. Half of the probability of a false alarm goes to what they have in common."""
     s, tests = fit.objective.stacked, {}
     for label, by in fit.whiteness.items():
         for name, test in by.items():
@@ -62,15 +65,21 @@ def _colour(fit: "Estimate") -> list[str]:
     for name, each in tests.items():
         together = scipy.stats.chi2.sf(sum(t.statistic for _, t in each), sum(t.lags for _, t in each))
         alone = min(min(t.probability, t.peak) for _, t in each) * 2 * len(each)
-        if min(float(together), alone) * len(tests) < IMPROBABLE:
+        if 4 * min(float(together), alone) * len(tests) < IMPROBABLE:
             label, worst = min(each, key=lambda pair: min(pair[1].probability, pair[1].peak))
             where = f" of {label}" if len(s.labels) > 1 else ""
             found.append(f"'{name}'{where} (neighbours correlate by {worst.correlation:.2f})")
-    if not found:
+    every = [test for each in tests.values() for _, test in each]
+    if not found and 2 * slow(every) >= IMPROBABLE:
         return []
+    if not found:
+        strongest = max(tests, key=lambda name: sum(sum(test.spectrum[:4]) for _, test in tests[name]))
+        found.append(
+            f"those of '{strongest}' and others drift slowly" if len(tests) > 1 else f"'{strongest}' drifts slowly"
+        )
     return [
         f"residuals are not white noise: {', '.join(found[:4])}. The model lacks something there, or noise is "
-        "correlated: intervals are too narrow. Look at fit.plot_residuals()"
+        "correlated: intervals are too narrow, and those of fit.table(white=False) wider. Look at fit.plot_residuals()"
     ]
 
 

@@ -198,6 +198,81 @@ def test_a_noise_level_for_each_sample():
     assert np.isnan(r[5]) and len(r) == 12
 
 
+def falling(a):
+    return np.r_[np.exp(-a * TS), (1 - np.exp(-a * TS)) / a]
+
+
+def noisy(draw, scale=1.0, **given):
+    """Records of x and z with noise of one kind."""
+    x, z = np.split(falling(1.3) + 0.03 * scale * draw, 2)
+    sigma = {"c.x": learning.Noise(**given), "c.z": learning.Noise(**given)}
+    return learning.Experiment(TS, {"c.x": x, "c.z": z}, sigma=sigma), np.r_[x, z]
+
+
+@pytest.mark.long("residuals and their Jacobian")
+def test_noise_with_outliers_is_that_of_scipy():
+    """A few outliers moved a fit as far as they liked."""
+    draw = np.random.default_rng(3).standard_normal(24)
+    draw[[4, 15]] = [12.0, -9.0]
+    reports = []
+    data, y = noisy(draw, level=0.03, student=4.0)
+    problem = learning.Problem(system(Falling), data, train=["c.a"], **TIGHT)
+    fit = problem.fit(progress=reports.append)
+
+    def surprise(a):
+        return -np.sum(scipy.stats.t(4.0).logpdf((falling(a) - y) / 0.03) - np.log(0.03))
+
+    exact = scipy.optimize.minimize_scalar(surprise, (1.2, 1.4), tol=1e-14).x
+    assert fit.values["c.a"] == pytest.approx(exact, rel=1e-6)
+    assert fit.log_likelihood == pytest.approx(-surprise(exact), rel=1e-8)
+    slope = (falling(exact + 1e-5) - falling(exact - 1e-5)) / 2e-5
+    information = 5 / 7 * np.sum(slope**2) / 0.03**2
+    assert fit.spread[0] * fit.objective.coordinates.size[0] == pytest.approx(information**-0.5, rel=1e-4)
+    assert [r.step for r in reports] == list(range(len(reports))) and reports[-1].cost <= reports[0].cost
+    plain = problem.fit(noisy(draw, level=0.03)[0], warn=False)
+    assert abs(plain.values["c.a"] - 1.3) > 2 * abs(fit.values["c.a"] - 1.3) and not plain.ok
+
+    data, y = noisy(draw, level="estimate", huber=1.5, shared="both")
+    fit = problem.fit(data, warn=False)
+
+    def rho(u):
+        return np.where(np.abs(u) <= 1.5, 0.5 * u**2, 1.5 * np.abs(u) - 1.125)
+
+    sigma, a = fit.sigma["both"], fit.values["c.a"]
+    best = scipy.optimize.minimize_scalar(lambda q: np.sum(rho((falling(q) - y) / sigma)), (1.2, 1.4), tol=1e-14).x
+    u = (falling(a) - y) / sigma
+    assert a == pytest.approx(best, rel=1e-5)
+    bent = np.sqrt(2 * rho(u))
+    flat = np.where(np.abs(u) <= 1.5, 1.0, 1.5 / np.where(bent > 0, bent, 1))
+    taken = np.sum(slope**2) / np.sum((flat * slope) ** 2)
+    assert np.sum(np.minimum(np.abs(u), 1.5) * np.abs(u)) == pytest.approx(24 - taken, rel=1e-3)
+    assert fit.table()["sigma of both"].value == sigma
+
+
+@pytest.mark.long("residuals and their Jacobian")
+def test_sensors_share_a_level_and_errors_grow_with_what_is_measured():
+    """Each name had a level of its own, the same for all of its samples."""
+    draw = np.random.default_rng(5).standard_normal(24)
+    unit = 0.2 + falling(1.3)
+    x, z = np.split(falling(1.3) + 0.03 * unit * draw, 2)
+    sigma = {n: learning.Noise(scale=u, shared="gauge") for n, u in zip(("c.x", "c.z"), np.split(unit, 2), strict=True)}
+    data = learning.Experiment(TS, {"c.x": x, "c.z": z}, sigma=sigma)
+    fit = learning.Problem(system(Falling), data, train=["c.a"], **TIGHT).fit()
+    (a,) = exactly(lambda q: (falling(q[0]) - np.r_[x, z]) / unit, [1.0])
+    level = np.sqrt(np.sum(((falling(a) - np.r_[x, z]) / unit) ** 2) / 23)
+    assert fit.values["c.a"] == pytest.approx(a, rel=1e-6) and fit.sigma == {"gauge": pytest.approx(level, rel=1e-6)}
+    assert fit.table(white=False)["c.a"].high > fit.table(white=False)["c.a"].low
+    half = data.window(0.5, 2.0, initial={"c.x": learning.Unknown(1.0), "c.z": learning.Unknown(0.0)})
+    np.testing.assert_array_equal(half.noise("c.x").scale, unit[:12][TS >= 0.5])
+    own = {"c.x": learning.Noise(student=4.0), "c.z": 0.1}
+    other = learning.Experiment(TS, {"c.x": x, "c.z": z}, sigma=own)
+    with pytest.raises(ModelError, match="the noise of 'c.x' has tails, which method=Shooting does not take"):
+        learning.Problem(system(Falling), other, train=["c.a"], method=learning.Shooting(2)).fit()
+    mixed = learning.Data(data, learning.Experiment(TS, {"c.x": x}, sigma=0.1))
+    with pytest.raises(ModelError, match="experiment 1: the noise of 'c.x' has another distribution or shared level"):
+        learning.Problem(system(Falling), mixed, train=["c.a"])
+
+
 def test_noise_levels_that_do_not_fit():
     cases = [
         (np.ones(11), r"shape \(12,\); got float64 of shape \(11,\)"),
