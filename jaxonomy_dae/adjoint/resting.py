@@ -106,7 +106,17 @@ class Resting(eqx.Module):
         shapes = jax.eval_shape(lambda: solver.init(terms, t, t, x, resting.args))
         state = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
         no, none = jnp.array(False), jnp.zeros(x.shape, bool)
-        return Pushed(x, state, no, no, none, no, x, state, jnp.full_like(jnp.asarray(t), jnp.inf))
+        return Pushed(
+            y=x,
+            solver_state=state,
+            fresh=no,
+            exists=no,
+            resting=none,
+            given_up=no,
+            next_y=x,
+            next_state=state,
+            allowed=jnp.full_like(jnp.asarray(t), jnp.inf),
+        )
 
     def first_end(self, t: Time, end: Time, y: State) -> Any:
         """The end of the first step, made earlier where a component rests. A second run begins after a step only, so
@@ -194,7 +204,17 @@ class Resting(eqx.Module):
         exists = look & done
         resting = jnp.where(new | again, rests, still_resting)
         given_up = pushed.given_up | (look & ~done)
-        after = Pushed(y, state, fresh, exists, resting, given_up, next_y, next_state, allowed)
+        after = Pushed(
+            y=y,
+            solver_state=state,
+            fresh=fresh,
+            exists=exists,
+            resting=resting,
+            given_up=given_up,
+            next_y=next_y,
+            next_state=next_state,
+            allowed=allowed,
+        )
         after = jax.tree.map(lambda a, b: jnp.where(exists, a, b), after, without)
         after = eqx.tree_at(lambda p: p.given_up, after, given_up)
         return jnp.where(exists, end, step.end), after
@@ -226,7 +246,16 @@ def held_back(
     if program.rest is None:
         return new, jnp.array(False), pushed
     jump = new.made_jump if program.jumps else False  # some versions of JAX make an array of a constant
-    step = AttemptedStep(state.tprev, state.tnext, state.y, new.y, accepted, jump, new.tprev, new.tnext)
+    step = AttemptedStep(
+        t0=state.tprev,
+        t1=state.tnext,
+        y0=state.y,
+        y1=new.y,
+        accepted=accepted,
+        jump=jump,
+        start=new.tprev,
+        end=new.tnext,
+    )
     end, pushed = program.rest(numbers["rest"], step, pushed)
     return dataclasses.replace(new, tnext=end), end < new.tnext, pushed
 
@@ -259,7 +288,7 @@ class HeldBack(WrappedControl):
             t0, t1, y0, y1, args, y_error, error_order, state
         )
         after = jax.tree.map(lambda a, b: jnp.where(keep, b, a), y0, y1)
-        step = AttemptedStep(t0, t1, y0, after, keep, jump, start, end)
+        step = AttemptedStep(t0=t0, t1=t1, y0=y0, y1=after, accepted=keep, jump=jump, start=start, end=end)
         allowed, pushed = self._resting(y0, args, span).restrained(step, pushed)
         return keep, start, _no_later(start, end, allowed), jump, (state, span, pushed), result
 

@@ -179,7 +179,9 @@ def find_equilibrium(
     x, q = parts(w, base)
     if events is not None and len(events.computed):
         q = recomputed(system, t, inputs, events, x, q, base.writer)
-    return Equilibrium(x, q, remaining, root.limit, root.jacobian, root.unit, event, holds)
+    return Equilibrium(
+        x=x, q=q, residual=remaining, limit=root.limit, jacobian=root.jacobian, unit=root.unit, event=event, holds=holds
+    )
 
 
 compiled_search = compiled(find_equilibrium)

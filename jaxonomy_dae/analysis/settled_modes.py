@@ -94,12 +94,30 @@ def settle(
         found = here, root, event
         first = jax.tree.map(lambda a, b: jnp.where(state.modes == 0, a, b), found, state.first)
         rounds = jnp.where(fails, 1, state.rounds + 1)
-        return _Search(at, root, event, modes, rounds, before, first, ~settled & (modes < len(flips)))
+        return _Search(
+            at=at,
+            root=root,
+            event=event,
+            modes=modes,
+            rounds=rounds,
+            before=before,
+            first=first,
+            goes_on=~settled & (modes < len(flips)),
+        )
 
     shapes = jax.eval_shape(search, begin)
     here, root = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
     nothing = here, root, jnp.array(-1)
-    state = _Search(begin, root, nothing[2], jnp.array(0), jnp.array(1), (here, nothing[2]), nothing, jnp.array(True))
+    state = _Search(
+        at=begin,
+        root=root,
+        event=nothing[2],
+        modes=jnp.array(0),
+        rounds=jnp.array(1),
+        before=(here, nothing[2]),
+        first=nothing,
+        goes_on=jnp.array(True),
+    )
     state = jax.lax.while_loop(lambda s: s.goes_on, once, state)
     settled = state.root.good & (state.event < 0)
     last = state.at, state.root, state.event

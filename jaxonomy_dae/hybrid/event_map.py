@@ -211,19 +211,19 @@ def handle(
             turns=turns,
         )
         return Instant(
-            state,
-            left,
-            caused,
-            delay,
-            together,
-            base,
-            base_slope,
-            previous,
-            after,
-            instant.arrived,
-            stuck,
-            now_noted,
-            wrote,
+            state=state,
+            left=left,
+            caused=caused,
+            delay=delay,
+            round=together,
+            before=base,
+            approach=base_slope,
+            previous=previous,
+            slope=after,
+            arrived=instant.arrived,
+            stuck=stuck,
+            noted=now_noted,
+            wrote=wrote,
         )
 
     def while_any_is_left(step: Callable[[Instant], Instant], times: int) -> Callable[[Instant], Instant]:
@@ -239,9 +239,20 @@ def handle(
 
     none = jnp.zeros((g,), bool)
     start = Instant(
-        state, arrival.due, arrival.jumped, jnp.zeros_like(t), arrival.due, state.x, arrival.slope, state.q,
-        arrival.slope, state.x, none, noted, rivals.nobody,
-    )  # fmt: skip
+        state=state,
+        left=arrival.due,
+        caused=arrival.jumped,
+        delay=jnp.zeros_like(t),
+        round=arrival.due,
+        before=state.x,
+        approach=arrival.slope,
+        previous=state.q,
+        slope=arrival.slope,
+        arrived=state.x,
+        stuck=none,
+        noted=noted,
+        wrote=rivals.nobody,
+    )
     length = _most_in_turn(problem)
     # Loops of fixed length, whose bodies are skipped where nothing is left: reverse mode cannot go back over a `while`.
     # Of a thousand clocks, few tick at once: loops in a loop pass over the others in √1000 steps.

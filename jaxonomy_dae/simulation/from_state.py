@@ -24,7 +24,16 @@ def from_state(system: AcausalSystem, t0: Time, inputs: Any, x: Float[Array, " n
     limit = jnp.sqrt(jnp.finfo(x.dtype).eps) * (jnp.abs(x) + system.state_sizes)
     nothing = jnp.zeros((), jnp.int32)
     if not system.is_constrained:
-        return InitialPoint(x, x[:0], jnp.zeros_like(x), limit, jnp.zeros_like(x), nothing, nothing, None)
+        return InitialPoint(
+            x=x,
+            solved=x[:0],
+            residual=jnp.zeros_like(x),
+            limit=limit,
+            target=jnp.zeros_like(x),
+            method=nothing,
+            evaluations=nothing,
+            jacobian=None,
+        )
     frozen = jax.lax.stop_gradient
     still, driving = (
         jax.tree.map(lambda leaf: frozen(leaf) if eqx.is_inexact_array(leaf) else leaf, tree)
@@ -33,7 +42,16 @@ def from_state(system: AcausalSystem, t0: Time, inputs: Any, x: Float[Array, " n
     near = still.project(frozen(t0), frozen(x), driving, iterations=ITERATIONS)
     # near has the value of the search and, by x − frozen(x), the derivative of x: the last step carries it over.
     moved = system.project(t0, near + (x - frozen(x)), inputs, iterations=1)
-    return InitialPoint(moved, x[:0], frozen(moved - near), limit, jnp.zeros_like(x), nothing, nothing, None)
+    return InitialPoint(
+        x=moved,
+        solved=x[:0],
+        residual=frozen(moved - near),
+        limit=limit,
+        target=jnp.zeros_like(x),
+        method=nothing,
+        evaluations=nothing,
+        jacobian=None,
+    )
 
 
 def check_array(system: AcausalSystem, initial: Any) -> None:

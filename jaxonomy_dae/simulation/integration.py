@@ -205,7 +205,17 @@ def run(
     if discrete is not None:
         discrete = jnp.where((filled & consistent)[:, None], discrete, jnp.nan)
     return Outcome(
-        found._replace(jacobian=None), saved, x, last, done.stats, result, stiff, discrete, events, held, memory
+        found=found._replace(jacobian=None),
+        ts=saved,
+        x=x,
+        last=last,
+        stats=done.stats,
+        result=result,
+        is_stiff=stiff,
+        discrete=discrete,
+        events=events,
+        held=held,
+        memory=memory,
     )
 
 

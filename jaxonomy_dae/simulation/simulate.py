@@ -209,9 +209,15 @@ def simulate(
             steps = controller_for(system, solver, rtol, atol, dtmax, control)
         chosen = default_adjoint(is_forwards(given), batch_size(given)) if adjoint is None else adjoint
         return Options(
-            solver, chosen, clipped(steps, jump_ts, ends),
-            max_steps + ends.count, progress, most_events, room, sides,
-        )  # fmt: skip
+            solver=solver,
+            adjoint=chosen,
+            controller=clipped(steps, jump_ts, ends),
+            max_steps=max_steps + ends.count,
+            progress=progress,
+            max_events=most_events,
+            room=room,
+            save_events=sides,
+        )
 
     if control and stepsize_controller is not None:
         raise ModelError("control= and stepsize_controller= both say what errors count: leave one of them out")
@@ -289,9 +295,19 @@ def simulate(
         saved, x, discrete = jax.tree.map(lambda rows: picked(rows, slice(n)), (saved, x, discrete))
         memory = memory if memory is None else memory.first(n)
     solution = Solution(
-        saved, x, system, inputs, counts, outcome.result, choice.solver, choice.reason, discrete, outcome.events,
-        memory, asked,
-    )  # fmt: skip
+        ts=saved,
+        states=x,
+        system=system,
+        inputs=inputs,
+        counts=counts,
+        result=outcome.result,
+        solver=choice.solver,
+        reason=choice.reason,
+        discrete=discrete,
+        event_log=outcome.events,
+        memory=memory,
+        asked=asked,
+    )
     if throw is not False and not is_code(outcome.result, *OKAY):
         first = t0, outcome.found.x
         held = system.holding(initial.discrete) if isinstance(initial, SavedState) else system
@@ -352,6 +368,16 @@ def _traced(
     if checked:
         x = raised(x, outcome.result, system.plan.events is not None, *bounds)
     return Solution(
-        outcome.ts, x, system, inputs, outcome.stats, outcome.result, choice.solver, choice.reason, outcome.discrete,
-        outcome.events, outcome.memory, asked,
-    )  # fmt: skip
+        ts=outcome.ts,
+        states=x,
+        system=system,
+        inputs=inputs,
+        counts=outcome.stats,
+        result=outcome.result,
+        solver=choice.solver,
+        reason=choice.reason,
+        discrete=outcome.discrete,
+        event_log=outcome.events,
+        memory=outcome.memory,
+        asked=asked,
+    )

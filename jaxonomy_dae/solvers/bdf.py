@@ -146,10 +146,21 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         phi = jnp.zeros((ROWS, y.shape[0]), y.dtype).at[0].set(y).at[1].set(h.astype(y.dtype) * slope)
         still = jax.lax.stop_gradient(h)
         return _History(
-            phi, h * jnp.arange(1, ROWS + 1, dtype=h.dtype), one, zero, zero, jnp.zeros_like(still), still,
-            jnp.array(True), factor, jnp.zeros_like(still), jnp.zeros_like(still), jnp.full((), 20.0, h.dtype), counts,
-            largest,
-        )  # fmt: skip
+            phi=phi,
+            psi=h * jnp.arange(1, ROWS + 1, dtype=h.dtype),
+            order=one,
+            last_order=zero,
+            steady=zero,
+            last_step=jnp.zeros_like(still),
+            planned=still,
+            starting=jnp.array(True),
+            factor=factor,
+            factor_cj=jnp.zeros_like(still),
+            last_cj=jnp.zeros_like(still),
+            contraction=jnp.full((), 20.0, h.dtype),
+            counts=counts,
+            largest=largest,
+        )
 
     def step(self, terms, t0, t1, y0, args, solver_state: _History, made_jump):
         """One step with its error estimate and dense output; see `diffrax.AbstractSolver.step`."""
@@ -258,10 +269,21 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
         updated = _advance(phi, e, k, self.max_order)
         h_ = still(h)
         new_state = _History(
-            updated, c.psi, next_order, k, steady.astype(jnp.int32), h_, h_ * factor.astype(h_.dtype), starting,
-            solved.factor, solved.factor_cj, still(cj), solved.contraction,
-            state.counts + jnp.stack([solved.factorisations, solved.iterations]), largest,
-        )  # fmt: skip
+            phi=updated,
+            psi=c.psi,
+            order=next_order,
+            last_order=k,
+            steady=steady.astype(jnp.int32),
+            last_step=h_,
+            planned=h_ * factor.astype(h_.dtype),
+            starting=starting,
+            factor=solved.factor,
+            factor_cj=solved.factor_cj,
+            last_cj=still(cj),
+            contraction=solved.contraction,
+            counts=state.counts + jnp.stack([solved.factorisations, solved.iterations]),
+            largest=largest,
+        )
         # The controller divides the error by the same scale, which must be finite where y1 is not.
         value = jnp.where(jnp.isfinite(y1), y1, y)
         scale = atol + jnp.maximum(jnp.abs(y), jnp.abs(value)) * rtol
