@@ -13,7 +13,8 @@ from ..adjoint.resting import still
 from ..aliases import Args, State, Time
 from ..modeling.event_flags import EventFlag
 from ..tolerances import WINDOW
-from .event_map import AHEAD, CLOSE, Arrival
+from .after_event import AHEAD
+from .instant import CLOSE, Arrival
 from .problem import AbstractHybridProblem, HybridState
 from .search import first_crossing
 from .side import ABOVE, BELOW, RESTS, rounding

@@ -10,7 +10,8 @@ from jax import lax
 from ..adjoint.resting import still
 from ..aliases import Args, State, Time
 from ..modeling.event_flags import EventFlag
-from .event_map import Arrival, handle
+from .event_map import handle
+from .instant import Arrival
 from .log import EventRows
 from .problem import AbstractHybridProblem, HybridState
 from .side import ABOVE, BELOW, RESTS, rounding
