@@ -2,9 +2,14 @@
 
 import importlib
 import re
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from .errors import MissingPackage
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+else:
+    Axes = object  # Matplotlib may be missing
 
 # What an axis shows if several variables of one unit share it.
 QUANTITIES = {
@@ -33,7 +38,7 @@ def pyplot() -> Any:
     return optional_module("matplotlib.pyplot", "plot", "plotting needs Matplotlib")
 
 
-def new_axes(ax: Any, width: float = 7.0, height: float = 3.5) -> Any:
+def new_axes(ax: Axes | None, width: float = 7.0, height: float = 3.5) -> Axes:
     """The Matplotlib axes given, or new ones."""
     return pyplot().subplots(figsize=(width, height), layout="constrained")[1] if ax is None else ax
 
@@ -45,7 +50,7 @@ def axis_label(name: str, unit: str | None) -> str:
     return f"{name} / ({unit})" if re.search(r"[*/]", unit) else f"{name} / {unit}"
 
 
-def legend_beside(ax: Any, of: Any = None) -> None:
+def legend_beside(ax: Axes, of: Axes | None = None) -> None:
     """Draws the legend of these axes, or of others, to the right of them, where it covers no data."""
     ax.legend(
         *(of or ax).get_legend_handles_labels(),

@@ -5,7 +5,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from .errors import ModelError
-from .optional import QUANTITIES, axis_label, legend_beside, new_axes, optional_module, pyplot
+from .optional import QUANTITIES, Axes, axis_label, legend_beside, new_axes, optional_module, pyplot
 from .simulation.labelled import ByName
 from .system.system import AcausalSystem
 
@@ -41,7 +41,7 @@ class Response(Protocol):
         ...
 
 
-def plot_solution(solution: ByName, *names: str, ax: Any = None, events: bool = True) -> Any:
+def plot_solution(solution: ByName, *names: str, ax: Axes | None = None, events: bool = True) -> Any:
     """Draws variables over time, discrete ones as steps: one panel for each unit, one below the other.
 
     **Arguments:**
@@ -75,7 +75,7 @@ def plot_solution(solution: ByName, *names: str, ax: Any = None, events: bool = 
     return axes
 
 
-def _panel(solution: ByName, names: list[str], units: list[str], ax: Any, events: bool) -> None:
+def _panel(solution: ByName, names: list[str], units: list[str], ax: Axes, events: bool) -> None:
     """Draws some variables into one pair of axes."""
     time = np.asarray(solution.ts)
     common = units[0] if len(set(units)) == 1 else None
@@ -137,7 +137,7 @@ def _seen(solution: ByName) -> np.ndarray:
     return (ts >= time.min() - slack) & (ts <= time.max() + slack)
 
 
-def _mark_events(solution: ByName, ax: Any) -> bool:
+def _mark_events(solution: ByName, ax: Axes) -> bool:
     """Marks the events within the saved times; returns True if there are any."""
     log = solution.event_log
     if log is None or solution.ts.ndim > 1:  # of a batch, each member has events of its own
@@ -161,7 +161,7 @@ def _mark_events(solution: ByName, ax: Any) -> bool:
     return bool(groups)
 
 
-def phase(solution: ByName, x: str, y: str, ax: Any = None) -> Any:
+def phase(solution: ByName, x: str, y: str, ax: Axes | None = None) -> Axes:
     """Draws one variable over another, with a dot at the start; returns the axes. Of a batch, each member has a line.
 
     **Arguments:**
@@ -189,7 +189,7 @@ def phase(solution: ByName, x: str, y: str, ax: Any = None) -> Any:
     return ax
 
 
-def structure(system: AcausalSystem, ax: Any = None) -> Any:
+def structure(system: AcausalSystem, ax: Axes | None = None) -> Axes:
     """Draws the incidence matrix in block lower triangular order, and returns the axes.
 
     Rows are equations, columns the unknowns they are solved for; a dot says that the equation contains the unknown.
@@ -266,7 +266,7 @@ def bode(response: Response, *pairs: tuple[str, str], axes: Any = None) -> Any:
     return axes
 
 
-def nyquist(response: Response, *pairs: tuple[str, str], ax: Any = None) -> Any:
+def nyquist(response: Response, *pairs: tuple[str, str], ax: Axes | None = None) -> Axes:
     """Draws responses in the complex plane, those of negative frequencies dashed, with the point −1; returns the axes.
 
     **Arguments:**

@@ -24,12 +24,14 @@ import importlib
 import importlib.metadata
 import inspect
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax
 
+from .aliases import Terms
 from .errors import JaxonomyDaeError
 
 TRIED = {
@@ -136,7 +138,7 @@ def has_stored_adjoint() -> bool:
     return lacking is None
 
 
-def clear_jitted(function: Any) -> None:
+def clear_jitted(function: Callable) -> None:
     """Frees the programs of a function of `equinox.filter_jit`, its derivatives by JAX included."""
     cached = getattr(function, "_cached", None)
     if cached is not None:
@@ -160,12 +162,12 @@ def _versions(path: str) -> str:
     return f"{library} {importlib.metadata.version(library)} (tried: {', '.join(TRIED[library])})"
 
 
-def unwrapped(terms: Any) -> tuple[Any, Any]:
+def unwrapped(terms: Terms) -> tuple[Any, Any]:
     """(term, direction of time) of what Diffrax hands to a solver or a controller, or of a term by itself."""
     return (terms.term, terms.direction) if hasattr(terms, "direction") else (terms, 1)
 
 
-def rewrapped(terms: Any, term: Any) -> Any:
+def rewrapped(terms: Terms, term: Any) -> Any:
     """Wraps `term` in the same direction of time as `terms`."""
     return type(terms)(term, terms.direction) if hasattr(terms, "direction") else term
 

@@ -6,9 +6,8 @@ spacing of floating-point numbers near one (2⁻⁵² in double, 2⁻²³ in sin
 others are relative. None has a unit of physics.
 """
 
-from typing import Any
-
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 
 EPS = 2.0**-52  # the spacing of double precision near one, a bound of the rounding of one operation
 
@@ -59,23 +58,23 @@ HALF_OF_THE_DIGITS = 1e-7
 UNCHANGED = 1e-5
 
 
-def spacing(dtype: Any) -> float:
+def spacing(dtype: DTypeLike) -> float:
     """The spacing of numbers of a dtype near one."""
     return float(jnp.finfo(dtype).eps)
 
 
-def solved(dtype: Any) -> float:
+def solved(dtype: DTypeLike) -> float:
     """The largest residual of an equation that holds, relative to its terms: 4e-10 in double, 7e-5 in single
     precision. Set by hand, above what cancellation inside of terms leaves where a search can do no better."""
     return spacing(dtype) ** 0.6
 
 
-def close(dtype: Any) -> float:
+def close(dtype: DTypeLike) -> float:
     """The residual at which a search ends, relative to the terms."""
     return min(CLOSE * spacing(dtype), 0.1 * solved(dtype))
 
 
-def ridge(dtype: Any) -> float:
+def ridge(dtype: DTypeLike) -> float:
     """What directions that a matrix leaves open are held by, beside rows of size one: far below the rounding of what
     only such directions feel. A solution in directions of the size σ is off by up to (ridge/σ)² of itself."""
     return spacing(dtype) ** 0.75

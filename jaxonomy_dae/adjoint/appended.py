@@ -14,6 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
+from ..aliases import State
+
 NOTED = "noted"  # the entry of a step's dense output that holds the rows it appends
 
 
@@ -34,17 +36,17 @@ class AbstractAppending(eqx.Module):
         """The number of rows so far, those for which there was no room included."""
 
 
-def apart(y: Any) -> tuple[Any, PyTree]:
+def apart(y: State) -> tuple[Any, PyTree]:
     """Returns (the state without its table, the table), for a state of any kind."""
     return (dataclasses.replace(y, table=None), y.table) if isinstance(y, AbstractAppending) else (y, None)
 
 
-def together(y: Any, table: PyTree) -> Any:
+def together(y: State, table: PyTree) -> Any:
     """The state with its table put back."""
     return dataclasses.replace(y, table=table) if isinstance(y, AbstractAppending) else y
 
 
-def appended(table: PyTree, noted: PyTree, y0: Any, y1: Any) -> PyTree:
+def appended(table: PyTree, noted: PyTree, y0: State, y1: Any) -> PyTree:
     """The table after a step from y0 to y1 that noted these rows."""
     if table is None:
         return None
@@ -55,7 +57,7 @@ def appended(table: PyTree, noted: PyTree, y0: Any, y1: Any) -> PyTree:
     return jax.tree.map(one, table, noted)
 
 
-def appended_transposed(cotangent: PyTree, noted: PyTree, y0: Any, y1: Any) -> PyTree:
+def appended_transposed(cotangent: PyTree, noted: PyTree, y0: State, y1: Any) -> PyTree:
     """The cotangents of the rows that a step from y0 to y1 noted, given the table's."""
 
     def one(cotangent: Any, rows: Any) -> Any:
@@ -66,7 +68,7 @@ def appended_transposed(cotangent: PyTree, noted: PyTree, y0: Any, y1: Any) -> P
     return jax.tree.map(one, cotangent, noted)
 
 
-def _places(table: Any, rows: Any, y0: Any, y1: Any) -> Any:
+def _places(table: Any, rows: Any, y0: State, y1: Any) -> Any:
     """Where in the table the rows go; past its end for those that are not appended."""
     places = y0.count.astype(jnp.int32) + jnp.arange(rows.shape[0], dtype=jnp.int32)
     return jnp.where(places < y1.count.astype(jnp.int32), places, table.shape[0])

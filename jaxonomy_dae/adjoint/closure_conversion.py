@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Int, PyTree
 
-from ..aliases import Args
+from ..aliases import Args, State
 from ..private_names import MissingName, private
 
 
@@ -159,7 +159,7 @@ def _(size, batched, active, new, old):
     return out, jax.tree.map(lambda _: True, out)
 
 
-def going(state: Any, numbers: dict[str, Any], program: SolveProgram) -> Bool[Array, ""]:
+def going(state: State, numbers: dict[str, Any], program: SolveProgram) -> Bool[Array, ""]:
     """True while a solve has steps left to take."""
     on = (state.tprev < numbers["t1"]) & diffrax.is_successful(state.result)
     return on if program.max_steps is None else on & (state.num_steps < program.max_steps)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from ..aliases import Args, Controller, Solver, State, Terms, Time
+from ..aliases import Args, Controller, PyTree, Solver, State, Terms, Time
 from ..private_names import FROM_CONTROLLER
 from .closure_conversion import SolveProgram, any_member, as_traced
 from .wrapped_control import WrappedControl
@@ -239,7 +239,7 @@ class Resting(eqx.Module):
 
 
 def held_back(
-    state: Any, new: Any, accepted: Bool[Array, ""], pushed: Any, numbers: dict[str, Any], program: SolveProgram
+    state: State, new: Any, accepted: Bool[Array, ""], pushed: Any, numbers: dict[str, Any], program: SolveProgram
 ) -> tuple[Any, Bool[Array, ""], Any]:
     """Returns (Diffrax's state `new` with its next step shortened where components rest, whether it was shortened, the
     second run's state)."""
@@ -312,7 +312,7 @@ def _shortened(start: Time, end: Time) -> Any:
     return jnp.minimum(end, start + jnp.maximum(TINY * (end - start), shortest))
 
 
-def still(tree: Any) -> Any:
+def still(tree: PyTree) -> Any:
     """The tree with all arrays constant under differentiation."""
     return jax.tree.map(lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, tree)
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from ..aliases import State
 from ..private_names import private
 from .appended import NOTED, appended_transposed
 from .closure_conversion import SolveProgram, any_member, inexact, read, unless_waiting
@@ -41,7 +42,7 @@ class ReverseStep:
         self.appends = bool(jax.tree.leaves(self.table))
         self.table = _full(self.table, numbers["table"]) if self.appends else self.table
 
-    def start(self, state: Any, moves: Any) -> dict[str, Any]:
+    def start(self, state: State, moves: Any) -> dict[str, Any]:
         """The carry of the reverse loop at the end of the solve."""
         given = self.state_cotangent
         seeds = jnp.zeros((self.times.count,), state.tprev.dtype)
@@ -186,7 +187,7 @@ class ReverseStep:
         )  # fmt: skip
 
 
-def state_saves(state: Any) -> list[Any]:
+def state_saves(state: State) -> list[Any]:
     """The `SaveState`s in Diffrax's state, one for each part of `SaveAt`."""
     kind = private("SaveState")
 

@@ -80,7 +80,7 @@ class StepTimes:
         return tprev, jnp.where(held, tprev, tnext), controlled
 
 
-def _clock(tree: dict[str, Any]) -> Any:
+def _clock(tree: dict[str, PyTree]) -> Any:
     """The quantities on which the ends of steps depend: (start, end, controller state), and (t1, controller)."""
     state = tree["state"]
     moving = state.tprev, state.tnext, state.controller_state[0]

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from ..aliases import Terms
+from ..aliases import Solver, Terms
 from ..private_names import has_stored_adjoint, private
 from ..programs.members import batch_size
 from .appended import NOTED, apart, together
@@ -271,7 +271,7 @@ def _quickly(*, args, terms, solver, init_state, made_jump, **_) -> tuple[Any, l
     return closure_convert(take_step, s.tprev, s.tnext, s.y, s.solver_state, jump)
 
 
-def _in_a_loop(solver: Any) -> Any:
+def _in_a_loop(solver: Solver) -> Any:
     """The solver with its stages in a loop; None if it has but one form, or the user has chosen."""
     if isinstance(solver, diffrax.AbstractWrappedSolver):
         inner = _in_a_loop(solver.solver)

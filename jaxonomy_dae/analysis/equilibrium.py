@@ -10,13 +10,14 @@ Discrete values that clocks or expressions write are unknowns, too; modes are se
 (`settled_modes.py`).
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..aliases import Args, Time
 from ..initialization.ladder import FAILED, find_root, looking
 from ..initialization.problem import frozen_inputs
 from ..initialization.sizes import Sizes
@@ -62,7 +63,7 @@ def unknowns(plan: SystemPlan, drifting: tuple[int, ...]) -> np.ndarray:
 
 
 def find_equilibrium(
-    system: AcausalSystem, t: Any, x0: Any, inputs: Any, drifting: tuple[int, ...], kept: tuple[int, ...] = ()
+    system: AcausalSystem, t: Time, x0: Array, inputs: Args, drifting: tuple[int, ...], kept: tuple[int, ...] = ()
 ) -> Equilibrium:
     """Searches from `x0`; a pure function, to be used inside jit. `drifting` are the places of states, `kept` those of
     discrete values, that stay as they are."""
@@ -135,7 +136,7 @@ def find_equilibrium(
         else:  # relations may hold slopes constant, and no step of a search for a root leads on
             mass = jnp.append(jnp.asarray(system.mass[free], x0.dtype), jnp.ones((k - n,), x0.dtype))
 
-            def again(carry: tuple[Any, Root]) -> tuple[Any, Root]:
+            def again(carry: tuple[Array, Root]) -> tuple[Array, Root]:
                 count, _ = carry
                 led = jax.lax.cond(count == 0, lambda: start, lambda: pseudo_transient(function, mass, start, typical))
                 return count + 1, root_from(led)

@@ -16,7 +16,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
+from ..aliases import Args, Time
 from ..lowering.plan import SystemPlan
 from ..model.declared import declared_scale
 from ..modeling.event_flags import EventFlag
@@ -85,13 +87,15 @@ def _flips(choices: list[int], n: int) -> np.ndarray:
     return rows
 
 
-def left_by_ticks(system: AcausalSystem, t: Any, inputs: Any, events: RestingEvents, x: Any, q: Any) -> Any:
+def left_by_ticks(system: AcausalSystem, t: Time, inputs: Args, events: RestingEvents, x: Array, q: Array) -> Array:
     """How far a tick of the clocks would move what it writes, shape (ticking,)."""
     values, now = _written(system, t, inputs, x, q)
     return values[events.ticking] - now[events.ticking]
 
 
-def recomputed(system: AcausalSystem, t: Any, inputs: Any, events: RestingEvents, x: Any, q: Any, writer: Any) -> Any:
+def recomputed(
+    system: AcausalSystem, t: Time, inputs: Args, events: RestingEvents, x: Array, q: Array, writer: Array
+) -> Array:
     """The discrete values with the derivatives of the expressions that events set them to; `writer` is the action that
     wrote each, or −1."""
     values, _ = _written(system, t, inputs, x, q)
@@ -101,8 +105,8 @@ def recomputed(system: AcausalSystem, t: Any, inputs: Any, events: RestingEvents
 
 
 def next_event(
-    system: AcausalSystem, t: Any, inputs: Any, events: RestingEvents, x: Any, q: Any, at_start: bool
-) -> Any:
+    system: AcausalSystem, t: Time, inputs: Args, events: RestingEvents, x: Array, q: Array, at_start: bool
+) -> Array:
     """The number of the first event of a condition that holds and that would change something, or −1; at the start, of
     those that happen there. Not differentiated."""
     plan: Any = system.plan.events
@@ -123,8 +127,8 @@ def next_event(
 
 
 def after_event(
-    system: AcausalSystem, t: Any, inputs: Any, events: RestingEvents, event: Any, x: Any, q: Any, writer: Any
-) -> tuple[Any, Any, Any]:
+    system: AcausalSystem, t: Time, inputs: Args, events: RestingEvents, event: Array, x: Array, q: Array, writer: Array
+) -> tuple[Array, Array, Array]:
     """(x, q, the action that wrote each discrete value or −1) after an event."""
     plan: Any = system.plan.events
     table = plan.table
@@ -140,7 +144,9 @@ def after_event(
     return x, q, jnp.where(new >= 0, new, writer)
 
 
-def both_sides(system: AcausalSystem, t: Any, inputs: Any, events: RestingEvents, x: Any, q: Any) -> tuple[Any, Any]:
+def both_sides(
+    system: AcausalSystem, t: Time, inputs: Args, events: RestingEvents, x: Array, q: Array
+) -> tuple[Array, Array]:
     """Where small deviations make events happen. Returns (the discrete values as they are, and after all events at
     whose levels the point lies, relations being true in one row and false in the other, shape (3, q); for each event,
     whether the point lies at its level, shape (events,)). Not differentiated."""
@@ -158,7 +164,9 @@ def both_sides(system: AcausalSystem, t: Any, inputs: Any, events: RestingEvents
     return jnp.stack([q, jnp.where(written, most, q), jnp.where(written, least, q)]), near
 
 
-def ticked(system: AcausalSystem, t: Any, inputs: Any, ticking: Sequence[int], x: Any, q: Any) -> tuple[Any, Any]:
+def ticked(
+    system: AcausalSystem, t: Time, inputs: Args, ticking: Sequence[int], x: Array, q: Array
+) -> tuple[Array, Array]:
     """(x, q) after the sampled events with these numbers, in order, at one instant."""
     plan: Any = system.plan.events
     table, previous = plan.table, q
@@ -171,7 +179,7 @@ def ticked(system: AcausalSystem, t: Any, inputs: Any, ticking: Sequence[int], x
     return x, q
 
 
-def _written(system: AcausalSystem, t: Any, inputs: Any, x: Any, q: Any) -> tuple[Any, Any]:
+def _written(system: AcausalSystem, t: Time, inputs: Args, x: Array, q: Array) -> tuple[Array, Array]:
     """What all actions would write, and what is there now, in units of the state array, shape (actions,) each."""
     plan: Any = system.plan.events
     values = system.around_event(t, q, q, inputs).event_values(x) / jnp.asarray(plan.factor, x.dtype)

@@ -1,9 +1,9 @@
 """`frequency_response`: how a model near a point answers sinusoids."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import jax.numpy as jnp
+from numpy.typing import ArrayLike
 
 from ..aliases import Time
 from ..errors import explained_keywords
@@ -17,9 +17,9 @@ from .response import FrequencyResponse
 def frequency_response(
     system: AcausalSystem,
     *,
-    inputs: Sequence[str] | Mapping[str, Any],
+    inputs: Sequence[str] | Mapping[str, ArrayLike],
     outputs: Sequence[str],
-    omega: Any,
+    omega: ArrayLike,
     at: OperatingPoint | None = None,
     t: Time = 0.0,
     sampled: bool = False,

@@ -6,6 +6,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from numpy.typing import ArrayLike
 
 from ..aliases import Time
 from ..diagnosis.wording import some
@@ -26,7 +28,7 @@ from .tangent import Coordinates, choose_coordinates
 @explained_keywords()
 def linearize(
     system: AcausalSystem,
-    inputs: Sequence[str] | Mapping[str, Any],
+    inputs: Sequence[str] | Mapping[str, ArrayLike],
     outputs: Sequence[str],
     *,
     at: OperatingPoint | None = None,
@@ -126,12 +128,12 @@ def _between_ticks(system: AcausalSystem, partials: Partials) -> Partials:
     return jax.tree.map(lambda leaf: _where(~jnp.any(depends), leaf), partials)
 
 
-def _where(fine: Any, leaf: Any) -> Any:
+def _where(fine: Array, leaf: Array) -> Array:
     return jnp.where(fine, leaf, jnp.nan) if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf
 
 
 def _reduced(
-    system: AcausalSystem, partials: Partials, x: Any, u: Any, coordinates: Coordinates, names: tuple[str, ...],
+    system: AcausalSystem, partials: Partials, x: Array, u: Array, coordinates: Coordinates, names: tuple[str, ...],
     outputs: tuple[str, ...],
 ) -> StateSpace:  # fmt: skip
     """The state space on the tangent of the constraints. Inputs that hidden constraints contain would be
@@ -195,7 +197,7 @@ def _checked_names(system: AcausalSystem, given: Any, what: str) -> list[str]:
     return names
 
 
-def _check_inputs(system: AcausalSystem, names: list[str], given: Mapping[str, Any], at: OperatingPoint | None):
+def _check_inputs(system: AcausalSystem, names: list[str], given: Mapping[str, object], at: OperatingPoint | None):
     """Every input has a value, and the model differentiates none that is asked for."""
     table = system.plan.inputs
     known = given if at is None else {**by_entry(system.plan, at.inputs), **given}
@@ -211,7 +213,7 @@ def _check_inputs(system: AcausalSystem, names: list[str], given: Mapping[str, A
             )
 
 
-def _value_at(system: AcausalSystem, values: Mapping[str, Any], name: str, t: Any) -> Any:
+def _value_at(system: AcausalSystem, values: Mapping[str, Any], name: str, t: Time) -> Array:
     table = system.plan.inputs
     value = values.get(name, table.defaults[table.names.index(name)])
     return jnp.asarray(value_at(value, t), t.dtype)

@@ -10,6 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from ..aliases import Args, Time
 from ..errors import ModelError
 from ..programs.cache import compiled
 from ..programs.staging import is_staged
@@ -36,7 +37,7 @@ class OperatingPoint(eqx.Module):
     inputs: dict[str, Any]
     residual: Float[Array, ""]
 
-    def __getitem__(self, name: Any) -> Any:
+    def __getitem__(self, name: Any) -> Array:
         """The value of a variable, or of several, discrete ones included; `"der(...)"` of what the model
         differentiates, and `"time"`. For the name of an array, its shape; among several names, it stands for those of
         all entries.
@@ -96,7 +97,7 @@ def _text(value: Any) -> str:
     return f"{float(value):.6g}" if np.ndim(value) == 0 else f"shape {np.shape(value)}"
 
 
-def _every_quantity(system: AcausalSystem, t: Any, x: Any, inputs: Any) -> Any:
+def _every_quantity(system: AcausalSystem, t: Time, x: Array, inputs: Args) -> Array:
     every = np.arange(system.plan.extended.quantities.n)
     return system.at(t, inputs).quantities(x, every, np.ones(len(every)))
 

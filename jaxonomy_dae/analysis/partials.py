@@ -5,7 +5,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
+from ..aliases import Args, Time
 from ..lowering.plan import SystemPlan
 from ..programs.cache import compiled
 from ..system.nonlinear import Refinement
@@ -25,17 +27,17 @@ class Partials(NamedTuple):
         events these are.
     """
 
-    slopes: Any
-    outputs: Any
-    of_slopes: tuple[Any, Any, Any]
-    of_constraints: tuple[Any, Any, Any]
-    of_outputs: tuple[Any, Any, Any]
-    agree: Any
-    near: Any
+    slopes: Array
+    outputs: Array
+    of_slopes: tuple[Array, Array, Array]
+    of_constraints: tuple[Array, Array, Array]
+    of_outputs: tuple[Array, Array, Array]
+    agree: Array
+    near: Array
 
 
 def partials_at(
-    system: AcausalSystem, t: Any, x: Any, q: Any, values: Any, u: Any, names: tuple[str, ...],
+    system: AcausalSystem, t: Time, x: Array, q: Array, values: Args, u: Array, names: tuple[str, ...],
     quantity: tuple[int, ...], factor: tuple[float, ...],
 ) -> Partials:  # fmt: skip
     n = len(system.plan.states)
@@ -72,13 +74,13 @@ def partials_at(
     return Partials(slopes, y, of_slopes, of_constraints, of_outputs, agree & ~_moves(system.plan, near), near)
 
 
-def _alike(sides: Any) -> Any:
+def _alike(sides: Array) -> Array:
     """Whether rows are the same, to half of the digits of the largest entry."""
     allowed = spacing(sides.dtype) ** 0.5 * jnp.max(jnp.abs(sides), initial=0.0)
     return jnp.all(jnp.abs(sides - sides[0]) <= allowed)
 
 
-def _moves(plan: SystemPlan, near: Any) -> Any:
+def _moves(plan: SystemPlan, near: Array) -> Array:
     """Whether one of these events lets states jump, or ends the run."""
     events: Any = plan.events
     moves = events.table.ends
@@ -86,7 +88,7 @@ def _moves(plan: SystemPlan, near: Any) -> Any:
     return jnp.any(near & moves)
 
 
-def on_tangent(partials: Partials, coordinates: Coordinates) -> tuple[Any, Any]:
+def on_tangent(partials: Partials, coordinates: Coordinates) -> tuple[Array, Array]:
     """(how states follow from the coordinates, shape (states, coordinates); the derivatives of slopes with respect to
     states that keep to the constraints). Dependent states d follow from coordinates q by ∂h/∂d·δd + ∂h/∂q·δq = 0."""
     kept, dependent, rows = coordinates

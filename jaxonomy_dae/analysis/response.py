@@ -7,6 +7,7 @@ from jaxtyping import Array, Complex, Float
 
 from ..diagnosis.wording import counted
 from ..errors import ModelError, nearest
+from ..optional import Axes
 
 
 class FrequencyResponse(eqx.Module):
@@ -22,7 +23,7 @@ class FrequencyResponse(eqx.Module):
     inputs: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
 
-    def __getitem__(self, pair: Any) -> Complex[Array, " k"]:
+    def __getitem__(self, pair: object) -> Complex[Array, " k"]:
         """The response of one output to one input.
 
         **Raises:**
@@ -54,7 +55,7 @@ class FrequencyResponse(eqx.Module):
 
         return bode(self, *pairs, axes=axes)
 
-    def nyquist(self, *pairs: tuple[str, str], ax: Any = None) -> Any:
+    def nyquist(self, *pairs: tuple[str, str], ax: Axes | None = None) -> Axes:
         """Draws responses in the complex plane, with the point −1. Responses at −ω are dashed.
 
         **Arguments:**

@@ -12,8 +12,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jax.core import Tracer
+from jax.typing import DTypeLike
 
+from ..aliases import Args, PyTree
 from ..diagnosis.wording import some
 from ..errors import ModelError
 from ..system.system import AcausalSystem
@@ -32,10 +35,10 @@ class Sampled(NamedTuple):
     """A point, what drives it there, and the names of inputs and outputs."""
 
     t: Any
-    x: Any
-    q: Any
-    values: Any
-    u: Any
+    x: Array
+    q: Array
+    values: Args
+    u: Array
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
 
@@ -78,7 +81,7 @@ def sampled_space(system: AcausalSystem, point: Sampled, partials: Partials, coo
     spread = jnp.zeros((n + k + m, size - 1), dtype)
     spread = spread.at[:n, : len(kept)].set(follow).at[n:, len(kept) :].set(jnp.eye(k + m, dtype=dtype))
 
-    def tick(events_now: tuple[int, ...]) -> Any:
+    def tick(events_now: tuple[int, ...]) -> PyTree:
         def written(given):
             state, held, u = jnp.split(given, [n, n + k])
             driving = {**point.values, **dict(zip(point.inputs, u, strict=True))}
@@ -171,7 +174,7 @@ def instants_of(system: AcausalSystem, events: RestingEvents) -> Instants:
     )
 
 
-def _times(system: AcausalSystem, instants: Instants) -> tuple[Any, Any]:
+def _times(system: AcausalSystem, instants: Instants) -> tuple[Array, Array]:
     """(The times of the instants, and of the first one of the next period; whether ticks are in the order that was
     taken for granted)."""
     periods, offsets = SystemAt(system.plan, system.numbers, (), 0.0, {}, system.typical_sizes).clocks()
@@ -187,6 +190,6 @@ def _times(system: AcausalSystem, instants: Instants) -> tuple[Any, Any]:
     return times, fine & (jnp.max(lengths) - jnp.min(lengths) <= allowed)
 
 
-def _equal(dtype: Any) -> float:
+def _equal(dtype: DTypeLike) -> float:
     """Relative: times that are one."""
     return max(MEANT_EQUAL, KNOWN_ROUNDINGS * spacing(dtype))

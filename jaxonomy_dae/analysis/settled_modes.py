@@ -11,7 +11,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import Array
 
+from ..aliases import Args, Time
 from ..system.system import AcausalSystem
 from ..tolerances import solved
 from .events_at_rest import RestingEvents, after_event, next_event
@@ -23,21 +25,21 @@ ROUNDS, FOR_EACH = 16, 4
 class Point(NamedTuple):
     """A point: states, discrete values, the action that wrote each of these (−1 for none), and whether one did."""
 
-    x: Any
-    q: Any
-    writer: Any
-    changed: Any
+    x: Array
+    q: Array
+    writer: Array
+    changed: Array
 
 
 class Root(NamedTuple):
     """What a search found: the unknowns, the rows' Jacobian, the largest residuals that count as rounding, the
     unknowns' sizes, and whether it is a root."""
 
-    w: Any
-    jacobian: Any
-    limit: Any
-    unit: Any
-    good: Any
+    w: Array
+    jacobian: Array
+    limit: Array
+    unit: Array
+    good: Array
 
 
 class _Search(NamedTuple):
@@ -46,27 +48,27 @@ class _Search(NamedTuple):
 
     at: Point
     root: Root
-    event: Any
-    modes: Any
-    rounds: Any
-    before: tuple[Point, Any]
+    event: Array
+    modes: Array
+    rounds: Array
+    before: tuple[Point, Array]
     first: tuple[Point, Root, Any]
-    goes_on: Any
+    goes_on: Array
 
 
 def settle(
-    system: AcausalSystem, t: Any, inputs: Any, events: RestingEvents, begin: Point,
+    system: AcausalSystem, t: Time, inputs: Args, events: RestingEvents, begin: Point,
     search: Callable[[Point], tuple[Point, Root]],
-) -> tuple[Point, Root, Any]:  # fmt: skip
+) -> tuple[Point, Root, Array]:  # fmt: skip
     """Returns (the point, what the search found there, the event that does not let it rest or −1)."""
     limit = ROUNDS + FOR_EACH * int(events.acting.sum())
     flips = jnp.asarray(events.flips)
 
-    def following(event: Any, at: Point) -> Point:
+    def following(event: Array, at: Point) -> Point:
         x, q, writer = after_event(system, t, inputs, events, event, at.x, at.q, at.writer)
         return Point(x, q, writer, at.changed | (q != at.q) | (writer != at.writer))
 
-    def at_start(carry: tuple[Any, Any, Point]) -> tuple[Any, Any, Point]:
+    def at_start(carry: tuple[Array, Array, Point]) -> tuple[Array, Array, Point]:
         count, event, at = carry
         at = following(event, at)
         return count + 1, next_event(system, t, inputs, events, at.x, at.q, True), at

@@ -7,9 +7,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jax.core import Tracer
 
-from ..aliases import Time
+from ..aliases import Args, PyTree, Time
 from ..diagnosis.wording import some
 from ..errors import ModelError, SteadyStateError, explained_keywords, nearest
 from ..initialization.check import check
@@ -39,8 +40,8 @@ def steady_state(
     system: AcausalSystem,
     *,
     t: Time = 0.0,
-    inputs: Mapping[str, Any] | None = None,
-    initial: Mapping[str, Any] | None = None,
+    inputs: Mapping[str, object] | None = None,
+    initial: Mapping[str, object] | None = None,
     drifting: Sequence[str] = (),
     throw: bool | None = None,
 ) -> OperatingPoint:
@@ -88,8 +89,13 @@ def steady_state(
 
 
 def equilibrium_from(
-    system: AcausalSystem, t: Any, inputs: Any, initial: Any, drifting: Drifting, throw: bool | None
-) -> tuple[Equilibrium, Any, dict[str, Any]]:
+    system: AcausalSystem,
+    t: Time,
+    inputs: Args,
+    initial: Mapping[str, object] | None,
+    drifting: Drifting,
+    throw: bool | None,
+) -> tuple[Equilibrium, Array, dict[str, Array]]:
     """The search from the initial point; the time and the inputs as arrays and as they were read."""
     dtype = system.parameters.values.dtype
     initial = system.plan.one_by_one(initial)
@@ -107,7 +113,7 @@ def equilibrium_from(
 
 
 def point_of(
-    system: AcausalSystem, found: Equilibrium, t: Any, inputs: Any, *, drifting: tuple[str, ...],
+    system: AcausalSystem, found: Equilibrium, t: Time, inputs: Args, *, drifting: tuple[str, ...],
     singular_is_error: bool, throw: bool | None,
 ) -> OperatingPoint:  # fmt: skip
     """The point, if it is one."""
@@ -132,12 +138,12 @@ def point_of(
     return OperatingPoint(x, resting, t, inputs, jax.lax.stop_gradient(jnp.max(relative, initial=0.0)))
 
 
-def is_traced(tree: Any) -> bool:
+def is_traced(tree: PyTree) -> bool:
     """True if a leaf is a tracer, whose value cannot be read."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
-def check_system(system: Any):
+def check_system(system: object):
     """Raises a `ModelError` for what is not one compiled system."""
     if not isinstance(system, AcausalSystem):
         raise ModelError(f"an AcausalSystem is needed (call the AcausalCompiler); got {type(system).__name__}")

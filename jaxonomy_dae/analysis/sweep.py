@@ -10,8 +10,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jax.core import Tracer
 
+from ..aliases import PyTree
 from ..errors import InitializationError, ModelError, SimulationError, SteadyStateError
 from ..optional import optional_module
 from ..programs.cache import compiled
@@ -32,8 +34,8 @@ class Sweep(eqx.Module):
     - `zipped`: whether the parameters vary together.
     """
 
-    axes: dict[str, Any]
-    values: Any
+    axes: dict[str, np.ndarray]
+    values: PyTree
     zipped: bool = eqx.field(static=True)
 
     @property
@@ -42,7 +44,7 @@ class Sweep(eqx.Module):
         sizes = tuple(len(v) for v in self.axes.values())
         return sizes[:1] if self.zipped else sizes
 
-    def __getitem__(self, key: Any) -> Any:
+    def __getitem__(self, key: Any) -> PyTree:
         """The array that the function returned under `key`: `sweep["c.v"]`."""
         return self.values[key]
 
@@ -86,7 +88,7 @@ class Sweep(eqx.Module):
 
 def sweep(
     system: AcausalSystem,
-    parameters: Mapping[str, Any],
+    parameters: Mapping[str, object],
     function: Callable[[AcausalSystem], Any] | None = None,
     *,
     zipped: bool = False,
@@ -153,14 +155,16 @@ class _Simulation(eqx.Module):
 
 
 @functools.partial(compiled, runs_once=False)
-def _mapped(function: Any, system: AcausalSystem, names: tuple[str, ...], rows: tuple[Any, ...]) -> Any:
+def _mapped(function: Callable, system: AcausalSystem, names: tuple[str, ...], rows: tuple[Array, ...]) -> PyTree:
     def one(row):
         return function(system.with_parameters(dict(zip(names, row, strict=True))))
 
     return eqx.filter_vmap(one)(rows)
 
 
-def _raise_first(function: Any, system: AcausalSystem, columns: dict[str, Any], rows: tuple[Any, ...], results: Any):
+def _raise_first(
+    function: Callable, system: AcausalSystem, columns: dict[str, Array], rows: tuple[Array, ...], results: PyTree
+):
     """Runs the function by itself for the first row that contains NaN, so that it raises its error; adds which row it
     was."""
     arrays = [leaf for leaf in jax.tree.leaves((results, rows)) if eqx.is_inexact_array(leaf)]
@@ -181,13 +185,13 @@ def _raise_first(function: Any, system: AcausalSystem, columns: dict[str, Any], 
         raise type(error)(text) from error
 
 
-def _named(parameters: Any) -> Mapping[str, Any]:
+def _named(parameters: object) -> Mapping[str, object]:
     if not isinstance(parameters, Mapping) or not parameters:
         raise ModelError(f"a sweep takes values by parameters' names, {{'r.R': [1.0, 2.0]}}; got {parameters!r}")
     return parameters
 
 
-def _values(system: AcausalSystem, name: str, given: Any) -> Any:
+def _values(system: AcausalSystem, name: str, given: object) -> Any:
     """Checks the values of one parameter, or of an array of them, against their bounds."""
     table = system.parameters.table
     entries = table.entries(name)
@@ -208,14 +212,14 @@ def _values(system: AcausalSystem, name: str, given: Any) -> Any:
     return values
 
 
-def _span(values: Any) -> str:
+def _span(values: PyTree) -> str:
     if isinstance(values, Tracer):
         return f"{len(values)} values"
     least, largest = float(np.min(values)), float(np.max(values))
     return f"{least:g}" if len(values) == 1 else f"{len(values)} values from {least:g} to {largest:g}"
 
 
-def _kinds(values: Any) -> str:
+def _kinds(values: PyTree) -> str:
     if isinstance(values, Mapping):
         return ", ".join(f"{k} {np.shape(v)}" for k, v in values.items())
     return repr(values) if isinstance(values, Solution) else str(np.shape(values)) if eqx.is_array(values) else "pytree"

@@ -1,7 +1,7 @@
 """Learned terms, functions and learned corrections: equations that SymPy never sees."""
 
 import dataclasses
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from .group_builder import GroupBuilder
 from .number_model import ModelNumbers
 
 
-def add_learned_terms(model: ModelNumbers, builder: GroupBuilder, networks: dict[str, Any]):
+def add_learned_terms(model: ModelNumbers, builder: GroupBuilder, networks: dict[str, Callable]):
     """Adds an equation for each output of the networks and functions in components."""
     for i in model.instances:
         for term in i.component.learned_terms:

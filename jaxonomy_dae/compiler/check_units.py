@@ -6,8 +6,7 @@ ones are of one domain, which says their units.)
 """
 
 import dataclasses
-from collections.abc import Callable, Hashable, Iterator
-from typing import Any
+from collections.abc import Callable, Iterator
 
 import sympy
 
@@ -16,7 +15,7 @@ from ..expressions.from_sympy import symbols_of
 from ..expressions.node import Node
 from ..expressions.to_sympy import shortened
 from ..modeling.component import Component
-from ..modeling.declarations import START
+from ..modeling.declarations import START, Parameter, Variable
 from ..modeling.diagram import AcausalDiagram
 from ..modeling.event_flags import EventFlag
 from ..modeling.events import Sampled, Terminate, When
@@ -28,7 +27,7 @@ from .number_model import RELATION, Instances, ModelNumbers
 from .read_equations import read_expression
 
 SHOWN = 12  # mismatches that an error lists
-UnitOf = Callable[[Hashable], Unit | None]
+UnitOf = Callable[[tuple], Unit | None]
 ACCOUNTS = {"energy": JOULE, "dissipation": WATT, "supply": WATT}
 
 
@@ -64,7 +63,7 @@ class _DeclaredUnits:
         self.unknown: list[str] = []
         texts: dict[str, list[str]] = {}
 
-        def read(name: str, declared: Any) -> Unit | None:
+        def read(name: str, declared: Variable | Parameter) -> Unit | None:
             try:
                 return read_unit(declared.unit)
             except UnknownUnit as why:
@@ -89,7 +88,7 @@ class _DeclaredUnits:
             more = f" ({len(found) - 1} more have it)" if len(found) > 1 else ""
             self.unknown.append(found[0] + more)
 
-    def of(self, i: Instances, label: Any) -> Unit | None:
+    def of(self, i: Instances, label: tuple) -> Unit | None:
         """The unit of a leaf in an expression of a component; it is the same for all of an array."""
         if label == TIME_LABEL:
             return SECOND
@@ -102,7 +101,7 @@ class _DeclaredUnits:
 
 
 def _misfits_in_components(model: ModelNumbers, units: _DeclaredUnits) -> list[str]:
-    by_shape: dict[tuple, tuple[list[Any], dict[tuple, list[Instances]]]] = {}
+    by_shape: dict[tuple, tuple[list[tuple], dict[tuple, list[Instances]]]] = {}
     for i in model.instances:
         outside, same = by_shape.setdefault(_shape(i.component), ([], {}))
         if not same:
@@ -115,7 +114,7 @@ def _misfits_in_components(model: ModelNumbers, units: _DeclaredUnits) -> list[s
             i, others = members[0], sum(map(len, members)) - 1
             component, path = i.component, model.path(members[0])
 
-            def unit_of(label: Any, i: Instances = i) -> Unit | None:
+            def unit_of(label: tuple, i: Instances = i) -> Unit | None:
                 return units.of(i, label)
 
             for statement in _statements(component, unit_of):
@@ -140,14 +139,14 @@ def _shape(component: Component) -> tuple:
     )
 
 
-def _symbolic(value: Any) -> sympy.Expr | None:
+def _symbolic(value: object) -> sympy.Expr | None:
     return value if isinstance(value, sympy.Expr) and not value.is_number else None
 
 
-def _outside(component: Component) -> list[Any]:
+def _outside(component: Component) -> list[tuple]:
     """Labels of what a component's expressions read of its children and of its parent."""
     own = {*component.variables, *component.parameters}
-    labels: set[Any] = {
+    labels: set[tuple] = {
         symbol_label(symbol)
         for statement in _statements(component, lambda label: None)
         for symbol in symbols_of(statement.expression)
@@ -156,7 +155,7 @@ def _outside(component: Component) -> list[Any]:
     return sorted((label for label in labels if label != TIME_LABEL and label[1] not in own), key=str)
 
 
-def _targets(when: When) -> tuple[Any, ...]:
+def _targets(when: When) -> tuple[sympy.Symbol, ...]:
     return tuple(action.target for action in when.actions if not isinstance(action, Terminate))
 
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import sympy
+from jax.typing import DTypeLike
 
 from ..errors import ModelError
 from ..model.starts import StartGroup, Starts
@@ -49,7 +50,7 @@ def variable_table(model: ModelNumbers, driven: set[int]) -> VariableTable:
             owner[at] = i.number[:, None]
     record[places], owner[places] = rows, owners
 
-    def column(of, dtype: Any) -> np.ndarray:
+    def column(of, dtype: DTypeLike) -> np.ndarray:
         return np.array([of(*entry) for entry in records], dtype)[record]
 
     first_port = np.empty(model.n_components, np.int64)

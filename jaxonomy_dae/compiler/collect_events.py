@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+import sympy
 
 from ..expressions.to_sympy import shortened
 from ..model.events import Event, EventTable, HeldTable, Write
@@ -39,7 +40,7 @@ def event_table(model: ModelNumbers) -> EventTable:
             known[key] = model.parameter(i, path)
         return int(known[key][row])
 
-    def in_parameters(i: Instances, row: int, expression: Any) -> Start:
+    def in_parameters(i: Instances, row: int, expression: sympy.Expr) -> Start:
         symbols: list[Any] = sorted(expression.free_symbols, key=lambda s: parameter(i, s.path, row))
         graph = read_expression(expression, model.paths[i.number[row]])
         return Start(canonical(graph, (), symbols), tuple(parameter(i, s.path, row) for s in symbols))

@@ -7,7 +7,6 @@ itself: it has no value where the slope is not zero, so that nothing is computed
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from ..expressions.node import (
     ONE,
     TRUE,
     Node,
+    Number,
     both,
     compare,
     constant,
@@ -55,14 +55,14 @@ def quantity_label(variable: int, order: int) -> Hashable:
     return ("quantity", variable, order)
 
 
-def somewhere(variable: Any, order: Any, trial: int) -> Any:
+def somewhere(variable: np.ndarray | int, order: np.ndarray | int, trial: int) -> np.ndarray:
     """Numbers in ±(0.5, 1.5) without pattern, always the same for the same quantity and trial."""
     x = np.sin(12.9898 * (np.asarray(variable) + 1) + 78.233 * (np.asarray(order) + 1) + 37.719 * trial) * 43758.5453
     x = 0.5 + x - np.floor(x)
     return x if trial % 2 else -x
 
 
-def tried(variable: Any, order: Any, trial: int) -> Any:
+def tried(variable: np.ndarray | int, order: np.ndarray | int, trial: int) -> np.ndarray:
     """Sample values for a trial: O(1) for the first four trials, then 1e-3 times smaller every four, so that
     expressions that overflow near 1 become finite."""
     return somewhere(variable, order, trial) * 10.0 ** (-3 * (trial // 4))
@@ -255,7 +255,7 @@ def _guarded(graph: Node, slopes: Sequence[Sequence[Node]]) -> Node | None:
 
 def _sum_of_terms(parts: Sequence[Node]) -> Node:
     """The sum of parts, multiplied out, without terms of which rounding alone is left."""
-    collected: dict[Node, list[Any]] = {}
+    collected: dict[Node, list[Number]] = {}
     for c, rest in (split(t) for part in parts for t in multiplied_out(part)):
         collected.setdefault(rest, []).append(c)
     sums = {rest: (sum(found), sum(map(abs, found))) for rest, found in collected.items()}

@@ -5,7 +5,7 @@ template. Components of equal shape (same declarations, literally the same equat
 symbolic work does not grow with the number of instances.
 """
 
-from typing import Any
+from collections.abc import Callable
 
 from ..model.tables import Declared, FlatModel
 from ..modeling.diagram import AcausalDiagram
@@ -29,7 +29,7 @@ def flatten(diagram: AcausalDiagram) -> FlatModel:
     """
     model = ModelNumbers(diagram)
     builder = GroupBuilder()
-    networks: dict[str, Any] = {}
+    networks: dict[str, Callable] = {}
     add_components(model, builder)
     add_learned_terms(model, builder, networks)
     ports = connect_ports(model, diagram, builder)

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
@@ -47,7 +47,7 @@ def _own(c: Component) -> tuple[int, ...]:
     return 1, len(c.variables), len(c.parameters), len(c.relations), len(c.ports)
 
 
-def _child(entry: Any) -> tuple[Component, ComponentArray | None]:
+def _child(entry: Component | ComponentArray) -> tuple[Component, ComponentArray | None]:
     return (cast(Component, entry.prototype), entry) if isinstance(entry, ComponentArray) else (entry, None)
 
 
@@ -92,16 +92,16 @@ class ModelNumbers:
         return counts
 
     @staticmethod
-    def _sizes(children: dict[str, Any], counts: dict[int, np.ndarray]) -> list[np.ndarray]:
+    def _sizes(children: dict[str, Component | ComponentArray], counts: dict[int, np.ndarray]) -> list[np.ndarray]:
         """For each child or array, the numbers of everything that it is and has inside."""
         found = [_child(entry) for entry in children.values()]
         return [counts[id(child)] * (array.size if array else 1) for child, array in found]
 
     def _number(self, counts: dict[int, np.ndarray]):
         """Lists all instances, a component before its children, the instances of an array one after the other."""
-        stack: list[tuple[Any, Instances | None, np.ndarray]] = []
+        stack: list[tuple[Component | ComponentArray, Instances | None, np.ndarray]] = []
 
-        def push(children: dict[str, Any], parent: Instances | None, first: np.ndarray):
+        def push(children: dict[str, Component | ComponentArray], parent: Instances | None, first: np.ndarray):
             """`first` has the ids from which those of the children go on, shape (instances of the parent, 5)."""
             if children:
                 sizes = np.cumsum(self._sizes(children, counts), axis=0)

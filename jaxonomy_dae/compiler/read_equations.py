@@ -1,7 +1,5 @@
 """Equations of components, and what they declare of energies and powers, as templates and rows of integers."""
 
-from typing import Any
-
 import numpy as np
 import sympy
 
@@ -22,7 +20,7 @@ from .number_model import Instances, Members, ModelNumbers
 
 
 def add_components(model: ModelNumbers, builder: GroupBuilder):
-    read_once: dict[int, Any] = {}  # of an expression, by its id: equal components hold the same objects
+    read_once: dict[int, Node] = {}  # of an expression, by its id: equal components hold the same objects
     by_shape: dict[tuple, list[Instances]] = {}
     for i in model.instances:
         c = i.component
@@ -60,7 +58,7 @@ def add_components(model: ModelNumbers, builder: GroupBuilder):
 
 
 def slots_of(
-    model: ModelNumbers, i: Instances, expression: Any, graph: Node
+    model: ModelNumbers, i: Instances, expression: sympy.Expr, graph: Node
 ) -> tuple[list[VariableSymbol], list[ParameterSymbol]]:
     """The variables and parameters in an expression of a component. Slots follow the order of declaration, never names,
     so names change nothing but names.
@@ -92,7 +90,7 @@ def slots_of(
     return variables, parameters
 
 
-def read_expression(expression: Any, component: str) -> Node:
+def read_expression(expression: sympy.Expr, component: str) -> Node:
     try:
         return read(expression, symbol_label)
     except UnsupportedExpression as error:

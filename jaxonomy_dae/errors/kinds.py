@@ -1,7 +1,5 @@
 """The package's errors. Every message speaks in user names and says what to do."""
 
-from typing import Any
-
 from .page import PAGE, entry_for
 
 
@@ -9,7 +7,7 @@ class JaxonomyDaeError(Exception):
     """The base class of all errors that this package raises. Below the message, Python shows where the page of errors
     explains it. `explanation` holds the text of that entry."""
 
-    def __init__(self, *args: Any):
+    def __init__(self, *args: object):
         super().__init__(*args)
         entry = entry_for(str(self))
         if entry is not None:
@@ -37,7 +35,7 @@ class UnitError(ModelError):
 class UnknownAttribute(ModelError, AttributeError):
     """A component or a port has no attribute of this name."""
 
-    def __init__(self, *args: Any):
+    def __init__(self, *args: object):
         Exception.__init__(self, *args)  # no entry is looked for: `hasattr` raises it, too
 
 

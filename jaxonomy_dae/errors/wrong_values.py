@@ -2,7 +2,6 @@
 
 import difflib
 from collections.abc import Iterable
-from typing import Any
 
 from .kinds import ModelError
 
@@ -19,7 +18,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return f"known names: {shown}{', …' if len(known) > 8 else '.'}"
 
 
-def whole_number(value: Any, what: str, least: int = 1) -> int:
+def whole_number(value: object, what: str, least: int = 1) -> int:
     """The value, if it is an integer and not less than `least`.
 
     **Raises:**

@@ -11,14 +11,14 @@ Which branch is taken, and between which of its jumps a step is, counts as known
 
 import functools
 from collections.abc import Hashable, Sequence
-from typing import Any
 
 import numpy as np
 
+from ..aliases import Numeric
 from ..tolerances import EPS, KNOWN
 from .functions import TABLE
 from .kernel import Kernel, is_active
-from .node import Node, leaf
+from .node import Node, Number, leaf
 
 # The argument of any other function is a number without a unit, in which a step of one is large: an angle of 1e-17 that
 # was computed is zero to rounding.
@@ -34,12 +34,12 @@ class KernelWithErrors:
     def __init__(self, roots: Sequence[Node], labels: Sequence[Hashable]):
         self._kernel = Kernel(roots, labels)
 
-    def __call__(self, values: Sequence[Any], errors: Sequence[Any]) -> tuple[list[Any], list[Any]]:
+    def __call__(self, values: Sequence[Numeric], errors: Sequence[Numeric]) -> tuple[list[Numeric], list[Numeric]]:
         """A value of `errors` is absolute; it has the shape of the leaf's value, or one that is broadcast."""
         with np.errstate(all="ignore"):
             found = self._kernel.all_values([np.asarray(v, float) for v in values])
             errors = [np.asarray(e, float) for e in errors]
-            bounds: list[Any] = [0.0] * len(found)
+            bounds: list[Numeric] = [0.0] * len(found)
             for k, position in self._kernel.leaves:
                 bounds[k] = errors[position]
             for k, value in self._kernel.constants:
@@ -54,7 +54,7 @@ class KernelWithErrors:
         return [found[r] for r in results], [bounds[r] for r in results]
 
 
-def _bound(node: Node, value: Any, inside: list[Any], errors: list[Any]) -> Any:
+def _bound(node: Node, value: Numeric, inside: list[Numeric], errors: list[Numeric]) -> Numeric:
     operation = node.operation
     if operation == "sum":
         start, coefficients = node.data
@@ -79,7 +79,7 @@ def _bound(node: Node, value: Any, inside: list[Any], errors: list[Any]) -> Any:
     return sum(carried) + EPS * np.abs(value)
 
 
-def _product(exponents: Sequence[Any], value: Any, bases: list[Any], errors: list[Any]) -> Any:
+def _product(exponents: Sequence[Number], value: Numeric, bases: list[Numeric], errors: list[Numeric]) -> Numeric:
     """Π(|b| + err(b))^e − Π|b|^e, and a rounding for each factor."""
     growth, largest = 0.0, 1.0
     for base, error, exponent in zip(bases, errors, exponents, strict=True):
@@ -93,7 +93,7 @@ def _product(exponents: Sequence[Any], value: Any, bases: list[Any], errors: lis
     return grown + EPS * len(bases) * np.abs(value)
 
 
-def _times(slope: Any, error: Any) -> Any:
+def _times(slope: Numeric, error: Numeric) -> Numeric:
     """slope·error, which is zero for an exact value (error 0) even if the slope is infinite."""
     return np.where(error == 0.0, 0.0, slope * error)
 

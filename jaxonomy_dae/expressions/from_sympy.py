@@ -34,7 +34,7 @@ class UnsupportedExpression(Exception):
     """An expression contains a part that cannot be evaluated. The message is a sentence that names it."""
 
 
-def atoms_of(expression: Any) -> set:
+def atoms_of(expression: sympy.Basic) -> set:
     """The symbols and numbers of an expression, found in time linear in its size."""
     seen: set[int] = set()
     out = set()
@@ -51,12 +51,12 @@ def atoms_of(expression: Any) -> set:
     return out
 
 
-def symbols_of(expression: Any) -> set[sympy.Symbol]:
+def symbols_of(expression: sympy.Basic) -> set[sympy.Symbol]:
     """The symbols of an expression."""
     return {a for a in atoms_of(expression) if isinstance(a, sympy.Symbol)}
 
 
-def read(expression: Any, label: Callable[[Any], Hashable], marks: bool = False) -> Node:
+def read(expression: sympy.Basic, label: Callable[[sympy.Symbol], Hashable], marks: bool = False) -> Node:
     """The graph of a SymPy expression; a symbol becomes the leaf `label(symbol)`. What is marked as smooth is so in the
     graph only if `marks` are asked for.
 
@@ -65,7 +65,7 @@ def read(expression: Any, label: Callable[[Any], Hashable], marks: bool = False)
     - `UnsupportedExpression` naming what cannot be evaluated.
     """
     known: dict[int, Node] = {}
-    stack: list[tuple[Any, bool]] = [(expression, False)]
+    stack: list[tuple[sympy.Basic, bool]] = [(expression, False)]
     while stack:
         e, finished = stack.pop()
         if id(e) in known:
@@ -84,7 +84,7 @@ def read(expression: Any, label: Callable[[Any], Hashable], marks: bool = False)
     return known[id(expression)]
 
 
-def parts_of(e: Any) -> Sequence[Any]:
+def parts_of(e: sympy.Basic) -> Sequence[sympy.Basic]:
     """The expressions from which a SymPy expression is computed.
 
     **Raises:**
@@ -98,7 +98,7 @@ def parts_of(e: Any) -> Sequence[Any]:
     return e.args
 
 
-def _read(e: Any, inside: list[Node]) -> Node:
+def _read(e: sympy.Basic, inside: list[Node]) -> Node:
     if isinstance(e, sympy.Integer):
         return constant(int(e))
     if isinstance(e, sympy.Rational):

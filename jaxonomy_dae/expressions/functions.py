@@ -17,6 +17,7 @@ import scipy.special as ssp
 import sympy
 from sympy.codegen import cfunctions
 
+from ..aliases import Numeric
 from .node import (
     ONE,
     ZERO,
@@ -46,8 +47,8 @@ class Function:
     """
 
     name: str
-    numpy: Callable[..., Any]
-    jax: Callable[..., Any]
+    numpy: Callable[..., Numeric]
+    jax: Callable[..., Numeric]
     partials: Callable[..., tuple[Node, ...]]
     sympy: Any
     safe: tuple[float | None, ...] = (None,)

@@ -1,15 +1,17 @@
 """Kernels: graphs evaluated in NumPy or in JAX, each shared node once."""
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from fractions import Fraction
+from types import ModuleType
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
+from ..aliases import Numeric
 from .branches import ALWAYS, is_partial, needed_where
 from .functions import TABLE
-from .node import Node, postorder
+from .node import Node, Number, postorder
 
 _BACKENDS: dict[str, Any] = {"numpy": np, "jax": jnp}
 _Operation = Callable[..., Any]
@@ -61,20 +63,20 @@ class Kernel:
             ]
         return self._compiled[backend]
 
-    def __call__(self, values: Sequence[Any], backend: str = "jax") -> list[Any]:
+    def __call__(self, values: Sequence[Numeric], backend: str = "jax") -> list[Numeric]:
         if backend == "numpy":
             with np.errstate(all="ignore"):
                 return self._run([np.asarray(v, float) for v in values], backend)
         return self._run(values, backend)
 
-    def _run(self, values: Sequence[Any], backend: str) -> list[Any]:
+    def _run(self, values: Sequence[Numeric], backend: str) -> list[Numeric]:
         found = self.all_values(values, backend)
         return [found[r] for r in self.results]
 
-    def all_values(self, values: Sequence[Any], backend: str = "numpy") -> list[Any]:
+    def all_values(self, values: Sequence[Numeric], backend: str = "numpy") -> list[Numeric]:
         """The values of all nodes, by place."""
         xp = _BACKENDS[backend]
-        found: list[Any] = [None] * (len(self.leaves) + len(self.constants) + len(self.steps))
+        found: list[Numeric] = [None] * (len(self.leaves) + len(self.constants) + len(self.steps))
         for k, position in self.leaves:
             found[k] = values[position]
         for k, value in self.constants:
@@ -97,16 +99,16 @@ def _by_digest(literal):
     return literal[0].digest
 
 
-def _sorted(needed: Any) -> list:
+def _sorted(needed: Iterable) -> list:
     return sorted(needed, key=lambda part: sorted((c.digest, holds) for c, holds in part))
 
 
-def is_active(found: list[Any], guard: list) -> Any:
+def is_active(found: list[Numeric], guard: list) -> Numeric:
     """True if a node is needed, given the values `found` of all nodes. `guard` is a union of intersections of literals
     (node number, truth); an empty one means that the node is never needed."""
-    total: Any = np.bool_(False)
+    total: Numeric = np.bool_(False)
     for part in guard:
-        inside: Any = None
+        inside: Numeric = None
         for k, holds in part:
             literal = found[k] if holds else ~found[k]
             inside = literal if inside is None else inside & literal
@@ -114,7 +116,7 @@ def is_active(found: list[Any], guard: list) -> Any:
     return total
 
 
-def _constant(node: Node) -> Any:
+def _constant(node: Node) -> Numeric:
     if node.operation != "constant":
         return np.bool_(node.operation == "true")
     return float(node.data)
@@ -128,7 +130,7 @@ def _safe(node: Node) -> tuple[float | None, ...]:
     return TABLE[node.operation].safe if node.operation in TABLE else (None,) * len(node.arguments)
 
 
-def _operation(node: Node, xp: Any, backend: str) -> _Operation:
+def _operation(node: Node, xp: ModuleType, backend: str) -> _Operation:
     operation = node.operation
     if operation == "sum":
         return _sum(*node.data)
@@ -148,21 +150,21 @@ def _operation(node: Node, xp: Any, backend: str) -> _Operation:
     }[operation]
 
 
-def _all(*conditions: Any) -> Any:
+def _all(*conditions: Numeric) -> Numeric:
     total = conditions[0]
     for c in conditions[1:]:
         total = total & c
     return total
 
 
-def _any(*conditions: Any) -> Any:
+def _any(*conditions: Numeric) -> Numeric:
     total = conditions[0]
     for c in conditions[1:]:
         total = total | c
     return total
 
 
-def _sum(start: Any, coefficients: Sequence[Any]) -> _Operation:
+def _sum(start: Number, coefficients: Sequence[Number]) -> _Operation:
     start = float(start)
     # A positive term first, so that no sign is changed for nothing.
     order = sorted(range(len(coefficients)), key=lambda k: coefficients[k] < 0)
@@ -170,7 +172,7 @@ def _sum(start: Any, coefficients: Sequence[Any]) -> _Operation:
 
     begins = start != 0 and scaled[0][1] == -1  # start − x rather than −x + start
 
-    def function(*terms: Any) -> Any:
+    def function(*terms: Numeric) -> Numeric:
         total = start if begins else None
         for k, c in scaled:
             term = terms[k]
@@ -191,14 +193,14 @@ def _sum(start: Any, coefficients: Sequence[Any]) -> _Operation:
     return function
 
 
-def _is_nought(value: Any) -> bool:
+def _is_nought(value: Numeric) -> bool:
     """True if a value is the Python number 0.0 when a program is traced: an unknown whose share in the sum is left
     out."""
     return isinstance(value, float) and bool(value == 0.0)
 
 
-def _product(exponents: Sequence[Any], xp: Any) -> _Operation:
-    def raised(base: Any, exponent: Any) -> Any:
+def _product(exponents: Sequence[Number], xp: ModuleType) -> _Operation:
+    def raised(base: Numeric, exponent: Number) -> Numeric:
         if exponent == 1:
             return base
         if isinstance(exponent, int):
@@ -207,7 +209,7 @@ def _product(exponents: Sequence[Any], xp: Any) -> _Operation:
             return xp.sqrt(base)
         return xp.power(base, float(exponent))
 
-    def function(*bases: Any) -> Any:
+    def function(*bases: Numeric) -> Numeric:
         over, under = None, None
         if any(_is_nought(base) and exponent > 0 for base, exponent in zip(bases, exponents, strict=True)):
             return 0.0

@@ -1,8 +1,7 @@
 """A mark on expressions whose relations are no events."""
 
-from typing import Any
-
 import sympy
+from sympy.printing.str import StrPrinter
 
 from .node import Node, make, number
 
@@ -18,10 +17,10 @@ class Smooth(sympy.Function):
     def _eval_is_extended_real(self):
         return self.args[0].is_extended_real
 
-    def _sympystr(self, printer: Any) -> str:
+    def _sympystr(self, printer: StrPrinter) -> str:
         return f"smooth({printer._print(self.args[0])})"
 
-    def _printed_inside(self, printer: Any) -> str:
+    def _printed_inside(self, printer: StrPrinter) -> str:
         return printer._print(self.args[0])
 
     _pythoncode = _numpycode = _mpmathcode = _printed_inside  # for sympy.lambdify

@@ -1,29 +1,29 @@
 """Writes graphs as SymPy expressions, sharing what is shared."""
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from fractions import Fraction
-from typing import Any
 
 import sympy
 
+from ..aliases import Expression
 from .functions import TABLE
 from .node import Node, Number, postorder
 from .smooth import Smooth
 
 
-def write(node: Node, symbol: Callable[[Hashable], Any]) -> Any:
+def write(node: Node, symbol: Callable[[tuple], sympy.Basic]) -> Expression:
     """The SymPy expression of a graph; `symbol(label)` gives the symbol of a leaf."""
-    known: dict[Node, Any] = {}
+    known: dict[Node, Expression] = {}
     for n in postorder([node]):
         known[n] = symbol(n.data) if n.operation == "leaf" else _write(n, [known[a] for a in n.arguments])
     return known[node]
 
 
-def _number(value: Number) -> Any:
+def _number(value: Number) -> Expression:
     return sympy.Rational(value.numerator, value.denominator) if isinstance(value, Fraction) else sympy.sympify(value)
 
 
-def _write(n: Node, inside: list[Any]) -> Any:
+def _write(n: Node, inside: list[Expression]) -> Expression:
     operation = n.operation
     if operation == "constant":
         return _number(n.data)
@@ -37,7 +37,7 @@ def _write(n: Node, inside: list[Any]) -> Any:
     return TABLE[operation].sympy(*inside)
 
 
-_OPERATIONS: dict[str, Callable[..., Any]] = {
+_OPERATIONS: dict[str, Callable[..., Expression]] = {
     "power": sympy.Pow,
     "smooth": Smooth,
     "select": lambda c, a, b: sympy.Piecewise((a, c), (b, True)),
@@ -55,7 +55,7 @@ _OPERATIONS: dict[str, Callable[..., Any]] = {
 LONGEST = 300  # operations in a text
 
 
-def shortened(expression: Any) -> str:
+def shortened(expression: sympy.Basic) -> str:
     """The expression as text, its inner parts left out if it is long; linear in the size of what is shared."""
     size: dict[int, int] = {}
     stack = [(expression, False)]
@@ -67,7 +67,7 @@ def shortened(expression: Any) -> str:
             stack.append((e, True))
             stack.extend((a, False) for a in e.args if id(a) not in size)
 
-    def cut(e: Any, budget: int) -> Any:
+    def cut(e: Expression, budget: int) -> Expression:
         if size[id(e)] <= budget or not e.args:
             return e
         if budget < 4 or not isinstance(e, sympy.Expr):

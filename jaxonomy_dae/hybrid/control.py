@@ -1,17 +1,16 @@
 """Step sizes with steps that end at events."""
 
-from typing import Any
-
 import diffrax
 import jax
 import jax.numpy as jnp
-from jax import lax
+from jax import Array, lax
 
 from ..adjoint.wrapped_control import WrappedControl
+from ..aliases import Result
 from .problem import HybridState
 from .term import bound
 
-ENDED: Any = diffrax.RESULTS.event_occurred  # Diffrax asks the controller last, so that it must say so
+ENDED: Result = diffrax.RESULTS.event_occurred  # Diffrax asks the controller last, so that it must say so
 # By how much the step after one that an event made short may be longer than it, up to the length that was planned
 # before. Controllers allow a factor of 8 to 10 a step, and would need several steps to get there after each event.
 # Set by hand: test_hybrid_runs.py and test_event_map.py pass with ten times it and a tenth.
@@ -58,5 +57,5 @@ class EventControl(WrappedControl):
         return kept, start, end, jump, (new, lax.stop_gradient(wished)), result
 
 
-def _due(y: HybridState) -> Any:
+def _due(y: HybridState) -> Array:
     return lax.stop_gradient(jnp.min(y.due, initial=jnp.inf))

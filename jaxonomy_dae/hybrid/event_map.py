@@ -16,8 +16,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jaxtyping import Array
+from jax import Array, lax
 
 from ..adjoint.closure_conversion import any_member
 from ..aliases import Args, Time

@@ -1,16 +1,15 @@
 """Constants of first derivatives that would not be constants of second ones."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 
+from ..aliases import PyTree
 from ..errors import ModelError
 
 
-def constant_once(tree: Any) -> Any:
+def constant_once(tree: PyTree) -> PyTree:
     """The tree with its inexact arrays constant under a first derivative. A second derivative raises an error.
 
     The map of an event takes slopes as constants. Its first derivative is exact, its second one is not.

@@ -4,7 +4,8 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array
+import numpy as np
+from jax import Array
 
 from ..aliases import Time
 from .log import EventRows
@@ -86,7 +87,7 @@ class Happening(NamedTuple):
     approach: Array
     rose: Array
     onto: Array
-    waits: Array
+    waits: Array | np.ndarray
 
 
 def within(rate: Array, arrival: Arrival) -> Array:

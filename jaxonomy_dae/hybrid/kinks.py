@@ -4,11 +4,9 @@ Where max(u, 0) turns, dx/dt has the same value on both sides: the saltation mat
 other guard has jumped, and what is left of the event is that its relation is known to have turned.
 """
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
+from jax import Array, lax
 
 from ..aliases import Args, Time
 from .event_map import SLIDES, TURNS
@@ -18,7 +16,7 @@ from .side import ABOVE, BELOW, RESTS, rounding
 
 
 def turned(
-    problem: AbstractHybridProblem, t: Time, state: HybridState, values: Any, due: Any, args: Args
+    problem: AbstractHybridProblem, t: Time, state: HybridState, values: Array, due: Array, args: Args
 ) -> HybridState:
     """The state after the events that are `due`, given the guards' `values`: clocks have ticked and relations have
     turned.

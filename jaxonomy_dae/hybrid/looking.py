@@ -1,12 +1,12 @@
 """What a step meets: guards looked at together at a few places, and where the first one falls through zero."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
+from jax import Array, lax
 
 from ..adjoint.closure_conversion import any_member
 from ..adjoint.resting import still
@@ -47,7 +47,7 @@ _DIVIDED = _WEIGHTS[:-1] / _WEIGHTS[-1] / (1.0 - LOOKS[:-1])
 _RATE_AT_END = np.append(_DIVIDED, -_DIVIDED.sum())
 
 
-def _between(place: Any, values: Any) -> Any:
+def _between(place: Array, values: Array) -> Array:
     """Evaluates the polynomial through `values` at LOOKS, shape (looks, guards), at `place`, a fraction of the step."""
     weights = jnp.asarray(_WEIGHTS, values.dtype) / (place - jnp.asarray(LOOKS, values.dtype))
     return weights @ values / jnp.sum(weights)
@@ -62,9 +62,9 @@ class Met(NamedTuple):
     - `arrival`: the events due at the end of the step.
     """
 
-    request: Any
-    armed: Any
-    values: Any
+    request: Array
+    armed: Array
+    values: Array
     arrival: Arrival
 
 

@@ -7,10 +7,12 @@ each other are mended one after another. What is regular but does not hold as it
 """
 
 import itertools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jax.typing import DTypeLike
 
 # Sets that are tried from one base: each of 127 values, each pair of 15, or each triple of 9.
 MOST_SETS = 128
@@ -35,23 +37,23 @@ class Search(NamedTuple):
     - `ends`: True if no set is better than `base`, which is looked at once more.
     """
 
-    tried: Any
-    base: Any
-    wrong: Any
-    best: Any
-    least: Any
-    ends: Any
+    tried: Array
+    base: Array
+    wrong: Array
+    best: Array
+    least: Array
+    ends: Array
 
     @classmethod
-    def begin(cls, n: int, dtype: Any) -> "Search":
+    def begin(cls, n: int, dtype: DTypeLike) -> "Search":
         none, infinite = jnp.zeros((n,), bool), jnp.full((), jnp.inf, dtype)
         return cls(jnp.array(0), none, infinite, none, infinite, jnp.array(False))
 
-    def flipped(self, sets: Any) -> Any:
+    def flipped(self, sets: Array) -> Array:
         """The values to flip in what is tried now."""
         return self.base ^ sets[self.tried]
 
-    def after(self, sets: Any, slope: Any, guards: Any, violated: Any) -> tuple["Search", Any]:
+    def after(self, sets: Array, slope: Array, guards: Array, violated: Array) -> tuple["Search", Array]:
         """(the search after the slope and the guards of what was tried, whether it has found its values: `base`)."""
         dtype = self.wrong.dtype
         lost = jnp.sum(~jnp.isfinite(slope), dtype=dtype) + jnp.sum(~jnp.isfinite(guards), dtype=dtype)

@@ -25,7 +25,7 @@ class AbstractHybridProblem(eqx.Module):
     """
 
     facts: eqx.AbstractVar[EventFacts]
-    resolution: eqx.AbstractVar[Any]  # a time that is nothing beside the run, but more than rounding
+    resolution: eqx.AbstractVar[Time]  # a time that is nothing beside the run, but more than rounding
 
     @abc.abstractmethod
     def term(self, q: Float[Array, " q"]) -> diffrax.AbstractTerm:
@@ -73,13 +73,13 @@ class AbstractHybridProblem(eqx.Module):
         ticks = lax.stop_gradient(ticks)
         return offset + jnp.where(ticks == 0, 0.0, ticks * period)
 
-    def slope(self, t: Time, x: State, q: Any, args: Args) -> Float[Array, " n"]:
+    def slope(self, t: Time, x: State, q: Array, args: Args) -> Float[Array, " n"]:
         """dx/dt, constant under a first derivative."""
         frozen, *point = constant_once((self, t, x, q, args))
         return frozen.field(*point)
 
     def rates(
-        self, t: Time, x: State, q: Any, args: Args, slope: Any
+        self, t: Time, x: State, q: Array, args: Args, slope: Array
     ) -> tuple[Float[Array, " guards"], Float[Array, " guards"]]:
         """Returns (the guards' values, their rates of change along `slope`), both constant under a first derivative."""
         frozen, t, x, q, args = constant_once((self, t, x, q, args))
@@ -109,7 +109,7 @@ class HybridState(AbstractAppending):
     table: EventRows | None
 
     @classmethod
-    def of(cls, x: State, q: Any, table: EventRows | None, **parts: Any) -> "HybridState":
+    def of(cls, x: State, q: Array, table: EventRows | None, **parts: Any) -> "HybridState":
         """A state of all its parts."""
         packed = {field: jnp.stack([parts[name] for name in names]) for field, names in _PARTS.items()}
         return cls(x=x, q=q, table=table, **packed)
@@ -143,5 +143,5 @@ _PARTS = {
 }
 
 
-def one_hot(index: Any, n: int) -> Bool[Array, " n"]:
+def one_hot(index: Array, n: int) -> Bool[Array, " n"]:
     return jnp.arange(n) == index

@@ -1,9 +1,10 @@
 """Events of one instant that write the same: nothing says which value counts, unless they agree."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from .facts import EventFacts
 
@@ -24,11 +25,11 @@ class Rivals(NamedTuple):
         return cls(places, writers)
 
     @property
-    def nobody(self) -> Any:
+    def nobody(self) -> Array:
         """The state before any event: −1 for each place."""
         return jnp.full((len(self.places),), -1)
 
-    def after(self, event: Any, before: Any, now: Any, wrote: Any) -> tuple[Any, Any]:
+    def after(self, event: Array, before: Array, now: Array, wrote: Array) -> tuple[Array, Array]:
         """Returns (a number below −1 if the event wrote another value than one before it in the same round, otherwise
         −1; which event wrote each place last). `before` and `now` are (x, q) around the event.
 
@@ -43,7 +44,7 @@ class Rivals(NamedTuple):
         return jnp.where(jnp.any(clash), number_of(first, event, len(self.writers)), -1), jnp.where(own, event, wrote)
 
 
-def number_of(first: Any, second: Any, n: int) -> Any:
+def number_of(first: Array, second: Array, n: int) -> Array:
     """One number, below −1, for a pair of n events."""
     return -2 - (first * n + second)
 

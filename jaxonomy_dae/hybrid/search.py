@@ -1,10 +1,9 @@
 """Where in a step the first guard falls through zero."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax.numpy as jnp
-from jax import lax
+from jax import Array, lax
 
 # Were every iteration a bisection, 44 would shorten the bracket to 1e-13 of it, below which the search ends.
 ITERATIONS = 48
@@ -13,8 +12,14 @@ BISECT_EVERY = 6
 
 
 def first_crossing(
-    guards: Callable[[Any], Any], falling: Any, low: Any, high: Any, at_low: Any, at_high: Any, going: Any
-) -> Any:
+    guards: Callable[[Array], Array],
+    falling: Array,
+    low: Array,
+    high: Array,
+    at_low: Array,
+    at_high: Array,
+    going: Array,
+) -> Array:
     """The first zero of the guards that are `falling`, positive at `low` and not so at `high`.
 
     The Illinois variant of regula falsi (Dowell & Jarratt 1971) on the guard that comes first by linear interpolation;

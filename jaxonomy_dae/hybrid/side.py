@@ -13,15 +13,14 @@ at zero, and would be so within the band only: it is armed by the fall of the fi
 lead back.
 """
 
-from typing import Any
-
 import jax.numpy as jnp
+from jax import Array
 
 from ..tolerances import BAND
 
 ABOVE, RESTS, BELOW = 1.0, 0.5, 0.0  # numbers, to be part of the integrated state; what is positive is armed
 
 
-def rounding(size: Any) -> Any:
+def rounding(size: Array) -> Array:
     """The distance from zero that rounding alone can give a guard of this size."""
     return BAND * jnp.finfo(size.dtype).eps * size

@@ -6,11 +6,11 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
+from jax import Array, lax
 
 from ..adjoint.appended import NOTED, apart, appended, together
 from ..adjoint.closure_conversion import any_member
-from ..aliases import Time
+from ..aliases import PyTree, Result, State, Time
 from ..solvers.wrapped import WrappedSolver
 from .event_map import handle, most_at_once
 from .kinks import turned
@@ -21,10 +21,10 @@ from .term import bound, problem_of
 
 MOVED = 1e3  # times the resolution: with a longer step time has gone on, and turns at one instant are counted anew
 
-TOO_MANY: Any = diffrax.RESULTS.max_steps_rejected  # events
-STUCK: Any = diffrax.RESULTS.stagnation  # an event happens again and again at one instant
-CLASH: Any = diffrax.RESULTS.conlim  # two events give one variable different values at one instant
-NOT_FINITE: Any = diffrax.RESULTS.nonlinear_divergence  # what an event wrote
+TOO_MANY: Result = diffrax.RESULTS.max_steps_rejected  # events
+STUCK: Result = diffrax.RESULTS.stagnation  # an event happens again and again at one instant
+CLASH: Result = diffrax.RESULTS.conlim  # two events give one variable different values at one instant
+NOT_FINITE: Result = diffrax.RESULTS.nonlinear_divergence  # what an event wrote
 
 
 class HybridInterpolation(diffrax.AbstractLocalInterpolation):
@@ -36,8 +36,8 @@ class HybridInterpolation(diffrax.AbstractLocalInterpolation):
     inner: Any
     y0: HybridState
     y1: HybridState
-    fired: Any
-    slope: Any
+    fired: Array
+    slope: Array
     resolution: Time
     noted: EventRows  # the events at its end that are listed
 
@@ -58,9 +58,9 @@ class _DenseOutput(eqx.Module):
     """The inner solver's dense output."""
 
     interpolation: Any = eqx.field(static=True)
-    info: Any
+    info: PyTree
 
-    def __call__(self, t0: Time, t1: Time, t: Time) -> Any:
+    def __call__(self, t0: Time, t1: Time, t: Time) -> State:
         return self.interpolation(t0=t0, t1=t1, **self.info).evaluate(t)
 
 

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
+from jax import Array, lax
 
 from ..adjoint.resting import still
 from ..aliases import Args, State, Time
@@ -27,13 +27,13 @@ class Resumed(NamedTuple):
     - `sizes`: how large the guards have been, shape (guards,).
     """
 
-    sides: Any
-    ticked: Any
-    sizes: Any
+    sides: Array
+    ticked: Array
+    sizes: Array
 
 
 def start(
-    problem: AbstractHybridProblem, t0: Time, x0: State, q0: Any, args: Args, logged: int, sides: bool,
+    problem: AbstractHybridProblem, t0: Time, x0: State, q0: Array, args: Args, logged: int, sides: bool,
     resumed: Resumed | None = None,
 ) -> HybridState:  # fmt: skip
     """The state at the initial time, after the clocks that tick there, and after the events that are immediate; or, of
@@ -80,7 +80,7 @@ def start(
     return dataclasses.replace(state, table=table)
 
 
-def _ticks_before(problem: AbstractHybridProblem, t0: Time, ticked: Any) -> Any:
+def _ticks_before(problem: AbstractHybridProblem, t0: Time, ticked: Array | None) -> Array:
     """How often each clock has ticked before t0, and at t0 if it has `ticked` there."""
     dtype, c = t0.dtype, problem.facts.n_clocks
     period, offset = (lax.stop_gradient(v) for v in problem.clocks())
@@ -97,20 +97,20 @@ def _ticks_before(problem: AbstractHybridProblem, t0: Time, ticked: Any) -> Any:
     return jnp.where((ticked > 0) & ~relations, next_one, ticks)
 
 
-def _turned(problem: AbstractHybridProblem, value: Any, rate: Any) -> Any:
+def _turned(problem: AbstractHybridProblem, value: Array, rate: Array) -> Array:
     """True for relations that hold from the initial time on. A guard at zero is judged by its rate, and where that is
     zero, too, by the kind of its relation."""
     return (value < 0) | ((value == 0) & ((rate < 0) | ((rate == 0) & problem.facts.true_at_zero)))
 
 
-def _beyond_doubt(size: Any) -> Any:
+def _beyond_doubt(size: Array) -> Array:
     """How far beyond zero a guard that was on the other side must be when a run is resumed, to have jumped there: saved
     states are on the constraints up to much less than half of the digits."""
     return jnp.sqrt(jnp.finfo(size.dtype).eps) * size
 
 
 def _settled(
-    problem: AbstractHybridProblem, t0: Time, x0: State, q0: Any, due: Any, args: Args, resumed: Resumed | None
+    problem: AbstractHybridProblem, t0: Time, x0: State, q0: Array, due: Array, args: Args, resumed: Resumed | None
 ) -> tuple[Any, Any, Any]:
     """Settles the relations at the initial time: each gets the truth of its sides, or, if its clock is `due`, what that
     writes; of a run that is `resumed`, one whose sides are equal keeps its truth. Returns (q, rates of the guards,
@@ -120,21 +120,21 @@ def _settled(
     given = still((problem, t0, x0, q0, due, args, resumed))
     problem, t0, x0, begin, due, args, resumed = given
 
-    def written(q: Any, clocks: Any, holding: Any) -> Any:
+    def written(q: Array, clocks: Array, holding: Array) -> Array:
         return problem.settled(t0, x0, q, jnp.concatenate([clocks, holding]) & relations, args)
 
-    def looked_at(q: Any) -> tuple[Any, Any]:
+    def looked_at(q: Array) -> tuple[Array, Array]:
         if problem.facts.only_kinks:  # which of two that are opposite holds at zero does not matter
             first = np.arange(g) < np.array(problem.facts.opposite)
             return problem.guards(t0, x0, q, args), jnp.where(first, -1.0, 1.0).astype(x0.dtype)
         return problem.rates(t0, x0, q, args, problem.slope(t0, x0, q, args))
 
-    def holding(value: Any, rate: Any) -> Any:
+    def holding(value: Array, rate: Array) -> Array:
         if resumed is None:
             return _turned(problem, value, rate)
         return value < -_beyond_doubt(jnp.maximum(jnp.abs(value), resumed.sizes))
 
-    def once(k: Any, carry: Any) -> Any:
+    def once(k: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         """One round: relations are set by the guards of the round before, and the guards are evaluated again."""
         q, rate, value = carry
         q = jnp.where(k > 0, written(q, jnp.zeros((c,), bool), holding(value, rate)), q)

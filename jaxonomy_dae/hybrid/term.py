@@ -4,7 +4,7 @@ from typing import Any
 
 import diffrax
 
-from ..aliases import Args, Terms, Time
+from ..aliases import Args, State, Terms, Time
 from ..private_names import rewrapped, unwrapped
 from .problem import AbstractHybridProblem, HybridState
 
@@ -15,13 +15,13 @@ class HybridTerm(diffrax.AbstractTerm):
 
     problem: AbstractHybridProblem
 
-    def vf(self, t: Time, y: HybridState, args: Args) -> Any:
+    def vf(self, t: Time, y: HybridState, args: Args) -> State:
         return self.problem.field(t, y.x, y.q, args)
 
     def contr(self, t0: Time, t1: Time, **kwargs: Any) -> Any:
         return t1 - t0
 
-    def prod(self, vf: Any, control: Any) -> Any:
+    def prod(self, vf: State, control: Time) -> State:
         raise NotImplementedError("a solver for events takes steps by the term of the discrete values at hand")
 
 

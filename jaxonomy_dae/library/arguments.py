@@ -3,15 +3,16 @@
 Each raises a `ModelError` that names the component and the argument.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from ..errors import ModelError
-from ..modeling import Component
+from ..modeling import Component, Value
 
 
-def finite(values: Any, name: str, what: str) -> np.ndarray:
+def finite(values: object, name: str, what: str) -> np.ndarray:
     """An array of the values.
 
     **Raises:**
@@ -28,7 +29,7 @@ def finite(values: Any, name: str, what: str) -> np.ndarray:
     return found
 
 
-def increasing(values: Any, name: str, what: str) -> np.ndarray:
+def increasing(values: object, name: str, what: str) -> np.ndarray:
     """An array of at least two increasing points.
 
     **Raises:**
@@ -47,7 +48,7 @@ def increasing(values: Any, name: str, what: str) -> np.ndarray:
     return found
 
 
-def row(values: Any, name: str, what: str) -> list[Any]:
+def row(values: Sequence[Value] | np.ndarray, name: str, what: str) -> list[Value]:
     """A list of the values, which may be expressions.
 
     **Raises:**

@@ -42,14 +42,14 @@ EFFICIENCY = Interval(0.0, 1.0, open_low=True)
 class _Circuit(NamedTuple):
     """Expressions of a cell's equivalent circuit, of which the terminal voltage and the heat are made."""
 
-    voltage: Any
-    current: Any
-    soc: Any
-    reacting: Any  # the part of the current that charges or discharges
-    table: Any  # the open-circuit voltage in the table
-    table_energy: Any  # its integral over the charge, joule
-    overpotentials: Any  # the sum of those of the RC pairs
-    heat: Any  # what the RC pairs lose
+    voltage: sympy.Expr
+    current: sympy.Expr
+    soc: sympy.Expr
+    reacting: sympy.Expr  # the part of the current that charges or discharges
+    table: sympy.Expr  # the open-circuit voltage in the table
+    table_energy: sympy.Expr  # its integral over the charge, joule
+    overpotentials: sympy.Expr  # the sum of those of the RC pairs
+    heat: sympy.Expr  # what the RC pairs lose
 
 
 class _CellData(NamedTuple):
@@ -139,8 +139,8 @@ class Cell(_Cell):
         self,
         ev: EqnEnv,
         name: str,
-        soc: Any,
-        ocv: Any,
+        soc: Sequence[Value] | np.ndarray,
+        ocv: Sequence[Value] | np.ndarray,
         Q: Value = 1.0,
         R0: Value = 0.01,
         R: Sequence[Value] = (),
@@ -187,8 +187,8 @@ class HeatedCell(_Cell):
         self,
         ev: EqnEnv,
         name: str,
-        soc: Any,
-        ocv: Any,
+        soc: Sequence[Value] | np.ndarray,
+        ocv: Sequence[Value] | np.ndarray,
         Q: Value = 1.0,
         R0: Value = 0.01,
         R: Sequence[Value] = (),
@@ -234,14 +234,14 @@ _OF_CELLS: dict[str, tuple[str, Interval]] = {
 }
 
 
-def _shape(name: str, series: Any, parallel: Any) -> tuple[int, int]:
+def _shape(name: str, series: int, parallel: int) -> tuple[int, int]:
     return count(series, name, "series"), count(parallel, name, "parallel")
 
 
 class _Pack(Component):
     """Rows of cells in parallel, one after the other in series, from `p` to `n`."""
 
-    def _each(self, what: str, value: Any, shape: tuple[int, int], unit: str, bounds: Interval) -> Any:
+    def _each(self, what: str, value: Any, shape: tuple[int, int], unit: str, bounds: Interval) -> Value | np.ndarray:
         """Declares one quantity of the cells: a parameter of the pack where one value holds for all cells, else one
         value per cell."""
         if not np.ndim(value):
@@ -253,7 +253,7 @@ class _Pack(Component):
             )
         return np.asarray(value)
 
-    def _values(self, shape: tuple[int, int], values: dict[str, Any]) -> dict[str, Any]:
+    def _values(self, shape: tuple[int, int], values: dict[str, Any]) -> dict[str, object]:
         return {what: self._each(what, value, shape, *_OF_CELLS[what]) for what, value in values.items()}
 
     def _cells(
@@ -264,7 +264,9 @@ class _Pack(Component):
         p, n = self.port("p", Electrical), self.port("n", Electrical)
         volts = [self.parameter(f"ocv{k}", value, unit="V") for k, value in enumerate(ocv, start=1)]
 
-        def of_pairs(what: str, given: Sequence[Any], unit: str, bounds: Interval) -> list[Any]:
+        def of_pairs(
+            what: str, given: Sequence[Value | np.ndarray], unit: str, bounds: Interval
+        ) -> list[Value | np.ndarray]:
             return [self._each(f"{what}{k}", value, shape, unit, bounds) for k, value in enumerate(given, start=1)]
 
         options = {"R": of_pairs("R", R, "Ohm", POSITIVE), "C": of_pairs("C", C, "F", POSITIVE)}
@@ -304,12 +306,12 @@ class Pack(_Pack):
         parallel: int,
         soc: Any,
         ocv: Any,
-        Q: Any = 1.0,
-        R0: Any = 0.01,
+        Q: Value | np.ndarray = 1.0,
+        R0: Value | np.ndarray = 0.01,
         R: Sequence[Any] = (),
         C: Sequence[Any] = (),
-        eta: Any = 1.0,
-        initial_soc: Any = 1.0,
+        eta: Value | np.ndarray = 1.0,
+        initial_soc: Value | np.ndarray = 1.0,
         initial_v: Sequence[Any] | None = None,
         kind: str = "linear",
     ):
@@ -347,21 +349,21 @@ class HeatedPack(_Pack):
         parallel: int,
         soc: Any,
         ocv: Any,
-        Q: Any = 1.0,
-        R0: Any = 0.01,
+        Q: Value | np.ndarray = 1.0,
+        R0: Value | np.ndarray = 0.01,
         R: Sequence[Any] = (),
         C: Sequence[Any] = (),
-        eta: Any = 1.0,
-        initial_soc: Any = 1.0,
+        eta: Value | np.ndarray = 1.0,
+        initial_soc: Value | np.ndarray = 1.0,
         initial_v: Sequence[Any] | None = None,
         kind: str = "linear",
-        Ea: Any = 0.0,
-        dUdT: Any = 0.0,
-        T_ref: Any = 298.15,
-        C_heat: Any = 50.0,
+        Ea: Value | np.ndarray = 0.0,
+        dUdT: Value | np.ndarray = 0.0,
+        T_ref: Value | np.ndarray = 298.15,
+        C_heat: Value | np.ndarray = 50.0,
         G_neighbour: Value = 0.5,
-        G_coolant: Any = 0.1,
-        initial_temperature: Any = 298.15,
+        G_coolant: Value | np.ndarray = 0.1,
+        initial_temperature: Value | np.ndarray = 298.15,
     ):
         super().__init__(ev, name)
         shape = _shape(name, series, parallel)

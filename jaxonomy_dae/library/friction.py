@@ -5,9 +5,9 @@ whatever keeps their relative acceleration zero (Otter, Elmqvist & Mattsson 1999
 the synchronous data flow principle"; here the branch is an equation of its own, and the mode a discrete variable).
 """
 
-from typing import Any
-
+import sympy
 from sympy import Abs, And, Max, Min, Ne, Piecewise, sign
+from sympy.logic.boolalg import Boolean
 
 from ..modeling import (
     NONNEGATIVE,
@@ -32,7 +32,7 @@ COMPLIANCE = 1e-30
 
 
 def stick_slip(
-    component: Component, speed: Any, friction: Any, sliding: Any, breakaway: Any, pressed: Any = None
+    component: Component, speed: Value, friction: Value, sliding: Value, breakaway: Value, pressed: Value | None = None
 ) -> None:
     """Adds the friction between two parts to a component; below the speed of its parameter `standstill`, parts that are
     pressed together stick at once. Parts whose motion a source prescribes do not feel the friction: it is zero while
@@ -50,7 +50,7 @@ def stick_slip(
     still = component.parameter("standstill", STANDSTILL, unit=speed_unit, bounds=POSITIVE)
     per = {"m/s": "1/kg", "rad/s": "rad/(kg*m*m)"}[speed_unit]
     compliance = component.parameter("compliance", COMPLIANCE, unit=per, bounds=POSITIVE)
-    stuck: Any = Eq(mode, 0)
+    stuck: Boolean = Eq(mode, 0)
     branch = Piecewise((0, Eq(mode, 2)), (mode * sliding, True))
     component.either(stuck, compliance * friction - der(speed), friction - branch)
     direction = Piecewise((1, speed > still), (-1, speed < -still), (0, True))
@@ -71,7 +71,7 @@ def stick_slip(
 class _Pressed(Component):
     """Shafts on which a normal force presses."""
 
-    def _pressed(self, mu: Value, fn_max: Value, cgeo: Value, peak: Value) -> tuple[Any, Any]:
+    def _pressed(self, mu: Value, fn_max: Value, cgeo: Value, peak: Value) -> tuple[sympy.Expr, sympy.Expr]:
         """(the friction under the whole normal force while shafts slide, how many times that they hold)."""
         coefficient = self.parameter("mu", mu, unit="1", bounds=NONNEGATIVE)
         largest = self.parameter("fn_max", fn_max, unit="N", bounds=NONNEGATIVE)

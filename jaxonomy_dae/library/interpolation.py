@@ -6,18 +6,18 @@ parameters. Tables of signals (`signal.tables`) interpolate in the same way, as 
 
 import functools
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
+import sympy
 from sympy import Max, Min, sympify
 
 from ..errors import ModelError
-from ..modeling import smooth
+from ..modeling import Value, smooth
 
 KINDS = ("linear", "cubic")
 
 
-def interpolated(u: Any, x: np.ndarray, values: Sequence[Any], kind: str) -> tuple[Any, Any]:
+def interpolated(u: Value, x: np.ndarray, values: Sequence[Value], kind: str) -> tuple[sympy.Expr, sympy.Expr]:
     """The interpolant of `values` at the increasing points `x`, and its integral over `u` from the first point.
 
     Kinds are those of `signal.Table1D`; with 'cubic', the slope at the end of a piece is that of its chord. Outside of
@@ -27,10 +27,12 @@ def interpolated(u: Any, x: np.ndarray, values: Sequence[Any], kind: str) -> tup
 
 
 @functools.lru_cache(maxsize=64)  # the cells of a pack have the same expression; SymPy takes 20 ms to make it
-def _interpolated(u: Any, x: tuple[float, ...], values: tuple[Any, ...], kind: str) -> tuple[Any, Any]:
+def _interpolated(
+    u: Value, x: tuple[float, ...], values: tuple[Value, ...], kind: str
+) -> tuple[sympy.Expr, sympy.Expr]:
     last = len(x) - 2
     value, integral = values[0], values[0] * (u - x[0])
-    before: Any = None
+    before: Value | None = None
     for k, a in enumerate(x[:-1]):
         width = x[k + 1] - a
         rise = values[k + 1] - values[k]

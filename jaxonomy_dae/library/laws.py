@@ -1,13 +1,12 @@
 """Laws that components of several domains share, as expressions; steps and pulses in time, whose edges are events."""
 
-from typing import Any
-
+import sympy
 from sympy import Piecewise, asinh, exp, frac, pi, sin, sqrt, tanh
 
 from ..modeling import POSITIVE, Component, Value
 
 
-def penetration(s: Any, gap: Any, smooth: Any) -> tuple[Any, Any]:
+def penetration(s: Value, gap: Value, smooth: Value) -> tuple[sympy.Expr, sympy.Expr]:
     """A dead zone: (distance of `s` beyond ±gap/2, its derivative by `s`), with corners rounded over the length
     `smooth`."""
     above, below = s - gap / 2, -s - gap / 2
@@ -16,7 +15,7 @@ def penetration(s: Any, gap: Any, smooth: Any) -> tuple[Any, Any]:
     return depth, 1 + (above / root_above + below / root_below) / 2
 
 
-def penetration_energy(s: Any, gap: Any, smooth: Any) -> Any:
+def penetration_energy(s: Value, gap: Value, smooth: Value) -> sympy.Expr:
     """The integral of the penetration over `s`."""
     total = 0
     for beyond in (s - gap / 2, -s - gap / 2):
@@ -25,7 +24,9 @@ def penetration_energy(s: Any, gap: Any, smooth: Any) -> Any:
     return total
 
 
-def stribeck(v: Any, sliding: Any, breakaway: Any, stribeck_speed: Any, viscous: Any, smooth: Any) -> Any:
+def stribeck(
+    v: Value, sliding: Value, breakaway: Value, stribeck_speed: Value, viscous: Value, smooth: Value
+) -> sympy.Expr:
     """Friction (Armstrong-Hélouvry, Dupont & Canudas de Wit 1994, Automatica 30:1083, with tanh in place of the sign):
     [sliding + (breakaway − sliding)·exp(−(v/stribeck_speed)²)]·tanh(v/smooth) + viscous·v."""
     return (sliding + (breakaway - sliding) * exp(-((v / stribeck_speed) ** 2))) * tanh(v / smooth) + viscous * v
@@ -34,7 +35,9 @@ def stribeck(v: Any, sliding: Any, breakaway: Any, stribeck_speed: Any, viscous:
 # Waveforms declare their parameters in the component that they drive; `unit` is that of the value.
 
 
-def sine(component: Component, amplitude: Value, frequency: Value, phase: Value, offset: Value, unit: str) -> Any:
+def sine(
+    component: Component, amplitude: Value, frequency: Value, phase: Value, offset: Value, unit: str
+) -> sympy.Expr:
     """offset + amplitude·sin(2π·frequency·t + phase)."""
     a = component.parameter("amplitude", amplitude, unit=unit)
     f = component.parameter("frequency", frequency, unit="Hz")
@@ -42,7 +45,7 @@ def sine(component: Component, amplitude: Value, frequency: Value, phase: Value,
     return component.parameter("offset", offset, unit=unit) + a * sin(2 * pi * f * component.ev.t + shift)
 
 
-def step(component: Component, height: Value, start_time: Value, offset: Value, unit: str) -> Any:
+def step(component: Component, height: Value, start_time: Value, offset: Value, unit: str) -> sympy.Expr:
     """offset, and offset + height from `start_time` on."""
     h = component.parameter("height", height, unit=unit)
     begin = component.parameter("start_time", start_time, unit="s")
@@ -58,7 +61,7 @@ def pulse(
     start_time: Value,
     offset: Value,
     unit: str,
-) -> Any:
+) -> sympy.Expr:
     """offset + height in the first part `width` of every `period` from `start_time` on, else offset."""
     h = component.parameter("height", height, unit=unit)
     length = component.parameter("period", period, unit="s", bounds=POSITIVE)

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..aliases import Numeric
 from ..linear.once import joined
 
 Chunk = Any  # an array of shape (n,), a scalar, or a tuple of scalars
@@ -21,14 +22,14 @@ GATHER = 2  # operations that a gather takes: instead, values may come in so man
 SCALARS = 32  # up to this many states, or inputs, tracing is done on scalars
 
 
-def entries(array: Any) -> list[Any]:
+def entries(array: Numeric) -> list[Numeric]:
     """The entries of an array of shape (n,), as scalars. Backwards, their cotangents are joined; those of entries read
     one by one would be padded and summed, and XLA may compute each anew for every place of the sum."""
     n = array.shape[0]
     return [jnp.reshape(v, ()) for v in jax.lax.split(array, (1,) * n)] if n else []
 
 
-def take(array: Any, index: np.ndarray) -> Any:
+def take(array: Numeric, index: np.ndarray) -> Numeric:
     """array[index] for a static index, as a slice where the index is an arithmetic progression."""
     n = len(index)
     if isinstance(array, tuple):
@@ -47,7 +48,7 @@ def take(array: Any, index: np.ndarray) -> Any:
     return jnp.asarray(array).at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
-def times(factor: Any, value: Any) -> Any:
+def times(factor: Numeric, value: Numeric) -> Numeric:
     """factor·value; nothing is multiplied by 1 or −1, if the factor is a Python number."""
     if isinstance(factor, float) and abs(factor) == 1.0:
         return value if factor > 0 else -value
@@ -62,7 +63,7 @@ class Gather:
     offset: np.ndarray
     factor: np.ndarray
 
-    def read(self, chunks: list[Chunk], dtype) -> Any:
+    def read(self, chunks: list[Chunk], dtype) -> Numeric:
         """The values: a scalar if n is 1 (or a Python 0.0 where all are zero), else an array of shape (n,)."""
         n = len(self.chunk)
         if (self.chunk < 0).all():
@@ -78,7 +79,7 @@ class Gather:
         same = (self.factor == self.factor[0]).all()
         return times(float(self.factor[0]) if same else jnp.asarray(self.factor, dtype), value)
 
-    def _from_several(self, chunks: list[Chunk], dtype) -> Any:
+    def _from_several(self, chunks: list[Chunk], dtype) -> Numeric:
         breaks = np.flatnonzero((np.diff(self.chunk) != 0) | (np.diff(self.offset) != 1)) + 1
         used = np.unique(self.chunk)
         if len(breaks) < len(used) + GATHER:
@@ -92,7 +93,7 @@ class Gather:
             position += part.shape[0]
         return take(joined(parts), start[self.chunk] + np.maximum(self.offset, 0))
 
-    def _run(self, chunks: list[Chunk], run: np.ndarray, dtype) -> Any:
+    def _run(self, chunks: list[Chunk], run: np.ndarray, dtype) -> Numeric:
         """Values that lie beside each other, shape (len(run),)."""
         chunk, offset = int(self.chunk[run[0]]), self.offset[run]
         if chunk < 0:
@@ -108,11 +109,11 @@ def _is_scalar(chunk: Chunk) -> bool:
     return not isinstance(chunk, tuple) and jnp.ndim(chunk) == 0
 
 
-def _as_vector(chunk: Chunk) -> Any:
+def _as_vector(chunk: Chunk) -> Numeric:
     if isinstance(chunk, tuple):
         return jnp.stack(chunk)
     return jnp.reshape(chunk, (-1,))
 
 
-def _entry(chunk: Chunk, offset: int) -> Any:
+def _entry(chunk: Chunk, offset: int) -> Numeric:
     return chunk if _is_scalar(chunk) else chunk[offset]

@@ -275,7 +275,7 @@ class SystemPlan:
         """Names, with those of the entries in place of an array's."""
         return [one for name in names for one in (self.entries(name) or ([name],))[0]]
 
-    def one_by_one(self, initial: Any) -> Any:
+    def one_by_one(self, initial: object) -> Any:
         """Initial values by name, with those of arrays under the names of their entries."""
         return one_by_one(self.flat.arrays, self.flat.variables.names, initial)
 

@@ -12,6 +12,7 @@ from typing import Any
 import lineax as lx
 import numpy as np
 
+from ..aliases import Numeric
 from ..linear.sparse import DENSE, SparsePattern
 from ..model.tables import ZERO
 from .gather import Gather
@@ -47,22 +48,22 @@ class Layout:
 class PlannedEquation:
     equation: StepEquation
     sources: tuple[Gather | int, ...]  # a gather, or −1 − u for the local unknown u
-    factors: tuple[Any, ...]  # of local slots
+    factors: tuple[Numeric, ...]  # of local slots
 
 
 class AbstractEvaluation(abc.ABC):
     """What evaluates the steps of a program."""
 
     @abc.abstractmethod
-    def step(self, planned: "PlannedStep", refine: Any) -> list[Any]:
+    def step(self, planned: "PlannedStep", refine: Any) -> list[Numeric]:
         """The unknowns of blocks that are written out, a chunk for each local one."""
 
     @abc.abstractmethod
-    def sparse_step(self, planned: "PlannedSparse", refine: Any) -> list[Any]:
+    def sparse_step(self, planned: "PlannedSparse", refine: Any) -> list[Numeric]:
         """The unknowns of large blocks, one chunk."""
 
     @abc.abstractmethod
-    def loop(self, planned: "PlannedLoop") -> list[Any]:
+    def loop(self, planned: "PlannedLoop") -> list[Numeric]:
         """The unknowns of all repetitions, a chunk for each unknown of the body."""
 
 
@@ -70,7 +71,7 @@ class AbstractPlanned(abc.ABC):
     """A part of a program that computes one chunk after the other."""
 
     @abc.abstractmethod
-    def evaluate(self, evaluation: AbstractEvaluation, refine: Any) -> list[Any]:
+    def evaluate(self, evaluation: AbstractEvaluation, refine: Any) -> list[Numeric]:
         """The chunks it computes."""
 
     @property
@@ -108,7 +109,7 @@ class PlannedSparse(AbstractPlanned):
 
     step: SparseStep
     equations: tuple[PlannedEquation, ...]
-    entries: tuple[tuple[tuple[int, np.ndarray, Any], ...], ...]
+    entries: tuple[tuple[tuple[int, np.ndarray, Numeric], ...], ...]
     pattern: SparsePattern
     guess: Gather | None
     linear_solver: lx.AbstractLinearSolver | None
@@ -141,7 +142,7 @@ class PlannedLoop(AbstractPlanned):
     outside: Gather | None  # (count · number,)
     parameters: np.ndarray  # (count, number)
 
-    def evaluate(self, evaluation: AbstractEvaluation, refine: Any) -> list[Any]:
+    def evaluate(self, evaluation: AbstractEvaluation, refine: Any) -> list[Numeric]:
         return evaluation.loop(self)
 
     @property
@@ -298,5 +299,5 @@ def _from_state(place: np.ndarray) -> Gather:
     return Gather(np.zeros(len(place), np.int64), place, np.ones(len(place)))
 
 
-def _uniform(factor: np.ndarray) -> Any:
+def _uniform(factor: np.ndarray) -> Numeric:
     return float(factor[0]) if (factor == factor[0]).all() else factor

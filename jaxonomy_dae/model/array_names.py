@@ -94,7 +94,7 @@ def inner_name(name: str) -> tuple[int, str]:
     return order, name
 
 
-def one_by_one(arrays: ArrayNames, names: list[str], initial: Any) -> Any:
+def one_by_one(arrays: ArrayNames, names: list[str], initial: object) -> Any:
     """Initial values by name, with those of arrays of variables under the names of their entries: a number for all, or
     an array of the same shape.
 
@@ -129,14 +129,14 @@ def one_by_one(arrays: ArrayNames, names: list[str], initial: Any) -> Any:
     return out
 
 
-def wrong_shape(name: str, shape: tuple[int, ...], value: Any) -> str:
+def wrong_shape(name: str, shape: tuple[int, ...], value: object) -> str:
     """The sentence that a value does not have the shape of an array of variables."""
     found = regular_shape(value)
     got = "rows of different lengths" if found is None else f"shape {found}"
     return f"'{name}' is an array of shape {shape}: give a number or an array of that shape; got {got}"
 
 
-def regular_shape(value: Any) -> tuple[int, ...] | None:
+def regular_shape(value: object) -> tuple[int, ...] | None:
     """The shape of numbers, nested lists and arrays; None if they have none."""
     try:
         return np.shape(as_array(value))

@@ -50,7 +50,7 @@ def consistent_point(extended: Extended, guess: Point, fixed: list[tuple[int, fl
 
     r, jacobian = evaluate(values)
     for _ in range(iterations):
-        full: Any = sp.vstack([jacobian, pin_rows]).tocsr()[:, :n]
+        full: sp.csr_array = sp.vstack([jacobian, pin_rows]).tocsr()[:, :n]
         if not np.isfinite(full.data).all():
             break
         scaled, rows, columns = equilibrated(full)

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import Float
 
+from ..aliases import Numeric
 from .networks import Networks
 from .template import AbstractTemplate
 
@@ -123,7 +124,7 @@ class Group:
         out = self.template.solve(slot, self.slots(at.values), *self.numbers(at), at.t, at.networks, backend="numpy")
         return np.broadcast_to(np.asarray(out, float), (len(self),)) / self.factor[:, slot]
 
-    def _stacked(self, by_slot: Sequence[Any]) -> np.ndarray:
+    def _stacked(self, by_slot: Sequence[Numeric]) -> np.ndarray:
         shape = (len(self),)
         columns = [v if np.shape(v) == shape else np.broadcast_to(np.asarray(v, float), shape) for v in by_slot]
         return np.array(columns, float).T if columns else np.zeros((*shape, 0))

@@ -18,6 +18,7 @@ import jax
 import numpy as np
 import sympy
 
+from ..aliases import PyTree
 from ..expressions.node import Node
 from ..linear.sparse import SparsePattern
 from .provenance import Lines
@@ -32,7 +33,7 @@ class Identity:
     functions: tuple[Callable, ...]
 
     @classmethod
-    def of(cls, tree: Any) -> "Identity":
+    def of(cls, tree: PyTree) -> "Identity":
         """The identity of a tree.
 
         **Raises:**
@@ -56,16 +57,16 @@ class _Walk:
 
     def __init__(self):
         self.functions: list[Callable] = []
-        self._seen: dict[int, tuple[Any, bytes]] = {}
+        self._seen: dict[int, tuple[object, bytes]] = {}
 
-    def digest(self, part: Any) -> bytes:
+    def digest(self, part: object) -> bytes:
         if type(part) in _PLAIN:
             return _digest(type(part).__name__, repr(part).encode())
         if id(part) not in self._seen:
             self._seen[id(part)] = part, self._of(part)
         return self._seen[id(part)][1]
 
-    def _of(self, part: Any) -> bytes:
+    def _of(self, part: object) -> bytes:
         name = type(part).__qualname__
         match part:
             case np.ndarray() if part.dtype == object:
@@ -105,7 +106,7 @@ class _Walk:
             return _digest("function", self._number(part), getattr(part, "__qualname__", name).encode())
         raise TypeError(f"it is not known what makes two objects of type {type(part)} equal")
 
-    def _all(self, name: str, parts: Iterable[Any]) -> bytes:
+    def _all(self, name: str, parts: Iterable[object]) -> bytes:
         return _digest(name, *map(self.digest, parts))
 
     def _number(self, function: Callable) -> bytes:
@@ -116,7 +117,7 @@ class _Walk:
         return str(place).encode()
 
 
-def _attributes(part: Any) -> list[Any]:
+def _attributes(part: object) -> list[object]:
     """All attributes of an object that is no dataclass, but for those that are computed from others when asked for."""
     kind = type(part)
     slots = [name for base in kind.__mro__ for name in getattr(base, "__slots__", ()) if name != "__weakref__"]

@@ -5,7 +5,6 @@ model will run in, from the same templates the lowered system uses.
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -17,7 +16,7 @@ from .group import Point
 from .tables import ZERO
 
 
-def residual_and_jacobian(extended: Extended, at: Point) -> tuple[Float[np.ndarray, " equations"], Any]:
+def residual_and_jacobian(extended: Extended, at: Point) -> tuple[Float[np.ndarray, " equations"], sp.csr_array]:
     """All residuals, and the sparse Jacobian with respect to all quantities."""
     residual = np.empty(extended.n_equations)
     for group in extended.groups:
@@ -25,7 +24,7 @@ def residual_and_jacobian(extended: Extended, at: Point) -> tuple[Float[np.ndarr
     return residual, _jacobian(extended, [(g, g.partials(at)) for g in extended.groups if g.quantity.shape[1]])
 
 
-def _jacobian(extended: Extended, partials: Sequence[tuple[ExtendedGroup, np.ndarray]]) -> Any:
+def _jacobian(extended: Extended, partials: Sequence[tuple[ExtendedGroup, np.ndarray]]) -> sp.csr_array:
     """The sparse Jacobian of all equations, from the partial derivatives (n, slots) of groups that have slots."""
     shape = (extended.n_equations, extended.quantities.n)
     if not partials:
@@ -40,7 +39,7 @@ def _jacobian(extended: Extended, partials: Sequence[tuple[ExtendedGroup, np.nda
 
 def generic_jacobian(
     extended: Extended, size: np.ndarray, parameter_size: np.ndarray
-) -> tuple[Any, Any, np.ndarray, np.ndarray]:
+) -> tuple[sp.csr_array, sp.csr_array, np.ndarray, np.ndarray]:
     """A sparse Jacobian with respect to all quantities at a generic point, for questions of rank: what depends there
     depends everywhere, or nearly so. Also bounds of the errors of its entries, the point and the parameters.
 

@@ -2,12 +2,12 @@
 
 import functools
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..aliases import Numeric
 from ..tolerances import EPS, NOISE
 from .template import AbstractTemplate, Slot
 
@@ -72,7 +72,7 @@ class LinearTemplate(AbstractTemplate):
         return 0.0 if total is None else total
 
 
-def scaled(c: Any, s: Any) -> Any:
+def scaled(c: Numeric, s: Numeric) -> Numeric:
     """c·s for a numeric coefficient, a number or one for each instance."""
     if np.ndim(c) == 0:
         if c == 1:

@@ -41,7 +41,7 @@ class _Seen(NamedTuple):
         """True if nothing but these powers, and parameters that are known, (parameters,), moves them."""
         return len(self.by_quantity[0]) == self.n_own and bool(is_known[self.by_parameter[1]].all())
 
-    def powers(self, n_quantities: int, n_parameters: int, n_equations: int) -> Any:
+    def powers(self, n_quantities: int, n_parameters: int, n_equations: int) -> sp.csr_array:
         """The powers in quantities, parameters and units of equations, a sparse matrix."""
         k = np.arange(len(self.equation))
         first = n_quantities + n_parameters
@@ -110,7 +110,7 @@ def natural_sizes(
 
 def _slopes(
     lower: np.ndarray, higher: np.ndarray, width: int, known: np.ndarray, size: np.ndarray, time: float
-) -> tuple[Any, np.ndarray]:
+) -> tuple[sp.csr_array, np.ndarray]:
     """Rows log s(q') − log s(q) + log T = 0 with a column for log T behind the others, and how far off each is."""
     k = np.arange(len(lower))
     rows, columns = np.concatenate([k, k, k]), np.concatenate([higher, lower, np.full(len(k), width)])

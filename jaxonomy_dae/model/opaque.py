@@ -3,13 +3,14 @@
 import abc
 import functools
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
+from ..aliases import PyTree
 from ..programs.cache import compiled
 from .template import AbstractTemplate, Slot
 
@@ -19,7 +20,7 @@ class AbstractReplacement(eqx.Module):
     weights stood."""
 
     @abc.abstractmethod
-    def __call__(self, u: Any) -> Any:
+    def __call__(self, u: Array) -> Array:
         """The law at its inputs, those that are time included."""
 
 
@@ -37,7 +38,7 @@ class OpaqueFunction:
         self.n_inputs = n_inputs
         self.time_positions = time_positions
 
-    def __call__(self, weights: Any, t, u):
+    def __call__(self, weights: PyTree, t, u):
         """The outputs, in the dtype of `u`; the weights are used in their own."""
         dtypes = [leaf.dtype for leaf in jax.tree.leaves(weights) if hasattr(leaf, "dtype")]
         floating = [d for d in dtypes if jnp.issubdtype(d, jnp.floating)]

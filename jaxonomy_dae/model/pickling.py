@@ -3,10 +3,11 @@
 import dataclasses
 import importlib
 import sys
-from typing import Any
 
 import equinox as eqx
 import jax
+
+from ..aliases import PyTree
 
 
 @dataclasses.dataclass(frozen=True)
@@ -16,14 +17,14 @@ class NamedFunction:
     module: str
     name: str
 
-    def load(self) -> Any:
+    def load(self) -> PyTree:
         return getattr(importlib.import_module(self.module), self.name)
 
 
-def functions_by_name(tree: Any) -> Any:
+def functions_by_name(tree: PyTree) -> PyTree:
     """The tree with functions that a module holds replaced by their names."""
 
-    def named(leaf: Any) -> Any:
+    def named(leaf: PyTree) -> PyTree:
         module = sys.modules.get(getattr(leaf, "__module__", None) or "")
         if eqx.is_array(leaf) or module is None or not callable(leaf):
             return leaf
@@ -37,6 +38,6 @@ def functions_by_name(tree: Any) -> Any:
     return jax.tree.map(named, tree)
 
 
-def named_functions(tree: Any) -> Any:
+def named_functions(tree: PyTree) -> PyTree:
     """The tree with names replaced by the functions again."""
     return jax.tree.map(lambda leaf: leaf.load() if isinstance(leaf, NamedFunction) else leaf, tree)

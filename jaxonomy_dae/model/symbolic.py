@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..aliases import Numeric
 from ..expressions.differentiate import directional_derivative, partial_derivative, raised
 from ..expressions.errors import KernelWithErrors
 from ..expressions.kernel import Kernel
@@ -51,7 +52,7 @@ class SymbolicTemplate(AbstractTemplate):
         self._numbers = [number_label(k) for k in range(n_coefficients)]
         parameters = map(parameter_label, range(n_parameters))
         self._labels = [*map(slot_label, slots), *parameters, *self._numbers, TIME_LABEL]
-        self._kernels: dict[Any, Kernel] = {}
+        self._kernels: dict[Hashable, Kernel] = {}
 
     def __reduce__(self):  # kernels are made again
         return template_of, (self.graph, self.slots, self.n_parameters, self.n_coefficients)
@@ -118,7 +119,9 @@ class SymbolicTemplate(AbstractTemplate):
             zero.append(all(abs(sum(parts)) <= NOISE * EPS * sum(map(abs, parts)) for parts in along.values()))
         return np.array(zero, bool)[which.ravel()]
 
-    def _evaluate(self, key: Any, graphs: Callable[[], Sequence[Node]], arguments: tuple[Any, ...], backend: str):
+    def _evaluate(
+        self, key: Hashable, graphs: Callable[[], Sequence[Node]], arguments: tuple[Numeric, ...], backend: str
+    ):
         if key not in self._kernels:
             self._kernels[key] = Kernel(graphs(), self._labels)
         slots, parameters, coefficients, t = arguments
@@ -131,7 +134,7 @@ class SymbolicTemplate(AbstractTemplate):
     def partial_values(self, slots, parameters, coefficients, t, networks, backend="jax") -> tuple:
         return tuple(self._evaluate("partials", lambda: self.partials, (slots, parameters, coefficients, t), backend))
 
-    def magnitude(self, sizes, slots, parameters, coefficients, t, networks, backend="jax") -> Any:
+    def magnitude(self, sizes, slots, parameters, coefficients, t, networks, backend="jax") -> Numeric:
         if "magnitude" not in self._kernels:
             sizes_of = [size_label(slot_label(s)) for s in self.slots]
             self._kernels["magnitude"] = Kernel([magnitude(self.graph, size_label)], [*self._labels, *sizes_of])
@@ -176,7 +179,7 @@ class SymbolicTemplate(AbstractTemplate):
         of_slots, of_parameters = ([frozenset(reading.get(label, ())) for label in side] for side in labels)
         return of_slots, of_parameters
 
-    def solve(self, position: int, slots, parameters, coefficients, t, networks, backend="jax") -> Any:
+    def solve(self, position: int, slots, parameters, coefficients, t, networks, backend="jax") -> Numeric:
         def solved() -> list[Node]:
             rest = substitute(self.graph, {slot_label(self.slots[position]): constant(0)})
             return [scale(-1, divide(rest, self.partials[position]))]
@@ -184,7 +187,7 @@ class SymbolicTemplate(AbstractTemplate):
         return self._evaluate(("solve", position), solved, (slots, parameters, coefficients, t), backend)[0]
 
 
-def _in_dtype(coefficients: Sequence[Any], values: Sequence[Any]) -> Sequence[Any]:
+def _in_dtype(coefficients: Sequence[Numeric], values: Sequence[Numeric]) -> Sequence[Numeric]:
     """Coefficients that differ by instance, in the dtype of traced values."""
     arrays = [v for v in values if isinstance(v, jax.Array)]
     return [c if np.ndim(c) == 0 else jnp.asarray(c, arrays[0].dtype) for c in coefficients] if arrays else coefficients
@@ -200,7 +203,7 @@ def canonical(
     residual: Node, variables: Sequence[VariableSymbol], parameters: Sequence[ParameterSymbol]
 ) -> SymbolicTemplate:
     """The template of a residual in symbols: slot k stands for variables[k], parameter k for parameters[k]."""
-    replaced = {symbol_label(v): leaf(slot_label((k, 0))) for k, v in enumerate(variables)}
+    replaced: dict[Hashable, Node] = {symbol_label(v): leaf(slot_label((k, 0))) for k, v in enumerate(variables)}
     replaced |= {symbol_label(p): leaf(parameter_label(k)) for k, p in enumerate(parameters)}
     slots = tuple((k, 0) for k in range(len(variables)))
     return template_of(substitute(residual, replaced), slots, len(parameters))

@@ -12,6 +12,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from ..aliases import Numeric
 from ..modeling.interval import Interval
 from .array_names import ArrayNames
 from .events import NO_EVENTS, NONE_HELD, EventTable, HeldTable
@@ -229,7 +230,7 @@ def provenance_of(groups: tuple[EquationGroup, ...], equation: int) -> Provenanc
     return group.provenance[place]
 
 
-def complete(dependents: Sequence[DependentParameters], array: Any) -> Any:
+def complete(dependents: Sequence[DependentParameters], array: Numeric) -> Numeric:
     """All parameters, shape (*batch, n), with the dependent ones computed from the others; NumPy or JAX."""
     for group in dependents:
         given = [array[..., column] for column in group.parameter.T]

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ..aliases import Numeric
 from ..tolerances import KNOWN
 
 Slot = tuple[int, int]
@@ -45,7 +46,7 @@ class AbstractTemplate(abc.ABC):
         """The values of ∂(residual)/∂(slot), one for each slot."""
 
     @abc.abstractmethod
-    def magnitude(self, sizes, slots, parameters, coefficients, t, networks, backend="jax") -> Any:
+    def magnitude(self, sizes, slots, parameters, coefficients, t, networks, backend="jax") -> Numeric:
         """The magnitude of the residual's terms (see `expressions.magnitude`); `sizes` are the magnitudes of slots."""
 
     def partial_errors(self, slots, errors, parameters, coefficients, t, networks) -> tuple:
@@ -70,7 +71,7 @@ class AbstractTemplate(abc.ABC):
         return [frozenset()] * len(self.slots), [frozenset()] * self.n_parameters
 
     @abc.abstractmethod
-    def solve(self, position: int, slots, parameters, coefficients, t, networks, backend="jax") -> Any:
+    def solve(self, position: int, slots, parameters, coefficients, t, networks, backend="jax") -> Numeric:
         """The value of the slot at `position` for which the residual, affine in it, is zero; the value given there is
         not read."""
 

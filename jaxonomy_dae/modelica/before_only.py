@@ -1,7 +1,6 @@
 """Which modes follow from what was before an instant alone: none of this kind takes back what another one does."""
 
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
 
 import sympy
 
@@ -38,7 +37,7 @@ class BeforeOnly:
         symbols = value.free_symbols if isinstance(value, sympy.Basic) else set()
         return all(self._is_symbol(s) for s in symbols)
 
-    def _is_symbol(self, s: Any) -> bool:
+    def _is_symbol(self, s: object) -> bool:
         if isinstance(s, VariableSymbol):
             return not s.order and self._is_variable(s.path)
         return not isinstance(s, DiscreteSymbol) or isinstance(s, PreviousSymbol) or s.path in self.by_when
@@ -57,7 +56,7 @@ class BeforeOnly:
         except ModelError:
             return False
 
-    def _at_event(self, evaluate: Any) -> Value:
+    def _at_event(self, evaluate: Callable) -> Value:
         self.scope.in_action = True
         try:
             return evaluate()
@@ -65,7 +64,7 @@ class BeforeOnly:
             self.scope.in_action = False
 
 
-def _differentiated(statement: Any) -> Iterator[Reference]:
+def _differentiated(statement: object) -> Iterator[Reference]:
     """The variables in der(…)."""
     stack = [statement]
     while stack:

@@ -3,7 +3,6 @@
 import functools
 import math
 from collections.abc import Callable
-from typing import Any
 
 import sympy
 
@@ -12,7 +11,7 @@ from ..modeling.automatic_events import smooth
 from .values import Value, as_number, both, chosen, either, entrywise, is_condition
 
 
-def _of_numbers(number: Callable[..., float], symbol: Callable[..., Any]) -> Callable[..., Value]:
+def _of_numbers(number: Callable[..., float], symbol: Callable[..., Value]) -> Callable[..., Value]:
     """A function of entries: `number` of constants, `symbol` of expressions."""
 
     def one(*arguments: Value) -> Value:
@@ -31,7 +30,7 @@ def _sign(x: float) -> int:
     return (x > 0) - (x < 0)
 
 
-def _quotient(a: Any, b: Any) -> Any:
+def _quotient(a: Value, b: Value) -> Value:
     """The quotient without its fraction, rounded towards zero."""
     q = sympy.sympify(a) / sympy.sympify(b)
     return sympy.Piecewise((sympy.floor(q), q >= 0), (sympy.ceiling(q), True), evaluate=False)

@@ -9,10 +9,11 @@ the continuous variables of their loop solved for in between: the event iteratio
 import collections
 import functools
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, TypeAlias, TypeVar
 
 import sympy
 
+from ..aliases import Condition
 from ..errors import ModelError
 from ..modeling.event_flags import EventFlag
 from ..modeling.events import Sampled, assign, pre, reinit, terminate
@@ -48,6 +49,9 @@ from .values import (
     plain,
 )
 
+T = TypeVar("T")
+Target: TypeAlias = sympy.Symbol | str  # what an action assigns; a text for `terminate`
+
 
 def write_modes(scope: Scope) -> None:
     """Adds the events by which discrete variables follow their equations."""
@@ -61,7 +65,7 @@ def write_modes(scope: Scope) -> None:
     _write_together(scope, before_only)
 
 
-def _located(scope: Scope, name: str, do: Callable[[Scope, str], Any]) -> Any:
+def _located(scope: Scope, name: str, do: Callable[[Scope, str], T]) -> T:
     return located(scope.flat.name, scope.declared[name].line, do, scope, name)
 
 
@@ -78,7 +82,7 @@ def _cases(scope: Scope, name: str) -> list[tuple[Value, Value]]:
 
 
 def _write_mode(scope: Scope, name: str) -> None:
-    m: Any = DiscreteSymbol(name)
+    m = DiscreteSymbol(name)
     for result, holds in _cases(scope, name):
         pending = False if result == m else both(holds, plain(sympy.Ne(m, result)))
         condition = scope.kept.in_events(pending)
@@ -93,7 +97,7 @@ def _write_together(scope: Scope, names: list[str]) -> None:
     pending: Value = False
     actions = []
     for name in names:
-        m: Any = DiscreteSymbol(name)
+        m = DiscreteSymbol(name)
         cases = _located(scope, name, _cases)
         value: Value = cases[-1][0]
         for result, holds in cases:
@@ -110,7 +114,7 @@ def _write_together(scope: Scope, names: list[str]) -> None:
         scope.component._event(condition, (*actions, assign(turn, 1 - now)), None, EventFlag.AT_START)
 
 
-def _hidden(scope: Scope, name: str, start: float) -> Any:
+def _hidden(scope: Scope, name: str, start: float) -> DiscreteSymbol:
     """Declares a discrete variable that is not the text's."""
     scope.component.discrete(name, start=start)
     return DiscreteSymbol(name)
@@ -152,7 +156,7 @@ def write_end_of_start(scope: Scope) -> None:
     """Ends the initial time when all modes have settled."""
     if scope.initial is None:
         return
-    ends: Any = sympy.Eq(scope.initial, 1)
+    ends: Condition = sympy.Eq(scope.initial, 1)
     for pending in scope.pending:
         ends = both(ends, negated(pending))
     condition = scope.kept.in_events(ends)
@@ -266,7 +270,7 @@ def _first(target: Any, cases: list[tuple[Value, Value]]) -> Value:
     return value
 
 
-def _each_action(scope: Scope, body: tuple[Statement, ...]) -> Iterator[tuple[Any, Value]]:
+def _each_action(scope: Scope, body: tuple[Statement, ...]) -> Iterator[tuple[Target, Value]]:
     """Pairs (variable, new value); a text for `terminate`."""
     if any(isinstance(s, Assignment | Loop) for s in body):
         yield from _of_algorithm(scope, tuple(s for s in body if not isinstance(s, Effect)))
@@ -289,7 +293,7 @@ def _each_action(scope: Scope, body: tuple[Statement, ...]) -> Iterator[tuple[An
             raise ModelError(f"a {type(s).__name__.lower()} in a when")
 
 
-def _of_algorithm(scope: Scope, body: tuple[Statement, ...]) -> Iterator[tuple[Any, Value]]:
+def _of_algorithm(scope: Scope, body: tuple[Statement, ...]) -> Iterator[tuple[Target, Value]]:
     """What statements assign one after another. A variable has its value before the event until it is assigned, and
     what is assigned once and then read is read as the new value of the variable."""
     model, stored = scope.flat.model, scope.definitions.stored
@@ -307,7 +311,7 @@ def _of_algorithm(scope: Scope, body: tuple[Statement, ...]) -> Iterator[tuple[A
         yield DiscreteSymbol(n), sympy.sympify(as_number(value))
 
 
-def _assigned(scope: Scope, target: Expression, value: Value) -> Iterator[tuple[Any, Value]]:
+def _assigned(scope: Scope, target: Expression, value: Value) -> Iterator[tuple[Target, Value]]:
     if isinstance(target, Several):
         for each, v in zip(target.entries, value, strict=False):
             if each is not None:
@@ -322,9 +326,9 @@ def _assigned(scope: Scope, target: Expression, value: Value) -> Iterator[tuple[
         yield DiscreteSymbol(name), sympy.sympify(as_number(value))
 
 
-def _chosen_actions(scope: Scope, s: Branches) -> Iterator[tuple[Any, Value]]:
+def _chosen_actions(scope: Scope, s: Branches) -> Iterator[tuple[Target, Value]]:
     """An `if` within a when: each target has the value of the branch that holds, or the one before."""
-    found: dict[Any, list[tuple[Value, Value]]] = {}
+    found: dict[sympy.Symbol, list[tuple[Value, Value]]] = {}
     otherwise: Value = True
     for condition, body in s.branches:
         holds = as_condition(scope.evaluate(condition))

@@ -85,7 +85,7 @@ class Interpreter:
         self.special, self.externals = special, externals
         self.literals = literal_numbers(classes)
         self.quiet = False  # True inside of noEvent, smooth and functions: conditions there are no events
-        self.quieted: set[Any] = set()  # conditions that stood in noEvent
+        self.quieted: set[sympy.Basic] = set()  # conditions that stood in noEvent
         self.named = named
         self.depth = 0
         self.guarded = 0  # conditions that are not constant, around what is carried out
@@ -247,7 +247,7 @@ class Interpreter:
         whole = self.evaluate(e.whole, names)
         return _field(whole, e.field) if e.field is not None else self._entry(whole, e.subscripts, names)
 
-    def constant(self, e: Expression, names: Names | None = None) -> Any:
+    def constant(self, e: Expression, names: Names | None = None) -> Value:
         """The value of an expression that must be known now, such as a subscript or the end of a loop."""
         value = self.evaluate(e, names)
         if not isinstance(value, int | float | bool | str | list):
@@ -536,7 +536,7 @@ def _field(value: Value, name: str) -> Value:
     return value[name]
 
 
-def _index(k: Any, count: int) -> int:
+def _index(k: Value, count: int) -> int:
     if not (float(k).is_integer() and 1 <= k <= count):
         raise ModelError(f"the subscript {k} is outside of 1:{count}")
     return int(k) - 1

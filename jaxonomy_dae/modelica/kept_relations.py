@@ -4,10 +4,9 @@ Between events the truth is kept, as in Modelica. All modes of an instant see th
 rests at the level, and continuous equations see the one that the modes see.
 """
 
-from typing import Any
-
 import sympy
 
+from ..aliases import Condition, Expression
 from ..modeling.automatic_events import varies
 from ..modeling.component import Component
 from .values import Value, plain
@@ -20,7 +19,8 @@ class KeptRelations:
 
     def __init__(self, component: Component):
         self.component = component
-        self.forms: dict[Any, tuple[Any, Any]] = {}  # (form in equations, form in conditions of events)
+        # (form in equations, form in conditions of events)
+        self.forms: dict[Condition, tuple[Condition, Condition]] = {}
 
     def in_events(self, condition: Value, alone: bool = True) -> Value:
         """A condition of an event in kept truths. One relation alone stays as it is: it is found where it turns."""
@@ -28,24 +28,24 @@ class KeptRelations:
             return condition
         return plain(self._replaced(condition, 1))
 
-    def in_equations(self, expression: Any) -> Any:
+    def in_equations(self, expression: Expression) -> Expression:
         """An expression with relations that events read replaced by their kept truths."""
         if not self.forms:
             return expression
         found = {r: self._form(r, 0) for r in expression.atoms(*_ORDER) if self._known(r)}
         return expression.xreplace(found) if found else expression
 
-    def _replaced(self, condition: Any, form: int) -> Any:
+    def _replaced(self, condition: Condition, form: int) -> Condition:
         if isinstance(condition, _ORDER) and varies(condition):
             return self._form(condition, form)
         if isinstance(condition, sympy.And | sympy.Or | sympy.Not):
             return condition.func(*(self._replaced(part, form) for part in condition.args))
         return condition
 
-    def _known(self, relation: Any) -> bool:
+    def _known(self, relation: Condition) -> bool:
         return relation in self.forms or sympy.Not(relation) in self.forms
 
-    def _form(self, relation: Any, form: int) -> Any:
+    def _form(self, relation: Condition, form: int) -> Condition:
         opposite = sympy.Not(relation)
         if opposite in self.forms:
             return sympy.Not(self.forms[opposite][form])

@@ -7,7 +7,7 @@ event are discrete variables; the others are expressions, put in wherever they a
 
 import re
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import TypeVar
 
 import sympy
 
@@ -58,11 +58,11 @@ class Scope:
             flat.classes, self.value, special, LEFT_OUT | EXTERNALS, self.entries, self._named
         )
         self.definitions = find_definitions(flat.model, self.is_discrete)
-        self.names: dict[sympy.Expr, Any] = {}
+        self.names: dict[sympy.Expr, sympy.Symbol] = {}
         self.in_action = False
-        self.initial: Any = None
+        self.initial: DiscreteSymbol | None = None
         self.pending: list[Value] = []
-        self.done: dict[Branches, Any] = {}
+        self.done: dict[Branches, DiscreteSymbol] = {}
 
     def evaluate(self, e: Expression) -> Value:
         return self.interpreter.evaluate(e)
@@ -189,7 +189,7 @@ class Scope:
             return bool(start) if self.kind(d.type) == "Boolean" else int(start)
         return self.defined(d.name, found)
 
-    def defined(self, name: str, found: Any) -> Value:
+    def defined(self, name: str, found: Value) -> Value:
         if isinstance(found, int):  # the number of an algorithm
             values = self.algorithm(found)
             known = self._known_of(name)
@@ -341,7 +341,10 @@ class Scope:
         return self.component.sampled(self.evaluate(interval), self.evaluate(start))
 
 
-def located(model: str, line: int, do: Callable[..., Any], *arguments: Any) -> Any:
+T = TypeVar("T")
+
+
+def located(model: str, line: int, do: Callable[..., T], *arguments: object) -> T:
     """Does something for a statement of the text; errors say where it stands."""
     try:
         return do(*arguments)

@@ -29,7 +29,7 @@ class Prototype(Protocol):
     parameters: dict[str, Parameter]
     variables: dict[str, Variable]
     ports: dict[str, Port]
-    children: dict[str, Any]  # components and arrays of them
+    children: dict[str, "Prototype | ComponentArray"]  # components and arrays of them
     equations: list[sympy.Expr]
     accounts: list[Account]
     events: list[When]
@@ -136,7 +136,7 @@ class ComponentArray:
             return self.symbols(inner.symbol(name), name)
         raise AttributeError(f"{type(inner).__name__} has no attribute '{name}'")
 
-    def symbols(self, symbol: Any, name: str) -> Any:
+    def symbols(self, symbol: sympy.Symbol, name: str) -> Any:
         """The symbol that a declared name has in each component: an array of symbols, or that of one component."""
         found = np.empty(self.numbers.shape, object)
         for place, number in np.ndenumerate(self.numbers):
@@ -175,7 +175,7 @@ class PortArray:
         symbol = getattr(self.port, name)  # which raises for what the domain lacks
         return self.chosen.symbols(symbol, f"{self.port.name}.{name}")
 
-    def __getitem__(self, index: Any) -> "PortArray":
+    def __getitem__(self, index: object) -> "PortArray":
         return PortArray(self.port, self.chosen[index])
 
     def __len__(self) -> int:
@@ -193,7 +193,9 @@ class PortArray:
         return f"{self.chosen.path}.{self.port.name} ({' × '.join(map(str, numbers.shape))})"
 
 
-def make_array(ev: EqnEnv, name: str, kind: type, shape: Any, args: tuple, kwargs: dict[str, Any]) -> ComponentArray:
+def make_array(
+    ev: EqnEnv, name: str, kind: type, shape: int | tuple[int, ...], args: tuple, kwargs: dict[str, object]
+) -> ComponentArray:
     """An array of components `kind(ev, name, *args, **kwargs)`; arrays among the arguments hold one value for each.
 
     **Raises:**
@@ -221,7 +223,7 @@ def make_array(ev: EqnEnv, name: str, kind: type, shape: Any, args: tuple, kwarg
     return ComponentArray(prototype, sizes, _give_values(prototype, values, sizes))
 
 
-def _regular(value: Any) -> Any:
+def _regular(value: list | tuple) -> Any:
     """The list itself; None if its parts differ in length."""
     try:
         np.shape(value)
@@ -230,7 +232,7 @@ def _regular(value: Any) -> Any:
     return value
 
 
-def _sizes(shape: Any, where: str) -> tuple[int, ...]:
+def _sizes(shape: int | tuple[int, ...], where: str) -> tuple[int, ...]:
     try:
         found = tuple(operator.index(n) for n in (shape if isinstance(shape, tuple | list) else (shape,)))
     except TypeError:
@@ -240,7 +242,7 @@ def _sizes(shape: Any, where: str) -> tuple[int, ...]:
     return found
 
 
-def _each(value: Any, name: str, shape: tuple[int, ...], array: str, values: dict[str, np.ndarray]) -> Any:
+def _each(value: object, name: str, shape: tuple[int, ...], array: str, values: dict[str, np.ndarray]) -> object:
     """An argument as the prototype gets it. In place of an array it gets a symbol, and the array is added to
     `values`."""
     where = f"array '{array}'"
@@ -274,7 +276,7 @@ def _each(value: Any, name: str, shape: tuple[int, ...], array: str, values: dic
     return ParameterSymbol(f"{array}:{name}")
 
 
-def _is_array(value: Any) -> TypeGuard[np.ndarray | jax.Array]:
+def _is_array(value: object) -> TypeGuard[np.ndarray | jax.Array]:
     return isinstance(value, np.ndarray | jax.Array) and value.ndim > 0
 
 

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 
 import sympy
 
+from ..aliases import Condition, Expression
 from ..errors import ModelError
 from ..expressions.branches import ALWAYS, NEVER, Needed, union, within
 from ..expressions.from_sympy import UnsupportedExpression, parts_of, symbols_of
@@ -24,7 +25,7 @@ ROUNDING = (sympy.floor, sympy.ceiling, sympy.frac, sympy.Mod)
 KINKED = (sympy.Max, sympy.Min, sympy.Abs, sympy.sign, sympy.Heaviside, *ROUNDING)
 
 
-def smooth(expression: Any) -> Any:
+def smooth(expression: object) -> Expression:
     """Marks an expression so that its relations do not become events. Use it for kinks whose effect does not justify
     the extra steps, and for branches that agree where they meet, such as a series near a point and a formula elsewhere.
 
@@ -50,8 +51,8 @@ class Turning:
     turns while `watched` holds, and is a `kink` if both branches have the same value where it turns."""
 
     number: int
-    condition: Any
-    watched: Any
+    condition: Condition
+    watched: Condition
     kink: bool = False
     starts: ClassVar = (float(LIVE),)
 
@@ -62,8 +63,8 @@ class Stepping:
     `number` + 1 to the whole part. It changes while `watched` holds."""
 
     number: int
-    argument: Any
-    watched: Any
+    argument: Expression
+    watched: Condition
     starts: ClassVar = (float(LIVE), 0.0)
 
 
@@ -73,7 +74,7 @@ class Timed:
     `kink` if both branches have the same value where it turns."""
 
     number: int
-    condition: Any
+    condition: Condition
     edges: Edges
     kink: bool = False
     starts: ClassVar = (float(LIVE),)
@@ -85,7 +86,7 @@ class TimedSteps:
     `Stepping`."""
 
     number: int
-    argument: Any
+    argument: Expression
     edges: Edges
     starts: ClassVar = (float(LIVE), 0.0)
 
@@ -100,9 +101,9 @@ class Splitting:
 
     def __init__(self, first: int):
         self.next = first
-        self.timed: dict[Any, Timed] = {}
+        self.timed: dict[Condition, Timed] = {}
 
-    def split(self, condition: Any) -> tuple[Any, Any]:
+    def split(self, condition: Condition) -> tuple[Condition, Condition]:
         """Returns (the condition for equations, the condition for guards), with relations that turn at known times
         replaced by hidden discrete variables."""
         simple = in_relations_of_time(condition)
@@ -110,10 +111,10 @@ class Splitting:
         if not found:
             return condition, condition
         numbers = {r: self.timed[r].number for r in found}
-        known: dict[Any, Any] = {r: sympy.Eq(RelationSymbol(n), 1) for r, n in numbers.items()}
+        known: dict[Condition, Condition] = {r: sympy.Eq(RelationSymbol(n), 1) for r, n in numbers.items()}
         return _replaced(simple, {r: turned(n, r) for r, n in numbers.items()}), _replaced(simple, known)
 
-    def _is_timed(self, relation: Any) -> bool:
+    def _is_timed(self, relation: Condition) -> bool:
         if relation not in self.timed:
             edges = edges_of(relation)
             if edges is None:
@@ -123,7 +124,7 @@ class Splitting:
         return True
 
 
-def _replaced(condition: Any, forms: dict[Any, Any]) -> Any:
+def _replaced(condition: Condition, forms: dict[Condition, Condition]) -> Condition:
     """The condition with relations replaced by other expressions."""
     if condition in forms:
         return forms[condition]
@@ -132,20 +133,20 @@ def _replaced(condition: Any, forms: dict[Any, Any]) -> Any:
     return condition
 
 
-def varies(condition: Any) -> bool:
+def varies(condition: Condition) -> bool:
     """True if the truth of a condition can change between events: some symbol in it moves."""
     return any(_moves(s) for s in symbols_of(condition))
 
 
-def turned(number: int, condition: Any) -> Any:
+def turned(number: int, condition: Condition) -> Condition:
     """The condition in terms of the hidden discrete variable that holds its truth."""
     known = RelationSymbol(number)
-    holds: Any = sympy.Eq(known, 1)
-    unknown: Any = sympy.Eq(known, LIVE)
+    holds: Condition = sympy.Eq(known, 1)
+    unknown: Condition = sympy.Eq(known, LIVE)
     return sympy.Or(holds, sympy.And(unknown, condition))
 
 
-def jumps(e: Any) -> bool:
+def jumps(e: Expression) -> bool:
     """True if an expression has a part that may jump while its symbols do not, and is not marked as smooth."""
     order = _inside_out([e])
     varying = _varying(order)
@@ -167,18 +168,22 @@ def with_events(residuals: tuple[sympy.Expr, ...], first: int) -> tuple[tuple[sy
 class _Rewriting:
     """Rewrites all parts of equations, inner ones first, and keeps their new forms."""
 
-    def __init__(self, residuals: tuple[sympy.Expr, ...], order: list[Any], varying: set[Any], first: int):
+    def __init__(
+        self, residuals: tuple[sympy.Expr, ...], order: list[Expression], varying: set[Expression], first: int
+    ):
         self.residuals, self.order, self.varying = residuals, order, varying
         self.numbers = Splitting(first)
         inside = set(order)
         self.needed = _needed_where([r for r in residuals if r in inside], order)
-        self.new: dict[Any, Any] = {}
-        self.old: dict[Any, Any] = {}  # the other way round
+        self.new: dict[Expression, Expression] = {}
+        self.old: dict[Expression, Expression] = {}  # the other way round
         self.timed_steps: list[TimedSteps] = []
-        self.conditions: dict[Any, Any] = {}
-        self.found: list[tuple[type, int, Any, list[Any]]] = []  # the last: where it stands
-        self.places: dict[Any, list[Any]] = {}  # of a condition, the same list
-        self.timed_places: dict[Any, list[list[Any]]] = {}  # of a relation of time, of all conditions that it is in
+        self.conditions: dict[Condition, Condition] = {}
+        # (kind, number, condition or argument, the expressions that it stands in)
+        self.found: list[tuple[type, int, Expression, list[Expression]]] = []
+        self.places: dict[Expression, list[Expression]] = {}  # of a condition, the same list
+        # of a relation of time: the places of all conditions that it is in
+        self.timed_places: dict[Expression, list[list[Expression]]] = {}
 
     def done(self) -> tuple[tuple[sympy.Expr, ...], tuple[Watched, ...]]:
         for e in self.order:
@@ -194,14 +199,14 @@ class _Rewriting:
         in_order = tuple(sorted((*watched, *timed), key=lambda w: w.number))
         return tuple(self.new.get(r, r) for r in self.residuals), in_order
 
-    def _watched(self, kind: Any, number: int, what: Any, places: list[Any]) -> Any:
+    def _watched(self, kind: type, number: int, watched: Expression, places: list[Expression]) -> Turning | Stepping:
         where = _holding(functools.reduce(union, (self.needed[e] for e in places)), self.conditions.__getitem__)
         if kind is Stepping:
-            return Stepping(number, what, where)
-        # What is looked at only at times may have turned before.
-        return Turning(number, what, where, where is sympy.true and all(map(_is_continuous, places)))
+            return Stepping(number, watched, where)
+        # A guard inside a branch is not monitored while the branch is off, and may have turned before.
+        return Turning(number, watched, where, where is sympy.true and all(map(_is_continuous, places)))
 
-    def _written(self, e: Any) -> Any:
+    def _written(self, e: Expression) -> Expression:
         if isinstance(e, sympy.Piecewise):
             return self._piecewise(e)
         if not e.args or isinstance(e, Smooth):
@@ -215,7 +220,7 @@ class _Rewriting:
             return e
         return e.func(*inside)
 
-    def _piecewise(self, e: Any) -> Any:
+    def _piecewise(self, e: Expression) -> Expression:
         pairs = []
         for branch, condition in e.args:
             if condition not in self.conditions:
@@ -229,7 +234,7 @@ class _Rewriting:
             pairs.append((self.new[branch], self.conditions[condition]))
         return sympy.Piecewise(*pairs, evaluate=False)
 
-    def _within_domain(self, e: Any, argument: Any) -> Any:
+    def _within_domain(self, e: Expression, argument: Expression) -> Expression:
         """The argument of a root or the like where a branch is kept beyond its end, and the function may have no value:
         brought back, unless it has none as the equations were written either."""
         live = e.args[0]
@@ -238,7 +243,7 @@ class _Rewriting:
             return argument
         low, high = _DOMAINS.get(type(e), (0, None))
         mirrored, outside = (-argument if low == 0 else sympy.Integer(low)), sympy.Lt(live, low)
-        back: Any = argument
+        back: Expression = argument
         if high is not None:
             outside = sympy.Or(outside, sympy.Gt(live, high))
             back = sympy.Piecewise((back, sympy.Le(argument, high, evaluate=False)), (high, True), evaluate=False)
@@ -246,12 +251,14 @@ class _Rewriting:
         written_so = sympy.And(_holding(self.needed[e], lambda c: c), outside)
         return back if written_so is sympy.false else sympy.Piecewise((live, written_so), (back, True), evaluate=False)
 
-    def _turns(self, places: list[Any], relation: Any) -> Any:
+    def _turns(self, places: list[Expression], relation: Condition) -> Condition:
         """`_turning` for a relation whose sides are in their new forms."""
         written = relation.func(*(self.old.get(side, side) for side in relation.args), evaluate=False)
         return self._turning(places, written, {written: relation})
 
-    def _turning(self, places: list[Any], condition: Any, inside: dict[Any, Any]) -> Any:
+    def _turning(
+        self, places: list[Expression], condition: Condition, inside: dict[Expression, Expression]
+    ) -> Condition:
         """The condition, as it is written, in terms of hidden discrete variables; `inside` has its relations with sides
         in their new forms. The variables that it needs are noted, to be declared later."""
         live, guarded = self.numbers.split(condition)
@@ -259,8 +266,8 @@ class _Rewriting:
             self.timed_places.setdefault(r, []).append(places)
         if not varies(guarded):
             return live
-        # What is known of time, and of relations inside its sides, is so in the guard, which jumps at their events and
-        # moves with them; equations that are looked at outside of runs have all as it is.
+        # The guard uses the discrete variables of relations of time and of relations inside its sides: it jumps at
+        # their events, and moves with them. Equations use the plain relations: they are evaluated outside of runs, too.
         forms = dict(inside)
         if not isinstance(condition, sympy.core.relational.Relational):
             # Of two sides that jump onto each other, the kind of their own relation decides.
@@ -278,7 +285,7 @@ class _Rewriting:
         self.numbers.next += count
         return first
 
-    def _stepping(self, e: Any, argument: Any) -> Any:
+    def _stepping(self, e: Expression, argument: Expression) -> Expression:
         """The whole part of an argument in the expression e, as a discrete variable."""
         number = self._numbers(2)
         live, whole = RelationSymbol(number), RelationSymbol(number + 1)
@@ -287,22 +294,24 @@ class _Rewriting:
             self.found.append((Stepping, number, argument, [e]))
         else:
             self.timed_steps.append(TimedSteps(number, argument, edges))
-        unknown: Any = sympy.Eq(live, LIVE)
+        unknown: Condition = sympy.Eq(live, LIVE)
         return sympy.Piecewise((sympy.floor(argument), unknown), (whole, True), evaluate=False)
 
 
-def _holding(needed: Needed, form: Callable[[Any], Any]) -> Any:
+def _holding(needed: Needed, form: Callable[[Expression], Expression]) -> Condition:
     """The condition under which a part is needed, with conditions in some form."""
     if needed == ALWAYS:
         return sympy.true
-    parts: list[Any] = [sympy.And(*(form(c) if holds else sympy.Not(form(c)) for c, holds in part)) for part in needed]
+    parts: list[Condition] = [
+        sympy.And(*(form(c) if holds else sympy.Not(form(c)) for c, holds in part)) for part in needed
+    ]
     return sympy.Or(*parts)
 
 
-_DOMAINS: dict[Any, tuple[Any, Any]] = {sympy.asin: (-1, 1), sympy.acos: (-1, 1)}
+_DOMAINS: dict[type, tuple[int, int]] = {sympy.asin: (-1, 1), sympy.acos: (-1, 1)}
 
 
-def _has_an_end(e: Any) -> bool:
+def _has_an_end(e: Expression) -> bool:
     """True for functions that are defined on a part of the real numbers only: log, asin and acos of their argument, and
     powers with an exponent that is not an integer."""
     return isinstance(e, (sympy.log, sympy.asin, sympy.acos)) or (isinstance(e, sympy.Pow) and not e.exp.is_integer)
@@ -311,40 +320,40 @@ def _has_an_end(e: Any) -> bool:
 Turn = Callable[[Any], Any]
 
 
-def _larger(turn: Turn, _: Turn, *arguments: Any) -> Any:
+def _larger(turn: Turn, _: Turn, *arguments: Expression) -> Expression:
     return functools.reduce(lambda a, b: _chosen(turn, a, b, sympy.Ge), arguments)
 
 
-def _smaller(turn: Turn, _: Turn, *arguments: Any) -> Any:
+def _smaller(turn: Turn, _: Turn, *arguments: Expression) -> Expression:
     return functools.reduce(lambda a, b: _chosen(turn, a, b, sympy.Le), arguments)
 
 
-def _chosen(turn: Turn, a: Any, b: Any, relation: Any) -> Any:
+def _chosen(turn: Turn, a: Expression, b: Expression, relation: Callable[..., Condition]) -> Expression:
     if a.is_number:
         a, b = b, a
     condition = relation(a, b, evaluate=False)
     return sympy.Piecewise((a, turn(condition) if varies(condition) else condition), (b, True), evaluate=False)
 
 
-def _absolute(turn: Turn, _: Turn, u: Any) -> Any:
+def _absolute(turn: Turn, _: Turn, u: Expression) -> Expression:
     return sympy.Piecewise((u, turn(sympy.Ge(u, 0, evaluate=False))), (-u, True), evaluate=False)
 
 
-def _by_sign(turn: Turn, u: Any, above: Any, at_zero: Any, below: Any) -> Any:
+def _by_sign(turn: Turn, u: Expression, above: Expression, at_zero: Expression, below: Expression) -> Expression:
     """Branches for u > 0, u = 0 and u < 0: at zero a solution may stay."""
     positive, negative = (turn(relation(u, 0, evaluate=False)) for relation in (sympy.Gt, sympy.Lt))
     return sympy.Piecewise((above, positive), (below, negative), (at_zero, True), evaluate=False)
 
 
-def _sign(turn: Turn, _: Turn, u: Any) -> Any:
+def _sign(turn: Turn, _: Turn, u: Expression) -> Expression:
     return _by_sign(turn, u, sympy.Integer(1), sympy.Integer(0), sympy.Integer(-1))
 
 
-def _heaviside(turn: Turn, _: Turn, u: Any, at_zero: Any) -> Any:
+def _heaviside(turn: Turn, _: Turn, u: Expression, at_zero: Expression) -> Expression:
     return _by_sign(turn, u, sympy.Integer(1), at_zero, sympy.Integer(0))
 
 
-_FORMS: dict[Any, Callable[..., Any]] = {
+_FORMS: dict[type, Callable[..., Expression]] = {
     sympy.Max: _larger,
     sympy.Min: _smaller,
     sympy.Abs: _absolute,
@@ -357,7 +366,7 @@ _FORMS: dict[Any, Callable[..., Any]] = {
 }
 
 
-def relations_left_alone(residual: sympy.Expr) -> tuple[Any, ...]:
+def relations_left_alone(residual: sympy.Expr) -> tuple[Expression, ...]:
     """The parts of an equation that change with relations which do not become events: it is smooth there, or was
     declared to be."""
     if _is_hidden(residual):
@@ -382,14 +391,14 @@ def _with_marks(residual: sympy.Expr) -> sympy.Expr:
         if parts is None:
             continue
         one, other, where = parts
-        whole: Any = residual
+        whole: Expression = residual
         if _meet_smoothly(whole.xreplace({e: one}) - whole.xreplace({e: other}), where):
             marks[e] = Smooth(e)
-    out: Any = residual.xreplace(marks)
+    out: Expression = residual.xreplace(marks)
     return out
 
 
-def _two_branches(e: Any) -> tuple[Any, Any, Any] | None:
+def _two_branches(e: Expression) -> tuple[Expression, Expression, Expression] | None:
     """Splits an expression with one relation into (first branch, second branch, difference that is zero where they
     meet); None for other expressions."""
     if isinstance(e, sympy.Abs):
@@ -407,7 +416,7 @@ def _two_branches(e: Any) -> tuple[Any, Any, Any] | None:
     return None
 
 
-def _is_continuous(e: Any) -> bool:
+def _is_continuous(e: Expression) -> bool:
     """True if the expression has the same value on both sides of its relation, as Max, Min and Abs have."""
     if isinstance(e, sympy.Max | sympy.Min | sympy.Abs):
         return True
@@ -419,12 +428,12 @@ def _is_continuous(e: Any) -> bool:
     return _vanish_on(where, lambda _: (one - other,))
 
 
-def _meet_smoothly(difference: Any, surface: Any) -> bool:
+def _meet_smoothly(difference: Expression, surface: Expression) -> bool:
     """True if `difference` and its derivative vanish wherever `surface` does."""
     return _vanish_on(surface, lambda v: (difference, sympy.diff(difference, v)))
 
 
-def _vanish_on(surface: Any, expressions_in: Callable[[Any], tuple[Any, ...]]) -> bool:
+def _vanish_on(surface: Expression, expressions_in: Callable[[Expression], tuple[Expression, ...]]) -> bool:
     """True if all expressions vanish wherever `surface` is zero. The surface is solved for a variable `v` that it
     contains linearly, and `expressions_in(v)` is evaluated there; False if there is no such variable."""
     for v in sorted((s for s in symbols_of(surface) if isinstance(s, VariableSymbol | sympy.Dummy)), key=str):
@@ -442,10 +451,10 @@ def _is_hidden(residual: sympy.Expr) -> bool:
     return any(isinstance(s, VariableSymbol) and s.path.startswith((":when", ":held")) for s in symbols_of(residual))
 
 
-def _inside_out(roots: Sequence[Any]) -> list[Any]:
+def _inside_out(roots: Sequence[Expression]) -> list[Expression]:
     """The parts of expressions, each once, inner ones first. Parts marked as smooth are left out."""
-    seen: set[Any] = set()
-    out: list[Any] = []
+    seen: set[Expression] = set()
+    out: list[Expression] = []
     stack = [(e, False) for e in reversed(roots)]
     while stack:
         e, finished = stack.pop()
@@ -458,17 +467,17 @@ def _inside_out(roots: Sequence[Any]) -> list[Any]:
     return out
 
 
-def _untyped(e: Any) -> tuple[Any, ...]:
+def _untyped(e: Expression) -> tuple[Expression, ...]:
     """The arguments of an expression. SymPy's stubs declare them with a narrower type."""
     return e.args
 
 
-def _pairs(e: Any) -> tuple[tuple[Any, Any], ...]:
+def _pairs(e: Expression) -> tuple[tuple[Expression, Expression], ...]:
     """The branches of a `Piecewise` with their conditions."""
     return e.args
 
 
-def _arguments(e: Any) -> list[Any]:
+def _arguments(e: Expression) -> list[Expression]:
     if isinstance(e, Smooth):
         return []
     if isinstance(e, sympy.Piecewise):
@@ -480,14 +489,14 @@ def _arguments(e: Any) -> list[Any]:
         return []
 
 
-def _sides_of(condition: Any) -> list[Any]:
+def _sides_of(condition: Condition) -> list[Expression]:
     """The relations whose sides are parts of an expression: those of a condition that can become an event."""
     return relations_in(condition) if _can_turn(condition) else []
 
 
-def _varying(order: list[Any]) -> set[Any]:
+def _varying(order: list[Expression]) -> set[Expression]:
     """The parts of an expression whose value can change with time."""
-    out: set[Any] = set()
+    out: set[Expression] = set()
     for e in order:
         conditions = (c for _, c in _pairs(e)) if isinstance(e, sympy.Piecewise) else ()
         if _moves(e) or any(a in out for a in _arguments(e)) or any(varies(c) for c in conditions):
@@ -495,11 +504,11 @@ def _varying(order: list[Any]) -> set[Any]:
     return out
 
 
-def _moves(symbol: Any) -> bool:
+def _moves(symbol: Expression) -> bool:
     return isinstance(symbol, VariableSymbol | TimeSymbol)
 
 
-def _can_turn(condition: Any) -> bool:
+def _can_turn(condition: Condition) -> bool:
     """True if a condition can become an event: it varies between events, contains no event's relation yet, and a guard
     can be made both of it and of its negation."""
     if not varies(condition) or any(isinstance(s, RelationSymbol) for s in symbols_of(condition)):
@@ -512,9 +521,9 @@ def _can_turn(condition: Any) -> bool:
     return True
 
 
-def _needed_where(roots: Sequence[Any], order: list[Any]) -> dict[Any, Needed]:
+def _needed_where(roots: Sequence[Expression], order: list[Expression]) -> dict[Expression, Needed]:
     """The conditions under which the value of each part reaches an equation."""
-    needed: dict[Any, Needed] = {e: NEVER for e in order} | {root: ALWAYS for root in roots}
+    needed: dict[Expression, Needed] = {e: NEVER for e in order} | {root: ALWAYS for root in roots}
     for e in reversed(order):
         here = needed[e]
         if not isinstance(e, sympy.Piecewise):

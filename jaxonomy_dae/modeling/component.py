@@ -1,8 +1,8 @@
 """The base class of everything a user models with."""
 
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 import sympy
@@ -11,7 +11,7 @@ from ..errors import ModelError, UnknownAttribute, nearest
 from .arrays import ComponentArray, make_array
 from .connections import Connection, Signal, resolve_ends
 from .construction import Construction
-from .declarations import INITIALLY, START, Account, Learned, Parameter, Variable, full_name
+from .declarations import INITIALLY, START, Account, Learned, Parameter, Value, Variable, full_name
 from .environment import EqnEnv
 from .equations import residual_of
 from .events import HeldBranch, When
@@ -23,6 +23,8 @@ from .place import line_of_caller
 from .ports import Domain, Port
 from .real_number import real_number
 from .symbols import DiscreteSymbol, ParameterSymbol, PreviousSymbol, TimeSymbol, VariableSymbol
+
+ChildT = TypeVar("ChildT", bound="Component")
 
 
 class Component(ModeDeclarations, metaclass=Construction):
@@ -57,7 +59,7 @@ class Component(ModeDeclarations, metaclass=Construction):
         self.parameters: dict[str, Parameter] = {}
         self.variables: dict[str, Variable] = {}
         self.ports: dict[str, Port] = {}
-        self.children: dict[str, Any] = {}  # components and arrays of them
+        self.children: dict[str, Component | ComponentArray] = {}  # components and arrays of them
         self.equations: list[sympy.Expr] = []
         self.learned_terms: list[Learned] = []
         self.connections: list[Connection] = []
@@ -118,7 +120,7 @@ class Component(ModeDeclarations, metaclass=Construction):
             + (f": {nearest(name, declared)}" if declared and not name.startswith("_") else "")
         )
 
-    def __setattr__(self, name: str, value: Any):
+    def __setattr__(self, name: str, value: object):
         # `self.v = self.variable("v")` is allowed and stores nothing: a stored symbol would keep the inside's name.
         if isinstance(value, VariableSymbol | ParameterSymbol):
             if name == value.name and (name in self.variables or name in self.parameters):
@@ -162,7 +164,7 @@ class Component(ModeDeclarations, metaclass=Construction):
     def parameter(
         self,
         name: str,
-        value: Any,
+        value: Value,
         unit: str = "",
         bounds: "Interval | tuple[float, float]" = (-math.inf, math.inf),
     ) -> ParameterSymbol:
@@ -186,7 +188,7 @@ class Component(ModeDeclarations, metaclass=Construction):
         """
         return ParameterSymbol(self._declare_parameter(name, "parameter", value, unit, bounds))
 
-    def _declare_parameter(self, name: str, kind: str, value: Any, unit: str, bounds: Any = None) -> str:
+    def _declare_parameter(self, name: str, kind: str, value: Value, unit: str, bounds: Any = None) -> str:
         """Declares a parameter or a discrete variable; returns its name."""
         self._claim(name, kind)
         where = f"{kind} '{self.name}.{name}'"
@@ -242,7 +244,7 @@ class Component(ModeDeclarations, metaclass=Construction):
     def variable(
         self,
         name: str,
-        start: Any = None,
+        start: Value | None = None,
         fixed: bool = False,
         nominal: float | None = None,
         unit: str = "",
@@ -302,7 +304,7 @@ class Component(ModeDeclarations, metaclass=Construction):
             for k, s in enumerate(starts)
         )
 
-    def start(self, derivative: Any, value: Any, fixed: bool = False) -> None:
+    def start(self, derivative: object, value: Value, fixed: bool = False) -> None:
         """Prescribes a derivative at the initial time: `self.start(der(x), 2.0)`.
 
         **Arguments:**
@@ -331,7 +333,7 @@ class Component(ModeDeclarations, metaclass=Construction):
         self._check_open(f"say the start of {derivative}")
         self.add_equations(sympy.Eq(self._declare(name, "start", value, fixed), derivative, evaluate=False))
 
-    def initially(self, *equations: Any) -> None:
+    def initially(self, *equations: sympy.Basic) -> None:
         """Adds equations that hold at the initial time: `self.initially(Eq(der(T), 0))` starts at rest.
 
         Each equation replaces one fixed start. Starts that are not fixed give way.
@@ -364,7 +366,7 @@ class Component(ModeDeclarations, metaclass=Construction):
             default = real_number(default, f"the default of input '{self.name}.{name}'")
         return self._declare(name, "input", unit=unit, default=default)
 
-    def output(self, name: str, expr: Any, unit: str = "") -> VariableSymbol:
+    def output(self, name: str, expr: Value, unit: str = "") -> VariableSymbol:
         """Declares a variable that equals `expr`, to be read in the solution."""
         self._claim(name, "output")
         symbol = self._declare(name, "output", unit=unit)
@@ -385,8 +387,8 @@ class Component(ModeDeclarations, metaclass=Construction):
     def learned(
         self,
         name: str,
-        network: Any,
-        inputs: Sequence[Any],
+        network: Callable,
+        inputs: Sequence[object],
         outputs: int | None = None,
         kind: type | tuple[type, ...] | None = None,
     ) -> tuple[VariableSymbol, ...]:
@@ -418,7 +420,7 @@ class Component(ModeDeclarations, metaclass=Construction):
         return self._opaque("learned term", name, network, inputs, outputs)
 
     def function(
-        self, name: str, function: Any, inputs: Sequence[Any], outputs: int | None = None
+        self, name: str, function: object, inputs: Sequence[object], outputs: int | None = None
     ) -> tuple[VariableSymbol, ...]:
         """Puts a JAX function into the equations as it is: the untrained twin of `learned`.
 
@@ -445,7 +447,7 @@ class Component(ModeDeclarations, metaclass=Construction):
             raise ModelError(f"function '{self.name}.{name}': the function must be callable; got {function!r}{method}")
         return self._opaque("function", name, of_scalars(function), inputs, outputs)
 
-    def _opaque(self, what: str, name: str, network: Any, inputs: Sequence[Any], outputs: int | None):
+    def _opaque(self, what: str, name: str, network: Callable, inputs: Sequence[object], outputs: int | None):
         self._claim(name, what)
         where = f"{what} '{self.name}.{name}'"
         if not callable(network):
@@ -466,7 +468,7 @@ class Component(ModeDeclarations, metaclass=Construction):
         self.learned_terms.append(Learned(name, network, tuple(symbols), declared, _noun(what)))
         return declared
 
-    def add_equations(self, *equations: Any) -> None:
+    def add_equations(self, *equations: sympy.Basic) -> None:
         """Adds equations: SymPy `Eq`s, or expressions that are zero.
 
         **Raises:**
@@ -490,7 +492,7 @@ class Component(ModeDeclarations, metaclass=Construction):
 
     # --- energy ------------------------------------------------------------------------------------------------
 
-    def declare_energy(self, *expressions: Any) -> None:
+    def declare_energy(self, *expressions: object) -> None:
         """Declares the energy that the component stores (joule): `self.declare_energy(m * v**2 / 2)`.
 
         `solution.energy()` reads the declarations of energy, dissipation and supply, and
@@ -508,17 +510,17 @@ class Component(ModeDeclarations, metaclass=Construction):
         """
         self._declare_accounts("energy", expressions)
 
-    def declare_dissipation(self, *expressions: Any) -> None:
+    def declare_dissipation(self, *expressions: object) -> None:
         """Declares the power that the component loses to outside the model (watt): `d * v**2`. Heat that leaves through
         a thermal port is not lost. Otherwise as `declare_energy`."""
         self._declare_accounts("dissipation", expressions)
 
-    def declare_supply(self, *expressions: Any) -> None:
+    def declare_supply(self, *expressions: object) -> None:
         """Declares the power that the component brings into the model from outside (watt). It is negative if the
         component takes power out. Otherwise as `declare_energy`."""
         self._declare_accounts("supply", expressions)
 
-    def _declare_accounts(self, kind: str, expressions: tuple[Any, ...]):
+    def _declare_accounts(self, kind: str, expressions: tuple[object, ...]):
         self._check_open(f"declare its {kind}")
         for given in expressions:
             expression = self.symbol(given) if isinstance(given, str) else given
@@ -533,7 +535,7 @@ class Component(ModeDeclarations, metaclass=Construction):
 
     # --- hierarchy ---------------------------------------------------------------------------------------------
 
-    def add(self, child: "Component") -> Any:
+    def add(self, child: ChildT) -> ChildT:
         """Adds a child component and returns it; its names become `"self.child.variable"`."""
         if not isinstance(child, Component):
             raise ModelError(f"component '{self.name}': only components can be added; got {type(child).__name__}")
@@ -549,7 +551,7 @@ class Component(ModeDeclarations, metaclass=Construction):
         return child
 
     def add_array(
-        self, name: str, kind: "type[Component]", shape: int | tuple[int, ...], /, *args: Any, **kwargs: Any
+        self, name: str, kind: "type[Component]", shape: int | tuple[int, ...], /, *args: object, **kwargs: Any
     ) -> ComponentArray:
         """Adds an array of equal components and returns it. Its variables are called `"self.name[17].variable"`.
 
@@ -574,7 +576,7 @@ class Component(ModeDeclarations, metaclass=Construction):
         self.children[name] = array
         return array
 
-    def connect(self, *ends: Any) -> "Component":
+    def connect(self, *ends: object) -> "Component":
         """Connects ports of this component and of its children, `connect(a.p, b.n, …)` or `connect(a, "p", b, "n")`; or
         signals: `connect(a.y, b.u)` lets the variable `y` of a child (or of this component) drive the input `u` of
         another child, which is then an ordinary unknown."""

@@ -73,16 +73,16 @@ def resolve_ends(ends: Sequence[Any], where: str) -> tuple[Connection | None, li
     return Connection(tuple(found), by_element), []
 
 
-def _is_port(end: Any) -> bool:
+def _is_port(end: object) -> bool:
     return isinstance(end, Port | PortArray)
 
 
-def _is_signal(end: Any) -> bool:
+def _is_signal(end: object) -> bool:
     symbols = end.ravel() if isinstance(end, np.ndarray) else [end]
     return all(isinstance(s, VariableSymbol) and not s.order for s in symbols)
 
 
-def _shape(end: Any) -> tuple[int, ...]:
+def _shape(end: object) -> tuple[int, ...]:
     return end.chosen.numbers.shape if isinstance(end, PortArray) else getattr(end, "shape", ())
 
 
@@ -125,7 +125,7 @@ def _listed(ends: Sequence[Any]) -> str:
     return ", ".join(_named(end) for end in ends)
 
 
-def _named(end: Any) -> str:
+def _named(end: object) -> str:
     if isinstance(end, Port):
         return f"'{end.component.path}.{end.name}'"
     if isinstance(end, PortArray):

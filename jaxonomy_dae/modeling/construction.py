@@ -2,7 +2,6 @@
 when construction ends, and common slips are explained."""
 
 import re
-from typing import Any
 
 from sympy import SympifyError
 
@@ -15,7 +14,7 @@ class Construction(type):
 
     def __call__(cls, *args, **kwargs):
         try:
-            outside: tuple[Any, ...] = tuple(map(seen_from_child, args))
+            outside: tuple[object, ...] = tuple(map(seen_from_child, args))
             component = super().__call__(*outside, **{k: seen_from_child(v) for k, v in kwargs.items()})
             if "_sealed" in component.__dict__:
                 component._with_events()

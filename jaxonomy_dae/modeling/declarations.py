@@ -1,6 +1,7 @@
 """What a component declares: parameters, variables, learned terms."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -58,7 +59,7 @@ class Learned:
     """A network or function in the equations: outputs = network(inputs), all named by local variables."""
 
     name: str
-    network: Any
+    network: Callable
     inputs: tuple[VariableSymbol | TimeSymbol, ...]
     outputs: tuple[VariableSymbol, ...]
     noun: str = "network"  # or "function"

@@ -69,7 +69,14 @@ class AcausalDiagram:
         return self
 
     def add_array(
-        self, ev: EqnEnv, name: str, kind: type[Component], shape: int | tuple[int, ...], /, *args: Any, **kwargs: Any
+        self,
+        ev: EqnEnv,
+        name: str,
+        kind: type[Component],
+        shape: int | tuple[int, ...],
+        /,
+        *args: object,
+        **kwargs: Any,
     ) -> ComponentArray:
         """Adds an array of equal components, as `Component.add_array` does, and returns it.
 
@@ -88,7 +95,7 @@ class AcausalDiagram:
         self.components[name] = array
         return array
 
-    def connect(self, *ends: Any) -> "AcausalDiagram":
+    def connect(self, *ends: object) -> "AcausalDiagram":
         """Connects ports: `connect(a.p, b.n, …)`, or `connect(a, "p", b, "n")`. Connects signals: `connect(a.y, b.u)`
         lets the variable `y` of `a` drive the input `u` of `b`, which is then an ordinary unknown.
 
@@ -123,7 +130,7 @@ class AcausalDiagram:
         return self
 
 
-def _described(wrong: Any) -> str:
+def _described(wrong: object) -> str:
     if isinstance(wrong, list | tuple):
         return f"a {type(wrong).__name__}: write diagram.add(*components)"
     if isinstance(wrong, ComponentArray):

@@ -1,7 +1,6 @@
 """Equations as residuals."""
 
 import functools
-from typing import Any
 
 import sympy
 
@@ -10,7 +9,7 @@ from ..expressions.from_sympy import atoms_of
 from .symbols import PreviousSymbol, VariableSymbol
 
 
-def zero_of(equation: Any) -> Any:
+def zero_of(equation: object) -> sympy.Basic:
     """Left side minus right side of an equation; an expression is returned as it is."""
     if isinstance(equation, sympy.Eq):
         return equation.lhs - equation.rhs  # pyright: ignore[reportOperatorIssue]
@@ -18,7 +17,7 @@ def zero_of(equation: Any) -> Any:
 
 
 @functools.lru_cache(maxsize=4096)
-def residual_of(equation: Any) -> sympy.Expr:
+def residual_of(equation: object) -> sympy.Expr:
     """Left side minus right side of an equation of a component.
 
     **Raises:**

@@ -1,11 +1,13 @@
 """How a component declares discrete variables and events."""
 
-from typing import Any
+from collections.abc import Callable
 
 import sympy
 
+from ..aliases import Condition, Expression
 from ..errors import ModelError
 from ..expressions.from_sympy import symbols_of
+from .declarations import Value
 from .environment import EqnEnv
 from .event_flags import NO_FLAG, EventFlag
 from .events import (
@@ -32,14 +34,14 @@ class EventDeclarations:
     path: str
     events: list[When]
     equations: list[sympy.Expr]
-    _check_open: Any
-    add_equations: Any
-    _declare: Any
-    _declare_parameter: Any
-    _check_parameters_only: Any
-    _without_jumps: Any
+    _check_open: Callable[[str], None]
+    add_equations: Callable[..., None]
+    _declare: Callable[..., VariableSymbol]
+    _declare_parameter: Callable[..., str]
+    _check_parameters_only: Callable[[sympy.Expr, str], None]
+    _without_jumps: Callable[[Condition], Condition]
 
-    def discrete(self, name: str, start: Any = 0.0, unit: str = "") -> DiscreteSymbol:
+    def discrete(self, name: str, start: Value = 0.0, unit: str = "") -> DiscreteSymbol:
         """Declares a discrete variable: constant but for the events that assign it.
 
         **Arguments:**
@@ -55,7 +57,7 @@ class EventDeclarations:
         """
         return DiscreteSymbol(self._declare_parameter(name, "discrete variable", start, unit))
 
-    def sampled(self, period: Any, offset: Any = 0.0) -> Sampled:
+    def sampled(self, period: Value, offset: Value = 0.0) -> Sampled:
         """A condition for `when` that becomes true again and again, at offset + k·period for k = 0, 1, 2, …
 
         **Arguments:**
@@ -81,7 +83,9 @@ class EventDeclarations:
             raise ModelError(f"component '{self.name}': the period of sampled must be positive; got {parts[0]}")
         return Sampled(*parts)
 
-    def when(self, condition: Any, *actions: Action, on: Any = None, at_start: bool = False) -> None:
+    def when(
+        self, condition: sympy.Basic | Sampled, *actions: Action, on: sympy.Basic | None = None, at_start: bool = False
+    ) -> None:
         """Declares an event: what happens at the instant at which a condition becomes true.
 
         ```python
@@ -109,12 +113,12 @@ class EventDeclarations:
 
     def _event(
         self,
-        condition: Any,
+        condition: Condition,
         actions: tuple[Action, ...],
-        on: Any,
+        on: Condition,
         flags: EventFlag,
         text: str | None = None,
-        watched: Any = sympy.true,
+        watched: Condition = sympy.true,
     ) -> None:
         """Declares an event, shown as `text`; its guard is monitored only while `watched` holds."""
         self._check_open("declare its events")
@@ -161,8 +165,8 @@ class EventDeclarations:
     def _values(self, actions: tuple[Action, ...], number: int, where: str) -> tuple:
         """The values that the actions of an event write: for each action a number, the name of a hidden variable that
         is declared here for its expression, or None for `terminate`."""
-        new: dict[Any, sympy.Expr] = {}
-        targets: list[Any] = []
+        new: dict[sympy.Expr, sympy.Expr] = {}
+        targets: list[sympy.Expr] = []
         for action in actions:
             if isinstance(action, Terminate):
                 continue
@@ -189,7 +193,7 @@ class EventDeclarations:
         return tuple(values)
 
 
-def _with_new_values(value: Any, new: dict, above: tuple, where: str) -> Any:
+def _with_new_values(value: Expression, new: dict, above: tuple, where: str) -> Expression:
     """Substitutes the new values of discrete variables that the same event assigns. `above` are the symbols being
     substituted: a circle among them is refused."""
     read = sorted((s for s in value.free_symbols if s in new), key=str)

@@ -1,13 +1,15 @@
 """What a component says of events: conditions, and what happens when they become true."""
 
 import dataclasses
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import sympy
 from sympy.logic.boolalg import BooleanAtom, BooleanFunction, to_nnf
 
+from ..aliases import Condition
 from ..errors import ModelError
 from ..expressions.from_sympy import symbols_of
+from .declarations import Value
 from .event_flags import EventFlag
 from .symbols import DiscreteSymbol, ParameterSymbol, PreviousSymbol, RelationSymbol, TimeSymbol, VariableSymbol
 
@@ -80,7 +82,7 @@ class HeldBranch:
     closed: DiscreteSymbol | None = None
 
 
-def pre(symbol: Any) -> sympy.Expr:
+def pre(symbol: sympy.Symbol) -> sympy.Expr:
     """The value of a variable before the present event, for use in `reinit` and `assign`.
 
     **Raises:**
@@ -94,7 +96,7 @@ def pre(symbol: Any) -> sympy.Expr:
     raise ModelError(f"pre takes a variable or a discrete variable; got {symbol}")
 
 
-def reinit(variable: Any, value: Any) -> Reinit:
+def reinit(variable: sympy.Symbol, value: Value) -> Reinit:
     """In `when`: sets a state to a new value. In `value`, variables have their values before the event.
 
     **Raises:**
@@ -109,7 +111,7 @@ def reinit(variable: Any, value: Any) -> Reinit:
     return Reinit(variable, _expression(value, f"reinit({variable}, …)"))
 
 
-def assign(variable: Any, value: Any) -> Assign:
+def assign(variable: sympy.Symbol, value: Value | sympy.Basic) -> Assign:
     """In `when`: assigns a value to a discrete variable, which keeps it until the next event assigns another one.
 
     **Raises:**
@@ -129,7 +131,7 @@ def terminate(message: str) -> Terminate:
     return Terminate(message)
 
 
-def _expression(value: Any, where: str) -> sympy.Expr:
+def _expression(value: object, where: str) -> sympy.Expr:
     try:
         found = sympy.sympify(value)
     except (sympy.SympifyError, TypeError):
@@ -141,9 +143,9 @@ def _expression(value: Any, where: str) -> sympy.Expr:
     return found
 
 
-def guard_of(condition: Any, where: str) -> sympy.Expr:
+def guard_of(condition: Condition, where: str) -> sympy.Expr:
     """An expression that is positive where a condition is false, and falls through zero where it becomes true."""
-    relation: Any = condition
+    relation: Condition = condition
     if isinstance(condition, BooleanAtom | bool):
         raise ModelError(f"{where}: the condition is always {condition}: it contains no variable")
     if _is_discrete(condition):
@@ -164,7 +166,7 @@ def guard_of(condition: Any, where: str) -> sympy.Expr:
     return _refused(condition, where)
 
 
-def is_strict(condition: Any) -> bool:
+def is_strict(condition: Condition) -> bool:
     """True for conditions with a relation that is false where its sides are equal; False for clocks."""
     if isinstance(condition, sympy.Not):
         return is_strict(to_nnf(condition))
@@ -173,12 +175,12 @@ def is_strict(condition: Any) -> bool:
     return isinstance(condition, sympy.StrictLessThan | sympy.StrictGreaterThan)
 
 
-def while_on(guard: sympy.Expr, condition: Any) -> sympy.Expr:
+def while_on(guard: sympy.Expr, condition: Condition) -> sympy.Expr:
     """A guard that is there only while a condition in discrete variables holds."""
     return guard if condition is sympy.true else sympy.Piecewise((guard, condition), (1, True), evaluate=False)
 
 
-def relation_in_discretes(mode: Any, where: str) -> Any:
+def relation_in_discretes(mode: Condition, where: str) -> Condition:
     """A condition that changes by events alone: a relation in discrete variables, or one of them, true if not zero.
 
     **Raises:**
@@ -192,7 +194,7 @@ def relation_in_discretes(mode: Any, where: str) -> Any:
     return mode
 
 
-def _is_discrete(condition: Any) -> bool:
+def _is_discrete(condition: Condition) -> bool:
     """True for a relation, or a combination of relations, that contains neither variables nor time: it can change at
     events only."""
     symbols = symbols_of(condition)
@@ -201,7 +203,7 @@ def _is_discrete(condition: Any) -> bool:
     )
 
 
-def _refused(condition: Any, where: str) -> sympy.Expr:
+def _refused(condition: object, where: str) -> sympy.Expr:
     if isinstance(condition, sympy.Eq | sympy.Ne):
         raise ModelError(
             f"{where}: {condition} holds at single instants only, if ever: write <= or >=, for a crossing in one "

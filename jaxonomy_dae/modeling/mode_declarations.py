@@ -1,10 +1,10 @@
 """How a component declares equations that change: branches and complementary pairs."""
 
-from typing import Any
-
 import sympy
 
+from ..aliases import Condition, Expression
 from ..errors import ModelError
+from .declarations import Value
 from .equations import zero_of
 from .event_flags import EventFlag
 from .events import Assign, HeldBranch, relation_in_discretes
@@ -19,7 +19,7 @@ class ModeDeclarations(RelationDeclarations):
 
     held_branches: list[HeldBranch]
 
-    def either(self, mode: Any, then: Any, otherwise: Any, order: int = 0) -> None:
+    def either(self, mode: sympy.Basic, then: Value, otherwise: Value, order: int = 0) -> None:
         """Adds an equation with two branches: `then` is zero while the mode holds, `otherwise` is zero while it does
         not. An ideal switch is `self.either(Eq(closed, 1), v, i)`.
 
@@ -44,8 +44,8 @@ class ModeDeclarations(RelationDeclarations):
         self._either(relation_in_discretes(mode, f"component '{self.name}': either"), then, otherwise, order, None)
 
     def complementary(
-        self, gap: Any, force: Any, name: str = "active", order: int = 0, restitution: Any = None,
-        rest_speed: Any = 0.0, clearance: Any = 1e-9, start: Any = 0,
+        self, gap: Value, force: Value, name: str = "active", order: int = 0, restitution: Value | None = None,
+        rest_speed: Value = 0.0, clearance: Value = 1e-9, start: Value = 0,
     ) -> DiscreteSymbol:  # fmt: skip
         """Adds gap ≥ 0, force ≥ 0 and gap·force = 0: one of the two is zero, and the other is not negative.
 
@@ -81,8 +81,8 @@ class ModeDeclarations(RelationDeclarations):
                 f"order={order}"
             )
         active = self.discrete(name, start=start, unit="1")
-        closed: Any = sympy.Eq(active, 1)
-        open_: Any = sympy.Eq(active, 0)
+        closed: Condition = sympy.Eq(active, 1)
+        open_: Condition = sympy.Eq(active, 0)
         impulse = self._either(closed, gap, force, order, active)
         chooses = EventFlag.LISTED | EventFlag.AT_START | EventFlag.REVOCABLE
         if impulse is None:
@@ -106,12 +106,12 @@ class ModeDeclarations(RelationDeclarations):
         shown = f"{gap <= 0}, on={open_}"
         self._event(gap + depth <= 0, struck, open_, chooses | EventFlag.STRIKE, shown)
         self._event(force <= 0, (Assign(active, no), Assign(lifted, no)), closed, chooses)
-        low: Any = sympy.Ne(lifted, 1)
+        low: Condition = sympy.Ne(lifted, 1)
         self._event(gap >= clearance, (Assign(lifted, yes),), sympy.And(open_, low), EventFlag.AT_START)
         return active
 
     def _either(
-        self, condition: Any, then: Any, otherwise: Any, order: int, pushes: DiscreteSymbol | None
+        self, condition: Condition, then: Expression, otherwise: Expression, order: int, pushes: DiscreteSymbol | None
     ) -> RelationSymbol | None:
         """Adds an equation with two branches; for one that is differentiated, what an event assigns to let an impulse
         act: 1 takes away the lowest derivative that may jump, 1 + e gives back the part e of it. `pushes` is the mode
@@ -129,7 +129,7 @@ class ModeDeclarations(RelationDeclarations):
         impulse = self._hidden_discrete(0.0)
         *zero, top = levels
         number = len(self.held_branches)
-        asked: Any = sympy.Ne(impulse, 0)
+        asked: Condition = sympy.Ne(impulse, 0)
         acts = sympy.Or(condition, asked)
         self.add_equations(sympy.Piecewise((top + impulse * zero[-1], acts), (otherwise, True)))
         self.held_branches.append(
@@ -145,7 +145,7 @@ class ModeDeclarations(RelationDeclarations):
         return impulse
 
 
-def _expression(value: Any, where: str) -> Any:
+def _expression(value: Expression, where: str) -> Expression:
     found = sympy.sympify(value)
     if not isinstance(found, sympy.Expr):
         raise ModelError(f"{where} {value} is not an expression")

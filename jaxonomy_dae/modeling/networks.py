@@ -8,16 +8,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
+from ..aliases import PyTree
 from ..errors import ModelError
 
 
-def as_weights(theta: Any) -> Any:
+def as_weights(theta: PyTree) -> PyTree:
     """Weights as arrays: Python and NumPy numbers become JAX arrays, everything else stays."""
     return jax.tree.map(lambda leaf: jnp.asarray(leaf) if eqx.is_inexact_array_like(leaf) else leaf, theta)
 
 
-def count_outputs(network: Callable, inputs: int, where: str, theta: Any = None, noun: str = "network") -> int:
+def count_outputs(network: Callable, inputs: int, where: str, theta: PyTree = None, noun: str = "network") -> int:
     """The number of outputs of `network(u)` or `network(t, u, theta)`, found without computing anything; `noun` is what
     errors call it."""
     dtypes = [leaf.dtype for leaf in jax.tree.leaves((network, theta)) if eqx.is_inexact_array(leaf)]
@@ -52,7 +54,7 @@ def count_outputs(network: Callable, inputs: int, where: str, theta: Any = None,
     return out.shape[0]
 
 
-def check_kind(network: Any, kind: Any, where: str) -> None:
+def check_kind(network: object, kind: Any, where: str) -> None:
     """Refuses a network that is not of a kind: a class, or a tuple of classes.
 
     **Raises:**
@@ -73,7 +75,7 @@ def check_kind(network: Any, kind: Any, where: str) -> None:
     )
 
 
-def _on_device(leaf: Any) -> Any:
+def _on_device(leaf: PyTree) -> PyTree:
     """A NumPy array as one of JAX; with its type, for which `asarray` compiles no program."""
     return jnp.asarray(leaf, jnp.result_type(leaf.dtype)) if isinstance(leaf, np.ndarray) else leaf
 
@@ -81,13 +83,13 @@ def _on_device(leaf: Any) -> Any:
 class OfScalars(eqx.Module):
     """A function of scalars as a function of one vector, u ↦ (outputs,); the arrays it holds are leaves."""
 
-    function: Any
+    function: Callable
 
-    def __call__(self, u: Any) -> Any:
+    def __call__(self, u: Array) -> Array:
         return jnp.atleast_1d(jnp.asarray(self.function(*u)))
 
 
-def of_scalars(function: Any) -> OfScalars:
+def of_scalars(function: Callable) -> OfScalars:
     """`function(x, y, …) -> scalar or (outputs,)` as a module; NumPy arrays in it become JAX arrays."""
     return OfScalars(jax.tree.map(_on_device, function))
 

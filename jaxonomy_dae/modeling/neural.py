@@ -1,7 +1,7 @@
 """Learned corrections of a model's equations."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Literal
 
 from ..errors import ModelError
 from .component import Component
@@ -37,13 +37,13 @@ class NeuralDAEBlock:
     def __init__(
         self,
         network: Callable,
-        theta: Any = None,
+        theta: object = None,
         *,
-        targets: Sequence[Any],
-        inputs: Sequence[Any] | None = None,
+        targets: Sequence[object],
+        inputs: Sequence[object] | None = None,
         name: str,
         inject: Literal["equation", "row"] = "equation",
-        kind: Any = None,
+        kind: object = None,
     ):
         where = f"neural block '{name}'"
         check_name(name, "neural block")
@@ -72,7 +72,7 @@ class NeuralDAEBlock:
         return f"NeuralDAEBlock({self.name!r}, inject={self.inject!r})"
 
 
-def _reference(entry: Any, where: str) -> tuple[Component | None, str]:
+def _reference(entry: object, where: str) -> tuple[Component | None, str]:
     """Reads a reference to a variable. Returns (component, local name), or (None, full name) for a string."""
     if isinstance(entry, str):
         return None, entry

@@ -5,7 +5,9 @@ positive into the component.
 """
 
 import dataclasses
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
+
+import sympy
 
 from ..errors import UnknownAttribute
 
@@ -58,7 +60,7 @@ class Owner(Protocol):
         """The component that contains it."""
         ...
 
-    def symbol(self, name: str) -> Any:
+    def symbol(self, name: str) -> sympy.Symbol:
         """The symbol of a declared variable or parameter, as the component now being written sees it."""
         ...
 

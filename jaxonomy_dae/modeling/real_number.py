@@ -12,7 +12,7 @@ import sympy
 from ..errors import ModelError
 
 
-def real_number(value: Any, where: str, hint: str = "") -> float:
+def real_number(value: object, where: str, hint: str = "") -> float:
     """The finite real number `value`; `where` names it in errors.
 
     **Raises:**
@@ -37,7 +37,7 @@ def real_number(value: Any, where: str, hint: str = "") -> float:
     return number
 
 
-def is_unknown_to_jax(value: Any) -> bool:
+def is_unknown_to_jax(value: object) -> bool:
     """True for numbers that JAX does not read, such as those of SymPy, and for texts."""
     return isinstance(value, str | sympy.Basic | fractions.Fraction | decimal.Decimal)
 
@@ -50,7 +50,7 @@ def _is_numeral(text: str) -> bool:
     return True
 
 
-def _is_complex(value: Any) -> bool:
+def _is_complex(value: object) -> bool:
     if isinstance(value, sympy.Expr):
         return bool(value.has(sympy.I))
     if isinstance(value, numbers.Complex):
@@ -58,5 +58,5 @@ def _is_complex(value: Any) -> bool:
     return np.issubdtype(getattr(value, "dtype", np.float64), np.complexfloating)
 
 
-def _is_array(value: Any) -> bool:
+def _is_array(value: object) -> bool:
     return hasattr(value, "dtype") or isinstance(value, list | tuple)

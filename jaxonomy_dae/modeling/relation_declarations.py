@@ -6,6 +6,7 @@ from typing import Any
 import sympy
 from sympy.logic.boolalg import BooleanAtom
 
+from ..aliases import Condition, Expression
 from ..expressions.to_sympy import shortened
 from .automatic_events import Splitting, Stepping, Timed, TimedSteps, Turning, jumps, turned, varies, with_events
 from .event_declarations import EventDeclarations
@@ -22,7 +23,7 @@ class RelationDeclarations(EventDeclarations):
     relations: list[float]  # the starts of discrete variables that are not shown
     as_written: dict[sympy.Expr, sympy.Expr]  # of equations in which relations are events
 
-    def relation(self, condition: Any) -> Any:
+    def relation(self, condition: Condition) -> Condition:
         """A condition for `Piecewise` whose changes are events: steps end where it turns, on either side equations see
         it as it is there, and derivatives know that the time of the change moves. Conditions in `Piecewise` become such
         by themselves; this one can be given to several equations.
@@ -41,7 +42,7 @@ class RelationDeclarations(EventDeclarations):
         """
         return condition if isinstance(condition, BooleanAtom | bool) else self._followed(condition)[0]
 
-    def _followed(self, condition: Any) -> tuple[Any, Any]:
+    def _followed(self, condition: Condition) -> tuple[Condition, Condition]:
         """Declares the events of a condition. Returns (the condition as equations see it between events, the truth that
         the last event has left)."""
         numbers = Splitting(len(self.relations))
@@ -51,11 +52,11 @@ class RelationDeclarations(EventDeclarations):
             self._ticks(each)
         if numbers.timed and not varies(guarded):
             return live, guarded
-        known: Any = self._hidden_discrete(float(LIVE))
+        known: Condition = self._hidden_discrete(float(LIVE))
         self._turns(Turning(known.number, self._without_jumps(guarded), sympy.true))
         return turned(known.number, condition), sympy.Eq(known, 1)
 
-    def _without_jumps(self, condition: Any) -> Any:
+    def _without_jumps(self, condition: Condition) -> Condition:
         """The condition for a guard that turns where sides jump, as floor(x) does, and moves with these jumps: such a
         side is a variable of its own, whose equation has events as others have.
 
@@ -70,14 +71,14 @@ class RelationDeclarations(EventDeclarations):
         own = condition.func(*sides, evaluate=False)
         return own if is_strict(condition) else self._turning_alone(condition, own)
 
-    def _turning_alone(self, condition: Any, own: Any) -> Any:
+    def _turning_alone(self, condition: Condition, own: Condition) -> Condition:
         if own == condition or not isinstance(own, _ORDERED):
             return own
         known = self._hidden_discrete(float(LIVE))
         self._turns(Turning(known.number, own, sympy.true))
         return sympy.Eq(known, 1)
 
-    def _as_variable(self, side: Any) -> VariableSymbol:
+    def _as_variable(self, side: Expression) -> VariableSymbol:
         symbol = self._declare(f":side[{len(self.equations)}]", "event")
         self.equations.append(symbol - side)
         return symbol
@@ -108,7 +109,7 @@ class RelationDeclarations(EventDeclarations):
     def _ticks(self, relation: Timed) -> None:
         """Clocks of a relation of time. At the initial time it is as its sides say, unless a clock ticks there."""
         known, condition, edges = RelationSymbol(relation.number), relation.condition, relation.edges
-        unknown: Any = sympy.Eq(PreviousSymbol(known.path), LIVE)
+        unknown: Condition = sympy.Eq(PreviousSymbol(known.path), LIVE)
         as_it_is = sympy.Piecewise((1, condition), (0, True))
         for clock, after in edges.clocks:
             value = _unless(sympy.Or(unknown, sympy.Not(edges.turns)), as_it_is, after)
@@ -117,7 +118,7 @@ class RelationDeclarations(EventDeclarations):
     def _ticks_of_steps(self, whole: TimedSteps) -> None:
         """Clocks of a whole part of time, which is halfway to the next number from the one that it has at a tick."""
         live, known = RelationSymbol(whole.number), RelationSymbol(whole.number + 1)
-        unknown: Any = sympy.Eq(PreviousSymbol(live.path), LIVE)
+        unknown: Condition = sympy.Eq(PreviousSymbol(live.path), LIVE)
         now = sympy.floor(whole.argument)
         for clock, rises in whole.edges.clocks:
             after = sympy.floor(whole.argument + rises - sympy.Rational(1, 2))
@@ -131,8 +132,8 @@ class RelationDeclarations(EventDeclarations):
         """Events of a whole part. One may leave more than one number behind at an instant, where the argument jumps."""
         live, known = RelationSymbol(whole.number), RelationSymbol(whole.number + 1)
         before, now = PreviousSymbol(known.path), sympy.floor(whole.argument)
-        unknown: Any = sympy.Eq(live, LIVE)
-        found: Any = sympy.Ne(live, LIVE)
+        unknown: Condition = sympy.Eq(live, LIVE)
+        found: Condition = sympy.Ne(live, LIVE)
         text, watched = shortened(now), whole.watched
         self._relation_event(unknown, text, watched, Assign(live, sympy.Integer(0)), Assign(known, now))
         for condition, value in (
@@ -141,12 +142,14 @@ class RelationDeclarations(EventDeclarations):
         ):
             self._relation_event(condition, text, sympy.And(found, watched), Assign(known, value))
 
-    def _relation_event(self, condition: Any, text: str, watched: Any, *actions: Assign, kink: bool = False) -> None:
+    def _relation_event(
+        self, condition: Condition, text: str, watched: Condition, *actions: Assign, kink: bool = False
+    ) -> None:
         flags = EventFlag.AT_START | EventFlag.REVOCABLE | EventFlag.RELATION | (EventFlag.KINK if kink else NO_FLAG)
         self._event(condition, actions, None, flags, text, watched)
 
 
-def _unless(condition: Any, otherwise: Any, value: Any) -> Any:
+def _unless(condition: Condition, otherwise: Expression, value: Expression) -> Expression:
     return sympy.Piecewise((otherwise, condition), (value, True), evaluate=False)
 
 

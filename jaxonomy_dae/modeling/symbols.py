@@ -8,11 +8,11 @@ symbol means is decided when the diagram is flattened, by integers. What a compo
 
 import functools
 import sys
-from collections.abc import Hashable
-from typing import Any
+from typing import Any, SupportsFloat
 
 import sympy
 
+from ..aliases import Condition
 from ..errors import ModelError
 from ..expressions.differentiate import directional_derivative, raised
 from ..expressions.from_sympy import UnsupportedExpression, read, symbols_of
@@ -37,7 +37,7 @@ class ComponentSymbol(sympy.Symbol):
     __hash__ = sympy.Symbol.__hash__
 
 
-def _refuse(comparison: str, symbol: sympy.Symbol, number: Any):
+def _refuse(comparison: str, symbol: sympy.Symbol, number: object):
     """Raises a `ModelError` unless SymPy or this package compares symbols as what they are."""
     caller, package = sys._getframe(1), __name__
     while caller is not None and (package == __name__ or package.startswith(("jaxtyping", "beartype"))):
@@ -152,7 +152,7 @@ ENVIRONMENT_TIME = EnvironmentTime()
 TIME_LABEL = ("time",)
 
 
-def symbol_label(symbol: sympy.Symbol) -> Hashable:
+def symbol_label(symbol: sympy.Symbol) -> tuple:
     """The label of a symbol in expression graphs."""
     if isinstance(symbol, VariableSymbol):
         return ("variable", symbol.path, symbol.order)
@@ -166,7 +166,7 @@ def symbol_label(symbol: sympy.Symbol) -> Hashable:
 def seen_from_child(value: Any) -> Any:
     """An argument of a component that is being made: symbols in it, of the place where it is made, get `../` paths."""
     if isinstance(value, sympy.Basic):
-        outside: dict[Any, Any] = {}
+        outside: dict[sympy.Basic, sympy.Basic] = {}
         for s in value.free_symbols:
             if isinstance(s, VariableSymbol):
                 outside[s] = VariableSymbol(f"../{s.path}", s.order)
@@ -192,7 +192,7 @@ SHADOWED = (
 )
 
 
-def Eq(left: Any, right: Any) -> Any:
+def Eq(left: SupportsFloat, right: SupportsFloat) -> Condition:
     """The equation left = right: SymPy's `Eq`.
 
     **Raises:**
@@ -214,7 +214,7 @@ def Eq(left: Any, right: Any) -> Any:
         ) from None
 
 
-def der(expression: Any) -> Any:
+def der(expression: object) -> sympy.Expr:
     """The time derivative of a variable, or of an expression in variables, parameters and time.
 
     **Arguments:**

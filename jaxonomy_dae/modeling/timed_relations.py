@@ -9,6 +9,7 @@ from typing import Any
 
 import sympy
 
+from ..aliases import Condition, Expression
 from ..expressions.from_sympy import symbols_of
 from .events import Sampled
 from .symbols import DiscreteSymbol, ParameterSymbol, PreviousSymbol, RelationSymbol, TimeSymbol
@@ -28,11 +29,11 @@ class Edges:
     """The instants at which a relation turns. At each tick of a clock the relation becomes the expression beside that
     clock (1 or 0, in parameters), provided that `turns`, a condition on parameters, holds; otherwise it never turns."""
 
-    clocks: tuple[tuple[Sampled, Any], ...]
-    turns: Any
+    clocks: tuple[tuple[Sampled, Expression], ...]
+    turns: Condition
 
 
-def edges_of(relation: Any) -> Edges | None:
+def edges_of(relation: Condition) -> Edges | None:
     """The clocks at which a relation turns; None if its form is not recognised, or it depends on more than time."""
     found = _in_time(relation)
     if found is None:
@@ -42,7 +43,7 @@ def edges_of(relation: Any) -> Edges | None:
     if isinstance(head, TimeSymbol):
         return Edges(((Sampled(None, level), _after(truth)),), _nonzero(slope))
     if isinstance(head, sympy.sin | sympy.cos):
-        inside: Any = head.args[0]
+        inside: Expression = head.args[0]
         angle = inside + (sympy.pi / 2 if isinstance(head, sympy.cos) else 0)
         frequency, instant = _affine(angle)
         if frequency is None:
@@ -67,7 +68,7 @@ def edges_of(relation: Any) -> Edges | None:
     return Edges(clocks, sympy.And(crosses, _nonzero(slope), _nonzero(frequency)))
 
 
-def whole_edges(argument: Any) -> Edges | None:
+def whole_edges(argument: Expression) -> Edges | None:
     """The clocks at which floor(argument) changes. Instead of a truth, each clock has the direction: 1 for up by one, 0
     for down."""
     if not _in_parameters(argument):
@@ -79,7 +80,7 @@ def whole_edges(argument: Any) -> Edges | None:
     return Edges(((Sampled(every, _quotient(-at_zero, slope)), _after(slope)),), _nonzero(slope))
 
 
-def in_relations_of_time(condition: Any) -> Any:
+def in_relations_of_time(condition: Condition) -> Condition:
     """The condition with relations of Max, Min and Abs of time replaced by relations of their arguments."""
     if isinstance(condition, sympy.And | sympy.Or | sympy.Not):
         return condition.func(*map(in_relations_of_time, condition.args))
@@ -101,18 +102,18 @@ def in_relations_of_time(condition: Any) -> Any:
     return together(*map(in_relations_of_time, parts))
 
 
-def relations_in(condition: Any) -> list[Any]:
+def relations_in(condition: Condition) -> list[Condition]:
     """The relations that a condition is made of."""
     if isinstance(condition, sympy.And | sympy.Or | sympy.Not):
         return list(dict.fromkeys(r for part in condition.args for r in relations_in(part)))
     return [condition] if isinstance(condition, sympy.core.relational.Relational) else []
 
 
-def _sides(relation: Any) -> tuple[Any, Any]:
+def _sides(relation: Condition) -> tuple[Expression, Expression]:
     return relation.args
 
 
-def _in_time(relation: Any) -> tuple[Any, Any, Any] | None:
+def _in_time(relation: Condition) -> tuple[Expression, Expression, Expression] | None:
     """Writes a relation as slope·(head − level), ordered against zero, where only the head changes with time. Returns
     (slope, head, level), or None."""
     if not isinstance(relation, _ORDERED) or not _in_parameters(relation):
@@ -125,7 +126,7 @@ def _in_time(relation: Any) -> tuple[Any, Any, Any] | None:
     return slope, head, _quotient(-rest, slope)
 
 
-def _with_one_head(e: Any) -> tuple[Any, Any, Any] | None:
+def _with_one_head(e: Expression) -> tuple[Expression, Expression, Expression] | None:
     """Writes an expression as slope·head + rest, where slope and rest do not change with time. Returns (slope, head,
     rest), with head None if nothing does; None if there are several heads."""
     if not _changes(e):
@@ -147,7 +148,7 @@ def _with_one_head(e: Any) -> tuple[Any, Any, Any] | None:
     return None
 
 
-def _affine(e: Any) -> tuple[Any, Any]:
+def _affine(e: Expression) -> tuple[Expression, Expression]:
     """Writes an expression as slope·t + value. Returns (slope, value), or (None, None) if it is not affine in time."""
     found = _with_one_head(e)
     if found is None or not isinstance(found[1], TimeSymbol):
@@ -155,11 +156,11 @@ def _affine(e: Any) -> tuple[Any, Any]:
     return found[0], found[2]
 
 
-def _changes(e: Any) -> bool:
+def _changes(e: Expression) -> bool:
     return any(isinstance(s, TimeSymbol) for s in symbols_of(e))
 
 
-def _in_parameters(e: Any) -> bool:
+def _in_parameters(e: Expression) -> bool:
     """True if an expression contains only time and parameters: no discrete variables, relations or values from before
     an event."""
     changing = DiscreteSymbol | RelationSymbol | PreviousSymbol
@@ -169,19 +170,19 @@ def _in_parameters(e: Any) -> bool:
     )
 
 
-def _after(direction: Any) -> Any:
+def _after(direction: Expression) -> Expression:
     """1 if a quantity that passes zero with this slope rises, 0 if it falls."""
     return sympy.Piecewise((1, direction > 0), (0, True))
 
 
-def _nonzero(e: Any) -> Any:
+def _nonzero(e: Expression) -> Condition:
     return sympy.Ne(e, 0)
 
 
-def _where(condition: Any, e: Any, otherwise: Any = 0) -> Any:
+def _where(condition: Condition, e: Expression, otherwise: Expression = 0) -> Expression:
     return sympy.Piecewise((e, condition), (otherwise, True))
 
 
-def _quotient(a: Any, b: Any) -> Any:
+def _quotient(a: Expression, b: Expression) -> Expression:
     """a/b, or 0 where b is 0."""
     return a / b if b.is_number else _where(_nonzero(b), a / b)

@@ -17,6 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from ..aliases import PyTree
 from .machine import Use, mappings, memory, return_memory
 from .reasons import reason
 from .staging import is_traced
@@ -74,7 +75,7 @@ class ProgramCache:
     def __len__(self) -> int:
         return len(self._programs)
 
-    def call(self, function: Callable, runs_once: bool, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    def call(self, function: Callable, runs_once: bool, args: tuple[PyTree, ...], kwargs: dict[str, Any]) -> Any:
         """Calls `function(*args, **kwargs)` through the program compiled at the first call of this kind."""
         leaves, structure = jax.tree.flatten((args, kwargs))
         # Those of NumPy, such as weights of a user's, lie nowhere yet.

@@ -8,17 +8,18 @@ from typing import Any
 import jax
 import numpy as np
 
+from ..aliases import PyTree
 from .staging import layers
 
 SHOWN = 8  # members that a sentence lists
 
 
-def is_batched(tree: Any) -> bool:
+def is_batched(tree: PyTree) -> bool:
     """True if `jax.vmap` is at work on a leaf."""
     return any(hasattr(layer, "batch_dim") for leaf in jax.tree.leaves(tree) for layer in layers(leaf))
 
 
-def batch_size(tree: Any) -> int:
+def batch_size(tree: PyTree) -> int:
     """How many members `jax.vmap` computes at once, as far as the leaves show it; 1 outside of batches.
 
     In `jax.vmap(jax.jit(f))` it cannot be seen from inside f.

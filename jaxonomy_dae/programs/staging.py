@@ -8,14 +8,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.typing import DTypeLike
+
+from ..aliases import PyTree
 
 
-def is_traced(tree: Any) -> bool:
+def is_traced(tree: PyTree) -> bool:
     """True if a leaf is a tracer: inside `jax.jit`, `jax.grad`, `jax.vmap` and the like."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
-def is_staged(tree: Any) -> bool:
+def is_staged(tree: PyTree) -> bool:
     """True if a leaf has no value yet: inside `jax.jit`, loops, `jax.make_jaxpr`.
 
     Under `jax.grad`, `jax.jvp` and `jax.vmap` alone, outside of jit, leaves are tracers around arrays, and JAX would
@@ -30,7 +33,7 @@ def as_array(value: Any) -> Any:
     return jnp.asarray(value) if is_traced(value) else np.asarray(value)
 
 
-def on_device(value: Any, dtype: Any = None) -> Any:
+def on_device(value: Any, dtype: DTypeLike | None = None) -> Any:
     """A number, or an array, as JAX' array of this type: where values are known, without a program that converts it."""
     # `jnp.asarray` compiles a program for each shape; `device_put` might share the memory of what it is given.
     return jnp.asarray(value, dtype) if is_traced(value) else jax.device_put(np.array(value, dtype))
@@ -48,7 +51,7 @@ def joined(parts: Sequence[Any]) -> Any:
     return on_device(np.concatenate([np.asarray(part) for part in parts], axis=-1))
 
 
-def is_forwards(tree: Any) -> bool:
+def is_forwards(tree: PyTree) -> bool:
     """True if `jax.jvp` or `jax.jacfwd` is at work on a leaf, and no reverse mode.
 
     `jax.jit(jax.jacfwd(f))` is known for what it is; inside `jax.jacfwd(jax.jit(f))` it cannot be seen.

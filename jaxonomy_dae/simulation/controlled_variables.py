@@ -14,7 +14,7 @@ import numpy as np
 
 from ..adjoint.resting import still
 from ..adjoint.wrapped_control import WrappedControl
-from ..aliases import Args, Controller, State, Time, Tolerance
+from ..aliases import Args, Controller, Solver, State, Time, Tolerance
 from ..errors import ModelError
 from ..programs.staging import is_traced
 from ..solvers import BDF
@@ -58,7 +58,9 @@ class ControlledVariables(WrappedControl):
         return self.system.at(t, args).quantities(x, np.array(self.quantity), np.array(self.factor))
 
 
-def with_variables(system: AcausalSystem, controller: Any, solver: Any, names: Sequence[str], atol: Tolerance) -> Any:
+def with_variables(
+    system: AcausalSystem, controller: Controller, solver: Solver, names: Sequence[str], atol: Tolerance
+) -> Any:
     """The controller, with the variables of these names under error control, too.
 
     **Raises:**

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
 from ..errors import ModelError
@@ -30,7 +31,7 @@ class EventLog(eqx.Module):
     after: Float[Array, "*batch rows m"]
 
     @classmethod
-    def empty(cls, batch: tuple[int, ...], m: int, dtype: Any) -> "EventLog":
+    def empty(cls, batch: tuple[int, ...], m: int, dtype: DTypeLike) -> "EventLog":
         """The log of runs of a model without events."""
         none, rows, zero = (on_device(np.zeros((*batch, *shape), dtype)) for shape in ((0,), (0, m), ()))
         return cls(none, none, none, zero, on_device(np.full(batch, -1.0, dtype)), rows, rows)

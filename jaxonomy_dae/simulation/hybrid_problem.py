@@ -171,7 +171,7 @@ class SystemProblem(AbstractHybridProblem):
         return jnp.where(consistent, projected, jnp.nan)
 
 
-def resolution(t0: Any, t1: Any) -> Any:
+def resolution(t0: Time, t1: Time) -> Any:
     """A time that is nothing beside a run from t0 to t1, but more than rounding."""
     largest = jax.lax.stop_gradient(jnp.maximum(jnp.maximum(jnp.abs(t0), jnp.abs(t1)), t1 - t0))
     return RESOLUTION * jnp.finfo(largest.dtype).eps * largest

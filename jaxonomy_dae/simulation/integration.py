@@ -127,7 +127,7 @@ def run(
     # With an implicit solver the controller chooses the first step itself: `dt0=None`.
     own_start = implicit and not isinstance(controller, diffrax.StepTo)
     dt0 = None if own_start else first_step(system, t0, t1, x0, inputs, solver.order(term), controller)
-    y0: Any = x0
+    y0: State = x0
     goes_on: Any = admitted
     clashes: Any = None
     saved_of: Any = _whole

@@ -41,7 +41,7 @@ class TracedOnce(eqx.Module):
         """For a program that is traced now."""
         return TracedOnce(system, eqx.filter_jit(lambda system, t, x, args: system.vector_field(t, x, args)))
 
-    def __call__(self, t: Any, x: Any, args: Any) -> Any:
+    def __call__(self, t: Time, x: State, args: Args) -> Any:
         return self.call(self.system, t, x, args)
 
 

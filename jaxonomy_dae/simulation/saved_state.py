@@ -9,6 +9,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from ..aliases import Time
 from ..errors import ModelError
 from ..hybrid.problem import AbstractHybridProblem
 from ..hybrid.start import Resumed
@@ -75,19 +76,19 @@ class Memory(eqx.Module):
         return Memory(sides, ticked, self.sizes)
 
 
-def initial_time(t0: Any, initial: Any) -> Any:
+def initial_time(t0: Time, initial: Any) -> Any:
     """The time at which a run begins: as given, that of a whole state, or 0."""
     if t0 is not None:
         return t0
     return initial.t if isinstance(initial, SavedState) else 0.0
 
 
-def same_time(t0: Any, state: SavedState) -> Any:
+def same_time(t0: Time, state: SavedState) -> Any:
     """True if a state is that of the time t0, up to the rounding of a few sums."""
     return jnp.abs(t0 - state.t) <= KNOWN_ROUNDINGS * jnp.finfo(state.x.dtype).eps * jnp.abs(state.t)
 
 
-def check_saved_state(system: AcausalSystem, t0: Any, state: SavedState) -> None:
+def check_saved_state(system: AcausalSystem, t0: Time, state: SavedState) -> None:
     """Raises a `ModelError` if a state cannot be one of this system, or is of another time than `t0`."""
     events, n = system.plan.events, system.plan.n_state
     clocks, guards, discretes = (

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..adjoint.stored_adjoint import default_adjoint
-from ..aliases import Time, Times, Tolerance
+from ..aliases import Solver, Time, Times, Tolerance
 from ..errors import InitializationError, ModelError, SimulationError, explained_keywords
 from ..initialization.check import check
 from ..initialization.initialize import known_start, search_outside
@@ -198,7 +198,7 @@ def simulate(
     most_events = MOST_EVENTS if max_events is None else max_events
     sides_possible = not is_traced((given, adjoint, stepsize_controller))
 
-    def options(solver: Any, room: int = ROOM) -> Options:
+    def options(solver: Solver, room: int = ROOM) -> Options:
         events = system.plan.events
         listed = room if max_events is None else max_events
         room = listed if events is not None and events.are_listed else 0

@@ -13,6 +13,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from ..aliases import Solver
 from ..errors import ModelError
 from ..lowering.gather import times
 from ..programs.blocks import at_times, fit
@@ -41,14 +42,14 @@ class Asked(eqx.Module):
     jump_ts: Any
     dtmax: Any
     max_steps: int = eqx.field(static=True)
-    solver: Any = eqx.field(static=True, default=None)
+    solver: Solver = eqx.field(static=True, default=None)
     control: tuple[str, ...] = eqx.field(static=True, default=())
     tolerances: tuple[Any, Any] | None = None  # rtol, and atol of each state
     throw: bool = eqx.field(static=True, default=True)
 
     @staticmethod
     def of(
-        jump_ts: Any, dtmax: Any, max_steps: int, solver: Any, control: tuple[str, ...], tolerances: Any, throw: bool
+        jump_ts: Any, dtmax: Any, max_steps: int, solver: Solver, control: tuple[str, ...], tolerances: Any, throw: bool
     ) -> "Asked":
         """The options, with a solver only if solutions that name it can be compared."""
         known = not any(eqx.is_array(leaf) for leaf in jax.tree.leaves(solver)) and isinstance(solver, Hashable)

@@ -40,7 +40,7 @@ def controller_for(
 ) -> Any:
     """The step-size controller for these tolerances, the absolute ones in units of the nominal values. If the user
     gives no longest step, it is bounded by the period of the waves that drive the model."""
-    controller: Any = step_control(solver, rtol, scaled_atol(system, atol), dtmax=dtmax)
+    controller: Controller = step_control(solver, rtol, scaled_atol(system, atol), dtmax=dtmax)
     if control:
         controller = with_variables(system, controller, solver, control, atol)
     if dtmax is not None or not system.plan.waves:

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ..errors import ModelError
@@ -26,7 +27,7 @@ class Tolerances(eqx.Module):
     atol: Any = FROM_CONTROLLER
     norm: Any = FROM_CONTROLLER
 
-    def values(self, dtype: Any) -> tuple[Any, Any, Callable[[Any], Any]]:
+    def values(self, dtype: DTypeLike) -> tuple[Any, Any, Callable[[Any], Any]]:
         """(rtol, atol flat, norm)."""
         if self.rtol is FROM_CONTROLLER:
             raise ModelError(

@@ -12,8 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
+from jax.typing import DTypeLike
 
 from ..adjoint.stored_adjoint import default_adjoint
+from ..aliases import Args, Solver, State, Time
 from ..errors import InitializationError, ModelError, SimulationError, explained_keywords
 from ..programs.cache import PROGRAMS, compiled
 from ..programs.members import failed_members, is_batched
@@ -38,15 +40,15 @@ SMALL = 30  # up to this many unknowns a factorisation costs less than the steps
 @explained_keywords()
 def solve_dae(
     term: Any,
-    t1: Any,
-    y0: Any,
+    t1: Time,
+    y0: State,
     *,
-    t0: Any = 0.0,
+    t0: Time = 0.0,
     ts: Any = None,
     solver: diffrax.AbstractSolver[Any] | None = None,
     rtol: Any = None,
     atol: Any = None,
-    args: Any = None,
+    args: Args | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController[Any, Any] | None = None,
     jump_ts: Any = None,
@@ -183,20 +185,20 @@ def default_solver(n: int) -> diffrax.AbstractSolver:
 
 
 def step_control(
-    solver: Any, rtol: Any, atol: Any, jump_ts: Any = None, dtmax: Any = None
+    solver: Solver, rtol: Any, atol: Any, jump_ts: Any = None, dtmax: Any = None
 ) -> diffrax.AbstractStepSizeController:
     """The step-size controller for one of our solvers."""
     control: Any = StepControl(rtol, atol, steered=is_multistep(solver), dtmax=dtmax)
     return control if jump_ts is None else diffrax.ClipStepSizeController(control, jump_ts=jump_ts)
 
 
-def default_tolerances(rtol: Any, atol: Any, dtype: Any) -> tuple[Any, Any]:
+def default_tolerances(rtol: Any, atol: Any, dtype: DTypeLike) -> tuple[Any, Any]:
     """The tolerances, where they are not given by precision."""
     single = dtype == jnp.float32
     return (1e-4 if single else 1e-6) if rtol is None else rtol, (1e-6 if single else 1e-8) if atol is None else atol
 
 
-def check_tolerances(rtol: Any, atol: Any, dtype: Any):
+def check_tolerances(rtol: Any, atol: Any, dtype: DTypeLike):
     """Refuses tolerances that are not numbers or that the precision cannot reach."""
     for name, value in (("rtol", rtol), ("atol", atol)):
         for leaf in jax.tree.leaves(value):
@@ -248,7 +250,7 @@ def _solve(term, t0, t1, y0, ts, args, tolerances, options, checked=False):
     return check, out, run.last
 
 
-def _on_constraints(term: Any, args: Any, ts: Any, ys: Any, y0: Any) -> Any:
+def _on_constraints(term: Any, args: Args, ts: Any, ys: Any, y0: State) -> Any:
     """Saved values with their algebraic unknowns solved for: dense output interpolates those, and no error estimate
     covers how fast they vary within a step."""
 
@@ -271,7 +273,7 @@ _compiled = compiled(_solve)
 
 
 def consistent_start(
-    term: DAETerm, y0: Any, *, t0: Any = 0.0, args: Any = None, max_steps: int = 50,
+    term: DAETerm, y0: State, *, t0: Time = 0.0, args: Args | None = None, max_steps: int = 50,
     names: Sequence[str] | None = None, throw: bool | None = None,
 ) -> Any:  # fmt: skip
     """A consistent start near y0: what occurs differentiated stays (M y does), the algebraic unknowns are solved for.

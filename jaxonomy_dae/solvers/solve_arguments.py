@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.typing import DTypeLike
 
 from ..aliases import State, Time, Tolerance
 from ..errors import ModelError
@@ -64,7 +65,7 @@ def tolerance_of(atol: Tolerance, y: State) -> Any:
     return jax.tree.map(lambda a, v: jnp.broadcast_to(jnp.asarray(a, v.dtype), v.shape), atol, y)
 
 
-def jump_times(jump_ts: Any, dtype: Any) -> Any:
+def jump_times(jump_ts: Any, dtype: DTypeLike) -> Any:
     """Times of jumps, a number or shape (n,), as an array; None if there is none."""
     array = None if jump_ts is None else as_array(jump_ts)
     if array is None or array.shape == (0,):

@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from ..adjoint.stored_adjoint import forward_mode
+from ..aliases import PyTree
 from ..errors import ModelError
 from .certificate import Certificate
 
@@ -23,7 +24,7 @@ WORSE = 2.0  # than the best so far: then smaller steps are rounding
 
 
 def assert_gradient(
-    f: Callable[[Any], Any], at: Any, *, rtol: float = 1e-3, directions: int = 8, seed: int = 0
+    f: Callable[[Any], Any], at: PyTree, *, rtol: float = 1e-3, directions: int = 8, seed: int = 0
 ) -> Certificate:
     """Asserts that reverse-mode derivatives agree with forward-mode ones, and with central differences.
 
@@ -114,7 +115,7 @@ def assert_gradient(
     ).asserted()
 
 
-def _directions(moving: Any, x: np.ndarray, count: int, rng: np.random.Generator) -> tuple[np.ndarray, list[str]]:
+def _directions(moving: PyTree, x: np.ndarray, count: int, rng: np.random.Generator) -> tuple[np.ndarray, list[str]]:
     """Returns (directions, shape (k, n), their names). Entries have the size of each number, or where that is zero, of
     its array."""
     sizes, names = [], []

@@ -8,8 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
+from ..aliases import PyTree
 from ..errors import ModelError, whole_number
 from ..learning.laws import AbstractPassive, PortHamiltonian
 from .certificate import Certificate
@@ -58,7 +60,7 @@ def assert_passive(
     arrays, static = eqx.partition(law, eqx.is_inexact_array)
 
     @jax.jit
-    def gained(arrays: Any, u: Float[Array, "n inputs"]) -> Float[Array, " n"]:
+    def gained(arrays: PyTree, u: Float[Array, "n inputs"]) -> Float[Array, " n"]:
         return jax.vmap(lambda one: _share(eqx.combine(arrays, static), one, size))(u)
 
     rate = jax.jit(jax.vmap(lambda u: _rate(law, u, size)))
@@ -95,7 +97,7 @@ def assert_passive(
     ).asserted()
 
 
-def _typical(law: Any, size: int | None, inputs: Any) -> tuple[np.ndarray, int]:
+def _typical(law: Callable, size: int | None, inputs: Any) -> tuple[np.ndarray, int]:
     """(typical sizes of the law's inputs, shape (inputs,), and the number of efforts among them)."""
     own = getattr(law, "size", None) if isinstance(law, AbstractPassive | PortHamiltonian) else None
     if not callable(law):
@@ -135,7 +137,7 @@ def _samples(rng: np.random.Generator, count: int, typical: np.ndarray) -> np.nd
     return found
 
 
-def _share(law: Any, u: Array, size: int) -> Array:
+def _share(law: Callable, u: Array, size: int) -> Array:
     """The power that comes in, as a share of Σ |N_i v_i|; zero if no power flows at all."""
     v = jax.grad(law.energy)(u) if isinstance(law, PortHamiltonian) else u[:size]
     terms = law(u) * v
@@ -143,25 +145,25 @@ def _share(law: Any, u: Array, size: int) -> Array:
     return jnp.where(total == 0, 0.0, jnp.sum(terms) / jnp.where(total == 0, 1.0, total))  # NaN stays
 
 
-def _rate(law: Any, u: Array, size: int) -> Array:
+def _rate(law: Callable, u: Array, size: int) -> Array:
     """N·v/|v|²."""
     v = jax.grad(law.energy)(u) if isinstance(law, PortHamiltonian) else u[:size]
     square = jnp.sum(v**2)
     return jnp.where(square == 0, 0.0, jnp.sum(law(u) * v) / jnp.where(square == 0, 1.0, square))
 
 
-def _drawn(arrays: Any, rng: np.random.Generator) -> Any:
+def _drawn(arrays: PyTree, rng: np.random.Generator) -> PyTree:
     """Random weights in place of `arrays`: each array normal, 0.1 to 10 times as large as at present."""
     factor = 10.0 ** rng.uniform(-1, 1)
 
-    def other(leaf: Any) -> Any:
+    def other(leaf: PyTree) -> PyTree:
         size = float(jnp.sqrt(jnp.mean(leaf**2))) or 1.0
         return jnp.asarray(factor * size * rng.standard_normal(leaf.shape), leaf.dtype)
 
     return jax.tree.map(other, arrays)
 
 
-def _climb(slope: Callable, start: np.ndarray, dtype: Any) -> np.ndarray:
+def _climb(slope: Callable, start: np.ndarray, dtype: DTypeLike) -> np.ndarray:
     """Follows the rate to a local maximum, from a start point and in units of it."""
     unit = np.where(start != 0, np.abs(start), np.abs(start).max() or 1.0)
     size = abs(float(slope(jnp.asarray(start / unit, dtype), jnp.asarray(unit, dtype))[0])) or 1.0

@@ -19,7 +19,7 @@ from ..expressions.node import Node, Number, leaf, linear, postorder, scale
 from ..expressions.to_sympy import shortened, write
 from .unit import NUMBER, Unit, interval, is_close, product
 
-UnitOf = Callable[[Hashable], Unit | None]
+UnitOf = Callable[[tuple], Unit | None]
 
 TIME = frozenset([("time",)])  # the leaves of functions of time
 LARGEST_PLAIN = 4  # whole numbers up to this one, and their quotients, do not convert units: 1/2, 4/3
@@ -257,7 +257,11 @@ class _Walk:
         return UnitOfValue(Unit(dimensions[0], common, zero, text), number, is_loose=is_loose)
 
     def _note(
-        self, rule: str, values: list[tuple[Term, UnitOfValue]], usual: Any, aspect: Callable[[UnitOfValue], Any]
+        self,
+        rule: str,
+        values: list[tuple[Term, UnitOfValue]],
+        usual: Hashable,
+        aspect: Callable[[UnitOfValue], Hashable],
     ) -> None:
         """Notes that an aspect of the values, which is `usual` for most of them, is not the same for all."""
         named = sorted(((t.name(), v) for t, v in values), key=lambda row: (len(row[0]), row[0]))

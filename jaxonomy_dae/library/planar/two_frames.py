@@ -1,10 +1,8 @@
 """What passes between two frames."""
 
-from typing import Any
-
 import sympy
 
-from ...modeling import Component, Eq, Planar
+from ...modeling import Component, Eq, Planar, Value
 from ...modeling.ports import Port
 
 
@@ -14,7 +12,7 @@ class TwoFrames(Component):
     def _two_frames(self) -> tuple[Port, Port]:
         return self.port("frame_a", Planar), self.port("frame_b", Planar)
 
-    def _balance(self, dx: Any = 0, dy: Any = 0) -> None:
+    def _balance(self, dx: Value = 0, dy: Value = 0) -> None:
         """The forces and the torques about frame_a sum to zero, with frame_b at (dx, dy) from it in world axes."""
         a, b = self.ports["frame_a"], self.ports["frame_b"]
         lever = sympy.sympify(dx) * b.fy - sympy.sympify(dy) * b.fx

@@ -1,9 +1,10 @@
 """Linear blocks with memory: input `u`, output `y`."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
+import sympy
+from numpy.typing import ArrayLike
 
 from ...errors import ModelError
 from ...modeling import POSITIVE, Component, Eq, EqnEnv, Value, der
@@ -70,7 +71,14 @@ class StateSpace(Component):
     """
 
     def __init__(
-        self, ev: EqnEnv, name: str, A: Any, B: Any, C: Any, D: Any = None, initial_x: Sequence[Value] | None = None
+        self,
+        ev: EqnEnv,
+        name: str,
+        A: ArrayLike,
+        B: ArrayLike,
+        C: ArrayLike,
+        D: ArrayLike | None = None,
+        initial_x: Sequence[Value] | None = None,
     ):
         super().__init__(ev, name)
         a, b, c = (np.atleast_2d(finite(m, name, what)) for what, m in (("A", A), ("B", B), ("C", C)))
@@ -97,7 +105,7 @@ class TransferFunction(Component):
     denominator's.
     """
 
-    def __init__(self, ev: EqnEnv, name: str, numerator: Any, denominator: Any):
+    def __init__(self, ev: EqnEnv, name: str, numerator: ArrayLike, denominator: ArrayLike):
         super().__init__(ev, name)
         top = np.atleast_1d(finite(numerator, name, "numerator"))
         bottom = np.atleast_1d(finite(denominator, name, "denominator"))
@@ -146,5 +154,5 @@ class PadeDelay(Component):
         self.output("y", _row(np.array(signed[:n]), x) + signed[n] * top)
 
 
-def _row(numbers: np.ndarray, symbols: Sequence[Any]) -> Any:
+def _row(numbers: np.ndarray, symbols: Sequence[sympy.Expr]) -> Value:
     return sum((float(k) * s for k, s in zip(numbers, symbols, strict=True) if k), 0)
