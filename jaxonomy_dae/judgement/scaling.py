@@ -10,7 +10,7 @@ PASSES = 10  # each halves, in logarithms, how far the largest entries are from 
 LARGEST_EXPONENT = 300.0  # of ten, for a scale
 
 
-def geometric_scales(matrix: np.ndarray | sp.sparray) -> tuple[np.ndarray, np.ndarray]:
+def geometric_scales(matrix: Any) -> tuple[np.ndarray, np.ndarray]:
     """r and c for which the logarithms of the entries of diag(r)·A·diag(c) are nearest to zero (Curtis & Reid 1972).
 
     Matrices that differ by scalings of rows and columns alone come out equal, however far apart the scales are. Small
@@ -30,7 +30,7 @@ def geometric_scales(matrix: np.ndarray | sp.sparray) -> tuple[np.ndarray, np.nd
     return 10.0 ** exponent[:n], 10.0 ** exponent[n:]
 
 
-def equilibrated(matrix: np.ndarray | sp.sparray, passes: int = PASSES) -> tuple[Any, np.ndarray, np.ndarray]:
+def equilibrated(matrix: Any, passes: int = PASSES) -> tuple[Any, np.ndarray, np.ndarray]:
     """diag(r)·A·diag(c) with the largest entry of every row and column near 1 (Ruiz 2001), r and c.
 
     The first pass scales rows, then columns: matrices that differ by such scalings alone come out nearly equal.
@@ -57,7 +57,7 @@ def equilibrated(matrix: np.ndarray | sp.sparray, passes: int = PASSES) -> tuple
     return scaled, r, c
 
 
-def balanced(matrix: np.ndarray | sp.sparray) -> tuple[Any, np.ndarray, np.ndarray]:
+def balanced(matrix: Any) -> tuple[Any, np.ndarray, np.ndarray]:
     """diag(r)·A·diag(c) with the sizes of its entries near 1, the largest of every row and column nearest; r and c."""
     r, c = geometric_scales(matrix)
     scaled, more_r, more_c = equilibrated(sp.csr_array(sp.diags_array(r) @ sp.csr_array(matrix) @ sp.diags_array(c)))
