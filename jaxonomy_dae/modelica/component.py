@@ -1,13 +1,14 @@
 """A flat Modelica model as a component."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from ..errors import ModelError, nearest
 from ..modeling.component import Component
 from ..modeling.environment import EqnEnv
-from .continuous import Law, equation_of, write_equation, write_law
+from .continuous import write_equation
 from .events import write_end_of_start, write_modes, write_when
 from .flat_model import FlatModel
+from .laws import equation_of, write_law
 from .scope import Scope, located
 from .starts import write_initial_algorithm, write_initial_equation
 from .values import as_number
@@ -24,25 +25,19 @@ class FlatComponent(Component):
     - `outputs`: names of Boolean and Integer variables to be found in the solution. Those that a `when` assigns, and
         those of which `pre(…)` is read, are there anyway.
 
-    - `laws`: other laws for some variables, by name. `laws={"damper.f": law}` puts `damper.f = law(m, f)` in the place
-        of the equation `damper.f = f` of the text, with m the component: `m.symbol("damper.v_rel")` is a symbol of it,
-        `m.learned(…)` puts a network in, and `f + …` is a term beside the written one.
-
     **Raises:**
 
-    - `ModelError` for what cannot be translated, with its line in the text; for a law of a variable that no equation,
-        or more than one, gives by itself.
+    - `ModelError` for what cannot be translated, with its line in the text; for a law, of `flat.replace` or
+        `flat.add_term`, of a variable that no equation, or more than one, gives by itself.
     """
 
-    def __init__(
-        self, ev: EqnEnv, name: str, flat: FlatModel, outputs: Sequence[str] = (), laws: Mapping[str, Law] | None = None
-    ):
+    def __init__(self, ev: EqnEnv, name: str, flat: FlatModel, outputs: Sequence[str] = ()):
         super().__init__(ev, name)
         self.flat = flat
         scope = Scope(flat, self)
         found = scope.definitions
         scope.declare_variables()
-        replaced = {variable: equation_of(scope, variable) for variable in laws or ()}
+        replaced = {variable: equation_of(scope, variable) for variable in flat.laws}
         equations = [s for s in found.equations if not any(s is r.statement for r in replaced.values())]
         write_modes(scope)
         for write, statements in (
@@ -54,7 +49,7 @@ class FlatComponent(Component):
                 located(flat.name, s.line, write, scope, s)
         for statements in filter(None, flat.model.initial_algorithms):
             located(flat.name, statements[0].line, write_initial_algorithm, scope, statements)
-        for variable, law in (laws or {}).items():
+        for variable, law in flat.laws.items():
             located(flat.name, replaced[variable].statement.line, write_law, scope, replaced[variable], law)
         for output in outputs:
             if output not in scope.declared:

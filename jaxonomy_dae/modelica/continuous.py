@@ -1,66 +1,29 @@
 """The continuous equations of a flat model."""
 
-from collections.abc import Callable
-from typing import Any, NamedTuple, TypeAlias
-
 import sympy
 
-from ..errors import ModelError, nearest
+from ..errors import ModelError
 from .definitions import OfAlgorithm
 from .scope import Scope
-from .tree import Branches, Effect, Equality, Expression, Reference, Several, Statement
+from .tree import Branches, Effect, Equality, Expression, Several, Statement
 from .values import Record, Value, as_number, chosen
 
 Sides = tuple[Value, Value]
-Law: TypeAlias = Callable[[Any, Any], Any]  # (component, written value) to the value in its place
 
 
 def write_equation(scope: Scope, s: Statement) -> None:
     """Adds the equations of one statement to the component."""
     if isinstance(s, Equality):
         for sides in equal(scope, s.left, s.right):
-            _add(scope, sides)
+            add(scope, sides)
     elif isinstance(s, Branches):
         for sides in side_by_side(scope, s):
-            _add(scope, sides)
+            add(scope, sides)
     elif isinstance(s, Effect):
         if s.call.function == "connect":
             raise ModelError("connect(…) is not flat: Modelica with connections is read by load(source, model=…)")
     else:
         raise ModelError("a loop of equations is not read")
-
-
-class Given(NamedTuple):
-    """The equation that gives a variable by itself: the variable, and what it is equal to."""
-
-    statement: Equality
-    variable: Expression
-    value: Expression
-
-
-def equation_of(scope: Scope, name: str) -> Given:
-    """The equation of which one side is the variable, and the other is more than another variable."""
-    found = []
-    for s in scope.definitions.equations:
-        if isinstance(s, Equality):
-            for side, other in ((s.left, s.right), (s.right, s.left)):
-                if _is_variable(scope, side, name) and not isinstance(other, Reference | OfAlgorithm):
-                    found.append(Given(s, side, other))
-    if len(found) == 1:
-        return found[0]
-    if name not in scope.declared:
-        raise ModelError(f"there is no variable '{name}': {nearest(name, scope.declared)}")
-    lines = " and ".join(str(g.statement.line) for g in found) or "no line"
-    raise ModelError(f"a law for '{name}' replaces the one equation that says '{name} = …'; found on {lines}")
-
-
-def _is_variable(scope: Scope, side: Expression, name: str) -> bool:
-    return isinstance(side, Reference) and scope.interpreter.name_of(side) == name
-
-
-def write_law(scope: Scope, given: Given, law: Law) -> None:
-    """Adds what a law of the user says in place of an equation."""
-    _add(scope, (scope.evaluate(given.variable), law(scope.component, scope.evaluate(given.value))))
 
 
 def equal(scope: Scope, left: Expression, right: Expression) -> list[Sides]:
@@ -73,7 +36,8 @@ def equal(scope: Scope, left: Expression, right: Expression) -> list[Sides]:
     return [pair for e, v in given for pair in pairs(scope.evaluate(e), v)]
 
 
-def _add(scope: Scope, sides: Sides) -> None:
+def add(scope: Scope, sides: Sides) -> None:
+    """Adds an equation of two values."""
     left, right = map(as_number, sides)
     if isinstance(left, str) or isinstance(right, str):
         return

@@ -1,9 +1,11 @@
 """A flat Modelica model: one class with the functions and types that it needs."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from ..errors import ModelError
+from .learned_law import Law, law_of
 from .read_base import INSIDE, written
 from .tree import Class, Number, Reference
 
@@ -16,10 +18,12 @@ class FlatModel:
 
     - `model`: its declarations and equations.
     - `classes`: functions, records and enumerations by name.
+    - `laws`: other laws for some variables, as `replace` and `add_term` note them, by name.
     """
 
     model: Class
     classes: Mapping[str, Class]
+    laws: Mapping[str, Law] = dataclasses.field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -30,6 +34,29 @@ class FlatModel:
         """The settings of the text's own experiment as numbers: `StartTime`, `StopTime`, `Interval`, `Tolerance`."""
         found = self.model.annotation.get("experiment", {})
         return {k: float(v.value) for k, v in found.items() if isinstance(v, Number)}
+
+    def replace(self, name: str, law: Any, inputs: Sequence[str] = ()) -> "FlatModel":
+        """The model with another law in the place of an equation.
+
+        **Arguments:**
+
+        - `name`: the variable that the equation gives, as `"damper.f"` for `damper.f = d*damper.v_rel`, or
+            `"der(v)"`; or a part with one law, as `"damper"`.
+        - `law`: a network, `law(u) -> (1,)`, that is trained under the name `name.law`; or a function
+            `law(m, written)` of the component and of the expression of the text, that returns another expression.
+        - `inputs`: the variables that a network reads; those of the replaced expression if left out.
+        """
+        return self._with_law(name, law_of(name, law, inputs, False))
+
+    def add_term(self, name: str, law: Any, inputs: Sequence[str] = ()) -> "FlatModel":
+        """The model with a term beside what an equation says: `damper.f = d*damper.v_rel + law`. The arguments are
+        those of `replace`."""
+        return self._with_law(name, law_of(name, law, inputs, True))
+
+    def _with_law(self, name: str, law: Law) -> "FlatModel":
+        if name in self.laws:
+            raise ModelError(f"the law of '{name}' has been changed already")
+        return dataclasses.replace(self, laws={**self.laws, name: law})
 
     @property
     def preferred_states(self) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 import math
 
+import equinox as eqx
 import numpy as np
 import pytest
 import sympy
@@ -363,23 +364,58 @@ DAMPED = """model m
 
 
 def test_a_law_takes_the_place_of_an_equation():
-    """A term beside the written law; a function in its place."""
-    for law, left in ((lambda m, f: f + m.symbol("v") ** 3, "-d*v + f - v**3"), (_doubled, "f - law")):
-        component = FlatComponent(EqnEnv(), "m", load(DAMPED), laws={"f": law})
-        assert [str(e) for e in component.equations] == ["der(x) - v", "der(v) + f + x", "-f + g", left]
+    """A term beside the written law; a function in its place; a law of a derivative."""
+    damped = load(DAMPED)
+    for flat, left in (
+        (damped.add_term("f", lambda m, f: m.symbol("v") ** 3), ["der(v) + f + x", "-d*v + f - v**3"]),
+        (damped.replace("f", _doubled), ["der(v) + f + x", "f - law"]),
+        (damped.replace("der(v)", lambda m, a: 2 * a), ["-d*v + f", "der(v) + 2*f + 2*x"]),
+    ):
+        equations = [str(e) for e in FlatComponent(EqnEnv(), "m", flat).equations]
+        assert sorted(equations) == sorted(["der(x) - v", "-f + g", *left])
 
 
 def _doubled(m, f):
     return m.function("law", lambda v: 2.0 * v, [m.symbol("v")])[0]
 
 
-def test_a_law_for_what_no_equation_gives_is_refused():
-    for name, told in (
-        ("g", "replaces the one equation that says 'g = …'; found on no line"),
-        ("w", "no variable 'w'"),
+PARTS = """model 'Parts'
+  parameter Real 'R' = 2; Real 'a.v'; Real 'a.i'; Real 'a.p'; Real 'a.n'; Real 'b.v'; Real 'b.i'; Real 'b.heat';
+  Real 'one';
+equation 'a.v' = 'a.p' - 'a.n'; 'R' * 'a.i' = 'a.v'; 'a.p' = 'one'; 'one' = 1; 'a.n' = 'a.p' - 'one';
+  'b.v' = 'a.v'; 'b.i' = 'b.v'^3;
+  'b.heat' = 'b.v' * 'b.i';
+end 'Parts';"""
+
+
+class Cubic(eqx.Module):
+    def __call__(self, u):
+        return u**3
+
+
+def test_a_network_is_the_law_of_a_part():
+    """The law of a part is its one equation that does more than add its variables up. A network reads what that read,
+    unless inputs are named."""
+    flat, network = load(PARTS), Cubic()
+    for changed, inputs in (
+        (flat.replace("a", network), ["a.i"]),
+        (flat.replace("a.v", network, inputs=["a.p"]), ["a.p"]),
+        (flat.add_term("a", network), ["a.i"]),
     ):
+        (term,) = FlatComponent(EqnEnv(), "m", changed).learned_terms
+        assert [s.path for s in term.inputs] == inputs
+    with pytest.raises(ModelError, match="found those of 'b.i' on line 5 and 'b.heat' on line 6: name one of them"):
+        FlatComponent(EqnEnv(), "m", flat.replace("b", network))
+    with pytest.raises(ModelError, match="a network, or a function law"):
+        flat.replace("a", 3.0)
+    with pytest.raises(ModelError, match="the law of 'a' has been changed already"):
+        flat.replace("a", network).add_term("a", network)
+
+
+def test_a_law_for_what_no_equation_gives_is_refused():
+    for name, told in (("g", "one equation 'g = …'; found none"), ("w", "no variable or part 'w'")):
         with pytest.raises(ModelError, match=told):
-            FlatComponent(EqnEnv(), "m", load(DAMPED), laws={name: lambda m, f: f})
+            FlatComponent(EqnEnv(), "m", load(DAMPED).replace(name, lambda m, f: f))
 
 
 def test_truths_that_define_each_other_are_refused():
