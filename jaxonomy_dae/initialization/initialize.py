@@ -31,9 +31,10 @@ from ..tolerances import solved
 from .explicit import Substitution, substitution
 from .given_solver import find_root_with
 from .initial_values import check_initial
-from .ladder import FAILED, STAGED, Found, Look, find_root
+from .ladder import FAILED, STAGED, Found, find_root
 from .problem import InitialProblem, bounds_of, independent_rows
 from .rows import InitialRows, initial_rows
+from .search import Look
 from .sizes import Sizes, column_sizes, row_sizes, weighed
 from .sparse_newton import SparseRows, sparse_newton, sparse_rows
 from .stages import solve_in_stages, stages

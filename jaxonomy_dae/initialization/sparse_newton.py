@@ -20,7 +20,8 @@ from ..lowering.plan import SystemPlan
 from ..lowering.remembered import remembered
 from ..tolerances import close as close_within
 from ..tolerances import solved
-from .ladder import DECREASE, METHODS, NEWTON_LIMIT, SHORTEST
+from .gauss_newton import DECREASE, NEWTON_LIMIT, SHORTEST
+from .ladder import METHODS
 from .rows import InitialRows
 from .sizes import Sizes, row_sizes
 
