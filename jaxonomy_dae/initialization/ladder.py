@@ -240,9 +240,7 @@ def _next(
         trial=ahead,
         start=start,
         best=where((rung == Rung.MARQUARDT) & failed, base.at, search.best),
-        base=base._replace(
-            at=where(sized.goes_on, sized.start, foot), jacobian=where(sized.goes_on, sized.slopes, base.jacobian)
-        ),
+        base=base._replace(at=at, jacobian=where(sized.goes_on, sized.slopes, base.jacobian)),
         descent=down.descent,
         curve=(search.curve if curve is None else curve.curve)._replace(turn=where(climbs_again, 1.0, turn)),
     )
