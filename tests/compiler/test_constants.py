@@ -66,7 +66,8 @@ def test_what_counts_as_explained():
 # Small numbers elsewhere belong to methods, and decide how they proceed: steps, dampings, what is asked of a solver.
 METHODS = {
     "hybrid/search": "where an interval is cut, and where the search in it ends",
-    "initialization/ladder": "the shortest step along a curve; the least gain",
+    "initialization/gauss_newton": "the least gain",
+    "initialization/homotopy": "the shortest step along a curve",
     "judgement/sparse_rank": "a shift for inverse iteration",
     "linear/sparse": "what stands for a zero in a factorization",
     "linear/sparse_least_squares": "regularization of what is solved again with the rest",
