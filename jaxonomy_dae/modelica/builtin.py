@@ -11,7 +11,7 @@ from ..modeling.automatic_events import smooth
 from .values import Value, as_number, both, chosen, either, entrywise, is_condition
 
 
-def _of_numbers(number: Callable[..., float], symbol: Callable[..., Value]) -> Callable[..., Value]:
+def of_numbers(number: Callable[..., float], symbol: Callable[..., Value]) -> Callable[..., Value]:
     """A function of entries: `number` of constants, `symbol` of expressions."""
 
     def one(*arguments: Value) -> Value:
@@ -33,7 +33,7 @@ def _sign(x: float) -> int:
 def _quotient(a: Value, b: Value) -> Value:
     """The quotient without its fraction, rounded towards zero."""
     q = sympy.sympify(a) / sympy.sympify(b)
-    return sympy.Piecewise((sympy.floor(q), q >= 0), (sympy.ceiling(q), True), evaluate=False)
+    return smooth(sympy.sign(q)) * sympy.floor(smooth(sympy.Abs(q)))
 
 
 def _extreme(smaller: bool) -> Callable[..., Value]:
@@ -141,28 +141,28 @@ def _boolean_as_integer(value: Value) -> Value:
 
 
 FUNCTIONS: dict[str, Callable[..., Value]] = {
-    "sin": _of_numbers(math.sin, sympy.sin),
-    "cos": _of_numbers(math.cos, sympy.cos),
-    "tan": _of_numbers(math.tan, sympy.tan),
-    "asin": _of_numbers(math.asin, sympy.asin),
-    "acos": _of_numbers(math.acos, sympy.acos),
-    "atan": _of_numbers(math.atan, sympy.atan),
-    "atan2": _of_numbers(math.atan2, sympy.atan2),
-    "sinh": _of_numbers(math.sinh, sympy.sinh),
-    "cosh": _of_numbers(math.cosh, sympy.cosh),
-    "tanh": _of_numbers(math.tanh, sympy.tanh),
-    "exp": _of_numbers(math.exp, sympy.exp),
-    "log": _of_numbers(math.log, sympy.log),
-    "log10": _of_numbers(math.log10, lambda x: sympy.log(x) / math.log(10.0)),
-    "sqrt": _of_numbers(math.sqrt, sympy.sqrt),
-    "abs": _of_numbers(lambda x: x if x >= 0 else -x, lambda x: smooth(sympy.Abs(x))),
-    "sign": _of_numbers(_sign, lambda x: smooth(sympy.sign(x))),
-    "floor": _of_numbers(math.floor, sympy.floor),
-    "ceil": _of_numbers(math.ceil, sympy.ceiling),
+    "sin": of_numbers(math.sin, sympy.sin),
+    "cos": of_numbers(math.cos, sympy.cos),
+    "tan": of_numbers(math.tan, sympy.tan),
+    "asin": of_numbers(math.asin, sympy.asin),
+    "acos": of_numbers(math.acos, sympy.acos),
+    "atan": of_numbers(math.atan, sympy.atan),
+    "atan2": of_numbers(math.atan2, sympy.atan2),
+    "sinh": of_numbers(math.sinh, sympy.sinh),
+    "cosh": of_numbers(math.cosh, sympy.cosh),
+    "tanh": of_numbers(math.tanh, sympy.tanh),
+    "exp": of_numbers(math.exp, sympy.exp),
+    "log": of_numbers(math.log, sympy.log),
+    "log10": of_numbers(math.log10, lambda x: sympy.log(x) / math.log(10.0)),
+    "sqrt": of_numbers(math.sqrt, sympy.sqrt),
+    "abs": of_numbers(lambda x: x if x >= 0 else -x, lambda x: smooth(sympy.Abs(x))),
+    "sign": of_numbers(_sign, lambda x: smooth(sympy.sign(x))),
+    "floor": of_numbers(math.floor, sympy.floor),
+    "ceil": of_numbers(math.ceil, sympy.ceiling),
     "integer": lambda x: entrywise(_integer, x),
-    "mod": _of_numbers(lambda a, b: a - math.floor(a / b) * b, sympy.Mod),
-    "div": _of_numbers(lambda a, b: math.trunc(a / b), _quotient),
-    "rem": _of_numbers(lambda a, b: a - math.trunc(a / b) * b, lambda a, b: a - _quotient(a, b) * b),
+    "mod": of_numbers(lambda a, b: a - math.floor(a / b) * b, sympy.Mod),
+    "div": of_numbers(lambda a, b: math.trunc(a / b), _quotient),
+    "rem": of_numbers(lambda a, b: a - math.trunc(a / b) * b, lambda a, b: a - _quotient(a, b) * b),
     "min": _extreme(True),
     "max": _extreme(False),
     "sum": total,

@@ -10,7 +10,7 @@ from .events import write_end_of_start, write_modes, write_when
 from .flat_model import FlatModel
 from .laws import equation_of, write_law
 from .scope import Scope, located
-from .starts import write_initial_algorithm, write_initial_equation
+from .starts import in_order, write_initial_algorithm, write_initial_equation
 from .values import as_number
 
 
@@ -43,7 +43,7 @@ class FlatComponent(Component):
         for write, statements in (
             (write_when, found.whens),
             (write_equation, equations),
-            (write_initial_equation, found.initial),
+            (write_initial_equation, in_order(scope, found.initial)),
         ):
             for s in statements:
                 located(flat.name, s.line, write, scope, s)

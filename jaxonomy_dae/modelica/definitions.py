@@ -55,8 +55,9 @@ class DiscreteDefinitions:
 
 def find_definitions(model: Class, is_discrete: Callable[[str], bool]) -> DiscreteDefinitions:
     """Splits the statements of a model."""
-    whens = [s for s in model.equations if isinstance(s, Branches) and s.kind == "when"]
-    others = _with_choices((s for s in model.equations if s not in whens) if whens else model.equations, is_discrete)
+    found = [s for s in model.equations if isinstance(s, Branches) and s.kind == "when"]
+    whens = _merged(found)
+    others = _with_choices((s for s in model.equations if s not in found) if found else model.equations, is_discrete)
     algorithms = []
     for section in model.algorithms:
         inside = [s for s in section if isinstance(s, Branches) and s.kind == "when"]
@@ -91,6 +92,22 @@ def find_definitions(model: Class, is_discrete: Callable[[str], bool]) -> Discre
         of, by_when | set(followed), followed, equations, whens,
         list(model.initial_equations), algorithms, assigned,
     )  # fmt: skip
+
+
+def _merged(whens: list[Branches]) -> list[Branches]:
+    """The whens of equations, those with one condition as one: what they assign at an instant holds for all of them."""
+    by_condition: dict[Expression, int] = {}
+    out: list[Branches] = []
+    for s in whens:
+        condition, body = s.branches[0]
+        if len(s.branches) == 1 and condition in by_condition:
+            first = out[by_condition[condition]]
+            out[by_condition[condition]] = first._replace(branches=((condition, first.branches[0][1] + body),))
+        else:
+            if len(s.branches) == 1:
+                by_condition[condition] = len(out)
+            out.append(s)
+    return out
 
 
 def _with_choices(statements: Iterable[Statement], is_discrete: Callable[[str], bool]) -> list[Statement]:

@@ -320,6 +320,13 @@ def _assigned(scope: Scope, target: Expression, value: Value) -> Iterator[tuple[
     if not isinstance(target, Reference):
         raise ModelError("in a when, a variable stands on the left")
     name = scope.interpreter.name_of(target)
+    if isinstance(value, list):
+        for place in scope.entries.get(name, ()):
+            entry = value
+            for k in place:
+                entry = entry[k - 1]
+            yield DiscreteSymbol(f"{name}[{','.join(map(str, place))}]"), sympy.sympify(as_number(entry))
+        return
     if name not in scope.definitions.stored:
         raise ModelError(f"'{name}' cannot be assigned in a when")
     if not isinstance(value, str):

@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 import sympy
 
 from ..errors import ModelError, nearest
-from ..modeling.symbols import der
+from ..modeling.symbols import VariableSymbol, der
 from .builtin import FUNCTIONS, filled, matrix_product
 from .flat_model import literal_numbers
 from .operations import ARITHMETIC, RELATIONS, of_complex_numbers
@@ -174,7 +174,7 @@ class Interpreter:
         entries = [self._entry(row, rest, names) for row in value]
         out = entries[-1]
         for k in range(len(entries) - 1, 0, -1):
-            out = chosen(sympy.Eq(index, k), entries[k - 1], out, self.quiet)
+            out = chosen(RELATIONS["=="](index, k), entries[k - 1], out, self.quiet)
         return out
 
     def _unary(self, e: Unary, names: Names) -> Value:
@@ -190,7 +190,7 @@ class Interpreter:
             return entrywise(both if sign == "and" else either, a, self.evaluate(e.right, names))
         a, b = self.evaluate(e.left, names), self.evaluate(e.right, names)
         if sign in RELATIONS:
-            return RELATIONS[sign](a, b)
+            return RELATIONS[sign](self._compared(a), self._compared(b))
         if sign == "*" and isinstance(a, list) and isinstance(b, list):
             return matrix_product(a, b)
         if sign == "+" and isinstance(a, str):
@@ -198,6 +198,13 @@ class Interpreter:
         if isinstance(a, Record) or isinstance(b, Record):
             return of_complex_numbers(sign, a, b)
         return entrywise(ARITHMETIC[sign.removeprefix(".")], a, b)
+
+    def _compared(self, value: Value) -> Value:
+        """A side of a relation. A choice in it that moves gets a name: SymPy would spread the relation over all
+        branches, and compare these as sets."""
+        if self.guarded or not isinstance(value, sympy.Expr) or not value.has(sympy.Piecewise):
+            return value
+        return self.named(value) if value.atoms(VariableSymbol) else value
 
     def _choice(self, e: Choice, names: Names) -> Value:
         pairs = []

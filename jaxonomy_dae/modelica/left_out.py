@@ -4,9 +4,13 @@ import math
 import sys
 from collections.abc import Callable
 
+import scipy.special
+import sympy
+
 from ..errors import ModelError
-from .builtin import FUNCTIONS, flattened, matrix_product, total, transposed
+from .builtin import FUNCTIONS, flattened, matrix_product, of_numbers, total, transposed
 from .operations import ARITHMETIC, RELATIONS
+from .random_numbers import initial_state
 from .values import Record, Value, chosen, entrywise
 
 ZERO_CELSIUS = 273.15  # in kelvin
@@ -59,6 +63,11 @@ def _low_pass(real: list, constant: list, linear: list, frequency: Value) -> lis
     return [[c * w for c in real], [c * w**2 for c in constant], [c * w for c in linear]]
 
 
+def _normal_cumulative(x: Value, mean: Value = 0.0, deviation: Value = 1.0) -> Value:
+    erf = of_numbers(math.erf, sympy.erf)
+    return (1 + erf((x - mean) / (deviation * math.sqrt(2)))) / 2
+
+
 def time_table_coefficients(
     table: list, offset: Value, start: Value, time: Value, last: Value, eps: float, shift: Value
 ) -> list:
@@ -105,5 +114,8 @@ LEFT_OUT: dict[str, Callable[..., Value]] = {
     "Modelica.Units.Conversions.to_bar": lambda p: entrywise(lambda x: x / 1e5, p),
     "Modelica.Units.Conversions.from_bar": lambda p: entrywise(lambda x: x * 1e5, p),
     "Complex.\\'constructor\\'.fromReal": lambda re, im=0.0: Record(re=re, im=im),
+    "Modelica.Math.Random.Generators.Xorshift64star.initialState": initial_state,
+    "Modelica.Math.Distributions.Normal.cumulative": _normal_cumulative,
+    "Modelica.Math.Special.erfInv": of_numbers(scipy.special.erfinv, sympy.erfinv),
     "getInterpolationCoefficients": time_table_coefficients,
 }

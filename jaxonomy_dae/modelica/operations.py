@@ -6,6 +6,7 @@ from typing import Any
 import sympy
 
 from ..errors import ModelError
+from ..modeling.symbols import VariableSymbol
 from .builtin import power, quotient
 from .values import Record, Value, as_number, both, either, is_condition, negated, parts_of_choice, plain
 
@@ -17,10 +18,7 @@ def _equal(a: Value, b: Value) -> Value:
         return a == b
     for choice, number in ((a, b), (b, a)):
         if isinstance(choice, sympy.Piecewise) and isinstance(number, int | float):
-            found: Value = False
-            for value, condition in parts_of_choice(choice):
-                found = either(found, both(condition, _equal(_plain_number(value), number)))
-            return found
+            return _of_branches(choice, lambda v: _equal(v, number))  # noqa: B023
     return plain(sympy.Eq(a, b))
 
 
@@ -36,9 +34,26 @@ def _relation(number: Callable[[Any, Any], bool], symbol: Any) -> Callable[[Valu
         a, b = as_number(a), as_number(b)
         if isinstance(a, int | float | str) and isinstance(b, int | float | str):
             return number(a, b)
+        for choice, on_left in ((a, True), (b, False)):
+            if isinstance(choice, sympy.Piecewise) and not _moves(choice):
+                return _of_branches(choice, lambda v: relation(v, b) if on_left else relation(a, v))  # noqa: B023
         return plain(symbol(a, b))
 
     return relation
+
+
+def _moves(choice: sympy.Piecewise) -> bool:
+    """True if a branch changes between events."""
+    branches: tuple[Any, ...] = choice.args
+    return any(isinstance(s, VariableSymbol) for value, _ in branches for s in value.free_symbols)
+
+
+def _of_branches(choice: sympy.Piecewise, holds: Callable[[Value], Value]) -> Value:
+    """Whether a relation holds of a choice: of the branch that is taken. SymPy would compare all conditions as sets."""
+    found: Value = False
+    for value, condition in parts_of_choice(choice):
+        found = either(found, both(condition, holds(_plain_number(value))))
+    return found
 
 
 RELATIONS: dict[str, Callable[[Value, Value], Value]] = {

@@ -19,6 +19,7 @@ from .flat_model import FlatModel
 from .interpret import Interpreter
 from .kept_relations import KeptRelations
 from .left_out import LEFT_OUT
+from .random_numbers import RandomNumbers
 from .tables import EXTERNALS
 from .tree import Assignment, Branches, Declaration, Equality, Expression, Reference, Truth
 from .values import Record, Value, as_number, both, is_condition, negated, plain
@@ -54,9 +55,11 @@ class Scope:
             "pre": self._pre, "edge": self._edge, "change": self._change, "initial": self.at_start,
             "terminal": lambda: False, "sample": self._sample, "delay": _delay,
         }  # fmt: skip
+        self.random = RandomNumbers(component)
         self.interpreter = Interpreter(
-            flat.classes, self.value, special, LEFT_OUT | EXTERNALS, self.entries, self._named
-        )
+            flat.classes, self.value, special, LEFT_OUT | EXTERNALS | self.random.functions(),
+            self.entries, self._named,
+        )  # fmt: skip
         self.definitions = find_definitions(flat.model, self.is_discrete)
         self.names: dict[sympy.Expr, sympy.Symbol] = {}
         self.in_action = False
@@ -144,8 +147,12 @@ class Scope:
                 return self._as_parameter(d, found)
         if self._is_unknown(d):
             return self._unknown_parameter(d)
-        if d.value is None and "start" in d.modifiers and self.kind(d.type) != REAL:
-            return self.evaluate(d.modifiers["start"])
+        if d.value is None and self.kind(d.type) != REAL:
+            value = self._said_initially(d.name) if d.modifiers.get("fixed") == Truth(False) else None
+            if value is not None:
+                return value
+            if "start" in d.modifiers:
+                return self.evaluate(d.modifiers["start"])
         if d.value is None:
             if self.kind(d.type) == REAL and not d.dimensions:
                 start = d.modifiers.get("start")
@@ -306,7 +313,8 @@ class Scope:
         if e in self.names:
             return self.names[e]
         symbols = e.free_symbols
-        if any(isinstance(s, PreviousSymbol) for s in symbols):
+        known_before = PreviousSymbol | DiscreteSymbol if self.in_action else PreviousSymbol
+        if any(isinstance(s, known_before) for s in symbols):  # a variable would have the value of another side
             return e
         name = f":value[{len(self.names)}]"
         if all(isinstance(s, ParameterSymbol) and not isinstance(s, DiscreteSymbol) for s in symbols):

@@ -1,7 +1,10 @@
 """The initial equations of a flat model."""
 
 import dataclasses
+import graphlib
 import math
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import sympy
 
@@ -15,6 +18,33 @@ from .tree import Branches, Call, Equality, Reference, Statement
 from .values import Value, as_number, is_condition
 
 
+def in_order(scope: Scope, statements: Sequence[Statement]) -> list[Statement]:
+    """Initial equations, those of discrete variables first, each after those of the variables that it reads."""
+    given: dict[str, Equality] = {}
+    for s in statements:
+        if isinstance(s, Equality):
+            side = s.left.arguments[0] if isinstance(s.left, Call) and s.left.function == "pre" else s.left
+            name = scope.interpreter.name_of(side) if isinstance(side, Reference) else ""
+            if name in scope.definitions.stored:
+                given[name] = s
+    read = {name: set(with_entries(_names(s.right), scope.flat.model)) & given.keys() for name, s in given.items()}
+    try:
+        first = [given[name] for name in graphlib.TopologicalSorter(read).static_order()]
+    except graphlib.CycleError:
+        return list(statements)
+    return [*first, *(s for s in statements if not any(s is f for f in first))]
+
+
+def _names(expression: Any) -> Iterator[str]:
+    stack = [expression]
+    while stack:
+        e = stack.pop()
+        if isinstance(e, Reference):
+            yield e.path
+        if isinstance(e, tuple):
+            stack.extend(e)
+
+
 def write_initial_equation(scope: Scope, s: Statement) -> None:
     """Adds what one statement says of the initial time."""
     if isinstance(s, Branches):
@@ -25,7 +55,11 @@ def write_initial_equation(scope: Scope, s: Statement) -> None:
             a = a.arguments[0]
             if isinstance(a, Reference) and scope.interpreter.name_of(a) not in scope.definitions.stored:
                 return  # nothing reads it
-        found = equal(scope, a, b)
+        scope.random.starting = True
+        try:
+            found = equal(scope, a, b)
+        finally:
+            scope.random.starting = False
     else:
         return
     for left, right in found:

@@ -13,6 +13,7 @@ from jaxonomy_dae.expressions.smooth import Smooth
 from jaxonomy_dae.modelica import FlatComponent, load, read_base
 from jaxonomy_dae.modelica.interpret import Interpreter
 from jaxonomy_dae.modelica.left_out import LEFT_OUT, time_table_coefficients
+from jaxonomy_dae.modelica.random_numbers import GENERATORS, number
 from jaxonomy_dae.modelica.tables import Table
 from jaxonomy_dae.modelica.tree import Binary, Call, Number, Reference, Unary
 from jaxonomy_dae.modeling.symbols import VariableSymbol
@@ -186,6 +187,54 @@ def test_functions_that_texts_leave_out():
     assert orientation(6) == pytest.approx([*orientation(3), *(a - math.pi / 6 for a in orientation(3))])
 
 
+def python_xorshift(name, state):
+    """The generators written with fixed-width integers of NumPy, one word after the other (Vigna 2016)."""
+    s = np.array(state[: len(state) // 2 * 2], np.int32).view(np.uint64).copy()
+    place = state[-1]
+    with np.errstate(over="ignore"):
+        if name == "xorshift64star":
+            x = s[0]
+            x ^= x >> np.uint64(12)
+            x ^= x << np.uint64(25)
+            x ^= x >> np.uint64(27)
+            out = s[0] = x * np.uint64(2685821657736338717)
+        elif name == "xorshift128plus":
+            a, b = s
+            a ^= a << np.uint64(23)
+            s[0] = b
+            out = s[1] = (a ^ b ^ (a >> np.uint64(17)) ^ (b >> np.uint64(26))) + b
+        else:
+            a = s[place]
+            place = (place + 1) % 16
+            b = s[place]
+            b ^= b << np.uint64(31)
+            s[place] = a ^ (a >> np.uint64(30)) ^ b ^ (b >> np.uint64(11))
+            out = s[place] * np.uint64(1181783497276652981)
+    after = s.view(np.int32).tolist() + ([place] if len(state) % 2 else [])
+    return float(np.int64(np.uint64(out).view(np.int64))) / 2.0**64 + 0.5, after
+
+
+@pytest.mark.parametrize(("name", "count"), [(n, c) for n, (_, c) in GENERATORS.items()])
+def test_generators_of_random_numbers(name, count):
+    """Many steps; the mean and variance of a uniform distribution."""
+    state = [*np.random.default_rng(5).integers(-(2**31), 2**31, count - count % 2).tolist(), *([14] * (count % 2))]
+    found = []
+    for _ in range(400):
+        expected = python_xorshift(name, state)
+        r, state = number(name, state)
+        assert (r, state) == expected
+        found.append(r)
+    assert np.mean(found) == pytest.approx(0.5, abs=0.05) and np.var(found) == pytest.approx(1 / 12, abs=0.01)
+
+
+def test_a_state_that_no_event_keeps_is_refused():
+    text = """package 'm' function 'f' input Integer 's'[2]; output Real 'r'; output Integer 'after'[2];
+      external "C" ModelicaRandom_xorshift64star('s', 'after', 'r'); end 'f';
+      model 'm' Real 'x'; Real 'y'; equation 'y' = time; 'x' = 'f'({'y', 'y'}); end 'm'; end 'm';"""
+    with pytest.raises(ModelError, match="a when assigns; got y"):
+        built(text)
+
+
 def test_a_time_table_is_a_line_until_its_next_event():
     """Its rows jump at t = 2; a line until the next row, and the last one goes on."""
     rows = [[0.0, 0.0], [1.0, 2.0], [2.0, 3.0], [2.0, 5.0], [4.0, 1.0]]
@@ -326,11 +375,41 @@ def test_an_algorithm_in_a_when_goes_on_from_the_values_before_it():
     assert found["n"] == "pre(n) + 1" and found["k"] == "2*n" and found["j"] == "8*pre(j)"
 
 
+def test_whens_with_one_condition_are_one_event():
+    """What one of them read was the value before, where the other one assigns it at the same instant."""
+    text = """model m Integer k(start = 0); Real j(start = 0.0); Real x; equation x = k + j;
+      when sample(0.0, 1.0) then j = 2.0 * k; end when; when sample(0.0, 1.0) then k = pre(k) + 1; end when; end m;"""
+    assert actions_of(text) == {"j": "2.0*k", "k": "pre(k) + 1"}
+
+
+def test_a_relation_with_a_choice_in_it():
+    """SymPy spread it over the branches and compared them as sets: minutes for a few branches of one variable."""
+    bits = " ".join(f"z := div(z, 2); b{k} := if mod(z, 2) > 0 then 1 else 0;" for k in range(1, 8))
+    names = " ".join(f"Integer b{k}; Real y{k};" for k in range(1, 8))
+    reads = " ".join(f"y{k} = b{k};" for k in range(1, 8))
+    text = f"""model m Integer z; Real u; {names} equation u = sin(time); {reads}
+      algorithm when time > 0.5 then z := if u > 0.0 then integer(u * 12.7 + 0.5) else 0; {bits} end when; end m;"""
+    assert len(actions_of(text)) == 8
+    text = """model m Real x; Real y; Real u; equation u = sin(time);
+      x = if (if u > 0.0 then u ^ 3 else -u) > 0.2 then 1.0 else 2.0;
+      y = if time < (if time < 1.0 then 0.5 else 2.0) then 1.0 else 2.0; end m;"""
+    component = built(text)
+    assert ":value[0]" in component.variables and ":value[1]" not in component.variables
+
+
 def test_at_a_tick_pre_is_the_value_before_it():
     """`pre(k) <> 0` beside a clock was the value that the tick gives to k: a circle."""
     text = """model m Integer k(start = -1); Integer j(start = 2); Real x; equation x = k + j;
       when pre(k) <> 0 and sample(0.0, 1.0) then k = pre(j); j = pre(j) - 1; end when; end m;"""
     assert "Ne(pre(k), 0)" in actions_of(text)["k"]
+
+
+def test_initial_equations_of_discrete_variables_follow_each_other():
+    """The first one read what the second one gives as it was declared."""
+    text = """model m discrete Real a; discrete Real b(start = -1.0); Real x; initial equation a = log(b); b = 1.0;
+      equation x = a + b; when sample(1.0, 1.0) then a = 2.0; b = 3.0; end when; end m;"""
+    parameters = built(text).parameters
+    assert parameters["a"].value == 0.0 and parameters["b"].value == 1.0
 
 
 def test_an_initial_algorithm_counts_at_its_end():

@@ -9,6 +9,7 @@ from modelica_texts import BALL, BLOCK, PIPE, TOKEN
 from jaxonomy_dae import AcausalCompiler, AcausalDiagram, EqnEnv, simulate
 from jaxonomy_dae.modelica import FlatComponent, load
 from jaxonomy_dae.modelica.__main__ import main
+from jaxonomy_dae.modelica.random_numbers import number
 
 
 def compiled(text, **options):
@@ -93,6 +94,28 @@ def test_an_elsewhen_acts_when_its_condition_becomes_true():
     assert solution["m.high"].tolist() == [0, 0, 1, 1, 1, 1, 1, 2]
     assert solution["m.low"].tolist() == [0, 1, 1, 1, 1, 1, 2, 2]
     assert solution["m.first"].tolist() == [0, 0, 0, 0, 1, 11, 11, 11]
+
+
+@pytest.mark.long("a clock of two generations of variables")
+def test_random_numbers_of_a_run_are_those_of_integers():
+    """A state of 128 bits, kept in four discrete variables, of which a clock makes the next one."""
+    text = """package 'N' function 'random' input Integer 's'[4]; output Real 'r'; output Integer 'after'[4];
+      external "C" ModelicaRandom_xorshift128plus('s', 'after', 'r'); end 'random';
+      model 'N' discrete Real 'y'; discrete Real 'r'; Integer 's[1]'; Integer 's[2]'; Integer 's[3]'; Integer 's[4]';
+      parameter Integer 'seed'(fixed = false);
+      initial equation 'seed' = -1234567890; pre('s[1]') = 'seed'; pre('s[2]') = 1; pre('s[3]') = 2147483647;
+        pre('s[4]') = -2147483648; 'r' = 'random'(pre('s'));
+      equation when sample(0.0, 1.0) then 'y' = 2.0 * 'r'; end when;
+        when sample(0.0, 1.0) then
+          ('r', 's') = 'random'({pre('s[1]'), pre('s[2]'), pre('s[3]'), pre('s[4]')});
+        end when; end 'N'; end 'N';"""
+    state, expected = [-1234567890, 1, 2147483647, -2147483648], []
+    for _ in range(6):
+        r, state = number("xorshift128plus", state)
+        expected.append(2 * r)
+    solution = simulate(compiled(text), 5.5, ts=np.arange(6) + 0.5)
+    np.testing.assert_array_equal(solution["m.y"], expected)
+    assert [int(solution[f"m.s[{k}]"][-1]) for k in range(1, 5)] == state
 
 
 @pytest.mark.long("two compilations")
