@@ -10,6 +10,7 @@ from .events import write_end_of_start, write_modes, write_when
 from .flat_model import FlatModel
 from .laws import equation_of, write_law
 from .scope import Scope, located
+from .semi_linear import with_chains_solved
 from .starts import in_order, write_initial_algorithm, write_initial_equation
 from .values import as_number
 
@@ -39,6 +40,7 @@ class FlatComponent(Component):
         scope.declare_variables()
         replaced = {variable: equation_of(scope, variable) for variable in flat.laws}
         equations = [s for s in found.equations if not any(s is r.statement for r in replaced.values())]
+        equations = with_chains_solved(equations, scope.interpreter.name_of)
         write_modes(scope)
         for write, statements in (
             (write_when, found.whens),

@@ -24,7 +24,7 @@ NEVER = 1e60  # a time event that does not come: corners of a table over time ar
 @dataclasses.dataclass(frozen=True)
 class Table:
     """Rows of abscissa and values. A table over time is shifted by `shift`. It is zero before `start`: the output of
-    Modelica.Blocks.Sources.CombiTimeTable is its offset there."""
+    Modelica.Blocks.Sources.CombiTimeTable is its offset there. Entries that are parameters make an array of objects."""
 
     rows: np.ndarray
     columns: list[int]
@@ -44,9 +44,13 @@ class Table:
         x = self.rows[:, 0] + self.shift
         y = self.rows[:, int(self.columns[int(column) - 1]) - 1]
         if len(x) == 1:
-            return float(y[0])
+            return _plain(y[0])
+        if self.rows.dtype == object:
+            if self.smoothness not in (LINEAR, CONSTANT):
+                raise ModelError("a smooth table needs numbers; give its parameters values that are final")
+            u = sympy.sympify(u)
         if self.extrapolation == PERIODIC:
-            period = float(x[-1] - x[0])
+            period = _plain(x[-1] - x[0])
             u = x[0] + (sympy.Mod(u - x[0], period) if isinstance(u, sympy.Expr) else (u - x[0]) % period)
         pieces = self._pieces(x, y)
         if isinstance(u, int | float):
@@ -54,26 +58,26 @@ class Table:
             k, beyond = min(k, len(pieces) - 1), not x[0] <= u < x[-1]
             return float(self._ends(pieces, x, y, u)[0 if u < x[0] else 1]) if beyond else float(pieces[k](u))
         low, high = self._ends(pieces, x, y, u)
-        branches = [(low, u < float(x[0]))]
-        branches += [(p(u), u < float(x[k + 1])) for k, p in enumerate(pieces) if x[k + 1] > x[k]]
+        branches = [(low, u < _plain(x[0]))]
+        branches += [(p(u), u < _plain(x[k + 1])) for k, p in enumerate(pieces) if _is_wide(x[k + 1] - x[k])]
         out = sympy.Piecewise(*branches, (high, True), evaluate=False)
         return out if events else smooth(out)
 
     def _ends(self, pieces: list[Callable], x: np.ndarray, y: np.ndarray, u: Value) -> tuple[Value, Value]:
         """The values before the first and after the last abscissa."""
         if self.extrapolation == LAST_TWO and self.smoothness == CONSTANT:
-            return float(y[0]), float(y[-1])
+            return _plain(y[0]), _plain(y[-1])
         if self.extrapolation in (LAST_TWO, PERIODIC):
             return _line(pieces[0], x[0], y[0], u), _line(pieces[-1], x[-1], y[-1], u)
-        return float(y[0]), float(y[-1])
+        return _plain(y[0]), _plain(y[-1])
 
     def _pieces(self, x: np.ndarray, y: np.ndarray) -> list[Callable[[Value], Value]]:
         """A polynomial for each interval."""
         if self.smoothness == CONSTANT:
-            return [_polynomial((float(v),), 0.0) for v in y[:-1]]
+            return [_polynomial((_plain(v),), 0.0) for v in y[:-1]]
         if self.smoothness == LINEAR or len(x) == 2:
-            slopes = np.divide(np.diff(y), np.diff(x), out=np.zeros(len(x) - 1), where=np.diff(x) > 0)
-            return [_polynomial((float(s), float(v)), float(a)) for s, v, a in zip(slopes, y, x, strict=False)]
+            slopes = [dy / dx if _is_wide(dx) else 0.0 for dx, dy in zip(np.diff(x), np.diff(y), strict=True)]
+            return [_polynomial((_plain(s), _plain(v)), _plain(a)) for s, v, a in zip(slopes, y, x, strict=False)]
         if (np.diff(x) <= 0).any():
             raise ModelError("a smooth table needs rising abscissae")
         if self.smoothness in (AKIMA, MODIFIED_AKIMA):
@@ -84,7 +88,16 @@ class Table:
         return [_polynomial(tuple(map(float, c)), float(a)) for c, a in zip(found.c.T, x, strict=False)]
 
 
-def _polynomial(coefficients: tuple[float, ...], at: float) -> Callable[[Value], Value]:
+def _plain(value: Value) -> Value:
+    return value if isinstance(value, sympy.Expr) else float(value)
+
+
+def _is_wide(interval: Value) -> bool:
+    """False for the interval between two rows of one abscissa, where a table jumps."""
+    return isinstance(interval, sympy.Expr) or interval > 0
+
+
+def _polynomial(coefficients: tuple[Value, ...], at: Value) -> Callable[[Value], Value]:
     def value(u: Value) -> Value:
         out: Value = coefficients[0]
         for c in coefficients[1:]:
@@ -98,13 +111,14 @@ def _line(piece: Callable[[Value], Value], x: float, y: float, u: Value) -> Valu
     """The tangent of a polynomial at an end of its interval."""
     t = sympy.Symbol("t")
     slope = sympy.diff(sympy.sympify(piece(t)), t)
-    return float(y) + float(slope.subs(t, float(x))) * (u - float(x))
+    return _plain(y) + _plain(slope.subs(t, _plain(x))) * (u - _plain(x))
 
 
 def _numbers(table: Value, name: str, file: str) -> np.ndarray:
     if file not in ("NoName", ""):
         raise ModelError(f"the table '{name}' is in the file '{file}', which is not read")
-    return np.array(table, float)
+    rows = np.array(table, object)
+    return rows if any(isinstance(v, sympy.Expr) for v in rows.flat) else rows.astype(float)
 
 
 def table_1d(
@@ -125,11 +139,11 @@ EXTERNALS: dict[str, Callable[..., Value]] = {
     "Modelica.Blocks.Types.ExternalCombiTable1D": table_1d,
     "Modelica.Blocks.Types.ExternalCombiTimeTable": time_table,
     "ModelicaStandardTables_CombiTable1D_getValue": lambda table, column, u: table.value(column, u, False),
-    "ModelicaStandardTables_CombiTable1D_minimumAbscissa": lambda table: float(table.rows[0, 0]),
-    "ModelicaStandardTables_CombiTable1D_maximumAbscissa": lambda table: float(table.rows[-1, 0]),
+    "ModelicaStandardTables_CombiTable1D_minimumAbscissa": lambda table: _plain(table.rows[0, 0]),
+    "ModelicaStandardTables_CombiTable1D_maximumAbscissa": lambda table: _plain(table.rows[-1, 0]),
     "ModelicaStandardTables_CombiTimeTable_getValue": lambda table, column, t, *_: table.value(column, t, True),
-    "ModelicaStandardTables_CombiTimeTable_minimumTime": lambda table: float(table.rows[0, 0]),
-    "ModelicaStandardTables_CombiTimeTable_maximumTime": lambda table: float(table.rows[-1, 0]),
+    "ModelicaStandardTables_CombiTimeTable_minimumTime": lambda table: _plain(table.rows[0, 0]),
+    "ModelicaStandardTables_CombiTimeTable_maximumTime": lambda table: _plain(table.rows[-1, 0]),
     "ModelicaStandardTables_CombiTimeTable_nextTimeEvent": lambda *_: NEVER,
     "ModelicaInternal_print": lambda *_: None,
     "ModelicaStreams_closeFile": lambda *_: None,

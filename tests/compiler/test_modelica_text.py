@@ -14,7 +14,8 @@ from jaxonomy_dae.modelica import FlatComponent, load, read_base
 from jaxonomy_dae.modelica.interpret import Interpreter
 from jaxonomy_dae.modelica.left_out import LEFT_OUT, time_table_coefficients
 from jaxonomy_dae.modelica.random_numbers import GENERATORS, number
-from jaxonomy_dae.modelica.tables import Table
+from jaxonomy_dae.modelica.semi_linear import with_chains_solved
+from jaxonomy_dae.modelica.tables import Table, table_1d
 from jaxonomy_dae.modelica.tree import Binary, Call, Number, Reference, Unary
 from jaxonomy_dae.modeling.symbols import VariableSymbol
 
@@ -227,6 +228,27 @@ def test_generators_of_random_numbers(name, count):
     assert np.mean(found) == pytest.approx(0.5, abs=0.05) and np.var(found) == pytest.approx(1 / 12, abs=0.01)
 
 
+def test_chains_of_semi_linear_have_a_solution_at_rest():
+    """Two connections with a passage between them, of opposite flows; what is between their ends hung on 0·h = 0."""
+    names = "ma Ha mb Hb mc Hc md Hd q ha hb hc"
+    text = f"""model m {" ".join(f"Real {n};" for n in names.split())} Real left; Real right; equation q = 0.0;
+      ma + mb = 0.0; Ha + Hb = 0.0; mb + mc = 0.0; Hb + Hc + q = 0.0; mc = -md; Hc + Hd = 0.0; ma = time - 1.0;
+      left = 3.0; right = 5.0; Ha = semiLinear(ma, ha, left); Hb = semiLinear(mb, ha, hb);
+      semiLinear(mc, hc, hb) = Hc; Hd = semiLinear(md, hc, right); end m;"""
+    statements = with_chains_solved(load(text).model.equations, lambda r: r.path)
+
+    def holds(values):
+        evaluate = Interpreter({}, values.__getitem__, {}, {}).evaluate
+        return all(evaluate(s.left) == evaluate(s.right) for s in statements)
+
+    for time in (0.0, 1.0, 2.5):
+        m, h = time - 1.0, 5.0 if time >= 1.0 else 3.0
+        values = dict(time=time, ma=m, mb=-m, mc=m, md=-m, Ha=m * h, Hb=-m * h, Hc=m * h, Hd=-m * h, q=0.0)
+        values |= dict(left=3.0, right=5.0, ha=h, hb=h, hc=h)
+        assert holds(values)
+        assert not any(holds(values | {name: 4.0}) for name in ("ha", "hb", "hc"))
+
+
 def test_a_state_that_no_event_keeps_is_refused():
     text = """package 'm' function 'f' input Integer 's'[2]; output Real 'r'; output Integer 'after'[2];
       external "C" ModelicaRandom_xorshift64star('s', 'after', 'r'); end 'f';
@@ -280,6 +302,19 @@ def test_a_table_of_a_symbol_is_that_of_numbers(smoothness, extrapolation):
     for v in np.linspace(-1.0, 6.0, 29):
         assert math.isclose(found(float(v)), table.value(1, float(v), True), rel_tol=1e-9, abs_tol=1e-9)
     assert [table.value(1, x, True) for x in rows[:-1, 0]] == pytest.approx(rows[:-1, 1].tolist())
+
+
+@pytest.mark.parametrize("extrapolation", [1, 2])
+def test_a_table_of_parameters_is_that_of_their_values(extrapolation):
+    """Its entries had to be numbers."""
+    rows = [[0.0, 1.0], [1.0, 3.0], [2.5, 2.0]]
+    a, b, u = sympy.symbols("a b u", real=True)
+    known = table_1d("t", "NoName", rows, [2], 1, extrapolation)
+    found = table_1d("t", "NoName", [[0.0, 1.0], [a, b], [2.5, 2.0]], [2], 1, extrapolation).value(1, u, True)
+    for at in (-1.0, 0.0, 0.3, 1.0, 2.0, 2.5, 4.0):
+        assert float(found.subs({a: 1.0, b: 3.0, u: at})) == pytest.approx(known.value(1, at, True))
+    with pytest.raises(ModelError, match="needs numbers"):
+        table_1d("t", "NoName", [[0.0, a], [1.0, 2.0], [3.0, b]], [2], 4, extrapolation).value(1, u, True)
 
 
 def test_a_table_that_jumps_has_the_later_value_at_the_jump():
