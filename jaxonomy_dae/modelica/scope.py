@@ -5,6 +5,7 @@ parameters are constants. Boolean, Integer and enumeration variables are of two 
 event are discrete variables; the others are expressions, put in wherever they are read.
 """
 
+import functools
 import re
 from collections.abc import Callable, Iterable
 from typing import TypeVar
@@ -20,7 +21,7 @@ from .interpret import Interpreter
 from .kept_relations import KeptRelations
 from .left_out import LEFT_OUT
 from .random_numbers import RandomNumbers
-from .tables import EXTERNALS
+from .tables import CONSTANT, EXTERNALS, LINEAR, SMOOTHNESS
 from .tree import Assignment, Branches, Declaration, Equality, Expression, Reference, Truth
 from .values import Record, Value, as_number, both, is_condition, negated, plain
 
@@ -38,6 +39,7 @@ class Scope:
     - `in_action`: True while values are evaluated that an event writes: `pre(m)` is then the value before it.
     - `names`: names of long expressions of functions.
     - `initial`: the discrete variable that is 1 at the initial time; None if nothing asks for it.
+    - `as_numbers`: True while parameters are read as their values, which are final then.
     - `pending`: conditions that hold while a mode is not what its equation says.
     - `done`: for whens that assign what modes read, the discrete variable that is 1 from their event until their
       condition is false.
@@ -55,6 +57,7 @@ class Scope:
             "pre": self._pre, "edge": self._edge, "change": self._change, "initial": self.at_start,
             "terminal": lambda: False, "sample": self._sample, "delay": _delay,
         }  # fmt: skip
+        special |= {name: functools.partial(self._table, name, place) for name, place in SMOOTHNESS.items()}
         self.random = RandomNumbers(component)
         self.interpreter = Interpreter(
             flat.classes, self.value, special, LEFT_OUT | EXTERNALS | self.random.functions(),
@@ -62,7 +65,8 @@ class Scope:
         )  # fmt: skip
         self.definitions = find_definitions(flat.model, self.is_discrete)
         self.names: dict[sympy.Expr, sympy.Symbol] = {}
-        self.in_action = False
+        self.in_action = self.as_numbers = False
+        self.final: dict[str, Value] = {}
         self.initial: DiscreteSymbol | None = None
         self.pending: list[Value] = []
         self.done: dict[Branches, DiscreteSymbol] = {}
@@ -109,6 +113,8 @@ class Scope:
 
     def _known_of(self, name: str) -> dict[str, Value]:
         """Where the value of a name is kept: what is an expression reads pre(m) in another way at events."""
+        if self.as_numbers:
+            return self.final
         if not self.in_action or name in self.definitions.stored or not self.is_discrete(name):
             return self.known
         return self.known_at_events
@@ -178,6 +184,8 @@ class Scope:
             return value
         if isinstance(value, int | float):
             value = float(value)
+            if self.as_numbers:
+                return value
         elif not isinstance(value, sympy.Expr):
             return value
         elif any(not isinstance(s, ParameterSymbol) or isinstance(s, DiscreteSymbol) for s in value.free_symbols):
@@ -323,6 +331,15 @@ class Scope:
             self.names[e] = self.component.variable(name)
             self.component.add_equations(sympy.Eq(self.names[e], self.kept.in_equations(e), evaluate=False))
         return self.names[e]
+
+    def _table(self, name: str, place: int, *arguments: Expression) -> Value:
+        """A table. The entries of a smooth one, whose polynomials depend on all of them, are numbers."""
+        smoothness = self.evaluate(arguments[place]) if len(arguments) > place else LINEAR
+        self.as_numbers = smoothness not in (LINEAR, CONSTANT)
+        try:
+            return EXTERNALS[name](*map(self.evaluate, arguments))
+        finally:
+            self.as_numbers = False
 
     def _pre(self, e: Expression) -> Value:
         value = self.evaluate(e)

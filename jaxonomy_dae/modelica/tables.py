@@ -47,7 +47,7 @@ class Table:
             return _plain(y[0])
         if self.rows.dtype == object:
             if self.smoothness not in (LINEAR, CONSTANT):
-                raise ModelError("a smooth table needs numbers; give its parameters values that are final")
+                raise ModelError("the entries of a smooth table are numbers")
             u = sympy.sympify(u)
         if self.extrapolation == PERIODIC:
             period = _plain(x[-1] - x[0])
@@ -135,6 +135,10 @@ def time_table(
     return Table(_numbers(table, name, file), columns, smoothness, extrapolation, start, shift)
 
 
+SMOOTHNESS = {  # of tables: the place of this argument, counted from 0
+    "Modelica.Blocks.Types.ExternalCombiTable1D": 4,
+    "Modelica.Blocks.Types.ExternalCombiTimeTable": 5,
+}
 EXTERNALS: dict[str, Callable[..., Value]] = {
     "Modelica.Blocks.Types.ExternalCombiTable1D": table_1d,
     "Modelica.Blocks.Types.ExternalCombiTimeTable": time_table,

@@ -313,8 +313,19 @@ def test_a_table_of_parameters_is_that_of_their_values(extrapolation):
     found = table_1d("t", "NoName", [[0.0, 1.0], [a, b], [2.5, 2.0]], [2], 1, extrapolation).value(1, u, True)
     for at in (-1.0, 0.0, 0.3, 1.0, 2.0, 2.5, 4.0):
         assert float(found.subs({a: 1.0, b: 3.0, u: at})) == pytest.approx(known.value(1, at, True))
-    with pytest.raises(ModelError, match="needs numbers"):
+    with pytest.raises(ModelError, match="entries of a smooth table are numbers"):
         table_1d("t", "NoName", [[0.0, a], [1.0, 2.0], [3.0, b]], [2], 4, extrapolation).value(1, u, True)
+
+
+@pytest.mark.parametrize(("smoothness", "changeable"), [(1, True), (2, False)])
+def test_entries_of_smooth_tables_are_final(smoothness, changeable):
+    """A table of parameters was refused where its polynomials depend on all entries."""
+    entries = "0.0, p; 1.0, 2.0; 2.0, q; 3.0, 1.0"
+    text = f"""model m parameter Real p = 0.5; parameter Real q = 2.0 * p; Real x; Real y;
+      parameter ExternalObject t = Modelica.Blocks.Types.ExternalCombiTable1D("NoName", "NoName",
+        [{entries}], {{2}}, {smoothness}, 1);
+      equation x = time; y = ModelicaStandardTables_CombiTable1D_getValue(t, 1, x); end m;"""
+    assert ("p" in built(text).parameters) == changeable
 
 
 def test_a_table_that_jumps_has_the_later_value_at_the_jump():
