@@ -7,14 +7,13 @@ the loop over the steps writes them to a table beside the state.
 
 import abc
 import dataclasses
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from ..aliases import State
+from ..aliases import Numeric, State
 
 NOTED = "noted"  # the entry of a step's dense output that holds the rows it appends
 
@@ -28,39 +27,39 @@ class AbstractAppending(eqx.Module):
     the structure of `table`.
     """
 
-    table: eqx.AbstractVar[Any]
+    table: eqx.AbstractVar[PyTree]
 
     @property
     @abc.abstractmethod
-    def count(self) -> Any:
+    def count(self) -> Numeric:
         """The number of rows so far, those for which there was no room included."""
 
 
-def apart(y: State) -> tuple[Any, PyTree]:
+def apart(y: State) -> tuple[PyTree, PyTree]:
     """Returns (the state without its table, the table), for a state of any kind."""
     return (dataclasses.replace(y, table=None), y.table) if isinstance(y, AbstractAppending) else (y, None)
 
 
-def together(y: State, table: PyTree) -> Any:
+def together(y: State, table: PyTree) -> State:
     """The state with its table put back."""
     return dataclasses.replace(y, table=table) if isinstance(y, AbstractAppending) else y
 
 
-def appended(table: PyTree, noted: PyTree, y0: State, y1: Any) -> PyTree:
+def appended(table: PyTree, noted: PyTree, y0: State, y1: State) -> PyTree:
     """The table after a step from y0 to y1 that noted these rows."""
     if table is None:
         return None
 
-    def one(table: Any, rows: Any) -> Any:
+    def one(table: PyTree, rows: PyTree) -> PyTree:
         return table.at[_places(table, rows, y0, y1)].set(rows, mode="drop") if table.shape[0] else table
 
     return jax.tree.map(one, table, noted)
 
 
-def appended_transposed(cotangent: PyTree, noted: PyTree, y0: State, y1: Any) -> PyTree:
+def appended_transposed(cotangent: PyTree, noted: PyTree, y0: State, y1: State) -> PyTree:
     """The cotangents of the rows that a step from y0 to y1 noted, given the table's."""
 
-    def one(cotangent: Any, rows: Any) -> Any:
+    def one(cotangent: PyTree, rows: PyTree) -> PyTree:
         if not cotangent.shape[0]:
             return jnp.zeros_like(rows)
         return cotangent.at[_places(cotangent, rows, y0, y1)].get(mode="fill", fill_value=0)
@@ -68,7 +67,7 @@ def appended_transposed(cotangent: PyTree, noted: PyTree, y0: State, y1: Any) ->
     return jax.tree.map(one, cotangent, noted)
 
 
-def _places(table: Any, rows: Any, y0: State, y1: Any) -> Any:
+def _places(table: PyTree, rows: PyTree, y0: State, y1: State) -> Numeric:
     """Where in the table the rows go; past its end for those that are not appended."""
     places = y0.count.astype(jnp.int32) + jnp.arange(rows.shape[0], dtype=jnp.int32)
     return jnp.where(places < y1.count.astype(jnp.int32), places, table.shape[0])

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Int, PyTree
 
-from ..aliases import Args, State
+from ..aliases import Args, Result, State
 from ..private_names import MissingName, private
 
 
@@ -44,32 +44,32 @@ class ClosureConverted(eqx.Module):
     """
 
     call: Any  # (arrays it closes over, *arrays among the arguments) -> arrays: a function of its own in the program
-    inputs: Any = eqx.field(static=True)  # the structure of the arrays among the arguments
-    outputs: Any = eqx.field(static=True)  # (structure of the arrays it returns, their shapes and dtypes)
+    inputs: PyTree = eqx.field(static=True)  # the structure of the arrays among the arguments
+    outputs: PyTree = eqx.field(static=True)  # (structure of the arrays it returns, their shapes and dtypes)
     static: Any = eqx.field(static=True)  # what it returns beside arrays: (leaves, structure)
 
-    def __call__(self, consts: Any, *args: Args) -> Any:
+    def __call__(self, consts: PyTree, *args: Args) -> PyTree:
         leaves, structure = jax.tree.flatten(eqx.filter(args, eqx.is_array))
         if structure != self.inputs:
             raise TypeError(f"a closure-converted function was made for {self.inputs}; got {structure}")
         return self._combined(self.call(consts, *leaves))
 
     @property
-    def out_struct(self) -> Any:
+    def out_struct(self) -> PyTree:
         """The structure of the function's result: shapes and dtypes, and values where they are static."""
         return self._combined(list(self.outputs[1]))
 
-    def _combined(self, leaves: Any) -> Any:
+    def _combined(self, leaves: PyTree) -> PyTree:
         others, structure = self.static
         return eqx.combine(jax.tree.unflatten(self.outputs[0], leaves), jax.tree.unflatten(structure, others))
 
 
-def closure_convert(function: Any, *args: Args) -> tuple[ClosureConverted, list[Any]]:
+def closure_convert(function: Any, *args: Args) -> tuple[ClosureConverted, list[PyTree]]:
     """Returns (`function` as a `ClosureConverted`, the list of arrays that it closed over). Arguments may be arrays or
     `jax.ShapeDtypeStruct`s."""
     dynamic, static = eqx.partition(args, lambda leaf: eqx.is_array(leaf) or isinstance(leaf, jax.ShapeDtypeStruct))
     leaves, structure = jax.tree.flatten(dynamic)
-    found: list[Any] = []
+    found: list[PyTree] = []
 
     def flat(*leaves):
         out = function(*eqx.combine(jax.tree.unflatten(structure, leaves), static))
@@ -92,7 +92,7 @@ def closure_convert(function: Any, *args: Args) -> tuple[ClosureConverted, list[
 
 
 def by_itself_or_batched(
-    one: ClosureConverted, of_one: list[Any], many: ClosureConverted, of_many: list[Any]
+    one: ClosureConverted, of_one: list[PyTree], many: ClosureConverted, of_many: list[PyTree]
 ) -> tuple[ClosureConverted, Any]:
     """A function in two forms that return the same, with the arrays that each closes over: `one` where it is called by
     itself, `many` in a batch and where it is differentiated."""
@@ -159,13 +159,13 @@ def _(size, batched, active, new, old):
     return out, jax.tree.map(lambda _: True, out)
 
 
-def going(state: State, numbers: dict[str, Any], program: SolveProgram) -> Bool[Array, ""]:
+def going(state: State, numbers: dict[str, PyTree], program: SolveProgram) -> Bool[Array, ""]:
     """True while a solve has steps left to take."""
     on = (state.tprev < numbers["t1"]) & diffrax.is_successful(state.result)
     return on if program.max_steps is None else on & (state.num_steps < program.max_steps)
 
 
-def as_traced(result: Any) -> Any:
+def as_traced(result: Result) -> Result:
     """A result code that Python knows, as a value of the program. Two that Python knows are compared by programs of
     their own, which JAX compiles on the way."""
     return jax.tree.map(lambda code: jnp.full(jnp.shape(code), code, jnp.result_type(code)), result)

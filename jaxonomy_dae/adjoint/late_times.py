@@ -18,12 +18,12 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool
 
-from ..aliases import Args, Controller, Solver, State, Terms, Time
+from ..aliases import Args, Controller, PyTree, Solver, State, Terms, Time, Times
 from ..private_names import FOR_LATE_TIMES, missing
 from .wrapped_control import WrappedControl
 
 
-def times_fit(t0: Time, t1: Time, ts: Any, controller: Controller) -> Bool[Array, ""] | bool:
+def times_fit(t0: Time, t1: Time, ts: Times, controller: Controller) -> Bool[Array, ""] | bool:
     """True if the times to save, shape (n,) or None, are sorted and lie between t0 and t1, and if those of a
     `diffrax.StepTo` lead from t0 to t1. A Python bool where nothing is traced."""
     steps = controller.ts if isinstance(controller, diffrax.StepTo) else None
@@ -74,9 +74,9 @@ class _LateTimes(diffrax.AbstractAdjoint):
 
     adjoint: diffrax.AbstractAdjoint
     save: diffrax.SubSaveAt
-    direction: Any
+    direction: Time
 
-    def loop(self, **given: Any) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def loop(self, **given: PyTree) -> PyTree:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The loop over the steps, as `diffrax.diffeqsolve` calls it; buffers and times of `SaveAt` are put in here."""
         state, saveat, t0 = given["init_state"], given["saveat"], given["t0"]
         ts, direction = self.save.ts, self.direction

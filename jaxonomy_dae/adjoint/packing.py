@@ -1,7 +1,7 @@
 """Small arrays put together into few."""
 
 import math
-from typing import Any
+from collections.abc import Hashable
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ class Packing:
     def __init__(self, tree: PyTree):
         leaves, self.structure = jax.tree.flatten(tree)
         self.shapes = [jnp.shape(leaf) for leaf in leaves]
-        unfilled: dict[Any, tuple[int, int]] = {}  # of each dtype, the vector being filled, and its bytes so far
+        unfilled: dict[Hashable, tuple[int, int]] = {}  # of each dtype, the vector being filled, and its bytes so far
         self.members: list[list[int]] = []  # the leaves in each vector
         for i, leaf in enumerate(leaves):
             dtype = jnp.result_type(leaf)
@@ -42,7 +42,7 @@ class Packing:
 
     def unpack(self, vectors: list[Shaped[Array, "..."]]) -> PyTree:
         """Rebuilds the tree from its vectors."""
-        leaves: list[Any] = [None] * len(self.shapes)
+        leaves: list[PyTree] = [None] * len(self.shapes)
         for inside, vector in zip(self.members, vectors, strict=True):
             start = 0
             for i in inside:

@@ -1,13 +1,13 @@
 """The loop over the steps of a solve that records them, and its derivative by going back over the record."""
 
 import dataclasses
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 
+from ..aliases import PyTree
 from ..private_names import private
 from .appended import appended
 from .closure_conversion import SolveProgram, any_member, apart, going, read, rows, unless_waiting, written
@@ -18,7 +18,7 @@ from .step_times import StepTimes
 
 
 @eqx.filter_custom_vjp
-def solve(numbers: dict[str, Any], program: SolveProgram) -> tuple[Any, Any, Any]:
+def solve(numbers: dict[str, PyTree], program: SolveProgram) -> tuple[PyTree, PyTree, PyTree]:
     """Takes steps until the end and returns the final `(state, buffers, table)`.
 
     `numbers` holds every array that the solve depends on: `state`, `buffers` and `table` to start from, `t1`, the
@@ -44,7 +44,7 @@ class _Recorder:
     the same for all members of a batch, and each says which members accepted it; a row that none did is written over.
     """
 
-    def __init__(self, numbers: dict[str, Any], program: SolveProgram, times: StepTimes):
+    def __init__(self, numbers: dict[str, PyTree], program: SolveProgram, times: StepTimes):
         self.numbers, self.program, self.times = numbers, program, times
         self.row, self.rest = (Packing(part) for part in self._given(numbers["state"], times.start()))
 

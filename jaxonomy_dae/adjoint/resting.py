@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from ..aliases import Args, Controller, PyTree, Solver, State, Terms, Time
+from ..aliases import Args, Controller, Numeric, PyTree, Solver, State, Terms, Time
 from ..private_names import FROM_CONTROLLER
 from .closure_conversion import SolveProgram, any_member, as_traced
 from .wrapped_control import WrappedControl
@@ -48,13 +48,13 @@ class Pushed(eqx.Module):
     """
 
     y: Float[Array, " n"]
-    solver_state: Any
+    solver_state: PyTree
     fresh: Bool[Array, ""]
     exists: Bool[Array, ""]
     resting: Bool[Array, " n"]
     given_up: Bool[Array, ""]
     next_y: Float[Array, " n"]
-    next_state: Any
+    next_state: PyTree
     allowed: Float[Array, ""]  # how long the step after the next one may be
 
 
@@ -70,8 +70,8 @@ class AttemptedStep(eqx.Module):
     t1: Time
     y0: State
     y1: State
-    accepted: Any
-    jump: Any
+    accepted: Numeric
+    jump: Numeric
     start: Time
     end: Time
 
@@ -118,7 +118,7 @@ class Resting(eqx.Module):
             allowed=jnp.full_like(jnp.asarray(t), jnp.inf),
         )
 
-    def first_end(self, t: Time, end: Time, y: State) -> Any:
+    def first_end(self, t: Time, end: Time, y: State) -> Time:
         """The end of the first step, made earlier where a component rests. A second run begins after a step only, so
         the first step must not exceed `RESOLVED` divided by the rate at which slopes answer to a push."""
         resting, t, end, y = still((self, t, end, y))
@@ -231,7 +231,7 @@ class Resting(eqx.Module):
     def _tolerances(self, x: Array) -> tuple[Array, Array]:
         return jnp.asarray(self.controller.rtol, x.dtype), jnp.asarray(self.controller.atol, x.dtype)
 
-    def _between_events(self, y0: State, y1: State) -> tuple[Any, Any, Any, Any]:
+    def _between_events(self, y0: State, y1: State) -> tuple[Numeric, Numeric, Numeric, Numeric]:
         """Returns (terms, solver, state, whether an event changed them) after a step from y0 to y1."""
         if isinstance(y1, jax.Array):
             return self.terms, self.solver, y1, False
@@ -239,7 +239,12 @@ class Resting(eqx.Module):
 
 
 def held_back(
-    state: State, new: Any, accepted: Bool[Array, ""], pushed: Any, numbers: dict[str, Any], program: SolveProgram
+    state: State,
+    new: PyTree,
+    accepted: Bool[Array, ""],
+    pushed: PyTree,
+    numbers: dict[str, PyTree],
+    program: SolveProgram,
 ) -> tuple[Any, Bool[Array, ""], Any]:
     """Returns (Diffrax's state `new` with its next step shortened where components rest, whether it was shortened, the
     second run's state)."""
@@ -300,13 +305,13 @@ def _pattern(x: Array) -> Array:
     return jnp.where(jnp.sin(12.9898 * k + 1.0) > 0, 1.0, -1.0) * (1.0 + 0.5 * jnp.sin(78.233 * k))
 
 
-def _no_later(start: Time, end: Time, allowed: Time) -> Any:
+def _no_later(start: Time, end: Time, allowed: Time) -> Time:
     """The end of a step, no later than `allowed`. An end taken from `allowed` moves with `start` under differentiation:
     the length of the step is constant."""
     return jnp.where(allowed < end, start + still(allowed - start), end)
 
 
-def _shortened(start: Time, end: Time) -> Any:
+def _shortened(start: Time, end: Time) -> Time:
     """The end of a step so short that it changes nothing, but long enough to advance time."""
     shortest = 16 * jnp.finfo(start.dtype).eps * jnp.abs(start)
     return jnp.minimum(end, start + jnp.maximum(TINY * (end - start), shortest))
@@ -317,18 +322,18 @@ def still(tree: PyTree) -> Any:
     return jax.tree.map(lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, tree)
 
 
-def _moving(y: State) -> Any:
+def _moving(y: State) -> Numeric:
     """The array that is integrated: y itself, or `y.x` of a state with events."""
     return y if isinstance(y, jax.Array) else getattr(y, "x", y)
 
 
-def _inner(solver: Solver) -> Any:
+def _inner(solver: Solver) -> Solver:
     while isinstance(solver, diffrax.AbstractWrappedSolver):
         solver = solver.solver
     return solver
 
 
-def _small(solver: Solver, controller: Controller) -> Any:
+def _small(solver: Solver, controller: Controller) -> Numeric:
     """A copy of the solver that compiles quickly: stages in a loop where supported, and Newton tolerances taken from
     the controller (as `diffeqsolve` does)."""
     if isinstance(solver, diffrax.AbstractWrappedSolver):
@@ -343,7 +348,7 @@ def _small(solver: Solver, controller: Controller) -> Any:
     return solver
 
 
-def _innermost(controller: Controller) -> Any:
+def _innermost(controller: Controller) -> Controller:
     while hasattr(controller, "controller"):
         controller = controller.controller
     return controller

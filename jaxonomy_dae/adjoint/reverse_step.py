@@ -1,14 +1,13 @@
 """One accepted step backwards: from cotangents after it to cotangents before it."""
 
 import dataclasses
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from ..aliases import State
+from ..aliases import PyTree, State
 from ..private_names import private
 from .appended import NOTED, appended_transposed
 from .closure_conversion import SolveProgram, any_member, inexact, read, unless_waiting
@@ -19,7 +18,7 @@ class ReverseStep:
     """Takes the derivative of one accepted step after another, backwards. Its carry holds the cotangents gathered so
     far and the position in the saved rows."""
 
-    def __init__(self, cotangents: Any, perturbed: Any, numbers: Any, program: SolveProgram, times: StepTimes):
+    def __init__(self, cotangents: PyTree, perturbed: PyTree, numbers: PyTree, program: SolveProgram, times: StepTimes):
         self.numbers, self.program, self.times = numbers, program, times
         self.state_cotangent, self.saved, self.table = cotangents
         self.timed = times.count > 0
@@ -42,7 +41,7 @@ class ReverseStep:
         self.appends = bool(jax.tree.leaves(self.table))
         self.table = _full(self.table, numbers["table"]) if self.appends else self.table
 
-    def start(self, state: State, moves: Any) -> dict[str, Any]:
+    def start(self, state: State, moves: PyTree) -> dict[str, PyTree]:
         """The carry of the reverse loop at the end of the solve."""
         given = self.state_cotangent
         seeds = jnp.zeros((self.times.count,), state.tprev.dtype)
@@ -64,7 +63,7 @@ class ReverseStep:
             after=(state.tprev, moves[0] if self.timed else ()),
         )
 
-    def step(self, carry: dict[str, Any], row: dict[str, Any], kept: Any) -> dict[str, Any]:
+    def step(self, carry: dict[str, PyTree], row: dict[str, PyTree], kept: PyTree) -> dict[str, PyTree]:
         """Pulls the carry back over one row of the record; `kept` is true for members of a batch that accepted this
         step."""
         before = dict(carry)
@@ -167,7 +166,7 @@ class ReverseStep:
         )
         return carry, dense_ct, ends_ct
 
-    def finish(self, carry: dict[str, Any]) -> dict[str, Any]:
+    def finish(self, carry: dict[str, PyTree]) -> dict[str, PyTree]:
         """The cotangents of `numbers`, from the carry at the start of the solve."""
         out = jax.tree.map(lambda _: None, inexact(self.numbers))
         (tprev, tnext, controller_state), (t1, controller) = self.times.split(carry["seeds"])
@@ -187,7 +186,7 @@ class ReverseStep:
         )  # fmt: skip
 
 
-def state_saves(state: State) -> list[Any]:
+def state_saves(state: State) -> list[PyTree]:
     """The `SaveState`s in Diffrax's state, one for each part of `SaveAt`."""
     kind = private("SaveState")
 

@@ -1,12 +1,11 @@
 """How the ends of steps move with the times that a solve was given."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
+from ..aliases import State, Time
 from ..private_names import clip_floor, private
 from .closure_conversion import SolveProgram, inexact
 
@@ -19,7 +18,7 @@ class StepTimes:
     controller's own times, as far as they are differentiated. Mostly there are none.
     """
 
-    def __init__(self, perturbed: dict[str, Any], numbers: dict[str, Any], program: SolveProgram):
+    def __init__(self, perturbed: dict[str, PyTree], numbers: dict[str, PyTree], program: SolveProgram):
         self.numbers, self.program = numbers, program
         clock = _clock(numbers)
         self.leaves, self.structure = jax.tree.flatten(inexact(clock))
@@ -51,7 +50,11 @@ class StepTimes:
         return self.seeds()[0] if self.count else ()
 
     def after(
-        self, state: Any, moves: PyTree[Float[Array, "seeds ..."]], taken: tuple[Any, Any], held: Bool[Array, ""]
+        self,
+        state: State,
+        moves: PyTree[Float[Array, "seeds ..."]],
+        taken: tuple[PyTree, PyTree],
+        held: Bool[Array, ""],
     ) -> PyTree[Float[Array, "seeds ..."]]:
         """The tangents `moves` of (start, end, controller state), advanced over the step that `state` attempts; `taken`
         are the state at its end and the error. Where `held`, a flag, is set, the end of the next step moves with its
@@ -80,7 +83,7 @@ class StepTimes:
         return tprev, jnp.where(held, tprev, tnext), controlled
 
 
-def _clock(tree: dict[str, PyTree]) -> Any:
+def _clock(tree: dict[str, PyTree]) -> Time:
     """The quantities on which the ends of steps depend: (start, end, controller state), and (t1, controller)."""
     state = tree["state"]
     moving = state.tprev, state.tnext, state.controller_state[0]

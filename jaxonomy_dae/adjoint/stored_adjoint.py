@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from ..aliases import Solver, Terms
+from ..aliases import PyTree, Solver, Terms
 from ..private_names import has_stored_adjoint, private
 from ..programs.members import batch_size
 from .appended import NOTED, apart, together
@@ -69,7 +69,7 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
 
     members: int = eqx.field(static=True, default=1)
 
-    def loop(self, **given: Any) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def loop(self, **given: PyTree) -> PyTree:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The loop over the steps, called by `diffrax.diffeqsolve`."""
         if not has_stored_adjoint():
             return diffrax.RecursiveCheckpointAdjoint().loop(**given)
@@ -162,7 +162,7 @@ class StoredAdjoint(diffrax.AbstractAdjoint):
 def _is_random(terms: Terms) -> bool:
     """True if Brownian motion drives the solve."""
 
-    def is_brownian(node: Any) -> bool:
+    def is_brownian(node: object) -> bool:
         return isinstance(node, diffrax.AbstractBrownianPath)
 
     return any(map(is_brownian, jax.tree.leaves(terms, is_leaf=is_brownian)))
@@ -255,7 +255,7 @@ def _functions(
     return functions, numbers
 
 
-def _quickly(*, args, terms, solver, init_state, made_jump, **_) -> tuple[Any, list[Any]] | None:
+def _quickly(*, args, terms, solver, init_state, made_jump, **_) -> tuple[PyTree, list[PyTree]] | None:
     """The step with its stages in a loop, if the solver has both forms: by itself, outside of batches, it takes the
     same time and compiles in a part of it. What is differentiated is the other form."""
     looped = _in_a_loop(solver)
@@ -271,7 +271,7 @@ def _quickly(*, args, terms, solver, init_state, made_jump, **_) -> tuple[Any, l
     return closure_convert(take_step, s.tprev, s.tnext, s.y, s.solver_state, jump)
 
 
-def _in_a_loop(solver: Solver) -> Any:
+def _in_a_loop(solver: Solver) -> Solver:
     """The solver with its stages in a loop; None if it has but one form, or the user has chosen."""
     if isinstance(solver, diffrax.AbstractWrappedSolver):
         inner = _in_a_loop(solver.solver)
@@ -283,8 +283,8 @@ class _Solver:
     """The part of a solver's interface that Diffrax's loop calls. `noted` are the rows that the last step appends to
     the table of the state, `taken` its end and error."""
 
-    noted: Any = None
-    taken: Any = None
+    noted: PyTree = None
+    taken: PyTree = None
 
     def __init__(self, step, consts, solver, terms):
         self.function, self.consts, self.interpolation_cls = step, consts, solver.interpolation_cls

@@ -17,7 +17,7 @@ from .combine_equations import quantity_label, somewhere, tried
 from .elimination import Row
 from .null_vectors import BlockMatrix
 
-HIGHER = 8  # derivatives that a quantity's size is taken for
+HIGHER = 8  # orders of derivatives that share one typical size
 
 
 class _Place(NamedTuple):

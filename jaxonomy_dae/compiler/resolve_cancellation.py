@@ -245,7 +245,8 @@ def _for_values(
     shown = [p for p in concerned if values[p] == 0.0 and p not in modes] or [p for p in concerned if p not in modes]
     given = some([f"{names[p]} = {values[p]:g}" for p in shown])
     mode = some([f"{names[p]} = {values[p]:g}" for p in modes if " " not in names[p]])  # hidden ones
-    # Where a block is singular more than once, no value alone makes it regular: then those that take it nearest.
+    # Where a block is singular more than once, no value alone makes it regular: the parameters that leave the smallest
+    # rank deficiency are taken.
     left = {p: _deficiency(jacobian, equations, p) for p in shown if values[p] == 0.0}
     least = min(left.values(), default=np.inf)
     if least < _deficiency(jacobian, equations):

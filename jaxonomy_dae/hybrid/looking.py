@@ -53,6 +53,18 @@ def _between(place: Array, values: Array) -> Array:
     return weights @ values / jnp.sum(weights)
 
 
+class _Step(NamedTuple):
+    """The step from y0 at t0 to x1 at t1, whose states are `dense(t0, t1, t)`; not differentiated."""
+
+    problem: AbstractHybridProblem
+    dense: Callable[[Time, Time, Time], State]
+    t0: Time
+    t1: Time
+    y0: HybridState
+    x1: State
+    args: Args
+
+
 class Met(NamedTuple):
     """The result of looking for events in a step, not differentiated.
 
@@ -74,11 +86,11 @@ def looked_at(
 ) -> Met:  # fmt: skip
     """Looks for events in the step from y0 to x1, whose states are `dense(t0, t1, t)`.
 
-    Where equations go on with the same values, at kinks, time may be known less well than where states jump: guards
-    between the places where they are looked at are on the polynomial through their values there, and so is their rate
-    at the end. A jump is located, and its rate known, by the equations.
+    At kinks the state is continuous, so the crossing is taken from the polynomial through the guards' values, and so is
+    their rate at the end. At jumps the crossing is solved for with the equations, which give the rate, too.
     """
-    problem, dense, t0, t1, y0, x1, args = still((problem, dense, t0, t1, y0, x1, args))
+    step = still(_Step(problem, dense, t0, t1, y0, x1, args))
+    problem, dense, t0, t1, y0, x1, args = step
     h, q, g = t1 - t0, y0.q, problem.facts.n_guards
     span = jnp.maximum(h, FORGOTTEN * y0.span)
     window = jnp.maximum(WINDOW * span, problem.resolution)
@@ -99,7 +111,7 @@ def looked_at(
     size = jnp.abs(values)
     largest = jnp.maximum(jnp.max(size, axis=0), y0.size)
     off = jnp.max(jnp.abs(jnp.asarray(_OFF_PARABOLA, values.dtype) @ values), axis=0)
-    # Of most steps: nothing is met where all guards are farther from zero than they were seen to move.
+    # Most steps meet nothing: all guards are farther from zero than they were seen to move.
     moves = jnp.max(values, axis=0) - jnp.min(values, axis=0)
     side = jnp.where(values[-1] > 0, ABOVE, BELOW)
     far = jnp.min(size, axis=0) > moves + 2 * off + rounding(largest)
@@ -109,37 +121,38 @@ def looked_at(
     clocks = Met(never, y0.armed, values[-1], Arrival(zero, y0.size, due, none, largest, window, span))
 
     def something():
-        return _met(problem, dense, t0, t1, y0, x1, args, times, values, off, clocks)
+        return _met(step, times, values, off, clocks)
 
     return lax.cond(any_member(~quiet), something, lambda: clocks)
 
 
-def _met(problem, dense, t0, t1, y0: HybridState, x1, args, times, values, off, clocks: Met) -> Met:
+def _met(step: _Step, times: Array, values: Array, off: Array, clocks: Met) -> Met:
     """Looks for events in a step, given the guards' `values` at `times`, shape (looks, guards), `off`, their distance
     from a parabola, shape (guards,), and the result `clocks` for sampled events alone."""
+    problem, dense, t0, t1, y0, x1, args = step
     h, q, g, arrival = t1 - t0, y0.q, problem.facts.n_guards, clocks.arrival
     span, window, ticking = arrival.span, arrival.window, arrival.due[: problem.facts.n_clocks]
     size = jnp.max(jnp.abs(values), axis=0)
     band = rounding(arrival.size)
-    # What has left the band above zero anywhere before is above, and armed, as is what rests.
+    # A guard that has left the band above zero at an earlier place is above. It is armed then, as a resting guard is.
     rises = jnp.concatenate([(y0.armed == ABOVE)[None], values[1:] > band])
     above = lax.associative_scan(jnp.logical_or, rises)
     armed = above | (y0.armed == RESTS)
-    raised = jnp.where((y0.armed == RESTS) & ~above, band, 0.0)  # what rests falls where it leaves the band
+    raised = jnp.where((y0.armed == RESTS) & ~above, band, 0.0)  # a resting guard falls where it leaves the band
     values = values + raised
-    # What rests may have been left below the band, by no more than rounding or the window, and rise: what is farther
-    # below has jumped, as an input does where a step begins.
+    # A resting guard may start slightly negative and rise, by no more than rounding or its rise within the window. One
+    # that is farther below has jumped, as an input does where a step begins.
     rise = (values[1:] - values[:-1]) / (h * jnp.asarray(np.diff(LOOKS), values.dtype)[:, None])
     left_there = jnp.maximum(band, jnp.minimum(rise * window, CLOSE * size))
     below = (values[1:] < 0) & (above[:-1] | (rise <= 0) | (values[1:] < -left_there))
-    # One may also reach zero and stay; or have jumped there, which makes a condition true if it is not strict.
+    # A guard may also reach zero and stay, or have jumped there: its condition is then true if it is not strict.
     strict = problem.facts.are(EventFlag.STRICT)[problem.facts.n_clocks :]
     stays = (values[1:] == 0) & ((values[:-1] > 0) | ((values[:-1] == 0) & above[:-1] & ~strict))
     crossed = armed[:-1] & (below | stays)
     last = values[-1]
 
     def reaches_zero(rate):
-        # A step that was to end at zero does so up to rounding in what the guard is the difference of.
+        # A step that was shortened to end at zero does so up to the rounding of the terms of the guard.
         rounded = jnp.minimum(band, -rate * (AHEAD * span))
         return (rate < 0) & (jnp.abs(last) <= jnp.maximum(-rate * window, rounded))
 
@@ -147,7 +160,7 @@ def _met(problem, dense, t0, t1, y0: HybridState, x1, args, times, values, off, 
         before = problem.slope(t1, x1, q, args)
         return before, reaches_zero(problem.rates(t1, x1, q, args, before)[1])
 
-    # A step that cannot be parted any further: its parts would not be told from its ends.
+    # A step so short that points inside cannot be distinguished from its ends.
     short = h <= 4 * problem.resolution
     if problem.facts.only_kinks:
         before, near = jnp.zeros_like(x1), reaches_zero(jnp.asarray(_RATE_AT_END, values.dtype) @ values / h)
@@ -158,7 +171,7 @@ def _met(problem, dense, t0, t1, y0: HybridState, x1, args, times, values, off, 
     bent = jnp.any(off > jnp.maximum(BEND * size, band))
     long = h > 1e3 * jnp.maximum(WINDOW * h, problem.resolution)
     bent = bent & long
-    # In a step too short to be parted, what has crossed has jumped.
+    # In a step too short to be split, a guard that crossed zero has jumped.
     jumped = jnp.any(crossed, axis=0) & ~near & short
     near = near | jumped
     within = jnp.any(crossed[:-1], axis=0) & ~short

@@ -52,7 +52,7 @@ def start(
     size = jnp.abs(value)
     if resumed is None:
         # A strict condition whose sides are equal is false: if it becomes true at once, that is an event of the first
-        # step. One that happens at the start, if it holds there, happens at once then, too.
+        # step. An event that happens at the start if its condition holds happens then, too.
         turned, holds = _turned(problem, value, rate), (value < 0) | ((value == 0) & problem.facts.true_at_zero)
         armed = jnp.where(jnp.where(relations[c:], turned, holds), BELOW, jnp.where(value == 0, RESTS, ABOVE))
         at_once = problem.facts.are(EventFlag.AT_START)[c:] & ~relations[c:]
@@ -87,10 +87,11 @@ def _ticks_before(problem: AbstractHybridProblem, t0: Time, ticked: Array | None
     relations = problem.facts.are(EventFlag.RELATION)[:c]
     passed = t0 - problem.resolution - offset
     ticks = jnp.where(jnp.isinf(period), (passed > 0).astype(dtype), jnp.ceil(passed / period))
-    ticks = jnp.where(relations, ticks, jnp.maximum(ticks, 0.0))  # relations have turned at all times
+    # Clocks of relations are counted from before t0, too. Other clocks start at tick 0.
+    ticks = jnp.where(relations, ticks, jnp.maximum(ticks, 0.0))
     if ticked is None:
         return ticks
-    # Of a clock that has ticked here, the next tick is clearly later, though rounding may have put this one on either
+    # The next tick of a clock that has ticked here is clearly later, though rounding may have put this one on either
     # side of t0.
     slack = jnp.sqrt(jnp.finfo(dtype).eps)
     next_one = jnp.where(jnp.isinf(period), 1.0, jnp.floor((t0 - offset) / period + slack) + 1.0)

@@ -31,15 +31,11 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
     state_order = selection.states  # as they lie in the state array
     quantities = extended.quantities
     n = quantities.n
-    steps = build_schedule(extended, model.blocks, EntrySizes(reduced))
-    for step in steps:
-        if step.whole and linear_solver is None:
-            check_solvable(step.n)
+    steps, carried = _schedule(model, linear_solver)
+    # Which relations stay plain depends on the steps, and what is planned below reads the flat model that is left.
     flat, left_alone = without_live_relations(reduced.flat, variable_map, steps)
     reduced = dataclasses.replace(reduced, flat=flat)
     selection = dataclasses.replace(selection, notes=(*selection.notes, *left_alone))
-    carried = [quantities for step in steps for quantities in step.guessed]
-    carried = np.concatenate(carried) if carried else np.zeros(0, np.int64)
     input_quantities = np.arange(quantities.n_unknown, n)
 
     def program(chosen: Sequence[AnyStep]) -> Program:
@@ -77,19 +73,6 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
         for row, inputs in zip(flat.rows, row_inputs, strict=True)
     )
 
-    columns = quantities.owner[input_quantities]
-    roots = quantities.variable[columns]
-    variables = flat.variables
-    # Those that are declared but unused follow: they are still names that `simulate` accepts.
-    input_roots = list(dict.fromkeys([*roots.tolist(), *np.flatnonzero(variables.is_input).tolist()]))
-    place = {v: k for k, v in enumerate(input_roots)}
-    inputs = InputTable(
-        [variables.names[v] for v in input_roots],
-        [variables.default[v] for v in input_roots],
-        np.array(input_roots, np.int64),
-        np.array([place[v] for v in roots.tolist()], np.int64),
-        quantities.order[input_quantities],
-    )
     in_state = np.concatenate([state_order, carried])
     waves = plan_waves(needed(steps, np.concatenate([following, rates, constraint_slots, *watched]), n))
     structure = dataclasses.replace(reduced, flat=dataclasses.replace(flat, declared=None))
@@ -103,7 +86,7 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
         states=state_order,
         carried=carried,
         nominal=quantity_scale(reduced)[in_state],
-        inputs=inputs,
+        inputs=_input_table(flat, extended, input_quantities),
         derivative=derivative,
         next_derivative=derivative.layout.gather(following) if len(following) else NOTHING,
         carried_rates=derivative.layout.gather(rates) if len(rates) else None,
@@ -117,6 +100,34 @@ def lower(model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None = 
         events=events,
         held=held,
         waves=waves,
+    )
+
+
+def _schedule(
+    model: CompiledModel, linear_solver: lx.AbstractLinearSolver | None
+) -> tuple[Sequence[AnyStep], np.ndarray]:
+    """Returns (the steps in order, the unknowns whose values are carried along as guesses)."""
+    steps = build_schedule(model.reduced.extended, model.blocks, EntrySizes(model.reduced))
+    for step in steps:
+        if step.whole and linear_solver is None:
+            check_solvable(step.n)
+    carried = [quantities for step in steps for quantities in step.guessed]
+    return steps, np.concatenate(carried) if carried else np.zeros(0, np.int64)
+
+
+def _input_table(flat: FlatModel, extended: Extended, input_quantities: np.ndarray) -> InputTable:
+    """The inputs by name, and where the quantities that derive from them find theirs."""
+    quantities, variables = extended.quantities, flat.variables
+    roots = quantities.variable[quantities.owner[input_quantities]]
+    # Inputs that are declared but unused follow: they are still names that `simulate` accepts.
+    input_roots = list(dict.fromkeys([*roots.tolist(), *np.flatnonzero(variables.is_input).tolist()]))
+    place = {v: k for k, v in enumerate(input_roots)}
+    return InputTable(
+        [variables.names[v] for v in input_roots],
+        [variables.default[v] for v in input_roots],
+        np.array(input_roots, np.int64),
+        np.array([place[v] for v in roots.tolist()], np.int64),
+        quantities.order[input_quantities],
     )
 
 

@@ -71,7 +71,7 @@ class When:
 class HeldBranch:
     """A branch of `either` that is differentiated: the names of the hidden variables that are it and its derivatives
     below the highest, all zero while the branch holds, and of the one that is 1 while it does and 0 otherwise; and the
-    discrete variable by which an event lets an impulse act. One that only pushes also has the hidden variable of its
+    discrete variable that an event sets to 1 to let an impulse act. One that only pushes also has the hidden variable of its
     force, and the discrete variable that lets go at 0."""
 
     text: str

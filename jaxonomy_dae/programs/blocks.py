@@ -1,9 +1,10 @@
 """One function at many times, in blocks that fit into memory."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
+
+from ..aliases import PyTree
 
 ROOM = 2**21  # numbers that are computed at once on the way to those asked for: 16 MiB in double precision
 
@@ -13,7 +14,7 @@ def fit(n: int, width: int) -> bool:
     return n * width <= ROOM
 
 
-def at_times(function: Callable[..., Any], *rows: Any, width: int) -> Any:
+def at_times(function: Callable[..., PyTree], *rows: PyTree, width: int) -> PyTree:
     """`function(*row)` for each row; `width` is how many numbers are computed on the way to each. At a few times of a
     small model all at once, else one block of times after another."""
     if fit(jax.tree.leaves(rows)[0].shape[0], width):

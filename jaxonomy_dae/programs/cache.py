@@ -16,6 +16,7 @@ from typing import Any, ParamSpec, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import Array
 
 from ..aliases import PyTree
 from .machine import Use, mappings, memory, return_memory
@@ -42,7 +43,7 @@ class _Called:
     """A function for certain static values; `calls` counts the calls that have not returned yet."""
 
     def __init__(self, function: Callable, runs_once: bool, structure: Any, static: tuple[Any, ...], why: str):
-        def run(arrays: list[Any]) -> Any:
+        def run(arrays: list[Array]) -> PyTree:
             rest = iter(arrays)
             leaves = [next(rest) if leaf is _ARRAY else leaf for leaf in static]
             args, kwargs = jax.tree.unflatten(structure, leaves)
@@ -52,7 +53,7 @@ class _Called:
         self.function = Function(run, getattr(function, "__name__", "run"), why, runs_once)
 
 
-def _surroundings(arrays: list[Any]) -> Hashable:
+def _surroundings(arrays: list[Array]) -> Hashable:
     """What else decides about a program: where its arrays lie, and JAX's options."""
     config: Any = jax.config
     where = frozenset(d for a in arrays if not is_traced(a) for d in a.devices())
@@ -75,7 +76,7 @@ class ProgramCache:
     def __len__(self) -> int:
         return len(self._programs)
 
-    def call(self, function: Callable, runs_once: bool, args: tuple[PyTree, ...], kwargs: dict[str, Any]) -> Any:
+    def call(self, function: Callable, runs_once: bool, args: tuple[PyTree, ...], kwargs: dict[str, PyTree]) -> PyTree:
         """Calls `function(*args, **kwargs)` through the program compiled at the first call of this kind."""
         leaves, structure = jax.tree.flatten((args, kwargs))
         # Those of NumPy, such as weights of a user's, lie nowhere yet.

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+from jax import Array
 
 from ..private_names import MissingName, private
 
@@ -116,7 +117,7 @@ def save(key: str | None, options: dict[str, Any], run: Any, cost: float) -> Non
         _make_room(path.parent)
 
 
-def load(key: str | None, options: dict[str, Any], lowered: Any, arrays: list[Any]) -> tuple[Any, float] | None:
+def load(key: str | None, options: dict[str, Any], lowered: Any, arrays: list[Array]) -> tuple[Any, float] | None:
     """The executable that an earlier process has kept, and what it cost; None if there is none, or it is not whole."""
     path = None if key is None else _path(key, options)
     if path is None or not path.exists():

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from ..aliases import PyTree
+from ..aliases import Numeric, PyTree
 from .staging import layers
 
 SHOWN = 8  # members that a sentence lists
@@ -54,7 +54,7 @@ def numbered(chosen: np.ndarray) -> str:
     return f"member{'s' if len(places) > 1 else ''} {listed} of {' by '.join(map(str, chosen.shape))}"
 
 
-def failed_members(codes: Any, texts: Sequence[str]) -> str:
+def failed_members(codes: Numeric, texts: Sequence[str]) -> str:
     """The members of a batch for which `codes` is not zero, in sentences; "" if there is none. `texts` explains the
     codes 1, 2, …"""
     values = values_of_members(codes)

@@ -34,6 +34,6 @@ def reason(key: tuple[Any, ...], known: Iterable[Hashable]) -> str:
     return "; ".join(changed[:SHOWN]) + (f"; and {len(changed) - SHOWN} more" if len(changed) > SHOWN else "")
 
 
-def _short(value: Any) -> str:
+def _short(value: object) -> str:
     text = repr(value)
     return text if len(text) <= WIDTH else text[: WIDTH - 1] + "…"

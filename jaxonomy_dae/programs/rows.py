@@ -1,10 +1,10 @@
 """Rows of any number, filled up to few different numbers, so that records of different lengths share a program."""
 
-from typing import Any
-
 import jax
 import numpy as np
+from jax import Array
 
+from ..aliases import PyTree
 from .staging import on_device
 
 DOUBLED = 1024  # up to so many, the next power of two: what more rows cost is nothing beside a compilation
@@ -20,10 +20,10 @@ def size_for(n: int) -> int:
     return -(-n // part) * part
 
 
-def filled_up(rows: Any) -> Any:
+def filled_up(rows: PyTree) -> PyTree:
     """Arrays with one length, filled up with copies of the last row, outside of jit."""
 
-    def filled(array: Any) -> Any:
+    def filled(array: Array) -> Array:
         values = np.asarray(array)
         more = size_for(len(values)) - len(values)
         return on_device(np.concatenate([values, np.repeat(values[-1:], more, axis=0)])) if more else array

@@ -10,7 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.typing import DTypeLike
 
-from ..aliases import PyTree
+from ..aliases import Numeric, PyTree
 
 
 def is_traced(tree: PyTree) -> bool:
@@ -28,23 +28,23 @@ def is_staged(tree: PyTree) -> bool:
     return any(isinstance([*layers(leaf)][-1], Tracer) for leaf in jax.tree.leaves(tree))
 
 
-def as_array(value: Any) -> Any:
+def as_array(value: Numeric) -> Numeric:
     """Numbers, or lists of numbers, as an array: of NumPy where values are known, so that nothing is compiled."""
     return jnp.asarray(value) if is_traced(value) else np.asarray(value)
 
 
-def on_device(value: Any, dtype: DTypeLike | None = None) -> Any:
+def on_device(value: Numeric, dtype: DTypeLike | None = None) -> Numeric:
     """A number, or an array, as JAX' array of this type: where values are known, without a program that converts it."""
     # `jnp.asarray` compiles a program for each shape; `device_put` might share the memory of what it is given.
     return jnp.asarray(value, dtype) if is_traced(value) else jax.device_put(np.array(value, dtype))
 
 
-def picked(array: Any, place: Any) -> Any:
+def picked(array: Numeric, place: Numeric) -> Numeric:
     """`array[place]`, by NumPy where values are known, so that nothing is compiled."""
     return array[place] if is_traced(array) else jax.device_put(np.array(np.asarray(array)[place]))
 
 
-def joined(parts: Sequence[Any]) -> Any:
+def joined(parts: Sequence[Numeric]) -> Numeric:
     """Arrays joined along their last axis, by NumPy where values are known, so that nothing is compiled."""
     if is_traced(parts):
         return jnp.concatenate(parts, axis=-1)
@@ -60,7 +60,7 @@ def is_forwards(tree: PyTree) -> bool:
     return any("JVPTracer" in found for found in kinds) and not any("LinearizeTracer" in found for found in kinds)
 
 
-def layers(leaf: Any) -> Iterator[Any]:
+def layers(leaf: PyTree) -> Iterator[Any]:
     """The leaf and the tracers inside it, from the outside in, as far as differentiation and batching have wrapped it;
     a tracer of another kind is the last."""
     yield leaf

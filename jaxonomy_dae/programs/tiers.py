@@ -19,7 +19,9 @@ from typing import Any
 
 import equinox as eqx
 import jax
+from jax import Array
 
+from ..aliases import PyTree
 from ..private_names import constants
 from . import kept
 from .compilations import Compilation, noted, timed
@@ -58,11 +60,11 @@ class Program:
     optimized at once. `stands_alone` False: it is not compiled, and cannot be called.
     """
 
-    def __init__(self, function: Callable[..., Any], arrays: list[Any], name: str, why: str, runs_once: bool):
+    def __init__(self, function: Callable[..., PyTree], arrays: list[Array], name: str, why: str, runs_once: bool):
         self._name, self._why = name, why
-        self._outcome: Any = None  # structure, and what is not an array
+        self._outcome: PyTree = None  # structure, and what is not an array
 
-        def flat(arrays: list[Any]) -> list[Any]:
+        def flat(arrays: list[Array]) -> list[Array]:
             leaves, structure = jax.tree.flatten(function(arrays))
             fixed = tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)
             self._outcome = structure, fixed, tuple(map(eqx.is_array, leaves))
@@ -99,7 +101,7 @@ class Program:
         if not options and self._doubted is None:
             self._lowered = None
 
-    def _loaded(self, options: dict[str, Any], arrays: list[Any]) -> Callable[..., Any] | None:
+    def _loaded(self, options: dict[str, Any], arrays: list[Any]) -> Callable[..., PyTree] | None:
         """The executable that an earlier process has kept; None if there is none."""
         with timed() as spent:
             found = kept.load(self._key, options, self._lowered, arrays)
@@ -129,7 +131,7 @@ class Program:
         noted(Compilation(self._name, how, self._why, *self._times, seconds))
         self._times = 0.0, 0.0  # counted once
 
-    def __call__(self, arrays: list[Any]) -> Any:
+    def __call__(self, arrays: list[Any]) -> PyTree:
         if self._doubted is not None:
             found = self._first_run(arrays)
         elif self._lowered is None:
@@ -145,7 +147,7 @@ class Program:
             structure, [next(rest) if a else leaf for a, leaf in zip(is_array, fixed, strict=True)]
         )
 
-    def _first_run(self, arrays: list[Any]) -> Any:
+    def _first_run(self, arrays: list[Array]) -> PyTree:
         """The first run of an executable that was read: one that does not run is compiled anew."""
         options, self._doubted = self._doubted, None
         try:

@@ -6,16 +6,18 @@ derivative in reverse mode is two programs: the values and all that the pullback
 is at work (`jax.jvp`, `jax.jit` around, arrays on several devices, `jax.debug_nans`), JAX transforms the function.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jax.core import ShapedArray
 from jax.custom_derivatives import SymbolicZero
 
+from ..aliases import PyTree
 from ..private_names import MissingName, clear_jitted, private
 from .staging import is_staged, is_traced, layers
 from .tiers import Program
@@ -28,17 +30,17 @@ class Function:
     - `runs_once`: its runs are expected to take less time than its compilation does.
     """
 
-    def __init__(self, function: Callable[[list[Any]], Any], name: str, why: str, runs_once: bool):
-        def run(arrays: list[Any]) -> Any:
+    def __init__(self, function: Callable[[list[PyTree]], PyTree], name: str, why: str, runs_once: bool):
+        def run(arrays: list[Array]) -> PyTree:
             return function(arrays)
 
         run.__name__ = run.__qualname__ = name
         self.function, self.name, self.why, self.runs_once = function, name, why, runs_once
         self._transformed: Any = eqx.filter_jit(run)  # for what JAX transforms
         self._program: Program | None = None
-        self._derived: dict[Any, Function] = {}
+        self._derived: dict[Hashable, Function] = {}
 
-    def __call__(self, arrays: list[Any]) -> Any:
+    def __call__(self, arrays: list[Any]) -> PyTree:
         arrays = [a if isinstance(a, jax.Array) else jax.device_put(a) for a in arrays]  # JAX' own kind of float
         kind = _at_work(arrays)
         if kind == "LinearizeTracer":
@@ -59,39 +61,39 @@ class Function:
             one.clear()
         self._derived.clear()
 
-    def _derive(self, key: Any, function: Callable[[list[Any]], Any], name: str) -> "Function":
+    def _derive(self, key: Hashable, function: Callable[[list[PyTree]], PyTree], name: str) -> "Function":
         if key not in self._derived:
             self._derived[key] = Function(function, name, self.why, self.runs_once)
         return self._derived[key]
 
-    def _differentiated(self, arrays: list[Any]) -> Any:
+    def _differentiated(self, arrays: list[Array]) -> PyTree:
         """The outcome in reverse mode, with respect to the arrays that are traced."""
         chosen = tuple(
             k for k, a in enumerate(arrays) if is_traced(a) and jnp.issubdtype(a.dtype, jnp.inexact)
         )  # fmt: skip
         values = self._derive(("values", chosen), lambda arrays: _values(self.function, chosen, arrays), self.name)
-        shape: list[Any] = []  # what the outcome is, beside its arrays
+        shape: list[PyTree] = []  # what the outcome is, beside its arrays
 
         @jax.custom_vjp
-        def call(*arrays: Any) -> Any:
+        def call(*arrays: Array) -> PyTree:
             return values([*arrays])[0]
 
-        def forward(*given: Any) -> Any:
+        def forward(*given: PyTree) -> PyTree:
             smooth, rest, pullback = values([one.value for one in given])
             shape[:] = [rest]
             leaves, structure = jax.tree.flatten(pullback)
             return smooth, _Residuals(leaves, structure)
 
-        def backward(residuals: _Residuals, cotangents: list[Any]) -> Any:
+        def backward(residuals: _Residuals, cotangents: list[PyTree]) -> PyTree:
             # JAX would make arrays of zeros for what is not read, by a program for each shape.
             read = tuple(not isinstance(c, SymbolicZero) for c in cotangents)
             leaves, structure = residuals.leaves, residuals.structure
             n = len(leaves)
 
-            def pulled(arrays: list[Any]) -> list[Any]:
+            def pulled(arrays: list[Array]) -> list[PyTree]:
                 pullback = jax.tree.unflatten(structure, arrays[:n])
 
-                def pulled_by(zeros: list[Any]) -> list[Any]:
+                def pulled_by(zeros: list[PyTree]) -> list[PyTree]:
                     given = iter(arrays[n:])
                     return list(pullback([next(given) if r else z for r, z in zip(read, zeros, strict=True)]))
 
@@ -115,10 +117,10 @@ class Function:
         k = next(k for k, axis in enumerate(axes) if axis is not None)
         size = values[k].shape[axes[k]]
 
-        def many(arrays: list[Any]) -> Any:
-            fixed: list[Any] = []
+        def many(arrays: list[Array]) -> PyTree:
+            fixed: list[PyTree] = []
 
-            def one(*arrays: Any) -> Any:
+            def one(*arrays: Array) -> PyTree:
                 moving, rest = eqx.partition(self.function([*arrays]), eqx.is_array)
                 fixed[:] = [rest]
                 return moving
@@ -128,11 +130,11 @@ class Function:
         moving, rest = self._derive(("batch", size, tuple(axes)), many, f"batch of {self.name}")(values)
 
         @jax.custom_batching.custom_vmap
-        def member(_: Any) -> Any:
+        def member(_: object) -> PyTree:
             return jax.tree.map(lambda rows: jnp.zeros(rows.shape[1:], rows.dtype), moving)
 
         @member.def_vmap
-        def members(size: int, is_batched: Any, _: Any) -> Any:
+        def members(size: int, is_batched: PyTree, _: object) -> PyTree:
             return moving, jax.tree.map(lambda rows: True, moving)
 
         return eqx.combine(member(arrays[k]), rest)
@@ -141,14 +143,14 @@ class Function:
 class _Residuals(eqx.Module):
     """The arrays of a pullback, and its structure."""
 
-    leaves: list[Any]
+    leaves: list[PyTree]
     structure: Any = eqx.field(static=True)
 
 
-def _values(function: Callable[[list[Any]], Any], chosen: tuple[int, ...], arrays: list[Any]) -> Any:
+def _values(function: Callable[[list[PyTree]], PyTree], chosen: tuple[int, ...], arrays: list[Array]) -> PyTree:
     """The inexact arrays of the outcome in a list, the outcome without them, and the pullback."""
 
-    def of(*moved: Any) -> Any:
+    def of(*moved: PyTree) -> PyTree:
         given = list(arrays)
         for k, value in zip(chosen, moved, strict=True):
             given[k] = value
@@ -157,7 +159,7 @@ def _values(function: Callable[[list[Any]], Any], chosen: tuple[int, ...], array
         shape[:] = [jax.tree.structure(smooth), fixed]
         return jax.tree.leaves(smooth), others
 
-    shape: list[Any] = []
+    shape: list[PyTree] = []
     smooth, pullback, others = jax.vjp(of, *(arrays[k] for k in chosen), has_aux=True)
     structure, fixed = shape
     return smooth, (_Static(structure), eqx.combine(others, fixed)), pullback
@@ -169,14 +171,14 @@ class _Static(eqx.Module):
     structure: Any = eqx.field(static=True)
 
 
-def _combined(smooth: list[Any], rest: tuple[_Static, Any]) -> Any:
+def _combined(smooth: list[PyTree], rest: tuple[_Static, PyTree]) -> PyTree:
     return eqx.combine(jax.tree.unflatten(rest[0].structure, smooth), rest[1])
 
 
 _SOMETHING = np.zeros((), bool)
 
 
-def _at_work(arrays: list[Any]) -> str:
+def _at_work(arrays: list[Array]) -> str:
     """The kind of tracer that wraps the others, if these wrap values; "other" if that is not one of two that are
     dealt with, or cannot be told; "" if nothing is traced."""
     if not is_traced(arrays):
@@ -193,7 +195,7 @@ def _at_work(arrays: list[Any]) -> str:
     return "other"
 
 
-def _is_plain(arrays: list[Any]) -> bool:
+def _is_plain(arrays: list[Array]) -> bool:
     """True if a program may be called as it is: arrays lie on one device, and nothing asks JAX for more checks."""
     config: Any = jax.config
     if config.jax_disable_jit or config.jax_debug_nans or config.jax_debug_infs or config.jax_check_tracer_leaks:
@@ -204,7 +206,7 @@ def _is_plain(arrays: list[Any]) -> bool:
     return not is_staged(jax.device_put(_SOMETHING))
 
 
-def _zero_like(cotangent: Any) -> Any:
+def _zero_like(cotangent: PyTree) -> PyTree:
     """The cotangent of what is not read: not an array of zeros, which would be computed with, and times infinity
     is not a number."""
     try:

@@ -10,8 +10,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
-from ..aliases import State, Time
+from ..aliases import Args, Numeric, State, Time, Times
 from ..errors import ModelError, nearest
 from ..lowering.plan import SystemPlan
 from ..model.networks import Networks
@@ -40,13 +41,15 @@ def chosen_terms(plan: SystemPlan, kind: str, component: str | None) -> np.ndarr
     return np.flatnonzero((kinds == kind) & inside[owners])
 
 
-def account_values(system: AcausalSystem, ts: Any, states: Any, inputs: Any, discrete: Any = None) -> Any:
+def account_values(
+    system: AcausalSystem, ts: Times, states: State, inputs: Args, discrete: Array | None = None
+) -> Numeric:
     """The values of all terms at all times, shape (n, terms); `discrete` holds the discrete values, if there are."""
     given = (system, ts, states, inputs, discrete)
     return _terms(*given) if is_staged(given) else _compiled(*given)
 
 
-def _terms(system: AcausalSystem, ts: Any, states: Any, inputs: Any, discrete: Any) -> Any:
+def _terms(system: AcausalSystem, ts: Times, states: State, inputs: Args, discrete: Any) -> Any:
     def one(t, x, q):
         return _at_one_time(system if q is None else system.holding(q), t, x, inputs)
 
@@ -56,7 +59,7 @@ def _terms(system: AcausalSystem, ts: Any, states: Any, inputs: Any, discrete: A
 _compiled = compiled(_terms)
 
 
-def _at_one_time(system: AcausalSystem, t: Time, x: State, inputs: Any) -> Any:
+def _at_one_time(system: AcausalSystem, t: Time, x: State, inputs: Args) -> Numeric:
     plan = system.plan
     every = np.arange(plan.extended.quantities.n)
 

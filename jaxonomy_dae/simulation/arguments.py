@@ -17,7 +17,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool
 
-from ..aliases import Inputs, Time
+from ..aliases import Inputs, Result, Time
 from ..errors import ModelError
 from ..initialization.initial_values import check_initial
 from ..solvers.solve_arguments import check_finite, check_longest_step
@@ -30,7 +30,7 @@ from .saved_state import SavedState, check_saved_state, initial_time
 
 MOST_ROOM = 4 * 2**30  # bytes that saved steps may reserve
 
-NOT_ADMITTED: Any = diffrax.RESULTS.nonfinite
+NOT_ADMITTED: Result = diffrax.RESULTS.nonfinite
 TEXT = (
     "a parameter, a weight or an input is not finite, a parameter is out of its bounds, or the samples of an input do "
     "not increase in time or do not reach over the run"
@@ -101,7 +101,7 @@ def _note_single_precision(system: AcausalSystem) -> None:
         )
 
 
-def check_switches(max_events: Any, **switches: Any) -> None:
+def check_switches(max_events: Any, **switches: object) -> None:
     """Raises a `ModelError` for options that are not Python numbers: they decide what the program is."""
     for name, value in switches.items():
         if value is not None and not isinstance(value, bool | np.bool_):
@@ -111,7 +111,7 @@ def check_switches(max_events: Any, **switches: Any) -> None:
         raise ModelError(f"max_events must be an integer, 0 or more; got {_told(max_events)}")
 
 
-def _told(value: Any) -> str:
+def _told(value: object) -> str:
     if isinstance(value, Tracer):
         return "a traced value, which is not known when the program is made: give it from outside of jit, grad and vmap"
     return repr(value)
@@ -131,7 +131,7 @@ def _check_periods(system: AcausalSystem):
         )
 
 
-def _concrete(value: Any) -> np.ndarray | None:
+def _concrete(value: object) -> np.ndarray | None:
     return None if isinstance(value, Tracer) else np.asarray(value, float)
 
 

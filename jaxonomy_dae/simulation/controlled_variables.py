@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from ..adjoint.resting import still
 from ..adjoint.wrapped_control import WrappedControl
@@ -54,7 +55,7 @@ class ControlledVariables(WrappedControl):
         joined = [jnp.concatenate(pair) for pair in pairs]
         return controller.adapt_step_size(t0, t1, *joined[:2], args, joined[2], error_order, controller_state)
 
-    def _read(self, t: Time, x: State, args: Args) -> Any:
+    def _read(self, t: Time, x: State, args: Args) -> Array:
         return self.system.at(t, args).quantities(x, np.array(self.quantity), np.array(self.factor))
 
 

@@ -1,11 +1,12 @@
 """Whether what components declare of energy and power balances along a solution."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..aliases import Times
 from ..errors import ModelError
 from ..programs.staging import is_traced
 from .accounts import account_values, chosen_terms
@@ -75,7 +76,7 @@ def _integrals(solution: Solution, rtol: float, atol: float) -> tuple[np.ndarray
     # Steps are shorter by the fifth root of what the tolerances are.
     asked |= {"max_steps": MORE_STEPS * asked["max_steps"]} if asked else {}
 
-    def again(ts: Any) -> Solution:
+    def again(ts: Times) -> Solution:
         return simulate(
             system, solution.ts[-1], t0=solution.ts[0], ts=ts, rtol=rtol, atol=atol, inputs=solution.inputs,
             initial=first, **asked,

@@ -11,6 +11,7 @@ from jax.core import Tracer
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
+from ..aliases import Args, Numeric, PyTree, Times
 from ..errors import ModelError
 from ..hybrid.problem import HybridState
 from ..programs.staging import on_device
@@ -62,7 +63,7 @@ class Events:
     - `terminated`: with what `terminate(...)` ended the run, or None.
     """
 
-    def __init__(self, log: EventLog, system: AcausalSystem, inputs: Any):
+    def __init__(self, log: EventLog, system: AcausalSystem, inputs: Args):
         self._log, self._system, self._inputs = log, system, inputs
         self._table: Any = system.plan.events
 
@@ -124,7 +125,7 @@ class Events:
 class Side:
     """Variables by name, on one side of the events."""
 
-    def __init__(self, ts: Any, rows: Any, system: AcausalSystem, inputs: Any):
+    def __init__(self, ts: Times, rows: PyTree, system: AcausalSystem, inputs: Args):
         self._given = (system, ts, rows, inputs)
 
     def __getitem__(self, name: str) -> Array:
@@ -150,7 +151,9 @@ class Side:
         return _observed(system, ts, rows, inputs, quantity, factor)
 
 
-def _observed(system: AcausalSystem, ts: Any, rows: Any, inputs: Any, quantity: np.ndarray, factor: np.ndarray) -> Any:
+def _observed(
+    system: AcausalSystem, ts: Times, rows: PyTree, inputs: Args, quantity: np.ndarray, factor: np.ndarray
+) -> Numeric:
     n, happened = len(system.plan.nominal), jnp.isfinite(ts)
 
     def one(t, row):

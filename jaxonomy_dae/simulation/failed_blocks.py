@@ -9,6 +9,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from ..aliases import Inputs, State, Time
 from ..diagnosis.wording import quoted
@@ -77,7 +78,7 @@ def _first_failed(system: AcausalSystem, t: Time, x: State, inputs: Inputs) -> A
 
 
 @compiled
-def quantities(system: AcausalSystem, t: Time, x: State, inputs: Inputs, chosen: tuple[int, ...]) -> Any:
+def quantities(system: AcausalSystem, t: Time, x: State, inputs: Inputs, chosen: tuple[int, ...]) -> Array:
     """The values of quantities, by number, at a point."""
     return system.at(t, inputs).quantities(x, np.array(chosen), np.ones(len(chosen)))
 

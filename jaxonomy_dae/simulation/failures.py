@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from ..aliases import Inputs, Result, State, Time, Tolerance
 from ..diagnosis.lost_cancellation import lost_cancellation
@@ -46,11 +47,14 @@ REST = (
     "Say how the model rests: a mode in which it stays (complementary(…, rest_speed=…), contacts.HardStop; a discrete "
     "variable that the event assigns and the equations read), or when(…, terminate(…)) before"
 )
-OKAY: Any = (diffrax.RESULTS.successful, diffrax.RESULTS.event_occurred)  # what `diffrax.is_okay` accepts
+OKAY: tuple[Result, Result] = (
+    diffrax.RESULTS.successful,
+    diffrax.RESULTS.event_occurred,
+)  # what `diffrax.is_okay` accepts
 PROBES = 64  # times at which inputs are looked at
 
 
-def _codes(result: Result, has_events: bool, max_steps: int, max_events: int) -> tuple[Any, list[str]]:
+def _codes(result: Result, has_events: bool, max_steps: int, max_events: int) -> tuple[Array, list[str]]:
     """A number for the reason by which a run failed, traced, 0 if it did not; and what the numbers from 1 on mean."""
     codes = diffrax.RESULTS
     lost = "the equations have no solution there, or the start is not consistent"
@@ -80,7 +84,7 @@ def is_code(result: Result, *codes: Result) -> bool:
     return number(result) in map(number, codes)
 
 
-def raised(x: State, result: Result, has_events: bool, max_steps: int, max_events: int) -> Any:
+def raised(x: State, result: Result, has_events: bool, max_steps: int, max_events: int) -> Result:
     """x, with a run-time error if the run failed: in traced runs only a code is known."""
     values = jax.tree.map(lambda leaf: [*layers(leaf)][-1], result)
     known = not is_traced(values) and not is_batched(result)  # under `jax.grad` outside of jit
@@ -107,8 +111,8 @@ def failed_in_batch(result: Result, has_events: bool, max_steps: int, max_events
 
 def explain(
     solution: Solution,
-    first: tuple[Any, Any],
-    last: tuple[Any, Any],
+    first: tuple[State, State],
+    last: tuple[State, State],
     t1: Time,
     implicit: bool,
     max_steps: int,
@@ -353,7 +357,7 @@ def _bad_input(plan: SystemPlan, inputs: Inputs, t0: float, t: float, t1: float)
     return ""
 
 
-def _singular_choice(solution: Solution, first: tuple[Any, Any], t: Time, x: State) -> str:
+def _singular_choice(solution: Solution, first: tuple[State, State], t: Time, x: State) -> str:
     """Names the quantities that the chosen states no longer determine at (t, x), if a singular choice of states ended
     the run; "" otherwise."""
     system, inputs = solution.system, solution.inputs

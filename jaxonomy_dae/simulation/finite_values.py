@@ -6,11 +6,11 @@ is read, with the equation that gives it no finite value.
 
 import warnings
 from collections.abc import Sequence
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
+from ..aliases import Args, Numeric, State
 from ..errors import SimulationError
 from ..lowering.plan import SystemPlan
 from ..lowering.schedule import AnyStep
@@ -22,8 +22,8 @@ SHOWN = 4  # equations, and values in each, that an error lists
 
 
 def refuse_not_finite(
-    system: AcausalSystem, names: Sequence[str], quantity: np.ndarray, values: Any, rows: tuple[Any, Any, Any],
-    inputs: Any,
+    system: AcausalSystem, names: Sequence[str], quantity: np.ndarray, values: Numeric, rows: tuple[Numeric, Numeric, Numeric],
+    inputs: Args,
 ) -> None:  # fmt: skip
     """**Arguments:**
 
@@ -55,7 +55,9 @@ def refuse_not_finite(
     )
 
 
-def refuse_account(plan: SystemPlan, kind: str, terms: np.ndarray, values: Any, rows: tuple[Any, Any]) -> None:
+def refuse_account(
+    plan: SystemPlan, kind: str, terms: np.ndarray, values: Numeric, rows: tuple[Numeric, Numeric]
+) -> None:
     """As `refuse_not_finite`, of declared energies or powers: `values`, shape (times, terms), of the terms `terms`."""
     found = np.asarray(values, float)
     if np.isfinite(found).all():
@@ -72,7 +74,7 @@ def refuse_account(plan: SystemPlan, kind: str, terms: np.ndarray, values: Any, 
         )
 
 
-def warn_of_members(name: str, values: Any, states: Any) -> None:
+def warn_of_members(name: str, values: Numeric, states: State) -> None:
     """Warns, outside of jit, that a variable is not finite in members of a batch that reached their saved times."""
     if is_traced((values, states)):
         return
@@ -88,7 +90,7 @@ def warn_of_members(name: str, values: Any, states: Any) -> None:
         )
 
 
-def _cause(system: AcausalSystem, quantity: int, t: float, x: np.ndarray, inputs: Any) -> str:
+def _cause(system: AcausalSystem, quantity: int, t: float, x: np.ndarray, inputs: Args) -> str:
     """Sentences on the first equation on the way to a quantity that has no finite value, with the values it reads."""
     plan = system.plan
     every = np.arange(plan.extended.quantities.n)

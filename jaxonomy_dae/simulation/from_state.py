@@ -9,7 +9,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from ..aliases import Time
+from ..aliases import Args, Time
 from ..errors import InitializationError, ModelError
 from ..initialization.initialize import InitialPoint, is_consistent
 from ..modeling.event_flags import EventFlag
@@ -18,7 +18,7 @@ from ..system.system import AcausalSystem
 ITERATIONS = 8  # Gauss–Newton steps onto the constraints; they converge quadratically, from 0.1 in four to rounding
 
 
-def from_state(system: AcausalSystem, t0: Time, inputs: Any, x: Float[Array, " n"]) -> InitialPoint:
+def from_state(system: AcausalSystem, t0: Time, inputs: Args, x: Float[Array, " n"]) -> InitialPoint:
     """The consistent point next to a state. The search is not differentiated; a last step carries first derivatives by
     the state and by parameters, which are those of the projection at the point found."""
     limit = jnp.sqrt(jnp.finfo(x.dtype).eps) * (jnp.abs(x) + system.state_sizes)

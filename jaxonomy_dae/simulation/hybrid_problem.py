@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from ..adjoint.resting import still
 from ..aliases import Args, Controller, State, Time, Tolerance
@@ -89,7 +90,7 @@ class SystemProblem(AbstractHybridProblem):
         )
         return jnp.where(new > -jnp.inf, new, q)
 
-    def struck(self, t: Time, x: State, before: Any, q: Any, args: Args) -> tuple[Any, Any, Any]:
+    def struck(self, t: Time, x: State, before: Array, q: Any, args: Args) -> tuple[Any, Any, Any]:
         """Applies the impulses of the constraints that begin to hold with q, or that q asks for. Returns (x, q, whether
         the impulses do what they should).
 
@@ -111,7 +112,7 @@ class SystemProblem(AbstractHybridProblem):
         e = levels[held.last]
         strength = jnp.where(q[place] == 0, holds * (1 - held_before), q[place])
 
-        def jump(problem: SystemProblem, t: Time, acting: Any, x: State, q: Any, strength: Any, args: Args) -> Any:
+        def jump(problem: SystemProblem, t: Time, acting: Array, x: State, q: Any, strength: Array, args: Args) -> Any:
             """(q with the contacts that act, the states after their impulses, these, e⁺)."""
             system = problem.system
             q = q.at[closed].set(jnp.where(acting[pushes], q[closed], 0.0))
@@ -136,9 +137,9 @@ class SystemProblem(AbstractHybridProblem):
         return after, q, jnp.all(done | (strength == 0) | ~acting) & ~wrong
 
     def _acting(
-        self, jump: Callable[..., Any], t: Time, x: State, q: Any, strength: Any, e: Any, strikes: Any, may_change: Any,
+        self, jump: Callable[..., Array], t: Time, x: State, q: Array, strength: Array, e: Array, strikes: Array, may_change: Array,
         args: Args,
-    ) -> tuple[Any, Any]:  # fmt: skip
+    ) -> tuple[Array, Array]:  # fmt: skip
         """Which contacts act, and whether that could not be found; not differentiated."""
         problem, t, x, q, strength, e, args = still(constant_once((self, t, x, q, strength, e, args)))
         n = len(may_change)
@@ -159,7 +160,7 @@ class SystemProblem(AbstractHybridProblem):
         acting, wrong, _ = jax.lax.while_loop(lambda c: c[1] & (c[2] < TRIES * n), exchanged, begin)
         return acting, wrong
 
-    def admitted(self, t: Time, x: State, q: Any, args: Args) -> Any:
+    def admitted(self, t: Time, x: State, q: Array, args: Args) -> Array:
         """The state projected onto the constraints that hold with q; NaN if it is not near them."""
         plan = self.system.plan
         if not self.system.is_constrained:
@@ -171,7 +172,7 @@ class SystemProblem(AbstractHybridProblem):
         return jnp.where(consistent, projected, jnp.nan)
 
 
-def resolution(t0: Time, t1: Time) -> Any:
+def resolution(t0: Time, t1: Time) -> Time:
     """A time that is nothing beside a run from t0 to t1, but more than rounding."""
     largest = jax.lax.stop_gradient(jnp.maximum(jnp.maximum(jnp.abs(t0), jnp.abs(t1)), t1 - t0))
     return RESOLUTION * jnp.finfo(largest.dtype).eps * largest
@@ -192,7 +193,7 @@ def problem_for(
     )
 
 
-def without_clocked(system: AcausalSystem, q: Any) -> Any:
+def without_clocked(system: AcausalSystem, q: Array) -> Array:
     """The discrete values with the relations of time as they are before they are known: a run that goes on from another
     one, perhaps with other parameters, looks at the clock instead."""
     events: Any = system.plan.events
@@ -204,7 +205,7 @@ def without_clocked(system: AcausalSystem, q: Any) -> Any:
     return q.at[chosen].set(jnp.asarray(system.plan.flat.parameters.starts_of(events.discrete[chosen]), q.dtype))
 
 
-def with_event_control(controller: Controller) -> Any:
+def with_event_control(controller: Controller) -> Controller:
     """Wraps the controller so that steps end at events. A controller that clips steps at jumps of inputs stays
     outermost."""
     if isinstance(controller, diffrax.ClipStepSizeController):

@@ -1,14 +1,15 @@
 """One run of a compiled system: a consistent start, the integration, and saved states on the constraints."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import Array
 
-from ..aliases import Args, Controller, Inputs, Result, Solver, State, Time
+from ..aliases import Args, Controller, Inputs, PyTree, Result, Solver, State, Time, Times
 from ..hybrid.control import ENDED
 from ..hybrid.problem import HybridState
 from ..hybrid.solver import CLASH, WithEvents
@@ -39,16 +40,16 @@ class Given(eqx.Module):
     system: AcausalSystem
     t0: Time
     t1: Time
-    ts: Any
+    ts: Times
     inputs: Inputs
-    initial: Any
+    initial: PyTree
 
 
 class Options(eqx.Module):
     """Options of a run: solver, adjoint, controller and limits."""
 
     solver: Solver
-    adjoint: Any
+    adjoint: diffrax.AbstractAdjoint
     controller: Controller
     max_steps: int = eqx.field(static=True)
     progress: bool = eqx.field(static=True)
@@ -69,18 +70,18 @@ class Outcome(eqx.Module):
     """
 
     found: InitialPoint
-    ts: Any
+    ts: Times
     x: State
     last: tuple[Any, Any]
-    stats: dict[str, Any]
+    stats: dict[str, PyTree]
     result: Result
-    is_stiff: Any
+    is_stiff: Array
     discrete: Any = None
     events: EventLog | None = None
     held: Any = None  # the discrete values at the last accepted point
     memory: Memory | None = None
 
-    def numbers(self) -> dict[str, Any]:
+    def numbers(self) -> dict[str, PyTree]:
         """The counts as Python integers."""
         return {name: int(value) for name, value in self.stats.items() if jnp.ndim(value) == 0}
 
@@ -130,7 +131,7 @@ def run(
     y0: State = x0
     goes_on: Any = admitted
     clashes: Any = None
-    saved_of: Any = _whole
+    saved_of: Callable = _whole
     consistent = is_consistent(found)
     if system.plan.events is not None:
         problem = problem_for(system, t0, t1, implicit, watch, tolerance)
@@ -193,7 +194,7 @@ def run(
     # gradient.
     consistent = consistent & admitted
     x = not_a_number(x, filled & consistent, x0, system, inputs)
-    failure: Any = diffrax.RESULTS.nonlinear_divergence
+    failure: Result = diffrax.RESULTS.nonlinear_divergence
     result = diffrax.RESULTS.where(okay | ~diffrax.is_okay(done.result), done.result, failure)
     if system.plan.events is not None:
         result = diffrax.RESULTS.where(okay & ~goes_on, ENDED, result)
@@ -222,9 +223,9 @@ def run(
 run_compiled = compiled(run)
 
 
-def _whole(t: Time, y: State, args: Args) -> Any:
+def _whole(t: Time, y: State, args: Args) -> State:
     return y
 
 
-def _with_events(t: Time, y: HybridState, args: Args) -> Any:
+def _with_events(t: Time, y: HybridState, args: Args) -> State:
     return y.x, y.q, jax.lax.stop_gradient(jnp.concatenate([y.armed, y.ticks]))

@@ -7,6 +7,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..aliases import Numeric
 from ..errors import ModelError
 from ..model.array_names import inner_name
 from ..optional import optional_module
@@ -71,7 +72,7 @@ def data_set(solution: ByName, names: tuple[str, ...]) -> Any:
 
 
 def dataset_of(
-    xarray: Any, solution: ByName, dims: tuple[str, ...], coordinates: dict[str, Any], names: tuple[str, ...] = ()
+    xarray: Any, solution: ByName, dims: tuple[str, ...], coordinates: dict[str, Numeric], names: tuple[str, ...] = ()
 ) -> Any:
     """The variables of a solution, or of a batch that has the dimensions `dims`, with their units. An array that is
     named is one variable, with a dimension for each that it has."""

@@ -6,13 +6,11 @@ which equation it is, by following the vector field to times just beyond the las
 on the manifold from there.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..aliases import Inputs, State, Time
+from ..aliases import Inputs, PyTree, State, Time
 from ..programs.cache import compiled
 from ..system.system import AcausalSystem
 from ..tolerances import solved
@@ -51,7 +49,7 @@ def lost_constraint(system: AcausalSystem, inputs: Inputs, t: Time, x: State, t1
 
 
 @compiled
-def _search(system: AcausalSystem, t: Time, dt: Time, x: State, inputs: Inputs) -> Any:
+def _search(system: AcausalSystem, t: Time, dt: Time, x: State, inputs: Inputs) -> PyTree:
     """A point on the manifold after a step along the field; the residuals of the hidden constraints, in units of their
     terms, before and after the search for it; and whether the search led back."""
     size = jnp.abs(x) + system.state_sizes

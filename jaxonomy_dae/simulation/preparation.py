@@ -34,14 +34,14 @@ class TracedOnce(eqx.Module):
     """
 
     system: AcausalSystem
-    call: Callable[..., Any] = eqx.field(static=True)
+    call: Callable[..., State] = eqx.field(static=True)
 
     @staticmethod
     def of(system: AcausalSystem) -> "TracedOnce":
         """For a program that is traced now."""
         return TracedOnce(system, eqx.filter_jit(lambda system, t, x, args: system.vector_field(t, x, args)))
 
-    def __call__(self, t: Time, x: State, args: Args) -> Any:
+    def __call__(self, t: Time, x: State, args: Args) -> State:
         return self.call(self.system, t, x, args)
 
 
@@ -90,12 +90,12 @@ def prepared(
     return solver
 
 
-def _converged(system: AcausalSystem) -> Callable[..., Any]:
+def _converged(system: AcausalSystem) -> Callable[..., State]:
     """The projection, not-a-number where it does not converge."""
     return lambda t, x, args: system.project_fully(t, x, args, SAVED_ITERATIONS)
 
 
-def largest_tolerance(system: AcausalSystem, controller: Controller) -> Any:
+def largest_tolerance(system: AcausalSystem, controller: Controller) -> Tolerance:
     """The largest absolute tolerance in units of the nominal values; zero for steps of prescribed sizes."""
     while isinstance(controller, diffrax.ClipStepSizeController):
         controller = controller.controller
@@ -104,6 +104,6 @@ def largest_tolerance(system: AcausalSystem, controller: Controller) -> Any:
     )
 
 
-def _unchanged(t: Time, x: State, args: Args) -> Any:
+def _unchanged(t: Time, x: State, args: Args) -> State:
     """The projection for an implicit solver of a system without constraints: it solves nonlinear blocks itself."""
     return x

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..aliases import PyTree
 from ..errors import ModelError
 from ..linear.sparse import klu
 from ..private_names import private
@@ -78,7 +79,7 @@ def load_compiled(path: str | PathLike[str]) -> Any:
     return _loaded(content, arguments, results)
 
 
-def _loaded(content: bytes, arguments: Any, results: Any) -> Any:
+def _loaded(content: bytes, arguments: PyTree, results: PyTree) -> Any:
     return private("deserialize_executable")(content, arguments, results, execution_devices=jax.devices()[:1])
 
 

@@ -1,7 +1,5 @@
 """Whole states of runs, from which other runs go on."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,7 +7,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from ..aliases import Time
+from ..aliases import Numeric, Time, Times
 from ..errors import ModelError
 from ..hybrid.problem import AbstractHybridProblem
 from ..hybrid.start import Resumed
@@ -38,7 +36,7 @@ class SavedState(eqx.Module):
         this time, and the largest sizes of the quantities in conditions.
     """
 
-    t: Any
+    t: Time
     x: Float[Array, "*batch n"]
     discrete: Float[Array, "*batch q"]
     sides: Float[Array, "*batch guards"]
@@ -59,7 +57,7 @@ class Memory(eqx.Module):
     sizes: Float[Array, "*batch guards"]
 
     @classmethod
-    def of(cls, problem: AbstractHybridProblem, ts: Any, marks: Any, sizes: Any) -> "Memory":
+    def of(cls, problem: AbstractHybridProblem, ts: Times, marks: Numeric, sizes: Numeric) -> "Memory":
         """The memory of the rows saved at `ts`, whose `marks` are the sides of the guards and the counts of ticks."""
         sides, ticks = marks[:, : problem.facts.n_guards], marks[:, problem.facts.n_guards :]
         since = jnp.abs(jax.vmap(problem.due)(ticks - 1.0) - ts[:, None])
@@ -70,20 +68,20 @@ class Memory(eqx.Module):
         """The first rows alone."""
         return Memory(picked(self.sides, slice(rows)), picked(self.ticked, slice(rows)), self.sizes)
 
-    def padded(self, ts: Any, steps: Any) -> "Memory":
+    def padded(self, ts: Times, steps: Numeric) -> "Memory":
         """With the rows beyond the steps taken replaced by the last one."""
         sides, ticked = (padded(ts, rows, steps)[1] for rows in (self.sides, self.ticked))
         return Memory(sides, ticked, self.sizes)
 
 
-def initial_time(t0: Time, initial: Any) -> Any:
+def initial_time(t0: Time, initial: object) -> Time:
     """The time at which a run begins: as given, that of a whole state, or 0."""
     if t0 is not None:
         return t0
     return initial.t if isinstance(initial, SavedState) else 0.0
 
 
-def same_time(t0: Time, state: SavedState) -> Any:
+def same_time(t0: Time, state: SavedState) -> Numeric:
     """True if a state is that of the time t0, up to the rounding of a few sums."""
     return jnp.abs(t0 - state.t) <= KNOWN_ROUNDINGS * jnp.finfo(state.x.dtype).eps * jnp.abs(state.t)
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..adjoint.stored_adjoint import default_adjoint
-from ..aliases import Solver, Time, Times, Tolerance
+from ..aliases import Args, Solver, Time, Times, Tolerance
 from ..errors import InitializationError, ModelError, SimulationError, explained_keywords
 from ..initialization.check import check
 from ..initialization.initialize import known_start, search_outside
@@ -78,7 +78,7 @@ def simulate(
     solver: diffrax.AbstractSolver[Any] | None = None,
     rtol: Tolerance = None,
     atol: Tolerance = None,
-    inputs: Mapping[str, Any] | None = None,
+    inputs: Mapping[str, Args] | None = None,
     initial: Mapping[str, Any] | Any = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController[Any, Any] | None = None,
@@ -357,7 +357,7 @@ def _say_of_members(outcome: Outcome, system: AcausalSystem, bounds: tuple[int, 
 def _traced(
     outcome: Outcome,
     system: AcausalSystem,
-    inputs: Any,
+    inputs: Args,
     choice: Choice,
     asked: Asked,
     checked: bool,

@@ -13,9 +13,10 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from ..aliases import Solver
+from ..aliases import Numeric, Result, Solver, Time, Times, Tolerance
 from ..errors import ModelError
 from ..lowering.gather import times
+from ..optional import Axes
 from ..programs.blocks import at_times, fit
 from ..programs.cache import compiled
 from ..programs.platform import precisely
@@ -39,17 +40,23 @@ class Asked(eqx.Module):
     - `throw`: whether variables that are not finite are refused where they are read.
     """
 
-    jump_ts: Any
-    dtmax: Any
+    jump_ts: Times
+    dtmax: Time
     max_steps: int = eqx.field(static=True)
     solver: Solver = eqx.field(static=True, default=None)
     control: tuple[str, ...] = eqx.field(static=True, default=())
-    tolerances: tuple[Any, Any] | None = None  # rtol, and atol of each state
+    tolerances: tuple[Tolerance, Tolerance] | None = None  # rtol, and atol of each state
     throw: bool = eqx.field(static=True, default=True)
 
     @staticmethod
     def of(
-        jump_ts: Any, dtmax: Any, max_steps: int, solver: Solver, control: tuple[str, ...], tolerances: Any, throw: bool
+        jump_ts: Times,
+        dtmax: Time,
+        max_steps: int,
+        solver: Solver,
+        control: tuple[str, ...],
+        tolerances: Tolerance,
+        throw: bool,
     ) -> "Asked":
         """The options, with a solver only if solutions that name it can be compared."""
         known = not any(eqx.is_array(leaf) for leaf in jax.tree.leaves(solver)) and isinstance(solver, Hashable)
@@ -84,8 +91,8 @@ class Solution(eqx.Module):
     states: Float[Array, "n x"]
     system: AcausalSystem
     inputs: dict[str, Any]
-    counts: dict[str, Any]
-    result: Any
+    counts: dict[str, Numeric]
+    result: Result
     solver: str = eqx.field(static=True, default="")
     reason: str = eqx.field(static=True, default="")
     discrete: Float[Array, "n q"] | None = None
@@ -93,7 +100,7 @@ class Solution(eqx.Module):
     memory: Memory | None = None
     asked: Asked | None = None
 
-    def at(self, k: Any) -> SavedState:
+    def at(self, k: Numeric) -> SavedState:
         """The whole state at the saved time number `k`. Another run continues from it: `simulate(system, t1,
         initial=solution.at(-1))` goes on as if this run had not stopped. Inside jit, `k` may be traced. A batch has a
         batch of states.
@@ -106,7 +113,7 @@ class Solution(eqx.Module):
         if not isinstance(k, Tracer) and not -n <= int(k) < n:
             raise ModelError(f"solution.at({int(k)}): there are {n} saved times")
 
-        def cut(rows: Any, place: Any) -> Any:
+        def cut(rows: Numeric, place: Numeric) -> Numeric:
             return rows[place] if isinstance(k, Tracer) else picked(rows, place)
 
         row = (..., k, slice(None))
@@ -160,7 +167,7 @@ class Solution(eqx.Module):
         values, _ = _chosen(*given, on_device(quantity), on_device(factor, self.states.dtype))
         return self._where_reached(values)[:, 0]
 
-    def _where_reached(self, values: Any) -> Any:
+    def _where_reached(self, values: Numeric) -> Numeric:
         """The values, shape (n, k), with not-a-number where they are not finite, and in rows that the run did not
         reach. Constants and functions of time could be evaluated there, too."""
         known = not is_traced((self.states, values))
@@ -170,7 +177,7 @@ class Solution(eqx.Module):
         found = xp.where(reached & xp.isfinite(values), values, xp.nan)
         return on_device(found) if known else found
 
-    def _state(self, quantity: int, factor: float) -> Any:
+    def _state(self, quantity: int, factor: float) -> Numeric:
         """The values of quantities that are zero or part of the state array; None for others."""
         if quantity < 0:
             zeros = np.zeros((*self.ts.shape, 1), self.states.dtype)
@@ -182,7 +189,9 @@ class Solution(eqx.Module):
         column = picked(self.states, (slice(None), int(place[0])))
         return column if factor == 1 else times(factor, column)
 
-    def _look_at(self, names: Sequence[str], quantity: np.ndarray, factor: np.ndarray, values: Any, some: Any) -> None:
+    def _look_at(
+        self, names: Sequence[str], quantity: np.ndarray, factor: np.ndarray, values: Numeric, some: Numeric
+    ) -> None:
         """Outside of jit, refuses variables that are not finite, and warns of those that amplify the tolerances of the
         run; `some` are the values of all quantities at a few times."""
         asked = self.asked
@@ -202,7 +211,7 @@ class Solution(eqx.Module):
         if found:
             warnings.warn(sentence(found), RuntimeWarning, stacklevel=4)
 
-    def _columns(self, names: tuple[str, ...]) -> Any:
+    def _columns(self, names: tuple[str, ...]) -> Numeric:
         """The values of several variables, shape `(n, len(names))`, evaluated at once."""
         if self.states.ndim > 2:
             return _each(self, lambda one: one._columns(names))
@@ -235,7 +244,7 @@ class Solution(eqx.Module):
         return jnp.concatenate([jnp.stack([*own.values()], axis=-1), values], axis=-1)[:, order]
 
     def _known_columns(
-        self, names: tuple[str, ...], own: dict[str, Any], quantity: np.ndarray, factor: np.ndarray, inside: Any
+        self, names: tuple[str, ...], own: dict[str, Numeric], quantity: np.ndarray, factor: np.ndarray, inside: Numeric
     ) -> Any:
         """`_columns` outside of jit, grad and vmap: one program at most."""
         read = [name for name in names if name not in own]
@@ -266,7 +275,7 @@ class Solution(eqx.Module):
         return Events(log, self.system, self.inputs)
 
     @property
-    def stats(self) -> dict[str, Any]:
+    def stats(self) -> dict[str, Numeric]:
         """The counts of steps, the solver's name, and the reason for choosing it."""
         return {**self.counts, "solver": self.solver, "reason": self.reason}
 
@@ -286,7 +295,7 @@ class Solution(eqx.Module):
         ts, states, discrete = filled_up((self.ts, self.states, self.discrete))
         return picked(_constraint_residual(self.system, ts, states, self.inputs, discrete), slice(len(self.ts)))
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Numeric]:
         """All variables, and `"time"`, by name."""
         names = ("time", *self)
         columns = self._columns(names)
@@ -310,7 +319,7 @@ class Solution(eqx.Module):
         """The power that comes from outside (watt), shape `(n,)`, negative where it leaves; otherwise as `energy`."""
         return self._account("supply", component)
 
-    def _account(self, kind: str, component: str | None) -> Any:
+    def _account(self, kind: str, component: str | None) -> Numeric:
         chosen = chosen_terms(self.system.plan, kind, component)
         if self.states.ndim > 2:
             return _each(self, lambda one: one._account(kind, component))
@@ -353,14 +362,14 @@ class Solution(eqx.Module):
         the dimensions `batch_0`, `batch_1`, …"""
         return data_set(self, names)
 
-    def plot(self, *names: str, ax: Any = None, events: bool = True) -> Any:
+    def plot(self, *names: str, ax: Axes | None = None, events: bool = True) -> Any:
         """Draws variables over time with Matplotlib (extra `plot`), discrete ones as steps, and marks events unless
         `events=False`; returns the axes."""
         from ..plotting import plot_solution
 
         return plot_solution(self, *names, ax=ax, events=events)
 
-    def plot_phase(self, x: str, y: str, ax: Any = None) -> Any:
+    def plot_phase(self, x: str, y: str, ax: Axes | None = None) -> Any:
         """Draws variable `y` over variable `x`, with a dot at the start; returns the Matplotlib axes."""
         from ..plotting import phase
 
@@ -397,7 +406,7 @@ def _places(system: AcausalSystem, quantity: np.ndarray) -> np.ndarray | None:
     return np.maximum(found, 0) if plan.n_state and (found[quantity >= 0] >= 0).all() else None
 
 
-def _held(system: AcausalSystem, values: Any) -> AcausalSystem:
+def _held(system: AcausalSystem, values: Numeric) -> AcausalSystem:
     return system if values is None else system.holding(values)
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..adjoint.resting import still
-from ..aliases import Controller, Solver, State, Time, Tolerance
+from ..aliases import Args, Controller, Numeric, Solver, State, Time, Times, Tolerance
 from ..errors import ModelError
 from ..programs.staging import is_traced, joined, on_device
 from ..solvers.solve import step_control
@@ -22,7 +22,7 @@ from .controlled_variables import with_variables
 from .wave_control import WaveControl
 
 
-def scaled_atol(system: AcausalSystem, atol: Tolerance) -> Any:
+def scaled_atol(system: AcausalSystem, atol: Tolerance) -> Tolerance:
     """The absolute tolerance of each entry of the state, shape (n_state,): in units of its nominal value, or of its
     typical size where none is declared and that is less than one.
 
@@ -51,7 +51,7 @@ def controller_for(
     return WaveControl(controller, *at.waves(is_traced(system.parameters)))  # pyright: ignore[reportCallIssue]
 
 
-def clipped(controller: Controller, jump_ts: Any, ends: StepEnds) -> Any:
+def clipped(controller: Controller, jump_ts: Times, ends: StepEnds) -> Controller:
     """Wraps the controller so that steps end at jumps and kinks; steps prescribed by the user stay as they are."""
     if isinstance(controller, diffrax.StepTo):
         if jump_ts is not None:
@@ -66,7 +66,7 @@ def clipped(controller: Controller, jump_ts: Any, ends: StepEnds) -> Any:
 
 
 def first_step(
-    system: AcausalSystem, t0: Time, t1: Time, x0: State, inputs: Any, order: Any, controller: Controller
+    system: AcausalSystem, t0: Time, t1: Time, x0: State, inputs: Args, order: Numeric, controller: Controller
 ) -> Any:
     """The size of the first step (Hairer, Nørsett & Wanner 1993, II.4), kept out of differentiation."""
     if isinstance(controller, diffrax.StepTo) or not x0.shape[0]:

@@ -6,8 +6,6 @@ fastest period, and where they are long, they end at the zeros and extremes of t
 answers when the wave is largest.
 """
 
-from typing import Any
-
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
@@ -46,7 +44,7 @@ class WaveControl(WrappedControl):
         )
         return keep, start, self._end(start, end), jump, state, result
 
-    def _end(self, start: Time, end: Time) -> Any:
+    def _end(self, start: Time, end: Time) -> Time:
         """The end of a step that the wrapped controller would take from `start` to `end`, moved forwards so that steps
         end where a wave has turned by whole quarters."""
         begin, step, frequency, phase = lax.stop_gradient((start, end - start, self.frequency, self.phase))

@@ -1,6 +1,6 @@
 """BDF: variable order, variable step, fixed leading coefficient."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import diffrax
 import equinox as eqx
@@ -10,7 +10,7 @@ import lineax as lx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
-from ..aliases import State, Time
+from ..aliases import Numeric, PyTree, State, Time
 from ..errors import ModelError
 from ..linear.choice import check_linear_solver, choose
 from .bdf_coefficients import Coefficients, coefficients, interpolate
@@ -31,11 +31,11 @@ class BDFInterpolation(diffrax.AbstractLocalInterpolation):
     t0: Time
     t1: Time
     y0: State
-    phi: Any
-    psi: Any
-    order: Any
+    phi: State
+    psi: Numeric
+    order: Numeric
 
-    def evaluate(self, t0: Time, t1: Time = None, left: bool = True) -> Any:
+    def evaluate(self, t0: Time, t1: Time = None, left: bool = True) -> State:
         """The solution at t0, or its increment from t0 to t1."""
         if t1 is not None:
             return jax.tree.map(jnp.subtract, self.evaluate(t1), self.evaluate(t0))
@@ -53,13 +53,13 @@ class _History(eqx.Module):
     steady: Int[Array, ""]  # steps taken with the same size and order
     last_step: Float[Array, ""]
     planned: Float[Array, ""]  # the next step's size, as proposed
-    starting: Any  # whether order and size still double and rise
-    factor: Any
+    starting: Numeric  # whether order and size still double and rise
+    factor: PyTree
     factor_cj: Float[Array, ""]  # the coefficient the factorisation was made with
     last_cj: Float[Array, ""]
     contraction: Float[Array, ""]  # ρ/(1−ρ) of the last Newton iterations
     counts: Int[Array, "2"]  # Jacobians (and factorisations), Newton iterations
-    largest: Any  # of the determinants measured, each; None if there are none
+    largest: Numeric  # of the determinants measured, each; None if there are none
 
 
 class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
@@ -99,7 +99,7 @@ class BDF(diffrax.AbstractImplicitSolver, diffrax.AbstractAdaptiveSolver):
     algebraic_errors: bool | None = eqx.field(static=True, default=None)
     projection: Projection | None = None
     guard: ChoiceGuard | None = None
-    root_finder: Any = Tolerances()
+    root_finder: Tolerances = Tolerances()
     root_find_max_steps: int = eqx.field(static=True, default=4)
 
     term_structure: ClassVar = diffrax.AbstractTerm

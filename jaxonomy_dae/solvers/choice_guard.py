@@ -6,18 +6,17 @@ like the root of x, so an error of 1e-8 in x, small under usual tolerances, is 1
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ..aliases import Args, State, Time, Tolerance
+from ..aliases import Args, PyTree, Result, State, Time, Tolerance
 
 Determinants = Float[Array, " blocks"]
 
-SINGULAR_CHOICE: Any = diffrax.RESULTS.singular
+SINGULAR_CHOICE: Result = diffrax.RESULTS.singular
 # Of the largest determinant so far: the determinant is as near to zero as z is to the branch point, and an error of
 # 1e-8 in x, the default tolerance, is one of 1e-4 in z (see above).
 NEAREST = 1e-4
@@ -33,7 +32,7 @@ class Verdict(eqx.Module):
     goes_on: Bool[Array, ""]
     largest: Determinants
 
-    def result(self, other: Any) -> Any:
+    def result(self, other: Result) -> Result:
         """The solver's own result, or `SINGULAR_CHOICE`."""
         return diffrax.RESULTS.where(self.goes_on, other, SINGULAR_CHOICE)
 
@@ -47,7 +46,7 @@ class ChoiceGuard(eqx.Module):
         steps over a branch point of g(x, z) = 0, and goes on along one of the branches.
     """
 
-    measure: Callable[[Any, Any, Any], Determinants]
+    measure: Callable[[PyTree, PyTree, PyTree], Determinants]
     atol: Tolerance
     ends_near: bool = eqx.field(static=True, default=True)
 

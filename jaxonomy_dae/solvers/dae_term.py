@@ -9,9 +9,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jax.flatten_util import ravel_pytree
 
-from ..aliases import Args, State, Terms, Time
+from ..aliases import Args, PyTree, State, Terms, Time
 from ..errors import ModelError
 from ..linear.mass import Mass
 from ..private_names import unwrapped
@@ -38,12 +39,12 @@ class DAETerm(diffrax.AbstractTerm):
     - `ModelError` for a mass of the wrong shape, and (when traced) functions that return the wrong shapes.
     """
 
-    field: Callable[..., Any]
-    constraint: Callable[..., Any] | None = None
+    field: Callable[..., State]
+    constraint: Callable[..., State] | None = None
     mass: Mass | None = eqx.field(static=True, default=None)
     pattern: Any = eqx.field(static=True, default=None)
 
-    def __init__(self, field, constraint=None, *, mass: Any = None, pattern: Any = None):
+    def __init__(self, field, constraint=None, *, mass: PyTree = None, pattern: Any = None):
         if not callable(field) or (constraint is not None and not callable(constraint)):
             raise ModelError("a DAETerm is made of functions: DAETerm(f, g), or DAETerm(F, mass=M)")
         if constraint is not None and mass is not None:
@@ -69,7 +70,7 @@ class DAETerm(diffrax.AbstractTerm):
             "Use jaxonomy_dae.solvers.BDF() or jaxonomy_dae.solvers.Rodas5P()"
         )
 
-    def right(self, t: Time, y: State, args: Args) -> Any:
+    def right(self, t: Time, y: State, args: Args) -> State:
         """F(t, y), flat, shape (n,)."""
         if self.constraint is None:
             out = self.field(t, y, args)
@@ -110,7 +111,7 @@ def _identity_mass(n: int) -> Mass:
     return Mass(np.ones(n))
 
 
-def _check_like(name: str, found: Any, expected: Any):
+def _check_like(name: str, found: PyTree, expected: PyTree):
     def shapes(tree):
         return [np.shape(leaf) for leaf in jax.tree.leaves(tree)]
 
@@ -143,7 +144,7 @@ class FlatProblem:
         parts = self.terms, self.like, self.args
         return FlatProblem(*jax.tree.map(lambda v: jax.lax.stop_gradient(v) if eqx.is_array(v) else v, parts))
 
-    def right(self, t: Time, flat: Any) -> Any:
+    def right(self, t: Time, flat: Array) -> State:
         """F, shape (n,)."""
         y = self.unravel(flat)
         sign = jnp.asarray(self.direction, flat.dtype)

@@ -11,12 +11,12 @@ import jax.numpy as jnp
 from ..adjoint.late_times import diffeqsolve, times_fit
 from ..adjoint.resting import HeldBack, Resting
 from ..adjoint.stored_adjoint import StoredAdjoint
-from ..aliases import Args, Controller, Result, Solver, State, Terms, Time
+from ..aliases import Args, Controller, Numeric, PyTree, Result, Solver, State, Terms, Time, Times
 from .bdf import BDF
 from .projected import Projected
 from .rodas5p import Rodas5P
 
-BAD_TIMES: Any = diffrax.RESULTS.nonlinear_divergence  # Diffrax has no code of its own for them
+BAD_TIMES: Result = diffrax.RESULTS.nonlinear_divergence  # Diffrax has no code of its own for them
 TIMES = (
     "times do not fit: t0 and t1 must be finite, ts sorted from t0 to t1 and inside, and the times of StepTo must lead "
     "from t0 to t1"
@@ -27,14 +27,14 @@ class Run(NamedTuple):
     """The raw result of an integration: saved times and values, the last accepted point (t, y), counts, a result
     code."""
 
-    ts: Any
-    ys: Any
-    last: tuple[Any, Any]
-    stats: dict[str, Any]
+    ts: Times
+    ys: State
+    last: tuple[PyTree, PyTree]
+    stats: dict[str, PyTree]
     result: Result
 
 
-def inner(solver: Solver) -> Any:
+def inner(solver: Solver) -> Solver:
     """The solver without the projection around it."""
     return solver.solver if isinstance(solver, Projected) else solver
 
@@ -44,7 +44,7 @@ def is_implicit(solver: Solver) -> bool:
     return isinstance(inner(solver), BDF | Rodas5P)
 
 
-def right_between_steps(solver: Solver) -> Any:
+def right_between_steps(solver: Solver) -> Solver:
     """The solver with an error test that covers its dense output, if values are saved within steps."""
     if isinstance(solver, Projected):
         return dataclasses.replace(solver, solver=right_between_steps(solver.solver))
@@ -58,8 +58,8 @@ def is_multistep(solver: Solver) -> bool:
 
 def integrate(
     term: Terms, solver: Solver, t0: Time, t1: Time, dt0: Time, y0: State, args: Args, *,
-    save: diffrax.SubSaveAt, controller: Controller, adjoint: Any, max_steps: int, progress: bool = False,
-    checked: bool = False, goes_on: Any = True,
+    save: diffrax.SubSaveAt, controller: Controller, adjoint: diffrax.AbstractAdjoint, max_steps: int, progress: bool = False,
+    checked: bool = False, goes_on: Numeric = True,
 ) -> Run:  # fmt: skip
     """Integrates; returns the values asked for, the last accepted point, and counts, Jacobians included."""
     # `StoredAdjoint` holds steps back by itself, where it is differentiated.

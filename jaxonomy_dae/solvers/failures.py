@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from ..aliases import Args, Result, State, Terms, Time, Tolerance
 from ..tolerances import KNOWN, KNOWN_ROUNDINGS, SLIGHT, spacing
@@ -35,18 +36,18 @@ class StartCheck(eqx.Module):
     - `matrix`: the matrix that is regular if the index is 1, shape (n, n), or None.
     """
 
-    right: Any
-    residual: Any
-    rounding: Any
-    shift: Any
+    right: Array
+    residual: Array
+    rounding: Array
+    shift: Array
     matrix: Any
 
     @property
-    def is_fine(self) -> Any:
+    def is_fine(self) -> Array:
         """True if the equations are finite at the start and the algebraic ones hold to the tolerance."""
         return jnp.all(jnp.isfinite(self.right)) & (jnp.max(jnp.abs(self.shift), initial=0.0) <= 1)
 
-    def error_if(self, ys: Any) -> Any:
+    def error_if(self, ys: State) -> State:
         """Adds run-time errors to `ys` for a start that is traced and turns out to be bad."""
         ys = eqx.error_if(ys, ~jnp.all(jnp.isfinite(self.right)), "the equations are not finite at the start")
         return eqx.error_if(ys, ~self.is_fine, "inconsistent start: see jaxonomy_dae.solvers.consistent_start")
@@ -69,7 +70,7 @@ def start_check(problem: FlatProblem, t: Time, rtol: Tolerance, atol: Tolerance)
     return jax.lax.stop_gradient(StartCheck(right, residual, rounding, shift, looked_at))
 
 
-def _flat(atol: Tolerance, like: Any) -> Any:
+def _flat(atol: Tolerance, like: State) -> Array:
     parts = [jnp.ravel(jnp.asarray(leaf, like.dtype)) for leaf in jax.tree.leaves(atol)]
     joined = jnp.concatenate(parts)
     return joined if joined.shape == like.shape else joined[0]

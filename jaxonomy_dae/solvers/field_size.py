@@ -9,12 +9,13 @@ from typing import Any
 
 import jax
 
+from ..aliases import PyTree
 from ..private_names import MissingName, private
 
 LARGE = 400  # operations from which stages are looped over: a pendulum has 150, a double pendulum 1,700
 
 
-def is_large(function: Callable[..., Any], *arguments: Any) -> bool:
+def is_large(function: Callable[..., PyTree], *arguments: PyTree) -> bool:
     """True if the traced function has more than `LARGE` operations."""
     program = jax.make_jaxpr(function)(*arguments)
     try:

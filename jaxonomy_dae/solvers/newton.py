@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax.typing import DTypeLike
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from ..aliases import PyTree, Tolerance
 from ..errors import ModelError
 from ..linear.choice import LinearAlgebra
 from ..private_names import FROM_CONTROLLER
@@ -23,9 +24,9 @@ STALE = 0.25  # relative change of the leading coefficient that a factorisation 
 class Tolerances(eqx.Module):
     """Tolerances of the iteration: those of the step-size controller, unless given."""
 
-    rtol: Any = FROM_CONTROLLER
-    atol: Any = FROM_CONTROLLER
-    norm: Any = FROM_CONTROLLER
+    rtol: Tolerance = FROM_CONTROLLER
+    atol: Tolerance = FROM_CONTROLLER
+    norm: PyTree = FROM_CONTROLLER
 
     def values(self, dtype: DTypeLike) -> tuple[Any, Any, Callable[[Any], Any]]:
         """(rtol, atol flat, norm)."""
@@ -43,7 +44,7 @@ class Solved(NamedTuple):
 
     y: Float[Array, " n"]
     converged: Bool[Array, ""]
-    factor: Any  # as the linear algebra keeps it
+    factor: PyTree  # as the linear algebra keeps it
     factor_cj: Float[Array, ""]
     contraction: Float[Array, ""]
     factorisations: Int[Array, ""]
@@ -59,9 +60,9 @@ def implicit_step(
     cj: Float[Array, ""],
     *,
     weight: Float[Array, " n"],
-    norm: Callable[[Any], Any],
+    norm: Callable[[PyTree], PyTree],
     max_iterations: int,
-    factor: Any,
+    factor: PyTree,
     factor_cj: Float[Array, ""],
     last_cj: Float[Array, ""],
     contraction: Float[Array, ""],

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from diffrax import AbstractSolver
 from diffrax import AbstractWrappedSolver as _Wrapped
 
+from ..aliases import Numeric
 from ..errors import ModelError
 from .choice_guard import ChoiceGuard
 from .wrapped import WrappedSolver
@@ -62,7 +63,7 @@ class Projected(WrappedSolver):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         if self.projection is None:
             raise ModelError("Projected needs a projection outside simulate(): Projected(solver, system.project)")
-        largest: Any = None
+        largest: Numeric = None
         if self.guard is not None:
             solver_state, largest = solver_state
         y1, y_error, dense_info, solver_state, result = self.solver.step(

@@ -11,7 +11,7 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..aliases import State, Time
+from ..aliases import Numeric, PyTree, State, Time
 from ..linear.choice import check_linear_solver, choose
 from .dae_term import FlatProblem
 from .field_size import is_large
@@ -66,9 +66,9 @@ class Stage(NamedTuple):
     """A stage solves (M/(γh) − J) k = F(t + node·h, y + Σ a·k) + M Σ c·k / h + d·h·∂F/∂t, k the stages before it."""
 
     a: Any
-    c: Any
-    d: Any
-    node: Any
+    c: Numeric
+    d: Numeric
+    node: Numeric
     moves: bool = True  # whether d is not zero
 
 
@@ -94,7 +94,7 @@ class Rodas5PInterpolation(diffrax.AbstractLocalInterpolation):
     y1: State
     k: Any
 
-    def evaluate(self, t0: Time, t1: Time = None, left: bool = True) -> Any:
+    def evaluate(self, t0: Time, t1: Time = None, left: bool = True) -> State:
         """The solution at t0, or its increment from t0 to t1."""
         if t1 is not None:
             return jax.tree.map(jnp.subtract, self.evaluate(t1), self.evaluate(t0))
@@ -173,7 +173,7 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
         matrix = linear.combine(mass, inverse / GAMMA, jacobian)
         factor = linear.factor(matrix)
 
-        def stage(row: Stage, stages: Any) -> Any:
+        def stage(row: Stage, stages: PyTree) -> PyTree:
             right = problem.right(t0 + row.node * h_time, y + _combine(row.a, stages))
             b = right + mass.times(inverse * _combine(row.c, stages))
             return linear.solve(factor, matrix, b + (row.d * h) * slope if row.moves else b)
@@ -192,7 +192,9 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
         return problem.unravel(y1), problem.unravel(error), dense, None, diffrax.RESULTS.successful
 
 
-def _written_out(stage: Callable[[Stage, Any], Any], rows: Sequence[Stage], first: Float[Array, " n"]) -> list[Any]:
+def _written_out(
+    stage: Callable[[Stage, PyTree], PyTree], rows: Sequence[Stage], first: Float[Array, " n"]
+) -> list[PyTree]:
     stages = [first]
     for row in rows:
         stages.append(stage(row, stages))
@@ -200,7 +202,7 @@ def _written_out(stage: Callable[[Stage, Any], Any], rows: Sequence[Stage], firs
 
 
 def _in_a_loop(
-    stage: Callable[[Stage, Any], Any], rows: Sequence[Stage], first: Float[Array, " n"], time_dtype: Any
+    stage: Callable[[Stage, PyTree], PyTree], rows: Sequence[Stage], first: Float[Array, " n"], time_dtype: PyTree
 ) -> Any:
     """The stages computed in a loop, shape (max(8, 1 + rows), n): the field is compiled once."""
 
@@ -215,11 +217,11 @@ def _in_a_loop(
     return jax.lax.scan(body, empty.at[0].set(first), given)[0]
 
 
-def _combine(coefficients: Any, stages: Any) -> Float[Array, " n"]:
+def _combine(coefficients: Numeric, stages: PyTree) -> Float[Array, " n"]:
     """Σ coefficient·stage over a list or an array of stages."""
     if not isinstance(stages, list):
         return jnp.tensordot(jnp.asarray(coefficients, stages.dtype), stages[:8], 1)
-    total: Any = None
+    total: Numeric = None
     for c, stage in zip(coefficients, stages, strict=False):
         if c:
             total = float(c) * stage if total is None else total + float(c) * stage

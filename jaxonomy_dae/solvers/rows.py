@@ -1,22 +1,22 @@
 """Saved rows that the integration did not fill."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ..aliases import Numeric, PyTree
+
 
 def padded(
-    ts: Float[Array, " n"], x: Float[Array, "n x"], steps: Any
+    ts: Float[Array, " n"], x: Float[Array, "n x"], steps: Numeric
 ) -> tuple[Float[Array, " n"], Float[Array, "n x"]]:
     """Replaces the rows beyond the steps taken by the last row, so that `[-1]` is the end, its derivatives included."""
     filled = jnp.arange(ts.shape[0]) <= steps
     return jnp.where(filled, ts, ts[steps]), jnp.where(filled[:, None], x, x[steps])
 
 
-def not_a_number(x: Float[Array, "n x"], reached: Bool[Array, " n"], *sources: Any) -> Float[Array, "n x"]:
+def not_a_number(x: Float[Array, "n x"], reached: Bool[Array, " n"], *sources: PyTree) -> Float[Array, "n x"]:
     """Sets the rows that were not reached to NaN, and the derivatives of these rows with respect to `sources`, too.
 
     Where such a row does not count (its cotangent is zero), as after `jnp.where(okay, loss, 0)`, derivatives are not

@@ -15,7 +15,7 @@ from jax.flatten_util import ravel_pytree
 from jax.typing import DTypeLike
 
 from ..adjoint.stored_adjoint import default_adjoint
-from ..aliases import Args, Solver, State, Time
+from ..aliases import Args, PyTree, Result, Solver, State, Time, Times, Tolerance
 from ..errors import InitializationError, ModelError, SimulationError, explained_keywords
 from ..programs.cache import PROGRAMS, compiled
 from ..programs.members import failed_members, is_batched
@@ -39,20 +39,20 @@ SMALL = 30  # up to this many unknowns a factorisation costs less than the steps
 
 @explained_keywords()
 def solve_dae(
-    term: Any,
+    term: diffrax.AbstractTerm,
     t1: Time,
     y0: State,
     *,
     t0: Time = 0.0,
-    ts: Any = None,
+    ts: Times | None = None,
     solver: diffrax.AbstractSolver[Any] | None = None,
-    rtol: Any = None,
-    atol: Any = None,
+    rtol: Tolerance | None = None,
+    atol: Tolerance | None = None,
     args: Args | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController[Any, Any] | None = None,
-    jump_ts: Any = None,
-    dtmax: Any = None,
+    jump_ts: Times | None = None,
+    dtmax: Time | None = None,
     max_steps: int = 16384,
     names: Sequence[str] | None = None,
     throw: bool | None = None,
@@ -146,7 +146,7 @@ def solve_dae(
     return solution
 
 
-def _say_of_members(check: StartCheck, result: Any, max_steps: int, throw: bool | None) -> None:
+def _say_of_members(check: StartCheck, result: Result, max_steps: int, throw: bool | None) -> None:
     """Says which members of a batch failed, outside of jit: in a warning, or in an error if it is asked for."""
     codes = diffrax.RESULTS
     number = jnp.where(result == OK, 0, 4)
@@ -166,7 +166,7 @@ def _say_of_members(check: StartCheck, result: Any, max_steps: int, throw: bool 
         warnings.warn(f"integrations that stopped {text}. Their rows are not-a-number", RuntimeWarning, stacklevel=4)
 
 
-def _inexact(leaf: Any) -> Any:
+def _inexact(leaf: PyTree) -> PyTree:
     """The array in floating point; integers become the default type."""
     array = jnp.asarray(leaf)
     return array if jnp.issubdtype(array.dtype, jnp.inexact) else array.astype(jnp.result_type(float))
@@ -185,20 +185,20 @@ def default_solver(n: int) -> diffrax.AbstractSolver:
 
 
 def step_control(
-    solver: Solver, rtol: Any, atol: Any, jump_ts: Any = None, dtmax: Any = None
+    solver: Solver, rtol: Tolerance, atol: Tolerance, jump_ts: Times | None = None, dtmax: Time | None = None
 ) -> diffrax.AbstractStepSizeController:
     """The step-size controller for one of our solvers."""
     control: Any = StepControl(rtol, atol, steered=is_multistep(solver), dtmax=dtmax)
     return control if jump_ts is None else diffrax.ClipStepSizeController(control, jump_ts=jump_ts)
 
 
-def default_tolerances(rtol: Any, atol: Any, dtype: DTypeLike) -> tuple[Any, Any]:
+def default_tolerances(rtol: Tolerance, atol: Tolerance, dtype: DTypeLike) -> tuple[Tolerance, Tolerance]:
     """The tolerances, where they are not given by precision."""
     single = dtype == jnp.float32
     return (1e-4 if single else 1e-6) if rtol is None else rtol, (1e-6 if single else 1e-8) if atol is None else atol
 
 
-def check_tolerances(rtol: Any, atol: Any, dtype: DTypeLike):
+def check_tolerances(rtol: Tolerance, atol: Tolerance, dtype: DTypeLike):
     """Refuses tolerances that are not numbers or that the precision cannot reach."""
     for name, value in (("rtol", rtol), ("atol", atol)):
         for leaf in jax.tree.leaves(value):
@@ -241,7 +241,7 @@ def _solve(term, t0, t1, y0, ts, args, tolerances, options, checked=False):
     reached = jnp.isfinite(run.ts) & check.is_fine
     saved = run.ys if ts is None else _on_constraints(term, args, run.ts, run.ys, y0)
     saved = jax.tree.map(lambda y: not_a_number(y, reached, y0, args), saved)
-    failure: Any = diffrax.RESULTS.nonlinear_divergence
+    failure: Result = diffrax.RESULTS.nonlinear_divergence
     result = diffrax.RESULTS.where(check.is_fine, run.result, failure)
     out = diffrax.Solution(
         t0=t0, t1=t1, ts=run.ts if ts is None else ts, ys=saved, interpolation=None, stats=run.stats, result=result,
@@ -250,7 +250,7 @@ def _solve(term, t0, t1, y0, ts, args, tolerances, options, checked=False):
     return check, out, run.last
 
 
-def _on_constraints(term: Any, args: Args, ts: Any, ys: Any, y0: State) -> Any:
+def _on_constraints(term: diffrax.AbstractTerm, args: Args, ts: Times, ys: State, y0: State) -> State:
     """Saved values with their algebraic unknowns solved for: dense output interpolates those, and no error estimate
     covers how fast they vary within a step."""
 

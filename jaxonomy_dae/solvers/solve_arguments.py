@@ -1,7 +1,6 @@
 """What `solve_dae` accepts: checked before anything is compiled."""
 
 import math
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,12 +8,12 @@ import numpy as np
 from jax.core import Tracer
 from jax.typing import DTypeLike
 
-from ..aliases import State, Time, Tolerance
+from ..aliases import Numeric, State, Time, Times, Tolerance
 from ..errors import ModelError
 from ..programs.staging import as_array
 
 
-def check_finite(**numbers: Any) -> None:
+def check_finite(**numbers: Numeric) -> None:
     """Refuses what is not a finite number, by the names of the arguments."""
     for name, value in numbers.items():
         if isinstance(value, Tracer):
@@ -34,7 +33,7 @@ def check_longest_step(dtmax: Time) -> None:
         raise ModelError(f"dtmax must be positive; got {dtmax}")
 
 
-def check_times(t0: Time, t1: Time, ts: Any):
+def check_times(t0: Time, t1: Time, ts: Times):
     """Refuses ends that are not finite, and times to save that are not between them, in order."""
     check_finite(t0=t0, t1=t1)
     if ts is None:
@@ -52,7 +51,7 @@ def check_times(t0: Time, t1: Time, ts: Any):
         raise ModelError("ts must be sorted in the direction of integration")
 
 
-def tolerance_of(atol: Tolerance, y: State) -> Any:
+def tolerance_of(atol: Tolerance, y: State) -> Tolerance:
     """An absolute tolerance as one number, or with the structure and shapes of y."""
     leaves = jax.tree.leaves(atol)
     if len(leaves) == 1 and np.shape(leaves[0]) == ():
@@ -65,7 +64,7 @@ def tolerance_of(atol: Tolerance, y: State) -> Any:
     return jax.tree.map(lambda a, v: jnp.broadcast_to(jnp.asarray(a, v.dtype), v.shape), atol, y)
 
 
-def jump_times(jump_ts: Any, dtype: DTypeLike) -> Any:
+def jump_times(jump_ts: Times, dtype: DTypeLike) -> Times:
     """Times of jumps, a number or shape (n,), as an array; None if there is none."""
     array = None if jump_ts is None else as_array(jump_ts)
     if array is None or array.shape == (0,):

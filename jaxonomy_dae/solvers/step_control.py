@@ -1,7 +1,6 @@
 """Step sizes: the first one, what follows a step, and the end when nothing helps."""
 
 from collections.abc import Callable
-from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -10,7 +9,7 @@ import jax.numpy as jnp
 import optimistix as optx
 
 from ..adjoint.wrapped_control import WrappedControl
-from ..aliases import State, Tolerance
+from ..aliases import Numeric, State, Time, Tolerance
 
 SAFETY = 0.9  # of the step that would just meet the tolerance (Hairer, Nørsett & Wanner 1993, II.4)
 # In tolerances: the first step is chosen as if everything moved by as much in the problem's own time. Motion below the
@@ -26,20 +25,20 @@ MOST_TRIES = 100
 # e = SAFETY + (1 − SAFETY)·φ for a step that is kept though the next shall be smaller.
 
 
-def encoded(factor: Any, keep: Any) -> Any:
+def encoded(factor: Numeric, keep: Numeric) -> Numeric:
     """The error norm by which a multistep solver asks the controller to change the step size by a factor."""
     smaller = keep & (factor < 1)
     return jnp.where(smaller, SAFETY + (1 - SAFETY) * factor, SAFETY / factor)
 
 
-def decoded(norm: Any) -> Any:
+def decoded(norm: Numeric) -> Numeric:
     """The factor that `encoded` stands for."""
     shrunk = (norm - SAFETY) / (1 - SAFETY)
     factor = jnp.where((norm > SAFETY * (1 + 1e-5)) & (norm < 1), shrunk, SAFETY / norm)
     return jnp.where(jnp.abs(factor - 1) < 1e-5, 1.0, factor)
 
 
-def tolerance_like(atol: Tolerance, y: State) -> Any:
+def tolerance_like(atol: Tolerance, y: State) -> Tolerance:
     """An absolute tolerance for every leaf of y, from one number for all or a tree like y."""
     if jax.tree.structure(atol) == jax.tree.structure(y):
         return atol
@@ -65,9 +64,9 @@ class StepControl(diffrax.AbstractAdaptiveStepSizeController):
 
     rtol: Tolerance
     atol: Tolerance
-    norm: Callable[[Any], Any] = optx.rms_norm
+    norm: Callable[[Numeric], Numeric] = optx.rms_norm
     steered: bool = eqx.field(static=True, default=False)
-    dtmax: Any = None
+    dtmax: Time = None
 
     def wrap(self, direction):
         return self

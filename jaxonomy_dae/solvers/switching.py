@@ -7,19 +7,17 @@ h·‖f(y₁) − f(y₁')‖ / ‖y₁ − y₁'‖ estimates h·|λ|. Such a r
 Where the user chose the explicit one, and inside jit, it fails with that code, if its steps would not suffice.
 """
 
-from typing import Any
-
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ..aliases import Time
+from ..aliases import Numeric, Result, Time
 
 # Diffrax has no code of its own for this. `breakdown` means nothing else here; an event that writes a value that is not
 # finite ends with `nonlinear_divergence`, too, and its run was made once more with an implicit solver.
-STIFF: Any = diffrax.RESULTS.breakdown
+STIFF: Result = diffrax.RESULTS.breakdown
 BOUNDARY = 0.9 * 3.5  # of Tsit5's stability region along the negative real axis is at −3.5
 PATIENCE = 15  # limited steps in a row, as in Hairer's DOPRI5: a transient that passes is not stiffness
 # Steps of that size still to be taken: fewer cost less than compiling another solver
@@ -39,8 +37,8 @@ class Watch(eqx.Module):
     - `of_run`: whether `many` includes the steps taken before.
     """
 
-    end: Any
-    floor: Any
+    end: Time
+    floor: Numeric
     many: int = eqx.field(static=True, default=MANY)
     of_run: bool = eqx.field(static=True, default=False)
 
@@ -68,6 +66,6 @@ class Watch(eqx.Module):
         count = jnp.where(limited, count + 1, jnp.maximum(count - 2, 0))
         return jnp.stack([count, steps + 1])
 
-    def result(self, counts: Int[Array, "2"]) -> Any:
+    def result(self, counts: Int[Array, "2"]) -> Result:
         """`STIFF` once enough steps in a row were limited."""
         return diffrax.RESULTS.where(counts[0] < PATIENCE, diffrax.RESULTS.successful, STIFF)
