@@ -103,8 +103,8 @@ BAND = 4096.0
 # retried up to a crossing has other errors than the step in which the crossing was located, so that it ends a little
 # off. Set by hand: test_hybrid_runs.py and test_event_map.py pass with ten times it and a tenth.
 WINDOW = 1e-6
-# Part of each state's size by which the projection onto the constraints may move what an event wrote and left. If it
-# moves more, the event asked for what the constraints do not admit, and the projection would decide what was meant
+# Largest relative change of a state by the projection onto the constraints after an event. If the projection moves it
+# more, the event asked for what the constraints do not admit, and the projection would decide what was meant
 # (test_event_attacks.py::test_a_reset_that_hidden_constraints_do_not_admit).
 CONSISTENT = 1e-4
 # Part of the speed (or charge) that an impulse takes away that may be left of it. The impulse is found by one linear

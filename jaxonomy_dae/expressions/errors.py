@@ -20,8 +20,8 @@ from .functions import TABLE
 from .kernel import Kernel, is_active
 from .node import Node, Number, leaf
 
-# The argument of any other function is a number without a unit, in which a step of one is large: an angle of 1e-17 that
-# was computed is zero to rounding.
+# Functions that take arguments of any unit and size. All others take dimensionless arguments of order one, for which an
+# absolute error of eps is assumed: a computed angle of 1e-17 is zero to rounding.
 WITHOUT_SCALE = frozenset(
     {"abs", "sign", "floor", "ceiling", "heaviside", "max", "min", "mod", "hypot", "atan2", "log", "loggamma"}
 )

@@ -69,10 +69,13 @@ class When:
 
 @dataclasses.dataclass(frozen=True)
 class HeldBranch:
-    """A branch of `either` that is differentiated: the names of the hidden variables that are it and its derivatives
-    below the highest, all zero while the branch holds, and of the one that is 1 while it does and 0 otherwise; and the
-    discrete variable that an event sets to 1 to let an impulse act. One that only pushes also has the hidden variable of its
-    force, and the discrete variable that lets go at 0."""
+    """A branch of `either` that is differentiated.
+
+    - `levels`: the hidden variables that equal the branch and its derivatives below the highest; zero while it holds.
+    - `active`: the hidden variable that is 1 while the branch holds, and 0 otherwise.
+    - `impulse`: the discrete variable that an event sets to 1 to let an impulse act.
+    - A branch that only pushes also has the hidden variable of its force, and the discrete variable that lets go at 0.
+    """
 
     text: str
     levels: tuple[str, ...]

@@ -22,9 +22,13 @@ SHOWN = 4  # equations, and values in each, that an error lists
 
 
 def refuse_not_finite(
-    system: AcausalSystem, names: Sequence[str], quantity: np.ndarray, values: Numeric, rows: tuple[Numeric, Numeric, Numeric],
+    system: AcausalSystem,
+    names: Sequence[str],
+    quantity: np.ndarray,
+    values: Numeric,
+    rows: tuple[Numeric, Numeric, Numeric],
     inputs: Args,
-) -> None:  # fmt: skip
+) -> None:
     """**Arguments:**
 
     - `names`, `quantity`: of variables, and what they are; −1 is zero.

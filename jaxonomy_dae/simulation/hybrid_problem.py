@@ -137,9 +137,17 @@ class SystemProblem(AbstractHybridProblem):
         return after, q, jnp.all(done | (strength == 0) | ~acting) & ~wrong
 
     def _acting(
-        self, jump: Callable[..., Array], t: Time, x: State, q: Array, strength: Array, e: Array, strikes: Array, may_change: Array,
+        self,
+        jump: Callable[..., Array],
+        t: Time,
+        x: State,
+        q: Array,
+        strength: Array,
+        e: Array,
+        strikes: Array,
+        may_change: Array,
         args: Args,
-    ) -> tuple[Array, Array]:  # fmt: skip
+    ) -> tuple[Array, Array]:
         """Which contacts act, and whether that could not be found; not differentiated."""
         problem, t, x, q, strength, e, args = still(constant_once((self, t, x, q, strength, e, args)))
         n = len(may_change)

@@ -1,9 +1,8 @@
 """Step sizes that see the waves by which a model is driven.
 
-While what a wave drives is idle, as a rectifier whose diodes block, nothing limits steps: they grow over whole
-periods, and what happens within goes without a trace in any error estimate. So steps are at most a quarter of the
-fastest period, and where they are long, they end at the zeros and extremes of the waves: what answers to a wave at all
-answers when the wave is largest.
+While the driven part is inactive, for example a rectifier whose diodes block, nothing limits steps: they grow over
+whole periods, and no error estimate sees what happens within. So steps are at most a quarter of the fastest period.
+Long steps also end at the zeros and extremes of the waves: at an extreme, a blocked diode would first conduct.
 """
 
 import jax.numpy as jnp

@@ -57,10 +57,22 @@ def is_multistep(solver: Solver) -> bool:
 
 
 def integrate(
-    term: Terms, solver: Solver, t0: Time, t1: Time, dt0: Time, y0: State, args: Args, *,
-    save: diffrax.SubSaveAt, controller: Controller, adjoint: diffrax.AbstractAdjoint, max_steps: int, progress: bool = False,
-    checked: bool = False, goes_on: Numeric = True,
-) -> Run:  # fmt: skip
+    term: Terms,
+    solver: Solver,
+    t0: Time,
+    t1: Time,
+    dt0: Time,
+    y0: State,
+    args: Args,
+    *,
+    save: diffrax.SubSaveAt,
+    controller: Controller,
+    adjoint: diffrax.AbstractAdjoint,
+    max_steps: int,
+    progress: bool = False,
+    checked: bool = False,
+    goes_on: Numeric = True,
+) -> Run:
     """Integrates; returns the values asked for, the last accepted point, and counts, Jacobians included."""
     # `StoredAdjoint` holds steps back by itself, where it is differentiated.
     if not isinstance(adjoint, StoredAdjoint) and Resting.of(term, solver, controller, y0, args, t1 - t0):
