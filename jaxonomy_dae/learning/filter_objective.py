@@ -6,7 +6,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from .descent import Minimum, descend
 from .evaluation import Evaluation, Weights
@@ -100,8 +100,8 @@ class AheadObjective(Objective):
         first, second = ([np.asarray(pair[k], np.float64) for pair in found] for k in (0, 1))
         return Predicted(*first), Predicted(*second)
 
-    def predicted(self, z: Float[np.ndarray, " p"]) -> Predicted:
-        """Predictions one step ahead."""
+    def predicted(self, z: Float[np.ndarray, " p"], of: Bool[np.ndarray, " e"] | None = None) -> Predicted:
+        """Predictions one step ahead, of all experiments, whatever is asked for."""
         return self._ahead(z)[0]
 
     def outputs(self, z: Float[np.ndarray, " p"]) -> Float[np.ndarray, "e n k"]:

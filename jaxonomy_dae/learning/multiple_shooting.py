@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from ..errors import ModelError
 from .block_elimination import Blocks, eliminate, linear
-from .descent import OFFSET, PATIENCE, SETTLED, TRIALS, Minimum, can_move, damping_after, offset
+from .descent import FIRST, OFFSET, PATIENCE, SETTLED, TRIALS, Minimum, can_move, damping_after, offset
 from .evaluation import Weights
 from .evidence import Evidence
 from .factors import Factors
@@ -100,7 +100,7 @@ class Descent:
     size: Float[np.ndarray, " n"]
     bounds: tuple[Float[np.ndarray, " f"], Float[np.ndarray, " f"]]
     tolerance: float
-    damping: float = 1e-3
+    damping: float = FIRST
     evaluations: int = 1
 
     def step(self, merit: Merit, point: Point) -> tuple[Point, float] | None:
@@ -120,6 +120,7 @@ class Descent:
                 self.damping = damping_after(self.damping, gain / max(cost - promised, np.finfo(float).tiny))
                 return new, gain
             self.damping *= 6
+        self.damping = FIRST  # other multipliers and weights are another function
         return None
 
     def _trial(
