@@ -268,8 +268,9 @@ def damped_oscillation(t, M=2.0, D=0.6, K=5.0, x0=0.7, v0=-0.4):
 
 
 def environment(**changed: str) -> dict[str, str]:
-    """The environment for a new Python that finds the package and this module, without JAX's settings."""
-    kept = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
+    """The environment for a new Python that finds the package and this module, without JAX's settings and without what
+    `threadpoolctl` set in this process."""
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "KMP_"))}
     folders = [ROOT, *(ROOT / "tests" / room for room in ("", "kernels", "compiler", "plants"))]
     return kept | {"PYTHONPATH": os.pathsep.join(map(str, folders))} | changed
 

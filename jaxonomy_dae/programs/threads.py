@@ -7,8 +7,10 @@ fit of 97 weights that was two thirds of the time and more.
 
 import contextlib
 import functools
+from typing import TYPE_CHECKING
 
-from threadpoolctl import ThreadpoolController
+if TYPE_CHECKING:
+    from threadpoolctl import ThreadpoolController
 
 LARGE = 3e8  # multiplications beyond which threads are worth it, some 0.1 s of one
 
@@ -19,6 +21,9 @@ def one_thread(multiplications: float) -> contextlib.AbstractContextManager:
 
 
 @functools.cache
-def _controller() -> ThreadpoolController:
-    """The thread-pool controller of the libraries that are loaded, made once: the search takes milliseconds."""
+def _controller() -> "ThreadpoolController":
+    """The thread-pool controller of the libraries that are loaded, made once: the search takes milliseconds. Imported
+    here, as the import changes the environment of the process."""
+    from threadpoolctl import ThreadpoolController
+
     return ThreadpoolController()
