@@ -48,13 +48,12 @@ def partials_at(
     def everything(state, u, held, q):
         now = system.holding(q.at[sampled].set(held) if len(sampled) else q)
         here = now.at(t, {**values, **dict(zip(names, u, strict=True))})
-        full = here.split(jnp.concatenate([state, x[n:]]))
+        full = jnp.concatenate([state, x[n:]])
         if len(system.plan.carried):  # which follow the states and the inputs
             full = here.refined(full, Refinement.ROOT)
-        joined = here.join(full)
-        read = here.quantities(joined, np.maximum(which, 0), scale) if len(which) else joined[:0]
+        read = here.quantities(full, np.maximum(which, 0), scale) if len(which) else full[:0]
         y = jnp.where(jnp.asarray(which < 0), 0.0, read)
-        return here.semi_explicit(joined)[:n], here.constraint_vector(full), y
+        return here.semi_explicit(full)[:n], here.constraint_vector(full), y
 
     def of(q):
         def twice(*given):

@@ -8,9 +8,9 @@ import sympy
 from jax.typing import DTypeLike
 
 from ..errors import ModelError
-from ..model.starts import StartGroup, Starts
+from ..model.starts import Formulas, Starts
 from ..model.symbolic import SymbolicTemplate, canonical
-from ..model.tables import DependentParameters, ParameterTable, VariableTable, complete
+from ..model.tables import ParameterTable, VariableTable, complete
 from ..modeling.declarations import EachValue, Variable
 from ..modeling.interval import Interval
 from .number_model import Instances, ModelNumbers
@@ -97,7 +97,7 @@ def _starts(model: ModelNumbers, started: Sequence[tuple[Variable, Instances, in
         ids = np.concatenate([i.variable + k for i, k in members])
         columns = [np.concatenate(c) for c in zip(*_parameters(model, members, paths), strict=True)]
         found.append(
-            StartGroup(template, ids, np.stack(columns, axis=1) if columns else np.zeros((len(ids), 0), np.int64))
+            Formulas(template, ids, np.stack(columns, axis=1) if columns else np.zeros((len(ids), 0), np.int64))
         )
     return Starts(model.n_variables, found)
 
@@ -173,9 +173,9 @@ def _place_in(value: EachValue, i: Instances) -> np.ndarray:
 
 def _dependent_parameters(
     reads: dict[int, tuple[sympy.Expr, list[int]]], expressions: dict[int, str], names: list[str]
-) -> tuple[DependentParameters, ...]:
+) -> tuple[Formulas, ...]:
     """Groups of equal templates, in an order in which everything that one reads is known."""
-    groups: list[DependentParameters] = []
+    groups: list[Formulas] = []
     known_templates: dict[sympy.Expr, SymbolicTemplate] = {}
     left = dict(reads)
     while left:
@@ -195,5 +195,5 @@ def _dependent_parameters(
             targets.append(p)
             parameters.append(ids)
         for template, targets, parameters in rows.values():
-            groups.append(DependentParameters(template, np.array(targets), np.array(parameters, np.int64)))
+            groups.append(Formulas(template, np.array(targets), np.array(parameters, np.int64)))
     return tuple(groups)

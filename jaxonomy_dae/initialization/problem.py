@@ -97,10 +97,9 @@ class InitialProblem:
         here, x = self._at(parameters, inputs, w), w[: self.plan.n_state]
         if len(self.unknown):
             target, _ = start_values(self.rows.kept, self._given, here.parameters)
-        state = here.split(x)
-        parts = [here.constraint_vector(state)]
+        parts = [here.constraint_vector(x)]
         if len(self.plan.carried):
-            parts.append(here.carried_vector(here.t, state))
+            parts.append(here.carried_vector(here.t, x))
         return jnp.concatenate([*parts, self.starts(here, x) - target])
 
     def function(self, w: Any) -> Any:
@@ -247,7 +246,7 @@ def _reader(plan: SystemPlan, kept: tuple[StartRow, ...]):
         if in_state:
             where = np.array([place[int(q)] for q in quantity])
             return times(jnp.asarray(factor, here.dtype) if (factor != 1).any() else 1.0, take(x, where))
-        evaluation = here.run(program, here.split(x), Refinement.NONE)
+        evaluation = here.run(program, x, Refinement.NONE)
         gather: Gather = program.layout.gather(quantity, factor)
         return jnp.broadcast_to(jnp.asarray(evaluation.read(gather), here.dtype), (len(quantity),))
 

@@ -127,8 +127,7 @@ class InitializationReport(Sections):
             row = rows.guess[k]
             guess = 0.0
             if row is not None and row.given < 0 and row.start is not None:
-                values = list(parameters[list(row.start.parameters)])
-                guess = float(row.start.template.residual([], values, [], 0.0, None, backend="numpy")) / row.factor
+                guess = row.start.value(parameters) / row.factor
             name = plan.quantity_name[q]
             out.append(Guess(name, guess + 0.0, float(self._x[k]) + 0.0))
         return out

@@ -128,10 +128,9 @@ def _jacobian(m: Model, t: Any, x: Any) -> Float[Array, "f f"]:
 
 def _slopes(here: SystemAt, x: Any) -> Float[Array, " f"]:
     """The slopes of the differential states, algebraic unknowns following them."""
-    state = here.split(x)
     if len(here.plan.carried):
-        state = here.refined(state, Refinement.ROOT)
-    return here.semi_explicit(here.join(state))[: len(here.plan.states)]
+        x = here.refined(x, Refinement.ROOT)
+    return here.semi_explicit(x)[: len(here.plan.states)]
 
 
 def _intensity(m: Model, t: Any, x: Any) -> Float[Array, "f f"]:

@@ -63,6 +63,10 @@ class Gather:
     offset: np.ndarray
     factor: np.ndarray
 
+    def only(self, k: int) -> "Gather":
+        """The gather of one of the values."""
+        return Gather(self.chunk[k : k + 1], self.offset[k : k + 1], self.factor[k : k + 1])
+
     def read(self, chunks: list[Chunk], dtype) -> Numeric:
         """The values: a scalar if n is 1 (or a Python 0.0 where all are zero), else an array of shape (n,)."""
         n = len(self.chunk)

@@ -11,7 +11,8 @@ from ..hybrid.facts import EventFacts
 from ..model.events import EventTable, HeldTable
 from ..model.extended import Extended
 from ..model.quantities import QuantityMap
-from ..model.tables import ZERO, DependentParameters, FlatModel
+from ..model.starts import Formulas
+from ..model.tables import ZERO, FlatModel
 from ..modeling.event_flags import EventFlag
 from .gather import NOTHING, Gather
 from .program import Program
@@ -35,7 +36,7 @@ class EventPlan:
     factor: np.ndarray  # of the variable that it writes, in units of the state
     discrete: np.ndarray  # the parameters that are discrete variables, hidden ones last
     n_visible: int  # how many of them were declared
-    dependents: tuple[DependentParameters, ...]  # the parameters that follow them
+    dependents: tuple[Formulas, ...]  # the parameters that follow them
     facts: EventFacts
 
     @property
@@ -237,7 +238,7 @@ def read_variables(
     return made, made.layout.gather(quantity, np.where(chosen < 0, 1.0, variables.factor[chosen]))
 
 
-def _following(flat: FlatModel) -> tuple[DependentParameters, ...]:
+def _following(flat: FlatModel) -> tuple[Formulas, ...]:
     """The parameters that are expressions in discrete variables, directly or through others."""
     moved = np.zeros(len(flat.parameters), bool)
     moved[flat.parameters.discrete] = True
@@ -246,5 +247,5 @@ def _following(flat: FlatModel) -> tuple[DependentParameters, ...]:
         rows = moved[group.parameter].any(axis=1) & ~moved[group.target]
         if rows.any():
             moved[group.target[rows]] = True
-            found.append(DependentParameters(group.template, group.target[rows], group.parameter[rows]))
+            found.append(group.take(rows))
     return tuple(found)

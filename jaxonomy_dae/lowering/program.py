@@ -4,7 +4,6 @@ Chunk 0 is the state (an array, or a tuple of scalars for small systems), chunk 
 appends one chunk for each of its local unknowns, a sparse step one for all, a loop one for each unknown of its body.
 """
 
-import abc
 import dataclasses
 from collections.abc import Sequence
 from typing import Any
@@ -51,37 +50,8 @@ class PlannedEquation:
     factors: tuple[Numeric, ...]  # of local slots
 
 
-class AbstractEvaluation(abc.ABC):
-    """What evaluates the steps of a program."""
-
-    @abc.abstractmethod
-    def step(self, planned: "PlannedStep", refine: Any) -> list[Numeric]:
-        """The unknowns of blocks that are written out, a chunk for each local one."""
-
-    @abc.abstractmethod
-    def sparse_step(self, planned: "PlannedSparse", refine: Any) -> list[Numeric]:
-        """The unknowns of large blocks, one chunk."""
-
-    @abc.abstractmethod
-    def loop(self, planned: "PlannedLoop") -> list[Numeric]:
-        """The unknowns of all repetitions, a chunk for each unknown of the body."""
-
-
-class AbstractPlanned(abc.ABC):
-    """A part of a program that computes one chunk after the other."""
-
-    @abc.abstractmethod
-    def evaluate(self, evaluation: AbstractEvaluation, refine: Any) -> list[Numeric]:
-        """The chunks it computes."""
-
-    @property
-    @abc.abstractmethod
-    def reads_networks(self) -> bool:
-        """As that of `Program`."""
-
-
 @dataclasses.dataclass(frozen=True)
-class PlannedStep(AbstractPlanned):
+class PlannedStep:
     """A step with its gathers planned; `guess` reads its tearing variables from the state if they are carried."""
 
     step: Step
@@ -93,16 +63,9 @@ class PlannedStep(AbstractPlanned):
         """The equations that tearing variables must fulfil."""
         return tuple(self.equations[e] for e in self.step.tearing.residuals)
 
-    def evaluate(self, evaluation: AbstractEvaluation, refine: Any) -> list[Any]:
-        return evaluation.step(self, refine)
-
-    @property
-    def reads_networks(self) -> bool:
-        return _is_opaque(self.equations)
-
 
 @dataclasses.dataclass(frozen=True)
-class PlannedSparse(AbstractPlanned):
+class PlannedSparse:
     """A sparse step: its equations read its own unknowns as a chunk that follows all others. `entries` lists, for each
     equation, (slot, instances, factors) of the slots that are unknowns; in this order their partial derivatives are the
     values of the matrix at the places of `pattern`."""
@@ -119,16 +82,9 @@ class PlannedSparse(AbstractPlanned):
         """The equations that the unknowns must fulfil."""
         return self.equations
 
-    def evaluate(self, evaluation: AbstractEvaluation, refine: Any) -> list[Any]:
-        return evaluation.sparse_step(self, refine)
-
-    @property
-    def reads_networks(self) -> bool:
-        return _is_opaque(self.equations)
-
 
 @dataclasses.dataclass(frozen=True)
-class PlannedLoop(AbstractPlanned):
+class PlannedLoop:
     """A loop over the repetitions of a few steps.
 
     Within it, chunk 0 are the values carried over from the repetitions before, chunk 1 what each repetition reads from
@@ -142,29 +98,26 @@ class PlannedLoop(AbstractPlanned):
     outside: Gather | None  # (count · number,)
     parameters: np.ndarray  # (count, number)
 
-    def evaluate(self, evaluation: AbstractEvaluation, refine: Any) -> list[Numeric]:
-        return evaluation.loop(self)
-
     @property
-    def reads_networks(self) -> bool:
-        return any(step.reads_networks for step in self.body)
+    def equations(self) -> list[PlannedEquation]:
+        """Those of the first repetition."""
+        return [equation for step in self.body for equation in step.equations]
+
+
+Planned = PlannedStep | PlannedSparse | PlannedLoop
 
 
 @dataclasses.dataclass(frozen=True)
 class Program:
     """Planned steps and the layout of all they compute."""
 
-    steps: tuple[AbstractPlanned, ...]
+    steps: tuple[Planned, ...]
     layout: Layout
 
     @property
     def reads_networks(self) -> bool:
         """True if a network or another function that SymPy does not see is evaluated."""
-        return any(planned.reads_networks for planned in self.steps)
-
-
-def _is_opaque(equations: Sequence[PlannedEquation]) -> bool:
-    return any(planned.equation.template.opaque is not None for planned in equations)
+        return any(e.equation.template.opaque is not None for planned in self.steps for e in planned.equations)
 
 
 def plan(

@@ -1,9 +1,10 @@
-"""Start values of variables, as expressions in parameters."""
+"""Numbers that are expressions in parameters: dependent parameters, and start values of variables."""
 
 import dataclasses
 from collections.abc import Sequence
-from typing import overload
+from typing import Any, overload
 
+import jax.numpy as jnp
 import numpy as np
 
 from .symbolic import SymbolicTemplate
@@ -16,24 +17,52 @@ class Start:
     template: SymbolicTemplate
     parameters: tuple[int, ...]
 
+    def value(self, parameters: np.ndarray) -> float:
+        """Its value for all parameters."""
+        return float(self.template.residual([], [*parameters[list(self.parameters)]], [], 0.0, None, backend="numpy"))
+
 
 @dataclasses.dataclass(frozen=True)
-class StartGroup:
-    """The starts of several variables that one template computes, each from its own parameters."""
+class Formulas:
+    """Numbers that one template without slots computes, each from its own parameters."""
 
     template: SymbolicTemplate
-    variable: np.ndarray  # (n,)
+    target: np.ndarray  # (n,): what the numbers are of
     parameter: np.ndarray  # (n, parameters of the template)
+
+    def take(self, rows: np.ndarray) -> "Formulas":
+        """Some of the numbers."""
+        return Formulas(self.template, self.target[rows], self.parameter[rows])
+
+    def put(self, array: Any, parameters: Any, t: Any = 0.0) -> Any:
+        """The array with the numbers at their targets, in its last axis; in NumPy it is changed. Numbers that are not
+        finite are named by those who call."""
+        given = [parameters[..., column] for column in self.parameter.T]
+        if isinstance(array, np.ndarray):
+            with np.errstate(all="ignore"):
+                array[..., self.target] = self.template.residual([], given, [], t, None, backend="numpy")
+            return array
+        return array.at[..., self.target].set(jnp.asarray(self.template.residual([], given, [], t, None), array.dtype))
+
+
+def formulas_of(starts: Sequence[Start | None]) -> list[Formulas]:
+    """Expressions as formulas whose targets are their places in the sequence."""
+    found = []
+    for template in dict.fromkeys(start.template for start in starts if start):
+        rows = [(k, start.parameters) for k, start in enumerate(starts) if start and start.template is template]
+        places, parameters = zip(*rows, strict=True)
+        found.append(Formulas(template, np.array(places), np.array(parameters, np.int64)))
+    return found
 
 
 class Starts(Sequence[Start | None]):
     """The start of every variable, None where there is none."""
 
-    def __init__(self, n: int, groups: Sequence[StartGroup]):
+    def __init__(self, n: int, groups: Sequence[Formulas]):
         self.groups = tuple(groups)
         self._place = np.full((n, 2), -1, np.int64)
         for k, group in enumerate(self.groups):
-            self._place[group.variable] = np.stack([np.full(len(group.variable), k), np.arange(len(group.variable))], 1)
+            self._place[group.target] = np.stack([np.full(len(group.target), k), np.arange(len(group.target))], 1)
 
     @property
     def is_given(self) -> np.ndarray:
@@ -56,8 +85,7 @@ class Starts(Sequence[Start | None]):
         """The starts of all variables, zero where there is none."""
         out = np.zeros(len(self))
         for group in self.groups:
-            columns = list(parameters[group.parameter].T)
-            out[group.variable] = group.template.residual([], columns, [], 0.0, None, backend="numpy")
+            group.put(out, parameters)
         return out
 
     def padded(self, extra: int) -> "Starts":

@@ -9,7 +9,6 @@ import functools
 from collections.abc import Sequence
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from ..aliases import Numeric
@@ -18,7 +17,7 @@ from .array_names import ArrayNames
 from .events import NO_EVENTS, NONE_HELD, EventTable, HeldTable
 from .opaque import OpaqueFunction
 from .provenance import Provenance, Provenances
-from .starts import Starts
+from .starts import Formulas, Starts
 from .symbolic import SymbolicTemplate
 from .template import AbstractTemplate
 
@@ -68,22 +67,13 @@ class PortTable:
 
 
 @dataclasses.dataclass(frozen=True)
-class DependentParameters:
-    """Parameters computed from others by one template without slots: one row for each."""
-
-    template: SymbolicTemplate
-    target: np.ndarray  # (n,)
-    parameter: np.ndarray  # (n, parameters of the template)
-
-
-@dataclasses.dataclass(frozen=True)
 class ParameterTable:
     """The declarations of all parameters, by id."""
 
     names: list[str]
     units: list[str]
     bounds: list[Interval]
-    dependents: tuple[DependentParameters, ...]  # each reads only what those before it have computed
+    dependents: tuple[Formulas, ...]  # each reads only what those before it have computed
     expressions: dict[int, str]  # of the dependent ones, in full names
     discrete: np.ndarray  # those that events assign, hidden ones last, such as relations that are events
     relation_starts: np.ndarray  # of the hidden ones, which follow what was declared
@@ -230,15 +220,9 @@ def provenance_of(groups: tuple[EquationGroup, ...], equation: int) -> Provenanc
     return group.provenance[place]
 
 
-def complete(dependents: Sequence[DependentParameters], array: Numeric) -> Numeric:
+def complete(dependents: Sequence[Formulas], array: Numeric) -> Numeric:
     """All parameters, shape (*batch, n), with the dependent ones computed from the others; NumPy or JAX."""
+    array = array.copy() if isinstance(array, np.ndarray) else array
     for group in dependents:
-        given = [array[..., column] for column in group.parameter.T]
-        if isinstance(array, np.ndarray):
-            array = array.copy()
-            with np.errstate(all="ignore"):  # what is not finite is named by those who call
-                array[..., group.target] = group.template.residual([], given, [], 0.0, None, backend="numpy")
-        else:
-            value = group.template.residual([], given, [], 0.0, None)
-            array = array.at[..., group.target].set(jnp.asarray(value, array.dtype))
+        array = group.put(array, array)
     return array

@@ -60,7 +60,7 @@ def _search(system: AcausalSystem, t: Time, dt: Time, x: State, inputs: Inputs) 
 
     def residual(x):
         terms = point.constraint_magnitudes(x, jnp.abs(x) + system.state_sizes)
-        return jnp.abs(point.constraint_vector(point.split(x))) / terms
+        return jnp.abs(point.constraint_vector(x)) / terms
 
     free = jnp.abs(way) < LIMIT * size  # followed all the way
     back = jnp.where(free, (ahead - found) * jnp.sign(way), 0.0) > BACK * jnp.abs(way)

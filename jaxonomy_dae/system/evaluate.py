@@ -15,7 +15,7 @@ import numpy as np
 from ..linear.torn import solve_torn
 from ..linear.whole import solve_whole
 from ..lowering.gather import Chunk, Gather
-from ..lowering.program import AbstractEvaluation, PlannedEquation, PlannedLoop, PlannedSparse, PlannedStep, Program
+from ..lowering.program import Planned, PlannedEquation, PlannedLoop, PlannedSparse, PlannedStep, Program
 from ..model.linear_template import LinearTemplate, scaled
 from ..model.networks import Networks
 from .nonlinear import AbstractBlock, Inside, Refinement, Whole, WrittenOut
@@ -34,7 +34,7 @@ class Linear(NamedTuple):
     at: Callable[[list[Any]], Inside]  # where equations are evaluated, given the unknowns
 
 
-class Evaluation(Values, AbstractEvaluation):
+class Evaluation(Values):
     """One pass over a program's steps at one point."""
 
     def __init__(self, state: Chunk, inputs: Chunk, parameters: Any, t: Any, networks: Networks, typical: Any):
@@ -44,8 +44,14 @@ class Evaluation(Values, AbstractEvaluation):
     def run(self, program: Program, refine: Refinement):
         """Evaluates all steps."""
         for planned in program.steps:
-            self.chunks.extend(planned.evaluate(self, refine))
+            self.chunks.extend(self._computed(planned, refine))
         return self
+
+    def _computed(self, planned: Planned, refine: Refinement) -> list[Any]:
+        """The chunks of a step: one for each local unknown, of a sparse step one for all."""
+        if isinstance(planned, PlannedLoop):
+            return self.loop(planned)
+        return self._whole(planned, refine) if isinstance(planned, PlannedSparse) else self.step(planned, refine)
 
     def step(self, planned: PlannedStep, refine: Refinement) -> list[Any]:
         if planned.step.carried:
@@ -68,7 +74,7 @@ class Evaluation(Values, AbstractEvaluation):
         rows = range(len(planned.equations))
         return self.linear(Linear(planned, rows, right, solve, lambda unknowns: Inside(self, unknowns, unknowns)))
 
-    def sparse_step(self, planned: PlannedSparse, refine: Refinement) -> list[Any]:
+    def _whole(self, planned: PlannedSparse, refine: Refinement) -> list[Any]:
         whole = Whole(self, planned)
         if planned.guess is not None:
             return self.nonlinear(whole, refine)

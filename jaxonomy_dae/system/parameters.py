@@ -14,7 +14,8 @@ from jaxtyping import Array, Bool, Float
 
 from ..errors import ModelError, nearest
 from ..model.array_names import ArrayNames
-from ..model.tables import DependentParameters, complete
+from ..model.starts import Formulas
+from ..model.tables import complete
 from ..modeling.interval import Interval, closed_ends
 from ..modeling.real_number import is_unknown_to_jax, real_number
 from ..programs.cache import compiled
@@ -30,7 +31,7 @@ class ParameterNames:
     names: list[str] = dataclasses.field(compare=False, hash=False)
     units: list[str] = dataclasses.field(compare=False, hash=False)
     intervals: list[Interval] = dataclasses.field(compare=False, hash=False)
-    dependents: tuple[DependentParameters, ...] = dataclasses.field(compare=False, hash=False)
+    dependents: tuple[Formulas, ...] = dataclasses.field(compare=False, hash=False)
     expressions: dict[int, str] = dataclasses.field(compare=False, hash=False)
     arrays: ArrayNames = dataclasses.field(default_factory=ArrayNames, compare=False, hash=False)
     digest: str = ""
@@ -89,9 +90,7 @@ class ParameterNames:
         if not any(int(k) in self.expressions for k in chosen):
             return self
         dependents = tuple(
-            DependentParameters(group.template, group.target[rows], group.parameter[rows])
-            for group in self.dependents
-            if (rows := ~np.isin(group.target, chosen)).any()
+            group.take(rows) for group in self.dependents if (rows := ~np.isin(group.target, chosen)).any()
         )
         expressions = {k: text for k, text in self.expressions.items() if k not in chosen}
         digest = f"{self.digest} given {list(map(int, chosen))}"

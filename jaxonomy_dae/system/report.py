@@ -247,6 +247,4 @@ def _actions(flat: FlatModel, event: int) -> str:
 
 
 def _number(start: Start | None, values: np.ndarray) -> float:
-    if start is None:
-        return float("inf")
-    return float(start.template.residual([], [*values[list(start.parameters)]], [], 0.0, None, backend="numpy"))
+    return float("inf") if start is None else start.value(values)

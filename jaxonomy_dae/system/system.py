@@ -351,9 +351,7 @@ class AcausalSystem(eqx.Module):
             )
         point = self.at(t, args)
         if len(self.plan.carried):
-            x = jax.lax.stop_gradient(point.join(point.refined(point.split(x), Refinement.ROOT))) + (
-                x - jax.lax.stop_gradient(x)
-            )
+            x = jax.lax.stop_gradient(point.refined(x, Refinement.ROOT)) + (x - jax.lax.stop_gradient(x))
         return SparseMatrix(sparse_jacobian(point.vector_field, pattern)(x), pattern)
 
     def project(self, t: Time, x: Float[Array, " n"], args: Any = None, iterations: int = 1) -> Float[Array, " n"]:
@@ -400,10 +398,9 @@ class AcausalSystem(eqx.Module):
     def constraint_residual(self, t: Time, x: Float[Array, " n"], args: Any = None) -> Float[Array, " m"]:
         """The residuals of all hidden constraints at a state."""
         point = self.at(t, args)
-        state = point.split(x)
-        parts = [point.constraint_vector(state)]
+        parts = [point.constraint_vector(x)]
         if len(self.plan.carried):
-            parts.append(point.carried_vector(point.t, state))
+            parts.append(point.carried_vector(point.t, x))
         return jnp.concatenate(parts)
 
     def observe(self, names: str | Sequence[str], t: Time, x: Float[Array, " n"], args: Any = None) -> Any:

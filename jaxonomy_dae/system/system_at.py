@@ -13,17 +13,16 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..errors import ModelError
-from ..linear.dense import solve_dense
 from ..linear.sparse import SparsePattern, sparse_jacobian
 from ..linear.whole import solve_whole
 from ..linear.written_out import UNROLLED, solve
-from ..lowering.gather import SCALARS, Gather, entries, take, times
+from ..lowering.gather import SCALARS, Gather, entries, times
 from ..lowering.plan import PlannedRow, SystemPlan
 from ..lowering.plan_events import EventPlan
 from ..lowering.plan_held import HeldPlan
 from ..lowering.program import Program
 from ..model.networks import Networks
-from ..model.starts import Start
+from ..model.starts import Start, formulas_of
 from ..programs.staging import is_traced, joined, on_device
 from ..solvers.field_size import is_large
 from .evaluate import Evaluation
@@ -45,123 +44,100 @@ class SystemAt:
         self.networks = networks
         self.inputs = inputs
         self.t = on_device(t, self.dtype)
+        self._last: tuple[Any, Any] | None = None  # the state that was asked for last, and its chunk
 
-    def split(self, x: Any) -> Any:
-        """The state as a tuple of scalars, if it has up to `SCALARS` entries; else as an array."""
-        x = jnp.asarray(x)
-        if jnp.shape(x) != (self.plan.n_state,):
-            raise ModelError(f"a state of this system has shape ({self.plan.n_state},); got {jnp.shape(x)}")
-        return tuple(entries(x)) if self.plan.n_state <= SCALARS else x
-
-    @staticmethod
-    def join(x: Any) -> Any:
-        """The state as an array."""
-        if isinstance(x, tuple | list):
-            return jnp.stack(x) if len(x) else jnp.zeros((0,))
-        return x
-
-    def run(self, program: Program, state: Any, refine: Refinement, t: Any = None) -> Evaluation:
-        """Evaluates a program."""
+    def run(self, program: Program, x: Any, refine: Refinement, t: Any = None) -> Evaluation:
+        """Evaluates a program at a state."""
         t = self.t if t is None else t
         inputs = input_values(self.plan, self.inputs, t, self.dtype)
         networks = Networks(self.networks)
-        return Evaluation(state, inputs, self.parameters, t, networks, self.typical).run(program, refine)
+        return Evaluation(self._chunk(x), inputs, self.parameters, t, networks, self.typical).run(program, refine)
+
+    def _chunk(self, x: Any) -> Any:
+        """The state as a tuple of scalars, if it has up to `SCALARS` entries; else as an array."""
+        if self._last is None or self._last[0] is not x:
+            array = jnp.asarray(x)
+            if jnp.shape(array) != (self.plan.n_state,):
+                raise ModelError(f"a state of this system has shape ({self.plan.n_state},); got {jnp.shape(array)}")
+            self._last = (x, tuple(entries(array)) if self.plan.n_state <= SCALARS else array)
+        return self._last[1]
+
+    def _read(self, evaluation: Evaluation, gather: Gather) -> Any:
+        """Gathered values as an array; those of a small system one by one, which XLA fuses."""
+        n = len(gather.chunk)
+        if not 0 < n <= SCALARS or self.plan.n_state > SCALARS:
+            return self._filled(evaluation, gather)
+        return jnp.stack([jnp.asarray(evaluation.read(gather.only(k)), self.dtype) for k in range(n)])
 
     # --- vector field ------------------------------------------------------------------------------------------
 
     def vector_field(self, x: Any) -> Any:
         """d(state)/dt, shape (n_state,)."""
         plan = self.plan
-        state = self.split(x)
-        if len(plan.carried):
-            state = self.refined(state, Refinement.ONCE)
-        slopes, evaluation = self._slopes(state)
+        if not len(plan.carried):
+            return self._slopes(x)[0]
+        x = self.refined(x, Refinement.ONCE)
+        slopes, evaluation = self._slopes(x)
         if plan.carried_rates is not None:
-            slopes = self._appended(slopes, evaluation, plan.carried_rates)
-        elif len(plan.carried):
-            slopes = self._with_carried(state, slopes)
-        return self.join(slopes)
+            return jnp.concatenate([slopes, self._read(evaluation, plan.carried_rates)])
+        return jnp.concatenate([slopes, self._carried_rates(x, slopes)])
 
     def semi_explicit(self, x: Any) -> Any:
         """dx/dt of the states, then the residuals of nonlinear blocks, at the state as it is: shape (n_state,)."""
-        state = self.split(x)
-        slopes, _ = self._slopes(state)
-        if not len(self.plan.carried):
-            return self.join(slopes)
-        residuals = self._carried(self.t, state)
-        if isinstance(slopes, list) and all(jnp.ndim(r) == 0 for r in residuals):
-            return self.join([*slopes, *residuals])
-        return jnp.concatenate([self.join(slopes), *(jnp.reshape(r, (-1,)) for r in residuals)])
+        slopes, _ = self._slopes(x)
+        return jnp.concatenate([slopes, self.carried_vector(self.t, x)]) if len(self.plan.carried) else slopes
 
-    def _slopes(self, state: Any) -> tuple[Any, Evaluation]:
+    def _slopes(self, x: Any) -> tuple[Any, Evaluation]:
         """dx/dt of the differential states, and all that was computed on the way."""
         plan = self.plan
-        n = len(plan.states)
-        evaluation = self.run(plan.derivative, state, Refinement.NONE)
-        if isinstance(state, tuple):
-            slopes: Any = [evaluation.read(_only(plan.next_derivative, k)) for k in range(n)]
-            slopes = [jnp.asarray(s, self.dtype) for s in slopes]
-        else:
-            slopes = jnp.broadcast_to(evaluation.read(plan.next_derivative), (n,)).astype(self.dtype)
+        evaluation = self.run(plan.derivative, x, Refinement.NONE)
+        slopes = self._read(evaluation, plan.next_derivative)
         for row in plan.rows:
-            u = [jnp.asarray(evaluation.read(g), self.dtype) for g in row.inputs]
-            slopes = self._corrected(slopes, row, u)
+            slopes = slopes + self._correction(row, evaluation)
         return slopes, evaluation
 
-    def _corrected(self, slopes: Any, row: PlannedRow, u: list[Any]) -> Any:
-        entries = iter(u)
-        full = [self.t if k in row.opaque.time_positions else next(entries) for k in range(row.opaque.n_inputs)]
-        out = row.opaque(self.networks[row.opaque.index], self.t, jnp.stack(full))
-        for k, (target, factor) in enumerate(zip(row.rows, row.factor, strict=True)):
-            if isinstance(slopes, list):
-                slopes[target] = slopes[target] + times(1 / factor, out[k])
-            else:
-                slopes = slopes.at[target].add(times(1 / factor, out[k]))
-        return slopes
+    def _correction(self, row: PlannedRow, evaluation: Evaluation) -> Any:
+        """What a network adds to the slopes."""
+        read = iter(row.inputs)
+        u = [
+            self.t if k in row.opaque.time_positions else jnp.asarray(evaluation.read(next(read)), self.dtype)
+            for k in range(row.opaque.n_inputs)
+        ]
+        out = row.opaque(self.networks[row.opaque.index], self.t, jnp.stack(u))
+        place = np.full(len(self.plan.states), -1)  # nothing is added to other slopes: the last entry, zero
+        place[list(row.rows)] = np.arange(len(row.rows))
+        return jnp.append(out[: len(row.rows)] / jnp.asarray(row.factor, self.dtype), 0.0)[place]
 
-    def _with_carried(self, state: Any, slopes: Any) -> Any:
-        """Appends dz/dt = −(∂g/∂z)⁻¹ (∂g/∂t + ∂g/∂x dx/dt) for the tearing variables z of nonlinear blocks."""
+    def _carried_rates(self, x: Any, slopes: Any) -> Any:
+        """dz/dt = −(∂g/∂z)⁻¹ (∂g/∂t + ∂g/∂x dx/dt) for the tearing variables z of nonlinear blocks."""
         plan = self.plan
         n, m = len(plan.states), len(plan.carried)
 
-        if isinstance(state, tuple):
-            x, z = list(state[:n]), list(state[n:])
+        def along(rates: Any) -> Any:
+            moved = jnp.ones_like(self.t), jnp.concatenate([slopes, rates])
+            return jax.jvp(self.carried_vector, (self.t, x), moved)[1]
 
-            def along(rates: list[Any]) -> list[Any]:
-                def g(t, x, z):  # blocks that are alike have one residual, an array
-                    return [v for r in self._carried(t, (*x, *z)) for v in (r if jnp.ndim(r) else [r])]
+        if plan.carried_pattern is None:
+            rates = newton(lambda rates: entries(along(jnp.stack(rates))), [jnp.zeros((), self.dtype)] * m)
+            return jnp.stack(rates)
+        matrix = sparse_jacobian(lambda z: self.carried_vector(self.t, jnp.append(x[:n], z)), plan.carried_pattern)(
+            x[n:]
+        )
+        rest = along(jnp.zeros(m, self.dtype))
+        return -solve_whole(plan.carried_pattern, matrix, rest, solver=plan.linear_solver)
 
-                return jax.jvp(g, (self.t, x, z), (jnp.ones_like(self.t), slopes, rates))[1]
-
-            rates = newton(along, [jnp.zeros_like(a) for a in z])
-            return [*slopes, *rates]
-        g = self.carried_vector
-        value = jax.jvp(g, (self.t, state), (jnp.ones_like(self.t), jnp.append(slopes, jnp.zeros(m, self.dtype))))[1]
-
-        def of_z(z):
-            return g(self.t, jnp.concatenate([state[:n], z]))
-
-        if plan.carried_pattern is not None:
-            matrix = sparse_jacobian(of_z, plan.carried_pattern)(state[n:])
-            rates = -solve_whole(plan.carried_pattern, matrix, value, solver=plan.linear_solver)
-            return jnp.concatenate([slopes, rates])
-        return jnp.concatenate([slopes, -solve_dense(jax.jacfwd(of_z)(state[n:]), value)])
-
-    def _carried(self, t: Any, state: Any) -> list[Any]:
-        """The residuals of nonlinear blocks at the tearing variables in the state."""
-        return self.run(self.plan.carried_residuals, state, Refinement.NONE, t=t).residuals
-
-    def carried_vector(self, t: Any, state: Any) -> Any:
-        return self._joined(self._carried(t, state))
+    def carried_vector(self, t: Any, x: Any) -> Any:
+        """The residuals of nonlinear blocks at the tearing variables in the state, shape (carried,)."""
+        return self._joined(self.run(self.plan.carried_residuals, x, Refinement.NONE, t=t).residuals)
 
     def block_determinants(self, x: Any) -> Any:
         """det ∂g/∂z of every nonlinear block that is written out, shape (blocks,)."""
         plan = self.plan
         n, m = len(plan.states), len(plan.carried)
-        y = self.join(self.split(x))
+        y = jnp.asarray(x)
 
         def of_z(z):
-            return self.carried_vector(self.t, self.split(jnp.concatenate([y[:n], z])))
+            return self.carried_vector(self.t, jnp.concatenate([y[:n], z]))
 
         found = []
         if plan.carried_pattern is None:
@@ -182,65 +158,42 @@ class SystemAt:
         with respect to all states, shape (blocks,). Zero where the choice of states is singular."""
         plan = self.plan
         n, m = len(plan.states), len(plan.carried)
-        state = self.split(x)
-        if isinstance(state, tuple) and m == 1:
-            return jnp.stack([self._only_determinant(state)])
 
         def g(x):
-            return self.carried_vector(self.t, self.split(x))
+            return self.carried_vector(self.t, x)
 
         if plan.carried_pattern is not None and plan.dae_pattern is not None:
             inside = plan.dae_pattern.rows >= n
-            rows, cols = plan.dae_pattern.rows[inside] - n, plan.dae_pattern.cols[inside]
+            rows, cols = (plan.dae_pattern.rows[inside] - n, plan.dae_pattern.cols[inside])
             pattern = SparsePattern(rows, cols, plan.n_state, n_rows=m)
             jacobian = pattern.dense(sparse_jacobian(g, pattern)(x))
         else:
-            jacobian = (jax.jacrev if 4 * m < n else jax.jacfwd)(g)(x)
+            jacobian = (jax.jacrev if m == 1 or 4 * m < n else jax.jacfwd)(g)(x)
         jacobian = jacobian * jnp.asarray(plan.nominal, self.dtype)
         size = jnp.sqrt(jnp.sum(jacobian**2, axis=1, keepdims=True))
         matrix = (jacobian / jnp.where(size == 0, 1, size))[:, n:]
         found = [matrix[b.rows[:, :, None], b.columns[:, None, :]] for b in plan.dummy_blocks]
         return jnp.concatenate([b[:, 0, 0] if b.shape[-1] == 1 else jnp.linalg.det(b) for b in found])
 
-    def _only_determinant(self, state: tuple) -> Any:
-        """As `dummy_determinants` for a single equation, on scalars, which XLA fuses."""
-        _, push = jax.linearize(lambda *x: self._carried(self.t, x)[0], *state)
-        one, zero = jnp.ones((), self.dtype), jnp.zeros((), self.dtype)
-        gradient = [
-            float(w) * push(*(one if j == k else zero for j in range(len(state))))
-            for k, w in enumerate(self.plan.nominal)
-        ]
-        size = jnp.sqrt(_sum([g * g for g in gradient], zero))
-        return jnp.reshape(gradient[-1] / jnp.where(size == 0, 1, size), ())
-
-    def refined(self, state: Any, refine: Refinement) -> Any:
+    def refined(self, x: Any, refine: Refinement) -> Any:
         """The state after Newton corrections of the tearing variables of nonlinear blocks, block by block;
         not-a-number where these blocks' equations do not hold then."""
         plan = self.plan
-        evaluation = self.run(plan.carried_residuals, state, refine)
+        evaluation = self.run(plan.carried_residuals, x, refine)
         gather = plan.carried_residuals.layout.gather(plan.carried)
-        return self._appended(state[: len(plan.states)], evaluation, gather)
-
-    def _appended(self, first: Any, evaluation: Evaluation, gather: Gather) -> Any:
-        """The values that were computed, appended to scalars (a list or a tuple) or to an array."""
-        n = len(gather.chunk)
-        if isinstance(first, list | tuple):
-            return type(first)(
-                [*first, *(jnp.asarray(evaluation.read(_only(gather, k)), self.dtype) for k in range(n))]
-            )
-        return jnp.concatenate([first, jnp.broadcast_to(jnp.asarray(evaluation.read(gather), self.dtype), (n,))])
+        return jnp.concatenate([x[: len(plan.states)], self._read(evaluation, gather)])
 
     # --- constraints -------------------------------------------------------------------------------------------
 
-    def constraints(self, state: Any) -> list[Any]:
+    def _constraints(self, x: Any) -> list[Any]:
         """The hidden constraints' residuals, one array for each template: scalars, or shape (instances,)."""
-        evaluation = self.run(self.plan.constraint_program, state, Refinement.NONE)
+        evaluation = self.run(self.plan.constraint_program, x, Refinement.NONE)
         found = (evaluation.equation(planned) for planned in self.plan.constraints)
         return [at.filled(at.residual()) for at in found]
 
-    def constraint_vector(self, state: Any) -> Any:
+    def constraint_vector(self, x: Any) -> Any:
         """All hidden constraints' residuals, shape (n_constraints,)."""
-        return self._joined(self.constraints(state))
+        return self._joined(self._constraints(x))
 
     def _joined(self, parts: Sequence[Any]) -> Any:
         return jnp.concatenate([jnp.reshape(v, (-1,)) for v in parts]) if parts else jnp.zeros((0,), self.dtype)
@@ -253,10 +206,9 @@ class SystemAt:
     def _measured(self, program: Program, x: Any, sizes: Any) -> Measured:
         inputs = input_values(self.plan, self.inputs, self.t, self.dtype)
         networks = Networks(self.networks)
-        state, sizes = self.split(x), self.split(sizes)
-        return Measured(state, sizes, inputs, self.parameters, self.t, networks, self.typical).run(
-            program, Refinement.NONE
-        )
+        return Measured(
+            self._chunk(x), self._chunk(sizes), inputs, self.parameters, self.t, networks, self.typical
+        ).run(program, Refinement.NONE)
 
     def constraint_magnitudes(self, x: Any, sizes: Any) -> Any:
         """The magnitudes of the hidden constraints' terms, shape (n_constraints,)."""
@@ -284,14 +236,13 @@ class SystemAt:
         """For the constraints that come and go with modes: (1.0 where one holds, 0.0 otherwise, shape (held,); all
         levels, shape (levels,), which are zero while it does)."""
         plan = self._held()
-        state = self.split(x)
-        active = self._filled(self.run(plan.active_program, state, Refinement.NONE), plan.active)
-        return active, self._filled(self.run(plan.level_program, state, Refinement.ONCE), plan.level)
+        active = self._filled(self.run(plan.active_program, x, Refinement.NONE), plan.active)
+        return active, self._filled(self.run(plan.level_program, x, Refinement.ONCE), plan.level)
 
     def held_forces(self, x: Any) -> Any:
         """The forces of the constraints that only push, shape (held,), zero for all others."""
         plan = self._held()
-        return self._filled(self.run(plan.force_program, self.split(x), Refinement.ONCE), plan.force)
+        return self._filled(self.run(plan.force_program, x, Refinement.ONCE), plan.force)
 
     def _held(self) -> HeldPlan:
         if self.plan.held is None:
@@ -300,7 +251,7 @@ class SystemAt:
 
     def projected_onto(self, x: Any) -> Any:
         """All residuals that states are projected onto: zero, whatever the state, where a mode does not ask for one."""
-        residuals = self.constraint_vector(self.split(x))
+        residuals = self.constraint_vector(x)
         if self.plan.held is None:
             return residuals
         active, levels = self.held(x)
@@ -311,85 +262,55 @@ class SystemAt:
         """The state moved onto the hidden constraints, and onto those of the modes at hand, by Gauss–Newton steps of
         least (nominal-weighted) norm, and the tearing variables of nonlinear blocks refined."""
         plan = self.plan
-        state = self.split(x)
-        if plan.n_projected and iterations > 1 and is_large(self._least_norm_step, state):
-            state, _ = jax.lax.scan(lambda state, _: (self._least_norm_step(state), None), state, length=iterations)
+        x = jnp.asarray(x)
+        if plan.n_projected and iterations > 1 and is_large(self._least_norm_step, x):
+            x, _ = jax.lax.scan(lambda x, _: (self._least_norm_step(x), None), x, length=iterations)
         else:
             for _ in range(iterations if plan.n_projected else 0):
-                state = self._least_norm_step(state)
+                x = self._least_norm_step(x)
         if len(plan.carried):
-            state = self.refined(state, Refinement.ONCE if iterations == 1 else Refinement.ROOT)
-        return self.join(state)
+            x = self.refined(x, Refinement.ONCE if iterations == 1 else Refinement.ROOT)
+        return x
 
-    def _least_norm_step(self, state: Any) -> Any:
+    def _least_norm_step(self, x: Any) -> Any:
         plan = self.plan
         n = len(plan.states)
-        nominal = plan.nominal[:n]
-        # In units of the states, and each constraint beside the largest unit in it: squares of single precision
-        # underflow at 1e-19.
-        if isinstance(state, tuple) and plan.n_constraints <= UNROLLED and plan.held is None:
-            rest = state[n:]
-
-            def h(*x):
-                return [
-                    v[k] if jnp.ndim(v) else v for v in self.constraints((*x, *rest)) for k in range(max(1, v.size))
-                ]
-
-            value, pull = jax.vjp(h, *state[:n])
-            one, zero = jnp.ones((), self.dtype), jnp.zeros((), self.dtype)
-            m = len(value)
-            rows = [pull([one if j == k else zero for j in range(m)]) for k in range(m)]
-            pattern = plan.constraint_pattern or (frozenset(range(n)),) * m
-            largest = [max((nominal[c] for c in inside), default=1.0) for inside in pattern]
-            unit = [[nominal[c] / size for c in range(n)] for size in largest]
-            gram = [
-                [_sum([times(unit[a][c] * unit[b][c], rows[a][c] * rows[b][c])
-                       for c in sorted(pattern[a] & pattern[b])], zero)
-                 for b in range(m)]
-                for a in range(m)
-            ]  # fmt: skip
-            value = [times(1 / size, v) for size, v in zip(largest, value, strict=True)]
-            multiplier = solve(gram, value, positive=True)  # of a definite matrix: scales do not matter
-            moved = [
-                s - _sum([times(nominal[c] * unit[a][c], rows[a][c] * multiplier[a])
-                          for a in range(m) if c in pattern[a]], zero)
-                for c, s in enumerate(state[:n])
-            ]  # fmt: skip
-            return (*moved, *rest)
-        array = self.join(state)
-        x, rest = array[:n], array[n:]
-
-        def vector(x):
-            return self.projected_onto(jnp.concatenate([x, rest]))
-
-        value, pull = jax.vjp(vector, x)
-        jacobian = jax.vmap(lambda e: pull(e)[0])(jnp.eye(value.shape[0], dtype=self.dtype))
-        jacobian = jacobian * jnp.asarray(nominal, self.dtype)
-        # Each constraint in units of its gradient: multiplied by 1e9 it is projected onto alike.
+        unit = plan.nominal[:n]
+        nominal = 1.0 if (unit == 1.0).all() else jnp.asarray(unit, self.dtype)
+        value, pull = jax.vjp(lambda states: self.projected_onto(jnp.concatenate([states, x[n:]])), x[:n])
+        jacobian = times(nominal, jax.vmap(lambda e: pull(e)[0])(np.eye(len(value), dtype=self.dtype)))
+        # Each constraint in units of its gradient: multiplied by 1e9 it is projected onto alike, and squares of single
+        # precision do not underflow.
         size = jnp.max(jnp.abs(jax.lax.stop_gradient(jacobian)), axis=1, initial=0.0)
-        absent: Any = None
+        absent = None
         if plan.held is not None:  # a row that asks for nothing is zero, and is left out
-            active, _ = self.held(array)
+            active, _ = self.held(x)
             absent = jnp.append(jnp.zeros(plan.n_constraints, self.dtype), 1 - active[plan.held.table.owner])
             size = size + absent
-        unit = 1 / size
-        jacobian, value = jacobian * unit[:, None], value * unit
+        jacobian, value = jacobian / size[:, None], value / size
         gram = jacobian @ jacobian.T
-        multiplier = jnp.linalg.solve(gram if absent is None else gram + jnp.diag(absent), value)
-        return self.split(jnp.concatenate([x - jnp.asarray(nominal, self.dtype) * (jacobian.T @ multiplier), rest]))
+        gram = gram if absent is None else gram + jnp.diag(absent)
+        m = len(value)
+        if m <= UNROLLED:
+            flat = entries(gram.ravel())
+            multiplier = jnp.stack(solve([flat[k * m : (k + 1) * m] for k in range(m)], entries(value), positive=True))
+        else:
+            multiplier = jnp.linalg.solve(gram, value)
+        moved = x[:n] - times(nominal, multiplier @ jacobian)
+        return jnp.concatenate([moved, x[n:]]) if len(plan.carried) else moved
 
     # --- events ------------------------------------------------------------------------------------------------
 
     def guards(self, x: Any) -> Any:
         """The guards of all events of conditions, shape (guards,)."""
         events = self._events()
-        evaluation = self.run(events.guards, self.split(x), Refinement.ONCE)
+        evaluation = self.run(events.guards, x, Refinement.ONCE)
         return self._filled(evaluation, events.guard)
 
     def event_values(self, x: Any) -> Any:
         """The values that the actions of all events would write, shape (actions,)."""
         events = self._events()
-        read = self._filled(self.run(events.values, self.split(x), Refinement.ROOT), events.value)
+        read = self._filled(self.run(events.values, x, Refinement.ROOT), events.value)
         return jnp.where(events.table.value < 0, jnp.asarray(events.table.constant, self.dtype), read)
 
     def clocks(self) -> tuple[Any, Any]:
@@ -400,22 +321,12 @@ class SystemAt:
 
     def _computed(self, starts: Sequence[Start | None]) -> Any:
         """Expressions in parameters, those that are alike at once; infinity for None."""
-        known = not is_traced((self.parameters, self.t))
         values: Any = np.full((len(starts),), np.inf, self.dtype)
+        known = not is_traced((self.parameters, self.t))
+        numbers, t = (np.asarray(self.parameters), np.asarray(self.t)) if known else (self.parameters, self.t)
         values = values if known else jnp.asarray(values)
-        alike: dict[Any, list[int]] = {}
-        for k, start in enumerate(starts):
-            if start is not None:
-                alike.setdefault(start.template, []).append(k)
-        for template, places in alike.items():
-            rows = np.array([starts[k].parameters for k in places], np.int64)  # pyright: ignore[reportOptionalMemberAccess]
-            if known:
-                numbers = [np.asarray(self.parameters)[column] for column in rows.T]
-                values[places] = template.residual([], numbers, [], np.asarray(self.t), None, backend="numpy")
-                continue
-            numbers = [take(self.parameters, column) for column in rows.T]
-            new = template.residual([], numbers, [], self.t, None)
-            values = values.at[np.array(places)].set(jnp.broadcast_to(jnp.asarray(new, self.dtype), (len(places),)))
+        for group in formulas_of(starts):
+            values = group.put(values, numbers, t)
         return values
 
     def waves(self, differentiated: bool = False) -> tuple[Any, Any]:
@@ -458,15 +369,4 @@ class SystemAt:
     def quantities(self, x: Any, quantity: np.ndarray, factor: np.ndarray) -> Any:
         """The values of quantities with factors, shape (len(quantity),)."""
         program = self.plan.reading(quantity)
-        return self._filled(self.run(program, self.split(x), Refinement.ROOT), program.layout.gather(quantity, factor))
-
-
-def _sum(terms: list[Any], zero: Any) -> Any:
-    total = None
-    for term in terms:
-        total = term if total is None else total + term
-    return zero if total is None else total
-
-
-def _only(gather, k: int):
-    return type(gather)(gather.chunk[k : k + 1], gather.offset[k : k + 1], gather.factor[k : k + 1])
+        return self._filled(self.run(program, x, Refinement.ROOT), program.layout.gather(quantity, factor))

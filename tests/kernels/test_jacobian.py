@@ -53,7 +53,6 @@ def test_pattern_of_the_semi_explicit_form(model):
 
     def residual(state):
         point = system.at(0.2, None)
-        state = point.split(state)
         f = point.run(plan.derivative, state, Refinement.NONE).read(plan.next_derivative)
         return jnp.concatenate([jnp.broadcast_to(f, (n,)), point.carried_vector(point.t, state)])
 
